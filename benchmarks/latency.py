@@ -27,8 +27,8 @@ from jax.flatten_util import ravel_pytree
 from scipy.integrate import solve_ivp
 
 import iblf_jax as ij
-from iblf_jax.engine.execute import run_one
-from iblf_jax.engine.step import Run
+from iblf_jax.engine import RunRequest
+from iblf_jax.engine.single_run import run_one
 from iblf_jax.simulation.closed_loop import initial_state, rate
 from iblf_jax.simulation.metrics import standard
 
@@ -97,7 +97,7 @@ def main() -> None:
     compiled, compile_times = {}, {}
     for backend in ("xla", "native"):
         start = time.perf_counter()
-        run = partial(run_one, run=Run(steps, method, 1), backend=backend)
+        run = partial(run_one, request=RunRequest(steps, method, 1, backend=backend))
         compiled[backend] = jax.jit(run).lower(scenario, folds, dt).compile()
         compile_times[backend] = time.perf_counter() - start
 

@@ -54,7 +54,7 @@ def main() -> None:
         runs=runs,
         risk=ij.cvar(0.9),
         iterations=iterations,
-        report_runs=fresh,
+        report=ij.tuning.Report(runs=fresh),
         progress=False,
         **timing,
     )

@@ -13,7 +13,7 @@ Rectangle sums at 1 ms: tau as it is applied at the start of a step, e1 as it is
 gain changes, would be a part of the ISE and J 0.003 larger.  Columns: the best J of each search;
 rollout-equivalents and seconds until it was within 0.5 % of the best J of all searches (compile
 time apart), and until it ended.  One rollout-equivalent is one value of J; a value with its
-derivatives counts by its cost, measured in the same run, for as many lanes as `tune` evaluates at
+derivatives counts by its cost, measured in the same run, for as many starts as `tune` evaluates at
 once.
 
 Peers: CMA-ES (`cma`) and Optuna's TPE, in logarithms of the gains, from the same start, within the
@@ -62,7 +62,7 @@ from iblf_jax.engine.mechanism import mechanism_of
 from iblf_jax.engine.step import Run
 from iblf_jax.simulation.scenario import canonical
 from iblf_jax.studies.cube import bounded
-from iblf_jax.tuning import _falsify, _tune, problem
+from iblf_jax.tuning import TuningProblem, _falsify, evaluation
 from iblf_jax.tuning.quantities import Peak, Quantities
 
 WITHIN = 1.005
@@ -173,7 +173,7 @@ class Search(NamedTuple):
 class Judge:
     """J at many points; every value counted and timed."""
 
-    def __init__(self, built: _tune.Problem, offset: float):
+    def __init__(self, built: TuningProblem, offset: float):
         self.built, self.offset = built, offset
         self.seen: list[float] = []
         self.began = time.perf_counter()
@@ -181,11 +181,7 @@ class Judge:
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
         """J at points (S, p) or (p,)."""
-        found = problem.value(
-            self.built.shared,
-            self.built.lanes(np.atleast_2d(points)),
-            formulation=self.built.formulation,
-        )
+        found = evaluation.value(self.built, self.built.candidates(np.atleast_2d(points)))
         losses = np.where(np.asarray(found.valid), np.asarray(found.objective) - self.offset, 1e6)
         losses = np.where(np.isfinite(losses), losses, 1e6)
         self.seen += losses.tolist()
@@ -203,7 +199,7 @@ class Judge:
         )
 
 
-def run_cma(built: _tune.Problem, offset: float, evaluations: int, seed: int) -> Search:
+def run_cma(built: TuningProblem, offset: float, evaluations: int, seed: int) -> Search:
     """CMA-ES, first step size 0.5 in logarithms, otherwise as it comes."""
     import cma
 
@@ -215,9 +211,7 @@ def run_cma(built: _tune.Problem, offset: float, evaluations: int, seed: int) ->
     }
     search = cma.CMAEvolutionStrategy(built.box.z, 0.5, options)
     size = search.popsize
-    problem.value(
-        built.shared, built.lanes(np.stack([built.box.z] * size)), formulation=built.formulation
-    )  # compile
+    evaluation.value(built, built.candidates(np.stack([built.box.z] * size)))  # compile
     judge = Judge(built, offset)
     while not search.stop() and len(judge.seen) < evaluations:
         points = search.ask()
@@ -225,7 +219,7 @@ def run_cma(built: _tune.Problem, offset: float, evaluations: int, seed: int) ->
     return judge.search("CMA-ES", seed)
 
 
-def run_tpe(built: _tune.Problem, offset: float, evaluations: int, seed: int) -> Search:
+def run_tpe(built: TuningProblem, offset: float, evaluations: int, seed: int) -> Search:
     """Optuna's TPE from the same start."""
     import optuna
 
@@ -262,13 +256,12 @@ def run_ours(
 
     def once(seed: int, iterations: int, callback=None):
         options = {
-            "starts": starts,
+            "solver": ij.tuning.SQP(starts=starts, patience=100),
             "backend": backend,
             "seed": seed,
-            "patience": 100,
-            "progress": False,
+            "progress": callback or False,
         }
-        timing = {"duration": duration, "iterations": iterations, "callback": callback}
+        timing = {"duration": duration, "iterations": iterations}
         return ij.tune(scenario, parameters, loss.objective(SMOOTHING), **timing, **options)
 
     def timed(seed: int) -> Search:
@@ -291,11 +284,11 @@ def compare(
     scenario, parameters, duration = problem_of(name, quick)
     timing = {"duration": duration, "dt": 1e-3, "method": "rk4", "backend": BACKEND[name]}
     loss = Loss(scenario, duration)
-    built = _tune.build(scenario, parameters, loss.objective(SMOOTHING), None, 1, 0, "mean", timing)
-    lanes, size = built.lanes(np.stack([built.box.z] * starts)), len(built.box.z)
+    built = TuningProblem.build(scenario, parameters, loss.objective(SMOOTHING), **timing)
+    candidates, size = built.candidates(np.stack([built.box.z] * starts)), len(built.box.z)
     calls = {
-        "value": lambda: problem.value(built.shared, lanes, formulation=built.formulation),
-        "slope": lambda: problem.slope(built.shared, lanes, formulation=built.formulation),
+        "value": lambda: evaluation.value(built, candidates),
+        "slope": lambda: evaluation.forward_derivatives(built, candidates),
     }
     seconds = interleaved(calls, 2 if quick else 20)
     cost = seconds["slope"] / seconds["value"]
@@ -436,7 +429,7 @@ def limited_problem(
 class LimitedJudge:
     """Objective and excess at many points; remembers every value."""
 
-    def __init__(self, built: _tune.Problem):
+    def __init__(self, built: TuningProblem):
         self.built = built
         self.seen: list[float] = []
         self.points: list[np.ndarray] = []
@@ -455,12 +448,7 @@ class LimitedJudge:
             np.concatenate([part, np.repeat(part[:1], 16 - len(part), 0)])
             for part in np.split(points, range(16, len(points), 16))
         ]
-        found = [
-            problem.value(
-                self.built.shared, self.built.lanes(part), formulation=self.built.formulation
-            )
-            for part in parts
-        ]
+        found = [evaluation.value(self.built, self.built.candidates(part)) for part in parts]
         f = np.concatenate(
             [np.where(np.asarray(x.valid), np.asarray(x.objective), 1e3) for x in found]
         )[: len(points)]
@@ -519,21 +507,12 @@ def limited_searches(name: str, quick: bool) -> tuple[list[Search], float, ij.Tu
 
     scenario, tunables, goal, timing, study = limited_problem(name, quick)
     runs = study.get("runs", 1)
-    built = _tune.build(
-        scenario,
-        tunables,
-        goal,
-        study.get("perturbations"),
-        runs,
-        0,
-        "mean",
-        timing | {"method": "rk4"},
-    )
+    built = TuningProblem.build(scenario, tunables, goal, **study, **timing)
     z, size = built.box.z, len(built.box.z)
-    one, steps, values = built.lanes(z[None]), 2 if quick else 40, 60 if quick else 250 * size
+    one, steps, values = built.candidates(z[None]), 2 if quick else 40, 60 if quick else 250 * size
     calls = {
-        "value": lambda: problem.value(built.shared, one, formulation=built.formulation),
-        "slope": lambda: problem.slope(built.shared, one, formulation=built.formulation),
+        "value": lambda: evaluation.value(built, one),
+        "slope": lambda: evaluation.forward_derivatives(built, one),
     }
     seconds = interleaved(calls, 2 if quick else 10)
     cost, began = seconds["slope"] / seconds["value"], time.perf_counter()
@@ -555,19 +534,20 @@ def limited_searches(name: str, quick: bool) -> tuple[list[Search], float, ij.Tu
     def exact(z: np.ndarray) -> Any:
         found = jax.tree.map(
             lambda x: np.asarray(x)[0],
-            problem.slope(built.shared, built.lanes(z[None]), formulation=built.formulation),
+            evaluation.forward_derivatives(built, built.candidates(z[None])),
         )
         judge.points.append(z.copy())
         judge.seen.append(
             float(found.value.objective) if np.all(found.value.exact_excess <= 0) else np.inf
         )
-        owner, limits = built.limits.owner, range(len(found.value.exact_excess))
-        worst = [np.flatnonzero(owner == r)[np.argmax(found.excess[0, owner == r])] for r in limits]
+        owner = built.search_space(1).constraints.owner
+        limits = range(len(found.value.exact_excess))
+        worst = [np.flatnonzero(owner == r)[np.argmax(found.pieces[0, owner == r])] for r in limits]
         return (
             float(found.value.objective),
             found.value.exact_excess,
             found.gradient,
-            found.slopes[0][:, worst].T,
+            found.piece_gradients[0][:, worst].T,
         )
 
     if runs == 1:  # the slope of a probability is that of a smoothed one

@@ -92,6 +92,7 @@ if TYPE_CHECKING:
     from iblf_jax import certificates as certificates
     from iblf_jax import plotting as plotting
     from iblf_jax import testing as testing
+    from iblf_jax import tuning as tuning
     from iblf_jax.certificates import Certificate as Certificate
     from iblf_jax.certificates import Counterexample as Counterexample
     from iblf_jax.certificates import certify as certify
@@ -165,6 +166,7 @@ _ON_FIRST_USE = {
     "testing": ("iblf_jax.testing", None),
     "tunable": ("iblf_jax.tuning", "tunable"),
     "tune": ("iblf_jax.tuning", "tune"),
+    "tuning": ("iblf_jax.tuning", None),
     "tune_file": ("iblf_jax.files.tuning", "tune_file"),
     "TuneResult": ("iblf_jax.tuning", "TuneResult"),
 }

@@ -1,15 +1,16 @@
 """`certify`: checks one run, a batch of runs or a study against Theorem 2.
 
-The stages are: `certify` checks the request; `_certificate_of` takes one run through its summary
-and its segments (`run_summary`), the lines about them (`theorem_lines`, `further_lines`) and the
-traces; `_over_runs` combines the certificates of many runs.
+The stages are: `_request` checks what the caller passed; `_certificate_of` takes one run through
+its summary and its segments (`run_summary`, which runs the engine), the lines about them
+(`theorem_lines`, `further_lines`) and the traces; `_over_runs` combines the certificates of many
+runs.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -81,6 +82,31 @@ def certify(
     Source: Zhang & Yan 2024, Theorem 2 and its proof, (3.16)-(3.31).
     """
     scenario = canonical(scenario)
+    _check_certifiable(scenario)
+    if run is None:
+        every = 1 + checks.whole_steps(duration, dt) // RECORDED
+        run = simulate(scenario, duration=duration, dt=dt, method=method, record_every=every)
+    request = _request(scenario, run, worst)
+    if request.many:
+        return _over_runs(request.runs)
+    _, single = next(iter(request.runs))
+    return _certificate_of(single)
+
+
+# --- the request ---------------------------------------------------------------------------------
+
+
+class _Request(NamedTuple):
+    """The runs to check."""
+
+    runs: Iterable[tuple[int, Rollout]]
+    """Index and run, its arrays on the host."""
+    many: bool
+    """Whether the certificate is about many runs."""
+
+
+def _check_certifiable(scenario: Scenario) -> None:
+    """Raises ValueError for a traced scenario, or a law that states half of a claim."""
     if not checks.is_concrete(scenario):
         raise checks.fail(
             "scenario",
@@ -88,30 +114,28 @@ def certify(
             "numbers",
             "certify works on the host: call it outside jit, vmap and grad.",
         )
-    own_claim(scenario)  # raises for half of a claim, before anything is simulated
-    if run is None:
-        every = 1 + checks.whole_steps(duration, dt) // RECORDED
-        run = simulate(scenario, duration=duration, dt=dt, method=method, record_every=every)
+    own_claim(scenario)
+
+
+def _request(scenario: Scenario, run: Any, worst: int | None) -> _Request:
+    """The runs to check; ValueError for a run of another scenario, or something that is no run."""
     if worst is not None:
         worst = checks.positive_integer("worst", worst)
     if isinstance(run, Rollout):
         _check_scenario(scenario, run)
-        run = _on_host(run)
-        if run.is_batch:
-            return _over_runs((i, run[i]) for i in range(len(run)))
-        return _certificate_of(run)
+        on_host = _on_host(run)
+        if not run.is_batch:
+            return _Request([(0, on_host)], many=False)
+        return _Request(((i, on_host[i]) for i in range(len(run))), many=True)
     if all(hasattr(run, name) for name in ("replay", "metrics", "__len__")):
-        worst_runs = _nearest_to_bounds(run, worst)
-        return _over_runs((i, _on_host(_replayed(run, i))) for i in worst_runs)
+        indices = _nearest_to_bounds(run, worst)
+        return _Request(((i, _on_host(_replayed(run, i))) for i in indices), many=True)
     raise checks.fail(
         "run",
         run,
         "a Rollout, a study or None",
         "Pass what ij.simulate or ij.monte_carlo returned.",
     )
-
-
-# --- the request ---------------------------------------------------------------------------------
 
 
 def _on_host(run: Rollout) -> Rollout:

@@ -38,7 +38,7 @@ from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.cube import bounded
 from iblf_jax.studies.distributions import Perturbation
 
-EXCLUDED = "The guard or a torque limit is at work at the start, where nothing is claimed."
+EXCLUDED = "The guard or a torque limit is active at the start, where nothing is claimed."
 
 
 class Counterexample(NamedTuple):

@@ -208,19 +208,6 @@ def rho_terms(
     ])  # fmt: skip
 
 
-@partial(jax.jit, static_argnames="case")
-def rho(
-    constants: Claim | FullClaim,
-    lambda_max: jax.typing.ArrayLike,
-    case: int,
-    lambda_min: jax.typing.ArrayLike = 0.0,
-) -> jax.Array:
-    """The rate of the claim, () [1/s].
-    (3.19), (3.27), (F.3)
-    """
-    return jnp.min(rho_terms(constants, lambda_max, case, lambda_min))
-
-
 # --- the claim with weights ----------------------------------------------------------------------
 
 

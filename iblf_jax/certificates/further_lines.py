@@ -209,8 +209,8 @@ def own_segment_lines(segment: Segment) -> list[Line]:
     note = ""
     if summary.excluded:
         note = (
-            f"{summary.excluded} of {summary.samples} samples are left out: the guard or a torque"
-            " limit was at work"
+            f"{summary.excluded} of {summary.samples} samples are excluded: the guard or a torque"
+            " limit was active"
         )
     return [
         check_margins(

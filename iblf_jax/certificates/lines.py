@@ -15,7 +15,7 @@ import numpy as np
 HOLDS, FAILS, NOT_APPLICABLE = "holds", "fails", "not applicable"
 OWN_INEQUALITY = "inequality, own V"
 """Name of the inequality that a law states about itself."""
-OBSERVED_ONLY = "no claim, only seen ("
+OBSERVED_ONLY = "no claim, only observed ("
 """Beginning of the note of a line that holds on the run although no theorem claims it."""
 
 

@@ -278,15 +278,12 @@ def proof_along(
     # they are one call of one program.
     both = jax.tree.map(lambda *xs: np.concatenate(xs), full, halves)
     levels = run_from(scenario, dt, both, step=AdvanceStep(method), steps=3)[1][1]
+    terms: dict[str, Any]
     terms, M0, sample = jax.tree.map(lambda x: np.asarray(x)[:, 0], found)
     eigenvalues = _eigenvalues(M0)
-    proof = ProofTerms(
-        **terms,
-        lambda_min=eigenvalues[:, 0],
-        lambda_max=eigenvalues[:, -1],
-        slowest=1.0 / _eigenvalues(np.asarray(mass_over_gain(scenario, M0)))[:, -1],
-    )
-    return proof, sample, *map(_defect, levels)
+    terms["lambda_min"], terms["lambda_max"] = eigenvalues[:, 0], eigenvalues[:, -1]
+    terms["slowest"] = 1.0 / _eigenvalues(np.asarray(mass_over_gain(scenario, M0)))[:, -1]
+    return ProofTerms(**terms), sample, *map(_defect, levels)
 
 
 def _eigenvalues(matrices: np.ndarray) -> np.ndarray:

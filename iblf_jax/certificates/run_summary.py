@@ -43,7 +43,7 @@ NOISE = 32.0
 """Rounding error of sqrt(2 V2) in units of the last place, relative to the sizes of its terms."""
 CONDITION = {1: "(3.17)", 2: "(3.25)"}
 """Gain condition of each case."""
-ALWAYS_EXCLUDED = "the guard or a torque limit was at work all the time"
+ALWAYS_EXCLUDED = "the guard or a torque limit was active all the time"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,7 +63,9 @@ class RunSummary:
     case: int
     """1 if f' = 0, else 2."""
     rho: dict[tuple[int, str], float]
-    """The rate, by case and by the domain of lambda_max ("run", "box") [1/s]."""
+    """The rate, by case and by the domain of the eigenvalues of M0 ("run", "box") [1/s]."""
+    rho_terms: dict[tuple[int, str], np.ndarray]
+    """The three terms of which each rate is the least, (3,) [1/s]."""
     F_m: float
     """sup |f| [N m]."""
     F_d: float
@@ -226,6 +228,7 @@ def _summary(run: Any, grid: TimeGrid, all_steps: Iterable[Steps]) -> RunSummary
     case, F_d = 2, float(extrema.F_d)
     if extrema.steady:
         case, F_d = 1, 0.0
+    rho_terms = _rho_terms(claimed, extrema, over_box)
     jumps = np.sort(np.ravel(np.asarray(scenario.jump_times())))
     return RunSummary(
         run=run,
@@ -234,7 +237,8 @@ def _summary(run: Any, grid: TimeGrid, all_steps: Iterable[Steps]) -> RunSummary
         eps=rounding(run.q.dtype),
         jumps=jumps[(jumps > 0) & (jumps <= grid.duration)],
         case=case,
-        rho=_rates(claimed, extrema, over_box),
+        rho={key: float(np.min(terms)) for key, terms in rho_terms.items()},
+        rho_terms=rho_terms,
         F_m=float(extrema.F_m),
         F_d=F_d,
         lambda_min=float(extrema.lambda_min),
@@ -248,17 +252,18 @@ def _summary(run: Any, grid: TimeGrid, all_steps: Iterable[Steps]) -> RunSummary
     )
 
 
-def _rates(claimed: Claims, extrema: _Extrema, over_box: Extremes) -> dict[tuple[int, str], float]:
-    """Rates of Theorem 2 by case, with the eigenvalues along the run and over the box."""
-    if claimed.constants is None:
+def _rho_terms(
+    claimed: Claims, extrema: _Extrema, over_box: Extremes
+) -> dict[tuple[int, str], np.ndarray]:
+    """The terms of rho by case, with the eigenvalues along the run and over the box."""
+    constants = claimed.constants
+    if constants is None:
         return {}
     found = {}
     for case in CASES:
-        for domain, eigenvalues in (("run", extrema), ("box", over_box)):
-            rho = claims.rho(
-                claimed.constants, eigenvalues.lambda_max, case, eigenvalues.lambda_min
-            )
-            found[case, domain] = float(rho)
+        for domain, source in (("run", extrema), ("box", over_box)):
+            terms = claims.rho_terms(constants, source.lambda_max, case, source.lambda_min)
+            found[case, domain] = np.asarray(terms)
     return found
 
 

@@ -54,7 +54,7 @@ NOT_NEEDED = (
     "the paper's own envelope of V2 is lost, stability is not: the claim with weights (W.1) does"
     " not need it"
 )
-CASE_1_COUNTS = "f' = 0 on this run, so case 1 is what counts"
+CASE_1_COUNTS = "f' = 0 on this run, so case 1 decides"
 
 BOUNDED = Statement("f bounded", "Assumption 1", "|f| <= F_m", "N m")
 RATE_BOUNDED = Statement("f' bounded", "Assumption 1", "|f'| <= F_d between jumps", "N m/s")
@@ -106,14 +106,14 @@ def exclusion_note(summary: RunSummary) -> str:
     """Which samples the claims exclude, and where they start again, in words."""
     excluded = ""
     if summary.excluded:
-        why = "the guard or a torque limit was at work"
+        why = "the guard or a torque limit was active"
         if summary.claims.bounds_velocities:
-            why = "alpha was outside, or the guard or a torque limit at work"
-        excluded = f"{summary.excluded} of {summary.samples} samples are left out: {why}"
+            why = "alpha was outside, or the guard or a torque limit active"
+        excluded = f"{summary.excluded} of {summary.samples} samples are excluded: {why}"
     restarts = ""
     if summary.jumps.size:
         times = ", ".join(f"{x:.4g}" for x in summary.jumps)
-        restarts = f"f jumps at t = {times} s, and the claim starts anew there"
+        restarts = f"f jumps at t = {times} s, and the claim starts again there"
     return join_notes(excluded, restarts)
 
 
@@ -206,8 +206,8 @@ def _gains(summary: RunSummary) -> list[Line]:
         (kf_2, constants.kf - claims.LOWEST_KF[2], not case_1),
     )
     lines = []
-    for statement, margins, counts in conditions:
-        margins = np.asarray(margins)
+    for statement, above_lowest, counts in conditions:
+        margins = np.asarray(above_lowest)
         line = check_positive(
             statement,
             float(margins.min()),
@@ -229,8 +229,7 @@ def _full_gains(summary: RunSummary) -> list[Line]:
         if not isinstance(constants, FullClaim):
             lines.append(not_applicable(statement, summary.claims.no_theorem))
             continue
-        terms = claims.rho_terms(constants, summary.lambda_max, case, lambda_min)
-        margin = 0.5 * float(terms[2])
+        margin = 0.5 * float(summary.rho_terms[case, "run"][2])
         needed = np.asarray(constants.kf).min() - claims.LOWEST_FULL[case]
         note = f"lambda_min(M0) = {lambda_min:.4g} kg m^2 along the run"
         if margin <= 0 < needed:
@@ -246,7 +245,7 @@ def _rate(summary: RunSummary, case: int, domain: str) -> Line:
     """The rate rho of one case, with the eigenvalues of M0 along the run or over the admissible
     box.
     """
-    full, constants = summary.claims.bounds_velocities, summary.claims.constants
+    full = summary.claims.bounds_velocities
     name = f"rho, case {case}" + {"run": "", "box": ", over the box"}[domain]
     equation = RHO[case]
     text = (
@@ -263,12 +262,9 @@ def _rate(summary: RunSummary, case: int, domain: str) -> Line:
     reason = summary.claims.no_theorem
     if case == 1 and summary.case == 2:
         reason = summary.why_not_theorem(1)
-    if reason or constants is None:
+    if reason:
         return not_applicable(statement, reason)
     source: Any = {"run": summary, "box": summary.over_box}[domain]
-    terms = claims.rho_terms(
-        constants, jnp.asarray(source.lambda_max), case, jnp.asarray(source.lambda_min)
-    )
     least = ["the decay rate of V1", "K2 over lambda_max(M0)", "kf"]
     eigenvalue = f"lambda_max(M0) = {source.lambda_max:.4g} kg m^2"
     if full:
@@ -279,7 +275,7 @@ def _rate(summary: RunSummary, case: int, domain: str) -> Line:
         statement,
         summary.rho[case, domain],
         value=summary.rho[case, domain],
-        note=f"{eigenvalue}{searched}; set by {least[int(np.argmin(np.asarray(terms)))]}",
+        note=f"{eigenvalue}{searched}; set by {least[np.argmin(summary.rho_terms[case, domain])]}",
         counts=not (case == 2 and summary.case == 1),
     )
     return _unless_replaced(summary, line)
@@ -489,13 +485,13 @@ def _dropped_terms(segment: Segment) -> tuple[list[Line], dict[str, float]]:
     by_law = Statement(
         "dropped term of the law",
         "(3.13)",
-        "e2^T M0' e2/2 alone <= the margin that the proof leaves",
+        "e2^T M0' e2/2 <= the margin that the proof leaves",
         "1/s",
     )
     by_observer = Statement(
         "dropped term of the observer",
         "(3.11)",
-        "-f_tilde^T kf M0' q' alone <= the margin that the proof leaves",
+        "-f_tilde^T kf M0' q' <= the margin that the proof leaves",
         "1/s",
     )
     unclaimed = summary.claims.no_theorem or summary.invalid

@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
     from iblf_jax.cli import complain
     from iblf_jax.cli._common import run_options
     from iblf_jax.deployment.export import export
-    from iblf_jax.kernels.toolchain import ToolchainError
+    from iblf_jax.kernels import ToolchainError
 
     file = scenario_of(args)
     options = run_options(args, file)

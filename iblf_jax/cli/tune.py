@@ -5,6 +5,10 @@ figures.
 from __future__ import annotations
 
 import argparse
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from iblf_jax.tuning import TuningReport
 
 
 def add_parser(subparsers: argparse._SubParsersAction) -> None:
@@ -41,13 +45,14 @@ def run(args: argparse.Namespace) -> int:
     from iblf_jax.cli._common import output_folder
     from iblf_jax.files.tuning import tune_file
 
-    folder = output_folder(args.out) if args.out else None
-    given = {
-        name: x
-        for name, x in (("checkpoint", args.checkpoint), ("iterations", args.iterations))
-        if x is not None
-    }
-    result = tune_file(args.file, progress=False if args.quiet else None, **given)
+    folder = None
+    if args.out:
+        folder = output_folder(args.out)
+    options = {"checkpoint": args.checkpoint, "iterations": args.iterations}
+    if args.quiet:
+        options["progress"] = False
+    given = {name: x for name, x in options.items() if x is not None}
+    result = tune_file(args.file, **given)
     print(result.report)
     print(result)
     if folder is not None:
@@ -64,8 +69,13 @@ def run(args: argparse.Namespace) -> int:
         (folder / "report.txt").write_text(f"{result.report}\n{result}\n", encoding="utf-8")
         plotting.save({"tuning": result.plot()}, folder, formats=("png",))
         print(f"\nwritten to {folder}: scenario.toml, tuning.json, report.txt, tuning.png")
-    failed = (
-        any(v.verdict == "fail" for v in result.report.verdicts)
-        or result.report.changes[0].after > result.report.changes[0].before
-    )
-    return 1 if failed and not (result.report.verdicts and result.report.passed) else 0
+    return int(_has_failed(result.report))
+
+
+def _has_failed(report: TuningReport) -> bool:
+    """Whether a requirement failed, or the objective went up although not all requirements pass."""
+    if report.verdicts and report.passed:
+        return False
+    objective = report.changes[0]
+    any_failed = any(verdict.verdict == "fail" for verdict in report.verdicts)
+    return any_failed or objective.after > objective.before

@@ -1,14 +1,13 @@
-"""The folder of the user's in which compiled programs are kept between processes, XLA's and our own
-kernels.
+"""The user's folder of compiled programs, XLA's and our own kernels, which later processes reuse.
 
 It is $XDG_CACHE_HOME/iblf_jax, or ~/.cache/iblf_jax, and in it a folder for XLA's by the kind of
-processor.  It is used from the first run of a process on, unless JAX has been given a folder of its
-own or told to keep nothing (JAX_ENABLE_COMPILATION_CACHE=0).  What was used longest ago is removed
-once all takes more than LIMIT; removing the folder loses nothing but time.
+processor.  The first run of a process enables it, unless the user has configured another folder
+of JAX or disabled its cache (JAX_ENABLE_COMPILATION_CACHE=0).  When all entries take more than
+LIMIT, the least recently used ones are removed.  The folder may be deleted at any time.
 
-JAX loads whatever it finds under the name of a program.  In our folder each of its entries
-therefore ends in a digest of its name and its content: one that is damaged, or belongs to another
-  program, or is no file, is removed, and the program is compiled again.
+JAX does not verify what it loads.  In our folder each of its entries therefore ends in a digest of
+its name and its content: an entry that is damaged, belongs to another program or is not a file is
+removed, and the program is compiled again.
 """
 
 from __future__ import annotations
@@ -32,20 +31,19 @@ from iblf_jax.kernels import cpuinfo, directory, processor
 LIMIT = 2 * 2**30
 """Bytes."""
 JAX_SUFFIX = "-cache"
-"""Of the names of JAX's entries."""
+"""Suffix of the names of JAX's entries."""
 SUFFIXES = (JAX_SUFFIX, "-atime", ".so", ".cubin")
-"""Of the names of what may be removed: JAX's and ours."""
+"""Suffixes of the names of entries that may be removed: JAX's and ours."""
 DIGEST_SIZE = 32
 """Bytes of a digest."""
 IN_USE = 3600.0
-"""Seconds for which nobody removes what was used: another process may be about to load it."""
+"""Seconds after its last use in which an entry stays: another process may be loading it."""
 
 
 class VerifiedCache:
-    """JAX's cache of compiled programs (`base`, in `folder`), of which only entries that are whole
-    and in their own place are used.
+    """JAX's cache of compiled programs (`base`, in `folder`) with verified entries.
 
-    It offers what JAX asks of a cache: `get` and `put`.
+    It has the two methods that JAX calls: `get` and `put`.
     """
 
     def __init__(self, base: Any, folder: Path) -> None:
@@ -60,9 +58,11 @@ class VerifiedCache:
         except OSError:
             return None
         # Only a file is opened: at a pipe, a reader waits.
-        whole = self._base.get(key) if is_file else None
-        if whole is not None:
-            image, digest = whole[:-DIGEST_SIZE], whole[-DIGEST_SIZE:]
+        entry = None
+        if is_file:
+            entry = self._base.get(key)
+        if entry is not None:
+            image, digest = entry[:-DIGEST_SIZE], entry[-DIGEST_SIZE:]
             if digest == entry_digest(key, image):
                 return image
         _remove(path)
@@ -77,7 +77,7 @@ class VerifiedCache:
 
 
 def entry_digest(key: str, image: bytes) -> bytes:
-    """What an entry ends in: entries that change places do not fit it."""
+    """The digest at the end of an entry, of its name and its content."""
     return hashlib.sha256(key.encode() + b"\0" + image).digest()
 
 
@@ -112,13 +112,15 @@ def _verify_entries(folder: Path) -> None:
 
 @memoised(1)
 def keep_programs() -> None:
-    """Makes room, and has JAX keep what it compiles, unless the user has told it where, or not to,
-    or no folder is safe; once a process.
+    """Removes old entries and enables JAX's cache on the disk, once per process.
+
+    JAX's cache stays as it is where the user has configured or disabled it, or where no folder is
+    safe.
     """
     try:
         top = directory()
-        stranger = _not_ours(top)
-        if stranger is None:
+        foreign = _not_ours(top)
+        if foreign is None:
             _trim(top)  # kernels are here whatever JAX does
         config: Any = jax.config  # its fields are made when JAX starts
         if (
@@ -130,13 +132,13 @@ def keep_programs() -> None:
         # XLA's programs hold instructions of the processor, and JAX does not ask which: homes are
         # shared by machines.
         folder = top / f"xla-{hashlib.sha256(processor().encode()).hexdigest()[:12]}"
-        if stranger is None:
+        if foreign is None:
             folder.mkdir(mode=0o700, exist_ok=True)
-            stranger = _not_ours(folder)
+            foreign = _not_ours(folder)
     except OSError:
         return
-    if stranger is not None:
-        problem = f"{top} holds {stranger!r}, a link or of another user; remove it."
+    if foreign is not None:
+        problem = f"{top} holds {foreign!r}, a link or of another user; remove it."
         notices.warn(f"compiled programs are not kept: {problem}")
     elif os.access(folder, os.W_OK | os.X_OK):
         config.update("jax_compilation_cache_dir", str(folder))
@@ -183,22 +185,25 @@ def _not_ours(folder: Path) -> str | None:
 
 
 def _trim(folder: Path) -> None:
-    """Removes what was used longest ago, until the rest is small enough."""
+    """Removes the least recently used entries until the rest is small enough."""
     top = _entries(folder)
-    inner = [
-        Path(x.path)
-        for x, _ in top
-        if x.name.startswith("xla-") and x.is_dir(follow_symlinks=False)
-    ]
-    kept = [
-        (status, x.path)
-        for x, status in [*top, *(y for part in inner for y in _entries(part))]
-        if x.name.endswith(SUFFIXES)
-    ]
-    size = sum(status.st_size for status, _ in kept)
-    for status, path in sorted(kept, key=lambda entry: max(entry[0].st_atime, entry[0].st_mtime)):
-        if size <= LIMIT or max(status.st_atime, status.st_mtime) > time.time() - IN_USE:
+    entries = list(top)
+    for x, _ in top:
+        if x.name.startswith("xla-") and x.is_dir(follow_symlinks=False):
+            entries += _entries(Path(x.path))
+    kept = [(_last_use(status), status.st_size, x.path) for x, status in entries if _is_ours(x)]
+    size = sum(bytes_of_one for _, bytes_of_one, _ in kept)
+    for last_use, bytes_of_one, path in sorted(kept):
+        if size <= LIMIT or last_use > time.time() - IN_USE:
             break
         with contextlib.suppress(OSError):
             os.unlink(path)
-            size -= status.st_size
+            size -= bytes_of_one
+
+
+def _last_use(status: os.stat_result) -> float:
+    return max(status.st_atime, status.st_mtime)
+
+
+def _is_ours(entry: os.DirEntry) -> bool:
+    return entry.name.endswith(SUFFIXES)

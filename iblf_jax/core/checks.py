@@ -79,24 +79,25 @@ def is_deep(value: Any) -> bool:
     """Whether lists, tuples and dicts are inside each other deeper than any array or file of this
     package is.
 
-    JAX must not see such a thing: it recurses, and the interpreter's count of levels is wrong ever
-      after.
+    JAX must not see such a value: it recurses, and the interpreter's recursion counter is wrong
+    from then on.
     """
-    level = [value]
+    level = _containers([value])
     for _ in range(DEEPEST):
-        parts = (
-            x.values() if isinstance(x, dict) else x
-            for x in level
-            if isinstance(x, list | tuple | dict)
-        )
-        level = list(
-            {
-                id(x): x for part in parts for x in part if isinstance(x, list | tuple | dict)
-            }.values()
-        )
-        if not level:
+        inner: dict[int, Any] = {}
+        for container in level.values():
+            if isinstance(container, dict):
+                container = container.values()
+            inner |= _containers(container)
+        if not inner:
             return False
+        level = inner
     return True
+
+
+def _containers(values: Iterable[Any]) -> dict[int, Any]:
+    """The lists, tuples and dicts among values, each once, by their identity."""
+    return {id(x): x for x in values if isinstance(x, list | tuple | dict)}
 
 
 def flat_enough(name: str, value: Any) -> None:
@@ -111,8 +112,17 @@ def line(text: str, part: str = "words") -> str:
     """
     most = LONGEST_TEXT[part]
     text = re.sub(r"\s*\n\s*", " ", text[: 4 * most])
-    text = "".join(x if x.isprintable() else ascii(x)[1:-1] for x in text)
-    return text if len(text) <= most else text[: most - 3] + "..."
+    text = "".join(map(_printable, text))
+    if len(text) > most:
+        return text[: most - 3] + "..."
+    return text
+
+
+def _printable(character: str) -> str:
+    """A character, or its escape sequence if it cannot be printed."""
+    if character.isprintable():
+        return character
+    return ascii(character)[1:-1]
 
 
 def shown(value: Any) -> str:
@@ -122,33 +132,39 @@ def shown(value: Any) -> str:
     try:
         if isinstance(value, jax.Array | np.ndarray):
             text = np.array2string(np.asarray(value), precision=6, threshold=8)
+        elif isinstance(value, np.generic):
+            text = repr(value.item())
         else:
-            text = repr(value.item() if isinstance(value, np.generic) else value)
-    except Exception:  # an integer of thousands of digits, a key, lists nested thousands deep, a class whose repr is broken
+            text = repr(value)
+    except Exception:
+        # An integer of thousands of digits, a key, deeply nested lists, a class with a broken repr.
         text = f"an object of class {type(value).__name__}"
     return line(text, "value")
 
 
 def fail(field: str, got: Any, expected: str, remedy: str = "") -> ValueError:
     """The one form of error message: field, value, expectation and remedy, in one line."""
-    return ValueError(
-        f"{line(field, 'field')}: got {shown(got)}, expected {line(expected)}."
-        + (f" {line(remedy)}" if remedy else "")
-    )
+    text = f"{line(field, 'field')}: got {shown(got)}, expected {line(expected)}."
+    if remedy:
+        text += f" {line(remedy)}"
+    return ValueError(text)
 
 
 def nearest(name: Any, known: Iterable[str]) -> str:
     """The remedy for a misspelt word, "Did you mean ...?"; nothing where no known word is near."""
     words = [str(word) for word in known]
     close = difflib.get_close_matches(str(name)[: LONGEST_TEXT["value"]], words, n=2, cutoff=0.6)
-    return f"Did you mean {' or '.join(close)}?" if close else ""
+    if not close:
+        return ""
+    return f"Did you mean {' or '.join(close)}?"
 
 
 def did_you_mean(name: Any, known: Iterable[str]) -> str:
     """The remedy for a misspelt word: the nearest known ones, or all of them."""
     words = [str(word) for word in known]
-    everything = f"There are: {', '.join(words)}." if words else ""
-    return nearest(name, words) or everything
+    if not words:
+        return ""
+    return nearest(name, words) or f"There are: {', '.join(words)}."
 
 
 def with_article(noun: str) -> str:
@@ -158,7 +174,9 @@ def with_article(noun: str) -> str:
     """
     spoken_as_consonant = re.match(r"(?i)(uni(?!n|m[^o])|us[ei]|eu|one([^a-z]|$))", noun)
     begins_with_vowel = noun[:1].lower() in tuple("aeiou")
-    return f"an {noun}" if begins_with_vowel and not spoken_as_consonant else f"a {noun}"
+    if begins_with_vowel and not spoken_as_consonant:
+        return f"an {noun}"
+    return f"a {noun}"
 
 
 class ArgumentError(TypeError, ValueError):
@@ -215,8 +233,8 @@ def _kind_of(field: dataclasses.Field) -> str:
 
 
 def renamed(**names: str) -> Callable[[F], F]:
-    """Of a function whose keywords have new names, old=new: who uses an old one is told the new one
-    (ValueError).
+    """Decorator of a function whose keywords have new names, old=new: an old one raises a
+    ValueError that names the new one.
     """
 
     def decorated(function: F) -> F:
@@ -262,15 +280,14 @@ def as_leaf(owner: str, field: dataclasses.Field, value: Any) -> Any:
     """Converts what a person typed for a leaf field to a floating-point array and checks it.
 
     A field that was not declared with `leaf` is converted too if it holds numbers, and is otherwise
-    left alone (it is another component).
+    returned as it is (it is another component).
     """
     declared = field.metadata.get("leaf", False)
     name = f"{owner}.{field.name}"
     if value is None:
         if field.default is not None:
-            raise fail(
-                name, value, "a number or an array of numbers" if declared else "a component"
-            )
+            expected = {True: "a number or an array of numbers", False: "a component"}
+            raise fail(name, value, expected[declared])
         return None
     if isinstance(value, tuple | list) and len(value) == 0 and not declared:
         return tuple(value)
@@ -296,10 +313,9 @@ def as_floats(name: str, value: Any) -> jax.Array:
     """An array of floating-point numbers, or a ValueError that names the field."""
     flat_enough(name, value)
     try:
-        array = _from_host(value) if _is_plain(value) else jnp.asarray(value)
-    except (
-        Exception
-    ) as error:  # whatever NumPy and JAX make of it: too large, ragged, nested too deep, no numbers
+        array = _as_array(value)
+    except Exception as error:
+        # NumPy and JAX raise many kinds: too large, ragged, nested too deeply, not numeric.
         raise fail(name, value, "numbers in a rectangular array") from error
     if jnp.issubdtype(array.dtype, jnp.floating):
         return array
@@ -308,10 +324,14 @@ def as_floats(name: str, value: Any) -> jax.Array:
     raise fail(name, value, "real numbers", f"Its type is {array.dtype}.")
 
 
-def _is_plain(value: Any) -> bool:
-    """Whether a value is a number, an array or a list of numbers that JAX has nothing to do
-    with.
-    """
+def _as_array(value: Any) -> jax.Array:
+    if _is_on_host(value):
+        return _from_host(value)
+    return jnp.asarray(value)
+
+
+def _is_on_host(value: Any) -> bool:
+    """Whether a value consists of Python's or NumPy's numbers only."""
     if isinstance(value, list | tuple):
         return all(isinstance(x, int | float) for x in jax.tree.leaves(value))
     return isinstance(value, int | float | np.ndarray | np.generic) and not isinstance(
@@ -320,14 +340,16 @@ def _is_plain(value: Any) -> bool:
 
 
 def _from_host(value: Any) -> jax.Array:
-    """The array of a plain value; `jnp.asarray` compiles a program for every new shape, 20 ms
-    each.
+    """The array of a value on the host; `jnp.asarray` compiles a program for every new shape, 20
+    ms each.
     """
-    host = np.array(value)  # a copy: JAX may share the memory of what it is given
+    host: Any = np.array(value)  # a copy: JAX may share the memory of its argument
     if host.dtype.kind in "iu":
         host = host.astype(jnp.result_type(float))
+    if isinstance(value, float):
+        host = value  # stays weakly typed
     with jax.ensure_compile_time_eval():
-        return jax.device_put(value if isinstance(value, float) else host)
+        return jax.device_put(host)
 
 
 def check_values(name: str, array: Any, sign: str | None) -> None:
@@ -394,14 +416,11 @@ def conforms(
         or isinstance(value, str | bytes | tuple | list | dict | jax.Array | np.ndarray)
         or _is_number_like(value)
     )
-    missing = sorted(x for x in members - set(optional) if bare or not hasattr(value, x))
-    if bare or missing:
-        raise fail(
-            name,
-            value,
-            expected,
-            " ".join(x for x in (remedy, "" if bare else f"It lacks {', '.join(missing)}.") if x),
-        )
+    if bare:
+        raise fail(name, value, expected, remedy)
+    missing = sorted(x for x in members - set(optional) if not hasattr(value, x))
+    if missing:
+        raise fail(name, value, expected, f"{remedy} It lacks {', '.join(missing)}.".strip())
     for field, part in getattr(value, "__dict__", {}).items():
         flat_enough(f"{name}.{field}", part)
     try:
@@ -426,9 +445,11 @@ def offers(name: str, value: Any, methods: tuple[str, ...], expected: str) -> No
         or isinstance(value, type | str | bytes | tuple | list | dict)
         or _is_number_like(value)
     )
-    missing = [x for x in methods if bare or not hasattr(value, x)]
+    if bare and methods:
+        raise fail(name, value, expected)
+    missing = [x for x in methods if not hasattr(value, x)]
     if missing:
-        raise fail(name, value, expected, "" if bare else f"It lacks {', '.join(missing)}.")
+        raise fail(name, value, expected, f"It lacks {', '.join(missing)}.")
 
 
 def vectors(n: int | None = None, **named: Any) -> tuple[jax.Array, ...]:
@@ -436,13 +457,18 @@ def vectors(n: int | None = None, **named: Any) -> tuple[jax.Array, ...]:
     first if n is not given.
     """
     arrays = tuple(as_floats(name, value) for name, value in named.items())
-    shape = np.shape(arrays[0]) if n is None else (n,)
+    shape: tuple[int, ...] = (n,)  # type: ignore[assignment]
+    if n is None:
+        shape = np.shape(arrays[0])
+    expected = "(n,)"
+    if len(shape) == 1:
+        expected = str(shape)
     for name, array in zip(named, arrays, strict=True):
         if array.ndim != 1 or array.shape != shape:
             raise fail(
                 name,
                 array,
-                f"one number a joint, shape {shape if len(shape) == 1 else '(n,)'}",
+                f"one number a joint, shape {expected}",
                 f"Its shape is {array.shape}.",
             )
     return arrays
@@ -458,7 +484,8 @@ def positive_number(name: str, value: Any, unit: str, zero: bool = False) -> flo
     """A finite positive Python float (or 0, if that may be) from a user's argument, or a
     ValueError.
     """
-    expected = f"a {'number >= 0' if zero else 'positive number'} [{unit}]"
+    kind = {True: "number >= 0", False: "positive number"}[zero]
+    expected = f"a {kind} [{unit}]"
     if isinstance(value, jax.core.Tracer):
         remedy = (
             "It decides how many steps are compiled: use a Python number, or static_argnames in"
@@ -514,7 +541,9 @@ def time_span(name: str, value: Any, zero: bool = False) -> float:
 
 def positive_integer(name: str, value: Any, *, least: int = 1, most: int | None = None) -> int:
     """A Python int from `least` on, at most `most`, from a user's argument, or a ValueError."""
-    expected = f"a whole number >= {least}" + (f" and <= {most}" if most is not None else "")
+    expected = f"a whole number >= {least}"
+    if most is not None:
+        expected += f" and <= {most}"
     if isinstance(value, bool | np.bool_) or not isinstance(value, numbers.Integral):
         raise fail(name, value, expected)
     number = int(value)
@@ -577,7 +606,8 @@ def flag(name: str, value: Any, optional: bool = False) -> Any:
     if value is None and optional:
         return None
     if not isinstance(value, bool | np.bool_):
-        raise fail(name, value, "True or False" + (" or None" if optional else ""))
+        expected = {True: "True or False or None", False: "True or False"}
+        raise fail(name, value, expected[optional])
     return bool(value)
 
 
@@ -626,8 +656,8 @@ def devices(name: str, value: Any) -> list[jax.Device]:
 
 
 def file_path(name: str, value: Any, what: str = "a file") -> Path:
-    """A path from a user's argument that this system can spell, or a ValueError.  Nothing need be
-    there.
+    """A path from a user's argument that this system can spell, or a ValueError.  The file need
+    not exist.
     """
     expected = f"the path of {what}"
     try:
@@ -653,13 +683,11 @@ def file_to_read(name: str, value: Any, what: str = "a file") -> Path:
     path = file_path(name, value, what)
     if not path.exists():
         raise MissingFileError(fail(name, str(path), f"the path of {what}", "Nothing is there."))
+    remedy = "It is not a file."
+    if path.is_dir():
+        remedy = "It is a folder."
     if not path.is_file():
-        raise fail(
-            name,
-            str(path),
-            f"the path of {what}",
-            "It is a folder." if path.is_dir() else "It is not a file.",
-        )
+        raise fail(name, str(path), f"the path of {what}", remedy)
     return path
 
 
@@ -741,9 +769,10 @@ def whole_steps(duration: Any, dt: Any, *, dt_is_free: bool = True) -> int:
     # for what it was.
     if steps < 1 or abs(steps * dt - duration) > 1e-3 * dt + 1e-12 * duration:
         near = max(steps, 1)
-        remedy = f"Take duration={near * dt:.12g}" + (
-            f" or dt={duration / near:.12g}." if dt_is_free else "."
-        )
+        remedy = f"Take duration={near * dt:.12g}"
+        if dt_is_free:
+            remedy += f" or dt={duration / near:.12g}"
+        remedy += "."
         raise fail("duration", duration, f"a whole number of steps dt = {dt:g} s", remedy)
     return steps
 
@@ -752,7 +781,6 @@ def recorded_every(value: Any, steps: int) -> int:
     """Every how many steps to record, as the compiled loops count it, in int32.
 
     Every number past the last step has the same effect: only the first instant is recorded.  A
-      number
-    that no integer type of a computer holds is a mistake, and refused.
+    number that does not fit in 64 bits is an error.
     """
     return min(positive_integer("record_every", value, most=LARGEST_INTEGER), steps + 1, MOST_STEPS)

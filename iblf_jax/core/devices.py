@@ -24,12 +24,16 @@ def default() -> list[jax.Device]:
     device = chosen()
     if device is None:
         return list(jax.local_devices())
-    return list(jax.local_devices(backend=device)) if isinstance(device, str) else [device]
+    if isinstance(device, str):
+        return list(jax.local_devices(backend=device))
+    return [device]
 
 
 def platform() -> str:
     """Their platform, as JAX names it: "cpu", "gpu" or "tpu"."""
-    return jax.default_backend() if chosen() is None else default()[0].platform
+    if chosen() is None:
+        return jax.default_backend()
+    return default()[0].platform
 
 
 def processors() -> int:

@@ -108,8 +108,16 @@ def _slice_as_text(field: str, given: slice) -> str:
         x is None or (isinstance(x, int | np.integer) and not isinstance(x, bool)) for x in parts
     ):
         raise checks.fail(field, given, "a slice of whole numbers", "Name single joints in a list.")
-    words = ["" if x is None else str(int(x)) for x in parts]
-    return ":".join(words if given.step is not None else words[:2])
+    words = [_text_of(x) for x in parts]
+    if given.step is None:
+        words = words[:2]
+    return ":".join(words)
+
+
+def _text_of(number: int | None) -> str:
+    if number is None:
+        return ""
+    return str(int(number))
 
 
 def indices(field: str, chosen: Selection, names: Sequence[str]) -> tuple[int, ...]:
@@ -165,5 +173,7 @@ def _indices_of(field: str, entry: int | str, names: Sequence[str]) -> list[int]
             raise checks.fail(field, entry, "a slice whose step is not 0")
         return list(range(n))[slice(*parts)]
     close = difflib.get_close_matches(entry, names, n=1)
-    remedy = f"Did you mean {close[0]!r}?" if close else f"There are: {', '.join(names)}."
+    remedy = f"There are: {', '.join(names)}."
+    if close:
+        remedy = f"Did you mean {close[0]!r}?"
     raise checks.fail(field, entry, "the name of a joint", remedy)

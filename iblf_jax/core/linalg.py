@@ -53,10 +53,13 @@ def cholesky(matrix: jax.Array) -> list[list[jax.Array]]:
         row: list[jax.Array] = []
         for j in range(i + 1):
             rest = matrix[i, j]
+            other = [*L, row][j]
             for k in range(j):
-                other = row if i == j else L[j]
                 rest = rest - row[k] * other[k]
-            row.append(jnp.sqrt(rest) if i == j else rest / L[j][j])
+            if i == j:
+                row.append(jnp.sqrt(rest))
+            else:
+                row.append(rest / L[j][j])
         L.append(row)
     return L
 
@@ -123,9 +126,8 @@ def solve(matrix: jax.Array, rhs: jax.Array) -> jax.Array:
     """X with matrix X = rhs, for any (m, m) matrix and an (m, k) right-hand side, by Gauss and
     Jordan with pivoting.
 
-    For what is done once a run: in a loop over the columns, quick to compile and without a call
-      into a library, which would keep the run
-    around it from becoming one machine function.
+    It is for operations that occur once per run: a loop over the columns compiles quickly, and a
+    library call would prevent the run from being compiled as one machine function.
     """
     rows = jnp.arange(len(matrix))
 

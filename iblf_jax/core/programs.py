@@ -1,10 +1,11 @@
-"""Bounds what compiled programs take of the process's memory maps.
+"""Bounds the number of memory maps that compiled programs use.
 
-The code of a program that JAX has compiled for a CPU lies in some hundred memory maps, and Linux
-gives a process 65,530.  JAX keeps every program for as long as the process lives: after a few
-hundred of them (a few dozen arms, each with programs of its own) the compiler finds no memory, and
-the process ends.  So JAX forgets its programs when the maps come near to their limit; what is
-needed again is compiled again, or read from the disk (`core.cache`).
+The code of a program that JAX has compiled for a CPU uses some hundred memory maps, and Linux
+allows a process 65,530.  JAX keeps every program for the life of the process: after a few hundred
+programs (a few dozen arms, each with programs of its own) the compiler cannot allocate memory, and
+the process ends.  This module therefore clears JAX's programs when the number of maps comes close
+to the limit; programs that are needed again are compiled again, or read from the disk
+(`core.cache`).
 """
 
 from __future__ import annotations
@@ -19,10 +20,10 @@ MAPS, MOST_MAPS = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
 COMPILED = "/jax/core/compile/backend_compile_duration"
 """JAX's event of a program that is compiled, or read from the disk."""
 SHARE = 0.6
-"""Of the maps that a process may have, from which programs are released: libraries and other
-threads need some too."""
+"""Share of the permitted maps above which programs are released: libraries and other threads need
+some, too."""
 PROGRAM = 300
-"""Maps of a program, about at most: one evaluation of the closed loop of an arm has 250."""
+"""Approximate largest number of maps of a program: a step of an arm's closed loop has 250."""
 
 
 def count_maps() -> int:
@@ -81,7 +82,7 @@ class ProgramBound:
 
 
 def release_programs() -> None:
-    """Has JAX forget what it has compiled; what runs is kept until its end."""
+    """Clears the programs that JAX has compiled; running programs stay until their end."""
     jax.clear_caches()
     gc.collect()
 

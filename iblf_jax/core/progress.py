@@ -16,20 +16,19 @@ def bar(progress: bool | None, total: int, done: int = 0, unit: str = "runs") ->
     """A tqdm bar over runs, or over something else, a context manager with `update(runs)`.
 
     Args:
-      progress: True or False, or None: shown where somebody watches and it takes more than DELAY
-        seconds.
+      progress: True or False; None shows the bar after DELAY seconds where a user can see it.
       total: number of runs.
       done: runs that were there before.
       unit: what is counted.
     """
     progress = checks.flag("progress", progress, optional=True)
     with warnings.catch_warnings():
-        warnings.simplefilter(
-            "ignore"
-        )  # tqdm warns where a notebook lacks ipywidgets and then falls back to text by itself
+        # tqdm warns where a notebook lacks ipywidgets, and falls back to text.
+        warnings.simplefilter("ignore")
         from tqdm.auto import tqdm
-    shown = has_reader() if progress is None else progress
-    delay = DELAY if progress is None else 0.0
+    shown, delay = progress, 0.0
+    if progress is None:
+        shown, delay = has_reader(), DELAY
     return tqdm(
         total=total,
         initial=done,

@@ -1,21 +1,18 @@
 """Components: frozen dataclasses that JAX can differentiate, batch and compile.
 
-A robot, a law, a bound is a *component*: it has behaviour (methods) and leaves (arrays).  JAX takes
-  a
-component apart into its leaves and puts it together again at every `jit`, `vmap` and `grad`, with
-tracers, placeholders or axis numbers in the place of the numbers.  So two things must be kept
-apart:
+A robot, a law, a bound is a *component*: it has behaviour (methods) and leaves (arrays).  At every
+`jit`, `vmap` and `grad`, JAX flattens a component into its leaves and reconstructs it with tracers,
+placeholders or axis numbers in their place.  Two operations are therefore separate:
 
 - **construction by a person**, `TwoLink(mass=[2, 0.85], ...)`: lists become arrays, signs and
   shapes are checked;
 - **reconstruction by JAX**: nothing may be converted or checked, because what comes is not a
   number.
 
-`component` does that: the checks live in the constructor, and the pytree is registered with an
-  unflatten that never
-calls it.  Fields are declared with `leaf` (a differentiable array with a unit), `static`
-(structure: changes recompile) or as a plain annotation (another component).  `eq=False`: comparing
-  arrays with `==` is ambiguous, identity is not.
+`component` implements both: the constructor converts and checks, and the registered `unflatten`
+never calls it.  Fields are declared with `leaf` (a differentiable array with a unit), `static`
+(structure: changes recompile) or as an annotation only (another component).  Components are
+compared by identity (`eq=False`), because `==` of arrays is ambiguous.
 """
 
 from __future__ import annotations
@@ -79,12 +76,12 @@ def component(cls: type[T]) -> type[T]:
     fields = dataclasses.fields(cls)  # type: ignore[arg-type]
     children = tuple(f.name for f in fields if not f.metadata.get("static"))
     structure = tuple(f.name for f in fields if f.metadata.get("static"))
-    plain_init = cls.__init__
+    dataclass_init = cls.__init__
 
-    @functools.wraps(plain_init)
+    @functools.wraps(dataclass_init)
     def checked_init(self, *args, **kwargs):
         try:
-            plain_init(self, *args, **kwargs)
+            dataclass_init(self, *args, **kwargs)
         except TypeError:
             if not has_own_init:
                 checks.check_arguments(cls.__name__, fields, args, kwargs)
@@ -126,7 +123,9 @@ def _getter(names: tuple[str, ...]) -> Callable[[Any], tuple]:
     """A function of an object that returns these attributes."""
     if len(names) > 1:
         return operator.attrgetter(*names)
-    return (lambda obj: (getattr(obj, names[0]),)) if names else lambda obj: ()
+    if names:
+        return lambda obj: (getattr(obj, names[0]),)
+    return lambda obj: ()
 
 
 def layers(part: Any) -> list[Any]:
@@ -149,11 +148,9 @@ def rewrapped(part: Any, inner: Any) -> Any:
     nothing.
     """
     name = getattr(type(part), "wraps", None)
-    return (
-        inner
-        if not name
-        else dataclasses.replace(part, **{name: rewrapped(getattr(part, name), inner)})
-    )
+    if not name:
+        return inner
+    return dataclasses.replace(part, **{name: rewrapped(getattr(part, name), inner)})
 
 
 def is_leaf_field(field: dataclasses.Field) -> bool:

@@ -1,10 +1,8 @@
-"""What can go wrong in a run, as bit flags: inside `jit` nothing raises, each run carries its
-status to the end.
+"""Status flags of a run: code inside `jit` raises nothing, and each run carries its status to the
+end.
 
-`Status.OK` is 0.  Flags combine: a run may violate a bound and saturate its torque.  The first
-  group says that the
-run is not to be believed or not to be accepted (`FAILED`), the second tells what happened on the
-way.
+`Status.OK` is 0.  Flags combine: a run may violate a bound and saturate its torque.  The flags of
+`FAILED` mean that a run is invalid or not acceptable; the others record events during the run.
 """
 
 from __future__ import annotations
@@ -21,7 +19,7 @@ class Status(enum.IntFlag):
     BOUND_VIOLATED = 1
     """A joint touched or left its bound."""
     NOT_FINITE = 2
-    """The state ran away (NaN, infinity, a joint faster than VELOCITY_LIMIT, or V is no number); it
+    """The state ran away (NaN, infinity, a joint faster than VELOCITY_LIMIT, or V is NaN); it
     was frozen at its last good value."""
     STEP_TOO_LARGE = 4
     """dt is beyond the stability limit of the integrator for the fastest mode of the closed
@@ -30,9 +28,9 @@ class Status(enum.IntFlag):
     """The reference touches or leaves a bound during the run: Assumption 2 fails and no law can
     keep both."""
     TORQUE_SATURATED = 16
-    """The torque that the law asked for was cut to the actuator's limit."""
+    """The torque that the law commanded was cut to the actuator's limit."""
     GUARD_ACTIVE = 32
-    """A joint came so near its bound that the barrier's slope was held at its greatest finite
+    """A joint came so near its bound that the barrier's slope was limited to its greatest finite
     value."""
     INADMISSIBLE_DRAW = 64
     """A study drew a value that its leaf does not admit (a negative mass, say): the run was not
@@ -41,8 +39,8 @@ class Status(enum.IntFlag):
     """The estimated error of the positions is more than 0.5 % of the tube (`accuracy.TOLERANCE`):
     take a smaller dt."""
     GUARD_STAYED = 256
-    """The guard was active beyond the first instant: there another law ran, softer than the one
-    that was asked for."""
+    """The guard was active beyond the first instant: there the loop ran with a softer law than the
+    requested one."""
 
     SAMPLING_TOO_SLOW = 512
     """The loop grows from one period to the next (spectral radius above 1) at one of the instants
@@ -59,13 +57,12 @@ class Status(enum.IntFlag):
     least slack, which the run records."""
 
     REGION_VIOLATED = 8192
-    """The tip, or the origin of a joint, touched or crossed the wall of a region that it must stay
-    in."""
+    """The tip, or the origin of a joint, left its region or touched the boundary of it."""
 
     INFINITE_SLOPE = 16384
-    """A run is inaccurate, or its step too large, and at an instant that was looked at a derivative
-    of the loop is infinite, as that of
-    |e2|^a sign(e2) with a < 1 is at e2 = 0, or nearly so, as that of sharp dry friction is at a reversal."""
+    """A run is inaccurate, or its step too large, and a derivative of the loop is infinite or
+    nearly infinite at one of the sampled instants.  Examples: |e2|^a sign(e2) with a < 1 at e2 = 0,
+    and sharp dry friction at a reversal."""
 
 
 VIOLATED = Status.BOUND_VIOLATED | Status.VELOCITY_VIOLATED | Status.REGION_VIOLATED
@@ -78,7 +75,7 @@ FAILED = (
     | Status.INFEASIBLE_REFERENCE
     | Status.INADMISSIBLE_DRAW
 )
-"""The flags that make a run one that did not do its job."""
+"""The flags of a failed run."""
 
 UNTRUSTED = Status.NOT_FINITE | Status.STEP_TOO_LARGE
 """The flags of a run whose numbers say nothing: no loss and no certificate is made of them."""
@@ -106,13 +103,13 @@ WORDS = {
     ),
     Status.ALPHA_INFEASIBLE: "the virtual velocity left the velocity bounds",
 }
-"""What each flag says, in the order in which it is told."""
+"""The text of each flag, in the order in which `describe` lists them."""
 
 
 def describe(status: int) -> str:
     """The flags of one run in words, "ok" if there is none."""
     words = [text for flag, text in WORDS.items() if int(status) & flag]
-    return "; ".join(words) if words else "ok"
+    return "; ".join(words) or "ok"
 
 
 def flag(condition, which: Status):

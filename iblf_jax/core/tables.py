@@ -22,7 +22,9 @@ def as_text(rows: Sequence[Sequence[str]], left: Collection[int] | None = None) 
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
 
     def cell(i: int, text: str) -> str:
-        return text.ljust(widths[i]) if left is None or i in left else text.rjust(widths[i])
+        if left is None or i in left:
+            return text.ljust(widths[i])
+        return text.rjust(widths[i])
 
     return ["  ".join(cell(i, text) for i, text in enumerate(row)).rstrip() for row in rows]
 

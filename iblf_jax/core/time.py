@@ -19,7 +19,9 @@ T = TypeVar("T")
 
 def as_at(part: T, t: jax.Array) -> T:
     """A part as it is at time t [s]: itself, unless it has a method `at`."""
-    return part.at(t) if hasattr(part, "at") else part
+    if not hasattr(part, "at"):
+        return part
+    return part.at(t)  # type: ignore[no-any-return]
 
 
 def no_times(dtype: jax.typing.DTypeLike | None = None) -> jax.Array:
@@ -58,4 +60,6 @@ def jump_times_of(name: str, part: Any, dtype: jax.typing.DTypeLike | None = Non
 def joined(times: list[jax.Array], dtype: jax.typing.DTypeLike | None = None) -> jax.Array:
     """Jump times of several parts together, (m,) [s]."""
     some = [x for x in times if x.size]
-    return jnp.concatenate(some) if some else no_times(dtype)
+    if not some:
+        return no_times(dtype)
+    return jnp.concatenate(some)

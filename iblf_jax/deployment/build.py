@@ -11,7 +11,7 @@ import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 
-from iblf_jax.kernels.toolchain import ToolchainError, has_ziglang, ziglang
+from iblf_jax.kernels import ToolchainError, has_ziglang, ziglang
 
 TIMEOUT = 300.0
 """Seconds that a compiler may take."""

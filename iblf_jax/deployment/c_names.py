@@ -17,7 +17,7 @@ import jax
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.kernels.program import Program
+from iblf_jax.kernels import Program
 from iblf_jax.simulation.paths import parameters, parse
 from iblf_jax.simulation.scenario import Scenario
 

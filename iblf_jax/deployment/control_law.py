@@ -19,10 +19,8 @@ import numpy as np
 from iblf_jax.control.sensors import Ideal, Measurement
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf
-from iblf_jax.engine.plan import LIMITS
-from iblf_jax.kernels.packed import Shapes, lowered
-from iblf_jax.kernels.passes import written_out
-from iblf_jax.kernels.program import Program
+from iblf_jax.engine import lowering_limits
+from iblf_jax.kernels import Program, Shapes, compile_step, written_out
 from iblf_jax.simulation.closed_loop import discrete_observer, law_update
 from iblf_jax.simulation.scenario import Scenario
 
@@ -194,7 +192,7 @@ def control_law(scenario: Scenario, external_reference: bool) -> ControlLaw:
 
     begin, step = program_of(first, scenario, inputs, ()), program_of(one, scenario, inputs, memory)
     reads = any(
-        node.op == "lane" and 1 + scenario.n <= node.value < 1 + 2 * scenario.n
+        node.op == "per_run" and 1 + scenario.n <= node.value < 1 + 2 * scenario.n
         for node in step.nodes
     )
     return ControlLaw(begin, step, number_names(memory), reads)
@@ -240,10 +238,10 @@ def program_of(function: Callable, scenario: Scenario, given: Any, carry: Any) -
         after, results = function(*parts, index)
         return jax.tree.leaves(after), jax.tree.leaves(results)
 
-    shapes = [Shapes.of(jax.tree.leaves(x)) for x in (scenario, given, carry)]
-    return written_out(
-        lowered(on_leaves, np.dtype(scenario.initial.q.dtype), *shapes, LIMITS).program
-    )
+    dtype = np.dtype(scenario.initial.q.dtype)
+    shared, per_run, carried = (Shapes.of(jax.tree.leaves(x)) for x in (scenario, given, carry))
+    step = compile_step(on_leaves, dtype, shared, per_run, carried, lowering_limits())
+    return written_out(step.program)
 
 
 def number_names(tree: Any) -> tuple[str, ...]:

@@ -23,8 +23,8 @@ from iblf_jax.core import checks, notices
 from iblf_jax.core.status import VELOCITY_LIMIT, Status
 from iblf_jax.core.time import as_at
 from iblf_jax.deployment.mujoco_plant import INTEGRATORS, MujocoPlant, Stages
+from iblf_jax.engine import folded, sample_status
 from iblf_jax.engine.simulate import report
-from iblf_jax.engine.step import folded, sample_status
 from iblf_jax.simulation.closed_loop import (
     LoopState,
     initial_state,

@@ -33,7 +33,7 @@ from iblf_jax.deployment.write_c import (
 from iblf_jax.deployment.write_loop import loop_files, wasm_files
 from iblf_jax.engine.simulate import simulate
 from iblf_jax.files.scenario import scenario_to_toml
-from iblf_jax.kernels.program import UnsupportedError
+from iblf_jax.kernels import UnsupportedError
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.sampling import check_step, has_noise, noise_key

@@ -20,7 +20,7 @@ from iblf_jax.core import checks, notices, tables
 from iblf_jax.core.status import FAILED, WORDS
 from iblf_jax.deployment.cosimulate import check_single
 from iblf_jax.deployment.export import export
-from iblf_jax.kernels.toolchain import ToolchainError
+from iblf_jax.kernels import ToolchainError
 from iblf_jax.reports import card
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.paths import sign_at

@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.deployment.control_law import as_floats, of_floats, program_of
-from iblf_jax.engine.step import Form, Inputs, advance, start
-from iblf_jax.kernels.program import Program
+from iblf_jax.engine.step import Inputs, StepOptions, advance, start
+from iblf_jax.kernels import Program
 from iblf_jax.simulation import accuracy
 from iblf_jax.simulation.closed_loop import initial_state
 from iblf_jax.simulation.sampling import has_noise
@@ -84,7 +84,11 @@ def loop_program(scenario: Scenario, method: str) -> Loop:
         size = accuracy.watched_indices(state).size
         blank = start(inputs, method, jnp.zeros((size, size), dtype))
         done = advance(
-            inputs, blank._replace(state=state, status=status), index, method, Form(scalar=True)
+            inputs,
+            blank._replace(state=state, status=status),
+            index,
+            method,
+            StepOptions(scalar=True),
         )
         outputs = [getattr(done.sample, OF_SAMPLE.get(name, name)) for name in OUTPUTS]
         return as_floats((done.carry.state, done.carry.status), dtype), (

@@ -14,9 +14,7 @@ import numpy as np
 from iblf_jax import __version__
 from iblf_jax.deployment.c_names import Parameters, comment, number
 from iblf_jax.deployment.control_law import FLAGS, ControlLaw
-from iblf_jax.kernels.emit_c import header, plain_function
-from iblf_jax.kernels.operations import OPERATIONS
-from iblf_jax.kernels.program import INPUTS, Program
+from iblf_jax.kernels import INPUTS, OPERATIONS, Program, header, plain_function
 from iblf_jax.simulation.scenario import Scenario
 
 SEGMENT = 500
@@ -182,7 +180,7 @@ def _functions(law: Law, parameters: Parameters) -> tuple[str, str]:
     arguments = [f"const F *{x}" for x in ("t", *arrays)]
     inputs = {
         "shared": parameters.numbers,
-        "lane": per_run,
+        "per_run": per_run,
         "carry": [f"m[{k}]" for k in range(size)],
     }
     start = plain_function(

@@ -14,7 +14,7 @@ from iblf_jax.deployment.build import build, zig
 from iblf_jax.deployment.c_names import Parameters
 from iblf_jax.deployment.loop_program import OUTPUTS, Loop
 from iblf_jax.deployment.write_c import SEGMENT, fill_template, shared_values
-from iblf_jax.kernels.emit_c import plain_function
+from iblf_jax.kernels import plain_function
 from iblf_jax.simulation.sampling import has_noise
 from iblf_jax.simulation.scenario import Scenario
 
@@ -41,7 +41,7 @@ def loop_files(
     output_count = len(loop.step.samples)
     inputs = {
         "shared": parameters.numbers,
-        "lane": [f"u[{i}]" for i in range(setting_count)],
+        "per_run": [f"u[{i}]" for i in range(setting_count)],
         "carry": [f"m[{k}]" for k in range(loop.size)],
         "index": ["index"],
     }

@@ -10,9 +10,9 @@ Modules outside this folder import from here; `simulate`, `explain`, `recommende
 step sizes have modules of their own.
 """
 
+from iblf_jax.engine.compile import BackendWarning as BackendWarning
 from iblf_jax.engine.derivatives import Outer as Outer
 from iblf_jax.engine.derivatives import Tangents as Tangents
-from iblf_jax.engine.execute import BackendWarning as BackendWarning
 from iblf_jax.engine.execute import CompiledBatch as CompiledBatch
 from iblf_jax.engine.execute import compile_batch as compile_batch
 from iblf_jax.engine.execute import run_batch as run_batch
@@ -28,10 +28,12 @@ from iblf_jax.engine.sizes import block_size as block_size
 from iblf_jax.engine.sizes import blocks_in_flight as blocks_in_flight
 from iblf_jax.engine.sizes import differentiates_forward as differentiates_forward
 from iblf_jax.engine.sizes import fresh_together as fresh_together
+from iblf_jax.engine.sizes import lowering_limits as lowering_limits
 from iblf_jax.engine.sizes import starts_together as starts_together
 from iblf_jax.engine.sizes import sweep_unit as sweep_unit
 from iblf_jax.engine.sizes import values_together as values_together
 from iblf_jax.engine.sizes import whole_blocks as whole_blocks
 from iblf_jax.engine.step import Outcome as Outcome
 from iblf_jax.engine.step import folded as folded
+from iblf_jax.engine.step import sample_status as sample_status
 from iblf_jax.engine.waiting import wait_until_ready as wait_until_ready

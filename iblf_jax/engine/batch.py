@@ -1,5 +1,5 @@
-"""A batch of runs, or one: which leaves differ between the runs, and the way from the start to the
-outcome, whatever steps them.
+"""A batch of runs, or one: which leaves differ between the runs, and the sequence from the start to
+the outcome, whatever loop makes the steps.
 """
 
 from __future__ import annotations
@@ -13,19 +13,19 @@ import jax.numpy as jnp
 
 from iblf_jax.engine.machine_function import machine_function
 from iblf_jax.engine.mechanism import Mechanism
-from iblf_jax.engine.plan import Shape
+from iblf_jax.engine.plan import PLAIN_LAYOUT, BatchLayout
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.step import (
     Carry,
     Inputs,
+    Linearization,
+    LinearizationStep,
     Outcome,
-    Probe,
-    Probed,
     TimeStep,
-    probe_steps,
-    probed,
+    linearization_at,
+    linearization_steps,
+    outcome_of,
     start,
-    verdict,
 )
 from iblf_jax.simulation import accuracy
 from iblf_jax.simulation.closed_loop import initial_state, perturbed_state
@@ -35,58 +35,65 @@ from iblf_jax.simulation.stability import resolved
 
 
 class Leaves(NamedTuple):
-    """The leaves of a pytree, told apart by whether they differ between runs."""
+    """The leaves of a pytree, in two groups: those that all runs share and those of each run."""
 
     treedef: Any
-    is_lane: tuple[bool, ...]
+    is_per_run: tuple[bool, ...]
+    """Of every leaf, whether it differs between runs."""
     shared: list[jax.Array]
-    lane: list[jax.Array]
+    per_run: list[jax.Array]
     """With a leading batch axis."""
 
-    def together(self, shared: Sequence, lane: Sequence):
+    @staticmethod
+    def of(treedef: Any, is_per_run: Sequence[bool], leaves: Sequence[jax.Array]) -> Leaves:
+        """From all leaves of a pytree, in its order."""
+        groups: dict[bool, list[jax.Array]] = {False: [], True: []}
+        for leaf, differs in zip(leaves, is_per_run, strict=True):
+            groups[bool(differs)].append(leaf)
+        return Leaves(treedef, tuple(is_per_run), groups[False], groups[True])
+
+    def merged(self, shared: Sequence, per_run: Sequence) -> list:
+        """Leaves of the two groups in the order of the pytree."""
+        sources = {False: iter(shared), True: iter(per_run)}
+        return [next(sources[differs]) for differs in self.is_per_run]
+
+    def together(self, shared: Sequence, per_run: Sequence):
         """The pytree again, from one run's leaves."""
-        one, other = iter(shared), iter(lane)
-        return jax.tree.unflatten(
-            self.treedef, [next(other) if lane else next(one) for lane in self.is_lane]
-        )
+        return jax.tree.unflatten(self.treedef, self.merged(shared, per_run))
 
     @property
     def first(self):
         """The pytree of the first run."""
-        return self.together(self.shared, [x[0] for x in self.lane])
+        return self.together(self.shared, [x[0] for x in self.per_run])
 
 
 def split(inputs: Inputs, varied: Mapping[str, jax.Array]) -> Leaves:
-    """The leaves of what runs are made from: those that `varied` replaces in the scenario become
-    one value a run.
+    """The leaves of what runs are computed from: those that `varied` replaces in the scenario
+    become one value a run.
     """
     before, treedef = jax.tree.flatten(inputs)
+    if not varied:
+        return Leaves.of(treedef, [False] * len(before), before)
 
     def replaced(values):
         leaves = {path: x for path, x in values.items() if path != NOISE_NAME}
-        noise = values[NOISE_NAME].astype(inputs.dt.dtype) if NOISE_NAME in values else inputs.noise
-        return jax.tree.leaves(
-            inputs._replace(scenario=with_parameters(inputs.scenario, leaves), noise=noise)
-        )
+        noise = inputs.noise
+        if NOISE_NAME in values:
+            noise = values[NOISE_NAME].astype(inputs.dt.dtype)
+        scenario = with_parameters(inputs.scenario, leaves)
+        return jax.tree.leaves(inputs._replace(scenario=scenario, noise=noise))
 
-    touched: list[bool] = []
+    # A leaf that no path replaces is the same object, which `vmap` hands on as it is.
+    is_per_run: list[bool] = []
 
-    def look(values):
+    def of_run(values):
         after = replaced(values)
-        touched[:] = [new is not old for new, old in zip(after, before, strict=True)]
-        return [new for new, yes in zip(after, touched, strict=True) if yes]
+        is_per_run[:] = [new is not old for new, old in zip(after, before, strict=True)]
+        return [new for new, differs in zip(after, is_per_run, strict=True) if differs]
 
-    lane = jax.vmap(look)(dict(varied)) if varied else []
-    touched = touched or [False] * len(before)
-    return Leaves(
-        treedef,
-        tuple(touched),
-        [x for x, yes in zip(before, touched, strict=True) if not yes],
-        list(lane),
-    )
-
-
-TOGETHER = Shape("together", "none", False)
+    per_run = jax.vmap(of_run)(dict(varied))
+    shared = [x for x, differs in zip(before, is_per_run, strict=True) if not differs]
+    return Leaves(treedef, tuple(is_per_run), shared, list(per_run))
 
 
 class Batch(NamedTuple):
@@ -96,33 +103,33 @@ class Batch(NamedTuple):
     """Of their `Inputs`."""
     runs: int | None
     """None: one run, and no array has a run axis."""
-    shape: Shape = TOGETHER
+    layout: BatchLayout = PLAIN_LAYOUT
     """How its parts are compiled."""
-    mechanism: Mechanism | None = None
-    """What of the robots is compiled in."""
+    constants: Mechanism | None = None
+    """Which numbers of the scenario are compiled in."""
 
     @staticmethod
     def of(
         inputs: Inputs,
         varied: Mapping[str, jax.Array] | None,
-        shape: Shape = TOGETHER,
-        mechanism: Mechanism | None = None,
+        layout: BatchLayout = PLAIN_LAYOUT,
+        constants: Mechanism | None = None,
     ) -> Batch:
         """A run for every entry of `varied` (path -> values, batch axis first), or one run."""
-        runs = jax.tree.leaves(dict(varied))[0].shape[0] if varied else None
-        return Batch(split(inputs, varied or {}), runs, shape, mechanism)
+        if not varied:
+            return Batch(split(inputs, {}), None, layout, constants)
+        runs = jax.tree.leaves(dict(varied))[0].shape[0]
+        return Batch(split(inputs, varied), runs, layout, constants)
 
     @property
     def known(self) -> tuple:
         """What is known of the shared numbers."""
-        if self.mechanism is None:
+        if self.constants is None:
             return ()
-        one, other = iter(self.leaves.shared), iter(self.leaves.lane)
-        sizes = [
-            math.prod(next(other).shape[1:]) if lane else next(one).size
-            for lane in self.leaves.is_lane
-        ]
-        return self.mechanism.of_shared(self.leaves.is_lane, sizes)
+        shapes = self.leaves.merged(
+            [x.shape for x in self.leaves.shared], [x.shape[1:] for x in self.leaves.per_run]
+        )
+        return self.constants.of_shared(self.leaves.is_per_run, [math.prod(x) for x in shapes])
 
     @property
     def dtype(self):
@@ -132,20 +139,20 @@ class Batch(NamedTuple):
     def each(self, function: Callable, *args: Any) -> Any:
         """function(inputs, *args) for every run; arguments and results have the run axis first."""
 
-        def one(lane, *rest):
-            return function(self.leaves.together(self.leaves.shared, lane), *rest)
+        def one(per_run, *rest):
+            return function(self.leaves.together(self.leaves.shared, per_run), *rest)
 
         if self.runs is None:
             return one([], *args)
-        if self.shape.runs == "in turn":
-            return jax.lax.map(lambda each: one(*each), (self.leaves.lane, *args))
+        if self.layout.mapping == "map":
+            return jax.lax.map(lambda each: one(*each), (self.leaves.per_run, *args))
         together = jax.vmap(one, axis_size=self.runs)
-        return (machine_function(together) if self.shape.function == "parts" else together)(
-            self.leaves.lane, *args
-        )
+        if self.layout.machine_functions == "parts":
+            together = machine_function(together)
+        return together(self.leaves.per_run, *args)
 
 
-Executor = Callable[[Any, Batch, Any, int, int | None], tuple[Any, Any]]
+Loop = Callable[[Any, Batch, Any, int, int | None], tuple[Any, Any]]
 """(step, batch, carry, steps, every) -> (the carry after all steps, what every `every`-th step
 recorded, from the first on).
 
@@ -153,113 +160,115 @@ All arrays have the run axis first, records then the time axis; `every` is None 
 recorded."""
 
 
-def _probed(executor: Executor, batch: Batch, carry: Probed) -> Probed:
-    """What a `Probe` of every run has found."""
+def _linearized(loop: Loop, batch: Batch, carry: Linearization) -> Linearization:
+    """What a `LinearizationStep` of every run has found."""
+    batch = _linearized_batch(batch)
+    return loop(
+        LinearizationStep(), batch, carry, linearization_steps(batch.leaves.first.scenario), None
+    )[0]
+
+
+def _linearized_batch(batch: Batch) -> Batch:
+    """The batch as a `LinearizationStep` reads it, without derivatives."""
     leaves = _without_folds(batch.leaves)
-    shared, lane = jax.lax.stop_gradient((leaves.shared, leaves.lane))
-    batch = batch._replace(leaves=leaves._replace(shared=shared, lane=lane))
-    steps = probe_steps(leaves.first.scenario)
-    return executor(Probe(), batch, carry, steps, None)[0]
+    shared, per_run = jax.lax.stop_gradient((leaves.shared, leaves.per_run))
+    return batch._replace(leaves=leaves._replace(shared=shared, per_run=per_run))
 
 
 def _without_folds(leaves: Leaves) -> Leaves:
-    """The leaves of inputs without what a `Probe` does not read: one program of it serves all
+    """The leaves of inputs that a `LinearizationStep` reads, so that one program of it serves all
     metrics and derivatives.
     """
-    places: Inputs = jax.tree.unflatten(leaves.treedef, range(len(leaves.is_lane)))
-    kept, treedef = jax.tree.flatten(places._replace(folds=(), noise=(), direction=()))
-    shared, lane = iter(leaves.shared), iter(leaves.lane)
-    values = [next(lane if is_lane else shared) for is_lane in leaves.is_lane]
-    is_lane = tuple(leaves.is_lane[i] for i in kept)
-    return Leaves(
-        treedef,
-        is_lane,
-        [values[i] for i in kept if not leaves.is_lane[i]],
-        [values[i] for i in kept if leaves.is_lane[i]],
-    )
+    numbered: Inputs = jax.tree.unflatten(leaves.treedef, range(len(leaves.is_per_run)))
+    kept, treedef = jax.tree.flatten(numbered._replace(folds=(), noise=(), direction=()))
+    values = leaves.merged(leaves.shared, leaves.per_run)
+    is_per_run = [leaves.is_per_run[i] for i in kept]
+    return Leaves.of(treedef, is_per_run, [values[i] for i in kept])
 
 
-def begin(executor: Executor, batch: Batch, method: str) -> tuple[Carry, Probed]:
-    """The carry before the first step, and what a `Probe` has found at the start."""
+def _initial_linearization(batch: Batch, method: str) -> Linearization:
+    """The carry of a `LinearizationStep` at the start of every run."""
 
-    def around(inputs):
-        unseen = accuracy.unresolved_signals(inputs.scenario, method, inputs.dt, inputs.steps)
+    def of_run(inputs):
+        estimate = accuracy.unresolved_signals(inputs.scenario, method, inputs.dt, inputs.steps)
         state = initial_state(inputs.scenario)
-        return probed(
-            jnp.zeros_like(inputs.dt),
-            perturbed_state(state),
-            accuracy.watched_indices(state).size,
-            unseen,
+        watched = accuracy.watched_indices(state).size
+        return linearization_at(
+            jnp.zeros_like(inputs.dt), perturbed_state(state), watched, estimate
         )
 
-    found = _probed(executor, batch, batch.each(around))
-    return (
-        batch.each(
-            lambda inputs, found: start(
-                inputs, method, resolved(found.jacobian, inputs.scenario.sampling is not None)
-            ),
-            found,
-        ),
-        found,
-    )
+    return batch.each(of_run)
+
+
+def linearization_batch(batch: Batch, method: str) -> tuple[Batch, Linearization]:
+    """The batch of the `LinearizationStep`s of some runs, and the shapes of their carry."""
+    return _linearized_batch(batch), jax.eval_shape(lambda: _initial_linearization(batch, method))
+
+
+def initialize(loop: Loop, batch: Batch, method: str) -> tuple[Carry, Linearization]:
+    """The carry before the first step, and what a `LinearizationStep` has found at the start."""
+    found = _linearized(loop, batch, _initial_linearization(batch, method))
+
+    def of_run(inputs, found):
+        is_sampled = inputs.scenario.sampling is not None
+        return start(inputs, method, resolved(found.jacobian, is_sampled))
+
+    return batch.each(of_run, found), found
 
 
 def carry_shapes(batch: Batch, method: str) -> Carry:
     """Shapes and types of the carry."""
 
-    def one(inputs):
+    def of_run(inputs):
         size = accuracy.watched_indices(initial_state(inputs.scenario)).size
         return start(inputs, method, jnp.zeros((size, size), inputs.dt.dtype))
 
-    return jax.eval_shape(lambda: batch.each(one))
+    return jax.eval_shape(lambda: batch.each(of_run))
 
 
-def end(
-    executor: Executor, batch: Batch, run: RunRequest, carry: Carry, at_start: Probed
+def finalize(
+    loop: Loop, batch: Batch, request: RunRequest, carry: Carry, at_start: Linearization
 ) -> Outcome:
-    """The outcome after the last step, without records; `at_start` is what a `Probe` has found
-    there.
-    """
+    """The outcome after the last step, without records; `at_start` is the linearization there."""
 
-    def critical(inputs, carry):
+    def critical_instants(inputs, carry):
+        watched = at_start.jacobian.shape[-1]
+        no_estimate = accuracy.UnresolvedSignals(*[jnp.zeros_like(carry.accuracy.error)] * 3)
+        nearest, end = carry.nearest, inputs.dt * inputs.steps
         instants = (
-            (carry.nearest.t, carry.nearest.around),
-            (inputs.dt * inputs.steps, perturbed_state(carry.state)),
+            linearization_at(nearest.t, nearest.state, watched, no_estimate),
+            linearization_at(end, perturbed_state(carry.state), watched, no_estimate),
         )
-        watched, nothing = (
-            at_start.jacobian.shape[-1],
-            accuracy.UnresolvedSignals(*[jnp.zeros_like(carry.accuracy.error)] * 3),
-        )
-        return jax.tree.map(
-            lambda *xs: jnp.stack(xs), *(probed(*instant, watched, nothing) for instant in instants)
-        )
+        return jax.tree.map(lambda *xs: jnp.stack(xs), *instants)
 
-    def judged(inputs, carry, at_start, later):
+    def outcome(inputs, carry, at_start, later):
         instants = jax.tree.map(lambda one, two: jnp.concatenate([one[None], two]), at_start, later)
-        return verdict(inputs, run.method, carry, at_start.unseen, instants)
+        return outcome_of(inputs, request.method, carry, at_start.unresolved, instants)
 
-    # Both instants of a run are probed as two runs, by the program that probed the start.
-    lane = [jnp.repeat(x, 2, axis=0) for x in batch.leaves.lane]
-    twice = batch._replace(leaves=batch.leaves._replace(lane=lane), runs=2 * (batch.runs or 1))
-    apart = batch.each(critical, carry)
+    # Both instants of a run are linearized as two runs, by the program that linearized the start.
+    per_run = [jnp.repeat(x, 2, axis=0) for x in batch.leaves.per_run]
+    leaves = batch.leaves._replace(per_run=per_run)
+    twice = batch._replace(leaves=leaves, runs=2 * (batch.runs or 1))
+    instants = batch.each(critical_instants, carry)
     if batch.runs is None:
-        later = _probed(executor, twice, apart)
+        later = _linearized(loop, twice, instants)
     else:
-        later = _probed(executor, twice, jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), apart))
+        in_a_row = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), instants)
+        later = _linearized(loop, twice, in_a_row)
         later = jax.tree.map(lambda x: x.reshape(-1, 2, *x.shape[1:]), later)
-    return batch.each(judged, carry, at_start, later)
+    return batch.each(outcome, carry, at_start, later)
 
 
-def run_all(executor: Executor, batch: Batch, run: RunRequest) -> Outcome:
+def run_all(loop: Loop, batch: Batch, request: RunRequest) -> Outcome:
     """All runs, from the start to the outcome."""
-    outcome, records = run_step(executor, batch, TimeStep.of(run), run)
-    return outcome if run.record_every is None else outcome._replace(records=records)
+    outcome, records = run_step(loop, batch, TimeStep.of(request), request)
+    if request.record_every is None:
+        return outcome
+    return outcome._replace(records=records)
 
 
-def run_step(
-    executor: Executor, batch: Batch, step: TimeStep, run: RunRequest
-) -> tuple[Outcome, Any]:
+def run_step(loop: Loop, batch: Batch, step: TimeStep, request: RunRequest) -> tuple[Outcome, Any]:
     """All runs by a step that may record something else; the outcome, and the records apart."""
-    carry, at_start = begin(executor, batch, run.method)
-    carry, records = executor(step, batch, carry, run.steps + 1, run.record_every)
-    return end(executor, batch, run, carry, at_start), records
+    carry, at_start = initialize(loop, batch, request.method)
+    carry, records = loop(step, batch, carry, request.steps + 1, request.record_every)
+    return finalize(loop, batch, request, carry, at_start), records

@@ -17,15 +17,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.engine.batch import Batch, Executor, Leaves, run_step
-from iblf_jax.engine.derivatives import Directions, Tangents, floats_of_carry, outers_of_step
+from iblf_jax.engine.batch import Batch, Leaves, Loop, run_step
+from iblf_jax.engine.derivatives import (
+    Directions,
+    Tangents,
+    count_curvatures,
+    floats_of_carry,
+    outers_of_step,
+)
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.step import (
     Advanced,
     Carry,
-    Form,
     Inputs,
     Node,
+    StepOptions,
     TimeStep,
     finished,
     samples_of_step,
@@ -92,13 +98,15 @@ class TangentStep:
     places: Places
     is_derivative: ClassVar[bool] = True
 
-    def __call__(self, inputs: Inputs, carry: WithTangent, index: jax.Array, form: Form):
+    def __call__(self, inputs: Inputs, carry: WithTangent, index: jax.Array, options: StepOptions):
         """The carry after the step, and the derivative of what is recorded."""
-        step = TangentStep(self.step, self.places[:-1]) if len(self.places) > 1 else self.step
+        step: Callable = self.step
+        if len(self.places) > 1:
+            step = TangentStep(self.step, self.places[:-1])
         floats, replaced = _floats(carry.carry)
 
         def of(eps, floats):
-            after, record = step(_moved(inputs, self.places, eps), replaced(floats), index, form)
+            after, record = step(_moved(inputs, self.places, eps), replaced(floats), index, options)
             return (_floats(after)[0], floats_of(record)), after
 
         zero = jnp.zeros_like(inputs.dt)
@@ -143,22 +151,20 @@ def _directed(batch: Batch, places: Places, directions: list[list[Any]]) -> tupl
 
     `directions`: for each derivative, of each of its leaves the tangents, (P, *shape of the leaf).
     """
-    leaves, runs, sizes = batch.leaves, batch.runs or 1, [len(level[0]) for level in directions]
-    lane = [jnp.repeat(x, math.prod(sizes), axis=0) for x in leaves.lane]
-    # One column of a derivative beside every column of the others, for every run.
-    added = [
-        [
-            jnp.tile(
-                jnp.repeat(x, math.prod(sizes[k + 1 :]), axis=0),
-                (runs * math.prod(sizes[:k]), *[1] * (x.ndim - 1)),
-            )
-            for x in level
-        ]
-        for k, level in enumerate(directions)
-    ]
-    inputs = leaves.together(leaves.shared, leaves.lane)._replace(direction=added)
-    is_lane = (*leaves.is_lane, *[True] * sum(map(len, places)))
-    wide = Leaves(jax.tree.structure(inputs), is_lane, leaves.shared, lane + jax.tree.leaves(added))
+    leaves, runs = batch.leaves, batch.runs or 1
+    sizes = [len(level[0]) for level in directions]
+    per_run = [jnp.repeat(x, math.prod(sizes), axis=0) for x in leaves.per_run]
+
+    def beside_others(k: int, column: jax.Array) -> jax.Array:
+        """Columns of derivative k, each beside every column of the others, for every run."""
+        repeated = jnp.repeat(column, math.prod(sizes[k + 1 :]), axis=0)
+        return jnp.tile(repeated, (runs * math.prod(sizes[:k]), *[1] * (column.ndim - 1)))
+
+    added = [[beside_others(k, x) for x in level] for k, level in enumerate(directions)]
+    inputs = leaves.together(leaves.shared, leaves.per_run)._replace(direction=added)
+    is_per_run = (*leaves.is_per_run, *[True] * sum(map(len, places)))
+    structure, values = jax.tree.structure(inputs), per_run + jax.tree.leaves(added)
+    wide = Leaves(structure, is_per_run, leaves.shared, values)
     return batch._replace(leaves=wide, runs=runs * math.prod(sizes)), sizes
 
 
@@ -175,16 +181,16 @@ def _scenario_shapes(batch: Batch) -> list[tuple[int, ...]]:
 
 
 def _stepped(
-    executor: Executor,
+    loop: Loop,
     batch: Batch,
     step: TangentStep,
     directions: list[list[Any]],
-    run: RunRequest,
+    request: RunRequest,
 ) -> tuple[list[jax.Array], Any]:
     """The derivatives of what a step records and of the metrics, (R, P, ...)."""
     wide, sizes = _directed(batch, step.places, directions)
-    before = wide.each(lambda inputs: _begun(inputs, run.method, step.places))
-    after, records = executor(step, wide, before, run.steps + 1, run.record_every)
+    before = wide.each(lambda inputs: _begun(inputs, request.method, step.places))
+    after, records = loop(step, wide, before, request.steps + 1, request.record_every)
     metrics = wide.each(lambda inputs, carry: _metrics(inputs, carry, step.places), after)
     return jax.tree.map(
         lambda x: x.reshape(batch.runs or 1, *sizes, *x.shape[1:]), (list(records), metrics)
@@ -192,17 +198,17 @@ def _stepped(
 
 
 def columns(
-    executor: Executor, batch: Batch, places: Places, run: RunRequest
+    loop: Loop, batch: Batch, places: Places, request: RunRequest
 ) -> tuple[list[jax.Array], dict[str, jax.Array]]:
     """The derivative of records and metrics of every run by the numbers of some leaves, or a second
     derivative.
 
     Args:
-      executor: what steps.
+      loop: makes the steps.
       batch: of R runs.
       places: of the leaves by whose numbers, P of them, it is; for a second derivative two such
         tuples, P and Q.
-      run: what to run.
+      request: what is run.
 
     Returns:
       Of each float that is recorded (R, P, T, ...), or (R, P, Q, T, ...), and by name of each
@@ -210,7 +216,7 @@ def columns(
     """
     shapes = _scenario_shapes(batch)
     directions = [_units([shapes[place] for place in level], batch.dtype) for level in places]
-    return _stepped(executor, batch, TangentStep(TimeStep.of(run), places), directions, run)
+    return _stepped(loop, batch, TangentStep(TimeStep.of(request), places), directions, request)
 
 
 def outer_vectors(folds: Any, found: Advanced) -> list[jax.Array]:
@@ -224,40 +230,35 @@ def _weights(folds: Any, found: Advanced) -> list[jax.Array]:
 
 
 def run_by_columns(
-    executor: Executor, batch: Batch, directions: Directions, run: RunRequest
+    loop: Loop, batch: Batch, directions: Directions, request: RunRequest
 ) -> Tangents:
     """As `run_with_tangents`, one run a tangent."""
     inputs = batch.leaves.first
-    zero, units = (
-        jnp.zeros(directions.tangents, batch.dtype),
-        np.eye(directions.tangents, dtype=batch.dtype),
-    )
+    zero = jnp.zeros(directions.tangents, batch.dtype)
     before = jax.tree.leaves(inputs.scenario)
-    places = tuple(
-        i
-        for i, x in enumerate(jax.tree.leaves(directions.moved(inputs.scenario, zero)))
-        if x is not before[i]
-    )
+    moved = jax.tree.leaves(directions.moved(inputs.scenario, zero))
+    places = tuple(i for i, x in enumerate(moved) if x is not before[i])
 
     def leaves_at(eps):
         moved = jax.tree.leaves(directions.moved(inputs.scenario, eps))
         return [moved[i] for i in places]
 
+    units = np.eye(directions.tangents, dtype=batch.dtype)
     along = jax.vmap(lambda unit: jax.jvp(leaves_at, (zero,), (unit,))[1])(units)
-    every = 1 if any(hasattr(fold, "curvatures") for fold in inputs.folds) else None
-    run = run._replace(record_every=every)
-    outcome, weights = run_step(
-        executor, batch, TimeStep(run.method, _weights if every else None), run
-    )
-    step = TangentStep(TimeStep(run.method, outer_vectors if every else None), (places,))
-    found, tangents = _stepped(executor, batch, step, [along], run)
-    still = {name: x for name, x in outcome.metrics.items() if name in ACCURACY}
-    nothing = {
+    weight_of, vector_of, every = None, None, None
+    if count_curvatures(inputs.folds):
+        weight_of, vector_of, every = _weights, outer_vectors, 1
+    request = request._replace(record_every=every)
+    outcome, weights = run_step(loop, batch, TimeStep(request.method, weight_of), request)
+    step = TangentStep(TimeStep(request.method, vector_of), (places,))
+    found, tangents = _stepped(loop, batch, step, [along], request)
+    constant = {name: x for name, x in outcome.metrics.items() if name in ACCURACY}
+    no_tangents = {
         name: jnp.zeros((len(x), directions.tangents, *x.shape[1:]), batch.dtype)
-        for name, x in still.items()
+        for name, x in constant.items()
     }
     products = [
         jnp.einsum("rptm,rtm,rqtm->rpq", y, weight, y)
         for y, weight in zip(found, weights, strict=True)
     ]
-    return Tangents(outcome, nothing | tangents, tuple(products))
+    return Tangents(outcome, no_tangents | tangents, tuple(products))

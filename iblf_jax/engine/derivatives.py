@@ -26,9 +26,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from iblf_jax.engine.batch import Batch, Executor, begin, end
+from iblf_jax.engine.batch import Batch, Loop, finalize, initialize
 from iblf_jax.engine.request import RunRequest
-from iblf_jax.engine.step import Advanced, Carry, Form, Inputs, Outcome, advance, finished
+from iblf_jax.engine.step import Advanced, Carry, Inputs, Outcome, StepOptions, advance, finished
 from iblf_jax.simulation import accuracy
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
 from iblf_jax.simulation.paths import get, with_parameters
@@ -128,7 +128,12 @@ def pushed(
       before: carry and tangents, or None where the function takes no carry.
       dtype: of the tangents.
     """
-    floats, replaced = floats_of_carry(before.carry) if before else ([], lambda _: None)
+    floats: list[jax.Array] = []
+    tangents_before: list[jax.Array] = []
+    replaced: Callable = lambda _: None  # noqa: E731
+    if before is not None:
+        floats, replaced = floats_of_carry(before.carry)
+        tangents_before = before.tangents
 
     def of(eps, floats):
         return function(directions.moved(scenario, eps), replaced(floats), eps)
@@ -140,7 +145,7 @@ def pushed(
         return value, tangent, rest
 
     units = np.eye(directions.tangents, dtype=dtype)
-    return jax.vmap(along, out_axes=(None, 0, None))(units, before.tangents if before else [])
+    return jax.vmap(along, out_axes=(None, 0, None))(units, tangents_before)
 
 
 def without_flags(sample: Sample) -> Any:
@@ -160,8 +165,9 @@ def preaccumulated(scenario, directions: Directions, eps: jax.Array) -> Callable
 
     def loop(moved, t, state, dt=0.0, torque=None):
         # A stage's time moves where a torque arrives within a step, or a jump time does.
-        parts = (() if torque is None else (torque,)), ((t,) if torque is not None or jumps else ())
-        leaves, structure = jax.tree.flatten((state, *parts))
+        torques = tuple(x for x in (torque,) if x is not None)
+        times = tuple(x for x in (t,) if torque is not None or jumps)
+        leaves, structure = jax.tree.flatten((state, torques, times))
         real = [jnp.issubdtype(x.dtype, jnp.floating) for x in leaves]
         here, unravel = ravel_pytree([x for x, yes in zip(leaves, real, strict=True) if yes])
         flags = [x for x, yes in zip(leaves, real, strict=True) if not yes]
@@ -202,11 +208,21 @@ def preaccumulated(scenario, directions: Directions, eps: jax.Array) -> Callable
     return loop
 
 
+def curvatures_of(fold: Any) -> int:
+    """How many `Outer` a fold offers of a sample; 0 for one without `curvatures`."""
+    return getattr(fold, "curvatures", 0)
+
+
+def count_curvatures(folds: Any) -> int:
+    """How many curvature matrices the folds have."""
+    return sum(curvatures_of(fold) for fold in folds)
+
+
 def outers_of(folds, accumulators, sample) -> tuple[Outer, ...]:
     """What a sample adds to the curvature matrices of the folds that have them."""
     found: tuple[Outer, ...] = ()
     for fold, acc in zip(folds, accumulators, strict=True):
-        if hasattr(fold, "curvatures"):
+        if curvatures_of(fold):
             found += tuple(fold.curvature(acc, sample))
     return found
 
@@ -232,17 +248,21 @@ class DerivativeStep:
     directions: Directions
     is_derivative: ClassVar[bool] = True
 
-    def __call__(self, inputs: Inputs, carry: Differentiated, index: jax.Array, form: Form):
+    def __call__(
+        self, inputs: Inputs, carry: Differentiated, index: jax.Array, options: StepOptions
+    ):
         """The carry after the step; nothing is recorded."""
         rows, columns = np.triu_indices(self.directions.tangents)
 
         def one(scenario, before, eps):
             # On arrays a Jacobian for a few tangents would cost more than the tangents.
             loop = (
-                preaccumulated(inputs.scenario, self.directions, eps) if form.scalar else evaluate
+                preaccumulated(inputs.scenario, self.directions, eps)
+                if options.scalar
+                else evaluate
             )
             found = advance(
-                inputs._replace(scenario=scenario), before, index, self.method, form, loop
+                inputs._replace(scenario=scenario), before, index, self.method, options, loop
             )
             outers = outers_of_step(inputs.folds, found)
             vectors, weights = (
@@ -259,16 +279,16 @@ class DerivativeStep:
 
 
 def run_with_tangents(
-    executor: Executor, batch: Batch, directions: Directions, run: RunRequest
+    loop: Loop, batch: Batch, directions: Directions, request: RunRequest
 ) -> Tangents:
-    """All runs with their tangents, from the start to the outcome; `run` records nothing."""
+    """All runs with their tangents, from the start to the outcome; `request` records nothing."""
     rows, columns = np.triu_indices(directions.tangents)
 
     def at_start(inputs, carry):
         def state(scenario, _, eps):
             return floats_of_carry(carry._replace(state=initial_state(scenario)))[0], ()
 
-        count = sum(getattr(fold, "curvatures", 0) for fold in inputs.folds)
+        count = count_curvatures(inputs.folds)
         _, tangents, _ = pushed(state, directions, inputs.scenario, None, inputs.dt.dtype)
         return Differentiated(carry, tangents, [jnp.zeros((len(rows),), inputs.dt.dtype)] * count)
 
@@ -290,8 +310,10 @@ def run_with_tangents(
             full.at[rows, columns].set(x).at[columns, rows].set(x) for x in before.products
         )
 
-    carry, instant = begin(executor, batch, run.method)
+    carry, instant = initialize(loop, batch, request.method)
     before = batch.each(at_start, carry)
-    after, _ = executor(DerivativeStep(run.method, directions), batch, before, run.steps + 1, None)
+    after, _ = loop(
+        DerivativeStep(request.method, directions), batch, before, request.steps + 1, None
+    )
     tangents, products = batch.each(at_end, after)
-    return Tangents(end(executor, batch, run, after.carry, instant), tangents, products)
+    return Tangents(finalize(loop, batch, request, after.carry, instant), tangents, products)

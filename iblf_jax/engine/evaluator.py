@@ -18,8 +18,7 @@ from jax.experimental.xla_metadata import set_xla_metadata
 
 from iblf_jax.core import devices
 from iblf_jax.engine import plan, vector_math
-from iblf_jax.kernels.operations import OPERATIONS
-from iblf_jax.kernels.program import Node, Program, needed
+from iblf_jax.kernels import OPERATIONS, Node, Program, needed
 
 
 class Entry(NamedTuple):

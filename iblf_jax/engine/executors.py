@@ -5,29 +5,41 @@ scalar program (`lowered_on`).
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache, partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.core.caches import CACHE
 from iblf_jax.engine import plan
-from iblf_jax.engine.batch import Batch, Executor, Leaves
+from iblf_jax.engine.batch import Batch, Leaves, Loop
 from iblf_jax.engine.machine_function import machine_function
-from iblf_jax.engine.step import Form, Probe, keep_if
-from iblf_jax.kernels.packed import Lowered, Packed, Shapes, lowered, pack, unpack, unpacked_records
+from iblf_jax.engine.step import LinearizationStep, StepOptions, is_derivative, keep_if
+from iblf_jax.kernels import (
+    CompiledStep,
+    Packed,
+    Shapes,
+    compile_step,
+    pack,
+    unpack,
+    unpacked_records,
+)
 
 
 def scan(step: Any, batch: Batch, carry: Any, steps: int, every: int | None) -> tuple[Any, Any]:
     """All steps of all runs in `jax.lax.scan`: any scenario, any device, and differentiable in
     either mode.
     """
-    shape = batch.shape
-    form = Form(shape.rolled, machine_function) if shape.function == "parts" else Form(shape.rolled)
+    options = StepOptions(batch.layout.rolled)
+    if batch.layout.machine_functions == "parts":
+        options = options._replace(piece=machine_function)
 
     def one(inputs, carry):
-        return _scanned(partial(step, inputs, form=form), carry, steps, every)
+        def of_run(carry, index):
+            return step(inputs, carry, index, options)
+
+        return _scanned(of_run, carry, steps, every)
 
     return batch.each(one, carry)
 
@@ -72,17 +84,16 @@ def checkpointed(
 
     Only every T^(2/3)-th state is kept; the others are computed again, in three nested loops.
     """
-    if every is not None or isinstance(step, Probe):
+    if every is not None or isinstance(step, LinearizationStep):
         return scan(step, batch, carry, steps, every)
     inner, blocks = plan.checkpoint_edge(steps)
+    options = StepOptions(batch.layout.rolled)
 
     def one(inputs, carry):
         @jax.checkpoint
         def single(carry, index):
             return (
-                keep_if(
-                    index < steps, step(inputs, carry, index, Form(batch.shape.rolled))[0], carry
-                ),
+                keep_if(index < steps, step(inputs, carry, index, options)[0], carry),
                 None,
             )
 
@@ -99,23 +110,23 @@ def checkpointed(
     return batch.each(one, carry)
 
 
-@lru_cache(maxsize=64)
-def _on_leaves(step: Any, treedef, is_lane: tuple[bool, ...], carry_treedef) -> Callable:
-    """A step as a function of lists of leaves, for `lowered`; the same object for the same
+@CACHE.memoised(64)
+def _on_leaves(step: Any, treedef, is_per_run: tuple[bool, ...], carry_treedef) -> Callable:
+    """A step as a function of lists of leaves, for `compile_step`; the same object for the same
     structure.
     """
 
-    def on_leaves(shared, lane, carry, index):
-        inputs = Leaves(treedef, is_lane, [], []).together(shared, lane)
+    def on_leaves(shared, per_run, carry, index):
+        inputs = Leaves(treedef, is_per_run, [], []).together(shared, per_run)
         after, records = step(
-            inputs, jax.tree.unflatten(carry_treedef, carry), index, Form(scalar=True)
+            inputs, jax.tree.unflatten(carry_treedef, carry), index, StepOptions(scalar=True)
         )
         return jax.tree.leaves(after), records
 
     return on_leaves
 
 
-def program_of(step: Any, batch: Batch, carry: Any) -> Lowered:
+def program_of(step: Any, batch: Batch, carry: Any) -> CompiledStep:
     """The scalar program of a step, for a carry with a leading batch axis (arrays or their shapes).
 
     Raises:
@@ -123,18 +134,18 @@ def program_of(step: Any, batch: Batch, carry: Any) -> Lowered:
     """
     flat, treedef = jax.tree.flatten(carry)
     leaves = batch.leaves
-    function = _on_leaves(step, leaves.treedef, leaves.is_lane, treedef)
+    function = _on_leaves(step, leaves.treedef, leaves.is_per_run, treedef)
     # A derivative's literal zero says "does not depend".
-    sparse = getattr(step, "is_derivative", False)
-    shapes = Shapes.of(leaves.shared), Shapes.of(leaves.lane, 1), Shapes.of(flat, 1)
-    return lowered(function, np.dtype(batch.dtype), *shapes, plan.LIMITS, sparse, batch.known)
+    sparse = is_derivative(step)
+    shapes = Shapes.of(leaves.shared), Shapes.of(leaves.per_run, 1), Shapes.of(flat, 1)
+    return compile_step(function, np.dtype(batch.dtype), *shapes, plan.LIMITS, sparse, batch.known)
 
 
 def lowered_on(
     run_program: Callable[..., tuple[Packed, list[jax.Array]]],
     pack: Callable = pack,
     unpack: Callable = unpack,
-) -> Executor:
+) -> Loop:
     """The executor that runs a step's scalar program by `run_program` (`native.run`, `gpu.run`,
     `xla.run`), between `pack` and `unpack`.
     """
@@ -148,11 +159,13 @@ def lowered_on(
         shared = pack(
             [x[None] for x in batch.leaves.shared], Shapes.of(batch.leaves.shared), dtype, 1
         ).floats[:, 0]
-        lane = pack(batch.leaves.lane, Shapes.of(batch.leaves.lane, 1), dtype, runs).floats
+        per_run = pack(batch.leaves.per_run, Shapes.of(batch.leaves.per_run, 1), dtype, runs).floats
         after, arrays = run_program(
-            found.program, shared, lane, pack(flat, shapes, dtype, runs), steps, every
+            found.program, shared, per_run, pack(flat, shapes, dtype, runs), steps, every
         )
-        records = unpacked_records(found.records, arrays) if every else ()
+        records = ()
+        if every:
+            records = unpacked_records(found.records, arrays)
         return jax.tree.unflatten(treedef, unpack(after, shapes, runs)), records
 
     return executor

@@ -1,4 +1,4 @@
-"""What one step of a scenario costs, counted on its scalar program: the roofline in plain sight."""
+"""`explain`: what one step of a scenario costs, counted on its scalar program."""
 
 from __future__ import annotations
 
@@ -13,14 +13,13 @@ import numpy as np
 from iblf_jax.core import checks, notices
 from iblf_jax.core.devices import threads
 from iblf_jax.engine.batch import Batch, carry_shapes
-from iblf_jax.engine.execute import automatic, inputs_of
+from iblf_jax.engine.compile import inputs_of
 from iblf_jax.engine.executors import program_of
 from iblf_jax.engine.mechanism import known_of
+from iblf_jax.engine.registry import automatic
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.step import TimeStep
-from iblf_jax.kernels.operations import OPERATIONS
-from iblf_jax.kernels.passes import written_out
-from iblf_jax.kernels.program import LANE, SHARED, TIME, Program
+from iblf_jax.kernels import OPERATIONS, PER_RUN, SHARED, TIME, Program, written_out
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.metrics import as_folds
 from iblf_jax.simulation.paths import get
@@ -32,8 +31,8 @@ LIBRARY_CALL = 40
 NAMES = {
     SHARED: "once",
     SHARED | TIME: "a step, shared",
-    LANE: "a run",
-    LANE | TIME: "a step and run",
+    PER_RUN: "a run",
+    PER_RUN | TIME: "a step and run",
 }
 
 
@@ -100,48 +99,53 @@ def explain(
         path: jnp.asarray(get(scenario, path))[None]
         for path in {"initial.q", "initial.dq", *varied}
     }
-    noise = {NOISE_NAME: jnp.zeros((1, 4), jnp.float32)} if has_noise(scenario) else {}
+    if has_noise(scenario):
+        leaves[NOISE_NAME] = jnp.zeros((1, 4), jnp.float32)
     one = Batch.of(
         inputs_of(scenario, folds, jnp.asarray(1e-3, dtype), RunRequest(1), None),
-        leaves | noise,
-        mechanism=known_of(scenario),
+        leaves,
+        constants=known_of(scenario),
     )
     program = written_out(program_of(TimeStep(method), one, carry_shapes(one, method)).program)
     width = 64 // np.dtype(dtype).itemsize
     slots = instructions(program, width)
     counts = {NAMES[c]: counter for c, counter in program.counts().items()}
     name, reason = automatic()
-    backend = f"{name}: {reason}" if reason else name
     columns = (
         f"by numbers of the scenario on {name}, one run a number, first and second ones; others by"
         " plain JAX"
     )
-    derivatives = f"by plain JAX: {reason}" if reason else columns
+    backend, derivatives = name, columns
+    if reason:
+        backend = f"{name}: {reason}"
+        derivatives = f"by plain JAX: {reason}"
     return Explanation(
         counts, slots, width, threads() * width * 2 * _clock() / slots, backend, derivatives
     )
 
 
 def instructions(program: Program, width: int) -> float:
-    """Vector instructions of a step for a register of runs (class LANE | TIME)."""
+    """Vector instructions of a step for a register of runs (class PER_RUN | TIME)."""
     classes, uses = program.classes(), Counter(a for node in program.nodes for a in node.args)
     fused = {
         next(
             (
                 a
                 for a in node.args
-                if program.nodes[a].op == "mul" and uses[a] == 1 and classes[a] == LANE | TIME
+                if program.nodes[a].op == "mul" and uses[a] == 1 and classes[a] == PER_RUN | TIME
             ),
             None,
         )
         for node in program.nodes
         if node.op in ("add", "sub")
     }
-    counted = program.counts()[LANE | TIME]
+    counted = program.counts()[PER_RUN | TIME]
     total = -len(fused - {None})
     for op, n in counted.items():
         cost = OPERATIONS[op].cost
-        total += n * (LIBRARY_CALL * width if cost is None else cost)
+        if cost is None:
+            cost = LIBRARY_CALL * width
+        total += n * cost
     return total
 
 

@@ -1,17 +1,14 @@
-"""Which term of a loop limits how slowly it may be sampled, or how large a step may be: found by
-scaling each term and looking.
+"""Which term of a loop limits the sampling period or the time step.
 
-The contribution of a term is a leaf of the scenario: a gain of law or observer, the weight of the
-  barrier, the delay, or the time
-constant of a filter or a drive.  Each is scaled by s = 2^(-1/2), 2^-1, ... at the same instants,
-the others as they are, until
+A term of the loop is a leaf of the scenario: a gain of law or observer, the weight of the barrier,
+the delay, or the time constant of a filter or a drive.  Each term is scaled by s = 2^(-1/2), 2^-1,
+... at the same instants, while the others keep their values, until
 
-    rho(s) < 1,   rho: the spectral radius of the map from one period to the next, or dt
-    |lambda|_max over the integrator's range
+    rho(s) < 1,   rho: the spectral radius of the map from one period to the next, or
+                       dt |lambda|_max divided by the stability limit of the integrator
 
-for one of them.  That one limits the loop: of all terms it has to change least.  A term whose
-  scaling never helps, such as a gain K2 whose
-damping the loop needs, is not named.
+holds for one of them.  This term limits the loop, because it has to change least.  A term whose
+scaling never helps, such as a gain K2 whose damping the loop needs, is not named.
 """
 
 from __future__ import annotations
@@ -26,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core.pytree import unwrapped
-from iblf_jax.engine.step_size import start_and_along
+from iblf_jax.engine.step_size import largest_eigenvalue, start_and_along
 from iblf_jax.simulation.closed_loop import LoopState, initial_state, run_sampled_law
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.paths import get, parameters, with_parameters
@@ -36,7 +33,7 @@ from iblf_jax.simulation.stability import jacobian, period_map
 LEVELS = 14
 """Scales 2^(-k/2) that are tried, down to 1/128."""
 INSTANTS = 4
-"""States that are looked at together."""
+"""States that are assessed together."""
 NEAREST = 0.98
 """|xi| up to which a state of the run counts: beyond it the guard is near, and every slope is
 steep."""
@@ -47,6 +44,8 @@ WORDS = {
     "cutoff": "the filter of the velocity",
 }
 """Name of a leaf -> the term of the loop that it sets."""
+LAGS = {"sensor": "the filter of the velocity", "actuator": "the lag of the drive"}
+"""Part of a scenario -> the term of the loop that its time constant sets."""
 SLOWER = ("cutoff", "bandwidth")
 """Leaves of sensors and actuators whose reciprocal is a time constant."""
 
@@ -113,13 +112,13 @@ def terms_of(scenario: Scenario) -> Iterator[Term]:
     """The terms of a scenario's loop that are leaves."""
     law = unwrapped(scenario.controller)
     gains = tuple(getattr(law, "gains", ("k1", "K2")))
-    wanted = {f"controller.{name}" for name in (*gains, *getattr(law, "unit_factors", ()), "c")}
+    of_law = {f"controller.{name}" for name in (*gains, *getattr(law, "unit_factors", ()), "c")}
     for parameter in parameters(scenario, named=False):
         part, _, rest = parameter.path.partition(".")
         name = rest.rpartition(".")[2]
         if not np.all(np.asarray(parameter.value) > 0):
             continue
-        if parameter.path in wanted:
+        if parameter.path in of_law:
             yield Term(WORDS.get(name, f"the gain {name}"), parameter.path)
         elif parameter.path == "controller.filter":
             yield Term(WORDS[name], parameter.path, True)
@@ -128,15 +127,14 @@ def terms_of(scenario: Scenario) -> Iterator[Term]:
         elif parameter.path == "sampling.delay":
             yield Term(WORDS[name], parameter.path)
         elif part in ("sensor", "actuator") and name in SLOWER:
-            drive = "the filter of the velocity" if part == "sensor" else "the lag of the drive"
-            yield Term(drive, parameter.path, True)
+            yield Term(LAGS[part], parameter.path, True)
 
 
 def _scaled(scenario: Scenario, term: Term, scale: float) -> Scenario:
-    value = get(scenario, term.path)
-    return with_parameters(
-        scenario, {term.path: value / scale if term.is_inverse else value * scale}
-    )
+    factor = scale
+    if term.is_inverse:
+        factor = 1.0 / scale
+    return with_parameters(scenario, {term.path: get(scenario, term.path) * factor})
 
 
 def _excess(scenario: Scenario, run: Any) -> Callable[[Scenario, jax.Array, LoopState], float]:
@@ -145,19 +143,15 @@ def _excess(scenario: Scenario, run: Any) -> Callable[[Scenario, jax.Array, Loop
     """
 
     def radius(scenario: Scenario, times: jax.Array, states: LoopState) -> float:
-        return _largest_eigenvalue(_period_maps(scenario, times, states))
+        return largest_eigenvalue(np.asarray(_period_maps(scenario, times, states), float))
 
-    def stretched(scenario: Scenario, times: jax.Array, states: LoopState) -> float:
-        modes = _largest_eigenvalue(_jacobians(scenario, times, states))
+    def scaled_modes(scenario: Scenario, times: jax.Array, states: LoopState) -> float:
+        modes = largest_eigenvalue(np.asarray(_jacobians(scenario, times, states), float))
         return float(run.dt) * modes / tableau(run.method).stability
 
-    return stretched if scenario.sampling is None else radius
-
-
-def _largest_eigenvalue(matrices: jax.Array) -> float:
-    """The largest size of an eigenvalue of some matrices; infinite where they are not finite."""
-    found = np.asarray(matrices, float)
-    return float(np.max(np.abs(np.linalg.eigvals(found)))) if np.all(np.isfinite(found)) else np.inf
+    if scenario.sampling is None:
+        return scaled_modes
+    return radius
 
 
 @jax.jit

@@ -1,12 +1,12 @@
-"""What is compiled in: which numbers of a robot's geometry are 0, 1 or -1, which are equal to
-others, and which factors of a law are 1.
+"""Finds properties of a scenario that are compiled in: which numbers of a robot's geometry are 0, 1
+or -1, which are equal to others, and which factors of a law are 1.
 
-Axes, offsets and rotations of real arms are mostly zeros, and model and plant mostly agree.  A
-scalar program that knows it needs fewer operations.  Numbers themselves are never compiled in, nor
-anything of masses, gains and loads, so new ones compile nothing: a robot says which these are
-(`geometry_fields`).  A law has factors that are mostly 1, such as the weight of a barrier
-(`unit_factors`): one that is 1 costs nothing.  What differs between runs is not shared, and nothing
-  is known of it.
+Axes, offsets and rotations of real arms are mostly zeros, and model and plant mostly agree. A
+scalar program that uses this needs fewer operations. Other values are never compiled in, nor is
+any property of masses, gains and loads, so that new values need no compilation. A robot declares
+the fields in question (`geometry_fields`). A law has factors that are mostly 1, such as the weight
+of a barrier (`unit_factors`); a factor of 1 costs nothing. Leaves that differ between runs are not
+shared, and nothing is compiled in for them.
 """
 
 from __future__ import annotations
@@ -19,95 +19,120 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import layers
-from iblf_jax.kernels.program import Known
+from iblf_jax.kernels import Known
 from iblf_jax.simulation.scenario import Scenario
 
 QUATERNIONS = ("rotation", "tip_rotation")
-"""Fields whose rows hold equal numbers for a reason: a right angle."""
+"""Fields whose rows have equal numbers for a systematic reason: a right angle."""
 
 
 class Mechanism(NamedTuple):
-    """What is known of every number of a scenario, leaf after leaf, None where nothing is;
-    hashable.
-    """
+    """The compiled-in properties of a scenario; hashable."""
 
     numbers: tuple[Known | None, ...]
+    """One entry per number of the scenario, leaf after leaf; None for no property."""
 
     def of_shared(self, is_lane: Sequence[bool], sizes: Sequence[int]) -> tuple[Known | None, ...]:
-        """What is known of the numbers that are shared, for leaves of these sizes of which the
-        scenario's come first.
+        """The properties of the shared numbers.
+
+        Args:
+          is_lane: whether a leaf differs between the runs, for all leaves; those of the scenario
+            come first.
+          sizes: number of entries of each leaf.
         """
-        place: dict[int, int] = {}
-        number = 0
-        for lane, size in zip(is_lane, sizes, strict=True):
-            if not lane:
-                place.update({number + i: len(place) + i for i in range(size)})
-            number += size
-        found: list[Known | None] = [None] * len(place)
+        position: dict[int, int] = {}
+        first = 0
+        for differs, size in zip(is_lane, sizes, strict=True):
+            if not differs:
+                position.update({first + i: len(position) + i for i in range(size)})
+            first += size
+        found: list[Known | None] = [None] * len(position)
         for i, known in enumerate(self.numbers):
-            if known is not None and i in place:
-                same = known.same if known.same is None else place.get(known.same)
-                found[place[i]] = known._replace(
-                    same=same, sign=known.sign if same is not None else 1
-                )
+            if known is None or i not in position:
+                continue
+            same = position.get(known.same) if known.same is not None else None
+            if same is None:
+                found[position[i]] = known._replace(same=None, sign=1)
+            else:
+                found[position[i]] = known._replace(same=same)
         return tuple(found)
 
 
 def _declared(part: Any, attribute: str) -> tuple[str, ...]:
-    """The fields of which a class declares that they may be compiled in; none where users have a
-    field of that name.
+    """The fields that a class declares in an attribute; empty if it does not declare any.
+
+    A class of a user may lack the attribute, or use the name for something else.
     """
     names = getattr(type(part), attribute, ())
-    return (
-        names if isinstance(names, tuple) and all(isinstance(name, str) for name in names) else ()
-    )
+    if isinstance(names, tuple) and all(isinstance(name, str) for name in names):
+        return names
+    return ()
+
+
+def _names(path: Sequence[Any]) -> tuple[str, ...]:
+    """The names of the fields on the path of a leaf; empty texts for entries of containers."""
+    return tuple(getattr(key, "name", "") for key in path)
 
 
 def mechanism_of(scenario: Scenario) -> Mechanism | None:
-    """What is known of the numbers of a scenario's robots; None where they are tracers, or no robot
-    has a geometry.
-    """
+    """The properties of a scenario's robots; None if they are traced or declare no geometry."""
     robots = {
         name: _declared(getattr(scenario, name), "geometry_fields") for name in ("plant", "model")
     }
     if not any(robots.values()) or not checks.is_concrete((scenario.plant, scenario.model)):
         return None
     numbers: list[Known | None] = []
-    begin: dict[str, tuple[int, np.ndarray]] = {}
+    first_of_field: dict[str, tuple[int, np.ndarray]] = {}
     for path, leaf in jax.tree_util.tree_flatten_with_path(scenario)[0]:
-        names = [getattr(key, "name", "") for key in path]
-        if len(names) == 2 and names[1] in robots.get(names[0], ()):
-            values = np.asarray(leaf, float)
-            twin = begin.get(names[1])
-            begin.setdefault(names[1], (len(numbers), values))
-            row = values.shape[-1] if names[1] in QUATERNIONS else 1
-            flat = values.ravel()
-            for i, x in enumerate(flat):
-                known = _known(x, flat[i - i % row : i], len(numbers) - i % row)
-                first = numbers[known.same] if known and known.same is not None else None
-                # The model's numbers are the plant's, so what is equal to one of them is equal to
-                # that of the plant.
-                numbers.append(
-                    known._replace(same=first.same)
-                    if known and first and first.same is not None
-                    else known
-                )
-                if (
-                    twin
-                    and numbers[-1] == Known()
-                    and twin[1].shape == values.shape
-                    and twin[1].flat[i] == x
-                ):
-                    numbers[-1] = Known(same=twin[0] + i)
-        else:
+        names = _names(path)
+        if len(names) != 2 or names[1] not in robots.get(names[0], ()):
             numbers += [None] * int(np.size(leaf))
+            continue
+        values = np.asarray(leaf, float)
+        twin = first_of_field.get(names[1])
+        first_of_field.setdefault(names[1], (len(numbers), values))
+        row = 1
+        if names[1] in QUATERNIONS:
+            row = values.shape[-1]
+        for i in range(values.size):
+            numbers.append(_of_entry(values, i, row, numbers, twin))
     return Mechanism(tuple(numbers))
 
 
-def known_of(scenario: Scenario) -> Mechanism | None:
-    """What is known of a scenario's numbers, robots' and law's; None where nothing is.
+def _of_entry(
+    values: np.ndarray,
+    i: int,
+    row: int,
+    numbers: Sequence[Known | None],
+    twin: tuple[int, np.ndarray] | None,
+) -> Known | None:
+    """The property of an entry of a field of a robot.
 
-    Of the law: which entries of its `unit_factors` are 1.
+    Args:
+      values: the field.
+      i: index of the entry.
+      row: length of the rows within which entries are compared.
+      numbers: the properties of all numbers before it.
+      twin: the same field of the plant, with the index of its first number; None for the plant.
+    """
+    flat = values.ravel()
+    start = i - i % row
+    known = _known(flat[i], flat[start:i], len(numbers) - i % row)
+    if known is not None and known.same is not None:
+        # The entry may equal one that itself equals a number of the plant.
+        first = numbers[known.same]
+        if first is not None and first.same is not None:
+            return known._replace(same=first.same)
+    is_twin = twin is not None and twin[1].shape == values.shape and twin[1].flat[i] == flat[i]
+    if twin is not None and is_twin and known == Known():
+        return Known(same=twin[0] + i)
+    return known
+
+
+def known_of(scenario: Scenario) -> Mechanism | None:
+    """The properties of a scenario's robots and of its law; None if there are none.
+
+    The property of a law is which entries of its `unit_factors` are 1.
     """
     mechanism = mechanism_of(scenario)
     factors = _factors(scenario)
@@ -115,20 +140,25 @@ def known_of(scenario: Scenario) -> Mechanism | None:
         return mechanism
     numbers: list[Known | None] = []
     for path, leaf in jax.tree_util.tree_flatten_with_path(scenario)[0]:
-        factor = factors.get(tuple(getattr(key, "name", "") for key in path))
+        factor = factors.get(_names(path))
         if factor is None:
             numbers += [None] * int(np.size(leaf))
             continue
-        numbers += [Known(1.0) if x == 1.0 else None for x in np.ravel(factor)]
+        numbers += [UNIT.get(x) for x in np.ravel(factor).tolist()]
     if mechanism is None:
         return Mechanism(tuple(numbers))
+    # Known() is a tuple and true; a number has a property of a robot or of the law, or none.
     both = zip(mechanism.numbers, numbers, strict=True)
-    return Mechanism(tuple(known if known is not None else of_law for known, of_law in both))
+    return Mechanism(tuple(of_robot or of_law for of_robot, of_law in both))
+
+
+UNIT = {1.0: Known(1.0)}
+"""Value of a factor -> its property."""
 
 
 def _factors(scenario: Scenario) -> dict[tuple[str, ...], Any]:
-    """The factors of a scenario's law that may be compiled in where they are 1, by where they are,
-    but for tracers.
+    """The `unit_factors` of a scenario's law and of the laws that it wraps, by their paths; traced
+    ones are excluded.
     """
     path: tuple[str, ...] = ("controller",)
     found: dict[tuple[str, ...], Any] = {}
@@ -140,8 +170,12 @@ def _factors(scenario: Scenario) -> dict[tuple[str, ...], Any]:
 
 
 def _known(x: float, before: np.ndarray, start: int) -> Known | None:
-    """What is known of a number, given those before it in its row, of which the first has the
-    number `start`.
+    """The property of a number.
+
+    Args:
+      x: the number.
+      before: the numbers before it in its row.
+      start: index of the first of them among all numbers of the scenario.
     """
     if not np.isfinite(x):
         return None

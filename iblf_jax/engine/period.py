@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks, notices
-from iblf_jax.engine.step_size import LOOKS, round_down, start_and_along
+from iblf_jax.engine.step_size import LOOKS, largest_eigenvalue, round_down, start_and_along
 from iblf_jax.simulation.closed_loop import LoopState, run_sampled_law
 from iblf_jax.simulation.sampling import Sampling, commands_in_transit, with_sufficient_queue
 from iblf_jax.simulation.scenario import Scenario, canonical
@@ -55,7 +55,7 @@ def radius_at(scenario: Scenario, period: float, times: np.ndarray) -> float:
     maps = np.asarray(
         _maps(dataclasses.replace(scenario, sampling=changed), jnp.asarray(times, dtype)), float
     )
-    return float(np.max(np.abs(np.linalg.eigvals(maps)))) if np.all(np.isfinite(maps)) else np.inf
+    return largest_eigenvalue(maps)
 
 
 @jax.jit
@@ -136,5 +136,8 @@ def _limit(scenario: Scenario, times: np.ndarray, radius: float) -> float | None
         return low
     for _ in range(HALVINGS):
         middle = math.sqrt(low * high)
-        low, high = (middle, high) if radius_at(scenario, middle, times) < radius else (low, middle)
+        if radius_at(scenario, middle, times) < radius:
+            low = middle
+        else:
+            high = middle
     return low

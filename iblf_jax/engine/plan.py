@@ -1,24 +1,24 @@
-"""How a run, a batch or its derivatives are executed: the one place that decides, from sizes, the
-number of runs and the platform.
+"""Stage 2 of a run: how a request is executed, decided from sizes and the platform alone.
 
-Decided are the executor (scan, xla, native, gpu), how XLA is given a batch (`Shape`), what is
-lowered, how long a piece of code a compiler gets at a time, forward or reverse mode, and how many
-runs or steps go together.  Every threshold stands in the table below, with the measurement behind
-it where there is one.
+`choose_plan` is a pure function from a request, the sizes of its inputs and the machine to an
+`ExecutionPlan`: which executors are tried, and how XLA is given a batch.  The other functions
+decide how long a piece of code a compiler gets at a time, whether derivatives are taken in forward
+or reverse mode, and how many runs or steps go together.  All thresholds are in the table below,
+with the measurement behind each where there is one.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-from iblf_jax.kernels.program import LoweringLimits
+from iblf_jax.kernels import LoweringLimits
 
-BACKENDS = ("auto", "vmap", "xla", "native", "gpu")
-"""How a user may ask for a batch to be executed; "vmap" is the scan executor."""
-SINGLE_RUN_BACKENDS = ("auto", "xla", "native", "gpu")
-"""How a user may ask for one run to be executed."""
-COMPILED = {"cpu": "native", "gpu": "gpu"}
-"""The executor that builds kernels, by platform."""
+if TYPE_CHECKING:
+    from iblf_jax.engine.registry import Machine
+    from iblf_jax.engine.request import RunRequest
+
+BACKENDS = ("auto", "vmap", "native", "gpu", "xla")
+"""The former form of `registry.backends()`."""
 
 # One machine function (`machine_function`), on CPU: numbers of operations are those of a jaxpr.
 SMALL_BATCH = 64
@@ -38,12 +38,13 @@ LONGEST_FUNCTION = 60_000
 """Operations over which LLVM takes minutes as one machine function."""
 
 # Scalar programs: numbers of operations are nodes of a step.
-LONGEST_ONE_RUN = {"native": 60_000, "gpu": 60_000, "xla": 2500}
-"""Nodes up to which one run is lowered unasked, by executor: a longer one gains less by it than it
-takes to compile.  A run of `presets.ur5`, 18,000 nodes, takes 0.04 s on native and 0.24 on scan;
-its first result takes 11 s of a busy processor there, 30 where the kernel has to be built, and 24
-on scan.  On an H100 1000 steps of it take 0.13 s on gpu and 0.9 on scan, the first result 28 s and
-13; 20,000 steps of the paper's loop take 0.11 s and 3, the first result 5 s and 9."""
+LONGEST_SINGLE_RUN, LONGEST_SINGLE_RUN_XLA = 60_000, 2500
+"""Nodes up to which a single run is lowered on "auto", for executors that compile kernels and for
+xla: a longer step gains less by it than it takes to compile.  A run of `presets.ur5`, 18,000
+nodes, takes 0.04 s on native and 0.24 on scan; its first result takes 11 s of a busy processor
+there, 30 where the kernel has to be built, and 24 on scan.  On an H100 1000 steps of it take 0.13 s
+on gpu and 0.9 on scan, the first result 28 s and 13; 20,000 steps of the paper's loop take 0.11 s
+and 3, the first result 5 s and 9."""
 LIMITS = LoweringLimits(
     choices=64, table=4096, tables=50_000, scan=64, written_out=1000, under_condition=64, power=64
 )
@@ -86,8 +87,8 @@ NATIVE_UNSEEN = 4e8
 tenth of a second, and two tenths of a per cent of time for the calls.  The paper's loop: 220,000
 steps."""
 NATIVE_FEW = 80
-"""Steps up to which they are not: so few take less time than a build of their own, and a `Probe` of
-a run serves a batch too."""
+"""Steps up to which the kernel of a batch also runs a single run: so few steps take less time than
+a build of their own, and the linearization of a run (`LinearizationStep`) serves a batch too."""
 GPU_STRETCH = 8192
 """Steps of a launch, at most: bounds the table of signals, and how long a display may have to
 wait."""
@@ -113,10 +114,10 @@ is filled up from, 0.16 s, 0.13 s and 0.28 s."""
 STUDY_MEMORY = 256 * 2**20
 """Bytes that runs in flight may take, unless the caller says otherwise."""
 STEP_SIZE_CHUNK = 1000
-"""Steps between two looks at the pair of runs that tells a step size."""
+"""Steps after which the pair of runs that decides on a step size is assessed again."""
 STUDY_IN_FLIGHT = 4
-"""Blocks that are made for a device at once, each by a thread: what surrounds a kernel goes beside
-another's."""
+"""Blocks that are computed on a device at the same time, each by a thread: draws and results of one
+block are handled while the kernel of another one runs."""
 SWEEP_UNIT, SWEEP_UNITS = 2e8, 16
 """Steps of all runs of a unit of a sweep's store together, seconds to a minute of work; units that
 a sweep has at least, if it is large."""
@@ -128,27 +129,132 @@ TUNE_FRESH = 10_000_000
 for the paper's scenario, where XLA compiles a block of them in 1.5 s."""
 
 
-class Shape(NamedTuple):
+class BatchLayout(NamedTuple):
     """How XLA is given a batch of runs."""
 
-    runs: str
-    """"together": in lock step, by vmap; "in turn": one after the other."""
-    function: str
-    """"whole": all is one machine function; "parts": its parts are one each (closed loop, record
-    and metrics, start, end); "none"."""
+    mapping: str
+    """"vmap": all runs advance together; "map": one run after the other."""
+    machine_functions: str
+    """"loop": the whole time loop is one machine function; "parts": its parts are one each (closed
+    loop, record and metrics, start, end); "none"."""
     rolled: bool
     """Whether the integrator's stages are a loop.  One run as a machine function takes half the
     time so, and a third to compile; 32 runs take 2.3 times as long, and XLA's own loop over one run
     three times."""
 
 
-STATES = Shape("together", "none", True)
+PLAIN_LAYOUT = BatchLayout("vmap", "none", False)
+"""A batch by `jax.vmap`, compiled by XLA in its usual way."""
+STATES_LAYOUT = BatchLayout("vmap", "none", True)
 """How one step is made from each of many states: it is made few times, so what counts is how long
 it compiles."""
 
 
-def scan_shape(platform: str, operations: int, runs: int | None, nested: bool) -> Shape:
-    """How the scan executor runs a batch.
+class Sizes(NamedTuple):
+    """What is known of the work before it is compiled."""
+
+    operations: int
+    """Operations of one evaluation of the closed loop."""
+    runs: int | None
+    """Runs of the batch; None for a single run."""
+    nodes: int | None = None
+    """Nodes of a step's scalar program, where a decision needs them."""
+    unsupported: str | None = None
+    """Why the step cannot be lowered to a scalar program."""
+
+
+class ExecutionPlan(NamedTuple):
+    """How a request is executed."""
+
+    executors: tuple[str, ...]
+    """Names of the executors to try, best first.  The scan follows if none of them can run it."""
+    layout: BatchLayout
+    """Of what surrounds a scalar program."""
+    scan_layout: BatchLayout
+    """Of the scan."""
+    reports_fallback: bool
+    """Whether a warning says that the requested executor is replaced by another one."""
+    notes: tuple[str, ...] = ()
+    """Warnings about the request itself."""
+
+
+def choose_plan(request: RunRequest, sizes: Sizes, machine: Machine) -> ExecutionPlan:
+    """The plan for a request.
+
+    Args:
+      request: what is to be run.
+      sizes: of the work.
+      machine: platform and the executors for it.
+    """
+    operations, runs, nested = sizes.operations, sizes.runs, request.nested
+    layout = lowered_layout(machine.platform, operations, runs or 1, nested)
+    by_scan = scan_layout(machine.platform, operations, runs, nested)
+    if runs is not None:
+        names, notes = requested_executors(request.backend, machine)
+        return ExecutionPlan(names, layout, by_scan, True, notes)
+    names, notes = single_run_executors(request.backend, operations, machine)
+    reports = machine.builds_kernels(request.backend)
+    if sizes.unsupported is not None:
+        notes = (*notes, slower_by_scan(sizes.unsupported)) if reports else notes
+        return ExecutionPlan((), layout, by_scan, reports, notes)
+    if names and not reports and sizes.nodes is not None:
+        limit = machine.limits(names[0]).single_run
+        names = names if limit is None or sizes.nodes <= limit else ()
+    return ExecutionPlan(names, layout, by_scan, reports, notes)
+
+
+def requested_executors(backend: str, machine: Machine) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """The executors for a requested backend on a machine, best first, and warnings about it."""
+    if backend == "vmap":
+        return (), ()
+    if backend == "auto":
+        return machine.names, ()
+    if backend in machine.names:
+        others = tuple(name for name in machine.portable if name != backend)
+        return (backend, *others), ()
+    instead = machine.portable[0] if machine.portable else "vmap"
+    note = (
+        f"The {backend} backend is not for the default device, {machine.platform}: running on"
+        f" {instead}."
+    )
+    return machine.portable, (note,)
+
+
+def single_run_executors(
+    backend: str, operations: int, machine: Machine
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """The executors for a single run, best first, and warnings about the request.
+
+    A requested executor that compiles kernels is always tried.  Otherwise only one is, and only if
+    its program is short enough.
+
+    Args:
+      backend: the requested one.
+      operations: of one evaluation of the closed loop.
+      machine: where it runs.
+    """
+    if machine.builds_kernels(backend):
+        return requested_executors(backend, machine)
+    if backend == "auto" and machine.builds_kernels(machine.automatic):
+        return (machine.automatic,), ()
+    if machine.platform != "cpu":
+        return (), ()
+    requested = (backend,) if backend in machine.portable else machine.portable
+    found = [name for name in requested if _fits(operations, machine.limits(name).evaluation)]
+    return tuple(found[:1]), ()
+
+
+def _fits(size: int, limit: int | None) -> bool:
+    return limit is None or size <= limit
+
+
+def slower_by_scan(reason: object) -> str:
+    """The warning that a scenario runs by the scan."""
+    return f"This scenario runs on the vmap backend, several times slower: {reason}."
+
+
+def scan_layout(platform: str, operations: int, runs: int | None, nested: bool) -> BatchLayout:
+    """How the scan runs a batch.
 
     Args:
       platform: as JAX names it.
@@ -157,53 +263,40 @@ def scan_shape(platform: str, operations: int, runs: int | None, nested: bool) -
       nested: whether a caller may batch, differentiate or loop over the result: XLA refuses machine
         functions there, or aborts.
     """
+    is_long = operations > LONG_EVALUATION
     if platform != "cpu" or nested:
-        return Shape("together", "none", operations > LONG_EVALUATION)
-    if operations > LONG_EVALUATION:
-        return Shape("in turn", "parts", True)
-    return Shape("together", "whole" if (runs or 1) <= SMALL_BATCH else "none", runs is None)
+        return BatchLayout("vmap", "none", is_long)
+    if is_long:
+        return BatchLayout("map", "parts", True)
+    is_small = (runs or 1) <= SMALL_BATCH
+    return BatchLayout("vmap", {True: "loop", False: "none"}[is_small], runs is None)
 
 
-def lowered_shape(platform: str, operations: int, runs: int, nested: bool) -> Shape:
+def lowered_layout(platform: str, operations: int, runs: int, nested: bool) -> BatchLayout:
     """How what surrounds a scalar program is compiled: for one run in two thirds of XLA's own time;
     of 48 runs, and of arms of many joints, XLA refuses a fusion.
     """
-    parts = platform == "cpu" and runs == 1 and operations <= LONG_EVALUATION and not nested
-    return Shape("together", "parts" if parts else "none", False)
+    in_parts = platform == "cpu" and runs == 1 and operations <= LONG_EVALUATION and not nested
+    return BatchLayout("vmap", {True: "parts", False: "none"}[in_parts], False)
 
 
-def executors_for(backend: str, platform: str) -> tuple[str, ...]:
-    """The executors that lower a step, best first, for what the user asked for; after them comes
-    scan.
+def compiles_states(operations: int) -> bool:
+    """Whether a kernel makes one step from each of many states: it is made few times, so that only
+    a short program pays.
     """
-    compiled = COMPILED.get(platform)
-    wanted = {"native": ("native",), "gpu": ("gpu",), "auto": (compiled,) if compiled else ()}.get(
-        backend, ()
-    )
-    return () if backend == "vmap" else (*wanted, "xla")
+    return operations <= LONG_EVALUATION
 
 
-def executor_of_one_run(compiled: str | None, platform: str, operations: int) -> str | None:
-    """The executor that one run is given unasked if its program is short enough; None for scan.
+def carries_tangents(limit: int | None, nodes: int, tangents: int) -> bool:
+    """Whether one kernel steps a run and all its tangents on "auto": longer ones compile for
+    minutes.
 
     Args:
-      compiled: the executor that builds kernels, if they can be, and may be, built here.
-      platform: as JAX names it.
-      operations: of one evaluation of the closed loop.
+      limit: of the executor (`Limits.derivatives`).
+      nodes: of a step without tangents.
+      tangents: how many.
     """
-    return compiled or ("xla" if platform == "cpu" and operations <= LONG_EVALUATION else None)
-
-
-def lowers_one_run(executor: str, nodes: int) -> bool:
-    """Whether one run is lowered unasked."""
-    return nodes <= LONGEST_ONE_RUN[executor]
-
-
-def lowers_derivatives(executor: str, nodes: int, tangents: int) -> bool:
-    """Whether derivatives are lowered unasked."""
-    return nodes * (1 + tangents) <= (
-        JVP_LARGEST_IN_SEGMENTS if executor == "native" else JVP_LARGEST
-    )
+    return _fits(nodes * (1 + tangents), limit)
 
 
 def xla_width(platform: str, nodes: int, runs: int) -> int:
@@ -220,12 +313,14 @@ def xla_stretch(steps: int, every: int) -> int:
     if steps <= most:
         return steps
     exact = next((d for d in range(most, 0, -every) if steps % d == 0), 0)
-    return exact if exact > most // 16 else most
+    if exact > most // 16:
+        return exact
+    return most
 
 
 def native_build(nodes: int, narrow: bool) -> tuple[int | None, tuple[str, ...]]:
-    """Nodes of a function of the generated C, None for one function, and how the compiler is told
-    to take it.
+    """Nodes of a function of the generated C, None for one function, and the flags of
+    the compiler.
 
     Args:
       nodes: of the step.

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from iblf_jax.core import checks
 from iblf_jax.engine.mechanism import Mechanism, known_of
-from iblf_jax.engine.plan import BACKENDS
+from iblf_jax.engine.registry import backends
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.scenario import Scenario
 
@@ -60,5 +60,5 @@ class RunRequest(NamedTuple):
 
 def check_backend(backend: str, argument: str = "backend") -> str:
     """Returns the name of a backend for batches; raises ValueError for an unknown one."""
-    checks.one_of(argument, backend, BACKENDS)
+    checks.one_of(argument, backend, backends())
     return backend

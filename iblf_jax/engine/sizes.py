@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from iblf_jax.core import devices
 from iblf_jax.engine import plan
+from iblf_jax.kernels import LoweringLimits
 
 STUDY_MEMORY = plan.STUDY_MEMORY
 """Bytes that runs in flight may take, unless the caller gives another number."""
@@ -71,3 +72,8 @@ def fresh_together(steps: int, compiled: int) -> int:
       compiled: runs for which the search has compiled a program.
     """
     return plan.fresh_together(devices.platform(), steps, compiled)
+
+
+def lowering_limits() -> LoweringLimits:
+    """Up to which sizes a step is expressed as a scalar program."""
+    return plan.LIMITS

@@ -11,7 +11,7 @@ sample alone counts.
 A step is a function (inputs, carry, index) -> (carry, records) of ONE run, and hashable: two steps
 that are equal compile once.  Before the first and after the last step come `start` and `verdict`,
 which hold no evaluation of the closed loop; what they need of it, its Jacobian, is stepped for too
-(`Probe`).
+(`LinearizationStep`).
 """
 
 from __future__ import annotations
@@ -48,14 +48,18 @@ from iblf_jax.simulation.signals import SIGNALS, Sample, has, speed_margin
 from iblf_jax.world.bounds import NARROWEST
 
 
-def Run(
-    steps: int,
-    method: str = "rk4",
-    record_every: int | None = None,
-    mechanism: Mechanism | None = None,
-) -> RunRequest:
-    """The former name of `RunRequest`."""
-    return RunRequest(steps, method, record_every, mechanism)
+class Run(RunRequest):
+    """The former name of `RunRequest`, whose `constants` were `mechanism`."""
+
+    def __new__(
+        cls,
+        steps: int,
+        method: str = "rk4",
+        record_every: int | None = None,
+        mechanism: Mechanism | None = None,
+    ):
+        """The request."""
+        return RunRequest(steps, method, record_every, mechanism)
 
 
 class Inputs(NamedTuple):
@@ -67,7 +71,7 @@ class Inputs(NamedTuple):
     folds: Any
     dt: jax.Array
     steps: jax.Array
-    """(), a float: whole numbers are no leaves of a scalar program."""
+    """(), a float: integers are not leaves of a scalar program."""
     noise: Any = ()
     """Of a sampled loop, the key of each run's noise (`sampling.noise_key`)."""
     direction: Any = ()
@@ -79,7 +83,7 @@ class Nearest(NamedTuple):
 
     xi: jax.Array
     t: jax.Array
-    around: Any
+    state: Any
     """What `closed_loop.perturbed_state` gives there."""
 
 
@@ -128,12 +132,10 @@ def sample_status(sample: Sample) -> jax.Array:
     )
 
 
-def is_sound(state: LoopState) -> jax.Array:
+def is_valid(state: LoopState) -> jax.Array:
     """Whether a state is finite and slow enough to be a robot's, () bool."""
-    slow, others = (
-        jnp.all(jnp.abs(state.dq) < VELOCITY_LIMIT),
-        jax.tree.leaves((state.q, integrated_part(state)[2:])),
-    )
+    slow = jnp.all(jnp.abs(state.dq) < VELOCITY_LIMIT)
+    others = jax.tree.leaves((state.q, integrated_part(state)[2:]))
     return jnp.all(jnp.stack([slow, *(jnp.all(jnp.isfinite(x)) for x in others)]))
 
 
@@ -149,19 +151,19 @@ def start(inputs: Inputs, method: str, jacobian: jax.Array) -> Carry:
     Args:
       inputs: of the run.
       method: the integrator.
-      jacobian: what a `Probe` has found at the start.
+      jacobian: what a `LinearizationStep` has found at the start.
     """
     state, zero = initial_state(inputs.scenario), jnp.zeros_like(inputs.dt)
     blank = _begun(inputs.folds, _blank_sample(inputs, state))
-    there, jacobian = jax.lax.stop_gradient((state, jacobian))
+    constant, jacobian = jax.lax.stop_gradient((state, jacobian))
     if inputs.scenario.sampling is not None:
-        jacobian = stability.per_time(jax.lax.stop_gradient(inputs.scenario), there, jacobian)
-    estimate = accuracy.begin(method, jacobian, there)
+        jacobian = stability.per_time(jax.lax.stop_gradient(inputs.scenario), constant, jacobian)
+    estimate = accuracy.begin(method, jacobian, constant)
     return Carry(
         state,
         blank,
         jnp.int32(0),
-        Nearest(-jnp.ones_like(zero), zero, perturbed_state(there)),
+        Nearest(-jnp.ones_like(zero), zero, perturbed_state(constant)),
         estimate,
     )
 
@@ -191,8 +193,14 @@ def _begun_at(index: jax.Array, folds: Any, sample: Sample, accumulators: tuple)
         jax.tree.structure(shapes),
         [isinstance(x, Var) and x in depends for x in closed.jaxpr.outvars],
     )
+
+    def of_first(depends_on_sample, new, old):
+        if not depends_on_sample:
+            return old
+        return jnp.where(index > 0, old, new)
+
     return jax.tree.map(
-        lambda yes, new, old: jnp.where(index > 0, old, new) if yes else old,
+        of_first,
         chosen,
         _begun(folds, sample),
         accumulators,
@@ -229,15 +237,20 @@ def _as_it_is(function: Callable) -> Callable:
     return function
 
 
-class Form(NamedTuple):
-    """How an executor wants a step to be written."""
+class StepOptions(NamedTuple):
+    """How the code of a step is generated for an executor; the numbers do not depend on it."""
 
     rolled: bool = False
-    """The stages of the integrator as a loop."""
+    """Whether the stages of the integrator are a loop."""
     piece: Callable = _as_it_is
-    """What is made of a function that is compiled on its own."""
+    """Applied to every part of the step that is compiled as a function of its own."""
     scalar: bool = False
-    """Whether it is taken apart into numbers, where equal ones are one."""
+    """Whether the step becomes a scalar program, in which equal numbers are computed once."""
+
+
+def is_derivative(step: Any) -> bool:
+    """Whether a step computes derivatives; steps without such an attribute do not."""
+    return getattr(step, "is_derivative", False)
 
 
 class _Moment(NamedTuple):
@@ -292,10 +305,13 @@ def _moment(inputs: Inputs, index: jax.Array, method: str, arrivals: tuple | Non
     """
     times, dt, number = inputs.scenario.jump_times(), inputs.dt, index.astype(inputs.dt.dtype)
     start = number * dt
-    span = jumps.Span(
-        start, (number + 1.0) * dt if times.size else start, dt, number < inputs.steps
-    )
-    here, last = (None, None) if arrivals is None else arrivals
+    end = start
+    if times.size:
+        end = (number + 1.0) * dt
+    span = jumps.Span(start, end, dt, number < inputs.steps)
+    here = last = None
+    if arrivals is not None:
+        here, last = arrivals
     before = jumps.Span((number - 1.0) * dt, start, dt)
     behind = jnp.where(index > 0, jumps.since_last(times, before, last), jnp.zeros_like(dt))
     restarts = None
@@ -320,7 +336,7 @@ def advance(
     carry: Carry,
     index: jax.Array,
     method: str,
-    form: Form,
+    options: StepOptions,
     loop: Callable = evaluate,
 ) -> Advanced:
     """One step: observe, integrate piece by piece, freeze what runs away.
@@ -329,78 +345,132 @@ def advance(
       inputs, carry: of the run.
       index: number of the instant, () int.
       method: the integrator.
-      form: how it is written.
+      options: how its code is generated.
       loop: stands for `closed_loop.evaluate`.
     """
-    scenario, dt = inputs.scenario, inputs.dt
-    at, state = form.piece(loop), carry.state
-    if scenario.sampling is None:
-        moment = _moment(inputs, index, method, None)
-        along = _Loop(at, inputs, state, ())
-        accumulators = carry.accumulators
-        early: tuple[Node, ...] = ()
-    else:
-        now = sampling.instant(scenario.sampling, dt, index)
-        due = (now.phase == 0) & (index > 0)
-        t = index.astype(dt.dtype) * dt
-        state = run_sampled_law_if_due(scenario, t, state, now, inputs.noise)
-        arriving = sampling.arriving(scenario.sampling, dt, now, state.sampled.commands)
-        before = sampling.arrival_before(scenario.sampling, dt, now)
-        arrivals = None if before is None else ((arriving.place * dt, arriving.changes), before)
-        moment = _moment(inputs, index, method, arrivals)
-        along = _Loop(at, inputs, state, (arriving.torque, arriving.next))
-        accumulators, early = _before_sample(along, carry, due, moment)
-        moment = moment._replace(behind=jnp.where(due, jnp.zeros_like(dt), moment.behind))
-
+    begin = _continuous_start
+    if inputs.scenario.sampling is not None:
+        begin = _sampled_start
+    start = begin(inputs, carry, index, method, options.piece(loop))
+    along, moment, state = start.along, start.moment, start.along.state
     first = moment.division.pieces[0]
-    stepped = _integrated(along, first, integrated_part(state), method, form)
-    ahead = jnp.where(moment.span.counts, first.length, jnp.zeros_like(dt))
-    step = jnp.where(index > 0, dt, jnp.zeros_like(dt))
+    stepped = _integrated(along, first, integrated_part(state), method, options)
+    ahead = jnp.where(moment.span.counts, first.length, jnp.zeros_like(inputs.dt))
+    step = jnp.where(index > 0, inputs.dt, jnp.zeros_like(inputs.dt))
     sample = _weighed(stepped.first, moment.span.start, 0.5 * (moment.behind + ahead), step)
-
-    def at_the_instant(inputs, index, accumulators, sample):
-        begun = _begun_at(index, inputs.folds, sample, accumulators)
-        return begun, _updated(inputs.folds, begun, sample)
-
-    begun, accumulators = form.piece(at_the_instant)(inputs, index, accumulators, sample)
-    if scenario.sampling is None:
+    begun, accumulators = options.piece(_observed)(inputs, index, start.accumulators, sample)
+    if inputs.scenario.sampling is None:
         stepped, accumulators = _across_jumps(
             along, first, state, method, stepped, begun, accumulators
         )
-    later = _later_pieces(along, moment.division.pieces, stepped, accumulators, method, form)
+    later = _later_pieces(along, moment.division.pieces, stepped, accumulators, method, options)
     parts = [(first.length, stepped.slopes), *later.parts]
-
-    def at_the_end(inputs, carry, index, sample, parts, later, before, goes_on, restarts, overfull):
-        near = jnp.max(jnp.abs(jax.lax.stop_gradient(sample.xi)))
-        here = Nearest(near, sample.t, jax.lax.stop_gradient(perturbed_state(before)))
-        nearest = keep_if(near > carry.nearest.xi, here, carry.nearest)
-        held = inputs.scenario.sampling is not None
-        width = sample.upper - sample.lower
-        estimate = accuracy.update(
-            carry.accuracy, method, inputs.dt, index, parts, width, held, restarts, overfull
-        )
-        moved, raised = later
-        status = carry.status | sample_status(sample)
-        status = status if raised is None else status | raised
-        sound = is_sound(moved) & (status & int(Status.NOT_FINITE) == 0)
-        status |= flag(~sound & goes_on, Status.NOT_FINITE)
-        return keep_if(sound & goes_on, moved, before), status, nearest, estimate
-
-    moved, division = with_integrated_part(state, later.moved), moment.division
-    after, status, nearest, estimate = form.piece(at_the_end)(
+    after, status, nearest, estimate = options.piece(partial(_concluded, method))(
         inputs,
         carry,
         index,
         sample,
         parts,
-        (moved, later.status),
+        (with_integrated_part(state, later.moved), later.status),
         state,
         moment.span.counts,
         moment.restarts,
-        division.overfull,
+        moment.division.overfull,
     )
-    nodes = (Node(begun, sample, True), *early, *later.nodes)
+    nodes = (Node(begun, sample, True), *start.nodes, *later.nodes)
     return Advanced(Carry(after, later.accumulators, status, nearest, estimate), nodes, state)
+
+
+class _Start(NamedTuple):
+    """What a step begins with."""
+
+    along: _Loop
+    moment: _Moment
+    accumulators: tuple
+    """After the sample before the law runs, where there is one."""
+    nodes: tuple[Node, ...]
+    """That sample."""
+
+
+def _continuous_start(
+    inputs: Inputs, carry: Carry, index: jax.Array, method: str, evaluated: Callable
+) -> _Start:
+    """The start of a step of a loop whose law acts continuously."""
+    moment = _moment(inputs, index, method, None)
+    return _Start(_Loop(evaluated, inputs, carry.state, ()), moment, carry.accumulators, ())
+
+
+def _sampled_start(
+    inputs: Inputs, carry: Carry, index: jax.Array, method: str, evaluated: Callable
+) -> _Start:
+    """The start of a step of a sampled loop: its law runs where it is due, and commands arrive."""
+    scenario, dt = inputs.scenario, inputs.dt
+    assert scenario.sampling is not None
+    now = sampling.instant(scenario.sampling, dt, index)
+    due = (now.phase == 0) & (index > 0)
+    t = index.astype(dt.dtype) * dt
+    state = run_sampled_law_if_due(scenario, t, carry.state, now, inputs.noise)
+    arriving = sampling.arriving(scenario.sampling, dt, now, state.sampled.commands)
+    before = sampling.arrival_before(scenario.sampling, dt, now)
+    arrivals = None
+    if before is not None:
+        arrivals = ((arriving.place * dt, arriving.changes), before)
+    moment = _moment(inputs, index, method, arrivals)
+    along = _Loop(evaluated, inputs, state, (arriving.torque, arriving.next))
+    accumulators, nodes = _before_sample(along, carry, due, moment)
+    behind = jnp.where(due, jnp.zeros_like(dt), moment.behind)
+    return _Start(along, moment._replace(behind=behind), accumulators, nodes)
+
+
+def _observed(
+    inputs: Inputs, index: jax.Array, accumulators: tuple, sample: Sample
+) -> tuple[tuple, tuple]:
+    """The accumulators before and after the sample of an instant."""
+    begun = _begun_at(index, inputs.folds, sample, accumulators)
+    return begun, _updated(inputs.folds, begun, sample)
+
+
+def _concluded(
+    method: str,
+    inputs: Inputs,
+    carry: Carry,
+    index: jax.Array,
+    sample: Sample,
+    parts: list,
+    later: tuple[LoopState, Any],
+    before: LoopState,
+    goes_on: jax.Array,
+    restarts: Any,
+    overfull: Any,
+) -> tuple[LoopState, jax.Array, Nearest, accuracy.Accuracy]:
+    """State, status, nearest instant and accuracy after a step; a state that runs away is frozen.
+
+    Args:
+      method: the integrator.
+      inputs, carry: of the run.
+      index: number of the instant, () int.
+      sample: of the instant.
+      parts: lengths and slopes of the pieces of the step.
+      later: the state at the end of the step, and the flags raised within it.
+      before: the state at its start.
+      goes_on: whether the step is made, () bool.
+      restarts, overfull: of `_Moment` and its division.
+    """
+    near = jnp.max(jnp.abs(jax.lax.stop_gradient(sample.xi)))
+    here = Nearest(near, sample.t, jax.lax.stop_gradient(perturbed_state(before)))
+    nearest = keep_if(near > carry.nearest.xi, here, carry.nearest)
+    is_sampled = inputs.scenario.sampling is not None
+    width = sample.upper - sample.lower
+    estimate = accuracy.update(
+        carry.accuracy, method, inputs.dt, index, parts, width, is_sampled, restarts, overfull
+    )
+    after, raised = later
+    status = carry.status | sample_status(sample)
+    if raised is not None:
+        status = status | raised
+    valid = is_valid(after) & (status & int(Status.NOT_FINITE) == 0)
+    status |= flag(~valid & goes_on, Status.NOT_FINITE)
+    return keep_if(valid & goes_on, after, before), status, nearest, estimate
 
 
 def _across_jumps(
@@ -462,7 +532,7 @@ def _split_floats(tree: Any) -> tuple[list[jax.Array], Callable]:
 
 
 def _integrated(
-    along: _Loop, piece: jumps.Piece, moved: LoopState, method: str, form: Form
+    along: _Loop, piece: jumps.Piece, moved: LoopState, method: str, options: StepOptions
 ) -> integrators.Stepped:
     """One step of the integrator over a piece."""
     return integrators.step(
@@ -471,7 +541,7 @@ def _integrated(
         piece.begin,
         moved,
         piece.length,
-        rolled=form.rolled,
+        rolled=options.rolled,
     )
 
 
@@ -485,8 +555,8 @@ def _before_sample(
     folds, scenario, dt = along.inputs.folds, along.inputs.scenario, along.inputs.dt
     if not folds:
         return carry.accumulators, ()
-    held = carry.state.sampled.commands
-    torque = sampling.torque_before(scenario.sampling, dt, held, along.state.sampled.commands)  # type: ignore[arg-type]
+    commands = carry.state.sampled.commands
+    torque = sampling.torque_before(scenario.sampling, dt, commands, along.state.sampled.commands)  # type: ignore[arg-type]
     t, behind = moment.span.start, moment.behind
     seen_at = (
         t
@@ -534,7 +604,7 @@ def _later_pieces(
     stepped: integrators.Stepped,
     accumulators: tuple,
     method: str,
-    form: Form,
+    options: StepOptions,
 ) -> _Later:
     """The pieces after the first, each with the samples before and after the jump at which it
     begins.
@@ -542,7 +612,9 @@ def _later_pieces(
     # These pieces are rare: their stages are a loop, which compiles in a fraction of the time.
     folds, none = along.inputs.folds, jnp.zeros_like(along.inputs.dt)
     moved, parts, nodes = stepped.state, [], []
-    status = jnp.int32(0) if len(pieces) > 1 else None
+    status = None
+    if len(pieces) > 1:
+        status = jnp.int32(0)
     for last, piece in itertools.pairwise(pieces):
 
         def further(kept, last=last, piece=piece):
@@ -553,9 +625,13 @@ def _later_pieces(
                 left = along.at(last, last.begin + last.length, moved)[1]
                 left = _weighed(left, piece.begin, 0.5 * last.length, none)
                 between = accumulators = _updated(folds, accumulators, left)
-            made = _integrated(along, piece, moved, method, form._replace(rolled=not form.scalar))
+            made = _integrated(
+                along, piece, moved, method, options._replace(rolled=not options.scalar)
+            )
             right = _weighed(made.first, piece.begin, 0.5 * piece.length, none)
-            accumulators = _updated(folds, between, right) if folds else ()
+            accumulators = ()
+            if folds:
+                accumulators = _updated(folds, between, right)
             if along.inputs.scenario.sampling is None:
                 made, accumulators = _across_jumps(
                     along, piece, moved, method, made, between, accumulators
@@ -579,12 +655,14 @@ def _later_pieces(
 
 def recorded(folds: Any, found: Advanced):
     """What a run keeps of an instant: the sample, and the states of law and observer."""
-    state = found.state
+    state, measured = found.state, ()
+    if state.sampled:
+        measured = state.sampled.measured
     states = (
         state.controller,
         state.observer,
         state.actuator,
-        state.sampled.measured if state.sampled else (),
+        measured,
     )
     return {name: getattr(found.sample, name) for name in SIGNALS}, *states
 
@@ -605,19 +683,24 @@ class TimeStep:
     """Function (folds, what `advance` found) of an instant."""
 
     @staticmethod
-    def of(run: RunRequest) -> TimeStep:
+    def of(request: RunRequest) -> TimeStep:
         """The step of a run."""
-        return TimeStep(run.method, None if run.record_every is None else recorded)
+        if request.record_every is None:
+            return TimeStep(request.method)
+        return TimeStep(request.method, recorded)
 
-    def __call__(self, inputs: Inputs, carry: Carry, index: jax.Array, form: Form):
+    def __call__(self, inputs: Inputs, carry: Carry, index: jax.Array, options: StepOptions):
         """The carry after the step, and what is recorded."""
-        found = advance(inputs, carry, index, self.method, form)
-        return found.carry, self.record(inputs.folds, found) if self.record else ()
+        found = advance(inputs, carry, index, self.method, options)
+        if self.record is None:
+            return found.carry, ()
+        return found.carry, self.record(inputs.folds, found)
 
 
-class Probed(NamedTuple):
-    """A state whose perturbed_state are looked at; it stays as it is, so what it decides is computed
-    once.
+class Linearization(NamedTuple):
+    """The carry of a `LinearizationStep`: a state around which the closed loop is linearized.
+
+    The state does not change, so what it decides is computed once.
     """
 
     time: jax.Array
@@ -628,28 +711,27 @@ class Probed(NamedTuple):
     jacobian: jax.Array
     """By the numbers that `accuracy` watches, by differences of three sizes, (3, m', m') [1/s];
     `stability.resolved` makes one of them."""
-    unseen: accuracy.UnresolvedSignals
+    unresolved: accuracy.UnresolvedSignals
     """Of the run; its torque is turned into what it accelerates, as that takes the robot's mass
     matrix."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Probe:
+class LinearizationStep:
     """The closed loop's derivative along one direction after the other.
 
-    The directions are at first the units of the numbers that `accuracy` watches.  Where these are
-    the whole state, the modes follow from them; else more directions do, those of the power
-    iteration.
+    The directions are at first the unit vectors of the numbers that `accuracy` watches.  Where
+    these are the complete state, the modes follow from them; otherwise a power iteration adds more
+    directions.
     """
 
-    def __call__(self, inputs: Inputs, carry: Probed, index: jax.Array, form: Form):
+    def __call__(
+        self, inputs: Inputs, carry: Linearization, index: jax.Array, options: StepOptions
+    ):
         """The carry after the step; nothing is recorded."""
         start = initial_state(inputs.scenario)
-        watched, whole, x = (
-            accuracy.watched_indices(start),
-            ravel_pytree(perturbed_state(start))[1],
-            carry.state,
-        )
+        watched, x = accuracy.watched_indices(start), carry.state
+        as_state = ravel_pytree(perturbed_state(start))[1]
         iteration = index - 3 * watched.size
         count = jnp.asarray(watched.size, index.dtype)
         level = jax.lax.div(index, count)
@@ -661,11 +743,12 @@ class Probe:
 
         def rate_at(y):
             return ravel_pytree(
-                perturbed_rate(inputs.scenario, carry.time, whole(y), inputs.dt, form.piece)
+                perturbed_rate(inputs.scenario, carry.time, as_state(y), inputs.dt, options.piece)
             )[0]
 
-        around = whole(x)
-        plant = around if inputs.scenario.sampling is None else around.plant
+        plant = as_state(x)
+        if inputs.scenario.sampling is not None:
+            plant = plant.plant
         rooms = stability.largest_difference_sizes(inputs.scenario, carry.time, plant, x.size)
         room = jnp.where(
             iteration < 0, jnp.sum(rooms * unit), jnp.asarray(stability.WIDEST, x.dtype)
@@ -687,41 +770,49 @@ class Probe:
         columns = jnp.arange(watched.size, dtype=index.dtype) == number
         chosen = (jnp.arange(3, dtype=index.dtype) == level)[:, None, None] & columns
         jacobian = jnp.where(chosen, jnp.stack([w[i] for i in watched])[:, None], carry.jacobian)
-        unseen = keep_if(
-            index == 0, accuracy.with_acceleration(inputs.scenario, carry.unseen), carry.unseen
+        unresolved = keep_if(
+            index == 0,
+            accuracy.with_acceleration(inputs.scenario, carry.unresolved),
+            carry.unresolved,
         )
-        return Probed(carry.time, x, growth, jacobian, unseen), ()
+        return Linearization(carry.time, x, growth, jacobian, unresolved), ()
 
 
-def probe_steps(scenario: Scenario) -> int:
-    """Steps of a `Probe`."""
+def linearization_steps(scenario: Scenario) -> int:
+    """Steps of a `LinearizationStep`."""
     state = initial_state(scenario)
     watched = accuracy.watched_indices(state).size
-    return 3 * watched + (
-        0 if watched == ravel_pytree(perturbed_state(state))[0].size else stability.POWER_ITERATIONS
-    )
+    if watched == ravel_pytree(perturbed_state(state))[0].size:
+        return 3 * watched
+    return 3 * watched + stability.POWER_ITERATIONS
 
 
-def fastest_mode(scenario: Scenario, probed: Probed) -> jax.Array:
-    """The mode that a `Probe` has found, () [1/s]: of what a step integrates."""
-    jacobian = stability.resolved(probed.jacobian, scenario.sampling is not None)
+def fastest_mode(scenario: Scenario, found: Linearization) -> jax.Array:
+    """The mode that a `LinearizationStep` has found, () [1/s]: of what a step integrates."""
+    jacobian = stability.resolved(found.jacobian, scenario.sampling is not None)
     if scenario.sampling is not None:
         size = ravel_pytree(integrated_part(initial_state(scenario)))[0].size
         return stability.growth_rate_by(jacobian[:size, :size])
-    complete = len(jacobian) == probed.state.size
-    return stability.growth_rate_by(jacobian) if complete else stability.growth_rate(probed.growth)
+    is_complete = len(jacobian) == found.state.size
+    if is_complete:
+        return stability.growth_rate_by(jacobian)
+    return stability.growth_rate(found.growth)
 
 
-def probed(
-    time: jax.Array, around: Any, watched: int, unseen: accuracy.UnresolvedSignals
-) -> Probed:
-    """The carry of a `Probe` of what `perturbed_state` gave, of which `accuracy` watches so many
-    numbers.
+def linearization_at(
+    time: jax.Array, state: Any, watched: int, unresolved: accuracy.UnresolvedSignals
+) -> Linearization:
+    """The carry of a `LinearizationStep` at a state, as `perturbed_state` gives it, of which
+    `accuracy` watches so many numbers.
     """
-    x = ravel_pytree(around)[0]
+    x = ravel_pytree(state)[0]
     return jax.lax.stop_gradient(
-        Probed(
-            time, x, stability.growth_start(x), jnp.zeros((3, watched, watched), x.dtype), unseen
+        Linearization(
+            time,
+            x,
+            stability.growth_start(x),
+            jnp.zeros((3, watched, watched), x.dtype),
+            unresolved,
         )
     )
 
@@ -745,8 +836,12 @@ def folded(folds: Any, samples: Sample) -> dict[str, jax.Array]:
     )
 
 
-def verdict(
-    inputs: Inputs, method: str, carry: Carry, unseen: accuracy.UnresolvedSignals, instants: Probed
+def outcome_of(
+    inputs: Inputs,
+    method: str,
+    carry: Carry,
+    unresolved: accuracy.UnresolvedSignals,
+    instants: Linearization,
 ) -> Outcome:
     """The folds' results and the accuracy, and the status with the verdict on the step.
 
@@ -754,10 +849,10 @@ def verdict(
       inputs: of the run.
       method: the integrator.
       carry: after the last step.
-      unseen: what a `Probe` has found for the run.
+      unresolved: what a `LinearizationStep` has found for the run.
       instants: what it has found at some of them.
     """
-    estimate = accuracy.with_unresolved(carry.accuracy, unseen)
+    estimate = accuracy.with_unresolved(carry.accuracy, unresolved)
     modes = jax.vmap(partial(fastest_mode, inputs.scenario))(instants)
     mode = jnp.max(jnp.where(jnp.isfinite(modes), modes, 0.0))
     limit = integrators.tableau(method).stability

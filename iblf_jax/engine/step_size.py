@@ -21,10 +21,10 @@ from jax.flatten_util import ravel_pytree
 
 from iblf_jax.core import checks, notices
 from iblf_jax.core.status import VELOCITY_LIMIT, Status
-from iblf_jax.engine.execute import run_one
 from iblf_jax.engine.machine_function import machine_function
 from iblf_jax.engine.plan import STEP_SIZE_CHUNK
 from iblf_jax.engine.request import RunRequest
+from iblf_jax.engine.single_run import run_one
 from iblf_jax.simulation import accuracy, jumps
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
 from iblf_jax.simulation.integrators import tableau
@@ -97,69 +97,65 @@ def _advanced(
     """The pair up to so many steps later: one machine function, as XLA's own loops take longer to
     go round than a small arm to compute.
     """
-    whole = ravel_pytree(initial_state(scenario))[1]
-    n = scenario.n
 
     def chunk(scenario, dt, steps, pair):
-        cuts, times = jnp.asarray(CUTS, dt.dtype), scenario.jump_times()
+        times = scenario.jump_times()
 
         def one(pair, _):
-            number = pair.step.astype(dt.dtype)
-            begin, after = number * dt, (number + 1.0) * dt
-
-            def part(both, cut):
-                coarse, fine = both
-                whole_step, h = cut[1] - cut[0] == 1.0, (cut[1] - cut[0]) * dt
-                x = jnp.where(whole_step, coarse, fine)
-
-                span = jumps.Span(
-                    begin + cut[0] * dt, jnp.where(cut[1] == 1.0, after, begin + cut[1] * dt), h
-                )
-                division = jumps.divided(times, span)
-                stepped = jumps.integrated(
-                    method, partial(evaluate, scenario), division, whole(x), rolled=True
-                )
-                new, sample = ravel_pytree(stepped.state)[0], stepped.first
-                seen = (stepped.parts, sample.upper - sample.lower, sample.xi, division.overfull)
-                return (jnp.where(whole_step, new, coarse), jnp.where(whole_step, fine, new)), seen
-
-            (coarse, fine), (parts, widths, xis, overfull) = jax.lax.scan(
-                part, (pair.coarse, pair.fine), cuts
-            )
-            width, of_coarse = widths[0], jax.tree.map(lambda x: x[0], parts)
-            reach = accuracy.steps_back(method)
-            restarts = jumps.within(times, (number - reach) * dt, after) if times.size else None
-            overfull = None if overfull is None else overfull[0]
-            estimate = accuracy.update(
-                pair.estimate,
-                method,
-                dt,
-                pair.step,
-                of_coarse,
-                width,
-                restarts=restarts,
-                overfull=overfull,
-            )
-            near = jnp.max(jnp.abs(xis[1]))
-            nearest = jax.tree.map(
-                partial(jnp.where, near > pair.nearest[0]), (near, begin, pair.fine), pair.nearest
-            )
-            off = jnp.max(jnp.abs(coarse[:n] - fine[:n]) / width)
-            going = jnp.all(jnp.isfinite(fine)) & jnp.all(jnp.abs(fine[n : 2 * n]) < VELOCITY_LIMIT)
-            difference = jnp.where(
-                going,
-                jnp.maximum(pair.difference, jnp.where(off <= 1.0, off, jnp.inf)),
-                pair.difference,
-            )
-            after = Pair(pair.step + 1, coarse, fine, estimate, difference, nearest, going)
-            return (
-                jax.tree.map(partial(jnp.where, pair.going & (pair.step < steps)), after, pair),
-                None,
-            )
+            after = _one_step(scenario, times, dt, pair, method)
+            goes_on = pair.going & (pair.step < steps)
+            return jax.tree.map(partial(jnp.where, goes_on), after, pair), None
 
         return jax.lax.scan(one, pair, None, STEP_SIZE_CHUNK)[0]
 
     return machine_function(chunk)(scenario, dt, steps, pair)
+
+
+def _one_step(scenario: Scenario, times: jax.Array, dt: jax.Array, pair: Pair, method: str) -> Pair:
+    """Both runs one step later; `times` are the jump times."""
+    n = scenario.n
+    as_state = ravel_pytree(initial_state(scenario))[1]
+    number = pair.step.astype(dt.dtype)
+    begin, end = number * dt, (number + 1.0) * dt
+
+    def part(both, cut):
+        coarse, fine = both
+        is_coarse, h = cut[1] - cut[0] == 1.0, (cut[1] - cut[0]) * dt
+        x = jnp.where(is_coarse, coarse, fine)
+        end_of_part = jnp.where(cut[1] == 1.0, end, begin + cut[1] * dt)
+        division = jumps.divided(times, jumps.Span(begin + cut[0] * dt, end_of_part, h))
+        stepped = jumps.integrated(
+            method, partial(evaluate, scenario), division, as_state(x), rolled=True
+        )
+        new, sample = ravel_pytree(stepped.state)[0], stepped.first
+        seen = (stepped.parts, sample.upper - sample.lower, sample.xi, division.overfull)
+        return (jnp.where(is_coarse, new, coarse), jnp.where(is_coarse, fine, new)), seen
+
+    (coarse, fine), seen = jax.lax.scan(part, (pair.coarse, pair.fine), jnp.asarray(CUTS, dt.dtype))
+    parts, width, _, overfull = jax.tree.map(lambda x: x[0], seen)
+    xi_of_fine = seen[2][1]
+    restarts = None
+    if times.size:
+        restarts = jumps.within(times, (number - accuracy.steps_back(method)) * dt, end)
+    estimate = accuracy.update(
+        pair.estimate,
+        method,
+        dt,
+        pair.step,
+        parts,
+        width,
+        restarts=restarts,
+        overfull=overfull,
+    )
+    near = jnp.max(jnp.abs(xi_of_fine))
+    nearest = jax.tree.map(
+        partial(jnp.where, near > pair.nearest[0]), (near, begin, pair.fine), pair.nearest
+    )
+    off = jnp.max(jnp.abs(coarse[:n] - fine[:n]) / width)
+    going = jnp.all(jnp.isfinite(fine)) & jnp.all(jnp.abs(fine[n : 2 * n]) < VELOCITY_LIMIT)
+    larger = jnp.maximum(pair.difference, jnp.where(off <= 1.0, off, jnp.inf))
+    difference = jnp.where(going, larger, pair.difference)
+    return Pair(pair.step + 1, coarse, fine, estimate, difference, nearest, going)
 
 
 @jax.jit
@@ -191,7 +187,14 @@ def fastest_along(scenario: Scenario, times: np.ndarray) -> float:
 def _mode(scenario: Scenario, t: float | jax.Array, state: LoopState) -> float:
     """The fastest mode at one state [1/s]."""
     found = np.asarray(jacobian(scenario, jnp.asarray(t, scenario.initial.q.dtype), state), float)
-    return float(np.max(np.abs(np.linalg.eigvals(found)))) if np.all(np.isfinite(found)) else np.inf
+    return largest_eigenvalue(found)
+
+
+def largest_eigenvalue(matrices: np.ndarray) -> float:
+    """The largest modulus of an eigenvalue of some matrices; infinite where they are not finite."""
+    if not np.all(np.isfinite(matrices)):
+        return np.inf
+    return float(np.max(np.abs(np.linalg.eigvals(matrices))))
 
 
 def round_down(dt: float) -> float:
@@ -210,8 +213,11 @@ def smaller(dt: float, excess: float, order: int) -> float:
     """The round step to try after dt, whose error is `excess` times what it may be: one to ten
     times smaller.
     """
-    wanted = dt / max(min(excess, 1e9), 1.0) ** (1.0 / order)
-    return round_down(min(max(wanted, dt / 10.0), 0.7 * dt))
+    bounded = 1e9
+    if np.isfinite(excess):
+        bounded = max(min(excess, 1e9), 1.0)
+    sufficient = dt / bounded ** (1.0 / order)
+    return round_down(min(max(sufficient, dt / 10.0), 0.7 * dt))
 
 
 def find_dt(scenario: Scenario, *, duration: float, method: str) -> float:
@@ -230,19 +236,19 @@ def find_dt(scenario: Scenario, *, duration: float, method: str) -> float:
         )
     dt = for_modes = min(comfortable_dt(mode), round_down(duration))
     _can_be_tried(duration, dt)
-    whole = ravel_pytree(initial_state(scenario))[1]
+    as_state = ravel_pytree(initial_state(scenario))[1]
     while duration / dt <= MOST_TRIED:
         pair = side_by_side(scenario, dt, math.ceil(duration / dt * (1 - 1e-9)), method=method)
         excess = max(
             float(pair.difference) / GOAL, float(pair.estimate.relative) / accuracy.TOLERANCE
         )
         if not excess > 1.0:
-            limit = comfortable_dt(_mode(scenario, pair.nearest[1], whole(pair.nearest[2])))
+            limit = comfortable_dt(_mode(scenario, pair.nearest[1], as_state(pair.nearest[2])))
             if dt <= limit:
                 return dt
             dt = for_modes = limit
         else:
-            dt = smaller(dt, excess if np.isfinite(excess) else np.inf, order)
+            dt = smaller(dt, excess, order)
     notices.warn(
         f"No step down to {duration / MOST_TRIED:.1g} s makes this run accurate: the loop may"
         f" magnify every error, or a signal may be faster than that. {for_modes:g} s is what the"
@@ -262,7 +268,7 @@ def _find_part(scenario: Scenario, duration: float, method: str) -> float:
     parts, before, poor_before, coarser = 1, None, 0, period
     while periods * parts <= MOST_TRIED:
         dt = jnp.asarray(period / parts, scenario.initial.q.dtype)
-        found = run_one(scenario, (), dt, RunRequest(periods * parts, method, parts), noise=noise)
+        found = run_one(scenario, (), dt, RunRequest(periods * parts, method, parts), noise)
         q, width = found.records[0]["q"], found.records[0]["upper"] - found.records[0]["lower"]
         poor = int(found.status) & int(Status.STEP_TOO_LARGE | Status.INACCURATE)
         if (

@@ -243,12 +243,12 @@ def _in_pieces(
     numbers = jnp.arange(signs.start.size + 1, dtype=crossings.rank.dtype)
     done, _ = jax.lax.scan(piece, start, numbers)
     end = loop.evaluate(t + dt, _with_derivative_of(after[0], done.state))[1]
-    whole = [
+    full_step = [
         0.5 * dt * (first + last) for first, last in zip(gains, loop.gains_of(end), strict=True)
     ]
     found = (
         done.state,
-        [x + more - less for x, more, less in zip(after[1], done.gained, whole, strict=True)],
+        [x + more - less for x, more, less in zip(after[1], done.gained, full_step, strict=True)],
     )
     return jax.tree.map(lambda new, old: jnp.where(done.usable, new, old), found, after)
 
@@ -317,7 +317,7 @@ def _piece(
     middle, sample = evaluated(since + 0.5 * length, _moved(state, 0.5 * length, first))
     middle = _sum(middle, sliding)
     reached = _moved(state, length, middle)
-    last = jax.tree.map(lambda half, whole: 2.0 * half - whole, middle, first)
+    last = jax.tree.map(lambda half, full: 2.0 * half - full, middle, first)
     g, dg = along(target, since + length, reached, last)
     correction, late = _time_to(g, dg, dt)
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from functools import lru_cache, partial
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -23,16 +23,24 @@ import numpy as np
 from jax.custom_batching import custom_vmap
 from jax.custom_derivatives import SymbolicZero
 
-from iblf_jax.core import checks, devices
-from iblf_jax.engine import execute, plan
+from iblf_jax.core import checks
+from iblf_jax.core.caches import CACHE
+from iblf_jax.engine import plan, registry
 from iblf_jax.engine.batch import Batch, Leaves, run_all
 from iblf_jax.engine.columns import ACCURACY, Places, columns, floats_of, numbers_of
+from iblf_jax.engine.compile import (
+    first_that_works,
+    inputs_of,
+    loop_of,
+    operations,
+    run_lowered,
+)
 from iblf_jax.engine.executors import scan
 from iblf_jax.engine.mechanism import known_of
+from iblf_jax.engine.plan import PLAIN_LAYOUT, ExecutionPlan
 from iblf_jax.engine.request import RunRequest
+from iblf_jax.engine.single_run import run_one
 from iblf_jax.engine.step import Outcome, recorded
-from iblf_jax.kernels.program import UnsupportedError
-from iblf_jax.kernels.toolchain import ToolchainError
 from iblf_jax.simulation.scenario import Scenario
 
 
@@ -41,84 +49,89 @@ class Runs(NamedTuple):
 
     treedef: Any
     """Of the `Inputs`."""
-    run: RunRequest
+    request: RunRequest
     executor: str
-    is_lane: tuple[bool, ...]
+    is_per_run: tuple[bool, ...]
     """Which leaves have a run axis."""
     runs: int = 1
 
     def batch(self, leaves: tuple) -> Batch:
         """Of all runs."""
-        shared, lane = (
-            [x for x, yes in zip(leaves, self.is_lane, strict=True) if yes is which]
-            for which in (False, True)
-        )
-        return Batch(
-            Leaves(self.treedef, self.is_lane, shared, lane),
-            self.runs,
-            mechanism=self.run.constants,
-        )
+        groups = Leaves.of(self.treedef, self.is_per_run, leaves)
+        return Batch(groups, self.runs, constants=self.request.constants)
+
+    @property
+    def plan(self) -> ExecutionPlan:
+        """One executor; no warning reports the scan, which gives the same derivatives."""
+        return ExecutionPlan((self.executor,), PLAIN_LAYOUT, PLAIN_LAYOUT, False)
 
 
 def run_transformable(
-    scenario: Scenario,
-    folds: Any,
-    dt: jax.Array,
-    run: RunRequest,
-    *,
-    backend: str = "auto",
-    noise: Any = None,
+    scenario: Scenario, folds: Any, dt: jax.Array, request: RunRequest, noise: Any = None
 ) -> Outcome:
     """One run that may be batched and differentiated from outside.
 
     Args:
-      scenario, folds, dt, run, noise: as `execute.run_one`.
-      backend: what its derivatives are computed on: "xla" for plain JAX, else kernels where they
+      scenario, folds, dt, noise: as `single_run.run_one`.
+      request: its backend is that of the derivatives: "xla" for plain JAX, else kernels where they
         can be built.
     """
-    leaves, treedef = jax.tree.flatten(execute.inputs_of(scenario, folds, dt, run, noise))
-    name, reason = execute.automatic()
-    request = run._replace(constants=known_of(scenario), backend="auto")
+    leaves, treedef = jax.tree.flatten(inputs_of(scenario, folds, dt, request, noise))
+    name, reason = registry.automatic()
+    compiles = request.backend != "xla" and reason is None
+    request = request._replace(constants=known_of(scenario), backend="auto")
     runs = Runs(treedef, request, name, (False,) * len(leaves))
-    return (
-        _differentiable(runs)(*leaves)
-        if backend != "xla" and reason is None
-        else _plain(runs, *leaves)
-    )
+    if compiles:
+        return _differentiable(runs)(*leaves)
+    return _run_by_scan(runs, *leaves)
 
 
 @partial(jax.jit, static_argnums=0)
-def _plain(runs: Runs, *leaves: jax.Array) -> Outcome:
+def _run_by_scan(runs: Runs, *leaves: jax.Array) -> Outcome:
     """The run by the scan."""
     inputs = jax.tree.unflatten(runs.treedef, leaves)
-    shape = plan.scan_shape(devices.platform(), execute.operations(inputs), None, nested=True)
-    return run_all(scan, Batch.of(inputs, None, shape), runs.run)
+    platform = registry.machine().platform
+    layout = plan.scan_layout(platform, operations(inputs), None, nested=True)
+    return run_all(scan, Batch.of(inputs, None, layout), runs.request)
 
 
-@lru_cache(maxsize=64)
-def _differentiable(runs: Runs, is_asked: bool = False) -> Callable:
-    """`_plain` with the kernel's derivatives; `is_asked`: the value beside a derivative is the
-    kernel's too.
+@CACHE.memoised(64)
+def _differentiable(runs: Runs, beside_derivative: bool = False) -> Callable:
+    """The run, with derivatives by the kernel.
+
+    Args:
+      runs: what is run.
+      beside_derivative: whether the value is computed beside a derivative, and so by the kernel,
+        too.
     """
-    whole = jax.custom_jvp(partial(_value if is_asked else _plain, runs))
+    value: Callable = _run_by_scan
+    if beside_derivative:
+        value = _run_by_kernel
+    run: Any = jax.custom_jvp(partial(value, runs))
 
     def rule(leaves, tangents):
         places, moves = _moves(tangents)
-        by_kernel = _by_kernel(runs, (places,), leaves)
-        if by_kernel is not None:
-            try:
-                found = _differentiable(runs, True)(*leaves)
-                return found, _in_form_of(found, *_times(by_kernel, moves, 0))
-            except (UnsupportedError, ToolchainError):
-                pass
-        return jax.jvp(
-            lambda *moved: _plain(runs, *_put(leaves, places, moved)),
-            [leaves[i] for i in places],
-            moves,
-        )
 
-    whole.defjvp(rule, symbolic_zeros=True)
-    return whole
+        def by_scan(_=None):
+            moved = partial(_replaced, leaves, places)
+            return jax.jvp(
+                lambda *values: _run_by_scan(runs, *moved(values)),
+                [leaves[i] for i in places],
+                moves,
+            )
+
+        by_kernel = _by_kernel(runs, (places,), leaves)
+        if by_kernel is None:
+            return by_scan()
+
+        def attempt(_):
+            found = _differentiable(runs, True)(*leaves)
+            return found, _in_form_of(found, *_times(by_kernel, moves, 0))
+
+        return first_that_works(runs.plan, attempt, by_scan)
+
+    run.defjvp(rule, symbolic_zeros=True)
+    return run
 
 
 def _moves(tangents: tuple) -> tuple[tuple[int, ...], list[jax.Array]]:
@@ -133,18 +146,18 @@ def _times(J: Any, moves: list[jax.Array], axis: int) -> Any:
     return jax.tree.map(lambda x: jnp.tensordot(x, direction, ((axis,), (0,))), J)
 
 
-def _put(leaves: tuple, places: tuple[int, ...], moved: Sequence[jax.Array]) -> tuple:
+def _replaced(leaves: tuple, places: tuple[int, ...], moved: Sequence[jax.Array]) -> tuple:
     """The leaves, some of them replaced."""
     new = dict(zip(places, moved, strict=True))
     return tuple(new.get(i, x) for i, x in enumerate(leaves))
 
 
-def _value(runs: Runs, *leaves: jax.Array) -> Outcome:
+def _run_by_kernel(runs: Runs, *leaves: jax.Array) -> Outcome:
     """The run by the kernel."""
     if checks.is_concrete(leaves):
         inputs = jax.tree.unflatten(runs.treedef, leaves)
-        run = runs.run._replace(constants=known_of(inputs.scenario))
-        return execute.run_one(inputs.scenario, inputs.folds, inputs.dt, run, noise=inputs.noise)
+        request = runs.request._replace(constants=known_of(inputs.scenario))
+        return run_one(inputs.scenario, inputs.folds, inputs.dt, request, inputs.noise)
     return jax.tree.map(lambda x: x[0], _over_runs(_values, runs)(*leaves))
 
 
@@ -152,10 +165,10 @@ def _by_kernel(runs: Runs, places: Places, leaves: tuple) -> Any:
     """A derivative of records and metrics by the kernel, differentiable; None where there is
     none.
     """
-    scenario = len(jax.tree.leaves(jax.tree.unflatten(runs.treedef, runs.is_lane).scenario))
-    if not all(i < scenario for level in places for i in level) or not plan.keeps_columns(
-        len(places), _size(runs, places, leaves)
-    ):
+    scenario = jax.tree.unflatten(runs.treedef, runs.is_per_run).scenario
+    number_of_leaves = len(jax.tree.leaves(scenario))
+    by_scenario = all(i < number_of_leaves for level in places for i in level)
+    if not by_scenario or not plan.keeps_columns(len(places), _size(runs, places, leaves)):
         return None
     kernel = jax.custom_jvp(
         lambda *leaves: jax.tree.map(lambda x: x[0], _over_runs(_columns, runs, places)(*leaves))
@@ -164,51 +177,49 @@ def _by_kernel(runs: Runs, places: Places, leaves: tuple) -> Any:
     def rule(leaves, tangents):
         more, moves = _moves(tangents)
         second = _by_kernel(runs, (*places, more), leaves)
-        if second is None:
-            return jax.jvp(
-                lambda *moved: _by_scan(runs, places, _put(leaves, more, moved)),
-                [leaves[i] for i in more],
-                moves,
-            )
-        return kernel(*leaves), _times(second, moves, len(places))
+        if second is not None:
+            return kernel(*leaves), _times(second, moves, len(places))
+        return jax.jvp(
+            lambda *moved: _by_scan(runs, places, _replaced(leaves, more, moved)),
+            [leaves[i] for i in more],
+            moves,
+        )
 
     kernel.defjvp(rule, symbolic_zeros=True)
-    try:
-        return kernel(*leaves)
-    except (UnsupportedError, ToolchainError):
-        return None
+    return first_that_works(runs.plan, lambda _: kernel(*leaves), lambda: None)
 
 
 def _by_scan(runs: Runs, places: Places, leaves: tuple) -> Any:
     """As `_by_kernel`, by the scan."""
     if not places:
-        found = _plain(runs, *leaves)
+        found = _run_by_scan(runs, *leaves)
         folded = {name: x for name, x in found.metrics.items() if name not in ACCURACY}
         return floats_of(found.records), {
             name: x for name, x in folded.items() if jnp.issubdtype(x.dtype, jnp.floating)
         }
-    level, shapes = places[-1], [jnp.shape(leaves[i]) for i in places[-1]]
+    level = places[-1]
+    shapes = [jnp.shape(leaves[i]) for i in level]
     ends = np.cumsum([math.prod(shape) for shape in shapes])
 
     def along(unit):
-        parts = [
-            x.reshape(shape) for x, shape in zip(jnp.split(unit, ends[:-1]), shapes, strict=True)
-        ]
+        parts = jnp.split(unit, ends[:-1])
+        directions = [x.reshape(shape) for x, shape in zip(parts, shapes, strict=True)]
         return jax.jvp(
-            lambda *moved: _by_scan(runs, places[:-1], _put(leaves, level, moved)),
+            lambda *moved: _by_scan(runs, places[:-1], _replaced(leaves, level, moved)),
             [leaves[i] for i in level],
-            parts,
+            directions,
         )[1]
 
-    return jax.vmap(along, out_axes=len(places) - 1)(
-        jnp.eye(ends[-1], dtype=leaves[level[0]].dtype)
-    )
+    units = jnp.eye(ends[-1], dtype=leaves[level[0]].dtype)
+    return jax.vmap(along, out_axes=len(places) - 1)(units)
 
 
 def _size(runs: Runs, places: Places, leaves: tuple) -> int:
     """Numbers of a derivative of one run's records."""
-    every, inputs = runs.run.record_every, jax.tree.unflatten(runs.treedef, leaves)
-    numbers = 0 if every is None else numbers_of(inputs, recorded) * (runs.run.steps // every + 1)
+    every, numbers = runs.request.record_every, 0
+    if every is not None:
+        samples = runs.request.steps // every + 1
+        numbers = numbers_of(jax.tree.unflatten(runs.treedef, leaves), recorded) * samples
     return numbers * math.prod(sum(jnp.size(leaves[i]) for i in level) for level in places)
 
 
@@ -220,17 +231,19 @@ def _over_runs(function: Callable, runs: Runs, *static: Any) -> Callable:
 
     @batched.def_vmap
     def rule(size, is_batched, *leaves):
-        def widened(x, new, lane):
-            if not (new or lane):
+        def widened(x, is_new, is_per_run):
+            if not (is_new or is_per_run):
                 return x
-            x = x if new else jnp.broadcast_to(x, (size, *x.shape))
-            return x.reshape(-1, *x.shape[2:]) if lane else jnp.repeat(x, runs.runs, axis=0)
+            if not is_new:
+                x = jnp.broadcast_to(x, (size, *x.shape))
+            if is_per_run:
+                return x.reshape(-1, *x.shape[2:])
+            return jnp.repeat(x, runs.runs, axis=0)
 
-        lane = tuple(map(bool.__or__, is_batched, runs.is_lane))
-        wide = [widened(*each) for each in zip(leaves, is_batched, runs.is_lane, strict=True)]
-        found = _over_runs(function, runs._replace(is_lane=lane, runs=size * runs.runs), *static)(
-            *wide
-        )
+        wide = map(widened, leaves, is_batched, runs.is_per_run)
+        is_per_run = tuple(map(bool.__or__, is_batched, runs.is_per_run))
+        more = runs._replace(is_per_run=is_per_run, runs=size * runs.runs)
+        found = _over_runs(function, more, *static)(*wide)
         found = jax.tree.map(lambda x: x.reshape(size, runs.runs, *x.shape[1:]), found)
         return found, jax.tree.map(lambda _: True, found)
 
@@ -239,26 +252,32 @@ def _over_runs(function: Callable, runs: Runs, *static: Any) -> Callable:
 
 @partial(jax.jit, static_argnums=0)
 def _values(runs: Runs, leaves: tuple) -> Outcome:
-    return execute.run_lowered(runs.executor, runs.batch(leaves), runs.run)
+    def run(loop, batch):
+        return run_all(loop, batch, runs.request)
+
+    executor = registry.EXECUTORS[runs.executor]
+    return run_lowered(executor, runs.batch(leaves), runs.request, run)
 
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _columns(runs: Runs, places: Places, leaves: tuple) -> Any:
-    return columns(execute.executor_named(runs.executor), runs.batch(leaves), places, runs.run)
+    loop = loop_of(registry.EXECUTORS[runs.executor])
+    return columns(loop, runs.batch(leaves), places, runs.request)
 
 
 def _in_form_of(found: Outcome, records: list[jax.Array], metrics: dict[str, jax.Array]) -> Outcome:
     """Tangents in the form of an outcome."""
     each = iter(records)
+
+    def of_record(x: jax.Array) -> Any:
+        if jnp.issubdtype(x.dtype, jnp.floating):
+            return next(each)
+        return _no_tangent(x)
+
+    no_tangents = {name: _no_tangent(x) for name, x in found.metrics.items()}
     return Outcome(
-        jax.tree.map(
-            lambda x: next(each) if jnp.issubdtype(x.dtype, jnp.floating) else _no_tangent(x),
-            found.records,
-        ),
-        {
-            name: metrics[name] if name in metrics else _no_tangent(x)
-            for name, x in found.metrics.items()
-        },
+        jax.tree.map(of_record, found.records),
+        no_tangents | metrics,
         _no_tangent(found.status),
         _no_tangent(found.fastest_mode),
     )
@@ -266,8 +285,6 @@ def _in_form_of(found: Outcome, records: list[jax.Array], metrics: dict[str, jax
 
 def _no_tangent(x: jax.Array) -> Any:
     """The tangent of what does not depend on any leaf, or cannot."""
-    return (
-        jnp.zeros_like(x)
-        if jnp.issubdtype(x.dtype, jnp.floating)
-        else np.zeros(jnp.shape(x), jax.dtypes.float0)
-    )
+    if jnp.issubdtype(x.dtype, jnp.floating):
+        return jnp.zeros_like(x)
+    return np.zeros(jnp.shape(x), jax.dtypes.float0)

@@ -22,9 +22,16 @@ from iblf_jax.core import devices
 from iblf_jax.engine import plan
 from iblf_jax.engine.evaluator import Entry, Evaluator, Table, on_cpu
 from iblf_jax.engine.machine_function import machine_function
-from iblf_jax.kernels.packed import Packed
-from iblf_jax.kernels.passes import written_out
-from iblf_jax.kernels.program import LANE, SHARED, TIME, Program, UnsupportedError, frontier
+from iblf_jax.kernels import (
+    PER_RUN,
+    SHARED,
+    TIME,
+    Packed,
+    Program,
+    UnsupportedError,
+    frontier,
+    written_out,
+)
 
 
 def run(
@@ -84,7 +91,7 @@ def _in_blocks(
     classes = program.classes()
     once = {i: shared[n.value] for i, n in enumerate(program.nodes) if n.op == "shared"}
     Evaluator(program, ()).compute(once, frontier(program, classes, SHARED, lambda c: c != SHARED))
-    columns = frontier(program, classes, TIME, lambda c: bool(c & LANE))
+    columns = frontier(program, classes, TIME, lambda c: bool(c & PER_RUN))
 
     def block(once, table, lane, carry):
         return _block(program, once, columns, table, lane, carry, every)
@@ -120,9 +127,11 @@ def _block(
     width = carry.floats.shape[1]
     evaluator = Evaluator(program, (width,))
     values = _separate(program, carry)
-    fixed = once | {i: lane[n.value] for i, n in enumerate(program.nodes) if n.op == "lane"}
+    fixed = once | {i: lane[n.value] for i, n in enumerate(program.nodes) if n.op == "per_run"}
     fixed |= {a: values[c] for c, (a, o) in enumerate(program.carry) if a == o}
-    evaluator.compute(fixed, frontier(program, program.classes(), LANE, lambda c: c == LANE | TIME))
+    evaluator.compute(
+        fixed, frontier(program, program.classes(), PER_RUN, lambda c: c == PER_RUN | TIME)
+    )
     moving = [c for c, (a, o) in enumerate(program.carry) if a != o]
     outputs = [program.carry[c][1] for c in moving]
 
@@ -218,3 +227,8 @@ def _joined(program: Program, values: list[jax.Array], runs: int) -> Packed:
         return jnp.stack(some) if some else jnp.zeros((0, runs), dtype)
 
     return Packed(rows("f", program.dtype), rows("ib", jnp.int32))
+
+
+def build(program: Program, shared: int, per_run: int, runs: int, steps: int) -> None:
+    """Raises UnsupportedError where a program is too long; XLA compiles it with its caller."""
+    compilable(program)

@@ -7,7 +7,7 @@ is that of a study file (`files.study`):
     preset = "zhang_yan_2024"
     [run]                                   # duration, dt, method
     duration = 5.0
-    [tune]                                  # arguments of `tune`: runs, seed, risk, level, iterations
+    [tune]                                  # runs, seed, risk, level, iterations of `tune`
     parameters = [
       "controller.k1",
       { path = "controller.K2", low = 0.6, high = 40.0, tied = true },
@@ -77,7 +77,7 @@ from iblf_jax.tuning.options import EARLIER_NAMES, REPLACED, Report
 from iblf_jax.tuning.parameters import tunable
 from iblf_jax.tuning.result import TuneResult, TuneSetup
 from iblf_jax.tuning.robust import KINDS, Risk, as_risk, cvar
-from iblf_jax.tuning.runs import BACKENDS
+from iblf_jax.tuning.runs import check_backend
 from iblf_jax.tuning.solvers import SOLVERS
 from iblf_jax.world.robots import joint_names
 
@@ -178,6 +178,7 @@ def _options(table: dict[str, Any]) -> dict[str, Any]:
         options["solver"] = _solver(table["solver"])
     if "report" in table:
         report = as_table(table["report"], "tune.report")
+        known_keys(report, "tune.report", [field.name for field in dataclasses.fields(Report)])
         options["report"] = components.construct(Report, dict(report), "tune.report")
     if "risk" in table:
         checks.one_of("tune.risk", table["risk"], KINDS)
@@ -248,15 +249,14 @@ _NO_NUMBERS = {"fold": "a metric", "name": "the name of one of its results"}
 def _with_weights(table: dict[str, Any], key: str, names: tuple[str, ...]) -> dict[str, Any]:
     """A table whose `joints` are a selection; those of earlier versions were weights."""
     given: Any = table.get("joints")
-    whole = isinstance(given, list) and bool(given) and all(type(x) is int for x in given)
-    if not (holds_weights(given) or whole):
+    is_integers = isinstance(given, list) and bool(given) and all(type(x) is int for x in given)
+    if not (holds_weights(given) or is_integers):
         return table
     n = len(names)
-    if (
-        whole and len(given) != n
-    ):  # earlier versions took one weight a joint, so this is a selection
+    # Earlier versions took one weight a joint, so another number of integers is a selection.
+    if is_integers and len(given) != n:
         return table
-    if whole and {x % n for x in given if -n <= x < n} == set(range(n)):
+    if is_integers and {x % n for x in given if -n <= x < n} == set(range(n)):
         text = (
             f"{key}.joints = {given} selects all joints. Earlier versions read it as weights: write"
             f" weights = {given} if you mean these."
@@ -316,7 +316,7 @@ def _objective(terms: Any, requirements: Any, names: tuple[str, ...]) -> Objecti
     return total
 
 
-# ------------------------------------------------------------------------------------------------------------- saved results
+# ----------------------------------------------------------------------------------- saved results
 
 
 RESULT = (
@@ -334,13 +334,14 @@ RESULT = (
 
 
 def save_tuning(result: TuneResult, path: str | os.PathLike) -> None:
-    """Writes a result to a JSON file that `load_tuning` gives back; errors as `TuneResult.save`."""
-    target, setup = checks.file_to_write("path", path), result.setup
+    """Writes a result to a JSON file that `load_tuning` reads; errors as `TuneResult.save`."""
+    target = checks.file_to_write("path", path)
+    setup = result.setup
     history = {
         name: {"dtype": str(x.dtype), "shape": x.shape, "values": x.ravel().tolist()}
         for name, x in result.history.items()
     }
-    plain = (
+    of_setup = (
         "runs",
         "seed",
         "duration",
@@ -358,7 +359,7 @@ def save_tuning(result: TuneResult, path: str | os.PathLike) -> None:
         "start": scenario_to_dict(result.start),
         "values": {key: np.asarray(x).tolist() for key, x in result.values.items()},
         "history": history,
-        "setup": {name: getattr(setup, name) for name in plain},
+        "setup": {name: getattr(setup, name) for name in of_setup},
         "risk": list(setup.risk),
         "objective": components.encode_fields(setup.objective, "objective"),
         "perturbations": {
@@ -417,10 +418,8 @@ def _with_new_names(table: Any) -> Any:
     return found
 
 
-def _decoded(data: dict[str, Any]) -> TuneResult:
-    """The result that `save_tuning` encoded."""
-    start = from_dict(data["start"]).scenario
-    values = {key: np.asarray(numbers(x, key)) for key, x in data["values"].items()}
+def _decoded_setup(data: dict[str, Any]) -> TuneSetup:
+    """The options of a saved result, checked."""
     setup = TuneSetup(
         objective=checked(
             components.decode_fields(Objective, _with_new_names(data["objective"]), "objective")
@@ -441,25 +440,23 @@ def _decoded(data: dict[str, Any]) -> TuneResult:
         },
     )
     tableau(setup.method)
-    checks.one_of("backend", setup.backend, BACKENDS)
+    check_backend(setup.backend)
     checks.whole_steps(setup.duration, setup.dt)
     check_confidence(setup.confidence)
     for name in ("runs", "report_runs"):
         checks.positive_integer(name, getattr(setup, name), most=MOST_RUNS)
     for name in ("seed", "report_seed"):
         checks.seed(getattr(setup, name))
-    targets_of(start, setup.perturbations)
-    words = {
-        name: checks.word(name, data[name], "a string") for name in ("stopped", "optimiser", "mode")
-    }
-    # Earlier versions called SQP "newton".
-    words["optimiser"] = EARLIER_NAMES.get(words["optimiser"], words["optimiser"])
-    names = tuple(checks.word("names", name, "a string") for name in data["names"])
-    history = {name: _array(data["history"][name], kinds) for name, kinds in HISTORY.items()}
+    return setup
+
+
+def _decoded_history(table: dict[str, Any], count: int) -> dict[str, np.ndarray]:
+    """The history of a saved result of so many tuned numbers, checked."""
+    history = {name: _array(table[name], kinds) for name, kinds in HISTORY.items()}
     steps, starts, size = history["x"].shape
     shapes = {name: x.shape[:2] for name, x in history.items() if name != "evaluations"}
     if (
-        size != len(names)
+        size != count
         or not steps
         or set(shapes.values()) != {(steps, starts)}
         or history["evaluations"].shape != (steps,)
@@ -467,8 +464,25 @@ def _decoded(data: dict[str, Any]) -> TuneResult:
         raise checks.fail(
             "history",
             Words("arrays that do not fit each other"),
-            f"(steps, starts, ...) of {len(names)} numbers",
+            f"(steps, starts, ...) of {count} numbers",
         )
+    return history
+
+
+def _decoded(data: dict[str, Any]) -> TuneResult:
+    """The result that `save_tuning` encoded."""
+    start = from_dict(data["start"]).scenario
+    values = {key: np.asarray(numbers(x, key)) for key, x in data["values"].items()}
+    setup = _decoded_setup(data)
+    targets_of(start, setup.perturbations)
+    words = {
+        name: checks.word(name, data[name], "a string") for name in ("stopped", "optimiser", "mode")
+    }
+    # Earlier versions called SQP "newton".
+    words["optimiser"] = EARLIER_NAMES.get(words["optimiser"], words["optimiser"])
+    names = tuple(checks.word("names", name, "a string") for name in data["names"])
+    history = _decoded_history(data["history"], len(names))
+    starts = history["x"].shape[1]
     best = checks.positive_integer("best_start", data["best_start"], least=0, most=starts - 1)
     seconds = checks.positive_number("seconds", data["seconds"], "s", zero=True)
     ends = [tuple(float(x) for x in data[name]) for name in ("multipliers", "residuals")]

@@ -1,8 +1,8 @@
-"""Folders in which something is made before it is moved to its place in one piece.
+"""Temporary folders in which files are written before they are moved to their place at once.
 
-The maker of a draft holds a lock on its folder, which the system drops when the process ends,
-however it ends.  A draft whose lock can be had is therefore nobody's any more, and whoever makes
-the next one removes it.
+The owner of a draft holds a lock on its folder, which the system releases when the process ends,
+however it ends. A draft whose lock is free is therefore abandoned, and the next draft of the same
+name removes it.
 """
 
 from __future__ import annotations
@@ -20,22 +20,21 @@ from pathlib import Path
 
 try:
     import fcntl
-except ImportError:  # Windows: age alone tells
+except ImportError:  # on Windows, only the age of a draft decides
     fcntl = None  # type: ignore[assignment]
 
 STALE = 3600.0
-"""Seconds after which a draft is nobody's where no lock can tell: made on another machine, or on a
-disk without locks."""
+"""Seconds after which a draft counts as abandoned where locks do not work: it was made on another
+machine, or on a disk without locks."""
 
 
 @contextlib.contextmanager
 def draft(parent: Path, name: str) -> Iterator[Path]:
-    """A new folder in `parent` that nobody else can enter; gone at the end, with what has not been
-    moved out of it.
+    """A new folder in `parent` that only this user can enter; it is removed at the end.
 
     Args:
       parent: a folder that exists.
-      name: what is made; drafts of the same name that killed processes have left are removed first.
+      name: name of the draft; abandoned drafts of the same name are removed first.
 
     Raises:
       OSError: the folder cannot be made.
@@ -47,7 +46,7 @@ def draft(parent: Path, name: str) -> Iterator[Path]:
         path = parent / f".{name}.{machine}.{uuid.uuid4().hex[:16]}.partial"
         path.mkdir(mode=0o700)
         lock = _locked(path, wait=True)
-        if path.exists():  # else another process took it for abandoned between the two lines above
+        if path.exists():  # else another process removed it before it was locked
             break
         _release(lock)
     try:
@@ -58,24 +57,28 @@ def draft(parent: Path, name: str) -> Iterator[Path]:
 
 
 def remove_abandoned(path: Path, *, lockable: bool) -> None:
-    """Removes a folder that nobody works in any more; links are left alone.
+    """Removes an abandoned folder; links are not touched.
 
     Args:
       path: the folder.
-      lockable: whether its maker, if alive, is on this machine and holds a lock on it.
+      lockable: whether its owner, if it runs, is on this machine and holds a lock on it.
     """
     with contextlib.suppress(OSError):
         if path.is_symlink():
             return
-        lock = _locked(path, wait=False) if lockable else None
+        lock = None
+        if lockable:
+            lock = _locked(path, wait=False)
         if lock is not None or time.time() - path.lstat().st_mtime > STALE:
             shutil.rmtree(path, ignore_errors=True)
         _release(lock)
 
 
 def _locked(path: Path, *, wait: bool) -> int | None:
-    """A lock on a folder, as an open file; None where there are no locks.  BlockingIOError if
-    another holds it and `wait` is False.
+    """A lock on a folder, as an open file; None where locks do not work.
+
+    Raises:
+      BlockingIOError: another process holds it and `wait` is False.
     """
     if fcntl is None:
         return None
@@ -83,8 +86,11 @@ def _locked(path: Path, *, wait: bool) -> int | None:
         folder = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
     except OSError:
         return None
+    operation = fcntl.LOCK_EX
+    if not wait:
+        operation |= fcntl.LOCK_NB
     try:
-        fcntl.flock(folder, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        fcntl.flock(folder, operation)
     except BlockingIOError:
         os.close(folder)
         raise

@@ -1,38 +1,48 @@
-"""C from a scalar program: one function for what only shared leaves decide, one for what time
-decides, one for a block of runs, and one for each function that the program calls (the closed loop
-of an arm).
+"""Writes the C of a scalar program.
 
-The text is plain statements, one a node, and the same for every target; the headers around it say
-what it means.  On a CPU `c/vector.h` makes of a name a vector of runs, `c/mathlib.h` has the
-elementary functions and `c/driver.h` the loops and threads; on a GPU `c/scalar.h` makes of it the
-number of one thread's run, and `c/kernels.h` has the kernels.  Out of the package `c/plain.h` makes
-of it a number of C99, and `plain_function` gives the function alone.
+The C has one function for the numbers that only shared leaves decide, one for those that time
+decides, one that steps a block of runs, and one for each function that the program calls (the
+closed loop of an arm).
+
+The text is one statement per node, the same for every target; the headers before and after it
+define its meaning. On a CPU, `c/vector.h` makes a name a vector of runs, `c/mathlib.h` has the
+elementary functions, and `c/driver.h` the loops and threads. On a GPU, `c/scalar.h` makes a name
+the number of one thread's run, and `c/kernels.h` has the kernels. For export, `c/plain.h` makes a
+name a number of C99, and `plain_function` writes one function.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib.resources import files
 from types import MappingProxyType
 
 import numpy as np
 
-from iblf_jax.kernels.layout import FunctionCalls, Layout, literal, places, unpacked
+from iblf_jax.kernels.layout import FunctionCalls, Layout, c_type, literal, places, unpacked
 from iblf_jax.kernels.operations import OPERATIONS
 from iblf_jax.kernels.passes import scheduled
-from iblf_jax.kernels.program import LANE, TIME, Node, Program, UnsupportedError, frontier, needed
+from iblf_jax.kernels.program import (
+    PER_RUN,
+    TIME,
+    Node,
+    Program,
+    UnsupportedError,
+    frontier,
+    needed,
+)
 
 NATIVE = (("vector.h", "mathlib.h", "records.h"), ("frame.h", "driver.h"))
 CUDA = (("scalar.h", "mathlib.h", "records.h"), ("kernels.h",))
 """The headers before and after the generated functions, by target."""
 TURNS = frozenset({"sin", "cos"})
-"""Operations that `mathlib.h` has in two parts: a polynomial, and what takes its place where an
-angle is huge."""
+"""Operations that `mathlib.h` has in two parts: a polynomial, and its replacement for large
+angles."""
 
 
 def expression(node: Node, args: list[str], kinds: list[str]) -> str:
-    """One operation in C; `args` are expressions of vectors."""
+    """The C of one operation; `args` are the C expressions of its arguments, of these kinds."""
     op = node.op
     if op == "convert":
         return _conversion(kinds[0], node.kind, args[0])
@@ -43,9 +53,14 @@ def expression(node: Node, args: list[str], kinds: list[str]) -> str:
 
 
 def _conversion(source: str, target: str, arg: str) -> str:
+    """The C of a conversion from one kind to another."""
+    if source == "b" and target == "f":
+        return f"{arg} ? splat(1) : splat(0)"
     if source == "b":
-        return f"{arg} ? splat(1) : splat(0)" if target == "f" else f"{arg} & 1"
-    return f"to_float({arg})" if target == "f" else f"to_int({arg})"
+        return f"{arg} & 1"
+    if target == "f":
+        return f"to_float({arg})"
+    return f"to_int({arg})"
 
 
 SEEN_BY_FUNCTION = (
@@ -66,21 +81,24 @@ SEEN_BY_ADVANCE = (
     "F *r",
     "I *s",
 )
-"""What the generated functions are given, besides their places."""
+"""Parameters of the generated functions, besides the arrays of numbers that they share."""
 
 
 class _Emitter:
-    """Statements for nodes; `names` are the C expressions of nodes that were read or computed
-    already.
+    """Writes statements for nodes.
 
-    `tables` says into which table each lookup looks, by the table's text; `calls` where the numbers
-    of a call are.
+    Args:
+      program: the program.
+      tables: text of a table -> its name in the C; the program's tables are added.
+      calls: places of the arguments and results of calls.
+
+    `names`, an argument of many methods, has the C expressions of nodes that are computed already.
     """
 
     def __init__(self, program: Program, tables: dict[str, str], calls: FunctionCalls) -> None:
         self.program = program
         self.turns = TURNS
-        """Operations of which several are done with one test (`_turned`)."""
+        """Operations of which several share one test (`_sines`)."""
         self.classes = program.classes()
         self.lines: list[str] = []
         self.tables = {
@@ -90,91 +108,95 @@ class _Emitter:
         }
         self.calls = calls
         self.in_place: dict[int, int] = {}
-        """Choices that change a carried number where it stands -> the number before."""
+        """Selections that overwrite a carried number in its place -> the node of the number before
+        the step."""
         self.end: list[str] = []
-        """What stands at the end of every function."""
+        """Statements at the end of every function."""
 
     def _numbers(self, lookup: Node) -> str:
-        """The bits of its table, which are constants for every compiler; infinity is a function's
-        result for some.
-        """
+        """The bits of a lookup's table: infinity is no constant for some compilers."""
         bits = np.asarray(lookup.value, self.program.dtype).view(f"u{self.program.dtype.itemsize}")
         return ", ".join(f"(integer){x:#x}" for x in bits.tolist())
 
-    def needed(self, names: dict[int, str], wanted: Iterable[int]) -> list[int]:
-        """The nodes without a name that `wanted` needs, in order."""
-        return needed(self.program.nodes, wanted, names)
+    def needed(self, names: dict[int, str], outputs: Iterable[int]) -> list[int]:
+        """The nodes without a name that the outputs depend on, in order."""
+        return needed(self.program.nodes, outputs, names)
 
     def statements(
         self,
         names: dict[int, str],
-        wanted: Iterable[int],
+        outputs: Iterable[int],
         stored: Mapping[int, str] = MappingProxyType({}),
     ) -> None:
-        """Adds statements for `wanted` and what it needs; `stored` has places in memory of some of
-        them.
+        """Adds statements that compute the outputs and what they depend on.
+
+        Args:
+          names: see the class; the new names are added.
+          outputs: nodes.
+          stored: places in memory to which some nodes are written, too.
         """
         nodes = self.program.nodes
-        order = self.needed(names, wanted)
-        turns = [i for i in order if nodes[i].op in self.turns]
+        order = self.needed(names, outputs)
+        sines = [i for i in order if nodes[i].op in self.turns]
         for i in order:
-            node = nodes[i]
             if i in names:
                 continue
-            together = (
-                [j for j in turns if j not in names and nodes[j].args[0] in names]
-                if node.op in self.turns
-                else []
-            )
-            if len(together) > 1:
-                self._turned(together, names, stored)
-                continue
-            if node.op == "const":
-                names[i] = literal(node, self.program.dtype)
-                continue
-            if node.op == "result":
-                names[i] = self.calls.results[i]
-                continue
-            args = [names[a] for a in node.args]
-            if i in self.in_place:
-                condition, yes, no = args
-                old, new, unless = (
-                    (no, yes, "") if node.args[2] == self.in_place[i] else (yes, no, "!")
-                )
-                self.lines.append(f"  if ({unless}AT({condition}, 0)) {old} = {new};")
-                names[i] = old
-                continue
-            if node.op == "call":
-                self.lines += self.calls.statements(i, args)
-                names[i] = "called"
-                continue
-            if node.op == "lookup":
-                text = f"f_lookup({self.tables[i]}, {len(node.value)}, {args[0]})"
-            else:
-                text = expression(node, args, [nodes[a].kind for a in node.args])
-            self.lines.append(f"  {'F' if node.kind == 'f' else 'I'} v{i} = {text};")
-            names[i] = f"v{i}"
-            if i in stored:  # at once: a compiler then needs no place of its own for it
-                self.lines.append(f"  {stored[i]} = v{i};")
+            if nodes[i].op in self.turns:
+                ready = [j for j in sines if j not in names and nodes[j].args[0] in names]
+                if len(ready) > 1:
+                    self._sines(ready, names, stored)
+                    continue
+            names[i] = self._statement(i, names)
+            if i in stored:  # at once: a compiler then needs no register for it
+                self.lines.append(f"  {stored[i]} = {names[i]};")
 
-    def _turned(self, turns: list[int], names: dict[int, str], stored: Mapping[int, str]) -> None:
-        """Adds statements for sines and cosines: all whose angles are there, as one test sees
-        whether any of these is huge.
+    def _statement(self, i: int, names: dict[int, str]) -> str:
+        """Adds the statement of a node, if it needs one; returns its name."""
+        node = self.program.nodes[i]
+        if node.op == "const":
+            return literal(node, self.program.dtype)
+        if node.op == "result":
+            return self.calls.results[i]
+        args = [names[a] for a in node.args]
+        if i in self.in_place:
+            return self._overwritten(i, args)
+        if node.op == "call":
+            self.lines += self.calls.statements(i, args)
+            return "called"
+        if node.op == "lookup":
+            text = f"f_lookup({self.tables[i]}, {len(node.value)}, {args[0]})"
+        else:
+            text = expression(node, args, [self.program.nodes[a].kind for a in node.args])
+        self.lines.append(f"  {c_type(node)} v{i} = {text};")
+        return f"v{i}"
+
+    def _overwritten(self, i: int, args: list[str]) -> str:
+        """Adds a statement that overwrites a carried number where a selection takes another one;
+        returns the number's name.
+        """
+        condition, yes, no = args
+        if self.program.nodes[i].args[2] == self.in_place[i]:
+            self.lines.append(f"  if (AT({condition}, 0)) {no} = {yes};")
+            return no
+        self.lines.append(f"  if (!AT({condition}, 0)) {yes} = {no};")
+        return yes
+
+    def _sines(self, sines: list[int], names: dict[int, str], stored: Mapping[int, str]) -> None:
+        """Adds statements for sines and cosines whose angles are computed: one test decides
+        whether any of the angles is large.
         """
         nodes = self.program.nodes
-        angles = {i: names[nodes[i].args[0]] for i in turns}
-        names |= {i: f"v{i}" for i in turns}
+        angles = {i: names[nodes[i].args[0]] for i in sines}
+        names |= {i: f"v{i}" for i in sines}
         self.lines += [f"  F v{i} = near_{nodes[i].op}({angle});" for i, angle in angles.items()]
-        self.lines.append(
-            "  if"
-            f" (RARELY({' | '.join(f'is_far({angle})' for angle in dict.fromkeys(angles.values()))})) {{"
-        )
+        is_any_far = " | ".join(f"is_far({angle})" for angle in dict.fromkeys(angles.values()))
+        self.lines.append(f"  if (RARELY({is_any_far})) {{")
         self.lines += [
             f"    v{i} = {nodes[i].op}_where(is_far({angle}), {angle}, v{i});"
             for i, angle in angles.items()
         ]
         self.lines.append("  }")
-        self.lines += [f"  {stored[i]} = v{i};" for i in turns if i in stored]
+        self.lines += [f"  {stored[i]} = v{i};" for i in sines if i in stored]
 
     def function(self, head: str) -> str:
         """The C function of the statements so far."""
@@ -182,50 +204,69 @@ class _Emitter:
         return f"{head} {{\n{body}\n}}\n"
 
 
-def sizes(program: Program, shared_leaves: int, lane_leaves: int) -> str:
-    """The definitions of the sizes that the headers ask for."""
+def sizes(program: Program, shared_leaves: int, per_run_leaves: int) -> str:
+    """The definitions of the sizes that the headers use.
+
+    Args:
+      program: the program.
+      shared_leaves: number of shared leaf entries.
+      per_run_leaves: number of leaf entries of each run.
+    """
     constants, columns, floats, ints = map(len, Layout.of(program))
     values: dict[str, object] = {
-        "SHARED_LEAVES": shared_leaves, "LEAVES": lane_leaves, "FLOATS": floats, "INTS": ints, "CONSTANTS": constants,
-        "COLUMNS": columns, "DOUBLE": int(program.dtype == np.float64),
-    }  # fmt: skip
-    values["RECORDED"], values["RECORDED_SIZES"] = (
-        len(program.recorded),
-        f"{{{', '.join(map(str, [*program.recorded, 0]))}}}",
-    )
+        "SHARED_LEAVES": shared_leaves,
+        "LEAVES": per_run_leaves,
+        "FLOATS": floats,
+        "INTS": ints,
+        "CONSTANTS": constants,
+        "COLUMNS": columns,
+        "DOUBLE": int(program.dtype == np.float64),
+        "RECORDED": len(program.recorded),
+        # C has no empty list of initial values.
+        "RECORDED_SIZES": f"{{{', '.join(map(str, [*program.recorded, 0]))}}}",
+    }
     return "".join(f"#define {name} {value}\n" for name, value in values.items())
 
 
 def source(
     program: Program,
     shared_leaves: int,
-    lane_leaves: int,
+    per_run_leaves: int,
     target: tuple[tuple[str, ...], ...] = NATIVE,
     segment: int | None = None,
 ) -> str:
-    """The whole C source of a program's kernel for a target, NATIVE or CUDA; cut into functions of
-    `segment` operations if given.
+    """The C source of a program's kernel.
+
+    Args:
+      program: the program.
+      shared_leaves: number of shared leaf entries.
+      per_run_leaves: number of leaf entries of each run.
+      target: NATIVE or CUDA.
+      segment: operations of a function, at most; None for one function per step.
     """
-    if (
-        target is NATIVE and not segment
-        # not the functions that it calls: they have work enough at any time, and no registers to
-        # spare
-    ):
+    if target is NATIVE and not segment:
+        # The functions that the program calls keep their order: they have enough independent
+        # operations at any time, and no free registers.
         program = scheduled(program)
-    layout, tables = Layout.of(program), dict[str, str]()
+    layout = Layout.of(program)
+    tables: dict[str, str] = {}
     calls = FunctionCalls(program, layout)
     e = _Emitter(program, tables, calls)
     functions = _functions(calls, tables, segment)
+    constants = _constants(e, layout.constants)
+    signals = _signals(e, layout.constants, layout.columns)
     before, after = target
-    parts = [sizes(program, shared_leaves, lane_leaves), *map(header, before)]
-    parts += [f"TABLE {name}[] = {{{numbers}}};" for numbers, name in tables.items()]
-    parts += [
+    parts = [
+        sizes(program, shared_leaves, per_run_leaves),
+        *map(header, before),
+        *(f"TABLE {name}[] = {{{numbers}}};" for numbers, name in tables.items()),
         *functions,
-        _constants(e, layout.constants),
-        _signals(e, layout.constants, layout.columns),
+        constants,
+        signals,
+        _advance(e, layout, segment),
+        *map(header, after),
     ]
-    parts += [_advance_in_segments(e, segment, *layout) if segment else _advance(e, *layout)]
-    return "\n".join([*parts, *map(header, after)])
+    return "\n".join(parts)
 
 
 def plain_function(
@@ -236,41 +277,48 @@ def plain_function(
     outputs: Sequence[str],
     segment: int,
 ) -> str:
-    """One C99 function of one run, for the names of `c/plain.h`.
+    """A C99 function of one run, for the names of `c/plain.h`.
 
     Args:
-      program: what it computes; without calls, which `passes.written_out` takes away.
-      name: of the function, and the beginning of those that it is cut into.
-      parameters: C declarations, `const F *q`.
-      inputs: operation that stands for an input -> what C calls each of these numbers.
-      outputs: places of the numbers that are carried and of the samples; none of them is an input.
-      segment: operations above which it is cut, into functions of so many.
+      program: a program without calls (see `passes.written_out`).
+      name: name of the function, and prefix of the functions that it is divided into.
+      parameters: C declarations, such as `const F *q`.
+      inputs: operation of an input -> C expression of each of these numbers.
+      outputs: C expressions of the places of the carried numbers and of the samples; none of them
+        is an input.
+      segment: operations above which the function is divided, into functions of so many.
     """
     tables = dict[str, str]()
     e = _Emitter(program, tables, FunctionCalls(program, Layout.of(program)))
     e.tables = {i: f"{name}_{table}" for i, table in e.tables.items()}
-    e.turns = frozenset()  # each by itself
+    e.turns = frozenset()  # `plain.h` has no shared test for large angles
     names = {
         i: inputs[node.op][node.value] for i, node in enumerate(program.nodes) if node.op in inputs
     }
-    wanted = [*(o for _, o in program.carry), *program.samples]
-    seen = [p.split()[-1].lstrip("*") for p in parameters]
+    results = [*(o for _, o in program.carry), *program.samples]
+    arguments = _names_of(parameters)
     parts = list[str]()
     if len(program.nodes) > segment:
         segments = _Segments(e, names, segment, name, tuple(parameters))
-        e.end = [f"  (void){x};" for x in [*seen, "x", "y"]]
-        calls = segments.add(sorted(set(wanted)), kept=False)
-        parts, names = segments.functions, segments.names
-        e.lines = [segments.room, *(f"  {call}" for call in calls)]
-        e.statements(names, wanted)
+        e.end = [f"  (void){x};" for x in [*arguments, "x", "y"]]
+        calls = segments.add(sorted(set(results)), kept=False)
+        parts = segments.functions
+        names = segments.names
+        e.lines = [segments.declarations, *(f"  {call}" for call in calls)]
+        e.statements(names, results)
     else:
-        e.statements(names, wanted)
-        e.end = [f"  (void){x};" for x in seen]
-    e.lines += [f"  {place} = {names[i]};" for place, i in zip(outputs, wanted, strict=True)]
+        e.statements(names, results)
+        e.end = [f"  (void){x};" for x in arguments]
+    e.lines += [f"  {place} = {names[i]};" for place, i in zip(outputs, results, strict=True)]
     parts.append(e.function(f"static void {name}({', '.join([*parameters, 'F *RESTRICT r'])})"))
     return "\n".join(
         [*(f"TABLE {name}_{table}[] = {{{numbers}}};" for numbers, table in tables.items()), *parts]
     )
+
+
+def _names_of(parameters: Iterable[str]) -> list[str]:
+    """The names in C declarations of parameters."""
+    return [parameter.split()[-1].lstrip("*") for parameter in parameters]
 
 
 def header(name: str) -> str:
@@ -279,7 +327,7 @@ def header(name: str) -> str:
 
 
 def _functions(calls: FunctionCalls, tables: dict[str, str], segment: int | None) -> list[str]:
-    """The functions that a program calls, each cut into some of `segment` operations if given."""
+    """The C of the functions that a program calls, divided as in `source`."""
     texts = []
     for k, (function, arguments, _) in enumerate(calls.functions):
         e = _Emitter(function, tables, calls)
@@ -299,7 +347,7 @@ def _functions(calls: FunctionCalls, tables: dict[str, str], segment: int | None
             segments = _Segments(e, names, segment, f"part_{k}", SEEN_BY_FUNCTION)
             parts = segments.add(sorted(set(function.samples)), kept=False, own=dict(results))
             texts += segments.functions
-            e.lines += [segments.room, *(f"  {part}" for part in parts)]
+            e.lines += [segments.declarations, *(f"  {part}" for part in parts)]
         else:
             e.statements(names, function.samples)
         e.lines += [f"  {place} = {names[i]};" for i, place in results if names[i] != place]
@@ -308,20 +356,18 @@ def _functions(calls: FunctionCalls, tables: dict[str, str], segment: int | None
 
 
 def _constants(e: _Emitter, constants: list[int]) -> str:
+    """The C function that computes the shared numbers."""
     nodes = e.program.nodes
     names = {i: f"splat(shared[{n.value}])" for i, n in enumerate(nodes) if n.op == "shared"}
     e.statements(names, constants)
-    e.lines += [
-        f"  out[{k}].{_part(nodes[i])} = AT({names[i]}, 0);" for k, i in enumerate(constants)
-    ]
+    for k, i in enumerate(constants):
+        member = {"F": "f", "I": "i"}[c_type(nodes[i])]
+        e.lines.append(f"  out[{k}].{member} = AT({names[i]}, 0);")
     return e.function("FUNCTION void shared_constants(const real *shared, word *out)")
 
 
-def _part(node: Node) -> str:
-    return "f" if node.kind == "f" else "i"
-
-
 def _signals(e: _Emitter, constants: list[int], columns: list[int]) -> str:
+    """The C function that tabulates the numbers that time decides."""
     nodes = e.program.nodes
     names = {i: unpacked(nodes[i], f"constants[{k}]") for k, i in enumerate(constants)}
     names |= {i: "index" for i, n in enumerate(nodes) if n.op == "index"}
@@ -340,49 +386,90 @@ HEAD_OF_ADVANCE = (
 )
 
 
-def _advance(
-    e: _Emitter, constants: list[int], columns: list[int], floats: list[int], ints: list[int]
-) -> str:
-    program, nodes, classes = e.program, e.program.nodes, e.classes
-    names = {i: unpacked(nodes[i], f"constants[{k}]") for k, i in enumerate(constants)}
-    names |= {i: f"leaves[{n.value}]" for i, n in enumerate(nodes) if n.op == "lane"}
-    places = {c: f"floats[{k}]" for k, c in enumerate(floats)} | {
-        c: f"ints[{k}]" for k, c in enumerate(ints)
-    }
-    for c in [*floats, *ints]:
-        kind = program.kinds[c]
-        e.lines.append(
-            f"  {'F' if kind == 'f' else 'I'} c{c} = {'-' if kind == 'b' else ''}{places[c]};"
-        )
-        if program.carry[c][0] >= 0:
-            names[program.carry[c][0]] = f"c{c}"
+def _places_of_carry(layout: Layout) -> dict[int, str]:
+    """Position in the carry -> C expression of its place in the arrays of the state."""
+    floats = {c: f"floats[{k}]" for k, c in enumerate(layout.floats)}
+    return floats | {c: f"ints[{k}]" for k, c in enumerate(layout.ints)}
+
+
+def _names_of_inputs(e: _Emitter, layout: Layout) -> dict[int, str]:
+    """C expressions of the shared numbers and of the leaves of a run."""
+    nodes = e.program.nodes
+    names = {i: unpacked(nodes[i], f"constants[{k}]") for k, i in enumerate(layout.constants)}
+    return names | {i: f"leaves[{n.value}]" for i, n in enumerate(nodes) if n.op == "per_run"}
+
+
+def _names_of_columns(e: _Emitter, layout: Layout) -> dict[int, str]:
+    """C expressions of the numbers of a time step that are the same for all runs."""
+    return {i: unpacked(e.program.nodes[i], f"row[{k}]") for k, i in enumerate(layout.columns)}
+
+
+def _of_kind(program: Program, c: int, of_float: str, of_other: str) -> str:
+    """One of two texts, by the kind of a carried number."""
+    if program.kinds[c] == "f":
+        return of_float
+    return of_other
+
+
+def _sign(program: Program, c: int) -> str:
+    """The sign between a carried truth value in memory, 0 or 1, and in a register, 0 or -1."""
+    if program.kinds[c] == "b":
+        return "-"
+    return ""
+
+
+def _moves(
+    program: Program, moved: list[tuple[int, str]], place: Callable[[int], str]
+) -> list[str]:
+    """Statements that move new numbers to the places of carried ones.
+
+    All are read before the first is written: a new number may be another one's old one.
+    """
+    lines = [f"  {_of_kind(program, c, 'F', 'I')} n{c} = {name};" for c, name in moved]
+    return lines + [f"  {place(c)} = n{c};" for c, _ in moved]
+
+
+def _advance(e: _Emitter, layout: Layout, segment: int | None) -> str:
+    """The C function that makes some steps of a block of runs, the state in registers."""
+    if segment:
+        return _advance_in_segments(e, layout, segment)
+    program = e.program
+    names = _names_of_inputs(e, layout)
+    places = _places_of_carry(layout)
+    for c, place in places.items():
+        kind = _of_kind(program, c, "F", "I")
+        e.lines.append(f"  {kind} c{c} = {_sign(program, c)}{place};")
+        before = program.carry[c][0]
+        if before >= 0:
+            names[before] = f"c{c}"
     e.in_place = _in_place(program)
-    e.statements(names, frontier(program, classes, LANE, lambda k: k == LANE | TIME))
-    e.lines += [e.calls.declarations, *e.calls.once_statements(names)] if e.calls.functions else []
+    e.statements(names, frontier(program, e.classes, PER_RUN, lambda k: k == PER_RUN | TIME))
+    if e.calls.functions:
+        e.lines += [e.calls.declarations, *e.calls.once_statements(names)]
     e.lines.append("  for (int step = 0; step < count; step++, row += COLUMNS) {")
-    names |= {i: unpacked(nodes[i], f"row[{k}]") for k, i in enumerate(columns)}
-    e.statements(names, [o for _, o in program.carry])
+    names |= _names_of_columns(e, layout)
+    e.statements(names, [after for _, after in program.carry])
     if program.samples:
         _record(e, names)
     moved = [
-        (c, names[o]) for c, (a, o) in enumerate(program.carry) if a != o and names[o] != f"c{c}"
+        (c, names[after])
+        for c, (before, after) in enumerate(program.carry)
+        if before != after and names[after] != f"c{c}"
     ]
-    e.lines += [f"  {'F' if program.kinds[c] == 'f' else 'I'} n{c} = {name};" for c, name in moved]
-    e.lines += [f"  c{c} = n{c};" for c, _ in moved]
+    e.lines += _moves(program, moved, "c{}".format)
     e.lines.append("  }")
-    e.lines += [
-        f"  {places[c]} = {'-' if program.kinds[c] == 'b' else ''}c{c};" for c in [*floats, *ints]
-    ]
+    e.lines += [f"  {place} = {_sign(program, c)}c{c};" for c, place in places.items()]
     return e.function(HEAD_OF_ADVANCE)
 
 
 def _in_place(program: Program) -> dict[int, int]:
-    """Choices, the same for all runs, between a carried number and the next one, where nobody else
-    needs the number before.
+    """Selections, the same for all runs, between a carried number and a new one, where no other
+    node needs the number before the step; node -> node of the number before.
 
-    What a sampled law said is so written once a period, not copied in every step.
+    The output of a sampled law is thus written once per period and not copied in every step.
     """
-    nodes, classes = program.nodes, program.classes()
+    nodes = program.nodes
+    classes = program.classes()
     uses = (
         Counter(a for node in nodes for a in node.args)
         + Counter(program.samples)
@@ -391,7 +478,7 @@ def _in_place(program: Program) -> dict[int, int]:
     found = {}
     for a, o in program.carry:
         node = nodes[o]
-        if node.op == "select" and a in node.args[1:] and not classes[node.args[0]] & LANE:
+        if node.op == "select" and a in node.args[1:] and not classes[node.args[0]] & PER_RUN:
             (new,) = [x for x in node.args[1:] if x != a]
             # A call whose result is the new number has read the one before.
             if uses[a] == 1 + (
@@ -402,139 +489,154 @@ def _in_place(program: Program) -> dict[int, int]:
 
 
 class _Segments:
-    """The statements of a long step, cut into functions of `size` operations; a number that one
-    hands to another has a place in memory.
+    """Divides the statements of a long step into functions.
+
+    A number that one function computes and another one reads has a place in the arrays `x` (floats)
+    or `y` (others).
+
+    Args:
+      e: writes the statements.
+      names: C expressions of nodes that are computed already; the places are added.
+      size: operations of a function.
+      name: prefix of the names of the functions.
+      parameters: C declarations of what the functions share with the function that calls them.
     """
 
     def __init__(
         self, e: _Emitter, names: dict[int, str], size: int, name: str, parameters: tuple[str, ...]
     ):
-        """`name` begins those of the functions; `parameters` are what they see of the function that
-        calls them.
-        """
-        self.e, self.names, self.size, self.name = e, names, size, name
-        places = ("F *RESTRICT x", "I *RESTRICT y")
-        self.head = f"SEPARATE void {{}}({', '.join([*parameters, *places])})"
-        self.arguments = f"({', '.join(p.split()[-1].lstrip('*') for p in [*parameters, *places])})"
+        self.e = e
+        self.names = names
+        self.size = size
+        self.name = name
+        declarations = [*parameters, "F *RESTRICT x", "I *RESTRICT y"]
+        self.head = f"SEPARATE void {{}}({', '.join(declarations)})"
+        self.arguments = f"({', '.join(_names_of(declarations))})"
         self.functions: list[str] = []
         self.free: dict[str, list[str]] = {"x": [], "y": []}
         self.sizes = {"x": 0, "y": 0}
 
     def add(
-        self, wanted: list[int], kept: bool, own: Mapping[int, str] = MappingProxyType({})
+        self, outputs: list[int], kept: bool, own: Mapping[int, str] = MappingProxyType({})
     ) -> list[str]:
-        """Cuts `wanted` and what it needs; returns the calls.
+        """Adds functions that compute the outputs and what they depend on; returns the calls.
 
         Args:
-          wanted: nodes.
-          kept: their places are never given to other numbers.
-          own: places, in other arrays, that some of `wanted` have already.
+          outputs: nodes.
+          kept: whether the places are never given to other numbers.
+          own: places, in other arrays, that some of the outputs have already.
         """
-        nodes, needed = self.e.program.nodes, self.e.needed(self.names, wanted)
+        nodes = self.e.program.nodes
+        needed = self.e.needed(self.names, outputs)
         computed = [i for i in needed if nodes[i].op not in ("const", "result")]
         part = {i: k // self.size for k, i in enumerate(computed)}
-        last = dict.fromkeys(computed, -1) | dict.fromkeys(wanted, len(computed))
-        for i in computed:
-            for a in nodes[i].args:
-                if a in part and a not in wanted:
-                    last[a] = max(last[a], part[i])
+        last = self._last_reading_part(part, outputs)
         calls = []
-        for k in range(0, len(computed), self.size):
-            here = computed[k : k + self.size]
-            calls.append(
-                self._one(
-                    here, [i for i in here if last[i] > part[i] and nodes[i].op != "call"], own
-                )
-            )
+        for first in range(0, len(computed), self.size):
+            number = first // self.size
+            here = computed[first : first + self.size]
+            outlive = [i for i in here if last[i] > number and nodes[i].op != "call"]
+            calls.append(self._one(here, outlive, own))
             if not kept:
-                for i in (
-                    i
-                    for i in computed
-                    if i in self.names and last[i] == k // self.size and nodes[i].op != "call"
-                ):
-                    self.free[self.names[i][0]].append(self.names[i])
+                self._free_places(
+                    [i for i in computed if last[i] == number and nodes[i].op != "call"]
+                )
         self.names |= {i: self.e.calls.results[i] for i in needed if nodes[i].op == "result"}
         return calls
 
+    def _last_reading_part(self, part: dict[int, int], outputs: list[int]) -> dict[int, int]:
+        """Node -> the last function that reads it, of the nodes of `part`, node -> function."""
+        last = dict.fromkeys(part, -1) | dict.fromkeys(outputs, len(part))
+        for i, number in part.items():
+            for a in self.e.program.nodes[i].args:
+                if a in part and a not in outputs:
+                    last[a] = max(last[a], number)
+        return last
+
+    def _free_places(self, nodes: list[int]) -> None:
+        """Makes the places of nodes free for others."""
+        for i in nodes:
+            if i in self.names:
+                place = self.names[i]
+                self.free[place[0]].append(place)
+
     @property
-    def room(self) -> str:
-        """The places."""
+    def declarations(self) -> str:
+        """Declarations of the arrays."""
         return f"  F x[{max(1, self.sizes['x'])}]; I y[{max(1, self.sizes['y'])}];"
 
     def _one(self, here: list[int], outlive: list[int], own: Mapping[int, str]) -> str:
-        inner, stored = dict(self.names), dict[int, str]()
-        for i in outlive:
-            array = "x" if self.e.program.nodes[i].kind == "f" else "y"
-            if i not in own and not self.free[array]:
-                self.free[array].append(f"{array}[{self.sizes[array]}]")
-                self.sizes[array] += 1
-            stored[i] = own[i] if i in own else self.free[array].pop()
+        """Adds a function that computes the nodes `here`, of which others read `outlive`; returns
+        the call.
+        """
+        nodes = self.e.program.nodes
+        inner = dict(self.names)
+        stored = {i: own[i] if i in own else self._free_place(nodes[i]) for i in outlive}
         self.e.statements(inner, here, stored)
-        self.names |= stored | {i: inner[i] for i in here if self.e.program.nodes[i].op == "call"}
+        self.names |= stored | {i: inner[i] for i in here if nodes[i].op == "call"}
         name = f"{self.name}_{len(self.functions)}"
         self.functions.append(self.e.function(self.head.format(name)))
         return f"{name}{self.arguments};"
 
+    def _free_place(self, node: Node) -> str:
+        """A free place for a number, a new one if there is none."""
+        array = {"F": "x", "I": "y"}[c_type(node)]
+        if self.free[array]:
+            return self.free[array].pop()
+        self.sizes[array] += 1
+        return f"{array}[{self.sizes[array] - 1}]"
+
 
 def _read_by_samples(e: _Emitter, names: dict[int, str], outputs: list[int]) -> list[int]:
-    """The nodes of a step that its samples read, directly or on the way."""
+    """The nodes of a step that its samples are, or read in nodes that only samples need."""
     computed = set(e.needed(names, outputs))
-    alone = [i for i in e.needed(names, e.program.samples) if i not in computed]
-    return sorted(
-        computed & {*e.program.samples, *(a for i in alone for a in e.program.nodes[i].args)}
-    )
-
-
-def _advance_in_segments(
-    e: _Emitter,
-    segment: int,
-    constants: list[int],
-    columns: list[int],
-    floats: list[int],
-    ints: list[int],
-) -> str:
-    """`_advance` for long steps, over which a compiler would take minutes: its time grows with the
-    square of a function's length.
-
-    The functions that the step calls stay whole calls; each is itself cut (`_functions`).
-    """
-    program, nodes, classes = e.program, e.program.nodes, e.classes
-    names = {i: unpacked(nodes[i], f"constants[{k}]") for k, i in enumerate(constants)}
-    names |= {i: unpacked(nodes[i], f"row[{k}]") for k, i in enumerate(columns)}
-    names |= {i: f"leaves[{n.value}]" for i, n in enumerate(nodes) if n.op == "lane"}
-    places = {c: f"floats[{k}]" for k, c in enumerate(floats)} | {
-        c: f"ints[{k}]" for k, c in enumerate(ints)
+    samples = e.program.samples
+    read = {
+        a for i in e.needed(names, samples) if i not in computed for a in e.program.nodes[i].args
     }
+    return sorted(computed & {*samples, *read})
+
+
+def _advance_in_segments(e: _Emitter, layout: Layout, segment: int) -> str:
+    """The same as `_advance` for long steps, divided into functions.
+
+    The time of a compiler grows with the square of a function's length: it would take minutes. The
+    functions that the step calls stay functions; each of them is divided, too (`_functions`).
+    """
+    program = e.program
+    nodes = program.nodes
+    names = _names_of_inputs(e, layout) | _names_of_columns(e, layout)
+    places = _places_of_carry(layout)
     names |= {program.carry[c][0]: place for c, place in places.items() if program.carry[c][0] >= 0}
     segments = _Segments(e, names, segment, "segment", SEEN_BY_ADVANCE)
-    before = segments.add(frontier(program, classes, LANE, lambda k: k == LANE | TIME), kept=True)
-    outputs = sorted({o for _, o in program.carry})
-    within = segments.add(
-        sorted({*outputs, *_read_by_samples(e, segments.names, outputs)}), kept=False
-    )
-    signs = [f"  {places[c]} = -{places[c]};" for c in ints if program.kinds[c] == "b"]
-    constant = {
-        o: literal(nodes[o], program.dtype) for _, o in program.carry if nodes[o].op == "const"
-    }
+    once = frontier(program, e.classes, PER_RUN, lambda k: k == PER_RUN | TIME)
+    before = segments.add(once, kept=True)
+    outputs = sorted({after for _, after in program.carry})
+    read = _read_by_samples(e, segments.names, outputs)
+    within = segments.add(sorted({*outputs, *read}), kept=False)
+    signs = [f"  {places[c]} = -{places[c]};" for c in layout.ints if program.kinds[c] == "b"]
+    names_after = dict(segments.names)
+    for _, after in program.carry:
+        if nodes[after].op == "const":
+            names_after[after] = literal(nodes[after], program.dtype)
     moved = [
-        (c, (segments.names | constant)[o]) for c, (a, o) in enumerate(program.carry) if a != o
+        (c, names_after[after])
+        for c, (unchanged, after) in enumerate(program.carry)
+        if unchanged != after
     ]
-    e.lines += [segments.room, e.calls.declarations, *signs]
+    e.lines += [segments.declarations, e.calls.declarations, *signs]
     e.lines += [*(f"  {call}" for call in before), *e.calls.once_statements(segments.names)]
-    e.lines += [
-        "  for (int step = 0; step < count; step++, row += COLUMNS) {",
-        *(f"  {call}" for call in within),
-    ]
+    e.lines.append("  for (int step = 0; step < count; step++, row += COLUMNS) {")
+    e.lines += [f"  {call}" for call in within]
     if program.samples:
         _record(e, segments.names)
-    e.lines += [f"  {'F' if program.kinds[c] == 'f' else 'I'} n{c} = {name};" for c, name in moved]
-    e.lines += [f"  {places[c]} = n{c};" for c, _ in moved]
+    e.lines += _moves(program, moved, places.__getitem__)
     e.lines += ["  }", *signs]
     return "\n".join([*segments.functions, e.function(HEAD_OF_ADVANCE)])
 
 
 def _record(e: _Emitter, names: dict[int, str]) -> None:
-    """The samples of a step that is recorded, written for the runs that exist."""
+    """Adds statements that record the samples of a step, for the runs that exist."""
     e.lines.append("  if (every > 0 && (first + step) % every == 0) {")
     inner = dict(names)
     e.statements(inner, e.program.samples)

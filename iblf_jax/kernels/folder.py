@@ -1,17 +1,20 @@
-"""The folder in which compiled programs are kept between processes, and the processor that they need."""
+"""The folder of compiled programs, and the processor that they are compiled for."""
 
 from __future__ import annotations
 
 import os
 import platform
 import stat
-from functools import cache
 from pathlib import Path
+
+from iblf_jax.kernels.caches import CACHES
 
 
 def directory() -> Path:
-    """The folder, mode 0700; OSError, whose text is one line for the user, if it cannot be made or
-    is not this user's.
+    """The folder in which compiled programs are kept between processes; its mode is 0700.
+
+    Raises:
+      OSError: it cannot be made, or belongs to another user; the message is one line for the user.
     """
     path = None
     try:
@@ -33,9 +36,9 @@ def directory() -> Path:
     return path
 
 
-@cache
+@CACHES.function(maxsize=1)
 def processor() -> str:
-    """What a compiled program is tied to: the processor's model and features."""
+    """The model and the features of the processor, for which a program is compiled."""
     names = ("model name", "flags", "Features", "CPU part")
     return (
         "\n".join(sorted({line for line in cpuinfo() if line.startswith(names)}))

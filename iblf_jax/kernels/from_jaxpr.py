@@ -1,8 +1,8 @@
-"""A jaxpr taken apart into scalars: every array becomes a NumPy array of node numbers.
+"""Interprets a jaxpr number by number: every array becomes a NumPy array of node numbers.
 
-So what only moves numbers about (reshape, slice, gather) is done here and now on the node numbers,
-and what computes becomes one node a number.  Nested functions are inlined, short scans unrolled; a
-primitive that has no rule raises `UnsupportedError`.
+Primitives that only rearrange numbers (reshape, slice, gather) are applied to the node numbers at
+once, and primitives that compute add one node per number. Nested functions are inlined, and short
+scans are unrolled. A primitive without a rule raises `UnsupportedError`.
 """
 
 from __future__ import annotations
@@ -18,13 +18,21 @@ from iblf_jax.kernels.program import Builder, Ids, UnsupportedError, constants
 from iblf_jax.kernels.rules import RULES
 
 INLINED = {
-    "jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr", "custom_jvp_call": "call_jaxpr",
-    "custom_vjp_call": "call_jaxpr", "custom_vjp_call_jaxpr": "fun_jaxpr", "checkpoint": "jaxpr", "remat": "jaxpr", "remat2": "jaxpr",
-}  # fmt: skip
-
+    "jit": "jaxpr",
+    "pjit": "jaxpr",
+    "closed_call": "call_jaxpr",
+    "core_call": "call_jaxpr",
+    "custom_jvp_call": "call_jaxpr",
+    "custom_vjp_call": "call_jaxpr",
+    "custom_vjp_call_jaxpr": "fun_jaxpr",
+    "checkpoint": "jaxpr",
+    "remat": "jaxpr",
+    "remat2": "jaxpr",
+}
+"""Primitive that calls an inner function -> the parameter that holds it."""
 READ_AGAIN = 50
-"""Equations up to which an inner function is read again at each call: that is as quick as to
-remember it."""
+"""Equations up to which an inner function is interpreted at each call: a cache would not be
+faster."""
 
 
 def interpret(b: Builder, jaxpr: Any, consts: Sequence[Ids], inputs: Sequence[Ids]) -> list[Ids]:
@@ -34,7 +42,9 @@ def interpret(b: Builder, jaxpr: Any, consts: Sequence[Ids], inputs: Sequence[Id
     )
 
     def read(atom):
-        return constants(b, atom.val) if isinstance(atom, core.Literal) else known[atom]
+        if isinstance(atom, core.Literal):
+            return constants(b, atom.val)
+        return known[atom]
 
     live = _live(jaxpr)
     uses = {id(eqn): tuple(v in live for v in eqn.outvars) for eqn in jaxpr.eqns}
@@ -65,8 +75,9 @@ def interpret(b: Builder, jaxpr: Any, consts: Sequence[Ids], inputs: Sequence[Id
         elif name in RULES:
             for v in eqn.outvars:
                 _check_float(b, v.aval.dtype, eqn)
-            out = RULES[name](b, eqn, *operands)
-            results = list(out) if isinstance(out, (list, tuple)) else [out]
+            results = RULES[name](b, eqn, *operands)
+            if isinstance(results, np.ndarray):
+                results = [results]
         else:
             raise UnsupportedError(f"the primitive {name!r} is not lowered")
         for v, ids in zip(eqn.outvars, results, strict=True):
@@ -81,7 +92,7 @@ def interpret(b: Builder, jaxpr: Any, consts: Sequence[Ids], inputs: Sequence[Id
 
 
 def _live(jaxpr: Any) -> set:
-    """The variables that the outputs need."""
+    """The variables that the outputs depend on."""
     live = {v for v in jaxpr.outvars if isinstance(v, core.Var)}
     for eqn in reversed(jaxpr.eqns):
         if any(v in live for v in eqn.outvars):
@@ -90,22 +101,20 @@ def _live(jaxpr: Any) -> set:
 
 
 def _check_float(b: Builder, dtype, eqn) -> None:
-    """Refuses floats of another type than the program's (constants, which are rounded once,
-    aside).
-    """
+    """Refuses floats of another type than the program's, except constants, which are rounded."""
     if np.issubdtype(dtype, np.floating) and dtype != b.dtype and eqn.invars:
         raise UnsupportedError(f"it mixes {dtype} with {b.dtype} ({eqn.primitive.name})")
 
 
 def closed(b: Builder, function: Any, operands: Sequence[Ids]) -> list[Ids]:
-    """The outputs of a closed or plain inner jaxpr."""
+    """The outputs of an inner jaxpr, closed or not."""
     inner = getattr(function, "jaxpr", function)
     consts = [constants(b, c) for c in getattr(function, "consts", ())]
     return interpret(b, inner, consts, operands)
 
 
 def _parts(params: dict[str, Any]) -> tuple[int, int]:
-    """How many operands of a scan are constants, and how many its carry."""
+    """The numbers of constants and of carried arrays among the operands of a scan."""
     if "num_consts" in params:  # before jax 0.11
         return params["num_consts"], params["num_carry"]
     consts, carry, _ = params["ft_in"].unpack()
@@ -114,18 +123,20 @@ def _parts(params: dict[str, Any]) -> tuple[int, int]:
 
 def _scan(b: Builder, eqn, operands, used):
     params = eqn.params
-    length, (n_const, n_carry) = params["length"], _parts(params)
+    length = params["length"]
+    n_const, n_carry = _parts(params)
     if length > b.limits.scan:
         raise UnsupportedError(
             f"an inner loop of {length} steps is too long to unroll (at most {b.limits.scan})"
         )
-    const, carry, xs = (
-        operands[:n_const],
-        operands[n_const : n_const + n_carry],
-        operands[n_const + n_carry :],
-    )
+    const = operands[:n_const]
+    carry = operands[n_const : n_const + n_carry]
+    xs = operands[n_const + n_carry :]
     stacked: list[list[Ids]] = []
-    for i in reversed(range(length)) if params["reverse"] else range(length):
+    indices = list(range(length))
+    if params["reverse"]:
+        indices.reverse()
+    for i in indices:
         out = closed(b, params["jaxpr"], [*const, *carry, *(x[i] for x in xs)])
         carry = out[:n_carry]
         stacked.append(out[n_carry:])
@@ -146,33 +157,31 @@ def _cond(b: Builder, eqn, operands, used):
         return closed(b, branches[min(max(int(value), 0), len(branches) - 1)], rest)
     results = _last(b, branches, which, rest, used)
     for i in reversed(range(len(branches) - 1)):
-        is_flag = b.nodes[which].kind == "b"
-        condition = (
-            b.emit("not", which, kind="b")
-            if is_flag
-            else b.emit("le", which, b.constant(i, "i"), kind="b")
-        )
+        condition = _is_at_most(b, which, i)
         others = closed(b, branches[i], rest)
-        results = [
-            None if no is None else choose(b, condition, yes, no)
-            for yes, no in zip(others, results, strict=True)
-        ]
+        results = [choose(b, condition, yes, no) for yes, no in zip(others, results, strict=True)]
     return results
+
+
+def _is_at_most(b: Builder, which: int, branch: int) -> int:
+    """The node of "the index of the branch is at most `branch`"."""
+    if b.nodes[which].kind == "b":
+        return b.emit("not", which, kind="b")
+    return b.emit("le", which, b.constant(branch, "i"), kind="b")
 
 
 def _last(
     b: Builder, branches: Sequence[Any], which: int, operands: Sequence[Ids], used: tuple[bool, ...]
 ) -> list[Ids | None]:
-    """The used results of the last branch, which may be computed where it is taken alone if all
-    runs take it together.
+    """The used results of the last branch.
+
+    If all runs take the same branch, the last one is computed only in steps that take it.
     """
     if not b.is_shared(which):
         return list(closed(b, branches[-1], operands))
-    taken = (
-        which
-        if b.nodes[which].kind == "b"
-        else b.emit("ge", which, b.constant(len(branches) - 1, "i"), kind="b")
-    )
+    taken = which
+    if b.nodes[which].kind != "b":
+        taken = b.emit("ge", which, b.constant(len(branches) - 1, "i"), kind="b")
     return apply(b, branches[-1], operands, used, [used], closed, taken)
 
 
@@ -180,8 +189,10 @@ def _while(b: Builder, eqn, operands, used):
     raise UnsupportedError("a while loop inside a step has no fixed length")
 
 
-def choose(b: Builder, condition: int, yes: Ids, no: Ids) -> Ids:
-    """`yes` where one scalar condition holds, else `no`, entry by entry."""
+def choose(b: Builder, condition: int, yes: Ids, no: Ids | None) -> Ids | None:
+    """`yes` where a scalar condition holds, else `no`, entry by entry; None if `no` is not used."""
+    if no is None:
+        return None
     flat = [
         b.emit("select", condition, int(x), int(y), kind=b.nodes[int(x)].kind)
         for x, y in zip(yes.ravel(), no.ravel(), strict=True)

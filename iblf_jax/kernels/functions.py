@@ -1,51 +1,51 @@
-"""Inner functions of a jaxpr: each is read once, and written out wherever it is called or, if it is
-long, called there.
+"""Inner functions of a jaxpr: each is interpreted once, and inlined at each call or, if it is long,
+called.
 
-The closed loop is such a function: a step evaluates it once a stage of the integrator.  A compiler
-  that sees it once has a quarter of the
-text to read, and its time grows faster than that.
+The closed loop is such a function: a step evaluates it once per stage of the integrator. A compiler
+that reads it once has a quarter of the text to read, and its time grows faster than the text.
 
-A branch that all runs take or leave together, as only time decides (the law of a sampled loop), is
-such a function too, and called where it is taken; what its other side gives is chosen afterwards.
+A branch that all runs take together, because only time decides it (the law of a sampled loop), is
+such a function, too. It is called in steps that take it; the result is selected afterwards.
 
-A call computes what moves with the state.  What leaves and time alone decide stays with the caller,
-which computes it as seldom as its class allows; so does what not every caller asks for (the sample,
-which the first stage alone gives): it is written out there, on numbers that the call hands over.
+A call computes the numbers that depend on the state. The caller computes what depends on leaves and
+time only, as rarely as its class permits. It also computes what not every call needs (the sample,
+which only the first stage returns), from numbers that the call returns.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from iblf_jax.kernels.caches import CACHES
 from iblf_jax.kernels.passes import with_reciprocals
 from iblf_jax.kernels.program import (
     INPUTS,
-    LANE,
+    PER_RUN,
     Builder,
     Ids,
     LoweringLimits,
+    Node,
     Program,
     finished,
     needed,
 )
 
 Uses = tuple[bool, ...]
-"""Which results of a function somebody reads."""
+"""Which results of a function are used."""
 
 
 class Called(NamedTuple):
-    """What decides how an inner function is read."""
+    """An inner function and the properties of its operands on which its program depends."""
 
     jaxpr: Any
     pattern: tuple
-    """Of its operands, number by number."""
+    """The pattern of its operands, number by number (`_pattern`)."""
     shapes: tuple[tuple[int, ...], ...]
-    """Of its operands."""
+    """The shapes of its operands."""
     dtype: Any
     sparse: bool
     limits: LoweringLimits
@@ -54,25 +54,27 @@ class Called(NamedTuple):
 
 
 class Template(NamedTuple):
-    """A function, read once for operands of one pattern."""
+    """The program of a function, for operands of one pattern."""
 
     program: Program
-    """Its samples are the results; operands are "argument" where they move with the state, else
-    "shared"."""
+    """Its samples are the results. An operand is an "argument" if it depends on the state, and
+    "shared" otherwise."""
     results: list[Ids]
-    """Places among the samples, in the shape of each result."""
+    """Positions among the samples, in the shape of each result."""
 
 
 class Split(NamedTuple):
-    """A template that is called."""
+    """A function that is called, divided into the work of the call and that of the caller."""
 
     program: Program
-    """The template's, with products instead of divisions by what the caller can invert."""
-    given: list[int]
-    """Its nodes that the call is given."""
-    handed: list[int]
-    """Its nodes that the call hands over."""
+    """The template's program, with products instead of divisions where the caller can compute the
+    reciprocal."""
+    arguments: list[int]
+    """Nodes of the program that are the arguments of the call."""
+    returned: list[int]
+    """Nodes of the program that are the results of the call."""
     function: Program
+    """The program of the call."""
 
 
 def apply(
@@ -84,17 +86,17 @@ def apply(
     read: Callable,
     condition: int | None = None,
 ) -> list[Ids | None]:
-    """The results of an inner function that are used.
+    """The results of an inner function; None for results that are not used.
 
     Args:
-      b: of the caller.
+      b: builder of the caller.
       jaxpr: the function.
-      operands: what it is given.
-      used: which results this call's are used.
-      all_uses: `used` of every call that the caller makes.
+      operands: its operands.
+      used: which results of this call are used.
+      all_uses: `used` of every call of the function by this caller.
       read: function (builder, jaxpr, operands) -> results.
-      condition: where it holds, the same for all runs, the results are wanted; everywhere if not
-        given.
+      condition: node of a truth value, the same for all runs: results are used only where it holds.
+        None for always.
     """
     flat = [int(i) for x in operands for i in x.ravel()]
     called = Called(
@@ -106,30 +108,36 @@ def apply(
         b.limits,
         read,
     )
-    template, split = _template(called), None
-    if _moving(template.program) > (
-        b.limits.written_out if condition is None else b.limits.under_condition
-    ):
-        split = _split(
-            called, *(tuple(map(which, zip(*all_uses, strict=True))) for which in (all, any))
-        )
-
-    program = split.program if split else template.program
-    known = {i: flat[node.value] for i, node in enumerate(program.nodes) if node.op in INPUTS}
-    if split:
-        _write(b, program, known, split.given)
-        call = b.call(split.function, [known[i] for i in split.given], condition)
-        known |= {i: b.result(call, k) for k, i in enumerate(split.handed)}
+    template = _template(called)
+    limit = b.limits.written_out
+    if condition is not None:
+        limit = b.limits.under_condition
+    if _operations_on_state(template.program) <= limit:
+        program = template.program
+        known = _known_inputs(program, flat)
+    else:
+        uses = list(zip(*all_uses, strict=True))
+        split = _split(called, tuple(map(all, uses)), tuple(map(any, uses)))
+        program = split.program
+        known = _known_inputs(program, flat)
+        _write(b, program, known, split.arguments)
+        call = b.call(split.function, [known[i] for i in split.arguments], condition)
+        known |= {i: b.result(call, k) for k, i in enumerate(split.returned)}
     _write(b, program, known, _samples(program, template.results, used))
     return [
-        _new(known, program, places) if yes else None
-        for places, yes in zip(template.results, used, strict=True)
+        _result(known, program, positions, is_used)
+        for positions, is_used in zip(template.results, used, strict=True)
     ]
 
 
+def _known_inputs(program: Program, operands: list[int]) -> dict[int, int]:
+    """Input of a function's program -> node of the caller."""
+    return {i: operands[node.value] for i, node in enumerate(program.nodes) if node.op in INPUTS}
+
+
 def _pattern(b: Builder, operands: list[int]) -> tuple:
-    """What of the operands decides how a function is read: constants, equal ones, and what moves
-    with the state.
+    """The properties of operands on which a program depends: constants, equal operands, and whether
+    an operand depends on the state.
     """
     first: dict[int, int] = {}
     pattern: list[tuple] = []
@@ -138,14 +146,24 @@ def _pattern(b: Builder, operands: list[int]) -> tuple:
         if i == b.absent:
             pattern.append((node.kind, None))
         elif node.op == "const":
-            pattern.append((node.kind, node.value.hex() if node.kind == "f" else node.value))
+            pattern.append((node.kind, _exact(node)))
         else:
-            pattern.append((node.kind, first.setdefault(i, place), b.moves(i), i in b.known_finite))
+            pattern.append(
+                (node.kind, first.setdefault(i, place), b.depends_on_state(i), i in b.known_finite)
+            )
     return tuple(pattern)
 
 
-@lru_cache(maxsize=16)
+def _exact(constant: Node) -> Any:
+    """The value of a constant in a form that also distinguishes NaN and the sign of zero."""
+    if constant.kind == "f":
+        return constant.value.hex()
+    return constant.value
+
+
+@CACHES.function(maxsize=16)
 def _template(called: Called) -> Template:
+    """The program of a function."""
     b = Builder(
         called.dtype,
         sparse=called.sparse,
@@ -155,11 +173,14 @@ def _template(called: Called) -> Template:
     def node_of(kind, value, *known):
         if value is None:
             return b.absent
+        if not known and kind == "f":
+            return b.constant(float.fromhex(value), kind)
         if not known:
-            return b.constant(float.fromhex(value) if kind == "f" else value, kind)
-        moves, finite = known
-        node = b.input("argument" if moves else "shared", value, kind)
-        b.known_finite.update([node] if finite else [])
+            return b.constant(value, kind)
+        depends_on_state, is_finite = known
+        node = b.input({True: "argument", False: "shared"}[depends_on_state], value, kind)
+        if is_finite:
+            b.known_finite.add(node)
         return node
 
     numbers = iter([node_of(*entry) for entry in called.pattern])
@@ -179,59 +200,78 @@ def _template(called: Called) -> Template:
     )
 
 
-@lru_cache(maxsize=16)
+@CACHES.function(maxsize=16)
 def _with_reciprocals(called: Called) -> Program:
+    """The program of a function, with products instead of divisions."""
     return with_reciprocals(_template(called).program)
 
 
-def _moving(program: Program) -> int:
-    """How many operations move with the state."""
+def _operations_on_state(program: Program) -> int:
+    """The number of operations that depend on the state."""
     return sum(
-        bool(c & LANE) and node.op not in INPUTS
+        bool(c & PER_RUN) and node.op not in INPUTS
         for c, node in zip(program.classes(), program.nodes, strict=True)
     )
 
 
 def _samples(program: Program, results: list[Ids], used: Uses) -> list[int]:
+    """The nodes of the results that are used."""
     return [
-        program.samples[place]
-        for places, yes in zip(results, used, strict=True)
-        if yes
-        for place in places.ravel()
+        program.samples[position]
+        for positions, is_used in zip(results, used, strict=True)
+        if is_used
+        for position in positions.ravel()
     ]
 
 
-@lru_cache(maxsize=16)
+@CACHES.function(maxsize=16)
 def _split(called: Called, everywhere: Uses, anywhere: Uses) -> Split:
-    """What a call computes: what moves and every caller uses."""
-    program, places = _with_reciprocals(called), _template(called).results
-    nodes, classes = program.nodes, program.classes()
+    """Divides a function: a call computes the operations that depend on the state and that every
+    caller uses.
 
-    def moving(wanted: Iterable[int]) -> list[int]:
-        return [i for i in needed(nodes, wanted) if classes[i] & LANE and nodes[i].op not in INPUTS]
+    Args:
+      called: the function.
+      everywhere: which results all calls use.
+      anywhere: which results some call uses.
+    """
+    program = _with_reciprocals(called)
+    positions = _template(called).results
+    nodes = program.nodes
+    classes = program.classes()
 
-    results, asked = _samples(program, places, everywhere), _samples(program, places, anywhere)
-    inside = moving(results)
+    def on_state(outputs: Iterable[int]) -> list[int]:
+        return [
+            i for i in needed(nodes, outputs) if classes[i] & PER_RUN and nodes[i].op not in INPUTS
+        ]
+
+    results = _samples(program, positions, everywhere)
+    inside = on_state(results)
     within = set(inside)
-    asked += [a for i in moving(asked) if i not in within for a in nodes[i].args]
-    handed = list(dict.fromkeys(i for i in [*results, *asked] if i in within))
-    given = sorted({a for i in inside for a in nodes[i].args if nodes[a].op != "const"} - within)
+    read = _samples(program, positions, anywhere)
+    # Numbers that the caller computes on the state read numbers of the call.
+    read += [a for i in on_state(read) if i not in within for a in nodes[i].args]
+    returned = list(dict.fromkeys(i for i in [*results, *read] if i in within))
+    operands = {a for i in inside for a in nodes[i].args if nodes[a].op != "const"}
+    arguments = sorted(operands - within)
 
     b = Builder(program.dtype)
-    new = {a: b.input("argument", k, nodes[a].kind) for k, a in enumerate(given)}
+    new = {a: b.input("argument", k, nodes[a].kind) for k, a in enumerate(arguments)}
     _write(b, program, new, inside)
-    return Split(program, given, handed, finished(b, [], [], [new[i] for i in handed]))
+    function = finished(b, [], [], [new[i] for i in returned])
+    return Split(program, arguments, returned, function)
 
 
-def _write(b: Builder, program: Program, known: dict[int, int], wanted: Iterable[int]) -> None:
-    """Adds the nodes of a program that `wanted` needs to another builder; `known` says which of its
-    nodes they are.
+def _write(b: Builder, program: Program, known: dict[int, int], outputs: Iterable[int]) -> None:
+    """Copies the nodes of a program that the outputs depend on to another builder; `known`, node of
+    the program -> node of the builder, receives them.
     """
-    for i in needed(program.nodes, wanted, known):
-        known[i] = b.again(program.nodes[i], [known[a] for a in program.nodes[i].args])
+    for i in needed(program.nodes, outputs, known):
+        known[i] = b.copy(program.nodes[i], [known[a] for a in program.nodes[i].args])
 
 
-def _new(known: dict[int, int], program: Program, places: Ids) -> Ids:
-    return np.asarray(
-        [known[program.samples[place]] for place in places.ravel()], np.int64
-    ).reshape(places.shape)
+def _result(known: dict[int, int], program: Program, positions: Ids, is_used: bool) -> Ids | None:
+    """The nodes of a result; None if it is not used."""
+    if not is_used:
+        return None
+    nodes = [known[program.samples[position]] for position in positions.ravel()]
+    return np.asarray(nodes, np.int64).reshape(positions.shape)

@@ -12,13 +12,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from iblf_jax.kernels.program import LANE, SHARED, TIME, Node, Program, frontier
+from iblf_jax.kernels.program import PER_RUN, SHARED, TIME, Node, Program, arguments_of, frontier
 
 
 def literal(node: Node, dtype: np.dtype) -> str:
     """The C expression of a constant, as a vector with one entry per run."""
     if node.kind == "b":
-        return "splat_i(-1)" if node.value else "splat_i(0)"
+        return f"splat_i({-int(node.value)})"
     if node.kind == "i":
         return f"splat_i({node.value})"
     if math.isnan(node.value):
@@ -34,7 +34,9 @@ def literal(node: Node, dtype: np.dtype) -> str:
 
 def c_type(node: Node) -> str:
     """The C type of a node: "F" for floating-point numbers, "I" for integers and truth values."""
-    return "F" if node.kind == "f" else "I"
+    if node.kind == "f":
+        return "F"
+    return "I"
 
 
 def unpacked(node: Node, place: str) -> str:
@@ -62,7 +64,7 @@ class Layout(NamedTuple):
         classes, kinds = program.classes(), program.kinds
         return Layout(
             frontier(program, classes, SHARED, lambda c: c != SHARED),
-            frontier(program, classes, TIME, lambda c: bool(c & LANE)),
+            frontier(program, classes, TIME, lambda c: bool(c & PER_RUN)),
             [i for i, kind in enumerate(kinds) if kind == "f"],
             [i for i, kind in enumerate(kinds) if kind != "f"],
         )
@@ -105,13 +107,6 @@ def places(nodes: Iterable[Node], floats: str, others: str, first: Positions = S
         found.append(f"{names[kind]}[{positions[kind]}]")
         positions[kind] += 1
     return found
-
-
-def arguments_of(call: Node) -> tuple[int, ...]:
-    """The nodes that a call passes to its function."""
-    if call.kind == "call":
-        return call.args
-    return call.args[1:]  # the first one is the condition of a conditional call
 
 
 class CalledFunction(NamedTuple):
@@ -175,7 +170,7 @@ class FunctionCalls:
             return literal(node, self.dtype)
         if value in self._constants:
             return unpacked(node, self._constants[value])
-        if self._classes[value] != LANE or node.kind != "f":
+        if self._classes[value] != PER_RUN or node.kind != "f":
             return None
         if value not in self.once:
             self.once.append(value)
@@ -223,7 +218,7 @@ class FunctionCalls:
         """
         node = self.nodes[call]
         is_conditional = node.kind != "call"
-        values = args[1:] if is_conditional else args
+        values = args[len(args) - len(arguments_of(node)) :]
         number = next(
             k for k, function in enumerate(self.functions) if function.program is node.value
         )

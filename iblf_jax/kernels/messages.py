@@ -1,4 +1,4 @@
-"""A line that tells a waiting user what takes long, in terminals and in notebooks."""
+"""A line that reports a slow operation to a waiting user, in terminals and in notebooks."""
 
 from __future__ import annotations
 

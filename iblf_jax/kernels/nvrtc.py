@@ -1,10 +1,9 @@
-"""NVIDIA's run-time compiler, NVRTC, which jax brings along with its CUDA plugin: CUDA C++ in,
-machine code of one kind of GPU out.
+"""NVIDIA's run-time compiler, NVRTC, which comes with the CUDA plugin of jax.
 
-It is a library of this process: no nvcc, no CUDA installation and no shell are needed, and no GPU
-  either, so that a kernel can be
-compiled, though not run, anywhere.  What comes out is machine code and not PTX: a driver accepts
-the machine code of a newer compiler of its generation, but the PTX of its own only.
+It compiles CUDA C++ to the machine code of one GPU architecture. It is a library of this process:
+nvcc, a CUDA installation, a shell and a GPU are not necessary, so that a kernel can be compiled,
+though not executed, anywhere. The result is machine code and not PTX: a driver accepts the machine
+code of a newer compiler of its generation, but PTX of its own compiler only.
 """
 
 from __future__ import annotations
@@ -15,9 +14,9 @@ import importlib.util
 import os
 from collections.abc import Iterator
 from ctypes import byref, c_char_p, c_int, c_size_t, c_void_p
-from functools import cache
 from pathlib import Path
 
+from iblf_jax.kernels.caches import CACHES
 from iblf_jax.kernels.toolchain import ToolchainError, content_of, kept
 
 NVRTC_FLAGS = (
@@ -28,8 +27,8 @@ NVRTC_FLAGS = (
     "--prec-sqrt=true",
     "-w",
 )
-"""Products go into sums unrounded, as on `native`; otherwise every operation is rounded as IEEE 754
-wants it."""
+"""Products are added without rounding, as on CPUs; all other operations are rounded as IEEE 754
+specifies."""
 
 
 def _candidates() -> Iterator[Path | str]:
@@ -47,7 +46,7 @@ def _candidates() -> Iterator[Path | str]:
             yield Path(os.environ[name]) / "lib64" / "libnvrtc.so"
 
 
-@cache
+@CACHES.function(maxsize=1)
 def library() -> ctypes.CDLL:
     """NVRTC; ToolchainError if there is none."""
     for path in _candidates():

@@ -1,8 +1,8 @@
-"""The operations of scalar programs, one row each: what folds them, what XLA and C call them, what
-they cost.
+"""The operations of scalar programs, one row each: how they are folded, how XLA and C write them,
+and what they cost.
 
-A new operation that a jaxpr does entry by entry is a row here and, if C has no word for it, its
-`f_<name>` in `c/mathlib.h`.
+A new operation that a jaxpr applies entry by entry is a row here and, if C has no operator for it,
+a function `f_<name>` in `c/mathlib.h`.
 """
 
 from __future__ import annotations
@@ -21,25 +21,27 @@ class Operation(NamedTuple):
     numpy: Callable[..., Any] | None
     """Folds constants; None where it depends on more than their values."""
     lax: Callable[..., Any] | None
-    """In XLA: no function of jnp, as those are jitted, and within a function that XLA may not
-    inline each would be a call."""
+    """The function of XLA. It is no function of jnp: those are jitted, and each would be a call
+    within a function that XLA may not inline."""
     cost: int | None
-    """Vector instructions, roughly; None: a call into the C library for every run."""
+    """Approximate number of vector instructions; None for a call of the C library for every run."""
     c: Mapping[str, str] | None = None
-    """Kind of the first argument -> its C, {} for each argument; None: `f_<name>`, of floats
-    alone."""
+    """Kind of the first argument -> the C, with {} for each argument; None for `f_<name>`, which
+    takes floats only."""
     cheap: bool = False
-    """Whether XLA takes one instruction for it on CPU."""
+    """Whether it is one instruction of a CPU in XLA."""
     commutes: bool = False
-    """Whether op(x, y) is op(y, x) for all numbers."""
+    """Whether op(x, y) equals op(y, x) for all numbers."""
     primitives: tuple[str, ...] | None = None
-    """The primitives of jaxprs that do it entry by entry; None: the one of its own name."""
+    """The primitives of jaxprs that apply it entry by entry; None for the one of the same name."""
 
     def in_c(self, name: str, kind: str, args: list[str]) -> str | None:
-        """It in C, of expressions of vectors; None if C has no word for it."""
-        if self.c is None:
-            return f"f_{name}({', '.join(args)})" if kind == "f" else None
-        return self.c[kind].format(*args) if kind in self.c else None
+        """The C of the operation on these expressions; None if there is none for this kind."""
+        if self.c is None and kind == "f":
+            return f"f_{name}({', '.join(args)})"
+        if self.c is None or kind not in self.c:
+            return None
+        return self.c[kind].format(*args)
 
 
 def _reciprocal_root(x):
@@ -61,7 +63,9 @@ def _arithmetic(numpy: Callable, xla: Callable, sign: str, cost: int = 1, **more
 def _comparison(
     numpy: Callable, xla: Callable, sign: str, of_flags: str | None = None, **more: Any
 ) -> Operation:
-    c = dict.fromkeys("fi", f"MASK({{}} {sign} {{}})") | ({"b": of_flags} if of_flags else {})
+    c = dict.fromkeys("fi", f"MASK({{}} {sign} {{}})")
+    if of_flags:
+        c["b"] = of_flags
     return Operation(numpy, xla, 1, c, cheap=True, **more)
 
 
@@ -131,5 +135,5 @@ OPERATIONS: dict[str, Operation] = {
     "convert": Operation(None, None, 1, {}, cheap=True, primitives=()),
     "lookup": Operation(None, None, 24, {}, primitives=()),
 }
-"""What a program may hold, besides constants and inputs.  What "convert" does depends on both
-kinds, a "lookup" has its table."""
+"""The operations of a program, besides constants and inputs. The effect of "convert" depends on
+both kinds, and a "lookup" has a table."""

@@ -1,154 +1,188 @@
-"""Rewritings of a whole program that save time: divisions become products with a reciprocal, at the
-price of one rounding, and operations are put in an order in which a processor need not wait.
+"""Transformations of a complete program that save time.
 
-A division takes as long as ten products.  Where the denominator is of a lower class than the
-quotient (a bound, which only time decides) or serves several quotients (a pivot), its reciprocal is
-computed once; a denominator that is a choice of shared ones has the choice of their reciprocals.
+Divisions become products with a reciprocal, which costs one rounding. A division takes as long as
+ten products. Where the denominator is of a lower class than the quotient (a bound, which only time
+decides) or occurs in several quotients (a pivot), its reciprocal is computed once. The reciprocal
+of a selection among shared denominators is the selection among their reciprocals.
+
+`scheduled` orders the operations such that a processor need not wait for results.
 """
 
 from __future__ import annotations
 
 import heapq
 from collections import Counter
-from functools import lru_cache
+from collections.abc import Sequence
 
+from iblf_jax.kernels.caches import CACHES
 from iblf_jax.kernels.operations import OPERATIONS
-from iblf_jax.kernels.program import LANE, TIME, Builder, Node, Program, finished, needed
+from iblf_jax.kernels.program import (
+    PER_RUN,
+    TIME,
+    Builder,
+    Node,
+    Program,
+    arguments_of,
+    finished,
+    needed,
+)
 
 
 def rebuilt(program: Program, rule) -> Program:
-    """The program with every operation made again by `rule(builder, node, args, index)`, or as it
-    was where that gives None.
+    """The program with other operations.
+
+    Args:
+      program: the program.
+      rule: function (builder, node, arguments, index of the node) -> new node; None to copy it.
     """
     b = Builder(program.dtype)
     new: list[int] = []
     for i, node in enumerate(program.nodes):
         args = tuple(new[a] for a in node.args)
-        made = rule(b, node, args, i)
-        new.append(b.again(node, args) if made is None else made)
-    carry_in = [new[a] if a >= 0 else -1 for a, _ in program.carry]
+        replacement = rule(b, node, args, i)
+        if replacement is None:
+            replacement = b.copy(node, args)
+        new.append(replacement)
+    # The last entry serves the node -1 of numbers that a step does not read.
+    new.append(-1)
     return finished(
         b,
-        carry_in,
-        [new[o] for _, o in program.carry],
-        [new[s] for s in program.samples],
+        [new[before] for before, _ in program.carry],
+        [new[after] for _, after in program.carry],
+        [new[sample] for sample in program.samples],
         program.recorded,
     )
 
 
-@lru_cache(maxsize=64)
+@CACHES.function(maxsize=64)
 def written_out(program: Program) -> Program:
-    """The program with its functions written out wherever they are called."""
-    found: dict[int, list[int]] = {}
+    """The program with its functions inlined at each call."""
+    results: dict[int, list[int]] = {}
 
     def rule(b: Builder, node, args, i):
         if node.op == "call":
-            function, new = node.value, list[int]()
-            args = args if node.kind == "call" else args[1:]
-            for inner in function.nodes:
-                new.append(
-                    args[inner.value]
-                    if inner.op == "argument"
-                    else b.again(inner, [new[a] for a in inner.args])
-                )
-            found[i] = [new[s] for s in function.samples]
+            results[i] = _inlined(b, node.value, args[len(args) - len(arguments_of(node)) :])
             return -1
-        return found[node.args[0]][node.value] if node.op == "result" else None
-
-    return rebuilt(program, rule)
-
-
-def with_reciprocals(program: Program) -> Program:
-    """Divisions by shared or repeated denominators as products (head of this module)."""
-    classes = program.classes()
-    uses = Counter(node.args[1] for node in program.nodes if node.op == "div" and node.kind == "f")
-
-    def is_shared(i: int) -> bool:
-        return not classes[i] & LANE
-
-    def reciprocal(b: Builder, old: int, new: int) -> int:
-        node = program.nodes[old]
-        if node.op == "select" and classes[old] & LANE and all(is_shared(a) for a in node.args[1:]):
-            condition, yes, no = (
-                b.nodes[new].args if b.nodes[new].op == "select" else (None, None, None)
-            )
-            if condition is not None and yes is not None and no is not None:
-                one = b.constant(1, "f")
-                return b.emit("select", condition, b.emit("div", one, yes), b.emit("div", one, no))
-        return b.emit("div", b.constant(1, "f"), new)
-
-    def cheap(i: int, quotient: int) -> bool:
-        node = program.nodes[i]
-        choice = node.op == "select" and all(is_shared(a) for a in node.args[1:])
-        return choice or classes[i] != classes[quotient] or uses[i] > 1
-
-    def rule(b: Builder, node, args, i):
-        if (
-            node.op == "div"
-            and node.kind == "f"
-            and b.value(args[0]) != 1
-            and cheap(node.args[1], i)
-        ):
-            return b.emit("mul", args[0], reciprocal(b, node.args[1], args[1]))
+        if node.op == "result":
+            return results[node.args[0]][node.value]
         return None
 
     return rebuilt(program, rule)
 
 
-def scheduled(program: Program) -> Program:
-    """The program in an order in which a processor need not wait: of what can be computed, first
-    what the longest chain hangs on.
+def _inlined(b: Builder, function: Program, arguments: tuple[int, ...]) -> list[int]:
+    """The nodes of the results of a function."""
+    new: list[int] = []
+    for node in function.nodes:
+        if node.op == "argument":
+            new.append(arguments[node.value])
+        else:
+            new.append(b.copy(node, [new[a] for a in node.args]))
+    return [new[sample] for sample in function.samples]
 
-    A processor looks a few hundred instructions ahead.  In depth-first order it sees one chain of a
-    step there; in this one, what metrics and estimates ask for stands between the stages of the
+
+def with_reciprocals(program: Program) -> Program:
+    """The program with products instead of divisions by shared or repeated denominators."""
+    classes = program.classes()
+    uses = Counter(node.args[1] for node in program.nodes if node.op == "div" and node.kind == "f")
+
+    def is_selection_of_shared(i: int) -> bool:
+        node = program.nodes[i]
+        return node.op == "select" and not any(classes[a] & PER_RUN for a in node.args[1:])
+
+    def reciprocal(b: Builder, old: int, new: int) -> int:
+        one = b.constant(1, "f")
+        if is_selection_of_shared(old) and classes[old] & PER_RUN and b.nodes[new].op == "select":
+            condition, yes, no = b.nodes[new].args
+            return b.emit("select", condition, b.emit("div", one, yes), b.emit("div", one, no))
+        return b.emit("div", one, new)
+
+    def rule(b: Builder, node, args, i):
+        if node.op != "div" or node.kind != "f" or b.value(args[0]) == 1:
+            return None
+        denominator = node.args[1]
+        pays = (
+            is_selection_of_shared(denominator)
+            or classes[denominator] != classes[i]
+            or uses[denominator] > 1
+        )
+        if not pays:
+            return None
+        return b.emit("mul", args[0], reciprocal(b, denominator, args[1]))
+
+    return rebuilt(program, rule)
+
+
+def scheduled(program: Program) -> Program:
+    """The program in an order in which a processor need not wait for results: of the nodes whose
+    arguments are computed, first the one with the longest chain of users.
+
+    A processor looks a few hundred instructions ahead. In depth-first order it finds one chain of a
+    step there. In this order, operations of metrics and estimates are between the stages of the
     integrator.
     """
-    nodes, classes = program.nodes, program.classes()
-    cost, users = [_cost(node) for node in nodes], [list[int]() for _ in nodes]
-    delay = [max(2 * c, LATENCY) if c else 0 for c in cost]
-    order, left = [i for i, c in enumerate(classes) if c != LANE | TIME], [0] * len(nodes)
-    known = set(order)
-    for i, node in enumerate(nodes):
-        for a in set(node.args) - known if i not in known else ():
-            users[a].append(i)
-            left[i] += 1
-    height = [0] * len(nodes)
-    for i in reversed(range(len(nodes))):
-        height[i] = delay[i] + max((height[user] for user in users[i]), default=0)
-    waiting = [(0, i) for i in range(len(nodes)) if i not in known and not left[i]]
-    ready, at, now = list[tuple[int, int]](), [0] * len(nodes), 0
-    while waiting or ready:
-        now = now if ready else max(now, waiting[0][0])
-        while waiting and waiting[0][0] <= now:
-            i = heapq.heappop(waiting)[1]
-            heapq.heappush(ready, (-height[i], i))
-        i = heapq.heappop(ready)[1]
-        order.append(i)
-        for user in users[i]:
-            at[user] = max(at[user], now + delay[i])
-            left[user] -= 1
-            if not left[user]:
-                heapq.heappush(waiting, (at[user], user))
-        now += cost[i]
-    # What only samples need stays last: a call that only they need must not write over what the
-    # next one has left there (`layout.FunctionCalls`).
-    in_time = set(needed(nodes, [o for _, o in program.carry])) | known
+    nodes = program.nodes
+    first = [i for i, c in enumerate(program.classes()) if c != PER_RUN | TIME]
+    order = first + _by_longest_chain(nodes, set(first))
+    # Nodes that only samples need stay last: a call that only they need must not overwrite the
+    # results that the next call has left (`layout.FunctionCalls`).
+    in_time = set(needed(nodes, [after for _, after in program.carry])) | set(first)
     order.sort(key=lambda i: i not in in_time)
     place = {i: k for k, i in enumerate(order)}
-    carry = tuple((place.get(a, -1), place[o]) for a, o in program.carry)
-    moved = tuple(nodes[i]._replace(args=tuple(place[a] for a in nodes[i].args)) for i in order)
     return program._replace(
-        nodes=moved, carry=carry, samples=tuple(place[s] for s in program.samples)
+        nodes=tuple(nodes[i]._replace(args=tuple(place[a] for a in nodes[i].args)) for i in order),
+        carry=tuple((place.get(before, -1), place[after]) for before, after in program.carry),
+        samples=tuple(place[sample] for sample in program.samples),
     )
 
 
-LATENCY, LIBRARY = 4, 100
-"""Cycles until an instruction's result is there; instructions of a call into the C library,
-roughly."""
+def _by_longest_chain(nodes: Sequence[Node], known: set[int]) -> list[int]:
+    """The order of `scheduled` of all nodes that are not known (list scheduling)."""
+    cost = [_cost(node) for node in nodes]
+    delay = [max(2 * c, LATENCY) if c else 0 for c in cost]
+    users: list[list[int]] = [[] for _ in nodes]
+    missing = [0] * len(nodes)
+    for i, node in enumerate(nodes):
+        if i in known:
+            continue
+        for a in set(node.args) - known:
+            users[a].append(i)
+            missing[i] += 1
+    chain = [0] * len(nodes)
+    for i in reversed(range(len(nodes))):
+        chain[i] = delay[i] + max((chain[user] for user in users[i]), default=0)
+    order = []
+    waiting = [(0, i) for i in range(len(nodes)) if i not in known and not missing[i]]
+    ready: list[tuple[int, int]] = []
+    earliest = [0] * len(nodes)
+    now = 0
+    while waiting or ready:
+        if not ready:
+            now = max(now, waiting[0][0])
+        while waiting and waiting[0][0] <= now:
+            _, i = heapq.heappop(waiting)
+            heapq.heappush(ready, (-chain[i], i))
+        _, i = heapq.heappop(ready)
+        order.append(i)
+        for user in users[i]:
+            earliest[user] = max(earliest[user], now + delay[i])
+            missing[user] -= 1
+            if not missing[user]:
+                heapq.heappush(waiting, (earliest[user], user))
+        now += cost[i]
+    return order
+
+
+LATENCY = 4
+"""Cycles until the result of an instruction is available."""
+LIBRARY = 100
+"""Instructions of a call of the C library, approximately."""
 
 
 def _cost(node: Node) -> int:
-    """Instructions of a node, roughly; constants and inputs are there."""
+    """Approximate number of instructions of a node; 0 for constants and inputs."""
     if node.op == "call":
         return node.value.size
-    return OPERATIONS[node.op].cost or LIBRARY if node.op in OPERATIONS else 0
+    if node.op not in OPERATIONS:
+        return 0
+    return OPERATIONS[node.op].cost or LIBRARY

@@ -1,24 +1,27 @@
-"""Scalar programs: what one step of a run does, number by number.
+"""Scalar programs: what one step of a run computes, number by number.
 
-A jaxpr works on small arrays; a processor that steps many runs at once wants to see single numbers,
-each of which is a register full of runs.  So arrays are taken apart (`from_jaxpr`): a `Program` is
-a list of nodes in an order in which each uses only earlier ones.  Equal nodes are one node
-(hash-consing), constants are folded, and what no output needs is dropped.
+A jaxpr works on small arrays. A processor that steps many runs at once needs single numbers, each
+of which is a register with one entry per run. `from_jaxpr` therefore splits arrays into numbers: a
+`Program` is a list of nodes in an order in which each node uses only earlier ones. Equal nodes are
+one node (hash-consing), constants are folded, and nodes that no output needs are removed.
 
-Every node has one of four classes, by what it depends on; each is computed as seldom as that
-allows:
+Every node has one of four classes, which follows from what it depends on. Generated code computes
+each node as rarely as its class permits:
 
-    SHARED        the shared leaves alone                   once
-    SHARED|TIME   shared leaves and time                    once a step, for all runs
-    LANE          the leaves of a run                       once a run
-    LANE|TIME     the state of a run                        once a step and run
+    class           depends on                  computed
+    SHARED          shared leaves only          once
+    SHARED|TIME     shared leaves and time      once per time step, for all runs
+    PER_RUN         the leaves of a run         once per run
+    PER_RUN|TIME    the state of a run          once per time step and run
 """
 
 from __future__ import annotations
 
 import math
+import operator
 from collections import Counter
 from collections.abc import Callable, Container, Iterable, Sequence
+from functools import reduce
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,22 +29,22 @@ import numpy as np
 from iblf_jax.kernels.identities import fold, simplify, without_absent
 from iblf_jax.kernels.operations import OPERATIONS
 
-SHARED, LANE, TIME = 0, 1, 2
-INPUTS = ("shared", "lane", "carry", "index", "argument")
-"""Operations that stand for an input: leaves that runs share, leaves of a run, what goes from step
-to step, number of the step, and of a function that a program calls, what it is given."""
+SHARED, PER_RUN, TIME = 0, 1, 2
+INPUTS = ("shared", "per_run", "carry", "index", "argument")
+"""Operations that stand for an input: leaves that all runs share, leaves of one run, the carry, the
+number of the step, and the arguments of a function that a program calls."""
 
 
 Ids = np.ndarray
-"""An array of node numbers, int64, of the shape of the array that it stands for."""
+"""An array of node numbers, int64, with the shape of the array that it represents."""
 
 
 class UnsupportedError(Exception):
-    """What a scalar program cannot express; the message is one line for the user."""
+    """A scalar program cannot express a step; the message is one line for the user."""
 
 
 def kind_of(dtype) -> str:
-    """The kind "f", "i" or "b" of an array's type; UnsupportedError for others."""
+    """The kind "f", "i" or "b" of a type of array; UnsupportedError for other types."""
     if np.issubdtype(dtype, np.floating):
         return "f"
     if np.issubdtype(dtype, np.signedinteger):
@@ -52,99 +55,121 @@ def kind_of(dtype) -> str:
 
 
 class Node(NamedTuple):
-    """One number: `op(*args)`; `kind` is "f" (float), "i" (int) or "b" (bool); `value` is that of a
-    constant, an input's index, or the numbers among which a "lookup" chooses by its whole-numbered
-    argument (the nearest end, outside).
+    """One number, `op(*args)`.
 
-    A "call" is no number: it has the results of a function, a program whose "samples" they are; a
-    "result" is one of them.  One of the kind "call if" is made where its first argument, the same
-    for all runs, holds; elsewhere its results are no numbers either.
+    Three operations are special. A "lookup" selects an entry of the table `value` by its integer
+    argument; an index outside the table selects the nearest end. A "call" has the results of a
+    function; the "samples" of the program `value` are these results, and each "result" is one of
+    them. A call of kind "call if" is executed where its first argument, which is the same for all
+    runs, is true; otherwise its results have no defined value.
     """
 
     op: str
     args: tuple[int, ...]
     kind: str
+    """"f" (float), "i" (integer) or "b" (truth value); "call" or "call if" for a call."""
     value: Any = None
+    """A constant's value, an input's index, a lookup's table, or a call's function."""
+
+
+def arguments_of(call: Node) -> tuple[int, ...]:
+    """The nodes that a call passes to its function."""
+    if call.kind == "call":
+        return call.args
+    return call.args[1:]  # the first one is the condition
 
 
 class Known(NamedTuple):
     """What is known beforehand of a shared number that is finite."""
 
     value: float | None = None
-    """0, 1 or -1, if it is that: a constant, and what is multiplied by such a zero is not there."""
+    """0, 1 or -1 if the number has this value: it is a constant then, and a product with such a
+    zero is absent."""
     same: int | None = None
-    """The shared number that it is equal to, up to a sign."""
+    """The shared number that it equals, up to a sign."""
     sign: int = 1
 
 
 class LoweringLimits(NamedTuple):
-    """What is too long to be lowered; the caller says so."""
+    """Sizes above which a step is not compiled."""
 
     choices: float = math.inf
-    """Entries among which indices of the run may choose."""
+    """Entries among which indices that depend on the run may select."""
     table: float = math.inf
-    """Floating-point constants among which one may."""
+    """Floating-point constants among which one such index may select."""
     tables: float = math.inf
-    """Numbers that the tables of one indexing may have in all."""
+    """Numbers in all tables of one indexing operation."""
     scan: float = math.inf
-    """Steps up to which an inner scan is unrolled."""
+    """Steps of an inner scan, which is unrolled."""
     written_out: float = math.inf
-    """Nodes up to which a function is written out wherever it is called."""
+    """Nodes of a function that is inlined at each call; a longer one is called."""
     under_condition: float = math.inf
-    """Nodes up to which a branch that all runs take together is written out."""
+    """Nodes of a branch that is inlined if all runs take it together; a longer one is called."""
     power: float = math.inf
-    """Whole exponents up to which a power is made of products."""
+    """Integer exponents of powers that become products."""
 
 
 NO_LIMITS = LoweringLimits()
 
 
-def extend_classes(classes: list[int], nodes: Sequence[Node], still: Container[int]) -> None:
-    """Adds the classes of the nodes that have none yet; `still`: carried numbers that a step leaves
-    alone, of class LANE.
+CLASS_OF_INPUT = {"const": SHARED, "shared": SHARED, "index": TIME, "per_run": PER_RUN}
+"""The class of a node without arguments; all others are of class PER_RUN | TIME."""
+
+
+def extend_classes(
+    classes: list[int], nodes: Sequence[Node], constant_carry: Container[int]
+) -> None:
+    """Appends the classes of the nodes that have none yet.
+
+    Args:
+      classes: classes of the first nodes.
+      nodes: all nodes.
+      constant_carry: nodes of carried numbers that a step returns unchanged; they are of class
+        PER_RUN.
     """
-    of_input = {"const": SHARED, "shared": SHARED, "index": TIME, "lane": LANE}
-    for node in nodes[len(classes) :]:
+    for i in range(len(classes), len(nodes)):
+        node = nodes[i]
         if node.args:
-            found = 0
-            for a in node.args:
-                found |= classes[a]
+            classes.append(reduce(operator.or_, (classes[a] for a in node.args)))
+        elif i in constant_carry:
+            classes.append(PER_RUN)
         else:
-            found = LANE if len(classes) in still else of_input.get(node.op, LANE | TIME)
-        classes.append(found)
+            classes.append(CLASS_OF_INPUT.get(node.op, PER_RUN | TIME))
 
 
 class Builder:
-    """Makes nodes; equal ones are made once."""
+    """Adds nodes to a list; equal nodes are one node."""
 
     def __init__(self, dtype, *, sparse: bool = False, limits: LoweringLimits = NO_LIMITS) -> None:
-        """`sparse`: a product with a literal zero is zero, for programs of derivatives, where such
-        a zero says "does not depend". `limits`: for what is read from a jaxpr.
+        """Starts an empty list of nodes.
+
+        Args:
+          dtype: floating-point type.
+          sparse: whether a product with a literal zero is zero. This holds for programs of
+            derivatives, in which such a zero means "does not depend".
+          limits: sizes above which a jaxpr is not compiled.
         """
         self.dtype = np.dtype(dtype)
         self.sparse = sparse
         self.limits = limits
         self.nodes: list[Node] = []
-        self.still: set[int] = set()
-        """Nodes of carried numbers that a step leaves alone."""
+        self.constant_carry: set[int] = set()
+        """Nodes of carried numbers that a step returns unchanged."""
         self._known: dict[tuple, int] = {}
         self._classes: list[int] = []
         self.known_finite: set[int] = set()
-        """Inputs that are known to be finite (`Known`), and what was computed of them alone."""
+        """Inputs that are known to be finite (`Known`), and nodes that depend only on these."""
         self.absent = self._add(Node("const", (), "f", 0.0), "absent")
-        """The zero of what is not there: a product with it is not there either, whatever the other
-        factor."""
+        """The zero of an absent quantity: a product with it is absent, too, whatever the other
+        factor is."""
 
     def constant(self, value, kind: str) -> int:
         """The node of a constant."""
-        value = (
-            float(self.dtype.type(value))
-            if kind == "f"
-            else int(value)
-            if kind == "i"
-            else bool(value)
-        )
-        return self._add(Node("const", (), kind, value), value.hex() if kind == "f" else value)
+        if kind == "f":
+            number = float(self.dtype.type(value))
+            return self._add(Node("const", (), kind, number), number.hex())
+        exact = {"i": int, "b": bool}[kind](value)
+        return self._add(Node("const", (), kind, exact), exact)
 
     def input(self, op: str, index: int, kind: str) -> int:
         """The node of an input (`INPUTS`)."""
@@ -156,10 +181,7 @@ class Builder:
             rest = without_absent(self, op, args)
             if rest is not None:
                 return rest
-        for a in args:
-            if self.nodes[a].op != "const":
-                break
-        else:
+        if all(self.nodes[a].op == "const" for a in args):
             nodes = [self.nodes[a] for a in args]
             folded = fold(op, [n.value for n in nodes], [n.kind for n in nodes], kind, self.dtype)
             if folded is not None:
@@ -167,73 +189,71 @@ class Builder:
         simpler = simplify(self, op, args, kind)
         if simpler is not None:
             return simpler
-        new = self._add(
-            Node(op, tuple(sorted(args)) if OPERATIONS[op].commutes else args, kind), None
-        )
-        if (
-            self.known_finite
-            and kind == "f"
-            and all(a in self.known_finite or self._is_finite_constant(a) for a in args)
-        ):
+        if OPERATIONS[op].commutes:
+            args = tuple(sorted(args))
+        new = self._add(Node(op, tuple(args), kind), None)
+        if kind == "f" and self.known_finite and all(map(self._is_finite, args)):
             self.known_finite.add(new)
         return new
 
     def lookup(self, table: tuple[float, ...], index: int) -> int:
-        """The node of table[index], for an index that only the run knows."""
+        """The node of table[index], for an index that is unknown at compile time."""
         return self._add(Node("lookup", (index,), "f", table), tuple(x.hex() for x in table))
 
     def call(self, function: Program, args: Sequence[int], condition: int | None = None) -> int:
-        """The node of a call of a function, made where the condition holds if there is one."""
-        args, kind = (tuple(args), "call") if condition is None else ((condition, *args), "call if")
-        return self._add(Node("call", args, kind, function), id(function))
+        """The node of a call of a function, which is executed where the condition holds, if any."""
+        if condition is None:
+            return self._add(Node("call", tuple(args), "call", function), id(function))
+        return self._add(Node("call", (condition, *args), "call if", function), id(function))
 
     def result(self, call: int, number: int) -> int:
-        """The node of one of its results."""
+        """The node of a result of a call."""
         function = self.nodes[call].value
-        return self._add(
-            Node("result", (call,), function.nodes[function.samples[number]].kind, number), number
-        )
+        kind = function.nodes[function.samples[number]].kind
+        return self._add(Node("result", (call,), kind, number), number)
 
-    def again(self, node: Node, args: Sequence[int]) -> int:
-        """A node of another builder, on nodes of this one."""
+    def copy(self, node: Node, args: Sequence[int]) -> int:
+        """A node of another builder, with arguments of this one."""
         if node.op == "const":
             return self.constant(node.value, node.kind)
         if node.op in INPUTS:
             return self.input(node.op, node.value, node.kind)
         if node.op == "lookup":
             return self.lookup(node.value, *args)
+        if node.op == "call" and node.kind == "call":
+            return self.call(node.value, args)
         if node.op == "call":
-            return (
-                self.call(node.value, args)
-                if node.kind == "call"
-                else self.call(node.value, args[1:], args[0])
-            )
-        return (
-            self.result(args[0], node.value)
-            if node.op == "result"
-            else self.emit(node.op, *args, kind=node.kind)
-        )
+            return self.call(node.value, args[1:], args[0])
+        if node.op == "result":
+            return self.result(args[0], node.value)
+        return self.emit(node.op, *args, kind=node.kind)
 
-    def moves(self, node: int) -> bool:
-        """Whether a node is of class LANE|TIME."""
-        return self._class(node) == LANE | TIME
+    def depends_on_state(self, node: int) -> bool:
+        """Whether a node is of class PER_RUN|TIME."""
+        return self._class(node) == PER_RUN | TIME
 
     def is_shared(self, node: int) -> bool:
         """Whether a node is the same for all runs."""
-        return not self._class(node) & LANE
+        return not self._class(node) & PER_RUN
 
     def _class(self, node: int) -> int:
-        extend_classes(self._classes, self.nodes, self.still)
+        extend_classes(self._classes, self.nodes, self.constant_carry)
         return self._classes[node]
 
-    def _is_finite_constant(self, node: int) -> bool:
+    def _is_finite(self, node: int) -> bool:
+        """Whether a node is known to be finite."""
+        if node in self.known_finite:
+            return True
         return self.nodes[node].op == "const" and math.isfinite(self.nodes[node].value)
 
     def value(self, node: int):
-        """The value of a constant node, else None."""
-        return self.nodes[node].value if self.nodes[node].op == "const" else None
+        """The value of a constant; None for every other node."""
+        if self.nodes[node].op != "const":
+            return None
+        return self.nodes[node].value
 
     def _add(self, node: Node, tag) -> int:
+        """The node, which is added unless there is an equal one; `tag` identifies its value."""
         key = (node.op, node.args, node.kind, tag)
         found = self._known.get(key)
         if found is None:
@@ -256,11 +276,11 @@ class Program(NamedTuple):
     Args:
       dtype: floating-point type of every "f".
       nodes: in an order in which each uses earlier ones only.
-      carry: (input node, output node) of every number that goes from step to step; input -1 where
-        the step does not read it.
-      samples: output nodes that a record may ask for; the results of a function.
+      carry: (input node, output node) of every number that goes from one step to the next; the
+        input is -1 where the step does not read the number.
+      samples: nodes of the recorded numbers; for a function that is called, its results.
       kinds: kind of every carried number.
-      recorded: how many of the samples each recorded array has, in order.
+      recorded: number of samples of each recorded array, in order.
     """
 
     dtype: np.dtype
@@ -271,33 +291,48 @@ class Program(NamedTuple):
     recorded: tuple[int, ...] = ()
 
     def classes(self) -> list[int]:
-        """The class of every node (head of this module); a carried number that a step leaves alone
-        is of class LANE.
-        """
+        """The class of every node (see the docstring of this module)."""
         result: list[int] = []
         extend_classes(result, self.nodes, {a for a, b in self.carry if a == b})
         return result
 
     def counts(self) -> dict[int, Counter]:
-        """Class -> how many of each operation; constants and inputs are not operations."""
+        """Class -> number of each operation; constants and inputs are not operations."""
         result: dict[int, Counter] = {c: Counter() for c in range(4)}
         for node, c in zip(self.nodes, self.classes(), strict=True):
             if node.op not in INPUTS and node.op != "const":
                 result[c][node.op] += 1
         return result
 
+    def listing(self) -> str:
+        """The program as text: one line for each node, then the carry and the samples."""
+        lines = []
+        for i, node in enumerate(self.nodes):
+            words = [node.op, *(f"n{a}" for a in node.args)]
+            if node.op in INPUTS or node.op in ("const", "result"):
+                words.append(str(node.value))
+            lines.append(f"n{i} = {' '.join(words)}")
+        lines += [f"carry {c}: n{after}" for c, (_, after) in enumerate(self.carry)]
+        lines += [f"sample {k}: n{sample}" for k, sample in enumerate(self.samples)]
+        return "\n".join(lines)
+
     @property
     def size(self) -> int:
-        """Nodes that a compiler sees: those of a function once, however often it is called."""
+        """Number of nodes that a compiler reads; those of a function count once."""
         functions = {id(node.value): node.value for node in self.nodes if node.op == "call"}
         return len(self.nodes) + sum(function.size for function in functions.values())
 
 
-def needed(nodes: Sequence[Node], wanted: Iterable[int], known: Container[int] = ()) -> list[int]:
-    """The nodes that `wanted` needs, itself included, in order; what is known needs nothing and is
-    left out.
+def needed(nodes: Sequence[Node], outputs: Iterable[int], known: Container[int] = ()) -> list[int]:
+    """The outputs and all nodes that they depend on, in order.
+
+    Args:
+      nodes: all nodes.
+      outputs: some of them.
+      known: nodes that are computed already; they and what only they depend on are excluded.
     """
-    stack, found = list(wanted), set()
+    stack = list(outputs)
+    found: set[int] = set()
     while stack:
         i = stack.pop()
         if i not in known and i not in found:
@@ -313,10 +348,10 @@ def finished(
     samples: list[int],
     recorded: tuple[int, ...] = (),
 ) -> Program:
-    """The program of the given outputs, without what they do not need, in depth-first order.
+    """The program of the given outputs, without nodes that they do not need, in depth-first order.
 
     The order matters to a compiler with few registers: a number is computed shortly before its
-      first use.
+    first use.
     """
     order: list[int] = []
     place: dict[int, int] = {}
@@ -346,9 +381,16 @@ def finished(
 def frontier(
     program: Program, classes: list[int], of: int, used_by: Callable[[int], bool]
 ) -> list[int]:
-    """The operations and inputs of class `of` that a node of a class accepted by `used_by` reads,
-    and no constants.
+    """The operations and inputs of one class that nodes of other classes read; no constants.
+
+    Args:
+      program: the program.
+      classes: classes of its nodes.
+      of: the class.
+      used_by: whether a class is one of those that read.
     """
-    found = {a for i, node in enumerate(program.nodes) if used_by(classes[i]) for a in node.args}
-    found |= {i for i in [*(o for _, o in program.carry), *program.samples] if used_by(LANE | TIME)}
-    return sorted(a for a in found if classes[a] == of and program.nodes[a].op != "const")
+    read = {a for i, node in enumerate(program.nodes) if used_by(classes[i]) for a in node.args}
+    if used_by(PER_RUN | TIME):
+        read.update(output for _, output in program.carry)
+        read.update(program.samples)
+    return sorted(a for a in read if classes[a] == of and program.nodes[a].op != "const")

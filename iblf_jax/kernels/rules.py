@@ -1,10 +1,13 @@
-"""What each jaxpr primitive becomes: the rules that compute.  Those that only move numbers about
-are in `structure`.
+"""The rules of the primitives of a jaxpr that compute numbers.
+
+The primitives that only rearrange numbers are in `structure`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
+from functools import reduce
 
 import numpy as np
 
@@ -14,7 +17,7 @@ from iblf_jax.kernels.structure import STRUCTURE
 
 
 def each(b: Builder, op: str, eqn, *operands: Ids, kind: str | None = None) -> Ids:
-    """op, entry by entry, on operands of one shape (or scalars)."""
+    """Applies an operation entry by entry to operands of one shape (or scalars)."""
     kind = kind or kind_of(eqn.outvars[0].aval.dtype)
     shape = np.broadcast_shapes(*(x.shape for x in operands))
     flat = zip(*(np.broadcast_to(x, shape).ravel().tolist() for x in operands), strict=True)
@@ -26,12 +29,11 @@ def _elementwise(op: str) -> Callable:
 
 
 def _integer_pow(b: Builder, eqn, x: Ids) -> Ids:
-    exponent = eqn.params["y"]
-    return power(b, eqn, x, exponent)
+    return power(b, eqn, x, eqn.params["y"])
 
 
 def power(b: Builder, eqn, x: Ids, exponent: int) -> Ids:
-    """x^exponent by squaring, for a whole exponent."""
+    """x^exponent by squaring, for an integer exponent."""
     result, square, left = None, x, abs(exponent)
     kind = kind_of(eqn.outvars[0].aval.dtype)
     while left:
@@ -43,14 +45,17 @@ def power(b: Builder, eqn, x: Ids, exponent: int) -> Ids:
     one = np.full(x.shape, b.constant(1, kind))
     if result is None:
         return one
-    return each(b, "div", eqn, one, result) if exponent < 0 else result
+    if exponent < 0:
+        return each(b, "div", eqn, one, result)
+    return result
 
 
 def _pow(b: Builder, eqn, x: Ids, y: Ids) -> Ids:
     exponents = {b.value(int(i)) for i in y.ravel()}
-    value = next(iter(exponents)) if len(exponents) == 1 else None
-    if value is not None and float(value).is_integer() and abs(value) <= b.limits.power:
-        return power(b, eqn, x, int(value))
+    if len(exponents) == 1:
+        (value,) = exponents
+        if value is not None and float(value).is_integer() and abs(value) <= b.limits.power:
+            return power(b, eqn, x, int(value))
     if kind_of(eqn.invars[1].aval.dtype) != "f":
         y = each(b, "convert", eqn, y, kind="f")
     return each(b, "pow", eqn, x, y)
@@ -90,6 +95,13 @@ def _stop(b: Builder, eqn, *operands: Ids):
     return list(operands)
 
 
+def _neutral(op: str, kind: str):
+    """The result of a reduction of no numbers."""
+    if op == "and":
+        return {"i": -1, "b": True}[kind]
+    return {"add": 0, "mul": 1, "or": 0, "max": -np.inf, "min": np.inf}[op]
+
+
 def _reduce(op: str) -> Callable:
     def rule(b: Builder, eqn, x: Ids) -> Ids:
         axes = eqn.params["axes"]
@@ -97,21 +109,14 @@ def _reduce(op: str) -> Callable:
         rows = np.transpose(x, [*axes, *kept]).reshape(-1, *(x.shape[a] for a in kept))
         if len(rows) == 0:
             kind = kind_of(eqn.outvars[0].aval.dtype)
-            neutral = {
-                "add": 0,
-                "mul": 1,
-                "or": 0,
-                "and": -1 if kind == "i" else True,
-                "max": -np.inf,
-                "min": np.inf,
-            }[op]
-            return np.full(rows.shape[1:], b.constant(neutral, kind))
+            return np.full(rows.shape[1:], b.constant(_neutral(op, kind), kind))
         return _along(b, op, eqn, rows)
 
     return rule
 
 
 def _along(b: Builder, op: str, eqn, rows: Ids) -> Ids:
+    """Reduces rows by an operation, one after the other."""
     total = rows[0]
     for row in rows[1:]:
         total = each(b, op, eqn, total, row)
@@ -122,17 +127,13 @@ def _arg_extreme(op: str) -> Callable:
     def rule(b: Builder, eqn, x: Ids) -> Ids:
         (axis,) = eqn.params["axes"]
         rows = np.moveaxis(x, axis, 0)
-        best, where = rows[0], np.full(rows.shape[1:], b.constant(0, "i"))
+        best = rows[0]
+        where = np.full(rows.shape[1:], b.constant(0, "i"))
         for i, row in enumerate(rows[1:], 1):
             better = each(b, op, eqn, row, best, kind="b")
-            first_nan = each(
-                b,
-                "and",
-                eqn,
-                each(b, "ne", eqn, row, row, kind="b"),
-                each(b, "eq", eqn, best, best, kind="b"),
-                kind="b",
-            )
+            is_nan = each(b, "ne", eqn, row, row, kind="b")
+            best_is_number = each(b, "eq", eqn, best, best, kind="b")
+            first_nan = each(b, "and", eqn, is_nan, best_is_number, kind="b")
             better = each(b, "or", eqn, better, first_nan, kind="b")
             where = each(b, "select", eqn, better, np.full(where.shape, b.constant(i, "i")), where)
             best = each(b, "select", eqn, better, row, best, kind=b.nodes[int(row.flat[0])].kind)
@@ -143,45 +144,57 @@ def _arg_extreme(op: str) -> Callable:
 
 def _cumulative(op: str) -> Callable:
     def rule(b: Builder, eqn, x: Ids) -> Ids:
-        rows = np.moveaxis(x, eqn.params["axis"], 0)
-        rows = rows[::-1] if eqn.params["reverse"] else rows
-        done = [rows[0]] if len(rows) else []
+        axis = eqn.params["axis"]
+        direction = slice(None)
+        if eqn.params["reverse"]:
+            direction = slice(None, None, -1)
+        rows = np.moveaxis(x, axis, 0)[direction]
+        if len(rows) == 0:
+            return x
+        done = [rows[0]]
         for row in rows[1:]:
             done.append(each(b, op, eqn, done[-1], row))
-        result = np.stack(done) if done else rows
-        return np.moveaxis(result[::-1] if eqn.params["reverse"] else result, 0, eqn.params["axis"])
+        return np.moveaxis(np.stack(done)[direction], 0, axis)
 
     return rule
 
 
 def _dot_general(b: Builder, eqn, x: Ids, y: Ids) -> Ids:
-    """Products and sums; a factor that is a literal zero leaves its term out, as a matrix that is
-    written with zeros means it.
+    """Products and sums.
+
+    A term with a factor that is a literal zero is excluded: a matrix that is written with zeros is
+    sparse.
     """
-    (xc, yc), (xb, yb) = eqn.params["dimension_numbers"]
-    xf = [a for a in range(x.ndim) if a not in (*xc, *xb)]
-    yf = [a for a in range(y.ndim) if a not in (*yc, *yb)]
-    batch, shape = [x.shape[a] for a in xb], ([x.shape[a] for a in xf], [y.shape[a] for a in yf])
-    xs = np.transpose(x, [*xb, *xf, *xc]).reshape(int(np.prod(batch)), int(np.prod(shape[0])), -1)
-    ys = np.transpose(y, [*yb, *yf, *yc]).reshape(int(np.prod(batch)), int(np.prod(shape[1])), -1)
+    (x_summed, y_summed), (x_batch, y_batch) = eqn.params["dimension_numbers"]
+    x_rows = _rows_of(x, x_batch, x_summed)
+    y_rows = _rows_of(y, y_batch, y_summed)
     kind = kind_of(eqn.outvars[0].aval.dtype)
     flat = [
         _dot(b, kind, u.tolist(), v.tolist())
-        for us, vs in zip(xs, ys, strict=True)
-        for u in us
-        for v in vs
+        for one, other in zip(x_rows, y_rows, strict=True)
+        for u in one
+        for v in other
     ]
-    return np.asarray(flat, np.int64).reshape((*batch, *shape[0], *shape[1]))
+    return np.asarray(flat, np.int64).reshape(eqn.outvars[0].aval.shape)
+
+
+def _rows_of(x: Ids, batch: Sequence[int], summed: Sequence[int]) -> Ids:
+    """An operand of a product as an array (batch, free, summed)."""
+    free = [axis for axis in range(x.ndim) if axis not in (*batch, *summed)]
+    sizes = [math.prod(x.shape[axis] for axis in axes) for axes in (batch, free, summed)]
+    return np.transpose(x, [*batch, *free, *summed]).reshape(sizes)
 
 
 def _dot(b: Builder, kind: str, u: list[int], v: list[int]) -> int:
-    total = None
+    """The scalar product of two rows."""
+    terms: list[int] = []
     for x, y in zip(u, v, strict=True):
         if b.value(x) == 0 or b.value(y) == 0:
             continue
-        term = b.emit("mul", x, y, kind=kind)
-        total = term if total is None else b.emit("add", total, term, kind=kind)
-    return b.constant(0, kind) if total is None else total
+        terms.append(b.emit("mul", x, y, kind=kind))
+    if not terms:
+        return b.constant(0, kind)
+    return reduce(lambda total, term: b.emit("add", total, term, kind=kind), terms)
 
 
 def _square(b: Builder, eqn, x: Ids) -> Ids:
@@ -195,20 +208,44 @@ def _one_minus_square(b: Builder, eqn, x: Ids) -> Ids:
 
 
 def _log2(b: Builder, eqn, x: Ids) -> Ids:
-    return each(
-        b, "div", eqn, each(b, "log", eqn, x), np.full(x.shape, b.constant(np.log(2.0), "f"))
-    )
+    log_of_2 = np.full(x.shape, b.constant(np.log(2.0), "f"))
+    return each(b, "div", eqn, each(b, "log", eqn, x), log_of_2)
+
+
+def _primitives_of(op: str) -> tuple[str, ...]:
+    """The primitives that apply an operation entry by entry."""
+    primitives = OPERATIONS[op].primitives
+    if primitives is None:
+        return (op,)
+    return primitives
 
 
 RULES: dict[str, Callable] = {
-    **{name: _elementwise(op) for op, row in OPERATIONS.items() for name in ((op,) if row.primitives is None else row.primitives)},
+    **{name: _elementwise(op) for op in OPERATIONS for name in _primitives_of(op)},
     **STRUCTURE,
-    "square": _square, "pow": _pow, "integer_pow": _integer_pow, "round": _round, "select_n": _select_n, "clamp": _clamp,
-    # the last two since jax 0.11
-    "convert_element_type": _convert, "one_minus_square": _one_minus_square, "log2": _log2,
-    "stop_gradient": _stop, "optimization_barrier": _stop, "copy": _stop, "copy_p": _stop, "reduce_precision": _stop,
-    "reduce_sum": _reduce("add"), "reduce_prod": _reduce("mul"), "reduce_max": _reduce("max"), "reduce_min": _reduce("min"),
-    "reduce_and": _reduce("and"), "reduce_or": _reduce("or"), "argmin": _arg_extreme("lt"), "argmax": _arg_extreme("gt"),
-    "cumsum": _cumulative("add"), "cumprod": _cumulative("mul"), "cummax": _cumulative("max"), "cummin": _cumulative("min"),
+    "square": _square,
+    "pow": _pow,
+    "integer_pow": _integer_pow,
+    "round": _round,
+    "select_n": _select_n,
+    "clamp": _clamp,
+    "convert_element_type": _convert,
+    "one_minus_square": _one_minus_square,  # since jax 0.11
+    "log2": _log2,  # since jax 0.11
+    **dict.fromkeys(
+        ("stop_gradient", "optimization_barrier", "copy", "copy_p", "reduce_precision"), _stop
+    ),
+    "reduce_sum": _reduce("add"),
+    "reduce_prod": _reduce("mul"),
+    "reduce_max": _reduce("max"),
+    "reduce_min": _reduce("min"),
+    "reduce_and": _reduce("and"),
+    "reduce_or": _reduce("or"),
+    "argmin": _arg_extreme("lt"),
+    "argmax": _arg_extreme("gt"),
+    "cumsum": _cumulative("add"),
+    "cumprod": _cumulative("mul"),
+    "cummax": _cumulative("max"),
+    "cummin": _cumulative("min"),
     "dot_general": _dot_general,
-}  # fmt: skip
+}

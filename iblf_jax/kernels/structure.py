@@ -1,12 +1,12 @@
-"""Rules for the primitives that only move numbers about: they run here and now, on node numbers.
+"""The rules of the primitives that only rearrange numbers: they are applied to node numbers.
 
-An index that is known only in the run (the piece of a spline at time t) becomes a choice among the
-entries that it can mean, or a lookup where all of these are constants.
+An index that is unknown at compile time (the piece of a spline at time t) becomes a selection among
+the possible entries, or a lookup if all of these are constants.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import jax
 import numpy as np
@@ -82,7 +82,7 @@ def _iota(b: Builder, eqn, *_: Ids) -> Ids:
 
 
 def _now(eqn, *operands):
-    """The primitive itself, run on node numbers."""
+    """Applies the primitive to node numbers."""
     with jax.ensure_compile_time_eval():
         return np.asarray(
             eqn.primitive.bind(*(jax.numpy.asarray(x, np.int32) for x in operands), **eqn.params),
@@ -93,18 +93,28 @@ def _now(eqn, *operands):
 def _chosen(
     b: Builder, x: Ids, index: Ids, at: Callable, known: dict[int, int] | None = None
 ) -> Ids:
-    """`at(values of the index)`, of entries of x; where the run alone knows an index, a choice
-    among its values 0 ... longest axis - 1.
+    """The entries of x at an index; a selection among the values 0 ... longest axis - 1 of each
+    number of the index that is unknown.
+
+    Args:
+      b: the builder.
+      x: the nodes among which the index selects.
+      index: nodes of the index.
+      at: function (values of the index) -> nodes.
+      known: node of the index -> value that is assumed.
     """
-    known, size = known or {}, max(x.shape, default=1)
-    flat = [known.get(i, b.value(i)) for i in index.ravel().tolist()]
-    unknown = [i for i, v in zip(index.ravel().tolist(), flat, strict=True) if v is None]
+    known = known or {}
+    size = max(x.shape, default=1)
+    nodes = index.ravel().tolist()
+    values = [known.get(i, b.value(i)) for i in nodes]
+    unknown = [i for i, value in zip(nodes, values, strict=True) if value is None]
     if not unknown:
-        return at(np.asarray(flat, np.int32).reshape(index.shape))
+        return at(np.asarray(values, np.int32).reshape(index.shape))
     choices = size ** len({*unknown, *known})
-    if choices > (
-        b.limits.table if choices == size and _is_table(b, x.ravel().tolist()) else b.limits.choices
-    ):
+    limit = b.limits.choices
+    if choices == size and _is_table(b, x.ravel().tolist()):
+        limit = b.limits.table
+    if choices > limit:
         raise UnsupportedError(
             f"indices that only the run knows choose among {choices} entries, which is too many"
         )
@@ -122,11 +132,12 @@ def _chosen(
 
 
 def _is_table(b: Builder, entries: list[int]) -> bool:
+    """Whether all entries are floating-point constants."""
     return all(b.value(i) is not None and b.nodes[i].kind == "f" for i in entries)
 
 
 def _one_of(b: Builder, entries: list[int], index: int) -> int:
-    """The entry at an index of the run: looked up where all are constants."""
+    """The entry at an unknown index: a lookup if all are constants, else a selection."""
     if len(set(entries)) == 1:
         return entries[0]
     if _is_table(b, entries):
@@ -149,8 +160,9 @@ def _one_of(b: Builder, entries: list[int], index: int) -> int:
 
 
 def _gather(b: Builder, eqn, x: Ids, index: Ids) -> Ids:
-    """Entries of x, the nearest one for an index outside; a gather that fills what lies outside is
-    refused.
+    """Entries of x, the nearest one for an index outside.
+
+    A gather that fills entries outside with a given number is refused.
     """
     filled = eqn.params["mode"] == jax.lax.GatherScatterMode.FILL_OR_DROP
     if filled and not _is_inside(b, eqn, x, index):
@@ -169,7 +181,7 @@ def _gather(b: Builder, eqn, x: Ids, index: Ids) -> Ids:
     rows = list(np.ndindex(index.shape[:-1]))
     if len(rows) == 1 or all(b.value(i) is not None for i in index.ravel().tolist()):
         return _chosen(b, x, index, at)
-    # One place after the other, so that each is chosen by its own index alone.
+    # One place after the other, so that each is selected by its own index only.
     result = np.empty(eqn.outvars[0].aval.shape, np.int64)
     offsets = eqn.params["dimension_numbers"].offset_dims
     axes = [a for a in range(result.ndim) if a not in offsets]
@@ -183,7 +195,8 @@ def _gather(b: Builder, eqn, x: Ids, index: Ids) -> Ids:
 
 def _is_inside(b: Builder, eqn, x: Ids, index: Ids) -> bool:
     """Whether all places of a gather are known and inside."""
-    axes, sizes = eqn.params["dimension_numbers"].start_index_map, eqn.params["slice_sizes"]
+    axes = eqn.params["dimension_numbers"].start_index_map
+    sizes = eqn.params["slice_sizes"]
     rows = [[b.value(i) for i in row] for row in index.reshape(-1, len(axes)).tolist()]
     return all(
         v is not None and 0 <= v <= x.shape[a] - sizes[a]
@@ -192,33 +205,36 @@ def _is_inside(b: Builder, eqn, x: Ids, index: Ids) -> bool:
     )
 
 
+def _window(starts, shape: Sequence[int], sizes: Sequence[int]) -> tuple[slice, ...]:
+    """The slices of a window of these sizes, moved inside the shape where it exceeds it."""
+    corner = [
+        min(max(int(start), 0), length - size)
+        for start, length, size in zip(starts, shape, sizes, strict=True)
+    ]
+    return tuple(slice(first, first + size) for first, size in zip(corner, sizes, strict=True))
+
+
 def _dynamic_slice(b: Builder, eqn, x: Ids, *starts: Ids) -> Ids:
     def at(values):
-        corner = [
-            min(max(int(v), 0), n - s)
-            for v, n, s in zip(values, x.shape, eqn.params["slice_sizes"], strict=True)
-        ]
-        return x[
-            tuple(slice(c, c + s) for c, s in zip(corner, eqn.params["slice_sizes"], strict=True))
-        ]
+        return x[_window(values, x.shape, eqn.params["slice_sizes"])]
 
     return _chosen(b, x, np.asarray(starts), at)
 
 
 def _dynamic_update_slice(b: Builder, eqn, x: Ids, new: Ids, *starts: Ids) -> Ids:
     def at(values):
-        corner = [
-            min(max(int(v), 0), n - s) for v, n, s in zip(values, x.shape, new.shape, strict=True)
-        ]
         result = x.copy()
-        result[tuple(slice(c, c + s) for c, s in zip(corner, new.shape, strict=True))] = new
+        result[_window(values, x.shape, new.shape)] = new
         return result
 
     return _chosen(b, x, np.asarray(starts), at)
 
 
 def _scatter(op: str | None) -> Callable:
-    """Scatter at known places: which update lands where is found by scattering their numbers."""
+    """The rule of a scatter at known places, which combines old and new numbers by `op`.
+
+    The numbers of the updates are scattered, which shows the place of each update.
+    """
 
     def rule(b: Builder, eqn, x: Ids, index: Ids, new: Ids) -> Ids:
         values = [b.value(i) for i in index.ravel().tolist()]
@@ -236,22 +252,37 @@ def _scatter(op: str | None) -> Callable:
         source = np.asarray(landed)
         if np.sum(source >= 0) != new.size:
             raise UnsupportedError(f"{eqn.primitive.name} with repeated or outlying places")
-        result, flat = x.copy().ravel(), new.ravel()
+        result = x.copy().ravel()
+        updates = new.ravel()
         for place, which in enumerate(source.ravel().tolist()):
-            if which >= 0:
-                old, update = int(result[place]), int(flat[which])
-                result[place] = (
-                    update if op is None else b.emit(op, old, update, kind=b.nodes[old].kind)
-                )
+            if which < 0:
+                continue
+            update = int(updates[which])
+            if op is not None:
+                old = int(result[place])
+                update = b.emit(op, old, update, kind=b.nodes[old].kind)
+            result[place] = update
         return result.reshape(x.shape)
 
     return rule
 
 
 STRUCTURE: dict[str, Callable] = {
-    "reshape": _reshape, "squeeze": _reshape, "expand_dims": _reshape, "broadcast_in_dim": _broadcast_in_dim, "transpose": _transpose,
-    "slice": _slice, "concatenate": _concatenate, "stack": _stack, "split": _split, "rev": _rev, "pad": _pad, "iota": _iota,
+    **dict.fromkeys(("reshape", "squeeze", "expand_dims"), _reshape),
+    "broadcast_in_dim": _broadcast_in_dim,
+    "transpose": _transpose,
+    "slice": _slice,
+    "concatenate": _concatenate,
+    "stack": _stack,
+    "split": _split,
+    "rev": _rev,
+    "pad": _pad,
+    "iota": _iota,
     "unstack": _unstack,  # since jax 0.11
-    "gather": _gather, "dynamic_slice": _dynamic_slice, "dynamic_update_slice": _dynamic_update_slice, "scatter": _scatter(None),
-    "scatter-add": _scatter("add"), "scatter_add": _scatter("add"), "scatter_mul": _scatter("mul"), "scatter-mul": _scatter("mul"),
-}  # fmt: skip
+    "gather": _gather,
+    "dynamic_slice": _dynamic_slice,
+    "dynamic_update_slice": _dynamic_update_slice,
+    "scatter": _scatter(None),
+    **dict.fromkeys(("scatter-add", "scatter_add"), _scatter("add")),
+    **dict.fromkeys(("scatter_mul", "scatter-mul"), _scatter("mul")),
+}

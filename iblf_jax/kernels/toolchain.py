@@ -1,15 +1,16 @@
-"""The C++ compiler: found, run without a shell, its results kept by content in a directory that
-only the user can write.
+"""Finds and runs the C++ compiler, and keeps its results in a directory that only the user can
+write.
 
-It is the system's, GCC or Clang, or Clang as the wheel `ziglang` brings it.  The flags depend on
-which of them it is, which its version text tells; each compiler prints that text once in a process.
+The compiler is the system's (GCC or Clang) or, where there is none, Clang from the package
+`ziglang`. It is run without a shell. The flags depend on the kind of compiler, which its version
+text shows; each compiler prints this text once in a process.
 
 The key of a kernel is a hash of its source, the flags, the compiler's version, the processor and
-the header of XLA's interface, so a stale kernel is never loaded.  A kernel is made in a draft,
-written out to the disk and renamed, so that two processes do not disturb each other.  A digest of
-key and content stands at its end: a file that does not fit it, for whatever reason, is made again,
-  and what is loaded is a copy of what was checked.  Nothing here follows a symbolic link that it
-  finds in the directory.
+the header of XLA's interface, so a stale kernel is never loaded. A kernel is compiled in a draft,
+written to the disk and renamed, so that two processes do not disturb each other. A digest of key
+and content is at the end of the file: a file that does not match its digest is compiled again, and
+the process loads a copy of the bytes that were verified. No symbolic link in the directory is
+followed.
 """
 
 from __future__ import annotations
@@ -31,12 +32,12 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
 import jax
 
+from iblf_jax.kernels.caches import CACHES
 from iblf_jax.kernels.drafts import draft, remove_abandoned
 from iblf_jax.kernels.folder import directory, processor
 from iblf_jax.kernels.messages import announce_if_slow
@@ -48,45 +49,45 @@ COMMON_FLAGS = (
 )  # fmt: skip
 """Flags that GCC and Clang share.
 
-NaN and infinities keep their meaning: no -ffast-math, no -ffinite-math-only.  Without
-  `-ffp-contract=fast`, which makes one
-operation of a product and a sum, the sine of a large angle would lose digits.  The headers are C's:
-C++ makes of `math.h` a tenth of a second more to read."""
+NaN and infinities keep their meaning: there is no -ffast-math and no -ffinite-math-only.
+`-ffp-contract=fast` combines a product and a sum in one operation; without it, the sine of a large
+angle would lose digits. `-nostdinc++` selects the headers of C: the `math.h` of C++ takes a tenth
+of a second longer to read."""
 FLAGS_OF_KIND = {
     "gcc": ("-fexpensive-optimizations", "-fcaller-saves", "-ftree-loop-vectorize"),
     "clang": ("-fvectorize", "-fslp-vectorize", "-fno-sanitize=undefined", "-nostdlib++"),
     "other": (),
 }
-"""Flags that only one kind of compiler knows, by kind.
+"""Flags that only one kind of compiler accepts, by kind.
 
-GCC: of -O3 what the generated text gains by.  The paper's loop runs as fast (1 % either way, one
-  run 3 % slower) and builds in
-0.6 s instead of 2.7.  The first flag is needed for products and sums to become one operation; with
-the second, numbers stay in registers across rare calls (a step of seven joints takes 5 to 25 %
-longer without); the third makes one instruction of a root of many runs.
+GCC: the optimisations of -O3 from which the generated text gains. The paper's loop runs as fast as
+with -O3 (within 1 %, a single run 3 % slower) and is compiled in 0.6 s instead of 2.7 s. The first
+flag is necessary for products and sums to become one operation. With the second, numbers stay in
+registers across rare calls (a step of seven joints takes 5 to 25 % longer without it). The third
+makes the square roots of many runs one instruction.
 
-Clang: the first two make one instruction of a root of many runs.  `ziglang` adds checks of
-  undefined behaviour to what is not
-optimised, and its own C++ library, of which a kernel uses nothing; the other two flags leave both
-out."""
+Clang: the first two flags make the square roots of many runs one instruction. `ziglang` adds checks
+of undefined behaviour to code that is not optimised, and its own C++ library, of which a kernel
+uses nothing; the other two flags exclude both."""
 TIMEOUT = 300.0
-"""Seconds that a compiler may take."""
+"""Time limit of a compiler [s]."""
 VERSION_TIMEOUT = 20.0
-"""Seconds that it may take to say its version."""
+"""Time limit for printing its version [s]."""
 MOST_TEXT = 1 << 20
-"""Bytes of a compiler's text that are read."""
+"""Bytes of a compiler's text that are read, at most."""
 DIGEST = hashlib.sha256
-"""Of the key and the content, at the end of every kept file."""
+"""The digest of key and content at the end of every file."""
 
 
 class ToolchainError(Exception):
-    """No compiler, or it failed, or there is no safe place for its result; the message is one line
-    for the user.
+    """There is no compiler, or it failed, or there is no safe place for its result.
+
+    The message is one line for the user.
     """
 
 
 class StoppedError(ToolchainError):
-    """Stopped by this process itself: another try may do."""
+    """The compiler was stopped by this process: another attempt may succeed."""
 
 
 def compiler() -> tuple[str, ...]:
@@ -96,9 +97,9 @@ def compiler() -> tuple[str, ...]:
     Raises:
       ToolchainError: there is none.
     """
-    wanted = os.environ.get("CXX")
-    if wanted:
-        return _command_of(wanted)
+    requested = os.environ.get("CXX")
+    if requested:
+        return _command_of(requested)
     for name in ("c++", "g++", "clang++"):
         path = shutil.which(name)
         if path:
@@ -106,25 +107,25 @@ def compiler() -> tuple[str, ...]:
     if has_ziglang():
         return ziglang("c++")
     raise ToolchainError(
-        "there is no C++ compiler (c++, g++, clang++; pip install ziglang has one)"
+        "there is no C++ compiler (c++, g++, clang++); `pip install ziglang` installs one"
     )
 
 
-def _command_of(wanted: str) -> tuple[str, ...]:
+def _command_of(requested: str) -> tuple[str, ...]:
     """The command that $CXX names: a program, or a program and its first arguments."""
-    path = shutil.which(wanted)
+    path = shutil.which(requested)
     if path:
         return (path,)
     with contextlib.suppress(ValueError):  # an open quotation mark
-        program, *arguments = shlex.split(wanted) or [""]
+        program, *arguments = shlex.split(requested) or [""]
         path = shutil.which(program)
         if path:
             return (path, *arguments)
-    raise ToolchainError(f"there is no C++ compiler {wanted!r} ($CXX)")
+    raise ToolchainError(f"there is no C++ compiler {requested!r} ($CXX)")
 
 
 def has_ziglang() -> bool:
-    """Whether the wheel `ziglang`, which holds Clang, is installed."""
+    """Whether the package `ziglang`, which contains Clang, is installed."""
     return importlib.util.find_spec("ziglang") is not None
 
 
@@ -134,29 +135,32 @@ def ziglang(language: str) -> tuple[str, ...]:
 
 
 def _name_of(command: Sequence[str]) -> str:
-    """What messages call a compiler."""
-    return "ziglang" if tuple(command[1:3]) == ("-m", "ziglang") else Path(command[0]).name
+    """The name of a compiler in messages."""
+    if tuple(command[1:3]) == ("-m", "ziglang"):
+        return "ziglang"
+    return Path(command[0]).name
 
 
 class Version(NamedTuple):
-    """What a compiler prints about itself."""
+    """The text that a compiler prints about itself."""
 
     line: str
-    """The first line of it."""
+    """The first line."""
     kind: str
     """A key of FLAGS_OF_KIND."""
 
     @staticmethod
     def of(text: str) -> Version | None:
-        """From the whole text; None if there is nothing in it."""
+        """The version from the entire text; None if the text is empty."""
         line = next((line.strip() for line in text.splitlines() if line.strip()), None)
         if line is None:
             return None
         if "Free Software Foundation" in text:
             return Version(line, "gcc")
-        # All compilers that are made of Clang name the folder that they are installed in.
-        is_clang = "clang" in text.lower() or "InstalledDir:" in text
-        return Version(line, "clang" if is_clang else "other")
+        # All compilers that are derived from Clang print the folder of their installation.
+        if "clang" in text.lower() or "InstalledDir:" in text:
+            return Version(line, "clang")
+        return Version(line, "other")
 
 
 def _version(command: tuple[str, ...]) -> Version:
@@ -170,28 +174,30 @@ def _version(command: tuple[str, ...]) -> Version:
     return version
 
 
-@cache
+@CACHES.function(maxsize=16)
 def _version_of(command: tuple[str, ...], changed: int) -> Version | ToolchainError:
-    """The version, or why there is none: a compiler that hangs is started once."""
+    """The version, or the error: a compiler that does not answer is started once."""
     try:
         text = _run([*command, "--version"], "stdout", VERSION_TIMEOUT).decode()
     except ToolchainError as error:
         return error
     except UnicodeDecodeError:
-        return ToolchainError(f"{_name_of(command)} --version prints what is no text")
+        return ToolchainError(f"{_name_of(command)} --version prints no text in UTF-8")
     return Version.of(text) or ToolchainError(f"{_name_of(command)} --version prints nothing")
 
 
 def flags_of(kind: str) -> tuple[str, ...]:
     """The flags of a kernel for a kind of compiler, a key of FLAGS_OF_KIND."""
     is_arm = platform.machine().lower() in ("arm64", "aarch64")
-    # Clang before version 16 does not know the first form there.
-    processor_flag = "-mcpu=native" if is_arm and kind == "clang" else "-march=native"
+    processor_flag = "-march=native"
+    if is_arm and kind == "clang":
+        # There, Clang before version 16 accepts only this form.
+        processor_flag = "-mcpu=native"
     return (*COMMON_FLAGS, processor_flag, *FLAGS_OF_KIND[kind])
 
 
 def built_for() -> dict[str, str]:
-    """What a kernel is tied to, in words; ToolchainError if there is no compiler."""
+    """Processor and compiler of the kernels, in words; ToolchainError if there is no compiler."""
     found = processor()
     command = compiler()
     names = [
@@ -206,19 +212,13 @@ def built_for() -> dict[str, str]:
     }
 
 
-_running: set[int] = set()
-"""Compilers that run now."""
-_making: dict[str, threading.Lock] = {}
-"""Key -> the lock of who makes it."""
-_failures: dict[str, ToolchainError] = {}
-"""Key -> why a thread that built it ahead could not."""
 _this_thread = threading.local()
 
 
 def stop_compilers() -> None:
     """Kills every compiler that this process has started."""
-    for pid in tuple(_running):
-        _running.discard(pid)
+    for pid in tuple(CACHES.running):
+        CACHES.running.discard(pid)
         with contextlib.suppress(ProcessLookupError):
             os.killpg(pid, signal.SIGKILL)
 
@@ -227,8 +227,8 @@ atexit.register(stop_compilers)
 
 
 def build_ahead(source: str, extra: tuple[str, ...] = ()) -> None:
-    """Starts `built` beside what this process does meanwhile; whoever wants the result waits for
-    it, and is told what went wrong.
+    """Starts `built` in the background; a later call of `built` waits for it, and raises its
+    error.
     """
 
     def build() -> None:
@@ -240,27 +240,33 @@ def build_ahead(source: str, extra: tuple[str, ...] = ()) -> None:
 
 
 def _run(command: list[str], stream: str, seconds: float) -> bytes:
-    """What a command says on one of its streams; ToolchainError if it fails, or takes too long, it
-    and all that it has started.
+    """The text that a command writes to one of its streams, "stdout" or "stderr".
+
+    Raises:
+      ToolchainError: it fails, or it takes longer than the given time; then the command and all
+        processes that it has started are stopped.
     """
     name = _name_of(command)
-    said = list[bytes]()
-    out, err = (
-        subprocess.PIPE if stream == x else subprocess.DEVNULL for x in ("stdout", "stderr")
-    )
+    received: list[bytes] = []
+    streams = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, stream: subprocess.PIPE}
     try:
         process = subprocess.Popen(
-            command, start_new_session=True, stdin=subprocess.DEVNULL, stdout=out, stderr=err
+            command,
+            start_new_session=True,
+            stdin=subprocess.DEVNULL,
+            stdout=streams["stdout"],
+            stderr=streams["stderr"],
         )
     except (OSError, ValueError) as error:
         raise ToolchainError(f"{name} could not be run: {error}") from None
 
     def listen() -> None:
         with getattr(process, stream) as pipe:
-            said.append(pipe.read(MOST_TEXT))
+            received.append(pipe.read(MOST_TEXT))
 
-    _running.add(process.pid)
-    listener, end = threading.Thread(target=listen, daemon=True), time.monotonic() + seconds
+    CACHES.running.add(process.pid)
+    listener = threading.Thread(target=listen, daemon=True)
+    end = time.monotonic() + seconds
     listener.start()
     try:
         listener.join(seconds)
@@ -273,23 +279,29 @@ def _run(command: list[str], stream: str, seconds: float) -> bytes:
             raise ToolchainError(f"{name} took longer than {seconds:g} s and was stopped") from None
         raise
     finally:
-        stopped = process.pid not in _running
-        _running.discard(process.pid)
+        stopped = process.pid not in CACHES.running
+        CACHES.running.discard(process.pid)
     if stopped:
         raise StoppedError(f"{name} was stopped")
-    text = said[0] if said else b""
+    text = b"".join(received)
+    if code < 0:
+        raise ToolchainError(f"{name} failed: ended by signal {-code}")
     if code:
         lines = text.decode(errors="replace").splitlines()
-        named = [line for line in lines if "error" in line] or lines or ["no message"]
-        raise ToolchainError(
-            f"{name} failed: " + (f"ended by signal {-code}" if code < 0 else named[0][:200])
-        )
+        errors = [line for line in lines if "error" in line] or lines or ["no message"]
+        raise ToolchainError(f"{name} failed: {errors[0][:200]}")
     return text
 
 
 def built(source: str, extra: tuple[str, ...] = ()) -> tuple[Path, str]:
-    """The shared library of a source and its key, compiled unless it is in the cache;
-    ToolchainError on failure.
+    """The shared library of a source and its key; it is compiled unless it is in the cache.
+
+    Args:
+      source: the C++ source.
+      extra: flags of the compiler, besides those of all kernels.
+
+    Raises:
+      ToolchainError: no compiler, or an error from it.
     """
     command = compiler()
     version = _version(command)
@@ -311,11 +323,16 @@ def built(source: str, extra: tuple[str, ...] = ()) -> tuple[Path, str]:
 
 
 def kept(content: Iterable[str], suffix: str, make: Callable[[Path], object]) -> tuple[Path, str]:
-    """The file that holds what `make(path)` writes, and the key of its content; made unless it is
-    in the cache, whole and this user's.
+    """A file of the cache and its key; `make(path)` writes the file unless it is in the cache,
+    intact and owned by this user.
+
+    Args:
+      content: texts that determine the content of the file; the key is their hash.
+      suffix: of the name of the file.
+      make: function that writes the file to a given path.
 
     Raises:
-      ToolchainError: it cannot be made, or there is no safe place or no room for it.
+      ToolchainError: the file cannot be made, or there is no safe place or no space for it.
     """
     key = hashlib.sha256("\0".join(content).encode()).hexdigest()[:32]
     try:
@@ -330,22 +347,22 @@ def kept(content: Iterable[str], suffix: str, make: Callable[[Path], object]) ->
 
 @contextlib.contextmanager
 def _made_once(key: str) -> Iterator[None]:
-    """Waits while another thread makes the same; who stops waiting stops the compilers.
+    """Waits while another thread makes the same file; an interrupted wait stops the compilers.
 
     Raises:
-      ToolchainError: what kept `build_ahead` from making it, once.
+      ToolchainError: the error of `build_ahead`, once.
     """
     waiting = True
     try:
-        with _making.setdefault(key, threading.Lock()):
+        with CACHES.locks.setdefault(key, threading.Lock()):
             waiting = False
-            if key in _failures:
-                raise _failures.pop(key)
+            if key in CACHES.failures:
+                raise CACHES.failures.pop(key)
             try:
                 yield
             except ToolchainError as error:
                 if getattr(_this_thread, "is_ahead", False) and not isinstance(error, StoppedError):
-                    _failures[key] = error
+                    CACHES.failures[key] = error
                 raise
     except BaseException:
         if waiting:
@@ -354,7 +371,7 @@ def _made_once(key: str) -> Iterator[None]:
 
 
 def _keep(folder: Path, path: Path, make: Callable[[Path], object]) -> None:
-    """Makes a file of `kept` unless it is there."""
+    """Makes a file of `kept` unless it exists."""
     try:
         if _checked(path) is None:
             for left in folder.glob("tmp????????"):  # of version 0.1.0
@@ -371,9 +388,9 @@ def _keep(folder: Path, path: Path, make: Callable[[Path], object]) -> None:
 
 
 def _write(folder: Path, image: bytes, path: Path) -> None:
-    """Puts a file with its digest into its place, from a draft, and on to the disk's surface."""
-    whole = folder / "whole"
-    file = os.open(whole, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o700)
+    """Moves a file with its digest from a draft to its place, and flushes it to the disk."""
+    complete = folder / "complete"
+    file = os.open(complete, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o700)
     with open(file, "wb") as out:
         os.fchmod(file, 0o700)
         out.write(image + DIGEST(path.stem.encode() + image).digest())
@@ -381,68 +398,67 @@ def _write(folder: Path, image: bytes, path: Path) -> None:
         os.fsync(file)
     if path.is_dir() and not path.is_symlink():
         path.rename(folder / "in the way")
-    whole.replace(path)
+    complete.replace(path)
     parent = os.open(path.parent, os.O_RDONLY)
-    with contextlib.suppress(OSError):  # not every disk can do that for a directory
+    with contextlib.suppress(OSError):  # not every file system supports this for a directory
         os.fsync(parent)
     os.close(parent)
 
 
 def _read(path: Path, forbidden: int = 0) -> bytes | None:
-    """The bytes of a file; None if it is none of this user's, or has a bit of `forbidden` in its
-    mode.
+    """The bytes of a file; None if it is not a file of this user, or has a bit of `forbidden` in
+    its mode.
     """
+    # Do not follow a link, and do not wait for a pipe.
+    flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK
     try:
-        file = os.open(
-            path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK
-        )  # neither follows a link nor waits at a pipe
-        with open(file, "rb") as opened:
-            status = os.fstat(file)
-            fits = (
-                stat.S_ISREG(status.st_mode)
-                and status.st_uid == os.getuid()
-                and not status.st_mode & forbidden
-            )
-            return opened.read() if fits else None
+        with open(os.open(path, flags), "rb") as file:
+            status = os.fstat(file.fileno())
+            is_own = stat.S_ISREG(status.st_mode) and status.st_uid == os.getuid()
+            if is_own and not status.st_mode & forbidden:
+                return file.read()
     except OSError:
-        return None
+        pass
+    return None
 
 
 def _checked(path: Path) -> bytes | None:
-    """What a kept file holds; None if it is not there, not whole, of another key, or could have
-    been written by another user.
+    """The content of a file of the cache; None if it is missing, incomplete, of another key, or
+    could have been written by another user.
     """
-    whole, size = _read(path, forbidden=0o022) or b"", DIGEST().digest_size
-    image, digest = whole[:-size], whole[-size:]
-    return image if DIGEST(path.stem.encode() + image).digest() == digest else None
+    content = _read(path, forbidden=0o022) or b""
+    size = DIGEST().digest_size
+    image = content[:-size]
+    digest = content[-size:]
+    if DIGEST(path.stem.encode() + image).digest() != digest:
+        return None
+    return image
 
 
 def content_of(path: Path) -> bytes:
-    """What a file of `kept` holds; ToolchainError if it has been damaged since."""
+    """The content of a file of `kept`; ToolchainError if it has been damaged since."""
     image = _checked(path)
     if image is None:
         raise ToolchainError(f"the kernel {path} was damaged just now")
     return image
 
 
-_libraries: dict[str, ctypes.CDLL] = {}
-"""Key -> what this process has loaded of it: once, as XLA takes one address for a name."""
-
-
 def loaded(library: Path, *names: str) -> ctypes.CDLL:
-    """A library of `built` in this process, from a copy that nobody can change; ToolchainError if
-    it does not load or lacks a name.
+    """Loads a library of `built`, from a copy that no other process can change.
+
+    Raises:
+      ToolchainError: it cannot be loaded, or lacks one of the names.
     """
     key = library.stem
     try:
-        found = _libraries[key] if key in _libraries else _load(content_of(library))
+        found = CACHES.libraries.get(key) or _load(content_of(library))
         for name in names:
             getattr(found, name)
     except (OSError, AttributeError) as error:
         with contextlib.suppress(OSError):
-            library.unlink()  # the compiler may do better another time
+            library.unlink()  # the next compilation may succeed
         raise ToolchainError(f"a kernel does not load: {error}") from None
-    return _libraries.setdefault(key, found)
+    return CACHES.libraries.setdefault(key, found)
 
 
 def _load(image: bytes) -> ctypes.CDLL:
@@ -452,10 +468,9 @@ def _load(image: bytes) -> ctypes.CDLL:
         file = os.memfd_create("iblf_jax")
         with open(file, "wb", closefd=False) as out:
             out.write(image)
-        return ctypes.CDLL(
-            f"/proc/self/fd/{file}"
-        )  # and stays open: the loader takes another library of this name for this one
-    except (OSError, AttributeError):  # no such files on this system, or none that may be executed
+        # The file stays open: the loader would take another library of this name for this one.
+        return ctypes.CDLL(f"/proc/self/fd/{file}")
+    except (OSError, AttributeError):  # this system has no such files, or they are not executable
         if file is not None:
             os.close(file)
     with tempfile.TemporaryDirectory() as folder:

@@ -261,7 +261,7 @@ def _update_by_stages(
         if restarts is not None:
             local_error = jnp.where(restarts, 0.0, local_error)
         drift = drift + jax.lax.stop_gradient(length) * local_error
-    pending = ()
+    pending: tuple[jax.Array, ...] = ()
     if before:
         pending = (motion_rate(pieces[0][1][0]),)
     return _with_drift(accuracy, pending, drift, width)

@@ -436,9 +436,9 @@ def perturbed_rate(
       compiled: wrapper of functions that are compiled on their own.
     """
     if not isinstance(perturbed, PerturbedState):
-        arguments = (scenario, t, perturbed)
+        arguments = [scenario, t, perturbed]
         if dt is not None:
-            arguments += (dt,)
+            arguments.append(dt)
         return compiled(evaluate)(*arguments)[0]
     scenario = _without_rounding_and_limits(scenario)
     controller, observer, sensor = perturbed.memory

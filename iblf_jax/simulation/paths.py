@@ -274,7 +274,9 @@ def unit_at(scenario: Scenario, path: str) -> str:
 def sign_at(scenario: Scenario, path: str) -> str | None:
     """The sign that the finite numbers at a path must have: None, "positive" or "nonnegative"."""
     sign = _metadata(scenario, path).get("sign")
-    return {"limit": None, "positive limit": "positive"}.get(sign, sign)
+    if sign is None or sign == "limit":
+        return None
+    return sign.removesuffix(" limit")
 
 
 def _metadata(scenario: Scenario, path: str) -> Mapping[str, Any]:

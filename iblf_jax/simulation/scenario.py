@@ -294,7 +294,7 @@ def _with_both_robots(scenario: Scenario, parts: dict[str, Any]) -> dict[str, An
     if "robot" in parts:
         for name in ("plant", "model"):
             if name in parts:
-                expected = "robot alone, or plant and model"
+                expected = "either robot, or plant and model"
                 remedy = "`robot` is plant and model together."
                 raise checks.fail(name, parts[name], expected, remedy)
         others = {name: part for name, part in parts.items() if name != "robot"}

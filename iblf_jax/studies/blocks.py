@@ -25,13 +25,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.core.devices import chosen, default, platform
+from iblf_jax.core.devices import chosen, default
 from iblf_jax.core.status import Status, flag
-from iblf_jax.engine import plan
-from iblf_jax.engine.execute import chosen_backend, run_batch
-from iblf_jax.engine.mechanism import Mechanism
-from iblf_jax.engine.step import Run
-from iblf_jax.engine.waiting import wait_until_ready
+from iblf_jax.engine import (
+    STUDY_MEMORY,
+    CompiledBatch,
+    RunRequest,
+    block_size,
+    blocks_in_flight,
+    compile_batch,
+    wait_until_ready,
+)
 from iblf_jax.simulation.sampling import noise_of
 from iblf_jax.studies.draws import Cases, Lanes, Target, draw, merge
 
@@ -40,10 +44,27 @@ class StudyRun(NamedTuple):
     """What every block of a study runs: which leaves are drawn, how many steps, by what; static."""
 
     targets: tuple[Target, ...]
-    steps: int
-    method: str
-    backend: str
-    mechanism: Mechanism | None = None
+    program: CompiledBatch
+
+    @property
+    def request(self) -> RunRequest:
+        """What is requested of each run."""
+        return self.program.request
+
+    @property
+    def steps(self) -> int:
+        """Time steps of each run."""
+        return self.request.steps
+
+    @property
+    def method(self) -> str:
+        """The integrator."""
+        return self.request.method
+
+    @property
+    def backend(self) -> str:
+        """The executor that runs the blocks."""
+        return self.program.executor
 
 
 class StudyInputs(NamedTuple):
@@ -61,11 +82,6 @@ class Results(NamedTuple):
     status: Any
     fastest_mode: Any
     samples: dict[str, Any]
-
-
-def block_size() -> int:
-    """Runs in a block on the devices of this process."""
-    return plan.study_block(platform())
 
 
 MOST_MEMORY = 2.0**60
@@ -92,13 +108,11 @@ def _without_inadmissible(admissible: jax.Array, x: jax.Array) -> jax.Array:
     )
 
 
-def _draws(study_run: StudyRun, shared: StudyInputs, lanes: Lanes):
+def _draws(targets: tuple[Target, ...], shared: StudyInputs, lanes: Lanes):
     """The leaves that a block's runs replace, the draws, and whether they were admissible."""
 
     def one(lane: Lanes):
-        made, drawn, admissible = draw(
-            shared.cases, study_run.targets, lane.index, lane.points, lane.u
-        )
+        made, drawn, admissible = draw(shared.cases, targets, lane.index, lane.points, lane.u)
         varied = merge(shared.cases.scenario, lane.points, made) | noise_of(
             shared.cases.scenario, shared.cases.key, lane.index
         )
@@ -109,33 +123,26 @@ def _draws(study_run: StudyRun, shared: StudyInputs, lanes: Lanes):
     return jax.lax.optimization_barrier(jax.vmap(one)(lanes))
 
 
-def with_chosen_backend(study_run: StudyRun, shared: StudyInputs, lanes: Lanes) -> StudyRun:
-    """The study's run with the backend that its blocks will run on in place of "auto" or one that
-    is not available.
+def compile_study(
+    targets: tuple[Target, ...], request: RunRequest, shared: StudyInputs, lanes: Lanes
+) -> StudyRun:
+    """What the blocks of a study run, on the first executor that works.
 
-    Raises:
-      ValueError: an unknown backend.
+    Args:
+      targets: the leaves that are drawn.
+      request: what is requested of each run.
+      shared: what all runs share.
+      lanes: what differs between the runs of one block.
     """
-    varied, _, _ = jax.eval_shape(partial(_draws, study_run), shared, lanes)
-    backend = chosen_backend(
-        study_run.backend,
-        shared.cases.scenario,
-        varied,
-        shared.folds,
-        shared.dt,
-        method=study_run.method,
-        mechanism=study_run.mechanism,
-    )
-    return study_run._replace(backend=backend)
+    varied, _, _ = jax.eval_shape(partial(_draws, targets), shared, lanes)
+    program = compile_batch(request, shared.cases.scenario, varied, shared.folds, shared.dt)
+    return StudyRun(targets, program)
 
 
 def _block(study_run: StudyRun, shared: StudyInputs, lanes: Lanes) -> Results:
     """Draws and runs one block."""
-    varied, drawn, admissible = _draws(study_run, shared, lanes)
-    run = Run(study_run.steps, study_run.method, mechanism=study_run.mechanism)
-    outcome = run_batch(
-        shared.cases.scenario, varied, shared.folds, shared.dt, run, backend=study_run.backend
-    )
+    varied, drawn, admissible = _draws(study_run.targets, shared, lanes)
+    outcome = study_run.program(shared.cases.scenario, varied, shared.folds, shared.dt)
     metrics = {name: _without_inadmissible(admissible, x) for name, x in outcome.metrics.items()}
     status = jnp.where(admissible, outcome.status, flag(~admissible, Status.INADMISSIBLE_DRAW))
     return Results(metrics, status, _without_inadmissible(admissible, outcome.fastest_mode), drawn)
@@ -143,10 +150,9 @@ def _block(study_run: StudyRun, shared: StudyInputs, lanes: Lanes) -> Results:
 
 def _record_block(study_run: StudyRun, shared: StudyInputs, lanes: Lanes, record_every: int):
     """Positions of a block's runs, (B, T, n), and their status."""
-    varied, _, admissible = _draws(study_run, shared, lanes)
-    run = Run(study_run.steps, study_run.method, record_every, study_run.mechanism)
-    outcome = run_batch(
-        shared.cases.scenario, varied, shared.folds, shared.dt, run, backend=study_run.backend
+    varied, _, admissible = _draws(study_run.targets, shared, lanes)
+    outcome = study_run.program(
+        shared.cases.scenario, varied, shared.folds, shared.dt, record_every=record_every
     )
     arrays = outcome.records[0]
     return (
@@ -173,7 +179,7 @@ def run_blocks(
     blocks: Sequence[int],
     *,
     chunk: int | None = None,
-    memory: float = plan.STUDY_MEMORY,
+    memory: float = STUDY_MEMORY,
     devices: list[jax.Device] | None = None,
     record_every: int | None = None,
 ) -> Iterator[tuple[int, Any]]:
@@ -218,7 +224,7 @@ def run_blocks(
         0
     )  # alone: what is compiled is compiled once, and what a block takes is known after it
     yield blocks[0], first
-    in_flight = plan.blocks_in_flight(chunk, memory, each, size, len(places))
+    in_flight = blocks_in_flight(chunk, memory, each, len(places))
     # A thread a block in flight: draws, start and results of one are made while another is stepped.
     pool, waiting = ThreadPoolExecutor(in_flight, "block"), deque[tuple[int, Future]]()
     try:

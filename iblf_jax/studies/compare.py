@@ -29,10 +29,8 @@ from iblf_jax.control.observers import NoObserver
 from iblf_jax.core import checks, notices
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import Status
-from iblf_jax.engine.execute import run_batch
-from iblf_jax.engine.mechanism import known_of
+from iblf_jax.engine import Outcome, RunRequest, run_batch
 from iblf_jax.engine.simulate import simulate
-from iblf_jax.engine.step import Run
 from iblf_jax.simulation.accuracy import RELATIVE
 from iblf_jax.simulation.metrics import AboveGravity, as_folds, standard, watched
 from iblf_jax.simulation.paths import with_parameters
@@ -256,7 +254,7 @@ def _trials_of(
     dtype, size = scenario.initial.q.dtype, len(grid())
     folds = as_folds((AboveGravity(),), dtype, scenario)
     steps = checks.whole_steps(options["duration"], options["dt"])
-    run = Run(steps, options["method"], mechanism=known_of(scenario))
+    request = RunRequest.of(scenario, steps=steps, method=options["method"])
     noise = noise_of(scenario, jax.random.PRNGKey(0), 0)
 
     def trials(factors: np.ndarray) -> Trials:
@@ -265,7 +263,7 @@ def _trials_of(
             path: jnp.asarray(x, dtype) for path, x in _scaled(scenario, names, padded).items()
         }
         varied |= {name: jnp.broadcast_to(x, (size, *x.shape)) for name, x in noise.items()}
-        found = _batch(scenario, varied, folds, jnp.asarray(options["dt"], dtype), run=run)
+        found = _batch(scenario, varied, folds, jnp.asarray(options["dt"], dtype), request=request)
         columns = (
             found.metrics["effort_above_gravity"],
             found.status,
@@ -277,11 +275,16 @@ def _trials_of(
     return trials
 
 
-@partial(jax.jit, static_argnames="run")
+@partial(jax.jit, static_argnames="request")
 def _batch(
-    scenario: Scenario, varied: dict[str, jax.Array], folds: Any, dt: jax.Array, *, run: Run
-):
-    return run_batch(scenario, varied, folds, dt, run)
+    scenario: Scenario,
+    varied: dict[str, jax.Array],
+    folds: Any,
+    dt: jax.Array,
+    *,
+    request: RunRequest,
+) -> Outcome:
+    return run_batch(scenario, varied, folds, dt, request)
 
 
 def factor_nearest_one(effort: Callable[[float], float], target: float) -> float:

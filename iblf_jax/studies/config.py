@@ -14,7 +14,7 @@ import numpy as np
 
 from iblf_jax.core import devices
 from iblf_jax.core.pytree import is_leaf_field
-from iblf_jax.kernels.toolchain import built_for
+from iblf_jax.kernels import built_for
 from iblf_jax.simulation.paths import get, parameters, unit_at
 from iblf_jax.studies.blocks import _execute, block_size
 from iblf_jax.studies.points import Points

@@ -18,7 +18,7 @@ import numpy as np
 
 from iblf_jax.core import checks, notices
 from iblf_jax.core.progress import bar
-from iblf_jax.engine import plan
+from iblf_jax.engine import STUDY_MEMORY
 from iblf_jax.simulation.accuracy import RELATIVE
 from iblf_jax.simulation.metrics import Fold
 from iblf_jax.simulation.sampling import has_noise
@@ -47,7 +47,7 @@ def monte_carlo(
     replicates: int = 1,
     backend: str = "auto",
     chunk: int | None = None,
-    memory: float = plan.STUDY_MEMORY,
+    memory: float = STUDY_MEMORY,
     devices: Sequence[jax.Device] | None = None,
     progress: bool | None = None,
 ) -> Study:

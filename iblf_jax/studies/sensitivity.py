@@ -24,7 +24,7 @@ import numpy as np
 from iblf_jax.core import checks, notices, tables
 from iblf_jax.core.progress import bar
 from iblf_jax.core.status import FAILED
-from iblf_jax.engine import plan
+from iblf_jax.engine import STUDY_MEMORY
 from iblf_jax.simulation.metrics import Fold, metric_units
 from iblf_jax.simulation.results import Metrics
 from iblf_jax.simulation.scenario import Scenario
@@ -114,7 +114,7 @@ def sensitivity(
     method: str = "rk4",
     metrics: Sequence[Fold] | None = None,
     backend: str = "auto",
-    memory: float = plan.STUDY_MEMORY,
+    memory: float = STUDY_MEMORY,
     devices: Sequence[jax.Device] | None = None,
     progress: bool | None = None,
 ) -> Sensitivity:

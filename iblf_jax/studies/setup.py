@@ -12,8 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.engine.mechanism import known_of
-from iblf_jax.engine.plan import BACKENDS
+from iblf_jax.engine import RunRequest, check_backend
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.metrics import Fold, as_folds
 from iblf_jax.simulation.sampling import check_step
@@ -24,7 +23,7 @@ from iblf_jax.studies.blocks import (
     StudyRun,
     _execute,
     block_size,
-    with_chosen_backend,
+    compile_study,
 )
 from iblf_jax.studies.designs import split, unit_points
 from iblf_jax.studies.distributions import Perturbation
@@ -55,7 +54,7 @@ class StudySetup:
     @property
     def cases(self) -> int:
         """Number of cases: points times runs."""
-        return self.runs * (len(next(iter(self.points.values()))) if self.points else 1)
+        return number_of_cases(self.runs, self.points)
 
     @cached_property
     def shapes(self) -> Results:
@@ -72,11 +71,7 @@ class StudySetup:
 
     def lanes(self, cases: np.ndarray) -> Lanes:
         """What differs between these cases; cases past the last one repeat it."""
-        point, run = np.divmod(np.minimum(cases, self.cases - 1), self.runs)
-        points = {path: values[point] for path, values in self.points.items()}
-        return Lanes(
-            run.astype(np.uint32), points, {path: u[run] for path, u in self.designed.items()}
-        )
+        return lanes_of(cases, self.runs, self.points, self.designed)
 
 
 def prepare(
@@ -96,7 +91,7 @@ def prepare(
 ) -> StudySetup:
     """Checks the arguments that studies share and puts together what their blocks need."""
     tableau(method)
-    checks.one_of("backend", backend, BACKENDS)
+    check_backend(backend)
     steps = checks.whole_steps(duration, dt)
     seed, scenario = checks.seed(seed), canonical(scenario)
     check_step(scenario, dt)
@@ -109,10 +104,12 @@ def prepare(
         shapes = sample_size(targets, by_path)
         dimension = sum(int(np.prod(shape, dtype=int)) for shape in shapes.values())
         designed = split(unit_points(sampler, dimension, runs, replicates, seed), shapes, dtype)
-    study_run = StudyRun(targets, steps, method, backend, known_of(scenario))
+    request = RunRequest.of(scenario, steps=steps, method=method, backend=backend)
     shared = StudyInputs(Cases(scenario, by_path, jax.random.PRNGKey(seed)), folds, step)
-    setup = StudySetup(
-        study_run,
+    points = dict(points or {})
+    first_block = lanes_of(np.arange(block_size()), runs, points, designed)
+    return StudySetup(
+        compile_study(targets, request, shared, first_block),
         shared,
         dict(perturbations),
         seed,
@@ -120,9 +117,27 @@ def prepare(
         sampler,
         replicates,
         designed,
-        dict(points or {}),
+        points,
     )
-    return dataclasses.replace(
-        setup,
-        study_run=with_chosen_backend(study_run, shared, setup.lanes(np.arange(block_size()))),
+
+
+def number_of_cases(runs: int, points: Mapping[str, np.ndarray]) -> int:
+    """Cases of a study: points times runs."""
+    if not points:
+        return runs
+    return runs * len(next(iter(points.values())))
+
+
+def lanes_of(
+    cases: np.ndarray,
+    runs: int,
+    points: Mapping[str, np.ndarray],
+    designed: Mapping[str, np.ndarray],
+) -> Lanes:
+    """What differs between these cases; cases past the last one repeat it."""
+    point, run = np.divmod(np.minimum(cases, number_of_cases(runs, points) - 1), runs)
+    return Lanes(
+        run.astype(np.uint32),
+        {path: values[point] for path, values in points.items()},
+        {path: u[run] for path, u in designed.items()},
     )

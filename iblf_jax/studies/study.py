@@ -26,7 +26,8 @@ from iblf_jax.core import checks, notices
 from iblf_jax.core.presentation import present
 from iblf_jax.core.status import FAILED, Status, describe
 from iblf_jax.core.status import VIOLATED as LEFT
-from iblf_jax.engine.simulate import SimulationWarning, simulate_unchecked
+from iblf_jax.engine import RunRequest, run_rollout
+from iblf_jax.engine.simulate import SimulationWarning
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.metrics import metric_units
 from iblf_jax.simulation.results import Metrics, Rollout
@@ -383,17 +384,14 @@ class Study:
             reason = "made on another machine or version"
             notices.warn(f"Run {i} gives other numbers here than in the study: {reason}.")
         study_run, shared = self.setup.study_run, self.setup.shared
-        run = simulate_unchecked(
-            paths.with_parameters(self.scenario, {path: x[i] for path, x in self.samples.items()}),
-            shared.folds,
-            shared.dt,
-            noise_of(
-                self.scenario, shared.cases.key, self.setup.lanes(np.asarray([i])).index[0]
-            ).get(NOISE_NAME),
-            steps=study_run.steps,
-            method=study_run.method,
-            record_every=record_every,
+        drawn = {path: x[i] for path, x in self.samples.items()}
+        scenario = paths.with_parameters(self.scenario, drawn)
+        request = RunRequest.of(
+            scenario, steps=study_run.steps, method=study_run.method, record_every=record_every
         )
+        index = self.setup.lanes(np.asarray([i])).index[0]
+        noise = noise_of(self.scenario, shared.cases.key, index).get(NOISE_NAME)
+        run = run_rollout(scenario, shared.folds, shared.dt, request, noise)
         self._warn_of_start(i)
         metrics = Metrics(again.metrics, self.metrics.unit_pairs)
         return dataclasses.replace(

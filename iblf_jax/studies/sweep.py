@@ -18,7 +18,7 @@ import numpy as np
 
 from iblf_jax.core import checks, notices
 from iblf_jax.core.progress import bar
-from iblf_jax.engine import plan
+from iblf_jax.engine import STUDY_MEMORY, sweep_unit, whole_blocks
 from iblf_jax.simulation.accuracy import RELATIVE
 from iblf_jax.simulation.metrics import Fold, metric_units
 from iblf_jax.simulation.scenario import Scenario, canonical
@@ -67,7 +67,7 @@ def sweep(
     unit: int | None = None,
     backend: str = "auto",
     chunk: int | None = None,
-    memory: float = plan.STUDY_MEMORY,
+    memory: float = STUDY_MEMORY,
     devices: Sequence[jax.Device] | None = None,
     progress: bool | None = None,
 ) -> xarray.Dataset:
@@ -270,13 +270,9 @@ def _units(
 
 def _chosen_unit(setup: StudySetup, unit: int | None) -> int:
     """Cases in a unit: whole blocks, or all there is."""
-    size, cases = block_size(), setup.cases
-    wanted = (
-        min(plan.SWEEP_UNIT / setup.study_run.steps, cases / plan.SWEEP_UNITS)
-        if unit is None
-        else unit
-    )
-    return min(cases, size * max(1, round(wanted / size)))
+    if unit is None:
+        return sweep_unit(setup.cases, setup.study_run.steps)
+    return whole_blocks(setup.cases, unit)
 
 
 def _into_store(

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.engine.step import folded
+from iblf_jax.engine import folded
 from iblf_jax.simulation.metrics import Fold
 from iblf_jax.simulation.signals import Sample
 from iblf_jax.testing._contract import Findings, examine, in_dtype, probe, same_structure, shape_of

@@ -12,9 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks, notices
-from iblf_jax.engine.derivatives import Outer
+from iblf_jax.engine import Outer, folded
 from iblf_jax.engine.simulate import simulate
-from iblf_jax.engine.step import folded
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.testing._contract import (
     Findings,

@@ -41,4 +41,6 @@ from iblf_jax.tuning.solvers import LBFGS as LBFGS
 from iblf_jax.tuning.solvers import SOLVERS as SOLVERS
 from iblf_jax.tuning.solvers import SQP as SQP
 from iblf_jax.tuning.solvers import Adam as Adam
+from iblf_jax.tuning.solvers import Optimality as Optimality
+from iblf_jax.tuning.solvers import SearchSpace as SearchSpace
 from iblf_jax.tuning.solvers import Solver as Solver

@@ -1,5 +1,5 @@
-"""`falsify`: searches for a run that violates its bounds, by derivatives over start, disturbance and
-plant within stated ranges.
+"""`falsify`: searches for a run that violates its bounds, by derivatives over start, disturbance
+and plant within stated ranges.
 
 Random runs seldom contain the worst case: in d dimensions its corner of the set is small.  Here the
 uniform number u in [0, 1]^d behind each perturbation is the unknown, and each of S attacks, which
@@ -34,7 +34,6 @@ from iblf_jax.core import checks, notices
 from iblf_jax.core.progress import bar
 from iblf_jax.core.pytree import astype
 from iblf_jax.core.status import VIOLATED, Status, describe
-from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.metrics import check_needs
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.results import Rollout
@@ -45,7 +44,7 @@ from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.tuning.evaluation import NUMBERS_A_RUN, Derivatives, Value
 from iblf_jax.tuning.parameters import Box
 from iblf_jax.tuning.quantities import DEFICITS, Peak, Quantities
-from iblf_jax.tuning.runs import BACKENDS, Run, known_of, simulate, tangents_of_runs
+from iblf_jax.tuning.runs import RunRequest, simulate, tangents_of_runs
 from iblf_jax.tuning.solvers import SQP, SearchSpace
 
 MARGINS = {"positions": "deficit", "velocities": "velocity_deficit", "regions": "region_deficit"}
@@ -94,7 +93,9 @@ class Attack:
         return simulate(self.scenario, record_every=record_every, **self.timing)
 
     def __repr__(self) -> str:
-        word = "FALSIFIED" if self.violated else "not falsified"
+        word = "not falsified"
+        if self.violated:
+            word = "FALSIFIED"
         lines = [
             f"Attack({word}: smallest margin {self.margin:.4g} {self.unit}, {self.first_margin:.4g}"
             f" at random; {self.runs} runs)"
@@ -154,27 +155,36 @@ def falsify(
 
     Source: head of this module.
     """
-    tableau(method)
-    checks.one_of("backend", backend, BACKENDS)
     steps = checks.whole_steps(duration, dt)
     scenario = canonical(scenario)
+    request = RunRequest.of(scenario, steps=steps, method=method, backend=backend)
     check_step(scenario, dt)
-    starts = checks.positive_integer("starts", starts)
-    checks.fits("starts", starts, 8.0 * NUMBERS_A_RUN)
-    iterations = checks.positive_integer("iterations", iterations, most=checks.MOST_STEPS)
-    seed = checks.seed(seed)
-    checks.fits("iterations", iterations, 8 * starts)
+    starts, iterations, seed = _checked_sizes(starts, iterations, seed)
     cube = bounded(scenario, perturbations)
     checks.fits("starts", starts, 8.0 * (1 + cube.size) * NUMBERS_A_RUN)
     checks.one_of("margin", margin, MARGINS)
     one: Any = 1.0
     peak = Peak(one, MARGINS[margin])
     check_needs("margin", peak, scenario)
-    run = Run(steps, method, mechanism=known_of(scenario))
-    evaluate = MarginEvaluator(cube, peak, dt, run, backend, starts)
+    evaluate = MarginEvaluator(cube, peak, dt, request, starts)
     unit = DEFICITS[peak.signal]
     with bar(progress, iterations + 1, unit="steps") as shown:
         _attack(cube, evaluate, seed, iterations, shown, unit)
+    timing = {"duration": duration, "dt": dt, "method": method}
+    return _result(cube, evaluate, timing, unit)
+
+
+def _checked_sizes(starts: Any, iterations: Any, seed: Any) -> tuple[int, int, int]:
+    """Number of attacks, of their steps, and the seed."""
+    starts = checks.positive_integer("starts", starts)
+    checks.fits("starts", starts, 8.0 * NUMBERS_A_RUN)
+    iterations = checks.positive_integer("iterations", iterations, most=checks.MOST_STEPS)
+    checks.fits("iterations", iterations, 8 * starts)
+    return starts, iterations, checks.seed(seed)
+
+
+def _result(cube: Cube, evaluate: MarginEvaluator, timing: dict[str, Any], unit: str) -> Attack:
+    """The worst run of all."""
     worst = evaluate.worst
     if worst is None:
         remedy = (
@@ -182,18 +192,18 @@ def falsify(
             " is too large: narrow the perturbations, widen the bounds, or take a smaller dt."
         )
         raise cube.nothing(remedy)
-    point = cube.values(jnp.asarray(worst.u, scenario.initial.q.dtype))
+    point = cube.values(jnp.asarray(worst.u, evaluate.dtype))
     values = {path: np.asarray(x) for path, x in point.items()}
     history = np.stack(evaluate.history)
     return Attack(
-        scenario=with_parameters(scenario, values),
+        scenario=with_parameters(cube.cases.scenario, values),
         values=values,
         margin=worst.margin,
         first_margin=next(float(np.nanmin(row)) for row in history if not np.all(np.isnan(row))),
         status=worst.status,
         history=history,
-        runs=starts * (iterations + 1),
-        timing={"duration": duration, "dt": dt, "method": method},
+        runs=history.size,
+        timing=timing,
         unit=unit,
     )
 
@@ -233,16 +243,14 @@ class MarginEvaluator:
       cube: the set.
       peak: of the deficit that is minus the margin.
       dt: time step [s].
-      run, backend: steps and integrator, and on what they are executed.
+      request: what is run.
       starts: number S of attacks.
     """
 
-    def __init__(self, cube: Cube, peak: Peak, dt: float, run: Run, backend: str, starts: int):
+    def __init__(self, cube: Cube, peak: Peak, dt: float, request: RunRequest, starts: int):
         self.dtype = cube.cases.scenario.initial.q.dtype
         step = jnp.asarray(dt, self.dtype)
-        self.margins = partial(
-            _margins, cube, astype(peak, self.dtype), step, run=run, backend=backend
-        )
+        self.margins = partial(_margins, cube, astype(peak, self.dtype), step, request=request)
         size = cube.size
         self.space = SearchSpace(Box(np.full(size, 0.5), np.zeros(size), np.ones(size)))
         self.active = np.ones(starts, bool)
@@ -274,9 +282,9 @@ def _admissible(
     return accepted.copy()
 
 
-@partial(jax.jit, static_argnames=("run", "backend"))
+@partial(jax.jit, static_argnames="request")
 def _margins(
-    cube: Cube, peak: Peak, dt: jax.Array, u: jax.Array, *, run: Run, backend: str
+    cube: Cube, peak: Peak, dt: jax.Array, u: jax.Array, *, request: RunRequest
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Smallest margin (S,), minus the peak of a deficit, its gradient by u (S, d) and the status of
     each attack.
@@ -284,9 +292,7 @@ def _margins(
     varied = jax.vmap(cube.values)(u)
     jacobians = jax.vmap(jax.jacfwd(cube.values))(u)
     folds = (Quantities((peak,)),)
-    found = tangents_of_runs(
-        cube.cases.scenario, varied, jacobians, folds, dt, run, backend=backend
-    )
+    found = tangents_of_runs(cube.cases.scenario, varied, jacobians, folds, dt, request)
     deficits = found.outcome.metrics["tuning_pieces"]
     slopes = found.tangents["tuning_pieces"]
     worst = jnp.argmax(deficits, axis=1)

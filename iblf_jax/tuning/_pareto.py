@@ -1,5 +1,5 @@
-"""`pareto`: the front of two objectives, for example tracking and effort: first its ends, then points
-in its largest gaps.
+"""`pareto`: the front of two objectives, for example tracking and effort: first its ends, then
+points in its largest gaps.
 
 With A = log risk_b[a_b], B = log risk_b[b_b], an end minimises one of them only,
 
@@ -188,19 +188,7 @@ def pareto(
     checks.fits("points", points, 8.0 * BETWEEN * problem.runs * NUMBERS_A_RUN)
     search = FrontSearch(problem, min(points, BATCH), iterations, tolerance)
     with bar(progress, points, unit="points") as shown:
-        search.ends(seed)
-        shown.update(2)
-        while len(search.nodes) < points:
-            gaps = search.largest_gaps(points - len(search.nodes))
-            if not gaps:
-                break
-            search.minimise(
-                np.stack([gap.z for gap in gaps]),
-                np.array([gap.objective for gap in gaps]),
-                np.array([gap.level for gap in gaps]),
-            )
-            shown.update(len(gaps))
-        search.fill(BETWEEN * points)
+        search.run(points, seed, shown)
     return search.front(time.perf_counter() - began)
 
 
@@ -240,6 +228,22 @@ class FrontSearch:
         """Which objective has been under which level."""
         self.evaluations = 0
         self.values = 0
+
+    def run(self, points: int, seed: int, shown: Any) -> None:
+        """The ends, points in the largest gaps, and values on the lines between them."""
+        self.ends(seed)
+        shown.update(2)
+        while len(self.nodes) < points:
+            gaps = self.largest_gaps(points - len(self.nodes))
+            if not gaps:
+                break
+            self.minimise(
+                np.stack([gap.z for gap in gaps]),
+                np.array([gap.objective for gap in gaps]),
+                np.array([gap.level for gap in gaps]),
+            )
+            shown.update(len(gaps))
+        self.fill(BETWEEN * points)
 
     def ends(self, seed: int) -> None:
         """Both ends: each objective alone, and then the other one at nearly no cost to it.

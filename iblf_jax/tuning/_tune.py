@@ -7,6 +7,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -20,7 +21,7 @@ from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.tuning.checkpoints import fingerprint, load_checkpoint, save_checkpoint
 from iblf_jax.tuning.evaluation import NUMBERS_A_RUN
 from iblf_jax.tuning.objectives import Objective
-from iblf_jax.tuning.options import Report, chosen_solver, options_of
+from iblf_jax.tuning.options import Options, Report, chosen_solver, options_of
 from iblf_jax.tuning.parameters import Tunable, in_units, names_of, values_at
 from iblf_jax.tuning.problem import TuningProblem
 from iblf_jax.tuning.result import STUCK, TuneResult, TuneSetup
@@ -102,10 +103,9 @@ def tune(
     """
     began = time.perf_counter()
     iterations = checks.positive_integer("iterations", iterations, most=checks.MOST_STEPS)
-    options = options_of(solver, report, deprecated)
+    options = options_of(solver, report, progress, deprecated)
     if checkpoint is not None:
         checkpoint = checks.file_to_write("checkpoint", checkpoint)
-    show, callback = _progress(progress, options.callback)
     problem = TuningProblem.build(
         scenario,
         parameters,
@@ -122,33 +122,11 @@ def tune(
     solver, mode = chosen_solver(options, problem.size)
     start = _start_of_search(problem, solver, seed)
     search = _search(problem, solver, mode, iterations, start)
-    mark = fingerprint(search.evaluate.problem, solver, mode, iterations)
-    if checkpoint is not None and checkpoint.exists():
-        load_checkpoint(checkpoint, search, mark)
-
-    with bar(show, iterations, int(search.state["iteration"]), unit="steps") as shown:
-
-        def on_step(search: Search) -> None:
-            if checkpoint is not None:
-                save_checkpoint(search, checkpoint, mark)
-            _show(shown, search)
-            if callback is not None:
-                callback(search)
-
-        stopped = search.run(iterations, on_step)
+    stopped = _run(search, mode, iterations, checkpoint, options)
     if not np.any(np.isfinite(search.state["best_key"])):
         raise problem.unstable_error()
     setup = _setup(problem, float(duration), float(dt), options.report)
     return _result(problem, search, setup, stopped, mode=mode, began=began, probes=start.evaluated)
-
-
-def _progress(
-    progress: Any, callback: Callable[[Search], None] | None
-) -> tuple[bool | None, Callable[[Search], None] | None]:
-    """Whether a bar is shown, and what is called after each step."""
-    if callable(progress):
-        return False, progress
-    return progress, callback
 
 
 class _Start(NamedTuple):
@@ -162,7 +140,9 @@ class _Start(NamedTuple):
     @property
     def evaluated(self) -> int:
         """Number of points that were evaluated without derivatives."""
-        return 0 if self.nearby is None else self.nearby.count
+        if self.nearby is None:
+            return 0
+        return self.nearby.count
 
 
 def _start_of_search(problem: TuningProblem, solver: Solver, seed: int) -> _Start:
@@ -186,8 +166,28 @@ def _search(
     problem = problem.for_solver(solver)
     space = problem.search_space(iterations)
     evaluate = Evaluator(problem, problem.candidates(start.z), mode, space)
-    second_start = None if start.nearby is None else start.nearby.away_from
-    return Search(evaluate, solver, start.z, second_start)
+    if start.nearby is None:
+        return Search(evaluate, solver, start.z)
+    return Search(evaluate, solver, start.z, second_start=start.nearby.away_from)
+
+
+def _run(
+    search: Search, mode: str, iterations: int, checkpoint: Path | None, options: Options
+) -> str:
+    """All steps of a search, from its checkpoint if there is one; returns why it ended."""
+    mark = fingerprint(search.evaluate.problem, search.solver, mode, iterations)
+    if checkpoint is not None and checkpoint.exists():
+        load_checkpoint(checkpoint, search, mark)
+    with bar(options.show, iterations, int(search.state["iteration"]), unit="steps") as shown:
+
+        def on_step(search: Search) -> None:
+            if checkpoint is not None:
+                save_checkpoint(search, checkpoint, mark)
+            _show(shown, search)
+            if options.callback is not None:
+                options.callback(search)
+
+        return search.run(iterations, on_step)
 
 
 def _show(shown: Any, search: Search) -> None:
@@ -204,6 +204,9 @@ def _show(shown: Any, search: Search) -> None:
 def _setup(problem: TuningProblem, duration: float, dt: float, report: Report) -> TuneSetup:
     """What the report needs to know of the call."""
     seed = int(problem.seed)
+    report_seed = report.seed
+    if report_seed is None:
+        report_seed = (seed + 1) % 2**32
     low, high = (in_units(problem.blocks, z) for z in (problem.box.low, problem.box.high))
     return TuneSetup(
         objective=problem.objective,
@@ -213,10 +216,10 @@ def _setup(problem: TuningProblem, duration: float, dt: float, report: Report) -
         seed=seed,
         duration=duration,
         dt=dt,
-        method=problem.method,
-        backend=problem.backend,
+        method=problem.request.method,
+        backend=problem.request.backend,
         report_runs=report.runs,
-        report_seed=(seed + 1) % 2**32 if report.seed is None else report.seed,
+        report_seed=report_seed,
         confidence=report.confidence,
         limits=tuple(zip(low.tolist(), high.tolist(), strict=True)),
         reasons=problem.box.reasons,

@@ -50,7 +50,7 @@ from iblf_jax.tuning.objectives import Objective
 from iblf_jax.tuning.parameters import values_at
 from iblf_jax.tuning.quantities import Peak, Quantities
 from iblf_jax.tuning.robust import Risk, combine, worst_share
-from iblf_jax.tuning.runs import Run, run_batch, run_for_reverse, tangents_of_runs
+from iblf_jax.tuning.runs import RunRequest, run_batch, run_for_reverse, tangents_of_runs
 
 if TYPE_CHECKING:
     from iblf_jax.tuning.problem import TuningProblem
@@ -156,7 +156,7 @@ def piece_counts(objective: Objective, scenario: Scenario, duration: float) -> t
 
 
 def _fold(problem: TuningProblem) -> tuple[Quantities, ...]:
-    return fold_of(problem.objective, problem.dt.dtype, problem.steps * problem.dt)
+    return fold_of(problem.objective, problem.dt.dtype, problem.request.steps * problem.dt)
 
 
 # ------------------------------------------------------------------------------------------ runs
@@ -220,24 +220,23 @@ class Rollouts(NamedTuple):
     fastest_mode: Any
 
 
-@partial(jax.jit, static_argnames=("run", "backend"))
+@partial(jax.jit, static_argnames="request")
 def rollouts(
     scenario: Scenario,
     varied: dict[str, jax.Array],
     objective: Objective,
     dt: jax.Array,
     *,
-    run: Run,
-    backend: str,
+    request: RunRequest,
 ) -> Rollouts:
     """Runs without derivatives, for a search and for the report on its result.
 
     Args:
-      scenario, varied, dt, run, backend: as `runs.run_batch`.
+      scenario, varied, dt, request: as `runs.run_batch`.
       objective: complete.
     """
-    folds = (*fold_of(objective, dt.dtype, run.steps * dt), Torque())
-    outcome = run_batch(scenario, varied, folds, dt, run, backend=backend)
+    folds = (*fold_of(objective, dt.dtype, request.steps * dt), Torque())
+    outcome = run_batch(scenario, varied, folds, dt, request)
     smooth, exact, peak_torque, error = (
         outcome.metrics[name] for name in ("tuning_smooth", "tuning_exact", "peak_torque", RELATIVE)
     )
@@ -279,9 +278,10 @@ def _objective(problem: TuningProblem, candidate: Candidate, quantities: jax.Arr
 
 def _excesses(problem: TuningProblem, quantities: jax.Array) -> jax.Array:
     """G_r of each requirement, (n_requirements,)."""
+    if not problem.allowed:
+        return jnp.zeros((0,), quantities.dtype)
     each = jax.vmap(problem.objective.excesses)(quantities)
-    found = [worst_share(each[:, r], share) for r, share in enumerate(problem.allowed)]
-    return jnp.stack(found) if found else jnp.zeros((0,), quantities.dtype)
+    return jnp.stack([worst_share(each[:, r], share) for r, share in enumerate(problem.allowed)])
 
 
 def _augmentation(excess: jax.Array, multipliers: jax.Array, penalty: jax.Array) -> jax.Array:
@@ -312,7 +312,9 @@ def value_of_start(
     """
     fine = (status & int(UNTRUSTED) == 0) & jnp.all(jnp.isfinite(smooth), axis=-1)
     valid = jnp.all(fine)
-    risk = problem.risk if problem.on_front else Risk()
+    risk = Risk()  # the mean
+    if problem.on_front:
+        risk = problem.risk
     return Value(
         loss=jnp.where(valid, _loss(problem, candidate, smooth), jnp.inf),
         objective=_objective(problem, candidate, exact),
@@ -381,15 +383,9 @@ def _over_levels(
 
 def value(problem: TuningProblem, candidates: Candidate) -> Value:
     """The problem at the coordinates of each start, (S, ...)."""
-    run = Run(problem.steps, problem.method, mechanism=problem.mechanism)
     varied = _compiled_varied(problem, candidates)
     found = rollouts(
-        problem.cases.scenario,
-        varied,
-        problem.objective,
-        problem.dt,
-        run=run,
-        backend=problem.backend,
+        problem.scenario, varied, problem.objective, problem.dt, request=problem.request
     )
     return _values(problem, candidates, found)
 
@@ -408,16 +404,13 @@ def forward_derivatives(problem: TuningProblem, candidates: Candidate) -> Deriva
     """The problem with gradient (S, p), Gauss-Newton matrix (S, p, p) and the pieces of the
     requirements, by forward mode.
     """
-    run = Run(problem.steps, problem.method, mechanism=problem.mechanism)
     found = tangents_of_runs(
-        problem.cases.scenario,
+        problem.scenario,
         _varied_of_all(problem, candidates),
         _jacobians(problem, candidates),
         _fold(problem),
         problem.dt,
-        run,
-        backend=problem.backend,
-        nested=problem.nested,
+        problem.request,
         uniform=_uniform_paths(problem),
     )
     by_start = _by_start((found.outcome, found.tangents, found.products), candidates)
@@ -444,7 +437,7 @@ def _uniform_paths(problem: TuningProblem) -> list[str]:
 
 
 def _overlaps(problem: TuningProblem, path: str, others: list[str]) -> bool:
-    return any(same_place(problem.cases.scenario, path, other) for other in others)
+    return any(same_place(problem.scenario, path, other) for other in others)
 
 
 @jax.jit
@@ -454,9 +447,9 @@ def reverse_derivatives(problem: TuningProblem, candidates: Candidate) -> Deriva
     def one_run(z: jax.Array, index: jax.Array) -> Any:
         values = _varied(problem, z, index)
         noise = values.pop(NOISE_NAME, None)
-        scenario = with_parameters(problem.cases.scenario, values)
-        run = Run(problem.steps, problem.method)
-        outcome = run_for_reverse(scenario, _fold(problem), problem.dt, run, noise)
+        scenario = with_parameters(problem.scenario, values)
+        request = problem.request._replace(constants=None)
+        outcome = run_for_reverse(scenario, _fold(problem), problem.dt, request, noise)
         return outcome.metrics["tuning_smooth"], (outcome.metrics["tuning_exact"], outcome.status)
 
     def loss(z: jax.Array, candidate: Candidate) -> Any:

@@ -1,30 +1,31 @@
-"""What gains are tuned for: objectives, composed with + and weights, and requirements, which are
-penalty and verdict at once.
+"""What gains are tuned for: objectives, composed with + and weights, and requirements, which
+constrain the tuning and get a verdict in the report.
 
-    objective = ij.objectives.tracking() + 0.5 * ij.objectives.effort() + 10 *
-    ij.objectives.peak_torque() objective += ij.objectives.margin_above(0.05)
+    objective = ij.objectives.tracking() + 0.5 * ij.objectives.effort()
+    objective += 10 * ij.objectives.peak_torque() + ij.objectives.margin_above(0.05)
 
-A term is a smooth number of a run over its scale, so that terms are comparable:
+A term is a smooth number of a run divided by its scale, so that terms are comparable:
 
-    plain   weight value / scale                 above   weight softplus(sharpness (value - limit) /
-    scale) / sharpness
+    plain   weight value / scale
+    above   weight softplus(sharpness (value - limit) / scale) / sharpness
 
-`scale` and `limit`, where they are not given, are the value at the gains that tuning starts from
-(its mean over perturbed runs).  A requirement holds where
+`scale` and `limit`, if they are not given, are the value at the gains that tuning starts from (its
+mean over perturbed runs).  A requirement holds where
 
-    g = (value - limit) / scale < 0        (its sign turned for "above" requirements);
+    g = (value - limit) / scale < 0        (with the opposite sign for "above" requirements);
 
-the tuning keeps g below zero (`newton`), in the report it passes or fails, with a confidence.
+the tuning keeps g below zero (`solvers`), and in the report the requirement passes or fails, with a
+confidence.
 
 In all functions `joints=` selects the joints that count, by index, name, slice or one truth value
 each (`core.joints`); `weights=` is one number, or one for each joint (or for each selected joint).
 A limit may be one number for all joints, or one for each:
 
-    ij.objectives.peak_torque_below([140, 140, 140, 27, 27, 27]) + ij.objectives.error_below(0.01,
-    joints=["wrist_1", "wrist_2"])
+    ij.objectives.peak_torque_below([140, 140, 140, 27, 27, 27])
+    ij.objectives.error_below(0.01, joints=["wrist_1", "wrist_2"])
 
-Limits of single joints are kept as one requirement on the largest part of a limit, max_i |y_i| /
-limit_i < 1.
+Limits of single joints are one requirement on the largest ratio to the limit,
+max_i |y_i| / limit_i < 1.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ class Term:
       limit: for "above", () in the quantity's unit; its value at the start if not given.
       sharpness: of the corner at the limit, () [1], > 0; 20 if not given.
       shape: "plain" or "above"; "plain" if not given.
-      name: what reports call it; "term" if not given.
+      name: in reports; "term" if not given.
     """
 
     quantity: Quantity
@@ -84,17 +85,17 @@ class Term:
 
 @component
 class Requirement:
-    """A limit that every run, but for an allowed share of them, has to keep.
+    """A limit that all runs have to satisfy, except for an allowed share of them.
 
     Args:
       quantity: the number of a run, any `Quantity`.
-      limit: what it must stay below, () in the quantity's unit.
-      scale: the size that matters, () in the quantity's unit, > 0.
-      allowed: share of perturbed runs that may break it, () [1], >= 0; 0.01 if not given.
-      event: "value": broken where g >= 0; "violated": broken where the run left its bounds or ran
-        away; "value" if not given.
-      name: what reports call it; "requirement" if not given.
-      function: the one that made it, for messages; "" if not given.
+      limit: upper limit, () in the quantity's unit.
+      scale: a relevant difference, () in the quantity's unit, > 0.
+      allowed: share of perturbed runs that may violate it, () [1], >= 0; 0.01 if not given.
+      event: "value": violated where g >= 0; "violated": where the run left its bounds or diverged;
+        "value" if not given.
+      name: in reports; "requirement" if not given.
+      function: the function that made it, for messages; "" if not given.
     """
 
     quantity: Quantity
@@ -179,8 +180,9 @@ class Objective:
     def excesses(self, smooth: jax.Array) -> jax.Array:
         """Excess g of each requirement, (n_requirements,)."""
         offset = len(self.terms)
-        found = [r.excess(smooth[offset + i]) for i, r in enumerate(self.requirements)]
-        return jnp.stack(found) if found else jnp.zeros((0,), smooth.dtype)
+        if not self.requirements:
+            return jnp.zeros((0,), smooth.dtype)
+        return jnp.stack([r.excess(smooth[offset + i]) for i, r in enumerate(self.requirements)])
 
 
 WHAT_IT_IS = (
@@ -200,13 +202,13 @@ def checked(objective: Any) -> Objective:
 
 
 def _remedy(given: Any) -> str:
-    """How an objective is written, for what a user gave in its place."""
+    """How to write an objective, for a user who gave something else."""
     example = "Such as ij.objectives.tracking() + 0.1 * ij.objectives.effort()."
     if isinstance(given, str):
         call = f"ij.objectives.metric(fold, {given!r})"
-        return f"A name is none; a metric is made a term by {call}. {example}"
+        return f"A name is not an objective; {call} makes a term of a metric. {example}"
     if isinstance(given, type) or callable(given):
-        return f"Terms are made by a call, with brackets. {example}"
+        return f"Call the function, with brackets. {example}"
     return example
 
 
@@ -248,8 +250,12 @@ def _completed(t: Term, x: Any) -> Term:
             "a finite number other than 0",
             "Give the term a scale of its own.",
         )
-    scale = abs(x) if t.scale is None else t.scale
-    limit = x if t.limit is None and t.shape == "above" else t.limit
+    scale = t.scale
+    if scale is None:
+        scale = abs(x)
+    limit = t.limit
+    if limit is None and t.shape == "above":
+        limit = x
     quantity = t.quantity
     if isinstance(quantity, Peak) and t.scale is None:
         quantity = dataclasses.replace(quantity, scale=scale)
@@ -257,32 +263,35 @@ def _completed(t: Term, x: Any) -> Term:
 
 
 def sharper(objective: Objective, factor: float) -> Objective:
-    """The objective with the smoothing of every peak in its terms multiplied by a factor; all else,
-    and the structure, stays.
+    """The objective with the smoothing of every peak in its terms multiplied by a factor; its
+    structure stays the same.
     """
 
-    def mended(part: Any) -> Any:
-        smoothing = getattr(part.quantity, "smoothing", None)
+    def with_factor(term: Term) -> Term:
+        smoothing = _smoothing(term)
         if smoothing is None:
-            return part
-        return dataclasses.replace(
-            part, quantity=dataclasses.replace(part.quantity, smoothing=factor * smoothing)
-        )
+            return term
+        quantity: Any = term.quantity
+        quantity = dataclasses.replace(quantity, smoothing=factor * smoothing)
+        return dataclasses.replace(term, quantity=quantity)
 
     objective = _composed(objective)
-    return Objective(tuple(map(mended, objective.terms)), objective.requirements)
+    return Objective(tuple(map(with_factor, objective.terms)), objective.requirements)
+
+
+def _smoothing(term: Term) -> Any:
+    """The smoothing of a term's quantity; None where it has none, as those of users may not."""
+    return getattr(term.quantity, "smoothing", None)
 
 
 def is_smoothed(objective: Objective) -> bool:
     """Whether a term of the objective is smoothed, so that `sharper` changes it."""
-    return any(
-        getattr(term.quantity, "smoothing", None) is not None for term in _composed(objective).terms
-    )
+    return any(_smoothing(term) is not None for term in _composed(objective).terms)
 
 
-def has_price_on_torque(objective: Objective) -> bool:
-    """Whether a term or a requirement grows with the torque; a metric of the user's own is taken
-    for one that does.
+def depends_on_torque(objective: Objective) -> bool:
+    """Whether a term or a requirement increases with the torque; a user's own metric is assumed to
+    do so.
     """
     quantities = _composed(objective).quantities
     return any(
@@ -293,8 +302,8 @@ def has_price_on_torque(objective: Objective) -> bool:
 
 
 def check_signals(objective: Objective, scenario: Scenario) -> None:
-    """Raises ValueError for an objective of what the scenario's runs do not have: margins of
-    velocities or regions, a slack.
+    """Raises ValueError for an objective of signals that the scenario's runs do not have: margins
+    of velocities or regions, a slack.
     """
     for quantity in _composed(objective).quantities:
         check_needs("objective", quantity, scenario)
@@ -332,7 +341,7 @@ def _part_of(part: Any, function: str, names: tuple[str, ...]) -> Any:
     if isinstance(quantity, MetricResult):
         function = "metric"
         if quantity.joints is None:
-            # its weights belong to the numbers of the metric, which may be other than the joints
+            # its weights belong to the numbers of the metric, which need not be those of joints
             return part
     chosen = indices(f"{function}: joints", quantity.joints, names)
     _check_count(function, quantity, len(chosen), len(names))
@@ -346,8 +355,11 @@ def _check_count(function: str, quantity: Any, chosen: int, n: int) -> None:
     if shape in ((), (chosen,), (n,)):
         return
     of_limits = isinstance(quantity, Peak) and quantity.relative
-    name = _LIMIT_OF.get(function, "limit") if of_limits else "weights"
-    came = 1.0 / quantity.weights if of_limits else quantity.weights
+    name = "weights"
+    came = quantity.weights
+    if of_limits:
+        name = _LIMIT_OF.get(function, "limit")
+        came = 1.0 / quantity.weights
     raise checks.fail(
         f"{function}: {name}",
         came,
@@ -376,7 +388,9 @@ def _number(
 
 
 def _optional(function: str, name: str, value: Any, sign: str | None = "positive") -> Any:
-    return None if value is None else _number(function, name, value, sign)
+    if value is None:
+        return None
+    return _number(function, name, value, sign)
 
 
 def _limit(function: str, name: str, value: Any, example: str) -> jax.Array:
@@ -424,8 +438,9 @@ def _choice(
 def _in_words(values: Any, unit: str) -> str:
     """A limit as names of requirements have it."""
     numbers = np.asarray(values)
-    text = f"{numbers:g}" if numbers.ndim == 0 else f"[{', '.join(f'{x:g}' for x in numbers)}]"
-    return f"{text} {unit}"
+    if numbers.ndim == 0:
+        return f"{numbers:g} {unit}"
+    return f"[{', '.join(f'{x:g}' for x in numbers)}] {unit}"
 
 
 def _of_joints(chosen: Selection) -> str:
@@ -435,8 +450,8 @@ def _of_joints(chosen: Selection) -> str:
     if isinstance(chosen[0], bool):
         chosen = tuple(i for i, taken in enumerate(chosen) if taken)
     one = len(chosen) == 1 and ":" not in str(chosen[0])
-    word = "joint" if one else "joints"
-    return f" of {word} {', '.join(map(str, chosen))}"
+    names = ", ".join(map(str, chosen))
+    return f" of joint {names}" if one else f" of joints {names}"
 
 
 def _peak(
@@ -567,8 +582,8 @@ def torque_rate(*, joints: Any = None, weights: Any = None, scale: Any = None) -
 def settle(
     tolerance: Any = 0.01, *, joints: Any = None, weights: Any = None, scale: Any = 1.0
 ) -> Objective:
-    """Time that the joints spend outside a tolerance, the smooth twin of the settling time, sum
-    over joints / scale.
+    """Time that the joints spend outside a tolerance, a smooth substitute for the settling time,
+    summed over joints / scale.
 
         int sum_i w_i^2 sigmoid((|e1_i| - tolerance) / (0.1 tolerance)) dt / scale
 
@@ -600,19 +615,20 @@ def peak_torque(
       joints, weights: as `tracking`.
     """
     function = "peak_torque"
-    given = None if limit is None else _limit(function, "limit", limit, "140.0")
-    peak = _peak(
-        function, "torque", 1.0 if given is None else given, joints, weights, smoothing=smoothing
-    )
-    scale = None if given is None else peak[1]
-    return _soft(function, peak, scale, scale, sharpness)
+    if limit is None:  # the peak at the start will be scale and limit
+        peak = _peak(function, "torque", 1.0, joints, weights, smoothing=smoothing)
+        return _soft(function, peak, None, None, sharpness)
+    given = _limit(function, "limit", limit, "140.0")
+    peak = _peak(function, "torque", given, joints, weights, smoothing=smoothing)
+    return _soft(function, peak, peak[1], peak[1], sharpness)
 
 
 def margin(
     target: Any = 0.05, *, sharpness: Any = 5.0, smoothing: Any = 0.02, joints: Any = None
 ) -> Objective:
-    """Soft penalty on coming nearer to a bound than a target, softplus(sharpness (1 - margin /
-    target)) / sharpness.
+    """Soft penalty on a margin to the bounds below a target.
+
+        softplus(sharpness (1 - margin / target)) / sharpness
 
     Args:
       target: in rad, one number or one for each joint.
@@ -625,14 +641,14 @@ def margin(
 def velocity_margin(
     target: Any = 0.05, *, sharpness: Any = 5.0, smoothing: Any = 0.02, joints: Any = None
 ) -> Objective:
-    """Soft penalty on velocities that come nearer to a bound than a target; as `margin`, in rad/s,
-    for scenarios with `velocity_bounds`.
+    """Soft penalty on a margin to the velocity bounds below a target; as `margin`, in rad/s, for
+    scenarios with `velocity_bounds`.
     """
     return _soft_margin("velocity_margin", "velocity_deficit", target, sharpness, smoothing, joints)
 
 
 def region_margin(target: Any = 0.02, *, sharpness: Any = 5.0, smoothing: Any = 0.02) -> Objective:
-    """Soft penalty on coming nearer to a region's wall than a target; as `margin`, in m, for
+    """Soft penalty on a distance to the regions' boundaries below a target; as `margin`, in m, for
     scenarios with `regions`.
     """
     return _soft_margin("region_margin", "region_deficit", target, sharpness, smoothing, None)
@@ -654,10 +670,9 @@ def metric(
 
         sum_i w_i m_i / scale
 
-    It has to be differentiable: integrals, rms values and peaks are; a time at which something
-      happens has no slope, and is infinite
-    where it does not happen (for the settling time there is `settle`).
-    `iblf_jax.testing.check_objective` looks at it.
+    It has to be differentiable.  Integrals, rms values and peaks are; the time of an event has no
+    derivative, and is infinite without the event (for the settling time use `settle`).
+    `iblf_jax.testing.check_objective` checks it.
 
     Args:
       fold: the metric, such as `iblf_jax.metrics.Tracking()`.
@@ -680,7 +695,8 @@ def metric(
     if holds_weights(joints):
         chosen, w = _choice("metric", joints, weights, sign=None)
     else:
-        chosen, w = selection("metric: joints", joints), 1.0 if weights is None else weights
+        chosen = selection("metric: joints", joints)
+        w = 1.0 if weights is None else weights
     return _one_term("metric", MetricResult(fold, name, w, chosen), scale, name)
 
 
@@ -694,16 +710,16 @@ def error_below(
     Args:
       limit: in rad, one number or one for each joint (or for each selected joint).
       after: in s.
-      allowed: share of perturbed runs that may break it.
+      allowed: share of perturbed runs that may violate it.
       joints: which joints count: indices, names, a slice, or one truth value each; all if not
         given.
       weights: w, one number or one for each joint; 1 if not given.
     """
     given = _limit("error_below", "limit", limit, "0.01")
     peak = _peak("error_below", "error", given, joints, weights, after)
-    name = f"|e1|{_of_joints(peak[2])} < {_in_words(given, 'rad')}" + (
-        f" after {after:g} s" if after else ""
-    )
+    name = f"|e1|{_of_joints(peak[2])} < {_in_words(given, 'rad')}"
+    if after:
+        name += f" after {after:g} s"
     return _below("error_below", peak, allowed, name)
 
 
@@ -740,7 +756,7 @@ def velocity_margin_above(limit: Any, *, allowed: Any = 0.01, joints: Any = None
 
 
 def region_margin_above(limit: Any, *, allowed: Any = 0.01) -> Requirement:
-    """Minimum over time and regions of the distance to the wall > limit [m], for scenarios with
+    """Minimum over time and regions of the distance to the boundary > limit [m], for scenarios with
     `regions`; as `margin_above`.
     """
     return _margin_above(
@@ -758,14 +774,14 @@ def _margin_above(
 
 
 def violation_probability_below(probability: Any, *, scale: Any = 0.05) -> Requirement:
-    """The probability that a run leaves its bounds or runs away is below a limit.
+    """The probability that a run leaves its bounds or diverges is below a limit.
 
-    In the loss: the margin of the worst `probability` share of the runs (at least of one) is driven
-      above zero.
+    While tuning, the margin of the worst `probability` share of the runs (at least of one) is kept
+    above zero.
 
     Args:
       probability: the limit.
-      scale: the margin that matters [rad].
+      scale: a relevant margin [rad].
     """
     function = "violation_probability_below"
     size = _number(function, "scale", scale, "positive")

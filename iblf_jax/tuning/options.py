@@ -72,16 +72,22 @@ class Options(NamedTuple):
     of_automatic: dict[str, Any]
     """Options of the solver that is chosen automatically, from deprecated keyword arguments."""
     report: Report
+    show: bool | None
+    """Whether a progress bar is shown."""
     callback: Callable[[Any], None] | None
+    """Called with the search after each step."""
 
 
 def options_of(
-    solver: Solver | str | None, report: Report | None, deprecated: Mapping[str, Any]
+    solver: Solver | str | None,
+    report: Report | None,
+    progress: bool | Callable[[Any], None] | None,
+    deprecated: Mapping[str, Any],
 ) -> Options:
     """Checks the options of `tune`.
 
     Args:
-      solver, report: as the user gave them.
+      solver, report, progress: as the user gave them.
       deprecated: further keyword arguments.
 
     Raises:
@@ -105,11 +111,13 @@ def options_of(
     of_report = {OF_REPORT[name]: given.pop(name) for name in OF_REPORT if name in given}
     if of_report and report is not None:
         raise _given_twice("report", of_report)
-    report = _report(report) if not of_report else Report(**of_report)
+    report = Report(**of_report) if of_report else _report(report)
     if given and solver is not None:
         raise _given_twice("solver", given)
     checked = {name: _checked(name, value) for name, value in given.items()}
-    return Options(_solver(solver), checked, report, callback)
+    if callable(progress):
+        return Options(_solver(solver), checked, report, False, progress)
+    return Options(_solver(solver), checked, report, progress, callback)
 
 
 def _report(given: Any) -> Report:
@@ -144,7 +152,7 @@ def _solver(given: Any) -> Solver | None:
             return None
         checks.one_of("solver", given, ("auto", *SOLVERS))
         return SOLVERS[given]()
-    members = [x for x in (*vars(Solver), *Solver.__annotations__) if not x.startswith("_")]
+    members = [x for x in vars(Solver) if not x.startswith("_")]
     expected = f"a solver: one of {', '.join(map(repr, SOLVERS))}, or as ij.tuning.SQP()"
     checks.offers("solver", given, tuple(members), expected)
     return given
@@ -153,14 +161,11 @@ def _solver(given: Any) -> Solver | None:
 def chosen_solver(options: Options, size: int) -> tuple[Solver, str]:
     """The solver for so many coordinates, and the mode of differentiation."""
     solver = options.solver
-    mode = solver.mode if solver is not None else options.of_automatic.get("mode", "auto")
     if solver is None:
         solver = _automatic(options.of_automatic, size)
-        if mode == "auto":
-            mode = solver.mode
-    if mode == "auto":
-        mode = "forward" if differentiates_forward(size) else "reverse"
-    return solver, mode
+    if solver.mode != "auto":
+        return solver, solver.mode
+    return solver, "forward" if differentiates_forward(size) else "reverse"
 
 
 def _automatic(given: Mapping[str, Any], size: int) -> Solver:
@@ -169,10 +174,10 @@ def _automatic(given: Mapping[str, Any], size: int) -> Solver:
     resample = given.get("resample", False)
     name = given.get("optimiser", "auto")
     is_forward = mode == "forward" or (mode == "auto" and differentiates_forward(size))
-    if name == "auto":
+    if name == "auto" and resample:
+        name = "adam"
+    elif name == "auto":
         name = "sqp" if is_forward else "lbfgs"
-        if resample:
-            name = "adam"
     if name == "sqp" and mode == "reverse":
         remedy = "Reverse mode has no Gauss-Newton matrix: take solver=ij.tuning.LBFGS()."
         raise checks.fail("mode", mode, '"forward" with SQP', remedy)

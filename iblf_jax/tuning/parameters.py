@@ -1,12 +1,11 @@
 """Which leaves are tuned, within which limits, and in which coordinates.
 
-A tuned number x lives in a coordinate z in which the loss is better shaped: z = log x for a gain
-that is positive, z = x otherwise.  Limits on x are limits on z; the "newton" method keeps to them
-as a box.  The methods of optax know no limits, so they work on a free w that is squashed into the
-box,
+A tuned number x has a coordinate z in which the loss is better conditioned: z = log x for a gain
+that is positive, z = x otherwise.  Limits on x are limits on z, which are the box of SQP.  The
+solvers of optax have no bounds, so they use an unbounded w that is squashed into the box,
 
-    z = z_low + (z_high - z_low) sigmoid(w)      both limits,      z = z_low + softplus(w)   or
-    z_high - softplus(w)      one.
+    z = z_low + (z_high - z_low) sigmoid(w)                      with two limits,
+    z = z_low + softplus(w)   or   z = z_high - softplus(w)      with one limit.
 
 Default limits are those of `ranges`.
 """
@@ -29,7 +28,7 @@ from iblf_jax.studies.draws import check_paths
 from iblf_jax.tuning.ranges import GIVEN, default_highs, default_low
 
 EDGE = 1e-3
-"""Distance from a limit, relative to the box, from which a squashed coordinate starts at least."""
+"""Smallest distance of the start of a squashed coordinate from a limit, relative to the box."""
 
 
 class Tunable(NamedTuple):
@@ -57,13 +56,13 @@ class Block(NamedTuple):
 )
 @dataclasses.dataclass(frozen=True, eq=False)
 class Box:
-    """Where tuning starts and how far it may go, in the coordinates z, (p,) each."""
+    """Start and range of a tuning, in the coordinates z, (p,) each."""
 
     z: np.ndarray
     low: np.ndarray
     high: np.ndarray
     reasons: tuple[tuple[str, str], ...] = ()
-    """What set the lower and the upper end of each coordinate, in words."""
+    """Why the lower and the upper end of each coordinate are there, in words."""
 
 
 def _own_limit(path: str, side: str, value: Any) -> jax.Array | None:
@@ -143,52 +142,52 @@ def layout(
         admissible.
     """
     given = checks.listed("parameters", parameters, '["controller.k1", "controller.K2"]')
-    wanted = [_as_tunable(i, x) for i, x in enumerate(given)]
-    check_paths(scenario, [x.path for x in wanted], "parameters")
-    starts = [_start_of(scenario, item) for item in wanted]
-    open_ended = {
-        item.path: value
-        for item, (value, _, _) in zip(wanted, starts, strict=True)
-        if item.high is None
-    }
-    highs = default_highs(scenario, open_ended, dt, method)
-    blocks, parts, reasons, start = [], [], [], 0
-    for item, (value, log, sign) in zip(wanted, starts, strict=True):
-        low, below = default_low(item.path, sign, value) if item.low is None else (item.low, GIVEN)
+    tunables = [_as_tunable(i, x) for i, x in enumerate(given)]
+    check_paths(scenario, [x.path for x in tunables], "parameters")
+    starts = {item.path: _start_of(scenario, item) for item in tunables}
+    without_end = {item.path: starts[item.path][0] for item in tunables if item.high is None}
+    highs = default_highs(scenario, without_end, dt, method)
+    blocks = []
+    parts = []
+    reasons: list[tuple[str, str]] = []
+    for item in tunables:
+        value, log, sign = starts[item.path]
+        low, below = item.low, GIVEN
+        if low is None:
+            low, below = default_low(item.path, sign, value)
         high, above = highs.get(item.path, (item.high, GIVEN))
-        block, part = _one(
-            item,
-            value,
-            _limit(item, "low", low, value),
-            _limit(item, "high", high, value),
-            start,
-            log,
-        )
+        limits = _limit(item, "low", low, value), _limit(item, "high", high, value)
+        block, part = _block(item, value, *limits, start=len(reasons), log=log)
         blocks.append(block)
         parts.append(part)
         reasons += [(below, above)] * block.size
-        start += block.size
     z, lowest, highest = (np.concatenate(x) for x in zip(*parts, strict=True))
     return tuple(blocks), Box(z, lowest, highest, tuple(reasons))
 
 
 def _start_of(scenario: Scenario, item: Tunable) -> tuple[np.ndarray, bool, str | None]:
-    """Where a leaf starts, whether its coordinate is a logarithm, and what sign it has to have."""
+    """Value of a leaf at the start, whether its coordinate is a logarithm, and the sign that it
+    must have.
+    """
     value = np.asarray(paths.get(scenario, item.path), float)
     sign = paths.sign_at(scenario, item.path)
-    log = item.scale == "log" if item.scale else sign == "positive"
+    log = sign == "positive"
+    if item.scale:
+        log = item.scale == "log"
     if log and not np.all(value > 0):
         raise checks.fail(
             item.path, value, "values > 0 for a logarithmic scale", 'Use scale="linear".'
         )
     if item.tied and not np.all(value == value.flat[0]):
-        value = np.full_like(value, np.exp(np.mean(np.log(value))) if log else np.mean(value))
+        common = np.exp(np.mean(np.log(value))) if log else np.mean(value)
+        value = np.full_like(value, common)
     return value, log, sign
 
 
-def _one(
-    item: Tunable, value: np.ndarray, low: np.ndarray, high: np.ndarray, start: int, log: bool
+def _block(
+    item: Tunable, value: np.ndarray, low: np.ndarray, high: np.ndarray, *, start: int, log: bool
 ) -> tuple[Block, tuple]:
+    """A leaf's share of the coordinates, and its start, lower and upper end in them."""
     size = 1 if item.tied else value.size
     if not np.all(low < high) or not np.all((low <= value) & (value <= high)):
         raise checks.fail(
@@ -221,10 +220,12 @@ def values_at(blocks: tuple[Block, ...], z: Any) -> dict[str, jax.Array]:
     values = {}
     for block in blocks:
         part = z[block.start : block.start + block.size]
-        part = jnp.exp(part) if block.log else part
-        values[block.path] = (
-            jnp.broadcast_to(part[0], block.shape) if block.size == 1 else part.reshape(block.shape)
-        )
+        if block.log:
+            part = jnp.exp(part)
+        if block.size == 1:
+            values[block.path] = jnp.broadcast_to(part[0], block.shape)
+        else:
+            values[block.path] = part.reshape(block.shape)
     return values
 
 
@@ -235,12 +236,12 @@ def in_units(blocks: tuple[Block, ...], z: np.ndarray) -> np.ndarray:
 
 
 def names_of(blocks: tuple[Block, ...]) -> list[str]:
-    """What each coordinate is called: "controller.K2[0]", or the path alone if it is tied or has
-    one entry.
+    """The name of each coordinate: "controller.K2[0]", or the path if it is tied or has one
+    entry.
     """
     names = []
     for block in blocks:
-        indices = list(np.ndindex(block.shape)) if block.size > 1 else [()]
+        indices = np.ndindex(block.shape) if block.size > 1 else [()]
         names += [block.path + "".join(f"[{i}]" for i in index) for index in indices]
     return names
 

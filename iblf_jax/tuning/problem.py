@@ -38,7 +38,7 @@ from iblf_jax.tuning.objectives import (
 from iblf_jax.tuning.parameters import Block, Box, Tunable, layout, values_at
 from iblf_jax.tuning.ranges import sampled_too_slowly
 from iblf_jax.tuning.robust import Risk, as_risk
-from iblf_jax.tuning.runs import BACKENDS, Mechanism, known_of, values_together
+from iblf_jax.tuning.runs import RunRequest, check_backend, values_together
 from iblf_jax.tuning.solvers import Constraints, SearchSpace, Solver
 
 FIRST_PENALTY = 10.0
@@ -49,8 +49,8 @@ minima.  Of three problems of six gains, one became 4 % better by the search fro
 the others were as good without."""
 
 STATIC = (
-    *("blocks", "targets", "runs", "steps", "method", "backend", "risk", "allowed"),
-    *("piece_counts", "mechanism", "on_front", "requirements_in_loss", "nested"),
+    *("blocks", "targets", "runs", "request", "risk", "allowed"),
+    *("piece_counts", "on_front", "requirements_in_loss"),
 )
 TRACED = ("cases", "objective", "dt", "box", "perturbations", "seed")
 
@@ -78,25 +78,17 @@ class TuningProblem:
     """The perturbed leaves."""
     runs: int
     """Number B of perturbed runs."""
-    steps: int
-    """Of a run."""
-    method: str
-    """Integrator."""
-    backend: str
-    """On what values and forward mode are executed; reverse mode always uses plain XLA."""
+    request: RunRequest
+    """Of the engine: steps, integrator, backend."""
     risk: Risk
     allowed: tuple[float, ...]
     """Share of the runs that may violate each requirement."""
     piece_counts: tuple[int, ...]
     """Number of pieces of each quantity, the margin's last."""
-    mechanism: Mechanism | None
-    """What of the robots is compiled in."""
     on_front: bool = False
     """Whether the terms are objectives of a front, with weights and levels of each start."""
     requirements_in_loss: bool = False
     """Whether the loss is the augmented Lagrangian, for solvers without constraints."""
-    nested: bool = False
-    """Whether a loop of JAX surrounds the evaluations."""
 
     @staticmethod
     def build(
@@ -121,22 +113,20 @@ class TuningProblem:
           ValueError: an argument that is not valid; the message names it and the remedy.
         """
         tableau(method)
-        checks.one_of("backend", backend, BACKENDS)
+        check_backend(backend)
         steps = checks.whole_steps(duration, dt)
         goal = checked(objective)
-        risk = as_risk(risk)
         seed = checks.seed(seed)
         runs = checks.positive_integer("runs", runs, most=MOST_RUNS)
         scenario = canonical(scenario)
         check_step(scenario, float(dt))
-        perturbations = {} if perturbations is None else perturbations
+        if perturbations is None:
+            perturbations = {}
         targets, by_path = targets_of(scenario, perturbations)
         _check_runs(runs, bool(targets) or has_noise(scenario))
         blocks, box = layout(scenario, parameters, float(dt), method)
         checks.fits("runs", runs, 8.0 * (1 + len(box.z)) * NUMBERS_A_RUN)
-        goal = for_scenario(goal, scenario)
-        check_signals(goal, scenario)
-        fit_joints(goal, scenario.n, "objective")
+        goal = _fitted(goal, scenario)
         # Terms without a scale are evaluated once with scale 1, for their values at the start.
         dtype = scenario.initial.q.dtype
         arrays = complete(goal, np.ones(len(goal.terms))), by_path, dt
@@ -151,13 +141,10 @@ class TuningProblem:
             blocks=blocks,
             targets=targets,
             runs=runs,
-            steps=steps,
-            method=method,
-            backend=backend,
-            risk=risk,
+            request=RunRequest.of(scenario, steps=steps, method=method, backend=backend),
+            risk=as_risk(risk),
             allowed=tuple(float(r.allowed) for r in goal.requirements),
             piece_counts=piece_counts(scaled, scenario, float(duration)),
-            mechanism=known_of(scenario),
             on_front=on_front,
         )
         if is_complete(goal):
@@ -174,7 +161,7 @@ class TuningProblem:
         return dataclasses.replace(
             self,
             requirements_in_loss=not solver.handles_requirements,
-            nested=solver.traces_evaluation,
+            request=self.request._replace(nested=solver.traces_evaluation),
         )
 
     # -------------------------------------------------------------------------------- properties
@@ -255,7 +242,9 @@ class TuningProblem:
           trusted: share of the runs that can be integrated, at the best of these gains.
         """
         count = round(trusted * self.runs)
-        how_many = f"only {count} of {self.runs} runs" if count else "no run"
+        how_many = "no run"
+        if count:
+            how_many = f"only {count} of {self.runs} runs"
         remedy = (
             f"Take dt={self.suggested_dt():g}, not {float(self.dt):g} s (ij.recommended_dt), lower"
             " gains, or narrower perturbations."
@@ -267,11 +256,19 @@ class TuningProblem:
         """The largest stable time step, found by simulation [s]."""
         return recommended_dt(
             self.scenario,
-            duration=self.steps * float(self.dt),
-            method=self.method,
+            duration=self.request.steps * float(self.dt),
+            method=self.request.method,
             perturbations=self.perturbations or None,
             seed=int(self.seed),
         )
+
+
+def _fitted(objective: Objective, scenario: Scenario) -> Objective:
+    """The objective for the joints and signals of a scenario."""
+    fitted = for_scenario(objective, scenario)
+    check_signals(fitted, scenario)
+    fit_joints(fitted, scenario.n, "objective")
+    return fitted
 
 
 def _check_runs(runs: int, differ: bool) -> None:

@@ -1,25 +1,26 @@
 """What objectives and requirements are made of: smooth numbers of a run, each a fold over its
 samples.
 
-Two kinds cover what gains are tuned for, over a signal y(t), a vector:
+Two kinds suffice for most objectives, over a signal y(t), a vector:
 
-    TimeIntegral   int |y|^2 dt = sum_k dt_k |y(t_k)|^2, by the weights of the samples (`Sample.dt`:
-    the trapezoidal rule) Peak           max_j p_j,   p_j the largest y_i(t_k) of one entry i of the
-    signal within one window of time
+    TimeIntegral   int |y|^2 dt = sum_k dt_k |y(t_k)|^2, with the weights of the samples
+                   (`Sample.dt`: the trapezoidal rule)
+    Peak           max_j p_j, where p_j is the largest y_i(t_k) of one entry i of the signal within
+                   one window of time
 
 The pieces p_j are smooth where their maximum is not: a requirement on a peak is one on each of its
-  pieces.  In a term of the objective
-the maximum is T log sum_j exp(p_j / T), which is smooth and never below it.
+pieces.  In a term of the objective the maximum is T log sum_j exp(p_j / T), which is smooth and
+never below the maximum.
 
-Both also give the matrix of their second derivatives without the second derivatives of the motion
-(Gauss-Newton), from the tangents y_u of their signal (`derivatives.Outer`) or p_ju of their pieces:
+Both also provide the matrix of their second derivatives without the second derivatives of the
+motion (Gauss-Newton), from the tangents y_u of their signal (`Outer`) or p_ju of their pieces:
 
-    TimeIntegral   2 sum dt y_u . y_v         Peak   (sum_j w_j p_ju p_jv - mean_u mean_v) / T,  w
-    the weights of the smooth maximum
+    TimeIntegral   2 sum dt y_u . y_v
+    Peak           (sum_j w_j p_ju p_jv - mean_u mean_v) / T,  w the weights of the smooth maximum
 
-`MetricResult` is a result of any metric's fold.  A quantity of one's own needs `init`, `update`,
-`finish`; for second-order methods `hessian`, and `curvature` if that is made of tangents along the
-way; `iblf_jax.testing.check_objective` looks at it.
+`MetricResult` is a result of any metric's fold.  A user's own quantity needs `init`, `update`,
+`finish`; for second-order methods `hessian`, and `curvature` if the matrix is made of tangents
+along the run; `iblf_jax.testing.check_objective` checks it.
 """
 
 from __future__ import annotations
@@ -38,13 +39,13 @@ from iblf_jax.simulation.signals import Sample
 from iblf_jax.tuning.runs import Outer
 
 FAR = 1e6
-"""Where a peak starts, below everything; in units of its scale."""
+"""Minus the initial value of a peak, in units of its scale."""
 SOFT_EDGE = 0.1
 """Width of the soft edge of a tolerance, as a part of it."""
 
 
 class Quantity(Protocol):
-    """What the package asks of a quantity: a component with these methods."""
+    """The contract of a quantity: a component with these methods."""
 
     def init(self, sample: Sample) -> Any:
         """The accumulator before the first sample."""
@@ -62,18 +63,18 @@ class Quantity(Protocol):
 
 
 DEFICITS = {"deficit": "rad", "velocity_deficit": "rad/s", "region_deficit": "m"}
-"""Signals of which the largest is minus a margin -> unit: they have a sign, so their size does not
-count."""
+"""Signals of which the largest is minus a margin -> unit; their sign counts, not their absolute
+value."""
 OF_LIMIT = "of the limit"
 """Unit of a peak that is measured in limits, one for each joint."""
 TUNED_SIGNALS = {"error": "rad", "torque": "N m", "torque_rate": "N m/s", "outside": "1"} | DEFICITS
 """Signal -> unit."""
 NEEDS = {"velocity_deficit": "dq_lower", "region_deficit": "region_margin"}
-"""Signal -> the optional one of the run that it is made of."""
+"""Signal -> the optional signal of the run that it is computed from."""
 
 
 def chosen_of(values: jax.Array, joints: Selection, field: str) -> jax.Array:
-    """The entries (k,) of the joints that are selected, from one number for each joint, (n,)."""
+    """The entries (k,) of the selected joints, from one number for each joint, (n,)."""
     if joints is None:
         return values
     names = tuple(f"joint {i}" for i in range(values.shape[-1]))
@@ -98,8 +99,8 @@ def weights_of(weights: jax.Array, joints: Selection, n: int, field: str) -> jax
 
 
 def _check_choice(owner: str, joints: Selection, weights: Any) -> None:
-    """Raises ValueError for a selection that is not normalised, or weights that are no list of
-    numbers.
+    """Raises ValueError for a selection that is not normalised, or weights of more dimensions than
+    one.
     """
     if joints is not None and (
         not isinstance(joints, tuple) or selection(f"{owner}.joints", joints) != joints
@@ -114,11 +115,16 @@ def signal_of(
 ) -> jax.Array:
     """A signal of the selected joints at one sample, (k,), (2 k,) or one number a region.
 
-    error e1; torque tau; torque_rate (tau - last tau) / step, the mean over the step before an
-    instant, jumps of the torque included; outside sqrt(sigmoid((|e1| - tolerance) / (SOFT_EDGE
-    tolerance))), whose integral of squares is the time outside the tolerance; deficit (lower - q, q
-    - upper), the largest of which is minus the margin; velocity_deficit the same of the velocities;
-      region_deficit minus the distances to the walls of the regions.
+    | Name | Signal |
+    |---|---|
+    | error | e1 |
+    | torque | tau |
+    | torque_rate | (tau - last tau) / step, the mean over the last step, jumps included |
+    | outside | sqrt(sigmoid((abs(e1) - tolerance) / (SOFT_EDGE tolerance))); the integral of its
+      square is the time outside the tolerance |
+    | deficit | (lower - q, q - upper), the largest of which is minus the margin |
+    | velocity_deficit | the same of the velocities |
+    | region_deficit | minus the distances to the boundaries of the regions |
     """
 
     def of_joints(values: jax.Array) -> jax.Array:
@@ -140,13 +146,14 @@ def signal_of(
     if name == "region_deficit":
         return -sample.region_margin
     if name == "velocity_deficit":
-        slow, fast = of_joints(sample.dq_lower - sample.dq), of_joints(sample.dq - sample.dq_upper)
-        return jnp.concatenate([slow, fast])
+        below = of_joints(sample.dq_lower - sample.dq)
+        above = of_joints(sample.dq - sample.dq_upper)
+        return jnp.concatenate([below, above])
     return jnp.concatenate([of_joints(sample.lower - sample.q), of_joints(sample.q - sample.upper)])
 
 
 def _last_torque(acc, sample: Sample) -> jax.Array:
-    """The torque of the last instant: a sample beside a jump is none."""
+    """The torque of the last instant; a second sample at a jump is not an instant of its own."""
     return jnp.where((sample.step > 0) | (sample.t <= 0), sample.tau, acc[1])
 
 
@@ -189,8 +196,8 @@ class TimeIntegral:
         """Weight of a sample, () [s]."""
         if self.signal == "torque_rate":
             return sample.step  # the difference quotient holds for all of the step before
-        # Half of the time since the sample before is in the weight.  Where counting begins within
-        # that time, what is left of it counts.
+        # The weight contains half of the time since the last sample.  Where counting begins within
+        # that time, only the rest of it counts.
         before = acc[2]
         left = jnp.maximum(sample.t - self.after, 0.0)
         return jnp.where(
@@ -198,7 +205,7 @@ class TimeIntegral:
         )
 
     def init(self, sample: Sample):
-        """Zero; the first torque has no predecessor but itself."""
+        """Zero; the predecessor of the first torque is the torque itself."""
         return jnp.zeros_like(sample.t), sample.tau, sample.t
 
     def update(self, acc, sample: Sample):
@@ -280,21 +287,25 @@ class Peak:
 
     def _at(self, acc, sample: Sample) -> jax.Array:
         y = signal_of(self.signal, sample, acc[1], None, self.joints)
-        count = y.size if self.signal == "region_deficit" else sample.q.size
+        one_side = self.signal == "region_deficit"
+        count = y.size if one_side else sample.q.size
         weights = weights_of(self.weights, self.joints, count, "Peak.weights")
         if self.signal not in DEFICITS:
             y = weights * y
             y = jnp.concatenate([y, -y])
-        elif jnp.ndim(weights) == 1:  # margins have no weights but limits of their own
-            one_side = self.signal == "region_deficit"
-            y = y * (weights if one_side else jnp.concatenate([weights, weights]))
+        elif jnp.ndim(weights) == 1:  # margins have no weights, but a limit for each joint
+            if not one_side:
+                weights = jnp.concatenate([weights, weights])
+            y = y * weights
         return jnp.where(sample.t >= self.after * (1 - 1e-6), y / self.scale, -FAR)
 
     def init(self, sample: Sample):
-        """Below everything, (W, 2 k) for k joints, or (W, m) for m regions; the first torque has no
-        predecessor but itself.
+        """Far below zero, (W, 2 k) for k joints, or (W, m) for m regions; the predecessor of the
+        first torque is the torque itself.
         """
-        count = 1 if self.windows is None else 1 + self.windows.size
+        count = 1
+        if self.windows is not None:
+            count += self.windows.size
         return jnp.full((count, self._entries(sample)), -FAR, sample.t.dtype), sample.tau
 
     def _entries(self, sample: Sample) -> int:
@@ -333,7 +344,7 @@ class Peak:
 class MetricResult:
     """sum_i w_i m_i of a named result m of a metric's fold; m is one number or one a joint.
 
-    It offers no matrix of second derivatives: `tune` learns that from the gradients along the way.
+    It has no matrix of second derivatives: `tune` estimates that from changes of the gradient.
 
     Args:
       fold: the metric, any `iblf_jax.metrics.Fold`.
@@ -353,7 +364,7 @@ class MetricResult:
             "MetricResult.fold",
             self.fold,
             Fold,
-            "iblf_jax.metrics has them; iblf_jax.testing.check_fold looks at your own.",
+            "iblf_jax.metrics has them; iblf_jax.testing.check_fold checks your own.",
         )
         checks.one_of("MetricResult.name", self.name, tuple(self.fold.units))
         if self.joints is not None:
@@ -402,11 +413,9 @@ class MetricResult:
                 expected,
                 f"Its shape is {jnp.shape(self.weights)}.",
             )
-        return (
-            self.weights
-            if self.joints is None
-            else weights_of(self.weights, self.joints, shape[0], "MetricResult.weights")
-        )
+        if self.joints is None:
+            return self.weights
+        return weights_of(self.weights, self.joints, shape[0], "MetricResult.weights")
 
 
 MEMBERS = {"integral": TimeIntegral, "peak": Peak, "metric_result": MetricResult}
@@ -426,8 +435,8 @@ class Quantities:
 
     @property
     def curvatures(self) -> int:
-        """How many `Outer` there are."""
-        return sum(hasattr(part, "curvature") for part in self.parts)
+        """Number of `Outer`."""
+        return sum(_has_curvature(part) for part in self.parts)
 
     def init(self, sample: Sample):
         """The quantities' accumulators."""
@@ -438,7 +447,7 @@ class Quantities:
         return tuple(part.update(a, sample) for part, a in zip(self.parts, acc, strict=True))
 
     def finish(self, acc) -> dict[str, jax.Array]:
-        """Smooth values and exact values, (K,) each, and the pieces of all, one quantity after the
+        """Smooth values and exact values, (K,) each, and all pieces, one quantity after the
         other.
         """
         found = [part.finish(a) for part, a in zip(self.parts, acc, strict=True)]
@@ -450,7 +459,7 @@ class Quantities:
         }
 
     def counts(self, sample: Sample) -> tuple[int, ...]:
-        """How many pieces each quantity has, for samples such as this one; shapes are enough."""
+        """The number of pieces of each quantity, from the shapes of a sample."""
         return tuple(
             jax.eval_shape(lambda s, part=part: part.finish(part.init(s))[2], sample).size
             for part in self.parts
@@ -458,11 +467,8 @@ class Quantities:
 
     def curvature(self, acc, sample: Sample) -> tuple[Outer, ...]:
         """One `Outer` for each quantity that offers one."""
-        return tuple(
-            part.curvature(a, sample)
-            for part, a in zip(self.parts, acc, strict=True)
-            if hasattr(part, "curvature")
-        )
+        pairs = zip(self.parts, acc, strict=True)
+        return tuple(part.curvature(a, sample) for part, a in pairs if _has_curvature(part))
 
     def hessians(
         self,
@@ -470,12 +476,26 @@ class Quantities:
         pieces: Sequence[jax.Array],
         slopes: Sequence[jax.Array],
     ) -> jax.Array:
-        """Gauss-Newton matrix of each quantity, (K, D, D), from the products (D, D) of those that
-        have a `curvature`, its pieces (m,) and their slopes (D, m); zero where it offers none.
+        """Gauss-Newton matrix of each quantity, (K, D, D); zero where it has none.
+
+        Args:
+          products: (D, D), of the quantities that have a `curvature`.
+          pieces: of each quantity, (m,).
+          slopes: their gradients, (D, m).
         """
-        left, none = iter(products), jnp.zeros((slopes[0].shape[0],) * 2, slopes[0].dtype)
+        remaining = iter(products)
+        size = slopes[0].shape[0]
+        none = jnp.zeros((size, size), slopes[0].dtype)
         found = []
         for part, own, slope in zip(self.parts, pieces, slopes, strict=True):
-            product = next(left) if hasattr(part, "curvature") else none
-            found.append(part.hessian(product, own, slope) if hasattr(part, "hessian") else none)
+            product = next(remaining) if _has_curvature(part) else none
+            matrix = none
+            if hasattr(part, "hessian"):
+                matrix = part.hessian(product, own, slope)
+            found.append(matrix)
         return jnp.stack(found)
+
+
+def _has_curvature(part: Any) -> bool:
+    """Whether a quantity has the optional method of the contract."""
+    return hasattr(part, "curvature")

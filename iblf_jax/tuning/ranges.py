@@ -1,22 +1,21 @@
-"""Default ranges of what is tuned: within the conditions of Theorem 2, and within what step, period
-and drive can bear.
+"""Default ranges of what is tuned: within the conditions of Theorem 2, and within the capabilities
+of time step, sampling period and drive.
 
-Below, k1 > 0, K2 > 1/2, kf > 1, for a leaf whose entries all start there, else its sign.  Above, a
-gain x may grow to f x0, f <= MOST, while the loop at the start and along its reference keeps
+The lower end of a leaf is k1 > 0, K2 > 1/2 or kf > 1 where all its entries start there, otherwise
+its sign decides.  The upper end of a gain x is f x0 with the largest f <= MOST for which the loop
+at the start and along its reference satisfies
 
-    dt |lambda|_max <= SHARE * (the integrator's stability range)                  where the law
-    runs all the time, rho(map from a period to the next) < 1
-    where it is sampled, the drive, at rest, can give each torque of |d tau / d y_j| r_j  and
-    (sum_kj (d tau / d w_kj)^2)^(1/2)      where there is a sensor:
+    dt |lambda|_max <= SHARE * (the integrator's stability range)     for a continuous law,
+    rho(map from a period to the next) < 1                            for a sampled law,
 
-one count r_j of a joint's encoder, and one standard deviation of all its noise w, are steps of the
-command that no motion asked for; where one alone asks a drive for more torque, or a higher rate of
-it (bandwidth times the step, behind a lag), than it has, what is tracked is the encoder.  A drive
-of which the starting gains already ask as much sets no limit.
+and, where there is a sensor, the drive at rest can deliver each torque of |d tau / d y_j| r_j and
+(sum_kj (d tau / d w_kj)^2)^(1/2).  One count r_j of a joint's encoder, and one standard deviation
+of all its noise w, are steps of the command that the motion does not need.  Where such a step alone
+exceeds the torque of a drive, or its rate (bandwidth times the step, behind a lag), the drive
+tracks the encoder.  A drive that the starting gains already exceed sets no limit.
 
-Each gain is looked at alone first, the others at their start.  Then all that have default ranges
-are moved together, each to f_i^s x0: s is the largest number up to 1 with which the same still
-holds.
+First each gain is examined with the others at their start.  Then all gains with default ranges are
+scaled together, each to f_i^s x0, with the largest s up to 1 for which the same conditions hold.
 """
 
 from __future__ import annotations
@@ -40,15 +39,14 @@ CONDITIONS = {"controller.k1": 0.05, "controller.K2": 0.505, "observer.kf": 1.01
 """Default lower limits: just inside Theorem 2's conditions (3.17), (3.25) on the gains of the
 paper's law."""
 SHARE = 0.7
-"""Part of the integrator's stability range that gains may use up by default."""
+"""Part of the integrator's stability range that gains may use by default."""
 TIMES = np.linspace(0.0, 6.0, 7)
-"""Along the reference, where is looked for how fast a loop is, and what it makes of a count [s]."""
+"""Along the reference, at which the loop is examined [s]."""
 MOST = 1e2
-"""How far above its start a gain may go by default, as a factor, where nothing else sets a
-limit."""
+"""Largest upper end of a gain by default, relative to its start."""
 HALVINGS = 10
 ROOM = 1.01
-"""Where the start itself is too much, the range ends so far above it, as a factor."""
+"""Upper end of a gain, relative to its start, where already the start violates a condition."""
 GIVEN, THEOREM, SIGN, NONE = "as given", "the conditions of Theorem 2", "its sign", "none"
 FACTOR = f"{MOST:g} times its start"
 STEP, PERIOD = (
@@ -56,33 +54,35 @@ STEP, PERIOD = (
     "beyond it the loop is unstable at its sampling period",
 )
 COUNT = (
-    "beyond it a count of the encoder asks for more torque, or a higher rate of it, than the drive"
-    " gives"
+    "beyond it one count of the encoder commands more torque, or a higher rate of it, than the"
+    " drive can deliver"
 )
 NOISE = (
-    "beyond it the sensor's noise asks for more torque, or a higher rate of it, than the drive"
-    " gives"
+    "beyond it the sensor's noise commands more torque, or a higher rate of it, than the drive can"
+    " deliver"
 )
 TOGETHER = ", with all gains at their upper ends"
 
 
 def default_low(path: str, sign: str | None, start: np.ndarray) -> tuple[float, str]:
-    """The lower end of the range of a leaf that starts at `start`, and what set it."""
+    """The lower end of the range of a leaf that starts at `start`, and why it is there."""
     leaf = re.sub(r"(\[\d+\])+$", "", path)
     if leaf in CONDITIONS and np.all(start >= CONDITIONS[leaf]):
         return CONDITIONS[leaf], THEOREM
-    return (0.0, SIGN) if sign in ("positive", "nonnegative") else (-np.inf, NONE)
+    if sign in ("positive", "nonnegative"):
+        return 0.0, SIGN
+    return -np.inf, NONE
 
 
 def default_highs(
     scenario: Scenario, values: dict[str, np.ndarray], dt: float, method: str
 ) -> dict[str, tuple[np.ndarray, str]]:
-    """The upper ends of the ranges of some leaves, and what set each.
+    """The upper ends of the ranges of some leaves, and why they are there.
 
     Args:
       scenario: canonical.
-      values: path -> where the leaf starts.
-      dt, method: how runs are stepped.
+      values: path -> start of the leaf.
+      dt, method: time step [s] and integrator of the runs.
     """
     gains = {
         path: x
@@ -92,53 +92,64 @@ def default_highs(
     ends: dict[str, tuple[np.ndarray, str]] = {
         path: (np.full(x.shape, np.inf), NONE) for path, x in values.items() if path not in gains
     }
-    by_drive = not too_much_for_drive(scenario)
+    limited_by_drive = not drive_exceeded(scenario)
 
-    def unfit(scaled: dict[str, float]) -> str:
-        changed = with_parameters(
-            scenario, {path: jnp.asarray(gains[path] * np.exp(x)) for path, x in scaled.items()}
-        )
+    def violated(logarithms: dict[str, float]) -> str:
+        """What is violated with gains scaled by exp(x); empty where nothing is."""
+        scaled = {path: jnp.asarray(gains[path] * np.exp(x)) for path, x in logarithms.items()}
+        changed = with_parameters(scenario, scaled)
         if changed.sampling is None:
             fits = dt * fastest_along(changed, TIMES) <= SHARE * tableau(method).stability
             return "" if fits else STEP
-        return (
-            PERIOD
-            if sampled_too_slowly(changed)
-            else too_much_for_drive(changed)
-            if by_drive
-            else ""
-        )
+        if sampled_too_slowly(changed):
+            return PERIOD
+        return drive_exceeded(changed) if limited_by_drive else ""
 
-    def one(path: str, share: float) -> str:
-        return unfit({path: share * float(np.log(MOST))})
+    def by_one(path: str, share: float) -> str:
+        return violated({path: share * float(np.log(MOST))})
 
-    reach, why = {}, {}
+    def by_all(share: float) -> str:
+        return violated({path: share * x for path, x in reach.items()})
+
+    reach: dict[str, float] = {}
+    why: dict[str, str] = {}
     for path in gains:
-        share, reason = _longest(partial(one, path))
-        reach[path], why[path] = share * np.log(MOST), reason or FACTOR
-    share, reason = (
-        _longest(lambda s: unfit({path: s * x for path, x in reach.items()}))
-        if len(gains) > 1
-        else (1.0, "")
-    )
+        share, reason = _largest_share(partial(by_one, path))
+        reach[path] = share * float(np.log(MOST))
+        why[path] = reason or FACTOR
+    share, reason = 1.0, ""
+    if len(gains) > 1:
+        share, reason = _largest_share(by_all)
     for path, x in gains.items():
-        shortened = reason and reach[path] > 0
-        factor = np.exp(share * reach[path]) if reach[path] > 0 else 1.0
-        ends[path] = max(factor, ROOM) * x, reason + TOGETHER if shortened else why[path]
+        factor = ROOM
+        if reach[path] > 0:
+            factor = max(np.exp(share * reach[path]), ROOM)
+            if reason:
+                why[path] = reason + TOGETHER
+        ends[path] = factor * x, why[path]
     return ends
 
 
-def _longest(unfit: Callable[[float], str]) -> tuple[float, str]:
-    """The largest share s up to 1 that is fit, 0 if none is found, and what is wrong beyond it."""
-    if not (reason := unfit(1.0)):
+def _largest_share(violated: Callable[[float], str]) -> tuple[float, str]:
+    """The largest share s up to 1 for which nothing is violated, 0 if there is none, and what is
+    violated beyond it.
+    """
+    reason = violated(1.0)
+    if not reason:
         return 1.0, ""
-    if first := unfit(0.0):
-        return 0.0, first
-    low, high = 0.0, 1.0
+    at_start = violated(0.0)
+    if at_start:
+        return 0.0, at_start
+    low = 0.0
+    high = 1.0
     for _ in range(HALVINGS):
         middle = 0.5 * (low + high)
-        found = unfit(middle)
-        low, high, reason = (low, middle, found) if found else (middle, high, reason)
+        found = violated(middle)
+        if found:
+            high = middle
+            reason = found
+        else:
+            low = middle
     return low, reason
 
 
@@ -148,34 +159,33 @@ def sampled_too_slowly(scenario: Scenario) -> bool:
     return sampling is not None and not radius_at(scenario, float(sampling.period), TIMES) < 1.0
 
 
-def too_much_for_drive(scenario: Scenario) -> str:
-    """What of the sensor, a count or its noise, asks for more than the actuator gives from rest;
-    empty where nothing does.
+def drive_exceeded(scenario: Scenario) -> str:
+    """Why the sensor, by a count or by its noise, commands more than the actuator can deliver from
+    rest; empty where it does not.
     """
-    if scenario.sampling is None or not hasattr(scenario.actuator, "unlimited"):
+    actuator = scenario.actuator
+    if scenario.sampling is None or not hasattr(actuator, "unlimited"):
         return ""
-    asked = _asked(scenario, jnp.asarray(TIMES, scenario.initial.q.dtype))
+    commands = _command_steps(scenario, jnp.asarray(TIMES, scenario.initial.q.dtype))
     zero = jnp.zeros_like(scenario.initial.q)
-    rest = scenario.actuator.init(zero)
-    for reason, torques in zip((COUNT, NOISE), asked, strict=True):
-        limited = jax.vmap(lambda tau: scenario.actuator.deliver(tau, zero, rest).limited)(
-            torques.reshape(-1, scenario.n)
-        )
-        if bool(jnp.any(limited)):
+    rest = actuator.init(zero)
+    deliver = jax.vmap(lambda tau: actuator.deliver(tau, zero, rest).limited)
+    for reason, torques in zip((COUNT, NOISE), commands, strict=True):
+        if bool(jnp.any(deliver(torques.reshape(-1, scenario.n)))):
             return reason
     return ""
 
 
 @jax.jit
-def _asked(scenario: Scenario, times: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _command_steps(scenario: Scenario, times: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Steps of the command by one count of each joint (T + 1, n, n), and the standard deviation by
     the noise (T + 1, n), [N m].
     """
     sensor = scenario.sensor
+    # A sensor without rounding or resolution has no counts.
     smooth = dataclasses.replace(scenario, sensor=getattr(sensor, "unrounded", sensor))
-    count = jnp.broadcast_to(
-        jnp.asarray(getattr(sensor, "resolution", 0.0), times.dtype), (scenario.n,)
-    )
+    resolution = jnp.asarray(getattr(sensor, "resolution", 0.0), times.dtype)
+    count = jnp.broadcast_to(resolution, (scenario.n,))
 
     def command(t: jax.Array, state: LoopState, q: jax.Array, normal: jax.Array) -> jax.Array:
         return run_sampled_law(smooth, t, state._replace(q=q), normal).sampled.commands[0]
@@ -185,6 +195,5 @@ def _asked(scenario: Scenario, times: jax.Array) -> tuple[jax.Array, jax.Array]:
         by_q, by_noise = jax.jacfwd(partial(command, t, state), argnums=(0, 1))(state.q, normal)
         return by_q.T * count[:, None], jnp.sqrt(jnp.sum(by_noise**2, axis=(1, 2)))
 
-    return jax.vmap(at)(
-        jnp.concatenate([jnp.zeros_like(times[:1]), times]), start_and_along(scenario, times)
-    )
+    from_start = jnp.concatenate([jnp.zeros_like(times[:1]), times])
+    return jax.vmap(at)(from_start, start_and_along(scenario, times))

@@ -1,18 +1,18 @@
-"""The verdict on a tuning: before and after, on runs that it never saw; on the one nominal run
-where nothing is perturbed.
+"""The report on a tuning: before and after, on fresh runs that it did not use; on the one nominal
+run where nothing is perturbed.
 
-Torque, and gains at the end of their range, are in it whatever the objective asked for: what tracks
-best without a price on torque asks for more than any actuator has.
+It contains torque, and gains at an end of their range, whatever the objective: the best tracking
+without a cost of torque needs more torque than any actuator has.
 
-Both gains are run on the same fresh draws, so that the change of every number is a mean of paired
-differences D_i with the interval
+The scenario is run with both gains on the same fresh draws, so that the change of every number is a
+mean of paired differences D_i with the interval
 
     mean(D) +- z std(D) / sqrt(N)
 
 (for CVaR, D_i is the difference of the influence functions v + max(L_i - v, 0) / (1 - level), v the
-quantile).  A change is called significant if that interval excludes zero, and not otherwise, in
-words.  A requirement is kept with probability: it passes if the upper Clopper-Pearson limit of its
-  breaking is within what is allowed, fails if the lower one is beyond, and is undecided between.
+quantile).  A change is called significant if that interval excludes zero.  A requirement is
+satisfied with a probability: it passes if the upper Clopper-Pearson limit of its violation is
+within what is allowed, fails if the lower limit is beyond, and is undecided otherwise.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.core import checks, devices
+from iblf_jax.core import checks
 from iblf_jax.core.status import Status
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Scenario, canonical
@@ -33,11 +33,11 @@ from iblf_jax.studies.draws import Cases, targets_of
 from iblf_jax.studies.recommended import tell_of_step
 from iblf_jax.studies.statistics import Probability, probability
 from iblf_jax.studies.study import VIOLATED
-from iblf_jax.tuning.evaluation import Rollouts, drawn, rollouts
+from iblf_jax.tuning.evaluation import drawn, rollouts
 from iblf_jax.tuning.objectives import Objective
 from iblf_jax.tuning.quantities import OF_LIMIT
 from iblf_jax.tuning.robust import Risk, worst_share
-from iblf_jax.tuning.runs import Run, fresh_together, known_of
+from iblf_jax.tuning.runs import RunRequest, fresh_together
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,16 +54,19 @@ class Change:
     @property
     def significant(self) -> bool | None:
         """Whether the interval excludes zero; None for a single run."""
-        return (
-            None if self.low is None or self.high is None else bool(self.low > 0 or self.high < 0)
-        )
+        if self.low is None or self.high is None:
+            return None
+        return bool(self.low > 0 or self.high < 0)
 
     def __str__(self) -> str:
-        part = f" ({(self.after / self.before - 1) * 100:+.1f} %)" if self.before else ""
-        text = f"{self.name}: {self.before:.5g} -> {self.after:.5g}{part}"
+        text = f"{self.name}: {self.before:.5g} -> {self.after:.5g}"
+        if self.before:
+            text += f" ({(self.after / self.before - 1) * 100:+.1f} %)"
         if self.low is None:
             return text
-        verdict = "significant" if self.significant else "NOT significant: the interval holds zero"
+        verdict = "NOT significant: the interval contains zero"
+        if self.significant:
+            verdict = "significant"
         return f"{text}; change {self.low:.3g} to {self.high:.3g}; {verdict}"
 
 
@@ -74,68 +77,70 @@ class Verdict:
     name: str
     allowed: float
     before: Probability
-    """How often it was broken."""
+    """Of a violation."""
     after: Probability
     verdict: str
     """"pass", "fail" or "undecided"."""
     value: float = float("nan")
-    """What is limited, after: the mean over the worst allowed share of the runs; a margin as a
-    margin."""
+    """Of the limited quantity, after: the mean over the worst allowed share of the runs; a margin
+    as a margin."""
     limit: float = float("nan")
     unit: str = ""
-    price: float | None = None
-    """By how much the objective of the tuning would fall if the limit were loosened by one unit;
-    None where that is not known."""
+    multiplier: float | None = None
+    """Decrease of the tuning's objective for each unit by which the limit is loosened; None where
+    it is not known."""
 
     def __str__(self) -> str:
         text = self._verdict()
         if np.isfinite(self.value):
-            text += self._of_limits() if self.unit == OF_LIMIT else self._of_units()
-        if self.price is not None and self.verdict != "fail" and self.price > 0:
-            text += self._price_in_words(self.price)
+            text += self._value_in_words()
+        if self.multiplier is not None and self.verdict != "fail" and self.multiplier > 0:
+            text += self._sensitivity(self.multiplier)
         return text
 
-    def _of_units(self) -> str:
+    def _value_in_words(self) -> str:
+        """The value; where each joint has a limit of its own, that of the worst joint relative to
+        its limit.
+        """
+        if self.unit == OF_LIMIT:
+            return f"; the worst joint is at {100 * self.value:.4g} % of its limit"
         text = f"; {self.value:.5g} {self.unit}"
         if self.verdict != "fail":
             return text
-        away = self.value - self.limit
-        return f"{text}, {abs(away):.3g} {self.unit} {'above' if away > 0 else 'below'} the limit"
+        side = "above" if self.value > self.limit else "below"
+        return f"{text}, {abs(self.value - self.limit):.3g} {self.unit} {side} the limit"
 
-    def _of_limits(self) -> str:
-        """Where each joint has a limit of its own, the value is that of the worst joint, in
-        limits.
-        """
-        return f"; the worst joint is at {100 * self.value:.4g} % of its limit"
-
-    def _price_in_words(self, price: float) -> str:
+    def _sensitivity(self, multiplier: float) -> str:
         if self.unit == OF_LIMIT:
             return (
-                f"; the objective would fall by {price / 100:.3g} for each percent that the limits"
-                " are loosened by"
+                f"; the objective would fall by {multiplier / 100:.3g} for each percent that the"
+                " limits are loosened by"
             )
         return (
-            f"; the objective would fall by {price:.3g} for each {self.unit} that the limit is"
+            f"; the objective would fall by {multiplier:.3g} for each {self.unit} that the limit is"
             " loosened by"
         )
 
     def _verdict(self) -> str:
         if self.after.runs == 1:
-            return (
-                f"{self.name}: {'broken' if self.before.count else 'kept'} ->"
-                f" {'broken' if self.after.count else 'kept'}: {self.verdict}"
-            )
+            words = ["broken" if x.count else "kept" for x in (self.before, self.after)]
+            return f"{self.name}: {' -> '.join(words)}: {self.verdict}"
         text = (
             f"{self.name} (broken by at most {self.allowed:g} of the runs):"
             f" {self.before.estimate:.4g} -> {self.after}: {self.verdict}"
         )
         if self.verdict == "undecided" and self.after.count == 0 and self.allowed > 0:
-            need = int(np.ceil(np.log((1 - self.after.confidence) / 2) / np.log1p(-self.allowed)))
-            text += (
-                f"; not one run broke it, but {need} such runs are needed to say so with"
-                f" {self.after.confidence:.0%} confidence"
-            )
+            text += self._needed_runs()
         return text
+
+    def _needed_runs(self) -> str:
+        """How many runs without a violation a pass needs."""
+        confidence = self.after.confidence
+        needed = int(np.ceil(np.log((1 - confidence) / 2) / np.log1p(-self.allowed)))
+        return (
+            f"; no run broke it, but {needed} such runs are needed to conclude that with"
+            f" {confidence:.0%} confidence"
+        )
 
 
 WORST_FIRST = ("fail", "undecided", "pass")
@@ -154,18 +159,17 @@ class TuningReport:
     """The objective first, then its terms."""
     verdicts: tuple[Verdict, ...]
     violation: tuple[Probability, Probability]
-    """How often a run left its bounds or ran away, before and after."""
+    """Of bounds: probability that a run leaves them or diverges, before and after."""
     margin: tuple[float, float]
     """The smallest margin of all runs, before and after [rad]."""
     peak_torque: tuple[tuple[float, ...], tuple[float, ...]] = ((), ())
     """The largest torque of all runs, joint by joint, before and after [N m]."""
     at_limits: tuple[str, ...] | None = None
-    """The tuned numbers that sit at an end of their range, in words; None where the ranges are not
-    known."""
+    """The tuned numbers at an end of their range, in words; None where the ranges are not known."""
     halved: str = ""
-    """What the nominal run with the tuned gains gives at dt / 2, in words."""
+    """The nominal run with the tuned gains at dt / 2, in words."""
     notes: tuple[str, ...] = ()
-    """How the search ended, and warnings."""
+    """Why the search ended, and warnings."""
 
     @property
     def passed(self) -> bool:
@@ -174,12 +178,12 @@ class TuningReport:
 
     @property
     def improved(self) -> bool:
-        """Whether the objective is lower, significantly so where there are runs to tell."""
+        """Whether the objective is lower, and significantly so where there are several runs."""
         first = self.changes[0]
         return first.after < first.before and first.significant is not False
 
     def __str__(self) -> str:
-        """What matters first: bounds, then requirements, then the objective, then the rest."""
+        """Bounds first, then requirements, the objective, and the rest."""
         sections = (
             self._of_bounds(),
             self._of_requirements(),
@@ -209,13 +213,13 @@ class TuningReport:
         return [f"requirement {verdict}" for verdict in ordered]
 
     def _of_objective(self) -> list[str]:
-        """The objective and its terms, and what their change is worth."""
-        whole = self.changes[0]
+        """The objective and its terms, and whether the change is significant."""
+        objective = self.changes[0]
         rows = [str(change) for change in self.changes]
-        if whole.significant is False:
+        if objective.significant is False:
             doubt = "these runs do not show that tuning helped."
             rows.append(f"The objective's change is not significant: {doubt}")
-        elif whole.after > whole.before:
+        elif objective.after > objective.before:
             rows.append("The objective went up.")
         return rows
 
@@ -231,7 +235,7 @@ class TuningReport:
     __repr__ = __str__
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything as plain numbers and strings."""
+        """Everything as numbers and strings."""
         out = dataclasses.asdict(self)
         out["changes"] = [
             {**dataclasses.asdict(c), "significant": c.significant} for c in self.changes
@@ -239,89 +243,191 @@ class TuningReport:
         return out
 
 
-APART = 0.01
-"""By how much the objective may differ at half the step before the report warns."""
+LARGEST_DIFFERENCE = 0.01
+"""Of the objective at half the step, relative, before the report warns."""
 
 
 class _Sample(NamedTuple):
-    """What a report needs of N runs with one set of gains."""
+    """The numbers of N runs with one set of gains that a report needs."""
 
     exact: np.ndarray
-    """Of each quantity of the objective, and minus the margin, (N, K + 1)."""
+    """Each quantity of the objective, and minus the margin, (N, K + 1)."""
     torque: np.ndarray
     """The largest of each joint, (N, n)."""
     status: np.ndarray
     made: np.ndarray
+    """Whether the run could be made: its draws were admissible, (N,)."""
 
     @property
     def margin(self) -> np.ndarray:
         """Of each run, (N,) [rad]."""
         return -self.exact[:, -1]
 
+    def left_bounds(self) -> np.ndarray:
+        """Whether each run left its bounds or diverged, (N,)."""
+        return self.status & int(VIOLATED) != 0
 
-def _run(
-    scenarios: Sequence[Scenario],
-    tuned: Sequence[str],
-    objective: Objective,
-    perturbations,
+
+class ReportCase(NamedTuple):
+    """What is reported on: a scenario before and after a tuning."""
+
+    before: Scenario
+    after: Scenario
+    tuned: tuple[str, ...]
+    """Paths of the tuned leaves."""
+    objective: Objective
+    """With scales and limits."""
+    perturbations: Any
+    """Path -> perturbation; one nominal run if empty."""
+    risk: Risk
+    duration: float
+    dt: float
+    method: str
+    backend: str = "auto"
+    batch: int = 1
+    """Runs in a batch of the search's values, whose compiled program is used again."""
+
+
+class _FreshRuns:
+    """Runs of the scenarios of a report, on the same draws.
+
+    They are made by the program of a search's values.  The nominal run replaces the perturbed
+    leaves too, so that one kernel serves all.
+    """
+
+    def __init__(self, case: ReportCase, seed: int):
+        self.case = case
+        self.scenario = canonical(case.before)
+        self.dtype = self.scenario.initial.q.dtype
+        self.targets, by_path = targets_of(self.scenario, case.perturbations or {})
+        by_path, self.objective = self._typed((by_path, case.objective))
+        self.cases = Cases(self.scenario, by_path, jax.random.PRNGKey(seed))
+
+    def _typed(self, tree: Any) -> Any:
+        return jax.tree.map(lambda x: jnp.asarray(x, self.dtype), tree)
+
+    def run(self, scenarios: Sequence[Scenario], runs: int, dt: float) -> list[_Sample]:
+        """The runs of each scenario: so many drawn ones, or the nominal one where `runs` is 0."""
+        case = self.case
+        steps = checks.whole_steps(case.duration, dt)
+        request = RunRequest.of(
+            self.scenario, steps=steps, method=case.method, backend=case.backend
+        )
+        batch = fresh_together(runs * len(scenarios) * steps, case.batch)
+        points = {
+            path: np.stack([np.asarray(paths.get(s, path), self.dtype) for s in scenarios])
+            for path in case.tuned
+        }
+        index = np.tile(np.arange(runs or 1, dtype=np.uint32), len(scenarios))
+        owner = np.repeat(np.arange(len(scenarios)), runs or 1)
+        step = self._typed(dt)
+        parts = []
+        for first in range(0, len(owner), batch):
+            rows = np.resize(np.arange(len(owner))[first : first + batch], batch)
+            varied, made = drawn(
+                self.cases,
+                {path: x[owner[rows]] for path, x in points.items()},
+                index[rows],
+                targets=self.targets,
+                nominal=not runs,
+            )
+            found = rollouts(self.scenario, varied, self.objective, step, request=request)
+            parts.append(jax.tree.map(np.asarray, (found, made)))
+        found, made = jax.tree.map(lambda *x: np.concatenate(x)[: len(owner)], *parts)
+        if len(scenarios) > 1:  # once in a report
+            tell_of_step(found.status, found.fastest_mode, found.relative_error, dt, case.method)
+        samples = _Sample(found.exact, found.peak_torque, found.status, made)
+        return [_Sample(*(x[owner == s] for x in samples)) for s in range(len(scenarios))]
+
+
+def make_report(
+    case: ReportCase,
+    *,
     runs: int,
     seed: int,
-    timing: dict[str, Any],
-    backend: str,
-    together: int,
-) -> list[_Sample]:
-    """The same runs of scenarios that differ in what was tuned: drawn ones, or the nominal one
-    where `runs` is 0, so many together.
+    confidence: float,
+    at_limits: tuple[str, ...] | None = None,
+    multipliers: tuple[float, ...] = (),
+    notes: tuple[str, ...] = (),
+) -> TuningReport:
+    """Runs both scenarios on the same fresh draws and compares them.
 
-    They are made by the program of a search's values, and the nominal one replaces what is drawn
-    too: one kernel does for all.
+    Args:
+      case: what is reported on.
+      runs, seed: of the fresh draws.
+      confidence: of the intervals.
+      at_limits: the tuned numbers at an end of their range, in words.
+      multipliers: of each requirement, by the unit of its limit; none if not known.
+      notes: further lines.
     """
-    first = canonical(scenarios[0])
-    dtype, (targets, by_path) = first.initial.q.dtype, targets_of(first, perturbations or {})
-    by_path, objective, dt = jax.tree.map(
-        lambda x: jnp.asarray(x, dtype), (by_path, objective, timing["dt"])
+    fresh = _FreshRuns(case, seed)
+    before, after = fresh.run((case.before, case.after), runs if case.perturbations else 0, case.dt)
+    full = after
+    if case.perturbations:
+        (full,) = fresh.run((case.after,), 0, case.dt)
+    (half,) = fresh.run((case.after,), 0, 0.5 * case.dt)
+    samples = (before, after)
+
+    def each(function: Any) -> tuple[Any, Any]:
+        return function(before), function(after)
+
+    return TuningReport(
+        runs=int(np.sum(before.made & after.made)),
+        seed=seed if case.perturbations else None,
+        confidence=confidence,
+        changes=_changes(case, samples, confidence),
+        verdicts=_verdicts(case.objective, samples, confidence, multipliers),
+        violation=each(lambda x: _probability(x.left_bounds(), x, confidence)),
+        margin=each(lambda x: float(x.margin[x.made].min())),
+        peak_torque=each(lambda x: tuple(x.torque[x.made].max(axis=0).tolist())),
+        at_limits=at_limits,
+        halved=_at_half_the_step(case.objective, full, half),
+        notes=notes,
     )
-    cases = Cases(first, by_path, jax.random.PRNGKey(seed))
-    run = Run(
-        checks.whole_steps(timing["duration"], timing["dt"]),
-        timing["method"],
-        mechanism=known_of(first),
-    )
-    points = {
-        path: np.stack([np.asarray(paths.get(s, path), dtype) for s in scenarios]) for path in tuned
-    }
-    index, of = (
-        np.tile(np.arange(runs or 1, dtype=np.uint32), len(scenarios)),
-        np.repeat(np.arange(len(scenarios)), runs or 1),
-    )
-    parts = []
-    for begin in range(0, len(of), together):
-        rows = np.resize(np.arange(len(of))[begin : begin + together], together)
-        varied, made = drawn(
-            cases,
-            {path: x[of[rows]] for path, x in points.items()},
-            index[rows],
-            targets=targets,
-            nominal=not runs,
-        )
-        parts.append(
-            jax.tree.map(
-                np.asarray, (rollouts(first, varied, objective, dt, run=run, backend=backend), made)
-            )
-        )
-    whole: tuple[Rollouts, np.ndarray] = jax.tree.map(
-        lambda *x: np.concatenate(x)[: len(of)], *parts
-    )
-    found, made = whole
-    if len(scenarios) > 1:  # once a report
-        tell_of_step(
-            found.status, found.fastest_mode, found.relative_error, timing["dt"], timing["method"]
-        )
-    each = (
-        x.reshape(len(scenarios), -1, *x.shape[1:])
-        for x in (found.exact, found.peak_torque, found.status, made)
-    )
-    return [_Sample(*x) for x in zip(*each, strict=True)]
+
+
+# ----------------------------------------------------------------------------------------- changes
+
+
+def _changes(
+    case: ReportCase, samples: tuple[_Sample, _Sample], confidence: float
+) -> tuple[Change, ...]:
+    """The objective first, then its terms."""
+    risk = case.risk
+    both = samples[0].made & samples[1].made
+    before, after = (_terms(case.objective, x.exact[both]) for x in samples)
+    is_cvar = risk.kind == "cvar"
+    risk_name = f"cvar {risk.level:g}" if is_cvar else risk.kind
+
+    def name(what: str, combined_by: str) -> str:
+        return f"{what} ({combined_by})" if len(before) > 1 else what
+
+    objective = name("objective", risk_name)
+    found = [_objective_change(risk, objective, before, after, confidence)]
+    for i, term in enumerate(case.objective.terms):
+        found.append(_change(name(term.name, "mean"), before[:, i], after[:, i], confidence))
+        if is_cvar and len(case.objective.terms) > 1:
+            tail = f"{term.name} ({risk_name})"
+            one = slice(i, i + 1)
+            found.append(_objective_change(risk, tail, before[:, one], after[:, one], confidence))
+    return tuple(found)
+
+
+def _terms(objective: Objective, exact: np.ndarray) -> np.ndarray:
+    """The value of each term in each run, (N, n_terms)."""
+    columns = [t.value(jnp.asarray(exact[:, i])) for i, t in enumerate(objective.terms)]
+    return np.stack([np.asarray(x) for x in columns], axis=1)
+
+
+def _objective_change(
+    risk: Risk, name: str, before: np.ndarray, after: np.ndarray, confidence: float
+) -> Change:
+    """The change of the risk of the sum of some terms, (N, k)."""
+    first = before.sum(axis=1)
+    last = after.sum(axis=1)
+    if risk.kind == "worst" and len(first) > 1:
+        return Change(name, float(first.max()), float(last.max()), None, None)
+    return _change(name, influence(risk, first), influence(risk, last), confidence)
 
 
 def influence(risk: Risk, losses: np.ndarray) -> np.ndarray:
@@ -348,181 +454,83 @@ def _change(name: str, before: np.ndarray, after: np.ndarray, confidence: float)
     )
 
 
+# ---------------------------------------------------------------------------------------- verdicts
+
+
+def _verdicts(
+    objective: Objective,
+    samples: tuple[_Sample, _Sample],
+    confidence: float,
+    multipliers: tuple[float, ...],
+) -> tuple[Verdict, ...]:
+    """The verdict on each requirement."""
+    found = []
+    for r, requirement in enumerate(objective.requirements):
+        before, after = (_probability(_broken(objective, r, x), x, confidence) for x in samples)
+        allowed = float(requirement.allowed)
+        # For a limited probability the constraint is on a margin: its multiplier is not the
+        # sensitivity to the probability.
+        multiplier = None
+        if r < len(multipliers) and requirement.event == "value":
+            multiplier = multipliers[r]
+        sign, unit = requirement.measure
+        values = samples[1].exact[samples[1].made, len(objective.terms) + r]
+        verdict = Verdict(
+            name=requirement.name,
+            allowed=allowed,
+            before=before,
+            after=after,
+            verdict=verdict_of(after, allowed),
+            value=sign * float(worst_share(jnp.asarray(values), allowed)),
+            limit=sign * float(requirement.limit),
+            unit=unit,
+            multiplier=multiplier,
+        )
+        found.append(verdict)
+    return tuple(found)
+
+
+def _probability(event: np.ndarray, sample: _Sample, confidence: float) -> Probability:
+    return probability(event, sample.made, confidence, "independent", 1)
+
+
 def verdict_of(p: Probability, allowed: float) -> str:
     """pass, fail or undecided."""
     if p.runs == 1 or p.low is None or p.high is None:
         return "fail" if p.count else "pass"
-    return "pass" if p.high <= allowed else "fail" if p.low > allowed else "undecided"
+    if p.high <= allowed:
+        return "pass"
+    if p.low > allowed:
+        return "fail"
+    return "undecided"
 
 
 def _broken(objective: Objective, r: int, sample: _Sample) -> np.ndarray:
+    """Whether each run violates a requirement, (N,)."""
     requirement = objective.requirements[r]
-    left = sample.status & int(VIOLATED) != 0
     if requirement.event == "violated":
-        return left
-    return ~(
-        np.asarray(requirement.excess(jnp.asarray(sample.exact[:, len(objective.terms) + r]))) < 0
-    ) | (sample.status & int(Status.NOT_FINITE) != 0)
-
-
-def make_report(
-    before: Scenario,
-    after: Scenario,
-    tuned: Sequence[str],
-    objective: Objective,
-    perturbations: Any,
-    *,
-    runs: int,
-    seed: int,
-    risk: Risk,
-    confidence: float,
-    timing: dict[str, Any],
-    backend: str = "auto",
-    together: int = 1,
-    at_limits: tuple[str, ...] | None = None,
-    prices: tuple[float, ...] = (),
-    notes: tuple[str, ...] = (),
-) -> TuningReport:
-    """Runs both scenarios on the same fresh draws and compares them.
-
-    Args:
-      before, after: the scenario with its starting gains and with the tuned ones.
-      tuned: paths of these.
-      objective: complete, with scales and limits.
-      perturbations: path -> perturbation; one nominal run if empty.
-      runs, seed: of the fresh draws.
-      risk: how the objective combines runs.
-      confidence: of the intervals.
-      timing: duration, dt, method.
-      backend: what the runs run on.
-      together: how many runs a search made at once for its values: what is compiled serves again.
-      at_limits: the tuned numbers at an end of their range, in words.
-      prices: of each requirement, by the unit of its limit; none if not known.
-      notes: lines for the reader.
-    """
-
-    def made(scenarios: tuple[Scenario, ...], runs: int, dt: float) -> list[_Sample]:
-        steps = runs * len(scenarios) * checks.whole_steps(timing["duration"], dt)
-        at_once = fresh_together(devices.platform(), steps, together)
-        return _run(
-            scenarios,
-            tuned,
-            objective,
-            perturbations,
-            runs,
-            seed,
-            timing | {"dt": dt},
-            backend,
-            at_once,
-        )
-
-    samples = made((before, after), runs if perturbations else 0, timing["dt"])
-    both = samples[0].made & samples[1].made
-    terms = [
-        np.stack(
-            [
-                np.asarray(t.value(jnp.asarray(s.exact[both, i])))
-                for i, t in enumerate(objective.terms)
-            ],
-            axis=1,
-        )
-        for s in samples
-    ]
-    level = f" {risk.level:g}" if risk.kind == "cvar" else ""
-    changes = [
-        _objective_change(
-            risk,
-            f"objective ({risk.kind}{level})" if len(both) > 1 else "objective",
-            terms,
-            confidence,
-        )
-    ]
-    for i, term in enumerate(objective.terms):
-        changes.append(
-            _change(
-                f"{term.name} (mean)" if len(both) > 1 else term.name,
-                terms[0][:, i],
-                terms[1][:, i],
-                confidence,
-            )
-        )
-        if risk.kind == "cvar" and len(objective.terms) > 1:
-            changes.append(
-                _objective_change(
-                    risk, f"{term.name} (cvar{level})", [x[:, i : i + 1] for x in terms], confidence
-                )
-            )
-    verdicts = []
-    for r, requirement in enumerate(objective.requirements):
-        found = [
-            probability(_broken(objective, r, s), s.made, confidence, "independent", 1)
-            for s in samples
-        ]
-        allowed = float(requirement.allowed)
-        # What limits a probability is a margin in the programme: its multiplier is no price of the
-        # probability.
-        priced = r < len(prices) and requirement.event == "value"
-        (sign, unit), price = requirement.measure, prices[r] if priced else None
-        worst = float(
-            worst_share(
-                jnp.asarray(samples[1].exact[samples[1].made, len(objective.terms) + r]), allowed
-            )
-        )
-        shown = sign * worst, sign * float(requirement.limit), unit, price
-        verdicts.append(
-            Verdict(
-                requirement.name, allowed, found[0], found[1], verdict_of(found[1], allowed), *shown
-            )
-        )
-    left = tuple(
-        probability(s.status & int(VIOLATED) != 0, s.made, confidence, "independent", 1)
-        for s in samples
-    )
-    margins = tuple(float(s.margin[s.made].min()) for s in samples)
-    torques = tuple(tuple(s.torque[s.made].max(axis=0).tolist()) for s in samples)
-    full = samples[1] if not perturbations else made((after,), 0, timing["dt"])[0]
-    half = made((after,), 0, 0.5 * timing["dt"])[0]
-    return TuningReport(
-        len(both),
-        seed if perturbations else None,
-        confidence,
-        tuple(changes),
-        tuple(verdicts),
-        left,  # type: ignore[arg-type]
-        margins,  # type: ignore[arg-type]
-        torques,  # type: ignore[arg-type]
-        at_limits,
-        _at_half_the_step(objective, full, half),
-        notes,
-    )
+        return sample.left_bounds()
+    values = jnp.asarray(sample.exact[:, len(objective.terms) + r])
+    satisfied = np.asarray(requirement.excess(values)) < 0
+    return ~satisfied | (sample.status & int(Status.NOT_FINITE) != 0)
 
 
 def _at_half_the_step(objective: Objective, full: _Sample, half: _Sample) -> str:
-    """The nominal run at dt and at dt / 2, in words: a result that the step made is no result."""
-    values = [
-        float(sum(t.value(jnp.asarray(s.exact[0, i])) for i, t in enumerate(objective.terms)))
-        for s in (full, half)
-    ]
-    text = f"the nominal run at dt / 2: objective {values[1]:.5g} instead of {values[0]:.5g}"
-    text += f", smallest margin {half.margin[0]:.4g} rad, peak torque {np.max(half.torque):.5g} N m"
-    apart = abs(values[1] - values[0]) > APART * abs(values[0])
-    lost = any(
-        _broken(objective, r, half)[0] and not _broken(objective, r, full)[0]
-        for r in range(len(objective.requirements))
+    """The nominal run at dt and at dt / 2, in words: a result that depends on the step is not
+    valid.
+    """
+    value_full, value_half = (float(_terms(objective, x.exact[:1]).sum()) for x in (full, half))
+    text = (
+        f"the nominal run at dt / 2: objective {value_half:.5g} instead of {value_full:.5g},"
+        f" smallest margin {half.margin[0]:.4g} rad, peak torque {np.max(half.torque):.5g} N m"
     )
-    if lost:
-        return (
-            "WARNING: "
-            + text
-            + "; a requirement is broken there: leave it some room, or take a smaller dt"
-        )
-    return (
-        "WARNING: " + text + f", more than {APART:.0%} apart: take a smaller dt" if apart else text
+    requirements = range(len(objective.requirements))
+    broken_full, broken_half = (
+        [_broken(objective, r, x)[0] for r in requirements] for x in (full, half)
     )
-
-
-def _objective_change(risk: Risk, name: str, terms: list[np.ndarray], confidence: float) -> Change:
-    losses = [x.sum(axis=1) for x in terms]
-    if risk.kind == "worst" and len(losses[0]) > 1:
-        return Change(name, float(losses[0].max()), float(losses[1].max()), None, None)
-    return _change(name, influence(risk, losses[0]), influence(risk, losses[1]), confidence)
+    if any(b and not a for a, b in zip(broken_full, broken_half, strict=True)):
+        remedy = "a requirement is broken there: leave it some room, or take a smaller dt"
+        return f"WARNING: {text}; {remedy}"
+    if abs(value_half - value_full) > LARGEST_DIFFERENCE * abs(value_full):
+        return f"WARNING: {text}, more than {LARGEST_DIFFERENCE:.0%} apart: take a smaller dt"
+    return text

@@ -1,11 +1,11 @@
-"""What a tuning gives back: `TuneResult`."""
+"""The result of a tuning: `TuneResult`."""
 
 from __future__ import annotations
 
 import dataclasses
 import os
 from functools import cached_property, partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,20 +20,19 @@ from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.tuning.evaluation import NUMBERS_A_RUN
-from iblf_jax.tuning.objectives import Objective, has_price_on_torque
+from iblf_jax.tuning.objectives import Objective, depends_on_torque
 from iblf_jax.tuning.quantities import Quantities
-from iblf_jax.tuning.report import TuningReport, make_report
+from iblf_jax.tuning.report import ReportCase, TuningReport, make_report
 from iblf_jax.tuning.robust import Risk
-from iblf_jax.tuning.runs import Run, known_of, run_batch, simulate_unchecked, values_together
+from iblf_jax.tuning.runs import RunRequest, run_batch, run_rollout, values_together
 
 FAR = 100.0
-"""A gain that ended so many times above or below its start is worth a warning."""
+"""Factor by which a gain may change before a warning is given."""
 STUCK = (
     "the steps became too small: the model of objective and requirements does not hold near these"
     " gains"
 )
-"""Why a tuning stopped whose trust region has collapsed before the conditions of an optimum were
-met."""
+"""Why a search ended whose trust region collapsed before the conditions of an optimum were met."""
 NEAR = 0.01
 """A number is at a limit if it differs from it by no more than this part of it (of the range, where
 the limit is 0)."""
@@ -47,22 +46,23 @@ class AtLimit(NamedTuple):
     """"lower" or "upper"."""
     limit: float
     reason: str = ""
-    """What set this end; empty where that is not known."""
+    """Why the range ends there; empty where that is not known."""
 
     def __str__(self) -> str:
-        return f"= {self.value:.5g} is at the {self.side} end of its range, {self.limit:.5g}" + (
-            f" ({self.reason})" if self.reason else ""
-        )
+        text = f"= {self.value:.5g} is at the {self.side} end of its range, {self.limit:.5g}"
+        return f"{text} ({self.reason})" if self.reason else text
 
 
-@partial(jax.jit, static_argnames=("run", "backend"))
-def _slice(scenario, changes, folds, dt, *, run, backend):
-    return run_batch(scenario, changes, folds, dt, run, backend=backend)
+@partial(jax.jit, static_argnames="request")
+def _slice(
+    scenario: Scenario, changes: Any, folds: Any, dt: jax.Array, *, request: RunRequest
+) -> Any:
+    return run_batch(scenario, changes, folds, dt, request)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class TuneSetup:
-    """What a tuning was asked for, as far as its report needs it."""
+    """The options of a tuning that its report needs."""
 
     objective: Objective
     """With all scales and limits."""
@@ -81,12 +81,12 @@ class TuneSetup:
     """Lower and upper limit of each tuned number, (p, 2), in its unit; empty in results that were
     saved without."""
     reasons: tuple[tuple[str, str], ...] = dataclasses.field(default=(), kw_only=True)
-    """What set them, in words, (p, 2); empty in results that were saved without."""
+    """Why the ranges end there, in words, (p, 2); empty in results that were saved without."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class TuneResult:
-    """A tuned scenario, how it was found, and what it is worth: on runs that tuning never saw,
+    """A tuned scenario, the history of its search, and its report: on runs that tuning did not use,
     where something is perturbed.
     """
 
@@ -99,29 +99,29 @@ class TuneResult:
     names: tuple[str, ...]
     """What each coordinate is called, (p,)."""
     history: dict[str, np.ndarray]
-    """Per step, (steps, starts, ...), two starts where two searches took turns: loss, objective,
+    """Per step, (steps, starts, ...), two starts where a second search followed: loss, objective,
     terms, excess of the requirements, margin [rad], gradient_norm, valid, z and x (the gains tried,
     in their units); evaluations is (steps,)."""
     best_start: int
-    """Which of the starts won."""
+    """The start that found the result."""
     stopped: str
     """Why it stopped."""
     optimiser: str
+    """Name of the solver."""
     mode: str
     """"forward" or "reverse"."""
     seconds: float
     setup: TuneSetup
     multipliers: tuple[float, ...] = ()
-    """Of each requirement: by how much the objective would fall if its limit were moved by one
-    `scale`; none where one is broken, NaN where the gains are not those at which the search
-    ended."""
+    """Lagrange multiplier of each requirement: the decrease of the objective if its limit is
+    loosened by one `scale`.  None where one is violated; NaN where the result is not the point at
+    which the solver ended."""
     residuals: tuple[float, ...] = ()
-    """At the end, of "newton": the largest entry of the Lagrangian's gradient by the coordinates z
-    that no limit of a gain holds, the largest excess g of a requirement, and the sum of multipliers
-    times distances from the limits; all 0 at an optimum."""
+    """Of the optimality conditions at the end, by SQP: the largest entry of the Lagrangian's
+    gradient by the coordinates z that no range blocks, the largest excess g of a requirement, and
+    the sum of multipliers times distances from the limits; all 0 at an optimum."""
     probes: int = 0
-    """Values without derivatives that were computed to find where to start, each of `setup.runs`
-    rollouts."""
+    """Number of evaluations without derivatives to find a start, each of `setup.runs` rollouts."""
 
     @property
     def objective(self) -> float:
@@ -143,45 +143,66 @@ class TuneResult:
 
     @property
     def evaluations(self) -> int:
-        """Values with derivatives that were computed, each of `setup.runs` rollouts."""
+        """Number of evaluations with derivatives, each of `setup.runs` rollouts."""
         return int(self.history["evaluations"][-1])
 
     @property
     def at_limits(self) -> dict[str, AtLimit]:
-        """The tuned numbers that sit at an end of their range, by name: a wider range, or a price
-        on what they cost, would move them.
+        """The tuned numbers at an end of their range, by name: a wider range, or a cost of what
+        they increase, would change them.
         """
         found = {}
         why = self.setup.reasons or (("", ""),) * len(self.names)
-        for name, x, ends, reasons in zip(
-            self.names, self.tuned, self.setup.limits, why, strict=False
-        ):
-            width = ends[1] - ends[0] if np.isfinite(ends[1] - ends[0]) else 1.0
+        rows = zip(self.names, self.tuned, self.setup.limits, why, strict=False)
+        for name, x, ends, reasons in rows:
+            width = ends[1] - ends[0]
+            if not np.isfinite(width):
+                width = 1.0
             for side, end, reason in zip(("lower", "upper"), ends, reasons, strict=True):
                 if np.isfinite(end) and abs(x - end) <= NEAR * (abs(end) or width):
                     found[name] = AtLimit(float(x), side, float(end), reason)
         return found
 
     @property
-    def prices(self) -> dict[str, float]:
-        """By the name of a requirement: how much the objective would fall if its limit were
-        loosened by one of its unit; for a violation probability, by one radian of the margin that
-        its worst runs keep.
+    def limit_multipliers(self) -> dict[str, float]:
+        """Multiplier of each requirement by its name and in the unit of its limit: the decrease of
+        the objective if the limit is loosened by one unit.  For a violation probability, by one
+        radian of the margin of its worst runs.
         """
         pairs = zip(self.setup.objective.requirements, self.multipliers, strict=False)
-        return {r.name: price / float(r.scale) for r, price in pairs}
+        return {r.name: multiplier / float(r.scale) for r, multiplier in pairs}
+
+    @property
+    def prices(self) -> dict[str, float]:
+        """The former name of `limit_multipliers`."""
+        return self.limit_multipliers
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What to know before these gains are believed, in words: how the search ended, gains far
-        from their start, no price on torque.
+        """What to consider before these gains are used, in words: why the search ended, gains far
+        from their start, an objective without a cost of torque.
         """
-        lines = [f"stopped: {self.stopped}"]
-        if self.residuals:
-            numbers = "gradient of the Lagrangian {:.2g}, largest excess {:.2g}, complementarity {:.2g}".format(
-                *self.residuals
+        lines = [self._end_in_words(), *self._warnings_of_search(), *self._distant_gains()]
+        if not depends_on_torque(self.setup.objective):
+            lines.append(
+                "WARNING: this objective has no price on torque: add effort(), torque_rate() or"
+                " peak_torque_below(limit)"
             )
-            lines[0] += f" ({numbers}; objective {self.objective:.5g})"
+        return tuple(lines)
+
+    def _end_in_words(self) -> str:
+        """Why the search ended, and how far from an optimum."""
+        text = f"stopped: {self.stopped}"
+        if not self.residuals:
+            return text
+        gradient, excess, complementarity = self.residuals
+        return (
+            f"{text} (gradient of the Lagrangian {gradient:.2g}, largest excess {excess:.2g},"
+            f" complementarity {complementarity:.2g}; objective {self.objective:.5g})"
+        )
+
+    def _warnings_of_search(self) -> list[str]:
+        lines = []
         if self.setup.objective.requirements and not self.multipliers:
             lines.append(
                 "WARNING: these gains break the requirements as little as was found: loosen one, or"
@@ -197,21 +218,20 @@ class TuneResult:
                 "WARNING: no optimum: give several starts, a smaller dt, or an objective whose"
                 " slope does not jump"
             )
+        return lines
+
+    def _distant_gains(self) -> list[str]:
+        """A warning for each gain that has changed by more than the factor FAR."""
+        lines = []
         first = np.concatenate([np.ravel(paths.get(self.start, path)) for path in self.values])
         last = np.concatenate([np.ravel(value) for value in self.values.values()])
         for name, before, after in zip(self._entries, first, last, strict=True):
-            factor = after / before if before * after > 0 else 1.0
-            if not 1 / FAR < factor < FAR:
+            if before * after > 0 and not 1 / FAR < after / before < FAR:
                 lines.append(
-                    f"WARNING: {name} ended at {factor:.3g} times its start: the objective hardly"
-                    " feels it, or puts no price on it"
+                    f"WARNING: {name} ended at {after / before:.3g} times its start: the objective"
+                    " hardly depends on it, or has no cost of it"
                 )
-        if not has_price_on_torque(self.setup.objective):
-            lines.append(
-                "WARNING: this objective has no price on torque: add effort(), torque_rate() or"
-                " peak_torque_below(limit)"
-            )
-        return tuple(lines)
+        return lines
 
     @property
     def _entries(self) -> list[str]:
@@ -225,19 +245,22 @@ class TuneResult:
 
     @cached_property
     def nominal(self) -> tuple[Rollout, Rollout]:
-        """The nominal run before and after, in full."""
+        """The nominal run before and after, recorded at every step."""
         setup = self.setup
-        dtype, steps = self.start.initial.q.dtype, checks.whole_steps(setup.duration, setup.dt)
-        folds, step = as_folds(None, dtype, self.start), jnp.asarray(setup.dt, dtype)
-        run = partial(
-            simulate_unchecked,
-            folds=folds,
-            dt=step,
-            steps=steps,
-            method=setup.method,
-            record_every=1,
-        )
-        return run(canonical(self.start)), run(canonical(self.scenario))
+        step = jnp.asarray(setup.dt, self.start.initial.q.dtype)
+        folds = as_folds(None, step.dtype, self.start)
+
+        def run(scenario: Scenario) -> Rollout:
+            scenario = canonical(scenario)
+            request = self._request(scenario, record_every=1)
+            return run_rollout(scenario, folds, step, request)
+
+        return run(self.start), run(self.scenario)
+
+    def _request(self, scenario: Scenario, **options: Any) -> RunRequest:
+        """A run as those of the tuning."""
+        steps = checks.whole_steps(self.setup.duration, self.setup.dt)
+        return RunRequest.of(scenario, steps=steps, method=self.setup.method, **options)
 
     @cached_property
     def report(self) -> TuningReport:
@@ -251,12 +274,12 @@ class TuneResult:
         """The report with another number of fresh runs, or another seed.
 
         Args:
-          runs: how many fresh runs; as in `report` if not given.
-          seed: of their draws; never the one that was tuned on.
+          runs: number of fresh runs; as in `report` if not given.
+          seed: of their draws; not the tuning's.
 
         Returns:
-          A `TuningReport`, which prints as text; without perturbations it is on the one nominal run,
-          whatever `runs` and `seed` say.
+          A `TuningReport`, which prints as text; without perturbations it is on the one nominal
+          run, for any `runs` and `seed`.
 
         Raises:
           ValueError: the seed of the tuning itself.
@@ -269,28 +292,32 @@ class TuneResult:
             raise checks.fail(
                 "seed", seed, "another seed than the tuning's", "Held-out runs must be fresh."
             )
-        timing = {"duration": setup.duration, "dt": setup.dt, "method": setup.method}
-        return make_report(
-            self.start,
-            self.scenario,
-            tuple(self.values),
-            setup.objective,
-            setup.perturbations,
-            runs=setup.report_runs if runs is None else checks.positive_integer("runs", runs),
-            seed=seed,
+        if runs is None:
+            runs = setup.report_runs
+        at_limits = None
+        if setup.limits:
+            at_limits = tuple(f"{name} {end}" for name, end in self.at_limits.items())
+        searched_in_batches = self.probes or setup.runs > 1
+        case = ReportCase(
+            before=self.start,
+            after=self.scenario,
+            tuned=tuple(self.values),
+            objective=setup.objective,
+            perturbations=setup.perturbations,
             risk=setup.risk,
-            confidence=setup.confidence,
-            timing=timing,
+            duration=setup.duration,
+            dt=setup.dt,
+            method=setup.method,
             backend=setup.backend,
-            together=(
-                setup.runs * values_together(setup.runs) if self.probes or setup.runs > 1 else 1
-            ),
-            at_limits=(
-                tuple(f"{name} {end}" for name, end in self.at_limits.items())
-                if setup.limits
-                else None
-            ),
-            prices=tuple(self.prices.values()),
+            batch=setup.runs * values_together(setup.runs) if searched_in_batches else 1,
+        )
+        return make_report(
+            case,
+            runs=checks.positive_integer("runs", runs),
+            seed=seed,
+            confidence=setup.confidence,
+            at_limits=at_limits,
+            multipliers=tuple(self.limit_multipliers.values()),
             notes=self.notes,
         )
 
@@ -315,10 +342,8 @@ class TuneResult:
         """
         for name in (first, second):
             checks.one_of("landscape: name", name, self.names)
-        points, span = (
-            checks.positive_integer("points", points),
-            checks.positive_number("span", span, "1"),
-        )
+        points = checks.positive_integer("points", points)
+        span = checks.positive_number("span", span, "1")
         checks.fits("points", points, 8 * points * NUMBERS_A_RUN)
         factor = np.exp(np.linspace(-span, span, points))
         a, b = (self.tuned[self.names.index(name)] * factor for name in (first, second))
@@ -333,28 +358,30 @@ class TuneResult:
         The objective is infinite where a run is invalid; without requirements the excess is -inf.
         """
         grid = {first: np.repeat(a, len(b)), second: np.tile(b, len(a))}
-        # A name that is a whole leaf's stands for one number for all of its entries.
-        shapes = {name: np.shape(self.values[name]) if name in self.values else () for name in grid}
-        changes = {
-            k: np.broadcast_to(x.reshape(-1, *(1,) * len(shapes[k])), (len(x), *shapes[k]))
-            for k, x in grid.items()
-        }
-        setup, scenario = self.setup, canonical(self.scenario)
+        changes = {name: self._values_of_leaf(name, x) for name, x in grid.items()}
+        setup = self.setup
+        scenario = canonical(self.scenario)
         dtype = scenario.initial.q.dtype
         folds = as_folds((Quantities(setup.objective.quantities),), dtype, scenario)
-        run = Run(
-            checks.whole_steps(setup.duration, setup.dt), setup.method, mechanism=known_of(scenario)
-        )
-        outcome = _slice(
-            scenario, changes, folds, jnp.asarray(setup.dt, dtype), run=run, backend=setup.backend
-        )
-        values = jax.vmap(setup.objective.values)(outcome.metrics["tuning_exact"]).sum(axis=1)
-        valid = np.asarray(outcome.status) & int(UNTRUSTED) == 0
-        excess = np.asarray(jax.vmap(setup.objective.excesses)(outcome.metrics["tuning_exact"]))
+        request = self._request(scenario, backend=setup.backend)
+        outcome = _slice(scenario, changes, folds, jnp.asarray(setup.dt, dtype), request=request)
+        exact = outcome.metrics["tuning_exact"]
+        values = jax.vmap(setup.objective.values)(exact).sum(axis=1)
+        excess = np.asarray(jax.vmap(setup.objective.excesses)(exact))
         worst = np.max(excess, axis=1, initial=-np.inf)
-        return tuple(
-            np.where(valid, x, np.inf).reshape(len(a), len(b)) for x in (np.asarray(values), worst)
-        )  # type: ignore[return-value]
+        valid = np.asarray(outcome.status) & int(UNTRUSTED) == 0
+        shape = len(a), len(b)
+        objective = np.where(valid, np.asarray(values), np.inf)
+        return objective.reshape(shape), np.where(valid, worst, np.inf).reshape(shape)
+
+    def _values_of_leaf(self, name: str, x: np.ndarray) -> np.ndarray:
+        """Values of a leaf or an entry for numbers x, (R,); a name of a leaf is one number for all
+        of its entries.
+        """
+        shape: tuple[int, ...] = ()
+        if name in self.values:
+            shape = np.shape(self.values[name])
+        return np.broadcast_to(x.reshape(-1, *(1,) * len(shape)), (len(x), *shape))
 
     def plot(self, **options):
         """Figure of the tuning: loss, gains, margin, torque and tubes before and after.  Options as
@@ -363,7 +390,7 @@ class TuneResult:
         return present("tuning figure", self, **options)
 
     def save(self, path: str | os.PathLike) -> None:
-        """Writes everything to one file, from which `load_tuning` gives the result back with the
+        """Writes everything to one file, from which `load_tuning` restores the result with the
         same report.
 
         Raises:

@@ -1,11 +1,12 @@
 """One number from many perturbed runs: the mean, the tail or the worst of their losses.
 
     mean    sum_b L_b / B
-    cvar    mean of the worst (1 - level) share of the runs, at least one: conditional value at risk
-    (expected shortfall) worst   max_b L_b
+    cvar    mean of the worst (1 - level) share of the runs, at least one: the conditional value at
+            risk (expected shortfall)
+    worst   max_b L_b
 
-All gains are judged on the same draws (common random numbers), so differences between them are
-differences of the gains.
+All gains are evaluated with the same draws (common random numbers), so that differences between
+losses are differences of the gains.
 
 Source: R. T. Rockafellar, S. Uryasev, J. Risk 2 (2000) 21-41.
 """
@@ -34,7 +35,7 @@ def as_risk(risk: str | Risk) -> Risk:
     """A Risk from what the user gave, "mean", "cvar", "worst" or `cvar(level)`."""
     if isinstance(risk, Risk):
         checks.one_of("risk", risk.kind, KINDS)
-        return risk if risk.kind != "cvar" else cvar(risk.level)
+        return cvar(risk.level) if risk.kind == "cvar" else risk
     checks.one_of("risk", risk, KINDS)
     return Risk(risk)
 
@@ -59,7 +60,7 @@ def cvar(level: float = 0.9) -> Risk:
 
 
 def worst_count(runs: int, share: float) -> int:
-    """How many the worst `share` of some runs are, at least one."""
+    """The number of the worst `share` of some runs, at least one."""
     return max(1, math.ceil(share * runs - 1e-9))
 
 
@@ -72,4 +73,6 @@ def combine(risk: Risk, losses: jax.Array) -> jax.Array:
     """The risk of B losses, ()."""
     if risk.kind == "mean":
         return jnp.mean(losses)
-    return worst_share(losses, 1 - risk.level if risk.kind == "cvar" else 0.0)
+    if risk.kind == "cvar":
+        return worst_share(losses, 1 - risk.level)
+    return worst_share(losses, 0.0)

@@ -20,23 +20,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.engine.derivatives import Outer as Outer
-from iblf_jax.engine.derivatives import Tangents
-from iblf_jax.engine.execute import run_batch as run_batch
-from iblf_jax.engine.execute import run_batch_jvp
-from iblf_jax.engine.execute import run_for_reverse as run_for_reverse
-from iblf_jax.engine.mechanism import Mechanism as Mechanism
-from iblf_jax.engine.mechanism import known_of as known_of
+from iblf_jax.engine import FORWARD_MOST as FORWARD_MOST
+from iblf_jax.engine import Outer as Outer
+from iblf_jax.engine import RunRequest as RunRequest
+from iblf_jax.engine import Tangents, run_batch_jvp
+from iblf_jax.engine import check_backend as check_backend
+from iblf_jax.engine import differentiates_forward as differentiates_forward
+from iblf_jax.engine import fresh_together as fresh_together
+from iblf_jax.engine import run_batch as run_batch
+from iblf_jax.engine import run_for_reverse as run_for_reverse
+from iblf_jax.engine import run_rollout as run_rollout
+from iblf_jax.engine import starts_together as starts_together
+from iblf_jax.engine import values_together as values_together
 from iblf_jax.engine.period import radius_at as radius_at
-from iblf_jax.engine.plan import BACKENDS as BACKENDS
-from iblf_jax.engine.plan import FORWARD_MOST as FORWARD_MOST
-from iblf_jax.engine.plan import differentiates_forward as differentiates_forward
-from iblf_jax.engine.plan import fresh_together as fresh_together
-from iblf_jax.engine.plan import starts_together as starts_together
-from iblf_jax.engine.plan import values_together as values_together
 from iblf_jax.engine.simulate import simulate as simulate
-from iblf_jax.engine.simulate import simulate_unchecked as simulate_unchecked
-from iblf_jax.engine.step import Run as Run
 from iblf_jax.engine.step_size import fastest_along as fastest_along
 from iblf_jax.engine.step_size import start_and_along as start_and_along
 from iblf_jax.simulation.scenario import Scenario
@@ -48,10 +45,8 @@ def tangents_of_runs(
     jacobians: Mapping[str, jax.Array],
     folds: Any,
     dt: jax.Array,
-    run: Run,
+    request: RunRequest,
     *,
-    backend: str,
-    nested: bool = False,
     uniform: Collection[str] = (),
 ) -> Tangents:
     """Runs a batch with its tangents along the coordinates; call it inside `jit`.
@@ -62,17 +57,14 @@ def tangents_of_runs(
       jacobians: path -> dx/dz, (B, ..., D), for the paths that depend on the coordinates.
       folds: the metrics.
       dt: time step, () [s].
-      run, backend: steps and integrator, and on what they are executed; static.
-      nested: whether a loop of JAX surrounds the call.
+      request: what is run, static.
       uniform: paths all of whose entries have the same derivative: one pattern for the leaf.
 
     Returns:
       `Tangents`, run axis first, along the D coordinates.
     """
     patterns = {path: _patterns(x.shape[1:-1], path in uniform) for path, x in jacobians.items()}
-    found = run_batch_jvp(
-        scenario, varied, _directions(patterns), folds, dt, run, backend=backend, nested=nested
-    )
+    found = run_batch_jvp(scenario, varied, _directions(patterns), folds, dt, request)
     by_entry = {path: x.reshape(len(x), -1, x.shape[-1]) for path, x in jacobians.items()}
     C = jnp.concatenate([x[:, : len(patterns[path])] for path, x in by_entry.items()], axis=1)
     tangents = jax.tree.map(lambda x: jnp.einsum("bpd,bp...->bd...", C, x), found.tangents)

@@ -106,8 +106,9 @@ def _scattered(found: Derivatives, rows: np.ndarray, starts: int) -> Derivatives
     """The values of some starts among all of them; the others are invalid, with infinite losses."""
 
     def scattered(x: np.ndarray) -> np.ndarray:
-        missing = np.nan if np.issubdtype(x.dtype, np.floating) else 0
-        full = np.full((starts, *x.shape[1:]), missing, x.dtype)
+        full = np.zeros((starts, *x.shape[1:]), x.dtype)
+        if np.issubdtype(x.dtype, np.floating):
+            full[:] = np.nan
         full[rows] = x
         return full
 
@@ -138,7 +139,9 @@ class Search:
         self.solver = solver
         self.second_start = second_start
         self.smoothest = evaluate.problem.objective
-        self.stages = solver.sharpenings if is_smoothed(self.smoothest) else 0
+        self.stages = 0
+        if is_smoothed(self.smoothest):
+            self.stages = solver.sharpenings
         starts = len(z)
         terms = len(self.smoothest.terms)
         requirements = len(evaluate.problem.allowed)
@@ -204,10 +207,11 @@ class Search:
 
     def _stage_is_long(self) -> bool:
         """Whether a stage without requirements has taken all of its steps."""
-        several = np.sum(~self.state["retired"]) > 1
-        most = COARSE_STEPS if several else STEPS_PER_UPDATE
-        without_requirements = self.state["multipliers"].shape[1] == 0
-        return without_requirements and int(self.state["stage_steps"]) >= most
+        if self.state["multipliers"].shape[1] > 0:
+            return False
+        if np.sum(~self.state["retired"]) > 1:
+            return int(self.state["stage_steps"]) >= COARSE_STEPS
+        return int(self.state["stage_steps"]) >= STEPS_PER_UPDATE
 
     def _next_stage(self) -> None:
         """Reduces the smoothing; the better half of the starts goes on."""
@@ -243,8 +247,9 @@ class Search:
         made = self.evaluate.evaluations - before
         state["evaluations"] = state["evaluations"] + made
         improved = self._keep_best(z, found)
-        waited = state["steps_without_better"]
-        state["steps_without_better"] = np.asarray(0) if improved else waited + 1
+        state["steps_without_better"] = state["steps_without_better"] + 1
+        if improved:
+            state["steps_without_better"] = np.asarray(0)
         self._record(z, found)
         converged = self.solver.converged(state["solver"])
         for s in range(len(z)):

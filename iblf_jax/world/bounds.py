@@ -2,14 +2,12 @@
 bounds on their velocities alike.
 
 Each side is a component of its own: constant, sinusoidal, or a funnel that shrinks onto the
-  reference.  The law works with
-the errors' bounds
+reference.  The law works with the errors' bounds
 
-    k_l = q_d - k_lc > 0,   k_u = k_uc - q_d > 0,   -k_l < e1 < k_u,                    (paper,
-    below Assumption 2)
+    k_l = q_d - k_lc > 0,   k_u = k_uc - q_d > 0,   -k_l < e1 < k_u,    (paper, below Assumption 2)
 
-and with their rates, all taken here, once, by automatic differentiation: `tube_at` returns them as
-a `Tube`.
+and with their rates.  `tube_at` computes them by automatic differentiation and returns them as a
+`Tube`.
 """
 
 from __future__ import annotations
@@ -270,9 +268,7 @@ class Tube(NamedTuple):
         return self.dupper - self.dq_d
 
     def xi(self, q: jax.Array) -> jax.Array:
-        """Xi = h e1/k_u + (1 - h) e1/k_l, h = 1 if e1 > 0 else 0, (n,) [1].
-        (2.4), (2.5)
-        """
+        """Xi = h e1/k_u + (1 - h) e1/k_l, h = 1 if e1 > 0 else 0, (n,) [1].    (2.4), (2.5)"""
         e1 = q - self.q_d
         return e1 / jnp.where(e1 > 0, self.k_u, self.k_l)
 

@@ -1,7 +1,6 @@
 """Disturbances: the generalised torque that acts on the plant and that the law does not know.
 
-    M q" + C q' + G = tau + (disturbance)                                        for the simulated
-    plant
+    M q" + C q' + G = tau + (disturbance)          for the simulated plant
 
 What the observer should estimate is the lumped uncertain term of (2.1),
 
@@ -68,14 +67,13 @@ class Nothing:
 
 @component
 class ModelShaped:
-    """The paper's uncertain term, shaped by the model's own matrices.
-    (4.3)
+    """The paper's uncertain term, shaped by the model's own matrices.                       (4.3)
 
         f = M0(q) a(t) + C0(q, q') b(t)
-        a = acceleration_amplitude sin(acceleration_frequency t + acceleration_phase + phase),   b
-        likewise
+        a = acceleration_amplitude sin(acceleration_frequency t + acceleration_phase + phase)
+        b = velocity_amplitude sin(velocity_frequency t + velocity_phase + phase)
 
-    `phase` shifts all of it at once: the one knob to turn in a Monte-Carlo study.
+    `phase` shifts both signals: a Monte-Carlo study can vary this parameter only.
 
     Args:
       acceleration_amplitude: amplitude of a, () or (n,) [rad/s^2].

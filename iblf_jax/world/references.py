@@ -33,8 +33,7 @@ class Reference(Protocol):
 
 @component
 class Sinusoid:
-    """q_d = offset + amplitude sin(frequency t + phase), joint by joint.
-    (4.2)
+    """q_d = offset + amplitude sin(frequency t + phase), joint by joint.              (4.2)
 
     Args:
       offset: middle of the motion, () or (n,) [rad].
@@ -83,7 +82,7 @@ class Quintic:
 
 @component
 class WaypointSpline:
-    """The quintic spline through waypoints, at rest at the first and the last one and held there.
+    """The quintic spline through waypoints, at rest at both ends and constant beyond them.
 
     It has four continuous derivatives between the ends, and zero velocity and acceleration at them.
     It is linear in the waypoints, q_d(t) = sum_j B_j(t) waypoints_j, so they are leaves: sweep them

@@ -36,13 +36,13 @@ class Region(Protocol):
     """ "tip", or the joint by its name or number whose origin it is."""
 
     def distance(self, x: jax.Array) -> jax.Array:
-        """Distance of a point (2,) or (3,) [m] to the wall, () [m]: positive where it may be,
+        """Distance of a point (2,) or (3,) [m] to the boundary, () [m]: positive where it may be,
         negative beyond.
         """
         ...
 
     def level(self, x: jax.Array) -> jax.Array:
-        """A function, () [m], with the distance's sign and, at the wall, its slope, that can be
+        """A function, () [m], with the distance's sign and, at the boundary, its slope, that can be
         differentiated twice inside.
         """
         ...
@@ -53,9 +53,10 @@ class HalfSpace:
     """The half-space  n . x >= offset,  n = normal/|normal|:  h = n . x - offset.
 
     Args:
-      normal: direction from the wall into what is allowed, (2,) or (3,) as the robot's points [1];
-        its length does not matter.
-      offset: distance of the wall from the base's origin along the normal, () [m]; 0 if not given.
+      normal: direction from the boundary into the allowed half-space, (2,) or (3,) as the robot's
+        points [1]; its length does not matter.
+      offset: distance of the boundary from the base's origin along the normal, () [m]; 0 if not
+        given.
       point: "tip", or the joint by its name or number whose origin is kept; "tip" if not given.
 
     Source: textbook.

@@ -70,7 +70,7 @@ def test_plant_alone_leaves_the_model_and_robot_takes_both(paper):
     both = ij.with_parts(paper, robot=HEAVY)
     assert both.model is both.plant
     assert same(ij.with_parts(other, model=None).model, HEAVY), "model=None is the plant itself"
-    with pytest.raises(ValueError, match="robot alone, or plant and model"):
+    with pytest.raises(ValueError, match="either robot, or plant and model"):
         ij.with_parts(paper, robot=HEAVY, model=HEAVY)
 
 

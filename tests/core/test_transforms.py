@@ -13,9 +13,10 @@ from conftest import PAPER, SHORT
 from made_up_runs import ALWAYS
 
 import iblf_jax as ij
+from iblf_jax.core.caches import CACHE
 from iblf_jax.core.status import Status
-from iblf_jax.engine import execute, native, plan, step, transformable
-from iblf_jax.kernels.program import UnsupportedError
+from iblf_jax.engine import compile, native, plan, registry, single_run, step, transformable
+from iblf_jax.kernels import UnsupportedError, cpu
 from iblf_jax.simulation.scenario import canonical
 
 PATHS = (
@@ -245,7 +246,7 @@ def test_derivatives_are_the_kernels_and_equal_those_of_plain_jax(paper, monkeyp
     calls = []
     monkeypatch.setattr(
         transformable,
-        "_plain",
+        "_run_by_scan",
         lambda *args: calls.append(1) or (_ for _ in ()).throw(AssertionError("the scan")),
     )
     run, _ = everything(paper)
@@ -278,7 +279,9 @@ def test_derivatives_are_the_kernels_and_equal_those_of_plain_jax(paper, monkeyp
 @needs_compiler
 def test_second_derivatives_are_the_kernels(paper, monkeypatch):
     monkeypatch.setattr(
-        transformable, "_plain", lambda *args: (_ for _ in ()).throw(AssertionError("the scan"))
+        transformable,
+        "_run_by_scan",
+        lambda *args: (_ for _ in ()).throw(AssertionError("the scan")),
     )
 
     def ise(values):
@@ -306,14 +309,16 @@ def test_where_kernels_cannot_the_scan_differentiates(paper, monkeypatch):
     def last(K2, dt):
         scenario = canonical(ij.with_parameters(paper, {"controller.K2": K2}))
         return jnp.sum(
-            transformable.run_transformable(scenario, (), dt, step.Run(30, "euler", 1)).records[0][
-                "q"
-            ][-1]
+            transformable.run_transformable(
+                scenario, (), dt, step.RunRequest(30, "euler", 1)
+            ).records[0]["q"][-1]
         )
 
     K2, dt, calls = jnp.asarray([20.0, 15.0]), jnp.asarray(1e-3), []
-    expected, original = jax.grad(last)(K2, dt), transformable._plain
-    monkeypatch.setattr(transformable, "_plain", lambda *args: calls.append(1) or original(*args))
+    expected, original = jax.grad(last)(K2, dt), transformable._run_by_scan
+    monkeypatch.setattr(
+        transformable, "_run_by_scan", lambda *args: calls.append(1) or original(*args)
+    )
     np.testing.assert_array_equal(jax.grad(last)(K2, dt), expected)
     assert calls == []
     slope = jax.grad(last, 1)(K2, dt)
@@ -326,7 +331,7 @@ def test_where_kernels_cannot_the_scan_differentiates(paper, monkeypatch):
 
     for place, name, value in (
         (plan, "COLUMNS_KEPT", 10),
-        (execute, "automatic", lambda: ("xla", "there is no C++ compiler")),
+        (registry, "automatic", lambda: ("xla", "there is no C++ compiler")),
         (transformable, "_columns", no_kernel),
     ):
         calls.clear()
@@ -345,7 +350,7 @@ def test_new_numbers_do_not_recompile(paper, paper_run, monkeypatch):
     monkeypatch.setattr(
         step, "advance", lambda *args, **options: traces.append(1) or original(*args, **options)
     )
-    parts = (execute._before_steps, execute._steps, execute._after_steps)
+    parts = (single_run._initialize, single_run._advance, single_run._finalize)
     before = [part._cache_size() for part in parts]
     for changes in (
         {"controller.K2": 30.0},
@@ -365,9 +370,11 @@ def test_new_numbers_do_not_recompile(paper, paper_run, monkeypatch):
 def test_a_new_structure_does_recompile(paper, monkeypatch):
     """So that the test above can fail."""
     traces = []
-    execute._before_steps.clear_cache()
+    single_run._initialize.clear_cache()
     monkeypatch.setattr(
-        execute, "begin", lambda *args: traces.append(1) or (_ for _ in ()).throw(KeyboardInterrupt)
+        single_run,
+        "initialize",
+        lambda *args: traces.append(1) or (_ for _ in ()).throw(KeyboardInterrupt),
     )
     with pytest.raises(KeyboardInterrupt):
         ij.simulate(paper, **SHORT, metrics=(ij.metrics.Torque(),))
@@ -379,7 +386,7 @@ def test_another_length_compiles_the_steps_alone(paper, backend):
     def compiled():
         return [
             part._cache_size()
-            for part in (execute._before_steps, execute._steps, execute._after_steps)
+            for part in (single_run._initialize, single_run._advance, single_run._finalize)
         ]
 
     ij.simulate(paper, **SHORT, backend=backend)
@@ -402,16 +409,16 @@ def test_a_run_alone_falls_back_where_its_kernel_cannot_be_built(paper, tmp_path
     broken.chmod(0o755)
     short = {"duration": 0.1, "dt": 1e-3, "method": "euler", "metrics": (ij.metrics.Margin(),)}
     expected = ij.simulate(paper, **short)
-    monkeypatch.setattr(execute, "_told", set())
-    monkeypatch.setattr(execute, "_failed", set())
-    for part in (execute._before_steps, execute._steps):
+    CACHE.clear(compile.WARNINGS)
+    CACHE.clear(single_run.FAILED_BUILDS)
+    for part in (single_run._initialize, single_run._advance):
         part.clear_cache()
-    native.kernel.cache_clear()
-    native._turner.cache_clear()
+    cpu.kernel.cache_clear()
+    cpu.rows_function.cache_clear()
     with monkeypatch.context() as patch:
         patch.setenv("CXX", str(broken))
         with pytest.warns(
-            execute.BackendWarning, match="native backend is not available .*g.. failed"
+            compile.BackendWarning, match="native backend is not available .*g.. failed"
         ):
             found = ij.simulate(paper, **short, backend="native")
         np.testing.assert_allclose(found.q, expected.q, rtol=1e-12)
@@ -419,7 +426,7 @@ def test_a_run_alone_falls_back_where_its_kernel_cannot_be_built(paper, tmp_path
             warnings.simplefilter("error")
             ij.simulate(paper, **short | {"duration": 0.11}, backend="native")
             np.testing.assert_allclose(ij.simulate(paper, **short).q, expected.q, rtol=1e-12)
-    execute._failed.clear()
+    CACHE.clear(single_run.FAILED_BUILDS)
     np.testing.assert_array_equal(ij.simulate(paper, **short, backend="native").q, expected.q)
 
 

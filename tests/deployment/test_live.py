@@ -16,7 +16,7 @@ import pytest
 
 import iblf_jax as ij
 from iblf_jax.deployment import live
-from iblf_jax.kernels.toolchain import ToolchainError
+from iblf_jax.kernels import ToolchainError
 
 BROWSER = next(
     (

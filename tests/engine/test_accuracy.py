@@ -17,9 +17,7 @@ import iblf_jax as ij
 from iblf_jax.control.actuators._base import Delivered
 from iblf_jax.core import linalg
 from iblf_jax.core.status import Status
-from iblf_jax.engine import step_size
-from iblf_jax.engine.execute import run_batch, run_batch_jvp, run_for_reverse
-from iblf_jax.engine.step import Run
+from iblf_jax.engine import RunRequest, run_batch, run_batch_jvp, run_for_reverse, step_size
 from iblf_jax.simulation.accuracy import RELATIVE, TOLERANCE
 from iblf_jax.simulation.integrators import TABLEAUS
 from iblf_jax.simulation.metrics import as_folds
@@ -63,7 +61,7 @@ def positions(scenario, varied, dt, steps, method):
     folds = as_folds((), jnp.float64)
     every = FINER if steps > 500 else 1
     run = jax.jit(
-        lambda varied, dt: run_batch(scenario, varied, folds, dt, Run(steps, method, every))
+        lambda varied, dt: run_batch(scenario, varied, folds, dt, RunRequest(steps, method, every))
     )
     found = run({path: jnp.asarray(x) for path, x in varied.items()}, jnp.asarray(dt))
     arrays = found.records[0]
@@ -445,7 +443,7 @@ def test_tangents_beside_a_batch_and_reverse_mode_go_through_a_jump(sampling):
     folds, dt, run, path = (
         (Quantities(objective.quantities),),
         jnp.asarray(1e-2),
-        Run(30),
+        RunRequest(30),
         "disturbance.parts[0].time",
     )
     directions = {path: np.array([1.0, 0.0]), "controller.K2": np.array([[0.0, 0.0], [1.0, 0.0]])}
@@ -488,7 +486,7 @@ def test_every_run_of_a_batch_has_its_own_jumps(backend):
     folds, times = as_folds(None, jnp.float64), np.array([LATE, 0.1, 0.0537, 0.9])
     varied = {"disturbance.parts[0].time": jnp.asarray(times)}
     run = jax.jit(
-        lambda v: run_batch(scenario, v, folds, jnp.asarray(1e-2), Run(30), backend=backend)
+        lambda v: run_batch(scenario, v, folds, jnp.asarray(1e-2), RunRequest(30), backend=backend)
     )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # no compiler

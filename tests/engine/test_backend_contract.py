@@ -16,8 +16,7 @@ import pytest
 
 import iblf_jax as ij
 from iblf_jax.core.status import FAILED, Status
-from iblf_jax.engine import execute
-from iblf_jax.engine.step import Run
+from iblf_jax.engine import RunRequest, compile_batch, run_batch
 from iblf_jax.kernels import toolchain
 from iblf_jax.simulation.metrics import as_folds
 from iblf_jax.simulation.scenario import canonical
@@ -38,7 +37,7 @@ def draws(scenario, dtype):
 
 @partial(jax.jit, static_argnames=("run", "backend"))
 def outcome_of(scenario, varied, folds, dt, run, backend):
-    return execute.run_batch(scenario, varied, folds, dt, run, backend=backend)
+    return run_batch(scenario, varied, folds, dt, run, backend=backend)
 
 
 ONE_TYPE = {"ur5": "float32", "iiwa14": "float64"}
@@ -60,13 +59,13 @@ CASES = [
 @pytest.mark.parametrize(("name", "dtype"), CASES)
 def test_backends_agree_with_the_reference(name, dtype):
     method = "rk4" if (name, dtype) == ("zhang_yan_2024", "float64") else "euler"
-    agree(name, dtype, Run(STEPS, method, 250), ["xla"] + ["native"] * has_compiler())
+    agree(name, dtype, RunRequest(STEPS, method, 250), ["xla"] + ["native"] * has_compiler())
 
 
 def test_native_agrees_on_a_short_run():
     if not has_compiler():
         pytest.skip("no C++ compiler")
-    agree("zhang_yan_2024", "float64", Run(STEPS // 10, "euler", 250), ["native"])
+    agree("zhang_yan_2024", "float64", RunRequest(STEPS // 10, "euler", 250), ["native"])
 
 
 def agree(name, dtype, run, asked):
@@ -78,7 +77,7 @@ def agree(name, dtype, run, asked):
     assert np.any(~ok), expected.status
     scenario, varied, folds, dt = arguments
     taken = {
-        execute.chosen_backend(backend, scenario, varied, folds, dt, method=run.method)
+        compile_batch(run._replace(backend=backend), scenario, varied, folds, dt).executor
         for backend in asked
     }
     for backend in sorted(taken - {"vmap"}):  # xla leaves arms of many joints to vmap

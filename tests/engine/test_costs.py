@@ -28,7 +28,7 @@ import pytest
 
 import iblf_jax as ij
 from iblf_jax import barriers, bounds, controllers, observers, references
-from iblf_jax.engine import native
+from iblf_jax.kernels import cpu
 
 FILE = Path(__file__).parents[1] / "data" / "costs.json"
 
@@ -123,7 +123,7 @@ otherwise."""
 def count_of(call: str) -> dict[str, int]:
     """What a first call makes, in this process, which must be a fresh one."""
     traced, sources = [], []
-    mass_matrix, built = ij.robots.TwoLink.mass_matrix, native.built
+    mass_matrix, built = ij.robots.TwoLink.mass_matrix, cpu.built
 
     def counted_matrix(self, q):
         traced.append(q.shape)
@@ -136,7 +136,7 @@ def count_of(call: str) -> dict[str, int]:
     paper = ij.presets.zhang_yan_2024()
     with tempfile.TemporaryDirectory() as folder:
         jax.config.update("jax_dump_ir_to", folder)
-        ij.robots.TwoLink.mass_matrix, native.built = counted_matrix, counted_source
+        ij.robots.TwoLink.mass_matrix, cpu.built = counted_matrix, counted_source
         CALLS[call](paper)
         programs = [path.read_text() for path in Path(folder).glob("*.mlir")]
     return {

@@ -15,10 +15,11 @@ import pytest
 import iblf_jax as ij
 from iblf_jax.core import programs
 from iblf_jax.core.status import Status
-from iblf_jax.engine import execute, machine_function, plan
+from iblf_jax.engine import compile, machine_function, plan, registry
 from iblf_jax.engine.batch import Batch, run_all
 from iblf_jax.engine.executors import checkpointed, scan
-from iblf_jax.engine.step import Inputs, Run
+from iblf_jax.engine.request import RunRequest
+from iblf_jax.engine.step import Inputs
 from iblf_jax.simulation import stability
 from iblf_jax.simulation.integrators import TABLEAUS, Tableau
 from iblf_jax.simulation.metrics import as_folds
@@ -61,7 +62,7 @@ def assert_same(one, other):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "run",
-    [Run(50, "heun", 7), Run(50, "euler", 1), Run(50, "euler")],
+    [RunRequest(50, "heun", 7), RunRequest(50, "euler", 1), RunRequest(50, "euler")],
     ids=lambda run: f"{run.method}-{run.record_every}",
 )
 def test_every_shape_is_the_same_run(short_loop, run):
@@ -83,15 +84,18 @@ def test_every_shape_is_the_same_run(short_loop, run):
     )
     assert_same(jax.tree.map(lambda x: x[0], together), first)
     shapes = (
-        plan.Shape("in turn", "parts", True),
-        plan.Shape("together", "parts", False),
-        plan.Shape("together", "none", True),
+        plan.BatchLayout("map", "parts", True),
+        plan.BatchLayout("vmap", "parts", False),
+        plan.BatchLayout("vmap", "none", True),
     )
     for shape in shapes[:1] if run.record_every == 1 else shapes:
         assert_same(outcome(inputs, run, shape, DRAWS), together)
     whole = jax.jit(
-        lambda inputs: execute._scanned(
-            inputs, None, False, lambda batch: run_all(scan, batch, run)
+        lambda inputs: compile.scanned(
+            plan.BatchLayout("vmap", "loop", True),
+            inputs,
+            None,
+            lambda batch: run_all(scan, batch, run),
         )
     )(inputs)
     assert_same(jax.tree.map(np.asarray, whole), alone)
@@ -113,20 +117,22 @@ def test_any_explicit_method_is_a_row_of_the_table(short_loop, monkeypatch):
         (1.0, -3.0, 3.0, -1.0),
     )
     monkeypatch.setitem(TABLEAUS, "kutta", kutta)
-    inputs, run = inputs_of(short_loop), Run(50, "kutta", 10)
+    inputs, run = inputs_of(short_loop), RunRequest(50, "kutta", 10)
     written_out, rolled = (
-        outcome(inputs, run, plan.Shape("together", "none", loop)) for loop in (False, True)
+        outcome(inputs, run, plan.BatchLayout("vmap", "none", loop)) for loop in (False, True)
     )
     lowered = outcome(
         inputs,
         run,
         varied={"initial.q": inputs.scenario.initial.q[None]},
-        executor=execute.executor_named("xla"),
+        executor=compile.loop_of(registry.EXECUTORS["xla"]),
     )
     assert_same(written_out, rolled)
     assert_same(jax.tree.map(lambda x: x[0], lowered), written_out)
     off = np.max(
-        np.abs(written_out.records[0]["q"] - outcome(inputs, Run(50, "rk4", 10)).records[0]["q"])
+        np.abs(
+            written_out.records[0]["q"] - outcome(inputs, RunRequest(50, "rk4", 10)).records[0]["q"]
+        )
     )
     assert 0 < off < 1e-6
 
@@ -135,9 +141,10 @@ def test_any_explicit_method_is_a_row_of_the_table(short_loop, monkeypatch):
 def test_a_state_frozen_at_the_last_step_is_no_flag(paper):
     """The step from the last instant, which is not made, says nothing."""
     fast = inputs_of(ij.with_parameters(paper, {"controller.K2": 1e4}), steps=1)
-    assert not outcome(fast, Run(1, "euler")).status & Status.NOT_FINITE
+    assert not outcome(fast, RunRequest(1, "euler")).status & Status.NOT_FINITE
     assert (
-        outcome(fast._replace(steps=jnp.asarray(40.0)), Run(40, "euler")).status & Status.NOT_FINITE
+        outcome(fast._replace(steps=jnp.asarray(40.0)), RunRequest(40, "euler")).status
+        & Status.NOT_FINITE
     )
 
 
@@ -146,7 +153,7 @@ def test_long_loops_are_machine_functions_in_parts(paper, monkeypatch):
     """By their length alone; a batch from outside and derivatives work as ever."""
     before = ij.simulate(paper, duration=0.011, dt=1e-3)
     monkeypatch.setattr(plan, "LONG_EVALUATION", 0)
-    execute._way_of_one.cache_clear()
+    compile.plan_of_single_run.cache_clear()
     try:
 
         def ise(K2):
@@ -162,7 +169,7 @@ def test_long_loops_are_machine_functions_in_parts(paper, monkeypatch):
         slope = jax.grad(ise)(K2)
         values = jax.vmap(ise)(K2[:, None] * jnp.ones(2))
     finally:
-        execute._way_of_one.cache_clear()
+        compile.plan_of_single_run.cache_clear()
     np.testing.assert_allclose(before.q, compact.q, rtol=0, atol=1e-12)
     step = 1e-3
     for i in range(2):
@@ -192,19 +199,27 @@ def test_stretches_are_whole_records(steps, every):
 def test_what_the_plan_says():
     """A short loop alone is one machine function, a long one goes in parts and in turn, and a
     caller's own batch is XLA's."""
-    assert plan.scan_shape("cpu", 700, None, False) == ("together", "whole", True)
-    assert plan.scan_shape("cpu", 700, 1000, False) == ("together", "none", False)
-    assert plan.scan_shape("cpu", 10_000, 1000, False) == ("in turn", "parts", True)
-    assert plan.scan_shape("cpu", 700, None, True) == ("together", "none", False)
-    assert plan.scan_shape("gpu", 10_000, None, False) == ("together", "none", True)
-    assert (
-        plan.executors_for("auto", "cpu")
-        == plan.executors_for("native", "cpu")
-        == ("native", "xla")
-    )
-    assert plan.executors_for("auto", "gpu") == ("gpu", "xla")
-    assert plan.executors_for("auto", "tpu") == plan.executors_for("xla", "cpu") == ("xla",)
-    assert plan.executors_for("vmap", "cpu") == ()
+    assert plan.scan_layout("cpu", 700, None, False) == ("vmap", "loop", True)
+    assert plan.scan_layout("cpu", 700, 1000, False) == ("vmap", "none", False)
+    assert plan.scan_layout("cpu", 10_000, 1000, False) == ("map", "parts", True)
+    assert plan.scan_layout("cpu", 700, None, True) == ("vmap", "none", False)
+    assert plan.scan_layout("gpu", 10_000, None, False) == ("vmap", "none", True)
+    cpu = executors_of("cpu")
+    assert cpu("auto") == cpu("native") == ("native", "xla")
+    assert executors_of("gpu")("auto") == ("gpu", "xla")
+    assert executors_of("tpu")("auto") == cpu("xla") == ("xla",)
+    assert cpu("vmap") == ()
+
+
+def executors_of(platform):
+    """Backend -> the executors of the plan of a batch of 1000 runs on a platform."""
+    found = registry.Machine(platform, registry.executors_for(platform), "xla")
+
+    def executors(backend):
+        request = RunRequest(100, backend=backend)
+        return plan.choose_plan(request, plan.Sizes(700, 1000), found).executors
+
+    return executors
 
 
 def test_the_length_of_a_function_is_that_of_its_inner_ones():

@@ -18,9 +18,8 @@ from iblf_jax.engine import execute, plan
 from iblf_jax.engine.batch import Batch
 from iblf_jax.engine.executors import program_of
 from iblf_jax.engine.mechanism import mechanism_of
-from iblf_jax.engine.step import Carry, Form, Inputs, Run, TimeStep
-from iblf_jax.kernels.passes import written_out
-from iblf_jax.kernels.program import LANE, TIME
+from iblf_jax.engine.step import Carry, Inputs, Run, StepOptions, TimeStep
+from iblf_jax.kernels import PER_RUN, TIME, written_out
 from iblf_jax.simulation.paths import get, with_parameters
 from iblf_jax.simulation.scenario import canonical
 
@@ -60,7 +59,7 @@ def batch_of(scenario, varied=(), known=True) -> tuple[Batch, Carry]:
     leaves = {path: jnp.asarray(get(scenario, path))[None] for path in ("initial.q", *varied)}
     inputs = Inputs(scenario, STANDARD, jnp.asarray(DT), jnp.asarray(10.0))
     carries = carry_of(inputs, {"initial.q": leaves["initial.q"]}, "euler")
-    return Batch.of(inputs, leaves, mechanism=mechanism_of(scenario) if known else None), carries
+    return Batch.of(inputs, leaves, constants=mechanism_of(scenario) if known else None), carries
 
 
 def lowered(*case):
@@ -71,13 +70,13 @@ def lowered(*case):
 
 @jax.jit
 def by_jax(inputs, carry, index):
-    return jax.tree.leaves(STEP(inputs, carry, index, Form())[0])
+    return jax.tree.leaves(STEP(inputs, carry, index, StepOptions())[0])
 
 
 def both(scenario, varied=()):
     """What a step gives by its program and by JAX."""
     batch, carries, program = lowered(scenario, varied)
-    carry, lane = (jax.tree.map(lambda x: x[0], x) for x in (carries, batch.leaves.lane))
+    carry, lane = (jax.tree.map(lambda x: x[0], x) for x in (carries, batch.leaves.per_run))
     inputs = batch.leaves.together(batch.leaves.shared, lane)
     values = (numbers(x) for x in (batch.leaves.shared, lane, jax.tree.leaves(carry)))
     index = jnp.int32(3)
@@ -85,7 +84,7 @@ def both(scenario, varied=()):
 
 
 def moving(program) -> int:
-    return sum(program.counts()[LANE | TIME].values())
+    return sum(program.counts()[PER_RUN | TIME].values())
 
 
 def test_a_mechanism_of_right_angles_saves_a_fifth_of_the_operations_of_two_joints():
@@ -119,7 +118,7 @@ def test_what_differs_between_runs_is_never_compiled_in(path):
     carry = jax.tree.map(lambda x: x[0], carries)
     moved = [
         x[0] + 0.01 * np.cos(1.0 + np.arange(x[0].size).reshape(x[0].shape))
-        for x in batch.leaves.lane
+        for x in batch.leaves.per_run
     ]
     inputs = batch.leaves.together(batch.leaves.shared, moved)
     values = (numbers(x) for x in (batch.leaves.shared, moved, jax.tree.leaves(carry)))

@@ -10,7 +10,7 @@ from pathlib import Path
 import jax
 
 from iblf_jax.engine import gpu
-from iblf_jax.kernels import toolchain
+from iblf_jax.kernels import cuda, toolchain
 from iblf_jax.kernels.emit_c import CUDA, source
 
 FOLDER = Path(__file__).parent
@@ -36,7 +36,7 @@ def kernel(
     program, shared: int, lane: int, flags: tuple[str, ...] = (), image: bytes = IMAGE
 ) -> str:
     """As `gpu.kernel`, for the platform of the tests."""
-    launcher = gpu.launcher(program, shared, lane, image) + text("cuda_stream.h")
+    launcher = cuda.launcher(program, shared, lane, image) + text("cuda_stream.h")
     library, key = toolchain.built(
         launcher, (f'-DDRIVER="{driver(program, shared, lane, flags)}"',)
     )

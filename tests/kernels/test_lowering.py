@@ -14,10 +14,11 @@ import pytest
 from arm_cases import random_arm
 
 import iblf_jax as ij
-from iblf_jax.engine import execute, plan
+from iblf_jax.core.caches import CACHE
+from iblf_jax.engine import compile, execute, plan
 from iblf_jax.engine.batch import Batch, carry_shapes
 from iblf_jax.engine.executors import program_of
-from iblf_jax.engine.step import Form, Inputs, Run, TimeStep, start
+from iblf_jax.engine.step import Inputs, Run, StepOptions, TimeStep, start
 from iblf_jax.kernels import passes, program
 from iblf_jax.kernels.from_jaxpr import closed
 from iblf_jax.kernels.operations import OPERATIONS
@@ -126,7 +127,7 @@ def carry_of(inputs, varied, method):
 def evaluate(p: program.Program, shared, lane, carry, index):
     """The outputs of a program by NumPy, node by node."""
     known = []
-    inputs = {"shared": shared, "lane": lane, "carry": carry}
+    inputs = {"shared": shared, "per_run": lane, "carry": carry}
     with np.errstate(all="ignore"):
         for node in p.nodes:
             args = [known[a] for a in node.args]
@@ -161,10 +162,12 @@ def test_every_member_lowers_and_its_program_is_its_step(family, name, monkeypat
     whole, step = Inputs(scenario, STANDARD, dt, jnp.asarray(10.0)), TimeStep("heun")
     run, carries = Batch.of(whole, varied), carry_of(whole, varied, "heun")
     carry = jax.tree.map(lambda x: x[0], carries)
-    inputs = run.leaves.together(run.leaves.shared, [x[0] for x in run.leaves.lane])
+    inputs = run.leaves.together(run.leaves.shared, [x[0] for x in run.leaves.per_run])
     p, _ = program_of(step, run, carries)
     expected = numbers(
-        jax.tree.leaves(jax.jit(lambda c: step(inputs, c, index, Form(rolled=True))[0])(carry))
+        jax.tree.leaves(
+            jax.jit(lambda c: step(inputs, c, index, StepOptions(rolled=True))[0])(carry)
+        )
     )
     monkeypatch.setattr(plan, "LIMITS", plan.LIMITS._replace(written_out=10))
     called, _ = program_of(step, run, carries)
@@ -174,7 +177,7 @@ def test_every_member_lowers_and_its_program_is_its_step(family, name, monkeypat
         found = evaluate(
             written_out(each),
             numbers(run.leaves.shared),
-            numbers(x[0] for x in run.leaves.lane),
+            numbers(x[0] for x in run.leaves.per_run),
             numbers(jax.tree.leaves(carry)),
             index,
         )
@@ -433,7 +436,7 @@ def test_classes_of_a_program():
     shapes = Shapes.of(flat, 1)
     classes = p.classes()
     sines = [c for c, node in zip(classes, p.nodes, strict=True) if node.op == "sin"]
-    assert sines.count(program.LANE | program.TIME) <= 8 < sines.count(program.TIME), (
+    assert sines.count(program.PER_RUN | program.TIME) <= 8 < sines.count(program.TIME), (
         "signals of time belong to no run"
     )
     assert len(p.carry) == shapes.size
@@ -451,14 +454,14 @@ class _Odd(ij.observers.NoObserver):
 def test_a_step_that_does_not_lower_runs_on_vmap_and_says_so():
     scenario = canonical(dataclasses.replace(PRESET, observer=_Odd()))
     varied = {"plant.mass[1]": jnp.asarray([0.8, 0.9])}
-    execute._told.clear()
+    CACHE.clear(compile.WARNINGS)
 
     def run():
         return jax.jit(
             lambda: execute.run_batch(scenario, varied, (), jnp.asarray(DT), Run(3, "euler"))
         )()
 
-    with pytest.warns(execute.BackendWarning, match="vmap.*'sort'"):
+    with pytest.warns(compile.BackendWarning, match="vmap.*'sort'"):
         outcome = run()
     assert outcome.status.shape == (2,)
     with warnings.catch_warnings():

@@ -14,14 +14,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from fallback import with_fallback
 from made_up_runs import ALWAYS
 from test_toolchain import ZIG_CACHE, ziglang_script
 
 import iblf_jax as ij
-from iblf_jax.engine import execute, executors, native, plan
+from iblf_jax.core.caches import CACHE
+from iblf_jax.engine import compile, execute, executors, native, plan
 from iblf_jax.engine.batch import Batch
 from iblf_jax.engine.step import Inputs, Run, TimeStep, start
-from iblf_jax.kernels import directory, packed, toolchain
+from iblf_jax.kernels import cpu, directory, packed, toolchain
 from iblf_jax.kernels.toolchain import ToolchainError
 from iblf_jax.simulation.metrics import as_folds, standard
 from iblf_jax.simulation.scenario import canonical
@@ -110,14 +112,14 @@ def test_every_compiler_gives_the_same_numbers(tmp_path, monkeypatch, recorded_s
     monkeypatch.setenv("CXX", ziglang_script(tmp_path) if family == "ziglang" else family)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     steps, values, expected = recorded_steps
-    native.kernel.cache_clear()
+    cpu.kernel.cache_clear()
     compiled = jax.jit(partial(steps, executors.lowered_on(native.run)))
     found = jax.tree.map(np.asarray, compiled(values))
     assert_same(found, jax.tree.map(np.asarray, expected), 1e-12)
     fewer = jax.tree.map(np.asarray, compiled({k: v[2:] for k, v in values.items()}))
     for x, y in zip(jax.tree.leaves(fewer), jax.tree.leaves(found), strict=True):
         np.testing.assert_array_equal(x, y[2:])
-    native.kernel.cache_clear()
+    cpu.kernel.cache_clear()
 
 
 @pytest.mark.slow
@@ -294,19 +296,19 @@ def test_rows_of_another_size_are_an_error_and_no_crash():
         [jax.ShapeDtypeStruct((n, 4), t) for n, t in ((2, jnp.float64), (0, jnp.int32))],
     )
     with pytest.raises(jax.errors.JaxRuntimeError, match="does not fit"):
-        jax.block_until_ready(jax.ffi.ffi_call(native._turner("pack"), rows)(leaf))
+        jax.block_until_ready(jax.ffi.ffi_call(cpu.rows_function("pack"), rows)(leaf))
     with pytest.raises(jax.errors.JaxRuntimeError, match="without an array"):
         jax.block_until_ready(
             jax.ffi.ffi_call(
-                native._turner("pack"), [jax.ShapeDtypeStruct((5, 4), jnp.float64), rows[1]]
+                cpu.rows_function("pack"), [jax.ShapeDtypeStruct((5, 4), jnp.float64), rows[1]]
             )(leaf)
         )
 
 
 def forget_kernels():
     """What this process knows of kernels and their text."""
-    native.kernel.cache_clear()
-    native._text.cache_clear()
+    cpu.kernel.cache_clear()
+    cpu.c_source.cache_clear()
 
 
 @pytest.mark.slow
@@ -369,16 +371,16 @@ def test_forward_sensitivities(monkeypatch, written_out):
 
 def test_without_a_compiler_it_runs_on_xla_with_one_warning(monkeypatch):
     monkeypatch.setenv("CXX", "no-such-compiler")
-    monkeypatch.setattr(execute, "_told", set())
-    native.kernel.cache_clear()
+    CACHE.clear(compile.WARNINGS)
+    cpu.kernel.cache_clear()
     called = []
-    with pytest.warns(execute.BackendWarning, match="no-such-compiler.*xla"):
-        execute.with_fallback(
+    with pytest.warns(compile.BackendWarning, match="no-such-compiler.*xla"):
+        with_fallback(
             "auto", lambda name: called.append(name) or fail_if_native(name), lambda: None
         )
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        execute.with_fallback("auto", fail_if_native, lambda: None)
+        with_fallback("auto", fail_if_native, lambda: None)
     assert called == ["native", "xla"]
 
 

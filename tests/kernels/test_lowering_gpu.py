@@ -18,11 +18,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from fallback import with_fallback
 from test_lowering import DT, MEMBERS, STANDARD, carry_of, evaluate, with_member
 from test_lowering_backends import TOLERANCE, assert_same, draws, needs_compiler
 
 import iblf_jax as ij
-from iblf_jax.engine import execute, gpu, plan
+from iblf_jax.core.caches import CACHE
+from iblf_jax.engine import compile, execute, gpu, plan, registry
 from iblf_jax.engine.batch import Batch
 from iblf_jax.engine.derivatives import Directions, run_with_tangents
 from iblf_jax.engine.executors import lowered_on, program_of
@@ -45,7 +47,7 @@ def _has_nvrtc() -> bool:
     return True
 
 
-pytestmark = pytest.mark.filterwarnings("error::iblf_jax.engine.execute.BackendWarning")
+pytestmark = pytest.mark.filterwarnings("error::iblf_jax.engine.compile.BackendWarning")
 ON_A_GPU = jax.default_backend() == "gpu"
 needs_a_cpu = pytest.mark.skipif(ON_A_GPU, reason="what happens without a GPU")
 run_program = gpu.run if ON_A_GPU else gpu_on_cpu.run
@@ -61,7 +63,7 @@ def step_of(scenario, varied, folds=STANDARD, method="euler", dtype="float64"):
     of, carry = Batch.of(inputs, varied), carry_of(inputs, varied, method)
     program, _ = program_of(TimeStep(method), of, carry)
     shared = jnp.concatenate([jnp.ravel(x) for x in of.leaves.shared])
-    lane = pack(of.leaves.lane, Shapes.of(of.leaves.lane, 1), dtype, of.runs).floats
+    lane = pack(of.leaves.per_run, Shapes.of(of.leaves.per_run, 1), dtype, of.runs).floats
     flat = jax.tree.leaves(carry)
     return program, shared, lane, pack(flat, Shapes.of(flat, 1), dtype, of.runs)
 
@@ -97,14 +99,20 @@ def test_the_kernel_of_every_member_does_what_its_program_says(family, name):
     np.testing.assert_array_equal(ints, expected[layout.ints])
 
 
+def gpu_for_this_platform(monkeypatch, **changes):
+    """The gpu executor is the one that compiles kernels for CPUs."""
+    gpu_record = registry.EXECUTORS["gpu"]._replace(platforms=("cpu",), **changes)
+    executors = {"gpu": gpu_record, "xla": registry.EXECUTORS["xla"]}
+    monkeypatch.setattr(registry, "EXECUTORS", executors)
+
+
 @pytest.fixture
 def runs_here(monkeypatch):
     """The gpu backend runs here, in stretches of 64 steps, on a CPU in blocks of 32 threads."""
     monkeypatch.setattr(plan, "GPU_STRETCH", 64)
-    monkeypatch.setattr(execute, "_told", set())
+    CACHE.clear(compile.WARNINGS)
     if not ON_A_GPU:
-        monkeypatch.setattr(gpu, "run", gpu_on_cpu.run)
-        monkeypatch.setattr(plan, "COMPILED", {"cpu": "gpu"})
+        gpu_for_this_platform(monkeypatch, run=gpu_on_cpu.run)
 
 
 def outcome(dtype, backend, values, steps=200, record_every=None):
@@ -293,16 +301,16 @@ def test_threads_in_a_block(runs, threads):
 
 @needs_a_cpu
 def test_without_a_gpu_it_runs_on_xla_with_one_warning(monkeypatch):
-    monkeypatch.setattr(execute, "_told", set())
+    CACHE.clear(compile.WARNINGS)
     called = []
     with pytest.warns(
-        execute.BackendWarning,
+        compile.BackendWarning,
         match="gpu backend is not for the default device, cpu: running on xla",
     ):
-        execute.with_fallback("gpu", called.append, lambda: None)
+        with_fallback("gpu", called.append, lambda: None)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        execute.with_fallback("gpu", called.append, lambda: None)
+        with_fallback("gpu", called.append, lambda: None)
     assert called == ["xla"] * 2
 
 
@@ -313,7 +321,7 @@ def test_explain_says_what_a_batch_runs_on(paper, monkeypatch):
     assert "a batch runs on native\n" in told and told.endswith(
         "on native, one run a number, first and second ones; others by plain JAX"
     )
-    monkeypatch.setattr(plan, "COMPILED", {"cpu": "gpu"})
+    gpu_for_this_platform(monkeypatch)
     told = repr(ij.explain(paper))
     assert (
         "a batch runs on xla: it needs an NVIDIA GPU, not cpu\n" in told
@@ -326,24 +334,22 @@ def test_auto_on_a_gpu_without_nvrtc_runs_on_xla(monkeypatch):
     def missing(*_):
         raise ToolchainError("there is no NVRTC")
 
-    monkeypatch.setattr(execute, "_told", set())
+    CACHE.clear(compile.WARNINGS)
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(gpu, "architecture", lambda: "sm_90")
     monkeypatch.setattr(nvrtc, "library", missing)
-    assert execute.automatic() == ("xla", "there is no NVRTC")
+    assert registry.automatic() == ("xla", "there is no NVRTC")
     with pytest.warns(
-        execute.BackendWarning,
+        compile.BackendWarning,
         match="gpu backend is not available .there is no NVRTC.: running on xla",
     ):
         assert (
-            execute.with_fallback(
-                "auto", lambda name: missing() if name == "gpu" else name, lambda: None
-            )
+            with_fallback("auto", lambda name: missing() if name == "gpu" else name, lambda: None)
             == "xla"
         )
     monkeypatch.setattr(nvrtc, "library", lambda: None)
     monkeypatch.setattr(gpu, "compiler", lambda: None)
-    assert execute.automatic() == ("gpu", None)
+    assert registry.automatic() == ("gpu", None)
 
 
 @needs_a_cpu
@@ -359,7 +365,7 @@ def test_the_default_device_decides_on_a_machine_with_a_gpu(paper, monkeypatch):
         ij.monte_carlo(paper, perturbations, runs=3, duration=0.05, devices=jax.devices("cpu"))
     monkeypatch.setattr(jax, "local_devices", lambda **_: pytest.fail("these would be GPUs"))
     with jax.default_device(jax.devices("cpu")[0]):
-        assert execute.automatic() == ("native", None)
+        assert registry.automatic() == ("native", None)
         run = ij.simulate(paper, duration=0.05, dt=1e-3)
         study = ij.monte_carlo(paper, perturbations, runs=600, duration=0.05, dt=1e-3)
     assert study.backend == "native"
@@ -447,7 +453,7 @@ def test_what_nvrtc_refuses_is_reported_in_one_line():
 @needs_compiler
 def test_the_kernel_is_registered_for_cuda_and_called_with_its_attributes(paper, monkeypatch):
     monkeypatch.setattr(gpu, "architecture", lambda: "sm_90")
-    monkeypatch.setattr(plan, "COMPILED", {"cpu": "gpu"})
+    gpu_for_this_platform(monkeypatch)
     scenario, dt, varied = (
         canonical(paper),
         jnp.asarray(DT),

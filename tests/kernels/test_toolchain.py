@@ -20,12 +20,14 @@ import jax
 import numpy as np
 import pytest
 from conftest import ROOT
+from fallback import with_fallback
 from jax.experimental.compilation_cache.compilation_cache import reset_cache
 
 from iblf_jax import cli
 from iblf_jax.core import devices
 from iblf_jax.core.cache import _reloads_badly, keep_programs
-from iblf_jax.engine import execute, native
+from iblf_jax.core.caches import CACHE
+from iblf_jax.engine import compile, native
 from iblf_jax.kernels import directory, drafts, nvrtc, processor, toolchain
 from iblf_jax.kernels.toolchain import ToolchainError
 
@@ -50,7 +52,7 @@ def filled(tmp_path_factory):
     folder = tmp_path_factory.mktemp("filled")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(folder))
-        patch.setattr(toolchain, "_libraries", {})
+        patch.setattr(toolchain.CACHES, "libraries", {})
         assert [value(), value(OTHER)] == [41, 42]
         return folder, toolchain.built(SOURCE)[0].name
 
@@ -59,7 +61,7 @@ def filled(tmp_path_factory):
 def cache(tmp_path, monkeypatch):
     """An empty cache of its own."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(toolchain, "_libraries", {})  # as in another process
+    monkeypatch.setattr(toolchain.CACHES, "libraries", {})  # as in another process
     return tmp_path / "cache" / "iblf_jax"
 
 
@@ -146,7 +148,7 @@ def test_what_was_checked_is_loaded(library):
         file.truncate(100)  # a library that was mapped from this file would now kill with SIGBUS
     assert loaded.value() == 41
     assert toolchain.loaded(library) is loaded
-    toolchain._libraries.clear()
+    toolchain.CACHES.libraries.clear()
     with pytest.raises(ToolchainError, match="damaged"):
         toolchain.loaded(library)
 
@@ -565,10 +567,10 @@ def falls_back(work):
             work()
         return name
 
-    with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings(record=True) as said:
+    with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
-        patch.setattr(execute, "_told", set())
-        assert execute.with_fallback("native", run_on, lambda: None) == "xla"
+        CACHE.clear(compile.WARNINGS)
+        assert with_fallback("native", run_on, lambda: None) == "xla"
     (line,) = [str(x.message) for x in said]
     assert line.endswith("running on xla.")
     assert "\n" not in line

@@ -32,7 +32,7 @@ from iblf_jax import barriers, bounds, cli, robots
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import is_leaf_field
 from iblf_jax.core.status import Status
-from iblf_jax.engine import simulate
+from iblf_jax.engine import CompiledBatch, simulate
 from iblf_jax.files.components import decode_fields
 from iblf_jax.simulation import metrics, paths
 from iblf_jax.simulation.results import Metrics
@@ -269,7 +269,7 @@ def test_no_silent_nan_in_a_run(paper, values):
     """Any numbers in any leaves: refused, or run; a run that is not finite says so, and its records
     are finite up to there."""
     # The step that a warning names takes longer to find than the run; other tests look at it.
-    with mock.patch("iblf_jax.engine.simulate.find_dt", return_value=1e-4):
+    with mock.patch("iblf_jax.engine.diagnosis.find_dt", return_value=1e-4):
         run = accepts_or_value_error(
             lambda: ij.simulate(ij.with_parameters(paper, values), **SHORT)
         )
@@ -382,26 +382,27 @@ ENTRIES = {
             "objective": GOAL,
             "runs": 1,
             "seed": 0,
-            "resample": False,
-            "starts": 1,
-        }
-        | {
-            "sharpenings": 2,
             "iterations": 2,
-            "tolerance": 1e-5,
-            "patience": 3,
-            "report_runs": 4,
-            "report_seed": None,
-            "confidence": 0.9,
+            "solver": None,
+            "report": None,
         }
         | {
             "checkpoint": None,
-            "callback": None,
             "risk": "mean",
             "perturbations": None,
             "progress": False,
         },
     ),
+    "SQP": (
+        ij.tuning.SQP,
+        {"tolerance": 1e-5, "starts": 1, "sharpenings": 2, "patience": 3, "radius": None},
+    ),
+    "LBFGS": (ij.tuning.LBFGS, {"memory": 10, "line_steps": 12, "mode": "auto"}),
+    "Adam": (
+        ij.tuning.Adam,
+        {"learning_rate": 0.1, "schedule": "cosine", "resample": False, "mode": "auto"},
+    ),
+    "tuning.Report": (ij.tuning.Report, {"runs": 4, "seed": None, "confidence": 0.9}),
     "pareto": (
         ij.pareto,
         {
@@ -455,15 +456,16 @@ def no_runs(monkeypatch):
         "engine.simulate.run_one",
         "studies.blocks._execute",
         "studies.setup._execute",
-        "tuning.problem.rollouts",
-        "tuning.problem.slope",
-        "tuning.problem.gradient",
-        "tuning._falsify._push",
+        "tuning.evaluation.rollouts",
+        "tuning.search.Evaluator.__call__",
+        "tuning._falsify._margins",
         "engine.explain.instructions",
         "certificates._certify._certificate_of",
     ):
         monkeypatch.setattr(f"iblf_jax.{place}", entered)
-    monkeypatch.setattr("iblf_jax.studies.blocks.chosen_backend", lambda *_, **__: "xla")
+    monkeypatch.setattr(
+        "iblf_jax.studies.blocks.compile_batch", lambda request, *_: CompiledBatch(request, "xla")
+    )
 
 
 @pytest.mark.parametrize("entry", ENTRIES)

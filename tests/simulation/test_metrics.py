@@ -168,7 +168,7 @@ def test_access_by_name_and_by_attribute(short_run):
         _ = metrics.nothing
 
 
-# -------------------------------------------------------------------------------------------- integrals are of second order
+# --- integrals are of second order -----------------------------------------------
 
 SLOW = ij.with_parameters(
     ij.presets.zhang_yan_2024(reading="corrected"), {"controller.K2": 4.0, "observer.kf": 4.0}

@@ -20,7 +20,7 @@ from iblf_jax.tuning import quantities
 from iblf_jax.tuning.objectives import for_scenario
 from iblf_jax.tuning.quantities import MetricResult, Quantities
 
-TUNING = {"duration": 0.5, "dt": 1e-3, "report_runs": 1}
+TUNING = {"duration": 0.5, "dt": 1e-3, "report": ij.tuning.Report(runs=1)}
 
 
 @ij.component
@@ -291,7 +291,7 @@ def test_a_term_without_a_scale_that_is_zero_at_the_start(paper):
     )
 
 
-# ------------------------------------------------------------------------------------ which joints, weights, limits of each
+# ------------------------------------------------------------ which joints, weights, limits of each
 
 
 def exact(objective, run):
@@ -351,8 +351,8 @@ def test_joints_selects_joints_everywhere(joints, expected, three_joints):
     # The integrals are those of a run in which the other joints stand still.
     chosen = np.isin(np.arange(3), expected).astype(float)
     others = dataclasses.replace(run, e1=run.e1 * chosen, tau=run.tau * chosen)
-    wanted = exact(o.tracking() + o.effort() + o.metric(ij.metrics.Tracking(), "iae"), others)
-    np.testing.assert_allclose(found[:3], wanted, rtol=1e-10)
+    separate = exact(o.tracking() + o.effort() + o.metric(ij.metrics.Tracking(), "iae"), others)
+    np.testing.assert_allclose(found[:3], separate, rtol=1e-10)
 
 
 def test_limits_of_single_joints_and_weights(three_joints):

@@ -1,6 +1,7 @@
 """Gain tuning: derivatives, objectives, coordinates, the loop, and the truth of its report."""
 
 import dataclasses
+import inspect
 import itertools
 import os
 import signal
@@ -21,6 +22,7 @@ from iblf_jax.engine.batch import Batch, carry_shapes
 from iblf_jax.engine.step import Inputs, Run
 from iblf_jax.engine.step_size import fastest_along
 from iblf_jax.engine.transformable import run_transformable
+from iblf_jax.files.tuning import load_tuning_file
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.metrics import standard
 from iblf_jax.simulation.scenario import canonical
@@ -67,7 +69,7 @@ def central(f, z, h=1e-5):
     return np.stack([(f(z + h * e) - f(z - h * e)) / (2 * h) for e in np.eye(len(z))])
 
 
-# ---------------------------------------------------------------------------------------------------------------- derivatives
+# -------------------------------------------------------------------------------------- derivatives
 
 
 @pytest.mark.slow
@@ -136,7 +138,7 @@ def test_reverse_mode_remembers_few_states(paper):
     assert sizes[4000] - sizes[500] < 2 * (np.sqrt(4000) - np.sqrt(500)) * state
 
 
-# ---------------------------------------------------------------------------------------------------------------- quantities
+# --------------------------------------------------------------------------------------- quantities
 
 
 @pytest.mark.slow
@@ -210,7 +212,7 @@ def test_risks():
         ij.cvar(1.0)
 
 
-# ---------------------------------------------------------------------------------------------------------------- coordinates
+# -------------------------------------------------------------------------------------- coordinates
 
 
 def test_bijections_keep_inside_and_invert():
@@ -239,16 +241,16 @@ def test_default_limits_keep_the_conditions_and_the_step(paper):
     run = ij.simulate(ij.with_parameters(paper, {"controller.K2": high[2:4]}), duration=0.2)
     assert run.ok
     assert 1e-3 * float(run.fastest_mode) > 1.2
-    # Together they keep to the same share of the step, which each alone would leave free to a
+    # Together they keep to the same share of the step, which each one would leave free to a
     # larger range.
     together = ij.with_parameters(
         paper, {b.path: high[b.start : b.start + b.size] for b in blocks[:3]}
     )
     mode = 1e-3 * fastest_along(canonical(together), TIMES)
     assert mode == pytest.approx(SHARE * tableau("rk4").stability, rel=0.01)
-    _, alone = layout(canonical(paper), ["controller.K2"], 1e-3, "rk4")
-    assert np.all(np.exp(alone.high) > 1.001 * high[2:4])
-    assert box.reasons[0] == (THEOREM, STEP + TOGETHER) and alone.reasons[0] == (THEOREM, STEP)
+    _, single = layout(canonical(paper), ["controller.K2"], 1e-3, "rk4")
+    assert np.all(np.exp(single.high) > 1.001 * high[2:4])
+    assert box.reasons[0] == (THEOREM, STEP + TOGETHER) and single.reasons[0] == (THEOREM, STEP)
     with pytest.raises(ValueError, match="do not overlap"):
         layout(canonical(paper), ["controller.K2", "controller.K2[0]"], 1e-3, "rk4")
     with pytest.raises(ValueError, match="Widen the limits"):
@@ -350,8 +352,8 @@ def test_curvature_is_kept_for_the_worst_pieces_of_many(monkeypatch):
 
 @pytest.mark.parametrize("sign", [1.0, -1.0], ids=["a slope", "a slope that points the wrong way"])
 def test_a_region_that_has_collapsed_is_no_optimum(sign):
-    """|z|^2 with its gradient, and with the opposite one: nothing is foretold there, however short
-    the step."""
+    """|z|^2 with its gradient, and with the opposite one: no decrease is predicted there, however
+    short the step."""
 
     def evaluate(z):
         value = Value(np.sum(z**2, axis=1))
@@ -452,7 +454,7 @@ def test_a_second_search_begins_elsewhere_and_the_better_goes_on():
     assert evaluate.evaluations == len(search.history["z"]) <= 40
 
 
-# ---------------------------------------------------------------------------------------------------------------- the loop
+# ----------------------------------------------------------------------------------------- the loop
 
 
 @pytest.mark.slow
@@ -486,12 +488,12 @@ def test_an_infeasible_start_finds_its_way_in(paper):
         paper, {"controller.k1": 0.3, "controller.K2": 1.0, "initial.dq": [10.0, 10.0]}
     )
     assert int(plain_status(weak)) & ij.Status.BOUND_VIOLATED
-    wanted = (
+    goal = (
         objectives.effort()
         + objectives.margin_above(0.06)
         + objectives.violation_probability_below(0.01)
     )
-    best = ij.tune(weak, ["controller.k1", "controller.K2"], wanted, iterations=60, **SHORT)
+    best = ij.tune(weak, ["controller.k1", "controller.K2"], goal, iterations=60, **SHORT)
     assert int(plain_status(best.scenario)) & ij.Status.BOUND_VIOLATED == 0
     assert best.report.passed, best.report
     assert best.report.margin[0] < 0 < 0.06 < best.report.margin[1]
@@ -499,10 +501,10 @@ def test_an_infeasible_start_finds_its_way_in(paper):
 
 @pytest.mark.slow
 def test_a_start_that_breaks_a_requirement_finds_its_way_in(paper):
-    """Nothing leaves the bounds, but the torque is too large: multipliers alone bring it in, just
-    so."""
-    wanted = objectives.tracking() + 0.05 * objectives.effort() + objectives.peak_torque_below(12.0)
-    best = ij.tune(paper, ["controller.k1", "controller.K2"], wanted, iterations=60, **SHORT)
+    """Nothing leaves the bounds, but the torque is too large: the multipliers make it feasible, and
+    just so."""
+    goal = objectives.tracking() + 0.05 * objectives.effort() + objectives.peak_torque_below(12.0)
+    best = ij.tune(paper, ["controller.k1", "controller.K2"], goal, iterations=60, **SHORT)
     assert best.report.verdicts[0].before.count == 1 and best.report.passed, best.report
     assert 11.0 < float(np.max(ij.simulate(best.scenario, **SHORT).metrics.peak_torque)) < 12.0
 
@@ -514,10 +516,10 @@ def test_a_multiplier_is_what_a_looser_limit_is_worth(paper):
     gains = ["controller.k1", "controller.K2"]
 
     def tuned(limit):
-        wanted = (
+        goal = (
             objectives.tracking() + 0.05 * objectives.effort() + objectives.peak_torque_below(limit)
         )
-        return ij.tune(paper, gains, wanted, solver=SQP(1e-7), **SHORT)
+        return ij.tune(paper, gains, goal, solver=SQP(1e-7), **SHORT)
 
     tight, best, loose = (tuned(9.0 * factor) for factor in (0.99, 1.0, 1.01))
     price = (tight.objective - loose.objective) / 0.18
@@ -534,9 +536,9 @@ def test_a_multiplier_is_what_a_looser_limit_is_worth(paper):
 
 @pytest.mark.slow
 def test_requirements_that_cannot_be_kept_are_named_with_how_much(paper):
-    """Gravity alone takes more than 2 N m.  Beside it, what else a reader is warned of."""
-    wanted = objectives.tracking() + 0.3 * objectives.effort() + objectives.peak_torque_below(2.0)
-    best = ij.tune(paper, ["controller.k1", "controller.K2"], wanted, **SHORT)
+    """Gravity takes more than 2 N m.  Beside it, what else a reader is warned of."""
+    goal = objectives.tracking() + 0.3 * objectives.effort() + objectives.peak_torque_below(2.0)
+    best = ij.tune(paper, ["controller.k1", "controller.K2"], goal, **SHORT)
     peak = float(np.max(ij.simulate(best.scenario, **SHORT).metrics.peak_torque))
     assert best.stopped == "the requirements cannot be kept together near these gains"
     assert f"fail; {peak:.5g} N m, {peak - 2:.3g} N m above the limit" in str(best.report)
@@ -780,7 +782,7 @@ def test_a_start_of_which_some_runs_are_too_stiff_says_how_many(nominal, monkeyp
         screened(perturbed, 0, nominal.box.z[None])
 
 
-# ---------------------------------------------------------------------------------------------------------------- robust
+# ------------------------------------------------------------------------------------------- robust
 
 
 @pytest.fixture(scope="module")
@@ -878,7 +880,144 @@ def test_common_random_numbers(paper):
     assert losses[0][0] == losses[0][1] == losses[1][0] != losses[2][0]
 
 
-# ---------------------------------------------------------------------------------------------------------------- resume
+# ---------------------------------------------------------------------------------- the options
+
+NAMES_OF_EARLIER_VERSIONS = {
+    "optimiser": "adam",
+    "mode": "forward",
+    "starts": 1,
+    "tolerance": 1e-4,
+    "patience": 5,
+    "sharpenings": 1,
+    "learning_rate": 0.2,
+    "resample": False,
+    "report_runs": 7,
+    "report_seed": 3,
+    "confidence": 0.9,
+}
+
+
+def test_signature_of_tune_is_short_and_solvers_fit_their_protocol():
+    parameters = inspect.signature(ij.tune).parameters.values()
+    assert len([x for x in parameters if x.kind is not x.VAR_KEYWORD]) <= 16
+    members = [name for name in vars(ij.tuning.Solver) if not name.startswith("_")]
+    assert {"init", "step", "converged"} <= set(members)
+    for name, solver in ij.tuning.SOLVERS.items():
+        assert solver.name == name
+        assert [member for member in members if not hasattr(solver(), member)] == []
+
+
+def test_keyword_arguments_of_earlier_versions_warn_and_mean_the_same(paper):
+    calls = []
+    with pytest.warns(DeprecationWarning, match="deprecated") as caught:
+        before = ij.tune(
+            paper,
+            ["controller.k1"],
+            objectives.tracking(),
+            iterations=2,
+            progress=False,
+            callback=calls.append,
+            **NAMES_OF_EARLIER_VERSIONS,
+            **SHORT,
+        )
+    text = " ".join(str(x.message) for x in caught)
+    for name in (*NAMES_OF_EARLIER_VERSIONS, "callback"):
+        assert f"The keyword argument {name} of ij.tune is deprecated" in text
+    assert all(x.filename == __file__ for x in caught)
+    after = ij.tune(
+        paper,
+        ["controller.k1"],
+        objectives.tracking(),
+        iterations=2,
+        solver=Adam(learning_rate=0.2, mode="forward", tolerance=1e-4, patience=5),
+        report=ij.tuning.Report(runs=7, seed=3, confidence=0.9),
+        progress=calls.append,
+        **SHORT,
+    )
+    np.testing.assert_array_equal(after.history["z"], before.history["z"])
+    reported = ("report_runs", "report_seed", "confidence")
+    assert [getattr(after.setup, x) for x in reported] == [7, 3, 0.9]
+    assert [getattr(before.setup, x) for x in reported] == [7, 3, 0.9]
+    assert before.optimiser == after.optimiser == "adam" and len(calls) == 4
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "words"),
+    [
+        ({"report_run": 3}, TypeError, "unexpected keyword argument 'report_run'.*report_runs"),
+        ({"solver": "newton"}, ValueError, "solver: got 'newton', expected one of 'auto', 'sqp'"),
+        ({"optimiser": "sgd"}, ValueError, "optimiser: got 'sgd', expected one of.*'newton'"),
+        ({"solver": SQP(), "starts": 2}, ValueError, "solver= and starts.*Put starts into solver"),
+        ({"optimiser": "newton", "mode": "reverse"}, ValueError, "LBFGS"),
+        ({"solver": object()}, ValueError, "a solver: one of 'sqp'.*It lacks"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_options_that_do_not_exist_or_fit_are_errors(paper, options, error, words):
+    with pytest.raises(error, match=words):
+        ij.tune(paper, ["controller.k1"], objectives.tracking(scale=1.0), **options, **SHORT)
+
+
+@dataclasses.dataclass(frozen=True)
+class Halving(Adam):
+    """A user's solver: Adam that halves its learning rate at each step, and always converges."""
+
+    name = "halving"
+
+    def step(self, evaluate, state, tolerance):
+        found = super().step(evaluate, state, tolerance)
+        state["rate"] = 0.5 * state["rate"]
+        return found
+
+    def converged(self, state):
+        return state["rate"] < 0.2
+
+
+def test_a_solver_of_the_users_own(paper):
+    best = ij.tune(paper, ["controller.k1"], objectives.tracking(), solver=Halving(), **SHORT)
+    assert (best.optimiser, best.stopped) == ("halving", "converged")
+    assert len(best.history["loss"]) == 3
+
+
+@pytest.mark.parametrize(
+    ("table", "expected"),
+    [
+        ('solver = "lbfgs"', {"solver": LBFGS()}),
+        ('[tune.solver]\nkind = "sqp"\nstarts = 4', {"solver": SQP(starts=4)}),
+        ("[tune.report]\nruns = 20\nseed = 5", {"report": ij.tuning.Report(20, 5)}),
+        ("report_runs = 20\nstarts = 4", {"report_runs": 20, "starts": 4}),
+    ],
+)
+def test_a_tuning_file_has_the_options_as_tables(tmp_path, table, expected):
+    file = tmp_path / "tune.toml"
+    file.write_text(
+        f'preset = "zhang_yan_2024"\n[tune]\nparameters = ["controller.k1"]\n{table}\n'
+        '[[objective]]\nkind = "tracking"\n'
+    )
+    arguments = load_tuning_file(file)
+    assert {name: arguments[name] for name in expected} == expected
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ('solver = "sgd"', "tune.solver.kind: got 'sgd', expected one of 'sqp'"),
+        ('[tune.solver]\nkind = "sqp"\nmemory = 4', "tune.solver.memory: got an unknown key"),
+        ('[tune.solver]\nkind = "sqp"\nstarts = 0', "tune.solver.*starts: got 0"),
+        ("[tune.report]\nrun = 20", "tune.report.run: got an unknown key.*runs"),
+    ],
+)
+def test_wrong_options_in_a_tuning_file_are_named(tmp_path, table, words):
+    file = tmp_path / "tune.toml"
+    file.write_text(
+        f'preset = "zhang_yan_2024"\n[tune]\nparameters = ["controller.k1"]\n{table}\n'
+        '[[objective]]\nkind = "tracking"\n'
+    )
+    with pytest.raises(ValueError, match=words):
+        load_tuning_file(file)
+
+
+# ------------------------------------------------------------------------------------------- resume
 
 KILLED = """
 import sys, jax
@@ -886,7 +1025,8 @@ jax.config.update("jax_enable_x64", True)
 import numpy as np, iblf_jax as ij
 o = ij.objectives
 slow = (lambda search: __import__("time").sleep(0.4)) if sys.argv[2] == "slow" else None
-best = ij.tune(ij.presets.zhang_yan_2024(), ["controller.k1", "controller.K2"], o.tracking() + 10 * o.peak_torque() + o.margin_above(0.11),
+goal = o.tracking() + 10 * o.peak_torque() + o.margin_above(0.11)
+best = ij.tune(ij.presets.zhang_yan_2024(), ["controller.k1", "controller.K2"], goal,
                duration=0.1, method="euler", iterations=12, checkpoint=sys.argv[1], progress=slow)
 np.savez(sys.argv[3], **best.history, **{k.replace(".", "_"): v for k, v in best.values.items()})
 """
@@ -916,13 +1056,16 @@ def test_a_killed_tuning_goes_on_bit_identically(tmp_path, monkeypatch):
         assert 1 <= len(half["history_loss"]) < 12
     assert start("a.npz", "fast", "resumed.npz").wait() == 0
     monkeypatch.setattr(
-        sys, "argv", ["-c", str(tmp_path / "b.npz"), "fast", str(tmp_path / "whole.npz")]
+        sys, "argv", ["-c", str(tmp_path / "b.npz"), "fast", str(tmp_path / "complete.npz")]
     )
     exec(KILLED, {})
-    with np.load(tmp_path / "resumed.npz") as resumed, np.load(tmp_path / "whole.npz") as whole:
-        assert set(resumed.files) == set(whole.files)
-        for name in whole.files:
-            assert resumed[name].tobytes() == whole[name].tobytes(), name
+    with (
+        np.load(tmp_path / "resumed.npz") as resumed,
+        np.load(tmp_path / "complete.npz") as complete,
+    ):
+        assert set(resumed.files) == set(complete.files)
+        for name in complete.files:
+            assert resumed[name].tobytes() == complete[name].tobytes(), name
 
 
 def test_a_checkpoint_of_another_problem_is_refused(paper, tmp_path):

@@ -156,8 +156,8 @@ def test_a_front_has_its_ends_and_no_gaps(paper):
     assert float(np.min(metrics.margin)) > -float(limit.limit) - 1e-12
 
 
-def test_a_front_asks_for_the_middle_of_its_largest_gap_once():
-    """What no level fills is a gap of the front, and is not asked for again."""
+def test_a_front_searches_the_middle_of_its_largest_gap_once():
+    """What no level fills is a gap of the front, and is not tried again."""
     search = _pareto.FrontSearch(SimpleNamespace(box=SimpleNamespace(z=np.zeros(1))), 8, 1, 0.0)
     search.z, search.terms, search.nodes = (
         np.array([[0.0], [1.0], [3.0]]),
@@ -237,7 +237,7 @@ def test_the_command_line_tunes_and_a_saved_result_reproduces_its_report(tmp_pat
 
 
 def _check_torque_and_ends(paper, best, figure):
-    """Report, repr and figure show both, although the objective asked for neither; the legend
+    """Report, repr and figure show both, although the objective contains neither; the legend
     covers no curve."""
     peaks = [
         np.asarray(ij.simulate(scenario, **SHORT).metrics.peak_torque)
@@ -314,12 +314,12 @@ def test_figures(paper, front):
 
 
 @pytest.mark.slow
-def test_the_way_of_a_tuning_across_what_is_allowed(paper):
+def test_the_path_of_a_tuning_across_what_is_allowed(paper):
     """Two gains that are one number for all joints; what the limit forbids is where runs break
     it."""
     gains = [ij.tunable("controller.k1", tied=True), ij.tunable("controller.K2", tied=True)]
-    wanted = ij.objectives.tracking() + ij.objectives.peak_torque_below(12.0)
-    best = ij.tune(paper, gains, wanted, iterations=3, progress=False, **SHORT)
+    goal = ij.objectives.tracking() + ij.objectives.peak_torque_below(12.0)
+    best = ij.tune(paper, gains, goal, iterations=3, progress=False, **SHORT)
     k1, K2 = np.array([1.0, 4.0]), np.array([3.0, 10.0, 40.0])
     loss, excess = best.on_slice(*best.names, k1, K2)
     for i, j in ((0, 0), (1, 2)):
@@ -395,15 +395,15 @@ def test_files_that_are_torn_or_others(paper, tuned, tmp_path):
             )
         with pytest.raises(ValueError, match="save_rollouts"):
             ij.load_rollouts(tmp_path / "bad.npz")
-    whole = json.loads(saved)
+    complete = json.loads(saved)
     bad = [
-        {key: x for key, x in whole.items() if key != left_out}
-        for left_out in whole
+        {key: x for key, x in complete.items() if key != left_out}
+        for left_out in complete
         if left_out != "report"
     ]
     bad += [
-        whole | {key: value}
-        for key in whole
+        complete | {key: value}
+        for key in complete
         for value in (None, 3, [[1]])
         if key not in ("report", "best_start", "seconds", "probes")
     ]

@@ -380,7 +380,7 @@ def test_tune_21_gains():
         ij.objectives.tracking(),
         method="euler",
         iterations=2,
-        report_runs=2,
+        report=ij.tuning.Report(runs=2),
         **BRIEF,
     )
     assert len(best.names) == 21

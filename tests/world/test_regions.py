@@ -50,7 +50,7 @@ def filtered(scenario, **options):
 def alone():
     with pytest.warns(
         ij.SimulationWarning,
-        match=r"a region was left\. regions\[\d\]: the \w+.* crossed its wall, at t = .* m\.$",
+        match=r"a region was left\. regions\[\d\]: the \w+.* crossed its boundary, at t = .* m\.$",
     ):
         return ij.simulate(stepping(), **RUN)
 

@@ -34,21 +34,21 @@ class Actuator(Protocol):
     a law that commands one; an observer is given the command, so such a loop needs one that does
     not use it.
 
-    One with limits also has `unlimited`, the same without them: how fast a loop is, is measured on
-      it.  One that changes with time, such
-    as a drive that fails, also has `at(t)`, the actuator as it is at time t [s], and, if it jumps,
-    `jump_times()`, (m,) [s], as disturbances have: steps of a run are divided there.
+    An actuator with limits also has the property `unlimited`, the same actuator without them; the
+    fastest mode of a loop is computed with it.  An actuator that changes with time, such as a drive
+    that fails, has `at(t)`, the actuator as it is at time t [s], and, if it jumps, `jump_times()`,
+    (m,) [s], as disturbances have: steps of a run are divided there.
     """
 
     def init(self, tau: jax.Array) -> State:
         """State at the start, where it delivers the torque `tau`, (n,) [N m]."""
         ...
 
-    def deliver(self, asked: jax.Array, dq: jax.Array, state: State) -> Delivered:
-        """What it delivers.
+    def deliver(self, command: jax.Array, dq: jax.Array, state: State) -> Delivered:
+        """The torque and the rate of the state.
 
         Args:
-          asked: the law's command, (n,): a torque [N m], or the actuator's own input in its unit.
+          command: the law's command, (n,): a torque [N m], or the actuator's own input in its unit.
           dq: velocity of the joints, (n,) [rad/s].
           state: its own.
         """

@@ -17,7 +17,7 @@ from iblf_jax.core.time import as_at, joined, jump_times_of
 
 @component
 class Chain:
-    """Each is told what the one before it delivers: `Chain((Motor(bandwidth=2000.0, limit=40.0),
+    """Each receives what the one before it delivers: `Chain((Motor(bandwidth=2000.0, limit=40.0),
     Motor(bandwidth=300.0)))`.
 
     Args:
@@ -64,9 +64,9 @@ class Chain:
         """The parts' states, each of which delivers the torque."""
         return tuple(part.init(tau) for part in self.parts)
 
-    def deliver(self, asked: jax.Array, dq: jax.Array, state: Any) -> Delivered:
+    def deliver(self, command: jax.Array, dq: jax.Array, state: Any) -> Delivered:
         """What the last delivers; a limit of any is one of the chain."""
-        torque, limited, rates = asked, jnp.zeros(asked.shape, bool), []
+        torque, limited, rates = command, jnp.zeros(command.shape, bool), []
         for part, own in zip(self.parts, state, strict=True):
             delivered = part.deliver(torque, dq, own)
             torque, limited = delivered.tau, limited | delivered.limited

@@ -1,4 +1,4 @@
-"""The actuator that does what it is told."""
+"""The ideal actuator: the applied torque equals the command."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from iblf_jax.core.pytree import component
 
 @component
 class Ideal:
-    """The torque that is asked for, at once.  Source: none; the baseline."""
+    """The applied torque equals the command, without delay.  Source: none; the baseline."""
 
     def init(self, tau: jax.Array) -> tuple[()]:
         """No state."""
         return ()
 
-    def deliver(self, asked: jax.Array, dq: jax.Array, state: tuple[()]) -> Delivered:
-        """What is asked."""
-        return Delivered(asked, jnp.zeros(asked.shape, bool), ())
+    def deliver(self, command: jax.Array, dq: jax.Array, state: tuple[()]) -> Delivered:
+        """The command itself."""
+        return Delivered(command, jnp.zeros(command.shape, bool), ())

@@ -17,7 +17,7 @@ from iblf_jax.core.pytree import Leaf, component, leaf
 
 @component
 class Motor:
-    """v = clip(asked, +-limit);   y' = clip(bandwidth (v - y), +-rate_limit);   tau = clip(y,
+    """v = clip(command, +-limit);   y' = clip(bandwidth (v - y), +-rate_limit);   tau = clip(y,
     +-stall (1 - |q'|/no_load_speed)).
 
     What is not given is not there; without a bandwidth y = v.  Nothing is delivered beyond the
@@ -69,14 +69,14 @@ class Motor:
         """The torque that it delivers, (n,) [N m]; no state without a lag."""
         return () if self.bandwidth is None else tau
 
-    def deliver(self, asked: jax.Array, dq: jax.Array, state: Any) -> Delivered:
+    def deliver(self, command: jax.Array, dq: jax.Array, state: Any) -> Delivered:
         """Lag and limits."""
-        limited = jnp.zeros(asked.shape, bool)
-        v: jax.Array = asked
+        limited = jnp.zeros(command.shape, bool)
+        v: jax.Array = command
         rate: Any = ()
         if self.limit is not None:
-            limited |= jnp.abs(asked) > self.limit
-            v = jnp.clip(asked, -self.limit, self.limit)
+            limited |= jnp.abs(command) > self.limit
+            v = jnp.clip(command, -self.limit, self.limit)
         if self.bandwidth is not None:
             rate = self.bandwidth * (v - state)
             if self.rate_limit is not None:

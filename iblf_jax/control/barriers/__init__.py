@@ -1,7 +1,7 @@
 """Barriers: V1, its slope and the virtual velocity of each.  The contract is `Barrier` in
 `_base.py`.
 
-A barrier or a law of your own stays finite at the wall by `guarded_error`, and says so by
+A barrier or a law of your own stays finite at the bound by `guarded_error`, and says so by
 `guard_is_active`.
 """
 

@@ -1,21 +1,21 @@
-"""The contract of a barrier, and the guard that keeps every barrier finite at the wall.
+"""The contract of a barrier, and the guard that keeps every barrier finite at the bound.
 
 A barrier turns the tube around the reference into three functions of one joint's position, written
 for all n joints at once: its Lyapunov function V1, its slope s = dV1/dq, and the virtual velocity
-  alpha that makes s alpha + dV1/dt negative.  The
-backstepping law (`controllers.Backstepping`) needs nothing else.
+alpha that makes s alpha + dV1/dt negative.  The backstepping law (`controllers.Backstepping`) needs
+nothing else.
 
-**At the wall.**  s has a pole at the bound and the wrong sign beyond it: a step too far and the law
-pushes outward, NaN spreads through the batch and its gradient.  So barriers evaluate at a guarded
-error (`guarded_error`), which is e1 itself for
-|xi| <= 1 - guard and stays at the edge of that range beyond.  There the slope is constant, large, finite and directed inward,
-V1 goes on along its tangent, and both have finite derivatives everywhere.  A virtual velocity that
-is a nonlinear function of the error is evaluated there too and goes on with gain k1, so that it
-still leads back inside.
+**At the bound.**  s has a pole at the bound and the wrong sign beyond it.  A joint that crosses the
+bound would be pushed outward, and NaN would spread through the batch and its gradient.  Barriers
+are therefore evaluated at a guarded error (`guarded_error`), which is e1 itself for
+|xi| <= 1 - guard and stays at the edge of that range beyond it.  There the slope is constant,
+large, finite and directed inward, V1 continues along its tangent, and both have finite derivatives
+everywhere.  A virtual velocity that is a nonlinear function of the error is evaluated at the
+guarded error, too, and continues with gain k1, so that it still leads back inside.
 
-**Claims.**  `decay_rate` and `xi_bound` say what a barrier's V1 promises; certificates ask for them
-and nothing else.  A barrier may lack them and then claims nothing.  `error_over_slope` is for laws
-that put a barrier on velocities (`controllers.FullState`).
+**Claims.**  `decay_rate` and `xi_bound` state the properties of V1 that certificates use.  A
+barrier without them makes no claim.  `error_over_slope` is for laws that put a barrier on
+velocities (`controllers.FullState`).
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ from iblf_jax.core.pytree import Leaf
 from iblf_jax.world.bounds import Tube
 
 GUARD = 1e-3
-"""Default distance from the wall, in xi, at which the guard takes over."""
+"""Default distance from the bound, in xi, at which the guard takes over."""
 
 CLAIMS = ("decay_rate", "xi_bound", "error_over_slope", "value_unit")
-"""Members that a barrier may lack: then it claims nothing, cannot stand on velocities, or has a V1
+"""Members that a barrier may lack: it then makes no claim, cannot bound velocities, or has a V1
 without a unit."""
 
 
@@ -88,7 +88,7 @@ class Barrier(Protocol):
 
         Args:
           V: level of the Lyapunov function, () or (n,), >= 0.
-          tube: the tube at that time; for several barriers the level at which a wall is reached
+          tube: the tube at that time; for several barriers the level at which a bound is reached
             depends on its width.
         """
         ...
@@ -133,7 +133,7 @@ def check_guard(owner: str, guard: float) -> None:
             f"{owner}.guard",
             guard,
             "a number between 0 and 1",
-            f"It is a distance from the wall in xi; the default is {GUARD:g}.",
+            f"It is a distance from the bound in xi; the default is {GUARD:g}.",
         )
 
 
@@ -147,27 +147,26 @@ class GuardedError(NamedTuple):
     beyond: jax.Array
     """e1 - e: zero inside the guard [rad]."""
     k: jax.Array
-    """k_u where e1 > 0, k_l elsewhere [rad].
-    (3.15)"""
+    """k_u where e1 > 0, k_l elsewhere [rad].                                         (3.15)"""
     dk: jax.Array
     """Its rate [rad/s]."""
 
 
 def guarded_error(tube: Tube, q: jax.Array, guard: float) -> GuardedError:
-    """The error e1 = q - q_d held inside (1 - guard) of its bound: what a barrier is evaluated at,
-    so that it is finite past its wall.
+    """The error e1 = q - q_d limited to (1 - guard) of its bound, where barriers are evaluated so
+    that they are finite beyond the bound.
 
         e = e1 where |e1| <= (1 - guard) k, else (1 - guard) k sign(e1),   beyond = e1 - e
-        k = h k_u + (1 - h) k_l,   k' = h k_u' + (1 - h) k_l',   h = 1 if e1 > 0 else 0
-        (2.5), (3.15)
+        k = h k_u + (1 - h) k_l,   k' = h k_u' + (1 - h) k_l'                          (2.5), (3.15)
+        h = 1 if e1 > 0 else 0
 
-    With V and s of the barrier at e, V + s beyond goes on along its tangent and s stays constant:
+    With V and s of the barrier at e, V + s beyond continues along its tangent and s stays constant:
     both are finite, with finite derivatives, at every q.
 
     Args:
       tube: reference and bounds at this time, a `bounds.Tube`.
       q: positions, (n,) [rad].
-      guard: distance from the wall in xi, a Python number in (0, 1) [1]; `guard` of the barriers,
+      guard: distance from the bound in xi, a Python number in (0, 1) [1]; `guard` of the barriers,
         1e-3 by default.
 
     Returns:
@@ -210,7 +209,7 @@ def _in_tube(tube: Tube, q: jax.Array) -> jax.Array:
 
 
 def guard_is_active(tube: Tube, q: jax.Array, guard: float) -> jax.Array:
-    """Whether each joint is so near its wall that the guard holds the slope: what a law answers in
+    """Whether the guard limits the slope of each joint, as a law returns it in
     `Command.guard_active`.
 
         |xi| > 1 - guard
@@ -233,8 +232,7 @@ def guard_is_active(tube: Tube, q: jax.Array, guard: float) -> jax.Array:
 
 
 def bound_motion_gain(tube: Tube, o: jax.Array) -> jax.Array:
-    """Kappa = sqrt((k_u'/k_u)^2 + (k_l'/k_l)^2 + o), (n,) [1/s].                          (3.7),
-    root restored
+    """Kappa = sqrt((k_u'/k_u)^2 + (k_l'/k_l)^2 + o), (n,) [1/s].        (3.7), root restored
 
     With the root, kappa + k'/k >= 0 on both sides for every o > 0, which is what the proof needs.
     """
@@ -242,7 +240,8 @@ def bound_motion_gain(tube: Tube, o: jax.Array) -> jax.Array:
 
 
 def paper_virtual_velocity(tube: Tube, q: jax.Array, k1: jax.Array, o: Leaf) -> jax.Array:
-    """Alpha = q_d' - (k1 + kappa(t)) e1, (n,) [rad/s]; shared by the integral and the logarithmic
-    barrier.     (3.5)
+    """Alpha = q_d' - (k1 + kappa(t)) e1, (n,) [rad/s].                                     (3.5)
+
+    The integral and the logarithmic barrier share it.
     """
     return tube.dq_d - (k1 + bound_motion_gain(tube, o)) * (q - tube.q_d)

@@ -19,11 +19,9 @@ from iblf_jax.world.bounds import Tube
 
 @component
 class Integral:
-    """V1 = int_0^xi 2 s / (1 - s^2) ds = -ln(1 - xi^2).
-    (2.6), (3.1)
+    """V1 = int_0^xi 2 s / (1 - s^2) ds = -ln(1 - xi^2).                        (2.6), (3.1)
 
-        s = dV1/de1 = 2 e1 / (k^2 - e1^2),   alpha = q_d' - (k1 + kappa) e1
-        (3.15), (3.5)
+        s = dV1/de1 = 2 e1 / (k^2 - e1^2),   alpha = q_d' - (k1 + kappa) e1    (3.15), (3.5)
 
     It is twice the logarithmic barrier with p = 1, identically.  Theorem 1: xi^2/2 <= V1 <= xi^2/(1
     - xi^2).
@@ -32,8 +30,8 @@ class Integral:
     what the kink adds.
 
     Args:
-      guard: distance from the wall in xi at which the slope is held, a number in (0, 1) [1]; 0.001
-        if not given.
+      guard: distance from the bound in xi at which the guard begins, a number in (0, 1) [1];
+        0.001 if not given.
 
     Source: T. Zhang, P. Yan, AIMS Mathematics 9(1) (2024) 319-339.
     """
@@ -52,9 +50,7 @@ class Integral:
         return -jnp.log1p(-((e / k) ** 2)) + 2.0 * e / (k**2 - e**2) * beyond
 
     def slope(self, tube: Tube, q: jax.Array) -> jax.Array:
-        """Con = 2 e1 / (k^2 - e1^2), (n,) [1/rad].
-        (3.15)
-        """
+        """Con = 2 e1 / (k^2 - e1^2), (n,) [1/rad].    (3.15)"""
         e, _, k, _ = guarded_error(tube, q, self.guard)
         return 2.0 * e / (k**2 - e**2)
 
@@ -66,19 +62,13 @@ class Integral:
     def virtual_velocity(
         self, tube: Tube, q: jax.Array, k1: jax.Array, o: jax.Array | None
     ) -> jax.Array:
-        """alpha, (n,) [rad/s].
-        (3.5)
-        """
+        """alpha, (n,) [rad/s].    (3.5)"""
         return paper_virtual_velocity(tube, q, k1, o)
 
     def decay_rate(self, k1: jax.Array) -> jax.Array:
-        """2 k1: V1' <= -2 k1 xi^2/(1 - xi^2) <= -2 k1 V1 at e2 = 0, (n,) [1/s].
-        (3.9), (3.19)
-        """
+        """2 k1: V1' <= -2 k1 xi^2/(1 - xi^2) <= -2 k1 V1 at e2 = 0, (n,) [1/s].    (3.9), (3.19)"""
         return 2.0 * k1
 
     def xi_bound(self, V: jax.Array, tube: Tube) -> jax.Array:
-        """|xi| <= sqrt(1 - exp(-V)), (n,) [1].
-        (3.22)
-        """
+        """|xi| <= sqrt(1 - exp(-V)), (n,) [1].    (3.22)"""
         return jnp.broadcast_to(jnp.sqrt(-jnp.expm1(-V)), tube.q_d.shape)

@@ -29,8 +29,8 @@ class Log:
 
     Args:
       p: exponent, a whole number >= 1; 1 if not given.
-      guard: distance from the wall in xi at which the slope is held, a number in (0, 1) [1]; 0.001
-        if not given.
+      guard: distance from the bound in xi at which the guard begins, a number in (0, 1) [1];
+        0.001 if not given.
 
     Source: K. P. Tee, B. Ren, S. S. Ge, Automatica 47 (2011) 2511-2516.
     """

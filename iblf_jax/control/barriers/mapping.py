@@ -18,16 +18,16 @@ from iblf_jax.world.bounds import Tube
 class Mapping:
     """V1 = 1/2 z^2,   z = e1 k_l k_u / ((k_l + e1)(k_u - e1)).
 
-        s = z z_e,   alpha = q_d' - (k1 z + z_t) / z_e,   z_e = k_l k_u (k_l k_u + e1^2) / ((k_l +
-        e1)(k_u - e1))^2
+        s = z z_e,   alpha = q_d' - (k1 z + z_t) / z_e
+        z_e = k_l k_u (k_l k_u + e1^2) / ((k_l + e1)(k_u - e1))^2
 
     z_t is the rate of z at fixed e1.  At e2 = 0, V1' = -k1 z^2.  For k -> infinity z -> e1:
     unconstrained backstepping, without a change of law ("uniform": one law with and without
     bounds).
 
     Args:
-      guard: distance from the wall in xi at which the slope is held, a number in (0, 1) [1]; 0.001
-        if not given.
+      guard: distance from the bound in xi at which the guard begins, a number in (0, 1) [1];
+        0.001 if not given.
 
     Source: K. Zhao, Y. Song, IEEE Trans. Automatic Control 64 (2019) 1265-1272.
     """

@@ -26,8 +26,8 @@ class PrescribedPerformance:
     any bounds do.  For k -> infinity s -> 0 and the gain of alpha is k1.
 
     Args:
-      guard: distance from the wall in xi at which the slope is held, a number in (0, 1) [1]; 0.001
-        if not given.
+      guard: distance from the bound in xi at which the guard begins, a number in (0, 1) [1];
+        0.001 if not given.
 
     Source: C. P. Bechlioulis, G. A. Rovithakis, IEEE Trans. Automatic Control 53 (2008) 2090-2099.
     """

@@ -1,7 +1,7 @@
-"""The integral barrier on the state itself: the wall acts on the position, not on the error.
+"""The integral barrier on the state itself: the bound acts on the position, not on the error.
 
 With the bounds' centre c(t) and half-width kc(t), x = q - c and y = q_d - c, so that e1 = x - y and
-|x| < kc.  The barrier weighs the error by how near the *position* is to its wall,
+|x| < kc.  The barrier weighs the error by how near the *position* is to its bound,
 
     V1 = int_0^e1 s kc^2 / (kc^2 - (s + y)^2) ds,
 
@@ -12,15 +12,15 @@ derivatives are
     kc, rho = kc / (2 e1) ln[ (kc + x)(kc - y) / ((kc - x)(kc + y)) ],
 
 the last because V1 = kc^2 K(x/kc, y/kc).  Hence, with w = V1/e1^2 and g = (kc^2 - x^2)/kc^2, the
-virtual velocity that gives V1' = -k1 kc^2 e1^2 / (kc^2 - x^2) at e2 = 0, for a moving centre and a
-changing half-width, is
+virtual velocity that gives V1' = -k1 kc^2 e1^2 / (kc^2 - x^2) at e2 = 0, for a time-varying centre
+and half-width, is
 
     alpha = c' + g rho (y' - y kc'/kc) - k1 e1 + x kc'/kc - 2 e1 w g kc'/kc
           = q_d' - k1 e1 - (1 - g rho) (y' - y kc'/kc) + e1 (1 - 2 g w) kc'/kc.
 
 K is the relative entropy KL(P || Q) of two coins P = (1 + y/kc)/2 and Q = (1 + x/kc)/2, and kc^2
 e1^2 / (kc^2 - x^2) is kc^2 times their chi-square distance.  KL <= ln(1 + chi^2) <= chi^2 for any
-two distributions, so V1' <= -k1 V1; and k1 is the best such constant (reference at the wall).  In
+two distributions, so V1' <= -k1 V1; and k1 is the best such constant (reference at the bound).  In
 the code, kc + x = k_l + e1 and kc - x = k_u - e1: no differences of nearly equal numbers.
 """
 
@@ -69,8 +69,8 @@ class State:
     x^2) <= -k1 V1.  For kc -> infinity it is unconstrained backstepping.
 
     Args:
-      guard: distance from the wall in xi at which the slope is held, a number in (0, 1) [1]; 0.001
-        if not given.
+      guard: distance from the bound in xi at which the guard begins, a number in (0, 1) [1];
+        0.001 if not given.
 
     Source: K. P. Tee, S. S. Ge, 51st IEEE CDC (2012) 3239-3244 (constant kc); the compensation of
       kc'(t) is derived here.
@@ -109,8 +109,8 @@ class State:
         kc, g, w, rho = _parts(e, tube.k_l, tube.k_u)
         y, dy = 0.5 * (tube.k_l - tube.k_u), 0.5 * (tube.dk_l - tube.dk_u)
         growth = 0.5 * (tube.dk_l + tube.dk_u) / kc
-        moving = (1.0 - g * rho) * (dy - y * growth) - e * (1.0 - 2.0 * g * w) * growth
-        return tube.dq_d - k1 * (e + beyond) - moving
+        bound_rate = (1.0 - g * rho) * (dy - y * growth) - e * (1.0 - 2.0 * g * w) * growth
+        return tube.dq_d - k1 * (e + beyond) - bound_rate
 
     def decay_rate(self, k1: jax.Array) -> jax.Array:
         """k1: V1' <= -k1 V1 at e2 = 0 (head of this module), (n,) [1/s]."""

@@ -26,8 +26,8 @@ class Tan:
     infinity s -> e1 and the gain of alpha is k1/2.
 
     Args:
-      guard: distance from the wall in xi at which the slope is held, a number in (0, 1) [1]; 0.001
-        if not given.
+      guard: distance from the bound in xi at which the guard begins, a number in (0, 1) [1];
+        0.001 if not given.
 
     Source: X. Yu, W. He, H. Li, J. Sun, IEEE Trans. Syst. Man Cybern. Syst. 51 (2021) 6994-7007.
     """

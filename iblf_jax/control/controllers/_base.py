@@ -1,8 +1,9 @@
 """The contract of a tracking law.
 
-A law knows the model, the reference and the bounds (its `LawContext`), measures q and q', is given the
-observer's estimate, and commands a torque.  Everything else that it returns is there to be looked
-at: its virtual velocity alpha, its Lyapunov function V1, whether a guard or a limit was at work.
+A law knows the model, the reference and the bounds (its `LawContext`), measures q and q', receives
+the observer's estimate and commands a torque.  It also returns signals for records and
+certificates: its virtual velocity alpha, its Lyapunov function V1, and whether a guard or a limit
+was active.
 """
 
 from __future__ import annotations
@@ -23,9 +24,7 @@ State = Any
 
 
 class LawContext(NamedTuple):
-    """What a law knows of the world; of bounds on the velocities, and of regions, if there are
-    any.
-    """
+    """What a law knows of the world: model, reference and bounds."""
 
     model: Robot
     reference: Reference
@@ -50,15 +49,14 @@ class LawContext(NamedTuple):
         return along(self.regions, self.model, q, dq)
 
 
-@partial(
-    jax.jit, static_argnums=3, inline=True
-)  # so that it is traced once for all that ask at a time
+# Compiled inline, so that several callers at one instant trace it once.
+@partial(jax.jit, static_argnums=3, inline=True)
 def _tube(reference: Reference, bounds: Bounds, t: jax.Array, acceleration: bool) -> Tube:
     return tube_at(reference, bounds, t, acceleration=acceleration)
 
 
 class Command(NamedTuple):
-    """What a law answers at one instant; all fields are (n,)."""
+    """The output of a law at one instant; all fields are (n,)."""
 
     tau: jax.Array
     """Torque [N m]."""
@@ -67,14 +65,13 @@ class Command(NamedTuple):
     V1: jax.Array
     """Lyapunov function of the position error, joint by joint."""
     guard_active: jax.Array
-    """bool: the barrier's guard holds the slope."""
+    """bool: the barrier's guard limits the slope."""
     saturated: jax.Array
     """bool: the torque was cut to a limit."""
     slack: Any = ()
-    """By how much a filter had to break its own conditions, (n,) [rad/s^2]; `()` for laws that have
-    none."""
+    """The violation of a filter's conditions, (n,) [rad/s^2]; `()` for laws without a filter."""
     region_slack: Any = ()
-    """The same of its conditions on m regions, (m,) [m/s^2]; `()` where there are none."""
+    """The violation of its conditions on m regions, (m,) [m/s^2]; `()` without regions."""
 
 
 class Controller(Protocol):
@@ -82,24 +79,27 @@ class Controller(Protocol):
 
     A law with a proof of its own may also fit `LyapunovLaw`; then `certify` checks what it states.
 
-    A law may also have, as class attributes: `gains`, the names of its leaves that set how hard it
-      works ("k1", "K2" if it says nothing),
-    which `compare` scales together; `uses_observer = False` if it has no use for f_hat;
-    `needs_velocity_bounds = True` if it cannot do without `LawContext.velocity_bounds`; `includes_e2 =
-    True` if its V1 holds what it weighs e2 with, so that V2 adds no 1/2 e2^T M0 e2; `filters =
-    True` if its commands have a `slack`; `wraps`, the name of the field that holds another law
-    whose paths are then its own ("controller.K2" reaches through); `unit_factors`, the names of
-    leaves that only multiply, of which it may be compiled in which numbers are 1
-    (`engine.mechanism`).  And methods: `advice()`, a list of warnings, `check_start(context)`,
-      which raises ValueError for what does not fit together where the number of joints is known,
-      and `leaf_units()`, the units of leaves that depend on other fields, by name.
+    A law may also have these class attributes; `law_member` holds their defaults.
 
-    A law whose command jumps declares where: `switching(t, q, dq, context, state)` returns (m,)
-      functions of q or q', and the command
-    jumps where one of them crosses 0 (as sliding-mode laws do, or `FullState` with some barriers).
-    The derivatives of a run then contain what such a jump does to a perturbation
-    (`engine.switching`); without the method they leave it out.  A law that wraps another passes the
-    call on with `switching_functions`.
+    - `gains`: the names of the leaves that `compare` scales together; ("k1", "K2") by default.
+    - `uses_observer`: False if it does not use f_hat.
+    - `needs_velocity_bounds`: True if it requires `LawContext.velocity_bounds`.
+    - `includes_e2`: True if its V1 contains its term of e2, so that V2 adds no 1/2 e2^T M0 e2.
+    - `filters`: True if its commands have a `slack`.
+    - `wraps`: the name of the field that holds another law.  Paths then reach through it
+      ("controller.K2").
+    - `unit_factors`: the names of leaves that are factors only.  Which of their numbers are 1 may
+      be compiled in (`engine.mechanism`).
+
+    It may have these methods: `advice()` returns a list of warnings; `check_start(context)` raises
+    ValueError for fields that do not fit together, once the number of joints is known;
+    `leaf_units()` returns the units of leaves that depend on other fields, by name.
+
+    A law whose command is discontinuous, such as a sliding-mode law or `FullState` with some
+    barriers, has `switching(t, q, dq, context, state)`.  It returns (m,) functions of q or q', and
+    the command jumps where one of them crosses 0.  The derivatives of a run then contain the effect
+    of such a jump on a perturbation (`engine.switching`); without the method they omit it.  A law
+    that wraps another forwards the call with `switching_functions`.
     """
 
     def init(self, q: jax.Array, dq: jax.Array, context: LawContext) -> State:

@@ -4,14 +4,13 @@ loop's state.
 What the backstepping law takes from the model, M0 alpha' + C0 alpha + G0 - f, a network of
 Gaussians learns while it runs:
 
-    W_hat^T S(Z),   S_j(Z) = exp(-|z - c_j|^2 / width^2),   Z = (q, q', alpha, alpha'),   z = Z over
-    its spans W_hat' = Gamma (-S(Z) e2^T - sigma W_hat),   W_hat(0) = 0.
+    W_hat^T S(Z),   S_j(Z) = exp(-|z - c_j|^2 / width^2),   Z = (q, q', alpha, alpha'),
+    z = Z over its spans,   W_hat' = Gamma (-S(Z) e2^T - sigma W_hat),   W_hat(0) = 0.
 
-The sigma-modification bounds the weights whatever happens: as |S| <= sqrt(nodes), the column of
-  joint i obeys
-|W_hat_i| <= sqrt(nodes) sup|e2_i| / sigma.  The literature puts the centres on a lattice, which in the 4n dimensions of Z has
-nodes^(4n) points; here they are a fixed number of points of a Sobol sequence in the box [-1,
-1]^(4n).
+The sigma-modification bounds the weights in every case: as |S| <= sqrt(nodes), the column of joint
+i obeys |W_hat_i| <= sqrt(nodes) sup|e2_i| / sigma.  The literature places the centres on a lattice,
+which in the 4n dimensions of Z has nodes^(4n) points; here they are a fixed number of points of a
+Sobol sequence in the box [-1, 1]^(4n).
 
 ASSUMPTION: the source's own node count, centres and gains could not be found; all numbers here are
   this package's.

@@ -1,10 +1,9 @@
 """The backstepping law of the paper, for any barrier.
 
-Step one: were q' = alpha(t, q), the barrier's V1 would decay.  Step two: drive e2 = q' - alpha to
-  zero,
+Step one: with q' = alpha(t, q), the barrier's V1 decays.  Step two: the torque drives
+e2 = q' - alpha to zero,
 
-    tau = C0 q' + G0 + M0 alpha' - f_hat - K2 e2 - w s,
-    (3.14)
+    tau = C0 q' + G0 + M0 alpha' - f_hat - K2 e2 - w s,                                       (3.14)
 
 with s = dV1/dq the barrier's slope ("Con" in the paper) and alpha' the total time derivative of
 alpha, taken by jvp along (1, q').  The paper has w = 1.  Another weight w_i > 0 scales the Lyapunov
@@ -38,7 +37,8 @@ READINGS = ("printed", "corrected")
 @component
 class Backstepping:
     """tau = C0 v + G0 + M0 alpha' - f_hat - K2 e2 - w s,   v = q' (printed) or alpha (corrected).
-    (3.14)
+
+    It is (3.14) of the paper.
 
     Args:
       k1: gain of the virtual velocity, () or (n,) [1/s], > 0.

@@ -1,6 +1,6 @@
 """Backstepping that filters alpha instead of differentiating it (dynamic surface, command filter).
 
-alpha goes through a filter of the first order, and the law follows what comes out of it,
+A filter of the first order smooths alpha, and the law follows the output beta of the filter,
 
     mu beta' + beta = alpha,   beta(0) = alpha(0),   e2 = q' - beta,
     tau = C0 beta + G0 + M0 beta' - f_hat - K2 e2 - w s,   beta' = (alpha - beta)/mu,
@@ -8,8 +8,7 @@ alpha goes through a filter of the first order, and the law follows what comes o
 so that alpha' is never formed: neither the reference's acceleration nor the rates of the bounds'
 rates are needed.  The price is the filter's lag, beta - alpha = -mu beta', which drives e1 as an
 error of the velocity would: about mu |alpha'|/k1 is left of it.  For mu -> 0 it is the backstepping
-  law in its corrected reading.  It is claimed to be ultimately bounded; Theorem 2 says nothing of
-  it.
+law in its corrected reading.  The literature claims ultimate boundedness; Theorem 2 does not apply.
 """
 
 from __future__ import annotations
@@ -30,10 +29,9 @@ from iblf_jax.core.pytree import Leaf, component, leaf
 
 @component
 class DynamicSurface:
-    """tau = C0 beta + G0 + M0 beta' - f_hat - K2 e2 - w s,   mu beta' + beta = alpha,   e2 = q' -
-    beta.
+    """tau = C0 beta + G0 + M0 beta' - f_hat - K2 e2 - w s,   mu beta' + beta = alpha.
 
-    The state is beta, (n,) [rad/s], which stands for alpha in all that is recorded.
+    With e2 = q' - beta.  The state is beta, (n,) [rad/s]; records show it as alpha.
 
     Args:
       k1: gain of the virtual velocity, () or (n,) [1/s], > 0.

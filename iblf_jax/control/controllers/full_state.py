@@ -6,22 +6,21 @@ e2 = q' - alpha,
     -K_l < e2 < K_u,   K_u = v_u - alpha,   K_l = alpha - v_l,
 
 which both must be positive: alpha inside the velocities' bounds is to e2 what Assumption 2 is to
-  e1.  So e2 has a tube like e1's, with
-alpha in the place of the reference, and any barrier of the family, phi with its slope s2 = dphi/de2
-and the "virtual velocity" a2 of that tube, keeps it:
+e1.  So e2 has a tube like e1's, with alpha in the place of the reference, and any barrier of the
+family, phi with its slope s2 = dphi/de2 and the "virtual velocity" a2 of that tube, keeps it:
 
-    q" = a2 - s1 e2/s2 - c s2 + M0^-1 f_tilde,   s2 (a2 - alpha') + dphi/dt <= -(its decay),
-    (F.1) (V1 + phi)' <= -(decay of V1) - (decay of phi) + s2 . M0^-1 f_tilde - c |s2|^2,
-    (F.2)
+    q" = a2 - s1 e2/s2 - c s2 + M0^-1 f_tilde,   s2 (a2 - alpha') + dphi/dt <= -(its decay),   (F.1)
+    (V1 + phi)' <= -(decay of V1) - (decay of phi) + s2 . M0^-1 f_tilde - c |s2|^2,            (F.2)
 
-as s1 e2/s2 . s2 cancels the cross term s1 . e2 of V1' exactly.  For the integral barrier a2 =
-alpha' - (K2 + kappa2) e2 and e2/s2 = (K^2 - e2^2)/2.  With f_tilde in V2 = V1 + phi + 1/2
-|f_tilde|^2, and s2 . M0^-1 f_tilde <= c |s2|^2 + |f_tilde|^2/(4 c lambda^2), lambda = lambda_min(M0), the loop with a momentum observer obeys
+as s1 e2/s2 . s2 cancels the cross term s1 . e2 of V1' exactly.  For the integral barrier
+a2 = alpha' - (K2 + kappa2) e2 and e2/s2 = (K^2 - e2^2)/2.  With f_tilde in
+V2 = V1 + phi + 1/2 |f_tilde|^2, s2 . M0^-1 f_tilde <= c |s2|^2 + |f_tilde|^2/(4 c lambda^2) and
+lambda = lambda_min(M0), the loop with a momentum observer obeys
 
-    V2' <= -rho V2 (+ 1/2 |f'|^2),   rho = min(decay rate of V1, that of phi, 2 (kf (- 1/2) - 1/(4 c
-    lambda^2)));               (F.3)
+    V2' <= -rho V2 (+ 1/2 |f'|^2),                                                             (F.3)
+    rho = min(decay rate of V1, that of phi, 2 (kf (- 1/2) - 1/(4 c lambda^2)));
 
-what stands in brackets is for f' != 0 (case 2).
+terms in brackets apply for f' != 0 (case 2).
 
 A weight w_i > 0 of each joint scales the first barrier, V1 = sum_i w_i V1_i: then w_i s1 replaces
 s1 in (F.1), the cross term cancels as before, and all claims hold with this V1.
@@ -209,11 +208,11 @@ class FullState:
         a2 = second.virtual_velocity(inner, dq, self.K2, self.o)
         ratio: Any = second.error_over_slope(inner, dq)
         crossed = self.weight * first.slope(outer, q) * ratio
-        wanted = a2 - crossed - self.c * second.slope(inner, dq)
+        acceleration = a2 - crossed - self.c * second.slope(inner, dq)
         tau = (
             model.coriolis(q, dq, dq)
             + model.gravity(q)
-            + matvec(model.mass_matrix(q), wanted)
+            + matvec(model.mass_matrix(q), acceleration)
             - f_hat
         )
         guard_active = guard_is_active(outer, q, first.guard) | guard_is_active(

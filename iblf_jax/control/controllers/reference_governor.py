@@ -1,23 +1,22 @@
-"""An explicit reference governor: a law that knows of no bound is given a reference of its own,
-which waits where the bound is near.
+"""An explicit reference governor: it gives a law without bounds an auxiliary reference that stops
+near a bound.
 
 With a reference g at rest, PD with gravity compensation and computed torque have a Lyapunov
 function that never grows,
 
-    V = 1/2 q'^T M0 q' + 1/2 (q - g)^T Kp (q - g)      (PD; computed torque has 1 in the place of
-    M0),
+    V = 1/2 q'^T M0 q' + 1/2 (q - g)^T Kp (q - g)      (PD; computed torque has 1 in place of M0),
 
 and V <= Gamma(g) = 1/2 min_i Kp_i d_i(g)^2 means |q_i - g_i| <= d_i, the distance of g_i to its
 nearer bound, less a margin.  So g may move towards the reference q_d as long as V is below Gamma,
 
-    g' = eta max(Gamma - V, 0) (attraction + repulsion),   attraction = (q_d - g)/max(|q_d - g|,
-    width), repulsion_i = max(1 - d_li/width, 0) - max(1 - d_ui/width, 0),   d_l = g - k_lc -
-    margin,   d_u = k_uc - margin - g,
+    g' = eta max(Gamma - V, 0) (attraction + repulsion)
+    attraction = (q_d - g)/max(|q_d - g|, width)
+    repulsion_i = max(1 - d_li/width, 0) - max(1 - d_ui/width, 0)
+    d_l = g - k_lc - margin,   d_u = k_uc - margin - g,
 
-and stands still where it is not: V <= Gamma stays true, and with it every bound, for constant
-  bounds, an exact model and f_hat = f.  Bounds
-that move, disturbances and samples are what the margin is for; nothing is claimed of them.  It lags
-behind a reference that moves.
+and stops otherwise.  V <= Gamma then stays true, and every bound is kept, for constant bounds, an
+exact model and f_hat = f.  The margin is for time-varying bounds, disturbances and sampling, for
+which no claim holds.  The joints lag behind a reference that moves.
 """
 
 from __future__ import annotations
@@ -112,8 +111,10 @@ class ReferenceGovernor:
     def energy(self, q: jax.Array, dq: jax.Array, g: jax.Array, context: LawContext) -> jax.Array:
         """V, () [N m for PD, rad^2/s^2 for computed torque]."""
         law: Any = self.law
-        moving = matvec(context.model.mass_matrix(q), dq) if isinstance(law, PDGravity) else dq
-        return 0.5 * (inner(dq, moving) + jnp.sum(law.Kp * (q - g) ** 2))
+        momentum = dq
+        if isinstance(law, PDGravity):
+            momentum = matvec(context.model.mass_matrix(q), dq)
+        return 0.5 * (inner(dq, momentum) + jnp.sum(law.Kp * (q - g) ** 2))
 
     def level(self, t: jax.Array, g: jax.Array, context: LawContext) -> jax.Array:
         """Gamma, () in the unit of V; 0 for a g outside."""

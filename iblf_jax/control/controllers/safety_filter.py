@@ -7,29 +7,30 @@ the conditions (d/dt + a1)(d/dt + a2) h >= 0 are a box of accelerations,
     q" <= k_uc" + (a1 + a2)(k_uc' - q') + a1 a2 (k_uc - q),
     q" >= k_lc" + (a1 + a2)(k_lc' - q') + a1 a2 (k_lc - q),
 
-and bounds on the velocities, of relative degree 1, are one more: v_l' + a3 (v_l - q') <= q" <= v_u'
-+ a3 (v_u - q').  Regions for the tip or a joint's origin (`Scenario.regions`) are of relative
-degree 2 in their level h(q), with b1, b2 > 0 (`regions.along` has dh/dq and c):
+and bounds on the velocities, of relative degree 1, are another:
+v_l' + a3 (v_l - q') <= q" <= v_u' + a3 (v_u - q').  Regions for the tip or a joint's origin
+(`Scenario.regions`) are of relative degree 2 in their level h(q), with b1, b2 > 0 (`regions.along`
+has dh/dq and c):
 
     h" + (b1 + b2) h' + b1 b2 h >= 0,    h' = dh/dq q',    h" = dh/dq q" + c.
 
-The conditions on positions may be of other shapes, and with a margin eta: with z = h' + a1 A(h), z'
-+ a2 B(z) >= eta, A(h) = h or atan h, B(z) = z or z^3.  An arc tangent bounds the speed towards a
+The conditions on positions may have other shapes, and a margin eta: with z = h' + a1 A(h),
+z' + a2 B(z) >= eta, A(h) = h or atan h, B(z) = z or z^3.  An arc tangent bounds the speed towards a
 bound by pi a1/2 wherever the joint is; a cube is softer the nearer z is to 0.
 
-The model and the observer's estimate turn accelerations into torques, tau = M0 q" + C0 q' + G0 -
-f_hat.  Inside what the conditions keep (h >= 0 and z >= 0 at the start) they keep it for as long as
-they have a common torque, and f_hat is f.
+The model and the observer's estimate turn accelerations into torques,
+tau = M0 q" + C0 q' + G0 - f_hat.  A run that starts with h >= 0 and z >= 0 stays there as long as
+the conditions have a common torque and f_hat = f.
 
-Where they have none (within the torque limits, or as a bound runs into another), the torque breaks
-them by the least slack, the sum of squares of the distances to what they allow, in torque or in
-acceleration as `nearest` says: it is in the command, is recorded, and raises
-  `Status.FILTER_INFEASIBLE`.
+Where they have none (because of the torque limits, or because two bounds conflict), the torque
+violates them by the least slack.  The slack is the sum of squares of the violations, in torque or
+in acceleration as `nearest` says; the command holds it, runs record it, and it sets
+`Status.FILTER_INFEASIBLE`.
 """
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -54,7 +55,8 @@ SHAPES2 = ("linear", "cubic")
 
 @component
 class SafetyFilter:
-    """The torque nearest to the law's with  q" as the conditions allow (head of this module)  and  |tau| <= limit.
+    """The torque nearest to the law's that meets the conditions on q" (head of this module) and
+    |tau| <= limit.
 
     Nearest in torque, |tau - tau_law|, or in acceleration, |M0^-1 (tau - tau_law)|; the latter
     without limit and regions is a clip, else it is a quadratic programme (`core.qp`).  Where the
@@ -155,23 +157,22 @@ class SafetyFilter:
     ) -> tuple[Command, State]:
         """The wrapped law's command with its torque filtered, and the slack."""
         command, rate = self.law.command(t, q, dq, f_hat, context, state)
-        model, asked = context.model, command.tau
+        model, tau_law = context.model, command.tau
         M = model.mass_matrix(q)
-        planned = solve_spd(M, asked + f_hat - model.coriolis(q, dq, dq) - model.gravity(q))
+        planned = solve_spd(M, tau_law + f_hat - model.coriolis(q, dq, dq) - model.gravity(q))
         lowest, highest = self.box(t, q, dq, context)
         if self.nearest == "acceleration" and self.limit is None and not context.regions:
             # An empty box is broken on both sides alike.
             slack = jnp.maximum(0.5 * (lowest - highest), 0.0)
-            wanted = jnp.clip(planned, lowest - slack, highest + slack)
-            return command._replace(tau=asked + matvec(M, wanted - planned), slack=slack), rate
-        unit = jnp.eye(context.model.n, dtype=asked.dtype)
-        # What is looked for is the change of the torque or of the acceleration; the columns say
-        # what it does to both.
-        torque, acceleration = (
-            (unit, jnp.stack([solve_spd(M, row) for row in unit]))
-            if self.nearest == "torque"
-            else (M, unit)
-        )
+            admitted = jnp.clip(planned, lowest - slack, highest + slack)
+            tau = tau_law + matvec(M, admitted - planned)
+            return command._replace(tau=tau, slack=slack), rate
+        unit = jnp.eye(context.model.n, dtype=tau_law.dtype)
+        # The unknown is the change of the torque or of the acceleration; the columns of these two
+        # matrices are its effects on both.
+        torque, acceleration = M, unit
+        if self.nearest == "torque":
+            torque, acceleration = unit, jnp.stack([solve_spd(M, row) for row in unit])
         rows = [(acceleration, highest - planned, 1.0), (-acceleration, planned - lowest, 1.0)]
         if context.regions:
             at = context.regions_along(q, dq)
@@ -184,14 +185,15 @@ class SafetyFilter:
             rows.append((-matmul(at.slope, acceleration), room, 1.0))
         saturated = command.saturated
         if self.limit is not None:
-            rows += [(torque, self.limit - asked, 0.0), (-torque, self.limit + asked, 0.0)]
-            saturated = saturated | (jnp.abs(asked) > self.limit)
+            rows += [(torque, self.limit - tau_law, 0.0), (-torque, self.limit + tau_law, 0.0)]
+            saturated = saturated | (jnp.abs(tau_law) > self.limit)
         found = _nearest(rows)
-        region_slack = (
-            found.slack[2 * len(q) : 2 * len(q) + len(context.regions)] if context.regions else ()
-        )
-        slack = jnp.maximum(found.slack[: len(q)], found.slack[len(q) : 2 * len(q)])
-        tau = asked + matvec(torque, found.x)
+        n = len(q)
+        slack = jnp.maximum(found.slack[:n], found.slack[n : 2 * n])
+        region_slack: Any = ()
+        if context.regions:
+            region_slack = found.slack[2 * n : 2 * n + len(context.regions)]
+        tau = tau_law + matvec(torque, found.x)
         return (
             command._replace(tau=tau, slack=slack, region_slack=region_slack, saturated=saturated),
             rate,

@@ -1,7 +1,7 @@
 """Actuator limits around any law; the paper leaves them to future work.
 
-The loop gives observer and plant the torque that was applied, so an observer that is told the truth
-estimates f and not the cut. While the torque is cut, no law's claims hold; outside, they do again.
+The loop passes the applied torque to observer and plant, so the observer estimates f without the
+torque that was cut.  The claims of a law hold only while its torque is not cut.
 """
 
 from __future__ import annotations
@@ -78,20 +78,16 @@ class Saturated:
         context: LawContext,
         state: State,
     ) -> tuple[Command, State]:
-        """The wrapped law's command with its torque limited; `saturated` says where it asked for
+        """The wrapped law's command with its torque limited; `saturated` says where it commanded
         more than the limit.
         """
         command, rate = self.law.command(t, q, dq, f_hat, context, state)
-        asked = command.tau
-        tau = (
-            jnp.clip(asked, -self.limit, self.limit)
-            if self.edge == "hard"
-            else self.limit * _smooth_clip(asked / self.limit)
-        )
-        return (
-            command._replace(tau=tau, saturated=command.saturated | (jnp.abs(asked) > self.limit)),
-            rate,
-        )
+        saturated = command.saturated | (jnp.abs(command.tau) > self.limit)
+        if self.edge == "hard":
+            tau = jnp.clip(command.tau, -self.limit, self.limit)
+        else:
+            tau = self.limit * _smooth_clip(command.tau / self.limit)
+        return command._replace(tau=tau, saturated=saturated), rate
 
 
 UNLIMITED = 1e6

@@ -1,7 +1,7 @@
 """The contract of a disturbance observer.
 
-An observer knows the model, measures q and q', is told the torque that was applied, and gives
-f_hat, an estimate of the lumped uncertain term f of (2.1).  Its state is part of the loop's state
+An observer knows the model, measures q and q', receives the applied torque and returns f_hat, an
+estimate of the lumped uncertain term f of (2.1).  Its state is part of the loop's state
 and is integrated with the plant; in a sampled loop it goes from one period to the next.
 """
 
@@ -21,10 +21,10 @@ State = Any
 class Observer(Protocol):
     """What the package asks of an observer.
 
-    Two methods more are for sampled loops, which take a step of Euler where there is none:
-    `advance(t, q, dq, tau, model, state, period)`, its state a period [s] later if what it measures
-    and the torque stay as they are; and `at_period(period)`, the same observer with gains for which
-    a step of Euler has the poles that it has over a period.
+    An observer may have two further methods for sampled loops, which use a step of Euler without
+    them.  `advance(t, q, dq, tau, model, state, period)` returns its state a period [s] later for
+    constant measurements and torque.  `at_period(period)` returns the observer with gains for which
+    a step of Euler has the same poles as the continuous observer has over one period.
     """
 
     def init(self, q: jax.Array, dq: jax.Array, model: Robot) -> State:

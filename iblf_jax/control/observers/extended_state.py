@@ -55,7 +55,7 @@ class ExtendedState:
         given = tuple(x is not None for x in (self.bandwidth, self.l1, self.l2))
         if given not in ((True, False, False), (False, True, True)):
             named = dict(zip(("bandwidth", "l1", "l2"), given, strict=True))
-            got = [name for name, there in named.items() if there]
+            got = [name for name, given in named.items() if given]
             raise checks.fail(
                 "ExtendedState",
                 got,

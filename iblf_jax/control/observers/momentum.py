@@ -17,10 +17,9 @@ from iblf_jax.world.robots import Robot, energy_gradient
 @component
 class Momentum:
     """f_hat = eta + kf M0 q',   eta' = -kf eta - kf (tau - C0 q' - G0 + kf M0 q' + M0' q').
-    (3.11), corrected
 
-    Then f_tilde' = f' - kf f_tilde exactly, since (M0 q')' = tau + f - C0 q' - G0 + M0' q'.  (M0'
-    q' - C0 q' is dT/dq.)
+    It is (3.11) of the paper, corrected: f_tilde' = f' - kf f_tilde holds exactly, since
+    (M0 q')' = tau + f - C0 q' - G0 + M0' q'.  (M0' q' - C0 q' is dT/dq.)
 
     Args:
       kf: gain, () or (n,) [1/s], > 0; Theorem 2 asks for more than 1/2, and for more than 1 where f

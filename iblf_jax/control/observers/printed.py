@@ -18,8 +18,7 @@ STARTS = ("zero", "matched")
 
 @component
 class Printed:
-    """f_hat = eta + kf M0 q',   eta' = -kf eta - kf (tau - C0 q' - G0 + kf M0 q').
-    (3.11)
+    """f_hat = eta + kf M0 q',   eta' = -kf eta - kf (tau - C0 q' - G0 + kf M0 q').    (3.11)
 
     Its error obeys f_tilde' = f' - kf f_tilde - kf M0' q': the last term is what `Momentum`
     removes.
@@ -109,7 +108,7 @@ def kf_advice(kf: jax.Array) -> list[str]:
 def held_eta(
     observer, t, q, dq, tau, model: Robot, state: jax.Array, period: jax.Array
 ) -> jax.Array:
-    """Eta a period later where all else is held, (n,) [N m]: eta' = kf (eta* - eta), so eta* - eta
+    """Eta a period later for constant inputs, (n,) [N m]: eta' = kf (eta* - eta), so eta* - eta
     falls by exp(-kf period).
     """
     rate = observer.derivative(t, q, dq, tau, model, state)

@@ -1,4 +1,4 @@
-"""The contracts of a sensor, and of the way in which one that reads positions comes to velocities.
+"""The contracts of a sensor, and of the velocity estimate of a sensor that measures positions.
 
 A sensor is read once a period, at its start.  What it draws are standard normal numbers, which the
 loop gives it: they depend on seed, run, sample and joint alone.  Torque is never measured.
@@ -19,7 +19,7 @@ State = Any
 
 
 class Measurement(NamedTuple):
-    """What law and observer are told."""
+    """What law and observer receive."""
 
     q: jax.Array
     """Position, (n,) [rad]."""
@@ -30,10 +30,10 @@ class Measurement(NamedTuple):
 class Sensor(Protocol):
     """What the package asks of a sensor.
 
-    One that rounds also has `unrounded`, the same without that: how fast a loop is, is measured on
-      it; and `resolution`, what a count is,
-    () or (n,) [rad], for the default ranges of gains.  It may have a method
-    `advice(period)`, a list of warnings.
+    A sensor that rounds also has the properties `unrounded`, the same sensor without rounding, with
+    which the fastest mode of a loop is computed, and `resolution`, the size of a count, () or (n,)
+    [rad], for the default ranges of gains.  A sensor may have a method `advice(period)`, a list of
+    warnings.
     """
 
     @property

@@ -27,8 +27,8 @@ class FilteredDifference:
     Args:
       cutoff: of the low pass, () or (n,) [rad/s], > 0.
 
-    Source: first-order low pass, exact for a difference that is held over a period; any text on
-      digital filters.
+    Source: first-order low pass, exact for a difference that is constant over a
+      period; any text on digital filters.
     """
 
     cutoff: Leaf = leaf("rad/s", sign="positive")

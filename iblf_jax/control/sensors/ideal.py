@@ -1,4 +1,4 @@
-"""The sensor that tells the truth."""
+"""The ideal sensor: it measures position and velocity without error."""
 
 from __future__ import annotations
 

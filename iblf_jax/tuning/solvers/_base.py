@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -89,27 +89,56 @@ class Solver(Protocol):
     which `step` and `restart` may change in place.
     """
 
-    name: ClassVar[str]
-    """In `SOLVERS`, in files and in results."""
-    handles_requirements: ClassVar[bool]
-    """Whether requirements are constraints of the solver.  Otherwise the loss is an augmented
-    Lagrangian, of which the loop updates the multipliers."""
-    traces_evaluation: ClassVar[bool]
-    """Whether a step evaluates inside of a compiled loop, by `evaluate.derivatives(problem,
-    candidate)` with the two of `evaluate.row(start)`."""
-    mode: Any
-    """"forward" or "reverse" differentiation, or "auto": by the number of coordinates."""
-    resample: Any
-    """Whether the runs are drawn anew at every step."""
-    starts: int
-    """Number of starting points."""
-    tolerance: float
-    """Relative change of the loss below which a start has converged."""
-    sharpenings: Any
-    """How often the smoothing of peaks in the objective is divided by 4, each time once the starts
-    have converged."""
-    patience: int
-    """Steps without a better result after which the search ends (or the smoothing is divided)."""
+    @property
+    def name(self) -> str:
+        """In `SOLVERS`, in files and in results."""
+        ...
+
+    @property
+    def handles_requirements(self) -> bool:
+        """Whether requirements are constraints of the solver.  Otherwise the loss is an augmented
+        Lagrangian, of which the search updates the multipliers.
+        """
+        ...
+
+    @property
+    def traces_evaluation(self) -> bool:
+        """Whether a step evaluates inside of a compiled loop, by `evaluate.derivatives(problem,
+        candidate)` with the two of `evaluate.row(start)`.
+        """
+        ...
+
+    @property
+    def mode(self) -> str:
+        """Differentiation: "forward", "reverse", or "auto", by the number of coordinates."""
+        ...
+
+    @property
+    def resample(self) -> bool:
+        """Whether the runs are drawn anew at every step."""
+        ...
+
+    @property
+    def starts(self) -> int:
+        """Number of starting points."""
+        ...
+
+    @property
+    def tolerance(self) -> float:
+        """Relative change of the loss below which a start has converged."""
+        ...
+
+    @property
+    def sharpenings(self) -> int:
+        """How often the smoothing of peaks in the objective is divided by 4, each time once the
+        starts have converged.
+        """
+        ...
+
+    @property
+    def patience(self) -> int:
+        """Steps without a better result after which the search or its stage ends."""
+        ...
 
     def init(self, space: SearchSpace, z: np.ndarray) -> Any:
         """The state of S starts at z, (S, p), before the first evaluation."""
@@ -145,15 +174,20 @@ class Solver(Protocol):
         ...
 
 
+def _word(name: str, value: Any, allowed: tuple[str, ...]) -> str:
+    checks.one_of(name, value, allowed)
+    return value
+
+
 CHECKS: dict[str, Any] = {
-    "mode": lambda name, x: checks.one_of(name, x, MODES) or x,
+    "mode": lambda name, x: _word(name, x, MODES),
     "resample": checks.flag,
     "starts": checks.positive_integer,
     "tolerance": lambda name, x: checks.number_between(name, x, 0.0, 1.0, "1"),
     "sharpenings": lambda name, x: checks.positive_integer(name, x, least=0, most=MOST_SHARPENINGS),
     "patience": lambda name, x: checks.positive_integer(name, x, most=checks.MOST_STEPS),
     "learning_rate": lambda name, x: checks.number_between(name, x, *LEARNING_RATES, "1"),
-    "schedule": lambda name, x: checks.one_of(name, x, SCHEDULES) or x,
+    "schedule": lambda name, x: _word(name, x, SCHEDULES),
     "memory": lambda name, x: checks.positive_integer(name, x, most=1000),
     "line_steps": lambda name, x: checks.positive_integer(name, x, most=1000),
     "radius": lambda name, x: None if x is None else checks.positive_number(name, x, "1"),

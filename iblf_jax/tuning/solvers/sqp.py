@@ -119,7 +119,7 @@ class Unknowns(NamedTuple):
     """Requirement -> column of t."""
     surplus: dict[int, np.ndarray]
     """Requirement -> columns of u, one a run with selected pieces."""
-    count: int
+    total: int
 
     @staticmethod
     def of(size: int, worst: tuple[int, ...], selected: list[Selected]) -> Unknowns:
@@ -170,27 +170,19 @@ def solve_subproblem(
         _pieces_that_may_bind(constraints, r, pieces, piece_gradients, reach) for r in range(count)
     ]
     unknowns = Unknowns.of(size, constraints.worst, selected)
-    # Rows of A x <= b: the pieces, the means of runs, the signs of v and u, the bounds of the step.
-    piece_rows = [
-        _piece_rows(unknowns, r, chosen, piece_gradients) for r, chosen in enumerate(selected)
-    ]
-    mean_rows = [_mean_row(unknowns, r, constraints.worst[r]) for r in unknowns.threshold]
-    nonnegative = unknowns.nonnegative
-    signs = -np.eye(unknowns.count)[nonnegative]
-    bounds = np.eye(size, unknowns.count)
-    A = np.concatenate([*piece_rows, *mean_rows, signs, bounds, -bounds])
-    limits = [-pieces[x.run, x.piece] - TARGET_EXCESS for x in selected]
-    zeros = np.zeros(len(mean_rows) + len(nonnegative))
-    b = np.concatenate([*limits, zeros, high, -low])
-
-    H = np.zeros((unknowns.count, unknowns.count))
+    A, b = _linear_constraints(unknowns, constraints, selected, pieces, piece_gradients)
+    bounds = np.eye(size, unknowns.total)
+    A = np.concatenate([A, bounds, -bounds])
+    b = np.concatenate([b, high, -low])
+    H = np.zeros((unknowns.total, unknowns.total))
     H[unknowns.step, unknowns.step] = matrix
-    c = np.zeros(unknowns.count)
+    c = np.zeros(unknowns.total)
     c[unknowns.step] = gradient
     c[unknowns.violation] = penalty
     x, y = quadratic.solve(H, c, A, b)
 
     step = np.clip(x[unknowns.step], low, high)
+    # The rows of the pieces are the first ones.
     piece_multipliers = np.zeros_like(pieces)
     multipliers = np.zeros(count)
     row = 0
@@ -209,11 +201,29 @@ def solve_subproblem(
     )
 
 
+def _linear_constraints(
+    unknowns: Unknowns,
+    constraints: Constraints,
+    selected: list[Selected],
+    pieces: np.ndarray,
+    piece_gradients: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """A and b of A x <= b: rows of the pieces, of the means of runs, and of the signs of v, u."""
+    piece_rows = [
+        _piece_rows(unknowns, r, chosen, piece_gradients) for r, chosen in enumerate(selected)
+    ]
+    mean_rows = [_mean_row(unknowns, r, constraints.worst[r]) for r in unknowns.threshold]
+    nonnegative = unknowns.nonnegative
+    A = np.concatenate([*piece_rows, *mean_rows, -np.eye(unknowns.total)[nonnegative]])
+    limits = [-pieces[x.run, x.piece] - TARGET_EXCESS for x in selected]
+    return A, np.concatenate([*limits, np.zeros(len(mean_rows) + len(nonnegative))])
+
+
 def _piece_rows(
     unknowns: Unknowns, r: int, chosen: Selected, piece_gradients: np.ndarray
 ) -> np.ndarray:
     """Rows a_j.s - v_r, or a_j.s - t - u_b where the requirement is a mean of runs."""
-    rows = np.zeros((len(chosen.run), unknowns.count))
+    rows = np.zeros((len(chosen.run), unknowns.total))
     rows[:, unknowns.step] = piece_gradients[chosen.run, :, chosen.piece]
     if r not in unknowns.threshold:
         rows[:, unknowns.violation.start + r] = -1.0
@@ -226,7 +236,7 @@ def _piece_rows(
 
 def _mean_row(unknowns: Unknowns, r: int, k: int) -> np.ndarray:
     """The row t + sum_b u_b / k - v_r <= 0."""
-    row = np.zeros((1, unknowns.count))
+    row = np.zeros((1, unknowns.total))
     row[0, unknowns.threshold[r]] = 1.0
     row[0, unknowns.surplus[r]] = 1.0 / k
     row[0, unknowns.violation.start + r] = -1.0
@@ -396,7 +406,9 @@ class SQP:
     def _first_radius(self, space: SearchSpace) -> float:
         if self.radius is not None:
             return self.radius
-        return RADIUS_IF_MULTIMODAL if space.multimodal else RADIUS
+        if space.multimodal:
+            return RADIUS_IF_MULTIMODAL
+        return RADIUS
 
     def _new_start(self, space: SearchSpace, z: np.ndarray, curved: int) -> SQPState:
         size = len(z)
@@ -607,7 +619,9 @@ def _plan(space: SearchSpace, state: SQPState, tolerance: float) -> None:
     linear_decrease = -found.change + state.penalty * reduction
     step, decrease = _best_with_curvature(space, state, found, penalty)
     state.trial = np.clip(state.z + step, space.box.low, space.box.high)
-    state.predicted = decrease if decrease > 0.1 * linear_decrease else linear_decrease
+    state.predicted = linear_decrease
+    if decrease > 0.1 * linear_decrease:
+        state.predicted = decrease
     state.corrected = False
 
     state.residuals = _residuals(space, state, found, excess)

@@ -1,7 +1,6 @@
 """The contract of a robot, and what follows from its energies alone.
 
-    M(q) q" + C(q, q') q' + G(q) = tau + f
-    (2.1)
+    M(q) q" + C(q, q') q' + G(q) = tau + f                                                  (2.1)
 
 A robot is known by its mass matrix M(q) and its potential U(q): then G = dU/dq, and C follows from
 the Christoffel symbols,
@@ -38,14 +37,13 @@ class Robot(Protocol):
     [kg], a point mass at the tip, is one of them in every member, so that any robot can carry what
     its model does not know.
 
-    Two methods more are used where a member has them, through `at_time` and `friction_torque`
-    below: `at(t)`, the robot as it is at time t [s], for one that changes while it moves, with
-      `jump_times()`, (m,) [s], if it jumps then, as disturbances have (steps of a run
-    are divided there); and `friction_torque(dq)`, (n,) [N m], for one with friction in its joints.
-    Both are of the plant only: law and observer know neither, and (2.1) has them in f.  A third,
-      `energy_gradient(q, v)`, is used by the function of this name where a member
-    has something shorter than the general formula.  A class may name its `geometry_fields`, a tuple
-    of fields whose zeros, ones and equal numbers may be compiled in (`engine.mechanism`).
+    A member may have further methods (`robot_member` holds their defaults).  `at(t)` returns the
+    robot as it is at time t [s], for one that changes during a run; `jump_times()`, (m,) [s], are
+    the times at which it jumps, where steps of a run are divided.  `friction_torque(dq)`, (n,)
+    [N m], is the friction of its joints.  These belong to the plant only: law and observer do not
+    know them, and (2.1) has them in f.  `energy_gradient(q, v)` replaces the general formula of the
+    function of this name where a member has a shorter one.  A class may name its `geometry_fields`,
+    a tuple of fields whose zeros, ones and equal numbers may be compiled in (`engine.mechanism`).
     """
 
     @property
@@ -164,7 +162,9 @@ def joint_names(robot: Any, n: int) -> tuple[str, ...]:
     """
     n = checks.positive_integer("n", n, least=0, most=checks.MOST_JOINTS)
     names = tuple(map(str, robot_member(robot, "joints")))
-    return names if len(names) == n else tuple(f"joint {i}" for i in range(n))
+    if len(names) == n:
+        return names
+    return tuple(f"joint {i}" for i in range(n))
 
 
 def mass_matrix_rate(robot: Robot, q: jax.Array, dq: jax.Array) -> jax.Array:

@@ -1,5 +1,5 @@
-"""A serial chain of rigid links in space, with revolute and prismatic joints: real arms
-(`iblf_jax.robots.load`).
+"""A serial chain of rigid links in space, with revolute and prismatic joints: the model of
+arms that `iblf_jax.robots.load` reads from files.
 
 Each joint i has a frame, placed in the frame of the link before it (of the base, for the first) by
 `position` and `rotation`, and an axis in that frame; link i moves with it.  In the world's frame
@@ -7,8 +7,8 @@ Each joint i has a frame, placed in the frame of the link before it (of the base
 and I_i the inertia of link i about the world's origin:
 
     J_i = [S_1 ... S_i 0 ... 0],   M = sum_i J_i^T I_i J_i + diag(armature)
-    M_ij = S_i . (I_j + ... + I_n) S_j  for i <= j                                    composite
-    bodies U = - g . sum_i m_i c_i
+    M_ij = S_i . (I_j + ... + I_n) S_j  for i <= j          (composite bodies)
+    U = - g . sum_i m_i c_i
     C = sum_i J_i^T (I_i J_i' + B(I_i, V_i) J_i),   V_i = J_i v
     B(I, V) u = 1/2 (V x* (I u) - I (V x u) + u x* (I V))
 
@@ -58,8 +58,8 @@ class Pose(NamedTuple):
 
 
 traced_once = partial(jax.jit, inline=True)
-"""For what is asked of an arm alone too: operation by operation it would be hundreds of programs,
-each compiled by itself."""
+"""Decorator of methods that are also called outside a compiled function: without it, JAX would
+compile hundreds of programs of one operation each."""
 
 
 class Frames(NamedTuple):
@@ -280,8 +280,6 @@ class Arm:
         """
         return self.carried.jump_times()
 
-    # ------------------------------------------------------------------------------------------------------- where things are
-
     @traced_once
     def _frames(self, q: jax.Array) -> Frames:
         """Frames of the links and directions of the joints at q."""
@@ -289,7 +287,9 @@ class Arm:
         a, fixed = spatial.unit(self.axis), spatial.rotation(self.rotation)
         axis = spatial.apply(fixed, a)
         along = axis[:, :, None] * a[:, None, :]
-        angle = q if turns.all() else jnp.where(turns, q, jnp.zeros_like(q))
+        angle = q
+        if not turns.all():
+            angle = jnp.where(turns, q, jnp.zeros_like(q))
         sine, cosine = jnp.sin(angle)[:, None, None], jnp.cos(angle)[:, None, None]
         turned = along + cosine * (fixed - along) + sine * spatial.cross(fixed, a[:, None, :])
         shifted = self.position
@@ -310,8 +310,8 @@ class Arm:
         P = spatial.pseudo_inertia(self.mass, self.centre, self.inertia)
         tip = jnp.concatenate([self._tip_placement(), jnp.asarray([[0.0, 0.0, 0.0, 1.0]], P.dtype)])
         corner = jnp.asarray(np.diag([0.0, 0.0, 0.0, 1.0]), P.dtype) * self.payload
-        held = spatial.product(spatial.product(tip, self.carried.moments() + corner), tip.T)
-        P = jnp.concatenate([P[:-1], P[-1:] + held])
+        at_tip = spatial.product(spatial.product(tip, self.carried.moments() + corner), tip.T)
+        P = jnp.concatenate([P[:-1], P[-1:] + at_tip])
         return spatial.moved(frames.placement, P), P[:, 3, 3:]
 
     @traced_once
@@ -345,8 +345,6 @@ class Arm:
         w, v = jnp.unstack(self._frames(q).allowed, axis=1)
         return jnp.concatenate([(v + spatial.cross(w, self.tip(q)[None])).T, w.T])
 
-    # ---------------------------------------------------------------------------------------------------------------- dynamics
-
     @traced_once
     def mass_matrix(self, q: jax.Array) -> jax.Array:
         """M(q), (n, n) [kg m^2]."""
@@ -363,14 +361,14 @@ class Arm:
         """C(q, v) u, (n,) [N m], with the C of the Christoffel symbols."""
         frames = self._frames(q)
         S, bodies = frames.allowed, spatial.inertia(*self._bodies(frames))
-        V = _moving(S, v)
-        carried = _moving(spatial.along(V, S), u)
+        V = _velocities(S, v)
+        carried = _velocities(spatial.along(V, S), u)
         if u is v:  # the usual case: V x V = 0
             forces = spatial.momentum(bodies, carried) + spatial.along_wrench(
                 V, spatial.momentum(bodies, V)
             )
         else:
-            U = _moving(S, u)
+            U = _velocities(S, u)
             L = spatial.momentum(bodies, jnp.stack([carried - 0.5 * spatial.along(V, U), U, V]))
             forces = L[0] + 0.5 * jnp.sum(spatial.along_wrench(jnp.stack([V, U]), L[1:]), axis=0)
         return _felt(S, forces)
@@ -382,7 +380,7 @@ class Arm:
         """
         frames = self._frames(q)
         S, bodies = frames.allowed, spatial.inertia(*self._bodies(frames))
-        V = _moving(S, v)
+        V = _velocities(S, v)
         return _felt(spatial.along(V, S), spatial.momentum(bodies, V))
 
     @traced_once
@@ -425,7 +423,7 @@ def _summed(rows: jax.Array, triangle: Callable) -> jax.Array:
     return jnp.sum(jnp.where(chosen, rows, jnp.zeros_like(rows)), axis=1)
 
 
-def _moving(S: jax.Array, speeds: jax.Array) -> jax.Array:
+def _velocities(S: jax.Array, speeds: jax.Array) -> jax.Array:
     """J_i u, the motion of every link when the joints move at `speeds`, (n, 2, 3)."""
     return _inward(S * speeds[:, None, None])
 

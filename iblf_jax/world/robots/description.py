@@ -202,13 +202,11 @@ def contents(field: str, path: Path, most: int, expected: str, remedy: str = "")
     """
     try:
         if not path.is_file():
-            found = (
-                "It is a directory."
-                if path.is_dir()
-                else "It is not a file."
-                if path.exists()
-                else "Nothing is there."
-            )
+            found = "Nothing is there."
+            if path.is_dir():
+                found = "It is a directory."
+            elif path.exists():
+                found = "It is not a file."
             raise checks.fail(field, str(path), expected, f"{found} {remedy}".strip())
         with path.open("rb") as file:
             return file.read(most + 1)
@@ -221,7 +219,9 @@ def contents(field: str, path: Path, most: int, expected: str, remedy: str = "")
 def label(element: ET.Element) -> str:
     """How an element is called in messages: link "forearm"."""
     name = element.get("name")
-    return f"{element.tag} {name[:60]!r}" if name else f"<{element.tag[:40]}>"
+    if not name:
+        return f"<{element.tag[:40]}>"
+    return f"{element.tag} {name[:60]!r}"
 
 
 def floats(
@@ -236,7 +236,7 @@ def floats(
     expected, finite and below `most`.
     """
     words = [word for word in re.split(f"[{SPACES}]+", text.strip(SPACES)) if word]
-    expected = f"{count} numbers" if count and count > 1 else "one number" if count else "numbers"
+    expected = {None: "numbers", 1: "one number"}.get(count, f"{count} numbers")
     if (count is not None and len(words) != count) or not 1 <= len(words) <= longest:
         raise checks.fail(where, text, expected)
     if not all(DECIMAL.fullmatch(word) for word in words):

@@ -47,7 +47,7 @@ class Links(NamedTuple):
     """Body -> that link, -1 for the base."""
 
     def repaired(self, joints: dict[str, Any], repairs: Repairs) -> Links:
-        """The links, those mended that would leave the mass matrix singular.
+        """The links after the repair of those that would leave the mass matrix singular.
 
         Args:
           joints: fields of an Arm: axis, armature, lower, upper, kinds.
@@ -92,7 +92,8 @@ class Links(NamedTuple):
         """
         P, where = self.moments[i], f"link {self.names[i]!r}: inertia"
         m, J = P[3, 3], _about_centre(P)
-        J = np.zeros((3, 3)) if is_nothing(J, m) else J
+        if is_nothing(J, m):
+            J = np.zeros((3, 3))
         error = checks.fail(
             where,
             moments_of(J),
@@ -110,13 +111,15 @@ class Links(NamedTuple):
         return self._replace(moments=moments)
 
     def _longest(self) -> float:
-        """Xs link, for the longest link; from the base to the first joint where all is in one
+        """Length [m] of the longest link; from the base to the first joint where all is in one
         point.
         """
         centres = self.moments[:, :3, 3] / np.maximum(self.moments[:, 3, 3], 1e-300)[:, None]
         places = [p for body, (p, _) in self.frames.items() if self.carrier[body] >= 0]
         longest = float(np.max(np.linalg.norm([*centres, *places, *self.position[1:]], axis=1)))
-        return longest if longest > FINEST else float(np.linalg.norm(self.position[0]))
+        if longest > FINEST:
+            return longest
+        return float(np.linalg.norm(self.position[0]))
 
     def _unresisting(self, joints: dict[str, Any]) -> int | None:
         """The link nearest to the tip that, at some configuration, does not resist its joint when

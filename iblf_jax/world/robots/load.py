@@ -1,9 +1,9 @@
-"""Robots from files: a serial arm picked out of a URDF or MJCF.
+"""Robots from files: a serial arm selected from a URDF or MJCF.
 
-The file is read and checked by `description`, `urdf` and `mjcf`; the `mujoco` package (extra
-`robots`) makes a tree of bodies of what is left.  From the tree a chain is picked, from `base` to
+`description`, `urdf` and `mjcf` read and check the file; the `mujoco` package (extra `robots`)
+makes a tree of bodies from the checked copy.  `load` selects the chain of this tree from `base` to
 `tip`: its joints move, every other joint is locked, and each body is welded to the link of the
-  chain that carries it.  The arm's world is the frame of the base.
+chain that carries it.  The arm's world is the frame of the base.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ def load(
     """The serial arm of a URDF or MJCF file.
 
     Fixed joints are fused; joints that are not between base and tip are locked, and their links'
-    masses and inertias stay, with the link that carries them.  A mesh is opened only where a body
+    masses and inertias are added to the link that carries them.  A mesh is opened only where a body
     of an MJCF takes its weight from it.  What is wrong with links that the chain does not carry,
     and with joints that do not move in it, does not matter; nor do moments of inertia that are off
     by rounding, 1e-6 of them or m (1 um)^2.
 
-    With `repair` the rest is mended where a rule says how, with the least change, and listed: with
-    J = V diag(...) V^T an inertia about the centre of mass m,
+    With `repair` the other faults are corrected where a rule exists, with the least change, and
+    listed: with J = V diag(...) V^T an inertia about the centre of mass m,
 
         S = 1/2 tr(J) 1 - J = V diag(s) V^T,   S' = V diag(max(s, f)) V^T,   J' = tr(S') 1 - S',
 
@@ -56,7 +56,7 @@ def load(
 
     Args:
       path: the file; `<robot>` is read as URDF, `<mujoco>` as MJCF, whatever its ending.
-      base: name of the link (body) that is held still, and whose frame is the arm's world; the root
+      base: name of the link (body) that is fixed, and whose frame is the arm's world; the root
         if not given.
       tip: name of the link (body, or site of an MJCF) whose frame is the tip; the end of the chain
         if there is only one.
@@ -64,8 +64,8 @@ def load(
         base and tip may be among them.  Others that are left out are locked at 0 (an MJCF's at
         `ref`).
       gravity: (3,) [m/s^2] in the file's world; the file's own, (0, 0, -9.81) if it has none.
-      repair: whether to mend what can be mended; a warning and the arm's `repaired` then say what
-        changed, a line a link or joint.
+      repair: whether to correct the faults that have a rule; a warning and the arm's `repaired`
+        then list the changes, a line a link or joint.
 
     Returns:
       An Arm, with the names of links and joints, limits, damping, friction, armature, efforts and
@@ -79,17 +79,17 @@ def load(
 
     Source: formats as defined by ROS (URDF) and MuJoCo (MJCF).
     """
-    base, tip = (
-        None if x is None else checks.word(what, x, "the name of a link")
-        for what, x in (("base", base), ("tip", tip))
-    )
-    locked = checks.mapping("locked", {} if locked is None else locked, '{"gripper_joint": 0.02}')
+    for name, link in (("base", base), ("tip", tip)):
+        if link is not None:
+            checks.word(name, link, "the name of a link")
+    if locked is None:
+        locked = {}
+    checks.mapping("locked", locked, '{"gripper_joint": 0.02}')
     repairs = Repairs(checks.flag("repair", repair))
     root = description.read(path)
-    picked = _Request(base, tip, dict(locked), gravity, repairs)
-    reader = _from_urdf if root.tag == "robot" else _from_mjcf
+    request = _ArmRequest(base, tip, dict(locked), gravity, repairs)
     try:
-        arm = reader(root, path, picked)
+        arm = _READERS[root.tag](root, path, request)
     except ValueError as error:
         raise description.of_file(path, error) from error
     if arm.repaired:
@@ -97,8 +97,8 @@ def load(
     return arm
 
 
-class _Request(NamedTuple):
-    """What the caller wants of a file."""
+class _ArmRequest(NamedTuple):
+    """The arguments of `load` except the path."""
 
     base: str | None
     tip: str | None
@@ -107,26 +107,30 @@ class _Request(NamedTuple):
     repairs: Repairs
 
 
-def _from_urdf(root: ET.Element, path: str | os.PathLike, request: _Request) -> Arm:
+def _from_urdf(root: ET.Element, path: str | os.PathLike, request: _ArmRequest) -> Arm:
     """The arm of a URDF whose root element has been read."""
     file = urdf.checked(root)
-    tree = Tree.compiled(file.text, str(path), file.root, file.taken_out)
+    tree = Tree.compiled(file.text, str(path), file.root, file.separate_weights)
     chain = _Chain.picked(tree, request.base, request.tip, request.locked, request.repairs)
     return chain.following(file, request.repairs).arm(
         request.gravity, {}, request.repairs, file.speeds
     )
 
 
-def _from_mjcf(root: ET.Element, path: str | os.PathLike, request: _Request) -> Arm:
+def _from_mjcf(root: ET.Element, path: str | os.PathLike, request: _ArmRequest) -> Arm:
     """The arm of an MJCF whose root element has been read."""
     model = mjcf.checked(root, Path(path).parent)
-    tree = Tree.compiled(model.text, str(path), "world", model.taken_out)
+    tree = Tree.compiled(model.text, str(path), "world", model.separate_weights)
     chain = _Chain.picked(tree, request.base, request.tip, request.locked, request.repairs)
     return chain.arm(request.gravity, model.tendons, request.repairs, {})
 
 
+_READERS = {"robot": _from_urdf, "mujoco": _from_mjcf}
+"""Root element -> the function that makes the arm."""
+
+
 class _Chain(NamedTuple):
-    """What was picked of a tree."""
+    """The chain from base to tip in a tree of bodies."""
 
     tree: Tree
     base: int
@@ -135,30 +139,33 @@ class _Chain(NamedTuple):
     """Position and orientation of the tip in the frame of its body."""
     joints: tuple[int, ...]
     """Joints that move, from the base on."""
-    held: dict[int, float]
-    """Joints that do not, and where they are."""
+    locked: dict[int, float]
+    """Locked joints -> their positions."""
 
     @staticmethod
     def picked(
         tree: Tree, base: str | None, tip: str | None, locked: dict[str, float], repairs: Repairs
     ) -> _Chain:
         """The chain from base to tip."""
-        first = 0 if base is None else tree.body(base, "base")
-        held = {tree.joint(name): locked_position(name, value) for name, value in locked.items()}
-        last, at_tip = (
-            tree.frame(tip)
-            if tip is not None
-            else (tree.only_tip(first, held), (np.zeros(3), np.eye(3)))
-        )
-        way = tree.way(first, last)
-        if way is None:
+        first = 0
+        if base is not None:
+            first = tree.body(base, "base")
+        positions = {
+            tree.joint(name): locked_position(name, value) for name, value in locked.items()
+        }
+        if tip is None:
+            last, at_tip = tree.only_tip(first, positions), (np.zeros(3), np.eye(3))
+        else:
+            last, at_tip = tree.frame(tip)
+        path = tree.path(first, last)
+        if path is None:
             raise checks.fail(
                 "tip",
                 tip,
                 f"a link beyond the base {tree.bodies[first]!r}",
                 "Another base or another tip.",
             )
-        joints = tuple(j for b in way for j in tree.joints_of(b) if j not in held)
+        joints = tuple(j for b in path for j in tree.joints_of(b) if j not in positions)
         if not joints:
             expected = "a chain with a joint that moves"
             raise checks.fail(
@@ -169,57 +176,52 @@ class _Chain(NamedTuple):
             )
         for j in joints:
             tree.check_joint(j, repairs)
-        return _Chain(tree, first, last, at_tip, joints, held)
+        return _Chain(tree, first, last, at_tip, joints, positions)
 
     def following(self, file: urdf.Urdf, repairs: Repairs) -> _Chain:
-        """The chain with the mimics that are not in it locked where their joints take them, and
-        what is wrong with its joints met.
+        """The chain with all mimic joints outside it locked where the joints that they follow are;
+        handles the faults of its joints.
         """
-        tree, held = self.tree, dict(self.held)
-        moving = {tree.joint_names[j] for j in self.joints}
+        tree, locked = self.tree, dict(self.locked)
+        free = {tree.joint_names[j] for j in self.joints}
         for name in file.mimics:
-            if name not in moving and tree.joint(name) not in held:
-                held[tree.joint(name)] = self._mimicked(name, file.mimics)
-        for j in (*self.joints, *(j for j, position in held.items() if position)):
-            for fault in (
-                file.axes.get(tree.joint_names[j]),
-                *(file.motions[tree.joint_names[j]] if j in self.joints else ()),
-            ):
-                if fault:
+            if name not in free and tree.joint(name) not in locked:
+                locked[tree.joint(name)] = self._mimicked(name, file.mimics)
+        displaced = [j for j, position in locked.items() if position]
+        for j in (*self.joints, *displaced):
+            name = tree.joint_names[j]
+            if name in file.axes:
+                repairs.meet(file.axes[name])
+            if name in free:
+                for fault in file.motions[name]:
                     repairs.meet(fault)
         for name, mimic in file.mimics.items():
-            if name in moving or mimic.master in moving:
-                coupled = name if name in moving else mimic.master
+            if name in free or mimic.master in free:
+                coupled, repaired = mimic.master, "one that is locked"
+                if name in free:
+                    coupled, repaired = name, "one that moves by itself"
                 remedy = f"Lock it: locked={{{coupled!r}: 0.0}}, or take another tip."
                 error = checks.fail(
                     f"joint {name!r}", Shown(mimic.shown), "joints that move by themselves", remedy
                 )
-                repairs.meet(
-                    Fault(
-                        f"joint {name!r}",
-                        mimic.shown,
-                        error,
-                        "one that moves by itself" if name in moving else "one that is locked",
-                    )
-                )
-        way = tree.way(0, self.tip) or []
+                repairs.meet(Fault(f"joint {name!r}", mimic.shown, error, repaired))
+        path = tree.path(0, self.tip) or []
         for b in range(1, tree.model.nbody):
-            carried = any(j in self.joints for c in tree.way(0, b) or () for j in tree.joints_of(c))
-            if tree.bodies[b] in file.places and (carried or b in way):
+            ancestors = tree.path(0, b) or ()
+            carried = any(j in self.joints for c in ancestors for j in tree.joints_of(c))
+            if tree.bodies[b] in file.places and (carried or b in path):
                 repairs.meet(file.places[tree.bodies[b]])
-        return self._replace(held=held)
+        return self._replace(locked=locked)
 
     def _mimicked(self, name: str, mimics: dict[str, urdf.Mimic]) -> float:
-        """Where a joint is that follows others, of which the last is locked."""
+        """The position of a joint that follows others, of which the last is locked."""
         factor, offset, seen = 1.0, 0.0, {name}
-        at = {self.tree.joint_names[j]: position for j, position in self.held.items()}
+        at = {self.tree.joint_names[j]: position for j, position in self.locked.items()}
         while name in mimics and name not in at:
             mimic = mimics[name]
-            offset, factor, name = (
-                offset + factor * mimic.offset,
-                factor * mimic.multiplier,
-                mimic.master,
-            )
+            offset += factor * mimic.offset
+            factor *= mimic.multiplier
+            name = mimic.master
             if name in seen:
                 raise checks.fail(
                     f"joint {name!r}: mimic", Shown("a ring of mimics"), "a joint that leads"
@@ -232,13 +234,13 @@ class _Chain(NamedTuple):
     ) -> Arm:
         """The Arm, all bodies welded to the links that carry them."""
         tree = self.tree
-        g = np.asarray(
-            tree.gravity if gravity is None else checks.as_floats("gravity", gravity), float
-        )
+        g = tree.gravity
+        if gravity is not None:
+            g = np.asarray(checks.as_floats("gravity", gravity), float)
         checks.shape_is("gravity", g, (3,))
-        _, upright = tree.pose(self.base, self.held)
+        _, upright = tree.pose(self.base, self.locked)
         joints = tree.of_joints(self.joints)
-        links = tree.welded(self.base, self.joints, self.held, repairs)
+        links = tree.welded(self.base, self.joints, self.locked, repairs)
         tree.check_closed(links, self.joints, tendons, repairs)
         links = links.repaired(joints, repairs)
         p, R = links.frames[self.tip]

@@ -1,8 +1,8 @@
 """The meshes that bodies of an MJCF are weighed by.
 
 A mesh is opened only where a body has no other weight.  Its file is read here, under a limit, and
-the library weighs it once apart from the rest: so one that is missing or broken is a fault of the
-  bodies that need it, and of no other.
+the library computes its mass properties in a separate model, so that a missing or broken mesh is a
+fault only of those bodies that need it.
 """
 
 from __future__ import annotations
@@ -75,7 +75,9 @@ class Meshes:
     def _weigh(self, geom: Any) -> None:
         """Raises unless the library can weigh the geom."""
         if geom.hfieldname or geom.meshname not in self.meshes:
-            got = Shown(f"height field {geom.hfieldname!r}") if geom.hfieldname else geom.meshname
+            got = geom.meshname
+            if geom.hfieldname:
+                got = Shown(f"height field {geom.hfieldname!r}")
             raise checks.fail(
                 "its weight",
                 got,
@@ -85,15 +87,15 @@ class Meshes:
         mesh = self.meshes[geom.meshname]
         if geom.meshname not in self.opened:
             self.opened[geom.meshname] = self._open(mesh)
-        alone = type(self.spec)()
-        copy, shaped = alone.add_mesh(), alone.worldbody.add_body().add_geom()
+        separate = type(self.spec)()
+        copy, shaped = separate.add_mesh(), separate.worldbody.add_body().add_geom()
         for one, other, names in ((copy, mesh, OF_MESH), (shaped, geom, OF_GEOM)):
             for name in names:
                 setattr(one, name, getattr(other, name))
         shaped.contype = shaped.conaffinity = 0
-        alone.assets = {name: data for name, data in self.files.items() if name == mesh.file}
+        separate.assets = {name: data for name, data in self.files.items() if name == mesh.file}
         try:
-            alone.compile()
+            separate.compile()
         except ValueError as error:
             path = self.opened.pop(geom.meshname)
             got = Shown(path or "vertices in the model")
@@ -106,10 +108,11 @@ class Meshes:
         """Reads the file of a mesh, if it has one."""
         if not mesh.file:
             return None
-        field, path = (
-            f"mesh {mesh.name!r}",
-            self.folder / (Path(mesh.file).name if self.bare else mesh.file),
-        )
+        field = f"mesh {mesh.name!r}"
+        file = mesh.file
+        if self.bare:
+            file = Path(file).name
+        path = self.folder / file
         left = LARGEST_MESHES - sum(map(len, self.files.values()))
         data = contents(field, path, left, "the path of a mesh, STL, OBJ or MSH", REMEDY)
         if len(data) > left:

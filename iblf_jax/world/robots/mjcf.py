@@ -1,10 +1,10 @@
-"""The part of an MJCF that says how bodies move and what they weigh.
+"""The part of an MJCF that defines how bodies move and what they weigh.
 
-A list of elements and attributes goes on; what draws, collides without weighing anything or senses
-does not.  The library resolves defaults and then would refuse a body for what may not matter: so
-what it would refuse is taken out of its hands before it compiles (`Mjcf.taken_out`), to be judged
-where the body counts.  Of the meshes it gets those that a body takes its weight from, if they can
-be weighed, as bytes that were read here.
+The copy keeps a list of elements and attributes; it drops visuals, collision geometry without mass
+and sensors.  The library resolves defaults, and it rejects a whole model for a faulty weight of a
+body that may not belong to the chain.  `Mjcf.separate_weights` therefore replaces such weights
+before the library compiles the model, and they are validated only where the chain carries the body.
+The library receives those meshes that define the weight of a body, as bytes that were read here.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from iblf_jax.core import checks
 from iblf_jax.world.robots.description import FARTHEST, LARGEST, MOST_BODIES, Shown, floats, label
 from iblf_jax.world.robots.meshes import Meshes
-from iblf_jax.world.robots.repair import Fault, Weight, judged
+from iblf_jax.world.robots.repair import Fault, Weight, checked_weight
 
 PLACE = "pos quat axisangle xyaxes zaxis euler"
 ACTUATOR = "name class joint gear ctrlrange ctrllimited forcerange forcelimited inheritrange"
@@ -114,9 +114,9 @@ class Mjcf(NamedTuple):
     """Whether they are there under their bare names, without the folders that the file gives
     them."""
 
-    def taken_out(self, spec: Any) -> list[tuple[Any, Weight]]:
-        """Gives every body whose weight the library would refuse or cannot know a harmless one, and
-        returns what the file says.
+    def separate_weights(self, spec: Any) -> list[tuple[Any, Weight]]:
+        """Replaces every weight that the library would reject or cannot know by a valid one, and
+        returns the weights of the file.
 
         Args:
           spec: the library's, parsed and not compiled; it is changed.
@@ -125,7 +125,8 @@ class Mjcf(NamedTuple):
           Bodies of it with their weights, along the axes and about the origin of the inertial frame
           that the library gives them.
         """
-        c, out, meshes = spec.compiler, [], Meshes(spec, self.folder, self.bare)
+        c, out = spec.compiler, []
+        meshes = Meshes(spec, self.folder, self.bare)
         bounded = c.boundmass > 0 or c.boundinertia > 0 or c.settotalmass > 0
         low, high = c.inertiagrouprange
         for body in spec.bodies:
@@ -145,7 +146,9 @@ class Mjcf(NamedTuple):
                     "mjGEOM_SDF",
                     "mjGEOM_HFIELD",
                 )
-                problem = meshes.problem(geom) if weighs and shaped and by_geoms else None
+                problem = None
+                if weighs and shaped and by_geoms:
+                    problem = meshes.problem(geom)
                 fault = fault or problem
                 if not weighs or problem or (shaped and not by_geoms):
                     spec.delete(geom)
@@ -164,8 +167,9 @@ class Mjcf(NamedTuple):
             body.fullinertia = [np.nan, 0, 0, 0, 0, 0]
             if np.isnan(body.ipos).any():
                 body.ipos = np.zeros(3)
-            for geom in list(body.geoms) if int(c.inertiafromgeom) == 1 else ():
-                spec.delete(geom)
+            if int(c.inertiafromgeom) == 1:
+                for geom in list(body.geoms):
+                    spec.delete(geom)
         meshes.leave()
         return out
 
@@ -203,19 +207,28 @@ def _copy(source: ET.Element, target: ET.Element, section: str) -> None:
         drives_no_joint = section == "actuator" and element.get("joint") is None
         if tag not in KEPT or drives_no_joint:
             continue
-        kept = COUPLING if (section, tag) == ("equality", "joint") else KEPT[tag]
+        kept = KEPT[tag]
+        if (section, tag) == ("equality", "joint"):
+            kept = COUPLING
         attributes = {name: text for name, text in element.items() if name in kept.split()}
         for name, text in attributes.items():
             if name not in WORDS and text not in SWITCHES:
-                limits = (
-                    {"most": FARTHEST}
-                    if name in WIDE
-                    else {"longest": LARGEST}
-                    if name in LONG
-                    else {}
-                )
-                floats(f"{label(element)}: {name}", text, 1 if name in SINGLE else None, **limits)
+                _check_numbers(f"{label(element)}: {name}", name, text)
         _copy(element, ET.SubElement(target, tag, attributes), section or tag)
+
+
+def _check_numbers(where: str, name: str, text: str) -> None:
+    """Raises ValueError unless an attribute holds numbers within its limits."""
+    if name in SINGLE and name in WIDE:
+        floats(where, text, 1, most=FARTHEST)
+    elif name in SINGLE:
+        floats(where, text, 1)
+    elif name in WIDE:
+        floats(where, text, most=FARTHEST)
+    elif name in LONG:
+        floats(where, text, longest=LARGEST)
+    else:
+        floats(where, text)
 
 
 def _tendons(root: ET.Element) -> Tendons:
@@ -245,11 +258,9 @@ def _explicit(body: Any, where: str, balanced: bool) -> Weight | None:
     if not body.explicitinertial:
         return Weight()
     xx, yy, zz, xy, xz, yz = body.fullinertia
-    J = (
-        np.diag(body.inertia)
-        if np.isnan(xx)
-        else np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    )
+    J = np.diag(body.inertia)
+    if not np.isnan(xx):
+        J = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     moments = np.linalg.eigvalsh(J)
     if (
         body.mass >= LEAST
@@ -257,4 +268,4 @@ def _explicit(body: Any, where: str, balanced: bool) -> Weight | None:
         and (balanced or moments[2] <= moments[0] + moments[1])
     ):
         return None
-    return judged(where, float(body.mass), J)
+    return checked_weight(where, float(body.mass), J)

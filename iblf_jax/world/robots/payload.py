@@ -4,7 +4,7 @@ A load that is picked up is at rest relative to the gripper when it is gripped: 
 momentum along, so there is no impulse and q' does not jump.  Its weight goes over from where it lay
 to the gripper within `rise` seconds, by the share
 
-    s(t) = x^3 (10 - 15 x + 6 x^2),   x = (t - start) / rise, held within 0 and 1,
+    s(t) = x^3 (10 - 15 x + 6 x^2),   x = (t - start) / rise, clipped to [0, 1],
 
 and the arm moves as one with the mass s m and the inertia s I at each instant: M(q; s) q" + C(q,
 q'; s) q' + G(q; s) = tau + f.  So f is differentiable (Assumption 1).  The law's model does not
@@ -84,4 +84,6 @@ class Payload:
         has looked at.
         """
         P = pseudo_inertia(self.mass, self.centre, self.inertia)
-        return P if self.start is None else jnp.zeros_like(P)
+        if self.start is None:
+            return P
+        return jnp.zeros_like(P)

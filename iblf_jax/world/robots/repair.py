@@ -1,19 +1,18 @@
-"""What a file says of a link or joint that cannot be, and the rule by which `load(...,
-repair=True)` mends it.
+"""Faults of links and joints in robot files, and the rules by which `load(..., repair=True)`
+corrects them.
 
 A body's second moments of mass about its centre are, with V orthogonal,
 
     S = int r r^T dm = 1/2 tr(J) 1 - J = V diag(s) V^T,
 
-and no body has a negative s: J is then positive, and no principal moment is above the sum of the
-  two others.  The nearest inertia that a
-body can have (the least change of S, and so of the pseudo-inertia, in the Frobenius norm; mass and
-centre stay) is
+and no body has a negative s: J is then positive, and no principal moment exceeds the sum of the two
+others.  The nearest inertia that a body can have (the least change of S, and so of the
+pseudo-inertia, in the Frobenius norm; mass and centre stay) is
 
     S' = V diag(max(s, f)) V^T,   J' = tr(S') 1 - S',
 
-with f = 0; for a link that moves and would resist its joint with nothing, f = m (L / 100)^2, m its
-mass and L the length of the longest link of the chain: a compact body.
+with f = 0.  A moving link that would add no inertia to its joint gets f = m (L / 100)^2, with its
+mass m and the length L of the longest link of the chain: it becomes a compact body.
 """
 
 from __future__ import annotations
@@ -26,36 +25,36 @@ from iblf_jax.core import checks
 from iblf_jax.world.robots.description import Shown
 
 ROUNDING = 1e-6
-"""Of a body's moments: what a file with seven digits cannot say."""
+"""Relative error of a body's moments in a file that has seven digits."""
 FINEST = 1e-6
-"""[m]: no link is known to a finer length, so moments of mass FINEST^2 are none."""
+"""[m]: no length of a link is known better, so moments below mass FINEST^2 count as zero."""
 COMPACT = 0.01
-"""Radius of gyration, along each axis, of a link that had no inertia, by the length of the
-longest."""
+"""Radius of gyration, along each axis, of a link that had no inertia, relative to the length of the
+longest link."""
 
 
 class Fault(NamedTuple):
-    """What is wrong with a link or joint, and what it would become."""
+    """A fault of a link or joint, and the value that repairs it."""
 
     where: str
     got: str
     error: ValueError
     to: str = ""
-    """What `repair=True` makes of it; nothing if it cannot be mended."""
+    """The value after the repair; empty if there is no repair."""
 
 
 class Repairs:
-    """Meets faults: mends and lists them where that was asked for, refuses the file elsewhere."""
+    """Handles faults: repairs and lists them if `enabled`, and raises their errors otherwise."""
 
-    def __init__(self, wanted: bool) -> None:
-        self.wanted = wanted
+    def __init__(self, enabled: bool) -> None:
+        self.enabled = enabled
         self.lines: list[str] = []
 
     def meet(self, fault: Fault) -> None:
-        """Raises the fault, or lists what it becomes."""
+        """Lists the repair of a fault; raises its error if no repair exists or is allowed."""
         if not fault.to:
             raise fault.error
-        if not self.wanted:
+        if not self.enabled:
             raise ValueError(
                 f"{fault.error} Or load it with repair=True, which makes of it: {fault.to}."
             )
@@ -65,21 +64,23 @@ class Repairs:
 
 
 class Weight(NamedTuple):
-    """What a body weighs, about its centre and along given axes."""
+    """Mass and inertia of a body, about its centre and along given axes."""
 
     mass: float = 0.0
     inertia: np.ndarray = np.zeros((3, 3))
     """(3, 3) [kg m^2]."""
     fault: Fault | None = None
     nearest: np.ndarray | None = None
-    """The inertia to take in its place, where there is a fault that can be mended."""
+    """The inertia that replaces it, where a fault can be repaired."""
 
     def repaired(self, repairs: Repairs) -> Weight:
-        """The weight to count, its fault met."""
+        """The weight after the repair of its fault."""
         if self.fault is None:
             return self
         repairs.meet(self.fault)
-        return Weight(self.mass, self.inertia if self.nearest is None else self.nearest)
+        if self.nearest is None:
+            return Weight(self.mass, self.inertia)
+        return Weight(self.mass, self.nearest)
 
 
 def second_moments(J: np.ndarray) -> np.ndarray:
@@ -95,7 +96,7 @@ def thickened(J: np.ndarray, least: float) -> np.ndarray:
 
 
 def moments_of(J: np.ndarray) -> Shown:
-    """How an inertia is called in messages."""
+    """The text by which messages show an inertia."""
     return Shown("principal moments " + ", ".join(f"{x:.4g}" for x in np.linalg.eigvalsh(J)))
 
 
@@ -104,8 +105,8 @@ def is_nothing(J: np.ndarray, mass: float) -> bool:
     return bool(np.trace(J) <= mass * FINEST**2)
 
 
-def judged(where: str, mass: float, J: np.ndarray) -> Weight:
-    """The weight that a file gives a body, with what is wrong with it.
+def checked_weight(where: str, mass: float, J: np.ndarray) -> Weight:
+    """The weight that a file gives a body, with its fault if it has one.
 
     Args:
       where: name of the body in messages.
@@ -136,11 +137,13 @@ def judged(where: str, mass: float, J: np.ndarray) -> Weight:
             ),
             nearest,
         )
-    moments, s = np.linalg.eigvalsh(J), np.linalg.eigvalsh(second_moments(J))
+    moments = np.linalg.eigvalsh(J)
+    s = np.linalg.eigvalsh(second_moments(J))
     rounding = ROUNDING * np.abs(moments).sum() + mass * FINEST**2
     if s[0] >= -0.5 * rounding:
         return Weight(mass, J)
-    shown, nearest = moments_of(J), thickened(J, 0.0)
+    shown = moments_of(J)
+    nearest = thickened(J, 0.0)
     if moments[0] < -rounding:
         error = checks.fail(
             field, shown, "a positive definite inertia [kg m^2]", "A body that moves needs one."

@@ -2,22 +2,22 @@
 elementwise products.
 
 A *motion* is (..., 2, 3): the angular velocity w, and the velocity v of the body's point at the
-  origin of the world.  A *wrench* (a
-force, or a momentum) is (..., 2, 3) as well: its moment n about the origin of the world, and f.
+origin of the world.  A *wrench* (a force, or a momentum) is (..., 2, 3) as well: its moment n about
+the origin of the world, and f.
 
 A *pseudo-inertia* is the symmetric 4 x 4 matrix of a body's moments about the origin of a frame,
 
-    P = [[Sigma, h], [h^T, m]],   Sigma = int r r^T dm,   h = m c,   rotational inertia J =
-    tr(Sigma) 1 - Sigma.
+    P = [[Sigma, h], [h^T, m]],   Sigma = int r r^T dm,   h = m c,
+    rotational inertia J = tr(Sigma) 1 - Sigma.
 
 It adds up over bodies, and moves to another frame as H P H^T with H = [[R, p], [0, 1]]: no
 parallel-axis rules.
 
 Products are written as sums: a call into a matrix library costs more than the arithmetic
-  (`core.linalg`), and what is compiled as one
-function must hold none.  Few operations on whole arrays rather than many on their entries keep the
-compiler quick, and where an entry is known to be zero it is selected or concatenated as such, not
-multiplied by zero, so that a scalar program drops it.
+(`core.linalg`), and a step that is compiled as one function must not contain such a call.  Few
+operations on complete arrays compile faster than many on their entries.  An entry that is known to
+be zero is selected or concatenated as a zero, not multiplied by zero, so that a scalar program
+drops it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The tree of bodies that `mujoco` makes of a file, and what is read from it.
+"""The tree of bodies that `mujoco` makes of a file, and the quantities of an arm read from it.
 
 Quantities are NumPy arrays in float64.  A pose is (position, rotation matrix).
 """
@@ -18,6 +18,7 @@ from iblf_jax.world.robots.mjcf import Tendons
 from iblf_jax.world.robots.repair import Fault, Repairs, Weight, second_moments
 
 FREE, BALL, SLIDE, HINGE = range(4)
+KINDS = {HINGE: "revolute", SLIDE: "prismatic"}
 CONNECT, WELD, COUPLED = range(3)
 JOINT, FIXED, NO_BIAS = 0, 0, 0
 """The library's numbers for kinds of joints, of constraints, and of an actuator's transmission,
@@ -42,7 +43,10 @@ class Tree:
         self.model = model
         self.weights = weights
         """Body -> what it weighs in its inertial frame, where that is not the model's number."""
-        names = lambda kind, count: [mujoco.mj_id2name(model, kind, i) for i in range(count)]  # noqa: E731
+
+        def names(kind: Any, count: int) -> list[str | None]:
+            return [mujoco.mj_id2name(model, kind, i) for i in range(count)]
+
         objects = mujoco.mjtObj
         self.bodies = [
             name or f"body{i}" for i, name in enumerate(names(objects.mjOBJ_BODY, model.nbody))
@@ -55,12 +59,13 @@ class Tree:
         self.sites = names(objects.mjOBJ_SITE, model.nsite)
         self.equalities = names(objects.mjOBJ_EQUALITY, model.neq)
         self.site_type = objects.mjOBJ_SITE
-        weightless = model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY
-        self.gravity = np.zeros(3) if weightless else np.array(model.opt.gravity)
+        self.gravity = np.array(model.opt.gravity, float)
+        if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY:
+            self.gravity = np.zeros(3)
 
     @staticmethod
     def compiled(
-        text: str, path: str, root: str, taken_out: Callable[[Any], list[tuple[Any, Weight]]]
+        text: str, path: str, root: str, separate_weights: Callable[[Any], list[tuple[Any, Weight]]]
     ) -> Tree:
         """The tree of a checked description.
 
@@ -68,8 +73,8 @@ class Tree:
           text: the description.
           path: its file, for messages.
           root: name of the body that the library calls the world.
-          taken_out: from the library's specification, before it is compiled, bodies whose weights
-            are not the library's business.
+          separate_weights: takes the library's specification before it is compiled and returns the
+            bodies whose weights the library must not check.
 
         Raises:
           ValueError: what the library does not accept, in its words.
@@ -79,14 +84,12 @@ class Tree:
         try:
             spec = mujoco.MjSpec.from_string(text)
             spec.compiler.fusestatic = False
-            weights = taken_out(spec)
+            weights = separate_weights(spec)
             model = spec.compile()
         except ValueError as error:
             words = " ".join(str(error).split())
             raise ValueError(f"{path}: {words}") from None
         return Tree(model, mujoco, root, {body.id: weight for body, weight in weights})
-
-    # ---------------------------------------------------------------------------------------------------------------- by name
 
     def body(self, name: str, what: str) -> int:
         """The body of a name."""
@@ -114,33 +117,33 @@ class Tree:
             "tip", name, "the name of a link or site", [*self.bodies, *filter(None, self.sites)]
         )
 
-    # ---------------------------------------------------------------------------------------------------------------- structure
-
     def joints_of(self, body: int) -> range:
         """The joints that move a body against its parent, in their order."""
         start = int(self.model.body_jntadr[body])
         return range(start, start + int(self.model.body_jntnum[body]))
 
-    def way(self, first: int, last: int) -> list[int] | None:
-        """The bodies after `first` up to `last`; None if `last` does not hang on it."""
-        way = []
+    def path(self, first: int, last: int) -> list[int] | None:
+        """The bodies after `first` up to `last`; None if `last` is no descendant of `first`."""
+        path = []
         while last != first:
             if last == 0:
                 return None
-            way.append(last)
+            path.append(last)
             last = int(self.model.body_parentid[last])
-        return way[::-1]
+        return path[::-1]
 
-    def only_tip(self, first: int, held: dict[int, float]) -> int:
+    def only_tip(self, first: int, locked: dict[int, float]) -> int:
         """The body at the end of the only chain that moves, beyond `first`.
 
         The end is the last body there if the links do not branch behind the last joint, else the
         link that this joint moves.
         """
         m = self.model
-        beyond = [b for b in range(m.nbody) if b == first or self.way(first, b) is not None]
-        moved = [b for b in beyond if b != first and any(j not in held for j in self.joints_of(b))]
-        ends = [b for b in moved if not any(b != c and self.way(b, c) is not None for c in moved)]
+        beyond = [b for b in range(m.nbody) if b == first or self.path(first, b) is not None]
+        moved = [
+            b for b in beyond if b != first and any(j not in locked for j in self.joints_of(b))
+        ]
+        ends = [b for b in moved if not any(b != c and self.path(b, c) is not None for c in moved)]
         if len(ends) != 1:
             found = ", ".join(repr(self.bodies[b]) for b in ends[:8]) or "none"
             expected = "the name of a link: the chain must have one end"
@@ -151,16 +154,19 @@ class Tree:
         leaves = [
             b
             for b in beyond
-            if b not in parents and (b == ends[0] or self.way(ends[0], b) is not None)
+            if b not in parents and (b == ends[0] or self.path(ends[0], b) is not None)
         ]
-        return leaves[0] if len(leaves) == 1 else ends[0]
+        if len(leaves) == 1:
+            return leaves[0]
+        return ends[0]
 
     def check_joint(self, j: int, repairs: Repairs) -> None:
-        """Meets what an Arm's joint cannot have."""
+        """Handles the properties of a joint that an Arm does not have."""
         m, name = self.model, self.joint_names[j]
         if m.jnt_type[j] not in (HINGE, SLIDE):
-            kind = "free" if m.jnt_type[j] == FREE else "ball"
-            remedy = "Take a base beyond it." if kind == "free" else "Write it as three hinges."
+            kind, remedy = "ball", "Write it as three hinges."
+            if m.jnt_type[j] == FREE:
+                kind, remedy = "free", "Take a base beyond it."
             raise checks.fail(
                 f"joint {name!r}",
                 Shown(f"a {kind} joint"),
@@ -173,35 +179,33 @@ class Tree:
             error = checks.fail(where, stiffness, "0: springs are not modelled", "Remove it.")
             repairs.meet(Fault(where, str(stiffness), error, "0: the spring is left out"))
 
-    # ----------------------------------------------------------------------------------------------------------------- geometry
-
     def placed(self, body: int) -> Pose:
         """Pose of a body in its parent's frame, its joints at their reference."""
         return np.array(self.model.body_pos[body]), matrix(self.model.body_quat[body])
 
-    def _held(self, pose: Pose, j: int, held: dict[int, float]) -> Pose:
+    def _after_locked(self, pose: Pose, j: int, locked: dict[int, float]) -> Pose:
         """`pose` of a body after its joint j, which is locked."""
         m = self.model
         if m.jnt_type[j] not in (HINGE, SLIDE):
             return pose
         reference = float(m.qpos0[m.jnt_qposadr[j]])
-        move, axis = held.get(j, reference) - reference, np.array(m.jnt_axis[j])
+        move, axis = locked.get(j, reference) - reference, np.array(m.jnt_axis[j])
         if m.jnt_type[j] == SLIDE:
             return joined(pose, (axis * move, np.eye(3)))
         anchor, R = np.array(m.jnt_pos[j]), turn(axis, move)
         return joined(pose, (anchor - R @ anchor, R))
 
-    def pose(self, body: int, held: dict[int, float]) -> Pose:
+    def pose(self, body: int, locked: dict[int, float]) -> Pose:
         """Pose of a body in the world, every joint locked."""
         pose: Pose = (np.zeros(3), np.eye(3))
-        for b in self.way(0, body) or ():
+        for b in self.path(0, body) or ():
             pose = joined(pose, self.placed(b))
             for j in self.joints_of(b):
-                pose = self._held(pose, j, held)
+                pose = self._after_locked(pose, j, locked)
         return pose
 
     def welded(
-        self, base: int, joints: tuple[int, ...], held: dict[int, float], repairs: Repairs
+        self, base: int, joints: tuple[int, ...], locked: dict[int, float], repairs: Repairs
     ) -> Links:
         """The links that `joints` move, and each body beyond the base with the link that carries
         it.
@@ -218,21 +222,23 @@ class Tree:
             own = [j for j in self.joints_of(b) if j in joints]
             for j in self.joints_of(b):
                 if j not in joints:
-                    pose = self._held(pose, j, held)
+                    pose = self._after_locked(pose, j, locked)
                     continue
-                anchor, axis, reference = (
-                    np.array(m.jnt_pos[j]),
-                    np.array(m.jnt_axis[j]),
-                    float(m.qpos0[m.jnt_qposadr[j]]),
-                )
+                anchor = np.array(m.jnt_pos[j])
+                axis = np.array(m.jnt_axis[j])
+                reference = float(m.qpos0[m.jnt_qposadr[j]])
                 p, R = joined(pose, (anchor, np.eye(3)))
-                hinge = m.jnt_type[j] == HINGE
-                position.append(p if hinge else p - R @ axis * reference)
-                rotation.append(R @ turn(axis, -reference) if hinge else R)
-                between.append(j != own[-1])
-                names.append(
-                    self.bodies[b] if j == own[-1] else f"{self.bodies[b]}:{self.joint_names[j]}"
-                )
+                if m.jnt_type[j] == HINGE:
+                    R = R @ turn(axis, -reference)
+                else:
+                    p = p - R @ axis * reference
+                position.append(p)
+                rotation.append(R)
+                name, is_between = self.bodies[b], j != own[-1]
+                if is_between:
+                    name = f"{name}:{self.joint_names[j]}"
+                names.append(name)
+                between.append(is_between)
                 link, pose = len(names) - 1, (-anchor, np.eye(3))
             frames[b], carrier[b] = pose, link
         moments = np.zeros((len(names), 4, 4))
@@ -283,7 +289,7 @@ class Tree:
             "lower": np.where(limited, m.jnt_range[at, 0], -np.inf),
             "upper": np.where(limited, m.jnt_range[at, 1], np.inf),
             "effort": np.where(effort > 0, effort, np.inf),
-            "kinds": tuple("revolute" if m.jnt_type[j] == HINGE else "prismatic" for j in joints),
+            "kinds": tuple(KINDS[int(m.jnt_type[j])] for j in joints),
             "joints": tuple(self.joint_names[j] for j in joints),
         }
 
@@ -295,12 +301,12 @@ class Tree:
         on_it = [
             a for a in range(m.nu) if m.actuator_trntype[a] == JOINT and m.actuator_trnid[a, 0] == j
         ]
+        if not on_it:
+            return np.inf
         for a in on_it:
-            limit = (
-                float(np.min(np.abs(m.actuator_forcerange[a])))
-                if m.actuator_forcelimited[a]
-                else np.inf
-            )
+            limit = np.inf
+            if m.actuator_forcelimited[a]:
+                limit = float(np.min(np.abs(m.actuator_forcerange[a])))
             if (
                 m.actuator_ctrllimited[a]
                 and m.actuator_gaintype[a] == FIXED
@@ -311,7 +317,7 @@ class Tree:
                     float(np.min(np.abs(m.actuator_ctrlrange[a])) * abs(m.actuator_gainprm[a, 0])),
                 )
             total += limit * abs(float(m.actuator_gear[a, 0]))
-        return total if on_it else np.inf
+        return total
 
     def check_closed(
         self, links: Links, joints: tuple[int, ...], tendons: Tendons, repairs: Repairs
@@ -333,10 +339,9 @@ class Tree:
             if m.eq_type[e] == COUPLED:
                 self._meet_coupling(where, {first, second} & set(joints), repairs)
             if m.eq_type[e] in (CONNECT, WELD):
-                bodies = [
-                    int(m.site_bodyid[x]) if m.eq_objtype[e] == self.site_type else x
-                    for x in (first, second)
-                ]
+                bodies = [first, second]
+                if m.eq_objtype[e] == self.site_type:
+                    bodies = [int(m.site_bodyid[site]) for site in bodies]
                 self._meet_tie(where, bodies, links, repairs)
         for where, (named, sites) in tendons.items():
             self._meet_coupling(where, {j for j in joints if self.joint_names[j] in named}, repairs)
@@ -373,11 +378,9 @@ class Tree:
         if len({links.carrier.get(b, -1) for b in bodies}) > 1:
             tied = f"{' and '.join(repr(self.bodies[b]) for b in bodies)} tied together"
             remedy = "A closed chain has no serial one: cut it open, or lock its joints."
-            to = (
-                "no tie: a motion-capture body is no link"
-                if any(self.model.body_mocapid[b] >= 0 for b in bodies)
-                else ""
-            )
+            to = ""
+            if any(self.model.body_mocapid[b] >= 0 for b in bodies):
+                to = "no tie: a motion-capture body is no link"
             repairs.meet(
                 Fault(where, tied, checks.fail(where, Shown(tied), "an open chain", remedy), to)
             )
@@ -386,12 +389,10 @@ class Tree:
 def unknown(what: str, name: Any, expected: str, known: list[str]) -> ValueError:
     """An error with the names that are near, or all of them."""
     near = difflib.get_close_matches(str(name), known, n=3) or known[:12]
-    return checks.fail(
-        what,
-        name,
-        expected,
-        f"There are {', '.join(map(repr, near))}{' ...' if len(known) > 12 else ''}.",
-    )
+    names = ", ".join(map(repr, near))
+    if len(known) > 12:
+        names += " ..."
+    return checks.fail(what, name, expected, f"There are {names}.")
 
 
 def matrix(quaternion: np.ndarray) -> np.ndarray:

@@ -1,9 +1,9 @@
-"""The check of a URDF, element by element, and the part of it that says how links move and what
+"""The check of a URDF, element by element, and the part of it that defines how links move and what
 they weigh.
 
-The copy that goes on holds links and joints; each number has been looked at.  What links weigh,
-what is wrong with a link or joint, and mimic joints go apart: whether they matter is known when the
-chain is.
+The copy that the library receives holds links and joints, and each of its numbers is checked.
+Weights of links, faults of links and joints, and mimic joints are kept separately: they matter only
+for those links and joints that the chain contains.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.world.robots.description import FARTHEST, MOST_BODIES, Shown, floats, label
-from iblf_jax.world.robots.repair import Fault, Weight, judged
+from iblf_jax.world.robots.repair import Fault, Weight, checked_weight
 
-MOVING = ("revolute", "continuous", "prismatic")
+MOVABLE = ("revolute", "continuous", "prismatic")
 INERTIA = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 ZERO = [0.0, 0.0, 0.0]
 
@@ -31,7 +31,7 @@ class Mimic(NamedTuple):
 
     @property
     def shown(self) -> str:
-        """How it is called in messages."""
+        """The text by which messages show it."""
         return f"a mimic of {self.master!r} in the chain"
 
 
@@ -55,9 +55,9 @@ class Urdf(NamedTuple):
     speeds: dict[str, float]
     """Joint -> its largest speed, which the library does not keep; none for one without."""
 
-    def taken_out(self, spec: Any) -> list[tuple[Any, Weight]]:
-        """The library's bodies with their weights: it gets none of them, as it would refuse what
-        may not matter.
+    def separate_weights(self, spec: Any) -> list[tuple[Any, Weight]]:
+        """The library's bodies with their weights, which the copy does not contain: the library
+        would reject faults of bodies that the chain does not carry.
         """
         return [
             (body, self.weights[body.name]) for body in spec.bodies if body.name in self.weights
@@ -172,20 +172,16 @@ def _one(parent: ET.Element, tag: str) -> ET.Element | None:
         raise checks.fail(
             f"{label(parent)}: <{tag}>", Shown(f"{len(found)} of them"), "one at most"
         )
-    return found[0] if found else None
+    return next(iter(found), None)
 
 
 def _origin(parent: ET.Element, where: str) -> tuple[list[float], list[float]]:
     """Position and roll, pitch, yaw of an element's <origin>."""
     origin = _one(parent, "origin")
-    xyz, rpy = (
-        floats(
-            f"{where}: origin {name}",
-            origin.get(name, "0 0 0") if origin is not None else "0 0 0",
-            3,
-        )
-        for name in ("xyz", "rpy")
-    )
+    if origin is None:
+        return ZERO, ZERO
+    xyz = floats(f"{where}: origin xyz", origin.get("xyz", "0 0 0"), 3)
+    rpy = floats(f"{where}: origin rpy", origin.get("rpy", "0 0 0"), 3)
     return xyz, rpy
 
 
@@ -194,7 +190,9 @@ def _weight(link: ET.Element) -> tuple[Weight, list[float]]:
     where = label(link)
     try:
         inertial = _one(link, "inertial")
-        return (Weight(), ZERO) if inertial is None else _inertial(where, inertial)
+        if inertial is None:
+            return Weight(), ZERO
+        return _inertial(where, inertial)
     except ValueError as error:
         return Weight(fault=Fault(where, "", error)), ZERO
 
@@ -209,7 +207,7 @@ def _inertial(where: str, inertial: ET.Element) -> tuple[Weight, list[float]]:
     centre, rpy = _origin(inertial, f"{where}: inertial")
     if inertia is None:
         if kg <= 0:
-            return judged(where, kg, np.zeros((3, 3))), centre
+            return checked_weight(where, kg, np.zeros((3, 3))), centre
         error = checks.fail(f"{where}: inertial", Shown("no <inertia>"), "an inertia [kg m^2]")
         return (
             Weight(
@@ -217,26 +215,25 @@ def _inertial(where: str, inertial: ET.Element) -> tuple[Weight, list[float]]:
             ),
             centre,
         )
-    numbers = (
-        floats(
-            f"{where}: inertia {name}", inertia.get(name, "0" if name in INERTIA[3:] else ""), 1
-        )[0]
+    products = dict.fromkeys(INERTIA[3:], "0")  # which may be left out
+    xx, yy, zz, xy, xz, yz = (
+        floats(f"{where}: inertia {name}", inertia.get(name, products.get(name, "")), 1)[0]
         for name in INERTIA
     )
-    xx, yy, zz, xy, xz, yz = numbers
     R = Rotation.from_euler("xyz", rpy).as_matrix()  # about fixed axes, one after the other
-    return judged(where, kg, R @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ R.T), centre
+    return checked_weight(
+        where, kg, R @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ R.T
+    ), centre
 
 
 def _joint(joint: ET.Element, found: Urdf) -> ET.Element:
     """The copy of a joint, with something harmless in the place of what is wrong with it."""
     where, name, kind = label(joint), str(joint.get("name")), joint.get("type", "")
     parent, child = (str(joint.findall(which)[0].get("link")) for which in ("parent", "child"))
-    copy = ET.Element(
-        "joint",
-        name=name,
-        type="fixed" if kind == "fixed" else "prismatic" if kind == "prismatic" else "continuous",
-    )
+    copied_kind = "continuous"  # a revolute joint too, until its range is known
+    if kind in ("fixed", "prismatic"):
+        copied_kind = kind
+    copy = ET.Element("joint", name=name, type=copied_kind)
     xyz, rpy = ZERO, ZERO
     try:
         xyz, rpy = _origin(joint, where)
@@ -271,19 +268,17 @@ def _words(numbers: list[float]) -> str:
 
 
 def _axis(joint: ET.Element, where: str, kind: str) -> list[float]:
-    if kind not in MOVING:
-        remedy = (
-            "Floating and planar joints are not part of a serial arm."
-            if kind in ("floating", "planar")
-            else ""
-        )
+    if kind not in MOVABLE:
+        remedy = ""
+        if kind in ("floating", "planar"):
+            remedy = "Floating and planar joints are not part of a serial arm."
         raise checks.fail(
             f"{where}: type", kind, "revolute, continuous, prismatic or fixed", remedy
         )
     axis = _one(joint, "axis")
-    direction = floats(
-        f"{where}: axis", axis.get("xyz", "1 0 0") if axis is not None else "1 0 0", 3
-    )
+    if axis is None:
+        return [1.0, 0.0, 0.0]
+    direction = floats(f"{where}: axis", axis.get("xyz", "1 0 0"), 3)
     if not np.linalg.norm(direction) > 1e-6:
         raise checks.fail(f"{where}: axis", direction, "a direction")
     return direction
@@ -293,7 +288,9 @@ def _limit(joint: ET.Element, where: str, copy: ET.Element, found: Urdf) -> list
     """Range and largest torque of a joint, into the copy, and its largest speed; what cannot be,
     and is left out there.
     """
-    limit, endless, faults = _one(joint, "limit"), joint.get("type") == "continuous", []
+    limit = _one(joint, "limit")
+    endless = joint.get("type") == "continuous"
+    faults = []
     if limit is None:
         if endless:
             return []
@@ -305,7 +302,9 @@ def _limit(joint: ET.Element, where: str, copy: ET.Element, found: Urdf) -> list
             remedy,
         )
         return [Fault(f"{where}: limit", "nothing", error, "no limits")]
-    names = ("effort", "velocity") if endless else ("lower", "upper", "effort", "velocity")
+    names = ["effort", "velocity"]
+    if not endless:
+        names = ["lower", "upper", *names]
     values = {
         name: floats(f"{where}: limit {name}", limit.get(name, "0"), 1, most=FARTHEST)[0]
         for name in names
@@ -321,31 +320,21 @@ def _limit(joint: ET.Element, where: str, copy: ET.Element, found: Urdf) -> list
             )
         )
     if values["effort"] < 0:
-        torque = values.pop("effort")
-        faults.append(
-            Fault(
-                f"{where}: effort",
-                str(torque),
-                checks.fail(f"{where}: effort", torque, "a number >= 0"),
-                "no limit",
-            )
-        )
+        faults.append(_negative(f"{where}: effort", values.pop("effort"), "no limit"))
     speed = values.pop("velocity")
     if speed > 0:
         found.speeds[str(joint.get("name"))] = speed
     elif speed < 0:
-        faults.append(
-            Fault(
-                f"{where}: velocity",
-                str(speed),
-                checks.fail(f"{where}: velocity", speed, "a number >= 0"),
-                "no limit",
-            )
-        )
+        faults.append(_negative(f"{where}: velocity", speed, "no limit"))
     if "lower" in values and copy.get("type") == "continuous":
         copy.set("type", "revolute")
     ET.SubElement(copy, "limit", {name: repr(value) for name, value in values.items()})
     return faults
+
+
+def _negative(where: str, value: float, repaired: str) -> Fault:
+    """The fault of a number below 0."""
+    return Fault(where, str(value), checks.fail(where, value, "a number >= 0"), repaired)
 
 
 def _dynamics(joint: ET.Element, where: str, copy: ET.Element, _: Urdf) -> list[Fault]:
@@ -359,8 +348,7 @@ def _dynamics(joint: ET.Element, where: str, copy: ET.Element, _: Urdf) -> list[
     }
     for name, value in found.items():
         if value < 0:
-            error = checks.fail(f"{where}: {name}", value, "a number >= 0")
-            faults.append(Fault(f"{where}: {name}", str(value), error, "0"))
+            faults.append(_negative(f"{where}: {name}", value, "0"))
     ET.SubElement(copy, "dynamics", {name: repr(max(value, 0.0)) for name, value in found.items()})
     return faults
 

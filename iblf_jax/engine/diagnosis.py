@@ -1,0 +1,260 @@
+"""The messages about a run that failed or needs a second look: its status flags in words, with the
+numbers behind them and the remedy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax.core import checks, notices
+from iblf_jax.core.pytree import unwrapped
+from iblf_jax.core.status import FAILED, Status, describe
+from iblf_jax.engine.limiting_term import limiting_term
+from iblf_jax.engine.step_size import comfortable_dt, find_dt
+from iblf_jax.simulation.accuracy import ERROR, RELATIVE, TOLERANCE
+from iblf_jax.simulation.integrators import tableau
+from iblf_jax.simulation.optional import optional_member
+from iblf_jax.simulation.results import Rollout
+from iblf_jax.simulation.signals import has
+from iblf_jax.simulation.stability import RADIUS, WIDEST
+from iblf_jax.world.bounds import tube_at
+from iblf_jax.world.regions import in_words
+from iblf_jax.world.robots import joint_names
+
+REPORTED = (
+    Status.INACCURATE
+    | Status.GUARD_STAYED
+    | Status.SAMPLING_TOO_SLOW
+    | Status.FILTER_INFEASIBLE
+    | Status.INFINITE_SLOPE
+)
+"""The flags of a run that did not fail and that a user should see."""
+
+
+class SimulationError(RuntimeError):
+    """A run that failed, raised by `simulate(..., throw=True)`."""
+
+
+class SimulationWarning(UserWarning):
+    """A run whose result needs a second look."""
+
+
+def report(result: Rollout, steps: int, throw: bool) -> None:
+    """Raises or warns, with the physics in the message, if a run failed."""
+    status = Status(int(result.status))
+    if status & Status.INFEASIBLE_REFERENCE:
+        raise _infeasible(result, steps)
+    failed = status & FAILED
+    reported = failed | status & REPORTED
+    if optional_member(unwrapped(result.scenario.controller), "needs_velocity_bounds"):
+        reported |= status & Status.ALPHA_INFEASIBLE
+    if not reported:
+        return
+    heading = "Look again"
+    if failed:
+        heading = "The run failed"
+    explained = reported | status & ~Status.ALPHA_INFEASIBLE
+    text = " ".join([f"{heading}: {describe(reported)}.", *_explanations(result, explained, steps)])
+    if throw and failed:
+        raise SimulationError(text)
+    notices.warn(text, SimulationWarning)
+
+
+def _explanations(result: Rollout, status: Status, steps: int) -> list[str]:
+    """A sentence or two for every flag that has an explanation."""
+    texts = [text(result) for flag, text in BOUNDS.items() if status & flag]
+    if status & Status.STEP_TOO_LARGE:
+        texts.append(_unstable_step(result))
+    elif status & Status.NOT_FINITE and np.isfinite(result.fastest_mode):
+        texts.append(
+            "The step was small enough for the fastest mode: look at the gains, the start and the"
+            " disturbance."
+        )
+    elif status & Status.INACCURATE:
+        texts.append(_about_accuracy(result, status, steps))
+    texts += [text(result) for flag, text in LOOP.items() if status & flag]
+    return [text for text in texts if text]
+
+
+def _bound_violated(result: Rollout) -> str:
+    metrics = result.metrics
+    if "first_violation_time" not in metrics:
+        return ""
+    joint = int(metrics["first_violation_joint"])
+    return (
+        f"{_joint_in_words(result, joint)} left its bounds first, at t ="
+        f" {float(metrics['first_violation_time']):.4g} s; its smallest margin is"
+        f" {float(metrics['margin'][joint]):.3g} rad."
+    )
+
+
+def _velocity_violated(result: Rollout) -> str:
+    metrics = result.metrics
+    if "first_velocity_violation_time" not in metrics:
+        return ""
+    joint = int(metrics["first_velocity_violation_joint"])
+    return (
+        f"{_joint_in_words(result, joint)} left its velocity bounds first, at t ="
+        f" {float(metrics['first_velocity_violation_time']):.4g} s; its smallest margin is"
+        f" {float(metrics['velocity_margin'][joint]):.3g} rad/s."
+    )
+
+
+def _region_violated(result: Rollout) -> str:
+    metrics = result.metrics
+    if "first_region_violation_time" not in metrics:
+        return ""
+    i = int(metrics["first_region_violation_region"])
+    region = in_words(result.scenario.regions[i], result.scenario.plant)
+    return (
+        f"regions[{i}]: {region} crossed its boundary, at t ="
+        f" {float(metrics['first_region_violation_time']):.4g} s; its smallest margin is"
+        f" {float(metrics['region_margin'][i]):.3g} m."
+    )
+
+
+def _unstable_step(result: Rollout) -> str:
+    mode = float(result.fastest_mode)
+    limit = tableau(result.method).stability / mode
+    return (
+        f"The closed loop's fastest mode is {mode:.4g} 1/s, so {result.method} is stable up to"
+        f" dt = {limit:.3g} s only; dt = {float(result.dt):g} s was requested. Take"
+        f" dt={comfortable_dt(mode):g}{_or_change(result)}."
+    )
+
+
+def _infinite_slope(result: Rollout) -> str:
+    return (
+        "At an isolated instant the derivative of the closed loop with respect to a state is"
+        " infinite or nearly so, as that of |e2|^a sign(e2) with a < 1 is with respect to e2 ="
+        " q' - alpha where e2 = 0, or that of sharp dry friction at a reversal. That is no"
+        f" fast mode, so the time step is assessed by differences of {WIDEST:g} rad/s there."
+        " Derivatives of the run are not reliable; replace such a power by e2 (e2^2 +"
+        " delta^2)^((a - 1)/2) with a small delta."
+    )
+
+
+def _sampling_too_slow(result: Rollout) -> str:
+    return (
+        "The deviation of the loop grows from one period to the next, by"
+        f" {float(result.metrics[RADIUS]):.4g} at the worst of the assessed instants. Sample faster"
+        f" (ij.recommended_period says how fast){_or_change(result)}."
+    )
+
+
+def _filter_infeasible(result: Rollout) -> str:
+    worst = f"{float(np.max(result.slack)):.3g} rad/s^2 (run.slack)"
+    if has(result, "region_slack"):
+        worst += f" and {float(np.max(result.region_slack)):.3g} m/s^2 (run.region_slack)"
+    return (
+        "At the recorded samples the filter's accelerations exceeded what its conditions allow by"
+        f" up to {worst}. Raise controller.limit, or lower a1, a2, a3, b1 and b2, so that it"
+        " brakes sooner."
+    )
+
+
+def _alpha_infeasible(result: Rollout) -> str:
+    worst = "at some time"
+    if "alpha_margin" in result.metrics:
+        worst = f"by up to {-float(np.min(result.metrics['alpha_margin'])):.3g} rad/s"
+    return (
+        f"The virtual velocity alpha left the velocity bounds {worst}: nothing is claimed"
+        " there. Start nearer to the reference, slow it down, widen the velocity bounds or"
+        " lower controller.k1."
+    )
+
+
+def _guard_stayed(result: Rollout) -> str:
+    return (
+        "While the guard is active the barrier is softer than the requested one: what ran there is"
+        " another law. Start or stay further from the bounds, or give the barrier a smaller guard."
+    )
+
+
+BOUNDS: dict[Status, Callable[[Rollout], str]] = {
+    Status.BOUND_VIOLATED: _bound_violated,
+    Status.VELOCITY_VIOLATED: _velocity_violated,
+    Status.REGION_VIOLATED: _region_violated,
+}
+"""The explanation of each flag of a violated bound."""
+LOOP: dict[Status, Callable[[Rollout], str]] = {
+    Status.INFINITE_SLOPE: _infinite_slope,
+    Status.SAMPLING_TOO_SLOW: _sampling_too_slow,
+    Status.FILTER_INFEASIBLE: _filter_infeasible,
+    Status.ALPHA_INFEASIBLE: _alpha_infeasible,
+    Status.GUARD_STAYED: _guard_stayed,
+}
+"""The explanation of each flag of the law and its sampling."""
+
+
+def _about_accuracy(result: Rollout, status: Status, steps: int) -> str:
+    """How inaccurate a run is, and what helps."""
+    error, relative = (float(np.max(result.metrics[name])) for name in (ERROR, RELATIVE))
+    size = (
+        f"Their error is estimated at {error:.2g} rad, {100 * relative:.2g} % of the tube, where"
+        f" {100 * TOLERANCE:g} % are tolerated"
+    )
+    if status & Status.SAMPLING_TOO_SLOW:
+        return (
+            f"{size}: a loop whose deviation grows from one period to the next magnifies every"
+            " error, whatever dt is."
+        )
+    return (
+        f"{size}: dt = {float(result.dt):g} s is too large for the signals that drive this loop."
+        f" Take {_smaller_step(result, steps)}."
+    )
+
+
+def _smaller_step(result: Rollout, steps: int) -> str:
+    """A time step with which this run would be accurate, in words."""
+    if not checks.is_concrete(result.scenario):
+        return "a smaller one"
+    duration = steps * float(result.dt)
+    try:
+        return f"dt={find_dt(result.scenario, duration=duration, method=result.method):g}"
+    except ValueError:  # the run is too long for trial runs
+        return "a smaller one"
+
+
+def _or_change(result: Rollout) -> str:
+    """The end of a sentence that names the one term that limits the loop of a run, and its remedy;
+    empty where there is no such term.
+    """
+    limit = None
+    if checks.is_concrete(result.scenario):
+        limit = limiting_term(result)
+    if limit is None:
+        return ""
+    return f", or {limit.advice}: of all terms {limit.term.words} limits this loop"
+
+
+def _joint_in_words(result: Rollout, joint: int) -> str:
+    """A joint by its number, and by its name if it has one."""
+    name = joint_names(result.scenario.plant, result.n)[joint]
+    if name == f"joint {joint}":
+        return f"Joint {joint}"
+    return f"Joint {joint} ({name})"
+
+
+def _infeasible(result: Rollout, steps: int) -> ValueError:
+    """The error for a reference that touches a bound (Assumption 2), with joint and time."""
+    times = jnp.arange(steps + 1).astype(result.dt.dtype) * result.dt
+    tube = jax.jit(jax.vmap(partial(tube_at, result.scenario.reference, result.scenario.bounds)))(
+        times
+    )
+    q_d, lower, upper = (np.asarray(x) for x in (tube.q_d, tube.lower, tube.upper))
+    sample, joint = np.unravel_index(np.argmin(np.minimum(q_d - lower, upper - q_d)), q_d.shape)
+    where = f"t = {float(times[sample]):.4g} s"
+    return checks.fail(
+        f"reference of {joint_names(result.scenario.plant, result.n)[joint]}",
+        float(q_d[sample, joint]),
+        f"a value inside the bounds ({float(lower[sample, joint]):.6g},"
+        f" {float(upper[sample, joint]):.6g}) at {where}",
+        "The reference must stay strictly inside the bounds (Assumption 2): move it, widen the"
+        " bounds or shorten the run.",
+    )

@@ -1,0 +1,152 @@
+"""`compile_step`: from a step as a JAX function to its scalar program."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax.kernels.caches import CACHES
+from iblf_jax.kernels.from_jaxpr import closed
+from iblf_jax.kernels.packed import Shapes
+from iblf_jax.kernels.passes import with_reciprocals
+from iblf_jax.kernels.program import (
+    NO_LIMITS,
+    Builder,
+    Ids,
+    Known,
+    LoweringLimits,
+    Program,
+    UnsupportedError,
+    finished,
+    kind_of,
+)
+
+
+class CompiledStep(NamedTuple):
+    """A step as a scalar program."""
+
+    program: Program
+    records: Any
+    """Shapes and types of the records of one step of one run, a pytree."""
+
+
+@CACHES.function(maxsize=64)
+def compile_step(
+    step: Callable,
+    dtype: np.dtype,
+    shared: Shapes,
+    per_run: Shapes,
+    carry: Shapes,
+    limits: LoweringLimits = NO_LIMITS,
+    is_derivative: bool = False,
+    known: tuple[Known | None, ...] = (),
+) -> CompiledStep:
+    """The scalar program of a step of one run.
+
+    Args:
+      step: function (shared leaves, leaves of the run, carry leaves, index) -> (carry leaves,
+        records) of JAX; leaves are lists of arrays, `index` is the number of the step, () int32.
+        The function object is the key of a cache: pass the same one for the same step.
+      dtype: floating-point type of all numbers.
+      shared: shapes of the leaves that all runs share.
+      per_run: shapes of the leaves of one run that differ between runs.
+      carry: shapes of the leaves that go from one step to the next, for one run.
+      limits: sizes above which a step is not compiled.
+      is_derivative: whether the step computes tangents, in which a literal zero means "does not
+        depend" (`program.Builder`).
+      known: what is known beforehand of each shared number; empty for nothing.
+
+    Raises:
+      UnsupportedError: the step contains an operation that a scalar program cannot express, or
+        exceeds a limit.
+    """
+    index = jax.ShapeDtypeStruct((), jnp.int32)
+    jaxpr, (after, records) = jax.make_jaxpr(step, return_shape=True)(
+        shared.structs(), per_run.structs(), carry.structs(), index
+    )
+    b = Builder(dtype, sparse=is_derivative, limits=limits)
+    shared_ids = _inputs(b, shared, lambda i, kind: _shared(b, i, known))
+    per_run_ids = _inputs(b, per_run, lambda i, kind: b.input("per_run", i, kind))
+    carry_ids = _inputs(b, carry, lambda i, kind: b.input("carry", i, kind), of_carry=True)
+    index_id = np.asarray(b.input("index", 0, "i"), np.int64)
+    _mark_constant_carry(b, jaxpr.jaxpr, carry_ids)
+    out = closed(b, jaxpr, [*shared_ids, *per_run_ids, *carry_ids, index_id])
+    carry_out, recorded = out[: len(after)], out[len(after) :]
+    if Shapes.of(after).kinds() != carry.kinds():
+        raise UnsupportedError("the step changes the types of its carry")
+    program = finished(
+        b,
+        _numbers(carry_ids),
+        _numbers(carry_out),
+        [_as_float(b, i) for i in _numbers(recorded)],
+        tuple(ids.size for ids in recorded),
+    )
+    return CompiledStep(with_reciprocals(program), records)
+
+
+def _numbers(arrays: Sequence[Ids]) -> list[int]:
+    """The node numbers of arrays, one after the other."""
+    return [int(i) for ids in arrays for i in ids.ravel()]
+
+
+def _inputs(
+    b: Builder, shapes: Shapes, node_of: Callable[[int, str], int], *, of_carry: bool = False
+) -> list[Ids]:
+    """The input nodes of leaves.
+
+    Args:
+      b: the builder.
+      shapes: shapes of the leaves.
+      node_of: function (index of a number, kind) -> node.
+      of_carry: whether the leaves may hold integers and truth values.
+    """
+    first = 0
+    arrays = []
+    for shape, dtype in shapes.items:
+        kind = kind_of(dtype)
+        if kind == "f" and dtype != b.dtype:
+            raise UnsupportedError(f"it mixes {dtype} with {b.dtype}")
+        if kind != "f" and not of_carry:
+            raise UnsupportedError(f"a leaf of type {dtype}")
+        ids = [node_of(first + i, kind) for i in range(math.prod(shape))]
+        arrays.append(np.asarray(ids, np.int64).reshape(shape))
+        first += len(ids)
+    return arrays
+
+
+def _mark_constant_carry(b: Builder, jaxpr: Any, carry: Sequence[Ids]) -> None:
+    """Marks the carried numbers that a step returns unchanged (`Builder.constant_carry`)."""
+    # The inputs of the jaxpr end with the carry and the index of the step.
+    inputs = jaxpr.invars[-1 - len(carry) : -1]
+    for before, after, ids in zip(inputs, jaxpr.outvars, carry, strict=False):
+        if after is before:
+            b.constant_carry.update(ids.ravel().tolist())
+
+
+def _shared(b: Builder, number: int, known: tuple[Known | None, ...]) -> int:
+    """The node of a shared number."""
+    fact = known[number] if known else None
+    if fact is None:
+        return b.input("shared", number, "f")
+    if fact.value == 0:
+        return b.absent
+    if fact.value is not None:
+        return b.constant(fact.value, "f")
+    equal = number if fact.same is None else fact.same
+    node = b.input("shared", equal, "f")
+    b.known_finite.add(node)
+    if fact.sign > 0:
+        return node
+    return b.emit("neg", node)
+
+
+def _as_float(b: Builder, node: int) -> int:
+    """The node of a number as a floating-point number."""
+    if b.nodes[node].kind == "f":
+        return node
+    return b.emit("convert", node, kind="f")

@@ -1,0 +1,126 @@
+"""The registry of executors: a record that is added is used, and an unknown name is an error."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import iblf_jax as ij
+from iblf_jax.core import devices
+from iblf_jax.engine import (
+    RunRequest,
+    check_backend,
+    compile,
+    compile_batch,
+    plan,
+    registry,
+    single_run,
+)
+from iblf_jax.kernels.program import UnsupportedError
+from iblf_jax.kernels.toolchain import ToolchainError
+from iblf_jax.simulation.scenario import canonical
+
+SHORT = {"duration": 0.02, "dt": 1e-3, "method": "euler", "metrics": (ij.metrics.Margin(),)}
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    return ij.with_parts(
+        ij.presets.zhang_yan_2024(),
+        controller=ij.controllers.PDGravity(Kp=60.0, Kd=20.0),
+        observer=ij.observers.NoObserver(),
+    )
+
+
+@pytest.fixture
+def added(monkeypatch):
+    """An executor "mine", first of all for this platform; the names of its calls."""
+    for part in (single_run._initialize, single_run._advance, single_run._finalize):
+        part.clear_cache()  # which would hold another test's "mine"
+    xla, calls = registry.EXECUTORS["xla"], []
+
+    def run(*arguments):
+        calls.append("run")
+        return xla.run(*arguments)
+
+    def build(*arguments):
+        calls.append("build")
+        return xla.build(*arguments)
+
+    mine = registry.Executor("mine", (devices.platform(),), run, lambda: None, build)
+    monkeypatch.setattr(registry, "EXECUTORS", {"mine": mine, **registry.EXECUTORS})
+    return calls
+
+
+@pytest.mark.parametrize("backend", ["mine", "auto"])
+def test_an_added_executor_runs_a_single_run(scenario, added, backend):
+    expected = ij.simulate(scenario, **SHORT, backend="xla")
+    assert added == []
+    found = ij.simulate(scenario, **SHORT, backend=backend)
+    np.testing.assert_allclose(found.q, expected.q, rtol=1e-12)
+    assert added == ["run"] * 3, "the start, the steps, the end"
+
+
+def test_an_added_executor_runs_a_batch(scenario, added):
+    perturbed = {"controller.Kp": ij.factor(ij.uniform(0.9, 1.1))}
+    study = ij.monte_carlo(scenario, perturbed, runs=3, **SHORT, backend="mine")
+    assert study.setup.study_run.program.executor == "mine"
+    assert added.count("build") == 2
+    assert added.count("run") == 3
+    other = ij.monte_carlo(scenario, perturbed, runs=3, **SHORT, backend="xla")
+    np.testing.assert_allclose(study.metrics["margin"], other.metrics["margin"], rtol=1e-12)
+
+
+@pytest.mark.parametrize("backend", ["fortran", "", None, "NATIVE"])
+def test_an_unknown_name_is_an_error(scenario, backend):
+    request = RunRequest(10, backend=backend)
+    varied = {"controller.Kp": jnp.ones((2, 2))}
+    calls = (
+        lambda: check_backend(backend),
+        lambda: RunRequest.of(canonical(scenario), steps=10, backend=backend),
+        lambda: compile_batch(request, canonical(scenario), varied, (), jnp.asarray(1e-3)),
+        lambda: ij.simulate(scenario, **SHORT, backend=backend),
+    )
+    for call in calls:
+        with pytest.raises(ValueError, match=r"backend.*one of 'auto'"):
+            call()
+
+
+def test_every_executor_says_why_it_is_unavailable():
+    for name, executor in registry.EXECUTORS.items():
+        assert executor.name == name
+        reason = executor.unavailable()
+        assert reason is None or "\n" not in reason
+    assert registry.EXECUTORS["xla"].unavailable() is None
+
+
+@pytest.mark.parametrize(
+    ("failures", "tried", "result"),
+    [
+        ({}, ["one"], "one"),
+        ({"one": ToolchainError("none")}, ["one", "two"], "two"),
+        ({"one": UnsupportedError("a sort")}, ["one"], "scan"),
+        ({"one": ToolchainError("none"), "two": ToolchainError("none")}, ["one", "two"], "scan"),
+    ],
+)
+def test_one_place_falls_back(monkeypatch, failures, tried, result):
+    """To the next executor where one is not available, to the scan where a step does not lower."""
+    monkeypatch.setattr(registry, "EXECUTORS", {"one": "one", "two": "two"})
+    execution = plan.ExecutionPlan(("one", "two"), plan.PLAIN_LAYOUT, plan.PLAIN_LAYOUT, False)
+    calls = []
+
+    def attempt(name):
+        calls.append(name)
+        if name in failures:
+            raise failures[name]
+        return name
+
+    assert compile.first_that_works(execution, attempt, lambda: "scan") == result
+    assert calls == tried
+
+
+def test_a_value_of_shapes_holds_no_arrays():
+    shape = [jax.ShapeDtypeStruct((3, 2), jnp.float32)]
+    assert compile.on_shapes(lambda arrays: arrays[0].shape, shape) == (3, 2)
