@@ -356,7 +356,7 @@ def test_priors_and_limits(scenario, log):
         ij.identify(scenario, log, PATHS, limits={"robot.mass": (3.0, 4.0)})
 
 
-# ----------------------------------------------------------------- terms that were left out of the fit
+# ---------------------------------------------- terms that were left out of the fit
 
 
 def with_friction(scenario, viscous, coulomb):
