@@ -172,7 +172,7 @@ def output_folder(name: str) -> Path:
     return folder
 
 
-# ---------------------------------------------------------------------------------- numbers as text
+# ------------------------------------------------------------------------------- numbers as text
 
 
 def strict(value: Any) -> Any:

@@ -45,7 +45,7 @@ def strict_json(path):
     return json.loads(path.read_text(), parse_constant=refuse)
 
 
-# ------------------------------------------------------------------------------------------------------------- the main job
+# ---------------------------------------------------------------------------------- the main job
 
 
 @pytest.mark.slow
@@ -119,7 +119,7 @@ def test_claims_can_fail(paper, short_run):
     assert not _claims.bounds_kept({"a": outside}).held
 
 
-# ------------------------------------------------------------------------------------------------------------------ simulate
+# -------------------------------------------------------------------------------------- simulate
 
 
 def test_simulate_a_file(command, paper, tmp_path):
@@ -208,7 +208,7 @@ def test_a_preset_file_with_its_own_run(command, tmp_path):
     assert "0.05 s, dt = 0.001 s, heun" in out
 
 
-# ------------------------------------------------------------------------------------------------------------- what there is
+# --------------------------------------------------------------------------------- what there is
 
 
 def test_presets(command, paper):
@@ -243,7 +243,7 @@ def test_help_and_version(command):
         assert "usage: iblf-jax" in out
 
 
-# ------------------------------------------------------------------------------------------------------------------ refusals
+# -------------------------------------------------------------------------------------- refusals
 
 
 REFUSALS = [
@@ -321,7 +321,7 @@ def test_a_folder_without_permission(command, tmp_path):
     assert "expected a folder that can be written" in err
 
 
-# ------------------------------------------------------------------------------------------------------------------ the process
+# ----------------------------------------------------------------------------------- the process
 
 
 @pytest.mark.slow

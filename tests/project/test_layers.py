@@ -22,8 +22,8 @@ LAYER_OF = {
 """Module or folder at the root of the package -> its layer."""
 
 UPWARD: dict[str, set[str]] = {}
-"""File -> the higher modules that it imports inside a function: none. Results reach figures, reports
-and files through `core/presentation.py`."""
+"""File -> the higher modules that it imports inside a function: none. Results reach figures,
+reports and files through `core/presentation.py`."""
 
 ONLY_IN = {
     "matplotlib": ("plotting",),

@@ -38,7 +38,7 @@ def results(study):
     )
 
 
-# ------------------------------------------------------------------------------------- bit-identity
+# ---------------------------------------------------------------------------------- bit-identity
 
 
 @pytest.mark.slow
@@ -122,7 +122,7 @@ def test_a_repeated_study_lowers_nothing(study, monkeypatch):
     cases.study(ways=cases.perturbations(0.2, 0.01), seed=8)
 
 
-# ---------------------------------------------------------------------------------------- the draws
+# ------------------------------------------------------------------------------------- the draws
 
 
 def test_draws_follow_the_documented_law(study):
@@ -236,7 +236,7 @@ def test_designs_fill_the_range_evenly(sampler):
     assert len(np.unique(study.samples["plant.mass[1]"])) == 256
 
 
-# ------------------------------------------------------------------------------------ one run again
+# --------------------------------------------------------------------------------- one run again
 
 
 def test_all_of_a_study_are_leaves(study):
@@ -272,7 +272,7 @@ def test_an_index_selects_a_run(study):
         study.replay(600)
 
 
-# -------------------------------------------------------------------------- failed runs, statistics
+# ----------------------------------------------------------------------- failed runs, statistics
 
 
 def test_a_failing_run_touches_no_other(study):
@@ -385,7 +385,7 @@ def test_study_says_what_happened(study):
     assert f"failed: {len(study.failed)}" in text
 
 
-# -------------------------------------------------------------------------------------- sensitivity
+# ----------------------------------------------------------------------------------- sensitivity
 
 
 def test_sobol_indices_of_what_is_known():
@@ -426,7 +426,7 @@ def test_sobol_indices_of_one_number_from_few_points():
         )
 
 
-# ----------------------------------------------------------------------------------------- refusals
+# -------------------------------------------------------------------------------------- refusals
 
 
 @pytest.mark.parametrize(

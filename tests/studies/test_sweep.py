@@ -51,7 +51,7 @@ def once(**more):
     return ij.sweep(SCENARIO, more.pop("grid", cases.GRID), **cases.options() | more)
 
 
-# --------------------------------------------------------------------------------------- the result
+# ------------------------------------------------------------------------------------ the result
 
 
 @pytest.mark.slow
@@ -138,7 +138,7 @@ def test_bad_grids_are_refused(grid, more, message):
         ij.sweep(SCENARIO, grid, duration=0.01, **more)
 
 
-# ------------------------------------------------------------------------------------------- stores
+# ---------------------------------------------------------------------------------------- stores
 
 
 def test_store_opens_with_xarray_and_load(written, table):
@@ -539,7 +539,7 @@ def test_the_draft_of_a_killed_creation_is_removed_by_the_next(tmp_path, table):
     assert list(tmp_path.iterdir()) == [path]
 
 
-# ------------------------------------------------------------------------------ killed, interrupted
+# --------------------------------------------------------------------------- killed, interrupted
 
 
 def killed_until_done(path, compiled, table, kills, seed):

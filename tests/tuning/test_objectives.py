@@ -291,7 +291,7 @@ def test_a_term_without_a_scale_that_is_zero_at_the_start(paper):
     )
 
 
-# ------------------------------------------------------------ which joints, weights, limits of each
+# --------------------------------------------------------- which joints, weights, limits of each
 
 
 def exact(objective, run):
