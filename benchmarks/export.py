@@ -28,7 +28,7 @@ from _timing import interleaved, report
 
 import iblf_jax as ij
 from iblf_jax.deployment.build import c_compiler
-from iblf_jax.deployment.control_law import Told, sample, start
+from iblf_jax.deployment.control_law import SampleInputs, sample, start
 from iblf_jax.simulation.scenario import canonical
 
 DRIVER = """
@@ -81,7 +81,7 @@ int main(void) {
 def in_jax(scenario) -> float:
     """Seconds of a sample as a jitted function."""
     scenario = canonical(scenario)
-    told = Told(jnp.zeros(()), scenario.initial.q, scenario.initial.dq)
+    told = SampleInputs(jnp.zeros(()), scenario.initial.q, scenario.initial.dq)
     memory, one = start(scenario, told)[0], jax.jit(sample)
     jax.block_until_ready(one(scenario, told, memory))
 

@@ -91,6 +91,7 @@ _keep_public_import_paths()
 if TYPE_CHECKING:
     from iblf_jax import certificates as certificates
     from iblf_jax import plotting as plotting
+    from iblf_jax import studies as studies
     from iblf_jax import testing as testing
     from iblf_jax import tuning as tuning
     from iblf_jax.certificates import Certificate as Certificate
@@ -161,6 +162,7 @@ _ON_FIRST_USE = {
     "Sensitivity": ("iblf_jax.studies.sensitivity", "Sensitivity"),
     "sensitivity": ("iblf_jax.studies.sensitivity", "sensitivity"),
     "StoreError": ("iblf_jax.studies.store", "StoreError"),
+    "studies": ("iblf_jax.studies", None),
     "Study": ("iblf_jax.studies.study", "Study"),
     "sweep": ("iblf_jax.studies.sweep", "sweep"),
     "testing": ("iblf_jax.testing", None),

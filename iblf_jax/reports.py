@@ -1,8 +1,8 @@
-"""Results that show themselves: a card in a notebook, `report` a page of its own.
+"""Presents results as HTML: a card in a notebook, or with `report` a file.
 
-Both are made of the same parts (`Shown`): what it is, tables, and figures, which are drawn only
-  where they are asked for.  A result of
-another kind than those below is shown by its text, and its figure if it has a `plot`.
+Both consist of the same content (`Shown`): a title, text, tables, and figures that are drawn when
+they are needed.  A result of a class that is not in `KINDS` is presented by its text, and by its
+figure if it has a method `plot`.
 """
 
 from __future__ import annotations
@@ -38,63 +38,69 @@ if TYPE_CHECKING:
 CARD_DPI, PAGE_DPI = 60, 110
 """Dots per inch of a figure, in a notebook and on a page."""
 
-STYLE = """body { font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
-h1 { font-size: 1.6rem; } h2 { font-size: 1.2rem; margin-top: 2rem; border-bottom: 1px solid #ddd; }
+STYLE = """body { font: 16px/1.5 system-ui, sans-serif; color: #222;
+  max-width: 60rem; margin: 2rem auto; padding: 0 1rem; }
+h1 { font-size: 1.6rem; }
+h2 { font-size: 1.2rem; margin-top: 2rem; border-bottom: 1px solid #ddd; }
 table { border-collapse: collapse; font-size: 0.85rem; }
 td, th { padding: 0.15rem 0.6rem; border-bottom: 1px solid #eee; text-align: left; }
-img { max-width: 100%; } pre { background: #f6f6f6; padding: 0.8rem; overflow-x: auto; font-size: 0.8rem; }
-.wide { overflow-x: auto; } footer { margin-top: 3rem; color: #777; font-size: 0.8rem; }"""
+img { max-width: 100%; }
+pre { background: #f6f6f6; padding: 0.8rem; overflow-x: auto; font-size: 0.8rem; }
+.wide { overflow-x: auto; }
+footer { margin-top: 3rem; color: #777; font-size: 0.8rem; }"""
 
 
 class Shown(NamedTuple):
-    """What a result has to show."""
+    """The content of a card or a report."""
 
     title: str
     words: Sequence[str]
-    """Lines of plain text below the title."""
-    tables: Mapping[str, str]
-    """Heading -> table in HTML; the first `on_card` are on the card too."""
-    figures: Mapping[str, Callable[[], Figure]]
-    """Heading -> what draws it; the first is on the card too."""
-    scenario: Scenario | None
+    """Lines of text below the title."""
+    tables: Mapping[str, str] = {}
+    """Heading -> table in HTML; a card shows the first `on_card` of them."""
+    figures: Mapping[str, Callable[[], Figure]] = {}
+    """Heading -> the function that draws the figure; a card shows the first."""
+    scenario: Scenario | None = None
     on_card: int = 1
 
 
 def _described(result: Any) -> list[str]:
-    """The lines of a result's `repr`, without the name of its class, which is in the title."""
+    """The lines of a result's `repr` without the name of its class, which is in the title."""
     first, *rest = repr(result).splitlines()
-    name = type(result).__name__
-    inside = re.fullmatch(rf"{name}(?:\((?P<numbers>.*)\)| of (?P<things>.*))", first)
-    return [inside["numbers"] or inside["things"] if inside else first, *rest]
+    match = re.fullmatch(rf"{type(result).__name__}(?:\((.*)\)| of (.*))", first)
+    if match:
+        first = match[1] or match[2]
+    return [first, *rest]
 
 
 def _parts_of(scenario: Scenario) -> str:
-    """What a scenario is made of, as a table."""
+    """The components of a scenario, as a table."""
     rows = []
-    for name in vars(scenario):
-        part = getattr(scenario, name)
+    for name, part in vars(scenario).items():
         if part is None or part == () or (name == "model" and part is scenario.plant):
             continue
         if isinstance(part, tuple):
             rows.append((name, ", ".join(type(each).__name__ for each in part), ""))
             continue
-        inner = getattr(part, getattr(type(part), "wraps", None) or "barrier", None)
-        kind = type(part).__name__ + (f" ({type(inner).__name__})" if inner is not None else "")
-        rows.append(
-            (
-                name,
-                kind,
-                ", ".join(
-                    f"{p.path} = {_short(p.value)}"
-                    for p in parameters(part, named=False)[:MOST_LEAVES]
-                ),
-            )
-        )
+        leaves = parameters(part, named=False)[:MOST_LEAVES]
+        rows.append((name, _kind(part), _assignments(leaves, " = ")))
     return tables.as_html(("part", "kind", "parameters"), rows)
 
 
+def _kind(part: Any) -> str:
+    """The class of a component, with the class of the law or the barrier inside it."""
+    inner = getattr(part, getattr(type(part), "wraps", None) or "barrier", None)
+    if inner is None:
+        return type(part).__name__
+    return f"{type(part).__name__} ({type(inner).__name__})"
+
+
+def _assignments(leaves: Any, sign: str) -> str:
+    return ", ".join(f"{leaf.path}{sign}{_short(leaf.value)}" for leaf in leaves)
+
+
 MOST_LEAVES = 4
-"""Leaves of a part that a scenario's table shows."""
+"""Largest number of parameters of a component in the table of a scenario."""
 
 
 def _short(value: Any) -> str:
@@ -108,35 +114,26 @@ def _short(value: Any) -> str:
 def _scenario(scenario: Scenario) -> Shown:
     from iblf_jax import plotting
 
-    figures = (
-        {"Reference in its tube": lambda: plotting.tube(scenario)}
-        if checks.is_concrete(scenario) and scenario.initial.q.ndim == 1
-        else {}
-    )
-    every = parameters(scenario, named=False)
-    every_leaf = tables.as_html(
-        ("path", "unit", "value"), [(p.path, p.unit, _short(p.value)) for p in every]
-    )
+    figures: dict[str, Callable[[], Figure]] = {}
+    if checks.is_concrete(scenario) and scenario.initial.q.ndim == 1:
+        figures["Reference and bounds"] = lambda: plotting.tube(scenario)
+    rows = [(p.path, p.unit, _short(p.value)) for p in parameters(scenario, named=False)]
+    leaves = tables.as_html(("path", "unit", "value"), rows)
     words = [f"{scenario.n} joints: {', '.join(joint_names(scenario.plant, scenario.n))}"]
-    return Shown(
-        "Scenario",
-        words,
-        {"Parts": _parts_of(scenario), "Parameters": every_leaf},
-        figures,
-        scenario,
-    )
+    content = {"Parts": _parts_of(scenario), "Parameters": leaves}
+    return Shown("Scenario", words, content, figures, scenario)
 
 
 def _rollout(run: Rollout) -> Shown:
     from iblf_jax import plotting
 
     if not checks.is_concrete(run) or run.is_batch:
-        return Shown("Run", _described(run), {}, {}, None)
-    rows = [
-        (name, run.metrics.units.get(name, ""), *(f"{x:.4g}" for x in np.ravel(value)))
-        for name, value in run.metrics.items()
-    ]
-    rows = [(*row, *[""] * (2 + run.n - len(row)))[: 2 + run.n] for row in rows]
+        return Shown("Run", _described(run))
+    rows = []
+    for name, value in run.metrics.items():
+        entries = [f"{x:.4g}" for x in np.ravel(value)[: run.n]]
+        entries += [""] * (run.n - len(entries))
+        rows.append((name, run.metrics.units.get(name, ""), *entries))
     table = tables.as_html(("metric", "unit", *joint_names(run.scenario.plant, run.n)), rows)
     figures: dict[str, Callable[[], Figure]] = {
         "Positions": lambda: plotting.positions(run),
@@ -150,15 +147,11 @@ def _rollout(run: Rollout) -> Shown:
 
 def _perturbation(drawn: Any) -> str:
     """A perturbation in words: "factor uniform, low 0.8, high 1.2"."""
-    distribution = drawn.distribution
-    numbers = [f"{p.path} {_short(p.value)}" for p in parameters(distribution, named=False)]
-    return ", ".join(
-        [
-            f"{drawn.kind} {type(distribution).__name__.lower()}",
-            *numbers,
-            *(["shared"] if drawn.shared else []),
-        ]
-    )
+    parts = [f"{drawn.kind} {type(drawn.distribution).__name__.lower()}"]
+    parts.append(_assignments(parameters(drawn.distribution, named=False), " "))
+    if drawn.shared:
+        parts.append("shared")
+    return ", ".join(filter(None, parts))
 
 
 def _study(study: Study) -> Shown:
@@ -166,36 +159,28 @@ def _study(study: Study) -> Shown:
     from iblf_jax.studies.statistics import SMALLER_IS_WORSE
 
     if not checks.is_concrete(study):
-        return Shown("Monte-Carlo study", _described(study), {}, {}, None)
+        return Shown("Monte-Carlo study", _described(study))
     quantiles = study.quantiles((0.05, 0.5, 0.95))
     rows = []
     for name in map(str, quantiles.data_vars):
         values = np.asarray(quantiles[name]).reshape(3, -1)
-        worst = (np.argmin if name in SMALLER_IS_WORSE else np.argmax)(values[1])
-        rows.append(
-            (name, study.metrics.units.get(name, ""), *(f"{x:.4g}" for x in values[:, worst]))
-        )
-    of_metrics = tables.as_html(
-        ("metric, of the worst joint", "unit", "5 %", "median", "95 %"), rows
-    )
-    drawn = tables.as_html(
-        ("path", "perturbation"),
-        [(path, _perturbation(x)) for path, x in study.perturbations.items()],
-    )
+        worst = np.argmin(values[1]) if name in SMALLER_IS_WORSE else np.argmax(values[1])
+        entries = [f"{x:.4g}" for x in values[:, worst]]
+        rows.append((name, study.metrics.units.get(name, ""), *entries))
+    header = ("metric, of the worst joint", "unit", "5 %", "median", "95 %")
+    perturbed = [(path, _perturbation(x)) for path, x in study.perturbations.items()]
+    content = {
+        "Metrics": tables.as_html(header, rows),
+        "Perturbed": tables.as_html(("path", "perturbation"), perturbed),
+    }
     first = "margin" if "margin" in study.metrics else next(iter(study.metrics))
     figures: dict[str, Callable[[], Figure]] = {
         f"Distribution of {first}": lambda: plotting.histograms(study, [first])
     }
-    if first == "margin":  # makes some of the runs again
-        figures["At a glance"] = lambda: plotting.study_overview(study)
+    if first == "margin":
+        figures["Overview"] = lambda: plotting.study_overview(study)
     figures["Every metric"] = lambda: plotting.histograms(study)
-    return Shown(
-        "Monte-Carlo study",
-        _described(study),
-        {"Metrics": of_metrics, "Perturbed": drawn},
-        figures,
-        study.scenario,
-    )
+    return Shown("Monte-Carlo study", _described(study), content, figures, study.scenario)
 
 
 def _certificate(found: Certificate) -> Shown:
@@ -204,7 +189,6 @@ def _certificate(found: Certificate) -> Shown:
         [found.subject],
         {"Line by line": found.table_html()},
         {"Along the run": found.plot},
-        None,
     )
 
 
@@ -226,14 +210,9 @@ def _tuning(found: TuneResult) -> Shown:
         for path, value in found.values.items()
     ]
     gains = tables.as_html(("tuned", "unit", "before", "after"), rows)
-    words = [*str(found.report).splitlines(), f"How it was found: {_described(found)[0]}"]
-    return Shown(
-        "Tuning",
-        words,
-        {"Gains": gains},
-        {"The search, and runs before and after": found.plot},
-        found.scenario,
-    )
+    words = [*str(found.report).splitlines(), f"Search: {_described(found)[0]}"]
+    figures = {"The search, and runs before and after": found.plot}
+    return Shown("Tuning", words, {"Gains": gains}, figures, found.scenario)
 
 
 def _identification(found: Identification) -> Shown:
@@ -241,7 +220,7 @@ def _identification(found: Identification) -> Shown:
         "Identification",
         found.words(),
         found.tables_html(),
-        {"Numbers and what is left": found.plot},
+        {"Numbers and residuals": found.plot},
         found.scenario,
         on_card=2,
     )
@@ -256,22 +235,24 @@ KINDS: dict[str, Callable[[Any], Shown]] = {
     "TuneResult": _tuning,
     "Identification": _identification,
 }
-"""Class of a result -> its parts; by name, so that what is not looked at is not imported."""
+"""Name of a result's class -> the function that makes the content.  Names in place of classes avoid
+the import of modules that are not used."""
 
 
 def shown(result: Any) -> Shown:
-    """The parts of a result."""
+    """The content of a result."""
     maker = KINDS.get(type(result).__name__)
     if maker is not None:
         return maker(result)
-    figures = {"Figure": result.plot} if callable(getattr(result, "plot", None)) else {}
-    return Shown(
-        type(result).__name__, _described(result), {}, figures, getattr(result, "scenario", None)
-    )
+    figures = {}
+    if hasattr(result, "plot"):
+        figures["Figure"] = result.plot
+    scenario = getattr(result, "scenario", None)
+    return Shown(type(result).__name__, _described(result), {}, figures, scenario)
 
 
 def _image(figure: Figure, dpi: int, words: str) -> str:
-    """A figure as part of a page."""
+    """A figure as an HTML image."""
     picture = io.BytesIO()
     figure.savefig(picture, format="png", dpi=dpi)
     data = base64.b64encode(picture.getvalue()).decode()
@@ -279,23 +260,17 @@ def _image(figure: Figure, dpi: int, words: str) -> str:
 
 
 def _lines(words: Sequence[str]) -> str:
-    return (
-        f"<pre>{html.escape(chr(10).join(words))}</pre>"
-        if len(words) > 1
-        else "".join(f"<p>{html.escape(x)}</p>" for x in words)
-    )
+    text = html.escape("\n".join(words))
+    if len(words) > 1:
+        return f"<pre>{text}</pre>"
+    return f"<p>{text}</p>" if words else ""
 
 
 def card(result: Any) -> str:
-    """What a notebook shows of a result: title, words, its first table and its first figure, as
-    HTML.
-    """
+    """The card of a result in a notebook: title, text, first table and first figure, as HTML."""
     parts = shown(result)
-    text = [
-        f"<b>{html.escape(parts.title)}</b>",
-        _lines(parts.words),
-        *list(parts.tables.values())[: parts.on_card],
-    ]
+    text = [f"<b>{html.escape(parts.title)}</b>", _lines(parts.words)]
+    text += list(parts.tables.values())[: parts.on_card]
     for name, draw in list(parts.figures.items())[:1]:
         text.append(_image(draw(), CARD_DPI, name))
     return f"<div>{''.join(text)}</div>"
@@ -303,21 +278,21 @@ def card(result: Any) -> str:
 
 @notices.each_warning_once
 def report(result: Any, path: str | Path, *, title: str | None = None) -> Path:
-    """Writes a result as one HTML file that needs nothing else: words, tables, figures, the
-    scenario and the versions.
+    """Writes a result as one self-contained HTML file with text, tables, figures, the scenario and
+    the versions.
 
     Args:
       result: a Scenario, Rollout, Study, Certificate, Comparison, TuneResult, Identification, or
         any other result of this package.
-      path: the file, ".html"; its folder must exist.
+      path: the file, which must end in ".html"; its folder must exist.
       title: the heading; the kind of the result if not given.
 
     Returns:
       The path of the file.
 
     Raises:
-      ValueError: a title that is no text, a path that ends otherwise, or an object that is no
-        result.
+      ValueError: a title that is not a text, a path with another ending, or an object that is not a
+        result of this package.
       OSError: the file cannot be written.
 
     Source: design of this package.
@@ -332,7 +307,7 @@ def report(result: Any, path: str | Path, *, title: str | None = None) -> Path:
             "result",
             result,
             "a result of this package",
-            "Such as what ij.simulate or ij.tune returns.",
+            "ij.simulate and ij.tune, for example, return one.",
         )
     path.write_text(_page(shown(result), title), encoding="utf-8")
     return path
@@ -343,11 +318,10 @@ def _page(parts: Shown, title: str | None) -> str:
     from iblf_jax.files.scenario import scenario_to_toml
 
     heading = html.escape(title or parts.title)
-    body = [
-        f"<h1>{heading}</h1>",
-        *([f"<p>{html.escape(parts.title)}</p>"] if title else []),
-        _lines(parts.words),
-    ]
+    body = [f"<h1>{heading}</h1>"]
+    if title:
+        body.append(f"<p>{html.escape(parts.title)}</p>")
+    body.append(_lines(parts.words))
     for name, table in parts.tables.items():
         body.append(f'<h2>{html.escape(name)}</h2><div class="wide">{table}</div>')
     for name, draw in parts.figures.items():
@@ -355,7 +329,7 @@ def _page(parts: Shown, title: str | None) -> str:
     if parts.scenario is not None:
         try:
             text = scenario_to_toml(parts.scenario)
-        except ValueError:  # a batch, or a class that files have no name for
+        except ValueError:  # A file cannot hold a batch, or a class without a registered name.
             text = repr(parameters(parts.scenario, named=False))
         body.append(
             "<h2>As a file</h2><details><summary>the"

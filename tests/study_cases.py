@@ -2,8 +2,7 @@
 compile.
 
 As a script it does the small sweep in a process of its own: `python study_cases.py OUT [--store S]
-  [--devices N] [--job ADDRESS N I]`;
-with `--serve` alone, in a process for each line that comes in (`Forks`).
+[--devices N] [--shared]`; with `--serve` alone, in a process for each line that comes in (`Forks`).
 """
 
 from __future__ import annotations
@@ -78,9 +77,9 @@ def from_file(text, **more):
     from iblf_jax.files import study as study_file
 
     file = study_file.study_from_dict(tomllib.loads(text), "sweep")
-    return ij.sweep(
-        file.scenario, file.grid, perturbations=file.perturbations, **file.options | more
-    )
+    options = dict(file.options)
+    options.pop("unit", None)
+    return ij.sweep(file.scenario, file.grid, perturbations=file.perturbations, **options | more)
 
 
 def study(runs=600, ways=None, **more):
@@ -91,15 +90,19 @@ def study(runs=600, ways=None, **more):
     )
 
 
-def table(**more):
+def table(store=None, unit=UNIT, **more):
+    """The small sweep; `store` is a path, or a `StoreOptions` that has its unit."""
     import iblf_jax as ij
 
+    if store is not None and not isinstance(store, ij.studies.StoreOptions):
+        store = ij.studies.StoreOptions(store, unit)
     return ij.sweep(
         ij.presets.zhang_yan_2024(),
         GRID,
         perturbations=perturbations(),
         runs=RUNS,
-        **options() | {"unit": UNIT} | more,
+        store=store,
+        **options() | more,
     )
 
 
@@ -246,7 +249,7 @@ def main() -> None:
     parser.add_argument("out")
     parser.add_argument("--store")
     parser.add_argument("--devices", type=int, default=1)
-    parser.add_argument("--job", nargs=3)
+    parser.add_argument("--shared", action="store_true", help="of a store for several processes")
     parser.add_argument("--slow", type=float, default=0.0, help="sleep so long after each unit")
     parser.add_argument("--die-after", type=int, help="kill this process after so many units")
     parser.add_argument(
@@ -258,16 +261,13 @@ def main() -> None:
     jax.config.update("jax_num_cpu_devices", args.devices)
     import iblf_jax as ij
 
-    if args.job:
-        ij.distributed.initialize(
-            args.job[0], int(args.job[1]), int(args.job[2]), heartbeat=5, start=60
-        )
     _hinder(args)
-    data = (
-        {}
-        if args.study and not args.store
-        else arrays(table(**({"store": args.store} if args.store else {})))
-    )
+    data = {}
+    if args.store:
+        store = ij.studies.StoreOptions(args.store, UNIT, shared=args.shared)
+        data = arrays(table(store=store))
+    elif not args.study:
+        data = arrays(table())
     if args.study:
         data |= named(study())
     np.savez(args.out, **data)

@@ -187,7 +187,7 @@ def output_folder(name: str) -> Path:
     return folder
 
 
-# ---------------------------------------------------------------------------------- numbers as text
+# ------------------------------------------------------------------------------- numbers as text
 
 
 def strict(value: Any) -> Any:

@@ -1,11 +1,12 @@
-"""What the commands for many runs share: devices and processes, how they end, and what they
-print.
+"""What the commands for many runs share: where the runs are computed, exit codes, and the file of
+results.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,17 +17,20 @@ MOST_DEVICES = 256
 """CPU devices of one process; each has threads of its own, and XLA aborts where the system gives it
 no more."""
 UNFINISHED = 3
-"""Exit code: a disk is full or another process was lost; start the same command again."""
+"""Exit code: a disk is full or a worker was lost; the same command computes the rest."""
+
+DASK_TIMEOUT = 30
+"""Seconds to wait for a Dask scheduler."""
 
 EPILOG = (
     "Exit codes: 0 every run is ok; 1 done, and some runs failed; 2 bad arguments or files, or a"
-    " store of another configuration; 3 not finished (disk full, another process lost), what is"
-    " written stays valid; 130 interrupted."
+    " store of another configuration; 3 not finished (disk full, worker lost), what is written"
+    " stays valid; 130 interrupted."
 )
 
 
 def add_study_arguments(parser: argparse.ArgumentParser) -> None:
-    """--out, --devices, --chunk, --quiet, and those of a job of several processes."""
+    """--out, --devices, --chunk, --dask, --quiet, and the deprecated ones of `jax.distributed`."""
     parser.add_argument("--out", metavar="FILE.nc", help="write the results as netCDF")
     parser.add_argument(
         "--devices",
@@ -41,71 +45,87 @@ def add_study_arguments(parser: argparse.ArgumentParser) -> None:
         help="runs in flight at a time (default: from a memory budget)",
     )
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
-    job = parser.add_argument_group("several processes", "Every process runs the same command.")
-    job.add_argument(
-        "--distributed",
-        action="store_true",
-        help="under SLURM or Open MPI: JAX finds the processes by itself",
+    parser.add_argument(
+        "--dask",
+        metavar="ADDRESS",
+        help="compute on the workers of this Dask scheduler, such as tcp://10.0.0.1:8786",
     )
-    job.add_argument("--coordinator", metavar="HOST:PORT", help="elsewhere: address of process 0")
-    job.add_argument("--num-processes", type=int, metavar="N")
-    job.add_argument("--process-id", type=int, metavar="I")
-    job.add_argument(
-        "--heartbeat",
-        type=int,
-        default=10,
-        metavar="S",
-        help="seconds after which a silent process is lost (default: 10)",
-    )
+    # Deprecated: use --dask, or the same sweep several times with --shared.
+    parser.add_argument("--distributed", action="store_true", help=argparse.SUPPRESS)
+    parser.add_argument("--coordinator", help=argparse.SUPPRESS)
+    parser.add_argument("--num-processes", type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--process-id", type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--heartbeat", type=int, default=10, help=argparse.SUPPRESS)
 
 
 def carried_out(args: argparse.Namespace, work: Callable[[dict[str, Any]], int]) -> int:
-    """Sets up devices and processes, does the work, and turns its errors into exit codes.
+    """Sets up devices and workers, does the work, and turns its errors into exit codes.
 
     Args:
       args: the arguments.
       work: gets the keyword arguments that `monte_carlo` and `sweep` share; returns the exit code.
     """
-    import jax
-
     from iblf_jax.cli import INTERRUPTED, complain
-    from iblf_jax.core import checks
-    from iblf_jax.studies import distributed
+    from iblf_jax.studies import WorkerError, distributed
     from iblf_jax.studies.store import StoreError, StoreWriteError
 
     _check_out(args.out)
-    distributed.check_seconds("--heartbeat", args.heartbeat)
-    if args.devices is not None:
-        devices = checks.positive_integer("--devices", args.devices, most=MOST_DEVICES)
-        try:
-            jax.config.update("jax_num_cpu_devices", devices)
-        except RuntimeError:  # who calls `main` where JAX has run
-            expected = f"{jax.local_device_count()}, as many as JAX has in this process"
-            raise checks.fail(
-                "--devices", devices, expected, "Start the command in a process of its own."
-            ) from None
+    _set_devices(args.devices)
     job = (args.coordinator, args.num_processes, args.process_id)
     try:
         if args.distributed or any(word is not None for word in job):
             distributed.initialize(*job, heartbeat=args.heartbeat)
-        code = work(
-            {"chunk": args.chunk, "progress": False if args.quiet or distributed.rank() else None}
-        )
+        is_silent = args.quiet or distributed.rank() > 0
+        with _executor(args) as executor:
+            return work({"executor": executor, "progress": False if is_silent else None})
     except KeyboardInterrupt as stop:
         complain(str(stop) or "interrupted")
-        code = INTERRUPTED
-    except (StoreWriteError, distributed.ProcessLostError) as error:
+        return INTERRUPTED
+    except (StoreWriteError, WorkerError) as error:
         complain(str(error))
-        code = UNFINISHED
-    except StoreError as error:
+        return UNFINISHED
+    except (StoreError, ValueError, OSError) as error:
         complain(str(error))
-        code = 2
-    except (ValueError, OSError) as error:
-        complain(str(error))
-        code = 2
-    if code not in (0, 1):
-        distributed.leave(code)
-    return code
+        return 2
+
+
+def _set_devices(number: int | None) -> None:
+    import jax
+
+    from iblf_jax.core import checks
+
+    if number is None:
+        return
+    number = checks.positive_integer("--devices", number, most=MOST_DEVICES)
+    try:
+        jax.config.update("jax_num_cpu_devices", number)
+    except RuntimeError:  # `main` was called in a process in which JAX has run
+        expected = f"{jax.local_device_count()}, as many as JAX has in this process"
+        raise checks.fail(
+            "--devices", number, expected, "Start the command in a process of its own."
+        ) from None
+
+
+@contextlib.contextmanager
+def _executor(args: argparse.Namespace) -> Iterator[Any]:
+    """Where the runs are computed: in this process, or by the workers of --dask."""
+    from iblf_jax.studies import ThisProcess, initialize_worker
+
+    if args.dask is None:
+        yield ThisProcess(chunk=args.chunk).checked()
+        return
+    if args.chunk is not None or args.devices is not None:
+        raise ValueError("--dask: got --chunk or --devices as well, which are of this process.")
+    try:
+        from distributed import Client
+    except ImportError:
+        raise ValueError(
+            "--dask: needs Dask, which is not installed: pip install distributed, or '.[sweep]' in"
+            " a clone."
+        ) from None
+    with Client(args.dask, timeout=DASK_TIMEOUT) as client:
+        client.register_worker_callbacks(initialize_worker)
+        yield client.get_executor()
 
 
 def _check_out(name: str | None) -> None:

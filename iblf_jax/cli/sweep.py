@@ -30,6 +30,11 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--store", metavar="FOLDER.zarr", help="write to this store, and compute what it lacks"
     )
+    parser.add_argument(
+        "--shared",
+        action="store_true",
+        help="several processes run this command on the same store at the same time",
+    )
     add_study_arguments(parser)
     parser.set_defaults(run=run)
 
@@ -40,16 +45,21 @@ def run(args: argparse.Namespace) -> int:
     def work(how: dict[str, Any]) -> int:
         from iblf_jax.core.status import FAILED
         from iblf_jax.files.study import load_study_file
-        from iblf_jax.studies import distributed
+        from iblf_jax.studies import StoreOptions, distributed
         from iblf_jax.studies.sweep import sweep
 
         file = load_study_file(args.file, "sweep")
+        options = dict(file.options)
+        unit = options.pop("unit", None)
+        store = None
+        if args.store is not None:
+            store = StoreOptions(args.store, unit, shared=args.shared)
         data = sweep(
             file.scenario,
             file.grid,
             perturbations=file.perturbations,
-            store=args.store,
-            **file.options | how,
+            store=store,
+            **options | how,
         )
         if distributed.rank() == 0:
             print(report(data))

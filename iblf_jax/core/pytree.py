@@ -74,8 +74,6 @@ def component(cls: type[T]) -> type[T]:
             "component", cls, "a class of annotated fields, those with defaults last", f"{error}."
         ) from error
     fields = dataclasses.fields(cls)  # type: ignore[arg-type]
-    children = tuple(f.name for f in fields if not f.metadata.get("static"))
-    structure = tuple(f.name for f in fields if f.metadata.get("static"))
     dataclass_init = cls.__init__
 
     @functools.wraps(dataclass_init)
@@ -97,6 +95,18 @@ def component(cls: type[T]) -> type[T]:
 
     cls.__init__ = checked_init  # type: ignore[method-assign]
 
+    return register_component(cls)
+
+
+def register_component(cls: type[T]) -> type[T]:
+    """Registers a component's class as a pytree, and returns it.
+
+    `component` calls it. It is called again where a class arrives from another process by value
+    (`studies.workers`), because decorators do not run there.
+    """
+    fields = dataclasses.fields(cls)  # type: ignore[arg-type]
+    children = tuple(f.name for f in fields if not f.metadata.get("static"))
+    structure = tuple(f.name for f in fields if f.metadata.get("static"))
     # Every call of a compiled function takes its arguments apart here.
     children_of, structure_of = _getter(children), _getter(structure)
     keys = tuple(map(jax.tree_util.GetAttrKey, children))
@@ -116,7 +126,17 @@ def component(cls: type[T]) -> type[T]:
         return obj
 
     jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
+    setattr(cls, _REGISTERED, True)
     return cls
+
+
+_REGISTERED = "_registered_component"
+"""Attribute of a class that `register_component` has registered."""
+
+
+def is_component_class(value: Any) -> bool:
+    """Whether this is a class that `component` was applied to."""
+    return isinstance(value, type) and _REGISTERED in vars(value)
 
 
 def _getter(names: tuple[str, ...]) -> Callable[[Any], tuple]:

@@ -1,7 +1,7 @@
-"""A law outside of the package: against another simulator's robot (`ij.cosimulate`), and as code of
-its own (`ij.export`).
+"""A law outside of the package: with the robot of another simulator (`ij.cosimulate`), and as
+generated code (`ij.export`).
 
-`export` writes what `control_law` (one sample of a law) and `loop_program` (one step of a closed
-loop) give as scalar programs.  `write_c` and `write_loop` make C of them by the generator of the
-native backend, `fmu` packs it for other simulators; templates stand in `c/`.
+`control_law` (one sample of a law) and `loop_program` (one step of a closed loop) build scalar
+programs.  `write_c` and `write_loop` translate them to C with the generator of the native backend,
+and `fmu` packages this code for other simulators.  The templates are in `c/`.
 """

@@ -23,16 +23,16 @@ def c_compiler() -> list[str]:
     """The command of a C compiler: $CC if it is set, else cc, gcc, clang or ziglang's;
     ToolchainError if there is none.
     """
-    wanted = os.environ.get("CC")
-    for name in [wanted] if wanted else ["cc", "gcc", "clang"]:
+    chosen = os.environ.get("CC")
+    for name in [chosen] if chosen else ["cc", "gcc", "clang"]:
         path = shutil.which(name)
         if path:
             return [path]
-    if not wanted and has_ziglang():
+    if not chosen and has_ziglang():
         return zig()
     raise ToolchainError(
         "there is no C compiler"
-        + (f" {wanted!r} ($CC)" if wanted else " (cc, gcc, clang; pip install ziglang has one)")
+        + (f" {chosen!r} ($CC)" if chosen else " (cc, gcc, clang; pip install ziglang has one)")
     )
 
 

@@ -1,8 +1,8 @@
-"""Parameters as a C struct whose fields are the paths of leaves; and what may stand in C's names,
-comments and strings.
+"""Parameters as a C struct whose fields are the paths of leaves; valid C names, comments and
+literals.
 
-Nothing that comes from a file or a user's class reaches code unescaped: a name keeps letters,
-digits and underscores, a comment is a JSON string in ASCII that cannot end it.
+Text from a file or a user's class never enters the generated code unescaped: a name keeps letters,
+digits and underscores, and a comment is an ASCII JSON string that cannot end the comment.
 """
 
 from __future__ import annotations
@@ -24,25 +24,33 @@ from iblf_jax.simulation.scenario import Scenario
 RESERVED = frozenset(
     re.findall(
         r"\w+",
-        """auto break case char const continue default do double else enum extern float for goto if inline int long register restrict return
-        short signed sizeof static struct switch typedef union unsigned void volatile while asm typeof bool true false class new delete
-        this template typename namespace private public protected friend virtual explicit mutable operator using try catch throw export
-        import and and_eq bitand bitor compl not not_eq or or_eq xor xor_eq alignas alignof constexpr decltype noexcept nullptr
-        static_assert thread_local typeid wchar_t const_cast dynamic_cast reinterpret_cast static_cast concept requires
-        real integer F I FN NULL NAN INFINITY SEPARATE RESTRICT TABLE MASK AT DOMAIN OVERFLOW UNDERFLOW SING PLOSS TLOSS linux unix""",
+        """
+        auto break case char const continue default do double else enum extern float for
+        goto if inline int long register restrict return short signed sizeof static struct
+        switch typedef union unsigned void volatile while asm typeof bool true false class
+        new delete this template typename namespace private public protected friend virtual
+        explicit mutable operator using try catch throw export import and and_eq bitand
+        bitor compl not not_eq or or_eq xor xor_eq alignas alignof constexpr decltype
+        noexcept nullptr static_assert thread_local typeid wchar_t const_cast dynamic_cast
+        reinterpret_cast static_cast concept requires real integer F I FN NULL NAN INFINITY
+        SEPARATE RESTRICT TABLE MASK AT DOMAIN OVERFLOW UNDERFLOW SING PLOSS TLOSS linux
+        unix
+        """,
     )
 )
 """Words of C and C++, of their headers, and of the generated code."""
 FILES = frozenset(
     re.findall(
         r"\w+",
-        """selftest vectors
-        assert complex ctype errno fenv float inttypes iso646 limits locale math setjmp signal stdarg stdbool stddef stdint stdio stdlib
-        string tgmath time wchar wctype
-        all clean edit_cache help install m package package_source preinstall rebuild_cache test""",
+        """
+        selftest vectors assert complex ctype errno fenv float inttypes iso646 limits locale
+        math setjmp signal stdarg stdbool stddef stdint stdio stdlib string tgmath time
+        wchar wctype all clean edit_cache help install m package package_source preinstall
+        rebuild_cache test
+        """,
     )
 )
-"""What no file may be called, in small letters: those beside it, headers of C, and targets and
+"""Reserved file names in lower case: the other generated files, headers of C, and targets and
 libraries of CMake."""
 
 

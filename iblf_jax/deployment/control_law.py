@@ -1,9 +1,9 @@
-"""What a robot's computer runs once a period, as scalar programs: the start, and a sample of
+"""The control law as scalar programs that a robot's computer runs: the start, and one sample of
 velocity filter, observer and law.
 
-It is `closed_loop.law_update`, with the sensor's velocity filter before it.  What an encoder does to
-a position (counts, offset, noise) the robot's own does.  Which leaves of the scenario the programs
-read decides what a user of the generated code can set.
+A sample is `closed_loop.law_update` after the sensor's velocity filter.  The effects of an encoder
+(counts, offset, noise) are those of the robot's own encoder.  The leaves of the scenario that the
+programs read are the parameters that a user of the generated code can set.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ from iblf_jax.simulation.scenario import Scenario
 
 @component
 class GivenReference:
-    """A reference that is told at every sample: q_d(s) = q_d + q_d' (s - t) + q_d" (s - t)^2 / 2.
+    """A reference that is an input of every sample: q_d(s) = q_d + q_d' (s - t) + q_d" (s - t)^2 /
+    2.
 
     Args:
       t: time of the sample, () [s].
@@ -48,15 +49,17 @@ class GivenReference:
 
 
 class Memory(NamedTuple):
-    """What goes from sample to sample."""
+    """The internal state between samples."""
 
     controller: Any
     observer: Any
     velocity: Any
 
 
-class Told(NamedTuple):
-    """What the law is told at a sample; the reference's fields are empty where it is inside."""
+class SampleInputs(NamedTuple):
+    """Inputs of the law at a sample; the reference's fields are empty if the reference is
+    internal.
+    """
 
     t: jax.Array
     q: jax.Array
@@ -67,7 +70,7 @@ class Told(NamedTuple):
 
 
 class Outputs(NamedTuple):
-    """What it answers."""
+    """Outputs of the law at a sample."""
 
     tau: jax.Array
     alpha: jax.Array
@@ -82,19 +85,19 @@ FLAGS = ("outside", "guarded", "saturated", "infeasible")
 """Fields of `Outputs` that are flags, in the order of their bits."""
 
 
-def _at(scenario: Scenario, told: Told) -> Scenario:
-    """The scenario, with the reference that it is told if it is."""
-    if isinstance(told.q_d, tuple):
+def _with_reference(scenario: Scenario, inputs: SampleInputs) -> Scenario:
+    """The scenario, with the reference of the inputs if these have one."""
+    if isinstance(inputs.q_d, tuple):
         return scenario
     return dataclasses.replace(
-        scenario, reference=GivenReference(told.t, told.q_d, told.dq_d, told.ddq_d)
+        scenario, reference=GivenReference(inputs.t, inputs.q_d, inputs.dq_d, inputs.ddq_d)
     )
 
 
-def start(scenario: Scenario, told: Told) -> tuple[Memory, jax.Array]:
-    """The memory before the first sample, and the torque that holds the model still."""
-    scenario, velocity = _at(scenario, told), _velocity(scenario)
-    q, dq = told.q, told.dq
+def start(scenario: Scenario, inputs: SampleInputs) -> tuple[Memory, jax.Array]:
+    """The memory before the first sample, and the torque that keeps the model at rest."""
+    scenario, velocity = _with_reference(scenario, inputs), _velocity(scenario)
+    q, dq = inputs.q, inputs.dq
     observer = discrete_observer(scenario).init(q, dq, scenario.model)
     filtered = () if velocity is None else velocity.init(q, dq, scenario.sampling.period)  # type: ignore[union-attr]
     return Memory(
@@ -102,65 +105,65 @@ def start(scenario: Scenario, told: Told) -> tuple[Memory, jax.Array]:
     ), scenario.model.gravity(q)
 
 
-def sample(scenario: Scenario, told: Told, memory: Memory) -> tuple[Memory, Outputs]:
-    """One sample: the memory at the next one, and what is said."""
-    scenario, velocity, n = _at(scenario, told), _velocity(scenario), scenario.n
-    dq, filtered = told.dq, ()
+def sample(scenario: Scenario, inputs: SampleInputs, memory: Memory) -> tuple[Memory, Outputs]:
+    """One sample: the memory for the next sample, and the outputs."""
+    scenario, velocity, n = _with_reference(scenario, inputs), _velocity(scenario), scenario.n
+    dq, filtered = inputs.dq, ()
     if velocity is not None:
         assert scenario.sampling is not None
-        normal = jnp.zeros((velocity.draws, n), told.q.dtype)
+        normal = jnp.zeros((velocity.draws, n), inputs.q.dtype)
         dq, filtered = velocity.estimate(
-            told.q, told.dq, normal, scenario.sampling.period, memory.velocity
+            inputs.q, inputs.dq, normal, scenario.sampling.period, memory.velocity
         )
     answer = law_update(
-        scenario, told.t, Measurement(told.q, dq), memory.controller, memory.observer
+        scenario, inputs.t, Measurement(inputs.q, dq), memory.controller, memory.observer
     )
-    command, tube = answer.command, scenario.context.tube(told.t)
+    command, tube = answer.command, scenario.context.tube(inputs.t)
     infeasible = jnp.zeros((), bool)
     for slack in jax.tree.leaves((command.slack, command.region_slack)):
         infeasible |= jnp.any(slack > 0)
-    said = Outputs(
+    outputs = Outputs(
         command.tau,
         command.alpha,
         answer.f_hat,
-        ~jnp.all((told.q > tube.lower) & (told.q < tube.upper)),
+        ~jnp.all((inputs.q > tube.lower) & (inputs.q < tube.upper)),
         jnp.any(command.guard_active),
         jnp.any(command.saturated),
         infeasible,
     )
-    return Memory(answer.controller, answer.observer, filtered), said
+    return Memory(answer.controller, answer.observer, filtered), outputs
 
 
 def _velocity(scenario: Scenario) -> Any:
-    """What makes velocities of positions; None where the law is told them."""
+    """The velocity filter of the sensor; None where velocities are inputs."""
     return None if isinstance(scenario.sensor, Ideal) else scenario.sensor.velocity  # type: ignore[attr-defined]
 
 
 class ControlLaw(NamedTuple):
-    """The programs of a scenario's law; leaves of the scenario are shared, numbers of `Told` are a
-    lane's.
+    """The programs of a scenario's law; they share the leaves of the scenario and read
+    `SampleInputs` as per-run leaves.
     """
 
     start: Program
-    """Of `start`; its samples are the memory and the torque."""
+    """The program of `start`; its results are the memory and the torque."""
     sample: Program
-    """Of `sample`; it carries the memory, and its samples are `Outputs`."""
+    """The program of `sample`; its carry is the memory, and its results are `Outputs`."""
     memory: tuple[str, ...]
-    """What each number of the memory is."""
+    """Names of the numbers of the memory."""
     reads_velocity: bool
     """Whether q' is an input."""
 
 
-def control_law(scenario: Scenario, told_reference: bool) -> ControlLaw:
+def control_law(scenario: Scenario, external_reference: bool) -> ControlLaw:
     """The programs of the law of a scenario that is sampled, in the type of its numbers.
 
     Args:
       scenario: canonical.
-      told_reference: the reference is told at every sample; else it is inside.
+      external_reference: whether the reference is an input; otherwise it is a function of t.
 
     Raises:
       ValueError: a sensor whose velocity filter is not known.
-      UnsupportedError: the law does not lower; the message says why.
+      UnsupportedError: the law cannot be lowered; the message states the reason.
     """
     if not isinstance(scenario.sensor, Ideal) and not hasattr(scenario.sensor, "velocity"):
         kind = type(scenario.sensor).__name__
@@ -168,24 +171,26 @@ def control_law(scenario: Scenario, told_reference: bool) -> ControlLaw:
             "scenario.sensor",
             kind,
             "one with a field `velocity`, or sensors.Ideal()",
-            "It says how q' follows from q.",
+            "The velocity filter computes q' from q.",
         )
-    told = told_at(jnp.zeros((), scenario.initial.q.dtype), scenario.initial.q, told_reference)
-    dtype = told.q.dtype
+    inputs = input_shapes(
+        jnp.zeros((), scenario.initial.q.dtype), scenario.initial.q, external_reference
+    )
+    dtype = inputs.q.dtype
     like = jax.tree.map(
-        lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(start, scenario, told)[0]
+        lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(start, scenario, inputs)[0]
     )
     memory = as_floats(like, dtype)
 
-    def first(scenario, told, carry, index):
-        memory, tau = start(scenario, told)
+    def first(scenario, inputs, carry, index):
+        memory, tau = start(scenario, inputs)
         return (), (as_floats(memory, dtype), tau)
 
-    def one(scenario, told, carry, index):
-        memory, said = sample(scenario, told, of_floats(carry, like))
-        return as_floats(memory, dtype), said
+    def one(scenario, inputs, carry, index):
+        memory, outputs = sample(scenario, inputs, of_floats(carry, like))
+        return as_floats(memory, dtype), outputs
 
-    begin, step = program_of(first, scenario, told, ()), program_of(one, scenario, told, memory)
+    begin, step = program_of(first, scenario, inputs, ()), program_of(one, scenario, inputs, memory)
     reads = any(
         node.op == "per_run" and 1 + scenario.n <= node.value < 1 + 2 * scenario.n
         for node in step.nodes
@@ -194,20 +199,20 @@ def control_law(scenario: Scenario, told_reference: bool) -> ControlLaw:
 
 
 def as_floats(memory: Any, dtype: Any) -> Any:
-    """A memory whose numbers are all of one type: whole numbers and flags as 0.0, 1.0, ..."""
+    """A memory with all numbers of one type; integers and flags become 0.0, 1.0, ..."""
     return jax.tree.map(lambda x: x.astype(dtype), memory)
 
 
 def of_floats(memory: Any, like: Any) -> Any:
-    """What `as_floats` was given, of the types of `like`."""
+    """The inverse of `as_floats`, with the types of `like`."""
     return jax.tree.map(
         lambda x, y: x > 0.5 if y.dtype == bool else x.astype(y.dtype), memory, like
     )
 
 
-def told_at(t: jax.Array, q: jax.Array, told_reference: bool) -> Told:
-    """A place for what the law is told, of the right shapes."""
-    return Told(t, q, q, *((q, q, q) if told_reference else ()))
+def input_shapes(t: jax.Array, q: jax.Array, external_reference: bool) -> SampleInputs:
+    """Inputs of the right shapes."""
+    return SampleInputs(t, q, q, *((q, q, q) if external_reference else ()))
 
 
 def program_of(function: Callable, scenario: Scenario, given: Any, carry: Any) -> Program:
@@ -215,20 +220,20 @@ def program_of(function: Callable, scenario: Scenario, given: Any, carry: Any) -
     out.
 
     Args:
-      function: what is computed.
+      function: the function to lower.
       scenario: its leaves are the program's shared numbers.
-      given: a pytree of arrays or their shapes, a lane's numbers.
-      carry: one, what goes from call to call.
+      given: a pytree of arrays or their shapes, the per-run leaves.
+      carry: a pytree of the same kind, carried from call to call.
 
     Raises:
-      UnsupportedError: it does not lower; the message says why.
+      UnsupportedError: the function cannot be lowered; the message states the reason.
     """
     trees = [jax.tree.structure(x) for x in (scenario, given, carry)]
 
-    def on_leaves(shared, lane, carried, index):
+    def on_leaves(shared, per_run, carried, index):
         parts = [
             jax.tree.unflatten(tree, x)
-            for tree, x in zip(trees, (shared, lane, carried), strict=True)
+            for tree, x in zip(trees, (shared, per_run, carried), strict=True)
         ]
         after, results = function(*parts, index)
         return jax.tree.leaves(after), jax.tree.leaves(results)
@@ -240,7 +245,7 @@ def program_of(function: Callable, scenario: Scenario, given: Any, carry: Any) -
 
 
 def number_names(tree: Any) -> tuple[str, ...]:
-    """What each number of a pytree of arrays is, "observer.p[1]"."""
+    """Names of the numbers of a pytree of arrays, such as "observer.p[1]"."""
     names = list[str]()
     for path, x in jax.tree_util.tree_flatten_with_path(tree)[0]:
         name = jax.tree_util.keystr(path).lstrip(".")

@@ -1,8 +1,8 @@
-"""`cosimulate`: a scenario's law, sampled, against a robot that MuJoCo moves.
+"""`cosimulate`: a scenario's sampled law against a robot that MuJoCo simulates.
 
 Sensor, law, observer, actuator, delay and disturbance are those of `simulate`; plant and integrator
-are MuJoCo's.  The run goes step by step in Python; its samples, metrics and flags follow from the
-motion when it is over.
+are MuJoCo's.  A Python loop advances the run step by step; samples, metrics and flags are computed
+from the recorded motion afterwards.
 """
 
 from __future__ import annotations
@@ -47,6 +47,7 @@ from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.simulation.signals import SIGNALS
 from iblf_jax.world.disturbances import Nothing
 from iblf_jax.world.robots import at_time
+from iblf_jax.world.robots._base import robot_member
 
 
 @notices.each_warning_once
@@ -65,29 +66,29 @@ def cosimulate(
     seed: int = 0,
     film: str | Path | None = None,
 ) -> Rollout:
-    """Runs a scenario's law against a robot that MuJoCo moves, contacts and mechanical stops
-    included.
+    """Runs a scenario's law against a robot that MuJoCo simulates, with contacts and mechanical
+    stops.
 
         tau_k = law(t_k, sensor(q, q'))  once a period,   x' = MuJoCo(x, tau + disturbance)  between
 
-    The law knows the scenario's `model`; what MuJoCo knows besides (a payload, friction, a stop, a
-    table) is uncertainty to it.  Of the scenario's `plant` only the names of its joints and what a
-    disturbance asks of it are used.  Torque changes when a command arrives, also within a step.  A
-    disturbance and an actuator go along with the stages of MuJoCo's integrator.  Joints have the
-    scenario's names in MuJoCo's model, or its order where the scenario's have none; other joints of
-    the same arm are locked at their reference, and a model's own drives of the arm are switched
-    off.
+    The law uses the scenario's `model`; further effects in MuJoCo's model (a payload, friction, a
+    stop, a table) are uncertainty.  The scenario's `plant` gives only the names of its joints and
+    what the disturbance needs.  The torque changes when a command arrives, within a step as well.
+    Disturbance and actuator are evaluated at the stages of MuJoCo's integrator.  The joints are
+    found in MuJoCo's model by the scenario's names, or by their order where these have no names.
+    Other joints of the same arm are locked at their reference positions, and the model's own
+    actuators of the arm are switched off.
 
     Args:
-      scenario: the law and all around it, of n joints.
+      scenario: the scenario, of n joints.
       plant: path of an MJCF or URDF, a `mujoco.MjSpec` or a `mujoco.MjModel`.  A URDF's shapes
-        whose mesh is not there are left out.
+        whose mesh files are missing are left out.
       duration: length of the run [s], a whole number of steps.
       period: of the law [s]; the scenario's `sampling.period` if not given.
       dt: step of MuJoCo [s], which divides the period; the model's own, or the next shorter one
         that does, if not given.
       integrator: "RK4", "Euler", "implicit" or "implicitfast"; None for the model's own.
-      locked: joint name -> position [rad or m], for joints of the model that are not to move.
+      locked: joint name -> position [rad or m], for joints of the model that are locked.
       record_every: record every so-many-th step; metrics and status cover every step whatever is
         recorded.
       metrics: the folds to run; None for `iblf_jax.metrics.standard()`.
@@ -97,9 +98,9 @@ def cosimulate(
         and the arm has shapes, the arm's skeleton otherwise.
 
     Returns:
-      A `Rollout` as `simulate` gives.  Of MuJoCo's robot nothing is known but how it moves:
-      `fastest_mode` is NaN, there is no `numerical_error`, and no flag tells of too large a step or
-      too long a period.
+      A `Rollout` as `simulate` returns.  Only the motion of MuJoCo's robot is available:
+      `fastest_mode` is NaN, there is no `numerical_error`, and no flag reports a step or a period
+      that is too long.
 
     Raises:
       ValueError: bad arguments, or joints that are not in MuJoCo's model; the message names the
@@ -114,31 +115,31 @@ def cosimulate(
     check_single(scenario)
     scenario = canonical(with_period(scenario, period))
     seed, throw = checks.seed(seed), checks.flag("throw", throw)
-    names = tuple(getattr(scenario.plant, "joints", ()))
+    names = tuple(robot_member(scenario.plant, "joints"))
     locked = checks.mapping("locked", {} if locked is None else locked, '{"gripper_joint": 0.02}')
     robot = MujocoPlant(plant, names, scenario.n, locked, integrator)
-    sampling: Any = scenario.sampling
-    own = float(sampling.period) / max(
-        1, math.ceil(float(sampling.period) / robot.timestep - DELAY_TOLERANCE)
-    )
-    dt = own if dt is None else checks.time_span("dt", dt)
+    dt = _own_step(scenario, robot) if dt is None else checks.time_span("dt", dt)
     check_step(scenario, dt)
     steps = checks.whole_steps(duration, dt, dt_is_free=False)
     record_every = checks.recorded_every(record_every, steps)
     write = None if film is None else _film_writer(film)
     folds = as_folds(metrics, scenario.initial.q.dtype, scenario)
-    motion = _run(scenario, robot, dt, steps, seed)
+    motion = _Run(scenario, robot, dt, seed).motion(steps)
     result = _rollout(scenario, folds, motion, dt, record_every, f"MuJoCo {integrator or 'own'}")
     report(result, steps, throw)
     if write is not None:
-        write(result, robot, motion.whole[motion.instant], dt)
+        write(result, robot, motion.model_positions[motion.instant], dt)
     return result
 
 
+def _own_step(scenario: Scenario, robot: MujocoPlant) -> float:
+    """The model's own step, or the next shorter one that divides the period of the law [s]."""
+    period = float(scenario.sampling.period)  # type: ignore[union-attr]
+    return period / max(1, math.ceil(period / robot.timestep - DELAY_TOLERANCE))
+
+
 def _film_writer(path: str | Path) -> Callable:
-    """What writes a film there.  Matplotlib comes with it, so it is imported where a film is asked
-    for.
-    """
+    """A function that writes a film.  It needs matplotlib, which is imported only here."""
     from iblf_jax.deployment.film import film_run
     from iblf_jax.plotting.animation import film_path
 
@@ -173,7 +174,7 @@ def with_period(scenario: Scenario, period: float | None) -> Scenario:
                 "period",
                 None,
                 "the period of the law [s]",
-                "Outside of the package a law is sampled: period=1e-3.",
+                "A law outside of the package is sampled: period=1e-3.",
             )
         return scenario
     period = checks.time_span("period", period)
@@ -188,9 +189,9 @@ def with_period(scenario: Scenario, period: float | None) -> Scenario:
 
 
 class _Motion(NamedTuple):
-    """What has happened, row by row (R first), and sample by sample.
+    """The recorded motion: R rows, and a state after each sample of the law.
 
-    There is a row for each instant, and where torque or law signals jump one before the jump and
+    Each instant has a row.  Where torque or law signals jump, there is one row before the jump and
     one after it.
     """
 
@@ -205,13 +206,13 @@ class _Motion(NamedTuple):
     limited: Any
     actuator: Any
     sample: Any
-    """Number of the last sample at each row, (R,)."""
-    whole: Any
-    """Positions of everything in MuJoCo's model."""
+    """Index of the last sample at each row, (R,)."""
+    model_positions: Any
+    """Positions of all joints of MuJoCo's model."""
     states: LoopState
     """After each sample of the law."""
-    broken: bool
-    """Whether the state ran away; it stands still from there."""
+    diverged: bool
+    """Whether the state diverged; it is constant from there on."""
 
 
 @jax.jit
@@ -221,133 +222,169 @@ def _law(scenario: Scenario, t, state: LoopState, index, noise) -> LoopState:
 
 
 @jax.jit
-def _delivered(scenario: Scenario, t, q, dq, asked, state):
-    """What the actuator delivers, and the torque with what disturbs."""
-    delivered = as_at(scenario.actuator, t).deliver(asked, dq, state)
+def _delivered(scenario: Scenario, t, q, dq, command, state):
+    """The actuator's output, and its torque plus that of the disturbance."""
+    delivered = as_at(scenario.actuator, t).deliver(command, dq, state)
     return delivered, delivered.tau + scenario.disturbance.torque(
         t, q, dq, at_time(scenario.plant, t), scenario.model
     )
 
 
-def _run(scenario: Scenario, robot: MujocoPlant, dt: float, steps: int, seed: int) -> _Motion:
-    """Moves the robot."""
-    sampling: Any = scenario.sampling
-    period, delay, every = (
-        float(sampling.period),
-        float(sampling.delay),
-        round(float(sampling.period) / dt),
-    )
-    noise = (
-        noise_key(jax.random.PRNGKey(seed)) if has_noise(scenario) else jnp.zeros(4, jnp.float32)
-    )
-    state, asked = initial_state(scenario), np.asarray(scenario.model.gravity(scenario.initial.q))
-    plain = isinstance(scenario.actuator, Ideal) and isinstance(scenario.disturbance, Nothing)
-    commands: list[np.ndarray] = []
-    states: list[LoopState] = []
-    arrived = 0
+class _Run:
+    """A run in progress: the law's state, the commands in transit and the recorded rows."""
 
-    times = np.sort(np.asarray(scenario.jump_times(), float))
-    apart = APART * np.finfo(scenario.initial.q.dtype).eps * np.abs(times)
-    jumped = 0
+    def __init__(self, scenario: Scenario, robot: MujocoPlant, dt: float, seed: int) -> None:
+        sampling: Any = scenario.sampling
+        self.scenario = scenario
+        self.robot = robot
+        self.dt = dt
+        self.period = float(sampling.period)
+        self.delay = float(sampling.delay)
+        self.steps_per_period = round(self.period / dt)
+        self.noise = jnp.zeros(4, jnp.float32)
+        if has_noise(scenario):
+            self.noise = noise_key(jax.random.PRNGKey(seed))
+        self.state = initial_state(scenario)
+        self.command = np.asarray(scenario.model.gravity(scenario.initial.q))
+        self.commands: list[np.ndarray] = []
+        self.arrived = 0
+        """Number of commands that have arrived."""
+        self.jump_times = np.sort(np.asarray(scenario.jump_times(), float))
+        eps = np.finfo(scenario.initial.q.dtype).eps
+        self.jump_widths = APART * eps * np.abs(self.jump_times)
+        self.jumped = 0
+        """Number of jumps of the scenario in the past."""
+        no_actuator = isinstance(scenario.actuator, Ideal)
+        self.applies_command = no_actuator and isinstance(scenario.disturbance, Nothing)
+        """Whether the robot receives the command unchanged."""
+        self.stages = Stages(self.torque_and_rate, jax.tree.map(np.asarray, self.state.actuator))
+        self.states: list[LoopState] = []
+        self.rows: list[tuple] = []
 
-    def beside(t: float) -> float:
-        """A time, on the side of the jumps on which the run is."""
-        if jumped > 0:
-            t = max(t, times[jumped - 1] + apart[jumped - 1])
-        if jumped < times.size:
-            t = min(t, times[jumped] - apart[jumped])
-        return t
+    def motion(self, steps: int) -> _Motion:
+        """The motion of so many steps."""
+        diverged = False
+        self.robot.place(np.asarray(self.state.q), np.asarray(self.state.dq))
+        with self.robot.driven(self.stages):
+            for index in range(steps + 1):
+                t = index * self.dt
+                diverged = diverged or self.has_diverged()
+                if diverged:
+                    self.rows.append((t, True, *self.rows[-1][2:]))
+                    continue
+                self.begin_step(index, t)
+                if index < steps:
+                    self.integrate(t, t + self.dt)
+        columns: list[Any] = [_stacked(column) for column in zip(*self.rows, strict=True)]
+        return _Motion._make([*columns, _stacked(self.states), diverged])
 
-    def rate(t, q, dq, actuator):
-        if plain:
-            return asked, ()
-        delivered, torque = _delivered(scenario, beside(t), q, dq, asked, actuator)
+    def has_diverged(self) -> bool:
+        """Whether the state is not finite or too fast."""
+        is_finite = np.all(np.isfinite(self.robot.q))
+        return not (is_finite and np.all(np.abs(self.robot.dq) < VELOCITY_LIMIT))
+
+    def begin_step(self, index: int, t: float) -> None:
+        """Samples the law if it is due, applies what changes at t, and records the instant."""
+        tolerance = DELAY_TOLERANCE * self.dt
+        is_due = index % self.steps_per_period == 0
+        changes = is_due or self.command_arrives(t + tolerance) or self.jumps(t + tolerance)
+        if index > 0 and changes:
+            self.record(t, instant=False)
+        if is_due:
+            self.sample_law(t)
+        self.apply_changes(t + tolerance)
+        self.record(t, instant=True)
+
+    def integrate(self, t: float, end: float) -> None:
+        """Advances MuJoCo from t to `end`; a step in which a command arrives or the scenario jumps
+        is divided there.
+        """
+        tolerance = DELAY_TOLERANCE * self.dt
+        while t < end - tolerance:
+            h = min(self.next_arrival(end), self.next_jump(end), end) - t
+            self.stages.begin(t)
+            self.robot.step(t, h)
+            self.stages.finish(h)
+            t += h
+            if t < end - tolerance:
+                self.record(t, instant=False)
+                self.apply_changes(t + tolerance)
+                self.record(t, instant=False)
+
+    def sample_law(self, t: float) -> None:
+        """One sample of the law; its command is in transit from here on."""
+        state = self.state._replace(q=jnp.asarray(self.robot.q), dq=jnp.asarray(self.robot.dq))
+        self.state = _law(self.scenario, t, state, len(self.commands), self.noise)
+        self.states.append(self.state)
+        self.commands.append(np.asarray(self.state.sampled.commands[0]))
+
+    def torque_and_rate(self, t, q, dq, actuator) -> tuple[np.ndarray, Any]:
+        """The torque on the joints, and the rate of the actuator's state."""
+        if self.applies_command:
+            return self.command, ()
+        side = self.side_of_jumps(t)
+        delivered, torque = _delivered(self.scenario, side, q, dq, self.command, actuator)
         return np.asarray(torque), jax.tree.map(np.asarray, delivered.rate)
 
-    stages = Stages(rate, jax.tree.map(np.asarray, state.actuator))
-    rows: list[tuple] = []
-    broken = False
-
-    def arrives(until: float) -> bool:
-        """Whether the next command has arrived by then."""
-        return arrived < len(commands) and arrived * period + delay <= until
-
-    def jumps(until: float) -> bool:
-        """Whether the next jump of the scenario is over by then."""
-        return jumped < times.size and times[jumped] <= until
-
-    def row(t: float, instant: bool) -> tuple:
-        """What there is to see at a time."""
-        q, dq = robot.q, robot.dq
-        stages.begin(t)
-        ddq = robot.acceleration(t)
-        tau, limited = asked, np.zeros(scenario.n, bool)
-        if not plain:
-            delivered, _ = _delivered(scenario, beside(t), q, dq, asked, stages.state)
+    def record(self, t: float, instant: bool) -> None:
+        """Appends the row of a time."""
+        q, dq = self.robot.q, self.robot.dq
+        self.stages.begin(t)
+        ddq = self.robot.acceleration(t)
+        tau, limited = self.command, np.zeros(self.scenario.n, bool)
+        actuator = self.stages.state
+        if not self.applies_command:
+            side = self.side_of_jumps(t)
+            delivered, _ = _delivered(self.scenario, side, q, dq, self.command, actuator)
             tau, limited = np.asarray(delivered.tau), np.asarray(delivered.limited)
-        return (
-            t,
-            instant,
-            q,
-            dq,
-            ddq,
-            tau,
-            limited,
-            stages.state,
-            len(commands) - 1,
-            robot.data.qpos.copy(),
-        )
+        model_positions = self.robot.data.qpos.copy()
+        sample = len(self.commands) - 1
+        row = (t, instant, q, dq, ddq, tau, limited, actuator, sample, model_positions)
+        self.rows.append(row)
 
-    def change(until: float) -> None:
-        """Takes up the commands that have arrived and the jumps that are over by then."""
-        nonlocal asked, arrived, jumped
-        while arrives(until):
-            asked, arrived = commands[arrived], arrived + 1
-        while jumps(until):
-            jumped += 1
+    # Commands in transit, and jumps of the scenario
 
-    robot.place(np.asarray(state.q), np.asarray(state.dq))
-    with robot.driven(stages):
-        for index in range(steps + 1):
-            t = index * dt
-            q, dq = robot.q, robot.dq
-            broken = broken or not (np.all(np.isfinite(q)) and np.all(np.abs(dq) < VELOCITY_LIMIT))
-            if broken:
-                rows.append((t, True, *rows[-1][2:]))
-                continue
-            # Where a command arrives or the scenario jumps within the step, MuJoCo makes two of it.
-            now, end, near = t, t + dt, DELAY_TOLERANCE * dt
-            due = index % every == 0
-            if index > 0 and (due or arrives(now + near) or jumps(now + near)):
-                rows.append(row(now, False))
-            if due:
-                state = _law(
-                    scenario,
-                    t,
-                    state._replace(q=jnp.asarray(q), dq=jnp.asarray(dq)),
-                    len(commands),
-                    noise,
-                )
-                states.append(state)
-                commands.append(np.asarray(state.sampled.commands[0]))
-            change(now + near)
-            rows.append(row(now, True))
-            while index < steps and now < end - near:
-                arrival = arrived * period + delay if arrived < len(commands) else end
-                jump = times[jumped] if jumped < times.size else end
-                h = min(arrival, jump, end) - now
-                stages.begin(now)
-                robot.step(now, h)
-                stages.finish(h)
-                now += h
-                if now < end - near:
-                    rows.append(row(now, False))
-                    change(now + near)
-                    rows.append(row(now, False))
-    columns: list[Any] = [
-        jax.tree.map(lambda *x: np.stack(x), *column) for column in zip(*rows, strict=True)
-    ]
-    return _Motion._make([*columns, jax.tree.map(lambda *x: np.stack(x), *states), broken])
+    def next_arrival(self, otherwise: float) -> float:
+        """When the next command arrives."""
+        if self.arrived < len(self.commands):
+            return self.arrived * self.period + self.delay
+        return otherwise
+
+    def next_jump(self, otherwise: float) -> float:
+        """When the scenario jumps next."""
+        if self.jumped < self.jump_times.size:
+            return float(self.jump_times[self.jumped])
+        return otherwise
+
+    def command_arrives(self, until: float) -> bool:
+        """Whether the next command arrives by then."""
+        return self.next_arrival(math.inf) <= until
+
+    def jumps(self, until: float) -> bool:
+        """Whether the scenario jumps by then."""
+        return self.next_jump(math.inf) <= until
+
+    def apply_changes(self, until: float) -> None:
+        """Applies the commands that arrive, and the jumps that occur, by then."""
+        while self.command_arrives(until):
+            self.command = self.commands[self.arrived]
+            self.arrived += 1
+        while self.jumps(until):
+            self.jumped += 1
+
+    def side_of_jumps(self, t: float) -> float:
+        """The time, moved to the side of the jumps on which the run is."""
+        if self.jumped > 0:
+            last = self.jumped - 1
+            t = max(t, self.jump_times[last] + self.jump_widths[last])
+        if self.jumped < self.jump_times.size:
+            t = min(t, self.jump_times[self.jumped] - self.jump_widths[self.jumped])
+        return t
+
+
+def _stacked(trees: Sequence[Any]) -> Any:
+    """Pytrees of arrays as one, with a new first axis."""
+    return jax.tree.map(lambda *x: np.stack(x), *trees)
 
 
 @jax.jit
@@ -357,9 +394,10 @@ def _observed(scenario: Scenario, folds, dt, motion: _Motion):
     half, zero = 0.5 * jnp.diff(t), jnp.zeros((1,), dt.dtype)
     weight = jnp.concatenate([zero, half]) + jnp.concatenate([half, zero])
     step = jnp.where(motion.instant & (t > 0), dt, 0.0)
-    said = jax.tree.map(lambda x: x[motion.sample], motion.states.sampled.signals)
-    see = jax.vmap(partial(sample_at, scenario))
-    samples = see(t, weight, motion.q, motion.dq, motion.ddq, motion.tau, motion.limited, said)
+    signals = jax.tree.map(lambda x: x[motion.sample], motion.states.sampled.signals)
+    samples = jax.vmap(partial(sample_at, scenario))(
+        t, weight, motion.q, motion.dq, motion.ddq, motion.tau, motion.limited, signals
+    )
     samples = dataclasses.replace(samples, step=step)
     raised = jax.vmap(sample_status)(samples)
     return samples, folded(folds, samples), raised
@@ -368,12 +406,12 @@ def _observed(scenario: Scenario, folds, dt, motion: _Motion):
 def _rollout(
     scenario: Scenario, folds: Any, motion: _Motion, dt: float, record_every: int, method: str
 ) -> Rollout:
-    """The motion as a run."""
+    """The result of a motion."""
     step_size = jnp.asarray(dt, scenario.initial.q.dtype)
     samples, results, raised = _observed(scenario, folds, step_size, motion)
-    status = np.bitwise_or.reduce(np.asarray(raised)) | (
-        int(Status.NOT_FINITE) if motion.broken else 0
-    )
+    status = np.bitwise_or.reduce(np.asarray(raised))
+    if motion.diverged:
+        status |= int(Status.NOT_FINITE)
     at = np.flatnonzero(motion.instant)[::record_every]
     recorded = jax.tree.map(lambda x: x[at], samples)
     states = jax.tree.map(lambda x: jnp.asarray(x[motion.sample[at]]), motion.states)

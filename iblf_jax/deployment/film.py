@@ -22,7 +22,7 @@ FPS = 25.0
 SIZE = (480, 640)
 """Height and width of a picture [pixels]: MuJoCo's own buffer of a model that says nothing else."""
 SHOWN_GROUPS = 3
-"""Groups of shapes that MuJoCo draws unasked: the first ones."""
+"""Number of the first groups of shapes, which MuJoCo draws by default."""
 AMBIENT, DIFFUSE = 0.5, 0.6
 """Of the camera's lamp, at least, in a model without lights: MuJoCo's own leaves a grey arm nearly
 black."""
@@ -53,12 +53,10 @@ def film_run(
 
 
 def _renderer(robot: MujocoPlant) -> Any:
-    """MuJoCo's renderer; None where nothing can be drawn, or nothing of the arm can be seen."""
-    return (
-        robot.mujoco.Renderer(robot.model, *SIZE)
-        if has_shapes(robot.model) and _can_draw()
-        else None
-    )
+    """MuJoCo's renderer; None if MuJoCo cannot draw, or if the arm has no visible shapes."""
+    if not has_shapes(robot.model) or not _can_draw():
+        return None
+    return robot.mujoco.Renderer(robot.model, *SIZE)
 
 
 def has_shapes(model: Any) -> bool:

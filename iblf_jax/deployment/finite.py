@@ -1,4 +1,4 @@
-"""Whether a law yields numbers; if not, which parameter is to blame."""
+"""Check that a law yields finite torques, and the parameter that causes others."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def check_finite(
         return
     row, joint = wrong[0]
     finding = f"the torque tau[{joint}] is {torques[row, joint]} {instant}"
-    blamed = _blamed(scenario, torques_of)
+    blamed = _cause(scenario, torques_of)
     if blamed is None:
         raise checks.fail(
             "scenario",
@@ -50,7 +50,7 @@ def check_finite(
     )
 
 
-def _blamed(
+def _cause(
     scenario: Scenario, torques_of: Callable[[Scenario], Any]
 ) -> tuple[str, np.ndarray] | None:
     """The parameter, of extreme size, without which the torques are finite; None if there is

@@ -19,8 +19,8 @@ from iblf_jax import __version__
 from iblf_jax.deployment.build import build, c_compiler, fmi_platform
 from iblf_jax.deployment.c_names import Parameters
 from iblf_jax.deployment.loop_program import OUTPUTS
-from iblf_jax.deployment.write_c import REFERENCE, Law, Written, filled, title_of
-from iblf_jax.deployment.write_loop import WrittenLoop
+from iblf_jax.deployment.write_c import REFERENCE, GeneratedLaw, Law, fill_template, title_of
+from iblf_jax.deployment.write_loop import GeneratedLoop
 from iblf_jax.simulation.scenario import Scenario
 
 FLAGS = ("-std=c99", "-O2", "-fPIC", "-shared", "-fvisibility=hidden")
@@ -65,11 +65,13 @@ def unit_exponents(unit: str) -> tuple[int, int, int, int] | None:
 
 
 def law_variables(law: Law, parameters: Parameters) -> list[Variable]:
-    """What an importer sees of a law alone."""
+    """The variables of an FMU of a law."""
     n = law.scenario.n
     start = [np.asarray(x, float) for x in law.vectors.first]
-    told = zip(REFERENCE, ("rad", "rad/s", "rad/s^2"), strict=True) if law.told_reference else ()
-    names = [("q", "rad"), ("dq", "rad/s"), *told]
+    reference = (
+        zip(REFERENCE, ("rad", "rad/s", "rad/s^2"), strict=True) if law.external_reference else ()
+    )
+    names = [("q", "rad"), ("dq", "rad/s"), *reference]
     inputs = [
         Variable(name, "input", unit, (n,), x) for (name, unit), x in zip(names, start, strict=True)
     ]
@@ -81,7 +83,7 @@ def law_variables(law: Law, parameters: Parameters) -> list[Variable]:
 
 
 def loop_variables(scenario: Scenario, parameters: Parameters) -> list[Variable]:
-    """What an importer sees of a closed loop."""
+    """The variables of an FMU of a closed loop."""
     outputs = [Variable(name, "output", unit, (scenario.n,)) for name, unit in OUTPUTS.items()]
     return [*_settable(parameters), *outputs, Variable("status", "output", "1", ())]
 
@@ -102,27 +104,65 @@ def _settable(parameters: Parameters) -> list[Variable]:
 def model_description(
     name: str, title: str, token: str, step: float, variables: Sequence[Variable]
 ) -> str:
-    """The XML that says what an FMU is."""
+    """The XML description of an FMU."""
     root = Xml.Element(
         "fmiModelDescription",
-        fmiVersion="3.0", modelName=name, instantiationToken=token, description=title, generationTool=f"iblf_jax {__version__}",
-    )  # fmt: skip
+        fmiVersion="3.0",
+        modelName=name,
+        instantiationToken=token,
+        description=title,
+        generationTool=f"iblf_jax {__version__}",
+    )
     Xml.SubElement(
-        root, "CoSimulation", modelIdentifier=name, canHandleVariableCommunicationStepSize="true", canGetAndSetFMUState="true",
+        root,
+        "CoSimulation",
+        modelIdentifier=name,
+        canHandleVariableCommunicationStepSize="true",
+        canGetAndSetFMUState="true",
         fixedInternalStepSize=repr(step),
-    )  # fmt: skip
-    units = {v.unit: unit_exponents(v.unit) for v in variables}
-    known = {"s": BASE["s"]} | {unit: x for unit, x in units.items() if x is not None and any(x)}
-    definitions = Xml.SubElement(root, "UnitDefinitions")
-    for unit, powers in sorted(known.items()):
-        base: dict[str, Any] = {
-            k: str(p) for k, p in zip(("kg", "m", "s", "rad"), powers, strict=True) if p
-        }
-        Xml.SubElement(Xml.SubElement(definitions, "Unit", name=unit), "BaseUnit", **base)
+    )
+    units = _add_units(root, variables)
     categories = Xml.SubElement(root, "LogCategories")
     for category in ("logStatusWarning", "logStatusError"):
         Xml.SubElement(categories, "Category", name=category)
     Xml.SubElement(root, "DefaultExperiment", startTime="0", stopTime="20", stepSize=repr(step))
+    _add_variables(root, variables, units)
+    structure = Xml.SubElement(root, "ModelStructure")
+    outputs = [str(k) for k, v in enumerate(variables, start=1) if v.causality == "output"]
+    for kind in ("Output", "InitialUnknown"):
+        for reference in outputs:
+            Xml.SubElement(structure, kind, valueReference=reference)
+    Xml.indent(root)
+    return (
+        '<?xml version="1.0" encoding="UTF-8"?>\n' + Xml.tostring(root, encoding="unicode") + "\n"
+    )
+
+
+def _add_units(root: Xml.Element, variables: Sequence[Variable]) -> set[str]:
+    """Adds the definitions of the units; returns their names."""
+    exponents = {"s": BASE["s"]}
+    for v in variables:
+        found = unit_exponents(v.unit)
+        if found is not None and any(found):
+            exponents[v.unit] = found
+    definitions = Xml.SubElement(root, "UnitDefinitions")
+    for unit, powers in sorted(exponents.items()):
+        pairs = zip(("kg", "m", "s", "rad"), powers, strict=True)
+        base = {name: str(power) for name, power in pairs if power}
+        Xml.SubElement(Xml.SubElement(definitions, "Unit", name=unit), "BaseUnit", base)
+    return set(exponents)
+
+
+CAUSALITY_ATTRIBUTES = {
+    "parameter": {"causality": "parameter", "variability": "tunable"},
+    "constant": {"causality": "local", "variability": "constant"},
+    "input": {"causality": "input", "variability": "continuous"},
+    "output": {"causality": "output", "variability": "discrete"},
+}
+
+
+def _add_variables(root: Xml.Element, variables: Sequence[Variable], units: set[str]) -> None:
+    """Adds time and the variables."""
     listed = Xml.SubElement(root, "ModelVariables")
     Xml.SubElement(
         listed,
@@ -135,35 +175,18 @@ def model_description(
         description="time",
     )
     for k, v in enumerate(variables, start=1):
-        kinds: dict[str, Any] = {
-            "parameter": {"causality": "parameter", "variability": "tunable"},
-            "constant": {"causality": "local", "variability": "constant"},
-            "input": {"causality": "input", "variability": "continuous"},
-            "output": {"causality": "output", "variability": "discrete"},
-        }[v.causality]
-        first: dict[str, Any] = (
-            {}
-            if v.start is None
-            else {"start": " ".join(map(repr, np.ravel(v.start).tolist())).replace("inf", "INF")}
-        )
-        unit_of: dict[str, Any] = {"unit": v.unit} if v.unit in known else {}
-        element = Xml.SubElement(
-            listed, "Float64", name=v.name, valueReference=str(k), **kinds, **unit_of, **first
-        )
+        attributes = {"name": v.name, "valueReference": str(k), **CAUSALITY_ATTRIBUTES[v.causality]}
+        if v.unit in units:
+            attributes["unit"] = v.unit
+        if v.start is not None:
+            numbers = " ".join(map(repr, np.ravel(v.start).tolist()))
+            attributes["start"] = numbers.replace("inf", "INF")
+        element = Xml.SubElement(listed, "Float64", attributes)
         for size in v.shape:
             Xml.SubElement(element, "Dimension", start=str(size))
-    structure = Xml.SubElement(root, "ModelStructure")
-    outputs = [str(k) for k, v in enumerate(variables, start=1) if v.causality == "output"]
-    for kind in ("Output", "InitialUnknown"):
-        for reference in outputs:
-            Xml.SubElement(structure, kind, valueReference=reference)
-    Xml.indent(root)
-    return (
-        '<?xml version="1.0" encoding="UTF-8"?>\n' + Xml.tostring(root, encoding="unicode") + "\n"
-    )
 
 
-def source_of(
+def wrapper_source(
     name: str,
     title: str,
     token: str,
@@ -171,7 +194,7 @@ def source_of(
     block: str,
     values: dict[str, Any],
 ) -> str:
-    """The C around a law or a loop."""
+    """The FMI 3.0 wrapper of a law or a loop in C."""
     table, place, starts = list[str](), 0, list[str]()
     for v in variables:
         size = math.prod(v.shape)
@@ -179,7 +202,7 @@ def source_of(
         place += size
     counts = {
         kind: sum(math.prod(v.shape) for v in variables if v.causality in kinds)
-        for kind, kinds in _KINDS.items()
+        for kind, kinds in CAUSALITIES.items()
     }
     begin = 0
     for v in (v for v in variables if v.causality == "input"):
@@ -188,7 +211,7 @@ def source_of(
             for i, x in enumerate(np.ravel(np.asarray(v.start)).tolist())
         ]
         begin += math.prod(v.shape)
-    return filled(
+    return fill_template(
         "fmi3.c",
         {
             "title": title,
@@ -201,14 +224,18 @@ def source_of(
             "inputs": counts["inputs"],
             "outputs": counts["outputs"],
             "starts": "".join(starts),
-            "block": filled(block, values),
+            "block": fill_template(block, values),
         },
     )
 
 
-_KINDS = {"parameters": ("parameter", "constant"), "inputs": ("input",), "outputs": ("output",)}
+CAUSALITIES = {
+    "parameters": ("parameter", "constant"),
+    "inputs": ("input",),
+    "outputs": ("output",),
+}
 
-BUILD = """<?xml version="1.0" encoding="UTF-8"?>
+BUILD_DESCRIPTION = """<?xml version="1.0" encoding="UTF-8"?>
 <fmiBuildDescription fmiVersion="3.0">
   <BuildConfiguration modelIdentifier="{name}">
     <SourceFileSet language="C99">
@@ -220,45 +247,47 @@ BUILD = """<?xml version="1.0" encoding="UTF-8"?>
 """
 
 
-def law_fmu(law: Law, made: Written, path: Path) -> None:
+def law_fmu(law: Law, generated: GeneratedLaw, path: Path) -> None:
     """Writes a law as an FMU; raises ToolchainError."""
     n, name, step = law.scenario.n, law.name, float(law.scenario.sampling.period)  # type: ignore[union-attr]
-    given = "".join(f", q + {k * n}" for k in (2, 3, 4)) if law.told_reference else ""
+    given = "".join(f", q + {k * n}" for k in (2, 3, 4)) if law.external_reference else ""
     values = {
         "name": name, "upper": name.upper(), "joints": n, "step": repr(step), "reference": given,
         "dq": f"q + {n}" if law.programs.reads_velocity else "NULL",
     }  # fmt: skip
-    sources = {file: made.files[file] for file in (f"{name}.h", f"{name}.c")}
+    sources = {file: generated.files[file] for file in (f"{name}.h", f"{name}.c")}
     _package(
         path,
         name,
         title_of(law.scenario),
         step,
-        law_variables(law, made.parameters),
+        law_variables(law, generated.parameters),
         "fmu_law.c",
         values,
         sources,
     )
 
 
-def loop_fmu(scenario: Scenario, made: WrittenLoop, settings: Sequence[float], path: Path) -> None:
+def loop_fmu(
+    scenario: Scenario, generated: GeneratedLoop, run_settings: Sequence[float], path: Path
+) -> None:
     """Writes a closed loop as an FMU; raises ToolchainError."""
-    name = made.values["name"]
+    name = generated.values["name"]
     values = {
         "name": name,
-        "step": repr(settings[0]),
-        "setting_values": ", ".join(map(repr, settings)),
+        "step": repr(run_settings[0]),
+        "setting_values": ", ".join(map(repr, run_settings)),
     }
-    title = f"the closed loop of {made.values['title']}"
+    title = f"the closed loop of {generated.values['title']}"
     _package(
         path,
         name,
         title,
-        settings[0],
-        loop_variables(scenario, made.parameters),
+        run_settings[0],
+        loop_variables(scenario, generated.parameters),
         "fmu_loop.c",
         values,
-        made.files,
+        generated.files,
     )
 
 
@@ -275,7 +304,9 @@ def _package(
     """The archive: description, sources, and the binary that is built of them here."""
     text = "\n".join(sources[key] for key in sorted(sources))
     token = f"{{{uuid.uuid5(uuid.NAMESPACE_URL, text + repr(values))}}}"
-    sources = sources | {f"{name}_fmi3.c": source_of(name, title, token, variables, block, values)}
+    sources = sources | {
+        f"{name}_fmi3.c": wrapper_source(name, title, token, variables, block, values)
+    }
     system, suffix = fmi_platform()
     with tempfile.TemporaryDirectory() as folder:
         for file, content in sources.items():
@@ -292,4 +323,4 @@ def _package(
             archive.write(Path(folder) / f"{name}{suffix}", f"binaries/{system}/{name}{suffix}")
             for file, content in sources.items():
                 archive.writestr(f"sources/{file}", content)
-            archive.writestr("sources/buildDescription.xml", BUILD.format(name=name))
+            archive.writestr("sources/buildDescription.xml", BUILD_DESCRIPTION.format(name=name))

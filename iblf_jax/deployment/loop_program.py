@@ -1,5 +1,5 @@
-"""A step of a whole closed loop as a scalar program: robot, disturbance, sensor, law, observer,
-actuator, as `simulate` steps them.
+"""A step of the complete closed loop as a scalar program: robot, disturbance, sensor, law, observer
+and actuator, with the steps of `simulate`.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ OUTPUTS = {
     "f": "N m",
     "f_hat": "N m",
 }
-"""What a step tells of its start, one number a joint: name -> unit."""
+"""Outputs of a step, one number for each joint, at its start: name -> unit."""
 OF_SAMPLE = {"f": "disturbance", "f_hat": "disturbance_estimate"}
-"""Outputs that a `Sample` calls otherwise."""
+"""Outputs that have another name in `Sample`."""
 ENDLESS = 2.0**52
-"""Steps of a run that does not end by itself."""
+"""Number of steps of a run without an end."""
 
 
-class Settings(NamedTuple):
-    """What a run is given besides its scenario."""
+class RunSettings(NamedTuple):
+    """The inputs of a run besides its scenario."""
 
     dt: jax.Array
     noise: Any
@@ -44,14 +44,14 @@ class Settings(NamedTuple):
 
 
 class Loop(NamedTuple):
-    """The programs of a closed loop; leaves of the scenario are shared, numbers of `Settings` are a
-    lane's.
+    """The programs of a closed loop; leaves of the scenario are shared, numbers of `RunSettings`
+    are per-run leaves.
     """
 
     start: Program
-    """Its samples are the memory before the first step."""
+    """Its results are the memory before the first step."""
     step: Program
-    """It carries the memory; its samples are OUTPUTS and the status, at the start of the step."""
+    """Its carry is the memory; its results are OUTPUTS and the status at the start of the step."""
     size: int
     """Numbers of the memory."""
 
@@ -64,25 +64,23 @@ def loop_program(scenario: Scenario, method: str) -> Loop:
       method: the integrator.
 
     Raises:
-      UnsupportedError: it does not lower; the message says why.
+      UnsupportedError: the loop cannot be lowered; the message states the reason.
     """
     dtype = scenario.initial.q.dtype
-    settings = Settings(jnp.zeros((), dtype), jnp.zeros((4,), dtype) if has_noise(scenario) else ())
+    run_settings = RunSettings(
+        jnp.zeros((), dtype), jnp.zeros((4,), dtype) if has_noise(scenario) else ()
+    )
     like = (initial_state(scenario), jnp.int32(0))
 
-    def first(scenario, settings, carry, index):
+    def first(scenario, run_settings, carry, index):
         return (), as_floats((initial_state(scenario), jnp.int32(0)), dtype)
 
-    def step(scenario, settings, carry, index):
+    def step(scenario, run_settings, carry, index):
         state, status = of_floats(carry, like)
-        noise = (
-            settings.noise
-            if has_noise(scenario)
-            else ()
-            if scenario.sampling is None
-            else jnp.zeros((4,), dtype)
-        )
-        inputs = Inputs(scenario, (), settings.dt, jnp.asarray(ENDLESS, dtype), noise)
+        noise = run_settings.noise
+        if not has_noise(scenario) and scenario.sampling is not None:
+            noise = jnp.zeros((4,), dtype)
+        inputs = Inputs(scenario, (), run_settings.dt, jnp.asarray(ENDLESS, dtype), noise)
         size = accuracy.watched_indices(state).size
         blank = start(inputs, method, jnp.zeros((size, size), dtype))
         done = advance(
@@ -92,16 +90,16 @@ def loop_program(scenario: Scenario, method: str) -> Loop:
             method,
             StepOptions(scalar=True),
         )
-        told = [getattr(done.sample, OF_SAMPLE.get(name, name)) for name in OUTPUTS]
+        outputs = [getattr(done.sample, OF_SAMPLE.get(name, name)) for name in OUTPUTS]
         return as_floats((done.carry.state, done.carry.status), dtype), (
-            *told,
+            *outputs,
             done.carry.status.astype(dtype),
         )
 
     shapes = as_floats(like, dtype)
-    begin = program_of(first, scenario, settings, ())
+    begin = program_of(first, scenario, run_settings, ())
     return Loop(
         begin,
-        program_of(step, scenario, settings, shapes),
+        program_of(step, scenario, run_settings, shapes),
         sum(x.size for x in jax.tree.leaves(shapes)),
     )

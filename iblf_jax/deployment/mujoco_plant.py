@@ -1,8 +1,9 @@
-"""A robot that MuJoCo moves: with its own model, contacts, stops and integrator.
+"""A robot that MuJoCo simulates, with its own model, contacts, stops and integrator.
 
 The joints of a scenario are found in MuJoCo's model by their names, or by their order where the
-scenario's have none.  What else moves on the same arm, such as the fingers of a gripper, is locked
-as `robots.load` locks it; what stands apart moves freely.
+scenario's have none.  Other
+joints of the same arm, such as the fingers of a gripper, are locked as `robots.load` locks them;
+separate bodies move freely.
 """
 
 from __future__ import annotations
@@ -39,18 +40,18 @@ class MujocoPlant:
         locked: Mapping[str, float],
         integrator: str | None,
     ) -> None:
-        """What `cosimulate` is given.
+        """The arguments of `cosimulate`.
 
         Args:
           plant: path of an MJCF or URDF, a `mujoco.MjSpec` or a `mujoco.MjModel`; the last two stay
             as they are.
-          names: of the joints to drive; none to take the model's in their order.
-          n: how many there are.
+          names: names of the driven joints; empty to use the model's joints in their order.
+          n: number of driven joints.
           locked: joint -> position [rad or m].
           integrator: MuJoCo's; None for the model's own.
 
         Raises:
-          ValueError: joints that are not there, or what MuJoCo does not accept.
+          ValueError: missing joints, or a model that MuJoCo does not accept.
           ImportError: the extra `robots` is not installed.
         """
         self.mujoco = mujoco = mujoco_package()
@@ -70,12 +71,12 @@ class MujocoPlant:
         self.model = model
         self.positions, self.speeds = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
         arm = {int(model.body_rootid[model.jnt_bodyid[j]]) for j in joints}
-        for a in range(model.nu):  # the law takes the place of the model's own drives
+        for a in range(model.nu):  # the law replaces the model's own actuators
             if arm & {int(model.body_rootid[body]) for body in _driven_bodies(mujoco, model, a)}:
                 model.actuator_gear[a] = model.actuator_gainprm[a] = model.actuator_biasprm[a] = 0.0
         if integrator is not None:
             model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
-        # Else it would begin again from its first state where it fails, and no result would say so.
+        # By default MuJoCo resets a diverged simulation to its first state without any report.
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self.data = mujoco.MjData(model)
 
@@ -95,7 +96,7 @@ class MujocoPlant:
         return self.data.qvel[self.speeds]
 
     def place(self, q: np.ndarray, dq: np.ndarray) -> None:
-        """Puts the driven joints there."""
+        """Sets the state of the driven joints."""
         self.data.qpos[self.positions], self.data.qvel[self.speeds] = q, dq
 
     @contextmanager
@@ -108,7 +109,7 @@ class MujocoPlant:
         def control(model: Any, data: Any) -> None:
             if before is not None:
                 before(model, data)
-            if data is self.data:  # the function is one for all models of the process
+            if data is self.data:  # the callback is global: it serves all models of the process
                 data.qfrc_applied[self.speeds] = push(data.time, self.q, self.dq)
 
         mujoco.set_mjcb_control(control)
@@ -118,19 +119,19 @@ class MujocoPlant:
             mujoco.set_mjcb_control(before)
 
     def acceleration(self, t: float) -> np.ndarray:
-        """What MuJoCo accelerates the joints by at time t [s], as they are, (n,)."""
+        """Acceleration of the driven joints at time t [s] in the present state, (n,)."""
         self.data.time = t
         self.mujoco.mj_forward(self.model, self.data)
         return self.data.qacc[self.speeds]
 
     def step(self, t: float, h: float) -> None:
-        """Goes on from time t for h [s]."""
+        """Integrates from time t over h [s]."""
         self.data.time, self.model.opt.timestep = t, h
         self.mujoco.mj_step(self.model, self.data)
 
 
 class Stages:
-    """What has a rate of its own, integrated along with MuJoCo's stages."""
+    """A state besides MuJoCo's, integrated with the stages of MuJoCo's integrator."""
 
     def __init__(
         self,
@@ -142,22 +143,24 @@ class Stages:
         self.begin(0.0)
 
     def begin(self, t: float) -> None:
-        """The next call is the first of a step from time t [s]."""
+        """Begins a step at time t [s]; the next call is its first stage."""
         self.start = t
         self.slopes: list[Any] = []
 
     def __call__(self, t: float, q: np.ndarray, dq: np.ndarray) -> np.ndarray:
-        """The torque at a stage: each begins where the slope of the one before it leads."""
-        torque, slope = self.rate(t, q, dq, self.moved(t - self.start, self.slopes[-1:], (1.0,)))
+        """The torque at a stage; the state there follows from the rate at the previous stage."""
+        torque, slope = self.rate(
+            t, q, dq, self.extrapolated(t - self.start, self.slopes[-1:], (1.0,))
+        )
         self.slopes.append(slope)
         return torque
 
     def finish(self, h: float) -> None:
-        """The step is over, h [s] long."""
+        """Ends a step of length h [s]."""
         weights = (1 / 6, 1 / 3, 1 / 3, 1 / 6) if len(self.slopes) == 4 else (1.0,)
-        self.state = self.moved(h, self.slopes, weights)
+        self.state = self.extrapolated(h, self.slopes, weights)
 
-    def moved(self, h: float, slopes: list, weights: tuple[float, ...]) -> Any:
+    def extrapolated(self, h: float, slopes: list, weights: tuple[float, ...]) -> Any:
         """The state after h [s]."""
         steps = [h * weight for weight in weights[: len(slopes)]]
         return jax.tree.map(
@@ -167,7 +170,7 @@ class Stages:
         )
 
 
-# ------------------------------------------------------------------------------------------------------- the model and its joints
+# ----------------------------------------------------------------- the model and its joints
 
 
 def _driven_bodies(mujoco: Any, model: Any, a: int) -> list[int]:
@@ -190,7 +193,7 @@ def _driven_bodies(mujoco: Any, model: Any, a: int) -> list[int]:
 
 
 def _specification(mujoco: Any, plant: Any) -> Any:
-    """MuJoCo's specification, whole: with what collides."""
+    """MuJoCo's specification of the complete model, with its collision geometry."""
     if isinstance(plant, mujoco.MjSpec):
         return plant.copy()
     if not isinstance(plant, str | os.PathLike):
@@ -208,7 +211,7 @@ def _specification(mujoco: Any, plant: Any) -> Any:
 
 
 def _refused(plant: Any, error: ValueError) -> ValueError:
-    """What MuJoCo does not accept, in its words."""
+    """The error for a model that MuJoCo does not accept, with its message."""
     name, words = (
         plant if isinstance(plant, str | os.PathLike) else "plant",
         " ".join(str(error).split()),
@@ -220,8 +223,8 @@ def _refused(plant: Any, error: ValueError) -> ValueError:
 
 
 def _without_missing_meshes(spec: Any, path: Path) -> None:
-    """Takes the shapes of a URDF whose files are not there out of it: its links have their weights
-    from numbers.
+    """Removes the shapes of a URDF whose mesh files are missing; the masses of its links are given
+    as numbers.
     """
     folder = path.parent
     place = folder / spec.meshdir
@@ -244,12 +247,16 @@ def _without_missing_meshes(spec: Any, path: Path) -> None:
 def _joints(
     tree: Tree, names: tuple[str, ...], n: int, locked: Mapping[str, float]
 ) -> tuple[list[int], dict[int, float]]:
-    """The joints to drive, and where those stay that are locked: the given ones, and what else
-    moves on the same arm.
+    """The driven joints, and the positions of the locked ones: the given ones, and the other joints
+    of the same arm.
     """
     m = tree.model
-    held = {tree.joint(name): locked_position(name, position) for name, position in locked.items()}
-    movable = [j for j in range(m.njnt) if m.jnt_type[j] in (HINGE, SLIDE) and j not in held]
+    locked_positions = {
+        tree.joint(name): locked_position(name, position) for name, position in locked.items()
+    }
+    movable = [
+        j for j in range(m.njnt) if m.jnt_type[j] in (HINGE, SLIDE) and j not in locked_positions
+    ]
     if names:
         for name in names:
             if name not in tree.joint_names:
@@ -258,7 +265,7 @@ def _joints(
                 )
         joints = [tree.joint_names.index(name) for name in names]
         for j in joints:
-            if j in held:
+            if j in locked_positions:
                 raise checks.fail(
                     "locked", tree.joint_names[j], "joints that the scenario does not move"
                 )
@@ -278,19 +285,23 @@ def _joints(
         joints = movable
     arm = {int(m.body_rootid[m.jnt_bodyid[j]]) for j in joints}
     for j in range(m.njnt):
-        if j not in joints and j not in held and int(m.body_rootid[m.jnt_bodyid[j]]) in arm:
+        if (
+            j not in joints
+            and j not in locked_positions
+            and int(m.body_rootid[m.jnt_bodyid[j]]) in arm
+        ):
             if m.jnt_type[j] not in (HINGE, SLIDE):
                 raise checks.fail(
                     f"joint {tree.joint_names[j]!r}",
                     Shown("free or a ball"),
                     "an arm on a base that stands still",
                 )
-            held[j] = float(m.qpos0[m.jnt_qposadr[j]])
-    return joints, held
+            locked_positions[j] = float(m.qpos0[m.jnt_qposadr[j]])
+    return joints, locked_positions
 
 
 def _compiled(spec: Any, plant: Any) -> Any:
-    """The model of a specification; what MuJoCo does not accept is a ValueError in its words."""
+    """The model of a specification; ValueError with MuJoCo's message if it is not accepted."""
     try:
         return spec.compile()
     except ValueError as error:
@@ -300,39 +311,39 @@ def _compiled(spec: Any, plant: Any) -> Any:
 def _locked(
     mujoco: Any, spec: Any, plant: Any, names: tuple[str, ...], n: int, locked: Mapping[str, float]
 ) -> tuple[Any, list[int]]:
-    """The compiled model without the joints that are locked, their bodies where these hold them,
-    and the numbers of the driven ones.
+    """The compiled model without its locked joints, with their bodies at the locked positions, and
+    the indices of the driven joints.
     """
     spec.compiler.fusestatic = False
-    whole = _compiled(spec, plant)
-    joints, held = _joints(Tree(whole, mujoco, "world", {}), names, n, locked)
-    if not held:
-        return whole, joints
-    data = mujoco.MjData(whole)
-    for j, position in held.items():
-        data.qpos[whole.jnt_qposadr[j]] = position
-    mujoco.mj_kinematics(whole, data)
-    gone = _in_the_way(
-        mujoco, spec, held
+    full_model = _compiled(spec, plant)
+    joints, locked_positions = _joints(Tree(full_model, mujoco, "world", {}), names, n, locked)
+    if not locked_positions:
+        return full_model, joints
+    data = mujoco.MjData(full_model)
+    for j, position in locked_positions.items():
+        data.qpos[full_model.jnt_qposadr[j]] = position
+    mujoco.mj_kinematics(full_model, data)
+    removed = _elements_to_remove(
+        mujoco, spec, locked_positions
     )  # before any frame is added, with which the numbers of joints are lost
-    for body in {int(whole.jnt_bodyid[j]) for j in held}:
-        _weld(mujoco, whole, data, spec, body, held)
-    for x in gone:
+    for body in {int(full_model.jnt_bodyid[j]) for j in locked_positions}:
+        _weld(mujoco, full_model, data, spec, body, locked_positions)
+    for x in removed:
         spec.delete(x)
-    left = [j for j in range(whole.njnt) if j not in held]
+    left = [j for j in range(full_model.njnt) if j not in locked_positions]
     return _compiled(spec, plant), [left.index(j) for j in joints]
 
 
-def _in_the_way(mujoco: Any, spec: Any, held: dict[int, float]) -> list[Any]:
-    """The locked joints, and what cannot be without them: tendons over them, what couples, drives
-    or senses these, keyframes.
+def _elements_to_remove(mujoco: Any, spec: Any, locked_positions: dict[int, float]) -> list[Any]:
+    """The locked joints, and the elements that refer to them: tendons, couplings, actuators,
+    sensors and keyframes.
     """
-    gone = [joint for joint in spec.joints if joint.id in held]
+    removed = [joint for joint in spec.joints if joint.id in locked_positions]
     tendons = []
     for tendon in spec.tendons:
         wrapped = [wrap.target for wrap in tendon.path if wrap.type == mujoco.mjtWrap.mjWRAP_JOINT]
-        if any(joint.id in held for joint in wrapped):
-            if not all(joint.id in held for joint in wrapped):
+        if any(joint.id in locked_positions for joint in wrapped):
+            if not all(joint.id in locked_positions for joint in wrapped):
                 got = Shown("a tendon over a joint that is locked and one that moves")
                 raise checks.fail(
                     f"tendon {tendon.name!r}",
@@ -341,7 +352,7 @@ def _in_the_way(mujoco: Any, spec: Any, held: dict[int, float]) -> list[Any]:
                     "Take it out of the model, or lock or drive all of its joints.",
                 )
             tendons.append(tendon)
-    known = {x.name for x in gone} - {""}, {x.name for x in tendons} - {""}
+    known = {x.name for x in removed} - {""}, {x.name for x in tendons} - {""}
     of_joints = {mujoco.mjtEq.mjEQ_JOINT: 0, mujoco.mjtEq.mjEQ_TENDON: 1}
     coupled = [
         x
@@ -356,23 +367,25 @@ def _in_the_way(mujoco: Any, spec: Any, held: dict[int, float]) -> list[Any]:
     driven = [
         x for x in spec.actuators if x.trntype in kinds and x.target in known[kinds[x.trntype]]
     ]
-    return [*coupled, *driven, *spec.sensors, *spec.keys, *tendons, *gone]
+    return [*coupled, *driven, *spec.sensors, *spec.keys, *tendons, *removed]
 
 
-def _weld(mujoco: Any, model: Any, data: Any, spec: Any, body: int, held: dict[int, float]) -> None:
-    """Places a body of the specification in its parent where its locked joints hold it."""
+def _weld(
+    mujoco: Any, model: Any, data: Any, spec: Any, body: int, locked_positions: dict[int, float]
+) -> None:
+    """Fixes a body of the specification in its parent at the positions of its locked joints."""
     start = int(model.body_jntadr[body])
     own = range(start, start + int(model.body_jntnum[body]))
-    if all(held.get(j) == model.qpos0[model.jnt_qposadr[j]] for j in own):
+    if all(locked_positions.get(j) == model.qpos0[model.jnt_qposadr[j]] for j in own):
         return
     element = spec.bodies[body]
-    if not all(j in held for j in own):
+    if not all(j in locked_positions for j in own):
         got, remedy = (
             "a locked joint beside one that moves",
             "Write each into a body of its own, or lock it at its reference.",
         )
         raise checks.fail(
-            f"body {element.name!r}", Shown(got), "joints that are locked alone", remedy
+            f"body {element.name!r}", Shown(got), "bodies whose joints are all locked", remedy
         )
     parent, back, turned = int(model.body_parentid[body]), np.zeros(4), np.zeros(4)
     mujoco.mju_negQuat(back, data.xquat[parent])

@@ -1,4 +1,4 @@
-"""The law as a folder of C99: source, header, self-test, how to build it, and what is inside."""
+"""The law as a folder of C99: source, header, self-test, build files and README."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from iblf_jax.kernels import INPUTS, OPERATIONS, Program, header, plain_function
 from iblf_jax.simulation.scenario import Scenario
 
 SEGMENT = 500
-"""Operations of a function, at most: compilers' time grows with the square of its length, and so
-does its stack without optimisation."""
+"""Largest number of operations of a C function: the compile time grows with the square of its
+length, and so does its stack without optimisation."""
 LONG = 16
 """Cost (`operations.OPERATIONS`) above which an operation is an elementary function."""
 REFERENCE = ("q_d", "dq_d", "ddq_d")
@@ -30,60 +30,61 @@ LOOKUP = """static F f_lookup(const I *table, I size, I i) {
 }
 """
 FRAME = 256
-"""Bytes of a call besides its numbers, at most about."""
+"""Upper estimate of the bytes of a stack frame besides its numbers."""
 ROUNDS_FOR = 10**8
-"""Operations that the self-test times, about."""
+"""Approximate number of operations that the self-test times."""
 
 
-def filled(template: str, values: dict[str, Any]) -> str:
-    """A file of `c/` with its places filled in."""
+C_TYPES = {
+    False: {"type": "double", "integer": "int64_t", "suffix": "name"},
+    True: {"type": "float", "integer": "int32_t", "suffix": "name##f"},
+}
+"""Placeholders that depend on whether the numbers are floats."""
+
+
+def fill_template(template: str, values: dict[str, Any]) -> str:
+    """A file of `c/` with its placeholders filled in."""
     return Template((files("iblf_jax.deployment") / "c" / template).read_text()).substitute(values)
 
 
 def operations_of(program: Program) -> Counter[str]:
-    """How many operations a call makes, by what they cost on a processor without vectors."""
-    counts: Counter[str] = Counter()
-    roots = {"div": "divisions", "sqrt": "square roots", "rsqrt": "square roots"}
-    for node in program.nodes:
-        if node.op not in INPUTS and node.op != "const":
-            cost = OPERATIONS[node.op].cost
-            counts[
-                roots.get(
-                    node.op,
-                    (
-                        "sums, products and choices"
-                        if cost is not None and cost <= LONG
-                        else "elementary functions"
-                    ),
-                )
-            ] += 1
-    return counts
+    """The number of operations of a call, by their cost on a processor without vectors."""
+    counted = (node.op for node in program.nodes if node.op not in INPUTS and node.op != "const")
+    return Counter(_operation_kind(op) for op in counted)
 
 
-def told(counts: Counter[str]) -> str:
-    """Counts in words."""
+def _operation_kind(op: str) -> str:
+    kinds = {"div": "divisions", "sqrt": "square roots", "rsqrt": "square roots"}
+    if op in kinds:
+        return kinds[op]
+    cost = OPERATIONS[op].cost
+    if cost is not None and cost <= LONG:
+        return "sums, products and choices"
+    return "elementary functions"
+
+
+def describe_counts(counts: Counter[str]) -> str:
+    """Counts as text."""
     order = ("sums, products and choices", "divisions", "square roots", "elementary functions")
     return ", ".join(f"{counts[name]} {name}" for name in order if counts[name])
 
 
-def stack_of(text: str, real_bytes: int) -> int:
-    """Bytes that the longest chain of calls of a generated function takes, every number of it in
-    memory.
+def stack_bytes_of(text: str, real_bytes: int) -> int:
+    """Stack of the longest chain of calls of a generated function with all its numbers in memory
+    [bytes].
     """
     bodies = re.split(r"^(?:static|SEPARATE) void ", text, flags=re.MULTILINE)[1:]
     own = [len(re.findall(r"^  [FI] v\d+ =", body, re.MULTILINE)) for body in bodies]
-    rooms = (
-        sum(map(int, re.findall(r"^  F x\[(\d+)\]; I y\[(\d+)\];$", bodies[-1], re.MULTILINE)[0]))
-        if len(bodies) > 1
-        else 0
-    )
-    return real_bytes * (max(own[:-1], default=0) + own[-1] + rooms) + FRAME * (1 + (len(own) > 1))
+    if len(bodies) == 1:
+        return real_bytes * own[0] + FRAME
+    # The last function calls the others and passes them arrays of floats and of integers.
+    arrays = re.findall(r"^  F x\[(\d+)\]; I y\[(\d+)\];$", bodies[-1], re.MULTILINE)[0]
+    passed = sum(int(size) for size in arrays)
+    return real_bytes * (max(own[:-1]) + own[-1] + passed) + 2 * FRAME
 
 
-def words_for(text: str) -> str:
-    """The lines of `c/plain.h` whose words a text uses; what they use themselves are functions of C
-    and `MASK`, which is kept with them.
-    """
+def helper_macros(text: str) -> str:
+    """The macros of `c/plain.h` that a text uses, and `MASK` if one of them uses it."""
     lines = header("plain.h").splitlines()
     used = [
         line
@@ -99,29 +100,29 @@ def words_for(text: str) -> str:
 
 
 CHECKED = 10
-"""The self-test compares the torque of every so-many-th sample."""
+"""The self-test compares the torque of one in so many samples."""
 
 
 class Vectors(NamedTuple):
-    """What the self-test compares with: a run's samples, (K, n) each, and what the law answered."""
+    """Reference data of the self-test: the samples of a run, (K, n) each, and the law's torques."""
 
     first: tuple[np.ndarray, ...]
     """q, q' and the reference at the start."""
     q: np.ndarray
     dq: np.ndarray
     reference: tuple[np.ndarray, ...]
-    """q_d, q_d', q_d"; empty where it is inside."""
+    """q_d, q_d', q_d"; empty if the reference is internal."""
     tau: np.ndarray
-    """Of every CHECKED-th sample."""
+    """Torque of every CHECKED-th sample."""
 
 
 class Law(NamedTuple):
-    """A law to be written."""
+    """A law to be exported."""
 
     scenario: Scenario
     programs: ControlLaw
     name: str
-    told_reference: bool
+    external_reference: bool
     vectors: Vectors
     joints: tuple[str, ...]
     file: str | None
@@ -133,8 +134,8 @@ class Law(NamedTuple):
         return self.programs.sample.dtype == np.float32
 
 
-class Written(NamedTuple):
-    """The files of a law, and what they take."""
+class GeneratedLaw(NamedTuple):
+    """The files of a law, its operations and its memory."""
 
     files: dict[str, str]
     operations: Counter[str]
@@ -144,69 +145,90 @@ class Written(NamedTuple):
     parameters: Parameters
 
 
-def written(law: Law) -> Written:
+def generate(law: Law) -> GeneratedLaw:
     """The files of a law, name -> text."""
-    scenario, programs, name, n = law.scenario, law.programs, law.name, law.scenario.n
-    parameters = Parameters.of(scenario, (programs.start, programs.sample))
-    size, real_bytes = len(programs.memory), 4 if law.is_float else 8
-    lane = [
-        "t[0]",
-        *(
-            f"{x}[{i}]"
-            for x in ("q", "dq", *(REFERENCE if law.told_reference else ()))
-            for i in range(n)
-        ),
-    ]
-    seen = [f"const {name}_parameters *p", "const F *m", "const F *t", "const F *q", "const F *dq"]
-    seen += [f"const F *{x}" for x in REFERENCE] if law.told_reference else []
-    inputs = {
-        "shared": parameters.numbers,
-        "per_run": lane,
-        "carry": [f"m[{k}]" for k in range(size)],
-    }
-    results = len(programs.start.samples), size + len(programs.sample.samples)
-    start = plain_function(
-        programs.start, f"{name}_start", [seen[0], *seen[2:]], inputs, _places(results[0]), SEGMENT
-    )
-    sample = plain_function(
-        programs.sample, f"{name}_sample", seen, inputs, _places(results[1]), SEGMENT
-    )
+    programs, name, n = law.programs, law.name, law.scenario.n
+    parameters = Parameters.of(law.scenario, (programs.start, programs.sample))
+    size = len(programs.memory)
+    real_bytes = np.dtype(programs.sample.dtype).itemsize
+    start, sample = _functions(law, parameters)
     operations = operations_of(programs.sample)
     state_bytes = real_bytes * (max(size, 1) + 3 * n)
     parameter_bytes = real_bytes * max(1, parameters.size)
-    stack_bytes = (
-        max(stack_of(start, real_bytes), stack_of(sample, real_bytes)) + real_bytes * results[1]
-    )
-    keep = "memcpy(s->memory, result, sizeof s->memory);\n{}" if size else ""
+    result_bytes = real_bytes * (size + len(programs.sample.samples))
+    stack_bytes = max(stack_bytes_of(text, real_bytes) for text in (start, sample)) + result_bytes
     values = shared_values(
-        scenario, name, programs.sample.dtype, parameters, law.joints, start, sample
-    ) | {
-        "period": "sampling.period",
-        "operations": told(operations),
-        "memory": (
-            "".join(f"       [{k}] {comment(x)}\n" for k, x in enumerate(programs.memory))
-            or "       nothing\n"
-        ),
-        "memory_size": max(size, 1),
-        "memory_count": size,
-        "flags": len(FLAGS),
-        "keep_start": keep.format("  "),
-        "keep_sample": keep.format("    "),
-        "default_dq": "(void)still;" if programs.reads_velocity else "if (dq == NULL) dq = still;",
-        "dq_argument": "dq" if programs.reads_velocity else "NULL",
-        "dq_note": (
-            ""
-            if programs.reads_velocity
-            else "\n   dq is the velocity that the filter starts with; NULL for 0."
-        ),
-        **_reference_text(law.told_reference, name, n),
+        law.scenario, name, programs.sample.dtype, parameters, law.joints, start, sample
+    )
+    values |= _law_values(law, operations)
+    texts = {
+        f"{name}.h": fill_template("law.h", values),
+        f"{name}.c": fill_template("law.c", values),
     }
-    texts = {f"{name}.h": filled("law.h", values), f"{name}.c": filled("law.c", values)}
-    texts |= _around(law, values, (state_bytes, parameter_bytes, stack_bytes))
-    return Written(texts, operations, state_bytes, parameter_bytes, stack_bytes, parameters)
+    texts |= _supporting_files(law, values, (state_bytes, parameter_bytes, stack_bytes))
+    return GeneratedLaw(texts, operations, state_bytes, parameter_bytes, stack_bytes, parameters)
 
 
-def _places(count: int) -> list[str]:
+def _functions(law: Law, parameters: Parameters) -> tuple[str, str]:
+    """The C functions of the start and of a sample."""
+    programs, name = law.programs, law.name
+    size = len(programs.memory)
+    references = REFERENCE if law.external_reference else ()
+    arrays = ("q", "dq", *references)
+    per_run = ["t[0]", *(f"{x}[{i}]" for x in arrays for i in range(law.scenario.n))]
+    parameter_argument = f"const {name}_parameters *p"
+    arguments = [f"const F *{x}" for x in ("t", *arrays)]
+    inputs = {
+        "shared": parameters.numbers,
+        "per_run": per_run,
+        "carry": [f"m[{k}]" for k in range(size)],
+    }
+    start = plain_function(
+        programs.start,
+        f"{name}_start",
+        [parameter_argument, *arguments],
+        inputs,
+        _result_entries(len(programs.start.samples)),
+        SEGMENT,
+    )
+    sample = plain_function(
+        programs.sample,
+        f"{name}_sample",
+        [parameter_argument, "const F *m", *arguments],
+        inputs,
+        _result_entries(size + len(programs.sample.samples)),
+        SEGMENT,
+    )
+    return start, sample
+
+
+def _law_values(law: Law, operations: Counter[str]) -> dict[str, Any]:
+    """The values for the placeholders of the law's source and header."""
+    memory = law.programs.memory
+    entries = "".join(f"       [{k}] {comment(x)}\n" for k, x in enumerate(memory))
+    values = {
+        "period": "sampling.period",
+        "operations": describe_counts(operations),
+        "memory": entries or "       nothing\n",
+        "memory_size": max(len(memory), 1),
+        "memory_count": len(memory),
+        "flags": len(FLAGS),
+        "keep_start": "",
+        "keep_sample": "",
+        "default_dq": "if (dq == NULL) dq = zero;",
+        "dq_argument": "NULL",
+        "dq_note": "\n   dq is the velocity that the filter starts with; NULL for 0.",
+        **_reference_text(law.external_reference, law.name, law.scenario.n),
+    }
+    if memory:
+        keep = "memcpy(s->memory, result, sizeof s->memory);\n"
+        values |= {"keep_start": keep + "  ", "keep_sample": keep + "    "}
+    if law.programs.reads_velocity:
+        values |= {"default_dq": "(void)zero;", "dq_argument": "dq", "dq_note": ""}
+    return values
+
+
+def _result_entries(count: int) -> list[str]:
     return [f"r[{k}]" for k in range(count)]
 
 
@@ -219,7 +241,7 @@ def shared_values(
     start: str,
     sample: str,
 ) -> dict[str, Any]:
-    """What the templates of laws and loops ask for alike; `start` and `sample` are generated
+    """The values that the templates of laws and of loops share; `start` and `sample` are generated
     functions.
     """
     is_float = dtype == np.float32
@@ -230,27 +252,27 @@ def shared_values(
         "version": __version__,
         "joints": scenario.n,
         "title": title_of(scenario),
-        "type": "float" if is_float else "double",
-        "integer": "int32_t" if is_float else "int64_t",
-        "suffix": "name##f" if is_float else "name",
+        **C_TYPES[is_float],
         "parameters": parameters.declaration(f"{name}_real", joints),
         "defaults": parameters.defaults(is_float),
-        "plain": words_for(start + sample),
-        "lookup": LOOKUP if "f_lookup(" in start + sample else "",
+        "plain": helper_macros(start + sample),
+        "lookup": "",
         "start": start,
         "sample": sample,
     }
-    return values | {"prelude": filled("prelude.c", values)}
+    if "f_lookup(" in start + sample:
+        values["lookup"] = LOOKUP
+    return values | {"prelude": fill_template("prelude.c", values)}
 
 
 def title_of(scenario: Scenario) -> str:
-    """What the law is, in a line."""
+    """A one-line description of the law."""
     parts = [type(x).__name__ for x in (scenario.controller, scenario.observer)]
     return comment(f"The law {parts[0]} with the observer {parts[1]}, for {scenario.n} joints")
 
 
-def _reference_text(told_reference: bool, name: str, n: int) -> dict[str, str]:
-    if not told_reference:
+def _reference_text(external_reference: bool, name: str, n: int) -> dict[str, str]:
+    if not external_reference:
         return dict.fromkeys(
             (
                 "reference_arguments",
@@ -270,64 +292,83 @@ def _reference_text(told_reference: bool, name: str, n: int) -> dict[str, str]:
     }
 
 
-def _around(law: Law, values: dict[str, Any], sizes: tuple[int, int, int]) -> dict[str, str]:
-    """Self-test, how to build it, README."""
-    v, reads, period = law.vectors, law.programs.reads_velocity, float(law.scenario.sampling.period)  # type: ignore[union-attr]
-    of = "".join(f", {x}[k]" for x in REFERENCE) if v.reference else ""
-    told_velocity = "It is told positions and velocities."
-    dtype, where = "float" if law.is_float else "double", "told" if v.reference else "inside"
-    again = (
-        f"python -m iblf_jax export scenario.toml --out . --name {law.name} --dtype {dtype}"
-        f" --reference {where}"
-    )
-    row = f"\n| `scenario.toml` | what it was written from: `{again}` writes it again |"
+def _supporting_files(
+    law: Law, values: dict[str, Any], sizes: tuple[int, int, int]
+) -> dict[str, str]:
+    """Self-test, build files and README."""
+    v, period = law.vectors, float(law.scenario.sampling.period)  # type: ignore[union-attr]
     values |= {
         "samples": len(v.q),
         "duration": f"{len(v.q) * period:g}",
         "rounds": max(1, ROUNDS_FOR // (len(v.q) * law.programs.sample.size)),
-        "tolerance": "1e-4" if law.is_float else "1e-10",
-        "dq_of_k": "dq[k]" if reads else "NULL",
-        "dq_of_0": "dq[0]" if reads else "NULL",
-        "reference_of_k": of,
-        "reference_of_0": of.replace("[k]", "[0]"),
-        "first_reference": "".join(f", first_{x}" for x in REFERENCE) if v.reference else "",
+        "tolerance": "1e-10",
         "state_bytes": sizes[0],
         "parameter_bytes": sizes[1],
         "stack_bytes": sizes[2],
         "period": repr(period),
-        "velocity": (
-            told_velocity
-            if reads
-            else "It is told positions alone; velocities follow by the scenario's filter."
-        ),
-        "inside": _inside(law),
-        "reference": (
-            "The reference is told at every sample."
-            if v.reference
-            else "The reference is inside, a function of t."
-        ),
-        "scenario_row": "" if law.file is None else row,
-        "time_note": (
+        "inside": _contents(law),
+        "scenario_row": "",
+        "time_note": "",
+        **_velocity_values(law.programs.reads_velocity),
+        **_reference_values(bool(v.reference)),
+    }
+    if law.is_float:
+        values["tolerance"] = "1e-4"
+        values["time_note"] = (
             "Time as a float loses a millisecond after four hours: start again before.  "
-            if law.is_float
-            else ""
-        ),
-    }
-    arrays = (
-        {"q": v.q, "torque": v.tau}
-        | ({"dq": v.dq} if reads else {})
-        | dict(zip(REFERENCE, v.reference, strict=bool(v.reference)))
-    )
-    return {
-        "selftest.c": filled("selftest.c", values),
+        )
+    arrays = {"q": v.q, "torque": v.tau}
+    if law.programs.reads_velocity:
+        arrays["dq"] = v.dq
+    arrays |= dict(zip(REFERENCE, v.reference, strict=bool(v.reference)))
+    if law.file is not None:
+        values["scenario_row"] = _scenario_row(law)
+    texts = {
+        "selftest.c": fill_template("selftest.c", values),
         "vectors.h": _vectors(law, arrays),
-        "CMakeLists.txt": filled("CMakeLists.txt", values),
-        "README.md": filled("README.md", values),
-        **({} if law.file is None else {"scenario.toml": law.file}),
+        "CMakeLists.txt": fill_template("CMakeLists.txt", values),
+        "README.md": fill_template("README.md", values),
+    }
+    if law.file is not None:
+        texts["scenario.toml"] = law.file
+    return texts
+
+
+def _velocity_values(reads_velocity: bool) -> dict[str, str]:
+    """The values that depend on whether velocities are inputs."""
+    if reads_velocity:
+        text = "Its inputs are positions and velocities."
+        return {"dq_of_k": "dq[k]", "dq_of_0": "dq[0]", "velocity": text}
+    text = "Its inputs are positions; the scenario's filter computes the velocities."
+    return {"dq_of_k": "NULL", "dq_of_0": "NULL", "velocity": text}
+
+
+def _reference_values(is_external: bool) -> dict[str, str]:
+    """The values that depend on whether the reference is an input."""
+    names = ("reference_of_k", "reference_of_0", "first_reference")
+    if not is_external:
+        text = "The reference is an internal function of t."
+        return {"reference": text, **dict.fromkeys(names, "")}
+    return {
+        "reference": "The reference is an input of every sample.",
+        "reference_of_k": "".join(f", {x}[k]" for x in REFERENCE),
+        "reference_of_0": "".join(f", {x}[0]" for x in REFERENCE),
+        "first_reference": "".join(f", first_{x}" for x in REFERENCE),
     }
 
 
-def _inside(law: Law) -> str:
+def _scenario_row(law: Law) -> str:
+    """The row of the README about the file of the scenario."""
+    dtype = {True: "float", False: "double"}[law.is_float]
+    reference = {True: "told", False: "inside"}[law.external_reference]
+    command = (
+        f"python -m iblf_jax export scenario.toml --out . --name {law.name} --dtype {dtype}"
+        f" --reference {reference}"
+    )
+    return f"\n| `scenario.toml` | the exported scenario: `{command}` repeats the export |"
+
+
+def _contents(law: Law) -> str:
     s = law.scenario
     parts = [
         type(s.controller).__name__,

@@ -13,39 +13,39 @@ from iblf_jax import __version__
 from iblf_jax.deployment.build import build, zig
 from iblf_jax.deployment.c_names import Parameters
 from iblf_jax.deployment.loop_program import OUTPUTS, Loop
-from iblf_jax.deployment.write_c import SEGMENT, filled, shared_values
+from iblf_jax.deployment.write_c import SEGMENT, fill_template, shared_values
 from iblf_jax.kernels import plain_function
 from iblf_jax.simulation.sampling import has_noise
 from iblf_jax.simulation.scenario import Scenario
 
 WASM_FLAGS = ("-target", "wasm32-wasi", "-mexec-model=reactor", "-O2", "-s")
 ROWS = 32_768
-"""Records that a module has room for."""
+"""Records in the buffer of a module."""
 
 
-class WrittenLoop(NamedTuple):
+class GeneratedLoop(NamedTuple):
     """The C of a loop."""
 
     files: dict[str, str]
     parameters: Parameters
     values: dict[str, Any]
-    """What its templates are filled with."""
+    """The values for the placeholders of the templates."""
 
 
 def loop_files(
     scenario: Scenario, loop: Loop, name: str, method: str, joints: tuple[str, ...]
-) -> WrittenLoop:
+) -> GeneratedLoop:
     """Header and source of a closed loop."""
     parameters = Parameters.of(scenario, (loop.start, loop.step))
-    settings = 1 + (4 if has_noise(scenario) else 0)
-    told = len(loop.step.samples)
+    setting_count = 1 + (4 if has_noise(scenario) else 0)
+    output_count = len(loop.step.samples)
     inputs = {
         "shared": parameters.numbers,
-        "per_run": [f"u[{i}]" for i in range(settings)],
+        "per_run": [f"u[{i}]" for i in range(setting_count)],
         "carry": [f"m[{k}]" for k in range(loop.size)],
         "index": ["index"],
     }
-    p, places = f"const {name}_parameters *p", [f"r[{k}]" for k in range(loop.size + told)]
+    p, places = f"const {name}_parameters *p", [f"r[{k}]" for k in range(loop.size + output_count)]
     begin = plain_function(
         loop.start, f"{name}_begin", [p, "const F *u"], inputs, places[: loop.size], SEGMENT
     )
@@ -59,32 +59,35 @@ def loop_files(
     )
     values = shared_values(scenario, name, loop.step.dtype, parameters, joints, begin, step) | {
         "method": method,
-        "settings": settings,
-        "told": told,
+        "settings": setting_count,
+        "told": output_count,
         "memory_size": loop.size,
         "outputs": ", ".join(OUTPUTS),
-        "noise_setting": ", then the four words of the noise's key" if settings > 1 else "",
+        "noise_setting": ", then the four words of the noise's key" if setting_count > 1 else "",
         "rows": ROWS,
         "array": "Float32Array" if loop.step.dtype == np.float32 else "Float64Array",
     }
-    return WrittenLoop(
-        {f"{name}.h": filled("loop.h", values), f"{name}.c": filled("loop.c", values)},
+    return GeneratedLoop(
+        {
+            f"{name}.h": fill_template("loop.h", values),
+            f"{name}.c": fill_template("loop.c", values),
+        },
         parameters,
         values,
     )
 
 
 def _finite(value: np.ndarray) -> Any:
-    """Numbers for JSON; null for what has no limit."""
+    """Numbers for JSON; null where a number is not finite."""
     value = np.asarray(value, object)
     value[~np.isfinite(value.astype(float))] = None
     return value.tolist()
 
 
-def table(written: WrittenLoop, settings: list[float]) -> dict[str, Any]:
-    """What a page must know of a module: its parameters, settings and records."""
+def table(generated: GeneratedLoop, settings: list[float]) -> dict[str, Any]:
+    """The description of a module for a page: its parameters, settings and records."""
     rows, offset = [], 0
-    for field in written.parameters.fields:
+    for field in generated.parameters.fields:
         rows.append(
             {
                 "path": field.path,
@@ -95,20 +98,20 @@ def table(written: WrittenLoop, settings: list[float]) -> dict[str, Any]:
             }
         )
         offset += math.prod(field.shape)
-    values, n = written.values, written.values["joints"]
+    values, n = generated.values, generated.values["joints"]
     columns = [
         {"name": name, "unit": unit, "offset": k * n, "size": n}
         for k, (name, unit) in enumerate(OUTPUTS.items())
     ]
     columns.append({"name": "status", "unit": "1", "offset": len(OUTPUTS) * n, "size": 1})
-    said = {
+    description = {
         "parameters": rows,
         "count": offset,
         "settings": settings,
         "records": columns,
         "record": values["told"],
     }
-    return said | {
+    return description | {
         "bytes": 8 if values["type"] == "double" else 4,
         "joints": n,
         "method": values["method"],
@@ -116,16 +119,16 @@ def table(written: WrittenLoop, settings: list[float]) -> dict[str, Any]:
     }
 
 
-def wasm_files(written: WrittenLoop, folder: Path, settings: list[float]) -> list[str]:
+def wasm_files(generated: GeneratedLoop, folder: Path, settings: list[float]) -> list[str]:
     """Writes a module, its table and its sources into a folder; their names.
 
     Raises:
       ToolchainError: ziglang is not installed, or it failed.
     """
-    name = written.values["name"]
-    texts = written.files | {f"{name}_module.c": filled("wasm.c", written.values)}
-    texts["README.md"] = filled("wasm.md", written.values)
-    texts[f"{name}.json"] = json.dumps(table(written, settings), indent=1, allow_nan=False) + "\n"
+    name = generated.values["name"]
+    texts = generated.files | {f"{name}_module.c": fill_template("wasm.c", generated.values)}
+    texts["README.md"] = fill_template("wasm.md", generated.values)
+    texts[f"{name}.json"] = json.dumps(table(generated, settings), indent=1, allow_nan=False) + "\n"
     command = zig()
     folder.mkdir(parents=True, exist_ok=True)
     for file, text in texts.items():

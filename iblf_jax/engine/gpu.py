@@ -46,7 +46,7 @@ def call(
     name: str,
     program: Program,
     shared: jax.Array,
-    lane: jax.Array,
+    per_run: jax.Array,
     carry: Packed,
     steps: int,
     every: int | None,
@@ -57,7 +57,7 @@ def call(
         name,
         program,
         shared,
-        lane,
+        per_run,
         carry,
         steps,
         every,
@@ -69,17 +69,17 @@ def call(
 def run(
     program: Program,
     shared: jax.Array,
-    lane: jax.Array,
+    per_run: jax.Array,
     carry: Packed,
     steps: int,
     every: int | None,
 ) -> tuple[Packed, list[jax.Array]]:
     """All steps of all runs; arguments and results as `native.run`."""
-    name = cuda.kernel(program, shared.size, lane.shape[0], architecture())
+    name = cuda.kernel(program, shared.size, per_run.shape[0], architecture())
     # The CPU devices of the tests have no attribute core_count.
     processors = getattr(devices.default()[0], "core_count", plan.GPU_PROCESSORS)
     threads = plan.gpu_threads(carry.floats.shape[1], processors)
-    return call(name, program, shared, lane, carry, steps, every, threads)
+    return call(name, program, shared, per_run, carry, steps, every, threads)
 
 
 def build(program: Program, shared: int, per_run: int, runs: int, steps: int) -> None:

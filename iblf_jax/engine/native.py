@@ -35,15 +35,15 @@ def _build(program: Program, runs: int, steps: int, narrow: bool | None = None) 
     return Build(*plan.native_build(program.size, narrow))
 
 
-def ahead(program: Program, shared: int, lane: int, runs: int, steps: int) -> None:
+def ahead(program: Program, shared: int, per_run: int, runs: int, steps: int) -> None:
     """Starts to compile the kernel with which `run` makes so many steps of so many runs."""
-    cpu.start_build(program, shared, lane, _build(program, runs, steps))
+    cpu.start_build(program, shared, per_run, _build(program, runs, steps))
 
 
 def run(
     program: Program,
     shared: jax.Array,
-    lane: jax.Array,
+    per_run: jax.Array,
     carry: Packed,
     steps: int,
     every: int | None,
@@ -53,7 +53,7 @@ def run(
     """All steps of all runs.
 
     Args:
-      program, shared, lane, carry, steps, every, first: as `kernels.cpu.run`.
+      program, shared, per_run, carry, steps, every, first: as `kernels.cpu.run`.
       narrow: as `_build`.
 
     Returns:
@@ -62,7 +62,7 @@ def run(
     """
     build = _build(program, carry.floats.shape[1], steps, narrow)
     return cpu.run(
-        program, shared, lane, carry, steps, every, first=first, build=build, threads=threads()
+        program, shared, per_run, carry, steps, every, first=first, build=build, threads=threads()
     )
 
 

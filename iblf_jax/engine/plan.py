@@ -105,6 +105,11 @@ FORWARD_MOST = 32
 COLUMNS_ORDER, COLUMNS_KEPT = 2, 1 << 27
 """Derivatives that are made column by column, and numbers of such a derivative of one run's records
 that are kept, 1 GiB: others are the scan's, in the mode that the caller takes."""
+COLUMNS_MOST = 96
+"""Numbers by which derivatives of a transformable run are made column by column, at most; by more
+numbers they are the scan's. 64 runs of 500 steps of the paper's loop with N weights take, by
+columns and by the scan in reverse mode: N = 8, 0.06 and 1.6 s; N = 32, 0.36 and 1.2 s; N = 96,
+4.2 and 3.5 s; N = 386, 9.7 and 2.2 s (two cores)."""
 
 # Studies: runs are made in blocks of one compiled shape.
 STUDY_BLOCK, STUDY_BLOCK_ELSEWHERE = {"cpu": 256}, 32_768
@@ -368,6 +373,11 @@ def blocks_in_flight(
 def keeps_columns(order: int, numbers: int) -> bool:
     """Whether a derivative of this order, of so many numbers, is made column by column and kept."""
     return order <= COLUMNS_ORDER and numbers <= COLUMNS_KEPT
+
+
+def differentiates_by_columns(numbers: int) -> bool:
+    """Whether a derivative of a transformable run by so many numbers is made column by column."""
+    return numbers <= COLUMNS_MOST
 
 
 def differentiates_forward(numbers: int) -> bool:

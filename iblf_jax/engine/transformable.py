@@ -170,6 +170,8 @@ def _by_kernel(runs: Runs, places: Places, leaves: tuple) -> Any:
     by_scenario = all(i < number_of_leaves for level in places for i in level)
     if not by_scenario or not plan.keeps_columns(len(places), _size(runs, places, leaves)):
         return None
+    if not all(plan.differentiates_by_columns(_numbers_in(leaves, level)) for level in places):
+        return None
     kernel = jax.custom_jvp(
         lambda *leaves: jax.tree.map(lambda x: x[0], _over_runs(_columns, runs, places)(*leaves))
     )
@@ -220,7 +222,12 @@ def _size(runs: Runs, places: Places, leaves: tuple) -> int:
     if every is not None:
         samples = runs.request.steps // every + 1
         numbers = numbers_of(jax.tree.unflatten(runs.treedef, leaves), recorded) * samples
-    return numbers * math.prod(sum(jnp.size(leaves[i]) for i in level) for level in places)
+    return numbers * math.prod(_numbers_in(leaves, level) for level in places)
+
+
+def _numbers_in(leaves: tuple, level: tuple[int, ...]) -> int:
+    """The number of entries of some leaves."""
+    return sum(jnp.size(leaves[i]) for i in level)
 
 
 def _over_runs(function: Callable, runs: Runs, *static: Any) -> Callable:

@@ -1,3 +1,1 @@
-"""What goes to disk and comes back: scenarios, studies, tunings and robots as TOML, runs as netCDF
-and npz.
-"""
+"""Files: scenarios, studies, tunings, identifications and robots as TOML, runs as netCDF or npz."""

@@ -1,13 +1,11 @@
-"""Components as plain tables (dicts, lists, numbers, strings) and back: what scenario files are
-made of.
+"""Converts components to tables (dicts, lists, numbers, strings) of a scenario file, and back.
 
-Nothing here knows a robot or a law by name.  A component's table has one key a field, and `kind =
-"<name>"` where the field may hold any member of a family; the family is read from the field's
-annotation (`barrier: Barrier`), its members from the family's MEMBERS.  So a new member, or a law
-  that holds another law, needs no change here.
+The conversion is generic.  The table of a component has one key per field, and `kind = "<name>"`
+where the field may hold any member of a family.  The annotation of the field names the family
+(`barrier: Barrier`), and the family's MEMBERS names its members.  A new member, or a law that
+contains another law, therefore needs no change in this module.
 
-Every refusal is a ValueError that names the dotted key, what came, what was expected, and the
-remedy.
+Every error is a ValueError that names the dotted key, what came, what was expected, and the remedy.
 """
 
 from __future__ import annotations
@@ -28,11 +26,12 @@ from iblf_jax.files.values import (
     as_table,
     decode_static,
     did_you_mean,
+    dotted,
+    encode_numbers,
+    encode_static,
     entry_hint,
     known_keys,
     numbers,
-    plain_numbers,
-    plain_static,
     without_none,
 )
 from iblf_jax.world import bounds, disturbances, references, regions, robots
@@ -50,11 +49,11 @@ FAMILIES: dict[Any, tuple[str, dict[str, Any]]] = {
     sensors.Velocity: ("sensors", sensors.VELOCITIES),
     actuators.Actuator: ("actuators", actuators.MEMBERS),
 }
-"""Contract -> the module that holds the family, and the family's members by name."""
+"""Protocol -> the module of the family, and the family's members by name."""
 
 
 def field_hints(cls: Any) -> dict[str, Any]:
-    """Field name -> annotation of a component class; empty where it cannot be resolved."""
+    """Field name -> annotation of a component class; empty if they cannot be resolved."""
     try:
         return typing.get_type_hints(cls)
     except (NameError, TypeError, AttributeError):
@@ -62,8 +61,8 @@ def field_hints(cls: Any) -> dict[str, Any]:
 
 
 def members_of(hint: Any) -> tuple[str, dict[str, Any]]:
-    """The family that an annotation names; for any other annotation all members whose names are
-    unique.
+    """Name and members of the family that an annotation names; for other annotations all members
+    whose names are unique.
     """
     if hint in FAMILIES:
         return FAMILIES[hint]
@@ -74,23 +73,23 @@ def members_of(hint: Any) -> tuple[str, dict[str, Any]]:
     return "any family", {name: found[0] for name, found in seen.items() if len(found) == 1}
 
 
-# ---------------------------------------------------------------------------------------------------------------- to tables
+# --- to tables
 
 
 def encode(part: Any, hint: Any, path: str) -> Any:
-    """What a file holds for one non-static field.
+    """The table, list or number of a file for one non-static field.
 
     Args:
       part: a component, an array, or a tuple of these.
-      hint: annotation of the field that holds it.
+      hint: annotation of the field.
       path: dotted key, for messages.
 
     Raises:
-      ValueError: a class that is in no MEMBERS, or something that a file cannot hold.
+      ValueError: a class that is in no MEMBERS, or an object that a file cannot hold.
     """
     hint, _ = without_none(hint)
     if isinstance(part, jax.Array | np.ndarray | np.generic | float | int):
-        return plain_numbers(part)
+        return encode_numbers(part)
     if isinstance(part, tuple | list):
         return [encode(x, entry_hint(hint, i), f"{path}[{i}]") for i, x in enumerate(part)]
     if not dataclasses.is_dataclass(part) or isinstance(part, type):
@@ -117,35 +116,38 @@ def encode(part: Any, hint: Any, path: str) -> Any:
 
 
 def encode_fields(part: Any, path: str) -> dict[str, Any]:
-    """The table of one component, without its kind."""
-    table, hints = {}, field_hints(type(part))
+    """The table of one component, without its kind; optional fields that are empty are left out."""
+    table: dict[str, Any] = {}
+    hints = field_hints(type(part))
     for field in dataclasses.fields(part):
-        value, name = getattr(part, field.name), f"{path}.{field.name}" if path else field.name
-        if value is None:
-            if field.default is not None:
-                table[field.name] = NONE
-        elif field.metadata.get("static"):
-            table[field.name] = plain_static(value, name)
-        elif isinstance(value, tuple) and not value and field.default == ():
+        value = getattr(part, field.name)
+        key = dotted(path, field.name)
+        if value is field.default is None:
             continue
+        if isinstance(value, tuple) and not value and field.default == ():
+            continue
+        if value is None:
+            table[field.name] = NONE
+        elif field.metadata.get("static"):
+            table[field.name] = encode_static(value, key)
         else:
-            table[field.name] = encode(value, hints.get(field.name, Any), name)
+            table[field.name] = encode(value, hints.get(field.name, Any), key)
     return table
 
 
-# -------------------------------------------------------------------------------------------------------------- from tables
+# --- from tables
 
 
 def decode(value: Any, hint: Any, path: str) -> Any:
-    """The component, array or tuple that `encode` wrote for one non-static field.
+    """The component, array or tuple of one non-static field; the inverse of `encode`.
 
     Args:
-      value: what the file holds.
+      value: the value in the file.
       hint: annotation of the field.
       path: dotted key, for messages.
 
     Raises:
-      ValueError: anything that does not fit; the message names the dotted key.
+      ValueError: a value that does not fit; the message names the dotted key.
     """
     hint, _ = without_none(hint)
     if hint not in FAMILIES and dataclasses.is_dataclass(hint):
@@ -181,13 +183,14 @@ def _decode_member(table: dict[str, Any], hint: Any, path: str) -> Any:
 
 
 def decode_fields(cls: Any, table: Any, path: str) -> Any:
-    """A component of class `cls` from its table, every key checked."""
+    """A component of class `cls` from its table; checks every key."""
     checks.flat_enough(path, as_table(table, path))
     fields = {field.name: field for field in dataclasses.fields(cls) if field.init}
     known_keys(table, path, fields)
-    hints, values = field_hints(cls), {}
+    hints = field_hints(cls)
+    values = {}
     for name, field in fields.items():
-        key = f"{path}.{name}" if path else name
+        key = dotted(path, name)
         if name in table:
             values[name] = _decode_field(table[name], field, hints.get(name, Any), key)
         elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
@@ -208,25 +211,28 @@ def _decode_field(value: Any, field: dataclasses.Field, hint: Any, key: str) -> 
     return numbers(value, key, field.metadata["unit"])
 
 
+SHAPES = {"joint": ", or one per joint", "any": " or a list of numbers", "scalar": ""}
+"""Shape of a leaf -> the words of an error message."""
+
+
 def _expectation(field: dataclasses.Field) -> str:
+    """The value that a missing field should have, in words."""
     if is_leaf_field(field):
-        many = {"joint": ", or one a joint", "any": " or a list of numbers", "scalar": ""}[
-            field.metadata["shape"]
-        ]
-        return f"a number{many} [{field.metadata['unit']}]"
+        return f"a number{SHAPES[field.metadata['shape']]} [{field.metadata['unit']}]"
     return "a value" if field.metadata.get("static") else "a table with a kind"
 
 
 def construct(make: Any, values: dict[str, Any], path: str) -> Any:
-    """`make(**values)`; what it refuses becomes a ValueError that names the key in the file in
-    place of the class.
+    """`make(**values)`; an error becomes a ValueError that names the key in the file instead of the
+    class.
     """
     try:
         return make(**values)
     except Exception as error:
-        own, text = f"{make.__name__}.", str(error)
-        if text.startswith(own):
-            text = (f"{path}." if path else "") + text.removeprefix(own)
+        text = str(error)
+        class_name = f"{make.__name__}."
+        if text.startswith(class_name):
+            text = dotted(path, text.removeprefix(class_name))
         elif path and not text.startswith(path):
             text = f"{path}: {text}"
         raise ValueError(text) from error

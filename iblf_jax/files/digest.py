@@ -1,11 +1,11 @@
-"""Digests of Datasets: netCDF 3 has no checksum, so a file stores one of what its reader must give
-back.
+"""Digests of Datasets.  netCDF 3 has no checksum; a file stores digests of the data that a reader
+must return.
 
     digest(variable) = SHA-256(name, dimensions, shape, kind of number, attributes, data)
 
-The digest is that of the values after decoding, so padding and the layout of a file do not count,
-and whatever would load as other data does.  It is stored per variable, so an error can name the
-variables that are damaged.
+A digest is computed from the decoded values.  It does not depend on padding or the layout of the
+file, and it changes if the file would load as other data.  Each variable has its own digest, so
+that an error can name the damaged variables.
 """
 
 from __future__ import annotations
@@ -22,35 +22,34 @@ if TYPE_CHECKING:
 
 ALGORITHM = "sha256"
 ATTRIBUTES = "attributes"
-"""What the attributes of a Dataset are called among its variables' digests."""
+"""Key of the digest of a Dataset's attributes, besides those of its variables."""
 
 
 def dataset_digests(data: xarray.Dataset) -> dict[str, str]:
     """The digest of each variable, and of the Dataset's attributes and list of coordinates.
 
     Args:
-      data: any Dataset of numbers, truth values and strings.
+      data: a Dataset of numbers, booleans and strings.
 
     Returns:
-      Name -> hexadecimal digest; "attributes" for what belongs to no variable.
+      Name -> hexadecimal digest; "attributes" for the attributes and the list of coordinates.
     """
     found = {}
     for name, variable in data.variables.items():
         found[f"variable {name}"] = _variable_digest(str(name), variable)
-    found[ATTRIBUTES] = _hexadecimal(
-        [_plain(data.attrs), sorted(str(name) for name in data.coords)]
-    )
+    coordinates = sorted(str(name) for name in data.coords)
+    found[ATTRIBUTES] = _hexadecimal([_canonical(data.attrs), coordinates])
     return found
 
 
 def encoded(digests: Mapping[str, Mapping[str, str]]) -> str:
-    """The text that a file stores: the digests of several Datasets by name."""
+    """The text for a file: the digests of several Datasets by name."""
     return json.dumps({"algorithm": ALGORITHM, "digests": digests}, sort_keys=True)
 
 
 def stored_in(attributes: Mapping[str, Any], name: str) -> str | None:
-    """The text with the digests among a file's attributes, even if damage has changed its name;
-    None in older files.
+    """The digests among a file's attributes, even if damage has changed the attribute's name; None
+    in files of older versions.
     """
     if name in attributes:
         return str(attributes[name])
@@ -61,10 +60,10 @@ def stored_in(attributes: Mapping[str, Any], name: str) -> str | None:
 
 
 def differences(stored: str, data: Mapping[str, xarray.Dataset]) -> list[str]:
-    """What does not agree with its digest, in words; empty where everything does.
+    """The parts that differ from their digests, in words.
 
     Args:
-      stored: what `encoded` gave.
+      stored: the text of `encoded`.
       data: the Datasets by name, as they were read.
 
     Raises:
@@ -80,9 +79,10 @@ def differences(stored: str, data: Mapping[str, xarray.Dataset]) -> list[str]:
     found = {name: dataset_digests(one) for name, one in data.items()}
     words = [f"run {name!r}" for name in sorted({*expected} ^ {*found})]
     for name in sorted({*expected} & {*found}):
-        wanted, own = expected[name], found[name]
-        different = [part for part in sorted({*wanted, *own}) if wanted.get(part) != own.get(part)]
-        words += [f"{part} of run {name!r}" for part in different]
+        before, now = expected[name], found[name]
+        for part in sorted({*before, *now}):
+            if before.get(part) != now.get(part):
+                words.append(f"{part} of run {name!r}")
     return words
 
 
@@ -93,7 +93,7 @@ def _variable_digest(name: str, variable: Any) -> str:
         list(map(str, variable.dims)),
         list(values.shape),
         _kind(values),
-        _plain(variable.attrs),
+        _canonical(variable.attrs),
     ]
     return _hexadecimal(head, _bytes(values))
 
@@ -101,23 +101,24 @@ def _variable_digest(name: str, variable: Any) -> str:
 def _kind(values: np.ndarray) -> str:
     """The kind of number, with the precision of floating-point numbers.
 
-    netCDF 3 shortens integers, so their width does not count.
+    netCDF 3 shortens integers, so their width is left out.
     """
-    if values.dtype.kind == "f":
+    kind = values.dtype.kind
+    if kind == "f":
         return f"f{values.dtype.itemsize}"
-    if values.dtype.kind in "iu":
+    if kind in "iu":
         return "i"
-    return "text" if values.dtype.kind in "OUS" else values.dtype.kind
+    if kind in "OUS":
+        return "text"
+    return kind
 
 
 def _bytes(values: np.ndarray) -> bytes:
-    """The data in an order and a width that do not depend on the machine or on the file's
-    format.
-    """
+    """The data in a byte order and width that do not depend on the machine or the file format."""
     if values.dtype.kind in "OUS":
         return json.dumps([_text(x) for x in values.ravel().tolist()]).encode()
     if values.dtype.kind == "f":
-        # Decoding replaces every NaN by this one.
+        # Decoding replaces every NaN by the same one.
         one_nan = np.where(np.isnan(values), values.dtype.type(np.nan), values)
         return one_nan.astype(values.dtype.newbyteorder("<")).tobytes()
     if values.dtype.kind in "iu":
@@ -129,8 +130,10 @@ def _text(value: Any) -> str:
     return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
 
 
-def _plain(attributes: Mapping[Any, Any]) -> list[Any]:
-    """Attributes in an order of their own; netCDF does not tell one number from a list of one."""
+def _canonical(attributes: Mapping[Any, Any]) -> list[Any]:
+    """Attributes in sorted order, with every number as a list, because netCDF stores a number and a
+    list of one number in the same way.
+    """
     found: list[Any] = []
     for name, value in sorted(attributes.items(), key=lambda item: str(item[0])):
         if isinstance(value, str | bytes):

@@ -1,18 +1,17 @@
-"""Identification files: whose parameters, from which log, as typed, validated TOML.
+"""Reads identification files: scenario, log and parameters to identify, as validated TOML.
 
 An identification file is a scenario file (`files.scenario`) with up to three more tables:
 
-    preset = "zhang_yan_2024"                                  # or the scenario written out: where
-    the search starts [identify]                                                 # the arguments of
-    `identify`: held_out, window, torque, delay, loss, ... log = "log.csv"
-      # beside this file; or a list of files
+    preset = "zhang_yan_2024"        # or the complete scenario: the start of the search
+    [identify]                       # arguments of `identify`: held_out, window, torque, delay, ...
+    log = "log.csv"                  # relative to this file; or a list of files
     parameters = ["robot.mass", "disturbance.viscous"]
-    [limits]                                                   # path -> [low, high]
+    [limits]                         # path -> [low, high]
     "robot.mass" = [0.1, 5.0]
-    [priors]                                                   # path -> [mean, standard deviation];
-    of a vector, two lists "robot.mass" = [[2.0, 0.8], 0.1]
+    [priors]                         # path -> [mean, standard deviation]; of a vector, two lists
+    "robot.mass" = [[2.0, 0.8], 0.1]
 
-Everything is checked; each refusal is a ValueError that names the dotted key.
+Every error is a ValueError that names the dotted key.
 """
 
 from __future__ import annotations
@@ -28,14 +27,14 @@ from iblf_jax.identification import Identification, identify
 
 TABLES = ("identify", "limits", "priors")
 ARGUMENTS = ("window", "torque", "delay", "loss", "widths", "iterations")
-"""What [identify] may hold besides `log`, `parameters` and `held_out`."""
+"""Keys of [identify] besides `log`, `parameters` and `held_out`."""
 
 
 def load_identification_file(path: str | os.PathLike) -> dict[str, Any]:
-    """The arguments of `identify` that an identification file describes, the scenario among them.
+    """The arguments of `identify` in an identification file, including the scenario.
 
     Args:
-      path: a file in the format at the head of this module.
+      path: a file in the format that the docstring of this module describes.
 
     Raises:
       ValueError: the file is not TOML or does not describe an identification; the message names
@@ -55,12 +54,9 @@ def load_identification_file(path: str | os.PathLike) -> dict[str, Any]:
             )
         options: dict[str, Any] = {key: table[key] for key in ARGUMENTS if key in table}
         if "held_out" in table:
-            share = isinstance(table["held_out"], int | float)
-            options["held_out"] = (
-                table["held_out"]
-                if share
-                else _logs(table["held_out"], "identify.held_out", folder)
-            )
+            options["held_out"] = table["held_out"]
+            if not isinstance(table["held_out"], int | float):
+                options["held_out"] = _logs(table["held_out"], "identify.held_out", folder)
         for name in ("limits", "priors"):
             given = by_path(as_table(data.get(name, {}), name), name)
             options[name] = {key: _pair(x, f"{name}.{key}") for key, x in given.items()}
@@ -77,15 +73,13 @@ def _pair(value: Any, key: str) -> tuple[Any, ...]:
 
 
 def _logs(given: Any, key: str, folder: Path) -> list[Path]:
-    """The files of one log or of several, beside the file that names them."""
+    """The files of one log or of several, relative to the file that names them."""
     names = given if isinstance(given, list) and given else [given]
-    return [
-        folder
-        / checks.word(
-            key, None if isinstance(name, Words) else name, "the path of a .csv or .nc file"
-        )
-        for name in names
-    ]
+    found = []
+    for name in names:
+        text = None if isinstance(name, Words) else name
+        found.append(folder / checks.word(key, text, "the path of a .csv or .nc file"))
+    return found
 
 
 def identify_file(path: str | os.PathLike, **options: Any) -> Identification:

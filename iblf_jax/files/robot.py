@@ -1,19 +1,19 @@
-"""Scenario files that name a robot's own file.
+"""Reads robots of scenario files that name a robot description file.
 
-    [robot]                         # or [plant], and [model] if the law knows another
-    file = "arm.urdf"               # URDF or MJCF, beside the scenario file if the path is relative
+    [robot]                         # or [plant], and [model] if the law uses another model
+    file = "arm.urdf"               # URDF or MJCF; the path is relative to the scenario file
     base = "base_link"              # optional, as are
     tip = "tool0"
     locked = { gripper_joint = 0.02 }
     gravity = [0.0, 0.0, -9.81]
-    repair = true                   # mend what can be mended, as `iblf_jax.robots.load` says
+    repair = true                   # correct errors of the file; see `iblf_jax.robots.load`
 
-    [reference]                     # and whatever else is to differ from
-    ...                             # `iblf_jax.presets.arm_scenario`: bounds, controller, observer, initial
+    [reference]                     # and other tables that differ from
+    ...                             # `iblf_jax.presets.arm_scenario`: bounds, controller, ...
 
-A law that is written out is kept within the file's largest torques, unless it is `kind =
-"saturated"` itself.  The scenario that is made holds the arm's numbers: saved again, it needs
-neither the file nor the package that reads it.
+A law in the file is limited to the largest torques of the robot, unless it is of `kind =
+"saturated"`.  The scenario contains the numbers of the arm: a saved copy needs neither the robot
+file nor the package that reads it.
 """
 
 from __future__ import annotations
@@ -35,20 +35,20 @@ ROBOTS = ("robot", "plant", "model")
 
 
 def names_a_file(tables: dict[str, Any]) -> bool:
-    """Whether one of the robots is to be read from a file of its own."""
+    """Whether one of the robots is described by a separate file."""
     return any(isinstance(tables.get(name), dict) and "file" in tables[name] for name in ROBOTS)
 
 
 def with_robots_read(tables: dict[str, Any], folder: str | os.PathLike) -> dict[str, Any]:
-    """The tables of a scenario with its robots' files read, and what they leave out filled in.
+    """The tables of a scenario with the numbers of its robots, and defaults for missing tables.
 
     Args:
-      tables: as in the file.
-      folder: of the scenario file; paths of robots' files are relative to it.
+      tables: the tables of the scenario file.
+      folder: folder of the scenario file; paths of robot files are relative to it.
 
     Raises:
-      ValueError: a robot's file that cannot be read, or tables that do not fit; the message names
-        the dotted key.
+      ValueError: a robot file that cannot be read, or tables that do not fit; the message names the
+        dotted key.
     """
     robots = {name: _robot(tables[name], name, folder) for name in ROBOTS if name in tables}
     plant = robots.get("robot", robots.get("plant"))
@@ -57,34 +57,29 @@ def with_robots_read(tables: dict[str, Any], folder: str | os.PathLike) -> dict[
             "plant",
             Words("nothing"),
             "a table [plant] beside [model]",
-            "Or call it [robot], for both.",
+            "Rename [model] to [robot] if it describes both.",
         )
     given = {name: table for name, table in tables.items() if name not in ROBOTS}
     if "reference" not in given:
         raise checks.fail(
-            "reference", Words("nothing"), "a table [reference]", "Say what the arm should do."
+            "reference", Words("nothing"), "a table [reference]", "It has no default."
         )
     parts: dict[str, Any] = {"reference": decode(given["reference"], Reference, "reference")}
     if "disturbance" in given:
         parts["disturbance"] = decode(given["disturbance"], Disturbance, "disturbance")
-    usual = construct(
-        arm_scenario, {"robot": plant, "model": robots.get("model"), **parts}, "robot"
-    )
+    parts |= {"robot": plant, "model": robots.get("model")}
+    default = construct(arm_scenario, parts, "robot")
     if "controller" in given:
         law = within_effort(decode(given["controller"], Controller, "controller"), plant)
         if as_table(given["controller"], "controller").get("kind") != "saturated":
             given["controller"] = encode(law, Controller, "controller")
-    own = {name: encode(robot, Robot, name) for name, robot in robots.items()}
-    filled = {
-        name: table
-        for name, table in encode_fields(usual, "").items()
-        if name not in ("plant", "model")
-    }
-    return {**own, **filled, **given}
+    filled = encode_fields(default, "")
+    del filled["plant"], filled["model"]
+    return {name: encode(robot, Robot, name) for name, robot in robots.items()} | filled | given
 
 
 def _robot(table: Any, name: str, folder: str | os.PathLike) -> Robot:
-    """The robot of one table: from the file that it names, or written out."""
+    """The robot of one table: from the file that it names, or from its numbers."""
     table = as_table(table, name)
     if "file" not in table:
         return decode(table, Robot, name)

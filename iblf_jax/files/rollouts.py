@@ -1,18 +1,18 @@
-"""Runs as labelled data: `xarray.Dataset`s in memory, netCDF or npz on disk.
+"""Converts runs to labelled data: an `xarray.Dataset` in memory, netCDF or npz on disk.
 
-A Dataset has the dimensions `time` and `joint` (and `run`, before them, for a batch), a unit and a
-description on every variable, the metrics beside the trajectories, and in its attributes what is
-needed to do the run again: the scenario as TOML where a file can hold it, its parameters as JSON,
-  the versions.  In a batch, a parameter that differs between runs is a variable named by its path.
+A Dataset has the dimensions `time` and `joint`, preceded by `run` for a batch.  Every variable has
+a unit and a description.  Metrics are variables too.  The attributes contain what is needed to
+repeat the run: the scenario as TOML (if a file can hold it), its parameters as JSON, and the
+versions.  In a batch, a parameter that differs between runs is a variable named by its path.
 
-On disk, several runs by name share one file.  They may differ in length, joints and states, so
-nothing is stacked: every variable and dimension is stored as `<name>.<variable>`, and
-  `load_rollouts` gives one Dataset a name back.  netCDF is version 3, written by SciPy.
+One file holds several named runs, which may differ in length, joints and states.  Every variable
+and dimension is therefore stored as `<name>.<variable>`, and `load_rollouts` returns one Dataset
+per name.  netCDF is version 3, written by SciPy.
 
-netCDF 3 has no checksum, so the file's attribute `digest` holds one of each variable
-(`files.digest`), and `load_rollouts` compares it with what it reads.  The attribute belongs to the
-file: the Datasets that `load_rollouts` returns do not carry it, so it cannot become stale in them.
-NumPy's format has a checksum of its own.
+netCDF 3 has no checksum.  The attribute `digest` of the file holds a digest of each variable
+(`files.digest`), which `load_rollouts` compares with the data that it reads.  The Datasets that it
+returns do not have the attribute, which would become stale in them.  NumPy's format has its own
+checksum.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ import json
 import os
 import re
 from collections.abc import Mapping
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -43,16 +44,16 @@ STATES = {
     "controller_state": "state of the law, in its own unit",
     "observer_state": "state of the observer, in its own unit",
     "actuator_state": "state of the actuator, in its own unit",
-    "measured": "what the sensor told last, positions [rad] and velocities [rad/s]",
+    "measured": "last measurement of the sensor, positions [rad] and velocities [rad/s]",
 }
-"""Recorded state -> description."""
+"""Field of a recorded state -> description."""
 
 ENDINGS = (".nc", ".npz")
 _ATTRIBUTES = "attributes"
 DIGEST = "digest"
-"""The attribute of a netCDF file that holds the digests of what is in it."""
+"""Attribute of a netCDF file that holds the digests of its content."""
 MOST_NAMED = 4
-"""How many damaged variables an error names."""
+"""Largest number of damaged variables that an error names."""
 
 
 def rollout_to_xarray(run: Rollout) -> xarray.Dataset:
@@ -62,12 +63,12 @@ def rollout_to_xarray(run: Rollout) -> xarray.Dataset:
       run: one run, arrays (T, ...), or a batch, (B, T, ...).
 
     Returns:
-      Dimensions time (T), joint (n), region where there are some, and run (B) first for a batch;
-      variables as the Rollout's fields and metrics, each with `units` and `description`.  A metric
-      whose name is taken is called `metric_<name>`.
+      A Dataset with the dimensions time (T), joint (n), region if the scenario has regions, and run
+      (B) first for a batch.  Its variables are the Rollout's fields and metrics, each with `units`
+      and `description`.  A metric with the name of another variable is called `metric_<name>`.
 
     Raises:
-      ValueError: not a Rollout, or one that is being traced.
+      ValueError: not a Rollout, or a traced one.
     """
     import xarray
 
@@ -78,27 +79,18 @@ def rollout_to_xarray(run: Rollout) -> xarray.Dataset:
             "run", run, "a Rollout that holds numbers", "Call this outside of jit, vmap and grad."
         )
     batch = _batch_dims(run)
-    variables = _trajectories(run, batch)
-    variables |= _states(run, batch)
+    variables = _trajectories(run, batch) | _states(run, batch)
     for name, value in run.metrics.items():
         dims = (*batch, *own_dims(name, np.shape(value)[len(batch) :], run.n))
         label = f"metric_{name}" if name in variables else name
-        variables[label] = (
-            dims,
-            np.asarray(value),
-            _attrs(run.metrics.units.get(name, "1"), f"metric {name.replace('_', ' ')}"),
-        )
+        unit = run.metrics.units.get(name, "1")
+        attributes = _attrs(unit, f"metric {name.replace('_', ' ')}")
+        variables[label] = (dims, np.asarray(value), attributes)
     variables |= _verdict(run, batch)
     varying, attributes = _parameters(run, batch)
-    coordinates: dict[str, Any] = {
-        "joint": ("joint", np.arange(run.n, dtype=np.int32), _attrs("1", "joint, from 0"))
-    }
+    coordinates: dict[str, Any] = {"joint": _index("joint", run.n)}
     if len(batch) == 1:
-        coordinates["run"] = (
-            "run",
-            np.arange(len(run), dtype=np.int32),
-            _attrs("1", "run, from 0"),
-        )
+        coordinates["run"] = _index("run", len(run))
     coordinates["time"], more = _time(run, batch)
     return xarray.Dataset(variables | varying | more, coordinates, attributes)
 
@@ -107,12 +99,12 @@ def save_rollouts(runs: Mapping[str, Rollout] | Rollout, path: str | os.PathLike
     """Writes runs to one file.
 
     Args:
-      runs: runs by name (letters, digits, "_", "-" and blanks), or one Rollout, which is then
-        called "run".
-      path: the file; its ending decides, ".nc" for netCDF or ".npz" for NumPy.
+      runs: runs by name (letters, digits, "_", "-" and blanks), or one Rollout, which gets the name
+        "run".
+      path: the file; its ending selects the format, ".nc" for netCDF or ".npz" for NumPy.
 
     Raises:
-      ValueError: another ending, no runs, a bad name, or something that is not a Rollout.
+      ValueError: another ending, no runs, an invalid name, or an object that is not a Rollout.
       OSError: the file cannot be written.
     """
     if isinstance(path, Mapping | Rollout):
@@ -127,16 +119,22 @@ def save_rollouts(runs: Mapping[str, Rollout] | Rollout, path: str | os.PathLike
     if not isinstance(runs, Mapping) or not runs:
         raise checks.fail("runs", runs, "a Rollout, or a dict of at least one Rollout by name")
     for name in runs:
-        if (
-            not isinstance(name, str)
-            or not re.fullmatch(r"[A-Za-z0-9_][\w -]*", name, re.ASCII)
-            or name == _ATTRIBUTES
-        ):
+        if not _is_name(name):
             raise checks.fail(
                 "name of a run", name, 'letters, digits, "_", "-" and blanks', "Choose another key."
             )
     data = {name: rollout_to_xarray(run) for name, run in runs.items()}
-    (_write_netcdf if ending == ".nc" else _write_npz)(path, data)
+    if ending == ".nc":
+        _write_netcdf(path, data)
+    else:
+        _write_npz(path, data)
+
+
+def _is_name(name: Any) -> bool:
+    """Whether a file can store a run under this name."""
+    if not isinstance(name, str) or name == _ATTRIBUTES:
+        return False
+    return re.fullmatch(r"[A-Za-z0-9_][\w -]*", name, re.ASCII) is not None
 
 
 def load_rollouts(path: str | os.PathLike) -> dict[str, xarray.Dataset]:
@@ -146,15 +144,14 @@ def load_rollouts(path: str | os.PathLike) -> dict[str, xarray.Dataset]:
       path: a ".nc" or ".npz" file.
 
     Raises:
-      ValueError: another ending, a file that `save_rollouts` did not write, or one that was damaged
-        or changed since.
+      ValueError: another ending, a file that `save_rollouts` did not write, or a file that was
+        damaged or changed since.
       OSError: the file cannot be read.
     """
     place = checks.file_path("path", path, "a file that ends in .nc or .npz")
     read = _read_netcdf if _ending(place) == ".nc" else _read_npz
-    with open(
-        checks.file_to_read("path", place), "rb"
-    ):  # a locked file is an OSError, whatever the reader would make of it
+    # A file that cannot be opened raises OSError here; the readers would raise other errors.
+    with open(checks.file_to_read("path", place), "rb"):
         pass
     try:
         return read(place)
@@ -167,39 +164,44 @@ def load_rollouts(path: str | os.PathLike) -> dict[str, xarray.Dataset]:
 
 
 class DamagedFileError(ValueError):
-    """The content of a file is not what its digest was made of."""
+    """The content of a file differs from its digest."""
 
 
-# ------------------------------------------------------------------------------------------------------------ the Dataset
+# --- the Dataset
 
 
 def _attrs(units: str, description: str) -> dict[str, str]:
     return {"units": units, "description": description}
 
 
+def _index(name: str, size: int) -> tuple[str, np.ndarray, dict[str, str]]:
+    """The coordinate of a dimension that is numbered from 0."""
+    return name, np.arange(size, dtype=np.int32), _attrs("1", f"{name}, from 0")
+
+
 def _batch_dims(run: Rollout) -> tuple[str, ...]:
     depth = np.ndim(run.status)
-    return ("run",) if depth == 1 else tuple(f"run_{i}" for i in range(depth))
+    if depth == 1:
+        return ("run",)
+    return tuple(f"run_{i}" for i in range(depth))
 
 
 def _trajectories(run: Rollout, batch: tuple[str, ...]) -> dict[str, Any]:
     variables = {}
     for name, signal in SIGNALS.items():
-        if name == "t":
+        value = getattr(run, name)
+        if name == "t" or isinstance(value, tuple):  # The scenario has no such signal.
             continue
-        if isinstance(getattr(run, name), tuple):
-            continue  # this scenario has no such signal
-        value = np.asarray(getattr(run, name))
         dims = (*batch, "time", *own_dims(name, value.shape[len(batch) + 1 :], run.n))
-        variables[name] = (dims, value, _attrs(signal.unit, signal.meaning))
+        variables[name] = (dims, np.asarray(value), _attrs(signal.unit, signal.meaning))
     return variables
 
 
 def _states(run: Rollout, batch: tuple[str, ...]) -> dict[str, Any]:
     variables = {}
-    for whole, description in STATES.items():
-        for keys, value in jax.tree_util.tree_leaves_with_path(getattr(run, whole)):
-            name = re.sub(r"\W+", "_", whole + jax.tree_util.keystr(keys)).strip("_")
+    for state, description in STATES.items():
+        for keys, value in jax.tree_util.tree_leaves_with_path(getattr(run, state)):
+            name = re.sub(r"\W+", "_", state + jax.tree_util.keystr(keys)).strip("_")
             dims = (*batch, "time", *own_dims(name, np.shape(value)[len(batch) + 1 :], run.n))
             variables[name] = (dims, np.asarray(value), _attrs("1", description))
     return variables
@@ -211,60 +213,47 @@ def _verdict(run: Rollout, batch: tuple[str, ...]) -> dict[str, Any]:
     attributes: dict[str, Any] = _attrs("1", "bit flags; 0 is ok")
     attributes["flag_masks"] = np.array([int(f) for f in flags], np.int32)
     attributes["flag_meanings"] = " ".join(f.name.lower() for f in flags if f.name)
-    words = {value: describe(value) for value in np.unique(status).tolist()}
+    described = {value: describe(value) for value in np.unique(status).tolist()}
+    words = np.vectorize(described.get, otypes=[str])(status)
+    fastest = _attrs("1/s", "largest measured mode of the closed loop")
     return {
         "status": (batch, status.astype(np.int32), attributes),
-        "status_words": (
-            batch,
-            np.vectorize(words.get, otypes=[str])(status),
-            _attrs("1", "status in words"),
-        ),
-        "fastest_mode": (
-            batch,
-            np.asarray(run.fastest_mode),
-            _attrs("1/s", "largest measured mode of the closed loop"),
-        ),
+        "status_words": (batch, words, _attrs("1", "status in words")),
+        "fastest_mode": (batch, np.asarray(run.fastest_mode), fastest),
         "dt": (batch, np.asarray(run.dt), _attrs("s", "time step")),
     }
 
 
 def _time(run: Rollout, batch: tuple[str, ...]) -> tuple[Any, dict[str, Any]]:
-    """The time coordinate; if the runs of a batch differ in it, sample numbers, and a variable `t`
-    (run, time).
+    """The time coordinate; if the times differ between the runs of a batch, sample numbers and a
+    variable `t` (run, time).
     """
     t = np.asarray(run.t)
     first = t.reshape(-1, t.shape[-1])[0]
     if np.all(t == first):
         return ("time", first, _attrs("s", "time")), {}
-    numbers = np.arange(t.shape[-1], dtype=np.int32)
-    return ("time", numbers, _attrs("1", "sample, from 0; the time is t")), {
-        "t": ((*batch, "time"), t, _attrs("s", "time"))
-    }
+    samples = np.arange(t.shape[-1], dtype=np.int32)
+    coordinate = ("time", samples, _attrs("1", "sample, from 0; the time is t"))
+    return coordinate, {"t": ((*batch, "time"), t, _attrs("s", "time"))}
 
 
 def _parameters(run: Rollout, batch: tuple[str, ...]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Variables for what differs between the runs of a batch; attributes for the rest."""
-    import iblf_jax
-
-    fixed, varying = {}, {}
-    batched = np.ndim(run.scenario.initial.q) > 1
+    """Variables for the parameters that differ between the runs of a batch, and attributes."""
+    fixed: dict[str, Any] = {}
+    varying: dict[str, Any] = {}
+    is_batched = np.ndim(run.scenario.initial.q) > 1
     for p in parameters(run.scenario, named=False):
         value = np.asarray(p.value)
-        if batched:
-            one = value[(0,) * len(batch)]
-            if not np.all(value == one):
-                varying[p.path] = (
-                    (*batch, *own_dims(p.path, one.shape, run.n)),
-                    value,
-                    _attrs(p.unit or "1", f"parameter {p.path}"),
-                )
-                continue
-            value = one
-        fixed[p.path] = value.tolist()
+        first = value[(0,) * len(batch)] if is_batched else value
+        if np.all(value == first):
+            fixed[p.path] = first.tolist()
+        else:
+            dims = (*batch, *own_dims(p.path, first.shape, run.n))
+            varying[p.path] = (dims, value, _attrs(p.unit or "1", f"parameter {p.path}"))
     attributes = {
         "parameters": json.dumps(fixed),
         "method": run.method,
-        "iblf_jax_version": iblf_jax.__version__,
+        "iblf_jax_version": version("iblf_jax"),
         "jax_version": jax.__version__,
     }
     if not batch:
@@ -276,7 +265,7 @@ def _parameters(run: Rollout, batch: tuple[str, ...]) -> tuple[dict[str, Any], d
     return varying, attributes
 
 
-# ------------------------------------------------------------------------------------------------------------------ files
+# --- files
 
 
 def _ending(path: Path) -> str:
@@ -295,10 +284,8 @@ def _write_netcdf(path: str | os.PathLike, data: dict[str, xarray.Dataset]) -> N
     renamed = []
     for name, one in data.items():
         attributes |= {f"{name}.{key}": value for key, value in one.attrs.items()}
-        labels = {*one.variables, *one.dims}
-        renamed.append(
-            one.drop_attrs(deep=False).rename({label: f"{name}.{label}" for label in labels})
-        )
+        labels = {label: f"{name}.{label}" for label in (*one.variables, *one.dims)}
+        renamed.append(one.drop_attrs(deep=False).rename(labels))
     merged = xarray.merge(renamed).assign_attrs(attributes)
     merged.to_netcdf(path, engine="scipy")
 
@@ -309,16 +296,15 @@ def _read_netcdf(path: str | os.PathLike) -> dict[str, xarray.Dataset]:
     merged = xarray.load_dataset(path, engine="scipy")
     found = {}
     for name in json.loads(merged.attrs["names"]):
-        start = f"{name}."
-        mine = merged[[v for v in merged.variables if str(v).startswith(start)]]
-        labels = {x for x in (*mine.variables, *mine.dims) if str(x).startswith(start)}
-        mine = mine.rename({x: str(x).removeprefix(start) for x in labels})
-        mine.attrs = {
-            key.removeprefix(start): value
+        prefix = f"{name}."
+        one = merged[[label for label in merged.variables if str(label).startswith(prefix)]]
+        labels = {label: str(label).removeprefix(prefix) for label in (*one.variables, *one.dims)}
+        attributes = {
+            key.removeprefix(prefix): value
             for key, value in merged.attrs.items()
-            if key.startswith(start)
+            if key.startswith(prefix)
         }
-        found[name] = mine
+        found[name] = one.rename(labels).drop_attrs(deep=False).assign_attrs(attributes)
     _verify(path, merged.attrs, found)
     return found
 
@@ -328,7 +314,7 @@ def _verify(
     attributes: Mapping[str, Any],
     found: Mapping[str, xarray.Dataset],
 ) -> None:
-    """Raises DamagedFileError where Datasets are not those of the file's digest.
+    """Raises DamagedFileError for Datasets that differ from the digest of the file.
 
     Files of older versions have no digest and are accepted.
     """
@@ -359,25 +345,16 @@ def _write_npz(path: str | os.PathLike, data: dict[str, xarray.Dataset]) -> None
     arrays: dict[str, np.ndarray] = {}
     described: dict[str, Any] = {}
     for name, one in data.items():
-        arrays |= {
-            f"{name}.{label}": np.asarray(variable.values)
-            for label, variable in one.variables.items()
-        }
         variables = {}
         for label, variable in one.variables.items():
-            variables[str(label)] = [
-                list(variable.dims),
-                {key: np.asarray(x).tolist() for key, x in variable.attrs.items()},
-            ]
-        described[name] = {
-            "variables": variables,
-            "coords": [str(c) for c in one.coords],
-            "attrs": dict(one.attrs),
-        }
+            arrays[f"{name}.{label}"] = np.asarray(variable.values)
+            attributes = {key: np.asarray(x).tolist() for key, x in variable.attrs.items()}
+            variables[str(label)] = [list(variable.dims), attributes]
+        coordinates = [str(label) for label in one.coords]
+        described[name] = {"variables": variables, "coords": coordinates, "attrs": dict(one.attrs)}
+    arrays[_ATTRIBUTES] = np.array(json.dumps(described))
     with open(path, "wb") as file:
-        np.savez_compressed(
-            file, allow_pickle=False, **{_ATTRIBUTES: np.array(json.dumps(described))}, **arrays
-        )
+        np.savez_compressed(file, allow_pickle=False, **arrays)
 
 
 def _read_npz(path: str | os.PathLike) -> dict[str, xarray.Dataset]:

@@ -1,29 +1,28 @@
-"""Scenario files: a scenario as typed, validated TOML, and back with the same structure and
-bit-identical numbers.
+"""Reads and writes scenario files: validated TOML that gives a scenario back with the same
+structure and bit-identical numbers.
 
-Written out in full, a file has one table a component, and `kind` names the member of the family:
+A complete file has one table per component, and `kind` names the member of the family:
 
-    [robot]                         # plant and model alike; or [plant] and, if they differ, [model]
+    [robot]                         # plant and model; or [plant] and [model] if they differ
     kind = "two_link"
     mass = [2.0, 0.85]
     ...
     [reference]  [bounds.lower]  [bounds.upper]  [disturbance]  [controller]  [controller.barrier]
     [observer]  [initial]
 
-or its robot is read from a URDF or MJCF, `robot.file = "arm.urdf"` (see `files.robot`), or it
-starts from a preset and changes some of it:
+The robot may be read from a URDF or MJCF, `robot.file = "arm.urdf"` (see `files.robot`).  A file
+may also start from a preset and change some of its parameters:
 
     preset = "zhang_yan_2024"
-    [arguments]                     # what the preset takes
+    [arguments]                     # arguments of the preset
     law = "log"
-    [parameters]                    # path -> value, in full files too
+    [parameters]                    # path -> value; complete files may have this table too
     "controller.K2" = 30.0
 
-`[run]` (duration, dt, method, record_every) is optional and says how to run it.  A scalar stands
-for one number a joint.  `dtype` is there only if the scenario's precision differs from JAX's at the
-time.  Everything is checked: an unknown table, key or kind, a wrong type or shape, a missing key
-  each is a ValueError that names the file, the dotted key, what came, what was expected and the
-  remedy.
+The optional table `[run]` (duration, dt, method, record_every) describes a simulation.  A scalar
+stands for one number per joint.  `dtype` is present only if the precision of the scenario differs
+from JAX's default.  An unknown table, key or kind, a wrong type or shape, and a missing key raise a
+ValueError that names the file, the dotted key, what came, what was expected and the remedy.
 """
 
 from __future__ import annotations
@@ -49,6 +48,7 @@ from iblf_jax.files.values import (
     as_table,
     decode_static,
     did_you_mean,
+    dotted,
     known_keys,
     numbers,
     toml_tables,
@@ -64,25 +64,25 @@ DTYPES = ("float64", "float32", "float16", "bfloat16")
 
 
 class ScenarioFile(NamedTuple):
-    """What a scenario file holds."""
+    """The content of a scenario file."""
 
     scenario: Scenario
     run: dict[str, Any]
-    """What its [run] table says: any of duration [s], dt [s], method, record_every."""
+    """The table [run]: any of duration [s], dt [s], method, record_every."""
 
 
 def save_scenario(
     scenario: Scenario, path: str | os.PathLike, *, run: Mapping[str, Any] | None = None
 ) -> None:
-    """Writes a scenario to a TOML file that `load_scenario` gives back equal.
+    """Writes a scenario to a TOML file from which `load_scenario` returns an equal scenario.
 
     Args:
       scenario: one scenario (not a batch).
       path: the file; its folder must exist.
-      run: what to write into [run]: duration [s], dt [s], method, record_every.
+      run: content of the table [run]: duration [s], dt [s], method, record_every.
 
     Raises:
-      ValueError: the scenario holds a class that is in no MEMBERS, a NaN, or a batch.
+      ValueError: the scenario contains a class that is in no MEMBERS, or NaN, or is a batch.
       OSError: the file cannot be written.
     """
     checks.file_to_write("path", path).write_text(
@@ -94,7 +94,7 @@ def load_scenario(path: str | os.PathLike) -> Scenario:
     """The scenario that a TOML file describes.
 
     Args:
-      path: a file in the format at the head of this module.
+      path: a file in the format that the docstring of this module describes.
 
     Raises:
       ValueError: the file is not TOML or does not describe a scenario; the message names file, key
@@ -111,8 +111,11 @@ def load_scenario_file(path: str | os.PathLike) -> ScenarioFile:
 
 
 def read_toml(path: str | os.PathLike) -> dict[str, Any]:
-    """The tables of a TOML file, unchecked; ValueError if it is not TOML, OSError if it cannot be
-    read.
+    """The tables of a TOML file, not validated.
+
+    Raises:
+      ValueError: the file is not TOML.
+      OSError: the file cannot be read.
     """
     content = checks.file_to_read("path", path, "a TOML file").read_bytes()
     try:
@@ -123,19 +126,18 @@ def read_toml(path: str | os.PathLike) -> dict[str, Any]:
         ) from error
 
 
-# ---------------------------------------------------------------------------------------------------------------- to tables
+# --- to tables
 
 
 def scenario_to_dict(scenario: Scenario) -> dict[str, Any]:
-    """The tables of a scenario file, as plain dicts, lists, numbers and strings.
+    """The tables of a scenario file, as dicts, lists, numbers and strings.
 
     Args:
       scenario: one scenario (not a batch).
 
     Returns:
-      What `from_dict` turns back into an equal scenario: same structure, bit-identical leaves.
-        (Leaves of several precisions
-      become the default one's, as in a run.)
+      Tables from which `from_dict` makes an equal scenario: same structure, bit-identical leaves.
+      (Leaves of several precisions get the default precision, as in a run.)
 
     Raises:
       ValueError: as `save_scenario`.
@@ -153,13 +155,10 @@ def scenario_to_dict(scenario: Scenario) -> dict[str, Any]:
     dtype = dtypes.pop() if len(dtypes) == 1 else jnp.result_type(float)
     scenario = astype(scenario, dtype)
     tables = encode_fields(scenario, "")
-    plant, model = tables.pop("plant"), tables.pop("model")
-    robots = (
-        {"robot": plant}
-        if _equal(scenario.plant, scenario.model)
-        else {"plant": plant, "model": model}
-    )
-    tables = {**robots, **tables}
+    robots = {name: tables.pop(name) for name in ("plant", "model")}
+    if _equal(scenario.plant, scenario.model):
+        robots = {"robot": robots["plant"]}
+    tables = robots | tables
     if dtype != jnp.result_type(float):
         tables = {"dtype": str(dtype), **tables}
     _check_round_trip(scenario, tables)
@@ -167,11 +166,9 @@ def scenario_to_dict(scenario: Scenario) -> dict[str, Any]:
 
 
 def _check_round_trip(scenario: Scenario, tables: dict[str, Any]) -> None:
-    """Raises ValueError if the tables do not give the scenario back."""
-    expected, remedy = (
-        "one scenario that its tables give back",
-        "Save the runs of a batch one by one.",
-    )
+    """Raises ValueError if the tables do not give an equal scenario."""
+    expected = "one scenario that its tables reproduce"
+    remedy = "Save the runs of a batch one by one."
     try:
         same = _equal(from_dict(tables).scenario, scenario)
     except ValueError as error:
@@ -179,7 +176,8 @@ def _check_round_trip(scenario: Scenario, tables: dict[str, Any]) -> None:
             "scenario", Words(f"leaves that a scenario cannot have ({error})"), expected, remedy
         ) from error
     if not same:
-        raise checks.fail("scenario", Words("leaves that change on the way"), expected, remedy)
+        came = Words("leaves that a file does not reproduce")
+        raise checks.fail("scenario", came, expected, remedy)
 
 
 def scenario_to_toml(scenario: Scenario, *, run: Mapping[str, Any] | None = None) -> str:
@@ -190,52 +188,70 @@ def scenario_to_toml(scenario: Scenario, *, run: Mapping[str, Any] | None = None
     if run is not None:
         tables["run"] = _run_table(dict(checks.mapping("run", run, '{"duration": 20.0}')))
     text = tomli_w.dumps(tables)
-    # tomli_w writes one number a line; a row a line reads better.  A line break inside a string is
-    # escaped, so this is safe.
+    # tomli_w writes one number per line; this joins the numbers of a row.  Line breaks inside
+    # strings are escaped, so the pattern matches no string.
     text = re.sub(
         r"\[\n(?:\s*[-+.\w]+,\n)+\s*\]",
-        lambda m: "[" + ", ".join(re.findall(r"[-+.\w]+", m[0])) + "]",
+        lambda row: "[" + ", ".join(re.findall(r"[-+.\w]+", row[0])) + "]",
         text,
     )
-    return _with_units(
-        text,
-        {p.path: p.unit for p in parameters(scenario, named=False)}
-        | {"run.duration": "s", "run.dt": "s"},
-    )
+    units = {p.path: p.unit for p in parameters(scenario, named=False)}
+    return _with_units(text, units | {"run.duration": "s", "run.dt": "s"})
 
 
 def _with_units(text: str, units: Mapping[str, str]) -> str:
-    """The text with the unit of each number behind it, as a comment."""
-    lines, prefix, counts = [], "", dict[str, int]()
-    for line in text.removesuffix("\n").split(
-        "\n"
-    ):  # and at no other character that is a line break to Unicode
+    """The text with the unit of each number as a comment behind it."""
+    lines = []
+    prefix = ""
+    counts: dict[str, int] = {}
+    # str.splitlines would also split at other Unicode line breaks.
+    for line in text.removesuffix("\n").split("\n"):
         if header := re.fullmatch(r"(\[\[?)([\w.]+)\]\]?", line):
-            prefix, names = "", header[2].split(".")
-            for depth, name in enumerate(names):
-                prefix = f"{prefix}.{name}" if depth else "plant" if name == "robot" else name
-                if header[1] == "[[" and depth == len(names) - 1:
-                    counts[prefix] = counts.get(prefix, -1) + 1
-                prefix += f"[{counts[prefix]}]" if prefix in counts else ""
+            prefix = _path_of_table(header[2].split("."), counts, is_entry=header[1] == "[[")
         key = re.match(r"(\w+) = [-+\d\[]", line)
-        unit = units.get(f"{prefix}.{key[1]}") if key else None
-        lines.append(f"{line}  # {unit}" if unit and not line.endswith("[") else line)
+        if key and not line.endswith("["):
+            unit = units.get(f"{prefix}.{key[1]}")
+            if unit:
+                line = f"{line}  # {unit}"
+        lines.append(line)
     return "\n".join(lines) + "\n"
 
 
+def _path_of_table(names: list[str], counts: dict[str, int], *, is_entry: bool) -> str:
+    """The path of a table in the scenario.
+
+    Args:
+      names: the parts of the table's header.
+      counts: path of a list of tables -> index of its last entry so far; updated.
+      is_entry: whether the header begins an entry of a list, [[...]].
+    """
+    if names[0] == "robot":
+        names = ["plant", *names[1:]]
+    path = ""
+    for depth, name in enumerate(names, 1):
+        path = dotted(path, name)
+        if is_entry and depth == len(names):
+            counts[path] = counts.get(path, -1) + 1
+        if path in counts:
+            path += f"[{counts[path]}]"
+    return path
+
+
 def _equal(a: Any, b: Any) -> bool:
-    """Same structure, shapes, precisions and bits."""
+    """Whether two pytrees have the same structure, shapes, precisions and bits."""
     leaves_a, structure_a = jax.tree.flatten(a)
     leaves_b, structure_b = jax.tree.flatten(b)
     if structure_a != structure_b:  # type: ignore[operator]
         return False
-    pairs = [(np.asarray(x), np.asarray(y)) for x, y in zip(leaves_a, leaves_b, strict=True)]
-    return all(
-        x.shape == y.shape and x.dtype == y.dtype and x.tobytes() == y.tobytes() for x, y in pairs
-    )
+    return all(map(_same_bits, leaves_a, leaves_b))
 
 
-# -------------------------------------------------------------------------------------------------------------- from tables
+def _same_bits(x: Any, y: Any) -> bool:
+    x, y = np.asarray(x), np.asarray(y)
+    return x.shape == y.shape and x.dtype == y.dtype and x.tobytes() == y.tobytes()
+
+
+# --- from tables
 
 
 def from_dict(
@@ -248,13 +264,13 @@ def from_dict(
     """Scenario and [run] table from the tables of a file.
 
     Args:
-      data: tables as read from TOML.
+      data: the tables of the TOML file.
       source: name of the file, for messages.
-      other_tables: names of further tables that the caller reads himself (a sweep's, say).
-      folder: of the file, which the paths of robots' files are relative to.
+      other_tables: names of further tables that the caller reads (those of a sweep, for example).
+      folder: folder of the file, to which the paths of robot files are relative.
 
     Raises:
-      ValueError: anything that does not fit; the message names source, dotted key and remedy.
+      ValueError: tables that do not fit; the message names source, dotted key and remedy.
     """
     try:
         data = {
@@ -281,8 +297,8 @@ def _from_components(data: dict[str, Any], folder: str | os.PathLike) -> Scenari
         if "robot" in tables and other in tables:
             raise checks.fail(
                 other,
-                Words("this table beside [robot]"),
-                "[robot] alone, or [plant] and [model]",
+                Words("this table besides [robot]"),
+                "only [robot], or [plant] and [model]",
                 f"Rename [robot] to [{_OTHER[other]}].",
             )
     if names_a_file(tables):
@@ -317,8 +333,8 @@ def _from_preset(data: dict[str, Any]) -> Scenario:
             )
             raise checks.fail(
                 name,
-                Words("this table beside preset"),
-                "a preset, or a scenario written out",
+                Words("this table besides preset"),
+                "a preset, or a complete scenario",
                 remedy,
             )
     known_keys(data, "", ("preset", "arguments", "parameters", "run", "dtype"))
@@ -326,14 +342,14 @@ def _from_preset(data: dict[str, Any]) -> Scenario:
 
 
 def preset_scenario(name: Any, arguments: dict[str, Any]) -> Scenario:
-    """The scenario of a preset, its name and its arguments checked.
+    """The scenario of a preset; validates the preset's name and arguments.
 
     Args:
       name: a key of `presets.PRESETS`.
-      arguments: the preset's own, by name.
+      arguments: arguments of the preset, by name.
 
     Raises:
-      ValueError: an unknown preset or argument, or a value that the preset refuses.
+      ValueError: an unknown preset or argument, or an invalid value of an argument.
     """
     as_table(arguments, "arguments")
     if not isinstance(name, str) or name not in PRESETS:
@@ -360,12 +376,11 @@ def by_path(table: dict[str, Any], name: str, prefix: str = "") -> dict[str, Any
     """
     found: dict[str, Any] = {}
     for key, value in table.items():
-        path = f"{prefix}.{key}" if prefix else key
-        found |= (
-            by_path(value, name, path)
-            if isinstance(value, dict)
-            else {path: numbers(value, f"{name}.{path}")}
-        )
+        path = dotted(prefix, key)
+        if isinstance(value, dict):
+            found |= by_path(value, name, path)
+        else:
+            found[path] = numbers(value, f"{name}.{path}")
     return found
 
 
@@ -383,15 +398,14 @@ def _dtype(name: Any) -> Any:
 
 
 def _run_table(table: Any) -> dict[str, Any]:
-    """The [run] table, checked."""
+    """The validated table [run]."""
     known_keys(as_table(table, "run"), "run", RUN)
-    values = {
-        key: value.item() if isinstance(value, np.generic) else value
-        for key, value in table.items()
-    }
-    for key, unit in (("duration", "s"), ("dt", "s")):
+    values = {}
+    for key, value in table.items():
+        values[key] = value.item() if isinstance(value, np.generic) else value
+    for key in ("duration", "dt"):
         if key in values:
-            values[key] = checks.positive_number(f"run.{key}", values[key], unit)
+            values[key] = checks.positive_number(f"run.{key}", values[key], "s")
     if "method" in values:
         checks.one_of("run.method", values["method"], tuple(TABLEAUS))
     if "record_every" in values:

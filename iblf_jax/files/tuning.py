@@ -316,7 +316,7 @@ def _objective(terms: Any, requirements: Any, names: tuple[str, ...]) -> Objecti
     return total
 
 
-# ----------------------------------------------------------------------------------- saved results
+# --------------------------------------------------------------------------------- saved results
 
 
 RESULT = (

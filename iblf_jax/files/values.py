@@ -1,8 +1,6 @@
-"""What a text file can hold, checked: tables, numbers, strings, lists, each against what was
-expected of it.
+"""Validates the values of a TOML file: tables, numbers, strings and lists.
 
-Every refusal is a ValueError that names the dotted key, what came, what was expected, and the
-remedy.
+Every error is a ValueError that names the dotted key, what came, what was expected, and the remedy.
 """
 
 from __future__ import annotations
@@ -21,16 +19,21 @@ from iblf_jax.core import checks
 from iblf_jax.core.checks import Words, did_you_mean
 
 NONE = "none"
-"""What a file says for a structural field that is None though its default is something else; TOML
-has no null."""
+"""The value in a file of a static field that is None although its default is not; TOML has no
+null."""
+
+
+def dotted(path: str, name: str) -> str:
+    """The dotted key of an entry of a table; an empty path is the file itself."""
+    return f"{path}.{name}" if path else name
 
 
 def toml_tables(text: str) -> dict[str, Any]:
-    """The tables of a text in TOML.
+    """The tables of a TOML text.
 
     Raises:
-      tomllib.TOMLDecodeError: it is none.
-      ValueError: it is nested deeper than any file of this package is.
+      tomllib.TOMLDecodeError: the text is not TOML.
+      ValueError: the tables are nested deeper than in any file of this package.
     """
     problem = f"more than {checks.DEEPEST} tables and lists inside each other"
     try:
@@ -43,8 +46,8 @@ def toml_tables(text: str) -> dict[str, Any]:
 
 
 def inline_table(table: dict[str, Any]) -> str:
-    """A table of numbers, strings, booleans and lists of these as one writes it in a file, { factor
-    = "uniform", low = 0.7 }.
+    """A table of numbers, strings, booleans and lists as a TOML inline table,
+    { factor = "uniform", low = 0.7 }.
     """
 
     def written(value: Any) -> str:
@@ -69,9 +72,9 @@ def known_keys(table: dict[str, Any], path: str, known: Iterable[str]) -> None:
     known = list(known)
     for key in table:
         if key not in known:
-            name = f"{path}.{key}" if path else str(key)
             expected = "one of the keys of this table" if known else "no keys in this table"
-            raise checks.fail(name, Words("an unknown key"), expected, did_you_mean(key, known))
+            came = Words("an unknown key")
+            raise checks.fail(dotted(path, str(key)), came, expected, did_you_mean(key, known))
 
 
 def numbers(value: Any, path: str, unit: str = "") -> Any:
@@ -83,17 +86,25 @@ def numbers(value: Any, path: str, unit: str = "") -> Any:
             raise checks.fail(path, value, "a number that fits into a float") from None
     if isinstance(value, list | tuple):
         return [numbers(entry, f"{path}[{i}]", unit) for i, entry in enumerate(value)]
-    raise checks.fail(path, value, "a number or a list of numbers" + (f" [{unit}]" if unit else ""))
+    expected = "a number or a list of numbers"
+    if unit:
+        expected += f" [{unit}]"
+    raise checks.fail(path, value, expected)
 
 
 def without_none(hint: Any) -> tuple[Any, bool]:
-    """An annotation without its `| None`, and whether it had one.  A union of several others
-    becomes Any.
+    """An annotation without its `| None`, and whether it had one.
+
+    A union of several other types becomes Any.
     """
     if typing.get_origin(hint) not in (typing.Union, types.UnionType):
         return hint, False
-    rest = [option for option in typing.get_args(hint) if option is not type(None)]
-    return rest[0] if len(rest) == 1 else Any, len(rest) < len(typing.get_args(hint))
+    options = typing.get_args(hint)
+    rest = [option for option in options if option is not type(None)]
+    is_optional = len(rest) < len(options)
+    if len(rest) == 1:
+        return rest[0], is_optional
+    return Any, is_optional
 
 
 def entry_hint(hint: Any, index: int) -> Any:
@@ -106,26 +117,33 @@ def entry_hint(hint: Any, index: int) -> Any:
     return entries[index] if index < len(entries) else Any
 
 
-def plain_numbers(array: Any) -> Any:
-    """Floats whose decimal form gives the same bits back, in the array's own precision."""
+def encode_numbers(array: Any) -> Any:
+    """Floats, in nested lists, whose shortest decimal form gives the same bits in the array's
+    precision.
+    """
     array = np.asarray(array)
     if array.ndim:
-        return [plain_numbers(x) for x in array]
-    short = float(str(array[()])) if array.dtype.itemsize < 8 else float(array)
-    return short if array.dtype.type(short) == array else float(array)
+        return [encode_numbers(x) for x in array]
+    if array.dtype.itemsize < 8:
+        short = float(str(array[()]))
+        if array.dtype.type(short) == array:
+            return short
+    return float(array)
 
 
-def plain_static(value: Any, path: str) -> Any:
-    """A structural value as a file holds it: tuples become lists; ValueError for what a file cannot
-    hold.
+def encode_static(value: Any, path: str) -> Any:
+    """The value of a static field for a file: tuples become lists.
+
+    Raises:
+      ValueError: a value that a file cannot hold.
     """
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, tuple):
-        return [plain_static(x, f"{path}[{i}]") for i, x in enumerate(value)]
+        return [encode_static(x, f"{path}[{i}]") for i, x in enumerate(value)]
     if isinstance(value, str) and any("\ud800" <= x <= "\udfff" for x in value):
         raise checks.fail(
-            path, value, "text without halves of surrogate pairs", "A scenario file cannot hold it."
+            path, value, "text without unpaired surrogates", "A scenario file cannot hold it."
         )
     if isinstance(value, bool | str | int) or (isinstance(value, float) and math.isfinite(value)):
         return value
@@ -138,7 +156,7 @@ def plain_static(value: Any, path: str) -> Any:
 
 
 def decode_static(value: Any, hint: Any, path: str) -> Any:
-    """A structural value of the annotated type: a string, a bool, a number, or a tuple of these."""
+    """The value of a static field of the annotated type: a string, a bool, a number, or a tuple."""
     hint, optional = without_none(hint)
     if optional and value == NONE:
         return None
@@ -152,7 +170,9 @@ def decode_static(value: Any, hint: Any, path: str) -> Any:
         raise checks.fail(path, value, "a list")
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         value = numbers(value, path)
-    fits = type(value) is hint if hint in _WORDS else isinstance(value, bool | int | float | str)
+    fits = isinstance(value, bool | int | float | str)
+    if hint in _WORDS:
+        fits = type(value) is hint
     if not fits or (isinstance(value, float) and not math.isfinite(value)):
         raise checks.fail(path, value, _WORDS.get(hint, "a finite number, a string or a bool"))
     return value

@@ -1,13 +1,22 @@
-"""Parameters of a robot from its log, with what the log cannot tell.
+"""Parameters of a robot from its log, with their uncertainty.
 
     known = ij.identify(scenario, "log.csv", ["robot.mass", "robot.damping"])
     known.scenario, known.perturbations, known.plot(), known.save("report.html")
 
-`log`           what was logged, read and checked            `coordinates`  what is looked for, so
-that bodies stay bodies `smoothing`, `regression`  the start                         `shooting`
-simulation error over windows `search`        Gauss-Newton inside limits
-`statistics`   standard errors, and what cannot be told `structure`     terms that the fit lacks
-`result`       `Identification` `_excitation`   a reference that makes a log tell much
+`_identify`    the public function: options, problem, search, result
+`problem`      what is identified, from which data
+`log`          logs, read and checked
+`coordinates`  parameters, and coordinates in which every point is a rigid body
+`smoothing`    velocities and accelerations from positions
+`regression`   the initial estimate
+`replay`       the plant under a logged torque, and its sensitivities
+`shooting`     simulation error over windows (multiple shooting)
+`standstill`   free torques in place of the friction law near standstill
+`search`       the Levenberg-Marquardt method inside limits
+`statistics`   standard errors, identifiability, whiteness
+`structure`    terms that the model lacks
+`result`       `Identification`
+`_excitation`  a reference that makes parameters identifiable
 """
 
 from iblf_jax.identification._excitation import excitation as excitation

@@ -1,16 +1,17 @@
-"""`excitation`: a reference that makes a log tell much (D-optimality), inside all bounds.
+"""`excitation`: a reference inside all bounds that makes parameters identifiable (D-optimality).
 
-    maximise  log det( sum_k Y_k^T W Y_k + REST 1 ),      Y_k = de/dx at (q_d, q_d', q_d")(t_k), x
-    in scales, W the inverse square torques
+    maximise  log det( sum_k Y_k^T W Y_k + REGULARISATION 1 ),
+    Y_k = de/dx at (q_d, q_d', q_d")(t_k), x in scales, W the inverse squares of the torques
 
-over the waypoints of a spline, by the gradients that the identification follows.  Bounds on
-positions and velocities, and the joints' largest speeds and torques, have a price while the search
-lasts; at its end the motion is drawn together until all are kept.
+over the waypoints of a spline, by the gradients that the identification uses.  Bounds on positions
+and velocities, and the joints' largest speeds and torques, are penalised during the search.  At its
+end the motion is scaled about a feasible one until it satisfies all of them.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -20,27 +21,28 @@ import numpy as np
 
 from iblf_jax.core import checks, notices
 from iblf_jax.core.pytree import astype
-from iblf_jax.identification.coordinates import coordinates, scales
-from iblf_jax.identification.replay import Place, slopes
+from iblf_jax.identification.coordinates import Coordinates, coordinates, drive_limit, scales
+from iblf_jax.identification.replay import LeafSlice, inverse_dynamics
 from iblf_jax.simulation.closed_loop import torque_needed
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.world.references import WaypointSpline
+from iblf_jax.world.robots._base import robot_member
 
 SPACING = 0.8
 """Time between waypoints, unless their number is given [s]."""
 SAMPLES, DENSE = 25, 8
-"""Times at which the motion counts, by waypoint; and how many times as many at which it must be
-inside."""
+"""Times per waypoint at which the motion is evaluated, and the factor between these and the times
+at which the bounds are checked."""
 BASIS_COPIES = 8
 """Matrices of position, velocity and acceleration in memory at once, with room for their use."""
-REST = 1e-4
+REGULARISATION = 1e-4
 MARGIN = 0.1
-"""Part of the room between bounds that is kept free on each side, for the errors of the law."""
-TORQUE = 0.6
-"""Part of a joint's largest torque that the motion may need."""
-PRICE = 300.0
-START = 0.5
-"""Part of the room that the first, random motion takes."""
+"""Share of the range between bounds that is left free on each side, for the errors of the law."""
+TORQUE_SHARE = 0.6
+"""Share of a joint's largest torque that the motion may need."""
+PENALTY = 300.0
+FIRST_SHARE = 0.5
+"""Share of the range that the first, random motion covers."""
 
 
 class Basis(NamedTuple):
@@ -54,8 +56,8 @@ class Basis(NamedTuple):
     acceleration: Any
 
 
-class Room(NamedTuple):
-    """What a motion must keep, besides the scenario's bounds."""
+class DriveLimits(NamedTuple):
+    """Limits of the drives, which a motion satisfies besides the scenario's bounds."""
 
     speed: Any
     """(n,) [rad/s]."""
@@ -73,18 +75,18 @@ def excitation(
     iterations: int = 60,
     seed: int = 0,
 ) -> WaypointSpline:
-    """A reference inside all bounds that makes a log tell these parameters well.
+    """A reference inside all bounds whose log identifies these parameters well.
 
         maximise  log det sum_k Y_k^T W Y_k,     Y = dtau/dx along the reference
         (D-optimality)
 
     It starts and ends at rest, at the scenario's start where that can be held, and keeps a tenth of
-    the room to its bounds for the law.
+    the drive to its bounds for the law.
 
     Args:
       scenario: on a robot of n joints, with its bounds; velocity bounds, largest speeds and torques
         are kept where there are any.
-      paths: of the leaves that will be looked for, as for `identify`.
+      paths: paths of the leaves to identify, as for `identify`.
       duration: of the motion [s].
       waypoints: of the spline; one each 0.8 s if not given.
       iterations: steps of the search, at most.
@@ -105,32 +107,50 @@ def excitation(
     with jax.enable_x64(True):
         dtype = jnp.asarray(scenario.initial.q).dtype if isinstance(scenario, Scenario) else None
         start = canonical(astype(canonical(scenario), "float64"))
-        replayed, c = coordinates(start, paths, {})
+        plant, c = coordinates(start, paths, {})
         times = tuple(np.linspace(0.0, duration, count).tolist())
         basis, dense = _basis(times, SAMPLES * count), _basis(times, DENSE * SAMPLES * count)
-        room, middle = _room(replayed), _middle(replayed, times)
-        rng = np.random.default_rng(seed)
-        lower, upper = _bounds(replayed, jnp.asarray(times), jnp.asarray(middle))
-        width = np.where(np.isfinite(np.asarray(upper - lower)), np.asarray(upper - lower), 2.0)
-        guess = middle + START * 0.5 * width * rng.uniform(-1.0, 1.0, middle.shape)
-        guess[[0, -1]] = middle[[0, -1]]
-        guess = _drawn_together(replayed, dense, room, middle, guess)
-        found = _information(replayed, basis, jnp.asarray(c.x), jnp.asarray(guess), places=c.places)
-        by_x, torque = np.asarray(found.by_x), np.asarray(found.torque)
-        scale, size = scales(c, replayed, by_x, torque), np.sqrt(np.mean(torque**2, axis=0)) + 1e-9
-        price = partial(
-            _price,
-            replayed,
-            basis,
-            room,
-            jnp.asarray(c.x),
-            jnp.asarray(scale),
-            jnp.asarray(size),
-            places=c.places,
-        )
-        best = _minimum(price, middle, guess, iterations)
-        best = _drawn_together(replayed, dense, room, middle, best)
+        drive, centre = _drive_limits(plant), _centre_motion(plant, times)
+        guess = _random_motion(plant, times, centre, seed)
+        guess = _scaled_to_fit(plant, dense, drive, centre, guess)
+        objective = _scaled_objective(plant, basis, drive, c, guess)
+        best = _minimum(objective, centre, guess, iterations)
+        best = _scaled_to_fit(plant, dense, drive, centre, best)
     return WaypointSpline(times, np.asarray(best, dtype))
+
+
+def _random_motion(
+    scenario: Scenario, times: tuple[float, ...], centre: np.ndarray, seed: int
+) -> np.ndarray:
+    """Random waypoints about a feasible motion."""
+    rng = np.random.default_rng(seed)
+    lower, upper = _bounds(scenario, jnp.asarray(times), jnp.asarray(centre))
+    width = np.asarray(upper - lower)
+    width = np.where(np.isfinite(width), width, 2.0)
+    guess = centre + FIRST_SHARE * 0.5 * width * rng.uniform(-1.0, 1.0, centre.shape)
+    guess[[0, -1]] = centre[[0, -1]]
+    return guess
+
+
+def _scaled_objective(
+    scenario: Scenario, basis: Basis, drive: DriveLimits, c: Coordinates, guess: np.ndarray
+) -> Callable:
+    """The objective and its gradient as a function of the waypoints, in the scales of a guess."""
+    x = jnp.asarray(c.x)
+    found = _information(scenario, basis, x, jnp.asarray(guess), places=c.places)
+    torque = np.asarray(found.torque)
+    scale = scales(c, scenario, np.asarray(found.by_x), torque)
+    size = np.sqrt(np.mean(torque**2, axis=0)) + 1e-9
+    return partial(
+        _objective,
+        scenario,
+        basis,
+        drive,
+        x,
+        jnp.asarray(scale),
+        jnp.asarray(size),
+        places=c.places,
+    )
 
 
 def _waypoints(duration: float, waypoints: int | None) -> int:
@@ -159,40 +179,45 @@ def _basis(times: tuple[float, ...], count: int) -> Basis:
 
 
 def _bounds(scenario: Scenario, t: jax.Array, q: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Of positions at times t (K,), for a reference q (K, n); the arm's limits too."""
-    bounds = scenario.bounds
-    lower, upper = jax.vmap(bounds.lower.at)(t, q), jax.vmap(bounds.upper.at)(t, q)
-    limits = getattr(scenario.plant, "limits", None)
-    return (
-        (lower, upper)
-        if limits is None
-        else (jnp.maximum(lower, limits.lower), jnp.minimum(upper, limits.upper))
-    )
+    """Bounds of positions at times t (K,), for a reference q (K, n), and the arm's limits."""
+    lower = jax.vmap(scenario.bounds.lower.at)(t, q)
+    upper = jax.vmap(scenario.bounds.upper.at)(t, q)
+    limits = robot_member(scenario.plant, "limits")
+    if limits is None:
+        return lower, upper
+    return jnp.maximum(lower, limits.lower), jnp.minimum(upper, limits.upper)
 
 
-def _room(scenario: Scenario) -> Room:
-    n = scenario.n
+def _drive_limits(scenario: Scenario) -> DriveLimits:
     speed, torque = (
-        np.broadcast_to(np.asarray(getattr(scenario.plant, name, np.inf)), (n,))
+        jnp.broadcast_to(jnp.asarray(drive_limit(scenario.plant, name)), (scenario.n,))
         for name in ("speed", "effort")
     )
-    return Room(jnp.asarray((1.0 - MARGIN) * speed), jnp.asarray(TORQUE * torque))
+    return DriveLimits((1.0 - MARGIN) * speed, TORQUE_SHARE * torque)
 
 
-def _middle(scenario: Scenario, times: tuple[float, ...]) -> np.ndarray:
-    """Waypoints of a motion that is surely inside: the start, where it can be held, else the middle
-    of the bounds.
+def _centre_motion(scenario: Scenario, times: tuple[float, ...]) -> np.ndarray:
+    """Waypoints of a feasible motion: rest at the start if it is feasible throughout, else the
+    middle of the bounds.
     """
     t = jnp.linspace(0.0, times[-1], 400)
-    still = jnp.broadcast_to(scenario.initial.q, (len(t), scenario.n))
-    lower, upper = _bounds(scenario, t, still)
+    rest = jnp.broadcast_to(scenario.initial.q, (len(t), scenario.n))
+    lower, upper = _bounds(scenario, t, rest)
     edge = MARGIN * jnp.where(jnp.isfinite(upper - lower), upper - lower, 0.0)
-    if bool(jnp.all((still > lower + edge) & (still < upper - edge))):
-        return np.broadcast_to(np.asarray(scenario.initial.q), (len(times), scenario.n)).copy()
-    at = jnp.asarray(times)
     start = jnp.broadcast_to(scenario.initial.q, (len(times), scenario.n))
-    lower, upper = _bounds(scenario, at, start)
+    if bool(jnp.all((rest > lower + edge) & (rest < upper - edge))):
+        return np.asarray(start).copy()
+    lower, upper = _bounds(scenario, jnp.asarray(times), start)
     return np.asarray(jnp.where(jnp.isfinite(upper - lower), 0.5 * (lower + upper), start)).copy()
+
+
+def _motion(basis: Basis, waypoints: jax.Array) -> tuple[jax.Array, ...]:
+    """Position, velocity and acceleration at the times of a basis, (K, n) each."""
+    return (
+        basis.position @ waypoints,
+        basis.velocity @ waypoints,
+        basis.acceleration @ waypoints,
+    )
 
 
 @partial(jax.jit, static_argnames="places")
@@ -202,27 +227,23 @@ def _information(
     x: jax.Array,
     waypoints: jax.Array,
     *,
-    places: tuple[Place, ...],
+    places: tuple[LeafSlice, ...],
 ) -> Any:
-    motion = (
-        basis.position @ waypoints,
-        basis.velocity @ waypoints,
-        basis.acceleration @ waypoints,
-    )
-    return slopes(scenario, x, basis.t, *motion, places=places)
+    motion = _motion(basis, waypoints)
+    return inverse_dynamics(scenario, x, basis.t, *motion, places=places)
 
 
-def _beyond(
-    scenario: Scenario, basis: Basis, room: Room, torque: jax.Array, waypoints: jax.Array
+def _violations(
+    scenario: Scenario, basis: Basis, drive: DriveLimits, torque: jax.Array, waypoints: jax.Array
 ) -> list[jax.Array]:
-    """By how much a motion is outside, in parts of the room, (K, n) each; negative inside."""
+    """By how much a motion is outside, in parts of the drive, (K, n) each; negative inside."""
     q, dq = basis.position @ waypoints, basis.velocity @ waypoints
     lower, upper = _bounds(scenario, basis.t, q)
     width = jnp.where(jnp.isfinite(upper - lower), upper - lower, 1.0)
     found = [(lower - q) / width + MARGIN, (q - upper) / width + MARGIN]
     found += [
         jnp.where(jnp.isfinite(limit), jnp.abs(x) / limit - 1.0, -1.0)
-        for x, limit in ((dq, room.speed), (torque, room.torque))
+        for x, limit in ((dq, drive.speed), (torque, drive.torque))
     ]
     if scenario.velocity_bounds is not None:
         bounds = scenario.velocity_bounds
@@ -232,32 +253,34 @@ def _beyond(
 
 
 @partial(jax.jit, static_argnames="places")
-def _price(scenario: Scenario, basis: Basis, room: Room, x, scale, size, waypoints, *, places):
-    """What is minimised, and its gradient by the waypoints."""
+def _objective(
+    scenario: Scenario, basis: Basis, drive: DriveLimits, x, scale, size, waypoints, *, places
+):
+    """The objective to minimise, and its gradient by the waypoints."""
 
-    def price(waypoints):
+    def objective(waypoints):
         found = _information(scenario, basis, x, waypoints, places=places)
         Y = (found.by_x * scale / size[:, None]).reshape(-1, len(x))
-        A = Y.T @ Y / len(basis.t) + REST * jnp.eye(len(x))
-        outside = _beyond(scenario, basis, room, found.torque, waypoints)
-        return -jnp.linalg.slogdet(A)[1] + PRICE * sum(
+        A = Y.T @ Y / len(basis.t) + REGULARISATION * jnp.eye(len(x))
+        outside = _violations(scenario, basis, drive, found.torque, waypoints)
+        return -jnp.linalg.slogdet(A)[1] + PENALTY * sum(
             jnp.mean(jnp.maximum(part, 0.0) ** 2) * len(x) for part in outside
         )
 
-    return jax.value_and_grad(price)(waypoints)
+    return jax.value_and_grad(objective)(waypoints)
 
 
-def _minimum(price: Any, middle: np.ndarray, guess: np.ndarray, iterations: int) -> np.ndarray:
+def _minimum(objective: Any, centre: np.ndarray, guess: np.ndarray, iterations: int) -> np.ndarray:
     from scipy.optimize import minimize
 
-    def whole(inner):
-        return np.concatenate([middle[:1], inner.reshape(-1, middle.shape[1]), middle[-1:]])
+    def with_ends(inner):
+        return np.concatenate([centre[:1], inner.reshape(-1, centre.shape[1]), centre[-1:]])
 
     def flat(inner):
-        value, slope = price(jnp.asarray(whole(inner)))
-        return float(value), np.asarray(slope)[1:-1].ravel()
+        value, gradient = objective(jnp.asarray(with_ends(inner)))
+        return float(value), np.asarray(gradient)[1:-1].ravel()
 
-    return whole(
+    return with_ends(
         minimize(
             flat, guess[1:-1].ravel(), jac=True, method="L-BFGS-B", options={"maxiter": iterations}
         ).x
@@ -265,37 +288,33 @@ def _minimum(price: Any, middle: np.ndarray, guess: np.ndarray, iterations: int)
 
 
 @jax.jit
-def _outside(scenario: Scenario, basis: Basis, room: Room, waypoints: jax.Array) -> jax.Array:
-    motion = (
-        basis.position @ waypoints,
-        basis.velocity @ waypoints,
-        basis.acceleration @ waypoints,
-    )
+def _largest_violation(
+    scenario: Scenario, basis: Basis, drive: DriveLimits, waypoints: jax.Array
+) -> jax.Array:
+    motion = _motion(basis, waypoints)
     torque = jax.lax.map(lambda at: torque_needed(scenario, *at), (basis.t, *motion))
     return jnp.max(
-        jnp.stack([jnp.max(part) for part in _beyond(scenario, basis, room, torque, waypoints)])
+        jnp.stack(
+            [jnp.max(part) for part in _violations(scenario, basis, drive, torque, waypoints)]
+        )
     )
 
 
-def _drawn_together(
-    scenario: Scenario, basis: Basis, room: Room, middle: np.ndarray, waypoints: np.ndarray
+def _scaled_to_fit(
+    scenario: Scenario, basis: Basis, drive: DriveLimits, centre: np.ndarray, waypoints: np.ndarray
 ) -> np.ndarray:
-    """The largest share of the motion about `middle` that is inside; raises ValueError if none
-    is.
+    """The motion scaled about `centre` by the largest factor up to 1 that satisfies all limits;
+    raises ValueError if there is none.
     """
 
-    def inside(share):
-        return (
-            float(
-                _outside(scenario, basis, room, jnp.asarray(middle + share * (waypoints - middle)))
-            )
-            <= 0.0
-        )
+    def is_feasible(factor):
+        scaled = jnp.asarray(centre + factor * (waypoints - centre))
+        return float(_largest_violation(scenario, basis, drive, scaled)) <= 0.0
 
-    if inside(1.0):
+    if is_feasible(1.0):
         return waypoints
     low, high = 0.0, 1.0
-    if not inside(low):
+    if not is_feasible(low):
         raise checks.fail(
             "bounds",
             scenario.bounds,
@@ -303,6 +322,9 @@ def _drawn_together(
             "Widen the bounds, or change initial.q.",
         )
     for _ in range(math.ceil(math.log2(1e3))):
-        share = 0.5 * (low + high)
-        low, high = (share, high) if inside(share) else (low, share)
-    return middle + low * (waypoints - middle)
+        factor = 0.5 * (low + high)
+        if is_feasible(factor):
+            low = factor
+        else:
+            high = factor
+    return centre + low * (waypoints - centre)

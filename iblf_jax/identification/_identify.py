@@ -21,21 +21,26 @@ from iblf_jax.identification.coordinates import (
     to_z,
     with_widths,
 )
-from iblf_jax.identification.log import Log, Said, read
+from iblf_jax.identification.log import Log, read
 from iblf_jax.identification.problem import IdentificationProblem
-from iblf_jax.identification.regression import LARGEST_DELAY, Start, coordinate_scales, started
+from iblf_jax.identification.regression import (
+    LARGEST_DELAY,
+    InitialEstimate,
+    coordinate_scales,
+    initial_estimate,
+)
 from iblf_jax.identification.result import FINEST, LACKS, Identification, assessed
-from iblf_jax.identification.shooting import Prior, Refined, Windows, windows
-from iblf_jax.identification.smoothing import smoothed
+from iblf_jax.identification.shooting import Prior, Refinement, Windows, windows
+from iblf_jax.identification.smoothing import smooth_logs
 from iblf_jax.identification.standstill import (
-    BETTER,
-    HOPELESS,
-    NONE,
-    SLOW,
-    WORSE,
-    Free,
-    by_the_law,
-    free_about_standstill,
+    ACCEPTED_RATIO,
+    NO_FRICTION_WIDTH,
+    REJECTED_RATIO,
+    SPEED_THRESHOLDS,
+    WORTHWHILE_RATIO,
+    FreeTorques,
+    free_torques_at_standstill,
+    no_free_torques,
 )
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical
@@ -60,35 +65,37 @@ def identify(
     priors: Mapping[str, Any] | None = None,
     iterations: int = 30,
 ) -> Identification:
-    """Parameters of a robot from what it logged: linear regression, refined by simulation error
-    over windows.
+    """Parameters of a robot from its log: linear regression, refined by simulation error over
+    windows.
 
         minimise  sum over windows, samples, joints of  rho((y - q) / sigma) / 2,    q the plant
         under the logged torque
 
-    Each window of the log has a start of its own, which is looked for too; sigma of each joint is
-    estimated.  The motion comes from positions alone; of a law nothing need be known.
+    Each window of the log has an initial state of its own, which is estimated as well; sigma of
+    each joint is estimated.  The motion comes from positions only, and no control law need be
+    known.
 
     Args:
-      scenario: on a robot of n joints; its plant's numbers are where the search starts.
+      scenario: on a robot of n joints; the search starts from its plant's parameters.
       log: t (N,) [s], q (N, n) [rad], tau (N, n) [N m], dq (N, n) [rad/s] if there is one: an
         xarray Dataset, a mapping, a `Rollout`, a CSV
         file (its heading: t, q[0], ..., tau[0], ...) or a netCDF file, or a list of these.  Times
           may be irregular and have gaps.
       paths: of leaves of robot (plant and model), plant, model or disturbance; "sampling.delay" for
         the torque's delay.
-      held_out: the share of each log, at its end, that is held back to judge the result; or a log,
-        or a list of logs, for that.
-      window: length of the windows [s]; longer ones know more, and more of what the model lacks.
+      held_out: the share of each log, at its end, that is held back for validation; or a log, or a
+        list of logs, for it.
+      window: length of the windows [s]; longer ones contain more information, and are more
+        sensitive to model errors.
       torque: "held" from a sample to the next, as a digital loop does, or "interpolated", for
         torques that were measured; if not given, interpolated for a `Rollout` of a continuous loop,
         else held.
-      delay: how late the logged torque acts [s]; found too if not given.
+      delay: delay of the logged torque [s]; estimated if not given.
       loss: "squares", or "huber" for logs with outliers.
-      widths: whether what Coulomb friction does about standstill is looked for with it: whether it
-        is tanh(q' / width), and with which width, or another law (sticking, a bristle, an impulse),
-        which the log then decides by free torques.  If not, the scenario's widths are believed: one
-        that is wrong spoils all numbers (7 joints with dry friction: by up to 34 %).
+      widths: whether the behaviour of Coulomb friction near standstill is identified as well: it is
+        tanh(q' / width) with an estimated width, or another law (sticking, a bristle, an impulse)
+        that free torques replace.  Otherwise the scenario's widths are assumed; a wrong width
+        biases all parameters (7 joints with dry friction: by up to 34 %).
       limits: path -> (low, high) in the leaf's unit, None for the default: masses are above 0,
         friction and damping not below.
       priors: path -> (mean, standard deviation) of what is known from elsewhere, in the leaf's
@@ -96,13 +103,13 @@ def identify(
       iterations: Gauss-Newton steps, at most.
 
     Returns:
-      An `Identification`: values with standard errors, what the log cannot tell, the fit, and
-        `.scenario` with the new numbers.
+      An `Identification`: values with standard errors, what the log does not identify, the fit, and
+        `.scenario` with the new parameters.
 
     Raises:
       ValueError: a path that does not move the plant; a log that is incomplete, has rows without
         numbers, times that do not increase, wrong units or columns, or in which the robot stands
-        still; the message names what came and the remedy.
+        still; the message names the value and the remedy.
       OSError: a file cannot be read.
 
     Source: H. G. Bock's multiple shooting; L. Ljung, System Identification, 2nd ed., 1999; C.
@@ -184,7 +191,7 @@ def _problem(
         coordinates=c,
         logs=logs,
         windows=fitted_windows,
-        smoothed=smoothed(fitted_logs, options.zero_order_hold),
+        smooth=smooth_logs(fitted_logs, options.zero_order_hold),
         prior=_prior(c, options.priors),
         requested=len([path for path in paths if path != DELAY]),
         fixed_delay=fixed_delay,
@@ -196,11 +203,11 @@ def _problem(
 
 def _solved(problem: IdentificationProblem, began: float) -> Identification:
     """The result: regression, free torques near standstill, then the friction law."""
-    guess = started(
-        problem.simulated, problem.coordinates, problem.smoothed, "log", problem.fixed_delay
+    guess = initial_estimate(
+        problem.simulated, problem.coordinates, problem.smooth, "log", problem.fixed_delay
     )
-    noise = np.maximum(problem.smoothed.noise, 1e-9)
-    by_law = by_the_law(problem.windows.y.shape, len(problem.coordinates.x))
+    noise = np.maximum(problem.smooth.noise, 1e-9)
+    by_law = no_free_torques(problem.windows.y.shape, len(problem.coordinates.x))
     before = problem.replay(problem.coordinates.x, by_law).best_starts(
         np.append(to_z(problem.coordinates, problem.coordinates.x), guess.delay), noise
     )[1]
@@ -211,16 +218,20 @@ def _solved(problem: IdentificationProblem, began: float) -> Identification:
 
 
 class _Search:
-    """The nonlinear search: simulation error over windows, by `Replay.refined`."""
+    """The nonlinear search: simulation error over windows, by `ShootingProblem.refine`."""
 
-    def __init__(self, problem: IdentificationProblem, guess: Start, noise: np.ndarray) -> None:
+    def __init__(
+        self, problem: IdentificationProblem, guess: InitialEstimate, noise: np.ndarray
+    ) -> None:
         self.problem = problem
         self.first = np.append(guess.z, guess.delay)
         self.noise = noise
         scales = coordinate_scales(problem.coordinates, guess.scale)
         self.scale = np.append(scales, OFFSET)
 
-    def refined(self, x: np.ndarray, z: np.ndarray, free: Free, hopeless: Any = np.inf) -> Refined:
+    def refine(
+        self, x: np.ndarray, z: np.ndarray, free: FreeTorques, hopeless: Any = np.inf
+    ) -> Refinement:
         """The fit from z on, with these free torques.
 
         Args:
@@ -230,22 +241,22 @@ class _Search:
           hopeless: residuals at which the search is given up.
         """
         problem = self.problem
-        return problem.replay(x, free).refined(
+        return problem.replay(x, free).refine(
             z, problem.limits, self.scale, self.noise, problem.prior, problem.iterations, hopeless
         )
 
-    def with_free_torques(self) -> Refined | None:
+    def with_free_torques(self) -> Refinement | None:
         """The best fit with free torques near standstill; None if no friction is identified.
 
         The friction law may be wrong near standstill, and this search converges from any start. A
         larger range of speeds is tried only if the smaller one leaves more than noise.
         """
         problem = self.problem
-        noise = np.maximum(problem.smoothed.noise, FINEST)
-        size = np.std(problem.smoothed.tau, axis=0)
-        best: Refined | None = None
-        for speed in SLOW:
-            free = free_about_standstill(
+        noise = np.maximum(problem.smooth.noise, FINEST)
+        size = np.std(problem.smooth.tau, axis=0)
+        best: Refinement | None = None
+        for speed in SPEED_THRESHOLDS:
+            free = free_torques_at_standstill(
                 problem.simulated,
                 problem.coordinates,
                 problem.windows,
@@ -253,20 +264,22 @@ class _Search:
                 size,
                 speed,
             )
-            if not free.held.any():
+            if not free.fixed.any():
                 break
             z = self.first if best is None else best.z
-            x = np.where(free.held, NONE, to_x(problem.coordinates, z[:-1])[0])
-            found = self.refined(x, z, free)
-            residual = np.max(found.left / noise)
-            if best is not None and not residual < BETTER * np.max(best.left / noise):
+            x = np.where(free.fixed, NO_FRICTION_WIDTH, to_x(problem.coordinates, z[:-1])[0])
+            found = self.refine(x, z, free)
+            residual = np.max(found.rms / noise)
+            if best is not None and not residual < WORTHWHILE_RATIO * np.max(best.rms / noise):
                 break
             best = found
             if residual < LACKS:
                 break
         return best
 
-    def with_friction_law(self, by_law: Free, free_fit: Refined | None) -> tuple[Refined, float]:
+    def with_friction_law(
+        self, by_law: FreeTorques, free_fit: Refinement | None
+    ) -> tuple[Refinement, float]:
         """The fit with the friction law, or the one with free torques if that is clearly better.
 
         Returns:
@@ -276,17 +289,17 @@ class _Search:
         z = self.first if free_fit is None else free_fit.z
         x = to_x(self.problem.coordinates, z[:-1])[0]
         if free_fit is None:
-            return self.refined(x, z, by_law), 0.0
+            return self.refine(x, z, by_law), 0.0
         # A log of a simulation has no noise: a smaller residual is no improvement.
-        smallest = np.maximum(free_fit.left, FINEST)
-        law_fit = self.refined(x, z, by_law, HOPELESS * smallest)
-        ratio = float(np.max(law_fit.left / smallest))
-        chosen = free_fit if ratio > WORSE else law_fit
+        smallest = np.maximum(free_fit.rms, FINEST)
+        law_fit = self.refine(x, z, by_law, REJECTED_RATIO * smallest)
+        ratio = float(np.max(law_fit.rms / smallest))
+        chosen = free_fit if ratio > ACCEPTED_RATIO else law_fit
         return chosen._replace(steps=free_fit.steps + law_fit.steps), ratio
 
 
 def _check_delay(delay: Any) -> None:
-    """Raises ValueError for a delay of the torque that is no number or too long."""
+    """Raises ValueError for a delay of the torque that is not a number or too long."""
     if delay is None:
         return
     number = checks.as_floats("delay", delay)
@@ -302,7 +315,7 @@ def _is_continuous(log: Any) -> bool:
 
 
 def _logs(log: Any, held_out: Any, n: int) -> tuple[list[Log], list[float]]:
-    """The logs, and which share of each is held back."""
+    """The logs, and the share of each that is held back."""
     logs = read(log, n)
     if isinstance(held_out, int | float) and not isinstance(held_out, bool):
         if not 0.0 <= held_out <= 0.9:
@@ -322,18 +335,20 @@ def _front(log: Log, share: float) -> list[Log]:
 
 
 def _enough(w: Windows, p: int, logs: list[Log], length: float) -> None:
-    """Raises ValueError for logs that are too short for what is looked for."""
-    n = w.y.shape[-1] if len(w.t) else 1
-    numbers = int(np.sum(w.kept)) * (w.t.shape[1] - 2) * n if len(w.t) else 0
+    """Raises ValueError for logs that are too short for the parameters."""
+    numbers = 0
+    if len(w.t):
+        _, samples, n = w.y.shape
+        numbers = int(np.sum(w.kept)) * (samples - 2) * n
     if numbers < 3 * p or not numbers:
-        came = Said(
+        came = checks.Words(
             f"{sum(x.t[-1] - x.t[0] for x in logs):.3g} s of log between gaps, in"
             f" {int(np.sum(w.kept))} windows of {length:g} s to fit"
         )
         raise checks.fail(
             "log",
             came,
-            f"at least one window, and 3 measured numbers for each of the {p} looked for",
+            f"at least one window, and 3 measured numbers for each of the {p} parameters",
             "Log for longer, or take a shorter window.",
         )
 

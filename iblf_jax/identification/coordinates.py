@@ -1,18 +1,17 @@
-"""What is looked for: the numbers x of the leaves, and coordinates z in which whatever is tried is
-a body.
+"""The parameters x of an identification, and coordinates z in which every point is a rigid body.
 
 A link's pseudo-inertia P = [[S + m c c^T, m c], [m c^T, m]] is positive definite where m > 0 and
 
-    S = 1/2 tr(J) 1 - J = L L^T,    L lower triangular with exp(z_1), exp(z_2), exp(z_3) on its
-    diagonal,
+    S = 1/2 tr(J) 1 - J = L L^T,
+    L lower triangular with exp(z_1), exp(z_2), exp(z_3) on its diagonal,
 
-its second moments about the centre: the log-Cholesky form, block by block.  So the six numbers of
-  an inertia have z_1 ... z_6, and masses
-and all other leaves are their own coordinates, within limits.
+S being the second moments about the centre of mass: this is the log-Cholesky form, block by block.
+The six entries of an inertia have the coordinates z_1 ... z_6.  Masses and all other leaves are
+their own coordinates, inside limits.
 
-Each number has a scale, that in which "well known" is measured: what it was for masses and moments
-of inertia, the arm's mean length for lengths, else what would by itself need a torque as large as
-the log's.
+Each parameter has a scale, relative to which its uncertainty is measured: the start for masses and
+moments of inertia; the mean length of the arm's links for lengths; for other parameters the value
+that alone would need a torque as large as the logged one.
 
 Source: C. Rucker, P. M. Wensing, IEEE Robotics and Automation Letters 7 (2022) 2645-2652.
 """
@@ -26,48 +25,48 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.identification.replay import Place
+from iblf_jax.identification.replay import LeafSlice
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Scenario, with_parts
 from iblf_jax.studies.draws import check_paths, same_place
+from iblf_jax.world.robots._base import robot_member
 
 SMALLEST = 1e-3
 """Default lower limit of a number that must be positive, by its start."""
 SHARPEST = 1e-3
-"""[rad/s]: default lower limit of a friction's width; below, what it does cannot be told from dry
-friction's."""
+"""[rad/s]: default lower limit of a friction's width; a narrower one cannot be distinguished from
+dry friction."""
 POINT = 0.01
-"""[m]: radius of gyration, along each axis, from which the inertia of a body that has none
-starts."""
+"""[m]: radius of gyration, along each axis, with which the search starts where an inertia is not
+positive definite."""
 DELAY, OFFSET = "sampling.delay", 0.01
 """The path of the torque's delay, and its scale [s]."""
 PARTS = ("plant", "model", "robot", "disturbance")
 
 
 class Coordinates(NamedTuple):
-    """The layout, and where the search starts."""
+    """The layout of x and z, and the start of the search."""
 
-    places: tuple[Place, ...]
-    """The leaves as the replay has them; static."""
+    places: tuple[LeafSlice, ...]
+    """The leaves of the simulated scenario, and their entries of x; static."""
     paths: tuple[str, ...]
-    """As the user wrote them, one a place; the torque's delay, if it is looked for, is not among
-    them."""
+    """Paths as the user wrote them, one for each place, without that of the torque's delay."""
     names: tuple[str, ...]
-    """What each number is called, (p,)."""
+    """Names of the parameters, (p,)."""
     units: tuple[str, ...]
     bodies: tuple[int, ...]
-    """Where the six numbers of an inertia start in x and z."""
+    """First index of each inertia in x and z."""
     x: np.ndarray
     low: np.ndarray
-    """Of z; infinite for log-Cholesky coordinates."""
+    """Lower limits of z; infinite for log-Cholesky coordinates."""
     high: np.ndarray
     delay: bool
-    """Whether the torque's delay was asked for by its path."""
+    """Whether the path of the torque's delay was given."""
 
 
-def replayed_scenario(scenario: Scenario, given: list[str]) -> tuple[Scenario, list[str]]:
-    """The scenario whose plant is looked for, and the paths in it: of "model." paths, the model in
-    the place of the plant.
+def scenario_of_plant(scenario: Scenario, given: list[str]) -> tuple[Scenario, list[str]]:
+    """The scenario whose plant is identified, and the paths in it; for "model." paths it has the
+    model in place of the plant.
     """
     roots = {paths.parse(path)[0] for path in given}
     for path in given:
@@ -76,24 +75,30 @@ def replayed_scenario(scenario: Scenario, given: list[str]) -> tuple[Scenario, l
                 "paths",
                 path,
                 f"a leaf of robot, plant, model or disturbance, or {DELAY}",
-                "What else there is does not move a robot whose torque was logged.",
+                "Other leaves do not influence the motion under a logged torque.",
             )
     if "model" in roots and roots & {"plant", "robot"}:
         raise checks.fail(
             "paths", given, "plant or model", "robot. is both: the log is of one robot."
         )
-    moved = [
-        "plant" + path[5:] if path.startswith(("robot.", "model.")) else path for path in given
-    ]
-    return (with_parts(scenario, plant=scenario.model) if "model" in roots else scenario), moved
+    if "model" in roots:
+        scenario = with_parts(scenario, plant=scenario.model)
+    return scenario, [plant_path(path) for path in given]
+
+
+def plant_path(path: str) -> str:
+    """The path of a leaf of the robot or of the model in the plant."""
+    if path.startswith(("robot.", "model.")):
+        return "plant" + path[5:]
+    return path
 
 
 WIDTHS = {"friction": "friction_width", "coulomb": "width"}
-"""Coulomb friction, and the leaf beside it over which it changes its sign."""
+"""Leaf of Coulomb friction -> leaf of its width, the speed over which it changes its sign."""
 
 
 def with_widths(scenario: Scenario, given: Any) -> Any:
-    """The paths, and for each Coulomb friction among them that of its width."""
+    """The paths, and the path of the width for each Coulomb friction among them."""
     if not isinstance(given, list | tuple) or not all(isinstance(path, str) for path in given):
         return given
     found = list(given)
@@ -101,7 +106,7 @@ def with_widths(scenario: Scenario, given: Any) -> Any:
     def new(path):
         try:
             return not any(same_place(scenario, path, other) for other in found)
-        except ValueError:  # a path of something else
+        except ValueError:  # the scenario has no such width
             return False
 
     for path in given:
@@ -109,10 +114,11 @@ def with_widths(scenario: Scenario, given: Any) -> Any:
         if place is None:
             continue
         width = f"{place[1]}{WIDTHS[place[2]]}{place[3]}"
-        entries = (
-            () if place[3] else (f"{width}[{j}]" for j in range(scenario.n))
-        )  # some of them may have been asked for
-        found += [width] if new(width) else [entry for entry in entries if new(entry)]
+        if new(width):
+            found.append(width)
+        elif not place[3]:  # the user may have given some of the entries
+            entries = [f"{width}[{j}]" for j in range(scenario.n)]
+            found += [entry for entry in entries if new(entry)]
     return found
 
 
@@ -130,25 +136,15 @@ def coordinates(
       ValueError: an unknown or overlapping path, one that does not move the plant, or limits that
         exclude the start.
     """
-    wanted = [
-        checks.word("paths", path, "a path")
-        for path in checks.listed("paths", given, '["plant.mass", "plant.damping"]')
-    ]
-    if DELAY in wanted and scenario.sampling is None:
-        raise checks.fail(
-            "paths",
-            DELAY,
-            "a scenario with a sampling, which holds it",
-            "Leave it out: known.delay is found in any case.",
-        )
-    check_paths(scenario, wanted, "paths")
-    scenario, moved = replayed_scenario(scenario, wanted)
+    requested = _checked_paths(scenario, given)
+    scenario, plant_paths = scenario_of_plant(scenario, requested)
     for path in limits:
-        if path not in wanted:
-            raise checks.fail("limits", path, f"one of the paths: {', '.join(wanted)}")
-    places, names, units, parts, start = [], [], [], [], 0
+        if path not in requested:
+            raise checks.fail("limits", path, f"one of the paths: {', '.join(requested)}")
+    places, names, units, parts = [], [], [], []
     bodies: list[int] = []
-    for path, own in zip(wanted, moved, strict=True):
+    start = 0
+    for path, own in zip(requested, plant_paths, strict=True):
         if path == DELAY:
             continue
         value = np.asarray(paths.get(scenario, own), float)
@@ -156,39 +152,42 @@ def coordinates(
             raise checks.fail(path, value, "a finite number to start from")
         low, high = _limits(path, value, paths.sign_at(scenario, own), limits.get(path))
         if is_inertia(scenario, own, value) and path not in limits:
-            first = len(bodies)
-            bodies += [start + 6 * i for i in range(value.size // 6)]
-            value = np.array(
-                [
-                    _a_body(J, m)
-                    for J, m in zip(
-                        value.reshape(-1, 6),
-                        _masses(scenario, own, len(bodies) - first),
-                        strict=True,
-                    )
-                ]
-            ).reshape(value.shape)
-        places.append(Place(own, value.shape, start, value.size))
+            count = value.size // 6
+            bodies += [start + 6 * i for i in range(count)]
+            value = _positive_definite(value, _masses(scenario, own, count))
+        places.append(LeafSlice(own, value.shape, start, value.size))
         parts.append((value.ravel(), low.ravel(), high.ravel()))
         names += [path + "".join(f"[{i}]" for i in index) for index in np.ndindex(value.shape)]
         units += [paths.unit_at(scenario, own)] * value.size
         start += value.size
-    x, low, high = (
-        np.concatenate(part) if part else np.zeros(0)
-        for part in (zip(*parts, strict=True) if parts else ((), (), ()))
-    )
-    kept = tuple(path for path in wanted if path != DELAY)
+    empty = (np.zeros(0),) * 3
+    x, low, high = (np.concatenate(column) for column in zip(empty, *parts, strict=True))
     return scenario, Coordinates(
-        tuple(places),
-        kept,
-        tuple(names),
-        tuple(units),
-        tuple(bodies),
-        x,
-        low,
-        high,
-        DELAY in wanted,
+        places=tuple(places),
+        paths=tuple(path for path in requested if path != DELAY),
+        names=tuple(names),
+        units=tuple(units),
+        bodies=tuple(bodies),
+        x=x,
+        low=low,
+        high=high,
+        delay=DELAY in requested,
     )
+
+
+def _checked_paths(scenario: Scenario, given: Any) -> list[str]:
+    """The paths; ValueError for an unknown or overlapping one."""
+    found = checks.listed("paths", given, '["plant.mass", "plant.damping"]')
+    found = [checks.word("paths", path, "a path") for path in found]
+    if DELAY in found and scenario.sampling is None:
+        raise checks.fail(
+            "paths",
+            DELAY,
+            "a scenario with a sampling, which has this leaf",
+            "Leave it out: the delay is estimated in any case.",
+        )
+    check_paths(scenario, found, "paths")
+    return found
 
 
 def is_inertia(scenario: Scenario, path: str, value: np.ndarray) -> bool:
@@ -207,11 +206,16 @@ def _masses(scenario: Scenario, path: str, count: int) -> np.ndarray:
     return np.broadcast_to(np.asarray(paths.get(scenario, f"{owner}.mass{rest}"), float), (count,))
 
 
-def _a_body(J: np.ndarray, mass: float) -> np.ndarray:
-    """An inertia to start from: itself, or where no body has it, the nearest of a body that is
-    thick enough.
-    """
-    S, least = moments(J), max(mass, 1e-3) * POINT**2
+def _positive_definite(value: np.ndarray, masses: np.ndarray) -> np.ndarray:
+    """Inertias from which the search can start, for a leaf of them."""
+    rows = zip(value.reshape(-1, 6), masses, strict=True)
+    return np.array([_rigid_body(J, mass) for J, mass in rows]).reshape(value.shape)
+
+
+def _rigid_body(J: np.ndarray, mass: float) -> np.ndarray:
+    """An inertia, or the nearest one of a rigid body of a least thickness if it belongs to none."""
+    S = moments(J)
+    least = max(mass, 1e-3) * POINT**2
     size, axes = np.linalg.eigh(S)
     if size[0] > 1e-9 * max(size[-1], least):
         return J
@@ -221,30 +225,16 @@ def _a_body(J: np.ndarray, mass: float) -> np.ndarray:
 def _limits(
     path: str, value: np.ndarray, sign: str | None, given: Any
 ) -> tuple[np.ndarray, np.ndarray]:
-    least = SHARPEST if "width" in path else SMALLEST * value
-    low = {
-        "positive": np.broadcast_to(np.minimum(least, value), value.shape),
-        "nonnegative": np.zeros_like(value),
-    }.get(sign or "", np.full_like(value, -np.inf))
-    if "mass" in path:
-        low = SMALLEST * value  # a link of no mass is none
-    high = np.full_like(value, np.inf)
+    """The lower and upper limits of a leaf: the given ones, or those that its sign implies."""
+    low, high = _default_lower_limit(path, value, sign), np.full_like(value, np.inf)
     if given is not None:
+        name = f"limits[{path!r}]"
         if not isinstance(given, tuple | list) or len(given) != 2:
-            raise checks.fail(
-                f"limits[{path!r}]", given, "(low, high), each a number, one an entry, or None"
-            )
-        ends = [
-            (
-                end
-                if x is None
-                else np.broadcast_to(
-                    np.asarray(checks.as_floats(f"limits[{path!r}]", x), float), value.shape
-                )
-            )
-            for x, end in zip(given, (low, high), strict=True)
-        ]
-        low, high = ends
+            expected = "(low, high), each a number, one an entry, or None"
+            raise checks.fail(name, given, expected)
+        low, high = (
+            _limit(name, x, default) for x, default in zip(given, (low, high), strict=True)
+        )
     if not np.all((low <= value) & (value <= high)) or not np.all(low < high):
         raise checks.fail(
             f"limits[{path!r}]",
@@ -255,7 +245,25 @@ def _limits(
     return low, high
 
 
-# -------------------------------------------------------------------------------------------------------------- inertias
+def _default_lower_limit(path: str, value: np.ndarray, sign: str | None) -> np.ndarray:
+    if "mass" in path:  # a link without mass has no motion
+        return SMALLEST * value
+    if sign == "positive":
+        least = SHARPEST if "width" in path else SMALLEST * value
+        return np.broadcast_to(np.minimum(least, value), value.shape)
+    if sign == "nonnegative":
+        return np.zeros_like(value)
+    return np.full_like(value, -np.inf)
+
+
+def _limit(name: str, given: Any, default: np.ndarray) -> np.ndarray:
+    """One limit of all entries of a leaf."""
+    if given is None:
+        return default
+    return np.broadcast_to(np.asarray(checks.as_floats(name, given), float), default.shape)
+
+
+# ----------------------------------------------------------------- inertias
 
 
 def moments(J: np.ndarray) -> np.ndarray:
@@ -275,63 +283,70 @@ LOWER = np.tril_indices(3, -1)
 
 
 def to_z(c: Coordinates, x: np.ndarray) -> np.ndarray:
-    """Coordinates of numbers."""
+    """The coordinates of parameters x."""
     z = x.copy()
-    for at in c.bodies:
-        L = np.linalg.cholesky(moments(x[at : at + 6]))
-        z[at : at + 6] = [*np.log(np.diag(L)), *L[LOWER]]
+    for first in c.bodies:
+        L = np.linalg.cholesky(moments(x[first : first + 6]))
+        z[first : first + 6] = [*np.log(np.diag(L)), *L[LOWER]]
     return z
 
 
 def to_x(c: Coordinates, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers at coordinates z, and their derivative dx/dz, (p, p)."""
-    x, slope = z.copy(), np.eye(len(z))
-    for at in c.bodies:
-        own = slice(at, at + 6)
-        L = np.diag(np.exp(z[at : at + 3]))
-        L[LOWER] = z[at + 3 : at + 6]
-        x[own] = inertia(L @ L.T)
+    """The parameters at coordinates z, and their derivative dx/dz, (p, p)."""
+    x, x_by_z = z.copy(), np.eye(len(z))
+    for first in c.bodies:
+        body = slice(first, first + 6)
+        L = np.diag(np.exp(z[first : first + 3]))
+        L[LOWER] = z[first + 3 : first + 6]
+        x[body] = inertia(L @ L.T)
         for i in range(6):
             dL = np.zeros((3, 3))
             if i < 3:
                 dL[i, i] = L[i, i]
             else:
                 dL[LOWER[0][i - 3], LOWER[1][i - 3]] = 1.0
-            slope[own, at + i] = inertia(dL @ L.T + L @ dL.T)
-    return x, slope
+            x_by_z[body, first + i] = inertia(dL @ L.T + L @ dL.T)
+    return x, x_by_z
 
 
 def scales(c: Coordinates, scenario: Scenario, by_x: np.ndarray, torque: np.ndarray) -> np.ndarray:
-    """The scale of each number (head of this module).
+    """The scale of each parameter (head of this module).
 
     Args:
       c: the coordinates.
-      scenario: whose plant is looked for.
+      scenario: scenario whose plant is identified.
       by_x: derivative of the torque, (P, n, p) [N m by unit].
-      torque: of the log, (P, n).
+      torque: torque of the log, (P, n) [N m].
     """
     size = np.sqrt(np.mean(torque**2, axis=0)) + 1e-9 * np.max(np.abs(torque))
-    effect, start = (
-        np.sqrt(np.sum(np.mean((by_x / size[:, None]) ** 2, axis=0), axis=0)),
-        np.abs(c.x),
-    )
-    alone = 1.0 / np.where(effect > 1e-12, effect, 1.0)
-    scale = alone.copy()
+    effect = np.sqrt(np.sum(np.mean((by_x / size[:, None]) ** 2, axis=0), axis=0))
+    by_torque = 1.0 / np.where(effect > 1e-12, effect, 1.0)
+    start = np.abs(c.x)
+    scale = by_torque.copy()
     for i, unit in enumerate(c.units):
         if unit in ("kg", "kg m^2") and start[i] > 0:
             scale[i] = start[i]
         elif unit == "m":
-            joints = (
-                np.asarray(scenario.plant.skeleton(scenario.initial.q))
-                if hasattr(scenario.plant, "skeleton")
-                else np.zeros((1, 3))
-            )
-            length = (
-                float(np.mean(np.linalg.norm(np.diff(joints, axis=0), axis=1)))
-                if len(joints) > 1
-                else 0.0
-            )
-            scale[i] = min(alone[i], length) if length > 0 else alone[i]
-    for at in c.bodies:
-        scale[at : at + 6] = np.sum(c.x[at : at + 3])
+            length = _mean_link_length(scenario)
+            if length > 0:
+                scale[i] = min(by_torque[i], length)
+    for first in c.bodies:
+        scale[first : first + 6] = np.sum(c.x[first : first + 3])
     return scale
+
+
+def _mean_link_length(scenario: Scenario) -> float:
+    """The mean distance between joints [m]; 0 for a robot without a skeleton."""
+    skeleton = robot_member(scenario.plant, "skeleton")
+    if skeleton is None:
+        return 0.0
+    joints = np.asarray(skeleton(scenario.initial.q))
+    if len(joints) < 2:
+        return 0.0
+    return float(np.mean(np.linalg.norm(np.diff(joints, axis=0), axis=1)))
+
+
+def drive_limit(robot: Any, name: str) -> np.ndarray:
+    """The largest speed ("speed") or torque ("effort") of a robot's joints; infinite if unknown."""
+    limit = robot_member(robot, name)
+    return np.asarray(np.inf if limit is None else limit)

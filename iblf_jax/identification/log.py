@@ -1,11 +1,11 @@
-"""What a robot logged: time, positions and torques of the joints, read and checked.
+"""Logs of a robot, read and checked: time, positions and torques of the joints.
 
     t [s], q (N, n) [rad], tau (N, n) [N m], and, where it was logged, q' (N, n) [rad/s]
 
 A log is a Dataset or a mapping with these names (what `Rollout.to_xarray` gives), a Rollout, a CSV
 file whose heading is t, q[0], ..., dq[0], ..., tau[0], ..., or a netCDF file.  Time stamps may be
-irregular; where one is missing for long, the log has a gap, and is two stretches.  Velocities of a
-log are filtered differences of its positions, most often: they are compared with these, no more.
+irregular; a long time without samples is a gap, which divides the log into two segments.  Logged
+velocities are mostly filtered differences of the positions and serve as a check only.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from iblf_jax.core import checks
 from iblf_jax.simulation.results import Rollout
 
 GAP, MOST = 3.0, 0.95
-"""A time between samples that is so many times what this share of them is below is a gap."""
+"""A time between samples of more than GAP times the quantile MOST of these times is a gap."""
 FEWEST = 50
 """Samples that a log must have."""
 UNITS = {
@@ -33,16 +33,7 @@ UNITS = {
     "tau": ("N m", "N", "Nm", "N*m", "N.m"),
     "t": ("s",),
 }
-"""What a Dataset may say of its units."""
-
-
-class Said(str):
-    """Words in place of a value in an error message."""
-
-    __slots__ = ()
-
-    def __repr__(self) -> str:
-        return str(self)
+"""Accepted units of a Dataset."""
 
 
 class Log(NamedTuple):
@@ -56,17 +47,17 @@ class Log(NamedTuple):
 
     @property
     def gap(self) -> float:
-        """Time between samples from which it is a gap [s]."""
+        """Time between samples above which there is a gap [s]."""
         return GAP * float(np.quantile(np.diff(self.t), MOST))
 
     @property
     def step(self) -> float:
-        """The mean time between samples, gaps apart [s]."""
+        """The mean time between samples without gaps [s]."""
         between = np.diff(self.t)
         return float(np.mean(between[between <= self.gap]))
 
     @property
-    def stretches(self) -> list[slice]:
+    def segments(self) -> list[slice]:
         """The samples between gaps."""
         ends = np.flatnonzero(np.diff(self.t) > self.gap) + 1
         return [
@@ -121,22 +112,24 @@ def _of_file(path: Path) -> dict[str, np.ndarray]:
             word.strip().removeprefix("# ") for word in next(csv.reader(file), [])
         ]  # numpy.savetxt's begins with "# "
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # no rows at all: told below
+            warnings.simplefilter("ignore")  # a file without rows is reported below
             try:
                 rows = np.genfromtxt(file, delimiter=",", ndmin=2)
             except ValueError as error:
                 short = re.search(r"Line #(\d+) \(got (\d+) columns instead of (\d+)\)", str(error))
                 if short is None:
-                    raise checks.fail(str(path), Said(str(error)), "rows of numbers") from error
-                came = Said(f"{short[2]} columns in row {int(short[1]) - 1}")
+                    raise checks.fail(
+                        str(path), checks.Words(str(error)), "rows of numbers"
+                    ) from error
+                came = checks.Words(f"{short[2]} columns in row {int(short[1]) - 1}")
                 raise checks.fail(
                     str(path),
                     came,
                     f"{short[3]}, as in the rows before",
-                    "Leave this row out: a gap is understood.",
+                    "Leave this row out: gaps are allowed.",
                 ) from error
     if "t" not in heading or rows.shape[1] != len(heading):
-        came = Said(
+        came = checks.Words(
             f"the heading {', '.join(heading) or 'of an empty file'} and rows of {rows.shape[1]}"
             " columns"
         )
@@ -147,7 +140,7 @@ def _of_file(path: Path) -> dict[str, np.ndarray]:
             "It begins t, q[0], q[1], ...",
         )
     if len(set(heading)) < len(heading):
-        raise checks.fail(str(path), Said(", ".join(heading)), "columns of different names")
+        raise checks.fail(str(path), checks.Words(", ".join(heading)), "columns of different names")
     found = {"t": rows[:, heading.index("t")]}
     for name in ("q", "dq", "tau"):
         own = {
@@ -158,7 +151,7 @@ def _of_file(path: Path) -> dict[str, np.ndarray]:
         missing = set(range(max(own, default=0) + 1)) - set(own)
         if own and missing:
             raise checks.fail(
-                str(path), Said(", ".join(heading)), f"a column {name}[{min(missing)}]"
+                str(path), checks.Words(", ".join(heading)), f"a column {name}[{min(missing)}]"
             )
         if own:
             found[name] = rows[:, [own[i] for i in range(len(own))]]
@@ -189,7 +182,7 @@ def _of_mapping(data: Any, what: str) -> dict[str, np.ndarray]:
 def _of_rollout(run: Rollout, what: str) -> dict[str, np.ndarray]:
     if np.ndim(run.t) != 1:
         raise checks.fail(
-            what, Said("a batch of runs"), "one run", "Give a list: [runs[0], runs[1]]."
+            what, checks.Words("a batch of runs"), "one run", "Give a list: [runs[0], runs[1]]."
         )
     if isinstance(run.measured, tuple) and not hasattr(run.measured, "q"):
         return {
@@ -197,7 +190,7 @@ def _of_rollout(run: Rollout, what: str) -> dict[str, np.ndarray]:
             "q": np.asarray(run.q, float),
             "tau": np.asarray(run.tau, float),
         }
-    # A sampled loop knows what it measured, at the start of each period.
+    # A sampled loop records its measurements at the start of each period.
     t, period = np.asarray(run.t, float), float(run.scenario.sampling.period)  # type: ignore[union-attr]
     taken = np.flatnonzero(np.abs(t / period - np.round(t / period)) < 1e-6)
     return {
@@ -212,7 +205,7 @@ def _checked(found: dict[str, np.ndarray], n: int, what: str) -> Log:
             columns = name if name == "t" else f"{name}[0] ... {name}[{n - 1}]"
             raise checks.fail(
                 what,
-                Said(f"no {name}"),
+                checks.Words(f"no {name}"),
                 f"t, q and tau: {columns} is missing",
                 "Of a CSV file the heading names the columns.",
             )
@@ -221,7 +214,7 @@ def _checked(found: dict[str, np.ndarray], n: int, what: str) -> Log:
         raise checks.fail(f"{what}: t", t, "one time a sample, (N,) [s]")
     for name in set(found) - {"t"}:
         if found[name].ndim != 2 or found[name].shape[1] != n:
-            came = Said(
+            came = checks.Words(
                 f"{found[name].shape[1]} joints"
                 if found[name].ndim == 2
                 else f"shape {found[name].shape}"
@@ -229,10 +222,14 @@ def _checked(found: dict[str, np.ndarray], n: int, what: str) -> Log:
             raise checks.fail(f"{what}: {name}", came, f"(N, {n}), as the scenario has {n} joints")
         if len(found[name]) != len(t):
             raise checks.fail(
-                f"{what}: {name}", Said(f"{len(found[name])} samples"), f"{len(t)}, as t has"
+                f"{what}: {name}",
+                checks.Words(f"{len(found[name])} samples"),
+                f"{len(t)}, as t has",
             )
     if len(t) < FEWEST:
-        raise checks.fail(what, Said(f"{len(t)} samples"), f"at least {FEWEST}", "Log for longer.")
+        raise checks.fail(
+            what, checks.Words(f"{len(t)} samples"), f"at least {FEWEST}", "Log for longer."
+        )
     broken = ~np.all(
         [np.isfinite(x).reshape(len(t), -1).all(axis=1) for x in found.values()], axis=0
     )
@@ -241,16 +238,16 @@ def _checked(found: dict[str, np.ndarray], n: int, what: str) -> Log:
         names = ", ".join(name for name, x in found.items() if not np.isfinite(x[first]).all())
         raise checks.fail(
             f"{what}: rows that hold no numbers",
-            Said(f"{int(broken.sum())} of {len(t)}, the first is row {first} (in {names})"),
+            checks.Words(f"{int(broken.sum())} of {len(t)}, the first is row {first} (in {names})"),
             "finite numbers",
-            "Leave these rows out: a gap is understood.",
+            "Leave these rows out: gaps are allowed.",
         )
     back = np.flatnonzero(np.diff(t) <= 0)
     if len(back):
         k = int(back[0])
         raise checks.fail(
             f"{what}: t",
-            Said(f"{t[k]:.9g} and then {t[k + 1]:.9g} in rows {k} and {k + 1}"),
+            checks.Words(f"{t[k]:.9g} and then {t[k + 1]:.9g} in rows {k} and {k + 1}"),
             "times that increase",
             "Leave out rows that repeat a time, or log times with more digits.",
         )

@@ -10,11 +10,11 @@ import numpy as np
 from iblf_jax.identification.coordinates import Coordinates, to_x
 from iblf_jax.identification.log import Log
 from iblf_jax.identification.regression import LARGEST_DELAY
-from iblf_jax.identification.replay import slopes, slopes_under
-from iblf_jax.identification.shooting import Prior, Replay, Windows, substeps_for
-from iblf_jax.identification.smoothing import Smoothed
-from iblf_jax.identification.standstill import Free
-from iblf_jax.identification.structure import LeftOut, left_out
+from iblf_jax.identification.replay import inverse_dynamics, inverse_dynamics_under
+from iblf_jax.identification.shooting import Prior, ShootingProblem, Windows, substeps_for
+from iblf_jax.identification.smoothing import SmoothedMotion
+from iblf_jax.identification.standstill import FreeTorques
+from iblf_jax.identification.structure import MissingTerms, missing_terms
 from iblf_jax.simulation.scenario import Scenario
 
 
@@ -31,7 +31,7 @@ class IdentificationProblem(NamedTuple):
     coordinates: Coordinates
     logs: list[Log]
     windows: Windows
-    smoothed: Smoothed
+    smooth: SmoothedMotion
     """Smoothed data of the logs, without the parts that are held back."""
     prior: Prior
     requested: int
@@ -56,14 +56,14 @@ class IdentificationProblem(NamedTuple):
             low = high = self.fixed_delay
         return np.append(self.coordinates.low, low), np.append(self.coordinates.high, high)
 
-    def replay(self, x: np.ndarray, free: Free) -> Replay:
+    def replay(self, x: np.ndarray, free: FreeTorques) -> ShootingProblem:
         """The simulation of all windows under the logged torque.
 
         Args:
           x: parameters at which the steps of the integrator are chosen.
           free: torques that are free near standstill.
         """
-        return Replay(
+        return ShootingProblem(
             self.simulated,
             self.coordinates,
             self.windows,
@@ -76,28 +76,28 @@ class IdentificationProblem(NamedTuple):
 
     def _substeps(self, x: np.ndarray) -> int:
         """Number of integrator steps between two samples."""
-        data = self.smoothed
+        data = self.smooth
         points = [jnp.asarray(a) for a in (data.t, data.q, data.dq, data.tau)]
-        sensitivities = slopes_under(
+        sensitivities = inverse_dynamics_under(
             self.simulated, jnp.asarray(x), *points, places=self.coordinates.places
         )
         return substeps_for(sensitivities, min(log.step for log in self.logs))
 
 
-def missing_terms(
-    simulated: Scenario, c: Coordinates, data: Smoothed, z: np.ndarray, fitted: np.ndarray
-) -> LeftOut:
+def missing_terms_of_fit(
+    simulated: Scenario, c: Coordinates, data: SmoothedMotion, z: np.ndarray, fitted: np.ndarray
+) -> MissingTerms:
     """The terms that a fit lacks.
 
     Args:
       simulated: scenario whose plant was simulated.
       c: coordinates of the parameters.
-      data: smoothed logs.
+      data: the smoothed logs.
       z: end of the fit, (p + 1,), the delay last.
       fitted: entries of z that the fit could move, (p + 1,) bool.
     """
     x, _ = to_x(c, z[:-1])
     points: list[Any] = [jnp.asarray(a) for a in (x, data.t, data.q, data.dq, data.ddq)]
-    at_end = slopes(simulated, *points, places=c.places)
+    at_end = inverse_dynamics(simulated, *points, places=c.places)
     torque, by_x = np.asarray(at_end.torque), np.asarray(at_end.by_x)
-    return left_out(data, torque, by_x, float(z[-1]), fitted)
+    return missing_terms(data, torque, by_x, float(z[-1]), fitted)

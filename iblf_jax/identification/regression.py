@@ -1,227 +1,273 @@
-"""The start: linear regression of the torques on the motion.
+"""The initial estimate: linear regression of the torques on the motion.
 
-    tau(t - d) = e(x; q, q', q") + noise,    e linear in masses, first and second moments, friction,
-    damping, armature, gravity
+    tau(t - d) = e(x; q, q', q") + noise
 
-so that one Gauss-Newton step ends the search where all leaves are such, and a few do elsewhere.
-The motion is smoothed (`smoothing`), and joints count by what is left of their torque.  Noise in q"
-biases it, and the more so in a loop that reacts to the noise: it is a start, no more.
+e is linear in masses, first and second moments, friction, damping, armature and gravity.  One
+Gauss-Newton step therefore solves the problem where all parameters are of these kinds, and a few
+steps do otherwise.  The motion comes from smoothed positions (`smoothing`), and each joint is
+weighted by its residual torque.  Noise in q" biases the estimate, most of all in a closed loop that
+reacts to the noise; the estimate is the start of the search only.
 
-Here a log that does not belong to the scenario is told: what another unit or another order of its
-  columns would explain is tried.
+This module also detects a log that does not belong to the scenario: it tests which other unit or
+order of columns would explain the torques.
 """
 
 from __future__ import annotations
 
 import itertools
 import re
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.identification.coordinates import Coordinates, scales, to_x, to_z
-from iblf_jax.identification.log import Said
-from iblf_jax.identification.replay import slopes
-from iblf_jax.identification.search import WEAK, Around, search
-from iblf_jax.identification.smoothing import Smoothed
+from iblf_jax.identification.coordinates import Coordinates, drive_limit, scales, to_x, to_z
+from iblf_jax.identification.replay import InverseDynamics, inverse_dynamics
+from iblf_jax.identification.search import WEAK_PRIOR, QuadraticModel, levenberg_marquardt
+from iblf_jax.identification.smoothing import SmoothedMotion
 from iblf_jax.world.robots import joint_names
+from iblf_jax.world.robots._base import robot_member
 
-ROUNDS = 3
-LITTLE = 0.3
-"""Share of the torques' variation below which the model explains nothing: the log does not belong
-to it."""
-POOR = 0.9
-"""Share of any joint's below which it is looked whether units or columns are wrong."""
+ROUNDS, STEPS = 3, 12
+"""Estimates of the joints' weights, and steps of the search for each of them."""
+BARELY_EXPLAINED = 0.3
+"""Share of the torques' variation below which the log does not belong to the model."""
+POORLY_EXPLAINED = 0.9
+"""Share of the variation of any joint's torque below which other units and columns are tested."""
 WRONG_SIZE = 30.0
-"""Torques that are so many times what the scenario's numbers ask for are in another unit."""
+"""Ratio of the logged torque to that of the scenario's robot from which the unit is wrong."""
 OTHER_ROBOT = 5.0
-"""Factor from which masses that all grew or shrank by it speak of another unit."""
+"""Factor of all masses from which the unit of the torques is wrong."""
 OTHER_UNITS = {
     "with tau of the other sign": -1.0,
     "with tau in kgf m": 9.80665,
     "with tau in lbf ft": 1.35582,
     "with tau in lbf in": 0.112985,
 }
-"""Torques as they are logged too, and their factor to N m."""
+"""Other units in which torques are logged, and their factors to N m."""
 SLOWEST = 0.02
-"""Speed, root of the mean square over all joints, below which a robot stands still [rad/s]."""
+"""Speed, root mean square over all joints, below which a robot is at standstill [rad/s]."""
 FAR = 0.1
-"""Motion that one who stands still does not make [rad]: if it is that slow, the times are in
-another unit."""
+"""Range of motion that a robot at standstill does not have [rad]; with it, a low speed means that
+the times are in another unit."""
 OUTSIDE = 0.1
-"""Part of a joint's range by which a log may be outside of it."""
+"""Share of a joint's range by which a log may be outside the range."""
 LARGEST_DELAY = 0.1
 """[s]"""
 
 
-class Start(NamedTuple):
-    """What the regression found."""
+class InitialEstimate(NamedTuple):
+    """The result of the regression."""
 
     z: np.ndarray
     delay: float
     scale: np.ndarray
-    """Of x, (p,)."""
+    """Scales of x, (p,)."""
     explained: np.ndarray
-    """Share of each torque's variation, (n,)."""
+    """Explained share of the variation of each torque, (n,)."""
     noise: np.ndarray
-    """Of the positions, (n,) [rad]."""
+    """Standard deviation of the noise of the positions, (n,) [rad]."""
 
 
-def started(scenario: Any, c: Coordinates, seen: Smoothed, what: str, delay: float | None) -> Start:
-    """Numbers to refine.
+def initial_estimate(
+    scenario: Any, c: Coordinates, motion: SmoothedMotion, what: str, delay: float | None
+) -> InitialEstimate:
+    """The parameters from which the search starts.
 
     Args:
-      scenario: whose plant is looked for.
+      scenario: scenario whose plant is identified.
       c: the coordinates.
-      seen: the logs, smoothed.
+      motion: the smoothed logs.
       what: the user's word for the log.
-      delay: of the torque [s]; looked for if None.
+      delay: delay of the torque [s]; estimated if None.
 
     Raises:
       ValueError: the log does not belong to the scenario.
     """
-    _moves(scenario, seen, what)
-    first = _slopes(scenario, c, c.x, seen)
-    _plausible(scenario, first.torque, seen, what)
-    scale = scales(c, scenario, np.asarray(first.by_x), seen.tau)
-    p, z0 = len(c.x), to_z(c, c.x)
-    scale_z = np.append(coordinate_scales(c, scale), 0.01)
-    sigma = np.sqrt(np.mean((seen.tau - np.mean(seen.tau, axis=0)) ** 2, axis=0)) + 1e-9
-    fixed = 0.0 if delay is None else delay
-    ends = (
-        np.append(c.low, -LARGEST_DELAY if delay is None else fixed),
-        np.append(c.high, LARGEST_DELAY if delay is None else fixed),
-    )
-    z, rest = np.append(z0, fixed), np.zeros_like(seen.tau)
+    _check_motion(scenario, motion, what)
+    first = _inverse_dynamics_at(scenario, c, c.x, motion)
+    _check_torque_size(scenario, first.torque, motion, what)
+    scale = scales(c, scenario, np.asarray(first.by_x), motion.tau)
+    low_delay, start_delay, high_delay = -LARGEST_DELAY, 0.0, LARGEST_DELAY
+    if delay is not None:
+        low_delay = start_delay = high_delay = delay
+    limits = np.append(c.low, low_delay), np.append(c.high, high_delay)
+    z = np.append(to_z(c, c.x), start_delay)
+    z_scale = np.append(coordinate_scales(c, scale), 0.01)
+    spread = np.sqrt(np.mean((motion.tau - np.mean(motion.tau, axis=0)) ** 2, axis=0))
+    sigma = spread + 1e-9
+    residual = np.zeros_like(motion.tau)
+    start = z
     for _ in range(ROUNDS):
+        regression = _Regression(scenario, c, motion, start, z_scale, sigma)
+        z, _, _ = levenberg_marquardt(
+            regression.linearized(z),
+            z,
+            limits,
+            z_scale,
+            regression.trial,
+            regression.linearized,
+            STEPS,
+        )
+        residual = regression.residual(regression.dynamics(z), z)
+        sigma = np.sqrt(np.mean(residual**2, axis=0)) + 1e-3 * sigma
+    explained = _explained(residual, motion.tau)
+    if np.min(explained) < POORLY_EXPLAINED:
+        _check_explained(scenario, c, motion, residual, what)
+    _check_masses(c, to_x(c, z[:-1])[0], what)
+    return InitialEstimate(z[:-1], float(z[-1]), scale, explained, motion.noise)
 
-        def residual(torque, shift):
-            return seen.tau - shift * seen.dtau - np.asarray(torque)
 
-        def full(z, found, sigma=sigma):
-            x, slope = to_x(c, z[:-1])
-            found = _slopes(scenario, c, x, seen) if found is None else found
-            r = residual(found.torque, z[-1]) / sigma
-            J = (
-                np.concatenate([-np.asarray(found.by_x) @ slope, -seen.dtau[..., None]], axis=-1)
-                / sigma[:, None]
-            )
-            weak, away = 1.0 / (WEAK * scale_z) ** 2, z - np.append(z0, fixed)
-            slope_ = np.einsum("pna,pn->a", J, r) + weak * away
-            matrix = np.einsum("pna,pnb->ab", J, J) + np.diag(weak)
-            return Around(0.5 * float(np.sum(r**2) + np.sum(weak * away**2)), slope_, matrix)
+class _Regression(NamedTuple):
+    """The least-squares problem of the torques for given weights of the joints."""
 
-        def attempt(here, z, step):
-            x, _ = to_x(c, (z + step)[:-1])
-            found = _slopes(scenario, c, x, seen)
-            return full(z + step, found).cost, found
+    scenario: Any
+    coordinates: Coordinates
+    motion: SmoothedMotion
+    start: np.ndarray
+    """z at the start, (p + 1,), the delay last."""
+    scale: np.ndarray
+    """Scales of z, (p + 1,)."""
+    sigma: np.ndarray
+    """Standard deviation of each joint's residual, (n,) [N m]."""
 
-        z, _, _ = search(full(z, None), z, ends, scale_z, attempt, full, 12)
-        rest = residual(_slopes(scenario, c, to_x(c, z[:-1])[0], seen).torque, z[-1])
-        sigma = np.sqrt(np.mean(rest**2, axis=0)) + 1e-3 * sigma
-    explained = _explained(rest, seen.tau)
-    if np.min(explained) < POOR:
-        _say_what_is_wrong(scenario, c, seen, rest, what)
-    _same_size(c, to_x(c, z[:-1])[0], what)
-    return Start(z[:p], float(z[-1]), scale, explained, seen.noise)
+    def dynamics(self, z: np.ndarray) -> InverseDynamics:
+        """The torques of the model at z, and their derivatives."""
+        x, _ = to_x(self.coordinates, z[:-1])
+        return _inverse_dynamics_at(self.scenario, self.coordinates, x, self.motion)
+
+    def residual(self, dynamics: InverseDynamics, z: np.ndarray) -> np.ndarray:
+        """Logged less modelled torques, (P, n) [N m]."""
+        return self.motion.tau - z[-1] * self.motion.dtau - np.asarray(dynamics.torque)
+
+    def linearized(self, z: np.ndarray, dynamics: InverseDynamics | None = None) -> QuadraticModel:
+        """The quadratic model at z; the dynamics there are computed if they are not given."""
+        if dynamics is None:
+            dynamics = self.dynamics(z)
+        _, x_by_z = to_x(self.coordinates, z[:-1])
+        r = self.residual(dynamics, z) / self.sigma
+        by_z = -np.asarray(dynamics.by_x) @ x_by_z
+        by_delay = -self.motion.dtau[..., None]
+        J = np.concatenate([by_z, by_delay], axis=-1) / self.sigma[:, None]
+        weak = 1.0 / (WEAK_PRIOR * self.scale) ** 2
+        offset = z - self.start
+        gradient = np.einsum("pna,pn->a", J, r) + weak * offset
+        hessian = np.einsum("pna,pnb->ab", J, J) + np.diag(weak)
+        cost = 0.5 * float(np.sum(r**2) + np.sum(weak * offset**2))
+        return QuadraticModel(cost, gradient, hessian)
+
+    def trial(self, here: QuadraticModel, z: np.ndarray, step: np.ndarray) -> tuple[float, Any]:
+        """The objective after a step, and the dynamics there."""
+        dynamics = self.dynamics(z + step)
+        return self.linearized(z + step, dynamics).cost, dynamics
 
 
 def coordinate_scales(c: Coordinates, scale: np.ndarray) -> np.ndarray:
-    """Scales of z, from those of x."""
+    """The scales of z that follow from those of x."""
     scale = scale.copy()
-    for at in c.bodies:
-        scale[at : at + 6] = [1.0, 1.0, 1.0, *np.full(3, np.sqrt(scale[at]))]
+    for first in c.bodies:
+        scale[first : first + 6] = [1.0, 1.0, 1.0, *np.full(3, np.sqrt(scale[first]))]
     return scale
 
 
-def _slopes(scenario: Any, c: Coordinates, x: np.ndarray, seen: Smoothed) -> Any:
-    arrays = (jnp.asarray(a) for a in (x, seen.t, seen.q, seen.dq, seen.ddq))
-    return slopes(scenario, *arrays, places=c.places)
+def _inverse_dynamics_at(
+    scenario: Any, c: Coordinates, x: np.ndarray, motion: SmoothedMotion
+) -> InverseDynamics:
+    points: list[Any] = [jnp.asarray(a) for a in (x, motion.t, motion.q, motion.dq, motion.ddq)]
+    return inverse_dynamics(scenario, *points, places=c.places)
 
 
-def _explained(rest: np.ndarray, tau: np.ndarray) -> np.ndarray:
+def _explained(residual: np.ndarray, tau: np.ndarray) -> np.ndarray:
+    """Explained share of the variation of each torque, (n,)."""
     spread = np.sum((tau - tau.mean(axis=0)) ** 2, axis=0)
-    return 1.0 - np.sum(rest**2, axis=0) / np.maximum(spread, 1e-300)
+    return 1.0 - np.sum(residual**2, axis=0) / np.maximum(spread, 1e-300)
 
 
-def _left(rest: np.ndarray, tau: np.ndarray) -> float:
-    """Share of the torques' variation that is left, the mean over the joints: a small joint whose
-    column is wrong is seen too.
+def _unexplained_share(residual: np.ndarray, tau: np.ndarray) -> float:
+    """Unexplained share of the torques' variation, averaged over the joints, so that a wrong column
+    of a small joint counts as well.
     """
-    return float(np.mean(np.minimum(1.0 - _explained(rest, tau), 1.0)))
+    return float(np.mean(np.minimum(1.0 - _explained(residual, tau), 1.0)))
 
 
-# ------------------------------------------------------------------------------------------------------------ does it belong?
+# ----------------------------------------------------------------- checks of the log
 
 
-def _moves(scenario: Any, seen: Smoothed, what: str) -> None:
-    """Raises ValueError for a robot that stands still, or that is where it cannot be."""
-    speed = np.sqrt(np.mean(seen.dq**2, axis=0))
-    if np.sqrt(np.sum(speed**2)) < SLOWEST:
-        far, long = float(np.max(np.ptp(seen.q, axis=0))), float(np.ptp(seen.t))
-        if far > FAR:
-            raise checks.fail(
-                f"{what}: t",
-                Said(f"{far:.3g} rad of motion in {long:.4g} s"),
-                f"times in s, and motion of at least {SLOWEST:g} rad/s",
-                "Divide times in ms by 1000.",
-            )
-        raise checks.fail(
-            what,
-            Said(
-                f"a robot that stands still: its joints move at {np.sqrt(np.sum(speed**2)):.2g}"
-                " rad/s (root of the mean square)"
-            ),
-            f"motion of at least {SLOWEST:g} rad/s",
-            "Log while it follows ij.excitation(scenario, paths).",
-        )
+def _check_motion(scenario: Any, motion: SmoothedMotion, what: str) -> None:
+    """Raises ValueError for a robot at standstill, or for a motion that is impossible."""
+    speed = np.sqrt(np.mean(motion.dq**2, axis=0))
+    _check_speed(motion, float(np.sqrt(np.sum(speed**2))), what)
     names = joint_names(scenario.plant, scenario.n)
-    turns = [
-        kind == "revolute" for kind in getattr(scenario.plant, "kinds", ("revolute",) * scenario.n)
-    ]
-    for name, row in _ranges(scenario).items():
-        for j, (low, high) in enumerate(row):
-            least, most = float(seen.q[:, j].min()), float(seen.q[:, j].max())
-            room = OUTSIDE * (high - low)
-            if least < low - room or most > high + room:
-                degrees = (
-                    turns[j] and low - room <= np.radians(least) and np.radians(most) <= high + room
-                )
-                remedy = (
-                    "It would fit in degrees: convert it to rad."
-                    if degrees
-                    else "Check units and the order of the columns."
-                )
-                raise checks.fail(
-                    f"{what}: q[{j}] ({names[j]})",
-                    Said(f"{least:.4g} to {most:.4g} rad"),
-                    f"positions inside {name}, {low:.4g} to {high:.4g} rad",
-                    remedy,
-                )
-    logged = np.isfinite(seen.measured).all(axis=1)
-    if logged.any():
-        apart = np.sqrt(np.mean((seen.measured - seen.dq)[logged] ** 2, axis=0))
-        worst = int(np.argmax(apart / (speed + 1e-6)))
-        if apart[worst] > 0.5 * speed[worst] + 0.05:
+    _check_positions(scenario, motion, names, what)
+    logged = np.isfinite(motion.measured).all(axis=1)
+    if not logged.any():
+        return
+    difference = np.sqrt(np.mean((motion.measured - motion.dq)[logged] ** 2, axis=0))
+    worst = int(np.argmax(difference / (speed + 1e-6)))
+    if difference[worst] > 0.5 * speed[worst] + 0.05:
+        rms = np.sqrt(np.mean(motion.measured[logged, worst] ** 2))
+        raise checks.fail(
+            f"{what}: dq[{worst}] ({names[worst]})",
+            checks.Words(f"{rms:.3g} rad/s (root mean square)"),
+            f"the rate of q[{worst}], {speed[worst]:.3g} rad/s",
+            "Check units and the order of the columns.",
+        )
+
+
+def _check_speed(motion: SmoothedMotion, speed: float, what: str) -> None:
+    """Raises ValueError for a robot at standstill; `speed` is the root mean square [rad/s]."""
+    if speed >= SLOWEST:
+        return
+    far, duration = float(np.max(np.ptp(motion.q, axis=0))), float(np.ptp(motion.t))
+    if far > FAR:
+        raise checks.fail(
+            f"{what}: t",
+            checks.Words(f"{far:.3g} rad of motion in {duration:.4g} s"),
+            f"times in s, and motion of at least {SLOWEST:g} rad/s",
+            "Divide times in ms by 1000.",
+        )
+    raise checks.fail(
+        what,
+        checks.Words(
+            f"a robot that stands still: its joints move at {speed:.2g} rad/s (root mean square)"
+        ),
+        f"motion of at least {SLOWEST:g} rad/s",
+        "Log while it follows ij.excitation(scenario, paths).",
+    )
+
+
+def _check_positions(
+    scenario: Any, motion: SmoothedMotion, names: tuple[str, ...], what: str
+) -> None:
+    """Raises ValueError for positions outside the ranges of the joints."""
+    kinds = robot_member(scenario.plant, "kinds") or ("revolute",) * scenario.n
+    for range_name, limits in _ranges(scenario).items():
+        for j, (low, high) in enumerate(limits):
+            least, most = float(motion.q[:, j].min()), float(motion.q[:, j].max())
+            tolerance = OUTSIDE * (high - low)
+            low_end, high_end = low - tolerance, high + tolerance
+            if low_end <= least and most <= high_end:
+                continue
+            remedy = "Check units and the order of the columns."
+            fits_in_degrees = low_end <= np.radians(least) and np.radians(most) <= high_end
+            if kinds[j] == "revolute" and fits_in_degrees:
+                remedy = "It would fit in degrees: convert it to rad."
             raise checks.fail(
-                f"{what}: dq[{worst}] ({names[worst]})",
-                Said(
-                    f"{np.sqrt(np.mean(seen.measured[logged, worst] ** 2)):.3g} rad/s (root of the"
-                    " mean square)"
-                ),
-                f"the rate of q[{worst}], {speed[worst]:.3g} rad/s",
-                "Check units and the order of the columns.",
+                f"{what}: q[{j}] ({names[j]})",
+                checks.Words(f"{least:.4g} to {most:.4g} rad"),
+                f"positions inside {range_name}, {low:.4g} to {high:.4g} rad",
+                remedy,
             )
 
 
 def _ranges(scenario: Any) -> dict[str, np.ndarray]:
-    """Where the joints can be: within the arm's limits, if it has any, and within a turn and a half
-    of the bounds.
+    """The ranges of the joints, (n, 2) each: the arm's limits, if it has any, and the bounds with a
+    margin of 8 times their width.
     """
     found = {}
-    limits = getattr(scenario.plant, "limits", None)
+    limits = robot_member(scenario.plant, "limits")
     if limits is not None:
         found["the arm's limits"] = np.stack(
             [np.asarray(limits.lower), np.asarray(limits.upper)], axis=1
@@ -238,36 +284,40 @@ def _ranges(scenario: Any) -> dict[str, np.ndarray]:
     return found
 
 
-def _plausible(scenario: Any, needed: Any, seen: Smoothed, what: str) -> None:
-    """Raises ValueError for torques in another unit."""
-    own, asked = (np.sqrt(np.sum(np.mean(np.asarray(x) ** 2, axis=0))) for x in (seen.tau, needed))
-    ratio = own / max(asked, 1e-12)
+def _check_torque_size(scenario: Any, modelled: Any, motion: SmoothedMotion, what: str) -> None:
+    """Raises ValueError for torques in another unit; `modelled` are those of the scenario's
+    robot.
+    """
+    logged_rms, model_rms = (
+        np.sqrt(np.sum(np.mean(np.asarray(x) ** 2, axis=0))) for x in (motion.tau, modelled)
+    )
+    ratio = logged_rms / max(model_rms, 1e-12)
     if ratio > WRONG_SIZE or ratio < 1.0 / WRONG_SIZE:
         raise checks.fail(
             f"{what}: tau",
-            Said(
-                f"{own:.3g} N m (root of the mean square), {ratio:.3g} times what the scenario's"
+            checks.Words(
+                f"{logged_rms:.3g} N m (root mean square), {ratio:.3g} times what the scenario's"
                 " robot needs for this motion"
             ),
-            f"about {asked:.3g} N m",
+            f"about {model_rms:.3g} N m",
             "Convert it to N m (from N mm, from a motor's side of its gear, from amperes), or"
             " check q.",
         )
-    effort = np.asarray(getattr(scenario.plant, "effort", np.full(scenario.n, np.inf)))
-    most = np.max(np.abs(seen.tau), axis=0)
+    effort = np.broadcast_to(drive_limit(scenario.plant, "effort"), (scenario.n,))
+    most = np.max(np.abs(motion.tau), axis=0)
     if np.any(most > 3.0 * effort):
         j = int(np.argmax(most / effort))
         raise checks.fail(
             f"{what}: tau[{j}]",
-            Said(f"up to {most[j]:.4g} N m"),
-            f"what the joint can give, {effort[j]:.4g} N m",
+            checks.Words(f"up to {most[j]:.4g} N m"),
+            f"at most the joint's largest torque, {effort[j]:.4g} N m",
             "Convert it to N m.",
         )
 
 
-def _same_size(c: Coordinates, x: np.ndarray, what: str) -> None:
-    """Raises ValueError for torques that ask for quite another robot: all of its masses many times
-    larger, or smaller.
+def _check_masses(c: Coordinates, x: np.ndarray, what: str) -> None:
+    """Raises ValueError for torques of a very different robot, all masses of which are many times
+    larger or smaller.
     """
     links = [
         i
@@ -278,7 +328,7 @@ def _same_size(c: Coordinates, x: np.ndarray, what: str) -> None:
     if len(links) and (np.min(factor) > OTHER_ROBOT or np.max(factor) < 1.0 / OTHER_ROBOT):
         raise checks.fail(
             f"{what}: tau",
-            Said(
+            checks.Words(
                 f"torques of a robot whose masses are {np.min(factor):.3g} to {np.max(factor):.3g}"
                 " times the scenario's"
             ),
@@ -287,67 +337,78 @@ def _same_size(c: Coordinates, x: np.ndarray, what: str) -> None:
         )
 
 
-def _say_what_is_wrong(
-    scenario: Any, c: Coordinates, seen: Smoothed, rest: np.ndarray, what: str
+def _check_explained(
+    scenario: Any, c: Coordinates, motion: SmoothedMotion, residual: np.ndarray, what: str
 ) -> None:
     """Raises ValueError if other columns or units explain the torques, or if nothing does."""
-    spread = np.sum((seen.tau - seen.tau.mean(axis=0)) ** 2)
-    share = 1.0 - np.sum(rest**2) / spread
-    own, words = _left(rest, seen.tau), ""
-    best = own
-    same = _slopes(scenario, c, c.x, seen)
-    for said, other in _otherwise(seen):
-        found = same if other.q is seen.q else _slopes(scenario, c, c.x, other)
-        J, r = np.asarray(found.by_x), other.tau - np.asarray(found.torque)
-        A = J.reshape(-1, J.shape[-1])
-        weight = np.tile(1.0 / (other.tau.std(axis=0) + 1e-9), len(r))
-        step = np.linalg.lstsq(A * weight[:, None], r.ravel() * weight, rcond=1e-6)[0]
-        left = _left(r - J @ step, other.tau)
-        if left < min(0.5 * best, 1.0 - LITTLE):
-            best, words = left, said
-    if words:
+    unexplained = _unexplained_share(residual, motion.tau)
+    best, best_reading = unexplained, ""
+    same = _inverse_dynamics_at(scenario, c, c.x, motion)
+    for reading, other in _alternative_readings(motion):
+        dynamics = same
+        if other.q is not motion.q:
+            dynamics = _inverse_dynamics_at(scenario, c, c.x, other)
+        share = _unexplained_by_regression(dynamics, other)
+        if share < min(0.5 * best, 1.0 - BARELY_EXPLAINED):
+            best, best_reading = share, reading
+    if best_reading:
         raise checks.fail(
             what,
-            Said(
-                f"torques of which these parameters explain {1.0 - own:.0%}, the mean over joints; "
-                f"{words}, they would explain {1.0 - best:.0%}"
+            checks.Words(
+                f"torques of which these parameters explain {1.0 - unexplained:.0%}, the mean over"
+                f" joints; {best_reading}, they would explain {1.0 - best:.0%}"
             ),
             "columns in order and SI units",
             "Check the log.",
         )
-    if share < LITTLE:
+    spread = np.sum((motion.tau - motion.tau.mean(axis=0)) ** 2)
+    explained = 1.0 - np.sum(residual**2) / spread
+    if explained < BARELY_EXPLAINED:
         raise checks.fail(
             what,
-            Said(f"torques of which these parameters explain {max(share, 0.0):.0%}"),
-            f"at least {LITTLE:.0%}",
-            "Check that the log is of this robot, its units and columns; or look for more"
+            checks.Words(f"torques of which these parameters explain {max(explained, 0.0):.0%}"),
+            f"at least {BARELY_EXPLAINED:.0%}",
+            "Check that the log is of this robot, its units and columns; or identify more"
             " parameters.",
         )
 
 
-def _otherwise(seen: Smoothed) -> Any:
-    """The log read in other ways, in words."""
-    n = seen.q.shape[1]
+def _unexplained_by_regression(dynamics: InverseDynamics, motion: SmoothedMotion) -> float:
+    """The unexplained share of the torques after one linear regression step."""
+    J = np.asarray(dynamics.by_x)
+    r = motion.tau - np.asarray(dynamics.torque)
+    A = J.reshape(-1, J.shape[-1])
+    weight = np.tile(1.0 / (motion.tau.std(axis=0) + 1e-9), len(r))
+    step = np.linalg.lstsq(A * weight[:, None], r.ravel() * weight, rcond=1e-6)[0]
+    return _unexplained_share(r - J @ step, motion.tau)
+
+
+def _alternative_readings(motion: SmoothedMotion) -> Iterator[tuple[str, SmoothedMotion]]:
+    """Other units, signs and orders of the columns: the description, and the log with them."""
+    n = motion.q.shape[1]
     turn = np.pi / 180.0
     yield (
         "with q in degrees",
-        seen._replace(q=seen.q * turn, dq=seen.dq * turn, ddq=seen.ddq * turn),
+        motion._replace(q=motion.q * turn, dq=motion.dq * turn, ddq=motion.ddq * turn),
     )
     for words, factor in OTHER_UNITS.items():
-        yield words, seen._replace(tau=factor * seen.tau)
-    for j in range(n if n > 1 else 0):
+        yield words, motion._replace(tau=factor * motion.tau)
+    joints = range(n) if n > 1 else ()
+    for j in joints:
         sign = np.where(np.arange(n) == j, -1.0, 1.0)
-        yield f"with tau[{j}] of the other sign", seen._replace(tau=sign * seen.tau)
-        turned = seen._replace(q=sign * seen.q, dq=sign * seen.dq, ddq=sign * seen.ddq)
+        yield f"with tau[{j}] of the other sign", motion._replace(tau=sign * motion.tau)
+        turned = motion._replace(q=sign * motion.q, dq=sign * motion.dq, ddq=sign * motion.ddq)
         yield f"with q[{j}] of the other sign", turned
-        yield f"with q[{j}] and tau[{j}] of the other sign", turned._replace(tau=sign * seen.tau)
+        yield f"with q[{j}] and tau[{j}] of the other sign", turned._replace(tau=sign * motion.tau)
     for i, j in itertools.combinations(range(n), 2):
         order = list(range(n))
         order[i], order[j] = j, i
-        yield f"with tau[{i}] and tau[{j}] exchanged", seen._replace(tau=seen.tau[:, order])
-        moved = seen._replace(q=seen.q[:, order], dq=seen.dq[:, order], ddq=seen.ddq[:, order])
+        yield f"with tau[{i}] and tau[{j}] exchanged", motion._replace(tau=motion.tau[:, order])
+        moved = motion._replace(
+            q=motion.q[:, order], dq=motion.dq[:, order], ddq=motion.ddq[:, order]
+        )
         yield f"with q[{i}] and q[{j}] exchanged", moved
         yield (
             f"with joints {i} and {j} exchanged, q and tau",
-            moved._replace(tau=seen.tau[:, order]),
+            moved._replace(tau=motion.tau[:, order]),
         )

@@ -1,4 +1,4 @@
-"""What `identify` gives back: an `Identification`, which prints as a table."""
+"""The result of `identify`: an `Identification`, which prints as a table."""
 
 from __future__ import annotations
 
@@ -13,13 +13,19 @@ import numpy as np
 
 from iblf_jax.core import checks, tables
 from iblf_jax.core.presentation import present
-from iblf_jax.identification.coordinates import DELAY, OFFSET, Coordinates, to_x
-from iblf_jax.identification.problem import IdentificationProblem, missing_terms
-from iblf_jax.identification.regression import Start
-from iblf_jax.identification.shooting import Refined, Windows
-from iblf_jax.identification.statistics import UNKNOWN, Known, Whiteness, in_words, known, whiteness
-from iblf_jax.identification.structure import LeftOut, biased, remedy_for
-from iblf_jax.identification.structure import in_words as in_words_of
+from iblf_jax.identification.coordinates import DELAY, OFFSET, Coordinates, plant_path, to_x
+from iblf_jax.identification.problem import IdentificationProblem, missing_terms_of_fit
+from iblf_jax.identification.regression import InitialEstimate
+from iblf_jax.identification.shooting import Refinement, Windows
+from iblf_jax.identification.statistics import (
+    IDENTIFIABLE_BELOW,
+    Uncertainty,
+    Whiteness,
+    describe_direction,
+    uncertainty,
+    whiteness,
+)
+from iblf_jax.identification.structure import MissingTerms, biased, describe_finding, remedy_for
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.paths import parameters, with_parameters
 from iblf_jax.simulation.scenario import Scenario
@@ -30,35 +36,35 @@ WHITE, SLIGHT = 1e-3, 0.05
 """Probability (Ljung and Box) below which residuals count as coloured, if an autocorrelation is
 above the second."""
 LACKS, FINEST = 1.5, 1e-5
-"""Times the positions' noise from which what is left is not noise, and the least noise that counts
-[rad]."""
+"""Residual relative to the positions' noise above which the model is incomplete, and the smallest
+noise that is assumed [rad]."""
 MORE_THAN_NOISE = 1.05
-"""Times the positions' noise from which terms are looked for that the fit lacks."""
+"""Residual relative to the positions' noise above which missing terms are searched."""
 CLEARLY = 1.1
-"""Times that standard errors are widened from which it is told."""
-SEEN = 1e-8
-"""Part of the best known combination's information from which one counts in what the log would do
-without limits."""
+"""Ratio of standard errors to those for white noise above which a note reports it."""
+LEAST_INFORMATION = 1e-8
+"""Information of a combination, relative to the best one, above which it enters the step without
+limits."""
 AT_END = 1e-6
 """Distance from a limit, in scales, within which a number is at it."""
 
 
 class Number(NamedTuple):
-    """One number that was looked for."""
+    """One identified parameter."""
 
     name: str
     unit: str
     start: float
     value: float | None
-    """None where the log cannot tell it."""
+    """None where the log does not identify it."""
     error: float | None
     """Standard error."""
     verdict: str
-    """"told", "cannot be told", "at its limit", "left free": the width of a friction that is not of
-    this law, or "biased": a term that was left out of the fit moves it by more than its standard
-    error, or by more than 5 % of it."""
+    """"told", "cannot be told", "at its limit", "left free" for the width of a friction that does
+    not obey this law, or "biased" where a missing term moves the value by more than its standard
+    error or by more than 5 %."""
     bias: float | None = None
-    """What the terms that were left out add to it, where it is biased."""
+    """The bias by missing terms, where it is biased."""
 
     @property
     def digits(self) -> str:
@@ -69,74 +75,72 @@ class Number(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """What is left of one joint's positions, root of the mean square over windows, each from the
-    start that fits it best.
-    """
+    """Residuals of one joint's positions, root mean square over windows with their best starts."""
 
     joint: str
     before: float
-    """With the numbers of the start [rad]."""
+    """With the parameters of the start [rad]."""
     after: float
     held_back: float
-    """On windows that were not fitted [rad]; NaN without any."""
+    """On windows that were held back [rad]; NaN without any."""
     correlation: float
-    """The largest autocorrelation of what is left, in size."""
+    """The largest absolute autocorrelation of the residuals."""
     white: float
-    """Probability of one as large in white noise."""
+    """Probability of such an autocorrelation in white noise."""
     explained: float
     """Share of the torque's variation that the regression explained."""
     noise: float
-    """What smooth curves leave of the logged positions: noise and counts of the encoder [rad]."""
+    """Logged positions about smooth curves: noise and quantisation of the encoder [rad]."""
 
     @property
     def lacking(self) -> float:
-        """How many times the noise of the positions is left."""
+        """The residual relative to the noise of the positions."""
         return self.after / max(self.noise, FINEST)
 
     @property
     def has_structure(self) -> bool:
-        """Whether what is left may follow something: it is more than the positions' noise, or
+        """Whether the residuals may have a cause: they are larger than the positions' noise, or
         coloured and no rounding.
         """
         return self.lacking > MORE_THAN_NOISE or (not self.is_white and self.after > FINEST)
 
     @property
     def is_white(self) -> bool:
-        """Whether what is left is noise: no correlation that is both certain and of a size."""
+        """Whether the residuals are white: no significant correlation of more than SLIGHT."""
         return self.white >= WHITE or self.correlation < SLIGHT
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Identification:
-    """Parameters from a log: values, how well they are known, and what the log cannot tell."""
+    """Parameters from a log: values, standard errors, and what the log does not identify."""
 
     scenario: Scenario
-    """With the new numbers, in plant and model alike where the paths were the robot's or the
-    plant's; what the log cannot tell is left where it agrees with what it can."""
+    """The scenario with the new parameters, in plant and model for paths of the robot or the plant;
+    parameters that are not identifiable have values that agree with the identifiable ones."""
     start: Scenario
     paths: tuple[str, ...]
-    """As asked for, and after them the widths of friction that were looked for with it."""
+    """The requested paths, and after them the widths of friction that were identified as well."""
     asked: int
-    """How many of the paths were asked for."""
+    """Number of requested paths."""
     numbers: tuple[Number, ...]
     covariance: np.ndarray
-    """Of the numbers, (p, p); zero where one cannot be told."""
+    """Of the parameters, (p, p); zero where one is not identifiable."""
     delay: float
-    """How late the logged torque acts [s]."""
+    """Delay of the logged torque [s]."""
     delay_error: float | None
-    """Its standard error, infinite if it cannot be told; None if it was given."""
+    """Its standard error, infinite if it is not identifiable; None if it was given."""
     singular_values: np.ndarray
-    """How well each combination is known, from the best on: their inverse is its standard error, in
-    the numbers' scales, (p,)."""
+    """Of the combinations, in decreasing order; their inverses are the standard errors, in the
+    parameters' scales, (p,)."""
     combinations: tuple[str, ...]
-    """The combinations, each number in its scale, by their paths."""
+    """The combinations of parameters in their scales, as text with their paths."""
     untold: tuple[str, ...]
-    """Those that the log cannot tell."""
+    """The combinations that the log does not identify."""
     scales: np.ndarray
-    """(p,), in the numbers' units."""
+    """(p,), in the parameters' units."""
     fit: tuple[Fit, ...]
     residuals: np.ndarray
-    """Logged less replayed positions, (W, K + 1, n) [rad]."""
+    """Logged less simulated positions, (W, K + 1, n) [rad]."""
     times: np.ndarray
     """(W, K + 1) [s]."""
     kept: np.ndarray
@@ -150,12 +154,12 @@ class Identification:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What each number is called, (p,)."""
+        """Names of the parameters, (p,)."""
         return tuple(number.name for number in self.numbers)
 
     @property
     def wanted(self) -> tuple[Number, ...]:
-        """The numbers that were asked for."""
+        """The requested parameters, without the added widths."""
         return self.numbers[
             : sum(
                 math.prod(np.shape(paths.get(self.start, path)))
@@ -165,21 +169,21 @@ class Identification:
 
     @cached_property
     def values(self) -> dict[str, np.ndarray]:
-        """Path -> value in the leaf's unit, NaN where the log cannot tell it."""
+        """Path -> value in the leaf's unit, NaN where it is not identifiable."""
         return self._by_path(
             [math.nan if number.value is None else number.value for number in self.numbers]
         )
 
     @cached_property
     def standard_errors(self) -> dict[str, np.ndarray]:
-        """Path -> standard error in the leaf's unit, infinite where the log cannot tell it."""
+        """Path -> standard error in the leaf's unit, infinite where it is not identifiable."""
         return self._by_path(
             [math.inf if number.error is None else number.error for number in self.numbers]
         )
 
     @property
     def correlation(self) -> np.ndarray:
-        """Of the numbers' errors, (p, p); NaN where one cannot be told."""
+        """Of the numbers' errors, (p, p); NaN where one is not identifiable."""
         size = np.sqrt(np.diag(self.covariance))
         with np.errstate(invalid="ignore", divide="ignore"):
             return self.covariance / size[:, None] / size
@@ -195,33 +199,33 @@ class Identification:
 
     @cached_property
     def perturbations(self) -> dict[str, Perturbation]:
-        """What the log leaves open, for `monte_carlo`, `sweep` and `tune`: the told numbers of the
-        plant, jointly normal.
+        """The remaining uncertainty for `monte_carlo`, `sweep` and `tune`: the identified
+        parameters of the plant, jointly normal.
 
         x = value + L w,   L L^T = covariance,   w standard normal, the same for all paths
         """
-        told = [
+        identified = [
             i
             for i, number in enumerate(self.wanted)
-            if number.error is not None and number.verdict == TOLD
+            if number.error is not None and number.verdict == IDENTIFIED
         ]
-        size, axes = np.linalg.eigh(self.covariance[np.ix_(told, told)])
-        factor = np.zeros((len(self.numbers), len(told)))
-        factor[told] = axes * np.sqrt(np.maximum(size, 0.0))
+        size, axes = np.linalg.eigh(self.covariance[np.ix_(identified, identified)])
+        factor = np.zeros((len(self.numbers), len(identified)))
+        factor[identified] = axes * np.sqrt(np.maximum(size, 0.0))
         found, first = {}, 0
         for path in self.paths[: self.asked]:
-            own, shape = _of_plant(path), np.shape(paths.get(self.start, path))
+            own, shape = plant_path(path), np.shape(paths.get(self.start, path))
             these = range(first, first + math.prod(shape))
             first += len(these)
-            if all(i in told for i in these):
+            if all(i in identified for i in these):
                 mean = np.array([self.numbers[i].value for i in these]).reshape(shape)
                 found[own] = value(
                     joint_normal(mean, factor[list(these)].reshape(*shape, -1), GROUP)
                 )
                 continue
             for i in these:
-                if i in told:
-                    entry = _of_plant(self.numbers[i].name)
+                if i in identified:
+                    entry = plant_path(self.numbers[i].name)
                     found[entry] = value(joint_normal(self.numbers[i].value, factor[i], GROUP))
         return found
 
@@ -240,12 +244,16 @@ class Identification:
         return present("card", self)
 
     def words(self) -> list[str]:
-        """What there is to say besides the tables, line by line."""
+        """The text besides the tables, line by line."""
         return [self._heading(), *(line.strip() for line in self._lines())]
 
     def tables_html(self) -> dict[str, str]:
-        """Its tables as HTML, numbers that the log cannot tell, or that are biased, in bold."""
-        bold = [i for i, number in enumerate(self.numbers) if number.verdict in (UNTOLD, BIASED)]
+        """Its tables as HTML, with parameters that are not identifiable or biased in bold."""
+        bold = [
+            i
+            for i, number in enumerate(self.numbers)
+            if number.verdict in (NOT_IDENTIFIABLE, BIASED)
+        ]
         return {
             "Numbers": tables.as_html(HEADING, self._rows(), bold),
             "Fit": tables.as_html(FIT, self._fits()),
@@ -254,11 +262,11 @@ class Identification:
     def _heading(self) -> str:
         W, back = int(np.sum(self.kept)), int(np.sum(~self.kept))
         length = float(np.mean(self.times[:, -1] - self.times[:, 0]))
-        looked = [number for number in self.numbers if number.verdict != FREE]
-        told = sum(number.value is not None for number in looked)
+        looked = [number for number in self.numbers if number.verdict != NOT_ESTIMATED]
+        count = sum(number.value is not None for number in looked)
         windows = f"{W} windows of {length:.3g} s fitted, {back} held back"
         return (
-            f"Identification: {told} of {len(looked)} numbers told; {windows}; {self.steps} steps,"
+            f"Identification: {count} of {len(looked)} numbers told; {windows}; {self.steps} steps,"
             f" {self.seconds:.3g} s"
         )
 
@@ -290,14 +298,18 @@ class Identification:
 
     def _lines(self) -> list[str]:
         lines = [f"  cannot be told: {words}" for words in self.untold]
-        error = "given" if self.delay_error is None else f"+- {1e3 * self.delay_error:.2g} ms"
-        early = self.delay < -3.0 * (self.delay_error or 0.0)
-        late = (
-            f"acts {1e3 * (-self.delay if early else self.delay):.3g} ms"
-            f" {'before its time' if early else 'late'} ({error})"
-        )
-        late = late if self.delay_error != math.inf else "is late by what the log cannot tell"
-        return [*lines, f"  the logged torque {late}", *(f"  {note}" for note in self.notes)]
+        delay = f"  the logged torque {self._delay_in_words()}"
+        return [*lines, delay, *(f"  {note}" for note in self.notes)]
+
+    def _delay_in_words(self) -> str:
+        if self.delay_error == math.inf:
+            return "is late by what the log cannot tell"
+        error = "given"
+        if self.delay_error is not None:
+            error = f"+- {1e3 * self.delay_error:.2g} ms"
+        if self.delay < -3.0 * (self.delay_error or 0.0):
+            return f"acts {-1e3 * self.delay:.3g} ms before its time ({error})"
+        return f"acts {1e3 * self.delay:.3g} ms late ({error})"
 
     def to_dict(self) -> dict[str, Any]:
         """Everything but the residuals as plain numbers, strings and lists, for strict JSON (no
@@ -343,13 +355,13 @@ class Identification:
         present("report", self, target)
 
     def plot(self, **options):
-        """Figure: values with their errors, what is known how well, and what is left.  Options as
+        """Figure: values with standard errors, combinations, and residuals.  Options as
         `plotting.identification`.
         """
         return present("identification figure", self, **options)
 
 
-TOLD, UNTOLD, LIMITED, FREE, BIASED = (
+IDENTIFIED, NOT_IDENTIFIABLE, LIMITED, NOT_ESTIMATED, BIASED = (
     "told",
     "cannot be told",
     "at its limit",
@@ -372,11 +384,9 @@ FIT = (
 
 
 def _share(error: float, of: float) -> str:
-    return f"{100 * error / abs(of):.2g} %" if of else ""
-
-
-def _of_plant(path: str) -> str:
-    return "plant" + path[5:] if path.startswith(("robot.", "model.")) else path
+    if not of:
+        return ""
+    return f"{100 * error / abs(of):.2g} %"
 
 
 def _for_json(x: Any) -> Any:
@@ -386,13 +396,15 @@ def _for_json(x: Any) -> Any:
         return [_for_json(y) for y in x]
     if isinstance(x, np.ndarray | np.generic):
         return _for_json(x.tolist())
-    return x if not isinstance(x, float) or math.isfinite(x) else None
+    if isinstance(x, float) and not math.isfinite(x):
+        return None
+    return x
 
 
 def assessed(
     problem: IdentificationProblem,
-    guess: Start,
-    end: Refined,
+    guess: InitialEstimate,
+    end: Refinement,
     before: np.ndarray,
     friction_ratio: float,
     seconds: float,
@@ -410,16 +422,17 @@ def assessed(
     """
     start, c, windows = problem.start, problem.coordinates, problem.windows
     white = [
-        whiteness(end.told.residuals[windows.kept][:, :, j]) for j in range(windows.y.shape[-1])
+        whiteness(end.statistics.residuals[windows.kept][:, :, j])
+        for j in range(windows.y.shape[-1])
     ]
     fit = _fits(start, windows, end, before, white, guess)
     scale = np.append(guess.scale, OFFSET)
     statistics = _statistics(problem, end, scale, max(one.lacking for one in fit))
-    x = np.where(end.free.held, c.x, to_x(c, end.z[:-1])[0])
-    missing = LeftOut((), np.zeros(len(x)))
+    x = np.where(end.free.fixed, c.x, to_x(c, end.z[:-1])[0])
+    missing = MissingTerms((), np.zeros(len(x)))
     if any(one.has_structure for one in fit):
         fitted = statistics.estimated & ~_at_limits(end, problem.limits, scale)
-        missing = missing_terms(problem.simulated, c, problem.smoothed, end.z, fitted)
+        missing = missing_terms_of_fit(problem.simulated, c, problem.smooth, end.z, fitted)
     bias = biased(missing, x, statistics.errors[:-1])
     numbers = tuple(
         _number(
@@ -441,7 +454,7 @@ def assessed(
         *scenario_notes,
         *_note_on_early_torque(c, end, statistics.errors[-1]),
         *_limited(c, numbers, statistics.beyond, problem.limits),
-        *_notes(statistics.known, numbers, fit),
+        *_notes(statistics.uncertainty, numbers, fit),
         *_freed(start, end, friction_ratio),
     )
     return Identification(
@@ -453,12 +466,12 @@ def assessed(
         covariance=statistics.covariance[:-1, :-1],
         delay=float(end.z[-1]),
         delay_error=float(statistics.errors[-1]) if problem.estimates_delay else None,
-        singular_values=statistics.known.singular,
+        singular_values=statistics.uncertainty.singular,
         combinations=statistics.combinations,
         untold=statistics.unidentifiable,
         scales=scale[:-1],
         fit=fit,
-        residuals=end.told.residuals,
+        residuals=end.statistics.residuals,
         times=windows.t,
         kept=windows.kept,
         autocorrelations=np.array([one.correlations for one in white]),
@@ -474,7 +487,7 @@ class _Statistics(NamedTuple):
 
     estimated: np.ndarray
     """Entries that are estimated, (p + 1,) bool."""
-    known: Known
+    uncertainty: Uncertainty
     errors: np.ndarray
     """Standard errors, (p + 1,); infinite where an entry is not estimated."""
     covariance: np.ndarray
@@ -482,17 +495,17 @@ class _Statistics(NamedTuple):
     beyond: np.ndarray
     """The step that the log suggests without limits, (p + 1,)."""
     combinations: tuple[str, ...]
-    """The combinations of parameters, from the best known one on."""
+    """The combinations of parameters, from the best one on."""
 
     @property
     def unidentifiable(self) -> tuple[str, ...]:
         """The combinations that the log does not identify."""
-        pairs = zip(self.combinations, self.known.singular, strict=True)
-        return tuple(text for text, size in pairs if not size > 1.0 / UNKNOWN)
+        pairs = zip(self.combinations, self.uncertainty.singular, strict=True)
+        return tuple(text for text, size in pairs if not size > 1.0 / IDENTIFIABLE_BELOW)
 
 
 def _statistics(
-    problem: IdentificationProblem, end: Refined, scale: np.ndarray, lacking: float
+    problem: IdentificationProblem, end: Refinement, scale: np.ndarray, lacking: float
 ) -> _Statistics:
     """The statistics of a fit.
 
@@ -507,14 +520,17 @@ def _statistics(
     p = len(x)
     z_by_x = np.eye(p + 1)
     z_by_x[:p, :p] = np.linalg.inv(slope)
-    estimated = np.append(~end.free.held, problem.estimates_delay)
+    estimated = np.append(~end.free.fixed, problem.estimates_delay)
     both = np.ix_(estimated, estimated)
-    information = (z_by_x.T @ end.told.information[kept] @ z_by_x)[:, estimated][:, :, estimated]
-    scores = (end.told.scores[kept] @ z_by_x)[:, estimated]
+    information = (z_by_x.T @ end.statistics.information[kept] @ z_by_x)[:, estimated][
+        :, :, estimated
+    ]
+    scores = (end.statistics.scores[kept] @ z_by_x)[:, estimated]
     precision = np.zeros((p + 1, p + 1))
     precision[:p, :p] = problem.prior.precision
-    widening = lacking if lacking > LACKS else 1.0
-    found = known(information, scores, precision[both], scale[estimated], widening)
+    if lacking <= LACKS:  # the residuals are noise
+        lacking = 1.0
+    found = uncertainty(information, scores, precision[both], scale[estimated], lacking)
     errors = np.full(p + 1, np.inf)
     errors[estimated] = found.errors
     covariance = np.zeros((p + 1, p + 1))
@@ -524,11 +540,13 @@ def _statistics(
     beyond = np.zeros(p + 1)
     beyond[estimated] = _without_limits(information, all_scores, scale[estimated])
     names = np.array([*problem.coordinates.names, "the torque's delay"])[estimated]
-    combinations = tuple(in_words(direction, tuple(names)) for direction in found.directions.T)
+    combinations = tuple(
+        describe_direction(direction, tuple(names)) for direction in found.directions.T
+    )
     return _Statistics(estimated, found, errors, covariance, beyond, combinations)
 
 
-def _note_on_early_torque(c: Coordinates, end: Refined, delay_error: float) -> list[str]:
+def _note_on_early_torque(c: Coordinates, end: Refinement, delay_error: float) -> list[str]:
     """A note where the delay of the torque is estimated to be negative."""
     if not c.delay or not end.z[-1] < -3.0 * delay_error:
         return []
@@ -539,18 +557,20 @@ def _note_on_early_torque(c: Coordinates, end: Refined, delay_error: float) -> l
 
 
 def _without_limits(information: np.ndarray, scores: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """How far the log would move each number if there were no limits: one Gauss-Newton step."""
+    """The Gauss-Newton step without limits."""
     A, g = np.sum(information, axis=0) * scale[:, None] * scale, np.sum(scores, axis=0) * scale
-    return -scale * np.linalg.lstsq(A, g, rcond=SEEN)[0]
+    return -scale * np.linalg.lstsq(A, g, rcond=LEAST_INFORMATION)[0]
 
 
-def _at_limits(end: Refined, ends: tuple[np.ndarray, ...], scale: np.ndarray) -> np.ndarray:
-    """Which numbers, the delay last, are at an end of their range, (p + 1,) bool."""
+def _at_limits(end: Refinement, ends: tuple[np.ndarray, ...], scale: np.ndarray) -> np.ndarray:
+    """Which parameters, the delay last, are at a limit, (p + 1,) bool."""
     return np.any([np.abs(end.z - side) < AT_END * scale for side in ends], axis=0)
 
 
-def _left_out_in_words(start: Scenario, lacks: LeftOut, numbers: tuple[Number, ...]) -> list[str]:
-    """What was left out, what to do, and which numbers make up for it."""
+def _left_out_in_words(
+    start: Scenario, lacks: MissingTerms, numbers: tuple[Number, ...]
+) -> list[str]:
+    """Notes on missing terms, remedies, and the parameters that they bias."""
     joints = joint_names(start.plant, start.n)
     available = [
         p.path
@@ -559,7 +579,7 @@ def _left_out_in_words(start: Scenario, lacks: LeftOut, numbers: tuple[Number, .
     ]
     names = tuple(number.name for number in numbers)
     lines = [
-        in_words_of(one, joints[one.joint], remedy_for(one, available, names))
+        describe_finding(one, joints[one.joint], remedy_for(one, available, names))
         for one in lacks.findings
     ]
     moved = [f"{x.name} by about {x.bias:+.2g} {x.unit}" for x in numbers if x.verdict == BIASED]
@@ -576,7 +596,7 @@ def _number(
     x: float,
     error: float,
     beyond: float,
-    end: Refined,
+    end: Refinement,
     ends: tuple[np.ndarray, ...],
     scale: np.ndarray,
     bias: float = 0.0,
@@ -584,39 +604,38 @@ def _number(
     def number(value, error, verdict):
         return Number(c.names[i], c.units[i], float(c.x[i]), value, error, verdict)
 
-    if end.free.held[i]:
-        return number(None, None, FREE)
+    if end.free.fixed[i]:
+        return number(None, None, NOT_ESTIMATED)
     at_low, at_high = (abs(end.z[i] - side[i]) < AT_END * scale[i] for side in ends)
     if not np.isfinite(error):
-        pushed = (at_low and beyond < -AT_END * scale[i]) or (
-            at_high and beyond > AT_END * scale[i]
-        )
-        return number(x, None, LIMITED) if pushed else number(None, None, UNTOLD)
-    if bias and not (at_low or at_high):
+        tolerance = AT_END * scale[i]
+        if (at_low and beyond < -tolerance) or (at_high and beyond > tolerance):
+            return number(x, None, LIMITED)
+        return number(None, None, NOT_IDENTIFIABLE)
+    if at_low or at_high:
+        return number(x, error, LIMITED)
+    if bias:
         return number(x, error, BIASED)._replace(bias=bias)
-    return number(x, error, LIMITED if at_low or at_high else TOLD)
+    return number(x, error, IDENTIFIED)
 
 
 def _fits(
     start: Scenario,
     w: Windows,
-    end: Refined,
+    end: Refinement,
     before: np.ndarray,
     white: list[Whiteness],
-    guess: Start,
+    guess: InitialEstimate,
 ) -> tuple[Fit, ...]:
-    def size(r, windows):
-        return (
-            np.sqrt(np.mean(r[windows] ** 2, axis=(0, 1)))
-            if np.any(windows)
-            else np.full(r.shape[-1], np.nan)
-        )
+    def rms(r, windows):
+        if not np.any(windows):
+            return np.full(r.shape[-1], np.nan)
+        return np.sqrt(np.mean(r[windows] ** 2, axis=(0, 1)))
 
-    first, fitted, others = (
-        size(before, w.kept),
-        size(end.told.residuals, w.kept),
-        size(end.told.residuals, ~w.kept),
-    )
+    residuals = end.statistics.residuals
+    first = rms(before, w.kept)
+    fitted = rms(residuals, w.kept)
+    others = rms(residuals, ~w.kept)
     return tuple(
         Fit(
             joint=name,
@@ -632,7 +651,7 @@ def _fits(
     )
 
 
-def _notes(found: Known, numbers: tuple[Number, ...], fit: tuple[Fit, ...]) -> list[str]:
+def _notes(found: Uncertainty, numbers: tuple[Number, ...], fit: tuple[Fit, ...]) -> list[str]:
     notes = []
     widest = float(np.max(found.widened))
     if not all(one.is_white for one in fit) and widest > CLEARLY:
@@ -663,7 +682,7 @@ def _notes(found: Known, numbers: tuple[Number, ...], fit: tuple[Fit, ...]) -> l
 def _limited(
     c: Coordinates, numbers: tuple[Number, ...], beyond: np.ndarray, ends: tuple[np.ndarray, ...]
 ) -> list[str]:
-    """Which limits bind, and what the log asks for."""
+    """Notes on active limits, and the values that the log suggests."""
     notes = []
     for place, path in zip(c.places, c.paths, strict=True):
         for i in range(place.start, place.start + place.size):
@@ -678,19 +697,19 @@ def _limited(
     return notes
 
 
-def _freed(start: Scenario, end: Refined, worse: float) -> list[str]:
-    """What was left to the log, and why."""
+def _freed(start: Scenario, end: Refinement, worse: float) -> list[str]:
+    """A note on free torques near standstill."""
     share = end.free.share
     if not np.any(share):
         return []
     names = [
         name for name, part in zip(joint_names(start.plant, start.n), share, strict=True) if part
     ]
-    whose = "all joints" if len(names) == start.n else ", ".join(names)
-    least, most = (
-        f"{100 * part:.{0 if part > 0.1 else 1}f}" for part in (share[share > 0].min(), share.max())
-    )
-    parts = f"{least} %" if least == most else f"{least} to {most} %"
+    whose = ", ".join(names)
+    if len(names) == start.n:
+        whose = "all joints"
+    least, most = _percent(share[share > 0].min()), _percent(share.max())
+    parts = " to ".join(dict.fromkeys((least, most))) + " %"
     return [
         f"About standstill (slower than {end.free.slow:g} rad/s: {parts} of the time) torques were"
         f" free in place of the friction of {whose}: coulomb tanh(q' / width) leaves {worse:.2g}"
@@ -698,25 +717,28 @@ def _freed(start: Scenario, end: Refined, worse: float) -> list[str]:
     ]
 
 
+def _percent(share: float) -> str:
+    digits = int(share <= 0.1)
+    return f"{100 * share:.{digits}f}"
+
+
 def _with_numbers(
     start: Scenario, c: Coordinates, x: np.ndarray, delay: float
 ) -> tuple[Scenario, list[str]]:
-    """The scenario with the new numbers."""
+    """The scenario with the new parameters."""
     scenario, notes = start, []
     for path, place in zip(c.paths, c.places, strict=True):
         own = x[place.start : place.start + place.size].reshape(place.shape)
-        targets = (
-            ["plant" + path[5:], "model" + path[5:]]
-            if path.startswith(("robot.", "plant."))
-            else [path]
-        )
+        targets = [path]
+        if path.startswith(("robot.", "plant.")):
+            targets = ["plant" + path[5:], "model" + path[5:]]
         for target in targets:
             try:
                 scenario = with_parameters(scenario, {target: own})
             except ValueError:
                 if target == path or target.startswith("plant"):
                     raise
-                notes.append(f"The model has no {target}: its number is the plant's alone.")
+                notes.append(f"The model has no {target}: only the plant has this parameter.")
     if c.delay:
         scenario = with_parameters(scenario, {DELAY: max(delay, 0.0)})
     return scenario, notes

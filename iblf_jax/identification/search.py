@@ -1,9 +1,9 @@
-"""Gauss-Newton steps inside limits: what regression and replay share.
+"""The Levenberg-Marquardt method inside limits, used by the regression and by multiple shooting.
 
-Around z the sum of squares is f + g.s + s.A.s/2.  The step minimises that with mu s.D.s/2 added (D:
-the scales of the numbers), within the limits; mu falls after a step that was good and rises after
-one that was not (Levenberg and Marquardt).  A number at a limit stays there while the slope pushes
-it outwards.
+Near z the objective is approximated by f + g.s + s.A.s/2.  A step s minimises this model with
+mu s.D.s/2 added (D: the scales of the parameters) inside the limits.  The damping mu falls after a
+good step and rises after a rejected one.  A parameter at a limit stays there while the gradient
+points outwards.
 """
 
 from __future__ import annotations
@@ -13,91 +13,96 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-FIRST, GROWTH, MOST = 1e-3, 6.0, 1e9
-"""mu, its factor, and where the search gives up."""
-SMALL, PART = 1e-2, 1e-9
-"""What a step must promise to lower f by, and as a part of f: what ends the search is a seventh of
-a standard error, and converges as Newton's method does."""
-WEAK = 30.0
-"""In scales: how far from its start a number is held back with the force of one standard deviation;
-keeps what cannot be told in place."""
+FIRST_DAMPING, DAMPING_FACTOR, LARGEST_DAMPING = 1e-3, 6.0, 1e9
+"""The first mu, the factor between steps, and the mu at which the search stops."""
+ABSOLUTE_TOLERANCE, RELATIVE_TOLERANCE = 1e-2, 1e-9
+"""The search stops where the predicted decrease of f is smaller than the sum of the first and the
+second times f: that is a seventh of a standard error, and convergence is quadratic there."""
+WEAK_PRIOR = 30.0
+"""Standard deviation, in scales, of the weak prior about the start; it keeps parameters that are
+not identifiable in place."""
 
 
-class Around(NamedTuple):
-    """A point of the search."""
+class QuadraticModel(NamedTuple):
+    """The quadratic model of the objective at a point of the search."""
 
     cost: float
     """f."""
-    slope: np.ndarray
-    matrix: np.ndarray
-    carried: Any = None
-    """What else the point holds."""
+    gradient: np.ndarray
+    """g, (p,)."""
+    hessian: np.ndarray
+    """A, (p, p)."""
+    data: Any = None
+    """Further results at the point, for the caller."""
 
 
-def inside(A: np.ndarray, g: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """The s of min g.s + s.A.s/2 with low <= s <= high, by holding one number after another at its
-    limit.
+def bounded_step(A: np.ndarray, g: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """The s that minimises g.s + s.A.s/2 with low <= s <= high, by an active-set method: entries
+    are fixed at their limits one after another.
     """
-    s, held = np.zeros(len(g)), np.zeros(len(g), bool)
+    s = np.zeros(len(g))
+    fixed = np.zeros(len(g), bool)
     for _ in range(len(g) + 1):
-        free = ~held
+        free = ~fixed
         if not free.any():
             break
-        s[free] = np.linalg.lstsq(
-            A[np.ix_(free, free)], -g[free] - A[np.ix_(free, held)] @ s[held], rcond=1e-15
-        )[0]
-        beyond = np.where(free, np.maximum(low - s, s - high), -np.inf)
-        worst = int(np.argmax(beyond))
-        if not beyond[worst] > 0:
+        right_side = -g[free] - A[np.ix_(free, fixed)] @ s[fixed]
+        s[free] = np.linalg.lstsq(A[np.ix_(free, free)], right_side, rcond=1e-15)[0]
+        violation = np.where(free, np.maximum(low - s, s - high), -np.inf)
+        worst = int(np.argmax(violation))
+        if not violation[worst] > 0:
             break
-        held[worst], s[worst] = True, np.clip(s[worst], low[worst], high[worst])
+        fixed[worst] = True
+        s[worst] = np.clip(s[worst], low[worst], high[worst])
     return np.clip(s, low, high)
 
 
-def search(
-    here: Around,
+def levenberg_marquardt(
+    here: QuadraticModel,
     z: np.ndarray,
     limits: tuple[np.ndarray, np.ndarray],
     scale: np.ndarray,
-    attempt: Callable,
-    full: Callable,
+    evaluate: Callable,
+    linearize: Callable,
     most: int,
-) -> tuple[np.ndarray, Around, int]:
-    """The end of the search.
+) -> tuple[np.ndarray, QuadraticModel, int]:
+    """The minimum inside limits.
 
     Args:
-      here: at z.
+      here: the quadratic model at z.
       z: start, (p,).
-      limits: low and high of z.
-      scale: of z, (p,).
-      attempt: function (Around, z, step) -> cost there, and what it holds; infinite where it cannot
-        be.
-      full: function (z, held) -> Around.
-      most: steps.
+      limits: lower and upper limits of z.
+      scale: scale of z, (p,).
+      evaluate: function (QuadraticModel, z, step) -> (cost, results) after the step; an infinite
+        cost where the objective is undefined.
+      linearize: function (z, results) -> QuadraticModel.
+      most: steps at most.
 
     Returns:
-      z, what is around it, and the number of steps.
+      z, the quadratic model there, and the number of steps.
     """
-    mu, steps = FIRST, 0
-    while steps < most and mu < MOST and len(z):
+    damping, steps = FIRST_DAMPING, 0
+    while steps < most and damping < LARGEST_DAMPING and len(z):
         steps += 1
-        S = scale[:, None] * here.matrix * scale
-        size = np.diag(S).max(initial=1e-300)
-        s = scale * inside(
-            S + mu * np.diag(np.diag(S) + 1e-9 * size),
-            scale * here.slope,
+        scaled_hessian = scale[:, None] * here.hessian * scale
+        diagonal = np.diag(scaled_hessian)
+        largest = diagonal.max(initial=1e-300)
+        step = scale * bounded_step(
+            scaled_hessian + damping * np.diag(diagonal + 1e-9 * largest),
+            scale * here.gradient,
             (limits[0] - z) / scale,
             (limits[1] - z) / scale,
         )
-        foretold = -(here.slope @ s + 0.5 * s @ here.matrix @ s)
-        if foretold <= SMALL + PART * here.cost:
+        predicted = -(here.gradient @ step + 0.5 * step @ here.hessian @ step)
+        if predicted <= ABSOLUTE_TOLERANCE + RELATIVE_TOLERANCE * here.cost:
             break
-        cost, held = attempt(here, z, s)
-        if np.isfinite(cost) and cost < here.cost:
-            good = (here.cost - cost) / foretold
-            z = z + s
-            here = full(z, held)
-            mu = mu / GROWTH if good > 0.5 else mu
-        else:
-            mu *= GROWTH
+        cost, results = evaluate(here, z, step)
+        if not (np.isfinite(cost) and cost < here.cost):
+            damping *= DAMPING_FACTOR
+            continue
+        gain_ratio = (here.cost - cost) / predicted
+        z = z + step
+        here = linearize(z, results)
+        if gain_ratio > 0.5:
+            damping /= DAMPING_FACTOR
     return z, here, steps

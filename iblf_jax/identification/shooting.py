@@ -1,25 +1,25 @@
-"""The refinement: simulation error over windows of the log, each with a start of its own (multiple
-shooting).
+"""Multiple shooting: the simulation error over windows of the log, each window with its own
+initial state.
 
-    minimise over z, d and the starts s_w     1/2 sum_w sum_k sum_i rho((y_i(t_k) - q_i(t_k; s_w,
-    x(z), d)) / sigma_i)
+    minimise over z, d and the starts s_w
+        1/2 sum_w sum_k sum_i rho((y_i(t_k) - q_i(t_k; s_w, x(z), d)) / sigma_i)
 
-y are the logged positions, q the plant's under the logged torque, which is taken d seconds late.
-The starts, 2 n numbers a window, are eliminated: with C = J_s^T W J_s, B = J_s^T W J_z of a window,
+Here y are the logged positions, and q those of the plant under the logged torque, delayed by d
+seconds.  The starts s_w, 2 n numbers for each window, are eliminated.  With C = J_s^T W J_s and
+B = J_s^T W J_z of a window, the information matrix and the score of z are
 
     A_w = J_z^T W J_z - B^T C^-1 B,     g_w = ... - B^T C^-1 h
 
-are what it says of z, and sum over windows.  As noise is in y alone, not in q", nothing biases the
-end; and what two windows say is independent but for z, so that the spread of the g_w says how well
-z is known, whatever the noise is like within a window.
+and the objective sums them over the windows.  Only y is noisy, and not q", so the estimate is
+unbiased.  Two windows are independent given z, and the spread of g_w between windows therefore
+measures the uncertainty of z for any noise within a window.
 
-About the standstill of joints whose friction is looked for, torques may be free (`standstill`):
-they are eliminated with the starts.
+Near the standstill of joints whose friction is identified, torques may be free (`standstill`).
+They are eliminated together with the starts.
 
-sigma_i is estimated in turn: what is left of joint i in a usual window (the median); in a window
-  with more than STRANGE times that, what is
-left there.  So windows in which the model lacks something (a contact, play) count for little where
-others do without.
+sigma_i is estimated in turn: it is the median over the windows of the residual of joint i, and in a
+window with more than OUTLIER_RATIO times the median it is the residual of that window.  Windows
+with effects that the model lacks (a contact, backlash) therefore get a small weight.
 """
 
 from __future__ import annotations
@@ -33,27 +33,36 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.identification.coordinates import Coordinates, to_x
-from iblf_jax.identification.log import Log, Said
-from iblf_jax.identification.replay import Slopes, Stretches, replayed, slopes_under, tangents
-from iblf_jax.identification.search import WEAK, Around, search
-from iblf_jax.identification.smoothing import around
-from iblf_jax.identification.standstill import NONE, Free
+from iblf_jax.identification.log import Log
+from iblf_jax.identification.replay import (
+    InverseDynamics,
+    Segments,
+    inverse_dynamics_under,
+    position_sensitivities,
+    simulate_segments,
+)
+from iblf_jax.identification.search import (
+    WEAK_PRIOR,
+    QuadraticModel,
+    levenberg_marquardt,
+)
+from iblf_jax.identification.smoothing import local_polynomial
+from iblf_jax.identification.standstill import NO_FRICTION_WIDTH, FreeTorques
 
 HUBER = 1.345
-"""Standard deviations beyond which a residual counts by its size, not its square ("huber"): 95 % as
-good where noise is normal."""
+"""Standard deviations beyond which the Huber loss is linear: 95 % efficiency for normal noise."""
 FEWEST_STEPS = 8
 USUAL_DELAY = 0.01
-"""[s]; a stretch's first window begins so late, so that a torque that is late by less was
-logged."""
-MOVED = 0.02
-"""Relative change of sigma at which it is settled."""
-STRANGE = 1.5
-ROUNDS, LATER = 6, 8
-"""Times that sigma is estimated, and steps after the first."""
+"""The first window of a segment starts this much later, so that the torque is logged from its start
+on for any delay up to this value [s]."""
+SIGMA_TOLERANCE = 0.02
+"""Relative change of sigma below which it has converged."""
+OUTLIER_RATIO = 1.5
+ROUNDS, LATER_STEPS = 6, 8
+"""Estimates of sigma at most, and Gauss-Newton steps after the first of them."""
 POINTS, STABLE = 200, 1.4
-"""Points at which modes are looked at, and how many radians of the fastest one a step may take,
-half of what RK4 bears."""
+"""Points at which the modes are evaluated, and the largest phase of the fastest mode in one step
+[rad]: half of the stability limit of RK4."""
 
 
 class Windows(NamedTuple):
@@ -73,102 +82,155 @@ class Windows(NamedTuple):
 
 
 class Torque:
-    """The torque of a log as a function of time, integrated: held from sample to sample, or
-    interpolated.
+    """The integral of a log's torque over time; the torque is constant between samples (zero-order
+    hold) or interpolated.
     """
 
-    def __init__(self, log: Log, held: bool) -> None:
+    def __init__(self, log: Log, hold: bool) -> None:
         dt = np.diff(log.t)[:, None]
-        self.t, self.tau = log.t, log.tau
+        zero = np.zeros((1, log.tau.shape[1]))
         rate = np.diff(log.tau, axis=0) / dt
-        self.rate = np.concatenate(
-            [np.zeros_like(rate) if held else rate, np.zeros((1, log.tau.shape[1]))]
-        )
-        steps = log.tau[:-1] * dt + 0.5 * self.rate[:-1] * dt**2
-        self.sum = np.concatenate([np.zeros((1, log.tau.shape[1])), np.cumsum(steps, axis=0)])
+        if hold:
+            rate = np.zeros_like(rate)
+        self.t = log.t
+        self.tau = log.tau
+        self.rate = np.concatenate([rate, zero])
+        steps = log.tau[:-1] * dt + 0.5 * rate * dt**2
+        self.sum = np.concatenate([zero, np.cumsum(steps, axis=0)])
 
     def until(self, t: np.ndarray) -> np.ndarray:
         """The integral from the first sample to t, (..., n)."""
         k = np.clip(np.searchsorted(self.t, t, side="right") - 1, 0, len(self.t) - 1)
         s = (t - self.t[k])[..., None]
-        return (
-            self.sum[k] + self.tau[k] * s + 0.5 * self.rate[k] * np.maximum(s, 0.0) ** 2
-        )  # before the first sample it was held
+        # Before the first sample (s < 0) the torque is constant.
+        ramp = 0.5 * self.rate[k] * np.maximum(s, 0.0) ** 2
+        return self.sum[k] + self.tau[k] * s + ramp
 
     def means(self, t: np.ndarray, delay: float) -> np.ndarray:
-        """The mean torque of each step between times (..., K + 1), taken `delay` late, (..., K,
-        n).
+        """The mean torque of each step between times (..., K + 1), delayed by `delay`,
+        (..., K, n).
         """
-        whole = self.until(t - delay)
-        return np.diff(whole, axis=-2) / np.diff(t, axis=-1)[..., None]
+        integral = self.until(t - delay)
+        return np.diff(integral, axis=-2) / np.diff(t, axis=-1)[..., None]
 
 
-def windows(logs: list[Log], length: float, held_back: list[float], held: bool) -> Windows:
-    """Cuts logs into windows of one number of steps.
+def windows(logs: list[Log], length: float, held_back: list[float], hold: bool) -> Windows:
+    """The windows of the logs, all with the same number of steps.
 
     Args:
-      logs: checked.
-      length: of a window [s].
+      logs: the checked logs.
+      length: length of a window [s].
       held_back: share of each log, at its end, that is not fitted.
-      held: whether the torque is held.
+      hold: whether the torque is constant between samples.
     """
     steps = max(FEWEST_STEPS, round(length / max(log.step for log in logs)))
     t: list[Any] = []
-    y, own, kept, q, dq = [], [], [], [], []
+    y, log_index, kept, q, dq = [], [], [], [], []
     for i, log in enumerate(logs):
-        first = len(t)
-        for stretch in log.stretches:
-            for a in range(
-                stretch.start + math.ceil(USUAL_DELAY / log.step), stretch.stop - steps, steps + 1
-            ):
-                now = slice(a, a + steps + 1)
-                t.append(log.t[now])
-                y.append(log.q[now])
-                found, _, _ = around(log, stretch, float(log.t[a]), held)
-                q.append(found[0])
-                dq.append(found[1])
-                own.append(i)
-        count = len(t) - first
-        back = round(held_back[i] * count)
-        kept += [True] * (count - back) + [False] * back
-    return Windows(*(np.array(x) for x in (t, y, own, kept, q, dq)))
+        count_before = len(t)
+        for segment in log.segments:
+            start = segment.start + math.ceil(USUAL_DELAY / log.step)
+            for first in range(start, segment.stop - steps, steps + 1):
+                samples = slice(first, first + steps + 1)
+                t.append(log.t[samples])
+                y.append(log.q[samples])
+                polynomial, _, _ = local_polynomial(log, segment, float(log.t[first]), hold)
+                q.append(polynomial[0])
+                dq.append(polynomial[1])
+                log_index.append(i)
+        count = len(t) - count_before
+        not_fitted = round(held_back[i] * count)
+        kept += [True] * (count - not_fitted) + [False] * not_fitted
+    return Windows(*(np.array(x) for x in (t, y, log_index, kept, q, dq)))
 
 
-class Told(NamedTuple):
-    """What windows say at the end: per window, so that their spread can be seen."""
+class WindowStatistics(NamedTuple):
+    """The residuals and the derivatives of the objective, window by window."""
 
     residuals: np.ndarray
     """y - q, (W, K + 1, n)."""
     information: np.ndarray
-    """A_w, (W, p + 1, p + 1), the last row and column of the delay."""
+    """A_w, (W, p + 1, p + 1); the last row and column belong to the delay."""
     scores: np.ndarray
     """g_w, (W, p + 1)."""
 
 
 class Prior(NamedTuple):
-    """What was known of x before."""
+    """Prior knowledge of x: a mean and a precision matrix."""
 
     mean: np.ndarray
     precision: np.ndarray
-    """(p, p), zero where nothing was."""
+    """(p, p); zero where there is no prior knowledge."""
 
 
-class Refined(NamedTuple):
+class Refinement(NamedTuple):
     """The end of the search."""
 
     z: np.ndarray
     """(p + 1,), the delay last."""
-    told: Told
-    left: np.ndarray
-    """What is left of each joint over the windows that were fitted, had they no numbers of their
-    own, (n,) [rad]."""
-    free: Free
-    """What was free in place of the law of friction."""
+    statistics: WindowStatistics
+    rms: np.ndarray
+    """Root mean square of the residuals of each joint over the fitted windows, (n,) [rad],
+    corrected for the parameters that each window has of its own."""
+    free: FreeTorques
+    """The free torques that replaced the friction law."""
     steps: int
 
 
-class Replay:
-    """The problem of the head of this module, with its starts."""
+class Simulation(NamedTuple):
+    """The simulated motion of all windows."""
+
+    starts: np.ndarray
+    """Initial states and free torques, (W, s)."""
+    segments: Segments
+    q: np.ndarray
+    """(W, K + 1, n) [rad]."""
+    dq: np.ndarray
+    sensitivities: Any = None
+    """dq/d(start, z) and the inverse dynamics that it is made of; None before they are computed."""
+
+
+class Point(NamedTuple):
+    """A point of the search."""
+
+    simulation: Simulation
+    statistics: WindowStatistics
+    starts_step: np.ndarray
+    """Step of the starts for constant z, (W, s)."""
+    starts_by_z: np.ndarray
+    """Derivative of the best starts by z, (W, s, p + 1)."""
+
+
+class Penalty(NamedTuple):
+    """The prior terms of the objective: a weak one of z about the start, and the user's of x."""
+
+    coordinates: Coordinates
+    start: np.ndarray
+    """z at the start of the search, (p + 1,)."""
+    precision: np.ndarray
+    """Precision of the weak prior, (p + 1,)."""
+    prior: Prior
+
+    def value(self, z: np.ndarray) -> float:
+        """The penalty at z."""
+        offset = to_x(self.coordinates, z[:-1])[0] - self.prior.mean
+        weak = np.sum(self.precision * (z - self.start) ** 2)
+        return 0.5 * float(weak + offset @ self.prior.precision @ offset)
+
+    def added_to(
+        self, z: np.ndarray, gradient: np.ndarray, hessian: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """A gradient (p + 1,) and a Gauss-Newton Hessian (p + 1, p + 1) with the penalty at z."""
+        x, x_by_z = to_x(self.coordinates, z[:-1])
+        gradient = gradient + self.precision * (z - self.start)
+        hessian = hessian + np.diag(self.precision)
+        gradient[:-1] += x_by_z.T @ self.prior.precision @ (x - self.prior.mean)
+        hessian[:-1, :-1] += x_by_z.T @ self.prior.precision @ x_by_z
+        return gradient, hessian
+
+
+class ShootingProblem:
+    """The least-squares problem that the head of this module states."""
 
     def __init__(
         self,
@@ -176,54 +238,52 @@ class Replay:
         c: Coordinates,
         w: Windows,
         logs: list[Log],
-        held: bool,
+        hold: bool,
         loss: str,
         substeps: int,
-        free: Free,
+        free: FreeTorques,
     ) -> None:
-        self.scenario, self.c, self.w, self.loss, self.substeps, self.free = (
-            scenario,
-            c,
-            w,
-            loss,
-            substeps,
-            free,
-        )
-        self.torques = [Torque(log, held) for log in logs]
+        self.scenario = scenario
+        self.c = c
+        self.w = w
+        self.loss = loss
+        self.substeps = substeps
+        self.free = free
+        self.torques = [Torque(log, hold) for log in logs]
         self.step = min(log.step for log in logs)
 
     def torque(self, delay: float) -> np.ndarray:
-        """Of each step, (W, K, n)."""
+        """Mean torque of each step, (W, K, n) [N m]."""
         found = np.empty((*self.w.t[:, 1:].shape, self.w.y.shape[-1]))
         for i, torque in enumerate(self.torques):
             own = self.w.log == i
             found[own] = torque.means(self.w.t[own], delay)
         return found
 
-    def _numbers(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """x, with which the plant is replayed, and dx/dz; what is held does not depend on z."""
-        x, slope = to_x(self.c, z[:-1])
-        return np.where(self.free.held, NONE, x), np.where(self.free.held[:, None], 0.0, slope)
+    def _parameters_at(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """x, with which the plant is simulated, and dx/dz; fixed entries do not depend on z."""
+        x, x_by_z = to_x(self.c, z[:-1])
+        fixed = self.free.fixed
+        return np.where(fixed, NO_FRICTION_WIDTH, x), np.where(fixed[:, None], 0.0, x_by_z)
 
-    def moved(self, z: np.ndarray, starts: np.ndarray) -> tuple[Stretches, np.ndarray, np.ndarray]:
-        """The windows' motion: stretches, q and q' (W, K + 1, n)."""
-        n, (x, _) = self.w.y.shape[-1], self._numbers(z)
-        tau = (
-            self.torque(z[-1])
-            + self.free.by_x @ x
-            + np.einsum("wknm,wm->wkn", self.free.torque, starts[:, 2 * n :])
+    def simulate(
+        self, z: np.ndarray, starts: np.ndarray
+    ) -> tuple[Segments, np.ndarray, np.ndarray]:
+        """The motion in the windows: the segments that are simulated, q and q' (W, K + 1, n)."""
+        n = self.w.y.shape[-1]
+        x, _ = self._parameters_at(z)
+        free_torque = np.einsum("wknm,wm->wkn", self.free.torque, starts[:, 2 * n :])
+        tau = self.torque(z[-1]) + self.free.by_x @ x + free_torque
+        inputs = (self.w.t, starts[:, :n], starts[:, n : 2 * n], tau)
+        segments = Segments(*(jnp.asarray(a) for a in inputs))
+        q, dq = simulate_segments(
+            self.scenario, jnp.asarray(x), segments, places=self.c.places, substeps=self.substeps
         )
-        stretches = Stretches(
-            *(jnp.asarray(a) for a in (self.w.t, starts[:, :n], starts[:, n : 2 * n], tau))
-        )
-        q, dq = replayed(
-            self.scenario, jnp.asarray(x), stretches, places=self.c.places, substeps=self.substeps
-        )
-        return stretches, np.asarray(q), np.asarray(dq)
+        return segments, np.asarray(q), np.asarray(dq)
 
     def weights(self, r: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-        """What each residual counts, (W, K + 1, n): 1 / sigma^2, less beyond HUBER sigma where that
-        is asked for.
+        """The weight of each residual, (W, K + 1, n): 1 / sigma^2, and with the Huber loss less
+        beyond HUBER sigma.
         """
         if self.loss == "squares":
             return np.broadcast_to(1.0 / sigma**2, r.shape)
@@ -231,209 +291,206 @@ class Replay:
         return np.where(size > HUBER, HUBER / np.maximum(size, 1e-300), 1.0) / sigma**2
 
     def cost(self, r: np.ndarray, starts: np.ndarray, sigma: np.ndarray) -> float:
-        """The sum of rho over the windows that are fitted, and of what their free torques cost."""
+        """The sum of rho over the fitted windows, and the penalty of their free torques."""
         size = (np.abs(r) / sigma)[self.w.kept]
-        rho = (
-            0.5 * size**2
-            if self.loss == "squares"
-            else np.where(size > HUBER, HUBER * (size - 0.5 * HUBER), 0.5 * size**2)
-        )
-        return float(np.sum(rho) + 0.5 * np.sum(starts[self.w.kept, 2 * self.w.y.shape[-1] :] ** 2))
+        rho = 0.5 * size**2
+        if self.loss == "huber":
+            rho = np.where(size > HUBER, HUBER * (size - 0.5 * HUBER), rho)
+        free_torques = starts[self.w.kept, 2 * self.w.y.shape[-1] :]
+        return float(np.sum(rho) + 0.5 * np.sum(free_torques**2))
 
-    def refined(
+    def refine(
         self,
         z: np.ndarray,
-        ends: Any,
+        limits: Any,
         scale: np.ndarray,
         sigma: np.ndarray,
         prior: Prior,
         most: int,
         hopeless: Any = np.inf,
-    ) -> Refined:
-        """The minimum.
+    ) -> Refinement:
+        """The minimum, by Gauss-Newton steps that alternate with estimates of sigma.
 
         Args:
-          z: where the search starts, (p + 1,), the delay last.
-          ends: low and high of z.
-          scale: of z.
-          sigma: of the joints, to begin with, (n,) [rad].
-          prior: what was known of x before.
-          most: Gauss-Newton steps for each sigma.
-          hopeless: what is left of a joint from which the search is given up, once it settled for
-            the first sigma, (n,) [rad].
+          z: start of the search, (p + 1,), the delay last.
+          limits: lower and upper limits of z.
+          scale: scale of z.
+          sigma: first noise level of each joint, (n,) [rad].
+          prior: prior knowledge of x.
+          most: Gauss-Newton steps for the first sigma, at most.
+          hopeless: residual of a joint at which the search stops after the first sigma, (n,) [rad].
 
         Raises:
-          ValueError: from the start on, the replay runs away from the log.
+          ValueError: the simulation from the start diverges.
         """
-        weak, z0 = 1.0 / (WEAK * scale) ** 2, z.copy()
+        starts, residuals = self.best_starts(z, sigma)
+        if not np.all(np.isfinite(residuals)):
+            came = checks.Words("windows in which the simulation diverges")
+            raise checks.fail("window", came, "shorter windows", "Such as window=0.1.")
+        sigma = np.maximum(sigma, self._noise_levels(residuals))
+        penalty = Penalty(self.c, z, 1.0 / (WEAK_PRIOR * scale) ** 2, prior)
+        simulation = Simulation(starts, *self.simulate(z, starts))
         total = 0
-
-        def full(z, found, sigma, known=None):
-            _, stretches, q, dq = found
-            r, (J, along) = self.w.y - q, known or self._slopes(z, stretches, q, dq)
-            told, own, by_z = self._eliminated(r, J, sigma, found[0])
-            x, slope = to_x(self.c, z[:-1])
-            g, A = (
-                np.sum(told.scores[self.w.kept], axis=0) + weak * (z - z0),
-                np.sum(told.information[self.w.kept], axis=0) + np.diag(weak),
-            )
-            g[:-1] += slope.T @ prior.precision @ (x - prior.mean)
-            A[:-1, :-1] += slope.T @ prior.precision @ slope
-            return Around(
-                cost(z, r, found[0], sigma),
-                g,
-                A,
-                {"own": own, "by_z": by_z, "told": told, "known": (J, along), "found": found},
-            )
-
-        def cost(z, r, starts, sigma):
-            away = to_x(self.c, z[:-1])[0] - prior.mean
-            return self.cost(r, starts, sigma) + 0.5 * float(
-                np.sum(weak * (z - z0) ** 2) + away @ prior.precision @ away
-            )
-
-        def attempt(here, z, step, sigma):
-            after = here.carried["found"][0] + here.carried["by_z"] @ step + here.carried["own"]
-            found = self.moved(z + step, after)
-            return cost(z + step, self.w.y - found[1], after, sigma), (after, *found)
-
-        starts, rest = self.best_starts(z, sigma)
-        if not np.all(np.isfinite(rest)):
-            raise checks.fail(
-                "window",
-                Said("windows in which the replay runs away"),
-                "shorter ones",
-                "Such as window=0.1.",
-            )
-        sigma = np.maximum(sigma, self._spread(rest))
-        found, known = (starts, *self.moved(z, starts)), None
         for again in range(ROUNDS):
-            here = full(z, found, sigma, known)
-            most = LATER if again else most
-            z, here, steps = search(
+            if again:
+                most = LATER_STEPS
+            here = self._linearized(z, simulation, sigma, penalty)
+            z, here, steps = levenberg_marquardt(
                 here,
                 z,
-                ends,
+                limits,
                 scale,
-                partial(attempt, sigma=sigma),
-                partial(full, sigma=sigma),
+                partial(self._trial, sigma=sigma, penalty=penalty),
+                partial(self._linearized, sigma=sigma, penalty=penalty),
                 most,
             )
-            found, known, told = (
-                here.carried["found"],
-                here.carried["known"],
-                here.carried["told"],
-            )  # the same at another sigma
-            before, sigma, total = sigma, self._spread(told.residuals), total + steps
-            left = np.sqrt(
-                np.mean((self._alone() * np.mean(told.residuals**2, axis=1))[self.w.kept], axis=0)
-            )
-            if np.any(left > hopeless):
+            total += steps
+            simulation, statistics = here.data.simulation, here.data.statistics
+            previous = sigma
+            sigma = self._noise_levels(statistics.residuals)
+            rms = self._rms(statistics.residuals)
+            if np.any(rms > hopeless):
                 break
-            finer, change = substeps_for(known[1], self.step), np.abs(sigma / before - 1.0)
-            if finer > self.substeps:  # friction has become sharper
-                self.substeps, found, known = finer, (found[0], *self.moved(z, found[0])), None
-            elif max(np.median(change), np.mean(change)) < MOVED:
+            substeps = substeps_for(simulation.sensitivities[1], self.step)
+            change = np.abs(sigma / previous - 1.0)
+            if substeps > self.substeps:  # a narrower friction width needs shorter steps
+                self.substeps = substeps
+                simulation = Simulation(simulation.starts, *self.simulate(z, simulation.starts))
+            elif max(np.median(change), np.mean(change)) < SIGMA_TOLERANCE:
                 break
-        return Refined(z, told, left, self.free, total)
+        return Refinement(z, statistics, rms, self.free, total)
+
+    def _linearized(
+        self, z: np.ndarray, simulation: Simulation, sigma: np.ndarray, penalty: Penalty
+    ) -> QuadraticModel:
+        """The quadratic model of the objective at z."""
+        if simulation.sensitivities is None:
+            found = self._sensitivities(z, simulation.segments, simulation.q, simulation.dq)
+            simulation = simulation._replace(sensitivities=found)
+        J, _ = simulation.sensitivities
+        residuals = self.w.y - simulation.q
+        statistics, own_step, by_z = self._eliminate_starts(residuals, J, sigma, simulation.starts)
+        scores = np.sum(statistics.scores[self.w.kept], axis=0)
+        information = np.sum(statistics.information[self.w.kept], axis=0)
+        gradient, hessian = penalty.added_to(z, scores, information)
+        cost = self.cost(residuals, simulation.starts, sigma) + penalty.value(z)
+        return QuadraticModel(
+            cost, gradient, hessian, Point(simulation, statistics, own_step, by_z)
+        )
+
+    def _trial(
+        self,
+        here: QuadraticModel,
+        z: np.ndarray,
+        step: np.ndarray,
+        sigma: np.ndarray,
+        penalty: Penalty,
+    ) -> tuple[float, Simulation]:
+        """The objective after a step, and the simulation there."""
+        point = here.data
+        starts = point.simulation.starts + point.starts_by_z @ step + point.starts_step
+        simulation = Simulation(starts, *self.simulate(z + step, starts))
+        cost = self.cost(self.w.y - simulation.q, starts, sigma) + penalty.value(z + step)
+        return cost, simulation
+
+    def _rms(self, residuals: np.ndarray) -> np.ndarray:
+        """Root mean square of each joint over the windows that are fitted, (n,) [rad]."""
+        mean_squares = self._noise_correction() * np.mean(residuals**2, axis=1)
+        return np.sqrt(np.mean(mean_squares[self.w.kept], axis=0))
 
     def best_starts(self, z: np.ndarray, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The starts that fit best with these numbers, (W, s), and what is left with them, (W, K +
-        1, n).
-        """
-        starts = np.concatenate(
-            [self.w.q, self.w.dq, np.zeros((len(self.w.q), self.free.torque.shape[-1]))], axis=1
-        )
+        """The starts that fit best for given z, (W, s), and the residuals, (W, K + 1, n)."""
+        free_torques = np.zeros((len(self.w.q), self.free.torque.shape[-1]))
+        starts = np.concatenate([self.w.q, self.w.dq, free_torques], axis=1)
         for _ in range(2):
-            stretches, q, dq = self.moved(z, starts)
-            starts = (
-                starts
-                + self._eliminated(
-                    self.w.y - q, self._slopes(z, stretches, q, dq)[0], sigma, starts
-                )[1]
-            )
-        return starts, self.w.y - self.moved(z, starts)[1]
+            segments, q, dq = self.simulate(z, starts)
+            J, _ = self._sensitivities(z, segments, q, dq)
+            _, step, _ = self._eliminate_starts(self.w.y - q, J, sigma, starts)
+            starts = starts + step
+        return starts, self.w.y - self.simulate(z, starts)[1]
 
-    def _spread(self, r: np.ndarray) -> np.ndarray:
-        """What is left of each joint, window by window, (W, 1, n) [rad] (head of this module)."""
-        own = (
-            np.sqrt(self._alone() * np.mean(r**2, axis=1))
-            if self.loss == "squares"
-            else 1.4826 * np.median(np.abs(r), axis=1)
-        )
+    def _noise_levels(self, r: np.ndarray) -> np.ndarray:
+        """Sigma of each window and joint, (W, 1, n) [rad] (head of this module)."""
+        if self.loss == "squares":
+            own = np.sqrt(self._noise_correction() * np.mean(r**2, axis=1))
+        else:
+            own = 1.4826 * np.median(np.abs(r), axis=1)
         usual = np.median(own[self.w.kept], axis=0) + 1e-12
-        return np.where(own > STRANGE * usual, own, usual)[:, None]
+        return np.where(own > OUTLIER_RATIO * usual, own, usual)[:, None]
 
-    def _alone(self) -> np.ndarray:
-        """Mean square noise by what is left of it, (W, n): each window and joint has two numbers of
-        its own, and its free torques.
+    def _noise_correction(self) -> np.ndarray:
+        """Noise variance relative to the mean square residual, (W, n): each window and joint has
+        two parameters of its own, and its free torques.
         """
         K = self.w.y.shape[1]
         return K / np.maximum(K - 2.0 - self.free.pieces, 1.0)
 
-    def _slopes(
-        self, z: np.ndarray, stretches: Stretches, q: np.ndarray, dq: np.ndarray
-    ) -> tuple[np.ndarray, Slopes]:
-        """dq/d(start, z), (W, K + 1, n, s + p + 1), and what it is made of."""
-        n, (x, slope) = q.shape[-1], self._numbers(z)
+    def _sensitivities(
+        self, z: np.ndarray, segments: Segments, q: np.ndarray, dq: np.ndarray
+    ) -> tuple[np.ndarray, InverseDynamics]:
+        """dq/d(start, z), (W, K + 1, n, s + p + 1), and the inverse dynamics that it is made of."""
+        n = q.shape[-1]
+        x, x_by_z = self._parameters_at(z)
         h = np.diff(self.w.t)[..., None]
-        tau = np.asarray(stretches.tau)
-        middle = 0.5 * (q[:, 1:] + q[:, :-1]) - 0.125 * h * np.diff(dq, axis=1)
-        points = (self.w.t[:, :-1] + 0.5 * h[..., 0], middle, 0.5 * (dq[:, 1:] + dq[:, :-1]), tau)
+        middle_t = self.w.t[:, :-1] + 0.5 * h[..., 0]
+        middle_q = 0.5 * (q[:, 1:] + q[:, :-1]) - 0.125 * h * np.diff(dq, axis=1)
+        middle_dq = 0.5 * (dq[:, 1:] + dq[:, :-1])
+        points = (middle_t, middle_q, middle_dq, np.asarray(segments.tau))
         flat = [jnp.asarray(a.reshape(-1, *a.shape[2:])) for a in points]
-        along = slopes_under(self.scenario, jnp.asarray(x), *flat, places=self.c.places)
-        along = along._replace(**{name: np.asarray(a) for name, a in along._asdict().items()})
-        along = along._replace(by_x=along.by_x - self.free.by_x.reshape(along.by_x.shape))
-        by_delay = (
-            self.torque(z[-1] + 0.5 * self.step) - self.torque(z[-1] - 0.5 * self.step)
-        ) / self.step
-        J = tangents(
-            stretches, along, np.concatenate([self.free.torque, by_delay[..., None]], axis=-1)
+        dynamics = inverse_dynamics_under(
+            self.scenario, jnp.asarray(x), *flat, places=self.c.places
         )
-        start, by_x, free, by_delay = np.split(J, [2 * n, 2 * n + len(x), J.shape[-1] - 1], axis=-1)
-        return np.concatenate([start, free, by_x @ slope, by_delay], axis=-1), along
+        dynamics = InverseDynamics(*(np.asarray(a) for a in dynamics))
+        free_by_x = self.free.by_x.reshape(dynamics.by_x.shape)
+        dynamics = dynamics._replace(by_x=dynamics.by_x - free_by_x)
+        late, early = self.torque(z[-1] + 0.5 * self.step), self.torque(z[-1] - 0.5 * self.step)
+        torque_by_delay = ((late - early) / self.step)[..., None]
+        torque_by_input = np.concatenate([self.free.torque, torque_by_delay], axis=-1)
+        J = position_sensitivities(segments, dynamics, torque_by_input)
+        columns = [2 * n, 2 * n + len(x), J.shape[-1] - 1]
+        by_start, by_x, by_free, by_delay = np.split(J, columns, axis=-1)
+        return np.concatenate([by_start, by_free, by_x @ x_by_z, by_delay], axis=-1), dynamics
 
-    def _eliminated(
+    def _eliminate_starts(
         self, r: np.ndarray, J: np.ndarray, sigma: np.ndarray, starts: np.ndarray
-    ) -> tuple[Told, np.ndarray, np.ndarray]:
-        """What the windows say of z, the starts' own step (W, s), and how it follows z (W, s, p +
-        1).
+    ) -> tuple[WindowStatistics, np.ndarray, np.ndarray]:
+        """The statistics of the windows without the starts, the step of the starts for constant z
+        (W, s), and the derivative of the best starts by z (W, s, p + 1).
         """
         W, s, m = len(r), starts.shape[1], self.free.torque.shape[-1]
-        w = np.sqrt(self.weights(r, sigma))
-        wJ, wr = (w[..., None] * J).reshape(W, -1, J.shape[-1]), (w * r).reshape(W, -1)
-        N = np.swapaxes(wJ, 1, 2) @ wJ
-        g = -np.einsum("wma,wm->wa", wJ, wr)
+        root_weights = np.sqrt(self.weights(r, sigma))
+        weighted_J = (root_weights[..., None] * J).reshape(W, -1, J.shape[-1])
+        weighted_r = (root_weights * r).reshape(W, -1)
+        N = np.swapaxes(weighted_J, 1, 2) @ weighted_J
+        g = -np.einsum("wma,wm->wa", weighted_J, weighted_r)
         free = np.arange(s - m, s)
         N[:, free, free] += 1.0
         g[:, free] += starts[:, free]
         C, B, A = N[:, :s, :s], N[:, :s, s:], N[:, s:, s:]
         solved = np.linalg.solve(C, np.concatenate([B, g[:, :s, None]], axis=-1))
-        by_z, own = -solved[..., :-1], -solved[..., -1]
-        across = np.swapaxes(B, 1, 2)
-        information = A + across @ by_z
-        scores = g[:, s:] + np.einsum("wab,wb->wa", across, own)
-        return Told(r, information, scores), own, by_z
+        starts_by_z, starts_step = -solved[..., :-1], -solved[..., -1]
+        B_transposed = np.swapaxes(B, 1, 2)
+        information = A + B_transposed @ starts_by_z
+        scores = g[:, s:] + np.einsum("wab,wb->wa", B_transposed, starts_step)
+        return WindowStatistics(r, information, scores), starts_step, starts_by_z
 
 
-def substeps_for(along: Slopes, step: float) -> int:
-    """Steps of RK4 from sample to sample that keep the fastest mode of the plant well inside its
-    stability range: a power of two.
+def substeps_for(dynamics: InverseDynamics, step: float) -> int:
+    """Number of RK4 steps between two samples, a power of two, for which the fastest mode of the
+    plant is well inside the stability region.
 
     Args:
-      along: at points of the motion; a few of them are looked at.
-      step: from sample to sample [s].
+      dynamics: at points of the motion, of which at most POINTS and the stiffest are used.
+      step: time between samples [s].
     """
-    n, count = along.mass.shape[-1], len(along.mass)
+    mass, by_q, by_dq = (np.asarray(x) for x in (dynamics.mass, dynamics.by_q, dynamics.by_dq))
+    n, count = mass.shape[-1], len(mass)
     chosen = np.linspace(0, count - 1, min(POINTS, count)).astype(int)
-    mass, by_q, by_dq = (np.asarray(x)[chosen] for x in (along.mass, along.by_q, along.by_dq))
-    stiffest = np.argmax(np.max(np.abs(np.asarray(along.by_dq)), axis=(1, 2)))
-    mass, by_q, by_dq = (
-        np.append(x, np.asarray(y)[stiffest, None], axis=0)
-        for x, y in ((mass, along.mass), (by_q, along.by_q), (by_dq, along.by_dq))
-    )
-    F = np.zeros((len(mass), 2 * n, 2 * n))
+    stiffest = np.argmax(np.max(np.abs(by_dq), axis=(1, 2)))
+    chosen = np.append(chosen, stiffest)
+    F = np.zeros((len(chosen), 2 * n, 2 * n))
     F[:, :n, n:] = np.eye(n)
-    F[:, n:] = -np.linalg.solve(mass, np.concatenate([by_q, by_dq], axis=-1))
+    forces = np.concatenate([by_q[chosen], by_dq[chosen]], axis=-1)
+    F[:, n:] = -np.linalg.solve(mass[chosen], forces)
     fastest = float(np.max(np.abs(np.linalg.eigvals(F))))
     return 2 ** int(np.clip(np.ceil(np.log2(step * fastest / STABLE)), 0, 5))

@@ -1,26 +1,24 @@
-"""Whether what a fit leaves follows something that was left out of it: friction, gravity, inertia
-of a joint.
+"""Terms that the model lacks: friction, gravity or inertia of a joint, detected in the residuals.
 
-A term that was left out acts as a torque theta r(t) on one joint, r one of
+A missing term acts as a torque theta r(t) on one joint, r one of
 
     tanh(q_j' / w)   q_j'   q_j"   sin q_j   cos q_j   1
 
-It is looked for in the torques of the smoothed log (`regression`), at the numbers x that were
-found:
+It is detected in the torques of the smoothed log (`regression`), at the estimate x:
 
     tau - e(x; q, q', q") = de/dx dx + theta r + noise
 
-by least squares, each joint by what is left of it.  Candidates are added one by one, the one that
-takes away most first, while it takes away at least GAIN of what is left of its joint; then those
-are dropped that are not significant.  Residuals are far from white, so the standard error of theta
-takes blocks of the log as its observations (cluster-robust variance), which covers any correlation
-within a block; theta over its error follows Student's t with one degree of freedom less than there
-are blocks.  The level is divided by the number of candidates (Bonferroni).
+by least squares, each joint weighted by its residual.  Forward selection adds the candidate that
+reduces the residual of its joint most, as long as it reduces it by at least SMALLEST_GAIN; backward
+elimination removes those that are not significant.  Residuals are far from white, so the standard
+error of theta takes blocks of the log as its observations (cluster-robust variance), which covers
+any correlation within a block; theta over its error follows Student's t with one degree of freedom
+less than there are blocks.  The level is divided by the number of candidates (Bonferroni).
 
-What the numbers lose when the terms are added is their bias:  x (without them) - x (with them).
+The bias of the parameters is x (without the terms) - x (with them).
 
 Source: H. White, Econometrica 50 (1982) 1-25, and K.-Y. Liang, S. L. Zeger, Biometrika 73 (1986)
-  13-22 (the variance).
+13-22 (the variance).
 """
 
 from __future__ import annotations
@@ -29,37 +27,36 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from iblf_jax.identification.smoothing import HALF, Smoothed
+from iblf_jax.identification.smoothing import HALF_WIDTH, SmoothedMotion
 
 LEVEL = 1e-3
-"""Probability of one finding or more where nothing was left out."""
-BLOCK = 6.0 * HALF
-"""Length of a block [s]: several times what smoothing correlates."""
+"""Probability of at least one finding if no term is missing."""
+BLOCK = 6.0 * HALF_WIDTH
+"""Length of a block [s]: several times the correlation length of the smoothing."""
 FEWEST_BLOCKS = 10
-"""Below which the spread between blocks is not known."""
-OWN = 0.01
-"""Part of a candidate that must be its own: less, and the fitted numbers explain the same."""
-GAIN = 0.1
-"""Part of what is left of a joint that a term must take away."""
-LEAST = 3e-3
-"""Part of a joint's torque, root of the mean square, that a term must have: smoothing alone makes
-less."""
-SHARE = 0.2
-"""Part of what a joint's torque leaves, root of the mean square, that a term must have beside
-others."""
-SLOW = 0.05
+"""Number of blocks from which the variance between blocks is estimated."""
+SMALLEST_OWN_SHARE = 0.01
+"""Share of a candidate that the estimated parameters must not explain."""
+SMALLEST_GAIN = 0.1
+"""Share of a joint's residual that a term must explain."""
+SMALLEST_TORQUE_SHARE = 3e-3
+"""Root mean square of a term relative to the joint's torque, at least; smoothing alone causes
+smaller terms."""
+SMALLEST_RESIDUAL_SHARE = 0.2
+"""Root mean square of a term relative to the joint's residual torque, at least, beside others."""
+COULOMB_WIDTH = 0.05
 """[rad/s]: w of the candidate for Coulomb friction."""
 BIASED_FROM = 0.05
-"""Part of a number from which its bias matters."""
+"""Relative bias from which a bias matters."""
 
 
 class Kind(NamedTuple):
-    """One form of term that can be left out."""
+    """A kind of missing term."""
 
     follows: str
-    """What the residuals follow, in words."""
+    """What the residuals depend on, as text."""
     term: str
-    """What is missing, in words."""
+    """What is missing, as text."""
     unit: str
     leaves: tuple[str, ...]
     """Names of leaves that hold it."""
@@ -80,7 +77,7 @@ KINDS = {
 
 
 class Finding(NamedTuple):
-    """A term that was left out."""
+    """A missing term."""
 
     joint: int
     kind: str
@@ -89,72 +86,72 @@ class Finding(NamedTuple):
     error: float
     """Its standard error."""
     gain: float
-    """Part of what was left of the joint's torque that it takes away."""
+    """Share of the joint's residual torque that it explains."""
 
 
-class LeftOut(NamedTuple):
-    """What was left out, and what that does to the numbers."""
+class MissingTerms(NamedTuple):
+    """Missing terms, and the bias that they cause."""
 
     findings: tuple[Finding, ...]
     bias: np.ndarray
-    """What was left out adds to each number, (p,); 0 for those that were not looked for."""
+    """Bias of each parameter, (p,); 0 for those that are not estimated."""
 
 
 class _Design(NamedTuple):
-    """A linear regression of the torques that are left, rows (P n,), weighted."""
+    """A weighted linear regression of the residual torques, with rows (P n,)."""
 
     columns: np.ndarray
-    """Of the numbers that were looked for, and of the candidates, (P n, k + c)."""
+    """Columns of the k parameters and of the c candidates, (P n, k + c)."""
     rest: np.ndarray
-    """What is left, (P n,)."""
+    """Residuals, (P n,)."""
     block: np.ndarray
     """In which block each row is, (P n,)."""
     joint: np.ndarray
     """Of which joint each row is, (P n,)."""
 
 
-def candidates(seen: Smoothed) -> tuple[list[tuple[int, str]], np.ndarray]:
+def candidates(motion: SmoothedMotion) -> tuple[list[tuple[int, str]], np.ndarray]:
     """The candidates, (joint, kind), and the torque of each for one unit of theta, (P, n, c)."""
     shapes = {
-        "sign": np.tanh(seen.dq / SLOW),
-        "velocity": seen.dq,
-        "acceleration": seen.ddq,
-        "sine": np.sin(seen.q),
-        "cosine": np.cos(seen.q),
-        "constant": np.ones_like(seen.q),
+        "sign": np.tanh(motion.dq / COULOMB_WIDTH),
+        "velocity": motion.dq,
+        "acceleration": motion.ddq,
+        "sine": np.sin(motion.q),
+        "cosine": np.cos(motion.q),
+        "constant": np.ones_like(motion.q),
     }
-    n = seen.q.shape[1]
+    n = motion.q.shape[1]
     names = [(j, kind) for j in range(n) for kind in shapes]
-    torque = np.zeros((*seen.q.shape, len(names)))
+    torque = np.zeros((*motion.q.shape, len(names)))
     for c, (j, kind) in enumerate(names):
         torque[:, j, c] = shapes[kind][:, j]
     return names, torque
 
 
-def left_out(
-    seen: Smoothed, torque: np.ndarray, by_x: np.ndarray, delay: float, fitted: np.ndarray
-) -> LeftOut:
+def missing_terms(
+    motion: SmoothedMotion, torque: np.ndarray, by_x: np.ndarray, delay: float, fitted: np.ndarray
+) -> MissingTerms:
     """The terms that the fit lacks.
 
     Args:
-      seen: the log, smoothed, P times.
-      torque: what the joints need with the numbers that were found, (P, n) [N m].
+      motion: the smoothed log at P times.
+      torque: torques of the model with the estimate, (P, n) [N m].
       by_x: its derivative by the numbers, (P, n, p).
       delay: of the logged torque [s].
-      fitted: which of the numbers, the delay last, were looked for and are at no limit, (p + 1,)
-        bool.
+      fitted: parameters, the delay last, that are estimated and not at a limit, (p + 1,) bool.
     """
     p = by_x.shape[-1]
-    names, of_candidates = candidates(seen)
-    rest = seen.tau - delay * seen.dtau - torque
-    numbers = np.concatenate([by_x, seen.dtau[..., None]], axis=-1)[..., fitted]
-    design = _weighted(seen, rest, numbers, of_candidates)
+    names, of_candidates = candidates(motion)
+    rest = motion.tau - delay * motion.dtau - torque
+    numbers = np.concatenate([by_x, motion.dtau[..., None]], axis=-1)[..., fitted]
+    design = _weighted_regression(motion, rest, numbers, of_candidates)
     k = numbers.shape[-1]
-    found = _significant(design, k, _added(design, k, names), len(names))
-    thetas = _solved(design, [*range(k), *found])[k:]
+    found = _backward_elimination(design, k, _forward_selection(design, k, names), len(names))
+    thetas = _least_squares(design, [*range(k), *found])[k:]
     unit = _rms(of_candidates)
     least = np.maximum(
-        LEAST * _rms(seen.tau), SHARE * _rms(rest - numbers @ _solved(design, range(k)))
+        SMALLEST_TORQUE_SHARE * _rms(motion.tau),
+        SMALLEST_RESIDUAL_SHARE * _rms(rest - numbers @ _least_squares(design, range(k))),
     )
     found = [
         i
@@ -163,16 +160,19 @@ def left_out(
     ]
     bias = np.zeros(p)
     if not found:
-        return LeftOut((), bias)
+        return MissingTerms((), bias)
     moved = np.zeros(p + 1)
-    without, with_them = _solved(design, range(k)), _solved(design, [*range(k), *found])
+    without, with_them = (
+        _least_squares(design, range(k)),
+        _least_squares(design, [*range(k), *found]),
+    )
     moved[fitted] = without - with_them[:k]
     errors = _errors(design, [*range(k), *found])[k:]
     made = []
     for i, theta, error in zip(found, with_them[k:].tolist(), errors.tolist(), strict=True):
         j, kind = names[i - k]
         made.append(Finding(j, kind, theta, error, _gain(design, [*range(k), *found], i, j)))
-    return LeftOut(tuple(sorted(made, key=lambda one: -one.gain)), moved[:p])
+    return MissingTerms(tuple(sorted(made, key=lambda one: -one.gain)), moved[:p])
 
 
 def _rms(x: np.ndarray) -> np.ndarray:
@@ -186,7 +186,7 @@ def _is_large(
 
     Args:
       theta: its size.
-      unit: root of the mean square of each candidate's torque for one unit, (n, c) [N m].
+      unit: root mean square of each candidate's torque for one unit, (n, c) [N m].
       least: what matters on each joint, (n,) [N m].
       names: of the candidates.
       c: which candidate.
@@ -195,13 +195,13 @@ def _is_large(
     return abs(theta) * unit[joint, c] > least[joint]
 
 
-def _weighted(
-    seen: Smoothed, rest: np.ndarray, numbers: np.ndarray, of_candidates: np.ndarray
+def _weighted_regression(
+    motion: SmoothedMotion, rest: np.ndarray, numbers: np.ndarray, of_candidates: np.ndarray
 ) -> _Design:
-    """The regression, joints weighed by what all candidates together leave of them."""
+    """The regression, joints weighted by their residual with all candidates."""
     P, n = rest.shape
     columns = np.concatenate([numbers, of_candidates], axis=-1)
-    spacing = float(np.median(np.abs(np.diff(seen.t)))) if P > 1 else BLOCK
+    spacing = float(np.median(np.abs(np.diff(motion.t)))) if P > 1 else BLOCK
     block = np.arange(P) // max(1, round(BLOCK / max(spacing, 1e-9)))
     sigma = np.std(rest, axis=0) + 1e-12
     for _ in range(2):
@@ -221,25 +221,25 @@ def _weighted(
 
 
 def _inverse(A: np.ndarray) -> np.ndarray:
-    """Of a symmetric matrix of any scales; combinations that nothing is known of are left out."""
+    """Of a symmetric matrix of any scales; combinations without information are omitted."""
     size = np.sqrt(np.maximum(np.diag(A), 1e-300))
     return (
         np.linalg.pinv(A / size[:, None] / size, rcond=1e-10, hermitian=True) / size[:, None] / size
     )
 
 
-def _solved(design: _Design, chosen: Any) -> np.ndarray:
+def _least_squares(design: _Design, chosen: Any) -> np.ndarray:
     X = design.columns[:, list(chosen)]
     return _inverse(X.T @ X) @ (X.T @ design.rest)
 
 
 def _residual(design: _Design, chosen: Any) -> np.ndarray:
     chosen = list(chosen)
-    return design.rest - design.columns[:, chosen] @ _solved(design, chosen)
+    return design.rest - design.columns[:, chosen] @ _least_squares(design, chosen)
 
 
 def _errors(design: _Design, chosen: Any) -> np.ndarray:
-    """Cluster-robust standard errors, one a column that is chosen."""
+    """Cluster-robust standard errors of the chosen columns."""
     chosen = list(chosen)
     X, left = design.columns[:, chosen], _residual(design, chosen)
     bread = _inverse(X.T @ X)
@@ -252,7 +252,7 @@ def _errors(design: _Design, chosen: Any) -> np.ndarray:
 
 
 def _gain(design: _Design, chosen: list[int], i: int, joint: int) -> float:
-    """Part of what is left of a joint, without column i, that the column takes away."""
+    """Share of a joint's residual without column i that the column explains."""
     own = design.joint == joint
     others = [x for x in chosen if x != i]
     before = float(np.sum(_residual(design, others)[own] ** 2))
@@ -260,20 +260,20 @@ def _gain(design: _Design, chosen: list[int], i: int, joint: int) -> float:
     return 1.0 - after / max(before, 1e-300)
 
 
-def _added(design: _Design, k: int, names: list[tuple[int, str]]) -> list[int]:
-    """Columns of candidates, added while each takes away enough of what is left of its joint."""
+def _forward_selection(design: _Design, k: int, names: list[tuple[int, str]]) -> list[int]:
+    """Columns of candidates, added while each explains enough of its joint's residual."""
     chosen: list[int] = []
     own = [design.joint == j for j, _ in names]
     X = design.columns
     for _ in names:
         base = [*range(k), *chosen]
         inverse, left = _inverse(X[:, base].T @ X[:, base]), _residual(design, base)
-        best, most = None, GAIN
+        best, most = None, SMALLEST_GAIN
         for c in range(len(names)):
             column = X[:, k + c]
             size = float(column @ column)
             part = column - X[:, base] @ (inverse @ (X[:, base].T @ column))
-            if k + c in chosen or float(part @ part) < OWN * size:
+            if k + c in chosen or float(part @ part) < SMALLEST_OWN_SHARE * size:
                 continue
             less = float(part @ left) ** 2 / float(part @ part)
             gain = less / max(float(np.sum(left[own[c]] ** 2)), 1e-300)
@@ -285,7 +285,7 @@ def _added(design: _Design, k: int, names: list[tuple[int, str]]) -> list[int]:
     return chosen
 
 
-def _significant(design: _Design, k: int, chosen: list[int], tests: int) -> list[int]:
+def _backward_elimination(design: _Design, k: int, chosen: list[int], tests: int) -> list[int]:
     """Those of the chosen columns that are significant, the least significant one dropped until all
     are.
     """
@@ -298,7 +298,7 @@ def _significant(design: _Design, k: int, chosen: list[int], tests: int) -> list
     chosen = list(chosen)
     while chosen:
         both = [*range(k), *chosen]
-        statistic = np.abs(_solved(design, both)) / np.maximum(_errors(design, both), 1e-300)
+        statistic = np.abs(_least_squares(design, both)) / np.maximum(_errors(design, both), 1e-300)
         worst = int(np.argmin(statistic[k:]))
         if statistic[k + worst] >= needed:
             return chosen
@@ -306,22 +306,21 @@ def _significant(design: _Design, k: int, chosen: list[int], tests: int) -> list
     return chosen
 
 
-def biased(found: LeftOut, x: np.ndarray, errors: np.ndarray) -> np.ndarray:
-    """What was left out adds to each number, (p,), where that matters; else 0.
+def biased(found: MissingTerms, x: np.ndarray, errors: np.ndarray) -> np.ndarray:
+    """The bias of each parameter, (p,), where it matters; else 0.
 
-    It matters where it is more than the number's standard error, or than a part of the number: the
-    standard errors have already been multiplied by how much of the residuals the model does not
-    explain.
+    It matters where it is more than the standard error or than BIASED_FROM of the parameter; the
+    standard errors already contain the factor for unexplained residuals.
 
     Args:
       found: what was left out.
-      x, errors: the numbers and their standard errors, (p,).
+      x, errors: the parameters and their standard errors, (p,).
     """
     much = (np.abs(found.bias) > errors) | (np.abs(found.bias) > BIASED_FROM * np.abs(x))
     return np.where(np.isfinite(errors) & much, found.bias, 0.0)
 
 
-def in_words(finding: Finding, joint: str, remedy: str) -> str:
+def describe_finding(finding: Finding, joint: str, remedy: str) -> str:
     """A finding as a line of the report.
 
     Args:
@@ -344,7 +343,7 @@ def remedy_for(finding: Finding, available: Any, names: tuple[str, ...]) -> str:
     Args:
       finding: what was found.
       available: paths of all leaves of the plant and of the disturbance.
-      names: of the numbers that were looked for.
+      names: names of the identified parameters.
     """
     kind = KINDS[finding.kind]
     suffixes = [(path, path.rsplit(".", 1)[-1]) for path in available]
@@ -363,9 +362,7 @@ def remedy_for(finding: Finding, available: Any, names: tuple[str, ...]) -> str:
 
 
 def _is_in(path: str, joint: int, names: tuple[str, ...]) -> bool:
-    """Whether the number of a joint at a path was looked for, whichever way its owner was
-    called.
-    """
+    """Whether the parameter of a joint at a path was identified, by any name of its owner."""
     owner, _, rest = path.partition(".")
     owners = ("plant", "robot", "model") if owner == "plant" else (owner,)
     return any(

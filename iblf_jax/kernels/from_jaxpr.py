@@ -75,9 +75,7 @@ def interpret(b: Builder, jaxpr: Any, consts: Sequence[Ids], inputs: Sequence[Id
         elif name in RULES:
             for v in eqn.outvars:
                 _check_float(b, v.aval.dtype, eqn)
-            results = RULES[name](b, eqn, *operands)
-            if isinstance(results, np.ndarray):
-                results = [results]
+            results = _several(RULES[name](b, eqn, *operands))
         else:
             raise UnsupportedError(f"the primitive {name!r} is not lowered")
         for v, ids in zip(eqn.outvars, results, strict=True):
@@ -89,6 +87,13 @@ def interpret(b: Builder, jaxpr: Any, consts: Sequence[Ids], inputs: Sequence[Id
                 )
             known[v] = ids
     return [read(v) for v in jaxpr.outvars]
+
+
+def _several(found: Any) -> list[Ids | None]:
+    """The results of a rule, of which a single one is an array or a NumPy scalar."""
+    if isinstance(found, list | tuple):
+        return list(found)
+    return [found]
 
 
 def _live(jaxpr: Any) -> set:

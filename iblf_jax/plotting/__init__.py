@@ -1,13 +1,13 @@
-"""Figures and animations of runs: the one place of the package that imports matplotlib.
+"""Figures and animations of runs, studies and tunings; only this folder imports matplotlib.
 
-    run.plot()                                                      one run at a glance (`overview`)
+    run.plot()                                                      the overview of one run
     figures = plotting.paper_figures({"iBLF": run, "log-BLF": other})
     plotting.save(figures, "figures")                               PNG and PDF
     plotting.animate(run, "arm.gif")                                or "arm.html"
 
-Every function takes one run or a dict of runs by name (`overview`: one run) and returns a
-matplotlib Figure, which a notebook shows when it is the value of a cell.  Runs may differ in
-length; of a batch, select a run first.
+Functions for runs take one run or a dict of runs by name (`overview`: one run) and return a
+matplotlib Figure, which a notebook shows if it is the value of a cell.  Runs may differ in length;
+select one run of a batch first.
 """
 
 from iblf_jax.plotting._figures import errors as errors

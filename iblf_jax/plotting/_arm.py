@@ -1,10 +1,10 @@
-"""The moving parts of an animation: arms, ghost, joint limits and joint bars, as artists that are
-only moved.
+"""The scene of an animation: arms, reference, joint limits and joint bars, as artists that are
+moved from frame to frame.
 
-A joint's limits are a fan around its link: where the link's direction would be with that joint
-anywhere from its lower to its upper bound, found by moving the robot's own `skeleton`, so that it
-is right for any robot, planar or not.  The bars beside the arm show the same for every joint as
-numbers, also for joints whose fan has no width (a wrist that rolls).
+The limits of a joint are drawn as a fan: the directions of the joint's link for all positions
+between the lower and the upper bound.  They are computed with the robot's own `skeleton` and are
+therefore correct for planar and spatial robots.  The bars beside the arm show the positions and
+bounds of all joints, including joints whose fan has no width (a wrist that rolls).
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from matplotlib.artist import Artist
 
 from iblf_jax.core import checks
 from iblf_jax.plotting import _style
-from iblf_jax.plotting._curves import Curve, called
-from iblf_jax.plotting._workspace import draw_walls, frame, skeletons
+from iblf_jax.plotting._curves import Curve, joint_labels
+from iblf_jax.plotting._workspace import draw_boundaries, set_limits, skeletons
 
 FAN_POINTS = 13
 FAN_RADIUS = 0.42
-"""Radius of a fan as a part of its link's length."""
+"""Radius of a fan as a share of its link's length."""
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """One run at the instants of the frames, F of them, of a robot in d = 2 or 3 dimensions."""
+    """One run at the times of the F frames, for a robot in d = 2 or 3 dimensions."""
 
     q: np.ndarray
     """(F, n) [rad]."""
@@ -40,16 +40,14 @@ class Motion:
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """What the runs should do and may do, at the instants of the frames; taken from the first
-    run.
-    """
+    """Reference and bounds of the first run at the times of the frames."""
 
     t: np.ndarray
     """(F,) [s]."""
     q_d: np.ndarray
     lower: np.ndarray
     upper: np.ndarray
-    ghost: np.ndarray
+    desired: np.ndarray
     """Skeleton of the reference, (F, n + 1, d) [m]."""
     fans: np.ndarray
     """Outline of each joint's fan, (F, n, FAN_POINTS + 2, d) [m]."""
@@ -57,42 +55,43 @@ class World:
 
 def _fans(robot: Any, q: jax.Array, lower: jax.Array, upper: jax.Array) -> jax.Array:
     """Outline of every joint's fan for one configuration, (n, FAN_POINTS + 2, d) [m]."""
-    n, here = q.shape[0], robot.skeleton(q)
-    share = jnp.linspace(0.0, 1.0, FAN_POINTS)
-    angles = lower[:, None] + share * (upper - lower)[:, None]
-    moved = jax.vmap(
-        lambda joint, row: jax.vmap(lambda a: robot.skeleton(q.at[joint].set(a)))(row)
-    )(jnp.arange(n), angles)
-    joint = jnp.arange(n)
-    rim = moved[joint, :, joint + 1] - moved[joint, :, joint]
-    centre = here[:-1, None]
-    return jnp.concatenate([centre, centre + FAN_RADIUS * rim, centre], axis=1)
+
+    def rim(joint: jax.Array, low: jax.Array, high: jax.Array) -> jax.Array:
+        """The link behind a joint, (FAN_POINTS, d), while the joint turns between its bounds."""
+        angles = low + jnp.linspace(0.0, 1.0, FAN_POINTS) * (high - low)
+        moved = jax.vmap(lambda angle: robot.skeleton(q.at[joint].set(angle)))(angles)
+        return moved[:, joint + 1] - moved[:, joint]
+
+    links = jax.vmap(rim)(jnp.arange(q.shape[0]), lower, upper)
+    centre = robot.skeleton(q)[:-1, None]
+    return jnp.concatenate([centre, centre + FAN_RADIUS * links, centre], axis=1)
 
 
 def motions_of(curves: Sequence[Curve], t: np.ndarray) -> tuple[World, list[Motion]]:
-    """The runs at the instants t [s] of the frames, (F,).
+    """The runs at the times t [s] of the frames, (F,).
 
     Raises:
-      ValueError: a robot whose `skeleton` does not give (n + 1, 2) or (n + 1, 3) points.
+      ValueError: a robot whose `skeleton` does not return (n + 1, 2) or (n + 1, 3) points, or runs
+        whose points differ in shape.
     """
-    first, motions = curves[0], []
+    first = curves[0]
+    motions: list[Motion] = []
     for curve in curves:
         q = curve.at("q", t)
         motions.append(Motion(q, skeletons(curve.run.scenario.plant, q)))
         shape = motions[-1].skeleton.shape[1:]
         if shape != motions[0].skeleton.shape[1:]:
-            raise checks.fail(
-                "plant.skeleton(q)", shape, "points in the plane or in space, alike for all runs"
-            )
+            expected = "points in the plane or in space, the same for all runs"
+            raise checks.fail("plant.skeleton(q)", shape, expected)
     robot = first.run.scenario.plant
     q_d, lower, upper = (first.at(field, t) for field in ("q_d", "lower", "upper"))
-    ghost = skeletons(robot, q_d)
+    desired = skeletons(robot, q_d)
     fans = jax.jit(jax.vmap(lambda *args: _fans(robot, *args)))(motions[0].q, lower, upper)
-    return World(t, q_d, lower, upper, ghost, np.asarray(fans)), motions
+    return World(t, q_d, lower, upper, desired, np.asarray(fans)), motions
 
 
-def _move(line: Any, points: np.ndarray) -> None:
-    """Puts a line through points (k, d)."""
+def _set_points(line: Any, points: np.ndarray) -> None:
+    """Moves a line to points (k, d)."""
     if points.shape[-1] == 3:
         line.set_data_3d(*points.T)
     else:
@@ -100,72 +99,62 @@ def _move(line: Any, points: np.ndarray) -> None:
 
 
 class Scene:
-    """The figure of an animation; `move_to(frame)` puts its parts where they belong."""
+    """The figure of an animation; `move_to(frame)` moves its parts to their places."""
 
     def __init__(self, curves: Sequence[Curve], world: World, motions: Sequence[Motion]) -> None:
-        self.world, self.motions = world, motions
+        self.world = world
+        self.motions = motions
         self.figure = _style.new_figure(6.4, 3.8)
         grid = self.figure.add_gridspec(1, 2, width_ratios=(1.7, 1))
-        solid = world.ghost.shape[-1] == 3
-        self.arm: Any = self.figure.add_subplot(grid[0], projection="3d" if solid else None)
+        self.dimensions = world.desired.shape[-1]
+        projection = "3d" if self.dimensions == 3 else None
+        self.arm: Any = self.figure.add_subplot(grid[0], projection=projection)
         self.bars: Any = self.figure.add_subplot(grid[1])
         self.parts: list[tuple[Any, Artist]] = []
-        self.fans: list[Any] = []
+
         self.dots: list[Any] = []
-        points = [self.world.ghost, *(motion.skeleton for motion in self.motions)]
-        robot, regions = curves[0].run.scenario.plant, curves[0].run.scenario.regions
-        limits = frame(
-            self.arm, np.concatenate([x.reshape(-1, x.shape[-1]) for x in points]), regions
-        )
-        draw_walls(self.arm, robot, regions, limits)
+        points = np.concatenate([world.desired, *(motion.skeleton for motion in motions)])
+        scenario = curves[0].run.scenario
+        limits = set_limits(self.arm, points, scenario.regions)
+        draw_boundaries(self.arm, scenario.plant, scenario.regions, limits)
         self._add_fans()
         self._add_arms(curves)
         self._add_bars(curves)
-        self.time = self._keep(self.bars.text(0.0, 1.03, "t = ", transform=self.bars.transAxes))
-        _style.entitle(self.figure, "The arm within its joint limits", curves)
+        self.time = self._animated(self.bars.text(0.0, 1.03, "t = ", transform=self.bars.transAxes))
+        _style.set_title(self.figure, "The arm within its joint limits", curves)
         _style.legend_below(self.figure, 4)
 
-    def _keep(self, artist: Any) -> Any:
+    def _animated(self, artist: Any) -> Any:
         artist.set_animated(True)
         self.parts.append((artist.axes, artist))
         return artist
 
     def _line(self, axes: Any, **options: Any) -> Any:
-        dimensions = self.world.ghost.shape[-1] if axes is self.arm else 2
-        return self._keep(axes.plot(*([[]] * dimensions), **options)[0])
+        """An animated line without points."""
+        dimensions = self.dimensions if axes is self.arm else 2
+        return self._animated(axes.plot(*([[]] * dimensions), **options)[0])
+
+    def _fan(self) -> Any:
+        """An animated fan: an area in the plane, an outline in space."""
+        edge = _style.bound()
+        if self.dimensions == 3:
+            return self._line(self.arm, color=edge, linewidth=0.8)
+        face = _style.blend(0.11, _style.colour(0))
+        (area,) = self.arm.fill([0.0], [0.0], edgecolor=edge, facecolor=face, linewidth=0.7)
+        return self._animated(area)
 
     def _add_fans(self) -> None:
-        n, planar = self.world.q_d.shape[1], self.world.ghost.shape[-1] == 2
-        look: dict[str, Any] = {
-            "edgecolor": _style.bound(),
-            "facecolor": _style.shade(0.11, _style.colour(0)),
-            "linewidth": 0.7,
-        }
-        for joint in range(n):
-            text = "joint limits" if joint == 0 else None
-            if planar:
-                self.fans.append(self._keep(self.arm.fill([0.0], [0.0], label=text, **look)[0]))
-            else:
-                self.fans.append(
-                    self._line(self.arm, color=_style.bound(), linewidth=0.8, label=text)
-                )
+        self.fans = [self._fan() for _ in range(self.world.q_d.shape[1])]
+        self.fans[0].set_label("joint limits")
 
     def _add_arms(self, curves: Sequence[Curve]) -> None:
-        self.arm.plot(
-            *self.world.ghost[:, -1].T,
-            **(_style.reference() | {"linewidth": 0.8, "color": _style.shade(0.533)}),
-        )
-        look: dict[str, Any] = {
-            "color": _style.shade(0.4),
-            "linewidth": 1.6,
-            "marker": "o",
-            "markersize": 4,
-        }
-        look["markerfacecolor"] = _style.paper()
-        self.ghost = self._line(self.arm, label="reference", **look)
+        path = {"linewidth": 0.8, "color": _style.blend(0.533)}
+        self.arm.plot(*self.world.desired[:, -1].T, **(_style.reference() | path))
+        look: dict[str, Any] = {"linewidth": 1.6, "marker": "o", "markersize": 4}
+        look |= {"color": _style.blend(0.4), "markerfacecolor": _style.background()}
+        self.reference = self._line(self.arm, label="reference", **look)
         self.trails = [
-            self._line(self.arm, color=_style.series(i)["color"], linewidth=0.9)
-            for i in range(len(curves))
+            self._line(self.arm, color=_style.colour(i), linewidth=0.9) for i in range(len(curves))
         ]
         look = {"linewidth": 2.6, "marker": "o", "markersize": 5}
         self.arms = [
@@ -175,58 +164,51 @@ class Scene:
 
     def _add_bars(self, curves: Sequence[Curve]) -> None:
         rows = np.arange(self.world.q_d.shape[1])
-        shown = np.concatenate(
-            [x[np.isfinite(x)] for x in (self.world.lower, self.world.upper, self.world.q_d)]
-        )
+        shown = np.stack([self.world.lower, self.world.upper, self.world.q_d])
+        shown = shown[np.isfinite(shown)]
         room = 0.15 * float(np.ptp(shown))
         self.bars.set(
             xlim=(shown.min() - room, shown.max() + room),
             ylim=(len(rows) - 0.4, -0.6),
             xlabel=_style.label("position $q$", "rad"),
         )
-        self.bars.set_yticks(rows, called(curves[0].run.scenario.plant, len(rows)))
+        self.bars.set_yticks(rows, joint_labels(curves[0].run.scenario.plant, len(rows)))
         self.bars.spines["left"].set_visible(False)
         self.bars.tick_params(axis="y", length=0)
         width = max(4.0, min(18.0, 90.0 / len(rows)))
         self.ranges = [
-            self._line(self.bars, color=_style.shade(0.149), linewidth=width, solid_capstyle="butt")
+            self._line(self.bars, color=_style.blend(0.149), linewidth=width, solid_capstyle="butt")
             for _ in rows
         ]
-        look: dict[str, Any] = {
-            "linestyle": "none",
-            "marker": "|",
-            "markersize": width + 3,
-            "markeredgewidth": 1.6,
-        }
-        self.wanted = self._line(self.bars, color=_style.ink(), **look)
+        look: dict[str, Any] = {"linestyle": "none", "marker": "|", "markersize": width + 3}
+        look |= {"color": _style.text_colour(), "markeredgewidth": 1.6}
+        self.desired = self._line(self.bars, **look)
         for i in range(len(curves)):
-            look = {
-                "linestyle": "none",
-                "marker": "oDs^v"[i % 5],
-                "markersize": max(3.0, min(5.5, width / len(curves))),
-            }
-            self.dots.append(self._line(self.bars, color=_style.series(i)["color"], **look))
+            look = {"linestyle": "none", "marker": "oDs^v"[i % 5], "color": _style.colour(i)}
+            look["markersize"] = max(3.0, min(5.5, width / len(curves)))
+            self.dots.append(self._line(self.bars, **look))
 
     def move_to(self, frame: int) -> list[tuple[Any, Artist]]:
-        """Moves every part to where it is in this frame; returns (axes, part) in the order of
+        """Moves every part to its place in a frame; returns (axes, part) in the order of
         drawing.
         """
         world = self.world
         rows = np.arange(world.q_d.shape[1])
         for joint, fan in enumerate(self.fans):
             outline = world.fans[frame, joint]
-            fan.set_xy(outline) if outline.shape[-1] == 2 else _move(fan, outline)
-            self.ranges[joint].set_data(
-                [world.lower[frame, joint], world.upper[frame, joint]], [joint, joint]
-            )
-        _move(self.ghost, world.ghost[frame])
-        self.wanted.set_data(world.q_d[frame], rows)
-        shifts = 0.14 * (np.arange(len(self.motions)) - 0.5 * (len(self.motions) - 1))
-        for motion, arm, trail, dots, shift in zip(
-            self.motions, self.arms, self.trails, self.dots, shifts, strict=True
-        ):
-            _move(arm, motion.skeleton[frame])
-            _move(trail, motion.skeleton[: frame + 1, -1])
-            dots.set_data(np.clip(motion.q[frame], *self.bars.get_xlim()), rows + shift)
+            if self.dimensions == 2:
+                fan.set_xy(outline)
+            else:
+                _set_points(fan, outline)
+            ends = [world.lower[frame, joint], world.upper[frame, joint]]
+            self.ranges[joint].set_data(ends, [joint, joint])
+        _set_points(self.reference, world.desired[frame])
+        self.desired.set_data(world.q_d[frame], rows)
+        middle = 0.5 * (len(self.motions) - 1)
+        for i, motion in enumerate(self.motions):
+            _set_points(self.arms[i], motion.skeleton[frame])
+            _set_points(self.trails[i], motion.skeleton[: frame + 1, -1])
+            q = np.clip(motion.q[frame], *self.bars.get_xlim())
+            self.dots[i].set_data(q, rows + 0.14 * (i - middle))
         self.time.set_text(f"t = {world.t[frame]:.2f} s")
         return self.parts

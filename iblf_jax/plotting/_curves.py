@@ -1,9 +1,7 @@
-"""What a figure draws: the runs that were given, on the host, checked, cut where they broke and
-thinned for drawing.
+"""Prepares runs for drawing: validates them, moves them to the host, truncates and thins them.
 
-A run whose state ran away was frozen there by the simulator; it is drawn up to that sample.  Lines
-are thinned so that no peak is lost: every piece of the time axis keeps its first, lowest and
-  highest sample.
+The simulator freezes a run whose state diverges; figures draw it up to that sample.  Thinning
+loses no peak: every interval of the time axis keeps its first, lowest and highest sample.
 """
 
 from __future__ import annotations
@@ -22,27 +20,27 @@ from iblf_jax.simulation.results import Rollout
 from iblf_jax.world.robots import joint_names
 
 POINTS = 2400
-"""About as many points as a line of a figure can show."""
+"""Approximate number of points that a line of a figure can resolve."""
 
 DERIVED = {
     "error_lower": lambda run: np.asarray(run.lower) - np.asarray(run.q_d),
     "error_upper": lambda run: np.asarray(run.upper) - np.asarray(run.q_d),
-    "wall_lower": lambda run: -np.ones(run.q.shape),
-    "wall_upper": lambda run: np.ones(run.q.shape),
+    "xi_lower": lambda run: -np.ones(run.q.shape),
+    "xi_upper": lambda run: np.ones(run.q.shape),
     "estimate_error": (
         lambda run: np.asarray(run.disturbance) - np.asarray(run.disturbance_estimate)
     ),
     "measured_q": lambda run: run.measured.q,
     "measured_dq": lambda run: run.measured.dq,
-    "region_wall": lambda run: np.zeros(np.shape(run.region_margin)),
+    "region_boundary": lambda run: np.zeros(np.shape(run.region_margin)),
 }
-"""Signals that follow from those of a Rollout: the bounds -k_l and k_u of e1, those of xi, f -
-f_hat, what was measured, walls."""
+"""Signals computed from those of a Rollout: the bounds -k_l and k_u of e1, the bounds of xi, the
+error f - f_hat, the measurements, and the boundary of a region."""
 
-HELD = {"tau", "alpha", "disturbance_estimate", "measured_q", "measured_dq"}
-"""Signals of a sampled law that stay as they are from sample to sample."""
+SAMPLED = {"tau", "alpha", "disturbance_estimate", "measured_q", "measured_dq"}
+"""Signals that are constant between the samples of a sampled law."""
 
-GIVEN = {
+EXTERNAL = {
     "t",
     "q_d",
     "dq_d",
@@ -50,38 +48,39 @@ GIVEN = {
     "upper",
     "error_lower",
     "error_upper",
-    "wall_lower",
-    "wall_upper",
+    "xi_lower",
+    "xi_upper",
     "dq_lower",
     "dq_upper",
-    "region_wall",
+    "region_boundary",
 }
-"""Signals that do not depend on the state, and are drawn to the end whatever became of it."""
+"""Signals that do not depend on the state; figures draw them to the end of a failed run too."""
 
 SAME = 0.03
-"""Signals that differ by less than this part of their range are drawn once for all runs."""
+"""Signals that differ by less than this fraction of their range are drawn once for all runs."""
 
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """One run as figures see it: `curve["q"]` is an array (T, n), shorter than `curve.t` if the run
-    was frozen before its end.
+    """One run to draw: `curve["q"]` is an array (T, n), shorter than `curve.t` if the run was
+    frozen before its end.
 
-    A signal that the run's scenario does not have is no number.
+    A signal that the run's scenario does not have is NaN.
     """
 
     name: str
-    """What the caller called it; empty for a run that came alone."""
+    """The caller's name of the run; empty for a single run."""
     run: Rollout
     samples: int
-    """How many samples are worth drawing."""
+    """Number of samples before the state was frozen."""
 
     def __getitem__(self, field: str) -> np.ndarray:
-        values = DERIVED[field](self.run) if field in DERIVED else getattr(self.run, field)
-        values = (
-            np.full(self.run.q.shape, np.nan) if isinstance(values, tuple) else np.asarray(values)
-        )
-        return values if field in GIVEN else values[: self.samples]
+        derive = DERIVED.get(field)
+        values = getattr(self.run, field) if derive is None else derive(self.run)
+        if isinstance(values, tuple):
+            values = np.full(self.run.q.shape, np.nan)
+        stop = None if field in EXTERNAL else self.samples
+        return np.asarray(values)[:stop]
 
     @property
     def t(self) -> np.ndarray:
@@ -97,54 +96,54 @@ class Curve:
             [np.interp(t, self.t[: len(values)], column) for column in values.T], axis=-1
         )
 
-    def is_held(self, field: str) -> bool:
-        """Whether a signal goes in steps: the law is sampled, and no drive makes something else of
-        its torque.
+    def is_sampled(self, field: str) -> bool:
+        """Whether a signal is piecewise constant: the law is sampled, and for the torque the
+        actuator is ideal.
         """
         scenario = self.run.scenario
         return (
             scenario.sampling is not None
-            and field in HELD
+            and field in SAMPLED
             and (field != "tau" or isinstance(scenario.actuator, IdealActuator))
         )
 
     @property
     def is_measured(self) -> bool:
-        """Whether the law was told something else than what was."""
+        """Whether the law received measurements that differ from the state."""
         return not isinstance(self.run.scenario.sensor, IdealSensor)
 
     @property
     def has_speed_limits(self) -> bool:
-        """Whether its velocities have bounds."""
+        """Whether the velocities have bounds."""
         return not isinstance(self.run.dq_lower, tuple)
 
     @property
     def has_regions(self) -> bool:
-        """Whether points of its robot must stay in regions."""
+        """Whether the scenario confines points of the robot to regions."""
         return not isinstance(self.run.region_margin, tuple)
 
     @property
     def ok(self) -> bool:
-        """Whether the run has no flag."""
+        """Whether the run has no status flag."""
         return self.run.ok
 
     @property
     def failed(self) -> bool:
-        """Whether the run did not do its job."""
+        """Whether a status flag marks the run as failed."""
         return bool(int(self.run.status) & FAILED)
 
     @property
     def status(self) -> str:
-        """The run's flags in words."""
+        """The run's status flags in words."""
         return describe(int(self.run.status))
 
-    def called(self, joint: int) -> str:
-        """What a joint is called in a figure."""
-        return called(getattr(self.run.scenario, "plant", None), self.run.n)[joint]
+    def joint_label(self, joint: int) -> str:
+        """The label of a joint in a figure."""
+        return joint_labels(self.run.scenario.plant, self.run.n)[joint]
 
     def break_index(self) -> int | None:
-        """The first sample at which the run was outside its bounds or regions, or its last one if
-        it ran away; None if neither.
+        """The first sample outside the bounds or regions, else the last sample of a run that
+        diverged, else None.
         """
         lower, upper = self["lower"][: self.samples], self["upper"][: self.samples]
         inside = ((lower < self["q"]) & (self["q"] < upper)).all(axis=1)
@@ -153,64 +152,69 @@ class Curve:
         outside = np.flatnonzero(~inside)
         if outside.size:
             return int(outside[0])
-        return self.samples - 1 if int(self.run.status) & Status.NOT_FINITE else None
+        if int(self.run.status) & Status.NOT_FINITE:
+            return self.samples - 1
+        return None
 
 
-def called(robot: Any, n: int) -> list[str]:
-    """What the joints of a robot are called in a figure: as in the robot's file, if it has
-    names.
+def joint_labels(robot: Any, n: int) -> list[str]:
+    """The labels of a robot's joints: the names in the robot's file, if it has names."""
+    return [escaped(name) for name in joint_names(robot, n)]
+
+
+def escaped(name: str) -> str:
+    """A name that matplotlib shows unchanged: it would read $ as mathematics, and leave names that
+    begin with _ out of legends.
     """
-    return [plain(name) for name in joint_names(robot, n)]
+    if name.startswith("_"):
+        name = f" {name}"
+    return name.replace("$", r"\$")
 
 
-def plain(name: str) -> str:
-    """A name from a file as it is: matplotlib takes $ for mathematics, and leaves what begins with
-    _ out of legends.
-    """
-    return (" " if name.startswith("_") else "") + name.replace("$", r"\$")
-
-
-def _sound_samples(run: Rollout) -> int:
-    """How many samples there are until the state was frozen: all, unless the run ran away."""
+def _valid_samples(run: Rollout) -> int:
+    """Number of samples before the state was frozen: all of them, unless the run diverged."""
     q, dq = np.asarray(run.q), np.asarray(run.dq)
     if not int(run.status) & Status.NOT_FINITE or len(q) < 2:
         return len(q)
     moved = np.any((np.diff(q, axis=0) != 0) | (np.diff(dq, axis=0) != 0), axis=1)
     finite = np.isfinite(q).all(axis=1)
     last = np.flatnonzero(moved & finite[1:])
-    return int(last[-1]) + 2 if last.size else len(q)
+    if not last.size:
+        return len(q)
+    return int(last[-1]) + 2
 
 
 def _checked(name: str, run: Any) -> Curve:
-    called = f"runs[{name!r}]" if name else "run"
+    argument = f"runs[{name!r}]" if name else "run"
     if not isinstance(run, Rollout):
         raise checks.fail(
-            called,
+            argument,
             type(run).__name__,
             "a Rollout",
             "Draw what ij.simulate returns, or a dict of such runs.",
         )
     if not checks.is_concrete(run):
         raise checks.fail(
-            called,
-            "a run that is being traced",
-            "one with numbers",
+            argument,
+            "a traced run",
+            "a run that holds numbers",
             "Draw outside of jit, vmap and grad.",
         )
     if run.is_batch:
-        raise checks.fail(called, f"a batch of {len(run)} runs", "one run", "Select a run: run[0].")
-    return Curve(name, run, _sound_samples(run))
+        came = f"a batch of {len(run)} runs"
+        raise checks.fail(argument, came, "one run", "Select a run: run[0].")
+    return Curve(name, run, _valid_samples(run))
 
 
 def curves_of(runs: Rollout | Mapping[str, Rollout]) -> list[Curve]:
-    """The runs to draw, in the order given.
+    """The runs to draw, in the given order.
 
     Args:
-      runs: one run, or a dict of such runs by name; they may differ in length and in what they
-        recorded.
+      runs: one run, or a dict of runs by name; they may differ in length and in the recorded
+        samples.
 
     Raises:
-      ValueError: nothing to draw, a batch, something that is no Rollout, or runs of robots with
+      ValueError: an empty dict, a batch, an object that is not a Rollout, or runs of robots with
         different numbers of joints.
     """
     if not isinstance(runs, Mapping):
@@ -227,11 +231,13 @@ def curves_of(runs: Rollout | Mapping[str, Rollout]) -> list[Curve]:
 
 
 def check_joint(curves: Sequence[Curve], joint: Any, field: str = "joint") -> int:
-    """The index of a joint, given by its index or its name, if the robot has it; ValueError if
-    not.
+    """The index of a joint that is given by its index or its name.
+
+    Raises:
+      ValueError: the robot has no such joint.
     """
     n = curves[0].run.n
-    names = joint_names(getattr(curves[0].run.scenario, "plant", None), n)
+    names = joint_names(curves[0].run.scenario.plant, n)
     if isinstance(joint, str) and joint in names:
         return names.index(joint)
     if isinstance(joint, bool) or not isinstance(joint, int | np.integer) or not 0 <= joint < n:
@@ -240,9 +246,7 @@ def check_joint(curves: Sequence[Curve], joint: Any, field: str = "joint") -> in
 
 
 def distinct(curves: Sequence[Curve], fields: Sequence[str], joints: Sequence[int]) -> list[Curve]:
-    """The curves that can be told apart in these fields on the time they share, longest first; one,
-    if all follow one reference.
-    """
+    """The curves that differ in these fields during the time that they share, longest first."""
     kept: list[Curve] = []
     for curve in sorted(curves, key=lambda c: -float(c.t[-1])):
         if all(_differ(curve, other, fields, joints) for other in kept):
@@ -261,22 +265,21 @@ def _differ(a: Curve, b: Curve, fields: Sequence[str], joints: Sequence[int]) ->
 
 
 def thinned(t: np.ndarray, y: np.ndarray, points: int = POINTS) -> tuple[np.ndarray, np.ndarray]:
-    """At most about `points` of the samples (t, y), with every peak among them.
+    """At most about `points` of the samples (t, y), every peak included.
 
     Args:
       t: time, (T,) [s].
       y: signal, (T,).
-      points: how many to keep.
+      points: approximate number of samples to keep.
     """
     if len(t) <= points:
         return t, y
     width = int(np.ceil(3 * len(t) / points))
-    whole = len(t) // width * width
-    pieces = np.nan_to_num(y[:whole], posinf=np.inf, neginf=-np.inf).reshape(-1, width)
-    starts = np.arange(0, whole, width)
-    rest = np.append(np.arange(whole, len(t)), len(t) - 1)
-    picked = np.concatenate(
-        [starts, starts + pieces.argmin(axis=1), starts + pieces.argmax(axis=1), rest]
-    )
-    index = np.unique(picked)
+    end = len(t) // width * width
+    intervals = np.nan_to_num(y[:end], posinf=np.inf, neginf=-np.inf).reshape(-1, width)
+    starts = np.arange(0, end, width)
+    lowest = starts + intervals.argmin(axis=1)
+    highest = starts + intervals.argmax(axis=1)
+    rest = np.append(np.arange(end, len(t)), len(t) - 1)
+    index = np.unique(np.concatenate([starts, lowest, highest, rest]))
     return t[index], y[index]

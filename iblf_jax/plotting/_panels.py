@@ -1,10 +1,9 @@
-"""One panel of a figure: a quantity of every run against time, with what frames it, and axis limits
-that stay readable.
+"""Draws one panel of a figure: a quantity of every run against time, with its bounds.
 
-`QUANTITIES` describes each panel as data; `show` draws one.  Limits follow the bounds where a
-quantity has bounds, so that a run that leaves them is cut at the edge instead of flattening all
-others; elsewhere they follow the runs, without the outliers of runs that failed.  Where a signal is
-cut, the panel says its peak.
+`QUANTITIES` describes each panel as data; `show` draws one.  Axis limits follow the bounds where a
+quantity has bounds, so that a run that leaves them is clipped at the edge and does not flatten the
+others.  Elsewhere the limits follow the runs, without the outliers of failed runs.  A panel whose
+limits clip a signal states the signal's peak.
 """
 
 from __future__ import annotations
@@ -22,21 +21,22 @@ from iblf_jax.plotting._style import FAINT, label, series
 
 Window = tuple[float, float]
 
-FAR = 20.0
-"""Bounds farther from the runs than this [rad] are no bounds to a picture, and do not set its
-limits."""
+FARTHEST_BOUND = 20.0
+"""Bounds farther from the runs than this [rad] do not set the limits of an axis."""
 
-OUT_OF_PROPORTION = 40.0
-"""A failed run's range is cut where it is wider than this many times its median deviation."""
+OUTLIER_RATIO = 40.0
+"""The axis excludes the outliers of a failed run whose range is wider than this many times its
+median deviation."""
 
-SPIKES, RULING = 0.98, 5.0
-"""A sound run's peaks rule an axis where its whole range is wider than RULING times the one that
-holds it for this part of the time."""
+SPIKE_FREE_SHARE = 0.98
+SPIKE_RATIO = 5.0
+"""The axis excludes the spikes of a signal whose full range is wider than SPIKE_RATIO times the
+range in which it is for SPIKE_FREE_SHARE of the time."""
 
 
 @dataclass(frozen=True)
-class Plotted:
-    """What a panel shows."""
+class PanelQuantity:
+    """The quantity that a panel shows, its labels, and the signals drawn with it."""
 
     field: str
     """The signal of the run."""
@@ -50,12 +50,12 @@ class Plotted:
     """The signal that it should follow, drawn once for all runs."""
     guide_words: str = ""
     truth: str | None = None
-    """The signal that it estimates, drawn broad and pale under it; once, where the runs' cannot be
-    told apart."""
+    """The signal that it estimates, drawn as a broad pale line under it; once, if it is the same in
+    all runs."""
     measured: str = ""
-    """What a sensor told of it."""
+    """The measurement of it."""
     transient: str = ""
-    """The signal whose transient a zoom should show, if not its own."""
+    """The signal whose transient a zoom shows, if not its own."""
 
     @property
     def label(self) -> str:
@@ -66,7 +66,7 @@ class Plotted:
 QUANTITIES = {
     quantity.field: quantity
     for quantity in (
-        Plotted(
+        PanelQuantity(
             "q",
             "position",
             "$q$",
@@ -78,17 +78,17 @@ QUANTITIES = {
             measured="measured_q",
             transient="e1",
         ),
-        Plotted("e1", "error", "$e_1$", "rad", ("error_lower", "error_upper"), "bounds"),
-        Plotted(
+        PanelQuantity("e1", "error", "$e_1$", "rad", ("error_lower", "error_upper"), "bounds"),
+        PanelQuantity(
             "xi",
             "relative error",
             r"$\xi$",
             "1",
-            ("wall_lower", "wall_upper"),
-            r"walls $\xi = \pm 1$",
+            ("xi_lower", "xi_upper"),
+            r"bounds $\xi = \pm 1$",
         ),
-        Plotted("e2", "error", "$e_2$", "rad/s"),
-        Plotted(
+        PanelQuantity("e2", "error", "$e_2$", "rad/s"),
+        PanelQuantity(
             "dq",
             "velocity",
             r"$\dot q$",
@@ -99,9 +99,11 @@ QUANTITIES = {
             r"reference $\dot q_d$",
             measured="measured_dq",
         ),
-        Plotted("region_margin", "distance", "$h$", "m", guide="region_wall", guide_words="wall"),
-        Plotted("tau", "torque", r"$\tau$", "N m"),
-        Plotted(
+        PanelQuantity(
+            "region_margin", "distance", "$h$", "m", guide="region_boundary", guide_words="boundary"
+        ),
+        PanelQuantity("tau", "torque", r"$\tau$", "N m"),
+        PanelQuantity(
             "disturbance_estimate",
             "uncertain term",
             "$f$",
@@ -111,27 +113,29 @@ QUANTITIES = {
         ),
     )
 }
-"""Every panel, by the signal that it shows."""
+"""Signal -> the panel that shows it."""
 
 
 def draw(
     axes: Axes, curve: Curve, field: str, joint: int, window: Window, **options: Any
 ) -> np.ndarray:
-    """Draws one signal of one joint within a window of time; returns what was drawn."""
+    """Draws one signal of one joint within a window of time; returns its samples there."""
     y = curve[field][:, joint]
     t = curve.t[: len(y)]
-    near = (t >= window[0]) & (t <= window[1])
-    shown_t, shown_y = thinned(t[near], y[near])
-    marker = {"marker": "."} if len(shown_t) == 1 else {}
-    steps = {"drawstyle": "steps-post"} if curve.is_held(field) else {}
-    axes.plot(shown_t, shown_y, **(marker | steps | options))
-    return y[near]
+    in_window = (t >= window[0]) & (t <= window[1])
+    shown_t, shown_y = thinned(t[in_window], y[in_window])
+    if len(shown_t) == 1:
+        options.setdefault("marker", ".")
+    if curve.is_sampled(field):
+        options.setdefault("drawstyle", "steps-post")
+    axes.plot(shown_t, shown_y, **options)
+    return y[in_window]
 
 
 def draw_frame(
-    axes: Axes, curve: Curve, quantity: Plotted, joint: int, window: Window, **options: Any
+    axes: Axes, curve: Curve, quantity: PanelQuantity, joint: int, window: Window, **options: Any
 ) -> list[np.ndarray]:
-    """Draws the bounds of a quantity as grey lines with a pale tube between them; returns them."""
+    """Draws the bounds of a quantity as grey lines with a pale band between them; returns them."""
     if quantity.frame is None or np.isnan(curve[quantity.frame[0]]).all():
         return []
     look = {
@@ -150,7 +154,7 @@ def draw_frame(
 
 
 def _span(arrays: Iterable[np.ndarray]) -> tuple[float, float] | None:
-    """Lowest and highest finite value."""
+    """Lowest and highest finite value; None if there is none."""
     finite = [y[np.isfinite(y)] for y in arrays]
     finite = [y for y in finite if y.size]
     if not finite:
@@ -158,32 +162,28 @@ def _span(arrays: Iterable[np.ndarray]) -> tuple[float, float] | None:
     return float(min(y.min() for y in finite)), float(max(y.max() for y in finite))
 
 
-def _in_proportion(y: np.ndarray) -> np.ndarray:
-    """A failed run's values without those that are out of all proportion to the rest."""
+def _without_outliers(y: np.ndarray) -> np.ndarray:
+    """The finite values of a failed run without its outliers."""
     finite = y[np.isfinite(y)]
     if not finite.size:
         return finite
-    middle = np.median(finite)
-    deviation = np.median(np.abs(finite - middle))
-    if np.ptp(finite) <= OUT_OF_PROPORTION * deviation:
+    median = np.median(finite)
+    deviation = np.median(np.abs(finite - median))
+    if np.ptp(finite) <= OUTLIER_RATIO * deviation:
         return finite
-    return finite[np.abs(finite - middle) <= max(0.25 * OUT_OF_PROPORTION * deviation, 1e-12)]
+    return finite[np.abs(finite - median) <= max(0.25 * OUTLIER_RATIO * deviation, 1e-12)]
 
 
 def _without_spikes(y: np.ndarray) -> np.ndarray:
-    """The range in which a signal is for SPIKES of the time, if the whole one is out of proportion
-    to it.
-    """
+    """The finite values, or the ends of an axis that clips the spikes of a signal."""
     finite = y[np.isfinite(y)]
     if finite.size < 10:
         return finite
-    usual = np.quantile(finite, [0.5 - 0.5 * SPIKES, 0.5 + 0.5 * SPIKES])
+    usual = np.quantile(finite, [0.5 - 0.5 * SPIKE_FREE_SHARE, 0.5 + 0.5 * SPIKE_FREE_SHARE])
     width = float(np.ptp(usual))
-    return (
-        usual + 0.5 * width * np.array([-1.0, 1.0])
-        if 0.0 < RULING * width < np.ptp(finite)
-        else finite
-    )
+    if 0.0 < SPIKE_RATIO * width < np.ptp(finite):
+        return usual + 0.5 * width * np.array([-1.0, 1.0])
+    return finite
 
 
 def set_limits(
@@ -194,35 +194,28 @@ def set_limits(
     *,
     spikes: bool = False,
 ) -> None:
-    """Sets the limits of the vertical axis: the frame, or the sound runs where there is none, and
-    the rest up to 40 % beyond.
+    """Sets the limits of the vertical axis.
+
+    The axis shows the bounds and the reference, or the successful runs where there are none, and
+    the remaining signals up to 40 % beyond.
 
     Args:
       axes: the panel.
       curves: the runs, in the order of `drawn`.
-      drawn: what was drawn of each run.
+      drawn: the drawn samples of each run.
       frame: bounds and reference; empty if there are none.
-      spikes: cut short peaks that would rule the axis.
+      spikes: clip short peaks.
     """
-    if spikes:
-        drawn = [_without_spikes(y) for y in drawn]
-    spans = [
-        _span([_in_proportion(y) if curve.failed else y])
-        for curve, y in zip(curves, drawn, strict=True)
-    ]
-    low, high = _span([np.array([span for span in spans if span])]) or (-1.0, 1.0)
-    near = [y[(y > low - FAR) & (y < high + FAR)] for y in frame]
-    base = _span(near) or _span(
-        [
-            np.array(
-                [
-                    span
-                    for span, curve in zip(spans, curves, strict=True)
-                    if span and not curve.failed
-                ]
-            )
-        ]
-    )
+    successful, failed = [], []
+    for curve, y in zip(curves, drawn, strict=True):
+        shown = _without_spikes(y) if spikes else y
+        if curve.failed:
+            failed.append(_without_outliers(shown))
+        else:
+            successful.append(shown)
+    low, high = _span([*successful, *failed]) or (-1.0, 1.0)
+    near = [y[(y > low - FARTHEST_BOUND) & (y < high + FARTHEST_BOUND)] for y in frame]
+    base = _span(near) or _span(successful)
     if base:
         room = 0.4 * (base[1] - base[0])
         low = min(base[0], max(low, base[0] - room))
@@ -231,16 +224,16 @@ def set_limits(
     axes.set_ylim(low - margin, high + margin)
 
 
-def say_what_is_cut(
+def annotate_clipped_peak(
     axes: Axes, curves: Sequence[Curve], drawn: Sequence[np.ndarray], unit: str
 ) -> None:
-    """Writes the largest value and its time into a panel whose limits leave it out.
+    """Writes the largest clipped value and its time into a panel.
 
     Args:
-      axes: the panel, its limits set.
+      axes: the panel, with its limits.
       curves: the runs, in the order of `drawn`.
-      drawn: what was drawn of each run, from its first sample on.
-      unit: of the values.
+      drawn: the drawn samples of each run, from the first one on.
+      unit: unit of the values.
     """
     low, high = axes.get_ylim()
     found = []
@@ -251,7 +244,7 @@ def say_what_is_cut(
             found.append((abs(float(y[i])), float(curve.t[i])))
     if found:
         value, t = max(found)
-        back = {"facecolor": _style.paper(), "edgecolor": "none", "alpha": 0.85, "pad": 1.0}
+        back = {"facecolor": _style.background(), "edgecolor": "none", "alpha": 0.85, "pad": 1.0}
         where: dict[str, Any] = {
             "transform": axes.transAxes,
             "ha": "right",
@@ -263,7 +256,7 @@ def say_what_is_cut(
 
 
 def _mark_break(axes: Axes, curve: Curve, y: np.ndarray, window: Window) -> None:
-    """A cross where a run broke, at the edge of the panel if that is outside of it."""
+    """Marks with a cross where a run failed, at the edge of the panel if the sample is outside."""
     index = curve.break_index()
     if index is not None and window[0] <= curve.t[index] <= window[1] and np.isfinite(y[index]):
         look: dict[str, Any] = {
@@ -275,21 +268,26 @@ def _mark_break(axes: Axes, curve: Curve, y: np.ndarray, window: Window) -> None
         axes.plot(
             curve.t[index],
             np.clip(y[index], *axes.get_ylim()),
-            color=_style.alarm(),
+            color=_style.failure(),
             zorder=5,
             clip_on=False,
             **look,
         )
 
 
-def _draw_surroundings(
-    axes: Axes, curves: Sequence[Curve], quantity: Plotted, joint: int, window: Window
+def _draw_bounds_and_guide(
+    axes: Axes, curves: Sequence[Curve], quantity: PanelQuantity, joint: int, window: Window
 ) -> tuple[list, list]:
-    """Draws bounds and guide, once for all runs that share them; returns the two."""
-    bounds, guides = [], []
-    fields = [*(quantity.frame or ()), *filter(None, [quantity.guide])]
-    for i, curve in enumerate(distinct(curves, fields, [joint]) if fields else []):
-        own = {"color": series(curves.index(curve))["color"], "alpha": 0.6} if i else {}
+    """Draws bounds and guide, once for all runs that share them; returns the samples of the two."""
+    bounds: list = []
+    guides: list = []
+    fields = [field for field in (*(quantity.frame or ()), quantity.guide) if field]
+    if not fields:
+        return bounds, guides
+    for i, curve in enumerate(distinct(curves, fields, [joint])):
+        own: dict[str, Any] = {}
+        if i > 0:
+            own = {"color": series(curves.index(curve))["color"], "alpha": 0.6}
         bounds += draw_frame(axes, curve, quantity, joint, window, **own)
         if quantity.guide:
             look = _style.reference() | {"zorder": 3, "label": quantity.guide_words} | own
@@ -298,35 +296,32 @@ def _draw_surroundings(
 
 
 def _draw_truth(
-    axes: Axes, curves: Sequence[Curve], quantity: Plotted, joint: int, window: Window
+    axes: Axes, curves: Sequence[Curve], quantity: PanelQuantity, joint: int, window: Window
 ) -> list[tuple[Curve, np.ndarray]]:
-    """Draws what the runs estimate, once for all runs in which it cannot be told apart; returns
-    it.
-    """
+    """Draws the estimated signal, once if it is the same in all runs; returns its samples."""
     if quantity.truth is None:
         return []
     several = distinct(curves, [quantity.truth], [joint])
     drawn = []
     for curve in several:
-        shared = len(several) == 1
-        look = _style.pale() | (
-            {} if shared else {"color": series(curves.index(curve))["color"], "alpha": 0.3}
-        )
-        look["label"] = quantity.symbol if shared else f"{curve.name} {quantity.symbol}"
+        look = _style.underlay() | {"label": quantity.symbol}
+        if len(several) > 1:
+            look |= {"color": series(curves.index(curve))["color"], "alpha": 0.3}
+            look["label"] = f"{curve.name} {quantity.symbol}"
         drawn.append((curve, draw(axes, curve, quantity.truth, joint, window, **look)))
     return drawn
 
 
 def _draw_measured(
-    axes: Axes, curves: Sequence[Curve], quantity: Plotted, joint: int, window: Window
+    axes: Axes, curves: Sequence[Curve], quantity: PanelQuantity, joint: int, window: Window
 ) -> list[tuple[Curve, np.ndarray]]:
-    """Draws what the sensors told, pale under what was; returns it."""
+    """Draws the measurements as pale lines under the signals; returns their samples."""
     drawn = []
     for i, curve in enumerate(curves):
         if quantity.measured and curve.is_measured:
-            name = " ".join(filter(None, [curve.name, "measured"]))
+            name = f"{curve.name} measured".strip()
             look: dict[str, Any] = {
-                "color": _style.shade(0.45, series(i)["color"]),
+                "color": _style.blend(0.45, series(i)["color"]),
                 "linewidth": 0.8,
                 "zorder": 1.9,
                 "label": name,
@@ -338,7 +333,7 @@ def _draw_measured(
 def show(
     axes: Axes,
     curves: Sequence[Curve],
-    quantity: Plotted,
+    quantity: PanelQuantity,
     joint: int,
     window: Window,
     *,
@@ -349,47 +344,50 @@ def show(
     Args:
       axes: the panel.
       curves: the runs.
-      quantity: what to draw.
-      joint: of which joint.
-      window: from and to which time [s].
-      tight: let the limits follow runs and reference alone, not the bounds (for a zoom).
+      quantity: the quantity to draw.
+      joint: index of the joint.
+      window: first and last time [s].
+      tight: let the limits follow runs and reference, not the bounds (for a zoom).
     """
-    bounds, guides = _draw_surroundings(axes, curves, quantity, joint, window)
-    drawn = _draw_truth(axes, curves, quantity, joint, window) + _draw_measured(
-        axes, curves, quantity, joint, window
-    )
+    bounds, guides = _draw_bounds_and_guide(axes, curves, quantity, joint, window)
+    drawn = _draw_truth(axes, curves, quantity, joint, window)
+    drawn += _draw_measured(axes, curves, quantity, joint, window)
     for i, curve in enumerate(curves):
-        name = (
-            " ".join(filter(None, [curve.name, r"$\hat f$" if quantity.truth else ""]))
-            or quantity.symbol
-        )
-        drawn.append(
-            (
-                curve,
-                draw(
-                    axes,
-                    curve,
-                    quantity.field,
-                    joint,
-                    window,
-                    label=name,
-                    **series(i) | (FAINT if curve.failed and len(curves) > 1 else {}),
-                ),
-            )
-        )
+        look = run_style(curves, i)
+        look["label"] = _run_label(curve, quantity)
+        drawn.append((curve, draw(axes, curve, quantity.field, joint, window, **look)))
     axes.set_xlim(*window)
-    frame = guides + ([y for curve, y in drawn if not curve.failed] if tight else bounds)
-    set_limits(axes, [c for c, _ in drawn], [y for _, y in drawn], frame if bounds else [])
+    owners = [curve for curve, _ in drawn]
+    samples = [y for _, y in drawn]
+    frame = guides + bounds
+    if tight:
+        frame = guides + [y for curve, y in drawn if not curve.failed]
+    if not bounds:
+        frame = []
+    set_limits(axes, owners, samples, frame)
     if not tight:
-        say_what_is_cut(axes, [c for c, _ in drawn], [y for _, y in drawn], quantity.unit)
+        annotate_clipped_peak(axes, owners, samples, quantity.unit)
     for curve in curves:
         if curve.failed:
             _mark_break(axes, curve, curve[quantity.field][:, joint], window)
 
 
-def transient_end(curves: Sequence[Curve], quantity: Plotted, joint: int) -> float:
-    """When the last of the sound runs has come within 5 % of the range that it keeps to later, [s];
-    0 if all start there.
+def run_style(curves: Sequence[Curve], index: int) -> dict[str, Any]:
+    """Colour and line of a run; a failed run among others is drawn faint."""
+    if curves[index].failed and len(curves) > 1:
+        return series(index) | FAINT
+    return series(index)
+
+
+def _run_label(curve: Curve, quantity: PanelQuantity) -> str:
+    if quantity.truth:
+        return rf"{curve.name} $\hat f$".strip()
+    return curve.name or quantity.symbol
+
+
+def transient_end(curves: Sequence[Curve], quantity: PanelQuantity, joint: int) -> float:
+    """Time [s] after which all successful runs stay within 5 % of the range of their second half;
+    0 if they start in it.
     """
     ends = [0.0]
     for curve in curves:
@@ -401,5 +399,6 @@ def transient_end(curves: Sequence[Curve], quantity: Plotted, joint: int) -> flo
         outside = np.flatnonzero(
             (y[:half] < y[half:].min() - room) | (y[:half] > y[half:].max() + room)
         )
-        ends.append(float(curve.t[outside[-1]]) if outside.size else 0.0)
+        if outside.size:
+            ends.append(float(curve.t[outside[-1]]))
     return max(ends)

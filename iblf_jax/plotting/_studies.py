@@ -1,11 +1,11 @@
-"""Figures of a Monte-Carlo study: the tube with quantile bands, histograms by verdict, margin
-against each drawn parameter.
+"""Figures of a Monte-Carlo study: quantile bands of the positions, histograms of metrics for failed
+and successful runs, and metrics against the drawn parameters.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from iblf_jax.core import checks
 from iblf_jax.plotting import _style
-from iblf_jax.plotting._curves import called, plain
+from iblf_jax.plotting._curves import escaped, joint_labels
 from iblf_jax.studies import statistics
 from iblf_jax.studies.study import Study
 
@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 
 WIDTH = 10.0
 COLUMNS = 4
-"""Panels side by side at most."""
+"""Largest number of panels in a row."""
 MOST_POINTS = 5000
-"""Runs in a scatter at most: all failed ones first, then others evenly."""
+"""Largest number of failed runs, and about that of successful ones, in a scatter."""
 
 
 def _check(study: Study) -> None:
@@ -33,21 +33,30 @@ def _check(study: Study) -> None:
 
 
 def _verdict(study: Study) -> str:
-    outside = study.status_counts["STARTED_OUTSIDE"]
-    apart = f", {outside} of them because they started outside" if outside else ""
-    return (
-        f"{study.runs} runs, {len(study.failed)} failed; bound violated or run away:"
-        f" {study.violation_probability}{apart}"
+    text = (
+        f"{study.runs} runs, {len(study.failed)} failed; bound violated or diverged:"
+        f" {study.violation_probability}"
     )
+    outside = study.status_counts["STARTED_OUTSIDE"]
+    if outside:
+        text += f", {outside} of them because they started outside"
+    return text
+
+
+def _is_failed(study: Study) -> np.ndarray:
+    """Whether each run failed, (runs,) bool."""
+    failed = np.zeros(study.runs, bool)
+    failed[study.failed] = True
+    return failed
 
 
 def _grid(count: int, height: float) -> tuple[Figure, list[Axes]]:
     sizes = _style.row_sizes(count, COLUMNS)
     figure = _style.new_figure(max(4.0, WIDTH * sizes[0] / COLUMNS), 0.8 + height * len(sizes))
-    return figure, [axes for row in _style.spread(figure, count, COLUMNS) for axes in row]
+    return figure, [axes for row in _style.panel_rows(figure, count, COLUMNS) for axes in row]
 
 
-# ------------------------------------------------------------------------------------------------------------------- bands
+# --- bands
 
 
 @_style.styled()
@@ -58,43 +67,44 @@ def bands(
     runs: int = 1024,
     exclude_failed: bool = False,
 ) -> Figure:
-    """The tube of every joint with the quantiles of the runs' positions along time.
+    """Quantiles of the positions over the runs along time, with the bounds, for every joint.
 
     Args:
-      study: of n joints.
+      study: the study, of n joints.
       quantiles: an odd number of levels in [0, 1]; the middle one is drawn as a line, the others as
-        bands around it.
-      runs: from how many of the runs, which are made again.
-      exclude_failed: leave out failed runs; the title says how many.
+        bands.
+      runs: number of the study's runs that are simulated again for the quantiles.
+      exclude_failed: leave out failed runs; the title states how many.
 
     Returns:
-      The figure, one panel a joint.
+      The figure, one panel per joint.
 
     Raises:
-      ValueError: not a study, or bad quantiles.
+      ValueError: not a Study, or invalid quantiles.
     """
     _check(study)
     data = study.bands(quantiles, runs=runs, exclude_failed=exclude_failed)
     figure, panels = _grid(study.scenario.n, 2.4)
     for joint, axes in enumerate(panels):
         _draw_bands(axes, data, joint, study)
-    _style.head(figure, [_bands_title(data)])
+    _style.set_heading(figure, [_bands_title(data)])
     _style.legend_below(figure)
     return figure
 
 
 def _bands_title(data: xarray.Dataset) -> str:
-    left_out = f", {data.attrs['excluded']} left out" if data.attrs["excluded"] else ""
-    failed = (
-        f", {data.attrs['failed_included']} failed ones among them"
-        if data.attrs["failed_included"]
-        else ""
-    )
-    return f"Quantiles of {data.attrs['runs']} runs{failed}{left_out}"
+    text = f"Quantiles of {data.attrs['runs']} runs"
+    if data.attrs["failed_included"]:
+        text += f", {data.attrs['failed_included']} failed ones among them"
+    if data.attrs["excluded"]:
+        text += f", {data.attrs['excluded']} left out"
+    return text
 
 
 def _draw_bands(axes: Axes, data: xarray.Dataset, joint: int, study: Study) -> None:
-    t, q, levels = data.time.values, data.q.values[:, :, joint], data["quantile"].values
+    t = data.time.values
+    q = data.q.values[:, :, joint]
+    levels = data["quantile"].values
     lower, upper = data.lower.values[:, joint], data.upper.values[:, joint]
     axes.fill_between(t, lower, upper, color=_style.tube(), linewidth=0, zorder=0)
     for edge, text in ((lower, "tightest bounds"), (upper, "_")):
@@ -106,75 +116,67 @@ def _draw_bands(axes: Axes, data: xarray.Dataset, joint: int, study: Study) -> N
         axes.fill_between(
             t, q[low], q[high], color=_style.colour(0), alpha=0.25, linewidth=0, label=words
         )
-        axes.plot(t, q[low], color=_style.colour(0), linewidth=0.6, label="_")
-        axes.plot(t, q[high], color=_style.colour(0), linewidth=0.6, label="_")
+        for edge in (q[low], q[high]):
+            axes.plot(t, edge, color=_style.colour(0), linewidth=0.6, label="_")
     if len(levels) % 2:
         middle = order[len(levels) // 2]
         axes.plot(t, q[middle], color=_style.colour(0), label=f"{100 * levels[middle]:g} %")
     axes.plot(t, data.q_d.values[:, joint], label="reference $q_d$", **_style.reference())
-    axes.set_title(called(study.scenario.plant, study.scenario.n)[joint])
+    axes.set_title(joint_labels(study.scenario.plant, study.scenario.n)[joint])
     axes.set_xlabel(_style.label("time $t$", "s"))
     axes.set_ylabel(_style.label("position $q$", "rad"))
 
 
-# ------------------------------------------------------------------------------------------------- histograms and scatters
+# --- histograms and scatters
 
 
 @_style.styled()
 def histograms(study: Study, metrics: Sequence[str] | None = None, *, bins: int = 40) -> Figure:
-    """Histograms of metrics, runs that failed and runs that did not apart.
+    """Histograms of metrics, with failed and successful runs in different colours.
 
     Args:
       study: the study.
-      metrics: names; all that are finite in some run if not given.  Of each the worst joint.
+      metrics: names; by default all metrics whose finite values differ.  Of a metric with one value
+        per joint, the figure shows the worst joint.
       bins: number of bins.
 
     Returns:
-      The figure, one panel a metric; runs without a finite value are counted in its title.
+      The figure, one panel per metric, whose title counts the runs without a finite value.
 
     Raises:
-      ValueError: not a study, or an unknown metric.
+      ValueError: not a Study, or an unknown metric.
     """
     _check(study)
-    names = (
-        list(study.metrics)
-        if metrics is None
-        else checks.listed("metrics", metrics, '["margin", "rmse"]')
-    )
+    names = list(study.metrics)
+    if metrics is not None:
+        names = checks.listed("metrics", metrics, '["margin", "rmse"]')
     values = {name: statistics.one_number(study.metrics, name) for name in names}
     if metrics is None:
-        values = {
-            name: x
-            for name, x in values.items()
-            if np.isfinite(x).any() and np.ptp(x[np.isfinite(x)]) > 0
-        }
+        values = {name: x for name, x in values.items() if _varies(x)}
     if not values:
         raise checks.fail("metrics", names, "at least one metric with values that differ")
     figure, panels = _grid(len(values), 2.0)
     for axes, (name, x) in zip(panels, values.items(), strict=True):
         _draw_histogram(axes, study, name, x, checks.positive_integer("bins", bins, most=10_000))
-    _style.head(figure, [_verdict(study)])
+    _style.set_heading(figure, [_verdict(study)])
     _style.legend_below(figure)
     return figure
 
 
+def _varies(x: np.ndarray) -> bool:
+    finite = x[np.isfinite(x)]
+    return bool(finite.size and np.ptp(finite) > 0)
+
+
 def _draw_histogram(axes: Axes, study: Study, name: str, x: np.ndarray, bins: int) -> None:
-    failed = np.zeros(study.runs, bool)
-    failed[study.failed] = True
+    failed = _is_failed(study)
     finite = np.isfinite(x)
     if finite.any():
         edges = np.histogram_bin_edges(x[finite].astype(float), bins).tolist()
         axes.hist(x[finite & ~failed], edges, label="not failed", alpha=0.8, color=_style.colour(0))
-        axes.hist(
-            x[finite & failed],
-            edges,
-            label="failed",
-            alpha=0.8,
-            hatch="////",
-            edgecolor=_style.paper(),
-            linewidth=0,
-            color=_style.colour(1),
-        )
+        look: dict[str, Any] = {"alpha": 0.8, "color": _style.colour(1), "linewidth": 0}
+        look |= {"hatch": "////", "edgecolor": _style.background()}
+        axes.hist(x[finite & failed], edges, label="failed", **look)
     if not finite.all():
         axes.set_title(f"{int((~finite).sum())} runs without a value")
     axes.set_xlabel(_style.label(name.replace("_", " "), study.metrics.units.get(name, "1")))
@@ -183,7 +185,7 @@ def _draw_histogram(axes: Axes, study: Study, name: str, x: np.ndarray, bins: in
 
 @_style.styled()
 def scatter(study: Study, metric: str = "margin") -> Figure:
-    """A metric (its worst joint) of every run against each drawn parameter, with the rank
+    """A metric (of the worst joint) of every run against each drawn parameter, with the rank
     correlation.
 
     Args:
@@ -191,71 +193,69 @@ def scatter(study: Study, metric: str = "margin") -> Figure:
       metric: name of the metric.
 
     Returns:
-      The figure, one panel a parameter.
+      The figure, one panel per parameter.
 
     Raises:
-      ValueError: not a study, or an unknown metric.
+      ValueError: not a Study, or an unknown metric.
     """
     _check(study)
     drawn = statistics.columns(study.samples)
     figure, panels = _grid(len(drawn), 2.2)
     for axes, (path, x) in zip(panels, drawn.items(), strict=True):
         _draw_scatter(axes, study, metric, path, x)
-    _style.head(figure, [_verdict(study)])
+    _style.set_heading(figure, [_verdict(study)])
     _style.legend_below(figure)
     return figure
 
 
 def _draw_scatter(axes: Axes, study: Study, metric: str, path: str, x: np.ndarray) -> None:
     y = statistics.one_number(study.metrics, metric)
-    failed = np.zeros(study.runs, bool)
-    failed[study.failed] = True
-    some = study.made & np.isfinite(y)
-    good = np.flatnonzero(some & ~failed)
+    failed = _is_failed(study)
+    known = study.made & np.isfinite(y)
+    good = np.flatnonzero(known & ~failed)
     good = good[:: max(1, len(good) // MOST_POINTS)]
-    bad = np.flatnonzero(some & failed)[:MOST_POINTS]
-    axes.scatter(
-        x[good], y[good], s=4, alpha=0.5, linewidths=0, label="not failed", color=_style.colour(0)
-    )
-    axes.scatter(
-        x[bad], y[bad], s=9, marker="x", linewidths=0.8, label="failed", color=_style.colour(1)
-    )
+    bad = np.flatnonzero(known & failed)[:MOST_POINTS]
+    dots: dict[str, Any] = {"s": 4, "alpha": 0.5, "linewidths": 0, "color": _style.colour(0)}
+    crosses: dict[str, Any] = {"s": 9, "marker": "x", "linewidths": 0.8, "color": _style.colour(1)}
+    axes.scatter(x[good], y[good], label="not failed", **dots)
+    axes.scatter(x[bad], y[bad], label="failed", **crosses)
     if metric in ("margin", "xi_margin"):
         axes.axhline(0.0, color=_style.bound(), linewidth=1.0)
-    rho, _ = statistics.rank_correlation(x[some], y[some])
-    axes.set_title("" if np.isnan(rho) else f"rank correlation {rho:.2f}")
+    rho, _ = statistics.rank_correlation(x[known], y[known])
+    if not np.isnan(rho):
+        axes.set_title(f"rank correlation {rho:.2f}")
     axes.locator_params(axis="x", nbins=4)
-    axes.set_xlabel(_style.label(plain(path), study.parameter_unit(path)))
-    axes.set_ylabel(
-        _style.label(f"worst {metric.replace('_', ' ')}", study.metrics.units.get(metric, "1"))
-    )
+    axes.set_xlabel(_style.label(escaped(path), study.parameter_unit(path)))
+    unit = study.metrics.units.get(metric, "1")
+    axes.set_ylabel(_style.label(f"worst {metric.replace('_', ' ')}", unit))
 
 
 @_style.styled()
 def study_overview(study: Study, *, runs: int = 512) -> Figure:
-    """A study at a glance: the tube with bands, the margins by verdict, the margin against each
-    parameter.
+    """The overview of a study: quantile bands, a histogram of the margin, and the margin against
+    each parameter.
 
     Args:
-      study: of n joints.
-      runs: from how many of the runs the bands are made.
+      study: the study, of n joints.
+      runs: number of the study's runs that are simulated again for the bands.
 
     Returns:
       The figure.
 
     Raises:
-      ValueError: not a study, or one without the metric `margin`.
+      ValueError: not a Study, or one without the metric `margin`.
     """
     _check(study)
-    drawn, data = statistics.columns(study.samples), study.bands(runs=runs)
+    n = study.scenario.n
+    drawn = statistics.columns(study.samples)
+    data = study.bands(runs=runs)
     margins = statistics.one_number(study.metrics, "margin")
-    count = study.scenario.n + 1 + len(drawn)
-    figure, panels = _grid(count, 2.3)
-    for joint in range(study.scenario.n):
+    figure, panels = _grid(n + 1 + len(drawn), 2.3)
+    for joint in range(n):
         _draw_bands(panels[joint], data, joint, study)
-    _draw_histogram(panels[study.scenario.n], study, "margin", margins, 40)
-    for axes, (path, x) in zip(panels[study.scenario.n + 1 :], drawn.items(), strict=True):
+    _draw_histogram(panels[n], study, "margin", margins, 40)
+    for axes, (path, x) in zip(panels[n + 1 :], drawn.items(), strict=True):
         _draw_scatter(axes, study, "margin", path, x)
-    _style.head(figure, [_verdict(study), f"bands: {_bands_title(data).lower()}"])
+    _style.set_heading(figure, [_verdict(study), f"bands: {_bands_title(data).lower()}"])
     _style.legend_below(figure, 6)
     return figure

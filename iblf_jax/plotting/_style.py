@@ -1,12 +1,12 @@
-"""How every figure of this package looks: sizes, colours, line styles, labels with units.
+"""The style of all figures: sizes, colours, line styles, labels with units.
 
-The user's style comes first: whatever of matplotlib's settings (`plt.style.use`, `rcParams`) is not
-at its default stays as it is, and what this package chooses for itself follows it: greys lie
-between the user's text and background, text keeps its proportion to `font.size`.  Colours are else
-Okabe and Ito's (told apart with any colour vision); every colour goes with a line style of its own,
-so that a figure also reads in black-and-white print.  The style is put on with a context manager,
-never on matplotlib's global settings, and figures are objects of their own, not pyplot's: none
-stays open behind a caller's back.
+The user's style has precedence.  Every matplotlib parameter (`plt.style.use`, `rcParams`) that
+differs from its default stays as it is, and the parameters that this package sets follow it: greys
+lie between the user's text and background, and text sizes are proportional to `font.size`.  The
+default colours are those of Okabe and Ito, which readers with any colour vision can distinguish.
+Each colour has its own line style, so that a figure is readable in black-and-white print.  A
+context manager applies the style and leaves matplotlib's global parameters unchanged.  Figures are
+not registered with pyplot, so none stays open.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ FAINT: dict[str, Any] = {"linewidth": 0.8, "alpha": 0.7, "zorder": 1.9}
 WIDTH = 7.2
 """Width of a figure, the text width of a page [in]."""
 FONT = 9.0
-"""Size of the text that every size here is meant for [pt]."""
+"""Font size for which all sizes in this module are chosen [pt]."""
 GROWTH = 0.75
-"""With larger text figures grow by this power of it, so that it is larger in them too."""
+"""Exponent with which figures grow with the font size."""
 
 SIZES = {
     "axes.labelsize": 9.0,
@@ -53,9 +53,9 @@ SIZES = {
     "xtick.labelsize": 8.0,
     "ytick.labelsize": 8.0,
 }
-"""Sizes of text that goes with FONT [pt]."""
+"""Text sizes for a font of size FONT [pt]."""
 
-SETTINGS: dict[str, Any] = {
+DEFAULTS: dict[str, Any] = {
     "legend.frameon": False,
     "legend.handlelength": 2.8,
     "lines.linewidth": 1.4,
@@ -70,9 +70,9 @@ SETTINGS: dict[str, Any] = {
     "savefig.dpi": 200,
     "pdf.fonttype": 42,
 }
-"""What this package sets where the user has not."""
+"""Parameters that this package sets unless the user has set them."""
 
-LOOK = (
+STYLE_GROUPS = (
     "axes",
     "axes3d",
     "figure",
@@ -88,107 +88,103 @@ LOOK = (
     "xtick",
     "ytick",
 )
-"""The groups of settings that a figure keeps from when it was made, because matplotlib reads them
-again when it draws."""
+"""Groups of parameters that a figure keeps from its creation, because matplotlib reads them again
+when it draws."""
 
 
 @contextmanager
 def styled() -> Iterator[None]:
-    """The context in which a figure of this package is made and saved; also a decorator,
-    `@styled()`.
-    """
-    own, user = SETTINGS | {"font.size": FONT}, [name for name in SETTINGS if _chosen(name)]
-    with matplotlib.rc_context({name: value for name, value in own.items() if not _chosen(name)}):  # type: ignore[misc]
-        sizes = {name: size(points) for name, points in SIZES.items() if not _chosen(name)}
-        panes = {f"axes3d.{axis}axis.panecolor": to_rgba(shade(0.05), 0.5) for axis in "xyz"}
-        colours: dict[Any, Any] = {"grid.color": shade(0.114)} | panes
-        if _chosen("grid.color") and "axes.grid" not in user:
-            colours["grid.alpha"] = (
-                0.35  # a colour for the few who ask for a grid; here every panel has one
-            )
-        with matplotlib.rc_context(
-            sizes | {name: value for name, value in colours.items() if not _chosen(name)}
-        ):  # type: ignore[operator]
+    """The context in which figures are made and saved; also a decorator, `@styled()`."""
+    user_sets_grid = _set_by_user("axes.grid")
+    with matplotlib.rc_context(_unset(DEFAULTS | {"font.size": FONT})):
+        panes = {f"axes3d.{axis}axis.panecolor": to_rgba(blend(0.05), 0.5) for axis in "xyz"}
+        sizes = {name: size(points) for name, points in SIZES.items()}
+        derived = sizes | panes | {"grid.color": blend(0.114)}
+        if _set_by_user("grid.color") and not user_sets_grid:
+            # The user chose the colour for figures that mostly have no grid; here all panels do.
+            derived["grid.alpha"] = 0.35
+        with matplotlib.rc_context(_unset(derived)):
             yield
 
 
-def _chosen(name: Any) -> bool:
-    """Whether the user's setting is not matplotlib's."""
+def _unset(parameters: dict[str, Any]) -> dict[Any, Any]:
+    """The parameters that the user has not set."""
+    return {name: value for name, value in parameters.items() if not _set_by_user(name)}
+
+
+def _set_by_user(name: Any) -> bool:
     return matplotlib.rcParams[name] != matplotlib.rcParamsDefault[name]
 
 
 def size(points: float) -> float:
-    """A size of text [pt] that is `points` where text is of size FONT, in proportion to the
-    user's.
-    """
+    """A text size [pt] that is `points` for a font of size FONT, scaled to the user's font."""
     return points * matplotlib.rcParams["font.size"] / FONT
 
 
 class StyledFigure(Figure):
-    """A figure that is drawn in the style that it was made in, and that a notebook shows when a
-    cell returns it.
+    """A figure that keeps the style of its creation, and that a notebook shows as a cell's
+    value.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self._fitted = False
-        self._look = {
+        self._style_of_creation = {
             name: matplotlib.rcParams[name]
             for name in matplotlib.rcParams
-            if name.split(".")[0] in LOOK
+            if name.split(".")[0] in STYLE_GROUPS
         }
 
     def draw(self, renderer: Any) -> None:
-        """As matplotlib's, in the style that the figure was made in."""
-        with matplotlib.rc_context(self._look):
+        """Draws the figure in the style of its creation."""
+        with matplotlib.rc_context(self._style_of_creation):
             if not self._fitted:
                 self._fitted = True
                 self._fit_labels(renderer)
             super().draw(renderer)
 
     def _fit_labels(self, renderer: Any) -> None:
-        """Breaks every title and label that is longer than its panel, by the places that the panels
-        have without them, then with them.
+        """Breaks every title and label that is longer than its panel.
+
+        The first pass lays the panels out without the labels, further ones with the broken labels.
         """
-        engine = self.get_layout_engine()
-        labels = [
-            (axes, text)
-            for axes in self.axes
-            for text in (axes.title, axes.xaxis.label, axes.yaxis.label)
-            if text.get_text()
-        ]
-        words = [text.get_text() for _, text in labels]
-
-        def laid_out(counted: bool) -> list[tuple[float, float]]:
-            """The length of every label and the room that it has."""
-            for _, text in labels:
-                text.set_in_layout(counted)
-            if engine is not None:
-                engine.execute(self)
-            found = []
-            for axes, text in labels:
-                upright, box, extent = (
-                    text is axes.yaxis.label,
-                    axes.get_window_extent(renderer),
-                    text.get_window_extent(renderer),
-                )
-                found.append((extent.height, box.height) if upright else (extent.width, box.width))
-            return found
-
-        if all(length <= room for length, room in laid_out(counted=True)):
+        labels = []
+        for axes in self.axes:
+            for text in (axes.title, axes.xaxis.label, axes.yaxis.label):
+                if text.get_text():
+                    labels.append((axes, text))
+        unbroken = [text.get_text() for _, text in labels]
+        if all(length <= room for length, room in self._lengths(labels, renderer, True)):
             return
-        for counted in (False, True, True):
-            for (_, text), whole, (length, room) in zip(
-                labels, words, laid_out(counted), strict=True
-            ):
+        for in_layout in (False, True, True):
+            lengths = self._lengths(labels, renderer, in_layout)
+            for (_, text), words, (length, room) in zip(labels, unbroken, lengths, strict=True):
                 if length > room > 0:
-                    most = int(max(map(len, text.get_text().split("\n"))) * room / length)
-                    text.set_text(
-                        "\n".join(wrapped(line, max(6, most)) for line in whole.split("\n"))
-                    )
+                    longest = max(map(len, text.get_text().split("\n")))
+                    most = max(6, int(longest * room / length))
+                    text.set_text("\n".join(wrapped(line, most) for line in words.split("\n")))
+
+    def _lengths(
+        self, labels: list[tuple[Axes, Any]], renderer: Any, in_layout: bool
+    ) -> list[tuple[float, float]]:
+        """The length of every label and the room that its panel has for it."""
+        for _, text in labels:
+            text.set_in_layout(in_layout)
+        engine = self.get_layout_engine()
+        if engine is not None:
+            engine.execute(self)
+        found = []
+        for axes, text in labels:
+            box = axes.get_window_extent(renderer)
+            extent = text.get_window_extent(renderer)
+            if text is axes.yaxis.label:  # It is rotated.
+                found.append((extent.height, box.height))
+            else:
+                found.append((extent.width, box.width))
+        return found
 
     def savefig(self, *args: Any, **kwargs: Any) -> None:
-        """As matplotlib's, in this package's style."""
+        """Saves the figure in this package's style."""
         with styled():
             super().savefig(*args, **kwargs)
 
@@ -199,22 +195,24 @@ class StyledFigure(Figure):
 
 
 def new_figure(width: float, height: float) -> StyledFigure:
-    """An empty figure whose parts make room for each other; sizes in inches, which grow with text
-    larger than FONT, but less.
+    """An empty figure with a constrained layout.
+
+    Args:
+      width, height: size for a font of size FONT [in]; larger fonts enlarge the figure.
     """
     growth = max(1.0, size(1.0)) ** GROWTH
     return StyledFigure(figsize=(width * growth, height * growth), layout="constrained")
 
 
-# ----------------------------------------------------------------------------------------------------------------- colours
+# --- colours
 
 
-def ink() -> str:
+def text_colour() -> str:
     """The colour of text."""
     return to_hex(matplotlib.rcParams["text.color"])
 
 
-def paper() -> str:
+def background() -> str:
     """The colour behind a panel; white where there is none."""
     for name in ("axes.facecolor", "figure.facecolor"):
         if to_rgba(matplotlib.rcParams[name])[3] > 0:
@@ -223,49 +221,52 @@ def paper() -> str:
 
 
 def is_light(colour: Any) -> bool:
-    """Whether dark marks are seen on this colour better than light ones."""
+    """Whether dark marks contrast with this colour better than light ones."""
     red, green, blue = to_rgb(colour)
     return 0.299 * red + 0.587 * green + 0.114 * blue > 0.5
 
 
-def shade(share: float, of: str | None = None) -> str:
-    """Between paper (0) and text, or another colour (1)."""
-    (r, g, b), (red, green, blue) = to_rgb(paper()), to_rgb(of or ink())
-    return to_hex((r + share * (red - r), g + share * (green - g), b + share * (blue - b)))
+def blend(share: float, of: str | None = None) -> str:
+    """The colour between the background (share 0) and text, or another colour (share 1)."""
+    ends = zip(to_rgb(background()), to_rgb(of or text_colour()), strict=True)
+    red, green, blue = (low + share * (high - low) for low, high in ends)
+    return to_hex((red, green, blue))
 
 
 def bound() -> str:
-    """The colour of bounds, and of all that is there to be compared with."""
-    return shade(0.459)
+    """The colour of bounds and of other lines for comparison."""
+    return blend(0.459)
 
 
 def tube() -> str:
     """The colour between bounds."""
-    return shade(0.055)
+    return blend(0.055)
 
 
-def alarm() -> str:
-    """The colour of what failed."""
-    return "#a00000" if is_light(paper()) else "#ff6b60"
+def failure() -> str:
+    """The colour of failures."""
+    if is_light(background()):
+        return "#a00000"
+    return "#ff6b60"
 
 
-def broken() -> str:
-    """The colour of where something would be broken."""
-    return shade(0.12, alarm())
+def forbidden() -> str:
+    """The colour of the area in which a requirement is violated."""
+    return blend(0.12, failure())
 
 
 def reference() -> dict[str, Any]:
-    """Look of a reference."""
-    return {"color": ink(), "linestyle": (0, (1, 1.6)), "linewidth": 1.1}
+    """The line style of a reference."""
+    return {"color": text_colour(), "linestyle": (0, (1, 1.6)), "linewidth": 1.1}
 
 
-def pale() -> dict[str, Any]:
-    """Look of a signal that others estimate, drawn under them."""
-    return {"color": shade(0.212), "linestyle": "-", "linewidth": 4.0}
+def underlay() -> dict[str, Any]:
+    """The line style of a signal that is drawn under its estimates."""
+    return {"color": blend(0.212), "linestyle": "-", "linewidth": 4.0}
 
 
 def colour(index: int) -> str:
-    """Colour of the index-th run, or joint, of a figure: of the user's cycle, if there is one."""
+    """Colour of the index-th run, or joint, of a figure, from the user's cycle if there is one."""
     cycle = matplotlib.rcParams["axes.prop_cycle"].by_key().get("color", COLOURS)
     return to_hex(cycle[index % len(cycle)])
 
@@ -276,21 +277,23 @@ def series(index: int) -> dict[str, Any]:
 
 
 def colour_map(name: str) -> str:
-    """The user's colour map, or this one."""
-    return matplotlib.rcParams["image.cmap"] if _chosen("image.cmap") else name
+    """The user's colour map, or this one if the user has set none."""
+    if _set_by_user("image.cmap"):
+        return matplotlib.rcParams["image.cmap"]
+    return name
 
 
-# -------------------------------------------------------------------------------------------------------------- words, places
+# --- labels and layout
 
 
 def label(words: str, unit: str) -> str:
-    """An axis label: what it is, and its unit in brackets."""
+    """An axis label: the quantity, and its unit in brackets."""
     return f"{words} [{unit}]"
 
 
 PIECES = re.compile(r"\\.|\$[^$]*\$|(?:[^\s._\]$\\]|\.(?=\d))+[\s._\]]*|[\s._\]]+|[$\\]")
-"""What a label may be broken between: escaped characters, formulas, and words with what separates
-them from the next."""
+"""Pieces between which a label may be broken: escaped characters, formulas, and words with the
+separators that follow them."""
 
 
 def wrapped(words: str, room: int) -> str:
@@ -300,82 +303,98 @@ def wrapped(words: str, room: int) -> str:
     text, unit = re.fullmatch(r"(.*?)( \[[^\[\]]*\])?", words, re.DOTALL).groups("")  # type: ignore[union-attr]
     lines = [""]
     for part in [*PIECES.findall(text), unit]:
-        whole = len(part) <= room or part == unit or "$" in part
-        for piece in [part] if whole else [part[i : i + room] for i in range(0, len(part), room)]:
+        pieces = [part]
+        if len(part) > room and part != unit and "$" not in part:
+            pieces = [part[i : i + room] for i in range(0, len(part), room)]
+        for piece in pieces:
             if lines[-1].strip() and len((lines[-1] + piece).rstrip()) > room:
                 lines.append("")
             lines[-1] += piece
     return "\n".join(line.strip() for line in lines)
 
 
-def entitle(figure: Figure, words: str, curves: Sequence[Curve], *, always: bool = False) -> None:
-    """The title of a figure, with the status of every run that has a flag (of every run with
-    `always`), once for runs that share it.
+def set_title(figure: Figure, words: str, curves: Sequence[Curve], *, always: bool = False) -> None:
+    """Sets the title of a figure, with the status of the runs that have a flag.
+
+    Args:
+      figure: the figure.
+      words: the first line.
+      curves: the runs; those with the same status share a line.
+      always: state the status of the other runs too.
     """
     named: dict[str, list[str]] = {}
     for curve in curves:
         if always or not curve.ok:
             named.setdefault(curve.status, []).append(curve.name or "status")
-    verdicts = [f"{', '.join(names)}: {status}" for status, names in named.items()]
+    lines = [words, *(f"{', '.join(names)}: {status}" for status, names in named.items())]
     failed = any(curve.failed for curve in curves)
-    head(figure, [words, *verdicts], color=alarm() if failed else ink())
+    set_heading(figure, lines, color=failure() if failed else text_colour())
 
 
-def head(figure: Figure, lines: Sequence[str], **options: Any) -> None:
-    """The title of a figure, line by line, each broken where it is too long."""
+def set_heading(figure: Figure, lines: Sequence[str], **options: Any) -> None:
+    """Sets the title of a figure from its lines; lines that are too long are broken."""
     room = int(12 * figure.get_figwidth() * 9.0 / size(9.0))
-    figure.suptitle(
-        "\n".join(part for line in lines for part in textwrap.wrap(line, room) or [""]), **options
-    )
+    figure.suptitle("\n".join(textwrap.fill(line, room) for line in lines), **options)
 
 
 def legend_below(figure: Figure, columns: int = 5, of: Sequence[Axes] | None = None) -> None:
-    """One legend for the whole figure (or for these panels) under it, each label once, in as many
-    columns as there is room for.
-    """
-    entries: dict[str, Any] = {}
-    for axes in figure.axes if of is None else of:
-        for handle, text in zip(*axes.get_legend_handles_labels(), strict=True):
-            entries.setdefault(text, handle)
-    if entries:
-        room = figure.get_figwidth() * 72 / (size(8.5) * (4.5 + 0.56 * max(map(len, entries))))
-        rows = math.ceil(len(entries) / max(1, min(columns, int(room))))
-        figure.legend(
-            list(entries.values()),
-            list(entries),
-            loc="outside lower center",
-            ncols=math.ceil(len(entries) / rows),
-        )
-
-
-def spread(
-    figure: Figure, count: int, most: int, where: SubplotSpec | None = None, **options: Any
-) -> list[list[Axes]]:
-    """Panels in rows of at most `most`, as many in one row as in another (one more or less), each
-    row over the whole width.
+    """Puts one legend under a figure, with each label once.
 
     Args:
-      figure: where they are made.
-      count: how many panels.
-      most: side by side at most.
+      figure: the figure.
+      columns: largest number of columns; there are fewer if the labels are long.
+      of: panels whose labels it shows; all panels if not given.
+    """
+    entries: dict[str, Any] = {}
+    for axes in of or figure.axes:
+        for handle, text in zip(*axes.get_legend_handles_labels(), strict=True):
+            entries.setdefault(text, handle)
+    if not entries:
+        return
+    characters = 4.5 + 0.56 * max(map(len, entries))  # line and label, in units of the text size
+    room = int(figure.get_figwidth() * 72 / (size(8.5) * characters))
+    rows = math.ceil(len(entries) / max(1, min(columns, room)))
+    columns = math.ceil(len(entries) / rows)
+    handles, labels = list(entries.values()), list(entries)
+    figure.legend(handles, labels, loc="outside lower center", ncols=columns)
+
+
+def name_ticks(axes: Axes, names: Sequence[str], room: int) -> None:
+    """Names the horizontal ticks; rotates the names if they need more than `room` characters."""
+    look: dict[str, Any] = {}
+    if max(map(len, names)) * len(names) > room:
+        look = {"rotation": 40, "ha": "right"}
+    axes.set_xticks(range(len(names)), names, **look)
+
+
+def panel_rows(
+    figure: Figure, count: int, most: int, where: SubplotSpec | None = None, **options: Any
+) -> list[list[Axes]]:
+    """Panels in rows of nearly equal length, each row over the full width.
+
+    Args:
+      figure: the figure.
+      count: number of panels.
+      most: largest number of panels in a row.
       where: the part of the figure; all of it if not given.
-      options: of the panels.
+      options: options of the panels.
 
     Returns:
       The panels, row by row.
     """
     sizes = row_sizes(count, most)
-    grid = figure.add_gridspec(len(sizes), 1) if where is None else where.subgridspec(len(sizes), 1)
+    grid: Any = (
+        figure.add_gridspec(len(sizes), 1) if where is None else where.subgridspec(len(sizes), 1)
+    )
     rows = []
-    for r, k in enumerate(sizes):
-        places = grid[r].subgridspec(
-            1, k
-        )  # of its own: columns that all rows share would be too narrow for their labels
-        rows.append([figure.add_subplot(places[c], **options) for c in range(k)])
+    for cell, k in zip(grid, sizes, strict=True):
+        # Each row has its own grid: shared columns would be too narrow for the labels.
+        row = cell.subgridspec(1, k)
+        rows.append([figure.add_subplot(place, **options) for place in row])
     return rows
 
 
 def row_sizes(count: int, most: int) -> list[int]:
-    """How many of `count` panels go into each row, at most `most`; the fuller rows first."""
+    """Number of panels in each row, at most `most`; the fuller rows first."""
     rows = -(-count // most)
     return [count // rows + (r < count % rows) for r in range(rows)]

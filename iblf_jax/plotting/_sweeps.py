@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from iblf_jax.core import checks
 from iblf_jax.core.status import FAILED, VIOLATED
 from iblf_jax.plotting import _style
-from iblf_jax.plotting._curves import plain
+from iblf_jax.plotting._curves import escaped
 from iblf_jax.studies.statistics import SMALLER_IS_WORSE
 
 if TYPE_CHECKING:
@@ -25,15 +25,22 @@ SHARES = {
     "failed": (int(FAILED), "share of failed runs [1]"),
     "violated": (int(VIOLATED), "share of runs that left a bound [1]"),
 }
-"""What may be drawn beside the metrics: the share of the runs that raised one of these flags."""
+"""Names that are accepted besides metrics: the share of the runs with one of these flags."""
 COLOURS = "viridis"
 
 
 def summary(data: xarray.Dataset, metric: str) -> tuple[xarray.DataArray, str]:
-    """One number a point, and what it is: the median over runs of the worst joint's metric, or the
-    share of failed runs.
+    """One number per point of a sweep, and its label.
+
+    Args:
+      data: the Dataset of a sweep.
+      metric: a metric, of which the result is the median over the runs of the worst joint's value,
+        or a key of `SHARES`.
+
+    Raises:
+      ValueError: not the Dataset of a sweep, or an unknown metric.
     """
-    if "config" not in getattr(data, "attrs", {}):
+    if not hasattr(data, "attrs") or "config" not in data.attrs:
         raise checks.fail(
             "data",
             type(data).__name__,
@@ -42,28 +49,30 @@ def summary(data: xarray.Dataset, metric: str) -> tuple[xarray.DataArray, str]:
         )
     if metric in SHARES:
         flags, words = SHARES[metric]
-        raised = ((data.status & flags) != 0).astype(float).where(data.status >= 0)
-        return (raised.mean("run") if "run" in raised.dims else raised), words
+        values = ((data.status & flags) != 0).astype(float).where(data.status >= 0)
+        if "run" in values.dims:
+            values = values.mean("run")
+        return values, words
     if metric not in data.data_vars:
         raise checks.fail(
             "metric", metric, "one of " + ", ".join([*SHARES, *map(str, data.data_vars)])
         )
-    values, words = data[metric], metric.replace("_", " ")
+    values = data[metric]
+    words = metric.replace("_", " ")
     unit = values.attrs.get("units", "1")
     if "joint" in values.dims:
-        smaller = metric in SMALLER_IS_WORSE
-        values, words = (
-            (values.min("joint") if smaller else values.max("joint")),
-            f"{words} of the worst joint",
-        )
+        values = values.min("joint") if metric in SMALLER_IS_WORSE else values.max("joint")
+        words = f"{words} of the worst joint"
     if "run" in values.dims:
-        values, words = values.median("run"), f"median {words}"
+        values = values.median("run")
+        words = f"median {words}"
     return values, f"{words} [{unit}]"
 
 
 def _axis_label(data: xarray.Dataset, name: str) -> str:
-    unit = data[name].attrs.get("units", "") if name in data.coords else ""
-    return _style.label(plain(name), unit) if unit else plain(name)
+    if name in data.coords and data[name].attrs.get("units"):
+        return _style.label(escaped(name), data[name].attrs["units"])
+    return escaped(name)
 
 
 @_style.styled()
@@ -75,34 +84,36 @@ def heat_map(
     y: str | None = None,
     **at: Any,
 ) -> Figure:
-    """A number at every point over two dimensions of a grid; several numbers side by side.
+    """Heat map of a metric over two dimensions of a grid; one panel per metric.
 
     Args:
       data: the Dataset of a sweep.
       metric: name of a metric (the median over the runs, of the worst joint), "failed" for the
-        share of runs that failed, or "violated" for that of those that left a bound; or several of
-        them.
+        share of failed runs, "violated" for the share of runs that left a bound, or a list of
+        these.
       x, y: dimensions of the axes; the first two if not given.
-      at: for further dimensions, which value to show (`sel`, nearest), given as a dict:
+      at: values of the other dimensions (the nearest point is shown), given as a dict:
         `heat_map(data, **{"observer.kf": 20})`.
 
     Returns:
       The figure, with the numbers in its cells if there are few.
 
     Raises:
-      ValueError: no Dataset of a sweep, an unknown metric or dimension, or a dimension that is
-        neither shown nor fixed.
+      ValueError: not the Dataset of a sweep, an unknown metric or dimension, or a dimension that is
+        neither an axis nor fixed.
     """
     metrics = [metric] if isinstance(metric, str) else list(metric)
     if not metrics:
-        raise checks.fail("metric", metric, "at least one")
-    figure = _style.new_figure(_style.WIDTH if len(metrics) == 1 else 5.2 * len(metrics), 4.2)
-    for axes, name in zip(figure.subplots(1, len(metrics), squeeze=False)[0], metrics, strict=True):
-        _heat(figure, axes, data, name, x, y, at)
+        raise checks.fail("metric", metric, "at least one name")
+    width = _style.WIDTH if len(metrics) == 1 else 5.2 * len(metrics)
+    figure = _style.new_figure(width, 4.2)
+    panels = figure.subplots(1, len(metrics), squeeze=False)[0]
+    for axes, name in zip(panels, metrics, strict=True):
+        _draw_heat_map(figure, axes, data, name, x, y, at)
     return figure
 
 
-def _heat(
+def _draw_heat_map(
     figure: Figure,
     axes: Any,
     data: xarray.Dataset,
@@ -118,8 +129,10 @@ def _heat(
             raise checks.fail("dimension", name, "one of " + ", ".join(map(str, values.dims)))
         values = values.sel({name: value}, method="nearest")
     dims = [str(d) for d in values.dims]
-    x = x if x is not None else (dims[0] if dims else "")
-    y = y if y is not None else next((d for d in dims if d != x), "")
+    if x is None:
+        x = next((d for d in dims if d != y), "")
+    if y is None:
+        y = next((d for d in dims if d != x), "")
     if len(dims) != 2 or {x, y} != set(dims):
         raise checks.fail(
             "x, y",
@@ -145,34 +158,29 @@ def _ticks(axis: Any, values: np.ndarray) -> None:
 
 
 def _write_numbers(axes: Any, picture: np.ndarray, image: Any) -> None:
+    centred = {"ha": "center", "va": "center", "fontsize": _style.size(7.5)}
     for (row, column), value in np.ndenumerate(picture):
-        behind = image.cmap(image.norm(value))[:3] if np.isfinite(value) else _style.paper()
-        colour = "black" if _style.is_light(behind) else "white"
-        axes.text(
-            column,
-            row,
-            f"{value:.3g}",
-            ha="center",
-            va="center",
-            color=colour,
-            fontsize=_style.size(7.5),
-        )
+        cell: Any = _style.background()
+        if np.isfinite(value):
+            cell = image.cmap(image.norm(value))[:3]
+        colour = "black" if _style.is_light(cell) else "white"
+        axes.text(column, row, f"{value:.3g}", color=colour, **centred)
 
 
 @_style.styled()
 def parallel(data: xarray.Dataset, metric: str = "margin") -> Figure:
-    """Parallel coordinates: one line a point through the values of all swept parameters, coloured
+    """Parallel coordinates: one line per point through the values of all swept parameters, coloured
     by a metric.
 
     Args:
       data: the Dataset of a sweep.
-      metric: as for `heat_map`; it is the last axis too.
+      metric: as for `heat_map`; it is also the last axis.
 
     Returns:
-      The figure; every axis runs from the least to the greatest of its values.
+      The figure; every axis extends from the smallest to the largest value.
 
     Raises:
-      ValueError: no Dataset of a sweep, or an unknown metric.
+      ValueError: not the Dataset of a sweep, or an unknown metric.
     """
     values, words = summary(data, metric)
     columns = _columns(data, values)
@@ -182,14 +190,17 @@ def parallel(data: xarray.Dataset, metric: str = "margin") -> Figure:
     if not len(raw):
         raise checks.fail("metric", metric, "a metric that is finite at some point")
     low, high = raw.min(0), raw.max(0)
-    scaled = (raw - low) / np.where(high > low, high - low, 1.0)
+    width = np.where(high > low, high - low, 1.0)
+    scaled = (raw - low) / width
     figure = _style.new_figure(max(_style.WIDTH, 1.6 * len(columns)), 4.2)
     axes = figure.subplots()
-    norm = matplotlib.colors.Normalize(low[-1], high[-1] if high[-1] > low[-1] else low[-1] + 1.0)
+    norm = matplotlib.colors.Normalize(low[-1], low[-1] + width[-1])
     mapper = matplotlib.cm.ScalarMappable(norm, _style.colour_map(COLOURS))
     for line, y in sorted(zip(scaled, raw[:, -1], strict=True), key=lambda pair: pair[1]):
         axes.plot(np.arange(len(columns)), line, color=mapper.to_rgba(y), linewidth=0.9, alpha=0.8)
-    axes.set_xticks(np.arange(len(columns)), [_style.wrapped(plain(name), 18) for name in columns])
+    axes.set_xticks(
+        np.arange(len(columns)), [_style.wrapped(escaped(name), 18) for name in columns]
+    )
     axes.set_yticks([])
     for place, (bottom, top) in enumerate(zip(low, high, strict=True)):
         for value, height, side in ((bottom, -0.02, "top"), (top, 1.02, "bottom")):
@@ -205,13 +216,13 @@ def _columns(data: xarray.Dataset, values: xarray.DataArray) -> dict[str, np.nda
     """Label of every swept number -> its value at every point, in the order of `values`."""
     columns = {}
     for path in json.loads(data.attrs["config"])["points"]:
-        name = path if f"{path}_values" not in data.coords else f"{path}_values"
-        coordinate = data[name]
+        vector = f"{path}_values"  # the coordinate of a path to a vector
+        coordinate = data[vector if vector in data.coords else path]
+        unit = coordinate.attrs.get("units") or "1"
         inner = [d for d in coordinate.dims if d not in values.dims]
-        for place in np.ndindex(*(coordinate.sizes[d] for d in inner)):
-            one = coordinate.isel(dict(zip(inner, place, strict=True)))
-            label = path + "".join(f"[{i}]" for i in place)
-            columns[_style.label(label, coordinate.attrs.get("units") or "1")] = np.ravel(
-                one.broadcast_like(values).transpose(*values.dims).values
-            )
+        for index in np.ndindex(*(coordinate.sizes[d] for d in inner)):
+            entry = coordinate.isel(dict(zip(inner, index, strict=True)))
+            label = path + "".join(f"[{i}]" for i in index)
+            at_points = entry.broadcast_like(values).transpose(*values.dims)
+            columns[_style.label(label, unit)] = np.ravel(at_points.values)
     return columns

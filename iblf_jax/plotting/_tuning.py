@@ -1,5 +1,5 @@
-"""Figures of gain tuning: how it went, what it changed, the loss around the optimum, a front of two
-objectives.
+"""Figures of gain tuning: its progress, its effect on the run, the loss near the optimum, and a
+front of two objectives.
 """
 
 from __future__ import annotations
@@ -13,28 +13,35 @@ from matplotlib.figure import Figure
 
 from iblf_jax.core import checks
 from iblf_jax.plotting import _style
-from iblf_jax.plotting._curves import Curve, curves_of, plain
-from iblf_jax.plotting._panels import QUANTITIES, Window, draw, say_what_is_cut, set_limits, show
+from iblf_jax.plotting._curves import Curve, curves_of, escaped
+from iblf_jax.plotting._panels import (
+    QUANTITIES,
+    Window,
+    annotate_clipped_peak,
+    draw,
+    set_limits,
+    show,
+)
 
 if TYPE_CHECKING:
     from iblf_jax.tuning import Front, TuneResult
 
 MOST_NAMED = 28
-"""Gains that the legend names at most."""
+"""Largest number of gains in the legend."""
 
 
 @_style.styled()
 def tuning(
     result: TuneResult, *, landscape: tuple[str, str] | None = None, points: int = 13
 ) -> Figure:
-    """A tuning at a glance: objective, margin and gains over steps, the loss around the optimum,
-    torque and tubes before and after.
+    """The overview of a tuning: objective, margin and gains over the steps, the loss near the
+    optimum, torques and positions before and after.
 
     Args:
-      result: of `tune`.
+      result: the result of `tune`.
       landscape: names of two tuned numbers, such as ("controller.k1[0]", "controller.K2[0]"); the
         first two if not given.
-      points: of the landscape, a side.
+      points: points of the landscape along each axis.
 
     Returns:
       A matplotlib Figure.
@@ -54,38 +61,32 @@ def tuning(
     n = result.scenario.n
     columns = 1 if n <= 3 else 2
     rows = len(_style.row_sizes(n, columns))
-    named = len(result.names) if len(result.names) <= MOST_NAMED else 0
-    heights = [1.9, 2.5 + 0.17 * named, 2.0, 1.7 * rows]
+    heights = [1.9, 2.5, 2.0, 1.7 * rows]
+    if len(result.names) <= MOST_NAMED:
+        heights[1] += 0.17 * len(result.names)
     figure = _style.new_figure(_style.WIDTH, 1.0 + sum(heights))
     grid = figure.add_gridspec(4, 2, height_ratios=heights)
     _progress(figure.add_subplot(grid[0, 0]), result)
     _margin(figure.add_subplot(grid[0, 1]), result)
     _gains(figure.add_subplot(grid[1, 0]), result)
-    names = landscape or ((result.names[0], result.names[1]) if len(result.names) > 1 else None)
-    if names is not None:
-        _landscape(figure.add_subplot(grid[1, 1]), result, names, points)
-    curves, whole = (
-        curves_of(dict(zip(("before", "tuned"), result.nominal, strict=True))),
-        (
-            0.0,
-            result.setup.duration,
-        ),
-    )
+    if landscape is None and len(result.names) > 1:
+        landscape = (result.names[0], result.names[1])
+    if landscape is not None:
+        _landscape(figure.add_subplot(grid[1, 1]), result, landscape, points)
+    curves = curves_of(dict(zip(("before", "tuned"), result.nominal, strict=True)))
+    window = (0.0, result.setup.duration)
     _peaks(figure.add_subplot(grid[2, 0]), curves)
-    _torque(figure.add_subplot(grid[2, 1]), curves, whole)
-    tubes = _style.spread(figure, n, columns, grid[3, :])
+    _torque(figure.add_subplot(grid[2, 1]), curves, window)
+    tubes = _style.panel_rows(figure, n, columns, grid[3, :])
     for i, axes in enumerate(axes for row in tubes for axes in row):
-        show(axes, curves, QUANTITIES["q"], i, whole)
-        axes.set_ylabel(_style.label(curves[0].called(i), "rad"))
-        axes.set_xlabel(_style.label("time $t$", "s") if axes in tubes[-1] else "")
-    ends = result.at_limits
-    _style.head(
-        figure,
-        [
-            "Gain tuning",
-            *(["at the end of their range: " + ", ".join(map(plain, ends))] if ends else []),
-        ],
-    )
+        show(axes, curves, QUANTITIES["q"], i, window)
+        axes.set_ylabel(_style.label(curves[0].joint_label(i), "rad"))
+    for axes in tubes[-1]:
+        axes.set_xlabel(_style.label("time $t$", "s"))
+    heading = ["Gain tuning"]
+    if result.at_limits:
+        heading.append("at the end of their range: " + ", ".join(map(escaped, result.at_limits)))
+    _style.set_heading(figure, heading)
     _style.legend_below(figure, of=tubes[0])
     return figure
 
@@ -93,57 +94,54 @@ def tuning(
 def _peaks(axes: Axes, curves: list[Curve]) -> None:
     """The largest torque of every joint, before and after."""
     n = curves[0].run.n
-    peaks = [
-        np.nanmax(np.where(np.isfinite(x), np.abs(x), 0.0), axis=0)
-        for x in (curve["tau"] for curve in curves)
-    ]
-    for i, peak in enumerate(peaks):
+    many = n > 3
+    above: dict[str, Any] = {"xytext": (0, 2), "textcoords": "offset points"}
+    above |= {"ha": "center", "va": "bottom", "fontsize": _style.size(6.5)}
+    if many:
+        above["rotation"] = 90
+    peaks = []
+    for i, curve in enumerate(curves):
+        size = np.abs(curve["tau"])
+        peak = np.where(np.isfinite(size), size, 0.0).max(axis=0)
         places = np.arange(n) + 0.4 * (i - 0.5)
         axes.bar(places, peak, width=0.36, color=_style.colour(i))
         for x, y in zip(places, peak, strict=True):
-            axes.annotate(f"{y:.5g}", (x, y), xytext=(0, 2), textcoords="offset points", rotation=90 if n > 3 else 0, ha="center",
-                          va="bottom", fontsize=_style.size(6.5))  # fmt: skip
-    sizes = np.concatenate(peaks)
-    if _spans_decades(sizes):
+            axes.annotate(f"{y:.5g}", (x, y), **above)
+        peaks.append(peak)
+    if _spans_decades(np.concatenate(peaks)):
         axes.set_yscale("log")
-    axes.margins(y=0.35 if n > 3 else 0.15)
-    names = [curves[0].called(i) for i in range(n)]
-    axes.set_xticks(
-        range(n),
-        names,
-        rotation=40 if max(map(len, names)) * n > 30 else 0,
-        ha="right" if max(map(len, names)) * n > 30 else "center",
-    )
+    axes.margins(y=0.35 if many else 0.15)
+    _style.name_ticks(axes, [curves[0].joint_label(i) for i in range(n)], 30)
     axes.grid(axis="x", visible=False)
     axes.set_ylabel(_style.label("peak torque", "N m"))
 
 
-def _torque(axes: Axes, curves: list[Curve], whole: Window) -> None:
+def _torque(axes: Axes, curves: list[Curve], window: Window) -> None:
     """The torque of the joint that has the largest one."""
     joint = int(np.argmax(np.nan_to_num(np.abs(curves[-1]["tau"])).max(axis=0)))
-    drawn = [
-        draw(axes, curve, "tau", joint, whole, **_style.series(i)) for i, curve in enumerate(curves)
-    ]
-    axes.set_xlim(*whole)
+    drawn = []
+    for i, curve in enumerate(curves):
+        drawn.append(draw(axes, curve, "tau", joint, window, **_style.series(i)))
+    axes.set_xlim(*window)
     set_limits(axes, curves, drawn, [], spikes=True)
-    say_what_is_cut(axes, curves, drawn, "N m")
-    axes.set_ylabel(_style.label(f"torque of {curves[0].called(joint)}", "N m"))
+    annotate_clipped_peak(axes, curves, drawn, "N m")
+    axes.set_ylabel(_style.label(f"torque of {curves[0].joint_label(joint)}", "N m"))
     axes.set_xlabel(_style.label("time $t$", "s"))
 
 
 def _spans_decades(x: np.ndarray) -> bool:
-    """Whether numbers are better seen on a logarithmic axis: all positive, over more than a
-    decade.
-    """
+    """Whether numbers need a logarithmic axis: all are positive and span more than a decade."""
     return bool(np.all(np.isfinite(x)) and np.all(x > 0) and x.max() > 10 * x.min())
 
 
 def _accepted(result: TuneResult) -> np.ndarray:
-    """The steps of the winning start at which its loss fell below all before."""
+    """The steps of the best start at which its loss fell below all previous values."""
     loss = np.where(result.history["valid"], result.history["loss"], np.inf)[:, result.best_start]
     before = np.minimum.accumulate(np.concatenate([[np.inf], loss[:-1]]))
     found = np.flatnonzero(loss < before)
-    return found if len(found) else np.arange(1)
+    if not len(found):
+        return np.arange(1)
+    return found
 
 
 def _progress(axes: Axes, result: TuneResult) -> None:
@@ -162,7 +160,7 @@ def _progress(axes: Axes, result: TuneResult) -> None:
 def _margin(axes: Axes, result: TuneResult) -> None:
     margin = result.history["margin"][:, result.best_start]
     axes.plot(np.arange(1, len(margin) + 1), margin, marker=".", markersize=3, **_style.series(2))
-    axes.axhline(0.0, color=_style.alarm(), linewidth=0.8)
+    axes.axhline(0.0, color=_style.failure(), linewidth=0.8)
     axes.set_xlabel("step")
     axes.set_ylabel(_style.label("smallest margin", "rad"))
 
@@ -171,58 +169,50 @@ def _gains(axes: Axes, result: TuneResult) -> None:
     steps = _accepted(result)
     x = result.history["x"][steps, result.best_start]
     ends = result.at_limits
+    at_end: dict[str, Any] = {"marker": "X", "markersize": 6, "linestyle": "none", "zorder": 4}
     for i, name in enumerate(result.names):
-        said = plain(name) + (
-            f" (at its {ends[name].side} limit {ends[name].limit:.4g})" if name in ends else ""
-        )
-        y = x[:, i] / (abs(x[0, i]) or 1.0)
-        axes.plot(steps + 1, y, marker=".", markersize=3, label=said, **_style.series(i))
+        words = escaped(name)
         if name in ends:
-            axes.plot(
-                steps[-1:] + 1,
-                y[-1:],
-                marker="X",
-                markersize=6,
-                linestyle="none",
-                color=_style.alarm(),
-                zorder=4,
-            )
+            words += f" (at its {ends[name].side} limit {ends[name].limit:.4g})"
+        y = x[:, i] / (abs(x[0, i]) or 1.0)
+        axes.plot(steps + 1, y, marker=".", markersize=3, label=words, **_style.series(i))
+        if name in ends:
+            axes.plot(steps[-1:] + 1, y[-1:], color=_style.failure(), **at_end)
     if np.all(x / np.where(x[0] == 0, 1, x[0]) > 0):
         axes.set_yscale("log")
     axes.set_xlabel("step")
     axes.set_ylabel("gain, relative to start")
     if len(result.names) <= MOST_NAMED:
-        axes.legend(
-            fontsize=_style.size(6.5),
-            loc="upper left",
-            bbox_to_anchor=(0.0, -0.22),
-            borderaxespad=0.0,
-        )
+        below: dict[str, Any] = {"bbox_to_anchor": (0.0, -0.22), "borderaxespad": 0.0}
+        axes.legend(fontsize=_style.size(6.5), loc="upper left", **below)
+
+
+def _draw_contours(
+    axes: Axes, x: np.ndarray, y: np.ndarray, loss: np.ndarray, highest: float, count: int
+) -> None:
+    """Filled contours of a loss from its minimum to a quantile; none if the loss is constant."""
+    finite = np.where(np.isfinite(loss), loss, np.nan)
+    low = float(np.nanmin(finite))
+    levels = low + (float(np.nanquantile(finite, highest)) - low) * np.linspace(0, 1, count) ** 2
+    if levels[-1] > low:
+        cmap = _style.colour_map("cividis")
+        axes.contourf(x, y, finite.T, levels=levels, cmap=cmap, extend="max")
 
 
 def _landscape(axes: Axes, result: TuneResult, names: tuple[str, str], points: int) -> None:
     a, b, loss = result.landscape(*names, points=points)
-    filled = np.where(np.isfinite(loss), loss, np.nan)
-    low = float(np.nanmin(filled))
-    levels = low + (np.nanquantile(filled, 0.8) - low) * np.linspace(0.0, 1.0, 12) ** 2
-    if levels[-1] > low:
-        axes.contourf(
-            a, b, filled.T, levels=levels, cmap=_style.colour_map("cividis"), extend="max"
-        )
-    here = [
-        result.history["x"][_accepted(result), result.best_start, result.names.index(name)]
-        for name in names
-    ]
-    axes.plot(*here, color="white", linewidth=0.8, marker=".", markersize=2)
-    best = [result.tuned[result.names.index(name)] for name in names]
-    axes.plot(*best, marker="*", color=_style.colour(1), markersize=10)
+    _draw_contours(axes, a, b, loss, 0.8, 12)
+    pair = [result.names.index(name) for name in names]
+    path = result.history["x"][_accepted(result), result.best_start][:, pair]
+    axes.plot(*path.T, color="white", linewidth=0.8, marker=".", markersize=2)
+    axes.plot(*result.tuned[pair], marker="*", color=_style.colour(1), markersize=10)
     axes.set_xlim(a.min(), a.max())
     axes.set_ylim(b.min(), b.max())
     if a.min() > 0 and b.min() > 0:
         axes.set_xscale("log")
         axes.set_yscale("log")
-    axes.set_xlabel(plain(names[0]))
-    axes.set_ylabel(plain(names[1]))
+    axes.set_xlabel(escaped(names[0]))
+    axes.set_ylabel(escaped(names[1]))
 
 
 @_style.styled()
@@ -233,18 +223,17 @@ def paths(
     gains: tuple[str, str] | None = None,
     points: int = 41,
 ) -> Figure:
-    """The way of a tuning across the gains that its requirements allow, beside the ways of other
-    searches.
+    """The iterates of a tuning in the plane of two gains, with those of other searches.
 
-    Contours are of the objective of the nominal run, on the slice through the tuned gains; what
-    breaks a requirement there is hatched.
+    The contours show the objective of the nominal run on the slice through the tuned gains; the
+    hatched area violates a requirement.
 
     Args:
-      result: of `tune`.
-      others: name of a search -> the two gains that it tried, in their units, (N, 2), one after
-        another; none if not given.
-      gains: names of the two; the first two tuned numbers if not given.
-      points: of the slice, a side.
+      result: the result of `tune`.
+      others: name of a search -> the values of the two gains that it tried, in their units and in
+        order, (N, 2); none if not given.
+      gains: names of the two gains; the first two tuned numbers if not given.
+      points: points of the slice along each axis.
 
     Returns:
       A matplotlib Figure.
@@ -254,73 +243,76 @@ def paths(
 
     Source: design of this package.
     """
-    names = tuple(result.names[:2]) if gains is None else gains
-    fine = (
-        isinstance(names, tuple | list)
-        and len(names) == 2
-        and all(name in result.names for name in names)
-    )
-    if not fine:
-        raise checks.fail(
-            "gains", gains, "the names of two tuned numbers", f"They are {', '.join(result.names)}."
-        )
+    names = _two_gains(result, gains)
     points = checks.positive_integer("points", points, least=2)
-    own = [result.names.index(name) for name in names]
-    trials = result.history["x"][:, result.best_start][:, own]
-    ways = {
-        "tune": trials,
-        **{name: np.asarray(x, float).reshape(-1, 2) for name, x in (others or {}).items()},
-    }
-    seen = np.concatenate([*ways.values(), result.tuned[None, own]])
-    positive = bool(np.all(seen > 0))
-    low, high = seen.min(axis=0), seen.max(axis=0)
-    room = 0.08 * (np.log(high / low) if positive else high - low) + 0.05
-    axis = [np.geomspace(a * np.exp(-r), b * np.exp(r), points) if positive else np.linspace(a - r, b + r, points)
-            for a, b, r in zip(low, high, room, strict=True)]  # fmt: skip
-    loss, excess = result.on_slice(names[0], names[1], *axis)
+    pair = [result.names.index(name) for name in names]
+    iterates = {"tune": result.history["x"][:, result.best_start][:, pair]}
+    for name, x in (others or {}).items():
+        iterates[name] = np.asarray(x, float).reshape(-1, 2)
+    tuned = result.tuned[pair]
+    every = np.concatenate([*iterates.values(), tuned[None]])
+    axis = [_axis(x, points, logarithmic=bool(np.all(every > 0))) for x in every.T]
+    loss, excess = result.on_slice(*names, *axis)
     figure = _style.new_figure(0.8 * _style.WIDTH, 4.4)
     axes = figure.subplots()
-    filled = np.where(np.isfinite(loss), loss, np.nan)
-    best = float(np.nanmin(filled))
-    levels = best + (float(np.nanquantile(filled, 0.7)) - best) * np.linspace(0.0, 1.0, 14) ** 2
-    if levels[-1] > best:
-        axes.contourf(
-            *axis, filled.T, levels=levels, cmap=_style.colour_map("cividis"), extend="max"
-        )
-    broken = np.where(np.isfinite(excess), excess, 1.0)
-    if np.any(broken > 0):
-        axes.contourf(*axis, broken.T, levels=[0.0, np.inf], colors="none", hatches=["//"])
-        axes.contour(*axis, broken.T, levels=[0.0], colors=[_style.alarm()], linewidths=1.0)
-    outlined: dict[str, Any] = {"markerfacecolor": "white", "markeredgecolor": "black", "zorder": 4}
-    for i, (name, way) in enumerate(ways.items()):
-        drawn: dict[str, Any] = {
-            "linestyle": "none",
-            "marker": ".",
-            "markersize": 3.5,
-            "color": _style.colour(i + 1),
-        }
-        if name == "tune":
-            drawn = {"linewidth": 1.2, "marker": "o", "markersize": 4, "color": "black", **outlined}
-        axes.plot(*way.T, label=f"{name}, {len(way)} values", **drawn)
-    axes.plot(*trials[0], marker="s", linestyle="none", markersize=6, label="start", **outlined)
-    axes.plot(
-        *result.tuned[own], marker="*", linestyle="none", markersize=13, label="tuned", **outlined
-    )
-    axes.set(
-        xlim=axis[0][[0, -1]], ylim=axis[1][[0, -1]], xlabel=plain(names[0]), ylabel=plain(names[1])
-    )
-    if positive:
+    _draw_contours(axes, axis[0], axis[1], loss, 0.7, 14)
+    violation = np.where(np.isfinite(excess), excess, 1.0)
+    if np.any(violation > 0):
+        axes.contourf(*axis, violation.T, levels=[0.0, np.inf], colors="none", hatches=["//"])
+        axes.contour(*axis, violation.T, levels=[0.0], colors=[_style.failure()], linewidths=1.0)
+    _draw_iterates(axes, iterates, tuned)
+    for direction, name, x in zip("xy", names, axis, strict=True):
+        axes.set(**{f"{direction}lim": x[[0, -1]], f"{direction}label": escaped(name)})
+    if np.all(every > 0):
         axes.set(xscale="log", yscale="log")
     _style.legend_below(figure, of=[axes])
     return figure
 
 
+def _two_gains(result: TuneResult, gains: Any) -> tuple[str, str]:
+    """The names of two tuned numbers; by default the first two."""
+    names = result.names[:2] if gains is None else gains
+    if (
+        not isinstance(names, tuple | list)
+        or len(names) != 2
+        or not all(name in result.names for name in names)
+    ):
+        raise checks.fail(
+            "gains", gains, "the names of two tuned numbers", f"They are {', '.join(result.names)}."
+        )
+    return names[0], names[1]
+
+
+def _axis(x: np.ndarray, points: int, *, logarithmic: bool) -> np.ndarray:
+    """Points of an axis with a margin around some values."""
+    low, high = float(x.min()), float(x.max())
+    if logarithmic:
+        room = np.exp(0.08 * np.log(high / low) + 0.05)
+        return np.geomspace(low / room, high * room, points)
+    room = 0.08 * (high - low) + 0.05
+    return np.linspace(low - room, high + room, points)
+
+
+def _draw_iterates(axes: Axes, iterates: Mapping[str, np.ndarray], tuned: np.ndarray) -> None:
+    """Draws the iterates of every search, and start and result of the tuning."""
+    outlined: dict[str, Any] = {"markerfacecolor": "white", "markeredgecolor": "black", "zorder": 4}
+    for i, (name, x) in enumerate(iterates.items()):
+        look: dict[str, Any] = {"linestyle": "none", "marker": ".", "markersize": 3.5}
+        look["color"] = _style.colour(i + 1)
+        if name == "tune":
+            look = {"linewidth": 1.2, "marker": "o", "markersize": 4, "color": "black", **outlined}
+        axes.plot(*x.T, label=f"{name}, {len(x)} values", **look)
+    outlined["linestyle"] = "none"
+    axes.plot(*iterates["tune"][0], marker="s", markersize=6, label="start", **outlined)
+    axes.plot(*tuned, marker="*", markersize=13, label="tuned", **outlined)
+
+
 @_style.styled()
 def pareto(front: Front) -> Figure:
-    """A front of two objectives, with every trial behind it.
+    """A front of two objectives, with all trials.
 
     Args:
-      front: of `pareto`.
+      front: the result of `pareto`.
 
     Returns:
       A matplotlib Figure.
@@ -329,14 +321,8 @@ def pareto(front: Front) -> Figure:
     """
     figure = _style.new_figure(0.7 * _style.WIDTH, 3.6)
     axes = figure.subplots()
-    axes.plot(
-        *front.tried.T,
-        linestyle="none",
-        marker=".",
-        markersize=3,
-        color=_style.bound(),
-        label="trials",
-    )
+    dots: dict[str, Any] = {"linestyle": "none", "marker": ".", "markersize": 3}
+    axes.plot(*front.tried.T, color=_style.bound(), label="trials", **dots)
     axes.plot(*front.objectives.T, marker="o", markersize=4, label="front", **_style.series(0))
     axes.plot(*front.first, linestyle="none", marker="s", color=_style.colour(1), label="start")
     for axis, x in zip("xy", np.concatenate([front.objectives, front.first[None]]).T, strict=True):

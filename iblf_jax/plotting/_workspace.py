@@ -1,12 +1,12 @@
-"""The space in which the arm moves: the paths of its points, and the walls of the regions in which
-these must stay.
+"""Draws paths of an arm's points in the workspace, with the boundaries of the scenario's regions.
 
-In the plane what is beyond a wall is shaded, whatever the region; in space half-spaces are drawn as
-planes and spheres as nets, and regions of other classes are not drawn.
+In the plane, the area outside of any region is shaded.  In space, half-spaces are drawn as planes
+and spheres as nets; regions of other classes are not drawn.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -18,38 +18,50 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from iblf_jax.core import checks
 from iblf_jax.plotting import _style
-from iblf_jax.plotting._curves import Curve, curves_of, plain
+from iblf_jax.plotting._curves import Curve, curves_of, escaped
 from iblf_jax.plotting._figures import Runs
+from iblf_jax.plotting._panels import run_style
 from iblf_jax.world.regions import HalfSpace, Region, Sphere, in_words, row_of
 
 GRID = 301
-"""Points on a side of the grid on which a wall in the plane is sought."""
+"""Points per side of the grid on which a boundary in the plane is computed."""
 NET = (13, 25)
 """Circles of latitude and of longitude of a sphere."""
 PATH_POINTS = 400
 LINES = ("-", "--", ":", "-.")
-"""Of the walls, point by point."""
+"""Line styles of the boundaries, one per confined point."""
 
 
 def skeletons(robot: Any, q: np.ndarray) -> np.ndarray:
-    """Base, joints and tip at every q of a run (T, n), (T, n + 1, d) [m].
+    """Base, joints and tip at the positions q of a run, (T, n + 1, d) [m].
+
+    Args:
+      robot: the robot.
+      q: positions, (T, n) [rad].
 
     Raises:
-      ValueError: a robot whose `skeleton` does not give (n + 1, 2) or (n + 1, 3) points.
+      ValueError: the robot's `skeleton` does not return (n + 1, 2) or (n + 1, 3) points.
     """
     found = np.asarray(jax.jit(jax.vmap(robot.skeleton))(q))
     if found.shape[1:] not in ((q.shape[1] + 1, 2), (q.shape[1] + 1, 3)):
         raise checks.fail(
             "plant.skeleton(q)",
             found.shape[1:],
-            "n + 1 points in the plane or in space, alike for all runs",
+            "n + 1 points in the plane or in space, the same for all runs",
         )
     return found
 
 
-def frame(axes: Any, points: np.ndarray, regions: Sequence[Region]) -> np.ndarray:
-    """Limits of a drawing that shows all points (..., d) [m], and spheres that are to be kept out
-    of; returns them, (d, 2).
+def set_limits(axes: Any, points: np.ndarray, regions: Sequence[Region]) -> np.ndarray:
+    """Sets the limits of a panel so that it shows all points and all spheres to stay out of.
+
+    Args:
+      axes: the panel.
+      points: (..., d) [m].
+      regions: the regions of the scenario.
+
+    Returns:
+      The limits, (d, 2) [m].
     """
     points = points.reshape(-1, points.shape[-1])
     points = points[np.isfinite(points).all(axis=1)]
@@ -60,181 +72,153 @@ def frame(axes: Any, points: np.ndarray, regions: Sequence[Region]) -> np.ndarra
             )
     low, high = points.min(axis=0), points.max(axis=0)
     size = max(float(np.max(high - low)), 1e-3)
-    room = (
-        np.full_like(low, 0.08 * size) if len(low) == 2 else 0.55 * size - 0.5 * (high - low)
-    )  # a cube, in space
+    is_plane = len(low) == 2
+    room = 0.08 * size
+    if not is_plane:  # In space the limits form a cube.
+        room = 0.55 * size - 0.5 * (high - low)
     limits = np.stack([low - room, high + room], axis=1)
     for name, ends in zip("xyz", limits, strict=False):
         axes.set(**{f"{name}lim": tuple(ends), f"{name}label": _style.label(f"${name}$", "m")})
     axes.set_aspect("equal")
-    axes.locator_params(nbins=6 if len(low) == 2 else 4)
+    axes.locator_params(nbins=6 if is_plane else 4)
     return limits
 
 
-def draw_walls(axes: Any, robot: Any, regions: Sequence[Region], limits: np.ndarray) -> None:
-    """Draws the walls of all regions within the limits (d, 2) of a drawing [m], one kind of line a
-    point.
+def draw_boundaries(axes: Any, robot: Any, regions: Sequence[Region], limits: np.ndarray) -> None:
+    """Draws the boundaries of all regions within the limits (d, 2) of a panel [m].
+
+    Boundaries for the same point of the robot have the same line style and one entry in the legend.
     """
-    rows = list(dict.fromkeys(row_of(robot, region.point) for region in regions))
-    named = set()
+    first: dict[int, Region] = {}
     for region in regions:
-        row = row_of(robot, region.point)
-        look = {"color": _style.alarm(), "linestyle": LINES[rows.index(row) % len(LINES)]}
-        (_in_the_plane if len(limits) == 2 else _in_space)(axes, region, limits, look)
-        if row not in named:
-            axes.plot(
-                *([[]] * len(limits)),
-                **look,
-                linewidth=1.2,
-                label=plain(f"wall of {in_words(region, robot)}"),
-            )
-        named.add(row)
+        first.setdefault(row_of(robot, region.point), region)
+    draw_one = _draw_in_plane if len(limits) == 2 else _draw_in_space
+    for line, (row, named) in enumerate(first.items()):
+        look = {"color": _style.failure(), "linestyle": LINES[line % len(LINES)]}
+        for region in regions:
+            if row_of(robot, region.point) == row:
+                draw_one(axes, region, limits, look)
+        nowhere: list[list[float]] = [[]] * len(limits)
+        words = escaped(f"bound of {in_words(named, robot)}")
+        axes.plot(*nowhere, **look, linewidth=1.2, label=words)
 
 
-def _in_the_plane(axes: Any, region: Region, limits: np.ndarray, look: dict[str, Any]) -> None:
+def _draw_in_plane(axes: Any, region: Region, limits: np.ndarray, look: dict[str, Any]) -> None:
     x, y = (np.linspace(low, high, GRID) for low, high in limits)
-    at = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    distance = np.asarray(jax.jit(jax.vmap(region.distance))(at)).reshape(GRID, GRID)
-    if distance.min() < 0.0 < distance.max():
-        axes.contourf(
-            x,
-            y,
-            distance,
-            levels=[distance.min(), 0.0],
-            colors=[_style.shade(0.12, _style.alarm())],
-            zorder=0,
-        )
-        axes.contour(
-            x,
-            y,
-            distance,
-            levels=[0.0],
-            colors=[look["color"]],
-            linestyles=[look["linestyle"]],
-            linewidths=1.2,
-            zorder=1,
-        )
+    points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    distance = np.asarray(jax.jit(jax.vmap(region.distance))(points)).reshape(GRID, GRID)
+    if not distance.min() < 0.0 < distance.max():
+        return
+    outside = [distance.min(), 0.0]
+    axes.contourf(x, y, distance, levels=outside, colors=[_style.forbidden()], zorder=0)
+    line = {"colors": [look["color"]], "linestyles": [look["linestyle"]], "linewidths": 1.2}
+    axes.contour(x, y, distance, levels=[0.0], zorder=1, **line)
 
 
-def _in_space(axes: Any, region: Region, limits: np.ndarray, look: dict[str, Any]) -> None:
+def _draw_in_space(axes: Any, region: Region, limits: np.ndarray, look: dict[str, Any]) -> None:
     if isinstance(region, HalfSpace):
-        corners = _cut(np.asarray(region.normal), float(region.offset), limits)
-        if len(corners):
-            pale = {
-                "facecolor": look["color"],
-                "alpha": 0.13,
-                "edgecolor": look["color"],
-                "linestyle": look["linestyle"],
-            }
-            axes.add_collection3d(Poly3DCollection([corners], **pale))
+        _draw_plane(axes, region, limits, look)
     elif isinstance(region, Sphere):
-        theta, phi = np.meshgrid(
-            np.linspace(0.0, np.pi, NET[0]), np.linspace(0.0, 2 * np.pi, NET[1]), indexing="ij"
-        )
-        unit = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)])
-        points = np.asarray(region.centre)[:, None, None] + float(region.radius) * unit
-        inside = np.all((points >= limits[:, :1, None]) & (points <= limits[:, 1:, None]), axis=0)
-        for lines in (points, points.transpose(0, 2, 1)):
-            seen = inside if lines is points else inside.T
-            for i in range(lines.shape[1]):
-                axes.plot(
-                    *np.where(seen[i], lines[:, i], np.nan),
-                    **look,
-                    linewidth=0.5,
-                    alpha=0.6,
-                    label="_",
-                )
+        _draw_sphere(axes, region, limits, look)
 
 
-def _cut(normal: np.ndarray, offset: float, limits: np.ndarray) -> np.ndarray:
-    """The polygon that the plane n . x = offset cuts out of a box, (k, 3) [m]; none where it passes
-    by.
+def _draw_plane(axes: Any, region: HalfSpace, limits: np.ndarray, look: dict[str, Any]) -> None:
+    corners = _plane_in_box(np.asarray(region.normal), float(region.offset), limits)
+    if len(corners):
+        edge = {"edgecolor": look["color"], "linestyle": look["linestyle"]}
+        polygon = Poly3DCollection([corners], facecolor=look["color"], alpha=0.13, **edge)
+        axes.add_collection3d(polygon)
+
+
+def _draw_sphere(axes: Any, region: Sphere, limits: np.ndarray, look: dict[str, Any]) -> None:
+    theta, phi = np.meshgrid(
+        np.linspace(0.0, np.pi, NET[0]), np.linspace(0.0, 2 * np.pi, NET[1]), indexing="ij"
+    )
+    unit = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)])
+    points = np.asarray(region.centre)[:, None, None] + float(region.radius) * unit
+    inside = np.all((points >= limits[:, :1, None]) & (points <= limits[:, 1:, None]), axis=0)
+    visible = np.where(inside, points, np.nan)
+    for circles in (visible.transpose(1, 0, 2), visible.transpose(2, 0, 1)):
+        for circle in circles:
+            axes.plot(*circle, **look, linewidth=0.5, alpha=0.6, label="_")
+
+
+def _plane_in_box(normal: np.ndarray, offset: float, limits: np.ndarray) -> np.ndarray:
+    """Corners of the polygon in which the plane n . x = offset intersects a box.
+
+    Returns:
+      (k, 3) [m], in order; (0, 3) if they do not intersect.
     """
     n = normal / np.linalg.norm(normal)
     corners = np.array(np.meshgrid(*limits, indexing="ij")).reshape(3, -1).T
     side = corners @ n - offset
-    # Edges of the box join corners that differ in one coordinate.
-    pairs = [
-        (i, j)
-        for i in range(8)
-        for j in range(i)
-        if np.sum(corners[i] != corners[j]) == 1 and side[i] * side[j] < 0
-    ]
-    if not pairs:
+    found = []
+    for i, j in itertools.combinations(range(8), 2):
+        is_edge = np.sum(corners[i] != corners[j]) == 1
+        if is_edge and side[i] * side[j] < 0:
+            share = side[i] / (side[i] - side[j])
+            found.append(corners[i] + share * (corners[j] - corners[i]))
+    if not found:
         return np.zeros((0, 3))
-    found = np.array(
-        [corners[i] + side[i] / (side[i] - side[j]) * (corners[j] - corners[i]) for i, j in pairs]
-    )
-    away = found - found.mean(axis=0)
-    across = np.cross(n, away[0])
-    return found[
-        np.argsort(
-            np.arctan2(
-                away @ across / np.linalg.norm(across), away @ away[0] / np.linalg.norm(away[0])
-            )
-        )
-    ]
+    from_centre = np.array(found) - np.mean(found, axis=0)
+    first = from_centre[0] / np.linalg.norm(from_centre[0])
+    second = np.cross(n, first)
+    angles = np.arctan2(from_centre @ second, from_centre @ first)
+    return np.array(found)[np.argsort(angles)]
 
 
 @_style.styled()
 def workspace(runs: Runs) -> Figure:
-    """The paths of the tip, and of what else has a wall, in the plane or in space [m], with the
-    walls of the regions; the arm at the end.
+    """The paths of the tip and of other confined points [m], the boundaries of the regions, and the
+    arm at the end of the run.
 
     Args:
-      runs: one run, or a dict of runs by name; walls and reference are the first one's.
+      runs: one run, or a dict of runs by name; boundaries and reference are those of the first.
 
     Returns:
       The figure.
 
     Raises:
-      ValueError: no run, a batch, or robots that do not fit together.
+      ValueError: no run, a batch, or robots in the plane and in space together.
     """
     curves = curves_of(runs)
     figure = _style.new_figure(4.9, 4.9)
     draw_paths(figure, figure.add_gridspec(1, 1)[0], curves)
-    _style.entitle(figure, "Paths and walls", curves)
+    _style.set_title(figure, "Paths and boundaries", curves)
     _style.legend_below(figure, 3)
     return figure
 
 
 def draw_paths(figure: Figure, where: SubplotSpec, curves: Sequence[Curve]) -> Any:
-    """Draws the paths of the points of the runs, and the first one's walls; returns the panel."""
+    """Draws the paths of the runs and the boundaries of the first run; returns the panel."""
     first = curves[0]
-    robot, regions = first.run.scenario.plant, first.run.scenario.regions
-    moved = [skeletons(curve.run.scenario.plant, curve.at("q", _times(curve))) for curve in curves]
-    wanted = skeletons(robot, first.at("q_d", _times(first)))
-    if len({x.shape[-1] for x in (wanted, *moved)}) > 1:
+    robot = first.run.scenario.plant
+    regions = first.run.scenario.regions
+    actual = [skeletons(curve.run.scenario.plant, curve.at("q", _times(curve))) for curve in curves]
+    desired = skeletons(robot, first.at("q_d", _times(first)))
+    d = desired.shape[-1]
+    if any(x.shape[-1] != d for x in actual):
         raise checks.fail(
             "runs", "arms in the plane and in space", "arms of one kind", "Draw them one by one."
         )
-    axes: Any = figure.add_subplot(where, projection="3d" if wanted.shape[-1] == 3 else None)
-    limits = frame(
-        axes, np.concatenate([x.reshape(-1, x.shape[-1]) for x in (wanted, *moved)]), regions
-    )
-    draw_walls(axes, robot, regions, limits)
-    axes.plot(*wanted[:, -1].T, **(_style.reference() | {"label": "reference"}))
-    rows = sorted({row_of(robot, region.point) for region in regions} | {robot.n})
-    for i, (curve, skeleton) in enumerate(zip(curves, moved, strict=True)):
-        look = _style.series(i) | (_style.FAINT if curve.failed and len(curves) > 1 else {})
-        for row in rows:
-            label = (curve.name or "tip") if row == robot.n else "_"
-            axes.plot(
-                *skeleton[:, row].T,
-                **(look | {"label": label, "linewidth": 1.6 if row == robot.n else 0.9}),
-            )
-        axes.plot(
-            *skeleton[-1].T,
-            color=_style.shade(0.45, look["color"]),
-            linewidth=2.4,
-            marker="o",
-            markersize=4,
-            label="_",
-        )
+    axes: Any = figure.add_subplot(where, projection="3d" if d == 3 else None)
+    points = np.concatenate([x.reshape(-1, d) for x in (desired, *actual)])
+    limits = set_limits(axes, points, regions)
+    draw_boundaries(axes, robot, regions, limits)
+    axes.plot(*desired[:, -1].T, **_style.reference(), label="reference")
+    confined = {row_of(robot, region.point) for region in regions}
+    arm: dict[str, Any] = {"linewidth": 2.4, "marker": "o", "markersize": 4, "label": "_"}
+    for i, (curve, skeleton) in enumerate(zip(curves, actual, strict=True)):
+        look = run_style(curves, i)
+        for row in sorted(confined - {robot.n}):
+            axes.plot(*skeleton[:, row].T, **(look | {"label": "_", "linewidth": 0.9}))
+        tip = {"label": curve.name or "tip", "linewidth": 1.6}
+        axes.plot(*skeleton[:, -1].T, **(look | tip))
+        axes.plot(*skeleton[-1].T, color=_style.blend(0.45, look["color"]), **arm)
     return axes
 
 
 def _times(curve: Curve) -> np.ndarray:
-    """Instants of a run that a path is drawn through, (k,) [s]."""
+    """Times of the points of a path, (PATH_POINTS,) [s]."""
     end = curve.t[: curve.samples][-1]
     return np.linspace(0.0, end, PATH_POINTS)

@@ -1,9 +1,9 @@
-"""The arm in motion, as a GIF or as a web page with controls: its joint limits, its reference as a
-ghost, its tip's path.
+"""Writes animations of an arm, with joint limits, reference and path of the tip, as a GIF or as a
+web page with controls.
 
-What stands still is drawn once; each frame moves and draws only what moves, which makes 20 s of
-motion a matter of seconds. A run longer than `LONGEST_FILM` plays faster than it was, unless the
-caller names a speed.
+The static parts are drawn once, and each frame draws only the parts that move, so that an animation
+of a 20 s run takes seconds.  A run longer than `LONGEST_FILM` plays faster than real time by
+default.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from iblf_jax.plotting._figures import Runs
 
 MOST_FPS, MOST_FRAMES = 50.0, 10_000
 LONGEST_FILM = 10.0
-"""How long an animation lasts at most if its speed is not given [s]."""
+"""Longest duration of an animation at the default speed [s]."""
 
 DPI = 90
 
@@ -35,23 +35,23 @@ DPI = 90
 def animate(runs: Runs, path: str | Path, fps: float = 25.0, *, speed: float | None = None) -> Path:
     """Writes the motion of the arm, with its joint limits, as a GIF or an HTML page.
 
-    Limits, reference and its ghost are those of the first run; every run is an arm of its own.
+    Each run is one arm; limits and reference are those of the first run.
 
     Args:
       runs: one run, or a dict of runs by name.
-      path: where to; its ending, ".gif" or ".html", decides.
-      fps: frames a second of the animation, up to 50.
-      speed: how many times faster than the run it plays; 1 if not given, more for runs longer than
-        10 s.
+      path: the file; its ending, ".gif" or ".html", determines the format.
+      fps: frames per second of the animation, up to 50.
+      speed: speed relative to the run; if not given 1, or more for runs longer than 10 s.
 
     Returns:
       The path of the file.
 
     Raises:
-      ValueError: another ending, no run, a batch, robots that do not fit together, or fps or speed
-        out of range.
+      ValueError: another ending, no run, a batch, robots in the plane and in space together, or fps
+        or speed out of range.
     """
-    curves, path = curves_of(runs), film_path(path)
+    curves = curves_of(runs)
+    path = film_path(path)
     fps = checks.positive_number("fps", fps, "1/s")
     if fps > MOST_FPS:
         raise checks.fail("fps", fps, f"at most {MOST_FPS:g} frames a second")
@@ -61,7 +61,7 @@ def animate(runs: Runs, path: str | Path, fps: float = 25.0, *, speed: float | N
 
 
 def film_path(path: str | Path, field: str = "path") -> Path:
-    """The path of a film, checked; `field` is what the caller calls it."""
+    """The validated path of a film; `field` is the caller's name of the argument."""
     path = checks.file_path(field, path)
     if path.is_dir():
         raise checks.fail(field, str(path), "the path of a file", "It is a folder.")
@@ -71,32 +71,30 @@ def film_path(path: str | Path, field: str = "path") -> Path:
 
 
 def write_film(pictures: list[Image.Image], path: Path, fps: float) -> Path:
-    """Writes pictures of one size as a film; returns its path."""
+    """Writes pictures of equal size as a film; returns its path."""
     path.parent.mkdir(parents=True, exist_ok=True)
     WRITERS[path.suffix.lower()](_with_one_palette(pictures), path, fps)
     return path
 
 
 def frame_times(end: float, fps: float, speed: float | None = None) -> np.ndarray:
-    """The times of the frames of a run that ends then [s], from 0 on, (F,) [s]."""
-    speed = (
-        max(1.0, end / LONGEST_FILM)
-        if speed is None
-        else checks.positive_number("speed", speed, "1")
-    )
+    """The times of the frames of a run from 0 to `end` [s], (F,) [s]."""
+    if speed is None:
+        speed = max(1.0, end / LONGEST_FILM)
+    speed = checks.positive_number("speed", speed, "1")
     frames = end / speed * fps
     if not frames <= MOST_FRAMES:
         raise checks.fail(
             "speed",
             speed,
-            f"one at which the run has at most {MOST_FRAMES} frames",
-            f"It would have {frames:.3g}.",
+            f"a speed at which the animation has at most {MOST_FRAMES} frames",
+            f"It would have {frames:.3g}; raise the speed or lower fps.",
         )
     return np.linspace(0.0, end, max(2, round(frames) + 1))
 
 
 def _pictures(scene: Scene) -> Iterator[Image.Image]:
-    """Every frame in turn as an RGB picture: the parts that move, drawn over those that do not."""
+    """Every frame in turn as an RGB picture: the moving parts drawn over the static ones."""
     canvas = FigureCanvasAgg(scene.figure)
     scene.figure.set_dpi(DPI)
     scene.move_to(0)
@@ -111,9 +109,7 @@ def _pictures(scene: Scene) -> Iterator[Image.Image]:
 
 
 def _with_one_palette(pictures: list[Image.Image]) -> list[Image.Image]:
-    """The pictures in 96 colours, the same for all, taken from the last one, in which every colour
-    occurs.
-    """
+    """The pictures in 96 colours of the last picture, in which every colour occurs."""
     palette = pictures[-1].quantize(96, method=Image.Quantize.MAXCOVERAGE)
     return [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
 
@@ -127,22 +123,22 @@ def _write_gif(pictures: list[Image.Image], path: Path, fps: float) -> None:
 
 
 class _Screen(Figure):
-    """A figure that saves the picture it was given, for a player that wants figures."""
+    """Presents pictures to `FuncAnimation`, which saves figures."""
 
     picture: Image.Image
 
     def show_picture(self, picture: Image.Image) -> tuple[()]:
-        """Takes the picture to save next."""
+        """Sets the picture to save next."""
         self.picture = picture
         return ()
 
     def savefig(self, fname: Any, **kwargs: Any) -> None:
-        """Saves the picture."""
+        """Saves the current picture."""
         self.picture.save(fname, format="png")
 
 
 def _write_html(pictures: list[Image.Image], path: Path, fps: float) -> None:
-    """Writes a page that holds its frames and matplotlib's controls to play them."""
+    """Writes a page that contains the frames and matplotlib's controls to play them."""
     screen = _Screen()
     screen.show_picture(pictures[0])
     with matplotlib.rc_context({"animation.embed_limit": 1000.0, "animation.frame_format": "png"}):
@@ -151,4 +147,4 @@ def _write_html(pictures: list[Image.Image], path: Path, fps: float) -> None:
 
 
 WRITERS: dict[str, Any] = {".gif": _write_gif, ".html": _write_html}
-"""Ending of a film's path -> what writes it."""
+"""Ending of a film's path -> the function that writes it."""

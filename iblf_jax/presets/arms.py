@@ -1,28 +1,28 @@
-"""Real arms: the ones that come with the package, and a scenario on any arm.
+"""Models of real arms, and scenarios on any arm.
 
-The data of an arm are what its file says, as the [robot] table of a scenario file (folder `data`,
-with sources and licences); they need neither the network nor a parser of robot descriptions.
+The data of an arm are stored as the [robot] table of a scenario file (folder `data`, with sources
+and licences); they need neither the network nor a parser of robot descriptions.
 
-`arm_scenario` fills in what an arm's own numbers give: bounds from its joint ranges, saturation
-from its largest torques, and gains in proportion to its inertia.  The inertia of a wrist is a
-thousandth of a shoulder's, so one number for all joints will not do: the loop's modes are about K2
-/ M, and
+`arm_scenario` derives a scenario from the numbers of an arm: bounds from the joint ranges,
+saturation from the largest torques, and gains proportional to the inertia.  The inertia of a wrist
+is a thousandth of that of a shoulder, so that one gain does not suit all joints.  The modes of the
+loop are about K2 / M.  With
 
-    K2_i = rate M_ii min(sum_j |M_ij| / M_ii, 4, 8 / max_t sum_j |R_ij|),   R = D^(1/2) M(q_d(t))^-1
-    D^(1/2)
+    K2_i = rate M_ii min(sum_j |M_ij| / M_ii, 4, 8 / max_t sum_j |R_ij|),
+    R = D^(1/2) M(q_d(t))^-1 D^(1/2),
 
-with M at the start and D its diagonal makes them `rate` on a joint that moves by itself and up to
-four times that where heavier joints push it, which is what a light wrist at the end of an arm
-needs.  With the last term no eigenvalue of M^-1 K2 is above eight times the rate along the
-reference: joints whose axes are nearly parallel move against each other with much less inertia than
-  M_ii, and a loop that is sampled at 500 Hz allows no faster modes.
+where M is evaluated at the start and D is its diagonal, the modes are `rate` on a joint that moves
+alone, and up to four times that on a joint that is coupled to heavier ones, as a light wrist at the
+end of an arm needs.  The last term keeps the eigenvalues of M^-1 K2 below eight times the rate
+along the reference: joints with nearly parallel axes move against each other with much less
+inertia than M_ii, and a loop that is sampled at 500 Hz allows no faster modes.
 
-The slope of the barrier is a spring besides, of stiffness w ds/de1, whatever K2 is.  With
+The slope of the barrier acts as a spring of stiffness w ds/de1, independently of K2.  With
 
     w_i = min(1, M_ii (rate/2)^2 / max_t ds_i/de1(e1 = 0))
 
-that spring with a damper rate M_ii is at most critically damped at the reference, and light joints
-can be sampled; 1 is the paper's weight.
+this spring and a damper rate M_ii are at most critically damped at the reference, so that light
+joints can be sampled.  The paper's weight is 1.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ from iblf_jax.control.observers import Momentum, Printed
 from iblf_jax.core import checks
 from iblf_jax.core.cache import keep_programs
 from iblf_jax.simulation.scenario import Initial, Scenario, fit_joints
-from iblf_jax.world import bounds as bounds_
 from iblf_jax.world import disturbances, references
-from iblf_jax.world.bounds import Bounds
+from iblf_jax.world.bounds import Bounds, from_limits, tube_at
+from iblf_jax.world.bounds import Sinusoid as SinusoidalBound
 from iblf_jax.world.disturbances import Disturbance, Nothing
 from iblf_jax.world.references import Reference
 from iblf_jax.world.robots import Arm, Robot
@@ -57,18 +57,19 @@ ARMS = ("ur5", "iiwa14")
 """The arms that come with the package."""
 
 RATE = 25.0
-"""1/s.  The modes of the velocity errors on every joint of `arm_scenario`."""
+"""Modes of the velocity errors on every joint of `arm_scenario` [1/s]."""
 COUPLED = 4.0
-"""How much above rate M_ii the gain of a joint may be for the inertia that couples it to others
-[1]."""
+"""Largest ratio of the gain of a joint to rate M_ii, for joints that are coupled to others [1]."""
 FASTEST = 8.0
-"""How much above `rate` the eigenvalues of M^-1 K2 may be [1]: with 4, the `iiwa14` starts with
-errors that last half as long again."""
+"""Largest ratio of the eigenvalues of M^-1 K2 to `rate` [1]; with 4, the initial errors of the
+`iiwa14` last 1.5 times as long."""
 LEAST_K2 = 0.6
-"""N m s/rad; above the 1/2 of Theorem 2 (3.17), for claims with the paper's own weights."""
+"""Smallest gain [N m s/rad]; above the 1/2 of Theorem 2 (3.17), for claims with the paper's
+weights."""
 TIMES = np.linspace(0.0, 20.0, 81)
-"""Times at which tubes are looked at for where they are narrowest, and arms for where their modes
-are fastest [s]."""
+"""Times at which the narrowest bounds and the fastest modes are sought [s]."""
+OBSERVERS: dict[str, Any] = {"printed": Printed, "corrected": Momentum}
+"""Reading of the paper -> its observer."""
 
 
 def arm(name: str) -> Arm:
@@ -83,15 +84,11 @@ def arm(name: str) -> Arm:
     Source: the files in `iblf_jax/presets/data` name theirs.
     """
     checks.one_of("arm", name, ARMS)
-    text = (
-        resources.files("iblf_jax.presets")
-        .joinpath("data", f"{name}.toml")
-        .read_text(encoding="utf-8")
-    )
-    fields: dict[str, Any] = {
-        key: tuple(value) if isinstance(value, list) else value
-        for key, value in tomllib.loads(text).items()
-    }
+    file = resources.files("iblf_jax.presets").joinpath("data", f"{name}.toml")
+    fields: dict[str, Any] = tomllib.loads(file.read_text(encoding="utf-8"))
+    for key, value in fields.items():
+        if isinstance(value, list):
+            fields[key] = tuple(value)
     return Arm(**fields)
 
 
@@ -102,40 +99,40 @@ def _start_of(reference: Reference) -> jax.Array:
 
 @jax.jit
 def _positions_of(reference: Reference, times: jax.Array) -> jax.Array:
-    """Where a reference is at some times (T,): (T, n), or (T,) for one number for all joints
-    [rad].
-    """
+    """Positions of a reference at times (T,): (T, n), or (T,) if all joints share one [rad]."""
     return jax.vmap(reference.position)(times)
 
 
 def inertial_gain(robot: Robot, q: Any, rate: float = RATE, least: Any = LEAST_K2) -> jax.Array:
-    """K2_i = max(rate M_ii(q), least), (n,) [N m s/rad]: about `rate` for the loop's modes on every
-    joint.
+    """The gain with which the modes of the loop are about `rate` on every joint.
+
+        K2_i = max(rate M_ii(q), least)
 
     Args:
-      robot: of n joints.
-      q: a position that is typical of the motion, (n,) [rad].
-      rate: [1/s].
-      least: smallest entry, one number or one a joint [N m s/rad].
+      robot: a robot of n joints.
+      q: a typical position of the motion, (n,) [rad].
+      rate: modes of the loop [1/s].
+      least: smallest entry, one number or one per joint [N m s/rad].
+
+    Returns:
+      (n,) [N m s/rad].
     """
     checks.conforms("robot", robot, Robot)
-    given = {
-        name: checks.as_floats(name, x) for name, x in (("q", q), ("rate", rate), ("least", least))
-    }
-    checks.shape_is("q", given["q"], (robot.n,))
-    for name in ("rate", "least"):
-        if given[name].shape not in ((), (robot.n,)):
-            raise checks.fail(name, given[name], f"one number, or {robot.n} (one a joint)")
-    inertia = jnp.diagonal(mass_matrix_at(robot, given["q"].astype(jnp.result_type(float))))
-    return jnp.maximum(given["rate"] * inertia, given["least"])
+    position = checks.as_floats("q", q)
+    checks.shape_is("q", position, (robot.n,))
+    numbers = {"rate": checks.as_floats("rate", rate), "least": checks.as_floats("least", least)}
+    for name, value in numbers.items():
+        if value.shape not in ((), (robot.n,)):
+            raise checks.fail(name, value, f"one number, or {robot.n} (one per joint)")
+    inertia = jnp.diagonal(mass_matrix_at(robot, position.astype(jnp.result_type(float))))
+    return jnp.maximum(numbers["rate"] * inertia, numbers["least"])
 
 
 def _coupled_gain(robot: Robot, reference: Reference) -> jax.Array:
     """The gain of `arm_scenario`, (n,) [N m s/rad].
 
     With D the diagonal of M at the start and R = D^(1/2) M^-1 D^(1/2), M^-1 K2 has the eigenvalues
-    of R K2/D.  The largest sum of the sizes in a column, max_i (K2_i/D_i) sum_j |R_ji|, is above
-    all of them.
+    of R K2/D.  The largest absolute column sum, max_i (K2_i/D_i) sum_j |R_ji|, bounds all of them.
     """
     positions = _positions_of(reference, jnp.asarray(TIMES, jnp.result_type(float)))
     if positions.ndim == 1:
@@ -154,27 +151,26 @@ def _coupled_gain(robot: Robot, reference: Reference) -> jax.Array:
 def inertial_weight(
     robot: Robot, reference: Reference, bounds: Bounds, barrier: Barrier, rate: float = RATE
 ) -> jax.Array:
-    """The weight of the barrier with which its slope suits the inertia of each joint, and at most
-    the paper's 1.
+    """The weight of the barrier that limits its slope according to the inertia of each joint; at
+    most the paper's 1.
 
         w_i = min(1, M_ii(q) (rate/2)^2 / max_t ds_i/de1),   at e1 = 0 and q = q_d(0)
 
-    The slope acts as a spring of stiffness w ds/de1.  With K2 = rate M_ii it is then at most
-    critically damped at the reference, on joints of any inertia and in tubes of any width.
+    The slope acts as a spring of stiffness w ds/de1.  With K2 = rate M_ii the spring is at most
+    critically damped at the reference, for joints of any inertia and bounds of any width.
 
     Args:
-      robot: whose inertia counts, of n joints.
-      reference: what it follows.
-      bounds: of its joints.
+      robot: the robot of n joints that provides the inertia.
+      reference: the reference.
+      bounds: bounds of the joints.
       barrier: any `Barrier`.
-      rate: of `inertial_gain` [1/s].
+      rate: as for `inertial_gain` [1/s].
 
     Returns:
       (n,), in the unit of the law's `weight`.
 
     Raises:
-      ValueError: something that is no robot, reference, bounds or barrier; a rate that is not
-        positive.
+      ValueError: an argument of another class, or a rate that is not positive.
 
     Source: this package.
     """
@@ -189,29 +185,23 @@ def inertial_weight(
             "Such as Bounds(lower=Constant(0.1), upper=Constant(0.9)).",
         )
     rate = checks.positive_number("rate", rate, "1/s")
-    reference, bounds = (
-        fit_joints(part, robot.n, name)
-        for part, name in ((reference, "reference"), (bounds, "bounds"))
-    )
+    reference = fit_joints(reference, robot.n, "reference")
+    bounds = fit_joints(bounds, robot.n, "bounds")
     inertia = jnp.diagonal(mass_matrix_at(robot, _start_of(reference)))
-    needed = (
-        inertia
-        * (0.5 * rate) ** 2
-        / _stiffness(barrier, reference, bounds, jnp.asarray(TIMES, inertia.dtype))
-    )
-    return jnp.minimum(needed, 1.0)
+    stiffness = _stiffness(barrier, reference, bounds, jnp.asarray(TIMES, inertia.dtype))
+    return jnp.minimum(inertia * (0.5 * rate) ** 2 / stiffness, 1.0)
 
 
 @jax.jit
 def _stiffness(
     barrier: Barrier, reference: Reference, bounds: Bounds, times: jax.Array
 ) -> jax.Array:
-    """The largest ds/de1 of each joint at e1 = 0 and these times, (n,); where a tube is closed it
-    does not count.
+    """The largest ds/de1 of each joint at e1 = 0 and these times, (n,), while lower and upper bound
+    leave room for the reference.
     """
 
     def at(t):
-        tube = bounds_.tube_at(reference, bounds, t, acceleration=False)
+        tube = tube_at(reference, bounds, t, acceleration=False)
         stiffness = jax.jvp(
             lambda q: barrier.slope(tube, q), (tube.q_d,), (jnp.ones_like(tube.q_d),)
         )[1]
@@ -231,25 +221,24 @@ def arm_scenario(
     initial: Initial | None = None,
     model: Robot | None = None,
 ) -> Scenario:
-    """A scenario on an arm, with what follows from the arm's own numbers: bounds, saturation,
-    gains.
+    """A scenario on an arm, with bounds, saturation and gains from the arm's numbers.
 
-    k1 = 2; K2_i = 25 min(sum_j |M_ij|, 4 M_ii) with M at the start, less where joints that move
-    against each other would have modes of M^-1 K2 above 200 1/s along the reference; the barrier's
-    weight as `inertial_weight`; kf = 20; the law within the arm's `effort`; bounds at its joint
-    limits; a start on the reference at rest.
+    The gains are k1 = 2; K2_i = 25 min(sum_j |M_ij|, 4 M_ii) with M at the start, reduced if joints
+    that move against each other would have modes of M^-1 K2 above 200 1/s along the reference; and
+    kf = 20.  The weight of the barrier is `inertial_weight`.  The torque is limited to the arm's
+    `effort`.
 
     Args:
-      robot: with `limits` and `effort`, such as `iblf_jax.robots.load` gives; it is the plant.
-      reference: what it should do.
+      robot: the plant, with `limits` and `effort`, as `iblf_jax.robots.load` returns it.
+      reference: the reference.
       law, reading: as for `iblf_jax.presets.zhang_yan_2024`.
-      bounds: in place of the joint limits.
-      disturbance: what acts on it; nothing if not given.
-      initial: where it starts.
-      model: what the law knows, if not the plant.
+      bounds: bounds of the joints; the joint limits if not given.
+      disturbance: the disturbance; none if not given.
+      initial: the initial state; at rest on the reference if not given.
+      model: the robot that the law knows; the plant if not given.
 
     Returns:
-      A Scenario; every number in it is a leaf to change.
+      A Scenario; all its numbers are leaves.
 
     Raises:
       ValueError: an unknown law or reading; a joint without limits and no bounds given.
@@ -262,42 +251,54 @@ def arm_scenario(
     checks.conforms("reference", reference, Reference)
     keep_programs()
     start = _start_of(reference)
-    known = robot if model is None else model
-    bounds = bounds if bounds is not None else bounds_.from_limits(robot)
-    K2 = _coupled_gain(known, reference)
-    if law == "pd":  # its gains by name are for one size of joint
-        controller: Controller = PDGravity(Kp=3.0 * K2, Kd=K2)
-    else:
-        controller = law_by_name(law, k1=2.0, K2=K2, o=0.1, reading=reading, p=1)
-    if "weight" in getattr(type(controller), "unit_factors", ()):
-        weight = inertial_weight(known, reference, bounds, controller.barrier)  # type: ignore[attr-defined]
-        controller = dataclasses.replace(controller, weight=weight)  # type: ignore[type-var]
+    if bounds is None:
+        bounds = from_limits(robot)
+    if disturbance is None:
+        disturbance = Nothing()
+    if initial is None:
+        initial = Initial(q=start)
+    controller = _arm_law(robot if model is None else model, reference, bounds, law, reading)
     return Scenario(
         plant=robot,
         model=model,  # type: ignore[arg-type]
         reference=reference,
         bounds=bounds,
-        disturbance=disturbance if disturbance is not None else Nothing(),
+        disturbance=disturbance,
         controller=within_effort(controller, robot),
-        observer=observer_of(law, (Printed if reading == "printed" else Momentum)(kf=20.0)),
-        initial=initial if initial is not None else Initial(q=start),
+        observer=observer_of(law, OBSERVERS[reading](kf=20.0)),
+        initial=initial,
     )
 
 
-def ur5(*, law: str = "integral", reading: str = "corrected", payload: float = 2.0) -> Scenario:
-    """A Universal Robots UR5 that swings its tool through half a metre, with a payload that its
-    model does not know.
+def _arm_law(
+    model: Robot, reference: Reference, bounds: Bounds, law: str, reading: str
+) -> Controller:
+    """The law of `arm_scenario`, without saturation."""
+    K2 = _coupled_gain(model, reference)
+    if law == "pd":  # The default gains of "pd" are for one size of joint.
+        return PDGravity(Kp=3.0 * K2, Kd=K2)
+    controller: Any = law_by_name(law, k1=2.0, K2=K2, o=0.1, reading=reading, p=1)
+    if "weight" in getattr(type(controller), "unit_factors", ()):
+        weight = inertial_weight(model, reference, bounds, controller.barrier)
+        controller = dataclasses.replace(controller, weight=weight)
+    return controller
 
-    Every joint has its own frequency and range; the bounds are 0.25 to 0.5 rad around them, other
-    above than below, move with time, and are inside the joint limits.  The law stays within the
-    actuators' torques, and the disturbance is about 3 % of these.
+
+def ur5(*, law: str = "integral", reading: str = "corrected", payload: float = 2.0) -> Scenario:
+    """A Universal Robots UR5 that moves its tool through half a metre, with a payload that its
+    model does not contain.
+
+    Every joint has its own frequency and amplitude.  The bounds are at 0.25 to 0.5 rad from the
+    reference, differ above and below, vary with time, and lie inside the joint limits.  The law
+    respects the torque limits of the actuators, and the disturbance is about 3 % of these.
 
     Args:
-      law, reading: as `zhang_yan_2024`; gains as `iblf_jax.presets.arms.arm_scenario`.
-      payload: at the tip of the plant; the model has none [kg].  (The maker allows 5 kg.)
+      law, reading: as for `zhang_yan_2024`; gains as in `iblf_jax.presets.arms.arm_scenario`.
+      payload: mass at the tip of the plant, which the model does not contain [kg].  (The
+        manufacturer allows 5 kg.)
 
     Returns:
-      A Scenario of 6 joints; 10 s show it.
+      A Scenario of 6 joints, for runs of 10 s.
 
     Raises:
       ValueError: an unknown law or reading, or a negative payload.
@@ -317,17 +318,17 @@ def ur5(*, law: str = "integral", reading: str = "corrected", payload: float = 2
 
 
 def iiwa14(*, law: str = "integral", reading: str = "corrected", payload: float = 3.0) -> Scenario:
-    """A KUKA LBR iiwa 14 that swings its flange through half a metre, with a payload that its model
-    does not know.
+    """A KUKA LBR iiwa 14 that moves its flange through half a metre, with a payload that its model
+    does not contain.
 
-    As `ur5`, for 7 joints.  The maker allows a payload of 14 kg.
+    Motion and bounds are chosen as for `ur5`.  The manufacturer allows a payload of 14 kg.
 
     Args:
-      law, reading: as `zhang_yan_2024`; gains as `iblf_jax.presets.arms.arm_scenario`.
-      payload: at the tip of the plant; the model has none [kg].
+      law, reading: as for `zhang_yan_2024`; gains as in `iblf_jax.presets.arms.arm_scenario`.
+      payload: mass at the tip of the plant, which the model does not contain [kg].
 
     Returns:
-      A Scenario of 7 joints; 10 s show it.
+      A Scenario of 7 joints, for runs of 10 s.
 
     Raises:
       ValueError: an unknown law or reading, or a negative payload.
@@ -356,16 +357,16 @@ def _swinging(
     law: str,
     reading: str,
 ) -> Scenario:
-    """A scenario in which every joint swings as a cosine, from rest, inside bounds that move."""
-    middle, amplitude, frequency = (np.asarray(x, float) for x in (middle, amplitude, frequency))
+    """A scenario in which every joint follows a cosine, from rest, between time-varying bounds."""
+    middle = np.asarray(middle)
+    amplitude = np.asarray(amplitude)
     quarter = math.pi / 2
     reference = references.Sinusoid(
         offset=middle, amplitude=amplitude, frequency=frequency, phase=quarter
     )
-    lower = bounds_.Sinusoid(
-        offset=middle - amplitude - 0.4, amplitude=0.1, frequency=0.5, phase=quarter
-    )
-    upper = bounds_.Sinusoid(offset=middle + amplitude + 0.3, amplitude=0.05, frequency=0.8)
+    lowest = middle - amplitude - 0.4
+    lower = SinusoidalBound(offset=lowest, amplitude=0.1, frequency=0.5, phase=quarter)
+    upper = SinusoidalBound(offset=middle + amplitude + 0.3, amplitude=0.05, frequency=0.8)
     return arm_scenario(
         dataclasses.replace(robot, payload=payload),
         reference,

@@ -1,13 +1,21 @@
-"""Studies: many runs of a scenario, and what they say together.
+"""Studies: many runs of a scenario, and statistics over them.
 
-    what is asked    compare (laws), monte_carlo (random parameters), sweep (a grid of them),
-    sensitivity (which parameter matters) what comes back  comparison, study, dataset (the table of
-    a sweep) cases            designs -> draws, points: which parameters case i has; setup: all of
-    it checked and ready searching        cube: the same cases as a box to climb in
-    running          blocks: the one compiled shape; progress, interrupt
-    keeping          config -> store: a sweep on disk that survives a kill
-    numbers          statistics, summaries
+    functions    compare (laws), monte_carlo (random parameters), sweep (a grid of parameters),
+                 sensitivity (which parameter matters), recommended (the time step)
+    request      options: where and how; setup: the checked arguments and the compiled program;
+                 designs, draws, points: which parameters case i has
+    execution    blocks: the one compiled shape; execution: in this process, or by workers;
+                 interrupt: Ctrl-C
+    store        config, store: a sweep on disk that survives a kill
+    results      comparison, study, dataset (the table of a sweep); statistics, summaries
+    search       cube: the cases as a box, for gradient-based search
 
-The public names are those of `iblf_jax`; `distributions` has those of parameters, `distributed` is
-for several processes.
+The public functions are those of `iblf_jax`; `distributions` has those of parameters.  The names
+below are options and errors of the functions.
 """
+
+from iblf_jax.studies.options import Design as Design
+from iblf_jax.studies.options import StoreOptions as StoreOptions
+from iblf_jax.studies.options import ThisProcess as ThisProcess
+from iblf_jax.studies.workers import WorkerError as WorkerError
+from iblf_jax.studies.workers import initialize_worker as initialize_worker

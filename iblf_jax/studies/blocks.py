@@ -1,21 +1,24 @@
 """Blocks: the one compiled shape in which studies run, whatever their size.
 
 XLA rounds differently at different batch sizes, so every device always runs a block of the same
-number of runs: run i sits in block i // B at place i % B, whether a study has ten runs or a
-  million, one device or eight, one process or many, and however many blocks are
-in flight.  The last block is filled up with repetitions, which are cut off.  Blocks are dealt to
-the devices of this process in turn, each with its own copy of the same program: runs are
-independent, so devices never talk to each other.  (`shard_map` would do the same with one program
-for all, but XLA compiles that one otherwise for one device than for two, and the last digits
+number of runs: run i is in block i // B at place i % B, whether a study has ten runs or a million,
+one device or eight, one process or many, and however many blocks are in flight.  The last block is
+filled with repetitions of the last run, which are cut off.
+
+The devices of this process take the blocks in turn, each with its own copy of the same program:
+runs are independent, so devices never communicate.  (`shard_map` would use one program for all
+devices, but XLA compiles that program otherwise for one device than for two, and the last digits
 differ.)
 
-Memory does not grow with time: a block returns its folds' results, its status and its draws.
+Memory does not grow with the length of a run: a block returns the results of its folds, its status
+and its draws.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from typing import Any, NamedTuple
@@ -24,59 +27,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.core import checks
 from iblf_jax.core.devices import chosen, default
 from iblf_jax.core.status import Status, flag
-from iblf_jax.engine import (
-    STUDY_MEMORY,
-    CompiledBatch,
-    RunRequest,
-    block_size,
-    blocks_in_flight,
-    compile_batch,
-    wait_until_ready,
-)
-from iblf_jax.simulation.sampling import noise_of
-from iblf_jax.studies.draws import Cases, Lanes, Target, draw, merge
+from iblf_jax.engine import block_size, blocks_in_flight, wait_until_ready
+from iblf_jax.studies.dataset import DRAWN
+from iblf_jax.studies.draws import CaseInputs
+from iblf_jax.studies.options import ThisProcess
+from iblf_jax.studies.setup import PreparedStudy, SharedInputs, StudyProgram, drawn_leaves
 
 
-class StudyRun(NamedTuple):
-    """What every block of a study runs: which leaves are drawn, how many steps, by what; static."""
-
-    targets: tuple[Target, ...]
-    program: CompiledBatch
-
-    @property
-    def request(self) -> RunRequest:
-        """What is requested of each run."""
-        return self.program.request
-
-    @property
-    def steps(self) -> int:
-        """Time steps of each run."""
-        return self.request.steps
-
-    @property
-    def method(self) -> str:
-        """The integrator."""
-        return self.request.method
-
-    @property
-    def backend(self) -> str:
-        """The executor that runs the blocks."""
-        return self.program.executor
-
-
-class StudyInputs(NamedTuple):
-    """What all runs share; traced."""
-
-    cases: Cases
-    folds: Any
-    dt: jax.Array
-
-
-class Results(NamedTuple):
-    """What a run leaves, run axis first."""
+class BlockResults(NamedTuple):
+    """What runs return, run axis first."""
 
     metrics: dict[str, Any]
     status: Any
@@ -84,152 +45,120 @@ class Results(NamedTuple):
     samples: dict[str, Any]
 
 
-MOST_MEMORY = 2.0**60
-"""Bytes.  No machine has more."""
+def named_arrays(results: BlockResults) -> dict[str, Any]:
+    """The arrays of results by the names that they have in a store."""
+    drawn = {DRAWN + path: x for path, x in results.samples.items()}
+    status = {"status": results.status, "fastest_mode": results.fastest_mode}
+    return {**results.metrics, **status, **drawn}
 
 
-def checked_how(chunk: Any, memory: Any, devices: Any) -> dict[str, Any]:
-    """A user's arguments of `run_blocks` that say how and change no number, checked; they may be
-    None (all devices, `memory` rules).
-    """
-    chunk = (
-        None if chunk is None else checks.positive_integer("chunk", chunk, most=checks.MOST_STEPS)
-    )
-    remedy = "Such as memory=4e9."
-    memory = checks.number_between("memory", memory, 1.0, MOST_MEMORY, "bytes", remedy)
-    return {"chunk": chunk, "memory": memory, "devices": checks.devices("devices", devices)}
+def result_shapes(study: PreparedStudy) -> BlockResults:
+    """Shapes and types of the results of one block."""
+    # The same call as in `run_blocks`, so that it is traced once.
+    block = partial(_execute, program=study.program, record_every=None)
+    return jax.eval_shape(block, study.shared, study.inputs_of(np.arange(block_size())))
+
+
+def case_bytes(study: PreparedStudy) -> float:
+    """Memory that the results of one case take [bytes]."""
+    leaves = jax.tree.leaves(result_shapes(study))
+    return sum(x.size * x.dtype.itemsize for x in leaves) / block_size()
 
 
 def _without_inadmissible(admissible: jax.Array, x: jax.Array) -> jax.Array:
-    """`x` where the draws were admissible, else NaN (-1 for whole numbers)."""
-    mark = jnp.nan if jnp.issubdtype(x.dtype, jnp.floating) else -1
-    return jnp.where(
-        admissible.reshape(admissible.shape + (1,) * (x.ndim - 1)), x, jnp.asarray(mark, x.dtype)
-    )
+    """`x` where the draws were admissible; elsewhere NaN, or -1 for integers."""
+    mark: float = -1
+    if jnp.issubdtype(x.dtype, jnp.floating):
+        mark = jnp.nan
+    mask = admissible.reshape(admissible.shape + (1,) * (x.ndim - 1))
+    return jnp.where(mask, x, jnp.asarray(mark, x.dtype))
 
 
-def _draws(targets: tuple[Target, ...], shared: StudyInputs, lanes: Lanes):
-    """The leaves that a block's runs replace, the draws, and whether they were admissible."""
-
-    def one(lane: Lanes):
-        made, drawn, admissible = draw(shared.cases, targets, lane.index, lane.points, lane.u)
-        varied = merge(shared.cases.scenario, lane.points, made) | noise_of(
-            shared.cases.scenario, shared.cases.key, lane.index
-        )
-        return varied, drawn, admissible
-
-    # Without the barrier XLA works the random numbers into every operation of the run: 18 s to
-    # compile instead of 5.
-    return jax.lax.optimization_barrier(jax.vmap(one)(lanes))
-
-
-def compile_study(
-    targets: tuple[Target, ...], request: RunRequest, shared: StudyInputs, lanes: Lanes
-) -> StudyRun:
-    """What the blocks of a study run, on the first executor that works.
-
-    Args:
-      targets: the leaves that are drawn.
-      request: what is requested of each run.
-      shared: what all runs share.
-      lanes: what differs between the runs of one block.
-    """
-    varied, _, _ = jax.eval_shape(partial(_draws, targets), shared, lanes)
-    program = compile_batch(request, shared.cases.scenario, varied, shared.folds, shared.dt)
-    return StudyRun(targets, program)
-
-
-def _block(study_run: StudyRun, shared: StudyInputs, lanes: Lanes) -> Results:
+def _block(program: StudyProgram, shared: SharedInputs, inputs: CaseInputs) -> BlockResults:
     """Draws and runs one block."""
-    varied, drawn, admissible = _draws(study_run.targets, shared, lanes)
-    outcome = study_run.program(shared.cases.scenario, varied, shared.folds, shared.dt)
+    varied, drawn, admissible = drawn_leaves(program.targets, shared, inputs)
+    outcome = program.batch(shared.cases.scenario, varied, shared.folds, shared.dt)
     metrics = {name: _without_inadmissible(admissible, x) for name, x in outcome.metrics.items()}
     status = jnp.where(admissible, outcome.status, flag(~admissible, Status.INADMISSIBLE_DRAW))
-    return Results(metrics, status, _without_inadmissible(admissible, outcome.fastest_mode), drawn)
+    mode = _without_inadmissible(admissible, outcome.fastest_mode)
+    return BlockResults(metrics, status, mode, drawn)
 
 
-def _record_block(study_run: StudyRun, shared: StudyInputs, lanes: Lanes, record_every: int):
+def _record_block(
+    program: StudyProgram, shared: SharedInputs, inputs: CaseInputs, record_every: int
+):
     """Positions of a block's runs, (B, T, n), and their status."""
-    varied, _, admissible = _draws(study_run.targets, shared, lanes)
-    outcome = study_run.program(
+    varied, _, admissible = drawn_leaves(program.targets, shared, inputs)
+    outcome = program.batch(
         shared.cases.scenario, varied, shared.folds, shared.dt, record_every=record_every
     )
     arrays = outcome.records[0]
-    return (
-        {name: arrays[name] for name in ("q", "e1", "lower", "upper", "q_d")},
-        arrays["t"],
-        outcome.status,
-        admissible,
-    )
+    recorded = {name: arrays[name] for name in ("q", "e1", "lower", "upper", "q_d")}
+    return recorded, arrays["t"], outcome.status, admissible
 
 
-@partial(jax.jit, static_argnames=("study_run", "record_every"))
+@partial(jax.jit, static_argnames=("program", "record_every"))
 def _execute(
-    shared: StudyInputs, lanes: Lanes, *, study_run: StudyRun, record_every: int | None = None
+    shared: SharedInputs,
+    inputs: CaseInputs,
+    *,
+    program: StudyProgram,
+    record_every: int | None = None,
 ):
     if record_every is None:
-        return _block(study_run, shared, lanes)
-    return _record_block(study_run, shared, lanes, record_every)
+        return _block(program, shared, inputs)
+    return _record_block(program, shared, inputs, record_every)
 
 
 def run_blocks(
-    study_run: StudyRun,
-    shared: StudyInputs,
-    lanes_of: Callable[[np.ndarray], Lanes],
-    blocks: Sequence[int],
+    study: PreparedStudy,
+    blocks: Iterable[int],
+    here: ThisProcess | None = None,
     *,
-    chunk: int | None = None,
-    memory: float = STUDY_MEMORY,
-    devices: list[jax.Device] | None = None,
     record_every: int | None = None,
 ) -> Iterator[tuple[int, Any]]:
-    """Runs blocks and yields (block, its results on the host), in order.
+    """Runs blocks in this process and yields (block, its results on the host), in their order.
 
     Args:
-      study_run, shared: what to run.
-      lanes_of: cases (m,) -> what differs between them; it must accept cases past the last one and
-        repeat there.
-      blocks: numbers of the blocks to run.
-      chunk: runs in flight; from `memory` if not given.
-      memory: bytes that runs in flight may take.
-      devices: the devices; all of this process if not given.
-      record_every: record trajectories instead of metrics.
+      study: what to run.
+      blocks: numbers of the blocks; each is taken when the block is started.
+      here: devices and limits; all devices and the default memory if not given.
+      record_every: records trajectories, every so-many-th step, instead of metrics.
     """
-    if not blocks:
+    here = here or ThisProcess()
+    remaining = iter(blocks)
+    devices = here.devices or default()
+    # A block for each device, in order to know how many devices are needed.
+    first_blocks = list(itertools.islice(remaining, len(devices)))
+    if not first_blocks:
         return
-    size = block_size()
-    places, chosen_device = (devices or default())[: len(blocks)], chosen()
-    call = partial(_execute, study_run=study_run, record_every=record_every)
-    copies = [jax.device_put(shared, place) for place in places]
+    places, chosen_device = devices[: len(first_blocks)], chosen()
+    call = partial(_execute, program=study.program, record_every=record_every)
+    copies = [jax.device_put(study.shared, place) for place in places]
     if len(places) > 1:
-        _compile(
-            study_run,
-            record_every,
-            copies,
-            [jax.device_put(lanes_of(np.arange(size)), place) for place in places],
-        )
+        inputs = study.inputs_of(np.arange(block_size()))
+        _compile(call, copies, [jax.device_put(inputs, place) for place in places])
 
-    def results(k: int) -> tuple[Any, int]:
-        """Those of block `blocks[k]`, on the host, and how many bytes it took."""
-        place = k % len(places)
-        lanes = jax.device_put(
-            lanes_of(np.arange(blocks[k] * size, (blocks[k] + 1) * size)), places[place]
-        )
-        with jax.default_device(chosen_device):  # which is a thread's own
-            out = call(copies[place], lanes)
+    def results(place: int, block: int) -> tuple[Any, int]:
+        """Those of a block on the device `places[place]`, and the bytes that it took."""
+        cases = np.arange(block * block_size(), (block + 1) * block_size())
+        inputs = jax.device_put(study.inputs_of(cases), places[place])
+        with jax.default_device(chosen_device):  # it is local to a thread
+            out = call(copies[place], inputs)
         wait_until_ready(out)
-        return jax.tree.map(np.asarray, out), sum(x.nbytes for x in jax.tree.leaves((lanes, out)))
+        return jax.tree.map(np.asarray, out), sum(x.nbytes for x in jax.tree.leaves((inputs, out)))
 
-    first, each = results(
-        0
-    )  # alone: what is compiled is compiled once, and what a block takes is known after it
-    yield blocks[0], first
-    in_flight = blocks_in_flight(chunk, memory, each, len(places))
-    # A thread a block in flight: draws, start and results of one are made while another is stepped.
+    # The first block runs by itself: each program is compiled once, and the bytes of a block are
+    # known afterwards.
+    first, bytes_taken = results(0, first_blocks[0])
+    yield first_blocks[0], first
+    in_flight = blocks_in_flight(here.chunk, here.memory, bytes_taken, len(places))
+    # One thread for each block in flight: draws, start and results of one block are made while
+    # another block is integrated.
     pool, waiting = ThreadPoolExecutor(in_flight, "block"), deque[tuple[int, Future]]()
     try:
-        for k in range(1, len(blocks)):
-            waiting.append((blocks[k], pool.submit(results, k)))
+        for k, block in enumerate(itertools.chain(first_blocks[1:], remaining), start=1):
+            waiting.append((block, pool.submit(results, k % len(places), block)))
             if len(waiting) == in_flight:
                 yield _first_of(waiting)
         while waiting:
@@ -239,19 +168,19 @@ def run_blocks(
 
 
 def _first_of(waiting: deque[tuple[int, Future]]) -> tuple[int, Any]:
-    """The block that waits longest, and its results."""
+    """The block that was started first, and its results."""
     block, future = waiting.popleft()
     return block, future.result()[0]
 
 
-def _compile(
-    study_run: StudyRun, record_every: int | None, copies: list[StudyInputs], lanes: list[Lanes]
-) -> None:
-    """Compiles the block for several devices at the same time; tracing is done once and shared."""
-    _execute.trace(copies[0], lanes[0], study_run=study_run, record_every=record_every)
+def _compile(call: partial, copies: list[SharedInputs], inputs: list[CaseInputs]) -> None:
+    """Compiles the block for several devices at the same time; it is traced once for all."""
+    program: Any = call.func
+    options = call.keywords
+    program.trace(copies[0], inputs[0], **options)
 
-    def one(shared, lane):
-        _execute.lower(shared, lane, study_run=study_run, record_every=record_every).compile()
+    def one(shared, inputs_there):
+        program.lower(shared, inputs_there, **options).compile()
 
     with ThreadPoolExecutor(len(copies)) as pool:
-        list(pool.map(one, copies, lanes))
+        list(pool.map(one, copies, inputs))

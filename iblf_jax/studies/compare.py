@@ -1,15 +1,14 @@
-"""`compare`: several laws on one scenario, at the gains they have and at equal effort.
+"""`compare`: several laws on one scenario, at their own gains and at equal effort.
 
-Two questions hide in "which law is better".  At equal gains k1 and K2, a law whose barrier term is
-larger works harder and looks better: the integral form's is twice the logarithmic one's (p = 1),
-  identically.  So each law is also run at **equal effort**: its gains
-are scaled by one factor at which the RMS torque above gravity, sqrt(mean |tau - G0(q)|^2), is the
-first law's.
+At equal gains k1 and K2, a law whose barrier term is larger uses more torque and has smaller
+errors: the term of the integral form is exactly twice that of the logarithmic form (p = 1).  Each
+law is therefore also run at **equal effort**: one factor scales its gains so that the RMS torque
+above gravity, sqrt(mean |tau - G0(q)|^2), is the first law's.
 
-The factor is looked for on a grid from 1/32 to 32 whose runs are one batch, and every crossing is
-refined (`equal_effort`): the effort need not grow with the factor, and trials may fail.  Of several
-  crossings the one nearest to 1, by |ln factor|, is taken.  What was
-searched, and which trials failed, is in the result.
+The search evaluates a grid of factors from 1/32 to 32 in one batch and refines every crossing
+(`equal_effort`): the effort need not grow with the factor, and trials may fail.  Of several
+crossings it takes the one nearest to 1, by |ln factor|.  The result contains all trials, including
+those that failed.
 """
 
 from __future__ import annotations
@@ -71,9 +70,9 @@ def compare(
       equal_effort: whether to look for the factors; a few batches of 89 further runs a law.
 
     Returns:
-      A `Comparison`: prints as two tables and says what was held equal; `rollouts`, `equal_effort`,
-        `factors`, `searches` (which
-      factors were tried, and which failed), `plot()`, `to_pandas()`.
+      A `Comparison`: prints as two tables and states what is equal in each; `rollouts`,
+      `equal_effort`, `factors`, `searches` (which factors were tried, and which failed), `plot()`,
+      `to_pandas()`.
 
     Raises:
       ValueError: an unknown law, no law, or bad arguments of `simulate`.
@@ -141,8 +140,12 @@ def _named_laws(laws: Laws) -> dict[str, str | Controller]:
 def _title(law: Controller) -> str:
     inner = unwrapped(law)
     barrier = getattr(inner, "barrier", None)
-    text = type(inner).__name__ + (f"({type(barrier).__name__})" if barrier is not None else "")
-    return text if inner is law else f"{type(law).__name__}({text})"
+    text = type(inner).__name__
+    if barrier is not None:
+        text += f"({type(barrier).__name__})"
+    if inner is law:
+        return text
+    return f"{type(law).__name__}({text})"
 
 
 def _with_law(scenario: Scenario, law: str | Controller) -> Scenario:
@@ -159,9 +162,9 @@ def _with_law(scenario: Scenario, law: str | Controller) -> Scenario:
         observer = observer_of(law, scenario.observer)
     else:
         controller = law
-        observer = (
-            scenario.observer if getattr(unwrapped(law), "uses_observer", True) else NoObserver()
-        )
+        observer = scenario.observer
+        if not getattr(unwrapped(law), "uses_observer", True):
+            observer = NoObserver()
     return dataclasses.replace(scenario, controller=controller, observer=observer)
 
 
@@ -314,4 +317,6 @@ def _gains_in_words(law: Controller) -> str:
 
 def _shown(value: Any) -> str:
     values = np.unique(np.asarray(value))
-    return f"{values[0]:g}" if values.size == 1 else np.array2string(np.asarray(value), precision=4)
+    if values.size == 1:
+        return f"{values[0]:g}"
+    return np.array2string(np.asarray(value), precision=4)

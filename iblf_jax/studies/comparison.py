@@ -19,7 +19,7 @@ from iblf_jax.core.status import FAILED, describe
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.studies.equal_effort import NO_EFFORT, EffortSearch
 
-HELD = {"gains": "Gains as given", "effort": "Equal effort"}
+TITLES = {"gains": "Gains as given", "effort": "Equal effort"}
 
 FACTOR_TWO = (
     "Equal gains favour the integral form: V_integral = 2 V_log (p = 1) identically, so its barrier"
@@ -47,7 +47,7 @@ class Row(NamedTuple):
     velocity_margin: float
     """Smallest distance of a velocity to its bound [rad/s]; NaN where velocities have none."""
     region_margin: float
-    """Smallest distance of a point to the wall of its region [m]; NaN where there are none."""
+    """Smallest distance of a point to the boundary of its region [m]; NaN without regions."""
     peak_torque: float
     """[N m]."""
     torque_rms: float
@@ -79,11 +79,19 @@ HEADINGS = (
 )
 
 
+def _verdict(status: int) -> str:
+    if status & FAILED:
+        return f"FAILED: {describe(status)}"
+    return describe(status)
+
+
 def row_of(law: str, factor: float, run: Rollout) -> Row:
     """The line of one run."""
     m = run.metrics
 
     def worst(name: str, reduce: Any = np.max) -> float:
+        if name in OPTIONAL and name not in m:
+            return math.nan
         return float(reduce(np.asarray(m[name])))
 
     return Row(
@@ -93,13 +101,13 @@ def row_of(law: str, factor: float, run: Rollout) -> Row:
         worst("rmse"),
         worst("margin", np.min),
         worst("xi_margin", np.min),
-        worst("velocity_margin", np.min) if "velocity_margin" in m else math.nan,
-        worst("region_margin", np.min) if "region_margin" in m else math.nan,
+        worst("velocity_margin", np.min),
+        worst("region_margin", np.min),
         worst("peak_torque"),
         float(np.sqrt(np.sum(np.asarray(m["torque_rms"]) ** 2))),
         float(m["effort_above_gravity"]),
         worst("torque_variation", np.sum),
-        ("FAILED: " if int(run.status) & FAILED else "") + describe(int(run.status)),
+        _verdict(int(run.status)),
     )
 
 
@@ -139,7 +147,9 @@ class Comparison:
         effort = tuple(
             row_of(name, self.factors[name], run) for name, run in self.equal_effort.items()
         )
-        return {"gains": as_given, "effort": effort} if self.factors else {"gains": as_given}
+        if not self.factors:
+            return {"gains": as_given}
+        return {"gains": as_given, "effort": effort}
 
     @property
     def failed(self) -> dict[str, str]:
@@ -162,22 +172,18 @@ class Comparison:
             getattr(unwrapped(run.scenario.controller), "barrier", None)
             for run in self.rollouts.values()
         ]
-        notes = {
-            "gains": [
-                f"Held equal: the scenario. Gains: {in_words}.",
-                *([OWN_GAINS] if len(groups) > 1 else []),
-            ]
-        }
-        notes["gains"] += (
-            [FACTOR_TWO] if any(isinstance(barrier, Integral) for barrier in barriers) else []
-        )
+        notes = {"gains": [f"Held equal: the scenario. Gains: {in_words}."]}
+        if len(groups) > 1:
+            notes["gains"].append(OWN_GAINS)
+        if any(isinstance(barrier, Integral) for barrier in barriers):
+            notes["gains"].append(FACTOR_TWO)
         notes["gains"] += [f"{name} FAILED: {why}." for name, why in self.failed.items()]
         if self.factors:
             if int(self.rollouts[first].status) & NO_EFFORT:
-                held = "Nothing could be held equal."
+                equal = "Nothing could be held equal."
             else:
                 effort = float(self.rollouts[first].metrics.effort_above_gravity)
-                held = (
+                equal = (
                     "Held equal: the RMS torque above gravity, sqrt(mean |tau - G0(q)|^2) ="
                     f" {effort:.4g} N m, that of {first}."
                 )
@@ -185,7 +191,7 @@ class Comparison:
                 "Each law's gains (k1 and K2, or its own) are scaled by one factor: of those found"
                 " from 1/32 to 32 that do it, the one nearest to 1 (by |ln factor|)."
             )
-            notes["effort"] = [f"{held} {scaled}", *self._searches_in_words()]
+            notes["effort"] = [f"{equal} {scaled}", *self._searches_in_words()]
         return notes
 
     def _searches_in_words(self) -> list[str]:
@@ -204,13 +210,13 @@ class Comparison:
             f"Comparison of {len(self.rollouts)} laws, {float(run.t[-1]):g} s, dt ="
             f" {float(run.dt):g} s, {run.method}; worst joint"
         ]
-        for held, rows in self.table.items():
+        for kind, rows in self.table.items():
             lines = _columns(rows)
             parts += [
                 "",
-                HELD[held],
+                TITLES[kind],
                 *tables.as_text(lines, left=(0, len(lines[0]) - 1)),
-                *self.notes[held],
+                *self.notes[kind],
             ]
         return "\n".join(parts)
 
@@ -220,10 +226,10 @@ class Comparison:
     def tables_html(self) -> dict[str, str]:
         """What is held equal -> its HTML table and notes."""
         found = {}
-        for held, rows in self.table.items():
-            notes = "".join(f"<p>{html.escape(note)}</p>" for note in self.notes[held])
+        for kind, rows in self.table.items():
+            notes = "".join(f"<p>{html.escape(note)}</p>" for note in self.notes[kind])
             headings, *lines = _columns(rows)
-            found[HELD[held]] = tables.as_html(headings, lines) + notes
+            found[TITLES[kind]] = tables.as_html(headings, lines) + notes
         return found
 
     def to_pandas(self):
@@ -233,7 +239,7 @@ class Comparison:
         import pandas as pd
 
         lines = [
-            {"held": held, **row._asdict()} for held, rows in self.table.items() for row in rows
+            {"held": kind, **row._asdict()} for kind, rows in self.table.items() for row in rows
         ]
         frame = pd.DataFrame(lines).set_index(["held", "law"])
         return frame.drop(columns=[name for name in OPTIONAL if frame[name].isna().all()])
@@ -256,7 +262,14 @@ def _columns(rows: tuple[Row, ...]) -> list[tuple[str, ...]]:
 
 
 def _cells(row: Row) -> tuple[str, ...]:
-    return tuple(
-        x if isinstance(x, str) else f"{x:.4g}" if math.isfinite(x) else "never" if x > 0 else "-"
-        for x in row
-    )
+    return tuple(map(_cell, row))
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, str):
+        return value
+    if math.isfinite(value):
+        return f"{value:.4g}"
+    if value > 0:
+        return "never"
+    return "-"

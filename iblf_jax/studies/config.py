@@ -14,11 +14,12 @@ import numpy as np
 
 from iblf_jax.core import devices
 from iblf_jax.core.pytree import is_leaf_field
+from iblf_jax.engine import block_size
 from iblf_jax.kernels import built_for
 from iblf_jax.simulation.paths import get, parameters, unit_at
-from iblf_jax.studies.blocks import _execute, block_size
+from iblf_jax.studies.blocks import _execute
 from iblf_jax.studies.points import Points
-from iblf_jax.studies.setup import StudySetup
+from iblf_jax.studies.setup import PreparedStudy
 
 
 def describe_component(part: Any) -> Any:
@@ -30,7 +31,7 @@ def describe_component(part: Any) -> Any:
     ):
         return np.asarray(part).tolist()
     if not dataclasses.is_dataclass(part) or isinstance(part, type):
-        return part if isinstance(part, str | bool | None) else repr(part)
+        return _simple(part, str | bool | None)
     fields = {
         field.name: describe_component(getattr(part, field.name))
         for field in dataclasses.fields(part)
@@ -38,8 +39,15 @@ def describe_component(part: Any) -> Any:
     return {"class": type(part).__qualname__, **fields}
 
 
+def _simple(value: Any, kinds: Any) -> Any:
+    """A value of these types, or its `repr`."""
+    if isinstance(value, kinds):
+        return value
+    return repr(value)
+
+
 def structure(part: Any) -> Any:
-    """As `describe_component`, without the numbers: what a parameter table does not tell."""
+    """As `describe_component`, without the numbers: what a parameter table does not show."""
     if isinstance(part, tuple | list):
         return [structure(x) for x in part]
     if not dataclasses.is_dataclass(part) or isinstance(part, type):
@@ -48,32 +56,29 @@ def structure(part: Any) -> Any:
     for field in dataclasses.fields(part):
         inner = getattr(part, field.name)
         if field.metadata.get("static"):
-            found[field.name] = (
-                inner if isinstance(inner, str | bool | int | float) else repr(inner)
-            )
+            found[field.name] = _simple(inner, str | bool | int | float)
         elif not is_leaf_field(field) and not isinstance(inner, jax.Array | np.ndarray):
             found[field.name] = structure(inner)
     return found
 
 
-def program_digest(setup: StudySetup) -> str:
-    """A digest of what a run computes: it tells when the code of a law, a robot or a metric has
+def program_digest(study: PreparedStudy) -> str:
+    """A digest of what a run computes: it differs if the code of a law, a robot or a metric has
     changed.
     """
-    traced = _execute.trace(
-        setup.shared, setup.lanes(np.arange(block_size())), study_run=setup.study_run
-    )
+    inputs = study.inputs_of(np.arange(block_size()))
+    traced = _execute.trace(study.shared, inputs, program=study.program)
     text = re.sub(r"0x[0-9a-f]+", "", str(traced.jaxpr))
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def describe(setup: StudySetup, points: Points, design: str, dt: float) -> dict[str, Any]:
+def describe(study: PreparedStudy, points: Points, design: str, dt: float) -> dict[str, Any]:
     """Everything that the data of a sweep depend on."""
     import jaxlib
 
     import iblf_jax
 
-    scenario = setup.shared.cases.scenario
+    scenario = study.shared.cases.scenario
 
     def place(path: str) -> dict[str, Any]:
         return {
@@ -83,38 +88,41 @@ def describe(setup: StudySetup, points: Points, design: str, dt: float) -> dict[
             "shape": list(np.shape(get(scenario, path))),
         }
 
-    study_run = setup.study_run
+    executor = study.program.batch.executor
+    kernel = {}
+    if executor == "native":
+        kernel = {"kernel": built_for()}
     return {
         "design": design,
         "dims": dict(points.dims),
         "points": {path: place(path) for path in points.values},
-        "perturbations": {path: describe_component(p) for path, p in setup.perturbations.items()},
+        "perturbations": {path: describe_component(p) for path, p in study.perturbations.items()},
         "perturbed": {
             t.path: {"unit": unit_at(scenario, t.path), "source": t.source}
-            for t in study_run.targets
+            for t in study.program.targets
         },
-        "runs": setup.runs,
-        "seed": setup.seed,
-        "sampler": setup.sampler,
-        "replicates": setup.replicates,
-        "duration": round(study_run.steps * dt, 12),
+        "runs": study.runs,
+        "seed": study.seed,
+        "sampler": study.sampler,
+        "replicates": study.replicates,
+        "duration": round(study.program.steps * dt, 12),
         "dt": dt,
-        "method": study_run.method,
-        "metrics": describe_component(setup.shared.folds),
+        "method": study.program.method,
+        "metrics": describe_component(study.shared.folds),
         "scenario": {
             p.path: np.asarray(p.value).tolist() for p in parameters(scenario, named=False)
         },
         "structure": structure(scenario),
         "joints": scenario.n,
         "dtype": str(scenario.initial.q.dtype),
-        "backend": study_run.backend,
+        "backend": executor,
         "platform": devices.platform(),
-        **({"kernel": built_for()} if study_run.backend == "native" else {}),
+        **kernel,
         "block": block_size(),
         "versions": {
             "iblf_jax": iblf_jax.__version__,
             "jax": jax.__version__,
             "jaxlib": jaxlib.__version__,
         },
-        "program": program_digest(setup),
+        "program": program_digest(study),
     }

@@ -1,9 +1,9 @@
-"""The unit cube behind bounded perturbations: where `ij.falsify` and
-`ij.certificates.counterexample` look for the worst.
+"""The unit cube of bounded perturbations, in which `ij.falsify` and
+`ij.certificates.counterexample` search for the worst case.
 
 Run i of a study draws u and has the values F^-1(u); a search takes the u itself, in [0, 1]^d, as
-its unknown.  So a search looks at the same perturbations as a study, within the ends of their
-distributions.
+its unknown.  A search therefore considers the same perturbations as a study, within the bounds of
+their distributions.
 """
 
 from __future__ import annotations
@@ -73,7 +73,8 @@ class Cube:
         for _ in range(BATCHES):
             for point in rng.uniform(size=(count, self.size)):
                 why = (refused or self.refused)(point)
-                found += [] if why else [point]
+                if not why:
+                    found.append(point)
                 reason = why or reason
             if len(found) >= count:
                 break

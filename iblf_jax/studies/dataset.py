@@ -55,50 +55,46 @@ def to_dataset(
         shaped = values.reshape(*outer.values(), *values.shape[1:])
         dims = (*outer, *own_dims(name.removeprefix(DRAWN), values.shape[1:], config["joints"]))
         attributes = {"units": units.get(name, "")}
-        if name.startswith(DRAWN):
+        by_point = values.reshape(-1, config["runs"], *values.shape[1:])
+        if name.startswith(DRAWN) and np.all(done) and _is_the_same_at_every_point(by_point):
             path = name.removeprefix(DRAWN)
-            same = values.reshape(-1, config["runs"], *values.shape[1:]) if len(values) else values
-            if np.all(done) and np.array_equal(
-                same, np.broadcast_to(same[:1], same.shape), equal_nan=True
-            ):
-                coordinates[path] = ((RUN, *dims[len(outer) :]), same[0], attributes)
-            else:
-                variables[name] = (dims, shaped, attributes)
+            coordinates[path] = ((RUN, *dims[len(outer) :]), by_point[0], attributes)
         else:
             variables[name] = (dims, shaped, attributes)
     dims, status, _ = variables["status"]
-    flags = [flag for flag in Status if flag]
-    variables["status"] = (
-        dims,
-        status,
-        {
-            "units": "1",
-            "description": "bit flags; 0 is ok, -1 not computed yet",
-            "flag_masks": np.array([int(f) for f in flags], np.int32),
-            "flag_meanings": " ".join((f.name or "").lower() for f in flags),
-        },
-    )
+    variables["status"] = (dims, status, _status_attributes())
     if "first_violation_time" in flat:
-        violated = {
-            flag: (flat["status"] >= 0) & (flat["status"] & int(flag) != 0)
-            for flag in FIRST_TIMES.values()
-        }
-        at_start = [
-            violated[flag] & (np.asarray(flat[name]) <= 0)
-            for name, flag in FIRST_TIMES.items()
-            if name in flat
-        ]
-        outside = np.any(at_start, axis=0)
-        words = (
-            "whether the run violated a bound, or was outside a region, at t = 0 already: it was"
-            " started there, and no law could keep it"
-        )
-        variables["started_outside"] = (
-            dims,
-            outside.reshape(status.shape),
-            {"units": "1", "description": words},
-        )
+        outside = _started_outside(flat).reshape(status.shape)
+        words = "whether the run violated a bound, or was outside a region, at t = 0 already"
+        text = f"{words}: it was started there, and no law could keep it"
+        variables["started_outside"] = (dims, outside, {"units": "1", "description": text})
     return xarray.Dataset(variables, coordinates, _attributes(config, done))
+
+
+def _is_the_same_at_every_point(values: np.ndarray) -> bool:
+    """Whether values, (points, runs, ...), do not depend on the point."""
+    return np.array_equal(values, np.broadcast_to(values[:1], values.shape), equal_nan=True)
+
+
+def _status_attributes() -> dict[str, Any]:
+    flags = [flag for flag in Status if flag]
+    return {
+        "units": "1",
+        "description": "bit flags; 0 is ok, -1 not computed yet",
+        "flag_masks": np.array([int(flag) for flag in flags], np.int32),
+        "flag_meanings": " ".join((flag.name or "").lower() for flag in flags),
+    }
+
+
+def _started_outside(flat: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Whether each case violated a constraint at t = 0, (cases,)."""
+    status = flat["status"]
+    at_start = [
+        (status >= 0) & (status & int(flag) != 0) & (np.asarray(flat[name]) <= 0)
+        for name, flag in FIRST_TIMES.items()
+        if name in flat
+    ]
+    return np.any(at_start, axis=0)
 
 
 def _coordinates(config: dict[str, Any]) -> dict[str, Any]:

@@ -5,11 +5,10 @@ Run i draws, for the leaf that is addressed by `path`,
     u = uniform(fold_in(fold_in(key(seed), i), crc32(path))),    value = perturbation(nominal,
     F^-1(u))
 
-so a draw depends on seed, run and path only: not on the chunk, the device, the number of runs or
-  the other perturbations.  u lies in
-the open interval (0, 1), in the middle of the cells that the generator's uniform numbers start;
-leaves that vary together share it, under the name of their group.  `robot.` perturbs plant and
-model with the same u, each around its own nominal value.
+so a draw depends on seed, run and path only: not on the device, the number of runs or the other
+perturbations.  u lies in the open interval (0, 1), in the middle of the cells that the generator's
+uniform numbers start.  Leaves that vary together share it, under the name of their group.  `robot.`
+perturbs plant and model with the same u, each about its own nominal value.
 """
 
 from __future__ import annotations
@@ -50,8 +49,8 @@ class Cases(NamedTuple):
     key: jax.Array
 
 
-class Lanes(NamedTuple):
-    """What differs between the runs of a block, run axis first."""
+class CaseInputs(NamedTuple):
+    """What differs between the cases of a block, case axis first."""
 
     index: Any
     """Run number: what the draw depends on, (B,) uint32."""
@@ -114,7 +113,7 @@ def targets_of(
         if not isinstance(perturbation, Perturbation):
             expected = "ij.factor(...), ij.offset(...) or ij.value(...)"
             raise checks.fail(
-                f"{what}[{source!r}]", perturbation, expected, _said_properly(perturbation)
+                f"{what}[{source!r}]", perturbation, expected, _remedy_for(perturbation)
             )
         for path in _targets(scenario, source, perturbation):
             nominal = np.asarray(paths.get(scenario, path))
@@ -127,7 +126,7 @@ def targets_of(
     return tuple(targets), by_path
 
 
-def _said_properly(given: Any) -> str:
+def _remedy_for(given: Any) -> str:
     """The remedy for a range or a distribution in the place of a perturbation, with the user's
     numbers.
     """
@@ -148,7 +147,9 @@ def _targets(scenario: Scenario, source: str, perturbation: Perturbation) -> lis
     full = paths.expand(source)
     nominal = [np.asarray(paths.get(scenario, path)) for path in full]
     same = perturbation.kind == "value" or all(np.array_equal(x, nominal[0]) for x in nominal)
-    return [source] if same else full
+    if same:
+        return [source]
+    return full
 
 
 def _check_fit(target: Target, perturbation: Perturbation, nominal: np.ndarray, what: str) -> None:
@@ -204,7 +205,9 @@ def drawn_as(target: Target, perturbation: Perturbation) -> str:
 def _shape_of_u(target: Target, perturbation: Perturbation) -> tuple[int, ...]:
     if getattr(perturbation.distribution, "group", ""):
         return (perturbation.distribution.draws,)  # type: ignore[attr-defined]
-    return () if perturbation.shared else target.shape
+    if perturbation.shared:
+        return ()
+    return target.shape
 
 
 def uniform_numbers(

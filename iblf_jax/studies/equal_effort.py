@@ -106,11 +106,11 @@ class EffortSearch:
     @property
     def failed(self) -> dict[float, str]:
         """Factor -> why its run is not valid, in words."""
-        why = NO_EFFORT if self.accepts_inaccurate else NO_EFFORT | Status.INACCURATE
+        why = invalid_flags(self.accepts_inaccurate)
         bad = zip(
             self.factors[~self.valid].tolist(), self.status[~self.valid].tolist(), strict=True
         )
-        return {factor: describe(int(status) & int(why)) for factor, status in bad}
+        return {factor: describe(int(status) & why) for factor, status in bad}
 
     def in_words(self) -> str:
         """What was searched, what failed and what was found, in one line."""
@@ -168,7 +168,7 @@ class EffortSearch:
         """Neighbouring trials that failed, from the smallest factor on: their factors, and the
         flags for which they count as failed.
         """
-        why = int(NO_EFFORT if self.accepts_inaccurate else NO_EFFORT | Status.INACCURATE)
+        why = invalid_flags(self.accepts_inaccurate)
         groups: list[tuple[list[float], list[int]]] = []
         after_valid = True
         for factor, status, fine in zip(
@@ -202,6 +202,13 @@ class EffortSearch:
         }
 
 
+def invalid_flags(accepts_inaccurate: bool) -> int:
+    """The flags of runs that have no valid effort."""
+    if accepts_inaccurate:
+        return int(NO_EFFORT)
+    return int(NO_EFFORT | Status.INACCURATE)
+
+
 def is_valid(efforts: np.ndarray, status: np.ndarray, inaccurate: bool) -> np.ndarray:
     """Which trials count, (N,) bool.
 
@@ -209,7 +216,7 @@ def is_valid(efforts: np.ndarray, status: np.ndarray, inaccurate: bool) -> np.nd
       efforts, status: of the trials, (N,).
       inaccurate: whether those count that are flagged INACCURATE.
     """
-    bad = int(NO_EFFORT if inaccurate else NO_EFFORT | Status.INACCURATE)
+    bad = invalid_flags(inaccurate)
     return np.isfinite(efforts) & (status & bad == 0)
 
 
@@ -243,7 +250,9 @@ def search(
     ordered = tuple(2.0**power for power in sorted(crossings, key=abs))
     valid = is_valid(trials.effort, trials.status, inaccurate)
     hidden = _hidden(powers, trials, valid, crossings)
-    dt = needed_dt(Trials(*(x[hidden] for x in trials))) if np.any(hidden) else None
+    dt = None
+    if np.any(hidden):
+        dt = needed_dt(Trials(*(x[hidden] for x in trials)))
     return EffortSearch(target, 2.0**powers, trials.effort, trials.status, ordered, inaccurate, dt)
 
 

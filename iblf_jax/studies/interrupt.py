@@ -1,4 +1,8 @@
-"""Asked to stop between two units: the first signal asks, the second one insists."""
+"""Ctrl-C and SIGTERM between two units of a store: the first signal stops the sweep after the
+present unit, the second one at once.
+
+No scheduler offers this: without it Ctrl-C would discard the unit that is being computed.
+"""
 
 from __future__ import annotations
 
@@ -15,11 +19,11 @@ STOP_SIGNALS = {
     signal.SIGINT: ("Ctrl-C", (signal.default_int_handler, end_process)),
     signal.SIGTERM: ("SIGTERM", (signal.SIG_DFL,)),
 }
-"""Signals that ask, what they are called, and who handles them where nobody else does.  A cluster
-sends SIGTERM before it kills.
+"""Signal -> its name, and the default handlers that a `StopRequest` replaces.  A cluster sends
+SIGTERM before it kills.
 
-Ctrl-C is the first, as it is what may raise in the middle of anything where nobody handles it: it
-is taken over first and given back last.
+Ctrl-C is the first, because its default handler may raise anywhere: its handler is replaced first
+and restored last.
 """
 
 
@@ -28,15 +32,15 @@ class Interrupted(KeyboardInterrupt):
 
 
 class StopRequest:
-    """While this context is open, the first Ctrl-C or SIGTERM only sets `asked`; the second one
+    """While this context is open, the first Ctrl-C or SIGTERM only sets `requested`; the second one
     interrupts at once.
 
-    Signals reach the main thread only; elsewhere, and where somebody else handles or ignores them,
-    this does nothing.
+    Signals reach the main thread only: in other threads, and where the program handles or ignores
+    them itself, this does nothing.
     """
 
     def __init__(self) -> None:
-        self.asked = False
+        self.requested = False
         self._before: dict[signal.Signals, Any] = {}
 
     def __enter__(self) -> StopRequest:
@@ -64,13 +68,13 @@ class StopRequest:
             signal.signal(number, handler)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        if self.asked:
+        if self.requested:
             # before it raises: that may be inside __enter__ or __exit__, which then do not come to
             # their end
             self._give_back()
             before = self._before[signal.Signals(number)]
             (before if callable(before) else signal.default_int_handler)(number, frame)
-        self.asked = True
+        self.requested = True
         with contextlib.suppress(Exception):  # nobody may be there to read it
             sys.stderr.write(
                 f"\n{STOP_SIGNALS[signal.Signals(number)][0]}: stopping after the unit at hand;"

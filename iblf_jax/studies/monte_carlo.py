@@ -1,33 +1,27 @@
 """Monte-Carlo studies: many runs of one scenario with parameters drawn at random.
 
-Only the results of the metrics are kept of each run, so memory does not grow with the length of a
-run; any run can be looked at again in full with `study.replay(i)`.
-
-Workers of one's own (`multiprocessing`) are to be started by `spawn` or `forkserver`: a `fork` of a
-process in which JAX has run hangs.
+Of each run only the results of its metrics are kept, so memory does not grow with the length of a
+run.  `study.replay(i)` computes the full trajectory of one run again.
 """
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
 from typing import Any
-
-import jax
-import numpy as np
 
 from iblf_jax.core import checks, notices
 from iblf_jax.core.progress import bar
-from iblf_jax.engine import STUDY_MEMORY
 from iblf_jax.simulation.accuracy import RELATIVE
 from iblf_jax.simulation.metrics import Fold
 from iblf_jax.simulation.sampling import has_noise
 from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.studies import distributed
-from iblf_jax.studies.blocks import Results, block_size, checked_how, run_blocks
+from iblf_jax.studies.blocks import case_bytes
 from iblf_jax.studies.designs import MOST_RUNS, check_sampler
 from iblf_jax.studies.distributions import Perturbation
-from iblf_jax.studies.recommended import tell_of_step
+from iblf_jax.studies.execution import run_all_cases
+from iblf_jax.studies.options import ThisProcess, check_deprecated, executor_of
+from iblf_jax.studies.recommended import warn_of_step
 from iblf_jax.studies.setup import prepare
 from iblf_jax.studies.study import Study
 
@@ -46,21 +40,18 @@ def monte_carlo(
     sampler: str = "independent",
     replicates: int = 1,
     backend: str = "auto",
-    chunk: int | None = None,
-    memory: float = STUDY_MEMORY,
-    devices: Sequence[jax.Device] | None = None,
+    executor: ThisProcess | Executor | None = None,
     progress: bool | None = None,
+    **deprecated: Any,
 ) -> Study:
     """Runs a scenario many times with parameters drawn at random.
 
-        run i:  u = uniform(fold_in(fold_in(key(seed), i), crc32(path))),   leaf =
-          perturbation(nominal, F^-1(u))
+        run i:  u = uniform(fold_in(fold_in(key(seed), i), crc32(path))),
+                leaf = perturbation(nominal, F^-1(u))
 
-    The results of run i depend on the seed and on i only: not on `runs`, `chunk`, the devices or
-      the processes.  They are
-    bit-identical on one backend and one version of JAX.  A perturbed run whose start or reference
-    lies outside its bounds is no error: its status says so.  In a job of several processes
-      (`iblf_jax.distributed`) each computes its share and all get the study.
+    The results of run i depend on the seed and on i only: not on `runs`, the devices or the
+    executor.  They are bit-identical on one backend and one version of JAX.  A perturbed run whose
+    start or reference lies outside its bounds is no error: its status reports it.
 
     Args:
       scenario: what to run, of n joints.
@@ -69,78 +60,60 @@ def monte_carlo(
         paths change plant and model alike.
       runs: number of runs N.
       duration: length of a run [s], a whole number of steps.
-      dt: time step [s]; `recommended_dt(scenario, perturbations=...)` says which will do.
+      dt: time step [s]; `recommended_dt(scenario, perturbations=...)` finds one.
       seed: whole number that fixes all draws.
       method: "rk4", "heun" or "euler".
       metrics: the folds to run; None for `iblf_jax.metrics.standard()`.
       sampler: "independent", "latin_hypercube" or "sobol".
       replicates: number of independent designs that a Latin hypercube or Sobol study is made of.
       backend: "auto", "native", "gpu", "xla" or "vmap".
-      chunk: runs in flight on the devices at a time; from `memory` if not given.  It changes no
-        result.
-      memory: bytes that runs in flight may take.
-      devices: devices to use; all of this process if not given.
-      progress: a progress bar; shown where somebody watches if not given.
+      executor: where the runs are computed: any `concurrent.futures.Executor`, such as a Dask
+        client's `get_executor()` or a process pool; or an `ij.studies.ThisProcess` with devices and
+        a limit of memory.  None for this process and all its devices.
+      progress: a progress bar; by default it is shown on a terminal.
 
     Returns:
       A `Study`: metrics, status and samples of every run, run axis first.
 
     Raises:
       ValueError: bad arguments; the message names the field, the value and the remedy.
+      ij.studies.WorkerError: a worker of the executor was lost, or has other versions or settings
+        than this process.
 
     Source: design of this package.
     """
-    how = checked_how(chunk, memory, devices)
+    check_deprecated("monte_carlo", deprecated, ("chunk", "memory", "devices"))
+    executor = executor_of(executor, deprecated)
     runs = checks.positive_integer("runs", runs, most=MOST_RUNS)
     replicates = check_sampler(sampler, runs, replicates)
-    if (
-        isinstance(perturbations, Mapping)
-        and not perturbations
-        and not (isinstance(scenario, Scenario) and has_noise(scenario))
-    ):
+    _check_not_all_the_same(scenario, perturbations)
+    study = prepare(
+        scenario,
+        perturbations,
+        runs,
+        seed,
+        duration=duration,
+        dt=dt,
+        method=method,
+        metrics=metrics,
+        backend=backend,
+        sampler=sampler,
+        replicates=replicates,
+    )
+    checks.fits("runs", runs, case_bytes(study))
+    with bar(progress, runs) as shown:
+        results = run_all_cases(study, executor, shown.update)
+    errors = results.metrics[RELATIVE]
+    warn_of_step(results.status, results.fastest_mode, errors, float(dt), method)
+    return Study.of(study, results)
+
+
+def _check_not_all_the_same(scenario: Any, perturbations: Any) -> None:
+    is_empty = isinstance(perturbations, Mapping) and not perturbations
+    if is_empty and not (isinstance(scenario, Scenario) and has_noise(scenario)):
         raise checks.fail(
             "perturbations",
             perturbations,
             "at least one perturbation",
             "Without any all runs are the same: use ij.simulate.",
         )
-    timing: dict[str, Any] = {"duration": duration, "dt": dt, "method": method}
-    setup = prepare(
-        scenario,
-        perturbations,
-        runs,
-        seed,
-        metrics=metrics,
-        backend=backend,
-        sampler=sampler,
-        replicates=replicates,
-        **timing,
-    )
-    checks.fits("runs", runs, setup.bytes_a_case)
-    results, blocks = None, range(-(-runs // block_size()))
-    mine = distributed.share(blocks) or [0]
-    begin = time.monotonic()
-    sizes = {block: min(block_size(), runs - block * block_size()) for block in mine}
-    with bar(progress, sum(sizes.values())) as shown:
-        for block, part in run_blocks(setup.study_run, setup.shared, setup.lanes, mine, **how):
-            results = _stored(results, part, block, runs)
-            shown.update(sizes[block])
-    results = distributed.gather_rows(
-        results, blocks, block_size(), (time.monotonic() - begin) / len(mine)
-    )
-    tell_of_step(results.status, results.fastest_mode, results.metrics[RELATIVE], float(dt), method)
-    return Study.of(setup, results)
-
-
-def _stored(results: Results | None, part: Results, block: int, runs: int) -> Results:
-    """`results`, made at the first call, with the runs of a block written in."""
-    if results is None:
-        results = jax.tree.map(lambda x: np.zeros((runs, *x.shape[1:]), x.dtype), part)
-    first, size = block * block_size(), block_size()
-    size = min(size, runs - first)
-
-    def write(whole, piece):
-        whole[first : first + size] = piece[:size]
-        return whole
-
-    return jax.tree.map(write, results, part)

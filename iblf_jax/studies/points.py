@@ -20,7 +20,15 @@ from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.designs import MOST_RUNS, split, unit_points
 from iblf_jax.studies.distributions import Perturbation, is_distribution, value
-from iblf_jax.studies.draws import Cases, Lanes, Target, check_paths, draw, sample_size, targets_of
+from iblf_jax.studies.draws import (
+    CaseInputs,
+    Cases,
+    Target,
+    check_paths,
+    draw,
+    sample_size,
+    targets_of,
+)
 
 MOST_DIMS = 60
 """NumPy's arrays have 64; runs and joints come on top."""
@@ -120,11 +128,8 @@ def _design(
 ) -> Points:
     if not grid:
         raise checks.fail("grid", dict(grid), f'at least one distribution for design="{design}"')
-    ways = {
-        path: way if isinstance(way, Perturbation) else value(_distribution(path, way))
-        for path, way in grid.items()
-    }
-    targets, by_path = targets_of(scenario, ways, "grid")
+    perturbations = {path: _perturbation(path, given) for path, given in grid.items()}
+    targets, by_path = targets_of(scenario, perturbations, "grid")
     dtype = scenario.initial.q.dtype
     by_path = jax.tree.map(lambda x: x.astype(dtype), by_path)
     designed: dict[str, np.ndarray] = {}
@@ -152,24 +157,29 @@ def _design(
     return Points({POINT: count}, dict.fromkeys(values, POINT), values, values)
 
 
-def _distribution(path: str, way: Any) -> Any:
-    if not is_distribution(way):
+def _perturbation(path: str, given: Any) -> Perturbation:
+    if isinstance(given, Perturbation):
+        return given
+    if not is_distribution(given):
         raise checks.fail(
             f"grid[{path!r}]",
-            way,
+            given,
             "a distribution, such as ij.uniform(10, 40)",
             'Lists of values go with design="grid".',
         )
-    return way
+    return value(given)
 
 
 def _draw_points(
     cases: Cases, targets: tuple[Target, ...], count: int, designed: dict[str, np.ndarray]
 ) -> dict[str, np.ndarray]:
-    lanes = Lanes(np.arange(count, dtype=np.uint32), {}, designed)
-    drawn, fine = jax.jit(
-        jax.vmap(lambda lane: draw(cases, targets, lane.index, lane.points, lane.u)[1:])
-    )(lanes)
+    inputs = CaseInputs(np.arange(count, dtype=np.uint32), {}, designed)
+
+    def one(point: CaseInputs):
+        _, drawn, admissible = draw(cases, targets, point.index, point.points, point.u)
+        return drawn, admissible
+
+    drawn, fine = jax.jit(jax.vmap(one))(inputs)
     if not np.all(fine):
         bad = int(np.argmin(np.asarray(fine)))
         shown = {path: np.asarray(x[bad]).tolist() for path, x in drawn.items()}

@@ -1,21 +1,18 @@
-"""Which time step will do for a study: for every run that is drawn, not for the nominal one
-alone.
-"""
+"""The largest valid time step for a scenario, or for all runs that a study draws."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
 from iblf_jax.core import checks, notices
 from iblf_jax.core.status import Status
-from iblf_jax.engine import step_size
+from iblf_jax.engine import block_size, step_size
 from iblf_jax.simulation.accuracy import RELATIVE, TOLERANCE
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.scenario import Scenario, canonical
-from iblf_jax.studies.blocks import block_size, run_blocks
+from iblf_jax.studies.blocks import run_blocks
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.draws import targets_of
 from iblf_jax.studies.setup import prepare
@@ -38,13 +35,12 @@ def recommended_dt(
     scenario.
 
     For one run: at most dt = 1.5 / max |eigenvalue of the closed loop's Jacobian|, at the start,
-      along the reference and where the run
-    comes nearest to a bound; and so small that the run agrees with one in steps of about a third to
-    0.1 % of the tube, and its own estimate of its error is below 0.5 %.  Rounded down to 1, 2 or 5
-    times a power of ten.
+    along the reference and where the run comes nearest to a bound; and so small that the run agrees
+    with one in steps of about a third to 0.1 % of the tube, and its own estimate of its error is
+    below 0.5 %.  Rounded down to 1, 2 or 5 times a power of ten.
 
     With perturbations: so small that no run of a first block of the study (256 runs on CPU) is
-      flagged STEP_TOO_LARGE or INACCURATE.
+    flagged STEP_TOO_LARGE or INACCURATE.
 
     Args:
       scenario: what is to run.
@@ -54,33 +50,37 @@ def recommended_dt(
       seed: of the draws.
 
     Returns:
-      The step [s].  Where none will do (a loop that magnifies every error, say), the one for the
-      modes alone, with a warning.
+      The step [s].  If no step is accurate (of a loop that amplifies every error, say), the one for
+      the modes only, with a warning.
 
     Raises:
       ValueError: bad scenario, duration, method, perturbations or seed.
     """
     tableau(method)
     seed, duration = checks.seed(seed), checks.time_span("duration", duration)
-    perturbations = {} if perturbations is None else perturbations
+    if perturbations is None:
+        perturbations = {}
     example = '{"plant.mass": ij.factor(ij.uniform(0.9, 1.1))}'
     checks.mapping("perturbations", perturbations, example)
-    if perturbations:  # refused here, before a step is looked for
+    if perturbations:  # checked here, before the search for a step
         targets_of(canonical(scenario), perturbations)
     dt = step_size.find_dt(scenario, duration=duration, method=method)
     if not perturbations:
         return dt
     for _ in range(MOST_TRIES):
         steps = max(round(duration / dt), 1)
-        options: dict[str, Any] = {
-            "duration": steps * dt,
-            "dt": dt,
-            "method": method,
-            "metrics": (),
-            "backend": "auto",
-        }
-        setup = prepare(scenario, perturbations, block_size(), seed, **options)
-        ((_, results),) = run_blocks(setup.study_run, setup.shared, setup.lanes, [0])
+        study = prepare(
+            scenario,
+            perturbations,
+            block_size(),
+            seed,
+            duration=steps * dt,
+            dt=dt,
+            method=method,
+            metrics=(),
+            backend="auto",
+        )
+        ((_, results),) = run_blocks(study, [0])
         needed = needed_dt(
             results.status, results.fastest_mode, results.metrics[RELATIVE], dt, method
         )
@@ -116,10 +116,10 @@ def needed_dt(
     return min(needed, default=None)
 
 
-def tell_of_step(
+def warn_of_step(
     status: np.ndarray, modes: np.ndarray, errors: np.ndarray, dt: float, method: str
 ) -> None:
-    """Warns if runs of a study were flagged because of their step, with one that would do;
+    """Warns if runs of a study were flagged because of their step, and names a smaller one;
     arguments as `needed_dt`.
     """
     needed = needed_dt(status, modes, errors, dt, method)
@@ -128,5 +128,5 @@ def tell_of_step(
         notices.warn(
             f"The time step dt = {dt:g} s is too large for {late} of {status.size} runs, which are"
             f" unstable or inaccurate. Take dt={needed:g}; ij.recommended_dt(scenario,"
-            " perturbations=..., duration=...) looks for one beforehand."
+            " perturbations=..., duration=...) finds one beforehand."
         )

@@ -16,24 +16,25 @@ from __future__ import annotations
 import dataclasses
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
 from typing import TYPE_CHECKING, Any
 
-import jax
 import numpy as np
 
 from iblf_jax.core import checks, notices, tables
 from iblf_jax.core.progress import bar
 from iblf_jax.core.status import FAILED
-from iblf_jax.engine import STUDY_MEMORY
 from iblf_jax.simulation.metrics import Fold, metric_units
 from iblf_jax.simulation.results import Metrics
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies import statistics
-from iblf_jax.studies.blocks import block_size, checked_how, run_blocks
+from iblf_jax.studies.blocks import case_bytes, result_shapes
 from iblf_jax.studies.designs import MOST_SOBOL, split
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.draws import sample_size
-from iblf_jax.studies.setup import StudySetup, prepare
+from iblf_jax.studies.execution import run_all_cases
+from iblf_jax.studies.options import ThisProcess, check_deprecated, executor_of
+from iblf_jax.studies.setup import PreparedStudy, prepare
 
 if TYPE_CHECKING:
     import xarray
@@ -114,9 +115,9 @@ def sensitivity(
     method: str = "rk4",
     metrics: Sequence[Fold] | None = None,
     backend: str = "auto",
-    memory: float = STUDY_MEMORY,
-    devices: Sequence[jax.Device] | None = None,
+    executor: ThisProcess | Executor | None = None,
     progress: bool | None = None,
+    **deprecated: Any,
 ) -> Sensitivity:
     """Which of the perturbed parameters matter for a metric: first-order and total Sobol indices.
 
@@ -135,9 +136,8 @@ def sensitivity(
       method: "rk4", "heun" or "euler".
       metrics: the folds to run; None for `iblf_jax.metrics.standard()`.
       backend: "auto", "native", "gpu", "xla" or "vmap".
-      memory: bytes that runs in flight may take.
-      devices: devices to use; all of this process if not given.
-      progress: a progress bar; shown where somebody watches if not given.
+      executor: where the runs are computed, as in `monte_carlo`.
+      progress: a progress bar; by default it is shown on a terminal.
 
     Returns:
       A `Sensitivity`, with bootstrap intervals.
@@ -147,73 +147,89 @@ def sensitivity(
 
     Source: A. Saltelli et al., Computer Physics Communications 181 (2010) 259-270.
     """
-    points, how = (
-        checks.positive_integer("points", points, most=MOST_SOBOL[1]),
-        checked_how(None, memory, devices),
-    )
-    if points & (points - 1) or points < 2:
-        raise checks.fail(
-            "points",
-            points,
-            "a power of two",
-            f"Take points={max(2, 1 << round(np.log2(points)))}.",
-        )
-    if not isinstance(output, str) and not callable(output):
-        raise checks.fail("output", output, "the name of a metric, or a function of the metrics")
-    if isinstance(perturbations, Mapping) and not perturbations:
-        raise checks.fail("perturbations", perturbations, "at least one perturbation")
-    timing: dict[str, Any] = {"duration": duration, "dt": dt, "method": method}
-    setup = prepare(
-        scenario, perturbations, 1, checks.seed(seed), metrics=metrics, backend=backend, **timing
+    check_deprecated("sensitivity", deprecated, ("memory", "devices"))
+    executor = executor_of(executor, deprecated)
+    points = _checked_points(points)
+    _check_arguments(perturbations, output)
+    study = prepare(
+        scenario,
+        perturbations,
+        1,
+        checks.seed(seed),
+        duration=duration,
+        dt=dt,
+        method=method,
+        metrics=metrics,
+        backend=backend,
     )
     if isinstance(output, str):
-        checks.one_of("output", output, sorted(setup.shapes.metrics))
-    shapes = sample_size(setup.study_run.targets, setup.shared.cases.perturbations)
+        checks.one_of("output", output, sorted(result_shapes(study).metrics))
+    shapes = sample_size(study.program.targets, study.shared.cases.perturbations)
     names = [
         path + "".join(f"[{i}]" for i in place)
         for path, shape in shapes.items()
         for place in np.ndindex(shape)
     ]
-    checks.fits("points", points, (len(names) + 2) * (setup.bytes_a_case + 3 * 8.0 * len(names)))
-    label = output if isinstance(output, str) else str(getattr(output, "__name__", "output"))
-    failed, values = 0, list[np.ndarray]()
-    with bar(progress, points * (len(names) + 2)) as shown:
-
-        def evaluate(u: np.ndarray) -> np.ndarray:
-            nonlocal failed
-            y, bad = _evaluate(setup, u.T, shapes, output, how, shown)
-            failed += bad
-            values.append(y)
-            # Twice, as if there were two outputs: of one number and one output SciPy makes scalars,
-            # and then fails to write into them.
-            return np.stack([y, y])
-
-        from scipy import stats  # a second to import
-
-        rng = np.random.default_rng(setup.seed)
-        found = stats.sobol_indices(
-            func=evaluate, n=points, dists=[stats.uniform()] * len(names), rng=rng
-        )
-        if (
-            np.ptp(np.concatenate(values[:2])) == 0
-        ):  # those of the runs whose variance all is divided by
-            remedy = "Choose another output, wider distributions or more points."
-            raise checks.fail(
-                label, float(values[0][0]), "an output that is not the same in all runs", remedy
-            )
-        with warnings.catch_warnings():
-            warnings.simplefilter(
-                "ignore"
-            )  # where an index is the same in every resample SciPy warns and gives NaN for its interval
-            ends = found.bootstrap(confidence_level=0.95)
-    counts = (points * (len(names) + 2), failed)
-    orders = (
-        np.ravel(found.first_order[0]),
-        np.ravel(found.total_order[0]),
+    runs = points * (len(names) + 2)
+    checks.fits("points", points, (len(names) + 2) * (case_bytes(study) + 3 * 8.0 * len(names)))
+    with bar(progress, runs) as shown:
+        search = _Evaluation(study, shapes, output, executor, shown.update)
+        indices, ends = _indices(search, points, len(names))
+    return Sensitivity(
+        tuple(names),
+        np.ravel(indices.first_order[0]),
+        np.ravel(indices.total_order[0]),
         _ends(ends.first_order),
         _ends(ends.total_order),
+        search.label,
+        runs,
+        search.failed,
     )
-    return Sensitivity(tuple(names), *orders, label, *counts)
+
+
+def _checked_points(points: Any) -> int:
+    points = checks.positive_integer("points", points, most=MOST_SOBOL[1])
+    if points & (points - 1) or points < 2:
+        nearest = max(2, 1 << round(np.log2(points)))
+        raise checks.fail("points", points, "a power of two", f"Take points={nearest}.")
+    return points
+
+
+def _check_arguments(perturbations: Any, output: Any) -> None:
+    if not isinstance(output, str) and not callable(output):
+        raise checks.fail("output", output, "the name of a metric, or a function of the metrics")
+    if isinstance(perturbations, Mapping) and not perturbations:
+        raise checks.fail("perturbations", perturbations, "at least one perturbation")
+
+
+def _indices(evaluation: _Evaluation, points: int, dimension: int) -> tuple[Any, Any]:
+    """SciPy's indices of `dimension` uniform numbers, and their bootstrap intervals."""
+    from scipy import stats  # its import takes a second
+
+    def evaluate(u: np.ndarray) -> np.ndarray:
+        y = evaluation(u.T)
+        # Twice, as if there were two outputs: for a single number and a single output SciPy makes
+        # scalars, into which it then fails to write.
+        return np.stack([y, y])
+
+    indices = stats.sobol_indices(
+        func=evaluate,
+        n=points,
+        dists=[stats.uniform()] * dimension,
+        rng=np.random.default_rng(evaluation.study.seed),
+    )
+    # The first two evaluations are the runs whose variance all others are divided by.
+    if np.ptp(np.concatenate(evaluation.values[:2])) == 0:
+        raise checks.fail(
+            evaluation.label,
+            float(evaluation.values[0][0]),
+            "an output that is not the same in all runs",
+            "Choose another output, wider distributions or more points.",
+        )
+    with warnings.catch_warnings():
+        # Where an index is the same in every resample, SciPy warns and gives NaN for its interval.
+        warnings.simplefilter("ignore")
+        return indices, indices.bootstrap(confidence_level=0.95)
 
 
 def _ends(bootstrapped: Any) -> np.ndarray:
@@ -229,49 +245,62 @@ def _ends(bootstrapped: Any) -> np.ndarray:
     return np.where(np.isfinite(ends), ends, percentiles)
 
 
-def _called(output: Callable[[Metrics], Any], metrics: Metrics) -> np.ndarray:
-    try:
-        return np.asarray(output(metrics))
-    except Exception as error:
-        expected = "a function of the metrics that returns one number a run"
-        raise checks.fail("output", f"{type(error).__name__}: {error}", expected) from error
+class _Evaluation:
+    """The output as a function of points of the unit cube."""
 
-
-def _evaluate(
-    setup: StudySetup, u: np.ndarray, shapes: dict, output: Any, how: dict[str, Any], shown: Any
-) -> tuple[np.ndarray, int]:
-    """The output of every row of the unit cube, and how many of these runs failed."""
-    dtype = setup.shared.cases.scenario.initial.q.dtype
-    designed = dataclasses.replace(setup, runs=len(u), designed=split(u, shapes, dtype))
-    parts: list[Any] = []
-    for _, part in run_blocks(
-        setup.study_run, setup.shared, designed.lanes, range(-(-len(u) // block_size())), **how
+    def __init__(
+        self,
+        study: PreparedStudy,
+        shapes: dict[str, tuple[int, ...]],
+        output: str | Callable[[Metrics], Any],
+        executor: ThisProcess | Executor,
+        advance: Callable[[int], None],
     ):
-        shown.update(min(block_size(), len(u) - len(parts) * block_size()))
-        parts.append(part)
-    metrics: dict[str, Any] = {
-        name: np.concatenate([p.metrics[name] for p in parts])[: len(u)]
-        for name in parts[0].metrics
-    }
-    status = np.concatenate([p.status for p in parts])[: len(u)]
-    if isinstance(output, str):
-        y = statistics.one_number(metrics, output)
-    else:
-        y = _called(output, Metrics(metrics, metric_units(setup.shared.folds)))
-    name = output if isinstance(output, str) else "output"
-    if y.shape != (len(u),) or y.dtype.kind not in "fiub":
-        raise checks.fail(
-            name,
-            y,
-            f"one number a run, shape ({len(u)},)",
-            f"Its shape is {y.shape}, its type {y.dtype}.",
-        )
-    if not np.all(np.isfinite(y)):
-        bad = int(np.sum(~np.isfinite(y)))
-        raise checks.fail(
-            name,
-            f"{bad} of {len(u)} runs without a finite value",
-            "finite numbers",
-            "Choose another output or narrower distributions.",
-        )
-    return y.astype(float), int(np.sum(status & int(FAILED) != 0))
+        self.study = study
+        self.shapes = shapes
+        self.output = output
+        self.executor = executor
+        self.advance = advance
+        self.name = output if isinstance(output, str) else "output"
+        """In error messages."""
+        self.label = str(getattr(output, "__name__", self.name))
+        """In the result."""
+        self.failed = 0
+        """Number of runs that failed until now."""
+        self.values: list[np.ndarray] = []
+        """The outputs of all evaluations until now."""
+
+    def __call__(self, u: np.ndarray) -> np.ndarray:
+        """The outputs at points u, (N, d) -> (N,)."""
+        dtype = self.study.shared.cases.scenario.initial.q.dtype
+        designed = split(u, self.shapes, dtype)
+        study = dataclasses.replace(self.study, runs=len(u), designed=designed)
+        results = run_all_cases(study, self.executor, self.advance)
+        y = self._output_of(results.metrics)
+        if y.shape != (len(u),) or y.dtype.kind not in "fiub":
+            raise checks.fail(
+                self.name,
+                y,
+                f"one number a run, shape ({len(u)},)",
+                f"Its shape is {y.shape}, its type {y.dtype}.",
+            )
+        invalid = int(np.sum(~np.isfinite(y)))
+        if invalid:
+            raise checks.fail(
+                self.name,
+                f"{invalid} of {len(u)} runs without a finite value",
+                "finite numbers",
+                "Choose another output or narrower distributions.",
+            )
+        self.failed += int(np.sum(results.status & int(FAILED) != 0))
+        self.values.append(y.astype(float))
+        return self.values[-1]
+
+    def _output_of(self, metrics: dict[str, Any]) -> np.ndarray:
+        if isinstance(self.output, str):
+            return statistics.one_number(metrics, self.output)
+        try:
+            return np.asarray(self.output(Metrics(metrics, metric_units(self.study.shared.folds))))
+        except Exception as error:
+            expected = "a function of the metrics that returns one number a run"
+            raise checks.fail("output", f"{type(error).__name__}: {error}", expected) from error

@@ -2,7 +2,7 @@
 
 Clopper-Pearson: with k events in N independent runs, the interval of the probability p that holds
   for every p with at least
-the confidence asked for is [B(a/2; k, N - k + 1), B(1 - a/2; k + 1, N - k)], B the quantile of the
+the requested confidence is [B(a/2; k, N - k + 1), B(1 - a/2; k + 1, N - k)], B the quantile of the
 beta distribution.
 
 Source: C. J. Clopper, E. S. Pearson, Biometrika 26 (1934) 404-413.
@@ -122,7 +122,9 @@ def one_number(metrics: Mapping[str, Any], name: str) -> np.ndarray:
     if values.ndim == 1:
         return values
     flat = values.reshape(len(values), -1)
-    return flat.min(1) if name in SMALLER_IS_WORSE else flat.max(1)
+    if name in SMALLER_IS_WORSE:
+        return flat.min(1)
+    return flat.max(1)
 
 
 def columns(samples: Mapping[str, Any]) -> dict[str, np.ndarray]:

@@ -1,22 +1,21 @@
 """A store of runs on disk (zarr) that survives a kill at any moment.
 
-- It is made in a draft and renamed in: there is never half a store.
+- It is made in a temporary folder, which is then renamed: there is never half a store.
 - A **unit** is a number of consecutive cases, and one whole chunk of every array, so processes that
   write different units never touch the same file, and two that write the same unit write the same
   bytes.  zarr writes a chunk to a temporary file and renames it.
-- A unit's data are written first, its mark in `done` after them, one unit a chunk.  The mark holds
-  a checksum of the unit's data and of
-  the configuration: data that are torn, missing, or of another store do not fit their mark and are
-    not read.
+- A unit's data are written first, then its mark in `done`, one unit a chunk.  The mark is a
+  checksum of the unit's data and of the configuration: data that are incomplete, missing, or of
+  another store do not agree with their mark and are not read.
 - The attributes hold the whole configuration.  A store that was made with another one is refused,
   naming the difference.
 - Only arrays of numbers in zarr's format 3 are opened: the older format, and objects, can make the
   reader run code.
-- What describes the store is looked at again around every write: one that was deleted or replaced
-  meanwhile is not written on.
+- The description of the store is read again before and after every write: a store that was deleted
+  or replaced meanwhile is not written to.
 
-zarr does not force data to the disk's surface: a kill cannot tear a store, a power failure can, and
-then the checksum tells.
+zarr does not flush data to the disk: a kill cannot damage a store, but a power failure can, and the
+checksum detects it.
 """
 
 from __future__ import annotations
@@ -91,12 +90,12 @@ def differences(theirs: Any, ours: Any, name: str = "") -> list[str]:
         return []
 
     def shown(value):
-        text = (
-            json.dumps(value)
-            if isinstance(value, str | int | float | list | dict | bool | None)
-            else "nothing"
-        )
-        return text if len(text) <= 80 else text[:77] + "..."
+        text = "nothing"
+        if isinstance(value, str | int | float | list | dict | bool | None):
+            text = json.dumps(value)
+        if len(text) > 80:
+            text = text[:77] + "..."
+        return text
 
     return [f"{name}: the store has {shown(theirs)}, this call {shown(ours)}"]
 
@@ -231,7 +230,9 @@ class Store:
             data = {
                 name: np.asarray(array[self.span(unit)]) for name, array in self._arrays.items()
             }
-            return data if int(self._done[unit]) == self._mark(data) else None
+            if int(self._done[unit]) != self._mark(data):
+                return None
+            return data
         except OSError as error:
             if error.errno in _FORBIDDEN:
                 raise StoreError(f"{self.path}: cannot be read: {error.strerror}.") from error
@@ -271,7 +272,7 @@ class Store:
         try:
             yield
         except Exception as error:
-            raise StoreError(f"{self.path}: {what} cannot be read ({_said(error)}).") from error
+            raise StoreError(f"{self.path}: {what} cannot be read ({_one_line(error)}).") from error
 
     @contextlib.contextmanager
     def _writing(self) -> Iterator[None]:
@@ -304,7 +305,7 @@ def _numbers(group: Any, name: str, rows: int, chunk: int) -> Any:
     return array
 
 
-def _said(error: Exception) -> str:
+def _one_line(error: Exception) -> str:
     """An error of a library, in one line of a bounded length."""
     return f"{type(error).__name__}: {' '.join(str(error).split())}"[:300]
 
@@ -320,7 +321,9 @@ def _why(path: Path, error: OSError, kept: str = "") -> StoreWriteError:
         text = f"{path}: cannot be written ({error.strerror}). Choose a path that you may write to."
     else:
         text = f"{path}: cannot be written ({error.strerror or error})."
-    return StoreWriteError(text + (f" {kept[0].upper()}{kept[1:]}." if kept else ""))
+    if kept:
+        text += f" {kept[0].upper()}{kept[1:]}."
+    return StoreWriteError(text)
 
 
 def load_store(path: str | os.PathLike) -> Store:
@@ -343,11 +346,9 @@ def load_store(path: str | os.PathLike) -> Store:
             f"{place}: is not a store of iblf_jax ({type(error).__name__}). Choose another path."
         ) from error
     if known != FORMAT:
-        came = (
-            "something that iblf_jax did not write"
-            if known is None
-            else f"a store of format {known}"
-        )
+        came = f"a store of format {known}"
+        if known is None:
+            came = "something that iblf_jax did not write"
         raise StoreError(
             f"{place}: holds {came}, expected a store of format {FORMAT}. Choose another path."
         )
@@ -355,8 +356,8 @@ def load_store(path: str | os.PathLike) -> Store:
         return Store(place, group)
     except Exception as error:
         raise StoreError(
-            f"{place}: is damaged: its description is wrong ({_said(error)}). Delete it, or choose"
-            " another path."
+            f"{place}: is damaged: its description is wrong ({_one_line(error)}). Delete it, or"
+            " choose another path."
         ) from error
 
 
@@ -403,7 +404,9 @@ def open_store(
             if tied
             else "Go on with the same arguments, or choose another path."
         )
-        more = f" (and {len(found) - 3} more)" if len(found) > 3 else ""
+        more = ""
+        if len(found) > 3:
+            more = f" (and {len(found) - 3} more)"
         raise StoreError(
             f"{place}: was made with another configuration: {'; '.join(found[:3])}{more}. {remedy}"
         )

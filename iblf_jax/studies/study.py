@@ -26,7 +26,7 @@ from iblf_jax.core import checks, notices
 from iblf_jax.core.presentation import present
 from iblf_jax.core.status import FAILED, Status, describe
 from iblf_jax.core.status import VIOLATED as LEFT
-from iblf_jax.engine import RunRequest, run_rollout
+from iblf_jax.engine import RunRequest, block_size, run_rollout
 from iblf_jax.engine.simulate import SimulationWarning
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.metrics import metric_units
@@ -34,9 +34,9 @@ from iblf_jax.simulation.results import Metrics, Rollout
 from iblf_jax.simulation.sampling import NOISE_NAME, noise_of
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies import statistics, summaries
-from iblf_jax.studies.blocks import Results, block_size, run_blocks
+from iblf_jax.studies.blocks import BlockResults, run_blocks
 from iblf_jax.studies.distributions import Perturbation
-from iblf_jax.studies.setup import StudySetup
+from iblf_jax.studies.setup import PreparedStudy
 from iblf_jax.studies.statistics import Probability
 from iblf_jax.world.regions import in_words
 from iblf_jax.world.robots import joint_names
@@ -76,18 +76,18 @@ class Study:
     """Largest measured mode of the closed loop, (N,) [1/s]."""
     samples: dict[str, Any]
     """Path -> the value of that leaf in each run, (N, ...), in the leaf's unit."""
-    setup: StudySetup
-    """What was asked for."""
+    setup: PreparedStudy
+    """The checked arguments and the program of the runs."""
 
     @classmethod
-    def of(cls, setup: StudySetup, results: Results) -> Study:
+    def of(cls, setup: PreparedStudy, results: BlockResults) -> Study:
         """The study with these results."""
         units = metric_units(setup.shared.folds)
         order = {
             name: None for name, _ in units if name in results.metrics
         } | results.metrics  # theirs, not sorted as by jit
         metrics = Metrics({name: results.metrics[name] for name in order}, units)
-        samples = {target.path: results.samples[target.path] for target in setup.study_run.targets}
+        samples = {target.path: results.samples[target.path] for target in setup.program.targets}
         return cls(
             setup.shared.cases.scenario,
             metrics,
@@ -114,8 +114,8 @@ class Study:
 
     @property
     def backend(self) -> str:
-        """What the runs ran on: "native", "gpu", "xla" or "vmap", whatever was asked for."""
-        return self.setup.study_run.backend
+        """The backend that computed the runs: "native", "gpu", "xla" or "vmap", not "auto"."""
+        return self.setup.program.batch.executor
 
     @property
     def dt(self) -> float:
@@ -125,7 +125,7 @@ class Study:
     @property
     def duration(self) -> float:
         """Length of a run [s]."""
-        return self.setup.study_run.steps * self.dt
+        return self.setup.program.steps * self.dt
 
     def __len__(self) -> int:
         return self.runs
@@ -241,9 +241,9 @@ class Study:
         """
         count = checks.positive_integer("count", count)
         values = statistics.one_number(self.metrics, metric)
-        order = np.argsort(
-            values if metric in statistics.SMALLER_IS_WORSE else -values, kind="stable"
-        )
+        if metric not in statistics.SMALLER_IS_WORSE:
+            values = -values
+        order = np.argsort(values, kind="stable")
         return order[self.made[order]][:count]
 
     def parameter_unit(self, path: str) -> str:
@@ -251,30 +251,33 @@ class Study:
         return paths.unit_at(self.scenario, path)
 
     def chosen(self, exclude_failed: bool = False) -> tuple[np.ndarray, dict[str, Any]]:
-        """Which runs a statistic is over, (N,) bool, and what to say about it."""
+        """Which runs a statistic is over, (N,) bool, and the counts that go with it."""
         exclude_failed = checks.flag("exclude_failed", exclude_failed)
-        used = self.made & (self.status & int(FAILED) == 0) if exclude_failed else self.made
-        said = {
+        has_failed = self.status & int(FAILED) != 0
+        used = self.made
+        if exclude_failed:
+            used = used & ~has_failed
+        counts = {
             "runs": int(used.sum()),
             "excluded": int(self.runs - used.sum()),
             "failed_excluded": str(bool(exclude_failed)),
+            "failed_included": int(np.sum(used & has_failed)),
         }
-        return used, said | {
-            "failed_included": int(np.sum(used & (self.status & int(FAILED) != 0)))
-        }
+        return used, counts
 
     @property
     def included(self) -> str:
         """In words: which runs statistics are over, unless failed ones are left out."""
-        said = self.chosen()[1]
-        failed = (
-            f"{said['failed_included']} failed ones included (exclude_failed=True leaves them out)"
-        )
-        unmade = f"; {said['excluded']} were not made" if said["excluded"] else ""
-        return (
-            f"statistics are over {said['runs']} runs,"
-            f" {failed if said['failed_included'] else 'none of them failed'}{unmade}"
-        )
+        _, counts = self.chosen()
+        text = f"statistics are over {counts['runs']} runs, "
+        if counts["failed_included"]:
+            text += f"{counts['failed_included']} failed ones included (exclude_failed=True leaves"
+            text += " them out)"
+        else:
+            text += "none of them failed"
+        if counts["excluded"]:
+            text += f"; {counts['excluded']} were not made"
+        return text
 
     def quantiles(
         self, quantiles: Sequence[float] = (0.05, 0.5, 0.95), *, exclude_failed: bool = False
@@ -366,16 +369,14 @@ class Study:
         Source: design of this package.
         """
         i = checks.entry("index", index, self.runs, "runs")
-        record_every = checks.recorded_every(record_every, self.setup.study_run.steps)
+        record_every = checks.recorded_every(record_every, self.setup.program.steps)
         if not self.made[i]:
             drawn = {path: np.asarray(x[i]).tolist() for path, x in self.samples.items()}
             raise checks.fail(
                 f"run {i}", drawn, "admissible draws", "It was not made; see study.made."
             )
         block, place = divmod(i, block_size())
-        ((_, again),) = run_blocks(
-            self.setup.study_run, self.setup.shared, self.setup.lanes, [block]
-        )
+        ((_, again),) = run_blocks(self.setup, [block])
         again = jax.tree.map(lambda x: x[place], again)
         if not all(
             np.array_equal(x, self.metrics[name][i], equal_nan=True)
@@ -383,14 +384,14 @@ class Study:
         ):
             reason = "made on another machine or version"
             notices.warn(f"Run {i} gives other numbers here than in the study: {reason}.")
-        study_run, shared = self.setup.study_run, self.setup.shared
         drawn = {path: x[i] for path, x in self.samples.items()}
         scenario = paths.with_parameters(self.scenario, drawn)
+        shared, program = self.setup.shared, self.setup.program
         request = RunRequest.of(
-            scenario, steps=study_run.steps, method=study_run.method, record_every=record_every
+            scenario, steps=program.steps, method=program.method, record_every=record_every
         )
-        index = self.setup.lanes(np.asarray([i])).index[0]
-        noise = noise_of(self.scenario, shared.cases.key, index).get(NOISE_NAME)
+        number = self.setup.inputs_of(np.asarray([i])).index[0]
+        noise = noise_of(self.scenario, shared.cases.key, number).get(NOISE_NAME)
         run = run_rollout(scenario, shared.folds, shared.dt, request, noise)
         self._warn_of_start(i)
         metrics = Metrics(again.metrics, self.metrics.unit_pairs)
@@ -437,7 +438,8 @@ class Study:
         flags = [
             f"{count} {describe(flag)}" for flag in Status if (count := counts[flag.name or ""])
         ]
-        lines += [f"  flags, of which a run may have several: {'; '.join(flags)}"] if flags else []
+        if flags:
+            lines.append(f"  flags, of which a run may have several: {'; '.join(flags)}")
         lines += [f"  {self.included}"]
         return "\n".join(lines)
 

@@ -14,12 +14,14 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.core.status import FAILED, Status
+from iblf_jax.engine import block_size
 from iblf_jax.simulation.paths import get, parameters, with_parameters
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import SIGNALS, own_dims
 from iblf_jax.studies import statistics
-from iblf_jax.studies.blocks import block_size, run_blocks
+from iblf_jax.studies.blocks import run_blocks
 from iblf_jax.studies.config import describe_component
+from iblf_jax.studies.options import ThisProcess
 from iblf_jax.world.bounds import tube_at
 from iblf_jax.world.regions import margins
 
@@ -78,21 +80,19 @@ def metric_quantiles(
     import xarray
 
     levels = check_quantiles(quantiles)
-    used, said = study.chosen(exclude_failed)
+    used, counts = study.chosen(exclude_failed)
     variables = {}
     for name, values in study.metrics.items():
         values = np.asarray(values)
-        made = (
-            _quantile(values[used], levels)
-            if used.any()
-            else np.full((len(levels), *values.shape[1:]), np.nan)
-        )
+        made = np.full((len(levels), *values.shape[1:]), np.nan)
+        if used.any():
+            made = _quantile(values[used], levels)
         variables[name] = (
             ("quantile", *own_dims(name, values.shape[1:], study.scenario.n)),
             made,
             {"units": study.metrics.units.get(name, "")},
         )
-    return xarray.Dataset(variables, {"quantile": levels}, said)
+    return xarray.Dataset(variables, {"quantile": levels}, counts)
 
 
 def _quantile(values: np.ndarray, levels: np.ndarray) -> np.ndarray:
@@ -108,7 +108,7 @@ def correlations(
     """
     import xarray
 
-    used, said = study.chosen(exclude_failed)
+    used, counts = study.chosen(exclude_failed)
     names = (
         list(study.metrics)
         if metrics is None
@@ -128,7 +128,7 @@ def correlations(
     return xarray.Dataset(
         variables,
         {"parameter": list(drawn), "metric": names},
-        said | {"of": "the worst joint of each metric"},
+        counts | {"of": "the worst joint of each metric"},
     )
 
 
@@ -141,20 +141,16 @@ def bands(
     levels, setup, size = check_quantiles(quantiles), study.setup, block_size()
     exclude_failed = checks.flag("exclude_failed", exclude_failed)
     count = min(checks.positive_integer("runs", runs), study.runs)
-    record_every = max(1, setup.study_run.steps // checks.positive_integer("samples", samples))
+    record_every = max(1, setup.program.steps // checks.positive_integer("samples", samples))
     parts, times = [], np.zeros(0)
+    one_block_at_a_time = ThisProcess(chunk=size)
     for _, (arrays, t, _, _) in run_blocks(
-        setup.study_run,
-        setup.shared,
-        setup.lanes,
-        range(-(-count // size)),
-        chunk=size,
-        record_every=record_every,
+        setup, range(-(-count // size)), one_block_at_a_time, record_every=record_every
     ):
         parts.append(arrays)
         times = t[0]
-    whole = {name: np.concatenate([part[name] for part in parts])[:count] for name in parts[0]}
-    used = study.made[:count] if not exclude_failed else study.chosen(True)[0][:count]
+    recorded = {name: np.concatenate([part[name] for part in parts])[:count] for name in parts[0]}
+    used = study.chosen(exclude_failed)[0][:count]
     if not used.any():
         raise checks.fail(
             "runs",
@@ -164,7 +160,7 @@ def bands(
         )
     dims = ("quantile", "time", "joint")
     variables: dict[str, Any] = {
-        name: (dims, _quantile(whole[name][used], levels), {"units": SIGNALS[name].unit})
+        name: (dims, _quantile(recorded[name][used], levels), {"units": SIGNALS[name].unit})
         for name in BANDS
     }
     edges: dict[str, Any] = {"lower": np.max, "upper": np.min, "q_d": np.median}
@@ -176,18 +172,18 @@ def bands(
         }[name]
         variables[name] = (
             dims[1:],
-            edge(whole[name][used], axis=0),
+            edge(recorded[name][used], axis=0),
             {"units": "rad", "description": f"{words} of the runs"},
         )
     failed = int(np.sum(used & (study.status[:count] & int(FAILED) != 0)))
-    said = {
+    attributes = {
         "runs": int(used.sum()),
         "excluded": int(count - used.sum()),
         "failed_included": failed,
         "of_runs": study.runs,
     }
     return xarray.Dataset(
-        variables, {"quantile": levels, "time": ("time", times, {"units": "s"})}, said
+        variables, {"quantile": levels, "time": ("time", times, {"units": "s"})}, attributes
     )
 
 
@@ -233,10 +229,10 @@ def to_xarray(study: Study) -> xarray.Dataset:
     attributes |= {
         "duration": study.duration,
         "dt": study.dt,
-        "method": setup.study_run.method,
+        "method": setup.program.method,
         "sampler": setup.sampler,
     }
-    attributes |= {"backend": setup.study_run.backend, "iblf_jax_version": iblf_jax.__version__}
+    attributes |= {"backend": study.backend, "iblf_jax_version": iblf_jax.__version__}
     attributes["perturbations"] = json.dumps(
         {path: describe_component(p) for path, p in study.perturbations.items()}
     )

@@ -1,9 +1,8 @@
-"""Checkers for members of every family: does this class fit the package, and if not, what is
-missing?
+"""Checkers that test whether a component satisfies the contract of its family.
 
-The contract of a family is the Protocol in its `_base.py` (or at the head of its file).  Each
-checker here takes an instance, a user's own from a notebook cell too, and either returns None or
-raises a `ContractError` that lists everything it found, each with the remedy:
+The contract of a family is the Protocol in its `_base.py` (or at the top of its file).  A checker
+takes an instance, for example of a class from a notebook cell, and raises a `ContractError` that
+lists all problems with their remedies:
 
     @ij.component
     class MyLaw:
@@ -11,12 +10,11 @@ raises a `ContractError` that lists everything it found, each with the remedy:
 
     ij.testing.check_law(MyLaw(gain=3.0))
 
-All look at the same things: the methods are there; shapes, types and state structures are as
-  promised; numbers are finite;
-the member works under `jit` and `vmap`; derivatives in both modes are those of finite differences;
-float32 stays float32. Then comes what the mathematics of the family asks for.  The package's own
-contract tests are these functions. They compute in float64 whatever the session's setting is, and
-leave the setting as it was.
+Every checker tests that the methods exist; that shapes, types and state structures follow the
+contract; that numbers are finite; that the component works under `jit` and `vmap`; that derivatives
+in both modes agree with finite differences; and that float32 stays float32.  It then tests the
+mathematical properties of the family.  The contract tests of this package call the same functions.
+The checkers compute in float64 and leave the configuration of JAX unchanged.
 """
 
 from iblf_jax.testing._contract import ContractError as ContractError

@@ -1,8 +1,8 @@
-"""What all checkers share: a list of findings, and the probe of a member's functions.
+"""The tools of all checkers: a list of findings, and generic tests of a component's functions.
 
-A family describes its functions as one pure function `outputs(member, *args) -> {name: array}`.
-`probe` runs it compiled, batched, differentiated in both modes and in float32, and writes down what
-does not hold.
+A checker describes the functions of a component as one pure function `outputs(member, *args) ->
+{name: array}`.  `check_function` runs it compiled, batched, differentiated in both modes and in
+float32, and records the problems.
 """
 
 from __future__ import annotations
@@ -19,45 +19,45 @@ import numpy as np
 from iblf_jax.core import checks
 
 STEP = 1e-6
-"""Relative step of the central differences; with float64 they are good to about 1e-9."""
+"""Relative step of the central differences, whose error is about 1e-9 in float64."""
 
 
 class ContractError(AssertionError):
-    """A member that does not fit its family; the message lists what is missing or wrong, and the
-    remedy of each.
+    """A component violates the contract of its family; the message lists the problems with their
+    remedies.
     """
 
 
 class Findings:
-    """What was found wrong with one member."""
+    """The problems of one component."""
 
     def __init__(self, member: Any, family: str):
         self.name = type(member).__name__
         self.family = family
         self.problems: list[str] = []
         self.remarks: list[str] = []
-        """What a user should know and what fails nothing."""
+        """Properties that the user should know and that violate no contract."""
 
     def add(self, problem: str, remedy: str = "") -> None:
-        """Writes one problem down, once."""
-        text = f"{problem}." + (f" {remedy}" if remedy else "")
+        """Records a problem, once."""
+        text = f"{problem}. {remedy}".strip()
         if text not in self.problems:
             self.problems.append(text)
 
-    def remark(self, remark: str, remedy: str = "") -> None:
-        """Writes one remark down, once."""
-        text = f"{remark}." + (f" {remedy}." if remedy else "")
+    def remark(self, remark: str, remedy: str) -> None:
+        """Records a remark, once."""
+        text = f"{remark}. {remedy}."
         if text not in self.remarks:
             self.remarks.append(text)
 
     def require(self, condition: Any, problem: str, remedy: str = "") -> bool:
-        """Writes the problem down unless the condition holds; returns whether it holds."""
+        """Records the problem unless the condition holds; returns whether it holds."""
         if not bool(condition):
             self.add(problem, remedy)
         return bool(condition)
 
     def stop_if_any(self) -> None:
-        """Raises ContractError if anything was found so far."""
+        """Raises ContractError if there are problems."""
         if self.problems:
             listed = "\n".join(f"  - {text}" for text in self.problems)
             raise ContractError(
@@ -70,8 +70,16 @@ class Findings:
 def examine(
     member: Any, family: str, protocol: type, optional: tuple[str, ...] = ()
 ) -> Iterator[Findings]:
-    """Float64 inside, the findings raised at the end; stops at once if the object lacks anything
-    but what is optional.
+    """The context of a checker: computes in float64, and raises the findings at the end.
+
+    Args:
+      member: the component.
+      family: name of the family, for messages.
+      protocol: contract of the family.
+      optional: members of the protocol that the component may lack.
+
+    Raises:
+      ContractError: at once if the object is not a component or lacks a required member.
     """
     findings = Findings(member, family)
     with jax.enable_x64(True):
@@ -83,19 +91,17 @@ def examine(
 
 
 def _is_component(findings: Findings, member: Any) -> None:
-    """The object is a pytree of numbers that JAX can take apart and put together with anything in
-    place of the numbers.
+    """Requires a pytree of floating-point numbers that JAX can flatten, and unflatten with other
+    objects instead of the numbers.
     """
     if isinstance(member, type):
-        findings.add("it is a class", "Give an instance, with brackets")
+        findings.add("it is a class", "Pass an instance, with brackets")
         findings.stop_if_any()
     try:
         checks.flat_enough(findings.family, member)
         leaves, structure = jax.tree.flatten(member)
     except Exception as error:
-        findings.add(
-            f"JAX cannot take it apart ({type(error).__name__}: {checks.line(str(error))})"
-        )
+        findings.add(f"JAX cannot flatten it ({type(error).__name__}: {checks.line(str(error))})")
         findings.stop_if_any()
         raise
     if any(leaf is member for leaf in leaves):
@@ -104,26 +110,17 @@ def _is_component(findings: Findings, member: Any) -> None:
             "Decorate it with @iblf_jax.component, or register it with jax.tree_util",
         )
         findings.stop_if_any()
+    remedy = "Make it a floating-point array, or declare it with iblf_jax.static"
     for path, leaf in jax.tree_util.tree_leaves_with_path(member):
-        numeric = isinstance(leaf, jax.Array | np.ndarray | np.generic | float) and jnp.issubdtype(
-            jnp.result_type(leaf), jnp.floating
-        )
-        remedy = (
-            "Make it a floating-point array, or declare it with iblf_jax.static if it is structure"
-        )
-        findings.require(
-            numeric,
-            f"the leaf {jax.tree_util.keystr(path).lstrip('.')} is {checks.shown(leaf)}, not a"
-            " floating-point number",
-            remedy,
-        )
+        name = jax.tree_util.keystr(path).lstrip(".")
+        problem = f"the leaf {name} is {checks.shown(leaf)}, not a floating-point number"
+        is_number = isinstance(leaf, jax.Array | np.ndarray | np.generic | float)
+        findings.require(is_number and _is_float(leaf), problem, remedy)
     try:
         rebuilt = jax.tree.unflatten(structure, [object() for _ in leaves])
         again: Any = jax.tree.structure(rebuilt)
         same = again == structure and hash(again) == hash(structure)
-        findings.require(
-            same, "it does not keep its structure when JAX takes it apart and puts it together"
-        )
+        findings.require(same, "its structure changes when JAX flattens and unflattens it")
     except Exception as error:
         remedy = (
             "JAX rebuilds it with placeholders: convert and check in `check(self)` of a component,"
@@ -132,21 +129,29 @@ def _is_component(findings: Findings, member: Any) -> None:
         findings.add(f"it cannot be rebuilt by JAX ({type(error).__name__}: {error})", remedy)
 
 
+def _is_float(x: Any) -> bool:
+    return jnp.issubdtype(jnp.result_type(x), jnp.floating)
+
+
+def first_line(error: Exception) -> str:
+    """The class of an exception and the first line of its text."""
+    text = str(error).strip().partition("\n")[0]
+    return f"{type(error).__name__}: {text}"
+
+
 def _has_members(
     findings: Findings, member: Any, protocol: type, optional: tuple[str, ...]
 ) -> None:
     for name, value in vars(protocol).items():
-        if name.startswith("_") or name in optional:
+        if name.startswith("_") or name in optional or hasattr(member, name):
             continue
-        if not hasattr(member, name):
-            text = (inspect.getdoc(value) or "").split("\n")[0]
-            signature = (
-                str(inspect.signature(value)).replace("self, ", "").split(" ->")[0]
-                if callable(value)
-                else ""
-            )
-            findings.add(f"{name}{_without_types(signature)} is missing", text)
-    for name in getattr(protocol, "__annotations__", {}):
+        text = (inspect.getdoc(value) or "").split("\n")[0]
+        arguments = ""
+        if callable(value):
+            names = [word for word in inspect.signature(value).parameters if word != "self"]
+            arguments = f"({', '.join(names)})"
+        findings.add(f"{name}{arguments} is missing", text)
+    for name in inspect.get_annotations(protocol):
         findings.require(
             hasattr(member, name),
             f"the attribute {name!r} is missing",
@@ -154,51 +159,44 @@ def _has_members(
         )
 
 
-def _without_types(signature: str) -> str:
-    return (
-        "("
-        + ", ".join(part.split(":")[0].strip() for part in signature.strip("()").split(", "))
-        + ")"
-        if signature
-        else ""
-    )
-
-
 def shape_of(findings: Findings, label: str, call: Callable, *args: Any) -> Any:
-    """Shapes and types of what `call(*args)` returns, or None and a finding if it raises."""
+    """Shapes and types of the result of `call(*args)`; None and a finding if it raises."""
     try:
         return jax.eval_shape(call, *args)
     except Exception as error:
-        first = str(error).strip().split("\n")[0]
-        remedy = (
-            "It is called with tracers: use jax.numpy, and `jnp.where` in place of `if`"
-            if isinstance(error, jax.errors.JAXTypeError)
-            else ""
-        )
-        findings.add(f"{label} raised {type(error).__name__}: {first}", remedy)
+        remedy = ""
+        if isinstance(error, jax.errors.JAXTypeError):
+            remedy = "It is called with tracers: use jax.numpy, and `jnp.where` in place of `if`"
+        findings.add(f"{label} raised {first_line(error)}", remedy)
         return None
 
 
 def has_shape(
     findings: Findings, label: str, got: Any, shape: tuple[int, ...], kind: Any = jnp.floating
 ) -> bool:
-    """Whether an abstract result is an array of this shape and kind; a finding if not."""
+    """Requires that an abstract result is an array of this shape and kind."""
     words = {jnp.floating: "floating-point numbers", jnp.bool_: "bool"}
     if got is None:
         return False
     if not hasattr(got, "shape"):
         findings.add(f"{label} gives {type(got).__name__}", f"It must be an array of shape {shape}")
         return False
-    ok = findings.require(
-        got.shape == shape, f"{label} has shape {got.shape}", f"It must be {shape}"
-    )
-    return ok and findings.require(
-        jnp.issubdtype(got.dtype, kind), f"{label} is {got.dtype}", f"It must be {words[kind]}"
-    )
+    if got.shape != shape:
+        findings.add(f"{label} has shape {got.shape}", f"It must be {shape}")
+        return False
+    is_kind = jnp.issubdtype(got.dtype, kind)
+    return findings.require(is_kind, f"{label} is {got.dtype}", f"It must be {words[kind]}")
+
+
+def call_has_shape(
+    findings: Findings, label: str, call: Callable, args: Sequence[Any], shape: tuple[int, ...]
+) -> bool:
+    """Requires that `call(*args)` returns floating-point numbers of this shape."""
+    return has_shape(findings, label, shape_of(findings, label, call, *args), shape)
 
 
 def same_structure(findings: Findings, label: str, got: Any, like: Any) -> bool:
-    """Whether two abstract pytrees have the same structure, shapes and types; a finding if not."""
+    """Requires that two abstract pytrees have the same structure, shapes and types."""
     if got is None or like is None:
         return False
     structure: Any = jax.tree.structure(got)
@@ -208,32 +206,38 @@ def same_structure(findings: Findings, label: str, got: Any, like: Any) -> bool:
             f"It must be that of the state, {jax.tree.structure(like)}",
         )
         return False
-    pairs = list(zip(jax.tree.leaves(got), jax.tree.leaves(like), strict=True))
-    described = " and ".join(
-        f"{a.dtype}{list(a.shape)} for {b.dtype}{list(b.shape)}"
-        for a, b in pairs
-        if (a.shape, a.dtype) != (b.shape, b.dtype)
-    )
+    different = []
+    for a, b in zip(jax.tree.leaves(got), jax.tree.leaves(like), strict=True):
+        if (a.shape, a.dtype) != (b.shape, b.dtype):
+            different.append(f"{a.dtype}{list(a.shape)} for {b.dtype}{list(b.shape)}")
     return findings.require(
-        not described,
-        f"{label} has {described}",
-        "Shapes and types must be those of the state; it is carried by a scan",
+        not different,
+        f"{label} has {' and '.join(different)}",
+        "Shapes and types must be those of the state, which a scan carries",
     )
 
 
 def in_dtype(tree: Any, dtype: str) -> Any:
     """A pytree with its floating-point numbers in another type."""
 
-    def one(x):
-        is_float = jnp.issubdtype(jnp.result_type(x), jnp.floating)
-        return jnp.asarray(
-            np.asarray(x, dtype if is_float else None)
-        )  # by NumPy: JAX compiles a program for every shape
+    def convert(x):
+        # NumPy converts without compiling a program for every shape, unlike JAX.
+        return jnp.asarray(np.asarray(x, dtype if _is_float(x) else None))
 
-    return jax.tree.map(one, tree)
+    return jax.tree.map(convert, tree)
 
 
-def probe(
+def leaves_by_name(name: str, tree: Any) -> dict[str, Any]:
+    """The leaves of a pytree by name, for the result of an `outputs` function."""
+    return {f"{name}, leaf {i}": x for i, x in enumerate(jax.tree.leaves(tree))}
+
+
+def largest(x: Any) -> float:
+    """The largest absolute value; 0 for an empty array."""
+    return float(np.max(np.abs(x), initial=0))
+
+
+def check_function(
     findings: Findings,
     outputs: Callable,
     member: Any,
@@ -242,15 +246,16 @@ def probe(
     rtol: float = 1e-5,
     seed: int = 0,
 ) -> None:
-    """Runs `outputs(member, *args) -> {name: array}` in all the ways in which the package does.
+    """Tests `outputs(member, *args) -> {name: array}` compiled, batched, differentiated in both
+    modes and in float32.
 
     Args:
-      findings: where problems go.
-      outputs: pure function of the member and of pytrees of floating-point numbers.
-      member: the member.
+      findings: receives the problems.
+      outputs: pure function of the component and of pytrees of floating-point numbers.
+      member: the component.
       args: the other arguments, at a point where the functions are smooth.
-      rtol: how well derivatives must agree.
-      seed: of the directions.
+      rtol: relative tolerance of derivatives.
+      seed: seed of the random directions.
     """
     point = in_dtype((member, *args), "float64")
     function = jax.jit(lambda p: outputs(*p))
@@ -270,18 +275,14 @@ def _derivatives(findings, function, values, point, rtol, rng) -> None:
     """Forward mode against central differences, reverse mode against forward mode."""
 
     def random_like(x):
-        size = np.where(np.isfinite(x), np.maximum(np.abs(x), 0.1), 0.1)  # a limit may be infinite
+        size = np.where(np.isfinite(x), np.maximum(np.abs(x), 0.1), 0.1)  # limits may be infinite
         return rng.normal(size=np.shape(x)) * size
 
     def floats(p):
-        return {k: v for k, v in function(p).items() if jnp.issubdtype(v.dtype, jnp.floating)}
+        return {k: v for k, v in function(p).items() if _is_float(v)}
 
     direction = jax.tree.map(random_like, point)
-    weights = {
-        k: rng.normal(size=v.shape)
-        for k, v in values.items()
-        if jnp.issubdtype(v.dtype, jnp.floating)
-    }
+    weights = {k: rng.normal(size=v.shape) for k, v in values.items() if _is_float(v)}
 
     @jax.jit
     def both(point, direction, weights):
@@ -292,38 +293,26 @@ def _derivatives(findings, function, values, point, rtol, rng) -> None:
     try:
         forward, reverse = both(point, direction, weights)
     except Exception as error:
-        findings.add(
-            f"it cannot be differentiated ({type(error).__name__}: {str(error).splitlines()[0]})",
-            "Use jax.numpy only",
-        )
+        findings.add(f"it cannot be differentiated ({first_line(error)})", "Use only jax.numpy")
         return
     ahead = function(jax.tree.map(lambda x, d: np.asarray(x) + STEP * d, point, direction))
     behind = function(jax.tree.map(lambda x, d: np.asarray(x) - STEP * d, point, direction))
+    remedy = (
+        "Look for rounding, clipping, stop_gradient and wrong custom derivatives in the function"
+    )
     for name, slope in forward.items():
         difference = (np.asarray(ahead[name]) - np.asarray(behind[name])) / (2 * STEP)
-        scale = max(
-            1.0,
-            float(np.max(np.abs(difference), initial=0)),
-            float(np.max(np.abs(values[name]), initial=0)),
-        )
-        apart = float(np.max(np.abs(slope - difference), initial=0))
-        remedy = (
-            "Is something rounded, cut off, stopped (stop_gradient) or given a wrong custom"
-            " derivative?"
-        )
-        findings.require(
-            apart <= rtol * scale,
-            f"the derivative of {name} differs from its finite difference by {apart:.2g}",
-            remedy,
-        )
+        scale = max(1.0, largest(difference), largest(values[name]))
+        off = largest(slope - difference)
+        problem = f"the derivative of {name} differs from its finite difference by {off:.2g}"
+        findings.require(off <= rtol * scale, problem, remedy)
     along = sum(float(np.vdot(weights[k], forward[k])) for k in weights)
-    size = max([1.0, *(float(np.max(np.abs(x), initial=0)) for x in forward.values())])
+    size = max([1.0, *map(largest, forward.values())])
     off = abs(float(reverse) - along)
-    remedy = "Look at custom derivatives and at jnp.where over infinities"
     findings.require(
         off <= 1e-8 * size * max(1, len(forward)),
         f"forward and reverse derivative differ by {off:.2g}",
-        remedy,
+        "Look at custom derivatives and at jnp.where over infinities",
     )
 
 
@@ -332,82 +321,70 @@ def _dot(a: Any, b: Any) -> Any:
 
 
 def _batch(findings, function, values, point) -> None:
-    """A batch of three points gives what each gives alone."""
+    """Requires that a batch of three points gives the results of single evaluations."""
     factors = (1.0, 1.001, 0.999)
     points = [jax.tree.map(lambda x, c=c: c * np.asarray(x), point) for c in factors]
     try:
         batch = jax.jit(jax.vmap(function))(jax.tree.map(lambda *xs: np.stack(xs), *points))
     except Exception as error:
-        findings.add(
-            f"it does not work under vmap ({type(error).__name__}: {str(error).splitlines()[0]})",
-            "Write it for one run, in jax.numpy",
-        )
+        remedy = "Write it for one run, in jax.numpy"
+        findings.add(f"it does not work under vmap ({first_line(error)})", remedy)
         return
-    alone = [values, *(function(p) for p in points[1:])]
+    single = [values, *(function(p) for p in points[1:])]
     for name in values:
-        for i, one in enumerate(alone):
-            scale = max(1.0, float(np.max(np.abs(one[name]), initial=0)))
-            off = float(
-                np.max(
-                    np.abs(np.asarray(batch[name][i], float) - np.asarray(one[name], float)),
-                    initial=0,
-                )
-            )
-            findings.require(
-                off <= 1e-9 * scale, f"{name} differs by {off:.2g} between vmap and one run"
-            )
+        for batched, one in zip(batch[name], single, strict=True):
+            expected = np.asarray(one[name], float)
+            off = largest(np.asarray(batched, float) - expected)
+            problem = f"{name} differs by {off:.2g} between vmap and one run"
+            findings.require(off <= 1e-9 * max(1.0, largest(expected)), problem)
 
 
 def _float32(findings, outputs, values, point) -> None:
-    """float32 in, float32 out, and about the same numbers."""
-    small = in_dtype(point, "float32")
-    function = jax.jit(lambda p: outputs(*p))
-    result = function(small)
+    """Requires float32 results for float32 arguments, with about the same numbers."""
+    result = jax.jit(lambda p: outputs(*p))(in_dtype(point, "float32"))
+    remedy = "Make constants with the dtype of an argument, jnp.zeros_like(q), or Python numbers"
     for name, value in result.items():
-        if jnp.issubdtype(values[name].dtype, jnp.floating):
-            remedy = (
-                "Make constants with the dtype of an argument, jnp.zeros_like(q), or keep them"
-                " plain Python numbers"
-            )
-            if findings.require(
-                value.dtype == jnp.float32, f"{name} is {value.dtype} for float32 arguments", remedy
-            ):
-                scale = max(1.0, float(np.max(np.abs(values[name]), initial=0)))
-                off = float(
-                    np.max(np.abs(np.asarray(value, float) - np.asarray(values[name])), initial=0)
-                )
-                findings.require(off <= 5e-3 * scale, f"{name} in float32 is off by {off:.2g}")
+        if not _is_float(values[name]):
+            continue
+        problem = f"{name} is {value.dtype} for float32 arguments"
+        if findings.require(value.dtype == jnp.float32, problem, remedy):
+            off = largest(np.asarray(value, float) - np.asarray(values[name]))
+            scale = max(1.0, largest(values[name]))
+            findings.require(off <= 5e-3 * scale, f"{name} in float32 is off by {off:.2g}")
 
 
 def find_jump(
     function: Callable, start: float, end: float, known: Sequence[float] = ()
 ) -> float | None:
-    """A time in [start, end] at which `function` (t -> array) jumps, other than the known ones;
-    None if none was seen.
+    """A time in [start, end] at which `function` (t -> array) jumps, other than the known times;
+    None if there is none.
 
-    The intervals of a grid with the largest changes are halved until a smooth function would not
-    change any more.
+    The search refines the intervals of a grid with the largest changes until a smooth function
+    would not change any more.
     """
     batched = jax.jit(jax.vmap(function))
-    edges = np.linspace(start, end, 2001)
-    values = np.asarray(batched(jnp.asarray(edges)), float).reshape(edges.size, -1)
-    scale = max(float(np.max(np.abs(values), initial=0)), 1e-9)
-    change = np.max(np.abs(np.diff(values, axis=0)), axis=1, initial=0)
-    for index in np.argsort(-change)[:8]:
-        a, b = edges[index], edges[index + 1]
+
+    def values(times):
+        return np.asarray(batched(jnp.asarray(times)), float).reshape(GRID, -1)
+
+    def changes(times):
+        return np.max(np.abs(np.diff(values(times), axis=0)), axis=1, initial=0)
+
+    times = np.linspace(start, end, GRID)
+    scale = max(largest(values(times)), 1e-9)
+    for index in np.argsort(-changes(times))[:8]:
+        a, b = times[index], times[index + 1]
         if any(a - 1e-9 <= t <= b + 1e-9 for t in known):
             continue
         while b - a > 1e-10 * max(1.0, abs(end)):
-            inner = np.linspace(a, b, 2001)
-            steps = np.max(
-                np.abs(
-                    np.diff(
-                        np.asarray(batched(jnp.asarray(inner)), float).reshape(2001, -1), axis=0
-                    )
-                ),
-                axis=1,
-            )
-            a, b = inner[np.argmax(steps)], inner[np.argmax(steps) + 1]
+            inner = np.linspace(a, b, GRID)
+            steps = changes(inner)
+            steepest = np.argmax(steps)
+            a, b = inner[steepest], inner[steepest + 1]
         if np.max(steps) > 1e-6 * scale:
             return float(b)
     return None
+
+
+GRID = 2001
+"""Points of the grids on which jumps are sought."""

@@ -11,7 +11,14 @@ import numpy as np
 
 from iblf_jax.control.barriers import Barrier
 from iblf_jax.control.barriers._base import CLAIMS
-from iblf_jax.testing._contract import Findings, examine, has_shape, in_dtype, probe, shape_of
+from iblf_jax.testing._contract import (
+    Findings,
+    call_has_shape,
+    check_function,
+    examine,
+    has_shape,
+    in_dtype,
+)
 from iblf_jax.testing.joints import check_number, fitted_to, number_of_joints, scenario_of
 from iblf_jax.world.bounds import Tube
 
@@ -34,8 +41,8 @@ XI = (
     3.0,
     40.0,
 )
-"""Where every barrier is looked at, in xi: far outside, on and about the wall, inside, on and about
-zero."""
+"""Values of xi at which every barrier is evaluated: far outside, at and near the bound, inside, at
+and near zero."""
 
 TIMES = (0.0, 1.0, 2.5, 4.0)
 
@@ -44,49 +51,35 @@ def check_barrier(barrier: Any, *, n: int | None = None) -> None:
     """Checks a barrier: shapes, derivatives, float32; finite everywhere; s = dV1/dq; V1 decays
     along alpha.
 
-        V1(e1 = 0) = 0,   V1 >= 0,   s = dV1/dq,   s e1 >= 0,   s alpha + dV1/dt <= 0 inside the
-        wall,
-        s alpha + dV1/dt <= -decay_rate V1,   |xi| <= xi_bound(V1), where it claims them
+        V1(e1 = 0) = 0,   V1 >= 0,   s = dV1/dq,   s e1 >= 0,
+        s alpha + dV1/dt <= 0 inside the bound,
+        s alpha + dV1/dt <= -decay_rate V1,   |xi| <= xi_bound(V1), if the barrier claims them
 
     Args:
       barrier: an instance.
-      n: number of joints; found from its leaves if not given, 2 if these are scalars.
+      n: number of joints; that of its leaves if not given, 2 if these are scalars.
 
     Raises:
       ContractError: lists what does not hold, with the remedy.
-      ValueError: no number of joints, or one that its leaves do not have.
+      ValueError: `n` is not a number of joints, or not that of the leaves.
     """
     check_number(n)
     with examine(barrier, "Barrier", Barrier, CLAIMS) as findings:
-        guard, uses_o = barrier.guard, barrier.uses_o
-        remedy = (
-            "It must be a static float between 0 and 1, or minus infinity where no guard is needed"
-        )
-        findings.require(
-            isinstance(guard, float) and (0 < guard < 1 or guard == -math.inf),
-            f"guard is {guard!r}",
-            remedy,
-        )
-        findings.require(
-            isinstance(uses_o, bool),
-            f"uses_o is {uses_o!r}",
-            "It must be a bool of the class, uses_o: ClassVar[bool]",
-        )
-        findings.stop_if_any()
+        _class_members(findings, barrier)
         n = number_of_joints(findings, barrier, n)
         barrier = fitted_to(in_dtype(barrier, "float64"), n, "barrier")
         context = in_dtype(scenario_of(n), "float64").context
         k1 = _joint_by_joint(n, 2.0, 3.0)
-        o = _joint_by_joint(n, 0.1, 0.2) if uses_o else None
+        o = _joint_by_joint(n, 0.1, 0.2) if barrier.uses_o else None
         tube = context.tube(jnp.asarray(1.0))
         q = tube.q_d + _joint_by_joint(n, 0.2, -0.15)
         calls: dict[str, tuple] = {
             "value(tube, q)": (barrier.value, (tube, q)),
             "slope(tube, q)": (barrier.slope, (tube, q)),
+            "virtual_velocity(tube, q, k1, o)": (barrier.virtual_velocity, (tube, q, k1, o)),
         }
-        calls["virtual_velocity(tube, q, k1, o)"] = (barrier.virtual_velocity, (tube, q, k1, o))
         for label, (call, args) in calls.items():
-            has_shape(findings, label, shape_of(findings, label, call, *args), (n,))
+            call_has_shape(findings, label, call, args, (n,))
         findings.stop_if_any()
 
         def outputs(barrier, tube, q, k1, o):
@@ -97,17 +90,33 @@ def check_barrier(barrier: Any, *, n: int | None = None) -> None:
             )
             return dict(zip(calls, named, strict=True))
 
-        probe(findings, outputs, barrier, (tube, q, k1, o))
+        check_function(findings, outputs, barrier, (tube, q, k1, o))
         _joints_apart(findings, barrier, tube, q, k1, o)
         for t in TIMES:
             tube = context.tube(jnp.asarray(t))
             numbers = _numbers(barrier, context, jnp.asarray(t), k1, o, jnp.asarray(XI))
-            _at_every_xi(findings, numbers, guard)
-            _claims(findings, barrier, tube, k1, numbers, guard)
+            _at_every_xi(findings, numbers, barrier.guard)
+            _claims(findings, barrier, tube, k1, numbers)
+
+
+def _class_members(findings: Findings, barrier: Any) -> None:
+    """Requires valid values of `guard` and `uses_o`."""
+    guard = barrier.guard
+    findings.require(
+        isinstance(guard, float) and (0 < guard < 1 or guard == -math.inf),
+        f"guard is {guard!r}",
+        "It must be a static float between 0 and 1, or minus infinity if no guard is needed",
+    )
+    findings.require(
+        isinstance(barrier.uses_o, bool),
+        f"uses_o is {barrier.uses_o!r}",
+        "It must be a bool of the class, uses_o: ClassVar[bool]",
+    )
+    findings.stop_if_any()
 
 
 def _joint_by_joint(n: int, first: float, second: float) -> jax.Array:
-    """Two numbers in turn, (n,)."""
+    """Two numbers that alternate over the joints, (n,)."""
     return jnp.asarray(np.resize([first, second], n))
 
 
@@ -115,8 +124,8 @@ def _joint_by_joint(n: int, first: float, second: float) -> jax.Array:
 def _numbers(
     barrier: Any, context: Any, t: jax.Array, k1: jax.Array, o: Any, xi: jax.Array
 ) -> dict[str, jax.Array]:
-    """The barrier at every xi, with its derivatives by q in both modes, and the rate of V1 along q'
-    = alpha.
+    """The barrier at every xi, its derivatives with respect to q in both modes, and the rate of V1
+    along q' = alpha.
     """
 
     def at(xi):
@@ -156,18 +165,15 @@ def _at_every_xi(findings: Findings, numbers: dict[str, jax.Array], guard: float
     xi = np.asarray(XI)[:, None] + 0 * got["xi"]
     words = {"V1": "value", "slope": "slope", "alpha": "virtual_velocity"}
     remedy = (
-        "Evaluate at iblf_jax.barriers.guarded_error; mind removable singularities at e1 = 0"
-        " (double jnp.where)"
+        "Evaluate at iblf_jax.barriers.guarded_error; remove singularities at e1 = 0 by a double"
+        " jnp.where"
     )
-    for prefix, text in (
-        ("", ""),
-        ("d", "the forward derivative of "),
-        ("r", "the reverse derivative of "),
-    ):
+    prefixes = {"": "", "d": "the forward derivative of ", "r": "the reverse derivative of "}
+    for prefix, text in prefixes.items():
         for name, word in words.items():
             bad = ~np.isfinite(got[prefix + name])
-            where = f"xi = {xi[bad][0]:.12g}" if np.any(bad) else ""
-            findings.require(not np.any(bad), f"{text}{word} is not finite at {where}", remedy)
+            if np.any(bad):
+                findings.add(f"{text}{word} is not finite at xi = {xi[bad][0]:.12g}", remedy)
         findings.stop_if_any()
     zero = np.abs(xi) == 0
     findings.require(
@@ -177,20 +183,19 @@ def _at_every_xi(findings: Findings, numbers: dict[str, jax.Array], guard: float
     findings.require(
         np.all(got["V1"] >= 0),
         "V1 is negative somewhere",
-        "A Lyapunov function is >= 0; beyond the guard go on along the tangent",
+        "A Lyapunov function is >= 0; continue it along the tangent beyond the guard",
     )
     inward = np.sign(xi) * got["slope"] >= 0
     findings.require(
         np.all(inward),
         "the slope points outward somewhere",
-        "tau = ... - slope must push back, beyond the wall too",
+        "tau = ... - slope must point inward, also beyond the bound",
     )
-    # On the edge of the guard both one-sided derivatives are right, so the points within 1e-3 of it
-    # are left out.
+    # At the edge of the guard both one-sided derivatives are correct; points near it are left out.
     clear = np.abs(np.abs(xi) - (1 - guard)) > 1e-3 * guard
     off = np.abs(got["dV1"] - got["slope"]) / np.maximum(1.0, np.abs(got["slope"]))
     worst = float(np.max(off[clear]))
-    remedy = "Beyond the guard V1 must go on along its tangent: V1(e) + slope(e) (e1 - e)"
+    remedy = "Beyond the guard V1 must continue along its tangent: V1(e) + slope(e) (e1 - e)"
     findings.require(worst < 1e-8, f"the slope is not dV1/dq (relative error {worst:.2g})", remedy)
     inside = np.abs(xi) < 1 - 2 * guard
     growth = float(np.max(got["decay"][inside]))
@@ -207,12 +212,11 @@ def _claims(
     tube: Tube,
     k1: jax.Array,
     numbers: dict[str, jax.Array],
-    guard: float,
 ) -> None:
-    """What the barrier promises of V1, if it promises anything."""
+    """Tests the claims of the barrier about V1, if it states any."""
     xi, V1, decay = (np.asarray(numbers[name]) for name in ("xi", "V1", "decay"))
-    inside = np.abs(xi) < min(1 - 2 * guard, 1.0)
-    rate = getattr(barrier, "decay_rate", lambda k1: None)(k1)
+    inside = np.abs(xi) < min(1 - 2 * barrier.guard, 1.0)
+    rate = claim(barrier, "decay_rate", k1)
     if rate is not None:
         has_shape(findings, "decay_rate(k1)", rate, k1.shape)
         excess = float(np.max((decay + np.asarray(rate) * V1)[inside]))
@@ -221,15 +225,12 @@ def _claims(
             f"V1' + decay_rate V1 reaches {excess:.3g} along q' = alpha",
             "Claim a smaller rate, or None",
         )
-    ratio = getattr(barrier, "error_over_slope", lambda tube, q: None)
-    if ratio(tube, tube.q_d) is not None:
+    if claim(barrier, "error_over_slope", tube, tube.q_d) is not None:
         q = tube.q_d + xi * np.where(xi > 0, tube.k_u, tube.k_l)
-        found, slope = (
-            np.asarray(jax.jit(jax.vmap(lambda q: ratio(tube, q)))(q)),
-            np.asarray(numbers["slope"]),
-        )
-        off = np.abs(found * slope - (q - np.asarray(tube.q_d)))[inside]
-        remedy = "It is e1/s inside the wall, written so that it has no 0/0 at e1 = 0"
+        found = np.asarray(jax.jit(jax.vmap(lambda q: barrier.error_over_slope(tube, q)))(q))
+        product = found * np.asarray(numbers["slope"])
+        off = np.abs(product - (q - np.asarray(tube.q_d)))[inside]
+        remedy = "It is e1/s inside the bound, in a form without 0/0 at e1 = 0"
         findings.require(
             np.max(off) < 1e-9,
             f"error_over_slope times the slope is not e1 (off by {np.max(off):.2g})",
@@ -238,9 +239,8 @@ def _claims(
         findings.require(
             np.all(np.isfinite(found)), "error_over_slope is not finite somewhere", remedy
         )
-    bound = getattr(barrier, "xi_bound", lambda V, tube: None)
-    if bound(jnp.asarray(V1[0]), tube) is not None:
-        claimed = np.asarray(jax.jit(jax.vmap(lambda V: bound(V, tube)))(V1))
+    if claim(barrier, "xi_bound", jnp.asarray(V1[0]), tube) is not None:
+        claimed = np.asarray(jax.jit(jax.vmap(lambda V: barrier.xi_bound(V, tube)))(V1))
         kept = (np.abs(xi) <= claimed * (1 + 1e-9) + 1e-12)[inside]
         findings.require(
             np.all(kept),
@@ -249,10 +249,17 @@ def _claims(
         )
 
 
+def claim(barrier: Any, name: str, *args: Any) -> Any:
+    """The result of an optional method of a barrier; None if it has no such method."""
+    if not hasattr(barrier, name):
+        return None
+    return getattr(barrier, name)(*args)
+
+
 def _joints_apart(
     findings: Findings, barrier: Any, tube: Tube, q: jax.Array, k1: jax.Array, o: Any
 ) -> None:
-    """No joint's barrier depends on another joint."""
+    """Requires that the barrier of a joint does not depend on other joints."""
     for label, function in (
         ("value", lambda q: barrier.value(tube, q)),
         ("slope", lambda q: barrier.slope(tube, q)),
@@ -262,5 +269,5 @@ def _joints_apart(
         findings.require(
             np.all(np.diag(np.diag(J)) == J),
             f"{label} mixes joints",
-            "It is written joint by joint; the law needs it so",
+            "The law needs a barrier that acts on every joint separately",
         )

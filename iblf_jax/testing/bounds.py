@@ -1,5 +1,5 @@
-"""What a law does at its bounds and beyond them: inside it must be finite, beyond it may be
-undefined, and that is a remark.
+"""Tests a law at and beyond its bounds.  It must be finite inside; if it is undefined beyond the
+bounds, the checker returns a remark.
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.testing._contract import Findings
 
 XI = (-40.0, -1.0, -0.9995, -0.5, 0.0, 0.5, 0.9995, 1.0, 40.0)
-"""Where a law is evaluated, in xi: a run may get anywhere."""
+"""Values of xi at which a law is evaluated; a run may reach any of them."""
 NEAR, NEARER = 1e-4, 1e-10
-"""rad/s.  e2 at which the slope of the command is measured."""
+"""Values of e2 at which the slope of the command is evaluated [rad/s]."""
 GROWTH = 3.0
-"""How much the slope may grow from the one to the other."""
+"""Largest allowed growth of the slope between these values."""
 TIME = 0.7
-"""s."""
+"""Time of the evaluation [s]."""
 LABELS = ("the command", "its forward derivative", "its reverse derivative")
 
 
 class Points(NamedTuple):
-    """What a law answers at some points, one number a point."""
+    """The results of a law at some points, one entry per point."""
 
     finite: dict[str, np.ndarray]
     """By label, whether all numbers are finite, bool."""
@@ -89,7 +89,7 @@ def _swept(findings: Findings, scenario: Scenario, axis: str, infinite_in_e2: bo
     found, xi = _at_points(scenario, axis), np.asarray(XI)
     beyond = np.zeros(xi.size, bool)
     remedy = (
-        "Near the wall hold the slope (iblf_jax.barriers.guarded_error); a run that fails must stay"
+        "Near the bound limit the slope (iblf_jax.barriers.guarded_error); a failed run must stay"
         " finite"
     )
     for label, finite in found.finite.items():

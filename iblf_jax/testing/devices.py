@@ -15,25 +15,27 @@ from iblf_jax.control.actuators import Actuator, Delivered
 from iblf_jax.control.sensors import Measurement, Sensor
 from iblf_jax.testing._contract import (
     Findings,
+    check_function,
     examine,
     has_shape,
     in_dtype,
-    probe,
+    leaves_by_name,
     same_structure,
     shape_of,
 )
 from iblf_jax.testing.joints import check_number, fitted_to, number_of_joints
 
 SMALL_TORQUES = (0.1, 1e-3)
-"""N m.  Sizes of the torques that an actuator has to deliver at a standstill; one is enough."""
+"""Torques that an actuator has to deliver at a standstill [N m]; one of them suffices."""
 POWERS = (0, 1, 2, 3, 4, 5, -1, -2, -3)
 INPUT_SCALES = np.asarray([sign * 10.0**power for power in POWERS for sign in (1, -1)])
-"""Inputs per torque from which the input that delivers a torque is searched, in any unit."""
+"""Initial guesses of the input per torque, in any unit, for the search of the input that delivers a
+torque."""
 NEWTON_STEPS = 20
 DELIVERED = 1e-6
-"""Relative error at which a torque counts as delivered."""
-RUNAWAY = 1e-6
-"""A real part above this share of the largest eigenvalue is a state that grows by itself."""
+"""Relative error below which a torque counts as delivered."""
+UNSTABLE = 1e-6
+"""Share of the largest eigenvalue above which a real part means an unstable state."""
 
 
 def check_sensor(sensor: Any, *, n: int | None = None) -> None:
@@ -41,11 +43,11 @@ def check_sensor(sensor: Any, *, n: int | None = None) -> None:
 
     Args:
       sensor: an instance.
-      n: number of joints; found from its leaves if not given, 2 if these are scalars.
+      n: number of joints; that of its leaves if not given, 2 if these are scalars.
 
     Raises:
       ContractError: lists what does not hold, with the remedy.
-      ValueError: no number of joints, or one that its leaves do not have.
+      ValueError: `n` is not a number of joints, or not that of the leaves.
     """
     check_number(n)
     with examine(sensor, "Sensor", Sensor) as findings:
@@ -61,24 +63,18 @@ def check_sensor(sensor: Any, *, n: int | None = None) -> None:
         def outputs(sensor, q, dq, normal, period):
             sensor = getattr(sensor, "unrounded", sensor)
             measured, state = sensor.measure(q, dq, normal, period, sensor.init(q, dq, period))
-            return {
-                "q": measured.q,
-                "dq": measured.dq,
-                **{f"state, leaf {i}": x for i, x in enumerate(jax.tree.leaves(state))},
-            }
+            return {"q": measured.q, "dq": measured.dq} | leaves_by_name("state", state)
 
-        probe(findings, outputs, fitted, (q, dq, normal, period))
+        check_function(findings, outputs, fitted, (q, dq, normal, period))
 
 
 def _measures(findings: Findings, sensor, q, dq, normal, period) -> None:
     kind = f" ({q.dtype})"
     state = shape_of(findings, "init(q, dq, period)" + kind, sensor.init, q, dq, period)
+    if state is None:
+        return
     label = "measure(q, dq, normal, period, state)" + kind
-    found = (
-        None
-        if state is None
-        else shape_of(findings, label, sensor.measure, q, dq, normal, period, state)
-    )
+    found = shape_of(findings, label, sensor.measure, q, dq, normal, period, state)
     if found is None:
         return
     is_pair = isinstance(found, tuple) and len(found) == 2 and isinstance(found[0], Measurement)
@@ -93,59 +89,58 @@ def _measures(findings: Findings, sensor, q, dq, normal, period) -> None:
 
 
 def check_actuator(actuator: Any, *, n: int | None = None) -> None:
-    """Checks an actuator: shapes, the state's structure, derivatives, float32, and that it starts
-    at the torque of `init`.
+    """Checks an actuator: shapes, the state's structure, derivatives, float32, and the initial
+    torque.
 
-    Its input need not be a torque.  From the state that `init(tau)` returns, at a standstill, some
-    input, in whatever unit, must make it deliver tau; and at that input its state must not grow.
+    The input of an actuator may have any unit.  In the state `init(tau)` at a standstill, some
+    input must deliver tau, and the state must be stable at this input.
 
     Args:
       actuator: an instance.
-      n: number of joints; found from its leaves if not given, 2 if these are scalars.
+      n: number of joints; that of its leaves if not given, 2 if these are scalars.
 
     Raises:
       ContractError: lists what does not hold, with the remedy.
-      ValueError: no number of joints, or one that its leaves do not have.
+      ValueError: `n` is not a number of joints, or not that of the leaves.
     """
     check_number(n)
     with examine(actuator, "Actuator", Actuator) as findings:
         n = number_of_joints(findings, actuator, n)
         fitted = fitted_to(in_dtype(actuator, "float64"), n, "actuator")
-        asked, dq = jnp.asarray(np.random.default_rng(3).uniform(-0.1, 0.1, (2, n)))
+        command, dq = jnp.asarray(np.random.default_rng(3).uniform(-0.1, 0.1, (2, n)))
         for dtype in ("float64", "float32"):
-            _delivers(findings, *in_dtype((fitted, asked, dq), dtype))
+            _delivers(findings, *in_dtype((fitted, command, dq), dtype))
         findings.stop_if_any()
 
-        def outputs(actuator, asked, dq):
-            delivered = actuator.deliver(asked, dq, actuator.init(0.9 * asked))
-            return {
-                "tau": delivered.tau,
-                **{f"rate, leaf {i}": x for i, x in enumerate(jax.tree.leaves(delivered.rate))},
-            }
+        def outputs(actuator, command, dq):
+            delivered = actuator.deliver(command, dq, actuator.init(0.9 * command))
+            return {"tau": delivered.tau} | leaves_by_name("rate", delivered.rate)
 
-        probe(findings, outputs, fitted, (asked, dq))
-        _starts_at_its_torque(findings, fitted, asked / jnp.max(jnp.abs(asked)))
+        check_function(findings, outputs, fitted, (command, dq))
+        _starts_at_its_torque(findings, fitted, command / jnp.max(jnp.abs(command)))
 
 
-def _delivers(findings: Findings, actuator, asked, dq) -> None:
-    kind = f" ({asked.dtype})"
-    state = shape_of(findings, "init(tau)" + kind, actuator.init, asked)
-    label = "deliver(asked, dq, state)" + kind
-    found = None if state is None else shape_of(findings, label, actuator.deliver, asked, dq, state)
+def _delivers(findings: Findings, actuator, command, dq) -> None:
+    kind = f" ({command.dtype})"
+    state = shape_of(findings, "init(tau)" + kind, actuator.init, command)
+    if state is None:
+        return
+    label = "deliver(command, dq, state)" + kind
+    found = shape_of(findings, label, actuator.deliver, command, dq, state)
     if found is None:
         return
     if not all(hasattr(found, field) for field in Delivered._fields):
         remedy = "It must be an iblf_jax.actuators.Delivered(tau, limited, rate)"
         findings.add(f"{label} gives {type(found).__name__}", remedy)
         return
-    has_shape(findings, label + ", tau", found.tau, asked.shape)
-    has_shape(findings, label + ", limited", found.limited, asked.shape, jnp.bool_)
+    has_shape(findings, label + ", tau", found.tau, command.shape)
+    has_shape(findings, label + ", limited", found.limited, command.shape, jnp.bool_)
     same_structure(findings, label + ", rate", found.rate, state)
 
 
 def _starts_at_its_torque(findings: Findings, actuator: Any, direction: jax.Array) -> None:
-    """From `init(tau)` some input delivers tau at a standstill, and keeps the state from
-    growing.
+    """Requires that in the state `init(tau)` some input delivers tau at a standstill, and that the
+    state is stable at this input.
     """
     for size in SMALL_TORQUES:
         torque = size * direction
@@ -167,19 +162,17 @@ def _starts_at_its_torque(findings: Findings, actuator: Any, direction: jax.Arra
 
 def _input_that_delivers(actuator: Any, torque: jax.Array, state: Any) -> jax.Array | None:
     """An input, in any unit, at which a state delivers a torque at a standstill, by Newton's
-    method.
-
-    None if no start leads to one.
+    method; None if no initial guess converges.
     """
 
     @jax.jit
     def shortfalls(inputs):
-        def shortfall(asked):
-            return actuator.deliver(asked, jnp.zeros_like(asked), state).tau - torque
+        def shortfall(command):
+            return actuator.deliver(command, jnp.zeros_like(command), state).tau - torque
 
         return jax.vmap(shortfall)(inputs), jax.vmap(jax.jacfwd(shortfall))(inputs)
 
-    # The torque itself comes first: most actuators take one.
+    # The first guess is the torque, because it is the input of most actuators.
     inputs = INPUT_SCALES[:, None] * np.asarray(torque)
     for _ in range(NEWTON_STEPS):
         missing, slopes = map(np.asarray, shortfalls(inputs))
@@ -199,17 +192,18 @@ def _input_that_delivers(actuator: Any, torque: jax.Array, state: Any) -> jax.Ar
     return None
 
 
-def _growth(actuator: Any, asked: jax.Array, state: Any) -> float:
-    """How fast the state grows by itself at a constant input at a standstill, 1/s; 0 if not at
-    all.
-    """
+def _growth(actuator: Any, command: jax.Array, state: Any) -> float:
+    """Growth rate of the state at a constant input at a standstill [1/s]; 0 if it is stable."""
     flat, rebuild = ravel_pytree(state)
     if flat.size == 0:
         return 0.0
 
     def rate(flat):
-        return ravel_pytree(actuator.deliver(asked, jnp.zeros_like(asked), rebuild(flat)).rate)[0]
+        delivered = actuator.deliver(command, jnp.zeros_like(command), rebuild(flat))
+        return ravel_pytree(delivered.rate)[0]
 
     eigenvalues = np.linalg.eigvals(np.asarray(jax.jit(jax.jacfwd(rate))(flat)))
     fastest = float(np.max(np.real(eigenvalues)))
-    return fastest if fastest > RUNAWAY * float(np.max(np.abs(eigenvalues))) else 0.0
+    if fastest <= UNSTABLE * float(np.max(np.abs(eigenvalues))):
+        return 0.0
+    return fastest

@@ -1,4 +1,4 @@
-"""How many joints a member is for, and arms and scenarios of that many joints to check it in."""
+"""The number of joints of a component, and arms and scenarios with that number for its check."""
 
 from __future__ import annotations
 

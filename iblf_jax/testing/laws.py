@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -17,10 +16,12 @@ from iblf_jax.engine.simulate import simulate
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.testing._contract import (
     Findings,
+    check_function,
     examine,
+    first_line,
     has_shape,
     in_dtype,
-    probe,
+    leaves_by_name,
     same_structure,
     shape_of,
 )
@@ -30,44 +31,43 @@ from iblf_jax.testing.own_claims import check_claims
 from iblf_jax.world.bounds import Bounds, Constant
 
 SHORT_RUN = 0.1
-"""s."""
+"""Duration of the closed-loop test [s]."""
 SPEED = 2.0
-"""rad/s.  Bounds of the velocities for a law that needs some."""
+"""Bound of the velocities for a law that needs one [rad/s]."""
 
 
 def check_law(
     law: Any, *, scenario: Scenario | None = None, n: int | None = None
 ) -> tuple[str, ...]:
-    """Checks a tracking law: shapes, the state's structure, derivatives, float32, finite inside its
-    bounds, a short closed loop.
+    """Checks a tracking law: shapes, the state's structure, derivatives, float32, finite values
+    inside the bounds, and a short closed loop.
 
     Args:
       law: an instance.
-      scenario: to try it in; if not given the paper's simulation, or one like it for as many joints
-        as the law is for.
-      n: number of joints, if no scenario is given; found from its leaves if not given, 2 if these
+      scenario: the scenario of the closed loop; if not given the paper's simulation, or a similar
+        one for the number of joints of the law.
+      n: number of joints, if no scenario is given; that of its leaves if not given, 2 if these
         are scalars.
 
     Returns:
-      Remarks, such as that the law is undefined beyond its bounds, where many published laws are;
+      Remarks, for example that the law is undefined beyond its bounds, as many published laws are;
       an empty tuple if there are none.
 
     Raises:
       ContractError: lists what does not hold, with the remedy.
-      ValueError: a scenario that is none, or has another number of joints than `n`.
+      ValueError: not a Scenario, or one with another number of joints than `n`.
     """
     check_scenario(scenario, n)
     with examine(law, "Controller", Controller) as findings:
         base = in_dtype(scenario_for(findings, law, scenario, n), "float64")
-        watched = base.velocity_bounds
-        if watched is None and getattr(unwrapped(law), "needs_velocity_bounds", False):
-            watched = Bounds(lower=Constant(-SPEED), upper=Constant(SPEED))
+        speeds = base.velocity_bounds
+        if speeds is None and getattr(unwrapped(law), "needs_velocity_bounds", False):
+            speeds = Bounds(lower=Constant(-SPEED), upper=Constant(SPEED))
         try:
-            base = in_dtype(
-                dataclasses.replace(base, controller=law, velocity_bounds=watched), "float64"
-            )
+            base = dataclasses.replace(base, controller=law, velocity_bounds=speeds)
+            base = in_dtype(base, "float64")
         except ValueError as error:
-            findings.add(f"it does not go into a Scenario ({error})")
+            findings.add(f"a Scenario does not accept it ({error})")
             findings.stop_if_any()
         for dtype in ("float64", "float32"):
             _structure(findings, in_dtype(base, dtype))
@@ -79,10 +79,10 @@ def check_law(
 
         def outputs(law, t, q, dq, f_hat, context):
             command, rate = law.command(t, q, dq, f_hat, context, law.init(q, dq, context))
-            named = {f"its state's rate, leaf {i}": x for i, x in enumerate(jax.tree.leaves(rate))}
-            return {"tau": command.tau, "alpha": command.alpha, "V1": command.V1, **named}
+            rates = leaves_by_name("its state's rate", rate)
+            return {"tau": command.tau, "alpha": command.alpha, "V1": command.V1} | rates
 
-        probe(findings, outputs, base.controller, (t, q, dq, f_hat, base.context))
+        check_function(findings, outputs, base.controller, (t, q, dq, f_hat, base.context))
         check_claims(findings, base)
         is_defined_beyond = check_at_the_bounds(findings, base)
         findings.stop_if_any()
@@ -91,13 +91,11 @@ def check_law(
 
 
 def _structure(findings: Findings, scenario: Scenario) -> None:
-    law, context, q, dq = (
-        scenario.controller,
-        scenario.context,
-        scenario.initial.q,
-        scenario.initial.dq,
-    )
-    t, kind = jnp.zeros((), q.dtype), f" ({q.dtype})"
+    law = scenario.controller
+    context = scenario.context
+    q, dq = scenario.initial.q, scenario.initial.dq
+    t = jnp.zeros((), q.dtype)
+    kind = f" ({q.dtype})"
     state = shape_of(findings, "init(q, dq, context)" + kind, law.init, q, dq, context)
     if state is None:
         return
@@ -112,29 +110,26 @@ def _structure(findings: Findings, scenario: Scenario) -> None:
         )
         return
     command, rate = answer
-    for name in ("tau", "alpha", "V1"):
-        ok = has_shape(findings, f"Command.{name}{kind}", getattr(command, name), q.shape)
-        remedy = "Make constants with the dtype of an argument, jnp.zeros_like(q)"
-        if ok:
-            got = getattr(command, name).dtype
-            findings.require(
-                got == q.dtype, f"Command.{name} is {got} for {q.dtype} arguments", remedy
-            )
-    for name in ("guard_active", "saturated"):
-        has_shape(findings, f"Command.{name}{kind}", getattr(command, name), q.shape, jnp.bool_)
+    remedy = "Make constants with the dtype of an argument, jnp.zeros_like(q)"
+    for name, got in (("tau", command.tau), ("alpha", command.alpha), ("V1", command.V1)):
+        if has_shape(findings, f"Command.{name}{kind}", got, q.shape):
+            problem = f"Command.{name} is {got.dtype} for {q.dtype} arguments"
+            findings.require(got.dtype == q.dtype, problem, remedy)
+    for name, got in (
+        ("guard_active", command.guard_active),
+        ("saturated", command.saturated),
+    ):
+        has_shape(findings, f"Command.{name}{kind}", got, q.shape, jnp.bool_)
     same_structure(findings, "the rate that command returns" + kind, rate, state)
 
 
 def _closed_loop(findings: Findings, scenario: Scenario, is_defined_beyond: bool) -> None:
-    """A short run in float32, where a state that changes its type is an error."""
+    """A short run in float32, in which a state that changes its type is an error."""
     try:
         with notices.muted():
             run = simulate(scenario, duration=SHORT_RUN, dt=1e-3, record_every=10, metrics=())
     except (TypeError, ValueError) as error:
-        findings.add(
-            f"it does not run in a closed loop ({type(error).__name__}:"
-            f" {str(error).splitlines()[0]})"
-        )
+        findings.add(f"it does not run in a closed loop ({first_line(error)})")
         return
     left = int(run.status) & int(VIOLATED | Status.ALPHA_INFEASIBLE)
     if left and not is_defined_beyond:
@@ -143,12 +138,11 @@ def _closed_loop(findings: Findings, scenario: Scenario, is_defined_beyond: bool
             "Try it in a scenario of its own",
         )
         return
-    lost = int(run.status) & int(Status.NOT_FINITE) and not int(run.status) & int(
-        Status.STEP_TOO_LARGE
-    )
+    status = Status(int(run.status))
+    diverged = Status.NOT_FINITE in status and Status.STEP_TOO_LARGE not in status
     findings.require(
-        not lost,
-        f"the arm ran away within {SHORT_RUN} s of the closed loop",
+        not diverged,
+        f"the closed loop diverged within {SHORT_RUN} s",
         "Look at the signs of the feedback",
     )
     finite = all(np.all(np.isfinite(x)) for x in (run.q, run.dq, run.tau, run.V))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -12,7 +13,14 @@ import numpy as np
 from iblf_jax.engine import folded
 from iblf_jax.simulation.metrics import Fold
 from iblf_jax.simulation.signals import Sample
-from iblf_jax.testing._contract import Findings, examine, in_dtype, probe, same_structure, shape_of
+from iblf_jax.testing._contract import (
+    Findings,
+    check_function,
+    examine,
+    in_dtype,
+    same_structure,
+    shape_of,
+)
 from iblf_jax.testing.joints import check_number, fitted_to, number_of_joints
 
 LENGTH, REGIONS = 40, 1
@@ -23,20 +31,20 @@ def check_fold(fold: Any, *, n: int | None = None) -> None:
 
     Args:
       fold: an instance.
-      n: number of joints; found from its leaves if not given, 2 if these are scalars.
+      n: number of joints; that of its leaves if not given, 2 if these are scalars.
 
     Raises:
       ContractError: lists what does not hold, with the remedy.
-      ValueError: no number of joints, or one that its leaves do not have.
+      ValueError: `n` is not a number of joints, or not that of the leaves.
     """
     check_number(n)
     with examine(fold, "Fold", Fold) as findings:
         units = fold.units
-        ok = hasattr(units, "items") and all(
-            isinstance(x, str) for pair in units.items() for x in pair
-        )
         findings.require(
-            ok, f"units is {units!r}", 'It must be a dict from name to SI unit, {"rmse": "rad"}'
+            isinstance(units, Mapping)
+            and all(isinstance(x, str) for x in (*units, *units.values())),
+            f"units is {units!r}",
+            'It must be a dict from name to SI unit, {"rmse": "rad"}',
         )
         n = number_of_joints(findings, fold, n)
         fold = fitted_to(in_dtype(fold, "float64"), n, "metric")
@@ -44,38 +52,35 @@ def check_fold(fold: Any, *, n: int | None = None) -> None:
             _structure(findings, *in_dtype((fold, samples(np.random.default_rng(4), n)), dtype))
         findings.stop_if_any()
 
-        def outputs(fold, moving, flags):
-            return folded((fold,), samples_from(moving, flags))
-
         some = samples(np.random.default_rng(4), n)
-        moving, flags = parts(some)
+        numbers, flags = parts(some)
         result = jax.jit(folded)((fold,), some)
         for name, value in result.items():
             findings.require(not np.any(np.isnan(value)), f"{name} is NaN on an ordinary run")
-        finite = {
+        finite = [
             name
             for name, value in result.items()
             if np.all(np.isfinite(value)) and jnp.issubdtype(value.dtype, jnp.floating)
-        }
-        probe(
-            findings,
-            lambda fold, moving: {
-                k: v for k, v in outputs(fold, moving, flags).items() if k in finite
-            },
-            fold,
-            (moving,),
-        )
+        ]
+
+        def outputs(fold, numbers):
+            found = folded((fold,), samples_from(numbers, flags))
+            return {name: found[name] for name in finite}
+
+        check_function(findings, outputs, fold, (numbers,))
         at_rest(findings, fold, some)
 
 
 def samples(rng: np.random.Generator, n: int = 2, step: float = 0.01) -> Sample:
-    """A made-up run of n joints, (LENGTH, ...), at steps of so many seconds, all its numbers apart
-    from each other.
+    """A synthetic run of n joints, (LENGTH, ...), with a time step [s], in which all numbers
+    differ.
     """
-    t = np.arange(LENGTH) * step
-    dt = np.where((np.arange(LENGTH) > 0) & (np.arange(LENGTH) < LENGTH - 1), step, 0.5 * step)
-    since = np.where(np.arange(LENGTH) > 0, step, 0.0)
-    angle = 0.08 * np.arange(LENGTH)[:, None]
+    index = np.arange(LENGTH)
+    t = index * step
+    dt = np.full(LENGTH, step)
+    dt[[0, -1]] = 0.5 * step
+    since = np.where(index > 0, step, 0.0)
+    angle = 0.08 * index[:, None]
 
     def wave(size):
         phase, speed = rng.uniform(0, 6, (2, 1, n))
@@ -118,13 +123,18 @@ def samples(rng: np.random.Generator, n: int = 2, step: float = 0.01) -> Sample:
 
 
 def parts(samples: Sample) -> tuple[dict[str, jax.Array], dict[str, jax.Array]]:
-    """The floating-point parts of a run, and its flags."""
-    moving = {k: v for k, v in vars(samples).items() if jnp.issubdtype(v.dtype, jnp.floating)}
-    return moving, {k: v for k, v in vars(samples).items() if k not in moving}
+    """The floating-point signals of a run, and its flags."""
+    numbers, flags = {}, {}
+    for name, value in vars(samples).items():
+        if jnp.issubdtype(value.dtype, jnp.floating):
+            numbers[name] = value
+        else:
+            flags[name] = value
+    return numbers, flags
 
 
 def samples_from(numbers: dict[str, jax.Array], flags: dict[str, jax.Array]) -> Sample:
-    """A Sample from its floating-point parts and its flags."""
+    """A Sample from its floating-point signals and its flags."""
     return Sample(**numbers, **flags)
 
 
@@ -153,34 +163,22 @@ def _structure(findings: Findings, fold: Any, samples: Sample) -> None:
 
 
 def at_rest(findings: Findings, fold: Any, samples: Sample) -> None:
-    """On a run without any error or torque, nothing is NaN, and nor is any derivative."""
-    still, kept = (
-        jax.tree.map(jnp.zeros_like, samples),
-        (
-            "t",
-            "dt",
-            "step",
-            "lower",
-            "upper",
-            "q_d",
-        ),
-    )
-    rest = dataclasses.replace(
-        still, q=samples.q_d, **{name: getattr(samples, name) for name in kept}
-    )
-    moving, flags = parts(rest)
+    """Requires that no result and no derivative is NaN on a run without errors and torques."""
+    kept = {name: vars(samples)[name] for name in ("t", "dt", "step", "lower", "upper", "q_d")}
+    zeros = jax.tree.map(jnp.zeros_like, samples)
+    numbers, flags = parts(dataclasses.replace(zeros, q=samples.q_d, **kept))
 
     @jax.jit
-    def both(fold, moving):
-        def floats(fold, moving):
-            result = folded((fold,), samples_from(moving, flags))
+    def both(fold, numbers):
+        def floats(fold, numbers):
+            result = folded((fold,), samples_from(numbers, flags))
             return {k: v for k, v in result.items() if jnp.issubdtype(v.dtype, jnp.floating)}
 
-        values, pull = jax.vjp(floats, fold, moving)
+        values, pull = jax.vjp(floats, fold, numbers)
         finite = {k: jnp.where(jnp.isfinite(v), jnp.ones_like(v), 0.0) for k, v in values.items()}
         return values, pull(finite)
 
-    values, gradient = both(fold, moving)
+    values, gradient = both(fold, numbers)
     for name, value in values.items():
         findings.require(
             not np.any(np.isnan(value)),

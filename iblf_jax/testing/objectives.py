@@ -17,10 +17,11 @@ from iblf_jax.engine.simulate import simulate
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.testing._contract import (
     Findings,
+    check_function,
     examine,
+    first_line,
     has_shape,
     in_dtype,
-    probe,
     same_structure,
     shape_of,
 )
@@ -30,31 +31,30 @@ from iblf_jax.tuning.objectives import Objective, Requirement, complete, for_sce
 from iblf_jax.tuning.quantities import MetricResult, Peak, Quantities, Quantity, TimeIntegral
 
 DIRECTIONS = 3
-"""Directions in which second derivatives are looked at."""
+"""Number of directions in which second derivatives are tested."""
 
 
 def check_objective(
     objective: Any, *, scenario: Scenario | None = None, duration: float = 2.0, n: int | None = None
 ) -> None:
-    """Checks what gains are to be tuned for: accumulators, derivatives, float32, no NaN, and a
-    short run that gives it its scales.
+    """Checks an objective of tuning: accumulators, derivatives, float32, no NaN, and its scales on
+    a short run.
 
-        g = d(smooth value) / d(samples) by both modes and by finite differences,   N = N^T,   value
-        at the start finite and not 0
+        g = d(smooth value) / d(samples) by both modes and by finite differences,   N = N^T,
+        the value at the start is finite and not 0
 
     Args:
-      objective: an objective as you composed it, a requirement, or a quantity of your own that they
-        are made of.
-      scenario: what it is tried on; if not given the paper's simulation, or one like it for as many
-        joints as its leaves have.
+      objective: an objective, a requirement, or a quantity of which these are composed.
+      scenario: the scenario of the run; if not given the paper's simulation, or a similar one for
+        the number of joints of the leaves.
       duration: of the run [s], as `tune` will have it.
-      n: number of joints, if no scenario is given; found from its leaves if not given, 2 if these
+      n: number of joints, if no scenario is given; that of its leaves if not given, 2 if these
         are scalars.
 
     Raises:
       ContractError: lists what does not hold, with the remedy.
-      ValueError: what it is tried on is no scenario, has another number of joints than `n`, or is
-        not for a time.
+      ValueError: not a Scenario, one with another number of joints than `n`, or a duration that is
+        not positive.
     """
     check_scenario(scenario, n)
     duration = checks.positive_number("duration", duration, "s")
@@ -97,30 +97,26 @@ def _with_joints(objective: Objective, scenario: Scenario) -> Objective:
 def _quantity(findings: Findings, quantity: Any, duration: float, n: int) -> None:
     step = duration / LENGTH
     some = samples(np.random.default_rng(4), n, step)
-    # Between whole steps, so that no sample stands where a quantity begins to count.
+    # Half a step later, so that no sample is at the time from which a quantity counts.
     some = dataclasses.replace(some, t=some.t + 0.5 * step)
     for dtype in ("float64", "float32"):
         _structure(findings, *in_dtype((quantity, jax.tree.map(lambda x: x[0], some)), dtype))
     findings.stop_if_any()
-    moving, flags = parts(some)
-    flags |= {
-        name: moving.pop(name) for name in ("t", "dt")
-    }  # the grid of the samples; nothing is differentiated by it
+    numbers, flags = parts(some)
+    # Nothing is differentiated with respect to the grid of the samples.
+    flags |= {name: numbers.pop(name) for name in ("t", "dt")}
     fold = Quantities((quantity,))
 
-    def outputs(fold, moving):
-        return {
-            "the smooth value": folded(
-                (fold,), samples_from(moving, in_dtype(flags, moving["q"].dtype))
-            )["tuning_smooth"]
-        }
+    def outputs(fold, numbers):
+        run = samples_from(numbers, in_dtype(flags, numbers["q"].dtype))
+        return {"the smooth value": folded((fold,), run)["tuning_smooth"]}
 
     exact = jax.jit(folded)((fold,), some)["tuning_exact"]
     findings.require(
         np.all(np.isfinite(exact)),
         f"the exact value is not finite on an ordinary run: {np.asarray(exact)}",
     )
-    probe(findings, outputs, fold, (moving,))
+    check_function(findings, outputs, fold, (numbers,))
     at_rest(findings, fold, some)
     largest = np.max(jax.jit(folded)((fold,), some)["tuning_pieces"])
     findings.require(
@@ -128,7 +124,7 @@ def _quantity(findings: Findings, quantity: Any, duration: float, n: int) -> Non
         f"the largest of its pieces, {largest}, is not its exact value, {np.asarray(exact)}",
     )
     if hasattr(quantity, "hessian"):
-        _second_order(findings, quantity, moving, flags)
+        _second_order(findings, quantity, numbers, flags)
 
 
 def _structure(findings: Findings, quantity: Any, first: Any) -> None:
@@ -169,60 +165,31 @@ def _structure(findings: Findings, quantity: Any, first: Any) -> None:
         f"curvature(acc, sample) gives {type(outer).__name__}",
         "It must be an iblf_jax.engine.derivatives.Outer",
     ):
-        size = getattr(outer.vector, "shape", ())
+        size = jnp.shape(outer.vector)
         findings.require(len(size) == 1, f"Outer.vector has shape {size}", "It must be (m,)")
-        weight = (
-            jnp.shape(outer.weight) if not hasattr(outer.weight, "shape") else outer.weight.shape
-        )
+        weight = jnp.shape(outer.weight)
         findings.require(
             weight in ((), size), f"Outer.weight has shape {weight}", f"It must be () or {size}"
         )
 
 
 def _second_order(
-    findings: Findings, quantity: Any, moving: dict[str, jax.Array], flags: dict[str, jax.Array]
+    findings: Findings, quantity: Any, numbers: dict[str, jax.Array], flags: dict[str, jax.Array]
 ) -> None:
-    """The Gauss-Newton matrix along some directions of the samples is square, symmetric and
-    finite.
+    """Requires a square, symmetric and finite Gauss-Newton matrix along some directions of the
+    samples.
     """
     rng = np.random.default_rng(6)
-    ways = [
-        jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)), moving)
+    samples = [
+        jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)), numbers)
         for _ in range(DIRECTIONS)
     ]
-    directions = jax.tree.map(lambda *x: jnp.stack(x), *ways)
-
-    @jax.jit
-    def matrix(quantity, moving, directions):
-        def run(moving):
-            def one(acc, sample):
-                none = Outer(jnp.zeros_like(sample.e1), jnp.zeros_like(sample.e1))
-                outer = quantity.curvature(acc, sample) if hasattr(quantity, "curvature") else none
-                return quantity.update(acc, sample), (
-                    outer.vector,
-                    jnp.broadcast_to(outer.weight, outer.vector.shape),
-                )
-
-            run = samples_from(moving, flags)
-            acc, kept = jax.lax.scan(one, quantity.init(jax.tree.map(lambda x: x[0], run)), run)
-            pieces = quantity.finish(acc)[2]
-            return (pieces, kept[0]), (kept[1], pieces)
-
-        def along(direction):
-            _, pushed, rest = jax.jvp(run, (moving,), (direction,), has_aux=True)
-            return pushed, rest
-
-        (slopes, vectors), (weights, pieces) = jax.vmap(along, out_axes=(0, None))(directions)
-        products = jnp.einsum("utm,vtm,tm->uv", vectors, vectors, weights)
-        return quantity.hessian(products, pieces, slopes)
-
+    directions = jax.tree.map(lambda *x: jnp.stack(x), *samples)
+    matrix = jax.jit(lambda quantity, *args: _gauss_newton(quantity, flags, *args))
     try:
-        found = np.asarray(matrix(quantity, moving, directions))
+        found = np.asarray(matrix(quantity, numbers, directions))
     except Exception as error:
-        findings.add(
-            f"hessian(products, pieces, slopes) raised {type(error).__name__}:"
-            f" {str(error).splitlines()[0]}"
-        )
+        findings.add(f"hessian(products, pieces, slopes) raised {first_line(error)}")
         return
     if not findings.require(
         found.shape == (DIRECTIONS, DIRECTIONS),
@@ -242,10 +209,41 @@ def _second_order(
     )
 
 
+def _gauss_newton(
+    quantity: Any,
+    flags: dict[str, jax.Array],
+    numbers: dict[str, jax.Array],
+    directions: dict[str, jax.Array],
+) -> jax.Array:
+    """The Gauss-Newton matrix of a quantity along directions of the samples, (D, D)."""
+
+    def accumulate(acc, sample):
+        outer = Outer(jnp.zeros_like(sample.e1), jnp.zeros_like(sample.e1))
+        if hasattr(quantity, "curvature"):
+            outer = quantity.curvature(acc, sample)
+        weight = jnp.broadcast_to(outer.weight, outer.vector.shape)
+        return quantity.update(acc, sample), (outer.vector, weight)
+
+    def run(numbers):
+        samples = samples_from(numbers, flags)
+        start = quantity.init(jax.tree.map(lambda x: x[0], samples))
+        acc, (vectors, weights) = jax.lax.scan(accumulate, start, samples)
+        pieces = quantity.finish(acc)[2]
+        return (pieces, vectors), (weights, pieces)
+
+    def along(direction):
+        _, pushed, rest = jax.jvp(run, (numbers,), (direction,), has_aux=True)
+        return pushed, rest
+
+    (slopes, vectors), (weights, pieces) = jax.vmap(along, out_axes=(0, None))(directions)
+    products = jnp.einsum("utm,vtm,tm->uv", vectors, vectors, weights)
+    return quantity.hessian(products, pieces, slopes)
+
+
 def _on_a_run(
     findings: Findings, objective: Objective, scenario: Scenario, duration: float
 ) -> None:
-    """A run gives finite numbers, and every term its scale."""
+    """Requires that a run gives finite numbers and the scale of every term."""
     try:
         with notices.muted():
             metrics = simulate(
@@ -256,9 +254,7 @@ def _on_a_run(
                 metrics=(Quantities(objective.quantities),),
             ).metrics
     except (TypeError, ValueError) as error:
-        findings.add(
-            f"it cannot be had from a run ({type(error).__name__}: {str(error).splitlines()[0]})"
-        )
+        findings.add(f"it cannot be computed from a run ({first_line(error)})")
         return
     for name, value in (("smooth", metrics["tuning_smooth"]), ("exact", metrics["tuning_exact"])):
         findings.require(

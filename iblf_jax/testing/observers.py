@@ -12,10 +12,12 @@ from iblf_jax.control.observers import Observer
 from iblf_jax.core import checks
 from iblf_jax.testing._contract import (
     Findings,
+    call_has_shape,
+    check_function,
     examine,
-    has_shape,
+    first_line,
     in_dtype,
-    probe,
+    leaves_by_name,
     same_structure,
     shape_of,
 )
@@ -30,7 +32,7 @@ def check_observer(observer: Any, *, model: Any = None, n: int | None = None) ->
     Args:
       observer: an instance.
       model: the robot that it knows; an arm of n joints if not given.
-      n: number of joints, if no model is given; found from its leaves if not given, 2 if these are
+      n: number of joints, if no model is given; that of its leaves if not given, 2 if these are
         scalars.
 
     Raises:
@@ -58,10 +60,10 @@ def check_observer(observer: Any, *, model: Any = None, n: int | None = None) ->
         def outputs(observer, t, q, dq, tau, model):
             state = observer.init(q, 0.5 * dq, model)
             rate = observer.derivative(t, q, dq, tau, model, state)
-            named = {f"derivative, leaf {i}": x for i, x in enumerate(jax.tree.leaves(rate))}
-            return {"estimate": observer.estimate(t, q, dq, model, state), **named}
+            estimate = observer.estimate(t, q, dq, model, state)
+            return {"estimate": estimate} | leaves_by_name("derivative", rate)
 
-        probe(findings, outputs, fitted, (t, q, dq, tau, model))
+        check_function(findings, outputs, fitted, (t, q, dq, tau, model))
         for dtype in ("float64", "float32"):
             _scan(findings, *in_dtype((fitted, t, q, dq, tau, model), dtype))
 
@@ -72,20 +74,14 @@ def _structure(findings: Findings, observer, t, q, dq, tau, model) -> None:
     if state is None:
         return
     label = "estimate(t, q, dq, model, state)" + kind
-    has_shape(
-        findings, label, shape_of(findings, label, observer.estimate, t, q, dq, model, state), (n,)
-    )
+    call_has_shape(findings, label, observer.estimate, (t, q, dq, model, state), (n,))
     label = "derivative(t, q, dq, tau, model, state)" + kind
-    same_structure(
-        findings,
-        label,
-        shape_of(findings, label, observer.derivative, t, q, dq, tau, model, state),
-        state,
-    )
+    rate = shape_of(findings, label, observer.derivative, t, q, dq, tau, model, state)
+    same_structure(findings, label, rate, state)
 
 
 def _scan(findings: Findings, observer, t, q, dq, tau, model) -> None:
-    """Euler steps at a standstill: the state keeps its structure and stays finite."""
+    """Requires that the state keeps its structure and stays finite at a standstill."""
 
     def step(state, _):
         rate = observer.derivative(t, q, dq, tau, model, state)
@@ -97,7 +93,7 @@ def _scan(findings: Findings, observer, t, q, dq, tau, model) -> None:
             lambda: jax.lax.scan(step, observer.init(q, dq, model), length=100)
         )()
     except TypeError as error:
-        findings.add(f"its state does not keep its type in a scan ({str(error).splitlines()[0]})")
+        findings.add(f"its state does not keep its type in a scan ({first_line(error)})")
         return
     finite = all(np.all(np.isfinite(x)) for x in jax.tree.leaves((state, estimates)))
     findings.require(

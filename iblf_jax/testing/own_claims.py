@@ -10,7 +10,7 @@ import numpy as np
 
 from iblf_jax.certificates.claims import OWN_CLAIM_METHODS
 from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.testing._contract import Findings, in_dtype, probe, shape_of
+from iblf_jax.testing._contract import Findings, check_function, in_dtype, shape_of
 
 STATES = 16
 """States at which V and W have to be nonnegative."""
@@ -43,7 +43,7 @@ def check_claims(findings: Findings, scenario: Scenario) -> None:
             name: getattr(law, name)(t, q, dq, f_tilde, context, own) for name in OWN_CLAIM_METHODS
         }
 
-    probe(findings, outputs, law, (t, q[0], dq[0], f_tilde, context))
+    check_function(findings, outputs, law, (t, q[0], dq[0], f_tilde, context))
 
     @jax.jit
     def sums(q, dq):

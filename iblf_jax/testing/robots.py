@@ -9,7 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.testing._contract import Findings, examine, has_shape, in_dtype, probe, shape_of
+from iblf_jax.testing._contract import (
+    Findings,
+    check_function,
+    examine,
+    has_shape,
+    in_dtype,
+    shape_of,
+)
 from iblf_jax.world.robots import Robot, coriolis_from_mass_matrix, mass_matrix_rate
 
 TOLERANCE = 1e-9
@@ -70,7 +77,7 @@ def check_robot(robot: Any, *, q: Any = None) -> None:
             }
 
         v, u = jnp.asarray(rng.normal(size=(2, n)))
-        probe(findings, outputs, robot, (points[0], v, u))
+        check_function(findings, outputs, robot, (points[0], v, u))
         numbers = jax.jit(jax.vmap(_identities, in_axes=(None, 0, None, None)))(robot, points, v, u)
         _physics(findings, {name: np.asarray(value) for name, value in numbers.items()})
 

@@ -258,7 +258,7 @@ def drawn(
     return jax.vmap(lambda point, i: _drawn(cases, targets, point, i, nominal))(points, index)
 
 
-# ------------------------------------------------------------- one start, from its B runs' numbers
+# ----------------------------------------------------------- one start, from its B runs' numbers
 
 
 def _terms(risk: Risk, objective: Objective, quantities: jax.Array) -> jax.Array:
@@ -378,7 +378,7 @@ def _over_levels(
     return excess, jnp.zeros((len(smooth), *slopes.shape), smooth.dtype).at[0].set(slopes)
 
 
-# ---------------------------------------------------------------------------------- compiled calls
+# -------------------------------------------------------------------------------- compiled calls
 
 
 def value(problem: TuningProblem, candidates: Candidate) -> Value:

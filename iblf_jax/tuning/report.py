@@ -30,7 +30,7 @@ from iblf_jax.core.status import Status
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.draws import Cases, targets_of
-from iblf_jax.studies.recommended import tell_of_step
+from iblf_jax.studies.recommended import warn_of_step
 from iblf_jax.studies.statistics import Probability, probability
 from iblf_jax.studies.study import VIOLATED
 from iblf_jax.tuning.evaluation import drawn, rollouts
@@ -335,7 +335,7 @@ class _FreshRuns:
             parts.append(jax.tree.map(np.asarray, (found, made)))
         found, made = jax.tree.map(lambda *x: np.concatenate(x)[: len(owner)], *parts)
         if len(scenarios) > 1:  # once in a report
-            tell_of_step(found.status, found.fastest_mode, found.relative_error, dt, case.method)
+            warn_of_step(found.status, found.fastest_mode, found.relative_error, dt, case.method)
         samples = _Sample(found.exact, found.peak_torque, found.status, made)
         return [_Sample(*(x[owner == s] for x in samples)) for s in range(len(scenarios))]
 
@@ -386,7 +386,7 @@ def make_report(
     )
 
 
-# ----------------------------------------------------------------------------------------- changes
+# --------------------------------------------------------------------------------------- changes
 
 
 def _changes(
@@ -454,7 +454,7 @@ def _change(name: str, before: np.ndarray, after: np.ndarray, confidence: float)
     )
 
 
-# ---------------------------------------------------------------------------------------- verdicts
+# -------------------------------------------------------------------------------------- verdicts
 
 
 def _verdicts(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import signal
+import sys
 import time
 import tomllib
 
@@ -15,6 +16,7 @@ import study_cases as cases
 
 import iblf_jax as ij
 from iblf_jax import cli
+from iblf_jax.cli import _studies
 from iblf_jax.files import study as study_file
 from iblf_jax.files.tuning import load_tuning_file
 from iblf_jax.studies import distributions, store
@@ -141,6 +143,7 @@ def test_ctrl_c_while_a_study_compiles(command, tmp_path):
     code = """
 import os, signal, sys, threading, jax
 from iblf_jax import cli
+from iblf_jax.cli import _studies
 from iblf_jax.studies import monte_carlo
 
 def compile_for_long(*_, **__):
@@ -306,6 +309,21 @@ def test_bad_commands_end_with_2_and_one_line(command, words):
     code, _, err = command(*words)
     assert code == 2
     assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize("installed", [True, False])
+def test_a_scheduler_that_cannot_be_reached_ends_with_2_and_one_line(
+    command, monkeypatch, installed
+):
+    if installed:
+        pytest.importorskip("distributed")
+        monkeypatch.setattr(_studies, "DASK_TIMEOUT", 0.5)
+    else:
+        monkeypatch.setitem(sys.modules, "distributed", None)
+    code, _, err = command("sweep", "sweep.toml", "--dask", "tcp://127.0.0.1:1")
+    assert code == 2
+    assert ("127.0.0.1:1" in err) if installed else ("pip install distributed" in err)
+    assert err.count("iblf-jax: error") == 1
 
 
 def test_ij_names_are_there():

@@ -149,7 +149,7 @@ def test_a_start_at_the_wall_stays_finite_in_float32(law):
         assert bool(jnp.all(sample.tau < 0))
 
 
-# ------------------------------------------------------------------------------------------------------------- adaptive RBF
+# ---------------------------------------------------------------------------------- adaptive RBF
 
 
 @pytest.mark.slow
@@ -226,7 +226,7 @@ def test_centres_fill_the_box(nodes, dimensions):
         np.testing.assert_allclose(points.mean(axis=0), 0.0, atol=1e-12)
 
 
-# -------------------------------------------------------------------------------------------------------------- saturation
+# ------------------------------------------------------------------------------------ saturation
 
 
 def test_under_the_preset_limit_bounds_tracking_and_estimate_still_hold(saturated_runs):
@@ -338,7 +338,7 @@ class _Fixed:
         return controllers.Command(self.tau, jnp.zeros_like(q), jnp.zeros_like(q), never, never), ()
 
 
-# ------------------------------------------------------------------------------------------------------- paths and wrappers
+# ---------------------------------------------------------------------------- paths and wrappers
 
 
 def test_paths_reach_through_a_wrapper():
@@ -398,7 +398,7 @@ def test_saturation_says_what_is_wrong():
         controllers.Saturated(law=3.0, limit=1.0)
 
 
-# ------------------------------------------------------------------------------------------------- extended-state observer
+# ----------------------------------------------------------------------- extended-state observer
 
 
 @pytest.mark.slow
@@ -456,7 +456,7 @@ def test_extended_state_observer_finds_a_constant_torque_and_its_gains_have_two_
             observers.ExtendedState(**wrong)
 
 
-# --------------------------------------------------------------------------------------------- laws for other constraints, on the backends
+# --------------------------------------------------- laws for other constraints, on the backends
 
 
 def _constrained(name):
@@ -535,7 +535,7 @@ def test_their_gains_can_be_tuned(name, path):
     assert result.history["objective"][-1, 0] <= result.history["objective"][0, 0]
 
 
-# ---------------------------------------------------------------------------------------------------- the weight of the barrier
+# --------------------------------------------------------------------- the weight of the barrier
 
 WEIGHTED = {
     "backstepping": controllers.Backstepping(k1=2.0, K2=20.0),

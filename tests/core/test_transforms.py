@@ -331,6 +331,7 @@ def test_where_kernels_cannot_the_scan_differentiates(paper, monkeypatch):
 
     for place, name, value in (
         (plan, "COLUMNS_KEPT", 10),
+        (plan, "COLUMNS_MOST", 1),
         (registry, "automatic", lambda: ("xla", "there is no C++ compiler")),
         (transformable, "_columns", no_kernel),
     ):

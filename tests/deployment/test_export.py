@@ -19,8 +19,8 @@ import pytest
 
 import iblf_jax as ij
 from iblf_jax.deployment.c_names import number
-from iblf_jax.deployment.control_law import Told, control_law, sample, start
-from iblf_jax.deployment.write_c import CHECKED, Law, Vectors, written
+from iblf_jax.deployment.control_law import SampleInputs, control_law, sample, start
+from iblf_jax.deployment.write_c import CHECKED, Law, Vectors, generate
 from iblf_jax.simulation.scenario import canonical
 
 fmpy, wasmtime = pytest.importorskip("fmpy"), pytest.importorskip("wasmtime")
@@ -35,8 +35,8 @@ SAMPLES = 40
 def built_and_run(folder, *flags, name="iblf_law", compiler=("gcc",)):
     """What the self-test of a folder prints, built with these flags."""
     command = [*compiler, *STRICT, *flags, f"{name}.c", "selftest.c", "-lm", "-o", "selftest"]
-    made = subprocess.run(command, cwd=folder, capture_output=True, text=True)
-    assert made.returncode == 0, made.stderr
+    generated = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    assert generated.returncode == 0, generated.stderr
     ran = subprocess.run(["./selftest"], cwd=folder, capture_output=True, text=True)
     assert ran.returncode == 0, ran.stdout + ran.stderr
     return ran.stdout
@@ -49,7 +49,7 @@ def walk(scenario, dtype, seed=0):
     tube = jax.vmap(scenario.context.tube)(t)
     share = 0.5 + 0.6 * np.cumsum(rng.normal(size=(SAMPLES, scenario.n)), axis=0) / np.sqrt(SAMPLES)
     q = tube.lower + share.astype(dtype) * (tube.upper - tube.lower)
-    return Told(t, q, jnp.asarray(0.3 * rng.normal(size=q.shape), dtype)), tube
+    return SampleInputs(t, q, jnp.asarray(0.3 * rng.normal(size=q.shape), dtype)), tube
 
 
 @pytest.fixture(scope="module")
@@ -67,41 +67,41 @@ CASES = [(law, "momentum") for law in members.LAWS] + [
 ]
 
 
-def against_jax(folder, scenario, *, told_reference=False, dtype="float64"):
+def against_jax(folder, scenario, *, external_reference=False, dtype="float64"):
     """Writes a law with its answers to a random walk as vectors, and runs its self-test under the
     sanitizers."""
     scenario = canonical(ij.astype(scenario, dtype))
-    asked, tube = walk(scenario, dtype)
-    if told_reference:
-        asked = Told(*asked[:3], tube.q_d, tube.dq_d, tube.ddq_d)
-    first = jax.tree.map(lambda x: x[0], asked)
+    inputs, tube = walk(scenario, dtype)
+    if external_reference:
+        inputs = SampleInputs(*inputs[:3], tube.q_d, tube.dq_d, tube.ddq_d)
+    first = jax.tree.map(lambda x: x[0], inputs)
 
-    def answers(scenario, first, asked):
-        def one(memory, told):
-            memory, said = sample(scenario, told, memory)
-            return memory, said.tau
+    def answers(scenario, first, inputs):
+        def one(memory, inputs):
+            memory, outputs = sample(scenario, inputs, memory)
+            return memory, outputs.tau
 
-        return jax.lax.scan(one, start(scenario, first)[0], asked)[1]
+        return jax.lax.scan(one, start(scenario, first)[0], inputs)[1]
 
-    tau = np.asarray(jax.jit(answers)(scenario, first, asked))[::CHECKED]
-    rows = [np.asarray(x) for x in asked[1:] if not isinstance(x, tuple)]
+    tau = np.asarray(jax.jit(answers)(scenario, first, inputs))[::CHECKED]
+    rows = [np.asarray(x) for x in inputs[1:] if not isinstance(x, tuple)]
     vectors = Vectors(tuple(x[0] for x in rows), rows[0], rows[1], tuple(rows[2:]), tau)
     joints = getattr(scenario.model, "joints", ())
     law = Law(
         scenario,
-        control_law(scenario, told_reference),
+        control_law(scenario, external_reference),
         "iblf_law",
-        told_reference,
+        external_reference,
         vectors,
         joints,
         None,
     )
-    made = written(law)
+    generated = generate(law)
     folder.mkdir(exist_ok=True)
-    for name, text in made.files.items():
+    for name, text in generated.files.items():
         (folder / name).write_text(text)
     built_and_run(folder, *SANE)
-    return made
+    return generated
 
 
 @pytest.mark.parametrize(("law", "observer"), CASES)
@@ -113,13 +113,15 @@ def test_every_law_and_observer_gives_in_c_what_it_gives_in_jax(base, tmp_path, 
 
 
 @pytest.mark.parametrize("velocity", members.VELOCITIES)
-@pytest.mark.parametrize("told_reference", [False, True])
-def test_velocities_follow_by_the_filter_of_the_scenario(base, tmp_path, velocity, told_reference):
+@pytest.mark.parametrize("external_reference", [False, True])
+def test_velocities_follow_by_the_filter_of_the_scenario(
+    base, tmp_path, velocity, external_reference
+):
     sensor = ij.sensors.Encoder(counts=4096, velocity=members.VELOCITIES[velocity])
     lab = ij.with_parts(base, sensor=sensor, observer=members.OBSERVERS["momentum"])
-    against_jax(tmp_path, lab, told_reference=told_reference)
+    against_jax(tmp_path, lab, external_reference=external_reference)
     asks = "const iblf_law_real *q_d" in (tmp_path / "iblf_law.h").read_text()
-    assert asks == told_reference
+    assert asks == external_reference
     assert ("NULL, " in (tmp_path / "selftest.c").read_text()) == (velocity != "measured")
 
 
@@ -149,8 +151,8 @@ def test_names_from_files_stay_in_comments(tmp_path):
         observer=ij.observers.Momentum(kf=20.0),
         sampling=ij.Sampling(1e-3),
     )
-    made = against_jax(tmp_path, scenario)
-    assert made.stack_bytes < 65_536
+    generated = against_jax(tmp_path, scenario)
+    assert generated.stack_bytes < 65_536
     text = (tmp_path / "iblf_law.h").read_text()
     assert text.isascii() and "int main" in text and "??" not in text
 
@@ -239,9 +241,12 @@ def test_a_users_law_goes_out_without_a_name_in_files(base, tmp_path):
                 (),
             )
 
-    made = against_jax(tmp_path, ij.with_parts(base, controller=Proportional([30.0, 20.0])))
-    assert "scenario.toml" not in made.files and "scenario.toml" not in made.files["README.md"]
-    assert "controller.gain" in [field.path for field in made.parameters.fields]
+    generated = against_jax(tmp_path, ij.with_parts(base, controller=Proportional([30.0, 20.0])))
+    assert (
+        "scenario.toml" not in generated.files
+        and "scenario.toml" not in generated.files["README.md"]
+    )
+    assert "controller.gain" in [field.path for field in generated.parameters.fields]
 
 
 def test_memories_may_hold_whole_numbers_and_flags(base, tmp_path):
@@ -290,10 +295,10 @@ int main(void) {
 
 def test_a_folder_is_complete_and_its_parameters_are_those_of_the_paths(tmp_path):
     scenario = ij.presets.zhang_yan_2024()
-    made = ij.export(scenario, tmp_path / "first", period=2e-3, name="arm_law")
-    shutil.move(made.folder, tmp_path / "moved")
+    generated = ij.export(scenario, tmp_path / "first", period=2e-3, name="arm_law")
+    shutil.move(generated.folder, tmp_path / "moved")
     folder = tmp_path / "moved"
-    assert sorted(x.name for x in folder.iterdir()) == sorted(made.files)
+    assert sorted(x.name for x in folder.iterdir()) == sorted(generated.files)
     assert "ok: torque within" in built_and_run(folder, "-O2", name="arm_law")
     assert "ok: torque within" in built_and_run(
         folder, "-O2", name="arm_law", compiler=(sys.executable, "-m", "ziglang", "cc")
@@ -315,7 +320,7 @@ def test_a_folder_is_complete_and_its_parameters_are_those_of_the_paths(tmp_path
     }
     assert (
         frames["arm_law_step"] + frames["arm_law_sample"]
-        < made.sizes["stack, without optimisation"]
+        < generated.sizes["stack, without optimisation"]
         < 2 * sum(frames.values())
     )
 
@@ -337,11 +342,11 @@ def test_a_folder_is_complete_and_its_parameters_are_those_of_the_paths(tmp_path
     lab = ij.with_parameters(
         lab, {"controller.K2[0]": 33.0, "model.mass[1]": 1.5, "bounds.upper.offset[0]": 0.6}
     )
-    told = Told(jnp.zeros(()), jnp.asarray([0.75, 0.7]), jnp.asarray([0.1, -0.2]))
-    memory = start(lab, told)[0]
+    inputs = SampleInputs(jnp.zeros(()), jnp.asarray([0.75, 0.7]), jnp.asarray([0.1, -0.2]))
+    memory = start(lab, inputs)[0]
     for k in range(3):
-        memory, said = sample(lab, told._replace(t=jnp.asarray(0.002 * k)), memory)
-    np.testing.assert_allclose(tau, said.tau, rtol=1e-12)
+        memory, outputs = sample(lab, inputs._replace(t=jnp.asarray(0.002 * k)), memory)
+    np.testing.assert_allclose(tau, outputs.tau, rtol=1e-12)
 
 
 def test_a_law_that_does_not_hold_is_told(tmp_path):
@@ -419,15 +424,15 @@ def test_a_law_as_an_fmu_gives_the_torque_of_simulate(lab, tmp_path):
     file = str(tmp_path / "iblf_law.fmu")
     assert validate_fmu(file) == []
     run = ij.simulate(lab, duration=0.5, dt=2e-3)
-    told = np.zeros(run.t.size, [("time", float), ("q", float, (2,)), ("dq", float, (2,))])
-    told["time"], told["q"], told["dq"] = run.t, run.measured.q, run.measured.dq
+    inputs = np.zeros(run.t.size, [("time", float), ("q", float, (2,)), ("dq", float, (2,))])
+    inputs["time"], inputs["q"], inputs["dq"] = run.t, run.measured.q, run.measured.dq
     found = fmpy.simulate_fmu(
         file,
         stop_time=0.5,
         step_size=2e-3,
         output_interval=2e-3,
         output=["tau", "f_hat"],
-        input=told,
+        input=inputs,
     )
     np.testing.assert_allclose(found["tau"][1:], run.tau[:-1], atol=1e-9)
 
@@ -530,7 +535,7 @@ def test_the_command_line_exports(tmp_path, capsys):
     assert "target" in capsys.readouterr().err
 
 
-# ------------------------------------------------------------------------------------------------------------------ no numbers
+# ----------------------------------------------------------------- no numbers
 
 
 @pytest.mark.parametrize(

@@ -312,7 +312,7 @@ def test_a_slope_beside_an_infinite_one_is_no_fast_mode(paper):
     assert run.ok
 
 
-# ------------------------------------------------------------------------------------------ what jumps within a step
+# ---------------------------------------------------------------------- what jumps within a step
 
 SLOW = ij.with_parameters(ij.presets.zhang_yan_2024(), {"controller.K2": 4.0, "observer.kf": 4.0})
 LATE = 0.2137

@@ -34,7 +34,7 @@ FILE = Path(__file__).parents[1] / "data" / "costs.json"
 
 JAX = ".".join(jax.__version__.split(".")[:2])
 
-# --- a step ----------------------------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------ a step
 
 
 def planar_chain(n: int) -> ij.Scenario:
@@ -86,12 +86,13 @@ def test_operations_of_a_step(name):
         for often, counter in changes.items()
     }
     assert found == expected, (
-        f"{name}: {moved} more than in {FILE.name}; if that is meant, `python tests/engine/test_costs.py`"
+        f"{name}: {moved} more than in {FILE.name}; if that is intended, run `python"
+        " tests/engine/test_costs.py`"
         " writes it anew"
     )
 
 
-# --- a first call ----------------------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------ a first call
 
 CALLS = {
     "simulate": lambda paper: ij.simulate(paper, duration=0.1, dt=1e-3),

@@ -247,7 +247,8 @@ from jax._src import monitoring
 def mean(joints):
     q = jnp.full(joints, 0.5)
     return jnp.mean(ij.bounds.Constant(jnp.cos(q) ** 2 + jnp.sin(q) ** 2).at(jnp.zeros(()), q))
-(own,) = [x for x in monitoring.get_event_duration_listeners() if isinstance(x, programs.ProgramBound)]
+listeners = monitoring.get_event_duration_listeners()
+(own,) = [x for x in listeners if isinstance(x, programs.ProgramBound)]
 print(own.limit, own.bound)
 mean(2)
 before = programs.count_maps()

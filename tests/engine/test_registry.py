@@ -18,8 +18,7 @@ from iblf_jax.engine import (
     registry,
     single_run,
 )
-from iblf_jax.kernels.program import UnsupportedError
-from iblf_jax.kernels.toolchain import ToolchainError
+from iblf_jax.kernels import ToolchainError, UnsupportedError
 from iblf_jax.simulation.scenario import canonical
 
 SHORT = {"duration": 0.02, "dt": 1e-3, "method": "euler", "metrics": (ij.metrics.Margin(),)}

@@ -199,7 +199,7 @@ def _with_start_times(scenario: ij.Scenario, value: Any) -> ij.Scenario:
     return dataclasses.replace(scenario, initial=initial)
 
 
-# ------------------------------------------------------------------------------------------------------------- bad files
+# --- bad files
 
 
 def changed(tables: dict[str, Any], key: str, value: Any) -> dict[str, Any]:
@@ -256,7 +256,7 @@ WRONG = [
     ("robot.mass", [1.0, 2.0, 3.0], r"robot\.mass: .*shape \(2,\)"),
     ("robot.mass", ..., r"robot\.mass: got nothing, .*\[kg\].*Add mass to \[robot\]"),
     ("robot", ..., r"robot: got nothing, expected a table \[robot\], or \[plant\] and \[model\]"),
-    ("plant", {"kind": "two_link"}, r"plant: got this table beside \[robot\]"),
+    ("plant", {"kind": "two_link"}, r"plant: got this table besides \[robot\]"),
     ("initial.q", 10**400, r"initial\.q: .*fits into a float"),
     ("initial.q", [], r"initial\.q: .*shape is \(0,\)"),
     ("disturbance", {"kind": "sum", "parts": 3}, r"disturbance\.parts: got 3, expected a list"),
@@ -282,7 +282,7 @@ WRONG = [
     ("dtype", "float65", "dtype: got 'float65'"),
     ("parameters.controller.K9", 3.0, r"parameters: .*controller\.K9.*Did you mean controller\.K2"),
     ("parameters.controller.K2", "x", r"parameters\.controller\.K2: got 'x'"),
-    ("preset", "zhang_yan_2024", r"robot: got this table beside preset"),
+    ("preset", "zhang_yan_2024", r"robot: got this table besides preset"),
 ]
 
 

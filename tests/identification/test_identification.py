@@ -27,11 +27,15 @@ from iblf_jax.files.identification import load_identification_file
 from iblf_jax.identification import statistics
 from iblf_jax.identification.coordinates import coordinates, to_x, to_z, with_widths
 from iblf_jax.identification.log import read
-from iblf_jax.identification.problem import missing_terms
-from iblf_jax.identification.replay import slopes
-from iblf_jax.identification.shooting import Replay, Torque, windows
-from iblf_jax.identification.smoothing import smoothed
-from iblf_jax.identification.standstill import _joints, by_the_law, free_about_standstill
+from iblf_jax.identification.problem import missing_terms_of_fit
+from iblf_jax.identification.replay import inverse_dynamics
+from iblf_jax.identification.shooting import ShootingProblem, Torque, windows
+from iblf_jax.identification.smoothing import smooth_logs
+from iblf_jax.identification.standstill import (
+    free_torques_at_standstill,
+    friction_pairs,
+    no_free_torques,
+)
 from iblf_jax.simulation.scenario import canonical
 
 MASS, VISCOUS, COULOMB, WIDTH = (
@@ -270,7 +274,7 @@ def test_irregular_times_and_a_gap(scenario, run, rng):
     interpolated."""
     rows = np.sort(rng.choice(6000, 3500, replace=False))
     log = counted(run, rows[(rows < 2000) | (rows > 2300)])
-    assert [len(one.stretches) for one in read(log, 2)] == [2]
+    assert [len(one.segments) for one in read(log, 2)] == [2]
     known = ij.identify(scenario, log, ["robot.mass"], torque="interpolated", held_out=0)
     assert np.max(np.abs(z_scores(known, {"robot.mass": MASS}))) < 4.0
     assert np.max(np.abs(known.values["robot.mass"] / MASS - 1.0)) < 1e-3
@@ -298,9 +302,9 @@ def test_the_torque_of_a_step_is_its_mean(log):
     """Held, it is the logged number whatever the times are; late by half a step, that of two
     samples."""
     jittered = log["t"] + np.random.default_rng(1).uniform(-1e-3, 1e-3, len(log["t"]))
-    torque = Torque(read({**log, "t": jittered}, 2)[0], held=True)
+    torque = Torque(read({**log, "t": jittered}, 2)[0], hold=True)
     np.testing.assert_allclose(torque.means(jittered, 0.0), log["tau"][:-1], rtol=1e-9, atol=1e-9)
-    late = Torque(read(log, 2)[0], held=True).means(log["t"], 2e-3)
+    late = Torque(read(log, 2)[0], hold=True).means(log["t"], 2e-3)
     np.testing.assert_allclose(
         late[1:], 0.5 * (log["tau"][:-2] + log["tau"][1:-1]), rtol=1e-9, atol=1e-9
     )
@@ -326,9 +330,9 @@ def test_outliers_are_borne_by_huber(scenario, log):
 
 def test_priors_and_limits(scenario, log):
     """What was known before is believed for what it is worth; what is at a limit is said to be."""
-    held = ij.identify(scenario, log, PATHS, widths=False, priors={"robot.mass": (MASS, 1e-7)})
-    np.testing.assert_allclose(held.values["robot.mass"], MASS, atol=5e-7)
-    assert np.max(held.standard_errors["robot.mass"]) < 5e-7
+    fixed = ij.identify(scenario, log, PATHS, widths=False, priors={"robot.mass": (MASS, 1e-7)})
+    np.testing.assert_allclose(fixed.values["robot.mass"], MASS, atol=5e-7)
+    assert np.max(fixed.standard_errors["robot.mass"]) < 5e-7
     for limits, name, at in (
         ({"disturbance.coulomb": (0.0, [0.199, 0.15])}, "disturbance.coulomb[0]", 0.199),
         (
@@ -352,7 +356,7 @@ def test_priors_and_limits(scenario, log):
         ij.identify(scenario, log, PATHS, limits={"robot.mass": (3.0, 4.0)})
 
 
-# ------------------------------------------------------------------------------------------- terms that were left out of the fit
+# ---------------------------------------------- terms that were left out of the fit
 
 
 def with_friction(scenario, viscous, coulomb):
@@ -365,8 +369,8 @@ def lacking(scenario, log, paths):
     """The terms that a fit lacks which ended at the scenario's numbers."""
     with jax.enable_x64(True):
         replayed, c = coordinates(canonical(astype(canonical(scenario), "float64")), paths, {})
-        seen = smoothed(read(log, 2), True)
-        return missing_terms(
+        seen = smooth_logs(read(log, 2), True)
+        return missing_terms_of_fit(
             replayed, c, seen, np.append(to_z(c, c.x), 0.0), np.ones(len(c.x) + 1, bool)
         )
 
@@ -448,7 +452,7 @@ def test_gravity_and_inertia_that_were_left_out_are_named(scenario, other_logs):
     }
 
 
-# ------------------------------------------------------------------------------------------------------- logs that are wrong
+# ----------------------------------------------------------------- logs that are wrong
 
 WRONG = {
     "degrees": (lambda x: {**x, "q": np.degrees(x["q"])}, "It would fit in degrees"),
@@ -579,7 +583,7 @@ def test_files(tmp_path, log):
         read(tmp_path / "none.csv", 2)
 
 
-# ------------------------------------------------------------------------------------------------------------ report, parts
+# ----------------------------------------------------------------- report, parts
 
 
 def test_the_report_is_words_json_and_a_page(known, tmp_path):
@@ -635,7 +639,7 @@ def test_standard_errors_are_those_of_repeated_noise(rng):
         g = -np.einsum("wka,wk->wa", Y, noise)
         x = np.linalg.lstsq(A.sum(axis=0), -g.sum(axis=0), rcond=1e-9)[0]
         rest = noise - Y @ x
-        return x, statistics.known(
+        return x, statistics.uncertainty(
             A / np.mean(rest**2),
             -np.einsum("wka,wk->wa", Y, rest) / np.mean(rest**2),
             np.zeros((p, p)),
@@ -649,17 +653,17 @@ def test_standard_errors_are_those_of_repeated_noise(rng):
         assert 0.8 < np.median([k.errors[0] for _, k in found]) / spread < 1.35, (W, colour)
     known = found[0][1]
     assert np.isinf(known.errors[1:]).all() and np.isfinite(known.errors[0])
-    wider = statistics.known(
+    wider = statistics.uncertainty(
         A,
         -np.einsum("wka,wk->wa", Y, rng.normal(size=(W, K))),
         np.zeros((p, p)),
         np.ones(p),
         lacking=3.0,
     )
-    usual = statistics.known(A, np.zeros((W, p)), np.zeros((p, p)), np.ones(p))
+    usual = statistics.uncertainty(A, np.zeros((W, p)), np.zeros((p, p)), np.ones(p))
     assert wider.errors[0] >= 3.0 * usual.errors[0] * (1 - 1e-9)
     np.testing.assert_allclose(3.0 * wider.singular[:2], usual.singular[:2])
-    words = statistics.in_words(known.directions[:, -1], ("a", "b", "c"))
+    words = statistics.describe_direction(known.directions[:, -1], ("a", "b", "c"))
     assert words == "0.89 b - 0.45 c"
 
 
@@ -789,25 +793,26 @@ def test_the_tangents_of_a_replay_are_those_of_finite_differences(left_free, sce
         if left_free
         else ["plant.mass[1]", "disturbance.viscous[0]"]
     )
-    replayed_, c = coordinates(scenario, paths, {})
+    plant, c = coordinates(scenario, paths, {})
     (one,) = read({name: x[:200] for name, x in log.items()}, 2)
-    cut = windows([one], 0.25, [0.0], held=True)
+    cut = windows([one], 0.25, [0.0], hold=True)
     free = (
-        free_about_standstill(replayed_, c, cut, [one], np.ones(2), 0.1)
+        free_torques_at_standstill(plant, c, cut, [one], np.ones(2), 0.1)
         if left_free
-        else by_the_law(cut.y.shape, len(c.x))
+        else no_free_torques(cut.y.shape, len(c.x))
     )
-    replay = Replay(replayed_, c, cut, [one], True, "squares", 1, free)
+    replay = ShootingProblem(plant, c, cut, [one], True, "squares", 1, free)
     z, m = np.append(c.x, 5e-4), free.torque.shape[-1]
     assert (m > 3) == left_free
     starts = np.concatenate([cut.q, cut.dq, np.full((len(cut.q), m), 0.05)], axis=1)
-    stretches, q, dq = replay.moved(z, starts)
-    J, along = replay._slopes(z, stretches, q, dq)
+    segments, q, dq = replay.simulate(z, starts)
+    J, along = replay._sensitivities(z, segments, q, dq)
     s = starts.shape[1]
     for i in [*range(4), *range(s - min(m, 3), J.shape[-1])]:
         step = 1e-4 * (np.arange(J.shape[-1]) == i)
         after, before = (
-            replay.moved(z + sign * step[s:], starts + sign * step[:s])[1] for sign in (1.0, -1.0)
+            replay.simulate(z + sign * step[s:], starts + sign * step[:s])[1]
+            for sign in (1.0, -1.0)
         )
         share = (
             2e-3 if i < J.shape[-1] - 1 else 0.05
@@ -815,16 +820,16 @@ def test_the_tangents_of_a_replay_are_those_of_finite_differences(left_free, sce
         np.testing.assert_allclose(
             J[..., i], (after - before) / 2e-4, atol=share * np.max(np.abs(J[..., i]))
         )
-    np.testing.assert_allclose(along.torque, np.asarray(stretches.tau).reshape(-1, 2), atol=1e-9)
+    np.testing.assert_allclose(along.torque, np.asarray(segments.tau).reshape(-1, 2), atol=1e-9)
 
 
 def test_friction_is_free_where_a_joint_turns_round_and_nowhere_else(scenario, log):
     """Coulomb friction has the direction of the motion, and 0 with torques in its place about
     standstill; of one joint, if it is asked."""
-    replayed_, c = coordinates(scenario, ["disturbance.coulomb[1]", "disturbance.width[1]"], {})
+    plant, c = coordinates(scenario, ["disturbance.coulomb[1]", "disturbance.width[1]"], {})
     (one,) = read(log, 2)
-    cut = windows([one], 0.5, [0.0], held=True)
-    free = free_about_standstill(replayed_, c, cut, [one], np.array([3.0, 2.0]), 0.1)
+    cut = windows([one], 0.5, [0.0], hold=True)
+    free = free_torques_at_standstill(plant, c, cut, [one], np.array([3.0, 2.0]), 0.1)
     at = np.rint(cut.t[:, 2:-2] / 4e-3).astype(int)
     speed = (log["q"][at + 2, 1] - log["q"][at - 2, 1]) / 16e-3
     fast, slow = np.abs(speed) > 0.25, np.abs(speed) < 0.05
@@ -837,7 +842,7 @@ def test_friction_is_free_where_a_joint_turns_round_and_nowhere_else(scenario, l
     assert (
         not free.by_x[:, :, 0].any()
         and not free.torque[:, :, 0].any()
-        and free.held.tolist() == [False, True]
+        and free.fixed.tolist() == [False, True]
     )
 
 
@@ -851,7 +856,7 @@ def test_one_joint_of_seven_that_is_mounted_the_other_way_is_named():
     with jax.enable_x64(True):
         arm = canonical(astype(canonical(scenario), "float64"))
         tau = np.asarray(
-            slopes(arm, *map(jnp.asarray, (np.zeros(0), t, q, dq, ddq)), places=()).torque
+            inverse_dynamics(arm, *map(jnp.asarray, (np.zeros(0), t, q, dq, ddq)), places=()).torque
         )
     log = {"t": t, "q": q * np.where(np.arange(7) == 6, -1.0, 1.0), "tau": tau}
     with pytest.raises(ValueError, match=r"with q\[6\] of the other sign, they would explain 100%"):
@@ -884,4 +889,4 @@ def test_the_width_of_each_friction_is_looked_for_beside_it(asked, looked_for, p
     rubbing = ij.disturbances.Friction(viscous=0.05, coulomb=0.05)
     believed = canonical(ij.with_parts(ij.presets.zhang_yan_2024(), disturbance=rubbing))
     assert with_widths(believed, asked) == looked_for
-    assert list(_joints(*coordinates(believed, looked_for, {}))) == pairs
+    assert list(friction_pairs(*coordinates(believed, looked_for, {}))) == pairs

@@ -162,7 +162,7 @@ def test_machine_code_of_gpus_is_checked_too(cache, monkeypatch):
     assert nvrtc.compiled("source", "sm_90") == b"machine code"
 
 
-# ------------------------------------------------------------------------------------------------------------------------- links
+# --------------------------------------------- links
 
 
 @needs_compiler
@@ -481,7 +481,7 @@ def test_who_told_jax_is_obeyed(tmp_path):
     assert fresh(tmp_path, JAX_ENABLE_COMPILATION_CACHE="0")[:2] == ["None", "None"]
 
 
-# ------------------------------------------------------------------------------------------------------------- an unusable cache
+# --------------------------------------------- an unusable cache
 
 
 def a_file_in_its_place(base, monkeypatch):
@@ -577,7 +577,7 @@ def falls_back(work):
     return line
 
 
-# --------------------------------------------------------------------------------------------------------------------- compilers
+# --------------------------------------------- compilers
 
 
 def fake(folder, monkeypatch, script):
@@ -773,7 +773,7 @@ def drafts_in(folder):
     return list(folder.glob(".*.partial"))
 
 
-# ------------------------------------------------------------------------------------------------------------------------ drafts
+# --------------------------------------------- drafts
 
 
 HOLD = """
@@ -814,7 +814,7 @@ def test_drafts_of_other_machines_go_by_age(tmp_path, monkeypatch):
         assert (young.exists(), old.exists()) == (True, False)
 
 
-# ----------------------------------------------------------------------------------------------------------------------- threads
+# --------------------------------------------- threads
 
 
 @pytest.mark.parametrize(

@@ -331,7 +331,7 @@ def test_no_row_has_a_panel_alone_and_no_labels_meet():
     ]
     with _style.styled():
         figure = _style.new_figure(10.0, 8.0)
-        rows = _style.spread(figure, 13, 4)
+        rows = _style.panel_rows(figure, 13, 4)
     for axes in itertools.chain(*rows):
         axes.set_xlabel(
             "plant.link[the_very_long_name_of_a_link_of_somebody].friction_width [rad/s]"

@@ -22,8 +22,8 @@ LAYER_OF = {
 """Module or folder at the root of the package -> its layer."""
 
 UPWARD: dict[str, set[str]] = {}
-"""File -> the higher modules that it imports inside a function: none. Results reach figures, reports
-and files through `core/presentation.py`."""
+"""File -> the higher modules that it imports inside a function: none. Results reach figures,
+reports and files through `core/presentation.py`."""
 
 ONLY_IN = {
     "matplotlib": ("plotting",),
@@ -171,13 +171,15 @@ def test_time_is_scanned_in_one_place():
 
 def test_the_session_is_left_alone():
     """jax.config belongs to the user: the command line, a program of its own, sets it, and the
-    cache of compiled programs its fields; which device is the default is read."""
+    cache of compiled programs its fields; `initialize_worker` sets it where a user calls it in a
+    worker's process; which device is the default is read."""
     users = {
         p.relative_to(PACKAGE): text for p, text in SOURCES.items() if calls(text, "jax.config")
     }
     assert {p for p in users if p.parts[0] != "cli"} == {
         Path("core/cache.py"),
         Path("core/devices.py"),
+        Path("studies/workers.py"),
     }
     assert not calls(users[Path("core/devices.py")], "jax.config.update")
 

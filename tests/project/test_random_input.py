@@ -12,6 +12,8 @@ import math
 import os
 import re
 import shutil
+import sys
+import types
 import warnings
 from pathlib import Path
 from unittest import mock
@@ -455,7 +457,6 @@ def no_runs(monkeypatch):
     for place in (
         "engine.simulate.run_one",
         "studies.blocks._execute",
-        "studies.setup._execute",
         "tuning.evaluation.rollouts",
         "tuning.search.Evaluator.__call__",
         "tuning._falsify._margins",
@@ -464,7 +465,7 @@ def no_runs(monkeypatch):
     ):
         monkeypatch.setattr(f"iblf_jax.{place}", entered)
     monkeypatch.setattr(
-        "iblf_jax.studies.blocks.compile_batch", lambda request, *_: CompiledBatch(request, "xla")
+        "iblf_jax.studies.setup.compile_batch", lambda request, *_: CompiledBatch(request, "xla")
     )
 
 
@@ -993,6 +994,7 @@ def test_any_word_in_the_place_of_any_other_on_the_command_line(
     `parameters` print."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("jax.distributed.initialize", entered)
+    monkeypatch.setitem(sys.modules, "distributed", types.SimpleNamespace(Client=entered))
     monkeypatch.setattr("iblf_jax.cli.prepare_jax", lambda: None)
     for name in ("study", "sweep", "tune"):
         shutil.copy(ROOT / "examples" / f"{name}.toml", tmp_path)

@@ -150,7 +150,7 @@ def test_the_page_of_a_tuning_begins_with_its_report(results):
     first, second, *rest = reports.shown(results["TuneResult"]).words
     assert first.startswith("Report on one nominal run")
     assert second.strip() == "bounds violated: 0 -> 0"
-    assert rest[-1].startswith("How it was found: ")
+    assert rest[-1].startswith("Search: ")
     assert "TuneResult(" not in rest[-1]
 
 

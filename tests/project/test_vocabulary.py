@@ -17,9 +17,39 @@ from conftest import ROOT
 
 PACKAGE = ROOT / "iblf_jax"
 NAMES = frozenset(
-    "said told asked alone foretold believed around way way_in mended mend judged unseen stranger"
-    " there kicked wanted whole sound plain still moving held lane lanes setting settings said_by"
-    " asked_for prices bends".split()
+    [
+        "said",
+        "told",
+        "asked",
+        "alone",
+        "foretold",
+        "believed",
+        "around",
+        "way",
+        "way_in",
+        "mended",
+        "mend",
+        "judged",
+        "unseen",
+        "stranger",
+        "there",
+        "kicked",
+        "wanted",
+        "whole",
+        "sound",
+        "plain",
+        "still",
+        "moving",
+        "held",
+        "lane",
+        "lanes",
+        "setting",
+        "settings",
+        "said_by",
+        "asked_for",
+        "prices",
+        "bends",
+    ]
 )
 PROSE = re.compile(
     r"\b(told|tells|foretold|mends?|mended|way in|strangers?|kicked|believed|unseen|asked for"
@@ -123,5 +153,5 @@ def test_notebooks_use_standard_terms():
 def test_these_tests_can_fail():
     source = '"""What is told."""\n\ndef judged(lanes):\n    held = 1  # past the wall\n'
     assert private_names(source) == {"judged", "lanes", "held"}
-    assert private_words(prose_in(source)) == ["told", "the wall"]
+    assert private_words(prose_in(source)) == ["told", "past the wall"]
     assert private_names("def requested(runs):\n    sampled = 1\n") == set()

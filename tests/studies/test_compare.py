@@ -232,7 +232,7 @@ def test_the_factor_is_the_one_nearest_one(effort, target, expected):
     np.testing.assert_allclose(factor_nearest_one(effort, target), expected, rtol=1e-6)
 
 
-# ------------------------------------------------------------------------------------------------- figure and command line
+# ----------------------------------------------------------------------- figure and command line
 
 
 def test_the_figure_shows_every_law_in_the_same_colour_on_both_sides(comparison):
@@ -297,7 +297,7 @@ def test_command_line_refuses_an_unknown_law(capsys):
     assert "one of 'integral'" in capsys.readouterr().err
 
 
-# ------------------------------------------------------------------------------- efforts that do not grow with the factor
+# ------------------------------------------------------ efforts that do not grow with the factor
 
 
 @ij.component

@@ -38,13 +38,15 @@ def results(study):
     )
 
 
-# ------------------------------------------------------------------------------------------------------------ bit-identity
+# ---------------------------------------------------------------------------------- bit-identity
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("chunk", [1, 256, 300, 10**6])
 def test_chunk_changes_nothing(study, chunk):
-    assert cases.same(results(study), results(cases.study(chunk=chunk)))
+    assert cases.same(
+        results(study), results(cases.study(executor=ij.studies.ThisProcess(chunk=chunk)))
+    )
 
 
 @pytest.mark.parametrize(("chunk", "together"), [(256, 1), (512, 2), (None, plan.STUDY_IN_FLIGHT)])
@@ -69,7 +71,9 @@ def test_as_many_blocks_are_made_beside_each_other_as_are_in_flight(
             now.pop()
 
     monkeypatch.setattr(blocks, "_execute", counted)
-    again = cases.study(runs=256 * (1 + plan.STUDY_IN_FLIGHT), chunk=chunk)
+    again = cases.study(
+        runs=256 * (1 + plan.STUDY_IN_FLIGHT), executor=ij.studies.ThisProcess(chunk=chunk)
+    )
     assert max(most) == together
     assert cases.same(results(study), {name: x[:600] for name, x in results(again).items()})
 
@@ -118,7 +122,7 @@ def test_a_repeated_study_lowers_nothing(study, monkeypatch):
     cases.study(ways=cases.perturbations(0.2, 0.01), seed=8)
 
 
-# ------------------------------------------------------------------------------------------------------------- the draws
+# ------------------------------------------------------------------------------------- the draws
 
 
 def test_draws_follow_the_documented_law(study):
@@ -232,7 +236,7 @@ def test_designs_fill_the_range_evenly(sampler):
     assert len(np.unique(study.samples["plant.mass[1]"])) == 256
 
 
-# ---------------------------------------------------------------------------------------------------------- one run again
+# --------------------------------------------------------------------------------- one run again
 
 
 def test_all_of_a_study_are_leaves(study):
@@ -268,7 +272,7 @@ def test_an_index_selects_a_run(study):
         study.replay(600)
 
 
-# ------------------------------------------------------------------------------------------------- failed runs, statistics
+# ----------------------------------------------------------------------- failed runs, statistics
 
 
 def test_a_failing_run_touches_no_other(study):
@@ -381,7 +385,7 @@ def test_study_says_what_happened(study):
     assert f"failed: {len(study.failed)}" in text
 
 
-# ------------------------------------------------------------------------------------------------------------ sensitivity
+# ----------------------------------------------------------------------------------- sensitivity
 
 
 def test_sobol_indices_of_what_is_known():
@@ -422,7 +426,7 @@ def test_sobol_indices_of_one_number_from_few_points():
         )
 
 
-# --------------------------------------------------------------------------------------------------------------- refusals
+# -------------------------------------------------------------------------------------- refusals
 
 
 @pytest.mark.parametrize(
@@ -513,7 +517,8 @@ def seen(event, duration, **details):
 
 jax.monitoring.register_event_duration_secs_listener(seen)
 def study():
-    ij.monte_carlo(ij.presets.zhang_yan_2024(), study_cases.perturbations(), runs=20_000, duration=20.0, dt=1e-3, backend="xla")
+    options = {"runs": 20_000, "duration": 20.0, "dt": 1e-3, "backend": "xla"}
+    ij.monte_carlo(ij.presets.zhang_yan_2024(), study_cases.perturbations(), **options)
 if sys.argv[1] == "caught":
     try:
         study()

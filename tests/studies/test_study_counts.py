@@ -15,6 +15,7 @@ import iblf_jax as ij
 from iblf_jax import Status
 from iblf_jax.core import progress
 from iblf_jax.core.status import FAILED
+from iblf_jax.kernels import messages
 from iblf_jax.studies import monte_carlo, sensitivity
 
 
@@ -98,10 +99,10 @@ def test_a_progress_bar_ends_where_it_should(monkeypatch, runs):
     ("watched", "seconds", "line"),
     [(True, 0.3, "iblf_jax: g++ compiles\n"), (True, 0.0, ""), (False, 0.3, "")],
 )
-def test_what_takes_long_is_told_to_who_watches(monkeypatch, capsys, watched, seconds, line):
-    monkeypatch.setattr(progress, "SLOW", 0.1)
-    monkeypatch.setattr(progress, "_has_reader", lambda: watched)
-    with progress.told("g++ compiles"):
+def test_a_slow_operation_is_announced_in_a_terminal(monkeypatch, capsys, watched, seconds, line):
+    monkeypatch.setattr(messages, "SLOW", 0.1)
+    monkeypatch.setattr(messages, "has_reader", lambda: watched)
+    with messages.announce_if_slow("g++ compiles"):
         time.sleep(seconds)
     time.sleep(0.2)
     assert capsys.readouterr().err == line

@@ -23,7 +23,7 @@ import study_cases as cases
 import iblf_jax as ij
 from iblf_jax.engine import native
 from iblf_jax.kernels import toolchain
-from iblf_jax.studies import interrupt, store, sweep
+from iblf_jax.studies import execution, interrupt, store, sweep
 
 SCENARIO = ij.presets.zhang_yan_2024()
 
@@ -51,7 +51,7 @@ def once(**more):
     return ij.sweep(SCENARIO, more.pop("grid", cases.GRID), **cases.options() | more)
 
 
-# --------------------------------------------------------------------------------------------------------------- the result
+# ------------------------------------------------------------------------------------ the result
 
 
 @pytest.mark.slow
@@ -87,7 +87,7 @@ def test_points_are_the_studies_of_their_scenarios(table):
 
 @pytest.mark.parametrize("chunk", [1, 700])
 def test_chunk_changes_nothing(table, chunk):
-    assert cases.table(chunk=chunk).identical(table)
+    assert cases.table(executor=ij.studies.ThisProcess(chunk=chunk)).identical(table)
 
 
 @pytest.mark.slow
@@ -97,7 +97,7 @@ def test_designs_and_vectors():
         "observer.kf": ij.factor(ij.log_uniform(0.5, 2.0), shared=True),
     }
     for design in ("random", "latin_hypercube"):
-        found = once(grid=ways, design=design, points=5)
+        found = once(grid=ways, design=ij.studies.Design(design, points=5))
         assert found.sizes == {"point": 5, "joint": 2}
         assert np.all((found["controller.K2"] > 10) & (found["controller.K2"] < 40))
         np.testing.assert_array_equal(found["observer.kf"][:, 0], found["observer.kf"][:, 1])
@@ -125,9 +125,9 @@ def test_vectors_in_a_grid_and_a_point_that_cannot_work():
         ({"controller.K2": ["a"]}, {}, "numbers"),
         ({"controller.K2": ij.uniform(1.0, 2.0)}, {}, "random"),
         ({"controller.K2": [10.0], "controller.K2[0]": [10.0]}, {}, "overlap"),
-        ({"controller.K2": [10.0]}, {"design": "random", "points": 3}, "distribution"),
+        ({"controller.K2": [10.0]}, {"design": ij.studies.Design("random", 3)}, "distribution"),
         ({"controller.K2": ij.uniform(1.0, 2.0)}, {"design": "random"}, "points"),
-        ({"controller.K2": [10.0]}, {"points": 3}, "points"),
+        ({"controller.K2": [10.0]}, {"design": ij.studies.Design(points=3)}, "points"),
         ({"controller.K2": [10.0]}, {"runs": 3}, "perturbations"),
         ({}, {}, "vary"),
         ([1.0], {}, "mapping"),
@@ -138,7 +138,7 @@ def test_bad_grids_are_refused(grid, more, message):
         ij.sweep(SCENARIO, grid, duration=0.01, **more)
 
 
-# ------------------------------------------------------------------------------------------------------------------ stores
+# ---------------------------------------------------------------------------------------- stores
 
 
 def test_store_opens_with_xarray_and_load(written, table):
@@ -149,8 +149,8 @@ def test_store_opens_with_xarray_and_load(written, table):
 
 
 def test_a_finished_store_is_not_computed_again(finished, table, monkeypatch):
-    monkeypatch.setattr(sweep, "run_blocks", lambda *_, **__: pytest.fail("computed again"))
-    monkeypatch.setattr(sweep, "_units", lambda *_: iter(()))
+    monkeypatch.setattr(execution, "run_blocks", lambda *_, **__: iter(()))
+    monkeypatch.setattr(sweep.Store, "write", lambda *_: pytest.fail("computed again"))
     assert cases.table(store=finished).identical(table)
 
 
@@ -539,7 +539,7 @@ def test_the_draft_of_a_killed_creation_is_removed_by_the_next(tmp_path, table):
     assert list(tmp_path.iterdir()) == [path]
 
 
-# -------------------------------------------------------------------------------------------------------- killed, interrupted
+# --------------------------------------------------------------------------- killed, interrupted
 
 
 def killed_until_done(path, compiled, table, kills, seed):

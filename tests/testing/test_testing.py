@@ -394,7 +394,7 @@ def test_broken_fold():
     rejects(ij.testing.check_fold, ij.component(Root)(), "NaN on a run without any error")
     rejects(ij.testing.check_fold, changed(Root, units={"other": "1"})(), "units names ['other']")
     grows = changed(Root, update=lambda self, acc, sample: jnp.append(acc, sample.t))
-    rejects(ij.testing.check_fold, grows(), "update(acc, sample)", "carried by a scan")
+    rejects(ij.testing.check_fold, grows(), "update(acc, sample)", "which a scan carries")
 
 
 def test_random_samples_are_apart(rng):
@@ -405,7 +405,7 @@ def test_random_samples_are_apart(rng):
     assert np.unique(e1).size == e1.size
 
 
-# ------------------------------------------------------------------------------------------------------------- any number of joints
+# --- any number of joints
 
 
 @ij.component

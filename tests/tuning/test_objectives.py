@@ -222,7 +222,7 @@ def test_a_quantity_of_ones_own_passes():
         ),
         (
             {"update": lambda self, acc, sample: acc + sample.dq},
-            ("update(acc, sample)", "carried by a scan"),
+            ("update(acc, sample)", "which a scan carries"),
         ),
         (
             {"curvature": lambda self, acc, sample: sample.dq},
@@ -291,7 +291,7 @@ def test_a_term_without_a_scale_that_is_zero_at_the_start(paper):
     )
 
 
-# ------------------------------------------------------------ which joints, weights, limits of each
+# --------------------------------------------------------- which joints, weights, limits of each
 
 
 def exact(objective, run):

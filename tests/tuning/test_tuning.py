@@ -69,7 +69,7 @@ def central(f, z, h=1e-5):
     return np.stack([(f(z + h * e) - f(z - h * e)) / (2 * h) for e in np.eye(len(z))])
 
 
-# -------------------------------------------------------------------------------------- derivatives
+# ----------------------------------------------------------------------------------- derivatives
 
 
 @pytest.mark.slow
@@ -138,7 +138,7 @@ def test_reverse_mode_remembers_few_states(paper):
     assert sizes[4000] - sizes[500] < 2 * (np.sqrt(4000) - np.sqrt(500)) * state
 
 
-# --------------------------------------------------------------------------------------- quantities
+# ------------------------------------------------------------------------------------ quantities
 
 
 @pytest.mark.slow
@@ -212,7 +212,7 @@ def test_risks():
         ij.cvar(1.0)
 
 
-# -------------------------------------------------------------------------------------- coordinates
+# ----------------------------------------------------------------------------------- coordinates
 
 
 def test_bijections_keep_inside_and_invert():
@@ -454,7 +454,7 @@ def test_a_second_search_begins_elsewhere_and_the_better_goes_on():
     assert evaluate.evaluations == len(search.history["z"]) <= 40
 
 
-# ----------------------------------------------------------------------------------------- the loop
+# -------------------------------------------------------------------------------------- the loop
 
 
 @pytest.mark.slow
@@ -782,7 +782,7 @@ def test_a_start_of_which_some_runs_are_too_stiff_says_how_many(nominal, monkeyp
         screened(perturbed, 0, nominal.box.z[None])
 
 
-# ------------------------------------------------------------------------------------------- robust
+# ---------------------------------------------------------------------------------------- robust
 
 
 @pytest.fixture(scope="module")
@@ -1017,7 +1017,7 @@ def test_wrong_options_in_a_tuning_file_are_named(tmp_path, table, words):
         load_tuning_file(file)
 
 
-# ------------------------------------------------------------------------------------------- resume
+# ---------------------------------------------------------------------------------------- resume
 
 KILLED = """
 import sys, jax

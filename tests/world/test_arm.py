@@ -196,7 +196,7 @@ def test_derivatives_by_inertial_parameters_are_finite_differences():
             )
 
 
-# ------------------------------------------------------------------------------------------------------- in the closed loop
+# ---------------------------------------------------------------------------- in the closed loop
 
 
 def scenario_with(plant, **parts) -> ij.Scenario:
@@ -289,7 +289,7 @@ def test_batches_of_arms_agree_with_single_runs():
         np.testing.assert_allclose(study.metrics["rmse"][i], alone.metrics["rmse"], rtol=1e-9)
 
 
-# ------------------------------------------------------------------------------------------------------------ names and checks
+# ------------------------------------------------------------------------------ names and checks
 
 
 def test_rows_have_names():

@@ -72,7 +72,7 @@ def test_unknown_arm():
         arms.arm("ur6")
 
 
-# ------------------------------------------------------------------------------------------------------------------ the presets
+# ----------------------------------------------------------------------------------- the presets
 
 
 @pytest.mark.slow
@@ -146,7 +146,7 @@ def test_files_give_it_back(scenario):
     )
 
 
-# --------------------------------------------------------------------------------------------- what follows from an arm's numbers
+# ------------------------------------------------------------ what follows from an arm's numbers
 
 
 def test_joint_limits_become_bounds():
@@ -210,7 +210,7 @@ def test_a_scenario_from_an_arm_alone():
         arms.arm_scenario(arm, reference, reading="wrong")
 
 
-# ------------------------------------------------------------------------------------------------ joints of small inertia, sampled
+# -------------------------------------------------------------- joints of small inertia, sampled
 
 LAB = {"sampling": ij.Sampling(period=2e-3, delay=1e-3)}
 """500 Hz, and half a period late."""
@@ -341,7 +341,7 @@ def test_joints_that_move_against_each_other_get_no_fast_mode(name):
     assert fastest(without) > 200.0
 
 
-# --------------------------------------------------------------------------------------------------------------- the whole chain
+# ------------------------------------------------------------------------------- the whole chain
 
 UNKNOWN = {
     "plant.link[iiwa_link_4].mass": ij.factor(ij.uniform(0.8, 1.2)),

@@ -81,7 +81,7 @@ def file(tmp_path):
     return write
 
 
-# ---------------------------------------------------------------------------------------------------------------- what is read
+# ---------------------------------------------------------------------------------- what is read
 
 
 def test_names_limits_and_friction(file):
@@ -331,7 +331,7 @@ def test_an_include_outside_the_folder_of_the_file_is_refused(leads, tmp_path):
         ij.robots.load(path, tip="ee")
 
 
-# ----------------------------------------------------------------------------------------------------------------- bad files
+# ------------------------------------------------------------------------------------- bad files
 
 PLAIN = (link("base", ""), link("a"), link("b"))
 CHAIN = (joint("ja", "base", "a"), joint("jb", "a", "b"))
@@ -592,7 +592,7 @@ def test_without_the_extra_the_message_says_how(monkeypatch, file):
         ij.robots.load(ARMS / "ur5.urdf")
 
 
-# ------------------------------------------------------------------------------------------------------------- mutated files
+# --------------------------------------------------------------------------------- mutated files
 
 SOURCES = [
     (ARMS / "ur5.urdf").read_text(),
@@ -694,7 +694,7 @@ def test_nothing_is_written_and_limits_are_stated(file, monkeypatch, tmp_path):
     assert description.LARGEST < 1 << 30
 
 
-# ---------------------------------------------------------------------------------------------------------------------- repair
+# ---------------------------------------------------------------------------------------- repair
 
 
 def weighing(inertia: str, mass: str = "1.5", place: str = "0 0 0.1", also: str = "0 0 0") -> str:

@@ -60,7 +60,7 @@ def kept():
     return ij.simulate(filtered(stepping()), **RUN, backend="xla")
 
 
-# ---------------------------------------------------------------------------------------------------- by hand, from the equations alone
+# ------------------------------------------------------------- by hand, from the equations alone
 
 
 def points(q):
@@ -165,7 +165,7 @@ def test_a_run_is_that_of_an_independent_program():
     np.testing.assert_allclose(run.q, found.y[:2].T, atol=1e-7)
 
 
-# ----------------------------------------------------------------------------------------------------------------- what is watched
+# ------------------------------------------------------------------------------- what is watched
 
 
 def test_margins_are_those_by_hand_and_what_the_status_says(alone):
@@ -282,7 +282,7 @@ def test_a_run_in_space_by_the_kernels():
     assert found.to_xarray().region_margin.dims == ("run", "region")
 
 
-# ----------------------------------------------------------------------------------------------------------------- what is done with them
+# ------------------------------------------------------------------------ what is done with them
 
 
 def test_derivatives_by_the_region_and_the_rates():
@@ -388,8 +388,8 @@ def test_figures(alone, kept):
     tip = next(x for x in drawn.get_lines() if x.get_label() == "filtered").get_xydata()
     np.testing.assert_allclose(tip[-1], points(np.asarray(kept.q[-1]))[1])
     assert {x.get_label() for x in drawn.get_lines()} >= {
-        "wall of the tip",
-        "wall of the origin of joint 1",
+        "bound of the tip",
+        "bound of the origin of joint 1",
         "reference",
     }
     line = next(x for x in figure.axes[0].get_lines() if x.get_label() == "alone")

@@ -1,7 +1,7 @@
 #define STEP ${step}
 #define STEP_TEXT "${step}"
 
-static void told(fmu *f) {
+static void write_outputs(fmu *f) {
   memcpy(f->outputs, f->s.tau, sizeof f->s.tau);
   memcpy(f->outputs + ${joints}, f->s.alpha, sizeof f->s.alpha);
   memcpy(f->outputs + 2 * ${joints}, f->s.f_hat, sizeof f->s.f_hat);
@@ -9,12 +9,12 @@ static void told(fmu *f) {
 
 static int begin(fmu *f) {
   const double *q = f->inputs;
-  if (${name}_init(&f->p, &f->s, q, q + ${joints}${reference}) != 0) return failed(f, "an input is no number");
-  told(f);
+  if (${name}_init(&f->p, &f->s, q, q + ${joints}${reference}) != 0) return failed(f, "an input is not finite");
+  write_outputs(f);
   return OK;
 }
 
-/* A sample: the torque of the period that begins now, from the inputs as they are; the last good one, and a warning, where one is no number. */
+/* One sample: the torque of the period that begins now.  Non-finite input returns the last valid torque and a warning. */
 static int advance(fmu *f) {
   const double *q = f->inputs;
   double tau[${joints}];
@@ -22,6 +22,6 @@ static int advance(fmu *f) {
   f->index += 1;
   f->outputs[3 * ${joints}] = (double)status;
   if ((status & ${upper}_NOT_FINITE) == 0) return OK;
-  if (f->log) f->log(f->environment, WARNING, "logStatusWarning", "an input or a result is no number: the torque is the last good one");
+  if (f->log) f->log(f->environment, WARNING, "logStatusWarning", "an input or a result is not finite: the torque is the last valid one");
   return WARNING;
 }

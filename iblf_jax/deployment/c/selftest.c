@@ -1,5 +1,5 @@
-/* Whether ${name}.c gives here what the package computed: the torque of samples of ${duration} s of a simulated run, and that what is no
-   number is refused.  Prints the largest difference and the time of a call. */
+/* Compares ${name}.c on this machine with the package: the torques of samples of ${duration} s of a simulated run, and the handling of
+   non-finite input.  Prints the largest difference and the time of a call. */
 #include "${name}.h"
 
 #include <math.h>

@@ -1,4 +1,4 @@
-/* What a page calls of the module: the tables are in its memory, runs are made in stretches. */
+/* The functions that a page calls: buffers are in the module's memory, and a run may be divided into several calls. */
 #include "${name}.h"
 
 #include <string.h>
@@ -15,20 +15,20 @@ EXPORT(settings) ${name}_real *module_settings(void) { return settings; }
 EXPORT(records) ${name}_real *module_records(void) { return records; }
 EXPORT(rows) int module_rows(void) { return ROWS; }
 
-/* The parameters as they were written. */
+/* Resets the parameters to those of the scenario. */
 EXPORT(defaults) void module_defaults(void) { parameters = ${name}_defaults; }
 
-/* The state at t = 0, by the parameters as they are now. */
+/* Initialises the state at t = 0 with the present parameters. */
 EXPORT(start) void module_start(void) { ${name}_start(&parameters, settings, &state); }
 
-/* Makes so many steps; writes those whose number since the start is a multiple of `every` into the records, and returns how many. */
+/* Runs so many steps, records those whose index since the start is a multiple of `every`, and returns the number of records. */
 EXPORT(run) int module_run(int steps, int every) {
   int k, row = 0;
-  ${name}_real told[${upper}_TOLD];
+  ${name}_real outputs[${upper}_TOLD];
   for (k = 0; k < steps && row < ROWS; k++) {
     const int is_due = every > 0 && state.index % every == 0;
-    ${name}_step(&parameters, settings, &state, told);
-    if (is_due) memcpy(records + row++ * ${upper}_TOLD, told, sizeof told);
+    ${name}_step(&parameters, settings, &state, outputs);
+    if (is_due) memcpy(records + row++ * ${upper}_TOLD, outputs, sizeof outputs);
   }
   return row;
 }

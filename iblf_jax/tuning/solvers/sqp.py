@@ -285,7 +285,7 @@ def positive_definite(matrix: np.ndarray) -> np.ndarray:
     return (vectors * np.maximum(values, SMALLEST_EIGENVALUE * largest)) @ vectors.T
 
 
-# -------------------------------------------------------------------------------------- the solver
+# ------------------------------------------------------------------------------------ the solver
 
 
 class Point(NamedTuple):
