@@ -47,17 +47,16 @@ def paper_claims(runs: Pair) -> list[PaperClaim]:
     Args:
       runs: two runs by name, of the integral and the logarithmic law, in this order.
     """
-    tests = (
-        bounds_kept,
-        both_track,
-        faster,
-        more_accurate,
-        overshoot_of_e2,
-        estimate_follows,
-        small_neighbourhood,
-        theorem_1,
-    )
-    return [test(runs) for test in tests]
+    return [
+        bounds_kept(runs),
+        both_track(runs),
+        faster(runs),
+        more_accurate(runs),
+        overshoot_of_e2(runs),
+        estimate_follows(runs),
+        small_neighbourhood(runs),
+        theorem_1(runs),
+    ]
 
 
 def each_joint(values: Any, unit: str) -> str:
@@ -76,18 +75,14 @@ def _versus(by_name: Mapping[str, Any], unit: str) -> str:
     return ", ".join(f"{name} {each_joint(values, unit)}" for name, values in by_name.items())
 
 
-def _late(run: Rollout) -> np.ndarray:
-    """Which samples of a run are in its second half, (T,)."""
-    t = np.asarray(run.t)
-    return t >= 0.5 * t[-1]
-
-
 def _peak(values: Any) -> np.ndarray:
     return np.abs(np.asarray(values)).max(axis=0)
 
 
 def _late_peak(run: Rollout, values: Any) -> np.ndarray:
-    return _peak(np.asarray(values)[_late(run)])
+    """Returns the peak over the second half of a run, (n,)."""
+    t = np.asarray(run.t)
+    return _peak(np.asarray(values)[t >= 0.5 * t[-1]])
 
 
 def _are_below(values: ByName, share: float, peaks: ByName) -> bool:
@@ -95,7 +90,7 @@ def _are_below(values: ByName, share: float, peaks: ByName) -> bool:
     return all(bool(np.all(values[name] < share * peaks[name])) for name in values)
 
 
-def _metric(runs: Pair, name: str) -> dict[str, np.ndarray]:
+def _metric(runs: Pair, name: str) -> ByName:
     return {label: np.asarray(run.metrics[name]) for label, run in runs.items()}
 
 
@@ -173,7 +168,7 @@ def overshoot_of_e2(runs: Pair) -> PaperClaim:
     )
 
 
-def _estimate_errors(runs: Pair) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+def _estimate_errors(runs: Pair) -> tuple[ByName, ByName]:
     """Returns the largest late |f - f_hat| and the peak of |f| of each run, each (n,) [N m]."""
     late = {
         name: _late_peak(run, run.disturbance - run.disturbance_estimate)

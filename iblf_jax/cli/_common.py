@@ -154,10 +154,13 @@ def run_options(args: argparse.Namespace, file: ScenarioFile) -> dict[str, Any]:
 
     The command line takes precedence over the file, and the file over the defaults.
     """
-    given = {
-        key: getattr(args, key) for key in RUN_DEFAULTS if getattr(args, key, None) is not None
-    }
-    return RUN_DEFAULTS | file.run | given
+    return RUN_DEFAULTS | file.run | given_options(args, *RUN_DEFAULTS)
+
+
+def given_options(args: argparse.Namespace, *names: str) -> dict[str, Any]:
+    """Returns those of the named options that have a value."""
+    values = vars(args)
+    return {name: values[name] for name in names if values.get(name) is not None}
 
 
 def optional_folder(name: str | None) -> Path | None:
@@ -174,17 +177,14 @@ def output_folder(name: str) -> Path:
       ValueError: the folder cannot be written.
     """
     folder = Path(name)
+    reason = "no permission"
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        if os.access(folder, os.W_OK | os.X_OK):
+            return folder
     except OSError as error:
-        raise ValueError(
-            f"--out: got {name!r}, expected a folder that can be written ({error.strerror})."
-        ) from error
-    if not os.access(folder, os.W_OK | os.X_OK):
-        raise ValueError(
-            f"--out: got {name!r}, expected a folder that can be written (no permission)."
-        )
-    return folder
+        reason = str(error.strerror)
+    raise ValueError(f"--out: got {name!r}, expected a folder that can be written ({reason}).")
 
 
 # ------------------------------------------------------------------------------- numbers as text

@@ -66,17 +66,14 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
 def run(args: argparse.Namespace) -> int:
     """Runs the command."""
     from iblf_jax.cli import complain
-    from iblf_jax.cli._common import run_options
+    from iblf_jax.cli._common import given_options, run_options
     from iblf_jax.deployment.export import export
     from iblf_jax.kernels import ToolchainError
 
     file = scenario_of(args)
     options = run_options(args, file)
-    chosen = {
-        key: getattr(args, key)
-        for key in ("target", "period", "dtype", "reference", "name", "seed")
-    }
-    chosen |= {key: options[key] for key in ("dt", "method")}
+    names = ("target", "period", "dtype", "reference", "name", "seed")
+    chosen = given_options(args, *names) | {key: options[key] for key in ("dt", "method")}
     try:
         print(export(file.scenario, output_folder(args.out), **chosen))
     except ToolchainError as error:

@@ -40,14 +40,11 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Runs the command."""
-    from iblf_jax.cli._common import optional_folder
+    from iblf_jax.cli._common import given_options, optional_folder
     from iblf_jax.files.identification import identify_file
 
     folder = optional_folder(args.out)
-    given = {}
-    if args.log:
-        given["log"] = args.log
-    result = identify_file(args.file, **given)
+    result = identify_file(args.file, **given_options(args, "log"))
     print(result)
     if folder is not None:
         from iblf_jax import plotting

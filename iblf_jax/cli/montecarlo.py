@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from iblf_jax.cli._studies import EPILOG, add_study_arguments, carried_out, write_netcdf
+from iblf_jax.cli._studies import EPILOG, add_study_arguments, run_study, write_netcdf
 from iblf_jax.core.tables import as_text
 
 if TYPE_CHECKING:
@@ -36,22 +36,21 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
 def run(args: argparse.Namespace) -> int:
     """Runs the command."""
 
-    def work(how: dict[str, Any]) -> int:
+    def work(execution: dict[str, Any]) -> int:
+        from iblf_jax.cli._common import given_options
         from iblf_jax.files.study import load_study_file
         from iblf_jax.studies import distributed
         from iblf_jax.studies.monte_carlo import monte_carlo
 
         file = load_study_file(args.file, "study")
-        given = {
-            key: getattr(args, key) for key in ("runs", "seed") if getattr(args, key) is not None
-        }
-        study = monte_carlo(file.scenario, file.perturbations, **file.options | given | how)
+        options = file.options | given_options(args, "runs", "seed") | execution
+        study = monte_carlo(file.scenario, file.perturbations, **options)
         if distributed.rank() == 0:
             print(report(study))
         write_netcdf(study.to_xarray(), args.out)
         return int(len(study.failed) > 0)
 
-    return carried_out(args, work)
+    return run_study(args, work)
 
 
 def report(study: Study) -> str:

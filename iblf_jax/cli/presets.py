@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import inspect
+from collections.abc import Callable
+from typing import Any
 
 from iblf_jax.cli._common import add_preset_arguments, assignments
 
@@ -35,10 +37,7 @@ def run(args: argparse.Namespace) -> int:
                 "--toml and --arg: expected the name of a preset before them; `presets` lists the"
                 " names."
             )
-        rows = [
-            (name, " ".join((inspect.getdoc(preset) or "").partition("\n")[0].split()))
-            for name, preset in PRESETS.items()
-        ]
+        rows = [(name, _summary(preset)) for name, preset in PRESETS.items()]
         print(*tables.as_text(rows), sep="\n")
         return 0
     scenario = preset_scenario(args.name, assignments("--arg", args.arg))
@@ -49,3 +48,9 @@ def run(args: argparse.Namespace) -> int:
         options = " ".join(f"--arg {argument.name}={argument.default}" for argument in arguments)
         print(f"{args.name} {options}\n\n{inspect.getdoc(PRESETS[args.name])}")
     return 0
+
+
+def _summary(preset: Callable[..., Any]) -> str:
+    """Returns the first paragraph of the docstring in one line."""
+    paragraph = (inspect.getdoc(preset) or "").partition("\n\n")[0]
+    return " ".join(paragraph.split())

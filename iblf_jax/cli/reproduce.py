@@ -138,17 +138,14 @@ def _write_data(
 
     save_rollouts(runs, folder / "rollouts.nc")
     # The file calls the verdict of a claim "held", as in earlier versions.
-    claims = [
-        {"held" if key == "confirmed" else key: value for key, value in claim._asdict().items()}
-        for claim in findings["claims"]
-    ]
+    keys = ("claim", "held", "detail", "numbers")
     report: dict[str, Any] = {
         "source": "Zhang & Yan 2024, section 4",
         "run": {"reading": args.reading, "duration": args.duration, "dt": args.dt, "method": "rk4"},
         "versions": {"iblf_jax": iblf_jax.__version__, "jax": jax.__version__},
         "runs": {name: verdict(one) for name, one in runs.items()},
         "assumed": findings["assumed"],
-        "claims": claims,
+        "claims": [dict(zip(keys, claim, strict=True)) for claim in findings["claims"]],
         "remark": findings["remark"],
         "seconds": {"with compilation": seconds["first"], "the two runs alone": seconds["again"]},
     }

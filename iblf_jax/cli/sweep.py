@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from iblf_jax.cli._studies import EPILOG, add_study_arguments, carried_out, write_netcdf
+from iblf_jax.cli._studies import EPILOG, add_study_arguments, run_study, write_netcdf
 from iblf_jax.core.tables import as_text
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
 def run(args: argparse.Namespace) -> int:
     """Runs the command."""
 
-    def work(how: dict[str, Any]) -> int:
+    def work(execution: dict[str, Any]) -> int:
         from iblf_jax.core.status import FAILED
         from iblf_jax.files.study import load_study_file
         from iblf_jax.studies import StoreOptions, distributed
@@ -59,14 +59,14 @@ def run(args: argparse.Namespace) -> int:
             file.grid,
             perturbations=file.perturbations,
             store=store,
-            **options | how,
+            **options | execution,
         )
         if distributed.rank() == 0:
             print(report(data))
         write_netcdf(data, args.out)
         return int((data.status & int(FAILED)).any())
 
-    return carried_out(args, work)
+    return run_study(args, work)
 
 
 def report(data: xarray.Dataset) -> str:

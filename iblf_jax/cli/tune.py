@@ -43,15 +43,14 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Runs the command."""
-    from iblf_jax.cli._common import optional_folder
+    from iblf_jax.cli._common import given_options, optional_folder
     from iblf_jax.files.tuning import tune_file
 
     folder = optional_folder(args.out)
-    options = {"checkpoint": args.checkpoint, "iterations": args.iterations}
+    options = given_options(args, "checkpoint", "iterations")
     if args.quiet:
         options["progress"] = False
-    given = {name: x for name, x in options.items() if x is not None}
-    result = tune_file(args.file, **given)
+    result = tune_file(args.file, **options)
     print(result.report)
     print(result)
     if folder is not None:

@@ -101,8 +101,9 @@ def test_the_assumed_numbers_are_those_of_the_runs(paper):
 
 
 def test_claims_can_fail(paper, short_run):
-    """The same run twice is neither faster nor more accurate; half a second is too short to
-    settle."""
+    """The same run twice is neither faster nor more accurate, and half a second is too short to
+    settle.
+    """
     claims = _claims.paper_claims({"a": short_run, "b": short_run})
     confirmed = {claim.claim: claim.confirmed for claim in claims}
     assert confirmed["Neither law violates its time-varying asymmetric bounds."]
@@ -213,7 +214,7 @@ def test_a_preset_file_with_its_own_run(command, tmp_path):
 def test_presets(command, paper):
     code, out, _ = command("presets")
     assert code == 0
-    assert re.match(r"zhang_yan_2024 +The paper's simulation", out)
+    assert re.match(r"zhang_yan_2024 +The simulation of the paper's section 4", out)
     code, out, _ = command("presets", "zhang_yan_2024")
     assert code == 0
     assert "--arg law=integral" in out
@@ -387,15 +388,15 @@ def test_a_command_is_interrupted_quietly_while_python_imports(module, started, 
         ([], [], False),
     ],
 )
-def test_who_imports_the_package_keeps_his_interrupts(monkeypatch, argv, orig, command):
+def test_only_a_command_replaces_the_interrupt_handler(monkeypatch, argv, orig, command):
     monkeypatch.setattr(sys, "argv", argv)
     monkeypatch.setattr(sys, "orig_argv", orig)
     assert _start._is_a_command() == command
 
 
 @pytest.mark.parametrize("cache", ["file", "missing"])
-def test_the_cache_is_only_a_help(cache, tmp_path, monkeypatch):
-    """A cache that the user chose is kept; one that cannot be written is left alone."""
+def test_the_cache_is_optional(cache, tmp_path, monkeypatch):
+    """The cache of compiled programs is optional: one that cannot be written is not used."""
     seen = {}
     monkeypatch.setattr(jax.config, "update", seen.__setitem__)
     monkeypatch.setattr(type(jax.config), "jax_compilation_cache_dir", None, raising=False)
