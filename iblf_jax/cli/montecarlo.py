@@ -1,4 +1,4 @@
-"""`montecarlo`: many runs of one scenario with parameters drawn at random."""
+"""`montecarlo`: runs one scenario many times with random parameters."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
     """Adds the command."""
     parser = subparsers.add_parser(
         "montecarlo",
-        help="run a scenario many times with parameters drawn at random",
+        help="run a scenario many times with random parameters",
         description=(
             "Run the study that a file describes (a scenario file with [run], [perturbations] and"
             " [study]); print how often the bounds were violated, quantiles of the metrics, the"
-            " worst runs, and which parameters go with the margin."
+            " worst runs, and which parameters correlate with the margin."
         ),
         epilog=EPILOG,
     )
@@ -55,17 +55,19 @@ def run(args: argparse.Namespace) -> int:
 
 
 def report(study: Study) -> str:
-    """What a study found, as text."""
+    """Returns the results of a study as text."""
     import numpy as np
 
     from iblf_jax.cli._common import number
     from iblf_jax.studies.statistics import one_number
 
     rows = [["metric, worst joint", "unit", "5 %", "50 %", "95 %"]]
-    for name in study.metrics if study.made.any() else ():
-        levels = np.quantile(
-            one_number(study.metrics, name)[study.made], (0.05, 0.5, 0.95), method="inverted_cdf"
-        )
+    names: list[str] = []
+    if study.made.any():
+        names = list(study.metrics)
+    for name in names:
+        numbers = one_number(study.metrics, name)[study.made]
+        levels = np.quantile(numbers, (0.05, 0.5, 0.95), method="inverted_cdf")
         rows.append([name, study.metrics.units.get(name, ""), *map(number, levels)])
     worst = study.worst(5)
     lines = [
