@@ -14,8 +14,8 @@ loop are about K2 / M.  With
 where M is evaluated at the start and D is its diagonal, the modes are `rate` on a joint without
 coupling, and up to four times that on a joint that is coupled to heavier ones, as required for a
 light wrist.  The last term keeps the eigenvalues of M^-1 K2 below eight times the rate along the
-reference: joints with nearly parallel axes move against each other with much less
-inertia than M_ii, and a loop that is sampled at 500 Hz allows no faster modes.
+reference: joints with nearly parallel axes move against each other with much less inertia than
+M_ii, and a loop that is sampled at 500 Hz allows no faster modes.
 
 The slope of the barrier acts as a spring of stiffness w ds/de1, independently of K2.  With
 
