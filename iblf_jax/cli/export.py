@@ -35,7 +35,7 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
         "--reference",
         default="inside",
         metavar="WHERE",
-        help="inside or told at every sample (default: inside)",
+        help="inside, or given at every sample (default: inside)",
     )
     parser.add_argument(
         "--name",
