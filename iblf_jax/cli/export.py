@@ -36,7 +36,7 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
         "--reference",
         default="inside",
         metavar="WHERE",
-        help="inside (a function of time) or told (an input at every sample) (default: inside)",
+        help="inside (a function of time) or given (an input at every sample) (default: inside)",
     )
     parser.add_argument(
         "--name",

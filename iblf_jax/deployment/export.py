@@ -113,7 +113,7 @@ def export(
       period: of the law [s]; the scenario's `sampling.period` if not given.  A closed loop need not
         be sampled.
       dtype: floating-point type of the code, "double" or "float"; an FMU has doubles.
-      reference: "inside" for a law that computes its reference as a function of time; "told" for
+      reference: "inside" for a law that computes its reference as a function of time; "given" for
         a law whose inputs are q_d, q_d' and q_d".
       name: prefix of all names in the code, a C identifier; "iblf_law" or "iblf_loop" if not
         given.
@@ -131,6 +131,7 @@ def export(
     Source: design of this package; FMI standard 3.0, Modelica Association, 2022.
     """
     is_loop = target in ("fmu-loop", "wasm")
+    reference = _current_name(reference)
     _check_options(target, dtype, reference, is_loop)
     tableau(method)
     dt, seed = checks.time_span("dt", dt), checks.seed(seed)
@@ -145,21 +146,30 @@ def export(
     try:
         if is_loop:
             return _export_loop(scenario, folder, target, name, dt, method, seed)
-        return _export_law(scenario, folder, target, name, reference == "told")
+        return _export_law(scenario, folder, target, name, reference == "given")
     except UnsupportedError as error:
         raise checks.fail(
             "scenario", f"what has no C ({error})", "a scenario whose operations are lowered"
         ) from None
 
 
+def _current_name(reference: str) -> str:
+    """The present name of a value of the argument `reference`."""
+    former = "told"
+    if reference != former:
+        return reference
+    notices.warn('reference="told" is named reference="given" now.', DeprecationWarning)
+    return "given"
+
+
 def _check_options(target: str, dtype: str, reference: str, is_loop: bool) -> None:
     """Raises ValueError for an unknown option, or for options that exclude each other."""
     checks.one_of("target", target, TARGETS)
     checks.one_of("dtype", dtype, tuple(TYPES))
-    checks.one_of("reference", reference, ("inside", "told"))
+    checks.one_of("reference", reference, ("inside", "given"))
     if target.startswith("fmu") and dtype != "double":
         raise checks.fail("dtype", dtype, '"double" for an FMU', "FMI's own numbers are.")
-    if is_loop and reference == "told":
+    if is_loop and reference == "given":
         expected = '"inside" for a closed loop'
         remedy = "Only a law alone receives its reference as an input."
         raise checks.fail("reference", reference, expected, remedy)

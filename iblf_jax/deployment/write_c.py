@@ -360,7 +360,7 @@ def _reference_values(is_external: bool) -> dict[str, str]:
 def _scenario_row(law: Law) -> str:
     """The row of the README about the file of the scenario."""
     dtype = {True: "float", False: "double"}[law.is_float]
-    reference = {True: "told", False: "inside"}[law.external_reference]
+    reference = {True: "given", False: "inside"}[law.external_reference]
     command = (
         f"python -m iblf_jax export scenario.toml --out . --name {law.name} --dtype {dtype}"
         f" --reference {reference}"

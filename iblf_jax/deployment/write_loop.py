@@ -84,7 +84,7 @@ def _finite(value: np.ndarray) -> Any:
     return value.tolist()
 
 
-def table(generated: GeneratedLoop, settings: list[float]) -> dict[str, Any]:
+def table(generated: GeneratedLoop, setting_values: list[float]) -> dict[str, Any]:
     """The description of a module for a page: its parameters, settings and records."""
     rows, offset = [], 0
     for field in generated.parameters.fields:
@@ -107,7 +107,7 @@ def table(generated: GeneratedLoop, settings: list[float]) -> dict[str, Any]:
     description = {
         "parameters": rows,
         "count": offset,
-        "settings": settings,
+        "settings": setting_values,
         "records": columns,
         "record": values["told"],
     }
@@ -119,7 +119,7 @@ def table(generated: GeneratedLoop, settings: list[float]) -> dict[str, Any]:
     }
 
 
-def wasm_files(generated: GeneratedLoop, folder: Path, settings: list[float]) -> list[str]:
+def wasm_files(generated: GeneratedLoop, folder: Path, setting_values: list[float]) -> list[str]:
     """Writes a module, its table and its sources into a folder; their names.
 
     Raises:
@@ -128,7 +128,9 @@ def wasm_files(generated: GeneratedLoop, folder: Path, settings: list[float]) ->
     name = generated.values["name"]
     texts = generated.files | {f"{name}_module.c": fill_template("wasm.c", generated.values)}
     texts["README.md"] = fill_template("wasm.md", generated.values)
-    texts[f"{name}.json"] = json.dumps(table(generated, settings), indent=1, allow_nan=False) + "\n"
+    texts[f"{name}.json"] = (
+        json.dumps(table(generated, setting_values), indent=1, allow_nan=False) + "\n"
+    )
     command = zig()
     folder.mkdir(parents=True, exist_ok=True)
     for file, text in texts.items():

@@ -54,27 +54,27 @@ class Evaluator:
         self.types = {"f": program.dtype, "i": np.dtype(np.int32), "b": np.dtype(np.bool_)}
 
     def compute(
-        self, known: dict[int, Any], wanted: Iterable[int], row: Table | None = None
+        self, known: dict[int, Any], outputs: Iterable[int], row: Table | None = None
     ) -> None:
-        """Adds `wanted`, and what it needs, to `known` (node -> array, or entry of `row`)."""
+        """Adds `outputs`, and what they need, to `known` (node -> array, or entry of `row`)."""
         nodes = self.program.nodes
-        missing = needed(nodes, wanted, known)
+        missing = needed(nodes, outputs, known)
         known |= {
             i: np.asarray(nodes[i].value, self.types[nodes[i].kind])
             for i in missing
             if nodes[i].op == "const"
         }
         order = [i for i in missing if nodes[i].op != "const"]
-        stored = self._stored(order, wanted)
+        stored = self._stored(order, outputs)
         size = plan.XLA_SEGMENT if self.bordered else max(len(order), 1)
         for start in range(0, len(order), size):
             self._segment(known, order[start : start + size], order[start + size :], stored, row)
 
-    def _stored(self, order: list[int], wanted: Iterable[int]) -> set[int]:
-        """The nodes of `order` to be stored: what is wanted, and what costs more to compute again
+    def _stored(self, order: list[int], outputs: Iterable[int]) -> set[int]:
+        """The nodes of `order` to be stored: the outputs, and what costs more to compute again
         than to read.
         """
-        nodes, cost, stored = self.program.nodes, dict.fromkeys(order, 0), set(wanted)
+        nodes, cost, stored = self.program.nodes, dict.fromkeys(order, 0), set(outputs)
         uses = Counter([a for i in order for a in nodes[i].args] + list(stored))
         for i in order:
             here = (1 if OPERATIONS[nodes[i].op].cheap else plan.XLA_DEAR) + sum(
@@ -113,8 +113,8 @@ class Evaluator:
 
         def body(row, arrays):
             local = arrays | {i: x.read(row) for i, x in entries.items()}
-            for plain, sines in rounds:
-                for i in plain:
+            for others, sines in rounds:
+                for i in others:
                     if nodes[i].op != "lookup":
                         local[i] = self._value(nodes[i], [local[a] for a in nodes[i].args])
                     elif i not in local:

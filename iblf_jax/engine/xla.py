@@ -37,7 +37,7 @@ from iblf_jax.kernels import (
 def run(
     program: Program,
     shared: jax.Array,
-    lane: jax.Array,
+    per_run: jax.Array,
     carry: Packed,
     steps: int,
     every: int | None,
@@ -62,7 +62,7 @@ def run(
         return rows.reshape(*rows.shape[:-2], blocks * width)[..., :runs]
 
     done, samples = _in_blocks(
-        program, shared, apart(lane), jax.tree.map(apart, carry), steps, every
+        program, shared, apart(per_run), jax.tree.map(apart, carry), steps, every
     )
     return jax.tree.map(together, done), jax.tree.map(together, samples)
 
@@ -83,7 +83,7 @@ def compilable(program: Program) -> Program:
 
 
 def _in_blocks(
-    program: Program, shared, lane, carry: Packed, steps: int, every: int | None
+    program: Program, shared, per_run, carry: Packed, steps: int, every: int | None
 ) -> tuple[Packed, list[jax.Array]]:
     """All steps of some blocks: (blocks, rows, width) in, and out; recorded arrays (blocks,
     samples, numbers, width).
@@ -93,49 +93,55 @@ def _in_blocks(
     Evaluator(program, ()).compute(once, frontier(program, classes, SHARED, lambda c: c != SHARED))
     columns = frontier(program, classes, TIME, lambda c: bool(c & PER_RUN))
 
-    def block(once, table, lane, carry):
-        return _block(program, once, columns, table, lane, carry, every)
+    def block(once, table, per_run, carry):
+        return _block(program, once, columns, table, per_run, carry, every)
 
     call = machine_function(block) if on_cpu() else block
 
     def stretch(carry, first, count):
         table = _table(program, once, columns, first, count)
-        return lax.map(lambda part: call(once, table, *part), (lane, carry))
+        return lax.map(lambda part: call(once, table, *part), (per_run, carry))
 
     length = plan.xla_stretch(steps, every or 1)
-    whole, rest = divmod(steps, length)
+    full, rest = divmod(steps, length)
     parts = []
-    if whole:
-        starts = length * jnp.arange(whole, dtype=jnp.int32)
+    if full:
+        starts = length * jnp.arange(full, dtype=jnp.int32)
         carry, arrays = lax.scan(partial(stretch, count=length), carry, starts)
         parts.append(
             [
-                jnp.moveaxis(x, 0, 1).reshape(x.shape[1], whole * x.shape[2], *x.shape[3:])
+                jnp.moveaxis(x, 0, 1).reshape(x.shape[1], full * x.shape[2], *x.shape[3:])
                 for x in arrays
             ]
         )
     if rest:
-        carry, arrays = stretch(carry, jnp.int32(whole * length), rest)
+        carry, arrays = stretch(carry, jnp.int32(full * length), rest)
         parts.append(arrays)
     return carry, [jnp.concatenate(arrays, axis=1) for arrays in zip(*parts, strict=True)]
 
 
 def _block(
-    program: Program, once, columns, table: Table, lane: jax.Array, carry: Packed, every: int | None
+    program: Program,
+    once,
+    columns,
+    table: Table,
+    per_run: jax.Array,
+    carry: Packed,
+    every: int | None,
 ) -> tuple[Packed, list[jax.Array]]:
     """One block of runs through the steps of a table."""
     width = carry.floats.shape[1]
     evaluator = Evaluator(program, (width,))
     values = _separate(program, carry)
-    fixed = once | {i: lane[n.value] for i, n in enumerate(program.nodes) if n.op == "per_run"}
+    fixed = once | {i: per_run[n.value] for i, n in enumerate(program.nodes) if n.op == "per_run"}
     fixed |= {a: values[c] for c, (a, o) in enumerate(program.carry) if a == o}
     evaluator.compute(
         fixed, frontier(program, program.classes(), PER_RUN, lambda c: c == PER_RUN | TIME)
     )
-    moving = [c for c, (a, o) in enumerate(program.carry) if a != o]
-    outputs = [program.carry[c][1] for c in moving]
+    changed = [c for c, (a, o) in enumerate(program.carry) if a != o]
+    outputs = [program.carry[c][1] for c in changed]
 
-    wanted = program.samples if every else ()
+    sampled = program.samples if every else ()
     count = len(table.floats)
     rows = -(-count // every) if every else 0
 
@@ -145,13 +151,13 @@ def _block(
         known = fixed | _entries(program, columns, row)
         known |= {
             program.carry[c][0]: x
-            for c, x in zip(moving, state, strict=True)
+            for c, x in zip(changed, state, strict=True)
             if program.carry[c][0] >= 0
         }
-        evaluator.compute(known, [*outputs, *wanted], row)
+        evaluator.compute(known, [*outputs, *sampled], row)
         found = [
             x.read(row) if isinstance(x, Entry) else x
-            for x in (known[i] for i in [*outputs, *wanted])
+            for x in (known[i] for i in [*outputs, *sampled])
         ]
         filled = [jnp.broadcast_to(x, (width,)) for x in found]
         if every:
@@ -163,9 +169,9 @@ def _block(
     # Every step writes its sample, to the row of the next step that is recorded, which so writes
     # last: one copy of the step to compile.
     places = (np.arange(count, dtype=np.int32) + (every or 1) - 1) // (every or 1)
-    records = jnp.zeros((rows + 1 if every else 0, len(wanted), width), program.dtype)
-    (state, records), _ = lax.scan(step, ([values[c] for c in moving], records), (table, places))
-    for c, x in zip(moving, state, strict=True):
+    records = jnp.zeros((rows + 1 if every else 0, len(sampled), width), program.dtype)
+    (state, records), _ = lax.scan(step, ([values[c] for c in changed], records), (table, places))
+    for c, x in zip(changed, state, strict=True):
         values[c] = x
     ends = accumulate(program.recorded if every else ())
     return _joined(program, values, width), [

@@ -60,9 +60,9 @@ class Number(NamedTuple):
     error: float | None
     """Standard error."""
     verdict: str
-    """"told", "cannot be told", "at its limit", "left free" for the width of a friction that does
-    not obey this law, or "biased" where a missing term moves the value by more than its standard
-    error or by more than 5 %."""
+    """One of the constants below: `IDENTIFIED`, `NOT_IDENTIFIABLE`, `LIMITED`, `NOT_ESTIMATED` for
+    the width of a friction that does not obey this law, or `BIASED` where a missing term moves the
+    value by more than its standard error or by more than 5 %."""
     bias: float | None = None
     """The bias by missing terms, where it is biased."""
 

@@ -11,11 +11,11 @@ loop are about K2 / M.  With
     K2_i = rate M_ii min(sum_j |M_ij| / M_ii, 4, 8 / max_t sum_j |R_ij|),
     R = D^(1/2) M(q_d(t))^-1 D^(1/2),
 
-where M is evaluated at the start and D is its diagonal, the modes are `rate` on a joint that moves
-alone, and up to four times that on a joint that is coupled to heavier ones, as a light wrist at the
-end of an arm needs.  The last term keeps the eigenvalues of M^-1 K2 below eight times the rate
-along the reference: joints with nearly parallel axes move against each other with much less
-inertia than M_ii, and a loop that is sampled at 500 Hz allows no faster modes.
+where M is evaluated at the start and D is its diagonal, the modes are `rate` on a joint without
+coupling, and up to four times that on a joint that is coupled to heavier ones, as required for a
+light wrist.  The last term keeps the eigenvalues of M^-1 K2 below eight times the rate along the
+reference: joints with nearly parallel axes move against each other with much less inertia than
+M_ii, and a loop that is sampled at 500 Hz allows no faster modes.
 
 The slope of the barrier acts as a spring of stiffness w ds/de1, independently of K2.  With
 
@@ -40,6 +40,7 @@ import numpy as np
 from iblf_jax.control.barriers import Barrier
 from iblf_jax.control.barriers._base import CLAIMS
 from iblf_jax.control.controllers import LAWS, Controller, PDGravity, law_by_name, within_effort
+from iblf_jax.control.controllers._base import law_member
 from iblf_jax.control.controllers.systems import observer_of
 from iblf_jax.control.observers import Momentum, Printed
 from iblf_jax.core import checks
@@ -278,7 +279,7 @@ def _arm_law(
     if law == "pd":  # The default gains of "pd" are for one size of joint.
         return PDGravity(Kp=3.0 * K2, Kd=K2)
     controller: Any = law_by_name(law, k1=2.0, K2=K2, o=0.1, reading=reading, p=1)
-    if "weight" in getattr(type(controller), "unit_factors", ()):
+    if "weight" in law_member(type(controller), "unit_factors"):
         weight = inertial_weight(model, reference, bounds, controller.barrier)
         controller = dataclasses.replace(controller, weight=weight)
     return controller

@@ -93,6 +93,8 @@ def printed_gap(*, reading: str = "printed") -> Scenario:
 
     Raises:
       ValueError: an unknown reading.
+
+    Source: this package.
     """
     return with_parameters(
         zhang_yan_2024(reading=reading),

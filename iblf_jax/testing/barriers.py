@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.control.barriers import Barrier
-from iblf_jax.control.barriers._base import CLAIMS
+from iblf_jax.control.barriers._base import CLAIMS, barrier_member
 from iblf_jax.testing._contract import (
     Findings,
     call_has_shape,
@@ -216,7 +216,7 @@ def _claims(
     """Tests the claims of the barrier about V1, if it states any."""
     xi, V1, decay = (np.asarray(numbers[name]) for name in ("xi", "V1", "decay"))
     inside = np.abs(xi) < min(1 - 2 * barrier.guard, 1.0)
-    rate = claim(barrier, "decay_rate", k1)
+    rate = barrier_member(barrier, "decay_rate")(k1)
     if rate is not None:
         has_shape(findings, "decay_rate(k1)", rate, k1.shape)
         excess = float(np.max((decay + np.asarray(rate) * V1)[inside]))
@@ -225,9 +225,10 @@ def _claims(
             f"V1' + decay_rate V1 reaches {excess:.3g} along q' = alpha",
             "Claim a smaller rate, or None",
         )
-    if claim(barrier, "error_over_slope", tube, tube.q_d) is not None:
+    error_over_slope = barrier_member(barrier, "error_over_slope")
+    if error_over_slope(tube, tube.q_d) is not None:
         q = tube.q_d + xi * np.where(xi > 0, tube.k_u, tube.k_l)
-        found = np.asarray(jax.jit(jax.vmap(lambda q: barrier.error_over_slope(tube, q)))(q))
+        found = np.asarray(jax.jit(jax.vmap(lambda q: error_over_slope(tube, q)))(q))
         product = found * np.asarray(numbers["slope"])
         off = np.abs(product - (q - np.asarray(tube.q_d)))[inside]
         remedy = "It is e1/s inside the bound, in a form without 0/0 at e1 = 0"
@@ -239,21 +240,15 @@ def _claims(
         findings.require(
             np.all(np.isfinite(found)), "error_over_slope is not finite somewhere", remedy
         )
-    if claim(barrier, "xi_bound", jnp.asarray(V1[0]), tube) is not None:
-        claimed = np.asarray(jax.jit(jax.vmap(lambda V: barrier.xi_bound(V, tube)))(V1))
+    xi_bound = barrier_member(barrier, "xi_bound")
+    if xi_bound(jnp.asarray(V1[0]), tube) is not None:
+        claimed = np.asarray(jax.jit(jax.vmap(lambda V: xi_bound(V, tube)))(V1))
         kept = (np.abs(xi) <= claimed * (1 + 1e-9) + 1e-12)[inside]
         findings.require(
             np.all(kept),
             "|xi| is beyond xi_bound(V1, tube)",
             "It must hold wherever V1 <= V; return None for no claim",
         )
-
-
-def claim(barrier: Any, name: str, *args: Any) -> Any:
-    """The result of an optional method of a barrier; None if it has no such method."""
-    if not hasattr(barrier, name):
-        return None
-    return getattr(barrier, name)(*args)
 
 
 def _joints_apart(

@@ -1,5 +1,6 @@
-"""Tests a law at and beyond its bounds.  It must be finite inside; if it is undefined beyond the
-bounds, the checker returns a remark.
+"""Tests of a law inside, at and beyond its bounds.
+
+The law must be finite inside.  If it is undefined beyond the bounds, the checker returns a remark.
 """
 
 from __future__ import annotations
@@ -37,8 +38,10 @@ class Points(NamedTuple):
 
 
 def check_at_the_bounds(findings: Findings, scenario: Scenario) -> bool:
-    """Torque, V1 and their derivatives in both modes are finite inside the bounds; whether they are
-    beyond them, too.
+    """Requires that torque, V1 and their derivatives in both modes are finite inside the bounds.
+
+    Returns:
+      Whether they are finite beyond the bounds, too.
     """
     infinite = _infinite_in_e2(findings, scenario)
     everywhere = _swept(findings, scenario, "xi", infinite)
@@ -58,7 +61,7 @@ def _command(
 
 
 def _infinite_in_e2(findings: Findings, scenario: Scenario) -> bool:
-    """Whether the slope of the torque grows without limit towards e2 = 0; a finding if it does."""
+    """Whether the slope of the torque grows without limit as e2 approaches 0; a finding if so."""
 
     @jax.jit
     def slope(scenario, e2):
@@ -83,8 +86,10 @@ def _infinite_in_e2(findings: Findings, scenario: Scenario) -> bool:
 
 
 def _swept(findings: Findings, scenario: Scenario, axis: str, infinite_in_e2: bool) -> bool:
-    """Looks along the positions ("xi") or the velocities across their bounds; whether everything is
-    finite beyond them.
+    """Requires finite results inside the bounds along the positions ("xi") or the velocities.
+
+    Returns:
+      Whether the results are finite beyond the bounds, too.
     """
     found, xi = _at_points(scenario, axis), np.asarray(XI)
     beyond = np.zeros(xi.size, bool)
@@ -99,8 +104,8 @@ def _swept(findings: Findings, scenario: Scenario, axis: str, infinite_in_e2: bo
             bad &= ~found.at_rest
         if np.array_equal(xi[bad], [0.0]) and label != LABELS[0]:
             smooth = (
-                "Smooth a root, a norm or a power below 1 of an error there, as (e^2 +"
-                " delta^2)^(1/2) for |e|"
+                "Replace a root, a norm or a power below 1 of an error by a smooth function, for"
+                " example |e| by (e^2 + delta^2)^(1/2)"
             )
             findings.add(f"{label} is not finite where the error is 0", smooth)
             continue
@@ -112,15 +117,15 @@ def _swept(findings: Findings, scenario: Scenario, axis: str, infinite_in_e2: bo
     findings.require(
         np.all(found.V1[found.inside & found.finite[LABELS[0]]] >= 0),
         "V1 is negative somewhere",
-        "It is a Lyapunov function; zeros if the law has none",
+        "V1 is a Lyapunov function; a law without one returns zeros",
     )
     if np.any(beyond):
         what = "bound" if axis == "xi" else "velocity bound"
         findings.remark(
             f"the law is undefined beyond the {what}: it or its derivative is not finite at {axis}"
             f" = {_listed(xi[beyond])}",
-            "A run that leaves the bounds is frozen there and flagged NOT_FINITE; with"
-            " iblf_jax.barriers.guarded_error it would go on",
+            "A run that leaves the bounds stops there with the flag NOT_FINITE; with"
+            " iblf_jax.barriers.guarded_error it would continue",
         )
     return not np.any(beyond)
 

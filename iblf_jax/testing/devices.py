@@ -13,6 +13,7 @@ from jax.flatten_util import ravel_pytree
 
 from iblf_jax.control.actuators import Actuator, Delivered
 from iblf_jax.control.sensors import Measurement, Sensor
+from iblf_jax.control.sensors._base import unrounded
 from iblf_jax.testing._contract import (
     Findings,
     check_function,
@@ -26,7 +27,7 @@ from iblf_jax.testing._contract import (
 from iblf_jax.testing.joints import check_number, fitted_to, number_of_joints
 
 SMALL_TORQUES = (0.1, 1e-3)
-"""Torques that an actuator has to deliver at a standstill [N m]; one of them suffices."""
+"""Torques, one of which an actuator must deliver at a standstill [N m]."""
 POWERS = (0, 1, 2, 3, 4, 5, -1, -2, -3)
 INPUT_SCALES = np.asarray([sign * 10.0**power for power in POWERS for sign in (1, -1)])
 """Initial guesses of the input per torque, in any unit, for the search of the input that delivers a
@@ -61,7 +62,7 @@ def check_sensor(sensor: Any, *, n: int | None = None) -> None:
         findings.stop_if_any()
 
         def outputs(sensor, q, dq, normal, period):
-            sensor = getattr(sensor, "unrounded", sensor)
+            sensor = unrounded(sensor)
             measured, state = sensor.measure(q, dq, normal, period, sensor.init(q, dq, period))
             return {"q": measured.q, "dq": measured.dq} | leaves_by_name("state", state)
 

@@ -24,7 +24,7 @@ from iblf_jax.world.robots import PlanarChain
 T = TypeVar("T")
 
 USUAL = 2
-"""Joints of a member whose leaves are all scalars."""
+"""Number of joints that is assumed for a component whose leaves are all scalars."""
 
 
 def joints_of(member: Any, default: int = USUAL) -> int:
@@ -34,7 +34,9 @@ def joints_of(member: Any, default: int = USUAL) -> int:
 
 
 def _sizes(member: Any) -> set[int]:
-    """Lengths of the leaves declared as one number a joint, or of all vectors if none is."""
+    """Lengths of the leaves that are declared as one number per joint; of all vectors if there are
+    none.
+    """
     declared = set(_declared_sizes(member))
     if declared:
         return declared
@@ -56,14 +58,14 @@ def _declared_sizes(member: Any) -> Iterator[int]:
 
 
 def _undeclared(member: Any) -> list[Any]:
-    """Leaves that no field declares: those of a class that was registered by hand."""
+    """Leaves of a class that was registered by hand, which no field declares."""
     if dataclasses.is_dataclass(member) and any(map(is_leaf_field, dataclasses.fields(member))):
         return []
     return jax.tree.leaves(member)
 
 
 def check_number(n: int | None) -> None:
-    """Raises ValueError for what is neither None nor a number of joints."""
+    """Raises ValueError unless `n` is None or a number of joints."""
     if n is not None:
         checks.positive_integer("n", n, most=checks.MOST_JOINTS)
 
@@ -75,14 +77,18 @@ def number_of_joints(findings: Findings, member: Any, n: int | None) -> int:
     sizes = sorted(set(_declared_sizes(member)))
     if len(sizes) > 1:
         listed = " and ".join(map(str, sizes))
-        remedy = "Give each one number, or all of them one number a joint"
+        remedy = "Use scalars, or leaves with one number per joint of the same arm"
         findings.add(f"its leaves are for {listed} joints", remedy)
         findings.stop_if_any()
     return joints_of(member)
 
 
 def fitted_to(member: T, n: int, family: str) -> T:
-    """The member with its scalars repeated for n joints; ValueError where a leaf has others."""
+    """The component with its scalars repeated for n joints.
+
+    Raises:
+      ValueError: a leaf is for another number of joints.
+    """
     return fit_joints(member, n, family)
 
 
@@ -96,7 +102,7 @@ def arm_of(n: int) -> Any:
 
 
 def scenario_of(n: int) -> Scenario:
-    """A scenario of n joints: the paper's, or one with its reference, bounds and gains."""
+    """A scenario of n joints: the paper's, or one with similar reference, bounds and gains."""
     if n == USUAL:
         return zhang_yan_2024()
     quarter = np.pi / 2
@@ -116,7 +122,7 @@ def scenario_of(n: int) -> Scenario:
 
 
 def check_scenario(scenario: Any, n: int | None) -> None:
-    """Raises ValueError for no scenario (None is allowed), or for an `n` that it does not have."""
+    """Raises ValueError unless `scenario` is None or a Scenario, of `n` joints if `n` is given."""
     check_number(n)
     if scenario is None:
         return
@@ -134,7 +140,7 @@ def scenario_for(
     scenario: Scenario | None,
     n: int | None,
 ) -> Scenario:
-    """The scenario to check a member in: the one given, or one of the member's number of joints."""
+    """The given scenario, or one with the number of joints of the component."""
     if scenario is not None:
         return scenario
     return scenario_of(number_of_joints(findings, member, n))

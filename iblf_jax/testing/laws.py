@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.control.controllers import Command, Controller
+from iblf_jax.control.controllers._base import law_member
 from iblf_jax.core import notices
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import VIOLATED, Status
@@ -61,7 +62,7 @@ def check_law(
     with examine(law, "Controller", Controller) as findings:
         base = in_dtype(scenario_for(findings, law, scenario, n), "float64")
         speeds = base.velocity_bounds
-        if speeds is None and getattr(unwrapped(law), "needs_velocity_bounds", False):
+        if speeds is None and law_member(unwrapped(law), "needs_velocity_bounds"):
             speeds = Bounds(lower=Constant(-SPEED), upper=Constant(SPEED))
         try:
             base = dataclasses.replace(base, controller=law, velocity_bounds=speeds)

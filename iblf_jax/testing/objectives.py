@@ -1,5 +1,6 @@
-"""The checker for objectives: the contract is `iblf_jax.tuning.quantities.Quantity`, which every
-term and requirement is made of.
+"""The checker for objectives.
+
+The contract is `iblf_jax.tuning.quantities.Quantity`: terms and requirements consist of quantities.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ def check_objective(
       objective: an objective, a requirement, or a quantity of which these are composed.
       scenario: the scenario of the run; if not given the paper's simulation, or a similar one for
         the number of joints of the leaves.
-      duration: of the run [s], as `tune` will have it.
+      duration: duration of the run [s], the same as for `tune`.
       n: number of joints, if no scenario is given; that of its leaves if not given, 2 if these
         are scalars.
 
@@ -76,16 +77,14 @@ def check_objective(
         findings.require(
             objective.quantities,
             "it has neither terms nor requirements",
-            "Such as ij.objectives.tracking()",
+            "Pass for example ij.objectives.tracking()",
         )
         findings.stop_if_any()
         _on_a_run(findings, in_dtype(objective, "float64"), scenario, duration)
 
 
 def _with_joints(objective: Objective, scenario: Scenario) -> Objective:
-    """The objective with the joints of the scenario's robot; a selection that does not fit it is a
-    finding.
-    """
+    """The objective for the joints of the scenario's robot; a finding if it selects others."""
     with examine(objective, "Objective", Objective) as findings:
         try:
             return for_scenario(objective, scenario)
@@ -268,7 +267,7 @@ def _on_a_run(
     except ValueError as error:
         findings.add(
             str(error).rstrip("."),
-            "Or give check_objective the scenario and the duration that `tune` will have",
+            "Or pass the scenario and the duration of `tune` to check_objective",
         )
         return
     smooth = jnp.asarray(metrics["tuning_smooth"])

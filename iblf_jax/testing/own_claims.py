@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.certificates.claims import OWN_CLAIM_METHODS
+from iblf_jax.control.controllers._base import law_member
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.testing._contract import Findings, check_function, in_dtype, shape_of
 
@@ -78,9 +79,10 @@ def _shapes(findings: Findings, scenario: Scenario) -> None:
     calls: dict[str, tuple[Any, tuple]] = {}
     for name in OWN_CLAIM_METHODS:
         calls[f"{name}(t, q, dq, f_tilde, context, state)"] = (getattr(law, name), arguments)
-    if hasattr(law, "disturbance_terms"):
+    disturbance_terms = law_member(law, "disturbance_terms")
+    if disturbance_terms is not None:
         label = "disturbance_terms(t, q, dq, f_tilde, df, context, state)"
-        calls[label] = (law.disturbance_terms, (t, q, dq, zero, zero, context, own))
+        calls[label] = (disturbance_terms, (t, q, dq, zero, zero, context, own))
     for label, (call, args) in calls.items():
         got = shape_of(findings, label, call, *args)
         if got is not None:
@@ -88,7 +90,7 @@ def _shapes(findings: Findings, scenario: Scenario) -> None:
 
 
 def _is_summable(findings: Findings, label: str, got: Any, like: jax.Array) -> None:
-    """A finding unless a method gives one number, or one a joint, of the arguments' type."""
+    """Requires that a method returns one number, or one per joint, of the arguments' type."""
     fits = hasattr(got, "shape") and got.shape in ((), like.shape)
     remedy = f"It must be an array of shape () or {like.shape}, which is summed"
     if not findings.require(fits, f"{label} gives {got}", remedy):

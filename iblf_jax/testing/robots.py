@@ -31,11 +31,11 @@ def check_robot(robot: Any, *, q: Any = None) -> None:
 
     Args:
       robot: an instance.
-      q: configurations to look at, (m, n) [rad or m]; random ones if not given.
+      q: configurations of the test, (m, n) [rad or m]; random ones if not given.
 
     Raises:
       ContractError: lists what does not hold, with the remedy.
-      ValueError: configurations that are none, or none of this robot.
+      ValueError: `q` is not an array of shape (m, n).
     """
     with examine(robot, "Robot", Robot) as findings:
         n = robot.n
@@ -52,11 +52,10 @@ def check_robot(robot: Any, *, q: Any = None) -> None:
         findings.stop_if_any()
         robot = in_dtype(robot, "float64")
         rng = np.random.default_rng(1)
-        points = (
-            jnp.asarray(rng.uniform(-2, 2, (4, n)))
-            if q is None
-            else jnp.atleast_2d(checks.as_floats("q", q))
-        )
+        if q is None:
+            points = jnp.asarray(rng.uniform(-2, 2, (4, n)))
+        else:
+            points = jnp.atleast_2d(checks.as_floats("q", q))
         checks.check_values("q", points, None)
         if points.ndim != 2 or points.shape[1] != n or not len(points):
             raise checks.fail(
@@ -103,7 +102,7 @@ def _shapes(findings: Findings, robot: Any, q: Any) -> None:
 
 
 def _identities(robot: Any, q: jax.Array, v: jax.Array, u: jax.Array) -> dict[str, jax.Array]:
-    """Quantities of the robot next to what they should equal."""
+    """The mass matrix, the residuals of the identities, and the scales of these residuals."""
     M = robot.mass_matrix(q)
     C = jax.vmap(lambda e: robot.coriolis(q, v, e), out_axes=1)(jnp.eye(robot.n))
     N = mass_matrix_rate(robot, q, v) - 2.0 * C

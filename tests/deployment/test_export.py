@@ -206,7 +206,7 @@ def test_what_cannot_be_written_says_why(base, tmp_path):
         with pytest.raises(ValueError, match="one scenario"):
             ij.export(several, tmp_path, target=target)
     with pytest.raises(ValueError, match="reference"):
-        ij.export(base, tmp_path, target="wasm", reference="told")
+        ij.export(base, tmp_path, target="wasm", reference="given")
     for wrong in (
         {"target": "rust"},
         {"dtype": "half"},
@@ -509,6 +509,14 @@ def test_a_closed_loop_in_webassembly_is_simulate(lab, tmp_path):
     np.testing.assert_allclose(run()["q"], slower.q, atol=1e-10)
 
 
+def test_the_former_name_of_a_given_reference_still_works(tmp_path):
+    with (
+        pytest.warns(DeprecationWarning, match="given"),
+        pytest.raises(ValueError, match="reference"),
+    ):
+        ij.export(ij.presets.zhang_yan_2024(), tmp_path, target="wasm", reference="told")
+
+
 def test_the_command_line_exports(tmp_path, capsys):
     from iblf_jax.cli import main
 
@@ -524,7 +532,7 @@ def test_the_command_line_exports(tmp_path, capsys):
                 "--dtype",
                 "float",
                 "--reference",
-                "told",
+                "given",
             ]
         )
         == 0
@@ -543,7 +551,7 @@ def test_the_command_line_exports(tmp_path, capsys):
     [
         ("controller.K2", 1e308, {}),
         ("controller.k1", 3e307, {}),
-        ("observer.kf", 1.1e308, {"reference": "told"}),
+        ("observer.kf", 1.1e308, {"reference": "given"}),
         pytest.param("controller.K2", 3e37, {"dtype": "float"}, marks=pytest.mark.slow),
         ("controller.K2", 1e308, {"target": "fmu-loop"}),
         ("controller.k1", 1e308, {"target": "wasm", "period": None}),

@@ -54,7 +54,7 @@ def test_the_checkers_leave_the_session_as_it_was():
 
 
 def rejects(check, member, *words):
-    # As in a session of a user's, where types are promoted.
+    # Type promotion is on, as it is by default.
     with jax.numpy_dtype_promotion("standard"), pytest.raises(ContractError) as caught:
         check(member)
     for word in words:
@@ -325,7 +325,7 @@ def test_an_infinite_derivative_in_e2_is_named():
         ij.testing.check_law(published(power=0.6))
     assert "with respect to e2" in str(caught.value)
     assert "delta^2" in str(caught.value)
-    assert "wall" not in str(caught.value)
+    assert "Near the bound" not in str(caught.value)
     assert len(ij.testing.check_law(published(power=0.6, delta=0.05))) == 2
 
 
@@ -410,7 +410,7 @@ def test_random_samples_are_apart(rng):
 
 @ij.component
 class VoltageMotor:
-    """An actuator of a user's, whose input is a voltage: tau = Kt i, L i' = u - R i - Kt q'."""
+    """A user's actuator whose input is a voltage: tau = Kt i, L i' = u - R i - Kt q'."""
 
     R: ij.Leaf = ij.leaf("ohm", sign="positive")
     Kt: ij.Leaf = ij.leaf("N m/A", sign="positive", default=0.08)
@@ -419,26 +419,26 @@ class VoltageMotor:
     def init(self, tau):
         return tau / self.Kt
 
-    def deliver(self, asked, dq, state):
-        rate = (asked - self.R * state - self.Kt * dq) / self.L
-        return ij.actuators.Delivered(self.Kt * state, jnp.zeros(asked.shape, bool), rate)
+    def deliver(self, command, dq, state):
+        rate = (command - self.R * state - self.Kt * dq) / self.L
+        return ij.actuators.Delivered(self.Kt * state, jnp.zeros(command.shape, bool), rate)
 
 
-def without_memory(self, asked, dq, state):
+def without_memory(self, command, dq, state):
     """Its input is a current in mA, its torque proportional to it, in the other direction."""
-    return ij.actuators.Delivered(-1e-3 * self.Kt * asked, jnp.zeros(asked.shape, bool), ())
+    return ij.actuators.Delivered(-1e-3 * self.Kt * command, jnp.zeros(command.shape, bool), ())
 
 
-def washed_out(self, asked, dq, state):
+def washed_out(self, command, dq, state):
     """It delivers what changes, and in the end nothing."""
     return ij.actuators.Delivered(
-        asked - state, jnp.zeros(asked.shape, bool), self.R * (asked - state)
+        command - state, jnp.zeros(command.shape, bool), self.R * (command - state)
     )
 
 
-def with_wrong_sign(self, asked, dq, state):
+def with_wrong_sign(self, command, dq, state):
     return ij.actuators.Delivered(
-        self.Kt * state, jnp.zeros(asked.shape, bool), (asked + self.R * state) / self.L
+        self.Kt * state, jnp.zeros(command.shape, bool), (command + self.R * state) / self.L
     )
 
 
@@ -461,7 +461,7 @@ def test_an_actuator_of_one_joint_whose_input_is_a_voltage():
         ),
         ({"deliver": with_wrong_sign}, ("its state grows by itself", "sign of its rate")),
         (
-            {"deliver": lambda self, asked, dq, state: (state, state, state)},
+            {"deliver": lambda self, command, dq, state: (state, state, state)},
             ("iblf_jax.actuators.Delivered",),
         ),
     ],
@@ -521,13 +521,12 @@ MEMBERS_OF_JOINTS = {
     "law-by-hand": (ij.testing.check_law, lambda k: PlainLaw(jnp.asarray(20.0 * k))),
     "barrier": (ij.testing.check_barrier, lambda k: WeightedMapping(weight=k)),
 }
-"""Family -> its checker, and a member from one number a joint."""
+"""Family -> its checker, and a member from one number per joint."""
 
 
 @ij.component
 class WeightedMapping:
-    """A barrier of a user's with a leaf of one number a joint: the mapping barrier with a
-    weight."""
+    """A user's barrier with a leaf of one number per joint: the mapping barrier with a weight."""
 
     weight: ij.Leaf = ij.leaf("1", sign="positive")
     guard: float = ij.static(default=1e-3)
@@ -545,7 +544,7 @@ class WeightedMapping:
 
 @ij.component
 class WeightedSquare:
-    """What a user tunes for, with a leaf of one number a joint: sum_k dt weight . e1^2."""
+    """A user's objective with a leaf of one number per joint: sum_k dt weight . e1^2."""
 
     weight: ij.Leaf = ij.leaf("1", sign="positive")
 
@@ -601,7 +600,7 @@ def test_the_number_of_joints_is_that_of_the_leaves(n):
         )
         == n
     )
-    # Coordinates of the tip, and waypoints, are not one number a joint.
+    # Coordinates of the tip, and waypoints, are not one number per joint.
     assert joints_of(ij.disturbances.TipForce(amplitude=[1.0, 2.0, 3.0])) == 2
     scenario = scenario_of(n)
     assert scenario.n == n
