@@ -34,7 +34,7 @@ def add_study_arguments(parser: argparse.ArgumentParser) -> None:
         "--devices",
         type=int,
         metavar="N",
-        help="use N CPU devices, one per core (default: 1)",
+        help="use N CPU devices, one per core (default: those of JAX, usually 1)",
     )
     parser.add_argument(
         "--chunk",

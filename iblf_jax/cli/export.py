@@ -14,7 +14,7 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
         help="write a law as C99 or an FMU, or a closed loop for a browser",
         description=(
             "Write the law of a scenario as C99 or an FMU, or its closed loop as an FMU or"
-            " WebAssembly; print what it takes."
+            " WebAssembly; print files, operations and sizes."
         ),
         epilog="Exit code 2 also if a compiler is missing or fails.",
     )
