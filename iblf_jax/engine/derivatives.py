@@ -11,8 +11,7 @@ are summed up along the way, at next to no cost.  With w = 2 dt that is the seco
 of every integral of squares.
 
 The step with its tangents is a step as any other: every executor steps it.  As a scalar program it
-  holds what all tangents share once,
-because equal nodes are one node.
+holds what all tangents share once, because equal nodes are one node.
 """
 
 from __future__ import annotations

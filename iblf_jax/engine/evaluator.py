@@ -96,8 +96,7 @@ class Evaluator:
         """Adds the nodes of `order` to `known`.
 
         On CPU in a function of its own: XLA computes each of its results once, and nothing across
-          its border.  The barrier keeps
-        results that nobody reads, which are there to be stored only.
+        its border.  The barrier keeps results that nobody reads, which are there to be stored only.
         """
         nodes, here = self.program.nodes, set(order)
         read_later = {a for i in later for a in nodes[i].args}

@@ -32,17 +32,19 @@ class Mechanism(NamedTuple):
     numbers: tuple[Known | None, ...]
     """One entry per number of the scenario, leaf after leaf; None for no property."""
 
-    def of_shared(self, is_lane: Sequence[bool], sizes: Sequence[int]) -> tuple[Known | None, ...]:
+    def of_shared(
+        self, is_per_run: Sequence[bool], sizes: Sequence[int]
+    ) -> tuple[Known | None, ...]:
         """The properties of the shared numbers.
 
         Args:
-          is_lane: whether a leaf differs between the runs, for all leaves; those of the scenario
+          is_per_run: whether a leaf differs between the runs, for all leaves; those of the scenario
             come first.
           sizes: number of entries of each leaf.
         """
         position: dict[int, int] = {}
         first = 0
-        for differs, size in zip(is_lane, sizes, strict=True):
+        for differs, size in zip(is_per_run, sizes, strict=True):
             if not differs:
                 position.update({first + i: len(position) + i for i in range(size)})
             first += size

@@ -54,8 +54,8 @@ class Executor(NamedTuple):
     start_build: Callable | None = None
     """Arguments of `build`: starts to compile in the background."""
     continues: bool = False
-    """Whether `run` takes the number of the first step (`first`), so that a long run can be made in
-    several calls."""
+    """Whether `run` takes the number of the first step (`first`) and the choice of a kernel for few
+    runs (`narrow`), so that a long single run can be made in several calls."""
 
 
 EXECUTORS: dict[str, Executor] = {

@@ -45,8 +45,7 @@ def simulate(
 ) -> Rollout:
     """Runs a scenario with a fixed step and returns everything that can be looked at.
 
-        x' = rate(t, x),   x = (q, q', state of the law, state of the observer)
-        (closed_loop)
+        x' = rate(t, x),   x = (q, q', states of law, observer and actuator)        (closed_loop)
 
     Works under `jax.jit`, `vmap`, `grad`, `jacfwd`: differentiate `run.metrics` or any array by the
       leaves of the scenario.

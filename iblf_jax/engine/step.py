@@ -9,9 +9,9 @@ remembered, because the loop is stiffest there.  The step from the last instant 
 sample alone counts.
 
 A step is a function (inputs, carry, index) -> (carry, records) of ONE run, and hashable: two steps
-that are equal compile once.  Before the first and after the last step come `start` and `verdict`,
-which hold no evaluation of the closed loop; what they need of it, its Jacobian, is stepped for too
-(`LinearizationStep`).
+that are equal compile once.  `start` creates the carry before the first step, and `outcome_of`
+computes the result after the last one. Neither evaluates the closed loop: its Jacobian, which both
+need, is computed by steps, too (`LinearizationStep`).
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@ it.
 
 The first guess is a step that follows the loop's fastest mode.  Then the run is made twice, side by
 side: in steps dt, and with each of them cut into three unequal ones, so that no signal goes through
-  whole periods between the stages of both.  The step is made smaller
-until the two agree, and until the run's own estimate of its error (`accuracy`) is content too.
+whole periods between the stages of both.  The step is made smaller until the two agree, and until
+the run's own estimate of its error (`accuracy`) is content too.
 """
 
 from __future__ import annotations

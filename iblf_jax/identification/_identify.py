@@ -14,7 +14,7 @@ from iblf_jax.core import checks, notices
 from iblf_jax.core.pytree import astype
 from iblf_jax.identification.coordinates import (
     DELAY,
-    OFFSET,
+    DELAY_SCALE,
     Coordinates,
     coordinates,
     to_x,
@@ -227,7 +227,7 @@ class _Search:
         self.first = np.append(guess.z, guess.delay)
         self.noise = noise
         scales = coordinate_scales(problem.coordinates, guess.scale)
-        self.scale = np.append(scales, OFFSET)
+        self.scale = np.append(scales, DELAY_SCALE)
 
     def refine(
         self, x: np.ndarray, z: np.ndarray, free: FreeTorques, hopeless: Any = np.inf

@@ -39,8 +39,10 @@ dry friction."""
 POINT = 0.01
 """[m]: radius of gyration, along each axis, with which the search starts where an inertia is not
 positive definite."""
-DELAY, OFFSET = "sampling.delay", 0.01
-"""The path of the torque's delay, and its scale [s]."""
+DELAY = "sampling.delay"
+"""The path of the torque's delay."""
+DELAY_SCALE = 0.01
+"""The scale of the delay [s]."""
 PARTS = ("plant", "model", "robot", "disturbance")
 
 

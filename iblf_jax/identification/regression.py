@@ -23,7 +23,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.identification.coordinates import Coordinates, drive_limit, scales, to_x, to_z
+from iblf_jax.identification.coordinates import (
+    DELAY_SCALE,
+    Coordinates,
+    drive_limit,
+    scales,
+    to_x,
+    to_z,
+)
 from iblf_jax.identification.replay import InverseDynamics, inverse_dynamics
 from iblf_jax.identification.search import WEAK_PRIOR, QuadraticModel, levenberg_marquardt
 from iblf_jax.identification.smoothing import SmoothedMotion
@@ -95,7 +102,7 @@ def initial_estimate(
         low_delay = start_delay = high_delay = delay
     limits = np.append(c.low, low_delay), np.append(c.high, high_delay)
     z = np.append(to_z(c, c.x), start_delay)
-    z_scale = np.append(coordinate_scales(c, scale), 0.01)
+    z_scale = np.append(coordinate_scales(c, scale), DELAY_SCALE)
     spread = np.sqrt(np.mean((motion.tau - np.mean(motion.tau, axis=0)) ** 2, axis=0))
     sigma = spread + 1e-9
     residual = np.zeros_like(motion.tau)

@@ -13,7 +13,7 @@ import numpy as np
 
 from iblf_jax.core import checks, tables
 from iblf_jax.core.presentation import present
-from iblf_jax.identification.coordinates import DELAY, OFFSET, Coordinates, plant_path, to_x
+from iblf_jax.identification.coordinates import DELAY, DELAY_SCALE, Coordinates, plant_path, to_x
 from iblf_jax.identification.problem import IdentificationProblem, missing_terms_of_fit
 from iblf_jax.identification.regression import InitialEstimate
 from iblf_jax.identification.shooting import Refinement, Windows
@@ -426,7 +426,7 @@ def assessed(
         for j in range(windows.y.shape[-1])
     ]
     fit = _fits(start, windows, end, before, white, guess)
-    scale = np.append(guess.scale, OFFSET)
+    scale = np.append(guess.scale, DELAY_SCALE)
     statistics = _statistics(problem, end, scale, max(one.lacking for one in fit))
     x = np.where(end.free.fixed, c.x, to_x(c, end.z[:-1])[0])
     missing = MissingTerms((), np.zeros(len(x)))

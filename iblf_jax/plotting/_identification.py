@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from iblf_jax.identification.result import NOT_IDENTIFIABLE
 from iblf_jax.plotting import _style
 from iblf_jax.plotting._curves import escaped
 
@@ -43,9 +44,9 @@ def identification(known: Identification) -> Figure:
     _residuals(figure.add_subplot(last[0]), known)
     _correlations(figure.add_subplot(last[1]), known)
     lines = ["Parameters from a log"]
-    unidentifiable = sum(number.verdict == "cannot be told" for number in known.numbers)
+    unidentifiable = sum(number.verdict == NOT_IDENTIFIABLE for number in known.numbers)
     if unidentifiable:
-        lines.append(f"{unidentifiable} numbers cannot be told")
+        lines.append(f"{unidentifiable} numbers are not identifiable")
     _style.set_heading(figure, lines)
     return figure
 

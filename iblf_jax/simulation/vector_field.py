@@ -5,7 +5,7 @@ The loop's own state is a pytree, and contains an empty tuple for a law without 
 solvers do not accept (diffrax: "Only arrays can be treated as buffers"). Here its numbers are
 concatenated in the order of `iblf_jax.simulation.closed_loop.LoopState`:
 
-    x = (q, q', state of the law, state of the observer),   (m,)
+    x = (q, q', state of the law, state of the observer, state of the actuator),   (m,)
 
 `VectorField.names` names the entries; `unpack` and `pack` convert between the two forms.
 """

@@ -87,7 +87,11 @@ def _block(program: StudyProgram, shared: SharedInputs, inputs: CaseInputs) -> B
 def _record_block(
     program: StudyProgram, shared: SharedInputs, inputs: CaseInputs, record_every: int
 ):
-    """Positions of a block's runs, (B, T, n), and their status."""
+    """The recorded positions of a block of runs.
+
+    Returns:
+      Signal -> (B, T, n); times (B, T); status (B,); and which draws are admissible, (B,).
+    """
     varied, _, admissible = drawn_leaves(program.targets, shared, inputs)
     outcome = program.batch(
         shared.cases.scenario, varied, shared.folds, shared.dt, record_every=record_every

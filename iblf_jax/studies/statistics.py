@@ -1,9 +1,8 @@
 """Statistics of runs: probabilities with intervals, one number a run, rank correlations.
 
 Clopper-Pearson: with k events in N independent runs, the interval of the probability p that holds
-  for every p with at least
-the requested confidence is [B(a/2; k, N - k + 1), B(1 - a/2; k + 1, N - k)], B the quantile of the
-beta distribution.
+for every p with at least the requested confidence is [B(a/2; k, N - k + 1), B(1 - a/2; k + 1, N -
+k)], B the quantile of the beta distribution.
 
 Source: C. J. Clopper, E. S. Pearson, Biometrika 26 (1934) 404-413.
 """

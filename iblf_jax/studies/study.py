@@ -163,9 +163,8 @@ class Study:
         """How many runs there are of each kind.
 
         OK, FLAGGED and FAILED add up to all runs: no flag, flags that are no failure, and a flag of
-          `status.FAILED`.  Then how many have
-        each flag, of which a run may have several, and how many of those that violated a bound did
-        so at t = 0 (`started_outside`).
+        `status.FAILED`.  Then how many have each flag, of which a run may have several, and how
+        many of those that violated a bound did so at t = 0 (`started_outside`).
         """
         failed, flagged = self.status & int(FAILED) != 0, self.status != 0
         counts = {

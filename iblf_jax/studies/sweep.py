@@ -261,8 +261,8 @@ def _into_store(
             f"{options.path}: {len(damaged)} units are damaged (their data do not fit their"
             f" checksums) and are computed again: {damaged[:10]}."
         )
-    remaining = study.cases - sum(_length(store, unit) for unit in pending)
-    with StopRequest() as stop, bar(progress, study.cases, remaining) as shown:
+    cases_done = study.cases - sum(_length(store, unit) for unit in pending)
+    with StopRequest() as stop, bar(progress, study.cases, cases_done) as shown:
         spans = _spans(store, pending, set(damaged), options, shown.update)
         with closing(_results(study, spans, executor, store, options, shown.update)) as results:
             for span, part in results:

@@ -22,8 +22,7 @@ class Motor:
 
     What is not given is not there; without a bandwidth y = v.  Nothing is delivered beyond the
     no-load speed.  The lag is integrated with the plant: behind a jump of the command the torque is
-      right to 1e-5 of the jump where dt bandwidth <= 0.2 (rk4), the positions far
-    better.
+    right to 1e-5 of the jump where dt bandwidth <= 0.2 (rk4), the positions far better.
 
     Args:
       bandwidth: of the current loop, () or (n,) [1/s], > 0; no lag if not given.

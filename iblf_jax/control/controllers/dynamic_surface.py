@@ -45,8 +45,7 @@ class DynamicSurface:
         rad^2), > 0; 1, the paper's, if not given.
 
     Source: D. Swaroop, J. K. Hedrick, P. P. Yip, J. C. Gerdes, IEEE Trans. Automatic Control 45
-      (2000) 1893-1899; with barriers as at the
-    head of this module.
+    (2000) 1893-1899; with barriers as at the head of this module.
     """
 
     k1: Leaf = leaf("1/s", sign="positive")

@@ -109,8 +109,7 @@ class FullState:
         has 1/rad^2 besides, where phi is in rad^2/s^2 it has rad^2/s^2.
 
     Source: W. He, Y. Chen, Z. Yin, IEEE Trans. Cybernetics 46 (2016) 620-629 (symmetric, constant,
-      logarithms); asymmetric, time-varying
-    and for any barrier as derived at the head of this module.
+    logarithms); asymmetric, time-varying and for any barrier as derived at the head of this module.
     """
 
     k1: Leaf = leaf("1/s", sign="positive")

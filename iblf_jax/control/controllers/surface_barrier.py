@@ -44,9 +44,8 @@ class SurfaceBarrier:
       barrier: on sigma, any `Barrier`; `PrescribedPerformance()` if not given.
 
     Source: C. P. Bechlioulis, A. Theodorakopoulos, G. A. Rovithakis, 52nd IEEE CDC (2013); with the
-      slope in it, I. Dimanidis, diploma
-    thesis, Aristotle University of Thessaloniki (2018), chapter 5; other barriers and asymmetric
-    bounds as derived here.
+    slope in it, I. Dimanidis, diploma thesis, Aristotle University of Thessaloniki (2018), chapter
+    5; other barriers and asymmetric bounds as derived here.
     """
 
     a: Leaf = leaf("1/s", sign="positive")
