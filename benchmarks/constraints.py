@@ -33,7 +33,7 @@ from _timing import report
 import iblf_jax as ij
 from iblf_jax import bounds, metrics, regions
 from iblf_jax.core.linalg import solve_spd
-from iblf_jax.engine.simulate import simulate_unchecked
+from iblf_jax.engine import RunRequest, run_rollout
 from iblf_jax.simulation.scenario import canonical
 
 LAWS = (
@@ -79,10 +79,10 @@ def scenario() -> ij.Scenario:
 def step_seconds(one: ij.Scenario) -> float:
     """Processor seconds of one period of a sampled law, the plant's motion with it."""
     sampled, steps = canonical(ij.with_parts(one, sampling=ij.Sampling(period=PERIOD))), 5000
-    options = {"steps": steps, "method": "rk4", "record_every": steps}
+    request = RunRequest.of(sampled, steps=steps, record_every=steps)
 
     def run():
-        jax.block_until_ready(simulate_unchecked(sampled, (), jnp.asarray(DT), **options).q)
+        jax.block_until_ready(run_rollout(sampled, (), jnp.asarray(DT), request).q)
 
     run()
     return min(_processor_seconds(run) for _ in range(3)) / steps

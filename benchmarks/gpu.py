@@ -31,8 +31,8 @@ from _timing import compile_seconds, interleaved, report
 from throughput import GAINS, chain, draws, method_for, textbook
 
 import iblf_jax as ij
+from iblf_jax.engine import RunRequest
 from iblf_jax.engine.execute import run_batch, run_batch_jvp
-from iblf_jax.engine.step import Run
 from iblf_jax.simulation.metrics import standard
 from iblf_jax.simulation.scenario import canonical
 
@@ -88,12 +88,12 @@ def candidates(scenario, dtype: str, is_paper: bool, method: str) -> dict:
 
     def on(backend, folds=folds):
         return lambda v, dt, steps: run_batch(
-            scenario, v, folds, dt, Run(steps, method), backend=backend
+            scenario, v, folds, dt, RunRequest(steps, method), backend=backend
         )
 
     def tangents(v, dt, steps):
         return run_batch_jvp(
-            scenario, v, GAINS, folds[:1], dt, Run(steps, method), backend=compiled
+            scenario, v, GAINS, folds[:1], dt, RunRequest(steps, method), backend=compiled
         )
 
     compiled = "gpu" if on_a_gpu() else "native"
@@ -109,7 +109,7 @@ def check(scenario, dtype: str, steps: int, method: str) -> None:
 
     def outcome(backend):
         return jax.jit(
-            lambda v: run_batch(scenario, v, folds, dt, Run(steps, method), backend=backend)
+            lambda v: run_batch(scenario, v, folds, dt, RunRequest(steps, method), backend=backend)
         )(values)
 
     found, expected = outcome("gpu"), outcome("vmap")

@@ -38,9 +38,9 @@ from _timing import compile_seconds, in_turn, report
 import iblf_jax as ij
 from iblf_jax import kernels
 from iblf_jax.core import devices
+from iblf_jax.engine import RunRequest
 from iblf_jax.engine.execute import run_batch, run_batch_jvp
 from iblf_jax.engine.mechanism import mechanism_of
-from iblf_jax.engine.step import Run
 from iblf_jax.kernels import toolchain
 from iblf_jax.simulation.metrics import standard
 from iblf_jax.simulation.scenario import canonical
@@ -262,12 +262,18 @@ def rows_of(scenario, dtype: str, loop: str, method: str) -> list[Row]:
 
     def on(backend, folds=folds):
         return lambda v, dt, steps: run_batch(
-            scenario, v, folds, dt, Run(steps, method, mechanism=mechanism), backend=backend
+            scenario, v, folds, dt, RunRequest(steps, method, constants=mechanism), backend=backend
         )
 
     def sensitivities(folds):
         return lambda v, dt, steps: run_batch_jvp(
-            scenario, v, GAINS, folds, dt, Run(steps, method, mechanism=mechanism), backend="native"
+            scenario,
+            v,
+            GAINS,
+            folds,
+            dt,
+            RunRequest(steps, method, constants=mechanism),
+            backend="native",
         )
 
     if loop == "arm":

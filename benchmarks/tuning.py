@@ -57,9 +57,9 @@ from scipy import optimize
 
 import iblf_jax as ij
 from iblf_jax import barriers, bounds, controllers, disturbances, observers, references, robots
+from iblf_jax.engine import RunRequest
 from iblf_jax.engine.execute import run_batch
 from iblf_jax.engine.mechanism import mechanism_of
-from iblf_jax.engine.step import Run
 from iblf_jax.simulation.scenario import canonical
 from iblf_jax.studies.cube import bounded
 from iblf_jax.tuning import TuningProblem, _falsify, evaluation
@@ -669,7 +669,9 @@ def margins_of(scenario: ij.Scenario, sets: dict[str, Any], timing: dict[str, fl
     """
     scenario = canonical(scenario)
     cube = bounded(scenario, sets)
-    run = Run(round(timing["duration"] / timing["dt"]), "rk4", mechanism=mechanism_of(scenario))
+    run = RunRequest(
+        round(timing["duration"] / timing["dt"]), "rk4", constants=mechanism_of(scenario)
+    )
     fold = jax.tree.map(jnp.asarray, Quantities((Peak(1.0, "deficit"),)))
 
     @jax.jit

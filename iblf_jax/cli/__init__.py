@@ -1,8 +1,8 @@
 """The command line: `python -m iblf_jax COMMAND`, or `iblf-jax COMMAND`.
 
-One module a command, each with `add_parser(subparsers)` and `run(args) -> int`; a new command is a
-new module and a word in `COMMANDS`.  `run` imports what is slow to import, so that `--help` is
-quick.  The commands compute in float64.
+Each command is one module with `add_parser(subparsers)` and `run(args) -> int`.  A new command is a
+new module and its name in `COMMANDS`.  Slow imports stand inside `run`, so that `--help` is fast.
+The commands compute in float64.
 
 Exit codes: 0 done; 1 a run failed (a bound was violated, the state diverged, the step was too
 large); 2 bad arguments or files, with one line on stderr; 3 a study did not finish (disk full, a
@@ -41,14 +41,14 @@ COMMANDS = (
 
 
 LONGEST_WORD = 400
-"""Characters of a word that an error or a warning repeats: a user's may be of any length."""
+"""Characters of one word in an error or a warning; longer words are shortened."""
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser that says what is wrong in one line."""
+    """An argument parser that reports an error in one line."""
 
     def _get_values(self, action: argparse.Action, arg_strings: list[str]) -> Any:
-        """The value of an option; of `--out=--` Python 3.11 and 3.12 make an empty list."""
+        """Rejects `--out=--`, from which Python 3.11 and 3.12 would make an empty list."""
         if action.option_strings and action.nargs is None and arg_strings == ["--"]:
             self.error(f"argument {'/'.join(action.option_strings)}: expected one argument")
         return super()._get_values(action, arg_strings)
@@ -63,10 +63,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command.
 
     Args:
-      argv: the words after the program's name; those of the process if not given.
+      argv: the arguments after the program's name (default: those of the process).
 
     Returns:
-      The exit code (head of this module).
+      The exit code (listed at the top of this module).
     """
     try:
         args = build_parser().parse_args(argv)
@@ -81,7 +81,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             code = args.run(args)
             sys.stdout.flush()
             return code
-        except BrokenPipeError:  # the reader of a pipe has gone, as `head` does
+        except BrokenPipeError:  # the reader of the pipe has closed it, as `head` does
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 0
         except ValueError as error:
@@ -93,8 +93,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             complain(text)
         except (MemoryError, jax.errors.JaxRuntimeError) as error:
             complain(
-                f"the machine gave up: {error}. A shorter --duration or a larger --record-every"
-                " takes less memory."
+                f"the computation could not be completed: {error}. A shorter --duration or a larger"
+                " --record-every takes less memory."
             )
         except KeyboardInterrupt:
             complain("interrupted")
@@ -103,9 +103,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def entry() -> NoReturn:
-    """A process of its own for one command: ends with `main`'s exit code.
+    """Runs `main` and ends the process with its exit code.
 
-    An interrupted one ends without taking JAX down, see `end_process`.
+    After an interrupt the process ends without the shutdown of JAX, see `end_process`.
     """
     signal.signal(signal.SIGINT, end_process)
     code = main()
@@ -123,16 +123,19 @@ def _warn_once(message: str, shown: set[str]) -> None:
 
 
 def complain(message: str, kind: str = "error") -> None:
-    """One line on stderr that can be read."""
-    words = [
-        x if len(x) <= LONGEST_WORD else f"{x[: LONGEST_WORD - 23]}...{x[-20:]}"
-        for x in message.split()
-    ]
-    print(f"iblf-jax: {kind}: {checks.line(' '.join(words), 'message')}", file=sys.stderr)
+    """Prints an error or a warning as one line on stderr."""
+    text = " ".join(map(_shortened, message.split()))
+    print(f"iblf-jax: {kind}: {checks.line(text, 'message')}", file=sys.stderr)
+
+
+def _shortened(word: str) -> str:
+    if len(word) <= LONGEST_WORD:
+        return word
+    return f"{word[: LONGEST_WORD - 23]}...{word[-20:]}"
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The parser of all commands."""
+    """Returns the parser of all commands."""
     import iblf_jax
 
     parser = Parser(
@@ -160,6 +163,6 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def prepare_jax() -> None:
-    """Float64, and compiled programs kept from the first on."""
+    """Enables float64 and the persistent cache of compiled programs."""
     jax.config.update("jax_enable_x64", True)
     keep_programs()

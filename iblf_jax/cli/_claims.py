@@ -1,7 +1,7 @@
-"""What the paper says that its figures show (section 4), each claim computed from the two runs.
+"""The claims of the paper about its figures (section 4), each checked against the two runs.
 
-A claim says in its own words by which numbers it is judged, so that a reader can disagree.  "Late"
-is the second half of the run; the initial stage is its first second.
+The text of each claim names the numbers and the tolerance that decide it.  "Late" means the second
+half of a run; the initial stage is its first second.
 """
 
 from __future__ import annotations
@@ -18,73 +18,84 @@ if TYPE_CHECKING:
 
 Pair = Mapping[str, "Rollout"]
 """The two runs by name: the integral form first, then the logarithmic one."""
+ByName = Mapping[str, np.ndarray]
+"""One number per joint, (n,), for each run by name."""
 
 INITIAL_STAGE = 1.0
 """s."""
 NEIGHBOURHOOD = 0.01
-"""Late errors count as a very small neighbourhood of zero below this share of their own peak."""
+"""A late error below this share of its own peak counts as a very small neighbourhood of zero."""
 ESTIMATE_SHARE = 0.1
-"""The estimate counts as following the uncertain term if its late error stays below this share of
-the term's peak."""
+"""The estimate follows the uncertain term if its late error stays below this share of the term's
+peak."""
 SETTLED = 0.01
 """rad; the tolerance of the metric settling_time."""
 
 
 class PaperClaim(NamedTuple):
-    """One claim of the paper and what the runs say."""
+    """One claim of the paper, whether the runs confirm it, and the numbers that decide it."""
 
     claim: str
-    held: bool
+    confirmed: bool
     detail: str
     numbers: dict[str, Any]
 
 
 def paper_claims(runs: Pair) -> list[PaperClaim]:
-    """Every claim, judged.
+    """Checks every claim.
 
     Args:
       runs: two runs by name, of the integral and the logarithmic law, in this order.
     """
-    judges = (
-        bounds_kept,
-        both_track,
-        faster,
-        more_accurate,
-        overshoot_of_e2,
-        estimate_follows,
-        small_neighbourhood,
-        theorem_1,
-    )
-    return [judge(runs) for judge in judges]
+    return [
+        bounds_kept(runs),
+        both_track(runs),
+        faster(runs),
+        more_accurate(runs),
+        overshoot_of_e2(runs),
+        estimate_follows(runs),
+        small_neighbourhood(runs),
+        theorem_1(runs),
+    ]
 
 
 def each_joint(values: Any, unit: str) -> str:
-    """Numbers of the joints as text, such as 0.99 / 0.71 s."""
-    shown = " / ".join(
-        f"{x:.3g}" if np.isfinite(x) else "never" for x in np.ravel(np.asarray(values, float))
-    )
+    """One number per joint as text, such as 0.99 / 0.71 s."""
+    shown = " / ".join(map(_or_never, np.ravel(np.asarray(values, float))))
     return f"{shown} {unit}".rstrip()
+
+
+def _or_never(value: float) -> str:
+    if not np.isfinite(value):
+        return "never"
+    return f"{value:.3g}"
 
 
 def _versus(by_name: Mapping[str, Any], unit: str) -> str:
     return ", ".join(f"{name} {each_joint(values, unit)}" for name, values in by_name.items())
 
 
-def _late(run: Rollout) -> np.ndarray:
-    t = np.asarray(run.t)
-    return t >= 0.5 * t[-1]
+def _peak(values: Any) -> np.ndarray:
+    return np.abs(np.asarray(values)).max(axis=0)
 
 
 def _late_peak(run: Rollout, values: Any) -> np.ndarray:
-    return np.abs(np.asarray(values))[_late(run)].max(axis=0)
+    """Returns the peak over the second half of a run, (n,)."""
+    t = np.asarray(run.t)
+    return _peak(np.asarray(values)[t >= 0.5 * t[-1]])
 
 
-def _metric(runs: Pair, name: str) -> dict[str, np.ndarray]:
+def _are_below(values: ByName, share: float, peaks: ByName) -> bool:
+    """Whether the values of every run and joint are below a share of their peaks."""
+    return all(bool(np.all(values[name] < share * peaks[name])) for name in values)
+
+
+def _metric(runs: Pair, name: str) -> ByName:
     return {label: np.asarray(run.metrics[name]) for label, run in runs.items()}
 
 
 def bounds_kept(runs: Pair) -> PaperClaim:
-    """The constraint boundaries are not broken."""
+    """Claim: the constraint boundaries are not broken."""
     margins = _metric(runs, "margin")
     flagged = [name for name, run in runs.items() if int(run.status) & int(Status.BOUND_VIOLATED)]
     confirmed = not flagged and all(np.all(m > 0) for m in margins.values())
@@ -98,7 +109,7 @@ def bounds_kept(runs: Pair) -> PaperClaim:
 
 
 def both_track(runs: Pair) -> PaperClaim:
-    """The robot tracks the reference under both laws."""
+    """Claim: the robot tracks the reference under both laws."""
     times = _metric(runs, "settling_time")
     confirmed = all(np.all(np.isfinite(x)) for x in times.values())
     detail = f"|e1| stays under {SETTLED:g} rad from: {_versus(times, 's')}."
@@ -108,7 +119,7 @@ def both_track(runs: Pair) -> PaperClaim:
 
 
 def faster(runs: Pair) -> PaperClaim:
-    """The trajectory converges more quickly under the proposed law."""
+    """Claim: the trajectory converges more quickly under the proposed law."""
     times = _metric(runs, "settling_time")
     proposed, compared = times.values()
     confirmed = bool(np.all(np.isfinite(proposed)) and np.all(proposed < compared))
@@ -121,10 +132,10 @@ def faster(runs: Pair) -> PaperClaim:
 
 
 def more_accurate(runs: Pair) -> PaperClaim:
-    """The control accuracy is slightly higher, the tracking error smaller."""
+    """Claim: the control accuracy is slightly higher, the tracking error smaller."""
     rmse = _metric(runs, "rmse")
     late = {name: _late_peak(run, run.e1) for name, run in runs.items()}
-    confirmed = all(bool(np.all(a < b)) for a, b in (tuple(rmse.values()), tuple(late.values())))
+    confirmed = _first_is_smaller(rmse) and _first_is_smaller(late)
     detail = f"rms of e1 {_versus(rmse, 'rad')}; largest late |e1| {_versus(late, 'rad')}."
     return PaperClaim(
         "The integral form is slightly more accurate.",
@@ -134,45 +145,48 @@ def more_accurate(runs: Pair) -> PaperClaim:
     )
 
 
+def _first_is_smaller(values: ByName) -> bool:
+    proposed, compared = values.values()
+    return bool(np.all(proposed < compared))
+
+
 def overshoot_of_e2(runs: Pair) -> PaperClaim:
-    """The overshoot of the velocity error is greater in the initial stage."""
-    swings = {}
+    """Claim: the overshoot of the velocity error is greater in the initial stage."""
+    overshoots = {}
     for name, run in runs.items():
         e2 = np.asarray(run.e2)[np.asarray(run.t) <= INITIAL_STAGE]
-        swings[name] = np.maximum(0.0, (-np.sign(e2[0]) * e2).max(axis=0))
-    proposed, compared = swings.values()
-    detail = (
-        f"how far e2 swings past zero in the first {INITIAL_STAGE:g} s: {_versus(swings, 'rad/s')}."
-    )
+        overshoots[name] = np.maximum(0.0, (-np.sign(e2[0]) * e2).max(axis=0))
+    proposed, compared = overshoots.values()
+    shown = _versus(overshoots, "rad/s")
+    detail = f"overshoot of e2 beyond zero in the first {INITIAL_STAGE:g} s: {shown}."
     confirmed = bool(np.all(proposed > compared))
     return PaperClaim(
         "The integral form overshoots more in e2 at the start.",
         confirmed,
         detail,
-        {"overshoot of e2 [rad/s]": swings},
+        {"overshoot of e2 [rad/s]": overshoots},
     )
 
 
-def _estimate_errors(runs: Pair) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Largest late |f - f_hat| and peak |f|, by name, each (n,) [N m]."""
+def _estimate_errors(runs: Pair) -> tuple[ByName, ByName]:
+    """Returns the largest late |f - f_hat| and the peak of |f| of each run, each (n,) [N m]."""
     late = {
         name: _late_peak(run, run.disturbance - run.disturbance_estimate)
         for name, run in runs.items()
     }
-    return late, {
-        name: np.abs(np.asarray(run.disturbance)).max(axis=0) for name, run in runs.items()
-    }
+    peak = {name: _peak(run.disturbance) for name, run in runs.items()}
+    return late, peak
 
 
 def estimate_follows(runs: Pair) -> PaperClaim:
-    """The observer's estimate tends to the uncertain term."""
+    """Claim: the observer's estimate tends to the uncertain term."""
     late, peak = _estimate_errors(runs)
-    confirmed = all(bool(np.all(late[name] < ESTIMATE_SHARE * peak[name])) for name in runs)
+    confirmed = _are_below(late, ESTIMATE_SHARE, peak)
     share = {name: 100.0 * late[name] / peak[name] for name in runs}
     detail = (
         f"largest late |f - f_hat|: {_versus(late, 'N m')}; as a share of the peak of |f|:"
-        f" {_versus(share, '%')} (held if under {100 * ESTIMATE_SHARE:g} %; the observer lags by"
-        " 1/kf, so about |f'|/kf remains)."
+        f" {_versus(share, '%')} (confirmed if under {100 * ESTIMATE_SHARE:g} %; the observer"
+        " lags by 1/kf, so about |f'|/kf remains)."
     )
     return PaperClaim(
         "The observer's estimate tends to the uncertain term.",
@@ -183,23 +197,18 @@ def estimate_follows(runs: Pair) -> PaperClaim:
 
 
 def small_neighbourhood(runs: Pair) -> PaperClaim:
-    """The error signals e1, e2 and f_tilde tend to a very small neighbourhood of zero."""
+    """Claim: e1, e2 and f_tilde tend to a very small neighbourhood of zero."""
     e1 = {name: _late_peak(run, run.e1) for name, run in runs.items()}
     e2 = {name: _late_peak(run, run.e2) for name, run in runs.items()}
     f_tilde, peak = _estimate_errors(runs)
-    small = all(
-        bool(
-            np.all(late[name] < NEIGHBOURHOOD * np.abs(np.asarray(getattr(run, field))).max(axis=0))
-        )
-        for name, run in runs.items()
-        for field, late in (("e1", e1), ("e2", e2))
-    )
-    confirmed = small and all(
-        bool(np.all(f_tilde[name] < ESTIMATE_SHARE * peak[name])) for name in runs
+    confirmed = (
+        _are_below(e1, NEIGHBOURHOOD, {name: _peak(run.e1) for name, run in runs.items()})
+        and _are_below(e2, NEIGHBOURHOOD, {name: _peak(run.e2) for name, run in runs.items()})
+        and _are_below(f_tilde, ESTIMATE_SHARE, peak)
     )
     detail = (
         f"largest late values: |e1| {_versus(e1, 'rad')}; |e2| {_versus(e2, 'rad/s')}; |f_tilde|"
-        f" {_versus(f_tilde, 'N m')} (held if e1 and e2 are under {100 * NEIGHBOURHOOD:g} % of"
+        f" {_versus(f_tilde, 'N m')} (confirmed if e1 and e2 are under {100 * NEIGHBOURHOOD:g} % of"
         f" their peaks, f_tilde under {100 * ESTIMATE_SHARE:g} % of the peak of |f|)."
     )
     numbers = {"late |e1| [rad]": e1, "late |e2| [rad/s]": e2, "late |f_tilde| [N m]": f_tilde}
@@ -209,8 +218,9 @@ def small_neighbourhood(runs: Pair) -> PaperClaim:
 
 
 def _along(run: Rollout, barrier: Any) -> tuple[np.ndarray, np.ndarray]:
-    """V1 of a barrier and xi at every sample of a run, (T, n), of the same bounds to the last
-    digit.
+    """Returns V1 of a barrier and xi at every sample of a run, (T, n) each.
+
+    Both come from one evaluation of the bounds, so that no rounding separates them.
     """
     import jax
 
@@ -223,12 +233,13 @@ def _along(run: Rollout, barrier: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def theorem_1(runs: Pair) -> PaperClaim:
-    """Theorem 1, xi^2/2 <= V1 <= xi^2/(1 - xi^2), along the run of the integral form."""
+    """Claim: xi^2/2 <= V1 <= xi^2/(1 - xi^2) (Theorem 1) along the run of the integral form."""
     from iblf_jax.control.barriers import Integral
 
     run = next(iter(runs.values()))
     V1, xi = _along(run, Integral())
-    low, high = 0.5 * xi**2, xi**2 / (1.0 - xi**2)
+    low = 0.5 * xi**2
+    high = xi**2 / (1.0 - xi**2)
     rounding = 8 * np.finfo(V1.dtype).eps * high + np.finfo(V1.dtype).tiny
     kept = (low <= V1 + rounding) & (high + rounding >= V1)
     broken = int(np.sum(~kept))
@@ -254,7 +265,7 @@ def theorem_1(runs: Pair) -> PaperClaim:
 
 
 def assumed(runs: Pair) -> str:
-    """What these runs assume because the paper does not print it: the numbers of the arm."""
+    """Returns the numbers of the arm, which the paper does not print, as text."""
     arm: Any = next(iter(runs.values())).scenario.plant  # the preset's TwoLink
     numbers = (
         ("masses", arm.mass, "kg"),
@@ -272,23 +283,22 @@ def assumed(runs: Pair) -> str:
 
 
 def _all_digits(values: Any) -> str:
-    """Numbers of the joints as text, with the digits that they were given."""
+    """One number per joint as text, in six significant digits."""
     return " / ".join(f"{x:.6g}" for x in np.ravel(np.asarray(values, float)))
 
 
 def remark(runs: Pair) -> str:
-    """What the comparison rests on: the two barriers differ by a factor of two, here confirmed
-    along the run.
-    """
+    """Returns a remark on the comparison: the two barriers differ by a factor of two."""
     from iblf_jax.control.barriers import Integral, Log
 
     run = next(iter(runs.values()))
-    (integral, _), (log, _) = _along(run, Integral()), _along(run, Log(p=1))
+    integral, _ = _along(run, Integral())
+    log, _ = _along(run, Log(p=1))
     worst = float(np.max(np.abs(integral - 2.0 * log)))
     return (
         "V_integral = 2 V_log (p = 1) identically (largest difference along this run:"
         f" {worst:.1g}). So with equal gains the integral form has twice the barrier term in its"
-        " torque, and that factor is the whole difference between these two runs: a log law whose"
+        " torque, and that factor is the only difference between these two runs: a log law whose"
         " barrier term is doubled is the same law. The comparison shows the gain of the barrier"
         " term, not the form of the barrier."
     )

@@ -1,5 +1,6 @@
-"""What the commands share: how a scenario is named, changed and run, how results are printed and
-written.
+"""Functions that several commands share.
+
+They define the arguments that select, change and run a scenario, and they print and write results.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import math
 import os
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,17 +22,35 @@ if TYPE_CHECKING:
     from iblf_jax.simulation.results import Rollout
 
 RUN_DEFAULTS: dict[str, Any] = {"duration": 20.0, "dt": 1e-3, "method": "rk4", "record_every": 1}
-"""How a scenario is run if neither the command line nor its file says."""
+"""Options of a run that neither the command line nor the scenario file gives."""
+
+FAILURES = "a bound was violated, the state diverged, or the step was too large."
+"""The reasons for which a run fails, for help texts."""
 
 
 def add_scenario_arguments(parser: argparse.ArgumentParser, default: str | None = None) -> None:
-    """SCENARIO (which may be left out if there is a default), --arg and --set."""
+    """Adds SCENARIO (optional if there is a default), --arg and --set."""
     words = "a scenario file, or the name of a preset"
     optional: dict[str, Any] = {}
     if default:
         words += f" (default: {default})"
         optional = {"nargs": "?", "default": default}
     parser.add_argument("scenario", metavar="SCENARIO.toml|PRESET", help=words, **optional)
+    add_preset_arguments(parser)
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="PATH=VALUE",
+        help=(
+            "the value of a parameter, such as controller.K2=30 or initial.q=[0.7,0.6]; may be"
+            " repeated"
+        ),
+    )
+
+
+def add_preset_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds --arg."""
     parser.add_argument(
         "--arg",
         action="append",
@@ -39,20 +58,10 @@ def add_scenario_arguments(parser: argparse.ArgumentParser, default: str | None 
         metavar="NAME=VALUE",
         help="an argument of the preset, such as law=log; may be repeated",
     )
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="PATH=VALUE",
-        help=(
-            "another value for a parameter, such as controller.K2=30 or initial.q=[0.7,0.6]; may be"
-            " repeated"
-        ),
-    )
 
 
 def add_run_arguments(parser: argparse.ArgumentParser) -> None:
-    """--duration, --dt, --method, --record-every."""
+    """Adds --duration, --dt, --method and --record-every."""
     parser.add_argument(
         "--duration",
         type=float,
@@ -72,19 +81,19 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def scenario_of(args: argparse.Namespace) -> ScenarioFile:
-    """The scenario that the arguments name, with their changes, and the [run] table of its file."""
+    """Returns the scenario of the arguments with its changes, and the [run] table of its file."""
     from iblf_jax.files.scenario import ScenarioFile, from_dict, load_scenario_file
     from iblf_jax.files.values import numbers
     from iblf_jax.presets import PRESETS
     from iblf_jax.simulation.paths import with_parameters
 
-    words = assignments("--arg", args.arg)
+    arguments = assignments("--arg", args.arg)
     if args.scenario in PRESETS:
         source = ""
-        if words:
+        if arguments:
             source = "--arg"
-        file = from_dict({"preset": args.scenario, "arguments": words}, source=source)
-    elif words:
+        file = from_dict({"preset": args.scenario, "arguments": arguments}, source=source)
+    elif arguments:
         raise ValueError(
             f"--arg: {args.scenario} is not a preset, and only presets take arguments; use --set"
             " for parameters."
@@ -104,21 +113,22 @@ def _check_exists(name: str) -> None:
     from iblf_jax.files.values import did_you_mean
     from iblf_jax.presets import PRESETS
 
-    if not Path(name).is_file():
-        remedy = did_you_mean(name, PRESETS)
-        if name.endswith(".toml"):
-            remedy = "Give the path of a scenario file."
-        raise ValueError(f"{name}: no such file, and no such preset. {remedy}")
+    if Path(name).is_file():
+        return
+    remedy = did_you_mean(name, PRESETS)
+    if name.endswith(".toml"):
+        remedy = "Give the path of a scenario file."
+    raise ValueError(f"{name}: no such file, and no such preset. {remedy}")
 
 
 def assignments(option: str, words: list[str]) -> dict[str, Any]:
-    """NAME=VALUE words as a dict; values are TOML, and a bare word is a string."""
+    """Returns NAME=VALUE words as a dict; a value is TOML, or a string if it is not."""
     from iblf_jax.core import checks
     from iblf_jax.files.values import toml_tables
 
     values = {}
     for word in words:
-        # Of NAME the part in brackets, the name of a link, may hold an = itself.
+        # The part of NAME in brackets is the name of a link, which can contain "=".
         found = re.fullmatch(
             r"""((?:\["(?:[^"\\]|\\.)*"\]|\[[^\]]*\]|[^=\[])*)=(.*)""", word, re.DOTALL
         )
@@ -140,13 +150,17 @@ def assignments(option: str, words: list[str]) -> dict[str, Any]:
 
 
 def run_options(args: argparse.Namespace, file: ScenarioFile) -> dict[str, Any]:
-    """Duration, dt, method and record_every: the command line's, else the file's, else the
-    defaults.
+    """Returns duration, dt, method and record_every.
+
+    The command line takes precedence over the file, and the file over the defaults.
     """
-    given = {
-        key: getattr(args, key) for key in RUN_DEFAULTS if getattr(args, key, None) is not None
-    }
-    return RUN_DEFAULTS | file.run | given
+    return RUN_DEFAULTS | file.run | given_options(args, *RUN_DEFAULTS)
+
+
+def given_options(args: argparse.Namespace, *names: str) -> dict[str, Any]:
+    """Returns those of the named options that have a value."""
+    values = vars(args)
+    return {name: values[name] for name in names if values.get(name) is not None}
 
 
 def optional_folder(name: str | None) -> Path | None:
@@ -157,26 +171,27 @@ def optional_folder(name: str | None) -> Path | None:
 
 
 def output_folder(name: str) -> Path:
-    """The folder of --out, made if it does not exist; ValueError if it cannot be written."""
+    """Returns the folder of --out and creates it if necessary.
+
+    Raises:
+      ValueError: the folder cannot be written.
+    """
     folder = Path(name)
+    reason = "no permission"
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        if os.access(folder, os.W_OK | os.X_OK):
+            return folder
     except OSError as error:
-        raise ValueError(
-            f"--out: got {name!r}, expected a folder that can be written ({error.strerror})."
-        ) from error
-    if not os.access(folder, os.W_OK | os.X_OK):
-        raise ValueError(
-            f"--out: got {name!r}, expected a folder that can be written (no permission)."
-        )
-    return folder
+        reason = str(error.strerror)
+    raise ValueError(f"--out: got {name!r}, expected a folder that can be written ({reason}).")
 
 
 # ------------------------------------------------------------------------------- numbers as text
 
 
 def strict(value: Any) -> Any:
-    """`value` in what strict JSON has: arrays become lists, NaN and infinities null."""
+    """Returns `value` as strict JSON: arrays become lists, NaN and infinities become null."""
     if isinstance(value, Mapping):
         return {str(key): strict(x) for key, x in value.items()}
     if isinstance(value, str | bool | int) or value is None:
@@ -196,7 +211,7 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def verdict(run: Rollout) -> dict[str, Any]:
-    """Status and metrics of one run, for JSON."""
+    """Returns status and metrics of one run, for JSON."""
     from iblf_jax.core.status import Status, describe
 
     status = Status(int(run.status))
@@ -212,7 +227,7 @@ def verdict(run: Rollout) -> dict[str, Any]:
 
 
 def number(value: Any) -> str:
-    """A number in four significant digits; a dash for what never happened."""
+    """A number in four significant digits; a dash for NaN and infinity (no event)."""
     value = float(value)
     if not math.isfinite(value):
         return "-"
@@ -220,29 +235,35 @@ def number(value: Any) -> str:
 
 
 def metrics_table(runs: Mapping[str, Rollout]) -> str:
-    """Metrics of runs side by side, one column a joint, with units."""
+    """Metrics of runs side by side, one column per joint, with units."""
     from iblf_jax.core import tables
     from iblf_jax.simulation.signals import OF_REGIONS
     from iblf_jax.world.robots import joint_names
 
     first = next(iter(runs.values()))
-    joints = joint_names(first.scenario.plant, first.n)
-    rows = [["metric", "unit", *(cell for _ in runs for cell in joints)]]
+    n = first.n
+    rows = [["metric", "unit", *joint_names(first.scenario.plant, n) * len(runs)]]
     for name, unit in first.metrics.units.items():
         values = [np.ravel(run.metrics[name]) for run in runs.values()]
-        # One row a region: there may be more of them than joints.
-        lines = [(name, values)]
-        if name in OF_REGIONS:
-            lines = [
-                (f"{name}[{i}]", [x[i : i + 1] for x in values]) for i in range(values[0].size)
-            ]
-        is_index = name.endswith(("violation_joint", "violation_region"))
-        for shown, numbers in lines:
-            row = [shown, unit]
+        if name.endswith(("violation_joint", "violation_region")):
+            values = [np.where(x < 0, np.nan, x) for x in values]  # -1: no violation
+        lines = {name: values}
+        if name in OF_REGIONS:  # one row per region: there can be more regions than joints
+            lines = {f"{name}[{i}]": [x[i : i + 1] for x in values] for i in range(values[0].size)}
+        for label, numbers in lines.items():
+            row = [label, unit]
             for x in numbers:
-                cells = [number(math.nan if is_index and y < 0 else y) for y in x]
-                row += [*cells, *[""] * (first.n - len(cells))]
+                row += _padded(map(number, x), n)
             rows.append(row)
-    if any(runs):  # a name, over the first of its joints
-        rows.insert(0, ["", "", *(cell for name in runs for cell in [name, *[""] * (first.n - 1)])])
+    if any(runs):  # the name of each run above its first joint
+        head = ["", ""]
+        for name in runs:
+            head += _padded([name], n)
+        rows.insert(0, head)
     return "\n".join(tables.as_text(rows, left=(0, 1)))
+
+
+def _padded(cells: Iterable[str], size: int) -> list[str]:
+    """The cells of one run, filled up with empty ones."""
+    cells = list(cells)
+    return cells + [""] * (size - len(cells))

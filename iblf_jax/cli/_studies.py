@@ -1,6 +1,4 @@
-"""What the commands for many runs share: where the runs are computed, exit codes, and the file of
-results.
-"""
+"""Functions that `montecarlo` and `sweep` share: arguments, executors, exit codes and output."""
 
 from __future__ import annotations
 
@@ -14,10 +12,10 @@ if TYPE_CHECKING:
     import xarray
 
 MOST_DEVICES = 256
-"""CPU devices of one process; each has threads of its own, and XLA aborts where the system gives it
-no more."""
+"""Largest number of CPU devices: each has its own threads, and XLA aborts if the system has none
+left."""
 UNFINISHED = 3
-"""Exit code: a disk is full or a worker was lost; the same command computes the rest."""
+"""Exit code if a disk is full or a worker was lost; the same command then computes the rest."""
 
 DASK_TIMEOUT = 30
 """Seconds to wait for a Dask scheduler."""
@@ -30,19 +28,19 @@ EPILOG = (
 
 
 def add_study_arguments(parser: argparse.ArgumentParser) -> None:
-    """--out, --devices, --chunk, --dask, --quiet, and the deprecated ones of `jax.distributed`."""
+    """Adds --out, --devices, --chunk, --quiet, --dask and the deprecated options for processes."""
     parser.add_argument("--out", metavar="FILE.nc", help="write the results as netCDF")
     parser.add_argument(
         "--devices",
         type=int,
         metavar="N",
-        help="use N CPU devices, one a core (default: JAX's, one)",
+        help="use N CPU devices, one per core (default: those of JAX, usually 1)",
     )
     parser.add_argument(
         "--chunk",
         type=int,
         metavar="N",
-        help="runs in flight at a time (default: from a memory budget)",
+        help="runs that are computed together (default: from a memory budget)",
     )
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     parser.add_argument(
@@ -58,12 +56,16 @@ def add_study_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--heartbeat", type=int, default=10, help=argparse.SUPPRESS)
 
 
-def carried_out(args: argparse.Namespace, work: Callable[[dict[str, Any]], int]) -> int:
-    """Sets up devices and workers, does the work, and turns its errors into exit codes.
+def run_study(args: argparse.Namespace, work: Callable[[dict[str, Any]], int]) -> int:
+    """Sets up devices and workers, runs a study, and turns its errors into exit codes.
 
     Args:
-      args: the arguments.
-      work: gets the keyword arguments that `monte_carlo` and `sweep` share; returns the exit code.
+      args: the arguments of the command.
+      work: runs the study with the keyword arguments `executor` and `progress`; returns the exit
+        code.
+
+    Returns:
+      The exit code.
     """
     from iblf_jax.cli import INTERRUPTED, complain
     from iblf_jax.studies import WorkerError, distributed
@@ -108,7 +110,7 @@ def _set_devices(number: int | None) -> None:
 
 @contextlib.contextmanager
 def _executor(args: argparse.Namespace) -> Iterator[Any]:
-    """Where the runs are computed: in this process, or by the workers of --dask."""
+    """Yields the executor of the runs: this process, or the workers of --dask."""
     from iblf_jax.studies import ThisProcess, initialize_worker
 
     if args.dask is None:
@@ -129,15 +131,16 @@ def _executor(args: argparse.Namespace) -> Iterator[Any]:
 
 
 def _check_out(name: str | None) -> None:
-    if name is not None:
-        if Path(name).suffix != ".nc":
-            raise ValueError(f"--out: got {name!r}, expected a file that ends in .nc.")
-        if not Path(name).absolute().parent.is_dir():
-            raise ValueError(f"--out: got {name!r}, expected a file in a folder that exists.")
+    if name is None:
+        return
+    if Path(name).suffix != ".nc":
+        raise ValueError(f"--out: got {name!r}, expected a file that ends in .nc.")
+    if not Path(name).absolute().parent.is_dir():
+        raise ValueError(f"--out: got {name!r}, expected a file in a folder that exists.")
 
 
 def write_netcdf(data: xarray.Dataset, name: str | None) -> None:
-    """Writes the file of --out, on the first process."""
+    """Writes the file of --out in the first process."""
     from iblf_jax.studies import distributed
 
     if name is not None and distributed.rank() == 0:

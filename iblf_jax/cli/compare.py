@@ -1,4 +1,4 @@
-"""`compare`: several laws on one scenario, at the gains they have and at equal effort."""
+"""`compare`: runs several laws on one scenario, at their given gains and at equal effort."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import argparse
 from typing import TYPE_CHECKING, Any
 
 from iblf_jax.cli._common import (
+    FAILURES,
     add_run_arguments,
     add_scenario_arguments,
     optional_folder,
@@ -27,13 +28,10 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
         "compare",
         help="run several laws side by side",
         description=(
-            "Run several laws on one scenario, at the gains they have and at equal effort (RMS"
-            " torque above gravity), and print two tables that say what is equal in each."
+            "Run several laws on one scenario, at their given gains and at equal effort (RMS torque"
+            " above gravity), and print one table for each."
         ),
-        epilog=(
-            "Exit code 1 if a run at the given gains failed: a bound was violated, the state ran"
-            " away, or the step was too large."
-        ),
+        epilog=f"Exit code 1 if a run at the given gains failed: {FAILURES}",
     )
     add_scenario_arguments(parser, default="zhang_yan_2024")
     add_run_arguments(parser)
@@ -43,11 +41,13 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
         metavar="LAW",
         help="the laws, the first of which sets the effort (default: the paper's)",
     )
-    parser.add_argument("--gains-only", action="store_true", help="do not look for equal effort")
+    parser.add_argument(
+        "--gains-only", action="store_true", help="skip the comparison at equal effort"
+    )
     parser.add_argument(
         "--out",
         metavar="DIR",
-        help="write comparison.txt, comparison.csv, comparison.json, figures and rollouts.nc here",
+        help="write comparison.txt, .csv and .json, figures and rollouts.nc into this folder",
     )
     parser.set_defaults(run=run)
 
@@ -60,7 +60,8 @@ def run(args: argparse.Namespace) -> int:
     file = scenario_of(args)
     options = run_options(args, file)
     folder = optional_folder(args.out)
-    laws = [name for word in args.laws or LAWS for name in word.split(",") if name]
+    words = ",".join(args.laws or LAWS).split(",")
+    laws = [name for name in words if name]
     result = compare(file.scenario, laws, equal_effort=not args.gains_only, **options)
     print(f"{args.scenario}\n{result!r}")
     if folder is not None:
@@ -90,8 +91,8 @@ def _write(folder: Path, source: str, result: Comparison, options: dict[str, Any
     figures = {f"comparison_joint_{joint}": plotting.comparison(result, joint) for joint in joints}
     plotting.save(figures, folder, formats=("png", "pdf"))
     save_rollouts(result.rollouts, folder / "rollouts.nc")
-    named = ", ".join(figures)
+    names = ", ".join(figures)
     print(
-        f"\nwritten to {folder}: comparison.txt, comparison.csv, comparison.json, {named} (.png,"
+        f"\nwritten to {folder}: comparison.txt, comparison.csv, comparison.json, {names} (.png,"
         " .pdf), rollouts.nc"
     )

@@ -1,6 +1,4 @@
-"""`export`: the law or the closed loop of a scenario file or preset as C99, an FMU or
-WebAssembly.
-"""
+"""`export`: writes the law or the closed loop of a scenario as C99, an FMU or WebAssembly."""
 
 from __future__ import annotations
 
@@ -16,9 +14,9 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
         help="write a law as C99 or an FMU, or a closed loop for a browser",
         description=(
             "Write the law of a scenario as C99 or an FMU, or its closed loop as an FMU or"
-            " WebAssembly; print what it takes."
+            " WebAssembly; print files, operations and sizes."
         ),
-        epilog="Exit code 2 too where a compiler is missing or fails.",
+        epilog="Exit code 2 also if a compiler is missing or fails.",
     )
     add_scenario_arguments(parser)
     parser.add_argument("--out", required=True, metavar="DIR", help="the folder to write into")
@@ -26,7 +24,10 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
         "--target", default="c", metavar="NAME", help="c, fmu, fmu-loop or wasm (default: c)"
     )
     parser.add_argument(
-        "--period", type=float, metavar="S", help="of the law [s] (default: the scenario's)"
+        "--period",
+        type=float,
+        metavar="S",
+        help="sampling period of the law [s] (default: the scenario's)",
     )
     parser.add_argument(
         "--dtype", default="double", metavar="TYPE", help="double or float (default: double)"
@@ -35,12 +36,12 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
         "--reference",
         default="inside",
         metavar="WHERE",
-        help="inside, or given at every sample (default: inside)",
+        help="inside (a function of time) or given (an input at every sample) (default: inside)",
     )
     parser.add_argument(
         "--name",
         metavar="NAME",
-        help="what begins every name in the code (default: iblf_law or iblf_loop)",
+        help="prefix of every name in the code (default: iblf_law or iblf_loop)",
     )
     parser.add_argument(
         "--dt",
@@ -49,14 +50,15 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
         help="time step of a closed loop [s] (default: the file's, else 0.001)",
     )
     parser.add_argument(
-        "--method", help="of a closed loop: rk4, heun or euler (default: the file's, else rk4)"
+        "--method",
+        help="integrator of a closed loop: rk4, heun or euler (default: the file's, else rk4)",
     )
     parser.add_argument(
         "--seed",
         type=int,
         default=0,
         metavar="N",
-        help="of a closed loop's sensor noise (default: 0)",
+        help="seed of a closed loop's sensor noise (default: 0)",
     )
     parser.set_defaults(run=run)
 
@@ -64,26 +66,16 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
 def run(args: argparse.Namespace) -> int:
     """Runs the command."""
     from iblf_jax.cli import complain
-    from iblf_jax.cli._common import run_options
+    from iblf_jax.cli._common import given_options, run_options
     from iblf_jax.deployment.export import export
     from iblf_jax.kernels import ToolchainError
 
     file = scenario_of(args)
     options = run_options(args, file)
-    chosen = {
-        key: getattr(args, key)
-        for key in ("target", "period", "dtype", "reference", "name", "seed")
-    }
+    names = ("target", "period", "dtype", "reference", "name", "seed")
+    chosen = given_options(args, *names) | {key: options[key] for key in ("dt", "method")}
     try:
-        print(
-            export(
-                file.scenario,
-                output_folder(args.out),
-                dt=options["dt"],
-                method=options["method"],
-                **chosen,
-            )
-        )
+        print(export(file.scenario, output_folder(args.out), **chosen))
     except ToolchainError as error:
         complain(str(error))
         return 2

@@ -1,5 +1,6 @@
-"""`identify`: finds parameters of a robot from its log and writes the scenario with them, the
-report and the figure.
+"""`identify`: estimates parameters of a robot from its log.
+
+It writes the scenario with the estimates, a report and a figure.
 """
 
 from __future__ import annotations
@@ -11,20 +12,20 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
     """Adds the command."""
     parser = subparsers.add_parser(
         "identify",
-        help="find parameters of a robot from its log",
+        help="estimate parameters of a robot from its log",
         description=(
-            "Find the parameters that an identification file names (its format:"
+            "Estimate the parameters that an identification file names (its format:"
             " iblf_jax.files.identification) from the log that it names; print values, standard"
-            " errors and what the log cannot tell."
+            " errors and the parameters that the log does not identify."
         ),
-        epilog="Exit code 1 if the log cannot tell one of the parameters.",
+        epilog="Exit code 1 if the log does not identify one of the parameters.",
     )
     parser.add_argument("file", metavar="IDENTIFY.toml", help="an identification file")
     parser.add_argument(
         "--log",
         action="append",
         metavar="FILE",
-        help="another log, .csv or .nc, in place of the file's; may be repeated",
+        help="use this log, .csv or .nc, instead of the file's; may be repeated",
     )
     parser.add_argument(
         "--out",
@@ -39,25 +40,22 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Runs the command."""
-    from iblf_jax.cli._common import optional_folder
+    from iblf_jax.cli._common import given_options, optional_folder
     from iblf_jax.files.identification import identify_file
 
     folder = optional_folder(args.out)
-    given = {}
-    if args.log:
-        given["log"] = args.log
-    known = identify_file(args.file, **given)
-    print(known)
+    result = identify_file(args.file, **given_options(args, "log"))
+    print(result)
     if folder is not None:
         from iblf_jax import plotting
         from iblf_jax.files.scenario import save_scenario
 
-        save_scenario(known.scenario, folder / "scenario.toml")
-        known.save(folder / "identification.json")
-        known.save(folder / "identification.html")
-        plotting.save({"identification": known.plot()}, folder, formats=("png",))
+        save_scenario(result.scenario, folder / "scenario.toml")
+        result.save(folder / "identification.json")
+        result.save(folder / "identification.html")
+        plotting.save({"identification": result.plot()}, folder, formats=("png",))
         print(
             f"\nwritten to {folder}: scenario.toml, identification.json, identification.html,"
             " identification.png"
         )
-    return int(any(number.value is None for number in known.wanted))
+    return int(any(number.value is None for number in result.wanted))

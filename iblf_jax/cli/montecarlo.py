@@ -1,11 +1,11 @@
-"""`montecarlo`: many runs of one scenario with parameters drawn at random."""
+"""`montecarlo`: runs one scenario many times with random parameters."""
 
 from __future__ import annotations
 
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from iblf_jax.cli._studies import EPILOG, add_study_arguments, carried_out, write_netcdf
+from iblf_jax.cli._studies import EPILOG, add_study_arguments, run_study, write_netcdf
 from iblf_jax.core.tables import as_text
 
 if TYPE_CHECKING:
@@ -16,11 +16,11 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
     """Adds the command."""
     parser = subparsers.add_parser(
         "montecarlo",
-        help="run a scenario many times with parameters drawn at random",
+        help="run a scenario many times with random parameters",
         description=(
             "Run the study that a file describes (a scenario file with [run], [perturbations] and"
             " [study]); print how often the bounds were violated, quantiles of the metrics, the"
-            " worst runs, and which parameters go with the margin."
+            " worst runs, and which parameters correlate with the margin."
         ),
         epilog=EPILOG,
     )
@@ -36,36 +36,37 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
 def run(args: argparse.Namespace) -> int:
     """Runs the command."""
 
-    def work(how: dict[str, Any]) -> int:
+    def work(execution: dict[str, Any]) -> int:
+        from iblf_jax.cli._common import given_options
         from iblf_jax.files.study import load_study_file
         from iblf_jax.studies import distributed
         from iblf_jax.studies.monte_carlo import monte_carlo
 
         file = load_study_file(args.file, "study")
-        given = {
-            key: getattr(args, key) for key in ("runs", "seed") if getattr(args, key) is not None
-        }
-        study = monte_carlo(file.scenario, file.perturbations, **file.options | given | how)
+        options = file.options | given_options(args, "runs", "seed") | execution
+        study = monte_carlo(file.scenario, file.perturbations, **options)
         if distributed.rank() == 0:
             print(report(study))
         write_netcdf(study.to_xarray(), args.out)
         return int(len(study.failed) > 0)
 
-    return carried_out(args, work)
+    return run_study(args, work)
 
 
 def report(study: Study) -> str:
-    """What a study found, as text."""
+    """Returns the results of a study as text."""
     import numpy as np
 
     from iblf_jax.cli._common import number
     from iblf_jax.studies.statistics import one_number
 
     rows = [["metric, worst joint", "unit", "5 %", "50 %", "95 %"]]
-    for name in study.metrics if study.made.any() else ():
-        levels = np.quantile(
-            one_number(study.metrics, name)[study.made], (0.05, 0.5, 0.95), method="inverted_cdf"
-        )
+    names: list[str] = []
+    if study.made.any():
+        names = list(study.metrics)
+    for name in names:
+        numbers = one_number(study.metrics, name)[study.made]
+        levels = np.quantile(numbers, (0.05, 0.5, 0.95), method="inverted_cdf")
         rows.append([name, study.metrics.units.get(name, ""), *map(number, levels)])
     worst = study.worst(5)
     lines = [

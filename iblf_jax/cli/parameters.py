@@ -1,6 +1,4 @@
-"""`parameters`: every number of a scenario that can be set, swept, perturbed or tuned, with its
-path.
-"""
+"""`parameters`: lists the numbers of a scenario that can be set, swept, perturbed or tuned."""
 
 from __future__ import annotations
 

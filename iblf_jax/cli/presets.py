@@ -1,35 +1,32 @@
-"""`presets`: which scenarios are ready to run, and any of them as TOML to start from."""
+"""`presets`: lists the predefined scenarios, or prints one of them as a scenario file."""
 
 from __future__ import annotations
 
 import argparse
 import inspect
+from collections.abc import Callable
+from typing import Any
+
+from iblf_jax.cli._common import add_preset_arguments, assignments
 
 
 def add_parser(subparsers: argparse._SubParsersAction) -> None:
     """Adds the command."""
     parser = subparsers.add_parser(
         "presets",
-        help="list the scenarios that are ready to run",
+        help="list the predefined scenarios",
         description="List the presets, describe one, or print it as a scenario file.",
     )
     parser.add_argument("name", nargs="?", metavar="PRESET", help="describe this one")
     parser.add_argument(
-        "--toml", action="store_true", help="print it as a scenario file: start from that"
+        "--toml", action="store_true", help="print it as a scenario file, to be edited"
     )
-    parser.add_argument(
-        "--arg",
-        action="append",
-        default=[],
-        metavar="NAME=VALUE",
-        help="an argument of the preset, such as law=log; may be repeated",
-    )
+    add_preset_arguments(parser)
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
     """Runs the command."""
-    from iblf_jax.cli._common import assignments
     from iblf_jax.core import tables
     from iblf_jax.files.scenario import preset_scenario, scenario_to_toml
     from iblf_jax.presets import PRESETS
@@ -40,10 +37,7 @@ def run(args: argparse.Namespace) -> int:
                 "--toml and --arg: expected the name of a preset before them; `presets` lists the"
                 " names."
             )
-        rows = [
-            (name, " ".join((inspect.getdoc(preset) or "").partition("\n")[0].split()))
-            for name, preset in PRESETS.items()
-        ]
+        rows = [(name, _summary(preset)) for name, preset in PRESETS.items()]
         print(*tables.as_text(rows), sep="\n")
         return 0
     scenario = preset_scenario(args.name, assignments("--arg", args.arg))
@@ -51,6 +45,12 @@ def run(args: argparse.Namespace) -> int:
         print(scenario_to_toml(scenario, run={"duration": 20.0, "dt": 1e-3}), end="")
     else:
         arguments = inspect.signature(PRESETS[args.name]).parameters.values()
-        taken = " ".join(f"--arg {argument.name}={argument.default}" for argument in arguments)
-        print(f"{args.name} {taken}\n\n{inspect.getdoc(PRESETS[args.name])}")
+        options = " ".join(f"--arg {argument.name}={argument.default}" for argument in arguments)
+        print(f"{args.name} {options}\n\n{inspect.getdoc(PRESETS[args.name])}")
     return 0
+
+
+def _summary(preset: Callable[..., Any]) -> str:
+    """Returns the first paragraph of the docstring in one line."""
+    paragraph = (inspect.getdoc(preset) or "").partition("\n\n")[0]
+    return " ".join(paragraph.split())

@@ -1,6 +1,4 @@
-"""`simulate`: one run of a scenario file or preset, its verdict and metrics, and files to look
-at.
-"""
+"""`simulate`: runs a scenario file or preset once; prints and writes its status and metrics."""
 
 from __future__ import annotations
 
@@ -8,6 +6,7 @@ import argparse
 from typing import TYPE_CHECKING, Any
 
 from iblf_jax.cli._common import (
+    FAILURES,
     add_run_arguments,
     add_scenario_arguments,
     metrics_table,
@@ -29,16 +28,13 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
     parser = subparsers.add_parser(
         "simulate",
         help="run a scenario once",
-        description="Run a scenario once; print its verdict and metrics.",
-        epilog=(
-            "Exit code 1 if the run failed: a bound was violated, the state ran away, or the step"
-            " was too large."
-        ),
+        description="Run a scenario once; print its status and metrics.",
+        epilog=f"Exit code 1 if the run failed: {FAILURES}",
     )
     add_scenario_arguments(parser)
     add_run_arguments(parser)
     parser.add_argument(
-        "--seed", type=int, default=0, metavar="N", help="of a sensor's noise (default: 0)"
+        "--seed", type=int, default=0, metavar="N", help="seed of the sensor noise (default: 0)"
     )
     parser.add_argument(
         "--out",

@@ -1,11 +1,11 @@
-"""`sweep`: a scenario over many values of its parameters, into a store that survives a kill."""
+"""`sweep`: runs a scenario over many values of its parameters; a store makes it resumable."""
 
 from __future__ import annotations
 
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from iblf_jax.cli._studies import EPILOG, add_study_arguments, carried_out, write_netcdf
+from iblf_jax.cli._studies import EPILOG, add_study_arguments, run_study, write_netcdf
 from iblf_jax.core.tables import as_text
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
 def run(args: argparse.Namespace) -> int:
     """Runs the command."""
 
-    def work(how: dict[str, Any]) -> int:
+    def work(execution: dict[str, Any]) -> int:
         from iblf_jax.core.status import FAILED
         from iblf_jax.files.study import load_study_file
         from iblf_jax.studies import StoreOptions, distributed
@@ -59,20 +59,18 @@ def run(args: argparse.Namespace) -> int:
             file.grid,
             perturbations=file.perturbations,
             store=store,
-            **options | how,
+            **options | execution,
         )
         if distributed.rank() == 0:
             print(report(data))
         write_netcdf(data, args.out)
         return int((data.status & int(FAILED)).any())
 
-    return carried_out(args, work)
+    return run_study(args, work)
 
 
 def report(data: xarray.Dataset) -> str:
-    """One line a point: how many runs failed, and the worst and the median of the smallest
-    margin.
-    """
+    """One line per point: how many runs failed, the worst and the median of the smallest margin."""
     import json
 
     import numpy as np
@@ -81,22 +79,17 @@ def report(data: xarray.Dataset) -> str:
     from iblf_jax.core.status import FAILED
 
     config = json.loads(data.attrs["config"])
-    dims, runs = list(config["dims"]), config["runs"]
+    runs = config["runs"]
     failed = ((data.status & int(FAILED)) != 0).values.reshape(-1, runs).sum(1)
-    rows = [[*(config["points"] if dims else ["point"]), "failed"]]
+    rows = [[*(config["points"] or ["point"]), "failed"]]
     margin = None
     if "margin" in data:
         margin = data["margin"].min("joint").values.reshape(-1, runs)
         rows[0] += ["worst margin [rad]", "median margin [rad]"]
-    shape = tuple(config["dims"].values())
-    for point, place in enumerate(np.ndindex(shape) if shape else [()]):
-        at = dict(zip(dims, place, strict=True))
-        cells = (
-            [_tick(p["values"][at[p["along"]]]) for p in config["points"].values()]
-            if dims
-            else ["nominal"]
-        )
-        cells.append(f"{failed[point]} of {runs}")
+    for point, indices in enumerate(np.ndindex(*config["dims"].values())):
+        index = dict(zip(config["dims"], indices, strict=True))
+        values = [_tick(p["values"][index[p["along"]]]) for p in config["points"].values()]
+        cells = [*(values or ["nominal"]), f"{failed[point]} of {runs}"]
         if margin is not None:
             cells += [number(np.nanmin(margin[point])), number(np.nanmedian(margin[point]))]
         rows.append(cells)

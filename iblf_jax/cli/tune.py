@@ -1,6 +1,4 @@
-"""`tune`: tunes the gains of a tuning file and writes the tuned scenario, the report and
-figures.
-"""
+"""`tune`: tunes the gains of a tuning file; writes the tuned scenario, a report and a figure."""
 
 from __future__ import annotations
 
@@ -18,9 +16,9 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
         help="tune gains by gradient",
         description=(
             "Tune the parameters of a tuning file (its format: iblf_jax.files.tuning); print the"
-            " report, on fresh runs where something is perturbed."
+            " report, on new random runs if there are perturbations."
         ),
-        epilog="Exit code 1 if a requirement failed or the objective did not go down.",
+        epilog="Exit code 1 if a requirement failed or the objective did not decrease.",
     )
     parser.add_argument("file", metavar="TUNE.toml", help="a tuning file")
     parser.add_argument(
@@ -31,10 +29,13 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--checkpoint",
         metavar="FILE",
-        help="keep the state here after each step, and go on from it if it is there",
+        help="save the state to this file after each step, and resume from it if it exists",
     )
     parser.add_argument(
-        "--iterations", type=int, metavar="N", help="steps at most (default: the file's, else 60)"
+        "--iterations",
+        type=int,
+        metavar="N",
+        help="largest number of steps (default: the file's, else 60)",
     )
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     parser.set_defaults(run=run)
@@ -42,17 +43,14 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Runs the command."""
-    from iblf_jax.cli._common import output_folder
+    from iblf_jax.cli._common import given_options, optional_folder
     from iblf_jax.files.tuning import tune_file
 
-    folder = None
-    if args.out:
-        folder = output_folder(args.out)
-    options = {"checkpoint": args.checkpoint, "iterations": args.iterations}
+    folder = optional_folder(args.out)
+    options = given_options(args, "checkpoint", "iterations")
     if args.quiet:
         options["progress"] = False
-    given = {name: x for name, x in options.items() if x is not None}
-    result = tune_file(args.file, **given)
+    result = tune_file(args.file, **options)
     print(result.report)
     print(result)
     if folder is not None:

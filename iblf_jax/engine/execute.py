@@ -259,18 +259,3 @@ def _run_from(
     return first_that_works(
         execution, lambda executor: by_loop(loop_of(executor)), partial(by_loop, scan)
     )
-
-
-def chosen_backend(
-    backend: str,
-    scenario: Scenario,
-    varied: Mapping[str, Any],
-    folds: Any,
-    dt: jax.Array,
-    *,
-    method: str,
-    mechanism: Any = None,
-) -> str:
-    """The former form of `compile_batch`: the name of the executor."""
-    request = RunRequest(1, method, constants=mechanism, backend=backend)
-    return compile_batch(request, scenario, varied, folds, dt).executor

@@ -17,9 +17,6 @@ if TYPE_CHECKING:
     from iblf_jax.engine.registry import Machine
     from iblf_jax.engine.request import RunRequest
 
-BACKENDS = ("auto", "vmap", "native", "gpu", "xla")
-"""The former form of `registry.backends()`."""
-
 # One machine function (`machine_function`), on CPU: numbers of operations are those of a jaxpr.
 SMALL_BATCH = 64
 """Runs up to which a batch gains from being one machine function; XLA refuses some of its fusions

@@ -16,7 +16,6 @@ from iblf_jax.core import checks, notices
 from iblf_jax.engine.diagnosis import SimulationError as SimulationError
 from iblf_jax.engine.diagnosis import SimulationWarning as SimulationWarning
 from iblf_jax.engine.diagnosis import report
-from iblf_jax.engine.mechanism import known_of
 from iblf_jax.engine.registry import single_run_backends
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.single_run import run_one
@@ -119,22 +118,6 @@ def _checked_record(record_every: int, steps: int) -> int:
         f"at most {MOST_SAMPLES} recorded samples of {steps} steps",
         remedy,
     )
-
-
-def simulate_unchecked(
-    scenario: Scenario,
-    folds,
-    dt,
-    noise: jax.Array | None = None,
-    *,
-    steps: int,
-    method: str,
-    record_every: int,
-    backend: str = "auto",
-) -> Rollout:
-    """The former form of `run_rollout`."""
-    request = RunRequest(steps, method, record_every, known_of(scenario), backend)
-    return run_rollout(scenario, folds, dt, request, noise)
 
 
 def run_rollout(

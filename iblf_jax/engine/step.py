@@ -29,7 +29,6 @@ from jax.extend.core import Var
 from jax.flatten_util import ravel_pytree
 
 from iblf_jax.core.status import VELOCITY_LIMIT, Status, flag
-from iblf_jax.engine.mechanism import Mechanism
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.switching import Loop, with_hybrid_derivative
 from iblf_jax.simulation import accuracy, integrators, jumps, sampling, stability
@@ -46,20 +45,6 @@ from iblf_jax.simulation.closed_loop import (
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import SIGNALS, Sample, has, speed_margin
 from iblf_jax.world.bounds import NARROWEST
-
-
-class Run(RunRequest):
-    """The former name of `RunRequest`, whose `constants` were `mechanism`."""
-
-    def __new__(
-        cls,
-        steps: int,
-        method: str = "rk4",
-        record_every: int | None = None,
-        mechanism: Mechanism | None = None,
-    ):
-        """The request."""
-        return RunRequest(steps, method, record_every, mechanism)
 
 
 class Inputs(NamedTuple):

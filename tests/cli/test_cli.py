@@ -1,4 +1,4 @@
-"""The command line: what it prints and writes, and how it refuses."""
+"""The command line: its output, its files and its error messages."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def strict_json(path):
     return json.loads(path.read_text(), parse_constant=refuse)
 
 
-# ---------------------------------------------------------------------------------- the main job
+# ---------------------------------------------------------------------------------------- reproduce
 
 
 @pytest.mark.slow
@@ -64,7 +64,7 @@ def test_reproduce(command, tmp_path):
         "0.837",
         "N m",
         "with compilation",
-        "for the two runs alone",
+        "without compilation",
         "Remark",
     ):
         assert word in out
@@ -101,25 +101,25 @@ def test_the_assumed_numbers_are_those_of_the_runs(paper):
 
 
 def test_claims_can_fail(paper, short_run):
-    """The same run twice is neither faster nor more accurate; half a second is too short to
-    settle."""
-    held = {
-        claim.claim: claim.held for claim in _claims.paper_claims({"a": short_run, "b": short_run})
-    }
-    assert held["Neither law violates its time-varying asymmetric bounds."]
-    assert not held["Both laws track the reference."]
-    assert not held["The integral form converges faster."]
-    assert not held["The integral form is slightly more accurate."]
-    assert not held["The integral form overshoots more in e2 at the start."]
-    assert not held["The error signals tend to a very small neighbourhood of zero."]
+    """The same run twice is neither faster nor more accurate, and half a second is too short to
+    settle.
+    """
+    claims = _claims.paper_claims({"a": short_run, "b": short_run})
+    confirmed = {claim.claim: claim.confirmed for claim in claims}
+    assert confirmed["Neither law violates its time-varying asymmetric bounds."]
+    assert not confirmed["Both laws track the reference."]
+    assert not confirmed["The integral form converges faster."]
+    assert not confirmed["The integral form is slightly more accurate."]
+    assert not confirmed["The integral form overshoots more in e2 at the start."]
+    assert not confirmed["The error signals tend to a very small neighbourhood of zero."]
     outside = jax.tree.map(lambda x: x, short_run)
     object.__setattr__(outside, "q", short_run.q + 10.0)
-    assert not _claims.theorem_1({"a": outside}).held
+    assert not _claims.theorem_1({"a": outside}).confirmed
     object.__setattr__(outside, "status", short_run.status | int(ij.Status.BOUND_VIOLATED))
-    assert not _claims.bounds_kept({"a": outside}).held
+    assert not _claims.bounds_kept({"a": outside}).confirmed
 
 
-# -------------------------------------------------------------------------------------- simulate
+# ----------------------------------------------------------------------------------------- simulate
 
 
 def test_simulate_a_file(command, paper, tmp_path):
@@ -208,13 +208,13 @@ def test_a_preset_file_with_its_own_run(command, tmp_path):
     assert "0.05 s, dt = 0.001 s, heun" in out
 
 
-# --------------------------------------------------------------------------------- what there is
+# ------------------------------------------------------------------------ presets, parameters, help
 
 
 def test_presets(command, paper):
     code, out, _ = command("presets")
     assert code == 0
-    assert re.match(r"zhang_yan_2024 +The paper's simulation", out)
+    assert re.match(r"zhang_yan_2024 +The simulation of the paper's section 4", out)
     code, out, _ = command("presets", "zhang_yan_2024")
     assert code == 0
     assert "--arg law=integral" in out
@@ -243,7 +243,7 @@ def test_help_and_version(command):
         assert "usage: iblf-jax" in out
 
 
-# -------------------------------------------------------------------------------------- refusals
+# ----------------------------------------------------------------------------------------- refusals
 
 
 REFUSALS = [
@@ -321,7 +321,7 @@ def test_a_folder_without_permission(command, tmp_path):
     assert "expected a folder that can be written" in err
 
 
-# ----------------------------------------------------------------------------------- the process
+# -------------------------------------------------------------------------------------- the process
 
 
 @pytest.mark.slow
@@ -371,8 +371,8 @@ def test_a_command_is_interrupted_quietly_while_python_imports(module, started, 
             break
     process.send_signal(signal.SIGINT)
     out, errors = process.communicate(timeout=60)
-    said = [line for line in errors.splitlines() if not line.startswith("import time:")]
-    assert (process.returncode, out, said) == (130, "", ["iblf-jax: error: interrupted"])
+    messages = [line for line in errors.splitlines() if not line.startswith("import time:")]
+    assert (process.returncode, out, messages) == (130, "", ["iblf-jax: error: interrupted"])
 
 
 @pytest.mark.parametrize(
@@ -388,15 +388,15 @@ def test_a_command_is_interrupted_quietly_while_python_imports(module, started, 
         ([], [], False),
     ],
 )
-def test_who_imports_the_package_keeps_his_interrupts(monkeypatch, argv, orig, command):
+def test_only_a_command_replaces_the_interrupt_handler(monkeypatch, argv, orig, command):
     monkeypatch.setattr(sys, "argv", argv)
     monkeypatch.setattr(sys, "orig_argv", orig)
     assert _start._is_a_command() == command
 
 
 @pytest.mark.parametrize("cache", ["file", "missing"])
-def test_the_cache_is_only_a_help(cache, tmp_path, monkeypatch):
-    """A cache that the user chose is kept; one that cannot be written is left alone."""
+def test_the_cache_is_optional(cache, tmp_path, monkeypatch):
+    """The cache of compiled programs is optional: one that cannot be written is not used."""
     seen = {}
     monkeypatch.setattr(jax.config, "update", seen.__setitem__)
     monkeypatch.setattr(type(jax.config), "jax_compilation_cache_dir", None, raising=False)

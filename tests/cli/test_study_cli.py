@@ -98,11 +98,11 @@ def test_sweep_and_again(command):
 @pytest.mark.slow
 def test_every_run_ok_is_zero_interrupted_is_130_and_full_is_3(command, monkeypatch):
     assert command("sweep", "calm.toml", "--quiet")[0] == 0
-    plain = store.Store.write
+    write = store.Store.write
 
     def stop(self, unit, data):
         signal.raise_signal(signal.SIGINT)
-        plain(self, unit, data)
+        write(self, unit, data)
 
     monkeypatch.setattr(store.Store, "write", stop)
     code, _, err = command("sweep", "sweep.toml", "--store", "s.zarr", "--quiet")
@@ -199,7 +199,7 @@ def test_bad_files_are_refused(kind, change, message, tmp_path):
         study_file.load_study_file(path, kind)
 
 
-WAYS = """
+PERTURBATIONS = """
 [perturbations]
 "plant.mass[1]" = { factor = "uniform", low = 0.7, high = 1.3 }
 initial.q = { offset = "normal", std = 0.02, shared = true }
@@ -213,9 +213,11 @@ HEADS = {
 }
 
 
-def perturbations_in(kind, ways, path):
+def perturbations_in(kind, perturbations, path):
     """The perturbations of a file of one of the three kinds."""
-    path.write_text(f'preset = "zhang_yan_2024"\n[run]\nduration = 0.01\n{ways}\n{HEADS[kind]}\n')
+    path.write_text(
+        f'preset = "zhang_yan_2024"\n[run]\nduration = 0.01\n{perturbations}\n{HEADS[kind]}\n'
+    )
     return (
         load_tuning_file(path)["perturbations"]
         if kind == "tune"
@@ -231,7 +233,7 @@ def test_one_table_of_perturbations_serves_every_file_and_the_api(tmp_path):
         "disturbance.phase": ij.value(ij.log_uniform(0.1, 6.28)),
     }
     for kind in HEADS:
-        found = perturbations_in(kind, WAYS, tmp_path / "file.toml")
+        found = perturbations_in(kind, PERTURBATIONS, tmp_path / "file.toml")
         assert list(found) == list(expected)
         assert jax.tree.structure(found) == jax.tree.structure(expected)
         jax.tree.map(np.testing.assert_array_equal, found, expected)
@@ -257,7 +259,7 @@ def test_one_table_of_perturbations_serves_every_file_and_the_api(tmp_path):
     ],
 )
 @pytest.mark.parametrize("kind", HEADS)
-def test_the_old_spelling_is_told_the_new_one(kind, old, new, tmp_path):
+def test_an_error_on_the_old_spelling_shows_the_new_one(kind, old, new, tmp_path):
     with pytest.raises(
         ValueError,
         match=rf"file.toml: perturbations.plant.mass.*{re.escape(f'This is now written {new}.')}",

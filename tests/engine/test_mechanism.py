@@ -14,11 +14,11 @@ from test_lowering import DT, PRESET, STANDARD, carry_of, evaluate, numbers
 
 import iblf_jax as ij
 from iblf_jax.core.status import Status
-from iblf_jax.engine import execute, plan
+from iblf_jax.engine import RunRequest, execute, plan
 from iblf_jax.engine.batch import Batch
 from iblf_jax.engine.executors import program_of
 from iblf_jax.engine.mechanism import mechanism_of
-from iblf_jax.engine.step import Carry, Inputs, Run, StepOptions, TimeStep
+from iblf_jax.engine.step import Carry, Inputs, StepOptions, TimeStep
 from iblf_jax.kernels import PER_RUN, TIME, written_out
 from iblf_jax.simulation.paths import get, with_parameters
 from iblf_jax.simulation.scenario import canonical
@@ -188,7 +188,7 @@ def test_derivatives_by_the_geometry(monkeypatch):
     dt = jnp.asarray(DT)
 
     def by(backend, mechanism):
-        run = Run(5, "euler", mechanism=mechanism)
+        run = RunRequest(5, "euler", constants=mechanism)
         return jax.jit(
             lambda s, v: (
                 execute.run_batch_jvp(s, v, along, STANDARD[:1], dt, run, backend=backend).tangents
@@ -243,7 +243,7 @@ def test_a_run_that_is_not_finite_is_seen_to_be_so(path):
             scenario, number
         )  # where nothing looks at the number
         assert (
-            int(status_of(changed, run=Run(5, "euler", mechanism=mechanism_of(changed))))
+            int(status_of(changed, run=RunRequest(5, "euler", constants=mechanism_of(changed))))
             & int(Status.NOT_FINITE)
             == expected
         )

@@ -15,10 +15,10 @@ from arm_cases import random_arm
 
 import iblf_jax as ij
 from iblf_jax.core.caches import CACHE
-from iblf_jax.engine import compile, execute, plan
+from iblf_jax.engine import RunRequest, compile, execute, plan
 from iblf_jax.engine.batch import Batch, carry_shapes
 from iblf_jax.engine.executors import program_of
-from iblf_jax.engine.step import Inputs, Run, StepOptions, TimeStep, start
+from iblf_jax.engine.step import Inputs, StepOptions, TimeStep, start
 from iblf_jax.kernels import passes, program
 from iblf_jax.kernels.from_jaxpr import closed
 from iblf_jax.kernels.operations import OPERATIONS
@@ -458,7 +458,7 @@ def test_a_step_that_does_not_lower_runs_on_vmap_and_says_so():
 
     def run():
         return jax.jit(
-            lambda: execute.run_batch(scenario, varied, (), jnp.asarray(DT), Run(3, "euler"))
+            lambda: execute.run_batch(scenario, varied, (), jnp.asarray(DT), RunRequest(3, "euler"))
         )()
 
     with pytest.warns(compile.BackendWarning, match="vmap.*'sort'"):
@@ -472,5 +472,10 @@ def test_a_step_that_does_not_lower_runs_on_vmap_and_says_so():
 def test_an_unknown_backend_is_refused():
     with pytest.raises(ValueError, match="backend"):
         execute.run_batch(
-            PRESET, {"initial.q": jnp.ones((2, 2))}, (), jnp.asarray(DT), Run(1), backend="fpga"
+            PRESET,
+            {"initial.q": jnp.ones((2, 2))},
+            (),
+            jnp.asarray(DT),
+            RunRequest(1),
+            backend="fpga",
         )

@@ -20,9 +20,9 @@ from test_toolchain import ZIG_CACHE, ziglang_script
 
 import iblf_jax as ij
 from iblf_jax.core.caches import CACHE
-from iblf_jax.engine import compile, execute, executors, native, plan
+from iblf_jax.engine import RunRequest, compile, execute, executors, native, plan
 from iblf_jax.engine.batch import Batch
-from iblf_jax.engine.step import Inputs, Run, TimeStep, start
+from iblf_jax.engine.step import Inputs, TimeStep, start
 from iblf_jax.kernels import cpu, directory, packed, toolchain
 from iblf_jax.kernels.toolchain import ToolchainError
 from iblf_jax.simulation.metrics import as_folds, standard
@@ -50,7 +50,7 @@ def batch(dtype="float64", backend="native", steps=400, values=None, record_ever
     varied = {k: jnp.asarray(v, dtype) for k, v in (values or draws(5)).items()}
     key = (dtype, backend, steps, record_every)
     if key not in COMPILED:
-        run = Run(steps, "rk4", record_every)
+        run = RunRequest(steps, "rk4", record_every)
         COMPILED[key] = jax.jit(
             lambda s, v, f, dt: execute.run_batch(s, v, f, dt, run, backend=backend)
         )
@@ -135,7 +135,7 @@ def test_xla_in_blocks_and_stretches_agrees(monkeypatch, every):
     monkeypatch.setattr(plan, "XLA_BLOCK", 2)
     monkeypatch.setattr(plan, "XLA_STRETCH", 4)
     scenario, dt = canonical(ij.presets.zhang_yan_2024()), jnp.asarray(1e-3)
-    run = Run(11, "euler", every)
+    run = RunRequest(11, "euler", every)
     varied = {k: jnp.asarray(v) for k, v in draws(7).items()}
     found, expected = (
         jax.jit(lambda s, v, b=b: execute.run_batch(s, v, (), dt, run, backend=b))(scenario, varied)
@@ -158,9 +158,10 @@ def test_a_spline_is_looked_up(backend):
         canonical(dataclasses.replace(ij.presets.zhang_yan_2024(), reference=spline)),
         jnp.asarray(1e-3),
     )
-    run = Run(50, "heun", 10)
+    run = RunRequest(50, "heun", 10)
     varied = {k: jnp.asarray(v) for k, v in draws(3).items()}
-    assert execute.chosen_backend(backend, scenario, varied, (), dt, method="heun") == backend
+    request = RunRequest(1, "heun", backend=backend)
+    assert execute.compile_batch(request, scenario, varied, (), dt).executor == backend
     found, expected = (
         jax.jit(lambda s, v, b=b: execute.run_batch(s, v, (), dt, run, backend=b))(scenario, varied)
         for b in (backend, "vmap")
@@ -225,7 +226,7 @@ def test_a_sine_of_any_size_is_finite_in_a_batch(backend):
     def run(backend):
         f = jax.jit(
             lambda v: execute.run_batch(
-                scenario, v, standard(), jnp.asarray(1e-3), Run(3, "euler"), backend=backend
+                scenario, v, standard(), jnp.asarray(1e-3), RunRequest(3, "euler"), backend=backend
             )
         )
         return jax.tree.map(np.asarray, f(varied))
@@ -351,7 +352,7 @@ def test_forward_sensitivities(monkeypatch, written_out):
     def pushed(backend):
         return jax.jit(
             lambda s, v: execute.run_batch_jvp(
-                s, v, directions, folds, dt, Run(60, "euler"), backend=backend
+                s, v, directions, folds, dt, RunRequest(60, "euler"), backend=backend
             )
         )(scenario, varied)
 

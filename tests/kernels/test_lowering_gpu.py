@@ -24,11 +24,11 @@ from test_lowering_backends import TOLERANCE, assert_same, draws, needs_compiler
 
 import iblf_jax as ij
 from iblf_jax.core.caches import CACHE
-from iblf_jax.engine import compile, execute, gpu, plan, registry
+from iblf_jax.engine import RunRequest, compile, execute, gpu, plan, registry
 from iblf_jax.engine.batch import Batch
 from iblf_jax.engine.derivatives import Directions, run_with_tangents
 from iblf_jax.engine.executors import lowered_on, program_of
-from iblf_jax.engine.step import Inputs, Run, TimeStep
+from iblf_jax.engine.step import Inputs, TimeStep
 from iblf_jax.kernels import nvrtc
 from iblf_jax.kernels.emit_c import CUDA, source
 from iblf_jax.kernels.layout import Layout
@@ -120,7 +120,7 @@ def outcome(dtype, backend, values, steps=200, record_every=None):
     scenario = canonical(ij.astype(ij.presets.zhang_yan_2024(), dtype))
     folds = jax.tree.map(lambda x: jnp.asarray(x, dtype), standard())
     varied, dt = {k: jnp.asarray(v, dtype) for k, v in values.items()}, jnp.asarray(DT, dtype)
-    run = Run(steps, "rk4", record_every)
+    run = RunRequest(steps, "rk4", record_every)
     return jax.tree.map(
         np.asarray,
         jax.jit(lambda s, v: execute.run_batch(s, v, folds, dt, run, backend=backend))(
@@ -216,7 +216,7 @@ def test_every_run_has_its_own_jump(runs_here, paper, dtype):
 
     def metrics(backend):
         return jax.jit(
-            lambda v: execute.run_batch(scenario, v, folds, dt, Run(20), backend=backend)
+            lambda v: execute.run_batch(scenario, v, folds, dt, RunRequest(20), backend=backend)
         )(varied).metrics
 
     found, expected = metrics("gpu"), metrics("vmap")
@@ -231,7 +231,7 @@ def test_forward_sensitivities(paper):
     scenario, dt = canonical(paper), jnp.asarray(DT)
     along = Directions.of({"controller.K2": np.eye(3, 2), "observer.kf": np.eye(3, 2, -1)})
     varied = {k: jnp.asarray(v) for k, v in draws(3).items()}
-    inputs, run = Inputs(scenario, standard()[:1], dt, jnp.asarray(60.0)), Run(60, "euler")
+    inputs, run = Inputs(scenario, standard()[:1], dt, jnp.asarray(60.0)), RunRequest(60, "euler")
     executor, numbers = (
         lowered_on(run_program),
         {path: np.reshape(x, shape) for path, shape, x in along.items},
@@ -461,7 +461,7 @@ def test_the_kernel_is_registered_for_cuda_and_called_with_its_attributes(paper,
     )
     call = jax.jit(
         lambda v: execute.run_batch(
-            scenario, v, STANDARD, dt, Run(20_000, "rk4", 10), backend="gpu"
+            scenario, v, STANDARD, dt, RunRequest(20_000, "rk4", 10), backend="gpu"
         )
     )
     text = call.trace(varied).lower(lowering_platforms=("cuda",)).as_text()

@@ -58,7 +58,6 @@ PROSE = re.compile(
     re.IGNORECASE,
 )
 PUBLIC_NAMES = {
-    "cli/_claims.py": {"held"},
     "identification/result.py": {"asked", "wanted"},
     "tuning/result.py": {"prices"},
     "control/controllers/__init__.py": {"Setting"},

@@ -16,10 +16,9 @@ from scipy.integrate import solve_ivp
 
 import iblf_jax as ij
 from iblf_jax.core.status import Status
-from iblf_jax.engine import native
+from iblf_jax.engine import RunRequest, native
 from iblf_jax.engine.execute import run_batch, run_batch_jvp
 from iblf_jax.engine.period import radius_at
-from iblf_jax.engine.step import Run
 from iblf_jax.engine.step_size import start_and_along
 from iblf_jax.simulation.closed_loop import run_sampled_law
 from iblf_jax.simulation.metrics import standard
@@ -319,7 +318,7 @@ def test_derivatives_beside_a_batch_are_those_of_every_backend():
     varied, folds = {"initial.q": scenario.initial.q + jnp.asarray([[0.0], [0.01]])}, standard()[:1]
 
     def pushed(backend):
-        run = Run(40, "heun")
+        run = RunRequest(40, "heun")
         return jax.jit(
             lambda v: run_batch_jvp(
                 scenario, v, directions, folds, jnp.asarray(5e-4), run, backend=backend
@@ -344,7 +343,12 @@ def test_a_run_says_the_same_alone_as_in_a_batch_to_the_bit():
     @jax.jit
     def runs(varied):
         found = run_batch(
-            scenario, varied, standard()[:1], jnp.asarray(1e-3), Run(400, "rk4"), backend="native"
+            scenario,
+            varied,
+            standard()[:1],
+            jnp.asarray(1e-3),
+            RunRequest(400, "rk4"),
+            backend="native",
         )
         return found.metrics | {"mode": found.fastest_mode}
 

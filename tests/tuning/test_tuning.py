@@ -18,8 +18,9 @@ import pytest
 
 import iblf_jax as ij
 from iblf_jax.core import checks
+from iblf_jax.engine import RunRequest
 from iblf_jax.engine.batch import Batch, carry_shapes
-from iblf_jax.engine.step import Inputs, Run
+from iblf_jax.engine.step import Inputs
 from iblf_jax.engine.step_size import fastest_along
 from iblf_jax.engine.transformable import run_transformable
 from iblf_jax.files.tuning import load_tuning_file
@@ -569,7 +570,9 @@ def test_requirements_that_cannot_be_kept_are_named_with_how_much(paper):
 
 def plain_status(scenario):
     return jax.jit(
-        lambda s: run_transformable(s, standard(), jnp.asarray(1e-3), Run(300, "euler")).status
+        lambda s: (
+            run_transformable(s, standard(), jnp.asarray(1e-3), RunRequest(300, "euler")).status
+        )
     )(scenario)
 
 
