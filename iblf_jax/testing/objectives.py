@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks, notices
+from iblf_jax.core.optional import OptionalMembers
 from iblf_jax.engine import Outer, folded
 from iblf_jax.engine.simulate import simulate
 from iblf_jax.simulation.scenario import Scenario
@@ -31,6 +32,8 @@ from iblf_jax.testing.metrics import LENGTH, at_rest, parts, samples, samples_fr
 from iblf_jax.tuning.objectives import Objective, Requirement, complete, for_scenario
 from iblf_jax.tuning.quantities import MetricResult, Peak, Quantities, Quantity, TimeIntegral
 
+quantity_member = OptionalMembers(hessian=None, curvature=None)
+"""Reads the members for second-order methods, which a quantity may lack."""
 DIRECTIONS = 3
 """Number of directions in which second derivatives are tested."""
 
@@ -122,7 +125,7 @@ def _quantity(findings: Findings, quantity: Any, duration: float, n: int) -> Non
         np.allclose(largest, exact),
         f"the largest of its pieces, {largest}, is not its exact value, {np.asarray(exact)}",
     )
-    if hasattr(quantity, "hessian"):
+    if quantity_member(quantity, "hessian") is not None:
         _second_order(findings, quantity, numbers, flags)
 
 
@@ -131,12 +134,9 @@ def _structure(findings: Findings, quantity: Any, first: Any) -> None:
     acc = shape_of(findings, "init(sample)" + kind, quantity.init, first)
     if acc is None:
         return
-    same_structure(
-        findings,
-        "update(acc, sample)" + kind,
-        shape_of(findings, "update(acc, sample)" + kind, quantity.update, acc, first),
-        acc,
-    )
+    label = "update(acc, sample)" + kind
+    after = shape_of(findings, label, quantity.update, acc, first)
+    same_structure(findings, label, after, acc)
     result = shape_of(findings, "finish(acc)" + kind, quantity.finish, acc)
     three = isinstance(result, tuple) and len(result) == 3
     if result is not None and findings.require(
@@ -146,30 +146,38 @@ def _structure(findings: Findings, quantity: Any, first: Any) -> None:
     ):
         for name, value in zip(("smooth value", "exact value"), result[:2], strict=True):
             has_shape(findings, f"the {name} of finish(acc){kind}", value, ())
-        shape = getattr(result[2], "shape", ())
+        shape = _shape(result[2])
         findings.require(
             len(shape) == 1,
             f"the pieces of finish(acc){kind} have shape {shape}",
             "They must be (m,): value[None] if it is one",
         )
-    matrix = hasattr(quantity, "hessian") or not hasattr(quantity, "curvature")
-    findings.require(
-        matrix, "it has `curvature` without `hessian`", "Second-order methods need both"
-    )
-    if not hasattr(quantity, "curvature"):
+    curvature = quantity_member(quantity, "curvature")
+    if curvature is None:
         return
-    outer = shape_of(findings, "curvature(acc, sample)" + kind, quantity.curvature, acc, first)
+    findings.require(
+        quantity_member(quantity, "hessian") is not None,
+        "it has `curvature` without `hessian`",
+        "Second-order methods need both",
+    )
+    outer = shape_of(findings, "curvature(acc, sample)" + kind, curvature, acc, first)
     if outer is not None and findings.require(
         isinstance(outer, Outer),
         f"curvature(acc, sample) gives {type(outer).__name__}",
         "It must be an iblf_jax.engine.derivatives.Outer",
     ):
-        size = jnp.shape(outer.vector)
+        size = _shape(outer.vector)
         findings.require(len(size) == 1, f"Outer.vector has shape {size}", "It must be (m,)")
-        weight = jnp.shape(outer.weight)
+        weight = _shape(outer.weight)
         findings.require(
             weight in ((), size), f"Outer.weight has shape {weight}", f"It must be () or {size}"
         )
+
+
+def _shape(x: Any) -> tuple[int, ...]:
+    """The shape of an abstract result; () for objects that are not arrays."""
+    shape: tuple[int, ...] = getattr(x, "shape", ())
+    return shape
 
 
 def _second_order(
@@ -218,7 +226,7 @@ def _gauss_newton(
 
     def accumulate(acc, sample):
         outer = Outer(jnp.zeros_like(sample.e1), jnp.zeros_like(sample.e1))
-        if hasattr(quantity, "curvature"):
+        if quantity_member(quantity, "curvature") is not None:
             outer = quantity.curvature(acc, sample)
         weight = jnp.broadcast_to(outer.weight, outer.vector.shape)
         return quantity.update(acc, sample), (outer.vector, weight)
@@ -271,7 +279,9 @@ def _on_a_run(
         )
         return
     smooth = jnp.asarray(metrics["tuning_smooth"])
-    numbers = [*(goal.values(smooth) if goal.terms else ()), *goal.excesses(smooth)]
+    numbers = list(goal.excesses(smooth))
+    if goal.terms:
+        numbers = [*goal.values(smooth), *numbers]
     findings.require(
         np.all(np.isfinite(numbers)),
         f"its terms and requirements on a run are {[float(x) for x in numbers]}",

@@ -1,4 +1,4 @@
-"""The checks of what a law states of itself: the contract is `iblf_jax.controllers.LyapunovLaw`."""
+"""The checks of a law's own claims: the contract is `iblf_jax.controllers.LyapunovLaw`."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.testing._contract import Findings, check_function, in_dtype, shape_of
 
 STATES = 16
-"""States at which V and W have to be nonnegative."""
+"""Number of states at which V and W must be nonnegative."""
 SPREAD = 0.3
-"""rad and rad/s.  How far these states are from the reference."""
+"""Largest distance of these states from the reference [rad] and [rad/s]."""
 
 
 def check_claims(findings: Findings, scenario: Scenario) -> None:
-    """Checks V, W and T of a law that states a claim: shapes, types, derivatives, V, W >= 0.
+    """Checks V, W and T of a law that states a claim: shapes, types, derivatives, and V, W >= 0.
 
-    The last is checked where the estimate is exact, f_tilde = 0.
+    The inequalities are tested with an exact estimate, f_tilde = 0.
     """
     law: Any = scenario.controller
     stated = [name for name in OWN_CLAIM_METHODS if hasattr(law, name)]
@@ -53,7 +53,7 @@ def check_claims(findings: Findings, scenario: Scenario) -> None:
 
     for name, values in jax.vmap(sums)(q, dq).items():
         lowest = float(jnp.min(values))
-        remedy = "V and W are nonnegative, or the inequality V' <= -W + T says nothing"
+        remedy = "V and W are nonnegative, or the inequality V' <= -W + T bounds nothing"
         findings.require(lowest >= 0, f"{name} is {lowest:.3g} somewhere where f_tilde = 0", remedy)
 
 
@@ -61,7 +61,7 @@ def _near_the_reference(
     scenario: Scenario,
     rng: np.random.Generator,
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """A time, and states and an error of the estimate there: (), (STATES, n), (STATES, n), (n,)."""
+    """A time (), positions and velocities (STATES, n), and an error of the estimate (n,)."""
     t = jnp.asarray(0.7)
     tube = scenario.context.tube(t)
     q, dq = jnp.asarray(rng.uniform(-SPREAD, SPREAD, (2, STATES, scenario.n)))
