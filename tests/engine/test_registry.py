@@ -65,7 +65,7 @@ def test_an_added_executor_runs_a_single_run(scenario, added, backend):
 def test_an_added_executor_runs_a_batch(scenario, added):
     perturbed = {"controller.Kp": ij.factor(ij.uniform(0.9, 1.1))}
     study = ij.monte_carlo(scenario, perturbed, runs=3, **SHORT, backend="mine")
-    assert study.setup.study_run.program.executor == "mine"
+    assert study.setup.program.batch.executor == "mine"
     assert added.count("build") == 2
     assert added.count("run") == 3
     other = ij.monte_carlo(scenario, perturbed, runs=3, **SHORT, backend="xla")

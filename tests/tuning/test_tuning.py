@@ -819,12 +819,18 @@ def test_the_report_is_on_fresh_runs_and_gives_intervals(robust):
 
 @pytest.mark.slow
 def test_a_change_that_is_not_significant_is_called_so(robust, paper):
-    from iblf_jax.tuning.report import make_report
+    from iblf_jax.tuning.report import ReportCase, make_report
 
-    known = robust.values, robust.setup.objective, DRAWS
-    report = make_report(
-        paper, paper, *known, runs=256, seed=5, risk=Risk("mean"), confidence=0.95, timing=SHORT
+    case = ReportCase(
+        before=paper,
+        after=paper,
+        tuned=tuple(robust.values),
+        objective=robust.setup.objective,
+        perturbations=DRAWS,
+        risk=Risk("mean"),
+        **SHORT,
     )
+    report = make_report(case, runs=256, seed=5, confidence=0.95)
     assert report.changes[0].significant is False
     assert "NOT significant" in str(report)
     assert "do not show that tuning helped" in str(report)
