@@ -22,6 +22,7 @@ import warnings
 from pathlib import Path
 from typing import Any
 
+from matplotlib import pyplot
 from matplotlib.figure import Figure
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -80,6 +81,7 @@ def page(script: Path) -> list[Path]:
             if printed.getvalue().strip():
                 lines += ["```text", printed.getvalue().rstrip(), "```", ""]
     finally:
+        pyplot.close("all")
         os.chdir(before)
     beside = script.with_suffix(".toml")
     if beside.exists():

@@ -130,6 +130,7 @@ def export(
 
     Source: design of this package; FMI standard 3.0, Modelica Association, 2022.
     """
+    checks.one_of("target", target, TARGETS)
     is_loop = target in ("fmu-loop", "wasm")
     reference = _current_name(reference)
     _check_options(target, dtype, reference, is_loop)
@@ -156,7 +157,7 @@ def export(
 def _current_name(reference: str) -> str:
     """The present name of a value of the argument `reference`."""
     former = "told"
-    if reference != former:
+    if not isinstance(reference, str) or reference != former:
         return reference
     notices.warn('reference="told" is named reference="given" now.', DeprecationWarning)
     return "given"
@@ -164,7 +165,6 @@ def _current_name(reference: str) -> str:
 
 def _check_options(target: str, dtype: str, reference: str, is_loop: bool) -> None:
     """Raises ValueError for an unknown option, or for options that exclude each other."""
-    checks.one_of("target", target, TARGETS)
     checks.one_of("dtype", dtype, tuple(TYPES))
     checks.one_of("reference", reference, ("inside", "given"))
     if target.startswith("fmu") and dtype != "double":

@@ -20,7 +20,7 @@ from test_toolchain import ZIG_CACHE, ziglang_script
 
 import iblf_jax as ij
 from iblf_jax.core.caches import CACHE
-from iblf_jax.engine import RunRequest, compile, execute, executors, native, plan
+from iblf_jax.engine import RunRequest, compile, execute, executors, native, plan, registry
 from iblf_jax.engine.batch import Batch
 from iblf_jax.engine.step import Inputs, TimeStep, start
 from iblf_jax.kernels import cpu, directory, packed, toolchain
@@ -360,7 +360,9 @@ def test_forward_sensitivities(monkeypatch, written_out):
     for by_columns in (False, True):
         with monkeypatch.context() as patch:
             if by_columns:
-                patch.setattr(plan, "JVP_LARGEST_IN_SEGMENTS", 0)
+                executor = registry.EXECUTORS["native"]
+                limits = executor.limits._replace(derivatives=0)
+                patch.setitem(registry.EXECUTORS, "native", executor._replace(limits=limits))
                 patch.setattr(execute, "run_with_tangents", None)
             outcome, tangents, products = pushed("auto" if by_columns else "native")
         assert_same(jax.tree.map(np.asarray, tangents), jax.tree.map(np.asarray, expected), 1e-10)
