@@ -140,7 +140,6 @@ def run_batch_jvp(
     request: RunRequest,
     *,
     backend: str | None = None,
-    nested: bool | None = None,
 ) -> Tangents:
     """Values of a batch and their derivatives along P directions in the space of leaves, in one
     pass; call it inside `jit`.
@@ -152,7 +151,7 @@ def run_batch_jvp(
         of one gain of two joints: `{"controller.K2": np.eye(2)}`.
       request: what is run, static.  On "auto" the tangents of long programs (many joints and
         directions), which take minutes to compile, are runs of their own.
-      backend, nested: replace those of the request.
+      backend: replaces that of the request.
 
     Returns:
       The outcome, name -> (batch, P, *shape) for every metric that is a float, and the Gauss-Newton
@@ -162,8 +161,6 @@ def run_batch_jvp(
       ValueError: an unknown backend or path.
     """
     request = _with_backend(request, backend)
-    if nested is not None:
-        request = request._replace(nested=nested)
     inputs, along = inputs_of(scenario, folds, dt, request), Directions.of(directions)
     execution = plan_of_batch(request, inputs, varied)
 

@@ -38,7 +38,6 @@ class RunRequest(NamedTuple):
         method: str = "rk4",
         record_every: int | None = None,
         backend: str = "auto",
-        nested: bool = False,
     ) -> RunRequest:
         """The checked request for a scenario, with the numbers of it that are compiled in.
 
@@ -48,17 +47,16 @@ class RunRequest(NamedTuple):
           method: "rk4", "heun" or "euler".
           record_every: interval of the recorded instants in steps; None for metrics only.
           backend: requested executor.
-          nested: whether the program is called inside a loop or a branch of JAX.
 
         Raises:
           ValueError: an unknown method or backend.
         """
         tableau(method)
         check_backend(backend)
-        return RunRequest(steps, method, record_every, known_of(scenario), backend, nested)
+        return RunRequest(steps, method, record_every, known_of(scenario), backend)
 
 
-def check_backend(backend: str, argument: str = "backend") -> str:
+def check_backend(backend: str) -> str:
     """Returns the name of a backend for batches; raises ValueError for an unknown one."""
-    checks.one_of(argument, backend, backends())
+    checks.one_of("backend", backend, backends())
     return backend

@@ -81,15 +81,6 @@ def _iota(b: Builder, eqn, *_: Ids) -> Ids:
     return constants(b, np.broadcast_to(line, shape).astype(eqn.outvars[0].aval.dtype))
 
 
-def _now(eqn, *operands):
-    """Applies the primitive to node numbers."""
-    with jax.ensure_compile_time_eval():
-        return np.asarray(
-            eqn.primitive.bind(*(jax.numpy.asarray(x, np.int32) for x in operands), **eqn.params),
-            np.int64,
-        )
-
-
 def _chosen(
     b: Builder, x: Ids, index: Ids, at: Callable, known: dict[int, int] | None = None
 ) -> Ids:

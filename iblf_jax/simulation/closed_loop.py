@@ -26,8 +26,10 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.control.actuators import Ideal
+from iblf_jax.control.actuators._base import unlimited
 from iblf_jax.control.controllers import Command
 from iblf_jax.control.sensors import Measurement
+from iblf_jax.control.sensors._base import unrounded
 from iblf_jax.core.linalg import inner, matvec, solve_spd
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.time import as_at
@@ -458,12 +460,6 @@ def _without_rounding_and_limits(scenario: Scenario) -> Scenario:
     """The scenario with the smooth variants of its sensor and its actuator."""
     return dataclasses.replace(
         scenario,
-        sensor=_variant(scenario.sensor, "unrounded"),
-        actuator=_variant(scenario.actuator, "unlimited"),
+        sensor=unrounded(scenario.sensor),
+        actuator=unlimited(scenario.actuator),
     )
-
-
-def _variant(part: Any, name: str) -> Any:
-    """A variant of a part, or the part itself if it has none."""
-    variant = optional_member(part, name)
-    return part if variant is None else variant

@@ -29,6 +29,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.control.sensors._base import unrounded
 from iblf_jax.simulation.closed_loop import LoopState, run_sampled_law
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.paths import with_parameters
@@ -183,7 +184,7 @@ def _command_steps(scenario: Scenario, times: jax.Array) -> tuple[jax.Array, jax
     """
     sensor = scenario.sensor
     # A sensor without rounding or resolution has no counts.
-    smooth = dataclasses.replace(scenario, sensor=getattr(sensor, "unrounded", sensor))
+    smooth = dataclasses.replace(scenario, sensor=unrounded(sensor))
     resolution = jnp.asarray(getattr(sensor, "resolution", 0.0), times.dtype)
     count = jnp.broadcast_to(resolution, (scenario.n,))
 
