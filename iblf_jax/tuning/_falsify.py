@@ -41,10 +41,10 @@ from iblf_jax.simulation.sampling import check_step
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.cube import Cube, bounded
 from iblf_jax.studies.distributions import Perturbation
-from iblf_jax.tuning.evaluation import NUMBERS_A_RUN, Derivatives, Value
+from iblf_jax.tuning.evaluation import Derivatives, Value
 from iblf_jax.tuning.parameters import Box
 from iblf_jax.tuning.quantities import DEFICITS, Peak, Quantities
-from iblf_jax.tuning.runs import RunRequest, simulate, tangents_of_runs
+from iblf_jax.tuning.runs import NUMBERS_A_RUN, RunRequest, simulate, tangents_of_runs
 from iblf_jax.tuning.solvers import SQP, SearchSpace
 
 MARGINS = {"positions": "deficit", "velocities": "velocity_deficit", "regions": "region_deficit"}

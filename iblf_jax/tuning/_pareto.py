@@ -42,13 +42,13 @@ from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.designs import MOST_RUNS
 from iblf_jax.studies.distributions import Perturbation
-from iblf_jax.tuning.evaluation import NO_LEVEL, NUMBERS_A_RUN, Value
+from iblf_jax.tuning.evaluation import Evaluator, Value, values
 from iblf_jax.tuning.objectives import Objective
 from iblf_jax.tuning.parameters import Block, Tunable, in_units, names_of, values_at
-from iblf_jax.tuning.problem import TuningProblem
+from iblf_jax.tuning.problem import NO_LEVEL, TuningProblem
 from iblf_jax.tuning.robust import Risk
-from iblf_jax.tuning.runs import FORWARD_MOST, differentiates_forward
-from iblf_jax.tuning.search import Evaluator, Search
+from iblf_jax.tuning.runs import FORWARD_MOST, NUMBERS_A_RUN, differentiates_forward
+from iblf_jax.tuning.search import Search
 from iblf_jax.tuning.solvers import SQP
 from iblf_jax.tuning.starts import screened
 
@@ -357,7 +357,7 @@ class FrontSearch:
         along = np.concatenate([[0.0], np.cumsum(size)])
         at = (np.arange(count) + 0.5) / count * along[-1]
         z = np.stack([np.interp(at, along, x) for x in self.z[curve].T], axis=1)
-        self._keep_values(z, self.problem.values(z))
+        self._keep_values(z, values(self.problem, z))
 
     def front(self, seconds: float) -> Front:
         """The trials that are not dominated."""

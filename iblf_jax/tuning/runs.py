@@ -13,7 +13,7 @@ its program does not depend on where it is called.  The chain rule does the rest
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 import jax
@@ -37,6 +37,23 @@ from iblf_jax.engine.simulate import simulate as simulate
 from iblf_jax.engine.step_size import fastest_along as fastest_along
 from iblf_jax.engine.step_size import start_and_along as start_and_along
 from iblf_jax.simulation.scenario import Scenario
+
+NUMBERS_A_RUN = 100
+"""Approximate count of numbers that one run of a batch holds while it is computed: its state, its
+stages, its folds."""
+
+
+def in_groups(function: Callable[[np.ndarray], Any], count: int, size: int) -> Any:
+    """What a function of row numbers returns for rows 0 to `count` - 1, as NumPy arrays.
+
+    It is called with `size` rows at a time, so that one shape is compiled; the last group is filled
+    up with rows that it already has.
+    """
+    parts = []
+    for first in range(0, count, size):
+        rows = np.resize(np.arange(first, min(first + size, count)), size)
+        parts.append(jax.tree.map(np.asarray, function(rows)))
+    return jax.tree.map(lambda *x: np.concatenate(x)[:count], *parts)
 
 
 def tangents_of_runs(

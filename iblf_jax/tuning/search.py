@@ -28,14 +28,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import jax
 import numpy as np
 
-from iblf_jax.tuning.evaluation import DERIVATIVES, Candidate, Derivatives
+from iblf_jax.tuning.evaluation import Derivatives, Evaluator
 from iblf_jax.tuning.objectives import is_smoothed, sharper
-from iblf_jax.tuning.problem import FIRST_PENALTY, TuningProblem
-from iblf_jax.tuning.runs import starts_together
-from iblf_jax.tuning.solvers import SearchSpace, Solver
+from iblf_jax.tuning.problem import FIRST_PENALTY
+from iblf_jax.tuning.solvers import Solver
 
 STEPS_PER_UPDATE = 12
 """Steps at most between two updates of the multipliers."""
@@ -52,69 +50,6 @@ SECOND_START_WITHIN, SECOND_START_UNTIL = 25, 40
 
 SecondStart = Callable[[np.ndarray], np.ndarray | None]
 """Function of where the first search began and ended, (2, p); where the second begins, or None."""
-
-
-class Evaluator:
-    """The compiled problem on the host: coordinates in, NumPy arrays out.
-
-    Args:
-      problem: what is tuned.
-      candidates: of S starts; their z is replaced at each call.
-      mode: of differentiation.
-      space: what the solver knows of the problem.
-    """
-
-    def __init__(
-        self, problem: TuningProblem, candidates: Candidate, mode: str, space: SearchSpace
-    ):
-        self.problem = problem
-        self.candidates = candidates
-        self.derivatives = DERIVATIVES[mode]
-        self.space = space
-        self.evaluations = 0
-        """Number of evaluated points."""
-        starts, runs = candidates.index.shape
-        self.group = starts_together(starts, runs)
-        self.active = np.ones(starts, bool)
-        """Which starts are evaluated; the others are returned as invalid."""
-
-    def __call__(self, z: np.ndarray) -> Derivatives:
-        """Value and derivatives at z, (S, p).
-
-        Active starts are evaluated in groups of one size, so that one shape is compiled.
-        """
-        active = np.flatnonzero(self.active)
-        self.evaluations += len(active)
-        candidates = self.candidates._replace(z=np.asarray(z, self.problem.dt.dtype))
-        parts = []
-        for first in range(0, len(active), self.group):
-            rows = np.resize(active[first : first + self.group], self.group)
-            group = jax.tree.map(lambda x, rows=rows: np.asarray(x)[rows], candidates)
-            parts.append(jax.tree.map(np.asarray, self.derivatives(self.problem, group)))
-        found = jax.tree.map(lambda *x: np.concatenate(x)[: len(active)], *parts)
-        if len(active) == len(z):
-            return found
-        return _scattered(found, active, len(z))
-
-    def row(self, start: int) -> tuple[TuningProblem, Candidate]:
-        """The problem, and the candidate of one start as a batch of one."""
-        one = jax.tree.map(lambda x: np.asarray(x)[start : start + 1], self.candidates)
-        return self.problem, one
-
-
-def _scattered(found: Derivatives, rows: np.ndarray, starts: int) -> Derivatives:
-    """The values of some starts among all of them; the others are invalid, with infinite losses."""
-
-    def scattered(x: np.ndarray) -> np.ndarray:
-        full = np.zeros((starts, *x.shape[1:]), x.dtype)
-        if np.issubdtype(x.dtype, np.floating):
-            full[:] = np.nan
-        full[rows] = x
-        return full
-
-    found = jax.tree.map(scattered, found)
-    found.value.loss[~found.value.valid] = np.inf
-    return found
 
 
 class Search:

@@ -20,7 +20,7 @@ from collections.abc import Callable
 import jax
 import numpy as np
 
-from iblf_jax.tuning.evaluation import Value
+from iblf_jax.tuning.evaluation import Value, values
 from iblf_jax.tuning.parameters import Box
 from iblf_jax.tuning.problem import TuningProblem
 
@@ -153,7 +153,7 @@ def screened(
     low = np.where(np.isfinite(box.low), box.low, box.z - 3 * SPREAD)
     high = np.where(np.isfinite(box.high), box.high, box.z + 3 * SPREAD)
     points = np.concatenate([z, rng.uniform(low, high, (SCREENED, len(low)))])
-    found = problem.values(points)
+    found = values(problem, points)
     if not np.any(found.valid):
         raise problem.unstable_error(float(np.max(found.trusted)))
     excess = np.max(np.maximum(found.exact_excess, 0.0), axis=1, initial=0.0)

@@ -51,7 +51,7 @@ import jax
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.tuning import quadratic
+from iblf_jax.tuning.solvers import quadratic
 from iblf_jax.tuning.solvers._base import Constraints, Optimality, SearchSpace, check_options
 
 RADIUS, RADIUS_IF_MULTIMODAL = 1.0, 0.5
