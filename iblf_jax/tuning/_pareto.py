@@ -3,7 +3,7 @@ points in its largest gaps.
 
 With A = log risk_b[a_b], B = log risk_b[b_b], an end minimises one of them only,
 
-    minimise A,      and then     minimise B   subject to   A <= A_end + TRADE,
+    minimise A,      and then     minimise B   subject to   A <= A_end + END_TOLERANCE,
 
 so that the end does not have a large B for an A that hardly depends on it; the other end likewise.
 Searches for the ends begin at the scenario's gains and at the best of some points that are spread
@@ -52,13 +52,13 @@ from iblf_jax.tuning.search import Search
 from iblf_jax.tuning.solvers import SQP
 from iblf_jax.tuning.starts import screened
 
-TRADE = 1e-3
+END_TOLERANCE = 1e-3
 """By how much an end may be above the least value of its objective, relative to it."""
-CLOSE = 0.05
+SMALLEST_GAP = 0.05
 """Neighbours whose objectives differ by less, relatively, have no gap between them."""
-BATCH = 8
+MAX_BATCH = 8
 """Number of points that are searched for in one batch at most."""
-BETWEEN = 8
+VALUES_PER_POINT = 8
 """Number of values on the lines between neighbours, for each point."""
 
 
@@ -106,10 +106,8 @@ class Front:
         return present("front figure", self, **options)
 
     def __repr__(self) -> str:
-        ends = ", ".join(
-            f"{name} {x.min():.4g} to {x.max():.4g}"
-            for name, x in zip(self.labels, self.objectives.T, strict=True)
-        )
+        pairs = zip(self.labels, self.objectives.T, strict=True)
+        ends = ", ".join(f"{name} {x.min():.4g} to {x.max():.4g}" for name, x in pairs)
         return f"Front({len(self)} points of {len(self.tried)} trials; {ends})"
 
 
@@ -185,8 +183,8 @@ def pareto(
         came = f"{problem.size} numbers"
         expected = f"at most {FORWARD_MOST} for a front"
         raise checks.fail("parameters", came, expected, "Tie or leave out some.")
-    checks.fits("points", points, 8.0 * BETWEEN * problem.runs * NUMBERS_A_RUN)
-    search = FrontSearch(problem, min(points, BATCH), iterations, tolerance)
+    checks.fits("points", points, 8.0 * VALUES_PER_POINT * problem.runs * NUMBERS_A_RUN)
+    search = FrontSearch(problem, min(points, MAX_BATCH), iterations, tolerance)
     with bar(progress, points, unit="points") as shown:
         search.run(points, seed, shown)
     return search.front(time.perf_counter() - began)
@@ -243,7 +241,7 @@ class FrontSearch:
                 np.array([gap.level for gap in gaps]),
             )
             shown.update(len(gaps))
-        self.fill(BETWEEN * points)
+        self.fill(VALUES_PER_POINT * points)
 
     def ends(self, seed: int) -> None:
         """Both ends: each objective alone, and then the other one at nearly no cost to it.
@@ -257,14 +255,11 @@ class FrontSearch:
         best = [_best_of(found, violation, k) for k in (0, 1)]
         self._search(points[[0, 0, *best]], np.array([0, 1, 0, 1]), np.full((4, 2), NO_LEVEL))
         if not len(self.z):
-            raise checks.fail(
-                "objectives",
-                "no trial that keeps bounds and requirements",
-                "at least one",
-                "Loosen them, or tune to them first.",
-            )
+            came = "no trial that keeps bounds and requirements"
+            remedy = "Loosen them, or tune to them first."
+            raise checks.fail("objectives", came, "at least one", remedy)
         least = np.argmin(self.terms, axis=0)
-        levels = np.log(np.min(self.terms, axis=0)) + TRADE
+        levels = np.log(np.min(self.terms, axis=0)) + END_TOLERANCE
         self.minimise(self.z[least], np.array([1, 0]), levels)
 
     def minimise(self, z: np.ndarray, objectives: np.ndarray, levels: np.ndarray) -> None:
@@ -296,24 +291,15 @@ class FrontSearch:
         search = Search(Evaluator(problem, candidates, "forward", space), self.solver, z[rows])
         search.retire(slice(len(z), None))
         search.run(self.iterations)
-        history = {name: np.stack(x) for name, x in search.history.items()}
-        self.evaluations += int(history["evaluations"][-1])
-        self._keep(
-            history["z"], history["terms"], history["valid"], history["margin"], history["excess"]
-        )
+        self.evaluations += int(search.history["evaluations"][-1])
+        names = ("z", "terms", "valid", "margin", "excess")
+        self._keep(*(np.stack(search.history[name]) for name in names))
 
     def _keep_values(self, z: np.ndarray, found: Value) -> None:
         self.values += len(z)
         self._keep(z, found.terms, found.valid, found.margin, found.exact_excess)
 
-    def _keep(
-        self,
-        z: np.ndarray,
-        terms: np.ndarray,
-        valid: np.ndarray,
-        margin: np.ndarray,
-        excess: np.ndarray,
-    ) -> None:
+    def _keep(self, z: Any, terms: Any, valid: Any, margin: Any, excess: Any) -> None:
         """Stores the trials that satisfy bounds and requirements."""
         feasible = valid & (margin > 0) & (np.max(excess, axis=-1, initial=-np.inf) <= 0)
         self.z = np.concatenate([self.z, z[feasible]])
@@ -340,8 +326,8 @@ class FrontSearch:
         size = np.abs(ends[1] - ends[0])
         for k in np.argsort(-size).tolist():
             low, high = np.sort(ends[:, k])
-            had_level = any(j == k and low + 2 * TRADE < x < high for j, x in self.levels)
-            if size[k] > CLOSE and not had_level:
+            had_level = any(j == k and low + 2 * END_TOLERANCE < x < high for j, x in self.levels)
+            if size[k] > SMALLEST_GAP and not had_level:
                 middle = 0.5 * (self.z[one] + self.z[other])
                 return Gap(float(size[k]), middle, 1 - k, 0.5 * (low + high))
         return None
@@ -392,12 +378,9 @@ def _pair(objectives: Any) -> Objective:
     is_pair = isinstance(objectives, tuple | list) and len(objectives) == 2
     if is_pair and all(_is_single_term(x) for x in objectives):
         return objectives[0] + objectives[1]
-    raise checks.fail(
-        "objectives",
-        objectives,
-        "two objectives of one term each, without a limit",
-        "Such as (ij.objectives.tracking(), ij.objectives.effort()).",
-    )
+    expected = "two objectives of one term each, without a limit"
+    remedy = "Such as (ij.objectives.tracking(), ij.objectives.effort())."
+    raise checks.fail("objectives", objectives, expected, remedy)
 
 
 def _is_single_term(objective: Any) -> bool:

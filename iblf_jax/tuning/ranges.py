@@ -2,11 +2,11 @@
 of time step, sampling period and drive.
 
 The lower end of a leaf is k1 > 0, K2 > 1/2 or kf > 1 where all its entries start there, otherwise
-its sign decides.  The upper end of a gain x is f x0 with the largest f <= MOST for which the loop
-at the start and along its reference satisfies
+its sign decides.  The upper end of a gain x is f x0 with the largest f <= MAX_FACTOR for which
+the loop at the start and along its reference satisfies
 
-    dt |lambda|_max <= SHARE * (the integrator's stability range)     for a continuous law,
-    rho(map from a period to the next) < 1                            for a sampled law,
+    dt |lambda|_max <= STABILITY_SHARE * (the integrator's stability range)  for a continuous law,
+    rho(map from a period to the next) < 1                                   for a sampled law,
 
 and, where there is a sensor, the drive at rest can deliver each torque of |d tau / d y_j| r_j and
 (sum_kj (d tau / d w_kj)^2)^(1/2).  One count r_j of a joint's encoder, and one standard deviation
@@ -29,7 +29,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.control.sensors._base import unrounded
+from iblf_jax.control.actuators._base import actuator_member
+from iblf_jax.control.sensors._base import sensor_member, unrounded
 from iblf_jax.simulation.closed_loop import LoopState, run_sampled_law
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.paths import with_parameters
@@ -39,17 +40,17 @@ from iblf_jax.tuning.runs import fastest_along, radius_at, start_and_along
 CONDITIONS = {"controller.k1": 0.05, "controller.K2": 0.505, "observer.kf": 1.01}
 """Default lower limits: just inside Theorem 2's conditions (3.17), (3.25) on the gains of the
 paper's law."""
-SHARE = 0.7
+STABILITY_SHARE = 0.7
 """Part of the integrator's stability range that gains may use by default."""
 TIMES = np.linspace(0.0, 6.0, 7)
 """Along the reference, at which the loop is examined [s]."""
-MOST = 1e2
+MAX_FACTOR = 1e2
 """Largest upper end of a gain by default, relative to its start."""
-HALVINGS = 10
-ROOM = 1.01
+BISECTION_STEPS = 10
+MIN_FACTOR = 1.01
 """Upper end of a gain, relative to its start, where already the start violates a condition."""
 GIVEN, THEOREM, SIGN, NONE = "as given", "the conditions of Theorem 2", "its sign", "none"
-FACTOR = f"{MOST:g} times its start"
+FACTOR = f"{MAX_FACTOR:g} times its start"
 STEP, PERIOD = (
     "beyond it the step dt is too long for the loop",
     "beyond it the loop is unstable at its sampling period",
@@ -100,34 +101,29 @@ def default_highs(
         scaled = {path: jnp.asarray(gains[path] * np.exp(x)) for path, x in logarithms.items()}
         changed = with_parameters(scenario, scaled)
         if changed.sampling is None:
-            fits = dt * fastest_along(changed, TIMES) <= SHARE * tableau(method).stability
+            fits = dt * fastest_along(changed, TIMES) <= STABILITY_SHARE * tableau(method).stability
             return "" if fits else STEP
         if sampled_too_slowly(changed):
             return PERIOD
         return drive_exceeded(changed) if limited_by_drive else ""
 
-    def by_one(path: str, share: float) -> str:
-        return violated({path: share * float(np.log(MOST))})
+    def largest_share(logarithms: dict[str, float]) -> tuple[float, str]:
+        return _largest_share(lambda s: violated({path: s * x for path, x in logarithms.items()}))
 
-    def by_all(share: float) -> str:
-        return violated({path: share * x for path, x in reach.items()})
-
+    furthest = float(np.log(MAX_FACTOR))
     reach: dict[str, float] = {}
     why: dict[str, str] = {}
     for path in gains:
-        share, reason = _largest_share(partial(by_one, path))
-        reach[path] = share * float(np.log(MOST))
+        share, reason = largest_share({path: furthest})
+        reach[path] = share * furthest
         why[path] = reason or FACTOR
     share, reason = 1.0, ""
     if len(gains) > 1:
-        share, reason = _largest_share(by_all)
+        share, reason = largest_share(reach)
     for path, x in gains.items():
-        factor = ROOM
-        if reach[path] > 0:
-            factor = max(np.exp(share * reach[path]), ROOM)
-            if reason:
-                why[path] = reason + TOGETHER
-        ends[path] = factor * x, why[path]
+        if reason and reach[path] > 0:
+            why[path] = reason + TOGETHER
+        ends[path] = max(np.exp(share * reach[path]), MIN_FACTOR) * x, why[path]
     return ends
 
 
@@ -143,7 +139,7 @@ def _largest_share(violated: Callable[[float], str]) -> tuple[float, str]:
         return 0.0, at_start
     low = 0.0
     high = 1.0
-    for _ in range(HALVINGS):
+    for _ in range(BISECTION_STEPS):
         middle = 0.5 * (low + high)
         found = violated(middle)
         if found:
@@ -165,7 +161,7 @@ def drive_exceeded(scenario: Scenario) -> str:
     rest; empty where it does not.
     """
     actuator = scenario.actuator
-    if scenario.sampling is None or not hasattr(actuator, "unlimited"):
+    if scenario.sampling is None or actuator_member(actuator, "unlimited") is None:
         return ""
     commands = _command_steps(scenario, jnp.asarray(TIMES, scenario.initial.q.dtype))
     zero = jnp.zeros_like(scenario.initial.q)
@@ -185,7 +181,7 @@ def _command_steps(scenario: Scenario, times: jax.Array) -> tuple[jax.Array, jax
     sensor = scenario.sensor
     # A sensor without rounding or resolution has no counts.
     smooth = dataclasses.replace(scenario, sensor=unrounded(sensor))
-    resolution = jnp.asarray(getattr(sensor, "resolution", 0.0), times.dtype)
+    resolution = jnp.asarray(sensor_member(sensor, "resolution"), times.dtype)
     count = jnp.broadcast_to(resolution, (scenario.n,))
 
     def command(t: jax.Array, state: LoopState, q: jax.Array, normal: jax.Array) -> jax.Array:

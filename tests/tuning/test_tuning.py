@@ -34,7 +34,7 @@ from iblf_jax.tuning.options import RunOptions
 from iblf_jax.tuning.parameters import Box, layout, squash, unsquash
 from iblf_jax.tuning.problem import Candidate, TuningProblem
 from iblf_jax.tuning.quantities import Peak, Quantities, TimeIntegral
-from iblf_jax.tuning.ranges import SHARE, STEP, THEOREM, TIMES, TOGETHER
+from iblf_jax.tuning.ranges import STABILITY_SHARE, STEP, THEOREM, TIMES, TOGETHER
 from iblf_jax.tuning.result import STUCK
 from iblf_jax.tuning.robust import Risk, combine
 from iblf_jax.tuning.rollouts import fold_of
@@ -250,7 +250,7 @@ def test_default_limits_keep_the_conditions_and_the_step(paper):
         paper, {b.path: high[b.start : b.start + b.size] for b in blocks[:3]}
     )
     mode = 1e-3 * fastest_along(canonical(together), TIMES)
-    assert mode == pytest.approx(SHARE * tableau("rk4").stability, rel=0.01)
+    assert mode == pytest.approx(STABILITY_SHARE * tableau("rk4").stability, rel=0.01)
     _, single = layout(canonical(paper), ["controller.K2"], 1e-3, "rk4")
     assert np.all(np.exp(single.high) > 1.001 * high[2:4])
     assert box.reasons[0] == (THEOREM, STEP + TOGETHER) and single.reasons[0] == (THEOREM, STEP)
@@ -345,12 +345,12 @@ def test_pieces_that_bind_are_found_with_their_multipliers(most, share, shift):
 def test_curvature_is_kept_for_the_worst_pieces_of_many(monkeypatch):
     """With room for one piece a requirement the one that leaves is forgotten, and the optimum is
     found all the same."""
-    monkeypatch.setattr(sqp, "MOST_CURVATURES", 1)
+    monkeypatch.setattr(sqp, "MAX_CURVATURES", 1)
     space = SearchSpace(SQUARE, Constraints.of((2,), (0.0,), 2))
     state = steps_of_sqp(TwoPieces(5.0), space, [3.0, -1.0], 20, 1e-10)
     assert state.curvatures.shape == (1, 2, 2)
     np.testing.assert_allclose(state.z, np.full(2, 0.5**0.5), atol=2e-5)
-    np.testing.assert_array_equal(state.curved, np.argmax(state.pieces))
+    np.testing.assert_array_equal(state.curved, np.argmax(state.here.pieces))
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0], ids=["a slope", "a slope that points the wrong way"])

@@ -198,6 +198,5 @@ ValueError."""
 
 def check_options(options: Any) -> None:
     """Checks the fields of a frozen dataclass of options, and converts them to their types."""
-    for field in dataclasses.fields(options):
-        value = CHECKS[field.name](field.name, getattr(options, field.name))
-        object.__setattr__(options, field.name, value)
+    for name, value in dataclasses.asdict(options).items():
+        object.__setattr__(options, name, CHECKS[name](name, value))
