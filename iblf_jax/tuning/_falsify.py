@@ -34,6 +34,8 @@ from iblf_jax.core import checks, notices
 from iblf_jax.core.progress import bar
 from iblf_jax.core.pytree import astype
 from iblf_jax.core.status import VIOLATED, Status, describe
+from iblf_jax.engine import RunRequest
+from iblf_jax.engine.simulate import simulate
 from iblf_jax.simulation.metrics import check_needs
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.results import Rollout
@@ -44,7 +46,7 @@ from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.tuning.evaluation import Derivatives, Value
 from iblf_jax.tuning.parameters import Box
 from iblf_jax.tuning.quantities import DEFICITS, Peak, Quantities
-from iblf_jax.tuning.runs import NUMBERS_A_RUN, RunRequest, simulate, tangents_of_runs
+from iblf_jax.tuning.runs import NUMBERS_A_RUN, tangents_of_runs
 from iblf_jax.tuning.solvers import SQP, SearchSpace
 
 MARGINS = {"positions": "deficit", "velocities": "velocity_deficit", "regions": "region_deficit"}

@@ -38,6 +38,7 @@ import numpy as np
 from iblf_jax.core import checks, notices
 from iblf_jax.core.presentation import present
 from iblf_jax.core.progress import bar
+from iblf_jax.engine import FORWARD_MOST, differentiates_forward
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.designs import MOST_RUNS
@@ -47,7 +48,7 @@ from iblf_jax.tuning.objectives import Objective
 from iblf_jax.tuning.parameters import Block, Tunable, in_units, names_of, values_at
 from iblf_jax.tuning.problem import NO_LEVEL, TuningProblem
 from iblf_jax.tuning.robust import Risk
-from iblf_jax.tuning.runs import FORWARD_MOST, NUMBERS_A_RUN, differentiates_forward
+from iblf_jax.tuning.runs import NUMBERS_A_RUN
 from iblf_jax.tuning.search import Search
 from iblf_jax.tuning.solvers import SQP
 from iblf_jax.tuning.starts import screened

@@ -27,7 +27,7 @@ NOT_PART_OF_THE_PROBLEM = ("patience",)
 
 def fingerprint(problem: TuningProblem, solver: Solver, mode: str, iterations: int) -> str:
     """A hash of everything that a checkpoint must agree with."""
-    options = {}
+    options: dict[str, Any] = {}
     if dataclasses.is_dataclass(solver):
         options = dataclasses.asdict(solver)  # type: ignore[arg-type]
     for name in NOT_PART_OF_THE_PROBLEM:

@@ -38,6 +38,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core.status import UNTRUSTED
+from iblf_jax.engine import run_for_reverse, starts_together
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.sampling import NOISE_NAME
 from iblf_jax.studies.draws import same_place
@@ -46,7 +47,7 @@ from iblf_jax.tuning.problem import NO_LEVEL, Candidate, TuningProblem, of_runs
 from iblf_jax.tuning.quantities import Quantities
 from iblf_jax.tuning.robust import Risk, combine, worst_share
 from iblf_jax.tuning.rollouts import Rollouts, fold_of
-from iblf_jax.tuning.runs import in_groups, run_for_reverse, starts_together, tangents_of_runs
+from iblf_jax.tuning.runs import in_groups, tangents_of_runs
 from iblf_jax.tuning.solvers import SearchSpace
 
 

@@ -40,8 +40,9 @@ import numpy as np
 from iblf_jax.core import checks, notices
 from iblf_jax.core.joints import Selection, holds_weights, indices, selection
 from iblf_jax.core.pytree import component, leaf, static
+from iblf_jax.engine import Outer as Outer
 from iblf_jax.simulation.metrics import Fold, Settling, Tracking, check_needs
-from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.simulation.scenario import Scenario, fit_joints
 from iblf_jax.tuning.quantities import (
     TUNED_SIGNALS,
     MetricResult,
@@ -50,7 +51,6 @@ from iblf_jax.tuning.quantities import (
     quantity_member,
 )
 from iblf_jax.tuning.quantities import Quantity as Quantity
-from iblf_jax.tuning.runs import Outer as Outer
 from iblf_jax.world.robots import joint_names
 
 A_SHARE = "a share of the runs, from 0 to 1"
@@ -85,9 +85,10 @@ class Term:
     def value(self, x: jax.Array) -> jax.Array:
         """The term, from the quantity's value."""
         scale: Any = self.scale
+        limit: Any = self.limit
         if self.shape == "plain":
             return self.weight * x / scale
-        excess = (x - self.limit) / scale
+        excess = (x - limit) / scale
         return self.weight * jax.nn.softplus(self.sharpness * excess) / self.sharpness
 
     @property
@@ -276,12 +277,18 @@ def depends_on_torque(objective: Objective) -> bool:
     )
 
 
-def check_signals(objective: Objective, scenario: Scenario) -> None:
-    """Raises ValueError for an objective of signals that the scenario's runs do not have: margins
-    of velocities or regions, a slack.
+def fitted(objective: Objective, scenario: Scenario) -> Objective:
+    """The objective for the joints and signals of a scenario.
+
+    Raises:
+      ValueError: as `for_scenario`; or the objective is of signals that the scenario's runs do not
+        have, such as margins of velocities or regions, or a slack.
     """
+    objective = for_scenario(objective, scenario)
     for quantity in objective.quantities:
         check_needs("objective", quantity, scenario)
+    fit_joints(objective, scenario.n, "objective")
+    return objective
 
 
 def for_scenario(objective: Objective, scenario: Scenario) -> Objective:

@@ -12,11 +12,11 @@ from typing import Any, NamedTuple, Self
 import jax
 
 from iblf_jax.core import checks, notices
+from iblf_jax.engine import check_backend, differentiates_forward
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.studies.designs import MOST_RUNS
 from iblf_jax.studies.statistics import check_confidence
 from iblf_jax.tuning.robust import as_risk
-from iblf_jax.tuning.runs import check_backend, differentiates_forward
 from iblf_jax.tuning.solvers import SOLVERS, Solver
 from iblf_jax.tuning.solvers._base import CHECKS
 

@@ -17,24 +17,24 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.engine import RunRequest, values_together
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.sampling import check_step, has_noise
-from iblf_jax.simulation.scenario import Scenario, canonical, fit_joints
+from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.draws import Cases, Target, targets_of
 from iblf_jax.studies.recommended import recommended_dt
 from iblf_jax.tuning.objectives import (
     Objective,
-    check_signals,
     checked,
     complete,
-    for_scenario,
+    fitted,
     is_complete,
 )
 from iblf_jax.tuning.options import RunOptions
 from iblf_jax.tuning.parameters import Block, Box, Tunable, layout, values_at
 from iblf_jax.tuning.ranges import sampled_too_slowly
 from iblf_jax.tuning.rollouts import Rollouts, draw_run, piece_counts, rollouts
-from iblf_jax.tuning.runs import NUMBERS_A_RUN, RunRequest, values_together
+from iblf_jax.tuning.runs import NUMBERS_A_RUN
 from iblf_jax.tuning.solvers import Constraints, SearchSpace, Solver
 
 FIRST_PENALTY = 10.0
@@ -129,7 +129,7 @@ class TuningProblem:
             raise checks.fail("runs", run.runs, "1 without perturbations", remedy)
         blocks, box = layout(scenario, parameters, run.dt, run.method)
         checks.fits("runs", run.runs, 8.0 * (1 + len(box.z)) * NUMBERS_A_RUN)
-        goal = _fitted(goal, scenario)
+        goal = fitted(goal, scenario)
         dtype = scenario.initial.q.dtype
         # Terms without a scale are evaluated once with scale 1, for their values at the start.
         arrays = complete(goal, np.ones(len(goal.terms))), by_path, run.dt
@@ -288,11 +288,3 @@ def of_runs(function: Any, candidates: Candidate) -> Any:
     """
     by_start = jax.vmap(jax.vmap(function, in_axes=(None, 0)))(candidates.z, candidates.index)
     return jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), by_start)
-
-
-def _fitted(objective: Objective, scenario: Scenario) -> Objective:
-    """The objective for the joints and signals of a scenario."""
-    fitted = for_scenario(objective, scenario)
-    check_signals(fitted, scenario)
-    fit_joints(fitted, scenario.n, "objective")
-    return fitted

@@ -35,10 +35,10 @@ from iblf_jax.core import checks
 from iblf_jax.core.joints import Selection, indices, selection
 from iblf_jax.core.optional import OptionalMembers
 from iblf_jax.core.pytree import component, leaf, static
+from iblf_jax.engine import Outer
 from iblf_jax.simulation.metrics import Fold
 from iblf_jax.simulation.optional import optional_member
 from iblf_jax.simulation.signals import Sample
-from iblf_jax.tuning.runs import Outer
 
 FAR = 1e6
 """Minus the initial value of a peak, in units of its scale."""

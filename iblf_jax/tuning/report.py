@@ -27,6 +27,7 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.core.status import Status
+from iblf_jax.engine import RunRequest, fresh_together
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.draws import Cases, targets_of
@@ -38,7 +39,7 @@ from iblf_jax.tuning.options import Report, RunOptions
 from iblf_jax.tuning.quantities import OF_LIMIT
 from iblf_jax.tuning.robust import Risk, worst_share
 from iblf_jax.tuning.rollouts import Rollouts, draw_runs, rollouts
-from iblf_jax.tuning.runs import RunRequest, fresh_together, in_groups
+from iblf_jax.tuning.runs import in_groups
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,6 +14,7 @@ import numpy as np
 from iblf_jax.core import checks, notices
 from iblf_jax.core.presentation import present
 from iblf_jax.core.status import UNTRUSTED
+from iblf_jax.engine import RunRequest, run_batch, run_rollout, values_together
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.metrics import as_folds
 from iblf_jax.simulation.results import Rollout
@@ -22,13 +23,7 @@ from iblf_jax.tuning.objectives import Objective, depends_on_torque
 from iblf_jax.tuning.options import Report, RunOptions
 from iblf_jax.tuning.quantities import Quantities
 from iblf_jax.tuning.report import ReportRequest, TuningReport, make_report
-from iblf_jax.tuning.runs import (
-    NUMBERS_A_RUN,
-    RunRequest,
-    run_batch,
-    run_rollout,
-    values_together,
-)
+from iblf_jax.tuning.runs import NUMBERS_A_RUN
 
 LARGEST_CHANGE = 100.0
 """Factor by which a gain may change before a warning is given."""

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.engine import RunRequest, run_batch
 from iblf_jax.simulation.accuracy import RELATIVE
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
 from iblf_jax.simulation.metrics import Torque
@@ -21,7 +22,6 @@ from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.draws import Cases, Target, draw, merge
 from iblf_jax.tuning.objectives import Objective
 from iblf_jax.tuning.quantities import Peak, Quantities
-from iblf_jax.tuning.runs import RunRequest, run_batch
 
 WINDOWS = 8
 """Time windows of a peak: within one of them a signal seldom has two peaks of one height.  With 8,
