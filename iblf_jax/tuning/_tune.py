@@ -1,5 +1,5 @@
-"""`tune`: gains by gradient through the closed loop, under requirements, over perturbed runs,
-validated on fresh ones.
+"""`tune` builds a tuning problem, chooses a solver, searches, and returns the result with its
+report.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def tune(
     progress: bool | Callable[[Search], None] | None = None,
     **deprecated: Any,
 ) -> TuneResult:
-    """Tunes leaves of a scenario, its gains for example, by gradient through the closed loop.
+    """Tunes leaves of a scenario, its gains for example, by derivatives through the closed loop.
 
         minimise    risk_b [ sum_k w_k term_k ]
         subject to  the requirements and the ranges of the parameters

@@ -1,5 +1,5 @@
-"""Objective and requirements of a tuning problem as compiled functions of the coordinates z, with
-their derivatives.
+"""Evaluates objective and requirements of a tuning problem, and their derivatives, by compiled
+functions of the coordinates z.
 
 For each start s and run b one rollout gives the quantities m_bk of the objective.  The objective is
 

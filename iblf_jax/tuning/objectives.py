@@ -1,5 +1,5 @@
-"""What gains are tuned for: objectives, composed with + and weights, and requirements, which
-constrain the tuning and get a verdict in the report.
+"""Gains are tuned for objectives, composed with + and weights, under requirements, which constrain
+the tuning and get a verdict in the report.
 
     objective = ij.objectives.tracking() + 0.5 * ij.objectives.effort()
     objective += 10 * ij.objectives.peak_torque() + ij.objectives.margin_above(0.05)

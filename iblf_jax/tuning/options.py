@@ -1,5 +1,5 @@
-"""Options of `tune`: of the runs, of the report, the choice of a solver, and keyword arguments of
-earlier versions.
+"""The options of `tune`: those of its runs, of its report and of its search, among them keyword
+arguments of earlier versions.
 """
 
 from __future__ import annotations
@@ -31,20 +31,25 @@ EARLIER_NAMES = {"auto": "auto", "newton": "sqp", "lbfgs": "lbfgs", "adam": "ada
 )
 @dataclasses.dataclass(frozen=True, eq=False)
 class RunOptions:
-    """The options of the runs of a tuning, which its problem, its result and its report share."""
+    """The options of the runs of a tuning, which its problem, its result and its report share.
+
+    A further option is a field of this class, a keyword argument of `tune`, and what uses it.
+    """
 
     duration: float
-    """[s]."""
+    """Length of a run [s]."""
     dt: float = 1e-3
     """Time step [s]."""
     method: str = "rk4"
     """Integrator."""
     backend: str = "auto"
+    """Executor of values and of forward mode."""
     perturbations: Any = None
     """Path -> `Perturbation`; one nominal run if empty."""
     runs: int = 1
+    """Number of perturbed runs in the loss."""
     seed: Any = 0
-    """Of the draws."""
+    """Seed of their draws."""
     risk: Any = "mean"
     """How the losses of the runs are combined; a `Risk` once it is checked."""
 
@@ -120,9 +125,9 @@ class SearchOptions(NamedTuple):
     """The options of a search, of its report and of the progress that it shows."""
 
     solver: Solver | None
-    """None: chosen by the number of coordinates."""
+    """The solver; None if the number of coordinates decides."""
     of_automatic: dict[str, Any]
-    """Options of the solver that is chosen automatically, from deprecated keyword arguments."""
+    """Options of a solver that is chosen automatically, from deprecated keyword arguments."""
     report: Report
     show: bool | None
     """Whether a progress bar is shown."""

@@ -1,4 +1,4 @@
-"""Which leaves are tuned, within which limits, and in which coordinates.
+"""Parameters of a tuning: which leaves vary, within which limits, and in which coordinates.
 
 A tuned number x has a coordinate z in which the loss is better conditioned: z = log x for a gain
 that is positive, z = x otherwise.  Limits on x are limits on z, which are the box of SQP.  The
@@ -27,7 +27,7 @@ from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.draws import check_paths
 from iblf_jax.tuning.ranges import GIVEN, default_highs, default_low
 
-EDGE = 1e-3
+MIN_INSET = 1e-3
 """Smallest distance of the start of a squashed coordinate from a limit, relative to the box."""
 
 
@@ -249,14 +249,14 @@ def squashed(box: Box, w: np.ndarray) -> tuple[np.ndarray, Callable[[np.ndarray]
 
 
 def unsquash(z: np.ndarray, box: Box) -> np.ndarray:
-    """The w whose `squash` is z; a z at a limit is moved inside by EDGE."""
+    """The w whose `squash` is z; a z at a limit is moved inside by MIN_INSET."""
     w = np.array(z, float)
     for i, (x, low, high) in enumerate(zip(w, box.low, box.high, strict=True)):
         if np.isfinite(low) and np.isfinite(high):
-            share = np.clip((x - low) / (high - low), EDGE, 1 - EDGE)
+            share = np.clip((x - low) / (high - low), MIN_INSET, 1 - MIN_INSET)
             w[i] = np.log(share / (1 - share))
         elif np.isfinite(low):
-            w[i] = np.log(np.expm1(max(x - low, EDGE)))
+            w[i] = np.log(np.expm1(max(x - low, MIN_INSET)))
         elif np.isfinite(high):
-            w[i] = np.log(np.expm1(max(high - x, EDGE)))
+            w[i] = np.log(np.expm1(max(high - x, MIN_INSET)))
     return w

@@ -73,23 +73,24 @@ class Candidate(NamedTuple):
 @partial(jax.tree_util.register_dataclass, data_fields=TRACED, meta_fields=STATIC)
 @dataclasses.dataclass(frozen=True, eq=False)
 class TuningProblem:
-    """Parameters with ranges, objective with requirements, cases and risk of a tuning."""
+    """A tuning: parameters with ranges, an objective with requirements, and options of its runs."""
 
     cases: Cases
     """The scenario, canonical, with the perturbations of its leaves and the key of the draws."""
     objective: Objective
-    """With requirements; with all scales and limits."""
+    """Terms and requirements, with all scales and limits."""
     dt: jax.Array
-    """Time step in the type of the runs, () [s]."""
+    """Time step as an array of the runs' type, () [s]."""
     box: Box
     """Start and range of the coordinates z."""
     options: RunOptions
+    """Options of the runs, checked."""
     blocks: tuple[Block, ...]
     """The tuned leaves, as parts of z."""
     targets: tuple[Target, ...]
     """The perturbed leaves."""
     request: RunRequest
-    """Of the engine: steps, integrator, backend."""
+    """What the engine runs: number of steps, integrator, executor."""
     allowed: tuple[float, ...]
     """Share of the runs that may violate each requirement."""
     piece_counts: tuple[int, ...]

@@ -1,4 +1,4 @@
-"""What objectives and requirements are made of: smooth numbers of a run, each a fold over its
+"""Objectives and requirements consist of quantities: smooth numbers of a run, each a fold over its
 samples.
 
 Two kinds suffice for most objectives, over a signal y(t), a vector:
@@ -40,9 +40,9 @@ from iblf_jax.simulation.metrics import Fold
 from iblf_jax.simulation.optional import optional_member
 from iblf_jax.simulation.signals import Sample
 
-FAR = 1e6
+FAR_BELOW = 1e6
 """Minus the initial value of a peak, in units of its scale."""
-SOFT_EDGE = 0.1
+EDGE_WIDTH = 0.1
 """Width of the soft edge of a tolerance, as a part of it."""
 
 
@@ -127,7 +127,7 @@ def signal_of(
     | error | e1 |
     | torque | tau |
     | torque_rate | (tau - last tau) / step, the mean over the last step, jumps included |
-    | outside | sqrt(sigmoid((abs(e1) - tolerance) / (SOFT_EDGE tolerance))); the integral of its
+    | outside | sqrt(sigmoid((abs(e1) - tolerance) / (EDGE_WIDTH tolerance))); the integral of its
       square is the time outside the tolerance |
     | deficit | (lower - q, q - upper), the largest of which is minus the margin |
     | velocity_deficit | the same of the velocities |
@@ -148,7 +148,7 @@ def signal_of(
     if name == "outside":
         e1 = of_joints(sample.e1)
         size = jnp.where(e1 >= 0, e1, -e1)
-        return jax.nn.sigmoid((size - tolerance) / (SOFT_EDGE * tolerance)) ** 0.5
+        return jax.nn.sigmoid((size - tolerance) / (EDGE_WIDTH * tolerance)) ** 0.5
     if name == "region_deficit":
         return -sample.region_margin
     if name == "velocity_deficit":
@@ -302,7 +302,7 @@ class Peak:
             y = jnp.concatenate([y, -y])
         elif jnp.ndim(weights) == 1:  # margins have no weights, but a limit for each joint
             y = y * jnp.tile(weights, 1 + has_sides)
-        return jnp.where(sample.t >= self.after * (1 - 1e-6), y / self.scale, -FAR)
+        return jnp.where(sample.t >= self.after * (1 - 1e-6), y / self.scale, -FAR_BELOW)
 
     def init(self, sample: Sample):
         """Far below zero, (W, 2 k) for k joints, or (W, m) for m regions; the predecessor of the
@@ -315,7 +315,7 @@ class Peak:
             entries = sample.region_margin.size
         else:
             entries = 2 * chosen_of(sample.q, self.joints, "joints").size
-        return jnp.full((windows, entries), -FAR, sample.t.dtype), sample.tau
+        return jnp.full((windows, entries), -FAR_BELOW, sample.t.dtype), sample.tau
 
     def update(self, acc, sample: Sample):
         """Adds one sample to the window that it is in."""

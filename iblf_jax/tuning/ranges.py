@@ -37,7 +37,7 @@ from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.tuning.runs import fastest_along, radius_at, start_and_along
 
-CONDITIONS = {"controller.k1": 0.05, "controller.K2": 0.505, "observer.kf": 1.01}
+THEOREM_LIMITS = {"controller.k1": 0.05, "controller.K2": 0.505, "observer.kf": 1.01}
 """Default lower limits: just inside Theorem 2's conditions (3.17), (3.25) on the gains of the
 paper's law."""
 STABILITY_SHARE = 0.7
@@ -69,8 +69,8 @@ TOGETHER = ", with all gains at their upper ends"
 def default_low(path: str, sign: str | None, start: np.ndarray) -> tuple[float, str]:
     """The lower end of the range of a leaf that starts at `start`, and why it is there."""
     leaf = re.sub(r"(\[\d+\])+$", "", path)
-    if leaf in CONDITIONS and np.all(start >= CONDITIONS[leaf]):
-        return CONDITIONS[leaf], THEOREM
+    if leaf in THEOREM_LIMITS and np.all(start >= THEOREM_LIMITS[leaf]):
+        return THEOREM_LIMITS[leaf], THEOREM
     if sign in ("positive", "nonnegative"):
         return 0.0, SIGN
     return -np.inf, NONE

@@ -1,7 +1,7 @@
-"""The report on a tuning: before and after, on fresh runs that it did not use; on the one nominal
-run where nothing is perturbed.
+"""The report on a tuning compares the gains before and after on fresh runs, which the tuning did
+not use, or on the one nominal run where nothing is perturbed.
 
-It contains torque, and gains at an end of their range, whatever the objective: the best tracking
+It contains torque, and gains at an end of their range, whatever the objective is: the best tracking
 without a cost of torque needs more torque than any actuator has.
 
 The scenario is run with both gains on the same fresh draws, so that the change of every number is a

@@ -1,4 +1,4 @@
-"""Batches of runs without derivatives, with the quantities of an objective: for the values of a
+"""Runs batches without derivatives and returns the quantities of an objective, for the values of a
 search and for the report on its result.
 """
 

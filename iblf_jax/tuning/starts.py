@@ -1,4 +1,4 @@
-"""Where a search begins: starting points by values without derivatives.
+"""Finds starting points of a search by values without derivatives.
 
 `starting_points` draws several starts around the scenario's gains.  `feasible_starts` replaces
 starts that leave their bounds by points of the box that do not.
@@ -6,15 +6,17 @@ starts that leave their bounds by points of the box that do not.
 With requirements that are active at the optimum, many gains have many local minima: at each of them
 other peaks are at their limit.  `NearbyStarts` therefore evaluates
 
-    f + PENALTY |f| sum_r max(0, G_r)
+    f + EXCESS_WEIGHT |f| sum_r max(0, G_r)
 
-at POINTS_A_GAIN points a gain, drawn within |z_i - z0_i| <= REACH, and the search begins at the
-lowest.  If that search has converged soon, a second one begins at the lowest point that is at least
-DISTANCE, in one coordinate, from where the first began and from where it ended (`search`).
+at POINTS_PER_GAIN points a gain, drawn within |z_i - z0_i| <= MAX_OFFSET, and the search begins at
+the lowest.  If that search has converged soon, a second one begins at the lowest point that is at
+least MIN_DISTANCE, in one coordinate, from where the first began and from where it ended
+(`search`).
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 
 import jax
@@ -24,20 +26,21 @@ from iblf_jax.tuning.evaluation import Value, values
 from iblf_jax.tuning.parameters import Box
 from iblf_jax.tuning.problem import TuningProblem
 
-POINTS_A_GAIN = 14
-REACH = 1.5
+POINTS_PER_GAIN = 14
+MAX_OFFSET = 1.5
 """Ten problems of six and nine gains, six starts each, 40 evaluations with derivatives.  The mean
 gap to the best known optimum was 6.1 % from the scenario's gains with a first trust region of 1,
-3.1 % with one of 0.5, 1.8 % from the best of 128 points (3.4 % within REACH 2), and 1.4 % with the
-second search (2.8 %)."""
-DISTANCE = 0.75
-PENALTY = 2.0
+3.1 % with one of 0.5, 1.8 % from the best of 128 points (3.4 % within a MAX_OFFSET of 2), and 1.4 %
+with the second search (2.8 %)."""
+MIN_DISTANCE = 0.75
+"""Of the second start from the first search, in one coordinate z."""
+EXCESS_WEIGHT = 2.0
 """Of an excess, relative to the objective; with 10 the gap was 1.6 % instead of 1.4 %, with 10,000
 it was 2.0 %."""
-SPREAD = 1.0
+START_SPREAD = 1.0
 """Half-width of the box around the start in which further starts are drawn, in the coordinates z: a
 factor e for gains."""
-SCREENED = 32
+SCREENED_POINTS = 32
 """Number of points of the box that are evaluated where the first start leaves its bounds, and for
 the ends of a front."""
 
@@ -60,13 +63,13 @@ class NearbyStarts:
         is_refused: Callable[[np.ndarray], bool],
     ):
         size = len(box.z)
-        count = POINTS_A_GAIN * size
+        count = POINTS_PER_GAIN * size
         rng = np.random.default_rng([seed, 4])
-        drawn = box.z + rng.uniform(-REACH, REACH, (count - 1, size))
+        drawn = box.z + rng.uniform(-MAX_OFFSET, MAX_OFFSET, (count - 1, size))
         points = np.concatenate([box.z[None], np.clip(drawn, box.low, box.high)])
         found = values(points)
         excess = np.sum(np.maximum(found.exact_excess, 0.0), axis=1)
-        merit = found.objective + PENALTY * np.abs(found.objective) * excess
+        merit = found.objective + EXCESS_WEIGHT * np.abs(found.objective) * excess
         fine = found.valid & np.isfinite(merit) & (found.margin > 0)
         # The sort is stable, so that the start is first where no point is fine.
         order = np.argsort(np.where(fine, merit, np.inf), kind="stable")
@@ -77,11 +80,11 @@ class NearbyStarts:
         """The values at the first point, (1, ...)."""
 
     def away_from(self, others: np.ndarray) -> np.ndarray | None:
-        """The best point, (p,), that differs by DISTANCE in one coordinate from each of `others`,
-        (k, p); None if there is none.
+        """The best point, (p,), that differs by MIN_DISTANCE in one coordinate from each of
+        `others`, (k, p); None if there is none.
         """
         for z in self.points:
-            is_away = np.all(np.max(np.abs(others - z), axis=1) > DISTANCE)
+            is_away = np.all(np.max(np.abs(others - z), axis=1) > MIN_DISTANCE)
             if is_away and not self.is_refused(z):
                 return z
         return None
@@ -90,7 +93,7 @@ class NearbyStarts:
 def starting_points(box: Box, starts: int, seed: int) -> np.ndarray:
     """The scenario's point and `starts - 1` drawn around it, inside the box, (S, p)."""
     rng = np.random.default_rng([seed, 1])
-    drawn = box.z + rng.uniform(-SPREAD, SPREAD, (starts - 1, len(box.z)))
+    drawn = box.z + rng.uniform(-START_SPREAD, START_SPREAD, (starts - 1, len(box.z)))
     return np.concatenate([box.z[None], np.clip(drawn, box.low, box.high)])
 
 
@@ -115,44 +118,29 @@ def feasible_starts(problem: TuningProblem, seed: int, z: np.ndarray, first: Val
         return z
     points, found, violation = screened(problem, seed, z)
     order = np.lexsort((found.objective, violation))
-    valid = order[found.valid[order]]
-    invalid = order[~found.valid[order]]
     ranked: list[int] = []
-    for group in (valid, invalid):
-        stable = _sampled_fast_enough(problem, points, group, len(z) - len(ranked))
-        ranked += [*stable, *(i for i in group if i not in stable)]
+    for group in (order[found.valid[order]], order[~found.valid[order]]):
+        stable = (i for i in group if not problem.sampled_too_slowly(points[i]))
+        # A test takes long, so no more are tested than are needed.
+        chosen = list(itertools.islice(stable, max(len(z) - len(ranked), 0)))
+        ranked += [*chosen, *(i for i in group if i not in chosen)]
     return points[ranked[: len(z)]]
-
-
-def _sampled_fast_enough(
-    problem: TuningProblem, points: np.ndarray, group: np.ndarray, count: int
-) -> list[int]:
-    """The first `count` of a group that are not sampled too slowly; no more are tested, as a test
-    takes long.
-    """
-    found: list[int] = []
-    for i in group.tolist():
-        if len(found) >= count:
-            break
-        if not problem.sampled_too_slowly(points[i]):
-            found.append(i)
-    return found
 
 
 def screened(
     problem: TuningProblem, seed: int, z: np.ndarray
 ) -> tuple[np.ndarray, Value, np.ndarray]:
-    """The points z (S, p) and SCREENED of the box, their values, and by how much they violate
-    requirements and bounds.
+    """The points z (S, p) and SCREENED_POINTS of the box, their values, and by how much they
+    violate requirements and bounds.
 
     Raises:
       ValueError: none of them can be integrated; the message names a step that is small enough.
     """
     box = problem.box
     rng = np.random.default_rng([seed, 2])
-    low = np.where(np.isfinite(box.low), box.low, box.z - 3 * SPREAD)
-    high = np.where(np.isfinite(box.high), box.high, box.z + 3 * SPREAD)
-    points = np.concatenate([z, rng.uniform(low, high, (SCREENED, len(low)))])
+    low = np.where(np.isfinite(box.low), box.low, box.z - 3 * START_SPREAD)
+    high = np.where(np.isfinite(box.high), box.high, box.z + 3 * START_SPREAD)
+    points = np.concatenate([z, rng.uniform(low, high, (SCREENED_POINTS, len(low)))])
     found = values(problem, points)
     if not np.any(found.valid):
         raise problem.unstable_error(float(np.max(found.trusted)))

@@ -41,7 +41,7 @@ from iblf_jax.tuning.rollouts import fold_of
 from iblf_jax.tuning.search import Search
 from iblf_jax.tuning.solvers import Constraints, SearchSpace, quadratic, sqp
 from iblf_jax.tuning.solvers.sqp import solve_subproblem
-from iblf_jax.tuning.starts import DISTANCE, REACH, NearbyStarts, screened
+from iblf_jax.tuning.starts import MAX_OFFSET, MIN_DISTANCE, NearbyStarts, screened
 
 jax.config.update("jax_enable_x64", True)
 
@@ -436,11 +436,11 @@ def test_a_second_search_begins_elsewhere_and_the_better_goes_on():
     valleys = Valleys()
     nearby = NearbyStarts(lambda z: valleys(z).value, box, 0, lambda z: False)
     assert nearby.count == len(nearby.points) == 14 * 7 and np.all(
-        np.abs(nearby.points - box.z) <= REACH
+        np.abs(nearby.points - box.z) <= MAX_OFFSET
     )
     first = nearby.points[0]
     assert np.sum((first + 1) ** 2) < np.sum((nearby.points[-1] + 1) ** 2)
-    assert np.max(np.abs(nearby.away_from(first[None]) - first)) > DISTANCE
+    assert np.max(np.abs(nearby.away_from(first[None]) - first)) > MIN_DISTANCE
     # From a second start that is given to it, it finds the deeper valley, and its minimum.
     evaluate = Turns(SearchSpace(box, Constraints.of((1,), (0.0,), 1)))
     calls = []

@@ -55,29 +55,41 @@ from iblf_jax.core import checks
 from iblf_jax.tuning.solvers import quadratic
 from iblf_jax.tuning.solvers._base import Constraints, Optimality, SearchSpace, check_options
 
-RADIUS, RADIUS_IF_MULTIMODAL = 1.0, 0.5
-"""First |s_i|; 1 is a factor e for a gain.  With 0.5 where several minima are expected, the mean
-gap to the best known optimum of ten problems fell from 6.1 % to 3.1 % (see `starts`)."""
+INITIAL_RADIUS = 1.0
+"""First |s_i|; 1 is a factor e for a gain."""
+INITIAL_RADIUS_IF_MULTIMODAL = 0.5
+"""Where several minima are expected.  With it, the mean gap to the best known optimum of ten
+problems fell from 6.1 % to 3.1 % (see `starts`)."""
 LARGEST_RADIUS = 4.0
-ACCEPTED, POOR, GOOD = 1e-4, 0.25, 0.7
-"""Ratio of actual to predicted decrease above which a trial is accepted, below which delta shrinks,
-and above which it grows."""
-SHRINK, GROW = 0.4, 2.0
+RATIO_TO_ACCEPT = 1e-4
+"""Ratio of actual to predicted decrease above which a trial is accepted."""
+RATIO_TO_SHRINK = 0.25
+"""Ratio below which delta shrinks."""
+RATIO_TO_GROW = 0.7
+"""Ratio above which delta grows."""
+SHRINK_FACTOR = 0.4
+GROWTH_FACTOR = 2.0
 SMALLEST_EIGENVALUE = 1e-6
 """Of the model's matrix, relative to its largest."""
 TARGET_EXCESS = 1e-5
 """How far inside its limit a requirement is aimed at, in its scale, so that rounding does not
 violate it."""
-LEAST_PENALTY, LARGEST_PENALTY, PENALTY_FACTOR = 2.0, 1e6, 10.0
-"""rho, relative to the size of the objective, and the factor by which it is increased."""
+LEAST_PENALTY = 2.0
+"""rho at least, relative to the size of the objective."""
+LARGEST_PENALTY = 1e6
+"""rho at most, relative to the size of the objective."""
+PENALTY_FACTOR = 10.0
+"""Factor by which rho is increased."""
 CURVATURE_ROUNDS = 3
+"""Subproblems with the curvature of the pieces."""
 COLLAPSED_RADIUS = 1e-3
 """delta below which a start is stuck: the model does not predict the objective even so near."""
-AT_END = 1e-6
+BLOCKING_DISTANCE = 1e-6
 """Distance in z from the end of a range within which the range blocks a gain."""
-MAX_PIECES, RUNS_OF_MEAN = 200, 3
-"""Largest number of pieces of one requirement in a subproblem, and of runs where G_r is the mean of
-k of them, as a multiple of k; the worst are taken."""
+MAX_PIECES = 200
+"""Largest number of pieces of one requirement in a subproblem; the worst are taken."""
+RUNS_OF_MEAN = 3
+"""Where G_r is the mean of the k worst runs, this multiple of k runs is in a subproblem."""
 MAX_CURVATURES = 4000
 """Largest number of pieces of one requirement of which C_j is stored.  With the 200 of a subproblem
 only, 64 runs of two joints took 26 evaluations instead of 14."""
@@ -369,8 +381,8 @@ class SQP:
         if self.radius is not None:
             return self.radius
         if space.multimodal:
-            return RADIUS_IF_MULTIMODAL
-        return RADIUS
+            return INITIAL_RADIUS_IF_MULTIMODAL
+        return INITIAL_RADIUS
 
     def _new_start(self, space: SearchSpace, z: np.ndarray, curved: int) -> SQPState:
         size = len(z)
@@ -453,14 +465,14 @@ def _advance(space: SearchSpace, state: SQPState, found: Point, tolerance: float
     if valid:
         ratio = _decrease_ratio(space, state, found)
         _update_curvatures(state, step, found)
-    if ratio > ACCEPTED:
+    if ratio > RATIO_TO_ACCEPT:
         _accept(space, state, found)
     elif valid and not state.corrected and _correct(space, state, step, found.pieces):
         return
-    if ratio < POOR:
-        state.radius = SHRINK * length
-    elif ratio > GOOD and length > 0.9 * state.radius:
-        state.radius = min(GROW * state.radius, LARGEST_RADIUS)
+    if ratio < RATIO_TO_SHRINK:
+        state.radius = SHRINK_FACTOR * length
+    elif ratio > RATIO_TO_GROW and length > 0.9 * state.radius:
+        state.radius = min(GROWTH_FACTOR * state.radius, LARGEST_RADIUS)
     _plan(space, state, tolerance)
 
 
@@ -601,8 +613,8 @@ def _best_with_curvature(
 def _residuals(space: SearchSpace, state: SQPState, found: Step, excess: np.ndarray) -> np.ndarray:
     """Residuals of the optimality conditions, as in `Optimality`."""
     slope = found.lagrangian
-    blocked_below = (state.z < space.box.low + AT_END) & (slope > 0)
-    blocked_above = (state.z > space.box.high - AT_END) & (slope < 0)
+    blocked_below = (state.z < space.box.low + BLOCKING_DISTANCE) & (slope > 0)
+    blocked_above = (state.z > space.box.high - BLOCKING_DISTANCE) & (slope < 0)
     stationarity = np.max(np.abs(np.where(blocked_below | blocked_above, 0.0, slope)))
     products = np.sum(found.piece_multipliers * state.here.pieces, axis=0)
     complementarity = sum(
