@@ -301,7 +301,7 @@ class Peak:
             y = weights * y
             y = jnp.concatenate([y, -y])
         elif jnp.ndim(weights) == 1:  # margins have no weights, but a limit for each joint
-            y = y * jnp.tile(weights, 1 + has_sides)
+            y = y * (jnp.concatenate([weights, weights]) if has_sides else weights)
         return jnp.where(sample.t >= self.after * (1 - 1e-6), y / self.scale, -FAR_BELOW)
 
     def init(self, sample: Sample):
