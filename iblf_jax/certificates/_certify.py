@@ -23,6 +23,7 @@ from iblf_jax.certificates.result import Certificate, Traces
 from iblf_jax.certificates.run_summary import RunSummary, Segment, summarise
 from iblf_jax.control import actuators, sensors
 from iblf_jax.core import checks, notices
+from iblf_jax.core.optional import has_members
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.engine.simulate import SimulationWarning, simulate
 from iblf_jax.simulation.optional import optional_member
@@ -127,7 +128,7 @@ def _request(scenario: Scenario, run: Any, worst: int | None) -> _Request:
         if not run.is_batch:
             return _Request([(0, on_host)], many=False)
         return _Request(((i, on_host[i]) for i in range(len(run))), many=True)
-    if all(hasattr(run, name) for name in ("replay", "metrics", "__len__")):
+    if has_members(run, "replay", "metrics", "__len__"):
         indices = _nearest_to_bounds(run, worst)
         return _Request(((i, _on_host(_replayed(run, i))) for i in indices), many=True)
     raise checks.fail(

@@ -25,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core.devices import default, platform
+from iblf_jax.core.optional import missing_members
 
 F = TypeVar("F", bound=Callable)
 
@@ -418,7 +419,7 @@ def conforms(
     )
     if bare:
         raise fail(name, value, expected, remedy)
-    missing = sorted(x for x in members - set(optional) if not hasattr(value, x))
+    missing = missing_members(value, sorted(members - set(optional)))
     if missing:
         raise fail(name, value, expected, f"{remedy} It lacks {', '.join(missing)}.".strip())
     for field, part in getattr(value, "__dict__", {}).items():
@@ -447,7 +448,7 @@ def offers(name: str, value: Any, methods: tuple[str, ...], expected: str) -> No
     )
     if bare and methods:
         raise fail(name, value, expected)
-    missing = [x for x in methods if not hasattr(value, x)]
+    missing = missing_members(value, methods)
     if missing:
         raise fail(name, value, expected, f"It lacks {', '.join(missing)}.")
 

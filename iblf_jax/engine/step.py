@@ -541,7 +541,9 @@ def _before_sample(
     if not folds:
         return carry.accumulators, ()
     commands = carry.state.sampled.commands
-    torque = sampling.torque_before(scenario.sampling, dt, commands, along.state.sampled.commands)  # type: ignore[arg-type]
+    pending = along.state.sampled.commands
+    schedule: Any = scenario.sampling
+    torque = sampling.torque_before(schedule, dt, commands, pending)
     t, behind = moment.span.start, moment.behind
     seen_at = (
         t

@@ -29,6 +29,7 @@ import jax
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.optional import attributes
 from iblf_jax.core.status import Status, describe
 from iblf_jax.files import digest
 from iblf_jax.files.scenario import scenario_to_toml
@@ -188,8 +189,9 @@ def _batch_dims(run: Rollout) -> tuple[str, ...]:
 
 def _trajectories(run: Rollout, batch: tuple[str, ...]) -> dict[str, Any]:
     variables = {}
+    values = attributes(run, SIGNALS)
     for name, signal in SIGNALS.items():
-        value = getattr(run, name)
+        value = values[name]
         if name == "t" or isinstance(value, tuple):  # The scenario has no such signal.
             continue
         dims = (*batch, "time", *own_dims(name, value.shape[len(batch) + 1 :], run.n))
@@ -199,8 +201,9 @@ def _trajectories(run: Rollout, batch: tuple[str, ...]) -> dict[str, Any]:
 
 def _states(run: Rollout, batch: tuple[str, ...]) -> dict[str, Any]:
     variables = {}
+    states = attributes(run, STATES)
     for state, description in STATES.items():
-        for keys, value in jax.tree_util.tree_leaves_with_path(getattr(run, state)):
+        for keys, value in jax.tree_util.tree_leaves_with_path(states[state]):
             name = re.sub(r"\W+", "_", state + jax.tree_util.keystr(keys)).strip("_")
             dims = (*batch, "time", *own_dims(name, np.shape(value)[len(batch) + 1 :], run.n))
             variables[name] = (dims, np.asarray(value), _attrs("1", description))

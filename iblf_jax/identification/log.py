@@ -191,7 +191,8 @@ def _of_rollout(run: Rollout, what: str) -> dict[str, np.ndarray]:
             "tau": np.asarray(run.tau, float),
         }
     # A sampled loop records its measurements at the start of each period.
-    t, period = np.asarray(run.t, float), float(run.scenario.sampling.period)  # type: ignore[union-attr]
+    t = np.asarray(run.t, float)
+    period = float(run.scenario.sampling.period)  # type: ignore[union-attr]
     taken = np.flatnonzero(np.abs(t / period - np.round(t / period)) < 1e-6)
     return {
         name: np.asarray(x, float)[taken]

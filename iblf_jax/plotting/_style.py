@@ -300,7 +300,8 @@ def wrapped(words: str, room: int) -> str:
     """A label on lines of about `room` characters; it breaks at spaces, in paths after a dot,
     bracket or underscore, and not in a unit.
     """
-    text, unit = re.fullmatch(r"(.*?)( \[[^\[\]]*\])?", words, re.DOTALL).groups("")  # type: ignore[union-attr]
+    found: Any = re.fullmatch(r"(.*?)( \[[^\[\]]*\])?", words, re.DOTALL)
+    text, unit = found.groups("")
     lines = [""]
     for part in [*PIECES.findall(text), unit]:
         pieces = [part]

@@ -23,6 +23,7 @@ import numpy as np
 
 from iblf_jax.core import checks, notices, tables
 from iblf_jax.core.progress import bar
+from iblf_jax.core.pytree import field_values
 from iblf_jax.core.status import FAILED
 from iblf_jax.simulation.metrics import Fold, metric_units
 from iblf_jax.simulation.results import Metrics
@@ -70,13 +71,12 @@ class Sensitivity:
         import xarray
 
         names = {"first_order": "S", "total_order": "ST"}
+        values = field_values(self)
         variables: dict[str, Any] = {
-            name: ("parameter", getattr(self, name), {"symbol": symbol})
-            for name, symbol in names.items()
+            name: ("parameter", values[name], {"symbol": symbol}) for name, symbol in names.items()
         }
         variables |= {
-            f"{name}_interval": (("parameter", "end"), getattr(self, f"{name}_interval"))
-            for name in names
+            f"{name}_interval": (("parameter", "end"), values[f"{name}_interval"]) for name in names
         }
         coordinates = {"parameter": list(self.parameters), "end": ["low", "high"]}
         return xarray.Dataset(

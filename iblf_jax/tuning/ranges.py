@@ -29,7 +29,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.control.sensors._base import unrounded
+from iblf_jax.control.actuators._base import actuator_member
+from iblf_jax.control.sensors._base import sensor_member, unrounded
 from iblf_jax.simulation.closed_loop import LoopState, run_sampled_law
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.paths import with_parameters
@@ -165,7 +166,7 @@ def drive_exceeded(scenario: Scenario) -> str:
     rest; empty where it does not.
     """
     actuator = scenario.actuator
-    if scenario.sampling is None or not hasattr(actuator, "unlimited"):
+    if scenario.sampling is None or actuator_member(actuator, "unlimited") is None:
         return ""
     commands = _command_steps(scenario, jnp.asarray(TIMES, scenario.initial.q.dtype))
     zero = jnp.zeros_like(scenario.initial.q)
@@ -185,7 +186,7 @@ def _command_steps(scenario: Scenario, times: jax.Array) -> tuple[jax.Array, jax
     sensor = scenario.sensor
     # A sensor without rounding or resolution has no counts.
     smooth = dataclasses.replace(scenario, sensor=unrounded(sensor))
-    resolution = jnp.asarray(getattr(sensor, "resolution", 0.0), times.dtype)
+    resolution = jnp.asarray(sensor_member(sensor, "resolution"), times.dtype)
     count = jnp.broadcast_to(resolution, (scenario.n,))
 
     def command(t: jax.Array, state: LoopState, q: jax.Array, normal: jax.Array) -> jax.Array:

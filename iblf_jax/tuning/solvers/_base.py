@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.pytree import field_values
 from iblf_jax.tuning.parameters import Box
 from iblf_jax.tuning.robust import worst_count
 
@@ -198,6 +198,5 @@ ValueError."""
 
 def check_options(options: Any) -> None:
     """Checks the fields of a frozen dataclass of options, and converts them to their types."""
-    for field in dataclasses.fields(options):
-        value = CHECKS[field.name](field.name, getattr(options, field.name))
-        object.__setattr__(options, field.name, value)
+    for name, value in field_values(options).items():
+        object.__setattr__(options, name, CHECKS[name](name, value))
