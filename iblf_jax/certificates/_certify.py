@@ -123,12 +123,15 @@ def _request(scenario: Scenario, run: Any, worst: int | None) -> _Request:
     if worst is not None:
         worst = checks.positive_integer("worst", worst)
     if isinstance(run, Rollout):
-        _check_scenario(scenario, run)
+        _check_same(scenario, run.scenario, numbers=not run.is_batch)
         on_host = _on_host(run)
         if not run.is_batch:
             return _Request([(0, on_host)], many=False)
         return _Request(((i, on_host[i]) for i in range(len(run))), many=True)
     if has_members(run, "replay", "metrics", "__len__"):
+        nominal = optional_member(run, "scenario")
+        if nominal is not None:
+            _check_same(scenario, canonical(nominal), numbers=True)
         indices = _nearest_to_bounds(run, worst)
         return _Request(((i, _on_host(_replayed(run, i))) for i in indices), many=True)
     raise checks.fail(
@@ -144,16 +147,16 @@ def _on_host(run: Rollout) -> Rollout:
     return jax.tree.map(np.asarray, run)
 
 
-def _check_scenario(scenario: Scenario, run: Rollout) -> None:
-    """Raises ValueError for a run of another scenario; the leaves of a batch may differ."""
+def _check_same(scenario: Scenario, of_run: Scenario, *, numbers: bool) -> None:
+    """Raises ValueError for a run or a study of another scenario; the numbers of the runs of a
+    batch may differ.
+    """
     structure: Any = jax.tree.structure(scenario)
     got = ""
-    if structure != jax.tree.structure(run.scenario):
+    if structure != jax.tree.structure(of_run):
         got = "a run of another kind of scenario"
-    elif not run.is_batch:
-        pairs = zip(jax.tree.leaves(scenario), jax.tree.leaves(run.scenario), strict=True)
-        if not all(np.array_equal(a, b) for a, b in pairs):
-            got = "a run of a scenario with other numbers"
+    elif numbers and not all(map(np.array_equal, *map(jax.tree.leaves, (scenario, of_run)))):
+        got = "a run of a scenario with other numbers"
     if got:
         remedy = "Pass run.scenario as the scenario."
         raise checks.fail("run", got, "a run of `scenario`", remedy)
