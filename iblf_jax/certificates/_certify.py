@@ -31,10 +31,10 @@ from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical, with_parts
 from iblf_jax.world.robots import joint_names
 
-RECORDED = 20_000
+MAX_RECORDED = 20_000
 """Largest number of recorded samples of a run that `certify` makes; the other steps are
 reconstructed."""
-WORST = 16
+DEFAULT_WORST = 16
 """Runs of a study that are checked if the caller does not say how many."""
 SAMPLED = "the loop is sampled, and Theorem 2 is about a law that runs at every instant"
 MEASURED = "how far the sampled run is from the continuous one; no claim of the theorem"
@@ -48,7 +48,7 @@ def certify(
     duration: float = 20.0,
     dt: float = 1e-3,
     method: str = "rk4",
-    worst: int | None = WORST,
+    worst: int | None = DEFAULT_WORST,
 ) -> Certificate:
     """Checks every inequality of Theorem 2 on a run, with margins.
 
@@ -85,7 +85,7 @@ def certify(
     scenario = canonical(scenario)
     _check_certifiable(scenario)
     if run is None:
-        every = 1 + checks.whole_steps(duration, dt) // RECORDED
+        every = 1 + checks.whole_steps(duration, dt) // MAX_RECORDED
         run = simulate(scenario, duration=duration, dt=dt, method=method, record_every=every)
     request = _request(scenario, run, worst)
     if request.many:
@@ -190,9 +190,9 @@ def _replayed(study: Any, index: int) -> Rollout:
     if duration is None or dt is None:
         return study.replay(index)
     steps = round(duration / dt)
-    if steps <= RECORDED:
+    if steps <= MAX_RECORDED:
         return study.replay(index)
-    return study.replay(index, record_every=1 + steps // RECORDED)
+    return study.replay(index, record_every=1 + steps // MAX_RECORDED)
 
 
 # --- one run -------------------------------------------------------------------------------------

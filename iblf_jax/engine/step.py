@@ -657,7 +657,7 @@ def recorded(folds: Any, found: Advanced):
 def samples_of_step(scenario: Scenario) -> int:
     """How many samples the folds see of a step at most: `Advanced.nodes`."""
     arrives = scenario.sampling is not None and scenario.sampling.queue > 0
-    cuts = min(scenario.jump_times().size, jumps.MOST_CUTS) + arrives
+    cuts = min(scenario.jump_times().size, jumps.MAX_CUTS) + arrives
     return 1 + (scenario.sampling is not None) + 2 * cuts
 
 
@@ -738,7 +738,7 @@ class LinearizationStep:
             plant = plant.plant
         rooms = stability.largest_difference_sizes(inputs.scenario, carry.time, plant, x.size)
         room = jnp.where(
-            iteration < 0, jnp.sum(rooms * unit), jnp.asarray(stability.WIDEST, x.dtype)
+            iteration < 0, jnp.sum(rooms * unit), jnp.asarray(stability.THIRD_SIZE, x.dtype)
         )
         sizes = stability.difference_sizes(x, direction, room)
         widest = level == 2

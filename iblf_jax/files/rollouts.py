@@ -53,7 +53,7 @@ ENDINGS = (".nc", ".npz")
 _ATTRIBUTES = "attributes"
 DIGEST = "digest"
 """Attribute of a netCDF file that holds the digests of its content."""
-MOST_NAMED = 4
+MAX_NAMED = 4
 """Largest number of damaged variables that an error names."""
 
 
@@ -333,9 +333,9 @@ def _verify(
 
 
 def _damaged(path: str | os.PathLike, different: list[str]) -> ValueError:
-    shown = ", ".join(different[:MOST_NAMED])
-    if len(different) > MOST_NAMED:
-        shown += f" and {len(different) - MOST_NAMED} more"
+    shown = ", ".join(different[:MAX_NAMED])
+    if len(different) > MAX_NAMED:
+        shown += f" and {len(different) - MAX_NAMED} more"
     came = Words(f"content that differs from its digest: {shown}")
     remedy = (
         "The file is damaged: restore it or run again. If it was edited on purpose, delete its"

@@ -67,7 +67,7 @@ from iblf_jax.simulation import metrics
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.studies import distributions
-from iblf_jax.studies.designs import MOST_RUNS
+from iblf_jax.studies.designs import MAX_RUNS
 from iblf_jax.studies.distributions import Distribution, Perturbation
 from iblf_jax.studies.draws import targets_of
 from iblf_jax.studies.statistics import check_confidence
@@ -445,7 +445,7 @@ def _decoded_setup(data: dict[str, Any]) -> TuneSetup:
     checks.whole_steps(setup.duration, setup.dt)
     check_confidence(setup.confidence)
     for name, value in attributes(setup, ("runs", "report_runs")).items():
-        checks.positive_integer(name, value, most=MOST_RUNS)
+        checks.positive_integer(name, value, most=MAX_RUNS)
     checks.seed(setup.seed)
     checks.seed(setup.report_seed)
     return setup

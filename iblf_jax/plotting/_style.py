@@ -42,7 +42,7 @@ WIDTH = 7.2
 """Width of a figure, the text width of a page [in]."""
 FONT = 9.0
 """Font size for which all sizes in this module are chosen [pt]."""
-GROWTH = 0.75
+SIZE_EXPONENT = 0.75
 """Exponent with which figures grow with the font size."""
 
 SIZES = {
@@ -200,7 +200,7 @@ def new_figure(width: float, height: float) -> StyledFigure:
     Args:
       width, height: size for a font of size FONT [in]; larger fonts enlarge the figure.
     """
-    growth = max(1.0, size(1.0)) ** GROWTH
+    growth = max(1.0, size(1.0)) ** SIZE_EXPONENT
     return StyledFigure(figsize=(width * growth, height * growth), layout="constrained")
 
 

@@ -30,7 +30,7 @@ from iblf_jax.simulation.results import Metrics
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies import statistics
 from iblf_jax.studies.blocks import case_bytes, result_shapes
-from iblf_jax.studies.designs import MOST_SOBOL, split
+from iblf_jax.studies.designs import MAX_SOBOL, split
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.draws import sample_size
 from iblf_jax.studies.execution import run_all_cases
@@ -188,7 +188,7 @@ def sensitivity(
 
 
 def _checked_points(points: Any) -> int:
-    points = checks.positive_integer("points", points, most=MOST_SOBOL[1])
+    points = checks.positive_integer("points", points, most=MAX_SOBOL[1])
     if points & (points - 1) or points < 2:
         nearest = max(2, 1 << round(np.log2(points)))
         raise checks.fail("points", points, "a power of two", f"Take points={nearest}.")

@@ -68,7 +68,7 @@ def _undeclared(member: Any) -> list[Any]:
 def check_number(n: int | None) -> None:
     """Raises ValueError unless `n` is None or a number of joints."""
     if n is not None:
-        checks.positive_integer("n", n, most=checks.MOST_JOINTS)
+        checks.positive_integer("n", n, most=checks.MAX_JOINTS)
 
 
 def number_of_joints(findings: Findings, member: Any, n: int | None) -> int:

@@ -161,7 +161,7 @@ def joint_names(robot: Any, n: int) -> tuple[str, ...]:
     """What the n joints of a robot are called: by its `joints`, the names in its file, else "joint
     0", "joint 1", ...
     """
-    n = checks.positive_integer("n", n, least=0, most=checks.MOST_JOINTS)
+    n = checks.positive_integer("n", n, least=0, most=checks.MAX_JOINTS)
     names = tuple(map(str, robot_member(robot, "joints")))
     if len(names) == n:
         return names
