@@ -25,7 +25,7 @@ from iblf_jax.simulation.results import Metrics, Rollout
 from iblf_jax.simulation.sampling import check_step, has_noise, noise_key
 from iblf_jax.simulation.scenario import Scenario, canonical
 
-MOST_SAMPLES = 20_000_000
+MAX_SAMPLES = 20_000_000
 """Recorded samples of a run at most: a mistake in `duration` or `dt` must not fill the memory.  For
 two joints they take some 5 GB."""
 
@@ -105,16 +105,16 @@ def simulate(
 def _checked_record(record_every: int, steps: int) -> int:
     """The interval of the recorded samples; raises ValueError where they would be too many."""
     record_every = checks.recorded_every(record_every, steps)
-    if steps // record_every <= MOST_SAMPLES:
+    if steps // record_every <= MAX_SAMPLES:
         return record_every
     remedy = (
-        f"Take record_every={-(-steps // MOST_SAMPLES)} or more; metrics cover every step all"
+        f"Take record_every={-(-steps // MAX_SAMPLES)} or more; metrics cover every step all"
         " the same."
     )
     raise checks.fail(
         "record_every",
         record_every,
-        f"at most {MOST_SAMPLES} recorded samples of {steps} steps",
+        f"at most {MAX_SAMPLES} recorded samples of {steps} steps",
         remedy,
     )
 

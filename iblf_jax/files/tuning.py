@@ -58,6 +58,8 @@ import numpy as np
 
 from iblf_jax.core import checks, notices
 from iblf_jax.core.joints import holds_weights
+from iblf_jax.core.optional import attributes
+from iblf_jax.core.pytree import field_values
 from iblf_jax.files import components
 from iblf_jax.files.scenario import from_dict, read_toml, scenario_to_dict
 from iblf_jax.files.study import perturbations_of
@@ -343,20 +345,20 @@ def save_tuning(result: TuneResult, path: str | os.PathLike) -> None:
         name: {"dtype": str(x.dtype), "shape": x.shape, "values": x.ravel().tolist()}
         for name, x in result.history.items()
     }
-    of_setup = {name: getattr(setup, name) for name in SETUP}
-    of_report = {name: getattr(setup.report, field) for name, field in OF_REPORT.items()}
+    report = field_values(setup.report)
+    of_report = {name: report[field] for name, field in OF_REPORT.items()}
     data = {
         "what": "iblf_jax tuning result",
         "start": scenario_to_dict(result.start),
         "values": {key: np.asarray(x).tolist() for key, x in result.values.items()},
         "history": history,
-        "setup": of_setup | of_report,
+        "setup": attributes(setup, SETUP) | of_report,
         "risk": list(setup.risk),
         "objective": components.encode_fields(setup.objective, "objective"),
         "perturbations": {
             key: components.encode_fields(x, key) for key, x in setup.perturbations.items()
         },
-        **{name: getattr(result, name) for name in RESULT},
+        **attributes(result, RESULT),
         "report": result.report.to_dict(),
     }
     temporary = target.with_name(f".{target.name}.partial")

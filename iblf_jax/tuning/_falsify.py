@@ -159,7 +159,7 @@ def falsify(
     check_step(scenario, dt)
     starts = checks.positive_integer("starts", starts)
     checks.fits("starts", starts, 8.0 * NUMBERS_A_RUN)
-    iterations = checks.positive_integer("iterations", iterations, most=checks.MOST_STEPS)
+    iterations = checks.positive_integer("iterations", iterations, most=checks.MAX_STEPS)
     checks.fits("iterations", iterations, 8 * starts)
     seed = checks.seed(seed)
     cube = bounded(scenario, perturbations)

@@ -41,7 +41,7 @@ from iblf_jax.core.progress import bar
 from iblf_jax.engine import FORWARD_MOST, differentiates_forward
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.studies.designs import MOST_RUNS
+from iblf_jax.studies.designs import MAX_RUNS
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.tuning.evaluation import Evaluator, Value, values
 from iblf_jax.tuning.objectives import Objective
@@ -55,11 +55,11 @@ from iblf_jax.tuning.starts import screened
 
 END_TOLERANCE = 1e-3
 """By how much an end may be above the least value of its objective, relative to it."""
-SMALLEST_GAP = 0.05
+GAP_TOLERANCE = 0.05
 """Neighbours whose objectives differ by less, relatively, have no gap between them."""
 MAX_BATCH = 8
 """Number of points that are searched for in one batch at most."""
-VALUES_PER_POINT = 8
+POINTS_BETWEEN = 8
 """Number of values on the lines between neighbours, for each point."""
 
 
@@ -163,8 +163,8 @@ def pareto(
     Source: head of this module.
     """
     began = time.perf_counter()
-    points = checks.positive_integer("points", points, least=2, most=MOST_RUNS)
-    iterations = checks.positive_integer("iterations", iterations, most=checks.MOST_STEPS)
+    points = checks.positive_integer("points", points, least=2, most=MAX_RUNS)
+    iterations = checks.positive_integer("iterations", iterations, most=checks.MAX_STEPS)
     tolerance = checks.number_between("tolerance", tolerance, 0.0, 1.0, "1")
     problem = TuningProblem.build(
         scenario,
@@ -184,7 +184,7 @@ def pareto(
         came = f"{problem.size} numbers"
         expected = f"at most {FORWARD_MOST} for a front"
         raise checks.fail("parameters", came, expected, "Tie or leave out some.")
-    checks.fits("points", points, 8.0 * VALUES_PER_POINT * problem.runs * NUMBERS_A_RUN)
+    checks.fits("points", points, 8.0 * POINTS_BETWEEN * problem.runs * NUMBERS_A_RUN)
     search = FrontSearch(problem, min(points, MAX_BATCH), iterations, tolerance)
     with bar(progress, points, unit="points") as shown:
         search.run(points, seed, shown)
@@ -242,7 +242,7 @@ class FrontSearch:
                 np.array([gap.level for gap in gaps]),
             )
             shown.update(len(gaps))
-        self.fill(VALUES_PER_POINT * points)
+        self.fill(POINTS_BETWEEN * points)
 
     def ends(self, seed: int) -> None:
         """Both ends: each objective alone, and then the other one at nearly no cost to it.
@@ -328,7 +328,7 @@ class FrontSearch:
         for k in np.argsort(-size).tolist():
             low, high = np.sort(ends[:, k])
             had_level = any(j == k and low + 2 * END_TOLERANCE < x < high for j, x in self.levels)
-            if size[k] > SMALLEST_GAP and not had_level:
+            if size[k] > GAP_TOLERANCE and not had_level:
                 middle = 0.5 * (self.z[one] + self.z[other])
                 return Gap(float(size[k]), middle, 1 - k, 0.5 * (low + high))
         return None

@@ -17,6 +17,7 @@ import jax
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.pytree import field_values
 from iblf_jax.tuning.problem import TuningProblem
 from iblf_jax.tuning.search import Search
 from iblf_jax.tuning.solvers import Solver
@@ -29,7 +30,7 @@ def fingerprint(problem: TuningProblem, solver: Solver, mode: str, iterations: i
     """A hash of everything that a checkpoint must agree with."""
     options: dict[str, Any] = {}
     if dataclasses.is_dataclass(solver):
-        options = dataclasses.asdict(solver)  # type: ignore[arg-type]
+        options = field_values(solver)
     for name in NOT_PART_OF_THE_PROBLEM:
         options.pop(name, None)
     if "schedule" in options:

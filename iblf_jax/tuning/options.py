@@ -14,7 +14,7 @@ import jax
 from iblf_jax.core import checks, notices
 from iblf_jax.engine import check_backend, differentiates_forward
 from iblf_jax.simulation.integrators import tableau
-from iblf_jax.studies.designs import MOST_RUNS
+from iblf_jax.studies.designs import MAX_RUNS
 from iblf_jax.studies.statistics import check_confidence
 from iblf_jax.tuning.robust import as_risk
 from iblf_jax.tuning.solvers import SOLVERS, Solver
@@ -69,7 +69,7 @@ class RunOptions:
             dt=float(self.dt),
             perturbations={} if self.perturbations is None else self.perturbations,
             seed=checks.seed(self.seed),
-            runs=checks.positive_integer("runs", self.runs, most=MOST_RUNS),
+            runs=checks.positive_integer("runs", self.runs, most=MAX_RUNS),
             risk=as_risk(self.risk),
         )
 
@@ -89,7 +89,7 @@ class Report:
     confidence: float = 0.95
 
     def __post_init__(self) -> None:
-        runs = checks.positive_integer("report_runs", self.runs, most=MOST_RUNS)
+        runs = checks.positive_integer("report_runs", self.runs, most=MAX_RUNS)
         object.__setattr__(self, "runs", runs)
         if self.seed is not None:
             object.__setattr__(self, "seed", checks.seed(self.seed, "report_seed"))

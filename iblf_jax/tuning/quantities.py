@@ -40,7 +40,7 @@ from iblf_jax.simulation.metrics import Fold
 from iblf_jax.simulation.optional import optional_member
 from iblf_jax.simulation.signals import Sample
 
-FAR_BELOW = 1e6
+INITIAL_PEAK = 1e6
 """Minus the initial value of a peak, in units of its scale."""
 EDGE_WIDTH = 0.1
 """Width of the soft edge of a tolerance, as a part of it."""
@@ -302,7 +302,7 @@ class Peak:
             y = jnp.concatenate([y, -y])
         elif jnp.ndim(weights) == 1:  # margins have no weights, but a limit for each joint
             y = y * (jnp.concatenate([weights, weights]) if has_sides else weights)
-        return jnp.where(sample.t >= self.after * (1 - 1e-6), y / self.scale, -FAR_BELOW)
+        return jnp.where(sample.t >= self.after * (1 - 1e-6), y / self.scale, -INITIAL_PEAK)
 
     def init(self, sample: Sample):
         """Far below zero, (W, 2 k) for k joints, or (W, m) for m regions; the predecessor of the
@@ -315,7 +315,7 @@ class Peak:
             entries = sample.region_margin.size
         else:
             entries = 2 * chosen_of(sample.q, self.joints, "joints").size
-        return jnp.full((windows, entries), -FAR_BELOW, sample.t.dtype), sample.tau
+        return jnp.full((windows, entries), -INITIAL_PEAK, sample.t.dtype), sample.tau
 
     def update(self, acc, sample: Sample):
         """Adds one sample to the window that it is in."""

@@ -25,7 +25,7 @@ from iblf_jax.tuning.quantities import Quantities
 from iblf_jax.tuning.report import ReportRequest, TuningReport, make_report
 from iblf_jax.tuning.runs import NUMBERS_A_RUN
 
-LARGEST_CHANGE = 100.0
+LARGE_CHANGE = 100.0
 """Factor by which a gain may change before a warning is given."""
 STUCK = (
     "the steps became too small: the model of objective and requirements does not hold near these"
@@ -204,13 +204,13 @@ class TuneResult:
         return tuple(lines)
 
     def _distant_gains(self) -> list[str]:
-        """A warning for each gain that has changed by more than the factor LARGEST_CHANGE."""
+        """A warning for each gain that has changed by more than the factor LARGE_CHANGE."""
         lines = []
         for path, value in self.values.items():
             start = np.asarray(paths.get(self.start, path))
             for index in np.ndindex(np.shape(value)):
                 before, after = start[index], value[index]
-                if before * after > 0 and not 1 / LARGEST_CHANGE < after / before < LARGEST_CHANGE:
+                if before * after > 0 and not 1 / LARGE_CHANGE < after / before < LARGE_CHANGE:
                     name = path + "".join(f"[{i}]" for i in index)
                     lines.append(
                         f"WARNING: {name} ended at {after / before:.3g} times its start: the"

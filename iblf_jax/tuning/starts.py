@@ -8,7 +8,7 @@ other peaks are at their limit.  `NearbyStarts` therefore evaluates
 
     f + EXCESS_WEIGHT |f| sum_r max(0, G_r)
 
-at POINTS_PER_GAIN points a gain, drawn within |z_i - z0_i| <= MAX_OFFSET, and the search begins at
+at POINTS_PER_GAIN points a gain, drawn within |z_i - z0_i| <= PROBE_RANGE, and the search begins at
 the lowest.  If that search has converged soon, a second one begins at the lowest point that is at
 least MIN_DISTANCE, in one coordinate, from where the first began and from where it ended
 (`search`).
@@ -27,17 +27,17 @@ from iblf_jax.tuning.parameters import Box
 from iblf_jax.tuning.problem import TuningProblem
 
 POINTS_PER_GAIN = 14
-MAX_OFFSET = 1.5
+PROBE_RANGE = 1.5
 """Ten problems of six and nine gains, six starts each, 40 evaluations with derivatives.  The mean
 gap to the best known optimum was 6.1 % from the scenario's gains with a first trust region of 1,
-3.1 % with one of 0.5, 1.8 % from the best of 128 points (3.4 % within a MAX_OFFSET of 2), and 1.4 %
-with the second search (2.8 %)."""
+3.1 % with one of 0.5, 1.8 % from the best of 128 points (3.4 % within a PROBE_RANGE of 2), and
+1.4 % with the second search (2.8 %)."""
 MIN_DISTANCE = 0.75
 """Of the second start from the first search, in one coordinate z."""
 EXCESS_WEIGHT = 2.0
 """Of an excess, relative to the objective; with 10 the gap was 1.6 % instead of 1.4 %, with 10,000
 it was 2.0 %."""
-START_SPREAD = 1.0
+START_RANGE = 1.0
 """Half-width of the box around the start in which further starts are drawn, in the coordinates z: a
 factor e for gains."""
 SCREENED_POINTS = 32
@@ -65,7 +65,7 @@ class NearbyStarts:
         size = len(box.z)
         count = POINTS_PER_GAIN * size
         rng = np.random.default_rng([seed, 4])
-        drawn = box.z + rng.uniform(-MAX_OFFSET, MAX_OFFSET, (count - 1, size))
+        drawn = box.z + rng.uniform(-PROBE_RANGE, PROBE_RANGE, (count - 1, size))
         points = np.concatenate([box.z[None], np.clip(drawn, box.low, box.high)])
         found = values(points)
         excess = np.sum(np.maximum(found.exact_excess, 0.0), axis=1)
@@ -93,7 +93,7 @@ class NearbyStarts:
 def starting_points(box: Box, starts: int, seed: int) -> np.ndarray:
     """The scenario's point and `starts - 1` drawn around it, inside the box, (S, p)."""
     rng = np.random.default_rng([seed, 1])
-    drawn = box.z + rng.uniform(-START_SPREAD, START_SPREAD, (starts - 1, len(box.z)))
+    drawn = box.z + rng.uniform(-START_RANGE, START_RANGE, (starts - 1, len(box.z)))
     return np.concatenate([box.z[None], np.clip(drawn, box.low, box.high)])
 
 
@@ -138,8 +138,8 @@ def screened(
     """
     box = problem.box
     rng = np.random.default_rng([seed, 2])
-    low = np.where(np.isfinite(box.low), box.low, box.z - 3 * START_SPREAD)
-    high = np.where(np.isfinite(box.high), box.high, box.z + 3 * START_SPREAD)
+    low = np.where(np.isfinite(box.low), box.low, box.z - 3 * START_RANGE)
+    high = np.where(np.isfinite(box.high), box.high, box.z + 3 * START_RANGE)
     points = np.concatenate([z, rng.uniform(low, high, (SCREENED_POINTS, len(low)))])
     found = values(problem, points)
     if not np.any(found.valid):

@@ -34,14 +34,14 @@ from iblf_jax.tuning.options import RunOptions
 from iblf_jax.tuning.parameters import Box, layout, squash, unsquash
 from iblf_jax.tuning.problem import Candidate, TuningProblem
 from iblf_jax.tuning.quantities import Peak, Quantities, TimeIntegral
-from iblf_jax.tuning.ranges import STABILITY_SHARE, STEP, THEOREM, TIMES, TOGETHER
+from iblf_jax.tuning.ranges import BY_STEP, BY_THEOREM, STABILITY_FRACTION, TIMES, TOGETHER
 from iblf_jax.tuning.result import STUCK
 from iblf_jax.tuning.robust import Risk, combine
 from iblf_jax.tuning.rollouts import fold_of
 from iblf_jax.tuning.search import Search
 from iblf_jax.tuning.solvers import Constraints, SearchSpace, quadratic, sqp
 from iblf_jax.tuning.solvers.sqp import solve_subproblem
-from iblf_jax.tuning.starts import MAX_OFFSET, MIN_DISTANCE, NearbyStarts, screened
+from iblf_jax.tuning.starts import MIN_DISTANCE, PROBE_RANGE, NearbyStarts, screened
 
 jax.config.update("jax_enable_x64", True)
 
@@ -250,10 +250,13 @@ def test_default_limits_keep_the_conditions_and_the_step(paper):
         paper, {b.path: high[b.start : b.start + b.size] for b in blocks[:3]}
     )
     mode = 1e-3 * fastest_along(canonical(together), TIMES)
-    assert mode == pytest.approx(STABILITY_SHARE * tableau("rk4").stability, rel=0.01)
+    assert mode == pytest.approx(STABILITY_FRACTION * tableau("rk4").stability, rel=0.01)
     _, single = layout(canonical(paper), ["controller.K2"], 1e-3, "rk4")
     assert np.all(np.exp(single.high) > 1.001 * high[2:4])
-    assert box.reasons[0] == (THEOREM, STEP + TOGETHER) and single.reasons[0] == (THEOREM, STEP)
+    assert box.reasons[0] == (BY_THEOREM, BY_STEP + TOGETHER) and single.reasons[0] == (
+        BY_THEOREM,
+        BY_STEP,
+    )
     with pytest.raises(ValueError, match="do not overlap"):
         layout(canonical(paper), ["controller.K2", "controller.K2[0]"], 1e-3, "rk4")
     with pytest.raises(ValueError, match="Widen the limits"):
@@ -436,7 +439,7 @@ def test_a_second_search_begins_elsewhere_and_the_better_goes_on():
     valleys = Valleys()
     nearby = NearbyStarts(lambda z: valleys(z).value, box, 0, lambda z: False)
     assert nearby.count == len(nearby.points) == 14 * 7 and np.all(
-        np.abs(nearby.points - box.z) <= MAX_OFFSET
+        np.abs(nearby.points - box.z) <= PROBE_RANGE
     )
     first = nearby.points[0]
     assert np.sum((first + 1) ** 2) < np.sum((nearby.points[-1] + 1) ** 2)

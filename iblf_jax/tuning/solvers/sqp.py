@@ -9,7 +9,7 @@ subproblem for the step s is, within |s_i| <= delta and the ranges of the gains,
     minimise  g.s + s.(B + sum_j y_j C_j).s/2 + rho sum_r v_r
     subject to     c_j + a_j.s <= v_r,  v_r >= 0      for the pieces j of r,
 
-first with c_j = e_j, and then, CURVATURE_ROUNDS times, with c_j = e_j + s.C_j.s/2 at the last
+first with c_j = e_j, and then, CURVATURE_SOLVES times, with c_j = e_j + s.C_j.s/2 at the last
 solution.  The trial is the solution of which the quadratic models predict the largest decrease.  y
 are the multipliers of the previous subproblem.  A requirement that a share of B runs may violate,
 k > 1 of them, has as G_r the mean of its k worst runs, which is exactly
@@ -74,21 +74,21 @@ SMALLEST_EIGENVALUE = 1e-6
 TARGET_EXCESS = 1e-5
 """How far inside its limit a requirement is aimed at, in its scale, so that rounding does not
 violate it."""
-LEAST_PENALTY = 2.0
+MIN_PENALTY = 2.0
 """rho at least, relative to the size of the objective."""
 LARGEST_PENALTY = 1e6
 """rho at most, relative to the size of the objective."""
 PENALTY_FACTOR = 10.0
 """Factor by which rho is increased."""
-CURVATURE_ROUNDS = 3
+CURVATURE_SOLVES = 3
 """Subproblems with the curvature of the pieces."""
 COLLAPSED_RADIUS = 1e-3
 """delta below which a start is stuck: the model does not predict the objective even so near."""
-BLOCKING_DISTANCE = 1e-6
+RANGE_TOLERANCE = 1e-6
 """Distance in z from the end of a range within which the range blocks a gain."""
 MAX_PIECES = 200
 """Largest number of pieces of one requirement in a subproblem; the worst are taken."""
-RUNS_OF_MEAN = 3
+RUNS_PER_WORST = 3
 """Where G_r is the mean of the k worst runs, this multiple of k runs is in a subproblem."""
 MAX_CURVATURES = 4000
 """Largest number of pieces of one requirement of which C_j is stored.  With the 200 of a subproblem
@@ -233,7 +233,7 @@ def _pieces_that_may_bind(
         return Selected(run[order], own[piece[order]])
     may_bind = values + change >= threshold
     from_worst = np.argsort(-np.max(values, axis=1), kind="stable")
-    may_bind[from_worst[RUNS_OF_MEAN * k :]] = False
+    may_bind[from_worst[RUNS_PER_WORST * k :]] = False
     run, piece = np.nonzero(may_bind)
     # A mean of k runs needs k runs: the worst piece of each run comes before all others.
     worst_of_run = np.argmax(np.where(may_bind, values, -np.inf), axis=1)
@@ -552,7 +552,7 @@ def _with_penalty(space: SearchSpace, state: SQPState) -> tuple[Step, float]:
     size = state.size
     largest = LARGEST_PENALTY * size
     twice = 2.0 * float(np.max(state.multipliers, initial=0.0))
-    penalty = min(max(twice, LEAST_PENALTY * size), largest)
+    penalty = min(max(twice, MIN_PENALTY * size), largest)
     found = _solve(space, state, state.here.pieces, penalty)
     while found.violation.sum() > TARGET_EXCESS and penalty < largest:
         other = _solve(space, state, state.here.pieces, PENALTY_FACTOR * penalty)
@@ -601,7 +601,7 @@ def _best_with_curvature(
     if not state.here.pieces.size:
         return best, decrease
     last = found
-    for _ in range(CURVATURE_ROUNDS):
+    for _ in range(CURVATURE_SOLVES):
         last = _solve(space, state, state.here.pieces + state.curvature_along(last.step), penalty)
         other = _predicted_decrease(space, state, last.step)
         if other > decrease:
@@ -613,8 +613,8 @@ def _best_with_curvature(
 def _residuals(space: SearchSpace, state: SQPState, found: Step, excess: np.ndarray) -> np.ndarray:
     """Residuals of the optimality conditions, as in `Optimality`."""
     slope = found.lagrangian
-    blocked_below = (state.z < space.box.low + BLOCKING_DISTANCE) & (slope > 0)
-    blocked_above = (state.z > space.box.high - BLOCKING_DISTANCE) & (slope < 0)
+    blocked_below = (state.z < space.box.low + RANGE_TOLERANCE) & (slope > 0)
+    blocked_above = (state.z > space.box.high - RANGE_TOLERANCE) & (slope < 0)
     stationarity = np.max(np.abs(np.where(blocked_below | blocked_above, 0.0, slope)))
     products = np.sum(found.piece_multipliers * state.here.pieces, axis=0)
     complementarity = sum(
