@@ -169,14 +169,13 @@ def falsify(
     peak = Peak(one, MARGINS[margin])
     check_needs("margin", peak, scenario)
     evaluate = MarginEvaluator(cube, peak, dt, request, starts)
-    unit = DEFICITS[peak.signal]
     with bar(progress, iterations + 1, unit="steps") as shown:
-        _attack(cube, evaluate, seed, iterations, shown, unit)
+        _attack(cube, evaluate, seed, iterations, shown)
     timing = {"duration": duration, "dt": dt, "method": method}
-    return _result(cube, evaluate, timing, unit)
+    return _result(cube, evaluate, timing)
 
 
-def _result(cube: Cube, evaluate: MarginEvaluator, timing: dict[str, Any], unit: str) -> Attack:
+def _result(cube: Cube, evaluate: MarginEvaluator, timing: dict[str, Any]) -> Attack:
     """The worst run of all."""
     worst = evaluate.worst
     if worst is None:
@@ -197,13 +196,11 @@ def _result(cube: Cube, evaluate: MarginEvaluator, timing: dict[str, Any], unit:
         history=history,
         runs=history.size,
         timing=timing,
-        unit=unit,
+        unit=evaluate.unit,
     )
 
 
-def _attack(
-    cube: Cube, evaluate: MarginEvaluator, seed: int, iterations: int, shown: Any, unit: str
-) -> None:
+def _attack(cube: Cube, evaluate: MarginEvaluator, seed: int, iterations: int, shown: Any) -> None:
     """All steps of all attacks; the results are in `evaluate`."""
     starts = len(evaluate.active)
     state = SOLVER.init(evaluate.space, cube.admissible_points(starts, [seed, 3]))
@@ -218,7 +215,7 @@ def _attack(
                 SOLVER.restart(evaluate.space, state, s, points[s])
         shown.update(1)
         if evaluate.worst is not None:
-            shown.set_postfix_str(f"margin {evaluate.worst.margin:.4g} {unit}")
+            shown.set_postfix_str(f"margin {evaluate.worst.margin:.4g} {evaluate.unit}")
 
 
 class Worst(NamedTuple):
@@ -244,6 +241,7 @@ class MarginEvaluator:
         self.dtype = cube.cases.scenario.initial.q.dtype
         step = jnp.asarray(dt, self.dtype)
         self.margins = partial(_margins, cube, astype(peak, self.dtype), step, request=request)
+        self.unit = DEFICITS[peak.signal]
         size = cube.size
         self.space = SearchSpace(Box(np.full(size, 0.5), np.zeros(size), np.ones(size)))
         self.active = np.ones(starts, bool)

@@ -152,12 +152,15 @@ def solve_subproblem(
     own_columns = [
         _own_columns(chosen.run, k) for chosen, k in zip(selected, constraints.worst, strict=True)
     ]
+    # The rows: both bounds of the step, and for each requirement its pieces and what `_own_columns`
+    # adds to them.
     step_columns = [np.eye(size), -np.eye(size)]
     limits = [high, -low]
     for chosen, own in zip(selected, own_columns, strict=True):
-        others = len(own) - len(chosen.run)
-        step_columns += [piece_gradients[chosen.run, :, chosen.piece], np.zeros((others, size))]
-        limits += [-pieces[chosen.run, chosen.piece] - TARGET_EXCESS, np.zeros(others)]
+        added = len(own) - len(chosen.run)
+        gradients = piece_gradients[chosen.run, :, chosen.piece]
+        step_columns.append(np.pad(gradients, ((0, added), (0, 0))))
+        limits.append(np.pad(-pieces[chosen.run, chosen.piece] - TARGET_EXCESS, (0, added)))
     own_block = block_diag(np.zeros((2 * size, 0)), *own_columns)
     A = np.hstack([np.vstack(step_columns), own_block])
     H = block_diag(matrix, np.zeros((own_block.shape[1], own_block.shape[1])))
