@@ -22,13 +22,10 @@ from iblf_jax.engine.execute import run_from as run_from
 from iblf_jax.engine.request import RunRequest as RunRequest
 from iblf_jax.engine.request import check_backend as check_backend
 from iblf_jax.engine.simulate import run_rollout as run_rollout
-from iblf_jax.engine.sizes import FORWARD_MOST as FORWARD_MOST
 from iblf_jax.engine.sizes import STUDY_MEMORY as STUDY_MEMORY
 from iblf_jax.engine.sizes import block_size as block_size
 from iblf_jax.engine.sizes import blocks_in_flight as blocks_in_flight
-from iblf_jax.engine.sizes import differentiates_forward as differentiates_forward
 from iblf_jax.engine.sizes import fresh_together as fresh_together
-from iblf_jax.engine.sizes import lowering_limits as lowering_limits
 from iblf_jax.engine.sizes import starts_together as starts_together
 from iblf_jax.engine.sizes import sweep_unit as sweep_unit
 from iblf_jax.engine.sizes import values_together as values_together
@@ -36,4 +33,7 @@ from iblf_jax.engine.sizes import whole_blocks as whole_blocks
 from iblf_jax.engine.step import Outcome as Outcome
 from iblf_jax.engine.step import folded as folded
 from iblf_jax.engine.step import sample_status as sample_status
+from iblf_jax.engine.thresholds import FORWARD_MOST as FORWARD_MOST
+from iblf_jax.engine.thresholds import LOWERING_LIMITS as LOWERING_LIMITS
+from iblf_jax.engine.thresholds import differentiates_forward as differentiates_forward
 from iblf_jax.engine.waiting import wait_until_ready as wait_until_ready

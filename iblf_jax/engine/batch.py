@@ -152,7 +152,7 @@ class Batch(NamedTuple):
         return together(self.leaves.per_run, *args)
 
 
-Loop = Callable[[Any, Batch, Any, int, int | None], tuple[Any, Any]]
+StepLoop = Callable[[Any, Batch, Any, int, int | None], tuple[Any, Any]]
 """(step, batch, carry, steps, every) -> (the carry after all steps, what every `every`-th step
 recorded, from the first on).
 
@@ -160,7 +160,7 @@ All arrays have the run axis first, records then the time axis; `every` is None 
 recorded."""
 
 
-def _linearized(loop: Loop, batch: Batch, carry: Linearization) -> Linearization:
+def _linearized(loop: StepLoop, batch: Batch, carry: Linearization) -> Linearization:
     """What a `LinearizationStep` of every run has found."""
     batch = _linearized_batch(batch)
     return loop(
@@ -205,7 +205,7 @@ def linearization_batch(batch: Batch, method: str) -> tuple[Batch, Linearization
     return _linearized_batch(batch), jax.eval_shape(lambda: _initial_linearization(batch, method))
 
 
-def initialize(loop: Loop, batch: Batch, method: str) -> tuple[Carry, Linearization]:
+def initialize(loop: StepLoop, batch: Batch, method: str) -> tuple[Carry, Linearization]:
     """The carry before the first step, and what a `LinearizationStep` has found at the start."""
     found = _linearized(loop, batch, _initial_linearization(batch, method))
 
@@ -227,7 +227,7 @@ def carry_shapes(batch: Batch, method: str) -> Carry:
 
 
 def finalize(
-    loop: Loop, batch: Batch, request: RunRequest, carry: Carry, at_start: Linearization
+    loop: StepLoop, batch: Batch, request: RunRequest, carry: Carry, at_start: Linearization
 ) -> Outcome:
     """The outcome after the last step, without records; `at_start` is the linearization there."""
 
@@ -259,7 +259,7 @@ def finalize(
     return batch.each(outcome, carry, at_start, later)
 
 
-def run_all(loop: Loop, batch: Batch, request: RunRequest) -> Outcome:
+def run_all(loop: StepLoop, batch: Batch, request: RunRequest) -> Outcome:
     """All runs, from the start to the outcome."""
     outcome, records = run_step(loop, batch, TimeStep.of(request), request)
     if request.record_every is None:
@@ -267,7 +267,9 @@ def run_all(loop: Loop, batch: Batch, request: RunRequest) -> Outcome:
     return outcome._replace(records=records)
 
 
-def run_step(loop: Loop, batch: Batch, step: TimeStep, request: RunRequest) -> tuple[Outcome, Any]:
+def run_step(
+    loop: StepLoop, batch: Batch, step: TimeStep, request: RunRequest
+) -> tuple[Outcome, Any]:
     """All runs by a step that may record something else; the outcome, and the records apart."""
     carry, at_start = initialize(loop, batch, request.method)
     carry, records = loop(step, batch, carry, request.steps + 1, request.record_every)

@@ -16,7 +16,6 @@ from iblf_jax.core import checks, notices
 from iblf_jax.engine.diagnosis import SimulationError as SimulationError
 from iblf_jax.engine.diagnosis import SimulationWarning as SimulationWarning
 from iblf_jax.engine.diagnosis import report
-from iblf_jax.engine.registry import single_run_backends
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.single_run import run_one
 from iblf_jax.engine.transformable import run_transformable
@@ -62,14 +61,12 @@ def simulate(
         recorded.
       metrics: the folds to run; None for `iblf_jax.metrics.standard()`.
       throw: raise instead of warn when the run failed.
-      backend: "native": generated code, built by the system's compiler once for a structure and
-        kept on disk; "xla": the same program without a compiler, twice as slow; "gpu": the same as
-        one kernel on an NVIDIA GPU; "auto": native, or gpu if that is JAX's default device, where
-        there is a compiler, else xla.  A long step (an arm of many joints) runs as plain JAX on
-        "xla".  Inside your own `jit` or `vmap` a run is plain JAX; where it is differentiated by
-        numbers of the scenario, it and its first and second derivatives are the kernel's if there
-        is one, but for "xla".  Derivatives are of all that is recorded, so record little where only
-        metrics matter.
+      backend: "native": generated code, built by a C++ compiler once for a structure and kept on
+        disk; "gpu": the same as one kernel on an NVIDIA GPU; "vmap": plain JAX; "auto": native, or
+        gpu if that is JAX's default device, else vmap.  Inside your own `jit` or `vmap` a run is
+        plain JAX; where it is differentiated by numbers of the scenario, it and its first and
+        second derivatives are the kernel's if there is one, but for "vmap".  Derivatives are of all
+        that is recorded, so record little where only metrics matter.
       seed: fixes the noise of a sensor; the run is number 0 of a study with this seed.
 
     Returns:
@@ -82,7 +79,6 @@ def simulate(
 
     Source: design of this package; the closed loop is Zhang & Yan 2024, section 3.
     """
-    checks.one_of("backend", backend, single_run_backends())
     steps = checks.whole_steps(duration, dt)
     record_every = _checked_record(record_every, steps)
     throw = checks.flag("throw", throw)
