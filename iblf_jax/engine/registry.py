@@ -99,12 +99,13 @@ class Machine(NamedTuple):
 def machine() -> Machine:
     """The default device of this process, and the executors for it."""
     platform = devices.platform()
-    found = [
-        Availability(executor.name, executor.unavailable())
-        for executor in EXECUTORS.values()
-        if platform in executor.platforms
-    ]
-    return Machine(platform, tuple(found))
+    executors = executors_for(platform)
+    return Machine(platform, tuple(Availability(x.name, x.unavailable()) for x in executors))
+
+
+def executors_for(platform: str) -> list[Executor]:
+    """The executors for a platform, best first."""
+    return [executor for executor in EXECUTORS.values() if platform in executor.platforms]
 
 
 def automatic() -> Availability:

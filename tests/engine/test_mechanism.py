@@ -10,13 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from iblf_jax.engine.executors import program_of
 from test_lowering import DT, PRESET, STANDARD, carry_of, evaluate, numbers
 
 import iblf_jax as ij
 from iblf_jax.core.status import Status
 from iblf_jax.engine import RunRequest, execute, plan
 from iblf_jax.engine.batch import Batch
-from iblf_jax.engine.executors import program_of
 from iblf_jax.engine.mechanism import mechanism_of
 from iblf_jax.engine.step import Carry, Inputs, StepOptions, TimeStep
 from iblf_jax.kernels import PER_RUN, TIME, written_out
