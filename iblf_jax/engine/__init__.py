@@ -6,8 +6,9 @@
     output  = program(scenario, varied, folds, dt)      an `Outcome`: records, metrics, status flags
     result  = run_rollout(...)                          a `Rollout`: named, with units, plotted
 
-Modules outside this folder import from here; `simulate`, `explain`, `recommended_period` and the
-step sizes have modules of their own.
+`registry` lists the executors, `loops` the loops over all steps of a batch, and `thresholds` the
+sizes with which the plan compares.  Modules outside this folder import from here; `simulate`,
+`explain`, `recommended_period` and the step sizes have modules of their own.
 """
 
 from iblf_jax.engine.compile import BackendWarning as BackendWarning

@@ -22,7 +22,10 @@ def architecture() -> str:
       ToolchainError: the default devices are no GPUs that NVRTC compiles for, or they differ.
     """
     default_devices = devices.default()
-    found = {str(getattr(device, "compute_capability", "")) for device in default_devices}
+    try:
+        found = {device.compute_capability for device in default_devices}
+    except AttributeError:  # no GPUs
+        found = {""}
     if len(found) > 1:
         raise ToolchainError(f"the GPUs differ: compute capabilities {', '.join(sorted(found))}")
     match = re.fullmatch(r"(\d+)\.(\d)", found.pop())
@@ -62,7 +65,7 @@ def call(
         steps,
         every,
         threads=threads,
-        table=thresholds.STEPS_PER_LAUNCH,
+        table=thresholds.MAX_STEPS_PER_LAUNCH,
     )
 
 

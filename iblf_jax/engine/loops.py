@@ -38,14 +38,14 @@ def scan(step: Any, batch: Batch, carry: Any, steps: int, every: int | None) -> 
         def of_run(carry, index):
             return step(inputs, carry, index, options)
 
-        return _scanned(of_run, carry, steps, every)
+        return _scan_run(of_run, carry, steps, every)
 
     return batch.each(one, carry)
 
 
-def _scanned(step: Callable, carry: Any, steps: int, every: int | None) -> tuple[Any, Any]:
-    """One run's steps; the step is compiled once, so what is not to be kept is made and thrown
-    away.
+def _scan_run(step: Callable, carry: Any, steps: int, every: int | None) -> tuple[Any, Any]:
+    """All steps of one run.  The step is compiled once, so records that are not kept are computed,
+    too, and overwritten.
     """
     if every is None:
         return jax.lax.scan(

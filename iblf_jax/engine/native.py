@@ -32,7 +32,7 @@ def _kernel_build(
         and `steps` if None.
     """
     if short_vector is None:
-        is_small = runs * program.dtype.itemsize <= thresholds.SHORT_VECTOR
+        is_small = runs * program.dtype.itemsize <= thresholds.SHORT_VECTOR_BYTES
         short_vector = is_small and steps > thresholds.FEW_STEPS
     return Build(*thresholds.native_build(program.size, short_vector))
 

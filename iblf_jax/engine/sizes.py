@@ -13,19 +13,19 @@ RUNS_PER_BLOCK, RUNS_PER_BLOCK_ELSEWHERE = {"cpu": 256}, 32_768
 take 0.48 s in float64, in blocks of 16,384 0.70 s and of 65,536 0.52 s; 1,000 runs, which a block
 is filled up from, 0.16 s, 0.13 s and 0.28 s."""
 STUDY_MEMORY = 256 * 2**20
-"""Bytes that runs in flight may take, unless the caller says otherwise."""
+"""Bytes that runs in flight may take, unless the caller gives another number."""
 MAX_IN_FLIGHT = 4
 """Blocks that are computed on a device at the same time, each by a thread: draws and results of one
 block are handled while the kernel of another one runs."""
 STEPS_PER_UNIT, MIN_UNITS = 2e8, 16
-"""Steps of all runs of a unit of a sweep's store together, seconds to a minute of work; units that
-a sweep has at least, if it is large."""
+"""Steps of all runs in a unit of a sweep's store, which is work for seconds to a minute; and the
+least number of units of a large sweep."""
 MIN_RUNS_TOGETHER = 16
-"""Runs that are evaluated at once at least, where starts of a tuning run out one by one: what a
-processor's vectors hold."""
-MAX_STEPS_AS_SEARCH = 10_000_000
-"""Steps up to which fresh runs are made in the shape of a search's values: half a second of work
-for the paper's scenario, where XLA compiles a block of them in 1.5 s."""
+"""Runs that are evaluated at once at least, when only a few starts of a tuning are left: as many as
+the vectors of a processor hold."""
+MAX_STEPS_IN_SEARCH_SHAPE = 10_000_000
+"""Steps up to which the runs of a report are evaluated in batches of the shape that the search has
+compiled: half a second of work for the paper's scenario, where another shape compiles in 1.5 s."""
 
 
 def block_size() -> int:
@@ -83,4 +83,4 @@ def fresh_together(steps: int, compiled: int) -> int:
       steps: of all runs together.
       compiled: runs for which the search has compiled a program.
     """
-    return compiled if steps <= MAX_STEPS_AS_SEARCH else block_size()
+    return compiled if steps <= MAX_STEPS_IN_SEARCH_SHAPE else block_size()

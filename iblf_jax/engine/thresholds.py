@@ -51,36 +51,37 @@ STEPS_OF_A_THREAD, BLOCKS_OF_A_THREAD = 128, 32
 """Steps and blocks of runs that a thread goes through together, so that states and the table of
 signals stay in its cache: 32 to 512 steps and 8 to 128 blocks take the same time within 5 % (the
 paper's loop)."""
-SHORT_VECTOR = 16
-"""Bytes of the runs of a batch up to which they are stepped in vectors of that length: a
-processor's longest would be mostly copies."""
+SHORT_VECTOR_BYTES = 16
+"""Bytes of the runs of a batch up to which they are stepped in vectors of that length: the longest
+vector of the processor would hold mostly copies."""
 OPERATIONS_PER_CALL = 4e8
-"""Nodes times steps of one run that a kernel makes before Python sees whether Ctrl-C was pressed: a
-tenth of a second, and two tenths of a per cent of time for the calls.  The paper's loop: 220,000
-steps."""
+"""Nodes times steps of one run in one call of a kernel, after which Python sees whether Ctrl-C was
+pressed: a tenth of a second, with two thousandths of the time for the calls.  For the paper's loop
+these are 220,000 steps."""
 FEW_STEPS = 80
-"""Steps up to which the kernel of a batch also runs a single run: so few steps take less time than
-a build of their own, and the linearization of a run (`LinearizationStep`) serves a batch too."""
-STEPS_PER_LAUNCH = 8192
-"""Steps of a launch on a GPU, at most: bounds the table of signals, and how long a display may have
-to wait."""
-WARP, THREADS_PER_BLOCK, MULTIPROCESSORS = 32, 128, 100
+"""Steps up to which a single run uses the kernel of a batch: so few steps take less time than to
+build another kernel, and the linearization of a run (`LinearizationStep`) serves a batch too."""
+MAX_STEPS_PER_LAUNCH = 8192
+"""Steps of a launch on a GPU, at most: it limits the table of signals, and how long a display may
+have to wait."""
+WARP, MAX_THREADS_PER_BLOCK, MULTIPROCESSORS = 32, 128, 100
 """Threads of a warp and of a block on a GPU, at most (`c/kernels.h` promises the compiler no more);
 multiprocessors where JAX does not know."""
 
 # Derivatives.
 LONGEST_DERIVATIVE, LONGEST_DERIVATIVE_CUT = 60_000, 150_000
-"""Nodes of a step, times one and its tangents, up to which "auto" lowers its derivatives: compilers
-take minutes over longer ones, the native one, which cuts a step into functions, half a minute.
-Equal numbers are computed once, so about a third is left of them."""
+"""Nodes of a step, times one plus the number of tangents, up to which "auto" lowers its
+derivatives; the second number is for executors that cut a step into functions, which compile half a
+minute where the others compile minutes.  Equal nodes are computed once, so about a third of them
+is left."""
 FORWARD_MOST = 32
 """Numbers that are differentiated by up to which forward mode is taken, above it reverse mode."""
 HIGHEST_COLUMN_ORDER, KEPT_NUMBERS = 2, 1 << 27
-"""Order of the derivatives that are made column by column, and numbers of such a derivative of one
-run's records that are kept, 1 GiB: others are the scan's, in the mode that the caller takes."""
+"""Highest order of the derivatives that are computed column by column, and the most numbers of such
+a derivative of one run's records, 1 GiB.  The scan computes all others, in the caller's mode."""
 MAX_COLUMNS = 96
-"""Numbers by which derivatives of a transformable run are made column by column, at most; by more
-numbers they are the scan's. 64 runs of 500 steps of the paper's loop with N weights take, by
+"""Numbers by which a transformable run is differentiated column by column, at most; the scan
+differentiates by more. 64 runs of 500 steps of the paper's loop with N weights take, by
 columns and by the scan in reverse mode: N = 8, 0.06 and 1.6 s; N = 32, 0.36 and 1.2 s; N = 96,
 4.2 and 3.5 s; N = 386, 9.7 and 2.2 s (two cores)."""
 STEP_SIZE_CHUNK = 1000
@@ -106,7 +107,7 @@ def native_build(nodes: int, short_vector: bool) -> tuple[int | None, tuple[str,
     """
     flags = [f"-DSTRETCH={STEPS_OF_A_THREAD}", f"-DGROUP={BLOCKS_OF_A_THREAD}"]
     if short_vector:
-        flags.append(f"-DVECTOR_BYTES={SHORT_VECTOR}")
+        flags.append(f"-DVECTOR_BYTES={SHORT_VECTOR_BYTES}")
     segment = None
     if nodes > LONGEST_C_FUNCTION:
         segment = NODES_OF_A_C_FUNCTION
@@ -125,7 +126,7 @@ def steps_per_call(nodes: int, steps: int, every: int | None) -> int:
 def gpu_threads(runs: int, multiprocessors: int) -> int:
     """Threads in a block: few enough that every multiprocessor gets a block, in whole warps."""
     warps = max(-(-runs // (multiprocessors * WARP)), 1)
-    return min(warps * WARP, THREADS_PER_BLOCK)
+    return min(warps * WARP, MAX_THREADS_PER_BLOCK)
 
 
 def compiles_states(operations: int) -> bool:

@@ -108,7 +108,7 @@ def gpu_for_this_platform(monkeypatch, **changes):
 @pytest.fixture
 def runs_here(monkeypatch):
     """The gpu backend runs here, 64 steps a launch, on a CPU in blocks of 32 threads."""
-    monkeypatch.setattr(thresholds, "STEPS_PER_LAUNCH", 64)
+    monkeypatch.setattr(thresholds, "MAX_STEPS_PER_LAUNCH", 64)
     CACHE.clear(compile.WARNINGS)
     if not ON_A_GPU:
         gpu_for_this_platform(monkeypatch, run=gpu_on_cpu.run, unavailable=lambda: None)
@@ -242,7 +242,7 @@ def test_forward_sensitivities(paper):
 @needs_a_cpu
 @needs_compiler
 def test_the_image_is_loaded_once_and_launched_for_some_steps_at_a_time(paper, monkeypatch):
-    monkeypatch.setattr(thresholds, "STEPS_PER_LAUNCH", 4)
+    monkeypatch.setattr(thresholds, "MAX_STEPS_PER_LAUNCH", 4)
     program, shared, lane, carry = step_of(paper, draws(2))
     sizes, seen = (program, shared.size, lane.shape[0]), []
     for _ in range(3):
