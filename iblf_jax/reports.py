@@ -82,7 +82,7 @@ def _parts_of(scenario: Scenario) -> str:
         if isinstance(part, tuple):
             rows.append((name, ", ".join(type(each).__name__ for each in part), ""))
             continue
-        leaves = parameters(part, named=False)[:MOST_LEAVES]
+        leaves = parameters(part, named=False)[:MAX_LEAVES]
         rows.append((name, _kind(part), _assignments(leaves, " = ")))
     return tables.as_html(("part", "kind", "parameters"), rows)
 
@@ -99,7 +99,7 @@ def _assignments(leaves: Any, sign: str) -> str:
     return ", ".join(f"{leaf.path}{sign}{_short(leaf.value)}" for leaf in leaves)
 
 
-MOST_LEAVES = 4
+MAX_LEAVES = 4
 """Largest number of parameters of a component in the table of a scenario."""
 
 

@@ -23,6 +23,7 @@ from iblf_jax.certificates.result import Certificate, Traces
 from iblf_jax.certificates.run_summary import RunSummary, Segment, summarise
 from iblf_jax.control import actuators, sensors
 from iblf_jax.core import checks, notices
+from iblf_jax.core.optional import has_members
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.engine.simulate import SimulationWarning, simulate
 from iblf_jax.simulation.optional import optional_member
@@ -30,10 +31,10 @@ from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical, with_parts
 from iblf_jax.world.robots import joint_names
 
-RECORDED = 20_000
+MAX_RECORDED = 20_000
 """Largest number of recorded samples of a run that `certify` makes; the other steps are
 reconstructed."""
-WORST = 16
+DEFAULT_WORST = 16
 """Runs of a study that are checked if the caller does not say how many."""
 SAMPLED = "the loop is sampled, and Theorem 2 is about a law that runs at every instant"
 MEASURED = "how far the sampled run is from the continuous one; no claim of the theorem"
@@ -47,7 +48,7 @@ def certify(
     duration: float = 20.0,
     dt: float = 1e-3,
     method: str = "rk4",
-    worst: int | None = WORST,
+    worst: int | None = DEFAULT_WORST,
 ) -> Certificate:
     """Checks every inequality of Theorem 2 on a run, with margins.
 
@@ -84,7 +85,7 @@ def certify(
     scenario = canonical(scenario)
     _check_certifiable(scenario)
     if run is None:
-        every = 1 + checks.whole_steps(duration, dt) // RECORDED
+        every = 1 + checks.whole_steps(duration, dt) // MAX_RECORDED
         run = simulate(scenario, duration=duration, dt=dt, method=method, record_every=every)
     request = _request(scenario, run, worst)
     if request.many:
@@ -122,12 +123,15 @@ def _request(scenario: Scenario, run: Any, worst: int | None) -> _Request:
     if worst is not None:
         worst = checks.positive_integer("worst", worst)
     if isinstance(run, Rollout):
-        _check_scenario(scenario, run)
+        _check_same(scenario, run.scenario, numbers=not run.is_batch)
         on_host = _on_host(run)
         if not run.is_batch:
             return _Request([(0, on_host)], many=False)
         return _Request(((i, on_host[i]) for i in range(len(run))), many=True)
-    if all(hasattr(run, name) for name in ("replay", "metrics", "__len__")):
+    if has_members(run, "replay", "metrics", "__len__"):
+        nominal = optional_member(run, "scenario")
+        if nominal is not None:
+            _check_same(scenario, canonical(nominal), numbers=True)
         indices = _nearest_to_bounds(run, worst)
         return _Request(((i, _on_host(_replayed(run, i))) for i in indices), many=True)
     raise checks.fail(
@@ -143,16 +147,16 @@ def _on_host(run: Rollout) -> Rollout:
     return jax.tree.map(np.asarray, run)
 
 
-def _check_scenario(scenario: Scenario, run: Rollout) -> None:
-    """Raises ValueError for a run of another scenario; the leaves of a batch may differ."""
+def _check_same(scenario: Scenario, of_run: Scenario, *, numbers: bool) -> None:
+    """Raises ValueError for a run or a study of another scenario; the numbers of the runs of a
+    batch may differ.
+    """
     structure: Any = jax.tree.structure(scenario)
     got = ""
-    if structure != jax.tree.structure(run.scenario):
+    if structure != jax.tree.structure(of_run):
         got = "a run of another kind of scenario"
-    elif not run.is_batch:
-        pairs = zip(jax.tree.leaves(scenario), jax.tree.leaves(run.scenario), strict=True)
-        if not all(np.array_equal(a, b) for a, b in pairs):
-            got = "a run of a scenario with other numbers"
+    elif numbers and not all(map(np.array_equal, *map(jax.tree.leaves, (scenario, of_run)))):
+        got = "a run of a scenario with other numbers"
     if got:
         remedy = "Pass run.scenario as the scenario."
         raise checks.fail("run", got, "a run of `scenario`", remedy)
@@ -186,9 +190,9 @@ def _replayed(study: Any, index: int) -> Rollout:
     if duration is None or dt is None:
         return study.replay(index)
     steps = round(duration / dt)
-    if steps <= RECORDED:
+    if steps <= MAX_RECORDED:
         return study.replay(index)
-    return study.replay(index, record_every=1 + steps // RECORDED)
+    return study.replay(index, record_every=1 + steps // MAX_RECORDED)
 
 
 # --- one run -------------------------------------------------------------------------------------

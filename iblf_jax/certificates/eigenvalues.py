@@ -24,7 +24,7 @@ BATCH_SIZE = 512
 POINTS_PER_AXIS = {1: 257, 2: 65, 3: 21}
 """Points of the grid per axis, by number of joints."""
 SOBOL_POINTS = 4096
-REFINED = 4
+REFINED_POINTS = 4
 """Number of the best points that are improved."""
 
 
@@ -103,7 +103,7 @@ def eigenvalues_over(robot: Robot, low: np.ndarray, high: np.ndarray) -> Extreme
 
     def largest(sign: int, values: np.ndarray) -> tuple[float, np.ndarray]:
         """The largest of sign * eigenvalue over the box: the best point, or an improvement."""
-        best = np.argsort(values)[::-1][:REFINED]
+        best = np.argsort(values)[::-1][:REFINED_POINTS]
         improved = [
             maximise(lambda x: _with_gradient(robot, np.asarray(x, dtype), sign), start, low, high)
             for start in points[best]
@@ -113,5 +113,5 @@ def eigenvalues_over(robot: Robot, low: np.ndarray, high: np.ndarray) -> Extreme
 
     lambda_max, q_max = largest(1, eigenvalues[:, -1])
     negative_min, q_min = largest(-1, -eigenvalues[:, 0])
-    searched = f"{description}, the best {REFINED} improved by L-BFGS-B"
+    searched = f"{description}, the best {REFINED_POINTS} improved by L-BFGS-B"
     return Extremes(-negative_min, lambda_max, q_min, q_max, searched)

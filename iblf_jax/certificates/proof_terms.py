@@ -50,10 +50,10 @@ from iblf_jax.simulation.signals import Sample
 from iblf_jax.world.bounds import NARROWEST
 from iblf_jax.world.robots import at_time, friction_torque, mass_matrix_rate
 
-ROUNDING = 2.0
+DECAY_ROUNDING = 2.0
 """Error of V2' in units of the last place, relative to the sizes of its terms; the largest that
 tests found is 0.1."""
-UNCHANGED = 8.0
+TORQUE_ROUNDING = 8.0
 """Units in the last place by which equal torques may differ."""
 GENERAL_TERMS = "dV/dq' . M0^-1 f_tilde + dV/df_tilde . f'"
 """T of a law without `disturbance_terms`."""
@@ -137,7 +137,7 @@ class ProofTerms(NamedTuple):
 
 def rounding(dtype) -> float:
     """The relative error that is attributed to rounding in sums of this floating-point type."""
-    return ROUNDING * float(jnp.finfo(dtype).eps)
+    return DECAY_ROUNDING * float(jnp.finfo(dtype).eps)
 
 
 def terms_at(scenario: Scenario, t: jax.Array, state: LoopState) -> ProofTerms:
@@ -275,7 +275,7 @@ def _differs_from_command(
     """
     f_hat = now["disturbance_estimate"]
     command, _ = law.command(t, state.q, state.dq, f_hat, scenario.context, law_state)
-    tolerance = UNCHANGED * jnp.finfo(command.tau.dtype).eps * jnp.abs(command.tau)
+    tolerance = TORQUE_ROUNDING * jnp.finfo(command.tau.dtype).eps * jnp.abs(command.tau)
     return jnp.any(jnp.abs(now["tau"] - command.tau) > tolerance)
 
 

@@ -26,6 +26,7 @@ import numpy as np
 
 from iblf_jax.certificates.proof_terms import ProofTerms, mass_over_gain, terms_and_sample
 from iblf_jax.core import checks
+from iblf_jax.core.optional import attributes
 from iblf_jax.core.status import UNTRUSTED, Status, describe
 from iblf_jax.engine import run_from
 from iblf_jax.simulation import jumps
@@ -312,7 +313,8 @@ def tolerances(run: Any) -> dict[str, float]:
     """
 
     def largest(names):
-        return max(float(np.max(np.abs(getattr(run, name)), initial=0.0)) for name in names)
+        recorded = attributes(run, names).values()
+        return max(float(np.max(np.abs(values), initial=0.0)) for values in recorded)
 
     relative = np.sqrt(np.finfo(run.q.dtype).eps)
     position, torque = largest(POSITIONS), largest(TORQUES)
@@ -344,10 +346,9 @@ def _check_signals(run: Any, steps: Steps, rows: np.ndarray, sizes: dict[str, fl
     run recorded.
     """
     for names, kind in ((POSITIONS, "position"), (SPEEDS, "speed"), (TORQUES, "torque")):
-        for name in names:
-            kept = getattr(run, name)[rows]
-            again = getattr(steps.sample, name)[steps.recorded]
-            _compare(run, name, kept, again, rows, sizes[kind])
+        again = attributes(steps.sample, names)
+        for name, recorded in attributes(run, names).items():
+            _compare(run, name, recorded[rows], again[name][steps.recorded], rows, sizes[kind])
 
 
 def _compare(

@@ -22,7 +22,7 @@ from iblf_jax.certificates.lines import (
 from iblf_jax.core import checks, tables
 from iblf_jax.core.presentation import present
 
-FEW = 3
+MAX_LISTED = 3
 """Lines that do not apply are listed by name up to this number."""
 
 
@@ -215,7 +215,7 @@ class Certificate:
 
 def _listed(names: list[str]) -> str:
     """The names of lines, or their number where there are many."""
-    return ", ".join(names) if len(names) <= FEW else f"{len(names)} lines"
+    return ", ".join(names) if len(names) <= MAX_LISTED else f"{len(names)} lines"
 
 
 def _reason(note: str) -> str:

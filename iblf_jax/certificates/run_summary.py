@@ -39,7 +39,7 @@ from iblf_jax.core.status import UNTRUSTED, describe
 
 KEPT_STEPS = 100_000
 """Largest number of steps that stay in memory between the two passes over a run."""
-NOISE = 32.0
+ENERGY_ROUNDING = 32.0
 """Rounding error of sqrt(2 V2) in units of the last place, relative to the sizes of its terms."""
 CONDITION = {1: "(3.17)", 2: "(3.25)"}
 """Gain condition of each case."""
@@ -377,7 +377,7 @@ def _level(steps: Steps, w_f: float) -> _Level:
     """V_w along some steps, with its errors."""
     proof = steps.proof
     eps = float(np.finfo(proof.V.dtype).eps)
-    noise = NOISE * eps * proof.V_terms * max(1.0, w_f) ** 0.5
+    noise = ENERGY_ROUNDING * eps * proof.V_terms * max(1.0, w_f) ** 0.5
     defect = steps.defect
     if w_f != 1.0:
         defect = defect + abs(w_f - 1.0) * steps.defect_f

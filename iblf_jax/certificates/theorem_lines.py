@@ -44,9 +44,9 @@ INEQUALITY = {1: "(3.18)", 2: "(3.26)"}
 ENVELOPE = {1: "(3.20)", 2: "(3.28)"}
 XI_BOUND = {1: "(3.22)", 2: "(3.30)"}
 BOUNDS = {1: "(3.23)", 2: "(3.31)"}
-LEFT = {1: "V2' + rho V2 <= 0", 2: "V2' + rho V2 - |f'|^2/2 <= 0"}
-ENVELOPED = {1: "V2(t) <= V2(0) exp(-rho t)", 2: "V2(t) <= V2(0) exp(-rho t) + rho2/rho"}
-HALF = {1: "", 2: " - 1/2"}
+DECAY_STATEMENT = {1: "V2' + rho V2 <= 0", 2: "V2' + rho V2 - |f'|^2/2 <= 0"}
+ENVELOPE_STATEMENT = {1: "V2(t) <= V2(0) exp(-rho t)", 2: "V2(t) <= V2(0) exp(-rho t) + rho2/rho"}
+FURTHER_TERM = {1: "", 2: " - 1/2"}
 """Further term in the condition (F.3) on kf, by case."""
 
 NO_BOUND = "the barrier states no bound on xi from V1"
@@ -224,7 +224,7 @@ def _full_gains(summary: RunSummary) -> list[Line]:
     constants, lambda_min = summary.claims.constants, summary.lambda_min
     lines = []
     for case in CASES:
-        text = f"lambda_min(kf){HALF[case]} - 1/(4 c lambda_min(M0)^2) > 0"
+        text = f"lambda_min(kf){FURTHER_TERM[case]} - 1/(4 c lambda_min(M0)^2) > 0"
         statement = Statement(f"kf and c, case {case}", "(F.3)", text, "1/s")
         if not isinstance(constants, FullClaim):
             lines.append(not_applicable(statement, summary.claims.no_theorem))
@@ -256,7 +256,7 @@ def _rate(summary: RunSummary, case: int, domain: str) -> Line:
         equation = "(F.3)"
         text = (
             "rho = min(decay of V1, decay of phi, 2 (kf"
-            f"{HALF[case]} - 1/(4 c lambda_min(M0)^2))) > 0"
+            f"{FURTHER_TERM[case]} - 1/(4 c lambda_min(M0)^2))) > 0"
         )
     statement = Statement(name, equation, text, "1/s")
     reason = summary.claims.no_theorem
@@ -306,7 +306,9 @@ def left_side(segment: Segment, case: int) -> np.ndarray:
 def _inequality(segment: Segment, case: int) -> Line:
     """The differential inequality, at every step."""
     summary, proof = segment.summary, segment.proof
-    statement = Statement(f"inequality, case {case}", INEQUALITY[case], LEFT[case], "1/s")
+    statement = Statement(
+        f"inequality, case {case}", INEQUALITY[case], DECAY_STATEMENT[case], "1/s"
+    )
     reason = summary.why_not_theorem(case)
     if reason:
         return not_applicable(statement, reason)
@@ -329,7 +331,7 @@ def _barriers_inequality(segment: Segment) -> Line:
 
 def _envelope(segment: Segment, case: int) -> Line:
     """The envelope of V2, at every step."""
-    statement = Statement(f"envelope, case {case}", ENVELOPE[case], ENVELOPED[case])
+    statement = Statement(f"envelope, case {case}", ENVELOPE[case], ENVELOPE_STATEMENT[case])
     reason = segment.summary.why_not_theorem(case)
     if reason:
         return not_applicable(statement, reason)

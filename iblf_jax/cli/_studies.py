@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     import xarray
 
-MOST_DEVICES = 256
+MAX_DEVICES = 256
 """Largest number of CPU devices: each has its own threads, and XLA aborts if the system has none
 left."""
 UNFINISHED = 3
@@ -98,7 +98,7 @@ def _set_devices(number: int | None) -> None:
 
     if number is None:
         return
-    number = checks.positive_integer("--devices", number, most=MOST_DEVICES)
+    number = checks.positive_integer("--devices", number, most=MAX_DEVICES)
     try:
         jax.config.update("jax_num_cpu_devices", number)
     except RuntimeError:  # `main` was called in a process in which JAX has run

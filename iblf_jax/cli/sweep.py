@@ -11,7 +11,7 @@ from iblf_jax.core.tables import as_text
 if TYPE_CHECKING:
     import xarray
 
-MOST_ROWS = 40
+MAX_ROWS = 40
 
 
 def add_parser(subparsers: argparse._SubParsersAction) -> None:
@@ -94,13 +94,13 @@ def report(data: xarray.Dataset) -> str:
             cells += [number(np.nanmin(margin[point])), number(np.nanmedian(margin[point]))]
         rows.append(cells)
     more = []
-    if len(rows) > MOST_ROWS + 1:
-        more = [f"... and {len(rows) - 1 - MOST_ROWS} more points"]
+    if len(rows) > MAX_ROWS + 1:
+        more = [f"... and {len(rows) - 1 - MAX_ROWS} more points"]
     head = (
         f"{data.attrs['cases']} runs of {data.attrs['duration']:g} s, dt = {data.attrs['dt']:g} s,"
         f" seed {data.attrs['seed']}"
     )
-    return "\n".join([head, "", *as_text(rows[: MOST_ROWS + 1], left=(0,)), *more])
+    return "\n".join([head, "", *as_text(rows[: MAX_ROWS + 1], left=(0,)), *more])
 
 
 def _tick(value: Any) -> str:

@@ -3,7 +3,7 @@
 It is $XDG_CACHE_HOME/iblf_jax, or ~/.cache/iblf_jax, and in it a folder for XLA's by the kind of
 processor.  The first run of a process enables it, unless the user has configured another folder
 of JAX or disabled its cache (JAX_ENABLE_COMPILATION_CACHE=0).  When all entries take more than
-LIMIT, the least recently used ones are removed.  The folder may be deleted at any time.
+MAX_BYTES, the least recently used ones are removed.  The folder may be deleted at any time.
 
 JAX does not verify what it loads.  In our folder each of its entries therefore ends in a digest of
 its name and its content: an entry that is damaged, belongs to another program or is not a file is
@@ -28,7 +28,7 @@ from iblf_jax.core import notices
 from iblf_jax.core.caches import memoised
 from iblf_jax.kernels import cpuinfo, directory, processor
 
-LIMIT = 2 * 2**30
+MAX_BYTES = 2 * 2**30
 """Bytes."""
 JAX_SUFFIX = "-cache"
 """Suffix of the names of JAX's entries."""
@@ -194,7 +194,7 @@ def _trim(folder: Path) -> None:
     kept = [(_last_use(status), status.st_size, x.path) for x, status in entries if _is_ours(x)]
     size = sum(bytes_of_one for _, bytes_of_one, _ in kept)
     for last_use, bytes_of_one, path in sorted(kept):
-        if size <= LIMIT or last_use > time.time() - IN_USE:
+        if size <= MAX_BYTES or last_use > time.time() - IN_USE:
             break
         with contextlib.suppress(OSError):
             os.unlink(path)

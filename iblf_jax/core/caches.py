@@ -22,7 +22,7 @@ from typing import Any, TypeVar, cast
 
 F = TypeVar("F", bound=Callable)
 
-MOST_MARKS = 1024
+MAX_MARKS = 1024
 """Marks per topic: a mark is a text, or a tuple of shapes and of the structure of a pytree."""
 
 
@@ -63,7 +63,7 @@ class Cache:
             is_new = key not in marks
             marks[key] = None
             marks.move_to_end(key)
-            if len(marks) > MOST_MARKS:
+            if len(marks) > MAX_MARKS:
                 marks.popitem(last=False)
         return is_new
 

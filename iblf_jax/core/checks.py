@@ -25,14 +25,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core.devices import default, platform
+from iblf_jax.core.optional import missing_members
 
 F = TypeVar("F", bound=Callable)
 
 LARGEST_INTEGER = 2**63 - 1
-MOST_STEPS = 2**31 - 1
+MAX_STEPS = 2**31 - 1
 """Steps are counted in int32 inside the compiled loop."""
 
-LIMITS = ("limit", "positive limit")
+SIGNS_OF_LIMITS = ("limit", "positive limit")
 """Signs of leaves that may be infinite."""
 
 LONGEST_TEXT = {"field": 200, "value": 160, "words": 800, "message": 1400}
@@ -48,10 +49,10 @@ LONGEST_NAME = 220
 File systems allow 255, and the names of temporary files are longer than those that they replace.
 """
 
-MOST_JOINTS = 10_000
+MAX_JOINTS = 10_000
 """More than any robot has."""
 
-DEEPEST = 32
+MAX_DEPTH = 32
 """Lists inside each other that can be an array."""
 
 
@@ -83,7 +84,7 @@ def is_deep(value: Any) -> bool:
     from then on.
     """
     level = _containers([value])
-    for _ in range(DEEPEST):
+    for _ in range(MAX_DEPTH):
         inner: dict[int, Any] = {}
         for container in level.values():
             if isinstance(container, dict):
@@ -103,7 +104,7 @@ def _containers(values: Iterable[Any]) -> dict[int, Any]:
 def flat_enough(name: str, value: Any) -> None:
     """Raises for lists, tuples and dicts inside each other that JAX must not see."""
     if is_deep(value):
-        raise fail(name, value, f"at most {DEEPEST} lists inside each other")
+        raise fail(name, value, f"at most {MAX_DEPTH} lists inside each other")
 
 
 def line(text: str, part: str = "words") -> str:
@@ -271,7 +272,7 @@ def _is_number_like(value: Any, depth: int = 0) -> bool:
         return True
     return (
         isinstance(value, list | tuple)
-        and depth < DEEPEST
+        and depth < MAX_DEPTH
         and all(_is_number_like(x, depth + 1) for x in value)
     )
 
@@ -357,11 +358,11 @@ def check_values(name: str, array: Any, sign: str | None) -> None:
     if array is None or isinstance(array, jax.core.Tracer):
         return
     values = np.asarray(array)
-    if sign in LIMITS and np.isnan(values).any():
+    if sign in SIGNS_OF_LIMITS and np.isnan(values).any():
         raise fail(
             name, array, "numbers, infinite where there is no limit", "Replace the NaN entries."
         )
-    if sign not in LIMITS and not np.isfinite(values).all():
+    if sign not in SIGNS_OF_LIMITS and not np.isfinite(values).all():
         raise fail(name, array, "finite numbers", "Replace the NaN or infinite entries.")
     if sign in ("positive", "positive limit") and not (values > 0).all():
         raise fail(name, array, "numbers > 0", "Give positive values.")
@@ -418,7 +419,7 @@ def conforms(
     )
     if bare:
         raise fail(name, value, expected, remedy)
-    missing = sorted(x for x in members - set(optional) if not hasattr(value, x))
+    missing = missing_members(value, sorted(members - set(optional)))
     if missing:
         raise fail(name, value, expected, f"{remedy} It lacks {', '.join(missing)}.".strip())
     for field, part in getattr(value, "__dict__", {}).items():
@@ -447,7 +448,7 @@ def offers(name: str, value: Any, methods: tuple[str, ...], expected: str) -> No
     )
     if bare and methods:
         raise fail(name, value, expected)
-    missing = [x for x in methods if not hasattr(value, x)]
+    missing = missing_members(value, methods)
     if missing:
         raise fail(name, value, expected, f"It lacks {', '.join(missing)}.")
 
@@ -757,11 +758,11 @@ def whole_steps(duration: Any, dt: Any, *, dt_is_free: bool = True) -> int:
     """
     duration = positive_number("duration", duration, "s")
     dt = positive_number("dt", dt, "s")
-    if not duration / dt <= MOST_STEPS:
+    if not duration / dt <= MAX_STEPS:
         raise fail(
             "duration",
             duration,
-            f"at most {MOST_STEPS} steps dt = {dt:g} s",
+            f"at most {MAX_STEPS} steps dt = {dt:g} s",
             "Shorten the run or take a larger dt.",
         )
     steps = round(duration / dt)
@@ -783,4 +784,4 @@ def recorded_every(value: Any, steps: int) -> int:
     Every number past the last step has the same effect: only the first instant is recorded.  A
     number that does not fit in 64 bits is an error.
     """
-    return min(positive_integer("record_every", value, most=LARGEST_INTEGER), steps + 1, MOST_STEPS)
+    return min(positive_integer("record_every", value, most=LARGEST_INTEGER), steps + 1, MAX_STEPS)

@@ -10,7 +10,7 @@ import jax
 
 from iblf_jax.core import notices
 
-MOST_THREADS = 256
+MAX_THREADS = 256
 """Largest number of threads of a kernel (`kernels/c/driver.h`)."""
 
 
@@ -56,11 +56,11 @@ def threads() -> int:
         return default_threads
     is_number = text.isascii() and text.isdigit()
     digits = text.lstrip("0") if is_number else ""
-    if 0 < len(digits) < 10 and int(digits) <= MOST_THREADS:
+    if 0 < len(digits) < 10 and int(digits) <= MAX_THREADS:
         return int(digits)
-    used = MOST_THREADS if digits else default_threads
+    used = MAX_THREADS if digits else default_threads
     notices.warn(
-        f"IBLF_JAX_THREADS: got {text[:40]!r}, expected a whole number from 1 to {MOST_THREADS}."
+        f"IBLF_JAX_THREADS: got {text[:40]!r}, expected a whole number from 1 to {MAX_THREADS}."
         f" Running with {used} threads."
     )
     return used

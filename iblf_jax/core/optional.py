@@ -1,4 +1,5 @@
-"""Optional members of a protocol, and their defaults.
+"""Members of an object by name: optional members of a protocol with their defaults, and groups of
+attributes.
 
 Classes that users write may leave out some attributes and methods of a protocol.  Each family
 declares these once, with their defaults, as an `OptionalMembers` beside its protocol; the rest of
@@ -7,6 +8,7 @@ the package reads them through it and never by `getattr` with a default of its o
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 
@@ -27,3 +29,18 @@ class OptionalMembers:
           KeyError: a name that the family does not declare.
         """
         return getattr(part, name, self.defaults[name])
+
+
+def attributes(part: Any, names: Iterable[str]) -> dict[str, Any]:
+    """Name -> value of these attributes of an object."""
+    return {name: getattr(part, name) for name in names}
+
+
+def missing_members(part: Any, names: Iterable[str]) -> list[str]:
+    """The names of which an object has no attribute and no method."""
+    return [name for name in names if not hasattr(part, name)]
+
+
+def has_members(part: Any, *names: str) -> bool:
+    """Whether an object has all of these attributes and methods."""
+    return not missing_members(part, names)

@@ -22,10 +22,10 @@ from iblf_jax._start import AT_END
 from iblf_jax.kernels import stop_compilers
 
 TASKS = Path("/proc/self/task")
-PATIENCE = 300.0
+MAX_WAIT = 300.0
 """Seconds that the end of a process waits for XLA at most: a compilation takes minutes at the
 worst."""
-LOOKS, PAUSE = 5, 0.002
+CONFIRMATIONS, CONFIRMATION_INTERVAL = 5, 0.002
 """Times that threads are looked at before they count as idle, and seconds between: one that waits
 for memory is not running."""
 
@@ -36,10 +36,10 @@ AT_END.append(stop_compilers)
 def native_threads_run() -> bool:
     """Whether a thread that Python has not started is running; False where that is not known."""
     known = {thread.native_id for thread in threading.enumerate()}
-    for _ in range(LOOKS):
+    for _ in range(CONFIRMATIONS):
         if any(_is_running(task) for task in _tasks() if int(task.name) not in known):
             return True
-        time.sleep(PAUSE)
+        time.sleep(CONFIRMATION_INTERVAL)
     return False
 
 
@@ -60,11 +60,11 @@ def _is_running(task: Path) -> bool:
 
 def finish() -> None:
     """Waits for XLA, or ends the process here if Ctrl-C ends it."""
-    end = time.monotonic() + PATIENCE
+    end = time.monotonic() + MAX_WAIT
     while native_threads_run() and time.monotonic() < end:
         if getattr(sys, "last_type", None) is KeyboardInterrupt:
             _end_by_interrupt()
-        time.sleep(10 * PAUSE)
+        time.sleep(10 * CONFIRMATION_INTERVAL)
 
 
 def _end_by_interrupt() -> None:

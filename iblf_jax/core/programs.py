@@ -16,13 +16,13 @@ from pathlib import Path
 
 import jax
 
-MAPS, MOST_MAPS = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
-COMPILED = "/jax/core/compile/backend_compile_duration"
+MAPS, MAX_MAPS = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
+COMPILE_EVENT = "/jax/core/compile/backend_compile_duration"
 """JAX's event of a program that is compiled, or read from the disk."""
-SHARE = 0.6
+MAX_MAP_FRACTION = 0.6
 """Share of the permitted maps above which programs are released: libraries and other threads need
 some, too."""
-PROGRAM = 300
+MAPS_OF_A_PROGRAM = 300
 """Approximate largest number of maps of a program: a step of an arm's closed loop has 250."""
 
 
@@ -37,7 +37,7 @@ def count_maps() -> int:
 def most_maps() -> int | None:
     """Memory maps that a process may have; None where there is no such limit."""
     try:
-        return int(MOST_MAPS.read_text())
+        return int(MAX_MAPS.read_text())
     except (OSError, ValueError):
         return None
 
@@ -59,7 +59,7 @@ class ProgramBound:
 
     def __call__(self, event: str, duration_secs: float, **kwargs: str | int) -> None:
         """Listens to JAX's events."""
-        if event != COMPILED:
+        if event != COMPILE_EVENT:
             return
         self._until_count -= 1
         if self._until_count >= 0 or not self._lock.acquire(blocking=False):
@@ -78,7 +78,7 @@ class ProgramBound:
             maps = count_maps()
             # Where others hold most of the maps, programs are not released after every new one.
             self.bound = max(self.bound, maps + (self.limit - maps) // 4)
-        self._until_count = max((self.bound - maps) // PROGRAM, 0)
+        self._until_count = max((self.bound - maps) // MAPS_OF_A_PROGRAM, 0)
 
 
 def release_programs() -> None:
@@ -92,6 +92,6 @@ def bound_programs() -> ProgramBound | None:
     limit = most_maps()
     if limit is None:
         return None
-    bound = ProgramBound(limit, int(SHARE * limit))
+    bound = ProgramBound(limit, int(MAX_MAP_FRACTION * limit))
     jax.monitoring.register_event_duration_secs_listener(bound)
     return bound

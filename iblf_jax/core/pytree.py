@@ -26,12 +26,16 @@ from typing import Any, TypeAlias, TypeVar, dataclass_transform
 import jax
 
 from iblf_jax.core import checks
+from iblf_jax.core.optional import OptionalMembers, attributes, has_members
 
 T = TypeVar("T")
 
 Leaf: TypeAlias = Any
 """Type of a field declared with `leaf`: a number, a list or an array when a person writes it, a
 `jax.Array` from then on."""
+
+component_member = OptionalMembers(wraps=None)
+"""Reads what the class of a component may declare: the field that holds a wrapped component."""
 
 
 def leaf(
@@ -84,13 +88,14 @@ def component(cls: type[T]) -> type[T]:
             if not has_own_init:
                 checks.check_arguments(cls.__name__, fields, args, kwargs)
             raise
+        values = field_values(self)
         for field in fields:
-            value = getattr(self, field.name)
+            value = values[field.name]
             if field.metadata.get("static"):
                 checks.structural(cls.__name__, field.name, value)
             else:
                 object.__setattr__(self, field.name, checks.as_leaf(cls.__name__, field, value))
-        if hasattr(self, "check"):
+        if has_members(self, "check"):
             self.check()
 
     cls.__init__ = checked_init  # type: ignore[method-assign]
@@ -144,7 +149,8 @@ def _getter(names: tuple[str, ...]) -> Callable[[Any], tuple]:
     if len(names) > 1:
         return operator.attrgetter(*names)
     if names:
-        return lambda obj: (getattr(obj, names[0]),)
+        get = operator.attrgetter(names[0])
+        return lambda obj: (get(obj),)
     return lambda obj: ()
 
 
@@ -153,9 +159,14 @@ def layers(part: Any) -> list[Any]:
     field that holds it).
     """
     found = [part]
-    while getattr(type(found[-1]), "wraps", None):
-        found.append(getattr(found[-1], type(found[-1]).wraps))
+    while field := wrapped_field(found[-1]):
+        found.append(field_values(found[-1])[field])
     return found
+
+
+def wrapped_field(part: Any) -> str | None:
+    """The name of the field that holds the component which a component wraps, if it wraps one."""
+    return component_member(type(part), "wraps")
 
 
 def unwrapped(part: Any) -> Any:
@@ -167,10 +178,15 @@ def rewrapped(part: Any, inner: Any) -> Any:
     """`part` with its innermost component replaced by `inner`; `inner` itself if `part` wraps
     nothing.
     """
-    name = getattr(type(part), "wraps", None)
+    name = wrapped_field(part)
     if not name:
         return inner
-    return dataclasses.replace(part, **{name: rewrapped(getattr(part, name), inner)})
+    return dataclasses.replace(part, **{name: rewrapped(field_values(part)[name], inner)})
+
+
+def field_values(part: Any) -> dict[str, Any]:
+    """Name -> value of the fields of a dataclass."""
+    return attributes(part, [field.name for field in dataclasses.fields(part)])
 
 
 def is_leaf_field(field: dataclasses.Field) -> bool:

@@ -35,15 +35,15 @@ from iblf_jax.core.linalg import inner, matvec, solve_spd
 ITERATIONS = 36
 """Random programmes of two unknowns are solved after 29 at most, with or without a solution, of
 seven after 34."""
-WEIGHT = 1e-12
+REGULARISATION = 1e-12
 """w, relative to the size of H and h: it moves a solution by the share 1e-8 at most (tests)."""
-CENTRING = 0.03
+CENTRING_FACTOR = 0.03
 """How far the mean product m is to fall in one iteration."""
-TO_THE_EDGE = 0.999
+MAX_STEP_FRACTION = 0.999
 """Part of the way to the nearest edge that a step goes at most."""
-REFINED = 3
+REFINEMENTS = 3
 """Solves for a derivative."""
-BROKEN = 1e-7
+SLACK_TOLERANCE = 1e-7
 """What counts as slack, relative to the size of h."""
 
 
@@ -79,8 +79,8 @@ def quadratic_program(H: jax.Array, G: jax.Array, h: jax.Array, soft: jax.Array)
     of_H = jnp.sum(H * jnp.eye(len(H), dtype=H.dtype)) / len(H)
     of_h = jax.lax.stop_gradient(1.0 + jnp.max(jnp.abs(h / size)))
     rows, room = G / size[:, None], h / (size * of_h)
-    x = _solved(WEIGHT * H / of_H, rows, room, soft).x
-    over, least = matvec(rows, x) - room, max(BROKEN, float(jnp.finfo(h.dtype).eps) ** 0.5)
+    x = _solved(REGULARISATION * H / of_H, rows, room, soft).x
+    over, least = matvec(rows, x) - room, max(SLACK_TOLERANCE, float(jnp.finfo(h.dtype).eps) ** 0.5)
     return Solution(of_h * x, jnp.where(over > least, over, 0.0) * size * of_h)
 
 
@@ -97,14 +97,14 @@ def _solved(H: jax.Array, G: jax.Array, h: jax.Array, soft: jax.Array) -> _Point
 @jax.jit  # so that the generated code holds it once
 def _improved(H: jax.Array, G: jax.Array, h: jax.Array, soft: jax.Array, at: _Point) -> _Point:
     """One iteration."""
-    mean, least = inner(at.l, at.y) / h.size, WEIGHT * float(jnp.finfo(h.dtype).eps) ** 1.05
-    target = jnp.maximum(CENTRING * mean, least)
+    mean, least = inner(at.l, at.y) / h.size, REGULARISATION * float(jnp.finfo(h.dtype).eps) ** 1.05
+    target = jnp.maximum(CENTRING_FACTOR * mean, least)
     matrix, weight = _newton(H, G, soft, at)
     residual = matvec(G, at.x) - soft * at.l - h + target / at.l
     dx = solve_spd(matrix, -matvec(H, at.x) - matvec(G.T, at.l + weight * residual))
     dl = weight * (matvec(G, dx) + residual)
     dy = (target - at.y * dl) / at.l - at.y
-    part = jnp.minimum(TO_THE_EDGE * jnp.minimum(_room(at.y, dy), _room(at.l, dl)), 1.0)
+    part = jnp.minimum(MAX_STEP_FRACTION * jnp.minimum(_room(at.y, dy), _room(at.l, dl)), 1.0)
     # At the solution there is nothing left to gain, and rounding would spoil the factors.
     go_on = (mean > least) & jnp.all(jnp.isfinite(dx))
     return jax.tree.map(
@@ -133,7 +133,7 @@ def _solved_jvp(primals, tangents):
     dx, dl = jnp.zeros_like(at.x), jnp.zeros_like(at.l)
     # The weights of active rows take from H all but a few digits: what a solve leaves is solved for
     # again.
-    for _ in range(REFINED):
+    for _ in range(REFINEMENTS):
         left, missed = matvec(H, dx) + matvec(G.T, dl) + turned, matvec(G, dx) - dl / weight + moved
         more = solve_spd(matrix, -left - matvec(G.T, weight * missed))
         dx, dl = dx + more, dl + weight * (matvec(G, more) + missed)

@@ -13,15 +13,16 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.core import checks
+from iblf_jax.core.optional import has_members
 
 T = TypeVar("T")
 
 
 def as_at(part: T, t: jax.Array) -> T:
     """A part as it is at time t [s]: itself, unless it has a method `at`."""
-    if not hasattr(part, "at"):
+    if not has_members(part, "at"):
         return part
-    return part.at(t)  # type: ignore[no-any-return]
+    return part.at(t)  # type: ignore[attr-defined, no-any-return]
 
 
 def no_times(dtype: jax.typing.DTypeLike | None = None) -> jax.Array:
@@ -40,7 +41,7 @@ def jump_times_of(name: str, part: Any, dtype: jax.typing.DTypeLike | None = Non
     Raises:
       ValueError: `jump_times` fails, or does not return times.
     """
-    if not hasattr(part, "jump_times"):
+    if not has_members(part, "jump_times"):
         return no_times(dtype)
     expected = "times [s], one number or (m,), made of the fields by jnp"
     try:

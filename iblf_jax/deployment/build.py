@@ -15,7 +15,7 @@ from iblf_jax.kernels import ToolchainError, has_ziglang, ziglang
 
 TIMEOUT = 300.0
 """Seconds that a compiler may take."""
-MOST_OUTPUT = 2000
+MAX_OUTPUT = 2000
 """Characters of a compiler's complaint that are repeated."""
 
 
@@ -54,7 +54,7 @@ def build(command: Sequence[str], folder: Path) -> None:
     except (OSError, subprocess.TimeoutExpired) as error:
         raise ToolchainError(f"the C compiler could not be run: {error}") from None
     if done.returncode:
-        raise ToolchainError(f"the C compiler failed: {done.stderr[:MOST_OUTPUT]}")
+        raise ToolchainError(f"the C compiler failed: {done.stderr[:MAX_OUTPUT]}")
 
 
 def fmi_platform() -> tuple[str, str]:

@@ -99,7 +99,9 @@ def start(scenario: Scenario, inputs: SampleInputs) -> tuple[Memory, jax.Array]:
     scenario, velocity = _with_reference(scenario, inputs), _velocity(scenario)
     q, dq = inputs.q, inputs.dq
     observer = discrete_observer(scenario).init(q, dq, scenario.model)
-    filtered = () if velocity is None else velocity.init(q, dq, scenario.sampling.period)  # type: ignore[union-attr]
+    filtered: Any = ()
+    if velocity is not None:
+        filtered = velocity.init(q, dq, scenario.sampling.period)  # type: ignore[union-attr]
     return Memory(
         scenario.controller.init(q, dq, scenario.context), observer, filtered
     ), scenario.model.gravity(q)
@@ -136,7 +138,9 @@ def sample(scenario: Scenario, inputs: SampleInputs, memory: Memory) -> tuple[Me
 
 def _velocity(scenario: Scenario) -> Any:
     """The velocity filter of the sensor; None where velocities are inputs."""
-    return None if isinstance(scenario.sensor, Ideal) else scenario.sensor.velocity  # type: ignore[attr-defined]
+    if isinstance(scenario.sensor, Ideal):
+        return None
+    return scenario.sensor.velocity  # type: ignore[attr-defined]
 
 
 class ControlLaw(NamedTuple):

@@ -31,7 +31,7 @@ from iblf_jax.simulation.closed_loop import (
     run_sampled_law_if_due,
     sample_at,
 )
-from iblf_jax.simulation.jumps import APART
+from iblf_jax.simulation.jumps import JUMP_SEPARATION
 from iblf_jax.simulation.metrics import Fold, as_folds, metric_units
 from iblf_jax.simulation.results import Metrics, Rollout
 from iblf_jax.simulation.sampling import (
@@ -251,7 +251,7 @@ class _Run:
         """Number of commands that have arrived."""
         self.jump_times = np.sort(np.asarray(scenario.jump_times(), float))
         eps = np.finfo(scenario.initial.q.dtype).eps
-        self.jump_widths = APART * eps * np.abs(self.jump_times)
+        self.jump_widths = JUMP_SEPARATION * eps * np.abs(self.jump_times)
         self.jumped = 0
         """Number of jumps of the scenario in the past."""
         no_actuator = isinstance(scenario.actuator, Ideal)

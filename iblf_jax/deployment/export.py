@@ -23,7 +23,7 @@ from iblf_jax.deployment.finite import check_finite
 from iblf_jax.deployment.fmu import law_fmu, loop_fmu
 from iblf_jax.deployment.loop_program import loop_program
 from iblf_jax.deployment.write_c import (
-    CHECKED,
+    CHECK_INTERVAL,
     Law,
     Vectors,
     describe_counts,
@@ -301,7 +301,7 @@ def vectors(scenario: Scenario, external_reference: bool) -> Vectors:
     references = tuple(np.asarray(x) for x in inputs[3:]) if external_reference else ()
     at_start = tuple(np.asarray(x) for x in first[1:] if not isinstance(x, tuple))
     measured_q, measured_dq = np.asarray(inputs.q), np.asarray(inputs.dq)
-    return Vectors(at_start, measured_q, measured_dq, references, torques[::CHECKED])
+    return Vectors(at_start, measured_q, measured_dq, references, torques[::CHECK_INTERVAL])
 
 
 def _with_own_reference(scenario: Scenario, inputs: SampleInputs) -> SampleInputs:

@@ -249,7 +249,9 @@ BUILD_DESCRIPTION = """<?xml version="1.0" encoding="UTF-8"?>
 
 def law_fmu(law: Law, generated: GeneratedLaw, path: Path) -> None:
     """Writes a law as an FMU; raises ToolchainError."""
-    n, name, step = law.scenario.n, law.name, float(law.scenario.sampling.period)  # type: ignore[union-attr]
+    n = law.scenario.n
+    name = law.name
+    step = float(law.scenario.sampling.period)  # type: ignore[union-attr]
     given = "".join(f", q + {k * n}" for k in (2, 3, 4)) if law.external_reference else ""
     values = {
         "name": name, "upper": name.upper(), "joints": n, "step": repr(step), "reference": given,

@@ -26,11 +26,11 @@ from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.paths import sign_at
 from iblf_jax.simulation.scenario import Scenario
 
-SPAN = 5.0
+GAIN_RANGE = 5.0
 """A gain's slider goes from a fifth of its value to five times it."""
-ROOM = 0.3
+START_RANGE = 0.3
 """That of a start or a bound, so far to both sides [rad]."""
-POINTS = 500
+DRAWN_INSTANTS = 500
 """Instants that are drawn of a run, about."""
 HEIGHT = 640
 """Pixels of the frame in a notebook."""
@@ -96,7 +96,7 @@ def explore(
         "title": "iblf_jax",
         "loops": tables.as_script_data(loops),
         "steps": steps,
-        "every": max(1, steps // POINTS),
+        "every": max(1, steps // DRAWN_INSTANTS),
         "state": _file("loops.js"),
     }
     return Page(Template(_file("live.html")).substitute(values))
@@ -143,7 +143,7 @@ def _slider(scenario: Scenario, row: dict[str, Any]) -> dict[str, Any]:
         return {}
     if path.startswith(("controller.", "observer.")) and sign_at(scenario, path) == "positive":
         return {
-            "slider": [[float(values[0]) / SPAN, float(values[0]) * SPAN]],
+            "slider": [[float(values[0]) / GAIN_RANGE, float(values[0]) * GAIN_RANGE]],
             "positive": True,
             "each": False,
         }
@@ -155,7 +155,7 @@ def _slider(scenario: Scenario, row: dict[str, Any]) -> dict[str, Any]:
         "bounds.upper.value",
     ):
         return {
-            "slider": [[float(x) - ROOM, float(x) + ROOM] for x in values],
+            "slider": [[float(x) - START_RANGE, float(x) + START_RANGE] for x in values],
             "positive": False,
             "each": True,
         }

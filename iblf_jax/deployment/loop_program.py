@@ -31,7 +31,7 @@ OUTPUTS = {
 """Outputs of a step, one number for each joint, at its start: name -> unit."""
 OF_SAMPLE = {"f": "disturbance", "f_hat": "disturbance_estimate"}
 """Outputs that have another name in `Sample`."""
-ENDLESS = 2.0**52
+UNLIMITED_STEPS = 2.0**52
 """Number of steps of a run without an end."""
 
 
@@ -80,7 +80,7 @@ def loop_program(scenario: Scenario, method: str) -> Loop:
         noise = run_settings.noise
         if not has_noise(scenario) and scenario.sampling is not None:
             noise = jnp.zeros((4,), dtype)
-        inputs = Inputs(scenario, (), run_settings.dt, jnp.asarray(ENDLESS, dtype), noise)
+        inputs = Inputs(scenario, (), run_settings.dt, jnp.asarray(UNLIMITED_STEPS, dtype), noise)
         size = accuracy.watched_indices(state).size
         blank = start(inputs, method, jnp.zeros((size, size), dtype))
         done = advance(

@@ -20,7 +20,7 @@ from iblf_jax.simulation.scenario import Scenario
 SEGMENT = 500
 """Largest number of operations of a C function: the compile time grows with the square of its
 length, and so does its stack without optimisation."""
-LONG = 16
+ELEMENTARY_COST = 16
 """Cost (`operations.OPERATIONS`) above which an operation is an elementary function."""
 REFERENCE = ("q_d", "dq_d", "ddq_d")
 LOOKUP = """static F f_lookup(const I *table, I size, I i) {
@@ -29,7 +29,7 @@ LOOKUP = """static F f_lookup(const I *table, I size, I i) {
   return x;
 }
 """
-FRAME = 256
+STACK_FRAME_BYTES = 256
 """Upper estimate of the bytes of a stack frame besides its numbers."""
 ROUNDS_FOR = 10**8
 """Approximate number of operations that the self-test times."""
@@ -58,7 +58,7 @@ def _operation_kind(op: str) -> str:
     if op in kinds:
         return kinds[op]
     cost = OPERATIONS[op].cost
-    if cost is not None and cost <= LONG:
+    if cost is not None and cost <= ELEMENTARY_COST:
         return "sums, products and choices"
     return "elementary functions"
 
@@ -76,11 +76,11 @@ def stack_bytes_of(text: str, real_bytes: int) -> int:
     bodies = re.split(r"^(?:static|SEPARATE) void ", text, flags=re.MULTILINE)[1:]
     own = [len(re.findall(r"^  [FI] v\d+ =", body, re.MULTILINE)) for body in bodies]
     if len(bodies) == 1:
-        return real_bytes * own[0] + FRAME
+        return real_bytes * own[0] + STACK_FRAME_BYTES
     # The last function calls the others and passes them arrays of floats and of integers.
     arrays = re.findall(r"^  F x\[(\d+)\]; I y\[(\d+)\];$", bodies[-1], re.MULTILINE)[0]
     passed = sum(int(size) for size in arrays)
-    return real_bytes * (max(own[:-1]) + own[-1] + passed) + 2 * FRAME
+    return real_bytes * (max(own[:-1]) + own[-1] + passed) + 2 * STACK_FRAME_BYTES
 
 
 def helper_macros(text: str) -> str:
@@ -99,7 +99,7 @@ def helper_macros(text: str) -> str:
     return "\n".join(mask + used)
 
 
-CHECKED = 10
+CHECK_INTERVAL = 10
 """The self-test compares the torque of one in so many samples."""
 
 
@@ -113,7 +113,7 @@ class Vectors(NamedTuple):
     reference: tuple[np.ndarray, ...]
     """q_d, q_d', q_d"; empty if the reference is internal."""
     tau: np.ndarray
-    """Torque of every CHECKED-th sample."""
+    """Torque of every CHECK_INTERVAL-th sample."""
 
 
 class Law(NamedTuple):
@@ -389,7 +389,7 @@ def _vectors(law: Law, arrays: dict[str, np.ndarray]) -> str:
         return "{" + ", ".join(number(float(y), law.is_float) for y in x) + "}"
 
     lines = ["/* Samples of a simulated run, for selftest.c; the torque of every CHECKED-th. */"]
-    lines.append(f"enum {{ SAMPLES = {len(v.q)}, CHECKED = {CHECKED} }};")
+    lines.append(f"enum {{ SAMPLES = {len(v.q)}, CHECKED = {CHECK_INTERVAL} }};")
     names = ("q", "dq", *REFERENCE)[: len(v.first)]
     lines += [
         f"static const {real} first_{x}[{n}] = {row(y)};"

@@ -19,7 +19,7 @@ from iblf_jax.simulation.sampling import has_noise
 from iblf_jax.simulation.scenario import Scenario
 
 WASM_FLAGS = ("-target", "wasm32-wasi", "-mexec-model=reactor", "-O2", "-s")
-ROWS = 32_768
+RECORD_BUFFER = 32_768
 """Records in the buffer of a module."""
 
 
@@ -64,7 +64,7 @@ def loop_files(
         "memory_size": loop.size,
         "outputs": ", ".join(OUTPUTS),
         "noise_setting": ", then the four words of the noise's key" if setting_count > 1 else "",
-        "rows": ROWS,
+        "rows": RECORD_BUFFER,
         "array": "Float32Array" if loop.step.dtype == np.float32 else "Float64Array",
     }
     return GeneratedLoop(

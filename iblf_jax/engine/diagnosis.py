@@ -21,7 +21,7 @@ from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.optional import optional_member
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.signals import has
-from iblf_jax.simulation.stability import RADIUS, WIDEST
+from iblf_jax.simulation.stability import RADIUS, THIRD_SIZE
 from iblf_jax.world.bounds import tube_at
 from iblf_jax.world.regions import in_words
 from iblf_jax.world.robots import joint_names
@@ -124,7 +124,7 @@ def _infinite_slope(result: Rollout) -> str:
         "At an isolated instant the derivative of the closed loop with respect to a state is"
         " infinite or nearly so, as that of |e2|^a sign(e2) with a < 1 is with respect to e2 ="
         " q' - alpha where e2 = 0, or that of sharp dry friction at a reversal. That is no"
-        f" fast mode, so the time step is assessed by differences of {WIDEST:g} rad/s there."
+        f" fast mode, so the time step is assessed by differences of {THIRD_SIZE:g} rad/s there."
         " Derivatives of the run are not reliable; replace such a power by e2 (e2^2 +"
         " delta^2)^((a - 1)/2) with a small delta."
     )

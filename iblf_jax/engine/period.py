@@ -17,22 +17,22 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks, notices
-from iblf_jax.engine.step_size import LOOKS, largest_eigenvalue, round_down, start_and_along
+from iblf_jax.engine.step_size import MODE_INSTANTS, largest_eigenvalue, round_down, start_and_along
 from iblf_jax.simulation.closed_loop import LoopState, run_sampled_law
 from iblf_jax.simulation.sampling import Sampling, commands_in_transit, with_sufficient_queue
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.simulation.stability import jacobian, period_map
 
-SHORTEST, LONGEST = 1e-5, 0.2
+SHORTEST_PERIOD, LONGEST_PERIOD = 1e-5, 0.2
 """Periods between which is looked [s]."""
-FACTOR = 2 ** (1 / 3)
+PERIOD_RATIO = 2 ** (1 / 3)
 """Between two that are tried; then the interval is halved."""
 HALVINGS = 8
-MOST_UNDER_WAY = 6
+MAX_COMMANDS_IN_TRANSIT = 6
 """Commands under way at the shortest period that is tried."""
 
 
-RADII, MARGINS = (1e-3, 10.0), (1.0, 1000.0)
+RADIUS_RANGE, MARGIN_RANGE = (1e-3, 10.0), (1.0, 1000.0)
 """Spectral radii and margins that a user can mean [1]."""
 
 
@@ -105,8 +105,8 @@ def recommended_period(
     """
     duration = checks.time_span("duration", duration)
     remedy = "A loop is stable below a spectral radius of 1."
-    radius = checks.number_between("radius", radius, *RADII, "1", remedy)
-    margin = checks.number_between("margin", margin, *MARGINS, "1")
+    radius = checks.number_between("radius", radius, *RADIUS_RANGE, "1", remedy)
+    margin = checks.number_between("margin", margin, *MARGIN_RANGE, "1")
     if isinstance(scenario, Scenario) and scenario.sampling is None:
         scenario = dataclasses.replace(scenario, sampling=Sampling(period=1e-3))
     scenario = with_sufficient_queue(canonical(scenario))
@@ -114,7 +114,7 @@ def recommended_period(
         raise checks.fail(
             "scenario", "traced values", "numbers", "Call it outside of jit, vmap and grad."
         )
-    times = np.linspace(0.0, duration, LOOKS)
+    times = np.linspace(0.0, duration, MODE_INSTANTS)
     limit = _limit(scenario, times, radius)
     if limit is None:
         raise checks.fail(
@@ -127,12 +127,14 @@ def recommended_period(
 
 
 def _limit(scenario: Scenario, times: np.ndarray, radius: float) -> float | None:
-    """The shortest period at which the loop is too slow; LONGEST if none is, None if all are."""
+    """The shortest period at which the loop is too slow; LONGEST_PERIOD if none is, None if all
+    are.
+    """
     sampling: Any = scenario.sampling
-    low, high = None, max(SHORTEST, float(sampling.delay) / MOST_UNDER_WAY)
-    while high <= LONGEST and radius_at(scenario, high, times) < radius:
-        low, high = high, high * FACTOR
-    if low is None or high > LONGEST:
+    low, high = None, max(SHORTEST_PERIOD, float(sampling.delay) / MAX_COMMANDS_IN_TRANSIT)
+    while high <= LONGEST_PERIOD and radius_at(scenario, high, times) < radius:
+        low, high = high, high * PERIOD_RATIO
+    if low is None or high > LONGEST_PERIOD:
         return low
     for _ in range(HALVINGS):
         middle = math.sqrt(low * high)

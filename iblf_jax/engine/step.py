@@ -541,7 +541,9 @@ def _before_sample(
     if not folds:
         return carry.accumulators, ()
     commands = carry.state.sampled.commands
-    torque = sampling.torque_before(scenario.sampling, dt, commands, along.state.sampled.commands)  # type: ignore[arg-type]
+    pending = along.state.sampled.commands
+    schedule: Any = scenario.sampling
+    torque = sampling.torque_before(schedule, dt, commands, pending)
     t, behind = moment.span.start, moment.behind
     seen_at = (
         t
@@ -655,7 +657,7 @@ def recorded(folds: Any, found: Advanced):
 def samples_of_step(scenario: Scenario) -> int:
     """How many samples the folds see of a step at most: `Advanced.nodes`."""
     arrives = scenario.sampling is not None and scenario.sampling.queue > 0
-    cuts = min(scenario.jump_times().size, jumps.MOST_CUTS) + arrives
+    cuts = min(scenario.jump_times().size, jumps.MAX_CUTS) + arrives
     return 1 + (scenario.sampling is not None) + 2 * cuts
 
 
@@ -736,7 +738,7 @@ class LinearizationStep:
             plant = plant.plant
         rooms = stability.largest_difference_sizes(inputs.scenario, carry.time, plant, x.size)
         room = jnp.where(
-            iteration < 0, jnp.sum(rooms * unit), jnp.asarray(stability.WIDEST, x.dtype)
+            iteration < 0, jnp.sum(rooms * unit), jnp.asarray(stability.THIRD_SIZE, x.dtype)
         )
         sizes = stability.difference_sizes(x, direction, room)
         widest = level == 2

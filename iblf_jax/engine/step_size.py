@@ -29,17 +29,17 @@ from iblf_jax.simulation import accuracy, jumps
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.scenario import Initial, Scenario, canonical
-from iblf_jax.simulation.stability import SLOWEST, jacobian
+from iblf_jax.simulation.stability import SLOWEST_RATE, jacobian
 
-COMFORT = 1.5
+RECOMMENDED_PHASE = 1.5
 """|dt * mode| that is recommended: RK4 follows the fastest mode itself to a few per cent there."""
-GOAL = accuracy.TOLERANCE / 5
+RECOMMENDED_ERROR = accuracy.TOLERANCE / 5
 """Difference of the two runs, relative to the tube, that a recommended step may leave."""
-LOOKS = 33
+MODE_INSTANTS = 33
 """Places along the reference at which modes are measured."""
-MOST_TRIED = 5_000_000
+MAX_TRIED = 5_000_000
 """Steps of the longest run that is tried."""
-CUTS = ((0.0, 1.0), (0.0, 0.382), (0.382, 0.618), (0.618, 1.0))
+INTERVALS = ((0.0, 1.0), (0.0, 0.382), (0.382, 0.618), (0.618, 1.0))
 """Start and end, in steps, of what is integrated for each step: it, and its three parts."""
 
 
@@ -131,7 +131,9 @@ def _one_step(scenario: Scenario, times: jax.Array, dt: jax.Array, pair: Pair, m
         seen = (stepped.parts, sample.upper - sample.lower, sample.xi, division.overfull)
         return (jnp.where(is_coarse, new, coarse), jnp.where(is_coarse, fine, new)), seen
 
-    (coarse, fine), seen = jax.lax.scan(part, (pair.coarse, pair.fine), jnp.asarray(CUTS, dt.dtype))
+    (coarse, fine), seen = jax.lax.scan(
+        part, (pair.coarse, pair.fine), jnp.asarray(INTERVALS, dt.dtype)
+    )
     parts, width, _, overfull = jax.tree.map(lambda x: x[0], seen)
     xi_of_fine = seen[2][1]
     restarts = None
@@ -206,7 +208,7 @@ def round_down(dt: float) -> float:
 
 def comfortable_dt(mode: float) -> float:
     """A round step (1, 2 or 5 times a power of ten) that follows a mode [1/s] comfortably, [s]."""
-    return round_down(COMFORT / max(mode, SLOWEST))
+    return round_down(RECOMMENDED_PHASE / max(mode, SLOWEST_RATE))
 
 
 def smaller(dt: float, excess: float, order: int) -> float:
@@ -227,7 +229,7 @@ def find_dt(scenario: Scenario, *, duration: float, method: str) -> float:
     duration = checks.positive_number("duration", duration, "s")
     if scenario.sampling is not None:
         return _find_part(scenario, duration, method)
-    mode = fastest_along(scenario, np.linspace(0.0, duration, LOOKS))
+    mode = fastest_along(scenario, np.linspace(0.0, duration, MODE_INSTANTS))
     if not np.isfinite(mode):
         raise checks.fail(
             "scenario",
@@ -237,10 +239,11 @@ def find_dt(scenario: Scenario, *, duration: float, method: str) -> float:
     dt = for_modes = min(comfortable_dt(mode), round_down(duration))
     _can_be_tried(duration, dt)
     as_state = ravel_pytree(initial_state(scenario))[1]
-    while duration / dt <= MOST_TRIED:
+    while duration / dt <= MAX_TRIED:
         pair = side_by_side(scenario, dt, math.ceil(duration / dt * (1 - 1e-9)), method=method)
         excess = max(
-            float(pair.difference) / GOAL, float(pair.estimate.relative) / accuracy.TOLERANCE
+            float(pair.difference) / RECOMMENDED_ERROR,
+            float(pair.estimate.relative) / accuracy.TOLERANCE,
         )
         if not excess > 1.0:
             limit = comfortable_dt(_mode(scenario, pair.nearest[1], as_state(pair.nearest[2])))
@@ -250,7 +253,7 @@ def find_dt(scenario: Scenario, *, duration: float, method: str) -> float:
         else:
             dt = smaller(dt, excess, order)
     notices.warn(
-        f"No step down to {duration / MOST_TRIED:.1g} s makes this run accurate: the loop may"
+        f"No step down to {duration / MAX_TRIED:.1g} s makes this run accurate: the loop may"
         f" magnify every error, or a signal may be faster than that. {for_modes:g} s is what the"
         " loop's modes allow."
     )
@@ -266,7 +269,7 @@ def _find_part(scenario: Scenario, duration: float, method: str) -> float:
     _can_be_tried(duration, period)
     periods = max(math.ceil(duration / period - 1e-9), 1)
     parts, before, poor_before, coarser = 1, None, 0, period
-    while periods * parts <= MOST_TRIED:
+    while periods * parts <= MAX_TRIED:
         dt = jnp.asarray(period / parts, scenario.initial.q.dtype)
         found = run_one(scenario, (), dt, RunRequest(periods * parts, method, parts), noise)
         q, width = found.records[0]["q"], found.records[0]["upper"] - found.records[0]["lower"]
@@ -274,7 +277,7 @@ def _find_part(scenario: Scenario, duration: float, method: str) -> float:
         if (
             before is not None
             and not poor_before
-            and float(jnp.max(jnp.abs(q - before) / width)) <= GOAL
+            and float(jnp.max(jnp.abs(q - before) / width)) <= RECOMMENDED_ERROR
         ):
             return coarser
         before, poor_before, coarser, parts = q, poor, float(dt), _next_round(parts)
@@ -285,8 +288,8 @@ def _find_part(scenario: Scenario, duration: float, method: str) -> float:
 
 def _can_be_tried(duration: float, dt: float) -> None:
     """Raises ValueError where a run is too long for a step to be tried on it."""
-    if duration / dt > MOST_TRIED:
-        expected = f"at most {MOST_TRIED * dt:g} s, which are {MOST_TRIED} steps of {dt:g} s"
+    if duration / dt > MAX_TRIED:
+        expected = f"at most {MAX_TRIED * dt:g} s, which are {MAX_TRIED} steps of {dt:g} s"
         remedy = (
             "Longer runs are not tried: give a time after which the motion repeats or has settled."
         )

@@ -44,10 +44,10 @@ from iblf_jax.simulation.closed_loop import LoopState
 from iblf_jax.simulation.integrators import Stepped, stage_states, tableau
 from iblf_jax.simulation.scenario import Scenario
 
-CLEARANCE = 1e-4
+SURFACE_CLEARANCE = 1e-4
 """How far from a surface a rate is evaluated at least, relative to how far the step moves the state
 across it."""
-LONGEST = 2.0
+MAX_PREDICTION = 2.0
 """Steps.  A crossing that is predicted further away does not belong to the step."""
 
 
@@ -263,9 +263,9 @@ def _slides(
     a step on the other one.
     """
     above = signs.above ^ signs.touched
-    other = loop.evaluate(t, _on_its_side(loop.scenario, t, state, above, CLEARANCE * signs.size))[
-        0
-    ]
+    other = loop.evaluate(
+        t, _on_its_side(loop.scenario, t, state, above, SURFACE_CLEARANCE * signs.size)
+    )[0]
     here, beyond = (_along(loop.scenario, t, state, rate)[1] for rate in (slope, other))
     towards_from_above = (here < 0) & (beyond > 0)
     towards_from_below = (here > 0) & (beyond < 0)
@@ -279,7 +279,7 @@ def _crossings(signs: Signs, crossed: jax.Array) -> Crossings:
     sooner = place[None, :] < place[:, None]
     sooner |= (place[None, :] == place[:, None]) & (number[None, :] < number[:, None])
     rank = jnp.sum(jnp.where(sooner & crossed[None, :], 1, 0), axis=1)
-    return Crossings(signs.above, crossed, rank, CLEARANCE * signs.size)
+    return Crossings(signs.above, crossed, rank, SURFACE_CLEARANCE * signs.size)
 
 
 def _piece(
@@ -372,7 +372,7 @@ def _time_to(g: jax.Array, dg: jax.Array, dt: jax.Array) -> tuple[jax.Array, jax
     """Time until g vanishes at the rate dg, () [s], 0 where it is far longer than the step; and
     whether it is not, () bool.
     """
-    usable = (dg != 0) & (jnp.abs(g) <= LONGEST * dt * jnp.abs(dg))
+    usable = (dg != 0) & (jnp.abs(g) <= MAX_PREDICTION * dt * jnp.abs(dg))
     return -jnp.where(usable, g, 0.0) / jnp.where(usable, dg, 1.0), usable
 
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from iblf_jax.control import actuators, barriers, controllers, observers, sensors
 from iblf_jax.core import checks
-from iblf_jax.core.pytree import is_leaf_field
+from iblf_jax.core.pytree import field_values, is_leaf_field
 from iblf_jax.files.values import (
     NONE,
     Words,
@@ -119,8 +119,9 @@ def encode_fields(part: Any, path: str) -> dict[str, Any]:
     """The table of one component, without its kind; optional fields that are empty are left out."""
     table: dict[str, Any] = {}
     hints = field_hints(type(part))
+    values = field_values(part)
     for field in dataclasses.fields(part):
-        value = getattr(part, field.name)
+        value = values[field.name]
         key = dotted(path, field.name)
         if value is field.default is None:
             continue

@@ -29,6 +29,7 @@ import jax
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.optional import attributes
 from iblf_jax.core.status import Status, describe
 from iblf_jax.files import digest
 from iblf_jax.files.scenario import scenario_to_toml
@@ -52,7 +53,7 @@ ENDINGS = (".nc", ".npz")
 _ATTRIBUTES = "attributes"
 DIGEST = "digest"
 """Attribute of a netCDF file that holds the digests of its content."""
-MOST_NAMED = 4
+MAX_NAMED = 4
 """Largest number of damaged variables that an error names."""
 
 
@@ -188,8 +189,9 @@ def _batch_dims(run: Rollout) -> tuple[str, ...]:
 
 def _trajectories(run: Rollout, batch: tuple[str, ...]) -> dict[str, Any]:
     variables = {}
+    values = attributes(run, SIGNALS)
     for name, signal in SIGNALS.items():
-        value = getattr(run, name)
+        value = values[name]
         if name == "t" or isinstance(value, tuple):  # The scenario has no such signal.
             continue
         dims = (*batch, "time", *own_dims(name, value.shape[len(batch) + 1 :], run.n))
@@ -199,8 +201,9 @@ def _trajectories(run: Rollout, batch: tuple[str, ...]) -> dict[str, Any]:
 
 def _states(run: Rollout, batch: tuple[str, ...]) -> dict[str, Any]:
     variables = {}
+    states = attributes(run, STATES)
     for state, description in STATES.items():
-        for keys, value in jax.tree_util.tree_leaves_with_path(getattr(run, state)):
+        for keys, value in jax.tree_util.tree_leaves_with_path(states[state]):
             name = re.sub(r"\W+", "_", state + jax.tree_util.keystr(keys)).strip("_")
             dims = (*batch, "time", *own_dims(name, np.shape(value)[len(batch) + 1 :], run.n))
             variables[name] = (dims, np.asarray(value), _attrs("1", description))
@@ -330,9 +333,9 @@ def _verify(
 
 
 def _damaged(path: str | os.PathLike, different: list[str]) -> ValueError:
-    shown = ", ".join(different[:MOST_NAMED])
-    if len(different) > MOST_NAMED:
-        shown += f" and {len(different) - MOST_NAMED} more"
+    shown = ", ".join(different[:MAX_NAMED])
+    if len(different) > MAX_NAMED:
+        shown += f" and {len(different) - MAX_NAMED} more"
     came = Words(f"content that differs from its digest: {shown}")
     remedy = (
         "The file is damaged: restore it or run again. If it was edited on purpose, delete its"

@@ -58,6 +58,7 @@ import numpy as np
 
 from iblf_jax.core import checks, notices
 from iblf_jax.core.joints import holds_weights
+from iblf_jax.core.optional import attributes
 from iblf_jax.files import components
 from iblf_jax.files.scenario import from_dict, read_toml, scenario_to_dict
 from iblf_jax.files.study import perturbations_of
@@ -66,7 +67,7 @@ from iblf_jax.simulation import metrics
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.studies import distributions
-from iblf_jax.studies.designs import MOST_RUNS
+from iblf_jax.studies.designs import MAX_RUNS
 from iblf_jax.studies.distributions import Distribution, Perturbation
 from iblf_jax.studies.draws import targets_of
 from iblf_jax.studies.statistics import check_confidence
@@ -359,13 +360,13 @@ def save_tuning(result: TuneResult, path: str | os.PathLike) -> None:
         "start": scenario_to_dict(result.start),
         "values": {key: np.asarray(x).tolist() for key, x in result.values.items()},
         "history": history,
-        "setup": {name: getattr(setup, name) for name in of_setup},
+        "setup": attributes(setup, of_setup),
         "risk": list(setup.risk),
         "objective": components.encode_fields(setup.objective, "objective"),
         "perturbations": {
             key: components.encode_fields(x, key) for key, x in setup.perturbations.items()
         },
-        **{name: getattr(result, name) for name in RESULT},
+        **attributes(result, RESULT),
         "report": result.report.to_dict(),
     }
     temporary = target.with_name(f".{target.name}.partial")
@@ -443,10 +444,10 @@ def _decoded_setup(data: dict[str, Any]) -> TuneSetup:
     check_backend(setup.backend)
     checks.whole_steps(setup.duration, setup.dt)
     check_confidence(setup.confidence)
-    for name in ("runs", "report_runs"):
-        checks.positive_integer(name, getattr(setup, name), most=MOST_RUNS)
-    for name in ("seed", "report_seed"):
-        checks.seed(getattr(setup, name))
+    for name, value in attributes(setup, ("runs", "report_runs")).items():
+        checks.positive_integer(name, value, most=MAX_RUNS)
+    checks.seed(setup.seed)
+    checks.seed(setup.report_seed)
     return setup
 
 

@@ -35,7 +35,7 @@ def toml_tables(text: str) -> dict[str, Any]:
       tomllib.TOMLDecodeError: the text is not TOML.
       ValueError: the tables are nested deeper than in any file of this package.
     """
-    problem = f"more than {checks.DEEPEST} tables and lists inside each other"
+    problem = f"more than {checks.MAX_DEPTH} tables and lists inside each other"
     try:
         tables = tomllib.loads(text)
     except RecursionError:

@@ -28,15 +28,15 @@ from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.world.references import WaypointSpline
 from iblf_jax.world.robots._base import robot_member
 
-SPACING = 0.8
+WAYPOINT_SPACING = 0.8
 """Time between waypoints, unless their number is given [s]."""
-SAMPLES, DENSE = 25, 8
+SAMPLES_PER_WAYPOINT, CHECK_DENSITY = 25, 8
 """Times per waypoint at which the motion is evaluated, and the factor between these and the times
 at which the bounds are checked."""
 BASIS_COPIES = 8
 """Matrices of position, velocity and acceleration in memory at once, with room for their use."""
 REGULARISATION = 1e-4
-MARGIN = 0.1
+BOUND_MARGIN = 0.1
 """Share of the range between bounds that is left free on each side, for the errors of the law."""
 TORQUE_SHARE = 0.6
 """Share of a joint's largest torque that the motion may need."""
@@ -102,14 +102,17 @@ def excitation(
     """
     duration = checks.time_span("duration", duration)
     count = _waypoints(duration, waypoints)
-    iterations = checks.positive_integer("iterations", iterations, most=checks.MOST_STEPS)
+    iterations = checks.positive_integer("iterations", iterations, most=checks.MAX_STEPS)
     seed = checks.seed(seed)
     with jax.enable_x64(True):
         dtype = jnp.asarray(scenario.initial.q).dtype if isinstance(scenario, Scenario) else None
         start = canonical(astype(canonical(scenario), "float64"))
         plant, c = coordinates(start, paths, {})
         times = tuple(np.linspace(0.0, duration, count).tolist())
-        basis, dense = _basis(times, SAMPLES * count), _basis(times, DENSE * SAMPLES * count)
+        basis, dense = (
+            _basis(times, SAMPLES_PER_WAYPOINT * count),
+            _basis(times, CHECK_DENSITY * SAMPLES_PER_WAYPOINT * count),
+        )
         drive, centre = _drive_limits(plant), _centre_motion(plant, times)
         guess = _random_motion(plant, times, centre, seed)
         guess = _scaled_to_fit(plant, dense, drive, centre, guess)
@@ -157,13 +160,15 @@ def _waypoints(duration: float, waypoints: int | None) -> int:
     """The number of waypoints; ValueError where the spline's matrices do not fit into the
     memory.
     """
-    most = int((checks.memory() / (BASIS_COPIES * 8.0 * DENSE * SAMPLES)) ** 0.5)
+    most = int(
+        (checks.memory() / (BASIS_COPIES * 8.0 * CHECK_DENSITY * SAMPLES_PER_WAYPOINT)) ** 0.5
+    )
     if waypoints is not None:
         return checks.positive_integer("waypoints", waypoints, least=4, most=most)
-    if duration / SPACING > most:
+    if duration / WAYPOINT_SPACING > most:
         remedy = "Excite the robot by several shorter motions."
-        raise checks.fail("duration", duration, f"at most {most * SPACING:g} s", remedy)
-    return max(6, round(duration / SPACING))
+        raise checks.fail("duration", duration, f"at most {most * WAYPOINT_SPACING:g} s", remedy)
+    return max(6, round(duration / WAYPOINT_SPACING))
 
 
 def _basis(times: tuple[float, ...], count: int) -> Basis:
@@ -193,7 +198,7 @@ def _drive_limits(scenario: Scenario) -> DriveLimits:
         jnp.broadcast_to(jnp.asarray(drive_limit(scenario.plant, name)), (scenario.n,))
         for name in ("speed", "effort")
     )
-    return DriveLimits((1.0 - MARGIN) * speed, TORQUE_SHARE * torque)
+    return DriveLimits((1.0 - BOUND_MARGIN) * speed, TORQUE_SHARE * torque)
 
 
 def _centre_motion(scenario: Scenario, times: tuple[float, ...]) -> np.ndarray:
@@ -203,7 +208,7 @@ def _centre_motion(scenario: Scenario, times: tuple[float, ...]) -> np.ndarray:
     t = jnp.linspace(0.0, times[-1], 400)
     rest = jnp.broadcast_to(scenario.initial.q, (len(t), scenario.n))
     lower, upper = _bounds(scenario, t, rest)
-    edge = MARGIN * jnp.where(jnp.isfinite(upper - lower), upper - lower, 0.0)
+    edge = BOUND_MARGIN * jnp.where(jnp.isfinite(upper - lower), upper - lower, 0.0)
     start = jnp.broadcast_to(scenario.initial.q, (len(times), scenario.n))
     if bool(jnp.all((rest > lower + edge) & (rest < upper - edge))):
         return np.asarray(start).copy()
@@ -240,7 +245,7 @@ def _violations(
     q, dq = basis.position @ waypoints, basis.velocity @ waypoints
     lower, upper = _bounds(scenario, basis.t, q)
     width = jnp.where(jnp.isfinite(upper - lower), upper - lower, 1.0)
-    found = [(lower - q) / width + MARGIN, (q - upper) / width + MARGIN]
+    found = [(lower - q) / width + BOUND_MARGIN, (q - upper) / width + BOUND_MARGIN]
     found += [
         jnp.where(jnp.isfinite(limit), jnp.abs(x) / limit - 1.0, -1.0)
         for x, limit in ((dq, drive.speed), (torque, drive.torque))
@@ -248,7 +253,10 @@ def _violations(
     if scenario.velocity_bounds is not None:
         bounds = scenario.velocity_bounds
         slow, fast = jax.vmap(bounds.lower.at)(basis.t, dq), jax.vmap(bounds.upper.at)(basis.t, dq)
-        found += [(slow - dq) / (fast - slow) + MARGIN, (dq - fast) / (fast - slow) + MARGIN]
+        found += [
+            (slow - dq) / (fast - slow) + BOUND_MARGIN,
+            (dq - fast) / (fast - slow) + BOUND_MARGIN,
+        ]
     return found
 
 

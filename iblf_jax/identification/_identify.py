@@ -13,7 +13,7 @@ import numpy as np
 from iblf_jax.core import checks, notices
 from iblf_jax.core.pytree import astype
 from iblf_jax.identification.coordinates import (
-    DELAY,
+    DELAY_PATH,
     DELAY_SCALE,
     Coordinates,
     coordinates,
@@ -29,7 +29,7 @@ from iblf_jax.identification.regression import (
     coordinate_scales,
     initial_estimate,
 )
-from iblf_jax.identification.result import FINEST, LACKS, Identification, assessed
+from iblf_jax.identification.result import INCOMPLETE_RATIO, MIN_NOISE, Identification, assessed
 from iblf_jax.identification.shooting import Prior, Refinement, Windows, windows
 from iblf_jax.identification.smoothing import smooth_logs
 from iblf_jax.identification.standstill import (
@@ -155,7 +155,7 @@ def _checked_options(
     checks.one_of("torque", torque, TORQUES)
     checks.one_of("loss", loss, LOSSES)
     window = checks.time_span("window", window)
-    iterations = checks.positive_integer("iterations", iterations, most=checks.MOST_STEPS)
+    iterations = checks.positive_integer("iterations", iterations, most=checks.MAX_STEPS)
     if limits is None:
         limits = {}
     limits = checks.mapping("limits", limits, '{"plant.mass": (0.1, 5.0)}')
@@ -193,7 +193,7 @@ def _problem(
         windows=fitted_windows,
         smooth=smooth_logs(fitted_logs, options.zero_order_hold),
         prior=_prior(c, options.priors),
-        requested=len([path for path in paths if path != DELAY]),
+        requested=len([path for path in paths if path != DELAY_PATH]),
         fixed_delay=fixed_delay,
         zero_order_hold=options.zero_order_hold,
         loss=options.loss,
@@ -252,7 +252,7 @@ class _Search:
         larger range of speeds is tried only if the smaller one leaves more than noise.
         """
         problem = self.problem
-        noise = np.maximum(problem.smooth.noise, FINEST)
+        noise = np.maximum(problem.smooth.noise, MIN_NOISE)
         size = np.std(problem.smooth.tau, axis=0)
         best: Refinement | None = None
         for speed in SPEED_THRESHOLDS:
@@ -273,7 +273,7 @@ class _Search:
             if best is not None and not residual < WORTHWHILE_RATIO * np.max(best.rms / noise):
                 break
             best = found
-            if residual < LACKS:
+            if residual < INCOMPLETE_RATIO:
                 break
         return best
 
@@ -291,7 +291,7 @@ class _Search:
         if free_fit is None:
             return self.refine(x, z, by_law), 0.0
         # A log of a simulation has no noise: a smaller residual is no improvement.
-        smallest = np.maximum(free_fit.rms, FINEST)
+        smallest = np.maximum(free_fit.rms, MIN_NOISE)
         law_fit = self.refine(x, z, by_law, REJECTED_RATIO * smallest)
         ratio = float(np.max(law_fit.rms / smallest))
         chosen = free_fit if ratio > ACCEPTED_RATIO else law_fit

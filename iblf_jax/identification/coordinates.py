@@ -31,15 +31,15 @@ from iblf_jax.simulation.scenario import Scenario, with_parts
 from iblf_jax.studies.draws import check_paths, same_place
 from iblf_jax.world.robots._base import robot_member
 
-SMALLEST = 1e-3
+MIN_POSITIVE_FACTOR = 1e-3
 """Default lower limit of a number that must be positive, by its start."""
-SHARPEST = 1e-3
+MIN_FRICTION_WIDTH = 1e-3
 """[rad/s]: default lower limit of a friction's width; a narrower one cannot be distinguished from
 dry friction."""
-POINT = 0.01
+STARTING_GYRATION_RADIUS = 0.01
 """[m]: radius of gyration, along each axis, with which the search starts where an inertia is not
 positive definite."""
-DELAY = "sampling.delay"
+DELAY_PATH = "sampling.delay"
 """The path of the torque's delay."""
 DELAY_SCALE = 0.01
 """The scale of the delay [s]."""
@@ -72,11 +72,11 @@ def scenario_of_plant(scenario: Scenario, given: list[str]) -> tuple[Scenario, l
     """
     roots = {paths.parse(path)[0] for path in given}
     for path in given:
-        if path != DELAY and paths.parse(path)[0] not in PARTS:
+        if path != DELAY_PATH and paths.parse(path)[0] not in PARTS:
             raise checks.fail(
                 "paths",
                 path,
-                f"a leaf of robot, plant, model or disturbance, or {DELAY}",
+                f"a leaf of robot, plant, model or disturbance, or {DELAY_PATH}",
                 "Other leaves do not influence the motion under a logged torque.",
             )
     if "model" in roots and roots & {"plant", "robot"}:
@@ -147,7 +147,7 @@ def coordinates(
     bodies: list[int] = []
     start = 0
     for path, own in zip(requested, plant_paths, strict=True):
-        if path == DELAY:
+        if path == DELAY_PATH:
             continue
         value = np.asarray(paths.get(scenario, own), float)
         if not np.all(np.isfinite(value)):
@@ -166,14 +166,14 @@ def coordinates(
     x, low, high = (np.concatenate(column) for column in zip(empty, *parts, strict=True))
     return scenario, Coordinates(
         places=tuple(places),
-        paths=tuple(path for path in requested if path != DELAY),
+        paths=tuple(path for path in requested if path != DELAY_PATH),
         names=tuple(names),
         units=tuple(units),
         bodies=tuple(bodies),
         x=x,
         low=low,
         high=high,
-        delay=DELAY in requested,
+        delay=DELAY_PATH in requested,
     )
 
 
@@ -181,10 +181,10 @@ def _checked_paths(scenario: Scenario, given: Any) -> list[str]:
     """The paths; ValueError for an unknown or overlapping one."""
     found = checks.listed("paths", given, '["plant.mass", "plant.damping"]')
     found = [checks.word("paths", path, "a path") for path in found]
-    if DELAY in found and scenario.sampling is None:
+    if DELAY_PATH in found and scenario.sampling is None:
         raise checks.fail(
             "paths",
-            DELAY,
+            DELAY_PATH,
             "a scenario with a sampling, which has this leaf",
             "Leave it out: the delay is estimated in any case.",
         )
@@ -217,7 +217,7 @@ def _positive_definite(value: np.ndarray, masses: np.ndarray) -> np.ndarray:
 def _rigid_body(J: np.ndarray, mass: float) -> np.ndarray:
     """An inertia, or the nearest one of a rigid body of a least thickness if it belongs to none."""
     S = moments(J)
-    least = max(mass, 1e-3) * POINT**2
+    least = max(mass, 1e-3) * STARTING_GYRATION_RADIUS**2
     size, axes = np.linalg.eigh(S)
     if size[0] > 1e-9 * max(size[-1], least):
         return J
@@ -249,9 +249,9 @@ def _limits(
 
 def _default_lower_limit(path: str, value: np.ndarray, sign: str | None) -> np.ndarray:
     if "mass" in path:  # a link without mass has no motion
-        return SMALLEST * value
+        return MIN_POSITIVE_FACTOR * value
     if sign == "positive":
-        least = SHARPEST if "width" in path else SMALLEST * value
+        least = MIN_FRICTION_WIDTH if "width" in path else MIN_POSITIVE_FACTOR * value
         return np.broadcast_to(np.minimum(least, value), value.shape)
     if sign == "nonnegative":
         return np.zeros_like(value)

@@ -23,9 +23,10 @@ import numpy as np
 from iblf_jax.core import checks
 from iblf_jax.simulation.results import Rollout
 
-GAP, MOST = 3.0, 0.95
-"""A time between samples of more than GAP times the quantile MOST of these times is a gap."""
-FEWEST = 50
+GAP_RATIO, GAP_QUANTILE = 3.0, 0.95
+"""A time between samples of more than GAP_RATIO times the quantile GAP_QUANTILE of these times is a
+gap."""
+MIN_SAMPLES = 50
 """Samples that a log must have."""
 UNITS = {
     "q": ("rad", "m", "1"),
@@ -48,7 +49,7 @@ class Log(NamedTuple):
     @property
     def gap(self) -> float:
         """Time between samples above which there is a gap [s]."""
-        return GAP * float(np.quantile(np.diff(self.t), MOST))
+        return GAP_RATIO * float(np.quantile(np.diff(self.t), GAP_QUANTILE))
 
     @property
     def step(self) -> float:
@@ -191,7 +192,8 @@ def _of_rollout(run: Rollout, what: str) -> dict[str, np.ndarray]:
             "tau": np.asarray(run.tau, float),
         }
     # A sampled loop records its measurements at the start of each period.
-    t, period = np.asarray(run.t, float), float(run.scenario.sampling.period)  # type: ignore[union-attr]
+    t = np.asarray(run.t, float)
+    period = float(run.scenario.sampling.period)  # type: ignore[union-attr]
     taken = np.flatnonzero(np.abs(t / period - np.round(t / period)) < 1e-6)
     return {
         name: np.asarray(x, float)[taken]
@@ -226,9 +228,9 @@ def _checked(found: dict[str, np.ndarray], n: int, what: str) -> Log:
                 checks.Words(f"{len(found[name])} samples"),
                 f"{len(t)}, as t has",
             )
-    if len(t) < FEWEST:
+    if len(t) < MIN_SAMPLES:
         raise checks.fail(
-            what, checks.Words(f"{len(t)} samples"), f"at least {FEWEST}", "Log for longer."
+            what, checks.Words(f"{len(t)} samples"), f"at least {MIN_SAMPLES}", "Log for longer."
         )
     broken = ~np.all(
         [np.isfinite(x).reshape(len(t), -1).all(axis=1) for x in found.values()], axis=0

@@ -37,7 +37,7 @@ from iblf_jax.identification.smoothing import SmoothedMotion
 from iblf_jax.world.robots import joint_names
 from iblf_jax.world.robots._base import robot_member
 
-ROUNDS, STEPS = 3, 12
+WEIGHT_UPDATES, STEPS_PER_UPDATE = 3, 12
 """Estimates of the joints' weights, and steps of the search for each of them."""
 BARELY_EXPLAINED = 0.3
 """Share of the torques' variation below which the log does not belong to the model."""
@@ -54,12 +54,12 @@ OTHER_UNITS = {
     "with tau in lbf in": 0.112985,
 }
 """Other units in which torques are logged, and their factors to N m."""
-SLOWEST = 0.02
+STANDSTILL_SPEED = 0.02
 """Speed, root mean square over all joints, below which a robot is at standstill [rad/s]."""
-FAR = 0.1
+STANDSTILL_RANGE = 0.1
 """Range of motion that a robot at standstill does not have [rad]; with it, a low speed means that
 the times are in another unit."""
-OUTSIDE = 0.1
+RANGE_TOLERANCE = 0.1
 """Share of a joint's range by which a log may be outside the range."""
 LARGEST_DELAY = 0.1
 """[s]"""
@@ -107,7 +107,7 @@ def initial_estimate(
     sigma = spread + 1e-9
     residual = np.zeros_like(motion.tau)
     start = z
-    for _ in range(ROUNDS):
+    for _ in range(WEIGHT_UPDATES):
         regression = _Regression(scenario, c, motion, start, z_scale, sigma)
         z, _, _ = levenberg_marquardt(
             regression.linearized(z),
@@ -116,7 +116,7 @@ def initial_estimate(
             z_scale,
             regression.trial,
             regression.linearized,
-            STEPS,
+            STEPS_PER_UPDATE,
         )
         residual = regression.residual(regression.dynamics(z), z)
         sigma = np.sqrt(np.mean(residual**2, axis=0)) + 1e-3 * sigma
@@ -225,14 +225,14 @@ def _check_motion(scenario: Any, motion: SmoothedMotion, what: str) -> None:
 
 def _check_speed(motion: SmoothedMotion, speed: float, what: str) -> None:
     """Raises ValueError for a robot at standstill; `speed` is the root mean square [rad/s]."""
-    if speed >= SLOWEST:
+    if speed >= STANDSTILL_SPEED:
         return
     far, duration = float(np.max(np.ptp(motion.q, axis=0))), float(np.ptp(motion.t))
-    if far > FAR:
+    if far > STANDSTILL_RANGE:
         raise checks.fail(
             f"{what}: t",
             checks.Words(f"{far:.3g} rad of motion in {duration:.4g} s"),
-            f"times in s, and motion of at least {SLOWEST:g} rad/s",
+            f"times in s, and motion of at least {STANDSTILL_SPEED:g} rad/s",
             "Divide times in ms by 1000.",
         )
     raise checks.fail(
@@ -240,7 +240,7 @@ def _check_speed(motion: SmoothedMotion, speed: float, what: str) -> None:
         checks.Words(
             f"a robot that stands still: its joints move at {speed:.2g} rad/s (root mean square)"
         ),
-        f"motion of at least {SLOWEST:g} rad/s",
+        f"motion of at least {STANDSTILL_SPEED:g} rad/s",
         "Log while it follows ij.excitation(scenario, paths).",
     )
 
@@ -253,7 +253,7 @@ def _check_positions(
     for range_name, limits in _ranges(scenario).items():
         for j, (low, high) in enumerate(limits):
             least, most = float(motion.q[:, j].min()), float(motion.q[:, j].max())
-            tolerance = OUTSIDE * (high - low)
+            tolerance = RANGE_TOLERANCE * (high - low)
             low_end, high_end = low - tolerance, high + tolerance
             if low_end <= least and most <= high_end:
                 continue

@@ -13,7 +13,13 @@ import numpy as np
 
 from iblf_jax.core import checks, tables
 from iblf_jax.core.presentation import present
-from iblf_jax.identification.coordinates import DELAY, DELAY_SCALE, Coordinates, plant_path, to_x
+from iblf_jax.identification.coordinates import (
+    DELAY_PATH,
+    DELAY_SCALE,
+    Coordinates,
+    plant_path,
+    to_x,
+)
 from iblf_jax.identification.problem import IdentificationProblem, missing_terms_of_fit
 from iblf_jax.identification.regression import InitialEstimate
 from iblf_jax.identification.shooting import Refinement, Windows
@@ -32,17 +38,17 @@ from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.distributions import Perturbation, joint_normal, value
 from iblf_jax.world.robots import joint_names
 
-WHITE, SLIGHT = 1e-3, 0.05
+COLOURED_PROBABILITY, MIN_AUTOCORRELATION = 1e-3, 0.05
 """Probability (Ljung and Box) below which residuals count as coloured, if an autocorrelation is
 above the second."""
-LACKS, FINEST = 1.5, 1e-5
+INCOMPLETE_RATIO, MIN_NOISE = 1.5, 1e-5
 """Residual relative to the positions' noise above which the model is incomplete, and the smallest
 noise that is assumed [rad]."""
 MORE_THAN_NOISE = 1.05
 """Residual relative to the positions' noise above which missing terms are searched."""
-CLEARLY = 1.1
+REPORTED_RATIO = 1.1
 """Ratio of standard errors to those for white noise above which a note reports it."""
-LEAST_INFORMATION = 1e-8
+MIN_INFORMATION = 1e-8
 """Information of a combination, relative to the best one, above which it enters the step without
 limits."""
 AT_END = 1e-6
@@ -95,19 +101,21 @@ class Fit(NamedTuple):
     @property
     def lacking(self) -> float:
         """The residual relative to the noise of the positions."""
-        return self.after / max(self.noise, FINEST)
+        return self.after / max(self.noise, MIN_NOISE)
 
     @property
     def has_structure(self) -> bool:
         """Whether the residuals may have a cause: they are larger than the positions' noise, or
         coloured and no rounding.
         """
-        return self.lacking > MORE_THAN_NOISE or (not self.is_white and self.after > FINEST)
+        return self.lacking > MORE_THAN_NOISE or (not self.is_white and self.after > MIN_NOISE)
 
     @property
     def is_white(self) -> bool:
-        """Whether the residuals are white: no significant correlation of more than SLIGHT."""
-        return self.white >= WHITE or self.correlation < SLIGHT
+        """Whether the residuals are white: no significant correlation of more than
+        MIN_AUTOCORRELATION.
+        """
+        return self.white >= COLOURED_PROBABILITY or self.correlation < MIN_AUTOCORRELATION
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -528,7 +536,7 @@ def _statistics(
     scores = (end.statistics.scores[kept] @ z_by_x)[:, estimated]
     precision = np.zeros((p + 1, p + 1))
     precision[:p, :p] = problem.prior.precision
-    if lacking <= LACKS:  # the residuals are noise
+    if lacking <= INCOMPLETE_RATIO:  # the residuals are noise
         lacking = 1.0
     found = uncertainty(information, scores, precision[both], scale[estimated], lacking)
     errors = np.full(p + 1, np.inf)
@@ -559,7 +567,7 @@ def _note_on_early_torque(c: Coordinates, end: Refinement, delay_error: float) -
 def _without_limits(information: np.ndarray, scores: np.ndarray, scale: np.ndarray) -> np.ndarray:
     """The Gauss-Newton step without limits."""
     A, g = np.sum(information, axis=0) * scale[:, None] * scale, np.sum(scores, axis=0) * scale
-    return -scale * np.linalg.lstsq(A, g, rcond=LEAST_INFORMATION)[0]
+    return -scale * np.linalg.lstsq(A, g, rcond=MIN_INFORMATION)[0]
 
 
 def _at_limits(end: Refinement, ends: tuple[np.ndarray, ...], scale: np.ndarray) -> np.ndarray:
@@ -654,7 +662,7 @@ def _fits(
 def _notes(found: Uncertainty, numbers: tuple[Number, ...], fit: tuple[Fit, ...]) -> list[str]:
     notes = []
     widest = float(np.max(found.widened))
-    if not all(one.is_white for one in fit) and widest > CLEARLY:
+    if not all(one.is_white for one in fit) and widest > REPORTED_RATIO:
         notes.append(
             f"What is left is coloured: standard errors are up to {widest:.2g} times those of white"
             " noise."
@@ -665,7 +673,7 @@ def _notes(found: Uncertainty, numbers: tuple[Number, ...], fit: tuple[Fit, ...]
         f"{'what a limit excludes, ' if bound else ''}dry friction that is not looked for, play, a"
         " torque in between samples"
     )
-    if worst.lacking > LACKS:
+    if worst.lacking > INCOMPLETE_RATIO:
         notes.append(
             f"What is left of {worst.joint} is {worst.lacking:.2g} times the noise of its"
             f" positions: the model lacks something ({likely}), and all standard errors are that"
@@ -740,5 +748,5 @@ def _with_numbers(
                     raise
                 notes.append(f"The model has no {target}: only the plant has this parameter.")
     if c.delay:
-        scenario = with_parameters(scenario, {DELAY: max(delay, 0.0)})
+        scenario = with_parameters(scenario, {DELAY_PATH: max(delay, 0.0)})
     return scenario, notes

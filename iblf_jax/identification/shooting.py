@@ -51,16 +51,16 @@ from iblf_jax.identification.standstill import NO_FRICTION_WIDTH, FreeTorques
 
 HUBER = 1.345
 """Standard deviations beyond which the Huber loss is linear: 95 % efficiency for normal noise."""
-FEWEST_STEPS = 8
+MIN_STEPS = 8
 USUAL_DELAY = 0.01
 """The first window of a segment starts this much later, so that the torque is logged from its start
 on for any delay up to this value [s]."""
 SIGMA_TOLERANCE = 0.02
 """Relative change of sigma below which it has converged."""
 OUTLIER_RATIO = 1.5
-ROUNDS, LATER_STEPS = 6, 8
+MAX_NOISE_UPDATES, LATER_STEPS = 6, 8
 """Estimates of sigma at most, and Gauss-Newton steps after the first of them."""
-POINTS, STABLE = 200, 1.4
+MODE_POINTS, MAX_PHASE = 200, 1.4
 """Points at which the modes are evaluated, and the largest phase of the fastest mode in one step
 [rad]: half of the stability limit of RK4."""
 
@@ -123,7 +123,7 @@ def windows(logs: list[Log], length: float, held_back: list[float], hold: bool) 
       held_back: share of each log, at its end, that is not fitted.
       hold: whether the torque is constant between samples.
     """
-    steps = max(FEWEST_STEPS, round(length / max(log.step for log in logs)))
+    steps = max(MIN_STEPS, round(length / max(log.step for log in logs)))
     t: list[Any] = []
     y, log_index, kept, q, dq = [], [], [], [], []
     for i, log in enumerate(logs):
@@ -331,7 +331,7 @@ class ShootingProblem:
         penalty = Penalty(self.c, z, 1.0 / (WEAK_PRIOR * scale) ** 2, prior)
         simulation = Simulation(starts, *self.simulate(z, starts))
         total = 0
-        for again in range(ROUNDS):
+        for again in range(MAX_NOISE_UPDATES):
             if again:
                 most = LATER_STEPS
             here = self._linearized(z, simulation, sigma, penalty)
@@ -480,12 +480,12 @@ def substeps_for(dynamics: InverseDynamics, step: float) -> int:
     plant is well inside the stability region.
 
     Args:
-      dynamics: at points of the motion, of which at most POINTS and the stiffest are used.
+      dynamics: at points of the motion, of which at most MODE_POINTS and the stiffest are used.
       step: time between samples [s].
     """
     mass, by_q, by_dq = (np.asarray(x) for x in (dynamics.mass, dynamics.by_q, dynamics.by_dq))
     n, count = mass.shape[-1], len(mass)
-    chosen = np.linspace(0, count - 1, min(POINTS, count)).astype(int)
+    chosen = np.linspace(0, count - 1, min(MODE_POINTS, count)).astype(int)
     stiffest = np.argmax(np.max(np.abs(by_dq), axis=(1, 2)))
     chosen = np.append(chosen, stiffest)
     F = np.zeros((len(chosen), 2 * n, 2 * n))
@@ -493,4 +493,4 @@ def substeps_for(dynamics: InverseDynamics, step: float) -> int:
     forces = np.concatenate([by_q[chosen], by_dq[chosen]], axis=-1)
     F[:, n:] = -np.linalg.solve(mass[chosen], forces)
     fastest = float(np.max(np.abs(np.linalg.eigvals(F))))
-    return 2 ** int(np.clip(np.ceil(np.log2(step * fastest / STABLE)), 0, 5))
+    return 2 ** int(np.clip(np.ceil(np.log2(step * fastest / MAX_PHASE)), 0, 5))

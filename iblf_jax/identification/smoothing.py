@@ -18,9 +18,9 @@ from iblf_jax.identification.log import Log
 HALF_WIDTH = 0.05
 """[s]; at 500 Hz the standard deviation of an acceleration is then 500 1/s^2 times that of a
 position, and a motion of 2 Hz is accurate to 1 %."""
-FEWEST_SAMPLES = 7
+MIN_SAMPLES = 7
 """Samples of a polynomial, at least."""
-MOST_TIMES = 1500
+MAX_TIMES = 1500
 """Times at which a log is evaluated, at most."""
 
 
@@ -46,9 +46,9 @@ def local_polynomial(
     of the positions (m, n).
     """
     t = log.t[segment]
-    half = max(HALF_WIDTH, 0.5 * FEWEST_SAMPLES * log.step)
+    half = max(HALF_WIDTH, 0.5 * MIN_SAMPLES * log.step)
     first, last = np.searchsorted(t, [centre - half, centre + half])
-    first, last = min(first, max(len(t) - FEWEST_SAMPLES, 0)), max(last, FEWEST_SAMPLES)
+    first, last = min(first, max(len(t) - MIN_SAMPLES, 0)), max(last, MIN_SAMPLES)
     s = t[first:last] - centre
     reach = max(half, 1.01 * float(np.max(np.abs(s))))
     weight = (1.0 - (s / reach) ** 2)[:, None]
@@ -63,12 +63,12 @@ def local_polynomial(
 
 def smooth_logs(logs: list[Log], hold: bool) -> SmoothedMotion:
     """The motion at some times of all logs."""
-    spacing = max(sum(log.t[-1] - log.t[0] for log in logs) / MOST_TIMES, logs[0].step)
+    spacing = max(sum(log.t[-1] - log.t[0] for log in logs) / MAX_TIMES, logs[0].step)
     rows, left = [], []
     for log in logs:
         for segment in log.segments:
             t = log.t[segment]
-            if len(t) < 2 * FEWEST_SAMPLES:
+            if len(t) < 2 * MIN_SAMPLES:
                 continue
             for centre in np.arange(t[0] + HALF_WIDTH, t[-1] - HALF_WIDTH, spacing):
                 a, b, rest = local_polynomial(log, segment, centre, hold)

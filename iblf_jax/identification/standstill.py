@@ -31,7 +31,7 @@ SPEED_THRESHOLDS, TIME_MARGIN, PIECE_DURATION = (0.05, 0.1, 0.2), 0.01, 0.01
 """[rad/s], a larger threshold being used if the smaller one leaves more than noise; [s]; [s]."""
 WORTHWHILE_RATIO = 0.9
 """A larger threshold is accepted if it reduces the residual to less than this share."""
-HALF = 0.02
+HALF_WINDOW = 0.02
 """Half of the time over which a speed is estimated [s]: at 500 Hz its standard deviation is then
 20 1/s times that of a position."""
 ACCEPTED_RATIO, REJECTED_RATIO = 1.02, 1.3
@@ -139,7 +139,7 @@ def _motion_direction(log: Log, slow: float) -> np.ndarray:
 
 def _speed(t: np.ndarray, q: np.ndarray, step: float) -> np.ndarray:
     """Slope of the line through the positions around each time, (N, n)."""
-    half = max(HALF, 2.5 * step)
+    half = max(HALF_WINDOW, 2.5 * step)
     k = np.arange(len(t))  # the neighbours, however far away they are
     first = np.minimum(np.searchsorted(t, t - half), np.maximum(k - 1, 0))
     last = np.maximum(np.searchsorted(t, t + half, side="right"), np.minimum(k + 2, len(t)))

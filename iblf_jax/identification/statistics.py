@@ -23,7 +23,7 @@ import numpy as np
 
 IDENTIFIABLE_BELOW = 0.5
 """Standard error, in scales, below which a parameter or a combination is identifiable."""
-FEWEST_WINDOWS = 4
+MIN_WINDOWS = 4
 """Number of windows from which the jackknife is used.  With a few windows it is rough, but the
 quantisation of an encoder is far from white: without the jackknife, 10 to 25 % of the parameters of
 12 logs of 6 and 4 s, at 500 Hz and 14 bits, were wrong by more than three standard errors."""
@@ -93,7 +93,7 @@ def uncertainty(
 def _jackknife(own: np.ndarray, g: np.ndarray, V: np.ndarray, size: np.ndarray) -> np.ndarray:
     """The jackknife's covariance; zero where there are too few windows."""
     W = len(own)
-    if W < FEWEST_WINDOWS:
+    if W < MIN_WINDOWS:
         return np.zeros((len(V), len(V)))
     parts, pushes = V.T @ own @ V, g @ V
     moved = np.stack(

@@ -29,11 +29,11 @@ import numpy as np
 
 from iblf_jax.identification.smoothing import HALF_WIDTH, SmoothedMotion
 
-LEVEL = 1e-3
+FALSE_ALARM_PROBABILITY = 1e-3
 """Probability of at least one finding if no term is missing."""
-BLOCK = 6.0 * HALF_WIDTH
+BLOCK_LENGTH = 6.0 * HALF_WIDTH
 """Length of a block [s]: several times the correlation length of the smoothing."""
-FEWEST_BLOCKS = 10
+MIN_BLOCKS = 10
 """Number of blocks from which the variance between blocks is estimated."""
 SMALLEST_OWN_SHARE = 0.01
 """Share of a candidate that the estimated parameters must not explain."""
@@ -201,8 +201,8 @@ def _weighted_regression(
     """The regression, joints weighted by their residual with all candidates."""
     P, n = rest.shape
     columns = np.concatenate([numbers, of_candidates], axis=-1)
-    spacing = float(np.median(np.abs(np.diff(motion.t)))) if P > 1 else BLOCK
-    block = np.arange(P) // max(1, round(BLOCK / max(spacing, 1e-9)))
+    spacing = float(np.median(np.abs(np.diff(motion.t)))) if P > 1 else BLOCK_LENGTH
+    block = np.arange(P) // max(1, round(BLOCK_LENGTH / max(spacing, 1e-9)))
     sigma = np.std(rest, axis=0) + 1e-12
     for _ in range(2):
         weight = 1.0 / sigma
@@ -292,9 +292,9 @@ def _backward_elimination(design: _Design, k: int, chosen: list[int], tests: int
     from scipy.stats import t
 
     count = int(design.block[-1]) + 1 if len(design.block) else 0
-    if count < FEWEST_BLOCKS:
+    if count < MIN_BLOCKS:
         return []
-    needed = float(t.isf(0.5 * LEVEL / tests, count - 1))
+    needed = float(t.isf(0.5 * FALSE_ALARM_PROBABILITY / tests, count - 1))
     chosen = list(chosen)
     while chosen:
         both = [*range(k), *chosen]

@@ -73,7 +73,7 @@ TIMEOUT = 300.0
 """Time limit of a compiler [s]."""
 VERSION_TIMEOUT = 20.0
 """Time limit for printing its version [s]."""
-MOST_TEXT = 1 << 20
+MAX_TEXT = 1 << 20
 """Bytes of a compiler's text that are read, at most."""
 DIGEST = hashlib.sha256
 """The digest of key and content at the end of every file."""
@@ -263,7 +263,7 @@ def _run(command: list[str], stream: str, seconds: float) -> bytes:
 
     def listen() -> None:
         with getattr(process, stream) as pipe:
-            received.append(pipe.read(MOST_TEXT))
+            received.append(pipe.read(MAX_TEXT))
 
     CACHES.running.add(process.pid)
     listener = threading.Thread(target=listen, daemon=True)

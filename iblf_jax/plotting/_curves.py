@@ -56,7 +56,7 @@ EXTERNAL = {
 }
 """Signals that do not depend on the state; figures draw them to the end of a failed run too."""
 
-SAME = 0.03
+SAME_SIGNAL = 0.03
 """Signals that differ by less than this fraction of their range are drawn once for all runs."""
 
 
@@ -259,7 +259,9 @@ def _differ(a: Curve, b: Curve, fields: Sequence[str], joints: Sequence[int]) ->
     for field in fields:
         for joint in joints:
             one, two = (c.at(field, t)[:, joint] for c in (a, b))
-            if not np.allclose(one, two, rtol=0.0, atol=SAME * np.ptp(one) + 1e-9, equal_nan=True):
+            if not np.allclose(
+                one, two, rtol=0.0, atol=SAME_SIGNAL * np.ptp(one) + 1e-9, equal_nan=True
+            ):
                 return True
     return False
 

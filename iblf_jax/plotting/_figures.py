@@ -38,7 +38,7 @@ Runs = Rollout | Mapping[str, Rollout]
 
 ZOOM_SHARE = 0.1
 """Share of the time that the zoom shows by default for runs without a transient."""
-MOST_ZOOMED = 0.3
+MAX_ZOOMED = 0.3
 """Largest share of the time that the zoom shows by default."""
 
 
@@ -73,7 +73,7 @@ def _default_zoom(curves: Sequence[Curve], rows: Sequence[PanelRow], end: float)
     transient = max(transient_end(curves, row.quantity, row.joint) for row in rows)
     if transient == 0:
         return ZOOM_SHARE * end
-    return float(f"{min(max(2.5 * transient, 0.01 * end), MOST_ZOOMED * end):.0e}")
+    return float(f"{min(max(2.5 * transient, 0.01 * end), MAX_ZOOMED * end):.0e}")
 
 
 @_style.styled()

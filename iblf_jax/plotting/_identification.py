@@ -15,7 +15,7 @@ from iblf_jax.plotting._curves import escaped
 if TYPE_CHECKING:
     from iblf_jax.identification import Identification
 
-MOST_ROWS = 40
+MAX_ROWS = 40
 """Largest number of identified numbers in the figure."""
 
 
@@ -32,7 +32,7 @@ def identification(known: Identification) -> Figure:
 
     Source: design of this package.
     """
-    rows = min(len(known.numbers), MOST_ROWS)
+    rows = min(len(known.numbers), MAX_ROWS)
     heights = [max(1.8, 0.45 + 0.17 * rows), 2.1, 2.1]
     figure = _style.new_figure(_style.WIDTH, 0.6 + sum(heights))
     grid = figure.add_gridspec(3, 1, height_ratios=heights)
@@ -53,7 +53,7 @@ def identification(known: Identification) -> Figure:
 
 def _numbers(axes: Axes, known: Identification) -> None:
     """Change of each number from its start, in scales, with three standard errors."""
-    chosen = known.numbers[:MOST_ROWS]
+    chosen = known.numbers[:MAX_ROWS]
     beside: dict[str, Any] = {
         "transform": axes.get_yaxis_transform(),
         "va": "center",

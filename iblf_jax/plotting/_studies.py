@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 WIDTH = 10.0
 COLUMNS = 4
 """Largest number of panels in a row."""
-MOST_POINTS = 5000
+MAX_POINTS = 5000
 """Largest number of failed runs, and about that of successful ones, in a scatter."""
 
 
@@ -213,8 +213,8 @@ def _draw_scatter(axes: Axes, study: Study, metric: str, path: str, x: np.ndarra
     failed = _is_failed(study)
     known = study.made & np.isfinite(y)
     good = np.flatnonzero(known & ~failed)
-    good = good[:: max(1, len(good) // MOST_POINTS)]
-    bad = np.flatnonzero(known & failed)[:MOST_POINTS]
+    good = good[:: max(1, len(good) // MAX_POINTS)]
+    bad = np.flatnonzero(known & failed)[:MAX_POINTS]
     dots: dict[str, Any] = {"s": 4, "alpha": 0.5, "linewidths": 0, "color": _style.colour(0)}
     crosses: dict[str, Any] = {"s": 9, "marker": "x", "linewidths": 0.8, "color": _style.colour(1)}
     axes.scatter(x[good], y[good], label="not failed", **dots)

@@ -42,7 +42,7 @@ WIDTH = 7.2
 """Width of a figure, the text width of a page [in]."""
 FONT = 9.0
 """Font size for which all sizes in this module are chosen [pt]."""
-GROWTH = 0.75
+SIZE_EXPONENT = 0.75
 """Exponent with which figures grow with the font size."""
 
 SIZES = {
@@ -200,7 +200,7 @@ def new_figure(width: float, height: float) -> StyledFigure:
     Args:
       width, height: size for a font of size FONT [in]; larger fonts enlarge the figure.
     """
-    growth = max(1.0, size(1.0)) ** GROWTH
+    growth = max(1.0, size(1.0)) ** SIZE_EXPONENT
     return StyledFigure(figsize=(width * growth, height * growth), layout="constrained")
 
 
@@ -300,7 +300,8 @@ def wrapped(words: str, room: int) -> str:
     """A label on lines of about `room` characters; it breaks at spaces, in paths after a dot,
     bracket or underscore, and not in a unit.
     """
-    text, unit = re.fullmatch(r"(.*?)( \[[^\[\]]*\])?", words, re.DOTALL).groups("")  # type: ignore[union-attr]
+    found: Any = re.fullmatch(r"(.*?)( \[[^\[\]]*\])?", words, re.DOTALL)
+    text, unit = found.groups("")
     lines = [""]
     for part in [*PIECES.findall(text), unit]:
         pieces = [part]

@@ -26,7 +26,7 @@ from iblf_jax.plotting._panels import (
 if TYPE_CHECKING:
     from iblf_jax.tuning import Front, TuneResult
 
-MOST_NAMED = 28
+MAX_NAMED = 28
 """Largest number of gains in the legend."""
 
 
@@ -62,7 +62,7 @@ def tuning(
     columns = 1 if n <= 3 else 2
     rows = len(_style.row_sizes(n, columns))
     heights = [1.9, 2.5, 2.0, 1.7 * rows]
-    if len(result.names) <= MOST_NAMED:
+    if len(result.names) <= MAX_NAMED:
         heights[1] += 0.17 * len(result.names)
     figure = _style.new_figure(_style.WIDTH, 1.0 + sum(heights))
     grid = figure.add_gridspec(4, 2, height_ratios=heights)
@@ -182,7 +182,7 @@ def _gains(axes: Axes, result: TuneResult) -> None:
         axes.set_yscale("log")
     axes.set_xlabel("step")
     axes.set_ylabel("gain, relative to start")
-    if len(result.names) <= MOST_NAMED:
+    if len(result.names) <= MAX_NAMED:
         below: dict[str, Any] = {"bbox_to_anchor": (0.0, -0.22), "borderaxespad": 0.0}
         axes.legend(fontsize=_style.size(6.5), loc="upper left", **below)
 

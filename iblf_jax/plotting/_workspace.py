@@ -25,7 +25,7 @@ from iblf_jax.world.regions import HalfSpace, Region, Sphere, in_words, row_of
 
 GRID = 301
 """Points per side of the grid on which a boundary in the plane is computed."""
-NET = (13, 25)
+SPHERE_CIRCLES = (13, 25)
 """Circles of latitude and of longitude of a sphere."""
 PATH_POINTS = 400
 LINES = ("-", "--", ":", "-.")
@@ -132,7 +132,9 @@ def _draw_plane(axes: Any, region: HalfSpace, limits: np.ndarray, look: dict[str
 
 def _draw_sphere(axes: Any, region: Sphere, limits: np.ndarray, look: dict[str, Any]) -> None:
     theta, phi = np.meshgrid(
-        np.linspace(0.0, np.pi, NET[0]), np.linspace(0.0, 2 * np.pi, NET[1]), indexing="ij"
+        np.linspace(0.0, np.pi, SPHERE_CIRCLES[0]),
+        np.linspace(0.0, 2 * np.pi, SPHERE_CIRCLES[1]),
+        indexing="ij",
     )
     unit = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)])
     points = np.asarray(region.centre)[:, None, None] + float(region.radius) * unit

@@ -25,7 +25,7 @@ from iblf_jax.plotting._arm import Scene, motions_of
 from iblf_jax.plotting._curves import curves_of
 from iblf_jax.plotting._figures import Runs
 
-MOST_FPS, MOST_FRAMES = 50.0, 10_000
+MAX_FPS, MAX_FRAMES = 50.0, 10_000
 LONGEST_FILM = 10.0
 """Longest duration of an animation at the default speed [s]."""
 
@@ -53,8 +53,8 @@ def animate(runs: Runs, path: str | Path, fps: float = 25.0, *, speed: float | N
     curves = curves_of(runs)
     path = film_path(path)
     fps = checks.positive_number("fps", fps, "1/s")
-    if fps > MOST_FPS:
-        raise checks.fail("fps", fps, f"at most {MOST_FPS:g} frames a second")
+    if fps > MAX_FPS:
+        raise checks.fail("fps", fps, f"at most {MAX_FPS:g} frames a second")
     t = frame_times(max(float(np.asarray(curve.run.t)[-1]) for curve in curves), fps, speed)
     with _style.styled():
         return write_film(list(_pictures(Scene(curves, *motions_of(curves, t)))), path, fps)
@@ -83,11 +83,11 @@ def frame_times(end: float, fps: float, speed: float | None = None) -> np.ndarra
         speed = max(1.0, end / LONGEST_FILM)
     speed = checks.positive_number("speed", speed, "1")
     frames = end / speed * fps
-    if not frames <= MOST_FRAMES:
+    if not frames <= MAX_FRAMES:
         raise checks.fail(
             "speed",
             speed,
-            f"a speed at which the animation has at most {MOST_FRAMES} frames",
+            f"a speed at which the animation has at most {MAX_FRAMES} frames",
             f"It would have {frames:.3g}; raise the speed or lower fps.",
         )
     return np.linspace(0.0, end, max(2, round(frames) + 1))

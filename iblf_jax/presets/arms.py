@@ -64,7 +64,7 @@ COUPLED = 4.0
 FASTEST = 8.0
 """Largest ratio of the eigenvalues of M^-1 K2 to `rate` [1]; with 4, the initial errors of the
 `iiwa14` last 1.5 times as long."""
-LEAST_K2 = 0.6
+MIN_K2 = 0.6
 """Smallest gain [N m s/rad]; above the 1/2 of Theorem 2 (3.17), for claims with the paper's
 weights."""
 TIMES = np.linspace(0.0, 20.0, 81)
@@ -104,7 +104,7 @@ def _positions_of(reference: Reference, times: jax.Array) -> jax.Array:
     return jax.vmap(reference.position)(times)
 
 
-def inertial_gain(robot: Robot, q: Any, rate: float = RATE, least: Any = LEAST_K2) -> jax.Array:
+def inertial_gain(robot: Robot, q: Any, rate: float = RATE, least: Any = MIN_K2) -> jax.Array:
     """The gain with which the modes of the loop are about `rate` on every joint.
 
         K2_i = max(rate M_ii(q), least)

@@ -9,7 +9,7 @@ and the other methods have formulas of their own (`integrators.Tableau.differenc
 ten times that of a smooth loop, so that the estimate also covers a torque that jumps within a step.
 Local errors accumulate and decay,
 
-    L_k = (1 - dt r) L_{k-1} + l_k,   r = `stability.SLOWEST`,
+    L_k = (1 - dt r) L_{k-1} + l_k,   r = `stability.SLOWEST_RATE`,
 
 and an error y of the velocities and of the observer displaces the positions by R y, with
 R = [I 0] (r I - J)^-1 and J the Jacobian of their rates at the start. The position error is about
@@ -46,16 +46,16 @@ from iblf_jax.simulation.closed_loop import LoopState, perturbed_state
 from iblf_jax.simulation.integrators import Tableau, tableau
 from iblf_jax.simulation.jumps import within
 from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.simulation.stability import SLOWEST
+from iblf_jax.simulation.stability import SLOWEST_RATE
 from iblf_jax.world.bounds import Tube
 from iblf_jax.world.robots import at_time
 
 TOLERANCE = 0.005
 """Estimated position error, relative to the width of the tube, above which a run is flagged
 INACCURATE."""
-INSTANTS = 16
+EXAMINED_STEPS = 16
 """Steps, spread over a run, in which `unresolved_signals` examines the signals between stages."""
-ONSET = 3.0
+ONSET_RATIO = 3.0
 """Ratio of the displacement by a torque at its onset to that by a torque that the observer has
 learnt."""
 GAUSS = ((0.5 - 0.15**0.5, 5 / 18), (0.5, 8 / 18), (0.5 + 0.15**0.5, 5 / 18))
@@ -114,7 +114,7 @@ def response(jacobian: jax.Array, n: int) -> jax.Array:
     """R of the Jacobian by the watched numbers, (m, m) [1/s]; 0 where it is not finite."""
     inner = jacobian[n:, n:]
     size = len(inner)
-    resolvent = SLOWEST * jnp.eye(size, dtype=inner.dtype) - inner.T
+    resolvent = SLOWEST_RATE * jnp.eye(size, dtype=inner.dtype) - inner.T
     found = solve(resolvent, jnp.eye(size, n, dtype=inner.dtype)).T
     return jnp.where(jnp.isfinite(found), found, 0.0)
 
@@ -225,7 +225,7 @@ def _update_by_differences(
         rate = partial(_rate, accuracy)
         by_stages = sum(_error_by_stages(rate, table, length, each) for length, each in pieces)
         added = jnp.where(restarts, by_stages, added)
-    drift = (1.0 - SLOWEST * dt) * accuracy.drift + added
+    drift = (1.0 - SLOWEST_RATE * dt) * accuracy.drift + added
     pending = [
         x + newest_first[per_step * (k + 1)] * here
         for k, x in enumerate((*accuracy.pending[1:], jnp.zeros_like(here)))
@@ -247,7 +247,7 @@ def _update_by_stages(
     """The estimate of a sampled loop: from the stages of one step. A method of one stage is
     compared with the step before.
     """
-    drift, before = (1.0 - SLOWEST * dt) * accuracy.drift, accuracy.pending
+    drift, before = (1.0 - SLOWEST_RATE * dt) * accuracy.drift, accuracy.pending
 
     def motion_rate(slope: LoopState) -> jax.Array:
         return _rate(accuracy, slope._replace(observer=(), actuator=()))
@@ -333,12 +333,12 @@ def unresolved_signals(
     table, n = tableau(method), scenario.n
     scenario, dt = jax.lax.stop_gradient((scenario, dt))
     # Fractions of the golden ratio, so that the steps share no period with a signal.
-    spread = jnp.asarray(np.arange(INSTANTS) * GOLDEN_RATIO % 1.0, dt.dtype)
+    spread = jnp.asarray(np.arange(EXAMINED_STEPS) * GOLDEN_RATIO % 1.0, dt.dtype)
     starts = jnp.floor(spread * jnp.asarray(steps, spread.dtype)) * dt
     nodes = jnp.asarray([*table.c, *(node for node, _ in GAUSS), 1.0], dt.dtype)
     times = starts[:, None] + nodes * dt
     tube = _at_all_times(scenario.context.tube, times)
-    missed = _missed_rates(table, tube, starts, dt).reshape(INSTANTS, -1, n)
+    missed = _missed_rates(table, tube, starts, dt).reshape(EXAMINED_STEPS, -1, n)
     missed = jnp.max(missed, axis=1)
     push = _missed_torque(scenario, table, tube, times)
     jumps = scenario.jump_times()
@@ -405,7 +405,7 @@ def with_unresolved(accuracy: Accuracy, found: UnresolvedSignals) -> Accuracy:
     assumed to last for 1/r.
     """
     displaced = jnp.abs(matvec(accuracy.response[:, : found.push.size], found.push))
-    error = (found.missed + ONSET * displaced) / SLOWEST
+    error = (found.missed + ONSET_RATIO * displaced) / SLOWEST_RATE
     return accuracy._replace(
         error=jnp.maximum(accuracy.error, error),
         relative=jnp.maximum(accuracy.relative, jnp.max(error / found.width)),

@@ -13,7 +13,7 @@ Jumps at equal times are one cut; the first of them receives the derivative of a
 
 The stages of a piece see one-sided limits: a piece that ends at a jump is evaluated before it, and
 one that begins there after it. A jump time may carry a rounding error, so stages keep a distance of
-`APART` units in the last place from it.
+`JUMP_SEPARATION` units in the last place from it.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ import numpy as np
 
 from iblf_jax.simulation import integrators
 
-MOST_CUTS = 4
+MAX_CUTS = 4
 """Largest number of different jump times at which one step is divided; the accuracy of a step with
 more is unknown."""
-APART = 4.0
+JUMP_SEPARATION = 4.0
 """Units in the last place between a stage and a jump time."""
 
 
@@ -69,7 +69,7 @@ class Division(NamedTuple):
 
     pieces: tuple[Piece, ...]
     overfull: Any
-    """Whether jumps lie at more times than `MOST_CUTS`, () bool; None where that cannot be."""
+    """Whether jumps lie at more times than `MAX_CUTS`, () bool; None where that cannot be."""
 
 
 @jax.custom_jvp
@@ -105,7 +105,7 @@ def divided(
         one does; None where none can.
     """
     count = times.size
-    cuts = min(count, MOST_CUTS) + (arrival is not None)
+    cuts = min(count, MAX_CUTS) + (arrival is not None)
     if cuts == 0:
         return Division((Piece(span.start, span.length, True, None, None, False),), None)
     passed = times <= span.start
@@ -123,7 +123,7 @@ def divided(
         if number < cuts:
             chosen = first = _first(offsets, pending)
             until = jnp.where(jnp.any(first), jnp.sum(jnp.where(first, offsets, 0.0)), span.length)
-            if count > MOST_CUTS:
+            if count > MAX_CUTS:
                 chosen = _with_equal_times(first, offsets, pending, count, span)
         earliest, latest = None, None
         if count:
@@ -136,7 +136,7 @@ def divided(
         if chosen is not None:
             begin, since, made = span.start + until, until, jnp.any(chosen)
             pending, done = pending & ~chosen, done | chosen
-    overfull = jnp.any(pending) if count > MOST_CUTS else None
+    overfull = jnp.any(pending) if count > MAX_CUTS else None
     return Division(tuple(pieces), overfull)
 
 
@@ -153,7 +153,7 @@ def _with_equal_times(
     first: jax.Array, offsets: jax.Array, pending: jax.Array, jumps: int, span: Span
 ) -> jax.Array:
     """The first event and, if it is a jump, the pending jumps at its time, (E,) bool."""
-    apart = APART * jnp.finfo(offsets.dtype).eps * jnp.abs(span.end)
+    apart = JUMP_SEPARATION * jnp.finfo(offsets.dtype).eps * jnp.abs(span.end)
     offset = jax.lax.stop_gradient(jnp.sum(jnp.where(first, offsets, 0.0)))
     equal = jnp.abs(jax.lax.stop_gradient(offsets) - offset) <= apart
     is_jump = np.arange(offsets.size) >= offsets.size - jumps
@@ -173,7 +173,7 @@ def _limits(times: jax.Array, passed: jax.Array, span: Span) -> tuple[jax.Array,
     the others.
     """
     times = jax.lax.stop_gradient(times)
-    apart = APART * jnp.finfo(times.dtype).eps * jnp.abs(times)
+    apart = JUMP_SEPARATION * jnp.finfo(times.dtype).eps * jnp.abs(times)
     earliest = jnp.max(jnp.where(passed, times + apart, span.start))
     latest = jnp.min(jnp.where(passed, span.end + span.length, times - apart))
     return jax.lax.stop_gradient((earliest, latest))
@@ -182,7 +182,7 @@ def _limits(times: jax.Array, passed: jax.Array, span: Span) -> tuple[jax.Array,
 def before_jumps(times: jax.Array, t: jax.Array) -> jax.Array:
     """The time t, or a time just before it where there is a jump, () [s]."""
     times = jax.lax.stop_gradient(times)
-    apart = APART * jnp.finfo(times.dtype).eps * jnp.abs(times)
+    apart = JUMP_SEPARATION * jnp.finfo(times.dtype).eps * jnp.abs(times)
     least = jnp.min(jnp.where(jnp.abs(times - t) <= apart, times - apart, t))
     return _limited(t, least, least)
 

@@ -36,6 +36,7 @@ optional_member = OptionalMembers(
     at_period=None,
     kf=None,
     # studies
+    scenario=None,
     made=True,
     duration=None,
     dt=None,

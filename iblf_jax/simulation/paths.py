@@ -28,6 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks, notices, tables
+from iblf_jax.core.pytree import field_values
 from iblf_jax.simulation.optional import optional_member
 from iblf_jax.simulation.scenario import NUMBERS, Scenario, canonical
 
@@ -117,10 +118,12 @@ def _walk(
     if not _is_component(part):
         return
     leaf_units = {**_own_units(part), **units}
+    values = field_values(part)
     for field in dataclasses.fields(part):
         if field.metadata.get("static"):
             continue
-        value, name = getattr(part, field.name), _joined(path, field.name)
+        value = values[field.name]
+        name = _joined(path, field.name)
         if field.name == _wrapped_field(part):
             yield from _walk_wrapped(part, value, path, name, named)
         elif isinstance(value, NUMBERS):
@@ -163,10 +166,11 @@ def _own_units(part: Any) -> Mapping[str, str]:
 def _named_rows(part: Any, path: str) -> Iterator[Parameter]:
     """The rows of leaves that have names."""
     units = {field.name: field.metadata.get("unit", "") for field in dataclasses.fields(part)}
+    values = field_values(part)
     for kind, (names, fields) in optional_member(type(part), "rows").items():
-        for i, name in enumerate(getattr(part, names)):
+        for i, name in enumerate(values[names]):
             for field in fields:
-                value = getattr(part, field)
+                value = values[field]
                 # A leaf with one axis has one entry per row, and others have rows first or last.
                 row = value[..., i] if jnp.ndim(value) == 1 else value[i]
                 full = _joined(path, f"{kind}[{_quoted(name)}].{field}")
@@ -292,7 +296,7 @@ def _metadata(scenario: Scenario, path: str) -> Mapping[str, Any]:
             field = next(f for f in dataclasses.fields(part) if f.name == token)
             metadata = {**field.metadata, "unit": _unit(field, {**_own_units(part), **units})}
             units |= field.metadata.get("units", {})
-            part = getattr(part, token)
+            part = field_values(part)[token]
     return metadata
 
 
@@ -337,7 +341,7 @@ def _steps(part: Any, tokens: list[str | int]) -> tuple[list[str | int], list[st
         row, field = tokens[1:3]
         if field not in fields:
             raise KeyError(field)
-        index = row if isinstance(row, int) else getattr(part, names).index(row)
+        index = row if isinstance(row, int) else field_values(part)[names].index(row)
         return [field, index], tokens[3:]
     wrapped = _wrapped_field(part)
     if wrapped:
@@ -370,7 +374,7 @@ def _field(part: Any, name: str) -> Any:
         raise AttributeError(name)
     for field in dataclasses.fields(part):
         if field.name == name and not field.metadata.get("static"):
-            return getattr(part, name)
+            return field_values(part)[name]
     raise AttributeError(name)
 
 
@@ -384,8 +388,9 @@ def _replaced(part: Any, tokens: list[str | int], value: Any, path: str, sign: s
         parts[head] = _replaced(part[head], rest, value, path, sign)
         return tuple(parts)
     copy = object.__new__(type(part))
+    values = field_values(part)
     for field in dataclasses.fields(part):
-        member = getattr(part, field.name)
+        member = values[field.name]
         if field.name == head:
             member = _replaced(member, rest, value, path, field.metadata.get("sign"))
         object.__setattr__(copy, field.name, member)

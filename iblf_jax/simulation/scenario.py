@@ -24,7 +24,16 @@ from iblf_jax.control.sensors import Sensor
 from iblf_jax.core import checks, notices
 from iblf_jax.core.cache import keep_programs
 from iblf_jax.core.presentation import present
-from iblf_jax.core.pytree import Leaf, astype, component, is_leaf_field, layers, leaf, unwrapped
+from iblf_jax.core.pytree import (
+    Leaf,
+    astype,
+    component,
+    field_values,
+    is_leaf_field,
+    layers,
+    leaf,
+    unwrapped,
+)
 from iblf_jax.core.status import VELOCITY_LIMIT
 from iblf_jax.core.time import joined, jump_times_of
 from iblf_jax.simulation.optional import optional_member
@@ -127,8 +136,9 @@ class Scenario:
         """
         if self.model is None:
             object.__setattr__(self, "model", self.plant)
+        parts = field_values(self)
         for name, protocol, remedy, optional in PARTS:
-            checks.conforms(f"Scenario.{name}", getattr(self, name), protocol, remedy, optional)
+            checks.conforms(f"Scenario.{name}", parts[name], protocol, remedy, optional)
         self._check_kinds()
         if self.model.n != self.plant.n:
             got, expected = f"{self.model.n} joints", f"{self.plant.n} joints, as the plant has"
@@ -136,9 +146,8 @@ class Scenario:
         self._check_velocity_bounds()
         self._check_sampling()
         self._check_regions()
-        for field in dataclasses.fields(self):
-            fitted = fit_joints(getattr(self, field.name), self.plant.n, field.name)
-            object.__setattr__(self, field.name, fitted)
+        for name, part in field_values(self).items():
+            object.__setattr__(self, name, fit_joints(part, self.plant.n, name))
 
     def _check_kinds(self) -> None:
         """Raises ValueError for a part of the wrong class."""
@@ -159,8 +168,9 @@ class Scenario:
                 "Such as ij.Sampling(period=2e-3).",
             ),
         )
+        parts = field_values(self)
         for name, kind, expected, remedy in kinds:
-            value = getattr(self, name)
+            value = parts[name]
             if not isinstance(value, kind):
                 raise checks.fail(f"Scenario.{name}", value, expected, remedy)
 
@@ -319,8 +329,10 @@ def fit_joints(part: Any, n: int, path: str) -> Any:
     if not dataclasses.is_dataclass(part) or isinstance(part, type):
         return part
     new: dict[str, Any] = {}
+    values = field_values(part)
     for field in dataclasses.fields(part):
-        old, name = getattr(part, field.name), f"{path}.{field.name}"
+        old = values[field.name]
+        name = f"{path}.{field.name}"
         if not is_leaf_field(field):
             value = fit_joints(old, n, name)
         elif field.metadata["shape"] == "joint" and old is not None:
@@ -362,10 +374,12 @@ def check_values(part: Any, path: str = "") -> None:
     if not dataclasses.is_dataclass(part) or isinstance(part, type):
         return
     prefix = f"{path}." if path else ""
+    values = field_values(part)
     for field in dataclasses.fields(part):
         if field.metadata.get("static"):
             continue
-        name, value = prefix + field.name, getattr(part, field.name)
+        name = prefix + field.name
+        value = values[field.name]
         if isinstance(value, NUMBERS):
             checks.check_values(name, value, field.metadata.get("sign"))
         else:

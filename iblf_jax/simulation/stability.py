@@ -13,8 +13,8 @@ A law such as |e2|^a sign(e2) with a < 1 has an infinite derivative where e2 = 0
 says nothing about the time step: an oscillation that a step excites stops growing at the amplitude
 at which the difference quotient is small enough. A smooth loop has the same derivative by
 differences of any small size. Every derivative is therefore measured by differences of three sizes,
-h0, 10 h0 and WIDEST (less near a bound, where the barrier is stiff). Where one of the larger ones
-gives much less than h0, the one of WIDEST counts (`resolved`).
+h0, 10 h0 and THIRD_SIZE (less near a bound, where the barrier is stiff). Where one of the larger
+ones gives much less than h0, the one of THIRD_SIZE counts (`resolved`).
 
 Stability of a sampled loop is that of the map from one period to the next. The derivative of the
 map follows from those of plant and law: the plant's state evolves with exp(A t), A the derivative
@@ -41,28 +41,28 @@ from iblf_jax.simulation.closed_loop import (
 )
 from iblf_jax.simulation.scenario import Scenario
 
-POWER_ITERATIONS, AVERAGED = 48, 16
+POWER_ITERATIONS, AVERAGED_STEPS = 48, 16
 """Steps of the power iteration, and the number of the last steps in its average: a power of two,
 and a third of the steps."""
-TAYLOR, HALVINGS = 8, 8
+TAYLOR_TERMS, HALVINGS = 8, 8
 """Terms of the Taylor series of a flow, and halvings of its time before: exact to rounding for
 |A| t up to 30."""
 SQUARINGS = 20
 """Squarings of a map for its spectral radius."""
 RADIUS = "sampling_radius"
 """Name of the spectral radius among the results of a sampled run."""
-WIDER, WIDEST = 10.0, 1e-2
+SECOND_SIZE, THIRD_SIZE = 10.0, 1e-2
 """The second size of a difference, relative to the first, and the third [rad/s or the state's
 unit]: an oscillation of 0.01 rad/s with the period of a few steps moves the positions by some 1e-5
 rad."""
-WIDEST_MOVE = 1e-3
+THIRD_SIZE_OF_POSITION = 1e-3
 """rad.  The third size of a difference in a position."""
-ROOM = 0.25
+MAX_BOUND_FRACTION = 0.25
 """Largest size of a difference, relative to the distance from a bound."""
-STEEP = 0.8
+INFINITE_RATIO = 0.8
 """Ratio of the derivatives by differences of the second and the first size below which the
 derivative is taken to be infinite."""
-SLOWEST = 1.0
+SLOWEST_RATE = 1.0
 """Rate of the slowest mode of a loop that follows a reference [1/s]."""
 
 
@@ -84,7 +84,7 @@ def growth_start(x: jax.Array) -> Growth:
 def grown(growth: Growth, w: jax.Array, iteration: jax.Array) -> Growth:
     """The growth after one of POWER_ITERATIONS; w is the Jacobian times the direction."""
     size = jnp.maximum(jnp.sqrt(jnp.sum(w * w)), jnp.finfo(w.dtype).tiny)
-    counted = iteration >= POWER_ITERATIONS - AVERAGED
+    counted = iteration >= POWER_ITERATIONS - AVERAGED_STEPS
     return Growth(w / size, growth.total + jnp.where(counted, jnp.log(size), jnp.zeros_like(size)))
 
 
@@ -92,7 +92,7 @@ def growth_rate(growth: Growth) -> jax.Array:
     """The rate of the fastest mode, () [1/s]; the average over iterations covers a pair of complex
     modes, too.
     """
-    return jnp.exp(growth.total / AVERAGED)
+    return jnp.exp(growth.total / AVERAGED_STEPS)
 
 
 def growth_rate_by(jacobian: jax.Array) -> jax.Array:
@@ -107,16 +107,16 @@ def growth_rate_by(jacobian: jax.Array) -> jax.Array:
         last = last / size
         return last, matmul_in_order(last, last), 2.0 * (logarithm + jnp.log(size))
 
-    # After the loop: J^AVERAGED and its square, each up to a factor, and the logarithm of the
+    # After the loop: J^AVERAGED_STEPS and its square, each up to a factor, and the logarithm of the
     # factor of the square.
     powers = (jacobian, jacobian, jnp.zeros((), jacobian.dtype))
-    last, first, logarithm = jax.lax.fori_loop(0, AVERAGED.bit_length(), squared, powers)
+    last, first, logarithm = jax.lax.fori_loop(0, AVERAGED_STEPS.bit_length(), squared, powers)
     before = matmul_in_order(first, growth_start(jacobian[0]).direction[:, None])
     after = matmul_in_order(last, before)
     lengths = [
         jnp.log(jnp.maximum(jnp.sqrt(matmul_in_order(w.T, w)[0, 0]), tiny)) for w in (before, after)
     ]
-    return jnp.exp((logarithm / 2.0 + lengths[1] - lengths[0]) / AVERAGED)
+    return jnp.exp((logarithm / 2.0 + lengths[1] - lengths[0]) / AVERAGED_STEPS)
 
 
 def difference_sizes(x: jax.Array, direction: jax.Array, room: jax.Array) -> jax.Array:
@@ -125,7 +125,7 @@ def difference_sizes(x: jax.Array, direction: jax.Array, room: jax.Array) -> jax
     """
     first = jnp.finfo(x.dtype).eps ** (1 / 3) * jnp.maximum(1.0, jnp.sum(jnp.abs(x * direction)))
     third = jnp.maximum(first, room)
-    return jnp.stack([first, jnp.minimum(WIDER * first, third), third])
+    return jnp.stack([first, jnp.minimum(SECOND_SIZE * first, third), third])
 
 
 def directional_derivative(
@@ -142,16 +142,16 @@ def largest_difference_sizes(
     scenario: Scenario, t: jax.Array, plant: LoopState, size: int
 ) -> jax.Array:
     """The largest sizes of differences of a `closed_loop.perturbed_state`, (size,): small near
-    bounds, WIDEST elsewhere.
+    bounds, THIRD_SIZE elsewhere.
     """
     tube = scenario.context.tube(t, acceleration=False)
     side = jnp.minimum(plant.q - tube.lower, tube.upper - plant.q)
-    near = [jnp.clip(ROOM * side, 0.0, WIDEST_MOVE)]
+    near = [jnp.clip(MAX_BOUND_FRACTION * side, 0.0, THIRD_SIZE_OF_POSITION)]
     if scenario.velocity_bounds is not None:
         slow, fast = scenario.context.speed_limits(t)
         side = jnp.minimum(plant.dq - slow, fast - plant.dq)
-        near.append(jnp.clip(ROOM * side, 0.0, WIDEST))
-    rest = jnp.full((size - sum(x.size for x in near),), WIDEST, plant.q.dtype)
+        near.append(jnp.clip(MAX_BOUND_FRACTION * side, 0.0, THIRD_SIZE))
+    rest = jnp.full((size - sum(x.size for x in near),), THIRD_SIZE, plant.q.dtype)
     return jnp.concatenate([*near, rest])
 
 
@@ -168,7 +168,7 @@ def is_steep(jacobians: jax.Array, sampled: bool) -> jax.Array:
     larger = lengths[..., 1, :]
     if not sampled:
         larger = jnp.minimum(larger, lengths[..., 2, :])
-    return larger < STEEP * lengths[..., 0, :]
+    return larger < INFINITE_RATIO * lengths[..., 0, :]
 
 
 def resolved(jacobians: jax.Array, sampled: bool) -> jax.Array:
@@ -210,13 +210,15 @@ def flow(A: jax.Array, B: jax.Array, t: jax.Array) -> jax.Array:
     unit, small = jnp.eye(m, m + B.shape[1], dtype=A.dtype), A * scale
 
     def next_term(k, found):
-        return unit + (matmul_in_order(small, found) + by_input) / (TAYLOR - k).astype(A.dtype)
+        return unit + (matmul_in_order(small, found) + by_input) / (TAYLOR_TERMS - k).astype(
+            A.dtype
+        )
 
     def doubled(_, found):
         constant_part = jnp.concatenate([jnp.zeros_like(A), found[:, m:]], axis=1)
         return matmul_in_order(found[:, :m], found) + constant_part
 
-    short = jax.lax.fori_loop(0, TAYLOR, next_term, unit)
+    short = jax.lax.fori_loop(0, TAYLOR_TERMS, next_term, unit)
     return jax.lax.fori_loop(0, HALVINGS, doubled, short)
 
 

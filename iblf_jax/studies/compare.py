@@ -22,11 +22,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.control.controllers import KEEPERS, LAWS, Controller, Saturated, law_by_name
+from iblf_jax.control.controllers import (
+    KEEPERS,
+    LAWS,
+    Controller,
+    Saturated,
+    law_by_name,
+)
+from iblf_jax.control.controllers._base import law_member
 from iblf_jax.control.controllers.systems import observer_of
 from iblf_jax.control.observers import NoObserver
 from iblf_jax.core import checks, notices
-from iblf_jax.core.pytree import unwrapped
+from iblf_jax.core.optional import attributes
+from iblf_jax.core.pytree import field_values, unwrapped
 from iblf_jax.core.status import Status
 from iblf_jax.engine import Outcome, RunRequest, run_batch
 from iblf_jax.engine.simulate import simulate
@@ -139,7 +147,7 @@ def _named_laws(laws: Laws) -> dict[str, str | Controller]:
 
 def _title(law: Controller) -> str:
     inner = unwrapped(law)
-    barrier = getattr(inner, "barrier", None)
+    barrier = law_member(inner, "barrier")
     text = type(inner).__name__
     if barrier is not None:
         text += f"({type(barrier).__name__})"
@@ -153,17 +161,17 @@ def _with_law(scenario: Scenario, law: str | Controller) -> Scenario:
     if isinstance(law, str):
         own = unwrapped(scenario.controller)
         kept = {
-            name: getattr(own, name)
-            for name in ("k1", "K2", "o", "reading")
-            if getattr(own, name, None) is not None
+            name: value
+            for name, value in field_values(own).items()
+            if name in ("k1", "K2", "o", "reading") and value is not None
         }
-        p = getattr(getattr(own, "barrier", None), "p", 1)
+        p = getattr(law_member(own, "barrier"), "p", 1)
         controller = _limited_as(scenario.controller, law_by_name(law, p=p, **kept))
         observer = observer_of(law, scenario.observer)
     else:
         controller = law
         observer = scenario.observer
-        if not getattr(unwrapped(law), "uses_observer", True):
+        if not law_member(unwrapped(law), "uses_observer"):
             observer = NoObserver()
     return dataclasses.replace(scenario, controller=controller, observer=observer)
 
@@ -188,10 +196,8 @@ def gain_names(law: Controller) -> tuple[str, ...]:
     and K2 that it has.
     """
     inner = unwrapped(law)
-    return tuple(
-        getattr(inner, "gains", None)
-        or (name for name in ("k1", "K2") if getattr(inner, name, None) is not None)
-    )
+    values = field_values(inner)
+    return tuple(name for name in law_member(inner, "gains") if values.get(name) is not None)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -232,7 +238,9 @@ def _at_effort_of(
 def _scaled(scenario: Scenario, names: Sequence[str], factor: Any) -> dict[str, Any]:
     """Path -> gains times a factor, or times each of several factors, (N, ...)."""
     inner = unwrapped(scenario.controller)
-    gains = {f"controller.{name}": np.asarray(getattr(inner, name)) for name in names}
+    gains = {
+        f"controller.{name}": np.asarray(gain) for name, gain in attributes(inner, names).items()
+    }
     if np.ndim(factor) == 0:
         return {path: gain * factor for path, gain in gains.items()}
     return {
@@ -310,7 +318,9 @@ def factor_nearest_one(effort: Callable[[float], float], target: float) -> float
 def _gains_in_words(law: Controller) -> str:
     inner = unwrapped(law)
     return (
-        ", ".join(f"{name} = {_shown(getattr(inner, name))}" for name in gain_names(law))
+        ", ".join(
+            f"{name} = {_shown(gain)}" for name, gain in attributes(inner, gain_names(law)).items()
+        )
         or "no gains"
     )
 

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from iblf_jax.control.barriers import Integral
+from iblf_jax.control.controllers._base import law_member
 from iblf_jax.core import tables
 from iblf_jax.core.presentation import present
 from iblf_jax.core.pytree import unwrapped
@@ -169,7 +170,7 @@ class Comparison:
             groups.setdefault(gains, []).append(name)
         in_words = "; ".join(f"{gains} ({', '.join(names)})" for gains, names in groups.items())
         barriers = [
-            getattr(unwrapped(run.scenario.controller), "barrier", None)
+            law_member(unwrapped(run.scenario.controller), "barrier")
             for run in self.rollouts.values()
         ]
         notes = {"gains": [f"Held equal: the scenario. Gains: {in_words}."]}
@@ -256,7 +257,7 @@ def _columns(rows: tuple[Row, ...]) -> list[tuple[str, ...]]:
     shown = [
         i
         for i, name in enumerate(Row._fields)
-        if name not in OPTIONAL or any(math.isfinite(getattr(row, name)) for row in rows)
+        if name not in OPTIONAL or any(math.isfinite(float(row[i])) for row in rows)
     ]
     return [tuple(line[i] for i in shown) for line in [HEADINGS, *map(_cells, rows)]]
 

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from iblf_jax.core import devices
-from iblf_jax.core.pytree import is_leaf_field
+from iblf_jax.core.pytree import field_values, is_leaf_field
 from iblf_jax.engine import block_size
 from iblf_jax.kernels import built_for
 from iblf_jax.simulation.paths import get, parameters, unit_at
@@ -32,10 +32,7 @@ def describe_component(part: Any) -> Any:
         return np.asarray(part).tolist()
     if not dataclasses.is_dataclass(part) or isinstance(part, type):
         return _simple(part, str | bool | None)
-    fields = {
-        field.name: describe_component(getattr(part, field.name))
-        for field in dataclasses.fields(part)
-    }
+    fields = {name: describe_component(value) for name, value in field_values(part).items()}
     return {"class": type(part).__qualname__, **fields}
 
 
@@ -53,8 +50,9 @@ def structure(part: Any) -> Any:
     if not dataclasses.is_dataclass(part) or isinstance(part, type):
         return None
     found: dict[str, Any] = {"class": type(part).__qualname__}
+    values = field_values(part)
     for field in dataclasses.fields(part):
-        inner = getattr(part, field.name)
+        inner = values[field.name]
         if field.metadata.get("static"):
             found[field.name] = _simple(inner, str | bool | int | float)
         elif not is_leaf_field(field) and not isinstance(inner, jax.Array | np.ndarray):

@@ -22,7 +22,7 @@ from iblf_jax.simulation.paths import get, why_inadmissible
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.draws import Cases, Target, draw, sample_size, targets_of
 
-BATCHES = 64
+MAX_BATCHES = 64
 """How often as many points as are wanted are drawn, to find admissible ones."""
 
 
@@ -70,7 +70,7 @@ class Cube:
           ValueError: no such point was found.
         """
         rng, found, reason = np.random.default_rng(seed), [], ""
-        for _ in range(BATCHES):
+        for _ in range(MAX_BATCHES):
             for point in rng.uniform(size=(count, self.size)):
                 why = (refused or self.refused)(point)
                 if not why:
@@ -80,8 +80,8 @@ class Cube:
                 break
         if not found:
             raise self.nothing(
-                f"None of {BATCHES * count} random points is; the last: {reason} Narrow or move the"
-                " ranges."
+                f"None of {MAX_BATCHES * count} random points is; the last: {reason} Narrow or move"
+                " the ranges."
             )
         return np.resize(np.array(found), (count, self.size))
 

@@ -19,9 +19,9 @@ import numpy as np
 from iblf_jax.core import checks
 
 SAMPLERS = ("independent", "latin_hypercube", "sobol")
-MOST_RUNS = 2**32
+MAX_RUNS = 2**32
 """A run's draws come from its number, which is a uint32."""
-MOST_SOBOL = (21201, 2**30)
+MAX_SOBOL = (21201, 2**30)
 """Dimensions and points that SciPy's Sobol sequence has."""
 
 
@@ -67,12 +67,12 @@ def unit_points(
       ValueError: more than the memory holds, or than the sequence has.
     """
     checks.fits("runs" if not salt else "points", runs, 3 * 8.0 * dimension)
-    if sampler == "sobol" and (dimension > MOST_SOBOL[0] or runs // replicates > MOST_SOBOL[1]):
+    if sampler == "sobol" and (dimension > MAX_SOBOL[0] or runs // replicates > MAX_SOBOL[1]):
         came = f"{runs // replicates} of {dimension} numbers"
         raise checks.fail(
             "sampler",
             sampler,
-            f"at most {MOST_SOBOL[1]} points of {MOST_SOBOL[0]} numbers in a design, not {came}",
+            f"at most {MAX_SOBOL[1]} points of {MAX_SOBOL[0]} numbers in a design, not {came}",
         )
     from scipy.stats import qmc  # a second to import
 

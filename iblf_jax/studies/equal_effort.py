@@ -27,26 +27,26 @@ import numpy as np
 
 from iblf_jax.core.status import FAILED, WORDS, Status, describe
 
-FINE, FINE_END = 16, 2
+FINE_POINTS, FINE_OCTAVES = 16, 2
 """Grid points in a factor of two, and the powers of two up to which the grid has so many."""
-COARSE, END = 4, 5
+COARSE_POINTS, MAX_OCTAVES = 4, 5
 """The same beyond: factors from 1/32 to 32."""
-CLOSE = 1e-6
+BRACKET_WIDTH = 1e-6
 """Width of a bracket, in powers of two, from which a straight line gives the crossing."""
-ROUNDS = 9
+MAX_REFINEMENTS = 9
 """Batches of refinement at most: a bracket takes three or four."""
-LOOKS = 2
+HIDDEN_REFINEMENTS = 2
 """Batches in which places are refined where a crossing may hide."""
-JUMP = 1e-3
+JUMP_TOLERANCE = 1e-3
 """Part of the target by which a trial must come near it for a crossing to be none of a jump."""
 
-MOST_NAMED = 4
+MAX_NAMED = 4
 """Crossings, and groups of failed trials, that the text names."""
 
 NO_EFFORT = FAILED & ~(Status.VELOCITY_VIOLATED | Status.REGION_VIOLATED)
 """Flags of runs whose effort is not to be compared; constraints that a law does not know of are no
 obstacle."""
-OF_STEP = Status.STEP_TOO_LARGE | Status.INACCURATE
+STEP_FLAGS = Status.STEP_TOO_LARGE | Status.INACCURATE
 """Flags for which the time step is to blame."""
 
 
@@ -224,8 +224,10 @@ def grid() -> np.ndarray:
     """Powers of two of the factors that are tried first, growing; 0, the factor 1, is among
     them.
     """
-    fine = np.arange(-FINE * FINE_END, FINE * FINE_END + 1) / FINE
-    outer = np.arange(COARSE * FINE_END + 1, COARSE * END + 1) / COARSE
+    fine = np.arange(-FINE_POINTS * FINE_OCTAVES, FINE_POINTS * FINE_OCTAVES + 1) / FINE_POINTS
+    outer = (
+        np.arange(COARSE_POINTS * FINE_OCTAVES + 1, COARSE_POINTS * MAX_OCTAVES + 1) / COARSE_POINTS
+    )
     return np.concatenate([-outer[::-1], fine, outer])
 
 
@@ -290,10 +292,10 @@ def _refined(
     """The trials with those of the refinement among them, growing, and the powers of the
     crossings.
     """
-    for count in range(ROUNDS):
+    for count in range(MAX_REFINEMENTS):
         excess = _excess(trials, target, inaccurate)
         places = _open_brackets(powers, excess)
-        if count < LOOKS:
+        if count < HIDDEN_REFINEMENTS:
             places += _hiding_places(powers, excess)
         if not places:
             break
@@ -316,7 +318,7 @@ def _open_brackets(powers: np.ndarray, excess: np.ndarray) -> list[int]:
     enough.
     """
     opposite = excess[:-1] * excess[1:] < 0.0
-    return np.flatnonzero(opposite & (np.diff(powers) > CLOSE)).tolist()
+    return np.flatnonzero(opposite & (np.diff(powers) > BRACKET_WIDTH)).tolist()
 
 
 def _hiding_places(powers: np.ndarray, excess: np.ndarray) -> list[int]:
@@ -357,7 +359,7 @@ def _crossings(powers: np.ndarray, excess: np.ndarray, target: float) -> list[fl
     found = powers[excess == 0.0].tolist()
     for i in np.flatnonzero(excess[:-1] * excess[1:] < 0.0).tolist():
         a, b = excess[i], excess[i + 1]
-        if min(abs(a), abs(b)) > JUMP * abs(target):
+        if min(abs(a), abs(b)) > JUMP_TOLERANCE * abs(target):
             continue  # a jump
         found.append(float(powers[i] - a * (powers[i + 1] - powers[i]) / (b - a)))
     return _distinct(found)
@@ -367,15 +369,15 @@ def _distinct(powers: list[float]) -> list[float]:
     """Without repetitions: rounding makes several crossings of one."""
     kept: list[float] = []
     for power in sorted(powers, key=abs):
-        if all(abs(power - other) > 10.0 * CLOSE for other in kept):
+        if all(abs(power - other) > 10.0 * BRACKET_WIDTH for other in kept):
             kept.append(power)
     return kept
 
 
 def _few(words: Sequence[str]) -> str:
     """The first few of some words, and how many more there are."""
-    more = len(words) - MOST_NAMED
-    return ", ".join(words[:MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
+    more = len(words) - MAX_NAMED
+    return ", ".join(words[:MAX_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
 def _range(factors: Sequence[float]) -> str:

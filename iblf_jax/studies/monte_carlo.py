@@ -17,7 +17,7 @@ from iblf_jax.simulation.metrics import Fold
 from iblf_jax.simulation.sampling import has_noise
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.blocks import case_bytes
-from iblf_jax.studies.designs import MOST_RUNS, check_sampler
+from iblf_jax.studies.designs import MAX_RUNS, check_sampler
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.execution import run_all_cases
 from iblf_jax.studies.options import ThisProcess, check_deprecated, executor_of
@@ -84,7 +84,7 @@ def monte_carlo(
     """
     check_deprecated("monte_carlo", deprecated, ("chunk", "memory", "devices"))
     executor = executor_of(executor, deprecated)
-    runs = checks.positive_integer("runs", runs, most=MOST_RUNS)
+    runs = checks.positive_integer("runs", runs, most=MAX_RUNS)
     replicates = check_sampler(sampler, runs, replicates)
     _check_not_all_the_same(scenario, perturbations)
     study = prepare(

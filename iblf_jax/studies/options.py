@@ -18,7 +18,7 @@ import jax
 from iblf_jax.core import checks, notices
 from iblf_jax.engine import STUDY_MEMORY
 
-MOST_MEMORY = 2.0**60
+MAX_MEMORY = 2.0**60
 """Bytes.  No machine has more."""
 WRITERS = ("client", "worker")
 
@@ -38,9 +38,9 @@ class ThisProcess:
         """The same options with valid values; ValueError names an invalid one."""
         chunk = self.chunk
         if chunk is not None:
-            chunk = checks.positive_integer("chunk", chunk, most=checks.MOST_STEPS)
+            chunk = checks.positive_integer("chunk", chunk, most=checks.MAX_STEPS)
         remedy = "Such as memory=4e9."
-        memory = checks.number_between("memory", self.memory, 1.0, MOST_MEMORY, "bytes", remedy)
+        memory = checks.number_between("memory", self.memory, 1.0, MAX_MEMORY, "bytes", remedy)
         return ThisProcess(checks.devices("devices", self.devices), memory, chunk)
 
 
@@ -64,7 +64,7 @@ class StoreOptions:
         """The same options with valid values; ValueError names an invalid one."""
         unit = self.unit
         if unit is not None:
-            unit = checks.positive_integer("unit", unit, most=checks.MOST_STEPS)
+            unit = checks.positive_integer("unit", unit, most=checks.MAX_STEPS)
         checks.one_of("writer", self.writer, WRITERS)
         path = checks.file_path("store", self.path, "a folder")
         return StoreOptions(path, unit, self.writer, checks.flag("shared", self.shared))
@@ -142,7 +142,7 @@ def store_of(store: Any, deprecated: Mapping[str, Any]) -> StoreOptions | None:
         return store.checked()
     if store is None:
         if unit.get("unit") is not None:
-            checks.positive_integer("unit", unit["unit"], most=checks.MOST_STEPS)
+            checks.positive_integer("unit", unit["unit"], most=checks.MAX_STEPS)
         return None
     return StoreOptions(store, **unit).checked()
 

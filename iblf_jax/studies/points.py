@@ -18,7 +18,7 @@ import numpy as np
 from iblf_jax.core import checks
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.studies.designs import MOST_RUNS, split, unit_points
+from iblf_jax.studies.designs import MAX_RUNS, split, unit_points
 from iblf_jax.studies.distributions import Perturbation, is_distribution, value
 from iblf_jax.studies.draws import (
     CaseInputs,
@@ -30,7 +30,7 @@ from iblf_jax.studies.draws import (
     targets_of,
 )
 
-MOST_DIMS = 60
+MAX_DIMS = 60
 """NumPy's arrays have 64; runs and joints come on top."""
 DESIGNS = ("grid", "random", "latin_hypercube")
 POINT = "point"
@@ -79,16 +79,16 @@ def make_points(
             )
         return _grid(scenario, grid)
     return _design(
-        scenario, grid, design, checks.positive_integer("points", points, most=MOST_RUNS), seed
+        scenario, grid, design, checks.positive_integer("points", points, most=MAX_RUNS), seed
     )
 
 
 def _grid(scenario: Scenario, grid: Mapping[str, Any]) -> Points:
     ticks = {path: _ticks(scenario, path, values) for path, values in grid.items()}
     dims = {path: len(values) for path, values in ticks.items()}
-    if len(dims) > MOST_DIMS:
+    if len(dims) > MAX_DIMS:
         raise checks.fail(
-            "grid", f"{len(dims)} paths", f"at most {MOST_DIMS}, as many dimensions as an array has"
+            "grid", f"{len(dims)} paths", f"at most {MAX_DIMS}, as many dimensions as an array has"
         )
     total = math.prod(dims.values())
     checks.fits(

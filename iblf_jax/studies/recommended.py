@@ -17,9 +17,9 @@ from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.draws import targets_of
 from iblf_jax.studies.setup import prepare
 
-TOO_LARGE = Status.STEP_TOO_LARGE | Status.INACCURATE
+STEP_FLAGS = Status.STEP_TOO_LARGE | Status.INACCURATE
 """Flags of a run whose time step was too large."""
-MOST_TRIES = 8
+MAX_TRIES = 8
 
 
 @notices.each_warning_once
@@ -67,7 +67,7 @@ def recommended_dt(
     dt = step_size.find_dt(scenario, duration=duration, method=method)
     if not perturbations:
         return dt
-    for _ in range(MOST_TRIES):
+    for _ in range(MAX_TRIES):
         steps = max(round(duration / dt), 1)
         study = prepare(
             scenario,
@@ -124,7 +124,7 @@ def warn_of_step(
     """
     needed = needed_dt(status, modes, errors, dt, method)
     if needed is not None:
-        late = int(np.sum(status & int(TOO_LARGE) != 0))
+        late = int(np.sum(status & int(STEP_FLAGS) != 0))
         notices.warn(
             f"The time step dt = {dt:g} s is too large for {late} of {status.size} runs, which are"
             f" unstable or inaccurate. Take dt={needed:g}; ij.recommended_dt(scenario,"

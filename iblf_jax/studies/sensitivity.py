@@ -23,13 +23,14 @@ import numpy as np
 
 from iblf_jax.core import checks, notices, tables
 from iblf_jax.core.progress import bar
+from iblf_jax.core.pytree import field_values
 from iblf_jax.core.status import FAILED
 from iblf_jax.simulation.metrics import Fold, metric_units
 from iblf_jax.simulation.results import Metrics
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies import statistics
 from iblf_jax.studies.blocks import case_bytes, result_shapes
-from iblf_jax.studies.designs import MOST_SOBOL, split
+from iblf_jax.studies.designs import MAX_SOBOL, split
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.draws import sample_size
 from iblf_jax.studies.execution import run_all_cases
@@ -70,13 +71,12 @@ class Sensitivity:
         import xarray
 
         names = {"first_order": "S", "total_order": "ST"}
+        values = field_values(self)
         variables: dict[str, Any] = {
-            name: ("parameter", getattr(self, name), {"symbol": symbol})
-            for name, symbol in names.items()
+            name: ("parameter", values[name], {"symbol": symbol}) for name, symbol in names.items()
         }
         variables |= {
-            f"{name}_interval": (("parameter", "end"), getattr(self, f"{name}_interval"))
-            for name in names
+            f"{name}_interval": (("parameter", "end"), values[f"{name}_interval"]) for name in names
         }
         coordinates = {"parameter": list(self.parameters), "end": ["low", "high"]}
         return xarray.Dataset(
@@ -188,7 +188,7 @@ def sensitivity(
 
 
 def _checked_points(points: Any) -> int:
-    points = checks.positive_integer("points", points, most=MOST_SOBOL[1])
+    points = checks.positive_integer("points", points, most=MAX_SOBOL[1])
     if points & (points - 1) or points < 2:
         nearest = max(2, 1 << round(np.log2(points)))
         raise checks.fail("points", points, "a power of two", f"Take points={nearest}.")

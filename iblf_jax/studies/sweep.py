@@ -28,7 +28,7 @@ from iblf_jax.simulation.signals import own_dims
 from iblf_jax.studies import config as configuration
 from iblf_jax.studies.blocks import case_bytes, named_arrays, result_shapes
 from iblf_jax.studies.dataset import DRAWN, to_dataset
-from iblf_jax.studies.designs import MOST_RUNS, check_sampler
+from iblf_jax.studies.designs import MAX_RUNS, check_sampler
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.execution import run_all_cases, run_spans
 from iblf_jax.studies.interrupt import Interrupted, StopRequest
@@ -127,7 +127,7 @@ def sweep(
     store_options = store_of(store, deprecated)
     points = design_of(design, deprecated)
     progress = checks.flag("progress", progress, optional=True)
-    runs = checks.positive_integer("runs", runs, most=MOST_RUNS)
+    runs = checks.positive_integer("runs", runs, most=MAX_RUNS)
     if perturbations is None:
         perturbations = {}
     replicates = check_sampler(sampler, runs, replicates)

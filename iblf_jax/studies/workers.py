@@ -44,7 +44,7 @@ from iblf_jax.studies.options import ThisProcess
 from iblf_jax.studies.setup import PreparedStudy
 from iblf_jax.studies.store import StoreError, load_store
 
-MOST_IN_FLIGHT = 1024
+MAX_IN_FLIGHT = 1024
 """Tasks that are submitted and not done: their results may wait in the client's memory."""
 THREAD_VARIABLES = ("IBLF_JAX_THREADS", "NPROC", "OMP_NUM_THREADS")
 """Environment variables that limit the threads of kernels, XLA and other libraries."""
@@ -248,7 +248,7 @@ def run_on_workers(
     remaining, waiting = iter(spans), dict[Future, slice]()
     try:
         while True:
-            for span in itertools.islice(remaining, MOST_IN_FLIGHT - len(waiting)):
+            for span in itertools.islice(remaining, MAX_IN_FLIGHT - len(waiting)):
                 waiting[executor.submit(run_task, payload, span.start, span.stop)] = span
             if not waiting:
                 return

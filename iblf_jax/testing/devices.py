@@ -14,6 +14,7 @@ from jax.flatten_util import ravel_pytree
 from iblf_jax.control.actuators import Actuator, Delivered
 from iblf_jax.control.sensors import Measurement, Sensor
 from iblf_jax.control.sensors._base import unrounded
+from iblf_jax.core.optional import has_members
 from iblf_jax.testing._contract import (
     Findings,
     check_function,
@@ -130,7 +131,7 @@ def _delivers(findings: Findings, actuator, command, dq) -> None:
     found = shape_of(findings, label, actuator.deliver, command, dq, state)
     if found is None:
         return
-    if not all(hasattr(found, field) for field in Delivered._fields):
+    if not has_members(found, *Delivered._fields):
         remedy = "It must be an iblf_jax.actuators.Delivered(tau, limited, rate)"
         findings.add(f"{label} gives {type(found).__name__}", remedy)
         return

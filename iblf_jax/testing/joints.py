@@ -12,7 +12,7 @@ import numpy as np
 from iblf_jax.control.controllers import Backstepping
 from iblf_jax.control.observers import Printed
 from iblf_jax.core import checks
-from iblf_jax.core.pytree import is_leaf_field
+from iblf_jax.core.pytree import field_values, is_leaf_field
 from iblf_jax.presets import customary_two_link, zhang_yan_2024
 from iblf_jax.simulation.scenario import Initial, Scenario, fit_joints
 from iblf_jax.testing._contract import Findings
@@ -49,8 +49,9 @@ def _declared_sizes(member: Any) -> Iterator[int]:
             yield from _declared_sizes(part)
     if not dataclasses.is_dataclass(member) or isinstance(member, type):
         return
+    values = field_values(member)
     for field in dataclasses.fields(member):
-        value = getattr(member, field.name)
+        value = values[field.name]
         if not is_leaf_field(field):
             yield from _declared_sizes(value)
         elif field.metadata["shape"] == "joint" and np.ndim(value) == 1:
@@ -67,7 +68,7 @@ def _undeclared(member: Any) -> list[Any]:
 def check_number(n: int | None) -> None:
     """Raises ValueError unless `n` is None or a number of joints."""
     if n is not None:
-        checks.positive_integer("n", n, most=checks.MOST_JOINTS)
+        checks.positive_integer("n", n, most=checks.MAX_JOINTS)
 
 
 def number_of_joints(findings: Findings, member: Any, n: int | None) -> int:

@@ -10,6 +10,7 @@ import numpy as np
 
 from iblf_jax.certificates.claims import OWN_CLAIM_METHODS
 from iblf_jax.control.controllers._base import law_member
+from iblf_jax.core.optional import attributes, has_members
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.testing._contract import Findings, check_function, in_dtype, shape_of
 
@@ -25,7 +26,7 @@ def check_claims(findings: Findings, scenario: Scenario) -> None:
     The inequalities are tested with an exact estimate, f_tilde = 0.
     """
     law: Any = scenario.controller
-    stated = [name for name in OWN_CLAIM_METHODS if hasattr(law, name)]
+    stated = [name for name in OWN_CLAIM_METHODS if has_members(law, name)]
     if not stated:
         return
     remedy = "A law states both, or neither: iblf_jax.controllers.LyapunovLaw"
@@ -41,7 +42,8 @@ def check_claims(findings: Findings, scenario: Scenario) -> None:
     def outputs(law, t, q, dq, f_tilde, context):
         own = law.init(q, dq, context)
         return {
-            name: getattr(law, name)(t, q, dq, f_tilde, context, own) for name in OWN_CLAIM_METHODS
+            name: method(t, q, dq, f_tilde, context, own)
+            for name, method in attributes(law, OWN_CLAIM_METHODS).items()
         }
 
     check_function(findings, outputs, law, (t, q[0], dq[0], f_tilde, context))
@@ -77,8 +79,8 @@ def _shapes(findings: Findings, scenario: Scenario) -> None:
     own = law.init(q, dq, context)
     arguments = (t, q, dq, zero, context, own)
     calls: dict[str, tuple[Any, tuple]] = {}
-    for name in OWN_CLAIM_METHODS:
-        calls[f"{name}(t, q, dq, f_tilde, context, state)"] = (getattr(law, name), arguments)
+    for name, method in attributes(law, OWN_CLAIM_METHODS).items():
+        calls[f"{name}(t, q, dq, f_tilde, context, state)"] = (method, arguments)
     disturbance_terms = law_member(law, "disturbance_terms")
     if disturbance_terms is not None:
         label = "disturbance_terms(t, q, dq, f_tilde, df, context, state)"
@@ -91,7 +93,7 @@ def _shapes(findings: Findings, scenario: Scenario) -> None:
 
 def _is_summable(findings: Findings, label: str, got: Any, like: jax.Array) -> None:
     """Requires that a method returns one number, or one per joint, of the arguments' type."""
-    fits = hasattr(got, "shape") and got.shape in ((), like.shape)
+    fits = has_members(got, "shape") and got.shape in ((), like.shape)
     remedy = f"It must be an array of shape () or {like.shape}, which is summed"
     if not findings.require(fits, f"{label} gives {got}", remedy):
         return

@@ -178,7 +178,7 @@ def _checked_sizes(starts: Any, iterations: Any, seed: Any) -> tuple[int, int, i
     """Number of attacks, of their steps, and the seed."""
     starts = checks.positive_integer("starts", starts)
     checks.fits("starts", starts, 8.0 * NUMBERS_A_RUN)
-    iterations = checks.positive_integer("iterations", iterations, most=checks.MOST_STEPS)
+    iterations = checks.positive_integer("iterations", iterations, most=checks.MAX_STEPS)
     checks.fits("iterations", iterations, 8 * starts)
     return starts, iterations, checks.seed(seed)
 

@@ -3,7 +3,7 @@ points in its largest gaps.
 
 With A = log risk_b[a_b], B = log risk_b[b_b], an end minimises one of them only,
 
-    minimise A,      and then     minimise B   subject to   A <= A_end + TRADE,
+    minimise A,      and then     minimise B   subject to   A <= A_end + END_TOLERANCE,
 
 so that the end does not have a large B for an A that hardly depends on it; the other end likewise.
 Searches for the ends begin at the scenario's gains and at the best of some points that are spread
@@ -40,7 +40,7 @@ from iblf_jax.core.presentation import present
 from iblf_jax.core.progress import bar
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.studies.designs import MOST_RUNS
+from iblf_jax.studies.designs import MAX_RUNS
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.tuning.evaluation import NO_LEVEL, NUMBERS_A_RUN, Value
 from iblf_jax.tuning.objectives import Objective
@@ -52,13 +52,13 @@ from iblf_jax.tuning.search import Evaluator, Search
 from iblf_jax.tuning.solvers import SQP
 from iblf_jax.tuning.starts import screened
 
-TRADE = 1e-3
+END_TOLERANCE = 1e-3
 """By how much an end may be above the least value of its objective, relative to it."""
-CLOSE = 0.05
+GAP_TOLERANCE = 0.05
 """Neighbours whose objectives differ by less, relatively, have no gap between them."""
-BATCH = 8
+MAX_BATCH = 8
 """Number of points that are searched for in one batch at most."""
-BETWEEN = 8
+POINTS_BETWEEN = 8
 """Number of values on the lines between neighbours, for each point."""
 
 
@@ -164,8 +164,8 @@ def pareto(
     Source: head of this module.
     """
     began = time.perf_counter()
-    points = checks.positive_integer("points", points, least=2, most=MOST_RUNS)
-    iterations = checks.positive_integer("iterations", iterations, most=checks.MOST_STEPS)
+    points = checks.positive_integer("points", points, least=2, most=MAX_RUNS)
+    iterations = checks.positive_integer("iterations", iterations, most=checks.MAX_STEPS)
     tolerance = checks.number_between("tolerance", tolerance, 0.0, 1.0, "1")
     problem = TuningProblem.build(
         scenario,
@@ -185,8 +185,8 @@ def pareto(
         came = f"{problem.size} numbers"
         expected = f"at most {FORWARD_MOST} for a front"
         raise checks.fail("parameters", came, expected, "Tie or leave out some.")
-    checks.fits("points", points, 8.0 * BETWEEN * problem.runs * NUMBERS_A_RUN)
-    search = FrontSearch(problem, min(points, BATCH), iterations, tolerance)
+    checks.fits("points", points, 8.0 * POINTS_BETWEEN * problem.runs * NUMBERS_A_RUN)
+    search = FrontSearch(problem, min(points, MAX_BATCH), iterations, tolerance)
     with bar(progress, points, unit="points") as shown:
         search.run(points, seed, shown)
     return search.front(time.perf_counter() - began)
@@ -243,7 +243,7 @@ class FrontSearch:
                 np.array([gap.level for gap in gaps]),
             )
             shown.update(len(gaps))
-        self.fill(BETWEEN * points)
+        self.fill(POINTS_BETWEEN * points)
 
     def ends(self, seed: int) -> None:
         """Both ends: each objective alone, and then the other one at nearly no cost to it.
@@ -264,7 +264,7 @@ class FrontSearch:
                 "Loosen them, or tune to them first.",
             )
         least = np.argmin(self.terms, axis=0)
-        levels = np.log(np.min(self.terms, axis=0)) + TRADE
+        levels = np.log(np.min(self.terms, axis=0)) + END_TOLERANCE
         self.minimise(self.z[least], np.array([1, 0]), levels)
 
     def minimise(self, z: np.ndarray, objectives: np.ndarray, levels: np.ndarray) -> None:
@@ -340,8 +340,8 @@ class FrontSearch:
         size = np.abs(ends[1] - ends[0])
         for k in np.argsort(-size).tolist():
             low, high = np.sort(ends[:, k])
-            had_level = any(j == k and low + 2 * TRADE < x < high for j, x in self.levels)
-            if size[k] > CLOSE and not had_level:
+            had_level = any(j == k and low + 2 * END_TOLERANCE < x < high for j, x in self.levels)
+            if size[k] > GAP_TOLERANCE and not had_level:
                 middle = 0.5 * (self.z[one] + self.z[other])
                 return Gap(float(size[k]), middle, 1 - k, 0.5 * (low + high))
         return None

@@ -102,7 +102,7 @@ def tune(
     Source: design of this package; see the modules of `iblf_jax.tuning` for the methods.
     """
     began = time.perf_counter()
-    iterations = checks.positive_integer("iterations", iterations, most=checks.MOST_STEPS)
+    iterations = checks.positive_integer("iterations", iterations, most=checks.MAX_STEPS)
     options = options_of(solver, report, progress, deprecated)
     if checkpoint is not None:
         checkpoint = checks.file_to_write("checkpoint", checkpoint)

@@ -17,6 +17,7 @@ import jax
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.pytree import field_values
 from iblf_jax.tuning.problem import TuningProblem
 from iblf_jax.tuning.search import Search
 from iblf_jax.tuning.solvers import Solver
@@ -29,8 +30,11 @@ def fingerprint(problem: TuningProblem, solver: Solver, mode: str, iterations: i
     """A hash of everything that a checkpoint must agree with."""
     options = {}
     if dataclasses.is_dataclass(solver):
-        fields = [x.name for x in dataclasses.fields(solver)]
-        options = {x: getattr(solver, x) for x in fields if x not in NOT_PART_OF_THE_PROBLEM}
+        options = {
+            name: value
+            for name, value in field_values(solver).items()
+            if name not in NOT_PART_OF_THE_PROBLEM
+        }
     if "schedule" in options:
         options["iterations"] = iterations  # a schedule ends with the last step
     leaves, structure = jax.tree.flatten(problem)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from iblf_jax.core import checks, notices
-from iblf_jax.studies.designs import MOST_RUNS
+from iblf_jax.studies.designs import MAX_RUNS
 from iblf_jax.studies.statistics import check_confidence
 from iblf_jax.tuning.runs import differentiates_forward
 from iblf_jax.tuning.solvers import SOLVERS, Solver
@@ -34,7 +34,7 @@ class Report:
     confidence: float = 0.95
 
     def __post_init__(self) -> None:
-        runs = checks.positive_integer("report_runs", self.runs, most=MOST_RUNS)
+        runs = checks.positive_integer("report_runs", self.runs, most=MAX_RUNS)
         object.__setattr__(self, "runs", runs)
         if self.seed is not None:
             object.__setattr__(self, "seed", checks.seed(self.seed, "report_seed"))

@@ -25,9 +25,9 @@ from iblf_jax.core import checks
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.draws import check_paths
-from iblf_jax.tuning.ranges import GIVEN, default_highs, default_low
+from iblf_jax.tuning.ranges import AS_GIVEN, default_highs, default_low
 
-EDGE = 1e-3
+LIMIT_DISTANCE = 1e-3
 """Smallest distance of the start of a squashed coordinate from a limit, relative to the box."""
 
 
@@ -152,10 +152,10 @@ def layout(
     reasons: list[tuple[str, str]] = []
     for item in tunables:
         value, log, sign = starts[item.path]
-        low, below = item.low, GIVEN
+        low, below = item.low, AS_GIVEN
         if low is None:
             low, below = default_low(item.path, sign, value)
-        high, above = highs.get(item.path, (item.high, GIVEN))
+        high, above = highs.get(item.path, (item.high, AS_GIVEN))
         limits = _limit(item, "low", low, value), _limit(item, "high", high, value)
         block, part = _block(item, value, *limits, start=len(reasons), log=log)
         blocks.append(block)
@@ -265,14 +265,14 @@ def squashed(box: Box, w: np.ndarray) -> tuple[np.ndarray, Callable[[np.ndarray]
 
 
 def unsquash(z: np.ndarray, box: Box) -> np.ndarray:
-    """The w whose `squash` is z; a z at a limit is moved inside by EDGE."""
+    """The w whose `squash` is z; a z at a limit is moved inside by LIMIT_DISTANCE."""
     w = np.array(z, float)
     for i, (x, low, high) in enumerate(zip(w, box.low, box.high, strict=True)):
         if np.isfinite(low) and np.isfinite(high):
-            share = np.clip((x - low) / (high - low), EDGE, 1 - EDGE)
+            share = np.clip((x - low) / (high - low), LIMIT_DISTANCE, 1 - LIMIT_DISTANCE)
             w[i] = np.log(share / (1 - share))
         elif np.isfinite(low):
-            w[i] = np.log(np.expm1(max(x - low, EDGE)))
+            w[i] = np.log(np.expm1(max(x - low, LIMIT_DISTANCE)))
         elif np.isfinite(high):
-            w[i] = np.log(np.expm1(max(high - x, EDGE)))
+            w[i] = np.log(np.expm1(max(high - x, LIMIT_DISTANCE)))
     return w

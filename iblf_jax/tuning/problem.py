@@ -21,7 +21,7 @@ from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.sampling import check_step, has_noise
 from iblf_jax.simulation.scenario import Scenario, canonical, fit_joints
-from iblf_jax.studies.designs import MOST_RUNS
+from iblf_jax.studies.designs import MAX_RUNS
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.draws import Cases, Target, targets_of
 from iblf_jax.studies.recommended import recommended_dt
@@ -117,7 +117,7 @@ class TuningProblem:
         steps = checks.whole_steps(duration, dt)
         goal = checked(objective)
         seed = checks.seed(seed)
-        runs = checks.positive_integer("runs", runs, most=MOST_RUNS)
+        runs = checks.positive_integer("runs", runs, most=MAX_RUNS)
         scenario = canonical(scenario)
         check_step(scenario, float(dt))
         if perturbations is None:

@@ -16,7 +16,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
-MOST_ITERATIONS = 60
+MAX_ITERATIONS = 60
 """Iterations; about fifteen are needed."""
 PRECISION = 1e-11
 """Of all conditions, relative to the numbers of the programme."""
@@ -40,7 +40,7 @@ def solve(
     s = np.maximum(b, 1.0)
     y = np.ones(len(b))
     limit = PRECISION * (1.0 + float(np.max(np.abs(b))))
-    for _ in range(MOST_ITERATIONS):
+    for _ in range(MAX_ITERATIONS):
         dual = H @ x + c + A.T @ y
         primal = A @ x + s - b
         gap = max(float(s @ y) / len(b), 1e-300)

@@ -38,7 +38,7 @@ from iblf_jax.simulation.metrics import Fold
 from iblf_jax.simulation.signals import Sample
 from iblf_jax.tuning.runs import Outer
 
-FAR = 1e6
+INITIAL_PEAK = 1e6
 """Minus the initial value of a peak, in units of its scale."""
 SOFT_EDGE = 0.1
 """Width of the soft edge of a tolerance, as a part of it."""
@@ -297,7 +297,7 @@ class Peak:
             if not one_side:
                 weights = jnp.concatenate([weights, weights])
             y = y * weights
-        return jnp.where(sample.t >= self.after * (1 - 1e-6), y / self.scale, -FAR)
+        return jnp.where(sample.t >= self.after * (1 - 1e-6), y / self.scale, -INITIAL_PEAK)
 
     def init(self, sample: Sample):
         """Far below zero, (W, 2 k) for k joints, or (W, m) for m regions; the predecessor of the
@@ -306,7 +306,7 @@ class Peak:
         count = 1
         if self.windows is not None:
             count += self.windows.size
-        return jnp.full((count, self._entries(sample)), -FAR, sample.t.dtype), sample.tau
+        return jnp.full((count, self._entries(sample)), -INITIAL_PEAK, sample.t.dtype), sample.tau
 
     def _entries(self, sample: Sample) -> int:
         """How many numbers the signal has at one sample."""

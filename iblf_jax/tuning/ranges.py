@@ -2,17 +2,18 @@
 of time step, sampling period and drive.
 
 The lower end of a leaf is k1 > 0, K2 > 1/2 or kf > 1 where all its entries start there, otherwise
-its sign decides.  The upper end of a gain x is f x0 with the largest f <= MOST for which the loop
-at the start and along its reference satisfies
+its sign decides.  The upper end of a gain x is f x0 with the largest f <= MAX_FACTOR for which the
+loop at the start and along its reference satisfies
 
-    dt |lambda|_max <= SHARE * (the integrator's stability range)     for a continuous law,
-    rho(map from a period to the next) < 1                            for a sampled law,
+    dt |lambda|_max <= STABILITY_FRACTION R                     for a continuous law,
+    rho(map from a period to the next) < 1                      for a sampled law,
 
-and, where there is a sensor, the drive at rest can deliver each torque of |d tau / d y_j| r_j and
-(sum_kj (d tau / d w_kj)^2)^(1/2).  One count r_j of a joint's encoder, and one standard deviation
-of all its noise w, are steps of the command that the motion does not need.  Where such a step alone
-exceeds the torque of a drive, or its rate (bandwidth times the step, behind a lag), the drive
-tracks the encoder.  A drive that the starting gains already exceed sets no limit.
+where R is the stability range of the integrator, and, where there is a sensor, the drive at rest
+can deliver each torque of |d tau / d y_j| r_j and (sum_kj (d tau / d w_kj)^2)^(1/2).  One count r_j
+of a joint's encoder, and one standard deviation of all its noise w, are steps of the command that
+the motion does not need.  Where such a step alone exceeds the torque of a drive, or its rate
+(bandwidth times the step, behind a lag), the drive tracks the encoder.  A drive that the starting
+gains already exceed sets no limit.
 
 First each gain is examined with the others at their start.  Then all gains with default ranges are
 scaled together, each to f_i^s x0, with the largest s up to 1 for which the same conditions hold.
@@ -29,7 +30,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.control.sensors._base import unrounded
+from iblf_jax.control.actuators._base import actuator_member
+from iblf_jax.control.sensors._base import sensor_member, unrounded
 from iblf_jax.simulation.closed_loop import LoopState, run_sampled_law
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.paths import with_parameters
@@ -39,26 +41,31 @@ from iblf_jax.tuning.runs import fastest_along, radius_at, start_and_along
 CONDITIONS = {"controller.k1": 0.05, "controller.K2": 0.505, "observer.kf": 1.01}
 """Default lower limits: just inside Theorem 2's conditions (3.17), (3.25) on the gains of the
 paper's law."""
-SHARE = 0.7
+STABILITY_FRACTION = 0.7
 """Part of the integrator's stability range that gains may use by default."""
 TIMES = np.linspace(0.0, 6.0, 7)
 """Along the reference, at which the loop is examined [s]."""
-MOST = 1e2
+MAX_FACTOR = 1e2
 """Largest upper end of a gain by default, relative to its start."""
 HALVINGS = 10
-ROOM = 1.01
+FACTOR_BEYOND_CONDITION = 1.01
 """Upper end of a gain, relative to its start, where already the start violates a condition."""
-GIVEN, THEOREM, SIGN, NONE = "as given", "the conditions of Theorem 2", "its sign", "none"
-FACTOR = f"{MOST:g} times its start"
-STEP, PERIOD = (
+AS_GIVEN, BY_THEOREM, BY_SIGN, UNLIMITED = (
+    "as given",
+    "the conditions of Theorem 2",
+    "its sign",
+    "none",
+)
+BY_FACTOR = f"{MAX_FACTOR:g} times its start"
+BY_STEP, BY_PERIOD = (
     "beyond it the step dt is too long for the loop",
     "beyond it the loop is unstable at its sampling period",
 )
-COUNT = (
+BY_COUNT = (
     "beyond it one count of the encoder commands more torque, or a higher rate of it, than the"
     " drive can deliver"
 )
-NOISE = (
+BY_NOISE = (
     "beyond it the sensor's noise commands more torque, or a higher rate of it, than the drive can"
     " deliver"
 )
@@ -69,10 +76,10 @@ def default_low(path: str, sign: str | None, start: np.ndarray) -> tuple[float, 
     """The lower end of the range of a leaf that starts at `start`, and why it is there."""
     leaf = re.sub(r"(\[\d+\])+$", "", path)
     if leaf in CONDITIONS and np.all(start >= CONDITIONS[leaf]):
-        return CONDITIONS[leaf], THEOREM
+        return CONDITIONS[leaf], BY_THEOREM
     if sign in ("positive", "nonnegative"):
-        return 0.0, SIGN
-    return -np.inf, NONE
+        return 0.0, BY_SIGN
+    return -np.inf, UNLIMITED
 
 
 def default_highs(
@@ -91,7 +98,9 @@ def default_highs(
         if path.startswith(("controller.", "observer.")) and np.all(x > 0)
     }
     ends: dict[str, tuple[np.ndarray, str]] = {
-        path: (np.full(x.shape, np.inf), NONE) for path, x in values.items() if path not in gains
+        path: (np.full(x.shape, np.inf), UNLIMITED)
+        for path, x in values.items()
+        if path not in gains
     }
     limited_by_drive = not drive_exceeded(scenario)
 
@@ -100,14 +109,16 @@ def default_highs(
         scaled = {path: jnp.asarray(gains[path] * np.exp(x)) for path, x in logarithms.items()}
         changed = with_parameters(scenario, scaled)
         if changed.sampling is None:
-            fits = dt * fastest_along(changed, TIMES) <= SHARE * tableau(method).stability
-            return "" if fits else STEP
+            fits = (
+                dt * fastest_along(changed, TIMES) <= STABILITY_FRACTION * tableau(method).stability
+            )
+            return "" if fits else BY_STEP
         if sampled_too_slowly(changed):
-            return PERIOD
+            return BY_PERIOD
         return drive_exceeded(changed) if limited_by_drive else ""
 
     def by_one(path: str, share: float) -> str:
-        return violated({path: share * float(np.log(MOST))})
+        return violated({path: share * float(np.log(MAX_FACTOR))})
 
     def by_all(share: float) -> str:
         return violated({path: share * x for path, x in reach.items()})
@@ -116,15 +127,15 @@ def default_highs(
     why: dict[str, str] = {}
     for path in gains:
         share, reason = _largest_share(partial(by_one, path))
-        reach[path] = share * float(np.log(MOST))
-        why[path] = reason or FACTOR
+        reach[path] = share * float(np.log(MAX_FACTOR))
+        why[path] = reason or BY_FACTOR
     share, reason = 1.0, ""
     if len(gains) > 1:
         share, reason = _largest_share(by_all)
     for path, x in gains.items():
-        factor = ROOM
+        factor = FACTOR_BEYOND_CONDITION
         if reach[path] > 0:
-            factor = max(np.exp(share * reach[path]), ROOM)
+            factor = max(np.exp(share * reach[path]), FACTOR_BEYOND_CONDITION)
             if reason:
                 why[path] = reason + TOGETHER
         ends[path] = factor * x, why[path]
@@ -165,13 +176,13 @@ def drive_exceeded(scenario: Scenario) -> str:
     rest; empty where it does not.
     """
     actuator = scenario.actuator
-    if scenario.sampling is None or not hasattr(actuator, "unlimited"):
+    if scenario.sampling is None or actuator_member(actuator, "unlimited") is None:
         return ""
     commands = _command_steps(scenario, jnp.asarray(TIMES, scenario.initial.q.dtype))
     zero = jnp.zeros_like(scenario.initial.q)
     rest = actuator.init(zero)
     deliver = jax.vmap(lambda tau: actuator.deliver(tau, zero, rest).limited)
-    for reason, torques in zip((COUNT, NOISE), commands, strict=True):
+    for reason, torques in zip((BY_COUNT, BY_NOISE), commands, strict=True):
         if bool(jnp.any(deliver(torques.reshape(-1, scenario.n)))):
             return reason
     return ""
@@ -185,7 +196,7 @@ def _command_steps(scenario: Scenario, times: jax.Array) -> tuple[jax.Array, jax
     sensor = scenario.sensor
     # A sensor without rounding or resolution has no counts.
     smooth = dataclasses.replace(scenario, sensor=unrounded(sensor))
-    resolution = jnp.asarray(getattr(sensor, "resolution", 0.0), times.dtype)
+    resolution = jnp.asarray(sensor_member(sensor, "resolution"), times.dtype)
     count = jnp.broadcast_to(resolution, (scenario.n,))
 
     def command(t: jax.Array, state: LoopState, q: jax.Array, normal: jax.Array) -> jax.Array:

@@ -26,14 +26,14 @@ from iblf_jax.tuning.report import ReportCase, TuningReport, make_report
 from iblf_jax.tuning.robust import Risk
 from iblf_jax.tuning.runs import RunRequest, run_batch, run_rollout, values_together
 
-FAR = 100.0
+LARGE_CHANGE = 100.0
 """Factor by which a gain may change before a warning is given."""
 STUCK = (
     "the steps became too small: the model of objective and requirements does not hold near these"
     " gains"
 )
 """Why a search ended whose trust region collapsed before the conditions of an optimum were met."""
-NEAR = 0.01
+LIMIT_TOLERANCE = 0.01
 """A number is at a limit if it differs from it by no more than this part of it (of the range, where
 the limit is 0)."""
 
@@ -159,7 +159,7 @@ class TuneResult:
             if not np.isfinite(width):
                 width = 1.0
             for side, end, reason in zip(("lower", "upper"), ends, reasons, strict=True):
-                if np.isfinite(end) and abs(x - end) <= NEAR * (abs(end) or width):
+                if np.isfinite(end) and abs(x - end) <= LIMIT_TOLERANCE * (abs(end) or width):
                     found[name] = AtLimit(float(x), side, float(end), reason)
         return found
 
@@ -221,12 +221,12 @@ class TuneResult:
         return lines
 
     def _distant_gains(self) -> list[str]:
-        """A warning for each gain that has changed by more than the factor FAR."""
+        """A warning for each gain that has changed by more than the factor LARGE_CHANGE."""
         lines = []
         first = np.concatenate([np.ravel(paths.get(self.start, path)) for path in self.values])
         last = np.concatenate([np.ravel(value) for value in self.values.values()])
         for name, before, after in zip(self._entries, first, last, strict=True):
-            if before * after > 0 and not 1 / FAR < after / before < FAR:
+            if before * after > 0 and not 1 / LARGE_CHANGE < after / before < LARGE_CHANGE:
                 lines.append(
                     f"WARNING: {name} ended at {after / before:.3g} times its start: the objective"
                     " hardly depends on it, or has no cost of it"

@@ -39,7 +39,7 @@ from iblf_jax.tuning.solvers import SearchSpace, Solver
 
 STEPS_PER_UPDATE = 12
 """Steps at most between two updates of the multipliers."""
-MOST_UPDATES = 12
+MAX_UPDATES = 12
 PENALTY_FACTOR = 5.0
 LARGEST_PENALTY = 1e6
 SMALL_EXCESS = 1e-3
@@ -329,7 +329,7 @@ class Search:
         multipliers = state["multipliers"][s]
         penalty = state["penalty"][s]
         worst = float(np.max(np.maximum(excess, -multipliers / penalty)))
-        if converged and (abs(worst) < SMALL_EXCESS or state["updates"][s] >= MOST_UPDATES):
+        if converged and (abs(worst) < SMALL_EXCESS or state["updates"][s] >= MAX_UPDATES):
             state["finished"][s] = True
             return
         # The multipliers follow from the penalty parameter of the steps that have been made.

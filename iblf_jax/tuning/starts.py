@@ -6,11 +6,12 @@ starts that leave their bounds by points of the box that do not.
 With requirements that are active at the optimum, many gains have many local minima: at each of them
 other peaks are at their limit.  `NearbyStarts` therefore evaluates
 
-    f + PENALTY |f| sum_r max(0, G_r)
+    f + EXCESS_WEIGHT |f| sum_r max(0, G_r)
 
-at POINTS_A_GAIN points a gain, drawn within |z_i - z0_i| <= REACH, and the search begins at the
-lowest.  If that search has converged soon, a second one begins at the lowest point that is at least
-DISTANCE, in one coordinate, from where the first began and from where it ended (`search`).
+at POINTS_A_GAIN points a gain, drawn within |z_i - z0_i| <= PROBE_RANGE, and the search begins at
+the lowest.  If that search has converged soon, a second one begins at the lowest point that is at
+least MIN_DISTANCE, in one coordinate, from where the first began and from where it ended
+(`search`).
 """
 
 from __future__ import annotations
@@ -25,19 +26,19 @@ from iblf_jax.tuning.parameters import Box
 from iblf_jax.tuning.problem import TuningProblem
 
 POINTS_A_GAIN = 14
-REACH = 1.5
+PROBE_RANGE = 1.5
 """Ten problems of six and nine gains, six starts each, 40 evaluations with derivatives.  The mean
 gap to the best known optimum was 6.1 % from the scenario's gains with a first trust region of 1,
-3.1 % with one of 0.5, 1.8 % from the best of 128 points (3.4 % within REACH 2), and 1.4 % with the
-second search (2.8 %)."""
-DISTANCE = 0.75
-PENALTY = 2.0
+3.1 % with one of 0.5, 1.8 % from the best of 128 points (3.4 % within PROBE_RANGE 2), and 1.4 %
+with the second search (2.8 %)."""
+MIN_DISTANCE = 0.75
+EXCESS_WEIGHT = 2.0
 """Of an excess, relative to the objective; with 10 the gap was 1.6 % instead of 1.4 %, with 10,000
 it was 2.0 %."""
-SPREAD = 1.0
+START_RANGE = 1.0
 """Half-width of the box around the start in which further starts are drawn, in the coordinates z: a
 factor e for gains."""
-SCREENED = 32
+SCREENED_POINTS = 32
 """Number of points of the box that are evaluated where the first start leaves its bounds, and for
 the ends of a front."""
 
@@ -62,11 +63,11 @@ class NearbyStarts:
         size = len(box.z)
         count = POINTS_A_GAIN * size
         rng = np.random.default_rng([seed, 4])
-        drawn = box.z + rng.uniform(-REACH, REACH, (count - 1, size))
+        drawn = box.z + rng.uniform(-PROBE_RANGE, PROBE_RANGE, (count - 1, size))
         points = np.concatenate([box.z[None], np.clip(drawn, box.low, box.high)])
         found = values(points)
         excess = np.sum(np.maximum(found.exact_excess, 0.0), axis=1)
-        merit = found.objective + PENALTY * np.abs(found.objective) * excess
+        merit = found.objective + EXCESS_WEIGHT * np.abs(found.objective) * excess
         fine = found.valid & np.isfinite(merit) & (found.margin > 0)
         # The sort is stable, so that the start is first where no point is fine.
         order = np.argsort(np.where(fine, merit, np.inf), kind="stable")
@@ -77,11 +78,11 @@ class NearbyStarts:
         """The values at the first point, (1, ...)."""
 
     def away_from(self, others: np.ndarray) -> np.ndarray | None:
-        """The best point, (p,), that differs by DISTANCE in one coordinate from each of `others`,
-        (k, p); None if there is none.
+        """The best point, (p,), that differs by MIN_DISTANCE in one coordinate from each of
+        `others`, (k, p); None if there is none.
         """
         for z in self.points:
-            is_away = np.all(np.max(np.abs(others - z), axis=1) > DISTANCE)
+            is_away = np.all(np.max(np.abs(others - z), axis=1) > MIN_DISTANCE)
             if is_away and not self.is_refused(z):
                 return z
         return None
@@ -90,7 +91,7 @@ class NearbyStarts:
 def starting_points(box: Box, starts: int, seed: int) -> np.ndarray:
     """The scenario's point and `starts - 1` drawn around it, inside the box, (S, p)."""
     rng = np.random.default_rng([seed, 1])
-    drawn = box.z + rng.uniform(-SPREAD, SPREAD, (starts - 1, len(box.z)))
+    drawn = box.z + rng.uniform(-START_RANGE, START_RANGE, (starts - 1, len(box.z)))
     return np.concatenate([box.z[None], np.clip(drawn, box.low, box.high)])
 
 
@@ -142,17 +143,17 @@ def _sampled_fast_enough(
 def screened(
     problem: TuningProblem, seed: int, z: np.ndarray
 ) -> tuple[np.ndarray, Value, np.ndarray]:
-    """The points z (S, p) and SCREENED of the box, their values, and by how much they violate
-    requirements and bounds.
+    """The points z (S, p) and SCREENED_POINTS of the box, their values, and by how much they
+    violate requirements and bounds.
 
     Raises:
       ValueError: none of them can be integrated; the message names a step that is small enough.
     """
     box = problem.box
     rng = np.random.default_rng([seed, 2])
-    low = np.where(np.isfinite(box.low), box.low, box.z - 3 * SPREAD)
-    high = np.where(np.isfinite(box.high), box.high, box.z + 3 * SPREAD)
-    points = np.concatenate([z, rng.uniform(low, high, (SCREENED, len(low)))])
+    low = np.where(np.isfinite(box.low), box.low, box.z - 3 * START_RANGE)
+    high = np.where(np.isfinite(box.high), box.high, box.z + 3 * START_RANGE)
+    points = np.concatenate([z, rng.uniform(low, high, (SCREENED_POINTS, len(low)))])
     found = problem.values(points)
     if not np.any(found.valid):
         raise problem.unstable_error(float(np.max(found.trusted)))

@@ -122,10 +122,10 @@ class Bounds:
 
     def check(self) -> None:
         """Raises ValueError for a side that is not one."""
-        for name in ("lower", "upper"):
+        for name, side in {"lower": self.lower, "upper": self.upper}.items():
             checks.conforms(
                 f"Bounds.{name}",
-                getattr(self, name),
+                side,
                 Side,
                 "A constant bound is iblf_jax.bounds.Constant(value).",
             )

@@ -986,6 +986,18 @@ def test_study_is_judged_at_its_worst_runs(corrected_run, batch):
     assert certify(corrected_run.scenario, Study(batch), worst=None).runs == (0, 1, 2)
 
 
+def test_study_of_another_scenario_is_refused(corrected_run):
+    scenario = corrected_run.scenario
+    perturbed = {"plant.mass": ij.factor(ij.uniform(0.9, 1.1))}
+    study = ij.monte_carlo(scenario, perturbed, runs=2, duration=0.01)
+    assert certify(scenario, study, worst=1).runs
+    stiffer = ij.with_parameters(scenario, {"controller.K2": 2 * scenario.controller.K2})
+    with pytest.raises(ValueError, match="a run of a scenario with other numbers"):
+        certify(stiffer, study)
+    with pytest.raises(ValueError, match="a run of another kind of scenario"):
+        certify(ij.presets.zhang_yan_2024(law="log"), study)
+
+
 # --- the gap --------------------------------------------------------------------------------------
 
 

@@ -24,7 +24,7 @@ def test_the_least_recently_used_results_leave():
 
 
 def test_a_mark_is_new_once(monkeypatch):
-    monkeypatch.setattr(caches, "MOST_MARKS", 2)
+    monkeypatch.setattr(caches, "MAX_MARKS", 2)
     cache = Cache()
     assert cache.mark("texts", "a") and not cache.mark("texts", "a")
     assert cache.mark("kernels", "a"), "topics are separate"

@@ -20,7 +20,7 @@ import pytest
 import iblf_jax as ij
 from iblf_jax.deployment.c_names import number
 from iblf_jax.deployment.control_law import SampleInputs, control_law, sample, start
-from iblf_jax.deployment.write_c import CHECKED, Law, Vectors, generate
+from iblf_jax.deployment.write_c import CHECK_INTERVAL, Law, Vectors, generate
 from iblf_jax.simulation.scenario import canonical
 
 fmpy, wasmtime = pytest.importorskip("fmpy"), pytest.importorskip("wasmtime")
@@ -83,7 +83,7 @@ def against_jax(folder, scenario, *, external_reference=False, dtype="float64"):
 
         return jax.lax.scan(one, start(scenario, first)[0], inputs)[1]
 
-    tau = np.asarray(jax.jit(answers)(scenario, first, inputs))[::CHECKED]
+    tau = np.asarray(jax.jit(answers)(scenario, first, inputs))[::CHECK_INTERVAL]
     rows = [np.asarray(x) for x in inputs[1:] if not isinstance(x, tuple)]
     vectors = Vectors(tuple(x[0] for x in rows), rows[0], rows[1], tuple(rows[2:]), tau)
     joints = getattr(scenario.model, "joints", ())

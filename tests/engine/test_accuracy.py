@@ -181,7 +181,7 @@ def test_the_two_runs_side_by_side(shaken):
 
 def test_no_step_will_do(shaken, monkeypatch):
     """A torque that no affordable step resolves: the advice of the loop's modes, and a warning."""
-    monkeypatch.setattr(step_size, "MOST_TRIED", 20_000)
+    monkeypatch.setattr(step_size, "MAX_TRIED", 20_000)
     wild = ij.with_parameters(shaken, {"disturbance.frequency": 1e10, "disturbance.amplitude": 1e3})
     with pytest.warns(UserWarning, match="No step down to"):
         assert ij.recommended_dt(wild, duration=0.01) == 1e-3

@@ -260,11 +260,11 @@ def test_what_was_used_longest_ago_goes_first(cache, monkeypatch):
     ):
         (cache / name).write_bytes(bytes(1000))
         os.utime(cache / name, (now - age, now - age))
-    monkeypatch.setattr("iblf_jax.core.cache.LIMIT", 2500)
+    monkeypatch.setattr("iblf_jax.core.cache.MAX_BYTES", 2500)
     chosen_cache(monkeypatch)
     assert sorted(path.name for path in cache.rglob("*.*")) == ["c.so", "d.so", "notes.txt"]
     assert not (cache / "xla-abc" / "b-cache").exists()
-    monkeypatch.setattr("iblf_jax.core.cache.LIMIT", 0)
+    monkeypatch.setattr("iblf_jax.core.cache.MAX_BYTES", 0)
     chosen_cache(monkeypatch)
     assert sorted(path.name for path in cache.rglob("*.*")) == ["d.so", "notes.txt"]
 
@@ -295,7 +295,7 @@ def test_nothing_is_removed_through_a_link(cache, tmp_path, monkeypatch):
     precious = tmp_path / "elsewhere" / "precious.so"
     precious.write_bytes(bytes(1000))
     os.utime(precious, (0, 0))
-    monkeypatch.setattr("iblf_jax.core.cache.LIMIT", 0)
+    monkeypatch.setattr("iblf_jax.core.cache.MAX_BYTES", 0)
     (cache / "xla-old").symlink_to(tmp_path / "elsewhere")
     assert chosen_cache(monkeypatch)[0] is None
     assert precious.exists()

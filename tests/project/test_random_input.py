@@ -246,7 +246,7 @@ def test_arguments_of_simulate(paper, data, value):
 def test_steps(duration, dt):
     steps = accepts_or_value_error(lambda: checks.whole_steps(duration, dt))
     if steps is not None:
-        assert 1 <= steps <= checks.MOST_STEPS
+        assert 1 <= steps <= checks.MAX_STEPS
         assert math.isclose(steps * dt, duration, rel_tol=1e-2)
 
 

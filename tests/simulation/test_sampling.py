@@ -25,7 +25,7 @@ from iblf_jax.simulation.metrics import standard
 from iblf_jax.simulation.sampling import noise_key, normals
 from iblf_jax.simulation.scenario import canonical
 from iblf_jax.tuning.parameters import layout
-from iblf_jax.tuning.ranges import COUNT, PERIOD, TIMES, TOGETHER
+from iblf_jax.tuning.ranges import BY_COUNT, BY_PERIOD, TIMES, TOGETHER
 from iblf_jax.tuning.result import AtLimit
 
 PAPER = ij.presets.zhang_yan_2024(reading="corrected")
@@ -581,7 +581,7 @@ def test_ranges_end_where_a_count_is_more_than_the_drive_gives():
     )
     gains = ["controller.k1", "controller.K2", "observer.kf"]
     blocks, box = layout(canonical(scenario), gains, 1e-3, "rk4")
-    assert box.reasons[0][1] == COUNT + TOGETHER
+    assert box.reasons[0][1] == BY_COUNT + TOGETHER
     assert TOGETHER in str(AtLimit(1.0, "upper", 1.0, box.reasons[0][1]))
 
     def rate_for_a_count(factor):
@@ -607,7 +607,7 @@ def test_ranges_end_where_a_count_is_more_than_the_drive_gives():
     slower = ij.with_parts(scenario, actuator=ij.actuators.Motor(bandwidth=600.0, rate_limit=450.0))
     assert np.all(layout(canonical(slower), gains, 1e-3, "rk4")[1].high < box.high)
     hopeless = ij.with_parts(scenario, actuator=ij.actuators.Motor(bandwidth=600.0, rate_limit=1.0))
-    assert layout(canonical(hopeless), gains, 1e-3, "rk4")[1].reasons[0][1] == PERIOD + TOGETHER
+    assert layout(canonical(hopeless), gains, 1e-3, "rk4")[1].reasons[0][1] == BY_PERIOD + TOGETHER
 
 
 def test_held_torque_is_drawn_as_steps_and_measurements_beside_the_truth():

@@ -33,13 +33,13 @@ from iblf_jax.tuning.evaluation import Candidate, Derivatives, Value
 from iblf_jax.tuning.parameters import Box, layout, squash, unsquash
 from iblf_jax.tuning.problem import TuningProblem
 from iblf_jax.tuning.quantities import Peak, Quantities, TimeIntegral
-from iblf_jax.tuning.ranges import SHARE, STEP, THEOREM, TIMES, TOGETHER
+from iblf_jax.tuning.ranges import BY_STEP, BY_THEOREM, STABILITY_FRACTION, TIMES, TOGETHER
 from iblf_jax.tuning.result import STUCK
 from iblf_jax.tuning.robust import Risk, combine
 from iblf_jax.tuning.search import Evaluator, Search
 from iblf_jax.tuning.solvers import Constraints, SearchSpace, sqp
 from iblf_jax.tuning.solvers.sqp import solve_subproblem
-from iblf_jax.tuning.starts import DISTANCE, REACH, NearbyStarts, screened
+from iblf_jax.tuning.starts import MIN_DISTANCE, PROBE_RANGE, NearbyStarts, screened
 
 jax.config.update("jax_enable_x64", True)
 
@@ -248,10 +248,13 @@ def test_default_limits_keep_the_conditions_and_the_step(paper):
         paper, {b.path: high[b.start : b.start + b.size] for b in blocks[:3]}
     )
     mode = 1e-3 * fastest_along(canonical(together), TIMES)
-    assert mode == pytest.approx(SHARE * tableau("rk4").stability, rel=0.01)
+    assert mode == pytest.approx(STABILITY_FRACTION * tableau("rk4").stability, rel=0.01)
     _, single = layout(canonical(paper), ["controller.K2"], 1e-3, "rk4")
     assert np.all(np.exp(single.high) > 1.001 * high[2:4])
-    assert box.reasons[0] == (THEOREM, STEP + TOGETHER) and single.reasons[0] == (THEOREM, STEP)
+    assert box.reasons[0] == (BY_THEOREM, BY_STEP + TOGETHER) and single.reasons[0] == (
+        BY_THEOREM,
+        BY_STEP,
+    )
     with pytest.raises(ValueError, match="do not overlap"):
         layout(canonical(paper), ["controller.K2", "controller.K2[0]"], 1e-3, "rk4")
     with pytest.raises(ValueError, match="Widen the limits"):
@@ -343,7 +346,7 @@ def test_pieces_that_bind_are_found_with_their_multipliers(most, share, shift):
 def test_curvature_is_kept_for_the_worst_pieces_of_many(monkeypatch):
     """With room for one piece a requirement the one that leaves is forgotten, and the optimum is
     found all the same."""
-    monkeypatch.setattr(sqp, "MOST_CURVATURES", 1)
+    monkeypatch.setattr(sqp, "MAX_CURVATURES", 1)
     space = SearchSpace(SQUARE, Constraints.of((2,), (0.0,), 2))
     state = steps_of_sqp(TwoPieces(5.0), space, [3.0, -1.0], 20, 1e-10)
     assert state.curvatures.shape == (1, 2, 2)
@@ -434,11 +437,11 @@ def test_a_second_search_begins_elsewhere_and_the_better_goes_on():
     valleys = Valleys()
     nearby = NearbyStarts(lambda z: valleys(z).value, box, 0, lambda z: False)
     assert nearby.count == len(nearby.points) == 14 * 7 and np.all(
-        np.abs(nearby.points - box.z) <= REACH
+        np.abs(nearby.points - box.z) <= PROBE_RANGE
     )
     first = nearby.points[0]
     assert np.sum((first + 1) ** 2) < np.sum((nearby.points[-1] + 1) ** 2)
-    assert np.max(np.abs(nearby.away_from(first[None]) - first)) > DISTANCE
+    assert np.max(np.abs(nearby.away_from(first[None]) - first)) > MIN_DISTANCE
     # From a second start that is given to it, it finds the deeper valley, and its minimum.
     evaluate = Turns(SearchSpace(box, Constraints.of((1,), (0.0,), 1)))
     calls = []

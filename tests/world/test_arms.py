@@ -185,7 +185,7 @@ def test_gains_follow_the_inertia():
     q = jnp.array([0.0, 0.6, 0.0, -1.1, 0.0, 0.9, 0.0])
     K2 = arms.inertial_gain(arm, q, rate=30.0)
     np.testing.assert_allclose(K2[:4], 30.0 * jnp.diagonal(arm.mass_matrix(q))[:4])
-    assert float(K2.min()) == arms.LEAST_K2
+    assert float(K2.min()) == arms.MIN_K2
 
 
 @pytest.mark.slow

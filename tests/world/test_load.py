@@ -691,7 +691,7 @@ def test_nothing_is_written_and_limits_are_stated(file, monkeypatch, tmp_path):
     with pytest.raises(ValueError, match="repeated name"):  # in MuJoCo's words
         ij.robots.load(file(BAD_MJCF["repeated"][0]))
     assert {p.name for p in tmp_path.iterdir()} == {"arm.urdf"}
-    assert description.LARGEST < 1 << 30
+    assert description.MAX_BYTES < 1 << 30
 
 
 # ---------------------------------------------------------------------------------------- repair

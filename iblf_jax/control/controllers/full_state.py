@@ -128,10 +128,11 @@ class FullState:
         """Raises ValueError for something that is no barrier, or one that cannot bound velocities;
         completes `o` and `weight`.
         """
-        for name in ("barrier", "velocity_barrier"):
+        barriers = {"barrier": self.barrier, "velocity_barrier": self.velocity_barrier}
+        for name, barrier in barriers.items():
             checks.conforms(
                 f"FullState.{name}",
-                getattr(self, name),
+                barrier,
                 Barrier,
                 "Such as iblf_jax.barriers.Integral().",
                 CLAIMS,

@@ -36,7 +36,7 @@ BARRIERS: dict[str, Callable[..., barriers.Barrier]] = {
 }
 """System -> barrier of the backstepping law."""
 
-YARDSTICKS: dict[str, Callable[[], Controller]] = {
+BASELINES: dict[str, Callable[[], Controller]] = {
     "computed_torque": lambda: ComputedTorque(Kp=25.0, Kd=10.0),
     "pd": lambda: PDGravity(Kp=60.0, Kd=20.0),
 }
@@ -55,7 +55,7 @@ SPEED = 10.0
 """rad/(N m s).  ASSUMPTION: eta of the governor by name, slow enough for steps of 1 ms beside the
 paper's bounds."""
 
-LAWS = (*BARRIERS, "adaptive_rbf", "dynamic_surface", *YARDSTICKS)
+LAWS = (*BARRIERS, "adaptive_rbf", "dynamic_surface", *BASELINES)
 """Every system of the paper by the name that `law_by_name`, the presets and `compare` take."""
 KEEPERS = ("full_state", "reference_governor", "safety_filter")
 """Laws for other constraints by the names that these take too: full state (for scenarios with
@@ -91,8 +91,8 @@ def law_by_name(
       ValueError: an unknown name or reading.
     """
     checks.one_of("law", name, (*LAWS, *KEEPERS))
-    if name in YARDSTICKS:
-        return YARDSTICKS[name]()
+    if name in BASELINES:
+        return BASELINES[name]()
     if name == "adaptive_rbf":
         return AdaptiveRBF(k1=k1, K2=K2, o=o, barrier=barriers.Log(p=p), weight=weight)
     if name == "dynamic_surface":
@@ -100,7 +100,7 @@ def law_by_name(
     if name == "full_state":
         return FullState(k1=k1, K2=K2, c=DAMPING, o=o, weight=weight)
     if name == "reference_governor":
-        return ReferenceGovernor(law=YARDSTICKS["pd"](), eta=SPEED)
+        return ReferenceGovernor(law=BASELINES["pd"](), eta=SPEED)
     if name == "safety_filter":
         return SafetyFilter(
             law=law_by_name("backstepping", k1=k1, K2=K2, reading=reading, weight=weight),

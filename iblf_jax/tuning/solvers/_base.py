@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.pytree import field_values
 from iblf_jax.tuning.parameters import Box
 from iblf_jax.tuning.robust import worst_count
 
 MODES = ("auto", "forward", "reverse")
 SCHEDULES = ("cosine", "constant")
-MOST_SHARPENINGS = 60
+MAX_SHARPENINGS = 60
 """With more, the smoothing is not representable in float32."""
 LEARNING_RATES = (1e-12, 1e3)
 
@@ -184,8 +184,8 @@ CHECKS: dict[str, Any] = {
     "resample": checks.flag,
     "starts": checks.positive_integer,
     "tolerance": lambda name, x: checks.number_between(name, x, 0.0, 1.0, "1"),
-    "sharpenings": lambda name, x: checks.positive_integer(name, x, least=0, most=MOST_SHARPENINGS),
-    "patience": lambda name, x: checks.positive_integer(name, x, most=checks.MOST_STEPS),
+    "sharpenings": lambda name, x: checks.positive_integer(name, x, least=0, most=MAX_SHARPENINGS),
+    "patience": lambda name, x: checks.positive_integer(name, x, most=checks.MAX_STEPS),
     "learning_rate": lambda name, x: checks.number_between(name, x, *LEARNING_RATES, "1"),
     "schedule": lambda name, x: _word(name, x, SCHEDULES),
     "memory": lambda name, x: checks.positive_integer(name, x, most=1000),
@@ -198,6 +198,5 @@ ValueError."""
 
 def check_options(options: Any) -> None:
     """Checks the fields of a frozen dataclass of options, and converts them to their types."""
-    for field in dataclasses.fields(options):
-        value = CHECKS[field.name](field.name, getattr(options, field.name))
-        object.__setattr__(options, field.name, value)
+    for name, value in field_values(options).items():
+        object.__setattr__(options, name, CHECKS[name](name, value))

@@ -9,10 +9,10 @@ subproblem for the step s is, within |s_i| <= delta and the ranges of the gains,
     minimise  g.s + s.(B + sum_j y_j C_j).s/2 + rho sum_r v_r
     subject to     c_j + a_j.s <= v_r,  v_r >= 0      for the pieces j of r,
 
-first with c_j = e_j, and then, ROUNDS times, with c_j = e_j + s.C_j.s/2 at the last solution.  The
-trial is the solution of which the quadratic models predict the largest decrease.  y are the
-multipliers of the previous subproblem.  A requirement that a share of B runs may violate, k > 1 of
-them, has as G_r the mean of its k worst runs, which is exactly
+first with c_j = e_j, and then, CURVATURE_SOLVES times, with c_j = e_j + s.C_j.s/2 at the last
+solution.  The trial is the solution of which the quadratic models predict the largest decrease.  y
+are the multipliers of the previous subproblem.  A requirement that a share of B runs may violate, k
+> 1 of them, has as G_r the mean of its k worst runs, which is exactly
 
     min over t of  t + sum_b max(0, max_j g_bj - t) / k,
 
@@ -67,17 +67,17 @@ SMALLEST_EIGENVALUE = 1e-6
 TARGET_EXCESS = 1e-5
 """How far inside its limit a requirement is aimed at, in its scale, so that rounding does not
 violate it."""
-LEAST_PENALTY, LARGEST_PENALTY, PENALTY_FACTOR = 2.0, 1e6, 10.0
+MIN_PENALTY, LARGEST_PENALTY, PENALTY_FACTOR = 2.0, 1e6, 10.0
 """rho, relative to the size of the objective, and the factor by which it is increased."""
-ROUNDS = 3
+CURVATURE_SOLVES = 3
 COLLAPSED_RADIUS = 1e-3
 """delta below which a start is stuck: the model does not predict the objective even so near."""
-AT_END = 1e-6
+RANGE_TOLERANCE = 1e-6
 """Distance in z from the end of a range within which the range blocks a gain."""
-MOST_PIECES, MORE_RUNS = 200, 3
+MAX_PIECES, RUNS_PER_WORST = 200, 3
 """Largest number of pieces of one requirement in a subproblem, and of runs where G_r is the mean of
 k of them, as a multiple of k; the worst are taken."""
-MOST_CURVATURES = 4000
+MAX_CURVATURES = 4000
 """Largest number of pieces of one requirement of which C_j is stored.  With the 200 of a subproblem
 only, 64 runs of two joints took 26 evaluations instead of 14."""
 
@@ -265,15 +265,15 @@ def _pieces_that_may_bind(
     may_bind = values + change >= threshold
     if is_mean:
         from_worst = np.argsort(-np.max(values, axis=1), kind="stable")
-        may_bind[from_worst[MORE_RUNS * k :]] = False
+        may_bind[from_worst[RUNS_PER_WORST * k :]] = False
     run, piece = np.nonzero(may_bind)
-    room = MOST_PIECES
+    room = MAX_PIECES
     is_further = np.zeros(len(run), bool)
     if is_mean:
         # A mean of k runs needs k runs: the worst piece of each run comes before all others.
         worst_of_run = np.argmax(np.where(may_bind, values, -np.inf), axis=1)
         is_further = piece != worst_of_run[run]
-        room = max(MOST_PIECES, int(np.sum(~is_further)))
+        room = max(MAX_PIECES, int(np.sum(~is_further)))
     order = np.lexsort((-values[run, piece], is_further))[:room]
     return Selected(run[order], own[piece[order]])
 
@@ -546,7 +546,7 @@ def _accept(space: SearchSpace, state: SQPState, found: Point) -> None:
 def _curvatures_kept(constraints: Constraints) -> list[int]:
     """The number of pieces of each requirement of which C_j is stored."""
     counts = [len(constraints.pieces_of(r)) for r in range(len(constraints.worst))]
-    return [min(constraints.runs * count, MOST_CURVATURES) for count in counts]
+    return [min(constraints.runs * count, MAX_CURVATURES) for count in counts]
 
 
 def _worst_pieces(constraints: Constraints, pieces: np.ndarray) -> np.ndarray:
@@ -593,7 +593,7 @@ def _with_penalty(space: SearchSpace, state: SQPState) -> tuple[Step, float]:
     size = state.size
     largest = LARGEST_PENALTY * size
     twice = 2.0 * float(np.max(state.multipliers, initial=0.0))
-    penalty = min(max(twice, LEAST_PENALTY * size), largest)
+    penalty = min(max(twice, MIN_PENALTY * size), largest)
     found = _solve(space, state, state.pieces, penalty)
     while found.violation.sum() > TARGET_EXCESS and penalty < largest:
         other = _solve(space, state, state.pieces, PENALTY_FACTOR * penalty)
@@ -642,7 +642,7 @@ def _best_with_curvature(
     if not state.pieces.size:
         return best, decrease
     last = found
-    for _ in range(ROUNDS):
+    for _ in range(CURVATURE_SOLVES):
         last = _solve(space, state, state.pieces + state.curvature_along(last.step), penalty)
         other = _predicted_decrease(space, state, last.step)
         if other > decrease:
@@ -654,8 +654,8 @@ def _best_with_curvature(
 def _residuals(space: SearchSpace, state: SQPState, found: Step, excess: np.ndarray) -> np.ndarray:
     """Residuals of the optimality conditions, as in `Optimality`."""
     slope = found.lagrangian
-    blocked_below = (state.z < space.box.low + AT_END) & (slope > 0)
-    blocked_above = (state.z > space.box.high - AT_END) & (slope < 0)
+    blocked_below = (state.z < space.box.low + RANGE_TOLERANCE) & (slope > 0)
+    blocked_above = (state.z > space.box.high - RANGE_TOLERANCE) & (slope < 0)
     stationarity = np.max(np.abs(np.where(blocked_below | blocked_above, 0.0, slope)))
     products = np.sum(found.piece_multipliers * state.pieces, axis=0)
     complementarity = sum(

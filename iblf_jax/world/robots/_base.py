@@ -14,6 +14,7 @@ which makes M' - 2 C skew-symmetric, the property that the proofs of all laws he
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any, Protocol, TypeVar
 
 import jax
@@ -23,7 +24,7 @@ import numpy as np
 from iblf_jax.core import checks
 from iblf_jax.core.cache import keep_programs
 from iblf_jax.core.linalg import inner, matvec
-from iblf_jax.core.optional import OptionalMembers
+from iblf_jax.core.optional import OptionalMembers, attributes, has_members, missing_members
 from iblf_jax.core.time import as_at
 
 T = TypeVar("T")
@@ -160,7 +161,7 @@ def joint_names(robot: Any, n: int) -> tuple[str, ...]:
     """What the n joints of a robot are called: by its `joints`, the names in its file, else "joint
     0", "joint 1", ...
     """
-    n = checks.positive_integer("n", n, least=0, most=checks.MOST_JOINTS)
+    n = checks.positive_integer("n", n, least=0, most=checks.MAX_JOINTS)
     names = tuple(map(str, robot_member(robot, "joints")))
     if len(names) == n:
         return names
@@ -211,7 +212,7 @@ def from_energy(cls: type[T]) -> type[T]:
     missing = [
         source
         for method, source in sources.items()
-        if not hasattr(cls, method) and not hasattr(cls, source)
+        if len(missing_members(cls, (method, source))) == 2
     ]
     if missing:
         raise checks.fail(
@@ -234,7 +235,7 @@ def from_energy(cls: type[T]) -> type[T]:
         return jax.jacfwd(self.tip)(q)
 
     for method in (coriolis, gravity, jacobian):
-        if not hasattr(cls, method.__name__):
+        if not has_members(cls, method.__name__):
             setattr(cls, method.__name__, method)
     return cls
 
@@ -244,3 +245,12 @@ def planar_skeleton(lengths: jax.Array, q: jax.Array) -> jax.Array:
     angles = jnp.cumsum(q)
     steps = lengths[:, None] * jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=-1)
     return jnp.concatenate([jnp.zeros((1, 2), steps.dtype), jnp.cumsum(steps, axis=0)])
+
+
+def broadcast_fields(robot: Any, names: Iterable[str], shape: tuple[int, ...]) -> None:
+    """Repeats the scalars among some fields of a robot; raises ValueError for any other shape."""
+    for name, value in attributes(robot, names).items():
+        if value.ndim == 0:
+            object.__setattr__(robot, name, jnp.broadcast_to(value, shape))
+        else:
+            checks.shape_is(f"{type(robot).__name__}.{name}", value, shape)

@@ -33,8 +33,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.core.pytree import Leaf, component, leaf, static
+from iblf_jax.core.optional import attributes
+from iblf_jax.core.pytree import Leaf, component, field_values, leaf, static
 from iblf_jax.world.robots import spatial
+from iblf_jax.world.robots._base import broadcast_fields
 from iblf_jax.world.robots.payload import Payload
 
 KINDS = ("revolute", "prismatic")
@@ -69,6 +71,13 @@ class Frames(NamedTuple):
     """[R, p] of each, (n, 3, 4)."""
     allowed: jax.Array
     """S, the links' motion per unit of joint speed, (n, 2, 3)."""
+
+
+NUMBERS_OF_A_JOINT = (
+    *("armature", "damping", "friction", "friction_width"),
+    *("lower", "upper", "effort", "speed"),
+)
+"""Fields with one number for each joint; a scalar is repeated."""
 
 
 @component
@@ -157,22 +166,7 @@ class Arm:
     (`engine.mechanism`)."""
     rows: ClassVar[dict[str, tuple[str, tuple[str, ...]]]] = {
         "link": ("links", ("mass", "centre", "inertia")),
-        "joint": (
-            "joints",
-            (
-                "position",
-                "rotation",
-                "axis",
-                "armature",
-                "damping",
-                "friction",
-                "friction_width",
-                "lower",
-                "upper",
-                "effort",
-                "speed",
-            ),
-        ),
+        "joint": ("joints", ("position", "rotation", "axis", *NUMBERS_OF_A_JOINT)),
     }
     """What a path may call by name: word -> (the field that holds the names, the fields with one
     row a name)."""
@@ -184,37 +178,16 @@ class Arm:
         if jnp.ndim(self.mass) != 1 or not len(self.mass):
             raise checks.fail("Arm.mass", self.mass, "one number a link, (n,)")
         n = self.mass.shape[0]
-        for name, width in (
-            ("centre", 3),
-            ("inertia", 6),
-            ("position", 3),
-            ("rotation", 4),
-            ("axis", 3),
-        ):
-            value = getattr(self, name)
-            if value.shape == (width,) and name in ("rotation", "axis"):
-                object.__setattr__(self, name, jnp.broadcast_to(value, (n, width)))
-            else:
-                checks.shape_is(f"Arm.{name}", value, (n, width))
-        for name in (
-            "armature",
-            "damping",
-            "friction",
-            "friction_width",
-            "lower",
-            "upper",
-            "effort",
-            "speed",
-        ):
-            value = getattr(self, name)
-            if value.ndim == 0:
-                object.__setattr__(self, name, jnp.broadcast_to(value, (n,)))
-            else:
-                checks.shape_is(f"Arm.{name}", value, (n,))
+        widths = {"centre": 3, "inertia": 6, "position": 3, "rotation": 4, "axis": 3}
+        for name, value in attributes(self, ("rotation", "axis")).items():
+            if value.shape == (widths[name],):
+                object.__setattr__(self, name, jnp.broadcast_to(value, (n, widths[name])))
+        for name, value in attributes(self, widths).items():
+            checks.shape_is(f"Arm.{name}", value, (n, widths[name]))
+        broadcast_fields(self, NUMBERS_OF_A_JOINT, (n,))
         for name, width in (("tip_position", 3), ("tip_rotation", 4), ("g", 3)):
-            checks.shape_is(f"Arm.{name}", getattr(self, name), (width,))
-        for name in ("rotation", "axis", "tip_rotation"):
-            value = getattr(self, name)
+            checks.shape_is(f"Arm.{name}", field_values(self)[name], (width,))
+        for name, value in attributes(self, ("rotation", "axis", "tip_rotation")).items():
             if checks.is_concrete(value) and not np.all(
                 np.linalg.norm(np.asarray(value), axis=-1) > 1e-6
             ):
@@ -237,12 +210,13 @@ class Arm:
         self._check_names(n)
 
     def _check_names(self, n: int) -> None:
-        for name, default in (
-            ("kinds", ("revolute",) * n),
-            ("links", _numbered("link", n)),
-            ("joints", _numbered("joint", n)),
-        ):
-            given = getattr(self, name)
+        defaults = {
+            "kinds": ("revolute",) * n,
+            "links": _numbered("link", n),
+            "joints": _numbered("joint", n),
+        }
+        for name, given in attributes(self, defaults).items():
+            default = defaults[name]
             if isinstance(given, tuple) and not given:
                 object.__setattr__(self, name, default)
             elif (

@@ -20,19 +20,19 @@ from xml.parsers import expat
 
 from iblf_jax.core import checks
 
-LARGEST = 8 << 20
+MAX_BYTES = 8 << 20
 """Bytes of a description, its includes together."""
-DEEPEST = 200
+MAX_DEPTH = 200
 """Levels of elements."""
-MOST_NESTED = 8
+MAX_NESTED = 8
 """Files that include each other."""
-MOST = 30_000
+MAX_ELEMENTS = 30_000
 """Elements."""
-MOST_BODIES = 1000
+MAX_BODIES = 1000
 """Links or bodies."""
 LARGEST_NUMBER = 1e10
 """No length, mass or inertia of a robot in SI units is beyond."""
-FARTHEST = 1e20
+MAX_RANGE = 1e20
 """A range or a friction may be, where it stands for "none" or "locked"."""
 DECIMAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 """A number of a description.
@@ -96,8 +96,8 @@ class _Reader:
     def __init__(self, folder: Path, field: str) -> None:
         self.folder = folder
         self.field = field
-        self.bytes_left = LARGEST
-        self.elements_left = MOST
+        self.bytes_left = MAX_BYTES
+        self.elements_left = MAX_ELEMENTS
 
     def parse(self, path: Path, nesting: int = 0) -> ET.Element:
         """The root element of one file, what it includes in its place."""
@@ -113,10 +113,10 @@ class _Reader:
             nonlocal depth
             depth += 1
             self.elements_left -= 1
-            if depth > DEEPEST:
-                raise fail(f"more than {DEEPEST} levels of elements")
+            if depth > MAX_DEPTH:
+                raise fail(f"more than {MAX_DEPTH} levels of elements")
             if self.elements_left < 0:
-                raise fail(f"more than {MOST} elements")
+                raise fail(f"more than {MAX_ELEMENTS} elements")
             if tag.startswith("xacro:"):
                 raise fail(
                     f"<{tag[:40]}> is a macro",
@@ -153,11 +153,11 @@ class _Reader:
         """
         if root.tag != "mujoco":
             return root
-        if nesting > MOST_NESTED:
+        if nesting > MAX_NESTED:
             raise checks.fail(
                 "<include>",
                 str(path),
-                f"at most {MOST_NESTED} files inside each other",
+                f"at most {MAX_NESTED} files inside each other",
                 "Does it include itself?",
             )
         for parent in list(root.iter()):
@@ -189,7 +189,7 @@ class _Reader:
         data = contents(self.field, path, self.bytes_left, "the path of a URDF or MJCF file")
         self.bytes_left -= len(data)
         if self.bytes_left < 0:
-            expected = f"a file of at most {LARGEST >> 20} MiB"
+            expected = f"a file of at most {MAX_BYTES >> 20} MiB"
             raise checks.fail(
                 self.field, str(path), expected, "A description without meshes is far smaller."
             )

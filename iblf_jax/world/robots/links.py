@@ -11,8 +11,8 @@ import numpy as np
 from iblf_jax.core import checks
 from iblf_jax.world.robots.description import Shown
 from iblf_jax.world.robots.repair import (
-    COMPACT,
-    FINEST,
+    GYRATION_FRACTION,
+    LENGTH_RESOLUTION,
     ROUNDING,
     Fault,
     Repairs,
@@ -24,9 +24,9 @@ from iblf_jax.world.robots.repair import (
 
 Pose = tuple[np.ndarray, np.ndarray]
 """Position and rotation matrix."""
-SINGULAR = 1e-12
+SINGULAR_FRACTION = 1e-12
 """Share of a joint's inertia, left when the joints beyond it are free, that is rounding."""
-SAMPLES = 8
+CONFIGURATIONS = 8
 """Configurations, beside zero and the middle of the ranges, at which the mass matrix is looked
 at."""
 
@@ -100,7 +100,7 @@ class Links(NamedTuple):
             "a positive definite inertia [kg m^2]",
             "A body that moves needs one.",
         )
-        nearest = thickened(J, m * (COMPACT * self._longest()) ** 2)
+        nearest = thickened(J, m * (GYRATION_FRACTION * self._longest()) ** 2)
         if not np.trace(nearest) > np.trace(J) * (
             1.0 + ROUNDING
         ):  # all of the file is in one point, or heavier by far beyond
@@ -117,7 +117,7 @@ class Links(NamedTuple):
         centres = self.moments[:, :3, 3] / np.maximum(self.moments[:, 3, 3], 1e-300)[:, None]
         places = [p for body, (p, _) in self.frames.items() if self.carrier[body] >= 0]
         longest = float(np.max(np.linalg.norm([*centres, *places, *self.position[1:]], axis=1)))
-        if longest > FINEST:
+        if longest > LENGTH_RESOLUTION:
             return longest
         return float(np.linalg.norm(self.position[0]))
 
@@ -128,13 +128,15 @@ class Links(NamedTuple):
         turns = np.array([kind == "revolute" for kind in joints["kinds"]])
         wide = np.where(turns, np.pi, 1.0)
         lower, upper = np.clip(joints["lower"], -wide, wide), np.clip(joints["upper"], -wide, wide)
-        shares = np.random.default_rng(0).uniform(size=(SAMPLES, len(turns)))
+        shares = np.random.default_rng(0).uniform(size=(CONFIGURATIONS, len(turns)))
         q = np.stack(
             [np.zeros(len(turns)), 0.5 * (lower + upper), *(lower + shares * (upper - lower))]
         )
         found: list[int] = []
         for M in self._mass_matrices(q, turns, joints["axis"]) + np.diag(joints["armature"]):
-            none = SINGULAR * np.diag(M) + np.where(turns, self.moments[:, 3, 3] * FINEST**2, 0.0)
+            none = SINGULAR_FRACTION * np.diag(M) + np.where(
+                turns, self.moments[:, 3, 3] * LENGTH_RESOLUTION**2, 0.0
+            )
             for k in reversed(range(len(turns))):
                 if not M[k, k] > none[k]:
                     found.append(k)

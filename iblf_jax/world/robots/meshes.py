@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from iblf_jax.core import checks
+from iblf_jax.core.optional import attributes
 from iblf_jax.world.robots.description import Shown, contents
 
 LARGEST_MESHES = 512 << 20
@@ -51,7 +52,7 @@ class Meshes:
 
     def problem(self, geom: Any) -> ValueError | None:
         """Why a geom with a mesh cannot be weighed; None if it can, and then the mesh stays."""
-        shape = repr([getattr(geom, name) for name in OF_GEOM])
+        shape = repr(list(attributes(geom, OF_GEOM).values()))
         if shape not in self.problems:
             try:
                 self._weigh(geom)
@@ -90,8 +91,8 @@ class Meshes:
         separate = type(self.spec)()
         copy, shaped = separate.add_mesh(), separate.worldbody.add_body().add_geom()
         for one, other, names in ((copy, mesh, OF_MESH), (shaped, geom, OF_GEOM)):
-            for name in names:
-                setattr(one, name, getattr(other, name))
+            for name, value in attributes(other, names).items():
+                setattr(one, name, value)
         shaped.contype = shaped.conaffinity = 0
         separate.assets = {name: data for name, data in self.files.items() if name == mesh.file}
         try:

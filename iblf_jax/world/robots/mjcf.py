@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.world.robots.description import FARTHEST, LARGEST, MOST_BODIES, Shown, floats, label
+from iblf_jax.world.robots.description import MAX_BODIES, MAX_BYTES, MAX_RANGE, Shown, floats, label
 from iblf_jax.world.robots.meshes import Meshes
 from iblf_jax.world.robots.repair import Fault, Weight, checked_weight
 
@@ -88,14 +88,30 @@ WORDS = [
     "biastype",
 ]
 """Attributes that hold words, not numbers."""
-LONG = ("vertex", "face")
+LONG_ATTRIBUTES = ("vertex", "face")
 """Attributes that may hold as many numbers as a file has."""
-SINGLE = ("gravcomp", "mass", "density", "ref", "stiffness", "damping", "frictionloss", "armature")
+SCALAR_ATTRIBUTES = (
+    "gravcomp",
+    "mass",
+    "density",
+    "ref",
+    "stiffness",
+    "damping",
+    "frictionloss",
+    "armature",
+)
 """Attributes that hold one number."""
-WIDE = ("damping", "frictionloss", "range", "ctrlrange", "forcerange", "actuatorfrcrange")
+RANGE_ATTRIBUTES = (
+    "damping",
+    "frictionloss",
+    "range",
+    "ctrlrange",
+    "forcerange",
+    "actuatorfrcrange",
+)
 """Attributes that may stand for "none" or "locked" by their size."""
 SWITCHES = ("true", "false", "auto", "enable", "disable")
-LEAST = 1e-15
+MIN_INERTIA = 1e-15
 """Mass [kg] and moments [kg m^2] below which the library refuses a body that moves."""
 
 Tendons = dict[str, tuple[set[str], set[str]]]
@@ -185,8 +201,8 @@ def checked(root: ET.Element, folder: Path) -> Mjcf:
     bodies = sum(1 for _ in copy.iter("body"))
     if not bodies:
         raise checks.fail("mujoco", Shown("no <body>"), "an MJCF with bodies and joints")
-    if bodies > MOST_BODIES:
-        raise checks.fail("mujoco", Shown(f"{bodies} bodies"), f"at most {MOST_BODIES}")
+    if bodies > MAX_BODIES:
+        raise checks.fail("mujoco", Shown(f"{bodies} bodies"), f"at most {MAX_BODIES}")
     meshes, bare = "", False
     for compiler in root.findall("compiler"):
         meshes = compiler.get("meshdir", compiler.get("assetdir", meshes))
@@ -219,14 +235,14 @@ def _copy(source: ET.Element, target: ET.Element, section: str) -> None:
 
 def _check_numbers(where: str, name: str, text: str) -> None:
     """Raises ValueError unless an attribute holds numbers within its limits."""
-    if name in SINGLE and name in WIDE:
-        floats(where, text, 1, most=FARTHEST)
-    elif name in SINGLE:
+    if name in SCALAR_ATTRIBUTES and name in RANGE_ATTRIBUTES:
+        floats(where, text, 1, most=MAX_RANGE)
+    elif name in SCALAR_ATTRIBUTES:
         floats(where, text, 1)
-    elif name in WIDE:
-        floats(where, text, most=FARTHEST)
-    elif name in LONG:
-        floats(where, text, longest=LARGEST)
+    elif name in RANGE_ATTRIBUTES:
+        floats(where, text, most=MAX_RANGE)
+    elif name in LONG_ATTRIBUTES:
+        floats(where, text, longest=MAX_BYTES)
     else:
         floats(where, text)
 
@@ -263,8 +279,8 @@ def _explicit(body: Any, where: str, balanced: bool) -> Weight | None:
         J = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     moments = np.linalg.eigvalsh(J)
     if (
-        body.mass >= LEAST
-        and moments[0] >= LEAST
+        body.mass >= MIN_INERTIA
+        and moments[0] >= MIN_INERTIA
         and (balanced or moments[2] <= moments[0] + moments[1])
     ):
         return None

@@ -19,8 +19,9 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.core.linalg import inner, matmul, matvec
+from iblf_jax.core.optional import attributes
 from iblf_jax.core.pytree import Leaf, component, leaf
-from iblf_jax.world.robots._base import from_energy, planar_skeleton
+from iblf_jax.world.robots._base import broadcast_fields, from_energy, planar_skeleton
 
 
 @component
@@ -51,23 +52,17 @@ class PlanarChain:
         number.
         """
         names = ("mass", "length", "centre", "inertia")
-        sizes = {name: getattr(self, name).shape for name in names if getattr(self, name).ndim == 1}
-        if not sizes:
+        shapes = [x.shape for x in attributes(self, names).values() if x.ndim == 1]
+        if not shapes:
             raise checks.fail(
                 "PlanarChain.mass",
                 self.mass,
                 "one number a link, (n,)",
                 "One field must say how many links.",
             )
-        shape = next(iter(sizes.values()))
-        if shape[0] == 0:
+        if shapes[0] == (0,):
             raise checks.fail("PlanarChain.mass", self.mass, "at least one link")
-        for name in names:
-            value = getattr(self, name)
-            if value.ndim == 0:
-                object.__setattr__(self, name, jnp.broadcast_to(value, shape))
-            else:
-                checks.shape_is(f"PlanarChain.{name}", value, shape)
+        broadcast_fields(self, names, shapes[0])
 
     @property
     def n(self) -> int:

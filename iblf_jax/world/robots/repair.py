@@ -26,9 +26,10 @@ from iblf_jax.world.robots.description import Shown
 
 ROUNDING = 1e-6
 """Relative error of a body's moments in a file that has seven digits."""
-FINEST = 1e-6
-"""[m]: no length of a link is known better, so moments below mass FINEST^2 count as zero."""
-COMPACT = 0.01
+LENGTH_RESOLUTION = 1e-6
+"""[m]: no length of a link is known better, so moments below mass LENGTH_RESOLUTION^2 count as
+zero."""
+GYRATION_FRACTION = 0.01
 """Radius of gyration, along each axis, of a link that had no inertia, relative to the length of the
 longest link."""
 
@@ -102,7 +103,7 @@ def moments_of(J: np.ndarray) -> Shown:
 
 def is_nothing(J: np.ndarray, mass: float) -> bool:
     """Whether a body with this inertia is a point, within rounding."""
-    return bool(np.trace(J) <= mass * FINEST**2)
+    return bool(np.trace(J) <= mass * LENGTH_RESOLUTION**2)
 
 
 def checked_weight(where: str, mass: float, J: np.ndarray) -> Weight:
@@ -139,7 +140,7 @@ def checked_weight(where: str, mass: float, J: np.ndarray) -> Weight:
         )
     moments = np.linalg.eigvalsh(J)
     s = np.linalg.eigvalsh(second_moments(J))
-    rounding = ROUNDING * np.abs(moments).sum() + mass * FINEST**2
+    rounding = ROUNDING * np.abs(moments).sum() + mass * LENGTH_RESOLUTION**2
     if s[0] >= -0.5 * rounding:
         return Weight(mass, J)
     shown = moments_of(J)

@@ -19,9 +19,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf
-from iblf_jax.world.robots._base import planar_skeleton
+from iblf_jax.world.robots._base import broadcast_fields, planar_skeleton
 
 
 class LumpedParameters(NamedTuple):
@@ -61,12 +60,7 @@ class TwoLink:
 
     def check(self) -> None:
         """Broadcasts scalars to the two links; raises ValueError for any other number of links."""
-        for name in ("mass", "length", "centre", "inertia"):
-            value = getattr(self, name)
-            if value.ndim == 0:
-                object.__setattr__(self, name, jnp.broadcast_to(value, (2,)))
-            else:
-                checks.shape_is(f"TwoLink.{name}", value, (2,))
+        broadcast_fields(self, ("mass", "length", "centre", "inertia"), (2,))
 
     @property
     def n(self) -> int:

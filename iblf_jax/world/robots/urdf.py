@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.world.robots.description import FARTHEST, MOST_BODIES, Shown, floats, label
+from iblf_jax.world.robots.description import MAX_BODIES, MAX_RANGE, Shown, floats, label
 from iblf_jax.world.robots.repair import Fault, Weight, checked_weight
 
 MOVABLE = ("revolute", "continuous", "prismatic")
@@ -74,8 +74,8 @@ def checked(robot: ET.Element) -> Urdf:
     joints = _by_name(robot, "joint")
     if not links:
         raise checks.fail("robot", Shown("no <link>"), "a URDF with links and joints")
-    if len(links) > MOST_BODIES:
-        raise checks.fail("robot", Shown(f"{len(links)} links"), f"at most {MOST_BODIES}")
+    if len(links) > MAX_BODIES:
+        raise checks.fail("robot", Shown(f"{len(links)} links"), f"at most {MAX_BODIES}")
     parent_of = {
         _end(joint, "child", links): (_end(joint, "parent", links), name)
         for name, joint in reversed(joints.items())
@@ -306,7 +306,7 @@ def _limit(joint: ET.Element, where: str, copy: ET.Element, found: Urdf) -> list
     if not endless:
         names = ["lower", "upper", *names]
     values = {
-        name: floats(f"{where}: limit {name}", limit.get(name, "0"), 1, most=FARTHEST)[0]
+        name: floats(f"{where}: limit {name}", limit.get(name, "0"), 1, most=MAX_RANGE)[0]
         for name in names
     }
     if not endless and not values["lower"] < values["upper"]:
@@ -343,7 +343,7 @@ def _dynamics(joint: ET.Element, where: str, copy: ET.Element, _: Urdf) -> list[
     if dynamics is None:
         return []
     found = {
-        name: floats(f"{where}: {name}", dynamics.get(name, "0"), 1, most=FARTHEST)[0]
+        name: floats(f"{where}: {name}", dynamics.get(name, "0"), 1, most=MAX_RANGE)[0]
         for name in ("damping", "friction")
     }
     for name, value in found.items():
