@@ -153,8 +153,8 @@ class Batch(NamedTuple):
 
 
 StepLoop = Callable[[Any, Batch, Any, int, int | None], tuple[Any, Any]]
-"""(step, batch, carry, steps, every) -> (the carry after all steps, what every `every`-th step
-recorded, from the first on).
+"""The loop over all steps of a batch: a function (step, batch, carry, steps, every) -> (carry after
+the last step, records of every `every`-th step from the first on).
 
 All arrays have the run axis first, records then the time axis; `every` is None where nothing is
 recorded."""
@@ -163,27 +163,21 @@ recorded."""
 def _linearized(loop: StepLoop, batch: Batch, carry: Linearization) -> Linearization:
     """What a `LinearizationStep` of every run has found."""
     batch = _linearized_batch(batch)
-    return loop(
-        LinearizationStep(), batch, carry, linearization_steps(batch.leaves.first.scenario), None
-    )[0]
+    steps = linearization_steps(batch.leaves.first.scenario)
+    return loop(LinearizationStep(), batch, carry, steps, None)[0]
 
 
 def _linearized_batch(batch: Batch) -> Batch:
-    """The batch as a `LinearizationStep` reads it, without derivatives."""
-    leaves = _without_folds(batch.leaves)
-    shared, per_run = jax.lax.stop_gradient((leaves.shared, leaves.per_run))
-    return batch._replace(leaves=leaves._replace(shared=shared, per_run=per_run))
-
-
-def _without_folds(leaves: Leaves) -> Leaves:
-    """The leaves of inputs that a `LinearizationStep` reads, so that one program of it serves all
-    metrics and derivatives.
+    """The batch with the inputs alone that a `LinearizationStep` reads, and without derivatives, so
+    that one program of it serves all metrics and derivatives.
     """
+    leaves = batch.leaves
     numbered: Inputs = jax.tree.unflatten(leaves.treedef, range(len(leaves.is_per_run)))
     kept, treedef = jax.tree.flatten(numbered._replace(folds=(), noise=(), direction=()))
     values = leaves.merged(leaves.shared, leaves.per_run)
     is_per_run = [leaves.is_per_run[i] for i in kept]
-    return Leaves.of(treedef, is_per_run, [values[i] for i in kept])
+    constants = jax.lax.stop_gradient([values[i] for i in kept])
+    return batch._replace(leaves=Leaves.of(treedef, is_per_run, constants))
 
 
 def _initial_linearization(batch: Batch, method: str) -> Linearization:

@@ -25,7 +25,7 @@ from iblf_jax.core.caches import CACHE
 from iblf_jax.engine import plan, registry, thresholds
 from iblf_jax.engine.batch import Batch, StepLoop, carry_shapes, linearization_batch
 from iblf_jax.engine.loops import kernel_loop, program_of
-from iblf_jax.engine.machine_function import length, machine_function
+from iblf_jax.engine.machine_function import count_operations, machine_function
 from iblf_jax.engine.plan import BatchLayout, ExecutionPlan, Sizes, choose_plan
 from iblf_jax.engine.registry import Executor, Machine
 from iblf_jax.engine.request import RunRequest
@@ -90,7 +90,7 @@ def inputs_of(
 def operations(inputs: Inputs) -> int:
     """Operations of one evaluation of the closed loop."""
     zero = jnp.zeros_like(inputs.dt)
-    return length(evaluate, inputs.scenario, zero, initial_state(inputs.scenario), zero)
+    return count_operations(evaluate, inputs.scenario, zero, initial_state(inputs.scenario), zero)
 
 
 def plan_of_batch(

@@ -16,6 +16,7 @@ piece: each piece is one function, and the loop around it XLA's own.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import jax
 from jax.experimental.xla_metadata import set_xla_metadata
@@ -75,7 +76,7 @@ def machine_function(function: Callable) -> Callable:
         `function`, where its size is seen.
     """
 
-    def traced(*args):
+    def traced(*args: Any) -> Any:
         closed, shapes = jax.make_jaxpr(function, return_shape=True)(*args)
         call = jaxpr_as_fun(closed)
         operations = list(_operations(closed.jaxpr))
@@ -90,12 +91,12 @@ def machine_function(function: Callable) -> Callable:
     return traced
 
 
-def length(function: Callable, *args) -> int:
-    """How many operations a function has."""
+def count_operations(function: Callable, *args: Any) -> int:
+    """Number of operations of a function, those of its inner functions included."""
     return sum(1 for _ in _operations(jax.make_jaxpr(function)(*args).jaxpr))
 
 
-def _operations(jaxpr: Jaxpr) -> Iterator:
+def _operations(jaxpr: Jaxpr) -> Iterator[Any]:
     """Every operation of a jaxpr, those of its inner functions included."""
     for operation in jaxpr.eqns:
         bodies = list(jaxprs_in_params(operation.params))
@@ -105,7 +106,7 @@ def _operations(jaxpr: Jaxpr) -> Iterator:
             yield operation
 
 
-def _is_trusted(operation) -> bool:
+def _is_trusted(operation: Any) -> bool:
     name = operation.primitive.name
     if name in REFUSED:
         return False

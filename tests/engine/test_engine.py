@@ -215,7 +215,7 @@ def test_the_length_of_a_function_is_that_of_its_inner_ones():
     inner = jax.jit(lambda x: jnp.sin(x) + jnp.cos(x))
     closed = jax.make_jaxpr(lambda x: inner(x) * inner(2.0 * x))(1.0)
     assert sum(1 for _ in machine_function._operations(closed.jaxpr)) == 8
-    assert machine_function.length(inner, 1.0) == 3
+    assert machine_function.count_operations(inner, 1.0) == 3
 
 
 @pytest.mark.parametrize("size", [40, 63, 64, 72])
