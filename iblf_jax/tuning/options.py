@@ -61,12 +61,13 @@ class RunOptions:
           ValueError: an option that is not valid; the message names it and the remedy.
         """
         tableau(self.method)
-        check_backend(self.backend)
+        backend = check_backend(self.backend)
         checks.whole_steps(self.duration, self.dt)
         return dataclasses.replace(
             self,
             duration=float(self.duration),
             dt=float(self.dt),
+            backend=backend,
             perturbations={} if self.perturbations is None else self.perturbations,
             seed=checks.seed(self.seed),
             runs=checks.positive_integer("runs", self.runs, most=MAX_RUNS),
