@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.engine.batch import Batch, Leaves, StepLoop, run_step
+from iblf_jax.engine.carry import Carry, Inputs, StepOptions, start
 from iblf_jax.engine.derivatives import (
     Directions,
     Tangents,
@@ -25,18 +26,10 @@ from iblf_jax.engine.derivatives import (
     floats_of_carry,
     outers_of_step,
 )
+from iblf_jax.engine.metric_folds import finished
 from iblf_jax.engine.request import RunRequest
-from iblf_jax.engine.step import (
-    Advanced,
-    Carry,
-    Inputs,
-    Node,
-    StepOptions,
-    TimeStep,
-    finished,
-    samples_of_step,
-    start,
-)
+from iblf_jax.engine.step_pieces import MetricSample
+from iblf_jax.engine.time_step import Advanced, TimeStep, samples_of_step
 from iblf_jax.simulation import accuracy
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
 
@@ -83,9 +76,8 @@ def numbers_of(inputs: Inputs, record: Callable) -> int:
     def one(inputs):
         state = initial_state(inputs.scenario)
         sample = evaluate(inputs.scenario, inputs.dt, state, inputs.dt)[1]
-        node = Node(tuple(fold.init(sample) for fold in inputs.folds), sample, True)
-        nodes = (node,) * samples_of_step(inputs.scenario)
-        found = Advanced(None, nodes, state)  # type: ignore[arg-type]
+        seen = MetricSample(tuple(fold.init(sample) for fold in inputs.folds), sample, True)
+        found = Advanced(None, (seen,) * samples_of_step(inputs.scenario), state)  # type: ignore[arg-type]
         return floats_of(record(inputs.folds, found))
 
     return sum(math.prod(x.shape) for x in jax.eval_shape(one, inputs))

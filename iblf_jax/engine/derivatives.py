@@ -25,9 +25,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from iblf_jax.core.optional import OptionalMembers, attributes
 from iblf_jax.engine.batch import Batch, StepLoop, finalize, initialize
+from iblf_jax.engine.carry import Carry, Inputs, StepOptions
+from iblf_jax.engine.metric_folds import finished, split_floats
+from iblf_jax.engine.outcome import Outcome
 from iblf_jax.engine.request import RunRequest
-from iblf_jax.engine.step import Advanced, Carry, Inputs, Outcome, StepOptions, advance, finished
+from iblf_jax.engine.time_step import Advanced, advance
 from iblf_jax.simulation import accuracy
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
 from iblf_jax.simulation.paths import get, with_parameters
@@ -98,20 +102,16 @@ class Differentiated(NamedTuple):
 
 
 def floats_of_carry(carry: Carry) -> tuple[list[jax.Array], Callable]:
-    """The numbers of a carry that have tangents, and the function that puts others in their
-    place.
+    """The numbers of a carry that have tangents, and the function that returns the carry with other
+    numbers in their place.
     """
-    leaves, treedef = jax.tree.flatten((carry.state, carry.accumulators))
-    places = [i for i, x in enumerate(leaves) if jnp.issubdtype(x.dtype, jnp.floating)]
+    floats, replaced = split_floats((carry.state, carry.accumulators))
 
-    def replaced(floats):
-        new = list(leaves)
-        for i, x in zip(places, floats, strict=True):
-            new[i] = x
-        state, accumulators = jax.tree.unflatten(treedef, new)
+    def with_floats(floats: list[jax.Array]) -> Carry:
+        state, accumulators = replaced(floats)
         return carry._replace(state=state, accumulators=accumulators)
 
-    return [leaves[i] for i in places], replaced
+    return floats, with_floats
 
 
 def pushed(
@@ -180,9 +180,7 @@ def preaccumulated(scenario, directions: Directions, eps: jax.Array) -> Callable
             )
             (t,) = time or (t,)
             slope, sample = evaluate(directions.moved(scenario, eps), t, state, dt, *torque)
-            return (slope, without_flags(sample)), {
-                name: getattr(sample, name) for name in FLAG_FIELDS
-            }
+            return (slope, without_flags(sample)), attributes(sample, FLAG_FIELDS)
 
         @jax.custom_jvp
         def floats(flat, eps, *rest):
@@ -207,21 +205,20 @@ def preaccumulated(scenario, directions: Directions, eps: jax.Array) -> Callable
     return loop
 
 
-def curvatures_of(fold: Any) -> int:
-    """How many `Outer` a fold offers of a sample; 0 for one without `curvatures`."""
-    return getattr(fold, "curvatures", 0)
+fold_member = OptionalMembers(curvatures=0)
+"""Optional members of a fold: how many `Outer` its `curvature` returns."""
 
 
 def count_curvatures(folds: Any) -> int:
     """How many curvature matrices the folds have."""
-    return sum(curvatures_of(fold) for fold in folds)
+    return sum(fold_member(fold, "curvatures") for fold in folds)
 
 
 def outers_of(folds, accumulators, sample) -> tuple[Outer, ...]:
     """What a sample adds to the curvature matrices of the folds that have them."""
     found: tuple[Outer, ...] = ()
     for fold, acc in zip(folds, accumulators, strict=True):
-        if curvatures_of(fold):
+        if fold_member(fold, "curvatures"):
             found += tuple(fold.curvature(acc, sample))
     return found
 
@@ -229,10 +226,10 @@ def outers_of(folds, accumulators, sample) -> tuple[Outer, ...]:
 def outers_of_step(folds, found: Advanced) -> list[Outer]:
     """What all samples of a step add to them."""
     samples = []
-    for node in found.nodes:
-        outers = outers_of(folds, node.before, node.sample)
-        if node.counts is not True:
-            outers = tuple(Outer(y, jnp.where(node.counts, weight, 0.0)) for y, weight in outers)
+    for seen in found.metric_samples:
+        outers = outers_of(folds, seen.before, seen.sample)
+        if seen.counts is not True:
+            outers = tuple(Outer(y, jnp.where(seen.counts, weight, 0.0)) for y, weight in outers)
         samples.append([Outer(y, jnp.broadcast_to(weight, y.shape)) for y, weight in outers])
     return [
         Outer(*map(jnp.concatenate, zip(*same, strict=True))) for same in zip(*samples, strict=True)
@@ -264,9 +261,8 @@ class DerivativeStep:
                 inputs._replace(scenario=scenario), before, index, self.method, options, loop
             )
             outers = outers_of_step(inputs.folds, found)
-            vectors, weights = (
-                [getattr(outer, part) for outer in outers] for part in Outer._fields
-            )
+            vectors = [outer.vector for outer in outers]
+            weights = [outer.weight for outer in outers]
             return (floats_of_carry(found.carry)[0], vectors), (found.carry, weights)
 
         _, (tangents, vectors), (after, weights) = pushed(

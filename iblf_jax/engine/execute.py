@@ -14,6 +14,7 @@ import jax
 
 from iblf_jax.engine import registry, thresholds
 from iblf_jax.engine.batch import Batch, StepLoop, carry_shapes, run_all
+from iblf_jax.engine.carry import Inputs
 from iblf_jax.engine.columns import numbers_of, outer_vectors, run_by_columns
 from iblf_jax.engine.compile import (
     compiled_plan,
@@ -29,11 +30,12 @@ from iblf_jax.engine.compile import (
 )
 from iblf_jax.engine.derivatives import Directions, Tangents, run_with_tangents
 from iblf_jax.engine.loops import checkpointed, kernel_loop, program_of, scan
-from iblf_jax.engine.mechanism import known_of
+from iblf_jax.engine.outcome import Outcome
 from iblf_jax.engine.plan import STATES_LAYOUT, ExecutionPlan
 from iblf_jax.engine.registry import Executor
 from iblf_jax.engine.request import RunRequest
-from iblf_jax.engine.step import Inputs, Outcome, TimeStep
+from iblf_jax.engine.structural_constants import constants_of
+from iblf_jax.engine.time_step import TimeStep
 from iblf_jax.simulation.scenario import Scenario
 
 
@@ -237,7 +239,7 @@ def run_from(
     """
     request = RunRequest(steps)
     if registry.automatic().reason is None:
-        request = request._replace(constants=known_of(scenario))
+        request = request._replace(constants=constants_of(scenario))
     return _run_from(scenario, dt, carry, step=step, request=request)
 
 

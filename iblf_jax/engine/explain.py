@@ -15,10 +15,10 @@ from iblf_jax.core.devices import threads
 from iblf_jax.engine.batch import Batch, carry_shapes
 from iblf_jax.engine.compile import inputs_of
 from iblf_jax.engine.loops import program_of
-from iblf_jax.engine.mechanism import known_of
 from iblf_jax.engine.registry import automatic
 from iblf_jax.engine.request import RunRequest
-from iblf_jax.engine.step import TimeStep
+from iblf_jax.engine.structural_constants import constants_of
+from iblf_jax.engine.time_step import TimeStep
 from iblf_jax.kernels import OPERATIONS, PER_RUN, SHARED, TIME, Program, written_out
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.metrics import as_folds
@@ -104,7 +104,7 @@ def explain(
     one = Batch.of(
         inputs_of(scenario, folds, jnp.asarray(1e-3, dtype), RunRequest(1), None),
         leaves,
-        constants=known_of(scenario),
+        constants=constants_of(scenario),
     )
     program = written_out(program_of(TimeStep(method), one, carry_shapes(one, method)).program)
     width = 64 // np.dtype(dtype).itemsize

@@ -51,7 +51,7 @@ MAX_PREDICTION = 2.0
 """Steps.  A crossing that is predicted further away does not belong to the step."""
 
 
-class Loop(NamedTuple):
+class SwitchedLoop(NamedTuple):
     """A closed loop along a step."""
 
     scenario: Scenario
@@ -141,7 +141,7 @@ def surfaces(scenario: Scenario, t: jax.Array, state: LoopState) -> jax.Array | 
 
 
 def with_hybrid_derivative(
-    loop: Loop,
+    loop: SwitchedLoop,
     method: str,
     t: jax.Array,
     before: LoopState,
@@ -208,7 +208,7 @@ def _(primals, tangents):
 
 
 def _in_pieces(
-    loop: Loop,
+    loop: SwitchedLoop,
     t: jax.Array,
     before: LoopState,
     dt: jax.Array,
@@ -254,7 +254,7 @@ def _in_pieces(
 
 
 def _slides(
-    loop: Loop, t: jax.Array, state: LoopState, slope: LoopState, signs: Signs
+    loop: SwitchedLoop, t: jax.Array, state: LoopState, slope: LoopState, signs: Signs
 ) -> jax.Array:
     """Along which surfaces that a stage has touched the state slides, (m,) bool: both rates point
     towards them.
@@ -283,7 +283,7 @@ def _crossings(signs: Signs, crossed: jax.Array) -> Crossings:
 
 
 def _piece(
-    loop: Loop,
+    loop: SwitchedLoop,
     t: jax.Array,
     dt: jax.Array,
     crossings: Crossings,

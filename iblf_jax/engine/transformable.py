@@ -35,11 +35,12 @@ from iblf_jax.engine.compile import (
     run_lowered,
 )
 from iblf_jax.engine.loops import kernel_loop, scan
-from iblf_jax.engine.mechanism import known_of
+from iblf_jax.engine.outcome import Outcome
 from iblf_jax.engine.plan import PLAIN_LAYOUT, ExecutionPlan
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.single_run import run_one
-from iblf_jax.engine.step import Outcome, recorded
+from iblf_jax.engine.structural_constants import constants_of
+from iblf_jax.engine.time_step import recorded
 from iblf_jax.simulation.scenario import Scenario
 
 
@@ -79,7 +80,7 @@ def run_transformable(
     leaves, treedef = jax.tree.flatten(inputs_of(scenario, folds, dt, request, noise))
     backend, reason = registry.automatic()
     compiles = request.backend != "vmap" and reason is None
-    request = request._replace(constants=known_of(scenario), backend="auto")
+    request = request._replace(constants=constants_of(scenario), backend="auto")
     runs = Runs(treedef, request, backend, (False,) * len(leaves))
     if compiles:
         return _differentiable(runs)(*leaves)
@@ -154,7 +155,7 @@ def _run_by_kernel(runs: Runs, *leaves: jax.Array) -> Outcome:
     """The run by the kernel."""
     if checks.is_concrete(leaves):
         inputs = jax.tree.unflatten(runs.treedef, leaves)
-        request = runs.request._replace(constants=known_of(inputs.scenario))
+        request = runs.request._replace(constants=constants_of(inputs.scenario))
         return run_one(inputs.scenario, inputs.folds, inputs.dt, request, inputs.noise)
     return jax.tree.map(lambda x: x[0], _over_runs(_values, runs)(*leaves))
 
