@@ -128,7 +128,7 @@ def not_available(backend: str, reason: object, following: str) -> str:
 
 def slower_by_scan(reason: object) -> str:
     """The warning that a scenario runs by the scan."""
-    return f"This scenario runs on the vmap backend, several times slower: {reason}."
+    return f"This scenario runs on the vmap backend, many times slower: {reason}."
 
 
 def scan_layout(platform: str, operations: int, runs: int | None, nested: bool) -> BatchLayout:

@@ -58,7 +58,7 @@ class RunRequest(NamedTuple):
 
 def check_backend(backend: str) -> str:
     """The name of a backend; raises ValueError for an unknown one."""
-    if backend == "xla":
+    if isinstance(backend, str) and backend == "xla":
         notices.warn(
             'backend="xla" was removed and means "vmap" now; "auto" is faster wherever there is a'
             " C++ compiler.",

@@ -478,6 +478,5 @@ def test_an_unknown_backend_is_refused():
             {"initial.q": jnp.ones((2, 2))},
             (),
             jnp.asarray(DT),
-            RunRequest(1),
-            backend="fpga",
+            RunRequest(1, backend="fpga"),
         )
