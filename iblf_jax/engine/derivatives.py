@@ -1,22 +1,40 @@
-"""Values and forward sensitivities of a batch, in one pass: several tangents a run, stepped beside
-it.
+"""Derivatives of runs, in two ways: tangents in a kernel, and the scan.
 
-Every direction u of the parameters has a tangent x_u of the state; gains are few, so forward mode
-beats reverse mode and needs no memory along time.  A fold may offer `curvature(acc, sample)`, a
-tuple of `curvatures` many `Outer`: vectors y with weights w, whose Gauss-Newton matrices
+**Tangents in a kernel.**  A step with tangents is a step as any other, and every executor makes it.
+Each direction u of the parameters has a tangent x_u of the state; a few tangents cost less than
+reverse mode and need no memory along time.  A kernel carries the tangents in one of two layouts:
+
+- All tangents of a run in one kernel (`DerivativeStep`, this module).  The tangents share the
+  evaluation of the law.  The directions are compiled in, only metrics are differentiated, and the
+  kernel grows with the number of tangents.
+- One tangent per run (`columns`).  The directions are inputs, so one kernel serves any number of
+  them; records are differentiated as well, and a tangent of a tangent is a second derivative.
+  `jax.grad`, `jacfwd`, `jacrev` and `hessian` of `simulate` use this layout (`transformable`).
+
+**The scan.**  JAX differentiates `loops.scan` or `loops.checkpointed` in forward or reverse mode.
+The time of reverse mode does not depend on how many numbers it is by, so this is the way for many
+numbers, for derivatives of third order, and where no kernel can be built.
+
+`choose_derivatives` chooses.  Each layout is needed: 64 runs of 500 steps, differentiated by the 4
+gains of the paper's loop on two busy cores, take 0.006 s with all tangents in one kernel (9.9 s
+with compilation), 0.042 s with one per run (15.7 s) and 0.40 s by the scan in forward mode (29 s).
+By 28 numbers of `presets.iiwa14`, whose kernel with all tangents would be too long, one tangent per
+run takes 16.6 s (60 s with compilation), while XLA had not compiled the scan after 5 minutes.  The
+threshold `MAX_COLUMNS` has the measurement against reverse mode.
+
+A fold may offer `curvature(acc, sample)`, a tuple of `curvatures` many `Outer`: vectors y with
+weights w.  Their Gauss-Newton matrices
 
     N_uv = sum_k w(t_k) y_u(t_k) . y_v(t_k),      y_u = tangent of y,
 
-are summed up along the way, at next to no cost.  With w = 2 dt that is the second-order information
-of every integral of squares.
-
-The step with its tangents is a step as any other: every executor steps it.  As a scalar program it
-holds what all tangents share once, because equal nodes are one node.
+are summed along the run at little cost.  With w = 2 dt they are the second-order information of
+every integral of squares.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, NamedTuple
 
@@ -26,6 +44,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from iblf_jax.core.optional import OptionalMembers, attributes
+from iblf_jax.engine import thresholds
 from iblf_jax.engine.batch import Batch, StepLoop, finalize, initialize
 from iblf_jax.engine.carry import Carry, Inputs, StepOptions
 from iblf_jax.engine.metric_folds import finished, split_floats
@@ -39,6 +58,33 @@ from iblf_jax.simulation.signals import Sample
 
 FLAG_FIELDS = ("guard_active", "saturated")
 """Fields of a sample that are no numbers."""
+
+
+class DerivativeSizes(NamedTuple):
+    """What decides how a derivative is computed."""
+
+    kept_numbers: int
+    """Numbers of the derivative that are kept along the run, with one tangent per run."""
+    order: int = 1
+    columns: int = 1
+    """Numbers of a transformed run by which it is differentiated, the most of any order."""
+    nodes_together: float = math.inf
+    """Nodes of the kernel that carries all tangents; infinite where records are differentiated."""
+    max_nodes: float | None = 0
+    """Nodes up to which the executor compiles such a kernel (`Limits.derivatives`)."""
+
+
+def choose_derivatives(sizes: DerivativeSizes) -> str:
+    """How a derivative is computed where a kernel can be built: "together" (all tangents of a run
+    in one kernel), "one per run" or "scan".
+    """
+    if thresholds.is_within(sizes.nodes_together, sizes.max_nodes):
+        return "together"
+    is_small = sizes.kept_numbers <= thresholds.KEPT_NUMBERS
+    is_low_order = sizes.order <= thresholds.HIGHEST_COLUMN_ORDER
+    if is_small and is_low_order and sizes.columns <= thresholds.MAX_COLUMNS:
+        return "one per run"
+    return "scan"
 
 
 class Outer(NamedTuple):

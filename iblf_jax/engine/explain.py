@@ -1,4 +1,4 @@
-"""`explain`: what one step of a scenario costs, counted on its scalar program."""
+"""`explain`: the operations of one step of a scenario, counted in its scalar program."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ NAMES = {
 
 @dataclasses.dataclass(frozen=True)
 class Explanation:
-    """Operations of one step by how often they are done; prints as a table."""
+    """Operations of one step, by how often they are executed; prints as a table."""
 
     counts: dict[str, Counter]
     """How often -> operation -> number."""
@@ -51,11 +51,11 @@ class Explanation:
     """Estimated limit of this machine's processor [steps/s]: two vector instructions a cycle on
     every core."""
     backend: str = ""
-    """What a batch runs on here when nobody says otherwise, and why that is not compiled code if it
-    is not."""
+    """The executor that runs a batch here by default, and the reason if it does not compile
+    kernels."""
     derivatives: str = ""
-    """What makes the derivatives of `simulate` under `jax.grad`, `jacfwd` or `hessian`, and why
-    that is not compiled code if it is not."""
+    """What computes the derivatives of `simulate` under `jax.grad`, `jacfwd` or `hessian`, and the
+    reason if it is no compiled kernel."""
 
     def __repr__(self) -> str:
         lines = ["operations done        number  which"]
