@@ -77,7 +77,8 @@ def numbers_of(inputs: Inputs, record: Callable) -> int:
         state = initial_state(inputs.scenario)
         sample = evaluate(inputs.scenario, inputs.dt, state, inputs.dt)[1]
         seen = MetricSample(tuple(fold.init(sample) for fold in inputs.folds), sample, True)
-        found = Advanced(None, (seen,) * samples_of_step(inputs.scenario), state)  # type: ignore[arg-type]
+        samples = (seen,) * samples_of_step(inputs.scenario)
+        found = Advanced(None, samples, state)  # type: ignore[arg-type]
         return floats_of(record(inputs.folds, found))
 
     return sum(math.prod(x.shape) for x in jax.eval_shape(one, inputs))

@@ -178,12 +178,12 @@ def run_batch_jvp(
     def attempt(executor: Executor) -> Tangents:
         batch = Batch.of(inputs, varied, execution.layout, request.constants)
         loop = kernel_loop(executor)
-        way = "together"
+        chosen = "together"
         if request.backend == "auto":
-            way = choose_derivatives(_derivative_sizes(executor, batch, along, request))
-        if way == "scan":
+            chosen = choose_derivatives(_derivative_sizes(executor, batch, along, request))
+        if chosen == "scan":
             return by_scan()
-        run = {"together": run_with_tangents, "one per run": run_by_columns}[way]
+        run = {"together": run_with_tangents, "one per run": run_by_columns}[chosen]
         return run(loop, batch, along, request)
 
     def by_scan() -> Tangents:
