@@ -59,7 +59,7 @@ import iblf_jax as ij
 from iblf_jax import barriers, bounds, controllers, disturbances, observers, references, robots
 from iblf_jax.engine import RunRequest
 from iblf_jax.engine.execute import run_batch
-from iblf_jax.engine.mechanism import mechanism_of
+from iblf_jax.engine.structural_constants import robot_constants
 from iblf_jax.simulation.scenario import canonical
 from iblf_jax.studies.cube import bounded
 from iblf_jax.tuning import TuningProblem, _falsify, evaluation
@@ -670,7 +670,7 @@ def margins_of(scenario: ij.Scenario, sets: dict[str, Any], timing: dict[str, fl
     scenario = canonical(scenario)
     cube = bounded(scenario, sets)
     run = RunRequest(
-        round(timing["duration"] / timing["dt"]), "rk4", constants=mechanism_of(scenario)
+        round(timing["duration"] / timing["dt"]), "rk4", constants=robot_constants(scenario)
     )
     fold = jax.tree.map(jnp.asarray, Quantities((Peak(1.0, "deficit"),)))
 

@@ -20,7 +20,7 @@ import iblf_jax as ij
 from iblf_jax.core import checks
 from iblf_jax.engine import RunRequest
 from iblf_jax.engine.batch import Batch, carry_shapes
-from iblf_jax.engine.step import Inputs
+from iblf_jax.engine.carry import Inputs
 from iblf_jax.engine.step_size import fastest_along
 from iblf_jax.engine.transformable import run_transformable
 from iblf_jax.files.tuning import load_tuning_file
