@@ -49,19 +49,19 @@ class Leaves(NamedTuple):
             groups[bool(differs)].append(leaf)
         return Leaves(treedef, tuple(is_per_run), groups[False], groups[True])
 
-    def merged(self, shared: Sequence, per_run: Sequence) -> list:
+    def merge(self, shared: Sequence, per_run: Sequence) -> list:
         """Leaves of the two groups in the order of the pytree."""
         sources = {False: iter(shared), True: iter(per_run)}
         return [next(sources[differs]) for differs in self.is_per_run]
 
-    def together(self, shared: Sequence, per_run: Sequence):
+    def unflatten(self, shared: Sequence, per_run: Sequence):
         """The pytree again, from one run's leaves."""
-        return jax.tree.unflatten(self.treedef, self.merged(shared, per_run))
+        return jax.tree.unflatten(self.treedef, self.merge(shared, per_run))
 
     @property
     def first(self):
         """The pytree of the first run."""
-        return self.together(self.shared, [x[0] for x in self.per_run])
+        return self.unflatten(self.shared, [x[0] for x in self.per_run])
 
 
 def split(inputs: Inputs, varied: Mapping[str, jax.Array]) -> Leaves:
@@ -119,11 +119,11 @@ class Batch(NamedTuple):
         return Batch(split(inputs, varied), runs, layout, constants)
 
     @property
-    def known(self) -> tuple:
+    def shared_constants(self) -> tuple:
         """What is known of the shared numbers."""
         if self.constants is None:
             return ()
-        shapes = self.leaves.merged(
+        shapes = self.leaves.merge(
             [x.shape for x in self.leaves.shared], [x.shape[1:] for x in self.leaves.per_run]
         )
         return self.constants.of_shared(self.leaves.is_per_run, [math.prod(x) for x in shapes])
@@ -133,11 +133,11 @@ class Batch(NamedTuple):
         """The floating-point type."""
         return self.leaves.shared[-1].dtype
 
-    def each(self, function: Callable, *args: Any) -> Any:
+    def map_runs(self, function: Callable, *args: Any) -> Any:
         """function(inputs, *args) for every run; arguments and results have the run axis first."""
 
         def one(per_run, *rest):
-            return function(self.leaves.together(self.leaves.shared, per_run), *rest)
+            return function(self.leaves.unflatten(self.leaves.shared, per_run), *rest)
 
         if self.runs is None:
             return one([], *args)
@@ -171,7 +171,7 @@ def _linearized_batch(batch: Batch) -> Batch:
     leaves = batch.leaves
     numbered: Inputs = jax.tree.unflatten(leaves.treedef, range(len(leaves.is_per_run)))
     kept, treedef = jax.tree.flatten(numbered._replace(folds=(), noise=(), direction=()))
-    values = leaves.merged(leaves.shared, leaves.per_run)
+    values = leaves.merge(leaves.shared, leaves.per_run)
     is_per_run = [leaves.is_per_run[i] for i in kept]
     constants = jax.lax.stop_gradient([values[i] for i in kept])
     return batch._replace(leaves=Leaves.of(treedef, is_per_run, constants))
@@ -188,7 +188,7 @@ def _initial_linearization(batch: Batch, method: str) -> Linearization:
             jnp.zeros_like(inputs.dt), perturbed_state(state), watched, estimate
         )
 
-    return batch.each(of_run)
+    return batch.map_runs(of_run)
 
 
 def linearization_batch(batch: Batch, method: str) -> tuple[Batch, Linearization]:
@@ -204,7 +204,7 @@ def initialize(loop: StepLoop, batch: Batch, method: str) -> tuple[Carry, Linear
         is_sampled = inputs.scenario.sampling is not None
         return start(inputs, method, resolved(found.jacobian, is_sampled))
 
-    return batch.each(of_run, found), found
+    return batch.map_runs(of_run, found), found
 
 
 def carry_shapes(batch: Batch, method: str) -> Carry:
@@ -214,7 +214,7 @@ def carry_shapes(batch: Batch, method: str) -> Carry:
         size = accuracy.watched_indices(initial_state(inputs.scenario)).size
         return start(inputs, method, jnp.zeros((size, size), inputs.dt.dtype))
 
-    return jax.eval_shape(lambda: batch.each(of_run))
+    return jax.eval_shape(lambda: batch.map_runs(of_run))
 
 
 def finalize(
@@ -240,14 +240,14 @@ def finalize(
     per_run = [jnp.repeat(x, 2, axis=0) for x in batch.leaves.per_run]
     leaves = batch.leaves._replace(per_run=per_run)
     twice = batch._replace(leaves=leaves, runs=2 * (batch.runs or 1))
-    instants = batch.each(critical_instants, carry)
+    instants = batch.map_runs(critical_instants, carry)
     if batch.runs is None:
         later = _linearized(loop, twice, instants)
     else:
         in_a_row = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), instants)
         later = _linearized(loop, twice, in_a_row)
         later = jax.tree.map(lambda x: x.reshape(-1, 2, *x.shape[1:]), later)
-    return batch.each(outcome, carry, at_start, later)
+    return batch.map_runs(outcome, carry, at_start, later)
 
 
 def run_all(loop: StepLoop, batch: Batch, request: RunRequest) -> Outcome:
@@ -263,5 +263,5 @@ def run_step(
 ) -> tuple[Outcome, Any]:
     """All runs by a step that may record something else; the outcome, and the records apart."""
     carry, at_start = initialize(loop, batch, request.method)
-    carry, records = loop(step, batch, carry, request.steps + 1, request.record_every)
+    carry, records = loop(step, batch, carry, request.instants, request.record_every)
     return finalize(loop, batch, request, carry, at_start), records

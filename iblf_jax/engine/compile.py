@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple, TypeVar
 
@@ -63,17 +64,17 @@ def first_that_works(
         available, and UnsupportedError where it cannot express the step.
       by_scan: function without arguments.
     """
-    for text in execution.notes:
+    for text in execution.warnings:
         _warn_once(text)
-    names = execution.backends
-    for name, following in zip(names, (*names[1:], "vmap"), strict=False):
+    names = (*execution.backends, "vmap")
+    for name, following in itertools.pairwise(names):
         try:
             return attempt(registry.EXECUTORS[name])
         except ToolchainError as error:
-            _warn_once(plan.not_available(name, error, following))
+            _warn_once(plan.unavailable_warning(name, error, following))
         except UnsupportedError as reason:
             if execution.reports_unsupported:
-                _warn_once(plan.slower_by_scan(reason))
+                _warn_once(plan.scan_warning(reason))
             break
     return by_scan()
 
@@ -109,7 +110,7 @@ def nested_batch(inputs: Inputs) -> Batch:
     return Batch.of(inputs, None, layout)
 
 
-def scanned(
+def run_by_scan(
     layout: BatchLayout, inputs: Inputs, varied: Mapping[str, jax.Array] | None, run: Callable
 ) -> Any:
     """`run(batch)` for a batch in a layout of the scan."""
@@ -137,9 +138,9 @@ class StepProgram(NamedTuple):
 
     program: Program
     shared: int
-    """Numbers that all runs share."""
+    """How many numbers all runs share."""
     per_run: int
-    """Numbers that differ between runs."""
+    """How many numbers differ between runs."""
     runs: int
     steps: int
 
@@ -159,7 +160,7 @@ class StepProgram(NamedTuple):
 def time_step_program(batch: Batch, request: RunRequest) -> StepProgram:
     """The program of a time step."""
     carry = carry_shapes(batch, request.method)
-    return StepProgram.of(TimeStep.of(request), batch, carry, request.steps + 1)
+    return StepProgram.of(TimeStep.of(request), batch, carry, request.instants)
 
 
 def _linearization_program(batch: Batch, request: RunRequest) -> StepProgram:
@@ -175,7 +176,7 @@ def start_build(executor: Executor, program: StepProgram) -> None:
         executor.start_build(*program)
 
 
-def run_lowered(
+def run_by_executor(
     executor: Executor, batch: Batch, request: RunRequest, run: Callable[[StepLoop, Batch], T]
 ) -> T:
     """`run(loop, batch)` by an executor.
@@ -216,11 +217,15 @@ def _tree_of_shapes(structure: Any, shapes: tuple) -> Any:
 
 
 def structural_part(request: RunRequest) -> RunRequest:
-    """The part of a request on which its kernels depend: of the number of steps whether it is
-    large, and of the record whether there is one.
+    """The request with only what its kernels depend on: whether there are at least FEW_STEPS steps,
+    and whether anything is recorded.
     """
-    steps = thresholds.FEW_STEPS if request.steps >= thresholds.FEW_STEPS else 0
-    return request._replace(steps=steps, record_every=request.record_every and 1)
+    part = request._replace(steps=0)
+    if request.steps >= thresholds.FEW_STEPS:
+        part = part._replace(steps=thresholds.FEW_STEPS)
+    if request.record_every is not None:
+        part = part._replace(record_every=1)
+    return part
 
 
 # --- batches ---
@@ -261,7 +266,7 @@ def compiled_plan(
         return (executor.name,)
 
     execution = on_shapes(choose, arguments)
-    return execution._replace(backends=first_that_works(execution, build, lambda: ()), notes=())
+    return execution._replace(backends=first_that_works(execution, build, lambda: ()), warnings=())
 
 
 # --- single runs ---
@@ -296,8 +301,7 @@ def plan_of_single_run(
       shapes: of their leaves.
     """
     inputs = _tree_of_shapes(structure, shapes)
-    sizes = Sizes(on_shapes(operations, inputs), None)
-    execution = choose_plan(request, sizes, machine)
+    execution = choose_plan(request, Sizes(on_shapes(operations, inputs), None), machine)
     if not execution.backends:
         return SingleRunPlan(execution, 0)
 
@@ -306,11 +310,9 @@ def plan_of_single_run(
 
     try:
         step = on_shapes(program, inputs)
-        nodes = step.program.size
-        execution = choose_plan(request, sizes._replace(nodes=nodes), machine)
+        execution = plan.within_node_limit(execution, request, step.program.size)
         if execution.backends:
             start_build(registry.EXECUTORS[execution.backend], step)
-        return SingleRunPlan(execution, nodes)
+        return SingleRunPlan(execution, step.program.size)
     except UnsupportedError as reason:
-        sizes = sizes._replace(unsupported=str(reason))
-        return SingleRunPlan(choose_plan(request, sizes, machine), 0)
+        return SingleRunPlan(plan.scan_only(execution, reason), 0)

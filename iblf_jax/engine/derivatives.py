@@ -71,7 +71,7 @@ class DerivativeSizes(NamedTuple):
     nodes_together: float = math.inf
     """Nodes of the kernel that carries all tangents; infinite where records are differentiated."""
     max_nodes: float | None = 0
-    """Nodes up to which the executor compiles such a kernel (`Limits.derivatives`)."""
+    """Nodes up to which the executor compiles such a kernel (`Limits.derivative_nodes`)."""
 
 
 def choose_derivatives(sizes: DerivativeSizes) -> str:
@@ -80,8 +80,8 @@ def choose_derivatives(sizes: DerivativeSizes) -> str:
     """
     if thresholds.is_within(sizes.nodes_together, sizes.max_nodes):
         return "together"
-    is_small = sizes.kept_numbers <= thresholds.KEPT_NUMBERS
-    is_low_order = sizes.order <= thresholds.HIGHEST_COLUMN_ORDER
+    is_small = sizes.kept_numbers <= thresholds.MAX_KEPT_NUMBERS
+    is_low_order = sizes.order <= thresholds.MAX_COLUMN_ORDER
     if is_small and is_low_order and sizes.columns <= thresholds.MAX_COLUMNS:
         return "one per run"
     return "scan"
@@ -352,9 +352,9 @@ def run_with_tangents(
         )
 
     carry, instant = initialize(loop, batch, request.method)
-    before = batch.each(at_start, carry)
+    before = batch.map_runs(at_start, carry)
     after, _ = loop(
         DerivativeStep(request.method, directions), batch, before, request.steps + 1, None
     )
-    tangents, products = batch.each(at_end, after)
+    tangents, products = batch.map_runs(at_end, after)
     return Tangents(finalize(loop, batch, request, after.carry, instant), tangents, products)

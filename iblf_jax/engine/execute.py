@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import jax
 
-from iblf_jax.engine import registry, thresholds
+from iblf_jax.engine import registry
 from iblf_jax.engine.batch import Batch, StepLoop, carry_shapes, run_all
 from iblf_jax.engine.carry import Inputs
 from iblf_jax.engine.columns import numbers_of, outer_vectors, run_by_columns
@@ -23,8 +23,8 @@ from iblf_jax.engine.compile import (
     nested_batch,
     operations,
     plan_of_batch,
-    run_lowered,
-    scanned,
+    run_by_executor,
+    run_by_scan,
     shapes_of,
     structural_part,
 )
@@ -37,7 +37,7 @@ from iblf_jax.engine.derivatives import (
 )
 from iblf_jax.engine.loops import checkpointed, kernel_loop, program_of, scan
 from iblf_jax.engine.outcome import Outcome
-from iblf_jax.engine.plan import STATES_LAYOUT, ExecutionPlan
+from iblf_jax.engine.plan import STATES_LAYOUT, ExecutionPlan, plan_of_states
 from iblf_jax.engine.registry import Executor
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.structural_constants import constants_of
@@ -83,10 +83,10 @@ def _run_planned(
 
     def attempt(executor: Executor) -> Outcome:
         batch = Batch.of(inputs, varied, execution.layout, request.constants)
-        return run_lowered(executor, batch, request, run)
+        return run_by_executor(executor, batch, request, run)
 
     def by_scan() -> Outcome:
-        return scanned(execution.scan_layout, inputs, varied, partial(run, scan))
+        return run_by_scan(execution.scan_layout, inputs, varied, partial(run, scan))
 
     return first_that_works(execution, attempt, by_scan)
 
@@ -190,7 +190,7 @@ def run_batch_jvp(
         def run(batch: Batch) -> Tangents:
             return run_with_tangents(scan, batch, along, request)
 
-        return scanned(execution.scan_layout, inputs, varied, run)
+        return run_by_scan(execution.scan_layout, inputs, varied, run)
 
     return first_that_works(execution, attempt, by_scan)
 
@@ -201,11 +201,11 @@ def _derivative_sizes(
     """The sizes that decide how an executor computes tangents."""
     carry = carry_shapes(batch, request.method)
     nodes = program_of(TimeStep(request.method), batch, carry).program.size
-    samples = (request.steps + 1) * (batch.runs or 1)
+    samples = request.instants * (batch.runs or 1)
     return DerivativeSizes(
         kept_numbers=numbers_of(batch.leaves.first, outer_vectors) * along.tangents * samples,
         nodes_together=nodes * (1 + along.tangents),
-        max_nodes=executor.limits.derivatives,
+        max_nodes=executor.limits.derivative_nodes,
     )
 
 
@@ -226,7 +226,7 @@ def run_for_reverse(
     return run_all(checkpointed, nested_batch(inputs), request)
 
 
-def run_from(
+def step_states(
     scenario: Scenario, dt: jax.Array, carry: Any, *, step: Any, steps: int = 1
 ) -> tuple[Any, Any]:
     """Makes a given step `steps` times from each of many states.
@@ -242,23 +242,19 @@ def run_from(
       The carry after the last, (R, ...), and what every step recorded, (R, steps, ...).
     """
     request = RunRequest(steps)
-    if registry.automatic().reason is None:
+    if registry.default_backend().reason is None:
         request = request._replace(constants=constants_of(scenario))
-    return _run_from(scenario, dt, carry, step=step, request=request)
+    return _step_states(scenario, dt, carry, step=step, request=request)
 
 
 @partial(jax.jit, static_argnames=("step", "request"))
-def _run_from(
+def _step_states(
     scenario: Scenario, dt: jax.Array, carry: Any, *, step: Any, request: RunRequest
 ) -> tuple[Any, Any]:
     inputs = inputs_of(scenario, (), dt, request)
     runs = jax.tree.leaves(carry)[0].shape[0]
     batch = Batch.of(inputs, None, STATES_LAYOUT, request.constants)._replace(runs=runs)
-    automatic = registry.automatic()
-    backends: tuple[str, ...] = ()
-    if automatic.reason is None and thresholds.compiles_states(operations(inputs)):
-        backends = (automatic.name,)
-    execution = ExecutionPlan(backends, STATES_LAYOUT, STATES_LAYOUT, False)
+    execution = plan_of_states(operations(inputs), registry.default_backend())
 
     def by(loop: StepLoop) -> tuple[Any, Any]:
         return loop(step, batch, carry, request.steps, 1)

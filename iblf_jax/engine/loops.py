@@ -41,7 +41,7 @@ def scan(step: Any, batch: Batch, carry: Any, steps: int, every: int | None) -> 
 
         return _scan_run(of_run, carry, steps, every)
 
-    return batch.each(one, carry)
+    return batch.map_runs(one, carry)
 
 
 def _scan_run(step: Callable, carry: Any, steps: int, every: int | None) -> tuple[Any, Any]:
@@ -107,7 +107,7 @@ def checkpointed(
 
         return jax.lax.scan(many, carry, inner * inner * jnp.arange(blocks))
 
-    return batch.each(one, carry)
+    return batch.map_runs(one, carry)
 
 
 @CACHE.memoised(64)
@@ -117,7 +117,7 @@ def _on_leaves(step: Any, treedef, is_per_run: tuple[bool, ...], carry_treedef) 
     """
 
     def on_leaves(shared, per_run, carry, index):
-        inputs = Leaves(treedef, is_per_run, [], []).together(shared, per_run)
+        inputs = Leaves(treedef, is_per_run, [], []).unflatten(shared, per_run)
         after, records = step(
             inputs, jax.tree.unflatten(carry_treedef, carry), index, StepOptions(scalar=True)
         )
@@ -144,7 +144,7 @@ def program_of(step: Any, batch: Batch, carry: Any) -> CompiledStep:
         *shapes,
         thresholds.LOWERING_LIMITS,
         sparse,
-        batch.known,
+        batch.shared_constants,
     )
 
 

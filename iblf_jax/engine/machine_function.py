@@ -82,7 +82,7 @@ def machine_function(function: Callable) -> Callable:
         operations = list(_operations(closed.jaxpr))
         if (
             thresholds.has_machine_functions(devices.platform())
-            and len(operations) <= thresholds.LONGEST_FUNCTION
+            and len(operations) <= thresholds.MAX_FUNCTION_OPERATIONS
             and all(map(_is_trusted, operations))
         ):
             call = set_xla_metadata(inlineable="false", xla_cpu_small_call="true")(jax.jit(call))

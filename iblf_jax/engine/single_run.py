@@ -27,7 +27,7 @@ from iblf_jax.engine.compile import (
     first_that_works,
     inputs_of,
     plan_of_single_run,
-    scanned,
+    run_by_scan,
     shapes_of,
     single_batch,
     structural_part,
@@ -70,7 +70,7 @@ def run_one(
         parts = Parts(executor.name, structure, execution.layout)
         try:
             with compilers_stopped_on_error():
-                return _run_lowered(parts, found.nodes, request, leaves)
+                return _run_by_executor(parts, found.nodes, request, leaves)
         except ToolchainError as error:
             if not isinstance(error, StoppedError):
                 CACHE.mark(FAILED_BUILDS, (executor.name, structure, shapes))
@@ -112,7 +112,7 @@ class Parts(NamedTuple):
         return kernel_loop(self.executor)
 
 
-def _run_lowered(parts: Parts, nodes: int, request: RunRequest, leaves: list) -> Outcome:
+def _run_by_executor(parts: Parts, nodes: int, request: RunRequest, leaves: list) -> Outcome:
     """One run by an executor; `nodes` of its step's program."""
     independent = request._replace(steps=0, record_every=None)
     carry, at_start = _initialize(parts, independent, leaves)
@@ -127,8 +127,8 @@ def _run_lowered(parts: Parts, nodes: int, request: RunRequest, leaves: list) ->
 def _steps_per_call(executor: Executor, nodes: int, request: RunRequest) -> int:
     """Steps of one run that are made before Python sees whether Ctrl-C was pressed."""
     steps = request.steps + 1
-    longest = executor.limits.single_run or nodes
-    if not executor.continues or steps * longest <= thresholds.OPERATIONS_PER_CALL:
+    longest = executor.limits.single_run_nodes or nodes
+    if not executor.accepts_first_step or steps * longest <= thresholds.OPERATIONS_PER_CALL:
         return steps
     return thresholds.steps_per_call(nodes, steps, request.record_every)
 
@@ -189,4 +189,4 @@ def _finalize(
 @partial(jax.jit, static_argnums=(0, 1, 2))
 def _run_by_scan(structure: Any, layout: BatchLayout, request: RunRequest, leaves: list) -> Outcome:
     inputs = jax.tree.unflatten(structure, leaves)
-    return scanned(layout, inputs, None, lambda batch: run_all(scan, batch, request))
+    return run_by_scan(layout, inputs, None, lambda batch: run_all(scan, batch, request))

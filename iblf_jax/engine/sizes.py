@@ -20,7 +20,7 @@ block are handled while the kernel of another one runs."""
 STEPS_PER_UNIT, MIN_UNITS = 2e8, 16
 """Steps of all runs in a unit of a sweep's store, which is work for seconds to a minute; and the
 least number of units of a large sweep."""
-MIN_RUNS_TOGETHER = 16
+MIN_RUNS_PER_BATCH = 16
 """Runs that are evaluated at once at least, when only a few starts of a tuning are left: as many as
 the vectors of a processor hold."""
 MAX_STEPS_IN_SEARCH_SHAPE = 10_000_000
@@ -50,7 +50,7 @@ def blocks_in_flight(chunk: int | None, memory: float, block_bytes: int, devices
     return int(min(max(allowed, 1), MAX_IN_FLIGHT * devices_used))
 
 
-def sweep_unit(cases: int, steps: int) -> int:
+def cases_per_unit(cases: int, steps: int) -> int:
     """Cases in one unit of a sweep's store: whole blocks, or all cases of a small sweep.
 
     Args:
@@ -66,17 +66,17 @@ def whole_blocks(cases: int, runs: float) -> int:
     return min(cases, size * max(1, round(runs / size)))
 
 
-def values_together(runs: int) -> int:
+def points_per_batch(runs: int) -> int:
     """Points of a tuning, of so many runs each, that are evaluated in one batch."""
-    return -(-MIN_RUNS_TOGETHER // runs)
+    return -(-MIN_RUNS_PER_BATCH // runs)
 
 
-def starts_together(starts: int, runs: int) -> int:
+def starts_per_batch(starts: int, runs: int) -> int:
     """Starts of a tuning, of so many runs each, that are evaluated in one batch."""
-    return min(starts, values_together(runs))
+    return min(starts, points_per_batch(runs))
 
 
-def fresh_together(steps: int, compiled: int) -> int:
+def report_runs_per_batch(steps: int, compiled: int) -> int:
     """Runs of a tuning's report that are evaluated in one batch.
 
     Args:

@@ -22,11 +22,11 @@ LONG_EVALUATION = 2500
 """Operations of one evaluation of the closed loop from which it is a machine function of its own,
 called from a loop of XLA's: LLVM's time grows faster than a function.  Two joints take some 700,
 three 1,500, an arm of seven 10,000."""
-LONGEST_FUNCTION = 60_000
+MAX_FUNCTION_OPERATIONS = 60_000
 """Operations over which LLVM takes minutes as one machine function."""
 
 # Scalar programs: numbers of operations are nodes of a step.
-LONGEST_SINGLE_RUN = 60_000
+MAX_SINGLE_RUN_NODES = 60_000
 """Nodes up to which a single run is lowered on "auto": a longer step gains less by it than it takes
 to compile.  A run of `presets.ur5`, 18,000 nodes, takes 0.04 s on native and 0.24 s on vmap; its
 first result takes 11 s of a busy processor there, 30 where the kernel has to be built, and 24 on
@@ -41,13 +41,13 @@ among 64 entries takes 9 ns, one among 256 entries 70; twelve tables of 4096 num
 ns, and one of 256 takes 6 s to build.  To call the loop of three joints, 1,000 nodes, takes 4 % of
 a step's time; of four joints 2 %, and the step builds in two thirds of the time.  A call costs
 about as much as 30 nodes."""
-LONGEST_C_FUNCTION, NODES_OF_A_C_FUNCTION = 4000, 500
+MAX_C_FUNCTION_NODES, SEGMENT_NODES = 4000, 500
 """Nodes above which the C of a step is cut into functions, and of how many each.  A step of
 `presets.iiwa14`, 15,000 nodes, takes 12.2 us a block of runs and builds in 3.3 s; in one function
 14.3 us and 6 s, in pieces of 125, 250, 1000 and 4000 3, 1, 5 and 12 % more.  Chains of three, five
 and six joints (4,600 to 7,800 nodes) gain 6, 1 and 17 %; the paper's loop (1,800) would lose 4 %, a
 chain of four (3,800) 7 %."""
-STEPS_OF_A_THREAD, BLOCKS_OF_A_THREAD = 128, 32
+TILE_STEPS, TILE_BLOCKS = 128, 32
 """Steps and blocks of runs that a thread goes through together, so that states and the table of
 signals stay in its cache: 32 to 512 steps and 8 to 128 blocks take the same time within 5 % (the
 paper's loop)."""
@@ -64,19 +64,19 @@ build another kernel, and the linearization of a run (`LinearizationStep`) serve
 MAX_STEPS_PER_LAUNCH = 8192
 """Steps of a launch on a GPU, at most: it limits the table of signals, and how long a display may
 have to wait."""
-WARP, MAX_THREADS_PER_BLOCK, MULTIPROCESSORS = 32, 128, 100
+WARP, MAX_THREADS_PER_BLOCK, DEFAULT_MULTIPROCESSORS = 32, 128, 100
 """Threads of a warp and of a block on a GPU, at most (`c/kernels.h` promises the compiler no more);
 multiprocessors where JAX does not know."""
 
 # Derivatives.
-LONGEST_DERIVATIVE, LONGEST_DERIVATIVE_CUT = 60_000, 150_000
+MAX_DERIVATIVE_NODES, MAX_SEGMENTED_DERIVATIVE_NODES = 60_000, 150_000
 """Nodes of a step, times one plus the number of tangents, up to which "auto" lowers its
 derivatives; the second number is for executors that cut a step into functions, which compile half a
 minute where the others compile minutes.  Equal nodes are computed once, so about a third of them
 is left."""
-FORWARD_MOST = 32
+MAX_FORWARD_NUMBERS = 32
 """Numbers that are differentiated by up to which forward mode is taken, above it reverse mode."""
-HIGHEST_COLUMN_ORDER, KEPT_NUMBERS = 2, 1 << 27
+MAX_COLUMN_ORDER, MAX_KEPT_NUMBERS = 2, 1 << 27
 """Highest order of the derivatives that are computed column by column, and the most numbers of such
 a derivative of one run's records, 1 GiB.  The scan computes all others, in the caller's mode."""
 MAX_COLUMNS = 96
@@ -105,12 +105,12 @@ def native_build(nodes: int, short_vector: bool) -> tuple[int | None, tuple[str,
       nodes: of the step.
       short_vector: for so few runs, of many steps, that they fill a short vector.
     """
-    flags = [f"-DSTRETCH={STEPS_OF_A_THREAD}", f"-DGROUP={BLOCKS_OF_A_THREAD}"]
+    flags = [f"-DSTRETCH={TILE_STEPS}", f"-DGROUP={TILE_BLOCKS}"]
     if short_vector:
         flags.append(f"-DVECTOR_BYTES={SHORT_VECTOR_BYTES}")
     segment = None
-    if nodes > LONGEST_C_FUNCTION:
-        segment = NODES_OF_A_C_FUNCTION
+    if nodes > MAX_C_FUNCTION_NODES:
+        segment = SEGMENT_NODES
     return segment, tuple(flags)
 
 
@@ -129,16 +129,9 @@ def gpu_threads(runs: int, multiprocessors: int) -> int:
     return min(warps * WARP, MAX_THREADS_PER_BLOCK)
 
 
-def compiles_states(operations: int) -> bool:
-    """Whether a kernel makes one step from each of many states: it is made few times, so that only
-    a short program pays.
-    """
-    return operations <= LONG_EVALUATION
-
-
 def differentiates_forward(numbers: int) -> bool:
     """Whether derivatives by so many numbers are taken in forward mode."""
-    return numbers <= FORWARD_MOST
+    return numbers <= MAX_FORWARD_NUMBERS
 
 
 def checkpoint_edge(steps: int) -> tuple[int, int]:

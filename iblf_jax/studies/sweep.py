@@ -20,7 +20,7 @@ import numpy as np
 
 from iblf_jax.core import checks, notices
 from iblf_jax.core.progress import bar
-from iblf_jax.engine import sweep_unit, whole_blocks
+from iblf_jax.engine import cases_per_unit, whole_blocks
 from iblf_jax.simulation.accuracy import RELATIVE
 from iblf_jax.simulation.metrics import Fold, metric_units
 from iblf_jax.simulation.scenario import Scenario, canonical
@@ -236,7 +236,7 @@ def _in_memory(
 def _unit_of(study: PreparedStudy, options: StoreOptions) -> int:
     """Cases in one unit of a new store: complete blocks, or all cases."""
     if options.unit is None:
-        return sweep_unit(study.cases, study.program.steps)
+        return cases_per_unit(study.cases, study.program.steps)
     return whole_blocks(study.cases, options.unit)
 
 
