@@ -47,8 +47,8 @@ class Executor(NamedTuple):
     start_build: Callable | None = None
     """Starts to compile in the background; arguments as `build`."""
     accepts_first_step: bool = False
-    """Whether `run` accepts `first`, the index of the first step, and `short_vector`.  A long single
-    run can then be divided into several calls."""
+    """Whether `run` accepts `first`, the index of the first step, and `short_vector`.  Then a long
+    single run can be divided into several calls."""
     uses_host_compiler: bool = False
     """Whether results depend on the processor and the C++ compiler of the host in their last
     digits."""
