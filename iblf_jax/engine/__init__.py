@@ -1,14 +1,17 @@
 """The engine: from a request for runs to numbers, in five stages.
 
-    request = RunRequest.of(scenario, steps=..., method=..., backend=...)     checked once
-    plan    = choose_plan(request, sizes, machine)      which executors, and how a batch is laid out
-    program = compile_batch(request, scenario, varied, folds, dt)     the first executor that works
-    output  = program(scenario, varied, folds, dt)      an `Outcome`: records, metrics, status flags
-    result  = run_rollout(...)                          a `Rollout`: named, with units, plotted
+    stage      a single run                          a batch
+    request    `RunRequest.of`                       `RunRequest.of`
+    plan       `plan.choose_plan`                    `plan.choose_plan`
+    program    `compile.plan_of_single_run`          `compile_batch`
+    output     `single_run.run_one`: an `Outcome`    `CompiledBatch` or `run_batch`: an `Outcome`
+    result     `run_rollout`: a `Rollout`            of the caller, such as a `Study`
 
-`registry` lists the executors, `loops` the loops over all steps of a batch, and `thresholds` the
-sizes with which the plan compares.  Modules outside this folder import from here; `simulate`,
-`explain`, `recommended_period` and the step sizes have modules of their own.
+The later functions call the earlier ones: `run_rollout` and `run_batch` need only a request.
+`time_step` defines a time step, `loops` has the loops over all steps, `registry` lists the
+executors, and `thresholds` has the limits that the plan applies.  Modules outside this folder
+import from here; `simulate`, `explain`, `recommended_period` and the step sizes have modules of
+their own.
 """
 
 from iblf_jax.engine.compile import BackendWarning as BackendWarning
