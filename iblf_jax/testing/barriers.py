@@ -15,11 +15,10 @@ from iblf_jax.testing._contract import (
     Findings,
     call_has_shape,
     check_function,
-    examine,
     has_shape,
     in_dtype,
 )
-from iblf_jax.testing.joints import check_number, fitted_to, number_of_joints, scenario_of
+from iblf_jax.testing.joints import examine_joints, scenario_of
 from iblf_jax.world.bounds import Tube
 
 XI = (
@@ -63,23 +62,20 @@ def check_barrier(barrier: Any, *, n: int | None = None) -> None:
       ContractError: lists what does not hold, with the remedy.
       ValueError: `n` is not a number of joints, or not that of the leaves.
     """
-    check_number(n)
-    with examine(barrier, "Barrier", Barrier, CLAIMS) as findings:
+    with examine_joints(barrier, Barrier, n, "barrier", CLAIMS) as (findings, barrier, joints):
         _class_members(findings, barrier)
-        n = number_of_joints(findings, barrier, n)
-        barrier = fitted_to(in_dtype(barrier, "float64"), n, "barrier")
-        context = in_dtype(scenario_of(n), "float64").context
-        k1 = _joint_by_joint(n, 2.0, 3.0)
-        o = _joint_by_joint(n, 0.1, 0.2) if barrier.uses_o else None
+        context = in_dtype(scenario_of(joints), "float64").context
+        k1 = jnp.asarray(np.resize([2.0, 3.0], joints))
+        o = jnp.asarray(np.resize([0.1, 0.2], joints)) if barrier.uses_o else None
         tube = context.tube(jnp.asarray(1.0))
-        q = tube.q_d + _joint_by_joint(n, 0.2, -0.15)
+        q = tube.q_d + np.resize([0.2, -0.15], joints)
         calls: dict[str, tuple] = {
             "value(tube, q)": (barrier.value, (tube, q)),
             "slope(tube, q)": (barrier.slope, (tube, q)),
             "virtual_velocity(tube, q, k1, o)": (barrier.virtual_velocity, (tube, q, k1, o)),
         }
         for label, (call, args) in calls.items():
-            call_has_shape(findings, label, call, args, (n,))
+            call_has_shape(findings, label, call, args, (joints,))
         findings.stop_if_any()
 
         def outputs(barrier, tube, q, k1, o):
@@ -113,11 +109,6 @@ def _class_members(findings: Findings, barrier: Any) -> None:
         "It must be a bool of the class, uses_o: ClassVar[bool]",
     )
     findings.stop_if_any()
-
-
-def _joint_by_joint(n: int, first: float, second: float) -> jax.Array:
-    """Two numbers that alternate over the joints, (n,)."""
-    return jnp.asarray(np.resize([first, second], n))
 
 
 @jax.jit

@@ -16,12 +16,11 @@ from iblf_jax.simulation.signals import Sample
 from iblf_jax.testing._contract import (
     Findings,
     check_function,
-    examine,
-    in_dtype,
+    in_both_types,
     same_structure,
     shape_of,
 )
-from iblf_jax.testing.joints import check_number, fitted_to, number_of_joints
+from iblf_jax.testing.joints import examine_joints
 
 LENGTH, REGIONS = 40, 1
 
@@ -37,8 +36,7 @@ def check_fold(fold: Any, *, n: int | None = None) -> None:
       ContractError: lists what does not hold, with the remedy.
       ValueError: `n` is not a number of joints, or not that of the leaves.
     """
-    check_number(n)
-    with examine(fold, "Fold", Fold) as findings:
+    with examine_joints(fold, Fold, n, "metric") as (findings, fold, joints):
         units = fold.units
         findings.require(
             isinstance(units, Mapping)
@@ -46,13 +44,9 @@ def check_fold(fold: Any, *, n: int | None = None) -> None:
             f"units is {units!r}",
             'It must be a dict from name to SI unit, {"rmse": "rad"}',
         )
-        n = number_of_joints(findings, fold, n)
-        fold = fitted_to(in_dtype(fold, "float64"), n, "metric")
-        for dtype in ("float64", "float32"):
-            _structure(findings, *in_dtype((fold, samples(np.random.default_rng(4), n)), dtype))
-        findings.stop_if_any()
+        some = samples(np.random.default_rng(4), joints)
+        in_both_types(findings, _structure, fold, some)
 
-        some = samples(np.random.default_rng(4), n)
         numbers, flags = parts(some)
         result = jax.jit(folded)((fold,), some)
         for name, value in result.items():
@@ -140,26 +134,23 @@ def samples_from(numbers: dict[str, jax.Array], flags: dict[str, jax.Array]) -> 
 
 def _structure(findings: Findings, fold: Any, samples: Sample) -> None:
     first = jax.tree.map(lambda x: x[0], samples)
-    kind = f" ({first.t.dtype})"
-    acc = shape_of(findings, "init(sample)" + kind, fold.init, first)
-    if acc is None:
-        return
-    after = shape_of(findings, "update(acc, sample)" + kind, fold.update, acc, first)
-    same_structure(findings, "update(acc, sample)" + kind, after, acc)
-    result = shape_of(findings, "finish(acc)" + kind, fold.finish, acc)
-    if result is None:
-        return
-    if findings.require(
-        isinstance(result, dict),
-        f"finish(acc) gives {type(result).__name__}",
-        "It must be a dict from name to array",
-    ):
-        remedy = "Every name needs a unit, and every unit a name"
-        findings.require(
-            set(result) == set(fold.units),
-            f"finish(acc) returns {sorted(result)}, units names {sorted(fold.units)}",
-            remedy,
-        )
+    acc = accumulates(findings, fold, first)
+    result = shape_of(findings, "finish(acc)", fold.finish, acc)
+    remedy = "It must be a dict from name to array"
+    findings.result_is(isinstance(result, dict), "finish(acc)", result, remedy)
+    findings.require(
+        set(result) == set(fold.units),
+        f"finish(acc) returns {sorted(result)}, units names {sorted(fold.units)}",
+        "Every name needs a unit, and every unit a name",
+    )
+
+
+def accumulates(findings: Findings, fold: Any, sample: Any) -> Any:
+    """The shapes of an accumulator; requires that `update` keeps them."""
+    acc = shape_of(findings, "init(sample)", fold.init, sample)
+    label = "update(acc, sample)"
+    same_structure(findings, label, shape_of(findings, label, fold.update, acc, sample), acc)
+    return acc
 
 
 def at_rest(findings: Findings, fold: Any, samples: Sample) -> None:
