@@ -105,6 +105,10 @@ class Mjcf(NamedTuple):
     bare: bool
     """Whether they are there under their bare names, without the folders that the file gives
     them."""
+    root: str = "world"
+    """Name of the body that no joint moves."""
+    speeds: dict[str, float] = {}  # noqa: RUF012
+    """Joint -> its largest speed, which an MJCF does not have."""
 
     def separate_weights(self, spec: Any) -> list[tuple[Any, Weight]]:
         """Replaces every weight that the library would reject or cannot know by a valid one, and

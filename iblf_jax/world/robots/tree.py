@@ -6,7 +6,6 @@ Quantities are NumPy arrays in float64.  A pose is (position, rotation matrix).
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -14,8 +13,9 @@ import numpy as np
 from iblf_jax.core import checks
 from iblf_jax.world.robots.description import Shown
 from iblf_jax.world.robots.links import Links, Pose
-from iblf_jax.world.robots.mjcf import Tendons
+from iblf_jax.world.robots.mjcf import Mjcf, Tendons
 from iblf_jax.world.robots.repair import Fault, Repairs, Weight, fault, second_moments
+from iblf_jax.world.robots.urdf import Urdf
 
 FREE, BALL, SLIDE, HINGE = range(4)
 KINDS = {HINGE: "revolute", SLIDE: "prismatic"}
@@ -64,17 +64,12 @@ class Tree:
             self.gravity = np.zeros(3)
 
     @staticmethod
-    def compiled(
-        text: str, path: str, root: str, separate_weights: Callable[[Any], list[tuple[Any, Weight]]]
-    ) -> Tree:
+    def compiled(file: Urdf | Mjcf, path: str) -> Tree:
         """The tree of a checked description.
 
         Args:
-          text: the description.
-          path: its file, for messages.
-          root: name of the body that the library calls the world.
-          separate_weights: takes the library's specification before it is compiled and returns the
-            bodies whose weights the library must not check.
+          file: the description.
+          path: of the file, for messages.
 
         Raises:
           ValueError: what the library does not accept, in its words.
@@ -82,14 +77,14 @@ class Tree:
         """
         mujoco = mujoco_package()
         try:
-            spec = mujoco.MjSpec.from_string(text)
+            spec = mujoco.MjSpec.from_string(file.text)
             spec.compiler.fusestatic = False
-            weights = separate_weights(spec)
+            weights = file.separate_weights(spec)
             model = spec.compile()
         except ValueError as error:
             words = " ".join(str(error).split())
             raise ValueError(f"{path}: {words}") from None
-        return Tree(model, mujoco, root, {body.id: weight for body, weight in weights})
+        return Tree(model, mujoco, file.root, {body.id: weight for body, weight in weights})
 
     def body(self, name: str, what: str) -> int:
         """The body of a name."""

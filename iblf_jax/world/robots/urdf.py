@@ -15,6 +15,7 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.world.robots.description import MAX_BODIES, MAX_RANGE, Shown, floats, label
+from iblf_jax.world.robots.mjcf import Tendons
 from iblf_jax.world.robots.repair import Fault, Weight, checked_weight, fault, symmetric
 
 MOVABLE = ("revolute", "continuous", "prismatic")
@@ -55,6 +56,8 @@ class Urdf(NamedTuple):
     """Joint -> what is wrong with its range, torque, speed or friction: matters where it moves."""
     speeds: dict[str, float]
     """Joint -> its largest speed, which the library does not keep; none for one without."""
+    tendons: Tendons = {}  # noqa: RUF012
+    """What constraints on tendons tie together, which a URDF does not have."""
 
     def separate_weights(self, spec: Any) -> list[tuple[Any, Weight]]:
         """The library's bodies with their weights, which the copy does not contain: the library
