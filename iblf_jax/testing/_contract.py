@@ -125,7 +125,7 @@ def _is_component(findings: Findings, member: Any) -> None:
         name = jax.tree_util.keystr(path).lstrip(".")
         problem = f"the leaf {name} is {checks.shown(leaf)}, not a floating-point number"
         is_number = isinstance(leaf, jax.Array | np.ndarray | np.generic | float)
-        findings.require(is_number and _is_float(leaf), problem, remedy)
+        findings.require(is_number and is_float(leaf), problem, remedy)
     try:
         rebuilt = jax.tree.unflatten(structure, [object() for _ in leaves])
         again: Any = jax.tree.structure(rebuilt)
@@ -139,7 +139,8 @@ def _is_component(findings: Findings, member: Any) -> None:
         findings.add(f"it cannot be rebuilt by JAX ({type(error).__name__}: {error})", remedy)
 
 
-def _is_float(x: Any) -> bool:
+def is_float(x: Any) -> bool:
+    """Whether numbers are floating-point numbers."""
     return jnp.issubdtype(jnp.result_type(x), jnp.floating)
 
 
@@ -233,7 +234,7 @@ def in_dtype(tree: Any, dtype: str) -> Any:
 
     def convert(x):
         # NumPy converts without compiling a program for every shape, unlike JAX.
-        return jnp.asarray(np.asarray(x, dtype if _is_float(x) else None))
+        return jnp.asarray(np.asarray(x, dtype if is_float(x) else None))
 
     return jax.tree.map(convert, tree)
 
@@ -300,10 +301,10 @@ def _derivatives(findings, function, values, point, rtol, rng) -> None:
         return rng.normal(size=np.shape(x)) * size
 
     def floats(p):
-        return {k: v for k, v in function(p).items() if _is_float(v)}
+        return {k: v for k, v in function(p).items() if is_float(v)}
 
     direction = jax.tree.map(random_like, point)
-    weights = {k: rng.normal(size=v.shape) for k, v in values.items() if _is_float(v)}
+    weights = {k: rng.normal(size=v.shape) for k, v in values.items() if is_float(v)}
 
     @jax.jit
     def both(point, direction, weights):
@@ -365,7 +366,7 @@ def _float32(findings, outputs, values, point) -> None:
     result = jax.jit(lambda p: outputs(*p))(in_dtype(point, "float32"))
     remedy = "Make constants with the dtype of an argument, jnp.zeros_like(q), or Python numbers"
     for name, value in result.items():
-        if not _is_float(values[name]):
+        if not is_float(values[name]):
             continue
         problem = f"{name} is {value.dtype} for float32 arguments"
         if findings.require(value.dtype == jnp.float32, problem, remedy):

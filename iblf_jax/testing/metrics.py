@@ -17,6 +17,7 @@ from iblf_jax.testing._contract import (
     Findings,
     check_function,
     in_both_types,
+    is_float,
     same_structure,
     shape_of,
 )
@@ -52,13 +53,11 @@ def check_fold(fold: Any, *, n: int | None = None) -> None:
         for name, value in result.items():
             findings.require(not np.any(np.isnan(value)), f"{name} is NaN on an ordinary run")
         finite = [
-            name
-            for name, value in result.items()
-            if np.all(np.isfinite(value)) and jnp.issubdtype(value.dtype, jnp.floating)
+            name for name, value in result.items() if np.all(np.isfinite(value)) and is_float(value)
         ]
 
         def outputs(fold, numbers):
-            found = folded((fold,), samples_from(numbers, flags))
+            found = folded((fold,), Sample(**numbers, **flags))
             return {name: found[name] for name in finite}
 
         check_function(findings, outputs, fold, (numbers,))
@@ -83,25 +82,20 @@ def samples(rng: np.random.Generator, n: int = 2, step: float = 0.01) -> Sample:
         )
 
     q_d, e1, tau = 0.5 + wave(0.1), wave(0.2), wave(5.0)
-    numbers = {
-        name: wave(1.0)
-        for name in ("dq", "e2", "dq_d", "alpha", "disturbance", "disturbance_estimate", "gravity")
-    }
-    sides = {"lower": np.full((LENGTH, n), 0.2), "upper": np.full((LENGTH, n), 0.85)}
-    k = np.where(e1 > 0, sides["upper"] - q_d, q_d - sides["lower"])
-    numbers |= {
+    names = ("dq", "e2", "dq_d", "alpha", "disturbance", "disturbance_estimate", "gravity")
+    signals = {name: wave(1.0) for name in names}
+    lower, upper = np.full((LENGTH, n), 0.2), np.full((LENGTH, n), 0.85)
+    signals |= {
         "slack": np.abs(wave(0.1)),
         "dq_lower": np.full((LENGTH, n), -0.9),
         "dq_upper": np.full((LENGTH, n), 1.1),
-    }
-    numbers |= {
         "region_margin": 0.3 + wave(0.2)[:, :REGIONS],
         "region_slack": np.abs(wave(0.1))[:, :REGIONS],
-    }
-    numbers |= sides | {
+        "lower": lower,
+        "upper": upper,
         "q": q_d + e1,
         "e1": e1,
-        "xi": e1 / k,
+        "xi": e1 / np.where(e1 > 0, upper - q_d, q_d - lower),
         "q_d": q_d,
         "tau": tau,
         "V": np.abs(wave(1.0))[:, 0],
@@ -109,27 +103,16 @@ def samples(rng: np.random.Generator, n: int = 2, step: float = 0.01) -> Sample:
         "dt": dt,
         "step": since,
     }
-    flags = {name: rng.uniform(size=(LENGTH, n)) < 0.3 for name in ("guard_active", "saturated")}
-    return samples_from(
-        {k: jnp.asarray(v) for k, v in numbers.items()},
-        {k: jnp.asarray(v) for k, v in flags.items()},
-    )
+    for name in ("guard_active", "saturated"):
+        signals[name] = rng.uniform(size=(LENGTH, n)) < 0.3
+    return Sample(**jax.tree.map(jnp.asarray, signals))
 
 
 def parts(samples: Sample) -> tuple[dict[str, jax.Array], dict[str, jax.Array]]:
     """The floating-point signals of a run, and its flags."""
-    numbers, flags = {}, {}
-    for name, value in vars(samples).items():
-        if jnp.issubdtype(value.dtype, jnp.floating):
-            numbers[name] = value
-        else:
-            flags[name] = value
+    flags = dict(vars(samples))
+    numbers = {name: flags.pop(name) for name, value in vars(samples).items() if is_float(value)}
     return numbers, flags
-
-
-def samples_from(numbers: dict[str, jax.Array], flags: dict[str, jax.Array]) -> Sample:
-    """A Sample from its floating-point signals and its flags."""
-    return Sample(**numbers, **flags)
 
 
 def _structure(findings: Findings, fold: Any, samples: Sample) -> None:
@@ -162,8 +145,8 @@ def at_rest(findings: Findings, fold: Any, samples: Sample) -> None:
     @jax.jit
     def both(fold, numbers):
         def floats(fold, numbers):
-            result = folded((fold,), samples_from(numbers, flags))
-            return {k: v for k, v in result.items() if jnp.issubdtype(v.dtype, jnp.floating)}
+            result = folded((fold,), Sample(**numbers, **flags))
+            return {k: v for k, v in result.items() if is_float(v)}
 
         values, pull = jax.vjp(floats, fold, numbers)
         finite = {k: jnp.where(jnp.isfinite(v), jnp.ones_like(v), 0.0) for k, v in values.items()}

@@ -17,6 +17,7 @@ from iblf_jax.core.optional import OptionalMembers
 from iblf_jax.engine import Outer, folded
 from iblf_jax.engine.simulate import simulate
 from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.simulation.signals import Sample
 from iblf_jax.testing._contract import (
     Findings,
     check_function,
@@ -28,7 +29,7 @@ from iblf_jax.testing._contract import (
     shape_of,
 )
 from iblf_jax.testing.joints import check_scenario, joints_of, scenario_for
-from iblf_jax.testing.metrics import LENGTH, accumulates, at_rest, parts, samples, samples_from
+from iblf_jax.testing.metrics import LENGTH, accumulates, at_rest, parts, samples
 from iblf_jax.tuning.objectives import Objective, Requirement, complete, for_scenario
 from iblf_jax.tuning.quantities import MetricResult, Peak, Quantities, Quantity, TimeIntegral
 
@@ -108,7 +109,7 @@ def _quantity(findings: Findings, quantity: Any, duration: float, n: int) -> Non
     fold = Quantities((quantity,))
 
     def outputs(fold, numbers):
-        run = samples_from(numbers, in_dtype(flags, numbers["q"].dtype))
+        run = Sample(**numbers, **in_dtype(flags, numbers["q"].dtype))
         return {"the smooth value": folded((fold,), run)["tuning_smooth"]}
 
     exact = jax.jit(folded)((fold,), some)["tuning_exact"]
@@ -218,7 +219,7 @@ def _gauss_newton(
         return quantity.update(acc, sample), (outer.vector, weight)
 
     def run(numbers):
-        samples = samples_from(numbers, flags)
+        samples = Sample(**numbers, **flags)
         start = quantity.init(jax.tree.map(lambda x: x[0], samples))
         acc, (vectors, weights) = jax.lax.scan(accumulate, start, samples)
         pieces = quantity.finish(acc)[2]
