@@ -35,6 +35,7 @@ from iblf_jax.core import checks
 from iblf_jax.core.pytree import is_leaf_field
 from iblf_jax.core.status import Status
 from iblf_jax.engine import CompiledBatch, simulate
+from iblf_jax.engine.plan import PLAIN_LAYOUT, ExecutionPlan
 from iblf_jax.files.components import decode_fields
 from iblf_jax.simulation import metrics, paths
 from iblf_jax.simulation.results import Metrics
@@ -457,15 +458,16 @@ def no_runs(monkeypatch):
     for place in (
         "engine.simulate.run_one",
         "studies.blocks._execute",
-        "tuning.evaluation.rollouts",
-        "tuning.search.Evaluator.__call__",
+        "tuning.problem.rollouts",
+        "tuning.evaluation.Evaluator.__call__",
         "tuning._falsify._margins",
         "engine.explain.instructions",
         "certificates._certify._certificate_of",
     ):
         monkeypatch.setattr(f"iblf_jax.{place}", entered)
+    by_scan = ExecutionPlan((), PLAIN_LAYOUT, PLAIN_LAYOUT, True)
     monkeypatch.setattr(
-        "iblf_jax.studies.setup.compile_batch", lambda request, *_: CompiledBatch(request, "xla")
+        "iblf_jax.studies.setup.compile_batch", lambda request, *_: CompiledBatch(request, by_scan)
     )
 
 
@@ -766,7 +768,7 @@ def results(paper, no_runs, monkeypatch):
     monkeypatch.setattr("iblf_jax.tuning.result._slice", entered)
     run = made_up(paper.plant, duration=0.1)
     setup = prepare(
-        paper, WAYS, 4, 0, duration=0.01, dt=1e-3, method="rk4", metrics=None, backend="xla"
+        paper, WAYS, 4, 0, duration=0.01, dt=1e-3, method="rk4", metrics=None, backend="vmap"
     )
     found = Metrics(
         {"margin": np.full((4, 2), 0.1), "rmse": np.full((4, 2), 0.01)},
@@ -786,20 +788,13 @@ def results(paper, no_runs, monkeypatch):
         "objective": np.ones((1, 1)),
         "evaluations": np.ones(1, int),
     }
-    asked = TuneSetup(
-        GOAL,
-        {},
-        as_risk("mean"),
-        1,
-        0,
-        0.01,
-        1e-3,
-        "rk4",
-        "auto",
-        4,
-        1,
-        0.95,
-        ((1.0, 100.0), (1.0, 100.0)),
+    setup = TuneSetup(
+        duration=0.01,
+        perturbations={},
+        risk=as_risk("mean"),
+        objective=GOAL,
+        report=ij.tuning.Report(runs=4, seed=1),
+        limits=((1.0, 100.0), (1.0, 100.0)),
     )
     names = ("controller.K2[0]", "controller.K2[1]")
     tuned = ij.TuneResult(
@@ -813,7 +808,7 @@ def results(paper, no_runs, monkeypatch):
         "newton",
         "forward",
         1.0,
-        asked,
+        setup,
     )
     vars(tuned)["nominal"] = (run, run)
     twos, (blocks, _) = np.ones((2, 2)), layout(paper, ["controller.K2"], 1e-3, "rk4")
