@@ -164,7 +164,7 @@ def given_options(args: argparse.Namespace, *names: str) -> dict[str, Any]:
 
 
 def optional_folder(name: str | None) -> Path | None:
-    """As `output_folder`; None without --out."""
+    """The folder of --out as `output_folder` returns it, or None without --out."""
     if not name:
         return None
     return output_folder(name)
@@ -194,14 +194,12 @@ def strict(value: Any) -> Any:
     """Returns `value` as strict JSON: arrays become lists, NaN and infinities become null."""
     if isinstance(value, Mapping):
         return {str(key): strict(x) for key, x in value.items()}
-    if isinstance(value, str | bool | int) or value is None:
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, str | bool | int | float) or value is None:
         return value
     if isinstance(value, list | tuple):
         return [strict(x) for x in value]
-    if isinstance(value, float):
-        if not math.isfinite(value):
-            return None
-        return value
     return strict(np.asarray(value).tolist())
 
 

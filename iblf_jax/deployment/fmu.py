@@ -249,11 +249,15 @@ def law_fmu(law: Law, generated: GeneratedLaw, path: Path) -> None:
     n = law.scenario.n
     name = law.name
     step = float(law.scenario.sampling.period)  # type: ignore[union-attr]
-    places = [f", q + {k * n}" for k, _ in enumerate(law.references, start=2)]
-    values = {"name": name, "upper": name.upper(), "joints": n, "step": repr(step), "dq": "NULL"}
-    values["reference"] = "".join(places)
+    places = "".join(f", q + {k * n}" for k, _ in enumerate(law.references, start=2))
+    dq = "NULL"
     if law.programs.reads_velocity:
-        values["dq"] = f"q + {n}"
+        dq = f"q + {n}"
+    # The order counts: the token of the FMU is computed from the text of these values.
+    values = {
+        "name": name, "upper": name.upper(), "joints": n, "step": repr(step), "reference": places,
+        "dq": dq,
+    }  # fmt: skip
     sources = {file: generated.files[file] for file in (f"{name}.h", f"{name}.c")}
     variables = law_variables(law, generated.parameters)
     title = title_of(law.scenario)

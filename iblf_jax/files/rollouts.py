@@ -324,7 +324,8 @@ def _verify(
         "The file is damaged: restore it or run again. If it was edited on purpose, delete its"
         f" attribute {DIGEST!r} before saving."
     )
-    raise DamagedFileError(checks.fail(str(path), came, "what save_rollouts wrote", remedy))
+    text = str(checks.fail(str(path), came, "what save_rollouts wrote", remedy))
+    raise DamagedFileError(text)
 
 
 def _write_npz(path: str | os.PathLike, data: dict[str, xarray.Dataset]) -> None:
