@@ -149,7 +149,7 @@ def _own_step(scenario: Scenario, robot: MujocoPlant) -> float:
 
 
 def check_single(scenario: Scenario) -> Scenario:
-    """The scenario; ValueError for no scenario, a batch of them, or one of traced values."""
+    """The scenario; raises ValueError for another object, for a batch and for traced values."""
     if not isinstance(scenario, Scenario):
         remedy = "Make one with ij.presets or ij.Scenario."
         raise checks.fail("scenario", scenario, "a Scenario", remedy)
@@ -163,7 +163,7 @@ def check_single(scenario: Scenario) -> Scenario:
 
 
 def with_period(scenario: Scenario, period: float | None) -> Scenario:
-    """The scenario, its law sampled with this period."""
+    """The scenario with this period of the law; None keeps the scenario's own period."""
     sampling = scenario.sampling
     if period is None and sampling is None:
         remedy = "A law outside of the package is sampled: period=1e-3."
@@ -186,7 +186,7 @@ class _Motion(NamedTuple):
     """
 
     t: Any
-    """(R,) [s]."""
+    """Time, (R,) [s]."""
     instant: Any
     """Whether the row belongs to an instant, and not to one side of a jump, (R,) bool."""
     q: Any
@@ -200,7 +200,7 @@ class _Motion(NamedTuple):
     model_positions: Any
     """Positions of all joints of MuJoCo's model."""
     states: LoopState
-    """After each sample of the law."""
+    """The state after each sample of the law."""
     diverged: bool
     """Whether the state diverged; it is constant from there on."""
 
@@ -335,13 +335,13 @@ class _Run:
     # Commands in transit, and jumps of the scenario
 
     def next_arrival(self, otherwise: float) -> float:
-        """When the next command arrives."""
+        """Time at which the next command arrives [s]; `otherwise` if none is in transit."""
         if self.arrived < len(self.commands):
             return self.arrived * self.period + self.delay
         return otherwise
 
     def next_jump(self, otherwise: float) -> float:
-        """When the scenario jumps next."""
+        """Time of the next jump of the scenario [s]; `otherwise` if there is none."""
         if self.jumped < self.jump_times.size:
             return float(self.jump_times[self.jumped])
         return otherwise
@@ -363,7 +363,7 @@ class _Run:
             self.jumped += 1
 
     def side_of_jumps(self, t: float) -> float:
-        """The time, moved to the side of the jumps on which the run is."""
+        """The time, moved away from the jumps: after those of the past and before the next one."""
         if self.jumped > 0:
             last = self.jumped - 1
             t = max(t, self.jump_times[last] + self.jump_widths[last])
@@ -373,7 +373,7 @@ class _Run:
 
 
 def _stacked(trees: Sequence[Any]) -> Any:
-    """Pytrees of arrays as one, with a new first axis."""
+    """One pytree whose arrays stack those of the given pytrees along a new first axis."""
     return jax.tree.map(lambda *x: np.stack(x), *trees)
 
 

@@ -43,17 +43,18 @@ from iblf_jax.world.robots._base import robot_member
 TARGETS = ("c", "fmu", "fmu-loop", "wasm")
 TYPES = {"double": "float64", "float": "float32"}
 VECTORS_DURATION = 20.0
-"""Length of the simulated run that the self-test compares with [s]."""
+"""Length of the simulated run whose torques the self-test compares [s]."""
 SAMPLES_AT_START = 3
 """Samples of a sampled law that are checked before its closed loop is written; the first torque
 influences later samples through the observer."""
 DECIMALS = 9
+"""Decimals of the inputs of the self-test."""
 LONGEST_STEP = 1e-3
-"""Longest step of that run [s]."""
+"""Longest time step of the run of the self-test [s]."""
 SHORTEST_PERIOD, LONGEST_PERIOD = 1e-6, 1e3
-"""[s].  A period outside these limits makes the run of the self-test too long."""
+"""Limits of the period of a law [s]; others make the run of the self-test too long."""
 LONGEST_IDENTIFIER = 63
-"""Characters of a name that every C compiler compares (C99, 5.2.4.1)."""
+"""Number of characters of a name that every C compiler distinguishes (C99, 5.2.4.1)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -155,7 +156,7 @@ def export(
 
 
 def _current_name(reference: str) -> str:
-    """The present name of a value of the argument `reference`."""
+    """The argument `reference`, with a former name of a value replaced by the present one."""
     former = "told"
     if not isinstance(reference, str) or reference != former:
         return reference
@@ -341,8 +342,8 @@ def _check_start(scenario: Scenario) -> None:
 
 @jax.jit
 def _first_torque(scenario: Scenario) -> jax.Array:
-    """The torque of a continuous law at t = 0, (1, n) [N m]; where a joint's acceleration is not
-    finite, the acceleration instead.
+    """The torque of a continuous law at t = 0, (1, n) [N m].  A joint whose acceleration is not
+    finite gets the acceleration in place of the torque.
     """
     t = jnp.zeros((), scenario.initial.q.dtype)
     rate, found = evaluate(scenario, t, initial_state(scenario))
@@ -350,7 +351,7 @@ def _first_torque(scenario: Scenario) -> jax.Array:
 
 
 def _rounded(x: Any, samples: int, dtype: Any) -> jax.Array:
-    """The first samples with nine decimals, so that the written inputs are short."""
+    """The first samples, rounded to DECIMALS so that the written inputs are short."""
     return jnp.asarray(np.round(np.asarray(x[:samples], float), DECIMALS), dtype)
 
 

@@ -1,5 +1,5 @@
-"""A law or a closed loop as an FMU: FMI 3.0 for co-simulation, with the binary of this platform and
-its sources.
+"""Writes a law or a closed loop as an FMU (FMI 3.0, co-simulation) with the binary of this platform
+and its sources.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ BASE = {
     "kg": (1, 0, 0, 0),
     "N": (1, 1, -2, 0),
 }
-"""Exponents of kg, m, s, rad."""
+"""Unit -> its exponents of kg, m, s and rad."""
 FIXED = ("sampling.period",)
-"""Parameters that the FMU is built for."""
+"""Parameters that an FMU does not let its user change."""
 
 
 class Variable(NamedTuple):
@@ -47,8 +47,8 @@ class Variable(NamedTuple):
 
 
 def unit_exponents(unit: str) -> tuple[int, int, int, int] | None:
-    """Exponents of kg, m, s, rad of a unit such as "N m s/rad" or "kg m^2"; None for what is no
-    product of these.
+    """The exponents of kg, m, s and rad in a unit such as "N m s/rad" or "kg m^2"; None for a unit
+    that is not a product of these.
     """
     found = [0, 0, 0, 0]
     above, _, below = unit.partition("/")

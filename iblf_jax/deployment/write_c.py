@@ -1,4 +1,4 @@
-"""The law as a folder of C99: source, header, self-test, build files and README."""
+"""Writes a law as a folder of C99: source, header, self-test, build files and README."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ C_TYPES = {
 
 
 def fill_template(template: str, values: dict[str, Any]) -> str:
-    """A file of `c/` with its placeholders filled in."""
+    """The text of a template in `c/` with its placeholders filled in."""
     return Template((files("iblf_jax.deployment") / "c" / template).read_text()).substitute(values)
 
 
@@ -64,7 +64,7 @@ def _operation_kind(op: str) -> str:
 
 
 def describe_counts(counts: Counter[str]) -> str:
-    """Counts as text."""
+    """The numbers of operations as text; kinds that do not occur are left out."""
     order = ("sums, products and choices", "divisions", "square roots", "elementary functions")
     return ", ".join(f"{counts[name]} {name}" for name in order if counts[name])
 
@@ -100,7 +100,7 @@ def helper_macros(text: str) -> str:
 
 
 CHECK_INTERVAL = 10
-"""The self-test compares the torque of one in so many samples."""
+"""The self-test compares the torque of every tenth sample."""
 
 
 class Vectors(NamedTuple):
@@ -175,7 +175,7 @@ def generate(law: Law) -> GeneratedLaw:
 
 
 def _functions(law: Law, parameters: Parameters) -> tuple[str, str]:
-    """The C functions of the start and of a sample."""
+    """The C functions that compute the start and a sample."""
     programs, name = law.programs, law.name
     size = len(programs.memory)
     arrays = ("q", "dq", *law.references)
@@ -291,7 +291,7 @@ def _reference_values(law: Law) -> dict[str, str]:
 def _supporting_files(
     law: Law, values: dict[str, Any], sizes: tuple[int, int, int]
 ) -> dict[str, str]:
-    """Self-test, build files and README."""
+    """The self-test, the build files, the README and, if possible, the file of the scenario."""
     v, period = law.vectors, float(law.scenario.sampling.period)  # type: ignore[union-attr]
     values |= {
         "samples": len(v.q),

@@ -1,4 +1,4 @@
-"""The closed loop as C, and as a WebAssembly module with a table of its parameters."""
+"""Writes a closed loop as C, and as a WebAssembly module with a table of its parameters."""
 
 from __future__ import annotations
 

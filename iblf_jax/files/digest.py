@@ -1,5 +1,4 @@
-"""Digests of Datasets.  netCDF 3 has no checksum; a file stores digests of the data that a reader
-must return.
+"""Computes and compares digests of Datasets, because netCDF 3 has no checksum.
 
     digest(variable) = SHA-256(name, dimensions, shape, kind of number, attributes, data)
 

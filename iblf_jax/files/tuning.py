@@ -1,5 +1,4 @@
-"""Tuning files: what to tune, as typed, validated TOML; and saved results, from which the report
-can be made again.
+"""Reads tuning files, which describe a tuning as validated TOML, and saves and loads its results.
 
 A tuning file is a scenario file (`files.scenario`) with four more tables, of which [perturbations]
 is that of a study file (`files.study`):
@@ -41,8 +40,8 @@ with a DeprecationWarning.  In files of earlier versions `joints` was a list of 
 now `weights`.  Floating-point numbers are still read so, and so are whole numbers that are no
 selection of joints; both with a DeprecationWarning.
 
-Everything is checked; each error is a ValueError that names the dotted key.  A saved result is JSON
-with all its numbers in full precision.
+Every value is checked, and each error is a ValueError that names the dotted key.  A saved result is
+JSON with all its numbers in full precision; its report can be computed again.
 """
 
 from __future__ import annotations
@@ -113,18 +112,18 @@ HISTORY = dict.fromkeys(
     "valid": "b",
     "evaluations": "iu",
 }
-"""What a result's history holds, and the kinds of its numbers."""
+"""Name of an array in the history of a result -> the kinds of number that it may have."""
 ARGUMENTS = ("runs", "seed", "backend", "iterations")
-"""What [tune] may contain besides `parameters`, `risk`, `level`, `solver` and `report`."""
+"""Keys of [tune] besides `parameters`, `risk`, `level`, `solver` and `report`."""
 EARLIER_ARGUMENTS = tuple(name for name in REPLACED if name != "callback")
-"""What it contained in earlier versions."""
+"""Keys that [tune] had in earlier versions."""
 
 
 def load_tuning_file(path: str | os.PathLike) -> dict[str, Any]:
     """The arguments of `tune` that a tuning file describes, the scenario among them.
 
     Args:
-      path: a file in the format at the head of this module.
+      path: a file in the format that the docstring of this module describes.
 
     Raises:
       ValueError: the file is not TOML or does not describe a tuning; the message names file, key
@@ -209,7 +208,15 @@ def _called(
     names: tuple[str, ...],
     besides: tuple[str, ...] = (),
 ) -> Any:
-    """What a function of objectives makes of a table; `names` are those of the robot's joints."""
+    """The objective or requirement that a table describes.
+
+    Args:
+      allowed: the functions of `objectives` that `kind` may name.
+      entry: the table.
+      key: dotted key of the table.
+      names: names of the robot's joints.
+      besides: further keys that the table may have.
+    """
     table = _with_weights(as_table(entry, key), key, names)
     checks.one_of(f"{key}.kind", table.get("kind"), allowed)
     function = getattr(objectives, table["kind"])
@@ -226,11 +233,13 @@ def _called(
 
 
 _NO_NUMBERS = {"fold": "a metric", "name": "the name of one of its results"}
-"""Arguments of objectives that are something else."""
+"""Argument of an objective that is not a number -> its description in words."""
 
 
 def _with_weights(table: dict[str, Any], key: str, names: tuple[str, ...]) -> dict[str, Any]:
-    """A table whose `joints` are a selection; those of earlier versions were weights."""
+    """The table with `joints` as a selection; in earlier versions `joints` were weights, which move
+    to the key `weights`.
+    """
     given: Any = table.get("joints")
     is_integers = isinstance(given, list) and bool(given) and all(type(x) is int for x in given)
     if not (holds_weights(given) or is_integers):
@@ -310,7 +319,7 @@ RESULT = (
     "residuals",
     "probes",
 )
-"""Fields of a result that are words and numbers."""
+"""Fields of a result that a file stores as they are."""
 
 
 def save_tuning(result: TuneResult, path: str | os.PathLike) -> None:
@@ -414,7 +423,7 @@ def _decoded_setup(data: dict[str, Any]) -> TuneSetup:
 
 
 def _decoded_history(table: dict[str, Any], count: int) -> dict[str, np.ndarray]:
-    """The history of a saved result of so many tuned numbers, checked."""
+    """The history of a saved result with `count` tuned numbers, checked."""
     history = {name: _array(table[name], kinds) for name, kinds in HISTORY.items()}
     steps, starts, size = history["x"].shape
     shapes = {x.shape[:2] for name, x in history.items() if name != "evaluations"}

@@ -47,15 +47,15 @@ class PanelQuantity:
     """The signals that bound it."""
     frame_words: str = ""
     guide: str | None = None
-    """The signal that it should follow, drawn once for all runs."""
+    """The signal that the quantity should follow; it is drawn once for all runs."""
     guide_words: str = ""
     truth: str | None = None
-    """The signal that it estimates, drawn as a broad pale line under it; once, if it is the same in
-    all runs."""
+    """The signal that the quantity estimates.  It is drawn as a broad pale line under them, and
+    only once if it is the same in all runs."""
     measured: str = ""
-    """The measurement of it."""
+    """The signal that is a measurement of the quantity."""
     transient: str = ""
-    """The signal whose transient a zoom shows, if not its own."""
+    """The signal whose transient a zoom shows; that of the quantity itself if empty."""
 
     @property
     def label(self) -> str:
