@@ -325,9 +325,9 @@ def draw_phase_portrait(axes: Axes, curves: Sequence[Curve], joints: tuple[int, 
         axes.plot(*path.T, **look)
         frame.append(path)
     starts = np.stack([curve["q"][0, joints] for curve in curves])
-    colours = {"color": _style.text_colour(), "markerfacecolor": _style.background()}
     dots: dict[str, Any] = {"marker": "o", "markersize": 6, "linestyle": "none", "zorder": 4}
-    axes.plot(*starts.T, label="start", **colours, **dots)
+    dots |= {"color": _style.text_colour(), "markerfacecolor": _style.background()}
+    axes.plot(*starts.T, label="start", **dots)
     for i, curve in enumerate(curves):
         path = curve["q"][:, joints]
         thin = path[:: max(1, len(path) // POINTS)]
