@@ -269,8 +269,8 @@ def loop_fmu(
 ) -> None:
     """Writes a closed loop as an FMU; raises ToolchainError."""
     name, step = generated.values["name"], run_settings[0]
-    settings = ", ".join(map(repr, run_settings))
-    values = {"name": name, "step": repr(step), "setting_values": settings}
+    setting_values = ", ".join(map(repr, run_settings))
+    values = {"name": name, "step": repr(step), "setting_values": setting_values}
     title = f"the closed loop of {generated.values['title']}"
     variables = loop_variables(scenario, generated.parameters)
     _package(path, name, title, step, variables, "fmu_loop.c", values, generated.files)
