@@ -33,7 +33,7 @@ from iblf_jax.engine import block_size, blocks_in_flight, wait_until_ready
 from iblf_jax.studies.dataset import DRAWN
 from iblf_jax.studies.draws import CaseInputs
 from iblf_jax.studies.options import ThisProcess
-from iblf_jax.studies.setup import PreparedStudy, SharedInputs, StudyProgram, drawn_leaves
+from iblf_jax.studies.study_setup import PreparedStudy, SharedInputs, StudyProgram, drawn_leaves
 
 
 class BlockResults(NamedTuple):

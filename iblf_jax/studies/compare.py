@@ -46,7 +46,7 @@ from iblf_jax.simulation.sampling import noise_of
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.comparison import Comparison
 from iblf_jax.studies.equal_effort import NO_EFFORT, EffortSearch, Trials, grid, search
-from iblf_jax.studies.recommended import needed_dt
+from iblf_jax.studies.time_step import needed_dt
 
 NAMES = (*LAWS, *KEEPERS)
 Laws = Sequence[str | Controller] | Mapping[str, str | Controller]

@@ -36,7 +36,7 @@ def to_dataset(
     """The Dataset from flat data.
 
     Args:
-      config: what `config.describe` gave.
+      config: what `store_config.describe` gave.
       flat: name -> (cases, ...); case = point * runs + run.
       units: name -> unit.
       done: which cases are there, (cases,) bool.

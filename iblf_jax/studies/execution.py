@@ -16,7 +16,7 @@ import numpy as np
 from iblf_jax.engine import block_size
 from iblf_jax.studies.blocks import BlockResults, run_blocks
 from iblf_jax.studies.options import ThisProcess
-from iblf_jax.studies.setup import PreparedStudy
+from iblf_jax.studies.study_setup import PreparedStudy
 
 
 def block_spans(cases: int) -> list[slice]:

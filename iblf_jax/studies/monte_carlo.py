@@ -21,9 +21,9 @@ from iblf_jax.studies.designs import MAX_RUNS, check_sampler
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.execution import run_all_cases
 from iblf_jax.studies.options import ThisProcess, check_deprecated, executor_of
-from iblf_jax.studies.recommended import warn_of_step
-from iblf_jax.studies.setup import prepare
 from iblf_jax.studies.study import Study
+from iblf_jax.studies.study_setup import prepare
+from iblf_jax.studies.time_step import warn_of_step
 
 
 @notices.each_warning_once

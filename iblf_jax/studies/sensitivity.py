@@ -35,7 +35,7 @@ from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.draws import sample_size
 from iblf_jax.studies.execution import run_all_cases
 from iblf_jax.studies.options import ThisProcess, check_deprecated, executor_of
-from iblf_jax.studies.setup import PreparedStudy, prepare
+from iblf_jax.studies.study_setup import PreparedStudy, prepare
 
 if TYPE_CHECKING:
     import xarray

@@ -36,8 +36,8 @@ from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies import statistics, summaries
 from iblf_jax.studies.blocks import BlockResults, run_blocks
 from iblf_jax.studies.distributions import Perturbation
-from iblf_jax.studies.setup import PreparedStudy
 from iblf_jax.studies.statistics import Probability
+from iblf_jax.studies.study_setup import PreparedStudy
 from iblf_jax.world.regions import in_words
 from iblf_jax.world.robots import joint_names
 

@@ -20,8 +20,8 @@ from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import SIGNALS, own_dims
 from iblf_jax.studies import statistics
 from iblf_jax.studies.blocks import run_blocks
-from iblf_jax.studies.config import describe_component
 from iblf_jax.studies.options import ThisProcess
+from iblf_jax.studies.store_config import describe_component
 from iblf_jax.world.bounds import tube_at
 from iblf_jax.world.regions import margins
 

@@ -25,7 +25,7 @@ from iblf_jax.simulation.accuracy import RELATIVE
 from iblf_jax.simulation.metrics import Fold, metric_units
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.simulation.signals import own_dims
-from iblf_jax.studies import config as configuration
+from iblf_jax.studies import store_config
 from iblf_jax.studies.blocks import case_bytes, named_arrays, result_shapes
 from iblf_jax.studies.dataset import DRAWN, to_dataset
 from iblf_jax.studies.designs import MAX_RUNS, check_sampler
@@ -42,10 +42,10 @@ from iblf_jax.studies.options import (
     executor_of,
     store_of,
 )
-from iblf_jax.studies.points import make_points
-from iblf_jax.studies.recommended import warn_of_step
-from iblf_jax.studies.setup import PreparedStudy, prepare
 from iblf_jax.studies.store import Store, StoreError, Variable, load_store, open_store
+from iblf_jax.studies.study_setup import PreparedStudy, prepare
+from iblf_jax.studies.sweep_points import make_points
+from iblf_jax.studies.time_step import warn_of_step
 
 if TYPE_CHECKING:
     import xarray
@@ -148,7 +148,7 @@ def sweep(
         points=where.values,
     )
     checks.fits("runs at all points", study.cases, case_bytes(study))
-    config = configuration.describe(study, where, points.kind, float(dt))
+    config = store_config.describe(study, where, points.kind, float(dt))
     if store_options is None:
         result = _in_memory(study, config, executor, progress)
     else:

@@ -41,8 +41,8 @@ from iblf_jax.core.pytree import is_component_class, register_component
 from iblf_jax.studies.blocks import BlockResults, named_arrays
 from iblf_jax.studies.execution import run_spans_here
 from iblf_jax.studies.options import ThisProcess
-from iblf_jax.studies.setup import PreparedStudy
 from iblf_jax.studies.store import StoreError, load_store
+from iblf_jax.studies.study_setup import PreparedStudy
 
 MAX_IN_FLIGHT = 1024
 """Tasks that are submitted and not done: their results may wait in the client's memory."""

@@ -24,7 +24,7 @@ from iblf_jax.simulation.scenario import Scenario, canonical, fit_joints
 from iblf_jax.studies.designs import MAX_RUNS
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.draws import Cases, Target, targets_of
-from iblf_jax.studies.recommended import recommended_dt
+from iblf_jax.studies.time_step import recommended_dt
 from iblf_jax.tuning.evaluation import NO_LEVEL, NUMBERS_A_RUN, Candidate, Value, piece_counts
 from iblf_jax.tuning.evaluation import value as evaluated
 from iblf_jax.tuning.objectives import (

@@ -39,7 +39,7 @@ from iblf_jax.files.components import decode_fields
 from iblf_jax.simulation import metrics, paths
 from iblf_jax.simulation.results import Metrics
 from iblf_jax.simulation.scenario import check_values
-from iblf_jax.studies.setup import prepare
+from iblf_jax.studies.study_setup import prepare
 from iblf_jax.tuning.parameters import layout
 from iblf_jax.tuning.result import TuneSetup
 from iblf_jax.tuning.robust import as_risk
@@ -465,7 +465,8 @@ def no_runs(monkeypatch):
     ):
         monkeypatch.setattr(f"iblf_jax.{place}", entered)
     monkeypatch.setattr(
-        "iblf_jax.studies.setup.compile_batch", lambda request, *_: CompiledBatch(request, "xla")
+        "iblf_jax.studies.study_setup.compile_batch",
+        lambda request, *_: CompiledBatch(request, "xla"),
     )
 
 

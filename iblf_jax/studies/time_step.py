@@ -15,7 +15,7 @@ from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.blocks import run_blocks
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.draws import targets_of
-from iblf_jax.studies.setup import prepare
+from iblf_jax.studies.study_setup import prepare
 
 STEP_FLAGS = Status.STEP_TOO_LARGE | Status.INACCURATE
 """Flags of a run whose time step was too large."""

@@ -18,8 +18,8 @@ from iblf_jax.engine import block_size
 from iblf_jax.kernels import built_for
 from iblf_jax.simulation.paths import get, parameters, unit_at
 from iblf_jax.studies.blocks import _execute
-from iblf_jax.studies.points import Points
-from iblf_jax.studies.setup import PreparedStudy
+from iblf_jax.studies.study_setup import PreparedStudy
+from iblf_jax.studies.sweep_points import Points
 
 
 def describe_component(part: Any) -> Any:
