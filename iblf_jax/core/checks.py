@@ -595,7 +595,7 @@ def fits(name: str, count: int, bytes_each: float, remedy: str = "") -> None:
 
 
 def ceil_div(a: int, b: int) -> int:
-    """a / b for positive integers, rounded up."""
+    """The quotient of two positive integers, rounded up."""
     return -(-a // b)
 
 

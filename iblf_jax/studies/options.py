@@ -16,7 +16,7 @@ from typing import Any
 import jax
 
 from iblf_jax.core import checks, notices
-from iblf_jax.engine import STUDY_MEMORY, check_backend
+from iblf_jax.engine import STUDY_MEMORY
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.studies.designs import MAX_RUNS, check_sampler
 
@@ -36,7 +36,7 @@ class RunOptions:
     method: str
     """The integrator."""
     backend: str
-    """The executor, as requested: perhaps "auto"."""
+    """As requested: perhaps "auto".  `engine.RunRequest` checks it."""
     runs: int
     """Runs at each point."""
     seed: int
@@ -49,7 +49,6 @@ class RunOptions:
         runs = checks.positive_integer("runs", self.runs, most=MAX_RUNS)
         replicates = check_sampler(self.sampler, runs, self.replicates)
         tableau(self.method)
-        check_backend(self.backend)
         checks.whole_steps(self.duration, self.dt)
         return dataclasses.replace(
             self,

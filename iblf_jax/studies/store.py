@@ -384,7 +384,7 @@ def _of_another_configuration(place: Path, found: list[str]) -> str:
     if any(text.startswith("kernel.") for text in found):
         remedy = (
             "A native kernel is tied to processor and compiler: go on on a machine of the same"
-            ' kind, or choose another path, with backend="xla" if machines of several kinds are to'
+            ' kind, or choose another path, with backend="vmap" if machines of several kinds are to'
             " share it."
         )
     shown = "; ".join(found[:3])

@@ -87,9 +87,9 @@ def describe(prepared: PreparedStudy, points: Points, design: str) -> dict[str, 
         }
 
     options = prepared.options
-    executor = prepared.executor
+    backend = prepared.backend
     kernel = {}
-    if executor == "native":
+    if backend == "native":
         kernel = {"kernel": built_for()}
     return {
         "design": design,
@@ -104,7 +104,7 @@ def describe(prepared: PreparedStudy, points: Points, design: str) -> dict[str, 
         },
         **dataclasses.asdict(options),
         "duration": round(options.steps * options.dt, 12),
-        "backend": executor,
+        "backend": backend,
         "metrics": describe_component(prepared.shared.folds),
         "scenario": values_of(scenario),
         "structure": structure(scenario),

@@ -112,8 +112,8 @@ class Study:
 
     @property
     def backend(self) -> str:
-        """The backend that computed the runs: "native", "gpu", "xla" or "vmap", not "auto"."""
-        return self.setup.executor
+        """The backend that computed the runs: "native", "gpu" or "vmap", not "auto"."""
+        return self.setup.backend
 
     @property
     def dt(self) -> float:

@@ -89,9 +89,9 @@ class PreparedStudy:
         return self.options.steps * self.dt
 
     @property
-    def executor(self) -> str:
-        """The executor that was chosen: "native", "gpu", "xla" or "vmap", not "auto"."""
-        return self.program.batch.executor
+    def backend(self) -> str:
+        """The backend that was chosen: "native", "gpu" or "vmap", not "auto"."""
+        return self.program.batch.backend
 
     def inputs_of(self, cases: np.ndarray) -> CaseInputs:
         """What differs between these cases; numbers past the last case repeat it."""

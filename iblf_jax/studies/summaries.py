@@ -241,7 +241,7 @@ def to_xarray(
         "dt": prepared.dt,
         "method": options.method,
         "sampler": options.sampler,
-        "backend": prepared.executor,
+        "backend": prepared.backend,
         "iblf_jax_version": iblf_jax.__version__,
         "perturbations": json.dumps(
             {path: describe_component(p) for path, p in prepared.perturbations.items()}
