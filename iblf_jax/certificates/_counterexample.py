@@ -10,8 +10,8 @@ and `counterexample` maximises g = (V2' - 1/2 |f'|^2) / Q at t = 0 over perturba
 scenario (`studies.perturbation_cube`), from many starting points, with the exact gradient. Where
 the proof is exact, g never exceeds -1, whatever is varied. g > -1 breaks (3.24); g > 0 breaks the
 claim itself, (3.18) and (3.26) for every rho > 0: V2 grows where the theorem claims a decrease. For
-law and observer as printed such starts exist, because the terms that the proof drops grow with the cube of
-the joint velocity, and Q with its square.
+law and observer as printed such starts exist, because the terms that the proof drops grow with the
+cube of the joint velocity, and Q with its square.
 
 Points at which the scenario cannot run (a start outside its bounds, a negative mass), or at which
 nothing is claimed (the guard or a torque limit is active), are no counterexamples and are skipped.
