@@ -594,6 +594,11 @@ def fits(name: str, count: int, bytes_each: float, remedy: str = "") -> None:
         )
 
 
+def ceil_div(a: int, b: int) -> int:
+    """The quotient of two positive integers, rounded up."""
+    return -(-a // b)
+
+
 def memory() -> int:
     """Bytes of this machine's memory; 16 GiB where the system does not say."""
     try:

@@ -112,6 +112,11 @@ def describe(status: int) -> str:
     return "; ".join(words) or "ok"
 
 
+def has_flag(status, which: Status):
+    """Whether `status`, a number or an array of flags, has any of these flags."""
+    return status & int(which) != 0
+
+
 def flag(condition, which: Status):
     """`which` as an int32 where `condition` holds, else 0; for use inside a compiled loop."""
     return jnp.where(condition, jnp.int32(int(which)), jnp.int32(0))
