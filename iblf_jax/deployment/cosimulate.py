@@ -31,7 +31,7 @@ from iblf_jax.simulation.closed_loop import (
     run_sampled_law_if_due,
     sample_at,
 )
-from iblf_jax.simulation.jumps import JUMP_SEPARATION
+from iblf_jax.simulation.discontinuities import JUMP_SEPARATION
 from iblf_jax.simulation.metrics import Fold, as_folds, metric_units
 from iblf_jax.simulation.results import Metrics, Rollout
 from iblf_jax.simulation.sampling import (

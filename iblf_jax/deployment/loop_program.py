@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from iblf_jax.deployment.control_law import as_floats, of_floats, program_of
 from iblf_jax.engine.step import Inputs, StepOptions, advance, start
 from iblf_jax.kernels import Program
-from iblf_jax.simulation import accuracy
+from iblf_jax.simulation import error_estimate
 from iblf_jax.simulation.closed_loop import initial_state
 from iblf_jax.simulation.sampling import has_noise
 from iblf_jax.simulation.scenario import Scenario
@@ -81,7 +81,7 @@ def loop_program(scenario: Scenario, method: str) -> Loop:
         if not has_noise(scenario) and scenario.sampling is not None:
             noise = jnp.zeros((4,), dtype)
         inputs = Inputs(scenario, (), run_settings.dt, jnp.asarray(UNLIMITED_STEPS, dtype), noise)
-        size = accuracy.watched_indices(state).size
+        size = error_estimate.watched_indices(state).size
         blank = start(inputs, method, jnp.zeros((size, size), dtype))
         done = advance(
             inputs,

@@ -37,10 +37,10 @@ from iblf_jax.engine.step import (
     samples_of_step,
     start,
 )
-from iblf_jax.simulation import accuracy
+from iblf_jax.simulation import error_estimate
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
 
-ACCURACY = tuple(name for name, _ in accuracy.UNITS)
+ACCURACY = tuple(name for name, _ in error_estimate.UNITS)
 """Metrics whose derivatives are zero."""
 Places = tuple[tuple[int, ...], ...]
 """For each derivative, by which leaves of the scenario it is."""
@@ -120,7 +120,7 @@ class TangentStep:
 def _begun(inputs: Inputs, method: str, places: Places) -> Carry | WithTangent:
     """The carry before the first step."""
     if not places:
-        size = accuracy.watched_indices(initial_state(inputs.scenario)).size
+        size = error_estimate.watched_indices(initial_state(inputs.scenario)).size
         # The estimate of the accuracy is the run's own: here nobody reads it.
         return start(inputs, method, jnp.zeros((size, size), inputs.dt.dtype))
 

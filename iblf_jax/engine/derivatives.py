@@ -28,7 +28,7 @@ from jax.flatten_util import ravel_pytree
 from iblf_jax.engine.batch import Batch, Loop, finalize, initialize
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.step import Advanced, Carry, Inputs, Outcome, StepOptions, advance, finished
-from iblf_jax.simulation import accuracy
+from iblf_jax.simulation import error_estimate
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
 from iblf_jax.simulation.paths import get, with_parameters
 from iblf_jax.simulation.signals import Sample
@@ -294,9 +294,9 @@ def run_with_tangents(
     def at_end(inputs, before):
         def metrics(scenario, carry, eps):
             found: dict[str, jax.Array] = dict.fromkeys(
-                (name for name, _ in accuracy.UNITS), jnp.zeros_like(inputs.dt)
+                (name for name, _ in error_estimate.UNITS), jnp.zeros_like(inputs.dt)
             )
-            found[accuracy.ERROR] = jnp.zeros_like(carry.accuracy.error)
+            found[error_estimate.ERROR] = jnp.zeros_like(carry.accuracy.error)
             results = finished(inputs.folds, carry.accumulators).items()
             return (
                 found | {name: x for name, x in results if jnp.issubdtype(x.dtype, jnp.floating)},

@@ -16,7 +16,7 @@ from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import FAILED, Status, describe
 from iblf_jax.engine.limiting_term import limiting_term
 from iblf_jax.engine.step_size import comfortable_dt, find_dt
-from iblf_jax.simulation.accuracy import ERROR, RELATIVE, TOLERANCE
+from iblf_jax.simulation.error_estimate import ERROR, RELATIVE, TOLERANCE
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.optional import optional_member
 from iblf_jax.simulation.results import Rollout

@@ -2,10 +2,10 @@
 
 At each instant k = 0 ... T the closed loop is evaluated once for record, metrics and the first
 stage of the integrator.  Where its right-hand side or its signals jump, a step is integrated in
-pieces (`simulation.jumps`), and the metrics see the limits from both sides; a step without a jump
-costs no more than the comparison.  A state that runs away is frozen at its last good value and
-flagged, so that no NaN ever enters a batch or a gradient; the instant nearest to a bound is
-remembered, because the loop is stiffest there.  The step from the last instant is not made: its
+pieces (`simulation.discontinuities`), and the metrics see the limits from both sides; a step
+without a jump costs no more than the comparison.  A state that runs away is frozen at its last good
+value and flagged, so that no NaN ever enters a batch or a gradient; the instant nearest to a bound
+is remembered, because the loop is stiffest there.  The step from the last instant is not made: its
 sample alone counts.
 
 A step is a function (inputs, carry, index) -> (carry, records) of ONE run, and hashable: two steps
@@ -31,7 +31,7 @@ from jax.flatten_util import ravel_pytree
 from iblf_jax.core.status import VELOCITY_LIMIT, Status, flag
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.switching import Loop, with_hybrid_derivative
-from iblf_jax.simulation import accuracy, integrators, jumps, sampling, stability
+from iblf_jax.simulation import discontinuities, error_estimate, integrators, sampling, stability
 from iblf_jax.simulation.closed_loop import (
     LoopState,
     evaluate,
@@ -79,7 +79,7 @@ class Carry(NamedTuple):
     accumulators: tuple
     status: jax.Array
     nearest: Nearest
-    accuracy: accuracy.Accuracy
+    accuracy: error_estimate.Accuracy
 
 
 class Outcome(NamedTuple):
@@ -143,7 +143,7 @@ def start(inputs: Inputs, method: str, jacobian: jax.Array) -> Carry:
     constant, jacobian = jax.lax.stop_gradient((state, jacobian))
     if inputs.scenario.sampling is not None:
         jacobian = stability.per_time(jax.lax.stop_gradient(inputs.scenario), constant, jacobian)
-    estimate = accuracy.begin(method, jacobian, constant)
+    estimate = error_estimate.begin(method, jacobian, constant)
     return Carry(
         state,
         blank,
@@ -241,8 +241,8 @@ def is_derivative(step: Any) -> bool:
 class _Moment(NamedTuple):
     """Where a step is in time, and how it is divided."""
 
-    span: jumps.Span
-    division: jumps.Division
+    span: discontinuities.Span
+    division: discontinuities.Division
     behind: jax.Array
     """How long before the instant the last piece of the step before begins, () [s]; 0 at the first
     instant."""
@@ -262,7 +262,9 @@ class _Loop(NamedTuple):
     """Where the law is sampled, what arrives at the actuator: before a command arrives within the
     step, and after."""
 
-    def at(self, piece: jumps.Piece, t: jax.Array, moved: LoopState) -> tuple[LoopState, Sample]:
+    def at(
+        self, piece: discontinuities.Piece, t: jax.Array, moved: LoopState
+    ) -> tuple[LoopState, Sample]:
         """Rate and sample within a piece of the step."""
         torque = self.torques
         if torque and isinstance(piece.arrived, bool):
@@ -271,7 +273,7 @@ class _Loop(NamedTuple):
             torque = (jnp.where(piece.arrived, torque[1], torque[0]),)
         return self.evaluate(
             self.inputs.scenario,
-            jumps.stage_time(piece, t),
+            discontinuities.stage_time(piece, t),
             with_integrated_part(self.state, moved),
             self.inputs.dt,
             *torque,
@@ -285,25 +287,27 @@ def _moment(inputs: Inputs, index: jax.Array, method: str, arrivals: tuple | Non
       inputs: of the run.
       index: number of the instant, () int.
       method: the integrator.
-      arrivals: when commands arrive in this step and in the one before, as `jumps.divided` takes
-        them; None where none can.
+      arrivals: when commands arrive in this step and in the one before, as
+        `discontinuities.divided` takes them; None where none can.
     """
     times, dt, number = inputs.scenario.jump_times(), inputs.dt, index.astype(inputs.dt.dtype)
     start = number * dt
     end = start
     if times.size:
         end = (number + 1.0) * dt
-    span = jumps.Span(start, end, dt, number < inputs.steps)
+    span = discontinuities.Span(start, end, dt, number < inputs.steps)
     here = last = None
     if arrivals is not None:
         here, last = arrivals
-    before = jumps.Span((number - 1.0) * dt, start, dt)
-    behind = jnp.where(index > 0, jumps.since_last(times, before, last), jnp.zeros_like(dt))
+    before = discontinuities.Span((number - 1.0) * dt, start, dt)
+    behind = jnp.where(
+        index > 0, discontinuities.since_last(times, before, last), jnp.zeros_like(dt)
+    )
     restarts = None
     if times.size and inputs.scenario.sampling is None:
-        reach = accuracy.steps_back(method)
-        restarts = jumps.within(times, (number - reach) * dt, span.end)
-    return _Moment(span, jumps.divided(times, span, here), behind, restarts)
+        reach = error_estimate.steps_back(method)
+        restarts = discontinuities.within(times, (number - reach) * dt, span.end)
+    return _Moment(span, discontinuities.divided(times, span, here), behind, restarts)
 
 
 def _weighed(sample: Sample, t: jax.Array, weight: jax.Array, step: jax.Array) -> Sample:
@@ -427,7 +431,7 @@ def _concluded(
     goes_on: jax.Array,
     restarts: Any,
     overfull: Any,
-) -> tuple[LoopState, jax.Array, Nearest, accuracy.Accuracy]:
+) -> tuple[LoopState, jax.Array, Nearest, error_estimate.Accuracy]:
     """State, status, nearest instant and accuracy after a step; a state that runs away is frozen.
 
     Args:
@@ -446,7 +450,7 @@ def _concluded(
     nearest = keep_if(near > carry.nearest.xi, here, carry.nearest)
     is_sampled = inputs.scenario.sampling is not None
     width = sample.upper - sample.lower
-    estimate = accuracy.update(
+    estimate = error_estimate.update(
         carry.accuracy, method, inputs.dt, index, parts, width, is_sampled, restarts, overfull
     )
     after, raised = later
@@ -460,7 +464,7 @@ def _concluded(
 
 def _across_jumps(
     along: _Loop,
-    piece: jumps.Piece,
+    piece: discontinuities.Piece,
     before: LoopState,
     method: str,
     stepped: integrators.Stepped,
@@ -484,7 +488,7 @@ def _across_jumps(
     )  # no metric counts what comes after the end of a run
 
     def rate(t, state):
-        return evaluate(inputs.scenario, jumps.stage_time(piece, t), state, dt)
+        return evaluate(inputs.scenario, discontinuities.stage_time(piece, t), state, dt)
 
     def gains_of(sample):
         def sums(weight):
@@ -517,7 +521,7 @@ def _split_floats(tree: Any) -> tuple[list[jax.Array], Callable]:
 
 
 def _integrated(
-    along: _Loop, piece: jumps.Piece, moved: LoopState, method: str, options: StepOptions
+    along: _Loop, piece: discontinuities.Piece, moved: LoopState, method: str, options: StepOptions
 ) -> integrators.Stepped:
     """One step of the integrator over a piece."""
     return integrators.step(
@@ -548,7 +552,7 @@ def _before_sample(
     seen_at = (
         t
         if moment.division.pieces[0].earliest is None
-        else jumps.before_jumps(scenario.jump_times(), t)
+        else discontinuities.before_jumps(scenario.jump_times(), t)
     )
 
     def seen(accumulators):
@@ -587,7 +591,7 @@ class _Later(NamedTuple):
 
 def _later_pieces(
     along: _Loop,
-    pieces: tuple[jumps.Piece, ...],
+    pieces: tuple[discontinuities.Piece, ...],
     stepped: integrators.Stepped,
     accumulators: tuple,
     method: str,
@@ -657,7 +661,7 @@ def recorded(folds: Any, found: Advanced):
 def samples_of_step(scenario: Scenario) -> int:
     """How many samples the folds see of a step at most: `Advanced.nodes`."""
     arrives = scenario.sampling is not None and scenario.sampling.queue > 0
-    cuts = min(scenario.jump_times().size, jumps.MAX_CUTS) + arrives
+    cuts = min(scenario.jump_times().size, discontinuities.MAX_CUTS) + arrives
     return 1 + (scenario.sampling is not None) + 2 * cuts
 
 
@@ -696,9 +700,9 @@ class Linearization(NamedTuple):
     growth: stability.Growth
     """Of the power iteration."""
     jacobian: jax.Array
-    """By the numbers that `accuracy` watches, by differences of three sizes, (3, m', m') [1/s];
+    """By the numbers that `error_estimate` watches, by differences of three sizes, (3, m', m') [1/s];
     `stability.resolved` makes one of them."""
-    unresolved: accuracy.UnresolvedSignals
+    unresolved: error_estimate.UnresolvedSignals
     """Of the run; its torque is turned into what it accelerates, as that takes the robot's mass
     matrix."""
 
@@ -707,7 +711,7 @@ class Linearization(NamedTuple):
 class LinearizationStep:
     """The closed loop's derivative along one direction after the other.
 
-    The directions are at first the unit vectors of the numbers that `accuracy` watches.  Where
+    The directions are at first the unit vectors of the numbers that `error_estimate` watches.  Where
     these are the complete state, the modes follow from them; otherwise a power iteration adds more
     directions.
     """
@@ -717,7 +721,7 @@ class LinearizationStep:
     ):
         """The carry after the step; nothing is recorded."""
         start = initial_state(inputs.scenario)
-        watched, x = accuracy.watched_indices(start), carry.state
+        watched, x = error_estimate.watched_indices(start), carry.state
         as_state = ravel_pytree(perturbed_state(start))[1]
         iteration = index - 3 * watched.size
         count = jnp.asarray(watched.size, index.dtype)
@@ -759,7 +763,7 @@ class LinearizationStep:
         jacobian = jnp.where(chosen, jnp.stack([w[i] for i in watched])[:, None], carry.jacobian)
         unresolved = keep_if(
             index == 0,
-            accuracy.with_acceleration(inputs.scenario, carry.unresolved),
+            error_estimate.with_acceleration(inputs.scenario, carry.unresolved),
             carry.unresolved,
         )
         return Linearization(carry.time, x, growth, jacobian, unresolved), ()
@@ -768,7 +772,7 @@ class LinearizationStep:
 def linearization_steps(scenario: Scenario) -> int:
     """Steps of a `LinearizationStep`."""
     state = initial_state(scenario)
-    watched = accuracy.watched_indices(state).size
+    watched = error_estimate.watched_indices(state).size
     if watched == ravel_pytree(perturbed_state(state))[0].size:
         return 3 * watched
     return 3 * watched + stability.POWER_ITERATIONS
@@ -787,10 +791,10 @@ def fastest_mode(scenario: Scenario, found: Linearization) -> jax.Array:
 
 
 def linearization_at(
-    time: jax.Array, state: Any, watched: int, unresolved: accuracy.UnresolvedSignals
+    time: jax.Array, state: Any, watched: int, unresolved: error_estimate.UnresolvedSignals
 ) -> Linearization:
     """The carry of a `LinearizationStep` at a state, as `perturbed_state` gives it, of which
-    `accuracy` watches so many numbers.
+    `error_estimate` watches so many numbers.
     """
     x = ravel_pytree(state)[0]
     return jax.lax.stop_gradient(
@@ -827,7 +831,7 @@ def outcome_of(
     inputs: Inputs,
     method: str,
     carry: Carry,
-    unresolved: accuracy.UnresolvedSignals,
+    unresolved: error_estimate.UnresolvedSignals,
     instants: Linearization,
 ) -> Outcome:
     """The folds' results and the accuracy, and the status with the verdict on the step.
@@ -839,7 +843,7 @@ def outcome_of(
       unresolved: what a `LinearizationStep` has found for the run.
       instants: what it has found at some of them.
     """
-    estimate = accuracy.with_unresolved(carry.accuracy, unresolved)
+    estimate = error_estimate.with_unresolved(carry.accuracy, unresolved)
     modes = jax.vmap(partial(fastest_mode, inputs.scenario))(instants)
     mode = jnp.max(jnp.where(jnp.isfinite(modes), modes, 0.0))
     limit = integrators.tableau(method).stability
@@ -849,10 +853,10 @@ def outcome_of(
     steep = stability.is_steep(instants.jacobian, inputs.scenario.sampling is not None) & (
         inputs.dt * steepest > limit
     )
-    status |= flag(~(estimate.relative <= accuracy.TOLERANCE), Status.INACCURATE)
+    status |= flag(~(estimate.relative <= error_estimate.TOLERANCE), Status.INACCURATE)
     suffers = status & int(Status.STEP_TOO_LARGE | Status.INACCURATE) != 0
     status |= flag(jnp.any(steep) & suffers, Status.INFINITE_SLOPE)
-    metrics = accuracy.results(estimate)
+    metrics = error_estimate.results(estimate)
     if inputs.scenario.sampling is not None:
         maps = jax.vmap(partial(stability.period_map, inputs.scenario, carry.state))(
             stability.resolved(instants.jacobian, sampled=True)

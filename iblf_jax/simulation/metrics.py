@@ -26,7 +26,7 @@ import jax.numpy as jnp
 
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, layers, leaf
-from iblf_jax.simulation.accuracy import UNITS
+from iblf_jax.simulation.error_estimate import UNITS
 from iblf_jax.simulation.optional import optional_member
 from iblf_jax.simulation.scenario import Scenario, fit_joints
 from iblf_jax.simulation.signals import Sample as Sample

@@ -22,7 +22,7 @@ from iblf_jax.control.observers import NoObserver, Observer
 from iblf_jax.control.sensors import Ideal as IdealSensor
 from iblf_jax.control.sensors import Sensor
 from iblf_jax.core import checks, notices
-from iblf_jax.core.cache import keep_programs
+from iblf_jax.core.disk_cache import keep_programs
 from iblf_jax.core.presentation import present
 from iblf_jax.core.pytree import (
     Leaf,

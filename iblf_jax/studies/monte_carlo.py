@@ -12,7 +12,7 @@ from typing import Any
 
 from iblf_jax.core import checks, notices
 from iblf_jax.core.progress import bar
-from iblf_jax.simulation.accuracy import RELATIVE
+from iblf_jax.simulation.error_estimate import RELATIVE
 from iblf_jax.simulation.metrics import Fold
 from iblf_jax.simulation.sampling import has_noise
 from iblf_jax.simulation.scenario import Scenario

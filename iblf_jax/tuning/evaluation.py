@@ -39,8 +39,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core.status import UNTRUSTED
-from iblf_jax.simulation.accuracy import RELATIVE
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
+from iblf_jax.simulation.error_estimate import RELATIVE
 from iblf_jax.simulation.metrics import Torque
 from iblf_jax.simulation.paths import get, with_parameters
 from iblf_jax.simulation.sampling import NOISE_NAME, noise_of
