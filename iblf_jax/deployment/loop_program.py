@@ -14,7 +14,7 @@ from iblf_jax.engine.step import Inputs, StepOptions, advance, start
 from iblf_jax.kernels import Program
 from iblf_jax.simulation import error_estimate
 from iblf_jax.simulation.closed_loop import initial_state
-from iblf_jax.simulation.sampling import has_noise
+from iblf_jax.simulation.noise import has_noise
 from iblf_jax.simulation.scenario import Scenario
 
 OUTPUTS = {

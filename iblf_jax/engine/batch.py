@@ -29,8 +29,8 @@ from iblf_jax.engine.step import (
 )
 from iblf_jax.simulation import error_estimate
 from iblf_jax.simulation.closed_loop import initial_state, perturbed_state
+from iblf_jax.simulation.noise import NOISE_NAME
 from iblf_jax.simulation.paths import with_parameters
-from iblf_jax.simulation.sampling import NOISE_NAME
 from iblf_jax.simulation.stability import resolved
 
 

@@ -58,7 +58,7 @@ class Inputs(NamedTuple):
     steps: jax.Array
     """(), a float: integers are not leaves of a scalar program."""
     noise: Any = ()
-    """Of a sampled loop, the key of each run's noise (`sampling.noise_key`)."""
+    """Of a sampled loop, the key of each run's noise (`noise.noise_key`)."""
     direction: Any = ()
     """Tangents of leaves, where a step takes them as data."""
 
@@ -700,8 +700,8 @@ class Linearization(NamedTuple):
     growth: stability.Growth
     """Of the power iteration."""
     jacobian: jax.Array
-    """By the numbers that `error_estimate` watches, by differences of three sizes, (3, m', m') [1/s];
-    `stability.resolved` makes one of them."""
+    """By the numbers that `error_estimate` watches, by differences of three sizes,
+    (3, m', m') [1/s]; `stability.resolved` makes one of them."""
     unresolved: error_estimate.UnresolvedSignals
     """Of the run; its torque is turned into what it accelerates, as that takes the robot's mass
     matrix."""
@@ -711,9 +711,9 @@ class Linearization(NamedTuple):
 class LinearizationStep:
     """The closed loop's derivative along one direction after the other.
 
-    The directions are at first the unit vectors of the numbers that `error_estimate` watches.  Where
-    these are the complete state, the modes follow from them; otherwise a power iteration adds more
-    directions.
+    The directions are at first the unit vectors of the numbers that `error_estimate` watches.
+    Where these are the complete state, the modes follow from them; otherwise a power iteration adds
+    more directions.
     """
 
     def __call__(

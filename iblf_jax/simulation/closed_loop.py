@@ -33,8 +33,9 @@ from iblf_jax.control.sensors._base import unrounded
 from iblf_jax.core.linalg import inner, matvec, solve_spd
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.time import as_at
+from iblf_jax.simulation.noise import normals
 from iblf_jax.simulation.optional import optional_member
-from iblf_jax.simulation.sampling import Instant, normals
+from iblf_jax.simulation.sampling import Instant
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import Sample
 from iblf_jax.world.regions import margins

@@ -20,8 +20,8 @@ from iblf_jax.core import checks
 from iblf_jax.engine import CompiledBatch, RunRequest, block_size, check_backend, compile_batch
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.metrics import Fold, as_folds
-from iblf_jax.simulation.sampling import check_step, noise_of
-from iblf_jax.simulation.scenario import Scenario, canonical
+from iblf_jax.simulation.noise import noise_of
+from iblf_jax.simulation.scenario import Scenario, canonical, check_step
 from iblf_jax.studies.designs import split, unit_points
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.draws import CaseInputs, Cases, Target, draw, merge, sample_size, targets_of

@@ -42,8 +42,8 @@ from iblf_jax.core.status import UNTRUSTED
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
 from iblf_jax.simulation.error_estimate import RELATIVE
 from iblf_jax.simulation.metrics import Torque
+from iblf_jax.simulation.noise import NOISE_NAME, noise_of
 from iblf_jax.simulation.paths import get, with_parameters
-from iblf_jax.simulation.sampling import NOISE_NAME, noise_of
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.draws import Cases, Target, draw, merge, same_place
 from iblf_jax.tuning.objectives import Objective

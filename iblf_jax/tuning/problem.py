@@ -18,9 +18,9 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.simulation.integrators import tableau
+from iblf_jax.simulation.noise import has_noise
 from iblf_jax.simulation.paths import with_parameters
-from iblf_jax.simulation.sampling import check_step, has_noise
-from iblf_jax.simulation.scenario import Scenario, canonical, fit_joints
+from iblf_jax.simulation.scenario import Scenario, canonical, check_step, fit_joints
 from iblf_jax.studies.designs import MAX_RUNS
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.draws import Cases, Target, targets_of
