@@ -19,6 +19,7 @@ from iblf_jax.certificates.lines import (
     join_notes,
     not_applicable,
 )
+from iblf_jax.certificates.optional import optional_member
 from iblf_jax.certificates.proof_terms import GENERAL_TERMS
 from iblf_jax.certificates.run_summary import (
     ALWAYS_EXCLUDED,
@@ -29,7 +30,6 @@ from iblf_jax.certificates.run_summary import (
 from iblf_jax.certificates.theorem_lines import NO_BOUND, exclusion_note, xi_bound_along
 from iblf_jax.control.actuators import Ideal
 from iblf_jax.core import checks
-from iblf_jax.simulation.optional import optional_member
 
 WEIGHTED_LEFT = {1: "V_w' + rho V_w <= 0", 2: "V_w' + rho V_w - w_f |f'|^2/(2 b) <= 0"}
 WEIGHTED_ENVELOPE = {

@@ -30,12 +30,12 @@ from iblf_jax.certificates.lines import (
     not_applicable,
     verdict_of,
 )
+from iblf_jax.certificates.optional import optional_member
 from iblf_jax.certificates.reconstruction import padded_index
 from iblf_jax.certificates.run_summary import RunSummary, Segment
 from iblf_jax.control.observers import Momentum
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import Status
-from iblf_jax.simulation.optional import optional_member
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import has
 

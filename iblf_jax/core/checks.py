@@ -387,12 +387,6 @@ def one_of(name: str, value: Any, allowed: Any) -> None:
         raise fail(name, value, "one of " + ", ".join(repr(x) for x in allowed))
 
 
-def instance(name: str, value: Any, kind: type, remedy: str = "") -> None:
-    """Raises unless `value` is of a class."""
-    if not isinstance(value, kind):
-        raise fail(name, value, with_article(kind.__name__), remedy)
-
-
 def conforms(
     name: str, value: Any, protocol: type, remedy: str = "", optional: tuple[str, ...] = ()
 ) -> None:

@@ -19,15 +19,17 @@ A fold is a component: its thresholds are leaves. Its `units` name the results o
 from __future__ import annotations
 
 from collections.abc import Sequence
+from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 
+from iblf_jax.control.controllers._base import law_member
 from iblf_jax.core import checks
+from iblf_jax.core.optional import OptionalMembers
 from iblf_jax.core.pytree import Leaf, component, layers, leaf
 from iblf_jax.simulation.error_estimate import UNITS
-from iblf_jax.simulation.optional import optional_member
 from iblf_jax.simulation.scenario import Scenario, fit_joints
 from iblf_jax.simulation.signals import Sample as Sample
 from iblf_jax.simulation.signals import speed_margin
@@ -56,6 +58,10 @@ class Fold(Protocol):
     def finish(self, acc: Any) -> dict[str, jax.Array]:
         """The named results."""
         ...
+
+
+fold_member = OptionalMembers(needs=None, units=MappingProxyType({}))
+"""Reads what a metric may lack."""
 
 
 def _root_mean_square(integral: jax.Array, time: jax.Array) -> jax.Array:
@@ -471,7 +477,7 @@ def has_signal(scenario: Scenario, signal: str) -> bool:
     has_regions = len(scenario.regions) > 0
     if signal == "region_margin":
         return has_regions
-    has_filter = any(optional_member(law, "filters") for law in layers(scenario.controller))
+    has_filter = any(law_member(law, "filters") for law in layers(scenario.controller))
     return has_filter and (signal == "slack" or has_regions)
 
 
@@ -479,7 +485,7 @@ def check_needs(field: str, fold: Any, scenario: Scenario) -> None:
     """Raises ValueError for a fold, or a quantity of a tuning, that reads a signal which runs of
     the scenario do not have.
     """
-    needs = optional_member(fold, "needs")
+    needs = fold_member(fold, "needs")
     if needs is None:
         return
     checks.one_of(f"{field}.needs", needs, OF_SCENARIO)
@@ -546,7 +552,7 @@ def _in_type(name: str, fold: Fold, dtype: jax.typing.DTypeLike) -> Fold:
 
 def metric_units(folds: Sequence[Fold]) -> tuple[tuple[str, str], ...]:
     """Name and unit of every result of a run with some folds: theirs, and those of its accuracy."""
-    of_folds = [optional_member(fold, "units") for fold in folds]
+    of_folds = [fold_member(fold, "units") for fold in folds]
     return tuple(pair for units in of_folds for pair in units.items()) + UNITS
 
 

@@ -28,8 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks, notices, tables
-from iblf_jax.core.pytree import field_values
-from iblf_jax.simulation.optional import optional_member
+from iblf_jax.core.pytree import component_member, field_values, wrapped_field
 from iblf_jax.simulation.scenario import NUMBERS, Scenario, canonical
 
 _BARE = r"[^\[\]]*[^\W\d_][^\[\]]*"
@@ -117,14 +116,14 @@ def _walk(
         return
     if not _is_component(part):
         return
-    leaf_units = {**_own_units(part), **units}
+    leaf_units = {**component_member(part, "leaf_units")(), **units}
     values = field_values(part)
     for field in dataclasses.fields(part):
         if field.metadata.get("static"):
             continue
         value = values[field.name]
         name = _joined(path, field.name)
-        if field.name == _wrapped_field(part):
+        if field.name == wrapped_field(part):
             yield from _walk_wrapped(part, value, path, name, named)
         elif isinstance(value, NUMBERS):
             yield Parameter(name, jnp.shape(value), _unit(field, leaf_units), value)
@@ -147,27 +146,16 @@ def _walk_wrapped(
         yield parameter
 
 
-def _wrapped_field(part: Any) -> str | None:
-    """The field of a component that holds a wrapped one, or None."""
-    return optional_member(type(part), "wraps")
-
-
 def _unit(field: dataclasses.Field, units: Mapping[str, str]) -> str:
     """The unit of a leaf: that of `units`, if it is there, else its own."""
     return str(units.get(field.name, field.metadata.get("unit", "")))
-
-
-def _own_units(part: Any) -> Mapping[str, str]:
-    """Units of a component's leaves that depend on its other fields, by name."""
-    leaf_units = optional_member(part, "leaf_units")
-    return {} if leaf_units is None else leaf_units()
 
 
 def _named_rows(part: Any, path: str) -> Iterator[Parameter]:
     """The rows of leaves that have names."""
     units = {field.name: field.metadata.get("unit", "") for field in dataclasses.fields(part)}
     values = field_values(part)
-    for kind, (names, fields) in optional_member(type(part), "rows").items():
+    for kind, (names, fields) in component_member(type(part), "rows").items():
         for i, name in enumerate(values[names]):
             for field in fields:
                 value = values[field]
@@ -294,7 +282,10 @@ def _metadata(scenario: Scenario, path: str) -> Mapping[str, Any]:
                 part = part[token]
         else:
             field = next(f for f in dataclasses.fields(part) if f.name == token)
-            metadata = {**field.metadata, "unit": _unit(field, {**_own_units(part), **units})}
+            metadata = {
+                **field.metadata,
+                "unit": _unit(field, {**component_member(part, "leaf_units")(), **units}),
+            }
             units |= field.metadata.get("units", {})
             part = field_values(part)[token]
     return metadata
@@ -335,7 +326,7 @@ def _steps(part: Any, tokens: list[str | int]) -> tuple[list[str | int], list[st
         raise KeyError(token)
     if _has_field(part, token):
         return [token], tokens[1:]
-    rows = optional_member(type(part), "rows")
+    rows = component_member(type(part), "rows")
     if token in rows:
         names, fields = rows[token]
         row, field = tokens[1:3]
@@ -343,7 +334,7 @@ def _steps(part: Any, tokens: list[str | int]) -> tuple[list[str | int], list[st
             raise KeyError(field)
         index = row if isinstance(row, int) else field_values(part)[names].index(row)
         return [field, index], tokens[3:]
-    wrapped = _wrapped_field(part)
+    wrapped = wrapped_field(part)
     if wrapped:
         return [wrapped], tokens
     return [token], tokens[1:]

@@ -44,7 +44,7 @@ from iblf_jax.core.status import VELOCITY_LIMIT
 from iblf_jax.core.time import joined, jump_times_of
 from iblf_jax.simulation.sampling import PERIOD_TOLERANCE, Sampling
 from iblf_jax.world import regions
-from iblf_jax.world.bounds import Bounds
+from iblf_jax.world.bounds import Bounds, speed_limits_at
 from iblf_jax.world.disturbances import Disturbance, Nothing
 from iblf_jax.world.references import Reference
 from iblf_jax.world.robots import Robot
@@ -282,7 +282,8 @@ def with_parts(scenario: Scenario, **parts: Any) -> Scenario:
       ValueError: an unknown name, `robot` beside plant or model, a part of the wrong kind, or parts
         that differ in their number of joints.
     """
-    checks.instance("scenario", scenario, Scenario, MAKE_ONE)
+    if not isinstance(scenario, Scenario):
+        raise checks.fail("scenario", scenario, "a Scenario", MAKE_ONE)
     names = ("robot", *(field.name for field in dataclasses.fields(Scenario)))
     for name in parts:
         if name not in names:
@@ -391,7 +392,8 @@ def canonical(scenario: Scenario) -> Scenario:
         definite, the start is outside its bounds or faster than VELOCITY_LIMIT; the message names
         the field, the value and the remedy.
     """
-    checks.instance("scenario", scenario, Scenario, MAKE_ONE)
+    if not isinstance(scenario, Scenario):
+        raise checks.fail("scenario", scenario, "a Scenario", MAKE_ONE)
     keep_programs()
     check_values(scenario)
     scenario = _with_sufficient_queue(scenario)
@@ -492,47 +494,39 @@ def _at_start(scenario: Scenario) -> _Start:
     structure.
     """
     n, q, dq = scenario.n, scenario.initial.q, scenario.initial.dq
-    t, zero = jnp.zeros((), q.dtype), jnp.zeros_like(q)
-    plant, model = scenario.plant, scenario.model
-    calls: dict[str, tuple[Any, tuple[int, ...]]] = {
-        "reference.position(t)": (lambda: scenario.reference.position(t), (n,)),
-        "bounds.lower.at(t, q_d)": (lambda: scenario.bounds.lower.at(t, zero), (n,)),
-        "bounds.upper.at(t, q_d)": (lambda: scenario.bounds.upper.at(t, zero), (n,)),
-        "disturbance.torque(t, q, dq, plant, model)": (
-            lambda: scenario.disturbance.torque(t, q, dq, plant, model),
-            (n,),
-        ),
-    }
+    t, plant, model = jnp.zeros((), q.dtype), scenario.plant, scenario.model
+    reference, bounds, of_speeds = scenario.reference, scenario.bounds, scenario.velocity_bounds
+    q_d = _shaped("reference.position(t)", partial(reference.position, t), n)
+    lower = _shaped("bounds.lower.at(t, q_d)", partial(bounds.lower.at, t, q_d), n)
+    upper = _shaped("bounds.upper.at(t, q_d)", partial(bounds.upper.at, t, q_d), n)
     for name, robot in (("plant", plant), ("model", model)):
-        calls[f"{name}.mass_matrix(q)"] = (partial(robot.mass_matrix, q), (n, n))
-        calls[f"{name}.coriolis(q, v, u)"] = (partial(robot.coriolis, q, dq, dq), (n,))
-        calls[f"{name}.gravity(q)"] = (partial(robot.gravity, q), (n,))
-    bounds = scenario.velocity_bounds
-    if bounds is not None:
-        calls["velocity_bounds.lower.at(t, dq_d)"] = (partial(bounds.lower.at, t, zero), (n,))
-        calls["velocity_bounds.upper.at(t, dq_d)"] = (partial(bounds.upper.at, t, zero), (n,))
-    for name, (call, shape) in calls.items():
-        _check_shape(name, call, shape)
-    tube = scenario.context.tube(t)
+        _shaped(f"{name}.mass_matrix(q)", partial(robot.mass_matrix, q), n, n)
+        _shaped(f"{name}.coriolis(q, v, u)", partial(robot.coriolis, q, dq, dq), n)
+        _shaped(f"{name}.gravity(q)", partial(robot.gravity, q), n)
+    torque = partial(scenario.disturbance.torque, t, q, dq, plant, model)
+    _shaped("disturbance.torque(t, q, dq, plant, model)", torque, n)
     speed_limits = None
-    if bounds is not None:
-        speed_limits = scenario.context.speed_limits(t)
+    if of_speeds is not None:
+        _shaped("velocity_bounds.lower.at(t, dq_d)", partial(of_speeds.lower.at, t, q_d), n)
+        _shaped("velocity_bounds.upper.at(t, dq_d)", partial(of_speeds.upper.at, t, q_d), n)
+        speed_limits = speed_limits_at(reference, of_speeds, t)
     margins = q[:0]
     if scenario.regions:
         margins = regions.margins(scenario.regions, plant, q)
-    return _Start(tube.q_d, tube.lower, tube.upper, speed_limits, margins)
+    return _Start(q_d, lower, upper, speed_limits, margins)
 
 
-def _check_shape(name: str, call: Callable, shape: tuple[int, ...]) -> None:
-    """Raises ValueError if `call()` raises or its value has another shape."""
+def _shaped(name: str, call: Callable[[], jax.Array], *shape: int) -> jax.Array:
+    """The value of `call()`, or a ValueError that names it if it raises or has another shape."""
     try:
-        found = jnp.shape(call())
+        value = call()
     except Exception as error:
         got = f"{type(error).__name__}: {error}"
         raise checks.fail(name, got, f"an array of shape {shape}") from error
-    if found != shape:
+    if jnp.shape(value) != shape:
         remedy = f"The plant has {shape[0]} joints."
-        raise checks.fail(name, f"shape {found}", f"shape {shape}", remedy)
+        raise checks.fail(name, f"shape {jnp.shape(value)}", f"shape {shape}", remedy)
+    return value
 
 
 def _check_start(scenario: Scenario) -> None:
