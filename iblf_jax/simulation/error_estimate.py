@@ -272,7 +272,10 @@ def _error_by_stages(
     rate: Callable, table: Tableau, length: jax.Array, slopes: list[LoopState]
 ) -> jax.Array:
     """Local error of one step of this length from the slopes of its stages, in terms of `rate` of a
-    slope; 0 for a method of one stage.
+    slope.
+
+    A method of one stage has no such estimate, and the result is 0. The factors below are those of
+    rk4, which has a stage in the middle of a step, and of Heun's method.
     """
     if len(table.c) == 1:
         return jnp.zeros_like(rate(slopes[0]))
