@@ -58,11 +58,11 @@ def native(dtype: str, metrics, runs: int, steps: int, method: str) -> tuple[flo
     scenario = canonical(ij.astype(ij.presets.iiwa14(), dtype))
     folds, run = (
         as_folds(metrics, dtype, scenario),
-        RunRequest(steps, method, constants=mechanism_of(scenario)),
+        RunRequest(steps, method, constants=mechanism_of(scenario), backend="native"),
     )
     values, dt = {"initial.q": jnp.asarray(starts(scenario, runs), dtype)}, jnp.asarray(DT, dtype)
     seconds, call = compile_seconds(
-        lambda v, dt: run_batch(scenario, v, folds, dt, run, backend="native"), values, dt
+        lambda v, dt: run_batch(scenario, v, folds, dt, run), values, dt
     )
     return seconds, *measured(lambda: call(values, dt), 3)
 

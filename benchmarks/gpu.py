@@ -5,7 +5,7 @@ machine's processor, side by side.
     4096,65536,1048576] [--chain]
 
 On a GPU it first holds the kernel to the reference (largest difference, statuses), then prints the
-rows of the GPU (`gpu`, `xla`, textbook `jit(vmap(scan))`) and, from a process of its own, those of
+rows of the GPU (`gpu`, `vmap`, textbook `jit(vmap(scan))`) and, from a process of its own, those of
 the processor.  `of peak` counts the instructions of the scalar program (`ij.explain`) against what
 the multiprocessors can issue at their highest clock.  Without a GPU there are the processor's rows
 only.
@@ -54,9 +54,9 @@ COLUMNS = [
     "x textbook",
     "of peak",
 ]
-RATES = {"textbook": 1e6, "xla": 3e7, "gpu + 6 tangents": 1e9, "gpu": 5e9, "gpu, no metrics": 5e9}
-"""Steps/s to expect, so that a row takes about a second; of textbook and xla on a processor."""
-LAUNCHED = {"textbook": 200, "xla": 200}
+RATES = {"textbook": 1e6, "vmap": 1e6, "gpu + 6 tangents": 1e9, "gpu": 5e9, "gpu, no metrics": 5e9}
+"""Steps/s to expect, so that a row takes about a second; of textbook and vmap on a processor."""
+LAUNCHED = {"textbook": 200, "vmap": 200}
 """Steps of the rows in which XLA launches the kernels of each step one after the other: those take
 as long for one run as for many."""
 QUICK = ("textbook", "native", "gpu", "gpu + 6 tangents")
@@ -88,17 +88,20 @@ def candidates(scenario, dtype: str, is_paper: bool, method: str) -> dict:
 
     def on(backend, folds=folds):
         return lambda v, dt, steps: run_batch(
-            scenario, v, folds, dt, RunRequest(steps, method), backend=backend
+            scenario, v, folds, dt, RunRequest(steps, method, backend=backend)
         )
 
     def tangents(v, dt, steps):
-        return run_batch_jvp(
-            scenario, v, GAINS, folds[:1], dt, RunRequest(steps, method), backend=compiled
-        )
+        request = RunRequest(steps, method, backend=compiled)
+        return run_batch_jvp(scenario, v, GAINS, folds[:1], dt, request)
 
     compiled = "gpu" if on_a_gpu() else "native"
     rows = {"textbook": lambda v, dt, steps: textbook(v, dt, steps=steps)} if is_paper else {}
-    rows |= {"xla": on("xla"), compiled: on(compiled), f"{compiled}, no metrics": on(compiled, ())}
+    rows |= {
+        "vmap": on("vmap"),
+        compiled: on(compiled),
+        f"{compiled}, no metrics": on(compiled, ()),
+    }
     return rows | ({f"{compiled} + 6 tangents": tangents} if is_paper else {})
 
 
@@ -108,9 +111,8 @@ def check(scenario, dtype: str, steps: int, method: str) -> None:
     values = draws(scenario, 300, dtype)
 
     def outcome(backend):
-        return jax.jit(
-            lambda v: run_batch(scenario, v, folds, dt, RunRequest(steps, method), backend=backend)
-        )(values)
+        request = RunRequest(steps, method, backend=backend)
+        return jax.jit(lambda v: run_batch(scenario, v, folds, dt, request))(values)
 
     found, expected = outcome("gpu"), outcome("vmap")
     worst = 0.0

@@ -30,7 +30,7 @@ import numpy as np
 DURATION, DT = 10.0, 1e-3
 SPREAD = 0.02
 COLUMNS = ["way", "runs", "runs/s", "times the Python loop", "resident MB", "remark"]
-SIZES = {"native": 20_480, "xla": 10_240, "vmap": 2_048}
+SIZES = {"native": 20_480, "vmap": 2_048}
 """Runs of 1 s that one device is timed on: seconds."""
 
 

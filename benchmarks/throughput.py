@@ -245,7 +245,6 @@ QUICK = (
     "textbook",
     "diffrax",
     "vmap",
-    "xla",
     "native, one thread",
     "native, rmse + 6 tangents",
     "limit, one thread",
@@ -262,7 +261,11 @@ def rows_of(scenario, dtype: str, loop: str, method: str) -> list[Row]:
 
     def on(backend, folds=folds):
         return lambda v, dt, steps: run_batch(
-            scenario, v, folds, dt, RunRequest(steps, method, constants=mechanism), backend=backend
+            scenario,
+            v,
+            folds,
+            dt,
+            RunRequest(steps, method, constants=mechanism, backend=backend),
         )
 
     def sensitivities(folds):
@@ -272,8 +275,7 @@ def rows_of(scenario, dtype: str, loop: str, method: str) -> list[Row]:
             GAINS,
             folds,
             dt,
-            RunRequest(steps, method, constants=mechanism),
-            backend="native",
+            RunRequest(steps, method, constants=mechanism, backend="native"),
         )
 
     if loop == "arm":
@@ -283,13 +285,11 @@ def rows_of(scenario, dtype: str, loop: str, method: str) -> list[Row]:
         ]
     rows = [
         Row("vmap", on("vmap"), 2e6, batches=(1, 64, 4096)),
-        Row("xla", on("xla"), 3e7),
         Row("native", on("native"), 1e8),
         Row("native, one thread", on("native"), 1e8, threads=1, batches=LARGE[1:]),
     ]
     if loop != "paper":
         return rows
-    rows.append(Row("xla, no metrics", on("xla", ()), 3e7, batches=LARGE))
     first = [Row("textbook", lambda v, dt, steps: textbook(v, dt, steps=steps), 1e6, most=16_384)]
     if importlib.util.find_spec("diffrax"):
         first.append(

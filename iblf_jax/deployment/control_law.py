@@ -19,7 +19,7 @@ import numpy as np
 from iblf_jax.control.sensors import Ideal, Measurement
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf
-from iblf_jax.engine import lowering_limits
+from iblf_jax.engine import LOWERING_LIMITS
 from iblf_jax.kernels import Program, Shapes, compile_step, written_out
 from iblf_jax.simulation.closed_loop import discrete_observer, law_update
 from iblf_jax.simulation.scenario import Scenario
@@ -244,7 +244,7 @@ def program_of(function: Callable, scenario: Scenario, given: Any, carry: Any) -
 
     dtype = np.dtype(scenario.initial.q.dtype)
     shared, per_run, carried = (Shapes.of(jax.tree.leaves(x)) for x in (scenario, given, carry))
-    step = compile_step(on_leaves, dtype, shared, per_run, carried, lowering_limits())
+    step = compile_step(on_leaves, dtype, shared, per_run, carried, LOWERING_LIMITS)
     return written_out(step.program)
 
 

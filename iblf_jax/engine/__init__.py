@@ -6,8 +6,9 @@
     output  = program(scenario, varied, folds, dt)      an `Outcome`: records, metrics, status flags
     result  = run_rollout(...)                          a `Rollout`: named, with units, plotted
 
-Modules outside this folder import from here; `simulate`, `explain`, `recommended_period` and the
-step sizes have modules of their own.
+`registry` lists the executors, `loops` the loops over all steps of a batch, and `thresholds` the
+sizes with which the plan compares.  Modules outside this folder import from here; `simulate`,
+`explain`, `recommended_period` and the step sizes have modules of their own.
 """
 
 from iblf_jax.engine.compile import BackendWarning as BackendWarning
@@ -22,13 +23,10 @@ from iblf_jax.engine.execute import run_from as run_from
 from iblf_jax.engine.request import RunRequest as RunRequest
 from iblf_jax.engine.request import check_backend as check_backend
 from iblf_jax.engine.simulate import run_rollout as run_rollout
-from iblf_jax.engine.sizes import FORWARD_MOST as FORWARD_MOST
 from iblf_jax.engine.sizes import STUDY_MEMORY as STUDY_MEMORY
 from iblf_jax.engine.sizes import block_size as block_size
 from iblf_jax.engine.sizes import blocks_in_flight as blocks_in_flight
-from iblf_jax.engine.sizes import differentiates_forward as differentiates_forward
 from iblf_jax.engine.sizes import fresh_together as fresh_together
-from iblf_jax.engine.sizes import lowering_limits as lowering_limits
 from iblf_jax.engine.sizes import starts_together as starts_together
 from iblf_jax.engine.sizes import sweep_unit as sweep_unit
 from iblf_jax.engine.sizes import values_together as values_together
@@ -36,4 +34,7 @@ from iblf_jax.engine.sizes import whole_blocks as whole_blocks
 from iblf_jax.engine.step import Outcome as Outcome
 from iblf_jax.engine.step import folded as folded
 from iblf_jax.engine.step import sample_status as sample_status
+from iblf_jax.engine.thresholds import FORWARD_MOST as FORWARD_MOST
+from iblf_jax.engine.thresholds import LOWERING_LIMITS as LOWERING_LIMITS
+from iblf_jax.engine.thresholds import differentiates_forward as differentiates_forward
 from iblf_jax.engine.waiting import wait_until_ready as wait_until_ready

@@ -152,38 +152,32 @@ class Batch(NamedTuple):
         return together(self.leaves.per_run, *args)
 
 
-Loop = Callable[[Any, Batch, Any, int, int | None], tuple[Any, Any]]
-"""(step, batch, carry, steps, every) -> (the carry after all steps, what every `every`-th step
-recorded, from the first on).
+StepLoop = Callable[[Any, Batch, Any, int, int | None], tuple[Any, Any]]
+"""The loop over all steps of a batch: a function (step, batch, carry, steps, every) -> (carry after
+the last step, records of every `every`-th step from the first on).
 
 All arrays have the run axis first, records then the time axis; `every` is None where nothing is
 recorded."""
 
 
-def _linearized(loop: Loop, batch: Batch, carry: Linearization) -> Linearization:
+def _linearized(loop: StepLoop, batch: Batch, carry: Linearization) -> Linearization:
     """What a `LinearizationStep` of every run has found."""
     batch = _linearized_batch(batch)
-    return loop(
-        LinearizationStep(), batch, carry, linearization_steps(batch.leaves.first.scenario), None
-    )[0]
+    steps = linearization_steps(batch.leaves.first.scenario)
+    return loop(LinearizationStep(), batch, carry, steps, None)[0]
 
 
 def _linearized_batch(batch: Batch) -> Batch:
-    """The batch as a `LinearizationStep` reads it, without derivatives."""
-    leaves = _without_folds(batch.leaves)
-    shared, per_run = jax.lax.stop_gradient((leaves.shared, leaves.per_run))
-    return batch._replace(leaves=leaves._replace(shared=shared, per_run=per_run))
-
-
-def _without_folds(leaves: Leaves) -> Leaves:
-    """The leaves of inputs that a `LinearizationStep` reads, so that one program of it serves all
-    metrics and derivatives.
+    """The batch with the inputs alone that a `LinearizationStep` reads, and without derivatives, so
+    that one program of it serves all metrics and derivatives.
     """
+    leaves = batch.leaves
     numbered: Inputs = jax.tree.unflatten(leaves.treedef, range(len(leaves.is_per_run)))
     kept, treedef = jax.tree.flatten(numbered._replace(folds=(), noise=(), direction=()))
     values = leaves.merged(leaves.shared, leaves.per_run)
     is_per_run = [leaves.is_per_run[i] for i in kept]
-    return Leaves.of(treedef, is_per_run, [values[i] for i in kept])
+    constants = jax.lax.stop_gradient([values[i] for i in kept])
+    return batch._replace(leaves=Leaves.of(treedef, is_per_run, constants))
 
 
 def _initial_linearization(batch: Batch, method: str) -> Linearization:
@@ -207,7 +201,7 @@ def linearization_batch(batch: Batch, method: str) -> tuple[Batch, Linearization
     return _linearized_batch(batch), jax.eval_shape(lambda: _initial_linearization(batch, method))
 
 
-def initialize(loop: Loop, batch: Batch, method: str) -> tuple[Carry, Linearization]:
+def initialize(loop: StepLoop, batch: Batch, method: str) -> tuple[Carry, Linearization]:
     """The carry before the first step, and what a `LinearizationStep` has found at the start."""
     found = _linearized(loop, batch, _initial_linearization(batch, method))
 
@@ -229,7 +223,7 @@ def carry_shapes(batch: Batch, method: str) -> Carry:
 
 
 def finalize(
-    loop: Loop, batch: Batch, request: RunRequest, carry: Carry, at_start: Linearization
+    loop: StepLoop, batch: Batch, request: RunRequest, carry: Carry, at_start: Linearization
 ) -> Outcome:
     """The outcome after the last step, without records; `at_start` is the linearization there."""
 
@@ -261,7 +255,7 @@ def finalize(
     return batch.each(outcome, carry, at_start, later)
 
 
-def run_all(loop: Loop, batch: Batch, request: RunRequest) -> Outcome:
+def run_all(loop: StepLoop, batch: Batch, request: RunRequest) -> Outcome:
     """All runs, from the start to the outcome."""
     outcome, records = run_step(loop, batch, TimeStep.of(request), request)
     if request.record_every is None:
@@ -269,7 +263,9 @@ def run_all(loop: Loop, batch: Batch, request: RunRequest) -> Outcome:
     return outcome._replace(records=records)
 
 
-def run_step(loop: Loop, batch: Batch, step: TimeStep, request: RunRequest) -> tuple[Outcome, Any]:
+def run_step(
+    loop: StepLoop, batch: Batch, step: TimeStep, request: RunRequest
+) -> tuple[Outcome, Any]:
     """All runs by a step that may record something else; the outcome, and the records apart."""
     carry, at_start = initialize(loop, batch, request.method)
     carry, records = loop(step, batch, carry, request.steps + 1, request.record_every)

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.engine.batch import Batch, Leaves, Loop, run_step
+from iblf_jax.engine.batch import Batch, Leaves, StepLoop, run_step
 from iblf_jax.engine.derivatives import (
     Directions,
     Tangents,
@@ -182,7 +182,7 @@ def _scenario_shapes(batch: Batch) -> list[tuple[int, ...]]:
 
 
 def _stepped(
-    loop: Loop,
+    loop: StepLoop,
     batch: Batch,
     step: TangentStep,
     directions: list[list[Any]],
@@ -199,7 +199,7 @@ def _stepped(
 
 
 def columns(
-    loop: Loop, batch: Batch, places: Places, request: RunRequest
+    loop: StepLoop, batch: Batch, places: Places, request: RunRequest
 ) -> tuple[list[jax.Array], dict[str, jax.Array]]:
     """The derivative of records and metrics of every run by the numbers of some leaves, or a second
     derivative.
@@ -231,7 +231,7 @@ def _weights(folds: Any, found: Advanced) -> list[jax.Array]:
 
 
 def run_by_columns(
-    loop: Loop, batch: Batch, directions: Directions, request: RunRequest
+    loop: StepLoop, batch: Batch, directions: Directions, request: RunRequest
 ) -> Tangents:
     """As `run_with_tangents`, one run a tangent."""
     inputs = batch.leaves.first

@@ -1,9 +1,8 @@
 """Stage 3 of a run: from a request and its plan to a program, a function of the inputs.
 
-    scan     the step as it is: any scenario, any device; a user calls it "vmap"
-    xla      the step's scalar program, one array of runs a number: any device, needs only jax
-    native   the same program as C, built by the system's compiler, SIMD over runs and threads: CPU
+    native   the step's scalar program as C, built by a C++ compiler, SIMD and threads: CPU
     gpu      the same C as a CUDA kernel, one run a thread, built by NVRTC: NVIDIA GPUs
+    vmap     the scan over the step as it is: any scenario, any device
 
 All give the same results.  `first_that_works` is the only place that falls back from one executor
 to the next: a scenario that no scalar program can express runs by the scan, and where an executor
@@ -21,13 +20,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.core import notices
+from iblf_jax.core import devices, notices
 from iblf_jax.core.caches import CACHE
-from iblf_jax.engine import plan, registry
-from iblf_jax.engine.batch import Batch, carry_shapes, linearization_batch
-from iblf_jax.engine.executors import lowered_on, program_of
-from iblf_jax.engine.machine_function import length, machine_function
-from iblf_jax.engine.plan import ExecutionPlan, Sizes, choose_plan
+from iblf_jax.engine import plan, registry, thresholds
+from iblf_jax.engine.batch import Batch, StepLoop, carry_shapes, linearization_batch
+from iblf_jax.engine.loops import kernel_loop, program_of
+from iblf_jax.engine.machine_function import count_operations, machine_function
+from iblf_jax.engine.plan import BatchLayout, ExecutionPlan, Sizes, choose_plan
 from iblf_jax.engine.registry import Executor, Machine
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.step import Inputs, LinearizationStep, TimeStep, linearization_steps
@@ -39,7 +38,7 @@ T = TypeVar("T")
 
 
 class BackendWarning(UserWarning):
-    """A batch runs on another backend than the requested one, and why."""
+    """Runs are executed on another backend than the requested one, and why."""
 
 
 WARNINGS = "backend warnings"
@@ -64,16 +63,14 @@ def first_that_works(
     """
     for text in execution.notes:
         _warn_once(text)
-    names = execution.executors
+    names = execution.backends
     for name, following in zip(names, (*names[1:], "vmap"), strict=False):
         try:
             return attempt(registry.EXECUTORS[name])
         except ToolchainError as error:
-            warning = f"The {name} backend is not available ({error}): running on {following}."
-            if execution.reports_fallback:
-                _warn_once(warning)
+            _warn_once(plan.not_available(name, error, following))
         except UnsupportedError as reason:
-            if execution.reports_fallback:
+            if execution.reports_unsupported:
                 _warn_once(plan.slower_by_scan(reason))
             break
     return by_scan()
@@ -93,28 +90,29 @@ def inputs_of(
 def operations(inputs: Inputs) -> int:
     """Operations of one evaluation of the closed loop."""
     zero = jnp.zeros_like(inputs.dt)
-    return length(evaluate, inputs.scenario, zero, initial_state(inputs.scenario), zero)
+    return count_operations(evaluate, inputs.scenario, zero, initial_state(inputs.scenario), zero)
 
 
 def plan_of_batch(
-    request: RunRequest, inputs: Inputs, varied: Mapping[str, jax.Array]
+    request: RunRequest, inputs: Inputs, varied: Mapping[str, Any], machine: Machine
 ) -> ExecutionPlan:
-    """The plan of a batch on this machine."""
+    """The plan of a batch on a machine."""
     runs = len(next(iter(varied.values())))
-    return choose_plan(request, Sizes(operations(inputs), runs), registry.machine())
+    return choose_plan(request, Sizes(operations(inputs), runs), machine)
 
 
-def loop_of(executor: Executor) -> Callable:
-    """The loop over all steps of a batch by an executor, as `executors.scan` is one."""
-    return lowered_on(executor.run, executor.pack, executor.unpack)
+def nested_batch(inputs: Inputs) -> Batch:
+    """One run for the scan, which a caller may batch, differentiate or loop over."""
+    layout = plan.scan_layout(devices.platform(), operations(inputs), None, nested=True)
+    return Batch.of(inputs, None, layout)
 
 
 def scanned(
-    layout: plan.BatchLayout, inputs: Inputs, varied: Mapping[str, jax.Array] | None, run: Callable
+    layout: BatchLayout, inputs: Inputs, varied: Mapping[str, jax.Array] | None, run: Callable
 ) -> Any:
     """`run(batch)` for a batch in a layout of the scan."""
 
-    def complete(inputs, varied):
+    def complete(inputs: Inputs, varied: dict[str, jax.Array]) -> Any:
         return run(Batch.of(inputs, varied, layout))
 
     if layout.machine_functions == "loop":
@@ -133,7 +131,7 @@ def compilers_stopped_on_error() -> Iterator[None]:
 
 
 class StepProgram(NamedTuple):
-    """A scalar program and how it is called; static."""
+    """A scalar program and the arguments with which an executor builds its kernel; static."""
 
     program: Program
     shared: int
@@ -146,10 +144,14 @@ class StepProgram(NamedTuple):
     @staticmethod
     def of(step: Any, batch: Batch, carry: Any, steps: int) -> StepProgram:
         """The program of a step of a batch; raises UnsupportedError where there is none."""
-        leaves = batch.leaves
-        shared, per_run = Shapes.of(leaves.shared).size, Shapes.of(leaves.per_run, 1).size
-        program = program_of(step, batch, carry).program
-        return StepProgram(program, shared, per_run, batch.runs or 1, steps)
+        shared, per_run = batch.leaves.shared, batch.leaves.per_run
+        return StepProgram(
+            program_of(step, batch, carry).program,
+            Shapes.of(shared).size,
+            Shapes.of(per_run, 1).size,
+            batch.runs or 1,
+            steps,
+        )
 
 
 def time_step_program(batch: Batch, request: RunRequest) -> StepProgram:
@@ -161,9 +163,8 @@ def time_step_program(batch: Batch, request: RunRequest) -> StepProgram:
 def _linearization_program(batch: Batch, request: RunRequest) -> StepProgram:
     """The program that linearizes the closed loop at the start and at the end of a run."""
     batch, carry = linearization_batch(batch, request.method)
-    return StepProgram.of(
-        LinearizationStep(), batch, carry, linearization_steps(batch.leaves.first.scenario)
-    )
+    steps = linearization_steps(batch.leaves.first.scenario)
+    return StepProgram.of(LinearizationStep(), batch, carry, steps)
 
 
 def start_build(executor: Executor, program: StepProgram) -> None:
@@ -173,7 +174,7 @@ def start_build(executor: Executor, program: StepProgram) -> None:
 
 
 def run_lowered(
-    executor: Executor, batch: Batch, request: RunRequest, run: Callable[[Callable, Batch], T]
+    executor: Executor, batch: Batch, request: RunRequest, run: Callable[[StepLoop, Batch], T]
 ) -> T:
     """`run(loop, batch)` by an executor.
 
@@ -182,7 +183,7 @@ def run_lowered(
     if executor.start_build:
         start_build(executor, time_step_program(batch, request))
     with compilers_stopped_on_error():
-        return run(loop_of(executor), batch)
+        return run(kernel_loop(executor), batch)
 
 
 @jax.tree_util.register_static
@@ -208,15 +209,15 @@ def shapes_of(leaves: list) -> tuple:
     return tuple((x.shape, x.dtype) for x in leaves)
 
 
-def _structs(shapes: tuple) -> list[jax.ShapeDtypeStruct]:
-    return [jax.ShapeDtypeStruct(*shape) for shape in shapes]
+def _tree_of_shapes(structure: Any, shapes: tuple) -> Any:
+    return jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(*shape) for shape in shapes])
 
 
 def structural_part(request: RunRequest) -> RunRequest:
     """The part of a request on which its kernels depend: of the number of steps whether it is
     large, and of the record whether there is one.
     """
-    steps = {True: plan.NATIVE_FEW, False: 0}[request.steps >= plan.NATIVE_FEW]
+    steps = thresholds.FEW_STEPS if request.steps >= thresholds.FEW_STEPS else 0
     return request._replace(steps=steps, record_every=request.record_every and 1)
 
 
@@ -224,8 +225,10 @@ def structural_part(request: RunRequest) -> RunRequest:
 
 
 @CACHE.memoised(64)
-def executor_of_batch(request: RunRequest, machine: Machine, structure: Any, shapes: tuple) -> str:
-    """The executor that can run a batch, its kernels built; "vmap" for the scan.
+def compiled_plan(
+    request: RunRequest, machine: Machine, structure: Any, shapes: tuple
+) -> ExecutionPlan:
+    """The plan of a batch, reduced to the first executor that can run it; its kernels are built.
 
     It depends on structure and shapes alone, and a trace takes longer than many a study.
 
@@ -235,27 +238,28 @@ def executor_of_batch(request: RunRequest, machine: Machine, structure: Any, sha
       structure: of (scenario, varied, folds, dt).
       shapes: of their leaves.
     """
+    arguments = _tree_of_shapes(structure, shapes)
 
-    def choose(leaves):
-        scenario, varied, folds, dt = jax.tree.unflatten(structure, leaves)
-        return plan_of_batch(request, inputs_of(scenario, folds, dt, request), varied)
+    def choose(arguments: Any) -> ExecutionPlan:
+        scenario, varied, folds, dt = arguments
+        return plan_of_batch(request, inputs_of(scenario, folds, dt, request), varied, machine)
 
-    def programs(leaves):
-        scenario, varied, folds, dt = jax.tree.unflatten(structure, leaves)
+    def programs(arguments: Any) -> tuple[StepProgram, StepProgram]:
+        scenario, varied, folds, dt = arguments
         inputs = inputs_of(scenario, folds, dt, request)
         batch = Batch.of(inputs, varied, execution.layout, request.constants)
         return _linearization_program(batch, request), time_step_program(batch, request)
 
-    def build(executor: Executor) -> str:
-        linearization, step = on_shapes(programs, _structs(shapes))
+    def build(executor: Executor) -> tuple[str, ...]:
+        linearization, step = on_shapes(programs, arguments)
         start_build(executor, step)
         with compilers_stopped_on_error():
             executor.build(*linearization)
             executor.build(*step)
-        return executor.name
+        return (executor.name,)
 
-    execution = on_shapes(choose, _structs(shapes))
-    return first_that_works(execution, build, lambda: "vmap")
+    execution = on_shapes(choose, arguments)
+    return execution._replace(backends=first_that_works(execution, build, lambda: ()), notes=())
 
 
 # --- single runs ---
@@ -269,7 +273,7 @@ class SingleRunPlan(NamedTuple):
     """Of a step's program; 0 where it is not lowered."""
 
 
-def single_batch(inputs: Inputs, request: RunRequest, layout: plan.BatchLayout) -> Batch:
+def single_batch(inputs: Inputs, request: RunRequest, layout: BatchLayout) -> Batch:
     """One run as a batch, which is what is lowered."""
     start = {"initial.q": inputs.scenario.initial.q[None]}
     return Batch.of(inputs, start, layout, request.constants)
@@ -289,36 +293,22 @@ def plan_of_single_run(
       structure: of the `Inputs`.
       shapes: of their leaves.
     """
-
-    def size(leaves):
-        return operations(jax.tree.unflatten(structure, leaves))
-
-    sizes = Sizes(on_shapes(size, _structs(shapes)), None)
+    inputs = _tree_of_shapes(structure, shapes)
+    sizes = Sizes(on_shapes(operations, inputs), None)
     execution = choose_plan(request, sizes, machine)
-    if not execution.executors:
+    if not execution.backends:
         return SingleRunPlan(execution, 0)
 
-    def program(leaves):
-        inputs = jax.tree.unflatten(structure, leaves)
+    def program(inputs: Inputs) -> StepProgram:
         return time_step_program(single_batch(inputs, request, execution.layout), request)
 
-    best = registry.EXECUTORS[execution.executors[0]]
     try:
-        step = on_shapes(program, _structs(shapes))
-        sizes = sizes._replace(nodes=best.nodes(step.program))
-        execution = choose_plan(request, sizes, machine)
-        if execution.executors:
-            start_build(best, step)
-        return SingleRunPlan(execution, step.program.size)
+        step = on_shapes(program, inputs)
+        nodes = step.program.size
+        execution = choose_plan(request, sizes._replace(nodes=nodes), machine)
+        if execution.backends:
+            start_build(registry.EXECUTORS[execution.backend], step)
+        return SingleRunPlan(execution, nodes)
     except UnsupportedError as reason:
         sizes = sizes._replace(unsupported=str(reason))
         return SingleRunPlan(choose_plan(request, sizes, machine), 0)
-
-
-def compile_batch_executor(
-    request: RunRequest, scenario: Scenario, varied: Mapping[str, Any], folds: Any, dt: jax.Array
-) -> str:
-    """The name of the executor for a batch of these inputs, or of inputs of these shapes."""
-    leaves, structure = jax.tree.flatten((scenario, dict(varied), folds, dt))
-    part = structural_part(request._replace(record_every=None))
-    return executor_of_batch(part, registry.machine(), structure, shapes_of(leaves))

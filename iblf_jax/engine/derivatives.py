@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from iblf_jax.engine.batch import Batch, Loop, finalize, initialize
+from iblf_jax.engine.batch import Batch, StepLoop, finalize, initialize
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.step import Advanced, Carry, Inputs, Outcome, StepOptions, advance, finished
 from iblf_jax.simulation import error_estimate
@@ -278,7 +278,7 @@ class DerivativeStep:
 
 
 def run_with_tangents(
-    loop: Loop, batch: Batch, directions: Directions, request: RunRequest
+    loop: StepLoop, batch: Batch, directions: Directions, request: RunRequest
 ) -> Tangents:
     """All runs with their tangents, from the start to the outcome; `request` records nothing."""
     rows, columns = np.triu_indices(directions.tangents)

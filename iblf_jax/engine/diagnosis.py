@@ -67,7 +67,7 @@ def report(result: Rollout, steps: int, throw: bool) -> None:
 
 def _explanations(result: Rollout, status: Status, steps: int) -> list[str]:
     """A sentence or two for every flag that has an explanation."""
-    texts = [text(result) for flag, text in BOUNDS.items() if status & flag]
+    texts = [text(result) for flag, text in BOUND_EXPLANATIONS.items() if status & flag]
     if status & Status.STEP_TOO_LARGE:
         texts.append(_unstable_step(result))
     elif status & Status.NOT_FINITE and np.isfinite(result.fastest_mode):
@@ -77,45 +77,36 @@ def _explanations(result: Rollout, status: Status, steps: int) -> list[str]:
         )
     elif status & Status.INACCURATE:
         texts.append(_about_accuracy(result, status, steps))
-    texts += [text(result) for flag, text in LOOP.items() if status & flag]
+    texts += [text(result) for flag, text in LOOP_EXPLANATIONS.items() if status & flag]
     return [text for text in texts if text]
 
 
-def _bound_violated(result: Rollout) -> str:
+def _joint_left(bounds: str, prefix: str, margin: str, unit: str, result: Rollout) -> str:
+    """Which joint left its bounds first; `prefix` and `margin` are those of the metrics."""
     metrics = result.metrics
-    if "first_violation_time" not in metrics:
+    if f"{prefix}_time" not in metrics:
         return ""
-    joint = int(metrics["first_violation_joint"])
-    return (
-        f"{_joint_in_words(result, joint)} left its bounds first, at t ="
-        f" {float(metrics['first_violation_time']):.4g} s; its smallest margin is"
-        f" {float(metrics['margin'][joint]):.3g} rad."
-    )
+    joint = int(metrics[f"{prefix}_joint"])
+    what = f"{_joint_in_words(result, joint)} left its {bounds} first"
+    return _first_violation(what, metrics[f"{prefix}_time"], metrics[margin][joint], unit)
 
 
-def _velocity_violated(result: Rollout) -> str:
-    metrics = result.metrics
-    if "first_velocity_violation_time" not in metrics:
-        return ""
-    joint = int(metrics["first_velocity_violation_joint"])
-    return (
-        f"{_joint_in_words(result, joint)} left its velocity bounds first, at t ="
-        f" {float(metrics['first_velocity_violation_time']):.4g} s; its smallest margin is"
-        f" {float(metrics['velocity_margin'][joint]):.3g} rad/s."
-    )
-
-
-def _region_violated(result: Rollout) -> str:
+def _region_left(result: Rollout) -> str:
     metrics = result.metrics
     if "first_region_violation_time" not in metrics:
         return ""
     i = int(metrics["first_region_violation_region"])
     region = in_words(result.scenario.regions[i], result.scenario.plant)
-    return (
-        f"regions[{i}]: {region} crossed its boundary, at t ="
-        f" {float(metrics['first_region_violation_time']):.4g} s; its smallest margin is"
-        f" {float(metrics['region_margin'][i]):.3g} m."
+    return _first_violation(
+        f"regions[{i}]: {region} crossed its boundary",
+        metrics["first_region_violation_time"],
+        metrics["region_margin"][i],
+        "m",
     )
+
+
+def _first_violation(what: str, time: jax.Array, margin: jax.Array, unit: str) -> str:
+    return f"{what}, at t = {float(time):.4g} s; its smallest margin is {float(margin):.3g} {unit}."
 
 
 def _unstable_step(result: Rollout) -> str:
@@ -176,13 +167,15 @@ def _guard_stayed(result: Rollout) -> str:
     )
 
 
-BOUNDS: dict[Status, Callable[[Rollout], str]] = {
-    Status.BOUND_VIOLATED: _bound_violated,
-    Status.VELOCITY_VIOLATED: _velocity_violated,
-    Status.REGION_VIOLATED: _region_violated,
+BOUND_EXPLANATIONS: dict[Status, Callable[[Rollout], str]] = {
+    Status.BOUND_VIOLATED: partial(_joint_left, "bounds", "first_violation", "margin", "rad"),
+    Status.VELOCITY_VIOLATED: partial(
+        _joint_left, "velocity bounds", "first_velocity_violation", "velocity_margin", "rad/s"
+    ),
+    Status.REGION_VIOLATED: _region_left,
 }
 """The explanation of each flag of a violated bound."""
-LOOP: dict[Status, Callable[[Rollout], str]] = {
+LOOP_EXPLANATIONS: dict[Status, Callable[[Rollout], str]] = {
     Status.INFINITE_SLOPE: _infinite_slope,
     Status.SAMPLING_TOO_SLOW: _sampling_too_slow,
     Status.FILTER_INFEASIBLE: _filter_infeasible,
@@ -225,9 +218,9 @@ def _or_change(result: Rollout) -> str:
     """The end of a sentence that names the one term that limits the loop of a run, and its remedy;
     empty where there is no such term.
     """
-    limit = None
-    if checks.is_concrete(result.scenario):
-        limit = limiting_term(result)
+    if not checks.is_concrete(result.scenario):
+        return ""
+    limit = limiting_term(result)
     if limit is None:
         return ""
     return f", or {limit.advice}: of all terms {limit.term.words} limits this loop"
@@ -244,9 +237,8 @@ def _joint_in_words(result: Rollout, joint: int) -> str:
 def _infeasible(result: Rollout, steps: int) -> ValueError:
     """The error for a reference that touches a bound (Assumption 2), with joint and time."""
     times = jnp.arange(steps + 1).astype(result.dt.dtype) * result.dt
-    tube = jax.jit(jax.vmap(partial(tube_at, result.scenario.reference, result.scenario.bounds)))(
-        times
-    )
+    tube_of_run = partial(tube_at, result.scenario.reference, result.scenario.bounds)
+    tube = jax.jit(jax.vmap(tube_of_run))(times)
     q_d, lower, upper = (np.asarray(x) for x in (tube.q_d, tube.lower, tube.upper))
     sample, joint = np.unravel_index(np.argmin(np.minimum(q_d - lower, upper - q_d)), q_d.shape)
     where = f"t = {float(times[sample]):.4g} s"

@@ -6,31 +6,33 @@ inside `jit`; `simulate` calls `single_run.run_one` for one run.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 
-from iblf_jax.engine import plan, registry
-from iblf_jax.engine.batch import Batch, carry_shapes, run_all
+from iblf_jax.engine import registry, thresholds
+from iblf_jax.engine.batch import Batch, StepLoop, carry_shapes, run_all
 from iblf_jax.engine.columns import numbers_of, outer_vectors, run_by_columns
 from iblf_jax.engine.compile import (
-    compile_batch_executor,
+    compiled_plan,
     first_that_works,
     inputs_of,
-    loop_of,
+    nested_batch,
     operations,
     plan_of_batch,
     run_lowered,
     scanned,
+    shapes_of,
+    structural_part,
 )
 from iblf_jax.engine.derivatives import Directions, Tangents, run_with_tangents
-from iblf_jax.engine.executors import checkpointed, program_of, scan
+from iblf_jax.engine.loops import checkpointed, kernel_loop, program_of, scan
 from iblf_jax.engine.mechanism import known_of
-from iblf_jax.engine.plan import ExecutionPlan
+from iblf_jax.engine.plan import STATES_LAYOUT, ExecutionPlan
 from iblf_jax.engine.registry import Executor
-from iblf_jax.engine.request import RunRequest, check_backend
+from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.step import Inputs, Outcome, TimeStep
 from iblf_jax.simulation.scenario import Scenario
 
@@ -41,8 +43,6 @@ def run_batch(
     folds: Any,
     dt: jax.Array,
     request: RunRequest,
-    *,
-    backend: str | None = None,
 ) -> Outcome:
     """Runs a scenario once for every entry of `varied`; call it inside `jit`.
 
@@ -53,7 +53,6 @@ def run_batch(
       folds: the metrics.
       dt: time step, () [s].
       request: what is run, static.
-      backend: replaces that of the request.
 
     Returns:
       An `Outcome` with a leading batch axis on every array.
@@ -61,11 +60,17 @@ def run_batch(
     Raises:
       ValueError: an unknown backend.
     """
-    request = _with_backend(request, backend)
     inputs = inputs_of(scenario, folds, dt, request)
-    execution = plan_of_batch(request, inputs, varied)
+    execution = plan_of_batch(request, inputs, varied, registry.machine())
+    return _run_planned(execution, inputs, varied, request)
 
-    def run(loop: Callable, batch: Batch) -> Outcome:
+
+def _run_planned(
+    execution: ExecutionPlan, inputs: Inputs, varied: Mapping[str, jax.Array], request: RunRequest
+) -> Outcome:
+    """Runs a batch as planned."""
+
+    def run(loop: StepLoop, batch: Batch) -> Outcome:
         return run_all(loop, batch, request)
 
     def attempt(executor: Executor) -> Outcome:
@@ -78,18 +83,17 @@ def run_batch(
     return first_that_works(execution, attempt, by_scan)
 
 
-def _with_backend(request: RunRequest, backend: str | None) -> RunRequest:
-    """The request with another backend, if one is given; raises ValueError for an unknown one."""
-    backend = request.backend if backend is None else backend
-    return request._replace(backend=check_backend(backend))
-
-
 class CompiledBatch(NamedTuple):
     """The program of a batch: a function of the inputs that is called inside `jit`.  Static."""
 
     request: RunRequest
-    executor: str
-    """The executor that runs the batch, "vmap" for the scan."""
+    execution: ExecutionPlan
+    """With the one executor that runs the batch, or none for the scan."""
+
+    @property
+    def backend(self) -> str:
+        """The backend on which the batch runs: "native", "gpu" or "vmap"."""
+        return self.execution.backend
 
     def __call__(
         self,
@@ -106,8 +110,9 @@ class CompiledBatch(NamedTuple):
           scenario, varied, folds, dt: as `run_batch`.
           record_every: interval of the recorded instants; None for metrics only.
         """
-        request = self.request._replace(record_every=record_every, backend=self.executor)
-        return run_batch(scenario, varied, folds, dt, request)
+        request = self.request._replace(record_every=record_every)
+        inputs = inputs_of(scenario, folds, dt, request)
+        return _run_planned(self.execution, inputs, varied, request)
 
 
 def compile_batch(
@@ -127,8 +132,10 @@ def compile_batch(
     Raises:
       ValueError: an unknown backend.
     """
-    request = _with_backend(request, None)
-    return CompiledBatch(request, compile_batch_executor(request, scenario, varied, folds, dt))
+    leaves, structure = jax.tree.flatten((scenario, dict(varied), folds, dt))
+    part = structural_part(request._replace(record_every=None))
+    found = compiled_plan(part, registry.machine(), structure, shapes_of(leaves))
+    return CompiledBatch(request, found)
 
 
 def run_batch_jvp(
@@ -138,8 +145,6 @@ def run_batch_jvp(
     folds: Any,
     dt: jax.Array,
     request: RunRequest,
-    *,
-    backend: str | None = None,
 ) -> Tangents:
     """Values of a batch and their derivatives along P directions in the space of leaves, in one
     pass; call it inside `jit`.
@@ -151,7 +156,6 @@ def run_batch_jvp(
         of one gain of two joints: `{"controller.K2": np.eye(2)}`.
       request: what is run, static.  On "auto" the tangents of long programs (many joints and
         directions), which take minutes to compile, are runs of their own.
-      backend: replaces that of the request.
 
     Returns:
       The outcome, name -> (batch, P, *shape) for every metric that is a float, and the Gauss-Newton
@@ -160,16 +164,15 @@ def run_batch_jvp(
     Raises:
       ValueError: an unknown backend or path.
     """
-    request = _with_backend(request, backend)
     inputs, along = inputs_of(scenario, folds, dt, request), Directions.of(directions)
-    execution = plan_of_batch(request, inputs, varied)
+    execution = plan_of_batch(request, inputs, varied, registry.machine())
 
     def attempt(executor: Executor) -> Tangents:
         batch = Batch.of(inputs, varied, execution.layout, request.constants)
-        loop = loop_of(executor)
+        loop = kernel_loop(executor)
         if request.backend != "auto" or _carries_tangents(executor, batch, along, request):
             return run_with_tangents(loop, batch, along, request)
-        if executor.platforms and _keeps_columns(batch, inputs, along, request):
+        if _keeps_columns(batch, inputs, along, request):
             return run_by_columns(loop, batch, along, request)
         return by_scan()
 
@@ -185,16 +188,19 @@ def run_batch_jvp(
 def _carries_tangents(
     executor: Executor, batch: Batch, along: Directions, request: RunRequest
 ) -> bool:
-    """Whether one kernel of an executor steps the runs and all their tangents."""
+    """Whether one kernel of an executor steps the runs and all their tangents: longer ones compile
+    for minutes.
+    """
     carry = carry_shapes(batch, request.method)
-    nodes = executor.nodes(program_of(TimeStep(request.method), batch, carry).program)
-    return plan.carries_tangents(executor.limits.derivatives, nodes, along.tangents)
+    nodes = program_of(TimeStep(request.method), batch, carry).program.size
+    return thresholds.is_within(nodes * (1 + along.tangents), executor.limits.derivatives)
 
 
 def _keeps_columns(batch: Batch, inputs: Inputs, along: Directions, request: RunRequest) -> bool:
     """Whether the tangents of all samples fit into memory, one run a tangent."""
     samples = (request.steps + 1) * (batch.runs or 1)
-    return plan.keeps_columns(1, numbers_of(inputs, outer_vectors) * along.tangents * samples)
+    numbers = numbers_of(inputs, outer_vectors) * along.tangents * samples
+    return thresholds.keeps_columns(1, numbers)
 
 
 def run_for_reverse(
@@ -211,9 +217,7 @@ def run_for_reverse(
       noise: key of a sensor's noise.
     """
     inputs = inputs_of(scenario, folds, dt, request, noise)
-    platform = registry.machine().platform
-    layout = plan.scan_layout(platform, operations(inputs), None, nested=True)
-    return run_all(checkpointed, Batch.of(inputs, None, layout), request)
+    return run_all(checkpointed, nested_batch(inputs), request)
 
 
 def run_from(
@@ -232,7 +236,7 @@ def run_from(
       The carry after the last, (R, ...), and what every step recorded, (R, steps, ...).
     """
     request = RunRequest(steps)
-    if registry.automatic()[1] is None:
+    if registry.automatic().reason is None:
         request = request._replace(constants=known_of(scenario))
     return _run_from(scenario, dt, carry, step=step, request=request)
 
@@ -243,16 +247,16 @@ def _run_from(
 ) -> tuple[Any, Any]:
     inputs = inputs_of(scenario, (), dt, request)
     runs = jax.tree.leaves(carry)[0].shape[0]
-    batch = Batch.of(inputs, None, plan.STATES_LAYOUT, request.constants)._replace(runs=runs)
-    name, reason = registry.automatic()
-    executors: tuple[str, ...] = ()
-    if reason is None and plan.compiles_states(operations(inputs)):
-        executors = (name,)
-    execution = ExecutionPlan(executors, plan.STATES_LAYOUT, plan.STATES_LAYOUT, False)
+    batch = Batch.of(inputs, None, STATES_LAYOUT, request.constants)._replace(runs=runs)
+    automatic = registry.automatic()
+    backends: tuple[str, ...] = ()
+    if automatic.reason is None and thresholds.compiles_states(operations(inputs)):
+        backends = (automatic.name,)
+    execution = ExecutionPlan(backends, STATES_LAYOUT, STATES_LAYOUT, False)
 
-    def by_loop(loop: Callable) -> tuple[Any, Any]:
+    def by(loop: StepLoop) -> tuple[Any, Any]:
         return loop(step, batch, carry, request.steps, 1)
 
     return first_that_works(
-        execution, lambda executor: by_loop(loop_of(executor)), partial(by_loop, scan)
+        execution, lambda executor: by(kernel_loop(executor)), partial(by, scan)
     )

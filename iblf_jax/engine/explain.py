@@ -14,7 +14,7 @@ from iblf_jax.core import checks, notices
 from iblf_jax.core.devices import threads
 from iblf_jax.engine.batch import Batch, carry_shapes
 from iblf_jax.engine.compile import inputs_of
-from iblf_jax.engine.executors import program_of
+from iblf_jax.engine.loops import program_of
 from iblf_jax.engine.mechanism import known_of
 from iblf_jax.engine.registry import automatic
 from iblf_jax.engine.request import RunRequest

@@ -11,7 +11,7 @@ import re
 import jax
 
 from iblf_jax.core import devices
-from iblf_jax.engine import plan
+from iblf_jax.engine import thresholds
 from iblf_jax.kernels import Packed, Program, ToolchainError, compiler, cuda, nvrtc
 
 
@@ -22,7 +22,10 @@ def architecture() -> str:
       ToolchainError: the default devices are no GPUs that NVRTC compiles for, or they differ.
     """
     default_devices = devices.default()
-    found = {str(getattr(device, "compute_capability", "")) for device in default_devices}
+    try:
+        found = {device.compute_capability for device in default_devices}
+    except AttributeError:  # no GPUs
+        found = {""}
     if len(found) > 1:
         raise ToolchainError(f"the GPUs differ: compute capabilities {', '.join(sorted(found))}")
     match = re.fullmatch(r"(\d+)\.(\d)", found.pop())
@@ -62,7 +65,7 @@ def call(
         steps,
         every,
         threads=threads,
-        table=plan.GPU_STRETCH,
+        table=thresholds.MAX_STEPS_PER_LAUNCH,
     )
 
 
@@ -77,8 +80,8 @@ def run(
     """All steps of all runs; arguments and results as `native.run`."""
     name = cuda.kernel(program, shared.size, per_run.shape[0], architecture())
     # The CPU devices of the tests have no attribute core_count.
-    processors = getattr(devices.default()[0], "core_count", plan.GPU_PROCESSORS)
-    threads = plan.gpu_threads(carry.floats.shape[1], processors)
+    processors = getattr(devices.default()[0], "core_count", thresholds.MULTIPROCESSORS)
+    threads = thresholds.gpu_threads(carry.floats.shape[1], processors)
     return call(name, program, shared, per_run, carry, steps, every, threads)
 
 

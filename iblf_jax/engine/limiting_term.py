@@ -22,6 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.control.controllers._base import law_member
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.engine.step_size import largest_eigenvalue, start_and_along
 from iblf_jax.simulation.closed_loop import LoopState, initial_state, run_sampled_law
@@ -30,11 +31,11 @@ from iblf_jax.simulation.paths import get, parameters, with_parameters
 from iblf_jax.simulation.scenario import Initial, Scenario
 from iblf_jax.simulation.stability import jacobian, period_map
 
-LEVELS = 14
+NUMBER_OF_SCALES = 14
 """Scales 2^(-k/2) that are tried, down to 1/128."""
 INSTANTS = 4
 """States that are assessed together."""
-NEAREST = 0.98
+LARGEST_XI = 0.98
 """|xi| up to which a state of the run counts: beyond it the guard is near, and every slope is
 steep."""
 WORDS = {
@@ -46,7 +47,7 @@ WORDS = {
 """Name of a leaf -> the term of the loop that it sets."""
 LAGS = {"sensor": "the filter of the velocity", "actuator": "the lag of the drive"}
 """Part of a scenario -> the term of the loop that its time constant sets."""
-SLOWER = ("cutoff", "bandwidth")
+BANDWIDTHS = ("cutoff", "bandwidth")
 """Leaves of sensors and actuators whose reciprocal is a time constant."""
 
 
@@ -91,14 +92,14 @@ def limiting_term(run: Any) -> Limit | None:
       run: a `Rollout` of one run, its leaves numbers.
     """
     scenario = run.scenario
-    excess = _excess(scenario, run)
+    relative_to_limit = _relative_to_limit(scenario, run)
     for times, states in _instants(scenario, run):
-        if excess(scenario, times, states) < 1.0:
+        if relative_to_limit(scenario, times, states) < 1.0:
             continue
-        for level in range(1, LEVELS + 1):
-            scale = 2.0 ** (-level / 2)
+        for k in range(1, NUMBER_OF_SCALES + 1):
+            scale = 2.0 ** (-k / 2)
             found = {
-                term: excess(_scaled(scenario, term, scale), times, states)
+                term: relative_to_limit(_scaled(scenario, term, scale), times, states)
                 for term in terms_of(scenario)
             }
             least = min(found, key=found.__getitem__, default=None)
@@ -111,8 +112,8 @@ def limiting_term(run: Any) -> Limit | None:
 def terms_of(scenario: Scenario) -> Iterator[Term]:
     """The terms of a scenario's loop that are leaves."""
     law = unwrapped(scenario.controller)
-    gains = tuple(getattr(law, "gains", ("k1", "K2")))
-    of_law = {f"controller.{name}" for name in (*gains, *getattr(law, "unit_factors", ()), "c")}
+    names = (*law_member(law, "gains"), *law_member(law, "unit_factors"), "c")
+    of_law = {f"controller.{name}" for name in names}
     for parameter in parameters(scenario, named=False):
         part, _, rest = parameter.path.partition(".")
         name = rest.rpartition(".")[2]
@@ -126,20 +127,20 @@ def terms_of(scenario: Scenario) -> Iterator[Term]:
             yield Term(f"the observer's gain {name}", parameter.path)
         elif parameter.path == "sampling.delay":
             yield Term(WORDS[name], parameter.path)
-        elif part in ("sensor", "actuator") and name in SLOWER:
+        elif part in ("sensor", "actuator") and name in BANDWIDTHS:
             yield Term(LAGS[part], parameter.path, True)
 
 
 def _scaled(scenario: Scenario, term: Term, scale: float) -> Scenario:
-    factor = scale
-    if term.is_inverse:
-        factor = 1.0 / scale
+    factor = 1.0 / scale if term.is_inverse else scale
     return with_parameters(scenario, {term.path: get(scenario, term.path) * factor})
 
 
-def _excess(scenario: Scenario, run: Any) -> Callable[[Scenario, jax.Array, LoopState], float]:
-    """How far a loop is from its limit at some instants, 1 at the limit: its spectral radius, or
-    its modes times dt.
+def _relative_to_limit(
+    scenario: Scenario, run: Any
+) -> Callable[[Scenario, jax.Array, LoopState], float]:
+    """The function that rates a loop at some instants, 1 at its limit: by the spectral radius of a
+    sampled loop, else by the fastest mode times dt.
     """
 
     def radius(scenario: Scenario, times: jax.Array, states: LoopState) -> float:
@@ -184,7 +185,7 @@ def _instants(scenario: Scenario, run: Any) -> Iterator[tuple[jax.Array, LoopSta
     later = jnp.asarray(np.linspace(0.0, float(recorded[-1]), INSTANTS - 1), dtype)
     yield jnp.concatenate([jnp.zeros_like(later[:1]), later]), start_and_along(scenario, later)
     size = np.max(np.abs(np.asarray(run.xi)), axis=1)
-    inside = np.flatnonzero(np.isfinite(size) & (size < NEAREST))
+    inside = np.flatnonzero(np.isfinite(size) & (size < LARGEST_XI))
     if not inside.size:
         return
     nearest = np.resize(inside[np.argsort(size[inside])[::-1]], INSTANTS)

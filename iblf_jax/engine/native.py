@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax
 
 from iblf_jax.core.devices import threads
-from iblf_jax.engine import plan
+from iblf_jax.engine import thresholds
 from iblf_jax.kernels import Build, Packed, Program, ToolchainError, compiler, cpu
 from iblf_jax.kernels.cpu import pack as pack
 from iblf_jax.kernels.cpu import unpack as unpack
@@ -20,24 +20,31 @@ def unavailable() -> str | None:
     return None
 
 
-def _build(program: Program, runs: int, steps: int, narrow: bool | None = None) -> Build:
+def _kernel_build(
+    program: Program, runs: int, steps: int, short_vector: bool | None = None
+) -> Build:
     """How the kernel of a program is compiled.
 
     Args:
       program: what a step computes.
       runs, steps: numbers of runs and steps.
-      narrow: whether it is the kernel for one or two runs of many steps; decided by `runs` and
-        `steps` if None.
+      short_vector: whether it is the kernel for one or two runs of many steps; decided by `runs`
+        and `steps` if None.
     """
-    if narrow is None:
-        is_small = runs * program.dtype.itemsize <= plan.NATIVE_NARROW
-        narrow = is_small and steps > plan.NATIVE_FEW
-    return Build(*plan.native_build(program.size, narrow))
+    if short_vector is None:
+        is_small = runs * program.dtype.itemsize <= thresholds.SHORT_VECTOR_BYTES
+        short_vector = is_small and steps > thresholds.FEW_STEPS
+    return Build(*thresholds.native_build(program.size, short_vector))
 
 
-def ahead(program: Program, shared: int, per_run: int, runs: int, steps: int) -> None:
-    """Starts to compile the kernel with which `run` makes so many steps of so many runs."""
-    cpu.start_build(program, shared, per_run, _build(program, runs, steps))
+def build(program: Program, shared: int, per_run: int, runs: int, steps: int) -> None:
+    """Compiles the kernel with which `run` makes so many steps of so many runs."""
+    cpu.kernel(program, shared, per_run, _kernel_build(program, runs, steps))
+
+
+def start_build(program: Program, shared: int, per_run: int, runs: int, steps: int) -> None:
+    """The same as `build`, in the background."""
+    cpu.start_build(program, shared, per_run, _kernel_build(program, runs, steps))
 
 
 def run(
@@ -48,24 +55,19 @@ def run(
     steps: int,
     every: int | None,
     first: jax.Array | int = 0,
-    narrow: bool | None = None,
+    short_vector: bool | None = None,
 ) -> tuple[Packed, list[jax.Array]]:
     """All steps of all runs.
 
     Args:
       program, shared, per_run, carry, steps, every, first: as `kernels.cpu.run`.
-      narrow: as `_build`.
+      short_vector: as `_kernel_build`.
 
     Returns:
       The rows after the last step, and the recorded arrays, (samples, numbers, runs), of every
       `every`-th step.
     """
-    build = _build(program, carry.floats.shape[1], steps, narrow)
+    build = _kernel_build(program, carry.floats.shape[1], steps, short_vector)
     return cpu.run(
         program, shared, per_run, carry, steps, every, first=first, build=build, threads=threads()
     )
-
-
-def build(program: Program, shared: int, per_run: int, runs: int, steps: int) -> None:
-    """Compiles the kernel with which `run` makes so many steps of so many runs."""
-    cpu.kernel(program, shared, per_run, _build(program, runs, steps))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from iblf_jax.core import checks
+from iblf_jax.core import checks, notices
 from iblf_jax.engine.mechanism import Mechanism, known_of
 from iblf_jax.engine.registry import backends
 from iblf_jax.simulation.integrators import tableau
@@ -26,7 +26,7 @@ class RunRequest(NamedTuple):
     constants: Mechanism | None = None
     """Which numbers of the scenario are compiled in (`mechanism`)."""
     backend: str = "auto"
-    """The requested executor: "auto", "vmap" or a name in the registry of executors."""
+    """The requested backend: "auto", "vmap" or a name in the registry of executors."""
     nested: bool = False
     """Whether the caller runs the program inside a loop or a branch of JAX."""
 
@@ -46,17 +46,24 @@ class RunRequest(NamedTuple):
           steps: number of time steps (`checks.whole_steps`).
           method: "rk4", "heun" or "euler".
           record_every: interval of the recorded instants in steps; None for metrics only.
-          backend: requested executor.
+          backend: "auto", "native", "gpu" or "vmap".
 
         Raises:
           ValueError: an unknown method or backend.
         """
         tableau(method)
-        check_backend(backend)
+        backend = check_backend(backend)
         return RunRequest(steps, method, record_every, known_of(scenario), backend)
 
 
 def check_backend(backend: str) -> str:
-    """Returns the name of a backend for batches; raises ValueError for an unknown one."""
+    """The name of a backend; raises ValueError for an unknown one."""
+    if isinstance(backend, str) and backend == "xla":
+        notices.warn(
+            'backend="xla" was removed and means "vmap" now; "auto" is faster wherever there is a'
+            " C++ compiler.",
+            DeprecationWarning,
+        )
+        return "vmap"
     checks.one_of("backend", backend, backends())
     return backend

@@ -16,7 +16,6 @@ from iblf_jax.core import checks, notices
 from iblf_jax.engine.diagnosis import SimulationError as SimulationError
 from iblf_jax.engine.diagnosis import SimulationWarning as SimulationWarning
 from iblf_jax.engine.diagnosis import report
-from iblf_jax.engine.registry import single_run_backends
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.single_run import run_one
 from iblf_jax.engine.transformable import run_transformable
@@ -47,29 +46,23 @@ def simulate(
 
         x' = rate(t, x),   x = (q, q', states of law, observer and actuator)        (closed_loop)
 
-    Works under `jax.jit`, `vmap`, `grad`, `jacfwd`: differentiate `run.metrics` or any array by the
-      leaves of the scenario.
-    New values of leaves do not recompile, but for which numbers of an arm's geometry are 0, 1, -1
-    or equal; a new structure or method does.  Another number of steps, or `record_every`, compiles
-    the steps alone, unless they run as plain JAX.
+    Works under `jax.jit`, `vmap`, `grad`, `jacfwd`: differentiate any array by leaves of the
+    scenario.  New values of leaves do not recompile, except where other numbers of an arm's
+    geometry become 0, 1, -1 or equal; a new structure or method does.  Another number of steps, or
+    `record_every`, compiles the steps alone, except on "vmap".
 
     Args:
       scenario: what to run, of n joints.
       duration: length of the run [s], a whole number of steps.
       dt: time step [s]; `recommended_dt(scenario)` says which will do.
       method: "rk4", "heun" or "euler".
-      record_every: record every so-many-th step; metrics and status cover every step whatever is
-        recorded.
+      record_every: record every so-many-th step; metrics and status cover every step.
       metrics: the folds to run; None for `iblf_jax.metrics.standard()`.
       throw: raise instead of warn when the run failed.
-      backend: "native": generated code, built by the system's compiler once for a structure and
-        kept on disk; "xla": the same program without a compiler, twice as slow; "gpu": the same as
-        one kernel on an NVIDIA GPU; "auto": native, or gpu if that is JAX's default device, where
-        there is a compiler, else xla.  A long step (an arm of many joints) runs as plain JAX on
-        "xla".  Inside your own `jit` or `vmap` a run is plain JAX; where it is differentiated by
-        numbers of the scenario, it and its first and second derivatives are the kernel's if there
-        is one, but for "xla".  Derivatives are of all that is recorded, so record little where only
-        metrics matter.
+      backend: "native", C code built once for a structure and kept on disk; "gpu", the same on an
+        NVIDIA GPU; "vmap", plain JAX; or "auto", the first of these that JAX's default device runs.
+        Inside your own `jit` or `vmap` a run is plain JAX; except on "vmap", kernels compute its
+        derivatives by the scenario, of all that is recorded: record little if metrics suffice.
       seed: fixes the noise of a sensor; the run is number 0 of a study with this seed.
 
     Returns:
@@ -77,26 +70,23 @@ def simulate(
 
     Raises:
       ValueError: bad arguments; the message names the field, the value and the remedy.
-      SimulationError: with `throw`, when a bound was violated, the state ran away or the step was
-        too large.
+      SimulationError: with `throw`, when the run failed.
 
     Source: design of this package; the closed loop is Zhang & Yan 2024, section 3.
     """
-    checks.one_of("backend", backend, single_run_backends())
     steps = checks.whole_steps(duration, dt)
-    record_every = _checked_record(record_every, steps)
+    every = _checked_record(record_every, steps)
     throw = checks.flag("throw", throw)
-    scenario, seed = canonical(scenario), checks.seed(seed)
+    seed = checks.seed(seed)
+    scenario = canonical(scenario)
     check_step(scenario, dt)
     request = RunRequest.of(
-        scenario, steps=steps, method=method, record_every=record_every, backend=backend
+        scenario, steps=steps, method=method, record_every=every, backend=backend
     )
-    dtype = scenario.initial.q.dtype
-    folds = as_folds(metrics, dtype, scenario)
-    noise = None
-    if has_noise(scenario):
-        noise = noise_key(jax.random.PRNGKey(seed))
-    result = run_rollout(scenario, folds, jnp.asarray(dt, dtype), request, noise)
+    step = jnp.asarray(dt, scenario.initial.q.dtype)
+    folds = as_folds(metrics, step.dtype, scenario)
+    noise = noise_key(jax.random.PRNGKey(seed)) if has_noise(scenario) else None
+    result = run_rollout(scenario, folds, step, request, noise)
     if checks.is_concrete(result.status) and result.status.ndim == 0:
         report(result, steps, throw)
     return result

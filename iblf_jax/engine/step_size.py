@@ -22,9 +22,9 @@ from jax.flatten_util import ravel_pytree
 from iblf_jax.core import checks, notices
 from iblf_jax.core.status import VELOCITY_LIMIT, Status
 from iblf_jax.engine.machine_function import machine_function
-from iblf_jax.engine.plan import STEP_SIZE_CHUNK
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.single_run import run_one
+from iblf_jax.engine.thresholds import STEP_SIZE_CHUNK
 from iblf_jax.simulation import discontinuities, error_estimate
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
 from iblf_jax.simulation.integrators import tableau

@@ -25,17 +25,16 @@ from jax.custom_derivatives import SymbolicZero
 
 from iblf_jax.core import checks
 from iblf_jax.core.caches import CACHE
-from iblf_jax.engine import plan, registry
+from iblf_jax.engine import registry, thresholds
 from iblf_jax.engine.batch import Batch, Leaves, run_all
 from iblf_jax.engine.columns import ACCURACY, Places, columns, floats_of, numbers_of
 from iblf_jax.engine.compile import (
     first_that_works,
     inputs_of,
-    loop_of,
-    operations,
+    nested_batch,
     run_lowered,
 )
-from iblf_jax.engine.executors import scan
+from iblf_jax.engine.loops import kernel_loop, scan
 from iblf_jax.engine.mechanism import known_of
 from iblf_jax.engine.plan import PLAIN_LAYOUT, ExecutionPlan
 from iblf_jax.engine.request import RunRequest
@@ -50,7 +49,8 @@ class Runs(NamedTuple):
     treedef: Any
     """Of the `Inputs`."""
     request: RunRequest
-    executor: str
+    backend: str
+    """Of the derivatives."""
     is_per_run: tuple[bool, ...]
     """Which leaves have a run axis."""
     runs: int = 1
@@ -63,7 +63,7 @@ class Runs(NamedTuple):
     @property
     def plan(self) -> ExecutionPlan:
         """One executor; no warning reports the scan, which gives the same derivatives."""
-        return ExecutionPlan((self.executor,), PLAIN_LAYOUT, PLAIN_LAYOUT, False)
+        return ExecutionPlan((self.backend,), PLAIN_LAYOUT, PLAIN_LAYOUT, False)
 
 
 def run_transformable(
@@ -73,14 +73,14 @@ def run_transformable(
 
     Args:
       scenario, folds, dt, noise: as `single_run.run_one`.
-      request: its backend is that of the derivatives: "xla" for plain JAX, else kernels where they
+      request: its backend is that of the derivatives: "vmap" for plain JAX, else kernels where they
         can be built.
     """
     leaves, treedef = jax.tree.flatten(inputs_of(scenario, folds, dt, request, noise))
-    name, reason = registry.automatic()
-    compiles = request.backend != "xla" and reason is None
+    backend, reason = registry.automatic()
+    compiles = request.backend != "vmap" and reason is None
     request = request._replace(constants=known_of(scenario), backend="auto")
-    runs = Runs(treedef, request, name, (False,) * len(leaves))
+    runs = Runs(treedef, request, backend, (False,) * len(leaves))
     if compiles:
         return _differentiable(runs)(*leaves)
     return _run_by_scan(runs, *leaves)
@@ -90,9 +90,7 @@ def run_transformable(
 def _run_by_scan(runs: Runs, *leaves: jax.Array) -> Outcome:
     """The run by the scan."""
     inputs = jax.tree.unflatten(runs.treedef, leaves)
-    platform = registry.machine().platform
-    layout = plan.scan_layout(platform, operations(inputs), None, nested=True)
-    return run_all(scan, Batch.of(inputs, None, layout), runs.request)
+    return run_all(scan, nested_batch(inputs), runs.request)
 
 
 @CACHE.memoised(64)
@@ -168,9 +166,9 @@ def _by_kernel(runs: Runs, places: Places, leaves: tuple) -> Any:
     scenario = jax.tree.unflatten(runs.treedef, runs.is_per_run).scenario
     number_of_leaves = len(jax.tree.leaves(scenario))
     by_scenario = all(i < number_of_leaves for level in places for i in level)
-    if not by_scenario or not plan.keeps_columns(len(places), _size(runs, places, leaves)):
+    if not by_scenario or not thresholds.keeps_columns(len(places), _size(runs, places, leaves)):
         return None
-    if not all(plan.differentiates_by_columns(_numbers_in(leaves, level)) for level in places):
+    if any(_numbers_in(leaves, level) > thresholds.MAX_COLUMNS for level in places):
         return None
     kernel = jax.custom_jvp(
         lambda *leaves: jax.tree.map(lambda x: x[0], _over_runs(_columns, runs, places)(*leaves))
@@ -262,13 +260,13 @@ def _values(runs: Runs, leaves: tuple) -> Outcome:
     def run(loop, batch):
         return run_all(loop, batch, runs.request)
 
-    executor = registry.EXECUTORS[runs.executor]
+    executor = registry.EXECUTORS[runs.backend]
     return run_lowered(executor, runs.batch(leaves), runs.request, run)
 
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _columns(runs: Runs, places: Places, leaves: tuple) -> Any:
-    loop = loop_of(registry.EXECUTORS[runs.executor])
+    loop = kernel_loop(registry.EXECUTORS[runs.backend])
     return columns(loop, runs.batch(leaves), places, runs.request)
 
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import jax
 
-WAIT_FRACTION, MAX_WAIT = 0.02, 0.02
-"""Of the time waited so far, what is waited until the next look; seconds of that at most."""
+RELATIVE_PAUSE, LONGEST_PAUSE = 0.02, 0.02
+"""Pause between two looks, as a part of the time waited so far, and in seconds at most."""
 
 
 def wait_until_ready(outputs: Any) -> None:
@@ -22,4 +22,4 @@ def wait_until_ready(outputs: Any) -> None:
         if not isinstance(array, jax.Array) or isinstance(array, jax.core.Tracer):
             continue  # under a transformation nothing is computed yet
         while not array.is_ready():  # type: ignore[attr-defined]
-            time.sleep(min(WAIT_FRACTION * (time.monotonic() - begin), MAX_WAIT))
+            time.sleep(min(RELATIVE_PAUSE * (time.monotonic() - begin), LONGEST_PAUSE))

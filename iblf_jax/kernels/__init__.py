@@ -87,11 +87,8 @@ from iblf_jax.kernels.program import SHARED as SHARED
 from iblf_jax.kernels.program import TIME as TIME
 from iblf_jax.kernels.program import Known as Known
 from iblf_jax.kernels.program import LoweringLimits as LoweringLimits
-from iblf_jax.kernels.program import Node as Node
 from iblf_jax.kernels.program import Program as Program
 from iblf_jax.kernels.program import UnsupportedError as UnsupportedError
-from iblf_jax.kernels.program import frontier as frontier
-from iblf_jax.kernels.program import needed as needed
 from iblf_jax.kernels.toolchain import StoppedError as StoppedError
 from iblf_jax.kernels.toolchain import ToolchainError as ToolchainError
 from iblf_jax.kernels.toolchain import built_for as built_for

@@ -107,7 +107,8 @@ def compiler() -> tuple[str, ...]:
     if has_ziglang():
         return ziglang("c++")
     raise ToolchainError(
-        "there is no C++ compiler (c++, g++, clang++); `pip install ziglang` installs one"
+        "there is no C++ compiler (c++, g++, clang++); install one, or `pip install"
+        ' "iblf_jax[export]"`, which contains one'
     )
 
 

@@ -549,9 +549,9 @@ def _check_start(scenario: Scenario) -> None:
     remedy = "Move the start or widen the bounds."
     _check_inside("initial.q[{}]", "bounds", q, start.lower, start.upper, remedy)
     if start.speed_limits is not None:
-        _check_order("velocity_bounds", *start.speed_limits)
-        remedy = "Change the start or widen the bounds."
-        _check_inside("initial.dq[{}]", "velocity bounds", dq, *start.speed_limits, remedy)
+        slow, fast = start.speed_limits
+        _check_order("velocity_bounds", slow, fast)
+        _check_inside("initial.dq[{}]", "velocity bounds", dq, slow, fast, remedy)
     for region, margin in zip(scenario.regions, start.region_margins, strict=True):
         if not margin > 0:
             point = regions.in_words(region, scenario.plant)

@@ -86,9 +86,9 @@ def describe(study: PreparedStudy, points: Points, design: str, dt: float) -> di
             "shape": list(np.shape(get(scenario, path))),
         }
 
-    executor = study.program.batch.executor
+    backend = study.program.batch.backend
     kernel = {}
-    if executor == "native":
+    if backend == "native":
         kernel = {"kernel": built_for()}
     return {
         "design": design,
@@ -113,7 +113,7 @@ def describe(study: PreparedStudy, points: Points, design: str, dt: float) -> di
         "structure": structure(scenario),
         "joints": scenario.n,
         "dtype": str(scenario.initial.q.dtype),
-        "backend": executor,
+        "backend": backend,
         "platform": devices.platform(),
         **kernel,
         "block": block_size(),

@@ -66,7 +66,7 @@ def monte_carlo(
       metrics: the folds to run; None for `iblf_jax.metrics.standard()`.
       sampler: "independent", "latin_hypercube" or "sobol".
       replicates: number of independent designs that a Latin hypercube or Sobol study is made of.
-      backend: "auto", "native", "gpu", "xla" or "vmap".
+      backend: "auto", "native", "gpu" or "vmap".
       executor: where the runs are computed: any `concurrent.futures.Executor`, such as a Dask
         client's `get_executor()` or a process pool; or an `ij.studies.ThisProcess` with devices and
         a limit of memory.  None for this process and all its devices.

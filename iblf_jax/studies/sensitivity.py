@@ -135,7 +135,7 @@ def sensitivity(
       seed: whole number that fixes the design.
       method: "rk4", "heun" or "euler".
       metrics: the folds to run; None for `iblf_jax.metrics.standard()`.
-      backend: "auto", "native", "gpu", "xla" or "vmap".
+      backend: "auto", "native", "gpu" or "vmap".
       executor: where the runs are computed, as in `monte_carlo`.
       progress: a progress bar; by default it is shown on a terminal.
 

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.engine import CompiledBatch, RunRequest, block_size, check_backend, compile_batch
+from iblf_jax.engine import CompiledBatch, RunRequest, block_size, compile_batch
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.metrics import Fold, as_folds
 from iblf_jax.simulation.noise import noise_of
@@ -140,7 +140,6 @@ def prepare(
       ValueError: an argument that is not valid.
     """
     tableau(method)
-    check_backend(backend)
     steps = checks.whole_steps(duration, dt)
     seed = checks.seed(seed)
     scenario = canonical(scenario)

@@ -399,7 +399,7 @@ def open_store(
         tied = any(text.startswith("kernel.") for text in found)
         remedy = (
             "A native kernel is tied to processor and compiler: go on on a machine of the same"
-            ' kind, or choose another path, with backend="xla" if machines of several kinds are to'
+            ' kind, or choose another path, with backend="vmap" if machines of several kinds are to'
             " share it."
             if tied
             else "Go on with the same arguments, or choose another path."

@@ -114,8 +114,8 @@ class Study:
 
     @property
     def backend(self) -> str:
-        """The backend that computed the runs: "native", "gpu", "xla" or "vmap", not "auto"."""
-        return self.setup.program.batch.executor
+        """The backend that computed the runs: "native", "gpu" or "vmap", not "auto"."""
+        return self.setup.program.batch.backend
 
     @property
     def dt(self) -> float:

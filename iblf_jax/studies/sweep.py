@@ -99,7 +99,7 @@ def sweep(
       store: folder to write to, unit by unit, and to resume from; or an `ij.studies.StoreOptions`
         with the size of a unit, who writes it, and whether several processes share the store.  It
         needs the extra `sweep`.
-      backend: "auto", "native", "gpu", "xla" or "vmap".
+      backend: "auto", "native", "gpu" or "vmap".
       executor: where the cases are computed: any `concurrent.futures.Executor`, such as a Dask
         client's `get_executor()` or a process pool; or an `ij.studies.ThisProcess` with devices and
         a limit of memory.  None for this process and all its devices.

@@ -171,8 +171,8 @@ def packed(task: WorkerTask) -> bytes:
     file = io.BytesIO()
     # The list is pickled after the task, and is complete by then.
     Pickler(file).dump((task, components))
-    executor = task.study.program.batch.executor
-    return pickle.dumps((environment(executor), executor, file.getvalue()))
+    backend = task.study.program.batch.backend
+    return pickle.dumps((environment(backend), backend, file.getvalue()))
 
 
 @lru_cache(maxsize=2)

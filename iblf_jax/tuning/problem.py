@@ -113,7 +113,7 @@ class TuningProblem:
           ValueError: an argument that is not valid; the message names it and the remedy.
         """
         tableau(method)
-        check_backend(backend)
+        backend = check_backend(backend)
         steps = checks.whole_steps(duration, dt)
         goal = checked(objective)
         seed = checks.seed(seed)

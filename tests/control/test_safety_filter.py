@@ -80,7 +80,7 @@ def test_it_keeps_what_the_law_breaks(alone, options):
     assert float(jnp.min(alone.metrics.margin)) < -0.01
     options = dict(options)
     method = options.pop("method", "rk4")
-    run = ij.simulate(filtered(falling(), **options), **RUN, method=method, backend="xla")
+    run = ij.simulate(filtered(falling(), **options), **RUN, method=method, backend="vmap")
     assert not int(run.status) & ~int(ij.Status.INACCURATE)
     assert float(jnp.min(run.metrics.margin)) > 0
     assert float(jnp.max(run.slack)) == 0
@@ -205,7 +205,7 @@ def test_an_empty_box_is_flagged_with_its_slack():
 def test_too_little_torque_is_flagged_and_never_exceeded():
     with pytest.warns(ij.SimulationWarning, match="safety filter"):
         run = ij.simulate(
-            filtered(falling(), limit=[7.0, 2.0]), **RUN, method="euler", backend="xla"
+            filtered(falling(), limit=[7.0, 2.0]), **RUN, method="euler", backend="vmap"
         )
     assert int(run.status) & int(ij.Status.FILTER_INFEASIBLE)
     assert np.all(np.max(np.abs(run.tau), axis=0) <= np.array([7.0, 2.0]) * (1 + 1e-9))
@@ -217,11 +217,11 @@ def test_backends_agree_and_a_run_alone_is_that_of_a_batch():
     scenario = filtered(falling(), **LIMITED)
     options = {"runs": 4, "duration": 0.05, "dt": 1e-3, "method": "euler", "progress": False}
     perturbations = {"initial.q": ij.offset(ij.uniform(-0.05, 0.05))}
-    native, xla = (
-        ij.monte_carlo(scenario, perturbations, backend=b, **options) for b in ("native", "xla")
+    native, vmap = (
+        ij.monte_carlo(scenario, perturbations, backend=b, **options) for b in ("native", "vmap")
     )
     for name in ("margin", "peak_torque", "ise"):
-        np.testing.assert_allclose(native.metrics[name], xla.metrics[name], rtol=1e-7, atol=1e-10)
+        np.testing.assert_allclose(native.metrics[name], vmap.metrics[name], rtol=1e-7, atol=1e-10)
     again_at = 3
     again = native.replay(again_at)
     np.testing.assert_array_equal(again.metrics.ise, native.metrics["ise"][again_at])

@@ -15,7 +15,7 @@ from made_up_runs import ALWAYS
 import iblf_jax as ij
 from iblf_jax.core.caches import CACHE
 from iblf_jax.core.status import Status
-from iblf_jax.engine import compile, native, plan, registry, single_run, step, transformable
+from iblf_jax.engine import compile, native, registry, single_run, step, thresholds, transformable
 from iblf_jax.kernels import UnsupportedError, cpu
 from iblf_jax.simulation.scenario import canonical
 
@@ -240,7 +240,7 @@ def everything(scenario, **options):
 def test_derivatives_are_the_kernels_and_equal_those_of_plain_jax(paper, monkeypatch):
     """Of all that is recorded and measured, by leaves of every kind, in both modes, in a batch and
     inside jit."""
-    plain, start = everything(paper, backend="xla")
+    plain, start = everything(paper, backend="vmap")
     expected, value = jax.jacfwd(plain)(start), plain(start)
     assert len(start) >= 10 and len(expected) > 20
     calls = []
@@ -330,9 +330,9 @@ def test_where_kernels_cannot_the_scan_differentiates(paper, monkeypatch):
         raise UnsupportedError("made up")
 
     for place, name, value in (
-        (plan, "COLUMNS_KEPT", 10),
-        (plan, "COLUMNS_MOST", 1),
-        (registry, "automatic", lambda: ("xla", "there is no C++ compiler")),
+        (thresholds, "KEPT_NUMBERS", 10),
+        (thresholds, "MAX_COLUMNS", 1),
+        (registry, "automatic", lambda: registry.Availability("vmap", "no compiler")),
         (transformable, "_columns", no_kernel),
     ):
         calls.clear()
@@ -351,7 +351,7 @@ def test_new_numbers_do_not_recompile(paper, paper_run, monkeypatch):
     monkeypatch.setattr(
         step, "advance", lambda *args, **options: traces.append(1) or original(*args, **options)
     )
-    parts = (single_run._initialize, single_run._advance, single_run._finalize)
+    parts = (single_run._initialize, single_run._all_steps, single_run._finalize)
     before = [part._cache_size() for part in parts]
     for changes in (
         {"controller.K2": 30.0},
@@ -382,19 +382,19 @@ def test_a_new_structure_does_recompile(paper, monkeypatch):
     assert traces == [1]
 
 
-@pytest.mark.parametrize("backend", ["native", "xla"])
-def test_another_length_compiles_the_steps_alone(paper, backend):
+@needs_compiler
+def test_another_length_compiles_the_steps_alone(paper):
     def compiled():
         return [
             part._cache_size()
-            for part in (single_run._initialize, single_run._advance, single_run._finalize)
+            for part in (single_run._initialize, single_run._all_steps, single_run._finalize)
         ]
 
-    ij.simulate(paper, **SHORT, backend=backend)
+    ij.simulate(paper, **SHORT, backend="native")
     before = compiled()
-    longer = ij.simulate(paper, duration=0.537, dt=1e-3, record_every=3, backend=backend)
+    longer = ij.simulate(paper, duration=0.537, dt=1e-3, record_every=3, backend="native")
     assert [new - old for new, old in zip(compiled(), before, strict=True)] == [0, 1, 0]
-    again = ij.simulate(paper, **SHORT, backend=backend)
+    again = ij.simulate(paper, **SHORT, backend="native")
     np.testing.assert_array_equal(longer.q[:150], again.q[:450:3])
 
 
@@ -412,7 +412,7 @@ def test_a_run_alone_falls_back_where_its_kernel_cannot_be_built(paper, tmp_path
     expected = ij.simulate(paper, **short)
     CACHE.clear(compile.WARNINGS)
     CACHE.clear(single_run.FAILED_BUILDS)
-    for part in (single_run._initialize, single_run._advance):
+    for part in (single_run._initialize, single_run._all_steps):
         part.clear_cache()
     cpu.kernel.cache_clear()
     cpu.rows_function.cache_clear()

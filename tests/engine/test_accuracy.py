@@ -471,7 +471,6 @@ def test_tangents_beside_a_batch_and_reverse_mode_go_through_a_jump(sampling):
     "backend",
     [
         "native",
-        pytest.param("xla", marks=pytest.mark.slow),
         pytest.param("vmap", marks=pytest.mark.slow),
     ],
 )
@@ -485,9 +484,8 @@ def test_every_run_of_a_batch_has_its_own_jumps(backend):
     )
     folds, times = as_folds(None, jnp.float64), np.array([LATE, 0.1, 0.0537, 0.9])
     varied = {"disturbance.parts[0].time": jnp.asarray(times)}
-    run = jax.jit(
-        lambda v: run_batch(scenario, v, folds, jnp.asarray(1e-2), RunRequest(30), backend=backend)
-    )
+    request = RunRequest(30, backend=backend)
+    run = jax.jit(lambda v: run_batch(scenario, v, folds, jnp.asarray(1e-2), request))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # no compiler
         together = run(varied)

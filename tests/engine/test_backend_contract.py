@@ -1,4 +1,4 @@
-"""The contract between backends: on every preset, over ten seconds, each gives what plain vmap of
+"""The contract between backends: on every preset, over ten seconds, native gives what plain vmap of
 the reference run gives.
 
 The paper's preset goes by Runge-Kutta, the others by Euler's method, which has one stage to
@@ -16,11 +16,11 @@ import pytest
 
 import iblf_jax as ij
 from iblf_jax.core.status import FAILED, Status
-from iblf_jax.engine import RunRequest, compile_batch, run_batch
-from iblf_jax.kernels import toolchain
+from iblf_jax.engine import RunRequest, compile_batch, native, run_batch
 from iblf_jax.simulation.metrics import as_folds
 from iblf_jax.simulation.scenario import canonical
 
+needs_compiler = pytest.mark.skipif(native.unavailable() is not None, reason="no C++ compiler")
 TOLERANCE = {"float64": 1e-10, "float32": 2e-4}
 DT, RUNS = 1e-3, 6
 STEPS = 10_000
@@ -35,9 +35,7 @@ def draws(scenario, dtype):
     return {"plant.mass[1]": jnp.asarray(mass, dtype), "initial.q": jnp.asarray(start, dtype)}
 
 
-@partial(jax.jit, static_argnames=("run", "backend"))
-def outcome_of(scenario, varied, folds, dt, run, backend):
-    return run_batch(scenario, varied, folds, dt, run, backend=backend)
+outcome_of = partial(jax.jit, static_argnames="request")(run_batch)
 
 
 ONE_TYPE = {"ur5": "float32", "iiwa14": "float64"}
@@ -55,54 +53,41 @@ CASES = [
 ]
 
 
+@needs_compiler
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "dtype"), CASES)
 def test_backends_agree_with_the_reference(name, dtype):
     method = "rk4" if (name, dtype) == ("zhang_yan_2024", "float64") else "euler"
-    agree(name, dtype, RunRequest(STEPS, method, 250), ["xla"] + ["native"] * has_compiler())
+    agree(name, dtype, RunRequest(STEPS, method, 250))
 
 
+@needs_compiler
 def test_native_agrees_on_a_short_run():
-    if not has_compiler():
-        pytest.skip("no C++ compiler")
-    agree("zhang_yan_2024", "float64", RunRequest(STEPS // 10, "euler", 250), ["native"])
+    agree("zhang_yan_2024", "float64", RunRequest(STEPS // 10, "euler", 250))
 
 
-def agree(name, dtype, run, asked):
+def agree(name, dtype, run):
     scenario = canonical(ij.astype(ij.presets.PRESETS[name](), dtype))
     arguments = (scenario, draws(scenario, dtype), as_folds(None, dtype), jnp.asarray(DT, dtype))
-    expected = jax.tree.map(np.asarray, outcome_of(*arguments, run=run, backend="vmap"))
+    expected = jax.tree.map(
+        np.asarray, outcome_of(*arguments, request=run._replace(backend="vmap"))
+    )
     ok = expected.status & int(FAILED) == 0
     assert np.any(ok), expected.status
     assert np.any(~ok), expected.status
-    scenario, varied, folds, dt = arguments
-    taken = {
-        compile_batch(run._replace(backend=backend), scenario, varied, folds, dt).executor
-        for backend in asked
-    }
-    for backend in sorted(taken - {"vmap"}):  # xla leaves arms of many joints to vmap
-        found = jax.tree.map(np.asarray, outcome_of(*arguments, run=run, backend=backend))
-        np.testing.assert_array_equal(
-            comparable(found.status), comparable(expected.status), err_msg=backend
-        )
-        times = (x.metrics["first_violation_time"] for x in (found, expected))
-        np.testing.assert_allclose(*times, rtol=0, atol=1.01 * DT, err_msg=backend)
-        for field in ("q", "dq", "e1", "xi", "tau", "disturbance_estimate"):
-            one, other = (x.records[0][field][ok] for x in (found, expected))
-            scale = max(1.0, np.abs(other).max())
-            np.testing.assert_allclose(
-                one, other, rtol=0, atol=TOLERANCE[dtype] * scale, err_msg=f"{backend} {field}"
-            )
+    run = run._replace(backend="native")
+    assert compile_batch(run, *arguments).backend == "native"
+    found = jax.tree.map(np.asarray, outcome_of(*arguments, request=run))
+    np.testing.assert_array_equal(comparable(found.status), comparable(expected.status))
+    times = (x.metrics["first_violation_time"] for x in (found, expected))
+    np.testing.assert_allclose(*times, rtol=0, atol=1.01 * DT)
+    for field in ("q", "dq", "e1", "xi", "tau", "disturbance_estimate"):
+        one, other = (x.records[0][field][ok] for x in (found, expected))
+        scale = max(1.0, np.abs(other).max())
+        np.testing.assert_allclose(one, other, rtol=0, atol=TOLERANCE[dtype] * scale, err_msg=field)
 
 
 def comparable(status):
     """A status without what is chance: the fastest mode of a run at the instant at which it ran
     away."""
     return np.where(status & int(Status.NOT_FINITE), status & ~int(Status.STEP_TOO_LARGE), status)
-
-
-def has_compiler() -> bool:
-    try:
-        return bool(toolchain.compiler())
-    except toolchain.ToolchainError:
-        return False

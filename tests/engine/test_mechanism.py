@@ -14,9 +14,9 @@ from test_lowering import DT, PRESET, STANDARD, carry_of, evaluate, numbers
 
 import iblf_jax as ij
 from iblf_jax.core.status import Status
-from iblf_jax.engine import RunRequest, execute, plan
+from iblf_jax.engine import RunRequest, execute, registry
 from iblf_jax.engine.batch import Batch
-from iblf_jax.engine.executors import program_of
+from iblf_jax.engine.loops import program_of
 from iblf_jax.engine.mechanism import mechanism_of
 from iblf_jax.engine.step import Carry, Inputs, StepOptions, TimeStep
 from iblf_jax.kernels import PER_RUN, TIME, written_out
@@ -188,15 +188,14 @@ def test_derivatives_by_the_geometry(monkeypatch):
     dt = jnp.asarray(DT)
 
     def by(backend, mechanism):
-        run = RunRequest(5, "euler", constants=mechanism)
+        run = RunRequest(5, "euler", constants=mechanism, backend=backend)
         return jax.jit(
-            lambda s, v: (
-                execute.run_batch_jvp(s, v, along, STANDARD[:1], dt, run, backend=backend).tangents
-            )
+            lambda s, v: execute.run_batch_jvp(s, v, along, STANDARD[:1], dt, run).tangents
         )(scenario, start)
 
     known, plain = by("native", mechanism_of(scenario)), by("vmap", None)
-    monkeypatch.setattr(plan, "JVP_LARGEST_IN_SEGMENTS", 0)
+    no_tangents = registry.NATIVE._replace(limits=registry.Limits(derivatives=0))
+    monkeypatch.setitem(registry.EXECUTORS, "native", no_tangents)
     column_by_column = by("auto", mechanism_of(scenario))
     for name, expected in plain.items():
         np.testing.assert_allclose(known[name], expected, rtol=1e-9, atol=1e-12, err_msg=name)
@@ -225,8 +224,7 @@ def status_of(scenario, *, run):
         {"initial.q": scenario.initial.q[None]},
         STANDARD,
         jnp.asarray(DT),
-        run,
-        backend="native",
+        run._replace(backend="native"),
     ).status[0]
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,11 +11,13 @@ import pytest
 
 import iblf_jax as ij
 from iblf_jax.core import devices
+from iblf_jax.core.caches import CACHE
 from iblf_jax.engine import (
     RunRequest,
     check_backend,
     compile,
     compile_batch,
+    native,
     plan,
     registry,
     single_run,
@@ -21,6 +25,7 @@ from iblf_jax.engine import (
 from iblf_jax.kernels import ToolchainError, UnsupportedError
 from iblf_jax.simulation.scenario import canonical
 
+needs_compiler = pytest.mark.skipif(native.unavailable() is not None, reason="no C++ compiler")
 SHORT = {"duration": 0.02, "dt": 1e-3, "method": "euler", "metrics": (ij.metrics.Margin(),)}
 
 
@@ -36,39 +41,41 @@ def scenario():
 @pytest.fixture
 def added(monkeypatch):
     """An executor "mine", first of all for this platform; the names of its calls."""
-    for part in (single_run._initialize, single_run._advance, single_run._finalize):
+    for part in (single_run._initialize, single_run._all_steps, single_run._finalize):
         part.clear_cache()  # which would hold another test's "mine"
-    xla, calls = registry.EXECUTORS["xla"], []
+    calls = []
 
     def run(*arguments):
         calls.append("run")
-        return xla.run(*arguments)
+        return native.run(*arguments)
 
     def build(*arguments):
         calls.append("build")
-        return xla.build(*arguments)
+        return native.build(*arguments)
 
     mine = registry.Executor("mine", (devices.platform(),), run, lambda: None, build)
     monkeypatch.setattr(registry, "EXECUTORS", {"mine": mine, **registry.EXECUTORS})
     return calls
 
 
+@needs_compiler
 @pytest.mark.parametrize("backend", ["mine", "auto"])
 def test_an_added_executor_runs_a_single_run(scenario, added, backend):
-    expected = ij.simulate(scenario, **SHORT, backend="xla")
+    expected = ij.simulate(scenario, **SHORT, backend="vmap")
     assert added == []
     found = ij.simulate(scenario, **SHORT, backend=backend)
     np.testing.assert_allclose(found.q, expected.q, rtol=1e-12)
     assert added == ["run"] * 3, "the start, the steps, the end"
 
 
+@needs_compiler
 def test_an_added_executor_runs_a_batch(scenario, added):
     perturbed = {"controller.Kp": ij.factor(ij.uniform(0.9, 1.1))}
     study = ij.monte_carlo(scenario, perturbed, runs=3, **SHORT, backend="mine")
-    assert study.setup.program.batch.executor == "mine"
+    assert study.setup.program.batch.backend == "mine"
     assert added.count("build") == 2
     assert added.count("run") == 3
-    other = ij.monte_carlo(scenario, perturbed, runs=3, **SHORT, backend="xla")
+    other = ij.monte_carlo(scenario, perturbed, runs=3, **SHORT, backend="vmap")
     np.testing.assert_allclose(study.metrics["margin"], other.metrics["margin"], rtol=1e-12)
 
 
@@ -92,7 +99,36 @@ def test_every_executor_says_why_it_is_unavailable():
         assert executor.name == name
         reason = executor.unavailable()
         assert reason is None or "\n" not in reason
-    assert registry.EXECUTORS["xla"].unavailable() is None
+
+
+def test_a_removed_backend_is_vmap(scenario):
+    """For one release its name is accepted."""
+    with pytest.warns(DeprecationWarning, match=r'backend="xla".*"vmap"'):
+        assert check_backend("xla") == "vmap"
+    with pytest.warns(DeprecationWarning, match=r'backend="xla".*"vmap"') as given:
+        request = RunRequest.of(canonical(scenario), steps=10, backend="xla")
+    assert len(given) == 1
+    assert request.backend == "vmap"
+
+
+def test_where_no_kernel_can_be_compiled_auto_runs_by_the_scan(scenario, monkeypatch):
+    """One warning names the remedy, for a run and for a batch."""
+    reason = 'there is no C++ compiler; `pip install "iblf_jax[export]"` contains one'
+    without = registry.NATIVE._replace(
+        platforms=(devices.platform(),), unavailable=lambda: reason, run=None, build=None
+    )
+    monkeypatch.setattr(registry, "EXECUTORS", {"native": without})
+    CACHE.clear(compile.WARNINGS)
+    assert registry.automatic() == ("vmap", reason)
+    expected = ij.simulate(scenario, **SHORT, backend="vmap")
+    with pytest.warns(compile.BackendWarning, match=r"iblf_jax\[export\].*running on vmap"):
+        found = ij.simulate(scenario, **SHORT)
+    np.testing.assert_array_equal(found.q, expected.q)
+    perturbed = {"controller.Kp": ij.factor(ij.uniform(0.9, 1.1))}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        study = ij.monte_carlo(scenario, perturbed, runs=3, **SHORT)
+    assert study.backend == "vmap"
 
 
 @pytest.mark.parametrize(
@@ -116,8 +152,13 @@ def test_one_place_falls_back(monkeypatch, failures, tried, result):
             raise failures[name]
         return name
 
-    assert compile.first_that_works(execution, attempt, lambda: "scan") == result
+    CACHE.clear(compile.WARNINGS)
+    with warnings.catch_warnings(record=True) as given:
+        warnings.simplefilter("always")
+        assert compile.first_that_works(execution, attempt, lambda: "scan") == result
     assert calls == tried
+    missing = [str(x) for x in failures.values() if isinstance(x, ToolchainError)]
+    assert len(given) == len(missing), "a step that does not lower is not reported here"
 
 
 def test_a_value_of_shapes_holds_no_arrays():

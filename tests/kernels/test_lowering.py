@@ -15,9 +15,9 @@ from arm_cases import random_arm
 
 import iblf_jax as ij
 from iblf_jax.core.caches import CACHE
-from iblf_jax.engine import RunRequest, compile, execute, plan
+from iblf_jax.engine import RunRequest, compile, execute, thresholds
 from iblf_jax.engine.batch import Batch, carry_shapes
-from iblf_jax.engine.executors import program_of
+from iblf_jax.engine.loops import program_of
 from iblf_jax.engine.step import Inputs, StepOptions, TimeStep, start
 from iblf_jax.kernels import passes, program
 from iblf_jax.kernels.from_jaxpr import closed
@@ -169,7 +169,8 @@ def test_every_member_lowers_and_its_program_is_its_step(family, name, monkeypat
             jax.jit(lambda c: step(inputs, c, index, StepOptions(rolled=True))[0])(carry)
         )
     )
-    monkeypatch.setattr(plan, "LIMITS", plan.LIMITS._replace(written_out=10))
+    limits = thresholds.LOWERING_LIMITS._replace(written_out=10)
+    monkeypatch.setattr(thresholds, "LOWERING_LIMITS", limits)
     called, _ = program_of(step, run, carries)
     # One for each stage, and one for the further piece of a step that a jump time divides.
     assert sum(node.op == "call" for node in called.nodes) == 2 + scenario.jump_times().size
@@ -188,7 +189,7 @@ def test_every_member_lowers_and_its_program_is_its_step(family, name, monkeypat
 
 def lowered_function(f, *arrays):
     """The outputs of `f` by its scalar program, with constants for inputs."""
-    b = program.Builder(np.float64, limits=plan.LIMITS)
+    b = program.Builder(np.float64, limits=thresholds.LOWERING_LIMITS)
     jaxpr = jax.make_jaxpr(f)(*arrays)
     operands, values = [], []
     for x in arrays:
@@ -476,6 +477,5 @@ def test_an_unknown_backend_is_refused():
             {"initial.q": jnp.ones((2, 2))},
             (),
             jnp.asarray(DT),
-            RunRequest(1),
-            backend="fpga",
+            RunRequest(1, backend="fpga"),
         )

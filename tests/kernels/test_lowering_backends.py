@@ -20,7 +20,7 @@ from test_toolchain import ZIG_CACHE, ziglang_script
 
 import iblf_jax as ij
 from iblf_jax.core.caches import CACHE
-from iblf_jax.engine import RunRequest, compile, execute, executors, native, plan, registry
+from iblf_jax.engine import RunRequest, compile, execute, loops, native, registry, thresholds
 from iblf_jax.engine.batch import Batch
 from iblf_jax.engine.step import Inputs, TimeStep, start
 from iblf_jax.kernels import cpu, directory, packed, toolchain
@@ -50,10 +50,8 @@ def batch(dtype="float64", backend="native", steps=400, values=None, record_ever
     varied = {k: jnp.asarray(v, dtype) for k, v in (values or draws(5)).items()}
     key = (dtype, backend, steps, record_every)
     if key not in COMPILED:
-        run = RunRequest(steps, "rk4", record_every)
-        COMPILED[key] = jax.jit(
-            lambda s, v, f, dt: execute.run_batch(s, v, f, dt, run, backend=backend)
-        )
+        run = RunRequest(steps, "rk4", record_every, backend=backend)
+        COMPILED[key] = jax.jit(lambda s, v, f, dt: execute.run_batch(s, v, f, dt, run))
     return jax.tree.map(np.asarray, COMPILED[key](scenario, varied, folds, jnp.asarray(dt, dtype)))
 
 
@@ -85,20 +83,20 @@ def test_native_agrees_with_the_reference(dtype):
 
 @pytest.fixture(scope="module")
 def recorded_steps():
-    """Steps of 19 runs with a record of every fifth one, as a function of an executor; and what the
-    scan gives."""
+    """Steps of 19 runs with a record of every fifth one, as a function of a loop; and what the scan
+    gives."""
     inputs = Inputs(
         canonical(ij.presets.zhang_yan_2024()), (), jnp.asarray(1e-3), jnp.asarray(40.0)
     )
     step = TimeStep("euler")
 
-    def steps(executor, values):
+    def steps(loop, values):
         batch = Batch.of(inputs, values)
         carry = batch.each(lambda inputs: start(inputs, "euler", jnp.zeros((6, 6))))
-        return executor(step, batch, carry, 40, 5)
+        return loop(step, batch, carry, 40, 5)
 
     values = {k: jnp.asarray(v) for k, v in draws(19).items()}
-    return steps, values, jax.jit(partial(steps, executors.scan))(values)
+    return steps, values, jax.jit(partial(steps, loops.scan))(values)
 
 
 @pytest.mark.parametrize("family", ["g++", "clang++", "ziglang"])
@@ -113,7 +111,7 @@ def test_every_compiler_gives_the_same_numbers(tmp_path, monkeypatch, recorded_s
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     steps, values, expected = recorded_steps
     cpu.kernel.cache_clear()
-    compiled = jax.jit(partial(steps, executors.lowered_on(native.run)))
+    compiled = jax.jit(partial(steps, loops.kernel_loop(registry.NATIVE)))
     found = jax.tree.map(np.asarray, compiled(values))
     assert_same(found, jax.tree.map(np.asarray, expected), 1e-12)
     fewer = jax.tree.map(np.asarray, compiled({k: v[2:] for k, v in values.items()}))
@@ -123,33 +121,8 @@ def test_every_compiler_gives_the_same_numbers(tmp_path, monkeypatch, recorded_s
 
 
 @pytest.mark.slow
-def test_xla_agrees_with_the_reference():
-    found, expected = batch(backend="xla"), batch(backend="vmap")
-    assert_same(found, expected, TOLERANCE["float64"])
-    np.testing.assert_array_equal(found.status, expected.status)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("every", [2, 30])
-def test_xla_in_blocks_and_stretches_agrees(monkeypatch, every):
-    monkeypatch.setattr(plan, "XLA_BLOCK", 2)
-    monkeypatch.setattr(plan, "XLA_STRETCH", 4)
-    scenario, dt = canonical(ij.presets.zhang_yan_2024()), jnp.asarray(1e-3)
-    run = RunRequest(11, "euler", every)
-    varied = {k: jnp.asarray(v) for k, v in draws(7).items()}
-    found, expected = (
-        jax.jit(lambda s, v, b=b: execute.run_batch(s, v, (), dt, run, backend=b))(scenario, varied)
-        for b in ("xla", "vmap")
-    )
-    assert_same(jax.tree.map(np.asarray, found), jax.tree.map(np.asarray, expected), 1e-10)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "backend",
-    [pytest.param("xla", marks=pytest.mark.release), pytest.param("native", marks=needs_compiler)],
-)
-def test_a_spline_is_looked_up(backend):
+@needs_compiler
+def test_a_spline_is_looked_up():
     times = np.linspace(0.0, 0.04, 9)
     spline = ij.references.WaypointSpline(
         tuple(times.tolist()), 0.5 + 0.1 * np.sin(20 * np.stack([times, times + 1], axis=1))
@@ -158,13 +131,15 @@ def test_a_spline_is_looked_up(backend):
         canonical(dataclasses.replace(ij.presets.zhang_yan_2024(), reference=spline)),
         jnp.asarray(1e-3),
     )
-    run = RunRequest(50, "heun", 10)
     varied = {k: jnp.asarray(v) for k, v in draws(3).items()}
-    request = RunRequest(1, "heun", backend=backend)
-    assert execute.compile_batch(request, scenario, varied, (), dt).executor == backend
+    request = RunRequest(1, "heun", backend="native")
+    assert execute.compile_batch(request, scenario, varied, (), dt).backend == "native"
+    requests = [RunRequest(50, "heun", 10, backend=backend) for backend in ("native", "vmap")]
     found, expected = (
-        jax.jit(lambda s, v, b=b: execute.run_batch(s, v, (), dt, run, backend=b))(scenario, varied)
-        for b in (backend, "vmap")
+        jax.jit(lambda s, v, request=request: execute.run_batch(s, v, (), dt, request))(
+            scenario, varied
+        )
+        for request in requests
     )
     assert_same(jax.tree.map(np.asarray, found), jax.tree.map(np.asarray, expected), 1e-10)
 
@@ -215,8 +190,8 @@ def test_a_run_that_fails_does_not_touch_the_others():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("backend", ["xla", pytest.param("native", marks=needs_compiler)])
-def test_a_sine_of_any_size_is_finite_in_a_batch(backend):
+@needs_compiler
+def test_a_sine_of_any_size_is_finite_in_a_batch():
     scenario = canonical(ij.presets.zhang_yan_2024())
     varied = {
         "disturbance.phase": jnp.asarray([0.3, 1e7, 1e18]),
@@ -224,14 +199,13 @@ def test_a_sine_of_any_size_is_finite_in_a_batch(backend):
     }
 
     def run(backend):
+        request = RunRequest(3, "euler", backend=backend)
         f = jax.jit(
-            lambda v: execute.run_batch(
-                scenario, v, standard(), jnp.asarray(1e-3), RunRequest(3, "euler"), backend=backend
-            )
+            lambda v: execute.run_batch(scenario, v, standard(), jnp.asarray(1e-3), request)
         )
         return jax.tree.map(np.asarray, f(varied))
 
-    found = run(backend)
+    found = run("native")
     assert not np.any(found.status & ij.Status.NOT_FINITE)
     assert_same(found, run("vmap"), TOLERANCE["float64"])
 
@@ -321,10 +295,11 @@ def test_a_long_step_is_cut_into_functions(monkeypatch, parts, record_every):
     places of some products with sums differ."""
     whole = batch(record_every=record_every)
     if parts != "calls":
-        monkeypatch.setattr(plan, "NATIVE_LONG", 0)
-        monkeypatch.setattr(plan, "NATIVE_SEGMENT", 50)
+        monkeypatch.setattr(thresholds, "LONGEST_C_FUNCTION", 0)
+        monkeypatch.setattr(thresholds, "NODES_OF_A_C_FUNCTION", 50)
     if parts != "functions":
-        monkeypatch.setattr(plan, "LIMITS", plan.LIMITS._replace(written_out=10))
+        limits = thresholds.LOWERING_LIMITS._replace(written_out=10)
+        monkeypatch.setattr(thresholds, "LOWERING_LIMITS", limits)
     forget_kernels()
     monkeypatch.setitem(COMPILED, ("float64", "native", 400, record_every), None)
     del COMPILED["float64", "native", 400, record_every]
@@ -337,9 +312,10 @@ def test_a_long_step_is_cut_into_functions(monkeypatch, parts, record_every):
 
 @pytest.mark.slow
 @needs_compiler
-@pytest.mark.parametrize("written_out", [plan.LIMITS.written_out, 10])
+@pytest.mark.parametrize("written_out", [thresholds.LOWERING_LIMITS.written_out, 10])
 def test_forward_sensitivities(monkeypatch, written_out):
-    monkeypatch.setattr(plan, "LIMITS", plan.LIMITS._replace(written_out=written_out))
+    limits = thresholds.LOWERING_LIMITS._replace(written_out=written_out)
+    monkeypatch.setattr(thresholds, "LOWERING_LIMITS", limits)
     scenario, dt = canonical(ij.presets.zhang_yan_2024()), jnp.asarray(1e-3)
     directions = {"controller.K2": np.eye(3, 2), "observer.kf": np.eye(3, 2, -1)}
     varied = {k: jnp.asarray(v) for k, v in draws(3).items()}
@@ -350,11 +326,10 @@ def test_forward_sensitivities(monkeypatch, written_out):
     )
 
     def pushed(backend):
-        return jax.jit(
-            lambda s, v: execute.run_batch_jvp(
-                s, v, directions, folds, dt, RunRequest(60, "euler"), backend=backend
-            )
-        )(scenario, varied)
+        request = RunRequest(60, "euler", backend=backend)
+        return jax.jit(lambda s, v: execute.run_batch_jvp(s, v, directions, folds, dt, request))(
+            scenario, varied
+        )
 
     reference, expected, exact = pushed("vmap")
     for by_columns in (False, True):
@@ -372,25 +347,17 @@ def test_forward_sensitivities(monkeypatch, written_out):
         assert [x.shape for x in products] == [(3, 3, 3)] * 2
 
 
-def test_without_a_compiler_it_runs_on_xla_with_one_warning(monkeypatch):
+def test_without_a_compiler_it_runs_on_vmap_with_one_warning(monkeypatch):
     monkeypatch.setenv("CXX", "no-such-compiler")
     CACHE.clear(compile.WARNINGS)
     cpu.kernel.cache_clear()
     called = []
-    with pytest.warns(compile.BackendWarning, match="no-such-compiler.*xla"):
-        with_fallback(
-            "auto", lambda name: called.append(name) or fail_if_native(name), lambda: None
-        )
+    with pytest.warns(compile.BackendWarning, match="no-such-compiler.*vmap"):
+        with_fallback("auto", called.append, lambda: called.append("vmap"))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        with_fallback("auto", fail_if_native, lambda: None)
-    assert called == ["native", "xla"]
-
-
-def fail_if_native(name):
-    if name == "native":
-        toolchain.compiler()
-    return name
+        with_fallback("auto", called.append, lambda: called.append("vmap"))
+    assert called == ["vmap"] * 2
 
 
 @needs_compiler
@@ -428,7 +395,7 @@ def test_a_cache_of_someone_else_is_refused(monkeypatch, tmp_path):
 
 @pytest.mark.slow
 def test_one_run_on_the_native_backend_is_the_run(paper):
-    """Records, metrics and status of `simulate(backend="native")` are those of xla; another value
+    """Records, metrics and status of `simulate(backend="native")` are those of vmap; another value
     of a leaf builds nothing new."""
     for scenario in (
         paper,
@@ -436,7 +403,7 @@ def test_one_run_on_the_native_backend_is_the_run(paper):
     ):
         one, other = (
             ij.simulate(scenario, duration=0.5, dt=1e-3, record_every=7, backend=backend)
-            for backend in ("xla", "native")
+            for backend in ("vmap", "native")
         )
         np.testing.assert_allclose(one.q, other.q, rtol=0, atol=1e-10)
         np.testing.assert_allclose(one.tau, other.tau, rtol=0, atol=1e-9)
@@ -452,7 +419,7 @@ def test_one_run_on_the_native_backend_is_the_run(paper):
 
 @needs_compiler
 @pytest.mark.parametrize("every", [1, 7])
-def test_a_long_run_in_stretches_is_the_same_run(monkeypatch, every):
+def test_a_long_run_in_several_calls_is_the_same_run(monkeypatch, every):
     """Python sees Ctrl-C between them; the numbers are bit for bit those of one call."""
     options = {
         "duration": 0.5,
@@ -464,9 +431,9 @@ def test_a_long_run_in_stretches_is_the_same_run(monkeypatch, every):
     scenario = ij.presets.zhang_yan_2024()
     whole = ij.simulate(scenario, **options)
     calls = []
-    monkeypatch.setattr(plan, "NATIVE_UNSEEN", 1.0)
+    monkeypatch.setattr(thresholds, "OPERATIONS_PER_CALL", 1.0)
     monkeypatch.setattr(
-        plan, "native_stretch", lambda nodes, steps, every: calls.append(nodes) or 21 * 7
+        thresholds, "steps_per_call", lambda nodes, steps, every: calls.append(nodes) or 21 * 7
     )
     parts = ij.simulate(scenario, **options)
     assert len(calls) == 1
@@ -479,8 +446,8 @@ def test_a_long_run_in_stretches_is_the_same_run(monkeypatch, every):
     ("nodes", "steps", "every"),
     [(1800, 20_001, 1), (1800, 20_000_001, 1000), (1800, 20_000_001, None), (60_000, 10**6, 10**5)],
 )
-def test_a_stretch_is_short_and_whole(nodes, steps, every):
-    stretch = plan.native_stretch(nodes, steps, every)
-    assert stretch == steps or stretch % (every or 1) == 0
-    assert stretch * nodes <= max(plan.NATIVE_UNSEEN, nodes * (every or 1))
-    assert (stretch == steps) == (steps * nodes < plan.NATIVE_UNSEEN)
+def test_a_call_is_short_and_whole(nodes, steps, every):
+    length = thresholds.steps_per_call(nodes, steps, every)
+    assert length == steps or length % (every or 1) == 0
+    assert length * nodes <= max(thresholds.OPERATIONS_PER_CALL, nodes * (every or 1))
+    assert (length == steps) == (steps * nodes < thresholds.OPERATIONS_PER_CALL)

@@ -24,10 +24,10 @@ from test_lowering_backends import TOLERANCE, assert_same, draws, needs_compiler
 
 import iblf_jax as ij
 from iblf_jax.core.caches import CACHE
-from iblf_jax.engine import RunRequest, compile, execute, gpu, plan, registry
+from iblf_jax.engine import RunRequest, compile, execute, gpu, registry, thresholds
 from iblf_jax.engine.batch import Batch
 from iblf_jax.engine.derivatives import Directions, run_with_tangents
-from iblf_jax.engine.executors import lowered_on, program_of
+from iblf_jax.engine.loops import kernel_loop, program_of
 from iblf_jax.engine.step import Inputs, TimeStep
 from iblf_jax.kernels import nvrtc
 from iblf_jax.kernels.emit_c import CUDA, source
@@ -101,18 +101,17 @@ def test_the_kernel_of_every_member_does_what_its_program_says(family, name):
 
 def gpu_for_this_platform(monkeypatch, **changes):
     """The gpu executor is the one that compiles kernels for CPUs."""
-    gpu_record = registry.EXECUTORS["gpu"]._replace(platforms=("cpu",), **changes)
-    executors = {"gpu": gpu_record, "xla": registry.EXECUTORS["xla"]}
-    monkeypatch.setattr(registry, "EXECUTORS", executors)
+    record = registry.GPU._replace(platforms=("cpu",), **changes)
+    monkeypatch.setattr(registry, "EXECUTORS", {"gpu": record})
 
 
 @pytest.fixture
 def runs_here(monkeypatch):
-    """The gpu backend runs here, in stretches of 64 steps, on a CPU in blocks of 32 threads."""
-    monkeypatch.setattr(plan, "GPU_STRETCH", 64)
+    """The gpu backend runs here, 64 steps a launch, on a CPU in blocks of 32 threads."""
+    monkeypatch.setattr(thresholds, "MAX_STEPS_PER_LAUNCH", 64)
     CACHE.clear(compile.WARNINGS)
     if not ON_A_GPU:
-        gpu_for_this_platform(monkeypatch, run=gpu_on_cpu.run)
+        gpu_for_this_platform(monkeypatch, run=gpu_on_cpu.run, unavailable=lambda: None)
 
 
 def outcome(dtype, backend, values, steps=200, record_every=None):
@@ -120,13 +119,9 @@ def outcome(dtype, backend, values, steps=200, record_every=None):
     scenario = canonical(ij.astype(ij.presets.zhang_yan_2024(), dtype))
     folds = jax.tree.map(lambda x: jnp.asarray(x, dtype), standard())
     varied, dt = {k: jnp.asarray(v, dtype) for k, v in values.items()}, jnp.asarray(DT, dtype)
-    run = RunRequest(steps, "rk4", record_every)
-    return jax.tree.map(
-        np.asarray,
-        jax.jit(lambda s, v: execute.run_batch(s, v, folds, dt, run, backend=backend))(
-            scenario, varied
-        ),
-    )
+    run = RunRequest(steps, "rk4", record_every, backend=backend)
+    compiled = jax.jit(lambda s, v: execute.run_batch(s, v, folds, dt, run))
+    return jax.tree.map(np.asarray, compiled(scenario, varied))
 
 
 def spoiled(runs):
@@ -142,7 +137,7 @@ def spoiled(runs):
 @pytest.mark.slow
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_a_batch_agrees_with_the_reference(dtype, runs_here):
-    """37 runs are two blocks, the second not full; 200 steps are four stretches, the last not
+    """37 runs are two blocks, the second not full; 200 steps are four launches, the last not
     full."""
     good = draws(37)
     found, expected = outcome(dtype, "gpu", good), outcome(dtype, "vmap", good)
@@ -167,9 +162,10 @@ def test_runs_that_fail_have_the_reference_s_status_and_touch_no_other(runs_here
 
 @pytest.mark.slow
 @needs_compiler
-@pytest.mark.parametrize("written_out", [plan.LIMITS.written_out, 10])
+@pytest.mark.parametrize("written_out", [thresholds.LOWERING_LIMITS.written_out, 10])
 def test_records_agree_with_the_reference(runs_here, monkeypatch, written_out):
-    monkeypatch.setattr(plan, "LIMITS", plan.LIMITS._replace(written_out=written_out))
+    limits = thresholds.LOWERING_LIMITS._replace(written_out=written_out)
+    monkeypatch.setattr(thresholds, "LOWERING_LIMITS", limits)
     found, expected = (outcome("float64", backend, draws(3), 150, 7) for backend in ("gpu", "vmap"))
     assert_same(found, expected, 1e-9)
 
@@ -192,7 +188,7 @@ def test_one_run_is_the_run(runs_here, paper, sampled):
             actuator=ij.actuators.Motor(bandwidth=600.0),
         )
     timing = {"duration": 0.06, "dt": 4e-4, "record_every": 10, "seed": 3}
-    one, other = (ij.simulate(paper, **timing, backend=backend) for backend in ("gpu", "xla"))
+    one, other = (ij.simulate(paper, **timing, backend=backend) for backend in ("gpu", "vmap"))
     np.testing.assert_allclose(one.tau, other.tau, rtol=0, atol=1e-9)
 
 
@@ -215,9 +211,9 @@ def test_every_run_has_its_own_jump(runs_here, paper, dtype):
     )
 
     def metrics(backend):
-        return jax.jit(
-            lambda v: execute.run_batch(scenario, v, folds, dt, RunRequest(20), backend=backend)
-        )(varied).metrics
+        request = RunRequest(20, backend=backend)
+        run = jax.jit(lambda v: execute.run_batch(scenario, v, folds, dt, request))
+        return run(varied).metrics
 
     found, expected = metrics("gpu"), metrics("vmap")
     rtol = {"float64": 1e-9, "float32": 2e-3}[dtype]
@@ -232,13 +228,12 @@ def test_forward_sensitivities(paper):
     along = Directions.of({"controller.K2": np.eye(3, 2), "observer.kf": np.eye(3, 2, -1)})
     varied = {k: jnp.asarray(v) for k, v in draws(3).items()}
     inputs, run = Inputs(scenario, standard()[:1], dt, jnp.asarray(60.0)), RunRequest(60, "euler")
-    executor, numbers = (
-        lowered_on(run_program),
-        {path: np.reshape(x, shape) for path, shape, x in along.items},
-    )
-    pushed = jax.jit(lambda v: run_with_tangents(executor, Batch.of(inputs, v), along, run))(varied)
+    loop = kernel_loop(registry.GPU._replace(run=run_program))
+    numbers = {path: np.reshape(x, shape) for path, shape, x in along.items}
+    pushed = jax.jit(lambda v: run_with_tangents(loop, Batch.of(inputs, v), along, run))(varied)
+    by_scan = run._replace(backend="vmap")
     expected = jax.jit(
-        lambda v: execute.run_batch_jvp(scenario, v, numbers, inputs.folds, dt, run, backend="vmap")
+        lambda v: execute.run_batch_jvp(scenario, v, numbers, inputs.folds, dt, by_scan)
     )(varied)
     for x, y in zip(pushed, expected, strict=True):
         assert_same(jax.tree.map(np.asarray, x), jax.tree.map(np.asarray, y), 1e-10)
@@ -246,8 +241,8 @@ def test_forward_sensitivities(paper):
 
 @needs_a_cpu
 @needs_compiler
-def test_the_image_is_loaded_once_and_launched_a_stretch_at_a_time(paper, monkeypatch):
-    monkeypatch.setattr(plan, "GPU_STRETCH", 4)
+def test_the_image_is_loaded_once_and_launched_for_some_steps_at_a_time(paper, monkeypatch):
+    monkeypatch.setattr(thresholds, "MAX_STEPS_PER_LAUNCH", 4)
     program, shared, lane, carry = step_of(paper, draws(2))
     sizes, seen = (program, shared.size, lane.shape[0]), []
     for _ in range(3):
@@ -296,22 +291,22 @@ def test_what_the_driver_refuses_is_an_error_of_jax(paper):
     ("runs", "threads"), [(1, 32), (4096, 32), (10_000, 96), (65_536, 128), (10**7, 128)]
 )
 def test_threads_in_a_block(runs, threads):
-    assert plan.gpu_threads(runs, 132) == threads
+    assert thresholds.gpu_threads(runs, 132) == threads
 
 
 @needs_a_cpu
-def test_without_a_gpu_it_runs_on_xla_with_one_warning(monkeypatch):
+def test_without_a_gpu_it_runs_on_vmap_with_one_warning(monkeypatch):
     CACHE.clear(compile.WARNINGS)
     called = []
     with pytest.warns(
         compile.BackendWarning,
-        match="gpu backend is not for the default device, cpu: running on xla",
+        match="gpu backend is not for the default device, cpu: running on vmap",
     ):
-        with_fallback("gpu", called.append, lambda: None)
+        with_fallback("gpu", called.append, lambda: called.append("vmap"))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        with_fallback("gpu", called.append, lambda: None)
-    assert called == ["xla"] * 2
+        with_fallback("gpu", called.append, lambda: called.append("vmap"))
+    assert called == ["vmap"] * 2
 
 
 @needs_a_cpu
@@ -324,13 +319,13 @@ def test_explain_says_what_a_batch_runs_on(paper, monkeypatch):
     gpu_for_this_platform(monkeypatch)
     told = repr(ij.explain(paper))
     assert (
-        "a batch runs on xla: it needs an NVIDIA GPU, not cpu\n" in told
+        "a batch runs on vmap: it needs an NVIDIA GPU, not cpu\n" in told
         and "derivatives of simulate: by plain JAX: it needs" in told
     )
 
 
 @needs_a_cpu
-def test_auto_on_a_gpu_without_nvrtc_runs_on_xla(monkeypatch):
+def test_auto_on_a_gpu_without_nvrtc_runs_on_vmap(monkeypatch):
     def missing(*_):
         raise ToolchainError("there is no NVRTC")
 
@@ -338,15 +333,12 @@ def test_auto_on_a_gpu_without_nvrtc_runs_on_xla(monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(gpu, "architecture", lambda: "sm_90")
     monkeypatch.setattr(nvrtc, "library", missing)
-    assert registry.automatic() == ("xla", "there is no NVRTC")
+    assert registry.automatic() == ("vmap", "there is no NVRTC")
     with pytest.warns(
         compile.BackendWarning,
-        match="gpu backend is not available .there is no NVRTC.: running on xla",
+        match="gpu backend is not available .there is no NVRTC.: running on vmap",
     ):
-        assert (
-            with_fallback("auto", lambda name: missing() if name == "gpu" else name, lambda: None)
-            == "xla"
-        )
+        assert with_fallback("auto", lambda name: name, lambda: "vmap") == "vmap"
     monkeypatch.setattr(nvrtc, "library", lambda: None)
     monkeypatch.setattr(gpu, "compiler", lambda: None)
     assert registry.automatic() == ("gpu", None)
@@ -459,11 +451,8 @@ def test_the_kernel_is_registered_for_cuda_and_called_with_its_attributes(paper,
         jnp.asarray(DT),
         {k: jnp.asarray(v) for k, v in draws(2).items()},
     )
-    call = jax.jit(
-        lambda v: execute.run_batch(
-            scenario, v, STANDARD, dt, RunRequest(20_000, "rk4", 10), backend="gpu"
-        )
-    )
+    request = RunRequest(20_000, "rk4", 10, backend="gpu")
+    call = jax.jit(lambda v: execute.run_batch(scenario, v, STANDARD, dt, request))
     text = call.trace(varied).lower(lowering_platforms=("cuda",)).as_text()
     assert text.count("custom_call @iblf_jax_") == 3, (
         "the rates around the start, the steps, the rates around two more instants"

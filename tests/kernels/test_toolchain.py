@@ -550,7 +550,7 @@ UNUSABLE = {
 
 @needs_compiler
 @pytest.mark.parametrize("way", UNUSABLE)
-def test_an_unusable_cache_is_one_line_and_xla(tmp_path, monkeypatch, way):
+def test_an_unusable_cache_is_one_line_and_vmap(tmp_path, monkeypatch, way):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "base"))
     UNUSABLE[way](tmp_path / "base", monkeypatch)
     assert falls_back(lambda: toolchain.built(SOURCE)).startswith(
@@ -560,19 +560,18 @@ def test_an_unusable_cache_is_one_line_and_xla(tmp_path, monkeypatch, way):
 
 
 def falls_back(work):
-    """The one line with which `work`, on the native backend, ends up on xla."""
+    """The one line with which `work`, on the native backend, ends up on vmap."""
 
     def run_on(name):
-        if name == "native":
-            work()
+        work()
         return name
 
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         CACHE.clear(compile.WARNINGS)
-        assert with_fallback("native", run_on, lambda: None) == "xla"
+        assert with_fallback("native", run_on, lambda: "vmap") == "vmap"
     (line,) = [str(x.message) for x in said]
-    assert line.endswith("running on xla.")
+    assert line.endswith("running on vmap.")
     assert "\n" not in line
     return line
 
@@ -680,7 +679,7 @@ def test_ziglang_where_the_system_has_no_compiler(cache, tmp_path, monkeypatch):
     assert native.unavailable() is None
     assert value() == 41
     monkeypatch.setattr(toolchain.importlib.util, "find_spec", lambda name: None)
-    assert "pip install ziglang" in native.unavailable()
+    assert 'pip install "iblf_jax[export]"' in native.unavailable()
 
 
 COMPILERS = {
@@ -708,7 +707,7 @@ COMPILERS = {
 
 @needs_compiler
 @pytest.mark.parametrize("what", COMPILERS)
-def test_a_broken_compiler_is_one_line_and_xla(cache, tmp_path, monkeypatch, what):
+def test_a_broken_compiler_is_one_line_and_vmap(cache, tmp_path, monkeypatch, what):
     script, words = COMPILERS[what]
     fake(tmp_path, monkeypatch, script)
     if "hangs" in what:

@@ -35,6 +35,7 @@ from iblf_jax.core import checks
 from iblf_jax.core.pytree import is_leaf_field
 from iblf_jax.core.status import Status
 from iblf_jax.engine import CompiledBatch, simulate
+from iblf_jax.engine.plan import PLAIN_LAYOUT, ExecutionPlan
 from iblf_jax.files.components import decode_fields
 from iblf_jax.simulation import metrics, paths
 from iblf_jax.simulation.results import Metrics
@@ -464,8 +465,9 @@ def no_runs(monkeypatch):
         "certificates._certify._certificate_of",
     ):
         monkeypatch.setattr(f"iblf_jax.{place}", entered)
+    by_scan = ExecutionPlan((), PLAIN_LAYOUT, PLAIN_LAYOUT, True)
     monkeypatch.setattr(
-        "iblf_jax.studies.setup.compile_batch", lambda request, *_: CompiledBatch(request, "xla")
+        "iblf_jax.studies.setup.compile_batch", lambda request, *_: CompiledBatch(request, by_scan)
     )
 
 
@@ -766,7 +768,7 @@ def results(paper, no_runs, monkeypatch):
     monkeypatch.setattr("iblf_jax.tuning.result._slice", entered)
     run = made_up(paper.plant, duration=0.1)
     setup = prepare(
-        paper, WAYS, 4, 0, duration=0.01, dt=1e-3, method="rk4", metrics=None, backend="xla"
+        paper, WAYS, 4, 0, duration=0.01, dt=1e-3, method="rk4", metrics=None, backend="vmap"
     )
     found = Metrics(
         {"margin": np.full((4, 2), 0.1), "rmse": np.full((4, 2), 0.01)},

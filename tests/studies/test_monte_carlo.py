@@ -21,7 +21,7 @@ from scipy import stats
 
 import iblf_jax as ij
 from iblf_jax.core.status import FAILED, Status
-from iblf_jax.engine import execute, plan
+from iblf_jax.engine import execute, sizes
 from iblf_jax.studies import blocks, statistics
 
 SCENARIO = ij.presets.zhang_yan_2024()
@@ -49,7 +49,7 @@ def test_chunk_changes_nothing(study, chunk):
     )
 
 
-@pytest.mark.parametrize(("chunk", "together"), [(256, 1), (512, 2), (None, plan.STUDY_IN_FLIGHT)])
+@pytest.mark.parametrize(("chunk", "together"), [(256, 1), (512, 2), (None, sizes.MAX_IN_FLIGHT)])
 def test_as_many_blocks_are_made_beside_each_other_as_are_in_flight(
     study, chunk, together, monkeypatch
 ):
@@ -72,7 +72,7 @@ def test_as_many_blocks_are_made_beside_each_other_as_are_in_flight(
 
     monkeypatch.setattr(blocks, "_execute", counted)
     again = cases.study(
-        runs=256 * (1 + plan.STUDY_IN_FLIGHT), executor=ij.studies.ThisProcess(chunk=chunk)
+        runs=256 * (1 + sizes.MAX_IN_FLIGHT), executor=ij.studies.ThisProcess(chunk=chunk)
     )
     assert max(most) == together
     assert cases.same(results(study), {name: x[:600] for name, x in results(again).items()})
@@ -206,7 +206,7 @@ def test_a_law_and_a_distribution_from_a_notebook():
         duration=0.05,
         progress=False,
     )
-    assert study.backend in ("native", "xla")
+    assert study.backend in ("native", "vmap")
     assert abs(study.samples["plant.payload"].mean() - 1 / 3) < 0.05
     replayed = study.replay(7)
     np.testing.assert_array_equal(replayed.metrics["effort"], study.metrics["effort"][7])
@@ -517,7 +517,7 @@ def seen(event, duration, **details):
 
 jax.monitoring.register_event_duration_secs_listener(seen)
 def study():
-    options = {"runs": 20_000, "duration": 20.0, "dt": 1e-3, "backend": "xla"}
+    options = {"runs": 20_000, "duration": 20.0, "dt": 1e-3, "backend": "vmap"}
     ij.monte_carlo(ij.presets.zhang_yan_2024(), study_cases.perturbations(), **options)
 if sys.argv[1] == "caught":
     try:

@@ -21,7 +21,7 @@ import pytest
 import study_cases as cases
 
 import iblf_jax as ij
-from iblf_jax.engine import native
+from iblf_jax.engine import CompiledBatch, native
 from iblf_jax.kernels import toolchain
 from iblf_jax.studies import execution, interrupt, store, sweep
 
@@ -189,8 +189,20 @@ def test_another_scenario_law_or_backend_is_refused(finished):
         ij.sweep(SCENARIO, cases.GRID, perturbations=ways, **options, backend="vmap")
     assert ij.load_sweep(finished).attrs["backend"] in (
         "native",
-        "xla",
+        "vmap",
     ), "what it ran on, not what was asked for"
+
+
+def test_a_store_of_a_backend_that_was_removed_loads(tmp_path, monkeypatch):
+    """As it is; to continue it is to compute other digits, and is refused."""
+    with monkeypatch.context() as patch:
+        patch.setattr(CompiledBatch, "backend", "xla")
+        written = once(store=tmp_path / "old")
+    loaded = ij.load_sweep(tmp_path / "old")
+    assert loaded.attrs["backend"] == "xla"
+    assert loaded.identical(written)
+    with pytest.raises(ij.StoreError, match=r"backend: the store has .?xla"):
+        once(store=tmp_path / "old")
 
 
 @pytest.mark.skipif(native.unavailable() is not None, reason="no C++ compiler")
@@ -200,7 +212,7 @@ def test_another_processor_is_named(finished, table, monkeypatch):
     monkeypatch.setattr(toolchain, "processor", lambda: "model name : Another 9000\nflags : avx")
     with pytest.raises(
         ij.StoreError,
-        match=r"kernel.processor: the store has .*Another 9000.*machine of the same kind.*xla",
+        match=r"kernel.processor: the store has .*Another 9000.*machine of the same kind.*vmap",
     ) as caught:
         cases.table(store=finished)
     assert "program" not in str(caught.value)

@@ -57,7 +57,7 @@ def alone():
 
 @pytest.fixture(scope="module")
 def kept():
-    return ij.simulate(filtered(stepping()), **RUN, backend="xla")
+    return ij.simulate(filtered(stepping()), **RUN, backend="vmap")
 
 
 # ------------------------------------------------------------- by hand, from the equations alone
@@ -160,7 +160,7 @@ def test_a_run_is_that_of_an_independent_program():
         rate, (0.0, 1.0), [1.0, 1.3, 0.0, 0.0], "DOP853", t_eval=t, rtol=1e-8, atol=1e-10
     )
     run = ij.simulate(
-        filtered(stepping()), duration=1.0, dt=2.5e-4, record_every=400, backend="xla"
+        filtered(stepping()), duration=1.0, dt=2.5e-4, record_every=400, backend="vmap"
     )
     np.testing.assert_allclose(run.q, found.y[:2].T, atol=1e-7)
 
@@ -203,7 +203,7 @@ def test_the_filter_keeps_what_the_law_breaks(kept):
 def test_too_little_torque_breaks_them_and_says_by_how_much():
     scenario = filtered(stepping(initial=ij.Initial([1.0, 1.3], [-3.0, -1.0])), limit=[3.0, 1.0])
     with pytest.warns(ij.SimulationWarning, match=r"m/s\^2 \(run\.region_slack\).*b1 and b2"):
-        run = ij.simulate(scenario, duration=0.3, dt=1e-3, method="euler", backend="xla")
+        run = ij.simulate(scenario, duration=0.3, dt=1e-3, method="euler", backend="vmap")
     assert int(run.status) & int(ij.Status.FILTER_INFEASIBLE)
     np.testing.assert_allclose(run.metrics.largest_region_slack, run.region_slack.max(axis=0))
     assert float(np.max(run.metrics.largest_region_slack)) > 0.1

@@ -28,7 +28,7 @@ static int succeeded(const char *what, int code, char *text, size_t size) {
   const char *reason = NULL;
   if (code == 0) return 1;
   if (!cu_describe || cu_describe(code, &reason) || !reason) reason = "unknown error";
-  snprintf(text, size, "iblf_jax kernel: %s: %s (CUDA error %d); backend=\"xla\" does without it", what, reason, code);
+  snprintf(text, size, "iblf_jax kernel: %s: %s (CUDA error %d); backend=\"vmap\" does without it", what, reason, code);
   return 0;
 }
 

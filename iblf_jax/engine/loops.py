@@ -1,10 +1,11 @@
-"""What steps a batch: loops of XLA over the step as it is (`scan`, `checkpointed`), or over its
-scalar program (`lowered_on`).
+"""The loops over all steps of a batch: of XLA over the step as it is (`scan`, `checkpointed`), and
+of an executor over the step's scalar program (`kernel_loop`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -12,17 +13,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core.caches import CACHE
-from iblf_jax.engine import plan
-from iblf_jax.engine.batch import Batch, Leaves, Loop
+from iblf_jax.engine import thresholds
+from iblf_jax.engine.batch import Batch, Leaves, StepLoop
 from iblf_jax.engine.machine_function import machine_function
+from iblf_jax.engine.registry import Executor
 from iblf_jax.engine.step import LinearizationStep, StepOptions, is_derivative, keep_if
 from iblf_jax.kernels import (
     CompiledStep,
-    Packed,
     Shapes,
     compile_step,
-    pack,
-    unpack,
     unpacked_records,
 )
 
@@ -39,14 +38,14 @@ def scan(step: Any, batch: Batch, carry: Any, steps: int, every: int | None) -> 
         def of_run(carry, index):
             return step(inputs, carry, index, options)
 
-        return _scanned(of_run, carry, steps, every)
+        return _scan_run(of_run, carry, steps, every)
 
     return batch.each(one, carry)
 
 
-def _scanned(step: Callable, carry: Any, steps: int, every: int | None) -> tuple[Any, Any]:
-    """One run's steps; the step is compiled once, so what is not to be kept is made and thrown
-    away.
+def _scan_run(step: Callable, carry: Any, steps: int, every: int | None) -> tuple[Any, Any]:
+    """All steps of one run.  The step is compiled once, so records that are not kept are computed,
+    too, and overwritten.
     """
     if every is None:
         return jax.lax.scan(
@@ -86,7 +85,7 @@ def checkpointed(
     """
     if every is not None or isinstance(step, LinearizationStep):
         return scan(step, batch, carry, steps, every)
-    inner, blocks = plan.checkpoint_edge(steps)
+    inner, blocks = thresholds.checkpoint_edge(steps)
     options = StepOptions(batch.layout.rolled)
 
     def one(inputs, carry):
@@ -138,34 +137,39 @@ def program_of(step: Any, batch: Batch, carry: Any) -> CompiledStep:
     # A derivative's literal zero says "does not depend".
     sparse = is_derivative(step)
     shapes = Shapes.of(leaves.shared), Shapes.of(leaves.per_run, 1), Shapes.of(flat, 1)
-    return compile_step(function, np.dtype(batch.dtype), *shapes, plan.LIMITS, sparse, batch.known)
+    return compile_step(
+        function,
+        np.dtype(batch.dtype),
+        *shapes,
+        thresholds.LOWERING_LIMITS,
+        sparse,
+        batch.known,
+    )
 
 
-def lowered_on(
-    run_program: Callable[..., tuple[Packed, list[jax.Array]]],
-    pack: Callable = pack,
-    unpack: Callable = unpack,
-) -> Loop:
-    """The executor that runs a step's scalar program by `run_program` (`native.run`, `gpu.run`,
-    `xla.run`), between `pack` and `unpack`.
+def kernel_loop(executor: Executor, **options: Any) -> StepLoop:
+    """The loop of an executor over a step's scalar program.
+
+    Args:
+      executor: what runs the program.
+      options: further arguments of `executor.run`.
     """
 
-    def executor(
-        step: Any, batch: Batch, carry: Any, steps: int, every: int | None
-    ) -> tuple[Any, Any]:
-        found, runs, dtype = program_of(step, batch, carry), batch.runs or 1, batch.dtype
+    def loop(step: Any, batch: Batch, carry: Any, steps: int, every: int | None) -> tuple[Any, Any]:
+        found, runs = program_of(step, batch, carry), batch.runs or 1
         flat, treedef = jax.tree.flatten(carry)
         shapes = Shapes.of(flat, 1)
-        shared = pack(
-            [x[None] for x in batch.leaves.shared], Shapes.of(batch.leaves.shared), dtype, 1
-        ).floats[:, 0]
-        per_run = pack(batch.leaves.per_run, Shapes.of(batch.leaves.per_run, 1), dtype, runs).floats
-        after, arrays = run_program(
-            found.program, shared, per_run, pack(flat, shapes, dtype, runs), steps, every
+        pack = partial(executor.pack, dtype=batch.dtype)
+        shared, per_run = batch.leaves.shared, batch.leaves.per_run
+        shared_numbers = pack([x[None] for x in shared], Shapes.of(shared), runs=1).floats[:, 0]
+        numbers_per_run = pack(per_run, Shapes.of(per_run, 1), runs=runs).floats
+        before = pack(flat, shapes, runs=runs)
+        after, arrays = executor.run(
+            found.program, shared_numbers, numbers_per_run, before, steps, every, **options
         )
         records = ()
         if every:
             records = unpacked_records(found.records, arrays)
-        return jax.tree.unflatten(treedef, unpack(after, shapes, runs)), records
+        return jax.tree.unflatten(treedef, executor.unpack(after, shapes, runs)), records
 
-    return executor
+    return loop
