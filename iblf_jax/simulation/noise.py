@@ -78,7 +78,8 @@ def _pair(key: list[jax.Array], sample: jax.Array, pair: int, dtype) -> list[jax
         x = [_upper(b) ^ x[1] ^ k[0], b & low, _upper(a) ^ x[3] ^ k[1], a & low]
         k = [(k[0] + WEYL[0]) & low, (k[1] + WEYL[1]) & low]
     first, second = (
-        (x[i].astype(dtype) * WORD + x[i + 1].astype(dtype) + 0.5) / (WORD * WORD) for i in (0, 2)
+        (x[i].astype(dtype) * WORD + x[i + 1].astype(dtype) + 0.5) / float(WORD * WORD)
+        for i in (0, 2)
     )
     size, angle = jnp.sqrt(-2.0 * jnp.log(first)), 2.0 * np.pi * second
     return [size * jnp.cos(angle), size * jnp.sin(angle)]

@@ -7,7 +7,6 @@ that step in two.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from typing import NamedTuple
 
@@ -87,14 +86,6 @@ class Sampling:
     def needed(self) -> int:
         """Largest number of commands in transit at once."""
         return commands_in_transit(float(self.delay), float(self.period))
-
-    def with_needed_queue(self) -> Sampling:
-        """The sampling with a queue that is long enough for its delay, which may have changed since
-        it was constructed.
-        """
-        if self.queue >= self.needed:
-            return self
-        return dataclasses.replace(self, queue=self.needed)
 
 
 def commands_in_transit(delay: float, period: float) -> int:
