@@ -37,7 +37,7 @@ import iblf_jax as ij
 from iblf_jax.core import devices
 from iblf_jax.engine import RunRequest
 from iblf_jax.engine.execute import run_batch
-from iblf_jax.engine.mechanism import mechanism_of
+from iblf_jax.engine.structural_constants import robot_constants
 from iblf_jax.kernels import toolchain
 from iblf_jax.simulation.metrics import as_folds
 from iblf_jax.simulation.scenario import canonical
@@ -58,7 +58,7 @@ def native(dtype: str, metrics, runs: int, steps: int, method: str) -> tuple[flo
     scenario = canonical(ij.astype(ij.presets.iiwa14(), dtype))
     folds, run = (
         as_folds(metrics, dtype, scenario),
-        RunRequest(steps, method, constants=mechanism_of(scenario), backend="native"),
+        RunRequest(steps, method, constants=robot_constants(scenario), backend="native"),
     )
     values, dt = {"initial.q": jnp.asarray(starts(scenario, runs), dtype)}, jnp.asarray(DT, dtype)
     seconds, call = compile_seconds(

@@ -40,7 +40,7 @@ from iblf_jax import kernels
 from iblf_jax.core import devices
 from iblf_jax.engine import RunRequest
 from iblf_jax.engine.execute import run_batch, run_batch_jvp
-from iblf_jax.engine.mechanism import mechanism_of
+from iblf_jax.engine.structural_constants import robot_constants
 from iblf_jax.kernels import toolchain
 from iblf_jax.simulation.metrics import standard
 from iblf_jax.simulation.scenario import canonical
@@ -256,7 +256,7 @@ def rows_of(scenario, dtype: str, loop: str, method: str) -> list[Row]:
     """What is measured on a loop."""
     folds, mechanism = (
         jax.tree.map(lambda x: jnp.asarray(x, dtype), standard()),
-        mechanism_of(scenario),
+        robot_constants(scenario),
     )
 
     def on(backend, folds=folds):

@@ -59,7 +59,7 @@ import iblf_jax as ij
 from iblf_jax import barriers, bounds, controllers, disturbances, observers, references, robots
 from iblf_jax.engine import RunRequest
 from iblf_jax.engine.execute import run_batch
-from iblf_jax.engine.mechanism import mechanism_of
+from iblf_jax.engine.structural_constants import robot_constants
 from iblf_jax.simulation.scenario import canonical
 from iblf_jax.studies.cube import bounded
 from iblf_jax.tuning import TuningProblem, _falsify, evaluation
@@ -670,7 +670,7 @@ def margins_of(scenario: ij.Scenario, sets: dict[str, Any], timing: dict[str, fl
     scenario = canonical(scenario)
     cube = bounded(scenario, sets)
     run = RunRequest(
-        round(timing["duration"] / timing["dt"]), "rk4", constants=mechanism_of(scenario)
+        round(timing["duration"] / timing["dt"]), "rk4", constants=robot_constants(scenario)
     )
     fold = jax.tree.map(jnp.asarray, Quantities((Peak(1.0, "deficit"),)))
 
@@ -679,7 +679,7 @@ def margins_of(scenario: ij.Scenario, sets: dict[str, Any], timing: dict[str, fl
         outcome = run_batch(
             scenario, jax.vmap(cube.values)(u), (fold,), jnp.asarray(timing["dt"]), run
         )
-        fine = outcome.status & int(_falsify.NO_ANSWER) == 0
+        fine = outcome.status & int(_falsify.UNINFORMATIVE) == 0
         return jnp.where(fine, -outcome.metrics["tuning_exact"][:, 0], 1.0)
 
     return lambda u: np.asarray(found(jnp.asarray(u))), cube.size
@@ -738,7 +738,7 @@ def compare_attacks(name: str, quick: bool) -> list[list[Any]]:
         ]
     ]
     random = ij.monte_carlo(scenario, sets, runs=least, seed=99, progress=False, **timing)
-    fine = np.asarray(random.status) & int(_falsify.NO_ANSWER) == 0
+    fine = np.asarray(random.status) & int(_falsify.UNINFORMATIVE) == 0
     drawn = np.where(fine, np.asarray(random.metrics.margin).reshape(least, -1).min(axis=1), np.inf)
     for many in (1,) if quick else (1, 4, 8):
         best = drawn[: least // (many * size) * many * size].reshape(-1, many * size).min(axis=1)

@@ -2,7 +2,7 @@
 and a search for states that break them (`counterexample`).
 
     certify -> run_summary.summarise -> reconstruction.steps_of -> proof_terms, engine
-            -> theorem_lines, further_lines -> lines
+            -> rate_lines, theorem_lines, decay_lines, law_claim_lines -> lines
             -> result.Certificate
 """
 

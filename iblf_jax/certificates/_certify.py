@@ -1,27 +1,27 @@
 """`certify`: checks one run, a batch of runs or a study against Theorem 2.
 
-The stages are: `_request` checks what the caller passed; `_certificate_of` takes one run through
+`certify` checks what the caller passed and lists the runs. `_certificate_of` takes one run through
 its summary and its segments (`run_summary`, which runs the engine), the lines about them
-(`theorem_lines`, `further_lines`) and the traces; `_over_runs` combines the certificates of many
-runs.
+(`rate_lines`, `theorem_lines`, `decay_lines`, `law_claim_lines`) and the traces. `_over_runs`
+combines the certificates of many runs.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
-from typing import Any, NamedTuple
+from collections.abc import Iterable, Iterator
+from typing import Any
 
 import jax
 import numpy as np
 
-from iblf_jax.certificates import further_lines, lines, theorem_lines
+from iblf_jax.certificates import decay_lines, law_claim_lines, lines, rate_lines, theorem_lines
 from iblf_jax.certificates.claims import own_claim
-from iblf_jax.certificates.lines import FAILS, NOT_APPLICABLE, Line, Statement
+from iblf_jax.certificates.lines import FAILS, NOT_APPLICABLE, Line, Statement, not_applicable
 from iblf_jax.certificates.optional import optional_member
 from iblf_jax.certificates.reconstruction import is_valid, time_grid
 from iblf_jax.certificates.result import Certificate, Traces
-from iblf_jax.certificates.run_summary import RunSummary, Segment, summarise
+from iblf_jax.certificates.run_summary import THEOREM, WEIGHTED, RunSummary, Segment, summarise
 from iblf_jax.control import actuators, sensors
 from iblf_jax.core import checks, notices
 from iblf_jax.core.optional import has_members
@@ -83,63 +83,39 @@ def certify(
     Source: Zhang & Yan 2024, Theorem 2 and its proof, (3.16)-(3.31).
     """
     scenario = canonical(scenario)
-    _check_certifiable(scenario)
+    if not checks.is_concrete(scenario):
+        remedy = "certify works on the host: call it outside jit, vmap and grad."
+        raise checks.fail("scenario", "traced values", "numbers", remedy)
+    own_claim(scenario)  # refuses half of a claim before a run is made
     if run is None:
         every = 1 + checks.whole_steps(duration, dt) // MAX_RECORDED
         run = simulate(scenario, duration=duration, dt=dt, method=method, record_every=every)
-    request = _request(scenario, run, worst)
-    if request.many:
-        return _over_runs(request.runs)
-    _, single = next(iter(request.runs))
-    return _certificate_of(single)
-
-
-# --- the request ---------------------------------------------------------------------------------
-
-
-class _Request(NamedTuple):
-    """The runs to check."""
-
-    runs: Iterable[tuple[int, Rollout]]
-    """Index and run, its arrays on the host."""
-    many: bool
-    """Whether the certificate is about many runs."""
-
-
-def _check_certifiable(scenario: Scenario) -> None:
-    """Raises ValueError for a traced scenario, or a law that states half of a claim."""
-    if not checks.is_concrete(scenario):
-        raise checks.fail(
-            "scenario",
-            "traced values",
-            "numbers",
-            "certify works on the host: call it outside jit, vmap and grad.",
-        )
-    own_claim(scenario)
-
-
-def _request(scenario: Scenario, run: Any, worst: int | None) -> _Request:
-    """The runs to check; ValueError for a run of another scenario, or something that is no run."""
     if worst is not None:
         worst = checks.positive_integer("worst", worst)
     if isinstance(run, Rollout):
         _check_same(scenario, run.scenario, numbers=not run.is_batch)
-        on_host = _on_host(run)
+        run = _on_host(run)
         if not run.is_batch:
-            return _Request([(0, on_host)], many=False)
-        return _Request(((i, on_host[i]) for i in range(len(run))), many=True)
-    if has_members(run, "replay", "metrics", "__len__"):
-        nominal = optional_member(run, "scenario")
-        if nominal is not None:
-            _check_same(scenario, canonical(nominal), numbers=True)
-        indices = _nearest_to_bounds(run, worst)
-        return _Request(((i, _on_host(_replayed(run, i))) for i in indices), many=True)
-    raise checks.fail(
-        "run",
-        run,
-        "a Rollout, a study or None",
-        "Pass what ij.simulate or ij.monte_carlo returned.",
-    )
+            return _certificate_of(run)
+        return _over_runs((i, run[i]) for i in range(len(run)))
+    return _over_runs(_runs_of_study(scenario, run, worst))
+
+
+# --- the runs ------------------------------------------------------------------------------------
+
+
+def _runs_of_study(
+    scenario: Scenario, study: Any, worst: int | None
+) -> Iterator[tuple[int, Rollout]]:
+    """The runs of a study to check; ValueError for a study of another scenario."""
+    if not has_members(study, "replay", "metrics", "__len__"):
+        remedy = "Pass what ij.simulate or ij.monte_carlo returned."
+        raise checks.fail("run", study, "a Rollout, a study or None", remedy)
+    nominal = optional_member(study, "scenario")
+    if nominal is not None:
+        _check_same(scenario, canonical(nominal), numbers=True)
+    for index in _nearest_to_bounds(study, worst):
+        yield index, _replayed(study, index)
 
 
 def _on_host(run: Rollout) -> Rollout:
@@ -152,12 +128,13 @@ def _check_same(scenario: Scenario, of_run: Scenario, *, numbers: bool) -> None:
     batch may differ.
     """
     structure: Any = jax.tree.structure(scenario)
-    got = ""
+    got = "a run of a scenario with other numbers"
+    same = not numbers
     if structure != jax.tree.structure(of_run):
-        got = "a run of another kind of scenario"
-    elif numbers and not all(map(np.array_equal, *map(jax.tree.leaves, (scenario, of_run)))):
-        got = "a run of a scenario with other numbers"
-    if got:
+        got, same = "a run of another kind of scenario", False
+    elif numbers:
+        same = all(map(np.array_equal, jax.tree.leaves(scenario), jax.tree.leaves(of_run)))
+    if not same:
         remedy = "Pass run.scenario as the scenario."
         raise checks.fail("run", got, "a run of `scenario`", remedy)
 
@@ -185,14 +162,14 @@ def _nearest_to_bounds(study: Any, worst: int | None) -> list[int]:
 
 
 def _replayed(study: Any, index: int) -> Rollout:
-    """One run of a study, with a bounded number of recorded samples."""
+    """One run of a study on the host, with a bounded number of recorded samples."""
     duration, dt = optional_member(study, "duration"), optional_member(study, "dt")
-    if duration is None or dt is None:
-        return study.replay(index)
-    steps = round(duration / dt)
-    if steps <= MAX_RECORDED:
-        return study.replay(index)
-    return study.replay(index, record_every=1 + steps // MAX_RECORDED)
+    options = {}
+    if duration is not None and dt is not None:
+        steps = round(duration / dt)
+        if steps > MAX_RECORDED:
+            options["record_every"] = 1 + steps // MAX_RECORDED
+    return _on_host(study.replay(index, **options))
 
 
 # --- one run -------------------------------------------------------------------------------------
@@ -209,8 +186,9 @@ def _certificate_of(run: Rollout) -> Certificate:
     traces = []
     for segment in segments:
         of_theorem, found = theorem_lines.segment_lines(segment)
-        checked += [*further_lines.own_segment_lines(segment), *of_theorem]
-        weighted += further_lines.weighted_segment_lines(segment)
+        checked += [*law_claim_lines.own_segment_lines(segment), *of_theorem]
+        if not summary.claims.no_weights:
+            weighted += decay_lines.decay_lines(segment, WEIGHTED)
         for name, share in found.items():
             shares[name] = max(share, shares.get(name, 0.0))
         traces.append(_traces(segment))
@@ -221,9 +199,9 @@ def _certificate_of(run: Rollout) -> Certificate:
     assumptions = [by_name.pop(name) for name in theorem_lines.ASSUMPTIONS if name in by_name]
     all_lines = (
         *assumptions,
-        *theorem_lines.run_lines(summary),
+        *rate_lines.rate_lines(summary),
         *by_name.values(),
-        *further_lines.weighted_run_lines(summary),
+        *rate_lines.weighted_rate_lines(summary),
         *_merged(weighted).values(),
     )
     return Certificate(
@@ -258,9 +236,9 @@ def _heading(scenario: Scenario) -> str:
 def _numbers(summary: RunSummary) -> dict[str, Any]:
     """The constants of the claims."""
     rho = {f"rho_{domain}_case_{case}": value for (case, domain), value in summary.rho.items()}
-    weights = {
+    weighted = {
         f"{name}_weighted_case_{case}": value
-        for case, chosen in summary.weights.items()
+        for case, chosen in summary.weighted_constants.items()
         for name, value in chosen._asdict().items()
     }
     return {
@@ -279,7 +257,7 @@ def _numbers(summary: RunSummary) -> dict[str, Any]:
         "q_of_lambda_max_box": summary.over_box.q_max,
         "jump_times": summary.jumps,
         "lambda_min_K2_over_M0_run": summary.slowest,
-        **weights,
+        **weighted,
         "samples": summary.samples,
         "samples_left_out": summary.excluded,
     }
@@ -291,33 +269,45 @@ def _traces(segment: Segment) -> Traces:
 
     For a law that has only a claim about itself, V and the left side are those of that claim.
     """
-    sample, proof, case = segment.sample, segment.proof, segment.summary.theorem_case
-    V, dropped = proof.V, proof.dropped_e2 + proof.dropped_f
-    envelope = left = e2_bound = f_tilde_bound = np.full(segment.t.shape, np.nan)
-    xi_bound = np.full(sample.q.shape, np.nan)
+    summary, sample, proof = segment.summary, segment.sample, segment.proof
+    case = summary.theorem_case
+    traces = _unclaimed_traces(segment.t, proof.V, sample.xi, proof.e2, proof.f_tilde)
+    traces = traces._replace(dropped=proof.dropped_e2 + proof.dropped_f, excluded=proof.excluded)
+    left = traces.left
     if case is not None:
-        envelope, left = segment.envelope[case].bound, theorem_lines.left_side(segment, case)
-        bounds = theorem_lines.bounds_along(segment, envelope)
-        xi_bound, e2_bound = bounds["xi, by V1"], bounds["e2"]
-        f_tilde_bound = bounds["f_tilde"]
-    elif segment.summary.claims.own is not None and not further_lines.why_not_own(segment.summary):
-        V, left = proof.own.V, further_lines.own_left_side(proof)
-        dropped = np.zeros_like(left)
-    traces = Traces(
-        t=segment.t,
-        V=V,
-        envelope=envelope,
-        left=np.where(proof.excluded, np.nan, left),
-        dropped=dropped,
-        xi=sample.xi,
-        xi_bound=xi_bound,
-        e2=np.linalg.norm(proof.e2, axis=1),
-        e2_bound=e2_bound,
-        f_tilde=np.linalg.norm(proof.f_tilde, axis=1),
-        f_tilde_bound=f_tilde_bound,
-        excluded=proof.excluded,
-    )
+        envelope = segment.envelopes[THEOREM, case].bound
+        left = decay_lines.left_side(segment, THEOREM, case)
+        bounds = decay_lines.bounds_along(segment, envelope)
+        traces = traces._replace(
+            envelope=envelope,
+            xi_bound=bounds["xi, by V1"],
+            e2_bound=bounds["e2"],
+            f_tilde_bound=bounds["f_tilde"],
+        )
+    elif summary.claims.own is not None and not law_claim_lines.why_not_own(summary):
+        left = law_claim_lines.own_left_side(proof)
+        traces = traces._replace(V=proof.own.V, dropped=np.zeros_like(left))
+    traces = traces._replace(left=np.where(proof.excluded, np.nan, left))
     return Traces(*(x[segment.recorded] for x in traces))
+
+
+def _unclaimed_traces(t: Any, V: Any, xi: Any, e2: Any, f_tilde: Any) -> Traces:
+    """The curves of samples of which nothing is claimed."""
+    nan = np.full(t.shape, np.nan)
+    return Traces(
+        t=t,
+        V=V,
+        envelope=nan,
+        left=nan,
+        dropped=nan,
+        xi=xi,
+        xi_bound=np.full(xi.shape, np.nan),
+        e2=np.linalg.norm(e2, axis=1),
+        e2_bound=nan,
+        f_tilde=np.linalg.norm(f_tilde, axis=1),
+        f_tilde_bound=nan,
+        excluded=np.ones(t.shape, bool),
+    )
 
 
 # --- one run of a sampled loop -------------------------------------------------------------------
@@ -348,7 +338,7 @@ def _certificate_of_sampled(run: Rollout) -> Certificate:
         _heading(scenario),
         (*unclaimed, *_compared(run, continuous)),
         certificate.numbers,
-        _sampled_traces(run),
+        _unclaimed_traces(run.t, run.V, run.xi, run.e2, run.disturbance - run.disturbance_estimate),
         joints=joint_names(scenario.plant, run.n),
     )
 
@@ -359,48 +349,28 @@ def _compared(run: Rollout, continuous: Rollout) -> tuple[Line, Line]:
     at = int(np.argmax(V_excess))
     margin_excess = _margins(run) - _margins(continuous)
     joint = int(np.argmin(margin_excess))
-    V_line = Statement(
+    by_V = Statement(
         "V2, sampled less continuous",
         "(3.12)",
         "max over t of V2 of this run less V2 of the continuous one",
     )
-    margin_line = Statement(
+    by_margin = Statement(
         "margin, sampled less continuous",
         "(2.2)",
         "smallest distance to a bound, less that of the continuous run",
         "rad",
     )
-    measured: dict[str, Any] = {"note": MEASURED, "counts": False}
+    V_line = not_applicable(by_V, MEASURED, counts=False)
+    margin_line = not_applicable(by_margin, MEASURED, counts=False)
     return (
-        V_line.line(NOT_APPLICABLE, value=float(V_excess[at]), time=float(run.t[at]), **measured),
-        margin_line.line(
-            NOT_APPLICABLE, value=float(margin_excess[joint]), joint=joint, **measured
-        ),
+        dataclasses.replace(V_line, value=float(V_excess[at]), time=float(run.t[at])),
+        dataclasses.replace(margin_line, value=float(margin_excess[joint]), joint=joint),
     )
 
 
 def _margins(run: Rollout) -> np.ndarray:
     """Smallest distance of each joint to a bound at the recorded samples, (n,) [rad]."""
     return np.min(np.minimum(run.q - run.lower, run.upper - run.q), axis=0)
-
-
-def _sampled_traces(run: Rollout) -> Traces:
-    """The curves of a sampled run, of which nothing is claimed."""
-    nan = np.full(run.t.shape, np.nan)
-    return Traces(
-        t=np.asarray(run.t),
-        V=np.asarray(run.V),
-        envelope=nan,
-        left=nan,
-        dropped=nan,
-        xi=np.asarray(run.xi),
-        xi_bound=np.full(run.xi.shape, np.nan),
-        e2=np.linalg.norm(run.e2, axis=1),
-        e2_bound=nan,
-        f_tilde=np.linalg.norm(run.disturbance - run.disturbance_estimate, axis=1),
-        f_tilde_bound=nan,
-        excluded=np.ones(run.t.shape, bool),
-    )
 
 
 # --- many runs -----------------------------------------------------------------------------------

@@ -52,15 +52,10 @@ class Counterexample(NamedTuple):
     claim."""
 
 
-def relative_growth(scenario: Scenario) -> jax.Array:
-    """The growth g = (V2' - 1/2 |f'|^2) / Q at the start of a scenario, ().
-    (3.24)
-    """
-    return _growth(scenario)[0]
-
-
 def _growth(scenario: Scenario) -> tuple[jax.Array, jax.Array]:
-    """The growth at the start, and whether the claim excludes the start."""
+    """The growth g = (V2' - 1/2 |f'|^2) / Q at the start of a scenario, (), and whether the claim
+    excludes the start.                                                                   (3.24)
+    """
     proof = terms_at(scenario, jnp.zeros((), scenario.initial.q.dtype), initial_state(scenario))
     constants: Any = claims.constants_of(scenario)
     M0 = scenario.model.mass_matrix(scenario.initial.q)

@@ -32,7 +32,7 @@ f_tilde . f' <= (b/2) |f_tilde|^2 + |f'|^2/(2 b), and integrates to
     V_w(t) <= V_w(0) exp(-rho t) + rho2/rho,   rho2 = w_f F_d^2/(2 b),   w_i V1_i <= V_w.      (W.3)
 
 The paper has w_i = w_f = 1 and a = 1/(2 K2), hence its conditions K2 > 1/2 and kf > 1/2: below them
-its envelope is lost, but stability is not. Here a, b and w_f are free, and `best_weights` chooses
+its envelope is lost, but stability is not. Here a, b and w_f are free, and `best_constants` chooses
 those with the smallest mean of (W.3) over a run.
 
 **The claim of a law about itself** (`controllers.LyapunovLaw`): a law may state a Lyapunov function
@@ -66,7 +66,7 @@ LOWEST_FULL = {1: 0.0, 2: 0.5}
 OWN_CLAIM_METHODS = ("lyapunov", "decay")
 """Methods of a law that states a claim about itself."""
 GRID = np.linspace(0.02, 0.98, 97)
-"""Fractions of the largest rate, and of the largest b for a rate, that `best_weights` tries."""
+"""Fractions of the largest rate, and of the largest b for a rate, that `best_constants` tries."""
 
 
 class Claim(NamedTuple):
@@ -100,8 +100,8 @@ class Claims(NamedTuple):
     """Why neither applies; "" if one does."""
     bounds_velocities: bool
     """Whether the law is a `FullState`."""
-    has_weights: bool
-    """Whether the claim with weights applies."""
+    no_weights: str
+    """Why the claim with weights does not apply; "" if it does."""
     other_weights: bool
     """Whether the barriers have weights other than the paper's, which are 1."""
     own: LyapunovLaw | None
@@ -118,12 +118,15 @@ def claims_of(scenario: Scenario) -> Claims:
     no_theorem = why_no_theorem(scenario)
     weight = optional_member(law, "weight")
     is_corrected = isinstance(law, Backstepping) and law.reading == "corrected"
+    no_weights = "the claim with weights is about the corrected law with a momentum observer"
+    if is_corrected and isinstance(scenario.observer, Momentum) and not no_theorem:
+        no_weights = ""
     return Claims(
         law=law,
         constants=None if no_theorem else constants_of(scenario),
         no_theorem=no_theorem,
         bounds_velocities=isinstance(law, FullState),
-        has_weights=is_corrected and isinstance(scenario.observer, Momentum) and not no_theorem,
+        no_weights=no_weights,
         other_weights=weight is not None and bool(np.any(np.asarray(weight) != 1.0)),
         own=own_claim(scenario),
     )
@@ -211,7 +214,7 @@ def rho_terms(
 # --- the claim with weights ----------------------------------------------------------------------
 
 
-class Weights(NamedTuple):
+class WeightedConstants(NamedTuple):
     """The free numbers of the claim with weights, and the resulting rates."""
 
     a: float
@@ -243,7 +246,7 @@ def weighted_rate_terms(
     return np.array([np.min(decay), by_K2, by_kf])
 
 
-def best_weights(
+def best_constants(
     constants: Claim,
     slowest: float,
     V_rest: float,
@@ -251,9 +254,9 @@ def best_weights(
     F_d: float,
     duration: float,
     case: int,
-) -> Weights | None:
-    """The weights with the smallest mean of the envelope (W.3) over a run; None if its numbers are
-    not finite.
+) -> WeightedConstants | None:
+    """The constants with the smallest mean of the envelope (W.3) over a run; None if the numbers of
+    the run are not finite.
 
     For each rho and b of a grid it takes the largest a that (W.2) allows, then the smallest w_f.
 
@@ -275,15 +278,15 @@ def best_weights(
     a = 1.0 - rho / (2.0 * slowest)
     fractions = {1: np.zeros((1, 1)), 2: GRID[None, :]}[case]
     b = 2.0 * (np.min(kf) - rho / 2.0) * fractions
-    room = kf - (b + rho)[..., None] / 2.0
-    w_f = np.max(0.25 / (a[..., None] * K2 * room), axis=-1)
+    kf_margin = kf - (b + rho)[..., None] / 2.0
+    w_f = np.max(0.25 / (a[..., None] * K2 * kf_margin), axis=-1)
     rho2 = np.zeros_like(w_f)
     if case == 2:
         rho2 = w_f * F_d**2 / (2.0 * b)
     mean_decay = -np.expm1(-rho * duration) / (rho * duration)
     mean = (V_rest + w_f * half_square) * mean_decay + rho2 / rho
     row, column = np.unravel_index(np.argmin(mean), mean.shape)
-    return Weights(
+    return WeightedConstants(
         a=float(a[row, 0]),
         b=float(b[row, column]),
         w_f=float(w_f[row, column]),

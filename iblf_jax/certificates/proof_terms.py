@@ -69,7 +69,7 @@ class FullTerms(NamedTuple):
     """e2 relative to its bound, (n,) [1]."""
     bound: jax.Array
     """K of each joint's side, (n,) [rad/s]."""
-    room: jax.Array
+    alpha_distance: jax.Array
     """Distance of alpha to the velocity bounds, (n,) [rad/s]."""
 
 
@@ -209,7 +209,7 @@ def terms_and_sample(
     if isinstance(unwrapped(scenario.controller), FullState):
         proof["full"] = _full_terms(scenario, t, state, M0, rates, f_tilde)
         # e2 has no tube where alpha is outside the velocity bounds.
-        proof["excluded"] |= jnp.any(proof["full"].room <= NARROWEST)
+        proof["excluded"] |= jnp.any(proof["full"].alpha_distance <= NARROWEST)
     return proof, M0, sample
 
 
@@ -295,8 +295,8 @@ def _full_terms(
             decays = decays + stated * value
     left = barriers_rate + jnp.sum(decays) - s2 @ solve_spd(M0, f_tilde) + jnp.sum(law.c * s2**2)
     above = state.dq > inner.q_d
-    room = jnp.minimum(inner.q_d - inner.lower, inner.upper - inner.q_d)
-    return FullTerms(left, inner.xi(state.dq), jnp.where(above, inner.k_u, inner.k_l), room)
+    distance = jnp.minimum(inner.q_d - inner.lower, inner.upper - inner.q_d)
+    return FullTerms(left, inner.xi(state.dq), jnp.where(above, inner.k_u, inner.k_l), distance)
 
 
 # --- sizes of the terms, for rounding ------------------------------------------------------------

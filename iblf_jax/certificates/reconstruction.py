@@ -219,8 +219,8 @@ class AdvanceStep:
             rolled=form.rolled,
         )
         f_tilde = result.first.disturbance - result.first.disturbance_estimate
-        levels = (result.first.V, 0.5 * jnp.sum(f_tilde**2))
-        return at._replace(state=result.state), (at.state, levels)
+        energies = (result.first.V, 0.5 * jnp.sum(f_tilde**2))
+        return at._replace(state=result.state), (at.state, energies)
 
 
 def _positions(index: np.ndarray, states: LoopState, dt: Any, parts: int = 1) -> Position:
@@ -278,13 +278,13 @@ def proof_along(
     # which V2 has fallen below what the integrator resolves. Both are advanced three times, so that
     # they are one call of one program.
     both = jax.tree.map(lambda *xs: np.concatenate(xs), full, halves)
-    levels = run_from(scenario, dt, both, step=AdvanceStep(method), steps=3)[1][1]
+    energies = run_from(scenario, dt, both, step=AdvanceStep(method), steps=3)[1][1]
     terms: dict[str, Any]
     terms, M0, sample = jax.tree.map(lambda x: np.asarray(x)[:, 0], found)
     eigenvalues = _eigenvalues(M0)
     terms["lambda_min"], terms["lambda_max"] = eigenvalues[:, 0], eigenvalues[:, -1]
     terms["slowest"] = 1.0 / _eigenvalues(np.asarray(mass_over_gain(scenario, M0)))[:, -1]
-    return ProofTerms(**terms), sample, *map(_defect, levels)
+    return ProofTerms(**terms), sample, *map(_defect, energies)
 
 
 def _eigenvalues(matrices: np.ndarray) -> np.ndarray:
@@ -296,11 +296,11 @@ def _eigenvalues(matrices: np.ndarray) -> np.ndarray:
     return np.where(finite[..., 0], np.linalg.eigvalsh(np.where(finite, matrices, unit)), np.nan)
 
 
-def _defect(level: jax.Array) -> np.ndarray:
-    """Difference of a level after one step and after two half steps, (T,), from its values along
+def _defect(energy: jax.Array) -> np.ndarray:
+    """Difference of an energy after one step and after two half steps, (T,), from its values along
     both, (2 T, 3); twice, for safety.
     """
-    full, halves = np.split(np.asarray(level), 2)
+    full, halves = np.split(np.asarray(energy), 2)
     return 2.0 * np.abs(full[:, 1] - halves[:, 2])
 
 
@@ -370,18 +370,18 @@ def _compare(
     )
 
 
-def check_status(run: Any, margin: float) -> None:
-    """Raises ValueError if the status of a run and the smallest margin of all steps [rad]
-    contradict each other beyond rounding.
+def check_status(run: Any, distance: float) -> None:
+    """Raises ValueError if the status of a run contradicts the smallest distance to a bound over
+    all its steps [rad] beyond rounding.
     """
     flagged = bool(int(run.status) & int(Status.BOUND_VIOLATED))
     # Without the number of steps, the run may have left its bounds after its last sample.
-    after_last_sample = flagged and margin > 0 and run.steps is None
-    agrees = flagged == (not margin > 0)
-    if agrees or after_last_sample or abs(margin) <= tolerances(run)["position"]:
+    after_last_sample = flagged and distance > 0 and run.steps is None
+    agrees = flagged == (not distance > 0)
+    if agrees or after_last_sample or abs(distance) <= tolerances(run)["position"]:
         return
     remedy = (
-        f"All its steps, integrated again, have a smallest margin of {margin:.3g} rad. Simulate it"
-        " again."
+        f"All its steps, integrated again, have a smallest margin of {distance:.3g} rad. Simulate"
+        " it again."
     )
     raise checks.fail("run.status", describe(int(run.status)), "the status of run.scenario", remedy)

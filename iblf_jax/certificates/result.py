@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import dataclasses
 import html
-import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -197,7 +196,7 @@ class Certificate:
         """Heading, verdict, constants and lines as plain numbers, strings and lists, for strict
         JSON (no NaN, no infinity).
         """
-        return _for_json({
+        return tables.for_json({
             "heading": self.heading,
             "verdict": self.verdict,
             "runs": list(self.runs),
@@ -231,16 +230,3 @@ def _number(value: float | None, unit: str) -> str:
     if unit == "1":
         return f"{value:.4g}"
     return f"{value:.4g} {unit}"
-
-
-def _for_json(value: Any) -> Any:
-    """`value` with arrays as lists, NumPy numbers as Python's, and non-finite numbers as None."""
-    if isinstance(value, dict):
-        return {str(key): _for_json(x) for key, x in value.items()}
-    if isinstance(value, list | tuple):
-        return [_for_json(x) for x in value]
-    if isinstance(value, np.ndarray | np.generic):
-        return _for_json(value.tolist())
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return value

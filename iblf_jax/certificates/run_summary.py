@@ -24,8 +24,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from iblf_jax.certificates import claims
-from iblf_jax.certificates.claims import CASES, Claims, Weights
+from iblf_jax.certificates.claims import CASES, Claims, WeightedConstants
 from iblf_jax.certificates.eigenvalues import Extremes, eigenvalues_over
+from iblf_jax.certificates.lines import join_notes
 from iblf_jax.certificates.proof_terms import rounding
 from iblf_jax.certificates.reconstruction import (
     Steps,
@@ -43,6 +44,8 @@ ENERGY_ROUNDING = 32.0
 """Rounding error of sqrt(2 V2) in units of the last place, relative to the sizes of its terms."""
 CONDITION = {1: "(3.17)", 2: "(3.25)"}
 """Gain condition of each case."""
+THEOREM, WEIGHTED = "theorem", "weighted"
+"""Kinds of a claimed decay: that of Theorem 2 (and F.3), and the claim with weights."""
 ALWAYS_EXCLUDED = "the guard or a torque limit was active all the time"
 
 
@@ -83,48 +86,47 @@ class RunSummary:
     """V2 at the first and at the last."""
     slowest: float
     """Smallest eigenvalue of M0^-1 K2 along the run [1/s]."""
-    weights: dict[int, Weights]
+    weighted_constants: dict[int, WeightedConstants]
     """The numbers of the claim with weights, by case, for a loop that has one."""
 
-    def why_not_theorem(self, case: int) -> str:
-        """Why the claim of a case of Theorem 2 does not apply to this run; "" if it does."""
-        if self.claims.no_theorem or self.invalid:
-            return self.claims.no_theorem or self.invalid
-        if case == 1 and self.case == 2:
-            return self._why_case_2()
-        if not self.rho[case, "run"] > 0:
-            if self.claims.bounds_velocities:
-                return "the gain conditions (F.3) are not met"
-            return f"the gain conditions {CONDITION[case]} are not met"
-        return self._why_excluded()
+    def why_not(self, kind: str, case: int) -> str:
+        """Why the claim of a case does not apply to this run; "" if it does.
 
-    def why_not_weighted(self, case: int) -> str:
-        """Why the claim with weights of a case does not apply to this run; "" if it does."""
-        if not self.claims.has_weights:
-            return "the claim with weights is about the corrected law with a momentum observer"
-        if self.invalid:
-            return self.invalid
+        Args:
+          kind: THEOREM or WEIGHTED.
+          case: 1 or 2.
+        """
+        unclaimed = self.claims.no_theorem
+        if kind == WEIGHTED:
+            unclaimed = self.claims.no_weights
+        if unclaimed or self.invalid:
+            return unclaimed or self.invalid
         if case == 1 and self.case == 2:
-            return self._why_case_2()
-        if case not in self.weights:
+            return f"case 1 is for f' = 0; here |f'| reaches {self.F_d:.4g} N m/s, see case 2"
+        if kind == WEIGHTED and case not in self.weighted_constants:
             return "the numbers of the run are not finite"
-        return self._why_excluded()
+        if kind == THEOREM and not self.rho[case, "run"] > 0:
+            condition = CONDITION[case]
+            if self.claims.bounds_velocities:
+                condition = "(F.3)"
+            return f"the gain conditions {condition} are not met"
+        if self.excluded == self.samples:
+            return ALWAYS_EXCLUDED
+        return ""
 
-    def _why_case_2(self) -> str:
-        return f"case 1 is for f' = 0; here |f'| reaches {self.F_d:.4g} N m/s, see case 2"
-
-    def _why_excluded(self) -> str:
-        return ALWAYS_EXCLUDED if self.excluded == self.samples else ""
+    def applicable_case(self, kind: str) -> int | None:
+        """The stronger case of a claim that applies to the run, or None."""
+        return next((case for case in CASES if not self.why_not(kind, case)), None)
 
     @property
     def theorem_case(self) -> int | None:
         """The stronger case of Theorem 2 that applies to the run, or None."""
-        return next((case for case in CASES if not self.why_not_theorem(case)), None)
+        return self.applicable_case(THEOREM)
 
     @property
     def weighted_case(self) -> int | None:
         """The stronger case of the claim with weights that applies to the run, or None."""
-        return next((case for case in CASES if not self.why_not_weighted(case)), None)
+        return self.applicable_case(WEIGHTED)
 
     @property
     def weights_replace_theorem(self) -> bool:
@@ -133,9 +135,52 @@ class RunSummary:
         """
         return self.claims.other_weights and self.weighted_case is not None
 
+    @property
+    def decays(self) -> dict[tuple[str, int], Decay]:
+        """The constants of every claimed decay, by kind and case."""
+        found = {}
+        if self.claims.constants is not None:
+            rho2 = {1: 0.0, 2: self.F_d**2 / 2}
+            for case in CASES:
+                found[THEOREM, case] = Decay(self.rho[case, "run"], rho2[case], 1.0, 0.5)
+        for case, chosen in self.weighted_constants.items():
+            gain = 0.0
+            if case == 2:
+                gain = chosen.w_f / (2.0 * chosen.b)
+            found[WEIGHTED, case] = Decay(chosen.rho, chosen.rho2, chosen.w_f, gain)
+        return found
+
+    @property
+    def exclusion_note(self) -> str:
+        """Which samples the claims exclude, and where they start again, in words."""
+        excluded = ""
+        if self.excluded:
+            why = "the guard or a torque limit was active"
+            if self.claims.bounds_velocities:
+                why = "alpha was outside, or the guard or a torque limit active"
+            excluded = f"{self.excluded} of {self.samples} samples are excluded: {why}"
+        restarts = ""
+        if self.jumps.size:
+            times = ", ".join(f"{x:.4g}" for x in self.jumps)
+            restarts = f"f jumps at t = {times} s, and the claim starts again there"
+        return join_notes(excluded, restarts)
+
+
+class Decay(NamedTuple):
+    """The constants of a claimed decay, V_w' <= -rho V_w + gain |f'|^2; V_w is V2 for w_f = 1."""
+
+    rho: float
+    """[1/s]."""
+    rho2: float
+    """gain F_d^2."""
+    w_f: float
+    """Weight of |f_tilde|^2 in the Lyapunov function."""
+    gain: float
+    """In case 2; case 1 has no f'."""
+
 
 class Envelope(NamedTuple):
-    """The bound on V2 along a segment, (T,) each; NaN where nothing is claimed."""
+    """The bound on V_w along a segment, (T,) each; NaN where nothing is claimed."""
 
     bound: np.ndarray
     """Right-hand side of (3.20) or (3.28)."""
@@ -152,10 +197,8 @@ class Segment(NamedTuple):
     sample: Any
     proof: Any
     recorded: np.ndarray
-    envelope: dict[int, Envelope]
-    """Envelope of V2, by case."""
-    weighted_envelope: dict[int, Envelope]
-    """Envelope of V_w, by case."""
+    envelopes: dict[tuple[str, int], Envelope]
+    """By kind and case."""
 
 
 def summarise(run: Any) -> tuple[RunSummary, Iterator[Segment]]:
@@ -178,7 +221,7 @@ class _Extrema:
     def __init__(self) -> None:
         self.low: Any = np.inf
         self.high: Any = -np.inf
-        self.margin = np.inf
+        self.bound_distance = np.inf
         self.F_m = -np.inf
         self.F_d = -np.inf
         self.lambda_min = np.inf
@@ -200,8 +243,8 @@ class _Extrema:
         self.V_end = proof.V[-1]
         self.low = np.minimum(self.low, sample.lower.min(axis=0))
         self.high = np.maximum(self.high, sample.upper.max(axis=0))
-        margin = np.minimum(sample.q - sample.lower, sample.upper - sample.q).min()
-        self.margin = np.minimum(self.margin, margin)
+        distance = np.minimum(sample.q - sample.lower, sample.upper - sample.q).min()
+        self.bound_distance = np.minimum(self.bound_distance, distance)
         self.F_m = np.maximum(self.F_m, np.linalg.norm(proof.f, axis=1).max())
         self.F_d = np.maximum(self.F_d, np.linalg.norm(proof.df, axis=1).max())
         self.lambda_min = np.minimum(self.lambda_min, proof.lambda_min.min())
@@ -219,7 +262,7 @@ def _summary(run: Any, grid: TimeGrid, all_steps: Iterable[Steps]) -> RunSummary
         extrema.add(steps)
     invalid = ""
     if is_valid(run):
-        check_status(run, float(extrema.margin))
+        check_status(run, float(extrema.bound_distance))
     else:
         invalid = f"the run is not valid: {describe(int(run.status) & int(UNTRUSTED))}"
     scenario = run.scenario
@@ -248,7 +291,7 @@ def _summary(run: Any, grid: TimeGrid, all_steps: Iterable[Steps]) -> RunSummary
         excluded=extrema.excluded,
         V_ends=(float(extrema.V_start), float(extrema.V_end)),
         slowest=float(extrema.slowest),
-        weights=_weights(claimed, extrema, F_d, grid.duration),
+        weighted_constants=_weighted_constants(claimed, extrema, F_d, grid.duration),
     )
 
 
@@ -267,17 +310,18 @@ def _rho_terms(
     return found
 
 
-def _weights(claimed: Claims, extrema: _Extrema, F_d: float, duration: float) -> dict[int, Weights]:
+def _weighted_constants(
+    claimed: Claims, extrema: _Extrema, F_d: float, duration: float
+) -> dict[int, WeightedConstants]:
     """The numbers of the claim with weights, by case; none for a loop that has no such claim."""
-    if not isinstance(claimed.constants, claims.Claim) or not claimed.has_weights:
+    if not isinstance(claimed.constants, claims.Claim) or claimed.no_weights:
         return {}
     half_square = float(extrema.half_square_start)
     V_rest = float(extrema.V_start) - half_square
-    slowest = float(extrema.slowest)
     found = {}
     for case in CASES:
-        best = claims.best_weights(
-            claimed.constants, slowest, V_rest, half_square, F_d, duration, case
+        best = claims.best_constants(
+            claimed.constants, float(extrema.slowest), V_rest, half_square, F_d, duration, case
         )
         if best is not None:
             found[case] = best
@@ -285,16 +329,6 @@ def _weights(claimed: Claims, extrema: _Extrema, F_d: float, duration: float) ->
 
 
 # --- second pass: envelopes ----------------------------------------------------------------------
-
-
-class _ClaimedDecay(NamedTuple):
-    """The constants of one envelope."""
-
-    rho: float
-    """[1/s]."""
-    rho2: float
-    w_f: float
-    """Weight of |f_tilde|^2 in the Lyapunov function."""
 
 
 class _Anchor(NamedTuple):
@@ -308,19 +342,9 @@ class _Anchor(NamedTuple):
     """Error of the integrator since then, at the first step of the next segment."""
 
 
-class _Level(NamedTuple):
-    """V2, or V_w, along some steps, (T,) each."""
-
-    V: np.ndarray
-    noise: np.ndarray
-    """Rounding error of sqrt(2 V)."""
-    defect: np.ndarray
-    """Error of the integrator in V over one step."""
-
-
 def _segments(summary: RunSummary, all_steps: Iterable[Steps]) -> Iterator[Segment]:
     """The segments, with the envelopes that run through them."""
-    decays = _claimed_decays(summary)
+    decays = summary.decays
     anchors: dict[tuple[str, int], _Anchor] = {}
     # The last step of the segment before decides whether an envelope starts again.
     last_t, last_excluded = np.zeros(0), np.zeros(0, bool)
@@ -329,32 +353,12 @@ def _segments(summary: RunSummary, all_steps: Iterable[Steps]) -> Iterator[Segme
         starts = restarts(np.append(last_t, t), np.append(last_excluded, excluded), summary.jumps)
         starts = starts[last_t.size :]
         last_t, last_excluded = t[-1:], excluded[-1:]
-        found: dict[str, dict[int, Envelope]] = {"theorem": {}, "weighted": {}}
-        for (kind, case), decay in decays.items():
-            anchor = anchors.get((kind, case))
-            envelope, anchor = _envelope(float(summary.run.dt), decay, steps, starts, anchor)
-            found[kind][case], anchors[kind, case] = envelope, anchor
-        yield Segment(
-            summary,
-            t,
-            steps.sample,
-            steps.proof,
-            steps.recorded,
-            found["theorem"],
-            found["weighted"],
-        )
-
-
-def _claimed_decays(summary: RunSummary) -> dict[tuple[str, int], _ClaimedDecay]:
-    """The constants of every envelope, by kind and case."""
-    found = {}
-    if summary.claims.constants is not None:
-        rho2 = {1: 0.0, 2: summary.F_d**2 / 2}
-        for case in CASES:
-            found["theorem", case] = _ClaimedDecay(summary.rho[case, "run"], rho2[case], 1.0)
-    for case, weights in summary.weights.items():
-        found["weighted", case] = _ClaimedDecay(weights.rho, weights.rho2, weights.w_f)
-    return found
+        envelopes = {}
+        for key, decay in decays.items():
+            envelopes[key], anchors[key] = _envelope(
+                float(summary.run.dt), decay, steps, starts, anchors.get(key)
+            )
+        yield Segment(summary, t, steps.sample, steps.proof, steps.recorded, envelopes)
 
 
 def restarts(t: np.ndarray, excluded: np.ndarray, jumps: np.ndarray) -> np.ndarray:
@@ -373,35 +377,29 @@ def weighted_lyapunov(proof: Any, w_f: float) -> np.ndarray:
     return proof.V + (w_f - 1.0) * 0.5 * np.sum(proof.f_tilde**2, axis=1)
 
 
-def _level(steps: Steps, w_f: float) -> _Level:
-    """V_w along some steps, with its errors."""
-    proof = steps.proof
-    eps = float(np.finfo(proof.V.dtype).eps)
-    noise = ENERGY_ROUNDING * eps * proof.V_terms * max(1.0, w_f) ** 0.5
-    defect = steps.defect
-    if w_f != 1.0:
-        defect = defect + abs(w_f - 1.0) * steps.defect_f
-    return _Level(weighted_lyapunov(proof, w_f), noise, defect)
-
-
 def _envelope(
-    dt: float, claimed: _ClaimedDecay, steps: Steps, starts: np.ndarray, anchor: _Anchor | None
+    dt: float, claimed: Decay, steps: Steps, starts: np.ndarray, anchor: _Anchor | None
 ) -> tuple[Envelope, _Anchor]:
     """The envelope along some steps and its tolerance; NaN at excluded steps, and everywhere if the
     rate is not positive.
     """
-    t, level, rho = steps.t, _level(steps, claimed.w_f), claimed.rho
+    t, proof, rho, w_f = steps.t, steps.proof, claimed.rho, claimed.w_f
+    V = weighted_lyapunov(proof, w_f)
+    eps = float(np.finfo(proof.V.dtype).eps)
+    # The rounding error of sqrt(2 V), and the error of the integrator in V over one step.
+    noise = ENERGY_ROUNDING * eps * proof.V_terms * max(1.0, w_f) ** 0.5
+    defects = steps.defect + abs(w_f - 1.0) * steps.defect_f
     if anchor is None:
-        anchor = _Anchor(t[0], level.V[0], level.noise[0], 0.0)
+        anchor = _Anchor(t[0], V[0], noise[0], 0.0)
     # Index of the step at which the envelope started, plus 1; 0 for one before these steps.
     start = np.maximum.accumulate(np.where(starts, np.arange(1, t.size + 1), 0))
     start_t = np.append(anchor.t, t)[start]
-    start_V = np.append(anchor.V, level.V)[start]
-    start_noise = np.append(anchor.noise, level.noise)[start]
+    start_V = np.append(anchor.V, V)[start]
+    start_noise = np.append(anchor.noise, noise)[start]
     # The integrator's errors accumulate and decay at the claimed rate.
     decay = np.exp(-max(rho, 0.0) * dt)
     errors, carried = [], anchor.carried
-    for restart, defect in zip(starts.tolist(), level.defect.tolist(), strict=True):
+    for restart, defect in zip(starts.tolist(), defects.tolist(), strict=True):
         errors.append(0.0 if restart else carried)
         carried = decay * errors[-1] + defect
     after = _Anchor(start_t[-1], start_V[-1], start_noise[-1], carried)
@@ -409,6 +407,6 @@ def _envelope(
         unclaimed = np.full(t.size, np.nan)
         return Envelope(unclaimed, unclaimed), after
     bound = start_V * np.exp(-rho * (t - start_t)) + claimed.rho2 / rho
-    bound = np.where(steps.proof.excluded, np.nan, bound)
-    widened = np.sqrt(2 * (bound + np.asarray(errors))) + start_noise + level.noise
+    bound = np.where(proof.excluded, np.nan, bound)
+    widened = np.sqrt(2 * (bound + np.asarray(errors))) + start_noise + noise
     return Envelope(bound, 0.5 * widened**2 - bound), after

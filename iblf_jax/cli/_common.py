@@ -190,24 +190,13 @@ def output_folder(name: str) -> Path:
 # ------------------------------------------------------------------------------- numbers as text
 
 
-def strict(value: Any) -> Any:
-    """Returns `value` as strict JSON: arrays become lists, NaN and infinities become null."""
-    if isinstance(value, Mapping):
-        return {str(key): strict(x) for key, x in value.items()}
-    if isinstance(value, str | bool | int) or value is None:
-        return value
-    if isinstance(value, list | tuple):
-        return [strict(x) for x in value]
-    if isinstance(value, float):
-        if not math.isfinite(value):
-            return None
-        return value
-    return strict(np.asarray(value).tolist())
-
-
 def write_json(path: Path, value: Any) -> None:
     """Writes strict JSON."""
-    path.write_text(json.dumps(strict(value), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    from iblf_jax.core import tables
+
+    path.write_text(
+        json.dumps(tables.for_json(value), indent=2, allow_nan=False) + "\n", encoding="utf-8"
+    )
 
 
 def verdict(run: Rollout) -> dict[str, Any]:

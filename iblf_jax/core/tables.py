@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import html
 import json
-from collections.abc import Collection, Iterable, Sequence
+import math
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
+
+import numpy as np
 
 UNSAFE_IN_SCRIPT = "<>&\u2028\u2029"
 """Characters that can end or change a script element, or a line of it, wherever they are."""
@@ -49,6 +52,23 @@ def as_html(
             + "</tr>"
         )
     return f"<table><tr>{head}</tr>{''.join(body)}</table>"
+
+
+def for_json(value: Any) -> Any:
+    """A value for strict JSON: arrays as lists, NumPy numbers as Python's, and None for a number
+    that is not finite.
+    """
+    if isinstance(value, Mapping):
+        return {str(key): for_json(x) for key, x in value.items()}
+    if isinstance(value, str | bool | int) or value is None:
+        return value
+    if isinstance(value, list | tuple):
+        return [for_json(x) for x in value]
+    if isinstance(value, float):
+        if not math.isfinite(value):
+            return None
+        return value
+    return for_json(np.asarray(value).tolist())
 
 
 def as_script_data(value: Any) -> str:

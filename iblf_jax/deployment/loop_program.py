@@ -10,7 +10,8 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.deployment.control_law import as_floats, of_floats, program_of
-from iblf_jax.engine.step import Inputs, StepOptions, advance, start
+from iblf_jax.engine.carry import Inputs, StepOptions, start
+from iblf_jax.engine.time_step import advance
 from iblf_jax.kernels import Program
 from iblf_jax.simulation import error_estimate
 from iblf_jax.simulation.closed_loop import initial_state

@@ -155,7 +155,7 @@ def generate(law: Law) -> GeneratedLaw:
     operations = operations_of(programs.sample)
     state_bytes = real_bytes * (max(size, 1) + 3 * n)
     parameter_bytes = real_bytes * max(1, parameters.size)
-    result_bytes = real_bytes * (size + len(programs.sample.samples))
+    result_bytes = real_bytes * (size + len(programs.sample.outputs))
     stack_bytes = max(stack_bytes_of(text, real_bytes) for text in (start, sample)) + result_bytes
     values = shared_values(
         law.scenario, name, programs.sample.dtype, parameters, law.joints, start, sample
@@ -188,7 +188,7 @@ def _functions(law: Law, parameters: Parameters) -> tuple[str, str]:
         f"{name}_start",
         [parameter_argument, *arguments],
         inputs,
-        _result_entries(len(programs.start.samples)),
+        _result_entries(len(programs.start.outputs)),
         SEGMENT,
     )
     sample = plain_function(
@@ -196,7 +196,7 @@ def _functions(law: Law, parameters: Parameters) -> tuple[str, str]:
         f"{name}_sample",
         [parameter_argument, "const F *m", *arguments],
         inputs,
-        _result_entries(size + len(programs.sample.samples)),
+        _result_entries(size + len(programs.sample.outputs)),
         SEGMENT,
     )
     return start, sample

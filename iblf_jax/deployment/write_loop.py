@@ -38,7 +38,7 @@ def loop_files(
     """Header and source of a closed loop."""
     parameters = Parameters.of(scenario, (loop.start, loop.step))
     setting_count = 1 + (4 if has_noise(scenario) else 0)
-    output_count = len(loop.step.samples)
+    output_count = len(loop.step.outputs)
     inputs = {
         "shared": parameters.numbers,
         "per_run": [f"u[{i}]" for i in range(setting_count)],

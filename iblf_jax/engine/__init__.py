@@ -20,6 +20,8 @@ from iblf_jax.engine.execute import run_batch as run_batch
 from iblf_jax.engine.execute import run_batch_jvp as run_batch_jvp
 from iblf_jax.engine.execute import run_for_reverse as run_for_reverse
 from iblf_jax.engine.execute import run_from as run_from
+from iblf_jax.engine.metric_folds import folded as folded
+from iblf_jax.engine.outcome import Outcome as Outcome
 from iblf_jax.engine.request import RunRequest as RunRequest
 from iblf_jax.engine.request import check_backend as check_backend
 from iblf_jax.engine.simulate import run_rollout as run_rollout
@@ -31,9 +33,7 @@ from iblf_jax.engine.sizes import starts_together as starts_together
 from iblf_jax.engine.sizes import sweep_unit as sweep_unit
 from iblf_jax.engine.sizes import values_together as values_together
 from iblf_jax.engine.sizes import whole_blocks as whole_blocks
-from iblf_jax.engine.step import Outcome as Outcome
-from iblf_jax.engine.step import folded as folded
-from iblf_jax.engine.step import sample_status as sample_status
+from iblf_jax.engine.status_flags import sample_status as sample_status
 from iblf_jax.engine.thresholds import FORWARD_MOST as FORWARD_MOST
 from iblf_jax.engine.thresholds import LOWERING_LIMITS as LOWERING_LIMITS
 from iblf_jax.engine.thresholds import differentiates_forward as differentiates_forward

@@ -11,22 +11,19 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.engine.machine_function import machine_function
-from iblf_jax.engine.mechanism import Mechanism
-from iblf_jax.engine.plan import PLAIN_LAYOUT, BatchLayout
-from iblf_jax.engine.request import RunRequest
-from iblf_jax.engine.step import (
-    Carry,
-    Inputs,
+from iblf_jax.engine.carry import Carry, Inputs, start
+from iblf_jax.engine.linearization import (
     Linearization,
     LinearizationStep,
-    Outcome,
-    TimeStep,
     linearization_at,
     linearization_steps,
-    outcome_of,
-    start,
 )
+from iblf_jax.engine.machine_function import machine_function
+from iblf_jax.engine.outcome import Outcome, outcome_of
+from iblf_jax.engine.plan import PLAIN_LAYOUT, BatchLayout
+from iblf_jax.engine.request import RunRequest
+from iblf_jax.engine.structural_constants import StructuralConstants
+from iblf_jax.engine.time_step import TimeStep
 from iblf_jax.simulation import error_estimate
 from iblf_jax.simulation.closed_loop import initial_state, perturbed_state
 from iblf_jax.simulation.noise import NOISE_NAME
@@ -105,7 +102,7 @@ class Batch(NamedTuple):
     """None: one run, and no array has a run axis."""
     layout: BatchLayout = PLAIN_LAYOUT
     """How its parts are compiled."""
-    constants: Mechanism | None = None
+    constants: StructuralConstants | None = None
     """Which numbers of the scenario are compiled in."""
 
     @staticmethod
@@ -113,7 +110,7 @@ class Batch(NamedTuple):
         inputs: Inputs,
         varied: Mapping[str, jax.Array] | None,
         layout: BatchLayout = PLAIN_LAYOUT,
-        constants: Mechanism | None = None,
+        constants: StructuralConstants | None = None,
     ) -> Batch:
         """A run for every entry of `varied` (path -> values, batch axis first), or one run."""
         if not varied:

@@ -1,9 +1,9 @@
-"""Derivatives of a run by the numbers of its leaves, one run a column.
+"""Derivatives of a run by the numbers of its leaves: one run with one tangent for each column of
+the Jacobian.
 
-A run with one tangent is a step as any other; a tangent of that one is a second derivative.
-Directions are data (`Inputs.direction`), so one program serves all columns, however many there are:
-it is what compiles soonest.  Where many runs are differentiated at once, and compiling pays,
-`derivatives` computes the law once for all tangents.
+A step with a tangent is a step as any other, and a tangent of it is a second derivative.  The
+directions are inputs (`Inputs.direction`), so one program serves any number of columns.  The
+docstring of `derivatives` compares this with the other ways to differentiate.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.engine.batch import Batch, Leaves, StepLoop, run_step
+from iblf_jax.engine.carry import Carry, Inputs, StepOptions, start
 from iblf_jax.engine.derivatives import (
     Directions,
     Tangents,
@@ -25,25 +26,17 @@ from iblf_jax.engine.derivatives import (
     floats_of_carry,
     outers_of_step,
 )
+from iblf_jax.engine.metric_folds import finished
 from iblf_jax.engine.request import RunRequest
-from iblf_jax.engine.step import (
-    Advanced,
-    Carry,
-    Inputs,
-    Node,
-    StepOptions,
-    TimeStep,
-    finished,
-    samples_of_step,
-    start,
-)
+from iblf_jax.engine.step_pieces import MetricSample
+from iblf_jax.engine.time_step import Advanced, TimeStep, samples_of_step
 from iblf_jax.simulation import error_estimate
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
 
 ACCURACY = tuple(name for name, _ in error_estimate.UNITS)
 """Metrics whose derivatives are zero."""
 Places = tuple[tuple[int, ...], ...]
-"""For each derivative, by which leaves of the scenario it is."""
+"""For each order of a derivative, the indices of the leaves by which it is taken."""
 
 
 class WithTangent(NamedTuple):
@@ -65,7 +58,7 @@ def _floats(carry: Carry | WithTangent) -> tuple[list[jax.Array], Callable]:
 
 
 def _moved(inputs: Inputs, places: Places, eps: jax.Array) -> Inputs:
-    """The inputs, leaves moved by eps along the last direction."""
+    """The inputs, with leaves moved by eps along the last direction."""
     leaves, treedef = jax.tree.flatten(inputs.scenario)
     for place, change in zip(places[-1], inputs.direction[len(places) - 1], strict=True):
         leaves[place] = leaves[place] + eps * change
@@ -83,9 +76,9 @@ def numbers_of(inputs: Inputs, record: Callable) -> int:
     def one(inputs):
         state = initial_state(inputs.scenario)
         sample = evaluate(inputs.scenario, inputs.dt, state, inputs.dt)[1]
-        node = Node(tuple(fold.init(sample) for fold in inputs.folds), sample, True)
-        nodes = (node,) * samples_of_step(inputs.scenario)
-        found = Advanced(None, nodes, state)  # type: ignore[arg-type]
+        seen = MetricSample(tuple(fold.init(sample) for fold in inputs.folds), sample, True)
+        samples = (seen,) * samples_of_step(inputs.scenario)
+        found = Advanced(None, samples, state)  # type: ignore[arg-type]
         return floats_of(record(inputs.folds, found))
 
     return sum(math.prod(x.shape) for x in jax.eval_shape(one, inputs))
@@ -121,7 +114,7 @@ def _begun(inputs: Inputs, method: str, places: Places) -> Carry | WithTangent:
     """The carry before the first step."""
     if not places:
         size = error_estimate.watched_indices(initial_state(inputs.scenario)).size
-        # The estimate of the accuracy is the run's own: here nobody reads it.
+        # The accuracy is estimated by the run without tangents; this estimate is not read.
         return start(inputs, method, jnp.zeros((size, size), inputs.dt.dtype))
 
     def of(eps):
@@ -233,7 +226,7 @@ def _weights(folds: Any, found: Advanced) -> list[jax.Array]:
 def run_by_columns(
     loop: StepLoop, batch: Batch, directions: Directions, request: RunRequest
 ) -> Tangents:
-    """As `run_with_tangents`, one run a tangent."""
+    """The same result as `run_with_tangents`, from one run per tangent."""
     inputs = batch.leaves.first
     zero = jnp.zeros(directions.tangents, batch.dtype)
     before = jax.tree.leaves(inputs.scenario)

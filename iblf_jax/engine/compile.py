@@ -24,12 +24,14 @@ from iblf_jax.core import devices, notices
 from iblf_jax.core.caches import CACHE
 from iblf_jax.engine import plan, registry, thresholds
 from iblf_jax.engine.batch import Batch, StepLoop, carry_shapes, linearization_batch
+from iblf_jax.engine.carry import Inputs
+from iblf_jax.engine.linearization import LinearizationStep, linearization_steps
 from iblf_jax.engine.loops import kernel_loop, program_of
 from iblf_jax.engine.machine_function import count_operations, machine_function
 from iblf_jax.engine.plan import BatchLayout, ExecutionPlan, Sizes, choose_plan
 from iblf_jax.engine.registry import Executor, Machine
 from iblf_jax.engine.request import RunRequest
-from iblf_jax.engine.step import Inputs, LinearizationStep, TimeStep, linearization_steps
+from iblf_jax.engine.time_step import TimeStep
 from iblf_jax.kernels import Program, Shapes, ToolchainError, UnsupportedError, stop_compilers
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
 from iblf_jax.simulation.scenario import Scenario

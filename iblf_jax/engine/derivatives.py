@@ -1,22 +1,40 @@
-"""Values and forward sensitivities of a batch, in one pass: several tangents a run, stepped beside
-it.
+"""Derivatives of runs, in two ways: tangents in a kernel, and the scan.
 
-Every direction u of the parameters has a tangent x_u of the state; gains are few, so forward mode
-beats reverse mode and needs no memory along time.  A fold may offer `curvature(acc, sample)`, a
-tuple of `curvatures` many `Outer`: vectors y with weights w, whose Gauss-Newton matrices
+**Tangents in a kernel.**  A step with tangents is a step as any other, and every executor makes it.
+Each direction u of the parameters has a tangent x_u of the state; a few tangents cost less than
+reverse mode and need no memory along time.  A kernel carries the tangents in one of two layouts:
+
+- All tangents of a run in one kernel (`DerivativeStep`, this module).  The tangents share the
+  evaluation of the law.  The directions are compiled in, only metrics are differentiated, and the
+  kernel grows with the number of tangents.
+- One tangent per run (`columns`).  The directions are inputs, so one kernel serves any number of
+  them; records are differentiated as well, and a tangent of a tangent is a second derivative.
+  `jax.grad`, `jacfwd`, `jacrev` and `hessian` of `simulate` use this layout (`transformable`).
+
+**The scan.**  JAX differentiates `loops.scan` or `loops.checkpointed` in forward or reverse mode.
+The time of reverse mode does not depend on how many numbers it is by, so this is the way for many
+numbers, for derivatives of third order, and where no kernel can be built.
+
+`choose_derivatives` chooses.  Each layout is needed: 64 runs of 500 steps, differentiated by the 4
+gains of the paper's loop on two busy cores, take 0.006 s with all tangents in one kernel (9.9 s
+with compilation), 0.042 s with one per run (15.7 s) and 0.40 s by the scan in forward mode (29 s).
+By 28 numbers of `presets.iiwa14`, whose kernel with all tangents would be too long, one tangent per
+run takes 16.6 s (60 s with compilation), while XLA had not compiled the scan after 5 minutes.  The
+threshold `MAX_COLUMNS` has the measurement against reverse mode.
+
+A fold may offer `curvature(acc, sample)`, a tuple of `curvatures` many `Outer`: vectors y with
+weights w.  Their Gauss-Newton matrices
 
     N_uv = sum_k w(t_k) y_u(t_k) . y_v(t_k),      y_u = tangent of y,
 
-are summed up along the way, at next to no cost.  With w = 2 dt that is the second-order information
-of every integral of squares.
-
-The step with its tangents is a step as any other: every executor steps it.  As a scalar program it
-holds what all tangents share once, because equal nodes are one node.
+are summed along the run at little cost.  With w = 2 dt they are the second-order information of
+every integral of squares.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, NamedTuple
 
@@ -25,9 +43,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from iblf_jax.core.optional import OptionalMembers, attributes
+from iblf_jax.engine import thresholds
 from iblf_jax.engine.batch import Batch, StepLoop, finalize, initialize
+from iblf_jax.engine.carry import Carry, Inputs, StepOptions
+from iblf_jax.engine.metric_folds import finished, split_floats
+from iblf_jax.engine.outcome import Outcome
 from iblf_jax.engine.request import RunRequest
-from iblf_jax.engine.step import Advanced, Carry, Inputs, Outcome, StepOptions, advance, finished
+from iblf_jax.engine.time_step import Advanced, advance
 from iblf_jax.simulation import error_estimate
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
 from iblf_jax.simulation.paths import get, with_parameters
@@ -35,6 +58,33 @@ from iblf_jax.simulation.signals import Sample
 
 FLAG_FIELDS = ("guard_active", "saturated")
 """Fields of a sample that are no numbers."""
+
+
+class DerivativeSizes(NamedTuple):
+    """What decides how a derivative is computed."""
+
+    kept_numbers: int
+    """Numbers of the derivative that are kept along the run, with one tangent per run."""
+    order: int = 1
+    columns: int = 1
+    """Numbers of a transformed run by which it is differentiated, the most of any order."""
+    nodes_together: float = math.inf
+    """Nodes of the kernel that carries all tangents; infinite where records are differentiated."""
+    max_nodes: float | None = 0
+    """Nodes up to which the executor compiles such a kernel (`Limits.derivatives`)."""
+
+
+def choose_derivatives(sizes: DerivativeSizes) -> str:
+    """How a derivative is computed where a kernel can be built: "together" (all tangents of a run
+    in one kernel), "one per run" or "scan".
+    """
+    if thresholds.is_within(sizes.nodes_together, sizes.max_nodes):
+        return "together"
+    is_small = sizes.kept_numbers <= thresholds.KEPT_NUMBERS
+    is_low_order = sizes.order <= thresholds.HIGHEST_COLUMN_ORDER
+    if is_small and is_low_order and sizes.columns <= thresholds.MAX_COLUMNS:
+        return "one per run"
+    return "scan"
 
 
 class Outer(NamedTuple):
@@ -98,20 +148,16 @@ class Differentiated(NamedTuple):
 
 
 def floats_of_carry(carry: Carry) -> tuple[list[jax.Array], Callable]:
-    """The numbers of a carry that have tangents, and the function that puts others in their
-    place.
+    """The numbers of a carry that have tangents, and the function that returns the carry with other
+    numbers in their place.
     """
-    leaves, treedef = jax.tree.flatten((carry.state, carry.accumulators))
-    places = [i for i, x in enumerate(leaves) if jnp.issubdtype(x.dtype, jnp.floating)]
+    floats, replaced = split_floats((carry.state, carry.accumulators))
 
-    def replaced(floats):
-        new = list(leaves)
-        for i, x in zip(places, floats, strict=True):
-            new[i] = x
-        state, accumulators = jax.tree.unflatten(treedef, new)
+    def with_floats(floats: list[jax.Array]) -> Carry:
+        state, accumulators = replaced(floats)
         return carry._replace(state=state, accumulators=accumulators)
 
-    return [leaves[i] for i in places], replaced
+    return floats, with_floats
 
 
 def pushed(
@@ -180,9 +226,7 @@ def preaccumulated(scenario, directions: Directions, eps: jax.Array) -> Callable
             )
             (t,) = time or (t,)
             slope, sample = evaluate(directions.moved(scenario, eps), t, state, dt, *torque)
-            return (slope, without_flags(sample)), {
-                name: getattr(sample, name) for name in FLAG_FIELDS
-            }
+            return (slope, without_flags(sample)), attributes(sample, FLAG_FIELDS)
 
         @jax.custom_jvp
         def floats(flat, eps, *rest):
@@ -207,21 +251,20 @@ def preaccumulated(scenario, directions: Directions, eps: jax.Array) -> Callable
     return loop
 
 
-def curvatures_of(fold: Any) -> int:
-    """How many `Outer` a fold offers of a sample; 0 for one without `curvatures`."""
-    return getattr(fold, "curvatures", 0)
+fold_member = OptionalMembers(curvatures=0)
+"""Optional members of a fold: how many `Outer` its `curvature` returns."""
 
 
 def count_curvatures(folds: Any) -> int:
     """How many curvature matrices the folds have."""
-    return sum(curvatures_of(fold) for fold in folds)
+    return sum(fold_member(fold, "curvatures") for fold in folds)
 
 
 def outers_of(folds, accumulators, sample) -> tuple[Outer, ...]:
     """What a sample adds to the curvature matrices of the folds that have them."""
     found: tuple[Outer, ...] = ()
     for fold, acc in zip(folds, accumulators, strict=True):
-        if curvatures_of(fold):
+        if fold_member(fold, "curvatures"):
             found += tuple(fold.curvature(acc, sample))
     return found
 
@@ -229,10 +272,10 @@ def outers_of(folds, accumulators, sample) -> tuple[Outer, ...]:
 def outers_of_step(folds, found: Advanced) -> list[Outer]:
     """What all samples of a step add to them."""
     samples = []
-    for node in found.nodes:
-        outers = outers_of(folds, node.before, node.sample)
-        if node.counts is not True:
-            outers = tuple(Outer(y, jnp.where(node.counts, weight, 0.0)) for y, weight in outers)
+    for seen in found.metric_samples:
+        outers = outers_of(folds, seen.before, seen.sample)
+        if seen.counts is not True:
+            outers = tuple(Outer(y, jnp.where(seen.counts, weight, 0.0)) for y, weight in outers)
         samples.append([Outer(y, jnp.broadcast_to(weight, y.shape)) for y, weight in outers])
     return [
         Outer(*map(jnp.concatenate, zip(*same, strict=True))) for same in zip(*samples, strict=True)
@@ -264,9 +307,8 @@ class DerivativeStep:
                 inputs._replace(scenario=scenario), before, index, self.method, options, loop
             )
             outers = outers_of_step(inputs.folds, found)
-            vectors, weights = (
-                [getattr(outer, part) for outer in outers] for part in Outer._fields
-            )
+            vectors = [outer.vector for outer in outers]
+            weights = [outer.weight for outer in outers]
             return (floats_of_carry(found.carry)[0], vectors), (found.carry, weights)
 
         _, (tangents, vectors), (after, weights) = pushed(

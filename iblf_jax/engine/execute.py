@@ -14,6 +14,7 @@ import jax
 
 from iblf_jax.engine import registry, thresholds
 from iblf_jax.engine.batch import Batch, StepLoop, carry_shapes, run_all
+from iblf_jax.engine.carry import Inputs
 from iblf_jax.engine.columns import numbers_of, outer_vectors, run_by_columns
 from iblf_jax.engine.compile import (
     compiled_plan,
@@ -27,13 +28,20 @@ from iblf_jax.engine.compile import (
     shapes_of,
     structural_part,
 )
-from iblf_jax.engine.derivatives import Directions, Tangents, run_with_tangents
+from iblf_jax.engine.derivatives import (
+    DerivativeSizes,
+    Directions,
+    Tangents,
+    choose_derivatives,
+    run_with_tangents,
+)
 from iblf_jax.engine.loops import checkpointed, kernel_loop, program_of, scan
-from iblf_jax.engine.mechanism import known_of
+from iblf_jax.engine.outcome import Outcome
 from iblf_jax.engine.plan import STATES_LAYOUT, ExecutionPlan
 from iblf_jax.engine.registry import Executor
 from iblf_jax.engine.request import RunRequest
-from iblf_jax.engine.step import Inputs, Outcome, TimeStep
+from iblf_jax.engine.structural_constants import constants_of
+from iblf_jax.engine.time_step import TimeStep
 from iblf_jax.simulation.scenario import Scenario
 
 
@@ -170,11 +178,13 @@ def run_batch_jvp(
     def attempt(executor: Executor) -> Tangents:
         batch = Batch.of(inputs, varied, execution.layout, request.constants)
         loop = kernel_loop(executor)
-        if request.backend != "auto" or _carries_tangents(executor, batch, along, request):
-            return run_with_tangents(loop, batch, along, request)
-        if _keeps_columns(batch, inputs, along, request):
-            return run_by_columns(loop, batch, along, request)
-        return by_scan()
+        chosen = "together"
+        if request.backend == "auto":
+            chosen = choose_derivatives(_derivative_sizes(executor, batch, along, request))
+        if chosen == "scan":
+            return by_scan()
+        run = {"together": run_with_tangents, "one per run": run_by_columns}[chosen]
+        return run(loop, batch, along, request)
 
     def by_scan() -> Tangents:
         def run(batch: Batch) -> Tangents:
@@ -185,22 +195,18 @@ def run_batch_jvp(
     return first_that_works(execution, attempt, by_scan)
 
 
-def _carries_tangents(
+def _derivative_sizes(
     executor: Executor, batch: Batch, along: Directions, request: RunRequest
-) -> bool:
-    """Whether one kernel of an executor steps the runs and all their tangents: longer ones compile
-    for minutes.
-    """
+) -> DerivativeSizes:
+    """The sizes that decide how an executor computes tangents."""
     carry = carry_shapes(batch, request.method)
     nodes = program_of(TimeStep(request.method), batch, carry).program.size
-    return thresholds.is_within(nodes * (1 + along.tangents), executor.limits.derivatives)
-
-
-def _keeps_columns(batch: Batch, inputs: Inputs, along: Directions, request: RunRequest) -> bool:
-    """Whether the tangents of all samples fit into memory, one run a tangent."""
     samples = (request.steps + 1) * (batch.runs or 1)
-    numbers = numbers_of(inputs, outer_vectors) * along.tangents * samples
-    return thresholds.keeps_columns(1, numbers)
+    return DerivativeSizes(
+        kept_numbers=numbers_of(batch.leaves.first, outer_vectors) * along.tangents * samples,
+        nodes_together=nodes * (1 + along.tangents),
+        max_nodes=executor.limits.derivatives,
+    )
 
 
 def run_for_reverse(
@@ -237,7 +243,7 @@ def run_from(
     """
     request = RunRequest(steps)
     if registry.automatic().reason is None:
-        request = request._replace(constants=known_of(scenario))
+        request = request._replace(constants=constants_of(scenario))
     return _run_from(scenario, dt, carry, step=step, request=request)
 
 

@@ -1,4 +1,4 @@
-"""`explain`: what one step of a scenario costs, counted on its scalar program."""
+"""`explain`: the operations of one step of a scenario, counted in its scalar program."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from iblf_jax.core.devices import threads
 from iblf_jax.engine.batch import Batch, carry_shapes
 from iblf_jax.engine.compile import inputs_of
 from iblf_jax.engine.loops import program_of
-from iblf_jax.engine.mechanism import known_of
 from iblf_jax.engine.registry import automatic
 from iblf_jax.engine.request import RunRequest
-from iblf_jax.engine.step import TimeStep
+from iblf_jax.engine.structural_constants import constants_of
+from iblf_jax.engine.time_step import TimeStep
 from iblf_jax.kernels import OPERATIONS, PER_RUN, SHARED, TIME, Program, written_out
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.metrics import as_folds
@@ -38,7 +38,7 @@ NAMES = {
 
 @dataclasses.dataclass(frozen=True)
 class Explanation:
-    """Operations of one step by how often they are done; prints as a table."""
+    """Operations of one step, by how often they are executed; prints as a table."""
 
     counts: dict[str, Counter]
     """How often -> operation -> number."""
@@ -51,11 +51,11 @@ class Explanation:
     """Estimated limit of this machine's processor [steps/s]: two vector instructions a cycle on
     every core."""
     backend: str = ""
-    """What a batch runs on here when nobody says otherwise, and why that is not compiled code if it
-    is not."""
+    """The executor that runs a batch here by default, and the reason if it does not compile
+    kernels."""
     derivatives: str = ""
-    """What makes the derivatives of `simulate` under `jax.grad`, `jacfwd` or `hessian`, and why
-    that is not compiled code if it is not."""
+    """What computes the derivatives of `simulate` under `jax.grad`, `jacfwd` or `hessian`, and the
+    reason if it is no compiled kernel."""
 
     def __repr__(self) -> str:
         lines = ["operations done        number  which"]
@@ -104,7 +104,7 @@ def explain(
     one = Batch.of(
         inputs_of(scenario, folds, jnp.asarray(1e-3, dtype), RunRequest(1), None),
         leaves,
-        constants=known_of(scenario),
+        constants=constants_of(scenario),
     )
     program = written_out(program_of(TimeStep(method), one, carry_shapes(one, method)).program)
     width = 64 // np.dtype(dtype).itemsize

@@ -15,9 +15,10 @@ import numpy as np
 from iblf_jax.core.caches import CACHE
 from iblf_jax.engine import thresholds
 from iblf_jax.engine.batch import Batch, Leaves, StepLoop
+from iblf_jax.engine.carry import StepOptions, keep_if, step_member
+from iblf_jax.engine.linearization import LinearizationStep
 from iblf_jax.engine.machine_function import machine_function
 from iblf_jax.engine.registry import Executor
-from iblf_jax.engine.step import LinearizationStep, StepOptions, is_derivative, keep_if
 from iblf_jax.kernels import (
     CompiledStep,
     Shapes,
@@ -135,7 +136,7 @@ def program_of(step: Any, batch: Batch, carry: Any) -> CompiledStep:
     leaves = batch.leaves
     function = _on_leaves(step, leaves.treedef, leaves.is_per_run, treedef)
     # A derivative's literal zero says "does not depend".
-    sparse = is_derivative(step)
+    sparse = step_member(step, "is_derivative")
     shapes = Shapes.of(leaves.shared), Shapes.of(leaves.per_run, 1), Shapes.of(flat, 1)
     return compile_step(
         function,

@@ -1,9 +1,8 @@
-"""At which period a sampled loop gets too slow: where its map from one period to the next stops
-being a contraction.
+"""`recommended_period`: the longest period at which a sampled loop is stable.
 
-The map's derivative is looked at where the run starts and along the reference; its spectral radius,
-the largest of these, grows past 1 at some period.  A sample of that search is a number, so nothing
-is compiled again but where more commands are under way.
+The spectral radius of the map from one period to the next decides.  It is computed at the start and
+along the reference, and the largest value grows past 1 at some period.  The period is an input of
+the compiled map, so the search compiles again only where more commands are in transit.
 """
 
 from __future__ import annotations
@@ -24,16 +23,16 @@ from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.simulation.stability import jacobian, period_map
 
 SHORTEST_PERIOD, LONGEST_PERIOD = 1e-5, 0.2
-"""Periods between which is looked [s]."""
+"""Shortest and longest period that is tried [s]."""
 PERIOD_RATIO = 2 ** (1 / 3)
-"""Between two that are tried; then the interval is halved."""
+"""Ratio of two periods that are tried one after the other; then the interval is halved."""
 HALVINGS = 8
 MAX_COMMANDS_IN_TRANSIT = 6
-"""Commands under way at the shortest period that is tried."""
+"""Commands in transit at the shortest period that is tried, at most."""
 
 
 RADIUS_RANGE, MARGIN_RANGE = (1e-3, 10.0), (1.0, 1000.0)
-"""Spectral radii and margins that a user can mean [1]."""
+"""Spectral radii and margins that are accepted [1]."""
 
 
 def radius_at(scenario: Scenario, period: float, times: np.ndarray) -> float:
@@ -84,14 +83,13 @@ def recommended_period(
         commands under way
 
     at the start and along the reference, for every period up to margin times the one that is
-    returned.  That is necessary, not sufficient: it says nothing of noise, nor of how far the
-      bounds are.  Rounded down to 1, 2 or 5 times a power of ten.
+    returned.  The condition is necessary, not sufficient: it takes account neither of noise nor of
+    the distance to the bounds.  The period is rounded down to 1, 2 or 5 times a power of ten.
 
     Args:
-      scenario: what is to run; its own period does not matter, its delay [s], sensor and actuator
-        do.
-      duration: of the reference that is looked at [s].
-      radius: spectral radius that counts as too slow [1], of every period up to the limit.
+      scenario: the loop; its delay [s], sensor and actuator count, its own period does not.
+      duration: of the reference along which the map is computed [s].
+      radius: spectral radius from which on a period is too long [1].
       margin: how much longer a period may be before the loop is that slow, >= 1 [1].
 
     Returns:

@@ -9,8 +9,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from iblf_jax.core import checks, notices
-from iblf_jax.engine.mechanism import Mechanism, known_of
 from iblf_jax.engine.registry import backends
+from iblf_jax.engine.structural_constants import StructuralConstants, constants_of
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.scenario import Scenario
 
@@ -23,7 +23,7 @@ class RunRequest(NamedTuple):
     """The integrator."""
     record_every: int | None = None
     """Every so-many-th instant is recorded, from t = 0; None records nothing but metrics."""
-    constants: Mechanism | None = None
+    constants: StructuralConstants | None = None
     """Which numbers of the scenario are compiled in (`mechanism`)."""
     backend: str = "auto"
     """The requested backend: "auto", "vmap" or a name in the registry of executors."""
@@ -53,7 +53,7 @@ class RunRequest(NamedTuple):
         """
         tableau(method)
         backend = check_backend(backend)
-        return RunRequest(steps, method, record_every, known_of(scenario), backend)
+        return RunRequest(steps, method, record_every, constants_of(scenario), backend)
 
 
 def check_backend(backend: str) -> str:

@@ -21,6 +21,7 @@ import numpy as np
 from iblf_jax.core.caches import CACHE
 from iblf_jax.engine import registry, thresholds
 from iblf_jax.engine.batch import Batch, StepLoop, finalize, initialize, run_all
+from iblf_jax.engine.carry import Carry
 from iblf_jax.engine.compile import (
     compilers_stopped_on_error,
     first_that_works,
@@ -31,11 +32,13 @@ from iblf_jax.engine.compile import (
     single_batch,
     structural_part,
 )
+from iblf_jax.engine.linearization import Linearization
 from iblf_jax.engine.loops import kernel_loop, scan
+from iblf_jax.engine.outcome import Outcome
 from iblf_jax.engine.plan import BatchLayout
 from iblf_jax.engine.registry import Executor
 from iblf_jax.engine.request import RunRequest
-from iblf_jax.engine.step import Carry, Linearization, Outcome, TimeStep
+from iblf_jax.engine.time_step import TimeStep
 from iblf_jax.engine.waiting import wait_until_ready
 from iblf_jax.kernels import StoppedError, ToolchainError
 from iblf_jax.simulation.scenario import Scenario

@@ -1,10 +1,10 @@
-"""Which time step will do: small enough for the modes of the loop and for the signals that drive
-it.
+"""`recommended_dt`: a time step that is small enough for the modes of the loop and for the signals
+that drive it.
 
-The first guess is a step that follows the loop's fastest mode.  Then the run is made twice, side by
-side: in steps dt, and with each of them cut into three unequal ones, so that no signal goes through
-whole periods between the stages of both.  The step is made smaller until the two agree, and until
-the run's own estimate of its error (`error_estimate`) is content too.
+The first candidate follows the fastest mode of the loop.  Then two runs are integrated side by
+side: one in steps dt, the other with each of these steps divided into three unequal ones, so that
+no signal passes through whole periods between the stages of both.  The step is reduced until the
+two runs agree and the error estimate of the run (`accuracy`) is within its tolerance.
 """
 
 from __future__ import annotations
@@ -36,11 +36,12 @@ RECOMMENDED_PHASE = 1.5
 RECOMMENDED_ERROR = error_estimate.TOLERANCE / 5
 """Difference of the two runs, relative to the tube, that a recommended step may leave."""
 MODE_INSTANTS = 33
-"""Places along the reference at which modes are measured."""
+"""Instants along the reference at which modes are computed."""
 MAX_TRIED = 5_000_000
-"""Steps of the longest run that is tried."""
+"""Steps of a run that is tried, at most."""
 INTERVALS = ((0.0, 1.0), (0.0, 0.382), (0.382, 0.618), (0.618, 1.0))
-"""Start and end, in steps, of what is integrated for each step: it, and its three parts."""
+"""Start and end of the intervals that are integrated for each step, in steps: the whole step and
+its three parts."""
 
 
 class Pair(NamedTuple):
@@ -55,12 +56,12 @@ class Pair(NamedTuple):
     nearest: tuple[jax.Array, jax.Array, jax.Array]
     """|xi|, time and state of the fine run where it was nearest to a bound."""
     going: jax.Array
-    """Whether the fine run has not run away."""
+    """Whether the fine run has not diverged."""
 
 
 def side_by_side(scenario: Scenario, dt: float, steps: int, *, method: str) -> Pair:
-    """A run in steps dt beside one in steps of about a third, until their end, or until they differ
-    by more than a tube's width.
+    """A run in steps dt beside one in steps of about dt / 3, until the end of both, or until they
+    differ by more than the width of the tube.
 
     Args:
       scenario: canonical.
@@ -96,8 +97,10 @@ def _start(scenario: Scenario, dt: jax.Array, steps: jax.Array, *, method: str) 
 def _advanced(
     scenario: Scenario, dt: jax.Array, steps: jax.Array, pair: Pair, *, method: str
 ) -> Pair:
-    """The pair up to so many steps later: one machine function, as XLA's own loops take longer to
-    go round than a small arm to compute.
+    """The pair after the next `STEP_SIZE_CHUNK` steps, or after the last one.
+
+    It is one machine function, because an iteration of a loop of XLA takes longer than the step of
+    a small arm.
     """
 
     def chunk(scenario, dt, steps, pair):
@@ -229,7 +232,7 @@ def smaller(dt: float, excess: float, order: int) -> float:
 
 
 def find_dt(scenario: Scenario, *, duration: float, method: str) -> float:
-    """`iblf_jax.recommended_dt` for one scenario: as it says there."""
+    """`iblf_jax.recommended_dt` for one scenario."""
     order = tableau(method).order
     scenario = canonical(scenario)
     duration = checks.positive_number("duration", duration, "s")
@@ -267,8 +270,8 @@ def find_dt(scenario: Scenario, *, duration: float, method: str) -> float:
 
 
 def _find_part(scenario: Scenario, duration: float, method: str) -> float:
-    """As `find_dt` where the law is sampled: the largest part of a period, 1, 2 or 5 times a power
-    of ten of them, that will do.
+    """`find_dt` for a sampled law: the largest accurate fraction of a period.  The divisor is 1, 2
+    or 5 times a power of ten.
     """
     sampling: Any = scenario.sampling
     period, noise = float(sampling.period), jnp.zeros((4,))

@@ -5,30 +5,31 @@ A law may declare functions g_i(t, q, q') at whose zeros its command jumps
 state crosses g_i = 0 at a time t*, with the rate f- before and f+ after the jump, a perturbation of
 the state jumps as well, and an integral of a signal L that jumps with the command gains a term:
 
-    dx+ = dx- + (f- - f+) dt*,      dt* = -(grad g_i . dx- + partial derivatives of g_i by
-    parameters) / g_i'-,                  (J.1) d(integral of L) = (integral of dL) + (L- - L+) dt*.
+    dx+ = dx- + (f- - f+) dt*,                                                        (J.1)
+    dt* = -(grad g_i . dx- + partial derivatives of g_i by parameters) / g_i'-,
+    d(integral of L) = (integral of dL) + (L- - L+) dt*.
 
-The derivative of a fixed step across the jump has no such terms.  So a step that reaches a surface
-keeps its value, and its derivative is that of the same step in pieces: from its start to the first
-crossing, on to the next one, and to its end.  Each piece is a step of the midpoint rule with the
-rate of its own side of every surface, and it ends where the next g_i vanishes,
+The derivative of a fixed step across the jump has no such terms.  A step that reaches a surface
+therefore keeps its value, and its derivative is that of the same step in pieces: from its start to
+the first crossing, from there to the next one, and to its end.  Each piece is a step of the
+midpoint rule with the rate on its own side of every surface, and it ends where the next g_i
+vanishes,
 
-    h = -g/g',   x* = x + h f(t + h/2, x + h f/2),   then one step of Newton's method on g(x*) = 0.
-    (J.2)
+    h = -g/g',   x* = x + h f(t + h/2, x + h f/2),                                    (J.2)
+    then one step of Newton's method on g(x*) = 0.
 
 Where the rates of both sides point towards a surface, the state slides along it.  From the crossing
 on, the rate is then the combination of both that keeps g_i' = 0 (Filippov),
 
-    f = f+ + a (f- - f+),   a = g_i'+ / (g_i'+ - g_i'-).
-    (J.3)
+    f = f+ + a (f- - f+),   a = g_i'+ / (g_i'+ - g_i'-).                              (J.3)
 
 The derivative is of second order in the time step at crossings and of first order where the state
 slides, in forward and in reverse mode. None exists where a state only touches a surface without
 crossing it.
 
-Source: (J.1) M. A. Aizerman, F. R. Gantmacher, Quart. J. Mech. Appl. Math. 11 (1958) 225-241; (J.3)
-  A. F. Filippov, Differential
-Equations with Discontinuous Righthand Sides, 1988; the scheme (J.2): design of this package.
+Sources: (J.1) M. A. Aizerman, F. R. Gantmacher, Quart. J. Mech. Appl. Math. 11 (1958) 225-241;
+(J.3) A. F. Filippov, Differential Equations with Discontinuous Righthand Sides, 1988.  The scheme
+(J.2) is a design of this package.
 """
 
 from __future__ import annotations
@@ -45,13 +46,13 @@ from iblf_jax.simulation.integrators import Stepped, stage_states, tableau
 from iblf_jax.simulation.scenario import Scenario
 
 SURFACE_CLEARANCE = 1e-4
-"""How far from a surface a rate is evaluated at least, relative to how far the step moves the state
-across it."""
+"""Smallest distance from a surface at which a rate is evaluated, relative to the distance by which
+the step moves the state across it."""
 MAX_PREDICTION = 2.0
 """Steps.  A crossing that is predicted further away does not belong to the step."""
 
 
-class Loop(NamedTuple):
+class SwitchedLoop(NamedTuple):
     """A closed loop along a step."""
 
     scenario: Scenario
@@ -64,7 +65,7 @@ class Loop(NamedTuple):
 
 
 class Signs(NamedTuple):
-    """On which side of m surfaces a step is; (m,) each."""
+    """The sides of m surfaces on which a step lies; (m,) each."""
 
     start: jax.Array
     """The switching functions at the start of the step."""
@@ -85,7 +86,7 @@ class Signs(NamedTuple):
 
     @property
     def size(self) -> jax.Array:
-        """How far the step moves the state across each surface, (m,)."""
+        """The distance by which the step moves the state across each surface, (m,)."""
         return jnp.abs(self.start) + jnp.abs(self.end)
 
 
@@ -99,7 +100,7 @@ class Crossings(NamedTuple):
     rank: jax.Array
     """How many other surfaces the step reaches before this one, int."""
     clearance: jax.Array
-    """|g| at which rates are evaluated at least."""
+    """Smallest |g| at which rates are evaluated."""
 
     def after(self, number: jax.Array) -> jax.Array:
         """Whether g > 0 after so many crossings, (m,) bool."""
@@ -113,7 +114,7 @@ class Crossings(NamedTuple):
 
 
 class Progress(NamedTuple):
-    """How far the pieces of a step have come."""
+    """The state after some pieces of a step, and the sums along them."""
 
     state: LoopState
     since: jax.Array
@@ -121,13 +122,14 @@ class Progress(NamedTuple):
     rate: LoopState
     """Of the state at the end of the last piece, on that piece's side of the surface."""
     sliding: LoopState
-    """What keeps the state on the surfaces along which it slides: added to its rate."""
+    """The term that is added to the rate, so that the state stays on the surfaces along which it
+    slides."""
     gains: list[jax.Array]
-    """What accumulators gain per second in the last piece, on that piece's side of the surface."""
+    """Rates of the accumulators in the last piece, on that piece's side of the surface."""
     sliding_gains: list[jax.Array]
-    """What sliding adds to what they gain per second."""
+    """The term that sliding adds to these rates."""
     gained: list[jax.Array]
-    """What accumulators gain in the pieces, by the midpoint rule."""
+    """Increments of the accumulators in the pieces, by the midpoint rule."""
     usable: jax.Array
     """Whether every crossing was found within about a step, () bool."""
 
@@ -141,7 +143,7 @@ def surfaces(scenario: Scenario, t: jax.Array, state: LoopState) -> jax.Array | 
 
 
 def with_hybrid_derivative(
-    loop: Loop,
+    loop: SwitchedLoop,
     method: str,
     t: jax.Array,
     before: LoopState,
@@ -158,7 +160,7 @@ def with_hybrid_derivative(
       t: start of the step, () [s].
       before: state at its start.
       dt: its length, () [s].
-      stepped: what the integrator has made of it.
+      stepped: the result of the integrator.
       sums: the accumulators of the run, those that are floating-point numbers.
     """
     start = surfaces(loop.scenario, t, before)
@@ -208,7 +210,7 @@ def _(primals, tangents):
 
 
 def _in_pieces(
-    loop: Loop,
+    loop: SwitchedLoop,
     t: jax.Array,
     before: LoopState,
     dt: jax.Array,
@@ -254,7 +256,7 @@ def _in_pieces(
 
 
 def _slides(
-    loop: Loop, t: jax.Array, state: LoopState, slope: LoopState, signs: Signs
+    loop: SwitchedLoop, t: jax.Array, state: LoopState, slope: LoopState, signs: Signs
 ) -> jax.Array:
     """Along which surfaces that a stage has touched the state slides, (m,) bool: both rates point
     towards them.
@@ -274,16 +276,16 @@ def _slides(
 
 def _crossings(signs: Signs, crossed: jax.Array) -> Crossings:
     """The order in which a step reaches surfaces."""
-    place = jnp.abs(signs.start) / jnp.where(signs.size > 0, signs.size, 1.0)
-    number = jnp.arange(place.size)
-    sooner = place[None, :] < place[:, None]
-    sooner |= (place[None, :] == place[:, None]) & (number[None, :] < number[:, None])
+    fraction = jnp.abs(signs.start) / jnp.where(signs.size > 0, signs.size, 1.0)
+    number = jnp.arange(fraction.size)
+    sooner = fraction[None, :] < fraction[:, None]
+    sooner |= (fraction[None, :] == fraction[:, None]) & (number[None, :] < number[:, None])
     rank = jnp.sum(jnp.where(sooner & crossed[None, :], 1, 0), axis=1)
     return Crossings(signs.above, crossed, rank, SURFACE_CLEARANCE * signs.size)
 
 
 def _piece(
-    loop: Loop,
+    loop: SwitchedLoop,
     t: jax.Array,
     dt: jax.Array,
     crossings: Crossings,
@@ -295,8 +297,8 @@ def _piece(
     above, target = crossings.after(number), crossings.numbered(number)
 
     def evaluated(since, state):
-        place = _on_its_side(scenario, t + since, state, above, crossings.clearance)
-        return loop.evaluate(t + since, place)
+        cleared = _on_its_side(scenario, t + since, state, above, crossings.clearance)
+        return loop.evaluate(t + since, cleared)
 
     def along(which, since, state, rate):
         g, dg = _along(scenario, t + since, state, rate)
@@ -306,8 +308,8 @@ def _piece(
     came_from = crossings.numbered(number - 1)
     arriving = along(came_from, since, state, before.rate)[1]
     leaving = along(came_from, since, state, first)[1]
-    share = _share(arriving, leaving)
-    added = _mixed(share, before.rate, first)
+    weight = _filippov_weight(arriving, leaving)
+    added = _mixed(weight, before.rate, first)
     first, sliding = _sum(first, added), _sum(before.sliding, added)
 
     aims = jnp.any(target)
@@ -323,7 +325,7 @@ def _piece(
 
     length = length + correction
     gains = _sum(loop.gains_of(sample), before.sliding_gains)
-    more = _mixed(share, before.gains, gains)
+    more = _mixed(weight, before.gains, gains)
     gains, sliding_gains = _sum(gains, more), _sum(before.sliding_gains, more)
     gained = [x + gain * length for x, gain in zip(before.gained, gains, strict=True)]
     usable = before.usable & ((early & late) | ~aims)
@@ -339,9 +341,8 @@ def _piece(
     )
 
 
-def _share(arriving: jax.Array, leaving: jax.Array) -> jax.Array:
-    """The share a of (J.3) that the rate before a surface has beyond it, () [1]: 0 where the state
-    moves on.
+def _filippov_weight(arriving: jax.Array, leaving: jax.Array) -> jax.Array:
+    """The weight a of (J.3), () [1]; 0 where the state crosses the surface.
 
     Args:
       arriving, leaving: rates of the switching function before and beyond the surface, ().
@@ -350,11 +351,9 @@ def _share(arriving: jax.Array, leaving: jax.Array) -> jax.Array:
     return jnp.where(slides, leaving, 0.0) / jnp.where(slides, leaving - arriving, 1.0)
 
 
-def _mixed(share: jax.Array, old: Any, new: Any) -> Any:
-    """What (J.3) adds beyond a surface to a rate, or to a signal that is integrated, from those
-    before and beyond it.
-    """
-    return jax.tree.map(lambda a, b: share * (a - b), old, new)
+def _mixed(weight: jax.Array, old: Any, new: Any) -> Any:
+    """The term a (f- - f+) of (J.3), for a rate of the state or of the accumulators."""
+    return jax.tree.map(lambda a, b: weight * (a - b), old, new)
 
 
 def _along(
@@ -388,9 +387,7 @@ def _sum(one: Any, other: Any) -> Any:
 def _on_its_side(
     scenario: Scenario, t: jax.Array, state: LoopState, above: jax.Array, clearance: jax.Array
 ) -> LoopState:
-    """The state, moved across every surface on whose other side it is by the little that is
-    missing.
-    """
+    """The state, moved to the given side of every surface, at least as far as the clearance."""
     fixed: Any = jax.lax.stop_gradient((scenario, t, state))
 
     def functions(q, dq):

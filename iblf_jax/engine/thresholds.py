@@ -136,11 +136,6 @@ def compiles_states(operations: int) -> bool:
     return operations <= LONG_EVALUATION
 
 
-def keeps_columns(order: int, numbers: int) -> bool:
-    """Whether a derivative of this order, of so many numbers, is made column by column and kept."""
-    return order <= HIGHEST_COLUMN_ORDER and numbers <= KEPT_NUMBERS
-
-
 def differentiates_forward(numbers: int) -> bool:
     """Whether derivatives by so many numbers are taken in forward mode."""
     return numbers <= FORWARD_MOST

@@ -1,13 +1,14 @@
-"""One run that a user transforms: differentiated, batched, or compiled as a part of something
-larger.
+"""One run that a user differentiates, batches, or compiles as a part of a larger program.
 
-The run itself is plain JAX (`scan`).  Its first derivatives are a kernel's, where there is one,
+The run itself is plain JAX (`scan`).  A kernel computes its first derivatives where one can be
+built,
 
     out' = J leaves',       J = d (records, metrics) / d leaves,
 
-each column of J a run with one tangent (`columns`).  JAX transposes the product, so both modes have
-it.  J's own derivative is made in the same way.  Third derivatives are the scan's, and those by the
-step, by a metric's parameters, or of more records than are kept.
+where each column of J is a run with one tangent (`columns`).  JAX transposes the product, so both
+forward and reverse mode use J, and the derivative of J is computed in the same way.  The scan
+computes all other derivatives: those of third order, by the time step, by parameters of a metric,
+by many numbers, and of more records than are kept (`derivatives.choose_derivatives`).
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from jax.custom_derivatives import SymbolicZero
 
 from iblf_jax.core import checks
 from iblf_jax.core.caches import CACHE
-from iblf_jax.engine import registry, thresholds
+from iblf_jax.engine import registry
 from iblf_jax.engine.batch import Batch, Leaves, run_all
 from iblf_jax.engine.columns import ACCURACY, Places, columns, floats_of, numbers_of
 from iblf_jax.engine.compile import (
@@ -34,12 +35,14 @@ from iblf_jax.engine.compile import (
     nested_batch,
     run_lowered,
 )
+from iblf_jax.engine.derivatives import DerivativeSizes, choose_derivatives
 from iblf_jax.engine.loops import kernel_loop, scan
-from iblf_jax.engine.mechanism import known_of
+from iblf_jax.engine.outcome import Outcome
 from iblf_jax.engine.plan import PLAIN_LAYOUT, ExecutionPlan
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.single_run import run_one
-from iblf_jax.engine.step import Outcome, recorded
+from iblf_jax.engine.structural_constants import constants_of
+from iblf_jax.engine.time_step import recorded
 from iblf_jax.simulation.scenario import Scenario
 
 
@@ -79,7 +82,7 @@ def run_transformable(
     leaves, treedef = jax.tree.flatten(inputs_of(scenario, folds, dt, request, noise))
     backend, reason = registry.automatic()
     compiles = request.backend != "vmap" and reason is None
-    request = request._replace(constants=known_of(scenario), backend="auto")
+    request = request._replace(constants=constants_of(scenario), backend="auto")
     runs = Runs(treedef, request, backend, (False,) * len(leaves))
     if compiles:
         return _differentiable(runs)(*leaves)
@@ -154,7 +157,7 @@ def _run_by_kernel(runs: Runs, *leaves: jax.Array) -> Outcome:
     """The run by the kernel."""
     if checks.is_concrete(leaves):
         inputs = jax.tree.unflatten(runs.treedef, leaves)
-        request = runs.request._replace(constants=known_of(inputs.scenario))
+        request = runs.request._replace(constants=constants_of(inputs.scenario))
         return run_one(inputs.scenario, inputs.folds, inputs.dt, request, inputs.noise)
     return jax.tree.map(lambda x: x[0], _over_runs(_values, runs)(*leaves))
 
@@ -166,9 +169,7 @@ def _by_kernel(runs: Runs, places: Places, leaves: tuple) -> Any:
     scenario = jax.tree.unflatten(runs.treedef, runs.is_per_run).scenario
     number_of_leaves = len(jax.tree.leaves(scenario))
     by_scenario = all(i < number_of_leaves for level in places for i in level)
-    if not by_scenario or not thresholds.keeps_columns(len(places), _size(runs, places, leaves)):
-        return None
-    if any(_numbers_in(leaves, level) > thresholds.MAX_COLUMNS for level in places):
+    if not by_scenario or choose_derivatives(_derivative_sizes(runs, places, leaves)) == "scan":
         return None
     kernel = jax.custom_jvp(
         lambda *leaves: jax.tree.map(lambda x: x[0], _over_runs(_columns, runs, places)(*leaves))
@@ -214,18 +215,18 @@ def _by_scan(runs: Runs, places: Places, leaves: tuple) -> Any:
     return jax.vmap(along, out_axes=len(places) - 1)(units)
 
 
-def _size(runs: Runs, places: Places, leaves: tuple) -> int:
-    """Numbers of a derivative of one run's records."""
-    every, numbers = runs.request.record_every, 0
+def _derivative_sizes(runs: Runs, places: Places, leaves: tuple) -> DerivativeSizes:
+    """The sizes that decide how a derivative of one run's records and metrics is computed."""
+    every, recorded_numbers = runs.request.record_every, 0
     if every is not None:
         samples = runs.request.steps // every + 1
-        numbers = numbers_of(jax.tree.unflatten(runs.treedef, leaves), recorded) * samples
-    return numbers * math.prod(_numbers_in(leaves, level) for level in places)
-
-
-def _numbers_in(leaves: tuple, level: tuple[int, ...]) -> int:
-    """The number of entries of some leaves."""
-    return sum(jnp.size(leaves[i]) for i in level)
+        recorded_numbers = numbers_of(jax.tree.unflatten(runs.treedef, leaves), recorded) * samples
+    columns = [sum(jnp.size(leaves[i]) for i in level) for level in places]
+    return DerivativeSizes(
+        kept_numbers=recorded_numbers * math.prod(columns),
+        order=len(places),
+        columns=max(columns),
+    )
 
 
 def _over_runs(function: Callable, runs: Runs, *static: Any) -> Callable:

@@ -59,26 +59,23 @@ import numpy as np
 from iblf_jax.core import checks, notices
 from iblf_jax.core.joints import holds_weights
 from iblf_jax.core.optional import attributes
+from iblf_jax.core.pytree import field_values
 from iblf_jax.files import components
 from iblf_jax.files.scenario import from_dict, read_toml, scenario_to_dict
 from iblf_jax.files.study import perturbations_of
 from iblf_jax.files.values import Words, as_table, did_you_mean, known_keys, numbers
 from iblf_jax.simulation import metrics
-from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.studies import distributions
-from iblf_jax.studies.designs import MAX_RUNS
 from iblf_jax.studies.distributions import Distribution, Perturbation
 from iblf_jax.studies.draws import targets_of
-from iblf_jax.studies.statistics import check_confidence
 from iblf_jax.tuning import objectives, quantities
 from iblf_jax.tuning._tune import tune
 from iblf_jax.tuning.objectives import Objective, checked
-from iblf_jax.tuning.options import EARLIER_NAMES, REPLACED, Report
+from iblf_jax.tuning.options import EARLIER_NAMES, OF_REPORT, REPLACED, Report
 from iblf_jax.tuning.parameters import tunable
 from iblf_jax.tuning.result import TuneResult, TuneSetup
-from iblf_jax.tuning.robust import KINDS, Risk, as_risk, cvar
-from iblf_jax.tuning.runs import check_backend
+from iblf_jax.tuning.robust import KINDS, Risk, cvar
 from iblf_jax.tuning.solvers import SOLVERS
 from iblf_jax.world.robots import joint_names
 
@@ -332,6 +329,12 @@ RESULT = (
     "probes",
 )
 """Fields of a result that are words and numbers."""
+SETUP = tuple(
+    field.name
+    for field in dataclasses.fields(TuneSetup)
+    if field.name not in ("objective", "perturbations", "risk", "report")
+)
+"""Fields of its setup that are words and numbers."""
 
 
 def save_tuning(result: TuneResult, path: str | os.PathLike) -> None:
@@ -342,25 +345,14 @@ def save_tuning(result: TuneResult, path: str | os.PathLike) -> None:
         name: {"dtype": str(x.dtype), "shape": x.shape, "values": x.ravel().tolist()}
         for name, x in result.history.items()
     }
-    of_setup = (
-        "runs",
-        "seed",
-        "duration",
-        "dt",
-        "method",
-        "backend",
-        "report_runs",
-        "report_seed",
-        "confidence",
-        "limits",
-        "reasons",
-    )
+    report = field_values(setup.report)
+    of_report = {name: report[field] for name, field in OF_REPORT.items()}
     data = {
         "what": "iblf_jax tuning result",
         "start": scenario_to_dict(result.start),
         "values": {key: np.asarray(x).tolist() for key, x in result.values.items()},
         "history": history,
-        "setup": attributes(setup, of_setup),
+        "setup": attributes(setup, SETUP) | of_report,
         "risk": list(setup.risk),
         "objective": components.encode_fields(setup.objective, "objective"),
         "perturbations": {
@@ -421,34 +413,23 @@ def _with_new_names(table: Any) -> Any:
 
 def _decoded_setup(data: dict[str, Any]) -> TuneSetup:
     """The options of a saved result, checked."""
+    saved = dict(data["setup"])
+    report = Report(**{field: saved.pop(name) for name, field in OF_REPORT.items()})
+    checks.seed(report.seed, "report_seed")
+    for name, decode in (("limits", float), ("reasons", str)):
+        saved[name] = tuple((decode(low), decode(high)) for low, high in saved.get(name, ()))
+    objective = _with_new_names(data["objective"])
     setup = TuneSetup(
-        objective=checked(
-            components.decode_fields(Objective, _with_new_names(data["objective"]), "objective")
-        ),
+        objective=checked(components.decode_fields(Objective, objective, "objective")),
         perturbations={
             key: components.decode_fields(Perturbation, x, key)
             for key, x in data["perturbations"].items()
         },
-        risk=as_risk(Risk(*data["risk"])),
-        **data["setup"]
-        | {
-            "limits": tuple(
-                (float(low), float(high)) for low, high in data["setup"].get("limits", ())
-            ),
-            "reasons": tuple(
-                (str(low), str(high)) for low, high in data["setup"].get("reasons", ())
-            ),
-        },
+        risk=Risk(*data["risk"]),
+        report=report,
+        **saved,
     )
-    tableau(setup.method)
-    check_backend(setup.backend)
-    checks.whole_steps(setup.duration, setup.dt)
-    check_confidence(setup.confidence)
-    for name, value in attributes(setup, ("runs", "report_runs")).items():
-        checks.positive_integer(name, value, most=MAX_RUNS)
-    checks.seed(setup.seed)
-    checks.seed(setup.report_seed)
-    return setup
+    return setup.checked()
 
 
 def _decoded_history(table: dict[str, Any], count: int) -> dict[str, np.ndarray]:

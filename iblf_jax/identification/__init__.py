@@ -3,20 +3,21 @@
     known = ij.identify(scenario, "log.csv", ["robot.mass", "robot.damping"])
     known.scenario, known.perturbations, known.plot(), known.save("report.html")
 
-`_identify`    the public function: options, problem, search, result
-`problem`      what is identified, from which data
-`log`          logs, read and checked
-`coordinates`  parameters, and coordinates in which every point is a rigid body
-`smoothing`    velocities and accelerations from positions
-`regression`   the initial estimate
-`replay`       the plant under a logged torque, and its sensitivities
-`shooting`     simulation error over windows (multiple shooting)
-`standstill`   free torques in place of the friction law near standstill
-`search`       the Levenberg-Marquardt method inside limits
-`statistics`   standard errors, identifiability, whiteness
-`structure`    terms that the model lacks
-`result`       `Identification`
-`_excitation`  a reference that makes parameters identifiable
+`_identify`             the public function: options, problem, search, result
+`problem`               what is identified, from which data
+`log`                   logs, read and checked
+`coordinates`           parameters, and coordinates in which all points are rigid bodies
+`smoothing`             velocities and accelerations from positions
+`regression`            the initial estimate
+`replay`                the plant under a logged torque, and its sensitivities
+`shooting`              simulation error over windows (multiple shooting)
+`standstill`            free torques in place of the friction law near standstill
+`levenberg_marquardt`   the Levenberg-Marquardt method inside limits
+`statistics`            standard errors, identifiability, whiteness
+`missing_terms`         terms that the model lacks
+`assessment`            verdicts and notes about a fit
+`result`                `Identification`
+`_excitation`           a reference that makes parameters identifiable
 """
 
 from iblf_jax.identification._excitation import excitation as excitation

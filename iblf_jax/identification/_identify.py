@@ -12,6 +12,7 @@ import numpy as np
 
 from iblf_jax.core import checks, notices
 from iblf_jax.core.pytree import astype
+from iblf_jax.identification.assessment import assessed
 from iblf_jax.identification.coordinates import (
     DELAY_PATH,
     DELAY_SCALE,
@@ -25,11 +26,10 @@ from iblf_jax.identification.log import Log, read
 from iblf_jax.identification.problem import IdentificationProblem
 from iblf_jax.identification.regression import (
     LARGEST_DELAY,
-    InitialEstimate,
     coordinate_scales,
     initial_estimate,
 )
-from iblf_jax.identification.result import INCOMPLETE_RATIO, MIN_NOISE, Identification, assessed
+from iblf_jax.identification.result import INCOMPLETE_RATIO, MIN_NOISE, Identification
 from iblf_jax.identification.shooting import Prior, Refinement, Windows, windows
 from iblf_jax.identification.smoothing import smooth_logs
 from iblf_jax.identification.standstill import (
@@ -65,106 +65,99 @@ def identify(
     priors: Mapping[str, Any] | None = None,
     iterations: int = 30,
 ) -> Identification:
-    """Parameters of a robot from its log: linear regression, refined by simulation error over
-    windows.
+    """Parameters of a robot from its log: regression, refined by simulation error over windows.
 
-        minimise  sum over windows, samples, joints of  rho((y - q) / sigma) / 2,    q the plant
-        under the logged torque
+        minimise  sum over windows, samples, joints of  rho((y - q) / sigma) / 2
 
-    Each window of the log has an initial state of its own, which is estimated as well; sigma of
-    each joint is estimated.  The motion comes from positions only, and no control law need be
-    known.
+    Here q is the motion of the plant under the logged torque.  The initial state of each window and
+    sigma of each joint are estimated as well.  No logged velocities and no control law are needed.
 
     Args:
       scenario: on a robot of n joints; the search starts from its plant's parameters.
       log: t (N,) [s], q (N, n) [rad], tau (N, n) [N m], dq (N, n) [rad/s] if there is one: an
-        xarray Dataset, a mapping, a `Rollout`, a CSV
-        file (its heading: t, q[0], ..., tau[0], ...) or a netCDF file, or a list of these.  Times
-          may be irregular and have gaps.
-      paths: of leaves of robot (plant and model), plant, model or disturbance; "sampling.delay" for
-        the torque's delay.
-      held_out: the share of each log, at its end, that is held back for validation; or a log, or a
-        list of logs, for it.
-      window: length of the windows [s]; longer ones contain more information, and are more
-        sensitive to model errors.
-      torque: "held" from a sample to the next, as a digital loop does, or "interpolated", for
-        torques that were measured; if not given, interpolated for a `Rollout` of a continuous loop,
-        else held.
+        xarray Dataset, a mapping, a `Rollout`, a CSV file with the heading t, q[0], ..., tau[0],
+        ..., a netCDF file, or a list of these.  Times may be irregular and have gaps.
+      paths: of leaves of robot (plant and model), plant, model, disturbance, or "sampling.delay".
+      held_out: the share of each log, at its end, that is held back for validation; or logs for it.
+      window: length of the windows [s]; long ones contain more information and more model error.
+      torque: "held" between samples, as in a digital loop, or "interpolated", for measured torques;
+        if not given, interpolated for a `Rollout` of a continuous loop, else held.
       delay: delay of the logged torque [s]; estimated if not given.
       loss: "squares", or "huber" for logs with outliers.
-      widths: whether the behaviour of Coulomb friction near standstill is identified as well: it is
-        tanh(q' / width) with an estimated width, or another law (sticking, a bristle, an impulse)
-        that free torques replace.  Otherwise the scenario's widths are assumed; a wrong width
-        biases all parameters (7 joints with dry friction: by up to 34 %).
+      widths: whether Coulomb friction near standstill is identified: tanh(q' / width) with an
+        estimated width, or free torques where it obeys another law (sticking, a bristle).  A wrong
+        width biases all parameters (7 joints with dry friction: by up to 34 %).
       limits: path -> (low, high) in the leaf's unit, None for the default: masses are above 0,
         friction and damping not below.
-      priors: path -> (mean, standard deviation) of what is known from elsewhere, in the leaf's
-        unit.
-      iterations: Gauss-Newton steps, at most.
+      priors: path -> (mean, standard deviation) known from elsewhere, in the leaf's unit.
+      iterations: largest number of Gauss-Newton steps.
 
     Returns:
-      An `Identification`: values with standard errors, what the log does not identify, the fit, and
-        `.scenario` with the new parameters.
+      An `Identification`: values with standard errors, the fit, and the new `.scenario`.
 
     Raises:
-      ValueError: a path that does not move the plant; a log that is incomplete, has rows without
-        numbers, times that do not increase, wrong units or columns, or in which the robot stands
-        still; the message names the value and the remedy.
+      ValueError: a path that does not move the plant; a log that is incomplete, in wrong units or
+        columns, has rows without numbers or times that do not increase, or shows no motion.
       OSError: a file cannot be read.
 
-    Source: H. G. Bock's multiple shooting; L. Ljung, System Identification, 2nd ed., 1999; C.
-      Rucker, P. M. Wensing 2022 for inertias.
+    Source: H. G. Bock; L. Ljung, System Identification, 1999; C. Rucker, P. M. Wensing 2022.
     """
     began = time.monotonic()
     given = canonical(scenario)
-    options = _checked_options(log, window, torque, delay, loss, widths, limits, priors, iterations)
+    options = Options(window, torque, delay, loss, widths, limits, priors, iterations)
+    options = _checked(options, log)
     with jax.enable_x64(True):  # noise of 1e-4 rad leaves no room for the rounding of float32
-        problem = _problem(given, log, paths, held_out, options)
-        result = _solved(problem, began)
+        result = _solved(_problem(given, log, paths, held_out, options), began)
     dtype = given.initial.q.dtype
     return dataclasses.replace(result, scenario=astype(result.scenario, dtype), start=given)
 
 
 class Options(NamedTuple):
-    """The checked options of `identify`."""
+    """The options of `identify`, as its arguments of the same names."""
 
-    window: float
-    zero_order_hold: bool
-    delay: float | None
+    window: Any
+    torque: Any
+    delay: Any
     loss: str
-    widths: bool
-    limits: Mapping[str, Any]
-    priors: Mapping[str, Any]
-    iterations: int
+    widths: Any
+    limits: Any
+    priors: Any
+    iterations: Any
 
 
-def _checked_options(
-    log: Any,
-    window: Any,
-    torque: Any,
-    delay: Any,
-    loss: Any,
-    widths: Any,
-    limits: Any,
-    priors: Any,
-    iterations: Any,
-) -> Options:
-    """The options of `identify`; ValueError for one that is invalid."""
+def _checked(options: Options, log: Any) -> Options:
+    """The options with their defaults; ValueError for one that is invalid."""
+    torque, delay = options.torque, options.delay
     if torque is None:
-        torque = "interpolated" if _is_continuous(log) else "held"
+        runs = log if isinstance(log, list | tuple) else [log]
+        continuous = all(isinstance(x, Rollout) and x.scenario.sampling is None for x in runs)
+        torque = TORQUES[int(continuous)]
     checks.one_of("torque", torque, TORQUES)
-    checks.one_of("loss", loss, LOSSES)
-    window = checks.time_span("window", window)
-    iterations = checks.positive_integer("iterations", iterations, most=checks.MAX_STEPS)
-    if limits is None:
-        limits = {}
-    limits = checks.mapping("limits", limits, '{"plant.mass": (0.1, 5.0)}')
-    if priors is None:
-        priors = {}
-    priors = checks.mapping("priors", priors, '{"plant.mass": (2.0, 0.1)}')
-    _check_delay(delay)
-    widths = checks.flag("widths", widths)
-    return Options(window, torque == "held", delay, loss, widths, limits, priors, iterations)
+    checks.one_of("loss", options.loss, LOSSES)
+    if delay is not None:
+        number = checks.as_floats("delay", delay)
+        if number.ndim != 0 or not abs(float(number)) <= LARGEST_DELAY:
+            expected = f"one number [s], of a size of at most {LARGEST_DELAY:g} s"
+            remedy = "Leave it out to have it found from the log."
+            raise checks.fail("delay", delay, expected, remedy)
+        delay = float(delay)
+    return Options(
+        window=checks.time_span("window", options.window),
+        torque=torque,
+        delay=delay,
+        loss=options.loss,
+        widths=checks.flag("widths", options.widths),
+        limits=_by_path("limits", options.limits, '{"plant.mass": (0.1, 5.0)}'),
+        priors=_by_path("priors", options.priors, '{"plant.mass": (2.0, 0.1)}'),
+        iterations=checks.positive_integer("iterations", options.iterations, most=checks.MAX_STEPS),
+    )
+
+
+def _by_path(name: str, given: Any, example: str) -> Mapping[str, Any]:
+    """A mapping from paths that may be left out."""
+    if given is None:
+        return {}
+    return checks.mapping(name, given, example)
 
 
 def _problem(
@@ -172,30 +165,24 @@ def _problem(
 ) -> IdentificationProblem:
     """What is identified, from which data; ValueError for logs that are too short."""
     start = canonical(astype(given, "float64"))
+    hold = options.torque == "held"
     all_paths = with_widths(start, paths) if options.widths else paths
     simulated, c = coordinates(start, all_paths, options.limits)
     logs, held_back = _logs(log, held_out, start.n)
-    fitted_windows = windows(logs, options.window, held_back, options.zero_order_hold)
-    _enough(fitted_windows, len(c.x), logs, options.window)
-    fitted_logs = [
-        part
-        for one, share in zip(logs, held_back, strict=True)
-        for part in _front(one, 1.0 - share)
-    ]
-    fixed_delay = None
-    if options.delay is not None and not c.delay:
-        fixed_delay = float(options.delay)
+    fitted_windows = windows(logs, options.window, held_back, hold)
+    _check_size(fitted_windows, len(c.x), logs, options.window)
+    fronts = [_front(one, 1.0 - share) for one, share in zip(logs, held_back, strict=True)]
     return IdentificationProblem(
         start=start,
         simulated=simulated,
         coordinates=c,
         logs=logs,
         windows=fitted_windows,
-        smooth=smooth_logs(fitted_logs, options.zero_order_hold),
+        smooth=smooth_logs([front for front in fronts if len(front.t)], hold),
         prior=_prior(c, options.priors),
         requested=len([path for path in paths if path != DELAY_PATH]),
-        fixed_delay=fixed_delay,
-        zero_order_hold=options.zero_order_hold,
+        fixed_delay=None if c.delay else options.delay,
+        zero_order_hold=hold,
         loss=options.loss,
         iterations=options.iterations,
     )
@@ -203,31 +190,27 @@ def _problem(
 
 def _solved(problem: IdentificationProblem, began: float) -> Identification:
     """The result: regression, free torques near standstill, then the friction law."""
-    guess = initial_estimate(
-        problem.simulated, problem.coordinates, problem.smooth, "log", problem.fixed_delay
-    )
-    noise = np.maximum(problem.smooth.noise, 1e-9)
-    by_law = no_free_torques(problem.windows.y.shape, len(problem.coordinates.x))
-    before = problem.replay(problem.coordinates.x, by_law).best_starts(
-        np.append(to_z(problem.coordinates, problem.coordinates.x), guess.delay), noise
-    )[1]
-    search = _Search(problem, guess, noise)
+    c, noise = problem.coordinates, np.maximum(problem.smooth.noise, 1e-9)
+    guess = initial_estimate(problem.simulated, c, problem.smooth, problem.limits)
+    by_law = no_free_torques(problem.windows.y.shape, len(c.x))
+    before = problem.replay(c.x, by_law).best_starts(np.append(to_z(c, c.x), guess.delay), noise)[1]
+    scale = np.append(coordinate_scales(c, guess.scale), DELAY_SCALE)
+    search = _Search(problem, np.append(guess.z, guess.delay), noise, scale)
     free_fit = search.with_free_torques()
     end, friction_ratio = search.with_friction_law(by_law, free_fit)
     return assessed(problem, guess, end, before, friction_ratio, time.monotonic() - began)
 
 
-class _Search:
+class _Search(NamedTuple):
     """The nonlinear search: simulation error over windows, by `ShootingProblem.refine`."""
 
-    def __init__(
-        self, problem: IdentificationProblem, guess: InitialEstimate, noise: np.ndarray
-    ) -> None:
-        self.problem = problem
-        self.first = np.append(guess.z, guess.delay)
-        self.noise = noise
-        scales = coordinate_scales(problem.coordinates, guess.scale)
-        self.scale = np.append(scales, DELAY_SCALE)
+    problem: IdentificationProblem
+    first: np.ndarray
+    """z at the start, (p + 1,), the delay last."""
+    noise: np.ndarray
+    """First noise level of each joint, (n,) [rad]."""
+    scale: np.ndarray
+    """Scales of z, (p + 1,)."""
 
     def refine(
         self, x: np.ndarray, z: np.ndarray, free: FreeTorques, hopeless: Any = np.inf
@@ -298,22 +281,6 @@ class _Search:
         return chosen._replace(steps=free_fit.steps + law_fit.steps), ratio
 
 
-def _check_delay(delay: Any) -> None:
-    """Raises ValueError for a delay of the torque that is not a number or too long."""
-    if delay is None:
-        return
-    number = checks.as_floats("delay", delay)
-    if number.ndim != 0 or not abs(float(number)) <= LARGEST_DELAY:
-        expected = f"one number [s], of a size of at most {LARGEST_DELAY:g} s"
-        raise checks.fail("delay", delay, expected, "Leave it out to have it found from the log.")
-
-
-def _is_continuous(log: Any) -> bool:
-    """Whether a log is of runs whose law was not sampled."""
-    runs = log if isinstance(log, list | tuple) else [log]
-    return all(isinstance(run, Rollout) and run.scenario.sampling is None for run in runs)
-
-
 def _logs(log: Any, held_out: Any, n: int) -> tuple[list[Log], list[float]]:
     """The logs, and the share of each that is held back."""
     logs = read(log, n)
@@ -325,53 +292,48 @@ def _logs(log: Any, held_out: Any, n: int) -> tuple[list[Log], list[float]]:
     return logs + others, [0.0] * len(logs) + [1.0] * len(others)
 
 
-def _front(log: Log, share: float) -> list[Log]:
-    """The first share of a log; an empty list for one that is held back."""
+def _front(log: Log, share: float) -> Log:
+    """The first share of a log."""
     count = round(share * len(log.t))
-    if not count:
-        return []
     dq = None if log.dq is None else log.dq[:count]
-    return [log._replace(t=log.t[:count], q=log.q[:count], tau=log.tau[:count], dq=dq)]
+    return Log(log.name, log.t[:count], log.q[:count], log.tau[:count], dq)
 
 
-def _enough(w: Windows, p: int, logs: list[Log], length: float) -> None:
-    """Raises ValueError for logs that are too short for the parameters."""
+def _check_size(w: Windows, p: int, logs: list[Log], length: float) -> None:
+    """Raises ValueError for logs that are too short for p parameters."""
+    fitted = int(np.sum(w.kept))
     numbers = 0
-    if len(w.t):
+    if fitted:
         _, samples, n = w.y.shape
-        numbers = int(np.sum(w.kept)) * (samples - 2) * n
+        numbers = fitted * (samples - 2) * n
     if numbers < 3 * p or not numbers:
-        came = checks.Words(
-            f"{sum(x.t[-1] - x.t[0] for x in logs):.3g} s of log between gaps, in"
-            f" {int(np.sum(w.kept))} windows of {length:g} s to fit"
-        )
+        duration = sum(log.t[-1] - log.t[0] for log in logs)
         raise checks.fail(
             "log",
-            came,
+            checks.Words(
+                f"{duration:.3g} s of log between gaps, in {fitted} windows of {length:g} s to fit"
+            ),
             f"at least one window, and 3 measured numbers for each of the {p} parameters",
             "Log for longer, or take a shorter window.",
         )
 
 
 def _prior(c: Coordinates, priors: Mapping[str, Any]) -> Prior:
-    mean, precision = c.x.copy(), np.zeros((len(c.x), len(c.x)))
+    """The prior knowledge of x; ValueError for one that is invalid."""
+    mean, precision = c.x.copy(), np.zeros(len(c.x))
     for path, given in priors.items():
+        name = f"priors[{path!r}]"
         if path not in c.paths:
             raise checks.fail("priors", path, f"one of the paths: {', '.join(c.paths)}")
-        place = c.places[c.paths.index(path)]
         if not isinstance(given, tuple | list) or len(given) != 2:
-            raise checks.fail(
-                f"priors[{path!r}]",
-                given,
-                "(mean, standard deviation), each a number or one an entry",
-            )
+            expected = "(mean, standard deviation), each a number or one an entry"
+            raise checks.fail(name, given, expected)
+        place = c.places[c.paths.index(path)]
         own = slice(place.start, place.start + place.size)
         centre, std = (
-            np.broadcast_to(
-                np.asarray(checks.as_floats(f"priors[{path!r}]", x), float), place.shape
-            ).ravel()
+            np.broadcast_to(np.asarray(checks.as_floats(name, x), float), place.shape).ravel()
             for x in given
         )
-        checks.check_values(f"priors[{path!r}]: standard deviation", std, "positive")
-        mean[own], precision[own, own] = centre, np.diag(std**-2)
-    return Prior(mean, precision)
+        checks.check_values(f"{name}: standard deviation", std, "positive")
+        mean[own], precision[own] = centre, std**-2
+    return Prior(mean, np.diag(precision))

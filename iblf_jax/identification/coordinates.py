@@ -312,7 +312,7 @@ def to_x(c: Coordinates, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def scales(c: Coordinates, scenario: Scenario, by_x: np.ndarray, torque: np.ndarray) -> np.ndarray:
-    """The scale of each parameter (head of this module).
+    """The scale of each parameter, as the docstring of this module defines it.
 
     Args:
       c: the coordinates.

@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.optional import has_members
 from iblf_jax.simulation.results import Rollout
 
 GAP_RATIO, GAP_QUANTILE = 3.0, 0.95
@@ -88,7 +89,7 @@ def read(log: Any, n: int, what: str = "log") -> list[Log]:
         return [_checked(_of_file(path), n, str(path))]
     if isinstance(log, Rollout):
         return [_checked(_of_rollout(log, what), n, what)]
-    if isinstance(log, Mapping) or hasattr(log, "data_vars"):
+    if isinstance(log, Mapping) or has_members(log, "data_vars"):
         return [_checked(_of_mapping(log, what), n, what)]
     raise checks.fail(
         what, log, "a Dataset, a Rollout, the path of a .csv or .nc file, or a list of these"
@@ -96,83 +97,86 @@ def read(log: Any, n: int, what: str = "log") -> list[Log]:
 
 
 def _of_file(path: Path) -> dict[str, np.ndarray]:
-    if path.suffix.lower() == ".nc":
+    ending = path.suffix.lower()
+    if ending == ".nc":
         import xarray
 
         try:
             data = xarray.load_dataset(path)
-        except Exception as error:  # whatever its reader makes of it
-            raise checks.fail(
-                str(path), type(error).__name__, "a netCDF file", str(error)
-            ) from error
+        except Exception as error:  # its readers raise errors of many kinds
+            came = type(error).__name__
+            raise checks.fail(str(path), came, "a netCDF file", str(error)) from error
         return _of_mapping(data, str(path))
-    if path.suffix.lower() != ".csv":
-        raise checks.fail("log", str(path), "a file that ends in .csv or .nc")
+    if ending == ".csv":
+        return _of_columns(*_columns(path), str(path))
+    raise checks.fail("log", str(path), "a file that ends in .csv or .nc")
+
+
+def _columns(path: Path) -> tuple[list[str], np.ndarray]:
+    """The heading of a CSV file, and its rows of numbers, (N, columns)."""
     with open(path, newline="", encoding="utf-8-sig") as file:
-        heading = [
-            word.strip().removeprefix("# ") for word in next(csv.reader(file), [])
-        ]  # numpy.savetxt's begins with "# "
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # a file without rows is reported below
-            try:
-                rows = np.genfromtxt(file, delimiter=",", ndmin=2)
-            except ValueError as error:
-                short = re.search(r"Line #(\d+) \(got (\d+) columns instead of (\d+)\)", str(error))
-                if short is None:
-                    raise checks.fail(
-                        str(path), checks.Words(str(error)), "rows of numbers"
-                    ) from error
-                came = checks.Words(f"{short[2]} columns in row {int(short[1]) - 1}")
-                raise checks.fail(
-                    str(path),
-                    came,
-                    f"{short[3]}, as in the rows before",
-                    "Leave this row out: gaps are allowed.",
-                ) from error
+        # The heading that numpy.savetxt writes begins with "# ".
+        heading = [word.strip().removeprefix("# ") for word in next(csv.reader(file), [])]
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # a file without rows is reported below
+                return heading, np.genfromtxt(file, delimiter=",", ndmin=2)
+        except ValueError as error:
+            text = str(error)
+            short = re.search(r"Line #(\d+) \(got (\d+) columns instead of (\d+)\)", text)
+            if short is None:
+                raise checks.fail(str(path), checks.Words(text), "rows of numbers") from error
+            raise checks.fail(
+                str(path),
+                checks.Words(f"{short[2]} columns in row {int(short[1]) - 1}"),
+                f"{short[3]}, as in the rows before",
+                "Leave this row out: gaps are allowed.",
+            ) from error
+
+
+def _of_columns(heading: list[str], rows: np.ndarray, what: str) -> dict[str, np.ndarray]:
+    """The signals in the columns of a table."""
+    words = checks.Words(", ".join(heading))
     if "t" not in heading or rows.shape[1] != len(heading):
-        came = checks.Words(
-            f"the heading {', '.join(heading) or 'of an empty file'} and rows of {rows.shape[1]}"
-            " columns"
-        )
         raise checks.fail(
-            str(path),
-            came,
+            what,
+            checks.Words(
+                f"the heading {words or 'of an empty file'} and rows of {rows.shape[1]} columns"
+            ),
             "a column t, and one column for each word of the heading",
             "It begins t, q[0], q[1], ...",
         )
     if len(set(heading)) < len(heading):
-        raise checks.fail(str(path), checks.Words(", ".join(heading)), "columns of different names")
+        raise checks.fail(what, words, "columns of different names")
     found = {"t": rows[:, heading.index("t")]}
     for name in ("q", "dq", "tau"):
-        own = {
-            int(m[1]): i
-            for i, word in enumerate(heading)
-            if (m := re.fullmatch(rf"{name}\[(\d+)\]", word))
-        }
-        missing = set(range(max(own, default=0) + 1)) - set(own)
-        if own and missing:
-            raise checks.fail(
-                str(path), checks.Words(", ".join(heading)), f"a column {name}[{min(missing)}]"
-            )
-        if own:
-            found[name] = rows[:, [own[i] for i in range(len(own))]]
+        matches = (re.fullmatch(rf"{name}\[(\d+)\]", word) for word in heading)
+        column = {int(match[1]): i for i, match in enumerate(matches) if match}
+        if not column:
+            continue
+        for j in range(max(column)):
+            if j not in column:
+                raise checks.fail(what, words, f"a column {name}[{j}]")
+        found[name] = rows[:, [column[j] for j in sorted(column)]]
     return found
 
 
 def _of_mapping(data: Any, what: str) -> dict[str, np.ndarray]:
     found = {}
-    time = next((name for name in ("t", "time") if name in data), "t")
-    for name, key in (("t", time), ("q", "q"), ("dq", "dq"), ("tau", "tau")):
+    keys = {"t": "t", "q": "q", "dq": "dq", "tau": "tau"}
+    if "t" not in data:
+        keys["t"] = "time"
+    for name, key in keys.items():
         if key not in data:
             continue
         x = data[key]
-        unit = getattr(x, "attrs", {}).get("units")
-        if unit is not None and unit not in UNITS[name]:
-            raise checks.fail(
-                f"{what}: units of {name}", unit, UNITS[name][0], "Convert the log to SI units."
-            )
-        if "time" in getattr(x, "dims", ()):
-            x = x.transpose("time", ...)
+        if has_members(x, "attrs", "dims"):  # a DataArray of xarray
+            unit = x.attrs.get("units", UNITS[name][0])
+            if unit not in UNITS[name]:
+                field = f"{what}: units of {name}"
+                raise checks.fail(field, unit, UNITS[name][0], "Convert the log to SI units.")
+            if "time" in x.dims:
+                x = x.transpose("time", ...)
         try:
             found[name] = np.asarray(x, float)
         except (TypeError, ValueError) as error:
@@ -182,74 +186,68 @@ def _of_mapping(data: Any, what: str) -> dict[str, np.ndarray]:
 
 def _of_rollout(run: Rollout, what: str) -> dict[str, np.ndarray]:
     if np.ndim(run.t) != 1:
-        raise checks.fail(
-            what, checks.Words("a batch of runs"), "one run", "Give a list: [runs[0], runs[1]]."
-        )
-    if isinstance(run.measured, tuple) and not hasattr(run.measured, "q"):
-        return {
-            "t": np.asarray(run.t, float),
-            "q": np.asarray(run.q, float),
-            "tau": np.asarray(run.tau, float),
-        }
-    # A sampled loop records its measurements at the start of each period.
-    t = np.asarray(run.t, float)
-    period = float(run.scenario.sampling.period)  # type: ignore[union-attr]
-    taken = np.flatnonzero(np.abs(t / period - np.round(t / period)) < 1e-6)
-    return {
-        name: np.asarray(x, float)[taken]
-        for name, x in (("t", t), ("q", run.measured.q), ("tau", run.tau))
-    }
+        remedy = "Give a list: [runs[0], runs[1]]."
+        raise checks.fail(what, checks.Words("a batch of runs"), "one run", remedy)
+    found = {"t": run.t, "q": run.q, "tau": run.tau}
+    rows: Any = slice(None)
+    if run.scenario.sampling is not None:
+        # A sampled loop records its measurements at the start of each period.
+        found["q"] = run.measured.q
+        periods = np.asarray(run.t, float) / float(run.scenario.sampling.period)
+        rows = np.abs(periods - np.round(periods)) < 1e-6
+    return {name: np.asarray(x, float)[rows] for name, x in found.items()}
 
 
 def _checked(found: dict[str, np.ndarray], n: int, what: str) -> Log:
-    for name in ("t", "q", "tau"):
+    """The log of these signals; ValueError for one that is incomplete or invalid."""
+
+    def invalid(about: str, came: str, expected: str, remedy: str = "") -> ValueError:
+        return checks.fail(f"{what}{about}", checks.Words(came), expected, remedy)
+
+    for name, columns in (
+        ("t", "t"),
+        ("q", f"q[0] ... q[{n - 1}]"),
+        ("tau", f"tau[0] ... tau[{n - 1}]"),
+    ):
         if name not in found:
-            columns = name if name == "t" else f"{name}[0] ... {name}[{n - 1}]"
-            raise checks.fail(
-                what,
-                checks.Words(f"no {name}"),
-                f"t, q and tau: {columns} is missing",
-                "Of a CSV file the heading names the columns.",
+            expected = f"t, q and tau: {columns} is missing"
+            raise invalid(
+                "", f"no {name}", expected, "Of a CSV file the heading names the columns."
             )
     t = found["t"]
     if t.ndim != 1:
         raise checks.fail(f"{what}: t", t, "one time a sample, (N,) [s]")
-    for name in set(found) - {"t"}:
-        if found[name].ndim != 2 or found[name].shape[1] != n:
-            came = checks.Words(
-                f"{found[name].shape[1]} joints"
-                if found[name].ndim == 2
-                else f"shape {found[name].shape}"
-            )
-            raise checks.fail(f"{what}: {name}", came, f"(N, {n}), as the scenario has {n} joints")
-        if len(found[name]) != len(t):
-            raise checks.fail(
-                f"{what}: {name}",
-                checks.Words(f"{len(found[name])} samples"),
-                f"{len(t)}, as t has",
-            )
-    if len(t) < MIN_SAMPLES:
-        raise checks.fail(
-            what, checks.Words(f"{len(t)} samples"), f"at least {MIN_SAMPLES}", "Log for longer."
-        )
-    broken = ~np.all(
-        [np.isfinite(x).reshape(len(t), -1).all(axis=1) for x in found.values()], axis=0
-    )
+    count = len(t)
+    for name in ("q", "tau", "dq"):
+        if name not in found:
+            continue
+        shape = found[name].shape
+        came = f"shape {shape}"
+        if len(shape) == 2:
+            came = f"{shape[1]} joints"
+        if len(shape) != 2 or shape[1] != n:
+            raise invalid(f": {name}", came, f"(N, {n}), as the scenario has {n} joints")
+        if shape[0] != count:
+            raise invalid(f": {name}", f"{shape[0]} samples", f"{count}, as t has")
+    if count < MIN_SAMPLES:
+        raise invalid("", f"{count} samples", f"at least {MIN_SAMPLES}", "Log for longer.")
+    finite = {name: np.isfinite(x).reshape(count, -1).all(axis=1) for name, x in found.items()}
+    broken = ~np.all(list(finite.values()), axis=0)
     if np.any(broken):
         first = int(np.argmax(broken))
-        names = ", ".join(name for name, x in found.items() if not np.isfinite(x[first]).all())
-        raise checks.fail(
-            f"{what}: rows that hold no numbers",
-            checks.Words(f"{int(broken.sum())} of {len(t)}, the first is row {first} (in {names})"),
+        names = ", ".join(name for name, rows in finite.items() if not rows[first])
+        raise invalid(
+            ": rows that hold no numbers",
+            f"{int(broken.sum())} of {count}, the first is row {first} (in {names})",
             "finite numbers",
             "Leave these rows out: gaps are allowed.",
         )
     back = np.flatnonzero(np.diff(t) <= 0)
     if len(back):
         k = int(back[0])
-        raise checks.fail(
-            f"{what}: t",
-            checks.Words(f"{t[k]:.9g} and then {t[k + 1]:.9g} in rows {k} and {k + 1}"),
+        raise invalid(
+            ": t",
+            f"{t[k]:.9g} and then {t[k + 1]:.9g} in rows {k} and {k + 1}",
             "times that increase",
             "Leave out rows that repeat a time, or log times with more digits.",
         )

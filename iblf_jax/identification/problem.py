@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.identification.coordinates import Coordinates, to_x
 from iblf_jax.identification.log import Log
-from iblf_jax.identification.regression import LARGEST_DELAY
-from iblf_jax.identification.replay import inverse_dynamics, inverse_dynamics_under
+from iblf_jax.identification.missing_terms import MissingTerms, missing_terms
+from iblf_jax.identification.regression import LARGEST_DELAY, inverse_dynamics_at
+from iblf_jax.identification.replay import inverse_dynamics_under
 from iblf_jax.identification.shooting import Prior, ShootingProblem, Windows, substeps_for
 from iblf_jax.identification.smoothing import SmoothedMotion
 from iblf_jax.identification.standstill import FreeTorques
-from iblf_jax.identification.structure import MissingTerms, missing_terms
 from iblf_jax.simulation.scenario import Scenario
 
 
@@ -42,11 +42,6 @@ class IdentificationProblem(NamedTuple):
     """Whether the torque is constant between samples; otherwise it is interpolated."""
     loss: str
     iterations: int
-
-    @property
-    def estimates_delay(self) -> bool:
-        """Whether the delay of the torque is estimated."""
-        return self.fixed_delay is None
 
     @property
     def limits(self) -> tuple[np.ndarray, np.ndarray]:
@@ -96,8 +91,6 @@ def missing_terms_of_fit(
       z: end of the fit, (p + 1,), the delay last.
       fitted: entries of z that the fit could move, (p + 1,) bool.
     """
-    x, _ = to_x(c, z[:-1])
-    points: list[Any] = [jnp.asarray(a) for a in (x, data.t, data.q, data.dq, data.ddq)]
-    at_end = inverse_dynamics(simulated, *points, places=c.places)
+    at_end = inverse_dynamics_at(simulated, c, to_x(c, z[:-1])[0], data)
     torque, by_x = np.asarray(at_end.torque), np.asarray(at_end.by_x)
     return missing_terms(data, torque, by_x, float(z[-1]), fitted)

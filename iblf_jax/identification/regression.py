@@ -31,8 +31,12 @@ from iblf_jax.identification.coordinates import (
     to_x,
     to_z,
 )
+from iblf_jax.identification.levenberg_marquardt import (
+    WEAK_PRIOR,
+    QuadraticModel,
+    levenberg_marquardt,
+)
 from iblf_jax.identification.replay import InverseDynamics, inverse_dynamics
-from iblf_jax.identification.search import WEAK_PRIOR, QuadraticModel, levenberg_marquardt
 from iblf_jax.identification.smoothing import SmoothedMotion
 from iblf_jax.world.robots import joint_names
 from iblf_jax.world.robots._base import robot_member
@@ -79,7 +83,7 @@ class InitialEstimate(NamedTuple):
 
 
 def initial_estimate(
-    scenario: Any, c: Coordinates, motion: SmoothedMotion, what: str, delay: float | None
+    scenario: Any, c: Coordinates, motion: SmoothedMotion, limits: tuple[np.ndarray, np.ndarray]
 ) -> InitialEstimate:
     """The parameters from which the search starts.
 
@@ -87,21 +91,16 @@ def initial_estimate(
       scenario: scenario whose plant is identified.
       c: the coordinates.
       motion: the smoothed logs.
-      what: the user's word for the log.
-      delay: delay of the torque [s]; estimated if None.
+      limits: lower and upper limits of z, (p + 1,) each, the delay last.
 
     Raises:
       ValueError: the log does not belong to the scenario.
     """
-    _check_motion(scenario, motion, what)
-    first = _inverse_dynamics_at(scenario, c, c.x, motion)
-    _check_torque_size(scenario, first.torque, motion, what)
+    _check_motion(scenario, motion)
+    first = inverse_dynamics_at(scenario, c, c.x, motion)
+    _check_torque_size(scenario, first.torque, motion)
     scale = scales(c, scenario, np.asarray(first.by_x), motion.tau)
-    low_delay, start_delay, high_delay = -LARGEST_DELAY, 0.0, LARGEST_DELAY
-    if delay is not None:
-        low_delay = start_delay = high_delay = delay
-    limits = np.append(c.low, low_delay), np.append(c.high, high_delay)
-    z = np.append(to_z(c, c.x), start_delay)
+    z = np.append(to_z(c, c.x), np.clip(0.0, limits[0][-1], limits[1][-1]))
     z_scale = np.append(coordinate_scales(c, scale), DELAY_SCALE)
     spread = np.sqrt(np.mean((motion.tau - np.mean(motion.tau, axis=0)) ** 2, axis=0))
     sigma = spread + 1e-9
@@ -122,8 +121,8 @@ def initial_estimate(
         sigma = np.sqrt(np.mean(residual**2, axis=0)) + 1e-3 * sigma
     explained = _explained(residual, motion.tau)
     if np.min(explained) < POORLY_EXPLAINED:
-        _check_explained(scenario, c, motion, residual, what)
-    _check_masses(c, to_x(c, z[:-1])[0], what)
+        _check_explained(scenario, c, motion, residual)
+    _check_masses(c, to_x(c, z[:-1])[0])
     return InitialEstimate(z[:-1], float(z[-1]), scale, explained, motion.noise)
 
 
@@ -143,7 +142,7 @@ class _Regression(NamedTuple):
     def dynamics(self, z: np.ndarray) -> InverseDynamics:
         """The torques of the model at z, and their derivatives."""
         x, _ = to_x(self.coordinates, z[:-1])
-        return _inverse_dynamics_at(self.scenario, self.coordinates, x, self.motion)
+        return inverse_dynamics_at(self.scenario, self.coordinates, x, self.motion)
 
     def residual(self, dynamics: InverseDynamics, z: np.ndarray) -> np.ndarray:
         """Logged less modelled torques, (P, n) [N m]."""
@@ -179,9 +178,10 @@ def coordinate_scales(c: Coordinates, scale: np.ndarray) -> np.ndarray:
     return scale
 
 
-def _inverse_dynamics_at(
+def inverse_dynamics_at(
     scenario: Any, c: Coordinates, x: np.ndarray, motion: SmoothedMotion
 ) -> InverseDynamics:
+    """The torques that a smoothed motion needs with parameters x, and their derivatives."""
     points: list[Any] = [jnp.asarray(a) for a in (x, motion.t, motion.q, motion.dq, motion.ddq)]
     return inverse_dynamics(scenario, *points, places=c.places)
 
@@ -202,12 +202,12 @@ def _unexplained_share(residual: np.ndarray, tau: np.ndarray) -> float:
 # ----------------------------------------------------------------- checks of the log
 
 
-def _check_motion(scenario: Any, motion: SmoothedMotion, what: str) -> None:
+def _check_motion(scenario: Any, motion: SmoothedMotion) -> None:
     """Raises ValueError for a robot at standstill, or for a motion that is impossible."""
     speed = np.sqrt(np.mean(motion.dq**2, axis=0))
-    _check_speed(motion, float(np.sqrt(np.sum(speed**2))), what)
+    _check_speed(motion, float(np.sqrt(np.sum(speed**2))))
     names = joint_names(scenario.plant, scenario.n)
-    _check_positions(scenario, motion, names, what)
+    _check_positions(scenario, motion, names)
     logged = np.isfinite(motion.measured).all(axis=1)
     if not logged.any():
         return
@@ -216,27 +216,27 @@ def _check_motion(scenario: Any, motion: SmoothedMotion, what: str) -> None:
     if difference[worst] > 0.5 * speed[worst] + 0.05:
         rms = np.sqrt(np.mean(motion.measured[logged, worst] ** 2))
         raise checks.fail(
-            f"{what}: dq[{worst}] ({names[worst]})",
+            f"log: dq[{worst}] ({names[worst]})",
             checks.Words(f"{rms:.3g} rad/s (root mean square)"),
             f"the rate of q[{worst}], {speed[worst]:.3g} rad/s",
             "Check units and the order of the columns.",
         )
 
 
-def _check_speed(motion: SmoothedMotion, speed: float, what: str) -> None:
+def _check_speed(motion: SmoothedMotion, speed: float) -> None:
     """Raises ValueError for a robot at standstill; `speed` is the root mean square [rad/s]."""
     if speed >= STANDSTILL_SPEED:
         return
     far, duration = float(np.max(np.ptp(motion.q, axis=0))), float(np.ptp(motion.t))
     if far > STANDSTILL_RANGE:
         raise checks.fail(
-            f"{what}: t",
+            "log: t",
             checks.Words(f"{far:.3g} rad of motion in {duration:.4g} s"),
             f"times in s, and motion of at least {STANDSTILL_SPEED:g} rad/s",
             "Divide times in ms by 1000.",
         )
     raise checks.fail(
-        what,
+        "log",
         checks.Words(
             f"a robot that stands still: its joints move at {speed:.2g} rad/s (root mean square)"
         ),
@@ -245,9 +245,7 @@ def _check_speed(motion: SmoothedMotion, speed: float, what: str) -> None:
     )
 
 
-def _check_positions(
-    scenario: Any, motion: SmoothedMotion, names: tuple[str, ...], what: str
-) -> None:
+def _check_positions(scenario: Any, motion: SmoothedMotion, names: tuple[str, ...]) -> None:
     """Raises ValueError for positions outside the ranges of the joints."""
     kinds = robot_member(scenario.plant, "kinds") or ("revolute",) * scenario.n
     for range_name, limits in _ranges(scenario).items():
@@ -262,7 +260,7 @@ def _check_positions(
             if kinds[j] == "revolute" and fits_in_degrees:
                 remedy = "It would fit in degrees: convert it to rad."
             raise checks.fail(
-                f"{what}: q[{j}] ({names[j]})",
+                f"log: q[{j}] ({names[j]})",
                 checks.Words(f"{least:.4g} to {most:.4g} rad"),
                 f"positions inside {range_name}, {low:.4g} to {high:.4g} rad",
                 remedy,
@@ -276,12 +274,8 @@ def _ranges(scenario: Any) -> dict[str, np.ndarray]:
     found = {}
     limits = robot_member(scenario.plant, "limits")
     if limits is not None:
-        found["the arm's limits"] = np.stack(
-            [np.asarray(limits.lower), np.asarray(limits.upper)], axis=1
-        )
-        found = {
-            name: np.where(np.isfinite(x), x, np.array([-1e9, 1e9])) for name, x in found.items()
-        }
+        ends = np.stack([np.asarray(limits.lower), np.asarray(limits.upper)], axis=1)
+        found["the arm's limits"] = np.where(np.isfinite(ends), ends, [-1e9, 1e9])
     tube = scenario.context.tube(jnp.zeros((), scenario.initial.q.dtype))
     low, high = np.asarray(tube.lower), np.asarray(tube.upper)
     wide = np.where(np.isfinite(high - low), np.maximum(1.0, high - low), np.inf)
@@ -291,7 +285,7 @@ def _ranges(scenario: Any) -> dict[str, np.ndarray]:
     return found
 
 
-def _check_torque_size(scenario: Any, modelled: Any, motion: SmoothedMotion, what: str) -> None:
+def _check_torque_size(scenario: Any, modelled: Any, motion: SmoothedMotion) -> None:
     """Raises ValueError for torques in another unit; `modelled` are those of the scenario's
     robot.
     """
@@ -301,7 +295,7 @@ def _check_torque_size(scenario: Any, modelled: Any, motion: SmoothedMotion, wha
     ratio = logged_rms / max(model_rms, 1e-12)
     if ratio > WRONG_SIZE or ratio < 1.0 / WRONG_SIZE:
         raise checks.fail(
-            f"{what}: tau",
+            "log: tau",
             checks.Words(
                 f"{logged_rms:.3g} N m (root mean square), {ratio:.3g} times what the scenario's"
                 " robot needs for this motion"
@@ -315,14 +309,14 @@ def _check_torque_size(scenario: Any, modelled: Any, motion: SmoothedMotion, wha
     if np.any(most > 3.0 * effort):
         j = int(np.argmax(most / effort))
         raise checks.fail(
-            f"{what}: tau[{j}]",
+            f"log: tau[{j}]",
             checks.Words(f"up to {most[j]:.4g} N m"),
             f"at most the joint's largest torque, {effort[j]:.4g} N m",
             "Convert it to N m.",
         )
 
 
-def _check_masses(c: Coordinates, x: np.ndarray, what: str) -> None:
+def _check_masses(c: Coordinates, x: np.ndarray) -> None:
     """Raises ValueError for torques of a very different robot, all masses of which are many times
     larger or smaller.
     """
@@ -334,7 +328,7 @@ def _check_masses(c: Coordinates, x: np.ndarray, what: str) -> None:
     factor = x[links] / c.x[links]
     if len(links) and (np.min(factor) > OTHER_ROBOT or np.max(factor) < 1.0 / OTHER_ROBOT):
         raise checks.fail(
-            f"{what}: tau",
+            "log: tau",
             checks.Words(
                 f"torques of a robot whose masses are {np.min(factor):.3g} to {np.max(factor):.3g}"
                 " times the scenario's"
@@ -345,22 +339,22 @@ def _check_masses(c: Coordinates, x: np.ndarray, what: str) -> None:
 
 
 def _check_explained(
-    scenario: Any, c: Coordinates, motion: SmoothedMotion, residual: np.ndarray, what: str
+    scenario: Any, c: Coordinates, motion: SmoothedMotion, residual: np.ndarray
 ) -> None:
     """Raises ValueError if other columns or units explain the torques, or if nothing does."""
     unexplained = _unexplained_share(residual, motion.tau)
     best, best_reading = unexplained, ""
-    same = _inverse_dynamics_at(scenario, c, c.x, motion)
+    same = inverse_dynamics_at(scenario, c, c.x, motion)
     for reading, other in _alternative_readings(motion):
         dynamics = same
         if other.q is not motion.q:
-            dynamics = _inverse_dynamics_at(scenario, c, c.x, other)
+            dynamics = inverse_dynamics_at(scenario, c, c.x, other)
         share = _unexplained_by_regression(dynamics, other)
         if share < min(0.5 * best, 1.0 - BARELY_EXPLAINED):
             best, best_reading = share, reading
     if best_reading:
         raise checks.fail(
-            what,
+            "log",
             checks.Words(
                 f"torques of which these parameters explain {1.0 - unexplained:.0%}, the mean over"
                 f" joints; {best_reading}, they would explain {1.0 - best:.0%}"
@@ -372,7 +366,7 @@ def _check_explained(
     explained = 1.0 - np.sum(residual**2) / spread
     if explained < BARELY_EXPLAINED:
         raise checks.fail(
-            what,
+            "log",
             checks.Words(f"torques of which these parameters explain {max(explained, 0.0):.0%}"),
             f"at least {BARELY_EXPLAINED:.0%}",
             "Check that the log is of this robot, its units and columns; or identify more"
@@ -393,29 +387,25 @@ def _unexplained_by_regression(dynamics: InverseDynamics, motion: SmoothedMotion
 def _alternative_readings(motion: SmoothedMotion) -> Iterator[tuple[str, SmoothedMotion]]:
     """Other units, signs and orders of the columns: the description, and the log with them."""
     n = motion.q.shape[1]
-    turn = np.pi / 180.0
-    yield (
-        "with q in degrees",
-        motion._replace(q=motion.q * turn, dq=motion.dq * turn, ddq=motion.ddq * turn),
-    )
+
+    def changed(change: Any) -> SmoothedMotion:
+        return motion._replace(q=change(motion.q), dq=change(motion.dq), ddq=change(motion.ddq))
+
+    yield "with q in degrees", changed(np.radians)
     for words, factor in OTHER_UNITS.items():
         yield words, motion._replace(tau=factor * motion.tau)
-    joints = range(n) if n > 1 else ()
-    for j in joints:
+    if n == 1:
+        return
+    for j in range(n):
         sign = np.where(np.arange(n) == j, -1.0, 1.0)
-        yield f"with tau[{j}] of the other sign", motion._replace(tau=sign * motion.tau)
-        turned = motion._replace(q=sign * motion.q, dq=sign * motion.dq, ddq=sign * motion.ddq)
+        turned, tau = changed(lambda x, sign=sign: sign * x), sign * motion.tau
+        yield f"with tau[{j}] of the other sign", motion._replace(tau=tau)
         yield f"with q[{j}] of the other sign", turned
-        yield f"with q[{j}] and tau[{j}] of the other sign", turned._replace(tau=sign * motion.tau)
+        yield f"with q[{j}] and tau[{j}] of the other sign", turned._replace(tau=tau)
     for i, j in itertools.combinations(range(n), 2):
-        order = list(range(n))
-        order[i], order[j] = j, i
-        yield f"with tau[{i}] and tau[{j}] exchanged", motion._replace(tau=motion.tau[:, order])
-        moved = motion._replace(
-            q=motion.q[:, order], dq=motion.dq[:, order], ddq=motion.ddq[:, order]
-        )
+        order = np.arange(n)
+        order[[i, j]] = j, i
+        moved, tau = changed(lambda x, order=order: x[:, order]), motion.tau[:, order]
+        yield f"with tau[{i}] and tau[{j}] exchanged", motion._replace(tau=tau)
         yield f"with q[{i}] and q[{j}] exchanged", moved
-        yield (
-            f"with joints {i} and {j} exchanged, q and tau",
-            moved._replace(tau=motion.tau[:, order]),
-        )
+        yield f"with joints {i} and {j} exchanged, q and tau", moved._replace(tau=tau)

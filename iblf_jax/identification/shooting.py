@@ -24,8 +24,9 @@ with effects that the model lacks (a contact, backlash) therefore get a small we
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -33,6 +34,11 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.identification.coordinates import Coordinates, to_x
+from iblf_jax.identification.levenberg_marquardt import (
+    WEAK_PRIOR,
+    QuadraticModel,
+    levenberg_marquardt,
+)
 from iblf_jax.identification.log import Log
 from iblf_jax.identification.replay import (
     InverseDynamics,
@@ -40,11 +46,6 @@ from iblf_jax.identification.replay import (
     inverse_dynamics_under,
     position_sensitivities,
     simulate_segments,
-)
-from iblf_jax.identification.search import (
-    WEAK_PRIOR,
-    QuadraticModel,
-    levenberg_marquardt,
 )
 from iblf_jax.identification.smoothing import local_polynomial
 from iblf_jax.identification.standstill import NO_FRICTION_WIDTH, FreeTorques
@@ -229,28 +230,30 @@ class Penalty(NamedTuple):
         return gradient, hessian
 
 
+@dataclasses.dataclass(eq=False)
 class ShootingProblem:
-    """The least-squares problem that the head of this module states."""
+    """The least-squares problem that the docstring of this module states."""
 
-    def __init__(
-        self,
-        scenario: Any,
-        c: Coordinates,
-        w: Windows,
-        logs: list[Log],
-        hold: bool,
-        loss: str,
-        substeps: int,
-        free: FreeTorques,
-    ) -> None:
-        self.scenario = scenario
-        self.c = c
-        self.w = w
-        self.loss = loss
-        self.substeps = substeps
-        self.free = free
-        self.torques = [Torque(log, hold) for log in logs]
-        self.step = min(log.step for log in logs)
+    scenario: Any
+    c: Coordinates
+    w: Windows
+    logs: list[Log]
+    hold: bool
+    """Whether the torque is constant between samples."""
+    loss: str
+    substeps: int
+    """Integrator steps between two samples."""
+    free: FreeTorques
+
+    @cached_property
+    def torques(self) -> list[Torque]:
+        """The torque of each log."""
+        return [Torque(log, self.hold) for log in self.logs]
+
+    @cached_property
+    def step(self) -> float:
+        """The shortest time between samples of all logs [s]."""
+        return min(log.step for log in self.logs)
 
     def torque(self, delay: float) -> np.ndarray:
         """Mean torque of each step, (W, K, n) [N m]."""
@@ -410,7 +413,7 @@ class ShootingProblem:
         return starts, self.w.y - self.simulate(z, starts)[1]
 
     def _noise_levels(self, r: np.ndarray) -> np.ndarray:
-        """Sigma of each window and joint, (W, 1, n) [rad] (head of this module)."""
+        """Sigma of each window and joint, as in the docstring of this module, (W, 1, n) [rad]."""
         if self.loss == "squares":
             own = np.sqrt(self._noise_correction() * np.mean(r**2, axis=1))
         else:

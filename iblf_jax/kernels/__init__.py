@@ -38,7 +38,7 @@ shared, and nothing differs between runs but the state:
     n4 = mul n0 n3
     n5 = sub n0 n4
     carry 0: n5
-    sample 0: n0
+    output 0: n0
 
 The product 0.1 k is shared, so the generated C computes it once, in `shared_constants`; the loop
 over the steps contains one product and one difference:

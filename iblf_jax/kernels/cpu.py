@@ -84,7 +84,7 @@ def rows_function(name: str) -> str:
 def register(target: str, library: Path, function: str, platform: str) -> str:
     """Makes a function of a library known to XLA under the name `target`, and returns this name."""
     if target not in CACHES.registered:
-        address = getattr(loaded(library, function), function)
+        address = loaded(library, function)[function]
         jax.ffi.register_ffi_target(target, jax.ffi.pycapsule(address), platform=platform)
         CACHES.registered.add(target)
     return target

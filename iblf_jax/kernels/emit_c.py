@@ -284,7 +284,7 @@ def plain_function(
       name: name of the function, and prefix of the functions that it is divided into.
       parameters: C declarations, such as `const F *q`.
       inputs: operation of an input -> C expression of each of these numbers.
-      outputs: C expressions of the places of the carried numbers and of the samples; none of them
+      outputs: C expressions of the places of the carried numbers and of the outputs; none of them
         is an input.
       segment: operations above which the function is divided, into functions of so many.
     """
@@ -295,7 +295,7 @@ def plain_function(
     names = {
         i: inputs[node.op][node.value] for i, node in enumerate(program.nodes) if node.op in inputs
     }
-    results = [*(o for _, o in program.carry), *program.samples]
+    results = [*(o for _, o in program.carry), *program.outputs]
     arguments = _names_of(parameters)
     parts = list[str]()
     if len(program.nodes) > segment:
@@ -338,18 +338,18 @@ def _functions(calls: FunctionCalls, tables: dict[str, str], segment: int | None
         }
         results = list(
             zip(
-                function.samples,
-                places([function.nodes[i] for i in function.samples], "r", "s"),
+                function.outputs,
+                places([function.nodes[i] for i in function.outputs], "r", "s"),
                 strict=True,
             )
         )
         if segment:
             segments = _Segments(e, names, segment, f"part_{k}", SEEN_BY_FUNCTION)
-            parts = segments.add(sorted(set(function.samples)), kept=False, own=dict(results))
+            parts = segments.add(sorted(set(function.outputs)), kept=False, own=dict(results))
             texts += segments.functions
             e.lines += [segments.declarations, *(f"  {part}" for part in parts)]
         else:
-            e.statements(names, function.samples)
+            e.statements(names, function.outputs)
         e.lines += [f"  {place} = {names[i]};" for i, place in results if names[i] != place]
         texts.append(e.function(f"SEPARATE void function_{k}({', '.join(SEEN_BY_FUNCTION)})"))
     return texts
@@ -449,7 +449,7 @@ def _advance(e: _Emitter, layout: Layout, segment: int | None) -> str:
     e.lines.append("  for (int step = 0; step < count; step++, row += COLUMNS) {")
     names |= _names_of_columns(e, layout)
     e.statements(names, [after for _, after in program.carry])
-    if program.samples:
+    if program.outputs:
         _record(e, names)
     moved = [
         (c, names[after])
@@ -472,7 +472,7 @@ def _in_place(program: Program) -> dict[int, int]:
     classes = program.classes()
     uses = (
         Counter(a for node in nodes for a in node.args)
-        + Counter(program.samples)
+        + Counter(program.outputs)
         + Counter(o for _, o in program.carry)
     )
     found = {}
@@ -587,14 +587,16 @@ class _Segments:
         return f"{array}[{self.sizes[array] - 1}]"
 
 
-def _read_by_samples(e: _Emitter, names: dict[int, str], outputs: list[int]) -> list[int]:
-    """The nodes of a step that its samples are, or read in nodes that only samples need."""
-    computed = set(e.needed(names, outputs))
-    samples = e.program.samples
+def _read_by_outputs(e: _Emitter, names: dict[int, str], carried: list[int]) -> list[int]:
+    """The nodes computed for the carried numbers that are also outputs of the program, or that the
+    nodes needed for outputs alone read.
+    """
+    computed = set(e.needed(names, carried))
+    outputs = e.program.outputs
     read = {
-        a for i in e.needed(names, samples) if i not in computed for a in e.program.nodes[i].args
+        a for i in e.needed(names, outputs) if i not in computed for a in e.program.nodes[i].args
     }
-    return sorted(computed & {*samples, *read})
+    return sorted(computed & {*outputs, *read})
 
 
 def _advance_in_segments(e: _Emitter, layout: Layout, segment: int) -> str:
@@ -611,9 +613,9 @@ def _advance_in_segments(e: _Emitter, layout: Layout, segment: int) -> str:
     segments = _Segments(e, names, segment, "segment", SEEN_BY_ADVANCE)
     once = frontier(program, e.classes, PER_RUN, lambda k: k == PER_RUN | TIME)
     before = segments.add(once, kept=True)
-    outputs = sorted({after for _, after in program.carry})
-    read = _read_by_samples(e, segments.names, outputs)
-    within = segments.add(sorted({*outputs, *read}), kept=False)
+    carried = sorted({after for _, after in program.carry})
+    read = _read_by_outputs(e, segments.names, carried)
+    within = segments.add(sorted({*carried, *read}), kept=False)
     signs = [f"  {places[c]} = -{places[c]};" for c in layout.ints if program.kinds[c] == "b"]
     names_after = dict(segments.names)
     for _, after in program.carry:
@@ -628,7 +630,7 @@ def _advance_in_segments(e: _Emitter, layout: Layout, segment: int) -> str:
     e.lines += [*(f"  {call}" for call in before), *e.calls.once_statements(segments.names)]
     e.lines.append("  for (int step = 0; step < count; step++, row += COLUMNS) {")
     e.lines += [f"  {call}" for call in within]
-    if program.samples:
+    if program.outputs:
         _record(e, segments.names)
     e.lines += _moves(program, moved, places.__getitem__)
     e.lines += ["  }", *signs]
@@ -636,10 +638,10 @@ def _advance_in_segments(e: _Emitter, layout: Layout, segment: int) -> str:
 
 
 def _record(e: _Emitter, names: dict[int, str]) -> None:
-    """Adds statements that record the samples of a step, for the runs that exist."""
+    """Adds statements that record the outputs of a step, for the runs that exist."""
     e.lines.append("  if (every > 0 && (first + step) % every == 0) {")
     inner = dict(names)
-    e.statements(inner, e.program.samples)
-    e.lines.append(f"  F sample[] = {{{', '.join(inner[i] for i in e.program.samples)}}};")
+    e.statements(inner, e.program.outputs)
+    e.lines.append(f"  F sample[] = {{{', '.join(inner[i] for i in e.program.outputs)}}};")
     e.lines.append("  write_sample(&records, sample, (first + step) / every, runs, run);")
     e.lines.append("  }")

@@ -57,10 +57,10 @@ class Template(NamedTuple):
     """The program of a function, for operands of one pattern."""
 
     program: Program
-    """Its samples are the results. An operand is an "argument" if it depends on the state, and
+    """Its outputs are the results. An operand is an "argument" if it depends on the state, and
     "shared" otherwise."""
     results: list[Ids]
-    """Positions among the samples, in the shape of each result."""
+    """Positions among the outputs, in the shape of each result."""
 
 
 class Split(NamedTuple):
@@ -217,7 +217,7 @@ def _operations_on_state(program: Program) -> int:
 def _samples(program: Program, results: list[Ids], used: Uses) -> list[int]:
     """The nodes of the results that are used."""
     return [
-        program.samples[position]
+        program.outputs[position]
         for positions, is_used in zip(results, used, strict=True)
         if is_used
         for position in positions.ravel()
@@ -273,5 +273,5 @@ def _result(known: dict[int, int], program: Program, positions: Ids, is_used: bo
     """The nodes of a result; None if it is not used."""
     if not is_used:
         return None
-    nodes = [known[program.samples[position]] for position in positions.ravel()]
+    nodes = [known[program.outputs[position]] for position in positions.ravel()]
     return np.asarray(nodes, np.int64).reshape(positions.shape)

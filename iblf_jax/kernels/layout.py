@@ -182,7 +182,7 @@ class FunctionCalls:
         free = START
         for call in calls:
             called = self.nodes[call].value
-            results = [called.nodes[sample] for sample in called.samples]
+            results = [called.nodes[output] for output in called.outputs]
             self.first[call] = free
             place_of[call] = places(results, "r", "s", free)
             self.size = self.size.largest(free.after(results))

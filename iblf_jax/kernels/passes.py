@@ -49,7 +49,7 @@ def rebuilt(program: Program, rule) -> Program:
         b,
         [new[before] for before, _ in program.carry],
         [new[after] for _, after in program.carry],
-        [new[sample] for sample in program.samples],
+        [new[output] for output in program.outputs],
         program.recorded,
     )
 
@@ -78,7 +78,7 @@ def _inlined(b: Builder, function: Program, arguments: tuple[int, ...]) -> list[
             new.append(arguments[node.value])
         else:
             new.append(b.copy(node, [new[a] for a in node.args]))
-    return [new[sample] for sample in function.samples]
+    return [new[output] for output in function.outputs]
 
 
 def with_reciprocals(program: Program) -> Program:
@@ -124,7 +124,7 @@ def scheduled(program: Program) -> Program:
     nodes = program.nodes
     first = [i for i, c in enumerate(program.classes()) if c != PER_RUN | TIME]
     order = first + _by_longest_chain(nodes, set(first))
-    # Nodes that only samples need stay last: a call that only they need must not overwrite the
+    # Nodes that only outputs need stay last: a call that only they need must not overwrite the
     # results that the next call has left (`layout.FunctionCalls`).
     in_time = set(needed(nodes, [after for _, after in program.carry])) | set(first)
     order.sort(key=lambda i: i not in in_time)
@@ -132,7 +132,7 @@ def scheduled(program: Program) -> Program:
     return program._replace(
         nodes=tuple(nodes[i]._replace(args=tuple(place[a] for a in nodes[i].args)) for i in order),
         carry=tuple((place.get(before, -1), place[after]) for before, after in program.carry),
-        samples=tuple(place[sample] for sample in program.samples),
+        outputs=tuple(place[output] for output in program.outputs),
     )
 
 

@@ -59,7 +59,7 @@ class Node(NamedTuple):
 
     Three operations are special. A "lookup" selects an entry of the table `value` by its integer
     argument; an index outside the table selects the nearest end. A "call" has the results of a
-    function; the "samples" of the program `value` are these results, and each "result" is one of
+    function; the "outputs" of the program `value` are these results, and each "result" is one of
     them. A call of kind "call if" is executed where its first argument, which is the same for all
     runs, is true; otherwise its results have no defined value.
     """
@@ -209,7 +209,7 @@ class Builder:
     def result(self, call: int, number: int) -> int:
         """The node of a result of a call."""
         function = self.nodes[call].value
-        kind = function.nodes[function.samples[number]].kind
+        kind = function.nodes[function.outputs[number]].kind
         return self._add(Node("result", (call,), kind, number), number)
 
     def copy(self, node: Node, args: Sequence[int]) -> int:
@@ -278,15 +278,15 @@ class Program(NamedTuple):
       nodes: in an order in which each uses earlier ones only.
       carry: (input node, output node) of every number that goes from one step to the next; the
         input is -1 where the step does not read the number.
-      samples: nodes of the recorded numbers; for a function that is called, its results.
+      outputs: nodes of the recorded numbers; for a function that is called, its results.
       kinds: kind of every carried number.
-      recorded: number of samples of each recorded array, in order.
+      recorded: number of outputs of each recorded array, in order.
     """
 
     dtype: np.dtype
     nodes: tuple[Node, ...]
     carry: tuple[tuple[int, int], ...]
-    samples: tuple[int, ...]
+    outputs: tuple[int, ...]
     kinds: tuple[str, ...]
     recorded: tuple[int, ...] = ()
 
@@ -305,7 +305,7 @@ class Program(NamedTuple):
         return result
 
     def listing(self) -> str:
-        """The program as text: one line for each node, then the carry and the samples."""
+        """The program as text: one line for each node, then the carry and the outputs."""
         lines = []
         for i, node in enumerate(self.nodes):
             words = [node.op, *(f"n{a}" for a in node.args)]
@@ -313,7 +313,7 @@ class Program(NamedTuple):
                 words.append(str(node.value))
             lines.append(f"n{i} = {' '.join(words)}")
         lines += [f"carry {c}: n{after}" for c, (_, after) in enumerate(self.carry)]
-        lines += [f"sample {k}: n{sample}" for k, sample in enumerate(self.samples)]
+        lines += [f"output {k}: n{node}" for k, node in enumerate(self.outputs)]
         return "\n".join(lines)
 
     @property
@@ -345,7 +345,7 @@ def finished(
     builder: Builder,
     carry_in: list[int],
     carry_out: list[int],
-    samples: list[int],
+    outputs: list[int],
     recorded: tuple[int, ...] = (),
 ) -> Program:
     """The program of the given outputs, without nodes that they do not need, in depth-first order.
@@ -355,7 +355,7 @@ def finished(
     """
     order: list[int] = []
     place: dict[int, int] = {}
-    for root in [*carry_out, *samples]:
+    for root in [*carry_out, *outputs]:
         stack = [root]
         while stack:
             node = stack[-1]
@@ -375,7 +375,7 @@ def finished(
     )
     carry = tuple((place.get(a, -1), place[b]) for a, b in zip(carry_in, carry_out, strict=True))
     kinds = tuple(builder.nodes[b].kind for b in carry_out)
-    return Program(builder.dtype, nodes, carry, tuple(place[s] for s in samples), kinds, recorded)
+    return Program(builder.dtype, nodes, carry, tuple(place[i] for i in outputs), kinds, recorded)
 
 
 def frontier(
@@ -392,5 +392,5 @@ def frontier(
     read = {a for i, node in enumerate(program.nodes) if used_by(classes[i]) for a in node.args}
     if used_by(PER_RUN | TIME):
         read.update(output for _, output in program.carry)
-        read.update(program.samples)
+        read.update(program.outputs)
     return sorted(a for a in read if classes[a] == of and program.nodes[a].op != "const")

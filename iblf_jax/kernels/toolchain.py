@@ -33,7 +33,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 
@@ -213,7 +213,12 @@ def built_for() -> dict[str, str]:
     }
 
 
-_this_thread = threading.local()
+class _ThisThread(threading.local):
+    is_ahead = False
+    """Whether the thread compiles something before it is needed."""
+
+
+_this_thread = _ThisThread()
 
 
 def stop_compilers() -> None:
@@ -262,7 +267,8 @@ def _run(command: list[str], stream: str, seconds: float) -> bytes:
         raise ToolchainError(f"{name} could not be run: {error}") from None
 
     def listen() -> None:
-        with getattr(process, stream) as pipe:
+        pipe: Any = {"stdout": process.stdout, "stderr": process.stderr}[stream]
+        with pipe:
             received.append(pipe.read(MAX_TEXT))
 
     CACHES.running.add(process.pid)
@@ -362,7 +368,7 @@ def _made_once(key: str) -> Iterator[None]:
             try:
                 yield
             except ToolchainError as error:
-                if getattr(_this_thread, "is_ahead", False) and not isinstance(error, StoppedError):
+                if _this_thread.is_ahead and not isinstance(error, StoppedError):
                     CACHES.failures[key] = error
                 raise
     except BaseException:
@@ -454,7 +460,7 @@ def loaded(library: Path, *names: str) -> ctypes.CDLL:
     try:
         found = CACHES.libraries.get(key) or _load(content_of(library))
         for name in names:
-            getattr(found, name)
+            found[name]  # raises AttributeError if the library lacks it
     except (OSError, AttributeError) as error:
         with contextlib.suppress(OSError):
             library.unlink()  # the next compilation may succeed

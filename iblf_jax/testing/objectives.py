@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks, notices
-from iblf_jax.core.optional import OptionalMembers
 from iblf_jax.engine import Outer, folded
 from iblf_jax.engine.simulate import simulate
 from iblf_jax.simulation.scenario import Scenario
@@ -30,10 +29,15 @@ from iblf_jax.testing._contract import (
 from iblf_jax.testing.joints import check_scenario, joints_of, scenario_for
 from iblf_jax.testing.metrics import LENGTH, at_rest, parts, samples, samples_from
 from iblf_jax.tuning.objectives import Objective, Requirement, complete, for_scenario
-from iblf_jax.tuning.quantities import MetricResult, Peak, Quantities, Quantity, TimeIntegral
+from iblf_jax.tuning.quantities import (
+    MetricResult,
+    Peak,
+    Quantities,
+    Quantity,
+    TimeIntegral,
+    quantity_member,
+)
 
-quantity_member = OptionalMembers(hessian=None, curvature=None)
-"""Reads the members for second-order methods, which a quantity may lack."""
 DIRECTIONS = 3
 """Number of directions in which second derivatives are tested."""
 

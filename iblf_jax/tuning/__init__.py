@@ -1,5 +1,5 @@
-"""Gain tuning by gradient through the closed loop, under requirements, over perturbed runs,
-validated on fresh ones.
+"""Tunes gains by derivatives through the closed loop, under requirements and over perturbed runs,
+and validates the result on fresh runs.
 
     best = ij.tune(
         scenario,
@@ -16,12 +16,14 @@ validated on fresh ones.
 | `objectives`, `quantities` | what is minimised and required |
 | `parameters`, `ranges` | which leaves vary, in which coordinates and within which limits |
 | `robust` | one number from many perturbed runs |
+| `options` | options of the runs, of the report and of the search |
 | `problem` | `TuningProblem`: all of the above in one object |
-| `evaluation`, `runs` | its value and derivatives; the calls of the engine |
+| `rollouts`, `runs` | batches of runs without and with derivatives |
+| `evaluation` | value and derivatives of the problem |
 | `solvers` | the Protocol `Solver`; `SQP`, `LBFGS`, `Adam` |
 | `starts`, `search`, `checkpoints` | where a search begins, its steps, its stored state |
-| `options`, `_tune` | options of `tune`, and `tune` |
 | `result`, `report` | what `tune` returns, and its validation on fresh runs |
+| `_tune` | `tune`, which calls these in this order |
 | `_pareto`, `_falsify` | fronts of two objectives, and attacks on a result |
 """
 

@@ -34,25 +34,27 @@ from iblf_jax.core import checks, notices
 from iblf_jax.core.progress import bar
 from iblf_jax.core.pytree import astype
 from iblf_jax.core.status import VIOLATED, Status, describe
+from iblf_jax.engine import RunRequest
+from iblf_jax.engine.simulate import simulate
 from iblf_jax.simulation.metrics import check_needs
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical, check_step
 from iblf_jax.studies.cube import Cube, bounded
 from iblf_jax.studies.distributions import Perturbation
-from iblf_jax.tuning.evaluation import NUMBERS_A_RUN, Derivatives, Value
+from iblf_jax.tuning.evaluation import Derivatives, Value
 from iblf_jax.tuning.parameters import Box
 from iblf_jax.tuning.quantities import DEFICITS, Peak, Quantities
-from iblf_jax.tuning.runs import RunRequest, simulate, tangents_of_runs
+from iblf_jax.tuning.runs import NUMBERS_A_RUN, tangents_of_runs
 from iblf_jax.tuning.solvers import SQP, SearchSpace
 
 MARGINS = {"positions": "deficit", "velocities": "velocity_deficit", "regions": "region_deficit"}
 """What may be attacked -> the deficit that is minus its margin."""
 SOLVER = SQP(tolerance=1e-4, radius=0.5)
-HALVINGS = 8
+MAX_HALVINGS = 8
 """How often a step to a point that is not admissible is halved before the attack stays where it
 is."""
-NO_ANSWER = Status.INFEASIBLE_REFERENCE | Status.STEP_TOO_LARGE
+UNINFORMATIVE = Status.INFEASIBLE_REFERENCE | Status.STEP_TOO_LARGE
 """Flags of runs that say nothing about the law: no law could keep the bounds, or the time step is
 too large."""
 
@@ -73,7 +75,7 @@ class Attack:
     """Flags of `Status` of that run."""
     history: np.ndarray
     """Margin of every attack's trial at every step, (iterations + 1, starts); NaN for runs that say
-    nothing about the law (`NO_ANSWER`)."""
+    nothing about the law (`UNINFORMATIVE`)."""
     runs: int
     """Number of rollouts with derivatives."""
     timing: dict[str, Any]
@@ -92,18 +94,14 @@ class Attack:
         return simulate(self.scenario, record_every=record_every, **self.timing)
 
     def __repr__(self) -> str:
-        word = "not falsified"
-        if self.violated:
-            word = "FALSIFIED"
+        word = "FALSIFIED" if self.violated else "not falsified"
         lines = [
             f"Attack({word}: smallest margin {self.margin:.4g} {self.unit}, {self.first_margin:.4g}"
-            f" at random; {self.runs} runs)"
+            f" at random; {self.runs} runs)",
+            f"  status: {describe(self.status)}",
         ]
-        lines += [f"  status: {describe(self.status)}"]
-        lines += [
-            f"  {path}: {np.array2string(np.asarray(x), precision=5)}"
-            for path, x in self.values.items()
-        ]
+        for path, x in self.values.items():
+            lines.append(f"  {path}: {np.array2string(np.asarray(x), precision=5)}")
         return "\n".join(lines)
 
 
@@ -158,7 +156,11 @@ def falsify(
     scenario = canonical(scenario)
     request = RunRequest.of(scenario, steps=steps, method=method, backend=backend)
     check_step(scenario, dt)
-    starts, iterations, seed = _checked_sizes(starts, iterations, seed)
+    starts = checks.positive_integer("starts", starts)
+    checks.fits("starts", starts, 8.0 * NUMBERS_A_RUN)
+    iterations = checks.positive_integer("iterations", iterations, most=checks.MAX_STEPS)
+    checks.fits("iterations", iterations, 8 * starts)
+    seed = checks.seed(seed)
     cube = bounded(scenario, perturbations)
     checks.fits("starts", starts, 8.0 * (1 + cube.size) * NUMBERS_A_RUN)
     checks.one_of("margin", margin, MARGINS)
@@ -166,23 +168,13 @@ def falsify(
     peak = Peak(one, MARGINS[margin])
     check_needs("margin", peak, scenario)
     evaluate = MarginEvaluator(cube, peak, dt, request, starts)
-    unit = DEFICITS[peak.signal]
     with bar(progress, iterations + 1, unit="steps") as shown:
-        _attack(cube, evaluate, seed, iterations, shown, unit)
+        _attack(cube, evaluate, seed, iterations, shown)
     timing = {"duration": duration, "dt": dt, "method": method}
-    return _result(cube, evaluate, timing, unit)
+    return _result(cube, evaluate, timing)
 
 
-def _checked_sizes(starts: Any, iterations: Any, seed: Any) -> tuple[int, int, int]:
-    """Number of attacks, of their steps, and the seed."""
-    starts = checks.positive_integer("starts", starts)
-    checks.fits("starts", starts, 8.0 * NUMBERS_A_RUN)
-    iterations = checks.positive_integer("iterations", iterations, most=checks.MAX_STEPS)
-    checks.fits("iterations", iterations, 8 * starts)
-    return starts, iterations, checks.seed(seed)
-
-
-def _result(cube: Cube, evaluate: MarginEvaluator, timing: dict[str, Any], unit: str) -> Attack:
+def _result(cube: Cube, evaluate: MarginEvaluator, timing: dict[str, Any]) -> Attack:
     """The worst run of all."""
     worst = evaluate.worst
     if worst is None:
@@ -203,13 +195,11 @@ def _result(cube: Cube, evaluate: MarginEvaluator, timing: dict[str, Any], unit:
         history=history,
         runs=history.size,
         timing=timing,
-        unit=unit,
+        unit=evaluate.unit,
     )
 
 
-def _attack(
-    cube: Cube, evaluate: MarginEvaluator, seed: int, iterations: int, shown: Any, unit: str
-) -> None:
+def _attack(cube: Cube, evaluate: MarginEvaluator, seed: int, iterations: int, shown: Any) -> None:
     """All steps of all attacks; the results are in `evaluate`."""
     starts = len(evaluate.active)
     state = SOLVER.init(evaluate.space, cube.admissible_points(starts, [seed, 3]))
@@ -224,7 +214,7 @@ def _attack(
                 SOLVER.restart(evaluate.space, state, s, points[s])
         shown.update(1)
         if evaluate.worst is not None:
-            shown.set_postfix_str(f"margin {evaluate.worst.margin:.4g} {unit}")
+            shown.set_postfix_str(f"margin {evaluate.worst.margin:.4g} {evaluate.unit}")
 
 
 class Worst(NamedTuple):
@@ -250,6 +240,7 @@ class MarginEvaluator:
         self.dtype = cube.cases.scenario.initial.q.dtype
         step = jnp.asarray(dt, self.dtype)
         self.margins = partial(_margins, cube, astype(peak, self.dtype), step, request=request)
+        self.unit = DEFICITS[peak.signal]
         size = cube.size
         self.space = SearchSpace(Box(np.full(size, 0.5), np.zeros(size), np.ones(size)))
         self.active = np.ones(starts, bool)
@@ -260,7 +251,7 @@ class MarginEvaluator:
         """Value and derivatives; infinite where a run says nothing about the law."""
         found = self.margins(jnp.asarray(u, self.dtype))
         margins, gradients, status = (np.asarray(x) for x in found)
-        fine = np.isfinite(margins) & (status & int(NO_ANSWER) == 0)
+        fine = np.isfinite(margins) & (status & int(UNINFORMATIVE) == 0)
         self.history.append(np.where(fine, margins, np.nan))
         losses = np.where(fine, margins, np.inf)
         s = int(np.argmin(losses))
@@ -274,7 +265,7 @@ def _admissible(
     refused: Callable[[np.ndarray], str], accepted: np.ndarray, trial: np.ndarray
 ) -> np.ndarray:
     """The trial, or the first of the points halfway back to the accepted one that is admissible."""
-    for _ in range(HALVINGS):
+    for _ in range(MAX_HALVINGS):
         if not refused(trial):
             return trial
         trial = 0.5 * (accepted + trial)

@@ -38,17 +38,18 @@ import numpy as np
 from iblf_jax.core import checks, notices
 from iblf_jax.core.presentation import present
 from iblf_jax.core.progress import bar
+from iblf_jax.engine import FORWARD_MOST, differentiates_forward
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.designs import MAX_RUNS
 from iblf_jax.studies.distributions import Perturbation
-from iblf_jax.tuning.evaluation import NO_LEVEL, NUMBERS_A_RUN, Value
+from iblf_jax.tuning.evaluation import Evaluator, Value, values
 from iblf_jax.tuning.objectives import Objective
 from iblf_jax.tuning.parameters import Block, Tunable, in_units, names_of, values_at
-from iblf_jax.tuning.problem import TuningProblem
+from iblf_jax.tuning.problem import NO_LEVEL, TuningProblem
 from iblf_jax.tuning.robust import Risk
-from iblf_jax.tuning.runs import FORWARD_MOST, differentiates_forward
-from iblf_jax.tuning.search import Evaluator, Search
+from iblf_jax.tuning.runs import NUMBERS_A_RUN
+from iblf_jax.tuning.search import Search
 from iblf_jax.tuning.solvers import SQP
 from iblf_jax.tuning.starts import screened
 
@@ -106,10 +107,8 @@ class Front:
         return present("front figure", self, **options)
 
     def __repr__(self) -> str:
-        ends = ", ".join(
-            f"{name} {x.min():.4g} to {x.max():.4g}"
-            for name, x in zip(self.labels, self.objectives.T, strict=True)
-        )
+        pairs = zip(self.labels, self.objectives.T, strict=True)
+        ends = ", ".join(f"{name} {x.min():.4g} to {x.max():.4g}" for name, x in pairs)
         return f"Front({len(self)} points of {len(self.tried)} trials; {ends})"
 
 
@@ -257,12 +256,9 @@ class FrontSearch:
         best = [_best_of(found, violation, k) for k in (0, 1)]
         self._search(points[[0, 0, *best]], np.array([0, 1, 0, 1]), np.full((4, 2), NO_LEVEL))
         if not len(self.z):
-            raise checks.fail(
-                "objectives",
-                "no trial that keeps bounds and requirements",
-                "at least one",
-                "Loosen them, or tune to them first.",
-            )
+            came = "no trial that keeps bounds and requirements"
+            remedy = "Loosen them, or tune to them first."
+            raise checks.fail("objectives", came, "at least one", remedy)
         least = np.argmin(self.terms, axis=0)
         levels = np.log(np.min(self.terms, axis=0)) + END_TOLERANCE
         self.minimise(self.z[least], np.array([1, 0]), levels)
@@ -296,24 +292,15 @@ class FrontSearch:
         search = Search(Evaluator(problem, candidates, "forward", space), self.solver, z[rows])
         search.retire(slice(len(z), None))
         search.run(self.iterations)
-        history = {name: np.stack(x) for name, x in search.history.items()}
-        self.evaluations += int(history["evaluations"][-1])
-        self._keep(
-            history["z"], history["terms"], history["valid"], history["margin"], history["excess"]
-        )
+        self.evaluations += int(search.history["evaluations"][-1])
+        names = ("z", "terms", "valid", "margin", "excess")
+        self._keep(*(np.stack(search.history[name]) for name in names))
 
     def _keep_values(self, z: np.ndarray, found: Value) -> None:
         self.values += len(z)
         self._keep(z, found.terms, found.valid, found.margin, found.exact_excess)
 
-    def _keep(
-        self,
-        z: np.ndarray,
-        terms: np.ndarray,
-        valid: np.ndarray,
-        margin: np.ndarray,
-        excess: np.ndarray,
-    ) -> None:
+    def _keep(self, z: Any, terms: Any, valid: Any, margin: Any, excess: Any) -> None:
         """Stores the trials that satisfy bounds and requirements."""
         feasible = valid & (margin > 0) & (np.max(excess, axis=-1, initial=-np.inf) <= 0)
         self.z = np.concatenate([self.z, z[feasible]])
@@ -357,7 +344,7 @@ class FrontSearch:
         along = np.concatenate([[0.0], np.cumsum(size)])
         at = (np.arange(count) + 0.5) / count * along[-1]
         z = np.stack([np.interp(at, along, x) for x in self.z[curve].T], axis=1)
-        self._keep_values(z, self.problem.values(z))
+        self._keep_values(z, values(self.problem, z))
 
     def front(self, seconds: float) -> Front:
         """The trials that are not dominated."""
@@ -392,12 +379,9 @@ def _pair(objectives: Any) -> Objective:
     is_pair = isinstance(objectives, tuple | list) and len(objectives) == 2
     if is_pair and all(_is_single_term(x) for x in objectives):
         return objectives[0] + objectives[1]
-    raise checks.fail(
-        "objectives",
-        objectives,
-        "two objectives of one term each, without a limit",
-        "Such as (ij.objectives.tracking(), ij.objectives.effort()).",
-    )
+    expected = "two objectives of one term each, without a limit"
+    remedy = "Such as (ij.objectives.tracking(), ij.objectives.effort())."
+    raise checks.fail("objectives", objectives, expected, remedy)
 
 
 def _is_single_term(objective: Any) -> bool:

@@ -1,14 +1,16 @@
-"""`tune`: gains by gradient through the closed loop, under requirements, over perturbed runs,
-validated on fresh ones.
+"""`tune` builds a tuning problem, chooses a solver, searches, and returns the result with its
+report.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,14 +21,15 @@ from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.tuning.checkpoints import fingerprint, load_checkpoint, save_checkpoint
-from iblf_jax.tuning.evaluation import NUMBERS_A_RUN
+from iblf_jax.tuning.evaluation import Evaluator, values
 from iblf_jax.tuning.objectives import Objective
-from iblf_jax.tuning.options import Options, Report, chosen_solver, options_of
+from iblf_jax.tuning.options import Report, SearchOptions, chosen_solver, options_of
 from iblf_jax.tuning.parameters import Tunable, in_units, names_of, values_at
 from iblf_jax.tuning.problem import TuningProblem
 from iblf_jax.tuning.result import STUCK, TuneResult, TuneSetup
 from iblf_jax.tuning.robust import Risk
-from iblf_jax.tuning.search import Evaluator, Search
+from iblf_jax.tuning.runs import NUMBERS_A_RUN
+from iblf_jax.tuning.search import Search
 from iblf_jax.tuning.solvers import Optimality, Solver
 from iblf_jax.tuning.starts import NearbyStarts, feasible_starts, starting_points
 
@@ -57,7 +60,7 @@ def tune(
     progress: bool | Callable[[Search], None] | None = None,
     **deprecated: Any,
 ) -> TuneResult:
-    """Tunes leaves of a scenario, its gains for example, by gradient through the closed loop.
+    """Tunes leaves of a scenario, its gains for example, by derivatives through the closed loop.
 
         minimise    risk_b [ sum_k w_k term_k ]
         subject to  the requirements and the ranges of the parameters
@@ -120,59 +123,46 @@ def tune(
         risk=risk,
     )
     solver, mode = chosen_solver(options, problem.size)
-    start = _start_of_search(problem, solver, seed)
-    search = _search(problem, solver, mode, iterations, start)
+    search, probes = _search_of(problem, solver, mode, iterations)
     stopped = _run(search, mode, iterations, checkpoint, options)
     if not np.any(np.isfinite(search.state["best_key"])):
         raise problem.unstable_error()
-    setup = _setup(problem, float(duration), float(dt), options.report)
-    return _result(problem, search, setup, stopped, mode=mode, began=began, probes=start.evaluated)
+    seconds = time.perf_counter() - began
+    setup = _setup(problem, options.report)
+    return _result(search, setup, stopped, mode=mode, seconds=seconds, probes=probes)
 
 
-class _Start(NamedTuple):
-    """Where a search begins."""
+def _search_of(
+    problem: TuningProblem, solver: Solver, mode: str, iterations: int
+) -> tuple[Search, int]:
+    """The search from its starting points, and the number of points that were evaluated without
+    derivatives to find them.
 
-    z: np.ndarray
-    """(S, p)."""
-    nearby: NearbyStarts | None = None
-    """Of the second start, where several minima are expected."""
-
-    @property
-    def evaluated(self) -> int:
-        """Number of points that were evaluated without derivatives."""
-        if self.nearby is None:
-            return 0
-        return self.nearby.count
-
-
-def _start_of_search(problem: TuningProblem, solver: Solver, seed: int) -> _Start:
-    """The starting points: values only, so that an error does not wait for the derivatives'
-    compilation.
-
-    With a checkpoint they are determined again, and are the same.
+    Values come first, so that an error does not wait for the derivatives' compilation.  With a
+    checkpoint the starting points are determined again, and are the same.
     """
     checks.fits("starts", solver.starts, 8.0 * problem.size * NUMBERS_A_RUN)
+    seed = int(problem.options.seed)
+    second_start = None
+    probes = 0
     if solver.starts == 1 and solver.handles_requirements and problem.multimodal:
-        nearby = NearbyStarts(problem.values, problem.box, seed, problem.sampled_too_slowly)
-        z = np.stack([nearby.points[0]] * 2)
-        return _Start(feasible_starts(problem, seed, z, nearby.first), nearby)
-    z = starting_points(problem.box, solver.starts, seed)
-    return _Start(feasible_starts(problem, seed, z, problem.at_start()))
-
-
-def _search(
-    problem: TuningProblem, solver: Solver, mode: str, iterations: int, start: _Start
-) -> Search:
+        nearby = NearbyStarts(
+            partial(values, problem), problem.box, seed, problem.sampled_too_slowly
+        )
+        z = feasible_starts(problem, seed, np.stack([nearby.points[0]] * 2), nearby.first)
+        second_start = nearby.away_from
+        probes = nearby.count
+    else:
+        z = starting_points(problem.box, solver.starts, seed)
+        z = feasible_starts(problem, seed, z, values(problem, problem.box.z[None]))
     problem = problem.for_solver(solver)
     space = problem.search_space(iterations)
-    evaluate = Evaluator(problem, problem.candidates(start.z), mode, space)
-    if start.nearby is None:
-        return Search(evaluate, solver, start.z)
-    return Search(evaluate, solver, start.z, second_start=start.nearby.away_from)
+    evaluate = Evaluator(problem, problem.candidates(z), mode, space)
+    return Search(evaluate, solver, z, second_start), probes
 
 
 def _run(
-    search: Search, mode: str, iterations: int, checkpoint: Path | None, options: Options
+    search: Search, mode: str, iterations: int, checkpoint: Path | None, options: SearchOptions
 ) -> str:
     """All steps of a search, from its checkpoint if there is one; returns why it ended."""
     mark = fingerprint(search.evaluate.problem, search.solver, mode, iterations)
@@ -201,41 +191,25 @@ def _show(shown: Any, search: Search) -> None:
     )
 
 
-def _setup(problem: TuningProblem, duration: float, dt: float, report: Report) -> TuneSetup:
+def _setup(problem: TuningProblem, report: Report) -> TuneSetup:
     """What the report needs to know of the call."""
-    seed = int(problem.seed)
-    report_seed = report.seed
-    if report_seed is None:
-        report_seed = (seed + 1) % 2**32
+    seed = int(problem.options.seed)
+    if report.seed is None:
+        report = dataclasses.replace(report, seed=(seed + 1) % 2**32)
     low, high = (in_units(problem.blocks, z) for z in (problem.box.low, problem.box.high))
     return TuneSetup(
+        **vars(problem.options) | {"seed": seed},
         objective=problem.objective,
-        perturbations=problem.perturbations,
-        risk=problem.risk,
-        runs=problem.runs,
-        seed=seed,
-        duration=duration,
-        dt=dt,
-        method=problem.request.method,
-        backend=problem.request.backend,
-        report_runs=report.runs,
-        report_seed=report_seed,
-        confidence=report.confidence,
+        report=report,
         limits=tuple(zip(low.tolist(), high.tolist(), strict=True)),
         reasons=problem.box.reasons,
     )
 
 
 def _result(
-    problem: TuningProblem,
-    search: Search,
-    setup: TuneSetup,
-    stopped: str,
-    *,
-    mode: str,
-    began: float,
-    probes: int,
+    search: Search, setup: TuneSetup, stopped: str, *, mode: str, seconds: float, probes: int
 ) -> TuneResult:
+    problem = search.evaluate.problem
     state = search.state
     best = search.best
     optimality = search.solver.optimality(state["solver"], best)
@@ -244,20 +218,20 @@ def _result(
         stopped = _why_converged(optimality, violated)
     multipliers, residuals = _multipliers(search, optimality, stopped, violated)
     point = values_at(problem.blocks, jnp.asarray(state["best_z"][best]))
-    values = {path: np.asarray(x) for path, x in point.items()}
+    tuned = {path: np.asarray(x) for path, x in point.items()}
     history = {name: np.stack(x) for name, x in search.history.items()}
     history["x"] = in_units(problem.blocks, history["z"])
     return TuneResult(
-        scenario=with_parameters(problem.scenario, values),
+        scenario=with_parameters(problem.scenario, tuned),
         start=problem.scenario,
-        values=values,
+        values=tuned,
         names=tuple(names_of(problem.blocks)),
         history=history,
         best_start=best,
         stopped=stopped,
         optimiser=search.solver.name,
         mode=mode,
-        seconds=time.perf_counter() - began,
+        seconds=seconds,
         setup=setup,
         multipliers=tuple(map(float, multipliers)),
         residuals=tuple(map(float, residuals)),
@@ -283,20 +257,20 @@ def _multipliers(
     requirements are violated they are those of the penalty function, and are left out.
     """
     none = np.zeros(0)
-    best = search.best
+    best_z = search.state["best_z"][search.best]
     if optimality is None:
-        multipliers = search.state["multipliers"][best]
+        multipliers = search.state["multipliers"][search.best]
         residuals = none
         is_here = stopped == "converged"
     else:
         multipliers = optimality.multipliers
         residuals = optimality.residuals
-        is_here = np.array_equal(search.state["best_z"][best], optimality.z)
+        is_here = np.array_equal(best_z, optimality.z)
     unknown = np.full(len(multipliers), np.nan)
-    if stopped == STUCK and not violated:
-        return unknown, residuals
     if violated:
         return none, none
+    if stopped == STUCK:
+        return unknown, residuals
     if not is_here or stopped == NO_GRADIENT:
         return unknown, none
     return multipliers, residuals

@@ -28,13 +28,11 @@ NOT_PART_OF_THE_PROBLEM = ("patience",)
 
 def fingerprint(problem: TuningProblem, solver: Solver, mode: str, iterations: int) -> str:
     """A hash of everything that a checkpoint must agree with."""
-    options = {}
+    options: dict[str, Any] = {}
     if dataclasses.is_dataclass(solver):
-        options = {
-            name: value
-            for name, value in field_values(solver).items()
-            if name not in NOT_PART_OF_THE_PROBLEM
-        }
+        options = field_values(solver)
+    for name in NOT_PART_OF_THE_PROBLEM:
+        options.pop(name, None)
     if "schedule" in options:
         options["iterations"] = iterations  # a schedule ends with the last step
     leaves, structure = jax.tree.flatten(problem)
@@ -48,6 +46,10 @@ def _named_leaves(state: Any) -> dict[str, np.ndarray]:
     """Name -> array of every leaf of a state."""
     pairs = jax.tree_util.tree_leaves_with_path(state)
     return {f"state{jax.tree_util.keystr(path)}": np.asarray(x) for path, x in pairs}
+
+
+def _shapes(arrays: dict[str, np.ndarray]) -> dict[str, Any]:
+    return {name: (x.shape, x.dtype) for name, x in arrays.items()}
 
 
 def save_checkpoint(search: Search, path: str | os.PathLike, mark: str) -> None:
@@ -85,22 +87,16 @@ def load_checkpoint(path: str | os.PathLike, search: Search, mark: str) -> None:
         )
         raise checks.fail("checkpoint", str(path), "a checkpoint of tune", remedy) from error
     if str(arrays.get("fingerprint")) != mark:
-        raise checks.fail(
-            "checkpoint",
-            str(path),
-            "a checkpoint of this very problem",
+        remedy = (
             "Scenario, objective, options or the package's version differ: delete it or name"
-            " another file.",
+            " another file."
         )
-    expected = {name: (x.shape, x.dtype) for name, x in _named_leaves(search.state).items()}
+        raise checks.fail("checkpoint", str(path), "a checkpoint of this very problem", remedy)
+    expected = _named_leaves(search.state)
     found = {name: np.array(x) for name, x in arrays.items() if name.startswith("state[")}
-    if {name: (x.shape, x.dtype) for name, x in found.items()} != expected:
-        raise checks.fail(
-            "checkpoint",
-            str(path),
-            "a complete checkpoint",
-            "An array is missing in it: delete it or name another file.",
-        )
+    if _shapes(found) != _shapes(expected):
+        remedy = "An array is missing in it: delete it or name another file."
+        raise checks.fail("checkpoint", str(path), "a complete checkpoint", remedy)
     structure = jax.tree.structure(search.state)
     search.state = jax.tree.unflatten(structure, [found[name] for name in expected])
     search.history = {

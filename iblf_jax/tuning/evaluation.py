@@ -1,5 +1,5 @@
-"""Objective and requirements of a tuning problem as compiled functions of the coordinates z, with
-their derivatives.
+"""Evaluates objective and requirements of a tuning problem, and their derivatives, by compiled
+functions of the coordinates z.
 
 For each start s and run b one rollout gives the quantities m_bk of the objective.  The objective is
 
@@ -30,59 +30,25 @@ of L only.
 
 from __future__ import annotations
 
-import dataclasses
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core.status import UNTRUSTED
-from iblf_jax.simulation.closed_loop import evaluate, initial_state
-from iblf_jax.simulation.error_estimate import RELATIVE
-from iblf_jax.simulation.metrics import Torque
-from iblf_jax.simulation.noise import NOISE_NAME, noise_of
-from iblf_jax.simulation.paths import get, with_parameters
-from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.studies.draws import Cases, Target, draw, merge, same_place
+from iblf_jax.engine import run_for_reverse, starts_together
+from iblf_jax.simulation.noise import NOISE_NAME
+from iblf_jax.simulation.paths import with_parameters
+from iblf_jax.studies.draws import same_place
 from iblf_jax.tuning.objectives import Objective
-from iblf_jax.tuning.parameters import values_at
-from iblf_jax.tuning.quantities import Peak, Quantities
+from iblf_jax.tuning.problem import NO_LEVEL, Candidate, TuningProblem, of_runs
+from iblf_jax.tuning.quantities import Quantities
 from iblf_jax.tuning.robust import Risk, combine, worst_share
-from iblf_jax.tuning.runs import RunRequest, run_batch, run_for_reverse, tangents_of_runs
-
-if TYPE_CHECKING:
-    from iblf_jax.tuning.problem import TuningProblem
-
-NO_LEVEL = 1e6
-"""A level of a front that no objective reaches."""
-
-NUMBERS_A_RUN = 100
-"""Approximate count of numbers that one run of a batch holds while it is computed: its state, its
-stages, its folds."""
-
-WINDOWS = 8
-"""Time windows of a peak: within one of them a signal seldom has two peaks of one height.  With 8,
-a peak of `presets.ur5` takes 1,400 choices of a step with 14 tangents, of some 200,000
-operations."""
-
-
-class Candidate(NamedTuple):
-    """Where one start is evaluated, and with which weights; batches have the starts first."""
-
-    z: Any
-    """Coordinates, (p,)."""
-    index: Any
-    """Run numbers, (B,)."""
-    weights: Any
-    """Of the terms, (n_terms,)."""
-    multipliers: Any
-    """Of the requirements in the augmented Lagrangian, (n_requirements,)."""
-    penalty: Any
-    """Penalty parameter mu of the augmented Lagrangian, ()."""
-    levels: Any = ()
-    """Of the terms on a front, (n_terms,); NO_LEVEL where there is none."""
+from iblf_jax.tuning.rollouts import Rollouts, fold_of
+from iblf_jax.tuning.runs import in_groups, tangents_of_runs
+from iblf_jax.tuning.solvers import SearchSpace
 
 
 class Value(NamedTuple):
@@ -102,9 +68,6 @@ class Value(NamedTuple):
     margin: Any = ()
     """The smallest margin of all runs [rad]."""
     valid: Any = ()
-    exact: Any = ()
-    """Each quantity without smoothing, averaged over the runs, (K + 1,); the last is minus the
-    margin."""
     trusted: Any = ()
     """Share of the runs that were integrated to their end, and stably; 1 where valid."""
 
@@ -123,139 +86,13 @@ class Derivatives(NamedTuple):
     """Their gradients, (B, p, M)."""
 
 
-# ------------------------------------------------------------------------------------ quantities
-
-
-def fold_of(objective: Objective, dtype: Any, duration: Any = None) -> tuple[Quantities, ...]:
-    """The fold of a problem: its quantities and the margin last.
-
-    Args:
-      objective: with scales and limits.
-      dtype: of the runs.
-      duration: of a run [s]; peaks are split into windows of it, if given.
-    """
-    parts = objective.quantities
-    if duration is not None:
-        edges = jnp.asarray(duration, dtype) * jnp.asarray(np.arange(1, WINDOWS) / WINDOWS, dtype)
-        parts = tuple(
-            dataclasses.replace(x, windows=edges) if isinstance(x, Peak) else x for x in parts
-        )
-    one: Any = 1.0
-    fold = Quantities((*parts, Peak(one, "deficit")))
-    return (jax.tree.map(lambda x: jnp.asarray(x, dtype), fold),)
-
-
-def piece_counts(objective: Objective, scenario: Scenario, duration: float) -> tuple[int, ...]:
-    """The number of pieces of each quantity, the margin's last."""
-
-    def first_sample(s: Scenario) -> Any:
-        return evaluate(s, jnp.zeros_like(s.initial.q[0]), initial_state(s))[1]
-
-    sample = jax.eval_shape(first_sample, scenario)
-    return fold_of(objective, scenario.initial.q.dtype, duration)[0].counts(sample)
-
-
 def _fold(problem: TuningProblem) -> tuple[Quantities, ...]:
     return fold_of(problem.objective, problem.dt.dtype, problem.request.steps * problem.dt)
-
-
-# ------------------------------------------------------------------------------------------ runs
-
-
-def _drawn(
-    cases: Cases,
-    targets: tuple[Target, ...],
-    point: dict[str, jax.Array],
-    index: jax.Array,
-    nominal: bool = False,
-) -> tuple[dict[str, jax.Array], jax.Array]:
-    """Path -> value for one run with the leaves of a point, and whether its draws were
-    admissible.
-    """
-    noise = noise_of(cases.scenario, cases.key, index)
-    if not targets:
-        return point | noise, jnp.asarray(True)
-    made, _, admissible = draw(cases, targets, index, point, {})
-    if nominal:
-        scenario = with_parameters(cases.scenario, point)
-        made = {path: jnp.asarray(get(scenario, path)) for path in made}
-        admissible = jnp.asarray(True)
-    return merge(cases.scenario, point, made) | noise, admissible
-
-
-def _varied(problem: TuningProblem, z: jax.Array, index: jax.Array) -> dict[str, jax.Array]:
-    """Path -> value for one run."""
-    dtype = problem.dt.dtype
-    point = {path: x.astype(dtype) for path, x in values_at(problem.blocks, z).items()}
-    return _drawn(problem.cases, problem.targets, point, index)[0]
-
-
-def _varied_of_all(problem: TuningProblem, candidates: Candidate) -> dict[str, jax.Array]:
-    """Path -> values (S * B, ...)."""
-    one = partial(_varied, problem)
-    return _flat(jax.vmap(jax.vmap(one, in_axes=(None, 0)))(candidates.z, candidates.index))
-
-
-def _flat(tree: Any) -> Any:
-    """Arrays (S, B, ...) as (S * B, ...)."""
-    return jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), tree)
 
 
 def _by_start(tree: Any, candidates: Candidate) -> Any:
     """Arrays (S * B, ...) as (S, B, ...)."""
     return jax.tree.map(lambda x: x.reshape(*candidates.index.shape, *x.shape[1:]), tree)
-
-
-class Rollouts(NamedTuple):
-    """What runs give, (R, ...)."""
-
-    smooth: Any
-    exact: Any
-    """Each quantity, the last minus the margin, (R, K + 1)."""
-    peak_torque: Any
-    """Of each joint, (R, n)."""
-    relative_error: Any
-    """Estimated error of each run by the time step, relative to its tube."""
-    status: Any
-    fastest_mode: Any
-
-
-@partial(jax.jit, static_argnames="request")
-def rollouts(
-    scenario: Scenario,
-    varied: dict[str, jax.Array],
-    objective: Objective,
-    dt: jax.Array,
-    *,
-    request: RunRequest,
-) -> Rollouts:
-    """Runs without derivatives, for a search and for the report on its result.
-
-    Args:
-      scenario, varied, dt, request: as `runs.run_batch`.
-      objective: complete.
-    """
-    folds = (*fold_of(objective, dt.dtype, request.steps * dt), Torque())
-    outcome = run_batch(scenario, varied, folds, dt, request)
-    smooth, exact, peak_torque, error = (
-        outcome.metrics[name] for name in ("tuning_smooth", "tuning_exact", "peak_torque", RELATIVE)
-    )
-    return Rollouts(smooth, exact, peak_torque, error, outcome.status, outcome.fastest_mode)
-
-
-@partial(jax.jit, static_argnames=("targets", "nominal"))
-def drawn(
-    cases: Cases,
-    points: dict[str, jax.Array],
-    index: jax.Array,
-    *,
-    targets: tuple[Target, ...],
-    nominal: bool,
-) -> tuple[dict[str, jax.Array], jax.Array]:
-    """Path -> values of runs by their points (R, ...) and numbers (R,), drawn or `nominal`, and
-    whether their draws were admissible.
-    """
-    return jax.vmap(lambda point, i: _drawn(cases, targets, point, i, nominal))(points, index)
 
 
 # ----------------------------------------------------------- one start, from its B runs' numbers
@@ -270,10 +107,10 @@ def _terms(risk: Risk, objective: Objective, quantities: jax.Array) -> jax.Array
 def _objective(problem: TuningProblem, candidate: Candidate, quantities: jax.Array) -> jax.Array:
     """f, from the quantities of the runs, (B, K)."""
     if problem.on_front:
-        terms = _terms(problem.risk, problem.objective, quantities)
+        terms = _terms(problem.options.risk, problem.objective, quantities)
         return jnp.log(terms) @ candidate.weights
     losses = jax.vmap(problem.objective.values)(quantities) @ candidate.weights
-    return combine(problem.risk, losses)
+    return combine(problem.options.risk, losses)
 
 
 def _excesses(problem: TuningProblem, quantities: jax.Array) -> jax.Array:
@@ -314,7 +151,7 @@ def value_of_start(
     valid = jnp.all(fine)
     risk = Risk()  # the mean
     if problem.on_front:
-        risk = problem.risk
+        risk = problem.options.risk
     return Value(
         loss=jnp.where(valid, _loss(problem, candidate, smooth), jnp.inf),
         objective=_objective(problem, candidate, exact),
@@ -323,7 +160,6 @@ def value_of_start(
         exact_excess=_excesses(problem, exact),
         margin=-jnp.max(exact[:, -1]),
         valid=valid,
-        exact=jnp.mean(exact, axis=0),
         trusted=jnp.mean(fine.astype(exact.dtype)),
     )
 
@@ -370,7 +206,7 @@ def _over_levels(
     """
 
     def over(smooth: jax.Array) -> jax.Array:
-        return jnp.log(_terms(problem.risk, problem.objective, smooth)) - candidate.levels
+        return jnp.log(_terms(problem.options.risk, problem.objective, smooth)) - candidate.levels
 
     slopes = jnp.einsum("tbk,buk->ut", jax.jacrev(over)(smooth), J)
     below = jnp.full((len(smooth), len(candidate.levels)), -NO_LEVEL, smooth.dtype)
@@ -383,14 +219,13 @@ def _over_levels(
 
 def value(problem: TuningProblem, candidates: Candidate) -> Value:
     """The problem at the coordinates of each start, (S, ...)."""
-    varied = _compiled_varied(problem, candidates)
-    found = rollouts(
-        problem.scenario, varied, problem.objective, problem.dt, request=problem.request
-    )
-    return _values(problem, candidates, found)
+    return _values(problem, candidates, problem.rollouts(candidates))
 
 
-_compiled_varied = jax.jit(_varied_of_all)
+def values(problem: TuningProblem, z: np.ndarray) -> Value:
+    """The problem without derivatives at points z, (S, p), as NumPy arrays."""
+    group = problem.points_together(len(z))
+    return in_groups(lambda rows: value(problem, problem.candidates(z[rows])), len(z), group)
 
 
 @jax.jit
@@ -406,7 +241,7 @@ def forward_derivatives(problem: TuningProblem, candidates: Candidate) -> Deriva
     """
     found = tangents_of_runs(
         problem.scenario,
-        _varied_of_all(problem, candidates),
+        problem.leaves_of_runs(candidates),
         _jacobians(problem, candidates),
         _fold(problem),
         problem.dt,
@@ -419,12 +254,11 @@ def forward_derivatives(problem: TuningProblem, candidates: Candidate) -> Deriva
 
 def _jacobians(problem: TuningProblem, candidates: Candidate) -> dict[str, jax.Array]:
     """Path -> dx/dz, (S * B, ..., p), for the leaves that depend on the coordinates."""
-    one = jax.jacfwd(partial(_varied, problem))
-    every = jax.vmap(jax.vmap(one, in_axes=(None, 0)))(candidates.z, candidates.index)
+    every = of_runs(jax.jacfwd(problem.leaves), candidates)
     tuned = [block.path for block in problem.blocks]
     return {
         path: x
-        for path, x in _flat(every).items()
+        for path, x in every.items()
         if path != NOISE_NAME and _overlaps(problem, path, tuned)
     }
 
@@ -445,7 +279,7 @@ def reverse_derivatives(problem: TuningProblem, candidates: Candidate) -> Deriva
     """The problem with gradient (S, p), by reverse mode; its matrix is zero."""
 
     def one_run(z: jax.Array, index: jax.Array) -> Any:
-        values = _varied(problem, z, index)
+        values = problem.leaves(z, index)
         noise = values.pop(NOISE_NAME, None)
         scenario = with_parameters(problem.scenario, values)
         request = problem.request._replace(constants=None)
@@ -466,3 +300,69 @@ def reverse_derivatives(problem: TuningProblem, candidates: Candidate) -> Deriva
 
 DERIVATIVES = {"forward": forward_derivatives, "reverse": reverse_derivatives}
 """Mode of differentiation -> function of a problem and candidates."""
+
+
+# ---------------------------------------------------------------------------------- on the host
+
+
+class Evaluator:
+    """The compiled problem on the host: coordinates in, NumPy arrays out.
+
+    Args:
+      problem: what is tuned.
+      candidates: of S starts; their z is replaced at each call.
+      mode: of differentiation.
+      space: what the solver knows of the problem.
+    """
+
+    def __init__(
+        self, problem: TuningProblem, candidates: Candidate, mode: str, space: SearchSpace
+    ):
+        self.problem = problem
+        self.candidates = candidates
+        self.derivatives = DERIVATIVES[mode]
+        self.space = space
+        self.evaluations = 0
+        """Number of evaluated points."""
+        starts, runs = candidates.index.shape
+        self.group = starts_together(starts, runs)
+        self.active = np.ones(starts, bool)
+        """Which starts are evaluated; the others are returned as invalid."""
+
+    def __call__(self, z: np.ndarray) -> Derivatives:
+        """Value and derivatives at z, (S, p).
+
+        Active starts are evaluated in groups of one size, so that one shape is compiled.
+        """
+        active = np.flatnonzero(self.active)
+        self.evaluations += len(active)
+        candidates = self.candidates._replace(z=np.asarray(z, self.problem.dt.dtype))
+
+        def derivatives(rows: np.ndarray) -> Derivatives:
+            group = jax.tree.map(lambda x: np.asarray(x)[active[rows]], candidates)
+            return self.derivatives(self.problem, group)
+
+        found = in_groups(derivatives, len(active), self.group)
+        if len(active) == len(z):
+            return found
+        return _scattered(found, active, len(z))
+
+    def row(self, start: int) -> tuple[TuningProblem, Candidate]:
+        """The problem, and the candidate of one start as a batch of one."""
+        one = jax.tree.map(lambda x: np.asarray(x)[start : start + 1], self.candidates)
+        return self.problem, one
+
+
+def _scattered(found: Derivatives, rows: np.ndarray, starts: int) -> Derivatives:
+    """The values of some starts among all of them; the others are invalid, with infinite losses."""
+
+    def scattered(x: np.ndarray) -> np.ndarray:
+        full = np.zeros((starts, *x.shape[1:]), x.dtype)
+        if np.issubdtype(x.dtype, np.floating):
+            full[:] = np.nan
+        full[rows] = x
+        return full
+
+    found = jax.tree.map(scattered, found)
+    found.value.loss[~found.value.valid] = np.inf
+    return found

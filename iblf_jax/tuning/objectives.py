@@ -1,5 +1,5 @@
-"""What gains are tuned for: objectives, composed with + and weights, and requirements, which
-constrain the tuning and get a verdict in the report.
+"""Gains are tuned for objectives, composed with + and weights, under requirements, which constrain
+the tuning and get a verdict in the report.
 
     objective = ij.objectives.tracking() + 0.5 * ij.objectives.effort()
     objective += 10 * ij.objectives.peak_torque() + ij.objectives.margin_above(0.05)
@@ -40,12 +40,20 @@ import numpy as np
 from iblf_jax.core import checks, notices
 from iblf_jax.core.joints import Selection, holds_weights, indices, selection
 from iblf_jax.core.pytree import component, leaf, static
+from iblf_jax.engine import Outer as Outer
 from iblf_jax.simulation.metrics import Fold, Settling, Tracking, check_needs
-from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.tuning.quantities import DEFICITS, MetricResult, Peak, TimeIntegral
+from iblf_jax.simulation.scenario import Scenario, fit_joints
+from iblf_jax.tuning.quantities import (
+    TUNED_SIGNALS,
+    MetricResult,
+    Peak,
+    TimeIntegral,
+    quantity_member,
+)
 from iblf_jax.tuning.quantities import Quantity as Quantity
-from iblf_jax.tuning.runs import Outer as Outer
 from iblf_jax.world.robots import joint_names
+
+A_SHARE = "a share of the runs, from 0 to 1"
 
 
 @component
@@ -80,7 +88,13 @@ class Term:
         limit: Any = self.limit
         if self.shape == "plain":
             return self.weight * x / scale
-        return self.weight * jax.nn.softplus(self.sharpness * (x - limit) / scale) / self.sharpness
+        excess = (x - limit) / scale
+        return self.weight * jax.nn.softplus(self.sharpness * excess) / self.sharpness
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether neither scale nor limit is missing."""
+        return self.scale is not None and (self.limit is not None or self.shape == "plain")
 
 
 @component
@@ -109,9 +123,7 @@ class Requirement:
     def check(self) -> None:
         """Raises ValueError for a share above 1, or another event."""
         if checks.is_concrete(self.allowed) and self.allowed > 1:
-            raise checks.fail(
-                "Requirement.allowed", self.allowed, "a share of the runs, from 0 to 1"
-            )
+            raise checks.fail("Requirement.allowed", self.allowed, A_SHARE)
         checks.one_of("Requirement.event", self.event, ("value", "violated"))
 
     def excess(self, x: jax.Array) -> jax.Array:
@@ -123,8 +135,7 @@ class Requirement:
         """Sign and unit with which its numbers are shown: a deficit is shown as a margin."""
         if not isinstance(self.quantity, Peak):
             return 1.0, ""
-        sign = -1.0 if self.quantity.signal in DEFICITS else 1.0
-        return sign, self.quantity.unit
+        return self.quantity.sign, self.quantity.unit
 
     def __add__(self, other: Any) -> Objective:
         return Objective((), (self,)) + other
@@ -149,22 +160,15 @@ class Objective:
         if isinstance(other, Requirement):
             other = Objective((), (other,))
         if not isinstance(other, Objective):
-            raise checks.fail(
-                "objective",
-                other,
-                "an objective or a requirement to add",
-                "ij.objectives has them.",
-            )
+            expected = "an objective or a requirement to add"
+            raise checks.fail("objective", other, expected, "ij.objectives has them.")
         return Objective((*self.terms, *other.terms), (*self.requirements, *other.requirements))
 
     def __mul__(self, weight: Any) -> Objective:
         weight = checks.as_floats("weight", weight)
         checks.shape_is("weight", weight, ())
-        terms = tuple(
-            Term(t.quantity, weight * t.weight, t.scale, t.limit, t.sharpness, t.shape, t.name)
-            for t in self.terms
-        )
-        return Objective(terms, self.requirements)
+        terms = (dataclasses.replace(t, weight=weight * t.weight) for t in self.terms)
+        return Objective(tuple(terms), self.requirements)
 
     __rmul__ = __mul__
 
@@ -196,36 +200,20 @@ def checked(objective: Any) -> Objective:
     """The objective that the user composed, if it is one; ValueError otherwise."""
     if isinstance(objective, Requirement):
         objective = Objective((), (objective,))
-    if not isinstance(objective, Objective) or not objective.terms:
-        raise checks.fail("objective", objective, WHAT_IT_IS, _remedy(objective))
-    return objective
-
-
-def _remedy(given: Any) -> str:
-    """How to write an objective, for a user who gave something else."""
-    example = "Such as ij.objectives.tracking() + 0.1 * ij.objectives.effort()."
-    if isinstance(given, str):
-        call = f"ij.objectives.metric(fold, {given!r})"
-        return f"A name is not an objective; {call} makes a term of a metric. {example}"
-    if isinstance(given, type) or callable(given):
-        return f"Call the function, with brackets. {example}"
-    return example
+    if isinstance(objective, Objective) and objective.terms:
+        return objective
+    remedy = "Such as ij.objectives.tracking() + 0.1 * ij.objectives.effort()."
+    if isinstance(objective, str):
+        call = f"ij.objectives.metric(fold, {objective!r})"
+        remedy = f"A name is not an objective; {call} makes a term of a metric. {remedy}"
+    elif callable(objective):
+        remedy = f"Call the function, with brackets. {remedy}"
+    raise checks.fail("objective", objective, WHAT_IT_IS, remedy)
 
 
 def is_complete(objective: Objective) -> bool:
     """Whether no scale or limit is missing."""
-    return all(
-        t.scale is not None and (t.limit is not None or t.shape == "plain")
-        for t in _composed(objective).terms
-    )
-
-
-def _composed(objective: Any) -> Objective:
-    if not isinstance(objective, Objective):
-        raise checks.fail(
-            "objective", objective, "an objective", "Such as ij.objectives.tracking()."
-        )
-    return objective
+    return all(term.is_complete for term in objective.terms)
 
 
 def complete(objective: Objective, start: Any) -> Objective:
@@ -236,81 +224,71 @@ def complete(objective: Objective, start: Any) -> Objective:
       start: the exact values of the terms' quantities at the start, (n_terms,).
     """
     values = np.asarray(checks.as_floats("start", start), float)
-    checks.shape_is("start", values, (len(_composed(objective).terms),))
+    checks.shape_is("start", values, (len(objective.terms),))
     terms = tuple(_completed(t, x) for t, x in zip(objective.terms, values, strict=True))
     return Objective(terms, objective.requirements)
 
 
-def _completed(t: Term, x: Any) -> Term:
-    missing = t.scale is None or (t.limit is None and t.shape == "above")
-    if missing and not (np.isfinite(x) and abs(x) > 0):
-        raise checks.fail(
-            f"{t.name}: its value at the start",
-            x,
-            "a finite number other than 0",
-            "Give the term a scale of its own.",
-        )
-    scale = t.scale
-    if scale is None:
-        scale = abs(x)
-    limit = t.limit
-    if limit is None and t.shape == "above":
-        limit = x
-    quantity = t.quantity
-    if isinstance(quantity, Peak) and t.scale is None:
-        quantity = dataclasses.replace(quantity, scale=scale)
-    return Term(quantity, t.weight, scale, limit, t.sharpness, t.shape, t.name)
+def _completed(term: Term, x: Any) -> Term:
+    if term.is_complete:
+        return term
+    if not (np.isfinite(x) and abs(x) > 0):
+        field = f"{term.name}: its value at the start"
+        remedy = "Give the term a scale of its own."
+        raise checks.fail(field, x, "a finite number other than 0", remedy)
+    if term.scale is None:
+        quantity: Any = term.quantity
+        if isinstance(quantity, Peak):
+            quantity = dataclasses.replace(quantity, scale=abs(x))
+        term = dataclasses.replace(term, quantity=quantity, scale=abs(x))
+    if not term.is_complete:
+        term = dataclasses.replace(term, limit=x)
+    return term
 
 
 def sharper(objective: Objective, factor: float) -> Objective:
     """The objective with the smoothing of every peak in its terms multiplied by a factor; its
     structure stays the same.
     """
-
-    def with_factor(term: Term) -> Term:
-        smoothing = _smoothing(term)
-        if smoothing is None:
-            return term
-        quantity: Any = term.quantity
-        quantity = dataclasses.replace(quantity, smoothing=factor * smoothing)
-        return dataclasses.replace(term, quantity=quantity)
-
-    objective = _composed(objective)
-    return Objective(tuple(map(with_factor, objective.terms)), objective.requirements)
-
-
-def _smoothing(term: Term) -> Any:
-    """The smoothing of a term's quantity; None where it has none, as those of users may not."""
-    return getattr(term.quantity, "smoothing", None)
+    terms = []
+    for term in objective.terms:
+        smoothing = quantity_member(term.quantity, "smoothing")
+        if smoothing is not None:
+            quantity: Any = term.quantity
+            quantity = dataclasses.replace(quantity, smoothing=factor * smoothing)
+            term = dataclasses.replace(term, quantity=quantity)
+        terms.append(term)
+    return Objective(tuple(terms), objective.requirements)
 
 
 def is_smoothed(objective: Objective) -> bool:
     """Whether a term of the objective is smoothed, so that `sharper` changes it."""
-    return any(_smoothing(term) is not None for term in _composed(objective).terms)
+    return any(quantity_member(t.quantity, "smoothing") is not None for t in objective.terms)
 
 
 def depends_on_torque(objective: Objective) -> bool:
     """Whether a term or a requirement increases with the torque; a user's own metric is assumed to
     do so.
     """
-    quantities = _composed(objective).quantities
     return any(
-        getattr(q, "signal", "torque") in ("torque", "torque_rate")
-        for q in quantities
-        if not _of_the_error(q)
+        quantity_member(q, "signal") in ("torque", "torque_rate")
+        for q in objective.quantities
+        if not (isinstance(q, MetricResult) and isinstance(q.fold, Tracking | Settling))
     )
 
 
-def check_signals(objective: Objective, scenario: Scenario) -> None:
-    """Raises ValueError for an objective of signals that the scenario's runs do not have: margins
-    of velocities or regions, a slack.
+def fitted(objective: Objective, scenario: Scenario) -> Objective:
+    """The objective for the joints and signals of a scenario.
+
+    Raises:
+      ValueError: as `for_scenario`; or the objective is of signals that the scenario's runs do not
+        have, such as margins of velocities or regions, or a slack.
     """
-    for quantity in _composed(objective).quantities:
+    objective = for_scenario(objective, scenario)
+    for quantity in objective.quantities:
         check_needs("objective", quantity, scenario)
-
-
-def _of_the_error(quantity: Quantity) -> bool:
-    return isinstance(quantity, MetricResult) and isinstance(quantity.fold, Tracking | Settling)
+    fit_joints(objective, scenario.n, "objective")
+    return objective
 
 
 def for_scenario(objective: Objective, scenario: Scenario) -> Objective:
@@ -326,7 +304,7 @@ def for_scenario(objective: Objective, scenario: Scenario) -> Objective:
         message names the function.
     """
     names = joint_names(scenario.plant, scenario.n)
-    terms = tuple(_part_of(t, t.name, names) for t in _composed(objective).terms)
+    terms = tuple(_part_of(t, t.name, names) for t in objective.terms)
     requirements = tuple(_part_of(r, r.function or r.name, names) for r in objective.requirements)
     return Objective(terms, requirements)
 
@@ -354,22 +332,26 @@ def _check_count(function: str, quantity: Any, chosen: int, n: int) -> None:
     shape = jnp.shape(quantity.weights)
     if shape in ((), (chosen,), (n,)):
         return
-    of_limits = isinstance(quantity, Peak) and quantity.relative
-    name = "weights"
-    came = quantity.weights
-    if of_limits:
-        name = _LIMIT_OF.get(function, "limit")
-        came = 1.0 / quantity.weights
-    raise checks.fail(
-        f"{function}: {name}",
-        came,
-        f"one number, or {chosen}, one for each of the joints",
-        f"Its shape is {shape}.",
-    )
+    name, came = "weights", quantity.weights
+    if isinstance(quantity, Peak) and quantity.relative:
+        name, came = NAME_OF_LIMIT.get(function, "limit"), 1.0 / quantity.weights
+    expected = f"one number, or {chosen}, one for each of the joints"
+    raise checks.fail(f"{function}: {name}", came, expected, f"Its shape is {shape}.")
 
 
-_LIMIT_OF = {"margin": "target", "velocity_margin": "target", "region_margin": "target"}
-"""Functions whose limit has another name."""
+NAME_OF_LIMIT = {"margin": "target", "velocity_margin": "target", "region_margin": "target"}
+"""Function -> name of its limit, where that is another one."""
+IN_WORDS = {
+    "error": "|e1|",
+    "torque": "peak torque",
+    "deficit": "margin",
+    "velocity_deficit": "velocity margin",
+    "region_deficit": "region margin",
+}
+"""Signal -> what the name of a requirement calls it."""
+
+
+# ----------------------------------------------- arguments of the functions that users compose with
 
 
 def _number(
@@ -387,26 +369,28 @@ def _number(
     return array
 
 
-def _optional(function: str, name: str, value: Any, sign: str | None = "positive") -> Any:
-    if value is None:
-        return None
-    return _number(function, name, value, sign)
-
-
-def _limit(function: str, name: str, value: Any, example: str) -> jax.Array:
+def _limit(function: str, limit: Any, example: str) -> jax.Array:
     """The limit of a function, one number or one for each joint."""
+    name = NAME_OF_LIMIT.get(function, "limit")
     try:
-        array = _number(function, name, value, "positive", most=1)
+        array = _number(function, name, limit, "positive", most=1)
     except ValueError as error:
         raise ValueError(
             f"{error} Such as {function}({name}={example}), or one number for each joint."
         ) from error
-    if array.ndim and not array.size:
-        raise checks.fail(f"{function}: {name}", value, "at least one number")
+    if not array.size:
+        raise checks.fail(f"{function}: {name}", limit, "at least one number")
     return array
 
 
-def _choice(
+def _share(function: str, name: str, share: Any) -> jax.Array:
+    number = _number(function, name, share, "nonnegative")
+    if checks.is_concrete(number) and number > 1:
+        raise checks.fail(f"{function}: {name}", share, A_SHARE)
+    return number
+
+
+def _selected(
     function: str, joints: Any, weights: Any, sign: str | None = "nonnegative"
 ) -> tuple[Selection, Any]:
     """The joints that count, and their weights, of the sign that the function takes.
@@ -416,12 +400,9 @@ def _choice(
     """
     if holds_weights(joints):
         if weights is not None:
-            raise checks.fail(
-                f"{function}: joints",
-                joints,
-                "indices, names or a slice of joints",
-                "The weights are in weights=.",
-            )
+            expected = "indices, names or a slice of joints"
+            remedy = "The weights are in weights=."
+            raise checks.fail(f"{function}: joints", joints, expected, remedy)
         notices.warn(
             f"{function}(joints=...) selects joints by index, name or slice. Floating-point numbers"
             f" are read as weights, as in earlier versions: write {function}(weights=...).",
@@ -435,15 +416,55 @@ def _choice(
     return chosen, found
 
 
-def _in_words(values: Any, unit: str) -> str:
-    """A limit as names of requirements have it."""
-    numbers = np.asarray(values)
-    if numbers.ndim == 0:
-        return f"{numbers:g} {unit}"
-    return f"[{', '.join(f'{x:g}' for x in numbers)}] {unit}"
+def _peak(
+    function: str,
+    signal: str,
+    limit: Any,
+    joints: Any,
+    weights: Any,
+    after: Any = 0.0,
+    smoothing: Any = 0.01,
+) -> tuple[Peak, Any]:
+    """The peak of a signal under a limit that is one number, or one for each joint; and the limit
+    of that peak.
+    """
+    chosen, w = _selected(function, joints, weights)
+    after = _number(function, "after", after)
+    smoothing = _number(function, "smoothing", smoothing, "positive")
+    if jnp.ndim(limit) == 0:
+        return Peak(limit, signal, w, after, smoothing, joints=chosen), limit
+    if jnp.ndim(w) == 1 and jnp.shape(w) != jnp.shape(limit):
+        expected = f"one number, or {jnp.size(limit)}, as there are limits"
+        raise checks.fail(f"{function}: weights", w, expected)
+    one: Any = 1.0
+    return Peak(one, signal, w / limit, after, smoothing, joints=chosen, relative=True), one
 
 
-def _of_joints(chosen: Selection) -> str:
+def _requirement(
+    function: str,
+    signal: str,
+    limit: Any,
+    example: str,
+    allowed: Any,
+    joints: Any = None,
+    weights: Any = None,
+    after: Any = 0.0,
+) -> Requirement:
+    """The requirement that a peak is below its limit, or a margin, minus a peak, above it."""
+    given = _limit(function, limit, example)
+    peak, limit = _peak(function, signal, given, joints, weights, after)
+    sides = {1.0: "<", -1.0: ">"}
+    numbers = np.asarray(given)
+    text = f"{numbers:g}" if not numbers.ndim else f"[{', '.join(f'{x:g}' for x in numbers)}]"
+    name = f"{IN_WORDS[signal]}{_of_joints(peak.joints)} {sides[peak.sign]} {text}"
+    name += f" {TUNED_SIGNALS[signal]}"
+    if after:
+        name += f" after {after:g} s"
+    share = _share(function, "allowed", allowed)
+    return Requirement(peak, peak.sign * limit, limit, share, name=name, function=function)
+
+
+def _of_joints(chosen: Any) -> str:
     """Which joints a requirement is on, for its name."""
     if chosen is None:
         return ""
@@ -454,62 +475,30 @@ def _of_joints(chosen: Selection) -> str:
     return f" of joint {names}" if one else f" of joints {names}"
 
 
-def _peak(
+def _soft(
     function: str,
     signal: str,
     limit: Any,
-    joints: Any,
-    weights: Any,
-    after: Any = 0.0,
-    smoothing: Any = 0.01,
-) -> tuple[Peak, Any, Selection]:
-    """The peak of a signal under a limit that is one number, or one for each joint; and the limit
-    of that peak.
+    example: str,
+    sharpness: Any,
+    smoothing: Any,
+    joints: Any = None,
+    weights: Any = None,
+) -> Objective:
+    """A soft penalty on a peak above a limit, or on a margin below it.  Without a limit, the peak
+    at the start will be scale and limit.
     """
-    chosen, w = _choice(function, joints, weights)
-    after = _number(function, "after", after)
-    smoothing = _number(function, "smoothing", smoothing, "positive")
-    if jnp.ndim(limit) == 0:
-        return Peak(limit, signal, w, after, smoothing, joints=chosen), limit, chosen
-    if jnp.ndim(w) == 1 and jnp.shape(w) != jnp.shape(limit):
-        raise checks.fail(
-            f"{function}: weights", w, f"one number, or {jnp.size(limit)}, as there are limits"
-        )
-    one: Any = 1.0
-    return Peak(one, signal, w / limit, after, smoothing, joints=chosen, relative=True), one, chosen
+    given = 1.0 if limit is None else _limit(function, limit, example)
+    peak, scale = _peak(function, signal, given, joints, weights, smoothing=smoothing)
+    sharpness = _number(function, "sharpness", sharpness, "positive")
+    limited = {} if limit is None else {"scale": scale, "limit": peak.sign * scale}
+    return Objective((Term(peak, sharpness=sharpness, shape="above", name=function, **limited),))
 
 
-def _below(
-    function: str, peak: tuple[Peak, Any, Selection], allowed: Any, name: str
-) -> Requirement:
-    """The requirement that a peak is below its limit."""
-    quantity, limit, _ = peak
-    return Requirement(
-        quantity, limit, limit, _share(function, allowed), name=name, function=function
-    )
-
-
-def _above(
-    function: str, peak: tuple[Peak, Any, Selection], allowed: Any, name: str
-) -> Requirement:
-    """The requirement that a margin, the negative of a peak, is above its limit."""
-    quantity, limit, _ = peak
-    return Requirement(
-        quantity, -limit, limit, _share(function, allowed), name=name, function=function
-    )
-
-
-def _share(function: str, allowed: Any) -> jax.Array:
-    share = _number(function, "allowed", allowed, "nonnegative")
-    if checks.is_concrete(share) and share > 1:
-        raise checks.fail(f"{function}: allowed", allowed, "a share of the runs, from 0 to 1")
-    return share
-
-
-def _one_term(function: str, quantity: Quantity, scale: Any, name: str = "") -> Objective:
-    return Objective(
-        (Term(quantity, scale=_optional(function, "scale", scale), name=name or function),)
-    )
+def _one_term(function: str, quantity: Quantity, scale: Any, name: str) -> Objective:
+    if scale is not None:
+        scale = _number(function, "scale", scale, "positive")
+    return Objective((Term(quantity, scale=scale, name=name),))
 
 
 def _integral(
@@ -521,23 +510,12 @@ def _integral(
     after: Any = 0.0,
     tolerance: Any = None,
 ) -> Objective:
-    chosen, w = _choice(function, joints, weights)
+    chosen, w = _selected(function, joints, weights)
     quantity = TimeIntegral(signal, w, _number(function, "after", after), tolerance, chosen)
-    return _one_term(function, quantity, scale)
+    return _one_term(function, quantity, scale, function)
 
 
-def _soft(
-    function: str, peak: tuple[Peak, Any, Selection], scale: Any, limit: Any, sharpness: Any
-) -> Objective:
-    """A soft penalty on a peak above a limit."""
-    sharpness = _number(function, "sharpness", sharpness, "positive")
-    return Objective(
-        (
-            Term(
-                peak[0], scale=scale, limit=limit, sharpness=sharpness, shape="above", name=function
-            ),
-        )
-    )
+# ---------------------------------------------------------------------------------------- terms
 
 
 def tracking(
@@ -614,13 +592,7 @@ def peak_torque(
       smoothing: of the maximum over time and joints, as a part of the limit.
       joints, weights: as `tracking`.
     """
-    function = "peak_torque"
-    if limit is None:  # the peak at the start will be scale and limit
-        peak = _peak(function, "torque", 1.0, joints, weights, smoothing=smoothing)
-        return _soft(function, peak, None, None, sharpness)
-    given = _limit(function, "limit", limit, "140.0")
-    peak = _peak(function, "torque", given, joints, weights, smoothing=smoothing)
-    return _soft(function, peak, peak[1], peak[1], sharpness)
+    return _soft("peak_torque", "torque", limit, "140.0", sharpness, smoothing, joints, weights)
 
 
 def margin(
@@ -635,7 +607,7 @@ def margin(
       sharpness, smoothing: as `peak_torque`, relative to the target.
       joints: as `tracking`.
     """
-    return _soft_margin("margin", "deficit", target, sharpness, smoothing, joints)
+    return _soft("margin", "deficit", target, "0.05", sharpness, smoothing, joints)
 
 
 def velocity_margin(
@@ -644,22 +616,16 @@ def velocity_margin(
     """Soft penalty on a margin to the velocity bounds below a target; as `margin`, in rad/s, for
     scenarios with `velocity_bounds`.
     """
-    return _soft_margin("velocity_margin", "velocity_deficit", target, sharpness, smoothing, joints)
+    return _soft(
+        "velocity_margin", "velocity_deficit", target, "0.05", sharpness, smoothing, joints
+    )
 
 
 def region_margin(target: Any = 0.02, *, sharpness: Any = 5.0, smoothing: Any = 0.02) -> Objective:
     """Soft penalty on a distance to the regions' boundaries below a target; as `margin`, in m, for
     scenarios with `regions`.
     """
-    return _soft_margin("region_margin", "region_deficit", target, sharpness, smoothing, None)
-
-
-def _soft_margin(
-    function: str, signal: str, target: Any, sharpness: Any, smoothing: Any, joints: Any
-) -> Objective:
-    given = _limit(function, "target", target, "0.05")
-    peak = _peak(function, signal, given, joints, None, smoothing=smoothing)
-    return _soft(function, peak, peak[1], -peak[1], sharpness)
+    return _soft("region_margin", "region_deficit", target, "0.05", sharpness, smoothing)
 
 
 def metric(
@@ -693,11 +659,14 @@ def metric(
     """
     name = checks.word("name", name, "the name of one of the fold's results")
     if holds_weights(joints):
-        chosen, w = _choice("metric", joints, weights, sign=None)
+        chosen, w = _selected("metric", joints, weights, sign=None)
     else:
         chosen = selection("metric: joints", joints)
         w = 1.0 if weights is None else weights
     return _one_term("metric", MetricResult(fold, name, w, chosen), scale, name)
+
+
+# ----------------------------------------------------------------------------------- requirements
 
 
 def error_below(
@@ -715,62 +684,35 @@ def error_below(
         given.
       weights: w, one number or one for each joint; 1 if not given.
     """
-    given = _limit("error_below", "limit", limit, "0.01")
-    peak = _peak("error_below", "error", given, joints, weights, after)
-    name = f"|e1|{_of_joints(peak[2])} < {_in_words(given, 'rad')}"
-    if after:
-        name += f" after {after:g} s"
-    return _below("error_below", peak, allowed, name)
+    return _requirement("error_below", "error", limit, "0.01", allowed, joints, weights, after)
 
 
 def peak_torque_below(
     limit: Any, *, allowed: Any = 0.01, joints: Any = None, weights: Any = None
 ) -> Requirement:
     """Largest |tau| < limit [N m], one number or one for each joint; arguments as `error_below`."""
-    given = _limit("peak_torque_below", "limit", limit, "140.0")
-    peak = _peak("peak_torque_below", "torque", given, joints, weights)
-    name = f"peak torque{_of_joints(peak[2])} < {_in_words(given, 'N m')}"
-    return _below("peak_torque_below", peak, allowed, name)
+    return _requirement("peak_torque_below", "torque", limit, "140.0", allowed, joints, weights)
 
 
 def margin_above(limit: Any, *, allowed: Any = 0.01, joints: Any = None) -> Requirement:
     """Minimum over time and joints of min(q - lower, upper - q) > limit [rad]; `limit`, `allowed`
     and `joints` as `error_below`.
     """
-    return _margin_above("margin_above", "deficit", "margin", limit, "rad", allowed, joints)
+    return _requirement("margin_above", "deficit", limit, "0.05", allowed, joints)
 
 
 def velocity_margin_above(limit: Any, *, allowed: Any = 0.01, joints: Any = None) -> Requirement:
     """Minimum over time and joints of min(q' - v_l, v_u - q') > limit [rad/s], for scenarios with
     `velocity_bounds`; as `margin_above`.
     """
-    return _margin_above(
-        "velocity_margin_above",
-        "velocity_deficit",
-        "velocity margin",
-        limit,
-        "rad/s",
-        allowed,
-        joints,
-    )
+    return _requirement("velocity_margin_above", "velocity_deficit", limit, "0.05", allowed, joints)
 
 
 def region_margin_above(limit: Any, *, allowed: Any = 0.01) -> Requirement:
     """Minimum over time and regions of the distance to the boundary > limit [m], for scenarios with
     `regions`; as `margin_above`.
     """
-    return _margin_above(
-        "region_margin_above", "region_deficit", "region margin", limit, "m", allowed, None
-    )
-
-
-def _margin_above(
-    function: str, signal: str, words: str, limit: Any, unit: str, allowed: Any, joints: Any
-) -> Requirement:
-    given = _limit(function, "limit", limit, "0.05")
-    peak = _peak(function, signal, given, joints, None)
-    name = f"{words}{_of_joints(peak[2])} > {_in_words(given, unit)}"
-    return _above(function, peak, allowed, name)
+    return _requirement("region_margin_above", "region_deficit", limit, "0.05", allowed)
 
 
 def violation_probability_below(probability: Any, *, scale: Any = 0.05) -> Requirement:
@@ -785,17 +727,13 @@ def violation_probability_below(probability: Any, *, scale: Any = 0.05) -> Requi
     """
     function = "violation_probability_below"
     size = _number(function, "scale", scale, "positive")
-    share = _number(function, "probability", probability, "nonnegative")
-    if checks.is_concrete(share) and share > 1:
-        raise checks.fail(
-            f"{function}: probability", probability, "a share of the runs, from 0 to 1"
-        )
-    made = Requirement(
+    limit: Any = 0.0
+    return Requirement(
         Peak(size, "deficit"),
-        checks.as_floats("limit", 0.0),
+        limit,
         size,
-        share,
+        _share(function, "probability", probability),
         event="violated",
+        name=f"violation probability < {probability:g}",
         function=function,
     )
-    return dataclasses.replace(made, name=f"violation probability < {probability:g}")

@@ -1,22 +1,78 @@
-"""Options of `tune`: the report's, the choice of a solver, and keyword arguments of earlier
-versions.
+"""The options of `tune`: those of its runs, of its report and of its search, among them keyword
+arguments of earlier versions.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Any, NamedTuple, Self
+
+import jax
 
 from iblf_jax.core import checks, notices
+from iblf_jax.engine import check_backend, differentiates_forward
+from iblf_jax.simulation.integrators import tableau
 from iblf_jax.studies.designs import MAX_RUNS
 from iblf_jax.studies.statistics import check_confidence
-from iblf_jax.tuning.runs import differentiates_forward
+from iblf_jax.tuning.robust import as_risk
 from iblf_jax.tuning.solvers import SOLVERS, Solver
 from iblf_jax.tuning.solvers._base import CHECKS
 
 EARLIER_NAMES = {"auto": "auto", "newton": "sqp", "lbfgs": "lbfgs", "adam": "adam"}
 """Value of `optimiser` in earlier versions -> name of the solver."""
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=("duration", "dt", "perturbations", "seed"),
+    meta_fields=("method", "backend", "runs", "risk"),
+)
+@dataclasses.dataclass(frozen=True, eq=False)
+class RunOptions:
+    """The options of the runs of a tuning, which its problem, its result and its report share.
+
+    A further option is a field of this class, a keyword argument of `tune`, and what uses it.
+    """
+
+    duration: float
+    """Length of a run [s]."""
+    dt: float = 1e-3
+    """Time step [s]."""
+    method: str = "rk4"
+    """Integrator."""
+    backend: str = "auto"
+    """Executor of values and of forward mode."""
+    perturbations: Any = None
+    """Path -> `Perturbation`; one nominal run if empty."""
+    runs: int = 1
+    """Number of perturbed runs in the loss."""
+    seed: Any = 0
+    """Seed of their draws."""
+    risk: Any = "mean"
+    """How the losses of the runs are combined; a `Risk` once it is checked."""
+
+    def checked(self) -> Self:
+        """These options, valid and of their types; the perturbations depend on a scenario and are
+        checked with it.
+
+        Raises:
+          ValueError: an option that is not valid; the message names it and the remedy.
+        """
+        tableau(self.method)
+        backend = check_backend(self.backend)
+        checks.whole_steps(self.duration, self.dt)
+        return dataclasses.replace(
+            self,
+            duration=float(self.duration),
+            dt=float(self.dt),
+            backend=backend,
+            perturbations={} if self.perturbations is None else self.perturbations,
+            seed=checks.seed(self.seed),
+            runs=checks.positive_integer("runs", self.runs, most=MAX_RUNS),
+            risk=as_risk(self.risk),
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,10 +102,10 @@ REPLACED = {
     "mode": "solver=ij.tuning.LBFGS(mode=...)",
     "resample": "solver=ij.tuning.Adam(resample=...)",
     "learning_rate": "solver=ij.tuning.Adam(learning_rate=...)",
-    **{
-        name: f"solver=ij.tuning.SQP({name}=...)"
-        for name in ("starts", "sharpenings", "tolerance", "patience")
-    },
+    "starts": "solver=ij.tuning.SQP(starts=...)",
+    "sharpenings": "solver=ij.tuning.SQP(sharpenings=...)",
+    "tolerance": "solver=ij.tuning.SQP(tolerance=...)",
+    "patience": "solver=ij.tuning.SQP(patience=...)",
     "report_runs": "report=ij.tuning.Report(runs=...)",
     "report_seed": "report=ij.tuning.Report(seed=...)",
     "confidence": "report=ij.tuning.Report(confidence=...)",
@@ -57,20 +113,22 @@ REPLACED = {
 }
 """Keyword argument of `tune` in earlier versions -> what replaces it."""
 OF_REPORT = {"report_runs": "runs", "report_seed": "seed", "confidence": "confidence"}
+"""Option of a report in earlier versions and in stored files -> its name in `Report`."""
 ARGUMENTS = (
-    *("scenario", "parameters", "objective", "duration", "dt", "method", "backend"),
-    *("perturbations", "runs", "seed", "risk", "solver", "iterations", "report", "checkpoint"),
-    "progress",
+    *("scenario", "parameters", "objective"),
+    *(field.name for field in dataclasses.fields(RunOptions)),
+    *("solver", "iterations", "report", "checkpoint", "progress"),
 )
+"""Of `tune`."""
 
 
-class Options(NamedTuple):
-    """The options of a call of `tune`."""
+class SearchOptions(NamedTuple):
+    """The options of a search, of its report and of the progress that it shows."""
 
     solver: Solver | None
-    """None: chosen by the number of coordinates."""
+    """The solver; None if the number of coordinates decides."""
     of_automatic: dict[str, Any]
-    """Options of the solver that is chosen automatically, from deprecated keyword arguments."""
+    """Options of a solver that is chosen automatically, from deprecated keyword arguments."""
     report: Report
     show: bool | None
     """Whether a progress bar is shown."""
@@ -83,8 +141,8 @@ def options_of(
     report: Report | None,
     progress: bool | Callable[[Any], None] | None,
     deprecated: Mapping[str, Any],
-) -> Options:
-    """Checks the options of `tune`.
+) -> SearchOptions:
+    """Checks options of `tune`.
 
     Args:
       solver, report, progress: as the user gave them.
@@ -108,32 +166,25 @@ def options_of(
     if callback is not None and not callable(callback):
         expected = "a function that is called with the search after each step"
         raise checks.fail("callback", callback, expected)
-    of_report = {OF_REPORT[name]: given.pop(name) for name in OF_REPORT if name in given}
-    if of_report and report is not None:
-        raise _given_twice("report", of_report)
-    report = Report(**of_report) if of_report else _report(report)
-    if given and solver is not None:
-        raise _given_twice("solver", given)
-    checked = {name: _checked(name, value) for name, value in given.items()}
     if callable(progress):
-        return Options(_solver(solver), checked, report, False, progress)
-    return Options(_solver(solver), checked, report, progress, callback)
-
-
-def _report(given: Any) -> Report:
-    if given is None:
-        return Report()
-    if not isinstance(given, Report):
+        callback, progress = progress, False
+    of_report = {OF_REPORT[name]: given.pop(name) for name in OF_REPORT if name in given}
+    _check_not_given_twice("report", report, of_report)
+    _check_not_given_twice("solver", solver, given)
+    if report is None:
+        report = Report(**of_report)
+    if not isinstance(report, Report):
         remedy = "Such as ij.tuning.Report(runs=200)."
-        raise checks.fail("report", given, "an ij.tuning.Report", remedy)
-    return given
+        raise checks.fail("report", report, "an ij.tuning.Report", remedy)
+    checked = {name: _checked(name, value) for name, value in given.items()}
+    return SearchOptions(_solver(solver), checked, report, progress, callback)
 
 
-def _given_twice(name: str, further: Mapping[str, Any]) -> ValueError:
-    names = ", ".join(further)
-    return checks.fail(
-        name, checks.Words(f"{name}= and {names}"), "one of them", f"Put {names} into {name}."
-    )
+def _check_not_given_twice(name: str, value: Any, further: Mapping[str, Any]) -> None:
+    if further and value is not None:
+        names = ", ".join(further)
+        came = checks.Words(f"{name}= and {names}")
+        raise checks.fail(name, came, "one of them", f"Put {names} into {name}.")
 
 
 def _checked(name: str, value: Any) -> Any:
@@ -144,25 +195,21 @@ def _checked(name: str, value: Any) -> Any:
 
 
 def _solver(given: Any) -> Solver | None:
-    """A solver by its name, or as it is."""
+    """A solver by its name, or as it is; None where one has to be chosen."""
     if given is None:
         return None
     if isinstance(given, str):
-        if given == "auto":
-            return None
         checks.one_of("solver", given, ("auto", *SOLVERS))
-        return SOLVERS[given]()
-    members = [x for x in vars(Solver) if not x.startswith("_")]
+        return None if given == "auto" else SOLVERS[given]()
+    members = tuple(x for x in vars(Solver) if not x.startswith("_"))
     expected = f"a solver: one of {', '.join(map(repr, SOLVERS))}, or as ij.tuning.SQP()"
-    checks.offers("solver", given, tuple(members), expected)
+    checks.offers("solver", given, members, expected)
     return given
 
 
-def chosen_solver(options: Options, size: int) -> tuple[Solver, str]:
+def chosen_solver(options: SearchOptions, size: int) -> tuple[Solver, str]:
     """The solver for so many coordinates, and the mode of differentiation."""
-    solver = options.solver
-    if solver is None:
-        solver = _automatic(options.of_automatic, size)
+    solver = options.solver or _automatic(options.of_automatic, size)
     if solver.mode != "auto":
         return solver, solver.mode
     return solver, "forward" if differentiates_forward(size) else "reverse"
@@ -173,10 +220,10 @@ def _automatic(given: Mapping[str, Any], size: int) -> Solver:
     mode = given.get("mode", "auto")
     resample = given.get("resample", False)
     name = given.get("optimiser", "auto")
-    is_forward = mode == "forward" or (mode == "auto" and differentiates_forward(size))
     if name == "auto" and resample:
         name = "adam"
     elif name == "auto":
+        is_forward = mode == "forward" or (mode == "auto" and differentiates_forward(size))
         name = "sqp" if is_forward else "lbfgs"
     if name == "sqp" and mode == "reverse":
         remedy = "Reverse mode has no Gauss-Newton matrix: take solver=ij.tuning.LBFGS()."

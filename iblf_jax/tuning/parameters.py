@@ -1,4 +1,4 @@
-"""Which leaves are tuned, within which limits, and in which coordinates.
+"""Parameters of a tuning: which leaves vary, within which limits, and in which coordinates.
 
 A tuned number x has a coordinate z in which the loss is better conditioned: z = log x for a gain
 that is positive, z = x otherwise.  Limits on x are limits on z, which are the box of SQP.  The
@@ -104,27 +104,25 @@ def tunable(
         checks.one_of("tunable: scale", scale, ("log", "linear"))
     paths.parse(path)
     low, high = _own_limit(path, "low", low), _own_limit(path, "high", high)
-    if low is not None and high is not None:
-        try:
-            below = bool(jnp.all(low < high))
-        except (TypeError, ValueError):  # shapes that do not fit each other
-            below = False
-        if not below:
-            raise checks.fail(
-                f"tunable({path!r})", (low, high), "low < high", "Exchange or widen them."
-            )
+    try:
+        is_range = low is None or high is None or bool(jnp.all(low < high))
+    except (TypeError, ValueError):  # shapes that do not fit each other
+        is_range = False
+    if not is_range:
+        remedy = "Exchange or widen them."
+        raise checks.fail(f"tunable({path!r})", (low, high), "low < high", remedy)
     return Tunable(path, low, high, checks.flag("tunable: tied", tied), scale)
 
 
 def _as_tunable(place: int, given: Any) -> Tunable:
     """An entry of a user's list of parameters."""
+    if isinstance(given, str):
+        return Tunable(given)
     if isinstance(given, Tunable):
         return given
-    if not isinstance(given, str):
-        remedy = 'Such as "controller.K2" or ij.tunable("controller.K2", 5.0, 50.0).'
-        expected = "the path of a leaf, or ij.tunable(path, low, high)"
-        raise checks.fail(f"parameters[{place}]", given, expected, remedy)
-    return Tunable(given)
+    remedy = 'Such as "controller.K2" or ij.tunable("controller.K2", 5.0, 50.0).'
+    expected = "the path of a leaf, or ij.tunable(path, low, high)"
+    raise checks.fail(f"parameters[{place}]", given, expected, remedy)
 
 
 def layout(
@@ -147,7 +145,7 @@ def layout(
     starts = {item.path: _start_of(scenario, item) for item in tunables}
     without_end = {item.path: starts[item.path][0] for item in tunables if item.high is None}
     highs = default_highs(scenario, without_end, dt, method)
-    blocks = []
+    blocks: list[Block] = []
     parts = []
     reasons: list[tuple[str, str]] = []
     for item in tunables:
@@ -156,11 +154,14 @@ def layout(
         if low is None:
             low, below = default_low(item.path, sign, value)
         high, above = highs.get(item.path, (item.high, AS_GIVEN))
-        limits = _limit(item, "low", low, value), _limit(item, "high", high, value)
-        block, part = _block(item, value, *limits, start=len(reasons), log=log)
-        blocks.append(block)
-        parts.append(part)
-        reasons += [(below, above)] * block.size
+        low, high = _limit(item, "low", low, value), _limit(item, "high", high, value)
+        if not np.all((low <= value) & (value <= high) & (low < high)):
+            expected = f"a start between its limits {low.tolist()} and {high.tolist()}"
+            raise checks.fail(f"tunable({item.path!r})", value, expected, "Widen the limits.")
+        size = 1 if item.tied else value.size
+        blocks.append(Block(item.path, value.shape, len(reasons), size, log))
+        parts.append([_coordinate(x.reshape(-1)[:size], log) for x in (value, low, high)])
+        reasons += [(below, above)] * size
     z, lowest, highest = (np.concatenate(x) for x in zip(*parts, strict=True))
     return tuple(blocks), Box(z, lowest, highest, tuple(reasons))
 
@@ -175,29 +176,12 @@ def _start_of(scenario: Scenario, item: Tunable) -> tuple[np.ndarray, bool, str 
     if item.scale:
         log = item.scale == "log"
     if log and not np.all(value > 0):
-        raise checks.fail(
-            item.path, value, "values > 0 for a logarithmic scale", 'Use scale="linear".'
-        )
+        expected = "values > 0 for a logarithmic scale"
+        raise checks.fail(item.path, value, expected, 'Use scale="linear".')
     if item.tied and not np.all(value == value.flat[0]):
         common = np.exp(np.mean(np.log(value))) if log else np.mean(value)
         value = np.full_like(value, common)
     return value, log, sign
-
-
-def _block(
-    item: Tunable, value: np.ndarray, low: np.ndarray, high: np.ndarray, *, start: int, log: bool
-) -> tuple[Block, tuple]:
-    """A leaf's share of the coordinates, and its start, lower and upper end in them."""
-    size = 1 if item.tied else value.size
-    if not np.all(low < high) or not np.all((low <= value) & (value <= high)):
-        raise checks.fail(
-            f"tunable({item.path!r})",
-            value,
-            f"a start between its limits {low.tolist()} and {high.tolist()}",
-            "Widen the limits.",
-        )
-    block = Block(item.path, value.shape, start, size, log)
-    return block, tuple(_coordinate(x.reshape(-1)[:size], log) for x in (value, low, high))
 
 
 def _limit(item: Tunable, name: str, given: Any, value: np.ndarray) -> np.ndarray:
@@ -223,9 +207,8 @@ def values_at(blocks: tuple[Block, ...], z: Any) -> dict[str, jax.Array]:
         if block.log:
             part = jnp.exp(part)
         if block.size == 1:
-            values[block.path] = jnp.broadcast_to(part[0], block.shape)
-        else:
-            values[block.path] = part.reshape(block.shape)
+            part = jnp.broadcast_to(part[0], block.shape)
+        values[block.path] = part.reshape(block.shape)
     return values
 
 
@@ -249,13 +232,14 @@ def names_of(blocks: tuple[Block, ...]) -> list[str]:
 def squash(w: jax.Array, box: Box) -> jax.Array:
     """Coordinates z inside the box for any real w, (p,)."""
     low, high = jnp.asarray(box.low), jnp.asarray(box.high)
-    below, above = jnp.isfinite(low), jnp.isfinite(high)
-    low_, high_ = jnp.where(below, low, 0.0), jnp.where(above, high, 0.0)
-    both = low_ + (high_ - low_) * jax.nn.sigmoid(w)
-    one = jnp.where(
-        below, low_ + jax.nn.softplus(w), jnp.where(above, high_ - jax.nn.softplus(w), w)
-    )
-    return jnp.where(below & above, both, one)
+    has_low, has_high = jnp.isfinite(low), jnp.isfinite(high)
+    low = jnp.where(has_low, low, 0.0)
+    high = jnp.where(has_high, high, 0.0)
+    with_both = low + (high - low) * jax.nn.sigmoid(w)
+    with_low = low + jax.nn.softplus(w)
+    with_high = high - jax.nn.softplus(w)
+    conditions = [has_low & has_high, has_low, has_high]
+    return jnp.select(conditions, [with_both, with_low, with_high], w)
 
 
 def squashed(box: Box, w: np.ndarray) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:

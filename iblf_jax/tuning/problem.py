@@ -8,37 +8,33 @@ arrays are traced and its structure is static, so it is passed to the compiled f
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.simulation.integrators import tableau
+from iblf_jax.engine import RunRequest, values_together
 from iblf_jax.simulation.noise import has_noise
 from iblf_jax.simulation.paths import with_parameters
-from iblf_jax.simulation.scenario import Scenario, canonical, check_step, fit_joints
-from iblf_jax.studies.designs import MAX_RUNS
-from iblf_jax.studies.distributions import Perturbation
+from iblf_jax.simulation.scenario import Scenario, canonical, check_step
 from iblf_jax.studies.draws import Cases, Target, targets_of
 from iblf_jax.studies.recommended import recommended_dt
-from iblf_jax.tuning.evaluation import NO_LEVEL, NUMBERS_A_RUN, Candidate, Value, piece_counts
-from iblf_jax.tuning.evaluation import value as evaluated
 from iblf_jax.tuning.objectives import (
     Objective,
-    check_signals,
     checked,
     complete,
-    for_scenario,
+    fitted,
     is_complete,
 )
+from iblf_jax.tuning.options import RunOptions
 from iblf_jax.tuning.parameters import Block, Box, Tunable, layout, values_at
 from iblf_jax.tuning.ranges import sampled_too_slowly
-from iblf_jax.tuning.robust import Risk, as_risk
-from iblf_jax.tuning.runs import RunRequest, check_backend, values_together
+from iblf_jax.tuning.rollouts import Rollouts, draw_run, piece_counts, rollouts
+from iblf_jax.tuning.runs import NUMBERS_A_RUN
 from iblf_jax.tuning.solvers import Constraints, SearchSpace, Solver
 
 FIRST_PENALTY = 10.0
@@ -47,40 +43,54 @@ MULTIMODAL_FROM = 6
 """Number of coordinates from which a problem with requirements is expected to have several local
 minima.  Of three problems of six gains, one became 4 % better by the search from several points,
 the others were as good without."""
+NO_LEVEL = 1e6
+"""A level of a front that no objective reaches."""
 
 STATIC = (
-    *("blocks", "targets", "runs", "request", "risk", "allowed"),
-    *("piece_counts", "on_front", "requirements_in_loss"),
+    *("blocks", "targets", "request", "allowed", "piece_counts"),
+    *("on_front", "requirements_in_loss"),
 )
-TRACED = ("cases", "objective", "dt", "box", "perturbations", "seed")
+TRACED = ("cases", "objective", "dt", "box", "options")
+
+
+class Candidate(NamedTuple):
+    """Where one start is evaluated, and with which weights; batches have the starts first."""
+
+    z: Any
+    """Coordinates, (p,)."""
+    index: Any
+    """Run numbers, (B,)."""
+    weights: Any
+    """Of the terms, (n_terms,)."""
+    multipliers: Any
+    """Of the requirements in the augmented Lagrangian, (n_requirements,)."""
+    penalty: Any
+    """Penalty parameter mu of the augmented Lagrangian, ()."""
+    levels: Any = ()
+    """Of the terms on a front, (n_terms,); NO_LEVEL where there is none."""
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=TRACED, meta_fields=STATIC)
 @dataclasses.dataclass(frozen=True, eq=False)
 class TuningProblem:
-    """Parameters with ranges, objective with requirements, cases and risk of a tuning."""
+    """A tuning: parameters with ranges, an objective with requirements, and options of its runs."""
 
     cases: Cases
     """The scenario, canonical, with the perturbations of its leaves and the key of the draws."""
     objective: Objective
-    """With requirements; with all scales and limits."""
+    """Terms and requirements, with all scales and limits."""
     dt: jax.Array
-    """Time step, () [s]."""
+    """Time step as an array of the runs' type, () [s]."""
     box: Box
     """Start and range of the coordinates z."""
-    perturbations: dict[str, Perturbation]
-    """As the user gave them."""
-    seed: Any
-    """Of the draws."""
+    options: RunOptions
+    """Options of the runs, checked."""
     blocks: tuple[Block, ...]
     """The tuned leaves, as parts of z."""
     targets: tuple[Target, ...]
     """The perturbed leaves."""
-    runs: int
-    """Number B of perturbed runs."""
     request: RunRequest
-    """Of the engine: steps, integrator, backend."""
-    risk: Risk
+    """What the engine runs: number of steps, integrator, executor."""
     allowed: tuple[float, ...]
     """Share of the runs that may violate each requirement."""
     piece_counts: tuple[int, ...]
@@ -96,60 +106,54 @@ class TuningProblem:
         parameters: Sequence[str | Tunable],
         objective: Any,
         *,
-        duration: float,
-        dt: float = 1e-3,
-        method: str = "rk4",
-        backend: str = "auto",
-        perturbations: Mapping[str, Perturbation] | None = None,
-        runs: int = 1,
-        seed: int = 0,
-        risk: str | Risk = "mean",
         on_front: bool = False,
+        **options: Any,
     ) -> TuningProblem:
         """Checks the arguments of `tune` and puts them together; scales and limits that are not
         given become the values at the start.
 
+        Args:
+          scenario, parameters, objective: as `tune`.
+          on_front: whether the terms are objectives of a front.
+          options: of the runs, the fields of `RunOptions`.
+
         Raises:
           ValueError: an argument that is not valid; the message names it and the remedy.
         """
-        tableau(method)
-        backend = check_backend(backend)
-        steps = checks.whole_steps(duration, dt)
+        run = RunOptions(**options).checked()
         goal = checked(objective)
-        seed = checks.seed(seed)
-        runs = checks.positive_integer("runs", runs, most=MAX_RUNS)
         scenario = canonical(scenario)
-        check_step(scenario, float(dt))
-        if perturbations is None:
-            perturbations = {}
-        targets, by_path = targets_of(scenario, perturbations)
-        _check_runs(runs, bool(targets) or has_noise(scenario))
-        blocks, box = layout(scenario, parameters, float(dt), method)
-        checks.fits("runs", runs, 8.0 * (1 + len(box.z)) * NUMBERS_A_RUN)
-        goal = _fitted(goal, scenario)
-        # Terms without a scale are evaluated once with scale 1, for their values at the start.
+        check_step(scenario, run.dt)
+        targets, by_path = targets_of(scenario, run.perturbations)
+        if run.runs > 1 and not (targets or has_noise(scenario)):
+            remedy = "All runs would be the same: give perturbations."
+            raise checks.fail("runs", run.runs, "1 without perturbations", remedy)
+        blocks, box = layout(scenario, parameters, run.dt, run.method)
+        checks.fits("runs", run.runs, 8.0 * (1 + len(box.z)) * NUMBERS_A_RUN)
+        goal = fitted(goal, scenario)
         dtype = scenario.initial.q.dtype
-        arrays = complete(goal, np.ones(len(goal.terms))), by_path, dt
-        scaled, by_path, step = jax.tree.map(lambda x: jnp.asarray(x, dtype), arrays)
+        # Terms without a scale are evaluated once with scale 1, for their values at the start.
+        arrays = complete(goal, np.ones(len(goal.terms))), by_path, run.dt
+        scaled, by_path, dt = jax.tree.map(lambda x: jnp.asarray(x, dtype), arrays)
+        steps = checks.whole_steps(run.duration, run.dt)
         problem = TuningProblem(
-            cases=Cases(scenario, by_path, jax.random.PRNGKey(seed)),
+            cases=Cases(scenario, by_path, jax.random.PRNGKey(run.seed)),
             objective=scaled,
-            dt=step,
+            dt=dt,
             box=box,
-            perturbations=dict(perturbations),
-            seed=np.uint32(seed),
+            options=dataclasses.replace(
+                run, seed=np.uint32(run.seed), perturbations=dict(run.perturbations)
+            ),
             blocks=blocks,
             targets=targets,
-            runs=runs,
-            request=RunRequest.of(scenario, steps=steps, method=method, backend=backend),
-            risk=as_risk(risk),
+            request=RunRequest.of(scenario, steps=steps, method=run.method, backend=run.backend),
             allowed=tuple(float(r.allowed) for r in goal.requirements),
-            piece_counts=piece_counts(scaled, scenario, float(duration)),
+            piece_counts=piece_counts(scaled, scenario, run.duration),
             on_front=on_front,
         )
         if is_complete(goal):
             return problem
-        goal = complete(goal, problem.at_start().exact[0, : len(goal.terms)])
+        goal = complete(goal, problem.exact_at_start()[: len(goal.terms)])
         return problem.with_objective(jax.tree.map(lambda x: jnp.asarray(x, dtype), goal))
 
     def with_objective(self, objective: Objective) -> TuningProblem:
@@ -170,6 +174,11 @@ class TuningProblem:
     def scenario(self) -> Scenario:
         """The scenario that tuning starts from."""
         return self.cases.scenario
+
+    @property
+    def runs(self) -> int:
+        """Number B of perturbed runs."""
+        return self.options.runs
 
     @property
     def size(self) -> int:
@@ -194,7 +203,7 @@ class TuningProblem:
         constraints = Constraints.of(counts, shares, self.runs)
         return SearchSpace(self.box, constraints, self.multimodal, iterations)
 
-    # -------------------------------------------------------------------------------- evaluation
+    # -------------------------------------------------------------------------------------- runs
 
     def candidates(self, z: np.ndarray) -> Candidate:
         """Candidates at z, (S, p): the same runs for all, multipliers 0."""
@@ -211,23 +220,33 @@ class TuningProblem:
             levels=np.full((starts, terms), NO_LEVEL, dtype),
         )
 
-    def values(self, z: np.ndarray) -> Value:
-        """The problem without derivatives at points z, (S, p), as NumPy arrays.
+    def leaves(self, z: jax.Array, index: jax.Array) -> dict[str, jax.Array]:
+        """Path -> value of each tuned or perturbed leaf in one run, at coordinates z, (p,)."""
+        point = {path: x.astype(self.dt.dtype) for path, x in values_at(self.blocks, z).items()}
+        return draw_run(self.cases, self.targets, point, index)[0]
 
-        Points are evaluated in groups of one size, so that few shapes are compiled.
+    def leaves_of_runs(self, candidates: Candidate) -> dict[str, jax.Array]:
+        """Path -> values of the leaves in all runs of all starts, (S * B, ...)."""
+        return of_runs(self.leaves, candidates)
+
+    def rollouts(self, candidates: Candidate) -> Rollouts:
+        """All runs of all starts, without derivatives, (S * B, ...)."""
+        varied = _leaves_of_runs(self, candidates)
+        return rollouts(self.scenario, varied, self.objective, self.dt, request=self.request)
+
+    def points_together(self, points: int) -> int:
+        """How many of some points are evaluated without derivatives in one batch.
+
+        Where many points will be evaluated later, one point is evaluated by their program.
         """
-        # Where many points will be evaluated later, one point is evaluated by their program.
-        many = len(z) > 1 or self.runs > 1 or self.multimodal or self.on_front
-        group = values_together(self.runs) if many else 1
-        parts = []
-        for first in range(0, len(z), group):
-            points = np.resize(z[first : first + group], (group, z.shape[1]))
-            parts.append(jax.tree.map(np.asarray, evaluated(self, self.candidates(points))))
-        return jax.tree.map(lambda *x: np.concatenate(x)[: len(z)], *parts)
+        many = points > 1 or self.runs > 1 or self.multimodal or self.on_front
+        return values_together(self.runs) if many else 1
 
-    def at_start(self) -> Value:
-        """The problem at its start, (1, ...)."""
-        return self.values(self.box.z[None])
+    def exact_at_start(self) -> np.ndarray:
+        """Each quantity at the start without smoothing, averaged over the runs, (K + 1,)."""
+        z = np.tile(self.box.z, (self.points_together(1), 1))
+        found = self.rollouts(self.candidates(z))
+        return np.asarray(jnp.mean(found.exact[: self.runs], axis=0))
 
     def sampled_too_slowly(self, z: np.ndarray) -> bool:
         """Whether the law's sampling period is too long for the gains at z, (p,)."""
@@ -242,9 +261,7 @@ class TuningProblem:
           trusted: share of the runs that can be integrated, at the best of these gains.
         """
         count = round(trusted * self.runs)
-        how_many = "no run"
-        if count:
-            how_many = f"only {count} of {self.runs} runs"
+        how_many = f"only {count} of {self.runs} runs" if count else "no run"
         remedy = (
             f"Take dt={self.suggested_dt():g}, not {float(self.dt):g} s (ij.recommended_dt), lower"
             " gains, or narrower perturbations."
@@ -256,22 +273,19 @@ class TuningProblem:
         """The largest stable time step, found by simulation [s]."""
         return recommended_dt(
             self.scenario,
-            duration=self.request.steps * float(self.dt),
-            method=self.request.method,
-            perturbations=self.perturbations or None,
-            seed=int(self.seed),
+            duration=self.options.duration,
+            method=self.options.method,
+            perturbations=self.options.perturbations or None,
+            seed=int(self.options.seed),
         )
 
 
-def _fitted(objective: Objective, scenario: Scenario) -> Objective:
-    """The objective for the joints and signals of a scenario."""
-    fitted = for_scenario(objective, scenario)
-    check_signals(fitted, scenario)
-    fit_joints(fitted, scenario.n, "objective")
-    return fitted
+_leaves_of_runs = jax.jit(TuningProblem.leaves_of_runs)
 
 
-def _check_runs(runs: int, differ: bool) -> None:
-    if runs > 1 and not differ:
-        remedy = "All runs would be the same: give perturbations."
-        raise checks.fail("runs", runs, "1 without perturbations", remedy)
+def of_runs(function: Any, candidates: Candidate) -> Any:
+    """A function of the coordinates and the number of one run, for all runs of all starts,
+    (S * B, ...).
+    """
+    by_start = jax.vmap(jax.vmap(function, in_axes=(None, 0)))(candidates.z, candidates.index)
+    return jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), by_start)

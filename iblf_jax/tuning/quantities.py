@@ -1,4 +1,4 @@
-"""What objectives and requirements are made of: smooth numbers of a run, each a fold over its
+"""Objectives and requirements consist of quantities: smooth numbers of a run, each a fold over its
 samples.
 
 Two kinds suffice for most objectives, over a signal y(t), a vector:
@@ -33,14 +33,15 @@ import jax.numpy as jnp
 
 from iblf_jax.core import checks
 from iblf_jax.core.joints import Selection, indices, selection
+from iblf_jax.core.optional import OptionalMembers
 from iblf_jax.core.pytree import component, leaf, static
-from iblf_jax.simulation.metrics import Fold
+from iblf_jax.engine import Outer
+from iblf_jax.simulation.metrics import Fold, fold_member
 from iblf_jax.simulation.signals import Sample
-from iblf_jax.tuning.runs import Outer
 
 INITIAL_PEAK = 1e6
 """Minus the initial value of a peak, in units of its scale."""
-SOFT_EDGE = 0.1
+EDGE_WIDTH = 0.1
 """Width of the soft edge of a tolerance, as a part of it."""
 
 
@@ -62,6 +63,9 @@ class Quantity(Protocol):
         ...
 
 
+quantity_member = OptionalMembers(hessian=None, curvature=None, smoothing=None, signal="torque")
+"""Reads the members for second-order methods, which a quantity may lack, and those of `Peak`.  A
+quantity without a signal is assumed to depend on the torque."""
 DEFICITS = {"deficit": "rad", "velocity_deficit": "rad/s", "region_deficit": "m"}
 """Signals of which the largest is minus a margin -> unit; their sign counts, not their absolute
 value."""
@@ -73,12 +77,15 @@ NEEDS = {"velocity_deficit": "dq_lower", "region_deficit": "region_margin"}
 """Signal -> the optional signal of the run that it is computed from."""
 
 
+def _indices(joints: Selection, n: int, field: str) -> tuple[int, ...]:
+    return indices(field, joints, tuple(f"joint {i}" for i in range(n)))
+
+
 def chosen_of(values: jax.Array, joints: Selection, field: str) -> jax.Array:
     """The entries (k,) of the selected joints, from one number for each joint, (n,)."""
     if joints is None:
         return values
-    names = tuple(f"joint {i}" for i in range(values.shape[-1]))
-    return jnp.stack([values[i] for i in indices(field, joints, names)])
+    return jnp.stack([values[i] for i in _indices(joints, values.shape[-1], field)])
 
 
 def weights_of(weights: jax.Array, joints: Selection, n: int, field: str) -> jax.Array:
@@ -88,23 +95,22 @@ def weights_of(weights: jax.Array, joints: Selection, n: int, field: str) -> jax
     Raises:
       ValueError: another number of weights.
     """
-    names = tuple(f"joint {i}" for i in range(n))
-    count = len(indices(field, joints, names))
-    if jnp.shape(weights) in ((), (count,)):
+    shape = jnp.shape(weights)
+    count = len(_indices(joints, n, field))
+    if shape in ((), (count,)):
         return weights
-    if jnp.shape(weights) == (n,):
+    if shape == (n,):
         return chosen_of(weights, joints, field)
     expected = f"one number, or {count}, one for each of the joints that count"
-    raise checks.fail(field, weights, expected, f"Its shape is {jnp.shape(weights)}.")
+    raise checks.fail(field, weights, expected, f"Its shape is {shape}.")
 
 
 def _check_choice(owner: str, joints: Selection, weights: Any) -> None:
     """Raises ValueError for a selection that is not normalised, or weights of more dimensions than
     one.
     """
-    if joints is not None and (
-        not isinstance(joints, tuple) or selection(f"{owner}.joints", joints) != joints
-    ):
+    is_tuple = joints is None or isinstance(joints, tuple)
+    if not is_tuple or selection(f"{owner}.joints", joints) != joints:
         raise checks.fail(f"{owner}.joints", joints, "a tuple of indices, names or truth values")
     if jnp.ndim(weights) > 1:
         raise checks.fail(f"{owner}.weights", weights, "one number, or one for each joint")
@@ -120,7 +126,7 @@ def signal_of(
     | error | e1 |
     | torque | tau |
     | torque_rate | (tau - last tau) / step, the mean over the last step, jumps included |
-    | outside | sqrt(sigmoid((abs(e1) - tolerance) / (SOFT_EDGE tolerance))); the integral of its
+    | outside | sqrt(sigmoid((abs(e1) - tolerance) / (EDGE_WIDTH tolerance))); the integral of its
       square is the time outside the tolerance |
     | deficit | (lower - q, q - upper), the largest of which is minus the margin |
     | velocity_deficit | the same of the velocities |
@@ -136,13 +142,12 @@ def signal_of(
         return of_joints(sample.tau)
     if name == "torque_rate":
         change = of_joints(sample.tau - last)
-        return jnp.where(
-            sample.step > 0, change / jnp.where(sample.step > 0, sample.step, 1.0), 0.0
-        )
+        moved = sample.step > 0
+        return jnp.where(moved, change / jnp.where(moved, sample.step, 1.0), 0.0)
     if name == "outside":
         e1 = of_joints(sample.e1)
         size = jnp.where(e1 >= 0, e1, -e1)
-        return jax.nn.sigmoid((size - tolerance) / (SOFT_EDGE * tolerance)) ** 0.5
+        return jax.nn.sigmoid((size - tolerance) / (EDGE_WIDTH * tolerance)) ** 0.5
     if name == "region_deficit":
         return -sample.region_margin
     if name == "velocity_deficit":
@@ -268,17 +273,18 @@ class Peak:
         """The optional signal of a run that it reads."""
         return NEEDS.get(self.signal)
 
+    @property
+    def sign(self) -> float:
+        """-1 where it is minus a margin, 1 otherwise."""
+        return -1.0 if self.signal in DEFICITS else 1.0
+
     def check(self) -> None:
         """Raises ValueError for an unknown signal, or a selection that is none."""
         checks.one_of("Peak.signal", self.signal, tuple(self.units))
         _check_choice("Peak", self.joints, self.weights)
         if self.signal == "region_deficit" and self.joints is not None:
-            raise checks.fail(
-                "Peak.joints",
-                self.joints,
-                "None for regions",
-                "A region does not belong to a joint.",
-            )
+            remedy = "A region does not belong to a joint."
+            raise checks.fail("Peak.joints", self.joints, "None for regions", remedy)
 
     @property
     def unit(self) -> str:
@@ -287,32 +293,28 @@ class Peak:
 
     def _at(self, acc, sample: Sample) -> jax.Array:
         y = signal_of(self.signal, sample, acc[1], None, self.joints)
-        one_side = self.signal == "region_deficit"
-        count = y.size if one_side else sample.q.size
+        has_sides = self.signal != "region_deficit"
+        count = sample.q.size if has_sides else y.size
         weights = weights_of(self.weights, self.joints, count, "Peak.weights")
         if self.signal not in DEFICITS:
             y = weights * y
             y = jnp.concatenate([y, -y])
         elif jnp.ndim(weights) == 1:  # margins have no weights, but a limit for each joint
-            if not one_side:
-                weights = jnp.concatenate([weights, weights])
-            y = y * weights
+            y = y * (jnp.concatenate([weights, weights]) if has_sides else weights)
         return jnp.where(sample.t >= self.after * (1 - 1e-6), y / self.scale, -INITIAL_PEAK)
 
     def init(self, sample: Sample):
         """Far below zero, (W, 2 k) for k joints, or (W, m) for m regions; the predecessor of the
         first torque is the torque itself.
         """
-        count = 1
+        windows = 1
         if self.windows is not None:
-            count += self.windows.size
-        return jnp.full((count, self._entries(sample)), -INITIAL_PEAK, sample.t.dtype), sample.tau
-
-    def _entries(self, sample: Sample) -> int:
-        """How many numbers the signal has at one sample."""
+            windows += self.windows.size
         if self.signal == "region_deficit":
-            return sample.region_margin.size
-        return 2 * chosen_of(sample.q, self.joints, "joints").size
+            entries = sample.region_margin.size
+        else:
+            entries = 2 * chosen_of(sample.q, self.joints, "joints").size
+        return jnp.full((windows, entries), -INITIAL_PEAK, sample.t.dtype), sample.tau
 
     def update(self, acc, sample: Sample):
         """Adds one sample to the window that it is in."""
@@ -360,20 +362,15 @@ class MetricResult:
 
     def check(self) -> None:
         """Raises ValueError for something that is not a fold, or a name that it does not return."""
-        checks.conforms(
-            "MetricResult.fold",
-            self.fold,
-            Fold,
-            "iblf_jax.metrics has them; iblf_jax.testing.check_fold checks your own.",
-        )
+        remedy = "iblf_jax.metrics has them; iblf_jax.testing.check_fold checks your own."
+        checks.conforms("MetricResult.fold", self.fold, Fold, remedy)
         checks.one_of("MetricResult.name", self.name, tuple(self.fold.units))
-        if self.joints is not None:
-            _check_choice("MetricResult", self.joints, 1.0)
+        _check_choice("MetricResult", self.joints, 1.0)
 
     @property
     def needs(self) -> str | None:
         """The optional signal of a run that its fold reads."""
-        return getattr(self.fold, "needs", None)
+        return fold_member(self.fold, "needs")  # type: ignore[no-any-return]
 
     def init(self, sample: Sample):
         """The fold's accumulator."""
@@ -387,35 +384,26 @@ class MetricResult:
         """The weighted sum, three times."""
         found = self.fold.finish(acc)[self.name]
         if not jnp.issubdtype(found.dtype, jnp.floating):
-            raise checks.fail(
-                "MetricResult.name",
-                self.name,
-                "a result that can be differentiated",
-                f"This one is {found.dtype}.",
-            )
-        value = jnp.sum(self._weights(found.shape) * self._chosen(found))
+            expected = "a result that can be differentiated"
+            remedy = f"This one is {found.dtype}."
+            raise checks.fail("MetricResult.name", self.name, expected, remedy)
+        value = jnp.sum(self._weighted(found))
         return value, value, value[None]
 
-    def _chosen(self, found: jax.Array) -> jax.Array:
-        if self.joints is not None and found.ndim != 1:
-            expected = f"None, as {self.name!r} is not one number a joint"
-            raise checks.fail(
-                "MetricResult.joints", self.joints, expected, f"Its shape is {found.shape}."
-            )
-        return chosen_of(found, self.joints, "MetricResult.joints")
-
-    def _weights(self, shape: tuple[int, ...]) -> jax.Array:
-        if self.joints is None and jnp.shape(self.weights) not in ((), shape):
-            expected = f"one number, or shape {shape} as {self.name!r} has"
-            raise checks.fail(
-                "MetricResult.weights",
-                self.weights,
-                expected,
-                f"Its shape is {jnp.shape(self.weights)}.",
-            )
+    def _weighted(self, found: jax.Array) -> jax.Array:
+        field = "MetricResult.weights"
+        shape = jnp.shape(self.weights)
         if self.joints is None:
-            return self.weights
-        return weights_of(self.weights, self.joints, shape[0], "MetricResult.weights")
+            if shape not in ((), found.shape):
+                expected = f"one number, or shape {found.shape} as {self.name!r} has"
+                raise checks.fail(field, self.weights, expected, f"Its shape is {shape}.")
+            return self.weights * found
+        if found.ndim != 1:
+            expected = f"None, as {self.name!r} is not one number a joint"
+            remedy = f"Its shape is {found.shape}."
+            raise checks.fail("MetricResult.joints", self.joints, expected, remedy)
+        chosen = chosen_of(found, self.joints, "MetricResult.joints")
+        return weights_of(self.weights, self.joints, found.size, field) * chosen
 
 
 MEMBERS = {"integral": TimeIntegral, "peak": Peak, "metric_result": MetricResult}
@@ -489,13 +477,11 @@ class Quantities:
         found = []
         for part, own, slope in zip(self.parts, pieces, slopes, strict=True):
             product = next(remaining) if _has_curvature(part) else none
-            matrix = none
-            if hasattr(part, "hessian"):
-                matrix = part.hessian(product, own, slope)
-            found.append(matrix)
+            hessian = quantity_member(part, "hessian")
+            found.append(none if hessian is None else hessian(product, own, slope))
         return jnp.stack(found)
 
 
 def _has_curvature(part: Any) -> bool:
     """Whether a quantity has the optional method of the contract."""
-    return hasattr(part, "curvature")
+    return quantity_member(part, "curvature") is not None

@@ -2,8 +2,8 @@
 of time step, sampling period and drive.
 
 The lower end of a leaf is k1 > 0, K2 > 1/2 or kf > 1 where all its entries start there, otherwise
-its sign decides.  The upper end of a gain x is f x0 with the largest f <= MAX_FACTOR for which the
-loop at the start and along its reference satisfies
+its sign decides.  The upper end of a gain x is f x0 with the largest f <= MAX_FACTOR for which
+the loop at the start and along its reference satisfies
 
     dt |lambda|_max <= STABILITY_FRACTION R                     for a continuous law,
     rho(map from a period to the next) < 1                      for a sampled law,
@@ -38,7 +38,7 @@ from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.tuning.runs import fastest_along, radius_at, start_and_along
 
-CONDITIONS = {"controller.k1": 0.05, "controller.K2": 0.505, "observer.kf": 1.01}
+THEOREM_LIMITS = {"controller.k1": 0.05, "controller.K2": 0.505, "observer.kf": 1.01}
 """Default lower limits: just inside Theorem 2's conditions (3.17), (3.25) on the gains of the
 paper's law."""
 STABILITY_FRACTION = 0.7
@@ -47,20 +47,16 @@ TIMES = np.linspace(0.0, 6.0, 7)
 """Along the reference, at which the loop is examined [s]."""
 MAX_FACTOR = 1e2
 """Largest upper end of a gain by default, relative to its start."""
-HALVINGS = 10
+BISECTION_STEPS = 10
 FACTOR_BEYOND_CONDITION = 1.01
 """Upper end of a gain, relative to its start, where already the start violates a condition."""
-AS_GIVEN, BY_THEOREM, BY_SIGN, UNLIMITED = (
-    "as given",
-    "the conditions of Theorem 2",
-    "its sign",
-    "none",
-)
+AS_GIVEN = "as given"
+BY_THEOREM = "the conditions of Theorem 2"
+BY_SIGN = "its sign"
+UNLIMITED = "none"
 BY_FACTOR = f"{MAX_FACTOR:g} times its start"
-BY_STEP, BY_PERIOD = (
-    "beyond it the step dt is too long for the loop",
-    "beyond it the loop is unstable at its sampling period",
-)
+BY_STEP = "beyond it the step dt is too long for the loop"
+BY_PERIOD = "beyond it the loop is unstable at its sampling period"
 BY_COUNT = (
     "beyond it one count of the encoder commands more torque, or a higher rate of it, than the"
     " drive can deliver"
@@ -75,8 +71,8 @@ TOGETHER = ", with all gains at their upper ends"
 def default_low(path: str, sign: str | None, start: np.ndarray) -> tuple[float, str]:
     """The lower end of the range of a leaf that starts at `start`, and why it is there."""
     leaf = re.sub(r"(\[\d+\])+$", "", path)
-    if leaf in CONDITIONS and np.all(start >= CONDITIONS[leaf]):
-        return CONDITIONS[leaf], BY_THEOREM
+    if leaf in THEOREM_LIMITS and np.all(start >= THEOREM_LIMITS[leaf]):
+        return THEOREM_LIMITS[leaf], BY_THEOREM
     if sign in ("positive", "nonnegative"):
         return 0.0, BY_SIGN
     return -np.inf, UNLIMITED
@@ -117,28 +113,23 @@ def default_highs(
             return BY_PERIOD
         return drive_exceeded(changed) if limited_by_drive else ""
 
-    def by_one(path: str, share: float) -> str:
-        return violated({path: share * float(np.log(MAX_FACTOR))})
+    def largest_share(logarithms: dict[str, float]) -> tuple[float, str]:
+        return _largest_share(lambda s: violated({path: s * x for path, x in logarithms.items()}))
 
-    def by_all(share: float) -> str:
-        return violated({path: share * x for path, x in reach.items()})
-
+    furthest = float(np.log(MAX_FACTOR))
     reach: dict[str, float] = {}
     why: dict[str, str] = {}
     for path in gains:
-        share, reason = _largest_share(partial(by_one, path))
-        reach[path] = share * float(np.log(MAX_FACTOR))
+        share, reason = largest_share({path: furthest})
+        reach[path] = share * furthest
         why[path] = reason or BY_FACTOR
     share, reason = 1.0, ""
     if len(gains) > 1:
-        share, reason = _largest_share(by_all)
+        share, reason = largest_share(reach)
     for path, x in gains.items():
-        factor = FACTOR_BEYOND_CONDITION
-        if reach[path] > 0:
-            factor = max(np.exp(share * reach[path]), FACTOR_BEYOND_CONDITION)
-            if reason:
-                why[path] = reason + TOGETHER
-        ends[path] = factor * x, why[path]
+        if reason and reach[path] > 0:
+            why[path] = reason + TOGETHER
+        ends[path] = max(np.exp(share * reach[path]), FACTOR_BEYOND_CONDITION) * x, why[path]
     return ends
 
 
@@ -154,7 +145,7 @@ def _largest_share(violated: Callable[[float], str]) -> tuple[float, str]:
         return 0.0, at_start
     low = 0.0
     high = 1.0
-    for _ in range(HALVINGS):
+    for _ in range(BISECTION_STEPS):
         middle = 0.5 * (low + high)
         found = violated(middle)
         if found:

@@ -1,7 +1,7 @@
-"""The report on a tuning: before and after, on fresh runs that it did not use; on the one nominal
-run where nothing is perturbed.
+"""The report on a tuning compares the gains before and after on fresh runs, which the tuning did
+not use, or on the one nominal run where nothing is perturbed.
 
-It contains torque, and gains at an end of their range, whatever the objective: the best tracking
+It contains torque, and gains at an end of their range, whatever the objective is: the best tracking
 without a cost of torque needs more torque than any actuator has.
 
 The scenario is run with both gains on the same fresh draws, so that the change of every number is a
@@ -27,17 +27,19 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.core.status import Status
+from iblf_jax.engine import RunRequest, fresh_together
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.draws import Cases, targets_of
 from iblf_jax.studies.recommended import warn_of_step
 from iblf_jax.studies.statistics import Probability, probability
 from iblf_jax.studies.study import VIOLATED
-from iblf_jax.tuning.evaluation import drawn, rollouts
 from iblf_jax.tuning.objectives import Objective
+from iblf_jax.tuning.options import Report, RunOptions
 from iblf_jax.tuning.quantities import OF_LIMIT
 from iblf_jax.tuning.robust import Risk, worst_share
-from iblf_jax.tuning.runs import RunRequest, fresh_together
+from iblf_jax.tuning.rollouts import Rollouts, draw_runs, rollouts
+from iblf_jax.tuning.runs import in_groups
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,17 +93,31 @@ class Verdict:
     it is not known."""
 
     def __str__(self) -> str:
-        text = self._verdict()
-        if np.isfinite(self.value):
-            text += self._value_in_words()
-        if self.multiplier is not None and self.verdict != "fail" and self.multiplier > 0:
-            text += self._sensitivity(self.multiplier)
-        return text
+        return self._change_in_words() + self._value_in_words() + self._sensitivity_in_words()
+
+    def _change_in_words(self) -> str:
+        if self.after.runs == 1:
+            words = ["broken" if x.count else "kept" for x in (self.before, self.after)]
+            return f"{self.name}: {' -> '.join(words)}: {self.verdict}"
+        text = (
+            f"{self.name} (broken by at most {self.allowed:g} of the runs):"
+            f" {self.before.estimate:.4g} -> {self.after}: {self.verdict}"
+        )
+        if self.verdict != "undecided" or self.after.count or not self.allowed > 0:
+            return text
+        confidence = self.after.confidence
+        needed = int(np.ceil(np.log((1 - confidence) / 2) / np.log1p(-self.allowed)))
+        return (
+            f"{text}; no run broke it, but {needed} such runs are needed to conclude that with"
+            f" {confidence:.0%} confidence"
+        )
 
     def _value_in_words(self) -> str:
         """The value; where each joint has a limit of its own, that of the worst joint relative to
         its limit.
         """
+        if not np.isfinite(self.value):
+            return ""
         if self.unit == OF_LIMIT:
             return f"; the worst joint is at {100 * self.value:.4g} % of its limit"
         text = f"; {self.value:.5g} {self.unit}"
@@ -110,37 +126,14 @@ class Verdict:
         side = "above" if self.value > self.limit else "below"
         return f"{text}, {abs(self.value - self.limit):.3g} {self.unit} {side} the limit"
 
-    def _sensitivity(self, multiplier: float) -> str:
+    def _sensitivity_in_words(self) -> str:
+        multiplier = self.multiplier
+        if multiplier is None or self.verdict == "fail" or not multiplier > 0:
+            return ""
+        change = f"{multiplier:.3g} for each {self.unit} that the limit is"
         if self.unit == OF_LIMIT:
-            return (
-                f"; the objective would fall by {multiplier / 100:.3g} for each percent that the"
-                " limits are loosened by"
-            )
-        return (
-            f"; the objective would fall by {multiplier:.3g} for each {self.unit} that the limit is"
-            " loosened by"
-        )
-
-    def _verdict(self) -> str:
-        if self.after.runs == 1:
-            words = ["broken" if x.count else "kept" for x in (self.before, self.after)]
-            return f"{self.name}: {' -> '.join(words)}: {self.verdict}"
-        text = (
-            f"{self.name} (broken by at most {self.allowed:g} of the runs):"
-            f" {self.before.estimate:.4g} -> {self.after}: {self.verdict}"
-        )
-        if self.verdict == "undecided" and self.after.count == 0 and self.allowed > 0:
-            text += self._needed_runs()
-        return text
-
-    def _needed_runs(self) -> str:
-        """How many runs without a violation a pass needs."""
-        confidence = self.after.confidence
-        needed = int(np.ceil(np.log((1 - confidence) / 2) / np.log1p(-self.allowed)))
-        return (
-            f"; no run broke it, but {needed} such runs are needed to conclude that with"
-            f" {confidence:.0%} confidence"
-        )
+            change = f"{multiplier / 100:.3g} for each percent that the limits are"
+        return f"; the objective would fall by {change} loosened by"
 
 
 WORST_FIRST = ("fail", "undecided", "pass")
@@ -184,63 +177,50 @@ class TuningReport:
 
     def __str__(self) -> str:
         """Bounds first, then requirements, the objective, and the rest."""
-        sections = (
-            self._of_bounds(),
-            self._of_requirements(),
-            self._of_objective(),
-            self._of_gains(),
-        )
-        rows = [f"  {row}" for section in sections for row in section]
-        return "\n".join([self._heading(), *rows])
-
-    def _heading(self) -> str:
-        if self.seed is None:
-            return "Report on one nominal run: no statistics"
-        runs = f"{self.runs} fresh runs (seed {self.seed})"
-        return f"Report on {runs}, {self.confidence:.0%} confidence"
-
-    def _of_bounds(self) -> list[str]:
-        """How often bounds were violated, and the smallest margin."""
-        before, after = (p.count if self.seed is None else p for p in self.violation)
-        violated = f"bounds violated: {before} -> {after}"
+        heading = "Report on one nominal run: no statistics"
+        violated: list[Any] = [p.count for p in self.violation]
+        of_all = ""
+        if self.seed is not None:
+            heading = (
+                f"Report on {self.runs} fresh runs (seed {self.seed}),"
+                f" {self.confidence:.0%} confidence"
+            )
+            violated = list(self.violation)
+            of_all = " of all runs"
+        bounds = f"bounds violated: {violated[0]} -> {violated[1]}"
         if self.violation[1].count:
-            violated += "; WARNING: with the tuned gains the bounds are not kept"
-        return [violated, f"smallest margin: {self.margin[0]:.4g} -> {self.margin[1]:.4g} rad"]
-
-    def _of_requirements(self) -> list[str]:
-        """The requirements, those that failed first."""
-        ordered = sorted(self.verdicts, key=lambda verdict: WORST_FIRST.index(verdict.verdict))
-        return [f"requirement {verdict}" for verdict in ordered]
-
-    def _of_objective(self) -> list[str]:
-        """The objective and its terms, and whether the change is significant."""
-        objective = self.changes[0]
-        rows = [str(change) for change in self.changes]
-        if objective.significant is False:
-            doubt = "these runs do not show that tuning helped."
-            rows.append(f"The objective's change is not significant: {doubt}")
-        elif objective.after > objective.before:
-            rows.append("The objective went up.")
-        return rows
-
-    def _of_gains(self) -> list[str]:
-        """Torque, gains at the end of their range, the run at half the step, the search's end."""
+            bounds += "; WARNING: with the tuned gains the bounds are not kept"
+        verdicts = sorted(self.verdicts, key=lambda verdict: WORST_FIRST.index(verdict.verdict))
         torques = [", ".join(f"{x:.5g}" for x in row) for row in self.peak_torque]
-        of_all = "" if self.seed is None else " of all runs"
-        rows = [f"peak torque{of_all}, joint by joint: {torques[0]} -> {torques[1]} N m"]
+        rows = [
+            bounds,
+            f"smallest margin: {self.margin[0]:.4g} -> {self.margin[1]:.4g} rad",
+            *(f"requirement {verdict}" for verdict in verdicts),
+            *map(str, self.changes),
+            *self._doubts(),
+            f"peak torque{of_all}, joint by joint: {torques[0]} -> {torques[1]} N m",
+        ]
         if self.at_limits is not None:
             rows += self.at_limits or ["gains at an end of their range: none"]
-        return [*rows, *(words for words in (self.halved, *self.notes) if words)]
+        rows += [words for words in (self.halved, *self.notes) if words]
+        return "\n  ".join([heading, *rows])
+
+    def _doubts(self) -> list[str]:
+        """What to say about the objective where it did not become lower."""
+        objective = self.changes[0]
+        if objective.significant is False:
+            doubt = "these runs do not show that tuning helped."
+            return [f"The objective's change is not significant: {doubt}"]
+        if objective.after > objective.before:
+            return ["The objective went up."]
+        return []
 
     __repr__ = __str__
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as numbers and strings."""
-        out = dataclasses.asdict(self)
-        out["changes"] = [
-            {**dataclasses.asdict(c), "significant": c.significant} for c in self.changes
-        ]
-        return out
+        changes = [{**dataclasses.asdict(c), "significant": c.significant} for c in self.changes]
+        return dataclasses.asdict(self) | {"changes": changes}
 
 
 LARGEST_DIFFERENCE = 0.01
@@ -255,8 +235,8 @@ class _Sample(NamedTuple):
     torque: np.ndarray
     """The largest of each joint, (N, n)."""
     status: np.ndarray
-    made: np.ndarray
-    """Whether the run could be made: its draws were admissible, (N,)."""
+    admissible: np.ndarray
+    """Whether the draws of the run were admissible; the others do not count, (N,)."""
 
     @property
     def margin(self) -> np.ndarray:
@@ -268,7 +248,7 @@ class _Sample(NamedTuple):
         return self.status & int(VIOLATED) != 0
 
 
-class ReportCase(NamedTuple):
+class ReportRequest(NamedTuple):
     """What is reported on: a scenario before and after a tuning."""
 
     before: Scenario
@@ -277,137 +257,110 @@ class ReportCase(NamedTuple):
     """Paths of the tuned leaves."""
     objective: Objective
     """With scales and limits."""
-    perturbations: Any
-    """Path -> perturbation; one nominal run if empty."""
-    risk: Risk
-    duration: float
-    dt: float
-    method: str
-    backend: str = "auto"
+    run: RunOptions
+    """As in the tuning, except for the number of runs and their seed."""
+    report: Report
+    """With a seed."""
     batch: int = 1
     """Runs in a batch of the search's values, whose compiled program is used again."""
+    at_limits: tuple[str, ...] | None = None
+    """The tuned numbers at an end of their range, in words."""
+    multipliers: tuple[float, ...] = ()
+    """Of each requirement, by the unit of its limit; none if not known."""
+    notes: tuple[str, ...] = ()
+    """Further lines."""
 
 
-class _FreshRuns:
-    """Runs of the scenarios of a report, on the same draws.
-
-    They are made by the program of a search's values.  The nominal run replaces the perturbed
-    leaves too, so that one kernel serves all.
-    """
-
-    def __init__(self, case: ReportCase, seed: int):
-        self.case = case
-        self.scenario = canonical(case.before)
-        self.dtype = self.scenario.initial.q.dtype
-        self.targets, by_path = targets_of(self.scenario, case.perturbations or {})
-        by_path, self.objective = self._typed((by_path, case.objective))
-        self.cases = Cases(self.scenario, by_path, jax.random.PRNGKey(seed))
-
-    def _typed(self, tree: Any) -> Any:
-        return jax.tree.map(lambda x: jnp.asarray(x, self.dtype), tree)
-
-    def run(self, scenarios: Sequence[Scenario], runs: int, dt: float) -> list[_Sample]:
-        """The runs of each scenario: so many drawn ones, or the nominal one where `runs` is 0."""
-        case = self.case
-        steps = checks.whole_steps(case.duration, dt)
-        request = RunRequest.of(
-            self.scenario, steps=steps, method=case.method, backend=case.backend
-        )
-        batch = fresh_together(runs * len(scenarios) * steps, case.batch)
-        points = {
-            path: np.stack([np.asarray(paths.get(s, path), self.dtype) for s in scenarios])
-            for path in case.tuned
-        }
-        index = np.tile(np.arange(runs or 1, dtype=np.uint32), len(scenarios))
-        owner = np.repeat(np.arange(len(scenarios)), runs or 1)
-        step = self._typed(dt)
-        parts = []
-        for first in range(0, len(owner), batch):
-            rows = np.resize(np.arange(len(owner))[first : first + batch], batch)
-            varied, made = drawn(
-                self.cases,
-                {path: x[owner[rows]] for path, x in points.items()},
-                index[rows],
-                targets=self.targets,
-                nominal=not runs,
-            )
-            found = rollouts(self.scenario, varied, self.objective, step, request=request)
-            parts.append(jax.tree.map(np.asarray, (found, made)))
-        found, made = jax.tree.map(lambda *x: np.concatenate(x)[: len(owner)], *parts)
-        if len(scenarios) > 1:  # once in a report
-            warn_of_step(found.status, found.fastest_mode, found.relative_error, dt, case.method)
-        samples = _Sample(found.exact, found.peak_torque, found.status, made)
-        return [_Sample(*(x[owner == s] for x in samples)) for s in range(len(scenarios))]
-
-
-def make_report(
-    case: ReportCase,
-    *,
-    runs: int,
-    seed: int,
-    confidence: float,
-    at_limits: tuple[str, ...] | None = None,
-    multipliers: tuple[float, ...] = (),
-    notes: tuple[str, ...] = (),
-) -> TuningReport:
-    """Runs both scenarios on the same fresh draws and compares them.
-
-    Args:
-      case: what is reported on.
-      runs, seed: of the fresh draws.
-      confidence: of the intervals.
-      at_limits: the tuned numbers at an end of their range, in words.
-      multipliers: of each requirement, by the unit of its limit; none if not known.
-      notes: further lines.
-    """
-    fresh = _FreshRuns(case, seed)
-    before, after = fresh.run((case.before, case.after), runs if case.perturbations else 0, case.dt)
+def make_report(request: ReportRequest) -> TuningReport:
+    """Runs both scenarios on the same fresh draws and compares them."""
+    is_perturbed = bool(request.run.perturbations)
+    confidence = request.report.confidence
+    dt = request.run.dt
+    before, after = samples = _fresh_runs(
+        request, (request.before, request.after), request.report.runs if is_perturbed else 0, dt
+    )
     full = after
-    if case.perturbations:
-        (full,) = fresh.run((case.after,), 0, case.dt)
-    (half,) = fresh.run((case.after,), 0, 0.5 * case.dt)
-    samples = (before, after)
+    if is_perturbed:
+        (full,) = _fresh_runs(request, (request.after,), 0, dt)
+    (half,) = _fresh_runs(request, (request.after,), 0, 0.5 * dt)
 
     def each(function: Any) -> tuple[Any, Any]:
         return function(before), function(after)
 
     return TuningReport(
-        runs=int(np.sum(before.made & after.made)),
-        seed=seed if case.perturbations else None,
+        runs=int(np.sum(before.admissible & after.admissible)),
+        seed=request.report.seed if is_perturbed else None,
         confidence=confidence,
-        changes=_changes(case, samples, confidence),
-        verdicts=_verdicts(case.objective, samples, confidence, multipliers),
+        changes=_changes(request, samples),
+        verdicts=tuple(
+            _verdict(request, r, samples) for r in range(len(request.objective.requirements))
+        ),
         violation=each(lambda x: _probability(x.left_bounds(), x, confidence)),
-        margin=each(lambda x: float(x.margin[x.made].min())),
-        peak_torque=each(lambda x: tuple(x.torque[x.made].max(axis=0).tolist())),
-        at_limits=at_limits,
-        halved=_at_half_the_step(case.objective, full, half),
-        notes=notes,
+        margin=each(lambda x: float(x.margin[x.admissible].min())),
+        peak_torque=each(lambda x: tuple(x.torque[x.admissible].max(axis=0).tolist())),
+        at_limits=request.at_limits,
+        halved=_at_half_the_step(request.objective, full, half),
+        notes=request.notes,
     )
+
+
+def _fresh_runs(
+    request: ReportRequest, scenarios: Sequence[Scenario], runs: int, dt: float
+) -> list[_Sample]:
+    """The runs of each scenario on the same draws: so many drawn ones, or the nominal one where
+    `runs` is 0.
+
+    They are made by the program of a search's values.  The nominal run replaces the perturbed
+    leaves too, so that one kernel serves all.
+    """
+    scenario = canonical(request.before)
+    dtype = scenario.initial.q.dtype
+    targets, by_path = targets_of(scenario, request.run.perturbations or {})
+    arrays = by_path, request.objective, dt
+    by_path, objective, step = jax.tree.map(lambda x: jnp.asarray(x, dtype), arrays)
+    cases = Cases(scenario, by_path, jax.random.PRNGKey(int(request.report.seed or 0)))
+    method = request.run.method
+    steps = checks.whole_steps(request.run.duration, dt)
+    of_run = RunRequest.of(scenario, steps=steps, method=method, backend=request.run.backend)
+    points = {
+        path: np.stack([np.asarray(paths.get(s, path), dtype) for s in scenarios])
+        for path in request.tuned
+    }
+    index = np.tile(np.arange(runs or 1, dtype=np.uint32), len(scenarios))
+    owner = np.repeat(np.arange(len(scenarios)), runs or 1)
+
+    def run(rows: np.ndarray) -> tuple[Rollouts, jax.Array]:
+        own = {path: x[owner[rows]] for path, x in points.items()}
+        varied, admissible = draw_runs(cases, own, index[rows], targets=targets, nominal=not runs)
+        return rollouts(scenario, varied, objective, step, request=of_run), admissible
+
+    batch = fresh_together(runs * len(scenarios) * steps, request.batch)
+    found, admissible = in_groups(run, len(owner), batch)
+    if len(scenarios) > 1:  # once in a report
+        warn_of_step(found.status, found.fastest_mode, found.relative_error, dt, method)
+    samples = _Sample(found.exact, found.peak_torque, found.status, admissible)
+    return [_Sample(*(x[owner == s] for x in samples)) for s in range(len(scenarios))]
 
 
 # --------------------------------------------------------------------------------------- changes
 
 
-def _changes(
-    case: ReportCase, samples: tuple[_Sample, _Sample], confidence: float
-) -> tuple[Change, ...]:
+def _changes(request: ReportRequest, samples: Sequence[_Sample]) -> tuple[Change, ...]:
     """The objective first, then its terms."""
-    risk = case.risk
-    both = samples[0].made & samples[1].made
-    before, after = (_terms(case.objective, x.exact[both]) for x in samples)
+    risk: Any = request.run.risk
+    confidence = request.report.confidence
+    terms = request.objective.terms
+    both = samples[0].admissible & samples[1].admissible
+    before, after = (_terms(request.objective, x.exact[both]) for x in samples)
     is_cvar = risk.kind == "cvar"
-    risk_name = f"cvar {risk.level:g}" if is_cvar else risk.kind
-
-    def name(what: str, combined_by: str) -> str:
-        return f"{what} ({combined_by})" if len(before) > 1 else what
-
-    objective = name("objective", risk_name)
-    found = [_objective_change(risk, objective, before, after, confidence)]
-    for i, term in enumerate(case.objective.terms):
-        found.append(_change(name(term.name, "mean"), before[:, i], after[:, i], confidence))
-        if is_cvar and len(case.objective.terms) > 1:
-            tail = f"{term.name} ({risk_name})"
+    of_risk, of_mean = (f" (cvar {risk.level:g})" if is_cvar else f" ({risk.kind})"), " (mean)"
+    if len(before) == 1:
+        of_risk = of_mean = ""
+    found = [_objective_change(risk, f"objective{of_risk}", before, after, confidence)]
+    for i, term in enumerate(terms):
+        found.append(_change(term.name + of_mean, before[:, i], after[:, i], confidence))
+        if is_cvar and len(terms) > 1:
+            tail = f"{term.name} (cvar {risk.level:g})"
             one = slice(i, i + 1)
             found.append(_objective_change(risk, tail, before[:, one], after[:, one], confidence))
     return tuple(found)
@@ -457,41 +410,37 @@ def _change(name: str, before: np.ndarray, after: np.ndarray, confidence: float)
 # -------------------------------------------------------------------------------------- verdicts
 
 
-def _verdicts(
-    objective: Objective,
-    samples: tuple[_Sample, _Sample],
-    confidence: float,
-    multipliers: tuple[float, ...],
-) -> tuple[Verdict, ...]:
-    """The verdict on each requirement."""
-    found = []
-    for r, requirement in enumerate(objective.requirements):
-        before, after = (_probability(_broken(objective, r, x), x, confidence) for x in samples)
-        allowed = float(requirement.allowed)
-        # For a limited probability the constraint is on a margin: its multiplier is not the
-        # sensitivity to the probability.
-        multiplier = None
-        if r < len(multipliers) and requirement.event == "value":
-            multiplier = multipliers[r]
-        sign, unit = requirement.measure
-        values = samples[1].exact[samples[1].made, len(objective.terms) + r]
-        verdict = Verdict(
-            name=requirement.name,
-            allowed=allowed,
-            before=before,
-            after=after,
-            verdict=verdict_of(after, allowed),
-            value=sign * float(worst_share(jnp.asarray(values), allowed)),
-            limit=sign * float(requirement.limit),
-            unit=unit,
-            multiplier=multiplier,
-        )
-        found.append(verdict)
-    return tuple(found)
+def _verdict(request: ReportRequest, r: int, samples: Sequence[_Sample]) -> Verdict:
+    """The verdict on requirement r."""
+    requirement = request.objective.requirements[r]
+    before, after = (
+        _probability(_broken(request.objective, r, x), x, request.report.confidence)
+        for x in samples
+    )
+    allowed = float(requirement.allowed)
+    # For a limited probability the constraint is on a margin: its multiplier is not the
+    # sensitivity to the probability.
+    multiplier = None
+    if r < len(request.multipliers) and requirement.event == "value":
+        multiplier = request.multipliers[r]
+    sign, unit = requirement.measure
+    last = samples[1]
+    values = last.exact[last.admissible, len(request.objective.terms) + r]
+    return Verdict(
+        name=requirement.name,
+        allowed=allowed,
+        before=before,
+        after=after,
+        verdict=verdict_of(after, allowed),
+        value=sign * float(worst_share(jnp.asarray(values), allowed)),
+        limit=sign * float(requirement.limit),
+        unit=unit,
+        multiplier=multiplier,
+    )
 
 
 def _probability(event: np.ndarray, sample: _Sample, confidence: float) -> Probability:
-    return probability(event, sample.made, confidence, "independent", 1)
+    return probability(event, sample.admissible, confidence, "independent", 1)
 
 
 def verdict_of(p: Probability, allowed: float) -> str:

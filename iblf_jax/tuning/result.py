@@ -14,17 +14,16 @@ import numpy as np
 from iblf_jax.core import checks, notices
 from iblf_jax.core.presentation import present
 from iblf_jax.core.status import UNTRUSTED
+from iblf_jax.engine import RunRequest, run_batch, run_rollout, values_together
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.metrics import as_folds
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical
-from iblf_jax.studies.distributions import Perturbation
-from iblf_jax.tuning.evaluation import NUMBERS_A_RUN
 from iblf_jax.tuning.objectives import Objective, depends_on_torque
+from iblf_jax.tuning.options import Report, RunOptions
 from iblf_jax.tuning.quantities import Quantities
-from iblf_jax.tuning.report import ReportCase, TuningReport, make_report
-from iblf_jax.tuning.robust import Risk
-from iblf_jax.tuning.runs import RunRequest, run_batch, run_rollout, values_together
+from iblf_jax.tuning.report import ReportRequest, TuningReport, make_report
+from iblf_jax.tuning.runs import NUMBERS_A_RUN
 
 LARGE_CHANGE = 100.0
 """Factor by which a gain may change before a warning is given."""
@@ -60,27 +59,18 @@ def _slice(
     return run_batch(scenario, changes, folds, dt, request)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class TuneSetup:
-    """The options of a tuning that its report needs."""
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+class TuneSetup(RunOptions):
+    """The options of a tuning that its report needs: those of its runs, and these."""
 
     objective: Objective
     """With all scales and limits."""
-    perturbations: dict[str, Perturbation]
-    risk: Risk
-    runs: int
-    seed: int
-    duration: float
-    dt: float
-    method: str
-    backend: str
-    report_runs: int
-    report_seed: int
-    confidence: float
+    report: Report
+    """With a seed."""
     limits: tuple[tuple[float, float], ...] = ()
     """Lower and upper limit of each tuned number, (p, 2), in its unit; empty in results that were
     saved without."""
-    reasons: tuple[tuple[str, str], ...] = dataclasses.field(default=(), kw_only=True)
+    reasons: tuple[tuple[str, str], ...] = ()
     """Why the ranges end there, in words, (p, 2); empty in results that were saved without."""
 
 
@@ -152,8 +142,8 @@ class TuneResult:
         they increase, would change them.
         """
         found = {}
-        why = self.setup.reasons or (("", ""),) * len(self.names)
-        rows = zip(self.names, self.tuned, self.setup.limits, why, strict=False)
+        all_reasons = self.setup.reasons or (("", ""),) * len(self.names)
+        rows = zip(self.names, self.tuned, self.setup.limits, all_reasons, strict=False)
         for name, x, ends, reasons in rows:
             width = ends[1] - ends[0]
             if not np.isfinite(width):
@@ -182,28 +172,15 @@ class TuneResult:
         """What to consider before these gains are used, in words: why the search ended, gains far
         from their start, an objective without a cost of torque.
         """
-        lines = [self._end_in_words(), *self._warnings_of_search(), *self._distant_gains()]
-        if not depends_on_torque(self.setup.objective):
-            lines.append(
-                "WARNING: this objective has no price on torque: add effort(), torque_rate() or"
-                " peak_torque_below(limit)"
+        objective = self.setup.objective
+        lines = [f"stopped: {self.stopped}"]
+        if self.residuals:
+            gradient, excess, complementarity = self.residuals
+            lines[0] += (
+                f" (gradient of the Lagrangian {gradient:.2g}, largest excess {excess:.2g},"
+                f" complementarity {complementarity:.2g}; objective {self.objective:.5g})"
             )
-        return tuple(lines)
-
-    def _end_in_words(self) -> str:
-        """Why the search ended, and how far from an optimum."""
-        text = f"stopped: {self.stopped}"
-        if not self.residuals:
-            return text
-        gradient, excess, complementarity = self.residuals
-        return (
-            f"{text} (gradient of the Lagrangian {gradient:.2g}, largest excess {excess:.2g},"
-            f" complementarity {complementarity:.2g}; objective {self.objective:.5g})"
-        )
-
-    def _warnings_of_search(self) -> list[str]:
-        lines = []
-        if self.setup.objective.requirements and not self.multipliers:
+        if objective.requirements and not self.multipliers:
             lines.append(
                 "WARNING: these gains break the requirements as little as was found: loosen one, or"
                 " add parameters or starts"
@@ -218,42 +195,38 @@ class TuneResult:
                 "WARNING: no optimum: give several starts, a smaller dt, or an objective whose"
                 " slope does not jump"
             )
-        return lines
+        lines += self._distant_gains()
+        if not depends_on_torque(objective):
+            lines.append(
+                "WARNING: this objective has no price on torque: add effort(), torque_rate() or"
+                " peak_torque_below(limit)"
+            )
+        return tuple(lines)
 
     def _distant_gains(self) -> list[str]:
         """A warning for each gain that has changed by more than the factor LARGE_CHANGE."""
         lines = []
-        first = np.concatenate([np.ravel(paths.get(self.start, path)) for path in self.values])
-        last = np.concatenate([np.ravel(value) for value in self.values.values()])
-        for name, before, after in zip(self._entries, first, last, strict=True):
-            if before * after > 0 and not 1 / LARGE_CHANGE < after / before < LARGE_CHANGE:
-                lines.append(
-                    f"WARNING: {name} ended at {after / before:.3g} times its start: the objective"
-                    " hardly depends on it, or has no cost of it"
-                )
+        for path, value in self.values.items():
+            start = np.asarray(paths.get(self.start, path))
+            for index in np.ndindex(np.shape(value)):
+                before, after = start[index], value[index]
+                if before * after > 0 and not 1 / LARGE_CHANGE < after / before < LARGE_CHANGE:
+                    name = path + "".join(f"[{i}]" for i in index)
+                    lines.append(
+                        f"WARNING: {name} ended at {after / before:.3g} times its start: the"
+                        " objective hardly depends on it, or has no cost of it"
+                    )
         return lines
-
-    @property
-    def _entries(self) -> list[str]:
-        """A name for each number of `values`."""
-        sizes = {path: np.shape(value) for path, value in self.values.items()}
-        return [
-            path + "".join(f"[{i}]" for i in index)
-            for path, shape in sizes.items()
-            for index in np.ndindex(shape)
-        ]
 
     @cached_property
     def nominal(self) -> tuple[Rollout, Rollout]:
         """The nominal run before and after, recorded at every step."""
-        setup = self.setup
-        step = jnp.asarray(setup.dt, self.start.initial.q.dtype)
+        step = jnp.asarray(self.setup.dt, self.start.initial.q.dtype)
         folds = as_folds(None, step.dtype, self.start)
 
         def run(scenario: Scenario) -> Rollout:
             scenario = canonical(scenario)
-            request = self._request(scenario, record_every=1)
-            return run_rollout(scenario, folds, step, request)
+            return run_rollout(scenario, folds, step, self._request(scenario, record_every=1))
 
         return run(self.start), run(self.scenario)
 
@@ -287,39 +260,31 @@ class TuneResult:
         Source: `iblf_jax.tuning.report`.
         """
         setup = self.setup
-        seed = setup.report_seed if seed is None else checks.seed(seed)
+        report = setup.report
+        seed = report.seed if seed is None else checks.seed(seed)
         if setup.perturbations and seed == setup.seed:
-            raise checks.fail(
-                "seed", seed, "another seed than the tuning's", "Held-out runs must be fresh."
-            )
+            expected = "another seed than the tuning's"
+            raise checks.fail("seed", seed, expected, "Held-out runs must be fresh.")
         if runs is None:
-            runs = setup.report_runs
+            runs = report.runs
+        runs = checks.positive_integer("runs", runs)
         at_limits = None
         if setup.limits:
             at_limits = tuple(f"{name} {end}" for name, end in self.at_limits.items())
         searched_in_batches = self.probes or setup.runs > 1
-        case = ReportCase(
+        request = ReportRequest(
             before=self.start,
             after=self.scenario,
             tuned=tuple(self.values),
             objective=setup.objective,
-            perturbations=setup.perturbations,
-            risk=setup.risk,
-            duration=setup.duration,
-            dt=setup.dt,
-            method=setup.method,
-            backend=setup.backend,
+            run=setup,
+            report=dataclasses.replace(report, runs=runs, seed=seed),
             batch=setup.runs * values_together(setup.runs) if searched_in_batches else 1,
-        )
-        return make_report(
-            case,
-            runs=checks.positive_integer("runs", runs),
-            seed=seed,
-            confidence=setup.confidence,
             at_limits=at_limits,
             multipliers=tuple(self.limit_multipliers.values()),
             notes=self.notes,
         )
+        return make_report(request)
 
     def landscape(
         self, first: str, second: str, *, points: int = 13, span: float = 1.0
@@ -357,8 +322,11 @@ class TuneResult:
 
         The objective is infinite where a run is invalid; without requirements the excess is -inf.
         """
-        grid = {first: np.repeat(a, len(b)), second: np.tile(b, len(a))}
-        changes = {name: self._values_of_leaf(name, x) for name, x in grid.items()}
+        changes = {}
+        for name, x in ((first, np.repeat(a, len(b))), (second, np.tile(b, len(a)))):
+            # A name of a leaf is one number for all of its entries.
+            shape = np.shape(self.values.get(name, 0.0))
+            changes[name] = np.broadcast_to(x.reshape(-1, *(1,) * len(shape)), (len(x), *shape))
         setup = self.setup
         scenario = canonical(self.scenario)
         dtype = scenario.initial.q.dtype
@@ -373,15 +341,6 @@ class TuneResult:
         shape = len(a), len(b)
         objective = np.where(valid, np.asarray(values), np.inf)
         return objective.reshape(shape), np.where(valid, worst, np.inf).reshape(shape)
-
-    def _values_of_leaf(self, name: str, x: np.ndarray) -> np.ndarray:
-        """Values of a leaf or an entry for numbers x, (R,); a name of a leaf is one number for all
-        of its entries.
-        """
-        shape: tuple[int, ...] = ()
-        if name in self.values:
-            shape = np.shape(self.values[name])
-        return np.broadcast_to(x.reshape(-1, *(1,) * len(shape)), (len(x), *shape))
 
     def plot(self, **options):
         """Figure of the tuning: loss, gains, margin, torque and tubes before and after.  Options as
@@ -402,10 +361,10 @@ class TuneResult:
 
     def __repr__(self) -> str:
         probes = f", {self.probes} probes" if self.probes else ""
-        steps, how = len(self.history["evaluations"]), f"{self.optimiser}, {self.mode} mode"
+        steps = len(self.history["evaluations"])
         lines = [
-            f"TuneResult({how}, {steps} steps, {self.evaluations} evaluations{probes},"
-            f" {self.seconds:.3g} s; {self.stopped})"
+            f"TuneResult({self.optimiser}, {self.mode} mode, {steps} steps,"
+            f" {self.evaluations} evaluations{probes}, {self.seconds:.3g} s; {self.stopped})"
         ]
         for path, value in self.values.items():
             before = np.array2string(np.asarray(paths.get(self.start, path)), precision=5)

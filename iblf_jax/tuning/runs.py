@@ -1,7 +1,5 @@
-"""The runs behind a tuning: the only module of `tuning` that calls the engine.
-
-`run_batch` integrates a batch, `tangents_of_runs` does so with derivatives along the coordinates z
-(forward mode), and `run_for_reverse` is one run to be differentiated in reverse mode.
+"""Runs with derivatives along the coordinates of a tuning (forward mode), and evaluation in groups
+of one size.
 
 The leaves of a batch are functions x_b(z) of D coordinates, of another Jacobian in every run.  The
 engine moves leaves along fixed patterns p (one entry of a leaf, or all of them together), so that
@@ -13,30 +11,35 @@ its program does not depend on where it is called.  The chain rule does the rest
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.engine import FORWARD_MOST as FORWARD_MOST
-from iblf_jax.engine import Outer as Outer
-from iblf_jax.engine import RunRequest as RunRequest
-from iblf_jax.engine import Tangents, run_batch_jvp
-from iblf_jax.engine import check_backend as check_backend
-from iblf_jax.engine import differentiates_forward as differentiates_forward
-from iblf_jax.engine import fresh_together as fresh_together
-from iblf_jax.engine import run_batch as run_batch
-from iblf_jax.engine import run_for_reverse as run_for_reverse
-from iblf_jax.engine import run_rollout as run_rollout
-from iblf_jax.engine import starts_together as starts_together
-from iblf_jax.engine import values_together as values_together
+from iblf_jax.engine import RunRequest, Tangents, run_batch_jvp
 from iblf_jax.engine.period import radius_at as radius_at
-from iblf_jax.engine.simulate import simulate as simulate
 from iblf_jax.engine.step_size import fastest_along as fastest_along
 from iblf_jax.engine.step_size import start_and_along as start_and_along
 from iblf_jax.simulation.scenario import Scenario
+
+NUMBERS_A_RUN = 100
+"""Approximate count of numbers that one run of a batch holds while it is computed: its state, its
+stages, its folds."""
+
+
+def in_groups(function: Callable[[np.ndarray], Any], count: int, size: int) -> Any:
+    """What a function of row numbers returns for rows 0 to `count` - 1, as NumPy arrays.
+
+    It is called with `size` rows at a time, so that one shape is compiled; the last group is filled
+    up with rows that it already has.
+    """
+    parts = []
+    for first in range(0, count, size):
+        rows = np.resize(np.arange(first, min(first + size, count)), size)
+        parts.append(jax.tree.map(np.asarray, function(rows)))
+    return jax.tree.map(lambda *x: np.concatenate(x)[:count], *parts)
 
 
 def tangents_of_runs(
@@ -87,8 +90,8 @@ def _directions(patterns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     directions = {}
     first = 0
     for path, pattern in patterns.items():
-        moved = np.zeros((total, *pattern.shape[1:]))
-        moved[first : first + len(pattern)] = pattern
-        directions[path] = moved
+        after = total - first - len(pattern)
+        of_entries = [(0, 0)] * (pattern.ndim - 1)
+        directions[path] = np.pad(pattern, [(first, after), *of_entries])
         first += len(pattern)
     return directions

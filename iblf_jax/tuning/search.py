@@ -1,4 +1,5 @@
-"""The search: steps of a solver, multipliers, less and less smoothing, the best result so far.
+"""The search calls a solver step by step, updates multipliers and smoothing, and keeps the best
+result so far.
 
 Solvers that handle requirements (`SQP`) get them as constraints.  For the others they are part of
 an augmented Lagrangian, whose parameters are updated whenever a start has converged (or after
@@ -28,93 +29,35 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import jax
 import numpy as np
 
-from iblf_jax.tuning.evaluation import DERIVATIVES, Candidate, Derivatives
+from iblf_jax.tuning.evaluation import Derivatives, Evaluator
 from iblf_jax.tuning.objectives import is_smoothed, sharper
-from iblf_jax.tuning.problem import FIRST_PENALTY, TuningProblem
-from iblf_jax.tuning.runs import starts_together
-from iblf_jax.tuning.solvers import SearchSpace, Solver
+from iblf_jax.tuning.problem import FIRST_PENALTY
+from iblf_jax.tuning.solvers import Solver
 
 STEPS_PER_UPDATE = 12
 """Steps at most between two updates of the multipliers."""
 MAX_UPDATES = 12
+"""Updates of the multipliers in a stage."""
 PENALTY_FACTOR = 5.0
-LARGEST_PENALTY = 1e6
-SMALL_EXCESS = 1e-3
+"""Factor by which the penalty parameter is increased."""
+MAX_PENALTY = 1e6
+EXCESS_TOLERANCE = 1e-3
 """Largest |G| at which a converged start ends."""
 SHARPENING = 4.0
-COARSE_TOLERANCE, COARSE_STEPS = 1e-3, 6
-"""Tolerance before the last stage, and steps at most of a stage of several starts without
-requirements: its result is a point to go on from, and good enough to choose by."""
-SECOND_START_WITHIN, SECOND_START_UNTIL = 25, 40
+"""Factor by which the smoothing is divided at each stage."""
+COARSE_TOLERANCE = 1e-3
+"""Tolerance before the last stage, whose result is a point to go on from."""
+COARSE_STEPS = 6
+"""Steps at most of a stage of several starts without requirements: enough to choose by."""
+SECOND_START_WITHIN = 25
+"""Evaluations of the first start at most, for which the second one begins."""
+SECOND_START_UNTIL = 40
+"""Evaluations of both, after which the second one ends."""
 
 SecondStart = Callable[[np.ndarray], np.ndarray | None]
 """Function of where the first search began and ended, (2, p); where the second begins, or None."""
-
-
-class Evaluator:
-    """The compiled problem on the host: coordinates in, NumPy arrays out.
-
-    Args:
-      problem: what is tuned.
-      candidates: of S starts; their z is replaced at each call.
-      mode: of differentiation.
-      space: what the solver knows of the problem.
-    """
-
-    def __init__(
-        self, problem: TuningProblem, candidates: Candidate, mode: str, space: SearchSpace
-    ):
-        self.problem = problem
-        self.candidates = candidates
-        self.derivatives = DERIVATIVES[mode]
-        self.space = space
-        self.evaluations = 0
-        """Number of evaluated points."""
-        starts, runs = candidates.index.shape
-        self.group = starts_together(starts, runs)
-        self.active = np.ones(starts, bool)
-        """Which starts are evaluated; the others are returned as invalid."""
-
-    def __call__(self, z: np.ndarray) -> Derivatives:
-        """Value and derivatives at z, (S, p).
-
-        Active starts are evaluated in groups of one size, so that one shape is compiled.
-        """
-        active = np.flatnonzero(self.active)
-        self.evaluations += len(active)
-        candidates = self.candidates._replace(z=np.asarray(z, self.problem.dt.dtype))
-        parts = []
-        for first in range(0, len(active), self.group):
-            rows = np.resize(active[first : first + self.group], self.group)
-            group = jax.tree.map(lambda x, rows=rows: np.asarray(x)[rows], candidates)
-            parts.append(jax.tree.map(np.asarray, self.derivatives(self.problem, group)))
-        found = jax.tree.map(lambda *x: np.concatenate(x)[: len(active)], *parts)
-        if len(active) == len(z):
-            return found
-        return _scattered(found, active, len(z))
-
-    def row(self, start: int) -> tuple[TuningProblem, Candidate]:
-        """The problem, and the candidate of one start as a batch of one."""
-        one = jax.tree.map(lambda x: np.asarray(x)[start : start + 1], self.candidates)
-        return self.problem, one
-
-
-def _scattered(found: Derivatives, rows: np.ndarray, starts: int) -> Derivatives:
-    """The values of some starts among all of them; the others are invalid, with infinite losses."""
-
-    def scattered(x: np.ndarray) -> np.ndarray:
-        full = np.zeros((starts, *x.shape[1:]), x.dtype)
-        if np.issubdtype(x.dtype, np.floating):
-            full[:] = np.nan
-        full[rows] = x
-        return full
-
-    found = jax.tree.map(scattered, found)
-    found.value.loss[~found.value.valid] = np.inf
-    return found
 
 
 class Search:
@@ -143,7 +86,6 @@ class Search:
         if is_smoothed(self.smoothest):
             self.stages = solver.sharpenings
         starts = len(z)
-        terms = len(self.smoothest.terms)
         requirements = len(evaluate.problem.allowed)
         self.history: dict[str, list[np.ndarray]] = {}
         self.state: dict[str, Any] = {
@@ -163,8 +105,6 @@ class Search:
             "waiting": np.zeros(starts, bool),
             "best_z": z.copy(),
             "best_key": np.full((starts, 2), np.inf),
-            "best_terms": np.full((starts, terms), np.nan),
-            "best_excess": np.full((starts, requirements), np.nan),
         }
         if second_start is not None:
             self.stages = max(self.stages, 1)
@@ -244,8 +184,7 @@ class Search:
         self._prepare_evaluation()
         before = self.evaluate.evaluations
         z, found = self.solver.step(self.evaluate, state["solver"], self._tolerance())
-        made = self.evaluate.evaluations - before
-        state["evaluations"] = state["evaluations"] + made
+        state["evaluations"] = state["evaluations"] + self.evaluate.evaluations - before
         improved = self._keep_best(z, found)
         state["steps_without_better"] = state["steps_without_better"] + 1
         if improved:
@@ -283,9 +222,9 @@ class Search:
         tolerance = self.solver.tolerance
         improved = False
         for s in np.flatnonzero(found.value.valid).tolist():
-            excess = found.value.exact_excess[s]
             out_of_bounds = max(-float(found.value.margin[s]), 0.0)
-            violation = float(np.sum(np.maximum(excess, 0.0))) + out_of_bounds
+            excess = np.sum(np.maximum(found.value.exact_excess[s], 0.0))
+            violation = float(excess) + out_of_bounds
             key = (violation, float(found.value.objective[s]))
             if not np.isfinite(key[1]) or key >= tuple(state["best_key"][s]):
                 continue
@@ -294,8 +233,6 @@ class Search:
             improved |= key[0] < overall[0] - tolerance or key[1] < overall[1] - small
             state["best_key"][s] = key
             state["best_z"][s] = z[s]
-            state["best_terms"][s] = found.value.terms[s]
-            state["best_excess"][s] = excess
         return improved
 
     def _record(self, z: np.ndarray, found: Derivatives) -> None:
@@ -329,13 +266,13 @@ class Search:
         multipliers = state["multipliers"][s]
         penalty = state["penalty"][s]
         worst = float(np.max(np.maximum(excess, -multipliers / penalty)))
-        if converged and (abs(worst) < SMALL_EXCESS or state["updates"][s] >= MAX_UPDATES):
+        if converged and (abs(worst) < EXCESS_TOLERANCE or state["updates"][s] >= MAX_UPDATES):
             state["finished"][s] = True
             return
         # The multipliers follow from the penalty parameter of the steps that have been made.
         state["multipliers"][s] = np.maximum(0.0, multipliers + penalty * excess)
         if max(worst, 0.0) > 0.25 * state["largest_excess"][s]:
-            state["penalty"][s] = min(PENALTY_FACTOR * penalty, LARGEST_PENALTY)
+            state["penalty"][s] = min(PENALTY_FACTOR * penalty, MAX_PENALTY)
         state["largest_excess"][s] = max(worst, 0.0)
         state["steps_since_update"][s] = 0
         state["updates"][s] += 1

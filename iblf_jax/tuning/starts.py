@@ -1,4 +1,4 @@
-"""Where a search begins: starting points by values without derivatives.
+"""Finds starting points of a search by values without derivatives.
 
 `starting_points` draws several starts around the scenario's gains.  `feasible_starts` replaces
 starts that leave their bounds by points of the box that do not.
@@ -8,7 +8,7 @@ other peaks are at their limit.  `NearbyStarts` therefore evaluates
 
     f + EXCESS_WEIGHT |f| sum_r max(0, G_r)
 
-at POINTS_A_GAIN points a gain, drawn within |z_i - z0_i| <= PROBE_RANGE, and the search begins at
+at POINTS_PER_GAIN points a gain, drawn within |z_i - z0_i| <= PROBE_RANGE, and the search begins at
 the lowest.  If that search has converged soon, a second one begins at the lowest point that is at
 least MIN_DISTANCE, in one coordinate, from where the first began and from where it ended
 (`search`).
@@ -16,22 +16,24 @@ least MIN_DISTANCE, in one coordinate, from where the first began and from where
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 
 import jax
 import numpy as np
 
-from iblf_jax.tuning.evaluation import Value
+from iblf_jax.tuning.evaluation import Value, values
 from iblf_jax.tuning.parameters import Box
 from iblf_jax.tuning.problem import TuningProblem
 
-POINTS_A_GAIN = 14
+POINTS_PER_GAIN = 14
 PROBE_RANGE = 1.5
 """Ten problems of six and nine gains, six starts each, 40 evaluations with derivatives.  The mean
 gap to the best known optimum was 6.1 % from the scenario's gains with a first trust region of 1,
-3.1 % with one of 0.5, 1.8 % from the best of 128 points (3.4 % within PROBE_RANGE 2), and 1.4 %
-with the second search (2.8 %)."""
+3.1 % with one of 0.5, 1.8 % from the best of 128 points (3.4 % within a PROBE_RANGE of 2), and
+1.4 % with the second search (2.8 %)."""
 MIN_DISTANCE = 0.75
+"""Of the second start from the first search, in one coordinate z."""
 EXCESS_WEIGHT = 2.0
 """Of an excess, relative to the objective; with 10 the gap was 1.6 % instead of 1.4 %, with 10,000
 it was 2.0 %."""
@@ -61,7 +63,7 @@ class NearbyStarts:
         is_refused: Callable[[np.ndarray], bool],
     ):
         size = len(box.z)
-        count = POINTS_A_GAIN * size
+        count = POINTS_PER_GAIN * size
         rng = np.random.default_rng([seed, 4])
         drawn = box.z + rng.uniform(-PROBE_RANGE, PROBE_RANGE, (count - 1, size))
         points = np.concatenate([box.z[None], np.clip(drawn, box.low, box.high)])
@@ -116,28 +118,13 @@ def feasible_starts(problem: TuningProblem, seed: int, z: np.ndarray, first: Val
         return z
     points, found, violation = screened(problem, seed, z)
     order = np.lexsort((found.objective, violation))
-    valid = order[found.valid[order]]
-    invalid = order[~found.valid[order]]
     ranked: list[int] = []
-    for group in (valid, invalid):
-        stable = _sampled_fast_enough(problem, points, group, len(z) - len(ranked))
-        ranked += [*stable, *(i for i in group if i not in stable)]
+    for group in (order[found.valid[order]], order[~found.valid[order]]):
+        stable = (i for i in group if not problem.sampled_too_slowly(points[i]))
+        # A test takes long, so no more are tested than are needed.
+        chosen = list(itertools.islice(stable, max(len(z) - len(ranked), 0)))
+        ranked += [*chosen, *(i for i in group if i not in chosen)]
     return points[ranked[: len(z)]]
-
-
-def _sampled_fast_enough(
-    problem: TuningProblem, points: np.ndarray, group: np.ndarray, count: int
-) -> list[int]:
-    """The first `count` of a group that are not sampled too slowly; no more are tested, as a test
-    takes long.
-    """
-    found: list[int] = []
-    for i in group.tolist():
-        if len(found) >= count:
-            break
-        if not problem.sampled_too_slowly(points[i]):
-            found.append(i)
-    return found
 
 
 def screened(
@@ -154,7 +141,7 @@ def screened(
     low = np.where(np.isfinite(box.low), box.low, box.z - 3 * START_RANGE)
     high = np.where(np.isfinite(box.high), box.high, box.z + 3 * START_RANGE)
     points = np.concatenate([z, rng.uniform(low, high, (SCREENED_POINTS, len(low)))])
-    found = problem.values(points)
+    found = values(problem, points)
     if not np.any(found.valid):
         raise problem.unstable_error(float(np.max(found.trusted)))
     excess = np.max(np.maximum(found.exact_excess, 0.0), axis=1, initial=0.0)

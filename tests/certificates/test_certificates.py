@@ -188,7 +188,7 @@ def test_the_weights_that_are_chosen_give_the_smallest_mean_of_the_envelope():
         fading = (1.0 - np.exp(-rho * 10.0)) / (rho * 10.0)
         return (given["V_rest"] + w_f * given["half_square"]) * fading + rho2 / rho
 
-    found = claims.best_weights(constants, *given.values(), 2)
+    found = claims.best_constants(constants, *given.values(), 2)
     assert np.min(
         claims.weighted_rate_terms(constants, 0.9, found.a, found.b, found.w_f)
     ) == pytest.approx(found.rho)
@@ -202,7 +202,7 @@ def test_the_weights_that_are_chosen_give_the_smallest_mean_of_the_envelope():
         rho = np.min(claims.weighted_rate_terms(constants, 0.9, a, b, w_f))
         others.append(mean(rho, w_f, w_f * given["F_d"] ** 2 / (2 * b)) if rho > 0 else np.inf)
     assert mean(found.rho, found.w_f, found.rho2) < 1.01 * min(others)
-    assert claims.best_weights(constants, 0.9, np.nan, 0.0, 0.2, 10.0, 2) is None
+    assert claims.best_constants(constants, 0.9, np.nan, 0.0, 0.2, 10.0, 2) is None
 
 
 # --- runs -----------------------------------------------------------------------------------------
@@ -385,10 +385,10 @@ def test_the_claim_with_weights_is_about_the_corrected_law_with_a_momentum_obser
 
 def test_a_broken_claim_with_weights_is_seen(corrected_run, monkeypatch):
     """With a rate that is too large the inequality fails where the right one holds."""
-    best = claims.best_weights
+    best = claims.best_constants
     monkeypatch.setattr(
         claims,
-        "best_weights",
+        "best_constants",
         lambda *given: (found := best(*given)) and found._replace(rho=1e3 * found.rho),
     )
     scenario = ij.with_parameters(corrected_run.scenario, LIGHT)

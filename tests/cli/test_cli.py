@@ -19,6 +19,7 @@ from conftest import ROOT
 import iblf_jax as ij
 from iblf_jax import _start, cli
 from iblf_jax.cli import _claims, _common
+from iblf_jax.core import tables
 from iblf_jax.core.disk_cache import keep_programs
 from iblf_jax.files import scenario as scenario_file
 
@@ -412,7 +413,7 @@ def test_the_cache_is_optional(cache, tmp_path, monkeypatch):
 
 def test_numbers_as_text():
     assert _common.number(float("inf")) == "-"
-    assert _common.strict(
+    assert tables.for_json(
         {"a": np.array([1.0, np.nan]), "b": np.float32(2.0), "c": (np.inf, True, None)}
     ) == {
         "a": [1.0, None],

@@ -15,7 +15,16 @@ from made_up_runs import ALWAYS
 import iblf_jax as ij
 from iblf_jax.core.caches import CACHE
 from iblf_jax.core.status import Status
-from iblf_jax.engine import compile, native, registry, single_run, step, thresholds, transformable
+from iblf_jax.engine import (
+    compile,
+    native,
+    registry,
+    request,
+    single_run,
+    thresholds,
+    time_step,
+    transformable,
+)
 from iblf_jax.kernels import UnsupportedError, cpu
 from iblf_jax.simulation.scenario import canonical
 
@@ -310,7 +319,7 @@ def test_where_kernels_cannot_the_scan_differentiates(paper, monkeypatch):
         scenario = canonical(ij.with_parameters(paper, {"controller.K2": K2}))
         return jnp.sum(
             transformable.run_transformable(
-                scenario, (), dt, step.RunRequest(30, "euler", 1)
+                scenario, (), dt, request.RunRequest(30, "euler", 1)
             ).records[0]["q"][-1]
         )
 
@@ -347,9 +356,11 @@ def test_new_numbers_do_not_recompile(paper, paper_run, monkeypatch):
     program."""
     ij.simulate(paper, **PAPER)
     traces = []
-    original = step.advance
+    original = time_step.advance
     monkeypatch.setattr(
-        step, "advance", lambda *args, **options: traces.append(1) or original(*args, **options)
+        time_step,
+        "advance",
+        lambda *args, **options: traces.append(1) or original(*args, **options),
     )
     parts = (single_run._initialize, single_run._all_steps, single_run._finalize)
     before = [part._cache_size() for part in parts]

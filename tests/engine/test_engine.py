@@ -17,9 +17,9 @@ from iblf_jax.core import programs
 from iblf_jax.core.status import Status
 from iblf_jax.engine import compile, machine_function, native, plan, registry, thresholds
 from iblf_jax.engine.batch import Batch, run_all
+from iblf_jax.engine.carry import Inputs
 from iblf_jax.engine.loops import checkpointed, kernel_loop, scan
 from iblf_jax.engine.request import RunRequest
-from iblf_jax.engine.step import Inputs
 from iblf_jax.simulation import stability
 from iblf_jax.simulation.integrators import TABLEAUS, Tableau
 from iblf_jax.simulation.metrics import as_folds

@@ -17,8 +17,9 @@ import iblf_jax as ij
 from iblf_jax.core.caches import CACHE
 from iblf_jax.engine import RunRequest, compile, execute, thresholds
 from iblf_jax.engine.batch import Batch, carry_shapes
+from iblf_jax.engine.carry import Inputs, StepOptions, start
 from iblf_jax.engine.loops import program_of
-from iblf_jax.engine.step import Inputs, StepOptions, TimeStep, start
+from iblf_jax.engine.time_step import TimeStep
 from iblf_jax.kernels import passes, program
 from iblf_jax.kernels.from_jaxpr import closed
 from iblf_jax.kernels.operations import OPERATIONS

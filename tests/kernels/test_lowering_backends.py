@@ -22,7 +22,8 @@ import iblf_jax as ij
 from iblf_jax.core.caches import CACHE
 from iblf_jax.engine import RunRequest, compile, execute, loops, native, registry, thresholds
 from iblf_jax.engine.batch import Batch
-from iblf_jax.engine.step import Inputs, TimeStep, start
+from iblf_jax.engine.carry import Inputs, start
+from iblf_jax.engine.time_step import TimeStep
 from iblf_jax.kernels import cpu, directory, packed, toolchain
 from iblf_jax.kernels.toolchain import ToolchainError
 from iblf_jax.simulation.metrics import as_folds, standard

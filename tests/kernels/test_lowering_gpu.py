@@ -26,9 +26,10 @@ import iblf_jax as ij
 from iblf_jax.core.caches import CACHE
 from iblf_jax.engine import RunRequest, compile, execute, gpu, registry, thresholds
 from iblf_jax.engine.batch import Batch
+from iblf_jax.engine.carry import Inputs
 from iblf_jax.engine.derivatives import Directions, run_with_tangents
 from iblf_jax.engine.loops import kernel_loop, program_of
-from iblf_jax.engine.step import Inputs, TimeStep
+from iblf_jax.engine.time_step import TimeStep
 from iblf_jax.kernels import nvrtc
 from iblf_jax.kernels.emit_c import CUDA, source
 from iblf_jax.kernels.layout import Layout

@@ -458,8 +458,8 @@ def no_runs(monkeypatch):
     for place in (
         "engine.simulate.run_one",
         "studies.blocks._execute",
-        "tuning.evaluation.rollouts",
-        "tuning.search.Evaluator.__call__",
+        "tuning.problem.rollouts",
+        "tuning.evaluation.Evaluator.__call__",
         "tuning._falsify._margins",
         "engine.explain.instructions",
         "certificates._certify._certificate_of",
@@ -788,20 +788,13 @@ def results(paper, no_runs, monkeypatch):
         "objective": np.ones((1, 1)),
         "evaluations": np.ones(1, int),
     }
-    asked = TuneSetup(
-        GOAL,
-        {},
-        as_risk("mean"),
-        1,
-        0,
-        0.01,
-        1e-3,
-        "rk4",
-        "auto",
-        4,
-        1,
-        0.95,
-        ((1.0, 100.0), (1.0, 100.0)),
+    setup = TuneSetup(
+        duration=0.01,
+        perturbations={},
+        risk=as_risk("mean"),
+        objective=GOAL,
+        report=ij.tuning.Report(runs=4, seed=1),
+        limits=((1.0, 100.0), (1.0, 100.0)),
     )
     names = ("controller.K2[0]", "controller.K2[1]")
     tuned = ij.TuneResult(
@@ -815,7 +808,7 @@ def results(paper, no_runs, monkeypatch):
         "newton",
         "forward",
         1.0,
-        asked,
+        setup,
     )
     vars(tuned)["nominal"] = (run, run)
     twos, (blocks, _) = np.ones((2, 2)), layout(paper, ["controller.K2"], 1e-3, "rk4")

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import iblf_jax as ij
-from iblf_jax.engine.step import folded
+from iblf_jax.engine.metric_folds import folded
 from iblf_jax.files.tuning import load_tuning_file
 from iblf_jax.testing import ContractError
 from iblf_jax.testing.metrics import samples

@@ -20,24 +20,26 @@ import iblf_jax as ij
 from iblf_jax.core import checks
 from iblf_jax.engine import RunRequest
 from iblf_jax.engine.batch import Batch, carry_shapes
-from iblf_jax.engine.step import Inputs
+from iblf_jax.engine.carry import Inputs
 from iblf_jax.engine.step_size import fastest_along
 from iblf_jax.engine.transformable import run_transformable
 from iblf_jax.files.tuning import load_tuning_file
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.metrics import standard
 from iblf_jax.simulation.scenario import canonical
-from iblf_jax.tuning import LBFGS, SQP, Adam, evaluation, quadratic
+from iblf_jax.tuning import LBFGS, SQP, Adam, Report, evaluation, starts
 from iblf_jax.tuning.checkpoints import load_checkpoint, save_checkpoint
-from iblf_jax.tuning.evaluation import Candidate, Derivatives, Value
+from iblf_jax.tuning.evaluation import Derivatives, Evaluator, Value
+from iblf_jax.tuning.options import RunOptions
 from iblf_jax.tuning.parameters import Box, layout, squash, unsquash
-from iblf_jax.tuning.problem import TuningProblem
+from iblf_jax.tuning.problem import Candidate, TuningProblem
 from iblf_jax.tuning.quantities import Peak, Quantities, TimeIntegral
 from iblf_jax.tuning.ranges import BY_STEP, BY_THEOREM, STABILITY_FRACTION, TIMES, TOGETHER
 from iblf_jax.tuning.result import STUCK
 from iblf_jax.tuning.robust import Risk, combine
-from iblf_jax.tuning.search import Evaluator, Search
-from iblf_jax.tuning.solvers import Constraints, SearchSpace, sqp
+from iblf_jax.tuning.rollouts import fold_of
+from iblf_jax.tuning.search import Search
+from iblf_jax.tuning.solvers import Constraints, SearchSpace, quadratic, sqp
 from iblf_jax.tuning.solvers.sqp import solve_subproblem
 from iblf_jax.tuning.starts import MIN_DISTANCE, PROBE_RANGE, NearbyStarts, screened
 
@@ -130,7 +132,7 @@ def test_reverse_mode_remembers_few_states(paper):
             built, built.candidates(built.box.z[None])
         ).compile()
         sizes[steps] = compiled.memory_analysis().temp_size_in_bytes
-    folds = evaluation.fold_of(built.objective, jnp.float64)
+    folds = fold_of(built.objective, jnp.float64)
     inputs = Inputs(canonical(paper), folds, built.dt, built.dt)
     state = sum(
         x.size * x.dtype.itemsize
@@ -351,7 +353,7 @@ def test_curvature_is_kept_for_the_worst_pieces_of_many(monkeypatch):
     state = steps_of_sqp(TwoPieces(5.0), space, [3.0, -1.0], 20, 1e-10)
     assert state.curvatures.shape == (1, 2, 2)
     np.testing.assert_allclose(state.z, np.full(2, 0.5**0.5), atol=2e-5)
-    np.testing.assert_array_equal(state.curved, np.argmax(state.pieces))
+    np.testing.assert_array_equal(state.curved, np.argmax(state.here.pieces))
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0], ids=["a slope", "a slope that points the wrong way"])
@@ -778,10 +780,11 @@ def test_a_start_of_which_some_runs_are_too_stiff_says_how_many(nominal, monkeyp
     smooth[2, 0] = np.nan
     found = evaluation.value_of_start(nominal, candidate, smooth, smooth, status)
     assert not found.valid and float(found.trusted) == 0.5
-    perturbed = dataclasses.replace(nominal, runs=4)
+    options = dataclasses.replace(nominal.options, runs=4)
+    perturbed = dataclasses.replace(nominal, options=options)
     seen = jax.tree.map(lambda x: np.asarray(x)[None], found)
     monkeypatch.setattr(TuningProblem, "suggested_dt", lambda self: 2e-4)
-    monkeypatch.setattr(TuningProblem, "values", lambda self, z: seen)
+    monkeypatch.setattr(starts, "values", lambda problem, z: seen)
     with pytest.raises(
         ValueError, match=r"only 2 of 4 runs can be integrated.*Take dt=0.0002, not 0.001 s"
     ):
@@ -822,18 +825,17 @@ def test_the_report_is_on_fresh_runs_and_gives_intervals(robust):
 
 @pytest.mark.slow
 def test_a_change_that_is_not_significant_is_called_so(robust, paper):
-    from iblf_jax.tuning.report import ReportCase, make_report
+    from iblf_jax.tuning.report import ReportRequest, make_report
 
-    case = ReportCase(
+    request = ReportRequest(
         before=paper,
         after=paper,
         tuned=tuple(robust.values),
         objective=robust.setup.objective,
-        perturbations=DRAWS,
-        risk=Risk("mean"),
-        **SHORT,
+        run=RunOptions(perturbations=DRAWS, risk=Risk("mean"), **SHORT),
+        report=Report(runs=256, seed=5),
     )
-    report = make_report(case, runs=256, seed=5, confidence=0.95)
+    report = make_report(request)
     assert report.changes[0].significant is False
     assert "NOT significant" in str(report)
     assert "do not show that tuning helped" in str(report)
@@ -947,9 +949,7 @@ def test_keyword_arguments_of_earlier_versions_warn_and_mean_the_same(paper):
         **SHORT,
     )
     np.testing.assert_array_equal(after.history["z"], before.history["z"])
-    reported = ("report_runs", "report_seed", "confidence")
-    assert [getattr(after.setup, x) for x in reported] == [7, 3, 0.9]
-    assert [getattr(before.setup, x) for x in reported] == [7, 3, 0.9]
+    assert after.setup.report == before.setup.report == Report(runs=7, seed=3, confidence=0.9)
     assert before.optimiser == after.optimiser == "adam" and len(calls) == 4
 
 

@@ -89,7 +89,7 @@ class Controller(Protocol):
     - `wraps`: the name of the field that holds another law.  Paths then reach through it
       ("controller.K2").
     - `unit_factors`: the names of leaves that are factors only.  Which of their numbers are 1 may
-      be compiled in (`engine.mechanism`).
+      be compiled in (`engine.structural_constants`).
 
     It may have these methods: `advice()` returns a list of warnings; `check_start(context)` raises
     ValueError for fields that do not fit together, once the number of joints is known;

@@ -11,8 +11,8 @@ subproblem for the step s is, within |s_i| <= delta and the ranges of the gains,
 
 first with c_j = e_j, and then, CURVATURE_SOLVES times, with c_j = e_j + s.C_j.s/2 at the last
 solution.  The trial is the solution of which the quadratic models predict the largest decrease.  y
-are the multipliers of the previous subproblem.  A requirement that a share of B runs may violate, k
-> 1 of them, has as G_r the mean of its k worst runs, which is exactly
+are the multipliers of the previous subproblem.  A requirement that a share of B runs may violate,
+k > 1 of them, has as G_r the mean of its k worst runs, which is exactly
 
     min over t of  t + sum_b max(0, max_j g_bj - t) / k,
 
@@ -49,34 +49,47 @@ from typing import Any, ClassVar, NamedTuple
 
 import jax
 import numpy as np
+from scipy.linalg import block_diag
 
 from iblf_jax.core import checks
-from iblf_jax.tuning import quadratic
+from iblf_jax.tuning.solvers import quadratic
 from iblf_jax.tuning.solvers._base import Constraints, Optimality, SearchSpace, check_options
 
-RADIUS, RADIUS_IF_MULTIMODAL = 1.0, 0.5
-"""First |s_i|; 1 is a factor e for a gain.  With 0.5 where several minima are expected, the mean
-gap to the best known optimum of ten problems fell from 6.1 % to 3.1 % (see `starts`)."""
+INITIAL_RADIUS = 1.0
+"""First |s_i|; 1 is a factor e for a gain."""
+INITIAL_RADIUS_IF_MULTIMODAL = 0.5
+"""Where several minima are expected.  With it, the mean gap to the best known optimum of ten
+problems fell from 6.1 % to 3.1 % (see `starts`)."""
 LARGEST_RADIUS = 4.0
-ACCEPTED, POOR, GOOD = 1e-4, 0.25, 0.7
-"""Ratio of actual to predicted decrease above which a trial is accepted, below which delta shrinks,
-and above which it grows."""
-SHRINK, GROW = 0.4, 2.0
+RATIO_TO_ACCEPT = 1e-4
+"""Ratio of actual to predicted decrease above which a trial is accepted."""
+RATIO_TO_SHRINK = 0.25
+"""Ratio below which delta shrinks."""
+RATIO_TO_GROW = 0.7
+"""Ratio above which delta grows."""
+SHRINK_FACTOR = 0.4
+GROWTH_FACTOR = 2.0
 SMALLEST_EIGENVALUE = 1e-6
 """Of the model's matrix, relative to its largest."""
 TARGET_EXCESS = 1e-5
 """How far inside its limit a requirement is aimed at, in its scale, so that rounding does not
 violate it."""
-MIN_PENALTY, LARGEST_PENALTY, PENALTY_FACTOR = 2.0, 1e6, 10.0
-"""rho, relative to the size of the objective, and the factor by which it is increased."""
+MIN_PENALTY = 2.0
+"""rho at least, relative to the size of the objective."""
+LARGEST_PENALTY = 1e6
+"""rho at most, relative to the size of the objective."""
+PENALTY_FACTOR = 10.0
+"""Factor by which rho is increased."""
 CURVATURE_SOLVES = 3
+"""Subproblems with the curvature of the pieces."""
 COLLAPSED_RADIUS = 1e-3
 """delta below which a start is stuck: the model does not predict the objective even so near."""
 RANGE_TOLERANCE = 1e-6
 """Distance in z from the end of a range within which the range blocks a gain."""
-MAX_PIECES, RUNS_PER_WORST = 200, 3
-"""Largest number of pieces of one requirement in a subproblem, and of runs where G_r is the mean of
-k of them, as a multiple of k; the worst are taken."""
+MAX_PIECES = 200
+"""Largest number of pieces of one requirement in a subproblem; the worst are taken."""
+RUNS_PER_WORST = 3
+"""Where G_r is the mean of the k worst runs, this multiple of k runs is in a subproblem."""
 MAX_CURVATURES = 4000
 """Largest number of pieces of one requirement of which C_j is stored.  With the 200 of a subproblem
 only, 64 runs of two joints took 26 evaluations instead of 14."""
@@ -108,39 +121,6 @@ class Selected(NamedTuple):
     piece: np.ndarray
 
 
-class Unknowns(NamedTuple):
-    """Where the unknowns of a subproblem stand in its vector: s, v, and for each requirement that
-    is a mean of runs its t and its u.
-    """
-
-    step: slice
-    violation: slice
-    threshold: dict[int, int]
-    """Requirement -> column of t."""
-    surplus: dict[int, np.ndarray]
-    """Requirement -> columns of u, one a run with selected pieces."""
-    total: int
-
-    @staticmethod
-    def of(size: int, worst: tuple[int, ...], selected: list[Selected]) -> Unknowns:
-        """The columns for p = `size` coordinates and these requirements."""
-        threshold, surplus = {}, {}
-        column = size + len(worst)
-        for r, k in enumerate(worst):
-            if k > 1:
-                runs = len(np.unique(selected[r].run))
-                threshold[r] = column
-                surplus[r] = column + 1 + np.arange(runs)
-                column += 1 + runs
-        return Unknowns(slice(size), slice(size, size + len(worst)), threshold, surplus, column)
-
-    @property
-    def nonnegative(self) -> np.ndarray:
-        """The columns of v and u."""
-        violation = np.arange(self.violation.start, self.violation.stop)
-        return np.concatenate([violation, *self.surplus.values()]).astype(int)
-
-
 def solve_subproblem(
     gradient: np.ndarray,
     matrix: np.ndarray,
@@ -161,86 +141,76 @@ def solve_subproblem(
       piece_gradients: a, (B, p, M).
       penalty: rho.
     """
-    size = len(gradient)
-    count = len(constraints.worst)
     low = np.minimum(low, -1e-12)
     high = np.maximum(high, 1e-12)
     reach = np.maximum(-low, high)
+    size = len(gradient)
     selected = [
-        _pieces_that_may_bind(constraints, r, pieces, piece_gradients, reach) for r in range(count)
+        _pieces_that_may_bind(constraints, r, pieces, piece_gradients, reach)
+        for r in range(len(constraints.worst))
     ]
-    unknowns = Unknowns.of(size, constraints.worst, selected)
-    A, b = _linear_constraints(unknowns, constraints, selected, pieces, piece_gradients)
-    bounds = np.eye(size, unknowns.total)
-    A = np.concatenate([A, bounds, -bounds])
-    b = np.concatenate([b, high, -low])
-    H = np.zeros((unknowns.total, unknowns.total))
-    H[unknowns.step, unknowns.step] = matrix
-    c = np.zeros(unknowns.total)
-    c[unknowns.step] = gradient
-    c[unknowns.violation] = penalty
-    x, y = quadratic.solve(H, c, A, b)
+    own_columns = [
+        _own_columns(chosen.run, k) for chosen, k in zip(selected, constraints.worst, strict=True)
+    ]
+    # The rows: both bounds of the step, and for each requirement its pieces and what `_own_columns`
+    # adds to them.
+    step_columns = [np.eye(size), -np.eye(size)]
+    limits = [high, -low]
+    for chosen, own in zip(selected, own_columns, strict=True):
+        added = len(own) - len(chosen.run)
+        gradients = piece_gradients[chosen.run, :, chosen.piece]
+        step_columns.append(np.pad(gradients, ((0, added), (0, 0))))
+        limits.append(np.pad(-pieces[chosen.run, chosen.piece] - TARGET_EXCESS, (0, added)))
+    own_block = block_diag(np.zeros((2 * size, 0)), *own_columns)
+    A = np.hstack([np.vstack(step_columns), own_block])
+    H = block_diag(matrix, np.zeros((own_block.shape[1], own_block.shape[1])))
+    widths = [own.shape[1] for own in own_columns]
+    violation_columns = size + np.cumsum([0, *widths])[:-1]
+    c = np.zeros(A.shape[1])
+    c[:size] = gradient
+    c[violation_columns] = penalty
+    x, y = quadratic.solve(H, c, A, np.concatenate(limits))
 
-    step = np.clip(x[unknowns.step], low, high)
-    # The rows of the pieces are the first ones.
+    step = np.clip(x[:size], low, high)
     piece_multipliers = np.zeros_like(pieces)
-    multipliers = np.zeros(count)
-    row = 0
+    multipliers = np.zeros(len(selected))
+    row = 2 * size
     for r, chosen in enumerate(selected):
-        own = y[row : row + len(chosen.run)]
-        piece_multipliers[chosen.run, chosen.piece] = own
-        multipliers[r] = own.sum()
-        row += len(chosen.run)
+        of_pieces = y[row : row + len(chosen.run)]
+        piece_multipliers[chosen.run, chosen.piece] = of_pieces
+        multipliers[r] = of_pieces.sum()
+        row += len(own_columns[r])
     return Step(
         step=step,
         change=float(gradient @ step + 0.5 * step @ matrix @ step),
-        violation=np.maximum(x[unknowns.violation], 0.0),
+        violation=np.maximum(x[violation_columns], 0.0),
         piece_multipliers=piece_multipliers,
         multipliers=multipliers,
         lagrangian=gradient + np.einsum("bm,bpm->p", piece_multipliers, piece_gradients),
     )
 
 
-def _linear_constraints(
-    unknowns: Unknowns,
-    constraints: Constraints,
-    selected: list[Selected],
-    pieces: np.ndarray,
-    piece_gradients: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """A and b of A x <= b: rows of the pieces, of the means of runs, and of the signs of v, u."""
-    piece_rows = [
-        _piece_rows(unknowns, r, chosen, piece_gradients) for r, chosen in enumerate(selected)
-    ]
-    mean_rows = [_mean_row(unknowns, r, constraints.worst[r]) for r in unknowns.threshold]
-    nonnegative = unknowns.nonnegative
-    A = np.concatenate([*piece_rows, *mean_rows, -np.eye(unknowns.total)[nonnegative]])
-    limits = [-pieces[x.run, x.piece] - TARGET_EXCESS for x in selected]
-    return A, np.concatenate([*limits, np.zeros(len(mean_rows) + len(nonnegative))])
+def _own_columns(run: np.ndarray, k: int) -> np.ndarray:
+    """The rows of one requirement in the columns of its own unknowns: v, and, where it is a mean of
+    k > 1 runs, t and one u_b for each run.
 
+        a_j.s - v <= -c_j                                           -v <= 0
+        a_j.s - t - u_b <= -c_j,      t + sum_b u_b / k - v <= 0,   -v <= 0,   -u_b <= 0
 
-def _piece_rows(
-    unknowns: Unknowns, r: int, chosen: Selected, piece_gradients: np.ndarray
-) -> np.ndarray:
-    """Rows a_j.s - v_r, or a_j.s - t - u_b where the requirement is a mean of runs."""
-    rows = np.zeros((len(chosen.run), unknowns.total))
-    rows[:, unknowns.step] = piece_gradients[chosen.run, :, chosen.piece]
-    if r not in unknowns.threshold:
-        rows[:, unknowns.violation.start + r] = -1.0
-        return rows
-    rows[:, unknowns.threshold[r]] = -1.0
-    position_of_run = np.unique(chosen.run, return_inverse=True)[1]
-    rows[np.arange(len(rows)), unknowns.surplus[r][position_of_run]] = -1.0
-    return rows
-
-
-def _mean_row(unknowns: Unknowns, r: int, k: int) -> np.ndarray:
-    """The row t + sum_b u_b / k - v_r <= 0."""
-    row = np.zeros((1, unknowns.total))
-    row[0, unknowns.threshold[r]] = 1.0
-    row[0, unknowns.surplus[r]] = 1.0 / k
-    row[0, unknowns.violation.start + r] = -1.0
-    return row
+    Args:
+      run: the run of each selected piece, (m,).
+      k: number of worst runs.
+    """
+    if k == 1:
+        return -np.ones((len(run) + 1, 1))
+    different, position = np.unique(run, return_inverse=True)
+    unknowns = 2 + len(different)
+    of_pieces = np.zeros((len(run), unknowns))
+    of_pieces[:, 1] = -1.0
+    of_pieces[np.arange(len(run)), 2 + position] = -1.0
+    mean = np.concatenate([[-1.0, 1.0], np.full(len(different), 1.0 / k)])
+    nonnegative = -np.delete(np.eye(unknowns), 1, axis=0)
+    return np.vstack([of_pieces, mean, nonnegative])
 
 
 def _pieces_that_may_bind(
@@ -255,26 +225,24 @@ def _pieces_that_may_bind(
     """
     own = constraints.pieces_of(r)
     k = constraints.worst[r]
-    is_mean = k > 1
     values = pieces[:, own]
     change = np.einsum("bpm,p->bm", np.abs(piece_gradients[:, :, own]), reach)
     # What a piece reaches at most is compared with what the largest of its run reaches at least.
     threshold = np.max(values - change, axis=1, keepdims=True)
-    if not is_mean:
-        threshold = np.maximum(threshold, -TARGET_EXCESS)
+    if k == 1:
+        may_bind = values + change >= np.maximum(threshold, -TARGET_EXCESS)
+        run, piece = np.nonzero(may_bind)
+        order = np.argsort(-values[run, piece], kind="stable")[:MAX_PIECES]
+        return Selected(run[order], own[piece[order]])
     may_bind = values + change >= threshold
-    if is_mean:
-        from_worst = np.argsort(-np.max(values, axis=1), kind="stable")
-        may_bind[from_worst[RUNS_PER_WORST * k :]] = False
+    from_worst = np.argsort(-np.max(values, axis=1), kind="stable")
+    may_bind[from_worst[RUNS_PER_WORST * k :]] = False
     run, piece = np.nonzero(may_bind)
-    room = MAX_PIECES
-    is_further = np.zeros(len(run), bool)
-    if is_mean:
-        # A mean of k runs needs k runs: the worst piece of each run comes before all others.
-        worst_of_run = np.argmax(np.where(may_bind, values, -np.inf), axis=1)
-        is_further = piece != worst_of_run[run]
-        room = max(MAX_PIECES, int(np.sum(~is_further)))
-    order = np.lexsort((-values[run, piece], is_further))[:room]
+    # A mean of k runs needs k runs: the worst piece of each run comes before all others.
+    worst_of_run = np.argmax(np.where(may_bind, values, -np.inf), axis=1)
+    is_further = piece != worst_of_run[run]
+    count = max(MAX_PIECES, int(np.sum(~is_further)))
+    order = np.lexsort((-values[run, piece], is_further))[:count]
     return Selected(run[order], own[piece[order]])
 
 
@@ -300,10 +268,27 @@ class Point(NamedTuple):
     piece_gradients: np.ndarray
     """a, (B, p, M)."""
 
+    @staticmethod
+    def of(space: SearchSpace, found: Any, start: int) -> Point:
+        """What was found for one start, in double precision."""
+        gradient = np.asarray(found.gradient[start], float)
+        runs = space.constraints.runs
+        pieces = np.zeros((runs, 0))
+        piece_gradients = np.zeros((runs, len(gradient), 0))
+        if len(space.constraints.owner):
+            pieces = np.asarray(found.pieces[start], float)
+            piece_gradients = np.asarray(found.piece_gradients[start], float)
+        matrix = np.asarray(found.hessian[start], float)
+        return Point(float(found.value.loss[start]), gradient, matrix, pieces, piece_gradients)
+
     @property
     def is_finite(self) -> bool:
         """Whether all numbers are finite."""
         return all(bool(np.all(np.isfinite(x))) for x in self)
+
+    def linear_change(self, step: np.ndarray) -> np.ndarray:
+        """a_j.s of every piece, (B, M)."""
+        return np.einsum("p,bpm->bm", step, self.piece_gradients)
 
 
 @jax.tree_util.register_dataclass
@@ -313,14 +298,10 @@ class SQPState:
 
     z: np.ndarray
     """The accepted point."""
-    loss: Any
-    gradient: np.ndarray
-    matrix: np.ndarray
-    """N at z."""
+    here: Point
+    """What the evaluation at z gave."""
     correction: np.ndarray
     """A."""
-    pieces: np.ndarray
-    piece_gradients: np.ndarray
     piece_multipliers: np.ndarray
     """y, (B, M)."""
     curved: np.ndarray
@@ -347,17 +328,13 @@ class SQPState:
     @property
     def size(self) -> float:
         """Size of the loss, for relative tolerances."""
-        return max(1e-3, abs(float(self.loss)))
+        return max(1e-3, abs(float(self.here.loss)))
 
     def curvature_along(self, step: np.ndarray) -> np.ndarray:
         """s.C_j.s/2 of every piece, (B, M)."""
-        found = np.zeros_like(self.pieces)
+        found = np.zeros_like(self.here.pieces)
         found.flat[self.curved] = 0.5 * np.einsum("p,kpq,q->k", step, self.curvatures, step)
         return found
-
-    def linear_change(self, step: np.ndarray) -> np.ndarray:
-        """a_j.s of every piece, (B, M)."""
-        return np.einsum("p,bpm->bm", step, self.piece_gradients)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -407,8 +384,8 @@ class SQP:
         if self.radius is not None:
             return self.radius
         if space.multimodal:
-            return RADIUS_IF_MULTIMODAL
-        return RADIUS
+            return INITIAL_RADIUS_IF_MULTIMODAL
+        return INITIAL_RADIUS
 
     def _new_start(self, space: SearchSpace, z: np.ndarray, curved: int) -> SQPState:
         size = len(z)
@@ -416,12 +393,14 @@ class SQP:
         pieces = len(space.constraints.owner)
         return SQPState(
             z=z.copy(),
-            loss=np.inf,
-            gradient=np.zeros(size),
-            matrix=np.zeros((size, size)),
+            here=Point(
+                loss=np.inf,
+                gradient=np.zeros(size),
+                matrix=np.zeros((size, size)),
+                pieces=np.zeros((runs, pieces)),
+                piece_gradients=np.zeros((runs, size, pieces)),
+            ),
             correction=np.zeros((size, size)),
-            pieces=np.zeros((runs, pieces)),
-            piece_gradients=np.zeros((runs, size, pieces)),
             piece_multipliers=np.zeros((runs, pieces)),
             curved=np.zeros(curved, int),
             curvatures=np.zeros((curved, size, size)),
@@ -444,12 +423,12 @@ class SQP:
         if z is not None:
             state[start] = self._new_start(space, z, len(state[start].curved))
             return
-        here = state[start]
-        here.evaluated = False
-        here.done = False
-        here.correction[:] = 0.0
-        here.trial = here.z.copy()
-        here.radius = max(here.radius, 0.1 * self._first_radius(space))
+        own = state[start]
+        own.evaluated = False
+        own.done = False
+        own.correction[:] = 0.0
+        own.trial = own.z.copy()
+        own.radius = max(own.radius, 0.1 * self._first_radius(space))
 
     def converged(self, state: list[SQPState]) -> np.ndarray:
         """As `Solver.converged`."""
@@ -457,8 +436,8 @@ class SQP:
 
     def optimality(self, state: list[SQPState], start: int) -> Optimality:
         """As `Solver.optimality`."""
-        here = state[start]
-        return Optimality(here.z, here.multipliers, here.residuals, bool(here.stuck))
+        own = state[start]
+        return Optimality(own.z, own.multipliers, own.residuals, bool(own.stuck))
 
     def step(
         self, evaluate: Any, state: list[SQPState], tolerance: float
@@ -468,21 +447,8 @@ class SQP:
         trials = np.stack([start.trial for start in state])
         found = evaluate(trials)
         for s in np.flatnonzero(evaluate.active).tolist():
-            _advance(space, state[s], _point(space, found, s), tolerance)
+            _advance(space, state[s], Point.of(space, found, s), tolerance)
         return trials, found
-
-
-def _point(space: SearchSpace, found: Any, s: int) -> Point:
-    """What was found for one start, in double precision."""
-    gradient = np.asarray(found.gradient[s], float)
-    runs = space.constraints.runs
-    pieces = np.zeros((runs, 0))
-    piece_gradients = np.zeros((runs, len(gradient), 0))
-    if len(space.constraints.owner):
-        pieces = np.asarray(found.pieces[s], float)
-        piece_gradients = np.asarray(found.piece_gradients[s], float)
-    matrix = np.asarray(found.hessian[s], float)
-    return Point(float(found.value.loss[s]), gradient, matrix, pieces, piece_gradients)
 
 
 def _advance(space: SearchSpace, state: SQPState, found: Point, tolerance: float) -> None:
@@ -502,14 +468,14 @@ def _advance(space: SearchSpace, state: SQPState, found: Point, tolerance: float
     if valid:
         ratio = _decrease_ratio(space, state, found)
         _update_curvatures(state, step, found)
-    if ratio > ACCEPTED:
+    if ratio > RATIO_TO_ACCEPT:
         _accept(space, state, found)
     elif valid and not state.corrected and _correct(space, state, step, found.pieces):
         return
-    if ratio < POOR:
-        state.radius = SHRINK * length
-    elif ratio > GOOD and length > 0.9 * state.radius:
-        state.radius = min(GROW * state.radius, LARGEST_RADIUS)
+    if ratio < RATIO_TO_SHRINK:
+        state.radius = SHRINK_FACTOR * length
+    elif ratio > RATIO_TO_GROW and length > 0.9 * state.radius:
+        state.radius = min(GROWTH_FACTOR * state.radius, LARGEST_RADIUS)
     _plan(space, state, tolerance)
 
 
@@ -523,18 +489,14 @@ def _decrease_ratio(space: SearchSpace, state: SQPState, found: Point) -> float:
     """Ratio of actual to predicted decrease of the penalty function."""
     if not state.predicted > 0:
         return -np.inf
-    before = _merit(space, state, state.loss, state.pieces)
+    before = _merit(space, state, state.here.loss, state.here.pieces)
     return (before - _merit(space, state, found.loss, found.pieces)) / state.predicted
 
 
 def _accept(space: SearchSpace, state: SQPState, found: Point) -> None:
     """Moves to the trial; curvatures of pieces that are no longer among the worst are dropped."""
     state.z = state.trial.copy()
-    state.loss = found.loss
-    state.gradient = found.gradient
-    state.matrix = found.matrix
-    state.pieces = found.pieces
-    state.piece_gradients = found.piece_gradients
+    state.here = found
     curved = _worst_pieces(space.constraints, found.pieces)
     curvatures = np.zeros_like(state.curvatures)
     _, new, old = np.intersect1d(curved, state.curved, return_indices=True)
@@ -565,27 +527,27 @@ def _solve(space: SearchSpace, state: SQPState, pieces: np.ndarray, penalty: flo
     """The subproblem at the accepted point, with `pieces` as c."""
     multipliers = state.piece_multipliers.ravel()[state.curved]
     of_pieces = np.einsum("k,kpq->pq", multipliers, state.curvatures)
-    matrix = positive_definite(state.matrix + state.correction + of_pieces)
+    matrix = positive_definite(state.here.matrix + state.correction + of_pieces)
     low = np.maximum(space.box.low - state.z, -state.radius)
     high = np.minimum(space.box.high - state.z, state.radius)
     return solve_subproblem(
-        state.gradient,
+        state.here.gradient,
         matrix,
         low,
         high,
         space.constraints,
         pieces,
-        state.piece_gradients,
+        state.here.piece_gradients,
         penalty,
     )
 
 
 def _predicted_decrease(space: SearchSpace, state: SQPState, step: np.ndarray) -> float:
     """Decrease of the penalty function by the quadratic models of objective and pieces."""
-    pieces = state.pieces + state.linear_change(step) + state.curvature_along(step)
-    matrix = state.matrix + state.correction
-    change = float(state.gradient @ step + 0.5 * step @ matrix @ step)
-    return _merit(space, state, 0.0, state.pieces) - _merit(space, state, change, pieces)
+    pieces = state.here.pieces + state.here.linear_change(step) + state.curvature_along(step)
+    matrix = state.here.matrix + state.correction
+    change = float(state.here.gradient @ step + 0.5 * step @ matrix @ step)
+    return _merit(space, state, 0.0, state.here.pieces) - _merit(space, state, change, pieces)
 
 
 def _with_penalty(space: SearchSpace, state: SQPState) -> tuple[Step, float]:
@@ -594,9 +556,9 @@ def _with_penalty(space: SearchSpace, state: SQPState) -> tuple[Step, float]:
     largest = LARGEST_PENALTY * size
     twice = 2.0 * float(np.max(state.multipliers, initial=0.0))
     penalty = min(max(twice, MIN_PENALTY * size), largest)
-    found = _solve(space, state, state.pieces, penalty)
+    found = _solve(space, state, state.here.pieces, penalty)
     while found.violation.sum() > TARGET_EXCESS and penalty < largest:
-        other = _solve(space, state, state.pieces, PENALTY_FACTOR * penalty)
+        other = _solve(space, state, state.here.pieces, PENALTY_FACTOR * penalty)
         if found.violation.sum() - other.violation.sum() < 0.01 * found.violation.sum():
             break
         found = other
@@ -613,7 +575,7 @@ def _plan(space: SearchSpace, state: SQPState, tolerance: float) -> None:
     state.piece_multipliers = found.piece_multipliers
     state.multipliers = found.multipliers
 
-    excess = space.constraints.excess(state.pieces)
+    excess = space.constraints.excess(state.here.pieces)
     violation = float(np.sum(np.maximum(excess + TARGET_EXCESS, 0.0)))
     reduction = violation - float(np.sum(found.violation))
     linear_decrease = -found.change + state.penalty * reduction
@@ -639,11 +601,11 @@ def _best_with_curvature(
     """Of the steps of all rounds, the one with the largest predicted decrease, and the decrease."""
     best = found.step
     decrease = _predicted_decrease(space, state, best)
-    if not state.pieces.size:
+    if not state.here.pieces.size:
         return best, decrease
     last = found
     for _ in range(CURVATURE_SOLVES):
-        last = _solve(space, state, state.pieces + state.curvature_along(last.step), penalty)
+        last = _solve(space, state, state.here.pieces + state.curvature_along(last.step), penalty)
         other = _predicted_decrease(space, state, last.step)
         if other > decrease:
             best = last.step
@@ -657,7 +619,7 @@ def _residuals(space: SearchSpace, state: SQPState, found: Step, excess: np.ndar
     blocked_below = (state.z < space.box.low + RANGE_TOLERANCE) & (slope > 0)
     blocked_above = (state.z > space.box.high - RANGE_TOLERANCE) & (slope < 0)
     stationarity = np.max(np.abs(np.where(blocked_below | blocked_above, 0.0, slope)))
-    products = np.sum(found.piece_multipliers * state.pieces, axis=0)
+    products = np.sum(found.piece_multipliers * state.here.pieces, axis=0)
     complementarity = sum(
         abs(float(np.sum(products[space.constraints.pieces_of(r)]))) for r in range(len(excess))
     )
@@ -669,7 +631,7 @@ def _correct(space: SearchSpace, state: SQPState, step: np.ndarray, pieces: np.n
     """Plans the second-order correction of a rejected step; whether it differs from the step."""
     if not len(space.constraints.owner):
         return False
-    found = _solve(space, state, pieces - state.linear_change(step), state.penalty)
+    found = _solve(space, state, pieces - state.here.linear_change(step), state.penalty)
     state.trial = np.clip(state.z + found.step, space.box.low, space.box.high)
     state.corrected = True
     difference = np.max(np.abs(state.trial - state.z - step))
@@ -678,9 +640,9 @@ def _correct(space: SearchSpace, state: SQPState, step: np.ndarray, pieces: np.n
 
 def _update_curvatures(state: SQPState, step: np.ndarray, found: Point) -> None:
     """The symmetric rank-one updates of A and of every stored C_j."""
-    change = found.gradient - state.gradient - state.matrix @ step
+    change = found.gradient - state.here.gradient - state.here.matrix @ step
     _rank_one_update(state.correction, change, step)
-    changes = np.swapaxes(found.piece_gradients - state.piece_gradients, 1, 2)
+    changes = np.swapaxes(found.piece_gradients - state.here.piece_gradients, 1, 2)
     _rank_one_update(state.curvatures, changes.reshape(-1, len(step))[state.curved], step)
 
 

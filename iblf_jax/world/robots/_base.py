@@ -44,7 +44,8 @@ class Robot(Protocol):
     [N m], is the friction of its joints.  These belong to the plant only: law and observer do not
     know them, and (2.1) has them in f.  `energy_gradient(q, v)` replaces the general formula of the
     function of this name where a member has a shorter one.  A class may name its `geometry_fields`,
-    a tuple of fields whose zeros, ones and equal numbers may be compiled in (`engine.mechanism`).
+    a tuple of fields whose zeros, ones and equal numbers may be compiled in
+    (`engine.structural_constants`).
     """
 
     @property

@@ -163,7 +163,7 @@ class Arm:
         "g",
     )
     """Fields of which it may be compiled in which numbers are 0, 1 or -1, and which are equal
-    (`engine.mechanism`)."""
+    (`engine.structural_constants`)."""
     rows: ClassVar[dict[str, tuple[str, tuple[str, ...]]]] = {
         "link": ("links", ("mass", "centre", "inertia")),
         "joint": ("joints", ("position", "rotation", "axis", *NUMBERS_OF_A_JOINT)),

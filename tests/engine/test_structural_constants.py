@@ -16,9 +16,10 @@ import iblf_jax as ij
 from iblf_jax.core.status import Status
 from iblf_jax.engine import RunRequest, execute, registry
 from iblf_jax.engine.batch import Batch
+from iblf_jax.engine.carry import Carry, Inputs, StepOptions
 from iblf_jax.engine.loops import program_of
-from iblf_jax.engine.mechanism import mechanism_of
-from iblf_jax.engine.step import Carry, Inputs, StepOptions, TimeStep
+from iblf_jax.engine.structural_constants import robot_constants
+from iblf_jax.engine.time_step import TimeStep
 from iblf_jax.kernels import PER_RUN, TIME, written_out
 from iblf_jax.simulation.paths import get, with_parameters
 from iblf_jax.simulation.scenario import canonical
@@ -59,7 +60,7 @@ def batch_of(scenario, varied=(), known=True) -> tuple[Batch, Carry]:
     leaves = {path: jnp.asarray(get(scenario, path))[None] for path in ("initial.q", *varied)}
     inputs = Inputs(scenario, STANDARD, jnp.asarray(DT), jnp.asarray(10.0))
     carries = carry_of(inputs, {"initial.q": leaves["initial.q"]}, "euler")
-    return Batch.of(inputs, leaves, constants=mechanism_of(scenario) if known else None), carries
+    return Batch.of(inputs, leaves, constants=robot_constants(scenario) if known else None), carries
 
 
 def lowered(*case):
@@ -141,22 +142,22 @@ def test_what_differs_between_runs_is_never_compiled_in(path):
 def test_new_masses_gains_and_loads_compile_nothing(path, value):
     scenario = square_arm()
     changed = with_parameters(scenario, {path: jnp.full_like(get(scenario, path), value)})
-    assert mechanism_of(changed) == mechanism_of(scenario)
-    assert hash(mechanism_of(changed)) == hash(mechanism_of(scenario))
+    assert robot_constants(changed) == robot_constants(scenario)
+    assert hash(robot_constants(changed)) == hash(robot_constants(scenario))
 
 
 def test_another_number_that_is_none_of_these_compiles_nothing():
     scenario = square_arm()
     longer = {f"{robot}.position[1]": jnp.asarray([0.5, 0.0, 0.0]) for robot in ("plant", "model")}
-    assert mechanism_of(with_parameters(scenario, longer)) == mechanism_of(scenario)
-    assert mechanism_of(
+    assert robot_constants(with_parameters(scenario, longer)) == robot_constants(scenario)
+    assert robot_constants(
         with_parameters(scenario, {"plant.position[1]": jnp.asarray([0.5, 0.0, 0.0])})
-    ) != mechanism_of(scenario)
+    ) != robot_constants(scenario)
 
 
 def test_a_right_angle_costs_no_more_in_the_model_than_in_the_plant():
     """Equal numbers of a row, of either sign, are one input, and the model's are the plant's."""
-    known = mechanism_of(square_arm()).numbers
+    known = robot_constants(square_arm()).numbers
     rows = [x for x in known if x is not None and x.sign < 0]
     assert rows and all(
         known[x.same].same is None for x in known if x is not None and x.same is not None
@@ -172,7 +173,9 @@ def test_a_robot_of_a_user_may_have_a_field_of_that_name():
     arm = square_arm().plant
     fields = {f.name: getattr(arm, f.name) for f in dataclasses.fields(arm)}
     assert (
-        mechanism_of(dataclasses.replace(square_arm(), plant=Mine(**fields), model=Mine(**fields)))
+        robot_constants(
+            dataclasses.replace(square_arm(), plant=Mine(**fields), model=Mine(**fields))
+        )
         is None
     )
 
@@ -193,10 +196,10 @@ def test_derivatives_by_the_geometry(monkeypatch):
             lambda s, v: execute.run_batch_jvp(s, v, along, STANDARD[:1], dt, run).tangents
         )(scenario, start)
 
-    known, plain = by("native", mechanism_of(scenario)), by("vmap", None)
+    known, plain = by("native", robot_constants(scenario)), by("vmap", None)
     no_tangents = registry.NATIVE._replace(limits=registry.Limits(derivatives=0))
     monkeypatch.setitem(registry.EXECUTORS, "native", no_tangents)
-    column_by_column = by("auto", mechanism_of(scenario))
+    column_by_column = by("auto", robot_constants(scenario))
     for name, expected in plain.items():
         np.testing.assert_allclose(known[name], expected, rtol=1e-9, atol=1e-12, err_msg=name)
         np.testing.assert_allclose(
@@ -207,11 +210,11 @@ def test_derivatives_by_the_geometry(monkeypatch):
 
 
 def test_robots_without_a_geometry_and_tracers_have_none():
-    assert mechanism_of(canonical(PRESET)) is None
+    assert robot_constants(canonical(PRESET)) is None
     jax.jit(
         lambda s: (
-            jnp.asarray([mechanism_of(s) is None])
-            if mechanism_of(s) is None
+            jnp.asarray([robot_constants(s) is None])
+            if robot_constants(s) is None
             else pytest.fail("read a tracer")
         )
     )(square_arm())
@@ -241,7 +244,7 @@ def test_a_run_that_is_not_finite_is_seen_to_be_so(path):
             scenario, number
         )  # where nothing looks at the number
         assert (
-            int(status_of(changed, run=RunRequest(5, "euler", constants=mechanism_of(changed))))
+            int(status_of(changed, run=RunRequest(5, "euler", constants=robot_constants(changed))))
             & int(Status.NOT_FINITE)
             == expected
         )

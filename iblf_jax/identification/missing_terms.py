@@ -146,53 +146,34 @@ def missing_terms(
     numbers = np.concatenate([by_x, motion.dtau[..., None]], axis=-1)[..., fitted]
     design = _weighted_regression(motion, rest, numbers, of_candidates)
     k = numbers.shape[-1]
-    found = _backward_elimination(design, k, _forward_selection(design, k, names), len(names))
-    thetas = _least_squares(design, [*range(k), *found])[k:]
+    significant = _backward_elimination(design, k, _forward_selection(design, k, names), len(names))
+    without = _least_squares(design, range(k))
+    thetas = _least_squares(design, [*range(k), *significant])[k:]
     unit = _rms(of_candidates)
     least = np.maximum(
         SMALLEST_TORQUE_SHARE * _rms(motion.tau),
-        SMALLEST_RESIDUAL_SHARE * _rms(rest - numbers @ _least_squares(design, range(k))),
+        SMALLEST_RESIDUAL_SHARE * _rms(rest - numbers @ without),
     )
-    found = [
-        i
-        for i, theta in zip(found, thetas, strict=True)
-        if _is_large(theta, unit, least, names, i - k)
-    ]
-    bias = np.zeros(p)
+    found = []
+    for i, theta in zip(significant, thetas, strict=True):
+        joint, _ = names[i - k]
+        if abs(theta) * unit[joint, i - k] > least[joint]:
+            found.append(i)
     if not found:
-        return MissingTerms((), bias)
-    moved = np.zeros(p + 1)
-    without, with_them = (
-        _least_squares(design, range(k)),
-        _least_squares(design, [*range(k), *found]),
-    )
-    moved[fitted] = without - with_them[:k]
-    errors = _errors(design, [*range(k), *found])[k:]
-    made = []
-    for i, theta, error in zip(found, with_them[k:].tolist(), errors.tolist(), strict=True):
-        j, kind = names[i - k]
-        made.append(Finding(j, kind, theta, error, _gain(design, [*range(k), *found], i, j)))
-    return MissingTerms(tuple(sorted(made, key=lambda one: -one.gain)), moved[:p])
+        return MissingTerms((), np.zeros(p))
+    chosen = [*range(k), *found]
+    with_them, errors = _least_squares(design, chosen), _errors(design, chosen)
+    bias = np.zeros(p + 1)
+    bias[fitted] = without - with_them[:k]
+    findings = []
+    for i, theta, error in zip(found, with_them[k:].tolist(), errors[k:].tolist(), strict=True):
+        joint, kind = names[i - k]
+        findings.append(Finding(joint, kind, theta, error, _gain(design, chosen, i, joint)))
+    return MissingTerms(tuple(sorted(findings, key=lambda one: -one.gain)), bias[:p])
 
 
 def _rms(x: np.ndarray) -> np.ndarray:
     return np.sqrt(np.mean(x**2, axis=0))
-
-
-def _is_large(
-    theta: float, unit: np.ndarray, least: np.ndarray, names: list[tuple[int, str]], c: int
-) -> bool:
-    """Whether a term is a torque that matters on its joint.
-
-    Args:
-      theta: its size.
-      unit: root mean square of each candidate's torque for one unit, (n, c) [N m].
-      least: what matters on each joint, (n,) [N m].
-      names: of the candidates.
-      c: which candidate.
-    """
-    joint, _ = names[c]
-    return abs(theta) * unit[joint, c] > least[joint]
 
 
 def _weighted_regression(

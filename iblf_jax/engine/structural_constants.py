@@ -1,12 +1,11 @@
-"""Finds properties of a scenario that are compiled in: which numbers of a robot's geometry are 0, 1
-or -1, which are equal to others, and which factors of a law are 1.
+"""Structural constants of a scenario: the numbers that are compiled into the kernel.
 
-Axes, offsets and rotations of real arms are mostly zeros, and model and plant mostly agree. A
-scalar program that uses this needs fewer operations. Other values are never compiled in, nor is
-any property of masses, gains and loads, so that new values need no compilation. A robot declares
-the fields in question (`geometry_fields`). A law has factors that are mostly 1, such as the weight
-of a barrier (`unit_factors`); a factor of 1 costs nothing. Leaves that differ between runs are not
-shared, and nothing is compiled in for them.
+They are the numbers of a robot's geometry that are 0, 1 or -1 or equal other numbers, and the
+factors of a law that are 1.  Axes, offsets and rotations of real arms are mostly zeros, and model
+and plant mostly agree, so a kernel that uses this needs fewer operations.  Other values are inputs
+of the kernel, and so are all masses, gains and loads: new values need no compilation.  A robot
+declares the fields in question (`geometry_fields`), and so does a law (`unit_factors`, such as the
+weight of a barrier).  Leaves that differ between runs are never structural constants.
 """
 
 from __future__ import annotations
@@ -18,7 +17,8 @@ import jax
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.core.pytree import layers
+from iblf_jax.core.optional import OptionalMembers, attributes
+from iblf_jax.core.pytree import layers, wrapped_field
 from iblf_jax.kernels import Known
 from iblf_jax.simulation.scenario import Scenario
 
@@ -26,16 +26,16 @@ QUATERNIONS = ("rotation", "tip_rotation")
 """Fields whose rows have equal numbers for a systematic reason: a right angle."""
 
 
-class Mechanism(NamedTuple):
-    """The compiled-in properties of a scenario; hashable."""
+class StructuralConstants(NamedTuple):
+    """The structural constants of a scenario; hashable."""
 
     numbers: tuple[Known | None, ...]
-    """One entry per number of the scenario, leaf after leaf; None for no property."""
+    """One entry per number of the scenario, leaf after leaf; None for a number that is an input."""
 
     def of_shared(
         self, is_per_run: Sequence[bool], sizes: Sequence[int]
     ) -> tuple[Known | None, ...]:
-        """The properties of the shared numbers.
+        """The structural constants among the shared numbers.
 
         Args:
           is_per_run: whether a leaf differs between the runs, for all leaves; those of the scenario
@@ -60,12 +60,16 @@ class Mechanism(NamedTuple):
         return tuple(found)
 
 
+declared_fields = OptionalMembers(geometry_fields=(), unit_factors=())
+"""Class attributes of robots and laws that name fields."""
+
+
 def _declared(part: Any, attribute: str) -> tuple[str, ...]:
     """The fields that a class declares in an attribute; empty if it does not declare any.
 
     A class of a user may lack the attribute, or use the name for something else.
     """
-    names = getattr(type(part), attribute, ())
+    names = declared_fields(type(part), attribute)
     if isinstance(names, tuple) and all(isinstance(name, str) for name in names):
         return names
     return ()
@@ -73,13 +77,16 @@ def _declared(part: Any, attribute: str) -> tuple[str, ...]:
 
 def _names(path: Sequence[Any]) -> tuple[str, ...]:
     """The names of the fields on the path of a leaf; empty texts for entries of containers."""
-    return tuple(getattr(key, "name", "") for key in path)
+    return tuple(key.name if isinstance(key, jax.tree_util.GetAttrKey) else "" for key in path)
 
 
-def mechanism_of(scenario: Scenario) -> Mechanism | None:
-    """The properties of a scenario's robots; None if they are traced or declare no geometry."""
+def robot_constants(scenario: Scenario) -> StructuralConstants | None:
+    """The structural constants of a scenario's robots; None if the robots are traced or declare no
+    geometry.
+    """
     robots = {
-        name: _declared(getattr(scenario, name), "geometry_fields") for name in ("plant", "model")
+        name: _declared(robot, "geometry_fields")
+        for name, robot in (("plant", scenario.plant), ("model", scenario.model))
     }
     if not any(robots.values()) or not checks.is_concrete((scenario.plant, scenario.model)):
         return None
@@ -98,7 +105,7 @@ def mechanism_of(scenario: Scenario) -> Mechanism | None:
             row = values.shape[-1]
         for i in range(values.size):
             numbers.append(_of_entry(values, i, row, numbers, twin))
-    return Mechanism(tuple(numbers))
+    return StructuralConstants(tuple(numbers))
 
 
 def _of_entry(
@@ -131,44 +138,38 @@ def _of_entry(
     return known
 
 
-def known_of(scenario: Scenario) -> Mechanism | None:
-    """The properties of a scenario's robots and of its law; None if there are none.
+def constants_of(scenario: Scenario) -> StructuralConstants | None:
+    """The structural constants of a scenario's robots and of its law; None if there are none.
 
-    The property of a law is which entries of its `unit_factors` are 1.
+    Those of a law are the entries of its `unit_factors` that are 1.
     """
-    mechanism = mechanism_of(scenario)
-    factors = _factors(scenario)
+    of_robots = robot_constants(scenario)
+    factors = _unit_factors(scenario)
     if not any(np.any(np.asarray(factor) == 1.0) for factor in factors.values()):
-        return mechanism
+        return of_robots
     numbers: list[Known | None] = []
     for path, leaf in jax.tree_util.tree_flatten_with_path(scenario)[0]:
-        factor = factors.get(_names(path))
-        if factor is None:
-            numbers += [None] * int(np.size(leaf))
-            continue
-        numbers += [UNIT.get(x) for x in np.ravel(factor).tolist()]
-    if mechanism is None:
-        return Mechanism(tuple(numbers))
-    # Known() is a tuple and true; a number has a property of a robot or of the law, or none.
-    both = zip(mechanism.numbers, numbers, strict=True)
-    return Mechanism(tuple(of_robot or of_law for of_robot, of_law in both))
+        values = np.ravel(factors.get(_names(path), np.zeros(np.size(leaf))))
+        numbers += [Known(1.0) if x == 1.0 else None for x in values.tolist()]
+    if of_robots is not None:
+        # A number is a constant of a robot or of the law, not of both.
+        both = zip(of_robots.numbers, numbers, strict=True)
+        numbers = [of_law if of_robot is None else of_robot for of_robot, of_law in both]
+    return StructuralConstants(tuple(numbers))
 
 
-UNIT = {1.0: Known(1.0)}
-"""Value of a factor -> its property."""
-
-
-def _factors(scenario: Scenario) -> dict[tuple[str, ...], Any]:
+def _unit_factors(scenario: Scenario) -> dict[tuple[str, ...], Any]:
     """The `unit_factors` of a scenario's law and of the laws that it wraps, by their paths; traced
     ones are excluded.
     """
     path: tuple[str, ...] = ("controller",)
     found: dict[tuple[str, ...], Any] = {}
     for law in layers(scenario.controller):
-        for name in _declared(law, "unit_factors"):
-            found[*path, name] = getattr(law, name)
-        path = (*path, getattr(type(law), "wraps", ""))
-    return {names: factor for names, factor in found.items() if checks.is_concrete(factor)}
+        for name, factor in attributes(law, _declared(law, "unit_factors")).items():
+            if checks.is_concrete(factor):
+                found[*path, name] = factor
+        path = (*path, wrapped_field(law) or "")
+    return found
 
 
 def _known(x: float, before: np.ndarray, start: int) -> Known | None:

@@ -1,0 +1,74 @@
+"""The lines of a certificate about the claim that a law states about itself (`claims`)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from iblf_jax.certificates.decay_lines import check_steps
+from iblf_jax.certificates.lines import (
+    OWN_INEQUALITY,
+    Line,
+    Statement,
+    not_applicable,
+)
+from iblf_jax.certificates.optional import optional_member
+from iblf_jax.certificates.proof_terms import GENERAL_TERMS
+from iblf_jax.certificates.run_summary import (
+    ALWAYS_EXCLUDED,
+    RunSummary,
+    Segment,
+)
+from iblf_jax.control.actuators import Ideal
+from iblf_jax.core import checks
+
+OWN_ROUNDING = 8.0
+"""Relative errors of the derivatives of a law's own V, in those of their terms."""
+
+
+def why_not_own(summary: RunSummary) -> str:
+    """Why the law's claim about itself does not apply to a run; "" if it does."""
+    actuator = summary.run.scenario.actuator
+    if not isinstance(actuator, Ideal):
+        about = "the law's own claim is about a torque that acts as it is commanded"
+        return f"{about}, not about {checks.with_article(type(actuator).__name__)}"
+    if summary.excluded == summary.samples:
+        return ALWAYS_EXCLUDED
+    return summary.invalid
+
+
+def own_left_side(proof: Any) -> np.ndarray:
+    """V' + W - T, which must not be positive, (T,)."""
+    return proof.own.dV + proof.own.decay - proof.own.terms
+
+
+def own_segment_lines(segment: Segment) -> list[Line]:
+    """The lines of the law's claim about itself for one segment; none for a law without one."""
+    summary, proof, law = segment.summary, segment.proof, segment.summary.claims.own
+    if law is None:
+        return []
+    own = proof.own
+    states_terms = optional_member(law, "disturbance_terms") is not None
+    right_side = "what the law states" if states_terms else GENERAL_TERMS
+    decay = "W >= 0: the decay that the law states"
+    inequality = f"V' <= -W + T,  T: {right_side}"
+    # Near 0, V and W are differences of numbers as large as their largest values.
+    checked = (
+        (Statement("own V", "own", "V >= 0", "1"), own.V, np.max(np.abs(own.V))),
+        (Statement("own decay", "own", decay, "1/s"), own.decay, np.max(np.abs(own.decay))),
+        (Statement(OWN_INEQUALITY, "own", inequality, "1/s"), -own_left_side(proof), own.size),
+    )
+    reason = why_not_own(summary)
+    if reason:
+        return [not_applicable(statement, reason) for statement, _, _ in checked]
+    note = ""
+    if summary.excluded:
+        note = (
+            f"{summary.excluded} of {summary.samples} samples are excluded: the guard or a torque"
+            " limit was active"
+        )
+    return [
+        check_steps(segment, statement, margins, OWN_ROUNDING * summary.eps * sizes, note=note)
+        for statement, margins, sizes in checked
+    ]

@@ -1,0 +1,113 @@
+"""Inputs and carry of a step: what a run is made from, and what goes from one step to the next.
+
+`start` creates the carry before the first step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from iblf_jax.core.optional import OptionalMembers
+from iblf_jax.engine.metric_folds import begun
+from iblf_jax.simulation import error_estimate, stability
+from iblf_jax.simulation.closed_loop import (
+    LoopState,
+    evaluate,
+    initial_state,
+    perturbed_state,
+)
+from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.simulation.signals import Sample
+
+
+class Inputs(NamedTuple):
+    """What a run is made from: its leaves are inputs of what is compiled, never constants (but see
+    `engine.structural_constants`).
+    """
+
+    scenario: Scenario
+    folds: Any
+    dt: jax.Array
+    steps: jax.Array
+    """(), a float: integers are not leaves of a scalar program."""
+    noise: Any = ()
+    """Of a sampled loop, the key of each run's noise (`sampling.noise_key`)."""
+    direction: Any = ()
+    """Tangents of leaves, where a step takes them as data."""
+
+
+class Nearest(NamedTuple):
+    """The instant at which a joint was nearest to its bound."""
+
+    xi: jax.Array
+    t: jax.Array
+    state: Any
+    """What `closed_loop.perturbed_state` gives there."""
+
+
+class Carry(NamedTuple):
+    """What goes from step to step."""
+
+    state: LoopState
+    accumulators: tuple
+    status: jax.Array
+    nearest: Nearest
+    accuracy: error_estimate.Accuracy
+
+
+def _unchanged(function: Callable) -> Callable:
+    return function
+
+
+class StepOptions(NamedTuple):
+    """How the code of a step is generated for an executor; the numbers do not depend on it."""
+
+    rolled: bool = False
+    """Whether the stages of the integrator are a loop."""
+    piece: Callable = _unchanged
+    """Applied to every part of the step that is compiled as a function of its own."""
+    scalar: bool = False
+    """Whether the step becomes a scalar program, in which equal numbers are computed once."""
+
+
+step_member = OptionalMembers(is_derivative=False)
+"""Optional members of a step: whether it computes derivatives."""
+
+
+def keep_if(condition, new, old):
+    """`new` where the condition holds, leaf by leaf, else `old`."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
+
+
+def start(inputs: Inputs, method: str, jacobian: jax.Array) -> Carry:
+    """The carry before the first step; accumulators that begin with something of the first sample
+    are blank until then.
+
+    Args:
+      inputs: of the run.
+      method: the integrator.
+      jacobian: what a `LinearizationStep` has found at the start.
+    """
+    state, zero = initial_state(inputs.scenario), jnp.zeros_like(inputs.dt)
+    blank = begun(inputs.folds, _blank_sample(inputs, state))
+    constant, jacobian = jax.lax.stop_gradient((state, jacobian))
+    if inputs.scenario.sampling is not None:
+        jacobian = stability.per_time(jax.lax.stop_gradient(inputs.scenario), constant, jacobian)
+    estimate = error_estimate.begin(method, jacobian, constant)
+    return Carry(
+        state,
+        blank,
+        jnp.int32(0),
+        Nearest(-jnp.ones_like(zero), zero, perturbed_state(constant)),
+        estimate,
+    )
+
+
+def _blank_sample(inputs: Inputs, state: LoopState) -> Sample:
+    """A sample of zeros."""
+    shapes = jax.eval_shape(evaluate, inputs.scenario, inputs.dt, state, inputs.dt)[1]
+    return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)

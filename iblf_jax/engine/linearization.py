@@ -1,0 +1,145 @@
+"""The Jacobian of the closed loop at a state, computed in steps like those of a run.
+
+An executor makes these steps, so that the closed loop is compiled by the executor and not once more
+by XLA.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from iblf_jax.engine.carry import Inputs, StepOptions, keep_if
+from iblf_jax.simulation import error_estimate, stability
+from iblf_jax.simulation.closed_loop import (
+    initial_state,
+    integrated_part,
+    perturbed_rate,
+    perturbed_state,
+)
+from iblf_jax.simulation.scenario import Scenario
+
+
+class Linearization(NamedTuple):
+    """The carry of a `LinearizationStep`: a state around which the closed loop is linearized.
+
+    The state does not change, so what it decides is computed once.
+    """
+
+    time: jax.Array
+    state: jax.Array
+    """(m,)."""
+    growth: stability.Growth
+    """Of the power iteration."""
+    jacobian: jax.Array
+    """By the numbers that `accuracy` watches, by differences of three sizes, (3, m', m') [1/s];
+    `stability.resolved` makes one of them."""
+    unresolved: error_estimate.UnresolvedSignals
+    """Of the run; its torque is turned into what it accelerates, as that takes the robot's mass
+    matrix."""
+
+
+@dataclasses.dataclass(frozen=True)
+class LinearizationStep:
+    """The closed loop's derivative along one direction after the other.
+
+    The directions are at first the unit vectors of the numbers that `accuracy` watches.  Where
+    these are the complete state, the modes follow from them; otherwise a power iteration adds more
+    directions.
+    """
+
+    def __call__(
+        self, inputs: Inputs, carry: Linearization, index: jax.Array, options: StepOptions
+    ):
+        """The carry after the step; nothing is recorded."""
+        start = initial_state(inputs.scenario)
+        watched, x = error_estimate.watched_indices(start), carry.state
+        as_state = ravel_pytree(perturbed_state(start))[1]
+        iteration = index - 3 * watched.size
+        count = jnp.asarray(watched.size, index.dtype)
+        level = jax.lax.div(index, count)
+        number = index - level * count
+        rank = np.full(x.size, -1, index.dtype)
+        rank[watched] = np.arange(watched.size)
+        unit = (jnp.asarray(rank) == number).astype(x.dtype)
+        direction = jnp.where(iteration < 0, unit, carry.growth.direction)
+
+        def rate_at(y):
+            return ravel_pytree(
+                perturbed_rate(inputs.scenario, carry.time, as_state(y), inputs.dt, options.piece)
+            )[0]
+
+        plant = as_state(x)
+        if inputs.scenario.sampling is not None:
+            plant = plant.plant
+        rooms = stability.largest_difference_sizes(inputs.scenario, carry.time, plant, x.size)
+        room = jnp.where(
+            iteration < 0, jnp.sum(rooms * unit), jnp.asarray(stability.THIRD_SIZE, x.dtype)
+        )
+        sizes = stability.difference_sizes(x, direction, room)
+        widest = level == 2
+        if (
+            len(watched) < x.size
+        ):  # a power iteration follows, across infinite slopes by the widest differences
+            widest |= (iteration >= 0) & jnp.any(
+                stability.is_steep(carry.jacobian, inputs.scenario.sampling is not None)
+            )
+        size = jnp.where(
+            widest, sizes[2], jnp.where((level == 1) & (iteration < 0), sizes[1], sizes[0])
+        )
+        w, growth = stability.directional_derivative(rate_at, x, direction, size), carry.growth
+        if len(watched) < x.size:
+            growth = keep_if(iteration < 0, growth, stability.grown(growth, w, iteration))
+        columns = jnp.arange(watched.size, dtype=index.dtype) == number
+        chosen = (jnp.arange(3, dtype=index.dtype) == level)[:, None, None] & columns
+        jacobian = jnp.where(chosen, jnp.stack([w[i] for i in watched])[:, None], carry.jacobian)
+        unresolved = keep_if(
+            index == 0,
+            error_estimate.with_acceleration(inputs.scenario, carry.unresolved),
+            carry.unresolved,
+        )
+        return Linearization(carry.time, x, growth, jacobian, unresolved), ()
+
+
+def linearization_steps(scenario: Scenario) -> int:
+    """Steps of a `LinearizationStep`."""
+    state = initial_state(scenario)
+    watched = error_estimate.watched_indices(state).size
+    if watched == ravel_pytree(perturbed_state(state))[0].size:
+        return 3 * watched
+    return 3 * watched + stability.POWER_ITERATIONS
+
+
+def fastest_mode(scenario: Scenario, found: Linearization) -> jax.Array:
+    """The mode that a `LinearizationStep` has found, () [1/s]: of what a step integrates."""
+    jacobian = stability.resolved(found.jacobian, scenario.sampling is not None)
+    if scenario.sampling is not None:
+        size = ravel_pytree(integrated_part(initial_state(scenario)))[0].size
+        return stability.growth_rate_by(jacobian[:size, :size])
+    is_complete = len(jacobian) == found.state.size
+    if is_complete:
+        return stability.growth_rate_by(jacobian)
+    return stability.growth_rate(found.growth)
+
+
+def linearization_at(
+    time: jax.Array, state: Any, watched: int, unresolved: error_estimate.UnresolvedSignals
+) -> Linearization:
+    """The carry of a `LinearizationStep` at a state, as `perturbed_state` gives it, of which
+    `accuracy` watches so many numbers.
+    """
+    x = ravel_pytree(state)[0]
+    return jax.lax.stop_gradient(
+        Linearization(
+            time,
+            x,
+            stability.growth_start(x),
+            jnp.zeros((3, watched, watched), x.dtype),
+            unresolved,
+        )
+    )

@@ -1,0 +1,65 @@
+"""The outcome of a run: records, metrics and status flags, with the assessment of the time step."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from iblf_jax.core.status import Status, flag
+from iblf_jax.engine.carry import Carry, Inputs
+from iblf_jax.engine.linearization import Linearization, fastest_mode
+from iblf_jax.engine.metric_folds import finished
+from iblf_jax.simulation import error_estimate, integrators, stability
+
+
+class Outcome(NamedTuple):
+    """What the time loop returns."""
+
+    records: Any
+    metrics: dict[str, jax.Array]
+    status: jax.Array
+    fastest_mode: jax.Array
+
+
+def outcome_of(
+    inputs: Inputs,
+    method: str,
+    carry: Carry,
+    unresolved: error_estimate.UnresolvedSignals,
+    instants: Linearization,
+) -> Outcome:
+    """The folds' results and the accuracy, and the status with the verdict on the step.
+
+    Args:
+      inputs: of the run.
+      method: the integrator.
+      carry: after the last step.
+      unresolved: what a `LinearizationStep` has found for the run.
+      instants: what it has found at some of them.
+    """
+    estimate = error_estimate.with_unresolved(carry.accuracy, unresolved)
+    modes = jax.vmap(partial(fastest_mode, inputs.scenario))(instants)
+    mode = jnp.max(jnp.where(jnp.isfinite(modes), modes, 0.0))
+    limit = integrators.tableau(method).stability
+    status = carry.status | flag(inputs.dt * mode > limit, Status.STEP_TOO_LARGE)
+    # A column is at least as long as the mode that it alone would make.
+    steepest = jnp.sum(jnp.abs(instants.jacobian[:, 0]), axis=-2)
+    steep = stability.is_steep(instants.jacobian, inputs.scenario.sampling is not None) & (
+        inputs.dt * steepest > limit
+    )
+    status |= flag(~(estimate.relative <= error_estimate.TOLERANCE), Status.INACCURATE)
+    suffers = status & int(Status.STEP_TOO_LARGE | Status.INACCURATE) != 0
+    status |= flag(jnp.any(steep) & suffers, Status.INFINITE_SLOPE)
+    metrics = error_estimate.results(estimate)
+    if inputs.scenario.sampling is not None:
+        maps = jax.vmap(partial(stability.period_map, inputs.scenario, carry.state))(
+            stability.resolved(instants.jacobian, sampled=True)
+        )
+        radii = jax.lax.stop_gradient(jax.vmap(stability.spectral_radius)(maps))
+        metrics[stability.RADIUS] = jnp.max(jnp.where(jnp.isfinite(radii), radii, 0.0))
+        status |= flag(metrics[stability.RADIUS] > 1.0, Status.SAMPLING_TOO_SLOW)
+    metrics |= finished(inputs.folds, carry.accumulators)
+    return Outcome(None, metrics, status, mode)

@@ -1,0 +1,47 @@
+"""Which status flags a sample raises, and whether a state is valid."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from iblf_jax.core.status import VELOCITY_LIMIT, Status, flag
+from iblf_jax.simulation.closed_loop import (
+    LoopState,
+    integrated_part,
+)
+from iblf_jax.simulation.signals import Sample, has, speed_margin
+from iblf_jax.world.bounds import NARROWEST
+
+
+def sample_status(sample: Sample) -> jax.Array:
+    """The flags that one sample raises, () int32."""
+    margin = jnp.minimum(sample.q - sample.lower, sample.upper - sample.q)
+    found = (
+        flag(jnp.any(~(margin > 0)), Status.BOUND_VIOLATED)
+        | flag(jnp.any(sample.guard_active), Status.GUARD_ACTIVE)
+        | flag(jnp.any(sample.guard_active) & (sample.t > 0), Status.GUARD_STAYED)
+        | flag(jnp.any(sample.saturated), Status.TORQUE_SATURATED)
+        | flag(~jnp.isfinite(sample.V), Status.NOT_FINITE)
+    )
+    if not has(sample, "slack"):  # a filter keeps its bounds wherever the reference goes
+        narrowest = jnp.minimum(sample.q_d - sample.lower, sample.upper - sample.q_d)
+        found |= flag(jnp.any(narrowest < NARROWEST), Status.INFEASIBLE_REFERENCE)
+    for slack in (sample.slack, sample.region_slack):
+        if not isinstance(slack, tuple):
+            found |= flag(jnp.any(slack > 0), Status.FILTER_INFEASIBLE)
+    if has(sample, "region_margin"):
+        found |= flag(jnp.any(~(sample.region_margin > 0)), Status.REGION_VIOLATED)
+    if not has(sample, "dq_lower"):
+        return found
+    found |= flag(jnp.any(~(speed_margin(sample, sample.dq) > 0)), Status.VELOCITY_VIOLATED)
+    return found | flag(
+        jnp.any(~(speed_margin(sample, sample.alpha) > NARROWEST)), Status.ALPHA_INFEASIBLE
+    )
+
+
+def is_valid(state: LoopState) -> jax.Array:
+    """Whether a state is finite and slow enough to be a robot's, () bool."""
+    slow = jnp.all(jnp.abs(state.dq) < VELOCITY_LIMIT)
+    others = jax.tree.leaves((state.q, integrated_part(state)[2:]))
+    return jnp.all(jnp.stack([slow, *(jnp.all(jnp.isfinite(x)) for x in others)]))

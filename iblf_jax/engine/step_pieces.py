@@ -1,0 +1,253 @@
+"""The pieces of a time step: a step is divided where a jump lies within it.
+
+A step without a jump has one piece.  The folds of the metrics see the limits of the sample from
+both sides of each jump.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from iblf_jax.engine.carry import Inputs, StepOptions
+from iblf_jax.engine.metric_folds import split_floats, updated, weighed
+from iblf_jax.engine.status_flags import sample_status
+from iblf_jax.engine.switching import SwitchedLoop, with_hybrid_derivative
+from iblf_jax.simulation import discontinuities, error_estimate, integrators
+from iblf_jax.simulation.closed_loop import (
+    LoopState,
+    evaluate,
+    with_integrated_part,
+)
+from iblf_jax.simulation.signals import Sample
+
+
+class MetricSample(NamedTuple):
+    """A sample that the metrics count: one at each instant, and one-sided limits at jumps."""
+
+    before: tuple
+    """The accumulators of the metrics before the sample."""
+    sample: Sample
+    counts: Any
+    """Whether the step has this sample, () bool; True for the sample of the instant."""
+
+
+class StepTimes(NamedTuple):
+    """The interval of a step, and its division into pieces."""
+
+    span: discontinuities.Span
+    division: discontinuities.Division
+    behind: jax.Array
+    """Length of the last piece of the previous step, () [s]; 0 at the first instant."""
+    restarts: Any
+    """Whether a jump lies in this step or in earlier ones that its error estimate uses, () bool;
+    None in scenarios without jump times."""
+
+
+def step_times(inputs: Inputs, index: jax.Array, method: str, arrivals: tuple | None) -> StepTimes:
+    """The interval of the step that begins at an instant, and its division.
+
+    Args:
+      inputs: of the run.
+      index: number of the instant, () int.
+      method: the integrator.
+      arrivals: when commands arrive in this step and in the one before, as
+        `discontinuities.divided` takes them; None where none can.
+    """
+    times, dt, number = inputs.scenario.jump_times(), inputs.dt, index.astype(inputs.dt.dtype)
+    start = number * dt
+    end = start
+    if times.size:
+        end = (number + 1.0) * dt
+    span = discontinuities.Span(start, end, dt, number < inputs.steps)
+    here = last = None
+    if arrivals is not None:
+        here, last = arrivals
+    before = discontinuities.Span((number - 1.0) * dt, start, dt)
+    behind = jnp.where(
+        index > 0, discontinuities.since_last(times, before, last), jnp.zeros_like(dt)
+    )
+    restarts = None
+    if times.size and inputs.scenario.sampling is None:
+        reach = error_estimate.steps_back(method)
+        restarts = discontinuities.within(times, (number - reach) * dt, span.end)
+    return StepTimes(span, discontinuities.divided(times, span, here), behind, restarts)
+
+
+class LoopAlongStep(NamedTuple):
+    """The closed loop along a step."""
+
+    evaluate: Callable
+    inputs: Inputs
+    state: LoopState
+    """At the instant, after what is due there."""
+    torques: tuple
+    """For a sampled law, the torques at the actuator before and after a command arrives within the
+    step."""
+
+    def at(
+        self, piece: discontinuities.Piece, t: jax.Array, moved: LoopState
+    ) -> tuple[LoopState, Sample]:
+        """Rate and sample within a piece of the step."""
+        torque = self.torques
+        if torque and isinstance(piece.arrived, bool):
+            torque = (torque[int(piece.arrived)],)
+        elif torque:
+            torque = (jnp.where(piece.arrived, torque[1], torque[0]),)
+        return self.evaluate(
+            self.inputs.scenario,
+            discontinuities.stage_time(piece, t),
+            with_integrated_part(self.state, moved),
+            self.inputs.dt,
+            *torque,
+        )
+
+
+def integrated(
+    along: LoopAlongStep,
+    piece: discontinuities.Piece,
+    moved: LoopState,
+    method: str,
+    options: StepOptions,
+) -> integrators.Stepped:
+    """One step of the integrator over a piece."""
+    return integrators.step(
+        method,
+        lambda t, x: along.at(piece, t, x),
+        piece.begin,
+        moved,
+        piece.length,
+        rolled=options.rolled,
+    )
+
+
+def across_jumps(
+    along: LoopAlongStep,
+    piece: discontinuities.Piece,
+    before: LoopState,
+    method: str,
+    stepped: integrators.Stepped,
+    begun: tuple,
+    accumulators: tuple,
+) -> tuple[integrators.Stepped, tuple]:
+    """A piece of a step and the accumulators, with their derivatives across jumps of the command;
+    values are unchanged.
+
+    Args:
+      along: the loop, whose law is not sampled.
+      piece: of the step.
+      before: state at its start.
+      method: the integrator.
+      stepped: the result of the integrator for this piece.
+      begun, accumulators: of the folds, before and after the sample at its start.
+    """
+    inputs, dt = along.inputs, along.inputs.dt
+    # No metric counts what comes after the end of a run.
+    counts = piece.begin < (inputs.steps - 0.5) * dt
+
+    def rate(t, state):
+        return evaluate(inputs.scenario, discontinuities.stage_time(piece, t), state, dt)
+
+    def gains_of(sample):
+        def sums(weight):
+            return split_floats(
+                updated(inputs.folds, begun, dataclasses.replace(sample, dt=weight))
+            )[0]
+
+        gains = jax.jvp(sums, (sample.dt,), (jnp.ones_like(sample.dt),))[1]
+        return [jnp.where(counts, gain, jnp.zeros_like(gain)) for gain in gains]
+
+    floats, replaced = split_floats(accumulators)
+    loop = SwitchedLoop(inputs.scenario, rate, gains_of)
+    after, floats = with_hybrid_derivative(
+        loop, method, piece.begin, before, piece.length, stepped, floats
+    )
+    return stepped._replace(state=after), replaced(floats)
+
+
+class LaterPieces(NamedTuple):
+    """The result of the pieces of a step after the first."""
+
+    moved: LoopState
+    """At the end of the step."""
+    accumulators: tuple
+    parts: list[tuple[jax.Array, list]]
+    """Length [s] of each piece, and the slopes of its stages."""
+    metric_samples: tuple[MetricSample, ...]
+    status: Any
+    """The flags that its samples raise, () int32; None where there are none."""
+
+
+def later_pieces(
+    along: LoopAlongStep,
+    pieces: tuple[discontinuities.Piece, ...],
+    stepped: integrators.Stepped,
+    accumulators: tuple,
+    method: str,
+    options: StepOptions,
+) -> LaterPieces:
+    """The pieces after the first, each with the samples before and after the jump at which it
+    begins.
+    """
+    # These pieces are rare: their stages are a loop, which compiles in a fraction of the time.
+    folds, none = along.inputs.folds, jnp.zeros_like(along.inputs.dt)
+    moved, parts, metric_samples = stepped.state, [], []
+    status = None
+    if len(pieces) > 1:
+        status = jnp.int32(0)
+    for last, piece in itertools.pairwise(pieces):
+
+        def further(kept, last=last, piece=piece):
+            moved, accumulators, status = kept
+            between: Any = ()
+            left: Any = ()
+            if folds:
+                left = along.at(last, last.begin + last.length, moved)[1]
+                left = weighed(left, piece.begin, 0.5 * last.length, none)
+                between = accumulators = updated(folds, accumulators, left)
+            made = integrated(
+                along, piece, moved, method, options._replace(rolled=not options.scalar)
+            )
+            right = weighed(made.first, piece.begin, 0.5 * piece.length, none)
+            accumulators = ()
+            if folds:
+                accumulators = updated(folds, between, right)
+            if along.inputs.scenario.sampling is None:
+                made, accumulators = across_jumps(
+                    along, piece, moved, method, made, between, accumulators
+                )
+            return (made.state, accumulators, status | sample_status(right)), (
+                made.slopes,
+                left,
+                between,
+                right,
+            )
+
+        before = accumulators
+        (moved, accumulators, status), (slopes, left, between, right) = run_if(
+            piece.made, further, (moved, accumulators, status)
+        )
+        parts.append((piece.length, slopes))
+        if folds:
+            metric_samples += [
+                MetricSample(before, left, piece.made),
+                MetricSample(between, right, piece.made),
+            ]
+    return LaterPieces(moved, accumulators, parts, tuple(metric_samples), status)
+
+
+def run_if(condition: jax.Array, made: Callable, kept: Any) -> tuple[Any, Any]:
+    """`made(kept)`, new values and anything else, where a condition holds; else the values as they
+    are, and zeros.
+    """
+    shapes = jax.eval_shape(made, kept)[1]
+
+    def otherwise(kept):
+        return kept, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+
+    return jax.lax.cond(condition, made, otherwise, kept)

@@ -1,0 +1,208 @@
+"""The definition of a time step, which every executor makes.
+
+At each instant k = 0 ... T the closed loop is evaluated once; this sample serves the record, the
+metrics and the first stage of the integrator.  Where the right-hand side or the signals jump, the
+step is integrated in pieces (`step_pieces`), and the metrics see the limits from both sides; a step
+without a jump costs no more than the comparison.  A state that diverges is frozen at its last valid
+value and flagged, so that no NaN enters a batch or a gradient.  The carry keeps the instant nearest
+to a bound, because the loop is stiffest there.  At the last instant the loop is evaluated, but not
+integrated.
+
+A step is a function (inputs, carry, index) -> (carry, records) of ONE run.  It is hashable, and
+equal steps are compiled once.  `carry.start` creates the carry before the first step, and
+`outcome.outcome_of` computes the result after the last one.  Neither evaluates the closed loop:
+`linearization` computes the Jacobian that both need, also in steps.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from iblf_jax.core.optional import attributes
+from iblf_jax.core.status import Status, flag
+from iblf_jax.engine.carry import Carry, Inputs, Nearest, StepOptions, keep_if
+from iblf_jax.engine.metric_folds import begun_at, updated, weighed
+from iblf_jax.engine.request import RunRequest
+from iblf_jax.engine.status_flags import is_valid, sample_status
+from iblf_jax.engine.step_pieces import MetricSample, across_jumps, integrated, later_pieces
+from iblf_jax.engine.step_start import continuous_start, sampled_start
+from iblf_jax.simulation import discontinuities, error_estimate
+from iblf_jax.simulation.closed_loop import (
+    LoopState,
+    evaluate,
+    integrated_part,
+    perturbed_state,
+    with_integrated_part,
+)
+from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.simulation.signals import SIGNALS, Sample
+
+
+@dataclasses.dataclass(frozen=True)
+class TimeStep:
+    """One step of a run."""
+
+    method: str
+    record: Callable | None = None
+    """Function (folds, what `advance` found) of an instant."""
+
+    @staticmethod
+    def of(request: RunRequest) -> TimeStep:
+        """The step of a run."""
+        if request.record_every is None:
+            return TimeStep(request.method)
+        return TimeStep(request.method, recorded)
+
+    def __call__(self, inputs: Inputs, carry: Carry, index: jax.Array, options: StepOptions):
+        """The carry after the step, and what is recorded."""
+        found = advance(inputs, carry, index, self.method, options)
+        if self.record is None:
+            return found.carry, ()
+        return found.carry, self.record(inputs.folds, found)
+
+
+class Advanced(NamedTuple):
+    """What one step of a run gives."""
+
+    carry: Carry
+    """After the step, its samples folded into the metrics."""
+    metric_samples: tuple[MetricSample, ...]
+    """The sample of the instant comes first, whatever the order in time."""
+    state: LoopState
+    """At the instant, after the law has run if it is due."""
+
+    @property
+    def sample(self) -> Sample:
+        """The sample of the instant."""
+        return self.metric_samples[0].sample
+
+
+def advance(
+    inputs: Inputs,
+    carry: Carry,
+    index: jax.Array,
+    method: str,
+    options: StepOptions,
+    loop: Callable = evaluate,
+) -> Advanced:
+    """One step: evaluates the closed loop, updates the metrics, integrates piece by piece, and
+    freezes a state that diverges.
+
+    Args:
+      inputs, carry: of the run.
+      index: number of the instant, () int.
+      method: the integrator.
+      options: how the code of the step is generated.
+      loop: replaces `closed_loop.evaluate`.
+    """
+    begin = continuous_start
+    if inputs.scenario.sampling is not None:
+        begin = sampled_start
+    start = begin(inputs, carry, index, method, options.piece(loop))
+    along, times = start.along, start.times
+    state = along.state
+    first = times.division.pieces[0]
+    stepped = integrated(along, first, integrated_part(state), method, options)
+    ahead = jnp.where(times.span.counts, first.length, jnp.zeros_like(inputs.dt))
+    step = jnp.where(index > 0, inputs.dt, jnp.zeros_like(inputs.dt))
+    sample = weighed(stepped.first, times.span.start, 0.5 * (times.behind + ahead), step)
+    begun, accumulators = options.piece(_observed)(inputs, index, start.accumulators, sample)
+    if inputs.scenario.sampling is None:
+        stepped, accumulators = across_jumps(
+            along, first, state, method, stepped, begun, accumulators
+        )
+    later = later_pieces(along, times.division.pieces, stepped, accumulators, method, options)
+    parts = [(first.length, stepped.slopes), *later.parts]
+    after, status, nearest, estimate = options.piece(partial(_concluded, method))(
+        inputs,
+        carry,
+        index,
+        sample,
+        parts,
+        (with_integrated_part(state, later.moved), later.status),
+        state,
+        times.span.counts,
+        times.restarts,
+        times.division.overfull,
+    )
+    metric_samples = (
+        MetricSample(begun, sample, True),
+        *start.metric_samples,
+        *later.metric_samples,
+    )
+    return Advanced(
+        Carry(after, later.accumulators, status, nearest, estimate), metric_samples, state
+    )
+
+
+def _observed(
+    inputs: Inputs, index: jax.Array, accumulators: tuple, sample: Sample
+) -> tuple[tuple, tuple]:
+    """The accumulators before and after the sample of an instant."""
+    begun = begun_at(index, inputs.folds, sample, accumulators)
+    return begun, updated(inputs.folds, begun, sample)
+
+
+def _concluded(
+    method: str,
+    inputs: Inputs,
+    carry: Carry,
+    index: jax.Array,
+    sample: Sample,
+    parts: list,
+    later: tuple[LoopState, Any],
+    before: LoopState,
+    goes_on: jax.Array,
+    restarts: Any,
+    overfull: Any,
+) -> tuple[LoopState, jax.Array, Nearest, error_estimate.Accuracy]:
+    """State, status, nearest instant and accuracy after a step; a state that diverges is frozen.
+
+    Args:
+      method: the integrator.
+      inputs, carry: of the run.
+      index: number of the instant, () int.
+      sample: of the instant.
+      parts: lengths and slopes of the pieces of the step.
+      later: the state at the end of the step, and the flags raised within it.
+      before: the state at its start.
+      goes_on: whether the step is made, () bool.
+      restarts, overfull: of `StepTimes` and its division.
+    """
+    near = jnp.max(jnp.abs(jax.lax.stop_gradient(sample.xi)))
+    here = Nearest(near, sample.t, jax.lax.stop_gradient(perturbed_state(before)))
+    nearest = keep_if(near > carry.nearest.xi, here, carry.nearest)
+    is_sampled = inputs.scenario.sampling is not None
+    width = sample.upper - sample.lower
+    estimate = error_estimate.update(
+        carry.accuracy, method, inputs.dt, index, parts, width, is_sampled, restarts, overfull
+    )
+    after, raised = later
+    status = carry.status | sample_status(sample)
+    if raised is not None:
+        status = status | raised
+    valid = is_valid(after) & (status & int(Status.NOT_FINITE) == 0)
+    status |= flag(~valid & goes_on, Status.NOT_FINITE)
+    return keep_if(valid & goes_on, after, before), status, nearest, estimate
+
+
+def recorded(folds: Any, found: Advanced):
+    """What a run keeps of an instant: the sample, and the states of law and observer."""
+    state, measured = found.state, ()
+    if state.sampled:
+        measured = state.sampled.measured
+    states = state.controller, state.observer, state.actuator, measured
+    return attributes(found.sample, SIGNALS), *states
+
+
+def samples_of_step(scenario: Scenario) -> int:
+    """How many samples the folds see of a step at most: `Advanced.metric_samples`."""
+    arrives = scenario.sampling is not None and scenario.sampling.queue > 0
+    cuts = min(scenario.jump_times().size, discontinuities.MAX_CUTS) + arrives
+    return 1 + (scenario.sampling is not None) + 2 * cuts
