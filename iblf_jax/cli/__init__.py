@@ -25,7 +25,7 @@ import jax
 
 from iblf_jax._start import INTERRUPTED, end_process
 from iblf_jax.core import checks
-from iblf_jax.core.cache import keep_programs
+from iblf_jax.core.disk_cache import keep_programs
 
 COMMANDS = (
     "reproduce",

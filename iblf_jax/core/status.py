@@ -36,8 +36,8 @@ class Status(enum.IntFlag):
     """A study drew a value that its leaf does not admit (a negative mass, say): the run was not
     made, its metrics are NaN."""
     INACCURATE = 128
-    """The estimated error of the positions is more than 0.5 % of the tube (`accuracy.TOLERANCE`):
-    take a smaller dt."""
+    """The estimated error of the positions is more than 0.5 % of the tube 
+    (`error_estimate.TOLERANCE`): take a smaller dt."""
     GUARD_STAYED = 256
     """The guard was active beyond the first instant: there the loop ran with a softer law than the
     requested one."""

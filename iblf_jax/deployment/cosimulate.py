@@ -32,19 +32,12 @@ from iblf_jax.simulation.closed_loop import (
     run_sampled_law_if_due,
     sample_at,
 )
-from iblf_jax.simulation.jumps import JUMP_SEPARATION
+from iblf_jax.simulation.discontinuities import JUMP_SEPARATION
 from iblf_jax.simulation.metrics import Fold, as_folds, metric_units
+from iblf_jax.simulation.noise import has_noise, noise_key
 from iblf_jax.simulation.results import Metrics, Rollout
-from iblf_jax.simulation.sampling import (
-    DELAY_TOLERANCE,
-    Instant,
-    Sampling,
-    check_step,
-    commands_in_transit,
-    has_noise,
-    noise_key,
-)
-from iblf_jax.simulation.scenario import Scenario, canonical
+from iblf_jax.simulation.sampling import DELAY_TOLERANCE, Instant, Sampling, commands_in_transit
+from iblf_jax.simulation.scenario import Scenario, canonical, check_step
 from iblf_jax.simulation.signals import SIGNALS
 from iblf_jax.world.disturbances import Nothing
 from iblf_jax.world.robots import at_time

@@ -36,8 +36,8 @@ from iblf_jax.files.scenario import scenario_to_toml
 from iblf_jax.kernels import UnsupportedError
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
 from iblf_jax.simulation.integrators import tableau
-from iblf_jax.simulation.sampling import check_step, has_noise, noise_key
-from iblf_jax.simulation.scenario import Scenario, canonical
+from iblf_jax.simulation.noise import has_noise, noise_key
+from iblf_jax.simulation.scenario import Scenario, canonical, check_step
 from iblf_jax.world.robots._base import robot_member
 
 TARGETS = ("c", "fmu", "fmu-loop", "wasm")

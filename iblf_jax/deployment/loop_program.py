@@ -14,9 +14,9 @@ from iblf_jax.deployment.control_law import as_floats, of_floats, program_of
 from iblf_jax.engine.carry import Inputs, StepOptions, start
 from iblf_jax.engine.time_step import advance
 from iblf_jax.kernels import Program
-from iblf_jax.simulation import accuracy
+from iblf_jax.simulation import error_estimate
 from iblf_jax.simulation.closed_loop import initial_state
-from iblf_jax.simulation.sampling import has_noise
+from iblf_jax.simulation.noise import has_noise
 from iblf_jax.simulation.scenario import Scenario
 
 OUTPUTS = {
@@ -84,7 +84,7 @@ def loop_program(scenario: Scenario, method: str) -> Loop:
         if not has_noise(scenario) and scenario.sampling is not None:
             noise = key
         inputs = Inputs(scenario, (), run_settings.dt, jnp.asarray(UNLIMITED_STEPS, dtype), noise)
-        size = accuracy.watched_indices(state).size
+        size = error_estimate.watched_indices(state).size
         before = start(inputs, method, jnp.zeros((size, size), dtype))
         before = before._replace(state=state, status=status)
         done = advance(inputs, before, index, method, StepOptions(scalar=True))

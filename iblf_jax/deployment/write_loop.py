@@ -15,7 +15,7 @@ from iblf_jax.deployment.c_names import Parameters
 from iblf_jax.deployment.loop_program import OUTPUTS, Loop
 from iblf_jax.deployment.write_c import SEGMENT, fill_template, shared_values
 from iblf_jax.kernels import plain_function
-from iblf_jax.simulation.sampling import has_noise
+from iblf_jax.simulation.noise import has_noise
 from iblf_jax.simulation.scenario import Scenario
 
 WASM_FLAGS = ("-target", "wasm32-wasi", "-mexec-model=reactor", "-O2", "-s")

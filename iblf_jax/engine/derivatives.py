@@ -51,7 +51,7 @@ from iblf_jax.engine.metric_folds import finished, split_floats
 from iblf_jax.engine.outcome import Outcome
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.time_step import Advanced, advance
-from iblf_jax.simulation import accuracy
+from iblf_jax.simulation import error_estimate
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
 from iblf_jax.simulation.paths import get, with_parameters
 from iblf_jax.simulation.signals import Sample
@@ -336,9 +336,9 @@ def run_with_tangents(
     def at_end(inputs, before):
         def metrics(scenario, carry, eps):
             found: dict[str, jax.Array] = dict.fromkeys(
-                (name for name, _ in accuracy.UNITS), jnp.zeros_like(inputs.dt)
+                (name for name, _ in error_estimate.UNITS), jnp.zeros_like(inputs.dt)
             )
-            found[accuracy.ERROR] = jnp.zeros_like(carry.accuracy.error)
+            found[error_estimate.ERROR] = jnp.zeros_like(carry.accuracy.error)
             results = finished(inputs.folds, carry.accumulators).items()
             return (
                 found | {name: x for name, x in results if jnp.issubdtype(x.dtype, jnp.floating)},

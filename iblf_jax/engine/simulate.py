@@ -20,9 +20,9 @@ from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.single_run import run_one
 from iblf_jax.engine.transformable import run_transformable
 from iblf_jax.simulation.metrics import Fold, as_folds, metric_units
+from iblf_jax.simulation.noise import has_noise, noise_key
 from iblf_jax.simulation.results import Metrics, Rollout
-from iblf_jax.simulation.sampling import check_step, has_noise, noise_key
-from iblf_jax.simulation.scenario import Scenario, canonical
+from iblf_jax.simulation.scenario import Scenario, canonical, check_step
 
 MAX_SAMPLES = 20_000_000
 """Recorded samples of a run at most: a mistake in `duration` or `dt` must not fill the memory.  For
@@ -123,7 +123,7 @@ def run_rollout(
       folds: the metrics, as `as_folds` gives them.
       dt: time step, () [s].
       request: the checked request; it records at least one instant.
-      noise: key of a sensor's noise (`sampling.noise_key`).
+      noise: key of a sensor's noise (`noise.noise_key`).
     """
     if checks.is_concrete((scenario, folds, dt)):
         outcome = run_one(scenario, folds, dt, request, noise)

@@ -38,11 +38,11 @@ from iblf_jax.core.pytree import field_values, unwrapped
 from iblf_jax.core.status import Status
 from iblf_jax.engine import Outcome, RunRequest, run_batch
 from iblf_jax.engine.simulate import simulate
-from iblf_jax.simulation.accuracy import RELATIVE
+from iblf_jax.simulation.error_estimate import RELATIVE
 from iblf_jax.simulation.metrics import AboveGravity, as_folds, standard, watched
+from iblf_jax.simulation.noise import noise_of
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.results import Rollout
-from iblf_jax.simulation.sampling import noise_of
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.comparison import Comparison
 from iblf_jax.studies.equal_effort import NO_EFFORT, EffortSearch, Trials, grid, search

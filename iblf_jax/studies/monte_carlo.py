@@ -12,9 +12,9 @@ from typing import Any
 
 from iblf_jax.core import checks, notices
 from iblf_jax.core.progress import bar
-from iblf_jax.simulation.accuracy import RELATIVE
+from iblf_jax.simulation.error_estimate import RELATIVE
 from iblf_jax.simulation.metrics import Fold
-from iblf_jax.simulation.sampling import has_noise
+from iblf_jax.simulation.noise import has_noise
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.blocks import case_bytes
 from iblf_jax.studies.distributions import Perturbation

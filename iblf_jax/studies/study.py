@@ -29,8 +29,8 @@ from iblf_jax.engine import RunRequest, block_size, run_rollout
 from iblf_jax.engine.simulate import SimulationWarning
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.metrics import metric_units
+from iblf_jax.simulation.noise import NOISE_NAME, noise_of
 from iblf_jax.simulation.results import Metrics, Rollout
-from iblf_jax.simulation.sampling import NOISE_NAME, noise_of
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies import statistics, summaries
 from iblf_jax.studies.blocks import BlockResults, run_blocks

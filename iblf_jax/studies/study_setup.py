@@ -18,8 +18,8 @@ import numpy as np
 
 from iblf_jax.engine import CompiledBatch, RunRequest, block_size, compile_batch
 from iblf_jax.simulation.metrics import Fold, as_folds
-from iblf_jax.simulation.sampling import check_step, noise_of
-from iblf_jax.simulation.scenario import Scenario, canonical
+from iblf_jax.simulation.noise import noise_of
+from iblf_jax.simulation.scenario import Scenario, canonical, check_step
 from iblf_jax.studies.designs import designed_numbers
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.draws import (

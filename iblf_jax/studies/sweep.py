@@ -21,7 +21,7 @@ import numpy as np
 from iblf_jax.core import checks, notices
 from iblf_jax.core.progress import bar
 from iblf_jax.engine import sweep_unit, whole_blocks
-from iblf_jax.simulation.accuracy import RELATIVE
+from iblf_jax.simulation.error_estimate import RELATIVE
 from iblf_jax.simulation.metrics import Fold, metric_units
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.simulation.signals import own_dims

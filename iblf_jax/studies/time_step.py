@@ -9,7 +9,7 @@ import numpy as np
 from iblf_jax.core import checks, notices
 from iblf_jax.core.status import Status, has_flag
 from iblf_jax.engine import block_size, step_size
-from iblf_jax.simulation.accuracy import RELATIVE, TOLERANCE
+from iblf_jax.simulation.error_estimate import RELATIVE, TOLERANCE
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.blocks import run_blocks
