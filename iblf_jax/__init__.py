@@ -113,13 +113,13 @@ if TYPE_CHECKING:
     from iblf_jax.studies.compare import compare as compare
     from iblf_jax.studies.comparison import Comparison as Comparison
     from iblf_jax.studies.monte_carlo import monte_carlo as monte_carlo
-    from iblf_jax.studies.recommended import recommended_dt as recommended_dt
     from iblf_jax.studies.sensitivity import Sensitivity as Sensitivity
     from iblf_jax.studies.sensitivity import sensitivity as sensitivity
     from iblf_jax.studies.store import StoreError as StoreError
     from iblf_jax.studies.study import Study as Study
     from iblf_jax.studies.sweep import load_sweep as load_sweep
     from iblf_jax.studies.sweep import sweep as sweep
+    from iblf_jax.studies.time_step import recommended_dt as recommended_dt
     from iblf_jax.tuning import Attack as Attack
     from iblf_jax.tuning import Front as Front
     from iblf_jax.tuning import TuneResult as TuneResult
@@ -155,7 +155,7 @@ _ON_FIRST_USE = {
     "objectives": ("iblf_jax.tuning.objectives", None),
     "pareto": ("iblf_jax.tuning", "pareto"),
     "plotting": ("iblf_jax.plotting", None),
-    "recommended_dt": ("iblf_jax.studies.recommended", "recommended_dt"),
+    "recommended_dt": ("iblf_jax.studies.time_step", "recommended_dt"),
     "recommended_period": ("iblf_jax.engine.period", "recommended_period"),
     "report": ("iblf_jax.reports", "report"),
     "save_tuning": ("iblf_jax.files.tuning", "save_tuning"),

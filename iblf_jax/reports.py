@@ -21,6 +21,8 @@ import jax
 import numpy as np
 
 from iblf_jax.core import checks, notices, tables
+from iblf_jax.core.optional import has_members
+from iblf_jax.core.pytree import wrapped_field
 from iblf_jax.simulation.paths import get, parameters, unit_at
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.world.robots import joint_names
@@ -89,7 +91,7 @@ def _parts_of(scenario: Scenario) -> str:
 
 def _kind(part: Any) -> str:
     """The class of a component, with the class of the law or the barrier inside it."""
-    inner = getattr(part, getattr(type(part), "wraps", None) or "barrier", None)
+    inner = getattr(part, wrapped_field(part) or "barrier", None)
     if inner is None:
         return type(part).__name__
     return f"{type(part).__name__} ({type(inner).__name__})"
@@ -106,9 +108,8 @@ MAX_LEAVES = 4
 def _short(value: Any) -> str:
     if not checks.is_concrete(value):
         return "traced"
-    return np.array2string(
-        np.asarray(value), precision=4, threshold=7, edgeitems=2, separator=", "
-    ).replace("\n", "")
+    options: dict[str, Any] = {"precision": 4, "threshold": 7, "edgeitems": 2, "separator": ", "}
+    return np.array2string(np.asarray(value), **options).replace("\n", "")
 
 
 def _scenario(scenario: Scenario) -> Shown:
@@ -184,24 +185,14 @@ def _study(study: Study) -> Shown:
 
 
 def _certificate(found: Certificate) -> Shown:
-    return Shown(
-        f"Certificate: {found.verdict}",
-        [found.subject],
-        {"Line by line": found.table_html()},
-        {"Along the run": found.plot},
-    )
+    table, figure = {"Line by line": found.table_html()}, {"Along the run": found.plot}
+    return Shown(f"Certificate: {found.verdict}", [found.subject], table, figure)
 
 
 def _comparison(found: Comparison) -> Shown:
-    first = next(iter(found.rollouts.values())).scenario
-    return Shown(
-        "Comparison",
-        _described(found)[:1],
-        found.tables_html(),
-        {"Side by side": found.plot},
-        first,
-        on_card=2,
-    )
+    scenario = next(iter(found.rollouts.values())).scenario
+    words, figures = _described(found)[:1], {"Side by side": found.plot}
+    return Shown("Comparison", words, found.tables_html(), figures, scenario, on_card=2)
 
 
 def _tuning(found: TuneResult) -> Shown:
@@ -216,14 +207,8 @@ def _tuning(found: TuneResult) -> Shown:
 
 
 def _identification(found: Identification) -> Shown:
-    return Shown(
-        "Identification",
-        found.words(),
-        found.tables_html(),
-        {"Numbers and residuals": found.plot},
-        found.scenario,
-        on_card=2,
-    )
+    contents, figures = found.tables_html(), {"Numbers and residuals": found.plot}
+    return Shown("Identification", found.words(), contents, figures, found.scenario, on_card=2)
 
 
 KINDS: dict[str, Callable[[Any], Shown]] = {
@@ -245,7 +230,7 @@ def shown(result: Any) -> Shown:
     if maker is not None:
         return maker(result)
     figures = {}
-    if hasattr(result, "plot"):
+    if has_members(result, "plot"):
         figures["Figure"] = result.plot
     scenario = getattr(result, "scenario", None)
     return Shown(type(result).__name__, _described(result), {}, figures, scenario)
@@ -303,12 +288,8 @@ def report(result: Any, path: str | Path, *, title: str | None = None) -> Path:
     if path.suffix not in (".html", ".htm"):
         raise checks.fail("path", str(path), 'a file that ends in ".html"')
     if not type(result).__module__.startswith("iblf_jax"):
-        raise checks.fail(
-            "result",
-            result,
-            "a result of this package",
-            "ij.simulate and ij.tune, for example, return one.",
-        )
+        remedy = "ij.simulate and ij.tune, for example, return one."
+        raise checks.fail("result", result, "a result of this package", remedy)
     path.write_text(_page(shown(result), title), encoding="utf-8")
     return path
 

@@ -18,6 +18,7 @@ import numpy as np
 from iblf_jax.certificates import decay_lines, law_claim_lines, lines, rate_lines, theorem_lines
 from iblf_jax.certificates.claims import own_claim
 from iblf_jax.certificates.lines import FAILS, NOT_APPLICABLE, Line, Statement, not_applicable
+from iblf_jax.certificates.optional import optional_member
 from iblf_jax.certificates.reconstruction import is_valid, time_grid
 from iblf_jax.certificates.result import Certificate, Traces
 from iblf_jax.certificates.run_summary import THEOREM, WEIGHTED, RunSummary, Segment, summarise
@@ -26,7 +27,6 @@ from iblf_jax.core import checks, notices
 from iblf_jax.core.optional import has_members
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.engine.simulate import SimulationWarning, simulate
-from iblf_jax.simulation.optional import optional_member
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical, with_parts
 from iblf_jax.world.robots import joint_names

@@ -7,11 +7,11 @@ scenario. The proof leaves
     Q = sum_i rate_i V1_i + e2^T (K2 - I/2) e2 + f_tilde^T (kf - I) f_tilde >= rho V2,        (3.24)
 
 and `counterexample` maximises g = (V2' - 1/2 |f'|^2) / Q at t = 0 over perturbations of the
-scenario (`studies.cube`), from many starting points, with the exact gradient. Where the proof is
-exact, g never exceeds -1, whatever is varied. g > -1 breaks (3.24); g > 0 breaks the claim itself,
-(3.18) and (3.26) for every rho > 0: V2 grows where the theorem claims a decrease. For law and
-observer as printed such starts exist, because the terms that the proof drops grow with the cube of
-the joint velocity, and Q with its square.
+scenario (`studies.perturbation_cube`), from many starting points, with the exact gradient. Where
+the proof is exact, g never exceeds -1, whatever is varied. g > -1 breaks (3.24); g > 0 breaks the
+claim itself, (3.18) and (3.26) for every rho > 0: V2 grows where the theorem claims a decrease. For
+law and observer as printed such starts exist, because the terms that the proof drops grow with the
+cube of the joint velocity, and Q with its square.
 
 Points at which the scenario cannot run (a start outside its bounds, a negative mass), or at which
 nothing is claimed (the guard or a torque limit is active), are no counterexamples and are skipped.
@@ -35,8 +35,8 @@ from iblf_jax.core.pytree import unwrapped
 from iblf_jax.simulation.closed_loop import initial_state
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.scenario import Scenario, canonical
-from iblf_jax.studies.cube import bounded
 from iblf_jax.studies.distributions import Perturbation
+from iblf_jax.studies.perturbation_cube import bounded
 
 EXCLUDED = "The guard or a torque limit is active at the start, where nothing is claimed."
 

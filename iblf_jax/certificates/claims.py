@@ -48,12 +48,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.certificates.optional import optional_member
 from iblf_jax.control.actuators import Ideal
 from iblf_jax.control.controllers import Backstepping, FullState, LyapunovLaw, Saturated
 from iblf_jax.control.observers import Momentum, Printed
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import unwrapped
-from iblf_jax.simulation.optional import optional_member
 from iblf_jax.simulation.scenario import Scenario
 
 CASES = (1, 2)

@@ -19,6 +19,7 @@ from iblf_jax.certificates.lines import (
     join_notes,
     not_applicable,
 )
+from iblf_jax.certificates.optional import optional_member
 from iblf_jax.certificates.reconstruction import padded_index
 from iblf_jax.certificates.run_summary import (
     THEOREM,
@@ -28,7 +29,6 @@ from iblf_jax.certificates.run_summary import (
     weighted_lyapunov,
 )
 from iblf_jax.core.pytree import unwrapped
-from iblf_jax.simulation.optional import optional_member
 from iblf_jax.simulation.scenario import Scenario
 
 INEQUALITIES = {

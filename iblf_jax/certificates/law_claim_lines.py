@@ -13,6 +13,7 @@ from iblf_jax.certificates.lines import (
     Statement,
     not_applicable,
 )
+from iblf_jax.certificates.optional import optional_member
 from iblf_jax.certificates.proof_terms import GENERAL_TERMS
 from iblf_jax.certificates.run_summary import (
     ALWAYS_EXCLUDED,
@@ -21,7 +22,6 @@ from iblf_jax.certificates.run_summary import (
 )
 from iblf_jax.control.actuators import Ideal
 from iblf_jax.core import checks
-from iblf_jax.simulation.optional import optional_member
 
 OWN_ROUNDING = 8.0
 """Relative errors of the derivatives of a law's own V, in those of their terms."""

@@ -39,12 +39,12 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.certificates.claims import decay_phi, decay_rate, own_claim
+from iblf_jax.certificates.optional import optional_member
 from iblf_jax.control.controllers import Backstepping, FullState
 from iblf_jax.control.observers import Printed
 from iblf_jax.core.linalg import matvec, solve_spd
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, rate
-from iblf_jax.simulation.optional import optional_member
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import Sample
 from iblf_jax.world.bounds import NARROWEST

@@ -29,7 +29,7 @@ from iblf_jax.core import checks
 from iblf_jax.core.optional import attributes
 from iblf_jax.core.status import UNTRUSTED, Status, describe
 from iblf_jax.engine import step_states
-from iblf_jax.simulation import jumps
+from iblf_jax.simulation import discontinuities
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
 from iblf_jax.simulation.scenario import Scenario
 
@@ -209,9 +209,9 @@ class AdvanceStep:
     def __call__(self, inputs, at: Position, index: jax.Array, form):
         """The position after the step; the state, V2 and |f_tilde|^2/2 before it."""
         number = at.steps + index.astype(at.steps.dtype)
-        span = jumps.Span(number * at.size, (number + 1.0) * at.size, at.size)
-        division = jumps.divided(inputs.scenario.jump_times(), span)
-        result = jumps.integrated(
+        span = discontinuities.Span(number * at.size, (number + 1.0) * at.size, at.size)
+        division = discontinuities.divided(inputs.scenario.jump_times(), span)
+        result = discontinuities.integrated(
             self.method,
             partial(evaluate, inputs.scenario),
             division,

@@ -27,10 +27,10 @@ from iblf_jax.certificates.lines import (
     not_applicable,
     verdict_of,
 )
+from iblf_jax.certificates.optional import optional_member
 from iblf_jax.certificates.run_summary import THEOREM, RunSummary, Segment
 from iblf_jax.control.observers import Momentum
 from iblf_jax.core.status import Status
-from iblf_jax.simulation.optional import optional_member
 from iblf_jax.simulation.signals import has
 
 BOUNDED = Statement("f bounded", "Assumption 1", "|f| <= F_m", "N m")

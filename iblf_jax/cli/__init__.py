@@ -1,7 +1,8 @@
 """The command line: `python -m iblf_jax COMMAND`, or `iblf-jax COMMAND`.
 
-Each command is one module with `add_parser(subparsers)` and `run(args) -> int`.  A new command is a
-new module and its name in `COMMANDS`.  Slow imports stand inside `run`, so that `--help` is fast.
+Each command is one module with the texts HELP, DESCRIPTION and EPILOG (or None), the function
+`add_arguments(parser)` and the function `run(args) -> int`.  A new command is a new module and its
+name in `COMMANDS`.  Slow imports are inside `run`, so that `--help` is fast.
 The commands compute in float64.
 
 Exit codes: 0 done; 1 a run failed (a bound was violated, the state diverged, the step was too
@@ -24,7 +25,7 @@ import jax
 
 from iblf_jax._start import INTERRUPTED, end_process
 from iblf_jax.core import checks
-from iblf_jax.core.cache import keep_programs
+from iblf_jax.core.disk_cache import keep_programs
 
 COMMANDS = (
     "reproduce",
@@ -158,7 +159,12 @@ def build_parser() -> argparse.ArgumentParser:
         title="commands", metavar="COMMAND", required=True, dest="command"
     )
     for name in COMMANDS:
-        importlib.import_module(f"iblf_jax.cli.{name}").add_parser(subparsers)
+        command = importlib.import_module(f"iblf_jax.cli.{name}")
+        of_command = subparsers.add_parser(
+            name, help=command.HELP, description=command.DESCRIPTION, epilog=command.EPILOG
+        )
+        command.add_arguments(of_command)
+        of_command.set_defaults(run=command.run)
     return parser
 
 

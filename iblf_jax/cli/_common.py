@@ -164,7 +164,7 @@ def given_options(args: argparse.Namespace, *names: str) -> dict[str, Any]:
 
 
 def optional_folder(name: str | None) -> Path | None:
-    """As `output_folder`; None without --out."""
+    """The folder of --out as `output_folder` returns it, or None without --out."""
     if not name:
         return None
     return output_folder(name)

@@ -20,7 +20,7 @@ UNFINISHED = 3
 DASK_TIMEOUT = 30
 """Seconds to wait for a Dask scheduler."""
 
-EPILOG = (
+STUDY_EPILOG = (
     "Exit codes: 0 every run is ok; 1 done, and some runs failed; 2 bad arguments or files, or a"
     " store of another configuration; 3 not finished (disk full, worker lost), what is written"
     " stays valid; 130 interrupted."

@@ -22,17 +22,16 @@ if TYPE_CHECKING:
     from iblf_jax.studies.comparison import Comparison
 
 
-def add_parser(subparsers: argparse._SubParsersAction) -> None:
-    """Adds the command."""
-    parser = subparsers.add_parser(
-        "compare",
-        help="run several laws side by side",
-        description=(
-            "Run several laws on one scenario, at their given gains and at equal effort (RMS torque"
-            " above gravity), and print one table for each."
-        ),
-        epilog=f"Exit code 1 if a run at the given gains failed: {FAILURES}",
-    )
+HELP = "run several laws side by side"
+DESCRIPTION = (
+    "Run several laws on one scenario, at their given gains and at equal effort (RMS torque"
+    " above gravity), and print one table for each."
+)
+EPILOG = f"Exit code 1 if a run at the given gains failed: {FAILURES}"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of the command."""
     add_scenario_arguments(parser, default="zhang_yan_2024")
     add_run_arguments(parser)
     parser.add_argument(
@@ -49,7 +48,6 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
         metavar="DIR",
         help="write comparison.txt, .csv and .json, figures and rollouts.nc into this folder",
     )
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

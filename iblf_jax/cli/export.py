@@ -6,18 +6,16 @@ import argparse
 
 from iblf_jax.cli._common import add_scenario_arguments, output_folder, scenario_of
 
+HELP = "write a law as C99 or an FMU, or a closed loop for a browser"
+DESCRIPTION = (
+    "Write the law of a scenario as C99 or an FMU, or its closed loop as an FMU or"
+    " WebAssembly; print files, operations and sizes."
+)
+EPILOG = "Exit code 2 also if a compiler is missing or fails."
 
-def add_parser(subparsers: argparse._SubParsersAction) -> None:
-    """Adds the command."""
-    parser = subparsers.add_parser(
-        "export",
-        help="write a law as C99 or an FMU, or a closed loop for a browser",
-        description=(
-            "Write the law of a scenario as C99 or an FMU, or its closed loop as an FMU or"
-            " WebAssembly; print files, operations and sizes."
-        ),
-        epilog="Exit code 2 also if a compiler is missing or fails.",
-    )
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of the command."""
     add_scenario_arguments(parser)
     parser.add_argument("--out", required=True, metavar="DIR", help="the folder to write into")
     parser.add_argument(
@@ -60,7 +58,6 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
         metavar="N",
         help="seed of a closed loop's sensor noise (default: 0)",
     )
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

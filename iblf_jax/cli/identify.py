@@ -7,19 +7,17 @@ from __future__ import annotations
 
 import argparse
 
+HELP = "estimate parameters of a robot from its log"
+DESCRIPTION = (
+    "Estimate the parameters that an identification file names (its format:"
+    " iblf_jax.files.identification) from the log that it names; print values, standard"
+    " errors and the parameters that the log does not identify."
+)
+EPILOG = "Exit code 1 if the log does not identify one of the parameters."
 
-def add_parser(subparsers: argparse._SubParsersAction) -> None:
-    """Adds the command."""
-    parser = subparsers.add_parser(
-        "identify",
-        help="estimate parameters of a robot from its log",
-        description=(
-            "Estimate the parameters that an identification file names (its format:"
-            " iblf_jax.files.identification) from the log that it names; print values, standard"
-            " errors and the parameters that the log does not identify."
-        ),
-        epilog="Exit code 1 if the log does not identify one of the parameters.",
-    )
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of the command."""
     parser.add_argument("file", metavar="IDENTIFY.toml", help="an identification file")
     parser.add_argument(
         "--log",
@@ -35,7 +33,6 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
             " folder"
         ),
     )
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -5,32 +5,30 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from iblf_jax.cli._studies import EPILOG, add_study_arguments, run_study, write_netcdf
+from iblf_jax.cli._studies import STUDY_EPILOG, add_study_arguments, run_study, write_netcdf
 from iblf_jax.core.tables import as_text
 
 if TYPE_CHECKING:
     from iblf_jax.studies.study import Study
 
 
-def add_parser(subparsers: argparse._SubParsersAction) -> None:
-    """Adds the command."""
-    parser = subparsers.add_parser(
-        "montecarlo",
-        help="run a scenario many times with random parameters",
-        description=(
-            "Run the study that a file describes (a scenario file with [run], [perturbations] and"
-            " [study]); print how often the bounds were violated, quantiles of the metrics, the"
-            " worst runs, and which parameters correlate with the margin."
-        ),
-        epilog=EPILOG,
-    )
+HELP = "run a scenario many times with random parameters"
+DESCRIPTION = (
+    "Run the study that a file describes (a scenario file with [run], [perturbations] and"
+    " [study]); print how often the bounds were violated, quantiles of the metrics, the"
+    " worst runs, and which parameters correlate with the margin."
+)
+EPILOG = STUDY_EPILOG
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of the command."""
     parser.add_argument("file", metavar="STUDY.toml", help="the study file")
     parser.add_argument(
         "--runs", type=int, metavar="N", help="number of runs (default: the file's)"
     )
     parser.add_argument("--seed", type=int, metavar="N", help="seed (default: the file's, else 0)")
     add_study_arguments(parser)
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -6,19 +6,16 @@ import argparse
 
 from iblf_jax.cli._common import add_scenario_arguments, scenario_of
 
+HELP = "list the parameters of a scenario: path, shape, unit, value"
+DESCRIPTION = (
+    "List every parameter of a scenario with the path by which --set, sweeps and tuning address it."
+)
+EPILOG = None
 
-def add_parser(subparsers: argparse._SubParsersAction) -> None:
-    """Adds the command."""
-    parser = subparsers.add_parser(
-        "parameters",
-        help="list the parameters of a scenario: path, shape, unit, value",
-        description=(
-            "List every parameter of a scenario with the path by which --set, sweeps and tuning"
-            " address it."
-        ),
-    )
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of the command."""
     add_scenario_arguments(parser)
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -9,20 +9,18 @@ from typing import Any
 
 from iblf_jax.cli._common import add_preset_arguments, assignments
 
+HELP = "list the predefined scenarios"
+DESCRIPTION = "List the presets, describe one, or print it as a scenario file."
+EPILOG = None
 
-def add_parser(subparsers: argparse._SubParsersAction) -> None:
-    """Adds the command."""
-    parser = subparsers.add_parser(
-        "presets",
-        help="list the predefined scenarios",
-        description="List the presets, describe one, or print it as a scenario file.",
-    )
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of the command."""
     parser.add_argument("name", nargs="?", metavar="PRESET", help="describe this one")
     parser.add_argument(
         "--toml", action="store_true", help="print it as a scenario file, to be edited"
     )
     add_preset_arguments(parser)
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -19,19 +19,18 @@ NAMES = {"integral": "integral BLF", "log": "log-BLF"}
 """Law of the preset -> name of the run in tables, figures and files."""
 
 
-def add_parser(subparsers: argparse._SubParsersAction) -> None:
-    """Adds the command."""
-    parser = subparsers.add_parser(
-        "reproduce",
-        help="reproduce the paper's simulation and its six figures",
-        description=(
-            "Run the paper's law (integral barrier) and its comparison (log barrier), write the six"
-            " figures, an animation of the arm, the data and the metrics, and report which of the"
-            " paper's claims hold. The paper prints no masses and lengths of its arm; the runs"
-            " assume values, and the output lists them."
-        ),
-        epilog="Source: T. Zhang, P. Yan, AIMS Mathematics 9(1) (2024) 319-339.",
-    )
+HELP = "reproduce the paper's simulation and its six figures"
+DESCRIPTION = (
+    "Run the paper's law (integral barrier) and its comparison (log barrier), write the six"
+    " figures, an animation of the arm, the data and the metrics, and report which of the"
+    " paper's claims hold. The paper prints no masses and lengths of its arm; the runs"
+    " assume values, and the output lists them."
+)
+EPILOG = "Source: T. Zhang, P. Yan, AIMS Mathematics 9(1) (2024) 319-339."
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of the command."""
     parser.add_argument(
         "--out", required=True, metavar="DIR", help="write everything into this folder"
     )
@@ -54,7 +53,6 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--dt", type=float, default=1e-3, metavar="S", help="time step [s] (default: 0.001)"
     )
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -23,14 +23,13 @@ if TYPE_CHECKING:
     from iblf_jax.simulation.results import Rollout
 
 
-def add_parser(subparsers: argparse._SubParsersAction) -> None:
-    """Adds the command."""
-    parser = subparsers.add_parser(
-        "simulate",
-        help="run a scenario once",
-        description="Run a scenario once; print its status and metrics.",
-        epilog=f"Exit code 1 if the run failed: {FAILURES}",
-    )
+HELP = "run a scenario once"
+DESCRIPTION = "Run a scenario once; print its status and metrics."
+EPILOG = f"Exit code 1 if the run failed: {FAILURES}"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of the command."""
     add_scenario_arguments(parser)
     add_run_arguments(parser)
     parser.add_argument(
@@ -41,7 +40,6 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
         metavar="DIR",
         help="write rollout.nc, metrics.json, overview.png and scenario.toml into this folder",
     )
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

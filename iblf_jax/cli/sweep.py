@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from iblf_jax.cli._studies import EPILOG, add_study_arguments, run_study, write_netcdf
+from iblf_jax.cli._studies import STUDY_EPILOG, add_study_arguments, run_study, write_netcdf
 from iblf_jax.core.tables import as_text
 
 if TYPE_CHECKING:
@@ -14,18 +14,17 @@ if TYPE_CHECKING:
 MAX_ROWS = 40
 
 
-def add_parser(subparsers: argparse._SubParsersAction) -> None:
-    """Adds the command."""
-    parser = subparsers.add_parser(
-        "sweep",
-        help="run a scenario over many values of its parameters",
-        description=(
-            "Run the sweep that a file describes (a scenario file with [run], [grid], [sweep] and,"
-            " if runs are perturbed, [perturbations]).  With --store it is written unit by unit;"
-            " killed or interrupted, the same command computes the rest."
-        ),
-        epilog=EPILOG,
-    )
+HELP = "run a scenario over many values of its parameters"
+DESCRIPTION = (
+    "Run the sweep that a file describes (a scenario file with [run], [grid], [sweep] and,"
+    " if runs are perturbed, [perturbations]).  With --store it is written unit by unit;"
+    " killed or interrupted, the same command computes the rest."
+)
+EPILOG = STUDY_EPILOG
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of the command."""
     parser.add_argument("file", metavar="SWEEP.toml", help="the sweep file")
     parser.add_argument(
         "--store", metavar="FOLDER.zarr", help="write to this store, and compute what it lacks"
@@ -36,7 +35,6 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
         help="several processes run this command on the same store at the same time",
     )
     add_study_arguments(parser)
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

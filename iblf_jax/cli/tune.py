@@ -9,17 +9,16 @@ if TYPE_CHECKING:
     from iblf_jax.tuning import TuningReport
 
 
-def add_parser(subparsers: argparse._SubParsersAction) -> None:
-    """Adds the command."""
-    parser = subparsers.add_parser(
-        "tune",
-        help="tune gains by gradient",
-        description=(
-            "Tune the parameters of a tuning file (its format: iblf_jax.files.tuning); print the"
-            " report, on new random runs if there are perturbations."
-        ),
-        epilog="Exit code 1 if a requirement failed or the objective did not decrease.",
-    )
+HELP = "tune gains by gradient"
+DESCRIPTION = (
+    "Tune the parameters of a tuning file (its format: iblf_jax.files.tuning); print the"
+    " report, on new random runs if there are perturbations."
+)
+EPILOG = "Exit code 1 if a requirement failed or the objective did not decrease."
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of the command."""
     parser.add_argument("file", metavar="TUNE.toml", help="a tuning file")
     parser.add_argument(
         "--out",
@@ -38,7 +37,6 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
         help="largest number of steps (default: the file's, else 60)",
     )
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -9,7 +9,7 @@
 Every function and every topic of marks has a bound of its own, and the entries that were used least
 recently leave first.  All entries can be computed again: `CACHE.clear()` costs time and nothing
 else.  Programs that JAX has compiled are bounded by `core.programs`, the folder on the disk by
-`core.cache`.
+`core.disk_cache`.
 """
 
 from __future__ import annotations

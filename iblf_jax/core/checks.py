@@ -12,11 +12,13 @@ import dataclasses
 import difflib
 import errno
 import functools
+import inspect
+import math
 import numbers
 import os
 import re
 import tempfile
-from collections.abc import Callable, Hashable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -25,16 +27,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core.devices import default, platform
-from iblf_jax.core.optional import missing_members
+from iblf_jax.core.optional import has_members, missing_members
 
 F = TypeVar("F", bound=Callable)
 
 LARGEST_INTEGER = 2**63 - 1
 MAX_STEPS = 2**31 - 1
 """Steps are counted in int32 inside the compiled loop."""
-
-SIGNS_OF_LIMITS = ("limit", "positive limit")
-"""Signs of leaves that may be infinite."""
 
 LONGEST_TEXT = {"field": 200, "value": 160, "words": 800, "message": 1400}
 """Characters of an error message's parts, and of all that the command line prints of one: what a
@@ -153,19 +152,15 @@ def fail(field: str, got: Any, expected: str, remedy: str = "") -> ValueError:
 
 def nearest(name: Any, known: Iterable[str]) -> str:
     """The remedy for a misspelt word, "Did you mean ...?"; nothing where no known word is near."""
-    words = [str(word) for word in known]
-    close = difflib.get_close_matches(str(name)[: LONGEST_TEXT["value"]], words, n=2, cutoff=0.6)
-    if not close:
-        return ""
-    return f"Did you mean {' or '.join(close)}?"
+    given, words = str(name)[: LONGEST_TEXT["value"]], map(str, known)
+    close = difflib.get_close_matches(given, list(words), n=2, cutoff=0.6)
+    return f"Did you mean {' or '.join(close)}?" if close else ""
 
 
 def did_you_mean(name: Any, known: Iterable[str]) -> str:
     """The remedy for a misspelt word: the nearest known ones, or all of them."""
     words = [str(word) for word in known]
-    if not words:
-        return ""
-    return nearest(name, words) or f"There are: {', '.join(words)}."
+    return nearest(name, words) or f"There are: {', '.join(words)}." if words else ""
 
 
 def with_article(noun: str) -> str:
@@ -230,7 +225,9 @@ def _kind_of(field: dataclasses.Field) -> str:
         return f"a number or an array of numbers [{field.metadata['unit']}]"
     if isinstance(field.type, str):
         return with_article(field.type)
-    return with_article(getattr(field.type, "__name__", str(field.type)))
+    if isinstance(field.type, type):
+        return with_article(field.type.__name__)
+    return with_article(str(field.type))
 
 
 def renamed(**names: str) -> Callable[[F], F]:
@@ -243,13 +240,9 @@ def renamed(**names: str) -> Callable[[F], F]:
         def called(*args: Any, **options: Any) -> Any:
             for old, new in names.items():
                 if old in options:
-                    call = f"{function.__name__}(..., {new}=...)"
-                    raise fail(
-                        f"{function.__name__}: {old}",
-                        options[old],
-                        f"it as {new}",
-                        f"The keyword has a new name: {call}.",
-                    )
+                    field, expected = f"{function.__name__}: {old}", f"it as {new}"
+                    remedy = f"The keyword has a new name: {function.__name__}(..., {new}=...)."
+                    raise fail(field, options[old], expected, remedy)
             return function(*args, **options)
 
         return cast(F, called)
@@ -268,13 +261,14 @@ def inside(where: str | os.PathLike, error: Exception) -> ValueError:
 
 
 def _is_number_like(value: Any, depth: int = 0) -> bool:
-    if isinstance(value, numbers.Number | np.ndarray | np.generic | jax.Array):
-        return True
-    return (
-        isinstance(value, list | tuple)
-        and depth < MAX_DEPTH
-        and all(_is_number_like(x, depth + 1) for x in value)
-    )
+    """Whether this is a number, an array, or nested lists and tuples of such."""
+    if isinstance(value, list | tuple):
+        return depth < MAX_DEPTH and all(_is_number_like(x, depth + 1) for x in value)
+    return isinstance(value, numbers.Number | np.ndarray | np.generic | jax.Array)
+
+
+MAX_AXES = {"scalar": (0, "one number"), "joint": (1, "one number, or one a joint, (n,)")}
+"""Shape of a leaf -> largest number of its axes, and what is expected."""
 
 
 def as_leaf(owner: str, field: dataclasses.Field, value: Any) -> Any:
@@ -285,27 +279,25 @@ def as_leaf(owner: str, field: dataclasses.Field, value: Any) -> Any:
     """
     declared = field.metadata.get("leaf", False)
     name = f"{owner}.{field.name}"
+    expected = "a number or an array of numbers"
     if value is None:
-        if field.default is not None:
-            expected = {True: "a number or an array of numbers", False: "a component"}
-            raise fail(name, value, expected[declared])
-        return None
-    if isinstance(value, tuple | list) and len(value) == 0 and not declared:
+        if field.default is None:
+            return None
+        raise fail(name, value, expected if declared else "a component")
+    if not declared and isinstance(value, tuple | list) and not value:
         return tuple(value)
     if not _is_number_like(value):
         if declared:
-            raise fail(name, value, "a number or an array of numbers")
+            raise fail(name, value, expected)
         return value
     array = as_floats(name, value)
     if declared:
+        shape = f"Its shape is {array.shape}."
         if array.size == 0:
-            raise fail(name, value, "at least one number", f"Its shape is {array.shape}.")
-        if field.metadata["shape"] == "scalar" and array.ndim != 0:
-            raise fail(name, value, "one number", f"Its shape is {array.shape}.")
-        if field.metadata["shape"] == "joint" and array.ndim > 1:
-            raise fail(
-                name, value, "one number, or one a joint, (n,)", f"Its shape is {array.shape}."
-            )
+            raise fail(name, value, "at least one number", shape)
+        most, expected = MAX_AXES.get(field.metadata["shape"], (array.ndim, ""))
+        if array.ndim > most:
+            raise fail(name, value, expected, shape)
     check_values(name, array, field.metadata.get("sign"))
     return array
 
@@ -326,24 +318,15 @@ def as_floats(name: str, value: Any) -> jax.Array:
 
 
 def _as_array(value: Any) -> jax.Array:
-    if _is_on_host(value):
-        return _from_host(value)
-    return jnp.asarray(value)
-
-
-def _is_on_host(value: Any) -> bool:
-    """Whether a value consists of Python's or NumPy's numbers only."""
-    if isinstance(value, list | tuple):
-        return all(isinstance(x, int | float) for x in jax.tree.leaves(value))
-    return isinstance(value, int | float | np.ndarray | np.generic) and not isinstance(
-        value, np.ma.MaskedArray
-    )  # JAX refuses a mask
-
-
-def _from_host(value: Any) -> jax.Array:
-    """The array of a value on the host; `jnp.asarray` compiles a program for every new shape, 20
-    ms each.
+    """The array of a value.  `jnp.asarray` compiles a program for every new shape, 20 ms each, so
+    numbers of the host are put on the device as they are.
     """
+    if isinstance(value, list | tuple):
+        is_on_host = all(isinstance(x, int | float) for x in jax.tree.leaves(value))
+    else:
+        is_on_host = isinstance(value, int | float | np.ndarray | np.generic)
+    if not is_on_host or isinstance(value, np.ma.MaskedArray):  # JAX refuses a mask
+        return jnp.asarray(value)
     host: Any = np.array(value)  # a copy: JAX may share the memory of its argument
     if host.dtype.kind in "iu":
         host = host.astype(jnp.result_type(float))
@@ -353,40 +336,49 @@ def _from_host(value: Any) -> jax.Array:
         return jax.device_put(host)
 
 
+SIGNS: dict[str | None, tuple[Callable[[np.ndarray], Any], str, str]] = {
+    None: (np.isfinite, "finite numbers", "Replace the NaN or infinite entries."),
+    "limit": (
+        lambda x: ~np.isnan(x),
+        "numbers, infinite where there is no limit",
+        "Replace the NaN entries.",
+    ),
+    "positive": (lambda x: x > 0, "numbers > 0", "Give positive values."),
+    "nonnegative": (lambda x: x >= 0, "numbers >= 0", "Give non-negative values."),
+}
+"""Sign of a leaf -> whether numbers have it, what is expected, and the remedy."""
+SIGNS_TO_CHECK = {
+    None: (None,),
+    "limit": ("limit",),
+    "positive limit": ("limit", "positive"),
+    "positive": (None, "positive"),
+    "nonnegative": (None, "nonnegative"),
+}
+"""Declared sign of a leaf -> the entries of `SIGNS` that its numbers must satisfy."""
+
+
 def check_values(name: str, array: Any, sign: str | None) -> None:
     """Raises if a concrete array has a NaN, an infinity or a number of the wrong sign."""
     if array is None or isinstance(array, jax.core.Tracer):
         return
     values = np.asarray(array)
-    if sign in SIGNS_OF_LIMITS and np.isnan(values).any():
-        raise fail(
-            name, array, "numbers, infinite where there is no limit", "Replace the NaN entries."
-        )
-    if sign not in SIGNS_OF_LIMITS and not np.isfinite(values).all():
-        raise fail(name, array, "finite numbers", "Replace the NaN or infinite entries.")
-    if sign in ("positive", "positive limit") and not (values > 0).all():
-        raise fail(name, array, "numbers > 0", "Give positive values.")
-    if sign == "nonnegative" and not (values >= 0).all():
-        raise fail(name, array, "numbers >= 0", "Give non-negative values.")
+    for each in SIGNS_TO_CHECK[sign]:
+        has_sign, expected, remedy = SIGNS[each]
+        if not np.all(has_sign(values)):
+            raise fail(name, array, expected, remedy)
 
 
 def structural(owner: str, name: str, value: Any) -> None:
     """Raises if a static field holds something that cannot be part of a compiled program's
     identity.
     """
-    if isinstance(value, jax.Array | np.ndarray) or not isinstance(value, Hashable):
-        raise fail(
-            f"{owner}.{name}",
-            value,
-            "a hashable value",
-            "It is a structural field: give a number, a string or a tuple, not an array.",
-        )
     try:
+        if isinstance(value, jax.Array | np.ndarray):
+            raise TypeError("an array")
         hash(value)
     except Exception as error:
-        raise fail(
-            f"{owner}.{name}", value, "a hashable value", "Give a tuple in place of a list."
-        ) from error
+        remedy = "It is a structural field: give a number, a string or a tuple, not an array."
+        raise fail(f"{owner}.{name}", value, "a hashable value", remedy) from error
 
 
 def one_of(name: str, value: Any, allowed: Any) -> None:
@@ -401,78 +393,61 @@ def conforms(
     """Raises unless `value` is an object that JAX can take apart and that has what `protocol` asks
     for, except `optional`.
     """
-    members = {
-        x
-        for x in (*vars(protocol), *getattr(protocol, "__annotations__", {}))
-        if not x.startswith("_")
-    }
+    declared = {*vars(protocol), *inspect.get_annotations(protocol)} - {*optional}
+    members = sorted(x for x in declared if not x.startswith("_"))
     public = protocol.__module__.removesuffix("._base").replace(
         "iblf_jax.simulation.metrics", "iblf_jax.metrics"
     )
     expected = f"a component that fits {public}.{protocol.__name__}"
     if isinstance(value, type):
         raise fail(name, value, expected, "It is a class: make an instance, with brackets.")
-    bare = (
-        value is None
-        or isinstance(value, str | bytes | tuple | list | dict | jax.Array | np.ndarray)
-        or _is_number_like(value)
-    )
-    if bare:
+    if _is_plain(value):
         raise fail(name, value, expected, remedy)
-    missing = missing_members(value, sorted(members - set(optional)))
-    if missing:
-        raise fail(name, value, expected, f"{remedy} It lacks {', '.join(missing)}.".strip())
-    for field, part in getattr(value, "__dict__", {}).items():
+    offers(name, value, members, expected, remedy)
+    fields = vars(value) if has_members(value, "__dict__") else {}
+    for field, part in fields.items():
         flat_enough(f"{name}.{field}", part)
     try:
         leaves = jax.tree.leaves(value)
     except Exception as error:
         raise fail(name, value, expected, f"JAX cannot take it apart: {error}") from error
     if any(leaf is value for leaf in leaves):
-        raise fail(
-            name,
-            value,
-            expected,
-            "JAX does not know its class: decorate it with iblf_jax.component.",
-        )
+        remedy = "JAX does not know its class: decorate it with iblf_jax.component."
+        raise fail(name, value, expected, remedy)
 
 
-def offers(name: str, value: Any, methods: tuple[str, ...], expected: str) -> None:
+def _is_plain(value: Any) -> bool:
+    """Whether this is None, a word, a container of Python's, or numbers: no object with members."""
+    return (
+        value is None
+        or isinstance(value, str | bytes | tuple | list | dict)
+        or _is_number_like(value)
+    )
+
+
+def offers(name: str, value: Any, members: Sequence[str], expected: str, remedy: str = "") -> None:
     """Raises unless `value` is an object, not a class, an array or a word, that has these methods
     or fields.
     """
-    bare = (
-        value is None
-        or isinstance(value, type | str | bytes | tuple | list | dict)
-        or _is_number_like(value)
-    )
-    if bare and methods:
+    if members and (isinstance(value, type) or _is_plain(value)):
         raise fail(name, value, expected)
-    missing = missing_members(value, methods)
+    missing = missing_members(value, members)
     if missing:
-        raise fail(name, value, expected, f"It lacks {', '.join(missing)}.")
+        raise fail(name, value, expected, f"{remedy} It lacks {', '.join(missing)}.".strip())
 
 
 def vectors(n: int | None = None, **named: Any) -> tuple[jax.Array, ...]:
     """Vectors with one number a joint, (n,), from arguments by name, traced or not; as long as the
     first if n is not given.
     """
-    arrays = tuple(as_floats(name, value) for name, value in named.items())
-    shape: tuple[int, ...] = (n,)  # type: ignore[assignment]
-    if n is None:
-        shape = np.shape(arrays[0])
-    expected = "(n,)"
-    if len(shape) == 1:
-        expected = str(shape)
-    for name, array in zip(named, arrays, strict=True):
+    arrays = {name: as_floats(name, value) for name, value in named.items()}
+    shape: tuple[int, ...] = next(iter(arrays.values())).shape if n is None else (n,)
+    for name, array in arrays.items():
         if array.ndim != 1 or array.shape != shape:
-            raise fail(
-                name,
-                array,
-                f"one number a joint, shape {expected}",
-                f"Its shape is {array.shape}.",
-            )
-    return arrays
+            expected = str(shape) if len(shape) == 1 else "(n,)"
+            remedy = f"Its shape is {array.shape}."
+            raise fail(name, array, f"one number a joint, shape {expected}", remedy)
+    return tuple(arrays.values())
 
 
 def shape_is(name: str, array: Any, shape: tuple[int, ...]) -> None:
@@ -481,50 +456,46 @@ def shape_is(name: str, array: Any, shape: tuple[int, ...]) -> None:
         raise fail(name, array, f"shape {shape}", f"Its shape is {jnp.shape(array)}.")
 
 
+TRACED = (
+    "It decides how many steps are compiled: use a Python number, or static_argnames in your jit."
+)
+
+
 def positive_number(name: str, value: Any, unit: str, zero: bool = False) -> float:
     """A finite positive Python float (or 0, if that may be) from a user's argument, or a
     ValueError.
     """
-    kind = {True: "number >= 0", False: "positive number"}[zero]
-    expected = f"a {kind} [{unit}]"
+    expected = f"a number >= 0 [{unit}]" if zero else f"a positive number [{unit}]"
     if isinstance(value, jax.core.Tracer):
-        remedy = (
-            "It decides how many steps are compiled: use a Python number, or static_argnames in"
-            " your jit."
-        )
-        raise fail(name, value, expected, remedy)
-    array_like = isinstance(value, np.generic | np.ndarray | jax.Array)
-    if isinstance(value, bool) or not (array_like or isinstance(value, numbers.Real)):
-        raise fail(name, value, expected)
-    if array_like and (
-        value.ndim != 0 or not jnp.issubdtype(value.dtype, np.number) or jnp.iscomplexobj(value)
-    ):
-        raise fail(name, value, expected)
-    try:
-        number = float(value)
-    except OverflowError:
-        number = float("inf")
-    if not np.isfinite(number) or number < 0 or (number == 0 and not zero):
+        raise fail(name, value, expected, TRACED)
+    number = _as_float(value)
+    if not (np.isfinite(number) and number >= 0 and (zero or number > 0)):
         raise fail(name, value, expected)
     return number
 
 
-def number_between(
-    name: str,
-    value: Any,
-    least: float,
-    most: float,
-    unit: str,
-    remedy: str = "",
-) -> float:
-    """A finite Python float from `least` to `most` from a user's argument, or a ValueError."""
-    expected = f"a number from {least:g} to {most:g} [{unit}]"
+def _as_float(value: Any) -> float:
+    """A real number, or an array of one, as a Python float; NaN for everything else."""
+    if isinstance(value, np.generic | np.ndarray | jax.Array):
+        is_real = jnp.issubdtype(value.dtype, np.number) and not jnp.iscomplexobj(value)
+        return float(value) if is_real and value.ndim == 0 else math.nan
+    if isinstance(value, bool) or not isinstance(value, numbers.Real):
+        return math.nan
     try:
-        number = positive_number(name, value, unit, zero=True)
-    except ValueError:
-        raise fail(name, value, expected, remedy) from None
+        return float(value)
+    except OverflowError:
+        return math.inf
+
+
+def number_between(
+    name: str, value: Any, least: float, most: float, unit: str, remedy: str = ""
+) -> float:
+    """A Python float from `least` >= 0 to `most` from a user's argument, or a ValueError."""
+    number = math.nan
+    if not isinstance(value, jax.core.Tracer):
+        number = _as_float(value)
     if not least <= number <= most:
-        raise fail(name, value, expected, remedy)
+        raise fail(name, value, f"a number from {least:g} to {most:g} [{unit}]", remedy)
     return number
 
 
@@ -534,10 +505,14 @@ def time_span(name: str, value: Any, zero: bool = False) -> float:
     It lies between the shortest and the longest that a robot has.
     """
     seconds = positive_number(name, value, "s", zero)
-    if seconds == 0.0 or SHORTEST_TIME <= seconds <= LONGEST_TIME:
+    if seconds == 0.0:
         return seconds
-    expected = f"a time from {SHORTEST_TIME:g} to {LONGEST_TIME:g} s"
-    raise fail(name, value, expected, "Times are in seconds.")
+    return number_between(name, seconds, SHORTEST_TIME, LONGEST_TIME, "s", "Times are in seconds.")
+
+
+def _is_integer(value: Any) -> bool:
+    """Whether this is a whole number of Python or NumPy, and no truth value."""
+    return isinstance(value, numbers.Integral) and not isinstance(value, bool | np.bool_)
 
 
 def positive_integer(name: str, value: Any, *, least: int = 1, most: int | None = None) -> int:
@@ -545,12 +520,9 @@ def positive_integer(name: str, value: Any, *, least: int = 1, most: int | None 
     expected = f"a whole number >= {least}"
     if most is not None:
         expected += f" and <= {most}"
-    if isinstance(value, bool | np.bool_) or not isinstance(value, numbers.Integral):
+    if not _is_integer(value) or value < least or (most is not None and value > most):
         raise fail(name, value, expected)
-    number = int(value)
-    if number < least or (most is not None and number > most):
-        raise fail(name, value, expected)
-    return number
+    return int(value)
 
 
 class NoSuchEntryError(IndexError, ValueError):
@@ -561,11 +533,7 @@ class NoSuchEntryError(IndexError, ValueError):
 
 def seed(value: Any, name: str = "seed") -> int:
     """A seed as a Python int in [0, 2^32), or a ValueError."""
-    if (
-        isinstance(value, bool | np.bool_)
-        or not isinstance(value, int | np.integer)
-        or not 0 <= value < 2**32
-    ):
+    if not _is_integer(value) or not 0 <= value < 2**32:
         raise fail(name, value, "a whole number from 0 to 2**32 - 1")
     return int(value)
 
@@ -574,11 +542,7 @@ def entry(name: str, value: Any, count: int, what: str) -> int:
     """A Python int from 0 to `count` - 1 from a user's index, which may count from the end;
     NoSuchEntryError where it leads nowhere.
     """
-    if (
-        isinstance(value, bool)
-        or not isinstance(value, int | np.integer)
-        or not -count <= value < count
-    ):
+    if not _is_integer(value) or not -count <= value < count:
         raise NoSuchEntryError(str(fail(name, value, f"one of the {what} 0 to {count - 1}")))
     return int(value) % count
 
@@ -589,9 +553,13 @@ def fits(name: str, count: int, bytes_each: float, remedy: str = "") -> None:
     """
     most = int(memory() // max(1, bytes_each))
     if count > most:
-        raise fail(
-            name, count, f"at most {most}, which is what {memory() / 2**30:.3g} GiB hold", remedy
-        )
+        expected = f"at most {most}, which is what {memory() / 2**30:.3g} GiB hold"
+        raise fail(name, count, expected, remedy)
+
+
+def ceil_div(a: int, b: int) -> int:
+    """The quotient of two positive integers, rounded up."""
+    return -(-a // b)
 
 
 def memory() -> int:
@@ -607,8 +575,7 @@ def flag(name: str, value: Any, optional: bool = False) -> Any:
     if value is None and optional:
         return None
     if not isinstance(value, bool | np.bool_):
-        expected = {True: "True or False or None", False: "True or False"}
-        raise fail(name, value, expected[optional])
+        raise fail(name, value, "True or False or None" if optional else "True or False")
     return bool(value)
 
 
@@ -637,22 +604,14 @@ def devices(name: str, value: Any) -> list[jax.Device]:
     """A user's devices, all of this process if there are none given, or a ValueError."""
     if value is None:
         return default()
-    if (
-        not isinstance(value, list | tuple)
-        or not value
-        or not all(isinstance(x, jax.Device) for x in value)
-    ):
-        raise fail(
-            name,
-            value,
-            "a list of at least one device",
-            "jax.devices() lists them; leave it out for all of them.",
-        )
+    is_list = isinstance(value, list | tuple) and len(value) > 0
+    if not is_list or not all(isinstance(x, jax.Device) for x in value):
+        remedy = "jax.devices() lists them; leave it out for all of them."
+        raise fail(name, value, "a list of at least one device", remedy)
     if {device.platform for device in value} != {platform()}:
+        expected = f"devices of the platform that JAX computes on, {platform()}"
         remedy = "Put the call into `with jax.default_device(device):` to compute on another one."
-        raise fail(
-            name, value, f"devices of the platform that JAX computes on, {platform()}", remedy
-        )
+        raise fail(name, value, expected, remedy)
     return list(value)
 
 
@@ -682,13 +641,13 @@ def file_path(name: str, value: Any, what: str = "a file") -> Path:
 def file_to_read(name: str, value: Any, what: str = "a file") -> Path:
     """The path of a file that is there, or a ValueError; a MissingFileError where nothing is."""
     path = file_path(name, value, what)
+    expected = f"the path of {what}"
     if not path.exists():
-        raise MissingFileError(fail(name, str(path), f"the path of {what}", "Nothing is there."))
-    remedy = "It is not a file."
+        raise MissingFileError(fail(name, str(path), expected, "Nothing is there."))
     if path.is_dir():
-        remedy = "It is a folder."
+        raise fail(name, str(path), expected, "It is a folder.")
     if not path.is_file():
-        raise fail(name, str(path), f"the path of {what}", remedy)
+        raise fail(name, str(path), expected, "It is not a file.")
     return path
 
 
@@ -759,12 +718,8 @@ def whole_steps(duration: Any, dt: Any, *, dt_is_free: bool = True) -> int:
     duration = positive_number("duration", duration, "s")
     dt = positive_number("dt", dt, "s")
     if not duration / dt <= MAX_STEPS:
-        raise fail(
-            "duration",
-            duration,
-            f"at most {MAX_STEPS} steps dt = {dt:g} s",
-            "Shorten the run or take a larger dt.",
-        )
+        remedy = "Shorten the run or take a larger dt."
+        raise fail("duration", duration, f"at most {MAX_STEPS} steps dt = {dt:g} s", remedy)
     steps = round(duration / dt)
     # A thousandth of a step is forgiven, so that a duration that has been through float32 is taken
     # for what it was.

@@ -54,11 +54,12 @@ def threads() -> int:
     text = os.environ.get("IBLF_JAX_THREADS", "")
     if not text:
         return default_threads
-    is_number = text.isascii() and text.isdigit()
-    digits = text.lstrip("0") if is_number else ""
-    if 0 < len(digits) < 10 and int(digits) <= MAX_THREADS:
-        return int(digits)
-    used = MAX_THREADS if digits else default_threads
+    used = default_threads
+    if text.isascii() and text.isdigit() and text.strip("0"):
+        digits = text.lstrip("0")[:10]  # of any length, as Python refuses to read thousands
+        if int(digits) <= MAX_THREADS:
+            return int(digits)
+        used = MAX_THREADS
     notices.warn(
         f"IBLF_JAX_THREADS: got {text[:40]!r}, expected a whole number from 1 to {MAX_THREADS}."
         f" Running with {used} threads."

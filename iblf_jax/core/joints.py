@@ -8,12 +8,11 @@ values.
     joints=[True, False]    one truth value for each joint
 
 A selection is structure, not a number: it is kept as a hashable tuple and becomes indices where the
-  robot is known.
+robot is known.
 """
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Sequence
 from typing import Any, TypeAlias
@@ -108,16 +107,10 @@ def _slice_as_text(field: str, given: slice) -> str:
         x is None or (isinstance(x, int | np.integer) and not isinstance(x, bool)) for x in parts
     ):
         raise checks.fail(field, given, "a slice of whole numbers", "Name single joints in a list.")
-    words = [_text_of(x) for x in parts]
+    words = ["" if x is None else str(int(x)) for x in parts]
     if given.step is None:
         words = words[:2]
     return ":".join(words)
-
-
-def _text_of(number: int | None) -> str:
-    if number is None:
-        return ""
-    return str(int(number))
 
 
 def indices(field: str, chosen: Selection, names: Sequence[str]) -> tuple[int, ...]:
@@ -172,8 +165,4 @@ def _indices_of(field: str, entry: int | str, names: Sequence[str]) -> list[int]
         if len(parts) == 3 and parts[2] == 0:
             raise checks.fail(field, entry, "a slice whose step is not 0")
         return list(range(n))[slice(*parts)]
-    close = difflib.get_close_matches(entry, names, n=1)
-    remedy = f"There are: {', '.join(names)}."
-    if close:
-        remedy = f"Did you mean {close[0]!r}?"
-    raise checks.fail(field, entry, "the name of a joint", remedy)
+    raise checks.fail(field, entry, "the name of a joint", checks.did_you_mean(entry, names))

@@ -5,7 +5,7 @@ allows a process 65,530.  JAX keeps every program for the life of the process: a
 programs (a few dozen arms, each with programs of its own) the compiler cannot allocate memory, and
 the process ends.  This module therefore clears JAX's programs when the number of maps comes close
 to the limit; programs that are needed again are compiled again, or read from the disk
-(`core.cache`).
+(`core.disk_cache`).
 """
 
 from __future__ import annotations

@@ -21,12 +21,13 @@ import dataclasses
 import functools
 import operator
 from collections.abc import Callable
+from types import MappingProxyType
 from typing import Any, TypeAlias, TypeVar, dataclass_transform
 
 import jax
 
 from iblf_jax.core import checks
-from iblf_jax.core.optional import OptionalMembers, attributes, has_members
+from iblf_jax.core.optional import OptionalMembers, has_members
 
 T = TypeVar("T")
 
@@ -34,8 +35,9 @@ Leaf: TypeAlias = Any
 """Type of a field declared with `leaf`: a number, a list or an array when a person writes it, a
 `jax.Array` from then on."""
 
-component_member = OptionalMembers(wraps=None)
-"""Reads what the class of a component may declare: the field that holds a wrapped component."""
+component_member = OptionalMembers(wraps=None, rows=MappingProxyType({}), leaf_units=dict)
+"""Reads what a component may declare: the field that holds a wrapped component, rows with names,
+and a function of the units of leaves that depend on other fields."""
 
 
 def leaf(
@@ -186,7 +188,7 @@ def rewrapped(part: Any, inner: Any) -> Any:
 
 def field_values(part: Any) -> dict[str, Any]:
     """Name -> value of the fields of a dataclass."""
-    return attributes(part, [field.name for field in dataclasses.fields(part)])
+    return {field.name: getattr(part, field.name) for field in dataclasses.fields(part)}
 
 
 def is_leaf_field(field: dataclasses.Field) -> bool:

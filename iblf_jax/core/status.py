@@ -36,8 +36,8 @@ class Status(enum.IntFlag):
     """A study drew a value that its leaf does not admit (a negative mass, say): the run was not
     made, its metrics are NaN."""
     INACCURATE = 128
-    """The estimated error of the positions is more than 0.5 % of the tube (`accuracy.TOLERANCE`):
-    take a smaller dt."""
+    """The estimated error of the positions is more than 0.5 % of the tube 
+    (`error_estimate.TOLERANCE`): take a smaller dt."""
     GUARD_STAYED = 256
     """The guard was active beyond the first instant: there the loop ran with a softer law than the
     requested one."""
@@ -110,6 +110,11 @@ def describe(status: int) -> str:
     """The flags of one run in words, "ok" if there is none."""
     words = [text for flag, text in WORDS.items() if int(status) & flag]
     return "; ".join(words) or "ok"
+
+
+def has_flag(status, which: Status):
+    """Whether `status`, a number or an array of flags, has any of these flags."""
+    return status & int(which) != 0
 
 
 def flag(condition, which: Status):

@@ -1,5 +1,5 @@
-"""Compilers of C for what is exported: the system's, or the one that comes with `ziglang`, which
-also makes WebAssembly.
+"""Finds and runs the C compiler for exported code: the system's, or the one in `ziglang`, which
+also compiles to WebAssembly.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from pathlib import Path
 from iblf_jax.kernels import ToolchainError, has_ziglang, ziglang
 
 TIMEOUT = 300.0
-"""Seconds that a compiler may take."""
+"""Longest time that a compiler may run [s]."""
 MAX_OUTPUT = 2000
-"""Characters of a compiler's complaint that are repeated."""
+"""Largest number of characters of a compiler's message that an error repeats."""
 
 
 def c_compiler() -> list[str]:
@@ -24,16 +24,14 @@ def c_compiler() -> list[str]:
     ToolchainError if there is none.
     """
     chosen = os.environ.get("CC")
-    for name in [chosen] if chosen else ["cc", "gcc", "clang"]:
-        path = shutil.which(name)
-        if path:
-            return [path]
-    if not chosen and has_ziglang():
-        return zig()
-    raise ToolchainError(
-        "there is no C compiler"
-        + (f" {chosen!r} ($CC)" if chosen else " (cc, gcc, clang; pip install ziglang has one)")
-    )
+    names = [chosen] if chosen else ["cc", "gcc", "clang"]
+    for path in filter(None, map(shutil.which, names)):
+        return [path]
+    if chosen:
+        raise ToolchainError(f"there is no C compiler {chosen!r} ($CC)")
+    if not has_ziglang():
+        raise ToolchainError("there is no C compiler (cc, gcc, clang; pip install ziglang has one)")
+    return zig()
 
 
 def zig() -> list[str]:
@@ -46,7 +44,7 @@ def zig() -> list[str]:
 
 
 def build(command: Sequence[str], folder: Path) -> None:
-    """Runs a compiler in a folder; ToolchainError with what it says if it fails."""
+    """Runs a compiler in a folder; a ToolchainError repeats its message if it fails."""
     try:
         done = subprocess.run(
             command, cwd=folder, capture_output=True, text=True, timeout=TIMEOUT, check=False
@@ -58,9 +56,8 @@ def build(command: Sequence[str], folder: Path) -> None:
 
 
 def fmi_platform() -> tuple[str, str]:
-    """FMI 3.0's name of this platform, and how its shared libraries end."""
-    machine = {"amd64": "x86_64", "arm64": "aarch64"}.get(
-        platform.machine().lower(), platform.machine().lower()
-    )
+    """FMI 3.0's name of this platform, and the file ending of its shared libraries."""
+    machine = platform.machine().lower()
+    machine = {"amd64": "x86_64", "arm64": "aarch64"}.get(machine, machine)
     system = platform.system().lower()
     return f"{machine}-{system}", {"windows": ".dll", "darwin": ".dylib"}.get(system, ".so")

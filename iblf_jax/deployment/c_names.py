@@ -1,5 +1,5 @@
-"""Parameters as a C struct whose fields are the paths of leaves; valid C names, comments and
-literals.
+"""The parameters of exported code as a C struct whose fields are named by the paths of the leaves;
+valid C names, comments and literals.
 
 Text from a file or a user's class never enters the generated code unescaped: a name keeps letters,
 digits and underscores, and a comment is an ASCII JSON string that cannot end the comment.
@@ -56,32 +56,34 @@ libraries of CMake."""
 
 def identifier(name: str) -> str:
     """A C identifier for a Python name."""
-    text = "".join(c if re.fullmatch(r"[A-Za-z0-9_]", c) else f"_u{ord(c):x}_" for c in name)
-    return f"{text}_" if text in RESERVED or not re.match(r"[A-Za-z_]", text) else text
+    text = re.sub(r"[^A-Za-z0-9_]", lambda found: f"_u{ord(found[0]):x}_", name)
+    if text in RESERVED or not re.match(r"[A-Za-z_]", text):
+        return f"{text}_"
+    return text
 
 
 def comment(text: str) -> str:
-    """Text that can stand in a C comment, whatever is in it: ASCII without the marks of comments,
-    trigraphs or a line's end.
-    """
-    return re.sub(
-        r"\?(?=\?)",
-        "? ",
-        json.dumps(text)[1:-1].replace("*/", "* /").replace("/*", "/ *").replace("\\", "|"),
-    )
+    """Any text as the content of a C comment: ASCII without comment marks or trigraphs."""
+    ascii_text = json.dumps(text)[1:-1]
+    for mark, replacement in (("*/", "* /"), ("/*", "/ *"), ("\\", "|")):
+        ascii_text = ascii_text.replace(mark, replacement)
+    return re.sub(r"\?(?=\?)", "? ", ascii_text)
 
 
 def number(x: float, is_float: bool) -> str:
-    """A C literal of exactly this number, as a float or a double; what is not finite is a name of
-    `math.h`.
+    """A C literal of exactly this float or double, or the name that `math.h` has for NaN or
+    infinity.
     """
+    dtype, suffix = C_LITERALS[is_float]
     with np.errstate(over="ignore"):
-        value = float(np.float32(x)) if is_float else float(x)
-    if math.isnan(value):
-        return "NAN"
-    if math.isinf(value):
-        return "-INFINITY" if value < 0 else "INFINITY"
-    return f"{value!r}{'f' if is_float else ''}"
+        value = float(dtype(x))
+    if math.isfinite(value):
+        return f"{value!r}{suffix}"
+    return {"nan": "NAN", "inf": "INFINITY", "-inf": "-INFINITY"}[repr(value)]
+
+
+C_LITERALS: dict[bool, tuple[Any, str]] = {False: (np.float64, ""), True: (np.float32, "f")}
+"""Whether a number is a float -> its NumPy type and the suffix of its literals in C."""
 
 
 class Field(NamedTuple):
@@ -89,29 +91,28 @@ class Field(NamedTuple):
 
     path: str
     names: tuple[str, ...]
-    """Of the structs that hold it, and its own."""
+    """Names of the structs that contain it, outermost first, and its own name."""
     shape: tuple[int, ...]
     unit: str
     value: np.ndarray
 
     @property
     def place(self) -> str:
-        """Where it is in the struct of all parameters: `controller.K2`."""
+        """The C expression for it in the struct of all parameters, such as `controller.K2`."""
         return ".".join(self.names)
 
 
 class Parameters(NamedTuple):
-    """The leaves that programs read."""
+    """The leaves of a scenario that exported programs read."""
 
     fields: tuple[Field, ...]
     numbers: tuple[str, ...]
-    """What C calls each number of the scenario, leaf after leaf; "" for those that are not read."""
+    """The C expression for each number of the scenario, leaf after leaf; "" for those that are not
+    read."""
 
     @staticmethod
     def of(scenario: Scenario, programs: Iterable[Program]) -> Parameters:
-        """Those of a scenario that any of the programs reads, as fields of a struct `p` points
-        to.
-        """
+        """The leaves of a scenario that any of the programs reads, as fields of the struct `*p`."""
         read = {node.value for program in programs for node in program.nodes if node.op == "shared"}
         fields, numbers = list[Field](), list[str]()
         for leaf in parameters(scenario, named=False):
@@ -127,7 +128,7 @@ class Parameters(NamedTuple):
 
     @property
     def size(self) -> int:
-        """How many numbers they are."""
+        """Number of floating-point numbers in the struct."""
         return sum(math.prod(field.shape) for field in self.fields)
 
     def declaration(self, real: str, joints: Sequence[str] = ()) -> str:
@@ -135,12 +136,16 @@ class Parameters(NamedTuple):
         return "\n".join(_members(_nested(self.fields), 1, real, joints)) or f"  {real} none;"
 
     def defaults(self, is_float: bool) -> str:
-        """Their values, as C's initialiser."""
-        return _initialiser(_nested(self.fields), is_float) if self.fields else "{0}"
+        """The values as an initialiser of the struct."""
+        if not self.fields:
+            return "{0}"
+        return _initialiser(_nested(self.fields), is_float)
 
 
 def _field_name(token: str | int) -> str:
-    return f"part_{token}" if isinstance(token, int) else identifier(token)
+    if isinstance(token, int):
+        return f"part_{token}"
+    return identifier(token)
 
 
 def _index(place: tuple[int, ...]) -> str:
@@ -152,42 +157,37 @@ def _nested(fields: Sequence[Field]) -> dict[str, Any]:
     tree: dict[str, Any] = {}
     for field in fields:
         *outer, last = field.names
-        node = tree
+        node: Any = tree
         for name in outer:
             node = node.setdefault(name, {})
             if isinstance(node, Field):
-                raise checks.fail("scenario", field.path, "paths that differ as names of C")
-        if last in node:
+                break
+        if isinstance(node, Field) or last in node:
             raise checks.fail("scenario", field.path, "paths that differ as names of C")
         node[last] = field
     return tree
 
 
 def _in_order(tree: dict[str, Any]) -> Iterator[Field]:
-    """The fields as they stand in the struct."""
+    """The fields in the order of the struct."""
     for part in tree.values():
-        yield from (part,) if isinstance(part, Field) else _in_order(part)
+        if isinstance(part, Field):
+            yield part
+        else:
+            yield from _in_order(part)
 
 
 def _members(tree: dict[str, Any], depth: int, real: str, joints: Sequence[str]) -> list[str]:
     lines, indent = list[str](), "  " * depth
     for name, part in tree.items():
-        if isinstance(part, Field):
-            of = (
-                f", joint by joint: {', '.join(map(str, joints))}"
-                if joints and part.shape[:1] == (len(joints),)
-                else ""
-            )
-            lines.append(
-                f"{indent}{real} {name}{_index(part.shape)};  /* {comment(part.path)}"
-                f" [{comment(part.unit)}]{comment(of)} */"
-            )
-        else:
-            lines += [
-                f"{indent}struct {{",
-                *_members(part, depth + 1, real, joints),
-                f"{indent}}} {name};",
-            ]
+        if not isinstance(part, Field):
+            inner = _members(part, depth + 1, real, joints)
+            lines += [f"{indent}struct {{", *inner, f"{indent}}} {name};"]
+            continue
+        meaning = f"{comment(part.path)} [{comment(part.unit)}]"
+        if joints and part.shape[:1] == (len(joints),):
+            meaning += comment(f", joint by joint: {', '.join(joints)}")
+        lines.append(f"{indent}{real} {name}{_index(part.shape)};  /* {meaning} */")
     return lines
 
 
@@ -198,7 +198,8 @@ def _initialiser(part: Any, is_float: bool, depth: int = 0) -> str:
             for name, x in part.items()
         )
         return f"{{\n{inner}\n{'  ' * depth}}}"
-    value = part.value if isinstance(part, Field) else part
-    if value.ndim == 0:
-        return number(float(value), is_float)
-    return "{" + ", ".join(_initialiser(x, is_float) for x in value) + "}"
+    if isinstance(part, Field):
+        part = part.value
+    if part.ndim == 0:
+        return number(float(part), is_float)
+    return "{" + ", ".join(_initialiser(x, is_float) for x in part) + "}"

@@ -18,6 +18,7 @@ import numpy as np
 
 from iblf_jax.control.sensors import Ideal, Measurement
 from iblf_jax.core import checks
+from iblf_jax.core.optional import has_members
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.engine import LOWERING_LIMITS
 from iblf_jax.kernels import Program, Shapes, compile_step, written_out
@@ -169,21 +170,18 @@ def control_law(scenario: Scenario, external_reference: bool) -> ControlLaw:
       ValueError: a sensor whose velocity filter is not known.
       UnsupportedError: the law cannot be lowered; the message states the reason.
     """
-    if not isinstance(scenario.sensor, Ideal) and not hasattr(scenario.sensor, "velocity"):
+    if not isinstance(scenario.sensor, Ideal) and not has_members(scenario.sensor, "velocity"):
         kind = type(scenario.sensor).__name__
-        raise checks.fail(
-            "scenario.sensor",
-            kind,
-            "one with a field `velocity`, or sensors.Ideal()",
-            "The velocity filter computes q' from q.",
-        )
-    inputs = input_shapes(
-        jnp.zeros((), scenario.initial.q.dtype), scenario.initial.q, external_reference
-    )
-    dtype = inputs.q.dtype
-    like = jax.tree.map(
-        lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(start, scenario, inputs)[0]
-    )
+        expected = "one with a field `velocity`, or sensors.Ideal()"
+        remedy = "The velocity filter computes q' from q."
+        raise checks.fail("scenario.sensor", kind, expected, remedy)
+    q = scenario.initial.q
+    dtype = q.dtype
+    inputs = SampleInputs(jnp.zeros((), dtype), q, q)
+    if external_reference:
+        inputs = inputs._replace(q_d=q, dq_d=q, ddq_d=q)
+    shapes, _ = jax.eval_shape(start, scenario, inputs)
+    like = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
     memory = as_floats(like, dtype)
 
     def first(scenario, inputs, carry, index):
@@ -195,28 +193,25 @@ def control_law(scenario: Scenario, external_reference: bool) -> ControlLaw:
         return as_floats(memory, dtype), outputs
 
     begin, step = program_of(first, scenario, inputs, ()), program_of(one, scenario, inputs, memory)
-    reads = any(
-        node.op == "per_run" and 1 + scenario.n <= node.value < 1 + 2 * scenario.n
-        for node in step.nodes
-    )
+    velocities = range(1 + scenario.n, 1 + 2 * scenario.n)  # after t and q
+    reads = any(node.op == "per_run" and node.value in velocities for node in step.nodes)
     return ControlLaw(begin, step, number_names(memory), reads)
 
 
 def as_floats(memory: Any, dtype: Any) -> Any:
-    """A memory with all numbers of one type; integers and flags become 0.0, 1.0, ..."""
+    """A memory whose numbers all have one type; integers and flags become 0.0, 1.0, ..."""
     return jax.tree.map(lambda x: x.astype(dtype), memory)
 
 
 def of_floats(memory: Any, like: Any) -> Any:
     """The inverse of `as_floats`, with the types of `like`."""
-    return jax.tree.map(
-        lambda x, y: x > 0.5 if y.dtype == bool else x.astype(y.dtype), memory, like
-    )
 
+    def converted(x: jax.Array, kind: jax.Array) -> jax.Array:
+        if kind.dtype == bool:
+            return x > 0.5
+        return x.astype(kind.dtype)
 
-def input_shapes(t: jax.Array, q: jax.Array, external_reference: bool) -> SampleInputs:
-    """Inputs of the right shapes."""
-    return SampleInputs(t, q, q, *((q, q, q) if external_reference else ()))
+    return jax.tree.map(converted, memory, like)
 
 
 def program_of(function: Callable, scenario: Scenario, given: Any, carry: Any) -> Program:

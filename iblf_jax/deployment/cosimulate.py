@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,6 +20,7 @@ import numpy as np
 
 from iblf_jax.control.actuators import Ideal
 from iblf_jax.core import checks, notices
+from iblf_jax.core.optional import attributes
 from iblf_jax.core.status import VELOCITY_LIMIT, Status
 from iblf_jax.core.time import as_at
 from iblf_jax.deployment.mujoco_plant import INTEGRATORS, MujocoPlant, Stages
@@ -31,19 +32,12 @@ from iblf_jax.simulation.closed_loop import (
     run_sampled_law_if_due,
     sample_at,
 )
-from iblf_jax.simulation.jumps import JUMP_SEPARATION
+from iblf_jax.simulation.discontinuities import JUMP_SEPARATION
 from iblf_jax.simulation.metrics import Fold, as_folds, metric_units
+from iblf_jax.simulation.noise import has_noise, noise_key
 from iblf_jax.simulation.results import Metrics, Rollout
-from iblf_jax.simulation.sampling import (
-    DELAY_TOLERANCE,
-    Instant,
-    Sampling,
-    check_step,
-    commands_in_transit,
-    has_noise,
-    noise_key,
-)
-from iblf_jax.simulation.scenario import Scenario, canonical
+from iblf_jax.simulation.sampling import DELAY_TOLERANCE, Instant, Sampling, commands_in_transit
+from iblf_jax.simulation.scenario import Scenario, canonical, check_step
 from iblf_jax.simulation.signals import SIGNALS
 from iblf_jax.world.disturbances import Nothing
 from iblf_jax.world.robots import at_time
@@ -116,19 +110,28 @@ def cosimulate(
     scenario = canonical(with_period(scenario, period))
     seed, throw = checks.seed(seed), checks.flag("throw", throw)
     names = tuple(robot_member(scenario.plant, "joints"))
-    locked = checks.mapping("locked", {} if locked is None else locked, '{"gripper_joint": 0.02}')
+    if locked is None:
+        locked = {}
+    checks.mapping("locked", locked, '{"gripper_joint": 0.02}')
     robot = MujocoPlant(plant, names, scenario.n, locked, integrator)
-    dt = _own_step(scenario, robot) if dt is None else checks.time_span("dt", dt)
+    if dt is None:
+        dt = _own_step(scenario, robot)
+    dt = checks.time_span("dt", dt)
     check_step(scenario, dt)
     steps = checks.whole_steps(duration, dt, dt_is_free=False)
     record_every = checks.recorded_every(record_every, steps)
-    write = None if film is None else _film_writer(film)
+    if film is not None:
+        # A film needs matplotlib, which is imported only for it.
+        from iblf_jax.deployment.film import film_run
+        from iblf_jax.plotting.animation import film_path
+
+        film = film_path(film, "film")
     folds = as_folds(metrics, scenario.initial.q.dtype, scenario)
     motion = _Run(scenario, robot, dt, seed).motion(steps)
     result = _rollout(scenario, folds, motion, dt, record_every, f"MuJoCo {integrator or 'own'}")
     report(result, steps, throw)
-    if write is not None:
-        write(result, robot, motion.model_positions[motion.instant], dt)
+    if film is not None:
+        film_run(result, robot, motion.model_positions[motion.instant], dt, Path(film))
     return result
 
 
@@ -138,54 +141,34 @@ def _own_step(scenario: Scenario, robot: MujocoPlant) -> float:
     return period / max(1, math.ceil(period / robot.timestep - DELAY_TOLERANCE))
 
 
-def _film_writer(path: str | Path) -> Callable:
-    """A function that writes a film.  It needs matplotlib, which is imported only here."""
-    from iblf_jax.deployment.film import film_run
-    from iblf_jax.plotting.animation import film_path
-
-    return partial(film_run, path=film_path(path, "film"))
-
-
 def check_single(scenario: Scenario) -> Scenario:
-    """The scenario; ValueError for no scenario, a batch of them, or one of traced values."""
+    """The scenario; raises ValueError for another object, for a batch and for traced values."""
     if not isinstance(scenario, Scenario):
-        raise checks.fail(
-            "scenario", scenario, "a Scenario", "Make one with ij.presets or ij.Scenario."
-        )
+        remedy = "Make one with ij.presets or ij.Scenario."
+        raise checks.fail("scenario", scenario, "a Scenario", remedy)
     if np.ndim(scenario.initial.q) != 1:
-        raise checks.fail(
-            "scenario",
-            f"a batch, initial.q of shape {np.shape(scenario.initial.q)}",
-            "one scenario",
-            "Call it once for each.",
-        )
+        came = f"a batch, initial.q of shape {np.shape(scenario.initial.q)}"
+        raise checks.fail("scenario", came, "one scenario", "Call it once for each.")
     if not checks.is_concrete(scenario):
-        raise checks.fail(
-            "scenario", "traced values", "numbers", "Call this outside of jit, vmap and grad."
-        )
+        remedy = "Call this outside of jit, vmap and grad."
+        raise checks.fail("scenario", "traced values", "numbers", remedy)
     return scenario
 
 
 def with_period(scenario: Scenario, period: float | None) -> Scenario:
-    """The scenario, its law sampled with this period."""
+    """The scenario with this period of the law; None keeps the scenario's own period."""
+    sampling = scenario.sampling
+    if period is None and sampling is None:
+        remedy = "A law outside of the package is sampled: period=1e-3."
+        raise checks.fail("period", None, "the period of the law [s]", remedy)
     if period is None:
-        if scenario.sampling is None:
-            raise checks.fail(
-                "period",
-                None,
-                "the period of the law [s]",
-                "A law outside of the package is sampled: period=1e-3.",
-            )
         return scenario
     period = checks.time_span("period", period)
-    if scenario.sampling is None:
+    if sampling is None:
         return dataclasses.replace(scenario, sampling=Sampling(period))
-    queue = max(
-        scenario.sampling.queue, commands_in_transit(float(scenario.sampling.delay), period)
-    )
-    return dataclasses.replace(
-        scenario, sampling=dataclasses.replace(scenario.sampling, period=period, queue=queue)
-    )
+    queue = max(sampling.queue, commands_in_transit(float(sampling.delay), period))
+    sampling = dataclasses.replace(sampling, period=period, queue=queue)
+    return dataclasses.replace(scenario, sampling=sampling)
 
 
 class _Motion(NamedTuple):
@@ -196,9 +179,9 @@ class _Motion(NamedTuple):
     """
 
     t: Any
-    """(R,) [s]."""
+    """Time, (R,) [s]."""
     instant: Any
-    """Whether the row is that of an instant, (R,) bool."""
+    """Whether the row belongs to an instant, and not to one side of a jump, (R,) bool."""
     q: Any
     dq: Any
     ddq: Any
@@ -210,7 +193,7 @@ class _Motion(NamedTuple):
     model_positions: Any
     """Positions of all joints of MuJoCo's model."""
     states: LoopState
-    """After each sample of the law."""
+    """The state after each sample of the law."""
     diverged: bool
     """Whether the state diverged; it is constant from there on."""
 
@@ -262,7 +245,7 @@ class _Run:
         self.rows: list[tuple] = []
 
     def motion(self, steps: int) -> _Motion:
-        """The motion of so many steps."""
+        """Runs this number of steps and returns the recorded motion."""
         diverged = False
         self.robot.place(np.asarray(self.state.q), np.asarray(self.state.dq))
         with self.robot.driven(self.stages):
@@ -345,13 +328,13 @@ class _Run:
     # Commands in transit, and jumps of the scenario
 
     def next_arrival(self, otherwise: float) -> float:
-        """When the next command arrives."""
+        """Time at which the next command arrives [s]; `otherwise` if none is in transit."""
         if self.arrived < len(self.commands):
             return self.arrived * self.period + self.delay
         return otherwise
 
     def next_jump(self, otherwise: float) -> float:
-        """When the scenario jumps next."""
+        """Time of the next jump of the scenario [s]; `otherwise` if there is none."""
         if self.jumped < self.jump_times.size:
             return float(self.jump_times[self.jumped])
         return otherwise
@@ -373,7 +356,7 @@ class _Run:
             self.jumped += 1
 
     def side_of_jumps(self, t: float) -> float:
-        """The time, moved to the side of the jumps on which the run is."""
+        """The time, moved away from the jumps: after those of the past and before the next one."""
         if self.jumped > 0:
             last = self.jumped - 1
             t = max(t, self.jump_times[last] + self.jump_widths[last])
@@ -383,7 +366,7 @@ class _Run:
 
 
 def _stacked(trees: Sequence[Any]) -> Any:
-    """Pytrees of arrays as one, with a new first axis."""
+    """One pytree whose arrays stack those of the given pytrees along a new first axis."""
     return jax.tree.map(lambda *x: np.stack(x), *trees)
 
 
@@ -427,5 +410,5 @@ def _rollout(
         measured=states.sampled.measured,
         method=method,
         steps=int(np.sum(motion.instant)) - 1,
-        **{name: getattr(recorded, name) for name in SIGNALS},
+        **attributes(recorded, SIGNALS),
     )

@@ -36,24 +36,25 @@ from iblf_jax.files.scenario import scenario_to_toml
 from iblf_jax.kernels import UnsupportedError
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
 from iblf_jax.simulation.integrators import tableau
-from iblf_jax.simulation.sampling import check_step, has_noise, noise_key
-from iblf_jax.simulation.scenario import Scenario, canonical
+from iblf_jax.simulation.noise import has_noise, noise_key
+from iblf_jax.simulation.scenario import Scenario, canonical, check_step
 from iblf_jax.world.robots._base import robot_member
 
 TARGETS = ("c", "fmu", "fmu-loop", "wasm")
 TYPES = {"double": "float64", "float": "float32"}
 VECTORS_DURATION = 20.0
-"""Length of the simulated run that the self-test compares with [s]."""
+"""Length of the simulated run whose torques the self-test compares [s]."""
 SAMPLES_AT_START = 3
 """Samples of a sampled law that are checked before its closed loop is written; the first torque
 influences later samples through the observer."""
 DECIMALS = 9
+"""Decimals of the inputs of the self-test."""
 LONGEST_STEP = 1e-3
-"""Longest step of that run [s]."""
+"""Longest time step of the run of the self-test [s]."""
 SHORTEST_PERIOD, LONGEST_PERIOD = 1e-6, 1e3
-"""[s].  A period outside these limits makes the run of the self-test too long."""
+"""Limits of the period of a law [s]; others make the run of the self-test too long."""
 LONGEST_IDENTIFIER = 63
-"""Characters of a name that every C compiler compares (C99, 5.2.4.1)."""
+"""Number of characters of a name that every C compiler distinguishes (C99, 5.2.4.1)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -136,7 +137,8 @@ def export(
     _check_options(target, dtype, reference, is_loop)
     tableau(method)
     dt, seed = checks.time_span("dt", dt), checks.seed(seed)
-    name = checked_name(name, "iblf_loop" if is_loop else "iblf_law")
+    defaults = {True: "iblf_loop", False: "iblf_law"}
+    name = checked_name(name, defaults[is_loop])
     check_single(scenario)
     if not is_loop or period is not None:
         scenario = with_period(scenario, period)
@@ -149,13 +151,12 @@ def export(
             return _export_loop(scenario, folder, target, name, dt, method, seed)
         return _export_law(scenario, folder, target, name, reference == "given")
     except UnsupportedError as error:
-        raise checks.fail(
-            "scenario", f"what has no C ({error})", "a scenario whose operations are lowered"
-        ) from None
+        came = f"what has no C ({error})"
+        raise checks.fail("scenario", came, "a scenario whose operations are lowered") from None
 
 
 def _current_name(reference: str) -> str:
-    """The present name of a value of the argument `reference`."""
+    """The argument `reference`, with a former name of a value replaced by the present one."""
     former = "told"
     if not isinstance(reference, str) or reference != former:
         return reference
@@ -250,12 +251,9 @@ def _available(dtype: str) -> str:
     """JAX's name of a C type; ValueError if JAX does not compute with it."""
     jax_type = TYPES[dtype]
     if jax.dtypes.canonicalize_dtype(jax_type) != jax_type:
-        raise checks.fail(
-            "dtype",
-            dtype,
-            '"float", as JAX computes in float32 here',
-            'Call jax.config.update("jax_enable_x64", True) first.',
-        )
+        expected = '"float", as JAX computes in float32 here'
+        remedy = 'Call jax.config.update("jax_enable_x64", True) first.'
+        raise checks.fail("dtype", dtype, expected, remedy)
     return jax_type
 
 
@@ -298,10 +296,9 @@ def vectors(scenario: Scenario, external_reference: bool) -> Vectors:
             f"the simulated run with this law every {period:g} s: {describe(status)}. The exported"
             " code is that law; ij.recommended_period(scenario) returns how long a period may be."
         )
-    references = tuple(np.asarray(x) for x in inputs[3:]) if external_reference else ()
-    at_start = tuple(np.asarray(x) for x in first[1:] if not isinstance(x, tuple))
-    measured_q, measured_dq = np.asarray(inputs.q), np.asarray(inputs.dq)
-    return Vectors(at_start, measured_q, measured_dq, references, torques[::CHECK_INTERVAL])
+    _, *at_start = map(np.asarray, jax.tree.leaves(first))
+    _, q, dq, *references = map(np.asarray, jax.tree.leaves(inputs))
+    return Vectors(tuple(at_start), q, dq, tuple(references), torques[::CHECK_INTERVAL])
 
 
 def _with_own_reference(scenario: Scenario, inputs: SampleInputs) -> SampleInputs:
@@ -323,12 +320,11 @@ def _check_torques(
     until = int(np.argmax(wrong)) + 1
     first_samples = jax.tree.map(lambda x: x[:until], inputs)
     instant = f"at t = {float(first_samples.t[-1]):g} s{where}"
-    check_finite(
-        scenario,
-        lambda changed: _torques(changed, first, first_samples),
-        torques[:until],
-        instant,
-    )
+
+    def torques_of(changed: Scenario) -> jax.Array:
+        return _torques(changed, first, first_samples)
+
+    check_finite(scenario, torques_of, torques[:until], instant)
 
 
 def _check_start(scenario: Scenario) -> None:
@@ -346,17 +342,16 @@ def _check_start(scenario: Scenario) -> None:
 
 @jax.jit
 def _first_torque(scenario: Scenario) -> jax.Array:
-    """The torque of a continuous law at t = 0, (1, n) [N m]; where a joint's acceleration is not
-    finite, the acceleration instead.
+    """The torque of a continuous law at t = 0, (1, n) [N m].  A joint whose acceleration is not
+    finite gets the acceleration in place of the torque.
     """
-    rate, found = evaluate(
-        scenario, jnp.zeros((), scenario.initial.q.dtype), initial_state(scenario)
-    )
+    t = jnp.zeros((), scenario.initial.q.dtype)
+    rate, found = evaluate(scenario, t, initial_state(scenario))
     return jnp.where(jnp.isfinite(rate.dq), found.tau, rate.dq)[None]
 
 
 def _rounded(x: Any, samples: int, dtype: Any) -> jax.Array:
-    """The first samples with nine decimals, so that the written inputs are short."""
+    """The first samples, rounded to DECIMALS so that the written inputs are short."""
     return jnp.asarray(np.round(np.asarray(x[:samples], float), DECIMALS), dtype)
 
 

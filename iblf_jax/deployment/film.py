@@ -1,5 +1,5 @@
-"""The motion of a run against MuJoCo as a film: MuJoCo's own picture where it can draw one, the
-arm's skeleton otherwise.
+"""Writes the motion of a run against MuJoCo as a film: MuJoCo's own picture where it can draw one,
+the arm's skeleton otherwise.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from iblf_jax.simulation.results import Rollout
 
 FPS = 25.0
 SIZE = (480, 640)
-"""Height and width of a picture [pixels]: MuJoCo's own buffer of a model that says nothing else."""
+"""Height and width of a picture [pixels], which are the defaults of MuJoCo's buffer."""
 SHOWN_GROUPS = 3
-"""Number of the first groups of shapes, which MuJoCo draws by default."""
+"""MuJoCo draws this many groups of shapes, the first ones, by default."""
 AMBIENT, DIFFUSE = 0.5, 0.6
-"""Of the camera's lamp, at least, in a model without lights: MuJoCo's own leaves a grey arm nearly
-black."""
+"""Smallest intensities of the camera's lamp in a model without lights.  With MuJoCo's own values a
+grey arm is nearly black."""
 
 
 def film_run(
@@ -35,20 +35,18 @@ def film_run(
 
     Args:
       run: the run.
-      robot: which MuJoCo has moved.
-      positions: of everything in its model, at every step.
+      robot: the robot that MuJoCo moved.
+      positions: positions of all joints of its model at every step.
       dt: the step [s].
-      path: where to, ".gif" or ".html".
+      path: the file, ".gif" or ".html".
     """
     renderer = _renderer(robot)
     if renderer is None:
         return animate(run, path, FPS)
     times = frame_times((len(positions) - 1) * dt, FPS)
+    shown = positions[np.round(times / dt).astype(int)]
     with renderer:
-        pictures = [
-            Image.fromarray(x)
-            for x in _pictures(renderer, robot, positions[np.round(times / dt).astype(int)])
-        ]
+        pictures = [Image.fromarray(x) for x in _pictures(renderer, robot, shown)]
     return write_film(pictures, path, FPS)
 
 
@@ -60,8 +58,8 @@ def _renderer(robot: MujocoPlant) -> Any:
 
 
 def has_shapes(model: Any) -> bool:
-    """Whether MuJoCo's picture of a model has something that moves: the arm of a URDF whose meshes
-    are not there has no shape.
+    """Whether MuJoCo's picture of a model shows something that moves.  The arm of a URDF whose mesh
+    files are missing has no shapes.
     """
     seen = (model.geom_group < SHOWN_GROUPS) & (model.geom_rgba[:, 3] > 0)
     return bool(np.any(model.body_weldid[model.geom_bodyid[seen]] > 0))
@@ -69,19 +67,15 @@ def has_shapes(model: Any) -> bool:
 
 @cache
 def _can_draw() -> bool:
-    """Whether MuJoCo can draw on this machine, tried in a process of its own: without a display,
-    the second try ends the process.
+    """Whether MuJoCo can draw on this machine.  A separate process tries it, because without a
+    display the second attempt ends the process.
     """
-    words = "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>')).render()"
+    code = "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>')).render()"
     try:
-        return (
-            subprocess.run(
-                [sys.executable, "-c", words], capture_output=True, timeout=60
-            ).returncode
-            == 0
-        )
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, timeout=60)
     except (OSError, subprocess.TimeoutExpired):
         return False
+    return done.returncode == 0
 
 
 def _pictures(renderer: Any, robot: MujocoPlant, positions: np.ndarray) -> Iterator[np.ndarray]:
@@ -92,8 +86,6 @@ def _pictures(renderer: Any, robot: MujocoPlant, positions: np.ndarray) -> Itera
         renderer.update_scene(data)
         if not robot.model.nlight:
             lamp = renderer.scene.lights[0]
-            lamp.ambient, lamp.diffuse = (
-                np.maximum(lamp.ambient, AMBIENT),
-                np.maximum(lamp.diffuse, DIFFUSE),
-            )
+            lamp.ambient = np.maximum(lamp.ambient, AMBIENT)
+            lamp.diffuse = np.maximum(lamp.diffuse, DIFFUSE)
         yield renderer.render().copy()

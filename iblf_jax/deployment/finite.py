@@ -1,4 +1,4 @@
-"""Check that a law yields finite torques, and the parameter that causes others."""
+"""Checks that a law yields finite torques, and finds the parameter that is the cause if not."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from iblf_jax.simulation.paths import parameters, with_parameters
 from iblf_jax.simulation.scenario import Scenario
 
 LARGE, SMALL = 1e6, 1e-6
-"""Sizes beyond which a parameter may be why a law yields no numbers."""
+"""A parameter whose absolute value is above or below these may be the cause of torques that are not
+finite."""
 
 
 def check_finite(
@@ -21,11 +22,11 @@ def check_finite(
     """Refuses a law whose torques are not finite.
 
     Args:
-      scenario: with the law.
-      torques_of: the torques of a scenario like this one, up to those that are not finite, (K, n)
+      scenario: the scenario with the law.
+      torques_of: computes the torques of a scenario, up to the first that is not finite, (K, n)
         [N m].
-      torques: those of this scenario, (K, n) [N m].
-      instant: when the last of them is, for the message.
+      torques: the torques of this scenario, (K, n) [N m].
+      instant: time of the last torque, in words for the message.
 
     Raises:
       ValueError: some torque is not finite; the message names the parameter that causes it, or else
@@ -38,16 +39,11 @@ def check_finite(
     finding = f"the torque tau[{joint}] is {torques[row, joint]} {instant}"
     blamed = _cause(scenario, torques_of)
     if blamed is None:
-        raise checks.fail(
-            "scenario",
-            f"a law that yields no numbers: {finding}",
-            "finite torques",
-            "Check its gains and its model.",
-        )
+        came, remedy = f"a law that yields no numbers: {finding}", "Check its gains and its model."
+        raise checks.fail("scenario", came, "finite torques", remedy)
     path, value = blamed
-    raise checks.fail(
-        path, value, "a value with which the law yields finite numbers", f"With it {finding}."
-    )
+    expected = "a value with which the law yields finite numbers"
+    raise checks.fail(path, value, expected, f"With it {finding}.")
 
 
 def _cause(
@@ -62,10 +58,9 @@ def _cause(
         is_extreme = (size > LARGE) | ((size < SMALL) & (size > 0))
         if not is_extreme.any():
             continue
+        moderate = np.where(is_extreme, np.sign(value), value)
         try:
-            changed = with_parameters(
-                scenario, {parameter.path: np.where(is_extreme, np.sign(value), value)}
-            )
+            changed = with_parameters(scenario, {parameter.path: moderate})
         except ValueError:  # this value is the only one that fits the others
             continue
         if np.all(np.isfinite(np.asarray(torques_of(changed)))):

@@ -1,5 +1,5 @@
-"""A law or a closed loop as an FMU: FMI 3.0 for co-simulation, with the binary of this platform and
-its sources.
+"""Writes a law or a closed loop as an FMU (FMI 3.0, co-simulation) with the binary of this platform
+and its sources.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from iblf_jax import __version__
 from iblf_jax.deployment.build import build, c_compiler, fmi_platform
 from iblf_jax.deployment.c_names import Parameters
 from iblf_jax.deployment.loop_program import OUTPUTS
-from iblf_jax.deployment.write_c import REFERENCE, GeneratedLaw, Law, fill_template, title_of
+from iblf_jax.deployment.write_c import GeneratedLaw, Law, fill_template, title_of
 from iblf_jax.deployment.write_loop import GeneratedLoop
 from iblf_jax.simulation.scenario import Scenario
 
@@ -31,9 +31,9 @@ BASE = {
     "kg": (1, 0, 0, 0),
     "N": (1, 1, -2, 0),
 }
-"""Exponents of kg, m, s, rad."""
+"""Unit -> its exponents of kg, m, s and rad."""
 FIXED = ("sampling.period",)
-"""Parameters that the FMU is built for."""
+"""Parameters that an FMU does not let its user change."""
 
 
 class Variable(NamedTuple):
@@ -47,8 +47,8 @@ class Variable(NamedTuple):
 
 
 def unit_exponents(unit: str) -> tuple[int, int, int, int] | None:
-    """Exponents of kg, m, s, rad of a unit such as "N m s/rad" or "kg m^2"; None for what is no
-    product of these.
+    """The exponents of kg, m, s and rad in a unit such as "N m s/rad" or "kg m^2"; None for a unit
+    that is not a product of these.
     """
     found = [0, 0, 0, 0]
     above, _, below = unit.partition("/")
@@ -66,38 +66,35 @@ def unit_exponents(unit: str) -> tuple[int, int, int, int] | None:
 
 def law_variables(law: Law, parameters: Parameters) -> list[Variable]:
     """The variables of an FMU of a law."""
-    n = law.scenario.n
-    start = [np.asarray(x, float) for x in law.vectors.first]
-    reference = (
-        zip(REFERENCE, ("rad", "rad/s", "rad/s^2"), strict=True) if law.external_reference else ()
-    )
-    names = [("q", "rad"), ("dq", "rad/s"), *reference]
+    units = {"q": "rad", "dq": "rad/s", "q_d": "rad", "dq_d": "rad/s", "ddq_d": "rad/s^2"}
+    names = ("q", "dq", *law.references)
     inputs = [
-        Variable(name, "input", unit, (n,), x) for (name, unit), x in zip(names, start, strict=True)
+        Variable(name, "input", units[name], (law.scenario.n,), np.asarray(x, float))
+        for name, x in zip(names, law.vectors.first, strict=True)
     ]
-    outputs = [
-        Variable(name, "output", unit, (n,))
-        for name, unit in (("tau", "N m"), ("alpha", "rad/s"), ("f_hat", "N m"))
-    ]
-    return [*_settable(parameters), *inputs, *outputs, Variable("status", "output", "1", ())]
+    outputs = _outputs({"tau": "N m", "alpha": "rad/s", "f_hat": "N m"}, law.scenario.n)
+    return [*_settable(parameters), *inputs, *outputs]
 
 
 def loop_variables(scenario: Scenario, parameters: Parameters) -> list[Variable]:
     """The variables of an FMU of a closed loop."""
-    outputs = [Variable(name, "output", unit, (scenario.n,)) for name, unit in OUTPUTS.items()]
-    return [*_settable(parameters), *outputs, Variable("status", "output", "1", ())]
+    return [*_settable(parameters), *_outputs(OUTPUTS, scenario.n)]
+
+
+def _outputs(units: dict[str, str], n: int) -> list[Variable]:
+    """Output variables with one number per joint, name -> unit, and the status."""
+    outputs = [Variable(name, "output", unit, (n,)) for name, unit in units.items()]
+    return [*outputs, Variable("status", "output", "1", ())]
 
 
 def _settable(parameters: Parameters) -> list[Variable]:
+    """The parameters; those in FIXED are constants."""
+    kinds = dict.fromkeys(FIXED, "constant")
     return [
         Variable(
-            field.path,
-            "constant" if field.path in FIXED else "parameter",
-            field.unit,
-            field.shape,
-            np.asarray(field.value, float),
+            x.path, kinds.get(x.path, "parameter"), x.unit, x.shape, np.asarray(x.value, float)
         )
-        for field in parameters.fields
+        for x in parameters.fields
     ]
 
 
@@ -252,45 +249,31 @@ def law_fmu(law: Law, generated: GeneratedLaw, path: Path) -> None:
     n = law.scenario.n
     name = law.name
     step = float(law.scenario.sampling.period)  # type: ignore[union-attr]
-    given = "".join(f", q + {k * n}" for k in (2, 3, 4)) if law.external_reference else ""
+    places = "".join(f", q + {k * n}" for k, _ in enumerate(law.references, start=2))
+    dq = "NULL"
+    if law.programs.reads_velocity:
+        dq = f"q + {n}"
+    # The order counts: the token of the FMU is computed from the text of these values.
     values = {
-        "name": name, "upper": name.upper(), "joints": n, "step": repr(step), "reference": given,
-        "dq": f"q + {n}" if law.programs.reads_velocity else "NULL",
+        "name": name, "upper": name.upper(), "joints": n, "step": repr(step), "reference": places,
+        "dq": dq,
     }  # fmt: skip
     sources = {file: generated.files[file] for file in (f"{name}.h", f"{name}.c")}
-    _package(
-        path,
-        name,
-        title_of(law.scenario),
-        step,
-        law_variables(law, generated.parameters),
-        "fmu_law.c",
-        values,
-        sources,
-    )
+    variables = law_variables(law, generated.parameters)
+    title = title_of(law.scenario)
+    _package(path, name, title, step, variables, "fmu_law.c", values, sources)
 
 
 def loop_fmu(
     scenario: Scenario, generated: GeneratedLoop, run_settings: Sequence[float], path: Path
 ) -> None:
     """Writes a closed loop as an FMU; raises ToolchainError."""
-    name = generated.values["name"]
-    values = {
-        "name": name,
-        "step": repr(run_settings[0]),
-        "setting_values": ", ".join(map(repr, run_settings)),
-    }
+    name, step = generated.values["name"], run_settings[0]
+    setting_values = ", ".join(map(repr, run_settings))
+    values = {"name": name, "step": repr(step), "setting_values": setting_values}
     title = f"the closed loop of {generated.values['title']}"
-    _package(
-        path,
-        name,
-        title,
-        run_settings[0],
-        loop_variables(scenario, generated.parameters),
-        "fmu_loop.c",
-        values,
-        generated.files,
-    )
+    variables = loop_variables(scenario, generated.parameters)
+    _package(path, name, title, step, variables, "fmu_loop.c", values, generated.files)
 
 
 def _package(
@@ -303,7 +286,7 @@ def _package(
     values: dict[str, Any],
     sources: dict[str, str],
 ) -> None:
-    """The archive: description, sources, and the binary that is built of them here."""
+    """Writes the archive: the description, the sources, and the binary that is built from them."""
     text = "\n".join(sources[key] for key in sorted(sources))
     token = f"{{{uuid.uuid5(uuid.NAMESPACE_URL, text + repr(values))}}}"
     sources = sources | {

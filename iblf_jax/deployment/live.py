@@ -1,5 +1,5 @@
-"""`explore`: a scenario's closed loop with sliders, as one page that computes in the browser; in
-notebooks the same page in a frame.
+"""`explore`: a page with sliders that computes a scenario's closed loop in the browser; a notebook
+shows the same page in a frame.
 """
 
 from __future__ import annotations
@@ -7,6 +7,7 @@ from __future__ import annotations
 import base64
 import html
 import json
+import re
 import tempfile
 from collections.abc import Mapping
 from importlib.resources import files
@@ -27,13 +28,13 @@ from iblf_jax.simulation.paths import sign_at
 from iblf_jax.simulation.scenario import Scenario
 
 GAIN_RANGE = 5.0
-"""A gain's slider goes from a fifth of its value to five times it."""
+"""The slider of a gain ranges from the gain divided by this to the gain times this."""
 START_RANGE = 0.3
-"""That of a start or a bound, so far to both sides [rad]."""
+"""The slider of an initial position or of a bound reaches this far to both sides [rad]."""
 DRAWN_INSTANTS = 500
-"""Instants that are drawn of a run, about."""
+"""Approximate number of instants of a run that are drawn."""
 HEIGHT = 640
-"""Pixels of the frame in a notebook."""
+"""Height of the frame in a notebook [pixels]."""
 
 
 class Page:
@@ -135,28 +136,17 @@ def _loop(scenario: Scenario, dt: float, method: str) -> dict[str, Any]:
 
 
 def _slider(scenario: Scenario, row: dict[str, Any]) -> dict[str, Any]:
-    """Ends of a parameter's sliders: of gains one for all joints, of starts and bounds one a joint;
-    nothing for others.
+    """The ranges of a parameter's sliders: gains have one slider for all joints, initial positions
+    and bounds have one per joint, and other parameters have none.
     """
     path, values = row["path"], np.ravel(row["value"])
     if len(row["shape"]) > 1 or any(x is None for x in values):
         return {}
     if path.startswith(("controller.", "observer.")) and sign_at(scenario, path) == "positive":
-        return {
-            "slider": [[float(values[0]) / GAIN_RANGE, float(values[0]) * GAIN_RANGE]],
-            "positive": True,
-            "each": False,
-        }
-    if path in (
-        "initial.q",
-        "bounds.lower.offset",
-        "bounds.upper.offset",
-        "bounds.lower.value",
-        "bounds.upper.value",
-    ):
-        return {
-            "slider": [[float(x) - START_RANGE, float(x) + START_RANGE] for x in values],
-            "positive": False,
-            "each": True,
-        }
+        first = float(values[0])
+        ends = [[first / GAIN_RANGE, first * GAIN_RANGE]]
+        return {"slider": ends, "positive": True, "each": False}
+    if re.fullmatch(r"initial\.q|bounds\.(lower|upper)\.(offset|value)", path):
+        ends = [[float(x) - START_RANGE, float(x) + START_RANGE] for x in values]
+        return {"slider": ends, "positive": False, "each": True}
     return {}

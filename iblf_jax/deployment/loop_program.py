@@ -9,13 +9,14 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from iblf_jax.core.optional import attributes
 from iblf_jax.deployment.control_law import as_floats, of_floats, program_of
 from iblf_jax.engine.carry import Inputs, StepOptions, start
 from iblf_jax.engine.time_step import advance
 from iblf_jax.kernels import Program
-from iblf_jax.simulation import accuracy
+from iblf_jax.simulation import error_estimate
 from iblf_jax.simulation.closed_loop import initial_state
-from iblf_jax.simulation.sampling import has_noise
+from iblf_jax.simulation.noise import has_noise
 from iblf_jax.simulation.scenario import Scenario
 
 OUTPUTS = {
@@ -33,7 +34,7 @@ OUTPUTS = {
 OF_SAMPLE = {"f": "disturbance", "f_hat": "disturbance_estimate"}
 """Outputs that have another name in `Sample`."""
 UNLIMITED_STEPS = 2.0**52
-"""Number of steps of a run without an end."""
+"""Number of steps that stands for a run without an end."""
 
 
 class RunSettings(NamedTuple):
@@ -54,7 +55,7 @@ class Loop(NamedTuple):
     step: Program
     """Its carry is the memory; its results are OUTPUTS and the status at the start of the step."""
     size: int
-    """Numbers of the memory."""
+    """Number of floating-point numbers in the memory."""
 
 
 def loop_program(scenario: Scenario, method: str) -> Loop:
@@ -68,9 +69,10 @@ def loop_program(scenario: Scenario, method: str) -> Loop:
       UnsupportedError: the loop cannot be lowered; the message states the reason.
     """
     dtype = scenario.initial.q.dtype
-    run_settings = RunSettings(
-        jnp.zeros((), dtype), jnp.zeros((4,), dtype) if has_noise(scenario) else ()
-    )
+    key = jnp.zeros((4,), dtype)
+    run_settings = RunSettings(jnp.zeros((), dtype), ())
+    if has_noise(scenario):
+        run_settings = run_settings._replace(noise=key)
     like = (initial_state(scenario), jnp.int32(0))
 
     def first(scenario, run_settings, carry, index):
@@ -80,27 +82,17 @@ def loop_program(scenario: Scenario, method: str) -> Loop:
         state, status = of_floats(carry, like)
         noise = run_settings.noise
         if not has_noise(scenario) and scenario.sampling is not None:
-            noise = jnp.zeros((4,), dtype)
+            noise = key
         inputs = Inputs(scenario, (), run_settings.dt, jnp.asarray(UNLIMITED_STEPS, dtype), noise)
-        size = accuracy.watched_indices(state).size
-        blank = start(inputs, method, jnp.zeros((size, size), dtype))
-        done = advance(
-            inputs,
-            blank._replace(state=state, status=status),
-            index,
-            method,
-            StepOptions(scalar=True),
-        )
-        outputs = [getattr(done.sample, OF_SAMPLE.get(name, name)) for name in OUTPUTS]
-        return as_floats((done.carry.state, done.carry.status), dtype), (
-            *outputs,
-            done.carry.status.astype(dtype),
-        )
+        size = error_estimate.watched_indices(state).size
+        before = start(inputs, method, jnp.zeros((size, size), dtype))
+        before = before._replace(state=state, status=status)
+        done = advance(inputs, before, index, method, StepOptions(scalar=True))
+        names = [OF_SAMPLE.get(name, name) for name in OUTPUTS]
+        outputs = (*attributes(done.sample, names).values(), done.carry.status.astype(dtype))
+        return as_floats((done.carry.state, done.carry.status), dtype), outputs
 
-    shapes = as_floats(like, dtype)
+    memory = as_floats(like, dtype)
     begin = program_of(first, scenario, run_settings, ())
-    return Loop(
-        begin,
-        program_of(step, scenario, run_settings, shapes),
-        sum(x.size for x in jax.tree.leaves(shapes)),
-    )
+    advanced = program_of(step, scenario, run_settings, memory)
+    return Loop(begin, advanced, sum(x.size for x in jax.tree.leaves(memory)))

@@ -1,9 +1,8 @@
 """A robot that MuJoCo simulates, with its own model, contacts, stops and integrator.
 
-The joints of a scenario are found in MuJoCo's model by their names, or by their order where the
-scenario's have none.  Other
-joints of the same arm, such as the fingers of a gripper, are locked as `robots.load` locks them;
-separate bodies move freely.
+The joints of a scenario are found in MuJoCo's model by their names, or by their order if the
+scenario's joints have no names.  Other joints of the same arm, such as the fingers of a gripper,
+are locked as `robots.load` locks them.  Separate bodies move freely.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from iblf_jax.world.robots.tree import HINGE, SLIDE, Tree, mujoco_package, unkno
 INTEGRATORS = ("RK4", "Euler", "implicit", "implicitfast")
 
 Push = Callable[[float, np.ndarray, np.ndarray], np.ndarray]
-"""Torque of the joints, (n,) [N m], at a time [s], q and q'."""
+"""Computes the torque of the joints, (n,) [N m], from time [s], q and q'."""
 
 
 class MujocoPlant:
@@ -59,13 +58,9 @@ class MujocoPlant:
             model = copy.copy(plant)
             joints, others = _joints(Tree(model, mujoco, "world", {}), names, n, locked)
             if others:
+                came = Shown("an MjModel in which more moves")
                 remedy = "Give the file or an MjSpec, in which they can be locked."
-                raise checks.fail(
-                    "plant",
-                    Shown("an MjModel in which more moves"),
-                    f"one whose arm has {n} joints that move",
-                    remedy,
-                )
+                raise checks.fail("plant", came, f"one whose arm has {n} joints that move", remedy)
         else:
             model, joints = _locked(mujoco, _specification(mujoco, plant), plant, names, n, locked)
         self.model = model
@@ -101,15 +96,13 @@ class MujocoPlant:
 
     @contextmanager
     def driven(self, push: Push) -> Iterator[None]:
-        """Inside, MuJoCo asks `push` for the torque whenever it needs one: at every stage of its
-        integrator.
-        """
+        """Context in which MuJoCo calls `push` for the torque at every stage of its integrator."""
         mujoco, before = self.mujoco, self.mujoco.get_mjcb_control()
 
         def control(model: Any, data: Any) -> None:
             if before is not None:
                 before(model, data)
-            if data is self.data:  # the callback is global: it serves all models of the process
+            if data is self.data:  # MuJoCo calls it for all models of the process.
                 data.qfrc_applied[self.speeds] = push(data.time, self.q, self.dq)
 
         mujoco.set_mjcb_control(control)
@@ -131,7 +124,7 @@ class MujocoPlant:
 
 
 class Stages:
-    """A state besides MuJoCo's, integrated with the stages of MuJoCo's integrator."""
+    """Integrates a state that MuJoCo does not have, with the stages of MuJoCo's integrator."""
 
     def __init__(
         self,
@@ -149,15 +142,16 @@ class Stages:
 
     def __call__(self, t: float, q: np.ndarray, dq: np.ndarray) -> np.ndarray:
         """The torque at a stage; the state there follows from the rate at the previous stage."""
-        torque, slope = self.rate(
-            t, q, dq, self.extrapolated(t - self.start, self.slopes[-1:], (1.0,))
-        )
+        state = self.extrapolated(t - self.start, self.slopes[-1:], (1.0,))
+        torque, slope = self.rate(t, q, dq, state)
         self.slopes.append(slope)
         return torque
 
     def finish(self, h: float) -> None:
         """Ends a step of length h [s]."""
-        weights = (1 / 6, 1 / 3, 1 / 3, 1 / 6) if len(self.slopes) == 4 else (1.0,)
+        weights: tuple[float, ...] = (1.0,)
+        if len(self.slopes) == 4:
+            weights = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
         self.state = self.extrapolated(h, self.slopes, weights)
 
     def extrapolated(self, h: float, slopes: list, weights: tuple[float, ...]) -> Any:
@@ -185,10 +179,9 @@ def _driven_bodies(mujoco: Any, model: Any, a: int) -> list[int]:
     start, bodies, wraps = model.tendon_adr[target], [], mujoco.mjtWrap
     of = {wraps.mjWRAP_JOINT: model.jnt_bodyid, wraps.mjWRAP_SITE: model.site_bodyid}
     for w in range(start, start + model.tendon_num[target]):
-        if wraps(int(model.wrap_type[w])) != wraps.mjWRAP_PULLEY:
-            bodies.append(
-                of.get(wraps(int(model.wrap_type[w])), model.geom_bodyid)[model.wrap_objid[w]]
-            )
+        wrap = wraps(int(model.wrap_type[w]))
+        if wrap != wraps.mjWRAP_PULLEY:
+            bodies.append(of.get(wrap, model.geom_bodyid)[model.wrap_objid[w]])
     return bodies
 
 
@@ -197,9 +190,8 @@ def _specification(mujoco: Any, plant: Any) -> Any:
     if isinstance(plant, mujoco.MjSpec):
         return plant.copy()
     if not isinstance(plant, str | os.PathLike):
-        raise checks.fail(
-            "plant", plant, "the path of an MJCF or URDF, a mujoco.MjSpec or a mujoco.MjModel"
-        )
+        expected = "the path of an MJCF or URDF, a mujoco.MjSpec or a mujoco.MjModel"
+        raise checks.fail("plant", plant, expected)
     root, path = read(plant, "plant"), Path(plant)
     try:
         spec = mujoco.MjSpec.from_file(str(path))
@@ -212,27 +204,25 @@ def _specification(mujoco: Any, plant: Any) -> Any:
 
 def _refused(plant: Any, error: ValueError) -> ValueError:
     """The error for a model that MuJoCo does not accept, with its message."""
-    name, words = (
-        plant if isinstance(plant, str | os.PathLike) else "plant",
-        " ".join(str(error).split()),
-    )
-    return ValueError(
-        f"{name}: {words}"
-        + (". Put the file where the model looks for it." if "opening file" in words else "")
-    )
+    name, words = "plant", " ".join(str(error).split())
+    if isinstance(plant, str | os.PathLike):
+        name = str(plant)
+    if "opening file" in words:
+        words += ". Put the file where the model looks for it."
+    return ValueError(f"{name}: {words}")
 
 
 def _without_missing_meshes(spec: Any, path: Path) -> None:
     """Removes the shapes of a URDF whose mesh files are missing; the masses of its links are given
     as numbers.
     """
-    folder = path.parent
-    place = folder / spec.meshdir
-    missing = {
-        mesh.name
-        for mesh in spec.meshes
-        if not (place / (Path(mesh.file).name if spec.strippath else mesh.file)).exists()
-    }
+    missing = set()
+    for mesh in spec.meshes:
+        file = Path(mesh.file)
+        if spec.strippath:
+            file = Path(file.name)
+        if not (path.parent / spec.meshdir / file).exists():
+            missing.add(mesh.name)
     shapes = [geom for geom in spec.geoms if geom.meshname in missing]
     if shapes:
         reason = "as their meshes are not there: these touch nothing."
@@ -260,43 +250,32 @@ def _joints(
     if names:
         for name in names:
             if name not in tree.joint_names:
-                raise unknown(
-                    "plant", name, "a model that has the scenario's joints", tree.joint_names
-                )
+                expected = "a model that has the scenario's joints"
+                raise unknown("plant", name, expected, tree.joint_names)
         joints = [tree.joint_names.index(name) for name in names]
         for j in joints:
+            name = tree.joint_names[j]
             if j in locked_positions:
-                raise checks.fail(
-                    "locked", tree.joint_names[j], "joints that the scenario does not move"
-                )
+                raise checks.fail("locked", name, "joints that the scenario does not move")
             if j not in movable:
-                raise checks.fail(
-                    f"joint {tree.joint_names[j]!r}",
-                    Shown("a free joint or a ball"),
-                    "a hinge or slide",
-                )
+                came = Shown("a free joint or a ball")
+                raise checks.fail(f"joint {name!r}", came, "a hinge or slide")
     elif len(movable) != n:
-        more = "Lock the others, or name the scenario's joints: robots.load does."
-        remedy = more if len(movable) > n else "Only hinges and slides count."
-        raise checks.fail(
-            "plant", Shown(f"{len(movable)} joints that move"), f"{n}, as the scenario has", remedy
-        )
+        came = Shown(f"{len(movable)} joints that move")
+        remedy = "Only hinges and slides count."
+        if len(movable) > n:
+            remedy = "Lock the others, or name the scenario's joints: robots.load does."
+        raise checks.fail("plant", came, f"{n}, as the scenario has", remedy)
     else:
         joints = movable
     arm = {int(m.body_rootid[m.jnt_bodyid[j]]) for j in joints}
-    for j in range(m.njnt):
-        if (
-            j not in joints
-            and j not in locked_positions
-            and int(m.body_rootid[m.jnt_bodyid[j]]) in arm
-        ):
-            if m.jnt_type[j] not in (HINGE, SLIDE):
-                raise checks.fail(
-                    f"joint {tree.joint_names[j]!r}",
-                    Shown("free or a ball"),
-                    "an arm on a base that stands still",
-                )
-            locked_positions[j] = float(m.qpos0[m.jnt_qposadr[j]])
+    for j in set(range(m.njnt)).difference(joints, locked_positions):
+        if int(m.body_rootid[m.jnt_bodyid[j]]) not in arm:
+            continue
+        if m.jnt_type[j] not in (HINGE, SLIDE):
+            field, came = f"joint {tree.joint_names[j]!r}", Shown("free or a ball")
+            raise checks.fail(field, came, "an arm on a base that stands still")
+        locked_positions[j] = float(m.qpos0[m.jnt_qposadr[j]])
     return joints, locked_positions
 
 
@@ -323,9 +302,8 @@ def _locked(
     for j, position in locked_positions.items():
         data.qpos[full_model.jnt_qposadr[j]] = position
     mujoco.mj_kinematics(full_model, data)
-    removed = _elements_to_remove(
-        mujoco, spec, locked_positions
-    )  # before any frame is added, with which the numbers of joints are lost
+    # The joints lose their numbers as soon as a frame is added.
+    removed = _elements_to_remove(mujoco, spec, locked_positions)
     for body in {int(full_model.jnt_bodyid[j]) for j in locked_positions}:
         _weld(mujoco, full_model, data, spec, body, locked_positions)
     for x in removed:
@@ -344,13 +322,9 @@ def _elements_to_remove(mujoco: Any, spec: Any, locked_positions: dict[int, floa
         wrapped = [wrap.target for wrap in tendon.path if wrap.type == mujoco.mjtWrap.mjWRAP_JOINT]
         if any(joint.id in locked_positions for joint in wrapped):
             if not all(joint.id in locked_positions for joint in wrapped):
-                got = Shown("a tendon over a joint that is locked and one that moves")
-                raise checks.fail(
-                    f"tendon {tendon.name!r}",
-                    got,
-                    "one or the other",
-                    "Take it out of the model, or lock or drive all of its joints.",
-                )
+                came = Shown("a tendon over a joint that is locked and one that moves")
+                remedy = "Take it out of the model, or lock or drive all of its joints."
+                raise checks.fail(f"tendon {tendon.name!r}", came, "one or the other", remedy)
             tendons.append(tendon)
     known = {x.name for x in removed} - {""}, {x.name for x in tendons} - {""}
     of_joints = {mujoco.mjtEq.mjEQ_JOINT: 0, mujoco.mjtEq.mjEQ_TENDON: 1}
@@ -380,19 +354,17 @@ def _weld(
         return
     element = spec.bodies[body]
     if not all(j in locked_positions for j in own):
-        got, remedy = (
-            "a locked joint beside one that moves",
-            "Write each into a body of its own, or lock it at its reference.",
-        )
-        raise checks.fail(
-            f"body {element.name!r}", Shown(got), "bodies whose joints are all locked", remedy
-        )
+        came = Shown("a locked joint beside one that moves")
+        expected = "bodies whose joints are all locked"
+        remedy = "Write each into a body of its own, or lock it at its reference."
+        raise checks.fail(f"body {element.name!r}", came, expected, remedy)
     parent, back, turned = int(model.body_parentid[body]), np.zeros(4), np.zeros(4)
     mujoco.mju_negQuat(back, data.xquat[parent])
     mujoco.mju_mulQuat(turned, back, data.xquat[body])
     element.pos = data.xmat[parent].reshape(3, 3).T @ (data.xpos[body] - data.xpos[parent])
-    element.quat, element.alt.type = turned, mujoco.mjtOrientation.mjORIENTATION_QUAT
-    if (
-        element.frame is not None
-    ):  # its place is in the parent now: a frame there that moves nothing takes the other's place
+    element.quat = turned
+    element.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+    if element.frame is not None:
+        # The pose is relative to the parent now, so a frame of the parent without an own pose
+        # replaces the frame of the body.
         element.set_frame(spec.bodies[parent].add_frame())

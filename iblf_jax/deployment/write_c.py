@@ -1,4 +1,4 @@
-"""The law as a folder of C99: source, header, self-test, build files and README."""
+"""Writes a law as a folder of C99: source, header, self-test, build files and README."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ LOOKUP = """static F f_lookup(const I *table, I size, I i) {
 """
 STACK_FRAME_BYTES = 256
 """Upper estimate of the bytes of a stack frame besides its numbers."""
-ROUNDS_FOR = 10**8
+TIMED_OPERATIONS = 10**8
 """Approximate number of operations that the self-test times."""
 
 
 C_TYPES = {
-    False: {"type": "double", "integer": "int64_t", "suffix": "name"},
-    True: {"type": "float", "integer": "int32_t", "suffix": "name##f"},
+    False: {"type": "double", "integer": "int64_t", "suffix": "name", "array": "Float64Array"},
+    True: {"type": "float", "integer": "int32_t", "suffix": "name##f", "array": "Float32Array"},
 }
 """Placeholders that depend on whether the numbers are floats."""
 
 
 def fill_template(template: str, values: dict[str, Any]) -> str:
-    """A file of `c/` with its placeholders filled in."""
+    """The text of a template in `c/` with its placeholders filled in."""
     return Template((files("iblf_jax.deployment") / "c" / template).read_text()).substitute(values)
 
 
@@ -64,14 +64,14 @@ def _operation_kind(op: str) -> str:
 
 
 def describe_counts(counts: Counter[str]) -> str:
-    """Counts as text."""
+    """The numbers of operations as text; kinds that do not occur are left out."""
     order = ("sums, products and choices", "divisions", "square roots", "elementary functions")
     return ", ".join(f"{counts[name]} {name}" for name in order if counts[name])
 
 
 def stack_bytes_of(text: str, real_bytes: int) -> int:
-    """Stack of the longest chain of calls of a generated function with all its numbers in memory
-    [bytes].
+    """Stack of the longest chain of calls in a generated function, if no number is held in a
+    register [bytes].
     """
     bodies = re.split(r"^(?:static|SEPARATE) void ", text, flags=re.MULTILINE)[1:]
     own = [len(re.findall(r"^  [FI] v\d+ =", body, re.MULTILINE)) for body in bodies]
@@ -100,7 +100,7 @@ def helper_macros(text: str) -> str:
 
 
 CHECK_INTERVAL = 10
-"""The self-test compares the torque of one in so many samples."""
+"""The self-test compares the torque of every tenth sample."""
 
 
 class Vectors(NamedTuple):
@@ -126,11 +126,16 @@ class Law(NamedTuple):
     vectors: Vectors
     joints: tuple[str, ...]
     file: str | None
-    """The scenario as TOML; None where it has parts that files have no name for."""
+    """The scenario as TOML; None if a file cannot hold it."""
+
+    @property
+    def references(self) -> tuple[str, ...]:
+        """Names of the inputs that give the reference; none if the reference is internal."""
+        return REFERENCE[: 3 * self.external_reference]
 
     @property
     def is_float(self) -> bool:
-        """Whether its numbers are floats; doubles otherwise."""
+        """Whether its numbers are floats and not doubles."""
         return self.programs.sample.dtype == np.float32
 
 
@@ -146,7 +151,7 @@ class GeneratedLaw(NamedTuple):
 
 
 def generate(law: Law) -> GeneratedLaw:
-    """The files of a law, name -> text."""
+    """The files of a law, with its operations and its memory."""
     programs, name, n = law.programs, law.name, law.scenario.n
     parameters = Parameters.of(law.scenario, (programs.start, programs.sample))
     size = len(programs.memory)
@@ -170,11 +175,10 @@ def generate(law: Law) -> GeneratedLaw:
 
 
 def _functions(law: Law, parameters: Parameters) -> tuple[str, str]:
-    """The C functions of the start and of a sample."""
+    """The C functions that compute the start and a sample."""
     programs, name = law.programs, law.name
     size = len(programs.memory)
-    references = REFERENCE if law.external_reference else ()
-    arrays = ("q", "dq", *references)
+    arrays = ("q", "dq", *law.references)
     per_run = ["t[0]", *(f"{x}[{i}]" for x in arrays for i in range(law.scenario.n))]
     parameter_argument = f"const {name}_parameters *p"
     arguments = [f"const F *{x}" for x in ("t", *arrays)]
@@ -183,23 +187,16 @@ def _functions(law: Law, parameters: Parameters) -> tuple[str, str]:
         "per_run": per_run,
         "carry": [f"m[{k}]" for k in range(size)],
     }
-    start = plain_function(
-        programs.start,
-        f"{name}_start",
-        [parameter_argument, *arguments],
-        inputs,
-        _result_entries(len(programs.start.outputs)),
-        SEGMENT,
+    start_arguments = [parameter_argument, *arguments]
+    sample_arguments = [parameter_argument, "const F *m", *arguments]
+    results = [f"r[{k}]" for k in range(size + len(programs.sample.outputs))]
+    at_start = results[: len(programs.start.outputs)]
+    return (
+        plain_function(programs.start, f"{name}_start", start_arguments, inputs, at_start, SEGMENT),
+        plain_function(
+            programs.sample, f"{name}_sample", sample_arguments, inputs, results, SEGMENT
+        ),
     )
-    sample = plain_function(
-        programs.sample,
-        f"{name}_sample",
-        [parameter_argument, "const F *m", *arguments],
-        inputs,
-        _result_entries(size + len(programs.sample.outputs)),
-        SEGMENT,
-    )
-    return start, sample
 
 
 def _law_values(law: Law, operations: Counter[str]) -> dict[str, Any]:
@@ -218,18 +215,19 @@ def _law_values(law: Law, operations: Counter[str]) -> dict[str, Any]:
         "default_dq": "if (dq == NULL) dq = zero;",
         "dq_argument": "NULL",
         "dq_note": "\n   dq is the velocity that the filter starts with; NULL for 0.",
-        **_reference_text(law.external_reference, law.name, law.scenario.n),
+        "dq_of_k": "NULL",
+        "dq_of_0": "NULL",
+        "velocity": "Its inputs are positions; the scenario's filter computes the velocities.",
+        **_reference_values(law),
     }
     if memory:
         keep = "memcpy(s->memory, result, sizeof s->memory);\n"
         values |= {"keep_start": keep + "  ", "keep_sample": keep + "    "}
     if law.programs.reads_velocity:
         values |= {"default_dq": "(void)zero;", "dq_argument": "dq", "dq_note": ""}
+        values |= {"dq_of_k": "dq[k]", "dq_of_0": "dq[0]"}
+        values["velocity"] = "Its inputs are positions and velocities."
     return values
-
-
-def _result_entries(count: int) -> list[str]:
-    return [f"r[{k}]" for k in range(count)]
 
 
 def shared_values(
@@ -267,40 +265,38 @@ def shared_values(
 
 def title_of(scenario: Scenario) -> str:
     """A one-line description of the law."""
-    parts = [type(x).__name__ for x in (scenario.controller, scenario.observer)]
-    return comment(f"The law {parts[0]} with the observer {parts[1]}, for {scenario.n} joints")
+    law, observer = type(scenario.controller).__name__, type(scenario.observer).__name__
+    return comment(f"The law {law} with the observer {observer}, for {scenario.n} joints")
 
 
-def _reference_text(external_reference: bool, name: str, n: int) -> dict[str, str]:
-    if not external_reference:
-        return dict.fromkeys(
-            (
-                "reference_arguments",
-                "reference_declarations",
-                "reference_parameters",
-                "reference_finite",
-                "reference_values",
-            ),
-            "",
-        )
-    return {
-        "reference_arguments": ", q_d, dq_d, ddq_d",
-        "reference_declarations": "".join(f", const {name}_real *{x}" for x in REFERENCE),
-        "reference_parameters": "".join(f", const real *{x}" for x in REFERENCE),
-        "reference_finite": "".join(f" && are_finite({x}, {n})" for x in REFERENCE),
-        "reference_values": "".join(f"{x}, " for x in REFERENCE),
+def _reference_values(law: Law) -> dict[str, str]:
+    """The values that depend on whether the reference is an input."""
+    text = "The reference is an internal function of t."
+    if law.external_reference:
+        text = "The reference is an input of every sample."
+    forms = {
+        "reference_arguments": ", {}",
+        "reference_declarations": f", const {law.name}_real *{{}}",
+        "reference_parameters": ", const real *{}",
+        "reference_finite": f" && are_finite({{}}, {law.scenario.n})",
+        "reference_values": "{}, ",
+        "reference_of_k": ", {}[k]",
+        "reference_of_0": ", {}[0]",
+        "first_reference": ", first_{}",
     }
+    texts = {key: "".join(map(form.format, law.references)) for key, form in forms.items()}
+    return {"reference": text, **texts}
 
 
 def _supporting_files(
     law: Law, values: dict[str, Any], sizes: tuple[int, int, int]
 ) -> dict[str, str]:
-    """Self-test, build files and README."""
+    """The self-test, the build files, the README and, if possible, the file of the scenario."""
     v, period = law.vectors, float(law.scenario.sampling.period)  # type: ignore[union-attr]
     values |= {
         "samples": len(v.q),
         "duration": f"{len(v.q) * period:g}",
-        "rounds": max(1, ROUNDS_FOR // (len(v.q) * law.programs.sample.size)),
+        "rounds": max(1, TIMED_OPERATIONS // (len(v.q) * law.programs.sample.size)),
         "tolerance": "1e-10",
         "state_bytes": sizes[0],
         "parameter_bytes": sizes[1],
@@ -309,8 +305,6 @@ def _supporting_files(
         "inside": _contents(law),
         "scenario_row": "",
         "time_note": "",
-        **_velocity_values(law.programs.reads_velocity),
-        **_reference_values(bool(v.reference)),
     }
     if law.is_float:
         values["tolerance"] = "1e-4"
@@ -320,7 +314,7 @@ def _supporting_files(
     arrays = {"q": v.q, "torque": v.tau}
     if law.programs.reads_velocity:
         arrays["dq"] = v.dq
-    arrays |= dict(zip(REFERENCE, v.reference, strict=bool(v.reference)))
+    arrays |= dict(zip(law.references, v.reference, strict=True))
     if law.file is not None:
         values["scenario_row"] = _scenario_row(law)
     texts = {
@@ -334,32 +328,9 @@ def _supporting_files(
     return texts
 
 
-def _velocity_values(reads_velocity: bool) -> dict[str, str]:
-    """The values that depend on whether velocities are inputs."""
-    if reads_velocity:
-        text = "Its inputs are positions and velocities."
-        return {"dq_of_k": "dq[k]", "dq_of_0": "dq[0]", "velocity": text}
-    text = "Its inputs are positions; the scenario's filter computes the velocities."
-    return {"dq_of_k": "NULL", "dq_of_0": "NULL", "velocity": text}
-
-
-def _reference_values(is_external: bool) -> dict[str, str]:
-    """The values that depend on whether the reference is an input."""
-    names = ("reference_of_k", "reference_of_0", "first_reference")
-    if not is_external:
-        text = "The reference is an internal function of t."
-        return {"reference": text, **dict.fromkeys(names, "")}
-    return {
-        "reference": "The reference is an input of every sample.",
-        "reference_of_k": "".join(f", {x}[k]" for x in REFERENCE),
-        "reference_of_0": "".join(f", {x}[0]" for x in REFERENCE),
-        "first_reference": "".join(f", first_{x}" for x in REFERENCE),
-    }
-
-
 def _scenario_row(law: Law) -> str:
     """The row of the README about the file of the scenario."""
-    dtype = {True: "float", False: "double"}[law.is_float]
+    dtype = C_TYPES[law.is_float]["type"]
     reference = {True: "given", False: "inside"}[law.external_reference]
     command = (
         f"python -m iblf_jax export scenario.toml --out . --name {law.name} --dtype {dtype}"

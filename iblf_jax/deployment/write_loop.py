@@ -1,4 +1,4 @@
-"""The closed loop as C, and as a WebAssembly module with a table of its parameters."""
+"""Writes a closed loop as C, and as a WebAssembly module with a table of its parameters."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from iblf_jax.deployment.c_names import Parameters
 from iblf_jax.deployment.loop_program import OUTPUTS, Loop
 from iblf_jax.deployment.write_c import SEGMENT, fill_template, shared_values
 from iblf_jax.kernels import plain_function
-from iblf_jax.simulation.sampling import has_noise
+from iblf_jax.simulation.noise import has_noise
 from iblf_jax.simulation.scenario import Scenario
 
 WASM_FLAGS = ("-target", "wasm32-wasi", "-mexec-model=reactor", "-O2", "-s")
@@ -37,7 +37,9 @@ def loop_files(
 ) -> GeneratedLoop:
     """Header and source of a closed loop."""
     parameters = Parameters.of(scenario, (loop.start, loop.step))
-    setting_count = 1 + (4 if has_noise(scenario) else 0)
+    setting_count, noise_setting = 1, ""
+    if has_noise(scenario):
+        setting_count, noise_setting = 5, ", then the four words of the noise's key"
     output_count = len(loop.step.outputs)
     inputs = {
         "shared": parameters.numbers,
@@ -45,36 +47,25 @@ def loop_files(
         "carry": [f"m[{k}]" for k in range(loop.size)],
         "index": ["index"],
     }
-    p, places = f"const {name}_parameters *p", [f"r[{k}]" for k in range(loop.size + output_count)]
+    results = [f"r[{k}]" for k in range(loop.size + output_count)]
+    arguments = [f"const {name}_parameters *p", "const F *u"]
     begin = plain_function(
-        loop.start, f"{name}_begin", [p, "const F *u"], inputs, places[: loop.size], SEGMENT
+        loop.start, f"{name}_begin", arguments, inputs, results[: loop.size], SEGMENT
     )
-    step = plain_function(
-        loop.step,
-        f"{name}_advance",
-        [p, "const F *m", "const F *u", "I index"],
-        inputs,
-        places,
-        SEGMENT,
-    )
+    arguments[1:] = ["const F *m", "const F *u", "I index"]
+    step = plain_function(loop.step, f"{name}_advance", arguments, inputs, results, SEGMENT)
     values = shared_values(scenario, name, loop.step.dtype, parameters, joints, begin, step) | {
         "method": method,
         "settings": setting_count,
         "told": output_count,
         "memory_size": loop.size,
         "outputs": ", ".join(OUTPUTS),
-        "noise_setting": ", then the four words of the noise's key" if setting_count > 1 else "",
+        "noise_setting": noise_setting,
         "rows": RECORD_BUFFER,
-        "array": "Float32Array" if loop.step.dtype == np.float32 else "Float64Array",
+        "real_bytes": loop.step.dtype.itemsize,
     }
-    return GeneratedLoop(
-        {
-            f"{name}.h": fill_template("loop.h", values),
-            f"{name}.c": fill_template("loop.c", values),
-        },
-        parameters,
-        values,
-    )
+    texts = {f"{name}.{ending}": fill_template(f"loop.{ending}", values) for ending in "hc"}
+    return GeneratedLoop(texts, parameters, values)
 
 
 def _finite(value: np.ndarray) -> Any:
@@ -88,15 +79,8 @@ def table(generated: GeneratedLoop, setting_values: list[float]) -> dict[str, An
     """The description of a module for a page: its parameters, settings and records."""
     rows, offset = [], 0
     for field in generated.parameters.fields:
-        rows.append(
-            {
-                "path": field.path,
-                "offset": offset,
-                "shape": field.shape,
-                "unit": field.unit,
-                "value": _finite(field.value),
-            }
-        )
+        row = {"path": field.path, "offset": offset, "shape": field.shape, "unit": field.unit}
+        rows.append(row | {"value": _finite(field.value)})
         offset += math.prod(field.shape)
     values, n = generated.values, generated.values["joints"]
     columns = [
@@ -104,15 +88,13 @@ def table(generated: GeneratedLoop, setting_values: list[float]) -> dict[str, An
         for k, (name, unit) in enumerate(OUTPUTS.items())
     ]
     columns.append({"name": "status", "unit": "1", "offset": len(OUTPUTS) * n, "size": 1})
-    description = {
+    return {
         "parameters": rows,
         "count": offset,
         "settings": setting_values,
         "records": columns,
         "record": values["told"],
-    }
-    return description | {
-        "bytes": 8 if values["type"] == "double" else 4,
+        "bytes": values["real_bytes"],
         "joints": n,
         "method": values["method"],
         "version": __version__,
@@ -120,7 +102,7 @@ def table(generated: GeneratedLoop, setting_values: list[float]) -> dict[str, An
 
 
 def wasm_files(generated: GeneratedLoop, folder: Path, setting_values: list[float]) -> list[str]:
-    """Writes a module, its table and its sources into a folder; their names.
+    """Writes a module, its table and its sources into a folder; returns the names of the files.
 
     Raises:
       ToolchainError: ziglang is not installed, or it failed.
@@ -128,9 +110,8 @@ def wasm_files(generated: GeneratedLoop, folder: Path, setting_values: list[floa
     name = generated.values["name"]
     texts = generated.files | {f"{name}_module.c": fill_template("wasm.c", generated.values)}
     texts["README.md"] = fill_template("wasm.md", generated.values)
-    texts[f"{name}.json"] = (
-        json.dumps(table(generated, setting_values), indent=1, allow_nan=False) + "\n"
-    )
+    description = json.dumps(table(generated, setting_values), indent=1, allow_nan=False)
+    texts[f"{name}.json"] = f"{description}\n"
     command = zig()
     folder.mkdir(parents=True, exist_ok=True)
     for file, text in texts.items():

@@ -25,10 +25,10 @@ from iblf_jax.engine.plan import PLAIN_LAYOUT, BatchLayout
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.structural_constants import StructuralConstants
 from iblf_jax.engine.time_step import TimeStep
-from iblf_jax.simulation import accuracy
+from iblf_jax.simulation import error_estimate
 from iblf_jax.simulation.closed_loop import initial_state, perturbed_state
+from iblf_jax.simulation.noise import NOISE_NAME
 from iblf_jax.simulation.paths import with_parameters
-from iblf_jax.simulation.sampling import NOISE_NAME
 from iblf_jax.simulation.stability import resolved
 
 
@@ -183,9 +183,11 @@ def _initial_linearization(batch: Batch, method: str) -> Linearization:
     """The carry of a `LinearizationStep` at the start of every run."""
 
     def of_run(inputs):
-        estimate = accuracy.unresolved_signals(inputs.scenario, method, inputs.dt, inputs.steps)
+        estimate = error_estimate.unresolved_signals(
+            inputs.scenario, method, inputs.dt, inputs.steps
+        )
         state = initial_state(inputs.scenario)
-        watched = accuracy.watched_indices(state).size
+        watched = error_estimate.watched_indices(state).size
         return linearization_at(
             jnp.zeros_like(inputs.dt), perturbed_state(state), watched, estimate
         )
@@ -213,7 +215,7 @@ def carry_shapes(batch: Batch, method: str) -> Carry:
     """Shapes and types of the carry of a `TimeStep`."""
 
     def of_run(inputs):
-        size = accuracy.watched_indices(initial_state(inputs.scenario)).size
+        size = error_estimate.watched_indices(initial_state(inputs.scenario)).size
         return start(inputs, method, jnp.zeros((size, size), inputs.dt.dtype))
 
     return jax.eval_shape(lambda: batch.map_runs(of_run))
@@ -226,7 +228,7 @@ def finalize(
 
     def at_nearest_and_end(inputs, carry):
         watched = at_start.jacobian.shape[-1]
-        no_estimate = accuracy.UnresolvedSignals(*[jnp.zeros_like(carry.accuracy.error)] * 3)
+        no_estimate = error_estimate.UnresolvedSignals(*[jnp.zeros_like(carry.accuracy.error)] * 3)
         nearest = carry.nearest
         end = inputs.dt * inputs.steps
         pair = (

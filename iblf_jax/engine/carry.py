@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from iblf_jax.core.optional import OptionalMembers
 from iblf_jax.engine.metric_folds import begun
-from iblf_jax.simulation import accuracy, stability
+from iblf_jax.simulation import error_estimate, stability
 from iblf_jax.simulation.closed_loop import (
     LoopState,
     evaluate,
@@ -56,7 +56,7 @@ class Carry(NamedTuple):
     accumulators: tuple
     status: jax.Array
     nearest: Nearest
-    accuracy: accuracy.Accuracy
+    accuracy: error_estimate.Accuracy
 
 
 def _unchanged(function: Callable) -> Callable:
@@ -97,7 +97,7 @@ def start(inputs: Inputs, method: str, jacobian: jax.Array) -> Carry:
     constant, jacobian = jax.lax.stop_gradient((state, jacobian))
     if inputs.scenario.sampling is not None:
         jacobian = stability.per_time(jax.lax.stop_gradient(inputs.scenario), constant, jacobian)
-    estimate = accuracy.begin(method, jacobian, constant)
+    estimate = error_estimate.begin(method, jacobian, constant)
     return Carry(
         state,
         blank,

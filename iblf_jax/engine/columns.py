@@ -30,10 +30,10 @@ from iblf_jax.engine.metric_folds import finished
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.step_pieces import MetricSample
 from iblf_jax.engine.time_step import Advanced, TimeStep, samples_of_step
-from iblf_jax.simulation import accuracy
+from iblf_jax.simulation import error_estimate
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
 
-ACCURACY = tuple(name for name, _ in accuracy.UNITS)
+ACCURACY = tuple(name for name, _ in error_estimate.UNITS)
 """Metrics whose derivatives are zero."""
 Places = tuple[tuple[int, ...], ...]
 """For each order of a derivative, the indices of the leaves by which it is taken."""
@@ -113,7 +113,7 @@ class TangentStep:
 def _begun(inputs: Inputs, method: str, places: Places) -> Carry | WithTangent:
     """The carry before the first step."""
     if not places:
-        size = accuracy.watched_indices(initial_state(inputs.scenario)).size
+        size = error_estimate.watched_indices(initial_state(inputs.scenario)).size
         # The accuracy is estimated by the run without tangents; this estimate is not read.
         return start(inputs, method, jnp.zeros((size, size), inputs.dt.dtype))
 

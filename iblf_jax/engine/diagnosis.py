@@ -11,14 +11,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.control.controllers._base import law_member
 from iblf_jax.core import checks, notices
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import FAILED, Status, describe
 from iblf_jax.engine.limiting_term import limiting_term
 from iblf_jax.engine.step_size import comfortable_dt, find_dt
-from iblf_jax.simulation.accuracy import ERROR, RELATIVE, TOLERANCE
+from iblf_jax.simulation.error_estimate import ERROR, RELATIVE, TOLERANCE
 from iblf_jax.simulation.integrators import tableau
-from iblf_jax.simulation.optional import optional_member
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.signals import has
 from iblf_jax.simulation.stability import RADIUS, THIRD_SIZE
@@ -57,7 +57,7 @@ def report(result: Rollout, steps: int, throw: bool) -> None:
         raise _infeasible(result, steps)
     failed = status & FAILED
     reported = failed | status & REPORTED
-    if optional_member(unwrapped(result.scenario.controller), "needs_velocity_bounds"):
+    if law_member(unwrapped(result.scenario.controller), "needs_velocity_bounds"):
         reported |= status & Status.ALPHA_INFEASIBLE
     if not reported:
         return

@@ -58,7 +58,7 @@ def run_batch(
     Args:
       scenario: the scenario that all runs share, canonical.
       varied: path -> values, batch axis first; each run replaces these leaves, and
-        `sampling.NOISE_NAME`, the key of its noise.
+        `noise.NOISE_NAME`, the key of its noise.
       folds: the metrics.
       dt: time step, () [s].
       request: the request; static.

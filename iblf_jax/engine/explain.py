@@ -22,8 +22,8 @@ from iblf_jax.engine.time_step import TimeStep
 from iblf_jax.kernels import OPERATIONS, PER_RUN, SHARED, TIME, Program, written_out
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.metrics import as_folds
+from iblf_jax.simulation.noise import NOISE_NAME, has_noise
 from iblf_jax.simulation.paths import get
-from iblf_jax.simulation.sampling import NOISE_NAME, has_noise
 from iblf_jax.simulation.scenario import Scenario, canonical
 
 LIBRARY_CALL = 40

@@ -15,7 +15,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from iblf_jax.engine.carry import Inputs, StepOptions, keep_if
-from iblf_jax.simulation import accuracy, stability
+from iblf_jax.simulation import error_estimate, stability
 from iblf_jax.simulation.closed_loop import (
     initial_state,
     integrated_part,
@@ -39,7 +39,7 @@ class Linearization(NamedTuple):
     jacobian: jax.Array
     """By the numbers that `accuracy` watches, by differences of three sizes, (3, m', m') [1/s];
     `stability.resolved` makes one of them."""
-    unresolved: accuracy.UnresolvedSignals
+    unresolved: error_estimate.UnresolvedSignals
     """Of the run; its torque is turned into what it accelerates, as that takes the robot's mass
     matrix."""
 
@@ -58,7 +58,7 @@ class LinearizationStep:
     ):
         """The carry after the step; nothing is recorded."""
         start = initial_state(inputs.scenario)
-        watched, x = accuracy.watched_indices(start), carry.state
+        watched, x = error_estimate.watched_indices(start), carry.state
         as_state = ravel_pytree(perturbed_state(start))[1]
         iteration = index - 3 * watched.size
         count = jnp.asarray(watched.size, index.dtype)
@@ -100,7 +100,7 @@ class LinearizationStep:
         jacobian = jnp.where(chosen, jnp.stack([w[i] for i in watched])[:, None], carry.jacobian)
         unresolved = keep_if(
             index == 0,
-            accuracy.with_acceleration(inputs.scenario, carry.unresolved),
+            error_estimate.with_acceleration(inputs.scenario, carry.unresolved),
             carry.unresolved,
         )
         return Linearization(carry.time, x, growth, jacobian, unresolved), ()
@@ -109,7 +109,7 @@ class LinearizationStep:
 def linearization_steps(scenario: Scenario) -> int:
     """Steps of a `LinearizationStep`."""
     state = initial_state(scenario)
-    watched = accuracy.watched_indices(state).size
+    watched = error_estimate.watched_indices(state).size
     if watched == ravel_pytree(perturbed_state(state))[0].size:
         return 3 * watched
     return 3 * watched + stability.POWER_ITERATIONS
@@ -128,7 +128,7 @@ def fastest_mode(scenario: Scenario, found: Linearization) -> jax.Array:
 
 
 def linearization_at(
-    time: jax.Array, state: Any, watched: int, unresolved: accuracy.UnresolvedSignals
+    time: jax.Array, state: Any, watched: int, unresolved: error_estimate.UnresolvedSignals
 ) -> Linearization:
     """The carry of a `LinearizationStep` at a state, as `perturbed_state` gives it, of which
     `accuracy` watches so many numbers.

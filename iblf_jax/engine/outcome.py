@@ -12,7 +12,7 @@ from iblf_jax.core.status import Status, flag
 from iblf_jax.engine.carry import Carry, Inputs
 from iblf_jax.engine.linearization import Linearization, fastest_mode
 from iblf_jax.engine.metric_folds import finished
-from iblf_jax.simulation import accuracy, integrators, stability
+from iblf_jax.simulation import error_estimate, integrators, stability
 
 
 class Outcome(NamedTuple):
@@ -28,7 +28,7 @@ def outcome_of(
     inputs: Inputs,
     method: str,
     carry: Carry,
-    unresolved: accuracy.UnresolvedSignals,
+    unresolved: error_estimate.UnresolvedSignals,
     instants: Linearization,
 ) -> Outcome:
     """The folds' results and the accuracy, and the status with the verdict on the step.
@@ -40,7 +40,7 @@ def outcome_of(
       unresolved: what a `LinearizationStep` has found for the run.
       instants: what it has found at some of them.
     """
-    estimate = accuracy.with_unresolved(carry.accuracy, unresolved)
+    estimate = error_estimate.with_unresolved(carry.accuracy, unresolved)
     modes = jax.vmap(partial(fastest_mode, inputs.scenario))(instants)
     mode = jnp.max(jnp.where(jnp.isfinite(modes), modes, 0.0))
     limit = integrators.tableau(method).stability
@@ -50,10 +50,10 @@ def outcome_of(
     steep = stability.is_steep(instants.jacobian, inputs.scenario.sampling is not None) & (
         inputs.dt * steepest > limit
     )
-    status |= flag(~(estimate.relative <= accuracy.TOLERANCE), Status.INACCURATE)
+    status |= flag(~(estimate.relative <= error_estimate.TOLERANCE), Status.INACCURATE)
     suffers = status & int(Status.STEP_TOO_LARGE | Status.INACCURATE) != 0
     status |= flag(jnp.any(steep) & suffers, Status.INFINITE_SLOPE)
-    metrics = accuracy.results(estimate)
+    metrics = error_estimate.results(estimate)
     if inputs.scenario.sampling is not None:
         maps = jax.vmap(partial(stability.period_map, inputs.scenario, carry.state))(
             stability.resolved(instants.jacobian, sampled=True)

@@ -18,7 +18,7 @@ import numpy as np
 from iblf_jax.core import checks, notices
 from iblf_jax.engine.step_size import MODE_INSTANTS, largest_eigenvalue, round_down, start_and_along
 from iblf_jax.simulation.closed_loop import LoopState, run_sampled_law
-from iblf_jax.simulation.sampling import Sampling, commands_in_transit, with_sufficient_queue
+from iblf_jax.simulation.sampling import Sampling, commands_in_transit
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.simulation.stability import jacobian, period_map
 
@@ -107,7 +107,7 @@ def recommended_period(
     margin = checks.number_between("margin", margin, *MARGIN_RANGE, "1")
     if isinstance(scenario, Scenario) and scenario.sampling is None:
         scenario = dataclasses.replace(scenario, sampling=Sampling(period=1e-3))
-    scenario = with_sufficient_queue(canonical(scenario))
+    scenario = canonical(scenario)
     if not checks.is_concrete(scenario):
         raise checks.fail(
             "scenario", "traced values", "numbers", "Call it outside of jit, vmap and grad."

@@ -21,9 +21,9 @@ from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.single_run import run_one
 from iblf_jax.engine.transformable import run_transformable
 from iblf_jax.simulation.metrics import Fold, as_folds, metric_units
+from iblf_jax.simulation.noise import has_noise, noise_key
 from iblf_jax.simulation.results import Metrics, Rollout
-from iblf_jax.simulation.sampling import check_step, has_noise, noise_key
-from iblf_jax.simulation.scenario import Scenario, canonical
+from iblf_jax.simulation.scenario import Scenario, canonical, check_step
 
 MAX_SAMPLES = 20_000_000
 """Largest number of recorded samples, so that a mistake in `duration` or `dt` does not fill the
@@ -126,7 +126,7 @@ def run_rollout(
       folds: the metrics, as `as_folds` returns them.
       dt: time step, () [s].
       request: the request; its `record_every` is not None.
-      noise: key of the noise of a sensor (`sampling.noise_key`).
+      noise: key of the noise of a sensor (`noise.noise_key`).
     """
     if checks.is_concrete((scenario, folds, dt)):
         outcome = run_one(scenario, folds, dt, request, noise)

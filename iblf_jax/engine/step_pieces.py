@@ -18,7 +18,7 @@ from iblf_jax.engine.carry import Inputs, StepOptions
 from iblf_jax.engine.metric_folds import split_floats, updated, weighed
 from iblf_jax.engine.status_flags import sample_status
 from iblf_jax.engine.switching import SwitchedLoop, with_hybrid_derivative
-from iblf_jax.simulation import accuracy, integrators, jumps
+from iblf_jax.simulation import discontinuities, error_estimate, integrators
 from iblf_jax.simulation.closed_loop import (
     LoopState,
     evaluate,
@@ -40,8 +40,8 @@ class MetricSample(NamedTuple):
 class StepTimes(NamedTuple):
     """The interval of a step, and its division into pieces."""
 
-    span: jumps.Span
-    division: jumps.Division
+    span: discontinuities.Span
+    division: discontinuities.Division
     behind: jax.Array
     """Length of the last piece of the previous step, () [s]; 0 at the first instant."""
     restarts: Any
@@ -56,25 +56,27 @@ def step_times(inputs: Inputs, index: jax.Array, method: str, arrivals: tuple | 
       inputs: of the run.
       index: number of the instant, () int.
       method: the integrator.
-      arrivals: when commands arrive in this step and in the one before, as `jumps.divided` takes
-        them; None where none can.
+      arrivals: when commands arrive in this step and in the one before, as
+        `discontinuities.divided` takes them; None where none can.
     """
     times, dt, number = inputs.scenario.jump_times(), inputs.dt, index.astype(inputs.dt.dtype)
     start = number * dt
     end = start
     if times.size:
         end = (number + 1.0) * dt
-    span = jumps.Span(start, end, dt, number < inputs.steps)
+    span = discontinuities.Span(start, end, dt, number < inputs.steps)
     here = last = None
     if arrivals is not None:
         here, last = arrivals
-    before = jumps.Span((number - 1.0) * dt, start, dt)
-    behind = jnp.where(index > 0, jumps.since_last(times, before, last), jnp.zeros_like(dt))
+    before = discontinuities.Span((number - 1.0) * dt, start, dt)
+    behind = jnp.where(
+        index > 0, discontinuities.since_last(times, before, last), jnp.zeros_like(dt)
+    )
     restarts = None
     if times.size and inputs.scenario.sampling is None:
-        reach = accuracy.steps_back(method)
-        restarts = jumps.within(times, (number - reach) * dt, span.end)
-    return StepTimes(span, jumps.divided(times, span, here), behind, restarts)
+        reach = error_estimate.steps_back(method)
+        restarts = discontinuities.within(times, (number - reach) * dt, span.end)
+    return StepTimes(span, discontinuities.divided(times, span, here), behind, restarts)
 
 
 class LoopAlongStep(NamedTuple):
@@ -88,7 +90,9 @@ class LoopAlongStep(NamedTuple):
     """For a sampled law, the torques at the actuator before and after a command arrives within the
     step."""
 
-    def at(self, piece: jumps.Piece, t: jax.Array, moved: LoopState) -> tuple[LoopState, Sample]:
+    def at(
+        self, piece: discontinuities.Piece, t: jax.Array, moved: LoopState
+    ) -> tuple[LoopState, Sample]:
         """Rate and sample within a piece of the step."""
         torque = self.torques
         if torque and isinstance(piece.arrived, bool):
@@ -97,7 +101,7 @@ class LoopAlongStep(NamedTuple):
             torque = (jnp.where(piece.arrived, torque[1], torque[0]),)
         return self.evaluate(
             self.inputs.scenario,
-            jumps.stage_time(piece, t),
+            discontinuities.stage_time(piece, t),
             with_integrated_part(self.state, moved),
             self.inputs.dt,
             *torque,
@@ -105,7 +109,11 @@ class LoopAlongStep(NamedTuple):
 
 
 def integrated(
-    along: LoopAlongStep, piece: jumps.Piece, moved: LoopState, method: str, options: StepOptions
+    along: LoopAlongStep,
+    piece: discontinuities.Piece,
+    moved: LoopState,
+    method: str,
+    options: StepOptions,
 ) -> integrators.Stepped:
     """One step of the integrator over a piece."""
     return integrators.step(
@@ -120,7 +128,7 @@ def integrated(
 
 def across_jumps(
     along: LoopAlongStep,
-    piece: jumps.Piece,
+    piece: discontinuities.Piece,
     before: LoopState,
     method: str,
     stepped: integrators.Stepped,
@@ -143,7 +151,7 @@ def across_jumps(
     counts = piece.begin < (inputs.steps - 0.5) * dt
 
     def rate(t, state):
-        return evaluate(inputs.scenario, jumps.stage_time(piece, t), state, dt)
+        return evaluate(inputs.scenario, discontinuities.stage_time(piece, t), state, dt)
 
     def gains_of(sample):
         def sums(weight):
@@ -177,7 +185,7 @@ class LaterPieces(NamedTuple):
 
 def later_pieces(
     along: LoopAlongStep,
-    pieces: tuple[jumps.Piece, ...],
+    pieces: tuple[discontinuities.Piece, ...],
     stepped: integrators.Stepped,
     accumulators: tuple,
     method: str,

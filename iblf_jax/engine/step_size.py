@@ -25,7 +25,7 @@ from iblf_jax.engine.machine_function import machine_function
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.single_run import run_one
 from iblf_jax.engine.thresholds import STEP_SIZE_CHUNK
-from iblf_jax.simulation import accuracy, jumps
+from iblf_jax.simulation import discontinuities, error_estimate
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.scenario import Initial, Scenario, canonical
@@ -33,7 +33,7 @@ from iblf_jax.simulation.stability import SLOWEST_RATE, jacobian
 
 RECOMMENDED_PHASE = 1.5
 """|dt * mode| that is recommended: RK4 follows the fastest mode itself to a few per cent there."""
-RECOMMENDED_ERROR = accuracy.TOLERANCE / 5
+RECOMMENDED_ERROR = error_estimate.TOLERANCE / 5
 """Difference of the two runs, relative to the tube, that a recommended step may leave."""
 MODE_INSTANTS = 33
 """Instants along the reference at which modes are computed."""
@@ -50,7 +50,7 @@ class Pair(NamedTuple):
     step: jax.Array
     coarse: jax.Array
     fine: jax.Array
-    estimate: accuracy.Accuracy
+    estimate: error_estimate.Accuracy
     difference: jax.Array
     """Largest so far, relative to the tube."""
     nearest: tuple[jax.Array, jax.Array, jax.Array]
@@ -80,12 +80,14 @@ def side_by_side(scenario: Scenario, dt: float, steps: int, *, method: str) -> P
 def _start(scenario: Scenario, dt: jax.Array, steps: jax.Array, *, method: str) -> Pair:
     start, zero = initial_state(scenario), jnp.zeros_like(dt)
     x = ravel_pytree(start)[0]
-    watched = accuracy.watched_indices(start)
-    estimate = accuracy.begin(method, jacobian(scenario, zero, start)[watched][:, watched], start)
-    estimate = accuracy.with_unresolved(
+    watched = error_estimate.watched_indices(start)
+    estimate = error_estimate.begin(
+        method, jacobian(scenario, zero, start)[watched][:, watched], start
+    )
+    estimate = error_estimate.with_unresolved(
         estimate,
-        accuracy.with_acceleration(
-            scenario, accuracy.unresolved_signals(scenario, method, dt, steps)
+        error_estimate.with_acceleration(
+            scenario, error_estimate.unresolved_signals(scenario, method, dt, steps)
         ),
     )
     return Pair(jnp.int32(0), x, x, estimate, zero, (zero - 1.0, zero, x), jnp.bool_(True))
@@ -126,8 +128,10 @@ def _one_step(scenario: Scenario, times: jax.Array, dt: jax.Array, pair: Pair, m
         is_coarse, h = cut[1] - cut[0] == 1.0, (cut[1] - cut[0]) * dt
         x = jnp.where(is_coarse, coarse, fine)
         end_of_part = jnp.where(cut[1] == 1.0, end, begin + cut[1] * dt)
-        division = jumps.divided(times, jumps.Span(begin + cut[0] * dt, end_of_part, h))
-        stepped = jumps.integrated(
+        division = discontinuities.divided(
+            times, discontinuities.Span(begin + cut[0] * dt, end_of_part, h)
+        )
+        stepped = discontinuities.integrated(
             method, partial(evaluate, scenario), division, as_state(x), rolled=True
         )
         new, sample = ravel_pytree(stepped.state)[0], stepped.first
@@ -141,8 +145,10 @@ def _one_step(scenario: Scenario, times: jax.Array, dt: jax.Array, pair: Pair, m
     xi_of_fine = seen[2][1]
     restarts = None
     if times.size:
-        restarts = jumps.within(times, (number - accuracy.steps_back(method)) * dt, end)
-    estimate = accuracy.update(
+        restarts = discontinuities.within(
+            times, (number - error_estimate.steps_back(method)) * dt, end
+        )
+    estimate = error_estimate.update(
         pair.estimate,
         method,
         dt,
@@ -246,7 +252,7 @@ def find_dt(scenario: Scenario, *, duration: float, method: str) -> float:
         pair = side_by_side(scenario, dt, math.ceil(duration / dt * (1 - 1e-9)), method=method)
         excess = max(
             float(pair.difference) / RECOMMENDED_ERROR,
-            float(pair.estimate.relative) / accuracy.TOLERANCE,
+            float(pair.estimate.relative) / error_estimate.TOLERANCE,
         )
         if not excess > 1.0:
             limit = comfortable_dt(_mode(scenario, pair.nearest[1], as_state(pair.nearest[2])))

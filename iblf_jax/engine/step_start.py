@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from iblf_jax.engine.carry import Carry, Inputs
 from iblf_jax.engine.metric_folds import updated, weighed
 from iblf_jax.engine.step_pieces import LoopAlongStep, MetricSample, StepTimes, run_if, step_times
-from iblf_jax.simulation import jumps, sampling
+from iblf_jax.simulation import discontinuities, sampling
 from iblf_jax.simulation.closed_loop import (
     run_sampled_law_if_due,
 )
@@ -82,7 +82,7 @@ def _before_sample(
     seen_at = (
         t
         if times.division.pieces[0].earliest is None
-        else jumps.before_jumps(scenario.jump_times(), t)
+        else discontinuities.before_jumps(scenario.jump_times(), t)
     )
 
     def seen(accumulators):

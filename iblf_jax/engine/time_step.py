@@ -32,7 +32,7 @@ from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.status_flags import is_valid, sample_status
 from iblf_jax.engine.step_pieces import MetricSample, across_jumps, integrated, later_pieces
 from iblf_jax.engine.step_start import continuous_start, sampled_start
-from iblf_jax.simulation import accuracy, jumps
+from iblf_jax.simulation import discontinuities, error_estimate
 from iblf_jax.simulation.closed_loop import (
     LoopState,
     evaluate,
@@ -161,7 +161,7 @@ def _concluded(
     goes_on: jax.Array,
     restarts: Any,
     overfull: Any,
-) -> tuple[LoopState, jax.Array, Nearest, accuracy.Accuracy]:
+) -> tuple[LoopState, jax.Array, Nearest, error_estimate.Accuracy]:
     """State, status, nearest instant and accuracy after a step; a state that diverges is frozen.
 
     Args:
@@ -180,7 +180,7 @@ def _concluded(
     nearest = keep_if(near > carry.nearest.xi, here, carry.nearest)
     is_sampled = inputs.scenario.sampling is not None
     width = sample.upper - sample.lower
-    estimate = accuracy.update(
+    estimate = error_estimate.update(
         carry.accuracy, method, inputs.dt, index, parts, width, is_sampled, restarts, overfull
     )
     after, raised = later
@@ -204,5 +204,5 @@ def recorded(folds: Any, found: Advanced):
 def samples_of_step(scenario: Scenario) -> int:
     """How many samples the folds see of a step at most: `Advanced.metric_samples`."""
     arrives = scenario.sampling is not None and scenario.sampling.queue > 0
-    cuts = min(scenario.jump_times().size, jumps.MAX_CUTS) + arrives
+    cuts = min(scenario.jump_times().size, discontinuities.MAX_CUTS) + arrives
     return 1 + (scenario.sampling is not None) + 2 * cuts

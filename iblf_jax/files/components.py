@@ -31,6 +31,8 @@ from iblf_jax.files.values import (
     encode_static,
     entry_hint,
     known_keys,
+    missing,
+    not_storable,
     numbers,
     without_none,
 )
@@ -93,25 +95,20 @@ def encode(part: Any, hint: Any, path: str) -> Any:
     if isinstance(part, tuple | list):
         return [encode(x, entry_hint(hint, i), f"{path}[{i}]") for i, x in enumerate(part)]
     if not dataclasses.is_dataclass(part) or isinstance(part, type):
-        raise checks.fail(
-            path,
-            part,
-            "a component, an array or a tuple of these",
-            "A scenario file cannot hold it.",
-        )
+        raise not_storable(path, part, "a component, an array or a tuple of these")
     if type(part) is hint:
         return encode_fields(part, path)
     family, members = members_of(hint)
     name = next((name for name, cls in members.items() if cls is type(part)), None)
     if name is None:
+        cls = type(part).__name__
         where = family if hint in FAMILIES else "<family>"
-        raise checks.fail(
-            path,
-            Words(f"an object of class {type(part).__name__}"),
-            f"a member of {family} that a file can name ({', '.join(members)})",
-            f'Name your class before saving and loading: iblf_jax.{where}.MEMBERS["my_name"] ='
-            f" {type(part).__name__}.",
+        expected = f"a member of {family} that a file can name ({', '.join(members)})"
+        remedy = (
+            "Name your class before saving and loading:"
+            f' iblf_jax.{where}.MEMBERS["my_name"] = {cls}.'
         )
+        raise checks.fail(path, Words(f"an object of class {cls}"), expected, remedy)
     return {"kind": name, **encode_fields(part, path)}
 
 
@@ -151,35 +148,29 @@ def decode(value: Any, hint: Any, path: str) -> Any:
       ValueError: a value that does not fit; the message names the dotted key.
     """
     hint, _ = without_none(hint)
-    if hint not in FAMILIES and dataclasses.is_dataclass(hint):
+    if hint in FAMILIES:
+        return _decode_member(as_table(value, path), hint, path)
+    if dataclasses.is_dataclass(hint):
         return decode_fields(hint, value, path)
-    if isinstance(value, list) and hint not in FAMILIES:
-        if typing.get_origin(hint) is tuple or any(isinstance(x, dict) for x in value):
-            return tuple(
-                decode(x, entry_hint(hint, i), f"{path}[{i}]") for i, x in enumerate(value)
-            )
-        return checks.as_floats(path, numbers(value, path))
-    if typing.get_origin(hint) is tuple:
+    is_tuple = typing.get_origin(hint) is tuple
+    if isinstance(value, list) and (is_tuple or any(isinstance(x, dict) for x in value)):
+        return tuple(decode(x, entry_hint(hint, i), f"{path}[{i}]") for i, x in enumerate(value))
+    if is_tuple:
         raise checks.fail(path, value, "a list")
-    if hint not in FAMILIES and not isinstance(value, dict):
-        return checks.as_floats(path, numbers(value, path))
-    return _decode_member(as_table(value, path), hint, path)
+    if isinstance(value, dict):
+        return _decode_member(value, hint, path)
+    return checks.as_floats(path, numbers(value, path))
 
 
 def _decode_member(table: dict[str, Any], hint: Any, path: str) -> Any:
     family, members = members_of(hint)
+    expected = f"the name of one of the {family}"
     kind = table.get("kind")
     if kind is None:
-        raise checks.fail(
-            f"{path}.kind",
-            Words("nothing"),
-            f"the name of one of the {family}: {', '.join(members)}",
-            f'Write kind = "{next(iter(members))}".',
-        )
+        remedy = f'Write kind = "{next(iter(members))}".'
+        raise missing(f"{path}.kind", f"{expected}: {', '.join(members)}", remedy)
     if not isinstance(kind, str) or kind not in members:
-        raise checks.fail(
-            f"{path}.kind", kind, f"the name of one of the {family}", did_you_mean(kind, members)
-        )
+        raise checks.fail(f"{path}.kind", kind, expected, did_you_mean(kind, members))
     return decode_fields(members[kind], {key: x for key, x in table.items() if key != "kind"}, path)
 
 
@@ -195,12 +186,8 @@ def decode_fields(cls: Any, table: Any, path: str) -> Any:
         if name in table:
             values[name] = _decode_field(table[name], field, hints.get(name, Any), key)
         elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
-            raise checks.fail(
-                key,
-                Words("nothing"),
-                _expectation(field),
-                f"Add {name} to [{path}]; {cls.__name__} has no default for it.",
-            )
+            remedy = f"Add {name} to [{path}]; {cls.__name__} has no default for it."
+            raise missing(key, _expectation(field), remedy)
     return construct(cls, values, path)
 
 

@@ -1,5 +1,4 @@
-"""Digests of Datasets.  netCDF 3 has no checksum; a file stores digests of the data that a reader
-must return.
+"""Computes and compares digests of Datasets, because netCDF 3 has no checksum.
 
     digest(variable) = SHA-256(name, dimensions, shape, kind of number, attributes, data)
 
@@ -76,10 +75,9 @@ def differences(stored: str, data: Mapping[str, xarray.Dataset]) -> list[str]:
             raise KeyError("algorithm")
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError("the stored digest itself cannot be read") from error
-    found = {name: dataset_digests(one) for name, one in data.items()}
-    words = [f"run {name!r}" for name in sorted({*expected} ^ {*found})]
-    for name in sorted({*expected} & {*found}):
-        before, now = expected[name], found[name]
+    words = [f"run {name!r}" for name in sorted({*expected} ^ {*data})]
+    for name in sorted({*expected} & {*data}):
+        before, now = expected[name], dataset_digests(data[name])
         for part in sorted({*before, *now}):
             if before.get(part) != now.get(part):
                 words.append(f"{part} of run {name!r}")
@@ -88,13 +86,8 @@ def differences(stored: str, data: Mapping[str, xarray.Dataset]) -> list[str]:
 
 def _variable_digest(name: str, variable: Any) -> str:
     values = np.asarray(variable.values)
-    head = [
-        name,
-        list(map(str, variable.dims)),
-        list(values.shape),
-        _kind(values),
-        _canonical(variable.attrs),
-    ]
+    dims, shape = list(map(str, variable.dims)), list(values.shape)
+    head = [name, dims, shape, _kind(values), _canonical(variable.attrs)]
     return _hexadecimal(head, _bytes(values))
 
 
@@ -145,6 +138,4 @@ def _canonical(attributes: Mapping[Any, Any]) -> list[Any]:
 
 
 def _hexadecimal(head: Any, data: bytes = b"") -> str:
-    found = hashlib.sha256(json.dumps(head).encode())
-    found.update(data)
-    return found.hexdigest()
+    return hashlib.sha256(json.dumps(head).encode() + data).hexdigest()

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from iblf_jax.core import checks
-from iblf_jax.files.scenario import by_path, from_dict, read_toml
+from iblf_jax.files.scenario import from_dict, numbers_by_path, read_toml
 from iblf_jax.files.values import Words, as_table, known_keys
 from iblf_jax.identification import Identification, identify
 
@@ -47,18 +47,16 @@ def load_identification_file(path: str | os.PathLike) -> dict[str, Any]:
         table = as_table(data.get("identify", {}), "identify")
         known_keys(table, "identify", ("log", "parameters", "held_out", *ARGUMENTS))
         if not isinstance(table.get("parameters"), list):
-            raise checks.fail(
-                "identify.parameters",
-                table.get("parameters", Words("nothing")),
-                'a list of paths, such as ["robot.mass"]',
-            )
+            given = table.get("parameters", Words("nothing"))
+            expected = 'a list of paths, such as ["robot.mass"]'
+            raise checks.fail("identify.parameters", given, expected)
         options: dict[str, Any] = {key: table[key] for key in ARGUMENTS if key in table}
         if "held_out" in table:
             options["held_out"] = table["held_out"]
             if not isinstance(table["held_out"], int | float):
                 options["held_out"] = _logs(table["held_out"], "identify.held_out", folder)
         for name in ("limits", "priors"):
-            given = by_path(as_table(data.get(name, {}), name), name)
+            given = numbers_by_path(data, name)
             options[name] = {key: _pair(x, f"{name}.{key}") for key, x in given.items()}
         log = _logs(table.get("log", Words("nothing")), "identify.log", folder)
     except ValueError as error:

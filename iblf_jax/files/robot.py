@@ -24,7 +24,7 @@ from typing import Any
 from iblf_jax.control.controllers import Controller, within_effort
 from iblf_jax.core import checks
 from iblf_jax.files.components import construct, decode, encode, encode_fields
-from iblf_jax.files.values import Words, as_table, known_keys, numbers
+from iblf_jax.files.values import as_table, known_keys, missing, numbers
 from iblf_jax.presets.arms import arm_scenario
 from iblf_jax.world.disturbances import Disturbance
 from iblf_jax.world.references import Reference
@@ -53,17 +53,11 @@ def with_robots_read(tables: dict[str, Any], folder: str | os.PathLike) -> dict[
     robots = {name: _robot(tables[name], name, folder) for name in ROBOTS if name in tables}
     plant = robots.get("robot", robots.get("plant"))
     if plant is None:
-        raise checks.fail(
-            "plant",
-            Words("nothing"),
-            "a table [plant] beside [model]",
-            "Rename [model] to [robot] if it describes both.",
-        )
+        remedy = "Rename [model] to [robot] if it describes both."
+        raise missing("plant", "a table [plant] beside [model]", remedy)
     given = {name: table for name, table in tables.items() if name not in ROBOTS}
     if "reference" not in given:
-        raise checks.fail(
-            "reference", Words("nothing"), "a table [reference]", "It has no default."
-        )
+        raise missing("reference", "a table [reference]", "It has no default.")
     parts: dict[str, Any] = {"reference": decode(given["reference"], Reference, "reference")}
     if "disturbance" in given:
         parts["disturbance"] = decode(given["disturbance"], Disturbance, "disturbance")

@@ -76,11 +76,10 @@ def rollout_to_xarray(run: Rollout) -> xarray.Dataset:
     if not isinstance(run, Rollout):
         raise checks.fail("run", run, "a Rollout", "ij.simulate returns one.")
     if not checks.is_concrete(run):
-        raise checks.fail(
-            "run", run, "a Rollout that holds numbers", "Call this outside of jit, vmap and grad."
-        )
+        remedy = "Call this outside of jit, vmap and grad."
+        raise checks.fail("run", run, "a Rollout that holds numbers", remedy)
     batch = _batch_dims(run)
-    variables = _trajectories(run, batch) | _states(run, batch)
+    variables = _trajectories(run, batch)
     for name, value in run.metrics.items():
         dims = (*batch, *own_dims(name, np.shape(value)[len(batch) :], run.n))
         label = f"metric_{name}" if name in variables else name
@@ -109,26 +108,19 @@ def save_rollouts(runs: Mapping[str, Rollout] | Rollout, path: str | os.PathLike
       OSError: the file cannot be written.
     """
     if isinstance(path, Mapping | Rollout):
-        raise checks.fail(
-            "path",
-            Words(type(path).__name__),
-            "a path, after the runs",
-            "The order is save_rollouts(runs, path).",
-        )
+        remedy = "The order is save_rollouts(runs, path)."
+        raise checks.fail("path", Words(type(path).__name__), "a path, after the runs", remedy)
     ending = _ending(checks.file_to_write("path", path, "a file that ends in .nc or .npz"))
     runs = {"run": runs} if isinstance(runs, Rollout) else runs
     if not isinstance(runs, Mapping) or not runs:
         raise checks.fail("runs", runs, "a Rollout, or a dict of at least one Rollout by name")
     for name in runs:
         if not _is_name(name):
-            raise checks.fail(
-                "name of a run", name, 'letters, digits, "_", "-" and blanks', "Choose another key."
-            )
+            expected = 'letters, digits, "_", "-" and blanks'
+            raise checks.fail("name of a run", name, expected, "Choose another key.")
     data = {name: rollout_to_xarray(run) for name, run in runs.items()}
-    if ending == ".nc":
-        _write_netcdf(path, data)
-    else:
-        _write_npz(path, data)
+    write = {".nc": _write_netcdf, ".npz": _write_npz}[ending]
+    write(path, data)
 
 
 def _is_name(name: Any) -> bool:
@@ -150,7 +142,7 @@ def load_rollouts(path: str | os.PathLike) -> dict[str, xarray.Dataset]:
       OSError: the file cannot be read.
     """
     place = checks.file_path("path", path, "a file that ends in .nc or .npz")
-    read = _read_netcdf if _ending(place) == ".nc" else _read_npz
+    read = {".nc": _read_netcdf, ".npz": _read_npz}[_ending(place)]
     # A file that cannot be opened raises OSError here; the readers would raise other errors.
     with open(checks.file_to_read("path", place), "rb"):
         pass
@@ -159,9 +151,8 @@ def load_rollouts(path: str | os.PathLike) -> dict[str, xarray.Dataset]:
     except DamagedFileError:
         raise
     except Exception as error:
-        raise checks.fail(
-            str(place), type(error).__name__, "a file written by save_rollouts", str(error)
-        ) from error
+        came, expected = type(error).__name__, "a file written by save_rollouts"
+        raise checks.fail(str(place), came, expected, str(error)) from error
 
 
 class DamagedFileError(ValueError):
@@ -188,25 +179,20 @@ def _batch_dims(run: Rollout) -> tuple[str, ...]:
 
 
 def _trajectories(run: Rollout, batch: tuple[str, ...]) -> dict[str, Any]:
+    """Variables of the signals and of the states of law, observer, actuator and sensor."""
     variables = {}
-    values = attributes(run, SIGNALS)
-    for name, signal in SIGNALS.items():
-        value = values[name]
-        if name == "t" or isinstance(value, tuple):  # The scenario has no such signal.
-            continue
-        dims = (*batch, "time", *own_dims(name, value.shape[len(batch) + 1 :], run.n))
-        variables[name] = (dims, np.asarray(value), _attrs(signal.unit, signal.meaning))
-    return variables
 
+    def add(name: str, value: Any, unit: str, description: str) -> None:
+        dims = (*batch, "time", *own_dims(name, np.shape(value)[len(batch) + 1 :], run.n))
+        variables[name] = (dims, np.asarray(value), _attrs(unit, description))
 
-def _states(run: Rollout, batch: tuple[str, ...]) -> dict[str, Any]:
-    variables = {}
-    states = attributes(run, STATES)
-    for state, description in STATES.items():
-        for keys, value in jax.tree_util.tree_leaves_with_path(states[state]):
+    for name, value in attributes(run, SIGNALS).items():
+        if name != "t" and not isinstance(value, tuple):  # The scenario has such a signal.
+            add(name, value, SIGNALS[name].unit, SIGNALS[name].meaning)
+    for state, tree in attributes(run, STATES).items():
+        for keys, value in jax.tree_util.tree_leaves_with_path(tree):
             name = re.sub(r"\W+", "_", state + jax.tree_util.keystr(keys)).strip("_")
-            dims = (*batch, "time", *own_dims(name, np.shape(value)[len(batch) + 1 :], run.n))
-            variables[name] = (dims, np.asarray(value), _attrs("1", description))
+            add(name, value, "1", STATES[state])
     return variables
 
 
@@ -328,11 +314,8 @@ def _verify(
         different = digest.differences(stored, found)
     except ValueError as error:
         different = [str(error)]
-    if different:
-        raise DamagedFileError(str(_damaged(path, different)))
-
-
-def _damaged(path: str | os.PathLike, different: list[str]) -> ValueError:
+    if not different:
+        return
     shown = ", ".join(different[:MAX_NAMED])
     if len(different) > MAX_NAMED:
         shown += f" and {len(different) - MAX_NAMED} more"
@@ -341,7 +324,8 @@ def _damaged(path: str | os.PathLike, different: list[str]) -> ValueError:
         "The file is damaged: restore it or run again. If it was edited on purpose, delete its"
         f" attribute {DIGEST!r} before saving."
     )
-    return checks.fail(str(path), came, "what save_rollouts wrote", remedy)
+    text = str(checks.fail(str(path), came, "what save_rollouts wrote", remedy))
+    raise DamagedFileError(text)
 
 
 def _write_npz(path: str | os.PathLike, data: dict[str, xarray.Dataset]) -> None:
@@ -366,10 +350,9 @@ def _read_npz(path: str | os.PathLike) -> dict[str, xarray.Dataset]:
     found = {}
     with np.load(path, allow_pickle=False) as arrays:
         for name, described in json.loads(str(arrays[_ATTRIBUTES])).items():
-            variables = {
-                label: (dims, arrays[f"{name}.{label}"], attrs)
-                for label, (dims, attrs) in described["variables"].items()
-            }
+            variables = {}
+            for label, (dims, attrs) in described["variables"].items():
+                variables[label] = (dims, arrays[f"{name}.{label}"], attrs)
             coords = {label: variables.pop(label) for label in described["coords"]}
             found[name] = xarray.Dataset(variables, coords, described["attrs"])
     return found

@@ -46,10 +46,12 @@ from iblf_jax.files.robot import names_a_file, with_robots_read
 from iblf_jax.files.values import (
     Words,
     as_table,
+    by_path,
     decode_static,
     did_you_mean,
     dotted,
     known_keys,
+    missing,
     numbers,
     toml_tables,
 )
@@ -85,9 +87,8 @@ def save_scenario(
       ValueError: the scenario contains a class that is in no MEMBERS, or NaN, or is a batch.
       OSError: the file cannot be written.
     """
-    checks.file_to_write("path", path).write_text(
-        scenario_to_toml(scenario, run=run), encoding="utf-8"
-    )
+    target = checks.file_to_write("path", path)
+    target.write_text(scenario_to_toml(scenario, run=run), encoding="utf-8")
 
 
 def load_scenario(path: str | os.PathLike) -> Scenario:
@@ -121,9 +122,8 @@ def read_toml(path: str | os.PathLike) -> dict[str, Any]:
     try:
         return toml_tables(content.decode("utf-8"))
     except ValueError as error:  # TOMLDecodeError and UnicodeDecodeError are ValueErrors
-        raise checks.inside(
-            path, ValueError(f"not a TOML file: {checks.line(str(error))}")
-        ) from error
+        found = ValueError(f"not a TOML file: {checks.line(str(error))}")
+        raise checks.inside(path, found) from error
 
 
 # --- to tables
@@ -143,13 +143,11 @@ def scenario_to_dict(scenario: Scenario) -> dict[str, Any]:
       ValueError: as `save_scenario`.
     """
     if not isinstance(scenario, Scenario):
-        raise checks.fail(
-            "scenario", scenario, "a Scenario", "Make one with ij.presets or ij.Scenario."
-        )
+        remedy = "Make one with ij.presets or ij.Scenario."
+        raise checks.fail("scenario", scenario, "a Scenario", remedy)
     if not checks.is_concrete(scenario):
-        raise checks.fail(
-            "scenario", Words("traced values"), "numbers", "Save it outside of jit, vmap and grad."
-        )
+        remedy = "Save it outside of jit, vmap and grad."
+        raise checks.fail("scenario", Words("traced values"), "numbers", remedy)
     check_values(scenario)
     dtypes = {jnp.result_type(x) for x in jax.tree.leaves(scenario)}
     dtype = dtypes.pop() if len(dtypes) == 1 else jnp.result_type(float)
@@ -172,9 +170,8 @@ def _check_round_trip(scenario: Scenario, tables: dict[str, Any]) -> None:
     try:
         same = _equal(from_dict(tables).scenario, scenario)
     except ValueError as error:
-        raise checks.fail(
-            "scenario", Words(f"leaves that a scenario cannot have ({error})"), expected, remedy
-        ) from error
+        came = Words(f"leaves that a scenario cannot have ({error})")
+        raise checks.fail("scenario", came, expected, remedy) from error
     if not same:
         came = Words("leaves that a file does not reproduce")
         raise checks.fail("scenario", came, expected, remedy)
@@ -273,18 +270,13 @@ def from_dict(
       ValueError: tables that do not fit; the message names source, dotted key and remedy.
     """
     try:
-        data = {
-            key: value
-            for key, value in as_table(data, "file").items()
-            if key not in set(other_tables)
-        }
+        others = set(other_tables)
+        data = {key: x for key, x in as_table(data, "file").items() if key not in others}
         scenario = _from_preset(data) if "preset" in data else _from_components(data, folder)
         if "dtype" in data:
             scenario = astype(scenario, _dtype(data["dtype"]))
-        changes = by_path(as_table(data.get("parameters", {}), "parameters"), "parameters")
-        scenario = construct(
-            with_parameters, {"scenario": scenario, "values": changes}, "parameters"
-        )
+        changes = {"scenario": scenario, "values": numbers_by_path(data, "parameters")}
+        scenario = construct(with_parameters, changes, "parameters")
         return ScenarioFile(scenario, _run_table(data.get("run", {})))
     except ValueError as error:
         raise checks.inside(source, error) from error
@@ -295,30 +287,22 @@ def _from_components(data: dict[str, Any], folder: str | os.PathLike) -> Scenari
     tables = {key: value for key, value in data.items() if key in COMPONENTS}
     for other in ("plant", "model"):
         if "robot" in tables and other in tables:
-            raise checks.fail(
-                other,
-                Words("this table besides [robot]"),
-                "only [robot], or [plant] and [model]",
-                f"Rename [robot] to [{_OTHER[other]}].",
-            )
+            came = Words("this table besides [robot]")
+            remedy = f"Rename [robot] to [{_OTHER[other]}]."
+            raise checks.fail(other, came, "only [robot], or [plant] and [model]", remedy)
     if names_a_file(tables):
         tables = with_robots_read(tables, folder)
     robot = tables.pop("robot", None)
     if robot is None:
         if "plant" not in tables:
-            raise checks.fail(
-                "robot",
-                Words("nothing"),
-                "a table [robot], or [plant] and [model]",
-                "Add it, or start from preset = ...",
-            )
+            remedy = "Add it, or start from preset = ..."
+            raise missing("robot", "a table [robot], or [plant] and [model]", remedy)
         return decode_fields(Scenario, tables, "")
     try:
         return decode_fields(Scenario, {"plant": robot, **tables}, "")
     except ValueError as error:
-        raise ValueError(
-            re.sub(r"^plant\b", "robot", str(error)).replace("[plant]", "[robot]")
-        ) from error
+        text = re.sub(r"^plant\b", "robot", str(error)).replace("[plant]", "[robot]")
+        raise ValueError(text) from error
 
 
 _OTHER = {"plant": "model", "model": "plant"}
@@ -331,12 +315,8 @@ def _from_preset(data: dict[str, Any]) -> Scenario:
                 "Change its numbers in [parameters], or take the full text: python -m iblf_jax"
                 f" presets {data['preset']} --toml."
             )
-            raise checks.fail(
-                name,
-                Words("this table besides preset"),
-                "a preset, or a complete scenario",
-                remedy,
-            )
+            came = Words("this table besides preset")
+            raise checks.fail(name, came, "a preset, or a complete scenario", remedy)
     known_keys(data, "", ("preset", "arguments", "parameters", "run", "dtype"))
     return preset_scenario(data["preset"], as_table(data.get("arguments", {}), "arguments"))
 
@@ -360,9 +340,7 @@ def preset_scenario(name: Any, arguments: dict[str, Any]) -> Scenario:
     hints = field_hints(preset)
     for key, parameter in taken.items():
         if parameter.default is parameter.empty and key not in arguments:
-            raise checks.fail(
-                f"arguments.{key}", Words("nothing"), f"a value; the preset {name} needs it"
-            )
+            raise missing(f"arguments.{key}", f"a value; the preset {name} needs it")
     values = {
         key: decode_static(value, hints.get(key, Any), f"arguments.{key}")
         for key, value in arguments.items()
@@ -370,30 +348,19 @@ def preset_scenario(name: Any, arguments: dict[str, Any]) -> Scenario:
     return construct(preset, values, "arguments")
 
 
-def by_path(table: dict[str, Any], name: str, prefix: str = "") -> dict[str, Any]:
-    """Path -> numbers of a table [name]: `"controller.K2" = 1` and `controller.K2 = 1` mean the
-    same.
-    """
-    found: dict[str, Any] = {}
-    for key, value in table.items():
-        path = dotted(prefix, key)
-        if isinstance(value, dict):
-            found |= by_path(value, name, path)
-        else:
-            found[path] = numbers(value, f"{name}.{path}")
-    return found
+def numbers_by_path(data: dict[str, Any], name: str) -> dict[str, Any]:
+    """Path -> numbers of the table [name] of a file, which may be missing."""
+    table = as_table(data.get(name, {}), name)
+    entries = by_path(table, lambda value: not isinstance(value, dict))
+    return {path: numbers(value, f"{name}.{path}") for path, value in entries.items()}
 
 
 def _dtype(name: Any) -> Any:
     checks.one_of("dtype", name, DTYPES)
     if name == "float64" and jnp.result_type(float) != jnp.float64:
-        raise checks.fail(
-            "dtype",
-            name,
-            "float32",
-            'JAX\'s 64-bit mode is off: jax.config.update("jax_enable_x64", True), or leave dtype'
-            " out.",
-        )
+        call = 'jax.config.update("jax_enable_x64", True)'
+        remedy = f"JAX's 64-bit mode is off: {call}, or leave dtype out."
+        raise checks.fail("dtype", name, "float32", remedy)
     return jnp.dtype(name)
 
 
@@ -402,12 +369,13 @@ def _run_table(table: Any) -> dict[str, Any]:
     known_keys(as_table(table, "run"), "run", RUN)
     values = {}
     for key, value in table.items():
-        values[key] = value.item() if isinstance(value, np.generic) else value
-    for key in ("duration", "dt"):
-        if key in values:
-            values[key] = checks.positive_number(f"run.{key}", values[key], "s")
-    if "method" in values:
-        checks.one_of("run.method", values["method"], tuple(TABLEAUS))
-    if "record_every" in values:
-        values["record_every"] = checks.positive_integer("run.record_every", values["record_every"])
+        if isinstance(value, np.generic):
+            value = value.item()
+        if key == "method":
+            checks.one_of("run.method", value, tuple(TABLEAUS))
+        elif key == "record_every":
+            value = checks.positive_integer("run.record_every", value)
+        else:
+            value = checks.positive_number(f"run.{key}", value, "s")
+        values[key] = value
     return values

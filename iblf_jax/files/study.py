@@ -35,11 +35,12 @@ from iblf_jax.files.scenario import from_dict, read_toml
 from iblf_jax.files.values import (
     Words,
     as_table,
+    by_path,
     decode_static,
     did_you_mean,
-    dotted,
     inline_table,
     known_keys,
+    missing,
     numbers,
 )
 from iblf_jax.simulation.scenario import Scenario
@@ -48,16 +49,8 @@ from iblf_jax.studies.distributions import KINDS, Perturbation
 
 OPTIONS: dict[str, dict[str, type]] = {
     "study": {"runs": int, "seed": int, "sampler": str, "replicates": int},
-    "sweep": {
-        "runs": int,
-        "seed": int,
-        "sampler": str,
-        "replicates": int,
-        "design": str,
-        "points": int,
-        "unit": int,
-    },
 }
+OPTIONS["sweep"] = OPTIONS["study"] | {"design": str, "points": int, "unit": int}
 """Table -> key -> type."""
 
 EXAMPLE = 'Write, for example, { factor = "uniform", low = 0.9, high = 1.1 }.'
@@ -98,25 +91,19 @@ def study_from_dict(
     file = from_dict(data, source, other_tables=own[kind], folder=folder)
     try:
         if "record_every" in file.run:
-            raise checks.fail(
-                "run.record_every",
-                file.run["record_every"],
-                "nothing",
-                "A study records no trajectories: leave it out.",
-            )
+            came = file.run["record_every"]
+            remedy = "A study records no trajectories: leave it out."
+            raise checks.fail("run.record_every", came, "nothing", remedy)
         if "duration" not in file.run:
-            raise checks.fail(
-                "run.duration",
-                Words("nothing"),
-                "the length of a run [s]",
-                "Add [run] with duration = ...",
-            )
+            remedy = "Add [run] with duration = ..."
+            raise missing("run.duration", "the length of a run [s]", remedy)
         options = file.run | _options(data.get(kind), kind)
         perturbations = perturbations_of(data)
         grid = {}
         if kind == "sweep":
-            for path, entry in _by_path(data, "grid").items():
-                grid[path] = _axis(entry, f"grid.{path}")
+            for path, entry in _entries(data, "grid").items():
+                read = _perturbation if isinstance(entry, dict) else numbers
+                grid[path] = read(entry, f"grid.{path}")
         return StudyFile(file.scenario, perturbations, grid, options)
     except ValueError as error:
         raise checks.inside(source, error) from error
@@ -124,14 +111,12 @@ def study_from_dict(
 
 def _options(table: Any, kind: str) -> dict[str, Any]:
     if table is None:
-        raise checks.fail(
-            kind, Words("nothing"), f"a table [{kind}]", "Write runs = 1000 in it, for example."
-        )
+        raise missing(kind, f"a table [{kind}]", "Write runs = 1000 in it, for example.")
     known_keys(as_table(table, kind), kind, OPTIONS[kind])
     for key, value in table.items():
         decode_static(value, OPTIONS[kind][key], f"{kind}.{key}")
     if kind == "study" and "runs" not in table:
-        raise checks.fail("study.runs", Words("nothing"), "a number of runs")
+        raise missing("study.runs", "a number of runs")
     options = dict(table)
     if "points" in options:
         options["design"] = Design(options.get("design", "grid"), options.pop("points"))
@@ -144,35 +129,23 @@ def perturbations_of(data: dict[str, Any]) -> dict[str, Perturbation]:
     Raises:
       ValueError: an entry that is not a perturbation.
     """
-    found = {}
-    for path, table in _by_path(data, "perturbations").items():
-        found[path] = _perturbation(table, f"perturbations.{path}")
-    return found
+    entries = _entries(data, "perturbations")
+    return {path: _perturbation(table, f"perturbations.{path}") for path, table in entries.items()}
 
 
-def _by_path(data: dict[str, Any], name: str) -> dict[str, Any]:
-    """Path -> entry: `"plant.mass" = {...}` and `plant.mass = {...}` mean the same."""
+def _entries(data: dict[str, Any], name: str) -> dict[str, Any]:
+    """Path -> entry of the table [name] of a file, which may be missing."""
     words = {"shared", *KINDS, *distributions.MEMBERS}
     for member in distributions.MEMBERS:
         words |= set(_arguments(member))
 
-    def is_part_of_path(value: Any) -> bool:
-        """Whether a table continues the path, and is not itself a perturbation."""
+    def is_entry(value: Any) -> bool:
+        """Whether a value is an entry, such as a perturbation, or a table that continues a path."""
         if not isinstance(value, dict) or words & set(value):
-            return False
-        return not any(isinstance(x, str) for x in value.values())
+            return True
+        return any(isinstance(x, str) for x in value.values())
 
-    def flat(table: dict[str, Any], prefix: str) -> dict[str, Any]:
-        found: dict[str, Any] = {}
-        for key, value in table.items():
-            path = dotted(prefix, key)
-            if is_part_of_path(value):
-                found |= flat(value, path)
-            else:
-                found[path] = value
-        return found
-
-    return flat(as_table(data.get(name, {}), name), "")
+    return by_path(as_table(data.get(name, {}), name), is_entry)
 
 
 def _made_by(name: str) -> Any:
@@ -188,11 +161,6 @@ def _arguments(name: str) -> dict[str, bool]:
     return {word: argument.default is argument.empty for word, argument in taken.items()}
 
 
-def _axis(entry: Any, path: str) -> Any:
-    """Values of a grid, or a perturbation that a random design draws from."""
-    return _perturbation(entry, path) if isinstance(entry, dict) else numbers(entry, path)
-
-
 def _perturbation(table: Any, path: str) -> Perturbation:
     if not isinstance(table, dict):
         raise checks.fail(path, table, "a table with a kind and a distribution", EXAMPLE)
@@ -206,12 +174,8 @@ def _perturbation(table: Any, path: str) -> Perturbation:
         remedy = _new_spelling(kind, name, table)
         raise checks.fail(f"{path}.{kind}", name, "the name of a distribution", remedy)
     if not isinstance(name, str) or name not in distributions.MEMBERS:
-        raise checks.fail(
-            f"{path}.{kind}",
-            name,
-            "the name of a distribution",
-            did_you_mean(name, distributions.MEMBERS),
-        )
+        remedy = did_you_mean(name, distributions.MEMBERS)
+        raise checks.fail(f"{path}.{kind}", name, "the name of a distribution", remedy)
     arguments = _arguments(name)
     known_keys(table, path, (kind, "shared", *arguments))
     shared = decode_static(table.get("shared", False), bool, f"{path}.shared")
@@ -219,18 +183,14 @@ def _perturbation(table: Any, path: str) -> Perturbation:
     for word, is_required in arguments.items():
         key = f"{path}.{word}"
         if word in table:
-            values[word] = _argument(word, table[word], key)
+            values[word] = table[word]
+            if word == "group":
+                checks.word(key, table[word], "a name")
+            else:
+                values[word] = numbers(table[word], key)
         elif is_required:
-            expected = "a number or a list of numbers"
-            raise checks.fail(key, Words("nothing"), expected, f"{name} needs it.")
+            raise missing(key, "a number or a list of numbers", f"{name} needs it.")
     return getattr(distributions, kind)(construct(_made_by(name), values, path), shared=shared)
-
-
-def _argument(word: str, value: Any, path: str) -> Any:
-    """An argument of a distribution: numbers, or the name of a group."""
-    if word == "group":
-        return checks.word(path, value, "a name")
-    return numbers(value, path)
 
 
 def _new_spelling(kind: str, old: dict[str, Any], table: dict[str, Any]) -> str:

@@ -1,5 +1,4 @@
-"""Tuning files: what to tune, as typed, validated TOML; and saved results, from which the report
-can be made again.
+"""Reads tuning files, which describe a tuning as validated TOML, and saves and loads its results.
 
 A tuning file is a scenario file (`files.scenario`) with four more tables, of which [perturbations]
 is that of a study file (`files.study`):
@@ -41,8 +40,8 @@ with a DeprecationWarning.  In files of earlier versions `joints` was a list of 
 now `weights`.  Floating-point numbers are still read so, and so are whole numbers that are no
 selection of joints; both with a DeprecationWarning.
 
-Everything is checked; each error is a ValueError that names the dotted key.  A saved result is JSON
-with all its numbers in full precision.
+Every value is checked, and each error is a ValueError that names the dotted key.  A saved result is
+JSON with all its numbers in full precision; its report can be computed again.
 """
 
 from __future__ import annotations
@@ -63,7 +62,7 @@ from iblf_jax.core.pytree import field_values
 from iblf_jax.files import components
 from iblf_jax.files.scenario import from_dict, read_toml, scenario_to_dict
 from iblf_jax.files.study import perturbations_of
-from iblf_jax.files.values import Words, as_table, did_you_mean, known_keys, numbers
+from iblf_jax.files.values import Words, as_table, did_you_mean, known_keys, missing, numbers
 from iblf_jax.simulation import metrics
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.studies import distributions
@@ -109,18 +108,18 @@ HISTORY = dict.fromkeys(
     "valid": "b",
     "evaluations": "iu",
 }
-"""What a result's history holds, and the kinds of its numbers."""
+"""Name of an array in the history of a result -> the kinds of number that it may have."""
 ARGUMENTS = ("runs", "seed", "backend", "iterations")
-"""What [tune] may contain besides `parameters`, `risk`, `level`, `solver` and `report`."""
+"""Keys of [tune] besides `parameters`, `risk`, `level`, `solver` and `report`."""
 EARLIER_ARGUMENTS = tuple(name for name in REPLACED if name != "callback")
-"""What it contained in earlier versions."""
+"""Keys that [tune] had in earlier versions."""
 
 
 def load_tuning_file(path: str | os.PathLike) -> dict[str, Any]:
     """The arguments of `tune` that a tuning file describes, the scenario among them.
 
     Args:
-      path: a file in the format at the head of this module.
+      path: a file in the format that the docstring of this module describes.
 
     Raises:
       ValueError: the file is not TOML or does not describe a tuning; the message names file, key
@@ -131,24 +130,12 @@ def load_tuning_file(path: str | os.PathLike) -> dict[str, Any]:
     file = from_dict(data, source=source, other_tables=TABLES, folder=Path(path).parent)
     try:
         options = _options(as_table(data.get("tune", {}), "tune"))
-        goal = _objective(
-            data.get("objective", []),
-            data.get("requirement", []),
-            joint_names(file.scenario.plant, file.scenario.n),
-        )
-        drawn = perturbations_of(data)
+        options["objective"] = _objective(data, joint_names(file.scenario.plant, file.scenario.n))
+        options["perturbations"] = perturbations_of(data)
     except ValueError as error:
         raise checks.inside(source, error) from error
-    timing = {"duration": 5.0} | {
-        key: x for key, x in dict(file.run or {}).items() if key in ("duration", "dt", "method")
-    }
-    return {
-        "scenario": file.scenario,
-        "objective": goal,
-        "perturbations": drawn,
-        **options,
-        **timing,
-    }
+    timing = {key: x for key, x in file.run.items() if key != "record_every"}
+    return {"scenario": file.scenario, "duration": 5.0, **options, **timing}
 
 
 def tune_file(path: str | os.PathLike, **options: Any) -> TuneResult:
@@ -204,48 +191,51 @@ def _parameter(entry: Any, key: str) -> Any:
     table = dict(as_table(entry, key))
     known_keys(table, key, ("path", "low", "high", "tied", "scale"))
     path = checks.word(f"{key}.path", table.pop("path", Words("nothing")), "the path of a leaf")
-    limits: dict[str, Any] = {
-        name: numbers(table[name], f"{key}.{name}") for name in ("low", "high") if name in table
-    }
-    return components.construct(tunable, {"path": path, **table, **limits}, key)
+    for name in ("low", "high"):
+        if name in table:
+            table[name] = numbers(table[name], f"{key}.{name}")
+    return components.construct(tunable, {"path": path, **table}, key)
 
 
 def _called(
-    module: Any,
     allowed: tuple[str, ...],
     entry: Any,
     key: str,
     names: tuple[str, ...],
     besides: tuple[str, ...] = (),
 ) -> Any:
-    """What a function of objectives makes of a table; `names` are those of the robot's joints."""
+    """The objective or requirement that a table describes.
+
+    Args:
+      allowed: the functions of `objectives` that `kind` may name.
+      entry: the table.
+      key: dotted key of the table.
+      names: names of the robot's joints.
+      besides: further keys that the table may have.
+    """
     table = _with_weights(as_table(entry, key), key, names)
     checks.one_of(f"{key}.kind", table.get("kind"), allowed)
-    function = getattr(module, table["kind"])
+    function = getattr(objectives, table["kind"])
     if function is objectives.metric and "fold" not in table:
         table = table | {"fold": _fold_of(table.get("name", Words("nothing")), f"{key}.name")}
     taken = inspect.signature(function).parameters
     known_keys(table, key, ("kind", *besides, *taken))
     for name, parameter in taken.items():
         if parameter.default is parameter.empty and name not in table:
-            raise checks.fail(
-                f"{key}.{name}",
-                Words("nothing"),
-                f"{_NO_NUMBERS.get(name, 'a number')}; {table['kind']} needs it",
-            )
-    return components.construct(
-        function,
-        {name: _argument(name, table[name], f"{key}.{name}") for name in taken if name in table},
-        key,
-    )
+            expected = f"{_NO_NUMBERS.get(name, 'a number')}; {table['kind']} needs it"
+            raise missing(f"{key}.{name}", expected)
+    given = {name: _argument(name, table[name], f"{key}.{name}") for name in taken if name in table}
+    return components.construct(function, given, key)
 
 
 _NO_NUMBERS = {"fold": "a metric", "name": "the name of one of its results"}
-"""Arguments of objectives that are something else."""
+"""Argument of an objective that is not a number -> its description in words."""
 
 
 def _with_weights(table: dict[str, Any], key: str, names: tuple[str, ...]) -> dict[str, Any]:
-    """A table whose `joints` are a selection; those of earlier versions were weights."""
+    """The table with `joints` as a selection; in earlier versions `joints` were weights, which move
+    to the key `weights`.
+    """
     given: Any = table.get("joints")
     is_integers = isinstance(given, list) and bool(given) and all(type(x) is int for x in given)
     if not (holds_weights(given) or is_integers):
@@ -255,30 +245,29 @@ def _with_weights(table: dict[str, Any], key: str, names: tuple[str, ...]) -> di
     if is_integers and len(given) != n:
         return table
     if is_integers and {x % n for x in given if -n <= x < n} == set(range(n)):
-        text = (
+        notices.warn(
             f"{key}.joints = {given} selects all joints. Earlier versions read it as weights: write"
             f" weights = {given} if you mean these."
         )
-        notices.warn(text)
         return table
-    text = (
+    notices.warn(
         f"{key}.joints selects joints now; {given} is read as weights, as in earlier versions:"
-        f" write weights = {given}."
+        f" write weights = {given}.",
+        DeprecationWarning,
     )
-    notices.warn(text, DeprecationWarning)
     return {name: value for name, value in table.items() if name != "joints"} | {"weights": given}
 
 
 def _argument(name: str, value: Any, key: str) -> Any:
     if name == "joints":
         return value  # the function checks it
-    if name == "fold":
-        return components.decode(
-            {"kind": value} if isinstance(value, str) else value, metrics.Fold, key
-        )
-    return (
-        checks.word(key, value, _NO_NUMBERS[name]) if name in _NO_NUMBERS else numbers(value, key)
-    )
+    if name == "name":
+        return checks.word(key, value, _NO_NUMBERS[name])
+    if name != "fold":
+        return numbers(value, key)
+    if isinstance(value, str):
+        value = {"kind": value}
+    return components.decode(value, metrics.Fold, key)
 
 
 def _fold_of(result: Any, key: str) -> str:
@@ -291,26 +280,24 @@ def _fold_of(result: Any, key: str) -> str:
     return owners[result]
 
 
-def _objective(terms: Any, requirements: Any, names: tuple[str, ...]) -> Objective:
+def _objective(data: dict[str, Any], names: tuple[str, ...]) -> Objective:
+    """The objective with its requirements; `names` are those of the robot's joints."""
+    terms, requirements = data.get("objective", []), data.get("requirement", [])
     if not isinstance(terms, list) or not terms:
-        raise checks.fail(
-            "objective",
-            terms or Words("nothing"),
-            "at least one [[objective]] table",
-            'Such as kind = "tracking".',
-        )
+        came = terms or Words("nothing")
+        remedy = 'Such as kind = "tracking".'
+        raise checks.fail("objective", came, "at least one [[objective]] table", remedy)
     total = Objective()
     for i, entry in enumerate(terms):
         key = f"objective[{i}]"
-        term = _called(objectives, OBJECTIVES, entry, key, names, ("weight",))
+        term = _called(OBJECTIVES, entry, key, names, ("weight",))
         weight = numbers(entry.get("weight", 1.0), f"{key}.weight")
         total += components.construct(term.__mul__, {"weight": weight}, key)
     if not isinstance(requirements, list):
-        raise checks.fail(
-            "requirement", requirements, "[[requirement]] tables", 'Such as kind = "margin_above".'
-        )
+        remedy = 'Such as kind = "margin_above".'
+        raise checks.fail("requirement", requirements, "[[requirement]] tables", remedy)
     for i, entry in enumerate(requirements):
-        total += _called(objectives, REQUIREMENTS, entry, f"requirement[{i}]", names)
+        total += _called(REQUIREMENTS, entry, f"requirement[{i}]", names)
     return total
 
 
@@ -341,6 +328,9 @@ def save_tuning(result: TuneResult, path: str | os.PathLike) -> None:
     """Writes a result to a JSON file that `load_tuning` reads; errors as `TuneResult.save`."""
     target = checks.file_to_write("path", path)
     setup = result.setup
+    options = field_values(setup)
+    for name in ("objective", "perturbations", "risk"):
+        del options[name]
     history = {
         name: {"dtype": str(x.dtype), "shape": x.shape, "values": x.ravel().tolist()}
         for name, x in result.history.items()
@@ -386,9 +376,8 @@ def load_tuning(path: str | os.PathLike) -> TuneResult:
     try:
         return _decoded(data)
     except Exception as error:  # whatever is missing in it, or of another kind
-        raise checks.fail(
-            "path", str(place), expected, f"{type(error).__name__}: {error}"
-        ) from error
+        found = f"{type(error).__name__}: {error}"
+        raise checks.fail("path", str(place), expected, found) from error
 
 
 def _array(entry: dict[str, Any], kinds: str) -> np.ndarray:
@@ -433,21 +422,14 @@ def _decoded_setup(data: dict[str, Any]) -> TuneSetup:
 
 
 def _decoded_history(table: dict[str, Any], count: int) -> dict[str, np.ndarray]:
-    """The history of a saved result of so many tuned numbers, checked."""
+    """The history of a saved result with `count` tuned numbers, checked."""
     history = {name: _array(table[name], kinds) for name, kinds in HISTORY.items()}
     steps, starts, size = history["x"].shape
-    shapes = {name: x.shape[:2] for name, x in history.items() if name != "evaluations"}
-    if (
-        size != count
-        or not steps
-        or set(shapes.values()) != {(steps, starts)}
-        or history["evaluations"].shape != (steps,)
-    ):
-        raise checks.fail(
-            "history",
-            Words("arrays that do not fit each other"),
-            f"(steps, starts, ...) of {count} numbers",
-        )
+    shapes = {x.shape[:2] for name, x in history.items() if name != "evaluations"}
+    fits = shapes == {(steps, starts)} and history["evaluations"].shape == (steps,)
+    if size != count or not steps or not fits:
+        came = Words("arrays that do not fit each other")
+        raise checks.fail("history", came, f"(steps, starts, ...) of {count} numbers")
     return history
 
 
@@ -467,7 +449,6 @@ def _decoded(data: dict[str, Any]) -> TuneResult:
     starts = history["x"].shape[1]
     best = checks.positive_integer("best_start", data["best_start"], least=0, most=starts - 1)
     seconds = checks.positive_number("seconds", data["seconds"], "s", zero=True)
-    ends = [tuple(float(x) for x in data[name]) for name in ("multipliers", "residuals")]
     return TuneResult(
         with_parameters(start, values),
         start,
@@ -477,8 +458,8 @@ def _decoded(data: dict[str, Any]) -> TuneResult:
         best,
         seconds=seconds,
         setup=setup,
-        multipliers=ends[0],
-        residuals=ends[1],
+        multipliers=tuple(map(float, data["multipliers"])),
+        residuals=tuple(map(float, data["residuals"])),
         probes=checks.positive_integer("probes", data["probes"], least=0),
         **words,
     )

@@ -10,7 +10,7 @@ import math
 import tomllib
 import types
 import typing
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -65,6 +65,31 @@ def as_table(value: Any, path: str) -> dict[str, Any]:
     if isinstance(value, dict):
         return value
     raise checks.fail(path, value, f"a table, [{path}]")
+
+
+def missing(key: str, expected: str, remedy: str = "") -> ValueError:
+    """The error for a key that a file does not have."""
+    return checks.fail(key, Words("nothing"), expected, remedy)
+
+
+def by_path(
+    table: dict[str, Any], is_entry: Callable[[Any], bool], prefix: str = ""
+) -> dict[str, Any]:
+    """Path -> entry: `"plant.mass" = x` and `plant.mass = x` mean the same.
+
+    Args:
+      table: tables inside each other.
+      is_entry: whether a value is an entry; otherwise it is a table that continues the path.
+      prefix: path of the table.
+    """
+    found: dict[str, Any] = {}
+    for key, value in table.items():
+        path = dotted(prefix, key)
+        if is_entry(value):
+            found[path] = value
+        else:
+            found |= by_path(value, is_entry, path)
+    return found
 
 
 def known_keys(table: dict[str, Any], path: str, known: Iterable[str]) -> None:
@@ -142,17 +167,15 @@ def encode_static(value: Any, path: str) -> Any:
     if isinstance(value, tuple):
         return [encode_static(x, f"{path}[{i}]") for i, x in enumerate(value)]
     if isinstance(value, str) and any("\ud800" <= x <= "\udfff" for x in value):
-        raise checks.fail(
-            path, value, "text without unpaired surrogates", "A scenario file cannot hold it."
-        )
+        raise not_storable(path, value, "text without unpaired surrogates")
     if isinstance(value, bool | str | int) or (isinstance(value, float) and math.isfinite(value)):
         return value
-    raise checks.fail(
-        path,
-        value,
-        "a finite number, a string, a bool or a tuple of these",
-        "A scenario file cannot hold it.",
-    )
+    raise not_storable(path, value, "a finite number, a string, a bool or a tuple of these")
+
+
+def not_storable(path: str, value: Any, expected: str) -> ValueError:
+    """The error for a value that a file cannot hold."""
+    return checks.fail(path, value, expected, "A scenario file cannot hold it.")
 
 
 def decode_static(value: Any, hint: Any, path: str) -> Any:

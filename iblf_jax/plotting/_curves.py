@@ -15,6 +15,7 @@ import numpy as np
 from iblf_jax.control.actuators import Ideal as IdealActuator
 from iblf_jax.control.sensors import Ideal as IdealSensor
 from iblf_jax.core import checks
+from iblf_jax.core.optional import attributes
 from iblf_jax.core.status import FAILED, Status, describe
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.world.robots import joint_names
@@ -75,12 +76,15 @@ class Curve:
     """Number of samples before the state was frozen."""
 
     def __getitem__(self, field: str) -> np.ndarray:
-        derive = DERIVED.get(field)
-        values = getattr(self.run, field) if derive is None else derive(self.run)
+        if field in DERIVED:
+            values = DERIVED[field](self.run)
+        else:
+            values = attributes(self.run, [field])[field]
         if isinstance(values, tuple):
             values = np.full(self.run.q.shape, np.nan)
-        stop = None if field in EXTERNAL else self.samples
-        return np.asarray(values)[:stop]
+        if field in EXTERNAL:
+            return np.asarray(values)
+        return np.asarray(values)[: self.samples]
 
     @property
     def t(self) -> np.ndarray:
@@ -121,11 +125,6 @@ class Curve:
     def has_regions(self) -> bool:
         """Whether the scenario confines points of the robot to regions."""
         return not isinstance(self.run.region_margin, tuple)
-
-    @property
-    def ok(self) -> bool:
-        """Whether the run has no status flag."""
-        return self.run.ok
 
     @property
     def failed(self) -> bool:
@@ -184,22 +183,17 @@ def _valid_samples(run: Rollout) -> int:
     return int(last[-1]) + 2
 
 
-def _checked(name: str, run: Any) -> Curve:
-    argument = f"runs[{name!r}]" if name else "run"
-    if not isinstance(run, Rollout):
-        raise checks.fail(
-            argument,
-            type(run).__name__,
-            "a Rollout",
-            "Draw what ij.simulate returns, or a dict of such runs.",
-        )
+def check_class(argument: str, value: Any, cls: type, remedy: str) -> None:
+    """Raises ValueError if the value is not an object of this class."""
+    if not isinstance(value, cls):
+        raise checks.fail(argument, type(value).__name__, checks.with_article(cls.__name__), remedy)
+
+
+def _checked(name: str, run: Any, argument: str) -> Curve:
+    check_class(argument, run, Rollout, "Draw what ij.simulate returns, or a dict of such runs.")
     if not checks.is_concrete(run):
-        raise checks.fail(
-            argument,
-            "a traced run",
-            "a run that holds numbers",
-            "Draw outside of jit, vmap and grad.",
-        )
+        remedy = "Draw outside of jit, vmap and grad."
+        raise checks.fail(argument, "a traced run", "a run that holds numbers", remedy)
     if run.is_batch:
         came = f"a batch of {len(run)} runs"
         raise checks.fail(argument, came, "one run", "Select a run: run[0].")
@@ -218,15 +212,14 @@ def curves_of(runs: Rollout | Mapping[str, Rollout]) -> list[Curve]:
         different numbers of joints.
     """
     if not isinstance(runs, Mapping):
-        return [_checked("", runs)]
+        return [_checked("", runs, "run")]
     if not runs:
         raise checks.fail("runs", runs, "at least one run")
-    curves = [_checked(str(name), run) for name, run in runs.items()]
+    curves = [_checked(str(name), run, f"runs[{str(name)!r}]") for name, run in runs.items()]
     joints = {curve.name: curve.run.n for curve in curves}
     if len(set(joints.values())) > 1:
-        raise checks.fail(
-            "runs", joints, "runs with one number of joints", "Draw the robots one by one."
-        )
+        remedy = "Draw the robots one by one."
+        raise checks.fail("runs", joints, "runs with one number of joints", remedy)
     return curves
 
 
@@ -259,9 +252,8 @@ def _differ(a: Curve, b: Curve, fields: Sequence[str], joints: Sequence[int]) ->
     for field in fields:
         for joint in joints:
             one, two = (c.at(field, t)[:, joint] for c in (a, b))
-            if not np.allclose(
-                one, two, rtol=0.0, atol=SAME_SIGNAL * np.ptp(one) + 1e-9, equal_nan=True
-            ):
+            tolerance = SAME_SIGNAL * np.ptp(one) + 1e-9
+            if not np.allclose(one, two, rtol=0.0, atol=tolerance, equal_nan=True):
                 return True
     return False
 

@@ -90,7 +90,7 @@ def _rows_with_zoom(
         main.set_ylabel(row.label)
         _outline(main, inset)
     for axes in table[-1]:
-        axes.set_xlabel(_style.label("time $t$", "s"))
+        _style.time_axis(axes)
     table[0, 1].set_title(f"the first {start[1]:.3g} s, magnified")
     figure.align_ylabels(table[:, 0])
     _style.set_title(figure, title, curves)
@@ -125,7 +125,9 @@ def _named_rows(
     quantity = QUANTITIES[field]
     unit = _style.label(quantity.symbol, quantity.unit)
     rows = [PanelRow(quantity, i, f"{name}\n{unit}") for i, name in enumerate(names)]
-    height = 1.75 if len(rows) <= 3 else 1.25
+    height = 1.75
+    if len(rows) > 3:
+        height = 1.25
     return _rows_with_zoom(title, curves, rows, zoom, height)
 
 
@@ -144,12 +146,8 @@ def tube(scenario: Scenario, *, duration: float = 20.0) -> Figure:
       ValueError: not one Scenario, or a duration that is not a positive number.
     """
     if not isinstance(scenario, Scenario) or scenario.initial.q.ndim != 1:
-        raise checks.fail(
-            "scenario",
-            type(scenario).__name__,
-            "one Scenario",
-            "Make one with ij.presets or ij.Scenario.",
-        )
+        remedy = "Make one with ij.presets or ij.Scenario."
+        raise checks.fail("scenario", type(scenario).__name__, "one Scenario", remedy)
     t = np.linspace(0.0, checks.positive_number("duration", duration, "s"), POINTS)
     tube = jax.vmap(scenario.context.tube)(jnp.asarray(t, scenario.initial.q.dtype))
     figure = _style.new_figure(7.2, 0.6 + 1.4 * scenario.n)
@@ -273,11 +271,8 @@ def region_margins(runs: Runs, *, zoom: float | None = None) -> Figure:
     curves = curves_of(runs)
     counts = [len(curve.run.scenario.regions) for curve in curves]
     if len(set(counts)) > 1 or not counts[0]:
-        raise checks.fail(
-            "runs",
-            f"runs with {', '.join(map(str, counts))} regions",
-            "runs with the same number of regions, at least one",
-        )
+        came = f"runs with {', '.join(map(str, counts))} regions"
+        raise checks.fail("runs", came, "runs with the same number of regions, at least one")
     scenario = curves[0].run.scenario
     names = [escaped(in_words(region, scenario.plant)) for region in scenario.regions]
     return _named_rows("Distance to the boundaries", curves, "region_margin", names, zoom)
@@ -330,21 +325,16 @@ def draw_phase_portrait(axes: Axes, curves: Sequence[Curve], joints: tuple[int, 
         axes.plot(*path.T, **look)
         frame.append(path)
     starts = np.stack([curve["q"][0, joints] for curve in curves])
-    axes.plot(
-        *starts.T,
-        marker="o",
-        color=_style.text_colour(),
-        markerfacecolor=_style.background(),
-        markersize=6,
-        linestyle="none",
-        zorder=4,
-        label="start",
-    )
+    dots: dict[str, Any] = {"marker": "o", "markersize": 6, "linestyle": "none", "zorder": 4}
+    dots |= {"color": _style.text_colour(), "markerfacecolor": _style.background()}
+    axes.plot(*starts.T, label="start", **dots)
     for i, curve in enumerate(curves):
         path = curve["q"][:, joints]
         thin = path[:: max(1, len(path) // POINTS)]
         axes.plot(*thin.T, label=curve.name or "$q$", **run_style(curves, i))
-        frame.append(path[:1] if curve.failed else path)
+        if curve.failed:
+            path = path[:1]
+        frame.append(path)
     points = np.concatenate(frame)
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):
@@ -376,11 +366,11 @@ def phase_portrait(runs: Runs, joints: tuple[int | str, int | str] = (0, 1)) -> 
     expected = "two different joints, such as (0, 1)"
     if not isinstance(joints, tuple | list) or len(joints) != 2:
         raise checks.fail("joints", joints, expected)
-    pair = (check_joint(curves, joints[0], "joints"), check_joint(curves, joints[1], "joints"))
-    if pair[0] == pair[1]:
+    first, second = (check_joint(curves, joint, "joints") for joint in joints)
+    if first == second:
         raise checks.fail("joints", joints, expected)
     figure = _style.new_figure(4.6, 4.9)
-    draw_phase_portrait(figure.subplots(), curves, pair)
+    draw_phase_portrait(figure.subplots(), curves, (first, second))
     _style.set_title(figure, "Phase portrait of the positions", curves)
     _style.legend_below(figure, 4)
     return figure
@@ -497,9 +487,8 @@ def save(
         checks.file_path("figures: name", name)
     folder = checks.file_path("folder", folder, "a folder")
     if any(part.exists() and not part.is_dir() for part in (folder, *folder.parents)):
-        raise checks.fail(
-            "folder", str(folder), "the path of a folder", "It, or a part of it, is a file."
-        )
+        remedy = "It, or a part of it, is a file."
+        raise checks.fail("folder", str(folder), "the path of a folder", remedy)
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
     for name, figure in figures.items():

@@ -125,7 +125,7 @@ def _residuals(axes: Axes, known: Identification) -> None:
             t = np.concatenate([known.times[chosen], gap], axis=1).ravel()
             left = np.concatenate([known.residuals[chosen, :, worst], gap], axis=1).ravel()
             axes.plot(t, left, color=_style.colour(index), linewidth=0.5, label=name)
-    axes.set_xlabel(_style.label("time $t$", "s"))
+    _style.time_axis(axes)
     axes.set_ylabel(_style.label(f"logged less replayed,\n{known.fit[worst].joint}", "rad"))
     axes.legend(ncols=2, fontsize=_style.size(6.5), loc="upper center")
     axes.margins(y=0.25)

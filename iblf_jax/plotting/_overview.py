@@ -13,7 +13,7 @@ from matplotlib.gridspec import SubplotSpec
 
 from iblf_jax.core import checks
 from iblf_jax.plotting import _style
-from iblf_jax.plotting._curves import Curve, curves_of, escaped, thinned
+from iblf_jax.plotting._curves import Curve, check_class, curves_of, escaped, thinned
 from iblf_jax.plotting._figures import draw_phase_portrait
 from iblf_jax.plotting._panels import (
     QUANTITIES,
@@ -54,13 +54,7 @@ def overview(run: Rollout, *, title: str = "Overview of the run") -> Figure:
     Raises:
       ValueError: a batch, not a Rollout, or a title that is not a text.
     """
-    if not isinstance(run, Rollout):
-        raise checks.fail(
-            "run",
-            type(run).__name__,
-            "a Rollout",
-            "plotting.joint and other figures compare several runs.",
-        )
+    check_class("run", run, Rollout, "plotting.joint and other figures compare several runs.")
     checks.word("title", title, "a text")
     (curve,) = curves_of(run)
     rows = len(_style.row_sizes(run.n, COLUMNS))
@@ -97,7 +91,7 @@ def _tubes(
     for row in rows:
         row[0].set_ylabel(quantity.label)
     for axes in rows[-1]:
-        axes.set_xlabel(_style.label("time $t$", "s"))
+        _style.time_axis(axes)
 
 
 def _together(figure: Figure, where: SubplotSpec, curve: Curve, window: Window) -> None:
@@ -129,11 +123,12 @@ def _joints(axes: Axes, curve: Curve, quantity: PanelQuantity, window: Window) -
             drawn.append(draw(axes, curve, quantity.truth, joint, window, label="_", **broad))
         look["label"] = curve.joint_label(joint)
         drawn.append(draw(axes, curve, quantity.field, joint, window, **look))
-    axes.set_xlim(*window)
     set_limits(axes, [curve] * len(drawn), drawn, frame, spikes=quantity.unit == "N m")
     annotate_clipped_peak(axes, [curve] * len(drawn), drawn, quantity.unit)
-    axes.set_ylabel(r"$f$ (broad), $\hat f$ [N m]" if quantity.truth else quantity.label)
-    axes.set_xlabel(_style.label("time $t$", "s"))
+    axes.set_ylabel(quantity.label)
+    if quantity.truth:
+        axes.set_ylabel(r"$f$ (broad), $\hat f$ [N m]")
+    _style.time_axis(axes, window)
 
 
 def _regions(figure: Figure, where: SubplotSpec, curve: Curve, window: Window) -> None:
@@ -148,8 +143,7 @@ def _regions(figure: Figure, where: SubplotSpec, curve: Curve, window: Window) -
         names.append(escaped(f"{i}: {in_words(region, scenario.plant)}"))
     axes.legend(axes.get_lines(), names, title="regions")
     axes.axhline(0.0, color=_style.failure(), linewidth=1.0)
-    axes.set_xlim(*window)
-    axes.set_xlabel(_style.label("time $t$", "s"))
+    _style.time_axis(axes, window)
     axes.set_ylabel(quantity.label)
     for line in draw_paths(figure, grid[1], [curve]).get_lines():
         line.set_label("_")
@@ -162,6 +156,5 @@ def _lyapunov(axes: Axes, curve: Curve, window: Window) -> None:
     axes.plot(*thinned(curve.t[: len(V)], positive), color=_style.blend(0.733))
     if np.isfinite(positive).any():
         axes.set_yscale("log")
-    axes.set_xlim(*window)
     axes.set_ylabel("Lyapunov function $V_2$")
-    axes.set_xlabel(_style.label("time $t$", "s"))
+    _style.time_axis(axes, window)

@@ -47,15 +47,15 @@ class PanelQuantity:
     """The signals that bound it."""
     frame_words: str = ""
     guide: str | None = None
-    """The signal that it should follow, drawn once for all runs."""
+    """The signal that the quantity should follow; it is drawn once for all runs."""
     guide_words: str = ""
     truth: str | None = None
-    """The signal that it estimates, drawn as a broad pale line under it; once, if it is the same in
-    all runs."""
+    """The signal that the quantity estimates.  It is drawn as a broad pale line under them, and
+    only once if it is the same in all runs."""
     measured: str = ""
-    """The measurement of it."""
+    """The signal that is a measurement of the quantity."""
     transient: str = ""
-    """The signal whose transient a zoom shows, if not its own."""
+    """The signal whose transient a zoom shows; that of the quantity itself if empty."""
 
     @property
     def label(self) -> str:
@@ -138,17 +138,12 @@ def draw_frame(
     """Draws the bounds of a quantity as grey lines with a pale band between them; returns them."""
     if quantity.frame is None or np.isnan(curve[quantity.frame[0]]).all():
         return []
-    look = {
-        "color": _style.bound(),
-        "linewidth": 1.0,
-        "zorder": 1.8,
-        "label": quantity.frame_words,
-    } | options
+    look = {"color": _style.bound(), "linewidth": 1.0, "zorder": 1.8} | options
+    look.setdefault("label", quantity.frame_words)
     lower, upper = (curve[field][:, joint] for field in quantity.frame)
     step = max(1, len(curve.t) // 500)
-    axes.fill_between(
-        curve.t[::step], lower[::step], upper[::step], color=_style.tube(), linewidth=0, zorder=0
-    )
+    band = (curve.t[::step], lower[::step], upper[::step])
+    axes.fill_between(*band, color=_style.tube(), linewidth=0, zorder=0)
     drawn = [draw(axes, curve, quantity.frame[0], joint, window, **look)]
     return [*drawn, draw(axes, curve, quantity.frame[1], joint, window, **(look | {"label": "_"}))]
 
@@ -208,11 +203,12 @@ def set_limits(
     """
     successful, failed = [], []
     for curve, y in zip(curves, drawn, strict=True):
-        shown = _without_spikes(y) if spikes else y
+        if spikes:
+            y = _without_spikes(y)
         if curve.failed:
-            failed.append(_without_outliers(shown))
+            failed.append(_without_outliers(y))
         else:
-            successful.append(shown)
+            successful.append(y)
     low, high = _span([*successful, *failed]) or (-1.0, 1.0)
     near = [y[(y > low - FARTHEST_BOUND) & (y < high + FARTHEST_BOUND)] for y in frame]
     base = _span(near) or _span(successful)
@@ -245,13 +241,8 @@ def annotate_clipped_peak(
     if found:
         value, t = max(found)
         back = {"facecolor": _style.background(), "edgecolor": "none", "alpha": 0.85, "pad": 1.0}
-        where: dict[str, Any] = {
-            "transform": axes.transAxes,
-            "ha": "right",
-            "va": "top",
-            "fontsize": _style.size(7.5),
-            "zorder": 6,
-        }
+        where: dict[str, Any] = {"transform": axes.transAxes, "ha": "right", "va": "top"}
+        where |= {"fontsize": _style.size(7.5), "zorder": 6}
         axes.text(0.98, 0.97, f"peak {value:.5g} {unit} at t = {t:.4g} s", bbox=back, **where)
 
 
@@ -259,20 +250,10 @@ def _mark_break(axes: Axes, curve: Curve, y: np.ndarray, window: Window) -> None
     """Marks with a cross where a run failed, at the edge of the panel if the sample is outside."""
     index = curve.break_index()
     if index is not None and window[0] <= curve.t[index] <= window[1] and np.isfinite(y[index]):
-        look: dict[str, Any] = {
-            "marker": "x",
-            "markersize": 7,
-            "markeredgewidth": 2,
-            "linestyle": "none",
-        }
-        axes.plot(
-            curve.t[index],
-            np.clip(y[index], *axes.get_ylim()),
-            color=_style.failure(),
-            zorder=5,
-            clip_on=False,
-            **look,
-        )
+        look: dict[str, Any] = {"marker": "x", "markersize": 7, "markeredgewidth": 2}
+        look |= {"linestyle": "none", "zorder": 5, "clip_on": False}
+        height = np.clip(y[index], *axes.get_ylim())
+        axes.plot(curve.t[index], height, color=_style.failure(), **look)
 
 
 def _draw_bounds_and_guide(
@@ -319,13 +300,9 @@ def _draw_measured(
     drawn = []
     for i, curve in enumerate(curves):
         if quantity.measured and curve.is_measured:
-            name = f"{curve.name} measured".strip()
-            look: dict[str, Any] = {
-                "color": _style.blend(0.45, series(i)["color"]),
-                "linewidth": 0.8,
-                "zorder": 1.9,
-                "label": name,
-            }
+            look: dict[str, Any] = {"label": f"{curve.name} measured".strip()}
+            look |= {"color": _style.blend(0.45, series(i)["color"])}
+            look |= {"linewidth": 0.8, "zorder": 1.9}
             drawn.append((curve, draw(axes, curve, quantity.measured, joint, window, **look)))
     return drawn
 
@@ -396,9 +373,8 @@ def transient_end(curves: Sequence[Curve], quantity: PanelQuantity, joint: int) 
         if curve.failed or half < 2 or not np.isfinite(y).all():
             continue
         room = 0.05 * np.ptp(y)
-        outside = np.flatnonzero(
-            (y[:half] < y[half:].min() - room) | (y[:half] > y[half:].max() + room)
-        )
+        low, high = y[half:].min() - room, y[half:].max() + room
+        outside = np.flatnonzero((y[:half] < low) | (y[:half] > high))
         if outside.size:
             ends.append(float(curve.t[outside[-1]]))
     return max(ends)

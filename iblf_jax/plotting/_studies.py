@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from iblf_jax.core import checks
 from iblf_jax.plotting import _style
-from iblf_jax.plotting._curves import escaped, joint_labels
+from iblf_jax.plotting._curves import check_class, escaped, joint_labels
 from iblf_jax.studies import statistics
 from iblf_jax.studies.study import Study
 
@@ -28,8 +28,7 @@ MAX_POINTS = 5000
 
 
 def _check(study: Study) -> None:
-    if not isinstance(study, Study):
-        raise checks.fail("study", type(study).__name__, "a Study", "ij.monte_carlo returns one.")
+    check_class("study", study, Study, "ij.monte_carlo returns one.")
 
 
 def _verdict(study: Study) -> str:
@@ -123,7 +122,7 @@ def _draw_bands(axes: Axes, data: xarray.Dataset, joint: int, study: Study) -> N
         axes.plot(t, q[middle], color=_style.colour(0), label=f"{100 * levels[middle]:g} %")
     axes.plot(t, data.q_d.values[:, joint], label="reference $q_d$", **_style.reference())
     axes.set_title(joint_labels(study.scenario.plant, study.scenario.n)[joint])
-    axes.set_xlabel(_style.label("time $t$", "s"))
+    _style.time_axis(axes)
     axes.set_ylabel(_style.label("position $q$", "rad"))
 
 

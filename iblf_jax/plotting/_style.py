@@ -291,6 +291,13 @@ def label(words: str, unit: str) -> str:
     return f"{words} [{unit}]"
 
 
+def time_axis(axes: Axes, window: tuple[float, float] | None = None) -> None:
+    """Labels the horizontal axis as time, and limits it to a window if one is given."""
+    axes.set_xlabel(label("time $t$", "s"))
+    if window is not None:
+        axes.set_xlim(*window)
+
+
 PIECES = re.compile(r"\\.|\$[^$]*\$|(?:[^\s._\]$\\]|\.(?=\d))+[\s._\]]*|[\s._\]]+|[$\\]")
 """Pieces between which a label may be broken: escaped characters, formulas, and words with the
 separators that follow them."""
@@ -325,11 +332,13 @@ def set_title(figure: Figure, words: str, curves: Sequence[Curve], *, always: bo
     """
     named: dict[str, list[str]] = {}
     for curve in curves:
-        if always or not curve.ok:
+        if always or not curve.run.ok:
             named.setdefault(curve.status, []).append(curve.name or "status")
     lines = [words, *(f"{', '.join(names)}: {status}" for status, names in named.items())]
-    failed = any(curve.failed for curve in curves)
-    set_heading(figure, lines, color=failure() if failed else text_colour())
+    colour = text_colour()
+    if any(curve.failed for curve in curves):
+        colour = failure()
+    set_heading(figure, lines, color=colour)
 
 
 def set_heading(figure: Figure, lines: Sequence[str], **options: Any) -> None:

@@ -40,13 +40,11 @@ def summary(data: xarray.Dataset, metric: str) -> tuple[xarray.DataArray, str]:
     Raises:
       ValueError: not the Dataset of a sweep, or an unknown metric.
     """
-    if not hasattr(data, "attrs") or "config" not in data.attrs:
-        raise checks.fail(
-            "data",
-            type(data).__name__,
-            "the Dataset of a sweep",
-            "ij.sweep and ij.load_sweep return one.",
-        )
+    import xarray
+
+    if not isinstance(data, xarray.Dataset) or "config" not in data.attrs:
+        remedy = "ij.sweep and ij.load_sweep return one."
+        raise checks.fail("data", type(data).__name__, "the Dataset of a sweep", remedy)
     if metric in SHARES:
         flags, words = SHARES[metric]
         values = ((data.status & flags) != 0).astype(float).where(data.status >= 0)
@@ -54,9 +52,7 @@ def summary(data: xarray.Dataset, metric: str) -> tuple[xarray.DataArray, str]:
             values = values.mean("run")
         return values, words
     if metric not in data.data_vars:
-        raise checks.fail(
-            "metric", metric, "one of " + ", ".join([*SHARES, *map(str, data.data_vars)])
-        )
+        raise checks.fail("metric", metric, f"one of {', '.join([*SHARES, *data.data_vars])}")
     values = data[metric]
     words = metric.replace("_", " ")
     unit = values.attrs.get("units", "1")
@@ -102,10 +98,14 @@ def heat_map(
       ValueError: not the Dataset of a sweep, an unknown metric or dimension, or a dimension that is
         neither an axis nor fixed.
     """
-    metrics = [metric] if isinstance(metric, str) else list(metric)
+    if isinstance(metric, str):
+        metric = [metric]
+    metrics = list(metric)
     if not metrics:
         raise checks.fail("metric", metric, "at least one name")
-    width = _style.WIDTH if len(metrics) == 1 else 5.2 * len(metrics)
+    width = _style.WIDTH
+    if len(metrics) > 1:
+        width = 5.2 * len(metrics)
     figure = _style.new_figure(width, 4.2)
     panels = figure.subplots(1, len(metrics), squeeze=False)[0]
     for axes, name in zip(panels, metrics, strict=True):
@@ -134,12 +134,8 @@ def _draw_heat_map(
     if y is None:
         y = next((d for d in dims if d != x), "")
     if len(dims) != 2 or {x, y} != set(dims):
-        raise checks.fail(
-            "x, y",
-            (x, y),
-            f"two dimensions of {dims}",
-            "Fix the others, heat_map(data, ..., **{'observer.kf': 20.0}).",
-        )
+        remedy = "Fix the others, heat_map(data, ..., **{'observer.kf': 20.0})."
+        raise checks.fail("x, y", (x, y), f"two dimensions of {dims}", remedy)
     picture = values.transpose(y, x).values
     image = axes.imshow(picture, origin="lower", aspect="auto", cmap=_style.colour_map(COLOURS))
     axes.grid(visible=False)
@@ -198,15 +194,13 @@ def parallel(data: xarray.Dataset, metric: str = "margin") -> Figure:
     mapper = matplotlib.cm.ScalarMappable(norm, _style.colour_map(COLOURS))
     for line, y in sorted(zip(scaled, raw[:, -1], strict=True), key=lambda pair: pair[1]):
         axes.plot(np.arange(len(columns)), line, color=mapper.to_rgba(y), linewidth=0.9, alpha=0.8)
-    axes.set_xticks(
-        np.arange(len(columns)), [_style.wrapped(escaped(name), 18) for name in columns]
-    )
+    names = [_style.wrapped(escaped(name), 18) for name in columns]
+    axes.set_xticks(np.arange(len(columns)), names)
     axes.set_yticks([])
+    small: dict[str, Any] = {"ha": "center", "fontsize": _style.size(7.5)}
     for place, (bottom, top) in enumerate(zip(low, high, strict=True)):
-        for value, height, side in ((bottom, -0.02, "top"), (top, 1.02, "bottom")):
-            axes.text(
-                place, height, f"{value:.4g}", ha="center", va=side, fontsize=_style.size(7.5)
-            )
+        axes.text(place, -0.02, f"{bottom:.4g}", va="top", **small)
+        axes.text(place, 1.02, f"{top:.4g}", va="bottom", **small)
     axes.set_ylim(-0.1, 1.1)
     figure.colorbar(mapper, ax=axes, label=words)
     return figure

@@ -52,14 +52,12 @@ def tuning(
     Source: design of this package.
     """
     if landscape is not None and (not isinstance(landscape, tuple | list) or len(landscape) != 2):
-        raise checks.fail(
-            "landscape",
-            landscape,
-            "the names of two tuned numbers",
-            f"They are {', '.join(result.names)}.",
-        )
+        remedy = f"They are {', '.join(result.names)}."
+        raise checks.fail("landscape", landscape, "the names of two tuned numbers", remedy)
     n = result.scenario.n
-    columns = 1 if n <= 3 else 2
+    columns = 1
+    if n > 3:
+        columns = 2
     rows = len(_style.row_sizes(n, columns))
     heights = [1.9, 2.5, 2.0, 1.7 * rows]
     if len(result.names) <= MAX_NAMED:
@@ -82,7 +80,7 @@ def tuning(
         show(axes, curves, QUANTITIES["q"], i, window)
         axes.set_ylabel(_style.label(curves[0].joint_label(i), "rad"))
     for axes in tubes[-1]:
-        axes.set_xlabel(_style.label("time $t$", "s"))
+        _style.time_axis(axes)
     heading = ["Gain tuning"]
     if result.at_limits:
         heading.append("at the end of their range: " + ", ".join(map(escaped, result.at_limits)))
@@ -93,12 +91,11 @@ def tuning(
 
 def _peaks(axes: Axes, curves: list[Curve]) -> None:
     """The largest torque of every joint, before and after."""
-    n = curves[0].run.n
-    many = n > 3
+    n, margin = curves[0].run.n, 0.15
     above: dict[str, Any] = {"xytext": (0, 2), "textcoords": "offset points"}
     above |= {"ha": "center", "va": "bottom", "fontsize": _style.size(6.5)}
-    if many:
-        above["rotation"] = 90
+    if n > 3:
+        margin, above["rotation"] = 0.35, 90
     peaks = []
     for i, curve in enumerate(curves):
         size = np.abs(curve["tau"])
@@ -110,7 +107,7 @@ def _peaks(axes: Axes, curves: list[Curve]) -> None:
         peaks.append(peak)
     if _spans_decades(np.concatenate(peaks)):
         axes.set_yscale("log")
-    axes.margins(y=0.35 if many else 0.15)
+    axes.margins(y=margin)
     _style.name_ticks(axes, [curves[0].joint_label(i) for i in range(n)], 30)
     axes.grid(axis="x", visible=False)
     axes.set_ylabel(_style.label("peak torque", "N m"))
@@ -122,11 +119,10 @@ def _torque(axes: Axes, curves: list[Curve], window: Window) -> None:
     drawn = []
     for i, curve in enumerate(curves):
         drawn.append(draw(axes, curve, "tau", joint, window, **_style.series(i)))
-    axes.set_xlim(*window)
     set_limits(axes, curves, drawn, [], spikes=True)
     annotate_clipped_peak(axes, curves, drawn, "N m")
     axes.set_ylabel(_style.label(f"torque of {curves[0].joint_label(joint)}", "N m"))
-    axes.set_xlabel(_style.label("time $t$", "s"))
+    _style.time_axis(axes, window)
 
 
 def _spans_decades(x: np.ndarray) -> bool:
@@ -271,15 +267,13 @@ def paths(
 
 def _two_gains(result: TuneResult, gains: Any) -> tuple[str, str]:
     """The names of two tuned numbers; by default the first two."""
-    names = result.names[:2] if gains is None else gains
-    if (
-        not isinstance(names, tuple | list)
-        or len(names) != 2
-        or not all(name in result.names for name in names)
-    ):
-        raise checks.fail(
-            "gains", gains, "the names of two tuned numbers", f"They are {', '.join(result.names)}."
-        )
+    names = gains
+    if gains is None:
+        names = result.names[:2]
+    are_two = isinstance(names, tuple | list) and len(names) == 2
+    if not are_two or not all(name in result.names for name in names):
+        remedy = f"They are {', '.join(result.names)}."
+        raise checks.fail("gains", gains, "the names of two tuned numbers", remedy)
     return names[0], names[1]
 
 

@@ -44,11 +44,8 @@ def skeletons(robot: Any, q: np.ndarray) -> np.ndarray:
     """
     found = np.asarray(jax.jit(jax.vmap(robot.skeleton))(q))
     if found.shape[1:] not in ((q.shape[1] + 1, 2), (q.shape[1] + 1, 3)):
-        raise checks.fail(
-            "plant.skeleton(q)",
-            found.shape[1:],
-            "n + 1 points in the plane or in space, the same for all runs",
-        )
+        expected = "n + 1 points in the plane or in space, the same for all runs"
+        raise checks.fail("plant.skeleton(q)", found.shape[1:], expected)
     return found
 
 
@@ -67,9 +64,8 @@ def set_limits(axes: Any, points: np.ndarray, regions: Sequence[Region]) -> np.n
     points = points[np.isfinite(points).all(axis=1)]
     for region in regions:
         if isinstance(region, Sphere) and region.keep == "outside":
-            points = np.concatenate(
-                [points, region.centre + region.radius * np.array([[1.0], [-1.0]])]
-            )
+            ends = region.centre + region.radius * np.array([[1.0], [-1.0]])
+            points = np.concatenate([points, ends])
     low, high = points.min(axis=0), points.max(axis=0)
     size = max(float(np.max(high - low)), 1e-3)
     is_plane = len(low) == 2
@@ -200,9 +196,8 @@ def draw_paths(figure: Figure, where: SubplotSpec, curves: Sequence[Curve]) -> A
     desired = skeletons(robot, first.at("q_d", _times(first)))
     d = desired.shape[-1]
     if any(x.shape[-1] != d for x in actual):
-        raise checks.fail(
-            "runs", "arms in the plane and in space", "arms of one kind", "Draw them one by one."
-        )
+        came = "arms in the plane and in space"
+        raise checks.fail("runs", came, "arms of one kind", "Draw them one by one.")
     axes: Any = figure.add_subplot(where, projection="3d" if d == 3 else None)
     points = np.concatenate([x.reshape(-1, d) for x in (desired, *actual)])
     limits = set_limits(axes, points, regions)

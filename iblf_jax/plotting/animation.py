@@ -84,12 +84,9 @@ def frame_times(end: float, fps: float, speed: float | None = None) -> np.ndarra
     speed = checks.positive_number("speed", speed, "1")
     frames = end / speed * fps
     if not frames <= MAX_FRAMES:
-        raise checks.fail(
-            "speed",
-            speed,
-            f"a speed at which the animation has at most {MAX_FRAMES} frames",
-            f"It would have {frames:.3g}; raise the speed or lower fps.",
-        )
+        expected = f"a speed at which the animation has at most {MAX_FRAMES} frames"
+        remedy = f"It would have {frames:.3g}; raise the speed or lower fps."
+        raise checks.fail("speed", speed, expected, remedy)
     return np.linspace(0.0, end, max(2, round(frames) + 1))
 
 

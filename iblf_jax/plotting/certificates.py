@@ -14,7 +14,7 @@ from iblf_jax.certificates import Certificate, Traces
 from iblf_jax.certificates.lines import Line
 from iblf_jax.core import checks
 from iblf_jax.plotting import _style
-from iblf_jax.plotting._curves import escaped, thinned
+from iblf_jax.plotting._curves import check_class, escaped, thinned
 
 WIDTH = 10.0
 HEIGHT = 5.4
@@ -43,10 +43,7 @@ def certificate(
     Raises:
       ValueError: not a Certificate, or `until` before the first samples.
     """
-    if not isinstance(shown, Certificate):
-        raise checks.fail(
-            "shown", type(shown).__name__, "a Certificate", "Draw what ij.certify returned."
-        )
+    check_class("shown", shown, Certificate, "Draw what ij.certify returned.")
     traces = _until(shown.traces, until)
     subject, V = "Theorem 2", Bounded("Lyapunov function", "$V_2$", "1")
     if shown.is_of_own_claim:
@@ -62,12 +59,19 @@ def certificate(
     _draw_bounded(panels[1, 1], traces.t, traces.f_tilde, traces.f_tilde_bound, f_tilde)
     _verdicts(panels[1, 2], shown)
     _mark_excluded(panels.flat[:5], traces)
-    heading = f"{subject} along the run" if title is None else title
+    if title is None:
+        title = f"{subject} along the run"
     if shown.worst_run is not None:
-        heading += f", worst run {shown.worst_run}"
-    colour = _style.failure() if shown.verdict == "fails" else _style.text_colour()
-    _style.set_heading(figure, [f"{heading}: {shown.verdict}", shown.heading], color=colour)
+        title += f", worst run {shown.worst_run}"
+    lines = [f"{title}: {shown.verdict}", shown.heading]
+    _style.set_heading(figure, lines, color=_verdict_colour(shown.verdict))
     return figure
+
+
+def _verdict_colour(verdict: str) -> str:
+    if verdict == "fails":
+        return _style.failure()
+    return _style.text_colour()
 
 
 class Bounded(NamedTuple):
@@ -84,9 +88,8 @@ def _until(traces: Traces, until: float | None) -> Traces:
         return traces
     keep = traces.t <= checks.positive_number("until", until, "s")
     if np.sum(keep) < 2:
-        raise checks.fail(
-            "until", until, f"a time after the second sample, {float(traces.t[1]):g} s"
-        )
+        expected = f"a time after the second sample, {float(traces.t[1]):g} s"
+        raise checks.fail("until", until, expected)
     return Traces(*(x[keep] for x in traces))
 
 
@@ -95,8 +98,7 @@ def _bound_style() -> dict[str, Any]:
 
 
 def _set_axes(axes: Axes, t: np.ndarray, words: str, unit: str) -> None:
-    axes.set_xlim(float(t[0]), float(t[-1]))
-    axes.set_xlabel(_style.label("time $t$", "s"))
+    _style.time_axis(axes, (float(t[0]), float(t[-1])))
     axes.set_ylabel(_style.label(words, unit))
 
 
@@ -185,7 +187,7 @@ def _verdicts(axes: Axes, shown: Certificate) -> None:
     columns = (0.0, 0.41, 0.56, 0.69)
     for row, line in enumerate(lines):
         height = 1.0 - (row + 0.5) / max(len(lines), 12)
-        colour = _style.failure() if line.verdict == "fails" else _style.text_colour()
+        colour = _verdict_colour(line.verdict)
         cells = (line.name, line.equation, line.verdict, _margin(line))
         for x, text in zip(columns, cells, strict=True):
             axes.text(x, height, text, color=colour, fontsize=7 * growth, **look)

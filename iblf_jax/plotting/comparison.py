@@ -14,9 +14,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from iblf_jax.core import checks
 from iblf_jax.plotting import _style
-from iblf_jax.plotting._curves import Curve, check_joint, curves_of, thinned
+from iblf_jax.plotting._curves import Curve, check_class, check_joint, curves_of, thinned
 from iblf_jax.plotting._figures import PanelRow, windows
 from iblf_jax.plotting._panels import QUANTITIES, Window, draw, set_limits
 from iblf_jax.simulation.metrics import Settling
@@ -48,10 +47,7 @@ def comparison(result: Comparison, joint: int = 0, *, zoom: float | None = None)
     Raises:
       ValueError: not a Comparison, no such joint, or a zoom that is not a positive number.
     """
-    if not isinstance(result, Comparison):
-        raise checks.fail(
-            "result", type(result).__name__, "a Comparison", "Draw what ij.compare returns."
-        )
+    check_class("result", result, Comparison, "Draw what ij.compare returns.")
     given = curves_of(result.rollouts)
     joint = check_joint(given, joint)
     error = PanelRow(QUANTITIES["e1"], joint, QUANTITIES["e1"].label)
@@ -97,17 +93,15 @@ def _errors(axes: Axes, curves: list[Curve], order: list[str], joint: int, windo
         start = max(start, size[0])
     tolerance = float(Settling().tolerance)
     axes.axhline(tolerance, color=_style.bound(), linewidth=0.8, zorder=1, label="settled")
-    axes.set_xlim(*window)
     axes.set_ylim(SMALLEST, 3.0 * max(start, 10.0 * SMALLEST))
-    axes.set_xlabel(_style.label("time $t$", "s"))
+    _style.time_axis(axes, window)
 
 
 def _torques(axes: Axes, curves: list[Curve], order: list[str], joint: int, window: Window) -> None:
     drawn = []
     for curve in curves:
         drawn.append(draw(axes, curve, "tau", joint, window, **_law_style(curve, order)))
-    axes.set_xlim(*window)
-    axes.set_xlabel(_style.label("time $t$", "s"))
+    _style.time_axis(axes, window)
     set_limits(axes, curves, drawn, [])
 
 

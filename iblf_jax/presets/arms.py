@@ -44,7 +44,7 @@ from iblf_jax.control.controllers._base import law_member
 from iblf_jax.control.controllers.systems import observer_of
 from iblf_jax.control.observers import Momentum, Printed
 from iblf_jax.core import checks
-from iblf_jax.core.cache import keep_programs
+from iblf_jax.core.disk_cache import keep_programs
 from iblf_jax.simulation.scenario import Initial, Scenario, fit_joints
 from iblf_jax.world import disturbances, references
 from iblf_jax.world.bounds import Bounds, from_limits, tube_at

@@ -28,13 +28,15 @@ import jax.numpy as jnp
 from iblf_jax.control.actuators import Ideal
 from iblf_jax.control.actuators._base import unlimited
 from iblf_jax.control.controllers import Command
+from iblf_jax.control.controllers._base import law_member
+from iblf_jax.control.observers._base import observer_member
 from iblf_jax.control.sensors import Measurement
 from iblf_jax.control.sensors._base import unrounded
 from iblf_jax.core.linalg import inner, matvec, solve_spd
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.time import as_at
-from iblf_jax.simulation.optional import optional_member
-from iblf_jax.simulation.sampling import Instant, normals
+from iblf_jax.simulation.noise import normals
+from iblf_jax.simulation.sampling import Instant
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import Sample
 from iblf_jax.world.regions import margins
@@ -248,7 +250,7 @@ def sample_at(
     M0, G0 = model.mass_matrix(q), model.gravity(q)
     f = matvec(M0, ddq) + model.coriolis(q, dq, dq) + G0 - tau
     e2, f_tilde = dq - signals.alpha, f - signals.f_hat
-    if optional_member(unwrapped(scenario.controller), "includes_e2"):
+    if law_member(unwrapped(scenario.controller), "includes_e2"):
         V = jnp.sum(signals.V1) + 0.5 * inner(f_tilde, f_tilde)
     else:
         V = jnp.sum(signals.V1) + 0.5 * (inner(e2, matvec(M0, e2)) + inner(f_tilde, f_tilde))
@@ -307,7 +309,7 @@ def discrete_observer(scenario: Scenario) -> Any:
     sampling, observer = scenario.sampling, scenario.observer
     if sampling is None or sampling.observer != "poles":
         return observer
-    at_period = optional_member(observer, "at_period")
+    at_period = observer_member(observer, "at_period")
     if at_period is None:
         return observer
     return at_period(sampling.period)
@@ -340,7 +342,7 @@ def law_update(
 
 def _next_observer_state(sampling: Any, observer: Any, arguments: tuple) -> Any:
     """The observer's state one period later; `arguments` are those of `Observer.derivative`."""
-    advance = optional_member(observer, "advance")
+    advance = observer_member(observer, "advance")
     if sampling.observer == "exact" and advance is not None:
         return advance(*arguments, sampling.period)
     return _euler(arguments[-1], observer.derivative(*arguments), sampling.period)

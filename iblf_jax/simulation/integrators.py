@@ -3,8 +3,8 @@
 The time step is fixed, because the loop is sampled in practice, gradients are then exact, and the
 runs of a batch stay in step. The integrated function may return other values besides the rate (the
 closed loop returns a sample to record); a step passes on those of its start. A new method is a new
-row of TABLEAUS; `accuracy` estimates its local error as that of a method of two stages, unless its
-row has `halfway`.
+row of TABLEAUS. `error_estimate` knows the local error by stages of Euler's method, of methods of
+two stages and of rk4; a row of another kind needs a formula there.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Tableau(NamedTuple):
     stability: float
     """|dt * mode| up to which the method is stable, on the negative real axis."""
     differences: tuple[float, ...]
-    """Weights of the last rates, oldest first, in the estimate of a step's error (`accuracy`)."""
+    """Weights of the last rates, oldest first, in `error_estimate`."""
     halfway: int = 0
     """Index of the stage in the middle of a step that enters `differences`; 0 if there is none."""
 

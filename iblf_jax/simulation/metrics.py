@@ -1,8 +1,8 @@
 """Metrics of a run; each is a fold over its samples.
 
-A fold has `init(sample)`, `update(acc, sample)` and `finish(acc)`. It receives every step, whatever
-the run records, so the same definition serves one recorded run, a million runs that store no
-trajectory, and a tuning loss.
+A metric is a `Fold`: an object that has `init(sample)`, `update(acc, sample)` and `finish(acc)`.
+It receives every step, whatever the run records, so the same definition serves one recorded run, a
+million runs that store no trajectory, and a tuning loss.
 
 Integrals are sums by the trapezoidal rule, of second order in the step,
 
@@ -19,15 +19,17 @@ A fold is a component: its thresholds are leaves. Its `units` name the results o
 from __future__ import annotations
 
 from collections.abc import Sequence
+from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 
+from iblf_jax.control.controllers._base import law_member
 from iblf_jax.core import checks
+from iblf_jax.core.optional import OptionalMembers
 from iblf_jax.core.pytree import Leaf, component, layers, leaf
-from iblf_jax.simulation.accuracy import UNITS
-from iblf_jax.simulation.optional import optional_member
+from iblf_jax.simulation.error_estimate import UNITS
 from iblf_jax.simulation.scenario import Scenario, fit_joints
 from iblf_jax.simulation.signals import Sample as Sample
 from iblf_jax.simulation.signals import speed_margin
@@ -56,6 +58,10 @@ class Fold(Protocol):
     def finish(self, acc: Any) -> dict[str, jax.Array]:
         """The named results."""
         ...
+
+
+fold_member = OptionalMembers(needs=None, units=MappingProxyType({}))
+"""Reads what a metric may lack."""
 
 
 def _root_mean_square(integral: jax.Array, time: jax.Array) -> jax.Array:
@@ -447,21 +453,12 @@ class Estimation:
 
 
 OF_SCENARIO = {
-    "dq_lower": (
-        "velocity_bounds",
-        "Such as velocity_bounds=Bounds(lower=Constant(-1.0), upper=Constant(1.0)).",
-    ),
-    "region_margin": (
-        "regions",
-        "Such as regions=(ij.regions.HalfSpace(normal=[0, 1], offset=0.1),).",
-    ),
-    "slack": ("a law with a filter", "Such as ij.controllers.SafetyFilter(law)."),
-    "region_slack": (
-        "regions and a law with a filter",
-        "Such as ij.controllers.SafetyFilter(law), and regions=(...).",
-    ),
+    "dq_lower": "velocity_bounds, such as Bounds(lower=Constant(-1.0), upper=Constant(1.0))",
+    "region_margin": "regions, such as (ij.regions.HalfSpace(normal=[0, 1], offset=0.1),)",
+    "slack": "a law with a filter, such as ij.controllers.SafetyFilter(law)",
+    "region_slack": "regions and a law with a filter, such as ij.controllers.SafetyFilter(law)",
 }
-"""Optional signal -> the part of a scenario that it needs, and an example."""
+"""Optional signal -> the part of a scenario that it needs, with an example."""
 
 
 def has_signal(scenario: Scenario, signal: str) -> bool:
@@ -471,7 +468,7 @@ def has_signal(scenario: Scenario, signal: str) -> bool:
     has_regions = len(scenario.regions) > 0
     if signal == "region_margin":
         return has_regions
-    has_filter = any(optional_member(law, "filters") for law in layers(scenario.controller))
+    has_filter = any(law_member(law, "filters") for law in layers(scenario.controller))
     return has_filter and (signal == "slack" or has_regions)
 
 
@@ -479,14 +476,13 @@ def check_needs(field: str, fold: Any, scenario: Scenario) -> None:
     """Raises ValueError for a fold, or a quantity of a tuning, that reads a signal which runs of
     the scenario do not have.
     """
-    needs = optional_member(fold, "needs")
+    needs = fold_member(fold, "needs")
     if needs is None:
         return
     checks.one_of(f"{field}.needs", needs, OF_SCENARIO)
     if not has_signal(scenario, needs):
-        part, remedy = OF_SCENARIO[needs]
         got = f"{checks.with_article(type(fold).__name__)} that reads {needs}"
-        raise checks.fail(field, got, f"a scenario with {part}", remedy)
+        raise checks.fail(field, got, f"a scenario with {OF_SCENARIO[needs]}")
 
 
 def as_folds(
@@ -511,10 +507,9 @@ def as_folds(
             folds += watched(scenario)
         return tuple(_in_type("metrics", fold, dtype) for fold in folds)
     if not isinstance(metrics, tuple | list):
-        raise checks.fail(
-            "metrics", metrics, "a tuple of folds", "Put one fold into brackets, metrics=(fold,)."
-        )
-    owner: dict[str, str] = dict.fromkeys((name for name, _ in UNITS), "every run")
+        remedy = "Put one fold into brackets, metrics=(fold,)."
+        raise checks.fail("metrics", metrics, "a tuple of folds", remedy)
+    owner: dict[str, str] = {name: "every run" for name, _ in UNITS}
     for i, fold in enumerate(metrics):
         field = f"metrics[{i}]"
         checks.conforms(field, fold, Fold, "iblf_jax.metrics has them.")
@@ -525,11 +520,8 @@ def as_folds(
         for name, unit in units.items():
             checks.word(f"{field}.units[{name!r}]", unit, "a unit in words")
             if name in owner:
-                expected, remedy = (
-                    "names that no other fold returns",
-                    f"{owner[name]} returns {name!r} too.",
-                )
-                raise checks.fail(field, fold, expected, remedy)
+                remedy = f"{owner[name]} returns {name!r} too."
+                raise checks.fail(field, fold, "names that no other fold returns", remedy)
             owner[name] = field
     return tuple(_in_type(f"metrics[{i}]", fold, dtype) for i, fold in enumerate(metrics))
 
@@ -539,14 +531,13 @@ def _in_type(name: str, fold: Fold, dtype: jax.typing.DTypeLike) -> Fold:
     try:
         return jax.tree.map(lambda x: jnp.asarray(x, dtype), fold)
     except Exception as error:
-        raise checks.fail(
-            name, fold, "a fold whose fields are numbers", "Other things belong in a static field."
-        ) from error
+        remedy = "Other things belong in a static field."
+        raise checks.fail(name, fold, "a fold whose fields are numbers", remedy) from error
 
 
 def metric_units(folds: Sequence[Fold]) -> tuple[tuple[str, str], ...]:
     """Name and unit of every result of a run with some folds: theirs, and those of its accuracy."""
-    of_folds = [optional_member(fold, "units") for fold in folds]
+    of_folds = [fold_member(fold, "units") for fold in folds]
     return tuple(pair for units in of_folds for pair in units.items()) + UNITS
 
 

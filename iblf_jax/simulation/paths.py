@@ -17,7 +17,6 @@ Sweeps, perturbations, tuning and scenario files address leaves by these paths.
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import json
 import re
 from collections.abc import Iterator, Mapping
@@ -28,9 +27,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks, notices, tables
-from iblf_jax.core.pytree import field_values
-from iblf_jax.simulation.optional import optional_member
-from iblf_jax.simulation.scenario import NUMBERS, Scenario, canonical
+from iblf_jax.core.pytree import component_member, field_values, wrapped_field
+from iblf_jax.simulation.scenario import MAKE_ONE, NUMBERS, Scenario, canonical
 
 _BARE = r"[^\[\]]*[^\W\d_][^\[\]]*"
 """The name of a row that needs no quotes."""
@@ -92,9 +90,7 @@ def parameters(scenario: Scenario, *, named: bool = True) -> ParameterTable:
 def _check_component(scenario: Any) -> None:
     """Raises ValueError for something that has no fields."""
     if not _is_component(scenario):
-        raise checks.fail(
-            "scenario", scenario, "a Scenario", "Make one with ij.presets or ij.Scenario."
-        )
+        raise checks.fail("scenario", scenario, "a Scenario", MAKE_ONE)
 
 
 def _is_component(part: Any) -> bool:
@@ -117,14 +113,14 @@ def _walk(
         return
     if not _is_component(part):
         return
-    leaf_units = {**_own_units(part), **units}
+    leaf_units = {**component_member(part, "leaf_units")(), **units}
     values = field_values(part)
     for field in dataclasses.fields(part):
         if field.metadata.get("static"):
             continue
         value = values[field.name]
         name = _joined(path, field.name)
-        if field.name == _wrapped_field(part):
+        if field.name == wrapped_field(part):
             yield from _walk_wrapped(part, value, path, name, named)
         elif isinstance(value, NUMBERS):
             yield Parameter(name, jnp.shape(value), _unit(field, leaf_units), value)
@@ -147,27 +143,16 @@ def _walk_wrapped(
         yield parameter
 
 
-def _wrapped_field(part: Any) -> str | None:
-    """The field of a component that holds a wrapped one, or None."""
-    return optional_member(type(part), "wraps")
-
-
 def _unit(field: dataclasses.Field, units: Mapping[str, str]) -> str:
     """The unit of a leaf: that of `units`, if it is there, else its own."""
     return str(units.get(field.name, field.metadata.get("unit", "")))
-
-
-def _own_units(part: Any) -> Mapping[str, str]:
-    """Units of a component's leaves that depend on its other fields, by name."""
-    leaf_units = optional_member(part, "leaf_units")
-    return {} if leaf_units is None else leaf_units()
 
 
 def _named_rows(part: Any, path: str) -> Iterator[Parameter]:
     """The rows of leaves that have names."""
     units = {field.name: field.metadata.get("unit", "") for field in dataclasses.fields(part)}
     values = field_values(part)
-    for kind, (names, fields) in optional_member(type(part), "rows").items():
+    for kind, (names, fields) in component_member(type(part), "rows").items():
         for i, name in enumerate(values[names]):
             for field in fields:
                 value = values[field]
@@ -181,14 +166,6 @@ def _quoted(name: str) -> str:
     """The name of a row as it is written in a path."""
     needs_no_quotes = re.fullmatch(_BARE, name) and name.isprintable() and not name.startswith('"')
     return name if needs_no_quotes else json.dumps(name)
-
-
-def _unquoted(text: str) -> str | None:
-    """The name in a JSON string; None if it is not valid."""
-    try:
-        return json.loads(text)
-    except ValueError:
-        return None
 
 
 def parse(path: str) -> list[str | int]:
@@ -205,9 +182,8 @@ def parse(path: str) -> list[str | int]:
         tokens.append(token)
         position = match.end()
     if not isinstance(path, str) or not path or position < len(path):
-        raise checks.fail(
-            "path", path, 'names joined by dots, with [i] for an entry, such as "plant.mass[1]"'
-        )
+        expected = 'names joined by dots, with [i] for an entry, such as "plant.mass[1]"'
+        raise checks.fail("path", path, expected)
     return tokens
 
 
@@ -218,10 +194,12 @@ def _token(match: re.Match) -> str | int | None:
         return field
     if index is not None:
         return int(index)
-    name = bare
-    if quoted is not None:
-        name = _unquoted(quoted)
-    return None if name is None else RowName(name)
+    if bare is not None:
+        return RowName(bare)
+    try:
+        return RowName(json.loads(quoted))
+    except ValueError:
+        return None
 
 
 def expand(path: str) -> list[str]:
@@ -237,10 +215,7 @@ def expand(path: str) -> list[str]:
 def _unknown(scenario: Scenario, path: str) -> ValueError:
     """The error about a path that leads to no leaf."""
     known = [p.path for p in parameters(scenario)]
-    close = difflib.get_close_matches(path, known, n=3)
-    remedy = "ij.parameters(scenario) lists them."
-    if close:
-        remedy = f"Did you mean {', '.join(close)}?"
+    remedy = checks.nearest(path, known) or "ij.parameters(scenario) lists them."
     return checks.fail("path", path, "the path of a leaf of this scenario", remedy)
 
 
@@ -294,7 +269,10 @@ def _metadata(scenario: Scenario, path: str) -> Mapping[str, Any]:
                 part = part[token]
         else:
             field = next(f for f in dataclasses.fields(part) if f.name == token)
-            metadata = {**field.metadata, "unit": _unit(field, {**_own_units(part), **units})}
+            metadata = {
+                **field.metadata,
+                "unit": _unit(field, {**component_member(part, "leaf_units")(), **units}),
+            }
             units |= field.metadata.get("units", {})
             part = field_values(part)[token]
     return metadata
@@ -335,7 +313,7 @@ def _steps(part: Any, tokens: list[str | int]) -> tuple[list[str | int], list[st
         raise KeyError(token)
     if _has_field(part, token):
         return [token], tokens[1:]
-    rows = optional_member(type(part), "rows")
+    rows = component_member(type(part), "rows")
     if token in rows:
         names, fields = rows[token]
         row, field = tokens[1:3]
@@ -343,7 +321,7 @@ def _steps(part: Any, tokens: list[str | int]) -> tuple[list[str | int], list[st
             raise KeyError(field)
         index = row if isinstance(row, int) else field_values(part)[names].index(row)
         return [field, index], tokens[3:]
-    wrapped = _wrapped_field(part)
+    wrapped = wrapped_field(part)
     if wrapped:
         return [wrapped], tokens
     return [token], tokens[1:]
@@ -354,28 +332,18 @@ def _has_field(part: Any, name: str) -> bool:
 
 
 def _member(part: Any, step: str | int) -> Any:
-    """The entry or field of a part."""
-    return _entry(part, step) if isinstance(step, int) else _field(part, step)
-
-
-def _entry(part: Any, index: int) -> Any:
-    """Part or entry `index`; IndexError beyond the ends, where JAX would take the nearest entry."""
+    """The non-static field or the entry of a part.  An error if there is none: JAX would take the
+    nearest entry.
+    """
+    if isinstance(step, str):
+        if step not in [f.name for f in dataclasses.fields(part) if not f.metadata.get("static")]:
+            raise AttributeError(step)
+        return field_values(part)[step]
     if not isinstance(part, tuple | list | jax.Array | np.ndarray):
         raise TypeError(part)
-    size = len(part)
-    if not -size <= index < size:
-        raise IndexError(index)
-    return part[index]
-
-
-def _field(part: Any, name: str) -> Any:
-    """A non-static field of a component, by name."""
-    if not dataclasses.is_dataclass(part):
-        raise AttributeError(name)
-    for field in dataclasses.fields(part):
-        if field.name == name and not field.metadata.get("static"):
-            return field_values(part)[name]
-    raise AttributeError(name)
+    if not -len(part) <= step < len(part):
+        raise IndexError(step)
+    return part[step]
 
 
 def _replaced(part: Any, tokens: list[str | int], value: Any, path: str, sign: str | None) -> Any:
@@ -430,9 +398,8 @@ def with_parameters(scenario: Scenario, values: Mapping[str, Any]) -> Scenario:
     """
     _check_component(scenario)
     if not isinstance(values, Mapping):
-        raise checks.fail(
-            "values", values, 'a mapping from path to value, such as {"controller.K2": 30.0}'
-        )
+        expected = 'a mapping from path to value, such as {"controller.K2": 30.0}'
+        raise checks.fail("values", values, expected)
     for path, value in values.items():
         for full in expand(path):
             scenario = _replaced(scenario, _resolved(scenario, path, full)[0], value, full, None)

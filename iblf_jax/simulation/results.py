@@ -16,7 +16,7 @@ import numpy as np
 from iblf_jax.core import checks
 from iblf_jax.core.presentation import present
 from iblf_jax.core.status import Status, describe
-from iblf_jax.simulation.accuracy import RELATIVE
+from iblf_jax.simulation.error_estimate import RELATIVE
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import Signals
 
@@ -93,7 +93,7 @@ class Rollout(Signals):
     metrics: Metrics
     """Results of the folds; and `numerical_error`, (n,) [rad], and `relative_numerical_error`, ()
     [1]: the estimated error of the positions that the time step causes, absolute and relative to
-    the width of the tube (`accuracy`)."""
+    the width of the tube (`error_estimate`)."""
     status: jax.Array
     """Bit flags of `Status`, () int32; 0 is ok."""
     fastest_mode: jax.Array

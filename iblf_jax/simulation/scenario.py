@@ -9,6 +9,9 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import math
+from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -18,11 +21,14 @@ import numpy as np
 from iblf_jax.control.actuators import Actuator
 from iblf_jax.control.actuators import Ideal as IdealActuator
 from iblf_jax.control.controllers import Controller, LawContext
+from iblf_jax.control.controllers._base import law_member
 from iblf_jax.control.observers import NoObserver, Observer
+from iblf_jax.control.observers._base import observer_member
 from iblf_jax.control.sensors import Ideal as IdealSensor
 from iblf_jax.control.sensors import Sensor
+from iblf_jax.control.sensors._base import sensor_member
 from iblf_jax.core import checks, notices
-from iblf_jax.core.cache import keep_programs
+from iblf_jax.core.disk_cache import keep_programs
 from iblf_jax.core.presentation import present
 from iblf_jax.core.pytree import (
     Leaf,
@@ -36,10 +42,9 @@ from iblf_jax.core.pytree import (
 )
 from iblf_jax.core.status import VELOCITY_LIMIT
 from iblf_jax.core.time import joined, jump_times_of
-from iblf_jax.simulation.optional import optional_member
-from iblf_jax.simulation.sampling import Sampling, with_sufficient_queue
+from iblf_jax.simulation.sampling import PERIOD_TOLERANCE, Sampling
 from iblf_jax.world import regions
-from iblf_jax.world.bounds import Bounds, speed_limits_at, tube_at
+from iblf_jax.world.bounds import Bounds, speed_limits_at
 from iblf_jax.world.disturbances import Disturbance, Nothing
 from iblf_jax.world.references import Reference
 from iblf_jax.world.robots import Robot
@@ -59,24 +64,25 @@ class Initial:
     dq: Leaf = leaf("rad/s", default=0.0)
 
 
-PARTS = (
-    ("plant", Robot, "iblf_jax.robots has them; write your own with from_energy.", ("skeleton",)),
-    ("model", Robot, "iblf_jax.robots has them; write your own with from_energy.", ("skeleton",)),
-    ("reference", Reference, "iblf_jax.references has them.", ()),
-    (
-        "controller",
+ROBOTS = "iblf_jax.robots has them; write your own with from_energy."
+PROTOCOLS = {
+    "plant": (Robot, ROBOTS),
+    "model": (Robot, ROBOTS),
+    "reference": (Reference, "iblf_jax.references has them."),
+    "controller": (
         Controller,
         "iblf_jax.controllers has them; iblf_jax.testing.check_law looks at your own.",
-        (),
     ),
-    ("observer", Observer, "iblf_jax.observers has them; NoObserver() for none.", ()),
-    ("disturbance", Disturbance, "iblf_jax.disturbances has them; Nothing() for none.", ()),
-    ("sensor", Sensor, "iblf_jax.sensors has them; Ideal() for none.", ()),
-    ("actuator", Actuator, "iblf_jax.actuators has them; Ideal() for none.", ()),
-)
-"""Field, protocol, remedy and members that may be missing, for each part of a scenario that a user
-may write."""
+    "observer": (Observer, "iblf_jax.observers has them; NoObserver() for none."),
+    "disturbance": (Disturbance, "iblf_jax.disturbances has them; Nothing() for none."),
+    "sensor": (Sensor, "iblf_jax.sensors has them; Ideal() for none."),
+    "actuator": (Actuator, "iblf_jax.actuators has them; Ideal() for none."),
+}
+"""Protocol and remedy for each part of a scenario that a user may write."""
+OPTIONAL_MEMBERS = ("skeleton",)
+"""Members of these protocols that a part may lack."""
 
+MAKE_ONE = "Make one with ij.presets or ij.Scenario."
 OF_VELOCITY = {
     "units": dict.fromkeys(("value", "offset", "amplitude", "initial", "final"), "rad/s")
 }
@@ -137,53 +143,53 @@ class Scenario:
         if self.model is None:
             object.__setattr__(self, "model", self.plant)
         parts = field_values(self)
-        for name, protocol, remedy, optional in PARTS:
-            checks.conforms(f"Scenario.{name}", parts[name], protocol, remedy, optional)
-        self._check_kinds()
-        if self.model.n != self.plant.n:
-            got, expected = f"{self.model.n} joints", f"{self.plant.n} joints, as the plant has"
-            raise checks.fail("Scenario.model", got, expected)
-        self._check_velocity_bounds()
-        self._check_sampling()
+        for name, (protocol, remedy) in PROTOCOLS.items():
+            checks.conforms(f"Scenario.{name}", parts[name], protocol, remedy, OPTIONAL_MEMBERS)
+        self._check_classes()
+        self._check_combination()
         self._check_regions()
         for name, part in field_values(self).items():
             object.__setattr__(self, name, fit_joints(part, self.plant.n, name))
 
-    def _check_kinds(self) -> None:
+    def _check_classes(self) -> None:
         """Raises ValueError for a part of the wrong class."""
-        of_speeds = "Such as Bounds(lower=Constant(-1.0), upper=Constant(1.0)), in rad/s."
-        kinds: tuple[tuple[str, Any, str, str], ...] = (
-            ("initial", Initial, "an Initial", "Such as Initial(q=[0.8, 0.8])."),
-            (
-                "bounds",
+        classes: dict[str, tuple[Any, Any, str]] = {
+            "initial": (self.initial, Initial, "an Initial, such as Initial(q=[0.8, 0.8])"),
+            "bounds": (
+                self.bounds,
                 Bounds,
-                "a Bounds",
-                "Such as Bounds(lower=Constant(0.1), upper=Constant(0.9)).",
+                "a Bounds, such as Bounds(lower=Constant(0.1), upper=Constant(0.9))",
             ),
-            ("velocity_bounds", Bounds | None, "a Bounds, or None", of_speeds),
-            (
-                "sampling",
+            "velocity_bounds": (
+                self.velocity_bounds,
+                Bounds | None,
+                "a Bounds, or None, such as Bounds(lower=Constant(-1.0), upper=Constant(1.0))",
+            ),
+            "sampling": (
+                self.sampling,
                 Sampling | None,
-                "a Sampling, or None",
-                "Such as ij.Sampling(period=2e-3).",
+                "a Sampling, or None, such as ij.Sampling(period=2e-3)",
             ),
-        )
-        parts = field_values(self)
-        for name, kind, expected, remedy in kinds:
-            value = parts[name]
+            "regions": (
+                self.regions,
+                tuple | list,
+                "a tuple of regions, such as (ij.regions.HalfSpace(normal=[0, 1], offset=0.1),)",
+            ),
+        }
+        for name, (value, kind, expected) in classes.items():
             if not isinstance(value, kind):
-                raise checks.fail(f"Scenario.{name}", value, expected, remedy)
+                raise checks.fail(f"Scenario.{name}", value, expected)
 
-    def _check_velocity_bounds(self) -> None:
-        """Raises ValueError for a law that needs velocity bounds in a scenario without them."""
+    def _check_combination(self) -> None:
+        """Raises ValueError for parts that do not fit together."""
+        if self.model.n != self.plant.n:
+            got, expected = f"{self.model.n} joints", f"{self.plant.n} joints, as the plant has"
+            raise checks.fail("Scenario.model", got, expected)
         law = unwrapped(self.controller)
-        if self.velocity_bounds is None and optional_member(law, "needs_velocity_bounds"):
+        if self.velocity_bounds is None and law_member(law, "needs_velocity_bounds"):
             expected = f"the bounds that {type(law).__name__} keeps"
             remedy = "Such as velocity_bounds=Bounds(lower=Constant(-1.0), upper=Constant(1.0))."
             raise checks.fail("Scenario.velocity_bounds", None, expected, remedy)
-
-    def _check_sampling(self) -> None:
-        """Raises ValueError for a sensor in a scenario without a sampling."""
         if self.sampling is None and not isinstance(self.sensor, IdealSensor):
             got, expected = type(self.sensor).__name__, "an Ideal sensor where no law is sampled"
             remedy = "Add sampling=ij.Sampling(period=...): a sensor is read once a period."
@@ -193,9 +199,6 @@ class Scenario:
         """Makes a tuple of the regions; raises ValueError for one that is no region, or does not
         fit plant and model.
         """
-        if not isinstance(self.regions, tuple | list):
-            remedy = "Such as (ij.regions.HalfSpace(normal=[0, 1], offset=0.1),)."
-            raise checks.fail("Scenario.regions", self.regions, "a tuple of regions", remedy)
         object.__setattr__(self, "regions", tuple(self.regions))
         for i, region in enumerate(self.regions):
             name = f"Scenario.regions[{i}]"
@@ -215,13 +218,13 @@ class Scenario:
         parts: dict[str, Any] = {"plant": self.plant, "reference": self.reference}
         for name, bounds in (("bounds", self.bounds), ("velocity_bounds", self.velocity_bounds)):
             if bounds is not None:
-                parts |= {f"{name}.lower": bounds.lower, f"{name}.upper": bounds.upper}
-        parts |= {f"controller[{i}]": layer for i, layer in enumerate(layers(self.controller))}
-        parts |= {
-            "observer": self.observer,
-            "disturbance": self.disturbance,
-            "actuator": self.actuator,
-        }
+                parts[f"{name}.lower"] = bounds.lower
+                parts[f"{name}.upper"] = bounds.upper
+        for i, law in enumerate(layers(self.controller)):
+            parts[f"controller[{i}]"] = law
+        parts["observer"] = self.observer
+        parts["disturbance"] = self.disturbance
+        parts["actuator"] = self.actuator
         dtype = jnp.result_type(self.initial.q)
         return joined([jump_times_of(name, part, dtype) for name, part in parts.items()], dtype)
 
@@ -256,13 +259,6 @@ def _check_region(name: str, region: regions.Region, robot: Robot) -> None:
         raise checks.fail(name, region, expected, reason) from error
 
 
-def _check_is_scenario(scenario: Any) -> None:
-    """Raises ValueError for something that is no scenario."""
-    if not isinstance(scenario, Scenario):
-        remedy = "Make one with ij.presets or ij.Scenario."
-        raise checks.fail("scenario", scenario, "a Scenario", remedy)
-
-
 def with_parts(scenario: Scenario, **parts: Any) -> Scenario:
     """A copy of the scenario with some parts replaced by name: `with_parts(scenario,
     observer=Momentum(kf=20.0), disturbance=Step(1.0, 5.0))`.
@@ -286,7 +282,8 @@ def with_parts(scenario: Scenario, **parts: Any) -> Scenario:
       ValueError: an unknown name, `robot` beside plant or model, a part of the wrong kind, or parts
         that differ in their number of joints.
     """
-    _check_is_scenario(scenario)
+    if not isinstance(scenario, Scenario):
+        raise checks.fail("scenario", scenario, "a Scenario", MAKE_ONE)
     names = ("robot", *(field.name for field in dataclasses.fields(Scenario)))
     for name in parts:
         if name not in names:
@@ -310,7 +307,8 @@ def _with_both_robots(scenario: Scenario, parts: dict[str, Any]) -> dict[str, An
         others = {name: part for name, part in parts.items() if name != "robot"}
         return {**others, "plant": parts["robot"], "model": parts["robot"]}
     if "plant" in parts and "model" not in parts:
-        n, joints = scenario.model.n, getattr(parts["plant"], "n", scenario.n)
+        checks.conforms("Scenario.plant", parts["plant"], *PROTOCOLS["plant"], OPTIONAL_MEMBERS)
+        n, joints = scenario.model.n, parts["plant"].n
         if joints != n:
             expected = f"{n} joints, as the model has"
             remedy = "Exchange plant and model together: robot=..."
@@ -373,12 +371,11 @@ def check_values(part: Any, path: str = "") -> None:
         return
     if not dataclasses.is_dataclass(part) or isinstance(part, type):
         return
-    prefix = f"{path}." if path else ""
     values = field_values(part)
     for field in dataclasses.fields(part):
         if field.metadata.get("static"):
             continue
-        name = prefix + field.name
+        name = f"{path}.{field.name}".lstrip(".")
         value = values[field.name]
         if isinstance(value, NUMBERS):
             checks.check_values(name, value, field.metadata.get("sign"))
@@ -395,33 +392,40 @@ def canonical(scenario: Scenario) -> Scenario:
         definite, the start is outside its bounds or faster than VELOCITY_LIMIT; the message names
         the field, the value and the remedy.
     """
-    _check_is_scenario(scenario)
+    if not isinstance(scenario, Scenario):
+        raise checks.fail("scenario", scenario, "a Scenario", MAKE_ONE)
     keep_programs()
     check_values(scenario)
-    scenario = with_sufficient_queue(scenario)
+    scenario = _with_sufficient_queue(scenario)
     dtype = _shared_dtype(scenario)
     scenario = jax.tree.map(lambda x: _typed(x, dtype), scenario)
-    if checks.is_concrete(scenario):
-        _check_start(scenario)
-        for law in layers(scenario.controller):
-            check = optional_member(law, "check_start")
-            if check is not None:
-                check(scenario.context)
-        for text in _advice(scenario):
-            notices.warn(text)
+    if not checks.is_concrete(scenario):
+        return scenario
+    _check_start(scenario)
+    for law in layers(scenario.controller):
+        law_member(law, "check_start")(scenario.context)
+    for text in _advice(scenario):
+        notices.warn(text)
     return scenario
+
+
+def _with_sufficient_queue(scenario: Scenario) -> Scenario:
+    """The scenario with a queue that is long enough for its delay, which may have changed since the
+    sampling was constructed.
+    """
+    sampling = scenario.sampling
+    if sampling is None or not checks.is_concrete(sampling) or sampling.queue >= sampling.needed:
+        return scenario
+    sampling = dataclasses.replace(sampling, queue=sampling.needed)
+    return dataclasses.replace(scenario, sampling=sampling)
 
 
 def _advice(scenario: Scenario) -> list[str]:
     """The warnings of the parts about their numbers."""
-    advice: list[str] = []
-    for part in (scenario.controller, scenario.observer):
-        of_part = optional_member(part, "advice")
-        if of_part is not None:
-            advice += of_part()
-    of_sensor = optional_member(scenario.sensor, "advice")
-    if scenario.sampling is not None and of_sensor is not None:
-        advice += of_sensor(scenario.sampling.period)
+    advice = law_member(scenario.controller, "advice")()
+    advice = advice + observer_member(scenario.observer, "advice")()
+    if scenario.sampling is not None:
+        advice = advice + sensor_member(scenario.sensor, "advice")(scenario.sampling.period)
     return advice
 
 
@@ -438,11 +442,14 @@ def _typed(x: Any, dtype) -> jax.Array:
 
 def _shared_dtype(scenario: Scenario) -> jax.typing.DTypeLike:
     """float32 if all numbers are float32, else JAX's default."""
-    leaves = jax.tree.leaves(scenario)
-    if not all(isinstance(x, NUMBERS) for x in leaves):
-        raise _not_a_number(scenario)
-    # `result_type` would not see the type of a weakly typed array.
-    types = {x.dtype if isinstance(x, jax.Array) else jnp.result_type(x) for x in leaves}
+    types = set()
+    for path, x in jax.tree_util.tree_leaves_with_path(scenario):
+        if not isinstance(x, NUMBERS):
+            name = jax.tree_util.keystr(path).lstrip(".")
+            remedy = "Other things belong in a static field."
+            raise checks.fail(name, x, "an array of numbers", remedy)
+        # `result_type` would not see the type of a weakly typed array.
+        types.add(x.dtype if isinstance(x, jax.Array) else jnp.result_type(x))
     supported = {jnp.dtype("float32"), jnp.dtype("float64")}
     floats = {x for x in types if jnp.issubdtype(x, jnp.floating)}
     if len(floats) == 1 and floats <= supported:
@@ -454,34 +461,20 @@ def _shared_dtype(scenario: Scenario) -> jax.typing.DTypeLike:
     return jnp.result_type(float)
 
 
-def _not_a_number(scenario: Scenario) -> ValueError:
-    """The error about the first leaf that is not an array of numbers."""
-    path, value = next(
-        (path, x)
-        for path, x in jax.tree_util.tree_leaves_with_path(scenario)
-        if not isinstance(x, NUMBERS)
-    )
-    name = jax.tree_util.keystr(path).lstrip(".")
-    remedy = "Other things belong in a static field."
-    return checks.fail(name, value, "an array of numbers", remedy)
+def check_step(scenario: Scenario, dt: float) -> None:
+    """Raises ValueError where the sampling period is not a whole number of steps dt [s]."""
+    sampling = scenario.sampling
+    if sampling is None or not checks.is_concrete(sampling):
+        return
+    period = float(sampling.period)
+    steps = period / dt
+    if round(steps) < 1 or abs(steps - round(steps)) > PERIOD_TOLERANCE * steps:
+        fitting = period / max(math.ceil(steps - 1e-9), 1)
+        expected = f"a whole number of steps in sampling.period = {period:g} s"
+        raise checks.fail("dt", dt, expected, f"Take dt={fitting:.6g}.")
 
 
 # --- checks of the start -------------------------------------------------------------------------
-
-
-def _shaped(name: str, call, *shape: int) -> jax.Array:
-    """The value of `call()`, or a ValueError that names it if it raises or has another shape."""
-    try:
-        value = call()
-    except Exception as error:
-        raise checks.fail(
-            name, f"{type(error).__name__}: {error}", f"an array of shape {shape}"
-        ) from error
-    if jnp.shape(value) != shape:
-        raise checks.fail(
-            name, f"shape {jnp.shape(value)}", f"shape {shape}", f"The plant has {shape[0]} joints."
-        )
-    return value
 
 
 class _Start(NamedTuple):
@@ -490,7 +483,7 @@ class _Start(NamedTuple):
     q_d: Any
     lower: Any
     upper: Any
-    velocity_bounds: Any
+    speed_limits: Any
     """Lower and upper, (n,) each [rad/s]; None if there are none."""
     region_margins: Any
 
@@ -501,36 +494,39 @@ def _at_start(scenario: Scenario) -> _Start:
     structure.
     """
     n, q, dq = scenario.n, scenario.initial.q, scenario.initial.dq
-    t = jnp.zeros((), q.dtype)
-    q_d = _shaped("reference.position(t)", lambda: scenario.reference.position(t), n)
-    _shaped("bounds.lower.at(t, q_d)", lambda: scenario.bounds.lower.at(t, q_d), n)
-    _shaped("bounds.upper.at(t, q_d)", lambda: scenario.bounds.upper.at(t, q_d), n)
-    tube = tube_at(scenario.reference, scenario.bounds, t)
-    for name, robot in (("plant", scenario.plant), ("model", scenario.model)):
-        _shaped(f"{name}.mass_matrix(q)", lambda r=robot: r.mass_matrix(q), n, n)
-        _shaped(f"{name}.coriolis(q, v, u)", lambda r=robot: r.coriolis(q, dq, dq), n)
-        _shaped(f"{name}.gravity(q)", lambda r=robot: r.gravity(q), n)
-    _shaped(
-        "disturbance.torque(t, q, dq, plant, model)",
-        lambda: scenario.disturbance.torque(t, q, dq, scenario.plant, scenario.model),
-        n,
-    )
-    velocity_bounds = _velocity_bounds(scenario, t)
+    t, plant, model = jnp.zeros((), q.dtype), scenario.plant, scenario.model
+    reference, bounds, of_speeds = scenario.reference, scenario.bounds, scenario.velocity_bounds
+    q_d = _shaped("reference.position(t)", partial(reference.position, t), n)
+    lower = _shaped("bounds.lower.at(t, q_d)", partial(bounds.lower.at, t, q_d), n)
+    upper = _shaped("bounds.upper.at(t, q_d)", partial(bounds.upper.at, t, q_d), n)
+    for name, robot in (("plant", plant), ("model", model)):
+        _shaped(f"{name}.mass_matrix(q)", partial(robot.mass_matrix, q), n, n)
+        _shaped(f"{name}.coriolis(q, v, u)", partial(robot.coriolis, q, dq, dq), n)
+        _shaped(f"{name}.gravity(q)", partial(robot.gravity, q), n)
+    torque = partial(scenario.disturbance.torque, t, q, dq, plant, model)
+    _shaped("disturbance.torque(t, q, dq, plant, model)", torque, n)
+    speed_limits = None
+    if of_speeds is not None:
+        _shaped("velocity_bounds.lower.at(t, dq_d)", partial(of_speeds.lower.at, t, q_d), n)
+        _shaped("velocity_bounds.upper.at(t, dq_d)", partial(of_speeds.upper.at, t, q_d), n)
+        speed_limits = speed_limits_at(reference, of_speeds, t)
     margins = q[:0]
     if scenario.regions:
-        margins = regions.margins(scenario.regions, scenario.plant, q)
-    return _Start(tube.q_d, tube.lower, tube.upper, velocity_bounds, margins)
+        margins = regions.margins(scenario.regions, plant, q)
+    return _Start(q_d, lower, upper, speed_limits, margins)
 
 
-def _velocity_bounds(scenario: Scenario, t: jax.Array):
-    """Bounds on the velocities at time t, their shapes checked; None if there are none."""
-    bounds, n = scenario.velocity_bounds, scenario.n
-    if bounds is None:
-        return None
-    dq_d = jnp.zeros((n,), t.dtype)
-    for name, side in (("lower", bounds.lower), ("upper", bounds.upper)):
-        _shaped(f"velocity_bounds.{name}.at(t, dq_d)", lambda side=side: side.at(t, dq_d), n)
-    return speed_limits_at(scenario.reference, bounds, t)
+def _shaped(name: str, call: Callable[[], jax.Array], *shape: int) -> jax.Array:
+    """The value of `call()`, or a ValueError that names it if it raises or has another shape."""
+    try:
+        value = call()
+    except Exception as error:
+        got = f"{type(error).__name__}: {error}"
+        raise checks.fail(name, got, f"an array of shape {shape}") from error
+    if jnp.shape(value) != shape:
+        remedy = f"The plant has {shape[0]} joints."
+        raise checks.fail(name, f"shape {jnp.shape(value)}", f"shape {shape}", remedy)
+    return value
 
 
 def _check_start(scenario: Scenario) -> None:
@@ -538,67 +534,55 @@ def _check_start(scenario: Scenario) -> None:
     not positive definite.
     """
     start = jax.tree.map(np.asarray, _at_start(scenario))
-    initial = scenario.initial
+    q, dq = np.asarray(scenario.initial.q), np.asarray(scenario.initial.dq)
     masses = {
-        name: np.asarray(mass_matrix_at(robot, initial.q))
+        name: np.asarray(mass_matrix_at(robot, scenario.initial.q))
         for name, robot in (("plant", scenario.plant), ("model", scenario.model))
     }
-    finite = (
-        ("reference", start.q_d),
-        ("bounds.lower", start.lower),
-        ("bounds.upper", start.upper),
-    )
-    for name, values in finite:
+    finite = {"reference": start.q_d, "bounds.lower": start.lower, "bounds.upper": start.upper}
+    for name, values in finite.items():
         if not np.all(np.isfinite(values)):
             raise checks.fail(name, values, "finite values at t = 0")
-    _check_positions(np.asarray(initial.q), start)
-    if start.velocity_bounds is not None:
-        _check_speeds(np.asarray(initial.dq), *start.velocity_bounds)
+    _check_order("bounds", start.lower, start.upper)
+    remedy = "Move the reference or widen the bounds (Assumption 2)."
+    _check_inside("reference of joint {}", "bounds", start.q_d, start.lower, start.upper, remedy)
+    remedy = "Move the start or widen the bounds."
+    _check_inside("initial.q[{}]", "bounds", q, start.lower, start.upper, remedy)
+    if start.speed_limits is not None:
+        slow, fast = start.speed_limits
+        _check_order("velocity_bounds", slow, fast)
+        _check_inside("initial.dq[{}]", "velocity bounds", dq, slow, fast, remedy)
     for region, margin in zip(scenario.regions, start.region_margins, strict=True):
         if not margin > 0:
-            name = regions.in_words(region, scenario.plant)
-            got, expected = (
-                f"{name} {-margin:.4g} m beyond its boundary",
-                "a start inside all regions",
-            )
+            point = regions.in_words(region, scenario.plant)
+            got = f"{point} {-margin:.4g} m beyond its boundary"
+            expected = "a start inside all regions"
             raise checks.fail("initial.q", got, expected, "Move the start or the region.")
-    if not np.all(np.abs(initial.dq) < VELOCITY_LIMIT):
+    if not np.all(np.abs(dq) < VELOCITY_LIMIT):
         expected = f"speeds below {VELOCITY_LIMIT:g} rad/s"
-        raise checks.fail("initial.dq", initial.dq, expected, "A run that fast counts as diverged.")
+        raise checks.fail("initial.dq", dq, expected, "A run that fast counts as diverged.")
     for name, matrix in masses.items():
         _check_mass_matrix(f"{name}.mass_matrix(initial.q)", matrix)
 
 
-def _check_positions(q: np.ndarray, start: _Start) -> None:
-    """Raises ValueError for bounds that leave no room at t = 0, or a reference or a start outside
-    of them.
-    """
-    for i, (low, high) in enumerate(zip(start.lower, start.upper, strict=True)):
-        interval = f"inside the bounds ({low:.6g}, {high:.6g}) at t = 0"
-        if not low < high:
-            expected, remedy = "lower < upper at t = 0", "Exchange or widen them."
-            raise checks.fail(f"bounds of joint {i}", (low, high), expected, remedy)
-        if not low < start.q_d[i] < high:
-            remedy = "Move the reference or widen the bounds (Assumption 2)."
-            name, expected = f"reference of joint {i}", f"a value {interval}"
-            raise checks.fail(name, start.q_d[i], expected, remedy)
-        if not low < q[i] < high:
-            remedy = "Move the start or widen the bounds."
-            raise checks.fail(f"initial.q[{i}]", q[i], f"a start {interval}", remedy)
-
-
-def _check_speeds(dq: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
-    """Raises ValueError for bounds on the velocities that leave no room at t = 0, or a start
-    outside of them.
-    """
+def _check_order(name: str, lower: np.ndarray, upper: np.ndarray) -> None:
+    """Raises ValueError for bounds that leave no room between them at t = 0."""
     for i, (low, high) in enumerate(zip(lower, upper, strict=True)):
         if not low < high:
             expected, remedy = "finite lower < upper at t = 0", "Exchange or widen them."
-            raise checks.fail(f"velocity_bounds of joint {i}", (low, high), expected, remedy)
-        if not low < dq[i] < high:
-            expected = f"a start inside the velocity bounds ({low:.6g}, {high:.6g}) at t = 0"
-            remedy = "Change the start or widen the bounds."
-            raise checks.fail(f"initial.dq[{i}]", dq[i], expected, remedy)
+            raise checks.fail(f"{name} of joint {i}", (low, high), expected, remedy)
+
+
+def _check_inside(
+    name: str, bounds: str, values: np.ndarray, lower: np.ndarray, upper: np.ndarray, remedy: str
+) -> None:
+    """Raises ValueError for a value that is not between its bounds; `{}` in the name stands for the
+    number of the joint.
+    """
+    for i, (value, low, high) in enumerate(zip(values, lower, upper, strict=True)):
+        if not low < value < high:
+            expected = f"a start inside the {bounds} ({low:.6g}, {high:.6g}) at t = 0"
+            raise checks.fail(name.format(i), value, expected, remedy)
 
 
 def _check_mass_matrix(name: str, matrix: np.ndarray) -> None:

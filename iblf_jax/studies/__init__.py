@@ -1,14 +1,14 @@
 """Studies: many runs of a scenario, and statistics over them.
 
     functions    compare (laws), monte_carlo (random parameters), sweep (a grid of parameters),
-                 sensitivity (which parameter matters), recommended (the time step)
-    request      options: where and how; setup: the checked arguments and the compiled program;
-                 designs, draws, points: which parameters case i has
-    execution    blocks: the one compiled shape; execution: in this process, or by workers;
-                 interrupt: Ctrl-C
-    store        config, store: a sweep on disk that survives a kill
+                 sensitivity (which parameter matters), time_step (the largest valid one)
+    request      options: what to run, where and how; study_setup: the checked arguments and the
+                 compiled program; designs, draws, sweep_points: which parameters case i has
+    execution    blocks: the one compiled shape, in this process; workers: on an executor;
+                 execution: chooses between the two; interrupt: Ctrl-C
+    store        store_config, store: a sweep on disk that survives a kill
     results      comparison, study, dataset (the table of a sweep); statistics, summaries
-    search       cube: the cases as a box, for gradient-based search
+    search       perturbation_cube: the cases as a box, for gradient-based search
 
 The public functions are those of `iblf_jax`; `distributions` has those of parameters.  The names
 below are options and errors of the functions.

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import itertools
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from typing import Any, NamedTuple
@@ -27,13 +27,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.core import checks
 from iblf_jax.core.devices import chosen, default
 from iblf_jax.core.status import Status, flag
 from iblf_jax.engine import block_size, blocks_in_flight, wait_until_ready
 from iblf_jax.studies.dataset import DRAWN
 from iblf_jax.studies.draws import CaseInputs
 from iblf_jax.studies.options import ThisProcess
-from iblf_jax.studies.setup import PreparedStudy, SharedInputs, StudyProgram, drawn_leaves
+from iblf_jax.studies.study_setup import PreparedStudy, SharedInputs, StudyProgram, drawn_leaves
 
 
 class BlockResults(NamedTuple):
@@ -52,16 +53,16 @@ def named_arrays(results: BlockResults) -> dict[str, Any]:
     return {**results.metrics, **status, **drawn}
 
 
-def result_shapes(study: PreparedStudy) -> BlockResults:
+def result_shapes(prepared: PreparedStudy) -> BlockResults:
     """Shapes and types of the results of one block."""
     # The same call as in `run_blocks`, so that it is traced once.
-    block = partial(_execute, program=study.program, record_every=None)
-    return jax.eval_shape(block, study.shared, study.inputs_of(np.arange(block_size())))
+    block = partial(_execute, program=prepared.program, record_every=None)
+    return jax.eval_shape(block, prepared.shared, prepared.inputs_of(np.arange(block_size())))
 
 
-def case_bytes(study: PreparedStudy) -> float:
+def case_bytes(prepared: PreparedStudy) -> float:
     """Memory that the results of one case take [bytes]."""
-    leaves = jax.tree.leaves(result_shapes(study))
+    leaves = jax.tree.leaves(result_shapes(prepared))
     return sum(x.size * x.dtype.itemsize for x in leaves) / block_size()
 
 
@@ -115,7 +116,7 @@ def _execute(
 
 
 def run_blocks(
-    study: PreparedStudy,
+    prepared: PreparedStudy,
     blocks: Iterable[int],
     here: ThisProcess | None = None,
     *,
@@ -124,7 +125,7 @@ def run_blocks(
     """Runs blocks in this process and yields (block, its results on the host), in their order.
 
     Args:
-      study: what to run.
+      prepared: what to run.
       blocks: numbers of the blocks; each is taken when the block is started.
       here: devices and limits; all devices and the default memory if not given.
       record_every: records trajectories, every so-many-th step, instead of metrics.
@@ -137,16 +138,16 @@ def run_blocks(
     if not first_blocks:
         return
     places, chosen_device = devices[: len(first_blocks)], chosen()
-    call = partial(_execute, program=study.program, record_every=record_every)
-    copies = [jax.device_put(study.shared, place) for place in places]
+    call = partial(_execute, program=prepared.program, record_every=record_every)
+    copies = [jax.device_put(prepared.shared, place) for place in places]
     if len(places) > 1:
-        inputs = study.inputs_of(np.arange(block_size()))
+        inputs = prepared.inputs_of(np.arange(block_size()))
         _compile(call, copies, [jax.device_put(inputs, place) for place in places])
 
     def results(place: int, block: int) -> tuple[Any, int]:
         """Those of a block on the device `places[place]`, and the bytes that it took."""
         cases = np.arange(block * block_size(), (block + 1) * block_size())
-        inputs = jax.device_put(study.inputs_of(cases), places[place])
+        inputs = jax.device_put(prepared.inputs_of(cases), places[place])
         with jax.default_device(chosen_device):  # it is local to a thread
             out = call(copies[place], inputs)
         wait_until_ready(out)
@@ -164,17 +165,12 @@ def run_blocks(
         for k, block in enumerate(itertools.chain(first_blocks[1:], remaining), start=1):
             waiting.append((block, pool.submit(results, k % len(places), block)))
             if len(waiting) == in_flight:
-                yield _first_of(waiting)
-        while waiting:
-            yield _first_of(waiting)
+                block, future = waiting.popleft()
+                yield block, future.result()[0]
+        for block, future in waiting:
+            yield block, future.result()[0]
     finally:
         pool.shutdown(cancel_futures=True)
-
-
-def _first_of(waiting: deque[tuple[int, Future]]) -> tuple[int, Any]:
-    """The block that was started first, and its results."""
-    block, future = waiting.popleft()
-    return block, future.result()[0]
 
 
 def _compile(call: partial, copies: list[SharedInputs], inputs: list[CaseInputs]) -> None:
@@ -188,3 +184,38 @@ def _compile(call: partial, copies: list[SharedInputs], inputs: list[CaseInputs]
 
     with ThreadPoolExecutor(len(copies)) as pool:
         list(pool.map(one, copies, inputs))
+
+
+def run_spans_here(
+    prepared: PreparedStudy,
+    spans: Iterable[slice],
+    here: ThisProcess,
+    advance: Callable[[int], None] = lambda cases: None,
+) -> Iterator[tuple[slice, BlockResults]]:
+    """Computes spans of consecutive cases in this process, in their order, and yields each with its
+    results; arguments as `execution.run_spans`.
+    """
+    size = block_size()
+    started: deque[slice] = deque()
+
+    def blocks() -> Iterator[int]:
+        for span in spans:
+            started.append(span)
+            yield from range(span.start // size, checks.ceil_div(span.stop, size))
+
+    parts: list[BlockResults] = []
+    for block, results in run_blocks(prepared, blocks(), here):
+        span = started[0]
+        first = block * size
+        count = min(size, span.stop - first)
+        parts.append(jax.tree.map(lambda x, count=count: x[:count], results))
+        advance(count)
+        if first + count == span.stop:
+            yield started.popleft(), jax.tree.map(_joined, *parts)
+            parts = []
+
+
+def _joined(*parts: np.ndarray) -> np.ndarray:
+    if len(parts) == 1:
+        return parts[0]
+    return np.concatenate(parts)

@@ -38,15 +38,15 @@ from iblf_jax.core.pytree import field_values, unwrapped
 from iblf_jax.core.status import Status
 from iblf_jax.engine import Outcome, RunRequest, run_batch
 from iblf_jax.engine.simulate import simulate
-from iblf_jax.simulation.accuracy import RELATIVE
+from iblf_jax.simulation.error_estimate import RELATIVE
 from iblf_jax.simulation.metrics import AboveGravity, as_folds, standard, watched
+from iblf_jax.simulation.noise import noise_of
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.results import Rollout
-from iblf_jax.simulation.sampling import noise_of
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.comparison import Comparison
 from iblf_jax.studies.equal_effort import NO_EFFORT, EffortSearch, Trials, grid, search
-from iblf_jax.studies.recommended import needed_dt
+from iblf_jax.studies.time_step import needed_dt
 
 NAMES = (*LAWS, *KEEPERS)
 Laws = Sequence[str | Controller] | Mapping[str, str | Controller]
@@ -160,11 +160,9 @@ def _with_law(scenario: Scenario, law: str | Controller) -> Scenario:
     """The scenario under another law, with the observer that belongs to it."""
     if isinstance(law, str):
         own = unwrapped(scenario.controller)
-        kept = {
-            name: value
-            for name, value in field_values(own).items()
-            if name in ("k1", "K2", "o", "reading") and value is not None
-        }
+        values = field_values(own)
+        given = {name: values.get(name) for name in ("k1", "K2", "o", "reading")}
+        kept = {name: value for name, value in given.items() if value is not None}
         p = getattr(law_member(own, "barrier"), "p", 1)
         controller = _limited_as(scenario.controller, law_by_name(law, p=p, **kept))
         observer = observer_of(law, scenario.observer)
@@ -215,17 +213,19 @@ def _at_effort_of(
 ) -> _Equal:
     """A law with gains scaled so that it has the first one's effort."""
     if int(reference.status) & NO_EFFORT:
-        return _Equal(
-            float("nan"), reason=f"the first law, {title}, failed itself, so it sets no effort"
-        )
+        reason = f"the first law, {title}, failed itself, so it sets no effort"
+        return _Equal(float("nan"), reason=reason)
     names = gain_names(scenario.controller)
     if not names:
-        return _Equal(
-            float("nan"),
-            reason="it has no gains to scale: no k1, K2, and no class attribute `gains`",
-        )
+        reason = "it has no gains to scale: no k1, K2, and no class attribute `gains`"
+        return _Equal(float("nan"), reason=reason)
     target = float(reference.metrics.effort_above_gravity)
-    dt_for = partial(_dt_for, dt=options["dt"], method=options["method"])
+
+    def dt_for(trials: Trials) -> float | None:
+        """The largest step [s] that would do for all of these trials."""
+        dt, method = options["dt"], options["method"]
+        return needed_dt(trials.status, trials.mode, trials.error, dt, method)
+
     inaccurate = bool((int(reference.status) | int(own.status)) & Status.INACCURATE)
     found = search(_trials_of(scenario, names, options), target, dt_for, inaccurate)
     for factor in found.crossings:
@@ -237,21 +237,11 @@ def _at_effort_of(
 
 def _scaled(scenario: Scenario, names: Sequence[str], factor: Any) -> dict[str, Any]:
     """Path -> gains times a factor, or times each of several factors, (N, ...)."""
-    inner = unwrapped(scenario.controller)
-    gains = {
-        f"controller.{name}": np.asarray(gain) for name, gain in attributes(inner, names).items()
-    }
-    if np.ndim(factor) == 0:
-        return {path: gain * factor for path, gain in gains.items()}
+    gains = attributes(unwrapped(scenario.controller), names)
     return {
-        path: np.asarray(factor).reshape(-1, *(1,) * gain.ndim) * gain
-        for path, gain in gains.items()
+        f"controller.{name}": np.multiply.outer(factor, np.asarray(gain))
+        for name, gain in gains.items()
     }
-
-
-def _dt_for(trials: Trials, *, dt: float, method: str) -> float | None:
-    """A step that would do for trials, the smallest that one of them needs [s]."""
-    return needed_dt(trials.status, trials.mode, trials.error, dt, method)
 
 
 def _trials_of(
@@ -275,13 +265,13 @@ def _trials_of(
         }
         varied |= {name: jnp.broadcast_to(x, (size, *x.shape)) for name, x in noise.items()}
         found = _batch(scenario, varied, folds, jnp.asarray(options["dt"], dtype), request=request)
-        columns = (
+        results = Trials(
             found.metrics["effort_above_gravity"],
             found.status,
             found.fastest_mode,
             found.metrics[RELATIVE],
         )
-        return Trials(*(np.asarray(x)[: len(factors)] for x in columns))
+        return Trials(*(np.asarray(x)[: len(factors)] for x in results))
 
     return trials
 
@@ -316,13 +306,8 @@ def factor_nearest_one(effort: Callable[[float], float], target: float) -> float
 
 
 def _gains_in_words(law: Controller) -> str:
-    inner = unwrapped(law)
-    return (
-        ", ".join(
-            f"{name} = {_shown(gain)}" for name, gain in attributes(inner, gain_names(law)).items()
-        )
-        or "no gains"
-    )
+    gains = attributes(unwrapped(law), gain_names(law))
+    return ", ".join(f"{name} = {_shown(gain)}" for name, gain in gains.items()) or "no gains"
 
 
 def _shown(value: Any) -> str:

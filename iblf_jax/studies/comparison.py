@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import dataclasses
 import html
+import itertools
 import math
 from typing import Any, NamedTuple
 
@@ -255,15 +256,11 @@ class Comparison:
 def _columns(rows: tuple[Row, ...]) -> list[tuple[str, ...]]:
     """Headings and lines, without the margins of constraints that there are none of."""
     shown = [
-        i
-        for i, name in enumerate(Row._fields)
-        if name not in OPTIONAL or any(math.isfinite(float(row[i])) for row in rows)
+        name not in OPTIONAL or any(math.isfinite(row._asdict()[name]) for row in rows)
+        for name in Row._fields
     ]
-    return [tuple(line[i] for i in shown) for line in [HEADINGS, *map(_cells, rows)]]
-
-
-def _cells(row: Row) -> tuple[str, ...]:
-    return tuple(map(_cell, row))
+    lines = [HEADINGS, *(tuple(map(_cell, row)) for row in rows)]
+    return [tuple(itertools.compress(line, shown)) for line in lines]
 
 
 def _cell(value: Any) -> str:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from iblf_jax.core.status import Status
+from iblf_jax.core.status import Status, has_flag
 from iblf_jax.simulation.signals import own_dims
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ def to_dataset(
     """The Dataset from flat data.
 
     Args:
-      config: what `config.describe` gave.
+      config: what `store_config.describe` gave.
       flat: name -> (cases, ...); case = point * runs + run.
       units: name -> unit.
       done: which cases are there, (cases,) bool.
@@ -62,11 +62,13 @@ def to_dataset(
         else:
             variables[name] = (dims, shaped, attributes)
     dims, status, _ = variables["status"]
-    variables["status"] = (dims, status, _status_attributes())
+    variables["status"] = (dims, status, status_attributes("0 is ok, -1 not computed yet"))
     if "first_violation_time" in flat:
         outside = _started_outside(flat).reshape(status.shape)
-        words = "whether the run violated a bound, or was outside a region, at t = 0 already"
-        text = f"{words}: it was started there, and no law could keep it"
+        text = (
+            "whether the run violated a bound, or was outside a region, at t = 0 already: it was"
+            " started there, and no law could keep it"
+        )
         variables["started_outside"] = (dims, outside, {"units": "1", "description": text})
     return xarray.Dataset(variables, coordinates, _attributes(config, done))
 
@@ -76,11 +78,12 @@ def _is_the_same_at_every_point(values: np.ndarray) -> bool:
     return np.array_equal(values, np.broadcast_to(values[:1], values.shape), equal_nan=True)
 
 
-def _status_attributes() -> dict[str, Any]:
+def status_attributes(values: str) -> dict[str, Any]:
+    """Attributes of flags, by the CF conventions; `values` says what special values mean."""
     flags = [flag for flag in Status if flag]
     return {
         "units": "1",
-        "description": "bit flags; 0 is ok, -1 not computed yet",
+        "description": f"bit flags; {values}",
         "flag_masks": np.array([int(flag) for flag in flags], np.int32),
         "flag_meanings": " ".join((flag.name or "").lower() for flag in flags),
     }
@@ -90,7 +93,7 @@ def _started_outside(flat: Mapping[str, np.ndarray]) -> np.ndarray:
     """Whether each case violated a constraint at t = 0, (cases,)."""
     status = flat["status"]
     at_start = [
-        (status >= 0) & (status & int(flag) != 0) & (np.asarray(flat[name]) <= 0)
+        (status >= 0) & has_flag(status, flag) & (np.asarray(flat[name]) <= 0)
         for name, flag in FIRST_TIMES.items()
         if name in flat
     ]

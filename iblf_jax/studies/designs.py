@@ -12,6 +12,8 @@ Source: A. B. Owen, Monte Carlo theory, methods and examples, chapters 10 and 17
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -76,25 +78,39 @@ def unit_points(
         )
     from scipy.stats import qmc  # a second to import
 
+    engine = qmc.Sobol if sampler == "sobol" else qmc.LatinHypercube
     designs = []
     for replicate in range(replicates):
         rng = np.random.default_rng([seed, replicate, salt])
-        if sampler == "sobol":
-            designs.append(qmc.Sobol(dimension, scramble=True, rng=rng).random(runs // replicates))
-        else:
-            designs.append(qmc.LatinHypercube(dimension, rng=rng).random(runs // replicates))
+        designs.append(engine(dimension, rng=rng).random(runs // replicates))
     return np.concatenate(designs)
 
 
+def designed_numbers(
+    sampler: str,
+    shapes: Mapping[str, tuple[int, ...]],
+    runs: int,
+    replicates: int,
+    seed: int,
+    dtype: Any,
+    salt: int = 0,
+) -> dict[str, np.ndarray]:
+    """Name of the draws -> their uniform numbers in all runs, (runs, ...); arguments as
+    `unit_points`.
+    """
+    dimension = sum(math.prod(shape) for shape in shapes.values())
+    return split(unit_points(sampler, dimension, runs, replicates, seed, salt), shapes, dtype)
+
+
 def split(
-    points: np.ndarray, shapes: dict[str, tuple[int, ...]], dtype: Any
+    points: np.ndarray, shapes: Mapping[str, tuple[int, ...]], dtype: Any
 ) -> dict[str, np.ndarray]:
     """The columns of `points` by path, each with its leaf's shape, kept off 0 and 1 in `dtype`."""
     edge = np.finfo(dtype).eps / 2
     inside = np.clip(points.astype(dtype), edge, 1 - edge)
     parts, start = {}, 0
     for path, shape in shapes.items():
-        width = int(np.prod(shape, dtype=int))
+        width = math.prod(shape)
         parts[path] = inside[:, start : start + width].reshape((-1, *shape))
         start += width
     return parts

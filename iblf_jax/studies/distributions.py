@@ -7,11 +7,11 @@ a draw:
     normal        mean + std Phi^-1(u)
     log_uniform   low (high / low)^u
     choice        the first value whose cumulative weight reaches u
-    joint_normal  mean + sum_k rows_k Phi^-1(u_k), with the same u_1 ... u_d for all leaves of a
-    group: so leaves may vary together
+    joint_normal  mean + sum_k rows_k Phi^-1(u_k)
 
-so that independent draws, Latin hypercubes and Sobol points differ in their u only.  A draw z
-changes a leaf that holds x0 to
+The leaves of a `joint_normal` group share u_1 ... u_d, so that they vary together.  Independent
+draws, Latin hypercubes and Sobol points differ in their u only.  A draw z changes a leaf that holds
+x0 to
 
     factor   x0 z        offset   x0 + z        value   z
 
@@ -22,19 +22,21 @@ numbers do not recompile a study.
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.optional import OptionalMembers
 from iblf_jax.core.pytree import component, leaf, static
 
 KINDS = ("factor", "offset", "value")
 """How a draw acts on the nominal value."""
 
 
+@runtime_checkable
 class Distribution(Protocol):
     """What the package asks of a distribution: a component with these two methods.
 
@@ -51,9 +53,8 @@ class Distribution(Protocol):
         ...
 
 
-def is_distribution(thing: Any) -> bool:
-    """Whether something has the methods of a `Distribution`."""
-    return all(callable(getattr(thing, name, None)) for name in ("quantile", "support"))
+distribution_member = OptionalMembers(group="", draws=0)
+"""The optional members of a `Distribution`: those of leaves that vary together."""
 
 
 @component
@@ -222,10 +223,15 @@ class Perturbation:
 
     def check(self) -> None:
         """Raises ValueError for something that is not a distribution."""
-        if not is_distribution(self.distribution):
+        if not isinstance(self.distribution, Distribution):
             raise _no_distribution(self.kind, self.distribution)
         checks.one_of("Perturbation.kind", self.kind, KINDS)
         object.__setattr__(self, "shared", checks.flag("Perturbation.shared", self.shared))
+
+    @property
+    def group(self) -> str:
+        """Name of the draws that the leaf shares with others; "" if it has draws of its own."""
+        return distribution_member(self.distribution, "group")
 
     def apply(self, nominal: jax.Array, u: jax.Array) -> jax.Array:
         """The perturbed leaf, from its nominal value and the uniform number(s) of this draw; the
@@ -234,19 +240,17 @@ class Perturbation:
         draw = jnp.broadcast_to(self.distribution.quantile(u).astype(nominal.dtype), nominal.shape)
         if self.kind == "factor":
             return nominal * draw
-        return nominal + draw if self.kind == "offset" else draw
+        if self.kind == "offset":
+            return nominal + draw
+        return draw
 
     def range(self, nominal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The least and the greatest value that the leaf can take."""
         low, high = self.distribution.support()
         if self.kind == "factor":
             with np.errstate(invalid="ignore"):
-                ends = np.nan_to_num(
-                    np.stack([nominal * low, nominal * high]),
-                    nan=0.0,
-                    posinf=np.inf,
-                    neginf=-np.inf,
-                )
+                ends = np.stack([nominal * low, nominal * high])
+            ends[np.isnan(ends)] = 0.0  # 0 times infinity
             return ends.min(0), ends.max(0)
         if self.kind == "offset":
             return nominal + low, nominal + high
@@ -354,17 +358,16 @@ def choice(values: Any, weights: Any = None) -> Choice:
     Raises:
       ValueError: an empty list, or weights that do not fit it.
     """
-    return Choice(
-        values,
-        jnp.ones(checks.as_floats("choice: values", values).shape) if weights is None else weights,
-    )
+    if weights is None:
+        weights = jnp.ones(checks.as_floats("choice: values", values).shape)
+    return Choice(values, weights)
 
 
 def _perturbation(kind: str, distribution: Any, shared: Any) -> Perturbation:
     """A perturbation; what is no distribution is refused before the fields of the component are
     read.
     """
-    if not is_distribution(distribution):
+    if not isinstance(distribution, Distribution):
         raise _no_distribution(kind, distribution)
     return Perturbation(distribution, kind, shared)
 

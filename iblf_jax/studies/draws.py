@@ -2,17 +2,19 @@
 
 Run i draws, for the leaf that is addressed by `path`,
 
-    u = uniform(fold_in(fold_in(key(seed), i), crc32(path))),    value = perturbation(nominal,
-    F^-1(u))
+    u = uniform(fold_in(fold_in(key(seed), i), crc32(path))),
+    value = perturbation(nominal, F^-1(u))
 
 so a draw depends on seed, run and path only: not on the device, the number of runs or the other
-perturbations.  u lies in the open interval (0, 1), in the middle of the cells that the generator's
-uniform numbers start.  Leaves that vary together share it, under the name of their group.  `robot.`
-perturbs plant and model with the same u, each about its own nominal value.
+perturbations.  The generator returns the lower ends of equal cells of [0, 1); u is the middle of
+such a cell, so it lies in the open interval (0, 1).  Leaves that vary together share u, under the
+name of their group.  A path that begins with `robot.` perturbs plant and model with the same u,
+each about its own nominal value.
 """
 
 from __future__ import annotations
 
+import itertools
 import zlib
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
@@ -24,7 +26,7 @@ import numpy as np
 from iblf_jax.core import checks
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.studies.distributions import Perturbation
+from iblf_jax.studies.distributions import Perturbation, distribution_member
 
 _SIGNS = {"positive": "> 0", "nonnegative": ">= 0"}
 
@@ -60,9 +62,31 @@ class CaseInputs(NamedTuple):
     """Path of the user -> designed uniform numbers; empty when draws are independent."""
 
 
+def case_inputs(
+    cases: np.ndarray,
+    runs: int,
+    points: Mapping[str, np.ndarray],
+    designed: Mapping[str, np.ndarray],
+) -> CaseInputs:
+    """What differs between cases of these numbers.
+
+    Args:
+      cases: numbers, case = point * runs + run.
+      runs: runs at each point.
+      points: path -> value at every point.
+      designed: path -> designed uniform numbers of every run.
+    """
+    point, run = np.divmod(cases, runs)
+    return CaseInputs(
+        run.astype(np.uint32),
+        {path: values[point] for path, values in points.items()},
+        {path: u[run] for path, u in designed.items()},
+    )
+
+
 def same_place(scenario: Scenario, path: str, other: str) -> bool:
     """Whether two paths address an entry in common."""
-    pairs = [(a, b) for a in paths.places(scenario, path) for b in paths.places(scenario, other)]
+    pairs = itertools.product(paths.places(scenario, path), paths.places(scenario, other))
     return any(all(x == y for x, y in zip(a, b, strict=False)) for a, b in pairs)
 
 
@@ -101,12 +125,7 @@ def targets_of(
         that does not fit the leaf or can only leave its admissible range by design (a factor from
         -1 to 1 on a mass).
     """
-    if not isinstance(perturbations, Mapping):
-        raise checks.fail(
-            what,
-            perturbations,
-            'a mapping such as {"plant.mass[1]": ij.factor(ij.uniform(0.7, 1.3))}',
-        )
+    checks.mapping(what, perturbations, '{"plant.mass[1]": ij.factor(ij.uniform(0.7, 1.3))}')
     check_paths(scenario, perturbations, what)
     targets, by_path = [], {}
     for source, perturbation in perturbations.items():
@@ -117,10 +136,11 @@ def targets_of(
             )
         for path in _targets(scenario, source, perturbation):
             nominal = np.asarray(paths.get(scenario, path))
-            target = Target(path, source, nominal.shape, paths.sign_at(scenario, path))
-            _check_fit(
-                target._replace(sign=target.sign if signs else None), perturbation, nominal, what
-            )
+            sign = paths.sign_at(scenario, path)
+            target = Target(path, source, nominal.shape, sign)
+            _check_fit(f"{what}[{source!r}]", perturbation, nominal)
+            if signs and sign is not None:
+                _check_sign(f"{what}[{source!r}]", target, perturbation, nominal)
             targets.append(target)
             by_path[path] = perturbation
     return tuple(targets), by_path
@@ -131,10 +151,10 @@ def _remedy_for(given: Any) -> str:
     numbers.
     """
     if isinstance(given, tuple | list) and len(given) == 2 and checks.is_concrete(given):
-        low, high = (
-            checks.shown(np.asarray(x).tolist() if isinstance(x, np.ndarray | jax.Array) else x)
-            for x in given
-        )
+        ends = [
+            np.asarray(x).tolist() if isinstance(x, np.ndarray | jax.Array) else x for x in given
+        ]
+        low, high = map(checks.shown, ends)
         return (
             "Say how the draw acts on the leaf: for values between two ends"
             f" ij.value(ij.uniform({low}, {high}))."
@@ -146,14 +166,12 @@ def _targets(scenario: Scenario, source: str, perturbation: Perturbation) -> lis
     """The source itself, or plant and model apart where their nominal values differ."""
     full = paths.expand(source)
     nominal = [np.asarray(paths.get(scenario, path)) for path in full]
-    same = perturbation.kind == "value" or all(np.array_equal(x, nominal[0]) for x in nominal)
-    if same:
+    if perturbation.kind == "value" or all(np.array_equal(x, nominal[0]) for x in nominal):
         return [source]
     return full
 
 
-def _check_fit(target: Target, perturbation: Perturbation, nominal: np.ndarray, what: str) -> None:
-    name = f"{what}[{target.source!r}]"
+def _check_fit(name: str, perturbation: Perturbation, nominal: np.ndarray) -> None:
     try:
         low, _ = perturbation.range(nominal)
         fits = np.broadcast_shapes(np.shape(low), nominal.shape) == nominal.shape
@@ -170,15 +188,16 @@ def _check_fit(target: Target, perturbation: Perturbation, nominal: np.ndarray, 
             "a nominal value that is not 0",
             "Use ij.offset or ij.value.",
         )
-    bounded = np.isfinite(low)
-    bad = {"positive": low <= 0, "nonnegative": low < 0}.get(
-        target.sign or "", np.zeros(nominal.shape, bool)
-    )
-    if np.any(bad & bounded):
-        worst = float(np.min(np.where(bounded, low, np.inf)))
+
+
+def _check_sign(name: str, target: Target, perturbation: Perturbation, nominal: np.ndarray) -> None:
+    """Raises ValueError if a bounded distribution reaches values that the leaf does not admit."""
+    low, _ = perturbation.range(nominal)
+    lowest = float(np.min(low, where=np.isfinite(low), initial=np.inf))
+    if lowest < 0 or (target.sign == "positive" and lowest == 0):
         raise checks.fail(
             name,
-            f"values down to {worst:g}",
+            f"values down to {lowest:g}",
             f"values {_SIGNS[target.sign or '']} only, as {target.path} needs",
             "Narrow the distribution.",
         )
@@ -190,24 +209,16 @@ def sample_size(
     """Name of the draws -> shape of their u: path of the user, the leaf's or () where one draw is
     shared; or a group, and its size.
     """
-    return {
-        drawn_as(t, perturbations[t.path]): _shape_of_u(t, perturbations[t.path]) for t in targets
-    }
-
-
-def drawn_as(target: Target, perturbation: Perturbation) -> str:
-    """The name of a target's draws: the path that the user wrote, or the group of leaves that vary
-    together.
-    """
-    return getattr(perturbation.distribution, "group", "") or target.source
-
-
-def _shape_of_u(target: Target, perturbation: Perturbation) -> tuple[int, ...]:
-    if getattr(perturbation.distribution, "group", ""):
-        return (perturbation.distribution.draws,)  # type: ignore[attr-defined]
-    if perturbation.shared:
-        return ()
-    return target.shape
+    shapes = {}
+    for target in targets:
+        perturbation = perturbations[target.path]
+        shape = target.shape
+        if perturbation.group:
+            shape = (distribution_member(perturbation.distribution, "draws"),)
+        elif perturbation.shared:
+            shape = ()
+        shapes[perturbation.group or target.source] = shape
+    return shapes
 
 
 def uniform_numbers(
@@ -244,36 +255,44 @@ def draw(
         source: uniform_numbers(cases.key, index, source, shape, dtype)
         for source, shape in sample_size(targets, cases.perturbations).items()
     }
-    made, drawn, admissible = {}, {}, jnp.asarray(True)
+    used, drawn, admissible = {}, {}, jnp.asarray(True)
     for target in targets:
         nominal = jnp.asarray(paths.get(scenario, target.path))
         perturbation = cases.perturbations[target.path]
-        value = perturbation.apply(nominal, numbers[drawn_as(target, perturbation)].astype(dtype))
+        u_of_target = numbers[perturbation.group or target.source]
+        value = perturbation.apply(nominal, u_of_target.astype(dtype))
         fine = jnp.all(jnp.isfinite(value))
-        if target.sign is not None:
-            fine &= jnp.all(value > 0 if target.sign == "positive" else value >= 0)
+        if target.sign == "positive":
+            fine &= jnp.all(value > 0)
+        elif target.sign is not None:
+            fine &= jnp.all(value >= 0)
         admissible &= fine
         drawn[target.path] = value
-        made[target.path] = jnp.where(fine, value, nominal)
-    return made, drawn, admissible
+        used[target.path] = jnp.where(fine, value, nominal)
+    return used, drawn, admissible
 
 
-def merge(scenario: Scenario, point: Mapping[str, Any], made: Mapping[str, Any]) -> dict[str, Any]:
+def merge(scenario: Scenario, point: Mapping[str, Any], drawn: Mapping[str, Any]) -> dict[str, Any]:
     """What a run replaces, from its point and its draws: each place once, whole leaves where the
     two overlap.
     """
-    overlapping = [p for p in point if any(same_place(scenario, p, m) for m in made)]
-    if not overlapping:
-        return {**point, **made}
-    changed = paths.with_parameters(paths.with_parameters(scenario, point), made)
-    meeting = [
-        *overlapping,
-        *(m for m in made if any(same_place(scenario, m, p) for p in overlapping)),
-    ]
-    touched = {leaf for p in meeting for leaf in paths.leaves(scenario, p)}
-    rest = {
-        p: v
-        for p, v in {**point, **made}.items()
-        if not any(same_place(scenario, p, leaf) for leaf in touched)
+    overlapping = {
+        path
+        for at_point in point
+        for of_draw in drawn
+        if same_place(scenario, at_point, of_draw)
+        for path in (at_point, of_draw)
     }
-    return {**rest, **{leaf: paths.get(changed, leaf) for leaf in touched}}
+    replaced = {**point, **drawn}
+    if not overlapping:
+        return replaced
+    changed = paths.with_parameters(paths.with_parameters(scenario, point), drawn)
+    leaves = {
+        leaf for path in replaced if path in overlapping for leaf in paths.leaves(scenario, path)
+    }
+    rest = {
+        path: value
+        for path, value in replaced.items()
+        if not any(same_place(scenario, path, leaf) for leaf in leaves)
+    }
+    return {**rest, **{leaf: paths.get(changed, leaf) for leaf in leaves}}

@@ -4,11 +4,11 @@ The effort need not grow with the factor, and trials may fail, so nothing is con
 them:
 
 1. A grid of factors is run in one batch: 2^(i / 16) from 1/4 to 4, and 2^(i / 4) beyond, to 1/32
-  and 32.
-2. Between neighbours that are both valid and have the target between them there is a crossing; it
-   is refined by further batches until the factor is known to 1e-6, and rejected if the effort jumps
-   over the target there.  Refined too are the places where a crossing may hide: next to failed
-   trials, and around an effort that turns back just before the target.
+   and 32.
+2. Between two valid neighbours that have the target between them there is a crossing.  Further
+   batches refine it until the factor is known to 1e-6; it is rejected if the effort jumps over the
+   target there.  The places where a crossing may hide are refined, too: next to failed trials, and
+   around an effort that turns back just before the target.
 3. Of all crossings the one nearest to 1, by |ln factor|, is chosen.
 
 A trial is valid if its run did not fail and is accurate.  Where the law's own run, or the one that
@@ -19,13 +19,14 @@ so.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from iblf_jax.core.status import FAILED, WORDS, Status, describe
+from iblf_jax.core.status import FAILED, WORDS, Status, describe, has_flag
 
 FINE_POINTS, FINE_OCTAVES = 16, 2
 """Grid points in a factor of two, and the powers of two up to which the grid has so many."""
@@ -46,8 +47,6 @@ MAX_NAMED = 4
 NO_EFFORT = FAILED & ~(Status.VELOCITY_VIOLATED | Status.REGION_VIOLATED)
 """Flags of runs whose effort is not to be compared; constraints that a law does not know of are no
 obstacle."""
-STEP_FLAGS = Status.STEP_TOO_LARGE | Status.INACCURATE
-"""Flags for which the time step is to blame."""
 
 
 class Trials(NamedTuple):
@@ -85,7 +84,7 @@ class EffortSearch:
     @property
     def factor(self) -> float:
         """The crossing nearest to 1 by |ln factor|; NaN where there is none."""
-        return self.crossings[0] if self.crossings else math.nan
+        return next(iter(self.crossings), math.nan)
 
     @property
     def valid(self) -> np.ndarray:
@@ -107,10 +106,8 @@ class EffortSearch:
     def failed(self) -> dict[float, str]:
         """Factor -> why its run is not valid, in words."""
         why = invalid_flags(self.accepts_inaccurate)
-        bad = zip(
-            self.factors[~self.valid].tolist(), self.status[~self.valid].tolist(), strict=True
-        )
-        return {factor: describe(int(status) & why) for factor, status in bad}
+        bad = zip(self.factors[~self.valid], self.status[~self.valid], strict=True)
+        return {float(factor): describe(int(status) & why) for factor, status in bad}
 
     def in_words(self) -> str:
         """What was searched, what failed and what was found, in one line."""
@@ -121,16 +118,13 @@ class EffortSearch:
     def _found(self) -> str:
         if not self.crossings:
             return self._nothing_found()
-        text = (
-            f"the effort is {self.target:.4g} N m at {_few([f'{x:.4g}' for x in self.crossings])}"
-        )
+        crossings = _few([f"{x:.4g}" for x in self.crossings])
+        text = f"the effort is {self.target:.4g} N m at {crossings}"
         if len(self.crossings) > 1:
             text += f", of which {self.factor:.4g} is the nearest to 1"
-        return text + (
-            " (inaccurate runs count, as those at the gains given are inaccurate)"
-            if self.accepts_inaccurate
-            else ""
-        )
+        if self.accepts_inaccurate:
+            text += " (inaccurate runs count, as those at the gains given are inaccurate)"
+        return text
 
     def _nothing_found(self) -> str:
         efforts = self.efforts[self.valid]
@@ -169,17 +163,12 @@ class EffortSearch:
         flags for which they count as failed.
         """
         why = invalid_flags(self.accepts_inaccurate)
-        groups: list[tuple[list[float], list[int]]] = []
-        after_valid = True
-        for factor, status, fine in zip(
-            self.factors.tolist(), self.status.tolist(), self.valid.tolist(), strict=True
-        ):
-            if not fine and after_valid:
-                groups.append(([], []))
-            if not fine:
-                groups[-1][0].append(factor)
-                groups[-1][1].append(status & why)
-            after_valid = fine
+        trials = zip(self.valid, self.factors.tolist(), self.status.tolist(), strict=True)
+        groups = []
+        for counts, neighbours in itertools.groupby(trials, key=lambda trial: trial[0]):
+            if not counts:
+                _, factors, status = zip(*neighbours, strict=True)
+                groups.append((list(factors), [flags & why for flags in status]))
         return groups
 
     def to_dict(self) -> dict[str, Any]:
@@ -267,10 +256,9 @@ def _hidden(
     Where the step is beyond its stability limit the other flags say nothing.  Where no crossing was
     found the trials are those nearest to 1 on each side.
     """
-    unstable = trials.status & int(Status.STEP_TOO_LARGE) != 0
-    only_inaccurate = (trials.status & int(Status.INACCURATE) != 0) & (
-        trials.status & int(NO_EFFORT) == 0
-    )
+    unstable = has_flag(trials.status, Status.STEP_TOO_LARGE)
+    inaccurate = has_flag(trials.status, Status.INACCURATE)
+    only_inaccurate = inaccurate & ~has_flag(trials.status, NO_EFFORT)
     blamed = ~valid & (unstable | only_inaccurate)
     if crossings:
         return blamed & (np.abs(powers) < min(map(abs, crossings)))
@@ -332,12 +320,10 @@ def _hiding_places(powers: np.ndarray, excess: np.ndarray) -> list[int]:
         turns = abs(here) <= min(abs(before), abs(after)) and min(before * here, here * after) > 0.0
         if turns:
             found |= {i - 1, i}
-    valid = np.flatnonzero(finite)
-    for a, b in zip(valid[:-1].tolist(), valid[1:].tolist(), strict=True):
-        if (
-            excess[a] * excess[b] < 0.0 and b > a + 1
-        ):  # the crossing is somewhere among failed trials
-            found |= set(range(a, b))
+    valid = np.flatnonzero(finite).tolist()
+    for a, b in itertools.pairwise(valid):
+        if b > a + 1 and excess[a] * excess[b] < 0.0:
+            found |= set(range(a, b))  # the crossing is somewhere among failed trials
     brackets = set(_open_brackets(powers, excess))
     return sorted(found - brackets)
 
@@ -376,8 +362,10 @@ def _distinct(powers: list[float]) -> list[float]:
 
 def _few(words: Sequence[str]) -> str:
     """The first few of some words, and how many more there are."""
-    more = len(words) - MAX_NAMED
-    return ", ".join(words[:MAX_NAMED]) + (f" and {more} more" if more > 0 else "")
+    text = ", ".join(words[:MAX_NAMED])
+    if len(words) > MAX_NAMED:
+        text += f" and {len(words) - MAX_NAMED} more"
+    return text
 
 
 def _range(factors: Sequence[float]) -> str:

@@ -12,18 +12,17 @@ from typing import Any
 
 from iblf_jax.core import checks, notices
 from iblf_jax.core.progress import bar
-from iblf_jax.simulation.accuracy import RELATIVE
+from iblf_jax.simulation.error_estimate import RELATIVE
 from iblf_jax.simulation.metrics import Fold
-from iblf_jax.simulation.sampling import has_noise
+from iblf_jax.simulation.noise import has_noise
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.blocks import case_bytes
-from iblf_jax.studies.designs import MAX_RUNS, check_sampler
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.execution import run_all_cases
-from iblf_jax.studies.options import ThisProcess, check_deprecated, executor_of
-from iblf_jax.studies.recommended import warn_of_step
-from iblf_jax.studies.setup import prepare
+from iblf_jax.studies.options import RunOptions, ThisProcess, check_deprecated, executor_of
 from iblf_jax.studies.study import Study
+from iblf_jax.studies.study_setup import prepare
+from iblf_jax.studies.time_step import warn_of_step
 
 
 @notices.each_warning_once
@@ -84,28 +83,25 @@ def monte_carlo(
     """
     check_deprecated("monte_carlo", deprecated, ("chunk", "memory", "devices"))
     executor = executor_of(executor, deprecated)
-    runs = checks.positive_integer("runs", runs, most=MAX_RUNS)
-    replicates = check_sampler(sampler, runs, replicates)
-    _check_not_all_the_same(scenario, perturbations)
-    study = prepare(
-        scenario,
-        perturbations,
-        runs,
-        seed,
+    options = RunOptions(
         duration=duration,
         dt=dt,
         method=method,
-        metrics=metrics,
         backend=backend,
+        runs=runs,
+        seed=seed,
         sampler=sampler,
         replicates=replicates,
     )
-    checks.fits("runs", runs, case_bytes(study))
-    with bar(progress, runs) as shown:
-        results = run_all_cases(study, executor, shown.update)
+    options = options.checked()
+    _check_not_all_the_same(scenario, perturbations)
+    prepared = prepare(scenario, perturbations, options, metrics)
+    checks.fits("runs", options.runs, case_bytes(prepared))
+    with bar(progress, options.runs) as shown:
+        results = run_all_cases(prepared, executor, shown.update)
     errors = results.metrics[RELATIVE]
-    warn_of_step(results.status, results.fastest_mode, errors, float(dt), method)
-    return Study.of(study, results)
+    warn_of_step(results.status, results.fastest_mode, errors, options.dt, method)
+    return Study.of(prepared, results)
 
 
 def _check_not_all_the_same(scenario: Any, perturbations: Any) -> None:

@@ -1,8 +1,8 @@
-"""Options of studies as objects: where runs are computed, how a store is written, what a sweep
-samples.
+"""Options of studies as objects: what is run, where runs are computed, how a store is written, and
+what a sweep samples.
 
-They change no number of a result.  `replacements` translates the keyword arguments of earlier
-versions into them.
+`RunOptions` are the arguments that all studies share; the others change no number of a result.
+`executor_of`, `store_of` and `design_of` accept the keyword arguments of earlier versions, too.
 """
 
 from __future__ import annotations
@@ -17,10 +17,52 @@ import jax
 
 from iblf_jax.core import checks, notices
 from iblf_jax.engine import STUDY_MEMORY
+from iblf_jax.simulation.integrators import tableau
+from iblf_jax.studies.designs import MAX_RUNS, check_sampler
 
 MAX_MEMORY = 2.0**60
 """Bytes.  No machine has more."""
 WRITERS = ("client", "worker")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RunOptions:
+    """The arguments that `monte_carlo`, `sweep`, `sensitivity` and `recommended_dt` share."""
+
+    duration: float
+    """Length of a run [s]."""
+    dt: float
+    """Time step [s]."""
+    method: str
+    """The integrator."""
+    backend: str
+    """As requested: perhaps "auto".  `engine.RunRequest` checks it."""
+    runs: int
+    """Runs at each point."""
+    seed: int
+    sampler: str = "independent"
+    replicates: int = 1
+    """Designs that the runs are made of."""
+
+    def checked(self) -> RunOptions:
+        """The same options with valid values; ValueError names an invalid one."""
+        runs = checks.positive_integer("runs", self.runs, most=MAX_RUNS)
+        replicates = check_sampler(self.sampler, runs, self.replicates)
+        tableau(self.method)
+        checks.whole_steps(self.duration, self.dt)
+        return dataclasses.replace(
+            self,
+            duration=float(self.duration),
+            dt=float(self.dt),
+            runs=runs,
+            seed=checks.seed(self.seed),
+            replicates=replicates,
+        )
+
+    @property
+    def steps(self) -> int:
+        """Time steps of a run."""
+        return checks.whole_steps(self.duration, self.dt)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,11 +158,9 @@ def executor_of(executor: Any, deprecated: Mapping[str, Any]) -> ThisProcess | E
       ValueError: it is neither a `ThisProcess` nor a `concurrent.futures.Executor`, or comes with
         one of the deprecated arguments.
     """
-    local = {n: deprecated[n] for n in ("chunk", "memory", "devices") if n in deprecated}
+    replaced = _replaced("executor", executor is not None, deprecated)
     if executor is None:
-        return ThisProcess(**local).checked()
-    if local:
-        raise _given_twice("executor", local)
+        executor = ThisProcess(**replaced)
     if isinstance(executor, ThisProcess):
         return executor.checked()
     if not isinstance(executor, Executor):
@@ -135,30 +175,37 @@ def executor_of(executor: Any, deprecated: Mapping[str, Any]) -> ThisProcess | E
 
 def store_of(store: Any, deprecated: Mapping[str, Any]) -> StoreOptions | None:
     """The checked `store` of a sweep, from a path or an object; arguments as `executor_of`."""
-    unit = {name: deprecated[name] for name in ("unit",) if name in deprecated}
-    if isinstance(store, StoreOptions):
-        if unit:
-            raise _given_twice("store", unit)
-        return store.checked()
+    is_object = isinstance(store, StoreOptions)
+    replaced = _replaced("store", is_object, deprecated)
     if store is None:
-        if unit.get("unit") is not None:
-            checks.positive_integer("unit", unit["unit"], most=checks.MAX_STEPS)
+        if replaced.get("unit") is not None:
+            checks.positive_integer("unit", replaced["unit"], most=checks.MAX_STEPS)
         return None
-    return StoreOptions(store, **unit).checked()
+    if not is_object:
+        store = StoreOptions(store, **replaced)
+    return store.checked()
 
 
 def design_of(design: Any, deprecated: Mapping[str, Any]) -> Design:
     """The `design` of a sweep, from a word or an object; arguments as `executor_of`."""
-    points = {name: deprecated[name] for name in ("points",) if name in deprecated}
-    if not isinstance(design, Design):
-        return Design(design, **points)
-    if points:
-        raise _given_twice("design", points)
-    return design
+    is_object = isinstance(design, Design)
+    replaced = _replaced("design", is_object, deprecated)
+    if is_object:
+        return design
+    return Design(design, **replaced)
 
 
-def _given_twice(name: str, further: Mapping[str, Any]) -> ValueError:
-    names = ", ".join(further)
-    return checks.fail(
-        name, checks.Words(f"{name}= and {names}"), "one of them", f"Put {names} into {name}."
-    )
+def _replaced(argument: str, is_object: bool, deprecated: Mapping[str, Any]) -> dict[str, Any]:
+    """The deprecated keyword arguments that an argument replaces; ValueError where that is given
+    as an object, too.
+    """
+    found = {name: x for name, x in deprecated.items() if REPLACED[name][0] == argument}
+    if found and is_object:
+        names = ", ".join(found)
+        raise checks.fail(
+            argument,
+            checks.Words(f"{argument}= and {names}"),
+            "one of them",
+            f"Put {names} into {argument}.",
+        )
+    return found

@@ -3,10 +3,10 @@
 With y the metric and x_1 ... x_d independent parameters,
 
     S_i  = var(E[y | x_i]) / var(y)              first order: what x_i explains by itself
-    ST_i = E[var(y | all but x_i)] / var(y)      total: with all its interactions; 0 if and only if
-    x_i does not matter
+    ST_i = E[var(y | all but x_i)] / var(y)      total: with all its interactions
 
-estimated from n (d + 2) runs on a Sobol design by SciPy (`scipy.stats.sobol_indices`).
+ST_i is 0 if and only if x_i does not matter.  SciPy estimates both from n (d + 2) runs on a Sobol
+design (`scipy.stats.sobol_indices`).
 
 Source: A. Saltelli et al., Computer Physics Communications 181 (2010) 259-270.
 """
@@ -24,7 +24,7 @@ import numpy as np
 from iblf_jax.core import checks, notices, tables
 from iblf_jax.core.progress import bar
 from iblf_jax.core.pytree import field_values
-from iblf_jax.core.status import FAILED
+from iblf_jax.core.status import FAILED, has_flag
 from iblf_jax.simulation.metrics import Fold, metric_units
 from iblf_jax.simulation.results import Metrics
 from iblf_jax.simulation.scenario import Scenario
@@ -34,8 +34,8 @@ from iblf_jax.studies.designs import MAX_SOBOL, split
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.draws import sample_size
 from iblf_jax.studies.execution import run_all_cases
-from iblf_jax.studies.options import ThisProcess, check_deprecated, executor_of
-from iblf_jax.studies.setup import PreparedStudy, prepare
+from iblf_jax.studies.options import RunOptions, ThisProcess, check_deprecated, executor_of
+from iblf_jax.studies.study_setup import PreparedStudy, prepare
 
 if TYPE_CHECKING:
     import xarray
@@ -151,29 +151,18 @@ def sensitivity(
     executor = executor_of(executor, deprecated)
     points = _checked_points(points)
     _check_arguments(perturbations, output)
-    study = prepare(
-        scenario,
-        perturbations,
-        1,
-        checks.seed(seed),
-        duration=duration,
-        dt=dt,
-        method=method,
-        metrics=metrics,
-        backend=backend,
+    options = RunOptions(
+        duration=duration, dt=dt, method=method, backend=backend, runs=1, seed=seed
     )
+    prepared = prepare(scenario, perturbations, options.checked(), metrics)
     if isinstance(output, str):
-        checks.one_of("output", output, sorted(result_shapes(study).metrics))
-    shapes = sample_size(study.program.targets, study.shared.cases.perturbations)
-    names = [
-        path + "".join(f"[{i}]" for i in place)
-        for path, shape in shapes.items()
-        for place in np.ndindex(shape)
-    ]
+        checks.one_of("output", output, sorted(result_shapes(prepared).metrics))
+    shapes = sample_size(prepared.program.targets, prepared.shared.cases.perturbations)
+    names = [name for path, shape in shapes.items() for name in statistics.entries(path, shape)]
     runs = points * (len(names) + 2)
-    checks.fits("points", points, (len(names) + 2) * (case_bytes(study) + 3 * 8.0 * len(names)))
+    checks.fits("points", points, (len(names) + 2) * (case_bytes(prepared) + 3 * 8.0 * len(names)))
     with bar(progress, runs) as shown:
-        search = _Evaluation(study, shapes, output, executor, shown.update)
+        search = _Evaluation(prepared, shapes, output, executor, shown.update)
         indices, ends = _indices(search, points, len(names))
     return Sensitivity(
         tuple(names),
@@ -216,7 +205,7 @@ def _indices(evaluation: _Evaluation, points: int, dimension: int) -> tuple[Any,
         func=evaluate,
         n=points,
         dists=[stats.uniform()] * dimension,
-        rng=np.random.default_rng(evaluation.study.seed),
+        rng=np.random.default_rng(evaluation.prepared.options.seed),
     )
     # The first two evaluations are the runs whose variance all others are divided by.
     if np.ptp(np.concatenate(evaluation.values[:2])) == 0:
@@ -245,37 +234,40 @@ def _ends(bootstrapped: Any) -> np.ndarray:
     return np.where(np.isfinite(ends), ends, percentiles)
 
 
+@dataclasses.dataclass(eq=False)
 class _Evaluation:
     """The output as a function of points of the unit cube."""
 
-    def __init__(
-        self,
-        study: PreparedStudy,
-        shapes: dict[str, tuple[int, ...]],
-        output: str | Callable[[Metrics], Any],
-        executor: ThisProcess | Executor,
-        advance: Callable[[int], None],
-    ):
-        self.study = study
-        self.shapes = shapes
-        self.output = output
-        self.executor = executor
-        self.advance = advance
-        self.name = output if isinstance(output, str) else "output"
-        """In error messages."""
-        self.label = str(getattr(output, "__name__", self.name))
-        """In the result."""
-        self.failed = 0
-        """Number of runs that failed until now."""
-        self.values: list[np.ndarray] = []
-        """The outputs of all evaluations until now."""
+    prepared: PreparedStudy
+    shapes: dict[str, tuple[int, ...]]
+    """Name of the draws -> shape of their uniform numbers."""
+    output: str | Callable[[Metrics], Any]
+    executor: ThisProcess | Executor
+    advance: Callable[[int], None]
+    failed: int = 0
+    """Number of runs that failed until now."""
+    values: list[np.ndarray] = dataclasses.field(default_factory=list)
+    """The outputs of all evaluations until now."""
+
+    @property
+    def name(self) -> str:
+        """The output in error messages."""
+        if isinstance(self.output, str):
+            return self.output
+        return "output"
+
+    @property
+    def label(self) -> str:
+        """The output in the result."""
+        return str(getattr(self.output, "__name__", self.name))
 
     def __call__(self, u: np.ndarray) -> np.ndarray:
         """The outputs at points u, (N, d) -> (N,)."""
-        dtype = self.study.shared.cases.scenario.initial.q.dtype
+        dtype = self.prepared.scenario.initial.q.dtype
         designed = split(u, self.shapes, dtype)
-        study = dataclasses.replace(self.study, runs=len(u), designed=designed)
-        results = run_all_cases(study, self.executor, self.advance)
+        options = dataclasses.replace(self.prepared.options, runs=len(u))
+        prepared = dataclasses.replace(self.prepared, options=options, designed=designed)
+        results = run_all_cases(prepared, self.executor, self.advance)
         y = self._output_of(results.metrics)
         if y.shape != (len(u),) or y.dtype.kind not in "fiub":
             raise checks.fail(
@@ -292,7 +284,7 @@ class _Evaluation:
                 "finite numbers",
                 "Choose another output or narrower distributions.",
             )
-        self.failed += int(np.sum(results.status & int(FAILED) != 0))
+        self.failed += int(np.sum(has_flag(results.status, FAILED)))
         self.values.append(y.astype(float))
         return self.values[-1]
 
@@ -300,7 +292,9 @@ class _Evaluation:
         if isinstance(self.output, str):
             return statistics.one_number(metrics, self.output)
         try:
-            return np.asarray(self.output(Metrics(metrics, metric_units(self.study.shared.folds))))
+            return np.asarray(
+                self.output(Metrics(metrics, metric_units(self.prepared.shared.folds)))
+            )
         except Exception as error:
             expected = "a function of the metrics that returns one number a run"
             raise checks.fail("output", f"{type(error).__name__}: {error}", expected) from error

@@ -126,13 +126,18 @@ def one_number(metrics: Mapping[str, Any], name: str) -> np.ndarray:
     return flat.max(1)
 
 
+def entries(path: str, shape: tuple[int, ...]) -> list[str]:
+    """The paths of the entries of a leaf: "plant.mass[0]", "plant.mass[1]"."""
+    return [path + "".join(f"[{i}]" for i in place) for place in np.ndindex(shape)]
+
+
 def columns(samples: Mapping[str, Any]) -> dict[str, np.ndarray]:
     """The drawn parameters entry by entry, "plant.mass[0]" -> (N,)."""
-    out = {}
+    out: dict[str, np.ndarray] = {}
     for path, values in samples.items():
         values = np.asarray(values)
-        for place in np.ndindex(values.shape[1:]):
-            out[path + "".join(f"[{i}]" for i in place)] = values[(slice(None), *place)]
+        flat = values.reshape(len(values), -1)
+        out |= zip(entries(path, values.shape[1:]), flat.T, strict=True)
     return out
 
 

@@ -26,15 +26,18 @@ import json
 import os
 import warnings
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from iblf_jax.core import checks
 from iblf_jax.kernels import draft
 
 FORMAT = 1
+ABSENT = object()
+"""In the place of an entry that a configuration does not have."""
 DONE = "done"
 CASE = "case"
 _MARK = "iblf_jax_store"
@@ -60,7 +63,7 @@ class Variable(NamedTuple):
     shape: tuple[int, ...]
     dtype: str
     dims: tuple[str, ...]
-    unit: str
+    si_unit: str
 
 
 def _zarr() -> Any:
@@ -77,27 +80,23 @@ def _zarr() -> Any:
 def differences(theirs: Any, ours: Any, name: str = "") -> list[str]:
     """Where two configurations differ, "name: the store has x, this call y"."""
     if isinstance(theirs, dict) and isinstance(ours, dict):
-        keys = [*theirs, *(key for key in ours if key not in theirs)]
-        absent = object()
-        found = [
-            differences(
-                theirs.get(k, absent), ours.get(k, absent), f"{name}.{k}" if name else str(k)
-            )
-            for k in keys
-        ]
-        return [text for texts in found for text in texts]
+        found = []
+        for key in {**theirs, **ours}:
+            inner = f"{name}.{key}" if name else str(key)
+            found += differences(theirs.get(key, ABSENT), ours.get(key, ABSENT), inner)
+        return found
     if type(theirs) is type(ours) and theirs == ours:
         return []
+    return [f"{name}: the store has {_shown(theirs)}, this call {_shown(ours)}"]
 
-    def shown(value):
-        text = "nothing"
-        if isinstance(value, str | int | float | list | dict | bool | None):
-            text = json.dumps(value)
-        if len(text) > 80:
-            text = text[:77] + "..."
-        return text
 
-    return [f"{name}: the store has {shown(theirs)}, this call {shown(ours)}"]
+def _shown(value: Any) -> str:
+    text = "nothing"
+    if value is not ABSENT:
+        text = json.dumps(value)
+    if len(text) > 80:
+        text = text[:77] + "..."
+    return text
 
 
 class Store:
@@ -110,11 +109,9 @@ class Store:
         self.config: dict[str, Any] = attributes["config"]
         self.cases: int = attributes["cases"]
         self.unit: int = attributes["unit"]
-        if any(
-            isinstance(x, bool) or not isinstance(x, int) or x < 1 for x in (self.cases, self.unit)
-        ):
-            raise ValueError(f"{self.cases!r} cases in units of {self.unit!r}")
-        self.units = -(-self.cases // self.unit)
+        for count in (self.cases, self.unit):
+            checks.positive_integer("cases and unit", count)
+        self.units = checks.ceil_div(self.cases, self.unit)
         self._salt = zlib.crc32(json.dumps(self.config, sort_keys=True).encode())
         self._arrays = {
             name: _numbers(group, name, self.cases, self.unit) for name in attributes["variables"]
@@ -122,36 +119,34 @@ class Store:
         self._done = _numbers(group, DONE, self.units, 1)
         self._description = self._described()
 
-    @property
-    def names(self) -> list[str]:
-        """Names of the arrays."""
-        return list(self._arrays)
-
     def span(self, unit: int) -> slice:
         """The cases of a unit."""
         return slice(unit * self.unit, min((unit + 1) * self.unit, self.cases))
 
+    def size(self, unit: int) -> int:
+        """Number of cases of a unit."""
+        span = self.span(unit)
+        return span.stop - span.start
+
     def marks(self) -> np.ndarray:
         """Which units are marked as done, (units,) bool."""
         self._check_it_is_there()
-        with self._reading("the marks"):
+        try:
             return np.asarray(self._done[:]) != 0
+        except Exception as error:
+            text = f"{self.path}: the marks cannot be read ({_one_line(error)})."
+            raise StoreError(text) from error
 
-    def dims(self, name: str) -> tuple[str, ...]:
-        """Dimensions of an array."""
-        return tuple(self._arrays[name].metadata.dimension_names)
-
-    def units_of(self, name: str) -> str:
+    def si_unit(self, name: str) -> str:
         """SI unit of an array."""
         return str(self._arrays[name].attrs.get("units", ""))
 
     def _mark(self, data: Mapping[str, np.ndarray]) -> int:
-        total = self._salt
+        checksum = self._salt
         for name in sorted(data):
-            total = zlib.crc32(
-                np.ascontiguousarray(data[name]).tobytes(), zlib.crc32(name.encode(), total)
-            )
-        return (1 << 32) | total
+            checksum = zlib.crc32(name.encode(), checksum)
+            checksum = zlib.crc32(np.ascontiguousarray(data[name]).tobytes(), checksum)
+        return (1 << 32) | checksum
 
     def write(self, unit: int, data: Mapping[str, np.ndarray]) -> None:
         """Writes one unit: its data, then its mark.
@@ -162,14 +157,23 @@ class Store:
         """
         self._check_it_is_there()
         try:
-            with self._writing():
-                for name, array in self._arrays.items():
-                    array[self.span(unit)] = data[name]
-                self._done[unit] = self._mark(data)
+            self._write(unit, data)
             self._check_it_is_there()
         except StoreWriteError:
             self._take_back(unit)
             raise
+
+    def _write(self, unit: int, data: Mapping[str, np.ndarray]) -> None:
+        try:
+            for name, array in self._arrays.items():
+                array[self.span(unit)] = data[name]
+            self._done[unit] = self._mark(data)
+        except OSError as error:
+            kept = (
+                f" {self.marks().sum()} of {self.units} units are written and valid: start the"
+                " same call again to go on."
+            )
+            raise _why(self.path, error, kept) from error
 
     def _described(self) -> list[bytes | None]:
         """What describes this store on disk: the group's file and those of its arrays; None for one
@@ -267,35 +271,14 @@ class Store:
                 out[name][self.span(int(unit))] = values
         return out, done
 
-    @contextlib.contextmanager
-    def _reading(self, what: str) -> Iterator[None]:
-        try:
-            yield
-        except Exception as error:
-            raise StoreError(f"{self.path}: {what} cannot be read ({_one_line(error)}).") from error
-
-    @contextlib.contextmanager
-    def _writing(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            kept = (
-                f"{int(self.marks().sum())} of {self.units} units are written and valid: start the"
-                " same call again to go on"
-            )
-            raise _why(self.path, error, kept) from error
-
 
 def _numbers(group: Any, name: str, rows: int, chunk: int) -> Any:
     """An array of a group; ValueError if it is none of numbers that this package could have
     written.
     """
     array = group[name]
-    format_, kind = (
-        getattr(array.metadata, "zarr_format", None),
-        getattr(getattr(array, "dtype", None), "kind", None),
-    )
-    if format_ != 3 or kind is None or kind not in _NUMBERS:
+    is_array = isinstance(array, _zarr().Array)
+    if not is_array or array.metadata.zarr_format != 3 or array.dtype.kind not in _NUMBERS:
         raise ValueError(f"{name!r} is no array of numbers in zarr's format 3")
     if array.shape[:1] != (rows,) or array.chunks != (min(chunk, rows), *array.shape[1:]):
         raise ValueError(
@@ -312,18 +295,12 @@ def _one_line(error: Exception) -> str:
 
 def _why(path: Path, error: OSError, kept: str = "") -> StoreWriteError:
     """The error for a failed write, in words."""
+    text = f"cannot be written ({error.strerror or error})."
     if error.errno in _FULL:
-        text = (
-            f"{path}: no space left to write to ({error.strerror}). Make room, or take another"
-            " disk."
-        )
+        text = f"no space left to write to ({error.strerror}). Make room, or take another disk."
     elif error.errno in _FORBIDDEN:
-        text = f"{path}: cannot be written ({error.strerror}). Choose a path that you may write to."
-    else:
-        text = f"{path}: cannot be written ({error.strerror or error})."
-    if kept:
-        text += f" {kept[0].upper()}{kept[1:]}."
-    return StoreWriteError(text)
+        text = f"{text} Choose a path that you may write to."
+    return StoreWriteError(f"{path}: {text}{kept}")
 
 
 def load_store(path: str | os.PathLike) -> Store:
@@ -389,36 +366,39 @@ def open_store(
         _make(place, config, variables, cases, unit)
     store = load_store(place)
     found = differences(store.config, config)
-    named = [text for text in found if not text.startswith("program:")]
-    found = named or [
+    # Where anything else differs, the program differs because of that.
+    found = [text for text in found if not text.startswith("program:")] or [
         text + " (the code of a law, a robot or a metric has changed)" for text in found
     ]
     if not any_unit:
         found += differences({"unit": store.unit}, {"unit": unit})
     if found:
-        tied = any(text.startswith("kernel.") for text in found)
-        remedy = (
-            "A native kernel is tied to processor and compiler: go on on a machine of the same"
-            ' kind, or choose another path, with backend="vmap" if machines of several kinds are to'
-            " share it."
-            if tied
-            else "Go on with the same arguments, or choose another path."
-        )
-        more = ""
-        if len(found) > 3:
-            more = f" (and {len(found) - 3} more)"
-        raise StoreError(
-            f"{place}: was made with another configuration: {'; '.join(found[:3])}{more}. {remedy}"
-        )
+        raise StoreError(_of_another_configuration(place, found))
     if not os.access(place, os.W_OK):
         raise _why(place, PermissionError(errno.EACCES, os.strerror(errno.EACCES)))
     return store
 
 
+def _of_another_configuration(place: Path, found: list[str]) -> str:
+    remedy = "Go on with the same arguments, or choose another path."
+    if any(text.startswith("kernel.") for text in found):
+        remedy = (
+            "A native kernel is tied to processor and compiler: go on on a machine of the same"
+            ' kind, or choose another path, with backend="vmap" if machines of several kinds are to'
+            " share it."
+        )
+    shown = "; ".join(found[:3])
+    if len(found) > 3:
+        shown += f" (and {len(found) - 3} more)"
+    return f"{place}: was made with another configuration: {shown}. {remedy}"
+
+
 def _exists(place: Path) -> bool:
     """Whether something is there (an empty folder is nothing)."""
     try:
-        return place.exists() and not (place.is_dir() and not any(place.iterdir()))
+        if place.is_dir():
+            return any(place.iterdir())
+        return place.exists()
     except OSError as error:
         raise _why(place, error) from error
 
@@ -444,28 +424,20 @@ def _make(
                     dimension_names=(CASE, *v.dims),
                     config={"write_empty_chunks": True},
                 )
-                array.attrs["units"] = v.unit
+                array.attrs["units"] = v.si_unit
             group.create_array(
                 DONE,
-                shape=(-(-cases // unit),),
+                shape=(checks.ceil_div(cases, unit),),
                 chunks=(1,),
                 dtype="uint64",
                 fill_value=0,
                 dimension_names=("unit",),
             )
-            group.attrs.update(
-                {
-                    _MARK: FORMAT,
-                    "config": config,
-                    "cases": cases,
-                    "unit": unit,
-                    "variables": list(variables),
-                }
-            )
+            attributes = {"config": config, "cases": cases, "unit": unit}
+            group.attrs.update({_MARK: FORMAT, **attributes, "variables": list(variables)})
             with warnings.catch_warnings():
-                warnings.simplefilter(
-                    "ignore"
-                )  # zarr says that consolidated metadata are not in its specification yet
+                # zarr says that consolidated metadata are not in its specification yet.
+                warnings.simplefilter("ignore")
                 zarr.consolidate_metadata(group.store)
             os.rename(folder / "store", place)
     except OSError as error:

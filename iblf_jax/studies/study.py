@@ -1,15 +1,14 @@
 """The result of a Monte-Carlo study: `Study`.
 
-Per run it holds the metrics, the status and what was drawn; never a trajectory.  `study.replay(i)`
-makes run i again in full.
+A study holds the metrics, the status and the draws of each run, and no trajectory.
+`study.replay(i)` computes run i again with its trajectory.
 
-Failed runs are part of every count and of every statistic, unless they are left out on request, and
-then the answer says how many were.  Runs that could not be made (an inadmissible draw,
-`Status.INADMISSIBLE_DRAW`) have no numbers; they are left out of statistics always, are counted,
-and the answer says so.
+Failed runs are part of every count and of every statistic.  A statistic that leaves them out on
+request reports how many there were.  Runs that could not be made (an inadmissible draw,
+`Status.INADMISSIBLE_DRAW`) have no numbers: they are counted, and no statistic includes them.
 
 A run whose start was drawn on or outside its bounds has violated them at t = 0, before any law
-could act.  Its flag is the same; counts, `started_outside` and `replay` tell it apart.
+could act.  Its flag is the same; `started_outside` says which runs these are.
 """
 
 from __future__ import annotations
@@ -24,20 +23,20 @@ import numpy as np
 
 from iblf_jax.core import checks, notices
 from iblf_jax.core.presentation import present
-from iblf_jax.core.status import FAILED, Status, describe
+from iblf_jax.core.status import FAILED, Status, describe, has_flag
 from iblf_jax.core.status import VIOLATED as LEFT
 from iblf_jax.engine import RunRequest, block_size, run_rollout
 from iblf_jax.engine.simulate import SimulationWarning
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.metrics import metric_units
+from iblf_jax.simulation.noise import NOISE_NAME, noise_of
 from iblf_jax.simulation.results import Metrics, Rollout
-from iblf_jax.simulation.sampling import NOISE_NAME, noise_of
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies import statistics, summaries
 from iblf_jax.studies.blocks import BlockResults, run_blocks
 from iblf_jax.studies.distributions import Perturbation
-from iblf_jax.studies.setup import PreparedStudy
 from iblf_jax.studies.statistics import Probability
+from iblf_jax.studies.study_setup import PreparedStudy
 from iblf_jax.world.regions import in_words
 from iblf_jax.world.robots import joint_names
 
@@ -46,7 +45,7 @@ if TYPE_CHECKING:
 
 VIOLATED = LEFT | Status.NOT_FINITE
 """What `violation_probability` counts: a run that did not keep its bounds or regions, or that ran
-away, after which it has no say."""
+away, after which nothing is known about its bounds."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -83,14 +82,13 @@ class Study:
     def of(cls, setup: PreparedStudy, results: BlockResults) -> Study:
         """The study with these results."""
         units = metric_units(setup.shared.folds)
-        order = {
-            name: None for name, _ in units if name in results.metrics
-        } | results.metrics  # theirs, not sorted as by jit
-        metrics = Metrics({name: results.metrics[name] for name in order}, units)
+        # In the order of the metrics; jit sorts the names.
+        names = [name for name, _ in units if name in results.metrics]
+        order = {**dict.fromkeys(names), **results.metrics}
         samples = {target.path: results.samples[target.path] for target in setup.program.targets}
         return cls(
-            setup.shared.cases.scenario,
-            metrics,
+            setup.scenario,
+            Metrics(order, units),
             results.status,
             results.fastest_mode,
             samples,
@@ -100,7 +98,7 @@ class Study:
     @property
     def runs(self) -> int:
         """Number of runs N."""
-        return self.setup.runs
+        return self.setup.options.runs
 
     @property
     def perturbations(self) -> dict[str, Perturbation]:
@@ -110,22 +108,22 @@ class Study:
     @property
     def seed(self) -> int:
         """The seed."""
-        return self.setup.seed
+        return self.setup.options.seed
 
     @property
     def backend(self) -> str:
         """The backend that computed the runs: "native", "gpu" or "vmap", not "auto"."""
-        return self.setup.program.batch.backend
+        return self.setup.backend
 
     @property
     def dt(self) -> float:
         """Time step [s]."""
-        return float(self.setup.shared.dt)
+        return self.setup.dt
 
     @property
     def duration(self) -> float:
         """Length of a run [s]."""
-        return self.setup.program.steps * self.dt
+        return self.setup.duration
 
     def __len__(self) -> int:
         return self.runs
@@ -148,15 +146,16 @@ class Study:
     @property
     def made(self) -> np.ndarray:
         """Whether each run was made, (N,) bool; False where a draw was inadmissible."""
-        return self.status & int(Status.INADMISSIBLE_DRAW) == 0
+        return ~has_flag(self.status, Status.INADMISSIBLE_DRAW)
 
     @cached_property
     def started_outside(self) -> np.ndarray:
         """Whether each run violated a bound or a region at t = 0 already, (N,) bool: drawn there,
         so that no law could keep it.
         """
-        inside = [np.min(margins, axis=1) > 0 for margins in summaries.first_margins(self).values()]
-        return self.made & (self.status & int(LEFT) != 0) & ~np.all(inside, axis=0)
+        first = summaries.first_margins(self.scenario, self.samples)
+        inside = [np.min(margins, axis=1) > 0 for margins in first.values()]
+        return self.made & has_flag(self.status, LEFT) & ~np.all(inside, axis=0)
 
     @property
     def status_counts(self) -> dict[str, int]:
@@ -166,14 +165,12 @@ class Study:
         `status.FAILED`.  Then how many have each flag, of which a run may have several, and how
         many of those that violated a bound did so at t = 0 (`started_outside`).
         """
-        failed, flagged = self.status & int(FAILED) != 0, self.status != 0
-        counts = {
-            "OK": int(np.sum(~flagged)),
-            "FLAGGED": int(np.sum(flagged & ~failed)),
-            "FAILED": int(np.sum(failed)),
-        }
-        counts |= {flag.name or "": int(np.sum(self.status & int(flag) != 0)) for flag in Status}
-        return counts | {"STARTED_OUTSIDE": int(np.sum(self.started_outside))}
+        flagged = self.status != 0
+        failed = has_flag(self.status, FAILED)
+        masks = {"OK": ~flagged, "FLAGGED": flagged & ~failed, "FAILED": failed}
+        masks |= {flag.name or "": has_flag(self.status, flag) for flag in Status}
+        masks["STARTED_OUTSIDE"] = self.started_outside
+        return {name: int(np.sum(mask)) for name, mask in masks.items()}
 
     @property
     def violation_probability(self) -> Probability:
@@ -210,16 +207,17 @@ class Study:
         Source: C. J. Clopper, E. S. Pearson, Biometrika 26 (1934) 404-413.
         """
         try:
-            happened = (
-                self.status & int(event) != 0 if isinstance(event, int) else np.asarray(event)
-            )
+            happened = np.asarray(event)
+            if isinstance(event, int):
+                happened = has_flag(self.status, event)
         except Exception:  # a number of more bits than flags, or nothing that is an array
             happened = np.zeros(0)
         if happened.shape != (self.runs,) or happened.dtype != bool:
             raise checks.fail("event", event, f"flags of Status, or {self.runs} booleans")
         confidence = statistics.check_confidence(confidence)
+        options = self.setup.options
         return statistics.probability(
-            happened, self.made, confidence, self.setup.sampler, self.setup.replicates
+            happened, self.made, confidence, options.sampler, options.replicates
         )
 
     def worst(self, count: int = 10, metric: str = "margin") -> np.ndarray:
@@ -252,7 +250,7 @@ class Study:
     def chosen(self, exclude_failed: bool = False) -> tuple[np.ndarray, dict[str, Any]]:
         """Which runs a statistic is over, (N,) bool, and the counts that go with it."""
         exclude_failed = checks.flag("exclude_failed", exclude_failed)
-        has_failed = self.status & int(FAILED) != 0
+        has_failed = has_flag(self.status, FAILED)
         used = self.made
         if exclude_failed:
             used = used & ~has_failed
@@ -268,12 +266,11 @@ class Study:
     def included(self) -> str:
         """In words: which runs statistics are over, unless failed ones are left out."""
         _, counts = self.chosen()
-        text = f"statistics are over {counts['runs']} runs, "
+        failed = "none of them failed"
         if counts["failed_included"]:
-            text += f"{counts['failed_included']} failed ones included (exclude_failed=True leaves"
-            text += " them out)"
-        else:
-            text += "none of them failed"
+            failed = f"{counts['failed_included']} failed ones included"
+            failed += " (exclude_failed=True leaves them out)"
+        text = f"statistics are over {counts['runs']} runs, {failed}"
         if counts["excluded"]:
             text += f"; {counts['excluded']} were not made"
         return text
@@ -294,7 +291,8 @@ class Study:
         Raises:
           ValueError: numbers outside [0, 1].
         """
-        return summaries.metric_quantiles(self, quantiles, exclude_failed)
+        used, counts = self.chosen(exclude_failed)
+        return summaries.metric_quantiles(self.metrics, self.scenario.n, quantiles, used, counts)
 
     def correlations(
         self, metrics: Sequence[str] | None = None, *, exclude_failed: bool = False
@@ -309,7 +307,8 @@ class Study:
         Raises:
           ValueError: an unknown metric.
         """
-        return summaries.correlations(self, metrics, exclude_failed)
+        used, counts = self.chosen(exclude_failed)
+        return summaries.correlations(self.metrics, self.samples, metrics, used, counts)
 
     def bands(
         self,
@@ -331,13 +330,17 @@ class Study:
         Raises:
           ValueError: bad arguments, or no run that is left.
         """
-        return summaries.bands(self, quantiles, runs, samples, exclude_failed)
+        used, _ = self.chosen(exclude_failed)
+        failed = has_flag(self.status, FAILED)
+        return summaries.bands(self.setup, quantiles, runs, samples, used, failed)
 
     def to_xarray(self) -> xarray.Dataset:
         """All runs as an `xarray.Dataset`: metrics and status along `run` (and `joint`), the drawn
         values as coordinates.
         """
-        return summaries.to_xarray(self)
+        return summaries.to_xarray(
+            self.setup, self.metrics, self.status, self.fastest_mode, self.samples
+        )
 
     def plot(self, **options: Any) -> Any:
         """Overview figure: the tube with bands, margins, and margin against each parameter.
@@ -351,8 +354,8 @@ class Study:
 
         Metrics, status and fastest mode are bit-identical to those of run `index`: its block is run
         again by the same compiled program.  The trajectory comes from the program for a single run,
-        where XLA rounds differently: it agrees with the metrics to rounding, until a run that has
-          left its bounds amplifies that.  A warning says if the run started outside its bounds.
+        which rounds differently.  It agrees with the metrics to rounding; a run that has left its
+        bounds may amplify the difference.  A warning says if the run started outside its bounds.
 
         Args:
           index: run number.
@@ -368,47 +371,54 @@ class Study:
         Source: design of this package.
         """
         i = checks.entry("index", index, self.runs, "runs")
-        record_every = checks.recorded_every(record_every, self.setup.program.steps)
+        setup, options = self.setup, self.setup.options
+        record_every = checks.recorded_every(record_every, options.steps)
         if not self.made[i]:
             drawn = {path: np.asarray(x[i]).tolist() for path, x in self.samples.items()}
             raise checks.fail(
                 f"run {i}", drawn, "admissible draws", "It was not made; see study.made."
             )
-        block, place = divmod(i, block_size())
-        ((_, again),) = run_blocks(self.setup, [block])
-        again = jax.tree.map(lambda x: x[place], again)
-        if not all(
-            np.array_equal(x, self.metrics[name][i], equal_nan=True)
-            for name, x in again.metrics.items()
-        ):
-            reason = "made on another machine or version"
-            notices.warn(f"Run {i} gives other numbers here than in the study: {reason}.")
+        again = self._computed_again(i)
         drawn = {path: x[i] for path, x in self.samples.items()}
         scenario = paths.with_parameters(self.scenario, drawn)
-        shared, program = self.setup.shared, self.setup.program
         request = RunRequest.of(
-            scenario, steps=program.steps, method=program.method, record_every=record_every
+            scenario, steps=options.steps, method=options.method, record_every=record_every
         )
-        number = self.setup.inputs_of(np.asarray([i])).index[0]
-        noise = noise_of(self.scenario, shared.cases.key, number).get(NOISE_NAME)
-        run = run_rollout(scenario, shared.folds, shared.dt, request, noise)
+        number = setup.inputs_of(np.asarray([i])).index[0]
+        noise = noise_of(self.scenario, setup.shared.cases.key, number).get(NOISE_NAME)
+        run = run_rollout(scenario, setup.shared.folds, setup.shared.dt, request, noise)
         self._warn_of_start(i)
         metrics = Metrics(again.metrics, self.metrics.unit_pairs)
         return dataclasses.replace(
             run, metrics=metrics, status=again.status, fastest_mode=again.fastest_mode
         )
 
+    def _computed_again(self, i: int) -> BlockResults:
+        """The results of run i, from its block; warns if they are not those of the study."""
+        block, place = divmod(i, block_size())
+        ((_, results),) = run_blocks(self.setup, [block])
+        again = jax.tree.map(lambda x: x[place], results)
+        if not all(
+            np.array_equal(x, self.metrics[name][i], equal_nan=True)
+            for name, x in again.metrics.items()
+        ):
+            notices.warn(
+                f"Run {i} gives other numbers here than in the study: made on another machine or"
+                " version."
+            )
+        return again
+
     def _warn_of_start(self, i: int) -> None:
         if not self.started_outside[i]:
             return
-        first = {unit: margins[i] for unit, margins in summaries.first_margins(self).items()}
-        unit = next(unit for unit, margins in first.items() if not np.min(margins) > 0)
+        margins = summaries.first_margins(self.scenario, self.samples)
+        first = {unit: x[i] for unit, x in margins.items()}
+        unit = next(unit for unit, x in first.items() if not np.min(x) > 0)
         worst, plant = int(np.argmin(first[unit])), self.scenario.plant
-        name = (
-            in_words(self.scenario.regions[worst], plant)
-            if unit == "m"
-            else joint_names(plant, self.scenario.n)[worst]
-        )
+        if unit == "m":
+            name = in_words(self.scenario.regions[worst], plant)
+        else:
+            name = joint_names(plant, self.scenario.n)[worst]
         notices.warn(
             f"Run {i} started outside its bounds: {name} was drawn {-first[unit][worst]:.3g} {unit}"
             " beyond one at t = 0. That violation is the draw's, not the law's: narrow the"
@@ -422,25 +432,24 @@ class Study:
         counts = self.status_counts
         lines = [
             f"Study({self.runs} runs of {self.duration:g} s, dt = {self.dt:g} s, seed {self.seed},"
-            f" {self.setup.sampler})"
+            f" {self.setup.options.sampler})",
+            f"  bound violated or run away: {self.violation_probability}",
         ]
-        lines += [f"  bound violated or run away: {self.violation_probability}"]
         if counts["STARTED_OUTSIDE"]:
-            lines += [
+            lines.append(
                 f"    {counts['STARTED_OUTSIDE']} of them at t = 0, because they started outside:"
                 " the draw's doing, not the law's"
-            ]
-        lines += [
+            )
+        lines.append(
             f"  failed: {counts['FAILED']}; flagged, but not failed: {counts['FLAGGED']}; ok:"
             f" {counts['OK']}"
-        ]
+        )
         flags = [
             f"{count} {describe(flag)}" for flag in Status if (count := counts[flag.name or ""])
         ]
         if flags:
             lines.append(f"  flags, of which a run may have several: {'; '.join(flags)}")
-        lines += [f"  {self.included}"]
-        return "\n".join(lines)
+        return "\n".join([*lines, f"  {self.included}"])
 
     def _repr_html_(self) -> str:
         return present("card", self)

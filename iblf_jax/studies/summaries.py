@@ -13,25 +13,32 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.core.status import FAILED, Status
+from iblf_jax.core.status import FAILED, has_flag
 from iblf_jax.engine import block_size
-from iblf_jax.simulation.paths import get, parameters, with_parameters
+from iblf_jax.simulation.paths import get, unit_at, with_parameters
+from iblf_jax.simulation.results import Metrics
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import SIGNALS, own_dims
 from iblf_jax.studies import statistics
 from iblf_jax.studies.blocks import run_blocks
-from iblf_jax.studies.config import describe_component
+from iblf_jax.studies.dataset import status_attributes
 from iblf_jax.studies.options import ThisProcess
+from iblf_jax.studies.store_config import describe_component, values_of
+from iblf_jax.studies.study_setup import PreparedStudy
 from iblf_jax.world.bounds import tube_at
 from iblf_jax.world.regions import margins
 
 if TYPE_CHECKING:
     import xarray
 
-    from iblf_jax.studies.study import Study
-
 BANDS = ("q", "e1")
 """Signals that bands are made of."""
+EDGES: dict[str, tuple[Any, str]] = {
+    "lower": (np.max, "tightest lower bound"),
+    "upper": (np.min, "tightest upper bound"),
+    "q_d": (np.median, "median reference"),
+}
+"""Signal -> how one curve is made of those of the runs, and its description."""
 
 
 def check_quantiles(quantiles: Sequence[float]) -> np.ndarray:
@@ -44,54 +51,62 @@ def check_quantiles(quantiles: Sequence[float]) -> np.ndarray:
     return values
 
 
-def first_margins(study: Study) -> dict[str, np.ndarray]:
+def first_margins(scenario: Scenario, samples: Mapping[str, Any]) -> dict[str, np.ndarray]:
     """How far each run is inside its constraints at t = 0; not above zero where it starts on or
     outside them.
 
     By unit: "rad" and, where velocities have bounds, "rad/s", (N, n); "m" where there are m
-      regions, (N, m).
+    regions, (N, m).
     """
-    return {
-        unit: np.asarray(x) for unit, x in _first_margins(study.scenario, study.samples).items()
-    }
+    return jax.tree.map(np.asarray, _first_margins(scenario, samples))
 
 
 @jax.jit
 def _first_margins(scenario: Scenario, samples: Mapping[str, Any]) -> dict[str, jax.Array]:
     def one(drawn: Mapping[str, Any]) -> dict[str, jax.Array]:
-        made = with_parameters(scenario, drawn)
-        q, dq, zero = made.initial.q, made.initial.dq, jnp.zeros((), made.initial.q.dtype)
-        tube = tube_at(made.reference, made.bounds, zero)
+        perturbed = with_parameters(scenario, drawn)
+        q, dq = perturbed.initial.q, perturbed.initial.dq
+        zero = jnp.zeros((), q.dtype)
+        tube = tube_at(perturbed.reference, perturbed.bounds, zero)
         found = {"rad": jnp.minimum(q - tube.lower, tube.upper - q)}
-        if made.velocity_bounds is not None:
-            low, high = made.context.speed_limits(zero)
+        if perturbed.velocity_bounds is not None:
+            low, high = perturbed.context.speed_limits(zero)
             found["rad/s"] = jnp.minimum(dq - low, high - dq)
-        if made.regions:
-            found["m"] = margins(made.regions, made.plant, q)
+        if perturbed.regions:
+            found["m"] = margins(perturbed.regions, perturbed.plant, q)
         return found
 
     return jax.vmap(one)(samples)
 
 
 def metric_quantiles(
-    study: Study, quantiles: Sequence[float], exclude_failed: bool
+    metrics: Metrics,
+    n: int,
+    quantiles: Sequence[float],
+    used: np.ndarray,
+    counts: Mapping[str, Any],
 ) -> xarray.Dataset:
-    """Quantiles of every metric over the runs; see `Study.quantiles`."""
+    """Quantiles of every metric over the runs; see `Study.quantiles`.
+
+    Args:
+      metrics: of all runs.
+      n: number of joints.
+      quantiles: numbers from 0 to 1.
+      used: the runs that count, (N,) bool.
+      counts: attributes of the result.
+    """
     import xarray
 
     levels = check_quantiles(quantiles)
-    used, counts = study.chosen(exclude_failed)
     variables = {}
-    for name, values in study.metrics.items():
+    for name, values in metrics.items():
         values = np.asarray(values)
-        made = np.full((len(levels), *values.shape[1:]), np.nan)
+        shape = values.shape[1:]
+        result = np.full((len(levels), *shape), np.nan)
         if used.any():
-            made = _quantile(values[used], levels)
-        variables[name] = (
-            ("quantile", *own_dims(name, values.shape[1:], study.scenario.n)),
-            made,
-            {"units": study.metrics.units.get(name, "")},
-        )
+            result = _quantile(values[used], levels)
+        dims = ("quantile", *own_dims(name, shape, n))
+        variables[name] = (dims, result, {"units": metrics.units.get(name, "")})
     return xarray.Dataset(variables, {"quantile": levels}, counts)
 
 
@@ -101,23 +116,24 @@ def _quantile(values: np.ndarray, levels: np.ndarray) -> np.ndarray:
 
 
 def correlations(
-    study: Study, metrics: Sequence[str] | None, exclude_failed: bool
+    metrics: Metrics,
+    samples: Mapping[str, Any],
+    names: Sequence[str] | None,
+    used: np.ndarray,
+    counts: Mapping[str, Any],
 ) -> xarray.Dataset:
-    """Spearman's rank correlation of every drawn parameter with metrics; see
-    `Study.correlations`.
+    """Spearman's rank correlation of every drawn parameter with the metrics `names`; other
+    arguments as `metric_quantiles`, see `Study.correlations`.
     """
     import xarray
 
-    used, counts = study.chosen(exclude_failed)
-    names = (
-        list(study.metrics)
-        if metrics is None
-        else checks.listed("metrics", metrics, '["margin", "rmse"]')
-    )
-    drawn = statistics.columns(study.samples)
+    if names is None:
+        names = list(metrics)
+    names = checks.listed("metrics", names, '["margin", "rmse"]')
+    drawn = statistics.columns(samples)
     found = np.full((len(drawn), len(names), 2), np.nan)
     for j, name in enumerate(names):
-        y = statistics.one_number(study.metrics, name)[used]
+        y = statistics.one_number(metrics, name)[used]
         for i, x in enumerate(drawn.values()):
             found[i, j] = statistics.rank_correlation(x[used], y)
     dims = ("parameter", "metric")
@@ -128,29 +144,32 @@ def correlations(
     return xarray.Dataset(
         variables,
         {"parameter": list(drawn), "metric": names},
-        counts | {"of": "the worst joint of each metric"},
+        {**counts, "of": "the worst joint of each metric"},
     )
 
 
 def bands(
-    study: Study, quantiles: Sequence[float], runs: int, samples: int, exclude_failed: bool
+    prepared: PreparedStudy,
+    quantiles: Sequence[float],
+    runs: int,
+    samples: int,
+    used: np.ndarray,
+    failed: np.ndarray,
 ) -> xarray.Dataset:
-    """Quantiles along time of position and error; see `Study.bands`."""
+    """Quantiles along time of position and error; see `Study.bands`.
+
+    Args:
+      prepared: the study, whose first runs are made again.
+      quantiles, runs, samples: as `Study.bands`.
+      used, failed: the runs that count, and those that failed, (N,) bool.
+    """
     import xarray
 
-    levels, setup, size = check_quantiles(quantiles), study.setup, block_size()
-    exclude_failed = checks.flag("exclude_failed", exclude_failed)
-    count = min(checks.positive_integer("runs", runs), study.runs)
-    record_every = max(1, setup.program.steps // checks.positive_integer("samples", samples))
-    parts, times = [], np.zeros(0)
-    one_block_at_a_time = ThisProcess(chunk=size)
-    for _, (arrays, t, _, _) in run_blocks(
-        setup, range(-(-count // size)), one_block_at_a_time, record_every=record_every
-    ):
-        parts.append(arrays)
-        times = t[0]
-    recorded = {name: np.concatenate([part[name] for part in parts])[:count] for name in parts[0]}
-    used = study.chosen(exclude_failed)[0][:count]
+    levels = check_quantiles(quantiles)
+    count = min(checks.positive_integer("runs", runs), prepared.options.runs)
+    samples = checks.positive_integer("samples", samples)
+    record_every = max(1, prepared.options.steps // samples)
+    used = used[:count]
     if not used.any():
         raise checks.fail(
             "runs",
@@ -158,85 +177,75 @@ def bands(
             "at least one run that is not left out",
             "Take more runs, or exclude_failed=False.",
         )
+    size = block_size()
+    blocks = range(checks.ceil_div(count, size))
+    one_block_at_a_time = ThisProcess(chunk=size)
+    parts = [
+        (arrays, t[0])
+        for _, (arrays, t, _, _) in run_blocks(
+            prepared, blocks, one_block_at_a_time, record_every=record_every
+        )
+    ]
+    first, times = parts[0]
+    recorded = {
+        name: np.concatenate([arrays[name] for arrays, _ in parts])[:count][used] for name in first
+    }
     dims = ("quantile", "time", "joint")
     variables: dict[str, Any] = {
-        name: (dims, _quantile(recorded[name][used], levels), {"units": SIGNALS[name].unit})
+        name: (dims, _quantile(recorded[name], levels), {"units": SIGNALS[name].unit})
         for name in BANDS
     }
-    edges: dict[str, Any] = {"lower": np.max, "upper": np.min, "q_d": np.median}
-    for name, edge in edges.items():
-        words = {
-            "lower": "tightest lower bound",
-            "upper": "tightest upper bound",
-            "q_d": "median reference",
-        }[name]
-        variables[name] = (
-            dims[1:],
-            edge(recorded[name][used], axis=0),
-            {"units": "rad", "description": f"{words} of the runs"},
-        )
-    failed = int(np.sum(used & (study.status[:count] & int(FAILED) != 0)))
-    attributes = {
+    for name, (edge, words) in EDGES.items():
+        attributes = {"units": "rad", "description": f"{words} of the runs"}
+        variables[name] = (dims[1:], edge(recorded[name], axis=0), attributes)
+    counts = {
         "runs": int(used.sum()),
         "excluded": int(count - used.sum()),
-        "failed_included": failed,
-        "of_runs": study.runs,
+        "failed_included": int(np.sum(used & failed[:count])),
+        "of_runs": prepared.options.runs,
     }
-    return xarray.Dataset(
-        variables, {"quantile": levels, "time": ("time", times, {"units": "s"})}, attributes
-    )
+    coordinates = {"quantile": levels, "time": ("time", times, {"units": "s"})}
+    return xarray.Dataset(variables, coordinates, counts)
 
 
-def to_xarray(study: Study) -> xarray.Dataset:
+def to_xarray(
+    prepared: PreparedStudy,
+    metrics: Metrics,
+    status: np.ndarray,
+    fastest_mode: np.ndarray,
+    samples: Mapping[str, Any],
+) -> xarray.Dataset:
     """Metrics, status and samples of all runs; see `Study.to_xarray`."""
     import xarray
 
     import iblf_jax
 
-    n = study.scenario.n
+    scenario, options = prepared.scenario, prepared.options
     variables: dict[str, Any] = {}
-    for name, values in study.metrics.items():
-        variables[name] = (
-            ("run", *own_dims(name, np.shape(values)[1:], n)),
-            np.asarray(values),
-            {"units": study.metrics.units.get(name, "")},
-        )
-    flags = [flag for flag in Status if flag]
-    masks = {
-        "flag_masks": np.array([int(f) for f in flags], np.int32),
-        "flag_meanings": " ".join((f.name or "").lower() for f in flags),
+    for name, values in metrics.items():
+        dims = ("run", *own_dims(name, np.shape(values)[1:], scenario.n))
+        variables[name] = (dims, np.asarray(values), {"units": metrics.units.get(name, "")})
+    variables["status"] = ("run", status, status_attributes("0 is ok"))
+    variables["fastest_mode"] = ("run", fastest_mode, {"units": "1/s"})
+    coordinates: dict[str, Any] = {"run": np.arange(options.runs)}
+    for path, values in samples.items():
+        dims = ("run", *own_dims(path, values.shape[1:], scenario.n))
+        nominal = np.asarray(get(scenario, path)).tolist()
+        unit = unit_at(scenario, path)
+        coordinates[path] = (dims, values, {"units": unit, "nominal": nominal})
+    attributes = {
+        "runs": options.runs,
+        "failed": int(np.sum(has_flag(status, FAILED))),
+        "seed": options.seed,
+        "duration": prepared.duration,
+        "dt": prepared.dt,
+        "method": options.method,
+        "sampler": options.sampler,
+        "backend": prepared.backend,
+        "iblf_jax_version": iblf_jax.__version__,
+        "perturbations": json.dumps(
+            {path: describe_component(p) for path, p in prepared.perturbations.items()}
+        ),
+        "parameters": json.dumps(values_of(scenario)),
     }
-    variables["status"] = (
-        "run",
-        study.status,
-        {"units": "1", "description": "bit flags; 0 is ok"} | masks,
-    )
-    variables["fastest_mode"] = ("run", study.fastest_mode, {"units": "1/s"})
-    coordinates: dict[str, Any] = {"run": np.arange(study.runs)}
-    for path, values in study.samples.items():
-        unit = study.parameter_unit(path)
-        coordinates[path] = (
-            ("run", *own_dims(path, values.shape[1:], n)),
-            values,
-            {"units": unit, "nominal": np.asarray(get(study.scenario, path)).tolist()},
-        )
-    setup = study.setup
-    attributes: dict[str, Any] = {
-        "runs": study.runs,
-        "failed": int(np.sum(study.status & int(FAILED) != 0)),
-        "seed": study.seed,
-    }
-    attributes |= {
-        "duration": study.duration,
-        "dt": study.dt,
-        "method": setup.program.method,
-        "sampler": setup.sampler,
-    }
-    attributes |= {"backend": study.backend, "iblf_jax_version": iblf_jax.__version__}
-    attributes["perturbations"] = json.dumps(
-        {path: describe_component(p) for path, p in study.perturbations.items()}
-    )
-    attributes["parameters"] = json.dumps(
-        {p.path: np.asarray(p.value).tolist() for p in parameters(study.scenario, named=False)}
-    )
     return xarray.Dataset(variables, coordinates, attributes)

@@ -21,20 +21,20 @@ import numpy as np
 from iblf_jax.core import checks, notices
 from iblf_jax.core.progress import bar
 from iblf_jax.engine import cases_per_unit, whole_blocks
-from iblf_jax.simulation.accuracy import RELATIVE
+from iblf_jax.simulation.error_estimate import RELATIVE
 from iblf_jax.simulation.metrics import Fold, metric_units
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.simulation.signals import own_dims
-from iblf_jax.studies import config as configuration
+from iblf_jax.studies import store_config
 from iblf_jax.studies.blocks import case_bytes, named_arrays, result_shapes
 from iblf_jax.studies.dataset import DRAWN, to_dataset
-from iblf_jax.studies.designs import MAX_RUNS, check_sampler
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.execution import run_all_cases, run_spans
 from iblf_jax.studies.interrupt import Interrupted, StopRequest
 from iblf_jax.studies.options import (
     REPLACED,
     Design,
+    RunOptions,
     StoreOptions,
     ThisProcess,
     check_deprecated,
@@ -42,10 +42,10 @@ from iblf_jax.studies.options import (
     executor_of,
     store_of,
 )
-from iblf_jax.studies.points import make_points
-from iblf_jax.studies.recommended import warn_of_step
-from iblf_jax.studies.setup import PreparedStudy, prepare
 from iblf_jax.studies.store import Store, StoreError, Variable, load_store, open_store
+from iblf_jax.studies.study_setup import PreparedStudy, prepare
+from iblf_jax.studies.sweep_points import make_points
+from iblf_jax.studies.time_step import warn_of_step
 
 if TYPE_CHECKING:
     import xarray
@@ -125,38 +125,34 @@ def sweep(
     check_deprecated("sweep", deprecated, tuple(REPLACED))
     executor = executor_of(executor, deprecated)
     store_options = store_of(store, deprecated)
-    points = design_of(design, deprecated)
+    chosen = design_of(design, deprecated)
     progress = checks.flag("progress", progress, optional=True)
-    runs = checks.positive_integer("runs", runs, most=MAX_RUNS)
     if perturbations is None:
         perturbations = {}
-    replicates = check_sampler(sampler, runs, replicates)
-    _check_something_varies(grid, perturbations, runs)
-    where = make_points(canonical(scenario), grid, points.kind, points.points, checks.seed(seed))
-    study = prepare(
-        scenario,
-        perturbations,
-        runs,
-        seed,
+    options = RunOptions(
         duration=duration,
         dt=dt,
         method=method,
-        metrics=metrics,
         backend=backend,
+        runs=runs,
+        seed=seed,
         sampler=sampler,
         replicates=replicates,
-        points=where.values,
     )
-    checks.fits("runs at all points", study.cases, case_bytes(study))
-    config = configuration.describe(study, where, points.kind, float(dt))
+    options = options.checked()
+    _check_something_varies(grid, perturbations, options.runs)
+    points = make_points(canonical(scenario), grid, chosen.kind, chosen.points, options.seed)
+    prepared = prepare(scenario, perturbations, options, metrics, points.values)
+    checks.fits("runs at all points", prepared.cases, case_bytes(prepared))
+    config = store_config.describe(prepared, points, chosen.kind)
     if store_options is None:
-        result = _in_memory(study, config, executor, progress)
+        result = _in_memory(prepared, config, executor, progress)
     else:
-        result = _into_store(study, config, executor, progress, store_options)
+        result = _into_store(prepared, config, executor, progress, store_options)
     status, modes, errors = (
         np.ravel(result[name]) for name in ("status", "fastest_mode", RELATIVE)
     )
-    warn_of_step(status, modes, errors, float(dt), method)
+    warn_of_step(status, modes, errors, options.dt, method)
     return result
 
 
@@ -200,17 +196,16 @@ def load_sweep(path: str | os.PathLike) -> xarray.Dataset:
 
 def _dataset(store: Store) -> xarray.Dataset:
     data, done = store.read_all()
-    return to_dataset(store.config, data, {name: store.units_of(name) for name in data}, done)
+    return to_dataset(store.config, data, {name: store.si_unit(name) for name in data}, done)
 
 
-def _variables(study: PreparedStudy, config: dict[str, Any]) -> dict[str, Variable]:
+def _variables(prepared: PreparedStudy, config: dict[str, Any]) -> dict[str, Variable]:
     """The arrays of a sweep; metrics first, in their own order."""
-    shapes = named_arrays(result_shapes(study))
-    units = dict(metric_units(study.shared.folds))
+    shapes = named_arrays(result_shapes(prepared))
+    units = dict(metric_units(prepared.shared.folds))
     units |= {"status": "1", "fastest_mode": "1/s"}
     units |= {DRAWN + path: p["unit"] for path, p in config["perturbed"].items()}
-    names = [name for name in units if name in shapes]
-    names += [name for name in shapes if name not in units]
+    names = dict.fromkeys([name for name in units if name in shapes]) | dict.fromkeys(shapes)
     variables = {}
     for name in names:
         shape = shapes[name].shape[1:]
@@ -220,61 +215,53 @@ def _variables(study: PreparedStudy, config: dict[str, Any]) -> dict[str, Variab
 
 
 def _in_memory(
-    study: PreparedStudy,
+    prepared: PreparedStudy,
     config: dict[str, Any],
     executor: ThisProcess | Executor,
     progress: bool | None,
 ) -> xarray.Dataset:
-    with bar(progress, study.cases) as shown:
-        arrays = named_arrays(run_all_cases(study, executor, shown.update))
-    variables = _variables(study, config)
+    with bar(progress, prepared.cases) as shown:
+        arrays = named_arrays(run_all_cases(prepared, executor, shown.update))
+    variables = _variables(prepared, config)
     data = {name: arrays[name] for name in variables}
-    units = {name: variable.unit for name, variable in variables.items()}
-    return to_dataset(config, data, units, np.ones(study.cases, bool))
-
-
-def _unit_of(study: PreparedStudy, options: StoreOptions) -> int:
-    """Cases in one unit of a new store: complete blocks, or all cases."""
-    if options.unit is None:
-        return cases_per_unit(study.cases, study.program.steps)
-    return whole_blocks(study.cases, options.unit)
+    units = {name: variable.si_unit for name, variable in variables.items()}
+    return to_dataset(config, data, units, np.ones(prepared.cases, bool))
 
 
 def _into_store(
-    study: PreparedStudy,
+    prepared: PreparedStudy,
     config: dict[str, Any],
     executor: ThisProcess | Executor,
     progress: bool | None,
     options: StoreOptions,
 ) -> xarray.Dataset:
-    store = open_store(
-        options.path,
-        config,
-        _variables(study, config),
-        study.cases,
-        _unit_of(study, options),
-        any_unit=options.unit is None,
-    )
+    cases = prepared.cases
+    if options.unit is None:
+        unit = cases_per_unit(cases, prepared.options.steps)
+    else:
+        unit = whole_blocks(cases, options.unit)
+    variables = _variables(prepared, config)
+    store = open_store(options.path, config, variables, cases, unit, any_unit=options.unit is None)
     pending, damaged = store.pending()
     if damaged:
         notices.warn(
             f"{options.path}: {len(damaged)} units are damaged (their data do not fit their"
             f" checksums) and are computed again: {damaged[:10]}."
         )
-    cases_done = study.cases - sum(_length(store, unit) for unit in pending)
-    with StopRequest() as stop, bar(progress, study.cases, cases_done) as shown:
+    cases_done = cases - sum(store.size(unit) for unit in pending)
+    with StopRequest() as stop, bar(progress, cases, cases_done) as shown:
         spans = _spans(store, pending, set(damaged), options, shown.update)
-        with closing(_results(study, spans, executor, store, options, shown.update)) as results:
+        with closing(_results(prepared, spans, executor, store, options, shown.update)) as results:
             for span, part in results:
                 if part is not None:
                     store.write(span.start // store.unit, named_arrays(part))
-                if stop.requested and not store.marks().all():
-                    raise _interrupted(store)
+                if stop.requested:
+                    _interrupt(store)
     return _dataset(store)
 
 
 def _results(
-    study: PreparedStudy,
+    prepared: PreparedStudy,
     spans: Iterator[slice],
     executor: ThisProcess | Executor,
     store: Store,
@@ -283,12 +270,12 @@ def _results(
 ) -> Generator[tuple[slice, Any], None, None]:
     """Units with their results; None for those that a worker has written."""
     if isinstance(executor, ThisProcess) or options.writer == "client":
-        yield from run_spans(study, spans, executor, advance)
+        yield from run_spans(prepared, spans, executor, advance)
         return
     from iblf_jax.studies.workers import SharedStore, run_on_workers
 
     shared = SharedStore(os.path.abspath(store.path), store.config)
-    for span, written in run_on_workers(study, spans, executor, shared):
+    for span, written in run_on_workers(prepared, spans, executor, shared):
         advance(span.stop - span.start)
         yield span, written
 
@@ -312,22 +299,19 @@ def _spans(
         random.SystemRandom().shuffle(units)
     for unit in units:
         if is_shared and unit not in damaged and store.marks()[unit]:
-            advance(_length(store, unit))
+            advance(store.size(unit))
         else:
             yield store.span(unit)
 
 
-def _length(store: Store, unit: int) -> int:
-    span = store.span(unit)
-    return span.stop - span.start
-
-
-def _interrupted(store: Store) -> Interrupted:
+def _interrupt(store: Store) -> None:
+    """Raises Interrupted if units are left to be computed."""
     marks = store.marks()
-    return Interrupted(
-        f"Stopped after {int(marks.sum())} of {store.units} units, which are written to"
-        f" {store.path}. Start the same call or command again to resume."
-    )
+    if not marks.all():
+        raise Interrupted(
+            f"Stopped after {marks.sum()} of {store.units} units, which are written to"
+            f" {store.path}. Start the same call or command again to resume."
+        )
 
 
 __all__ = ["Interrupted", "StoreError", "load_sweep", "sweep"]

@@ -39,11 +39,10 @@ import jax
 from iblf_jax.core import devices
 from iblf_jax.core.pytree import is_component_class, register_component
 from iblf_jax.engine import uses_host_compiler
-from iblf_jax.studies.blocks import BlockResults, named_arrays
-from iblf_jax.studies.execution import run_spans_here
+from iblf_jax.studies.blocks import BlockResults, named_arrays, run_spans_here
 from iblf_jax.studies.options import ThisProcess
-from iblf_jax.studies.setup import PreparedStudy
 from iblf_jax.studies.store import StoreError, load_store
+from iblf_jax.studies.study_setup import PreparedStudy
 
 MAX_IN_FLIGHT = 1024
 """Tasks that are submitted and not done: their results may wait in the client's memory."""
@@ -69,7 +68,7 @@ class SharedStore(NamedTuple):
 class WorkerTask(NamedTuple):
     """What all tasks of a study share."""
 
-    study: PreparedStudy
+    prepared: PreparedStudy
     store: SharedStore | None
 
 
@@ -172,7 +171,7 @@ def packed(task: WorkerTask) -> bytes:
     file = io.BytesIO()
     # The list is pickled after the task, and is complete by then.
     Pickler(file).dump((task, components))
-    backend = task.study.program.batch.backend
+    backend = task.prepared.backend
     return pickle.dumps((environment(backend), backend, file.getvalue()))
 
 
@@ -203,7 +202,7 @@ def run_task(payload: bytes, first: int, last: int) -> BlockResults | None:
         unit = first // store.unit
         if store.marks()[unit] and store.read(unit) is not None:
             return None
-    ((_, results),) = run_spans_here(task.study, [slice(first, last)], ThisProcess())
+    ((_, results),) = run_spans_here(task.prepared, [slice(first, last)], ThisProcess())
     if store is None:
         return results
     store.write(unit, named_arrays(results))
@@ -227,7 +226,7 @@ def _opened(shared: SharedStore) -> Any:
 
 
 def run_on_workers(
-    study: PreparedStudy,
+    prepared: PreparedStudy,
     spans: Iterable[slice],
     executor: Executor,
     store: SharedStore | None = None,
@@ -236,7 +235,7 @@ def run_on_workers(
     returns, in the order in which they are done.
 
     Args:
-      study: what to run.
+      prepared: what to run.
       spans: as `execution.run_spans`.
       executor: the executor.
       store: written by the workers; None if they return their results.
@@ -245,7 +244,7 @@ def run_on_workers(
       WorkerError: a worker was lost, or is not fit.
       ValueError: the study cannot be sent to another process.
     """
-    payload = packed(WorkerTask(study, store))
+    payload = packed(WorkerTask(prepared, store))
     remaining, waiting = iter(spans), dict[Future, slice]()
     try:
         while True:

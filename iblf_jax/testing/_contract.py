@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from typing import Any
+from contextlib import contextmanager, suppress
+from typing import Any, NoReturn
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +28,10 @@ class ContractError(AssertionError):
     """
 
 
+class StoppedCheckError(Exception):
+    """A check that cannot go on; the reason is among the findings."""
+
+
 class Findings:
     """The problems of one component."""
 
@@ -37,6 +41,8 @@ class Findings:
         self.problems: list[str] = []
         self.remarks: list[str] = []
         """Properties that the user should know and that violate no contract."""
+        self.kind = ""
+        """What labels of the present check end with: the type of its arguments."""
 
     def add(self, problem: str, remedy: str = "") -> None:
         """Records a problem, once."""
@@ -55,6 +61,16 @@ class Findings:
         if not bool(condition):
             self.add(problem, remedy)
         return bool(condition)
+
+    def stop(self, problem: str, remedy: str = "") -> NoReturn:
+        """Records a problem that ends the check."""
+        self.add(problem, remedy)
+        raise StoppedCheckError
+
+    def result_is(self, condition: Any, label: str, got: Any, remedy: str) -> None:
+        """Stops the check unless a result has the type that the condition requires."""
+        if not condition:
+            self.stop(f"{label}{self.kind} gives {type(got).__name__}", remedy)
 
     def stop_if_any(self) -> None:
         """Raises ContractError if there are problems."""
@@ -82,7 +98,7 @@ def examine(
       ContractError: at once if the object is not a component or lacks a required member.
     """
     findings = Findings(member, family)
-    with jax.enable_x64(True):
+    with jax.enable_x64(True), suppress(StoppedCheckError):
         _is_component(findings, member)
         _has_members(findings, member, protocol, optional)
         findings.stop_if_any()
@@ -95,27 +111,21 @@ def _is_component(findings: Findings, member: Any) -> None:
     objects instead of the numbers.
     """
     if isinstance(member, type):
-        findings.add("it is a class", "Pass an instance, with brackets")
-        findings.stop_if_any()
+        findings.stop("it is a class", "Pass an instance, with brackets")
     try:
         checks.flat_enough(findings.family, member)
         leaves, structure = jax.tree.flatten(member)
     except Exception as error:
-        findings.add(f"JAX cannot flatten it ({type(error).__name__}: {checks.line(str(error))})")
-        findings.stop_if_any()
-        raise
+        findings.stop(f"JAX cannot flatten it ({type(error).__name__}: {checks.line(str(error))})")
     if any(leaf is member for leaf in leaves):
-        findings.add(
-            "JAX does not know its class",
-            "Decorate it with @iblf_jax.component, or register it with jax.tree_util",
-        )
-        findings.stop_if_any()
+        remedy = "Decorate it with @iblf_jax.component, or register it with jax.tree_util"
+        findings.stop("JAX does not know its class", remedy)
     remedy = "Make it a floating-point array, or declare it with iblf_jax.static"
     for path, leaf in jax.tree_util.tree_leaves_with_path(member):
         name = jax.tree_util.keystr(path).lstrip(".")
         problem = f"the leaf {name} is {checks.shown(leaf)}, not a floating-point number"
         is_number = isinstance(leaf, jax.Array | np.ndarray | np.generic | float)
-        findings.require(is_number and _is_float(leaf), problem, remedy)
+        findings.require(is_number and is_float(leaf), problem, remedy)
     try:
         rebuilt = jax.tree.unflatten(structure, [object() for _ in leaves])
         again: Any = jax.tree.structure(rebuilt)
@@ -129,7 +139,8 @@ def _is_component(findings: Findings, member: Any) -> None:
         findings.add(f"it cannot be rebuilt by JAX ({type(error).__name__}: {error})", remedy)
 
 
-def _is_float(x: Any) -> bool:
+def is_float(x: Any) -> bool:
+    """Whether numbers are floating-point numbers."""
     return jnp.issubdtype(jnp.result_type(x), jnp.floating)
 
 
@@ -160,15 +171,14 @@ def _has_members(
 
 
 def shape_of(findings: Findings, label: str, call: Callable, *args: Any) -> Any:
-    """Shapes and types of the result of `call(*args)`; None and a finding if it raises."""
+    """Shapes and types of the result of `call(*args)`; the check stops if it raises."""
     try:
         return jax.eval_shape(call, *args)
     except Exception as error:
         remedy = ""
         if isinstance(error, jax.errors.JAXTypeError):
             remedy = "It is called with tracers: use jax.numpy, and `jnp.where` in place of `if`"
-        findings.add(f"{label} raised {first_line(error)}", remedy)
-        return None
+        findings.stop(f"{label}{findings.kind} raised {first_line(error)}", remedy)
 
 
 def has_shape(
@@ -176,13 +186,13 @@ def has_shape(
 ) -> bool:
     """Requires that an abstract result is an array of this shape and kind."""
     words = {jnp.floating: "floating-point numbers", jnp.bool_: "bool"}
-    if got is None:
-        return False
+    label += findings.kind
     if not hasattr(got, "shape"):
         findings.add(f"{label} gives {type(got).__name__}", f"It must be an array of shape {shape}")
         return False
-    if got.shape != shape:
-        findings.add(f"{label} has shape {got.shape}", f"It must be {shape}")
+    if not findings.require(
+        got.shape == shape, f"{label} has shape {got.shape}", f"It must be {shape}"
+    ):
         return False
     is_kind = jnp.issubdtype(got.dtype, kind)
     return findings.require(is_kind, f"{label} is {got.dtype}", f"It must be {words[kind]}")
@@ -192,25 +202,27 @@ def call_has_shape(
     findings: Findings, label: str, call: Callable, args: Sequence[Any], shape: tuple[int, ...]
 ) -> bool:
     """Requires that `call(*args)` returns floating-point numbers of this shape."""
-    return has_shape(findings, label, shape_of(findings, label, call, *args), shape)
+    try:
+        got = shape_of(findings, label, call, *args)
+    except StoppedCheckError:
+        return False
+    return has_shape(findings, label, got, shape)
 
 
-def same_structure(findings: Findings, label: str, got: Any, like: Any) -> bool:
+def same_structure(findings: Findings, label: str, got: Any, like: Any) -> None:
     """Requires that two abstract pytrees have the same structure, shapes and types."""
-    if got is None or like is None:
-        return False
+    label += findings.kind
     structure: Any = jax.tree.structure(got)
-    if structure != jax.tree.structure(like):
-        findings.add(
-            f"{label} has the structure {structure}",
-            f"It must be that of the state, {jax.tree.structure(like)}",
-        )
-        return False
+    expected: Any = jax.tree.structure(like)
+    if structure != expected:
+        remedy = f"It must be that of the state, {expected}"
+        findings.add(f"{label} has the structure {structure}", remedy)
+        return
     different = []
     for a, b in zip(jax.tree.leaves(got), jax.tree.leaves(like), strict=True):
         if (a.shape, a.dtype) != (b.shape, b.dtype):
             different.append(f"{a.dtype}{list(a.shape)} for {b.dtype}{list(b.shape)}")
-    return findings.require(
+    findings.require(
         not different,
         f"{label} has {' and '.join(different)}",
         "Shapes and types must be those of the state, which a scan carries",
@@ -222,9 +234,19 @@ def in_dtype(tree: Any, dtype: str) -> Any:
 
     def convert(x):
         # NumPy converts without compiling a program for every shape, unlike JAX.
-        return jnp.asarray(np.asarray(x, dtype if _is_float(x) else None))
+        return jnp.asarray(np.asarray(x, dtype if is_float(x) else None))
 
     return jax.tree.map(convert, tree)
+
+
+def in_both_types(findings: Findings, check: Callable, *args: Any) -> None:
+    """Runs `check(findings, *args)` in float64 and in float32, then raises the problems."""
+    for dtype in ("float64", "float32"):
+        findings.kind = f" ({dtype})"
+        with suppress(StoppedCheckError):
+            check(findings, *in_dtype(args, dtype))
+    findings.kind = ""
+    findings.stop_if_any()
 
 
 def leaves_by_name(name: str, tree: Any) -> dict[str, Any]:
@@ -279,10 +301,10 @@ def _derivatives(findings, function, values, point, rtol, rng) -> None:
         return rng.normal(size=np.shape(x)) * size
 
     def floats(p):
-        return {k: v for k, v in function(p).items() if _is_float(v)}
+        return {k: v for k, v in function(p).items() if is_float(v)}
 
     direction = jax.tree.map(random_like, point)
-    weights = {k: rng.normal(size=v.shape) for k, v in values.items() if _is_float(v)}
+    weights = {k: rng.normal(size=v.shape) for k, v in values.items() if is_float(v)}
 
     @jax.jit
     def both(point, direction, weights):
@@ -344,7 +366,7 @@ def _float32(findings, outputs, values, point) -> None:
     result = jax.jit(lambda p: outputs(*p))(in_dtype(point, "float32"))
     remedy = "Make constants with the dtype of an argument, jnp.zeros_like(q), or Python numbers"
     for name, value in result.items():
-        if not _is_float(values[name]):
+        if not is_float(values[name]):
             continue
         problem = f"{name} is {value.dtype} for float32 arguments"
         if findings.require(value.dtype == jnp.float32, problem, remedy):

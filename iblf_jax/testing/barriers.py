@@ -15,11 +15,10 @@ from iblf_jax.testing._contract import (
     Findings,
     call_has_shape,
     check_function,
-    examine,
     has_shape,
     in_dtype,
 )
-from iblf_jax.testing.joints import check_number, fitted_to, number_of_joints, scenario_of
+from iblf_jax.testing.joints import examine_joints, scenario_of
 from iblf_jax.world.bounds import Tube
 
 XI = (
@@ -44,6 +43,12 @@ XI = (
 """Values of xi at which every barrier is evaluated: far outside, at and near the bound, inside, at
 and near zero."""
 
+FUNCTIONS = {
+    "value": "value(tube, q)",
+    "slope": "slope(tube, q)",
+    "virtual_velocity": "virtual_velocity(tube, q, k1, o)",
+}
+"""The functions of a barrier, and what messages call them."""
 TIMES = (0.0, 1.0, 2.5, 4.0)
 
 
@@ -63,32 +68,23 @@ def check_barrier(barrier: Any, *, n: int | None = None) -> None:
       ContractError: lists what does not hold, with the remedy.
       ValueError: `n` is not a number of joints, or not that of the leaves.
     """
-    check_number(n)
-    with examine(barrier, "Barrier", Barrier, CLAIMS) as findings:
+    with examine_joints(barrier, Barrier, n, "barrier", CLAIMS) as (findings, barrier, joints):
         _class_members(findings, barrier)
-        n = number_of_joints(findings, barrier, n)
-        barrier = fitted_to(in_dtype(barrier, "float64"), n, "barrier")
-        context = in_dtype(scenario_of(n), "float64").context
-        k1 = _joint_by_joint(n, 2.0, 3.0)
-        o = _joint_by_joint(n, 0.1, 0.2) if barrier.uses_o else None
+        context = in_dtype(scenario_of(joints), "float64").context
+        k1 = jnp.asarray(np.resize([2.0, 3.0], joints))
+        o = jnp.asarray(np.resize([0.1, 0.2], joints)) if barrier.uses_o else None
         tube = context.tube(jnp.asarray(1.0))
-        q = tube.q_d + _joint_by_joint(n, 0.2, -0.15)
-        calls: dict[str, tuple] = {
-            "value(tube, q)": (barrier.value, (tube, q)),
-            "slope(tube, q)": (barrier.slope, (tube, q)),
-            "virtual_velocity(tube, q, k1, o)": (barrier.virtual_velocity, (tube, q, k1, o)),
-        }
-        for label, (call, args) in calls.items():
-            call_has_shape(findings, label, call, args, (n,))
+        q = tube.q_d + np.resize([0.2, -0.15], joints)
+        for name, label in FUNCTIONS.items():
+
+            def function(*args, name=name):
+                return _functions(*args)[name]
+
+            call_has_shape(findings, label, function, (barrier, tube, q, k1, o), (joints,))
         findings.stop_if_any()
 
-        def outputs(barrier, tube, q, k1, o):
-            named = (
-                barrier.value(tube, q),
-                barrier.slope(tube, q),
-                barrier.virtual_velocity(tube, q, k1, o),
-            )
-            return dict(zip(calls, named, strict=True))
+        def outputs(*args):
+            return {FUNCTIONS[name]: x for name, x in _functions(*args).items()}
 
         check_function(findings, outputs, barrier, (tube, q, k1, o))
         _joints_apart(findings, barrier, tube, q, k1, o)
@@ -97,6 +93,17 @@ def check_barrier(barrier: Any, *, n: int | None = None) -> None:
             numbers = _numbers(barrier, context, jnp.asarray(t), k1, o, jnp.asarray(XI))
             _at_every_xi(findings, numbers, barrier.guard)
             _claims(findings, barrier, tube, k1, numbers)
+
+
+def _functions(
+    barrier: Any, tube: Tube, q: jax.Array, k1: jax.Array, o: Any
+) -> dict[str, jax.Array]:
+    """The three functions of a barrier by name, (n,) each."""
+    return {
+        "value": barrier.value(tube, q),
+        "slope": barrier.slope(tube, q),
+        "virtual_velocity": barrier.virtual_velocity(tube, q, k1, o),
+    }
 
 
 def _class_members(findings: Findings, barrier: Any) -> None:
@@ -115,11 +122,6 @@ def _class_members(findings: Findings, barrier: Any) -> None:
     findings.stop_if_any()
 
 
-def _joint_by_joint(n: int, first: float, second: float) -> jax.Array:
-    """Two numbers that alternate over the joints, (n,)."""
-    return jnp.asarray(np.resize([first, second], n))
-
-
 @jax.jit
 def _numbers(
     barrier: Any, context: Any, t: jax.Array, k1: jax.Array, o: Any, xi: jax.Array
@@ -133,29 +135,20 @@ def _numbers(
         q = tube.q_d + xi * jnp.where(xi > 0, tube.k_u, tube.k_l)
 
         def functions(q):
-            return (
-                barrier.value(tube, q),
-                barrier.slope(tube, q),
-                barrier.virtual_velocity(tube, q, k1, o),
-            )
+            return _functions(barrier, tube, q, k1, o)
 
         ones = jnp.ones_like(q)
-        (V1, slope, alpha), forward = jax.jvp(functions, (q,), (ones,))
-        pull = jax.vjp(functions, q)[1]
-        one_by_one = jnp.eye(3)[:, :, None] * ones
-        reverse = jax.vmap(pull)(tuple(one_by_one[:, i] for i in range(3)))[0]
-        rate = jax.jvp(
-            lambda t, q: barrier.value(context.tube(t), q), (t, q), (jnp.ones_like(t), alpha)
+        values, forward = jax.jvp(functions, (q,), (ones,))
+        found = values | {"xi": tube.xi(q)}
+        for name in FUNCTIONS:
+            pull = jax.vjp(lambda q, name=name: functions(q)[name], q)[1]
+            found |= {f"d{name}": forward[name], f"r{name}": pull(ones)[0]}
+        found["decay"] = jax.jvp(
+            lambda t, q: barrier.value(context.tube(t), q),
+            (t, q),
+            (jnp.ones_like(t), values["virtual_velocity"]),
         )[1]
-        return {
-            "V1": V1,
-            "slope": slope,
-            "alpha": alpha,
-            "xi": tube.xi(q),
-            "decay": rate,
-            **{f"d{name}": x for name, x in zip(("V1", "slope", "alpha"), forward, strict=True)},
-            **{f"r{name}": x for name, x in zip(("V1", "slope", "alpha"), reverse, strict=True)},
-        }
+        return found
 
     return jax.vmap(at)(xi)
 
@@ -163,25 +156,23 @@ def _numbers(
 def _at_every_xi(findings: Findings, numbers: dict[str, jax.Array], guard: float) -> None:
     got = {name: np.asarray(value) for name, value in numbers.items()}
     xi = np.asarray(XI)[:, None] + 0 * got["xi"]
-    words = {"V1": "value", "slope": "slope", "alpha": "virtual_velocity"}
     remedy = (
         "Evaluate at iblf_jax.barriers.guarded_error; remove singularities at e1 = 0 by a double"
         " jnp.where"
     )
     prefixes = {"": "", "d": "the forward derivative of ", "r": "the reverse derivative of "}
     for prefix, text in prefixes.items():
-        for name, word in words.items():
+        for name in FUNCTIONS:
             bad = ~np.isfinite(got[prefix + name])
             if np.any(bad):
-                findings.add(f"{text}{word} is not finite at xi = {xi[bad][0]:.12g}", remedy)
+                findings.add(f"{text}{name} is not finite at xi = {xi[bad][0]:.12g}", remedy)
         findings.stop_if_any()
     zero = np.abs(xi) == 0
-    findings.require(
-        np.all(np.abs(got["V1"][zero]) < 1e-12), "V1 is not 0 at e1 = 0", "Subtract its value there"
-    )
+    is_zero = np.all(np.abs(got["value"][zero]) < 1e-12)
+    findings.require(is_zero, "V1 is not 0 at e1 = 0", "Subtract its value there")
     findings.require(np.all(np.abs(got["slope"][zero]) < 1e-12), "the slope is not 0 at e1 = 0")
     findings.require(
-        np.all(got["V1"] >= 0),
+        np.all(got["value"] >= 0),
         "V1 is negative somewhere",
         "A Lyapunov function is >= 0; continue it along the tangent beyond the guard",
     )
@@ -193,7 +184,7 @@ def _at_every_xi(findings: Findings, numbers: dict[str, jax.Array], guard: float
     )
     # At the edge of the guard both one-sided derivatives are correct; points near it are left out.
     clear = np.abs(np.abs(xi) - (1 - guard)) > 1e-3 * guard
-    off = np.abs(got["dV1"] - got["slope"]) / np.maximum(1.0, np.abs(got["slope"]))
+    off = np.abs(got["dvalue"] - got["slope"]) / np.maximum(1.0, np.abs(got["slope"]))
     worst = float(np.max(off[clear]))
     remedy = "Beyond the guard V1 must continue along its tangent: V1(e) + slope(e) (e1 - e)"
     findings.require(worst < 1e-8, f"the slope is not dV1/dq (relative error {worst:.2g})", remedy)
@@ -214,7 +205,7 @@ def _claims(
     numbers: dict[str, jax.Array],
 ) -> None:
     """Tests the claims of the barrier about V1, if it states any."""
-    xi, V1, decay = (np.asarray(numbers[name]) for name in ("xi", "V1", "decay"))
+    xi, V1, decay = (np.asarray(numbers[name]) for name in ("xi", "value", "decay"))
     inside = np.abs(xi) < min(1 - 2 * barrier.guard, 1.0)
     rate = barrier_member(barrier, "decay_rate")(k1)
     if rate is not None:
@@ -255,14 +246,10 @@ def _joints_apart(
     findings: Findings, barrier: Any, tube: Tube, q: jax.Array, k1: jax.Array, o: Any
 ) -> None:
     """Requires that the barrier of a joint does not depend on other joints."""
-    for label, function in (
-        ("value", lambda q: barrier.value(tube, q)),
-        ("slope", lambda q: barrier.slope(tube, q)),
-        ("virtual_velocity", lambda q: barrier.virtual_velocity(tube, q, k1, o)),
-    ):
-        J = np.asarray(jax.jit(jax.jacfwd(function))(q))
+    jacobians = jax.jit(jax.jacfwd(lambda q: _functions(barrier, tube, q, k1, o)))(q)
+    for name, J in jacobians.items():
         findings.require(
             np.all(np.diag(np.diag(J)) == J),
-            f"{label} mixes joints",
+            f"{name} mixes joints",
             "The law needs a barrier that acts on every joint separately",
         )

@@ -18,14 +18,13 @@ from iblf_jax.core.optional import has_members
 from iblf_jax.testing._contract import (
     Findings,
     check_function,
-    examine,
     has_shape,
-    in_dtype,
+    in_both_types,
     leaves_by_name,
     same_structure,
     shape_of,
 )
-from iblf_jax.testing.joints import check_number, fitted_to, number_of_joints
+from iblf_jax.testing.joints import examine_joints
 
 SMALL_TORQUES = (0.1, 1e-3)
 """Torques, one of which an actuator must deliver at a standstill [N m]."""
@@ -51,16 +50,11 @@ def check_sensor(sensor: Any, *, n: int | None = None) -> None:
       ContractError: lists what does not hold, with the remedy.
       ValueError: `n` is not a number of joints, or not that of the leaves.
     """
-    check_number(n)
-    with examine(sensor, "Sensor", Sensor) as findings:
-        n = number_of_joints(findings, sensor, n)
-        fitted = fitted_to(in_dtype(sensor, "float64"), n, "sensor")
+    with examine_joints(sensor, Sensor, n, "sensor") as (findings, fitted, joints):
         rng = np.random.default_rng(3)
-        q, dq = jnp.asarray(rng.uniform(-1, 1, (2, n)))
-        normal, period = jnp.asarray(rng.normal(size=(fitted.draws, n))), jnp.asarray(1e-3)
-        for dtype in ("float64", "float32"):
-            _measures(findings, *in_dtype((fitted, q, dq, normal, period), dtype))
-        findings.stop_if_any()
+        q, dq = jnp.asarray(rng.uniform(-1, 1, (2, joints)))
+        normal, period = jnp.asarray(rng.normal(size=(fitted.draws, joints))), jnp.asarray(1e-3)
+        in_both_types(findings, _measures, fitted, q, dq, normal, period)
 
         def outputs(sensor, q, dq, normal, period):
             sensor = unrounded(sensor)
@@ -71,19 +65,12 @@ def check_sensor(sensor: Any, *, n: int | None = None) -> None:
 
 
 def _measures(findings: Findings, sensor, q, dq, normal, period) -> None:
-    kind = f" ({q.dtype})"
-    state = shape_of(findings, "init(q, dq, period)" + kind, sensor.init, q, dq, period)
-    if state is None:
-        return
-    label = "measure(q, dq, normal, period, state)" + kind
+    state = shape_of(findings, "init(q, dq, period)", sensor.init, q, dq, period)
+    label = "measure(q, dq, normal, period, state)"
     found = shape_of(findings, label, sensor.measure, q, dq, normal, period, state)
-    if found is None:
-        return
     is_pair = isinstance(found, tuple) and len(found) == 2 and isinstance(found[0], Measurement)
-    if not is_pair:
-        remedy = "It must be a pair (iblf_jax.sensors.Measurement(q, dq), next state)"
-        findings.add(f"{label} gives {type(found).__name__}", remedy)
-        return
+    remedy = "It must be a pair (iblf_jax.sensors.Measurement(q, dq), next state)"
+    findings.result_is(is_pair, label, found, remedy)
     measured, after = found
     has_shape(findings, label + ", q", measured.q, q.shape)
     has_shape(findings, label + ", dq", measured.dq, q.shape)
@@ -105,14 +92,9 @@ def check_actuator(actuator: Any, *, n: int | None = None) -> None:
       ContractError: lists what does not hold, with the remedy.
       ValueError: `n` is not a number of joints, or not that of the leaves.
     """
-    check_number(n)
-    with examine(actuator, "Actuator", Actuator) as findings:
-        n = number_of_joints(findings, actuator, n)
-        fitted = fitted_to(in_dtype(actuator, "float64"), n, "actuator")
-        command, dq = jnp.asarray(np.random.default_rng(3).uniform(-0.1, 0.1, (2, n)))
-        for dtype in ("float64", "float32"):
-            _delivers(findings, *in_dtype((fitted, command, dq), dtype))
-        findings.stop_if_any()
+    with examine_joints(actuator, Actuator, n, "actuator") as (findings, fitted, joints):
+        command, dq = jnp.asarray(np.random.default_rng(3).uniform(-0.1, 0.1, (2, joints)))
+        in_both_types(findings, _delivers, fitted, command, dq)
 
         def outputs(actuator, command, dq):
             delivered = actuator.deliver(command, dq, actuator.init(0.9 * command))
@@ -123,18 +105,11 @@ def check_actuator(actuator: Any, *, n: int | None = None) -> None:
 
 
 def _delivers(findings: Findings, actuator, command, dq) -> None:
-    kind = f" ({command.dtype})"
-    state = shape_of(findings, "init(tau)" + kind, actuator.init, command)
-    if state is None:
-        return
-    label = "deliver(command, dq, state)" + kind
+    state = shape_of(findings, "init(tau)", actuator.init, command)
+    label = "deliver(command, dq, state)"
     found = shape_of(findings, label, actuator.deliver, command, dq, state)
-    if found is None:
-        return
-    if not has_members(found, *Delivered._fields):
-        remedy = "It must be an iblf_jax.actuators.Delivered(tau, limited, rate)"
-        findings.add(f"{label} gives {type(found).__name__}", remedy)
-        return
+    remedy = "It must be an iblf_jax.actuators.Delivered(tau, limited, rate)"
+    findings.result_is(has_members(found, *Delivered._fields), label, found, remedy)
     has_shape(findings, label + ", tau", found.tau, command.shape)
     has_shape(findings, label + ", limited", found.limited, command.shape, jnp.bool_)
     same_structure(findings, label + ", rate", found.rate, state)

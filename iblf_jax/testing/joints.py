@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, TypeVar
 
 import jax
@@ -15,7 +16,7 @@ from iblf_jax.core import checks
 from iblf_jax.core.pytree import field_values, is_leaf_field
 from iblf_jax.presets import customary_two_link, zhang_yan_2024
 from iblf_jax.simulation.scenario import Initial, Scenario, fit_joints
-from iblf_jax.testing._contract import Findings
+from iblf_jax.testing._contract import Findings, examine, in_dtype
 from iblf_jax.world.bounds import Bounds, Sinusoid
 from iblf_jax.world.disturbances import Sinusoids
 from iblf_jax.world.references import Sinusoid as SinusoidalReference
@@ -65,10 +66,43 @@ def _undeclared(member: Any) -> list[Any]:
     return jax.tree.leaves(member)
 
 
+@contextmanager
+def examine_joints(
+    member: Any,
+    protocol: type,
+    n: int | None,
+    name: str,
+    optional: tuple[str, ...] = (),
+) -> Iterator[tuple[Findings, Any, int]]:
+    """The context of a checker whose component has one number per joint, as `examine`.
+
+    Args:
+      member: the component.
+      protocol: contract of the family.
+      n: number of joints; that of the leaves if None.
+      name: what messages call the component.
+      optional: members of the protocol that the component may lack.
+
+    Yields:
+      The findings, the component in float64 for n joints, and n.
+    """
+    check_number(n)
+    with examine(member, protocol.__name__, protocol, optional) as findings:
+        n = number_of_joints(findings, member, n)
+        yield findings, fitted_to(in_dtype(member, "float64"), n, name), n
+
+
 def check_number(n: int | None) -> None:
     """Raises ValueError unless `n` is None or a number of joints."""
     if n is not None:
         checks.positive_integer("n", n, most=checks.MAX_JOINTS)
+
+
+def check_joints_of(n: int | None, owner: Any, name: str) -> None:
+    """Raises ValueError unless `n` is None or the number of joints of its owner."""
+    if n not in (None, owner.n):
+        expected = f"{owner.n}, the joints of the {name}"
+        raise checks.fail("n", n, expected, "Leave one of the two out.")
 
 
 def number_of_joints(findings: Findings, member: Any, n: int | None) -> int:
@@ -79,8 +113,7 @@ def number_of_joints(findings: Findings, member: Any, n: int | None) -> int:
     if len(sizes) > 1:
         listed = " and ".join(map(str, sizes))
         remedy = "Use scalars, or leaves with one number per joint of the same arm"
-        findings.add(f"its leaves are for {listed} joints", remedy)
-        findings.stop_if_any()
+        findings.stop(f"its leaves are for {listed} joints", remedy)
     return joints_of(member)
 
 
@@ -130,16 +163,11 @@ def check_scenario(scenario: Any, n: int | None) -> None:
     if not isinstance(scenario, Scenario):
         remedy = "Such as iblf_jax.presets.zhang_yan_2024()."
         raise checks.fail("scenario", scenario, "a Scenario", remedy)
-    if n not in (None, scenario.n):
-        expected = f"{scenario.n}, the joints of the scenario"
-        raise checks.fail("n", n, expected, "Leave one of the two out.")
+    check_joints_of(n, scenario, "scenario")
 
 
 def scenario_for(
-    findings: Findings,
-    member: Any,
-    scenario: Scenario | None,
-    n: int | None,
+    findings: Findings, member: Any, scenario: Scenario | None, n: int | None
 ) -> Scenario:
     """The given scenario, or one with the number of joints of the component."""
     if scenario is not None:

@@ -21,6 +21,7 @@ from iblf_jax.testing._contract import (
     examine,
     first_line,
     has_shape,
+    in_both_types,
     in_dtype,
     leaves_by_name,
     same_structure,
@@ -68,11 +69,8 @@ def check_law(
             base = dataclasses.replace(base, controller=law, velocity_bounds=speeds)
             base = in_dtype(base, "float64")
         except ValueError as error:
-            findings.add(f"a Scenario does not accept it ({error})")
-            findings.stop_if_any()
-        for dtype in ("float64", "float32"):
-            _structure(findings, in_dtype(base, dtype))
-        findings.stop_if_any()
+            findings.stop(f"a Scenario does not accept it ({error})")
+        in_both_types(findings, _structure, base)
         t = jnp.asarray(0.7)
         tube = base.context.tube(t)
         q, dq = tube.q_d + 0.3 * tube.k_u, tube.dq_d - 0.2
@@ -96,32 +94,20 @@ def _structure(findings: Findings, scenario: Scenario) -> None:
     context = scenario.context
     q, dq = scenario.initial.q, scenario.initial.dq
     t = jnp.zeros((), q.dtype)
-    kind = f" ({q.dtype})"
-    state = shape_of(findings, "init(q, dq, context)" + kind, law.init, q, dq, context)
-    if state is None:
-        return
-    label = "command(t, q, dq, f_hat, context, state)" + kind
+    state = shape_of(findings, "init(q, dq, context)", law.init, q, dq, context)
+    label = "command(t, q, dq, f_hat, context, state)"
     answer = shape_of(findings, label, law.command, t, q, dq, jnp.zeros_like(q), context, state)
-    if answer is None:
-        return
-    if not (isinstance(answer, tuple) and len(answer) == 2 and isinstance(answer[0], Command)):
-        findings.add(
-            f"{label} gives {type(answer).__name__}",
-            "It must be a pair (Command, rate of the state)",
-        )
-        return
+    is_pair = isinstance(answer, tuple) and len(answer) == 2 and isinstance(answer[0], Command)
+    findings.result_is(is_pair, label, answer, "It must be a pair (Command, rate of the state)")
     command, rate = answer
     remedy = "Make constants with the dtype of an argument, jnp.zeros_like(q)"
     for name, got in (("tau", command.tau), ("alpha", command.alpha), ("V1", command.V1)):
-        if has_shape(findings, f"Command.{name}{kind}", got, q.shape):
+        if has_shape(findings, f"Command.{name}", got, q.shape):
             problem = f"Command.{name} is {got.dtype} for {q.dtype} arguments"
             findings.require(got.dtype == q.dtype, problem, remedy)
-    for name, got in (
-        ("guard_active", command.guard_active),
-        ("saturated", command.saturated),
-    ):
-        has_shape(findings, f"Command.{name}{kind}", got, q.shape, jnp.bool_)
-    same_structure(findings, "the rate that command returns" + kind, rate, state)
+    has_shape(findings, "Command.guard_active", command.guard_active, q.shape, jnp.bool_)
+    has_shape(findings, "Command.saturated", command.saturated, q.shape, jnp.bool_)
+    same_structure(findings, "the rate that command returns", rate, state)
 
 
 def _closed_loop(findings: Findings, scenario: Scenario, is_defined_beyond: bool) -> None:

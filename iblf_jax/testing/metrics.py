@@ -16,12 +16,12 @@ from iblf_jax.simulation.signals import Sample
 from iblf_jax.testing._contract import (
     Findings,
     check_function,
-    examine,
-    in_dtype,
+    in_both_types,
+    is_float,
     same_structure,
     shape_of,
 )
-from iblf_jax.testing.joints import check_number, fitted_to, number_of_joints
+from iblf_jax.testing.joints import examine_joints
 
 LENGTH, REGIONS = 40, 1
 
@@ -37,8 +37,7 @@ def check_fold(fold: Any, *, n: int | None = None) -> None:
       ContractError: lists what does not hold, with the remedy.
       ValueError: `n` is not a number of joints, or not that of the leaves.
     """
-    check_number(n)
-    with examine(fold, "Fold", Fold) as findings:
+    with examine_joints(fold, Fold, n, "metric") as (findings, fold, joints):
         units = fold.units
         findings.require(
             isinstance(units, Mapping)
@@ -46,25 +45,19 @@ def check_fold(fold: Any, *, n: int | None = None) -> None:
             f"units is {units!r}",
             'It must be a dict from name to SI unit, {"rmse": "rad"}',
         )
-        n = number_of_joints(findings, fold, n)
-        fold = fitted_to(in_dtype(fold, "float64"), n, "metric")
-        for dtype in ("float64", "float32"):
-            _structure(findings, *in_dtype((fold, samples(np.random.default_rng(4), n)), dtype))
-        findings.stop_if_any()
+        some = samples(np.random.default_rng(4), joints)
+        in_both_types(findings, _structure, fold, some)
 
-        some = samples(np.random.default_rng(4), n)
         numbers, flags = parts(some)
         result = jax.jit(folded)((fold,), some)
         for name, value in result.items():
             findings.require(not np.any(np.isnan(value)), f"{name} is NaN on an ordinary run")
         finite = [
-            name
-            for name, value in result.items()
-            if np.all(np.isfinite(value)) and jnp.issubdtype(value.dtype, jnp.floating)
+            name for name, value in result.items() if np.all(np.isfinite(value)) and is_float(value)
         ]
 
         def outputs(fold, numbers):
-            found = folded((fold,), samples_from(numbers, flags))
+            found = folded((fold,), Sample(**numbers, **flags))
             return {name: found[name] for name in finite}
 
         check_function(findings, outputs, fold, (numbers,))
@@ -89,25 +82,20 @@ def samples(rng: np.random.Generator, n: int = 2, step: float = 0.01) -> Sample:
         )
 
     q_d, e1, tau = 0.5 + wave(0.1), wave(0.2), wave(5.0)
-    numbers = {
-        name: wave(1.0)
-        for name in ("dq", "e2", "dq_d", "alpha", "disturbance", "disturbance_estimate", "gravity")
-    }
-    sides = {"lower": np.full((LENGTH, n), 0.2), "upper": np.full((LENGTH, n), 0.85)}
-    k = np.where(e1 > 0, sides["upper"] - q_d, q_d - sides["lower"])
-    numbers |= {
+    names = ("dq", "e2", "dq_d", "alpha", "disturbance", "disturbance_estimate", "gravity")
+    signals = {name: wave(1.0) for name in names}
+    lower, upper = np.full((LENGTH, n), 0.2), np.full((LENGTH, n), 0.85)
+    signals |= {
         "slack": np.abs(wave(0.1)),
         "dq_lower": np.full((LENGTH, n), -0.9),
         "dq_upper": np.full((LENGTH, n), 1.1),
-    }
-    numbers |= {
         "region_margin": 0.3 + wave(0.2)[:, :REGIONS],
         "region_slack": np.abs(wave(0.1))[:, :REGIONS],
-    }
-    numbers |= sides | {
+        "lower": lower,
+        "upper": upper,
         "q": q_d + e1,
         "e1": e1,
-        "xi": e1 / k,
+        "xi": e1 / np.where(e1 > 0, upper - q_d, q_d - lower),
         "q_d": q_d,
         "tau": tau,
         "V": np.abs(wave(1.0))[:, 0],
@@ -115,51 +103,37 @@ def samples(rng: np.random.Generator, n: int = 2, step: float = 0.01) -> Sample:
         "dt": dt,
         "step": since,
     }
-    flags = {name: rng.uniform(size=(LENGTH, n)) < 0.3 for name in ("guard_active", "saturated")}
-    return samples_from(
-        {k: jnp.asarray(v) for k, v in numbers.items()},
-        {k: jnp.asarray(v) for k, v in flags.items()},
-    )
+    for name in ("guard_active", "saturated"):
+        signals[name] = rng.uniform(size=(LENGTH, n)) < 0.3
+    return Sample(**jax.tree.map(jnp.asarray, signals))
 
 
 def parts(samples: Sample) -> tuple[dict[str, jax.Array], dict[str, jax.Array]]:
     """The floating-point signals of a run, and its flags."""
-    numbers, flags = {}, {}
-    for name, value in vars(samples).items():
-        if jnp.issubdtype(value.dtype, jnp.floating):
-            numbers[name] = value
-        else:
-            flags[name] = value
+    flags = dict(vars(samples))
+    numbers = {name: flags.pop(name) for name, value in vars(samples).items() if is_float(value)}
     return numbers, flags
-
-
-def samples_from(numbers: dict[str, jax.Array], flags: dict[str, jax.Array]) -> Sample:
-    """A Sample from its floating-point signals and its flags."""
-    return Sample(**numbers, **flags)
 
 
 def _structure(findings: Findings, fold: Any, samples: Sample) -> None:
     first = jax.tree.map(lambda x: x[0], samples)
-    kind = f" ({first.t.dtype})"
-    acc = shape_of(findings, "init(sample)" + kind, fold.init, first)
-    if acc is None:
-        return
-    after = shape_of(findings, "update(acc, sample)" + kind, fold.update, acc, first)
-    same_structure(findings, "update(acc, sample)" + kind, after, acc)
-    result = shape_of(findings, "finish(acc)" + kind, fold.finish, acc)
-    if result is None:
-        return
-    if findings.require(
-        isinstance(result, dict),
-        f"finish(acc) gives {type(result).__name__}",
-        "It must be a dict from name to array",
-    ):
-        remedy = "Every name needs a unit, and every unit a name"
-        findings.require(
-            set(result) == set(fold.units),
-            f"finish(acc) returns {sorted(result)}, units names {sorted(fold.units)}",
-            remedy,
-        )
+    acc = accumulates(findings, fold, first)
+    result = shape_of(findings, "finish(acc)", fold.finish, acc)
+    remedy = "It must be a dict from name to array"
+    findings.result_is(isinstance(result, dict), "finish(acc)", result, remedy)
+    findings.require(
+        set(result) == set(fold.units),
+        f"finish(acc) returns {sorted(result)}, units names {sorted(fold.units)}",
+        "Every name needs a unit, and every unit a name",
+    )
+
+
+def accumulates(findings: Findings, fold: Any, sample: Any) -> Any:
+    """The shapes of an accumulator; requires that `update` keeps them."""
+    acc = shape_of(findings, "init(sample)", fold.init, sample)
+    label = "update(acc, sample)"
+    same_structure(findings, label, shape_of(findings, label, fold.update, acc, sample), acc)
+    return acc
 
 
 def at_rest(findings: Findings, fold: Any, samples: Sample) -> None:
@@ -171,8 +145,8 @@ def at_rest(findings: Findings, fold: Any, samples: Sample) -> None:
     @jax.jit
     def both(fold, numbers):
         def floats(fold, numbers):
-            result = folded((fold,), samples_from(numbers, flags))
-            return {k: v for k, v in result.items() if jnp.issubdtype(v.dtype, jnp.floating)}
+            result = folded((fold,), Sample(**numbers, **flags))
+            return {k: v for k, v in result.items() if is_float(v)}
 
         values, pull = jax.vjp(floats, fold, numbers)
         finite = {k: jnp.where(jnp.isfinite(v), jnp.ones_like(v), 0.0) for k, v in values.items()}

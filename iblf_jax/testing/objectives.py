@@ -16,18 +16,19 @@ from iblf_jax.core import checks, notices
 from iblf_jax.engine import Outer, folded
 from iblf_jax.engine.simulate import simulate
 from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.simulation.signals import Sample
 from iblf_jax.testing._contract import (
     Findings,
     check_function,
     examine,
     first_line,
     has_shape,
+    in_both_types,
     in_dtype,
-    same_structure,
     shape_of,
 )
 from iblf_jax.testing.joints import check_scenario, joints_of, scenario_for
-from iblf_jax.testing.metrics import LENGTH, at_rest, parts, samples, samples_from
+from iblf_jax.testing.metrics import LENGTH, accumulates, at_rest, parts, samples
 from iblf_jax.tuning.objectives import Objective, Requirement, complete, for_scenario
 from iblf_jax.tuning.quantities import (
     MetricResult,
@@ -105,16 +106,14 @@ def _quantity(findings: Findings, quantity: Any, duration: float, n: int) -> Non
     some = samples(np.random.default_rng(4), n, step)
     # Half a step later, so that no sample is at the time from which a quantity counts.
     some = dataclasses.replace(some, t=some.t + 0.5 * step)
-    for dtype in ("float64", "float32"):
-        _structure(findings, *in_dtype((quantity, jax.tree.map(lambda x: x[0], some)), dtype))
-    findings.stop_if_any()
+    in_both_types(findings, _structure, quantity, jax.tree.map(lambda x: x[0], some))
     numbers, flags = parts(some)
     # Nothing is differentiated with respect to the grid of the samples.
     flags |= {name: numbers.pop(name) for name in ("t", "dt")}
     fold = Quantities((quantity,))
 
     def outputs(fold, numbers):
-        run = samples_from(numbers, in_dtype(flags, numbers["q"].dtype))
+        run = Sample(**numbers, **in_dtype(flags, numbers["q"].dtype))
         return {"the smooth value": folded((fold,), run)["tuning_smooth"]}
 
     exact = jax.jit(folded)((fold,), some)["tuning_exact"]
@@ -134,28 +133,19 @@ def _quantity(findings: Findings, quantity: Any, duration: float, n: int) -> Non
 
 
 def _structure(findings: Findings, quantity: Any, first: Any) -> None:
-    kind = f" ({first.t.dtype})"
-    acc = shape_of(findings, "init(sample)" + kind, quantity.init, first)
-    if acc is None:
-        return
-    label = "update(acc, sample)" + kind
-    after = shape_of(findings, label, quantity.update, acc, first)
-    same_structure(findings, label, after, acc)
-    result = shape_of(findings, "finish(acc)" + kind, quantity.finish, acc)
+    acc = accumulates(findings, quantity, first)
+    result = shape_of(findings, "finish(acc)", quantity.finish, acc)
     three = isinstance(result, tuple) and len(result) == 3
-    if result is not None and findings.require(
-        three,
-        f"finish(acc) gives {type(result).__name__}",
-        "It must be (smooth value, exact value, pieces)",
-    ):
-        for name, value in zip(("smooth value", "exact value"), result[:2], strict=True):
-            has_shape(findings, f"the {name} of finish(acc){kind}", value, ())
-        shape = _shape(result[2])
-        findings.require(
-            len(shape) == 1,
-            f"the pieces of finish(acc){kind} have shape {shape}",
-            "They must be (m,): value[None] if it is one",
-        )
+    remedy = "It must be (smooth value, exact value, pieces)"
+    findings.result_is(three, "finish(acc)", result, remedy)
+    for name, value in zip(("smooth value", "exact value"), result[:2], strict=True):
+        has_shape(findings, f"the {name} of finish(acc)", value, ())
+    shape = _shape(result[2])
+    findings.require(
+        len(shape) == 1,
+        f"the pieces of finish(acc) have shape {shape}",
+        "They must be (m,): value[None] if it is one",
+    )
     curvature = quantity_member(quantity, "curvature")
     if curvature is None:
         return
@@ -164,18 +154,15 @@ def _structure(findings: Findings, quantity: Any, first: Any) -> None:
         "it has `curvature` without `hessian`",
         "Second-order methods need both",
     )
-    outer = shape_of(findings, "curvature(acc, sample)" + kind, curvature, acc, first)
-    if outer is not None and findings.require(
-        isinstance(outer, Outer),
-        f"curvature(acc, sample) gives {type(outer).__name__}",
-        "It must be an iblf_jax.engine.derivatives.Outer",
-    ):
-        size = _shape(outer.vector)
-        findings.require(len(size) == 1, f"Outer.vector has shape {size}", "It must be (m,)")
-        weight = _shape(outer.weight)
-        findings.require(
-            weight in ((), size), f"Outer.weight has shape {weight}", f"It must be () or {size}"
-        )
+    label = "curvature(acc, sample)"
+    outer = shape_of(findings, label, curvature, acc, first)
+    remedy = "It must be an iblf_jax.engine.derivatives.Outer"
+    findings.result_is(isinstance(outer, Outer), label, outer, remedy)
+    size, weight = _shape(outer.vector), _shape(outer.weight)
+    findings.require(len(size) == 1, f"Outer.vector has shape {size}", "It must be (m,)")
+    findings.require(
+        weight in ((), size), f"Outer.weight has shape {weight}", f"It must be () or {size}"
+    )
 
 
 def _shape(x: Any) -> tuple[int, ...]:
@@ -236,7 +223,7 @@ def _gauss_newton(
         return quantity.update(acc, sample), (outer.vector, weight)
 
     def run(numbers):
-        samples = samples_from(numbers, flags)
+        samples = Sample(**numbers, **flags)
         start = quantity.init(jax.tree.map(lambda x: x[0], samples))
         acc, (vectors, weights) = jax.lax.scan(accumulate, start, samples)
         pieces = quantity.finish(acc)[2]

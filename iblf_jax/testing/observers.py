@@ -16,12 +16,19 @@ from iblf_jax.testing._contract import (
     check_function,
     examine,
     first_line,
+    in_both_types,
     in_dtype,
     leaves_by_name,
     same_structure,
     shape_of,
 )
-from iblf_jax.testing.joints import arm_of, check_number, fitted_to, number_of_joints
+from iblf_jax.testing.joints import (
+    arm_of,
+    check_joints_of,
+    check_number,
+    fitted_to,
+    number_of_joints,
+)
 from iblf_jax.world.robots import Robot
 
 
@@ -45,17 +52,12 @@ def check_observer(observer: Any, *, model: Any = None, n: int | None = None) ->
     with examine(observer, "Observer", Observer) as findings:
         if model is None:
             model = arm_of(number_of_joints(findings, observer, n))
-        if n not in (None, model.n):
-            raise checks.fail(
-                "n", n, f"{model.n}, the joints of the model", "Leave one of the two out."
-            )
+        check_joints_of(n, model, "model")
         model = in_dtype(model, "float64")
         n, t = model.n, jnp.asarray(0.7)
         fitted = fitted_to(in_dtype(observer, "float64"), n, "observer")
         q, dq, tau = jnp.asarray(np.random.default_rng(3).uniform(-1, 1, (3, n)))
-        for dtype in ("float64", "float32"):
-            _structure(findings, *in_dtype((fitted, t, q, dq, tau, model), dtype))
-        findings.stop_if_any()
+        in_both_types(findings, _structure, fitted, t, q, dq, tau, model)
 
         def outputs(observer, t, q, dq, tau, model):
             state = observer.init(q, 0.5 * dq, model)
@@ -64,18 +66,14 @@ def check_observer(observer: Any, *, model: Any = None, n: int | None = None) ->
             return {"estimate": estimate} | leaves_by_name("derivative", rate)
 
         check_function(findings, outputs, fitted, (t, q, dq, tau, model))
-        for dtype in ("float64", "float32"):
-            _scan(findings, *in_dtype((fitted, t, q, dq, tau, model), dtype))
+        in_both_types(findings, _scan, fitted, t, q, dq, tau, model)
 
 
 def _structure(findings: Findings, observer, t, q, dq, tau, model) -> None:
-    n, kind = model.n, f" ({q.dtype})"
-    state = shape_of(findings, "init(q, dq, model)" + kind, observer.init, q, dq, model)
-    if state is None:
-        return
-    label = "estimate(t, q, dq, model, state)" + kind
-    call_has_shape(findings, label, observer.estimate, (t, q, dq, model, state), (n,))
-    label = "derivative(t, q, dq, tau, model, state)" + kind
+    state = shape_of(findings, "init(q, dq, model)", observer.init, q, dq, model)
+    label = "estimate(t, q, dq, model, state)"
+    call_has_shape(findings, label, observer.estimate, (t, q, dq, model, state), q.shape)
+    label = "derivative(t, q, dq, tau, model, state)"
     rate = shape_of(findings, label, observer.derivative, t, q, dq, tau, model, state)
     same_structure(findings, label, rate, state)
 

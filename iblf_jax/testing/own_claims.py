@@ -12,7 +12,7 @@ from iblf_jax.certificates.claims import OWN_CLAIM_METHODS
 from iblf_jax.control.controllers._base import law_member
 from iblf_jax.core.optional import attributes, has_members
 from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.testing._contract import Findings, check_function, in_dtype, shape_of
+from iblf_jax.testing._contract import Findings, check_function, in_both_types, shape_of
 
 STATES = 16
 """Number of states at which V and W must be nonnegative."""
@@ -33,9 +33,7 @@ def check_claims(findings: Findings, scenario: Scenario) -> None:
     for name in OWN_CLAIM_METHODS:
         findings.require(name in stated, f"it has {stated[0]} and no {name}", remedy)
     findings.stop_if_any()
-    for dtype in ("float64", "float32"):
-        _shapes(findings, in_dtype(scenario, dtype))
-    findings.stop_if_any()
+    in_both_types(findings, _shapes, scenario)
     t, q, dq, f_tilde = _near_the_reference(scenario, np.random.default_rng(5))
     context = scenario.context
 
@@ -77,18 +75,15 @@ def _shapes(findings: Findings, scenario: Scenario) -> None:
     context, q, dq = scenario.context, scenario.initial.q, scenario.initial.dq
     t, zero = jnp.zeros((), q.dtype), jnp.zeros_like(q)
     own = law.init(q, dq, context)
-    arguments = (t, q, dq, zero, context, own)
-    calls: dict[str, tuple[Any, tuple]] = {}
+    arguments: tuple[Any, ...] = (t, q, dq, zero, context, own)
     for name, method in attributes(law, OWN_CLAIM_METHODS).items():
-        calls[f"{name}(t, q, dq, f_tilde, context, state)"] = (method, arguments)
+        label = f"{name}(t, q, dq, f_tilde, context, state)"
+        _is_summable(findings, label, shape_of(findings, label, method, *arguments), q)
     disturbance_terms = law_member(law, "disturbance_terms")
     if disturbance_terms is not None:
         label = "disturbance_terms(t, q, dq, f_tilde, df, context, state)"
-        calls[label] = (disturbance_terms, (t, q, dq, zero, zero, context, own))
-    for label, (call, args) in calls.items():
-        got = shape_of(findings, label, call, *args)
-        if got is not None:
-            _is_summable(findings, label, got, q)
+        arguments = (t, q, dq, zero, zero, context, own)
+        _is_summable(findings, label, shape_of(findings, label, disturbance_terms, *arguments), q)
 
 
 def _is_summable(findings: Findings, label: str, got: Any, like: jax.Array) -> None:

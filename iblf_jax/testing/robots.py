@@ -11,9 +11,9 @@ import numpy as np
 from iblf_jax.core import checks
 from iblf_jax.testing._contract import (
     Findings,
+    call_has_shape,
     check_function,
     examine,
-    has_shape,
     in_dtype,
     shape_of,
 )
@@ -84,11 +84,9 @@ def check_robot(robot: Any, *, q: Any = None) -> None:
 def _shapes(findings: Findings, robot: Any, q: Any) -> None:
     n = robot.n
     tip = shape_of(findings, "tip(q)", robot.tip, q)
-    if tip is not None:
-        findings.require(
-            tip.shape in ((2,), (3,)), f"tip(q) has shape {tip.shape}", "It must be (2,) or (3,)"
-        )
-    d = tip.shape[0] if tip is not None and tip.shape in ((2,), (3,)) else 2
+    if tip.shape not in ((2,), (3,)):
+        findings.stop(f"tip(q) has shape {tip.shape}", "It must be (2,) or (3,)")
+    d = tip.shape[0]
     methods = {
         "mass_matrix(q)": (robot.mass_matrix, (q,), (n, n)),
         "coriolis(q, v, u)": (robot.coriolis, (q, q, q), (n,)),
@@ -98,7 +96,7 @@ def _shapes(findings: Findings, robot: Any, q: Any) -> None:
         "skeleton(q)": (robot.skeleton, (q,), (n + 1, d)),
     }
     for label, (method, args, shape) in methods.items():
-        has_shape(findings, label, shape_of(findings, label, method, *args), shape)
+        call_has_shape(findings, label, method, args, shape)
 
 
 def _identities(robot: Any, q: jax.Array, v: jax.Array, u: jax.Array) -> dict[str, jax.Array]:

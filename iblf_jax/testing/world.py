@@ -19,7 +19,14 @@ from iblf_jax.testing._contract import (
     in_dtype,
     shape_of,
 )
-from iblf_jax.testing.joints import arm_of, check_number, fitted_to, joints_of, number_of_joints
+from iblf_jax.testing.joints import (
+    arm_of,
+    check_joints_of,
+    check_number,
+    examine_joints,
+    fitted_to,
+    number_of_joints,
+)
 from iblf_jax.world.bounds import Side
 from iblf_jax.world.disturbances import Disturbance
 from iblf_jax.world.references import Reference
@@ -35,12 +42,6 @@ def rates(function: Any, t: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]
 
     (value, rate), (_, second) = jax.jvp(first, (t,), (jnp.ones_like(t),))
     return value, rate, second
-
-
-def _validated(n: int | None, duration: float) -> tuple[int | None, float]:
-    """The validated number of joints, if given, and duration [s] of a checker."""
-    check_number(n)
-    return n, checks.positive_number("duration", duration, "s")
 
 
 def _smooth_in_time(findings: Findings, label: str, function: Any, duration: float) -> None:
@@ -76,15 +77,12 @@ def check_reference(reference: Any, *, n: int | None = None, duration: float = 2
       ContractError: lists what does not hold, with the remedy.
       ValueError: an invalid argument.
     """
-    n, duration = _validated(n, duration)
-    with examine(reference, "Reference", Reference) as findings:
+    duration = checks.positive_number("duration", duration, "s")
+    with examine_joints(reference, Reference, n, "reference") as (findings, fitted, joints):
         t = jnp.asarray(0.3217 * duration)
-        fitted = fitted_to(
-            in_dtype(reference, "float64"), number_of_joints(findings, reference, n), "reference"
-        )
         got = shape_of(findings, "position(t)", fitted.position, t)
-        expected = (n or joints_of(reference),)
-        if n is None and got is not None and len(got.shape) == 1:
+        expected = (joints,)
+        if n is None and len(got.shape) == 1:
             expected = got.shape
         has_shape(findings, "position(t)", got, expected)
         findings.stop_if_any()
@@ -110,13 +108,11 @@ def check_side(side: Any, *, n: int | None = None, duration: float = 20.0) -> No
       ContractError: lists what does not hold, with the remedy.
       ValueError: an invalid argument.
     """
-    n, duration = _validated(n, duration)
-    with examine(side, "Side", Side) as findings:
-        n = number_of_joints(findings, side, n)
+    duration = checks.positive_number("duration", duration, "s")
+    with examine_joints(side, Side, n, "side") as (findings, fitted, joints):
         t = jnp.asarray(0.3217 * duration)
-        fitted = fitted_to(in_dtype(side, "float64"), n, "side")
-        q_d = jnp.linspace(0.3, 0.7, n)
-        call_has_shape(findings, "at(t, q_d)", fitted.at, (t, q_d), (n,))
+        q_d = jnp.linspace(0.3, 0.7, joints)
+        call_has_shape(findings, "at(t, q_d)", fitted.at, (t, q_d), (joints,))
         findings.stop_if_any()
 
         def along(side, t, q_d):
@@ -152,9 +148,8 @@ def check_region(region: Any, *, dimensions: int | None = None, size: float = 2.
     if dimensions is not None:
         known = [checks.positive_integer("dimensions", dimensions, least=2, most=3)]
     with examine(region, "Region", Region) as findings:
-        ok = isinstance(region.point, str | int)
         findings.require(
-            ok,
+            isinstance(region.point, str | int),
             f"point is {region.point!r}",
             'It must be "tip", or a joint\'s name or number, in a static field',
         )
@@ -239,7 +234,8 @@ def check_disturbance(
       ContractError: lists what does not hold, with the remedy.
       ValueError: an invalid argument, or a plant with another number of joints than `n`.
     """
-    n, duration = _validated(n, duration)
+    check_number(n)
+    duration = checks.positive_number("duration", duration, "s")
     for name, robot in (("plant", plant), ("model", model)):
         if robot is not None:
             checks.conforms(name, robot, Robot)
@@ -248,10 +244,7 @@ def check_disturbance(
             plant = model
         if plant is None:
             plant = arm_of(number_of_joints(findings, disturbance, n))
-        if n not in (None, plant.n):
-            raise checks.fail(
-                "n", n, f"{plant.n}, the joints of the plant", "Leave one of the two out."
-            )
+        check_joints_of(n, plant, "plant")
         plant = in_dtype(plant, "float64")
         model = plant if model is None else in_dtype(model, "float64")
         n, t = plant.n, jnp.asarray(0.3217 * duration)
@@ -262,8 +255,7 @@ def check_disturbance(
         arguments = (t, q, dq, plant, model)
         call_has_shape(findings, label, fitted.torque, arguments, (n,))
         jumps = shape_of(findings, "jump_times()", fitted.jump_times)
-        if jumps is not None:
-            has_shape(findings, "jump_times()", jumps, (*getattr(jumps, "shape", ()), 0)[:1])
+        has_shape(findings, "jump_times()", jumps, (*getattr(jumps, "shape", ()), 0)[:1])
         findings.stop_if_any()
         check_function(findings, lambda d, *args: {label: d.torque(*args)}, fitted, arguments)
         known = _finite_jump_times(findings, fitted)

@@ -39,10 +39,9 @@ from iblf_jax.engine.simulate import simulate
 from iblf_jax.simulation.metrics import check_needs
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.results import Rollout
-from iblf_jax.simulation.sampling import check_step
-from iblf_jax.simulation.scenario import Scenario, canonical
-from iblf_jax.studies.cube import Cube, bounded
+from iblf_jax.simulation.scenario import Scenario, canonical, check_step
 from iblf_jax.studies.distributions import Perturbation
+from iblf_jax.studies.perturbation_cube import Cube, bounded
 from iblf_jax.tuning.evaluation import Derivatives, Value
 from iblf_jax.tuning.parameters import Box
 from iblf_jax.tuning.quantities import DEFICITS, Peak, Quantities

@@ -39,8 +39,8 @@ import numpy as np
 
 from iblf_jax.core.status import UNTRUSTED
 from iblf_jax.engine import run_for_reverse, starts_per_batch
+from iblf_jax.simulation.noise import NOISE_NAME
 from iblf_jax.simulation.paths import with_parameters
-from iblf_jax.simulation.sampling import NOISE_NAME
 from iblf_jax.studies.draws import same_place
 from iblf_jax.tuning.objectives import Objective
 from iblf_jax.tuning.problem import NO_LEVEL, Candidate, TuningProblem, of_runs

@@ -18,11 +18,11 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.engine import RunRequest, points_per_batch
+from iblf_jax.simulation.noise import has_noise
 from iblf_jax.simulation.paths import with_parameters
-from iblf_jax.simulation.sampling import check_step, has_noise
-from iblf_jax.simulation.scenario import Scenario, canonical
+from iblf_jax.simulation.scenario import Scenario, canonical, check_step
 from iblf_jax.studies.draws import Cases, Target, targets_of
-from iblf_jax.studies.recommended import recommended_dt
+from iblf_jax.studies.time_step import recommended_dt
 from iblf_jax.tuning.objectives import (
     Objective,
     checked,

@@ -36,8 +36,7 @@ from iblf_jax.core.joints import Selection, indices, selection
 from iblf_jax.core.optional import OptionalMembers
 from iblf_jax.core.pytree import component, leaf, static
 from iblf_jax.engine import Outer
-from iblf_jax.simulation.metrics import Fold
-from iblf_jax.simulation.optional import optional_member
+from iblf_jax.simulation.metrics import Fold, fold_member
 from iblf_jax.simulation.signals import Sample
 
 INITIAL_PEAK = 1e6
@@ -371,7 +370,7 @@ class MetricResult:
     @property
     def needs(self) -> str | None:
         """The optional signal of a run that its fold reads."""
-        return optional_member(self.fold, "needs")  # type: ignore[no-any-return]
+        return fold_member(self.fold, "needs")  # type: ignore[no-any-return]
 
     def init(self, sample: Sample):
         """The fold's accumulator."""

@@ -31,9 +31,9 @@ from iblf_jax.engine import RunRequest, report_runs_per_batch
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.draws import Cases, targets_of
-from iblf_jax.studies.recommended import warn_of_step
 from iblf_jax.studies.statistics import Probability, probability
 from iblf_jax.studies.study import VIOLATED
+from iblf_jax.studies.time_step import warn_of_step
 from iblf_jax.tuning.objectives import Objective
 from iblf_jax.tuning.options import Report, RunOptions
 from iblf_jax.tuning.quantities import OF_LIMIT

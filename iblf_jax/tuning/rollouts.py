@@ -13,11 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.engine import RunRequest, run_batch
-from iblf_jax.simulation.accuracy import RELATIVE
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
+from iblf_jax.simulation.error_estimate import RELATIVE
 from iblf_jax.simulation.metrics import Torque
+from iblf_jax.simulation.noise import noise_of
 from iblf_jax.simulation.paths import get, with_parameters
-from iblf_jax.simulation.sampling import noise_of
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.draws import Cases, Target, draw, merge
 from iblf_jax.tuning.objectives import Objective

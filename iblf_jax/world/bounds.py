@@ -122,13 +122,9 @@ class Bounds:
 
     def check(self) -> None:
         """Raises ValueError for a side that is not one."""
-        for name, side in {"lower": self.lower, "upper": self.upper}.items():
-            checks.conforms(
-                f"Bounds.{name}",
-                side,
-                Side,
-                "A constant bound is iblf_jax.bounds.Constant(value).",
-            )
+        remedy = "A constant bound is iblf_jax.bounds.Constant(value)."
+        checks.conforms("Bounds.lower", self.lower, Side, remedy)
+        checks.conforms("Bounds.upper", self.upper, Side, remedy)
 
 
 def _distance(name: str, value: Any, n: int, sign: str | None) -> jax.Array:
@@ -140,11 +136,20 @@ def _distance(name: str, value: Any, n: int, sign: str | None) -> jax.Array:
     return array
 
 
-def _distance_or_zero(name: str, value: Any, n: int) -> jax.Array | float:
-    """A positive distance as `_distance`; 0 where none is given."""
-    if value is None:
-        return 0.0
-    return _distance(name, value, n, "positive")
+def _limits_of(robot: Robot, member: str, what: str, unlimited: Any) -> tuple[Any, Any]:
+    """Limits that a robot declares, and what replaces them where a joint has none, which is 0 if
+    every joint has limits.
+    """
+    limits = robot_member(robot, member)
+    if limits is None:
+        expected, remedy = f"a robot with {what} limits, such as an Arm", "Give bounds of your own."
+        raise checks.fail("robot", type(robot).__name__, expected, remedy)
+    if unlimited is not None:
+        return limits, _distance("unlimited", unlimited, robot.n, "positive")
+    if checks.is_concrete(limits) and not np.all(np.isfinite(limits)):
+        remedy = "Say what to use where there is none, such as unlimited=6.3."
+        raise checks.fail(f"robot.{member}", limits, "limits on every joint", remedy)
+    return limits, 0.0
 
 
 def from_limits(robot: Robot, *, margin: float = 0.0, unlimited: float | None = None) -> Bounds:
@@ -161,34 +166,14 @@ def from_limits(robot: Robot, *, margin: float = 0.0, unlimited: float | None = 
       ValueError: a robot without `limits`, or with joints that have none and no `unlimited`; a
         margin that leaves nothing.
     """
-    limits = robot_member(robot, "limits")
-    if limits is None:
-        raise checks.fail(
-            "robot",
-            type(robot).__name__,
-            "a robot with joint limits, such as an Arm",
-            "Give bounds of your own.",
-        )
+    limits, far = _limits_of(robot, "limits", "joint", unlimited)
     margins = _distance("margin", margin, robot.n, None)
-    far = _distance_or_zero("unlimited", unlimited, robot.n)
-    sides = []
-    for side, sign in zip(limits, (1.0, -1.0), strict=True):
-        if checks.is_concrete(side) and not np.all(np.isfinite(side)) and unlimited is None:
-            raise checks.fail(
-                "robot.limits",
-                side,
-                "limits on every joint",
-                "Say what to use where there are none: unlimited=6.3.",
-            )
-        sides.append(jnp.where(jnp.isfinite(side), side + sign * margins, -sign * far))
-    lower, upper = sides
-    if checks.is_concrete(sides) and not np.all(np.asarray(lower) < np.asarray(upper)):
-        raise checks.fail(
-            "margin",
-            margin,
-            "a margin that leaves room between the limits",
-            f"The narrowest range is {float(np.min(np.diff(limits, axis=0))):g} rad.",
-        )
+    lower = jnp.where(jnp.isfinite(limits[0]), limits[0] + margins, -far)
+    upper = jnp.where(jnp.isfinite(limits[1]), limits[1] - margins, far)
+    if checks.is_concrete((lower, upper)) and not np.all(np.asarray(lower) < np.asarray(upper)):
+        expected = "a margin that leaves room between the limits"
+        narrowest = float(np.min(np.diff(limits, axis=0)))
+        raise checks.fail("margin", margin, expected, f"The narrowest range is {narrowest:g} rad.")
     return Bounds(lower=Constant(lower), upper=Constant(upper))
 
 
@@ -209,19 +194,8 @@ def from_speed_limits(
       ValueError: a robot without `speed`, or with joints that have no limit and no `unlimited`; a
         share that is not positive.
     """
-    speed = robot_member(robot, "speed")
-    if speed is None:
-        raise checks.fail(
-            "robot",
-            type(robot).__name__,
-            "a robot with speed limits, such as an Arm",
-            "Give velocity bounds of your own.",
-        )
+    speed, far = _limits_of(robot, "speed", "speed", unlimited)
     share = checks.positive_number("share", share, "1")
-    far = _distance_or_zero("unlimited", unlimited, robot.n)
-    if checks.is_concrete(speed) and not np.all(np.isfinite(speed)) and unlimited is None:
-        remedy = "Say what to use where there is none: unlimited=3.0."
-        raise checks.fail("robot.speed", speed, "a limit on every joint", remedy)
     most = share * jnp.where(jnp.isfinite(speed), speed, far)
     return Bounds(lower=Constant(-most), upper=Constant(most))
 
@@ -302,15 +276,10 @@ def tube_at(
     Raises:
       ValueError: something that is no reference, no bounds or no time.
     """
-    checks.offers(
-        "reference", reference, ("position",), "a reference, as iblf_jax.references.Reference"
-    )
-    checks.offers(
-        "bounds",
-        bounds,
-        ("lower", "upper"),
-        "bounds, as iblf_jax.bounds.Bounds(lower=..., upper=...)",
-    )
+    expected = "a reference, as iblf_jax.references.Reference"
+    checks.offers("reference", reference, ("position",), expected)
+    expected = "bounds, as iblf_jax.bounds.Bounds(lower=..., upper=...)"
+    checks.offers("bounds", bounds, ("lower", "upper"), expected)
     t = checks.as_floats("t", t)
     checks.shape_is("t", t, ())
     acceleration = checks.flag("acceleration", acceleration)

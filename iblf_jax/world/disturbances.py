@@ -13,7 +13,7 @@ differentiable (Assumption 1), so a disturbance that jumps says when: `jump_time
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from iblf_jax.core import checks
 from iblf_jax.core.linalg import matvec
 from iblf_jax.core.pytree import Leaf, component, leaf
-from iblf_jax.core.time import joined, jump_times_of
+from iblf_jax.core.time import joined, jump_times_of, no_times
 from iblf_jax.world.robots import Robot
 
 
@@ -46,8 +46,9 @@ class Disturbance(Protocol):
         ...
 
 
-def _never() -> jax.Array:
-    return jnp.zeros((0,))
+def _never(disturbance: Any) -> jax.Array:
+    """No jump times: the torque is continuous."""
+    return no_times()
 
 
 @component
@@ -60,9 +61,7 @@ class Nothing:
         """Zero, (n,) [N m]."""
         return jnp.zeros_like(q)
 
-    def jump_times(self) -> jax.Array:
-        """None."""
-        return _never()
+    jump_times = _never
 
 
 @component
@@ -107,9 +106,7 @@ class ModelShaped:
         )
         return matvec(model.mass_matrix(q), a) + model.coriolis(q, dq, b)
 
-    def jump_times(self) -> jax.Array:
-        """None: it is smooth."""
-        return _never()
+    jump_times = _never
 
 
 @component
@@ -136,9 +133,7 @@ class Sinusoids:
             self.offset + self.amplitude * jnp.sin(self.frequency * t + self.phase), q.shape
         )
 
-    def jump_times(self) -> jax.Array:
-        """None: it is smooth."""
-        return _never()
+    jump_times = _never
 
 
 @component
@@ -191,9 +186,7 @@ class TipForce:
         force = self.offset + self.amplitude * jnp.sin(self.frequency * t + self.phase)
         return matvec(J.T, jnp.broadcast_to(force, (J.shape[0],)))
 
-    def jump_times(self) -> jax.Array:
-        """None: it is smooth."""
-        return _never()
+    jump_times = _never
 
 
 @component
@@ -218,9 +211,7 @@ class Friction:
         """(n,) [N m]."""
         return -(self.viscous * dq + self.coulomb * jnp.tanh(dq / self.width))
 
-    def jump_times(self) -> jax.Array:
-        """None: the Coulomb part is smoothed."""
-        return _never()
+    jump_times = _never
 
 
 @component

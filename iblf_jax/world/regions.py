@@ -70,15 +70,11 @@ class HalfSpace:
         """Raises ValueError for a normal without a direction."""
         _is_point("HalfSpace.normal", self.normal)
         if checks.is_concrete(self.normal) and not float(jnp.max(jnp.abs(self.normal))) > 0:
-            raise checks.fail(
-                "HalfSpace.normal",
-                self.normal,
-                "a direction, of a length above 0",
-                "Such as [0, 0, 1]: up.",
-            )
+            expected = "a direction, of a length above 0"
+            raise checks.fail("HalfSpace.normal", self.normal, expected, "Such as [0, 0, 1]: up.")
 
     def distance(self, x: jax.Array) -> jax.Array:
-        """N . x - offset, () [m]."""
+        """The distance n . x - offset, n = normal/|normal|, () [m]."""
         return jnp.sum(self.normal * x) / jnp.sqrt(jnp.sum(self.normal**2)) - self.offset
 
     def level(self, x: jax.Array) -> jax.Array:
@@ -117,10 +113,10 @@ class Sphere:
     def distance(self, x: jax.Array) -> jax.Array:
         """|x - centre| - radius outside, radius - |x - centre| inside, () [m]."""
         square = jnp.sum((x - self.centre) ** 2)
-        away = (
-            jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0) - self.radius
-        )
-        return away if self.keep == "outside" else -away
+        length = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+        if self.keep == "outside":
+            return length - self.radius
+        return -(length - self.radius)
 
     def level(self, x: jax.Array) -> jax.Array:
         """The distance outside, (radius^2 - |x - centre|^2)/(2 radius) inside, () [m]."""
@@ -131,12 +127,8 @@ class Sphere:
 
 def _is_point(name: str, value: jax.Array) -> None:
     if jnp.shape(value) not in ((2,), (3,)):
-        raise checks.fail(
-            name,
-            value,
-            "two numbers in the plane, or three in space",
-            f"Its shape is {jnp.shape(value)}.",
-        )
+        expected = "two numbers in the plane, or three in space"
+        raise checks.fail(name, value, expected, f"Its shape is {jnp.shape(value)}.")
 
 
 def row_of(robot: Robot, point: str | int) -> int:

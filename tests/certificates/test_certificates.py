@@ -22,7 +22,7 @@ from iblf_jax.certificates.proof_terms import rounding, terms_at
 from iblf_jax.certificates.run_summary import restarts, summarise
 from iblf_jax.simulation.closed_loop import LoopState, initial_state
 from iblf_jax.simulation.scenario import canonical
-from iblf_jax.studies.cube import bounded
+from iblf_jax.studies.perturbation_cube import bounded
 
 
 def between(low, high):

@@ -20,7 +20,7 @@ import iblf_jax as ij
 from iblf_jax import _start, cli
 from iblf_jax.cli import _claims, _common
 from iblf_jax.core import tables
-from iblf_jax.core.cache import keep_programs
+from iblf_jax.core.disk_cache import keep_programs
 from iblf_jax.files import scenario as scenario_file
 
 SHORT = ["--duration", "0.05", "--dt", "0.001", "--method", "heun"]
@@ -404,7 +404,7 @@ def test_the_cache_is_optional(cache, tmp_path, monkeypatch):
     monkeypatch.setattr(type(jax.config), "jax_enable_compilation_cache", True, raising=False)
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / cache))
-    monkeypatch.setattr("iblf_jax.core.cache._reloads_badly", lambda: False)
+    monkeypatch.setattr("iblf_jax.core.disk_cache._reloads_badly", lambda: False)
     keep_programs.cache_clear()
     cli.prepare_jax()
     assert seen["jax_enable_x64"] is True

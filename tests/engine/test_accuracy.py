@@ -18,7 +18,7 @@ from iblf_jax.control.actuators._base import Delivered
 from iblf_jax.core import linalg
 from iblf_jax.core.status import Status
 from iblf_jax.engine import RunRequest, run_batch, run_batch_jvp, run_for_reverse, step_size
-from iblf_jax.simulation.accuracy import RELATIVE, TOLERANCE
+from iblf_jax.simulation.error_estimate import RELATIVE, TOLERANCE
 from iblf_jax.simulation.integrators import TABLEAUS
 from iblf_jax.simulation.metrics import as_folds
 from iblf_jax.simulation.scenario import canonical

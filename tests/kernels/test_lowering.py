@@ -25,7 +25,7 @@ from iblf_jax.kernels.from_jaxpr import closed
 from iblf_jax.kernels.operations import OPERATIONS
 from iblf_jax.kernels.packed import Shapes, pack
 from iblf_jax.kernels.passes import written_out
-from iblf_jax.simulation import accuracy
+from iblf_jax.simulation import error_estimate
 from iblf_jax.simulation.closed_loop import initial_state
 from iblf_jax.simulation.metrics import standard
 from iblf_jax.simulation.scenario import canonical
@@ -116,7 +116,7 @@ def carry_of(inputs, varied, method):
     programs of their own."""
 
     def one(inputs):
-        size = accuracy.watched_indices(initial_state(inputs.scenario)).size
+        size = error_estimate.watched_indices(initial_state(inputs.scenario)).size
         jacobian = 0.1 * jnp.cos(jnp.arange(1.0, 1.0 + size * size, dtype=inputs.dt.dtype)).reshape(
             size, size
         )

@@ -25,8 +25,8 @@ from jax.experimental.compilation_cache.compilation_cache import reset_cache
 
 from iblf_jax import cli
 from iblf_jax.core import devices
-from iblf_jax.core.cache import _reloads_badly, keep_programs
 from iblf_jax.core.caches import CACHE
+from iblf_jax.core.disk_cache import _reloads_badly, keep_programs
 from iblf_jax.engine import compile, native
 from iblf_jax.kernels import directory, drafts, nvrtc, processor, toolchain
 from iblf_jax.kernels.toolchain import ToolchainError
@@ -209,7 +209,7 @@ def chosen_cache(monkeypatch, badly=False):
     monkeypatch.setattr(type(jax.config), "jax_compilation_cache_dir", None, raising=False)
     monkeypatch.setattr(type(jax.config), "jax_enable_compilation_cache", True, raising=False)
     monkeypatch.setattr(warnings, "warn", lambda text, *_, **__: said.append(text))
-    monkeypatch.setattr("iblf_jax.core.cache._reloads_badly", lambda: badly)
+    monkeypatch.setattr("iblf_jax.core.disk_cache._reloads_badly", lambda: badly)
     keep_programs.cache_clear()
     cli.prepare_jax()
     return seen.get("jax_compilation_cache_dir"), said
@@ -260,11 +260,11 @@ def test_what_was_used_longest_ago_goes_first(cache, monkeypatch):
     ):
         (cache / name).write_bytes(bytes(1000))
         os.utime(cache / name, (now - age, now - age))
-    monkeypatch.setattr("iblf_jax.core.cache.MAX_BYTES", 2500)
+    monkeypatch.setattr("iblf_jax.core.disk_cache.MAX_BYTES", 2500)
     chosen_cache(monkeypatch)
     assert sorted(path.name for path in cache.rglob("*.*")) == ["c.so", "d.so", "notes.txt"]
     assert not (cache / "xla-abc" / "b-cache").exists()
-    monkeypatch.setattr("iblf_jax.core.cache.MAX_BYTES", 0)
+    monkeypatch.setattr("iblf_jax.core.disk_cache.MAX_BYTES", 0)
     chosen_cache(monkeypatch)
     assert sorted(path.name for path in cache.rglob("*.*")) == ["d.so", "notes.txt"]
 
@@ -283,7 +283,7 @@ def test_programs_of_another_processor_are_apart(cache, monkeypatch):
     processor.cache_clear()
     assert len(folders - {None}) == 2
     monkeypatch.setattr(
-        "iblf_jax.core.cache.cpuinfo",
+        "iblf_jax.core.disk_cache.cpuinfo",
         lambda: ["model name : Same 9000", "bugs : spectre_v2 gds mds"],
     )
     assert chosen_cache(monkeypatch, badly=_reloads_badly()) == (None, [])
@@ -295,7 +295,7 @@ def test_nothing_is_removed_through_a_link(cache, tmp_path, monkeypatch):
     precious = tmp_path / "elsewhere" / "precious.so"
     precious.write_bytes(bytes(1000))
     os.utime(precious, (0, 0))
-    monkeypatch.setattr("iblf_jax.core.cache.MAX_BYTES", 0)
+    monkeypatch.setattr("iblf_jax.core.disk_cache.MAX_BYTES", 0)
     (cache / "xla-old").symlink_to(tmp_path / "elsewhere")
     assert chosen_cache(monkeypatch)[0] is None
     assert precious.exists()

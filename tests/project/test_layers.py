@@ -177,7 +177,7 @@ def test_the_session_is_left_alone():
         p.relative_to(PACKAGE): text for p, text in SOURCES.items() if calls(text, "jax.config")
     }
     assert {p for p in users if p.parts[0] != "cli"} == {
-        Path("core/cache.py"),
+        Path("core/disk_cache.py"),
         Path("core/devices.py"),
         Path("studies/workers.py"),
     }

@@ -40,7 +40,8 @@ from iblf_jax.files.components import decode_fields
 from iblf_jax.simulation import metrics, paths
 from iblf_jax.simulation.results import Metrics
 from iblf_jax.simulation.scenario import check_values
-from iblf_jax.studies.setup import prepare
+from iblf_jax.studies.options import RunOptions
+from iblf_jax.studies.study_setup import prepare
 from iblf_jax.tuning.parameters import layout
 from iblf_jax.tuning.result import TuneSetup
 from iblf_jax.tuning.robust import as_risk
@@ -467,7 +468,8 @@ def no_runs(monkeypatch):
         monkeypatch.setattr(f"iblf_jax.{place}", entered)
     by_scan = ExecutionPlan((), PLAIN_LAYOUT, PLAIN_LAYOUT, True)
     monkeypatch.setattr(
-        "iblf_jax.studies.setup.compile_batch", lambda request, *_: CompiledBatch(request, by_scan)
+        "iblf_jax.studies.study_setup.compile_batch",
+        lambda request, *_: CompiledBatch(request, by_scan),
     )
 
 
@@ -767,9 +769,8 @@ def results(paper, no_runs, monkeypatch):
     monkeypatch.setattr("iblf_jax.plotting._style.new_figure", entered)
     monkeypatch.setattr("iblf_jax.tuning.result._slice", entered)
     run = made_up(paper.plant, duration=0.1)
-    setup = prepare(
-        paper, WAYS, 4, 0, duration=0.01, dt=1e-3, method="rk4", metrics=None, backend="vmap"
-    )
+    options = RunOptions(duration=0.01, dt=1e-3, method="rk4", backend="vmap", runs=4, seed=0)
+    setup = prepare(paper, WAYS, options.checked(), metrics=None)
     found = Metrics(
         {"margin": np.full((4, 2), 0.1), "rmse": np.full((4, 2), 0.01)},
         (("margin", "rad"), ("rmse", "rad")),

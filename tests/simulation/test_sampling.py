@@ -22,7 +22,7 @@ from iblf_jax.engine.period import radius_at
 from iblf_jax.engine.step_size import start_and_along
 from iblf_jax.simulation.closed_loop import run_sampled_law
 from iblf_jax.simulation.metrics import standard
-from iblf_jax.simulation.sampling import noise_key, normals
+from iblf_jax.simulation.noise import noise_key, normals
 from iblf_jax.simulation.scenario import canonical
 from iblf_jax.tuning.parameters import layout
 from iblf_jax.tuning.ranges import BY_COUNT, BY_PERIOD, TIMES, TOGETHER

@@ -23,7 +23,7 @@ import study_cases as cases
 import iblf_jax as ij
 from iblf_jax.engine import CompiledBatch, native
 from iblf_jax.kernels import toolchain
-from iblf_jax.studies import execution, interrupt, store, sweep
+from iblf_jax.studies import blocks, interrupt, store, sweep
 
 SCENARIO = ij.presets.zhang_yan_2024()
 
@@ -149,7 +149,7 @@ def test_store_opens_with_xarray_and_load(written, table):
 
 
 def test_a_finished_store_is_not_computed_again(finished, table, monkeypatch):
-    monkeypatch.setattr(execution, "run_blocks", lambda *_, **__: iter(()))
+    monkeypatch.setattr(blocks, "run_blocks", lambda *_, **__: iter(()))
     monkeypatch.setattr(sweep.Store, "write", lambda *_: pytest.fail("computed again"))
     assert cases.table(store=finished).identical(table)
 

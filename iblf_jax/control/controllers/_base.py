@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, Protocol
 
 import jax
 
+from iblf_jax.core.linalg import matvec
 from iblf_jax.core.optional import OptionalMembers
 from iblf_jax.world.bounds import Bounds, Tube, speed_limits_at, tube_at
 from iblf_jax.world.references import Reference
@@ -156,6 +157,36 @@ def switching_functions(
     """
     functions: jax.Array | None = law_member(law, "switching")(t, q, dq, context, state)
     return functions
+
+
+def no_state(law: Any, q: jax.Array, dq: jax.Array, context: LawContext) -> tuple[()]:
+    """`init` of a law without a state."""
+    return ()
+
+
+def wrapped_advice(law: Any) -> list[str]:
+    """`advice` of a law that wraps another: the other's."""
+    return law_member(law.law, "advice")()  # type: ignore[no-any-return]
+
+
+def wrapped_state(law: Any, q: jax.Array, dq: jax.Array, context: LawContext) -> State:
+    """`init` of a law that wraps another and has no state of its own."""
+    return law.law.init(q, dq, context)
+
+
+def wrapped_switching(
+    law: Any, t: jax.Array, q: jax.Array, dq: jax.Array, context: LawContext, state: State
+) -> jax.Array | None:
+    """`switching` of a law that wraps another and has no state of its own: the other's."""
+    return switching_functions(law.law, t, q, dq, context, state)
+
+
+def rigid_body_torque(
+    model: Robot, q: jax.Array, dq: jax.Array, v: jax.Array, acceleration: jax.Array
+) -> jax.Array:
+    """C0 v + G0 + M0 acceleration, (n,) [N m]."""
+    coriolis, gravity = model.coriolis(q, dq, v), model.gravity(q)
+    return coriolis + gravity + matvec(model.mass_matrix(q), acceleration)
 
 
 class LyapunovLaw(Protocol):

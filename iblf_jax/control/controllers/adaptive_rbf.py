@@ -26,9 +26,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.control.barriers import Barrier, Log
-from iblf_jax.control.barriers._base import CLAIMS, guard_is_active
 from iblf_jax.control.controllers._base import Command, LawContext
-from iblf_jax.control.controllers.backstepping import alpha_and_rate, fit_o, fit_weight, weight_unit
+from iblf_jax.control.controllers.backstepping import (
+    alpha_and_rate,
+    barrier_command,
+    check_barrier,
+    fit_o,
+    fit_weight,
+    weight_units,
+)
 from iblf_jax.core import checks
 from iblf_jax.core.caches import memoised
 from iblf_jax.core.pytree import Leaf, component, leaf, static
@@ -79,19 +85,14 @@ class AdaptiveRBF:
     gains: ClassVar[tuple[str, ...]] = ("k1", "K2")
     unit_factors: ClassVar[tuple[str, ...]] = ("weight",)
     uses_observer: ClassVar[bool] = False
+    leaf_units = weight_units
 
     def check(self) -> None:
         """Raises ValueError for a bad barrier or number of nodes; completes `o` and `weight`."""
         checks.positive_integer("AdaptiveRBF.nodes", self.nodes)
-        checks.conforms(
-            "AdaptiveRBF.barrier", self.barrier, Barrier, "Such as iblf_jax.barriers.Log().", CLAIMS
-        )
-        fit_o(self)
+        check_barrier(self, "barrier", self.barrier, "Log")
+        fit_o(self, self.barrier)
         fit_weight(self)
-
-    def leaf_units(self) -> dict[str, str]:
-        """The unit of the weight, which depends on the barrier."""
-        return {"weight": weight_unit(self.barrier)}
 
     def init(self, q: jax.Array, dq: jax.Array, context: LawContext) -> jax.Array:
         """W_hat(0) = 0, (nodes, n) [N m]."""
@@ -99,14 +100,9 @@ class AdaptiveRBF:
 
     def basis(self, q: jax.Array, dq: jax.Array, alpha: jax.Array, dalpha: jax.Array) -> jax.Array:
         """S(Z), (nodes,) [1]."""
-        z = jnp.concatenate(
-            [
-                (q - self.middle) / self.span_q,
-                dq / self.span_dq,
-                alpha / self.span_dq,
-                dalpha / self.span_ddq,
-            ]
-        )
+        position = (q - self.middle) / self.span_q
+        rates = [dq / self.span_dq, alpha / self.span_dq, dalpha / self.span_ddq]
+        z = jnp.concatenate([position, *rates])
         offset = z - jnp.asarray(sobol_centres(self.nodes, z.size), z.dtype)
         return jnp.exp(-jnp.sum(offset**2, axis=1) / self.width**2)
 
@@ -125,9 +121,7 @@ class AdaptiveRBF:
         S = self.basis(q, dq, alpha, dalpha)
         learned = jnp.sum(S[:, None] * state, axis=0)
         tau = learned - self.K2 * e2 - self.weight * self.barrier.slope(tube, q)
-        guard_active = guard_is_active(tube, q, self.barrier.guard)
-        value = self.weight * self.barrier.value(tube, q)
-        command = Command(tau, alpha, value, guard_active, jnp.zeros_like(guard_active))
+        command = barrier_command(self, tube, q, alpha, tau)
         return command, -self.Gamma * (S[:, None] * e2 + self.sigma * state)
 
 

@@ -18,7 +18,7 @@ exact.
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -26,12 +26,17 @@ import numpy as np
 
 from iblf_jax.control.barriers import Barrier, Integral
 from iblf_jax.control.barriers._base import CLAIMS, barrier_member, guard_is_active, value_unit
-from iblf_jax.control.controllers._base import Command, LawContext
+from iblf_jax.control.controllers._base import Command, LawContext, no_state, rigid_body_torque
 from iblf_jax.core import checks
-from iblf_jax.core.linalg import matvec
 from iblf_jax.core.pytree import Leaf, component, leaf, static
+from iblf_jax.world.bounds import Tube
 
 READINGS = ("printed", "corrected")
+
+
+def weight_units(law: Any) -> dict[str, str]:
+    """`leaf_units` of a law with a barrier: the weight w has a unit for which w s is a torque."""
+    return {"weight": "N m/rad" if value_unit(law.barrier) == "rad^2" else "N m rad"}
 
 
 @component
@@ -62,25 +67,17 @@ class Backstepping:
     weight: Leaf = leaf("N m rad", sign="positive", default=None)
     gains: ClassVar[tuple[str, ...]] = ("k1", "K2")
     unit_factors: ClassVar[tuple[str, ...]] = ("weight",)
+    leaf_units = weight_units
+    init = no_state
 
     def check(self) -> None:
         """Raises ValueError for an unknown reading; completes `o` (0.1, the paper's, if the barrier
         needs one) and `weight`.
         """
         checks.one_of("Backstepping.reading", self.reading, READINGS)
-        checks.conforms(
-            "Backstepping.barrier",
-            self.barrier,
-            Barrier,
-            "Such as iblf_jax.barriers.Integral().",
-            CLAIMS,
-        )
-        fit_o(self)
+        check_barrier(self, "barrier", self.barrier)
+        fit_o(self, self.barrier)
         fit_weight(self)
-
-    def leaf_units(self) -> dict[str, str]:
-        """The unit of the weight, which depends on the barrier."""
-        return {"weight": weight_unit(self.barrier)}
 
     def advice(self) -> list[str]:
         """What is lost of Theorem 2 where the paper's law, whose weight is 1, has a gain outside
@@ -98,10 +95,6 @@ class Backstepping:
         )
         return [f"controller.K2 = {self.K2}: {need}. Below it that envelope is lost: {rest}."]
 
-    def init(self, q: jax.Array, dq: jax.Array, context: LawContext) -> tuple[()]:
-        """No state."""
-        return ()
-
     def command(
         self,
         t: jax.Array,
@@ -113,37 +106,46 @@ class Backstepping:
     ) -> tuple[Command, tuple[()]]:
         """The torque (3.14) and what belongs to it."""
         alpha, dalpha = alpha_and_rate(self, t, q, dq, context)
-        tube, model = context.tube(t), context.model
-        carried = alpha if self.reading == "corrected" else dq
-        feedforward = (
-            model.coriolis(q, dq, carried) + model.gravity(q) + matvec(model.mass_matrix(q), dalpha)
-        )
-        tau = (
-            feedforward - f_hat - self.K2 * (dq - alpha) - self.weight * self.barrier.slope(tube, q)
-        )
-        guard_active = guard_is_active(tube, q, self.barrier.guard)
-        value = self.weight * self.barrier.value(tube, q)
-        return Command(tau, alpha, value, guard_active, jnp.zeros_like(guard_active)), ()
+        tube = context.tube(t)
+        v = alpha if self.reading == "corrected" else dq
+        feedforward = rigid_body_torque(context.model, q, dq, v, dalpha)
+        tau = feedforward - f_hat - self.K2 * (dq - alpha)
+        tau = tau - self.weight * self.barrier.slope(tube, q)
+        return barrier_command(self, tube, q, alpha, tau), ()
 
 
-def fit_o(law) -> None:
-    """Fits `o` of a law under construction to its barrier: 0.1, the paper's, if the barrier needs
-    one and none was given.
+def barrier_command(law, tube: Tube, q: jax.Array, alpha: jax.Array, tau: jax.Array) -> Command:
+    """The command of a law with `barrier` and `weight` that cuts no torque: V1 is w times the
+    barrier's.
+    """
+    guard_active = guard_is_active(tube, q, law.barrier.guard)
+    V1 = law.weight * law.barrier.value(tube, q)
+    return Command(tau, alpha, V1, guard_active, jnp.zeros_like(guard_active))
+
+
+def check_barrier(law, field: str, barrier: Any, example: str = "Integral") -> None:
+    """Raises ValueError unless a field of a law holds a barrier."""
+    name = f"{type(law).__name__}.{field}"
+    checks.conforms(name, barrier, Barrier, f"Such as iblf_jax.barriers.{example}().", CLAIMS)
+
+
+def fit_o(law, *barriers: Barrier) -> None:
+    """Fits `o` of a law under construction to its barriers: 0.1, the paper's, if one of them needs
+    it and none was given.
 
     Raises:
-      ValueError: an `o` for a barrier that has no kappa.
+      ValueError: an `o` for barriers of which none has a kappa.
     """
-    uses_o = barrier_member(law.barrier, "uses_o")
+    uses_o = any(barrier_member(barrier, "uses_o") for barrier in barriers)
     if uses_o and law.o is None:
         object.__setattr__(law, "o", jnp.full_like(law.k1, 0.1))
     if not uses_o and law.o is not None:
-        barrier = type(law.barrier).__name__
-        raise checks.fail(
-            f"{type(law).__name__}.o",
-            law.o,
-            f"None with the barrier {barrier}",
-            "That barrier has no kappa; leave `o` out.",
-        )
+        names = " and ".join(type(barrier).__name__ for barrier in barriers)
+        expected = f"None with the barrier {names}"
+        remedy = "That barrier has no kappa; leave `o` out."
+        if len(barriers) > 1:
+            remedy = "Neither has a kappa; leave `o` out."
+        raise checks.fail(f"{type(law).__name__}.o", law.o, expected, remedy)
 
 
 def fit_weight(law) -> None:
@@ -152,9 +154,9 @@ def fit_weight(law) -> None:
         object.__setattr__(law, "weight", jnp.full_like(law.k1, 1.0))
 
 
-def weight_unit(barrier: Barrier) -> str:
-    """The unit of a weight w for which w s is a torque, with the slope s of a barrier."""
-    return "N m/rad" if value_unit(barrier) == "rad^2" else "N m rad"
+def virtual_velocity(law, t: jax.Array, q: jax.Array, context: LawContext) -> jax.Array:
+    """Alpha, (n,) [rad/s], of a law with `barrier`, `k1`, `o`."""
+    return law.barrier.virtual_velocity(context.tube(t, acceleration=False), q, law.k1, law.o)
 
 
 def alpha_and_rate(
@@ -165,6 +167,6 @@ def alpha_and_rate(
     """
 
     def alpha_at(t, q):
-        return law.barrier.virtual_velocity(context.tube(t, acceleration=False), q, law.k1, law.o)
+        return virtual_velocity(law, t, q, context)
 
     return jax.jvp(alpha_at, (t, q), (jnp.ones_like(t), dq))

@@ -11,7 +11,7 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.controllers._base import Command, LawContext
+from iblf_jax.control.controllers._base import Command, LawContext, no_state
 from iblf_jax.core.linalg import matvec
 from iblf_jax.core.pytree import Leaf, component, leaf
 
@@ -33,9 +33,7 @@ class ComputedTorque:
     Kd: Leaf = leaf("1/s", sign="positive")
     gains: ClassVar[tuple[str, ...]] = ("Kp", "Kd")
 
-    def init(self, q: jax.Array, dq: jax.Array, context: LawContext) -> tuple[()]:
-        """No state."""
-        return ()
+    init = no_state
 
     def command(
         self,

@@ -19,11 +19,15 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.control.barriers import Barrier, Integral
-from iblf_jax.control.barriers._base import CLAIMS, guard_is_active
-from iblf_jax.control.controllers._base import Command, LawContext
-from iblf_jax.control.controllers.backstepping import fit_o, fit_weight, weight_unit
-from iblf_jax.core import checks
-from iblf_jax.core.linalg import matvec
+from iblf_jax.control.controllers._base import Command, LawContext, rigid_body_torque
+from iblf_jax.control.controllers.backstepping import (
+    barrier_command,
+    check_barrier,
+    fit_o,
+    fit_weight,
+    virtual_velocity,
+    weight_units,
+)
 from iblf_jax.core.pytree import Leaf, component, leaf
 
 
@@ -56,32 +60,17 @@ class DynamicSurface:
     weight: Leaf = leaf("N m rad", sign="positive", default=None)
     gains: ClassVar[tuple[str, ...]] = ("k1", "K2")
     unit_factors: ClassVar[tuple[str, ...]] = ("weight",)
+    leaf_units = weight_units
 
     def check(self) -> None:
         """Raises ValueError for something that is no barrier; completes `o` and `weight`."""
-        checks.conforms(
-            "DynamicSurface.barrier",
-            self.barrier,
-            Barrier,
-            "Such as iblf_jax.barriers.Integral().",
-            CLAIMS,
-        )
-        fit_o(self)
+        check_barrier(self, "barrier", self.barrier)
+        fit_o(self, self.barrier)
         fit_weight(self)
-
-    def leaf_units(self) -> dict[str, str]:
-        """The unit of the weight, which depends on the barrier."""
-        return {"weight": weight_unit(self.barrier)}
-
-    def _alpha(self, t: jax.Array, q: jax.Array, context: LawContext) -> jax.Array:
-        """Alpha, (n,) [rad/s]."""
-        return self.barrier.virtual_velocity(
-            context.tube(t, acceleration=False), q, self.k1, self.o
-        )
 
     def init(self, q: jax.Array, dq: jax.Array, context: LawContext) -> jax.Array:
         """beta(0) = alpha(0), (n,) [rad/s]."""
-        return self._alpha(jnp.zeros((), q.dtype), q, context)
+        return virtual_velocity(self, jnp.zeros((), q.dtype), q, context)
 
     def command(
         self,
@@ -93,14 +82,9 @@ class DynamicSurface:
         state: jax.Array,
     ) -> tuple[Command, jax.Array]:
         """The torque, what belongs to it, and beta'."""
-        tube, model, beta = context.tube(t), context.model, state
-        dbeta = (self._alpha(t, q, context) - beta) / self.filter
-        feedforward = (
-            model.coriolis(q, dq, beta) + model.gravity(q) + matvec(model.mass_matrix(q), dbeta)
-        )
-        tau = (
-            feedforward - f_hat - self.K2 * (dq - beta) - self.weight * self.barrier.slope(tube, q)
-        )
-        guard_active = guard_is_active(tube, q, self.barrier.guard)
-        value = self.weight * self.barrier.value(tube, q)
-        return Command(tau, beta, value, guard_active, jnp.zeros_like(guard_active)), dbeta
+        tube, beta = context.tube(t), state
+        dbeta = (virtual_velocity(self, t, q, context) - beta) / self.filter
+        feedforward = rigid_body_torque(context.model, q, dq, beta, dbeta)
+        tau = feedforward - f_hat - self.K2 * (dq - beta)
+        tau = tau - self.weight * self.barrier.slope(tube, q)
+        return barrier_command(self, tube, q, beta, tau), dbeta

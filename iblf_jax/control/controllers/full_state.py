@@ -56,16 +56,20 @@ import jax.numpy as jnp
 
 from iblf_jax.control.barriers import Barrier, Integral
 from iblf_jax.control.barriers._base import (
-    CLAIMS,
     barrier_member,
     guard_is_active,
     ratio_jumps,
     value_unit,
 )
-from iblf_jax.control.controllers._base import Command, LawContext
-from iblf_jax.control.controllers.backstepping import alpha_and_rate, fit_weight
+from iblf_jax.control.controllers._base import Command, LawContext, no_state, rigid_body_torque
+from iblf_jax.control.controllers.backstepping import (
+    alpha_and_rate,
+    check_barrier,
+    fit_o,
+    fit_weight,
+    virtual_velocity,
+)
 from iblf_jax.core import checks
-from iblf_jax.core.linalg import matvec
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.world.bounds import Tube
 
@@ -123,6 +127,7 @@ class FullState:
     unit_factors: ClassVar[tuple[str, ...]] = ("weight",)
     needs_velocity_bounds: ClassVar[bool] = True
     includes_e2: ClassVar[bool] = True
+    init = no_state
 
     def check(self) -> None:
         """Raises ValueError for something that is no barrier, or one that cannot bound velocities;
@@ -130,45 +135,21 @@ class FullState:
         """
         barriers = {"barrier": self.barrier, "velocity_barrier": self.velocity_barrier}
         for name, barrier in barriers.items():
-            checks.conforms(
-                f"FullState.{name}",
-                barrier,
-                Barrier,
-                "Such as iblf_jax.barriers.Integral().",
-                CLAIMS,
-            )
+            check_barrier(self, name, barrier)
         if _ratio_of(self.velocity_barrier) is None:
             remedy = (
                 "iblf_jax.barriers.Integral() and Log() with p = 1 are such; one of your own needs"
                 " `error_over_slope`."
             )
-            raise checks.fail(
-                "FullState.velocity_barrier",
-                self.velocity_barrier,
-                "one whose slope falls with the error itself",
-                remedy,
-            )
-        uses_o = [
-            barrier_member(barrier, "uses_o") for barrier in (self.barrier, self.velocity_barrier)
-        ]
-        if any(uses_o) and self.o is None:
-            object.__setattr__(self, "o", jnp.full_like(self.k1, 0.1))
-        if not any(uses_o) and self.o is not None:
-            raise checks.fail(
-                "FullState.o",
-                self.o,
-                "None with these barriers",
-                "Neither has a kappa; leave `o` out.",
-            )
+            expected = "one whose slope falls with the error itself"
+            field = "FullState.velocity_barrier"
+            raise checks.fail(field, self.velocity_barrier, expected, remedy)
+        fit_o(self, *barriers.values())
         fit_weight(self)
 
     def leaf_units(self) -> dict[str, str]:
         """The unit of the weight, by those of V1 and phi."""
         return {"weight": WEIGHT_UNITS[value_unit(self.barrier), value_unit(self.velocity_barrier)]}
-
-    def init(self, q: jax.Array, dq: jax.Array, context: LawContext) -> tuple[()]:
-        """No state."""
-        return ()
 
     def tubes(
         self, t: jax.Array, q: jax.Array, dq: jax.Array, context: LawContext
@@ -188,10 +169,7 @@ class FullState:
         """
         if not ratio_jumps(self.velocity_barrier):
             return None
-        alpha = self.barrier.virtual_velocity(
-            context.tube(t, acceleration=False), q, self.k1, self.o
-        )
-        return dq - alpha
+        return dq - virtual_velocity(self, t, q, context)
 
     def command(
         self,
@@ -203,18 +181,13 @@ class FullState:
         state: tuple[()],
     ) -> tuple[Command, tuple[()]]:
         """The torque and what belongs to it; V1 is V1 + phi."""
-        (outer, inner), model = self.tubes(t, q, dq, context), context.model
+        outer, inner = self.tubes(t, q, dq, context)
         first, second = self.barrier, self.velocity_barrier
         a2 = second.virtual_velocity(inner, dq, self.K2, self.o)
         ratio: Any = second.error_over_slope(inner, dq)
         crossed = self.weight * first.slope(outer, q) * ratio
         acceleration = a2 - crossed - self.c * second.slope(inner, dq)
-        tau = (
-            model.coriolis(q, dq, dq)
-            + model.gravity(q)
-            + matvec(model.mass_matrix(q), acceleration)
-            - f_hat
-        )
+        tau = rigid_body_torque(context.model, q, dq, dq, acceleration) - f_hat
         guard_active = guard_is_active(outer, q, first.guard) | guard_is_active(
             inner, dq, second.guard
         )

@@ -7,7 +7,7 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.controllers._base import Command, LawContext
+from iblf_jax.control.controllers._base import Command, LawContext, no_state
 from iblf_jax.core.pytree import Leaf, component, leaf
 
 
@@ -30,9 +30,7 @@ class PDGravity:
     Kd: Leaf = leaf("N m s/rad", sign="positive")
     gains: ClassVar[tuple[str, ...]] = ("Kp", "Kd")
 
-    def init(self, q: jax.Array, dq: jax.Array, context: LawContext) -> tuple[()]:
-        """No state."""
-        return ()
+    init = no_state
 
     def command(
         self,

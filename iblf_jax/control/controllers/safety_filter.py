@@ -40,8 +40,9 @@ from iblf_jax.control.controllers._base import (
     Controller,
     LawContext,
     State,
-    law_member,
-    switching_functions,
+    wrapped_advice,
+    wrapped_state,
+    wrapped_switching,
 )
 from iblf_jax.core import checks
 from iblf_jax.core.linalg import matmul, matvec, solve_spd
@@ -98,6 +99,9 @@ class SafetyFilter:
     margin: Leaf = leaf("rad/s^2", sign="nonnegative", default=None)
     wraps: ClassVar[str] = "law"
     filters: ClassVar[bool] = True
+    advice = wrapped_advice
+    init = wrapped_state
+    switching = wrapped_switching
 
     def check(self) -> None:
         """Raises ValueError for something that is not a law, or an unknown measure."""
@@ -105,14 +109,6 @@ class SafetyFilter:
         checks.one_of("SafetyFilter.nearest", self.nearest, NEAREST)
         checks.one_of("SafetyFilter.shape1", self.shape1, SHAPES1)
         checks.one_of("SafetyFilter.shape2", self.shape2, SHAPES2)
-
-    def advice(self) -> list[str]:
-        """The wrapped law's."""
-        return law_member(self.law, "advice")()  # type: ignore[no-any-return]
-
-    def init(self, q: jax.Array, dq: jax.Array, context: LawContext) -> State:
-        """The wrapped law's state."""
-        return self.law.init(q, dq, context)
 
     def box(
         self, t: jax.Array, q: jax.Array, dq: jax.Array, context: LawContext
@@ -136,15 +132,14 @@ class SafetyFilter:
         """
         if self.shape1 == self.shape2 == "linear":
             return (self.a1 + self.a2) * dh + self.a1 * self.a2 * h
-        A, dA = (h, 1.0) if self.shape1 == "linear" else (jnp.arctan(h), 1.0 / (1.0 + h * h))
+        A = h
+        dA: jax.Array | float = 1.0
+        if self.shape1 == "atan":
+            A, dA = jnp.arctan(h), 1.0 / (1.0 + h * h)
         z = dh + self.a1 * A
-        return self.a1 * dA * dh + self.a2 * (z if self.shape2 == "linear" else z**3)
-
-    def switching(
-        self, t: jax.Array, q: jax.Array, dq: jax.Array, context: LawContext, state: State
-    ) -> jax.Array | None:
-        """Where the wrapped law's command jumps."""
-        return switching_functions(self.law, t, q, dq, context, state)
+        carried = self.a1 * dA * dh
+        B = z if self.shape2 == "linear" else z**3
+        return carried + self.a2 * B
 
     def command(
         self,
@@ -193,11 +188,8 @@ class SafetyFilter:
         region_slack: Any = ()
         if context.regions:
             region_slack = found.slack[2 * n : 2 * n + len(context.regions)]
-        tau = tau_law + matvec(torque, found.x)
-        return (
-            command._replace(tau=tau, slack=slack, region_slack=region_slack, saturated=saturated),
-            rate,
-        )
+        command = command._replace(tau=tau_law + matvec(torque, found.x), saturated=saturated)
+        return command._replace(slack=slack, region_slack=region_slack), rate
 
 
 def _nearest(rows: list[tuple[jax.Array, jax.Array, float]]) -> Solution:

@@ -17,8 +17,9 @@ from iblf_jax.control.controllers._base import (
     Controller,
     LawContext,
     State,
-    law_member,
-    switching_functions,
+    wrapped_advice,
+    wrapped_state,
+    wrapped_switching,
 )
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf, static
@@ -49,25 +50,14 @@ class Saturated:
     limit: Leaf = leaf("N m", sign="positive")
     edge: str = static(default="hard")
     wraps: ClassVar[str] = "law"
+    advice = wrapped_advice
+    init = wrapped_state
+    switching = wrapped_switching
 
     def check(self) -> None:
         """Raises ValueError for something that is not a law, or an unknown edge."""
         checks.conforms("Saturated.law", self.law, Controller, "iblf_jax.controllers has them.")
         checks.one_of("Saturated.edge", self.edge, EDGES)
-
-    def advice(self) -> list[str]:
-        """The wrapped law's."""
-        return law_member(self.law, "advice")()  # type: ignore[no-any-return]
-
-    def init(self, q: jax.Array, dq: jax.Array, context: LawContext) -> State:
-        """The wrapped law's state."""
-        return self.law.init(q, dq, context)
-
-    def switching(
-        self, t: jax.Array, q: jax.Array, dq: jax.Array, context: LawContext, state: State
-    ) -> jax.Array | None:
-        """Where the wrapped law's command jumps."""
-        return switching_functions(self.law, t, q, dq, context, state)
 
     def command(
         self,
@@ -107,18 +97,10 @@ def within_effort(law: Controller, robot: Robot, *, edge: str = "hard") -> Contr
       ValueError: as `Saturated`.
     """
     effort = robot_member(robot, "effort")
-    if effort is None:
-        effort = jnp.inf
-    if not checks.is_concrete(effort):
-        return Saturated(
-            law=law, limit=jnp.where(jnp.isfinite(effort), effort, UNLIMITED), edge=edge
-        )
-    finite = np.isfinite(effort)
-    return (
-        Saturated(law=law, limit=np.where(finite, effort, UNLIMITED), edge=edge)
-        if finite.any()
-        else law
-    )
+    if effort is None or (checks.is_concrete(effort) and not np.isfinite(effort).any()):
+        return law
+    limit = jnp.where(jnp.isfinite(effort), effort, UNLIMITED)
+    return Saturated(law=law, limit=limit, edge=edge)
 
 
 def _smooth_clip(x: jax.Array) -> jax.Array:

@@ -19,8 +19,9 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.control.barriers import Barrier, PrescribedPerformance
-from iblf_jax.control.barriers._base import CLAIMS, guard_is_active
-from iblf_jax.control.controllers._base import Command, LawContext
+from iblf_jax.control.barriers._base import guard_is_active
+from iblf_jax.control.controllers._base import Command, LawContext, no_state
+from iblf_jax.control.controllers.backstepping import check_barrier
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.world.bounds import Bounds, Tube
@@ -55,16 +56,11 @@ class SurfaceBarrier:
     gains: ClassVar[tuple[str, ...]] = ("K",)
     uses_observer: ClassVar[bool] = False
     includes_e2: ClassVar[bool] = True
+    init = no_state
 
     def check(self) -> None:
         """Raises ValueError for something that is no barrier, or no bounds."""
-        checks.conforms(
-            "SurfaceBarrier.barrier",
-            self.barrier,
-            Barrier,
-            "Such as iblf_jax.barriers.PrescribedPerformance().",
-            CLAIMS,
-        )
+        check_barrier(self, "barrier", self.barrier, "PrescribedPerformance")
         if not isinstance(self.surface, Bounds):
             raise checks.fail(
                 "SurfaceBarrier.surface",
@@ -85,10 +81,6 @@ class SurfaceBarrier:
                 "Exchange or widen them.",
             )
 
-    def init(self, q: jax.Array, dq: jax.Array, context: LawContext) -> tuple[()]:
-        """No state."""
-        return ()
-
     def command(
         self,
         t: jax.Array,
@@ -107,14 +99,6 @@ class SurfaceBarrier:
             zero, zero, self.surface.lower.at(t, zero), self.surface.upper.at(t, zero), zero, zero
         )
         guard_active = guard_is_active(tube, sigma, self.barrier.guard)
-        value = self.barrier.value(tube, sigma)
-        return (
-            Command(
-                -self.K * self.barrier.slope(tube, sigma),
-                alpha,
-                value,
-                guard_active,
-                jnp.zeros_like(guard_active),
-            ),
-            (),
-        )
+        V1 = self.barrier.value(tube, sigma)
+        tau = -self.K * self.barrier.slope(tube, sigma)
+        return Command(tau, alpha, V1, guard_active, jnp.zeros_like(guard_active)), ()

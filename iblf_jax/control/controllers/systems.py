@@ -102,10 +102,8 @@ def law_by_name(
     if name == "reference_governor":
         return ReferenceGovernor(law=BASELINES["pd"](), eta=SPEED)
     if name == "safety_filter":
-        return SafetyFilter(
-            law=law_by_name("backstepping", k1=k1, K2=K2, reading=reading, weight=weight),
-            nearest="acceleration",
-        )
+        law = law_by_name("backstepping", k1=k1, K2=K2, reading=reading, weight=weight)
+        return SafetyFilter(law=law, nearest="acceleration")
     barrier = barriers.Log(p=p) if name == "log" else BARRIERS[name]()
     o = o if barrier_member(barrier, "uses_o") else None
     return Backstepping(k1=k1, K2=K2, o=o, barrier=barrier, reading=reading, weight=weight)
@@ -115,8 +113,6 @@ def observer_of(name: str, usual: Observer) -> Observer:
     """The observer that belongs to a system: `usual`, or none for the laws that are classical
     without one.
     """
-    return (
-        NoObserver()
-        if checks.word("name", name, "the name of a law") in _WITHOUT_OBSERVER
-        else usual
-    )
+    if checks.word("name", name, "the name of a law") in _WITHOUT_OBSERVER:
+        return NoObserver()
+    return usual

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import jax
-import jax.numpy as jnp
 
-from iblf_jax.control.observers.printed import STARTS, held_eta, initial_eta, kf_advice
+from iblf_jax.control.observers._eta import (
+    STARTS,
+    advanced_eta,
+    eta_and_momentum,
+    initial_eta,
+    kf_advice,
+    with_discrete_gain,
+)
 from iblf_jax.core import checks
-from iblf_jax.core.linalg import matvec
 from iblf_jax.core.pytree import Leaf, component, leaf, static
 from iblf_jax.world.robots import Robot, energy_gradient
 
@@ -35,24 +38,15 @@ class Momentum:
     kf: Leaf = leaf("1/s", sign="positive")
     eta0: Leaf = leaf("N m", default=0.0)
     start: str = static(default="zero")
+    advice = kf_advice
+    init = initial_eta
+    estimate = eta_and_momentum
+    advance = advanced_eta
+    at_period = with_discrete_gain
 
     def check(self) -> None:
         """Raises ValueError for an unknown `start`."""
         checks.one_of("Momentum.start", self.start, STARTS)
-
-    def advice(self) -> list[str]:
-        """Warnings about gains outside the conditions of Theorem 2."""
-        return kf_advice(self.kf)
-
-    def init(self, q: jax.Array, dq: jax.Array, model: Robot) -> jax.Array:
-        """eta(0), (n,) [N m]."""
-        return initial_eta(self, q, dq, model)
-
-    def estimate(
-        self, t: jax.Array, q: jax.Array, dq: jax.Array, model: Robot, state: jax.Array
-    ) -> jax.Array:
-        """f_hat, (n,) [N m]."""
-        return state + self.kf * matvec(model.mass_matrix(q), dq)
 
     def derivative(
         self,
@@ -66,22 +60,3 @@ class Momentum:
         """eta', (n,) [N m/s]."""
         f_hat = self.estimate(t, q, dq, model, state)
         return -self.kf * (f_hat + tau + energy_gradient(model, q, dq) - model.gravity(q))
-
-    def advance(
-        self,
-        t: jax.Array,
-        q: jax.Array,
-        dq: jax.Array,
-        tau: jax.Array,
-        model: Robot,
-        state: jax.Array,
-        period: jax.Array,
-    ) -> jax.Array:
-        """Eta a period later, (n,) [N m]: exact, as (3.11) is linear in eta."""
-        return held_eta(self, t, q, dq, tau, model, state, period)
-
-    def at_period(self, period: jax.Array) -> Momentum:
-        """Kf = (1 - exp(-kf period)) / period: then 1 - kf period is what is left of an error after
-        a period.
-        """
-        return dataclasses.replace(self, kf=-jnp.expm1(-self.kf * period) / period)

@@ -34,6 +34,8 @@ LARGEST_NUMBER = 1e10
 """No length, mass or inertia of a robot in SI units is beyond."""
 MAX_RANGE = 1e20
 """A range or a friction may be, where it stands for "none" or "locked"."""
+MAX_NUMBERS = 100
+"""Numbers of an attribute, except those of a mesh."""
 DECIMAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 """A number of a description.
 
@@ -65,15 +67,10 @@ def read(path: str | os.PathLike, field: str = "path") -> ET.Element:
     except ValueError as error:
         raise of_file(path, error) from error
     if root.tag not in ("robot", "mujoco"):
-        expected = "a URDF or MJCF file"
+        remedy = f"Its root element is <{root.tag[:40]}>, not <robot> or <mujoco>."
         if root.tag == "sdf":
-            raise checks.fail(field, str(path), expected, "It is SDF.")
-        raise checks.fail(
-            field,
-            str(path),
-            expected,
-            f"Its root element is <{root.tag[:40]}>, not <robot> or <mujoco>.",
-        )
+            remedy = "It is SDF."
+        raise checks.fail(field, str(path), "a URDF or MJCF file", remedy)
     return root
 
 
@@ -154,12 +151,8 @@ class _Reader:
         if root.tag != "mujoco":
             return root
         if nesting > MAX_NESTED:
-            raise checks.fail(
-                "<include>",
-                str(path),
-                f"at most {MAX_NESTED} files inside each other",
-                "Does it include itself?",
-            )
+            expected = f"at most {MAX_NESTED} files inside each other"
+            raise checks.fail("<include>", str(path), expected, "Does it include itself?")
         for parent in list(root.iter()):
             for element in [child for child in parent if child.tag == "include"]:
                 file = element.get("file")
@@ -176,23 +169,21 @@ class _Reader:
         Symbolic links are followed before the comparison: a link cannot lead out of the folder.
         """
         folder = os.path.realpath(self.folder)
+        if "\0" not in file and not os.path.isabs(file):
+            target = os.path.realpath(os.path.join(folder, file))
+            if os.path.commonpath([folder, target]) == folder:
+                return Path(target)
         expected = f"a file in the folder of the description, {folder}, or in a folder below it"
         remedy = "Copy the file into that folder and name it by a relative path."
-        if "\0" in file or os.path.isabs(file):
-            raise checks.fail("<include>: file", file, expected, remedy)
-        target = os.path.realpath(os.path.join(folder, file))
-        if os.path.commonpath([folder, target]) != folder:
-            raise checks.fail("<include>: file", file, expected, remedy)
-        return Path(target)
+        raise checks.fail("<include>: file", file, expected, remedy)
 
     def _bytes(self, path: Path) -> bytes:
         data = contents(self.field, path, self.bytes_left, "the path of a URDF or MJCF file")
         self.bytes_left -= len(data)
         if self.bytes_left < 0:
             expected = f"a file of at most {MAX_BYTES >> 20} MiB"
-            raise checks.fail(
-                self.field, str(path), expected, "A description without meshes is far smaller."
-            )
+            remedy = "A description without meshes is far smaller."
+            raise checks.fail(self.field, str(path), expected, remedy)
         return data
 
 
@@ -211,9 +202,8 @@ def contents(field: str, path: Path, most: int, expected: str, remedy: str = "")
         with path.open("rb") as file:
             return file.read(most + 1)
     except OSError as error:
-        raise checks.fail(
-            field, str(path), expected, f"It cannot be read: {error}. {remedy}".strip()
-        ) from None
+        found = f"It cannot be read: {error}."
+        raise checks.fail(field, str(path), expected, f"{found} {remedy}".strip()) from None
 
 
 def label(element: ET.Element) -> str:
@@ -230,7 +220,7 @@ def floats(
     count: int | None = None,
     *,
     most: float = LARGEST_NUMBER,
-    longest: int = 100,
+    longest: int = MAX_NUMBERS,
 ) -> list[float]:
     """The numbers that an attribute holds; ValueError, with `where`, unless they are as many as
     expected, finite and below `most`.

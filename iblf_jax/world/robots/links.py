@@ -8,14 +8,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from iblf_jax.core import checks
 from iblf_jax.world.robots.description import Shown
 from iblf_jax.world.robots.repair import (
     GYRATION_FRACTION,
     LENGTH_RESOLUTION,
+    POSITIVE_DEFINITE,
     ROUNDING,
     Fault,
     Repairs,
+    fault,
     is_nothing,
     moments_of,
     second_moments,
@@ -61,30 +62,19 @@ class Links(NamedTuple):
                 links = links._compact(i, repairs)
         while (k := links._unresisting(joints)) is not None:
             if not links.moments[k, 3, 3] > 0:
-                raise links._massless(
-                    k, "Give it an inertial, lock or fix its joint, or take a tip before it."
-                )
+                remedy = "Give it an inertial, lock or fix its joint, or take a tip before it."
+                raise links._massless(k, remedy).error
             links = links._compact(k, repairs)
         for i, P in enumerate(self.moments):
             if not self.between[i] and not P[3, 3] > 0:
                 kept = "no mass, as it is: the mass matrix is positive definite all the same"
-                repairs.meet(
-                    Fault(
-                        f"link {self.names[i]!r}",
-                        "no mass",
-                        self._massless(i, "Give it an inertial, or fix its joint."),
-                        kept,
-                    )
-                )
+                remedy = "Give it an inertial, or fix its joint."
+                repairs.meet(self._massless(i, remedy, kept))
         return links
 
-    def _massless(self, i: int, remedy: str) -> ValueError:
-        return checks.fail(
-            f"link {self.names[i]!r}",
-            Shown("no mass"),
-            "a mass [kg] of each link that moves",
-            remedy,
-        )
+    def _massless(self, i: int, remedy: str, to: str = "") -> Fault:
+        expected = "a mass [kg] of each link that moves"
+        return fault(f"link {self.names[i]!r}", Shown("no mass"), expected, to, remedy=remedy)
 
     def _compact(self, i: int, repairs: Repairs) -> Links:
         """The links, with link i as a compact body where it is a point, or a rod along its
@@ -94,18 +84,13 @@ class Links(NamedTuple):
         m, J = P[3, 3], _about_centre(P)
         if is_nothing(J, m):
             J = np.zeros((3, 3))
-        error = checks.fail(
-            where,
-            moments_of(J),
-            "a positive definite inertia [kg m^2]",
-            "A body that moves needs one.",
-        )
+        expected, remedy = POSITIVE_DEFINITE
         nearest = thickened(J, m * (GYRATION_FRACTION * self._longest()) ** 2)
-        if not np.trace(nearest) > np.trace(J) * (
-            1.0 + ROUNDING
-        ):  # all of the file is in one point, or heavier by far beyond
-            raise error
-        repairs.meet(Fault(where, moments_of(J), error, moments_of(nearest)))
+        found = fault(where, moments_of(J), expected, moments_of(nearest), remedy=remedy)
+        # All of the file may be in one point, or far heavier beyond.
+        if not np.trace(nearest) > np.trace(J) * (1.0 + ROUNDING):
+            raise found.error
+        repairs.meet(found)
         moments = self.moments.copy()
         moments[i, :3, :3] += second_moments(nearest) - second_moments(J)
         return self._replace(moments=moments)

@@ -87,9 +87,13 @@ def load(
     checks.mapping("locked", locked, '{"gripper_joint": 0.02}')
     repairs = Repairs(checks.flag("repair", repair))
     root = description.read(path)
-    request = _ArmRequest(base, tip, dict(locked), gravity, repairs)
     try:
-        arm = _READERS[root.tag](root, path, request)
+        file = _checked(root, Path(path).parent)
+        tree = Tree.compiled(file, str(path))
+        chain = _Chain.picked(tree, base, tip, dict(locked), repairs)
+        if isinstance(file, urdf.Urdf):
+            chain = chain.following(file, repairs)
+        arm = chain.arm(gravity, file, repairs)
     except ValueError as error:
         raise description.of_file(path, error) from error
     if arm.repaired:
@@ -97,36 +101,11 @@ def load(
     return arm
 
 
-class _ArmRequest(NamedTuple):
-    """The arguments of `load` except the path."""
-
-    base: str | None
-    tip: str | None
-    locked: dict[str, float]
-    gravity: Any
-    repairs: Repairs
-
-
-def _from_urdf(root: ET.Element, path: str | os.PathLike, request: _ArmRequest) -> Arm:
-    """The arm of a URDF whose root element has been read."""
-    file = urdf.checked(root)
-    tree = Tree.compiled(file.text, str(path), file.root, file.separate_weights)
-    chain = _Chain.picked(tree, request.base, request.tip, request.locked, request.repairs)
-    return chain.following(file, request.repairs).arm(
-        request.gravity, {}, request.repairs, file.speeds
-    )
-
-
-def _from_mjcf(root: ET.Element, path: str | os.PathLike, request: _ArmRequest) -> Arm:
-    """The arm of an MJCF whose root element has been read."""
-    model = mjcf.checked(root, Path(path).parent)
-    tree = Tree.compiled(model.text, str(path), "world", model.separate_weights)
-    chain = _Chain.picked(tree, request.base, request.tip, request.locked, request.repairs)
-    return chain.arm(request.gravity, model.tendons, request.repairs, {})
-
-
-_READERS = {"robot": _from_urdf, "mujoco": _from_mjcf}
-"""Root element -> the function that makes the arm."""
+def _checked(root: ET.Element, folder: Path) -> urdf.Urdf | mjcf.Mjcf:
+    """The checked copy of a description in a folder."""
+    if root.tag == "robot":
+        return urdf.checked(root)
+    return mjcf.checked(root, folder)
 
 
 class _Chain(NamedTuple):
@@ -159,21 +138,13 @@ class _Chain(NamedTuple):
             last, at_tip = tree.frame(tip)
         path = tree.path(first, last)
         if path is None:
-            raise checks.fail(
-                "tip",
-                tip,
-                f"a link beyond the base {tree.bodies[first]!r}",
-                "Another base or another tip.",
-            )
+            expected = f"a link beyond the base {tree.bodies[first]!r}"
+            raise checks.fail("tip", tip, expected, "Another base or another tip.")
         joints = tuple(j for b in path for j in tree.joints_of(b) if j not in positions)
         if not joints:
             expected = "a chain with a joint that moves"
-            raise checks.fail(
-                "tip",
-                tree.bodies[last],
-                expected,
-                f"Between it and {tree.bodies[first]!r} there is none.",
-            )
+            remedy = f"Between it and {tree.bodies[first]!r} there is none."
+            raise checks.fail("tip", tree.bodies[last], expected, remedy)
         for j in joints:
             tree.check_joint(j, repairs)
         return _Chain(tree, first, last, at_tip, joints, positions)
@@ -223,15 +194,12 @@ class _Chain(NamedTuple):
             factor *= mimic.multiplier
             name = mimic.master
             if name in seen:
-                raise checks.fail(
-                    f"joint {name!r}: mimic", Shown("a ring of mimics"), "a joint that leads"
-                )
+                field, ring = f"joint {name!r}: mimic", Shown("a ring of mimics")
+                raise checks.fail(field, ring, "a joint that leads")
             seen.add(name)
         return offset + factor * at.get(name, 0.0)
 
-    def arm(
-        self, gravity: Any, tendons: mjcf.Tendons, repairs: Repairs, speeds: Mapping[str, float]
-    ) -> Arm:
+    def arm(self, gravity: Any, file: urdf.Urdf | mjcf.Mjcf, repairs: Repairs) -> Arm:
         """The Arm, all bodies welded to the links that carry them."""
         tree = self.tree
         g = tree.gravity
@@ -241,7 +209,7 @@ class _Chain(NamedTuple):
         _, upright = tree.pose(self.base, self.locked)
         joints = tree.of_joints(self.joints)
         links = tree.welded(self.base, self.joints, self.locked, repairs)
-        tree.check_closed(links, self.joints, tendons, repairs)
+        tree.check_closed(links, self.joints, file.tendons, repairs)
         links = links.repaired(joints, repairs)
         p, R = links.frames[self.tip]
         tip_p, tip_R = p + R @ self.at_tip[0], R @ self.at_tip[1]
@@ -251,7 +219,7 @@ class _Chain(NamedTuple):
             tip_position=tip_p,
             tip_rotation=quaternion(tip_R),
             g=upright.T @ g,
-            speed=np.array([speeds.get(name, np.inf) for name in joints["joints"]]),
+            speed=np.array([file.speeds.get(name, np.inf) for name in joints["joints"]]),
             links=links.names,
             repaired=tuple(repairs.lines),
         )

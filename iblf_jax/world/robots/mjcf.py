@@ -16,9 +16,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.world.robots.description import MAX_BODIES, MAX_BYTES, MAX_RANGE, Shown, floats, label
+from iblf_jax.world.robots.description import (
+    LARGEST_NUMBER,
+    MAX_BODIES,
+    MAX_BYTES,
+    MAX_NUMBERS,
+    MAX_RANGE,
+    Shown,
+    floats,
+    label,
+)
 from iblf_jax.world.robots.meshes import Meshes
-from iblf_jax.world.robots.repair import Fault, Weight, checked_weight
+from iblf_jax.world.robots.repair import Fault, Weight, checked_weight, symmetric
 
 PLACE = "pos quat axisangle xyaxes zaxis euler"
 ACTUATOR = "name class joint gear ctrlrange ctrllimited forcerange forcelimited inheritrange"
@@ -64,51 +73,18 @@ REFUSED = {
     "flexcomp": "Write the bodies out.",
     "attach": "Write the model out into one file.",
 }
-WORDS = [
-    "mesh",
-    "hfield",
-    "file",
-    "content_type",
-    "inertia",
-    "builtin",
-    "name",
-    "class",
-    "childclass",
-    "type",
-    "angle",
-    "eulerseq",
-    "joint",
-    "joint1",
-    "joint2",
-    "body1",
-    "body2",
-    "site1",
-    "site2",
-    "gaintype",
-    "biastype",
-]
+WORDS = (
+    "mesh hfield file content_type inertia builtin name class childclass type angle eulerseq"
+    " joint joint1 joint2 body1 body2 site1 site2 gaintype biastype"
+)
 """Attributes that hold words, not numbers."""
-LONG_ATTRIBUTES = ("vertex", "face")
+MESH_TYPES = ("mjGEOM_MESH", "mjGEOM_SDF", "mjGEOM_HFIELD")
+"""The library's names of geoms whose shape is in a file."""
+LONG_ATTRIBUTES = "vertex face"
 """Attributes that may hold as many numbers as a file has."""
-SCALAR_ATTRIBUTES = (
-    "gravcomp",
-    "mass",
-    "density",
-    "ref",
-    "stiffness",
-    "damping",
-    "frictionloss",
-    "armature",
-)
+SCALAR_ATTRIBUTES = "gravcomp mass density ref stiffness damping frictionloss armature"
 """Attributes that hold one number."""
-RANGE_ATTRIBUTES = (
-    "damping",
-    "frictionloss",
-    "range",
-    "ctrlrange",
-    "forcerange",
-    "actuatorfrcrange",
-)
+RANGE_ATTRIBUTES = "damping frictionloss range ctrlrange forcerange actuatorfrcrange"
 """Attributes that may stand for "none" or "locked" by their size."""
 SWITCHES = ("true", "false", "auto", "enable", "disable")
 MIN_INERTIA = 1e-15
@@ -129,6 +105,10 @@ class Mjcf(NamedTuple):
     bare: bool
     """Whether they are there under their bare names, without the folders that the file gives
     them."""
+    root: str = "world"
+    """Name of the body that no joint moves."""
+    speeds: dict[str, float] = {}  # noqa: RUF012
+    """Joint -> its largest speed, which an MJCF does not have."""
 
     def separate_weights(self, spec: Any) -> list[tuple[Any, Weight]]:
         """Replaces every weight that the library would reject or cannot know by a valid one, and
@@ -151,17 +131,9 @@ class Mjcf(NamedTuple):
                 int(c.inertiafromgeom) == 2 and not body.explicitinertial
             )
             for geom in list(body.geoms):
-                weightless = (
-                    body.name == "world"
-                    or geom.mass == 0
-                    or (np.isnan(geom.mass) and geom.density == 0)
-                )
-                weighs = not weightless and low <= geom.group <= high
-                shaped = bool(geom.meshname or geom.hfieldname) or geom.type.name in (
-                    "mjGEOM_MESH",
-                    "mjGEOM_SDF",
-                    "mjGEOM_HFIELD",
-                )
+                has_mass = geom.mass != 0 and not (np.isnan(geom.mass) and geom.density == 0)
+                weighs = body.name != "world" and has_mass and low <= geom.group <= high
+                shaped = geom.meshname or geom.hfieldname or geom.type.name in MESH_TYPES
                 problem = None
                 if weighs and shaped and by_geoms:
                     problem = meshes.problem(geom)
@@ -214,12 +186,8 @@ def _copy(source: ET.Element, target: ET.Element, section: str) -> None:
     for element in source:
         tag = element.tag
         if tag in REFUSED:
-            raise checks.fail(
-                f"<{tag}>",
-                Shown("an element that makes bodies"),
-                "bodies written out",
-                REFUSED[tag],
-            )
+            got = Shown("an element that makes bodies")
+            raise checks.fail(f"<{tag}>", got, "bodies written out", REFUSED[tag])
         drives_no_joint = section == "actuator" and element.get("joint") is None
         if tag not in KEPT or drives_no_joint:
             continue
@@ -228,42 +196,29 @@ def _copy(source: ET.Element, target: ET.Element, section: str) -> None:
             kept = COUPLING
         attributes = {name: text for name, text in element.items() if name in kept.split()}
         for name, text in attributes.items():
-            if name not in WORDS and text not in SWITCHES:
+            if name not in WORDS.split() and text not in SWITCHES:
                 _check_numbers(f"{label(element)}: {name}", name, text)
         _copy(element, ET.SubElement(target, tag, attributes), section or tag)
 
 
 def _check_numbers(where: str, name: str, text: str) -> None:
     """Raises ValueError unless an attribute holds numbers within its limits."""
-    if name in SCALAR_ATTRIBUTES and name in RANGE_ATTRIBUTES:
-        floats(where, text, 1, most=MAX_RANGE)
-    elif name in SCALAR_ATTRIBUTES:
-        floats(where, text, 1)
-    elif name in RANGE_ATTRIBUTES:
-        floats(where, text, most=MAX_RANGE)
-    elif name in LONG_ATTRIBUTES:
-        floats(where, text, longest=MAX_BYTES)
-    else:
-        floats(where, text)
+    count = 1 if name in SCALAR_ATTRIBUTES.split() else None
+    most = MAX_RANGE if name in RANGE_ATTRIBUTES.split() else LARGEST_NUMBER
+    longest = MAX_BYTES if name in LONG_ATTRIBUTES.split() else MAX_NUMBERS
+    floats(where, text, count, most=most, longest=longest)
 
 
 def _tendons(root: ET.Element) -> Tendons:
     """The constraints on tendons, and the joints and sites that each ties together."""
-    made = {
-        tendon.get("name"): (
-            {x.get("joint", "") for x in tendon.findall("joint")},
-            {x.get("site", "") for x in tendon.findall("site")},
-        )
-        for tendons in root.findall("tendon")
-        for tendon in tendons
-    }
-    ties = {}
-    for equality in root.findall("equality"):
-        for element in equality.findall("tendon"):
-            ends = [
-                made.get(element.get(which), (set(), set())) for which in ("tendon1", "tendon2")
-            ]
-            ties[label(element)] = (ends[0][0] | ends[1][0], ends[0][1] | ends[1][1])
+    defined = {tendon.get("name"): tendon for tendon in root.findall("tendon/*")}
+    ties: Tendons = {}
+    for element in root.findall("equality/tendon"):
+        joints, sites = ties[label(element)] = (set(), set())
+        for which in ("tendon1", "tendon2"):
+            tendon = defined.get(element.get(which), ET.Element("tendon"))
+            joints |= {x.get("joint", "") for x in tendon.findall("joint")}
+            sites |= {x.get("site", "") for x in tendon.findall("site")}
     return ties
 
 
@@ -273,15 +228,11 @@ def _explicit(body: Any, where: str, balanced: bool) -> Weight | None:
     """
     if not body.explicitinertial:
         return Weight()
-    xx, yy, zz, xy, xz, yz = body.fullinertia
     J = np.diag(body.inertia)
-    if not np.isnan(xx):
-        J = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    if not np.isnan(body.fullinertia[0]):
+        J = symmetric(*body.fullinertia)
     moments = np.linalg.eigvalsh(J)
-    if (
-        body.mass >= MIN_INERTIA
-        and moments[0] >= MIN_INERTIA
-        and (balanced or moments[2] <= moments[0] + moments[1])
-    ):
+    is_possible = balanced or moments[2] <= moments[0] + moments[1]
+    if min(body.mass, moments[0]) >= MIN_INERTIA and is_possible:
         return None
     return checked_weight(where, float(body.mass), J)

@@ -17,7 +17,7 @@ mass m and the length L of the longest link of the chain: it becomes a compact b
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -34,6 +34,10 @@ GYRATION_FRACTION = 0.01
 longest link."""
 
 
+POSITIVE_DEFINITE = ("a positive definite inertia [kg m^2]", "A body that moves needs one.")
+"""What a message expects of the inertia of a moving body, and the remedy."""
+
+
 class Fault(NamedTuple):
     """A fault of a link or joint, and the value that repairs it."""
 
@@ -42,6 +46,22 @@ class Fault(NamedTuple):
     error: ValueError
     to: str = ""
     """The value after the repair; empty if there is no repair."""
+
+
+def fault(
+    field: str, got: Any, expected: str, to: str = "", *, remedy: str = "", where: str = ""
+) -> Fault:
+    """A fault with its error.
+
+    Args:
+      field: the faulty field, for the error.
+      got: its value, as `checks.fail` takes it.
+      expected: what the field must be.
+      to: the value after the repair; empty if there is no repair.
+      remedy: what a user can do in place of a repair.
+      where: what the list of repairs calls the place; the field if not given.
+    """
+    return Fault(where or field, str(got), checks.fail(field, got, expected, remedy), to)
 
 
 class Repairs:
@@ -84,6 +104,11 @@ class Weight(NamedTuple):
         return Weight(self.mass, self.nearest)
 
 
+def symmetric(xx: float, yy: float, zz: float, xy: float, xz: float, yz: float) -> np.ndarray:
+    """A symmetric matrix, (3, 3), of its six numbers."""
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
 def second_moments(J: np.ndarray) -> np.ndarray:
     """S of an inertia J, both (3, 3)."""
     return 0.5 * np.trace(J) * np.eye(3) - J
@@ -116,40 +141,30 @@ def checked_weight(where: str, mass: float, J: np.ndarray) -> Weight:
     """
     field = f"{where}: inertia"
     if mass < 0:
-        return Weight(
-            fault=Fault(where, f"{mass} kg", checks.fail(f"{where}: mass", mass, "a mass >= 0 kg"))
-        )
+        return Weight(fault=fault(f"{where}: mass", mass, "a mass >= 0 kg"))
     if mass == 0:
         if not np.any(J):
             return Weight()
-        remedy = "Give it its mass, or remove its inertia: tools differ in what they make of this."
-        error = checks.fail(
-            f"{where}: inertial", Shown("an inertia without a mass"), "both or neither", remedy
-        )
         nearest = thickened(J, 0.0)
-        return Weight(
-            0.0,
-            J,
-            Fault(
-                field,
-                "an inertia without a mass",
-                error,
-                f"a body that turns but weighs nothing, {moments_of(nearest)}",
-            ),
-            nearest,
+        remedy = "Give it its mass, or remove its inertia: tools differ in what they make of this."
+        without_mass = fault(
+            f"{where}: inertial",
+            Shown("an inertia without a mass"),
+            "both or neither",
+            f"a body that turns but weighs nothing, {moments_of(nearest)}",
+            remedy=remedy,
+            where=field,
         )
+        return Weight(0.0, J, without_mass, nearest)
     moments = np.linalg.eigvalsh(J)
     s = np.linalg.eigvalsh(second_moments(J))
     rounding = ROUNDING * np.abs(moments).sum() + mass * LENGTH_RESOLUTION**2
     if s[0] >= -0.5 * rounding:
         return Weight(mass, J)
-    shown = moments_of(J)
     nearest = thickened(J, 0.0)
+    expected = "none above the sum of the two others"
+    remedy = "No body has such an inertia: look at the units, the signs and the frame."
     if moments[0] < -rounding:
-        error = checks.fail(
-            field, shown, "a positive definite inertia [kg m^2]", "A body that moves needs one."
-        )
-    else:
-        remedy = "No body has such an inertia: look at the units, the signs and the frame."
-        error = checks.fail(field, shown, "none above the sum of the two others", remedy)
-    return Weight(mass, J, Fault(field, shown, error, moments_of(nearest)), nearest)
+        expected, remedy = POSITIVE_DEFINITE
+    found = fault(field, moments_of(J), expected, moments_of(nearest), remedy=remedy)
+    return Weight(mass, J, found, nearest)

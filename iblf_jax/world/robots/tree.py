@@ -6,7 +6,6 @@ Quantities are NumPy arrays in float64.  A pose is (position, rotation matrix).
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -14,8 +13,9 @@ import numpy as np
 from iblf_jax.core import checks
 from iblf_jax.world.robots.description import Shown
 from iblf_jax.world.robots.links import Links, Pose
-from iblf_jax.world.robots.mjcf import Tendons
-from iblf_jax.world.robots.repair import Fault, Repairs, Weight, second_moments
+from iblf_jax.world.robots.mjcf import Mjcf, Tendons
+from iblf_jax.world.robots.repair import Fault, Repairs, Weight, fault, second_moments
+from iblf_jax.world.robots.urdf import Urdf
 
 FREE, BALL, SLIDE, HINGE = range(4)
 KINDS = {HINGE: "revolute", SLIDE: "prismatic"}
@@ -64,17 +64,12 @@ class Tree:
             self.gravity = np.zeros(3)
 
     @staticmethod
-    def compiled(
-        text: str, path: str, root: str, separate_weights: Callable[[Any], list[tuple[Any, Weight]]]
-    ) -> Tree:
+    def compiled(file: Urdf | Mjcf, path: str) -> Tree:
         """The tree of a checked description.
 
         Args:
-          text: the description.
-          path: its file, for messages.
-          root: name of the body that the library calls the world.
-          separate_weights: takes the library's specification before it is compiled and returns the
-            bodies whose weights the library must not check.
+          file: the description.
+          path: of the file, for messages.
 
         Raises:
           ValueError: what the library does not accept, in its words.
@@ -82,14 +77,14 @@ class Tree:
         """
         mujoco = mujoco_package()
         try:
-            spec = mujoco.MjSpec.from_string(text)
+            spec = mujoco.MjSpec.from_string(file.text)
             spec.compiler.fusestatic = False
-            weights = separate_weights(spec)
+            weights = file.separate_weights(spec)
             model = spec.compile()
         except ValueError as error:
             words = " ".join(str(error).split())
             raise ValueError(f"{path}: {words}") from None
-        return Tree(model, mujoco, root, {body.id: weight for body, weight in weights})
+        return Tree(model, mujoco, file.root, {body.id: weight for body, weight in weights})
 
     def body(self, name: str, what: str) -> int:
         """The body of a name."""
@@ -139,7 +134,7 @@ class Tree:
         link that this joint moves.
         """
         m = self.model
-        beyond = [b for b in range(m.nbody) if b == first or self.path(first, b) is not None]
+        beyond = [b for b in range(m.nbody) if self.path(first, b) is not None]
         moved = [
             b for b in beyond if b != first and any(j not in locked for j in self.joints_of(b))
         ]
@@ -151,11 +146,7 @@ class Tree:
                 "tip", None, expected, f"Chains beyond {self.bodies[first]!r} end at: {found}."
             )
         parents = {int(m.body_parentid[b]) for b in beyond if b}
-        leaves = [
-            b
-            for b in beyond
-            if b not in parents and (b == ends[0] or self.path(ends[0], b) is not None)
-        ]
+        leaves = [b for b in beyond if b not in parents and self.path(ends[0], b) is not None]
         if len(leaves) == 1:
             return leaves[0]
         return ends[0]
@@ -167,17 +158,13 @@ class Tree:
             kind, remedy = "ball", "Write it as three hinges."
             if m.jnt_type[j] == FREE:
                 kind, remedy = "free", "Take a base beyond it."
-            raise checks.fail(
-                f"joint {name!r}",
-                Shown(f"a {kind} joint"),
-                "a hinge or slide between base and tip",
-                remedy,
-            )
+            expected = "a hinge or slide between base and tip"
+            raise checks.fail(f"joint {name!r}", Shown(f"a {kind} joint"), expected, remedy)
         stiffness = float(m.jnt_stiffness[j])
         if stiffness:
+            expected, to = "0: springs are not modelled", "0: the spring is left out"
             where = f"joint {name!r}: stiffness"
-            error = checks.fail(where, stiffness, "0: springs are not modelled", "Remove it.")
-            repairs.meet(Fault(where, str(stiffness), error, "0: the spring is left out"))
+            repairs.meet(fault(where, stiffness, expected, to, remedy="Remove it."))
 
     def placed(self, body: int) -> Pose:
         """Pose of a body in its parent's frame, its joints at their reference."""
@@ -216,7 +203,7 @@ class Tree:
         carrier: dict[int, int] = {base: -1}
         for b in range(m.nbody):
             parent = int(m.body_parentid[b])
-            if b == base or parent not in frames or (b == 0):
+            if b in (0, base) or parent not in frames:
                 continue
             link, pose = carrier[parent], joined(frames[parent], self.placed(b))
             own = [j for j in self.joints_of(b) if j in joints]
@@ -224,8 +211,7 @@ class Tree:
                 if j not in joints:
                     pose = self._after_locked(pose, j, locked)
                     continue
-                anchor = np.array(m.jnt_pos[j])
-                axis = np.array(m.jnt_axis[j])
+                anchor, axis = np.array(m.jnt_pos[j]), np.array(m.jnt_axis[j])
                 reference = float(m.qpos0[m.jnt_qposadr[j]])
                 p, R = joined(pose, (anchor, np.eye(3)))
                 if m.jnt_type[j] == HINGE:
@@ -234,11 +220,11 @@ class Tree:
                     p = p - R @ axis * reference
                 position.append(p)
                 rotation.append(R)
-                name, is_between = self.bodies[b], j != own[-1]
-                if is_between:
+                between.append(j != own[-1])
+                name = self.bodies[b]
+                if between[-1]:
                     name = f"{name}:{self.joint_names[j]}"
                 names.append(name)
-                between.append(is_between)
                 link, pose = len(names) - 1, (-anchor, np.eye(3))
             frames[b], carrier[b] = pose, link
         moments = np.zeros((len(names), 4, 4))
@@ -265,12 +251,10 @@ class Tree:
         mass, inertia, *_ = own.repaired(repairs)
         compensated = float(m.body_gravcomp[body])
         if compensated and mass:
-            where, expected = (
-                f"body {self.bodies[body]!r}: gravcomp",
-                "0: compensation of gravity is not modelled, it is the law's to do",
-            )
-            error = checks.fail(where, compensated, expected, "Remove it.")
-            repairs.meet(Fault(where, str(compensated), error, "0: gravity acts on it"))
+            where = f"body {self.bodies[body]!r}: gravcomp"
+            expected = "0: compensation of gravity is not modelled, it is the law's to do"
+            to = "0: gravity acts on it"
+            repairs.meet(fault(where, compensated, expected, to, remedy="Remove it."))
         second = R @ second_moments(inertia) @ R.T + mass * np.outer(p, p)
         return np.block([[second, mass * p[:, None]], [mass * p[None, :], np.array([[mass]])]])
 
@@ -307,15 +291,10 @@ class Tree:
             limit = np.inf
             if m.actuator_forcelimited[a]:
                 limit = float(np.min(np.abs(m.actuator_forcerange[a])))
-            if (
-                m.actuator_ctrllimited[a]
-                and m.actuator_gaintype[a] == FIXED
-                and m.actuator_biastype[a] == NO_BIAS
-            ):
-                limit = min(
-                    limit,
-                    float(np.min(np.abs(m.actuator_ctrlrange[a])) * abs(m.actuator_gainprm[a, 0])),
-                )
+            is_torque = m.actuator_gaintype[a] == FIXED and m.actuator_biastype[a] == NO_BIAS
+            if m.actuator_ctrllimited[a] and is_torque:
+                largest_input = np.min(np.abs(m.actuator_ctrlrange[a]))
+                limit = min(limit, float(largest_input * abs(m.actuator_gainprm[a, 0])))
             total += limit * abs(float(m.actuator_gear[a, 0]))
         return total
 
@@ -345,31 +324,17 @@ class Tree:
                 self._meet_tie(where, bodies, links, repairs)
         for where, (named, sites) in tendons.items():
             self._meet_coupling(where, {j for j in joints if self.joint_names[j] in named}, repairs)
-            self._meet_tie(
-                where,
-                [int(m.site_bodyid[i]) for i, site in enumerate(self.sites) if site in sites],
-                links,
-                repairs,
-            )
+            tied = [int(m.site_bodyid[i]) for i, site in enumerate(self.sites) if site in sites]
+            self._meet_tie(where, tied, links, repairs)
 
     def _meet_coupling(self, where: str, coupled: set[int], repairs: Repairs) -> None:
         for j in sorted(coupled):
             name = self.joint_names[j]
             remedy = f"Lock it: locked={{{name!r}: 0.0}}, or remove the constraint."
-            error = checks.fail(
-                where,
-                Shown(f"joint {name!r} tied to another"),
-                "joints that move by themselves",
-                remedy,
-            )
-            repairs.meet(
-                Fault(
-                    f"joint {name!r}",
-                    f"one tied to another by {where}",
-                    error,
-                    "one that moves by itself",
-                )
-            )
+            tied = Shown(f"joint {name!r} tied to another")
+            error = checks.fail(where, tied, "joints that move by themselves", remedy)
+            got, to = f"one tied to another by {where}", "one that moves by itself"
+            repairs.meet(Fault(f"joint {name!r}", got, error, to))
 
     def _meet_tie(self, where: str, bodies: list[int], links: Links, repairs: Repairs) -> None:
         """Meets a tie of bodies: what ties to a motion-capture body drives the arm, what ties its
@@ -381,9 +346,7 @@ class Tree:
             to = ""
             if any(self.model.body_mocapid[b] >= 0 for b in bodies):
                 to = "no tie: a motion-capture body is no link"
-            repairs.meet(
-                Fault(where, tied, checks.fail(where, Shown(tied), "an open chain", remedy), to)
-            )
+            repairs.meet(fault(where, Shown(tied), "an open chain", to, remedy=remedy))
 
 
 def unknown(what: str, name: Any, expected: str, known: list[str]) -> ValueError:

@@ -15,11 +15,13 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.world.robots.description import MAX_BODIES, MAX_RANGE, Shown, floats, label
-from iblf_jax.world.robots.repair import Fault, Weight, checked_weight
+from iblf_jax.world.robots.mjcf import Tendons
+from iblf_jax.world.robots.repair import Fault, Weight, checked_weight, fault, symmetric
 
 MOVABLE = ("revolute", "continuous", "prismatic")
 INERTIA = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 ZERO = [0.0, 0.0, 0.0]
+NONNEGATIVE = "a number >= 0"
 
 
 class Mimic(NamedTuple):
@@ -54,6 +56,8 @@ class Urdf(NamedTuple):
     """Joint -> what is wrong with its range, torque, speed or friction: matters where it moves."""
     speeds: dict[str, float]
     """Joint -> its largest speed, which the library does not keep; none for one without."""
+    tendons: Tendons = {}  # noqa: RUF012
+    """What constraints on tendons tie together, which a URDF does not have."""
 
     def separate_weights(self, spec: Any) -> list[tuple[Any, Weight]]:
         """The library's bodies with their weights, which the copy does not contain: the library
@@ -77,8 +81,7 @@ def checked(robot: ET.Element) -> Urdf:
     if len(links) > MAX_BODIES:
         raise checks.fail("robot", Shown(f"{len(links)} links"), f"at most {MAX_BODIES}")
     parent_of = {
-        _end(joint, "child", links): (_end(joint, "parent", links), name)
-        for name, joint in reversed(joints.items())
+        _end(joint, "child", links): _end(joint, "parent", links) for joint in joints.values()
     }
     _is_tree(links, joints, parent_of)
     root = next(name for name in links if name not in parent_of)
@@ -95,9 +98,8 @@ def checked(robot: ET.Element) -> Urdf:
     for name, mimic in found.mimics.items():
         if mimic.master not in joints:
             error = checks.fail(f"joint {name!r}: mimic", mimic.master, "the name of a joint")
-            found.motions[name].append(
-                Fault(f"joint {name!r}", mimic.shown, error, "one that moves by itself")
-            )
+            to = "one that moves by itself"
+            found.motions[name].append(Fault(f"joint {name!r}", mimic.shown, error, to))
     return found._replace(text=ET.tostring(copy, encoding="unicode"))
 
 
@@ -122,9 +124,7 @@ def _end(joint: ET.Element, which: str, links: dict[str, ET.Element]) -> str:
 
 
 def _is_tree(
-    links: dict[str, ET.Element],
-    joints: dict[str, ET.Element],
-    parent_of: dict[str, tuple[str, str]],
+    links: dict[str, ET.Element], joints: dict[str, ET.Element], parent_of: dict[str, str]
 ) -> None:
     """Raises where a link has two parents, or none of the links is the root of all."""
     seen: dict[str, str] = {}
@@ -132,46 +132,30 @@ def _is_tree(
         child = _end(joint, "child", links)
         if child in seen:
             remedy = "A closed chain has no serial one: cut it open at a joint."
-            raise checks.fail(
-                f"link {child!r}",
-                Shown(f"two parents, by joints {seen[child]!r} and {name!r}"),
-                "one parent",
-                remedy,
-            )
+            got = Shown(f"two parents, by joints {seen[child]!r} and {name!r}")
+            raise checks.fail(f"link {child!r}", got, "one parent", remedy)
         seen[child] = name
     roots = [name for name in links if name not in parent_of]
     if len(roots) > 1:
-        raise checks.fail(
-            "robot",
-            Shown(f"links without a parent: {', '.join(map(repr, roots[:5]))}"),
-            "one root",
-            "Connect them by joints.",
-        )
-    reached = set(roots)
-    children: dict[str, list[str]] = {}
-    for child, (parent, _) in parent_of.items():
-        children.setdefault(parent, []).append(child)
-    frontier = list(roots)
-    while frontier:
-        below = [child for parent in frontier for child in children.get(parent, ())]
-        reached.update(below)
-        frontier = below
-    if len(reached) < len(links):
-        lost = next(name for name in links if name not in reached)
-        raise checks.fail(
-            f"link {lost!r}",
-            Shown("a ring of joints"),
-            "links that hang on one root",
-            "A closed chain: cut it open at a joint.",
-        )
+        got = Shown(f"links without a parent: {', '.join(map(repr, roots[:5]))}")
+        raise checks.fail("robot", got, "one root", "Connect them by joints.")
+    for name in links:
+        ancestors = {name}
+        above = name
+        while above in parent_of:
+            above = parent_of[above]
+            if above in ancestors:
+                expected = "links that hang on one root"
+                remedy = "A closed chain: cut it open at a joint."
+                raise checks.fail(f"link {name!r}", Shown("a ring of joints"), expected, remedy)
+            ancestors.add(above)
 
 
 def _one(parent: ET.Element, tag: str) -> ET.Element | None:
     found = parent.findall(tag)
     if len(found) > 1:
-        raise checks.fail(
-            f"{label(parent)}: <{tag}>", Shown(f"{len(found)} of them"), "one at most"
-        )
+        got = Shown(f"{len(found)} of them")
+        raise checks.fail(f"{label(parent)}: <{tag}>", got, "one at most")
     return next(iter(found), None)
 
 
@@ -209,21 +193,16 @@ def _inertial(where: str, inertial: ET.Element) -> tuple[Weight, list[float]]:
         if kg <= 0:
             return checked_weight(where, kg, np.zeros((3, 3))), centre
         error = checks.fail(f"{where}: inertial", Shown("no <inertia>"), "an inertia [kg m^2]")
-        return (
-            Weight(
-                kg, fault=Fault(f"{where}: inertia", "nothing", error, "that of a point, 0 kg m^2")
-            ),
-            centre,
-        )
+        point = Fault(f"{where}: inertia", "nothing", error, "that of a point, 0 kg m^2")
+        return Weight(kg, fault=point), centre
     products = dict.fromkeys(INERTIA[3:], "0")  # which may be left out
     xx, yy, zz, xy, xz, yz = (
         floats(f"{where}: inertia {name}", inertia.get(name, products.get(name, "")), 1)[0]
         for name in INERTIA
     )
     R = Rotation.from_euler("xyz", rpy).as_matrix()  # about fixed axes, one after the other
-    return checked_weight(
-        where, kg, R @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ R.T
-    ), centre
+    J = symmetric(xx, yy, zz, xy, xz, yz)
+    return checked_weight(where, kg, R @ J @ R.T), centre
 
 
 def _joint(joint: ET.Element, found: Urdf) -> ET.Element:
@@ -251,15 +230,11 @@ def _joint(joint: ET.Element, found: Urdf) -> ET.Element:
         found.axes[name] = Fault(where, "", error)
     ET.SubElement(copy, "axis", xyz=_words(axis))
     faults = found.motions[name] = []
-    for read in (_limit, _dynamics):
+    for read in (_limit, _dynamics, _mimic):
         try:
             faults += read(joint, where, copy, found)
         except ValueError as error:
             faults.append(Fault(where, "", error))
-    try:
-        _mimic(joint, where, found)
-    except ValueError as error:
-        faults.append(Fault(where, "", error))
     return copy
 
 
@@ -295,13 +270,8 @@ def _limit(joint: ET.Element, where: str, copy: ET.Element, found: Urdf) -> list
         if endless:
             return []
         remedy = 'Add <limit lower="..." upper="..."/>, or make it continuous.'
-        error = checks.fail(
-            f"{where}: limit",
-            Shown("nothing"),
-            "the range of a joint that is not continuous",
-            remedy,
-        )
-        return [Fault(f"{where}: limit", "nothing", error, "no limits")]
+        expected = "the range of a joint that is not continuous"
+        return [fault(f"{where}: limit", Shown("nothing"), expected, "no limits", remedy=remedy)]
     names = ["effort", "velocity"]
     if not endless:
         names = ["lower", "upper", *names]
@@ -311,30 +281,18 @@ def _limit(joint: ET.Element, where: str, copy: ET.Element, found: Urdf) -> list
     }
     if not endless and not values["lower"] < values["upper"]:
         got = (values.pop("lower"), values.pop("upper"))
-        faults.append(
-            Fault(
-                f"{where}: limit",
-                str(got),
-                checks.fail(f"{where}: limit", got, "lower < upper"),
-                "no limits",
-            )
-        )
+        faults.append(fault(f"{where}: limit", got, "lower < upper", "no limits"))
     if values["effort"] < 0:
-        faults.append(_negative(f"{where}: effort", values.pop("effort"), "no limit"))
+        faults.append(fault(f"{where}: effort", values.pop("effort"), NONNEGATIVE, "no limit"))
     speed = values.pop("velocity")
     if speed > 0:
         found.speeds[str(joint.get("name"))] = speed
     elif speed < 0:
-        faults.append(_negative(f"{where}: velocity", speed, "no limit"))
+        faults.append(fault(f"{where}: velocity", speed, NONNEGATIVE, "no limit"))
     if "lower" in values and copy.get("type") == "continuous":
         copy.set("type", "revolute")
     ET.SubElement(copy, "limit", {name: repr(value) for name, value in values.items()})
     return faults
-
-
-def _negative(where: str, value: float, repaired: str) -> Fault:
-    """The fault of a number below 0."""
-    return Fault(where, str(value), checks.fail(where, value, "a number >= 0"), repaired)
 
 
 def _dynamics(joint: ET.Element, where: str, copy: ET.Element, _: Urdf) -> list[Fault]:
@@ -348,17 +306,16 @@ def _dynamics(joint: ET.Element, where: str, copy: ET.Element, _: Urdf) -> list[
     }
     for name, value in found.items():
         if value < 0:
-            faults.append(_negative(f"{where}: {name}", value, "0"))
+            faults.append(fault(f"{where}: {name}", value, NONNEGATIVE, "0"))
     ET.SubElement(copy, "dynamics", {name: repr(max(value, 0.0)) for name, value in found.items()})
     return faults
 
 
-def _mimic(joint: ET.Element, where: str, found: Urdf) -> None:
+def _mimic(joint: ET.Element, where: str, _: ET.Element, found: Urdf) -> list[Fault]:
+    """The joint that a joint follows, into `found`."""
     mimic = _one(joint, "mimic")
-    if mimic is None:
-        return
-    (multiplier,), (offset,) = (
-        floats(f"{where}: mimic {name}", mimic.get(name, default), 1)
-        for name, default in (("multiplier", "1"), ("offset", "0"))
-    )
-    found.mimics[str(joint.get("name"))] = Mimic(mimic.get("joint", ""), multiplier, offset)
+    if mimic is not None:
+        (multiplier,) = floats(f"{where}: mimic multiplier", mimic.get("multiplier", "1"), 1)
+        (offset,) = floats(f"{where}: mimic offset", mimic.get("offset", "0"), 1)
+        found.mimics[str(joint.get("name"))] = Mimic(mimic.get("joint", ""), multiplier, offset)
+    return []

@@ -17,30 +17,24 @@ from iblf_jax.core.pytree import field_values, is_leaf_field
 from iblf_jax.engine import block_size, uses_host_compiler
 from iblf_jax.kernels import built_for
 from iblf_jax.simulation.paths import get, parameters, unit_at
+from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.blocks import _execute
-from iblf_jax.studies.points import Points
-from iblf_jax.studies.setup import PreparedStudy
+from iblf_jax.studies.study_setup import PreparedStudy
+from iblf_jax.studies.sweep_points import Points
 
 
 def describe_component(part: Any) -> Any:
     """A component as JSON: its class, its structural fields and its numbers, all the way down."""
+    if isinstance(part, str | bool | None):
+        return part
     if isinstance(part, tuple | list):
         return [describe_component(x) for x in part]
-    if isinstance(part, jax.Array | np.ndarray | np.generic | float | int) and not isinstance(
-        part, bool
-    ):
+    if isinstance(part, jax.Array | np.ndarray | np.generic | float | int):
         return np.asarray(part).tolist()
     if not dataclasses.is_dataclass(part) or isinstance(part, type):
-        return _simple(part, str | bool | None)
+        return repr(part)
     fields = {name: describe_component(value) for name, value in field_values(part).items()}
     return {"class": type(part).__qualname__, **fields}
-
-
-def _simple(value: Any, kinds: Any) -> Any:
-    """A value of these types, or its `repr`."""
-    if isinstance(value, kinds):
-        return value
-    return repr(value)
 
 
 def structure(part: Any) -> Any:
@@ -54,29 +48,35 @@ def structure(part: Any) -> Any:
     for field in dataclasses.fields(part):
         inner = values[field.name]
         if field.metadata.get("static"):
-            found[field.name] = _simple(inner, str | bool | int | float)
+            is_simple = isinstance(inner, str | bool | int | float)
+            found[field.name] = inner if is_simple else repr(inner)
         elif not is_leaf_field(field) and not isinstance(inner, jax.Array | np.ndarray):
             found[field.name] = structure(inner)
     return found
 
 
-def program_digest(study: PreparedStudy) -> str:
+def values_of(scenario: Scenario) -> dict[str, Any]:
+    """Path -> value of every parameter."""
+    return {p.path: np.asarray(p.value).tolist() for p in parameters(scenario, named=False)}
+
+
+def program_digest(prepared: PreparedStudy) -> str:
     """A digest of what a run computes: it differs if the code of a law, a robot or a metric has
     changed.
     """
-    inputs = study.inputs_of(np.arange(block_size()))
-    traced = _execute.trace(study.shared, inputs, program=study.program)
+    inputs = prepared.inputs_of(np.arange(block_size()))
+    traced = _execute.trace(prepared.shared, inputs, program=prepared.program)
     text = re.sub(r"0x[0-9a-f]+", "", str(traced.jaxpr))
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def describe(study: PreparedStudy, points: Points, design: str, dt: float) -> dict[str, Any]:
+def describe(prepared: PreparedStudy, points: Points, design: str) -> dict[str, Any]:
     """Everything that the data of a sweep depend on."""
     import jaxlib
 
     import iblf_jax
 
-    scenario = study.shared.cases.scenario
+    scenario = prepared.scenario
 
     def place(path: str) -> dict[str, Any]:
         return {
@@ -86,7 +86,8 @@ def describe(study: PreparedStudy, points: Points, design: str, dt: float) -> di
             "shape": list(np.shape(get(scenario, path))),
         }
 
-    backend = study.program.batch.backend
+    options = prepared.options
+    backend = prepared.backend
     kernel = {}
     if uses_host_compiler(backend):
         kernel = {"kernel": built_for()}
@@ -94,26 +95,21 @@ def describe(study: PreparedStudy, points: Points, design: str, dt: float) -> di
         "design": design,
         "dims": dict(points.dims),
         "points": {path: place(path) for path in points.values},
-        "perturbations": {path: describe_component(p) for path, p in study.perturbations.items()},
+        "perturbations": {
+            path: describe_component(p) for path, p in prepared.perturbations.items()
+        },
         "perturbed": {
             t.path: {"unit": unit_at(scenario, t.path), "source": t.source}
-            for t in study.program.targets
+            for t in prepared.program.targets
         },
-        "runs": study.runs,
-        "seed": study.seed,
-        "sampler": study.sampler,
-        "replicates": study.replicates,
-        "duration": round(study.program.steps * dt, 12),
-        "dt": dt,
-        "method": study.program.method,
-        "metrics": describe_component(study.shared.folds),
-        "scenario": {
-            p.path: np.asarray(p.value).tolist() for p in parameters(scenario, named=False)
-        },
+        **dataclasses.asdict(options),
+        "duration": round(options.steps * options.dt, 12),
+        "backend": backend,
+        "metrics": describe_component(prepared.shared.folds),
+        "scenario": values_of(scenario),
         "structure": structure(scenario),
         "joints": scenario.n,
         "dtype": str(scenario.initial.q.dtype),
-        "backend": backend,
         "platform": devices.platform(),
         **kernel,
         "block": block_size(),
@@ -122,5 +118,5 @@ def describe(study: PreparedStudy, points: Points, design: str, dt: float) -> di
             "jax": jax.__version__,
             "jaxlib": jaxlib.__version__,
         },
-        "program": program_digest(study),
+        "program": program_digest(prepared),
     }

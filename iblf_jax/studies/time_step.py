@@ -7,15 +7,16 @@ from collections.abc import Mapping
 import numpy as np
 
 from iblf_jax.core import checks, notices
-from iblf_jax.core.status import Status
+from iblf_jax.core.status import Status, has_flag
 from iblf_jax.engine import block_size, step_size
-from iblf_jax.simulation.accuracy import RELATIVE, TOLERANCE
+from iblf_jax.simulation.error_estimate import RELATIVE, TOLERANCE
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.blocks import run_blocks
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.draws import targets_of
-from iblf_jax.studies.setup import prepare
+from iblf_jax.studies.options import RunOptions
+from iblf_jax.studies.study_setup import prepare
 
 STEP_FLAGS = Status.STEP_TOO_LARGE | Status.INACCURATE
 """Flags of a run whose time step was too large."""
@@ -57,33 +58,31 @@ def recommended_dt(
       ValueError: bad scenario, duration, method, perturbations or seed.
     """
     tableau(method)
-    seed, duration = checks.seed(seed), checks.time_span("duration", duration)
+    seed = checks.seed(seed)
+    duration = checks.time_span("duration", duration)
     if perturbations is None:
         perturbations = {}
-    example = '{"plant.mass": ij.factor(ij.uniform(0.9, 1.1))}'
-    checks.mapping("perturbations", perturbations, example)
+    checks.mapping(
+        "perturbations", perturbations, '{"plant.mass": ij.factor(ij.uniform(0.9, 1.1))}'
+    )
     if perturbations:  # checked here, before the search for a step
         targets_of(canonical(scenario), perturbations)
     dt = step_size.find_dt(scenario, duration=duration, method=method)
     if not perturbations:
         return dt
     for _ in range(MAX_TRIES):
-        steps = max(round(duration / dt), 1)
-        study = prepare(
-            scenario,
-            perturbations,
-            block_size(),
-            seed,
-            duration=steps * dt,
+        options = RunOptions(
+            duration=max(round(duration / dt), 1) * dt,
             dt=dt,
             method=method,
-            metrics=(),
             backend="auto",
+            runs=block_size(),
+            seed=seed,
         )
-        ((_, results),) = run_blocks(study, [0])
-        needed = needed_dt(
-            results.status, results.fastest_mode, results.metrics[RELATIVE], dt, method
-        )
+        prepared = prepare(scenario, perturbations, options.checked(), metrics=())
+        ((_, results),) = run_blocks(prepared, [0])
+        errors = results.metrics[RELATIVE]
+        needed = needed_dt(results.status, results.fastest_mode, errors, dt, method)
         if needed is None:
             return dt
         dt = needed
@@ -102,17 +101,14 @@ def needed_dt(
       dt: their time step [s].
       method: the integrator.
     """
-    stiff = status & int(Status.STEP_TOO_LARGE) != 0
-    inaccurate = (status & int(Status.INACCURATE) != 0) & ~stiff
+    stiff = has_flag(status, Status.STEP_TOO_LARGE)
+    inaccurate = has_flag(status, Status.INACCURATE) & ~stiff
     needed = []
     if np.any(stiff):
         needed.append(step_size.comfortable_dt(float(np.max(modes[stiff]))))
     if np.any(inaccurate):
-        needed.append(
-            step_size.smaller(
-                dt, float(np.max(errors[inaccurate])) / TOLERANCE, tableau(method).order
-            )
-        )
+        excess = float(np.max(errors[inaccurate])) / TOLERANCE
+        needed.append(step_size.smaller(dt, excess, tableau(method).order))
     return min(needed, default=None)
 
 
@@ -124,9 +120,9 @@ def warn_of_step(
     """
     needed = needed_dt(status, modes, errors, dt, method)
     if needed is not None:
-        late = int(np.sum(status & int(STEP_FLAGS) != 0))
+        count = np.sum(has_flag(status, STEP_FLAGS))
         notices.warn(
-            f"The time step dt = {dt:g} s is too large for {late} of {status.size} runs, which are"
+            f"The time step dt = {dt:g} s is too large for {count} of {status.size} runs, which are"
             f" unstable or inaccurate. Take dt={needed:g}; ij.recommended_dt(scenario,"
             " perturbations=..., duration=...) finds one beforehand."
         )

@@ -18,12 +18,13 @@ import numpy as np
 from iblf_jax.core import checks
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.studies.designs import MAX_RUNS, split, unit_points
-from iblf_jax.studies.distributions import Perturbation, is_distribution, value
+from iblf_jax.studies.designs import MAX_RUNS, designed_numbers
+from iblf_jax.studies.distributions import Distribution, Perturbation, value
 from iblf_jax.studies.draws import (
     CaseInputs,
     Cases,
     Target,
+    case_inputs,
     check_paths,
     draw,
     sample_size,
@@ -104,7 +105,7 @@ def _ticks(scenario: Scenario, path: str, values: Any) -> np.ndarray:
     leaves.
     """
     name = f"grid[{path!r}]"
-    if isinstance(values, Perturbation) or is_distribution(values):
+    if isinstance(values, Perturbation | Distribution):
         raise checks.fail(
             name,
             values,
@@ -135,32 +136,18 @@ def _design(
     designed: dict[str, np.ndarray] = {}
     checks.fits("points", count, 3 * 8.0 * (1 + sum(math.prod(target.shape) for target in targets)))
     if design == "latin_hypercube":
-        shapes = sample_size(targets, by_path)
-        designed = split(
-            unit_points(
-                design,
-                sum(int(np.prod(s, dtype=int)) for s in shapes.values()),
-                count,
-                1,
-                seed,
-                _SALT,
-            ),
-            shapes,
-            dtype,
+        designed = designed_numbers(
+            design, sample_size(targets, by_path), count, 1, seed, dtype, _SALT
         )
-    values = _draw_points(
-        Cases(scenario, by_path, jax.random.fold_in(jax.random.PRNGKey(seed), _SALT)),
-        targets,
-        count,
-        designed,
-    )
+    key = jax.random.fold_in(jax.random.PRNGKey(seed), _SALT)
+    values = _draw_points(Cases(scenario, by_path, key), targets, count, designed)
     return Points({POINT: count}, dict.fromkeys(values, POINT), values, values)
 
 
 def _perturbation(path: str, given: Any) -> Perturbation:
     if isinstance(given, Perturbation):
         return given
-    if not is_distribution(given):
+    if not isinstance(given, Distribution):
         raise checks.fail(
             f"grid[{path!r}]",
             given,
@@ -173,7 +160,7 @@ def _perturbation(path: str, given: Any) -> Perturbation:
 def _draw_points(
     cases: Cases, targets: tuple[Target, ...], count: int, designed: dict[str, np.ndarray]
 ) -> dict[str, np.ndarray]:
-    inputs = CaseInputs(np.arange(count, dtype=np.uint32), {}, designed)
+    inputs = case_inputs(np.arange(count), count, {}, designed)
 
     def one(point: CaseInputs):
         _, drawn, admissible = draw(cases, targets, point.index, point.points, point.u)

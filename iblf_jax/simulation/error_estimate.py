@@ -24,7 +24,8 @@ dt |k_3 - k_2| |dt A|^2 / 30. That of Heun's method is dt |k_2 - k_1| |dt A| / 6
 
 The stages cannot resolve a reference or a disturbance with whole periods between them;
 `unresolved_signals` measures these separately. A step is divided at the jump times of a scenario
-(`jumps`). Differences are not taken across a jump: the stages of that step give its error.
+(`discontinuities`). Differences are not taken across a jump: the stages of that step give its
+error.
 
 Compared with runs at a sixteenth of the step, the estimate is 1/3 to 30 times the error where the
 error exceeds 1e-4 of the tube, and larger below.
@@ -43,8 +44,8 @@ import numpy as np
 
 from iblf_jax.core.linalg import matvec, solve, solve_spd
 from iblf_jax.simulation.closed_loop import LoopState, perturbed_state
+from iblf_jax.simulation.discontinuities import within
 from iblf_jax.simulation.integrators import Tableau, tableau
-from iblf_jax.simulation.jumps import within
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.stability import SLOWEST_RATE
 from iblf_jax.world.bounds import Tube
@@ -180,7 +181,7 @@ def update(
       method: the integrator.
       dt: time step, () [s].
       index: number of the step, () int.
-      pieces: length [s] of each piece of the step (`jumps`), and the slopes of its stages.
+      pieces: length [s] of each piece of the step, and the slopes of its stages.
       width: of the tube, (n,) [rad].
       sampled: whether the law is sampled.
       restarts: whether a jump lies in this step or in one of those that the differences cover,
@@ -271,7 +272,10 @@ def _error_by_stages(
     rate: Callable, table: Tableau, length: jax.Array, slopes: list[LoopState]
 ) -> jax.Array:
     """Local error of one step of this length from the slopes of its stages, in terms of `rate` of a
-    slope; 0 for a method of one stage.
+    slope.
+
+    A method of one stage has no such estimate, and the result is 0. The factors below are those of
+    rk4, which has a stage in the middle of a step, and of Heun's method.
     """
     if len(table.c) == 1:
         return jnp.zeros_like(rate(slopes[0]))

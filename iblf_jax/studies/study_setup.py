@@ -1,0 +1,160 @@
+"""The request of a study: its arguments, checked once, and the program that its blocks run.
+
+Cases are numbered, case = point * runs + run, with one point unless the study is a sweep.  What all
+cases share is traced (`SharedInputs`); what differs between them is made for the cases of one block
+(`PreparedStudy.inputs_of`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax.engine import CompiledBatch, RunRequest, block_size, compile_batch
+from iblf_jax.simulation.metrics import Fold, as_folds
+from iblf_jax.simulation.noise import noise_of
+from iblf_jax.simulation.scenario import Scenario, canonical, check_step
+from iblf_jax.studies.designs import designed_numbers
+from iblf_jax.studies.distributions import Perturbation
+from iblf_jax.studies.draws import (
+    CaseInputs,
+    Cases,
+    Target,
+    case_inputs,
+    draw,
+    merge,
+    sample_size,
+    targets_of,
+)
+from iblf_jax.studies.options import RunOptions
+
+
+class StudyProgram(NamedTuple):
+    """What every block of a study computes; static."""
+
+    targets: tuple[Target, ...]
+    """The leaves that are drawn."""
+    batch: CompiledBatch
+    """The program of the runs, on the executor that was chosen."""
+
+
+class SharedInputs(NamedTuple):
+    """What all runs of a study share; traced."""
+
+    cases: Cases
+    folds: Any
+    dt: jax.Array
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, eq=False)
+class PreparedStudy:
+    """A study whose arguments are checked and whose program is chosen."""
+
+    program: StudyProgram = dataclasses.field(metadata={"static": True})
+    shared: SharedInputs
+    perturbations: dict[str, Perturbation]
+    """As the user gave them."""
+    options: RunOptions = dataclasses.field(metadata={"static": True})
+    designed: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    """Path -> uniform numbers of every run, for samplers with a design."""
+    points: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    """Path -> value at every point of a sweep."""
+
+    @property
+    def cases(self) -> int:
+        """Number of cases: points times runs."""
+        counts = [len(values) for values in self.points.values()]
+        return self.options.runs * next(iter(counts), 1)
+
+    @property
+    def scenario(self) -> Scenario:
+        """The nominal scenario, canonical."""
+        return self.shared.cases.scenario
+
+    @property
+    def dt(self) -> float:
+        """Time step [s], in the type of the scenario."""
+        return float(self.shared.dt)
+
+    @property
+    def duration(self) -> float:
+        """Length of a run [s]."""
+        return self.options.steps * self.dt
+
+    @property
+    def backend(self) -> str:
+        """The backend that was chosen: "native", "gpu" or "vmap", not "auto"."""
+        return self.program.batch.backend
+
+    def inputs_of(self, cases: np.ndarray) -> CaseInputs:
+        """What differs between these cases; numbers past the last case repeat it."""
+        cases = np.minimum(cases, self.cases - 1)
+        return case_inputs(cases, self.options.runs, self.points, self.designed)
+
+
+def drawn_leaves(
+    targets: tuple[Target, ...], shared: SharedInputs, inputs: CaseInputs
+) -> tuple[dict[str, Any], dict[str, Any], jax.Array]:
+    """The leaves that the runs of a block replace, the draws, and whether they were admissible."""
+
+    def one(case: CaseInputs):
+        used, drawn, admissible = draw(shared.cases, targets, case.index, case.points, case.u)
+        scenario = shared.cases.scenario
+        noise = noise_of(scenario, shared.cases.key, case.index)
+        return merge(scenario, case.points, used) | noise, drawn, admissible
+
+    # Without the barrier XLA fuses the random numbers into every operation of the run, and
+    # compiles for 18 s instead of 5 s.
+    return jax.lax.optimization_barrier(jax.vmap(one)(inputs))
+
+
+def prepare(
+    scenario: Scenario,
+    perturbations: Mapping[str, Perturbation],
+    options: RunOptions,
+    metrics: Sequence[Fold] | None,
+    points: Mapping[str, np.ndarray] | None = None,
+) -> PreparedStudy:
+    """Checks the scenario, its perturbations and the metrics, and compiles the program of blocks.
+
+    Args:
+      scenario, perturbations, metrics: as `monte_carlo`.
+      options: checked.
+      points: path -> value at every point of a sweep, (P, ...).
+
+    Raises:
+      ValueError: an argument that is not valid.
+    """
+    scenario = canonical(scenario)
+    request = RunRequest.of(
+        scenario, steps=options.steps, method=options.method, backend=options.backend
+    )
+    check_step(scenario, options.dt)
+    targets, by_path = targets_of(scenario, perturbations)
+    dtype = scenario.initial.q.dtype
+    folds = as_folds(metrics, dtype, scenario)
+    by_path, dt = jax.tree.map(lambda x: jnp.asarray(x, dtype), (by_path, options.dt))
+    designed: dict[str, np.ndarray] = {}
+    if options.sampler != "independent":
+        designed = designed_numbers(
+            options.sampler,
+            sample_size(targets, by_path),
+            options.runs,
+            options.replicates,
+            options.seed,
+            dtype,
+        )
+    shared = SharedInputs(Cases(scenario, by_path, jax.random.PRNGKey(options.seed)), folds, dt)
+    points = dict(points or {})
+    inputs = case_inputs(np.zeros(block_size(), int), options.runs, points, designed)
+    varied, _, _ = jax.eval_shape(partial(drawn_leaves, targets), shared, inputs)
+    batch = compile_batch(request, scenario, varied, folds, dt)
+    program = StudyProgram(targets, batch)
+    return PreparedStudy(program, shared, dict(perturbations), options, designed, points)
