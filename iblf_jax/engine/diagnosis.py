@@ -45,13 +45,7 @@ class SimulationWarning(UserWarning):
 
 
 def report(result: Rollout, steps: int, throw: bool) -> None:
-    """Raises or warns if a run failed or may be unreliable; the message says why.
-
-    Args:
-      result: one run, with concrete numbers.
-      steps: number of steps of the run.
-      throw: whether to raise SimulationError if the run failed.
-    """
+    """Raises (`throw`) or warns if a run failed, and warns if it may be unreliable."""
     status = Status(int(result.status))
     if status & Status.INFEASIBLE_REFERENCE:
         raise _infeasible(result, steps)
@@ -90,15 +84,7 @@ def _explanations(result: Rollout, status: Status, steps: int) -> list[str]:
 
 
 def _joint_violation(bounds: str, prefix: str, margin: str, unit: str, result: Rollout) -> str:
-    """Which joint violated its bounds first.
-
-    Args:
-      bounds: the bounds in words.
-      prefix: prefix of the metrics of the first violation.
-      margin: name of the metric of the smallest margin.
-      unit: unit of the margin.
-      result: the run.
-    """
+    """Which joint violated its bounds first; `prefix` and `margin` are names of metrics."""
     metrics = result.metrics
     if f"{prefix}_time" not in metrics:
         return ""

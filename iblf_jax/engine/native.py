@@ -67,15 +67,7 @@ def run(
       The rows after the last step, and the recorded arrays, (samples, numbers, runs), of every
       `every`-th step.
     """
-    runs = carry.floats.shape[1]
+    kernel = _kernel_build(program, carry.floats.shape[1], steps, short_vector)
     return cpu.run(
-        program,
-        shared,
-        per_run,
-        carry,
-        steps,
-        every,
-        first=first,
-        build=_kernel_build(program, runs, steps, short_vector),
-        threads=threads(),
+        program, shared, per_run, carry, steps, every, first=first, build=kernel, threads=threads()
     )

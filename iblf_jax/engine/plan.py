@@ -88,13 +88,7 @@ def choose_plan(request: RunRequest, sizes: Sizes, machine: Machine) -> Executio
 
 
 def within_node_limit(execution: ExecutionPlan, request: RunRequest, nodes: int) -> ExecutionPlan:
-    """The plan of a single run whose step has so many nodes: on "auto" the scan makes long steps.
-
-    Args:
-      execution: as `choose_plan` returns it, with at least one executor.
-      request: what is to be run.
-      nodes: nodes of the scalar program of a step.
-    """
+    """The plan of a single run with so many nodes per step; on "auto" the scan makes long steps."""
     limit = registry.EXECUTORS[execution.backend].limits.single_run_nodes
     if request.backend != "auto" or thresholds.is_within(nodes, limit):
         return execution
@@ -110,11 +104,8 @@ def scan_only(execution: ExecutionPlan, reason: object) -> ExecutionPlan:
 
 
 def plan_of_states(operations: int, backend: Availability) -> ExecutionPlan:
-    """The plan of a few steps from each of many states: a kernel is built for short steps only.
-
-    Args:
-      operations: operations of one evaluation of the closed loop.
-      backend: the default backend of the machine.
+    """The plan of a few steps from each of many states, by the default backend of the machine; a
+    kernel is built only if the closed loop has few operations.
     """
     backends: tuple[str, ...] = ()
     if backend.reason is None and operations <= thresholds.LONG_EVALUATION:
