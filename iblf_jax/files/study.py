@@ -190,9 +190,8 @@ def _perturbation(table: Any, path: str) -> Perturbation:
                 values[word] = numbers(table[word], key)
         elif is_required:
             raise missing(key, "a number or a list of numbers", f"{name} needs it.")
-    return getattr(distributions, kind)(
-        construct(_distribution_maker(name), values, path), shared=shared
-    )
+    distribution = construct(_distribution_maker(name), values, path)
+    return getattr(distributions, kind)(distribution, shared=shared)
 
 
 def _new_spelling(kind: str, old: dict[str, Any], table: dict[str, Any]) -> str:
