@@ -44,7 +44,7 @@ import numpy as np
 
 from iblf_jax.core.linalg import matvec, solve, solve_spd
 from iblf_jax.simulation.closed_loop import LoopState, perturbed_state
-from iblf_jax.simulation.discontinuities import within
+from iblf_jax.simulation.discontinuities import has_jump
 from iblf_jax.simulation.integrators import Tableau, tableau
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.stability import SLOWEST_RATE
@@ -172,7 +172,7 @@ def update(
     width: jax.Array,
     sampled: bool = False,
     restarts: Any = None,
-    overfull: Any = None,
+    too_many_jumps: Any = None,
 ) -> Accuracy:
     """The estimate after one more step.
 
@@ -186,14 +186,14 @@ def update(
       sampled: whether the law is sampled.
       restarts: whether a jump lies in this step or in one of those that the differences cover,
         () bool; None for scenarios without jumps.
-      overfull: whether a step has more jumps than it is divided at, () bool; None where this cannot
-        happen.
+      too_many_jumps: whether jumps lie at more times than a step is divided at, () bool; None where
+        this cannot happen.
     """
     table = tableau(method)
-    if overfull is not None:
+    if too_many_jumps is not None:
         accuracy = accuracy._replace(
-            error=jnp.where(overfull, jnp.inf, accuracy.error),
-            relative=jnp.where(overfull, jnp.inf, accuracy.relative),
+            error=jnp.where(too_many_jumps, jnp.inf, accuracy.error),
+            relative=jnp.where(too_many_jumps, jnp.inf, accuracy.relative),
         )
     width = jax.lax.stop_gradient(width)
     if sampled:
@@ -349,7 +349,7 @@ def unresolved_signals(
     if jumps.size:
         # A step is divided at declared jumps, so its stages resolve them.
         before = starts - 0.5 * dt
-        divided = jax.vmap(lambda start: within(jumps, start, start + 2.0 * dt))(before)[:, None]
+        divided = jax.vmap(lambda start: has_jump(jumps, start, start + 2.0 * dt))(before)[:, None]
         missed, push = jnp.where(divided, 0.0, missed), jnp.where(divided, 0.0, push)
     missed = jnp.max(missed, axis=0)
     if scenario.sampling is not None:
