@@ -1,14 +1,13 @@
-"""What an argument `joints=` selects, with one meaning everywhere: indices, names, slices or truth
-values.
+"""Selection of joints: the one meaning of every argument `joints=`.
 
     joints=None             all joints
     joints=[0, 1]           joints 0 and 1; joints=-1 is the last one
     joints="elbow"          by name, as in the robot's file
-    joints=slice(0, 3)      or "0:3" in a file
+    joints=slice(0, 3)      a slice, "0:3" in a file
     joints=[True, False]    one truth value for each joint
 
-A selection is structure, not a number: it is kept as a hashable tuple and becomes indices where the
-robot is known.
+A selection is structure, so it is stored as a hashable tuple; `indices` converts it to indices once
+the robot is known.
 """
 
 from __future__ import annotations
@@ -42,15 +41,15 @@ def holds_weights(joints: Any) -> bool:
 
 
 def selection(field: str, joints: Any) -> Selection:
-    """What a user gave as a hashable tuple, with what needs no robot checked.
+    """A user's selection as a hashable tuple, with all checks that do not need the robot.
 
     Args:
-      field: what messages call it.
+      field: name of the argument, for error messages.
       joints: an index, a name, a slice, a sequence of these, or one truth value for each joint;
         None for all joints.
 
     Raises:
-      ValueError: something else, numbers that are not whole, or nothing.
+      ValueError: another type, numbers that are not integers, or an empty selection.
     """
     if joints is None:
         return None
@@ -117,9 +116,9 @@ def indices(field: str, chosen: Selection, names: Sequence[str]) -> tuple[int, .
     """The joints of a selection, from 0, in the order in which they were given.
 
     Args:
-      field: what messages call it.
-      chosen: what `selection` gave.
-      names: what each of the n joints is called.
+      field: name of the argument, for error messages.
+      chosen: as `selection` returns it.
+      names: of the n joints.
 
     Raises:
       ValueError: a joint that the robot does not have, one that is given twice, or none.

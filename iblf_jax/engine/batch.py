@@ -28,7 +28,7 @@ from iblf_jax.simulation import error_estimate
 from iblf_jax.simulation.closed_loop import initial_state, perturbed_state
 from iblf_jax.simulation.noise import NOISE_NAME
 from iblf_jax.simulation.paths import with_parameters
-from iblf_jax.simulation.stability import resolved
+from iblf_jax.simulation.stability import resolved_jacobian
 
 
 class Leaves(NamedTuple):
@@ -204,7 +204,7 @@ def initialize(loop: StepLoop, batch: Batch, method: str) -> tuple[Carry, Linear
 
     def of_run(inputs, found):
         is_sampled = inputs.scenario.sampling is not None
-        return start(inputs, method, resolved(found.jacobian, is_sampled))
+        return start(inputs, method, resolved_jacobian(found.jacobian, is_sampled))
 
     return batch.each(of_run, found), found
 

@@ -21,7 +21,7 @@ def architecture() -> str:
     Raises:
       ToolchainError: the default devices are no GPUs that NVRTC compiles for, or they differ.
     """
-    default_devices = devices.default()
+    default_devices = devices.default_devices()
     try:
         found = {device.compute_capability for device in default_devices}
     except AttributeError:  # no GPUs
@@ -80,7 +80,7 @@ def run(
     """All steps of all runs; arguments and results as `native.run`."""
     name = cuda.kernel(program, shared.size, per_run.shape[0], architecture())
     # The CPU devices of the tests have no attribute core_count.
-    processors = getattr(devices.default()[0], "core_count", thresholds.MULTIPROCESSORS)
+    processors = getattr(devices.default_devices()[0], "core_count", thresholds.MULTIPROCESSORS)
     threads = thresholds.gpu_threads(carry.floats.shape[1], processors)
     return call(name, program, shared, per_run, carry, steps, every, threads)
 

@@ -4,16 +4,16 @@ A Runge-Kutta step across a jump is of first order, whatever the method. A step 
 integrated in pieces that end where
 
     a jump time of the scenario lies in it,   t_k < t_j <= t_(k+1)   (`Scenario.jump_times`),
-    a command of a sampled law arrives in it  (`sampling.arriving`).
+    a command of a sampled law arrives in it  (`sampling.step_torques`).
 
-A jump at the end of a step belongs to that step. A piece of length 0 follows it, through which the
-state has a derivative by the jump time there, too. The lengths of the pieces carry the derivatives
-by jump times and delays, so the jump of the right-hand side enters the derivative of the state.
-Jumps at equal times are one cut; the first of them receives the derivative of all together.
+A jump at the end of a step belongs to that step and is followed by a piece of length 0. The
+lengths of the pieces, this one included, depend on jump times and delays, so the derivative of the
+state by these contains the jump of the right-hand side. Jumps at equal times are one cut; the first
+of them receives the derivative of all together.
 
-The stages of a piece see one-sided limits: a piece that ends at a jump is evaluated before it, and
-one that begins there after it. A jump time may carry a rounding error, so stages keep a distance of
-`JUMP_SEPARATION` units in the last place from it.
+The stages of a piece use one-sided limits: a piece that ends at a jump is evaluated before it, and
+a piece that begins there after it. Because a jump time may have a rounding error, stages keep a
+distance of `JUMP_SEPARATION` units in the last place from it.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ import numpy as np
 from iblf_jax.simulation import integrators
 
 MAX_CUTS = 4
-"""Largest number of different jump times at which one step is divided; the accuracy of a step with
-more is unknown."""
+"""Largest number of different jump times at which one step is divided. The accuracy of a step with
+more of them is unknown."""
 JUMP_SEPARATION = 4.0
 """Units in the last place between a stage and a jump time."""
 
@@ -211,7 +211,7 @@ def has_jump(times: jax.Array, after: jax.Array, until: jax.Array) -> jax.Array:
 def last_piece_length(
     times: jax.Array, before: Span, arrival: tuple[jax.Array, jax.Array] | None = None
 ) -> jax.Array:
-    """Length of the last piece of a step, () [s]; that of the step if it is not divided.
+    """Length of the last piece of a step, () [s]; the length of the step if it is not divided.
 
     Args:
       times: the scenario's jump times, (J,) [s].
@@ -232,7 +232,7 @@ class DividedStepResult(NamedTuple):
     """Result of integrating over the pieces of a step."""
 
     state: Any
-    """At the end of the step."""
+    """State at the end of the step."""
     aux: Any
     """What the function returned besides the rate at the start of the step."""
     parts: list[tuple[jax.Array, list]]
@@ -248,8 +248,8 @@ def integrate_pieces(
       method: a name in `integrators.TABLEAUS`.
       evaluate: function (t, state) -> (rate of the state, anything else), as for
         `integrators.step`.
-      division: of the step.
-      state: at its start.
+      division: the pieces of the step.
+      state: state at the start of the step.
       rolled: as for `integrators.step`.
     """
 

@@ -1,10 +1,10 @@
 """Explicit Runge-Kutta steps on pytrees; each method is a Butcher tableau.
 
-The time step is fixed, because the loop is sampled in practice, gradients are then exact, and the
-runs of a batch stay in step. The integrated function may return other values besides the rate (the
-closed loop returns a sample to record); a step passes on those of its start. A new method is a new
-row of TABLEAUS. `error_estimate` knows the local error by stages of Euler's method, of methods of
-two stages and of rk4; a row of another kind needs a formula there.
+The time step is fixed for three reasons: the loop is sampled in practice, gradients are exact, and
+the runs of a batch advance together. The integrated function may return other values besides the
+rate (the closed loop returns a sample to record); a step passes on those of its start. A new method
+is a new row of TABLEAUS. `error_estimate` has the local error by stages for Euler's method, methods
+of two stages and rk4; a row of another kind needs a formula there.
 """
 
 from __future__ import annotations

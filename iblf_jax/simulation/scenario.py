@@ -71,19 +71,19 @@ PROTOCOLS = {
     "reference": (Reference, "iblf_jax.references has them."),
     "controller": (
         Controller,
-        "iblf_jax.controllers has them; iblf_jax.testing.check_law looks at your own.",
+        "iblf_jax.controllers has them; iblf_jax.testing.check_law checks your own.",
     ),
     "observer": (Observer, "iblf_jax.observers has them; NoObserver() for none."),
     "disturbance": (Disturbance, "iblf_jax.disturbances has them; Nothing() for none."),
     "sensor": (Sensor, "iblf_jax.sensors has them; Ideal() for none."),
     "actuator": (Actuator, "iblf_jax.actuators has them; Ideal() for none."),
 }
-"""Protocol and remedy for each part of a scenario that a user may write."""
+"""Part of a scenario that a user may write -> its protocol, and the remedy of an error message."""
 OPTIONAL_MEMBERS = ("skeleton",)
 """Members of these protocols that a part may lack."""
 
-MAKE_ONE = "Make one with ij.presets or ij.Scenario."
-OF_VELOCITY = {
+HOW_TO_MAKE = "Make one with ij.presets or ij.Scenario."
+VELOCITY_UNITS = {
     "units": dict.fromkeys(("value", "offset", "amplitude", "initial", "final"), "rad/s")
 }
 """Units of the leaves of bounds on velocities: leaf -> unit."""
@@ -91,8 +91,7 @@ OF_VELOCITY = {
 
 @component
 class Scenario:
-    """Plant, model, reference, bounds, disturbance, law, observer and start of a run; and sampling,
-    sensor and actuator of the law.
+    """The plant, the control system and the start of a run.
 
     Leaves with one number per joint may be given as a scalar; it is repeated for the plant's n
     joints.
@@ -104,18 +103,19 @@ class Scenario:
       controller: the law, any of `iblf_jax.controllers`.
       initial: position and velocity at the start, an `Initial`.
       observer: estimator of f, any of `iblf_jax.observers`; `NoObserver()` if not given.
-      disturbance: torque on the plant that the law does not know, any of `iblf_jax.disturbances`;
+      disturbance: torque on the plant that is unknown to the law, any of `iblf_jax.disturbances`;
         `Nothing()` if not given.
       model: the robot that law and observer know; the plant itself if not given.
       sampling: timing of law and observer, a `Sampling`; continuous time if not given.
       sensor: measurement of q and q', any of `iblf_jax.sensors`; `Ideal()` if not given.  Others
         need a sampling.
-      actuator: from the command to the torque, any of `iblf_jax.actuators`; `Ideal()` if not given.
+      actuator: map from command to torque, any of `iblf_jax.actuators`; `Ideal()` if not given.
       velocity_bounds: constraints on the joint velocities, a `bounds.Bounds` [rad/s] whose funnels
         follow q_d'; none if not given.  Runs record their margins under every law;
         `controllers.FullState` enforces them.
-      regions: where points of the robot must stay, a tuple of any of `iblf_jax.regions`; () if not
-        given.  Runs record their margins under every law; `controllers.SafetyFilter` enforces them.
+      regions: sets in which points of the robot must stay, a tuple of any of `iblf_jax.regions`; ()
+        if not given.  Runs record their margins under every law; `controllers.SafetyFilter`
+        enforces them.
 
     Raises:
       ValueError: if a leaf has the wrong number of joints, model and plant differ in theirs, or a
@@ -133,12 +133,12 @@ class Scenario:
     sampling: Sampling | None = None
     sensor: Sensor = IdealSensor()
     actuator: Actuator = IdealActuator()
-    velocity_bounds: Bounds | None = dataclasses.field(default=None, metadata=OF_VELOCITY)
+    velocity_bounds: Bounds | None = dataclasses.field(default=None, metadata=VELOCITY_UNITS)
     regions: tuple[regions.Region, ...] = ()
 
     def check(self) -> None:
-        """Completes the model, checks the parts, and gives every leaf with one number per joint its
-        n entries.
+        """Checks the parts, makes the plant the model if none is given, and repeats scalars for the
+        n joints.
         """
         if self.model is None:
             object.__setattr__(self, "model", self.plant)
@@ -255,7 +255,7 @@ def _check_region(name: str, region: regions.Region, robot: Robot) -> None:
     except Exception as error:
         kind = checks.with_article(type(robot).__name__)
         expected = f"a region for a point of {kind} of {robot.n} joints"
-        reason = f"{type(error).__name__}: {checks.line(str(error))}"
+        reason = f"{type(error).__name__}: {checks.one_line(str(error))}"
         raise checks.fail(name, region, expected, reason) from error
 
 
@@ -283,7 +283,7 @@ def with_parts(scenario: Scenario, **parts: Any) -> Scenario:
         that differ in their number of joints.
     """
     if not isinstance(scenario, Scenario):
-        raise checks.fail("scenario", scenario, "a Scenario", MAKE_ONE)
+        raise checks.fail("scenario", scenario, "a Scenario", HOW_TO_MAKE)
     names = ("robot", *(field.name for field in dataclasses.fields(Scenario)))
     for name in parts:
         if name not in names:
@@ -361,13 +361,13 @@ NUMBERS = (jax.Array, np.ndarray, np.generic, float, int)
 """Types of leaves."""
 
 
-def check_values(part: Any, path: str = "") -> None:
+def check_leaves(part: Any, path: str = "") -> None:
     """Raises ValueError for the first concrete leaf that is not finite or has the wrong sign, with
     its path.
     """
     if isinstance(part, tuple):
         for i, x in enumerate(part):
-            check_values(x, f"{path}[{i}]")
+            check_leaves(x, f"{path}[{i}]")
         return
     if not dataclasses.is_dataclass(part) or isinstance(part, type):
         return
@@ -380,7 +380,7 @@ def check_values(part: Any, path: str = "") -> None:
         if isinstance(value, NUMBERS):
             checks.check_values(name, value, field.metadata.get("sign"))
         else:
-            check_values(value, name)
+            check_leaves(value, name)
 
 
 def canonical(scenario: Scenario) -> Scenario:
@@ -393,9 +393,9 @@ def canonical(scenario: Scenario) -> Scenario:
         the field, the value and the remedy.
     """
     if not isinstance(scenario, Scenario):
-        raise checks.fail("scenario", scenario, "a Scenario", MAKE_ONE)
+        raise checks.fail("scenario", scenario, "a Scenario", HOW_TO_MAKE)
     keep_programs()
-    check_values(scenario)
+    check_leaves(scenario)
     scenario = _with_sufficient_queue(scenario)
     dtype = _shared_dtype(scenario)
     scenario = jax.tree.map(lambda x: _typed(x, dtype), scenario)
@@ -421,7 +421,7 @@ def _with_sufficient_queue(scenario: Scenario) -> Scenario:
 
 
 def _advice(scenario: Scenario) -> list[str]:
-    """The warnings of the parts about their numbers."""
+    """The warnings of the parts about their parameter values."""
     advice = law_member(scenario.controller, "advice")()
     advice = advice + observer_member(scenario.observer, "advice")()
     if scenario.sampling is not None:
@@ -477,7 +477,7 @@ def check_step(scenario: Scenario, dt: float) -> None:
 # --- checks of the start -------------------------------------------------------------------------
 
 
-class _Start(NamedTuple):
+class _InitialValues(NamedTuple):
     """Reference, bounds and margins at t = 0."""
 
     q_d: Any
@@ -489,13 +489,14 @@ class _Start(NamedTuple):
 
 
 @jax.jit
-def _at_start(scenario: Scenario) -> _Start:
-    """Reference and bounds at the start. Shapes are checked while this is traced, once per
+def _initial_values(scenario: Scenario) -> _InitialValues:
+    """The values at the start. Their shapes are checked while this is traced, once per
     structure.
     """
     n, q, dq = scenario.n, scenario.initial.q, scenario.initial.dq
     t, plant, model = jnp.zeros((), q.dtype), scenario.plant, scenario.model
-    reference, bounds, of_speeds = scenario.reference, scenario.bounds, scenario.velocity_bounds
+    reference, bounds = scenario.reference, scenario.bounds
+    velocity_bounds = scenario.velocity_bounds
     q_d = _shaped("reference.position(t)", partial(reference.position, t), n)
     lower = _shaped("bounds.lower.at(t, q_d)", partial(bounds.lower.at, t, q_d), n)
     upper = _shaped("bounds.upper.at(t, q_d)", partial(bounds.upper.at, t, q_d), n)
@@ -506,14 +507,14 @@ def _at_start(scenario: Scenario) -> _Start:
     torque = partial(scenario.disturbance.torque, t, q, dq, plant, model)
     _shaped("disturbance.torque(t, q, dq, plant, model)", torque, n)
     speed_limits = None
-    if of_speeds is not None:
-        _shaped("velocity_bounds.lower.at(t, dq_d)", partial(of_speeds.lower.at, t, q_d), n)
-        _shaped("velocity_bounds.upper.at(t, dq_d)", partial(of_speeds.upper.at, t, q_d), n)
-        speed_limits = speed_limits_at(reference, of_speeds, t)
+    if velocity_bounds is not None:
+        _shaped("velocity_bounds.lower.at(t, dq_d)", partial(velocity_bounds.lower.at, t, q_d), n)
+        _shaped("velocity_bounds.upper.at(t, dq_d)", partial(velocity_bounds.upper.at, t, q_d), n)
+        speed_limits = speed_limits_at(reference, velocity_bounds, t)
     margins = q[:0]
     if scenario.regions:
         margins = regions.margins(scenario.regions, plant, q)
-    return _Start(q_d, lower, upper, speed_limits, margins)
+    return _InitialValues(q_d, lower, upper, speed_limits, margins)
 
 
 def _shaped(name: str, call: Callable[[], jax.Array], *shape: int) -> jax.Array:
@@ -533,7 +534,7 @@ def _check_start(scenario: Scenario) -> None:
     """Raises ValueError for a start outside its bounds or too fast, or a mass matrix there that is
     not positive definite.
     """
-    start = jax.tree.map(np.asarray, _at_start(scenario))
+    start = jax.tree.map(np.asarray, _initial_values(scenario))
     q, dq = np.asarray(scenario.initial.q), np.asarray(scenario.initial.dq)
     masses = {
         name: np.asarray(mass_matrix_at(robot, scenario.initial.q))
@@ -549,9 +550,9 @@ def _check_start(scenario: Scenario) -> None:
     remedy = "Move the start or widen the bounds."
     _check_inside("initial.q[{}]", "bounds", q, start.lower, start.upper, remedy)
     if start.speed_limits is not None:
-        slow, fast = start.speed_limits
-        _check_order("velocity_bounds", slow, fast)
-        _check_inside("initial.dq[{}]", "velocity bounds", dq, slow, fast, remedy)
+        slowest, fastest = start.speed_limits
+        _check_order("velocity_bounds", slowest, fastest)
+        _check_inside("initial.dq[{}]", "velocity bounds", dq, slowest, fastest, remedy)
     for region, margin in zip(scenario.regions, start.region_margins, strict=True):
         if not margin > 0:
             point = regions.in_words(region, scenario.plant)
