@@ -25,6 +25,7 @@ Selection: TypeAlias = "tuple[int | str, ...] | None"
 """Indices, names, slices as text, or truth values; None for all joints."""
 
 EXPECTED = "indices, names or a slice of joints, or one truth value for each joint"
+WEIGHTS = "Weights have an argument of their own, weights=."
 SLICE = re.compile(r"(-?\d+)?:(-?\d+)?(?::(-?\d+)?)?")
 """A slice as text."""
 
@@ -58,9 +59,7 @@ def selection(field: str, joints: Any) -> Selection:
             field, joints, EXPECTED, "It decides what is compiled, so it cannot be traced."
         )
     if holds_weights(joints):
-        raise checks.fail(
-            field, joints, EXPECTED, "Weights have an argument of their own, weights=."
-        )
+        raise checks.fail(field, joints, EXPECTED, WEIGHTS)
     entries = _entries(field, joints)
     found = tuple(_entry(field, joints, x) for x in entries)
     if not found:
@@ -136,10 +135,8 @@ def indices(field: str, chosen: Selection, names: Sequence[str]) -> tuple[int, .
         raise checks.fail(field, list(chosen), "at least one joint")
     twice = next((i for i in found if found.count(i) > 1), None)
     if twice is not None:
-        remedy = "Weights have an argument of their own, weights=."
-        raise checks.fail(
-            field, list(chosen), f"each joint once, but it holds joint {twice} twice", remedy
-        )
+        expected = f"each joint once, but it holds joint {twice} twice"
+        raise checks.fail(field, list(chosen), expected, WEIGHTS)
     return tuple(found)
 
 
@@ -147,10 +144,8 @@ def _indices_of(field: str, entry: int | str, names: Sequence[str]) -> list[int]
     n = len(names)
     if isinstance(entry, int):
         if not -n <= entry < n:
-            remedy = "Weights have an argument of their own, weights=."
-            raise checks.fail(
-                field, entry, f"an index from 0 to {n - 1}, as the robot has {n} joints", remedy
-            )
+            expected = f"an index from 0 to {n - 1}, as the robot has {n} joints"
+            raise checks.fail(field, entry, expected, WEIGHTS)
         return [entry % n]
     if entry in names:
         same = [i for i, name in enumerate(names) if name == entry]

@@ -42,29 +42,6 @@ def inner(u: jax.Array, v: jax.Array) -> jax.Array:
     return jnp.sum(u * v)
 
 
-def cholesky(matrix: jax.Array) -> list[list[jax.Array]]:
-    """Lower triangular L with L L^T = matrix, as a list of rows of scalars.
-
-    A matrix that is not positive definite gives NaN, as LAPACK does; the run is then flagged, not
-    stopped.
-    """
-    n = matrix.shape[-1]
-    L: list[list[jax.Array]] = []
-    for i in range(n):
-        row: list[jax.Array] = []
-        for j in range(i + 1):
-            rest = matrix[i, j]
-            other = [*L, row][j]
-            for k in range(j):
-                rest = rest - row[k] * other[k]
-            if i == j:
-                row.append(jnp.sqrt(rest))
-            else:
-                row.append(rest / L[j][j])
-        L.append(row)
-    return L
-
-
 def _factors(matrix: jax.Array) -> tuple[list[list[jax.Array]], list[jax.Array]]:
     """L (rows below its unit diagonal) and 1/D with L D L^T = matrix; NaN where a pivot is not
     positive.

@@ -55,11 +55,11 @@ class Piece(NamedTuple):
     length: jax.Array
     """() [s]."""
     exists: Any
-    """Whether there is such a piece, () bool; True for the first."""
+    """Whether the step has this piece, () bool; True for the first."""
     earliest: Any
     """Time before which no stage is evaluated, () [s]; None in scenarios without jump times."""
     latest: Any
-    """Time after which no stage is evaluated, () [s]; None likewise."""
+    """Time after which no stage is evaluated, () [s]; None in scenarios without jump times."""
     command_arrived: Any
     """Whether the command that arrives within the step has arrived, () bool."""
 
@@ -236,7 +236,7 @@ class DividedStepResult(NamedTuple):
     aux: Any
     """What the function returned besides the rate at the start of the step."""
     parts: list[tuple[jax.Array, list]]
-    """Length [s] of each piece, and the slopes of its stages; 0 where there is no such piece."""
+    """Length [s] of each piece, and the slopes of its stages; 0 for a piece that the step lacks."""
 
 
 def integrate_pieces(

@@ -36,7 +36,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -65,6 +65,10 @@ GOLDEN_RATIO = 0.6180339887498949
 ERROR, RELATIVE = "numerical_error", "relative_numerical_error"
 ACCURACY_UNITS = ((ERROR, "rad"), (RELATIVE, "1"))
 """Name and unit of the accuracy results that every run has beside its metrics."""
+
+
+StepSlopes: TypeAlias = list[tuple[jax.Array, list[LoopState]]]
+"""Length [s] of each piece of a step, and the slopes of its stages."""
 
 
 class Accuracy(NamedTuple):
@@ -168,7 +172,7 @@ def update(
     method: str,
     dt: jax.Array,
     index: jax.Array,
-    pieces: list[tuple[jax.Array, list[LoopState]]],
+    pieces: StepSlopes,
     width: jax.Array,
     sampled: bool = False,
     restarts: Any = None,
@@ -181,7 +185,7 @@ def update(
       method: the integrator.
       dt: time step, () [s].
       index: number of the step, () int.
-      pieces: length [s] of each piece of the step, and the slopes of its stages.
+      pieces: of the step.
       width: of the tube, (n,) [rad].
       sampled: whether the law is sampled.
       restarts: whether a jump lies in this step or in one of those that the differences cover,
@@ -206,7 +210,7 @@ def _update_by_differences(
     table: Tableau,
     dt: jax.Array,
     index: jax.Array,
-    pieces: list[tuple[jax.Array, list[LoopState]]],
+    pieces: StepSlopes,
     width: jax.Array,
     restarts: Any,
 ) -> Accuracy:
@@ -241,7 +245,7 @@ def _update_by_stages(
     accuracy: Accuracy,
     table: Tableau,
     dt: jax.Array,
-    pieces: list[tuple[jax.Array, list[LoopState]]],
+    pieces: StepSlopes,
     width: jax.Array,
     restarts: Any,
 ) -> Accuracy:

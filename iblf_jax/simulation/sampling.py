@@ -58,29 +58,21 @@ class Sampling:
     def check(self) -> None:
         """Raises ValueError for an unknown step of the observer or a queue that is too short."""
         checks.one_of("Sampling.observer", self.observer, OBSERVER_STEPS)
-        concrete, least = checks.is_concrete(self), 0
-        if concrete:
+        name, queue, least = "Sampling.queue", self.queue, 0
+        if checks.is_concrete(self):
             checks.time_span("Sampling.period", self.period)
             checks.time_span("Sampling.delay", self.delay, zero=True)
             least = self.needed
-        if self.queue is None:
-            if not concrete:
-                raise checks.fail(
-                    "Sampling.queue",
-                    None,
-                    "a whole number, where period or delay is traced",
-                    "Such as queue=1.",
-                )
-            object.__setattr__(self, "queue", least)
-        object.__setattr__(
-            self, "queue", checks.positive_integer("Sampling.queue", self.queue, least=0)
-        )
-        if self.queue < least:
-            raise checks.fail(
-                "Sampling.queue",
-                self.queue,
-                f"at least {least}, for a delay of {float(self.delay):g} s",
-            )
+            if queue is None:
+                queue = least
+        if queue is None:
+            expected = "a whole number, where period or delay is traced"
+            raise checks.fail(name, None, expected, "Such as queue=1.")
+        queue = checks.positive_integer(name, queue, least=0)
+        if queue < least:
+            expected = f"at least {least}, for a delay of {float(self.delay):g} s"
+            raise checks.fail(name, queue, expected)
+        object.__setattr__(self, "queue", queue)
 
     @property
     def needed(self) -> int:

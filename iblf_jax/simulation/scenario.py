@@ -1,4 +1,4 @@
-"""A scenario: everything that defines a run except its length and its step.
+"""A scenario: everything that defines a run except its duration and its time step.
 
 The plant (the simulated robot) and the model (the robot that law and observer know) are separate
 objects. By default the model is the plant; give `model`, or perturb leaves of `plant` only, to let
@@ -44,7 +44,7 @@ from iblf_jax.core.status import VELOCITY_LIMIT
 from iblf_jax.core.time import joined, jump_times_of
 from iblf_jax.simulation.sampling import PERIOD_TOLERANCE, Sampling
 from iblf_jax.world import regions
-from iblf_jax.world.bounds import Bounds, speed_limits_at
+from iblf_jax.world.bounds import Bounds, Side, speed_limits_at
 from iblf_jax.world.disturbances import Disturbance, Nothing
 from iblf_jax.world.references import Reference
 from iblf_jax.world.robots import Robot
@@ -79,6 +79,20 @@ PROTOCOLS = {
     "actuator": (Actuator, "iblf_jax.actuators has them; Ideal() for none."),
 }
 """Part of a scenario that a user may write -> its protocol, and the remedy of an error message."""
+CLASSES: dict[str, tuple[Any, str]] = {
+    "initial": (Initial, "an Initial, such as Initial(q=[0.8, 0.8])"),
+    "bounds": (Bounds, "a Bounds, such as Bounds(lower=Constant(0.1), upper=Constant(0.9))"),
+    "velocity_bounds": (
+        Bounds | None,
+        "a Bounds, or None, such as Bounds(lower=Constant(-1.0), upper=Constant(1.0))",
+    ),
+    "sampling": (Sampling | None, "a Sampling, or None, such as ij.Sampling(period=2e-3)"),
+    "regions": (
+        tuple | list,
+        "a tuple of regions, such as (ij.regions.HalfSpace(normal=[0, 1], offset=0.1),)",
+    ),
+}
+"""Class of each other part, and its description in an error message."""
 OPTIONAL_MEMBERS = ("skeleton",)
 """Members of these protocols that a part may lack."""
 
@@ -153,32 +167,10 @@ class Scenario:
 
     def _check_classes(self) -> None:
         """Raises ValueError for a part of the wrong class."""
-        classes: dict[str, tuple[Any, Any, str]] = {
-            "initial": (self.initial, Initial, "an Initial, such as Initial(q=[0.8, 0.8])"),
-            "bounds": (
-                self.bounds,
-                Bounds,
-                "a Bounds, such as Bounds(lower=Constant(0.1), upper=Constant(0.9))",
-            ),
-            "velocity_bounds": (
-                self.velocity_bounds,
-                Bounds | None,
-                "a Bounds, or None, such as Bounds(lower=Constant(-1.0), upper=Constant(1.0))",
-            ),
-            "sampling": (
-                self.sampling,
-                Sampling | None,
-                "a Sampling, or None, such as ij.Sampling(period=2e-3)",
-            ),
-            "regions": (
-                self.regions,
-                tuple | list,
-                "a tuple of regions, such as (ij.regions.HalfSpace(normal=[0, 1], offset=0.1),)",
-            ),
-        }
-        for name, (value, kind, expected) in classes.items():
-            if not isinstance(value, kind):
-                raise checks.fail(f"Scenario.{name}", value, expected)
+        parts = field_values(self)
+        for name, (kind, expected) in CLASSES.items():
+            if not isinstance(parts[name], kind):
+                raise checks.fail(f"Scenario.{name}", parts[name], expected)
 
     def _check_combination(self) -> None:
         """Raises ValueError for parts that do not fit together."""
@@ -495,11 +487,14 @@ def _initial_values(scenario: Scenario) -> _InitialValues:
     """
     n, q, dq = scenario.n, scenario.initial.q, scenario.initial.dq
     t, plant, model = jnp.zeros((), q.dtype), scenario.plant, scenario.model
-    reference, bounds = scenario.reference, scenario.bounds
-    velocity_bounds = scenario.velocity_bounds
+    reference, velocity_bounds = scenario.reference, scenario.velocity_bounds
     q_d = _shaped("reference.position(t)", partial(reference.position, t), n)
-    lower = _shaped("bounds.lower.at(t, q_d)", partial(bounds.lower.at, t, q_d), n)
-    upper = _shaped("bounds.upper.at(t, q_d)", partial(bounds.upper.at, t, q_d), n)
+
+    def limit(name: str, side: Side) -> jax.Array:
+        return _shaped(name, partial(side.at, t, q_d), n)
+
+    lower = limit("bounds.lower.at(t, q_d)", scenario.bounds.lower)
+    upper = limit("bounds.upper.at(t, q_d)", scenario.bounds.upper)
     for name, robot in (("plant", plant), ("model", model)):
         _shaped(f"{name}.mass_matrix(q)", partial(robot.mass_matrix, q), n, n)
         _shaped(f"{name}.coriolis(q, v, u)", partial(robot.coriolis, q, dq, dq), n)
@@ -508,8 +503,8 @@ def _initial_values(scenario: Scenario) -> _InitialValues:
     _shaped("disturbance.torque(t, q, dq, plant, model)", torque, n)
     speed_limits = None
     if velocity_bounds is not None:
-        _shaped("velocity_bounds.lower.at(t, dq_d)", partial(velocity_bounds.lower.at, t, q_d), n)
-        _shaped("velocity_bounds.upper.at(t, dq_d)", partial(velocity_bounds.upper.at, t, q_d), n)
+        limit("velocity_bounds.lower.at(t, dq_d)", velocity_bounds.lower)
+        limit("velocity_bounds.upper.at(t, dq_d)", velocity_bounds.upper)
         speed_limits = speed_limits_at(reference, velocity_bounds, t)
     margins = q[:0]
     if scenario.regions:
@@ -536,10 +531,6 @@ def _check_start(scenario: Scenario) -> None:
     """
     start = jax.tree.map(np.asarray, _initial_values(scenario))
     q, dq = np.asarray(scenario.initial.q), np.asarray(scenario.initial.dq)
-    masses = {
-        name: np.asarray(mass_matrix_at(robot, scenario.initial.q))
-        for name, robot in (("plant", scenario.plant), ("model", scenario.model))
-    }
     finite = {"reference": start.q_d, "bounds.lower": start.lower, "bounds.upper": start.upper}
     for name, values in finite.items():
         if not np.all(np.isfinite(values)):
@@ -562,12 +553,13 @@ def _check_start(scenario: Scenario) -> None:
     if not np.all(np.abs(dq) < VELOCITY_LIMIT):
         expected = f"speeds below {VELOCITY_LIMIT:g} rad/s"
         raise checks.fail("initial.dq", dq, expected, "A run that fast counts as diverged.")
-    for name, matrix in masses.items():
+    for name, robot in (("plant", scenario.plant), ("model", scenario.model)):
+        matrix = np.asarray(mass_matrix_at(robot, scenario.initial.q))
         _check_mass_matrix(f"{name}.mass_matrix(initial.q)", matrix)
 
 
 def _check_order(name: str, lower: np.ndarray, upper: np.ndarray) -> None:
-    """Raises ValueError for bounds that leave no room between them at t = 0."""
+    """Raises ValueError where a lower bound is not below its upper bound at t = 0."""
     for i, (low, high) in enumerate(zip(lower, upper, strict=True)):
         if not low < high:
             expected, remedy = "finite lower < upper at t = 0", "Exchange or widen them."
@@ -577,8 +569,8 @@ def _check_order(name: str, lower: np.ndarray, upper: np.ndarray) -> None:
 def _check_inside(
     name: str, bounds: str, values: np.ndarray, lower: np.ndarray, upper: np.ndarray, remedy: str
 ) -> None:
-    """Raises ValueError for a value that is not between its bounds; `{}` in the name stands for the
-    number of the joint.
+    """Raises ValueError for a value that is not between its bounds; `{}` in the name is replaced by
+    the index of the joint.
     """
     for i, (value, low, high) in enumerate(zip(values, lower, upper, strict=True)):
         if not low < value < high:

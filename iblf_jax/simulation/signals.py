@@ -1,4 +1,4 @@
-"""The signals of a closed loop: the only list of their names, units and meanings."""
+"""The signals of a closed loop, with the only list of their names, units and meanings."""
 
 from __future__ import annotations
 
@@ -39,24 +39,19 @@ class Signals:
     disturbance_estimate: Annotated[Array, Recorded("N m", "estimate of the uncertain term")]
     V: Annotated[Array, Recorded("1", "Lyapunov function V2")]
     """Of (3.12), ()."""
-    dq_lower: Annotated[Any, Recorded("rad/s", "lower bound of dq")] = dataclasses.field(
-        default=(), kw_only=True
-    )
+    _: dataclasses.KW_ONLY
+    dq_lower: Annotated[Any, Recorded("rad/s", "lower bound of dq")] = ()
     """`()` where velocities have no bounds."""
-    dq_upper: Annotated[Any, Recorded("rad/s", "upper bound of dq")] = dataclasses.field(
-        default=(), kw_only=True
-    )
-    slack: Annotated[Any, Recorded("rad/s^2", "violation of the safety filter's conditions")] = (
-        dataclasses.field(default=(), kw_only=True)
-    )
+    dq_upper: Annotated[Any, Recorded("rad/s", "upper bound of dq")] = ()
+    slack: Annotated[Any, Recorded("rad/s^2", "violation of the safety filter's conditions")] = ()
     """`()` under laws without a filter."""
     region_margin: Annotated[
         Any, Recorded("m", "distance of the regions' points to their boundaries")
-    ] = dataclasses.field(default=(), kw_only=True)
+    ] = ()
     """One number a region; `()` where there are none."""
     region_slack: Annotated[
         Any, Recorded("m/s^2", "violation of the safety filter's conditions on the regions")
-    ] = dataclasses.field(default=(), kw_only=True)
+    ] = ()
     """`()` without regions or without a filter."""
 
 
@@ -111,5 +106,6 @@ def dimension_names(name: str, shape: tuple[int, ...], joints: int) -> tuple[str
 SIGNALS: dict[str, Recorded] = {
     name: hint.__metadata__[0]
     for name, hint in get_type_hints(Signals, include_extras=True).items()
+    if name != "_"
 }
 """Name of a recorded signal -> its unit and meaning, time first."""

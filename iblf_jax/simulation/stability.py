@@ -265,21 +265,19 @@ def period_map(scenario: Scenario, state: LoopState, derivative: jax.Array) -> j
     law_by_x = derivative[plant : plant + n, x]
     memory_by_x = derivative[plant + n :, x]
     by_plant, by_command = _plant_over_period(sampling, A, B)
-    through_plant = jnp.concatenate([by_plant, jnp.zeros((plant, memory), A.dtype)], axis=1)
-    plant_by_x = through_plant + matmul_in_order(by_command[0], law_by_x)
 
     def zeros(rows: int, columns: int) -> jax.Array:
         return jnp.zeros((rows, columns), A.dtype)
 
-    rows = [
-        jnp.concatenate([plant_by_x, *by_command[1:]], axis=1),
-        jnp.concatenate([memory_by_x, zeros(memory, queue * n)], axis=1),
-    ]
+    def row(*blocks: jax.Array) -> jax.Array:
+        return jnp.concatenate(blocks, axis=1)
+
+    plant_by_x = row(by_plant, zeros(plant, memory)) + matmul_in_order(by_command[0], law_by_x)
+    rows = [row(plant_by_x, *by_command[1:]), row(memory_by_x, zeros(memory, queue * n))]
     if queue:
         older = (queue - 1) * n
-        shift = jnp.eye(older, queue * n, dtype=A.dtype)
-        rows.append(jnp.concatenate([law_by_x, zeros(n, queue * n)], axis=1))
-        rows.append(jnp.concatenate([zeros(older, plant + memory), shift], axis=1))
+        rows.append(row(law_by_x, zeros(n, queue * n)))
+        rows.append(row(zeros(older, plant + memory), jnp.eye(older, queue * n, dtype=A.dtype)))
     return jnp.concatenate(rows)
 
 
