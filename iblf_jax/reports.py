@@ -283,7 +283,7 @@ def report(result: Any, path: str | Path, *, title: str | None = None) -> Path:
     Source: design of this package.
     """
     if title is not None:
-        checks.word("title", title, "a text")
+        checks.string("title", title, "a text")
     path = checks.file_to_write("path", path)
     if path.suffix not in (".html", ".htm"):
         raise checks.fail("path", str(path), 'a file that ends in ".html"')

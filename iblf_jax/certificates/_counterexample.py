@@ -97,7 +97,7 @@ def counterexample(
     starts = checks.positive_integer("starts", starts)
     seed = checks.positive_integer("seed", seed, least=0, most=2**32 - 1)
     cube = bounded(scenario, perturbations, signs=False)
-    checks.fits("starts", starts, 8.0 * 2 * cube.size)
+    checks.fits_memory("starts", starts, 8.0 * 2 * cube.size)
     search = _Search(scenario, cube)
     for point in cube.admissible_points(starts, seed, search.why_unusable):
         search.ascend(point)

@@ -210,16 +210,16 @@ class AdvanceStep:
         """The position after the step; the state, V2 and |f_tilde|^2/2 before it."""
         number = at.steps + index.astype(at.steps.dtype)
         span = discontinuities.Span(number * at.size, (number + 1.0) * at.size, at.size)
-        division = discontinuities.divided(inputs.scenario.jump_times(), span)
-        result = discontinuities.integrated(
+        division = discontinuities.divide_step(inputs.scenario.jump_times(), span)
+        result = discontinuities.integrate_pieces(
             self.method,
             partial(evaluate, inputs.scenario),
             division,
             at.state,
             rolled=form.rolled,
         )
-        f_tilde = result.first.disturbance - result.first.disturbance_estimate
-        energies = (result.first.V, 0.5 * jnp.sum(f_tilde**2))
+        f_tilde = result.aux.disturbance - result.aux.disturbance_estimate
+        energies = (result.aux.V, 0.5 * jnp.sum(f_tilde**2))
         return at._replace(state=result.state), (at.state, energies)
 
 

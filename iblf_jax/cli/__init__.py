@@ -126,7 +126,7 @@ def _warn_once(message: str, shown: set[str]) -> None:
 def complain(message: str, kind: str = "error") -> None:
     """Prints an error or a warning as one line on stderr."""
     text = " ".join(map(_shortened, message.split()))
-    print(f"iblf-jax: {kind}: {checks.line(text, 'message')}", file=sys.stderr)
+    print(f"iblf-jax: {kind}: {checks.one_line(text, 'message')}", file=sys.stderr)
 
 
 def _shortened(word: str) -> str:

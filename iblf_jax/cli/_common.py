@@ -226,7 +226,7 @@ def number(value: Any) -> str:
 def metrics_table(runs: Mapping[str, Rollout]) -> str:
     """Metrics of runs side by side, one column per joint, with units."""
     from iblf_jax.core import tables
-    from iblf_jax.simulation.signals import OF_REGIONS
+    from iblf_jax.simulation.signals import PER_REGION
     from iblf_jax.world.robots import joint_names
 
     first = next(iter(runs.values()))
@@ -237,7 +237,7 @@ def metrics_table(runs: Mapping[str, Rollout]) -> str:
         if name.endswith(("violation_joint", "violation_region")):
             values = [np.where(x < 0, np.nan, x) for x in values]  # -1: no violation
         lines = {name: values}
-        if name in OF_REGIONS:  # one row per region: there can be more regions than joints
+        if name in PER_REGION:  # one row per region: there can be more regions than joints
             lines = {f"{name}[{i}]": [x[i : i + 1] for x in values] for i in range(values[0].size)}
         for label, numbers in lines.items():
             row = [label, unit]

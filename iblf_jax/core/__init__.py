@@ -1,3 +1,3 @@
-"""What everything stands on: components as pytrees, checks, small linear algebra, status flags,
-tables of words, whole files.
+"""Foundations of the package: components as pytrees, checks of arguments, small linear algebra,
+status flags, caches, warnings and tables.
 """

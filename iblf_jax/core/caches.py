@@ -3,12 +3,12 @@
 `CACHE` holds two kinds of entries:
 
 - results of functions that depend on hashable arguments only, such as the structure of a pytree
-  and the shapes of its leaves; `@memoised(size)` keeps them;
+  and the shapes of its leaves; `@memoised(size)` stores them;
 - marks, which record that something happened: a message was shown, a kernel could not be built.
 
-Every function and every topic of marks has a bound of its own, and the entries that were used least
-recently leave first.  All entries can be computed again: `CACHE.clear()` costs time and nothing
-else.  Programs that JAX has compiled are bounded by `core.programs`, the folder on the disk by
+Every function and every topic of marks has its own bound, and the least recently used entries are
+removed first. All entries can be computed again, so `CACHE.clear()` costs only time. The programs
+that JAX has compiled are bounded by `core.programs`, and the folder on the disk is bounded by
 `core.disk_cache`.
 """
 

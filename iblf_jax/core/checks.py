@@ -1,9 +1,9 @@
-"""Host-side checks: each failure is a ValueError that names the field, what came, what was
-expected, and the remedy.
+"""Host-side checks of arguments: each failure is a ValueError that names the field, the value that
+came, what was expected, and the remedy.
 
-Values that JAX is tracing have no number yet; every check passes them by, so the same constructors
-and entry points work under `jit`, `vmap` and `grad`.  What can only be known inside a run is in
-`status`, not here.
+A value that JAX is tracing has no number yet, so every check accepts it; the same constructors and
+entry points therefore work under `jit`, `vmap` and `grad`. Conditions that are known only inside a
+run are flags of `status`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.core.devices import default, platform
+from iblf_jax.core.devices import default_devices, platform
 from iblf_jax.core.optional import has_members, missing_members
 
 F = TypeVar("F", bound=Callable)
@@ -36,8 +36,8 @@ MAX_STEPS = 2**31 - 1
 """Steps are counted in int32 inside the compiled loop."""
 
 LONGEST_TEXT = {"field": 200, "value": 160, "words": 800, "message": 1400}
-"""Characters of an error message's parts, and of all that the command line prints of one: what a
-user typed may be of any length."""
+"""Part of an error message -> its largest number of characters, because a user's input may have any
+length; "message" is all that the command line prints."""
 
 SHORTEST_TIME, LONGEST_TIME = 1e-12, 1e9
 """[s].  No run, step, period or delay of a robot is shorter or longer."""
@@ -52,7 +52,7 @@ MAX_JOINTS = 10_000
 """More than any robot has."""
 
 MAX_DEPTH = 32
-"""Lists inside each other that can be an array."""
+"""Largest depth of nested lists that can be an array."""
 
 
 class Words(str):
@@ -76,8 +76,8 @@ def is_concrete(value: Any) -> bool:
 
 
 def is_deep(value: Any) -> bool:
-    """Whether lists, tuples and dicts are inside each other deeper than any array or file of this
-    package is.
+    """Whether lists, tuples and dicts are nested more deeply than in any array or file of this
+    package.
 
     JAX must not see such a value: it recurses, and the interpreter's recursion counter is wrong
     from then on.
@@ -101,14 +101,14 @@ def _containers(values: Iterable[Any]) -> dict[int, Any]:
 
 
 def flat_enough(name: str, value: Any) -> None:
-    """Raises for lists, tuples and dicts inside each other that JAX must not see."""
+    """Raises for lists, tuples and dicts nested so deeply that JAX must not see them."""
     if is_deep(value):
         raise fail(name, value, f"at most {MAX_DEPTH} lists inside each other")
 
 
-def line(text: str, part: str = "words") -> str:
-    """Text as one line of a message: cut, and without characters that would break the line or
-    cannot be printed.
+def one_line(text: str, part: str = "words") -> str:
+    """Text as one line of a message: shortened, with escape sequences for characters that cannot be
+    printed.
     """
     most = LONGEST_TEXT[part]
     text = re.sub(r"\s*\n\s*", " ", text[: 4 * most])
@@ -139,14 +139,14 @@ def shown(value: Any) -> str:
     except Exception:
         # An integer of thousands of digits, a key, deeply nested lists, a class with a broken repr.
         text = f"an object of class {type(value).__name__}"
-    return line(text, "value")
+    return one_line(text, "value")
 
 
 def fail(field: str, got: Any, expected: str, remedy: str = "") -> ValueError:
     """The one form of error message: field, value, expectation and remedy, in one line."""
-    text = f"{line(field, 'field')}: got {shown(got)}, expected {line(expected)}."
+    text = f"{one_line(field, 'field')}: got {shown(got)}, expected {one_line(expected)}."
     if remedy:
-        text += f" {line(remedy)}"
+        text += f" {one_line(remedy)}"
     return ValueError(text)
 
 
@@ -178,7 +178,7 @@ def with_article(noun: str) -> str:
 class ArgumentError(TypeError, ValueError):
     """Arguments that do not fit a constructor.
 
-    It is a refusal like every other, and the TypeError that Python itself would raise.
+    It is a ValueError like every other refusal, and the TypeError that Python itself would raise.
     """
 
 
@@ -250,14 +250,14 @@ def renamed(**names: str) -> Callable[[F], F]:
     return decorated
 
 
-def inside(where: str | os.PathLike, error: Exception) -> ValueError:
-    """An error in a file, or in a part of one: the same with a name in front."""
+def with_location(where: str | os.PathLike, error: Exception) -> ValueError:
+    """The error with the name of the file, or of the part of a file, in front of its text."""
     if not where:
         return ValueError(str(error))
     name, most = os.fspath(where), LONGEST_TEXT["field"]
     if len(name) > most:  # of a long path the end says more than the beginning
         name = "..." + name[-(most - 3) :]
-    return ValueError(f"{line(name, 'field')}: {error}")
+    return ValueError(f"{one_line(name, 'field')}: {error}")
 
 
 def _is_number_like(value: Any, depth: int = 0) -> bool:
@@ -272,7 +272,7 @@ MAX_AXES = {"scalar": (0, "one number"), "joint": (1, "one number, or one a join
 
 
 def as_leaf(owner: str, field: dataclasses.Field, value: Any) -> Any:
-    """Converts what a person typed for a leaf field to a floating-point array and checks it.
+    """Converts a user's value for a leaf field to a floating-point array and checks it.
 
     A field that was not declared with `leaf` is converted too if it holds numbers, and is otherwise
     returned as it is (it is another component).
@@ -369,9 +369,7 @@ def check_values(name: str, array: Any, sign: str | None) -> None:
 
 
 def structural(owner: str, name: str, value: Any) -> None:
-    """Raises if a static field holds something that cannot be part of a compiled program's
-    identity.
-    """
+    """Raises if the value of a static field is an array or cannot be hashed."""
     try:
         if isinstance(value, jax.Array | np.ndarray):
             raise TypeError("an array")
@@ -390,8 +388,8 @@ def one_of(name: str, value: Any, allowed: Any) -> None:
 def conforms(
     name: str, value: Any, protocol: type, remedy: str = "", optional: tuple[str, ...] = ()
 ) -> None:
-    """Raises unless `value` is an object that JAX can take apart and that has what `protocol` asks
-    for, except `optional`.
+    """Raises unless `value` is an object that JAX can flatten and that has the members of
+    `protocol`, those in `optional` excepted.
     """
     declared = {*vars(protocol), *inspect.get_annotations(protocol)} - {*optional}
     members = sorted(x for x in declared if not x.startswith("_"))
@@ -526,8 +524,8 @@ def positive_integer(name: str, value: Any, *, least: int = 1, most: int | None 
 
 
 class NoSuchEntryError(IndexError, ValueError):
-    """An index that leads nowhere: a refusal like every other, and an IndexError, which Python's
-    own protocols look for.
+    """An index out of range: a ValueError like every other refusal, and the IndexError that
+    Python's protocols expect.
     """
 
 
@@ -547,9 +545,9 @@ def entry(name: str, value: Any, count: int, what: str) -> int:
     return int(value) % count
 
 
-def fits(name: str, count: int, bytes_each: float, remedy: str = "") -> None:
-    """Raises if `count` things of that size are more than this machine's memory holds; says how
-    many it does.
+def fits_memory(name: str, count: int, bytes_each: float, remedy: str = "") -> None:
+    """Raises if `count` objects of that size exceed this machine's memory; the message says how
+    many fit.
     """
     most = int(memory() // max(1, bytes_each))
     if count > most:
@@ -570,7 +568,7 @@ def memory() -> int:
         return 16 * 2**30
 
 
-def flag(name: str, value: Any, optional: bool = False) -> Any:
+def boolean(name: str, value: Any, optional: bool = False) -> Any:
     """True or False (or None, if that may be) from a user's argument, or a ValueError."""
     if value is None and optional:
         return None
@@ -579,7 +577,7 @@ def flag(name: str, value: Any, optional: bool = False) -> Any:
     return bool(value)
 
 
-def word(name: str, value: Any, what: str) -> str:
+def string(name: str, value: Any, what: str) -> str:
     """A string from a user's argument, or a ValueError."""
     if not isinstance(value, str):
         raise fail(name, value, what)
@@ -593,7 +591,7 @@ def mapping(name: str, value: Any, example: str) -> Mapping[str, Any]:
     return value
 
 
-def listed(name: str, value: Any, example: str) -> list[Any]:
+def nonempty_list(name: str, value: Any, example: str) -> list[Any]:
     """The entries of a list or tuple that has some, else a ValueError."""
     if not isinstance(value, list | tuple) or not value:
         raise fail(name, value, f"a list such as {example}")
@@ -603,7 +601,7 @@ def listed(name: str, value: Any, example: str) -> list[Any]:
 def devices(name: str, value: Any) -> list[jax.Device]:
     """A user's devices, all of this process if there are none given, or a ValueError."""
     if value is None:
-        return default()
+        return default_devices()
     is_list = isinstance(value, list | tuple) and len(value) > 0
     if not is_list or not all(isinstance(x, jax.Device) for x in value):
         remedy = "jax.devices() lists them; leave it out for all of them."
@@ -654,15 +652,16 @@ def file_to_read(name: str, value: Any, what: str = "a file") -> Path:
 class UnwritableError(OSError, ValueError):
     """A path at which nothing can be written.
 
-    It is a refusal like every other, and the OSError that programs which write files expect.
+    It is a ValueError like every other refusal, and the OSError that programs which write files
+    expect.
     """
 
 
 class MissingFileError(FileNotFoundError, ValueError):
     """A path at which nothing is, or whose folder does not exist.
 
-    It is a refusal like every other, and the FileNotFoundError that programs which open files
-    expect.
+    It is a ValueError like every other refusal, and the FileNotFoundError that programs which open
+    files expect.
     """
 
 
@@ -697,7 +696,8 @@ def folder_to_write(name: str, value: Any) -> Path:
 def _can_be_written(name: str, path: Path, folder: Path, expected: str) -> None:
     """Raises UnwritableError unless a file can be made in `folder`, which is there.
 
-    It is tried: neither the permissions nor the user's rank say whether a file system is read-only.
+    The function creates a temporary file, because permissions do not show whether a file system is
+    read-only.
     """
     if not folder.is_dir():
         raise UnwritableError(fail(name, str(path), expected, f"{folder} is not a folder."))
@@ -706,14 +706,14 @@ def _can_be_written(name: str, path: Path, folder: Path, expected: str) -> None:
             pass
     except OSError as error:
         if error.errno == errno.ENOSPC:
-            return  # A full disk is no fault of the path; what is written later says so.
+            return  # The path is valid although the disk is full; a later write reports it.
         remedy = f"{folder} cannot be written ({error.strerror}): choose another place."
         raise UnwritableError(fail(name, str(path), expected, remedy)) from None
 
 
 def whole_steps(duration: Any, dt: Any, *, dt_is_free: bool = True) -> int:
-    """The number of steps of size `dt` in `duration`, or a ValueError that says which duration, or
-    which dt if that is free, would do.
+    """The number of steps of size `dt` in `duration`, or a ValueError that proposes a duration, or
+    a dt if that is free.
     """
     duration = positive_number("duration", duration, "s")
     dt = positive_number("dt", dt, "s")
@@ -721,8 +721,7 @@ def whole_steps(duration: Any, dt: Any, *, dt_is_free: bool = True) -> int:
         remedy = "Shorten the run or take a larger dt."
         raise fail("duration", duration, f"at most {MAX_STEPS} steps dt = {dt:g} s", remedy)
     steps = round(duration / dt)
-    # A thousandth of a step is forgiven, so that a duration that has been through float32 is taken
-    # for what it was.
+    # A difference of a thousandth of a step is accepted, as of a duration rounded to float32.
     if steps < 1 or abs(steps * dt - duration) > 1e-3 * dt + 1e-12 * duration:
         near = max(steps, 1)
         remedy = f"Take duration={near * dt:.12g}"
@@ -734,9 +733,9 @@ def whole_steps(duration: Any, dt: Any, *, dt_is_free: bool = True) -> int:
 
 
 def recorded_every(value: Any, steps: int) -> int:
-    """Every how many steps to record, as the compiled loops count it, in int32.
+    """The interval of the recorded samples in steps, as an int32 of the compiled loops.
 
-    Every number past the last step has the same effect: only the first instant is recorded.  A
+    All numbers beyond the last step have the same effect: only the first instant is recorded. A
     number that does not fit in 64 bits is an error.
     """
     return min(positive_integer("record_every", value, most=LARGEST_INTEGER), steps + 1, MAX_STEPS)

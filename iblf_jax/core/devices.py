@@ -1,5 +1,5 @@
-"""What JAX computes on: all devices of this process, or the one that the user has made the default
-(`jax.default_device`).
+"""The devices and threads that computations use: all devices of this process, or the one that the
+user has made the default (`jax.default_device`).
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ MAX_THREADS = 256
 """Largest number of threads of a kernel (`kernels/c/driver.h`)."""
 
 
-def chosen() -> jax.Device | str | None:
+def user_default() -> jax.Device | str | None:
     """The device, or platform, that the user has made the default."""
     return jax.config.jax_default_device  # type: ignore[attr-defined]
 
 
-def default() -> list[jax.Device]:
-    """The devices that are taken where the user names none."""
-    device = chosen()
+def default_devices() -> list[jax.Device]:
+    """The devices that are used where the user names none."""
+    device = user_default()
     if device is None:
         return list(jax.local_devices())
     if isinstance(device, str):
@@ -30,10 +30,10 @@ def default() -> list[jax.Device]:
 
 
 def platform() -> str:
-    """Their platform, as JAX names it: "cpu", "gpu" or "tpu"."""
-    if chosen() is None:
+    """The platform of the default devices, as JAX names it: "cpu", "gpu" or "tpu"."""
+    if user_default() is None:
         return jax.default_backend()
-    return default()[0].platform
+    return default_devices()[0].platform
 
 
 def processors() -> int:

@@ -1,13 +1,14 @@
-"""The user's folder of compiled programs, XLA's and our own kernels, which later processes reuse.
+"""The folder of compiled programs, of XLA and of our own kernels, which later processes reuse.
 
-It is $XDG_CACHE_HOME/iblf_jax, or ~/.cache/iblf_jax, and in it a folder for XLA's by the kind of
-processor.  The first run of a process enables it, unless the user has configured another folder
-of JAX or disabled its cache (JAX_ENABLE_COMPILATION_CACHE=0).  When all entries take more than
-MAX_BYTES, the least recently used ones are removed.  The folder may be deleted at any time.
+It is $XDG_CACHE_HOME/iblf_jax, or ~/.cache/iblf_jax; the programs of XLA have a folder in it for
+each kind of processor. The first run of a process enables JAX's cache there, unless the user
+has configured another folder or disabled the cache (JAX_ENABLE_COMPILATION_CACHE=0). When all
+entries take more than MAX_BYTES, the least recently used ones are removed. The folder may be
+deleted at any time.
 
-JAX does not verify what it loads.  In our folder each of its entries therefore ends in a digest of
-its name and its content: an entry that is damaged, belongs to another program or is not a file is
-removed, and the program is compiled again.
+JAX does not verify what it loads. Each of its entries in our folder therefore ends in a digest of
+the entry's name and content. An entry that is damaged, belongs to another program or is not a file
+is removed, and the program is compiled again.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from iblf_jax.core.caches import memoised
 from iblf_jax.kernels import cpuinfo, directory, processor
 
 MAX_BYTES = 2 * 2**30
-"""Bytes."""
+"""Largest size of all entries together."""
 JAX_SUFFIX = "-cache"
 """Suffix of the names of JAX's entries."""
 SUFFIXES = (JAX_SUFFIX, "-atime", ".so", ".cubin")
@@ -82,7 +83,7 @@ def entry_digest(key: str, image: bytes) -> bytes:
 
 
 def _remove(path: Path) -> None:
-    """Removes what is in the place of a file, a link itself."""
+    """Removes a file or a folder; of a link, the link itself."""
     with contextlib.suppress(OSError):
         if stat.S_ISDIR(path.lstat().st_mode):
             shutil.rmtree(path, ignore_errors=True)
@@ -91,10 +92,10 @@ def _remove(path: Path) -> None:
 
 
 def _verify_entries(folder: Path) -> None:
-    """Has JAX use `VerifiedCache` for its folder.
+    """Makes JAX use `VerifiedCache` for its folder.
 
-    JAX has no public way to hand it a cache.  A release that keeps its own elsewhere is left as it
-    is: its entries are then not verified (`tests/kernels/test_toolchain.py` notices).
+    JAX has no public function to set a cache. A release that keeps its cache elsewhere is not
+    changed; its entries are then not verified, and `tests/kernels/test_toolchain.py` fails.
     """
     try:
         from jax._src import compilation_cache
@@ -129,8 +130,8 @@ def keep_programs() -> None:
             or _reloads_badly()
         ):
             return
-        # XLA's programs hold instructions of the processor, and JAX does not ask which: homes are
-        # shared by machines.
+        # XLA's programs are for one kind of processor, which JAX does not check, and several
+        # machines may share a home folder.
         folder = top / f"xla-{hashlib.sha256(processor().encode()).hexdigest()[:12]}"
         if foreign is None:
             folder.mkdir(mode=0o700, exist_ok=True)
@@ -144,23 +145,23 @@ def keep_programs() -> None:
         config.update("jax_compilation_cache_dir", str(folder))
         config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
         config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-        reset_cache()  # what JAX has compiled before this has made it decide that it keeps nothing
+        reset_cache()  # a program that JAX compiled earlier has made it decide to keep nothing
         _verify_entries(folder)
 
 
 def _reloads_badly() -> bool:
-    """Whether XLA refuses its own programs here, with a line of complaint each
+    """Whether XLA refuses to load its own programs on this processor, with a warning for each
     (github.com/jax-ml/jax/issues/38445).
 
-    It takes "prefer no gather", with which LLVM tunes for the processors that have the bug GDS, for
-    a feature that they lack.
+    LLVM compiles with the tuning option "prefer no gather" for processors with the bug GDS, and XLA
+    mistakes the option for a feature that the processor lacks.
     """
     return any(line.startswith("bugs") and "gds" in line.split() for line in cpuinfo())
 
 
 def _entries(folder: Path) -> list[tuple[os.DirEntry, os.stat_result]]:
-    """What a folder holds and what each is, links themselves; another process may remove some
-    meanwhile.
+    """The entries of a folder with their status, that of the link itself for a link; entries that
+    another process removes meanwhile are left out.
     """
     found = []
     with os.scandir(folder) as entries:
@@ -171,7 +172,7 @@ def _entries(folder: Path) -> list[tuple[os.DirEntry, os.stat_result]]:
 
 
 def _not_ours(folder: Path) -> str | None:
-    """The name of something in a folder that another user owns, or that is a link; None if there is
+    """The name of an entry of a folder that is a link or that another user owns; None if there is
     none.
     """
     return next(

@@ -1,14 +1,13 @@
-"""What an argument `joints=` selects, with one meaning everywhere: indices, names, slices or truth
-values.
+"""Selection of joints: the one meaning of every argument `joints=`.
 
     joints=None             all joints
     joints=[0, 1]           joints 0 and 1; joints=-1 is the last one
     joints="elbow"          by name, as in the robot's file
-    joints=slice(0, 3)      or "0:3" in a file
+    joints=slice(0, 3)      a slice, "0:3" in a file
     joints=[True, False]    one truth value for each joint
 
-A selection is structure, not a number: it is kept as a hashable tuple and becomes indices where the
-robot is known.
+A selection is structure, so it is stored as a hashable tuple; `indices` converts it to indices once
+the robot is known.
 """
 
 from __future__ import annotations
@@ -26,6 +25,7 @@ Selection: TypeAlias = "tuple[int | str, ...] | None"
 """Indices, names, slices as text, or truth values; None for all joints."""
 
 EXPECTED = "indices, names or a slice of joints, or one truth value for each joint"
+WEIGHTS = "Weights have an argument of their own, weights=."
 SLICE = re.compile(r"(-?\d+)?:(-?\d+)?(?::(-?\d+)?)?")
 """A slice as text."""
 
@@ -42,15 +42,15 @@ def holds_weights(joints: Any) -> bool:
 
 
 def selection(field: str, joints: Any) -> Selection:
-    """What a user gave as a hashable tuple, with what needs no robot checked.
+    """A user's selection as a hashable tuple, with all checks that do not need the robot.
 
     Args:
-      field: what messages call it.
+      field: name of the argument, for error messages.
       joints: an index, a name, a slice, a sequence of these, or one truth value for each joint;
         None for all joints.
 
     Raises:
-      ValueError: something else, numbers that are not whole, or nothing.
+      ValueError: another type, numbers that are not integers, or an empty selection.
     """
     if joints is None:
         return None
@@ -59,9 +59,7 @@ def selection(field: str, joints: Any) -> Selection:
             field, joints, EXPECTED, "It decides what is compiled, so it cannot be traced."
         )
     if holds_weights(joints):
-        raise checks.fail(
-            field, joints, EXPECTED, "Weights have an argument of their own, weights=."
-        )
+        raise checks.fail(field, joints, EXPECTED, WEIGHTS)
     entries = _entries(field, joints)
     found = tuple(_entry(field, joints, x) for x in entries)
     if not found:
@@ -117,9 +115,9 @@ def indices(field: str, chosen: Selection, names: Sequence[str]) -> tuple[int, .
     """The joints of a selection, from 0, in the order in which they were given.
 
     Args:
-      field: what messages call it.
-      chosen: what `selection` gave.
-      names: what each of the n joints is called.
+      field: name of the argument, for error messages.
+      chosen: as `selection` returns it.
+      names: of the n joints.
 
     Raises:
       ValueError: a joint that the robot does not have, one that is given twice, or none.
@@ -137,10 +135,8 @@ def indices(field: str, chosen: Selection, names: Sequence[str]) -> tuple[int, .
         raise checks.fail(field, list(chosen), "at least one joint")
     twice = next((i for i in found if found.count(i) > 1), None)
     if twice is not None:
-        remedy = "Weights have an argument of their own, weights=."
-        raise checks.fail(
-            field, list(chosen), f"each joint once, but it holds joint {twice} twice", remedy
-        )
+        expected = f"each joint once, but it holds joint {twice} twice"
+        raise checks.fail(field, list(chosen), expected, WEIGHTS)
     return tuple(found)
 
 
@@ -148,10 +144,8 @@ def _indices_of(field: str, entry: int | str, names: Sequence[str]) -> list[int]
     n = len(names)
     if isinstance(entry, int):
         if not -n <= entry < n:
-            remedy = "Weights have an argument of their own, weights=."
-            raise checks.fail(
-                field, entry, f"an index from 0 to {n - 1}, as the robot has {n} joints", remedy
-            )
+            expected = f"an index from 0 to {n - 1}, as the robot has {n} joints"
+            raise checks.fail(field, entry, expected, WEIGHTS)
         return [entry % n]
     if entry in names:
         same = [i for i, name in enumerate(names) if name == entry]

@@ -22,14 +22,15 @@ def matmul(left: jax.Array, right: jax.Array) -> jax.Array:
 
 
 def matmul_in_order(left: jax.Array, right: jax.Array) -> jax.Array:
-    """The product of two matrices, term by term: XLA orders those of a reduction by the number of
-    runs beside it.
+    """The product of two matrices, summed in the order of the terms.
 
-    Written out, as XLA then goes over the runs once, not once a term: 4,096 runs of seven joints
-    took 0.67 s before and after their steps with a loop, and take 0.33 s so.
+    XLA chooses the order of a reduction by the number of runs in the batch, so its results depend
+    on that number. The sum is written out and not a loop, because XLA then passes over the runs
+    once and not once per term: the work before and after the steps of 4,096 runs of seven joints
+    takes 0.33 s instead of 0.67 s.
     """
-    # The first product is kept apart: of two in one sum a processor may round either, and batches
-    # and lone runs would differ.
+    # The first product is computed on its own. In a sum of two products a processor may round
+    # either one, and a batch would differ from a single run.
     total = jax.lax.optimization_barrier(left[:, :1] * right[0])
     for k in range(1, len(right)):
         total = total + left[:, k, None] * right[k]
@@ -41,35 +42,12 @@ def inner(u: jax.Array, v: jax.Array) -> jax.Array:
     return jnp.sum(u * v)
 
 
-def cholesky(matrix: jax.Array) -> list[list[jax.Array]]:
-    """Lower triangular L with L L^T = matrix, as a list of rows of scalars.
-
-    A matrix that is not positive definite gives NaN, as LAPACK does; the run is then flagged, not
-    stopped.
-    """
-    n = matrix.shape[-1]
-    L: list[list[jax.Array]] = []
-    for i in range(n):
-        row: list[jax.Array] = []
-        for j in range(i + 1):
-            rest = matrix[i, j]
-            other = [*L, row][j]
-            for k in range(j):
-                rest = rest - row[k] * other[k]
-            if i == j:
-                row.append(jnp.sqrt(rest))
-            else:
-                row.append(rest / L[j][j])
-        L.append(row)
-    return L
-
-
 def _factors(matrix: jax.Array) -> tuple[list[list[jax.Array]], list[jax.Array]]:
     """L (rows below its unit diagonal) and 1/D with L D L^T = matrix; NaN where a pivot is not
     positive.
 
-    Without roots, and with one division a row: on a processor that steps many robots at once these
-      cost as much as all the rest.
+    The factors take no root and one division per row. On a processor that steps many robots at
+    once, roots and divisions cost as much as all other operations together.
     """
     lower: list[list[jax.Array]] = []
     scaled: list[list[jax.Array]] = []
@@ -92,11 +70,10 @@ def _factors(matrix: jax.Array) -> tuple[list[list[jax.Array]], list[jax.Array]]
 
 @jax.custom_jvp
 def solve_spd(matrix: jax.Array, rhs: jax.Array) -> jax.Array:
-    """X with matrix x = rhs, for a symmetric positive definite (n, n) matrix and an (n,) right-hand
-    side.
+    """The solution x of matrix x = rhs, (n,), for a symmetric positive definite (n, n) matrix.
 
-    A matrix that is not positive definite gives NaN.  The derivative is that of the equation, dx =
-    matrix^-1 (drhs - dmatrix x), with the same factors.
+    A matrix that is not positive definite gives NaN. The derivative is that of the equation,
+    dx = matrix^-1 (drhs - dmatrix x), with the same factors.
     """
     lower, inverse = _factors(matrix)
     n = len(inverse)
@@ -123,8 +100,8 @@ def _solve_spd_jvp(primals, tangents):
 
 
 def solve(matrix: jax.Array, rhs: jax.Array) -> jax.Array:
-    """X with matrix X = rhs, for any (m, m) matrix and an (m, k) right-hand side, by Gauss and
-    Jordan with pivoting.
+    """The solution X of matrix X = rhs, (m, k), for any (m, m) matrix, by Gauss-Jordan elimination
+    with pivoting.
 
     It is for operations that occur once per run: a loop over the columns compiles quickly, and a
     library call would prevent the run from being compiled as one machine function.

@@ -1,11 +1,11 @@
-"""Warnings of the package: each once in a call of the user's, at the user's line.
+"""Warnings of the package: each is shown once per call of a public function, at the user's line.
 
 `warnings.warn(text, stacklevel=...)` counts frames, and the number of frames between a check and
-the user's line differs between the routes through the package.  A wrong count shows a line of the
-package with its source, and the same text again for every route, because Python takes it for
-another place.  So `warn` looks for the frame of the user, and `each_warning_once` marks a call.
+the user's line depends on the path through the package. With a wrong count Python shows a line of
+the package, and shows the same text again for every path, because it takes each for another place.
+`warn` therefore searches for the frame of the user, and `each_warning_once` marks a call.
 
-Python 3.12 has `skip_file_prefixes` for the first; the package runs on 3.11 too.
+Python 3.12 has `skip_file_prefixes` for this search; the package also runs on 3.11.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ NOT_THE_USER = (
 user."""
 
 _GIVEN: ContextVar[set[str] | None] = ContextVar("iblf_jax_warnings", default=None)
-"""The texts that the current call of the package has warned with; None outside of every call."""
+"""The warnings that the current public call has given; None outside of every such call."""
 _MUTED: ContextVar[type[Warning] | None] = ContextVar("iblf_jax_muted", default=None)
 """The category of warnings that are not shown at present."""
 
@@ -55,7 +55,7 @@ def warn(text: str, category: type[Warning] = UserWarning) -> None:
 def _levels_to_the_user() -> int:
     """How many frames above `warn` the user's line is, as the argument `stacklevel` counts them.
 
-    Where there is no line of a user's, as in the command line, it is more than there are frames.
+    If there is no such line, as in the command line, it is larger than the number of frames.
     """
     level = 1
     frame: FrameType | None = sys._getframe(1)
@@ -67,20 +67,19 @@ def _levels_to_the_user() -> int:
 
 
 def _is_of_the_package(frame: FrameType) -> bool:
-    """Whether a frame is of this package, or of what stands between it and its user."""
+    """Whether a frame belongs to a package or module of `NOT_THE_USER`."""
     return str(frame.f_globals.get("__name__", "")).partition(".")[0] in NOT_THE_USER
 
 
 def _is_skipped(frame: FrameType) -> bool:
-    """Whether `warnings.warn` does not count a frame: one of the machinery of imports."""
+    """Whether `warnings.warn` does not count a frame, being one of the import system."""
     filename = frame.f_code.co_filename
     return "importlib" in filename and "_bootstrap" in filename
 
 
 def each_warning_once(function: F) -> F:
-    """Decorator of a public function: inside of one call of it, each warning is given once.
-
-    What it calls counts too, other public functions included.
+    """Decorator of a public function: one call of it, including the public functions that it calls,
+    gives each warning once.
     """
 
     @functools.wraps(function)
@@ -98,7 +97,7 @@ def each_warning_once(function: F) -> F:
 
 @contextlib.contextmanager
 def muted(category: type[Warning] = Warning) -> Iterator[None]:
-    """Inside, no warning of this category is shown, and none counts as given."""
+    """Context in which no warning of this category is shown, and none counts as given."""
     token = _MUTED.set(category)
     try:
         with warnings.catch_warnings():

@@ -1,4 +1,4 @@
-"""Members of an object by name: optional members of a protocol with their defaults, and groups of
+"""Access to members by name: optional members of a protocol with their defaults, and groups of
 attributes.
 
 Classes that users write may leave out some attributes and methods of a protocol.  Each family

@@ -27,11 +27,11 @@ PRESENTATIONS = {
 
 
 def present(name: str, result: Any, *args: Any, **options: Any) -> Any:
-    """Make one presentation of a result.
+    """Makes one presentation of a result.
 
     Args:
       name: key of `PRESENTATIONS`.
-      result: what is presented.
+      result: the object to present.
       args, options: further arguments of the function.
 
     Returns:

@@ -1,9 +1,9 @@
-"""The end of a process in which XLA is still at work.
+"""Ends a process in which XLA is still compiling.
 
 Ctrl-C while XLA compiles raises KeyboardInterrupt at once, and XLA goes on compiling in threads of
-its own.  When the interpreter then ends, it takes away what these threads work on, and the process
-crashes or hangs.  So the end waits for them; a process that ends by Ctrl-C does not wait, but ends
-by that signal without taking the interpreter down.
+its own. If the interpreter then shuts down, it frees the data of these threads, and the process
+crashes or hangs. `finish` therefore waits for the threads before the interpreter shuts down. A
+process that ends by Ctrl-C does not wait: it ends by that signal without a shutdown.
 """
 
 from __future__ import annotations
@@ -23,18 +23,17 @@ from iblf_jax.kernels import stop_compilers
 
 TASKS = Path("/proc/self/task")
 MAX_WAIT = 300.0
-"""Seconds that the end of a process waits for XLA at most: a compilation takes minutes at the
-worst."""
+"""Longest time that `finish` waits for XLA [s]: a compilation can take minutes."""
 CONFIRMATIONS, CONFIRMATION_INTERVAL = 5, 0.002
-"""Times that threads are looked at before they count as idle, and seconds between: one that waits
-for memory is not running."""
+"""Number of times that no thread may run before all count as idle, and seconds between them: a
+thread that waits for memory is not running."""
 
 
 AT_END.append(stop_compilers)
 
 
 def native_threads_run() -> bool:
-    """Whether a thread that Python has not started is running; False where that is not known."""
+    """Whether a thread that Python did not start is running; False where this is unknown."""
     known = {thread.native_id for thread in threading.enumerate()}
     for _ in range(CONFIRMATIONS):
         if any(_is_running(task) for task in _tasks() if int(task.name) not in known):
@@ -59,7 +58,7 @@ def _is_running(task: Path) -> bool:
 
 
 def finish() -> None:
-    """Waits for XLA, or ends the process here if Ctrl-C ends it."""
+    """Waits for XLA, or ends the process by SIGINT if Ctrl-C has ended the program."""
     end = time.monotonic() + MAX_WAIT
     while native_threads_run() and time.monotonic() < end:
         if getattr(sys, "last_type", None) is KeyboardInterrupt:
@@ -68,7 +67,9 @@ def finish() -> None:
 
 
 def _end_by_interrupt() -> None:
-    """Ends the process as Python ends one by Ctrl-C, without taking the interpreter down."""
+    """Ends the process by SIGINT, as Python does after Ctrl-C, without shutting the interpreter
+    down.
+    """
     for last in AT_END:
         last()
     logging.shutdown()
@@ -80,5 +81,5 @@ def _end_by_interrupt() -> None:
 
 
 def finish_at_exit() -> None:
-    """Has every end of this process go through `finish`, before JAX takes XLA down."""
+    """Registers `finish` to run at the end of this process, before JAX shuts XLA down."""
     atexit.register(finish)

@@ -27,7 +27,7 @@ MAPS_OF_A_PROGRAM = 300
 
 
 def count_maps() -> int:
-    """Memory maps of this process; 0 where that is not known."""
+    """Number of memory maps of this process; 0 where it is unknown."""
     try:
         return MAPS.read_bytes().count(b"\n")
     except OSError:
@@ -35,7 +35,7 @@ def count_maps() -> int:
 
 
 def most_maps() -> int | None:
-    """Memory maps that a process may have; None where there is no such limit."""
+    """Largest number of memory maps of a process; None where there is no such limit."""
     try:
         return int(MAX_MAPS.read_text())
     except (OSError, ValueError):
@@ -43,8 +43,8 @@ def most_maps() -> int | None:
 
 
 class ProgramBound:
-    """Has JAX release all programs once the process has more than `bound` memory maps of the
-    `limit` that it may have.
+    """Makes JAX release all programs when the process has more than `bound` memory maps, of the
+    `limit` that the system allows.
     """
 
     def __init__(self, limit: int, bound: int) -> None:
@@ -53,8 +53,8 @@ class ProgramBound:
         self.released = 0
         """How many times programs were released."""
         self._until_count = 0
-        """Programs to compile before maps are counted: to count ten thousands of them takes as long
-        as a small program."""
+        """Programs to compile before maps are counted again: counting tens of thousands takes as
+        long as compiling a small program."""
         self._lock = threading.Lock()
 
     def __call__(self, event: str, duration_secs: float, **kwargs: str | int) -> None:
@@ -76,7 +76,7 @@ class ProgramBound:
             release_programs()
             self.released += 1
             maps = count_maps()
-            # Where others hold most of the maps, programs are not released after every new one.
+            # Where other code uses most maps, programs must not be released after every new one.
             self.bound = max(self.bound, maps + (self.limit - maps) // 4)
         self._until_count = max((self.bound - maps) // MAPS_OF_A_PROGRAM, 0)
 

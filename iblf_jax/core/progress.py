@@ -21,7 +21,7 @@ def bar(progress: bool | None, total: int, done: int = 0, unit: str = "runs") ->
       done: runs that were there before.
       unit: what is counted.
     """
-    progress = checks.flag("progress", progress, optional=True)
+    progress = checks.boolean("progress", progress, optional=True)
     with warnings.catch_warnings():
         # tqdm warns where a notebook lacks ipywidgets, and falls back to text.
         warnings.simplefilter("ignore")

@@ -114,7 +114,7 @@ def register_component(cls: type[T]) -> type[T]:
     fields = dataclasses.fields(cls)  # type: ignore[arg-type]
     children = tuple(f.name for f in fields if not f.metadata.get("static"))
     structure = tuple(f.name for f in fields if f.metadata.get("static"))
-    # Every call of a compiled function takes its arguments apart here.
+    # Every call of a compiled function flattens its arguments by these getters.
     children_of, structure_of = _getter(children), _getter(structure)
     keys = tuple(map(jax.tree_util.GetAttrKey, children))
 
@@ -157,8 +157,8 @@ def _getter(names: tuple[str, ...]) -> Callable[[Any], tuple]:
 
 
 def layers(part: Any) -> list[Any]:
-    """A component, and what it wraps, outermost first (class attribute `wraps`: the name of the
-    field that holds it).
+    """A component and the components that it wraps, outermost first. The class attribute `wraps`
+    is the name of the field that holds the wrapped component.
     """
     found = [part]
     while field := wrapped_field(found[-1]):
@@ -167,18 +167,18 @@ def layers(part: Any) -> list[Any]:
 
 
 def wrapped_field(part: Any) -> str | None:
-    """The name of the field that holds the component which a component wraps, if it wraps one."""
+    """The name of the field that holds the wrapped component; None if there is none."""
     return component_member(type(part), "wraps")
 
 
 def unwrapped(part: Any) -> Any:
-    """The innermost component of one that wraps another."""
+    """The innermost of the `layers` of a component."""
     return layers(part)[-1]
 
 
 def rewrapped(part: Any, inner: Any) -> Any:
     """`part` with its innermost component replaced by `inner`; `inner` itself if `part` wraps
-    nothing.
+    no component.
     """
     name = wrapped_field(part)
     if not name:

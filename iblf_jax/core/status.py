@@ -19,14 +19,14 @@ class Status(enum.IntFlag):
     BOUND_VIOLATED = 1
     """A joint touched or left its bound."""
     NOT_FINITE = 2
-    """The state ran away (NaN, infinity, a joint faster than VELOCITY_LIMIT, or V is NaN); it
-    was frozen at its last good value."""
+    """The state diverged (NaN, infinity, a joint faster than VELOCITY_LIMIT, or V is NaN); it was
+    frozen at its last valid value."""
     STEP_TOO_LARGE = 4
     """dt is beyond the stability limit of the integrator for the fastest mode of the closed
     loop."""
     INFEASIBLE_REFERENCE = 8
-    """The reference touches or leaves a bound during the run: Assumption 2 fails and no law can
-    keep both."""
+    """The reference touches or leaves a bound during the run. Assumption 2 fails: no law can follow
+    the reference and keep the bound."""
     TORQUE_SATURATED = 16
     """The torque that the law commanded was cut to the actuator's limit."""
     GUARD_ACTIVE = 32
@@ -36,28 +36,28 @@ class Status(enum.IntFlag):
     """A study drew a value that its leaf does not admit (a negative mass, say): the run was not
     made, its metrics are NaN."""
     INACCURATE = 128
-    """The estimated error of the positions is more than 0.5 % of the tube 
+    """The estimated error of the positions is more than 0.5 % of the width of the tube
     (`error_estimate.TOLERANCE`): take a smaller dt."""
     GUARD_STAYED = 256
-    """The guard was active beyond the first instant: there the loop ran with a softer law than the
-    requested one."""
+    """The guard was active after the first instant: there the loop ran with a softer barrier than
+    the requested one."""
 
     SAMPLING_TOO_SLOW = 512
-    """The loop grows from one period to the next (spectral radius above 1) at one of the instants
-    that were looked at: sample faster."""
+    """Deviations of the loop grow from one period to the next (spectral radius above 1) at one of
+    the assessed instants: sample faster."""
 
     VELOCITY_VIOLATED = 1024
     """A joint's velocity touched or left its bound."""
     ALPHA_INFEASIBLE = 2048
-    """The virtual velocity touched or left the velocities' bounds: there no law that follows it can
-    keep them, and nothing is claimed."""
+    """The virtual velocity touched or left the velocity bounds. No law that follows it can keep
+    them there, and the theorem makes no claim."""
 
     FILTER_INFEASIBLE = 4096
-    """A safety filter's conditions had no common torque at some time: the torque broke them by the
-    least slack, which the run records."""
+    """No torque satisfied all conditions of the safety filter at some time: the torque violated
+    them by the least slack, which the run records."""
 
     REGION_VIOLATED = 8192
-    """The tip, or the origin of a joint, left its region or touched the boundary of it."""
+    """The tip, or the origin of a joint, left its region or touched its boundary."""
 
     INFINITE_SLOPE = 16384
     """A run is inaccurate, or its step too large, and a derivative of the loop is infinite or
@@ -66,7 +66,7 @@ class Status(enum.IntFlag):
 
 
 VIOLATED = Status.BOUND_VIOLATED | Status.VELOCITY_VIOLATED | Status.REGION_VIOLATED
-"""The flags of a constraint that was not kept."""
+"""The flags of violated constraints."""
 
 FAILED = (
     VIOLATED
@@ -78,11 +78,11 @@ FAILED = (
 """The flags of a failed run."""
 
 UNTRUSTED = Status.NOT_FINITE | Status.STEP_TOO_LARGE
-"""The flags of a run whose numbers say nothing: no loss and no certificate is made of them."""
+"""The flags of a run whose results are meaningless: no loss and no certificate uses them."""
 
 VELOCITY_LIMIT = 1e4
-"""rad/s (or m/s).  No robot moves so; beyond it a run has diverged, and stopping there keeps every
-number finite in float32, so that neither a batch nor its gradient meets an infinity."""
+"""Speed above which a run counts as diverged [rad/s, or m/s]. No robot is so fast. Stopping there
+keeps every number finite in float32, so a batch and its gradient contain no infinity."""
 
 WORDS = {
     Status.BOUND_VIOLATED: "a bound was violated",
@@ -90,7 +90,7 @@ WORDS = {
     Status.STEP_TOO_LARGE: "the time step is too large for the closed loop",
     Status.INFEASIBLE_REFERENCE: "the reference leaves the bounds",
     Status.TORQUE_SATURATED: "the torque was saturated",
-    Status.GUARD_ACTIVE: "the guard at the wall was active",
+    Status.GUARD_ACTIVE: "the guard at the bound was active",
     Status.INADMISSIBLE_DRAW: "a drawn parameter was inadmissible, so the run was not made",
     Status.INACCURATE: "the positions are inaccurate: the time step is too large",
     Status.GUARD_STAYED: "the guard stayed active beyond the first instant",

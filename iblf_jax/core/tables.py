@@ -18,9 +18,9 @@ def as_text(rows: Sequence[Sequence[str]], left: Collection[int] | None = None) 
     """The rows as lines of text in columns.
 
     Args:
-      rows: cells, as many in each row; the heading is the first.
-      left: numbers of the columns that begin at the left, the others end at the right; None for
-        all.
+      rows: cells, the same number in each row; the first row is the heading.
+      left: indices of the columns that are aligned left; the others are aligned right. None aligns
+        all of them left.
     """
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
 
@@ -38,9 +38,9 @@ def as_html(
     """The rows as an HTML table.
 
     Args:
-      heading: what the columns are called.
+      heading: names of the columns.
       rows: cells.
-      bold: numbers of the rows that stand out.
+      bold: indices of the rows in bold type.
     """
     head = "".join(f"<th>{html.escape(x)}</th>" for x in heading)
     body = []
@@ -84,7 +84,7 @@ def as_script_data(value: Any) -> str:
       JSON in ASCII, with each of `UNSAFE_IN_SCRIPT` written as \uXXXX.
 
     Raises:
-      ValueError: the value holds a NaN or an infinity, which JSON has no word for.
+      ValueError: the value holds a NaN or an infinity, which JSON cannot represent.
 
     Source: the HTML standard, section 4.12.1.3 (restrictions for contents of script elements).
     """

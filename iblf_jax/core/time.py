@@ -1,8 +1,8 @@
-"""Parts of a scenario that change with time: what they are at an instant, and when they jump.
+"""Time-varying parts of a scenario: their values at an instant, and the times at which they jump.
 
-A part that changes with time may have `at(t)`, which returns the part as it is at time t [s].  A
-part that is discontinuous in time declares the instants by `jump_times()`, and steps of a run are
-divided there.  Both methods are optional in every family, but for the `jump_times` of disturbances.
+A time-varying part may have `at(t)`, which returns the part as it is at time t [s]. A part that is
+discontinuous in time declares the instants by `jump_times()`, and steps of a run are divided there.
+Both methods are optional in every family, except for `jump_times` of disturbances.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def as_at(part: T, t: jax.Array) -> T:
 
 
 def no_times(dtype: jax.typing.DTypeLike | None = None) -> jax.Array:
-    """The jump times of what never jumps, (0,) [s]."""
+    """The jump times of a part without jumps, (0,) [s]."""
     return jnp.zeros((0,), dtype)
 
 
@@ -47,7 +47,7 @@ def jump_times_of(name: str, part: Any, dtype: jax.typing.DTypeLike | None = Non
     try:
         times = jnp.asarray(part.jump_times(), dtype)
     except Exception as error:
-        got = f"{type(error).__name__}: {checks.line(str(error))}"
+        got = f"{type(error).__name__}: {checks.one_line(str(error))}"
         remedy = (
             "Their number may not depend on the numbers of the fields; return jnp.zeros(0) for"
             " none."

@@ -108,7 +108,7 @@ def cosimulate(
         checks.one_of("integrator", integrator, INTEGRATORS)
     check_single(scenario)
     scenario = canonical(with_period(scenario, period))
-    seed, throw = checks.seed(seed), checks.flag("throw", throw)
+    seed, throw = checks.seed(seed), checks.boolean("throw", throw)
     names = tuple(robot_member(scenario.plant, "joints"))
     if locked is None:
         locked = {}

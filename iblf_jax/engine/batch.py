@@ -29,7 +29,7 @@ from iblf_jax.simulation import error_estimate
 from iblf_jax.simulation.closed_loop import initial_state, perturbed_state
 from iblf_jax.simulation.noise import NOISE_NAME
 from iblf_jax.simulation.paths import with_parameters
-from iblf_jax.simulation.stability import resolved
+from iblf_jax.simulation.stability import resolved_jacobian
 
 
 class Leaves(NamedTuple):
@@ -206,7 +206,7 @@ def initialize(loop: StepLoop, batch: Batch, method: str) -> tuple[Carry, Linear
 
     def of_run(inputs, at_start):
         is_sampled = inputs.scenario.sampling is not None
-        return start(inputs, method, resolved(at_start.jacobian, is_sampled))
+        return start(inputs, method, resolved_jacobian(at_start.jacobian, is_sampled))
 
     return batch.map_runs(of_run, at_start), at_start
 

@@ -96,7 +96,9 @@ def start(inputs: Inputs, method: str, jacobian: jax.Array) -> Carry:
     blank = begun(inputs.folds, _blank_sample(inputs, state))
     constant, jacobian = jax.lax.stop_gradient((state, jacobian))
     if inputs.scenario.sampling is not None:
-        jacobian = stability.per_time(jax.lax.stop_gradient(inputs.scenario), constant, jacobian)
+        jacobian = stability.period_map_as_rate(
+            jax.lax.stop_gradient(inputs.scenario), constant, jacobian
+        )
     estimate = error_estimate.begin(method, jacobian, constant)
     return Carry(
         state,

@@ -33,7 +33,7 @@ from iblf_jax.engine.time_step import Advanced, TimeStep, samples_of_step
 from iblf_jax.simulation import error_estimate
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
 
-ACCURACY = tuple(name for name, _ in error_estimate.UNITS)
+ACCURACY = tuple(name for name, _ in error_estimate.ACCURACY_UNITS)
 """Metrics whose derivatives are zero."""
 Places = tuple[tuple[int, ...], ...]
 """For each order of a derivative, the indices of the leaves by which it is taken."""

@@ -335,7 +335,7 @@ def run_with_tangents(
     def at_end(inputs, before):
         def metrics(scenario, carry, eps):
             found: dict[str, jax.Array] = dict.fromkeys(
-                (name for name, _ in error_estimate.UNITS), jnp.zeros_like(inputs.dt)
+                (name for name, _ in error_estimate.ACCURACY_UNITS), jnp.zeros_like(inputs.dt)
             )
             found[error_estimate.ERROR] = jnp.zeros_like(carry.accuracy.error)
             results = finished(inputs.folds, carry.accumulators).items()

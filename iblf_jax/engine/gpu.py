@@ -17,7 +17,7 @@ def architecture() -> str:
     Raises:
       ToolchainError: the default devices are not GPUs that NVRTC supports, or they differ.
     """
-    default_devices = devices.default()
+    default_devices = devices.default_devices()
     try:
         found = {device.compute_capability for device in default_devices}
     except AttributeError:  # no GPUs
@@ -76,7 +76,9 @@ def run(
     """All steps of all runs; arguments and results as `native.run`."""
     name = cuda.kernel(program, shared.size, per_run.shape[0], architecture())
     # The CPU devices of the tests have no attribute core_count.
-    processors = getattr(devices.default()[0], "core_count", thresholds.DEFAULT_MULTIPROCESSORS)
+    processors = getattr(
+        devices.default_devices()[0], "core_count", thresholds.DEFAULT_MULTIPROCESSORS
+    )
     threads = thresholds.gpu_threads(carry.floats.shape[1], processors)
     return call(name, program, shared, per_run, carry, steps, every, threads)
 

@@ -34,11 +34,11 @@ class Linearization(NamedTuple):
     time: jax.Array
     state: jax.Array
     """(m,)."""
-    growth: stability.Growth
+    growth: stability.PowerIteration
     """Of the power iteration."""
     jacobian: jax.Array
     """By the numbers that `accuracy` watches, by differences of three sizes, (3, m', m') [1/s];
-    `stability.resolved` makes one of them."""
+    `stability.resolved_jacobian` makes one of them."""
     unresolved: error_estimate.UnresolvedSignals
     """Of the run; its torque is turned into what it accelerates, as that takes the robot's mass
     matrix."""
@@ -87,14 +87,18 @@ class LinearizationStep:
             len(watched) < x.size
         ):  # a power iteration follows, across infinite slopes by the widest differences
             widest |= (iteration >= 0) & jnp.any(
-                stability.is_steep(carry.jacobian, inputs.scenario.sampling is not None)
+                stability.has_infinite_derivative(
+                    carry.jacobian, inputs.scenario.sampling is not None
+                )
             )
         size = jnp.where(
             widest, sizes[2], jnp.where((level == 1) & (iteration < 0), sizes[1], sizes[0])
         )
         w, growth = stability.directional_derivative(rate_at, x, direction, size), carry.growth
         if len(watched) < x.size:
-            growth = keep_if(iteration < 0, growth, stability.grown(growth, w, iteration))
+            growth = keep_if(
+                iteration < 0, growth, stability.power_iteration_step(growth, w, iteration)
+            )
         columns = jnp.arange(watched.size, dtype=index.dtype) == number
         chosen = (jnp.arange(3, dtype=index.dtype) == level)[:, None, None] & columns
         jacobian = jnp.where(chosen, jnp.stack([w[i] for i in watched])[:, None], carry.jacobian)
@@ -117,13 +121,13 @@ def linearization_steps(scenario: Scenario) -> int:
 
 def fastest_mode(scenario: Scenario, found: Linearization) -> jax.Array:
     """The mode that a `LinearizationStep` has found, () [1/s]: of what a step integrates."""
-    jacobian = stability.resolved(found.jacobian, scenario.sampling is not None)
+    jacobian = stability.resolved_jacobian(found.jacobian, scenario.sampling is not None)
     if scenario.sampling is not None:
         size = ravel_pytree(integrated_part(initial_state(scenario)))[0].size
-        return stability.growth_rate_by(jacobian[:size, :size])
+        return stability.growth_rate_of_matrix(jacobian[:size, :size])
     is_complete = len(jacobian) == found.state.size
     if is_complete:
-        return stability.growth_rate_by(jacobian)
+        return stability.growth_rate_of_matrix(jacobian)
     return stability.growth_rate(found.growth)
 
 
@@ -138,7 +142,7 @@ def linearization_at(
         Linearization(
             time,
             x,
-            stability.growth_start(x),
+            stability.power_iteration_start(x),
             jnp.zeros((3, watched, watched), x.dtype),
             unresolved,
         )

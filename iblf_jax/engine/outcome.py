@@ -47,16 +47,16 @@ def outcome_of(
     status = carry.status | flag(inputs.dt * mode > limit, Status.STEP_TOO_LARGE)
     # A column is at least as long as the mode that it alone would make.
     steepest = jnp.sum(jnp.abs(instants.jacobian[:, 0]), axis=-2)
-    steep = stability.is_steep(instants.jacobian, inputs.scenario.sampling is not None) & (
-        inputs.dt * steepest > limit
-    )
+    steep = stability.has_infinite_derivative(
+        instants.jacobian, inputs.scenario.sampling is not None
+    ) & (inputs.dt * steepest > limit)
     status |= flag(~(estimate.relative <= error_estimate.TOLERANCE), Status.INACCURATE)
     suffers = status & int(Status.STEP_TOO_LARGE | Status.INACCURATE) != 0
     status |= flag(jnp.any(steep) & suffers, Status.INFINITE_SLOPE)
     metrics = error_estimate.results(estimate)
     if inputs.scenario.sampling is not None:
         maps = jax.vmap(partial(stability.period_map, inputs.scenario, carry.state))(
-            stability.resolved(instants.jacobian, sampled=True)
+            stability.resolved_jacobian(instants.jacobian, sampled=True)
         )
         radii = jax.lax.stop_gradient(jax.vmap(stability.spectral_radius)(maps))
         metrics[stability.RADIUS] = jnp.max(jnp.where(jnp.isfinite(radii), radii, 0.0))

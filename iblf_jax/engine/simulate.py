@@ -79,7 +79,7 @@ def simulate(
     """
     steps = checks.whole_steps(duration, dt)
     every = _checked_record(record_every, steps)
-    throw = checks.flag("throw", throw)
+    throw = checks.boolean("throw", throw)
     seed = checks.seed(seed)
     scenario = canonical(scenario)
     check_step(scenario, dt)

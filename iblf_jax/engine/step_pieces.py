@@ -57,7 +57,7 @@ def step_times(inputs: Inputs, index: jax.Array, method: str, arrivals: tuple | 
       index: number of the instant, () int.
       method: the integrator.
       arrivals: when commands arrive in this step and in the one before, as
-        `discontinuities.divided` takes them; None where none can.
+        `discontinuities.divide_step` takes them; None where none can.
     """
     times, dt, number = inputs.scenario.jump_times(), inputs.dt, index.astype(inputs.dt.dtype)
     start = number * dt
@@ -70,13 +70,13 @@ def step_times(inputs: Inputs, index: jax.Array, method: str, arrivals: tuple | 
         here, last = arrivals
     before = discontinuities.Span((number - 1.0) * dt, start, dt)
     behind = jnp.where(
-        index > 0, discontinuities.since_last(times, before, last), jnp.zeros_like(dt)
+        index > 0, discontinuities.last_piece_length(times, before, last), jnp.zeros_like(dt)
     )
     restarts = None
     if times.size and inputs.scenario.sampling is None:
         reach = error_estimate.steps_back(method)
-        restarts = discontinuities.within(times, (number - reach) * dt, span.end)
-    return StepTimes(span, discontinuities.divided(times, span, here), behind, restarts)
+        restarts = discontinuities.has_jump(times, (number - reach) * dt, span.end)
+    return StepTimes(span, discontinuities.divide_step(times, span, here), behind, restarts)
 
 
 class LoopAlongStep(NamedTuple):
@@ -95,10 +95,10 @@ class LoopAlongStep(NamedTuple):
     ) -> tuple[LoopState, Sample]:
         """Rate and sample within a piece of the step."""
         torque = self.torques
-        if torque and isinstance(piece.arrived, bool):
-            torque = (torque[int(piece.arrived)],)
+        if torque and isinstance(piece.command_arrived, bool):
+            torque = (torque[int(piece.command_arrived)],)
         elif torque:
-            torque = (jnp.where(piece.arrived, torque[1], torque[0]),)
+            torque = (jnp.where(piece.command_arrived, torque[1], torque[0]),)
         return self.evaluate(
             self.inputs.scenario,
             discontinuities.stage_time(piece, t),
@@ -114,7 +114,7 @@ def integrated(
     moved: LoopState,
     method: str,
     options: StepOptions,
-) -> integrators.Stepped:
+) -> integrators.StepResult:
     """One step of the integrator over a piece."""
     return integrators.step(
         method,
@@ -131,10 +131,10 @@ def across_jumps(
     piece: discontinuities.Piece,
     before: LoopState,
     method: str,
-    stepped: integrators.Stepped,
+    stepped: integrators.StepResult,
     begun: tuple,
     accumulators: tuple,
-) -> tuple[integrators.Stepped, tuple]:
+) -> tuple[integrators.StepResult, tuple]:
     """A piece of a step and the accumulators, with their derivatives across jumps of the command;
     values are unchanged.
 
@@ -186,7 +186,7 @@ class LaterPieces(NamedTuple):
 def later_pieces(
     along: LoopAlongStep,
     pieces: tuple[discontinuities.Piece, ...],
-    stepped: integrators.Stepped,
+    stepped: integrators.StepResult,
     accumulators: tuple,
     method: str,
     options: StepOptions,
@@ -213,7 +213,7 @@ def later_pieces(
             made = integrated(
                 along, piece, moved, method, options._replace(rolled=not options.scalar)
             )
-            right = weighed(made.first, piece.begin, 0.5 * piece.length, none)
+            right = weighed(made.aux, piece.begin, 0.5 * piece.length, none)
             accumulators = ()
             if folds:
                 accumulators = updated(folds, between, right)
@@ -230,13 +230,13 @@ def later_pieces(
 
         before = accumulators
         (moved, accumulators, status), (slopes, left, between, right) = run_if(
-            piece.made, further, (moved, accumulators, status)
+            piece.exists, further, (moved, accumulators, status)
         )
         parts.append((piece.length, slopes))
         if folds:
             metric_samples += [
-                MetricSample(before, left, piece.made),
-                MetricSample(between, right, piece.made),
+                MetricSample(before, left, piece.exists),
+                MetricSample(between, right, piece.exists),
             ]
     return LaterPieces(moved, accumulators, parts, tuple(metric_samples), status)
 

@@ -128,24 +128,24 @@ def _one_step(scenario: Scenario, times: jax.Array, dt: jax.Array, pair: Pair, m
         is_coarse, h = cut[1] - cut[0] == 1.0, (cut[1] - cut[0]) * dt
         x = jnp.where(is_coarse, coarse, fine)
         end_of_part = jnp.where(cut[1] == 1.0, end, begin + cut[1] * dt)
-        division = discontinuities.divided(
+        division = discontinuities.divide_step(
             times, discontinuities.Span(begin + cut[0] * dt, end_of_part, h)
         )
-        stepped = discontinuities.integrated(
+        stepped = discontinuities.integrate_pieces(
             method, partial(evaluate, scenario), division, as_state(x), rolled=True
         )
-        new, sample = ravel_pytree(stepped.state)[0], stepped.first
-        seen = (stepped.parts, sample.upper - sample.lower, sample.xi, division.overfull)
+        new, sample = ravel_pytree(stepped.state)[0], stepped.aux
+        seen = (stepped.parts, sample.upper - sample.lower, sample.xi, division.too_many_jumps)
         return (jnp.where(is_coarse, new, coarse), jnp.where(is_coarse, fine, new)), seen
 
     (coarse, fine), seen = jax.lax.scan(
         part, (pair.coarse, pair.fine), jnp.asarray(INTERVALS, dt.dtype)
     )
-    parts, width, _, overfull = jax.tree.map(lambda x: x[0], seen)
+    parts, width, _, too_many_jumps = jax.tree.map(lambda x: x[0], seen)
     xi_of_fine = seen[2][1]
     restarts = None
     if times.size:
-        restarts = discontinuities.within(
+        restarts = discontinuities.has_jump(
             times, (number - error_estimate.steps_back(method)) * dt, end
         )
     estimate = error_estimate.update(
@@ -156,7 +156,7 @@ def _one_step(scenario: Scenario, times: jax.Array, dt: jax.Array, pair: Pair, m
         parts,
         width,
         restarts=restarts,
-        overfull=overfull,
+        too_many_jumps=too_many_jumps,
     )
     near = jnp.max(jnp.abs(xi_of_fine))
     nearest = jax.tree.map(

@@ -52,13 +52,13 @@ def sampled_start(
     due = (now.phase == 0) & (index > 0)
     t = index.astype(dt.dtype) * dt
     state = run_sampled_law_if_due(scenario, t, carry.state, now, inputs.noise)
-    arriving = sampling.arriving(scenario.sampling, dt, now, state.sampled.commands)
+    torques = sampling.step_torques(scenario.sampling, dt, now, state.sampled.commands)
     before = sampling.arrival_before(scenario.sampling, dt, now)
     arrivals = None
     if before is not None:
-        arrivals = ((arriving.place * dt, arriving.changes), before)
+        arrivals = ((torques.arrival * dt, torques.arrives), before)
     times = step_times(inputs, index, method, arrivals)
-    along = LoopAlongStep(evaluated, inputs, state, (arriving.torque, arriving.next))
+    along = LoopAlongStep(evaluated, inputs, state, (torques.torque, torques.next))
     accumulators, metric_samples = _before_sample(along, carry, due, times)
     behind = jnp.where(due, jnp.zeros_like(dt), times.behind)
     return StepStart(along, times._replace(behind=behind), accumulators, metric_samples)

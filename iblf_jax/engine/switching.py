@@ -42,7 +42,7 @@ import jax.numpy as jnp
 
 from iblf_jax.control.controllers._base import switching_functions
 from iblf_jax.simulation.closed_loop import LoopState
-from iblf_jax.simulation.integrators import Stepped, stage_states, tableau
+from iblf_jax.simulation.integrators import StepResult, stage_states, tableau
 from iblf_jax.simulation.scenario import Scenario
 
 SURFACE_CLEARANCE = 1e-4
@@ -148,7 +148,7 @@ def with_hybrid_derivative(
     t: jax.Array,
     before: LoopState,
     dt: jax.Array,
-    stepped: Stepped,
+    stepped: StepResult,
     sums: list[jax.Array],
 ) -> tuple[LoopState, list[jax.Array]]:
     """The state after a step and the accumulators, unchanged in value, with the derivatives of the
@@ -174,7 +174,7 @@ def with_hybrid_derivative(
         return _in_pieces(loop, t, before, dt, after, stepped.slopes[0], gains, signs)
 
     after = stepped.state, sums
-    gains = loop.gains_of(stepped.first)
+    gains = loop.gains_of(stepped.aux)
     reached = jnp.any(signs.changed | signs.touched)
     return _with_derivative_of(after, jax.lax.cond(reached, in_pieces, lambda same: same, after))
 
@@ -185,7 +185,7 @@ def _touched(
     t: jax.Array,
     before: LoopState,
     dt: jax.Array,
-    stepped: Stepped,
+    stepped: StepResult,
     above: jax.Array,
 ) -> jax.Array:
     """Whether a stage of the integrator lies on the other side of each surface than the start of

@@ -109,9 +109,9 @@ def advance(
     state = along.state
     first = times.division.pieces[0]
     stepped = integrated(along, first, integrated_part(state), method, options)
-    ahead = jnp.where(times.span.counts, first.length, jnp.zeros_like(inputs.dt))
+    ahead = jnp.where(times.span.in_run, first.length, jnp.zeros_like(inputs.dt))
     step = jnp.where(index > 0, inputs.dt, jnp.zeros_like(inputs.dt))
-    sample = weighed(stepped.first, times.span.start, 0.5 * (times.behind + ahead), step)
+    sample = weighed(stepped.aux, times.span.start, 0.5 * (times.behind + ahead), step)
     begun, accumulators = options.piece(_observed)(inputs, index, start.accumulators, sample)
     if inputs.scenario.sampling is None:
         stepped, accumulators = across_jumps(
@@ -127,9 +127,9 @@ def advance(
         parts,
         (with_integrated_part(state, later.moved), later.status),
         state,
-        times.span.counts,
+        times.span.in_run,
         times.restarts,
-        times.division.overfull,
+        times.division.too_many_jumps,
     )
     metric_samples = (
         MetricSample(begun, sample, True),
@@ -160,7 +160,7 @@ def _concluded(
     before: LoopState,
     goes_on: jax.Array,
     restarts: Any,
-    overfull: Any,
+    too_many_jumps: Any,
 ) -> tuple[LoopState, jax.Array, Nearest, error_estimate.Accuracy]:
     """State, status, nearest instant and accuracy after a step; a state that diverges is frozen.
 
@@ -173,7 +173,7 @@ def _concluded(
       later: the state at the end of the step, and the flags raised within it.
       before: the state at its start.
       goes_on: whether the step is made, () bool.
-      restarts, overfull: of `StepTimes` and its division.
+      restarts, too_many_jumps: of `StepTimes` and its division.
     """
     near = jnp.max(jnp.abs(jax.lax.stop_gradient(sample.xi)))
     here = Nearest(near, sample.t, jax.lax.stop_gradient(perturbed_state(before)))
@@ -181,7 +181,7 @@ def _concluded(
     is_sampled = inputs.scenario.sampling is not None
     width = sample.upper - sample.lower
     estimate = error_estimate.update(
-        carry.accuracy, method, inputs.dt, index, parts, width, is_sampled, restarts, overfull
+        carry.accuracy, method, inputs.dt, index, parts, width, is_sampled, restarts, too_many_jumps
     )
     after, raised = later
     status = carry.status | sample_status(sample)

@@ -60,7 +60,7 @@ def load_identification_file(path: str | os.PathLike) -> dict[str, Any]:
             options[name] = {key: _pair(x, f"{name}.{key}") for key, x in given.items()}
         log = _logs(table.get("log", Words("nothing")), "identify.log", folder)
     except ValueError as error:
-        raise checks.inside(source, error) from error
+        raise checks.with_location(source, error) from error
     return {"scenario": file.scenario, "log": log, "paths": table["parameters"], **options}
 
 
@@ -76,7 +76,7 @@ def _logs(given: Any, key: str, folder: Path) -> list[Path]:
     found = []
     for name in names:
         text = None if isinstance(name, Words) else name
-        found.append(folder / checks.word(key, text, "the path of a .csv or .nc file"))
+        found.append(folder / checks.string(key, text, "the path of a .csv or .nc file"))
     return found
 
 

@@ -94,4 +94,4 @@ def _robot(table: Any, name: str, folder: str | os.PathLike) -> Robot:
     try:
         return load(os.path.join(folder, table["file"]), **options)
     except (ValueError, ImportError) as error:
-        raise checks.inside(f"{name}.file", error) from error
+        raise checks.with_location(f"{name}.file", error) from error

@@ -36,7 +36,7 @@ from iblf_jax.files.scenario import scenario_to_toml
 from iblf_jax.files.values import Words
 from iblf_jax.simulation.paths import parameters
 from iblf_jax.simulation.results import Rollout
-from iblf_jax.simulation.signals import SIGNALS, own_dims
+from iblf_jax.simulation.signals import SIGNALS, dimension_names
 
 if TYPE_CHECKING:
     import xarray
@@ -81,7 +81,7 @@ def rollout_to_xarray(run: Rollout) -> xarray.Dataset:
     batch = _batch_dims(run)
     variables = _trajectories(run, batch)
     for name, value in run.metrics.items():
-        dims = (*batch, *own_dims(name, np.shape(value)[len(batch) :], run.n))
+        dims = (*batch, *dimension_names(name, np.shape(value)[len(batch) :], run.n))
         label = f"metric_{name}" if name in variables else name
         unit = run.metrics.units.get(name, "1")
         attrs = _attrs(unit, f"metric {name.replace('_', ' ')}")
@@ -183,7 +183,7 @@ def _trajectories(run: Rollout, batch: tuple[str, ...]) -> dict[str, Any]:
     variables = {}
 
     def add(name: str, value: Any, unit: str, description: str) -> None:
-        dims = (*batch, "time", *own_dims(name, np.shape(value)[len(batch) + 1 :], run.n))
+        dims = (*batch, "time", *dimension_names(name, np.shape(value)[len(batch) + 1 :], run.n))
         variables[name] = (dims, np.asarray(value), _attrs(unit, description))
 
     for name, value in attributes(run, SIGNALS).items():
@@ -238,7 +238,7 @@ def _parameters(run: Rollout, batch: tuple[str, ...]) -> tuple[dict[str, Any], d
         if np.all(value == first):
             fixed[p.path] = first.tolist()
         else:
-            dims = (*batch, *own_dims(p.path, first.shape, run.n))
+            dims = (*batch, *dimension_names(p.path, first.shape, run.n))
             varying[p.path] = (dims, value, _attrs(p.unit or "1", f"parameter {p.path}"))
     attrs = {
         "parameters": json.dumps(fixed),

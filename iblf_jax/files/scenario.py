@@ -58,7 +58,7 @@ from iblf_jax.files.values import (
 from iblf_jax.presets import PRESETS
 from iblf_jax.simulation.integrators import TABLEAUS
 from iblf_jax.simulation.paths import parameters, with_parameters
-from iblf_jax.simulation.scenario import Scenario, check_values
+from iblf_jax.simulation.scenario import Scenario, check_leaves
 
 COMPONENTS = ("robot", *(field.name for field in dataclasses.fields(Scenario)))
 RUN = ("duration", "dt", "method", "record_every")
@@ -122,8 +122,8 @@ def read_toml(path: str | os.PathLike) -> dict[str, Any]:
     try:
         return toml_tables(content.decode("utf-8"))
     except ValueError as error:  # TOMLDecodeError and UnicodeDecodeError are ValueErrors
-        found = ValueError(f"not a TOML file: {checks.line(str(error))}")
-        raise checks.inside(path, found) from error
+        found = ValueError(f"not a TOML file: {checks.one_line(str(error))}")
+        raise checks.with_location(path, found) from error
 
 
 # --- to tables
@@ -148,7 +148,7 @@ def scenario_to_dict(scenario: Scenario) -> dict[str, Any]:
     if not checks.is_concrete(scenario):
         remedy = "Save it outside of jit, vmap and grad."
         raise checks.fail("scenario", Words("traced values"), "numbers", remedy)
-    check_values(scenario)
+    check_leaves(scenario)
     dtypes = {jnp.result_type(x) for x in jax.tree.leaves(scenario)}
     dtype = dtypes.pop() if len(dtypes) == 1 else jnp.result_type(float)
     scenario = astype(scenario, dtype)
@@ -279,7 +279,7 @@ def from_dict(
         scenario = construct(with_parameters, changes, "parameters")
         return ScenarioFile(scenario, _run_table(data.get("run", {})))
     except ValueError as error:
-        raise checks.inside(source, error) from error
+        raise checks.with_location(source, error) from error
 
 
 def _from_components(data: dict[str, Any], folder: str | os.PathLike) -> Scenario:

@@ -106,7 +106,7 @@ def study_from_dict(
                 grid[path] = read(entry, f"grid.{path}")
         return StudyFile(file.scenario, perturbations, grid, options)
     except ValueError as error:
-        raise checks.inside(source, error) from error
+        raise checks.with_location(source, error) from error
 
 
 def _options(table: Any, kind: str) -> dict[str, Any]:
@@ -185,7 +185,7 @@ def _perturbation(table: Any, path: str) -> Perturbation:
         if word in table:
             values[word] = table[word]
             if word == "group":
-                checks.word(key, table[word], "a name")
+                checks.string(key, table[word], "a name")
             else:
                 values[word] = numbers(table[word], key)
         elif is_required:

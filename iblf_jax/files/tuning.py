@@ -132,7 +132,7 @@ def load_tuning_file(path: str | os.PathLike) -> dict[str, Any]:
         options["objective"] = _objective(data, joint_names(file.scenario.plant, file.scenario.n))
         options["perturbations"] = perturbations_of(data)
     except ValueError as error:
-        raise checks.inside(source, error) from error
+        raise checks.with_location(source, error) from error
     timing = {key: x for key, x in file.run.items() if key != "record_every"}
     return {"scenario": file.scenario, "duration": 5.0, **options, **timing}
 
@@ -189,7 +189,7 @@ def _parameter(entry: Any, key: str) -> Any:
         return entry
     table = dict(as_table(entry, key))
     known_keys(table, key, ("path", "low", "high", "tied", "scale"))
-    path = checks.word(f"{key}.path", table.pop("path", Words("nothing")), "the path of a leaf")
+    path = checks.string(f"{key}.path", table.pop("path", Words("nothing")), "the path of a leaf")
     for name in ("low", "high"):
         if name in table:
             table[name] = numbers(table[name], f"{key}.{name}")
@@ -261,7 +261,7 @@ def _argument(name: str, value: Any, key: str) -> Any:
     if name == "joints":
         return value  # the function checks it
     if name == "name":
-        return checks.word(key, value, _TEXT_ARGUMENTS[name])
+        return checks.string(key, value, _TEXT_ARGUMENTS[name])
     if name != "fold":
         return numbers(value, key)
     if isinstance(value, str):
@@ -439,11 +439,12 @@ def _decoded(data: dict[str, Any]) -> TuneResult:
     setup = _decoded_setup(data)
     targets_of(start, setup.perturbations)
     words = {
-        name: checks.word(name, data[name], "a string") for name in ("stopped", "optimiser", "mode")
+        name: checks.string(name, data[name], "a string")
+        for name in ("stopped", "optimiser", "mode")
     }
     # Earlier versions called SQP "newton".
     words["optimiser"] = EARLIER_NAMES.get(words["optimiser"], words["optimiser"])
-    names = tuple(checks.word("names", name, "a string") for name in data["names"])
+    names = tuple(checks.string("names", name, "a string") for name in data["names"])
     history = _decoded_history(data["history"], len(names))
     starts = history["x"].shape[1]
     best = checks.positive_integer("best_start", data["best_start"], least=0, most=starts - 1)

@@ -146,7 +146,7 @@ def _checked(options: Options, log: Any) -> Options:
         torque=torque,
         delay=delay,
         loss=options.loss,
-        widths=checks.flag("widths", options.widths),
+        widths=checks.boolean("widths", options.widths),
         limits=_by_path("limits", options.limits, '{"plant.mass": (0.1, 5.0)}'),
         priors=_by_path("priors", options.priors, '{"plant.mass": (2.0, 0.1)}'),
         iterations=checks.positive_integer("iterations", options.iterations, most=checks.MAX_STEPS),

@@ -179,8 +179,8 @@ def coordinates(
 
 def _checked_paths(scenario: Scenario, given: Any) -> list[str]:
     """The paths; ValueError for an unknown or overlapping one."""
-    found = checks.listed("paths", given, '["plant.mass", "plant.damping"]')
-    found = [checks.word("paths", path, "a path") for path in found]
+    found = checks.nonempty_list("paths", given, '["plant.mass", "plant.damping"]')
+    found = [checks.string("paths", path, "a path") for path in found]
     if DELAY_PATH in found and scenario.sampling is None:
         raise checks.fail(
             "paths",

@@ -479,7 +479,7 @@ def save(
     """
     if isinstance(formats, str):
         formats = (formats,)
-    for ending in checks.listed("formats", formats, '("png", "pdf")'):
+    for ending in checks.nonempty_list("formats", formats, '("png", "pdf")'):
         checks.one_of("formats", ending, sorted(Figure().canvas.get_supported_filetypes()))
     for name, figure in checks.mapping("figures", figures, '{"overview": run.plot()}').items():
         if not isinstance(figure, Figure):

@@ -55,7 +55,7 @@ def overview(run: Rollout, *, title: str = "Overview of the run") -> Figure:
       ValueError: a batch, not a Rollout, or a title that is not a text.
     """
     check_class("run", run, Rollout, "plotting.joint and other figures compare several runs.")
-    checks.word("title", title, "a text")
+    checks.string("title", title, "a text")
     (curve,) = curves_of(run)
     rows = len(_style.row_sizes(run.n, COLUMNS))
     tubes = ["q"]

@@ -148,7 +148,7 @@ def histograms(study: Study, metrics: Sequence[str] | None = None, *, bins: int 
     _check(study)
     names = list(study.metrics)
     if metrics is not None:
-        names = checks.listed("metrics", metrics, '["margin", "rmse"]')
+        names = checks.nonempty_list("metrics", metrics, '["margin", "rmse"]')
     values = {name: statistics.one_number(study.metrics, name) for name in names}
     if metrics is None:
         values = {name: x for name, x in values.items() if _varies(x)}

@@ -1,3 +1,3 @@
-"""What one run is: scenario and paths, the closed loop, its signals and vector field, integrators,
-accuracy, metrics, results.
+"""One run of a scenario: its definition and paths, the closed loop, signals and vector field,
+integrators, accuracy, metrics and results.
 """

@@ -444,7 +444,9 @@ def perturbed_rate(
         if dt is not None:
             arguments.append(dt)
         return compiled(evaluate)(*arguments)[0]
-    scenario = _without_rounding_and_limits(scenario)
+    scenario = dataclasses.replace(
+        scenario, sensor=unrounded(scenario.sensor), actuator=unlimited(scenario.actuator)
+    )
     controller, observer, sensor = perturbed.memory
     state = with_integrated_part(initial_state(scenario), perturbed.plant)
     state = state._replace(
@@ -456,12 +458,3 @@ def perturbed_rate(
     plant_rate = compiled(evaluate)(scenario, t, state, weight, perturbed.torque)[0]
     memory = (after.controller, after.observer, after.sampled.sensor)
     return PerturbedState(plant_rate, after.sampled.commands[0], memory)
-
-
-def _without_rounding_and_limits(scenario: Scenario) -> Scenario:
-    """The scenario with the smooth variants of its sensor and its actuator."""
-    return dataclasses.replace(
-        scenario,
-        sensor=unrounded(scenario.sensor),
-        actuator=unlimited(scenario.actuator),
-    )

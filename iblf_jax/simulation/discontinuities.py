@@ -4,16 +4,16 @@ A Runge-Kutta step across a jump is of first order, whatever the method. A step 
 integrated in pieces that end where
 
     a jump time of the scenario lies in it,   t_k < t_j <= t_(k+1)   (`Scenario.jump_times`),
-    a command of a sampled law arrives in it  (`sampling.arriving`).
+    a command of a sampled law arrives in it  (`sampling.step_torques`).
 
-A jump at the end of a step belongs to that step. A piece of length 0 follows it, through which the
-state has a derivative by the jump time there, too. The lengths of the pieces carry the derivatives
-by jump times and delays, so the jump of the right-hand side enters the derivative of the state.
-Jumps at equal times are one cut; the first of them receives the derivative of all together.
+A jump at the end of a step belongs to that step and is followed by a piece of length 0. The
+lengths of the pieces, this one included, depend on jump times and delays, so the derivative of the
+state by these contains the jump of the right-hand side. Jumps at equal times are one cut; the first
+of them receives the derivative of all together.
 
-The stages of a piece see one-sided limits: a piece that ends at a jump is evaluated before it, and
-one that begins there after it. A jump time may carry a rounding error, so stages keep a distance of
-`JUMP_SEPARATION` units in the last place from it.
+The stages of a piece use one-sided limits: a piece that ends at a jump is evaluated before it, and
+a piece that begins there after it. Because a jump time may have a rounding error, stages keep a
+distance of `JUMP_SEPARATION` units in the last place from it.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ import numpy as np
 from iblf_jax.simulation import integrators
 
 MAX_CUTS = 4
-"""Largest number of different jump times at which one step is divided; the accuracy of a step with
-more is unknown."""
+"""Largest number of different jump times at which one step is divided. The accuracy of a step with
+more of them is unknown."""
 JUMP_SEPARATION = 4.0
 """Units in the last place between a stage and a jump time."""
 
@@ -43,7 +43,7 @@ class Span(NamedTuple):
     """() [s]; the start of the next step to the last bit, so that each jump belongs to one step."""
     length: jax.Array
     """() [s]."""
-    counts: Any = True
+    in_run: Any = True
     """Whether the step belongs to the run, () bool; a step after the end is not divided."""
 
 
@@ -54,13 +54,13 @@ class Piece(NamedTuple):
     """Time at which it begins, () [s]."""
     length: jax.Array
     """() [s]."""
-    made: Any
-    """Whether there is such a piece, () bool; True for the first."""
+    exists: Any
+    """Whether the step has this piece, () bool; True for the first."""
     earliest: Any
     """Time before which no stage is evaluated, () [s]; None in scenarios without jump times."""
     latest: Any
-    """Time after which no stage is evaluated, () [s]; None likewise."""
-    arrived: Any
+    """Time after which no stage is evaluated, () [s]; None in scenarios without jump times."""
+    command_arrived: Any
     """Whether the command that arrives within the step has arrived, () bool."""
 
 
@@ -68,35 +68,46 @@ class Division(NamedTuple):
     """The pieces of a step."""
 
     pieces: tuple[Piece, ...]
-    overfull: Any
-    """Whether jumps lie at more times than `MAX_CUTS`, () bool; None where that cannot be."""
+    too_many_jumps: Any
+    """Whether jumps lie at more times than `MAX_CUTS`, () bool; None where this cannot happen."""
+
+
+class _Cut(NamedTuple):
+    """An instant at which a step is divided."""
+
+    offset: jax.Array
+    """From the start of the step, () [s]; the length of the step if no event is left."""
+    events: jax.Array
+    """Which events are there, (E,) bool."""
 
 
 @jax.custom_jvp
-def _limited(t: jax.Array, least: jax.Array, most: jax.Array) -> jax.Array:
+def _clipped(t: jax.Array, lower: jax.Array, upper: jax.Array) -> jax.Array:
     """The time t clipped to two limits, with the derivative of t itself."""
-    return jnp.minimum(jnp.maximum(t, least), most)
+    return jnp.minimum(jnp.maximum(t, lower), upper)
 
 
-@_limited.defjvp
+@_clipped.defjvp
 def _(primals, tangents):
-    return _limited(*primals), tangents[0]
+    return _clipped(*primals), tangents[0]
 
 
 def stage_time(piece: Piece, t: jax.Array) -> jax.Array:
-    """The time at which a stage is evaluated, () [s]: on the piece's own side of every jump."""
+    """The time at which a stage is evaluated, () [s]: on the side of every jump on which the piece
+    lies.
+    """
     if piece.earliest is None:
         return t
-    return _limited(t, piece.earliest, piece.latest)
+    return _clipped(t, piece.earliest, piece.latest)
 
 
-def divided(
+def divide_step(
     times: jax.Array, span: Span, arrival: tuple[jax.Array, jax.Array] | None = None
 ) -> Division:
     """The pieces of a step.
 
     The events of a step are the arrival of a command and the jumps, at offsets from the start of
-    the step. Each of a fixed number of cuts takes the earliest event that no cut has taken yet.
+    the step. The number of cuts is fixed, and each takes the earliest event that is left.
 
     Args:
       times: the scenario's jump times, (J,) [s].
@@ -104,44 +115,56 @@ def divided(
       arrival: when a command arrives within the step, counted from its start, () [s], and whether
         one does; None where none can.
     """
-    count = times.size
-    cuts = min(count, MAX_CUTS) + (arrival is not None)
-    if cuts == 0:
+    jumps = times.size
+    number = min(jumps, MAX_CUTS) + (arrival is not None)
+    if number == 0:
         return Division((Piece(span.start, span.length, True, None, None, False),), None)
     passed = times <= span.start
-    offsets = _limited(times - span.start, jnp.zeros_like(span.length), span.length)
-    pending = ~passed & (times <= span.end) & span.counts
+    offsets = _clipped(times - span.start, jnp.zeros_like(span.length), span.length)
+    pending = ~passed & (times <= span.end) & span.in_run
     if arrival is not None:
         offsets = jnp.concatenate([arrival[0][None], offsets])
-        pending = jnp.concatenate([(arrival[1] & span.counts)[None], pending])
-    pieces: list[Piece] = []
-    begin, done = span.start, jnp.zeros_like(pending)
-    since: Any = None  # offset at which the piece begins; None for the first
-    made: Any = True
-    for number in range(cuts + 1):
-        until, chosen = span.length, None
-        if number < cuts:
-            chosen = first = _first(offsets, pending)
-            until = jnp.where(jnp.any(first), jnp.sum(jnp.where(first, offsets, 0.0)), span.length)
-            if count > MAX_CUTS:
-                chosen = _with_equal_times(first, offsets, pending, count, span)
-        earliest, latest = None, None
-        if count:
-            earliest, latest = _limits(times, passed | done[-count:], span)
-        arrived = _arrived(done, number, count, arrival is not None)
-        length = until
-        if since is not None:
-            length = until - since
-        pieces.append(Piece(begin, length, made, earliest, latest, arrived))
-        if chosen is not None:
-            begin, since, made = span.start + until, until, jnp.any(chosen)
-            pending, done = pending & ~chosen, done | chosen
-    overfull = jnp.any(pending) if count > MAX_CUTS else None
-    return Division(tuple(pieces), overfull)
+        pending = jnp.concatenate([(arrival[1] & span.in_run)[None], pending])
+    cuts, left_over = _cuts(offsets, pending, number, jumps, span)
+
+    def limits(done: jax.Array) -> tuple[jax.Array | None, jax.Array | None]:
+        if not jumps:
+            return None, None
+        return _limits(times, passed | done[-jumps:], span)
+
+    done = jnp.zeros_like(pending)
+    pieces = [Piece(span.start, cuts[0].offset, True, *limits(done), False)]
+    ends = [*(cut.offset for cut in cuts[1:]), span.length]
+    for cut, end in zip(cuts, ends, strict=True):
+        done = done | cut.events
+        command_arrived: Any = arrival is not None
+        if command_arrived and jumps:
+            command_arrived = done[0]
+        begin, exists = span.start + cut.offset, jnp.any(cut.events)
+        pieces.append(Piece(begin, end - cut.offset, exists, *limits(done), command_arrived))
+    too_many_jumps = None
+    if jumps > MAX_CUTS:
+        too_many_jumps = jnp.any(left_over)
+    return Division(tuple(pieces), too_many_jumps)
+
+
+def _cuts(
+    offsets: jax.Array, pending: jax.Array, number: int, jumps: int, span: Span
+) -> tuple[list[_Cut], jax.Array]:
+    """The cuts of a step in the order of their times, and the pending events that are left."""
+    cuts = []
+    for _ in range(number):
+        events = first = _first(offsets, pending)
+        offset = jnp.where(jnp.any(first), jnp.sum(jnp.where(first, offsets, 0.0)), span.length)
+        if jumps > MAX_CUTS:
+            events = _with_equal_times(first, offsets, pending, jumps, span)
+        cuts.append(_Cut(offset, events))
+        pending = pending & ~events
+    return cuts, pending
 
 
 def _first(offsets: jax.Array, pending: jax.Array) -> jax.Array:
-    """Which of the pending events comes first, (E,) bool: one, or none."""
+    """Mask of the earliest pending event, (E,) bool; all False if none is pending."""
     if offsets.size == 1:
         return pending
     order = jnp.where(pending, jax.lax.stop_gradient(offsets), jnp.inf)
@@ -161,16 +184,9 @@ def _with_equal_times(
     return first | together
 
 
-def _arrived(done: jax.Array, number: int, jumps: int, can_arrive: bool) -> Any:
-    """Whether the command has arrived before the piece of this number begins."""
-    if not can_arrive or number == 0:
-        return False
-    return done[0] if jumps else True
-
-
 def _limits(times: jax.Array, passed: jax.Array, span: Span) -> tuple[jax.Array, jax.Array]:
-    """Between which times the stages of a piece lie, () [s] each: after the passed jumps, before
-    the others.
+    """The earliest and the latest time of a stage of a piece, () [s] each: after the passed jumps
+    and before the others.
     """
     times = jax.lax.stop_gradient(times)
     apart = JUMP_SEPARATION * jnp.finfo(times.dtype).eps * jnp.abs(times)
@@ -184,60 +200,60 @@ def before_jumps(times: jax.Array, t: jax.Array) -> jax.Array:
     times = jax.lax.stop_gradient(times)
     apart = JUMP_SEPARATION * jnp.finfo(times.dtype).eps * jnp.abs(times)
     least = jnp.min(jnp.where(jnp.abs(times - t) <= apart, times - apart, t))
-    return _limited(t, least, least)
+    return _clipped(t, least, least)
 
 
-def within(times: jax.Array, after: jax.Array, until: jax.Array) -> jax.Array:
+def has_jump(times: jax.Array, after: jax.Array, until: jax.Array) -> jax.Array:
     """Whether a jump lies in the interval (after, until], () bool."""
     return jnp.any((times > after) & (times <= until))
 
 
-def since_last(
+def last_piece_length(
     times: jax.Array, before: Span, arrival: tuple[jax.Array, jax.Array] | None = None
 ) -> jax.Array:
-    """Length of the last piece of a step, () [s]; that of the step if it is not divided.
+    """Length of the last piece of a step, () [s]; the length of the step if it is not divided.
 
     Args:
       times: the scenario's jump times, (J,) [s].
       before: the step.
-      arrival: as for `divided`.
+      arrival: as for `divide_step`.
     """
     zero, found = jnp.zeros_like(before.length), before.length
     if times.size:
         here = (times > before.start) & (times <= before.end)
-        elapsed = _limited(before.end - times, zero, before.length)
+        elapsed = _clipped(before.end - times, zero, before.length)
         found = jnp.min(jnp.where(here, elapsed, before.length))
     if arrival is not None:
         found = jnp.minimum(found, jnp.where(arrival[1], before.length - arrival[0], before.length))
     return found
 
 
-class Passage(NamedTuple):
+class DividedStepResult(NamedTuple):
     """Result of integrating over the pieces of a step."""
 
     state: Any
-    """At the end of the step."""
-    first: Any
+    """State at the end of the step."""
+    aux: Any
     """What the function returned besides the rate at the start of the step."""
     parts: list[tuple[jax.Array, list]]
-    """Length [s] of each piece, and the slopes of its stages; 0 where there is no such piece."""
+    """Length [s] of each piece, and the slopes of its stages; 0 for a piece that the step lacks."""
 
 
-def integrated(
+def integrate_pieces(
     method: str, evaluate: Callable, division: Division, state: Any, *, rolled: bool = False
-) -> Passage:
+) -> DividedStepResult:
     """One step of the integrator over every piece of a step.
 
     Args:
       method: a name in `integrators.TABLEAUS`.
       evaluate: function (t, state) -> (rate of the state, anything else), as for
         `integrators.step`.
-      division: of the step.
-      state: at its start.
+      division: the pieces of the step.
+      state: state at the start of the step.
       rolled: as for `integrators.step`.
     """
 
-    def over(piece: Piece, state: Any) -> integrators.Stepped:
+    def over(piece: Piece, state: Any) -> integrators.StepResult:
         return integrators.step(
             method,
             lambda t, x: evaluate(stage_time(piece, t), x),
@@ -260,6 +276,6 @@ def integrated(
             result = over(piece, state)
             return result.state, result.slopes
 
-        state, slopes = jax.lax.cond(piece.made, integrate, skip, state)
+        state, slopes = jax.lax.cond(piece.exists, integrate, skip, state)
         parts.append((piece.length, slopes))
-    return Passage(state, start.first, parts)
+    return DividedStepResult(state, start.aux, parts)

@@ -36,7 +36,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -44,7 +44,7 @@ import numpy as np
 
 from iblf_jax.core.linalg import matvec, solve, solve_spd
 from iblf_jax.simulation.closed_loop import LoopState, perturbed_state
-from iblf_jax.simulation.discontinuities import within
+from iblf_jax.simulation.discontinuities import has_jump
 from iblf_jax.simulation.integrators import Tableau, tableau
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.stability import SLOWEST_RATE
@@ -57,14 +57,18 @@ INACCURATE."""
 EXAMINED_STEPS = 16
 """Steps, spread over a run, in which `unresolved_signals` examines the signals between stages."""
 ONSET_RATIO = 3.0
-"""Ratio of the displacement by a torque at its onset to that by a torque that the observer has
-learnt."""
+"""Ratio of the displacement by a torque at its onset to that after the observer has estimated the
+torque."""
 GAUSS = ((0.5 - 0.15**0.5, 5 / 18), (0.5, 8 / 18), (0.5 + 0.15**0.5, 5 / 18))
 """Nodes and weights of Gauss's quadrature, the reference for the quadrature of a method."""
 GOLDEN_RATIO = 0.6180339887498949
 ERROR, RELATIVE = "numerical_error", "relative_numerical_error"
-UNITS = ((ERROR, "rad"), (RELATIVE, "1"))
+ACCURACY_UNITS = ((ERROR, "rad"), (RELATIVE, "1"))
 """Name and unit of the accuracy results that every run has beside its metrics."""
+
+
+StepSlopes: TypeAlias = list[tuple[jax.Array, list[LoopState]]]
+"""Length [s] of each piece of a step, and the slopes of its stages."""
 
 
 class Accuracy(NamedTuple):
@@ -73,16 +77,16 @@ class Accuracy(NamedTuple):
     """
 
     pending: tuple[jax.Array, ...]
-    """Contributions of past rates to the local errors of the next instants, (2 n,) each: of the
-    positions, and of their final displacement, from x'_q + R x'_y."""
+    """Contributions of past rates to the local errors at the next instants, (2 n,) each: n for the
+    positions, then n for their final displacement, from x'_q + R x'_y."""
     drift: jax.Array
-    """L of these, (2 n,)."""
+    """Accumulated error L of the same 2 n numbers."""
     response: jax.Array
     """R, (n, m - n)."""
     error: jax.Array
-    """Largest error so far, (n,) [rad]."""
+    """Largest position error so far, (n,) [rad]."""
     relative: jax.Array
-    """The largest, relative to the width of its tube, () [1]."""
+    """Largest position error so far, relative to the width of its tube, () [1]."""
 
 
 # --- the watched numbers and their response ------------------------------------------------------
@@ -168,11 +172,11 @@ def update(
     method: str,
     dt: jax.Array,
     index: jax.Array,
-    pieces: list[tuple[jax.Array, list[LoopState]]],
+    pieces: StepSlopes,
     width: jax.Array,
     sampled: bool = False,
     restarts: Any = None,
-    overfull: Any = None,
+    too_many_jumps: Any = None,
 ) -> Accuracy:
     """The estimate after one more step.
 
@@ -181,19 +185,19 @@ def update(
       method: the integrator.
       dt: time step, () [s].
       index: number of the step, () int.
-      pieces: length [s] of each piece of the step, and the slopes of its stages.
+      pieces: of the step.
       width: of the tube, (n,) [rad].
       sampled: whether the law is sampled.
       restarts: whether a jump lies in this step or in one of those that the differences cover,
         () bool; None for scenarios without jumps.
-      overfull: whether a step has more jumps than it is divided at, () bool; None where this cannot
-        happen.
+      too_many_jumps: whether jumps lie at more times than a step is divided at, () bool; None where
+        this cannot happen.
     """
     table = tableau(method)
-    if overfull is not None:
+    if too_many_jumps is not None:
         accuracy = accuracy._replace(
-            error=jnp.where(overfull, jnp.inf, accuracy.error),
-            relative=jnp.where(overfull, jnp.inf, accuracy.relative),
+            error=jnp.where(too_many_jumps, jnp.inf, accuracy.error),
+            relative=jnp.where(too_many_jumps, jnp.inf, accuracy.relative),
         )
     width = jax.lax.stop_gradient(width)
     if sampled:
@@ -206,7 +210,7 @@ def _update_by_differences(
     table: Tableau,
     dt: jax.Array,
     index: jax.Array,
-    pieces: list[tuple[jax.Array, list[LoopState]]],
+    pieces: StepSlopes,
     width: jax.Array,
     restarts: Any,
 ) -> Accuracy:
@@ -241,31 +245,31 @@ def _update_by_stages(
     accuracy: Accuracy,
     table: Tableau,
     dt: jax.Array,
-    pieces: list[tuple[jax.Array, list[LoopState]]],
+    pieces: StepSlopes,
     width: jax.Array,
     restarts: Any,
 ) -> Accuracy:
     """The estimate of a sampled loop: from the stages of one step. A method of one stage is
     compared with the step before.
     """
-    drift, before = (1.0 - SLOWEST_RATE * dt) * accuracy.drift, accuracy.pending
+    drift = (1.0 - SLOWEST_RATE * dt) * accuracy.drift
 
     def motion_rate(slope: LoopState) -> jax.Array:
         return _rate(accuracy, slope._replace(observer=(), actuator=()))
 
-    for length, slopes in pieces:
-        if not before:
+    if not accuracy.pending:
+        for length, slopes in pieces:
             drift = drift + _error_by_stages(motion_rate, table, length, slopes)
-            continue
+        return _with_drift(accuracy, (), drift, width)
+    before = accuracy.pending[0]
+    for length, slopes in pieces:
         here = motion_rate(slopes[0])
-        local_error, before = (here - before[0]) / 2.0, (here,)
+        local_error = (here - before) / 2.0
         if restarts is not None:
             local_error = jnp.where(restarts, 0.0, local_error)
         drift = drift + jax.lax.stop_gradient(length) * local_error
-    pending: tuple[jax.Array, ...] = ()
-    if before:
-        pending = (motion_rate(pieces[0][1][0]),)
-    return _with_drift(accuracy, pending, drift, width)
+        before = here
+    return _with_drift(accuracy, (motion_rate(pieces[0][1][0]),), drift, width)
 
 
 def _error_by_stages(
@@ -317,11 +321,11 @@ def _with_drift(
 class UnresolvedSignals(NamedTuple):
     """Largest quadrature errors of a method for the signals of a scenario."""
 
-    missed: jax.Array
-    """Of the rates of reference and bounds, (n,) [rad/s]."""
-    push: jax.Array
-    """Of the disturbance, (n,) [N m]; after `with_acceleration` the acceleration by it, (n,)
-    [rad/s^2]."""
+    rate_error: jax.Array
+    """Quadrature error of the rates of reference and bounds, (n,) [rad/s]."""
+    disturbance_error: jax.Array
+    """Quadrature error of the disturbance, (n,) [N m]; after `with_acceleration`, the acceleration
+    that it causes, (n,) [rad/s^2]."""
     width: jax.Array
     """Smallest width of the tube, (n,) [rad]."""
 
@@ -342,21 +346,22 @@ def unresolved_signals(
     nodes = jnp.asarray([*table.c, *(node for node, _ in GAUSS), 1.0], dt.dtype)
     times = starts[:, None] + nodes * dt
     tube = _at_all_times(scenario.context.tube, times)
-    missed = _missed_rates(table, tube, starts, dt).reshape(EXAMINED_STEPS, -1, n)
-    missed = jnp.max(missed, axis=1)
-    push = _missed_torque(scenario, table, tube, times)
+    rate_error = _rate_errors(table, tube, starts, dt).reshape(EXAMINED_STEPS, -1, n)
+    rate_error = jnp.max(rate_error, axis=1)
+    disturbance_error = _disturbance_error(scenario, table, tube, times)
     jumps = scenario.jump_times()
     if jumps.size:
         # A step is divided at declared jumps, so its stages resolve them.
         before = starts - 0.5 * dt
-        divided = jax.vmap(lambda start: within(jumps, start, start + 2.0 * dt))(before)[:, None]
-        missed, push = jnp.where(divided, 0.0, missed), jnp.where(divided, 0.0, push)
-    missed = jnp.max(missed, axis=0)
+        divided = jax.vmap(lambda start: has_jump(jumps, start, start + 2.0 * dt))(before)[:, None]
+        rate_error = jnp.where(divided, 0.0, rate_error)
+        disturbance_error = jnp.where(divided, 0.0, disturbance_error)
+    rate_error = jnp.max(rate_error, axis=0)
     if scenario.sampling is not None:
         # A sampled law reads reference and bounds at its samples only.
-        missed = jnp.zeros_like(missed)
+        rate_error = jnp.zeros_like(rate_error)
     width = jnp.min((tube.upper - tube.lower)[:, 0], axis=0)
-    return UnresolvedSignals(missed, jnp.max(push, axis=0), width)
+    return UnresolvedSignals(rate_error, jnp.max(disturbance_error, axis=0), width)
 
 
 def _at_all_times(signal: Callable, times: jax.Array, *others: jax.Array) -> Any:
@@ -366,7 +371,7 @@ def _at_all_times(signal: Callable, times: jax.Array, *others: jax.Array) -> Any
     return jax.tree.map(lambda x: x.reshape(*times.shape, *x.shape[1:]), found)
 
 
-def _missed_rates(table: Tableau, tube: Tube, starts: jax.Array, dt: jax.Array) -> jax.Array:
+def _rate_errors(table: Tableau, tube: Tube, starts: jax.Array, dt: jax.Array) -> jax.Array:
     """Quadrature error of the rates of reference and bounds, beyond rounding, (steps, 3 n)."""
     weights = np.asarray(table.b, dt.dtype)[:, None]
     values = jnp.concatenate([tube.q_d, tube.lower, tube.upper], axis=-1)
@@ -379,7 +384,9 @@ def _missed_rates(table: Tableau, tube: Tube, starts: jax.Array, dt: jax.Array) 
     return jnp.maximum(jnp.abs(rate - change) - rounding, 0.0)
 
 
-def _missed_torque(scenario: Scenario, table: Tableau, tube: Tube, times: jax.Array) -> jax.Array:
+def _disturbance_error(
+    scenario: Scenario, table: Tableau, tube: Tube, times: jax.Array
+) -> jax.Array:
     """Quadrature error of the disturbance, (steps, n) [N m], along the reference at the start of
     each step.
     """
@@ -399,17 +406,23 @@ def _missed_torque(scenario: Scenario, table: Tableau, tube: Tube, times: jax.Ar
 
 
 def with_acceleration(scenario: Scenario, found: UnresolvedSignals) -> UnresolvedSignals:
-    """`found` with its torque replaced by the acceleration of the plant by it at the start."""
-    M = at_time(scenario.plant, jnp.zeros_like(found.push[0])).mass_matrix(scenario.initial.q)
-    return found._replace(push=jax.lax.stop_gradient(solve_spd(M, found.push)))
+    """`found` with the error of the disturbance as an acceleration of the plant at the start."""
+    M = at_time(scenario.plant, jnp.zeros_like(found.disturbance_error[0])).mass_matrix(
+        scenario.initial.q
+    )
+    return found._replace(
+        disturbance_error=jax.lax.stop_gradient(solve_spd(M, found.disturbance_error))
+    )
 
 
 def with_unresolved(accuracy: Accuracy, found: UnresolvedSignals) -> Accuracy:
-    """The estimate with the unresolved signals, given as accelerations; the largest of them is
+    """The estimate with the unresolved signals after `with_acceleration`; the largest of them is
     assumed to last for 1/r.
     """
-    displaced = jnp.abs(matvec(accuracy.response[:, : found.push.size], found.push))
-    error = (found.missed + ONSET_RATIO * displaced) / SLOWEST_RATE
+    displaced = jnp.abs(
+        matvec(accuracy.response[:, : found.disturbance_error.size], found.disturbance_error)
+    )
+    error = (found.rate_error + ONSET_RATIO * displaced) / SLOWEST_RATE
     return accuracy._replace(
         error=jnp.maximum(accuracy.error, error),
         relative=jnp.maximum(accuracy.relative, jnp.max(error / found.width)),

@@ -1,10 +1,10 @@
 """Explicit Runge-Kutta steps on pytrees; each method is a Butcher tableau.
 
-The time step is fixed, because the loop is sampled in practice, gradients are then exact, and the
-runs of a batch stay in step. The integrated function may return other values besides the rate (the
-closed loop returns a sample to record); a step passes on those of its start. A new method is a new
-row of TABLEAUS. `error_estimate` knows the local error by stages of Euler's method, of methods of
-two stages and of rk4; a row of another kind needs a formula there.
+The time step is fixed for three reasons: the loop is sampled in practice, gradients are exact, and
+the runs of a batch advance together. The integrated function may return other values besides the
+rate (the closed loop returns a sample to record); a step passes on those of its start. A new method
+is a new row of TABLEAUS. `error_estimate` has the local error by stages for Euler's method, methods
+of two stages and rk4; a row of another kind needs a formula there.
 """
 
 from __future__ import annotations
@@ -61,20 +61,20 @@ def tableau(method: str) -> Tableau:
     return TABLEAUS[method]
 
 
-class Stepped(NamedTuple):
+class StepResult(NamedTuple):
     """Result of one step of the integrator."""
 
     state: Any
     """The state one step later."""
     slopes: list
     """The slopes of the stages."""
-    first: Any
+    aux: Any
     """What the function returned besides the rate at the start."""
 
 
 def step(
     method: str, evaluate, t: jax.Array, state, dt: jax.Array, *, rolled: bool = False
-) -> Stepped:
+) -> StepResult:
     """One step of an explicit Runge-Kutta method.
 
     Args:
@@ -88,13 +88,13 @@ def step(
     return take_step(tableau(method), evaluate, t, state, dt)
 
 
-def _unrolled(table: Tableau, evaluate, t, state, dt) -> Stepped:
+def _unrolled(table: Tableau, evaluate, t, state, dt) -> StepResult:
     """A step whose stages are written out."""
-    slope, first = evaluate(t, state)
+    slope, aux = evaluate(t, state)
     slopes = [slope]
     for c, row in zip(table.c[1:], table.a[1:], strict=True):
         slopes.append(evaluate(t + c * dt, _combine(state, dt, row, slopes))[0])
-    return Stepped(_combine(state, dt, table.b, slopes), slopes, first)
+    return StepResult(_combine(state, dt, table.b, slopes), slopes, aux)
 
 
 def stage_states(method: str, state, dt: jax.Array, slopes: list) -> list:
@@ -115,7 +115,7 @@ def _combine(state, dt, weights, slopes):
     return jax.tree.map(combine_leaf, state, *slopes)
 
 
-def _rolled(table: Tableau, evaluate, t, state, dt) -> Stepped:
+def _rolled(table: Tableau, evaluate, t, state, dt) -> StepResult:
     """A step whose stages are a loop over the rows of the tableau, on the flat state."""
     x, unflatten = ravel_pytree(state)
     stages = len(table.c)
@@ -131,5 +131,5 @@ def _rolled(table: Tableau, evaluate, t, state, dt) -> Stepped:
     at_stages = (jnp.arange(stages), jnp.asarray(table.c, x.dtype), rows)
     slopes, others = jax.lax.scan(stage, jnp.zeros((stages, x.size), x.dtype), at_stages)
     total = jnp.sum(jnp.asarray(table.b, x.dtype)[:, None] * slopes, axis=0)
-    first = jax.tree.map(lambda y: y[0], others)
-    return Stepped(unflatten(x + dt * total), [unflatten(k) for k in slopes], first)
+    aux = jax.tree.map(lambda y: y[0], others)
+    return StepResult(unflatten(x + dt * total), [unflatten(k) for k in slopes], aux)

@@ -29,7 +29,7 @@ from iblf_jax.control.controllers._base import law_member
 from iblf_jax.core import checks
 from iblf_jax.core.optional import OptionalMembers
 from iblf_jax.core.pytree import Leaf, component, layers, leaf
-from iblf_jax.simulation.error_estimate import UNITS
+from iblf_jax.simulation.error_estimate import ACCURACY_UNITS
 from iblf_jax.simulation.scenario import Scenario, fit_joints
 from iblf_jax.simulation.signals import Sample as Sample
 from iblf_jax.simulation.signals import speed_margin
@@ -38,8 +38,8 @@ from iblf_jax.simulation.signals import speed_margin
 class Fold(Protocol):
     """The protocol of a metric.
 
-    A fold that reads an optional signal, which not every scenario has (`OF_SCENARIO`), names it in
-    a class attribute `needs`.
+    A fold that reads an optional signal, which not every scenario has (`SIGNAL_SOURCES`), names it
+    in a class attribute `needs`.
     """
 
     units: ClassVar[dict[str, str]]
@@ -61,7 +61,7 @@ class Fold(Protocol):
 
 
 fold_member = OptionalMembers(needs=None, units=MappingProxyType({}))
-"""Reads what a metric may lack."""
+"""Reads the members that a metric may lack."""
 
 
 def _root_mean_square(integral: jax.Array, time: jax.Array) -> jax.Array:
@@ -167,7 +167,7 @@ class Settling:
 
 class _MarginState(NamedTuple):
     smallest: tuple[jax.Array, ...]
-    """Smallest margins so far; those of the first entry decide about violations."""
+    """Smallest margins so far. Only the first entry decides about violations."""
     time: jax.Array
     """Of the first violation; infinite before."""
     first: jax.Array
@@ -182,12 +182,12 @@ def _no_violation(t: jax.Array, *margins: jax.Array) -> _MarginState:
 
 def _with_margins(acc: _MarginState, t: jax.Array, *margins: jax.Array) -> _MarginState:
     """The state after an instant with these margins."""
-    watched = margins[0]
-    is_first = jnp.any(~(watched > 0)) & (acc.first < 0)
+    decisive = margins[0]
+    is_first = jnp.any(~(decisive > 0)) & (acc.first < 0)
     return _MarginState(
         tuple(map(jnp.minimum, acc.smallest, margins)),
         jnp.where(is_first, t, acc.time),
-        jnp.where(is_first, jnp.argmin(watched).astype(jnp.int32), acc.first),
+        jnp.where(is_first, jnp.argmin(decisive).astype(jnp.int32), acc.first),
     )
 
 
@@ -216,7 +216,7 @@ class Margin:
         return _with_margins(acc, sample.t, margin, 1.0 - jnp.abs(sample.xi))
 
     def finish(self, acc: _MarginState) -> dict[str, jax.Array]:
-        """Margin and xi_margin, each (n,); first_violation_time and first_violation_joint, ()."""
+        """The margins, each (n,); first_violation_time and first_violation_joint, ()."""
         return {
             "margin": acc.smallest[0],
             "xi_margin": acc.smallest[1],
@@ -452,7 +452,7 @@ class Estimation:
         return {"estimate_rmse": _root_mean_square(acc.square, acc.time)}
 
 
-OF_SCENARIO = {
+SIGNAL_SOURCES = {
     "dq_lower": "velocity_bounds, such as Bounds(lower=Constant(-1.0), upper=Constant(1.0))",
     "region_margin": "regions, such as (ij.regions.HalfSpace(normal=[0, 1], offset=0.1),)",
     "slack": "a law with a filter, such as ij.controllers.SafetyFilter(law)",
@@ -462,7 +462,7 @@ OF_SCENARIO = {
 
 
 def has_signal(scenario: Scenario, signal: str) -> bool:
-    """Whether runs of a scenario have an optional signal, one of `OF_SCENARIO`."""
+    """Whether runs of a scenario have an optional signal, one of `SIGNAL_SOURCES`."""
     if signal == "dq_lower":
         return scenario.velocity_bounds is not None
     has_regions = len(scenario.regions) > 0
@@ -479,10 +479,10 @@ def check_needs(field: str, fold: Any, scenario: Scenario) -> None:
     needs = fold_member(fold, "needs")
     if needs is None:
         return
-    checks.one_of(f"{field}.needs", needs, OF_SCENARIO)
+    checks.one_of(f"{field}.needs", needs, SIGNAL_SOURCES)
     if not has_signal(scenario, needs):
         got = f"{checks.with_article(type(fold).__name__)} that reads {needs}"
-        raise checks.fail(field, got, f"a scenario with {OF_SCENARIO[needs]}")
+        raise checks.fail(field, got, f"a scenario with {SIGNAL_SOURCES[needs]}")
 
 
 def as_folds(
@@ -498,18 +498,18 @@ def as_folds(
 
     Raises:
       ValueError: something that is not a fold, one that needs a signal that the scenario does not
-        have, units that are no words, fields that are no numbers, or two folds that return the same
-        name.
+        have, units that are not strings, fields that are not numbers, or two folds that return the
+        same name.
     """
     if metrics is None:
         folds = standard()
         if scenario is not None:
-            folds += watched(scenario)
+            folds += optional_folds(scenario)
         return tuple(_in_type("metrics", fold, dtype) for fold in folds)
     if not isinstance(metrics, tuple | list):
         remedy = "Put one fold into brackets, metrics=(fold,)."
         raise checks.fail("metrics", metrics, "a tuple of folds", remedy)
-    owner: dict[str, str] = {name: "every run" for name, _ in UNITS}
+    owner: dict[str, str] = {name: "every run" for name, _ in ACCURACY_UNITS}
     for i, fold in enumerate(metrics):
         field = f"metrics[{i}]"
         checks.conforms(field, fold, Fold, "iblf_jax.metrics has them.")
@@ -518,7 +518,7 @@ def as_folds(
             check_needs(field, fold, scenario)
         units = checks.mapping(f"{field}.units", fold.units, '{"rmse": "rad"}')
         for name, unit in units.items():
-            checks.word(f"{field}.units[{name!r}]", unit, "a unit in words")
+            checks.string(f"{field}.units[{name!r}]", unit, "a unit in words")
             if name in owner:
                 remedy = f"{owner[name]} returns {name!r} too."
                 raise checks.fail(field, fold, "names that no other fold returns", remedy)
@@ -536,13 +536,13 @@ def _in_type(name: str, fold: Fold, dtype: jax.typing.DTypeLike) -> Fold:
 
 
 def metric_units(folds: Sequence[Fold]) -> tuple[tuple[str, str], ...]:
-    """Name and unit of every result of a run with some folds: theirs, and those of its accuracy."""
+    """Name and unit of every result of a run with these folds, its accuracy results included."""
     of_folds = [fold_member(fold, "units") for fold in folds]
-    return tuple(pair for units in of_folds for pair in units.items()) + UNITS
+    return tuple(pair for units in of_folds for pair in units.items()) + ACCURACY_UNITS
 
 
 def standard() -> tuple[Fold, ...]:
-    """The folds that every run carries by default; runs of some scenarios carry more (`watched`).
+    """The folds that every run carries by default; some scenarios add `optional_folds`.
 
     They are constructed on the call: an array made at import would start JAX's backend and fix its
     precision before a user can choose.
@@ -550,7 +550,7 @@ def standard() -> tuple[Fold, ...]:
     return (Tracking(), Settling(), Margin(), Torque(), Estimation())
 
 
-def watched(scenario: Scenario) -> tuple[Fold, ...]:
+def optional_folds(scenario: Scenario) -> tuple[Fold, ...]:
     """The folds that runs of a scenario carry besides the standard ones: margins of velocity bounds
     and regions, and slacks of a filter.
     """

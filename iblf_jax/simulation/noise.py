@@ -1,5 +1,5 @@
-"""Noise of the sensor of a sampled law: standard normal numbers that depend on the run and the
-sample only.
+"""Noise of the sensor of a sampled law: standard normal numbers that depend only on the run and the
+sample.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from iblf_jax.simulation.scenario import Scenario
 
 NOISE_NAME = "noise"
 """Name of the noise key among the replaced values of a run; no leaf of a scenario has this name."""
-NOISE = 0x6E6F6973
+NOISE_STREAM = 0x6E6F6973
 """Folded into a key so that the noise is independent of the draws of a study."""
 ROUNDS = 10
 MULTIPLIERS = (0x6A09, 0x5BB7)
@@ -26,7 +26,7 @@ def noise_key(key: jax.Array, run: int | jax.Array = 0) -> jax.Array:
     """Four words of 16 bits, as floats, for the noise of one run of a study whose seed gave `key`;
     (4,) float32.
     """
-    own = jax.random.fold_in(jax.random.fold_in(key, run), NOISE)
+    own = jax.random.fold_in(jax.random.fold_in(key, run), NOISE_STREAM)
     return jax.random.bits(own, (4,), jnp.uint16).astype(jnp.float32)
 
 
@@ -35,9 +35,9 @@ def has_noise(scenario: Scenario) -> bool:
     return scenario.sampling is not None and scenario.sensor.draws > 0
 
 
-def noise_of(scenario: Scenario, key: jax.Array, run: int | jax.Array) -> dict[str, jax.Array]:
-    """The noise key of one run of a study, by `NOISE_NAME`, as the run replaces it besides leaves;
-    empty for a scenario without noise.
+def noise_values(scenario: Scenario, key: jax.Array, run: int | jax.Array) -> dict[str, jax.Array]:
+    """`NOISE_NAME` -> the noise key of one run of a study, which replaces that of the run as leaves
+    are replaced; empty for a scenario without noise.
     """
     if not has_noise(scenario):
         return {}
@@ -48,9 +48,9 @@ def normals(key: jax.Array, sample: jax.Array, draws: int, n: int) -> jax.Array:
     """Independent standard normal numbers of one sample, (draws, n); they depend on key, sample and
     index only.
 
-    The generator is counter-based: ten rounds of products whose halves are exchanged and combined
-    with the key, as in Philox, then the Box-Muller transform.  JAX's own generator does not lower
-    to scalar programs.
+    The generator is counter-based, like Philox: in ten rounds, the halves of products are exchanged
+    and combined with the key; then follows the Box-Muller transform. JAX's own generator cannot be
+    compiled to the scalar programs of `kernels`.
 
     Args:
       key: of the run, four words of 16 bits.
@@ -77,11 +77,14 @@ def _pair(key: list[jax.Array], sample: jax.Array, pair: int, dtype) -> list[jax
         a, b = MULTIPLIERS[0] * x[0], MULTIPLIERS[1] * x[2]
         x = [_upper(b) ^ x[1] ^ k[0], b & low, _upper(a) ^ x[3] ^ k[1], a & low]
         k = [(k[0] + WEYL[0]) & low, (k[1] + WEYL[1]) & low]
-    first, second = (
-        (x[i].astype(dtype) * WORD + x[i + 1].astype(dtype) + 0.5) / float(WORD * WORD)
-        for i in (0, 2)
-    )
-    size, angle = jnp.sqrt(-2.0 * jnp.log(first)), 2.0 * np.pi * second
+
+    def uniform(high: jax.Array, low: jax.Array) -> jax.Array:
+        return (high.astype(dtype) * WORD + low.astype(dtype) + 0.5) / float(WORD * WORD)
+
+    first = uniform(x[0], x[1])
+    second = uniform(x[2], x[3])
+    size = jnp.sqrt(-2.0 * jnp.log(first))
+    angle = 2.0 * np.pi * second
     return [size * jnp.cos(angle), size * jnp.sin(angle)]
 
 

@@ -28,7 +28,7 @@ import numpy as np
 
 from iblf_jax.core import checks, notices, tables
 from iblf_jax.core.pytree import component_member, field_values, wrapped_field
-from iblf_jax.simulation.scenario import MAKE_ONE, NUMBERS, Scenario, canonical
+from iblf_jax.simulation.scenario import HOW_TO_MAKE, NUMBERS, Scenario, canonical
 
 _BARE = r"[^\[\]]*[^\W\d_][^\[\]]*"
 """The name of a row that needs no quotes."""
@@ -84,13 +84,13 @@ def parameters(scenario: Scenario, *, named: bool = True) -> ParameterTable:
       A tuple of `Parameter`, which prints as a table.
     """
     _check_component(scenario)
-    return ParameterTable(_walk(scenario, "", checks.flag("named", named)))
+    return ParameterTable(_walk(scenario, "", checks.boolean("named", named)))
 
 
 def _check_component(scenario: Any) -> None:
     """Raises ValueError for something that has no fields."""
     if not _is_component(scenario):
-        raise checks.fail("scenario", scenario, "a Scenario", MAKE_ONE)
+        raise checks.fail("scenario", scenario, "a Scenario", HOW_TO_MAKE)
 
 
 def _is_component(part: Any) -> bool:
@@ -163,7 +163,7 @@ def _named_rows(part: Any, path: str) -> Iterator[Parameter]:
 
 
 def _quoted(name: str) -> str:
-    """The name of a row as it is written in a path."""
+    """The name of a row as a path contains it."""
     needs_no_quotes = re.fullmatch(_BARE, name) and name.isprintable() and not name.startswith('"')
     return name if needs_no_quotes else json.dumps(name)
 
@@ -225,7 +225,7 @@ def get(scenario: Scenario, path: str) -> Any:
 
 
 def places(scenario: Scenario, path: str) -> list[list[str | int]]:
-    """Fields and indices that lead to the numbers at a path, for each of its full paths."""
+    """The location of the numbers at a path, for each of its full paths: fields and indices."""
     return [_resolved(scenario, path, full)[0] for full in expand(path)]
 
 
@@ -241,7 +241,7 @@ def leaves(scenario: Scenario, path: str) -> list[str]:
 
 
 def _written(token: str | int) -> str:
-    """A field or an index as it is written in a path."""
+    """A field or an index as a path contains it."""
     return f"[{token}]" if isinstance(token, int) else f".{token}"
 
 

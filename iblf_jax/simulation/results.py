@@ -48,11 +48,9 @@ class Metrics(Mapping):
         if name.startswith("_") or name in ("values_by_name", "unit_pairs"):
             raise AttributeError(name)
         try:
-            return self.values_by_name[name]
-        except KeyError:
-            raise AttributeError(
-                f"no metric {name!r}; there are {', '.join(self.values_by_name)}"
-            ) from None
+            return self[name]
+        except KeyError as error:
+            raise AttributeError(error.args[0]) from None
 
     def __dir__(self) -> list[str]:
         return [*super().__dir__(), *self.values_by_name]

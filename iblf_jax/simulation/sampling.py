@@ -18,7 +18,7 @@ from iblf_jax.core.pytree import Leaf, component, leaf, static
 
 OBSERVER_STEPS = ("exact", "poles", "euler")
 DELAY_TOLERANCE = 1e-6
-"""A delay that is this near to a whole number of steps counts as one [steps]."""
+"""Largest distance [steps] at which a delay is rounded to a whole number of steps."""
 PERIOD_TOLERANCE = 1e-4
 """Largest relative distance of a period from a whole number of steps."""
 
@@ -58,29 +58,21 @@ class Sampling:
     def check(self) -> None:
         """Raises ValueError for an unknown step of the observer or a queue that is too short."""
         checks.one_of("Sampling.observer", self.observer, OBSERVER_STEPS)
-        concrete, least = checks.is_concrete(self), 0
-        if concrete:
+        name, queue, least = "Sampling.queue", self.queue, 0
+        if checks.is_concrete(self):
             checks.time_span("Sampling.period", self.period)
             checks.time_span("Sampling.delay", self.delay, zero=True)
             least = self.needed
-        if self.queue is None:
-            if not concrete:
-                raise checks.fail(
-                    "Sampling.queue",
-                    None,
-                    "a whole number, where period or delay is traced",
-                    "Such as queue=1.",
-                )
-            object.__setattr__(self, "queue", least)
-        object.__setattr__(
-            self, "queue", checks.positive_integer("Sampling.queue", self.queue, least=0)
-        )
-        if self.queue < least:
-            raise checks.fail(
-                "Sampling.queue",
-                self.queue,
-                f"at least {least}, for a delay of {float(self.delay):g} s",
-            )
+            if queue is None:
+                queue = least
+        if queue is None:
+            expected = "a whole number, where period or delay is traced"
+            raise checks.fail(name, None, expected, "Such as queue=1.")
+        queue = checks.positive_integer(name, queue, least=0)
+        if queue < least:
+            expected = f"at least {least}, for a delay of {float(self.delay):g} s"
+            raise checks.fail(name, queue, expected)
+        object.__setattr__(self, "queue", queue)
 
     @property
     def needed(self) -> int:
@@ -118,21 +110,23 @@ def instant(sampling: Sampling, dt: jax.Array, index: jax.Array) -> Instant:
     return Instant(sample, index - sample * steps)
 
 
-class Arriving(NamedTuple):
-    """The torque of a step, (n,) each [N m]."""
+class StepTorques(NamedTuple):
+    """The torques of a step, (n,) each [N m], and the time of the change between them."""
 
     torque: jax.Array
     """From the start of the step."""
     next: jax.Array
     """From the arrival of the next command."""
-    place: jax.Array
-    """Its position in the step, () [1]: 0 is the start, 1 the end; 1 where none arrives."""
-    changes: jax.Array
-    """Whether a command arrives, at the end of the step at the latest, () bool."""
+    arrival: jax.Array
+    """Its arrival, counted from the start of the step, () [steps]; 1 where none arrives."""
+    arrives: jax.Array
+    """Whether a command arrives in the step or at its end, () bool."""
 
 
-def arriving(sampling: Sampling, dt: jax.Array, now: Instant, commands: jax.Array) -> Arriving:
-    """The torque of a step that may change once within it.
+def step_torques(
+    sampling: Sampling, dt: jax.Array, now: Instant, commands: jax.Array
+) -> StepTorques:
+    """The torques of a step, within which the torque may change once.
 
     A command that arrives at the end of a step belongs to that step, so that its torque has a
     derivative by the delay there, too.
@@ -146,11 +140,12 @@ def arriving(sampling: Sampling, dt: jax.Array, now: Instant, commands: jax.Arra
     if sampling.queue == 0:
         one = jnp.ones_like(dt)
         torque = _if_consistent(sampling, dt, sampling.delay, commands[0])
-        return Arriving(torque, commands[0], one, one < 0)
-    age, place, changes = _arrival(sampling, dt, now.phase)
-    old, new = (_chosen(commands, age - back) for back in (0.0, 1.0))
+        return StepTorques(torque, commands[0], one, one < 0)
+    age, arrival, arrives = _arrival(sampling, dt, now.phase)
+    old = _command_at(commands, age)
+    new = _command_at(commands, age - 1.0)
     torque = _if_consistent(sampling, dt, age, old)
-    return Arriving(torque, new, jnp.where(changes, place, 1.0), changes)
+    return StepTorques(torque, new, jnp.where(arrives, arrival, 1.0), arrives)
 
 
 def _arrival(
@@ -170,8 +165,8 @@ def _arrival(
     delay = delay + jax.lax.stop_gradient(correction)
     steps, phase = _steps(sampling, dt), phase.astype(dt.dtype)
     age = jnp.maximum(jnp.ceil(jax.lax.stop_gradient(delay - phase) / steps), 0.0)
-    place = delay - phase - (age - 1.0) * steps
-    return age, place, (age > 0) & (place <= 1.0)
+    arrival = delay - phase - (age - 1.0) * steps
+    return age, arrival, (age > 0) & (arrival <= 1.0)
 
 
 def arrival_before(
@@ -183,8 +178,8 @@ def arrival_before(
     if sampling.queue == 0:
         return None
     steps = _steps(sampling, dt).astype(now.phase.dtype)
-    _, place, changes = _arrival(sampling, dt, jnp.where(now.phase == 0, steps, now.phase) - 1)
-    return place * dt, changes
+    _, arrival, arrives = _arrival(sampling, dt, jnp.where(now.phase == 0, steps, now.phase) - 1)
+    return arrival * dt, arrives
 
 
 def torque_before(
@@ -203,23 +198,23 @@ def torque_before(
     # A command that arrives with the sample belongs to the step before, so the active command is at
     # least one sample old.
     age, _, _ = _arrival(sampling, dt, jnp.zeros((), jnp.int32))
-    return _chosen(after, jnp.maximum(age, 1.0))
+    return _command_at(after, jnp.maximum(age, 1.0))
 
 
 def _if_consistent(
     sampling: Sampling, dt: jax.Array, age: jax.Array, torque: jax.Array
 ) -> jax.Array:
-    """The torque; NaN where a command has left the queue before its arrival, or where a period is
-    not a whole number of steps.
+    """The torque; NaN where its command left the queue before it arrived, or where a period is not
+    a whole number of steps.
     """
     steps = sampling.period / dt
     is_whole = jnp.abs(steps - _steps(sampling, dt)) <= PERIOD_TOLERANCE * steps
     return jnp.where((age <= sampling.queue) & is_whole, torque, jnp.nan)
 
 
-def _chosen(commands: jax.Array, place: jax.Array) -> jax.Array:
-    """The command at a place in the queue, which is a floating-point number."""
+def _command_at(commands: jax.Array, position: jax.Array) -> jax.Array:
+    """The command at a position in the queue, a whole number of floating-point type."""
     found = commands[0]
     for k in range(1, len(commands)):
-        found = jnp.where(place >= k, commands[k], found)
+        found = jnp.where(position >= k, commands[k], found)
     return found

@@ -1,4 +1,4 @@
-"""A scenario: everything that defines a run except its length and its step.
+"""A scenario: everything that defines a run except its duration and its time step.
 
 The plant (the simulated robot) and the model (the robot that law and observer know) are separate
 objects. By default the model is the plant; give `model`, or perturb leaves of `plant` only, to let
@@ -44,7 +44,7 @@ from iblf_jax.core.status import VELOCITY_LIMIT
 from iblf_jax.core.time import joined, jump_times_of
 from iblf_jax.simulation.sampling import PERIOD_TOLERANCE, Sampling
 from iblf_jax.world import regions
-from iblf_jax.world.bounds import Bounds, speed_limits_at
+from iblf_jax.world.bounds import Bounds, Side, speed_limits_at
 from iblf_jax.world.disturbances import Disturbance, Nothing
 from iblf_jax.world.references import Reference
 from iblf_jax.world.robots import Robot
@@ -71,19 +71,33 @@ PROTOCOLS = {
     "reference": (Reference, "iblf_jax.references has them."),
     "controller": (
         Controller,
-        "iblf_jax.controllers has them; iblf_jax.testing.check_law looks at your own.",
+        "iblf_jax.controllers has them; iblf_jax.testing.check_law checks your own.",
     ),
     "observer": (Observer, "iblf_jax.observers has them; NoObserver() for none."),
     "disturbance": (Disturbance, "iblf_jax.disturbances has them; Nothing() for none."),
     "sensor": (Sensor, "iblf_jax.sensors has them; Ideal() for none."),
     "actuator": (Actuator, "iblf_jax.actuators has them; Ideal() for none."),
 }
-"""Protocol and remedy for each part of a scenario that a user may write."""
+"""Part of a scenario that a user may write -> its protocol, and the remedy of an error message."""
+CLASSES: dict[str, tuple[Any, str]] = {
+    "initial": (Initial, "an Initial, such as Initial(q=[0.8, 0.8])"),
+    "bounds": (Bounds, "a Bounds, such as Bounds(lower=Constant(0.1), upper=Constant(0.9))"),
+    "velocity_bounds": (
+        Bounds | None,
+        "a Bounds, or None, such as Bounds(lower=Constant(-1.0), upper=Constant(1.0))",
+    ),
+    "sampling": (Sampling | None, "a Sampling, or None, such as ij.Sampling(period=2e-3)"),
+    "regions": (
+        tuple | list,
+        "a tuple of regions, such as (ij.regions.HalfSpace(normal=[0, 1], offset=0.1),)",
+    ),
+}
+"""Class of each other part, and its description in an error message."""
 OPTIONAL_MEMBERS = ("skeleton",)
 """Members of these protocols that a part may lack."""
 
-MAKE_ONE = "Make one with ij.presets or ij.Scenario."
-OF_VELOCITY = {
+HOW_TO_MAKE = "Make one with ij.presets or ij.Scenario."
+VELOCITY_UNITS = {
     "units": dict.fromkeys(("value", "offset", "amplitude", "initial", "final"), "rad/s")
 }
 """Units of the leaves of bounds on velocities: leaf -> unit."""
@@ -91,8 +105,7 @@ OF_VELOCITY = {
 
 @component
 class Scenario:
-    """Plant, model, reference, bounds, disturbance, law, observer and start of a run; and sampling,
-    sensor and actuator of the law.
+    """The plant, the control system and the start of a run.
 
     Leaves with one number per joint may be given as a scalar; it is repeated for the plant's n
     joints.
@@ -104,18 +117,19 @@ class Scenario:
       controller: the law, any of `iblf_jax.controllers`.
       initial: position and velocity at the start, an `Initial`.
       observer: estimator of f, any of `iblf_jax.observers`; `NoObserver()` if not given.
-      disturbance: torque on the plant that the law does not know, any of `iblf_jax.disturbances`;
+      disturbance: torque on the plant that is unknown to the law, any of `iblf_jax.disturbances`;
         `Nothing()` if not given.
       model: the robot that law and observer know; the plant itself if not given.
       sampling: timing of law and observer, a `Sampling`; continuous time if not given.
       sensor: measurement of q and q', any of `iblf_jax.sensors`; `Ideal()` if not given.  Others
         need a sampling.
-      actuator: from the command to the torque, any of `iblf_jax.actuators`; `Ideal()` if not given.
+      actuator: map from command to torque, any of `iblf_jax.actuators`; `Ideal()` if not given.
       velocity_bounds: constraints on the joint velocities, a `bounds.Bounds` [rad/s] whose funnels
         follow q_d'; none if not given.  Runs record their margins under every law;
         `controllers.FullState` enforces them.
-      regions: where points of the robot must stay, a tuple of any of `iblf_jax.regions`; () if not
-        given.  Runs record their margins under every law; `controllers.SafetyFilter` enforces them.
+      regions: sets in which points of the robot must stay, a tuple of any of `iblf_jax.regions`; ()
+        if not given.  Runs record their margins under every law; `controllers.SafetyFilter`
+        enforces them.
 
     Raises:
       ValueError: if a leaf has the wrong number of joints, model and plant differ in theirs, or a
@@ -133,12 +147,12 @@ class Scenario:
     sampling: Sampling | None = None
     sensor: Sensor = IdealSensor()
     actuator: Actuator = IdealActuator()
-    velocity_bounds: Bounds | None = dataclasses.field(default=None, metadata=OF_VELOCITY)
+    velocity_bounds: Bounds | None = dataclasses.field(default=None, metadata=VELOCITY_UNITS)
     regions: tuple[regions.Region, ...] = ()
 
     def check(self) -> None:
-        """Completes the model, checks the parts, and gives every leaf with one number per joint its
-        n entries.
+        """Checks the parts, makes the plant the model if none is given, and repeats scalars for the
+        n joints.
         """
         if self.model is None:
             object.__setattr__(self, "model", self.plant)
@@ -153,32 +167,10 @@ class Scenario:
 
     def _check_classes(self) -> None:
         """Raises ValueError for a part of the wrong class."""
-        classes: dict[str, tuple[Any, Any, str]] = {
-            "initial": (self.initial, Initial, "an Initial, such as Initial(q=[0.8, 0.8])"),
-            "bounds": (
-                self.bounds,
-                Bounds,
-                "a Bounds, such as Bounds(lower=Constant(0.1), upper=Constant(0.9))",
-            ),
-            "velocity_bounds": (
-                self.velocity_bounds,
-                Bounds | None,
-                "a Bounds, or None, such as Bounds(lower=Constant(-1.0), upper=Constant(1.0))",
-            ),
-            "sampling": (
-                self.sampling,
-                Sampling | None,
-                "a Sampling, or None, such as ij.Sampling(period=2e-3)",
-            ),
-            "regions": (
-                self.regions,
-                tuple | list,
-                "a tuple of regions, such as (ij.regions.HalfSpace(normal=[0, 1], offset=0.1),)",
-            ),
-        }
-        for name, (value, kind, expected) in classes.items():
-            if not isinstance(value, kind):
-                raise checks.fail(f"Scenario.{name}", value, expected)
+        parts = field_values(self)
+        for name, (kind, expected) in CLASSES.items():
+            if not isinstance(parts[name], kind):
+                raise checks.fail(f"Scenario.{name}", parts[name], expected)
 
     def _check_combination(self) -> None:
         """Raises ValueError for parts that do not fit together."""
@@ -255,7 +247,7 @@ def _check_region(name: str, region: regions.Region, robot: Robot) -> None:
     except Exception as error:
         kind = checks.with_article(type(robot).__name__)
         expected = f"a region for a point of {kind} of {robot.n} joints"
-        reason = f"{type(error).__name__}: {checks.line(str(error))}"
+        reason = f"{type(error).__name__}: {checks.one_line(str(error))}"
         raise checks.fail(name, region, expected, reason) from error
 
 
@@ -283,7 +275,7 @@ def with_parts(scenario: Scenario, **parts: Any) -> Scenario:
         that differ in their number of joints.
     """
     if not isinstance(scenario, Scenario):
-        raise checks.fail("scenario", scenario, "a Scenario", MAKE_ONE)
+        raise checks.fail("scenario", scenario, "a Scenario", HOW_TO_MAKE)
     names = ("robot", *(field.name for field in dataclasses.fields(Scenario)))
     for name in parts:
         if name not in names:
@@ -361,13 +353,13 @@ NUMBERS = (jax.Array, np.ndarray, np.generic, float, int)
 """Types of leaves."""
 
 
-def check_values(part: Any, path: str = "") -> None:
+def check_leaves(part: Any, path: str = "") -> None:
     """Raises ValueError for the first concrete leaf that is not finite or has the wrong sign, with
     its path.
     """
     if isinstance(part, tuple):
         for i, x in enumerate(part):
-            check_values(x, f"{path}[{i}]")
+            check_leaves(x, f"{path}[{i}]")
         return
     if not dataclasses.is_dataclass(part) or isinstance(part, type):
         return
@@ -380,7 +372,7 @@ def check_values(part: Any, path: str = "") -> None:
         if isinstance(value, NUMBERS):
             checks.check_values(name, value, field.metadata.get("sign"))
         else:
-            check_values(value, name)
+            check_leaves(value, name)
 
 
 def canonical(scenario: Scenario) -> Scenario:
@@ -393,9 +385,9 @@ def canonical(scenario: Scenario) -> Scenario:
         the field, the value and the remedy.
     """
     if not isinstance(scenario, Scenario):
-        raise checks.fail("scenario", scenario, "a Scenario", MAKE_ONE)
+        raise checks.fail("scenario", scenario, "a Scenario", HOW_TO_MAKE)
     keep_programs()
-    check_values(scenario)
+    check_leaves(scenario)
     scenario = _with_sufficient_queue(scenario)
     dtype = _shared_dtype(scenario)
     scenario = jax.tree.map(lambda x: _typed(x, dtype), scenario)
@@ -421,7 +413,7 @@ def _with_sufficient_queue(scenario: Scenario) -> Scenario:
 
 
 def _advice(scenario: Scenario) -> list[str]:
-    """The warnings of the parts about their numbers."""
+    """The warnings of the parts about their parameter values."""
     advice = law_member(scenario.controller, "advice")()
     advice = advice + observer_member(scenario.observer, "advice")()
     if scenario.sampling is not None:
@@ -477,7 +469,7 @@ def check_step(scenario: Scenario, dt: float) -> None:
 # --- checks of the start -------------------------------------------------------------------------
 
 
-class _Start(NamedTuple):
+class _InitialValues(NamedTuple):
     """Reference, bounds and margins at t = 0."""
 
     q_d: Any
@@ -489,16 +481,20 @@ class _Start(NamedTuple):
 
 
 @jax.jit
-def _at_start(scenario: Scenario) -> _Start:
-    """Reference and bounds at the start. Shapes are checked while this is traced, once per
+def _initial_values(scenario: Scenario) -> _InitialValues:
+    """The values at the start. Their shapes are checked while this is traced, once per
     structure.
     """
     n, q, dq = scenario.n, scenario.initial.q, scenario.initial.dq
     t, plant, model = jnp.zeros((), q.dtype), scenario.plant, scenario.model
-    reference, bounds, of_speeds = scenario.reference, scenario.bounds, scenario.velocity_bounds
+    reference, velocity_bounds = scenario.reference, scenario.velocity_bounds
     q_d = _shaped("reference.position(t)", partial(reference.position, t), n)
-    lower = _shaped("bounds.lower.at(t, q_d)", partial(bounds.lower.at, t, q_d), n)
-    upper = _shaped("bounds.upper.at(t, q_d)", partial(bounds.upper.at, t, q_d), n)
+
+    def limit(name: str, side: Side) -> jax.Array:
+        return _shaped(name, partial(side.at, t, q_d), n)
+
+    lower = limit("bounds.lower.at(t, q_d)", scenario.bounds.lower)
+    upper = limit("bounds.upper.at(t, q_d)", scenario.bounds.upper)
     for name, robot in (("plant", plant), ("model", model)):
         _shaped(f"{name}.mass_matrix(q)", partial(robot.mass_matrix, q), n, n)
         _shaped(f"{name}.coriolis(q, v, u)", partial(robot.coriolis, q, dq, dq), n)
@@ -506,14 +502,14 @@ def _at_start(scenario: Scenario) -> _Start:
     torque = partial(scenario.disturbance.torque, t, q, dq, plant, model)
     _shaped("disturbance.torque(t, q, dq, plant, model)", torque, n)
     speed_limits = None
-    if of_speeds is not None:
-        _shaped("velocity_bounds.lower.at(t, dq_d)", partial(of_speeds.lower.at, t, q_d), n)
-        _shaped("velocity_bounds.upper.at(t, dq_d)", partial(of_speeds.upper.at, t, q_d), n)
-        speed_limits = speed_limits_at(reference, of_speeds, t)
+    if velocity_bounds is not None:
+        limit("velocity_bounds.lower.at(t, dq_d)", velocity_bounds.lower)
+        limit("velocity_bounds.upper.at(t, dq_d)", velocity_bounds.upper)
+        speed_limits = speed_limits_at(reference, velocity_bounds, t)
     margins = q[:0]
     if scenario.regions:
         margins = regions.margins(scenario.regions, plant, q)
-    return _Start(q_d, lower, upper, speed_limits, margins)
+    return _InitialValues(q_d, lower, upper, speed_limits, margins)
 
 
 def _shaped(name: str, call: Callable[[], jax.Array], *shape: int) -> jax.Array:
@@ -533,12 +529,8 @@ def _check_start(scenario: Scenario) -> None:
     """Raises ValueError for a start outside its bounds or too fast, or a mass matrix there that is
     not positive definite.
     """
-    start = jax.tree.map(np.asarray, _at_start(scenario))
+    start = jax.tree.map(np.asarray, _initial_values(scenario))
     q, dq = np.asarray(scenario.initial.q), np.asarray(scenario.initial.dq)
-    masses = {
-        name: np.asarray(mass_matrix_at(robot, scenario.initial.q))
-        for name, robot in (("plant", scenario.plant), ("model", scenario.model))
-    }
     finite = {"reference": start.q_d, "bounds.lower": start.lower, "bounds.upper": start.upper}
     for name, values in finite.items():
         if not np.all(np.isfinite(values)):
@@ -549,9 +541,9 @@ def _check_start(scenario: Scenario) -> None:
     remedy = "Move the start or widen the bounds."
     _check_inside("initial.q[{}]", "bounds", q, start.lower, start.upper, remedy)
     if start.speed_limits is not None:
-        slow, fast = start.speed_limits
-        _check_order("velocity_bounds", slow, fast)
-        _check_inside("initial.dq[{}]", "velocity bounds", dq, slow, fast, remedy)
+        slowest, fastest = start.speed_limits
+        _check_order("velocity_bounds", slowest, fastest)
+        _check_inside("initial.dq[{}]", "velocity bounds", dq, slowest, fastest, remedy)
     for region, margin in zip(scenario.regions, start.region_margins, strict=True):
         if not margin > 0:
             point = regions.in_words(region, scenario.plant)
@@ -561,12 +553,13 @@ def _check_start(scenario: Scenario) -> None:
     if not np.all(np.abs(dq) < VELOCITY_LIMIT):
         expected = f"speeds below {VELOCITY_LIMIT:g} rad/s"
         raise checks.fail("initial.dq", dq, expected, "A run that fast counts as diverged.")
-    for name, matrix in masses.items():
+    for name, robot in (("plant", scenario.plant), ("model", scenario.model)):
+        matrix = np.asarray(mass_matrix_at(robot, scenario.initial.q))
         _check_mass_matrix(f"{name}.mass_matrix(initial.q)", matrix)
 
 
 def _check_order(name: str, lower: np.ndarray, upper: np.ndarray) -> None:
-    """Raises ValueError for bounds that leave no room between them at t = 0."""
+    """Raises ValueError where a lower bound is not below its upper bound at t = 0."""
     for i, (low, high) in enumerate(zip(lower, upper, strict=True)):
         if not low < high:
             expected, remedy = "finite lower < upper at t = 0", "Exchange or widen them."
@@ -576,8 +569,8 @@ def _check_order(name: str, lower: np.ndarray, upper: np.ndarray) -> None:
 def _check_inside(
     name: str, bounds: str, values: np.ndarray, lower: np.ndarray, upper: np.ndarray, remedy: str
 ) -> None:
-    """Raises ValueError for a value that is not between its bounds; `{}` in the name stands for the
-    number of the joint.
+    """Raises ValueError for a value that is not between its bounds; `{}` in the name is replaced by
+    the index of the joint.
     """
     for i, (value, low, high) in enumerate(zip(values, lower, upper, strict=True)):
         if not low < value < high:

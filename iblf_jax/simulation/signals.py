@@ -1,4 +1,4 @@
-"""The signals of a closed loop: the only list of their names, units and meanings."""
+"""The signals of a closed loop, with the only list of their names, units and meanings."""
 
 from __future__ import annotations
 
@@ -39,24 +39,19 @@ class Signals:
     disturbance_estimate: Annotated[Array, Recorded("N m", "estimate of the uncertain term")]
     V: Annotated[Array, Recorded("1", "Lyapunov function V2")]
     """Of (3.12), ()."""
-    dq_lower: Annotated[Any, Recorded("rad/s", "lower bound of dq")] = dataclasses.field(
-        default=(), kw_only=True
-    )
+    _: dataclasses.KW_ONLY
+    dq_lower: Annotated[Any, Recorded("rad/s", "lower bound of dq")] = ()
     """`()` where velocities have no bounds."""
-    dq_upper: Annotated[Any, Recorded("rad/s", "upper bound of dq")] = dataclasses.field(
-        default=(), kw_only=True
-    )
-    slack: Annotated[
-        Any, Recorded("rad/s^2", "how far the law's filter broke its own conditions")
-    ] = dataclasses.field(default=(), kw_only=True)
+    dq_upper: Annotated[Any, Recorded("rad/s", "upper bound of dq")] = ()
+    slack: Annotated[Any, Recorded("rad/s^2", "violation of the safety filter's conditions")] = ()
     """`()` under laws without a filter."""
     region_margin: Annotated[
-        Any, Recorded("m", "distance of the regions' points to their walls")
-    ] = dataclasses.field(default=(), kw_only=True)
+        Any, Recorded("m", "distance of the regions' points to their boundaries")
+    ] = ()
     """One number a region; `()` where there are none."""
     region_slack: Annotated[
-        Any, Recorded("m/s^2", "how far the law's filter broke its own conditions on the regions")
-    ] = dataclasses.field(default=(), kw_only=True)
+        Any, Recorded("m/s^2", "violation of the safety filter's conditions on the regions")
+    ] = ()
     """`()` without regions or without a filter."""
 
 
@@ -77,7 +72,7 @@ class Sample(Signals):
     guard_active: Array
     saturated: Array
     step: Any = dataclasses.field(default=0.0, kw_only=True)
-    """Time since the instant before, () [s]; 0 for the first instant, and for the two samples at a
+    """Time since the previous instant, () [s]; 0 for the first instant and the two samples at a
     jump."""
 
 
@@ -93,15 +88,15 @@ def speed_margin(sample: Sample, velocity: Array) -> Array:
     return jnp.minimum(velocity - sample.dq_lower, sample.dq_upper - velocity)
 
 
-OF_REGIONS = ("region_margin", "region_slack", "largest_region_slack")
+PER_REGION = ("region_margin", "region_slack", "largest_region_slack")
 """Signals and metrics with one number per region."""
 
 
-def own_dims(name: str, shape: tuple[int, ...], joints: int) -> tuple[str, ...]:
+def dimension_names(name: str, shape: tuple[int, ...], joints: int) -> tuple[str, ...]:
     """Names of the dimensions of a signal at one instant, or of a metric of one run: "joint" for
     (n,), "region" for one number per region, else names of its own.
     """
-    if name in OF_REGIONS:
+    if name in PER_REGION:
         return ("region",)
     if shape == (joints,):
         return ("joint",)
@@ -111,5 +106,6 @@ def own_dims(name: str, shape: tuple[int, ...], joints: int) -> tuple[str, ...]:
 SIGNALS: dict[str, Recorded] = {
     name: hint.__metadata__[0]
     for name, hint in get_type_hints(Signals, include_extras=True).items()
+    if name != "_"
 }
 """Name of a recorded signal -> its unit and meaning, time first."""

@@ -14,7 +14,7 @@ says nothing about the time step: an oscillation that a step excites stops growi
 at which the difference quotient is small enough. A smooth loop has the same derivative by
 differences of any small size. Every derivative is therefore measured by differences of three sizes,
 h0, 10 h0 and THIRD_SIZE (less near a bound, where the barrier is stiff). Where one of the larger
-ones gives much less than h0, the one of THIRD_SIZE counts (`resolved`).
+ones gives much less than h0, the one of THIRD_SIZE counts (`resolved_jacobian`).
 
 Stability of a sampled loop is that of the map from one period to the next. The derivative of the
 map follows from those of plant and law: the plant's state evolves with exp(A t), A the derivative
@@ -42,21 +42,21 @@ from iblf_jax.simulation.closed_loop import (
 from iblf_jax.simulation.scenario import Scenario
 
 POWER_ITERATIONS, AVERAGED_STEPS = 48, 16
-"""Steps of the power iteration, and the number of the last steps in its average: a power of two,
-and a third of the steps."""
+"""Iterations of the power iteration, and the number of last iterations over which it averages: a
+power of two, and a third of the iterations."""
 TAYLOR_TERMS, HALVINGS = 8, 8
-"""Terms of the Taylor series of a flow, and halvings of its time before: exact to rounding for
-|A| t up to 30."""
+"""Terms of the Taylor series of a flow, and the number of times its duration is halved first: exact
+to rounding for |A| t up to 30."""
 SQUARINGS = 20
-"""Squarings of a map for its spectral radius."""
+"""Number of times a map is squared to compute its spectral radius."""
 RADIUS = "sampling_radius"
-"""Name of the spectral radius among the results of a sampled run."""
+"""Name of the spectral radius among the metrics of a sampled run."""
 SECOND_SIZE, THIRD_SIZE = 10.0, 1e-2
-"""The second size of a difference, relative to the first, and the third [rad/s or the state's
-unit]: an oscillation of 0.01 rad/s with the period of a few steps moves the positions by some 1e-5
+"""The second size of a difference, relative to the first, and the third [rad/s, or the unit of the
+state]. An oscillation of 0.01 rad/s with a period of a few steps moves the positions by only 1e-5
 rad."""
 THIRD_SIZE_OF_POSITION = 1e-3
-"""rad.  The third size of a difference in a position."""
+"""The third size of a difference in a position [rad]."""
 MAX_BOUND_FRACTION = 0.25
 """Largest size of a difference, relative to the distance from a bound."""
 INFINITE_RATIO = 0.8
@@ -66,65 +66,73 @@ SLOWEST_RATE = 1.0
 """Rate of the slowest mode of a loop that follows a reference [1/s]."""
 
 
-class Growth(NamedTuple):
-    """State of the power iteration: a direction of length one, and the sum of the last logarithms
-    of its growth.
-    """
+class PowerIteration(NamedTuple):
+    """State of the power iteration."""
 
     direction: jax.Array
-    total: jax.Array
+    """A unit vector, (m,)."""
+    log_growth: jax.Array
+    """Sum of the logarithms of its growth over the last iterations, ()."""
 
 
-def growth_start(x: jax.Array) -> Growth:
-    """A direction that no mode is orthogonal to, for a state (m,)."""
+def power_iteration_start(x: jax.Array) -> PowerIteration:
+    """The start of the power iteration for a state x, (m,), with a direction that no mode is
+    orthogonal to.
+    """
     start = jnp.cos(jnp.arange(1, x.size + 1, dtype=x.dtype))
-    return Growth(start / jnp.sqrt(jnp.sum(start**2)), jnp.zeros((), x.dtype))
+    return PowerIteration(start / jnp.sqrt(jnp.sum(start**2)), jnp.zeros((), x.dtype))
 
 
-def grown(growth: Growth, w: jax.Array, iteration: jax.Array) -> Growth:
-    """The growth after one of POWER_ITERATIONS; w is the Jacobian times the direction."""
+def power_iteration_step(
+    growth: PowerIteration, w: jax.Array, iteration: jax.Array
+) -> PowerIteration:
+    """The state after one of POWER_ITERATIONS; w is the Jacobian times the direction."""
     size = jnp.maximum(jnp.sqrt(jnp.sum(w * w)), jnp.finfo(w.dtype).tiny)
     counted = iteration >= POWER_ITERATIONS - AVERAGED_STEPS
-    return Growth(w / size, growth.total + jnp.where(counted, jnp.log(size), jnp.zeros_like(size)))
+    return PowerIteration(
+        w / size, growth.log_growth + jnp.where(counted, jnp.log(size), jnp.zeros_like(size))
+    )
 
 
-def growth_rate(growth: Growth) -> jax.Array:
-    """The rate of the fastest mode, () [1/s]; the average over iterations covers a pair of complex
-    modes, too.
+def growth_rate(growth: PowerIteration) -> jax.Array:
+    """The rate of the fastest mode, () [1/s]. The average over iterations makes it valid for a pair
+    of complex modes, too.
     """
-    return jnp.exp(growth.total / AVERAGED_STEPS)
+    return jnp.exp(growth.log_growth / AVERAGED_STEPS)
 
 
-def growth_rate_by(jacobian: jax.Array) -> jax.Array:
-    """The rate that the power iteration of a Jacobian gives, () [1/s], from J^16 and J^32 by
-    squaring.
+def growth_rate_of_matrix(jacobian: jax.Array) -> jax.Array:
+    """The `growth_rate` of a power iteration with a Jacobian J, () [1/s].
+
+    It is (|J^48 v| / |J^32 v|)^(1/16) for the direction v at the start; repeated squaring gives the
+    powers of J.
     """
     tiny = jnp.finfo(jacobian.dtype).tiny
 
     def squared(_, powers):
-        _, last, logarithm = powers
-        size = jnp.maximum(jnp.max(jnp.abs(last)), tiny)
-        last = last / size
-        return last, matmul_in_order(last, last), 2.0 * (logarithm + jnp.log(size))
+        _, power, log_factor = powers
+        size = jnp.maximum(jnp.max(jnp.abs(power)), tiny)
+        power = power / size
+        return power, matmul_in_order(power, power), 2.0 * (log_factor + jnp.log(size))
 
-    # After the loop: J^AVERAGED_STEPS and its square, each up to a factor, and the logarithm of the
-    # factor of the square.
+    def log_length(w):
+        return jnp.log(jnp.maximum(jnp.sqrt(matmul_in_order(w.T, w)[0, 0]), tiny))
+
+    # J^16 and J^32, each up to a factor, and the logarithm of the factor of J^32.
     powers = (jacobian, jacobian, jnp.zeros((), jacobian.dtype))
-    last, first, logarithm = jax.lax.fori_loop(0, AVERAGED_STEPS.bit_length(), squared, powers)
-    before = matmul_in_order(first, growth_start(jacobian[0]).direction[:, None])
-    after = matmul_in_order(last, before)
-    lengths = [
-        jnp.log(jnp.maximum(jnp.sqrt(matmul_in_order(w.T, w)[0, 0]), tiny)) for w in (before, after)
-    ]
-    return jnp.exp((logarithm / 2.0 + lengths[1] - lengths[0]) / AVERAGED_STEPS)
+    J16, J32, log_factor = jax.lax.fori_loop(0, AVERAGED_STEPS.bit_length(), squared, powers)
+    before = matmul_in_order(J32, power_iteration_start(jacobian[0]).direction[:, None])
+    after = matmul_in_order(J16, before)
+    growth = log_factor / 2.0 + log_length(after) - log_length(before)
+    return jnp.exp(growth / AVERAGED_STEPS)
 
 
-def difference_sizes(x: jax.Array, direction: jax.Array, room: jax.Array) -> jax.Array:
-    """The three sizes of central differences at x along a direction, (3,); `room` is the largest
+def difference_sizes(x: jax.Array, direction: jax.Array, largest: jax.Array) -> jax.Array:
+    """The three sizes of central differences at x along a direction, (3,); `largest` is the largest
     useful one, ().
     """
     first = jnp.finfo(x.dtype).eps ** (1 / 3) * jnp.maximum(1.0, jnp.sum(jnp.abs(x * direction)))
-    third = jnp.maximum(first, room)
+    third = jnp.maximum(first, largest)
     return jnp.stack([first, jnp.minimum(SECOND_SIZE * first, third), third])
 
 
@@ -155,7 +163,7 @@ def largest_difference_sizes(
     return jnp.concatenate([*near, rest])
 
 
-def is_steep(jacobians: jax.Array, sampled: bool) -> jax.Array:
+def has_infinite_derivative(jacobians: jax.Array, sampled: bool) -> jax.Array:
     """Which columns of a Jacobian are infinite derivatives or nearly so, (..., m) bool.
 
     Args:
@@ -171,11 +179,13 @@ def is_steep(jacobians: jax.Array, sampled: bool) -> jax.Array:
     return larger < INFINITE_RATIO * lengths[..., 0, :]
 
 
-def resolved(jacobians: jax.Array, sampled: bool) -> jax.Array:
-    """The Jacobian that counts, (..., m, m), from those by differences of three sizes, (..., 3, m,
-    m), as for `is_steep`.
+def resolved_jacobian(jacobians: jax.Array, sampled: bool) -> jax.Array:
+    """One Jacobian, (..., m, m), from those by differences of three sizes, (..., 3, m, m).
+
+    A column with an infinite derivative is that of the largest size, and others are that of the
+    smallest.
     """
-    steep = is_steep(jacobians, sampled)[..., None, :]
+    steep = has_infinite_derivative(jacobians, sampled)[..., None, :]
     return jnp.where(steep, jacobians[..., 2, :, :], jacobians[..., 0, :, :])
 
 
@@ -185,7 +195,7 @@ def jacobian(scenario: Scenario, t: jax.Array, state: LoopState) -> jax.Array:
     closed loop [1/s] where the law is not sampled.
     """
     x, unflatten = ravel_pytree(perturbed_state(state))
-    room = largest_difference_sizes(scenario, t, state, x.size)
+    largest = largest_difference_sizes(scenario, t, state, x.size)
 
     def rate_at(y):
         return ravel_pytree(perturbed_rate(scenario, t, unflatten(y)))[0]
@@ -195,10 +205,10 @@ def jacobian(scenario: Scenario, t: jax.Array, state: LoopState) -> jax.Array:
         return directional_derivative(rate_at, x, unit, size)
 
     units = jnp.eye(x.size, dtype=x.dtype)
-    sizes = jax.vmap(lambda unit, room: difference_sizes(x, unit, room))(units, room)
+    sizes = jax.vmap(partial(difference_sizes, x))(units, largest)
     found = jax.lax.map(column, (jnp.repeat(units, 3, axis=0), sizes.ravel()))
     by_size = jnp.transpose(found.reshape(x.size, 3, x.size), (1, 2, 0))
-    return resolved(by_size, scenario.sampling is not None)
+    return resolved_jacobian(by_size, scenario.sampling is not None)
 
 
 def flow(A: jax.Array, B: jax.Array, t: jax.Array) -> jax.Array:
@@ -223,7 +233,7 @@ def flow(A: jax.Array, B: jax.Array, t: jax.Array) -> jax.Array:
 
 
 def spectral_radius(A: jax.Array) -> jax.Array:
-    """The largest size of an eigenvalue, () [1]: |A^m|^(1/m) for m = 2^SQUARINGS."""
+    """The spectral radius max |lambda_i(A)|, () [1]: |A^m|^(1/m) for m = 2^SQUARINGS."""
     tiny = jnp.finfo(A.dtype).tiny
 
     def squared(k, found):
@@ -250,27 +260,24 @@ def period_map(scenario: Scenario, state: LoopState, derivative: jax.Array) -> j
     plant = ravel_pytree(integrated_part(state))[0].size
     memory = size - plant - n
     A, B = derivative[:plant, :plant], derivative[:plant, plant : plant + n]
-    # The law and the memory depend on the plant and the memory, not on the newest command.
-    known = jnp.concatenate([jnp.arange(plant), jnp.arange(plant + n, size)])
-    law_by_known = derivative[plant : plant + n, known]
-    memory_by_known = derivative[plant + n :, known]
+    # Law and memory depend on x, the plant and the memory, and not on the newest command.
+    x = jnp.concatenate([jnp.arange(plant), jnp.arange(plant + n, size)])
+    law_by_x = derivative[plant : plant + n, x]
+    memory_by_x = derivative[plant + n :, x]
     by_plant, by_command = _plant_over_period(sampling, A, B)
-    plant_by_known = jnp.concatenate(
-        [by_plant, jnp.zeros((plant, memory), A.dtype)], axis=1
-    ) + matmul_in_order(by_command[0], law_by_known)
 
     def zeros(rows: int, columns: int) -> jax.Array:
         return jnp.zeros((rows, columns), A.dtype)
 
-    rows = [
-        jnp.concatenate([plant_by_known, *by_command[1:]], axis=1),
-        jnp.concatenate([memory_by_known, zeros(memory, queue * n)], axis=1),
-    ]
+    def row(*blocks: jax.Array) -> jax.Array:
+        return jnp.concatenate(blocks, axis=1)
+
+    plant_by_x = row(by_plant, zeros(plant, memory)) + matmul_in_order(by_command[0], law_by_x)
+    rows = [row(plant_by_x, *by_command[1:]), row(memory_by_x, zeros(memory, queue * n))]
     if queue:
         older = (queue - 1) * n
-        shift = jnp.eye(older, queue * n, dtype=A.dtype)
-        rows.append(jnp.concatenate([law_by_known, zeros(n, queue * n)], axis=1))
-        rows.append(jnp.concatenate([zeros(older, plant + memory), shift], axis=1))
+        rows.append(row(law_by_x, zeros(n, queue * n)))
+        rows.append(row(zeros(older, plant + memory), jnp.eye(older, queue * n, dtype=A.dtype)))
     return jnp.concatenate(rows)
 
 
@@ -284,7 +291,7 @@ def _plant_over_period(
     if not sampling.queue:
         by_state, by_torque = jnp.split(flow(A, B, sampling.period), [plant], axis=1)
         return by_state, [by_torque]
-    # A delay of `periods` and a rest: the torque changes once within a period, after the rest.
+    # The delay is a number of periods and a rest; the torque changes once a period, after the rest.
     periods = jnp.floor(sampling.delay / sampling.period + 1e-9)
     rest = jnp.maximum(sampling.delay - periods * sampling.period, 0.0)
     before, after = jax.lax.map(partial(flow, A, B), jnp.stack([rest, sampling.period - rest]))
@@ -297,7 +304,7 @@ def _plant_over_period(
     return by_state, by_command
 
 
-def per_time(scenario: Scenario, state: LoopState, derivative: jax.Array) -> jax.Array:
+def period_map_as_rate(scenario: Scenario, state: LoopState, derivative: jax.Array) -> jax.Array:
     """The one-period map as a rate, (m, m) [1/s]: the rate at which errors of a sampled loop grow
     or decay.
     """

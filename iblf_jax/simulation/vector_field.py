@@ -181,11 +181,11 @@ def _layout(scenario: Scenario) -> LoopState:
 
 def _pack(scenario: Scenario, state: LoopState) -> jax.Array:
     leaves, structure = jax.tree.flatten(_layout(scenario))
-    shapes, of = [x.shape for x in leaves], jax.tree.structure(state)
+    shapes = [x.shape for x in leaves]
     expected = (
         f"a LoopState whose arrays have the shapes {shapes}, behind leading axes that all share"
     )
-    if of != structure:  # type: ignore[operator]
+    if jax.tree.structure(state) != structure:  # type: ignore[operator]
         raise checks.fail("state", state, expected)
     given = [checks.as_floats("state", x) for x in jax.tree.leaves(state)]
     lead = given[0].shape[: given[0].ndim - len(shapes[0])]

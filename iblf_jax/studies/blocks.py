@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.core.devices import chosen, default
+from iblf_jax.core.devices import default_devices, user_default
 from iblf_jax.core.status import Status, flag
 from iblf_jax.engine import block_size, blocks_in_flight, wait_until_ready
 from iblf_jax.studies.dataset import DRAWN
@@ -132,12 +132,12 @@ def run_blocks(
     """
     here = here or ThisProcess()
     remaining = iter(blocks)
-    devices = here.devices or default()
+    devices = here.devices or default_devices()
     # A block for each device, in order to know how many devices are needed.
     first_blocks = list(itertools.islice(remaining, len(devices)))
     if not first_blocks:
         return
-    places, chosen_device = devices[: len(first_blocks)], chosen()
+    places, chosen_device = devices[: len(first_blocks)], user_default()
     call = partial(_execute, program=prepared.program, record_every=record_every)
     copies = [jax.device_put(prepared.shared, place) for place in places]
     if len(places) > 1:

@@ -39,8 +39,8 @@ from iblf_jax.core.status import Status
 from iblf_jax.engine import Outcome, RunRequest, run_batch
 from iblf_jax.engine.simulate import simulate
 from iblf_jax.simulation.error_estimate import RELATIVE
-from iblf_jax.simulation.metrics import AboveGravity, as_folds, standard, watched
-from iblf_jax.simulation.noise import noise_of
+from iblf_jax.simulation.metrics import AboveGravity, as_folds, optional_folds, standard
+from iblf_jax.simulation.noise import noise_values
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical
@@ -87,7 +87,7 @@ def compare(
 
     Source: design of this package; the factor 2 is a fact about (3.1).
     """
-    scenario, equal_effort = canonical(scenario), checks.flag("equal_effort", equal_effort)
+    scenario, equal_effort = canonical(scenario), checks.boolean("equal_effort", equal_effort)
     named = _named_laws(laws)
     scenarios = {name: _with_law(scenario, law) for name, law in named.items()}
     options: dict[str, Any] = {
@@ -185,7 +185,7 @@ def _run(scenario: Scenario, options: Mapping[str, Any]) -> Rollout:
     """One run; a failure is named in the table, not warned of."""
     with notices.muted(UserWarning):
         return simulate(
-            scenario, metrics=(*standard(), *watched(scenario), AboveGravity()), **options
+            scenario, metrics=(*standard(), *optional_folds(scenario), AboveGravity()), **options
         )
 
 
@@ -256,7 +256,7 @@ def _trials_of(
     folds = as_folds((AboveGravity(),), dtype, scenario)
     steps = checks.whole_steps(options["duration"], options["dt"])
     request = RunRequest.of(scenario, steps=steps, method=options["method"])
-    noise = noise_of(scenario, jax.random.PRNGKey(0), 0)
+    noise = noise_values(scenario, jax.random.PRNGKey(0), 0)
 
     def trials(factors: np.ndarray) -> Trials:
         padded = np.resize(factors, size)

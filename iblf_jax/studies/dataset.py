@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from iblf_jax.core.status import Status, has_flag
-from iblf_jax.simulation.signals import own_dims
+from iblf_jax.simulation.signals import dimension_names
 
 if TYPE_CHECKING:
     import xarray
@@ -53,7 +53,10 @@ def to_dataset(
     variables: dict[str, Any] = {}
     for name, values in flat.items():
         shaped = values.reshape(*outer.values(), *values.shape[1:])
-        dims = (*outer, *own_dims(name.removeprefix(DRAWN), values.shape[1:], config["joints"]))
+        dims = (
+            *outer,
+            *dimension_names(name.removeprefix(DRAWN), values.shape[1:], config["joints"]),
+        )
         attributes = {"units": units.get(name, "")}
         by_point = values.reshape(-1, config["runs"], *values.shape[1:])
         if name.startswith(DRAWN) and np.all(done) and _is_the_same_at_every_point(by_point):
@@ -127,7 +130,7 @@ def _coordinates(config: dict[str, Any]) -> dict[str, Any]:
             )
             path = f"{path}_values"
         found[path] = (
-            (place["along"], *own_dims(path, values.shape[1:], config["joints"])),
+            (place["along"], *dimension_names(path, values.shape[1:], config["joints"])),
             values,
             attributes,
         )

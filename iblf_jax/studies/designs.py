@@ -68,7 +68,7 @@ def unit_points(
     Raises:
       ValueError: more than the memory holds, or than the sequence has.
     """
-    checks.fits("runs" if not salt else "points", runs, 3 * 8.0 * dimension)
+    checks.fits_memory("runs" if not salt else "points", runs, 3 * 8.0 * dimension)
     if sampler == "sobol" and (dimension > MAX_SOBOL[0] or runs // replicates > MAX_SOBOL[1]):
         came = f"{runs // replicates} of {dimension} numbers"
         raise checks.fail(

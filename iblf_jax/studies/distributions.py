@@ -226,7 +226,7 @@ class Perturbation:
         if not isinstance(self.distribution, Distribution):
             raise _no_distribution(self.kind, self.distribution)
         checks.one_of("Perturbation.kind", self.kind, KINDS)
-        object.__setattr__(self, "shared", checks.flag("Perturbation.shared", self.shared))
+        object.__setattr__(self, "shared", checks.boolean("Perturbation.shared", self.shared))
 
     @property
     def group(self) -> str:

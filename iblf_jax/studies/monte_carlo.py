@@ -96,7 +96,7 @@ def monte_carlo(
     options = options.checked()
     _check_not_all_the_same(scenario, perturbations)
     prepared = prepare(scenario, perturbations, options, metrics)
-    checks.fits("runs", options.runs, case_bytes(prepared))
+    checks.fits_memory("runs", options.runs, case_bytes(prepared))
     with bar(progress, options.runs) as shown:
         results = run_all_cases(prepared, executor, shown.update)
     errors = results.metrics[RELATIVE]

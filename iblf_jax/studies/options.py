@@ -109,7 +109,7 @@ class StoreOptions:
             unit = checks.positive_integer("unit", unit, most=checks.MAX_STEPS)
         checks.one_of("writer", self.writer, WRITERS)
         path = checks.file_path("store", self.path, "a folder")
-        return StoreOptions(path, unit, self.writer, checks.flag("shared", self.shared))
+        return StoreOptions(path, unit, self.writer, checks.boolean("shared", self.shared))
 
 
 @dataclasses.dataclass(frozen=True)

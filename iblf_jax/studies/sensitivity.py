@@ -160,7 +160,9 @@ def sensitivity(
     shapes = sample_size(prepared.program.targets, prepared.shared.cases.perturbations)
     names = [name for path, shape in shapes.items() for name in statistics.entries(path, shape)]
     runs = points * (len(names) + 2)
-    checks.fits("points", points, (len(names) + 2) * (case_bytes(prepared) + 3 * 8.0 * len(names)))
+    checks.fits_memory(
+        "points", points, (len(names) + 2) * (case_bytes(prepared) + 3 * 8.0 * len(names))
+    )
     with bar(progress, runs) as shown:
         search = _Evaluation(prepared, shapes, output, executor, shown.update)
         indices, ends = _indices(search, points, len(names))

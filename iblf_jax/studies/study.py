@@ -29,7 +29,7 @@ from iblf_jax.engine import RunRequest, block_size, run_rollout
 from iblf_jax.engine.simulate import SimulationWarning
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.metrics import metric_units
-from iblf_jax.simulation.noise import NOISE_NAME, noise_of
+from iblf_jax.simulation.noise import NOISE_NAME, noise_values
 from iblf_jax.simulation.results import Metrics, Rollout
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies import statistics, summaries
@@ -249,7 +249,7 @@ class Study:
 
     def chosen(self, exclude_failed: bool = False) -> tuple[np.ndarray, dict[str, Any]]:
         """Which runs a statistic is over, (N,) bool, and the counts that go with it."""
-        exclude_failed = checks.flag("exclude_failed", exclude_failed)
+        exclude_failed = checks.boolean("exclude_failed", exclude_failed)
         has_failed = has_flag(self.status, FAILED)
         used = self.made
         if exclude_failed:
@@ -385,7 +385,7 @@ class Study:
             scenario, steps=options.steps, method=options.method, record_every=record_every
         )
         number = setup.inputs_of(np.asarray([i])).index[0]
-        noise = noise_of(self.scenario, setup.shared.cases.key, number).get(NOISE_NAME)
+        noise = noise_values(self.scenario, setup.shared.cases.key, number).get(NOISE_NAME)
         run = run_rollout(scenario, setup.shared.folds, setup.shared.dt, request, noise)
         self._warn_of_start(i)
         metrics = Metrics(again.metrics, self.metrics.unit_pairs)

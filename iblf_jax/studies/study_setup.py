@@ -18,7 +18,7 @@ import numpy as np
 
 from iblf_jax.engine import CompiledBatch, RunRequest, block_size, compile_batch
 from iblf_jax.simulation.metrics import Fold, as_folds
-from iblf_jax.simulation.noise import noise_of
+from iblf_jax.simulation.noise import noise_values
 from iblf_jax.simulation.scenario import Scenario, canonical, check_step
 from iblf_jax.studies.designs import designed_numbers
 from iblf_jax.studies.distributions import Perturbation
@@ -107,7 +107,7 @@ def drawn_leaves(
     def one(case: CaseInputs):
         used, drawn, admissible = draw(shared.cases, targets, case.index, case.points, case.u)
         scenario = shared.cases.scenario
-        noise = noise_of(scenario, shared.cases.key, case.index)
+        noise = noise_values(scenario, shared.cases.key, case.index)
         return merge(scenario, case.points, used) | noise, drawn, admissible
 
     # Without the barrier XLA fuses the random numbers into every operation of the run, and

@@ -18,7 +18,7 @@ from iblf_jax.engine import block_size
 from iblf_jax.simulation.paths import get, unit_at, with_parameters
 from iblf_jax.simulation.results import Metrics
 from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.simulation.signals import SIGNALS, own_dims
+from iblf_jax.simulation.signals import SIGNALS, dimension_names
 from iblf_jax.studies import statistics
 from iblf_jax.studies.blocks import run_blocks
 from iblf_jax.studies.dataset import status_attributes
@@ -105,7 +105,7 @@ def metric_quantiles(
         result = np.full((len(levels), *shape), np.nan)
         if used.any():
             result = _quantile(values[used], levels)
-        dims = ("quantile", *own_dims(name, shape, n))
+        dims = ("quantile", *dimension_names(name, shape, n))
         variables[name] = (dims, result, {"units": metrics.units.get(name, "")})
     return xarray.Dataset(variables, {"quantile": levels}, counts)
 
@@ -129,7 +129,7 @@ def correlations(
 
     if names is None:
         names = list(metrics)
-    names = checks.listed("metrics", names, '["margin", "rmse"]')
+    names = checks.nonempty_list("metrics", names, '["margin", "rmse"]')
     drawn = statistics.columns(samples)
     found = np.full((len(drawn), len(names), 2), np.nan)
     for j, name in enumerate(names):
@@ -223,13 +223,13 @@ def to_xarray(
     scenario, options = prepared.scenario, prepared.options
     variables: dict[str, Any] = {}
     for name, values in metrics.items():
-        dims = ("run", *own_dims(name, np.shape(values)[1:], scenario.n))
+        dims = ("run", *dimension_names(name, np.shape(values)[1:], scenario.n))
         variables[name] = (dims, np.asarray(values), {"units": metrics.units.get(name, "")})
     variables["status"] = ("run", status, status_attributes("0 is ok"))
     variables["fastest_mode"] = ("run", fastest_mode, {"units": "1/s"})
     coordinates: dict[str, Any] = {"run": np.arange(options.runs)}
     for path, values in samples.items():
-        dims = ("run", *own_dims(path, values.shape[1:], scenario.n))
+        dims = ("run", *dimension_names(path, values.shape[1:], scenario.n))
         nominal = np.asarray(get(scenario, path)).tolist()
         unit = unit_at(scenario, path)
         coordinates[path] = (dims, values, {"units": unit, "nominal": nominal})

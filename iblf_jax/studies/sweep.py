@@ -24,7 +24,7 @@ from iblf_jax.engine import cases_per_unit, whole_blocks
 from iblf_jax.simulation.error_estimate import RELATIVE
 from iblf_jax.simulation.metrics import Fold, metric_units
 from iblf_jax.simulation.scenario import Scenario, canonical
-from iblf_jax.simulation.signals import own_dims
+from iblf_jax.simulation.signals import dimension_names
 from iblf_jax.studies import store_config
 from iblf_jax.studies.blocks import case_bytes, named_arrays, result_shapes
 from iblf_jax.studies.dataset import DRAWN, to_dataset
@@ -126,7 +126,7 @@ def sweep(
     executor = executor_of(executor, deprecated)
     store_options = store_of(store, deprecated)
     chosen = design_of(design, deprecated)
-    progress = checks.flag("progress", progress, optional=True)
+    progress = checks.boolean("progress", progress, optional=True)
     if perturbations is None:
         perturbations = {}
     options = RunOptions(
@@ -143,7 +143,7 @@ def sweep(
     _check_something_varies(grid, perturbations, options.runs)
     points = make_points(canonical(scenario), grid, chosen.kind, chosen.points, options.seed)
     prepared = prepare(scenario, perturbations, options, metrics, points.values)
-    checks.fits("runs at all points", prepared.cases, case_bytes(prepared))
+    checks.fits_memory("runs at all points", prepared.cases, case_bytes(prepared))
     config = store_config.describe(prepared, points, chosen.kind)
     if store_options is None:
         result = _in_memory(prepared, config, executor, progress)
@@ -209,7 +209,7 @@ def _variables(prepared: PreparedStudy, config: dict[str, Any]) -> dict[str, Var
     variables = {}
     for name in names:
         shape = shapes[name].shape[1:]
-        dims = own_dims(name.removeprefix(DRAWN), shape, config["joints"])
+        dims = dimension_names(name.removeprefix(DRAWN), shape, config["joints"])
         variables[name] = Variable(shape, str(shapes[name].dtype), dims, units.get(name, ""))
     return variables
 

@@ -92,7 +92,7 @@ def _grid(scenario: Scenario, grid: Mapping[str, Any]) -> Points:
             "grid", f"{len(dims)} paths", f"at most {MAX_DIMS}, as many dimensions as an array has"
         )
     total = math.prod(dims.values())
-    checks.fits(
+    checks.fits_memory(
         "points of the grid", total, sum(8.0 * (2 + values[0].size) for values in ticks.values())
     )
     places = np.indices(tuple(dims.values())).reshape(len(dims), total)
@@ -134,7 +134,9 @@ def _design(
     dtype = scenario.initial.q.dtype
     by_path = jax.tree.map(lambda x: x.astype(dtype), by_path)
     designed: dict[str, np.ndarray] = {}
-    checks.fits("points", count, 3 * 8.0 * (1 + sum(math.prod(target.shape) for target in targets)))
+    checks.fits_memory(
+        "points", count, 3 * 8.0 * (1 + sum(math.prod(target.shape) for target in targets))
+    )
     if design == "latin_hypercube":
         designed = designed_numbers(
             design, sample_size(targets, by_path), count, 1, seed, dtype, _SALT

@@ -116,7 +116,9 @@ def _is_component(findings: Findings, member: Any) -> None:
         checks.flat_enough(findings.family, member)
         leaves, structure = jax.tree.flatten(member)
     except Exception as error:
-        findings.stop(f"JAX cannot flatten it ({type(error).__name__}: {checks.line(str(error))})")
+        findings.stop(
+            f"JAX cannot flatten it ({type(error).__name__}: {checks.one_line(str(error))})"
+        )
     if any(leaf is member for leaf in leaves):
         remedy = "Decorate it with @iblf_jax.component, or register it with jax.tree_util"
         findings.stop("JAX does not know its class", remedy)

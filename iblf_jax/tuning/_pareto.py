@@ -184,7 +184,7 @@ def pareto(
         came = f"{problem.size} numbers"
         expected = f"at most {MAX_FORWARD_NUMBERS} for a front"
         raise checks.fail("parameters", came, expected, "Tie or leave out some.")
-    checks.fits("points", points, 8.0 * POINTS_BETWEEN * problem.runs * NUMBERS_A_RUN)
+    checks.fits_memory("points", points, 8.0 * POINTS_BETWEEN * problem.runs * NUMBERS_A_RUN)
     search = FrontSearch(problem, min(points, MAX_BATCH), iterations, tolerance)
     with bar(progress, points, unit="points") as shown:
         search.run(points, seed, shown)

@@ -141,7 +141,7 @@ def _search_of(
     Values come first, so that an error does not wait for the derivatives' compilation.  With a
     checkpoint the starting points are determined again, and are the same.
     """
-    checks.fits("starts", solver.starts, 8.0 * problem.size * NUMBERS_A_RUN)
+    checks.fits_memory("starts", solver.starts, 8.0 * problem.size * NUMBERS_A_RUN)
     seed = int(problem.options.seed)
     second_start = None
     probes = 0

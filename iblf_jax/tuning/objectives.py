@@ -666,7 +666,7 @@ def metric(
 
     Source: design of this package.
     """
-    name = checks.word("name", name, "the name of one of the fold's results")
+    name = checks.string("name", name, "the name of one of the fold's results")
     if holds_weights(joints):
         chosen, w = _selected("metric", joints, weights, sign=None)
     else:

@@ -111,7 +111,7 @@ def tunable(
     if not is_range:
         remedy = "Exchange or widen them."
         raise checks.fail(f"tunable({path!r})", (low, high), "low < high", remedy)
-    return Tunable(path, low, high, checks.flag("tunable: tied", tied), scale)
+    return Tunable(path, low, high, checks.boolean("tunable: tied", tied), scale)
 
 
 def _as_tunable(place: int, given: Any) -> Tunable:
@@ -139,7 +139,7 @@ def layout(
       ValueError: an unknown or overlapping path, limits that exclude the start or are not
         admissible.
     """
-    given = checks.listed("parameters", parameters, '["controller.k1", "controller.K2"]')
+    given = checks.nonempty_list("parameters", parameters, '["controller.k1", "controller.K2"]')
     tunables = [_as_tunable(i, x) for i, x in enumerate(given)]
     check_paths(scenario, [x.path for x in tunables], "parameters")
     starts = {item.path: _start_of(scenario, item) for item in tunables}

@@ -129,7 +129,7 @@ class TuningProblem:
             remedy = "All runs would be the same: give perturbations."
             raise checks.fail("runs", run.runs, "1 without perturbations", remedy)
         blocks, box = layout(scenario, parameters, run.dt, run.method)
-        checks.fits("runs", run.runs, 8.0 * (1 + len(box.z)) * NUMBERS_A_RUN)
+        checks.fits_memory("runs", run.runs, 8.0 * (1 + len(box.z)) * NUMBERS_A_RUN)
         goal = fitted(goal, scenario)
         dtype = scenario.initial.q.dtype
         # Terms without a scale are evaluated once with scale 1, for their values at the start.

@@ -309,7 +309,7 @@ class TuneResult:
             checks.one_of("landscape: name", name, self.names)
         points = checks.positive_integer("points", points)
         span = checks.positive_number("span", span, "1")
-        checks.fits("points", points, 8 * points * NUMBERS_A_RUN)
+        checks.fits_memory("points", points, 8 * points * NUMBERS_A_RUN)
         factor = np.exp(np.linspace(-span, span, points))
         a, b = (self.tuned[self.names.index(name)] * factor for name in (first, second))
         return a, b, self.on_slice(first, second, a, b)[0]

@@ -16,7 +16,7 @@ from iblf_jax.engine import RunRequest, run_batch
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
 from iblf_jax.simulation.error_estimate import RELATIVE
 from iblf_jax.simulation.metrics import Torque
-from iblf_jax.simulation.noise import noise_of
+from iblf_jax.simulation.noise import noise_values
 from iblf_jax.simulation.paths import get, with_parameters
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.draws import Cases, Target, draw, merge
@@ -68,7 +68,7 @@ def draw_run(
     """Path -> value for one run with the leaves of a point, and whether its draws were
     admissible.
     """
-    noise = noise_of(cases.scenario, cases.key, index)
+    noise = noise_values(cases.scenario, cases.key, index)
     if not targets:
         return point | noise, jnp.asarray(True)
     drawn, _, admissible = draw(cases, targets, index, point, {})

@@ -278,7 +278,7 @@ def tube_at(
     checks.offers("bounds", bounds, ("lower", "upper"), expected)
     t = checks.as_floats("t", t)
     checks.shape_is("t", t, ())
-    acceleration = checks.flag("acceleration", acceleration)
+    acceleration = checks.boolean("acceleration", acceleration)
 
     def values(t):
         q_d = reference.position(t)

@@ -39,7 +39,7 @@ from iblf_jax.engine.plan import PLAIN_LAYOUT, ExecutionPlan
 from iblf_jax.files.components import decode_fields
 from iblf_jax.simulation import metrics, paths
 from iblf_jax.simulation.results import Metrics
-from iblf_jax.simulation.scenario import check_values
+from iblf_jax.simulation.scenario import check_leaves
 from iblf_jax.studies.options import RunOptions
 from iblf_jax.studies.study_setup import prepare
 from iblf_jax.tuning.parameters import layout
@@ -125,7 +125,7 @@ def test_constructors(member, data, value):
     given_now = {f.name: getattr(member, f.name) for f in fields} | {field.name: value}
     made = accepts_or_value_error(lambda: type(member)(**given_now))
     if made is not None:
-        check_values(made)
+        check_leaves(made)
         if is_leaf_field(field) and getattr(made, field.name) is not None:
             assert np.issubdtype(getattr(made, field.name).dtype, np.floating)
 

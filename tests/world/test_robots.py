@@ -146,13 +146,10 @@ def test_payload_hangs_at_the_tip(rng):
 
 @pytest.mark.parametrize("n", [1, 2, 4, 7])
 def test_small_algebra_against_numpy(n, rng):
-    from iblf_jax.core.linalg import cholesky, solve_spd
+    from iblf_jax.core.linalg import solve_spd
 
     A = rng.normal(size=(n, n))
     A = A @ A.T + 0.1 * np.eye(n)
     b = rng.normal(size=n)
     np.testing.assert_allclose(jax.jit(solve_spd)(A, b), np.linalg.solve(A, b), rtol=1e-9)
-    L = np.linalg.cholesky(A)
-    for i, row in enumerate(cholesky(jnp.asarray(A))):
-        np.testing.assert_allclose(row, L[i, : i + 1], rtol=1e-10)
     assert np.all(np.isnan(solve_spd(jnp.asarray(-A), b)))

@@ -111,6 +111,6 @@ def observer_of(name: str, usual: Observer) -> Observer:
     """The observer that belongs to a system: `usual`, or none for the laws that are classical
     without one.
     """
-    if checks.word("name", name, "the name of a law") in _WITHOUT_OBSERVER:
+    if checks.string("name", name, "the name of a law") in _WITHOUT_OBSERVER:
         return NoObserver()
     return usual

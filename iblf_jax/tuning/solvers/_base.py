@@ -181,7 +181,7 @@ def _word(name: str, value: Any, allowed: tuple[str, ...]) -> str:
 
 CHECKS: dict[str, Any] = {
     "mode": lambda name, x: _word(name, x, MODES),
-    "resample": checks.flag,
+    "resample": checks.boolean,
     "starts": checks.positive_integer,
     "tolerance": lambda name, x: checks.number_between(name, x, 0.0, 1.0, "1"),
     "sharpenings": lambda name, x: checks.positive_integer(name, x, least=0, most=MAX_SHARPENINGS),

@@ -377,7 +377,7 @@ class SQP:
         pieces = len(constraints.owner)
         curved = sum(_curvatures_kept(constraints))
         numbers = curved * size + constraints.runs * pieces
-        checks.fits("runs", constraints.runs, 8.0 * starts * size * numbers)
+        checks.fits_memory("runs", constraints.runs, 8.0 * starts * size * numbers)
         return [self._new_start(space, x, curved) for x in z]
 
     def _first_radius(self, space: SearchSpace) -> float:

@@ -82,8 +82,8 @@ def of_file(path: str | os.PathLike, error: ValueError) -> ValueError:
     if text.startswith(f"{path}: ") or repr(str(path)) in text:
         return error
     if text.startswith(ARGUMENTS):
-        return ValueError(f"{text} The file is {checks.line(str(path), 'field')}.")
-    return checks.inside(path, error)
+        return ValueError(f"{text} The file is {checks.one_line(str(path), 'field')}.")
+    return checks.with_location(path, error)
 
 
 class _Reader:

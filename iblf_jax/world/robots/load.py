@@ -80,11 +80,11 @@ def load(
     """
     for name, link in (("base", base), ("tip", tip)):
         if link is not None:
-            checks.word(name, link, "the name of a link")
+            checks.string(name, link, "the name of a link")
     if locked is None:
         locked = {}
     checks.mapping("locked", locked, '{"gripper_joint": 0.02}')
-    repairs = Repairs(checks.flag("repair", repair))
+    repairs = Repairs(checks.boolean("repair", repair))
     root = description.read(path)
     try:
         file = _checked(root, Path(path).parent)

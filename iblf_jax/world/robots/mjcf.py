@@ -142,7 +142,9 @@ class Mjcf(NamedTuple):
                 else:
                     from_geoms = True
             if fault:
-                out.append((body, Weight(fault=Fault(where, "", checks.inside(where, fault)))))
+                out.append(
+                    (body, Weight(fault=Fault(where, "", checks.with_location(where, fault))))
+                )
             elif (by_geoms and from_geoms) or bounded:
                 continue
             else:
