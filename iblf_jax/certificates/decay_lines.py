@@ -107,7 +107,7 @@ def _inequality(segment: Segment, kind: str, case: int) -> Line:
     if reason:
         return not_applicable(statement, reason)
     decay = summary.decays[kind, case]
-    size = max(1.0, decay.w_f) * proof.terms + decay.rho * weighted_lyapunov(proof, decay.w_f)
+    size = max(1.0, decay.w_f) * proof.dV_size + decay.rho * weighted_lyapunov(proof, decay.w_f)
     margins, note = -left_side(segment, kind, case), summary.exclusion_note
     return check_steps(segment, statement, margins, summary.eps * size, note=note)
 

@@ -223,11 +223,11 @@ class AdvanceStep:
         return at._replace(state=result.state), (at.state, energies)
 
 
-def _positions(index: np.ndarray, states: LoopState, dt: Any, parts: int = 1) -> Position:
-    """Positions of some steps, in time steps of dt divided by `parts`."""
+def _positions(index: np.ndarray, states: LoopState, dt: Any, substeps: int = 1) -> Position:
+    """Positions of some steps, in time steps of dt divided by `substeps`."""
     dtype = np.asarray(dt).dtype
-    steps = (parts * index).astype(dtype)
-    size = np.full(index.shape, float(dt) / parts, dtype)
+    steps = (substeps * index).astype(dtype)
+    size = np.full(index.shape, float(dt) / substeps, dtype)
     return Position(jax.device_put(steps), jax.device_put(size), states)
 
 
@@ -272,7 +272,7 @@ def proof_along(
       `ProofTerms`, `Sample`, and the errors of the integrator in V2 and in |f_tilde|^2/2 over one
       step, on the host; (T, ...) each.
     """
-    full, halves = (_positions(index, states, dt, parts) for parts in (1, 2))
+    full, halves = (_positions(index, states, dt, substeps) for substeps in (1, 2))
     found = run_from(scenario, dt, full, step=ObserveStep())[1]
     # One step is compared with two half steps, because the envelopes are compared with a run in
     # which V2 has fallen below what the integrator resolves. Both are advanced three times, so that
@@ -283,7 +283,7 @@ def proof_along(
     terms, M0, sample = jax.tree.map(lambda x: np.asarray(x)[:, 0], found)
     eigenvalues = _eigenvalues(M0)
     terms["lambda_min"], terms["lambda_max"] = eigenvalues[:, 0], eigenvalues[:, -1]
-    terms["slowest"] = 1.0 / _eigenvalues(np.asarray(mass_over_gain(scenario, M0)))[:, -1]
+    terms["mu"] = 1.0 / _eigenvalues(np.asarray(mass_over_gain(scenario, M0)))[:, -1]
     return ProofTerms(**terms), sample, *map(_defect, energies)
 
 
@@ -326,19 +326,21 @@ def tolerances(run: Any) -> dict[str, float]:
     }
 
 
-def _check_arrival(run: Any, recorded: LoopState, made: LoopState, rows: np.ndarray) -> None:
+def _check_arrival(
+    run: Any, recorded: LoopState, reconstructed: LoopState, rows: np.ndarray
+) -> None:
     """Raises ValueError if the reconstructed states are not those that the run recorded."""
     sizes = tolerances(run)
-    expected, reached = recorded._asdict(), made._asdict()
+    expected, reached = recorded._asdict(), reconstructed._asdict()
     for field, label, kind in STATES:
         leaves = (jax.tree.leaves(expected[field]), jax.tree.leaves(reached[field]))
-        for kept, again in zip(*leaves, strict=True):
+        for kept, made in zip(*leaves, strict=True):
             tolerance = sizes[kind]
             if label.endswith("state"):
                 # A state of law or observer has its own unit, hence its own scale if larger.
                 own = np.max(np.abs(kept), initial=0.0)
                 tolerance = max(tolerance, np.sqrt(np.finfo(kept.dtype).eps) * own)
-            _compare(run, label, kept, again, rows, tolerance)
+            _compare(run, label, kept, made, rows, tolerance)
 
 
 def _check_signals(run: Any, steps: Steps, rows: np.ndarray, sizes: dict[str, float]) -> None:
@@ -346,24 +348,33 @@ def _check_signals(run: Any, steps: Steps, rows: np.ndarray, sizes: dict[str, fl
     run recorded.
     """
     for names, kind in ((POSITIONS, "position"), (SPEEDS, "speed"), (TORQUES, "torque")):
-        again = attributes(steps.sample, names)
+        reconstructed = attributes(steps.sample, names)
         for name, recorded in attributes(run, names).items():
-            _compare(run, name, recorded[rows], again[name][steps.recorded], rows, sizes[kind])
+            _compare(
+                run, name, recorded[rows], reconstructed[name][steps.recorded], rows, sizes[kind]
+            )
 
 
 def _compare(
-    run: Any, name: str, kept: np.ndarray, made: np.ndarray, rows: np.ndarray, tolerance: float
+    run: Any,
+    name: str,
+    recorded: np.ndarray,
+    reconstructed: np.ndarray,
+    rows: np.ndarray,
+    tolerance: float,
 ) -> None:
     """Raises ValueError if a reconstructed signal differs from the recorded one."""
-    far = np.any(~(np.abs(made - kept) <= tolerance), axis=tuple(range(1, np.ndim(kept))))
+    far = np.any(
+        ~(np.abs(reconstructed - recorded) <= tolerance), axis=tuple(range(1, np.ndim(recorded)))
+    )
     if not far.any():
         return
     k = int(np.argmax(far))
     where = f"{name} of sample {int(rows[k])} (t = {float(run.t[rows[k]]):.6g} s)"
     remedy = (
-        f"Its scenario, dt and method do not reproduce the run: {where} is {kept[k]}, and {made[k]}"
-        " when integrated again. Simulate it again; a loop that amplifies rounding that much needs"
-        " record_every=1."
+        f"Its scenario, dt and method do not reproduce the run: {where} is {recorded[k]}, and"
+        f" {reconstructed[k]} when integrated again. Simulate it again; a loop that amplifies"
+        " rounding that much needs record_every=1."
     )
     raise checks.fail(
         "run", "samples that its scenario does not give", "the run of run.scenario", remedy
