@@ -327,7 +327,7 @@ def _certificate_of_sampled(run: Rollout) -> Certificate:
             duration=grid.duration,
             dt=float(run.dt),
             method=run.method,
-            record_every=grid.every,
+            record_every=grid.record_every,
         )
     continuous = _on_host(simulated)
     certificate = _certificate_of(continuous)

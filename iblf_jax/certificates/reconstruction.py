@@ -50,7 +50,7 @@ STATES = (
 class TimeGrid(NamedTuple):
     """The steps of a run."""
 
-    every: int
+    record_every: int
     """Steps from one recorded sample to the next."""
     last: int
     """Number of the last step."""
@@ -116,7 +116,7 @@ def steps_of(run: Any, grid: TimeGrid) -> Iterator[Steps]:
     for index, states in blocks:
         steps = _with_proof(run, index, states, grid)
         if valid:
-            _check_signals(run, steps, index[steps.recorded] // grid.every, sizes)
+            _check_signals(run, steps, index[steps.recorded] // grid.record_every, sizes)
         yield steps
 
 
@@ -138,7 +138,7 @@ def _as_recorded(run: Any, grid: TimeGrid) -> Iterator[tuple[np.ndarray, LoopSta
     states = _recorded_states(run)
     for first in range(0, run.t.size, BLOCK_STEPS):
         rows = np.arange(first, min(first + BLOCK_STEPS, run.t.size))
-        yield rows * grid.every, _rows(states, rows)
+        yield rows * grid.record_every, _rows(states, rows)
 
 
 def _integrated_again(run: Any, grid: TimeGrid) -> Iterator[tuple[np.ndarray, LoopState]]:
@@ -147,29 +147,31 @@ def _integrated_again(run: Any, grid: TimeGrid) -> Iterator[tuple[np.ndarray, Lo
     A block holds the intervals of several samples where these are short, and a part of one interval
     where it is long.
     """
-    recorded, count, every = _recorded_states(run), run.t.size, grid.every
-    intervals, length = max(1, BLOCK_STEPS // every), min(every, BLOCK_STEPS)
+    recorded = _recorded_states(run)
+    count, every = run.t.size, grid.record_every
+    intervals, length = max(1, BLOCK_STEPS // every), min(every, BLOCK_STEPS)  # of a block
     start = jax.tree.map(lambda x: np.asarray(x)[None], initial_state(run.scenario))
     _check_arrival(run, _rows(recorded, slice(0, 1)), start, np.zeros(1, int))
     for first_row in range(0, count, intervals):
-        numbers = np.arange(first_row, first_row + intervals)
-        rows = np.minimum(numbers, count - 1)  # the last block repeats the last sample
+        samples = np.arange(first_row, first_row + intervals)
+        rows = np.minimum(samples, count - 1)  # the last block repeats the last sample
         states = _rows(recorded, rows)
         for offset in range(0, every, length):
             first = rows * every + offset
             states, path = _advance(run, first, states, length)
             index = first[:, None] + np.arange(length)
             in_interval = np.arange(offset, offset + length) < every
-            keep = (numbers < count)[:, None] & in_interval & (index <= grid.last)
+            keep = (samples < count)[:, None] & in_interval & (index <= grid.last)
             if not keep.any():
                 return
             path = jax.tree.map(np.asarray, path)
             yield index[keep], _rows(path, keep)
         # The last part of an interval may be shorter than `length`: its end lies on the path.
-        arrived, rest = jax.tree.map(np.asarray, states), every - offset
-        if rest < length:
-            arrived = _rows(path, (slice(None), rest))
-        has_next = numbers < count - 1
+        arrived = jax.tree.map(np.asarray, states)
+        remaining = every - offset
+        if remaining < length:
+            arrived = _rows(path, (slice(None), remaining))
+        has_next = samples < count - 1
         following = rows[has_next] + 1
         _check_arrival(run, _rows(recorded, following), _rows(arrived, has_next), following)
 
@@ -254,7 +256,7 @@ def _with_proof(run: Any, index: np.ndarray, states: LoopState, grid: TimeGrid) 
     padded_states = _rows(jax.tree.map(np.asarray, states), padded)
     found = proof_along(run.scenario, index[padded], padded_states, run.dt, method=run.method)
     proof, sample, defect, defect_f = _rows(found, slice(0, size))
-    return Steps(t, sample, proof, index % grid.every == 0, defect, defect_f)
+    return Steps(t, sample, proof, index % grid.record_every == 0, defect, defect_f)
 
 
 def proof_along(

@@ -99,8 +99,9 @@ class RunSummary:
         unclaimed = self.claims.why_no_theorem
         if kind == WEIGHTED:
             unclaimed = self.claims.why_no_weights
-        if unclaimed or self.why_invalid:
-            return unclaimed or self.why_invalid
+        unclaimed = unclaimed or self.why_invalid
+        if unclaimed:
+            return unclaimed
         if case == 1 and self.case == 2:
             return f"case 1 is for f' = 0; here |f'| reaches {self.F_d:.4g} N m/s, see case 2"
         if kind == WEIGHTED and case not in self.weighted_constants:

@@ -157,7 +157,7 @@ def _dropped_terms(segment: Segment) -> tuple[list[Line], dict[str, float]]:
         "-f_tilde^T kf M0' q' <= the margin that the proof leaves",
         "1/s",
     )
-    unclaimed = summary.claims.why_no_theorem or summary.why_invalid
+    why_unclaimed = summary.claims.why_no_theorem or summary.why_invalid
     why_no_case = summary.why_not(THEOREM, case or summary.case)
     terms = (
         (by_law, proof.dropped_e2, _why_law_is_exact(summary)),
@@ -165,8 +165,8 @@ def _dropped_terms(segment: Segment) -> tuple[list[Line], dict[str, float]]:
     )
     lines: list[Line] = []
     shares: dict[str, float] = {}
-    for statement, term, exact in terms:
-        reason = unclaimed or exact or why_no_case
+    for statement, term, why_exact in terms:
+        reason = why_unclaimed or why_exact or why_no_case
         if reason or case is None:
             lines.append(not_applicable(statement, reason, counts=False))
             continue
