@@ -28,7 +28,7 @@ from iblf_jax.certificates.proof_terms import ProofTerms, mass_over_gain, terms_
 from iblf_jax.core import checks
 from iblf_jax.core.optional import attributes
 from iblf_jax.core.status import UNTRUSTED, Status, describe
-from iblf_jax.engine import run_from
+from iblf_jax.engine import step_states
 from iblf_jax.simulation import discontinuities
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
 from iblf_jax.simulation.scenario import Scenario
@@ -238,7 +238,9 @@ def _advance(
 ) -> tuple[LoopState, LoopState]:
     """States after `length` steps from each of some states, and along the way."""
     at = _positions(first, states, run.dt)
-    end, (path, _) = run_from(run.scenario, run.dt, at, step=AdvanceStep(run.method), steps=length)
+    end, (path, _) = step_states(
+        run.scenario, run.dt, at, step=AdvanceStep(run.method), steps=length
+    )
     return end.state, path
 
 
@@ -275,12 +277,12 @@ def proof_along(
       step, on the host; (T, ...) each.
     """
     full, halves = (_positions(index, states, dt, substeps) for substeps in (1, 2))
-    found = run_from(scenario, dt, full, step=ObserveStep())[1]
+    found = step_states(scenario, dt, full, step=ObserveStep())[1]
     # One step is compared with two half steps, because the envelopes are compared with a run in
     # which V2 has fallen below what the integrator resolves. Both are advanced three times, so that
     # they are one call of one program.
     both = jax.tree.map(lambda *xs: np.concatenate(xs), full, halves)
-    energies = run_from(scenario, dt, both, step=AdvanceStep(method), steps=3)[1][1]
+    energies = step_states(scenario, dt, both, step=AdvanceStep(method), steps=3)[1][1]
     terms: dict[str, Any]
     terms, M0, sample = jax.tree.map(lambda x: np.asarray(x)[:, 0], found)
     eigenvalues = _eigenvalues(M0)

@@ -136,7 +136,7 @@ def _shortened(word: str) -> str:
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """Returns the parser of all commands."""
+    """The parser of all commands."""
     import iblf_jax
 
     parser = Parser(

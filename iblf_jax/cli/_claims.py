@@ -80,7 +80,7 @@ def _peak(values: Any) -> np.ndarray:
 
 
 def _late_peak(run: Rollout, values: Any) -> np.ndarray:
-    """Returns the peak over the second half of a run, (n,)."""
+    """The peak over the second half of a run, (n,)."""
     t = np.asarray(run.t)
     return _peak(np.asarray(values)[t >= 0.5 * t[-1]])
 
@@ -169,7 +169,7 @@ def overshoot_of_e2(runs: Pair) -> PaperClaim:
 
 
 def _estimate_errors(runs: Pair) -> tuple[ByName, ByName]:
-    """Returns the largest late |f - f_hat| and the peak of |f| of each run, each (n,) [N m]."""
+    """The largest late |f - f_hat| and the peak of |f| of each run, each (n,) [N m]."""
     late = {
         name: _late_peak(run, run.disturbance - run.disturbance_estimate)
         for name, run in runs.items()
@@ -218,7 +218,7 @@ def small_neighbourhood(runs: Pair) -> PaperClaim:
 
 
 def _along(run: Rollout, barrier: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Returns V1 of a barrier and xi at every sample of a run, (T, n) each.
+    """V1 of a barrier and xi at every sample of a run, (T, n) each.
 
     Both come from one evaluation of the bounds, so that no rounding separates them.
     """
@@ -265,7 +265,7 @@ def theorem_1(runs: Pair) -> PaperClaim:
 
 
 def assumed(runs: Pair) -> str:
-    """Returns the numbers of the arm, which the paper does not print, as text."""
+    """The numbers of the arm, which the paper does not print, as text."""
     arm: Any = next(iter(runs.values())).scenario.plant  # the preset's TwoLink
     numbers = (
         ("masses", arm.mass, "kg"),
@@ -288,7 +288,7 @@ def _all_digits(values: Any) -> str:
 
 
 def remark(runs: Pair) -> str:
-    """Returns a remark on the comparison: the two barriers differ by a factor of two."""
+    """A remark on the comparison: the two barriers differ by a factor of two."""
     from iblf_jax.control.barriers import Integral, Log
 
     run = next(iter(runs.values()))

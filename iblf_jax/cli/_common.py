@@ -30,12 +30,12 @@ FAILURES = "a bound was violated, the state diverged, or the step was too large.
 
 def add_scenario_arguments(parser: argparse.ArgumentParser, default: str | None = None) -> None:
     """Adds SCENARIO (optional if there is a default), --arg and --set."""
-    words = "a scenario file, or the name of a preset"
+    help_text = "a scenario file, or the name of a preset"
     optional: dict[str, Any] = {}
     if default:
-        words += f" (default: {default})"
+        help_text += f" (default: {default})"
         optional = {"nargs": "?", "default": default}
-    parser.add_argument("scenario", metavar="SCENARIO.toml|PRESET", help=words, **optional)
+    parser.add_argument("scenario", metavar="SCENARIO.toml|PRESET", help=help_text, **optional)
     add_preset_arguments(parser)
     parser.add_argument(
         "--set",
@@ -81,7 +81,7 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def scenario_of(args: argparse.Namespace) -> ScenarioFile:
-    """Returns the scenario of the arguments with its changes, and the [run] table of its file."""
+    """The scenario of the arguments with its changes, and the [run] table of its file."""
     from iblf_jax.files.scenario import ScenarioFile, from_dict, load_scenario_file
     from iblf_jax.files.values import numbers
     from iblf_jax.presets import PRESETS
@@ -122,7 +122,7 @@ def _check_exists(name: str) -> None:
 
 
 def assignments(option: str, words: list[str]) -> dict[str, Any]:
-    """Returns NAME=VALUE words as a dict; a value is TOML, or a string if it is not."""
+    """The NAME=VALUE words of an option as a dict; a value that is not TOML is a string."""
     from iblf_jax.core import checks
     from iblf_jax.files.values import toml_tables
 
@@ -150,7 +150,7 @@ def assignments(option: str, words: list[str]) -> dict[str, Any]:
 
 
 def run_options(args: argparse.Namespace, file: ScenarioFile) -> dict[str, Any]:
-    """Returns duration, dt, method and record_every.
+    """The options duration, dt, method and record_every of a run.
 
     The command line takes precedence over the file, and the file over the defaults.
     """
@@ -158,7 +158,7 @@ def run_options(args: argparse.Namespace, file: ScenarioFile) -> dict[str, Any]:
 
 
 def given_options(args: argparse.Namespace, *names: str) -> dict[str, Any]:
-    """Returns those of the named options that have a value."""
+    """The named options that have a value."""
     values = vars(args)
     return {name: values[name] for name in names if values.get(name) is not None}
 
@@ -171,7 +171,7 @@ def optional_folder(name: str | None) -> Path | None:
 
 
 def output_folder(name: str) -> Path:
-    """Returns the folder of --out and creates it if necessary.
+    """The folder of --out, which is created if it does not exist.
 
     Raises:
       ValueError: the folder cannot be written.
@@ -199,8 +199,8 @@ def write_json(path: Path, value: Any) -> None:
     )
 
 
-def verdict(run: Rollout) -> dict[str, Any]:
-    """Returns status and metrics of one run, for JSON."""
+def status_and_metrics(run: Rollout) -> dict[str, Any]:
+    """The status and the metrics of one run, for JSON."""
     from iblf_jax.core.status import Status, describe
 
     status = Status(int(run.status))

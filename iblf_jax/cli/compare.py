@@ -12,7 +12,7 @@ from iblf_jax.cli._common import (
     optional_folder,
     run_options,
     scenario_of,
-    verdict,
+    status_and_metrics,
     write_json,
 )
 
@@ -81,8 +81,8 @@ def _write(folder: Path, source: str, result: Comparison, options: dict[str, Any
         "notes": result.notes,
         "factors": result.factors,
         "searches": {name: found.to_dict() for name, found in result.searches.items()},
-        "gains": {name: verdict(one) for name, one in result.rollouts.items()},
-        "effort": {name: verdict(one) for name, one in result.equal_effort.items()},
+        "gains": {name: status_and_metrics(one) for name, one in result.rollouts.items()},
+        "effort": {name: status_and_metrics(one) for name, one in result.equal_effort.items()},
     }
     write_json(folder / "comparison.json", report)
     joints = range(next(iter(result.rollouts.values())).n)

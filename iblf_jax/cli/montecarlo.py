@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def report(study: Study) -> str:
-    """Returns the results of a study as text."""
+    """The results of a study as text."""
     import numpy as np
 
     from iblf_jax.cli._common import number

@@ -49,6 +49,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _summary(preset: Callable[..., Any]) -> str:
-    """Returns the first paragraph of the docstring in one line."""
+    """The first paragraph of the docstring in one line."""
     paragraph = (inspect.getdoc(preset) or "").partition("\n\n")[0]
     return " ".join(paragraph.split())

@@ -7,7 +7,7 @@ import textwrap
 import time
 from typing import TYPE_CHECKING, Any
 
-from iblf_jax.cli._common import metrics_table, output_folder, verdict, write_json
+from iblf_jax.cli._common import metrics_table, output_folder, status_and_metrics, write_json
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -115,9 +115,9 @@ def _simulate_both(args: argparse.Namespace) -> tuple[dict[str, Rollout], dict[s
 
 def _print_claims(claims: list[PaperClaim], note: str) -> None:
     print("The claims of the paper, and what these runs show")
-    verdicts = {True: "HELD        ", False: "DID NOT HOLD"}
     for i, claim in enumerate(claims, 1):
-        print(f"{i}. {verdicts[claim.confirmed]}  {claim.claim}")
+        verdict = "HELD" if claim.confirmed else "DID NOT HOLD"
+        print(f"{i}. {verdict:12}  {claim.claim}")
         print(textwrap.fill(claim.detail, 118, initial_indent=" " * 5, subsequent_indent=" " * 5))
     print(textwrap.fill(f"Remark: {note}", 118))
 
@@ -141,7 +141,7 @@ def _write_data(
         "source": "Zhang & Yan 2024, section 4",
         "run": {"reading": args.reading, "duration": args.duration, "dt": args.dt, "method": "rk4"},
         "versions": {"iblf_jax": iblf_jax.__version__, "jax": jax.__version__},
-        "runs": {name: verdict(one) for name, one in runs.items()},
+        "runs": {name: status_and_metrics(one) for name, one in runs.items()},
         "assumed": findings["assumed"],
         "claims": [dict(zip(keys, claim, strict=True)) for claim in findings["claims"]],
         "remark": findings["remark"],

@@ -13,7 +13,7 @@ from iblf_jax.cli._common import (
     optional_folder,
     run_options,
     scenario_of,
-    verdict,
+    status_and_metrics,
     write_json,
 )
 
@@ -76,6 +76,6 @@ def _write(folder: Path, source: str, result: Rollout, options: dict[str, Any], 
         "seed": seed,
         "iblf_jax_version": iblf_jax.__version__,
     }
-    write_json(folder / "metrics.json", head | verdict(result))
+    write_json(folder / "metrics.json", head | status_and_metrics(result))
     plotting.save({"overview": plotting.overview(result)}, folder, formats=("png",))
     print(f"\nwritten to {folder}: rollout.nc, metrics.json, overview.png, scenario.toml")

@@ -8,7 +8,7 @@ import os
 import platform
 import shutil
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from iblf_jax.kernels import ToolchainError, has_ziglang, ziglang
@@ -41,6 +41,13 @@ def zig() -> list[str]:
             'ziglang is not installed: pip install ziglang, or ".[export]" in a clone'
         )
     return list(ziglang("cc"))
+
+
+def write_files(folder: Path, texts: Mapping[str, str]) -> None:
+    """Writes texts, file name -> text, into a folder, which is created if it does not exist."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, text in texts.items():
+        (folder / name).write_text(text, encoding="utf-8")
 
 
 def build(command: Sequence[str], folder: Path) -> None:

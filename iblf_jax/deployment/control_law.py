@@ -49,8 +49,8 @@ class GivenReference:
         return self.q_d + s * (self.dq_d + 0.5 * s * self.ddq_d)
 
 
-class Memory(NamedTuple):
-    """The internal state between samples."""
+class LawState(NamedTuple):
+    """The internal state of the law between samples; the generated C calls it `memory`."""
 
     controller: Any
     observer: Any
@@ -95,49 +95,52 @@ def _with_reference(scenario: Scenario, inputs: SampleInputs) -> Scenario:
     )
 
 
-def start(scenario: Scenario, inputs: SampleInputs) -> tuple[Memory, jax.Array]:
-    """The memory before the first sample, and the torque that keeps the model at rest."""
-    scenario, velocity = _with_reference(scenario, inputs), _velocity(scenario)
+def start(scenario: Scenario, inputs: SampleInputs) -> tuple[LawState, jax.Array]:
+    """The state before the first sample, and the torque that keeps the model at rest."""
+    scenario = _with_reference(scenario, inputs)
     q, dq = inputs.q, inputs.dq
+    controller = scenario.controller.init(q, dq, scenario.context)
     observer = discrete_observer(scenario).init(q, dq, scenario.model)
+    velocity_filter = _velocity_filter(scenario)
     filtered: Any = ()
-    if velocity is not None:
-        filtered = velocity.init(q, dq, scenario.sampling.period)  # type: ignore[union-attr]
-    return Memory(
-        scenario.controller.init(q, dq, scenario.context), observer, filtered
-    ), scenario.model.gravity(q)
+    if velocity_filter is not None:
+        filtered = velocity_filter.init(q, dq, scenario.sampling.period)  # type: ignore[union-attr]
+    return LawState(controller, observer, filtered), scenario.model.gravity(q)
 
 
-def sample(scenario: Scenario, inputs: SampleInputs, memory: Memory) -> tuple[Memory, Outputs]:
-    """One sample: the memory for the next sample, and the outputs."""
-    scenario, velocity, n = _with_reference(scenario, inputs), _velocity(scenario), scenario.n
-    dq, filtered = inputs.dq, ()
-    if velocity is not None:
+def sample(scenario: Scenario, inputs: SampleInputs, state: LawState) -> tuple[LawState, Outputs]:
+    """One sample: the state for the next sample, and the outputs."""
+    scenario = _with_reference(scenario, inputs)
+    dq = inputs.dq
+    velocity_filter = _velocity_filter(scenario)
+    filtered: Any = ()
+    if velocity_filter is not None:
         assert scenario.sampling is not None
-        normal = jnp.zeros((velocity.draws, n), inputs.q.dtype)
-        dq, filtered = velocity.estimate(
-            inputs.q, inputs.dq, normal, scenario.sampling.period, memory.velocity
+        normal = jnp.zeros((velocity_filter.draws, scenario.n), inputs.q.dtype)
+        dq, filtered = velocity_filter.estimate(
+            inputs.q, inputs.dq, normal, scenario.sampling.period, state.velocity
         )
-    answer = law_update(
-        scenario, inputs.t, Measurement(inputs.q, dq), memory.controller, memory.observer
+    update = law_update(
+        scenario, inputs.t, Measurement(inputs.q, dq), state.controller, state.observer
     )
-    command, tube = answer.command, scenario.context.tube(inputs.t)
+    command = update.command
+    tube = scenario.context.tube(inputs.t)
     infeasible = jnp.zeros((), bool)
     for slack in jax.tree.leaves((command.slack, command.region_slack)):
         infeasible |= jnp.any(slack > 0)
     outputs = Outputs(
         command.tau,
         command.alpha,
-        answer.f_hat,
+        update.f_hat,
         ~jnp.all((inputs.q > tube.lower) & (inputs.q < tube.upper)),
         jnp.any(command.guard_active),
         jnp.any(command.saturated),
         infeasible,
     )
-    return Memory(answer.controller, answer.observer, filtered), outputs
+    return LawState(update.controller, update.observer, filtered), outputs
 
 
-def _velocity(scenario: Scenario) -> Any:
+def _velocity_filter(scenario: Scenario) -> Any:
     """The velocity filter of the sensor; None where velocities are inputs."""
     if isinstance(scenario.sensor, Ideal):
         return None
@@ -150,17 +153,17 @@ class ControlLaw(NamedTuple):
     """
 
     start: Program
-    """The program of `start`; its results are the memory and the torque."""
+    """The program of `start`; its results are the state and the torque."""
     sample: Program
-    """The program of `sample`; its carry is the memory, and its results are `Outputs`."""
-    memory: tuple[str, ...]
-    """Names of the numbers of the memory."""
+    """The program of `sample`; its carry is the state, and its results are `Outputs`."""
+    state_names: tuple[str, ...]
+    """Names of the numbers of the state."""
     reads_velocity: bool
     """Whether q' is an input."""
 
 
 def control_law(scenario: Scenario, external_reference: bool) -> ControlLaw:
-    """The programs of the law of a scenario that is sampled, in the type of its numbers.
+    """The programs of the law of a sampled scenario, with the floating-point type of its leaves.
 
     Args:
       scenario: canonical.
@@ -182,28 +185,31 @@ def control_law(scenario: Scenario, external_reference: bool) -> ControlLaw:
         inputs = inputs._replace(q_d=q, dq_d=q, ddq_d=q)
     shapes, _ = jax.eval_shape(start, scenario, inputs)
     like = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-    memory = as_floats(like, dtype)
+    state = as_floats(like, dtype)
 
-    def first(scenario, inputs, carry, index):
-        memory, tau = start(scenario, inputs)
-        return (), (as_floats(memory, dtype), tau)
+    def start_step(scenario, inputs, carry, index):
+        state, tau = start(scenario, inputs)
+        return (), (as_floats(state, dtype), tau)
 
-    def one(scenario, inputs, carry, index):
-        memory, outputs = sample(scenario, inputs, of_floats(carry, like))
-        return as_floats(memory, dtype), outputs
+    def sample_step(scenario, inputs, carry, index):
+        state, outputs = sample(scenario, inputs, of_floats(carry, like))
+        return as_floats(state, dtype), outputs
 
-    begin, step = program_of(first, scenario, inputs, ()), program_of(one, scenario, inputs, memory)
+    start_program = program_of(start_step, scenario, inputs, ())
+    sample_program = program_of(sample_step, scenario, inputs, state)
     velocities = range(1 + scenario.n, 1 + 2 * scenario.n)  # after t and q
-    reads = any(node.op == "per_run" and node.value in velocities for node in step.nodes)
-    return ControlLaw(begin, step, number_names(memory), reads)
+    reads_velocity = any(
+        node.op == "per_run" and node.value in velocities for node in sample_program.nodes
+    )
+    return ControlLaw(start_program, sample_program, number_names(state), reads_velocity)
 
 
-def as_floats(memory: Any, dtype: Any) -> Any:
-    """A memory whose numbers all have one type; integers and flags become 0.0, 1.0, ..."""
-    return jax.tree.map(lambda x: x.astype(dtype), memory)
+def as_floats(state: Any, dtype: Any) -> Any:
+    """The state as floats of one type; integers and flags become 0.0, 1.0, ..."""
+    return jax.tree.map(lambda x: x.astype(dtype), state)
 
 
-def of_floats(memory: Any, like: Any) -> Any:
+def of_floats(state: Any, like: Any) -> Any:
     """The inverse of `as_floats`, with the types of `like`."""
 
     def converted(x: jax.Array, kind: jax.Array) -> jax.Array:
@@ -211,12 +217,11 @@ def of_floats(memory: Any, like: Any) -> Any:
             return x > 0.5
         return x.astype(kind.dtype)
 
-    return jax.tree.map(converted, memory, like)
+    return jax.tree.map(converted, state, like)
 
 
 def program_of(function: Callable, scenario: Scenario, given: Any, carry: Any) -> Program:
-    """The scalar program of `function(scenario, given, carry, index) -> (carry, results)`, written
-    out.
+    """The scalar program of `function(scenario, given, carry, index) -> (carry, results)`.
 
     Args:
       function: the function to lower.

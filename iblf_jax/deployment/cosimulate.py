@@ -79,8 +79,8 @@ def cosimulate(
         whose mesh files are missing are left out.
       duration: length of the run [s], a whole number of steps.
       period: of the law [s]; the scenario's `sampling.period` if not given.
-      dt: step of MuJoCo [s], which divides the period; the model's own, or the next shorter one
-        that does, if not given.
+      dt: step of MuJoCo [s], which divides the period.  If not given, the model's own step, or the
+        next shorter one that divides the period.
       integrator: "RK4", "Euler", "implicit" or "implicitfast"; None for the model's own.
       locked: joint name -> position [rad or m], for joints of the model that are locked.
       record_every: record every so-many-th step; metrics and status cover every step whatever is
@@ -128,10 +128,11 @@ def cosimulate(
         film = film_path(film, "film")
     folds = as_folds(metrics, scenario.initial.q.dtype, scenario)
     motion = _Run(scenario, robot, dt, seed).motion(steps)
+    rows = motion.rows
     result = _rollout(scenario, folds, motion, dt, record_every, f"MuJoCo {integrator or 'own'}")
     report(result, steps, throw)
     if film is not None:
-        film_run(result, robot, motion.model_positions[motion.instant], dt, Path(film))
+        film_run(result, robot, rows.model_positions[rows.instant], dt, Path(film))
     return result
 
 
@@ -171,17 +172,17 @@ def with_period(scenario: Scenario, period: float | None) -> Scenario:
     return dataclasses.replace(scenario, sampling=sampling)
 
 
-class _Motion(NamedTuple):
-    """The recorded motion: R rows, and a state after each sample of the law.
+class _Rows(NamedTuple):
+    """One row of the recorded motion, or R rows stacked.
 
-    Each instant has a row.  Where torque or law signals jump, there is one row before the jump and
-    one after it.
+    Each time step has a row at its start.  Where torque or law signals jump, there is one row
+    before the jump and one after it.
     """
 
     t: Any
     """Time, (R,) [s]."""
     instant: Any
-    """Whether the row belongs to an instant, and not to one side of a jump, (R,) bool."""
+    """Whether the row is the one of a time step, and not of one side of a jump, (R,) bool."""
     q: Any
     dq: Any
     ddq: Any
@@ -192,6 +193,12 @@ class _Motion(NamedTuple):
     """Index of the last sample at each row, (R,)."""
     model_positions: Any
     """Positions of all joints of MuJoCo's model."""
+
+
+class _Motion(NamedTuple):
+    """The recorded motion of a run."""
+
+    rows: _Rows
     states: LoopState
     """The state after each sample of the law."""
     diverged: bool
@@ -242,7 +249,7 @@ class _Run:
         """Whether the robot receives the command unchanged."""
         self.stages = Stages(self.torque_and_rate, jax.tree.map(np.asarray, self.state.actuator))
         self.states: list[LoopState] = []
-        self.rows: list[tuple] = []
+        self.rows: list[_Rows] = []
 
     def motion(self, steps: int) -> _Motion:
         """Runs this number of steps and returns the recorded motion."""
@@ -253,13 +260,12 @@ class _Run:
                 t = index * self.dt
                 diverged = diverged or self.has_diverged()
                 if diverged:
-                    self.rows.append((t, True, *self.rows[-1][2:]))
+                    self.rows.append(self.rows[-1]._replace(t=t, instant=True))
                     continue
                 self.begin_step(index, t)
                 if index < steps:
                     self.integrate(t, t + self.dt)
-        columns: list[Any] = [_stacked(column) for column in zip(*self.rows, strict=True)]
-        return _Motion._make([*columns, _stacked(self.states), diverged])
+        return _Motion(_stacked(self.rows), _stacked(self.states), diverged)
 
     def has_diverged(self) -> bool:
         """Whether the state is not finite or too fast."""
@@ -322,8 +328,9 @@ class _Run:
             tau, limited = np.asarray(delivered.tau), np.asarray(delivered.limited)
         model_positions = self.robot.data.qpos.copy()
         sample = len(self.commands) - 1
-        row = (t, instant, q, dq, ddq, tau, limited, actuator, sample, model_positions)
-        self.rows.append(row)
+        self.rows.append(
+            _Rows(t, instant, q, dq, ddq, tau, limited, actuator, sample, model_positions)
+        )
 
     # Commands in transit, and jumps of the scenario
 
@@ -373,13 +380,14 @@ def _stacked(trees: Sequence[Any]) -> Any:
 @jax.jit
 def _observed(scenario: Scenario, folds, dt, motion: _Motion):
     """Samples, metrics and flags of a motion."""
-    t = motion.t.astype(dt.dtype)
+    rows = motion.rows
+    t = rows.t.astype(dt.dtype)
     half, zero = 0.5 * jnp.diff(t), jnp.zeros((1,), dt.dtype)
     weight = jnp.concatenate([zero, half]) + jnp.concatenate([half, zero])
-    step = jnp.where(motion.instant & (t > 0), dt, 0.0)
-    signals = jax.tree.map(lambda x: x[motion.sample], motion.states.sampled.signals)
+    step = jnp.where(rows.instant & (t > 0), dt, 0.0)
+    signals = jax.tree.map(lambda x: x[rows.sample], motion.states.sampled.signals)
     samples = jax.vmap(partial(sample_at, scenario))(
-        t, weight, motion.q, motion.dq, motion.ddq, motion.tau, motion.limited, signals
+        t, weight, rows.q, rows.dq, rows.ddq, rows.tau, rows.limited, signals
     )
     samples = dataclasses.replace(samples, step=step)
     raised = jax.vmap(sample_status)(samples)
@@ -395,9 +403,10 @@ def _rollout(
     status = np.bitwise_or.reduce(np.asarray(raised))
     if motion.diverged:
         status |= int(Status.NOT_FINITE)
-    at = np.flatnonzero(motion.instant)[::record_every]
+    rows = motion.rows
+    at = np.flatnonzero(rows.instant)[::record_every]
     recorded = jax.tree.map(lambda x: x[at], samples)
-    states = jax.tree.map(lambda x: jnp.asarray(x[motion.sample[at]]), motion.states)
+    states = jax.tree.map(lambda x: jnp.asarray(x[rows.sample[at]]), motion.states)
     return Rollout(
         scenario=scenario,
         controller_state=states.controller,
@@ -406,9 +415,9 @@ def _rollout(
         status=jnp.int32(status),
         fastest_mode=jnp.full_like(step_size, jnp.nan),
         dt=step_size,
-        actuator_state=jax.tree.map(lambda x: jnp.asarray(x[at]), motion.actuator),
+        actuator_state=jax.tree.map(lambda x: jnp.asarray(x[at]), rows.actuator),
         measured=states.sampled.measured,
         method=method,
-        steps=int(np.sum(motion.instant)) - 1,
+        steps=int(np.sum(rows.instant)) - 1,
         **attributes(recorded, SIGNALS),
     )

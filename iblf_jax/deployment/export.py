@@ -16,6 +16,7 @@ import numpy as np
 from iblf_jax.core import checks, notices
 from iblf_jax.core.pytree import astype
 from iblf_jax.core.status import FAILED, Status, describe
+from iblf_jax.deployment.build import write_files
 from iblf_jax.deployment.c_names import FILES, RESERVED
 from iblf_jax.deployment.control_law import SampleInputs, control_law, sample, start
 from iblf_jax.deployment.cosimulate import check_single, with_period
@@ -40,7 +41,8 @@ from iblf_jax.simulation.noise import has_noise, noise_key
 from iblf_jax.simulation.scenario import Scenario, canonical, check_step
 from iblf_jax.world.robots._base import robot_member
 
-TARGETS = ("c", "fmu", "fmu-loop", "wasm")
+LAW_TARGETS = ("c", "fmu")
+LOOP_TARGETS = ("fmu-loop", "wasm")
 TYPES = {"double": "float64", "float": "float32"}
 VECTORS_DURATION = 20.0
 """Length of the simulated run whose torques the self-test compares [s]."""
@@ -131,14 +133,13 @@ def export(
 
     Source: design of this package; FMI standard 3.0, Modelica Association, 2022.
     """
-    checks.one_of("target", target, TARGETS)
-    is_loop = target in ("fmu-loop", "wasm")
+    checks.one_of("target", target, (*LAW_TARGETS, *LOOP_TARGETS))
+    is_loop = target in LOOP_TARGETS
     reference = _current_name(reference)
     _check_options(target, dtype, reference, is_loop)
     tableau(method)
     dt, seed = checks.time_span("dt", dt), checks.seed(seed)
-    defaults = {True: "iblf_loop", False: "iblf_law"}
-    name = checked_name(name, defaults[is_loop])
+    name = checked_name(name, "iblf_loop" if is_loop else "iblf_law")
     check_single(scenario)
     if not is_loop or period is not None:
         scenario = with_period(scenario, period)
@@ -146,10 +147,11 @@ def export(
     if not is_loop:
         _check_period(float(scenario.sampling.period))  # type: ignore[union-attr]
     folder = checks.folder_to_write("folder", folder)
+    external_reference = reference == "given"
     try:
         if is_loop:
             return _export_loop(scenario, folder, target, name, dt, method, seed)
-        return _export_law(scenario, folder, target, name, reference == "given")
+        return _export_law(scenario, folder, target, name, external_reference)
     except UnsupportedError as error:
         came = f"what has no C ({error})"
         raise checks.fail("scenario", came, "a scenario whose operations are lowered") from None
@@ -180,17 +182,18 @@ def _export_law(
     scenario: Scenario, folder: Path, target: str, name: str, external_reference: bool
 ) -> Exported:
     law = Law(
-        scenario,
-        control_law(scenario, external_reference),
-        name,
-        external_reference,
-        vectors(scenario, external_reference),
-        tuple(robot_member(scenario.model, "joints")),
-        _scenario_file(scenario),
+        scenario=scenario,
+        programs=control_law(scenario, external_reference),
+        name=name,
+        external_reference=external_reference,
+        vectors=vectors(scenario, external_reference),
+        joints=tuple(robot_member(scenario.model, "joints")),
+        scenario_toml=_scenario_toml(scenario),
     )
     generated = generate(law)
     if target == "c":
-        files = _write_files(folder, generated.files)
+        write_files(folder, generated.files)
+        files = tuple(generated.files)
     else:
         law_fmu(law, generated, folder / f"{name}.fmu")
         files = (f"{name}.fmu",)
@@ -220,7 +223,7 @@ def _export_loop(
         loop_fmu(scenario, generated, run_settings, folder / f"{name}.fmu")
         files = (f"{name}.fmu",)
     width = loop.step.dtype.itemsize
-    sizes = {"state": width * loop.size + 8, "parameters": width * generated.parameters.size}
+    sizes = {"state": width * loop.carry_size + 8, "parameters": width * generated.parameters.size}
     paths = tuple(field.path for field in generated.parameters.fields)
     return Exported(folder, target, files, operations_of(loop.step), sizes, paths)
 
@@ -257,19 +260,12 @@ def _available(dtype: str) -> str:
     return jax_type
 
 
-def _scenario_file(scenario: Scenario) -> str | None:
+def _scenario_toml(scenario: Scenario) -> str | None:
     """The scenario as TOML; None if it has parts that cannot be stored in a file."""
     try:
         return scenario_to_toml(scenario)
     except ValueError:
         return None
-
-
-def _write_files(folder: Path, texts: dict[str, str]) -> tuple[str, ...]:
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, text in texts.items():
-        (folder / name).write_text(text, encoding="utf-8")
-    return tuple(texts)
 
 
 def vectors(scenario: Scenario, external_reference: bool) -> Vectors:
@@ -296,9 +292,10 @@ def vectors(scenario: Scenario, external_reference: bool) -> Vectors:
             f"the simulated run with this law every {period:g} s: {describe(status)}. The exported"
             " code is that law; ij.recommended_period(scenario) returns how long a period may be."
         )
-    _, *at_start = map(np.asarray, jax.tree.leaves(first))
-    _, q, dq, *references = map(np.asarray, jax.tree.leaves(inputs))
-    return Vectors(tuple(at_start), q, dq, tuple(references), torques[::CHECK_INTERVAL])
+    at_start = tuple(map(np.asarray, jax.tree.leaves(first[1:])))  # without the time
+    references = tuple(map(np.asarray, jax.tree.leaves(inputs[3:])))
+    q, dq = np.asarray(inputs.q), np.asarray(inputs.dq)
+    return Vectors(at_start, q, dq, references, torques[::CHECK_INTERVAL])
 
 
 def _with_own_reference(scenario: Scenario, inputs: SampleInputs) -> SampleInputs:
@@ -366,8 +363,8 @@ def _reference(scenario: Scenario, t: jax.Array) -> tuple[jax.Array, ...]:
 def _torques(scenario: Scenario, first: SampleInputs, inputs: SampleInputs) -> jax.Array:
     """The torques of samples one after the other, (K, n) [N m]."""
 
-    def one(memory, inputs):
-        memory, outputs = sample(scenario, inputs, memory)
-        return memory, outputs.tau
+    def one(state, inputs):
+        state, outputs = sample(scenario, inputs, state)
+        return state, outputs.tau
 
     return jax.lax.scan(one, start(scenario, first)[0], inputs)[1]

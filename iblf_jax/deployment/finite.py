@@ -19,7 +19,7 @@ finite."""
 def check_finite(
     scenario: Scenario, torques_of: Callable[[Scenario], Any], torques: np.ndarray, instant: str
 ) -> None:
-    """Refuses a law whose torques are not finite.
+    """Raises ValueError for a law whose torques are not finite.
 
     Args:
       scenario: the scenario with the law.
@@ -37,11 +37,12 @@ def check_finite(
         return
     row, joint = wrong[0]
     finding = f"the torque tau[{joint}] is {torques[row, joint]} {instant}"
-    blamed = _cause(scenario, torques_of)
-    if blamed is None:
-        came, remedy = f"a law that yields no numbers: {finding}", "Check its gains and its model."
+    cause = _cause(scenario, torques_of)
+    if cause is None:
+        came = f"a law that yields no numbers: {finding}"
+        remedy = "Check its gains and its model."
         raise checks.fail("scenario", came, "finite torques", remedy)
-    path, value = blamed
+    path, value = cause
     expected = "a value with which the law yields finite numbers"
     raise checks.fail(path, value, expected, f"With it {finding}.")
 
@@ -49,8 +50,8 @@ def check_finite(
 def _cause(
     scenario: Scenario, torques_of: Callable[[Scenario], Any]
 ) -> tuple[str, np.ndarray] | None:
-    """The parameter, of extreme size, without which the torques are finite; None if there is
-    none.
+    """The parameter of extreme size with which the torques are not finite, and its value; None if
+    no single parameter is the cause.
     """
     for parameter in parameters(scenario, named=False):
         value = np.asarray(parameter.value, float)

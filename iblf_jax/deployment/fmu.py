@@ -16,7 +16,7 @@ from xml.etree import ElementTree as Xml
 import numpy as np
 
 from iblf_jax import __version__
-from iblf_jax.deployment.build import build, c_compiler, fmi_platform
+from iblf_jax.deployment.build import build, c_compiler, fmi_platform, write_files
 from iblf_jax.deployment.c_names import Parameters
 from iblf_jax.deployment.loop_program import OUTPUTS
 from iblf_jax.deployment.write_c import GeneratedLaw, Law, fill_template, title_of
@@ -32,7 +32,7 @@ BASE = {
     "N": (1, 1, -2, 0),
 }
 """Unit -> its exponents of kg, m, s and rad."""
-FIXED = ("sampling.period",)
+CONSTANTS = ("sampling.period",)
 """Parameters that an FMU does not let its user change."""
 
 
@@ -51,16 +51,17 @@ def unit_exponents(unit: str) -> tuple[int, int, int, int] | None:
     that is not a product of these.
     """
     found = [0, 0, 0, 0]
-    above, _, below = unit.partition("/")
-    for sign, words in ((1, above), (-1, below)):
-        for word in words.replace("(", " ").replace(")", " ").split():
-            name, _, power = word.partition("^")
+    numerator, _, denominator = unit.partition("/")
+    for sign, factors in ((1, numerator), (-1, denominator)):
+        for factor in factors.replace("(", " ").replace(")", " ").split():
+            name, _, power = factor.partition("^")
             if name == "1":
                 continue
-            if name not in BASE or not (power or "1").lstrip("-").isdecimal():
+            power = power or "1"
+            if name not in BASE or not power.lstrip("-").isdecimal():
                 return None
             for k, exponent in enumerate(BASE[name]):
-                found[k] += sign * int(power or 1) * exponent
+                found[k] += sign * int(power) * exponent
     return tuple(found)  # type: ignore[return-value]
 
 
@@ -88,14 +89,13 @@ def _outputs(units: dict[str, str], n: int) -> list[Variable]:
 
 
 def _settable(parameters: Parameters) -> list[Variable]:
-    """The parameters; those in FIXED are constants."""
-    kinds = dict.fromkeys(FIXED, "constant")
-    return [
-        Variable(
-            x.path, kinds.get(x.path, "parameter"), x.unit, x.shape, np.asarray(x.value, float)
-        )
-        for x in parameters.fields
-    ]
+    """The parameters; those in CONSTANTS are constants."""
+    variables = list[Variable]()
+    for field in parameters.fields:
+        causality = "constant" if field.path in CONSTANTS else "parameter"
+        value = np.asarray(field.value, float)
+        variables.append(Variable(field.path, causality, field.unit, field.shape, value))
+    return variables
 
 
 def model_description(
@@ -192,22 +192,20 @@ def wrapper_source(
     values: dict[str, Any],
 ) -> str:
     """The FMI 3.0 wrapper of a law or a loop in C."""
-    table, place, starts = list[str](), 0, list[str]()
+    rows = list[str]()
+    offset = 0
     for v in variables:
         size = math.prod(v.shape)
-        table.append(f"  {{{place}, {size}, {int(v.causality in ('parameter', 'input'))}}},")
-        place += size
+        is_settable = v.causality in ("parameter", "input")
+        rows.append(f"  {{{offset}, {size}, {int(is_settable)}}},")
+        offset += size
     counts = {
-        kind: sum(math.prod(v.shape) for v in variables if v.causality in kinds)
-        for kind, kinds in CAUSALITIES.items()
+        kind: sum(math.prod(v.shape) for v in variables if v.causality in causalities)
+        for kind, causalities in CAUSALITIES.items()
     }
-    begin = 0
-    for v in (v for v in variables if v.causality == "input"):
-        starts += [
-            f"  f->inputs[{begin + i}] = {x!r};\n"
-            for i, x in enumerate(np.ravel(np.asarray(v.start)).tolist())
-        ]
-        begin += math.prod(v.shape)
+    inputs = [np.ravel(np.asarray(v.start)) for v in variables if v.causality == "input"]
+    values_of_inputs = np.concatenate([*inputs, []]).tolist()
+    starts = [f"  f->inputs[{i}] = {x!r};\n" for i, x in enumerate(values_of_inputs)]
     return fill_template(
         "fmi3.c",
         {
@@ -216,7 +214,7 @@ def wrapper_source(
             "name": name,
             "token": token,
             "variables": len(variables),
-            "variable_table": "\n".join(table),
+            "variable_table": "\n".join(rows),
             "parameter_count": counts["parameters"],
             "inputs": counts["inputs"],
             "outputs": counts["outputs"],
@@ -294,8 +292,7 @@ def _package(
     }
     system, suffix = fmi_platform()
     with tempfile.TemporaryDirectory() as folder:
-        for file, content in sources.items():
-            (Path(folder) / file).write_text(content)
+        write_files(Path(folder), sources)
         build(
             [*c_compiler(), *FLAGS, f"{name}.c", f"{name}_fmi3.c", "-lm", "-o", f"{name}{suffix}"],
             Path(folder),

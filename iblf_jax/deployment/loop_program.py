@@ -51,11 +51,12 @@ class Loop(NamedTuple):
     """
 
     start: Program
-    """Its results are the memory before the first step."""
+    """Its results are the carry before the first step."""
     step: Program
-    """Its carry is the memory; its results are OUTPUTS and the status at the start of the step."""
-    size: int
-    """Number of floating-point numbers in the memory."""
+    """Its carry is state and status; its results are OUTPUTS and the status, both at the start of
+    the step."""
+    carry_size: int
+    """Number of floating-point numbers in the carry."""
 
 
 def loop_program(scenario: Scenario, method: str) -> Loop:
@@ -92,7 +93,7 @@ def loop_program(scenario: Scenario, method: str) -> Loop:
         outputs = (*attributes(done.sample, names).values(), done.carry.status.astype(dtype))
         return as_floats((done.carry.state, done.carry.status), dtype), outputs
 
-    memory = as_floats(like, dtype)
-    begin = program_of(first, scenario, run_settings, ())
-    advanced = program_of(step, scenario, run_settings, memory)
-    return Loop(begin, advanced, sum(x.size for x in jax.tree.leaves(memory)))
+    carry = as_floats(like, dtype)
+    start_program = program_of(first, scenario, run_settings, ())
+    step_program = program_of(step, scenario, run_settings, carry)
+    return Loop(start_program, step_program, sum(x.size for x in jax.tree.leaves(carry)))

@@ -24,7 +24,7 @@ from iblf_jax.world.robots.tree import HINGE, SLIDE, Tree, mujoco_package, unkno
 
 INTEGRATORS = ("RK4", "Euler", "implicit", "implicitfast")
 
-Push = Callable[[float, np.ndarray, np.ndarray], np.ndarray]
+TorqueCallback = Callable[[float, np.ndarray, np.ndarray], np.ndarray]
 """Computes the torque of the joints, (n,) [N m], from time [s], q and q'."""
 
 
@@ -56,13 +56,14 @@ class MujocoPlant:
         self.mujoco = mujoco = mujoco_package()
         if isinstance(plant, mujoco.MjModel):
             model = copy.copy(plant)
-            joints, others = _joints(Tree(model, mujoco, "world", {}), names, n, locked)
-            if others:
+            joints, locked_positions = _joints(Tree(model, mujoco, "world", {}), names, n, locked)
+            if locked_positions:
                 came = Shown("an MjModel in which more moves")
                 remedy = "Give the file or an MjSpec, in which they can be locked."
                 raise checks.fail("plant", came, f"one whose arm has {n} joints that move", remedy)
         else:
-            model, joints = _locked(mujoco, _specification(mujoco, plant), plant, names, n, locked)
+            spec = _specification(mujoco, plant)
+            model, joints = _with_locked_joints(mujoco, spec, plant, names, n, locked)
         self.model = model
         self.positions, self.speeds = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
         arm = {int(model.body_rootid[model.jnt_bodyid[j]]) for j in joints}
@@ -95,15 +96,15 @@ class MujocoPlant:
         self.data.qpos[self.positions], self.data.qvel[self.speeds] = q, dq
 
     @contextmanager
-    def driven(self, push: Push) -> Iterator[None]:
-        """Context in which MuJoCo calls `push` for the torque at every stage of its integrator."""
+    def driven(self, torque: TorqueCallback) -> Iterator[None]:
+        """Context in which MuJoCo calls `torque` at every stage of its integrator."""
         mujoco, before = self.mujoco, self.mujoco.get_mjcb_control()
 
         def control(model: Any, data: Any) -> None:
             if before is not None:
                 before(model, data)
             if data is self.data:  # MuJoCo calls it for all models of the process.
-                data.qfrc_applied[self.speeds] = push(data.time, self.q, self.dq)
+                data.qfrc_applied[self.speeds] = torque(data.time, self.q, self.dq)
 
         mujoco.set_mjcb_control(control)
         try:
@@ -247,27 +248,15 @@ def _joints(
     movable = [
         j for j in range(m.njnt) if m.jnt_type[j] in (HINGE, SLIDE) and j not in locked_positions
     ]
+    joints = movable
     if names:
-        for name in names:
-            if name not in tree.joint_names:
-                expected = "a model that has the scenario's joints"
-                raise unknown("plant", name, expected, tree.joint_names)
-        joints = [tree.joint_names.index(name) for name in names]
-        for j in joints:
-            name = tree.joint_names[j]
-            if j in locked_positions:
-                raise checks.fail("locked", name, "joints that the scenario does not move")
-            if j not in movable:
-                came = Shown("a free joint or a ball")
-                raise checks.fail(f"joint {name!r}", came, "a hinge or slide")
+        joints = _joints_by_name(tree, names, movable, locked_positions)
     elif len(movable) != n:
         came = Shown(f"{len(movable)} joints that move")
         remedy = "Only hinges and slides count."
         if len(movable) > n:
             remedy = "Lock the others, or name the scenario's joints: robots.load does."
         raise checks.fail("plant", came, f"{n}, as the scenario has", remedy)
-    else:
-        joints = movable
     arm = {int(m.body_rootid[m.jnt_bodyid[j]]) for j in joints}
     for j in set(range(m.njnt)).difference(joints, locked_positions):
         if int(m.body_rootid[m.jnt_bodyid[j]]) not in arm:
@@ -279,6 +268,24 @@ def _joints(
     return joints, locked_positions
 
 
+def _joints_by_name(
+    tree: Tree, names: tuple[str, ...], movable: list[int], locked_positions: dict[int, float]
+) -> list[int]:
+    """The driven joints that the scenario names; ValueError if one of them cannot be driven."""
+    for name in names:
+        if name not in tree.joint_names:
+            expected = "a model that has the scenario's joints"
+            raise unknown("plant", name, expected, tree.joint_names)
+    joints = [tree.joint_names.index(name) for name in names]
+    for name, j in zip(names, joints, strict=True):
+        if j in locked_positions:
+            raise checks.fail("locked", name, "joints that the scenario does not move")
+        if j not in movable:
+            came = Shown("a free joint or a ball")
+            raise checks.fail(f"joint {name!r}", came, "a hinge or slide")
+    return joints
+
+
 def _compiled(spec: Any, plant: Any) -> Any:
     """The model of a specification; ValueError with MuJoCo's message if it is not accepted."""
     try:
@@ -287,11 +294,11 @@ def _compiled(spec: Any, plant: Any) -> Any:
         raise _refused(plant, error) from None
 
 
-def _locked(
+def _with_locked_joints(
     mujoco: Any, spec: Any, plant: Any, names: tuple[str, ...], n: int, locked: Mapping[str, float]
 ) -> tuple[Any, list[int]]:
-    """The compiled model without its locked joints, with their bodies at the locked positions, and
-    the indices of the driven joints.
+    """The compiled model, in which the bodies of locked joints are fixed at the locked positions,
+    and the indices of the driven joints in it.
     """
     spec.compiler.fusestatic = False
     full_model = _compiled(spec, plant)
@@ -326,22 +333,17 @@ def _elements_to_remove(mujoco: Any, spec: Any, locked_positions: dict[int, floa
                 remedy = "Take it out of the model, or lock or drive all of its joints."
                 raise checks.fail(f"tendon {tendon.name!r}", came, "one or the other", remedy)
             tendons.append(tendon)
-    known = {x.name for x in removed} - {""}, {x.name for x in tendons} - {""}
-    of_joints = {mujoco.mjtEq.mjEQ_JOINT: 0, mujoco.mjtEq.mjEQ_TENDON: 1}
-    coupled = [
-        x
-        for x in spec.equalities
-        if x.type in of_joints and {x.name1, x.name2} & known[of_joints[x.type]]
-    ]
-    kinds = {
-        mujoco.mjtTrn.mjTRN_JOINT: 0,
-        mujoco.mjtTrn.mjTRN_JOINTINPARENT: 0,
-        mujoco.mjtTrn.mjTRN_TENDON: 1,
+    joint_names = {x.name for x in removed} - {""}
+    tendon_names = {x.name for x in tendons} - {""}
+    coupled_to = {mujoco.mjtEq.mjEQ_JOINT: joint_names, mujoco.mjtEq.mjEQ_TENDON: tendon_names}
+    couplings = [x for x in spec.equalities if {x.name1, x.name2} & coupled_to.get(x.type, set())]
+    acts_on = {
+        mujoco.mjtTrn.mjTRN_JOINT: joint_names,
+        mujoco.mjtTrn.mjTRN_JOINTINPARENT: joint_names,
+        mujoco.mjtTrn.mjTRN_TENDON: tendon_names,
     }
-    driven = [
-        x for x in spec.actuators if x.trntype in kinds and x.target in known[kinds[x.trntype]]
-    ]
-    return [*coupled, *driven, *spec.sensors, *spec.keys, *tendons, *removed]
+    actuators = [x for x in spec.actuators if x.target in acts_on.get(x.trntype, set())]
+    return [*couplings, *actuators, *spec.sensors, *spec.keys, *tendons, *removed]
 
 
 def _weld(

@@ -70,8 +70,8 @@ def describe_counts(counts: Counter[str]) -> str:
 
 
 def stack_bytes_of(text: str, real_bytes: int) -> int:
-    """Stack of the longest chain of calls in a generated function, if no number is held in a
-    register [bytes].
+    """Stack of the longest chain of calls of a generated function [bytes], under the assumption
+    that no number is held in a register.
     """
     bodies = re.split(r"^(?:static|SEPARATE) void ", text, flags=re.MULTILINE)[1:]
     own = [len(re.findall(r"^  [FI] v\d+ =", body, re.MULTILINE)) for body in bodies]
@@ -85,18 +85,11 @@ def stack_bytes_of(text: str, real_bytes: int) -> int:
 
 def helper_macros(text: str) -> str:
     """The macros of `c/plain.h` that a text uses, and `MASK` if one of them uses it."""
-    lines = header("plain.h").splitlines()
-    used = [
-        line
-        for line in lines
-        if (found := re.match(r"#define (\w+)", line)) and re.search(rf"\b{found[1]}\b", text)
-    ]
-    mask = [
-        line
-        for line in lines
-        if line.startswith("#define MASK") and line not in used and any("MASK(" in x for x in used)
-    ]
-    return "\n".join(mask + used)
+    macros = re.findall(r"^(#define (\w+).*)$", header("plain.h"), re.MULTILINE)
+    used = [line for line, name in macros if re.search(rf"\b{name}\b", text)]
+    if any("MASK(" in line for line in used):
+        used = [line for line, name in macros if name == "MASK" and line not in used] + used
+    return "\n".join(used)
 
 
 CHECK_INTERVAL = 10
@@ -125,13 +118,15 @@ class Law(NamedTuple):
     external_reference: bool
     vectors: Vectors
     joints: tuple[str, ...]
-    file: str | None
+    scenario_toml: str | None
     """The scenario as TOML; None if a file cannot hold it."""
 
     @property
     def references(self) -> tuple[str, ...]:
         """Names of the inputs that give the reference; none if the reference is internal."""
-        return REFERENCE[: 3 * self.external_reference]
+        if self.external_reference:
+            return REFERENCE
+        return ()
 
     @property
     def is_float(self) -> bool:
@@ -140,7 +135,7 @@ class Law(NamedTuple):
 
 
 class GeneratedLaw(NamedTuple):
-    """The files of a law, its operations and its memory."""
+    """The files of a law, its operations and the sizes of its data [bytes]."""
 
     files: dict[str, str]
     operations: Counter[str]
@@ -151,10 +146,10 @@ class GeneratedLaw(NamedTuple):
 
 
 def generate(law: Law) -> GeneratedLaw:
-    """The files of a law, with its operations and its memory."""
+    """Generates the files of a law and counts its operations and the bytes of its data."""
     programs, name, n = law.programs, law.name, law.scenario.n
     parameters = Parameters.of(law.scenario, (programs.start, programs.sample))
-    size = len(programs.memory)
+    size = len(programs.state_names)
     real_bytes = np.dtype(programs.sample.dtype).itemsize
     start, sample = _functions(law, parameters)
     operations = operations_of(programs.sample)
@@ -177,7 +172,7 @@ def generate(law: Law) -> GeneratedLaw:
 def _functions(law: Law, parameters: Parameters) -> tuple[str, str]:
     """The C functions that compute the start and a sample."""
     programs, name = law.programs, law.name
-    size = len(programs.memory)
+    size = len(programs.state_names)
     arrays = ("q", "dq", *law.references)
     per_run = ["t[0]", *(f"{x}[{i}]" for x in arrays for i in range(law.scenario.n))]
     parameter_argument = f"const {name}_parameters *p"
@@ -201,14 +196,14 @@ def _functions(law: Law, parameters: Parameters) -> tuple[str, str]:
 
 def _law_values(law: Law, operations: Counter[str]) -> dict[str, Any]:
     """The values for the placeholders of the law's source and header."""
-    memory = law.programs.memory
-    entries = "".join(f"       [{k}] {comment(x)}\n" for k, x in enumerate(memory))
+    state = law.programs.state_names
+    entries = "".join(f"       [{k}] {comment(x)}\n" for k, x in enumerate(state))
     values = {
-        "period": "sampling.period",
+        "period_parameter": "sampling.period",
         "operations": describe_counts(operations),
         "memory": entries or "       nothing\n",
-        "memory_size": max(len(memory), 1),
-        "memory_count": len(memory),
+        "memory_size": max(len(state), 1),
+        "memory_count": len(state),
         "flags": len(FLAGS),
         "keep_start": "",
         "keep_sample": "",
@@ -220,7 +215,7 @@ def _law_values(law: Law, operations: Counter[str]) -> dict[str, Any]:
         "velocity": "Its inputs are positions; the scenario's filter computes the velocities.",
         **_reference_values(law),
     }
-    if memory:
+    if state:
         keep = "memcpy(s->memory, result, sizeof s->memory);\n"
         values |= {"keep_start": keep + "  ", "keep_sample": keep + "    "}
     if law.programs.reads_velocity:
@@ -292,7 +287,8 @@ def _supporting_files(
     law: Law, values: dict[str, Any], sizes: tuple[int, int, int]
 ) -> dict[str, str]:
     """The self-test, the build files, the README and, if possible, the file of the scenario."""
-    v, period = law.vectors, float(law.scenario.sampling.period)  # type: ignore[union-attr]
+    v = law.vectors
+    period = float(law.scenario.sampling.period)  # type: ignore[union-attr]
     values |= {
         "samples": len(v.q),
         "duration": f"{len(v.q) * period:g}",
@@ -302,7 +298,7 @@ def _supporting_files(
         "parameter_bytes": sizes[1],
         "stack_bytes": sizes[2],
         "period": repr(period),
-        "inside": _contents(law),
+        "contents": _contents(law),
         "scenario_row": "",
         "time_note": "",
     }
@@ -315,7 +311,7 @@ def _supporting_files(
     if law.programs.reads_velocity:
         arrays["dq"] = v.dq
     arrays |= dict(zip(law.references, v.reference, strict=True))
-    if law.file is not None:
+    if law.scenario_toml is not None:
         values["scenario_row"] = _scenario_row(law)
     texts = {
         "selftest.c": fill_template("selftest.c", values),
@@ -323,15 +319,15 @@ def _supporting_files(
         "CMakeLists.txt": fill_template("CMakeLists.txt", values),
         "README.md": fill_template("README.md", values),
     }
-    if law.file is not None:
-        texts["scenario.toml"] = law.file
+    if law.scenario_toml is not None:
+        texts["scenario.toml"] = law.scenario_toml
     return texts
 
 
 def _scenario_row(law: Law) -> str:
     """The row of the README about the file of the scenario."""
     dtype = C_TYPES[law.is_float]["type"]
-    reference = {True: "given", False: "inside"}[law.external_reference]
+    reference = "given" if law.external_reference else "inside"
     command = (
         f"python -m iblf_jax export scenario.toml --out . --name {law.name} --dtype {dtype}"
         f" --reference {reference}"

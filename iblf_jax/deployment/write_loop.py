@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from iblf_jax import __version__
-from iblf_jax.deployment.build import build, zig
+from iblf_jax.deployment.build import build, write_files, zig
 from iblf_jax.deployment.c_names import Parameters
 from iblf_jax.deployment.loop_program import OUTPUTS, Loop
 from iblf_jax.deployment.write_c import SEGMENT, fill_template, shared_values
@@ -44,43 +44,43 @@ def loop_files(
     inputs = {
         "shared": parameters.numbers,
         "per_run": [f"u[{i}]" for i in range(setting_count)],
-        "carry": [f"m[{k}]" for k in range(loop.size)],
+        "carry": [f"m[{k}]" for k in range(loop.carry_size)],
         "index": ["index"],
     }
-    results = [f"r[{k}]" for k in range(loop.size + output_count)]
+    results = [f"r[{k}]" for k in range(loop.carry_size + output_count)]
     arguments = [f"const {name}_parameters *p", "const F *u"]
     begin = plain_function(
-        loop.start, f"{name}_begin", arguments, inputs, results[: loop.size], SEGMENT
+        loop.start, f"{name}_begin", arguments, inputs, results[: loop.carry_size], SEGMENT
     )
     arguments[1:] = ["const F *m", "const F *u", "I index"]
     step = plain_function(loop.step, f"{name}_advance", arguments, inputs, results, SEGMENT)
     values = shared_values(scenario, name, loop.step.dtype, parameters, joints, begin, step) | {
         "method": method,
         "settings": setting_count,
-        "told": output_count,
-        "memory_size": loop.size,
+        "output_count": output_count,
+        "memory_size": loop.carry_size,
         "outputs": ", ".join(OUTPUTS),
         "noise_setting": noise_setting,
-        "rows": RECORD_BUFFER,
+        "buffer_rows": RECORD_BUFFER,
         "real_bytes": loop.step.dtype.itemsize,
     }
     texts = {f"{name}.{ending}": fill_template(f"loop.{ending}", values) for ending in "hc"}
     return GeneratedLoop(texts, parameters, values)
 
 
-def _finite(value: np.ndarray) -> Any:
-    """Numbers for JSON; null where a number is not finite."""
+def _json_numbers(value: np.ndarray) -> Any:
+    """Numbers for JSON; a number that is not finite becomes null."""
     value = np.asarray(value, object)
     value[~np.isfinite(value.astype(float))] = None
     return value.tolist()
 
 
-def table(generated: GeneratedLoop, setting_values: list[float]) -> dict[str, Any]:
+def table(generated: GeneratedLoop, run_settings: list[float]) -> dict[str, Any]:
     """The description of a module for a page: its parameters, settings and records."""
     rows, offset = [], 0
     for field in generated.parameters.fields:
         row = {"path": field.path, "offset": offset, "shape": field.shape, "unit": field.unit}
-        rows.append(row | {"value": _finite(field.value)})
+        rows.append(row | {"value": _json_numbers(field.value)})
         offset += math.prod(field.shape)
     values, n = generated.values, generated.values["joints"]
     columns = [
@@ -91,9 +91,9 @@ def table(generated: GeneratedLoop, setting_values: list[float]) -> dict[str, An
     return {
         "parameters": rows,
         "count": offset,
-        "settings": setting_values,
+        "settings": run_settings,
         "records": columns,
-        "record": values["told"],
+        "record": values["output_count"],
         "bytes": values["real_bytes"],
         "joints": n,
         "method": values["method"],
@@ -101,7 +101,7 @@ def table(generated: GeneratedLoop, setting_values: list[float]) -> dict[str, An
     }
 
 
-def wasm_files(generated: GeneratedLoop, folder: Path, setting_values: list[float]) -> list[str]:
+def wasm_files(generated: GeneratedLoop, folder: Path, run_settings: list[float]) -> list[str]:
     """Writes a module, its table and its sources into a folder; returns the names of the files.
 
     Raises:
@@ -110,12 +110,10 @@ def wasm_files(generated: GeneratedLoop, folder: Path, setting_values: list[floa
     name = generated.values["name"]
     texts = generated.files | {f"{name}_module.c": fill_template("wasm.c", generated.values)}
     texts["README.md"] = fill_template("wasm.md", generated.values)
-    description = json.dumps(table(generated, setting_values), indent=1, allow_nan=False)
+    description = json.dumps(table(generated, run_settings), indent=1, allow_nan=False)
     texts[f"{name}.json"] = f"{description}\n"
     command = zig()
-    folder.mkdir(parents=True, exist_ok=True)
-    for file, text in texts.items():
-        (folder / file).write_text(text)
+    write_files(folder, texts)
     build(
         [*command, *WASM_FLAGS, f"{name}.c", f"{name}_module.c", "-lm", "-o", f"{name}.wasm"],
         folder,

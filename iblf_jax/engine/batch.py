@@ -1,5 +1,6 @@
-"""A batch of runs, or one: which leaves differ between the runs, and the sequence from the start to
-the outcome, whatever loop makes the steps.
+"""A batch of runs, or a single run: its leaves, and the sequence from the start to the outcome.
+
+`run_all` calls `initialize`, a loop over the steps (`StepLoop`) and `finalize`.
 """
 
 from __future__ import annotations
@@ -32,41 +33,41 @@ from iblf_jax.simulation.stability import resolved
 
 
 class Leaves(NamedTuple):
-    """The leaves of a pytree, in two groups: those that all runs share and those of each run."""
+    """The leaves of a pytree in two groups: shared by all runs, and different for each run."""
 
     treedef: Any
     is_per_run: tuple[bool, ...]
-    """Of every leaf, whether it differs between runs."""
+    """Whether each leaf of the pytree differs between runs."""
     shared: list[jax.Array]
     per_run: list[jax.Array]
-    """With a leading batch axis."""
+    """The leaves that differ, with a leading batch axis."""
 
     @staticmethod
     def of(treedef: Any, is_per_run: Sequence[bool], leaves: Sequence[jax.Array]) -> Leaves:
-        """From all leaves of a pytree, in its order."""
+        """From all leaves of a pytree, in the order of the pytree."""
         groups: dict[bool, list[jax.Array]] = {False: [], True: []}
         for leaf, differs in zip(leaves, is_per_run, strict=True):
             groups[bool(differs)].append(leaf)
         return Leaves(treedef, tuple(is_per_run), groups[False], groups[True])
 
-    def merged(self, shared: Sequence, per_run: Sequence) -> list:
-        """Leaves of the two groups in the order of the pytree."""
+    def merge(self, shared: Sequence, per_run: Sequence) -> list:
+        """The leaves of both groups in the order of the pytree."""
         sources = {False: iter(shared), True: iter(per_run)}
         return [next(sources[differs]) for differs in self.is_per_run]
 
-    def together(self, shared: Sequence, per_run: Sequence):
-        """The pytree again, from one run's leaves."""
-        return jax.tree.unflatten(self.treedef, self.merged(shared, per_run))
+    def unflatten(self, shared: Sequence, per_run: Sequence):
+        """The pytree of one run, from its shared and its per-run leaves."""
+        return jax.tree.unflatten(self.treedef, self.merge(shared, per_run))
 
     @property
     def first(self):
         """The pytree of the first run."""
-        return self.together(self.shared, [x[0] for x in self.per_run])
+        return self.unflatten(self.shared, [x[0] for x in self.per_run])
 
 
 def split(inputs: Inputs, varied: Mapping[str, jax.Array]) -> Leaves:
-    """The leaves of what runs are computed from: those that `varied` replaces in the scenario
-    become one value a run.
+    """The leaves of the inputs; the leaves that `varied` replaces in the scenario become per-run
+    leaves.
     """
     before, treedef = jax.tree.flatten(inputs)
     if not varied:
@@ -80,7 +81,7 @@ def split(inputs: Inputs, varied: Mapping[str, jax.Array]) -> Leaves:
         scenario = with_parameters(inputs.scenario, leaves)
         return jax.tree.leaves(inputs._replace(scenario=scenario, noise=noise))
 
-    # A leaf that no path replaces is the same object, which `vmap` hands on as it is.
+    # A leaf that no path replaces stays the same object, also under `vmap`.
     is_per_run: list[bool] = []
 
     def of_run(values):
@@ -97,13 +98,13 @@ class Batch(NamedTuple):
     """Runs that are stepped together."""
 
     leaves: Leaves
-    """Of their `Inputs`."""
+    """The leaves of the `Inputs` of all runs."""
     runs: int | None
-    """None: one run, and no array has a run axis."""
+    """Number of runs; None for a single run, whose arrays have no run axis."""
     layout: BatchLayout = PLAIN_LAYOUT
     """How its parts are compiled."""
     constants: StructuralConstants | None = None
-    """Which numbers of the scenario are compiled in."""
+    """The numbers of the scenario that are compiled in."""
 
     @staticmethod
     def of(
@@ -119,59 +120,60 @@ class Batch(NamedTuple):
         return Batch(split(inputs, varied), runs, layout, constants)
 
     @property
-    def known(self) -> tuple:
-        """What is known of the shared numbers."""
+    def shared_constants(self) -> tuple:
+        """The structural constants among the shared numbers."""
         if self.constants is None:
             return ()
-        shapes = self.leaves.merged(
-            [x.shape for x in self.leaves.shared], [x.shape[1:] for x in self.leaves.per_run]
+        leaves = self.leaves
+        sizes = leaves.merge(
+            [x.size for x in leaves.shared], [math.prod(x.shape[1:]) for x in leaves.per_run]
         )
-        return self.constants.of_shared(self.leaves.is_per_run, [math.prod(x) for x in shapes])
+        return self.constants.of_shared(leaves.is_per_run, sizes)
 
     @property
     def dtype(self):
         """The floating-point type."""
         return self.leaves.shared[-1].dtype
 
-    def each(self, function: Callable, *args: Any) -> Any:
-        """function(inputs, *args) for every run; arguments and results have the run axis first."""
+    def map_runs(self, function: Callable, *args: Any) -> Any:
+        """`function(inputs, *args)` of every run; arguments and results have a leading run axis."""
 
         def one(per_run, *rest):
-            return function(self.leaves.together(self.leaves.shared, per_run), *rest)
+            return function(self.leaves.unflatten(self.leaves.shared, per_run), *rest)
 
         if self.runs is None:
             return one([], *args)
         if self.layout.mapping == "map":
             return jax.lax.map(lambda each: one(*each), (self.leaves.per_run, *args))
-        together = jax.vmap(one, axis_size=self.runs)
+        all_runs = jax.vmap(one, axis_size=self.runs)
         if self.layout.machine_functions == "parts":
-            together = machine_function(together)
-        return together(self.leaves.per_run, *args)
+            all_runs = machine_function(all_runs)
+        return all_runs(self.leaves.per_run, *args)
 
 
 StepLoop = Callable[[Any, Batch, Any, int, int | None], tuple[Any, Any]]
 """The loop over all steps of a batch: a function (step, batch, carry, steps, every) -> (carry after
-the last step, records of every `every`-th step from the first on).
+the last step, records).
 
-All arrays have the run axis first, records then the time axis; `every` is None where nothing is
-recorded."""
+The first step and every `every`-th one after it are recorded; None records nothing.  All arrays
+have a leading run axis, which the time axis of the records follows."""
 
 
 def _linearized(loop: StepLoop, batch: Batch, carry: Linearization) -> Linearization:
-    """What a `LinearizationStep` of every run has found."""
+    """The carry after the `LinearizationStep`s of every run."""
     batch = _linearized_batch(batch)
     steps = linearization_steps(batch.leaves.first.scenario)
     return loop(LinearizationStep(), batch, carry, steps, None)[0]
 
 
 def _linearized_batch(batch: Batch) -> Batch:
-    """The batch with the inputs alone that a `LinearizationStep` reads, and without derivatives, so
-    that one program of it serves all metrics and derivatives.
+    """The batch with only the inputs that a `LinearizationStep` reads, and without derivatives, so
+    that the same program serves all metrics and derivatives.
     """
     leaves = batch.leaves
-    numbered: Inputs = jax.tree.unflatten(leaves.treedef, range(len(leaves.is_per_run)))
-    kept, treedef = jax.tree.flatten(numbered._replace(folds=(), noise=(), direction=()))
-    values = leaves.merged(leaves.shared, leaves.per_run)
+    indices: Inputs = jax.tree.unflatten(leaves.treedef, range(len(leaves.is_per_run)))
+    kept, treedef = jax.tree.flatten(indices._replace(folds=(), noise=(), direction=()))
+    values = leaves.merge(leaves.shared, leaves.per_run)
     is_per_run = [leaves.is_per_run[i] for i in kept]
     constants = jax.lax.stop_gradient([values[i] for i in kept])
     return batch._replace(leaves=Leaves.of(treedef, is_per_run, constants))
@@ -190,33 +192,33 @@ def _initial_linearization(batch: Batch, method: str) -> Linearization:
             jnp.zeros_like(inputs.dt), perturbed_state(state), watched, estimate
         )
 
-    return batch.each(of_run)
+    return batch.map_runs(of_run)
 
 
 def linearization_batch(batch: Batch, method: str) -> tuple[Batch, Linearization]:
-    """The batch of the `LinearizationStep`s of some runs, and the shapes of their carry."""
+    """The batch and the shapes of the carry of the `LinearizationStep`s of a batch."""
     return _linearized_batch(batch), jax.eval_shape(lambda: _initial_linearization(batch, method))
 
 
 def initialize(loop: StepLoop, batch: Batch, method: str) -> tuple[Carry, Linearization]:
-    """The carry before the first step, and what a `LinearizationStep` has found at the start."""
-    found = _linearized(loop, batch, _initial_linearization(batch, method))
+    """The carry before the first step, and the linearization at the start."""
+    at_start = _linearized(loop, batch, _initial_linearization(batch, method))
 
-    def of_run(inputs, found):
+    def of_run(inputs, at_start):
         is_sampled = inputs.scenario.sampling is not None
-        return start(inputs, method, resolved(found.jacobian, is_sampled))
+        return start(inputs, method, resolved(at_start.jacobian, is_sampled))
 
-    return batch.each(of_run, found), found
+    return batch.map_runs(of_run, at_start), at_start
 
 
 def carry_shapes(batch: Batch, method: str) -> Carry:
-    """Shapes and types of the carry."""
+    """Shapes and types of the carry of a `TimeStep`."""
 
     def of_run(inputs):
         size = error_estimate.watched_indices(initial_state(inputs.scenario)).size
         return start(inputs, method, jnp.zeros((size, size), inputs.dt.dtype))
 
-    return jax.eval_shape(lambda: batch.each(of_run))
+    return jax.eval_shape(lambda: batch.map_runs(of_run))
 
 
 def finalize(
@@ -224,36 +226,37 @@ def finalize(
 ) -> Outcome:
     """The outcome after the last step, without records; `at_start` is the linearization there."""
 
-    def critical_instants(inputs, carry):
+    def at_nearest_and_end(inputs, carry):
         watched = at_start.jacobian.shape[-1]
         no_estimate = error_estimate.UnresolvedSignals(*[jnp.zeros_like(carry.accuracy.error)] * 3)
-        nearest, end = carry.nearest, inputs.dt * inputs.steps
-        instants = (
+        nearest = carry.nearest
+        end = inputs.dt * inputs.steps
+        pair = (
             linearization_at(nearest.t, nearest.state, watched, no_estimate),
             linearization_at(end, perturbed_state(carry.state), watched, no_estimate),
         )
-        return jax.tree.map(lambda *xs: jnp.stack(xs), *instants)
+        return jax.tree.map(lambda *xs: jnp.stack(xs), *pair)
 
-    def outcome(inputs, carry, at_start, later):
-        instants = jax.tree.map(lambda one, two: jnp.concatenate([one[None], two]), at_start, later)
+    def outcome(inputs, carry, at_start, pair):
+        instants = jax.tree.map(lambda x, xs: jnp.concatenate([x[None], xs]), at_start, pair)
         return outcome_of(inputs, request.method, carry, at_start.unresolved, instants)
 
-    # Both instants of a run are linearized as two runs, by the program that linearized the start.
+    # The two instants of a run are linearized as two runs, by the program of the start.
     per_run = [jnp.repeat(x, 2, axis=0) for x in batch.leaves.per_run]
     leaves = batch.leaves._replace(per_run=per_run)
-    twice = batch._replace(leaves=leaves, runs=2 * (batch.runs or 1))
-    instants = batch.each(critical_instants, carry)
+    doubled = batch._replace(leaves=leaves, runs=2 * (batch.runs or 1))
+    pairs = batch.map_runs(at_nearest_and_end, carry)
     if batch.runs is None:
-        later = _linearized(loop, twice, instants)
+        pairs = _linearized(loop, doubled, pairs)
     else:
-        in_a_row = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), instants)
-        later = _linearized(loop, twice, in_a_row)
-        later = jax.tree.map(lambda x: x.reshape(-1, 2, *x.shape[1:]), later)
-    return batch.each(outcome, carry, at_start, later)
+        flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), pairs)
+        flat = _linearized(loop, doubled, flat)
+        pairs = jax.tree.map(lambda x: x.reshape(-1, 2, *x.shape[1:]), flat)
+    return batch.map_runs(outcome, carry, at_start, pairs)
 
 
 def run_all(loop: StepLoop, batch: Batch, request: RunRequest) -> Outcome:
-    """All runs, from the start to the outcome."""
+    """The outcome of all runs, made by a loop."""
     outcome, records = run_step(loop, batch, TimeStep.of(request), request)
     if request.record_every is None:
         return outcome
@@ -263,7 +266,7 @@ def run_all(loop: StepLoop, batch: Batch, request: RunRequest) -> Outcome:
 def run_step(
     loop: StepLoop, batch: Batch, step: TimeStep, request: RunRequest
 ) -> tuple[Outcome, Any]:
-    """All runs by a step that may record something else; the outcome, and the records apart."""
+    """The outcome without records, and the records, of all runs by a given step."""
     carry, at_start = initialize(loop, batch, request.method)
-    carry, records = loop(step, batch, carry, request.steps + 1, request.record_every)
+    carry, records = loop(step, batch, carry, request.instants, request.record_every)
     return finalize(loop, batch, request, carry, at_start), records

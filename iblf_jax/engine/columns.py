@@ -155,7 +155,7 @@ def _directed(batch: Batch, places: Places, directions: list[list[Any]]) -> tupl
         return jnp.tile(repeated, (runs * math.prod(sizes[:k]), *[1] * (column.ndim - 1)))
 
     added = [[beside_others(k, x) for x in level] for k, level in enumerate(directions)]
-    inputs = leaves.together(leaves.shared, leaves.per_run)._replace(direction=added)
+    inputs = leaves.unflatten(leaves.shared, leaves.per_run)._replace(direction=added)
     is_per_run = (*leaves.is_per_run, *[True] * sum(map(len, places)))
     structure, values = jax.tree.structure(inputs), per_run + jax.tree.leaves(added)
     wide = Leaves(structure, is_per_run, leaves.shared, values)
@@ -183,9 +183,9 @@ def _stepped(
 ) -> tuple[list[jax.Array], Any]:
     """The derivatives of what a step records and of the metrics, (R, P, ...)."""
     wide, sizes = _directed(batch, step.places, directions)
-    before = wide.each(lambda inputs: _begun(inputs, request.method, step.places))
+    before = wide.map_runs(lambda inputs: _begun(inputs, request.method, step.places))
     after, records = loop(step, wide, before, request.steps + 1, request.record_every)
-    metrics = wide.each(lambda inputs, carry: _metrics(inputs, carry, step.places), after)
+    metrics = wide.map_runs(lambda inputs, carry: _metrics(inputs, carry, step.places), after)
     return jax.tree.map(
         lambda x: x.reshape(batch.runs or 1, *sizes, *x.shape[1:]), (list(records), metrics)
     )

@@ -1,18 +1,22 @@
-"""Stage 3 of a run: from a request and its plan to a program, a function of the inputs.
+"""Stage 3 of a run: lowers the step, builds its kernels, and falls back to what works.
 
-    native   the step's scalar program as C, built by a C++ compiler, SIMD and threads: CPU
-    gpu      the same C as a CUDA kernel, one run a thread, built by NVRTC: NVIDIA GPUs
-    vmap     the scan over the step as it is: any scenario, any device
+    native   the scalar program of the step as C, built by a C++ compiler: SIMD, threads; CPU
+    gpu      the same C as a CUDA kernel, built by NVRTC: one run per thread; NVIDIA GPUs
+    vmap     `jax.lax.scan` over the step; any scenario and device
 
-All give the same results.  `first_that_works` is the only place that falls back from one executor
-to the next: a scenario that no scalar program can express runs by the scan, and where an executor
-is not available the next one runs it.  A `BackendWarning` says why, once.
+All backends give the same results.  `first_that_works` is the only function that falls back: to the
+next executor where one is not available, and to the scan where a step cannot be lowered.  A
+`BackendWarning` gives the reason once.
+
+`plan_of_single_run` and `compiled_plan` depend on structures and shapes only.  They are cached,
+because tracing a step takes longer than many a run.
 """
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple, TypeVar
 
@@ -44,7 +48,7 @@ class BackendWarning(UserWarning):
 
 
 WARNINGS = "backend warnings"
-"""Topic of the marks of the warnings that this process has shown."""
+"""Topic of `CACHE` for the warnings that this process has shown."""
 
 
 def _warn_once(text: str) -> None:
@@ -55,25 +59,25 @@ def _warn_once(text: str) -> None:
 def first_that_works(
     execution: ExecutionPlan, attempt: Callable[[Executor], T], by_scan: Callable[[], T]
 ) -> T:
-    """`attempt` with the first executor of a plan that can, else `by_scan()`.
+    """The value of `attempt` for the first executor of a plan that works, else that of `by_scan`.
 
     Args:
       execution: the plan.
-      attempt: function of an executor; it raises ToolchainError where the executor is not
-        available, and UnsupportedError where it cannot express the step.
+      attempt: function of an executor; it raises ToolchainError if the executor is not available,
+        and UnsupportedError if the executor cannot express the step.
       by_scan: function without arguments.
     """
-    for text in execution.notes:
+    for text in execution.warnings:
         _warn_once(text)
-    names = execution.backends
-    for name, following in zip(names, (*names[1:], "vmap"), strict=False):
+    names = (*execution.backends, "vmap")
+    for name, following in itertools.pairwise(names):
         try:
             return attempt(registry.EXECUTORS[name])
         except ToolchainError as error:
-            _warn_once(plan.not_available(name, error, following))
+            _warn_once(plan.unavailable_warning(name, error, following))
         except UnsupportedError as reason:
             if execution.reports_unsupported:
-                _warn_once(plan.slower_by_scan(reason))
+                _warn_once(plan.scan_warning(reason))
             break
     return by_scan()
 
@@ -81,10 +85,12 @@ def first_that_works(
 def inputs_of(
     scenario: Scenario, folds: Any, dt: jax.Array, request: RunRequest, noise: Any = None
 ) -> Inputs:
-    """What a run is computed from; `noise` is the key of the noise of a sampled loop."""
+    """The inputs of a run; `noise` is the key of the noise of a sampled loop."""
     key: Any = ()
     if scenario.sampling is not None:
-        key = jnp.zeros((4,), dt.dtype) if noise is None else noise.astype(dt.dtype)
+        key = jnp.zeros((4,), dt.dtype)
+        if noise is not None:
+            key = noise.astype(dt.dtype)
     steps: Any = np.asarray(request.steps, dt.dtype)
     return Inputs(scenario, folds, dt, steps, noise=key)
 
@@ -104,15 +110,15 @@ def plan_of_batch(
 
 
 def nested_batch(inputs: Inputs) -> Batch:
-    """One run for the scan, which a caller may batch, differentiate or loop over."""
+    """One run for the scan; callers may batch, differentiate or loop over it."""
     layout = plan.scan_layout(devices.platform(), operations(inputs), None, nested=True)
     return Batch.of(inputs, None, layout)
 
 
-def scanned(
+def run_by_scan(
     layout: BatchLayout, inputs: Inputs, varied: Mapping[str, jax.Array] | None, run: Callable
 ) -> Any:
-    """`run(batch)` for a batch in a layout of the scan."""
+    """`run(batch)` for the batch of these inputs, in a layout of the scan."""
 
     def complete(inputs: Inputs, varied: dict[str, jax.Array]) -> Any:
         return run(Batch.of(inputs, varied, layout))
@@ -124,7 +130,7 @@ def scanned(
 
 @contextlib.contextmanager
 def compilers_stopped_on_error() -> Iterator[None]:
-    """What fails, or is interrupted, leaves no compiler behind."""
+    """Context manager that stops the compilers in the background if its body raises."""
     try:
         yield
     except BaseException:
@@ -133,19 +139,19 @@ def compilers_stopped_on_error() -> Iterator[None]:
 
 
 class StepProgram(NamedTuple):
-    """A scalar program and the arguments with which an executor builds its kernel; static."""
+    """A scalar program and the other arguments of `Executor.build`; static."""
 
     program: Program
     shared: int
-    """Numbers that all runs share."""
+    """How many numbers all runs share."""
     per_run: int
-    """Numbers that differ between runs."""
+    """How many numbers differ between runs."""
     runs: int
     steps: int
 
     @staticmethod
     def of(step: Any, batch: Batch, carry: Any, steps: int) -> StepProgram:
-        """The program of a step of a batch; raises UnsupportedError where there is none."""
+        """The program of a step of a batch; raises UnsupportedError if it cannot be lowered."""
         shared, per_run = batch.leaves.shared, batch.leaves.per_run
         return StepProgram(
             program_of(step, batch, carry).program,
@@ -159,7 +165,7 @@ class StepProgram(NamedTuple):
 def time_step_program(batch: Batch, request: RunRequest) -> StepProgram:
     """The program of a time step."""
     carry = carry_shapes(batch, request.method)
-    return StepProgram.of(TimeStep.of(request), batch, carry, request.steps + 1)
+    return StepProgram.of(TimeStep.of(request), batch, carry, request.instants)
 
 
 def _linearization_program(batch: Batch, request: RunRequest) -> StepProgram:
@@ -170,17 +176,17 @@ def _linearization_program(batch: Batch, request: RunRequest) -> StepProgram:
 
 
 def start_build(executor: Executor, program: StepProgram) -> None:
-    """Starts to compile a kernel in the background, where the executor can."""
+    """Starts to compile a kernel in the background if the executor supports it."""
     if executor.start_build:
         executor.start_build(*program)
 
 
-def run_lowered(
+def run_by_executor(
     executor: Executor, batch: Batch, request: RunRequest, run: Callable[[StepLoop, Batch], T]
 ) -> T:
-    """`run(loop, batch)` by an executor.
+    """`run(loop, batch)` with the loop of an executor.
 
-    The longest kernel is built in the background meanwhile: compilers use one core each.
+    The longest kernel is built in the background at the same time, on another core.
     """
     if executor.start_build:
         start_build(executor, time_step_program(batch, request))
@@ -191,16 +197,16 @@ def run_lowered(
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class _Static:
-    """A result of a trace that holds no arrays."""
+    """A value without arrays, as the output of a traced function."""
 
     value: Any
 
 
 def on_shapes(function: Callable[..., T], shapes: Any) -> T:
-    """The value of a function of arrays of which it reads only shapes; the value holds no arrays.
+    """The value of a function that depends only on the shapes of its arrays.
 
     Args:
-      function: of one pytree of arrays.
+      function: function of one pytree of arrays; its value contains no arrays.
       shapes: pytree of `jax.ShapeDtypeStruct` in place of the arrays.
     """
     return jax.eval_shape(lambda arrays: _Static(function(arrays)), shapes).value
@@ -216,11 +222,15 @@ def _tree_of_shapes(structure: Any, shapes: tuple) -> Any:
 
 
 def structural_part(request: RunRequest) -> RunRequest:
-    """The part of a request on which its kernels depend: of the number of steps whether it is
-    large, and of the record whether there is one.
+    """The request with only what its kernels depend on: whether there are at least FEW_STEPS steps,
+    and whether anything is recorded.
     """
-    steps = thresholds.FEW_STEPS if request.steps >= thresholds.FEW_STEPS else 0
-    return request._replace(steps=steps, record_every=request.record_every and 1)
+    part = request._replace(steps=0)
+    if request.steps >= thresholds.FEW_STEPS:
+        part = part._replace(steps=thresholds.FEW_STEPS)
+    if request.record_every is not None:
+        part = part._replace(record_every=1)
+    return part
 
 
 # --- batches ---
@@ -230,15 +240,13 @@ def structural_part(request: RunRequest) -> RunRequest:
 def compiled_plan(
     request: RunRequest, machine: Machine, structure: Any, shapes: tuple
 ) -> ExecutionPlan:
-    """The plan of a batch, reduced to the first executor that can run it; its kernels are built.
-
-    It depends on structure and shapes alone, and a trace takes longer than many a study.
+    """The plan of a batch with only the first executor that can run it, whose kernels are built.
 
     Args:
-      request: structural part of the request.
-      machine: where it runs.
-      structure: of (scenario, varied, folds, dt).
-      shapes: of their leaves.
+      request: `structural_part` of the request.
+      machine: the machine that runs the batch.
+      structure: tree structure of (scenario, varied, folds, dt).
+      shapes: shapes of their leaves (`shapes_of`).
     """
     arguments = _tree_of_shapes(structure, shapes)
 
@@ -261,22 +269,22 @@ def compiled_plan(
         return (executor.name,)
 
     execution = on_shapes(choose, arguments)
-    return execution._replace(backends=first_that_works(execution, build, lambda: ()), notes=())
+    return execution._replace(backends=first_that_works(execution, build, lambda: ()), warnings=())
 
 
 # --- single runs ---
 
 
 class SingleRunPlan(NamedTuple):
-    """How one run is executed; static."""
+    """The plan of one run; static."""
 
     execution: ExecutionPlan
     nodes: int
-    """Of a step's program; 0 where it is not lowered."""
+    """Nodes of the scalar program of a step; 0 if it is not lowered."""
 
 
 def single_batch(inputs: Inputs, request: RunRequest, layout: BatchLayout) -> Batch:
-    """One run as a batch, which is what is lowered."""
+    """A batch of one run: executors need a run axis, so the start is its per-run leaf."""
     start = {"initial.q": inputs.scenario.initial.q[None]}
     return Batch.of(inputs, start, layout, request.constants)
 
@@ -285,19 +293,16 @@ def single_batch(inputs: Inputs, request: RunRequest, layout: BatchLayout) -> Ba
 def plan_of_single_run(
     request: RunRequest, machine: Machine, structure: Any, shapes: tuple
 ) -> SingleRunPlan:
-    """How one run is executed; the kernel of the first executor is being built on return.
-
-    It depends on structure and shapes alone, and a trace takes longer than many a run.
+    """The plan of one run; the first executor has started to build the kernel of the step.
 
     Args:
-      request: structural part of the request.
-      machine: where it runs.
-      structure: of the `Inputs`.
-      shapes: of their leaves.
+      request: `structural_part` of the request.
+      machine: the machine that runs it.
+      structure: tree structure of the `Inputs`.
+      shapes: shapes of their leaves (`shapes_of`).
     """
     inputs = _tree_of_shapes(structure, shapes)
-    sizes = Sizes(on_shapes(operations, inputs), None)
-    execution = choose_plan(request, sizes, machine)
+    execution = choose_plan(request, Sizes(on_shapes(operations, inputs), None), machine)
     if not execution.backends:
         return SingleRunPlan(execution, 0)
 
@@ -306,11 +311,9 @@ def plan_of_single_run(
 
     try:
         step = on_shapes(program, inputs)
-        nodes = step.program.size
-        execution = choose_plan(request, sizes._replace(nodes=nodes), machine)
+        execution = plan.within_node_limit(execution, request, step.program.size)
         if execution.backends:
             start_build(registry.EXECUTORS[execution.backend], step)
-        return SingleRunPlan(execution, nodes)
+        return SingleRunPlan(execution, step.program.size)
     except UnsupportedError as reason:
-        sizes = sizes._replace(unsupported=str(reason))
-        return SingleRunPlan(choose_plan(request, sizes, machine), 0)
+        return SingleRunPlan(plan.scan_only(execution, reason), 0)

@@ -15,12 +15,11 @@ reverse mode and need no memory along time.  A kernel carries the tangents in on
 The time of reverse mode does not depend on how many numbers it is by, so this is the way for many
 numbers, for derivatives of third order, and where no kernel can be built.
 
-`choose_derivatives` chooses.  Each layout is needed: 64 runs of 500 steps, differentiated by the 4
-gains of the paper's loop on two busy cores, take 0.006 s with all tangents in one kernel (9.9 s
-with compilation), 0.042 s with one per run (15.7 s) and 0.40 s by the scan in forward mode (29 s).
-By 28 numbers of `presets.iiwa14`, whose kernel with all tangents would be too long, one tangent per
-run takes 16.6 s (60 s with compilation), while XLA had not compiled the scan after 5 minutes.  The
-threshold `MAX_COLUMNS` has the measurement against reverse mode.
+`choose_derivatives` chooses.  Each way is needed.  16 runs of 1000 steps by 9 gains of a chain of
+three joints take 0.025 s with all tangents in one kernel (8.6 s with compilation) and 0.064 s with
+one tangent per run (5.5 s).  By 16 gains of `presets.iiwa14` they take 0.53 s (63 s) and 0.35 s
+(35 s).  64 runs of 500 steps of the paper's loop by 4 gains take 0.006 s, 0.042 s, and 0.40 s by
+the scan in forward mode.  The threshold `MAX_COLUMNS` has the measurement against reverse mode.
 
 A fold may offer `curvature(acc, sample)`, a tuple of `curvatures` many `Outer`: vectors y with
 weights w.  Their Gauss-Newton matrices
@@ -71,7 +70,7 @@ class DerivativeSizes(NamedTuple):
     nodes_together: float = math.inf
     """Nodes of the kernel that carries all tangents; infinite where records are differentiated."""
     max_nodes: float | None = 0
-    """Nodes up to which the executor compiles such a kernel (`Limits.derivatives`)."""
+    """Nodes up to which the executor compiles such a kernel (`Limits.derivative_nodes`)."""
 
 
 def choose_derivatives(sizes: DerivativeSizes) -> str:
@@ -80,8 +79,8 @@ def choose_derivatives(sizes: DerivativeSizes) -> str:
     """
     if thresholds.is_within(sizes.nodes_together, sizes.max_nodes):
         return "together"
-    is_small = sizes.kept_numbers <= thresholds.KEPT_NUMBERS
-    is_low_order = sizes.order <= thresholds.HIGHEST_COLUMN_ORDER
+    is_small = sizes.kept_numbers <= thresholds.MAX_KEPT_NUMBERS
+    is_low_order = sizes.order <= thresholds.MAX_COLUMN_ORDER
     if is_small and is_low_order and sizes.columns <= thresholds.MAX_COLUMNS:
         return "one per run"
     return "scan"
@@ -352,9 +351,9 @@ def run_with_tangents(
         )
 
     carry, instant = initialize(loop, batch, request.method)
-    before = batch.each(at_start, carry)
+    before = batch.map_runs(at_start, carry)
     after, _ = loop(
         DerivativeStep(request.method, directions), batch, before, request.steps + 1, None
     )
-    tangents, products = batch.each(at_end, after)
+    tangents, products = batch.map_runs(at_end, after)
     return Tangents(finalize(loop, batch, request, after.carry, instant), tangents, products)

@@ -1,5 +1,5 @@
-"""The messages about a run that failed or needs a second look: its status flags in words, with the
-numbers behind them and the remedy.
+"""The messages about a run that failed or may be unreliable: its status flags in words, with the
+quantities that caused them and the remedy.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ REPORTED = (
     | Status.FILTER_INFEASIBLE
     | Status.INFINITE_SLOPE
 )
-"""The flags of a run that did not fail and that a user should see."""
+"""The flags that a warning reports although the run did not fail."""
 
 
 class SimulationError(RuntimeError):
@@ -41,11 +41,11 @@ class SimulationError(RuntimeError):
 
 
 class SimulationWarning(UserWarning):
-    """A run whose result needs a second look."""
+    """A run that failed or whose result may be unreliable."""
 
 
 def report(result: Rollout, steps: int, throw: bool) -> None:
-    """Raises or warns, with the physics in the message, if a run failed."""
+    """Raises (`throw`) or warns if a run failed, and warns if it may be unreliable."""
     status = Status(int(result.status))
     if status & Status.INFEASIBLE_REFERENCE:
         raise _infeasible(result, steps)
@@ -58,7 +58,9 @@ def report(result: Rollout, steps: int, throw: bool) -> None:
     heading = "Look again"
     if failed:
         heading = "The run failed"
-    explained = reported | status & ~Status.ALPHA_INFEASIBLE
+    explained = status
+    if not reported & Status.ALPHA_INFEASIBLE:
+        explained &= ~Status.ALPHA_INFEASIBLE
     text = " ".join([f"{heading}: {describe(reported)}.", *_explanations(result, explained, steps)])
     if throw and failed:
         raise SimulationError(text)
@@ -66,7 +68,7 @@ def report(result: Rollout, steps: int, throw: bool) -> None:
 
 
 def _explanations(result: Rollout, status: Status, steps: int) -> list[str]:
-    """A sentence or two for every flag that has an explanation."""
+    """The explanations of the flags of a status that have one."""
     texts = [text(result) for flag, text in BOUND_EXPLANATIONS.items() if status & flag]
     if status & Status.STEP_TOO_LARGE:
         texts.append(_unstable_step(result))
@@ -76,13 +78,13 @@ def _explanations(result: Rollout, status: Status, steps: int) -> list[str]:
             " disturbance."
         )
     elif status & Status.INACCURATE:
-        texts.append(_about_accuracy(result, status, steps))
+        texts.append(_inaccurate(result, status, steps))
     texts += [text(result) for flag, text in LOOP_EXPLANATIONS.items() if status & flag]
     return [text for text in texts if text]
 
 
-def _joint_left(bounds: str, prefix: str, margin: str, unit: str, result: Rollout) -> str:
-    """Which joint left its bounds first; `prefix` and `margin` are those of the metrics."""
+def _joint_violation(bounds: str, prefix: str, margin: str, unit: str, result: Rollout) -> str:
+    """Which joint violated its bounds first; `prefix` and `margin` are names of metrics."""
     metrics = result.metrics
     if f"{prefix}_time" not in metrics:
         return ""
@@ -91,7 +93,7 @@ def _joint_left(bounds: str, prefix: str, margin: str, unit: str, result: Rollou
     return _first_violation(what, metrics[f"{prefix}_time"], metrics[margin][joint], unit)
 
 
-def _region_left(result: Rollout) -> str:
+def _region_violation(result: Rollout) -> str:
     metrics = result.metrics
     if "first_region_violation_time" not in metrics:
         return ""
@@ -115,7 +117,7 @@ def _unstable_step(result: Rollout) -> str:
     return (
         f"The closed loop's fastest mode is {mode:.4g} 1/s, so {result.method} is stable up to"
         f" dt = {limit:.3g} s only; dt = {float(result.dt):g} s was requested. Take"
-        f" dt={comfortable_dt(mode):g}{_or_change(result)}."
+        f" dt={comfortable_dt(mode):g}{_alternative_remedy(result)}."
     )
 
 
@@ -134,7 +136,7 @@ def _sampling_too_slow(result: Rollout) -> str:
     return (
         "The deviation of the loop grows from one period to the next, by"
         f" {float(result.metrics[RADIUS]):.4g} at the worst of the assessed instants. Sample faster"
-        f" (ij.recommended_period says how fast){_or_change(result)}."
+        f" (ij.recommended_period says how fast){_alternative_remedy(result)}."
     )
 
 
@@ -168,11 +170,11 @@ def _guard_stayed(result: Rollout) -> str:
 
 
 BOUND_EXPLANATIONS: dict[Status, Callable[[Rollout], str]] = {
-    Status.BOUND_VIOLATED: partial(_joint_left, "bounds", "first_violation", "margin", "rad"),
+    Status.BOUND_VIOLATED: partial(_joint_violation, "bounds", "first_violation", "margin", "rad"),
     Status.VELOCITY_VIOLATED: partial(
-        _joint_left, "velocity bounds", "first_velocity_violation", "velocity_margin", "rad/s"
+        _joint_violation, "velocity bounds", "first_velocity_violation", "velocity_margin", "rad/s"
     ),
-    Status.REGION_VIOLATED: _region_left,
+    Status.REGION_VIOLATED: _region_violation,
 }
 """The explanation of each flag of a violated bound."""
 LOOP_EXPLANATIONS: dict[Status, Callable[[Rollout], str]] = {
@@ -182,29 +184,30 @@ LOOP_EXPLANATIONS: dict[Status, Callable[[Rollout], str]] = {
     Status.ALPHA_INFEASIBLE: _alpha_infeasible,
     Status.GUARD_STAYED: _guard_stayed,
 }
-"""The explanation of each flag of the law and its sampling."""
+"""The explanation of each flag of the control law and its sampling."""
 
 
-def _about_accuracy(result: Rollout, status: Status, steps: int) -> str:
-    """How inaccurate a run is, and what helps."""
-    error, relative = (float(np.max(result.metrics[name])) for name in (ERROR, RELATIVE))
-    size = (
+def _inaccurate(result: Rollout, status: Status, steps: int) -> str:
+    """The estimated error of a run, and the remedy."""
+    error = float(np.max(result.metrics[ERROR]))
+    relative = float(np.max(result.metrics[RELATIVE]))
+    estimate = (
         f"Their error is estimated at {error:.2g} rad, {100 * relative:.2g} % of the tube, where"
         f" {100 * TOLERANCE:g} % are tolerated"
     )
     if status & Status.SAMPLING_TOO_SLOW:
         return (
-            f"{size}: a loop whose deviation grows from one period to the next magnifies every"
+            f"{estimate}: a loop whose deviation grows from one period to the next magnifies every"
             " error, whatever dt is."
         )
     return (
-        f"{size}: dt = {float(result.dt):g} s is too large for the signals that drive this loop."
-        f" Take {_smaller_step(result, steps)}."
+        f"{estimate}: dt = {float(result.dt):g} s is too large for the signals that drive this"
+        f" loop. Take {_smaller_step(result, steps)}."
     )
 
 
 def _smaller_step(result: Rollout, steps: int) -> str:
-    """A time step with which this run would be accurate, in words."""
+    """A time step that makes this run accurate, in words."""
     if not checks.is_concrete(result.scenario):
         return "a smaller one"
     duration = steps * float(result.dt)
@@ -214,9 +217,9 @@ def _smaller_step(result: Rollout, steps: int) -> str:
         return "a smaller one"
 
 
-def _or_change(result: Rollout) -> str:
-    """The end of a sentence that names the one term that limits the loop of a run, and its remedy;
-    empty where there is no such term.
+def _alternative_remedy(result: Rollout) -> str:
+    """The end of a sentence: the term that limits the loop, and how to change it; empty if no
+    single term does.
     """
     if not checks.is_concrete(result.scenario):
         return ""

@@ -1,7 +1,8 @@
-"""Stage 4 of a run: batches, their derivatives, and steps from many states, executed as planned.
+"""Stage 4 of a run: executes batches, their derivatives, and steps from many states.
 
-Each function takes a request and inputs, plans, compiles and returns the output.  They are called
-inside `jit`; `simulate` calls `single_run.run_one` for one run.
+The functions are called inside `jit`.  Each of them takes a request and inputs, makes the plan and
+returns the output.  `compile_batch` makes the plan beforehand and returns a `CompiledBatch`, which
+is called any number of times.  `simulate` uses `single_run.run_one` instead.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from typing import Any, NamedTuple
 
 import jax
 
-from iblf_jax.engine import registry, thresholds
+from iblf_jax.engine import registry
 from iblf_jax.engine.batch import Batch, StepLoop, carry_shapes, run_all
 from iblf_jax.engine.carry import Inputs
 from iblf_jax.engine.columns import numbers_of, outer_vectors, run_by_columns
@@ -23,8 +24,8 @@ from iblf_jax.engine.compile import (
     nested_batch,
     operations,
     plan_of_batch,
-    run_lowered,
-    scanned,
+    run_by_executor,
+    run_by_scan,
     shapes_of,
     structural_part,
 )
@@ -37,7 +38,7 @@ from iblf_jax.engine.derivatives import (
 )
 from iblf_jax.engine.loops import checkpointed, kernel_loop, program_of, scan
 from iblf_jax.engine.outcome import Outcome
-from iblf_jax.engine.plan import STATES_LAYOUT, ExecutionPlan
+from iblf_jax.engine.plan import STATES_LAYOUT, ExecutionPlan, plan_of_states
 from iblf_jax.engine.registry import Executor
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.structural_constants import constants_of
@@ -60,7 +61,7 @@ def run_batch(
         `noise.NOISE_NAME`, the key of its noise.
       folds: the metrics.
       dt: time step, () [s].
-      request: what is run, static.
+      request: the request; static.
 
     Returns:
       An `Outcome` with a leading batch axis on every array.
@@ -83,20 +84,20 @@ def _run_planned(
 
     def attempt(executor: Executor) -> Outcome:
         batch = Batch.of(inputs, varied, execution.layout, request.constants)
-        return run_lowered(executor, batch, request, run)
+        return run_by_executor(executor, batch, request, run)
 
     def by_scan() -> Outcome:
-        return scanned(execution.scan_layout, inputs, varied, partial(run, scan))
+        return run_by_scan(execution.scan_layout, inputs, varied, partial(run, scan))
 
     return first_that_works(execution, attempt, by_scan)
 
 
 class CompiledBatch(NamedTuple):
-    """The program of a batch: a function of the inputs that is called inside `jit`.  Static."""
+    """The program of a batch, a function of the inputs to call inside `jit`; static."""
 
     request: RunRequest
     execution: ExecutionPlan
-    """With the one executor that runs the batch, or none for the scan."""
+    """The plan, whose `backends` holds the executor that runs the batch; empty for the scan."""
 
     @property
     def backend(self) -> str:
@@ -130,10 +131,10 @@ def compile_batch(
     folds: Any,
     dt: jax.Array,
 ) -> CompiledBatch:
-    """The program of a batch on the first executor that can run it; its kernels are built.
+    """Builds the kernels of a batch with the first executor that can run it.
 
     Args:
-      request: what is requested of each run.
+      request: the request.
       scenario, folds, dt: as `run_batch`.
       varied: path -> values or their shapes, batch axis first.
 
@@ -142,8 +143,8 @@ def compile_batch(
     """
     leaves, structure = jax.tree.flatten((scenario, dict(varied), folds, dt))
     part = structural_part(request._replace(record_every=None))
-    found = compiled_plan(part, registry.machine(), structure, shapes_of(leaves))
-    return CompiledBatch(request, found)
+    execution = compiled_plan(part, registry.machine(), structure, shapes_of(leaves))
+    return CompiledBatch(request, execution)
 
 
 def run_batch_jvp(
@@ -154,16 +155,16 @@ def run_batch_jvp(
     dt: jax.Array,
     request: RunRequest,
 ) -> Tangents:
-    """Values of a batch and their derivatives along P directions in the space of leaves, in one
-    pass; call it inside `jit`.
+    """Runs a batch and differentiates it along P directions in the space of leaves, in one pass;
+    call it inside `jit`.
 
     Args:
       scenario, varied, folds, dt: as `run_batch`.
       directions: path -> (P, *shape of the leaf), concrete numbers, the same for every run:
-        direction p moves each of these leaves along its p-th row.  For the derivative by each entry
-        of one gain of two joints: `{"controller.K2": np.eye(2)}`.
-      request: what is run, static.  On "auto" the tangents of long programs (many joints and
-        directions), which take minutes to compile, are runs of their own.
+        direction p changes each of these leaves by its p-th row.  `{"controller.K2": np.eye(2)}`
+        differentiates with respect to each entry of a gain of two joints.
+      request: the request; static.  On "auto" `choose_derivatives` selects the method; a requested
+        executor computes all tangents of a run in one kernel.
 
     Returns:
       The outcome, name -> (batch, P, *shape) for every metric that is a float, and the Gauss-Newton
@@ -172,25 +173,26 @@ def run_batch_jvp(
     Raises:
       ValueError: an unknown backend or path.
     """
-    inputs, along = inputs_of(scenario, folds, dt, request), Directions.of(directions)
+    inputs = inputs_of(scenario, folds, dt, request)
+    along = Directions.of(directions)
     execution = plan_of_batch(request, inputs, varied, registry.machine())
 
     def attempt(executor: Executor) -> Tangents:
         batch = Batch.of(inputs, varied, execution.layout, request.constants)
-        loop = kernel_loop(executor)
-        chosen = "together"
+        method = "together"
         if request.backend == "auto":
-            chosen = choose_derivatives(_derivative_sizes(executor, batch, along, request))
-        if chosen == "scan":
+            method = choose_derivatives(_derivative_sizes(executor, batch, along, request))
+        if method == "scan":
             return by_scan()
-        run = {"together": run_with_tangents, "one per run": run_by_columns}[chosen]
-        return run(loop, batch, along, request)
+        if method == "one per run":
+            return run_by_columns(kernel_loop(executor), batch, along, request)
+        return run_with_tangents(kernel_loop(executor), batch, along, request)
 
     def by_scan() -> Tangents:
         def run(batch: Batch) -> Tangents:
             return run_with_tangents(scan, batch, along, request)
 
-        return scanned(execution.scan_layout, inputs, varied, run)
+        return run_by_scan(execution.scan_layout, inputs, varied, run)
 
     return first_that_works(execution, attempt, by_scan)
 
@@ -201,11 +203,11 @@ def _derivative_sizes(
     """The sizes that decide how an executor computes tangents."""
     carry = carry_shapes(batch, request.method)
     nodes = program_of(TimeStep(request.method), batch, carry).program.size
-    samples = (request.steps + 1) * (batch.runs or 1)
+    samples = request.instants * (batch.runs or 1)
     return DerivativeSizes(
         kept_numbers=numbers_of(batch.leaves.first, outer_vectors) * along.tangents * samples,
         nodes_together=nodes * (1 + along.tangents),
-        max_nodes=executor.limits.derivatives,
+        max_nodes=executor.limits.derivative_nodes,
     )
 
 
@@ -216,49 +218,45 @@ def run_for_reverse(
     request: RunRequest,
     noise: jax.Array | None = None,
 ) -> Outcome:
-    """One run for reverse mode: few states are in memory at a time; nothing is recorded.
+    """One run without records, for reverse mode: only a few states are in memory at a time.
 
     Args:
       scenario, folds, dt, request: as `run_batch`.
-      noise: key of a sensor's noise.
+      noise: key of the noise of a sensor.
     """
     inputs = inputs_of(scenario, folds, dt, request, noise)
     return run_all(checkpointed, nested_batch(inputs), request)
 
 
-def run_from(
+def step_states(
     scenario: Scenario, dt: jax.Array, carry: Any, *, step: Any, steps: int = 1
 ) -> tuple[Any, Any]:
-    """Makes a given step `steps` times from each of many states.
+    """Makes some steps from each of many states.
 
     Args:
-      scenario: what all share, canonical.
+      scenario: the scenario that all states share, canonical.
       dt: time step, () [s].
       carry: the states, as the step takes them, (R, ...).
-      step: a function (inputs, carry, index, options) -> (carry, records) of one run, hashable.
-      steps: how many.
+      step: hashable function (inputs, carry, index, options) -> (carry, records) of one run.
+      steps: number of steps.
 
     Returns:
-      The carry after the last, (R, ...), and what every step recorded, (R, steps, ...).
+      The carry after the last step, (R, ...), and the records of every step, (R, steps, ...).
     """
     request = RunRequest(steps)
-    if registry.automatic().reason is None:
+    if registry.default_backend().reason is None:
         request = request._replace(constants=constants_of(scenario))
-    return _run_from(scenario, dt, carry, step=step, request=request)
+    return _step_states(scenario, dt, carry, step=step, request=request)
 
 
 @partial(jax.jit, static_argnames=("step", "request"))
-def _run_from(
+def _step_states(
     scenario: Scenario, dt: jax.Array, carry: Any, *, step: Any, request: RunRequest
 ) -> tuple[Any, Any]:
     inputs = inputs_of(scenario, (), dt, request)
     runs = jax.tree.leaves(carry)[0].shape[0]
     batch = Batch.of(inputs, None, STATES_LAYOUT, request.constants)._replace(runs=runs)
-    automatic = registry.automatic()
-    backends: tuple[str, ...] = ()
-    if automatic.reason is None and thresholds.compiles_states(operations(inputs)):
-        backends = (automatic.name,)
-    execution = ExecutionPlan(backends, STATES_LAYOUT, STATES_LAYOUT, False)
+    execution = plan_of_states(operations(inputs), registry.default_backend())
 
     def by(loop: StepLoop) -> tuple[Any, Any]:
         return loop(step, batch, carry, request.steps, 1)

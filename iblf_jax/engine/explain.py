@@ -15,7 +15,7 @@ from iblf_jax.core.devices import threads
 from iblf_jax.engine.batch import Batch, carry_shapes
 from iblf_jax.engine.compile import inputs_of
 from iblf_jax.engine.loops import program_of
-from iblf_jax.engine.registry import automatic
+from iblf_jax.engine.registry import default_backend
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.structural_constants import constants_of
 from iblf_jax.engine.time_step import TimeStep
@@ -110,7 +110,7 @@ def explain(
     width = 64 // np.dtype(dtype).itemsize
     slots = instructions(program, width)
     counts = {NAMES[c]: counter for c, counter in program.counts().items()}
-    name, reason = automatic()
+    name, reason = default_backend()
     columns = (
         f"by numbers of the scenario on {name}, one run a number, first and second ones; others by"
         " plain JAX"

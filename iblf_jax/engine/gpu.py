@@ -1,8 +1,4 @@
-"""The gpu executor: the kernels of `kernels.cuda`, compiled and run as the plan decides.
-
-The tests run on a GPU where there is one. Elsewhere the same source and the same launcher run on a
-CPU, with a driver that loops over the threads, and are compiled for GPUs where NVRTC is installed.
-"""
+"""The gpu executor: compiles and runs the kernels of `kernels.cuda`."""
 
 from __future__ import annotations
 
@@ -16,10 +12,10 @@ from iblf_jax.kernels import Packed, Program, ToolchainError, compiler, cuda, nv
 
 
 def architecture() -> str:
-    """The name that NVRTC has for the GPUs of this process, as in "sm_90".
+    """The architecture of the GPUs of this process, as NVRTC names it: "sm_90", for example.
 
     Raises:
-      ToolchainError: the default devices are no GPUs that NVRTC compiles for, or they differ.
+      ToolchainError: the default devices are not GPUs that NVRTC supports, or they differ.
     """
     default_devices = devices.default()
     try:
@@ -35,7 +31,7 @@ def architecture() -> str:
 
 
 def unavailable() -> str | None:
-    """Why this process cannot run it, in one line, or None if it can."""
+    """Why this process cannot use the executor, in one line; None if it can."""
     try:
         architecture()
         nvrtc.library()
@@ -55,7 +51,7 @@ def call(
     every: int | None,
     threads: int,
 ) -> tuple[Packed, list[jax.Array]]:
-    """All steps by the launcher `name`, with so many threads per block; see `kernels.cuda.call`."""
+    """As `kernels.cuda.call`, with the table of signals that this executor uses."""
     return cuda.call(
         name,
         program,
@@ -80,7 +76,7 @@ def run(
     """All steps of all runs; arguments and results as `native.run`."""
     name = cuda.kernel(program, shared.size, per_run.shape[0], architecture())
     # The CPU devices of the tests have no attribute core_count.
-    processors = getattr(devices.default()[0], "core_count", thresholds.MULTIPROCESSORS)
+    processors = getattr(devices.default()[0], "core_count", thresholds.DEFAULT_MULTIPROCESSORS)
     threads = thresholds.gpu_threads(carry.floats.shape[1], processors)
     return call(name, program, shared, per_run, carry, steps, every, threads)
 

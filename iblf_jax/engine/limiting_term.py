@@ -1,14 +1,15 @@
-"""Which term of a loop limits the sampling period or the time step.
+"""Finds the term of a loop that limits the sampling period or the time step.
 
 A term of the loop is a leaf of the scenario: a gain of law or observer, the weight of the barrier,
-the delay, or the time constant of a filter or a drive.  Each term is scaled by s = 2^(-1/2), 2^-1,
-... at the same instants, while the others keep their values, until
+the delay, or the time constant of a filter or a drive.  Each term is scaled separately by
+s = 2^(-1/2), 2^-1, ..., until
 
     rho(s) < 1,   rho: the spectral radius of the map from one period to the next, or
                        dt |lambda|_max divided by the stability limit of the integrator
 
-holds for one of them.  This term limits the loop, because it has to change least.  A term whose
-scaling never helps, such as a gain K2 whose damping the loop needs, is not named.
+holds for one of them at the assessed instants.  This term limits the loop, because it has to change
+least.  A term that no scale makes stable, such as a gain K2 whose damping the loop needs, does not
+limit it.
 """
 
 from __future__ import annotations
@@ -34,21 +35,20 @@ from iblf_jax.simulation.stability import jacobian, period_map
 NUMBER_OF_SCALES = 14
 """Scales 2^(-k/2) that are tried, down to 1/128."""
 INSTANTS = 4
-"""States that are assessed together."""
+"""States that are assessed in one batch."""
 LARGEST_XI = 0.98
-"""|xi| up to which a state of the run counts: beyond it the guard is near, and every slope is
-steep."""
-WORDS = {
+"""Largest |xi| of an assessed state of the run.  Near the guard every slope is steep."""
+TERMS = {
     "weight": "the slope of the barrier",
     "delay": "the delay",
     "filter": "the law's filter",
     "cutoff": "the filter of the velocity",
 }
-"""Name of a leaf -> the term of the loop that it sets."""
+"""Name of a leaf -> the term of the loop, in words."""
 LAGS = {"sensor": "the filter of the velocity", "actuator": "the lag of the drive"}
-"""Part of a scenario -> the term of the loop that its time constant sets."""
+"""Part of a scenario -> the lag of this part, in words."""
 BANDWIDTHS = ("cutoff", "bandwidth")
-"""Leaves of sensors and actuators whose reciprocal is a time constant."""
+"""Leaves of sensors and actuators whose reciprocal is the time constant of a lag."""
 
 
 class Term(NamedTuple):
@@ -56,9 +56,8 @@ class Term(NamedTuple):
 
     words: str
     path: str
-    is_inverse: bool = False
-    """Whether the leaf is divided where the term is scaled: a bandwidth, where the term is a
-    lag."""
+    is_reciprocal: bool = False
+    """Whether the leaf is the reciprocal of the term, as a bandwidth is of a time constant."""
 
 
 class Limit(NamedTuple):
@@ -66,12 +65,12 @@ class Limit(NamedTuple):
 
     term: Term
     scale: float
-    """With the term scaled by this the loop is within its limit."""
+    """A scale of the term at which the loop is stable."""
 
     @property
     def advice(self) -> str:
-        """What to change, in words."""
-        if self.term.is_inverse:
+        """How to change the leaf, in words."""
+        if self.term.is_reciprocal:
             return (
                 f"raise {self.term.path} to {_two_digits(1.0 / self.scale, math.ceil):g} times its"
                 " value"
@@ -79,17 +78,17 @@ class Limit(NamedTuple):
         return f"lower {self.term.path} to {_two_digits(self.scale, math.floor):g} times its value"
 
 
-def _two_digits(x: float, rounded: Callable[[float], int]) -> float:
-    """A number with two digits, rounded to the side on which the loop is within its limit."""
+def _two_digits(x: float, rounding: Callable[[float], int]) -> float:
+    """A number with two significant digits; `rounding` is `math.floor` or `math.ceil`."""
     unit = 10.0 ** (math.floor(math.log10(x)) - 1)
-    return float(f"{rounded(x / unit) * unit:.2g}")
+    return float(f"{rounding(x / unit) * unit:.2g}")
 
 
 def limiting_term(run: Any) -> Limit | None:
-    """The term that limits the loop of a run, or None if no single one brings it within its limit.
+    """The term that limits the loop of a run; None if the loop is stable, or no single term does.
 
     Args:
-      run: a `Rollout` of one run, its leaves numbers.
+      run: a `Rollout` of one run, with concrete numbers.
     """
     scenario = run.scenario
     relative_to_limit = _relative_to_limit(scenario, run)
@@ -98,13 +97,13 @@ def limiting_term(run: Any) -> Limit | None:
             continue
         for k in range(1, NUMBER_OF_SCALES + 1):
             scale = 2.0 ** (-k / 2)
-            found = {
+            ratings = {
                 term: relative_to_limit(_scaled(scenario, term, scale), times, states)
                 for term in terms_of(scenario)
             }
-            least = min(found, key=found.__getitem__, default=None)
-            if least is not None and found[least] < 1.0:
-                return Limit(least, scale)
+            stable = [term for term, rating in ratings.items() if rating < 1.0]
+            if stable:
+                return Limit(min(stable, key=ratings.__getitem__), scale)
         return None
     return None
 
@@ -120,38 +119,41 @@ def terms_of(scenario: Scenario) -> Iterator[Term]:
         if not np.all(np.asarray(parameter.value) > 0):
             continue
         if parameter.path in of_law:
-            yield Term(WORDS.get(name, f"the gain {name}"), parameter.path)
+            yield Term(TERMS.get(name, f"the gain {name}"), parameter.path)
         elif parameter.path == "controller.filter":
-            yield Term(WORDS[name], parameter.path, True)
+            yield Term(TERMS[name], parameter.path, is_reciprocal=True)
         elif part == "observer" and parameter.unit in ("1/s", "1/s^2"):
             yield Term(f"the observer's gain {name}", parameter.path)
         elif parameter.path == "sampling.delay":
-            yield Term(WORDS[name], parameter.path)
-        elif part in ("sensor", "actuator") and name in BANDWIDTHS:
-            yield Term(LAGS[part], parameter.path, True)
+            yield Term(TERMS[name], parameter.path)
+        elif part in LAGS and name in BANDWIDTHS:
+            yield Term(LAGS[part], parameter.path, is_reciprocal=True)
 
 
 def _scaled(scenario: Scenario, term: Term, scale: float) -> Scenario:
-    factor = 1.0 / scale if term.is_inverse else scale
+    """The scenario with one of its terms scaled."""
+    factor = 1.0 / scale if term.is_reciprocal else scale
     return with_parameters(scenario, {term.path: get(scenario, term.path) * factor})
 
 
 def _relative_to_limit(
     scenario: Scenario, run: Any
 ) -> Callable[[Scenario, jax.Array, LoopState], float]:
-    """The function that rates a loop at some instants, 1 at its limit: by the spectral radius of a
-    sampled loop, else by the fastest mode times dt.
+    """A function that rates a loop at some instants, 1 at its limit of stability.
+
+    It is the spectral radius of a sampled loop; otherwise the fastest mode times dt, relative to
+    the stability limit of the integrator.
     """
 
     def radius(scenario: Scenario, times: jax.Array, states: LoopState) -> float:
         return largest_eigenvalue(np.asarray(_period_maps(scenario, times, states), float))
 
-    def scaled_modes(scenario: Scenario, times: jax.Array, states: LoopState) -> float:
-        modes = largest_eigenvalue(np.asarray(_jacobians(scenario, times, states), float))
-        return float(run.dt) * modes / tableau(run.method).stability
+    def fastest_mode(scenario: Scenario, times: jax.Array, states: LoopState) -> float:
+        mode = largest_eigenvalue(np.asarray(_jacobians(scenario, times, states), float))
+        return float(run.dt) * mode / tableau(run.method).stability
 
     if scenario.sampling is None:
-        return scaled_modes
+        return fastest_mode
     return radius
 
 
@@ -174,28 +176,29 @@ def _jacobians(scenario: Scenario, times: jax.Array, states: LoopState) -> jax.A
 
 
 def _instants(scenario: Scenario, run: Any) -> Iterator[tuple[jax.Array, LoopState]]:
-    """Times and states, one group after the other: the start and along the reference, and where the
-    run was nearest to its bounds.
+    """Two groups of times and states: the start and along the reference, and where the run was
+    nearest to its bounds.
 
-    What is unstable in the first group is so whatever the run does; a run that comes near a bound
-    after that has steep slopes besides.
+    The first group does not depend on the course of the run, so it is assessed first: an unstable
+    run comes near its bounds, where slopes are steep in addition.
     """
     dtype = scenario.initial.q.dtype
     recorded = np.asarray(run.t)
     later = jnp.asarray(np.linspace(0.0, float(recorded[-1]), INSTANTS - 1), dtype)
     yield jnp.concatenate([jnp.zeros_like(later[:1]), later]), start_and_along(scenario, later)
-    size = np.max(np.abs(np.asarray(run.xi)), axis=1)
-    inside = np.flatnonzero(np.isfinite(size) & (size < LARGEST_XI))
+    xi = np.max(np.abs(np.asarray(run.xi)), axis=1)
+    inside = np.flatnonzero(np.isfinite(xi) & (xi < LARGEST_XI))
     if not inside.size:
         return
-    nearest = np.resize(inside[np.argsort(size[inside])[::-1]], INSTANTS)
+    by_decreasing_xi = inside[np.argsort(xi[inside])[::-1]]
+    nearest = np.resize(by_decreasing_xi, INSTANTS)
     q, dq = (jnp.asarray(np.asarray(x)[nearest], dtype) for x in (run.q, run.dq))
     yield jnp.asarray(recorded[nearest], dtype), _states_at(scenario, q, dq)
 
 
 @jax.jit
 def _states_at(scenario: Scenario, q: jax.Array, dq: jax.Array) -> LoopState:
-    """States of a loop that starts at these positions and velocities, (INSTANTS, ...)."""
+    """Initial states of a loop at these positions and velocities, (INSTANTS, ...)."""
     return jax.vmap(
         lambda q, dq: initial_state(dataclasses.replace(scenario, initial=Initial(q, dq)))
     )(q, dq)

@@ -1,5 +1,7 @@
-"""The loops over all steps of a batch: of XLA over the step as it is (`scan`, `checkpointed`), and
-of an executor over the step's scalar program (`kernel_loop`).
+"""The loops over all steps of a batch, each a `StepLoop`.
+
+`scan` and `checkpointed` are loops of JAX over the step.  `kernel_loop` returns the loop of an
+executor over the scalar program of the step.
 """
 
 from __future__ import annotations
@@ -28,8 +30,8 @@ from iblf_jax.kernels import (
 
 
 def scan(step: Any, batch: Batch, carry: Any, steps: int, every: int | None) -> tuple[Any, Any]:
-    """All steps of all runs in `jax.lax.scan`: any scenario, any device, and differentiable in
-    either mode.
+    """All steps of all runs by `jax.lax.scan`, for any scenario and device; differentiable in
+    forward and reverse mode.
     """
     options = StepOptions(batch.layout.rolled)
     if batch.layout.machine_functions == "parts":
@@ -41,12 +43,12 @@ def scan(step: Any, batch: Batch, carry: Any, steps: int, every: int | None) -> 
 
         return _scan_run(of_run, carry, steps, every)
 
-    return batch.each(one, carry)
+    return batch.map_runs(one, carry)
 
 
 def _scan_run(step: Callable, carry: Any, steps: int, every: int | None) -> tuple[Any, Any]:
-    """All steps of one run.  The step is compiled once, so records that are not kept are computed,
-    too, and overwritten.
+    """All steps of one run.  Every step computes its record, because the step is compiled once;
+    records that are not requested are discarded.
     """
     if every is None:
         return jax.lax.scan(
@@ -59,21 +61,19 @@ def _scan_run(step: Callable, carry: Any, steps: int, every: int | None) -> tupl
         lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(step, carry, jnp.int32(0))[1]
     )
 
-    def one(carried, index):
-        before, record = carried
-        after, new = step(before, index)
-        return (
-            keep_if(index < steps, after, before),
-            keep_if(index % every == 0, new, record),
-        ), None
+    def one_step(carry_and_record, index):
+        before, record = carry_and_record
+        after, new_record = step(before, index)
+        after = keep_if(index < steps, after, before)
+        return (after, keep_if(index % every == 0, new_record, record)), None
 
-    def block(carried, first):
-        carried, _ = jax.lax.scan(one, carried, first + jnp.arange(every))
-        return carried, carried[1]
+    def one_interval(carry_and_record, first):
+        indices = first + jnp.arange(every)
+        carry_and_record, _ = jax.lax.scan(one_step, carry_and_record, indices)
+        return carry_and_record, carry_and_record[1]
 
-    (carry, _), records = jax.lax.scan(
-        block, (carry, blank), every * jnp.arange(-(-steps // every))
-    )
+    intervals = -(-steps // every)
+    (carry, _), records = jax.lax.scan(one_interval, (carry, blank), every * jnp.arange(intervals))
     return carry, records
 
 
@@ -82,7 +82,7 @@ def checkpointed(
 ) -> tuple[Any, Any]:
     """As `scan` without records, for reverse mode: about 3 T^(1/3) states are in memory at a time.
 
-    Only every T^(2/3)-th state is kept; the others are computed again, in three nested loops.
+    Three nested loops keep only every T^(2/3)-th state and compute the others again.
     """
     if every is not None or isinstance(step, LinearizationStep):
         return scan(step, batch, carry, steps, every)
@@ -91,36 +91,33 @@ def checkpointed(
 
     def one(inputs, carry):
         @jax.checkpoint
-        def single(carry, index):
-            return (
-                keep_if(index < steps, step(inputs, carry, index, options)[0], carry),
-                None,
-            )
+        def one_step(carry, index):
+            after, _ = step(inputs, carry, index, options)
+            return keep_if(index < steps, after, carry), None
 
         @jax.checkpoint
-        def few(carry, first):
-            return jax.lax.scan(single, carry, first + jnp.arange(inner))
+        def inner_loop(carry, first):
+            return jax.lax.scan(one_step, carry, first + jnp.arange(inner))
 
         @jax.checkpoint
-        def many(carry, first):
-            return jax.lax.scan(few, carry, first + inner * jnp.arange(inner))
+        def middle_loop(carry, first):
+            return jax.lax.scan(inner_loop, carry, first + inner * jnp.arange(inner))
 
-        return jax.lax.scan(many, carry, inner * inner * jnp.arange(blocks))
+        return jax.lax.scan(middle_loop, carry, inner * inner * jnp.arange(blocks))
 
-    return batch.each(one, carry)
+    return batch.map_runs(one, carry)
 
 
 @CACHE.memoised(64)
 def _on_leaves(step: Any, treedef, is_per_run: tuple[bool, ...], carry_treedef) -> Callable:
-    """A step as a function of lists of leaves, for `compile_step`; the same object for the same
-    structure.
+    """The step as a function of lists of leaves.  `compile_step` caches by the function object, so
+    the same structure gives the same object.
     """
 
     def on_leaves(shared, per_run, carry, index):
-        inputs = Leaves(treedef, is_per_run, [], []).together(shared, per_run)
-        after, records = step(
-            inputs, jax.tree.unflatten(carry_treedef, carry), index, StepOptions(scalar=True)
-        )
+        inputs = Leaves(treedef, is_per_run, [], []).unflatten(shared, per_run)
+        before = jax.tree.unflatten(carry_treedef, carry)
+        after, records = step(inputs, before, index, StepOptions(scalar=True))
         return jax.tree.leaves(after), records
 
     return on_leaves
@@ -130,47 +127,48 @@ def program_of(step: Any, batch: Batch, carry: Any) -> CompiledStep:
     """The scalar program of a step, for a carry with a leading batch axis (arrays or their shapes).
 
     Raises:
-      UnsupportedError: it does not lower.
+      UnsupportedError: the step cannot be lowered.
     """
     flat, treedef = jax.tree.flatten(carry)
     leaves = batch.leaves
     function = _on_leaves(step, leaves.treedef, leaves.is_per_run, treedef)
-    # A derivative's literal zero says "does not depend".
-    sparse = step_member(step, "is_derivative")
-    shapes = Shapes.of(leaves.shared), Shapes.of(leaves.per_run, 1), Shapes.of(flat, 1)
     return compile_step(
         function,
         np.dtype(batch.dtype),
-        *shapes,
-        thresholds.LOWERING_LIMITS,
-        sparse,
-        batch.known,
+        Shapes.of(leaves.shared),
+        Shapes.of(leaves.per_run, 1),
+        Shapes.of(flat, 1),
+        limits=thresholds.LOWERING_LIMITS,
+        is_derivative=step_member(step, "is_derivative"),
+        known=batch.shared_constants,
     )
 
 
 def kernel_loop(executor: Executor, **options: Any) -> StepLoop:
-    """The loop of an executor over a step's scalar program.
+    """The loop of an executor over the scalar program of a step.
 
     Args:
-      executor: what runs the program.
+      executor: the executor.
       options: further arguments of `executor.run`.
     """
 
     def loop(step: Any, batch: Batch, carry: Any, steps: int, every: int | None) -> tuple[Any, Any]:
-        found, runs = program_of(step, batch, carry), batch.runs or 1
+        compiled = program_of(step, batch, carry)
+        runs = batch.runs or 1
         flat, treedef = jax.tree.flatten(carry)
         shapes = Shapes.of(flat, 1)
         pack = partial(executor.pack, dtype=batch.dtype)
         shared, per_run = batch.leaves.shared, batch.leaves.per_run
-        shared_numbers = pack([x[None] for x in shared], Shapes.of(shared), runs=1).floats[:, 0]
-        numbers_per_run = pack(per_run, Shapes.of(per_run, 1), runs=runs).floats
+        # Shared leaves are packed as those of a single run.
+        shared_rows = pack([x[None] for x in shared], Shapes.of(shared), runs=1).floats
+        per_run_rows = pack(per_run, Shapes.of(per_run, 1), runs=runs).floats
         before = pack(flat, shapes, runs=runs)
         after, arrays = executor.run(
-            found.program, shared_numbers, numbers_per_run, before, steps, every, **options
+            compiled.program, shared_rows[:, 0], per_run_rows, before, steps, every, **options
         )
         records = ()
         if every:
-            records = unpacked_records(found.records, arrays)
+            records = unpacked_records(compiled.records, arrays)
         return jax.tree.unflatten(treedef, executor.unpack(after, shapes, runs)), records
 
     return loop

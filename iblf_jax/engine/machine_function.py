@@ -1,16 +1,15 @@
-"""Machine functions: a time loop, or a piece of one, compiled as one function of the processor
-instead of many of XLA's operations.
+"""Machine functions: XLA compiles a time loop, or a part of one, as one function of the processor.
 
-XLA dispatches every operation of a CPU loop by itself, which costs microseconds a step, more than
-the arithmetic of a robot.  Two attributes on a call make it compile the whole callee as one
-function: two to five times faster for one run and for small batches, with the same numbers.  The
-attributes are XLA's own, and its CPU compiler fails on some operations inside such a function
-(matrix products, calls into libraries) and on arrays large enough to be shared out over threads.
-So the callee is traced first, and only what is known to work gets them.
+In a loop on the CPU, XLA dispatches every operation separately.  This costs microseconds per step,
+more than the arithmetic of a robot.  Two attributes of a call make XLA compile the complete callee
+as one function, which is two to five times faster for one run and for small batches, with the same
+numbers.  XLA's CPU compiler fails on some operations in such a function (matrix products, calls of
+libraries) and on arrays so large that it divides them among threads.  Therefore the callee is
+traced first, and the attributes are set only if all of its operations are known to work.
 
-The compiler's time grows faster than the length of a function.  A long loop (an arm of seven joints
-has ten thousand operations an evaluation) is therefore not made one function but called piece by
-piece: each piece is one function, and the loop around it XLA's own.
+Compilation time grows faster than the length of a function.  A long time loop (an evaluation of an
+arm of seven joints has ten thousand operations) is therefore compiled in parts: each part is a
+machine function, and XLA's own loop calls them.
 """
 
 from __future__ import annotations
@@ -19,6 +18,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import Jaxpr, jaxpr_as_fun, jaxprs_in_params
 
@@ -50,8 +50,8 @@ REFUSED = frozenset(
         "schur",
     }
 )
-"""Operations that are not trusted inside: matrix products and decompositions become library calls,
-the others were not needed.  Loops and branches are judged by what is in them."""
+"""Operations that a machine function may not contain.  Matrix products and decompositions become
+library calls; the others are not needed.  A loop or a branch is allowed if its operations are."""
 
 COPIES = frozenset(
     {
@@ -65,15 +65,15 @@ COPIES = frozenset(
         "dynamic_update_slice",
     }
 )
-"""Operations that compute nothing; their size does not matter."""
+"""Operations that only move or convert data; their size is not limited."""
 
 
 def machine_function(function: Callable) -> Callable:
-    """`function`, compiled as one machine function where that is known to work; else as it is.
+    """`function` as one machine function if that is known to work, and unchanged otherwise.
 
     Args:
-      function: pure function of pytrees of arrays.  Do not `vmap` the result: batch inside
-        `function`, where its size is seen.
+      function: pure function of pytrees of arrays.  Do not `vmap` the result; apply `vmap` within
+        `function`, so that the sizes of its arrays are known.
     """
 
     def traced(*args: Any) -> Any:
@@ -82,8 +82,8 @@ def machine_function(function: Callable) -> Callable:
         operations = list(_operations(closed.jaxpr))
         if (
             thresholds.has_machine_functions(devices.platform())
-            and len(operations) <= thresholds.LONGEST_FUNCTION
-            and all(map(_is_trusted, operations))
+            and len(operations) <= thresholds.MAX_FUNCTION_OPERATIONS
+            and all(map(_is_allowed, operations))
         ):
             call = set_xla_metadata(inlineable="false", xla_cpu_small_call="true")(jax.jit(call))
         return jax.tree.unflatten(jax.tree.structure(shapes), call(*jax.tree.leaves(args)))
@@ -92,12 +92,12 @@ def machine_function(function: Callable) -> Callable:
 
 
 def count_operations(function: Callable, *args: Any) -> int:
-    """Number of operations of a function, those of its inner functions included."""
+    """Number of operations of a function, including those of its inner functions."""
     return sum(1 for _ in _operations(jax.make_jaxpr(function)(*args).jaxpr))
 
 
 def _operations(jaxpr: Jaxpr) -> Iterator[Any]:
-    """Every operation of a jaxpr, those of its inner functions included."""
+    """The operations of a jaxpr, including those of its inner functions."""
     for operation in jaxpr.eqns:
         bodies = list(jaxprs_in_params(operation.params))
         for body in bodies:
@@ -106,13 +106,17 @@ def _operations(jaxpr: Jaxpr) -> Iterator[Any]:
             yield operation
 
 
-def _is_trusted(operation: Any) -> bool:
+def _is_allowed(operation: Any) -> bool:
+    """Whether a machine function may contain an operation."""
     name = operation.primitive.name
     if name in REFUSED:
         return False
+    if name in COPIES:
+        return True
     if name.startswith(("reduce_", "arg")):
         return all(v.aval.size <= thresholds.LARGEST_REDUCED for v in operation.invars)
-    computed = [
-        v.aval for v in operation.outvars if jax.numpy.issubdtype(v.aval.dtype, jax.numpy.floating)
-    ]
-    return name in COPIES or all(aval.size <= thresholds.LARGEST_ARRAY for aval in computed)
+    outputs = [v.aval for v in operation.outvars]
+    return all(
+        x.size <= thresholds.LARGEST_ARRAY or not jnp.issubdtype(x.dtype, jnp.floating)
+        for x in outputs
+    )

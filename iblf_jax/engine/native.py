@@ -1,4 +1,4 @@
-"""The native executor: the kernels of `kernels.cpu`, compiled and run as the plan decides."""
+"""The native executor: compiles and runs the kernels of `kernels.cpu`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from iblf_jax.kernels.cpu import unpack as unpack
 
 
 def unavailable() -> str | None:
-    """Why this process cannot run it, in one line, or None if it can."""
+    """Why this process cannot use the executor, in one line; None if it can."""
     try:
         compiler()
     except ToolchainError as error:
@@ -26,10 +26,10 @@ def _kernel_build(
     """How the kernel of a program is compiled.
 
     Args:
-      program: what a step computes.
+      program: the scalar program of a step.
       runs, steps: numbers of runs and steps.
-      short_vector: whether it is the kernel for one or two runs of many steps; decided by `runs`
-        and `steps` if None.
+      short_vector: whether the kernel is the one for so few runs, of many steps, that they fit in
+        a short vector; `runs` and `steps` decide if None.
     """
     if short_vector is None:
         is_small = runs * program.dtype.itemsize <= thresholds.SHORT_VECTOR_BYTES
@@ -43,7 +43,7 @@ def build(program: Program, shared: int, per_run: int, runs: int, steps: int) ->
 
 
 def start_build(program: Program, shared: int, per_run: int, runs: int, steps: int) -> None:
-    """The same as `build`, in the background."""
+    """As `build`, in the background."""
     cpu.start_build(program, shared, per_run, _kernel_build(program, runs, steps))
 
 
@@ -67,7 +67,7 @@ def run(
       The rows after the last step, and the recorded arrays, (samples, numbers, runs), of every
       `every`-th step.
     """
-    build = _kernel_build(program, carry.floats.shape[1], steps, short_vector)
+    kernel = _kernel_build(program, carry.floats.shape[1], steps, short_vector)
     return cpu.run(
-        program, shared, per_run, carry, steps, every, first=first, build=build, threads=threads()
+        program, shared, per_run, carry, steps, every, first=first, build=kernel, threads=threads()
     )

@@ -1,8 +1,9 @@
-"""Stage 2 of a run: how a request is executed, decided from sizes and the machine alone.
+"""Stage 2 of a run: how a request is executed, decided from sizes and the machine.
 
 `choose_plan` is a pure function from a request, the sizes of its inputs and the machine to an
-`ExecutionPlan`: which executors are tried, and how XLA is given a batch.  The numbers that it
-compares with are in `thresholds`.
+`ExecutionPlan`, which lists the executors to try and says how XLA compiles a batch.
+`within_node_limit` and `scan_only` revise the plan of a single run once its step has been lowered.
+The limits are in `thresholds`.
 """
 
 from __future__ import annotations
@@ -10,62 +11,57 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from iblf_jax.engine import registry, thresholds
-from iblf_jax.engine.registry import Machine
+from iblf_jax.engine.registry import Availability, Machine
 from iblf_jax.engine.request import RunRequest, check_backend
 
 
 class BatchLayout(NamedTuple):
-    """How XLA is given a batch of runs."""
+    """How XLA compiles a batch of runs."""
 
     mapping: str
     """"vmap": all runs advance together; "map": one run after the other."""
     machine_functions: str
-    """"loop": the whole time loop is one machine function; "parts": its parts are one each (closed
-    loop, record and metrics, start, end); "none"."""
+    """What is compiled as a machine function: "loop" (the entire time loop), "parts" (closed loop,
+    record and metrics, start and end, each on its own) or "none"."""
     rolled: bool
-    """Whether the integrator's stages are a loop.  One run as a machine function takes half the
-    time so, and a third to compile; 32 runs take 2.3 times as long, and XLA's own loop over one run
-    three times."""
+    """Whether the integrator's stages are a loop.  This halves the time of one run as a machine
+    function and divides its compilation time by 3.  It multiplies the time of 32 runs by 2.3, and
+    that of one run in XLA's own loop by 3."""
 
 
 PLAIN_LAYOUT = BatchLayout("vmap", "none", False)
 """A batch by `jax.vmap`, compiled by XLA in its usual way."""
 STATES_LAYOUT = BatchLayout("vmap", "none", True)
-"""How one step is made from each of many states: it is made few times, so what counts is how long
-it compiles."""
+"""For a few steps from each of many states, where compilation takes most of the time."""
 
 
 class Sizes(NamedTuple):
-    """What is known of the work before it is compiled."""
+    """Sizes that are known before a step is lowered."""
 
     operations: int
     """Operations of one evaluation of the closed loop."""
     runs: int | None
     """Runs of the batch; None for a single run."""
-    nodes: int | None = None
-    """Nodes of a step's scalar program, where a decision needs them."""
-    unsupported: str | None = None
-    """Why the step cannot be lowered to a scalar program."""
 
 
 class ExecutionPlan(NamedTuple):
     """How a request is executed."""
 
     backends: tuple[str, ...]
-    """Names of the executors to try, best first.  The scan follows if none of them can run it."""
+    """Names of the executors to try, best first.  If none of them can run it, the scan does."""
     layout: BatchLayout
-    """Of what surrounds a scalar program."""
+    """Layout of the code before and after the steps that an executor makes."""
     scan_layout: BatchLayout
-    """Of the scan."""
+    """Layout of the scan."""
     reports_unsupported: bool
-    """Whether a warning says that a step cannot be lowered."""
-    notes: tuple[str, ...] = ()
-    """Warnings about the request itself."""
+    """Whether to warn if the step cannot be lowered."""
+    warnings: tuple[str, ...] = ()
+    """Warnings about the requested backend."""
 
     @property
     def backend(self) -> str:
-        """The first backend, "vmap" for the scan."""
-        return (*self.backends, "vmap")[0]
+        """The first executor to try; "vmap" for the scan."""
+        return next(iter(self.backends), "vmap")
 
 
 def choose_plan(request: RunRequest, sizes: Sizes, machine: Machine) -> ExecutionPlan:
@@ -73,73 +69,90 @@ def choose_plan(request: RunRequest, sizes: Sizes, machine: Machine) -> Executio
 
     Args:
       request: what is to be run.
-      sizes: of the work.
-      machine: platform and the executors for it.
+      sizes: sizes of the closed loop and of the batch.
+      machine: the platform and its executors.
 
     Raises:
       ValueError: an unknown backend.
     """
     backend = check_backend(request.backend)
-    names, notes = requested_executors(backend, machine)
-    is_batch = sizes.runs is not None
-    # One run takes little time either way: on "auto" it is not worth a warning.
-    reports = is_batch or backend != "auto"
-    if sizes.unsupported is not None:
-        names = ()
-        if reports:
-            notes = (*notes, slower_by_scan(sizes.unsupported))
-    elif names and backend == "auto" and not is_batch and sizes.nodes is not None:
-        limit = registry.EXECUTORS[names[0]].limits.single_run
-        if not thresholds.is_within(sizes.nodes, limit):
-            names = ()
-    operations, platform = sizes.operations, machine.platform
+    names, warnings = requested_executors(backend, machine)
     return ExecutionPlan(
         names,
-        lowered_layout(platform, operations, sizes.runs or 1, request.nested),
-        scan_layout(platform, operations, sizes.runs, request.nested),
-        reports,
-        notes,
+        lowered_layout(machine.platform, sizes.operations, sizes.runs or 1, request.nested),
+        scan_layout(machine.platform, sizes.operations, sizes.runs, request.nested),
+        # A single run takes little time on any backend, so that "auto" does not warn.
+        reports_unsupported=sizes.runs is not None or backend != "auto",
+        warnings=warnings,
     )
 
 
+def within_node_limit(execution: ExecutionPlan, request: RunRequest, nodes: int) -> ExecutionPlan:
+    """The plan of a single run with so many nodes per step; on "auto" the scan makes long steps."""
+    limit = registry.EXECUTORS[execution.backend].limits.single_run_nodes
+    if request.backend != "auto" or thresholds.is_within(nodes, limit):
+        return execution
+    return execution._replace(backends=())
+
+
+def scan_only(execution: ExecutionPlan, reason: object) -> ExecutionPlan:
+    """The plan of a run whose step cannot be lowered, for the given reason."""
+    warnings = execution.warnings
+    if execution.reports_unsupported:
+        warnings = (*warnings, scan_warning(reason))
+    return execution._replace(backends=(), warnings=warnings)
+
+
+def plan_of_states(operations: int, backend: Availability) -> ExecutionPlan:
+    """The plan of a few steps from each of many states, by the default backend of the machine; a
+    kernel is built only if the closed loop has few operations.
+    """
+    backends: tuple[str, ...] = ()
+    if backend.reason is None and operations <= thresholds.LONG_EVALUATION:
+        backends = (backend.name,)
+    return ExecutionPlan(backends, STATES_LAYOUT, STATES_LAYOUT, reports_unsupported=False)
+
+
 def requested_executors(backend: str, machine: Machine) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """The executors for a requested backend on a machine, best first, and warnings about it."""
+    """The available executors for a requested backend, best first, and warnings."""
     if backend == "vmap":
         return (), ()
     requested = [state for state in machine.executors if backend in ("auto", state.name)]
     if not requested and backend != "auto":
-        note = (
+        warning = (
             f"The {backend} backend is not for the default device, {machine.platform}: running on"
             " vmap."
         )
-        return (), (note,)
+        return (), (warning,)
     names = tuple(name for name, reason in requested if reason is None)
-    following = (*names, "vmap")[0]
-    notes = tuple(
-        not_available(name, reason, following) for name, reason in requested if reason is not None
+    following = next(iter(names), "vmap")
+    warnings = tuple(
+        unavailable_warning(name, reason, following)
+        for name, reason in requested
+        if reason is not None
     )
-    return names, notes
+    return names, warnings
 
 
-def not_available(backend: str, reason: object, following: str) -> str:
-    """The warning that another backend takes the place of one."""
+def unavailable_warning(backend: str, reason: object, following: str) -> str:
+    """The warning that an executor is not available and which backend replaces it."""
     return f"The {backend} backend is not available ({reason}): running on {following}."
 
 
-def slower_by_scan(reason: object) -> str:
-    """The warning that a scenario runs by the scan."""
+def scan_warning(reason: object) -> str:
+    """The warning that a scenario cannot be lowered and runs by the scan."""
     return f"This scenario runs on the vmap backend, many times slower: {reason}."
 
 
 def scan_layout(platform: str, operations: int, runs: int | None, nested: bool) -> BatchLayout:
-    """How the scan runs a batch.
+    """The layout of the scan.
 
     Args:
-      platform: as JAX names it.
-      operations: of one evaluation of the closed loop.
-      runs: in the batch; None for one run.
-      nested: whether a caller may batch, differentiate or loop over the result: XLA refuses machine
-        functions there, or aborts.
+      platform: the platform, as JAX names it.
+      operations: operations of one evaluation of the closed loop.
+      runs: runs of the batch; None for one run.
+      nested: whether a caller may batch, differentiate or loop over the result, where XLA refuses
+        machine functions or aborts.
     """
     is_long = operations > thresholds.LONG_EVALUATION
     if nested or not thresholds.has_machine_functions(platform):
@@ -151,8 +164,10 @@ def scan_layout(platform: str, operations: int, runs: int | None, nested: bool) 
 
 
 def lowered_layout(platform: str, operations: int, runs: int, nested: bool) -> BatchLayout:
-    """How XLA compiles what surrounds a scalar program: as machine functions for one run, which
-    takes two thirds of the time.  For 48 runs, and for arms of many joints, XLA refuses a fusion.
+    """The layout of the code before and after the steps that an executor makes.
+
+    Machine functions reduce its time to two thirds for one run.  For 48 runs, and for arms of many
+    joints, XLA refuses one of their fusions.
     """
     is_short = operations <= thresholds.LONG_EVALUATION
     if runs == 1 and is_short and not nested and thresholds.has_machine_functions(platform):

@@ -1,8 +1,8 @@
-"""The registry of executors: what runs scalar programs, one record each.
+"""The registry of executors.  An executor runs the scalar program of a step.
 
 A new executor is a module with functions like those of `native`, and one record in `EXECUTORS`.
-The scan, which needs no scalar program, is no member: it runs what no executor can, and users
-request it as "vmap".
+The scan is not an executor, because it needs no scalar program.  It runs what no executor can, and
+users request it as "vmap".
 """
 
 from __future__ import annotations
@@ -18,36 +18,40 @@ from iblf_jax.kernels import pack, unpack
 class Limits(NamedTuple):
     """Largest sizes for which "auto" takes an executor; None for no limit."""
 
-    single_run: int | None = None
+    single_run_nodes: int | None = None
     """Nodes of a step of a single run."""
-    derivatives: int | None = None
-    """Nodes of a step times one and the number of its tangents."""
+    derivative_nodes: int | None = None
+    """Nodes of a step, times one plus the number of tangents."""
 
 
 class Executor(NamedTuple):
-    """What runs scalar programs, all steps of all runs."""
+    """A compiler and a launcher of kernels, which make all steps of all runs of a batch."""
 
     name: str
     """The backend, as users request it."""
     platforms: tuple[str, ...]
-    """For which it compiles kernels."""
+    """Platforms, as JAX names them, for which it compiles kernels."""
     run: Callable
-    """As `native.run`."""
+    """`run(program, shared, per_run, carry, steps, every)` returns the carry after the last step
+    and the records; `native.run` describes the arguments."""
     unavailable: Callable[[], str | None]
     """Why this process cannot use it, in one line; None if it can."""
     build: Callable
-    """`build(program, shared, per_run, runs, steps)`: compiles the kernel of a program, for so many
-    shared numbers and numbers per run; raises ToolchainError or UnsupportedError."""
+    """`build(program, shared, per_run, runs, steps)` compiles the kernel of a program; `shared` and
+    `per_run` are counts of numbers.  It raises ToolchainError or UnsupportedError."""
     limits: Limits = Limits()
     pack: Callable = pack
-    """Leaves to rows of numbers."""
+    """Converts leaves to rows of numbers."""
     unpack: Callable = unpack
-    """Rows of numbers to leaves."""
+    """Converts rows of numbers to leaves."""
     start_build: Callable | None = None
-    """Arguments of `build`: starts to compile in the background."""
-    continues: bool = False
-    """Whether `run` takes the number of the first step (`first`) and the choice of a kernel for few
-    runs (`short_vector`), so that a long single run can be made in several calls."""
+    """Starts to compile in the background; arguments as `build`."""
+    accepts_first_step: bool = False
+    """Whether `run` accepts `first`, the index of the first step, and `short_vector`.  Then a long
+    single run can be divided into several calls."""
+    uses_host_compiler: bool = False
+    """Whether results depend on the processor and the C++ compiler of the host in their last
+    digits."""
 
 
 NATIVE = Executor(
@@ -56,11 +60,12 @@ NATIVE = Executor(
     run=native.run,
     unavailable=native.unavailable,
     build=native.build,
-    limits=Limits(thresholds.LONGEST_SINGLE_RUN, thresholds.LONGEST_DERIVATIVE_CUT),
+    limits=Limits(thresholds.MAX_SINGLE_RUN_NODES, thresholds.MAX_SEGMENTED_DERIVATIVE_NODES),
     pack=native.pack,
     unpack=native.unpack,
     start_build=native.start_build,
-    continues=True,
+    accepts_first_step=True,
+    uses_host_compiler=True,
 )
 GPU = Executor(
     name="gpu",
@@ -68,19 +73,24 @@ GPU = Executor(
     run=gpu.run,
     unavailable=gpu.unavailable,
     build=gpu.build,
-    limits=Limits(thresholds.LONGEST_SINGLE_RUN, thresholds.LONGEST_DERIVATIVE),
+    limits=Limits(thresholds.MAX_SINGLE_RUN_NODES, thresholds.MAX_DERIVATIVE_NODES),
 )
 EXECUTORS: dict[str, Executor] = {executor.name: executor for executor in (NATIVE, GPU)}
 """All executors by name; those for the same platform in the order of preference."""
 
 
 def backends() -> tuple[str, ...]:
-    """How a user may request that runs be executed."""
+    """The values that users may give for `backend`."""
     return ("auto", "vmap", *EXECUTORS)
 
 
+def uses_host_compiler(backend: str) -> bool:
+    """Whether the results of a backend depend on the processor and compiler of the host."""
+    return backend in EXECUTORS and EXECUTORS[backend].uses_host_compiler
+
+
 class Availability(NamedTuple):
-    """Whether an executor can be used."""
+    """Whether an executor is available."""
 
     name: str
     reason: str | None
@@ -100,7 +110,8 @@ def machine() -> Machine:
     """The default device of this process, and the executors for it."""
     platform = devices.platform()
     executors = executors_for(platform)
-    return Machine(platform, tuple(Availability(x.name, x.unavailable()) for x in executors))
+    available = [Availability(x.name, x.unavailable()) for x in executors]
+    return Machine(platform, tuple(available))
 
 
 def executors_for(platform: str) -> list[Executor]:
@@ -108,11 +119,12 @@ def executors_for(platform: str) -> list[Executor]:
     return [executor for executor in EXECUTORS.values() if platform in executor.platforms]
 
 
-def automatic() -> Availability:
-    """What "auto" takes; "vmap", with the reason, where no kernels can be compiled."""
+def default_backend() -> Availability:
+    """The backend that "auto" selects; "vmap", with the reason, where no executor is available."""
     here = machine()
     for executor in here.executors:
         if executor.reason is None:
             return executor
-    reasons = [executor.reason for executor in here.executors]
-    return Availability("vmap", (*reasons, f"no kernels are compiled for {here.platform}")[0])
+    if here.executors:
+        return here.executors[0]._replace(name="vmap")
+    return Availability("vmap", f"no kernels are compiled for {here.platform}")

@@ -1,7 +1,7 @@
-"""Stage 1 of a run: what a caller requests, checked once.
+"""Stage 1 of a run: what a caller requests.
 
-A `RunRequest` is static and hashable: together with the structure of the inputs (scenario, metrics,
-time step) it decides what is compiled.  The numbers of the inputs are not part of it.
+A `RunRequest` is static and hashable. Together with the structure of the inputs (scenario, metrics,
+time step) it determines the compiled program. The values of the inputs are not part of it.
 """
 
 from __future__ import annotations
@@ -16,19 +16,24 @@ from iblf_jax.simulation.scenario import Scenario
 
 
 class RunRequest(NamedTuple):
-    """What is to be run, besides the inputs; use `RunRequest.of` to have it checked."""
+    """What is to be run, except for the inputs; `RunRequest.of` checks its arguments."""
 
     steps: int
     method: str = "rk4"
     """The integrator."""
     record_every: int | None = None
-    """Every so-many-th instant is recorded, from t = 0; None records nothing but metrics."""
+    """Interval of the recorded instants in steps, from t = 0; None for metrics only."""
     constants: StructuralConstants | None = None
-    """Which numbers of the scenario are compiled in (`mechanism`)."""
+    """The numbers of the scenario that are compiled in; None for none."""
     backend: str = "auto"
-    """The requested backend: "auto", "vmap" or a name in the registry of executors."""
+    """"auto", "vmap" (the scan) or the name of an executor."""
     nested: bool = False
     """Whether the caller runs the program inside a loop or a branch of JAX."""
+
+    @property
+    def instants(self) -> int:
+        """Instants at which the closed loop is evaluated: the start and the end of every step."""
+        return self.steps + 1
 
     @staticmethod
     def of(

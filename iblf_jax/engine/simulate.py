@@ -1,8 +1,9 @@
-"""`simulate`: runs one scenario and returns a `Rollout`.
+"""`simulate` runs one scenario and returns a `Rollout`.
 
-request = RunRequest.of(...)     what is requested, checked
-output  = run_one(...)           planned, compiled and executed (`single_run`)
-result  = Rollout(...)           named arrays with units
+request = RunRequest.of(...)     checks what is requested
+output  = run_one(...)           plans, compiles and executes it (`single_run`); under a
+                                 transformation of JAX `run_transformable` (`transformable`)
+result  = Rollout(...)           arrays with names and units
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ from iblf_jax.simulation.results import Metrics, Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical, check_step
 
 MAX_SAMPLES = 20_000_000
-"""Recorded samples of a run at most: a mistake in `duration` or `dt` must not fill the memory.  For
-two joints they take some 5 GB."""
+"""Largest number of recorded samples, so that a mistake in `duration` or `dt` does not fill the
+memory.  For two joints they take about 5 GB."""
 
 
 @notices.each_warning_once
@@ -42,28 +43,30 @@ def simulate(
     backend: str = "auto",
     seed: int = 0,
 ) -> Rollout:
-    """Runs a scenario with a fixed step and returns everything that can be looked at.
+    """Runs a scenario with a fixed step and returns its signals, metrics and status.
 
         x' = rate(t, x),   x = (q, q', states of law, observer and actuator)        (closed_loop)
 
-    Works under `jax.jit`, `vmap`, `grad`, `jacfwd`: differentiate any array by leaves of the
-    scenario.  New values of leaves do not recompile, except where other numbers of an arm's
-    geometry become 0, 1, -1 or equal; a new structure or method does.  Another number of steps, or
-    `record_every`, compiles the steps alone, except on "vmap".
+    `jax.jit`, `vmap`, `grad`, `jacfwd` and their compositions apply to it; every array of the
+    result is differentiable with respect to leaves of the scenario.  New values of leaves do not
+    recompile, unless other numbers of an arm's geometry become 0, 1, -1 or equal.  A new structure
+    or method does.  A new number of steps or `record_every` recompiles only the steps; on "vmap",
+    the complete run.
 
     Args:
       scenario: what to run, of n joints.
       duration: length of the run [s], a whole number of steps.
-      dt: time step [s]; `recommended_dt(scenario)` says which will do.
+      dt: time step [s]; `recommended_dt(scenario)` returns a suitable one.
       method: "rk4", "heun" or "euler".
-      record_every: record every so-many-th step; metrics and status cover every step.
+      record_every: interval of the recorded samples in steps; metrics and status cover every step.
       metrics: the folds to run; None for `iblf_jax.metrics.standard()`.
-      throw: raise instead of warn when the run failed.
-      backend: "native", C code built once for a structure and kept on disk; "gpu", the same on an
-        NVIDIA GPU; "vmap", plain JAX; or "auto", the first of these that JAX's default device runs.
-        Inside your own `jit` or `vmap` a run is plain JAX; except on "vmap", kernels compute its
-        derivatives by the scenario, of all that is recorded: record little if metrics suffice.
-      seed: fixes the noise of a sensor; the run is number 0 of a study with this seed.
+      throw: whether to raise instead of warn if the run failed.
+      backend: "native", C code that is built once for a structure and kept on disk; "gpu", the same
+        on an NVIDIA GPU; "vmap", JAX without kernels; or "auto", the first of these that JAX's
+        default device supports.  Under `jit` or `vmap` of the caller, a run uses JAX without
+        kernels.  Kernels compute its derivatives with respect to the scenario, except on "vmap",
+        and differentiate everything that is recorded: increase `record_every` if metrics suffice.
+      seed: seed of the noise of a sensor; the run is run 0 of a study with this seed.
 
     Returns:
       A `Rollout` with T = steps // record_every + 1 samples.
@@ -93,7 +96,7 @@ def simulate(
 
 
 def _checked_record(record_every: int, steps: int) -> int:
-    """The interval of the recorded samples; raises ValueError where they would be too many."""
+    """The interval of the recorded samples; raises ValueError if there are too many samples."""
     record_every = checks.recorded_every(record_every, steps)
     if steps // record_every <= MAX_SAMPLES:
         return record_every
@@ -119,11 +122,11 @@ def run_rollout(
     """One run as a `Rollout`, without checks and warnings.
 
     Args:
-      scenario: canonical, or with parameters that a study has drawn.
-      folds: the metrics, as `as_folds` gives them.
+      scenario: canonical scenario; its parameters may be those of a run of a study.
+      folds: the metrics, as `as_folds` returns them.
       dt: time step, () [s].
-      request: the checked request; it records at least one instant.
-      noise: key of a sensor's noise (`noise.noise_key`).
+      request: the request; its `record_every` is not None.
+      noise: key of the noise of a sensor (`noise.noise_key`).
     """
     if checks.is_concrete((scenario, folds, dt)):
         outcome = run_one(scenario, folds, dt, request, noise)

@@ -1,12 +1,12 @@
-"""One run, compiled in three parts, of which only the one in the middle depends on the number of
-steps and on what is recorded.
+"""Stage 4 of a single run, which is compiled in three parts:
 
-    initialize    the carry before the first step, and the loop linearized at the start
-    all steps
-    finalize      the folds' results and the status
+    _initialize    the carry before the first step, and the linearization at the start
+    _all_steps     the steps and the records
+    _finalize      the metrics and the status
 
-A long run is made in several calls, so that Python sees Ctrl-C between them; the numbers are those
-of one call.
+Only the second part depends on the number of steps and on what is recorded.  The steps of a long
+run are made in several calls (`_steps_in_calls`), between which Python responds to Ctrl-C; the
+results are the same.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from iblf_jax.engine.compile import (
     first_that_works,
     inputs_of,
     plan_of_single_run,
-    scanned,
+    run_by_scan,
     shapes_of,
     single_batch,
     structural_part,
@@ -44,33 +44,35 @@ from iblf_jax.kernels import StoppedError, ToolchainError
 from iblf_jax.simulation.scenario import Scenario
 
 FAILED_BUILDS = "failed builds"
-"""Topic of the marks of runs whose kernels could not be built, by backend, structure and shapes;
-they are not tried again in this process."""
+"""Topic of `CACHE` for kernels that could not be built, by executor, structure and shapes; this
+process does not try to build them again."""
 
 
 def run_one(
     scenario: Scenario, folds: Any, dt: jax.Array, request: RunRequest, noise: Any = None
 ) -> Outcome:
-    """One run; do not batch or differentiate it from outside.
+    """Runs a scenario once; the caller must not batch or differentiate it.
 
-    On "auto" a run that is long, or that does not lower, goes by the scan without a warning.
+    On "auto" the scan makes a run whose step is long or cannot be lowered, without a warning.
 
     Args:
       scenario, folds, dt: as `run_batch`.
-      request: the checked request.
-      noise: key of a sensor's noise.
+      request: the request.
+      noise: key of the noise of a sensor.
     """
     leaves, structure = jax.tree.flatten(inputs_of(scenario, folds, dt, request, noise))
     shapes = shapes_of(leaves)
-    found = plan_of_single_run(structural_part(request), registry.machine(), structure, shapes)
-    execution = found.execution
-    request = request._replace(backend="auto")  # the same programs, whatever is requested
+    execution, nodes = plan_of_single_run(
+        structural_part(request), registry.machine(), structure, shapes
+    )
+    # The parts do not depend on the requested backend, so they are compiled for one value of it.
+    request = request._replace(backend="auto")
 
     def attempt(executor: Executor) -> Outcome:
         parts = Parts(executor.name, structure, execution.layout)
         try:
             with compilers_stopped_on_error():
-                return _run_lowered(parts, found.nodes, request, leaves)
+                return _run_by_executor(parts, nodes, request, leaves)
         except ToolchainError as error:
             if not isinstance(error, StoppedError):
                 CACHE.mark(FAILED_BUILDS, (executor.name, structure, shapes))
@@ -93,44 +95,45 @@ class Parts(NamedTuple):
     """What the three parts of a run are compiled for; static."""
 
     backend: str
-    inputs: Any
-    """The tree of the `Inputs`."""
+    """Name of the executor."""
+    structure: Any
+    """Tree structure of the `Inputs`."""
     layout: BatchLayout
 
     def batch(self, leaves: list, request: RunRequest) -> Batch:
-        """The run as a batch."""
-        return single_batch(jax.tree.unflatten(self.inputs, leaves), request, self.layout)
+        """The batch of one run."""
+        return single_batch(jax.tree.unflatten(self.structure, leaves), request, self.layout)
 
     @property
     def executor(self) -> Executor:
-        """What makes the steps."""
+        """The executor."""
         return registry.EXECUTORS[self.backend]
 
     @property
     def loop(self) -> StepLoop:
-        """The loop over the steps."""
+        """The loop of the executor."""
         return kernel_loop(self.executor)
 
 
-def _run_lowered(parts: Parts, nodes: int, request: RunRequest, leaves: list) -> Outcome:
-    """One run by an executor; `nodes` of its step's program."""
-    independent = request._replace(steps=0, record_every=None)
-    carry, at_start = _initialize(parts, independent, leaves)
+def _run_by_executor(parts: Parts, nodes: int, request: RunRequest, leaves: list) -> Outcome:
+    """One run by an executor; `nodes` are those of the scalar program of its step."""
+    without_steps = request._replace(steps=0, record_every=None)
+    carry, at_start = _initialize(parts, without_steps, leaves)
     length = _steps_per_call(parts.executor, nodes, request)
-    if length > request.steps:
+    if length >= request.instants:
         carry, records = _all_steps(parts, request, leaves, carry)
     else:
         carry, records = _steps_in_calls(parts, request, leaves, carry, length)
-    return _finalize(parts, independent, leaves, carry, at_start)._replace(records=records)
+    return _finalize(parts, without_steps, leaves, carry, at_start)._replace(records=records)
 
 
 def _steps_per_call(executor: Executor, nodes: int, request: RunRequest) -> int:
-    """Steps of one run that are made before Python sees whether Ctrl-C was pressed."""
-    steps = request.steps + 1
-    longest = executor.limits.single_run or nodes
-    if not executor.continues or steps * longest <= thresholds.OPERATIONS_PER_CALL:
-        return steps
-    return thresholds.steps_per_call(nodes, steps, request.record_every)
+    """Steps that the executor makes in one call."""
+    max_nodes = executor.limits.single_run_nodes or nodes
+    is_short = request.instants * max_nodes <= thresholds.OPERATIONS_PER_CALL
+    if is_short or not executor.accepts_first_step:
+        return request.instants
+    return thresholds.steps_per_call(nodes, request.instants, request.record_every)
 
 
 @partial(jax.jit, static_argnums=(0, 1))
@@ -140,18 +143,18 @@ def _initialize(parts: Parts, request: RunRequest, leaves: list) -> tuple[Carry,
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _all_steps(parts: Parts, request: RunRequest, leaves: list, carry: Carry) -> tuple[Carry, Any]:
-    return _steps(parts.loop, parts.batch(leaves, request), request, carry, request.steps + 1)
+    return _steps(parts.loop, parts.batch(leaves, request), request, carry, request.instants)
 
 
 def _steps_in_calls(
     parts: Parts, request: RunRequest, leaves: list, carry: Carry, length: int
 ) -> tuple[Carry, Any]:
     """All steps, `length` of them in each call."""
-    steps = request.steps + 1
+    without_steps = request._replace(steps=0)
     recorded = []
-    for first in range(0, steps, length):
-        part = request._replace(steps=min(length, steps - first))
-        carry, records = _steps_from(parts, part, leaves, carry, np.int32(first))
+    for first in range(0, request.instants, length):
+        count = min(length, request.instants - first)
+        carry, records = _steps_from(parts, without_steps, count, leaves, carry, np.int32(first))
         jax.block_until_ready(carry)
         recorded.append(records)
     if request.record_every is None:
@@ -159,19 +162,19 @@ def _steps_in_calls(
     return carry, jax.tree.map(lambda *x: jnp.asarray(np.concatenate(x)), *recorded)
 
 
-@partial(jax.jit, static_argnums=(0, 1))
+@partial(jax.jit, static_argnums=(0, 1, 2))
 def _steps_from(
-    parts: Parts, request: RunRequest, leaves: list, carry: Carry, first: jax.Array
+    parts: Parts, request: RunRequest, count: int, leaves: list, carry: Carry, first: jax.Array
 ) -> tuple[Carry, Any]:
-    """`request.steps` steps of one run from step `first` on, by the kernel for many steps."""
+    """`count` steps from step `first` on, by the kernel for many steps."""
     loop = kernel_loop(parts.executor, first=first, short_vector=True)
-    return _steps(loop, parts.batch(leaves, request), request, carry, request.steps)
+    return _steps(loop, parts.batch(leaves, request), request, carry, count)
 
 
 def _steps(
     loop: StepLoop, batch: Batch, request: RunRequest, carry: Carry, steps: int
 ) -> tuple[Carry, Any]:
-    """Steps of the only run of a batch; the records are None where nothing is recorded."""
+    """Steps of a batch of one run; the records have no run axis, and are None if not requested."""
     carry, records = loop(TimeStep.of(request), batch, carry, steps, request.record_every)
     if request.record_every is None:
         return carry, None
@@ -189,4 +192,4 @@ def _finalize(
 @partial(jax.jit, static_argnums=(0, 1, 2))
 def _run_by_scan(structure: Any, layout: BatchLayout, request: RunRequest, leaves: list) -> Outcome:
     inputs = jax.tree.unflatten(structure, leaves)
-    return scanned(layout, inputs, None, lambda batch: run_all(scan, batch, request))
+    return run_by_scan(layout, inputs, None, lambda batch: run_all(scan, batch, request))

@@ -33,7 +33,7 @@ from iblf_jax.engine.compile import (
     first_that_works,
     inputs_of,
     nested_batch,
-    run_lowered,
+    run_by_executor,
 )
 from iblf_jax.engine.derivatives import DerivativeSizes, choose_derivatives
 from iblf_jax.engine.loops import kernel_loop, scan
@@ -80,7 +80,7 @@ def run_transformable(
         can be built.
     """
     leaves, treedef = jax.tree.flatten(inputs_of(scenario, folds, dt, request, noise))
-    backend, reason = registry.automatic()
+    backend, reason = registry.default_backend()
     compiles = request.backend != "vmap" and reason is None
     request = request._replace(constants=constants_of(scenario), backend="auto")
     runs = Runs(treedef, request, backend, (False,) * len(leaves))
@@ -262,7 +262,7 @@ def _values(runs: Runs, leaves: tuple) -> Outcome:
         return run_all(loop, batch, runs.request)
 
     executor = registry.EXECUTORS[runs.backend]
-    return run_lowered(executor, runs.batch(leaves), runs.request, run)
+    return run_by_executor(executor, runs.batch(leaves), runs.request, run)
 
 
 @partial(jax.jit, static_argnums=(0, 1))

@@ -1,4 +1,4 @@
-"""Waiting for XLA in a way that Ctrl-C ends at once."""
+"""Waits for results of XLA and responds to Ctrl-C immediately."""
 
 from __future__ import annotations
 
@@ -7,19 +7,22 @@ from typing import Any
 
 import jax
 
-RELATIVE_PAUSE, LONGEST_PAUSE = 0.02, 0.02
-"""Pause between two looks, as a part of the time waited so far, and in seconds at most."""
+RELATIVE_PAUSE = 0.02
+"""Time between two queries, relative to the time waited so far."""
+LONGEST_PAUSE = 0.02
+"""Longest time between two queries [s]."""
 
 
 def wait_until_ready(outputs: Any) -> None:
-    """Waits for arrays that XLA computes in threads of its own.
+    """Waits for arrays that XLA computes in its own threads.
 
-    JAX's own waiting sees Ctrl-C only when the arrays are there.  Here KeyboardInterrupt is raised
-    at once; XLA goes on meanwhile, which does no harm (`core.process_end`).
+    `jax.block_until_ready` raises KeyboardInterrupt only after the arrays are complete.  This
+    function raises it immediately.  XLA continues its computation, which does no harm
+    (`core.process_end`).
     """
     begin = time.monotonic()
     for array in jax.tree.leaves(outputs):
         if not isinstance(array, jax.Array) or isinstance(array, jax.core.Tracer):
-            continue  # under a transformation nothing is computed yet
+            continue  # a traced array is not being computed
         while not array.is_ready():  # type: ignore[attr-defined]
             time.sleep(min(RELATIVE_PAUSE * (time.monotonic() - begin), LONGEST_PAUSE))

@@ -84,15 +84,15 @@ def rollout_to_xarray(run: Rollout) -> xarray.Dataset:
         dims = (*batch, *own_dims(name, np.shape(value)[len(batch) :], run.n))
         label = f"metric_{name}" if name in variables else name
         unit = run.metrics.units.get(name, "1")
-        attributes = _attrs(unit, f"metric {name.replace('_', ' ')}")
-        variables[label] = (dims, np.asarray(value), attributes)
-    variables |= _verdict(run, batch)
-    varying, attributes = _parameters(run, batch)
+        attrs = _attrs(unit, f"metric {name.replace('_', ' ')}")
+        variables[label] = (dims, np.asarray(value), attrs)
+    variables |= _status_variables(run, batch)
+    varying, attrs = _parameters(run, batch)
     coordinates: dict[str, Any] = {"joint": _index("joint", run.n)}
     if len(batch) == 1:
         coordinates["run"] = _index("run", len(run))
     coordinates["time"], more = _time(run, batch)
-    return xarray.Dataset(variables | varying | more, coordinates, attributes)
+    return xarray.Dataset(variables | varying | more, coordinates, attrs)
 
 
 def save_rollouts(runs: Mapping[str, Rollout] | Rollout, path: str | os.PathLike) -> None:
@@ -196,17 +196,18 @@ def _trajectories(run: Rollout, batch: tuple[str, ...]) -> dict[str, Any]:
     return variables
 
 
-def _verdict(run: Rollout, batch: tuple[str, ...]) -> dict[str, Any]:
+def _status_variables(run: Rollout, batch: tuple[str, ...]) -> dict[str, Any]:
+    """Variables of the status, the fastest mode and the time step."""
     flags = [flag for flag in Status if flag]
     status = np.asarray(run.status)
-    attributes: dict[str, Any] = _attrs("1", "bit flags; 0 is ok")
-    attributes["flag_masks"] = np.array([int(f) for f in flags], np.int32)
-    attributes["flag_meanings"] = " ".join(f.name.lower() for f in flags if f.name)
+    attrs: dict[str, Any] = _attrs("1", "bit flags; 0 is ok")
+    attrs["flag_masks"] = np.array([int(f) for f in flags], np.int32)
+    attrs["flag_meanings"] = " ".join(f.name.lower() for f in flags if f.name)
     described = {value: describe(value) for value in np.unique(status).tolist()}
     words = np.vectorize(described.get, otypes=[str])(status)
     fastest = _attrs("1/s", "largest measured mode of the closed loop")
     return {
-        "status": (batch, status.astype(np.int32), attributes),
+        "status": (batch, status.astype(np.int32), attrs),
         "status_words": (batch, words, _attrs("1", "status in words")),
         "fastest_mode": (batch, np.asarray(run.fastest_mode), fastest),
         "dt": (batch, np.asarray(run.dt), _attrs("s", "time step")),
@@ -239,19 +240,19 @@ def _parameters(run: Rollout, batch: tuple[str, ...]) -> tuple[dict[str, Any], d
         else:
             dims = (*batch, *own_dims(p.path, first.shape, run.n))
             varying[p.path] = (dims, value, _attrs(p.unit or "1", f"parameter {p.path}"))
-    attributes = {
+    attrs = {
         "parameters": json.dumps(fixed),
         "method": run.method,
         "iblf_jax_version": version("iblf_jax"),
         "jax_version": jax.__version__,
     }
     if not batch:
-        attributes["status"] = describe(int(run.status))
+        attrs["status"] = describe(int(run.status))
         try:
-            attributes["scenario"] = scenario_to_toml(run.scenario)
+            attrs["scenario"] = scenario_to_toml(run.scenario)
         except ValueError as error:
-            attributes["scenario_not_saved"] = str(error)
-    return varying, attributes
+            attrs["scenario_not_saved"] = str(error)
+    return varying, attrs
 
 
 # --- files
@@ -267,15 +268,15 @@ def _ending(path: Path) -> str:
 def _write_netcdf(path: str | os.PathLike, data: dict[str, xarray.Dataset]) -> None:
     import xarray
 
-    attributes: dict[str, Any] = {"names": json.dumps(list(data))}
+    attrs: dict[str, Any] = {"names": json.dumps(list(data))}
     digests = {name: digest.dataset_digests(one) for name, one in data.items()}
-    attributes[DIGEST] = digest.encoded(digests)
+    attrs[DIGEST] = digest.encoded(digests)
     renamed = []
     for name, one in data.items():
-        attributes |= {f"{name}.{key}": value for key, value in one.attrs.items()}
+        attrs |= {f"{name}.{key}": value for key, value in one.attrs.items()}
         labels = {label: f"{name}.{label}" for label in (*one.variables, *one.dims)}
         renamed.append(one.drop_attrs(deep=False).rename(labels))
-    merged = xarray.merge(renamed).assign_attrs(attributes)
+    merged = xarray.merge(renamed).assign_attrs(attrs)
     merged.to_netcdf(path, engine="scipy")
 
 
@@ -288,26 +289,26 @@ def _read_netcdf(path: str | os.PathLike) -> dict[str, xarray.Dataset]:
         prefix = f"{name}."
         one = merged[[label for label in merged.variables if str(label).startswith(prefix)]]
         labels = {label: str(label).removeprefix(prefix) for label in (*one.variables, *one.dims)}
-        attributes = {
+        attrs = {
             key.removeprefix(prefix): value
             for key, value in merged.attrs.items()
             if key.startswith(prefix)
         }
-        found[name] = one.rename(labels).drop_attrs(deep=False).assign_attrs(attributes)
+        found[name] = one.rename(labels).drop_attrs(deep=False).assign_attrs(attrs)
     _verify(path, merged.attrs, found)
     return found
 
 
 def _verify(
     path: str | os.PathLike,
-    attributes: Mapping[str, Any],
+    attrs: Mapping[str, Any],
     found: Mapping[str, xarray.Dataset],
 ) -> None:
     """Raises DamagedFileError for Datasets that differ from the digest of the file.
 
     Files of older versions have no digest and are accepted.
     """
-    stored = digest.stored_in(attributes, DIGEST)
+    stored = digest.stored_in(attrs, DIGEST)
     if stored is None:
         return
     try:
@@ -335,8 +336,8 @@ def _write_npz(path: str | os.PathLike, data: dict[str, xarray.Dataset]) -> None
         variables = {}
         for label, variable in one.variables.items():
             arrays[f"{name}.{label}"] = np.asarray(variable.values)
-            attributes = {key: np.asarray(x).tolist() for key, x in variable.attrs.items()}
-            variables[str(label)] = [list(variable.dims), attributes]
+            attrs = {key: np.asarray(x).tolist() for key, x in variable.attrs.items()}
+            variables[str(label)] = [list(variable.dims), attrs]
         coordinates = [str(label) for label in one.coords]
         described[name] = {"variables": variables, "coords": coordinates, "attrs": dict(one.attrs)}
     arrays[_ATTRIBUTES] = np.array(json.dumps(described))

@@ -285,11 +285,11 @@ def from_dict(
 def _from_components(data: dict[str, Any], folder: str | os.PathLike) -> Scenario:
     known_keys(data, "", (*COMPONENTS, "preset", "parameters", "run", "dtype"))
     tables = {key: value for key, value in data.items() if key in COMPONENTS}
-    for other in ("plant", "model"):
-        if "robot" in tables and other in tables:
+    for present, absent in (("plant", "model"), ("model", "plant")):
+        if "robot" in tables and present in tables:
             came = Words("this table besides [robot]")
-            remedy = f"Rename [robot] to [{_OTHER[other]}]."
-            raise checks.fail(other, came, "only [robot], or [plant] and [model]", remedy)
+            remedy = f"Rename [robot] to [{absent}]."
+            raise checks.fail(present, came, "only [robot], or [plant] and [model]", remedy)
     if names_a_file(tables):
         tables = with_robots_read(tables, folder)
     robot = tables.pop("robot", None)
@@ -303,9 +303,6 @@ def _from_components(data: dict[str, Any], folder: str | os.PathLike) -> Scenari
     except ValueError as error:
         text = re.sub(r"^plant\b", "robot", str(error)).replace("[plant]", "[robot]")
         raise ValueError(text) from error
-
-
-_OTHER = {"plant": "model", "model": "plant"}
 
 
 def _from_preset(data: dict[str, Any]) -> Scenario:

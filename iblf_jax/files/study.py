@@ -135,20 +135,20 @@ def perturbations_of(data: dict[str, Any]) -> dict[str, Perturbation]:
 
 def _entries(data: dict[str, Any], name: str) -> dict[str, Any]:
     """Path -> entry of the table [name] of a file, which may be missing."""
-    words = {"shared", *KINDS, *distributions.MEMBERS}
+    keys_of_entries = {"shared", *KINDS, *distributions.MEMBERS}
     for member in distributions.MEMBERS:
-        words |= set(_arguments(member))
+        keys_of_entries |= set(_arguments(member))
 
     def is_entry(value: Any) -> bool:
-        """Whether a value is an entry, such as a perturbation, or a table that continues a path."""
-        if not isinstance(value, dict) or words & set(value):
+        """Whether a value is an entry; otherwise it is a table that continues a path."""
+        if not isinstance(value, dict) or keys_of_entries & set(value):
             return True
         return any(isinstance(x, str) for x in value.values())
 
     return by_path(as_table(data.get(name, {}), name), is_entry)
 
 
-def _made_by(name: str) -> Any:
+def _distribution_maker(name: str) -> Any:
     """The function that makes a distribution with its defaults; for a user's distribution, the
     class.
     """
@@ -157,7 +157,7 @@ def _made_by(name: str) -> Any:
 
 def _arguments(name: str) -> dict[str, bool]:
     """The arguments of a distribution, and whether each is required."""
-    taken = inspect.signature(_made_by(name)).parameters
+    taken = inspect.signature(_distribution_maker(name)).parameters
     return {word: argument.default is argument.empty for word, argument in taken.items()}
 
 
@@ -190,7 +190,8 @@ def _perturbation(table: Any, path: str) -> Perturbation:
                 values[word] = numbers(table[word], key)
         elif is_required:
             raise missing(key, "a number or a list of numbers", f"{name} needs it.")
-    return getattr(distributions, kind)(construct(_made_by(name), values, path), shared=shared)
+    distribution = construct(_distribution_maker(name), values, path)
+    return getattr(distributions, kind)(distribution, shared=shared)
 
 
 def _new_spelling(kind: str, old: dict[str, Any], table: dict[str, Any]) -> str:

@@ -35,10 +35,9 @@ is that of a study file (`files.study`):
     "plant.mass[1]" = { factor = "uniform", low = 0.7, high = 1.3 }
     "initial.q" = { offset = "normal", mean = 0.0, std = 0.02, shared = true }
 
-Options of solver and report that stand in [tune] itself, as in files of earlier versions, are read
-with a DeprecationWarning.  In files of earlier versions `joints` was a list of weights, which is
-now `weights`.  Floating-point numbers are still read so, and so are whole numbers that are no
-selection of joints; both with a DeprecationWarning.
+Files of earlier versions are read with a DeprecationWarning.  They have the options of solver and
+report in [tune] itself, and `joints` is the list of weights that is called `weights` now: a list of
+floating-point numbers, or of whole numbers that do not select joints, is read as weights.
 
 Every value is checked, and each error is a ValueError that names the dotted key.  A saved result is
 JSON with all its numbers in full precision; its report can be computed again.
@@ -197,12 +196,12 @@ def _parameter(entry: Any, key: str) -> Any:
     return components.construct(tunable, {"path": path, **table}, key)
 
 
-def _called(
+def _term(
     allowed: tuple[str, ...],
     entry: Any,
     key: str,
     names: tuple[str, ...],
-    besides: tuple[str, ...] = (),
+    other_keys: tuple[str, ...] = (),
 ) -> Any:
     """The objective or requirement that a table describes.
 
@@ -211,7 +210,7 @@ def _called(
       entry: the table.
       key: dotted key of the table.
       names: names of the robot's joints.
-      besides: further keys that the table may have.
+      other_keys: further keys that the table may have.
     """
     table = _with_weights(as_table(entry, key), key, names)
     checks.one_of(f"{key}.kind", table.get("kind"), allowed)
@@ -219,16 +218,16 @@ def _called(
     if function is objectives.metric and "fold" not in table:
         table = table | {"fold": _fold_of(table.get("name", Words("nothing")), f"{key}.name")}
     taken = inspect.signature(function).parameters
-    known_keys(table, key, ("kind", *besides, *taken))
+    known_keys(table, key, ("kind", *other_keys, *taken))
     for name, parameter in taken.items():
         if parameter.default is parameter.empty and name not in table:
-            expected = f"{_NO_NUMBERS.get(name, 'a number')}; {table['kind']} needs it"
+            expected = f"{_TEXT_ARGUMENTS.get(name, 'a number')}; {table['kind']} needs it"
             raise missing(f"{key}.{name}", expected)
     given = {name: _argument(name, table[name], f"{key}.{name}") for name in taken if name in table}
     return components.construct(function, given, key)
 
 
-_NO_NUMBERS = {"fold": "a metric", "name": "the name of one of its results"}
+_TEXT_ARGUMENTS = {"fold": "a metric", "name": "the name of one of its results"}
 """Argument of an objective that is not a number -> its description in words."""
 
 
@@ -262,7 +261,7 @@ def _argument(name: str, value: Any, key: str) -> Any:
     if name == "joints":
         return value  # the function checks it
     if name == "name":
-        return checks.word(key, value, _NO_NUMBERS[name])
+        return checks.word(key, value, _TEXT_ARGUMENTS[name])
     if name != "fold":
         return numbers(value, key)
     if isinstance(value, str):
@@ -290,14 +289,14 @@ def _objective(data: dict[str, Any], names: tuple[str, ...]) -> Objective:
     total = Objective()
     for i, entry in enumerate(terms):
         key = f"objective[{i}]"
-        term = _called(OBJECTIVES, entry, key, names, ("weight",))
+        term = _term(OBJECTIVES, entry, key, names, ("weight",))
         weight = numbers(entry.get("weight", 1.0), f"{key}.weight")
         total += components.construct(term.__mul__, {"weight": weight}, key)
     if not isinstance(requirements, list):
         remedy = 'Such as kind = "margin_above".'
         raise checks.fail("requirement", requirements, "[[requirement]] tables", remedy)
     for i, entry in enumerate(requirements):
-        total += _called(REQUIREMENTS, entry, f"requirement[{i}]", names)
+        total += _term(REQUIREMENTS, entry, f"requirement[{i}]", names)
     return total
 
 
@@ -375,7 +374,7 @@ def load_tuning(path: str | os.PathLike) -> TuneResult:
         raise checks.fail("path", str(place), expected) from error
     try:
         return _decoded(data)
-    except Exception as error:  # whatever is missing in it, or of another kind
+    except Exception as error:  # A missing or wrong entry raises errors of many kinds.
         found = f"{type(error).__name__}: {error}"
         raise checks.fail("path", str(place), expected, found) from error
 
@@ -387,8 +386,8 @@ def _array(entry: dict[str, Any], kinds: str) -> np.ndarray:
 
 
 def _with_new_names(table: Any) -> Any:
-    """The table of an objective in which the weights of a quantity, in earlier versions called
-    `joints`, have their name.
+    """The table of an objective with the key `weights` in place of `joints`, as earlier versions
+    called the weights of a quantity.
     """
     if isinstance(table, list):
         return [_with_new_names(x) for x in table]

@@ -1,4 +1,4 @@
-"""What this process keeps of kernels, in one object.
+"""The caches and the state of the compiler in this process, in one object.
 
 `CACHES` holds the results of functions that take long (a trace, a program, a text in C) and the
 state that belongs to the process as such: loaded libraries, functions that XLA knows by name, and
@@ -26,7 +26,7 @@ class Caches:
     def __init__(self) -> None:
         self._functions: list[Any] = []
         self.failures: dict[str, Exception] = {}
-        """Key of a kernel -> why a thread that built it in the background could not."""
+        """Key of a kernel -> the error of the thread that built it in the background."""
         self.locks: dict[str, threading.Lock] = {}
         """Key of a kernel -> the lock of the thread that builds it."""
         self.running: set[int] = set()

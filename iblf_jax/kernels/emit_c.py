@@ -36,9 +36,8 @@ from iblf_jax.kernels.program import (
 NATIVE = (("vector.h", "mathlib.h", "records.h"), ("frame.h", "driver.h"))
 CUDA = (("scalar.h", "mathlib.h", "records.h"), ("kernels.h",))
 """The headers before and after the generated functions, by target."""
-TURNS = frozenset({"sin", "cos"})
-"""Operations that `mathlib.h` has in two parts: a polynomial, and its replacement for large
-angles."""
+SINES = frozenset({"sin", "cos"})
+"""Operations that `mathlib.h` divides into a polynomial and its replacement for large angles."""
 
 
 def expression(node: Node, args: list[str], kinds: list[str]) -> str:
@@ -97,7 +96,7 @@ class _Emitter:
 
     def __init__(self, program: Program, tables: dict[str, str], calls: FunctionCalls) -> None:
         self.program = program
-        self.turns = TURNS
+        self.with_shared_test = SINES
         """Operations of which several share one test (`_sines`)."""
         self.classes = program.classes()
         self.lines: list[str] = []
@@ -137,11 +136,11 @@ class _Emitter:
         """
         nodes = self.program.nodes
         order = self.needed(names, outputs)
-        sines = [i for i in order if nodes[i].op in self.turns]
+        sines = [i for i in order if nodes[i].op in self.with_shared_test]
         for i in order:
             if i in names:
                 continue
-            if nodes[i].op in self.turns:
+            if nodes[i].op in self.with_shared_test:
                 ready = [j for j in sines if j not in names and nodes[j].args[0] in names]
                 if len(ready) > 1:
                     self._sines(ready, names, stored)
@@ -291,7 +290,7 @@ def plain_function(
     tables = dict[str, str]()
     e = _Emitter(program, tables, FunctionCalls(program, Layout.of(program)))
     e.tables = {i: f"{name}_{table}" for i, table in e.tables.items()}
-    e.turns = frozenset()  # `plain.h` has no shared test for large angles
+    e.with_shared_test = frozenset()  # `plain.h` has no shared test for large angles
     names = {
         i: inputs[node.op][node.value] for i, node in enumerate(program.nodes) if node.op in inputs
     }
@@ -480,10 +479,10 @@ def _in_place(program: Program) -> dict[int, int]:
         node = nodes[o]
         if node.op == "select" and a in node.args[1:] and not classes[node.args[0]] & PER_RUN:
             (new,) = [x for x in node.args[1:] if x != a]
-            # A call whose result is the new number has read the one before.
-            if uses[a] == 1 + (
-                nodes[new].op == "result" and nodes[nodes[new].args[0]].args.count(a)
-            ):
+            reads = 1
+            if nodes[new].op == "result":  # the call has read the number before the step
+                reads += nodes[nodes[new].args[0]].args.count(a)
+            if uses[a] == reads:
                 found[o] = a
     return found
 

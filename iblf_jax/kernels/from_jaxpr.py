@@ -30,7 +30,7 @@ INLINED = {
     "remat2": "jaxpr",
 }
 """Primitive that calls an inner function -> the parameter that holds it."""
-READ_AGAIN = 50
+MAX_REINTERPRETED = 50
 """Equations up to which an inner function is interpreted at each call: a cache would not be
 faster."""
 
@@ -59,7 +59,7 @@ def interpret(b: Builder, jaxpr: Any, consts: Sequence[Ids], inputs: Sequence[Id
         name = eqn.primitive.name
         operands = [read(v) for v in eqn.invars]
         results: Sequence[Ids | None]
-        if name == "jit" and len(eqn.params["jaxpr"].eqns) > READ_AGAIN:
+        if name == "jit" and len(eqn.params["jaxpr"].eqns) > MAX_REINTERPRETED:
             results = apply(
                 b,
                 eqn.params["jaxpr"],

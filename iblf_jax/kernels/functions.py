@@ -8,8 +8,8 @@ A branch that all runs take together, because only time decides it (the law of a
 such a function, too. It is called in steps that take it; the result is selected afterwards.
 
 A call computes the numbers that depend on the state. The caller computes what depends on leaves and
-time only, as rarely as its class permits. It also computes what not every call needs (the sample,
-which only the first stage returns), from numbers that the call returns.
+time only, as rarely as its class permits. It also computes results that only some calls use (the
+sample, which only the first stage returns), from numbers that the call returns.
 """
 
 from __future__ import annotations
@@ -146,7 +146,7 @@ def _pattern(b: Builder, operands: list[int]) -> tuple:
         if i == b.absent:
             pattern.append((node.kind, None))
         elif node.op == "const":
-            pattern.append((node.kind, _exact(node)))
+            pattern.append((node.kind, _hashable_value(node)))
         else:
             pattern.append(
                 (node.kind, first.setdefault(i, place), b.depends_on_state(i), i in b.known_finite)
@@ -154,7 +154,7 @@ def _pattern(b: Builder, operands: list[int]) -> tuple:
     return tuple(pattern)
 
 
-def _exact(constant: Node) -> Any:
+def _hashable_value(constant: Node) -> Any:
     """The value of a constant in a form that also distinguishes NaN and the sign of zero."""
     if constant.kind == "f":
         return constant.value.hex()
@@ -225,14 +225,14 @@ def _samples(program: Program, results: list[Ids], used: Uses) -> list[int]:
 
 
 @CACHES.function(maxsize=16)
-def _split(called: Called, everywhere: Uses, anywhere: Uses) -> Split:
+def _split(called: Called, used_by_all: Uses, used_by_some: Uses) -> Split:
     """Divides a function: a call computes the operations that depend on the state and that every
     caller uses.
 
     Args:
       called: the function.
-      everywhere: which results all calls use.
-      anywhere: which results some call uses.
+      used_by_all: which results all calls use.
+      used_by_some: which results some call uses.
     """
     program = _with_reciprocals(called)
     positions = _template(called).results
@@ -244,10 +244,10 @@ def _split(called: Called, everywhere: Uses, anywhere: Uses) -> Split:
             i for i in needed(nodes, outputs) if classes[i] & PER_RUN and nodes[i].op not in INPUTS
         ]
 
-    results = _samples(program, positions, everywhere)
+    results = _samples(program, positions, used_by_all)
     inside = on_state(results)
     within = set(inside)
-    read = _samples(program, positions, anywhere)
+    read = _samples(program, positions, used_by_some)
     # Numbers that the caller computes on the state read numbers of the call.
     read += [a for i in on_state(read) if i not in within for a in nodes[i].args]
     returned = list(dict.fromkeys(i for i in [*results, *read] if i in within))

@@ -17,7 +17,7 @@ from ctypes import byref, c_char_p, c_int, c_size_t, c_void_p
 from pathlib import Path
 
 from iblf_jax.kernels.caches import CACHES
-from iblf_jax.kernels.toolchain import ToolchainError, content_of, kept
+from iblf_jax.kernels.toolchain import ToolchainError, cached_file, content_of
 
 NVRTC_FLAGS = (
     "--std=c++17",
@@ -116,7 +116,7 @@ def compiled(source: str, architecture: str) -> bytes:
       ToolchainError: no NVRTC, an error from it, or an architecture that it does not know.
     """
     flags = (*NVRTC_FLAGS, f"--gpu-architecture={architecture}")
-    path, _ = kept(
+    path, _ = cached_file(
         [source, *flags, version()],
         ".cubin",
         lambda result: result.write_bytes(_compile(source, flags)),

@@ -326,10 +326,12 @@ def built(source: str, extra: tuple[str, ...] = ()) -> tuple[Path, str]:
         ):
             _run([*command, *flags, *files], "stderr", TIMEOUT)
 
-    return kept(content, ".so", compile_to)
+    return cached_file(content, ".so", compile_to)
 
 
-def kept(content: Iterable[str], suffix: str, make: Callable[[Path], object]) -> tuple[Path, str]:
+def cached_file(
+    content: Iterable[str], suffix: str, make: Callable[[Path], object]
+) -> tuple[Path, str]:
     """A file of the cache and its key; `make(path)` writes the file unless it is in the cache,
     intact and owned by this user.
 
@@ -348,7 +350,7 @@ def kept(content: Iterable[str], suffix: str, make: Callable[[Path], object]) ->
         raise ToolchainError(str(error)) from None
     path = folder / f"{key}{suffix}"
     with _made_once(key):
-        _keep(folder, path, make)
+        _make_if_missing(folder, path, make)
     return path, key
 
 
@@ -377,8 +379,8 @@ def _made_once(key: str) -> Iterator[None]:
         raise
 
 
-def _keep(folder: Path, path: Path, make: Callable[[Path], object]) -> None:
-    """Makes a file of `kept` unless it exists."""
+def _make_if_missing(folder: Path, path: Path, make: Callable[[Path], object]) -> None:
+    """Makes a file of the cache unless an intact one exists."""
     try:
         if _checked(path) is None:
             for left in folder.glob("tmp????????"):  # of version 0.1.0
@@ -443,7 +445,7 @@ def _checked(path: Path) -> bytes | None:
 
 
 def content_of(path: Path) -> bytes:
-    """The content of a file of `kept`; ToolchainError if it has been damaged since."""
+    """The content of a file of `cached_file`; ToolchainError if it has been damaged since."""
     image = _checked(path)
     if image is None:
         raise ToolchainError(f"the kernel {path} was damaged just now")

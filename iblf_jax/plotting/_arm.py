@@ -39,7 +39,7 @@ class Motion:
 
 
 @dataclass(frozen=True, eq=False)
-class World:
+class Target:
     """Reference and bounds of the first run at the times of the frames."""
 
     t: np.ndarray
@@ -67,7 +67,7 @@ def _fans(robot: Any, q: jax.Array, lower: jax.Array, upper: jax.Array) -> jax.A
     return jnp.concatenate([centre, centre + FAN_RADIUS * links, centre], axis=1)
 
 
-def motions_of(curves: Sequence[Curve], t: np.ndarray) -> tuple[World, list[Motion]]:
+def motions_of(curves: Sequence[Curve], t: np.ndarray) -> tuple[Target, list[Motion]]:
     """The runs at the times t [s] of the frames, (F,).
 
     Raises:
@@ -87,7 +87,7 @@ def motions_of(curves: Sequence[Curve], t: np.ndarray) -> tuple[World, list[Moti
     q_d, lower, upper = (first.at(field, t) for field in ("q_d", "lower", "upper"))
     desired = skeletons(robot, q_d)
     fans = jax.jit(jax.vmap(lambda *args: _fans(robot, *args)))(motions[0].q, lower, upper)
-    return World(t, q_d, lower, upper, desired, np.asarray(fans)), motions
+    return Target(t, q_d, lower, upper, desired, np.asarray(fans)), motions
 
 
 def _set_points(line: Any, points: np.ndarray) -> None:
@@ -101,19 +101,19 @@ def _set_points(line: Any, points: np.ndarray) -> None:
 class Scene:
     """The figure of an animation; `move_to(frame)` moves its parts to their places."""
 
-    def __init__(self, curves: Sequence[Curve], world: World, motions: Sequence[Motion]) -> None:
-        self.world = world
+    def __init__(self, curves: Sequence[Curve], target: Target, motions: Sequence[Motion]) -> None:
+        self.target = target
         self.motions = motions
         self.figure = _style.new_figure(6.4, 3.8)
         grid = self.figure.add_gridspec(1, 2, width_ratios=(1.7, 1))
-        self.dimensions = world.desired.shape[-1]
+        self.dimensions = target.desired.shape[-1]
         projection = "3d" if self.dimensions == 3 else None
         self.arm: Any = self.figure.add_subplot(grid[0], projection=projection)
         self.bars: Any = self.figure.add_subplot(grid[1])
         self.parts: list[tuple[Any, Artist]] = []
 
         self.dots: list[Any] = []
-        points = np.concatenate([world.desired, *(motion.skeleton for motion in motions)])
+        points = np.concatenate([target.desired, *(motion.skeleton for motion in motions)])
         scenario = curves[0].run.scenario
         limits = set_limits(self.arm, points, scenario.regions)
         draw_boundaries(self.arm, scenario.plant, scenario.regions, limits)
@@ -144,27 +144,27 @@ class Scene:
         return self._animated(area)
 
     def _add_fans(self) -> None:
-        self.fans = [self._fan() for _ in range(self.world.q_d.shape[1])]
+        self.fans = [self._fan() for _ in range(self.target.q_d.shape[1])]
         self.fans[0].set_label("joint limits")
 
     def _add_arms(self, curves: Sequence[Curve]) -> None:
         path = {"linewidth": 0.8, "color": _style.blend(0.533)}
-        self.arm.plot(*self.world.desired[:, -1].T, **(_style.reference() | path))
-        look: dict[str, Any] = {"linewidth": 1.6, "marker": "o", "markersize": 4}
-        look |= {"color": _style.blend(0.4), "markerfacecolor": _style.background()}
-        self.reference = self._line(self.arm, label="reference", **look)
+        self.arm.plot(*self.target.desired[:, -1].T, **(_style.reference() | path))
+        style: dict[str, Any] = {"linewidth": 1.6, "marker": "o", "markersize": 4}
+        style |= {"color": _style.blend(0.4), "markerfacecolor": _style.background()}
+        self.reference = self._line(self.arm, label="reference", **style)
         self.trails = [
             self._line(self.arm, color=_style.colour(i), linewidth=0.9) for i in range(len(curves))
         ]
-        look = {"linewidth": 2.6, "marker": "o", "markersize": 5}
+        style = {"linewidth": 2.6, "marker": "o", "markersize": 5}
         self.arms = [
-            self._line(self.arm, label=curve.name or "arm", **look, **_style.series(i))
+            self._line(self.arm, label=curve.name or "arm", **style, **_style.series(i))
             for i, curve in enumerate(curves)
         ]
 
     def _add_bars(self, curves: Sequence[Curve]) -> None:
-        rows = np.arange(self.world.q_d.shape[1])
-        shown = np.stack([self.world.lower, self.world.upper, self.world.q_d])
+        rows = np.arange(self.target.q_d.shape[1])
+        shown = np.stack([self.target.lower, self.target.upper, self.target.q_d])
         shown = shown[np.isfinite(shown)]
         room = 0.15 * float(np.ptp(shown))
         self.bars.set(
@@ -180,35 +180,35 @@ class Scene:
             self._line(self.bars, color=_style.blend(0.149), linewidth=width, solid_capstyle="butt")
             for _ in rows
         ]
-        look: dict[str, Any] = {"linestyle": "none", "marker": "|", "markersize": width + 3}
-        look |= {"color": _style.text_colour(), "markeredgewidth": 1.6}
-        self.desired = self._line(self.bars, **look)
+        style: dict[str, Any] = {"linestyle": "none", "marker": "|", "markersize": width + 3}
+        style |= {"color": _style.text_colour(), "markeredgewidth": 1.6}
+        self.desired = self._line(self.bars, **style)
         for i in range(len(curves)):
-            look = {"linestyle": "none", "marker": "oDs^v"[i % 5], "color": _style.colour(i)}
-            look["markersize"] = max(3.0, min(5.5, width / len(curves)))
-            self.dots.append(self._line(self.bars, **look))
+            style = {"linestyle": "none", "marker": "oDs^v"[i % 5], "color": _style.colour(i)}
+            style["markersize"] = max(3.0, min(5.5, width / len(curves)))
+            self.dots.append(self._line(self.bars, **style))
 
     def move_to(self, frame: int) -> list[tuple[Any, Artist]]:
         """Moves every part to its place in a frame; returns (axes, part) in the order of
         drawing.
         """
-        world = self.world
-        rows = np.arange(world.q_d.shape[1])
+        target = self.target
+        rows = np.arange(target.q_d.shape[1])
         for joint, fan in enumerate(self.fans):
-            outline = world.fans[frame, joint]
+            outline = target.fans[frame, joint]
             if self.dimensions == 2:
                 fan.set_xy(outline)
             else:
                 _set_points(fan, outline)
-            ends = [world.lower[frame, joint], world.upper[frame, joint]]
+            ends = [target.lower[frame, joint], target.upper[frame, joint]]
             self.ranges[joint].set_data(ends, [joint, joint])
-        _set_points(self.reference, world.desired[frame])
-        self.desired.set_data(world.q_d[frame], rows)
+        _set_points(self.reference, target.desired[frame])
+        self.desired.set_data(target.q_d[frame], rows)
         middle = 0.5 * (len(self.motions) - 1)
         for i, motion in enumerate(self.motions):
             _set_points(self.arms[i], motion.skeleton[frame])
             _set_points(self.trails[i], motion.skeleton[: frame + 1, -1])
             q = np.clip(motion.q[frame], *self.bars.get_xlim())
             self.dots[i].set_data(q, rows + 0.14 * (i - middle))
-        self.time.set_text(f"t = {world.t[frame]:.2f} s")
+        self.time.set_text(f"t = {target.t[frame]:.2f} s")
         return self.parts

@@ -186,7 +186,7 @@ def _valid_samples(run: Rollout) -> int:
 def check_class(argument: str, value: Any, cls: type, remedy: str) -> None:
     """Raises ValueError if the value is not an object of this class."""
     if not isinstance(value, cls):
-        raise checks.fail(argument, type(value).__name__, f"a {cls.__name__}", remedy)
+        raise checks.fail(argument, type(value).__name__, checks.with_article(cls.__name__), remedy)
 
 
 def _checked(name: str, run: Any, argument: str) -> Curve:

@@ -316,14 +316,14 @@ def draw_phase_portrait(axes: Axes, curves: Sequence[Curve], joints: tuple[int, 
     """Draws one joint's position against another's, with reference and starts; limits follow the
     reference and the successful runs.
     """
-    frame = []
+    shown = []
     for i, curve in enumerate(distinct(curves, ["q_d"], joints)):
         path = curve["q_d"][:, joints]
-        look = _style.reference() | {"zorder": 3, "label": "reference $q_d$"}
+        style = _style.reference() | {"zorder": 3, "label": "reference $q_d$"}
         if i > 0:
-            look |= {"color": _style.colour(curves.index(curve)), "alpha": 0.6}
-        axes.plot(*path.T, **look)
-        frame.append(path)
+            style |= {"color": _style.colour(curves.index(curve)), "alpha": 0.6}
+        axes.plot(*path.T, **style)
+        shown.append(path)
     starts = np.stack([curve["q"][0, joints] for curve in curves])
     dots: dict[str, Any] = {"marker": "o", "markersize": 6, "linestyle": "none", "zorder": 4}
     dots |= {"color": _style.text_colour(), "markerfacecolor": _style.background()}
@@ -334,8 +334,8 @@ def draw_phase_portrait(axes: Axes, curves: Sequence[Curve], joints: tuple[int, 
         axes.plot(*thin.T, label=curve.name or "$q$", **run_style(curves, i))
         if curve.failed:
             path = path[:1]
-        frame.append(path)
-    points = np.concatenate(frame)
+        shown.append(path)
+    points = np.concatenate(shown)
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):
         points = np.zeros((1, 2))
@@ -343,8 +343,8 @@ def draw_phase_portrait(axes: Axes, curves: Sequence[Curve], joints: tuple[int, 
     half = 0.55 * max(float(np.max(high - low)), 1e-3)
     middle = 0.5 * (low + high)
     for axis, joint, centre in zip("xy", joints, middle, strict=True):
-        words = _style.label(f"position of {curves[0].joint_label(joint)}", "rad")
-        axes.set(**{f"{axis}lim": (centre - half, centre + half), f"{axis}label": words})
+        text = _style.label(f"position of {curves[0].joint_label(joint)}", "rad")
+        axes.set(**{f"{axis}lim": (centre - half, centre + half), f"{axis}label": text})
     axes.set_aspect("equal")
 
 
@@ -404,10 +404,10 @@ def velocity_portrait(runs: Runs, joint: int = 0) -> Figure:
         path = (curve["q_d"][:, joint], curve["dq_d"][:, joint])
         axes.plot(*path, **_style.reference(), label="reference")
     for i, curve in enumerate(curves):
-        look = run_style(curves, i)
+        style = run_style(curves, i)
         q, dq = curve["q"][:, joint], curve["dq"][:, joint]
-        axes.plot(q, dq, label=curve.name or "run", **look)
-        axes.plot(q[0], dq[0], marker="o", color=look["color"], linestyle="none", label="_")
+        axes.plot(q, dq, label=curve.name or "run", **style)
+        axes.plot(q[0], dq[0], marker="o", color=style["color"], linestyle="none", label="_")
     axes.set_xlabel(_style.label(f"position of {curves[0].joint_label(joint)}", "rad"))
     axes.set_ylabel(_style.label(r"velocity $\dot q$", "rad/s"))
     _style.set_title(figure, "Velocity against position", curves)
@@ -430,12 +430,12 @@ def _draw_box(axes: Axes, curve: Curve, joint: int) -> None:
     if not np.allclose(first, reached, equal_nan=True):
         boxes.append((reached, ":", "_"))
     for (x0, x1, y0, y1), line, label in boxes:
-        look: dict[str, Any] = {"color": _style.bound(), "linewidth": 1.0, "linestyle": line}
+        style: dict[str, Any] = {"color": _style.bound(), "linewidth": 1.0, "linestyle": line}
         if curve.has_speed_limits:
-            axes.plot([x0, x1, x1, x0, x0], [y0, y0, y1, y1, y0], label=label, **look)
+            axes.plot([x0, x1, x1, x0, x0], [y0, y0, y1, y1, y0], label=label, **style)
         else:
-            axes.axvline(x0, label=label, **look)
-            axes.axvline(x1, **look)
+            axes.axvline(x0, label=label, **style)
+            axes.axvline(x1, **style)
 
 
 def paper_figures(runs: Runs, *, zoom: float | None = None) -> dict[str, Figure]:

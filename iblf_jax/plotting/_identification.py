@@ -66,14 +66,14 @@ def _numbers(axes: Axes, known: Identification) -> None:
             axes.text(1.01, i, number.verdict, color=colour, **beside)
             continue
         colour = _style.colour(0)
-        words = f"{number.digits} $\\pm$ {number.error:.2g} {number.unit}"
+        text = f"{number.digits} $\\pm$ {number.error:.2g} {number.unit}"
         if number.verdict == "biased":
             colour = _style.failure()
-            words += ", biased"
+            text += ", biased"
         change = (number.value - number.start) / scale
         error = 3.0 * number.error / scale
         axes.errorbar(change, i, xerr=error, fmt="o", markersize=3.5, capsize=2, color=colour)
-        axes.text(1.01, i, words, **beside)
+        axes.text(1.01, i, text, **beside)
     axes.axvline(0.0, color=_style.bound(), linewidth=0.8)
     axes.set_yticks(
         range(len(chosen)), [escaped(number.name) for number in chosen], fontsize=_style.size(7)

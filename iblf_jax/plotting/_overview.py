@@ -21,7 +21,7 @@ from iblf_jax.plotting._panels import (
     Window,
     annotate_clipped_peak,
     draw,
-    draw_frame,
+    draw_bounds,
     set_limits,
     show,
 )
@@ -112,18 +112,18 @@ def _together(figure: Figure, where: SubplotSpec, curve: Curve, window: Window) 
 
 def _joints(axes: Axes, curve: Curve, quantity: PanelQuantity, window: Window) -> None:
     """One quantity of all joints, each in its own colour."""
-    frame = []
+    bounds = []
     if quantity.field == "xi":  # The bounds of e1 differ between joints; those of xi do not.
-        frame = draw_frame(axes, curve, quantity, 0, window, label="_")
+        bounds = draw_bounds(axes, curve, quantity, 0, window, label="_")
     drawn = []
     for joint in range(curve.run.n):
-        look = _style.series(joint)
+        style = _style.series(joint)
         if quantity.truth:
-            broad: dict[str, Any] = {"color": look["color"], "linewidth": 4.0, "alpha": 0.3}
+            broad: dict[str, Any] = {"color": style["color"], "linewidth": 4.0, "alpha": 0.3}
             drawn.append(draw(axes, curve, quantity.truth, joint, window, label="_", **broad))
-        look["label"] = curve.joint_label(joint)
-        drawn.append(draw(axes, curve, quantity.field, joint, window, **look))
-    set_limits(axes, [curve] * len(drawn), drawn, frame, spikes=quantity.unit == "N m")
+        style["label"] = curve.joint_label(joint)
+        drawn.append(draw(axes, curve, quantity.field, joint, window, **style))
+    set_limits(axes, [curve] * len(drawn), drawn, bounds, spikes=quantity.unit == "N m")
     annotate_clipped_peak(axes, [curve] * len(drawn), drawn, quantity.unit)
     axes.set_ylabel(quantity.label)
     if quantity.truth:

@@ -40,15 +40,15 @@ class PanelQuantity:
 
     field: str
     """The signal of the run."""
-    words: str
+    name: str
     symbol: str
     unit: str
-    frame: tuple[str, str] | None = None
+    bounds: tuple[str, str] | None = None
     """The signals that bound it."""
-    frame_words: str = ""
+    bounds_label: str = "bounds"
     guide: str | None = None
     """The signal that the quantity should follow; it is drawn once for all runs."""
-    guide_words: str = ""
+    guide_label: str = ""
     truth: str | None = None
     """The signal that the quantity estimates.  It is drawn as a broad pale line under them, and
     only once if it is the same in all runs."""
@@ -60,7 +60,7 @@ class PanelQuantity:
     @property
     def label(self) -> str:
         """The label of the axis."""
-        return label(f"{self.words} {self.symbol}", self.unit)
+        return label(f"{self.name} {self.symbol}", self.unit)
 
 
 QUANTITIES = {
@@ -71,21 +71,20 @@ QUANTITIES = {
             "position",
             "$q$",
             "rad",
-            ("lower", "upper"),
-            "bounds",
-            "q_d",
-            "reference $q_d$",
+            bounds=("lower", "upper"),
+            guide="q_d",
+            guide_label="reference $q_d$",
             measured="measured_q",
             transient="e1",
         ),
-        PanelQuantity("e1", "error", "$e_1$", "rad", ("error_lower", "error_upper"), "bounds"),
+        PanelQuantity("e1", "error", "$e_1$", "rad", bounds=("error_lower", "error_upper")),
         PanelQuantity(
             "xi",
             "relative error",
             r"$\xi$",
             "1",
-            ("xi_lower", "xi_upper"),
-            r"bounds $\xi = \pm 1$",
+            bounds=("xi_lower", "xi_upper"),
+            bounds_label=r"bounds $\xi = \pm 1$",
         ),
         PanelQuantity("e2", "error", "$e_2$", "rad/s"),
         PanelQuantity(
@@ -93,14 +92,13 @@ QUANTITIES = {
             "velocity",
             r"$\dot q$",
             "rad/s",
-            ("dq_lower", "dq_upper"),
-            "bounds",
-            "dq_d",
-            r"reference $\dot q_d$",
+            bounds=("dq_lower", "dq_upper"),
+            guide="dq_d",
+            guide_label=r"reference $\dot q_d$",
             measured="measured_dq",
         ),
         PanelQuantity(
-            "region_margin", "distance", "$h$", "m", guide="region_boundary", guide_words="boundary"
+            "region_margin", "distance", "$h$", "m", guide="region_boundary", guide_label="boundary"
         ),
         PanelQuantity("tau", "torque", r"$\tau$", "N m"),
         PanelQuantity(
@@ -132,20 +130,22 @@ def draw(
     return y[in_window]
 
 
-def draw_frame(
+def draw_bounds(
     axes: Axes, curve: Curve, quantity: PanelQuantity, joint: int, window: Window, **options: Any
 ) -> list[np.ndarray]:
     """Draws the bounds of a quantity as grey lines with a pale band between them; returns them."""
-    if quantity.frame is None or np.isnan(curve[quantity.frame[0]]).all():
+    if quantity.bounds is None or np.isnan(curve[quantity.bounds[0]]).all():
         return []
-    look = {"color": _style.bound(), "linewidth": 1.0, "zorder": 1.8} | options
-    look.setdefault("label", quantity.frame_words)
-    lower, upper = (curve[field][:, joint] for field in quantity.frame)
+    style = {"color": _style.bound(), "linewidth": 1.0, "zorder": 1.8} | options
+    style.setdefault("label", quantity.bounds_label)
+    low_field, high_field = quantity.bounds
+    lower, upper = curve[low_field][:, joint], curve[high_field][:, joint]
     step = max(1, len(curve.t) // 500)
     band = (curve.t[::step], lower[::step], upper[::step])
     axes.fill_between(*band, color=_style.tube(), linewidth=0, zorder=0)
-    drawn = [draw(axes, curve, quantity.frame[0], joint, window, **look)]
-    return [*drawn, draw(axes, curve, quantity.frame[1], joint, window, **(look | {"label": "_"}))]
+    drawn_lower = draw(axes, curve, low_field, joint, window, **style)
+    style["label"] = "_"
+    return [drawn_lower, draw(axes, curve, high_field, joint, window, **style)]
 
 
 def _span(arrays: Iterable[np.ndarray]) -> tuple[float, float] | None:
@@ -185,7 +185,7 @@ def set_limits(
     axes: Axes,
     curves: Sequence[Curve],
     drawn: Sequence[np.ndarray],
-    frame: Sequence[np.ndarray],
+    always_shown: Sequence[np.ndarray],
     *,
     spikes: bool = False,
 ) -> None:
@@ -198,7 +198,7 @@ def set_limits(
       axes: the panel.
       curves: the runs, in the order of `drawn`.
       drawn: the drawn samples of each run.
-      frame: bounds and reference; empty if there are none.
+      always_shown: bounds and reference; empty if there are none.
       spikes: clip short peaks.
     """
     successful, failed = [], []
@@ -210,7 +210,7 @@ def set_limits(
         else:
             successful.append(y)
     low, high = _span([*successful, *failed]) or (-1.0, 1.0)
-    near = [y[(y > low - FARTHEST_BOUND) & (y < high + FARTHEST_BOUND)] for y in frame]
+    near = [y[(y > low - FARTHEST_BOUND) & (y < high + FARTHEST_BOUND)] for y in always_shown]
     base = _span(near) or _span(successful)
     if base:
         room = 0.4 * (base[1] - base[0])
@@ -250,10 +250,10 @@ def _mark_break(axes: Axes, curve: Curve, y: np.ndarray, window: Window) -> None
     """Marks with a cross where a run failed, at the edge of the panel if the sample is outside."""
     index = curve.break_index()
     if index is not None and window[0] <= curve.t[index] <= window[1] and np.isfinite(y[index]):
-        look: dict[str, Any] = {"marker": "x", "markersize": 7, "markeredgewidth": 2}
-        look |= {"linestyle": "none", "zorder": 5, "clip_on": False}
+        style: dict[str, Any] = {"marker": "x", "markersize": 7, "markeredgewidth": 2}
+        style |= {"linestyle": "none", "zorder": 5, "clip_on": False}
         height = np.clip(y[index], *axes.get_ylim())
-        axes.plot(curve.t[index], height, color=_style.failure(), **look)
+        axes.plot(curve.t[index], height, color=_style.failure(), **style)
 
 
 def _draw_bounds_and_guide(
@@ -262,17 +262,17 @@ def _draw_bounds_and_guide(
     """Draws bounds and guide, once for all runs that share them; returns the samples of the two."""
     bounds: list = []
     guides: list = []
-    fields = [field for field in (*(quantity.frame or ()), quantity.guide) if field]
+    fields = [field for field in (*(quantity.bounds or ()), quantity.guide) if field]
     if not fields:
         return bounds, guides
     for i, curve in enumerate(distinct(curves, fields, [joint])):
         own: dict[str, Any] = {}
         if i > 0:
             own = {"color": series(curves.index(curve))["color"], "alpha": 0.6}
-        bounds += draw_frame(axes, curve, quantity, joint, window, **own)
+        bounds += draw_bounds(axes, curve, quantity, joint, window, **own)
         if quantity.guide:
-            look = _style.reference() | {"zorder": 3, "label": quantity.guide_words} | own
-            guides.append(draw(axes, curve, quantity.guide, joint, window, **look))
+            style = _style.reference() | {"zorder": 3, "label": quantity.guide_label} | own
+            guides.append(draw(axes, curve, quantity.guide, joint, window, **style))
     return bounds, guides
 
 
@@ -285,11 +285,11 @@ def _draw_truth(
     several = distinct(curves, [quantity.truth], [joint])
     drawn = []
     for curve in several:
-        look = _style.underlay() | {"label": quantity.symbol}
+        style = _style.underlay() | {"label": quantity.symbol}
         if len(several) > 1:
-            look |= {"color": series(curves.index(curve))["color"], "alpha": 0.3}
-            look["label"] = f"{curve.name} {quantity.symbol}"
-        drawn.append((curve, draw(axes, curve, quantity.truth, joint, window, **look)))
+            style |= {"color": series(curves.index(curve))["color"], "alpha": 0.3}
+            style["label"] = f"{curve.name} {quantity.symbol}"
+        drawn.append((curve, draw(axes, curve, quantity.truth, joint, window, **style)))
     return drawn
 
 
@@ -300,10 +300,10 @@ def _draw_measured(
     drawn = []
     for i, curve in enumerate(curves):
         if quantity.measured and curve.is_measured:
-            look: dict[str, Any] = {"label": f"{curve.name} measured".strip()}
-            look |= {"color": _style.blend(0.45, series(i)["color"])}
-            look |= {"linewidth": 0.8, "zorder": 1.9}
-            drawn.append((curve, draw(axes, curve, quantity.measured, joint, window, **look)))
+            style: dict[str, Any] = {"label": f"{curve.name} measured".strip()}
+            style |= {"color": _style.blend(0.45, series(i)["color"])}
+            style |= {"linewidth": 0.8, "zorder": 1.9}
+            drawn.append((curve, draw(axes, curve, quantity.measured, joint, window, **style)))
     return drawn
 
 
@@ -330,18 +330,18 @@ def show(
     drawn = _draw_truth(axes, curves, quantity, joint, window)
     drawn += _draw_measured(axes, curves, quantity, joint, window)
     for i, curve in enumerate(curves):
-        look = run_style(curves, i)
-        look["label"] = _run_label(curve, quantity)
-        drawn.append((curve, draw(axes, curve, quantity.field, joint, window, **look)))
+        style = run_style(curves, i)
+        style["label"] = _run_label(curve, quantity)
+        drawn.append((curve, draw(axes, curve, quantity.field, joint, window, **style)))
     axes.set_xlim(*window)
     owners = [curve for curve, _ in drawn]
     samples = [y for _, y in drawn]
-    frame = guides + bounds
-    if tight:
-        frame = guides + [y for curve, y in drawn if not curve.failed]
-    if not bounds:
-        frame = []
-    set_limits(axes, owners, samples, frame)
+    always_shown: list = []
+    if bounds and tight:
+        always_shown = guides + [y for curve, y in drawn if not curve.failed]
+    elif bounds:
+        always_shown = guides + bounds
+    set_limits(axes, owners, samples, always_shown)
     if not tight:
         annotate_clipped_peak(axes, owners, samples, quantity.unit)
     for curve in curves:

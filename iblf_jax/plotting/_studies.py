@@ -31,7 +31,7 @@ def _check(study: Study) -> None:
     check_class("study", study, Study, "ij.monte_carlo returns one.")
 
 
-def _verdict(study: Study) -> str:
+def _failure_summary(study: Study) -> str:
     text = (
         f"{study.runs} runs, {len(study.failed)} failed; bound violated or diverged:"
         f" {study.violation_probability}"
@@ -111,9 +111,9 @@ def _draw_bands(axes: Axes, data: xarray.Dataset, joint: int, study: Study) -> N
     order = np.argsort(levels)
     for k in range(len(levels) // 2):
         low, high = order[k], order[-1 - k]
-        words = f"{100 * levels[low]:g} to {100 * levels[high]:g} %"
+        band = f"{100 * levels[low]:g} to {100 * levels[high]:g} %"
         axes.fill_between(
-            t, q[low], q[high], color=_style.colour(0), alpha=0.25, linewidth=0, label=words
+            t, q[low], q[high], color=_style.colour(0), alpha=0.25, linewidth=0, label=band
         )
         for edge in (q[low], q[high]):
             axes.plot(t, edge, color=_style.colour(0), linewidth=0.6, label="_")
@@ -157,7 +157,7 @@ def histograms(study: Study, metrics: Sequence[str] | None = None, *, bins: int 
     figure, panels = _grid(len(values), 2.0)
     for axes, (name, x) in zip(panels, values.items(), strict=True):
         _draw_histogram(axes, study, name, x, checks.positive_integer("bins", bins, most=10_000))
-    _style.set_heading(figure, [_verdict(study)])
+    _style.set_heading(figure, [_failure_summary(study)])
     _style.legend_below(figure)
     return figure
 
@@ -173,9 +173,9 @@ def _draw_histogram(axes: Axes, study: Study, name: str, x: np.ndarray, bins: in
     if finite.any():
         edges = np.histogram_bin_edges(x[finite].astype(float), bins).tolist()
         axes.hist(x[finite & ~failed], edges, label="not failed", alpha=0.8, color=_style.colour(0))
-        look: dict[str, Any] = {"alpha": 0.8, "color": _style.colour(1), "linewidth": 0}
-        look |= {"hatch": "////", "edgecolor": _style.background()}
-        axes.hist(x[finite & failed], edges, label="failed", **look)
+        style: dict[str, Any] = {"alpha": 0.8, "color": _style.colour(1), "linewidth": 0}
+        style |= {"hatch": "////", "edgecolor": _style.background()}
+        axes.hist(x[finite & failed], edges, label="failed", **style)
     if not finite.all():
         axes.set_title(f"{int((~finite).sum())} runs without a value")
     axes.set_xlabel(_style.label(name.replace("_", " "), study.metrics.units.get(name, "1")))
@@ -202,7 +202,7 @@ def scatter(study: Study, metric: str = "margin") -> Figure:
     figure, panels = _grid(len(drawn), 2.2)
     for axes, (path, x) in zip(panels, drawn.items(), strict=True):
         _draw_scatter(axes, study, metric, path, x)
-    _style.set_heading(figure, [_verdict(study)])
+    _style.set_heading(figure, [_failure_summary(study)])
     _style.legend_below(figure)
     return figure
 
@@ -255,6 +255,6 @@ def study_overview(study: Study, *, runs: int = 512) -> Figure:
     _draw_histogram(panels[n], study, "margin", margins, 40)
     for axes, (path, x) in zip(panels[n + 1 :], drawn.items(), strict=True):
         _draw_scatter(axes, study, "margin", path, x)
-    _style.set_heading(figure, [_verdict(study), f"bands: {_bands_title(data).lower()}"])
+    _style.set_heading(figure, [_failure_summary(study), f"bands: {_bands_title(data).lower()}"])
     _style.legend_below(figure, 6)
     return figure

@@ -286,9 +286,9 @@ def colour_map(name: str) -> str:
 # --- labels and layout
 
 
-def label(words: str, unit: str) -> str:
+def label(name: str, unit: str) -> str:
     """An axis label: the quantity, and its unit in brackets."""
-    return f"{words} [{unit}]"
+    return f"{name} [{unit}]"
 
 
 def time_axis(axes: Axes, window: tuple[float, float] | None = None) -> None:
@@ -303,11 +303,11 @@ PIECES = re.compile(r"\\.|\$[^$]*\$|(?:[^\s._\]$\\]|\.(?=\d))+[\s._\]]*|[\s._\]]
 separators that follow them."""
 
 
-def wrapped(words: str, room: int) -> str:
+def wrapped(label: str, room: int) -> str:
     """A label on lines of about `room` characters; it breaks at spaces, in paths after a dot,
     bracket or underscore, and not in a unit.
     """
-    found: Any = re.fullmatch(r"(.*?)( \[[^\[\]]*\])?", words, re.DOTALL)
+    found: Any = re.fullmatch(r"(.*?)( \[[^\[\]]*\])?", label, re.DOTALL)
     text, unit = found.groups("")
     lines = [""]
     for part in [*PIECES.findall(text), unit]:
@@ -321,12 +321,12 @@ def wrapped(words: str, room: int) -> str:
     return "\n".join(line.strip() for line in lines)
 
 
-def set_title(figure: Figure, words: str, curves: Sequence[Curve], *, always: bool = False) -> None:
+def set_title(figure: Figure, title: str, curves: Sequence[Curve], *, always: bool = False) -> None:
     """Sets the title of a figure, with the status of the runs that have a flag.
 
     Args:
       figure: the figure.
-      words: the first line.
+      title: the first line.
       curves: the runs; those with the same status share a line.
       always: state the status of the other runs too.
     """
@@ -334,7 +334,7 @@ def set_title(figure: Figure, words: str, curves: Sequence[Curve], *, always: bo
     for curve in curves:
         if always or not curve.run.ok:
             named.setdefault(curve.status, []).append(curve.name or "status")
-    lines = [words, *(f"{', '.join(names)}: {status}" for status, names in named.items())]
+    lines = [title, *(f"{', '.join(names)}: {status}" for status, names in named.items())]
     colour = text_colour()
     if any(curve.failed for curve in curves):
         colour = failure()
@@ -371,10 +371,10 @@ def legend_below(figure: Figure, columns: int = 5, of: Sequence[Axes] | None = N
 
 def name_ticks(axes: Axes, names: Sequence[str], room: int) -> None:
     """Names the horizontal ticks; rotates the names if they need more than `room` characters."""
-    look: dict[str, Any] = {}
+    style: dict[str, Any] = {}
     if max(map(len, names)) * len(names) > room:
-        look = {"rotation": 40, "ha": "right"}
-    axes.set_xticks(range(len(names)), names, **look)
+        style = {"rotation": 40, "ha": "right"}
+    axes.set_xticks(range(len(names)), names, **style)
 
 
 def panel_rows(
@@ -406,5 +406,6 @@ def panel_rows(
 
 def row_sizes(count: int, most: int) -> list[int]:
     """Number of panels in each row, at most `most`; the fuller rows first."""
-    rows = -(-count // most)
-    return [count // rows + (r < count % rows) for r in range(rows)]
+    rows = math.ceil(count / most)
+    size, remainder = divmod(count, rows)
+    return [size + 1] * remainder + [size] * (rows - remainder)

@@ -46,23 +46,23 @@ def summary(data: xarray.Dataset, metric: str) -> tuple[xarray.DataArray, str]:
         remedy = "ij.sweep and ij.load_sweep return one."
         raise checks.fail("data", type(data).__name__, "the Dataset of a sweep", remedy)
     if metric in SHARES:
-        flags, words = SHARES[metric]
+        flags, label = SHARES[metric]
         values = ((data.status & flags) != 0).astype(float).where(data.status >= 0)
         if "run" in values.dims:
             values = values.mean("run")
-        return values, words
+        return values, label
     if metric not in data.data_vars:
         raise checks.fail("metric", metric, f"one of {', '.join([*SHARES, *data.data_vars])}")
     values = data[metric]
-    words = metric.replace("_", " ")
+    label = metric.replace("_", " ")
     unit = values.attrs.get("units", "1")
     if "joint" in values.dims:
         values = values.min("joint") if metric in SMALLER_IS_WORSE else values.max("joint")
-        words = f"{words} of the worst joint"
+        label = f"{label} of the worst joint"
     if "run" in values.dims:
         values = values.median("run")
-        words = f"median {words}"
-    return values, f"{words} [{unit}]"
+        label = f"median {label}"
+    return values, f"{label} [{unit}]"
 
 
 def _axis_label(data: xarray.Dataset, name: str) -> str:
@@ -123,7 +123,7 @@ def _draw_heat_map(
     at: dict[str, Any],
 ) -> None:
     """One panel of a heat map."""
-    values, words = summary(data, metric)
+    values, label = summary(data, metric)
     for name, value in at.items():
         if name not in values.dims:
             raise checks.fail("dimension", name, "one of " + ", ".join(map(str, values.dims)))
@@ -143,7 +143,7 @@ def _draw_heat_map(
         _ticks(axis, np.asarray(data[name].values))
     axes.set_xlabel(_axis_label(data, x))
     axes.set_ylabel(_axis_label(data, y))
-    figure.colorbar(image, ax=axes, label=words)
+    figure.colorbar(image, ax=axes, label=label)
     if picture.size <= 150:
         _write_numbers(axes, picture, image)
 
@@ -178,9 +178,9 @@ def parallel(data: xarray.Dataset, metric: str = "margin") -> Figure:
     Raises:
       ValueError: not the Dataset of a sweep, or an unknown metric.
     """
-    values, words = summary(data, metric)
+    values, label = summary(data, metric)
     columns = _columns(data, values)
-    columns[words] = np.ravel(values.values)
+    columns[label] = np.ravel(values.values)
     raw = np.stack(list(columns.values()), -1)
     raw = raw[np.isfinite(raw).all(1)]
     if not len(raw):
@@ -202,7 +202,7 @@ def parallel(data: xarray.Dataset, metric: str = "margin") -> Figure:
         axes.text(place, -0.02, f"{bottom:.4g}", va="top", **small)
         axes.text(place, 1.02, f"{top:.4g}", va="bottom", **small)
     axes.set_ylim(-0.1, 1.1)
-    figure.colorbar(mapper, ax=axes, label=words)
+    figure.colorbar(mapper, ax=axes, label=label)
     return figure
 
 

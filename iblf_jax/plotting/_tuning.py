@@ -98,8 +98,8 @@ def _peaks(axes: Axes, curves: list[Curve]) -> None:
         margin, above["rotation"] = 0.35, 90
     peaks = []
     for i, curve in enumerate(curves):
-        size = np.abs(curve["tau"])
-        peak = np.where(np.isfinite(size), size, 0.0).max(axis=0)
+        magnitude = np.abs(curve["tau"])
+        peak = np.where(np.isfinite(magnitude), magnitude, 0.0).max(axis=0)
         places = np.arange(n) + 0.4 * (i - 0.5)
         axes.bar(places, peak, width=0.36, color=_style.colour(i))
         for x, y in zip(places, peak, strict=True):
@@ -167,11 +167,11 @@ def _gains(axes: Axes, result: TuneResult) -> None:
     ends = result.at_limits
     at_end: dict[str, Any] = {"marker": "X", "markersize": 6, "linestyle": "none", "zorder": 4}
     for i, name in enumerate(result.names):
-        words = escaped(name)
+        label = escaped(name)
         if name in ends:
-            words += f" (at its {ends[name].side} limit {ends[name].limit:.4g})"
+            label += f" (at its {ends[name].side} limit {ends[name].limit:.4g})"
         y = x[:, i] / (abs(x[0, i]) or 1.0)
-        axes.plot(steps + 1, y, marker=".", markersize=3, label=words, **_style.series(i))
+        axes.plot(steps + 1, y, marker=".", markersize=3, label=label, **_style.series(i))
         if name in ends:
             axes.plot(steps[-1:] + 1, y[-1:], color=_style.failure(), **at_end)
     if np.all(x / np.where(x[0] == 0, 1, x[0]) > 0):
@@ -246,20 +246,21 @@ def paths(
     for name, x in (others or {}).items():
         iterates[name] = np.asarray(x, float).reshape(-1, 2)
     tuned = result.tuned[pair]
-    every = np.concatenate([*iterates.values(), tuned[None]])
-    axis = [_axis(x, points, logarithmic=bool(np.all(every > 0))) for x in every.T]
-    loss, excess = result.on_slice(*names, *axis)
+    all_gains = np.concatenate([*iterates.values(), tuned[None]])
+    logarithmic = bool(np.all(all_gains > 0))
+    grid = [_axis(x, points, logarithmic=logarithmic) for x in all_gains.T]
+    loss, excess = result.on_slice(*names, *grid)
     figure = _style.new_figure(0.8 * _style.WIDTH, 4.4)
     axes = figure.subplots()
-    _draw_contours(axes, axis[0], axis[1], loss, 0.7, 14)
+    _draw_contours(axes, grid[0], grid[1], loss, 0.7, 14)
     violation = np.where(np.isfinite(excess), excess, 1.0)
     if np.any(violation > 0):
-        axes.contourf(*axis, violation.T, levels=[0.0, np.inf], colors="none", hatches=["//"])
-        axes.contour(*axis, violation.T, levels=[0.0], colors=[_style.failure()], linewidths=1.0)
+        axes.contourf(*grid, violation.T, levels=[0.0, np.inf], colors="none", hatches=["//"])
+        axes.contour(*grid, violation.T, levels=[0.0], colors=[_style.failure()], linewidths=1.0)
     _draw_iterates(axes, iterates, tuned)
-    for direction, name, x in zip("xy", names, axis, strict=True):
+    for direction, name, x in zip("xy", names, grid, strict=True):
         axes.set(**{f"{direction}lim": x[[0, -1]], f"{direction}label": escaped(name)})
-    if np.all(every > 0):
+    if logarithmic:
         axes.set(xscale="log", yscale="log")
     _style.legend_below(figure, of=[axes])
     return figure
@@ -291,11 +292,11 @@ def _draw_iterates(axes: Axes, iterates: Mapping[str, np.ndarray], tuned: np.nda
     """Draws the iterates of every search, and start and result of the tuning."""
     outlined: dict[str, Any] = {"markerfacecolor": "white", "markeredgecolor": "black", "zorder": 4}
     for i, (name, x) in enumerate(iterates.items()):
-        look: dict[str, Any] = {"linestyle": "none", "marker": ".", "markersize": 3.5}
-        look["color"] = _style.colour(i + 1)
+        style: dict[str, Any] = {"linestyle": "none", "marker": ".", "markersize": 3.5}
+        style["color"] = _style.colour(i + 1)
         if name == "tune":
-            look = {"linewidth": 1.2, "marker": "o", "markersize": 4, "color": "black", **outlined}
-        axes.plot(*x.T, label=f"{name}, {len(x)} values", **look)
+            style = {"linewidth": 1.2, "marker": "o", "markersize": 4, "color": "black", **outlined}
+        axes.plot(*x.T, label=f"{name}, {len(x)} values", **style)
     outlined["linestyle"] = "none"
     axes.plot(*iterates["tune"][0], marker="s", markersize=6, label="start", **outlined)
     axes.plot(*tuned, marker="*", markersize=13, label="tuned", **outlined)

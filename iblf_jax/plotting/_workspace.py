@@ -89,17 +89,17 @@ def draw_boundaries(axes: Any, robot: Any, regions: Sequence[Region], limits: np
     for region in regions:
         first.setdefault(row_of(robot, region.point), region)
     draw_one = _draw_in_plane if len(limits) == 2 else _draw_in_space
-    for line, (row, named) in enumerate(first.items()):
-        look = {"color": _style.failure(), "linestyle": LINES[line % len(LINES)]}
+    for index, (row, first_region) in enumerate(first.items()):
+        style = {"color": _style.failure(), "linestyle": LINES[index % len(LINES)]}
         for region in regions:
             if row_of(robot, region.point) == row:
-                draw_one(axes, region, limits, look)
+                draw_one(axes, region, limits, style)
         nowhere: list[list[float]] = [[]] * len(limits)
-        words = escaped(f"bound of {in_words(named, robot)}")
-        axes.plot(*nowhere, **look, linewidth=1.2, label=words)
+        label = escaped(f"bound of {in_words(first_region, robot)}")
+        axes.plot(*nowhere, **style, linewidth=1.2, label=label)
 
 
-def _draw_in_plane(axes: Any, region: Region, limits: np.ndarray, look: dict[str, Any]) -> None:
+def _draw_in_plane(axes: Any, region: Region, limits: np.ndarray, style: dict[str, Any]) -> None:
     x, y = (np.linspace(low, high, GRID) for low, high in limits)
     points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     distance = np.asarray(jax.jit(jax.vmap(region.distance))(points)).reshape(GRID, GRID)
@@ -107,26 +107,26 @@ def _draw_in_plane(axes: Any, region: Region, limits: np.ndarray, look: dict[str
         return
     outside = [distance.min(), 0.0]
     axes.contourf(x, y, distance, levels=outside, colors=[_style.forbidden()], zorder=0)
-    line = {"colors": [look["color"]], "linestyles": [look["linestyle"]], "linewidths": 1.2}
+    line = {"colors": [style["color"]], "linestyles": [style["linestyle"]], "linewidths": 1.2}
     axes.contour(x, y, distance, levels=[0.0], zorder=1, **line)
 
 
-def _draw_in_space(axes: Any, region: Region, limits: np.ndarray, look: dict[str, Any]) -> None:
+def _draw_in_space(axes: Any, region: Region, limits: np.ndarray, style: dict[str, Any]) -> None:
     if isinstance(region, HalfSpace):
-        _draw_plane(axes, region, limits, look)
+        _draw_plane(axes, region, limits, style)
     elif isinstance(region, Sphere):
-        _draw_sphere(axes, region, limits, look)
+        _draw_sphere(axes, region, limits, style)
 
 
-def _draw_plane(axes: Any, region: HalfSpace, limits: np.ndarray, look: dict[str, Any]) -> None:
+def _draw_plane(axes: Any, region: HalfSpace, limits: np.ndarray, style: dict[str, Any]) -> None:
     corners = _plane_in_box(np.asarray(region.normal), float(region.offset), limits)
     if len(corners):
-        edge = {"edgecolor": look["color"], "linestyle": look["linestyle"]}
-        polygon = Poly3DCollection([corners], facecolor=look["color"], alpha=0.13, **edge)
+        edge = {"edgecolor": style["color"], "linestyle": style["linestyle"]}
+        polygon = Poly3DCollection([corners], facecolor=style["color"], alpha=0.13, **edge)
         axes.add_collection3d(polygon)
 
 
-def _draw_sphere(axes: Any, region: Sphere, limits: np.ndarray, look: dict[str, Any]) -> None:
+def _draw_sphere(axes: Any, region: Sphere, limits: np.ndarray, style: dict[str, Any]) -> None:
     theta, phi = np.meshgrid(
         np.linspace(0.0, np.pi, SPHERE_CIRCLES[0]),
         np.linspace(0.0, 2 * np.pi, SPHERE_CIRCLES[1]),
@@ -138,7 +138,7 @@ def _draw_sphere(axes: Any, region: Sphere, limits: np.ndarray, look: dict[str, 
     visible = np.where(inside, points, np.nan)
     for circles in (visible.transpose(1, 0, 2), visible.transpose(2, 0, 1)):
         for circle in circles:
-            axes.plot(*circle, **look, linewidth=0.5, alpha=0.6, label="_")
+            axes.plot(*circle, **style, linewidth=0.5, alpha=0.6, label="_")
 
 
 def _plane_in_box(normal: np.ndarray, offset: float, limits: np.ndarray) -> np.ndarray:
@@ -206,12 +206,12 @@ def draw_paths(figure: Figure, where: SubplotSpec, curves: Sequence[Curve]) -> A
     confined = {row_of(robot, region.point) for region in regions}
     arm: dict[str, Any] = {"linewidth": 2.4, "marker": "o", "markersize": 4, "label": "_"}
     for i, (curve, skeleton) in enumerate(zip(curves, actual, strict=True)):
-        look = run_style(curves, i)
+        style = run_style(curves, i)
         for row in sorted(confined - {robot.n}):
-            axes.plot(*skeleton[:, row].T, **(look | {"label": "_", "linewidth": 0.9}))
+            axes.plot(*skeleton[:, row].T, **(style | {"label": "_", "linewidth": 0.9}))
         tip = {"label": curve.name or "tip", "linewidth": 1.6}
-        axes.plot(*skeleton[:, -1].T, **(look | tip))
-        axes.plot(*skeleton[-1].T, color=_style.blend(0.45, look["color"]), **arm)
+        axes.plot(*skeleton[:, -1].T, **(style | tip))
+        axes.plot(*skeleton[-1].T, color=_style.blend(0.45, style["color"]), **arm)
     return axes
 
 

@@ -98,7 +98,7 @@ def _pictures(scene: Scene) -> Iterator[Image.Image]:
     canvas.draw()
     scene.figure.set_layout_engine("none")
     background = canvas.copy_from_bbox(scene.figure.bbox)
-    for frame in range(len(scene.world.t)):
+    for frame in range(len(scene.target.t)):
         canvas.restore_region(background)
         for axes, part in scene.move_to(frame):
             axes.draw_artist(part)

@@ -4,6 +4,7 @@ inequality, and the errors with their bounds.
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -75,9 +76,9 @@ def _verdict_colour(verdict: str) -> str:
 
 
 class Bounded(NamedTuple):
-    """A signal with a bound: the words, the symbol and the unit of its panel."""
+    """A signal with a bound: the name, the symbol and the unit of its panel."""
 
-    words: str
+    name: str
     symbol: str
     unit: str
 
@@ -97,21 +98,21 @@ def _bound_style() -> dict[str, Any]:
     return {"color": _style.bound(), "linewidth": 1.6, "linestyle": "-"}
 
 
-def _set_axes(axes: Axes, t: np.ndarray, words: str, unit: str) -> None:
+def _set_axes(axes: Axes, t: np.ndarray, name: str, unit: str) -> None:
     _style.time_axis(axes, (float(t[0]), float(t[-1])))
-    axes.set_ylabel(_style.label(words, unit))
+    axes.set_ylabel(_style.label(name, unit))
 
 
 def _draw_bounded(
-    axes: Axes, t: np.ndarray, values: np.ndarray, bound: np.ndarray, shown: Bounded
+    axes: Axes, t: np.ndarray, values: np.ndarray, bound: np.ndarray, signal: Bounded
 ) -> None:
     """A nonnegative signal and its bound on a logarithmic axis."""
     if np.isfinite(bound).any():
         axes.plot(*thinned(t, bound), label="bound", **_bound_style())
     positive = np.where(values > 0, values, np.nan)
-    axes.plot(*thinned(t, positive), label=shown.symbol, **_style.series(0))
+    axes.plot(*thinned(t, positive), label=signal.symbol, **_style.series(0))
     axes.set_yscale("log")
-    _set_axes(axes, t, f"{shown.words} {shown.symbol}", shown.unit)
+    _set_axes(axes, t, f"{signal.name} {signal.symbol}", signal.unit)
     axes.legend(loc="best", **LEGEND)
 
 
@@ -143,17 +144,17 @@ def _relative_error(axes: Axes, traces: Traces, joints: tuple[str, ...]) -> None
     n = traces.xi.shape[1]
     bounds_differ = np.ptp(traces.xi_bound, axis=1).max(initial=0.0) > 1e-3
     for joint in range(n):
-        look = _style.series(joint)
-        axes.plot(*thinned(traces.t, traces.xi[:, joint]), label=escaped(joints[joint]), **look)
+        style = _style.series(joint)
+        axes.plot(*thinned(traces.t, traces.xi[:, joint]), label=escaped(joints[joint]), **style)
         own = _bound_style()
         if bounds_differ:
-            own |= {"color": look["color"], "alpha": 0.45}
+            own |= {"color": style["color"], "alpha": 0.45}
         t, bound = thinned(traces.t, traces.xi_bound[:, joint])
         axes.plot(t, bound, label="_" if joint else "bound", **own)
         axes.plot(t, -bound, label="_", **own)
     # Joint names may be long: the legend has as many columns as fit, the axis room for its rows.
     columns = int(np.clip(44 // (max(map(len, joints)) + 4), 1, 4 if n > 5 else 3))
-    top = 1.3 + 0.15 * -(-(n + 1) // columns)
+    top = 1.3 + 0.15 * math.ceil((n + 1) / columns)
     axes.axhspan(1.0, top, color=_style.forbidden(), linewidth=0, zorder=0)
     axes.axhspan(-1.08, -1.0, color=_style.forbidden(), linewidth=0, zorder=0)
     axes.set_ylim(-1.08, top)
@@ -166,10 +167,10 @@ def _mark_excluded(panels: Any, traces: Traces) -> None:
     """Shades the samples without a claim."""
     if not traces.excluded.any():
         return
-    look = {"color": _style.blend(0.149), "step": "mid", "zorder": 0.5}
+    style = {"color": _style.blend(0.149), "step": "mid", "zorder": 0.5}
     for axes in panels:
         full_height = axes.get_xaxis_transform()
-        axes.fill_between(traces.t, 0, 1, where=traces.excluded, transform=full_height, **look)
+        axes.fill_between(traces.t, 0, 1, where=traces.excluded, transform=full_height, **style)
 
 
 def _verdicts(axes: Axes, shown: Certificate) -> None:
@@ -181,16 +182,16 @@ def _verdicts(axes: Axes, shown: Certificate) -> None:
         names.append("weighted")  # The claim of the paper does not apply.
     lines = [line for line in applicable if line.name.startswith(tuple(names)) and line.counts]
     growth = axes.get_figure().get_figwidth() / WIDTH  # type: ignore[union-attr]
-    look: dict[str, Any] = {"transform": axes.transAxes, "va": "center"}
+    style: dict[str, Any] = {"transform": axes.transAxes, "va": "center"}
     if not lines:
-        axes.text(0.5, 0.5, "no claim applies", ha="center", **look)
+        axes.text(0.5, 0.5, "no claim applies", ha="center", **style)
     columns = (0.0, 0.41, 0.56, 0.69)
     for row, line in enumerate(lines):
         height = 1.0 - (row + 0.5) / max(len(lines), 12)
         colour = _verdict_colour(line.verdict)
         cells = (line.name, line.equation, line.verdict, _margin(line))
         for x, text in zip(columns, cells, strict=True):
-            axes.text(x, height, text, color=colour, fontsize=7 * growth, **look)
+            axes.text(x, height, text, color=colour, fontsize=7 * growth, **style)
 
 
 def _margin(line: Line) -> str:

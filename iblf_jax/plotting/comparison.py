@@ -75,22 +75,22 @@ def comparison(result: Comparison, joint: int = 0, *, zoom: float | None = None)
 
 
 def _law_style(curve: Curve, order: list[str]) -> dict[str, Any]:
-    look = _style.series(order.index(curve.name)) | {"label": curve.name}
+    style = _style.series(order.index(curve.name)) | {"label": curve.name}
     if curve.failed:
-        look |= _style.FAINT
-    return look
+        style |= _style.FAINT
+    return style
 
 
 def _errors(axes: Axes, curves: list[Curve], order: list[str], joint: int, window: Window) -> None:
     """The error |e1| of every law, and the tolerance of the settling time."""
     start = 0.0
     for curve in curves:
-        size = np.abs(curve["e1"][:, joint])
-        t = curve.t[: len(size)]
+        error = np.abs(curve["e1"][:, joint])
+        t = curve.t[: len(error)]
         shown = t <= window[1]
-        points = thinned(t[shown], np.maximum(size[shown], SMALLEST))
+        points = thinned(t[shown], np.maximum(error[shown], SMALLEST))
         axes.semilogy(*points, **_law_style(curve, order))
-        start = max(start, size[0])
+        start = max(start, error[0])
     tolerance = float(Settling().tolerance)
     axes.axhline(tolerance, color=_style.bound(), linewidth=0.8, zorder=1, label="settled")
     axes.set_ylim(SMALLEST, 3.0 * max(start, 10.0 * SMALLEST))

@@ -14,7 +14,7 @@ import numpy as np
 
 from iblf_jax.core import devices
 from iblf_jax.core.pytree import field_values, is_leaf_field
-from iblf_jax.engine import block_size
+from iblf_jax.engine import block_size, uses_host_compiler
 from iblf_jax.kernels import built_for
 from iblf_jax.simulation.paths import get, parameters, unit_at
 from iblf_jax.simulation.scenario import Scenario
@@ -89,7 +89,7 @@ def describe(prepared: PreparedStudy, points: Points, design: str) -> dict[str, 
     options = prepared.options
     backend = prepared.backend
     kernel = {}
-    if backend == "native":
+    if uses_host_compiler(backend):
         kernel = {"kernel": built_for()}
     return {
         "design": design,

@@ -20,7 +20,7 @@ import numpy as np
 
 from iblf_jax.core import checks, notices
 from iblf_jax.core.progress import bar
-from iblf_jax.engine import sweep_unit, whole_blocks
+from iblf_jax.engine import cases_per_unit, whole_blocks
 from iblf_jax.simulation.error_estimate import RELATIVE
 from iblf_jax.simulation.metrics import Fold, metric_units
 from iblf_jax.simulation.scenario import Scenario, canonical
@@ -237,7 +237,7 @@ def _into_store(
 ) -> xarray.Dataset:
     cases = prepared.cases
     if options.unit is None:
-        unit = sweep_unit(cases, prepared.options.steps)
+        unit = cases_per_unit(cases, prepared.options.steps)
     else:
         unit = whole_blocks(cases, options.unit)
     variables = _variables(prepared, config)

@@ -38,6 +38,7 @@ import jax
 
 from iblf_jax.core import devices
 from iblf_jax.core.pytree import is_component_class, register_component
+from iblf_jax.engine import uses_host_compiler
 from iblf_jax.studies.blocks import BlockResults, named_arrays, run_spans_here
 from iblf_jax.studies.options import ThisProcess
 from iblf_jax.studies.store import StoreError, load_store
@@ -109,7 +110,7 @@ def environment(executor: str) -> dict[str, Any]:
         "jax_enable_x64": bool(jax.config.jax_enable_x64),  # type: ignore[attr-defined]
         "platform": devices.platform(),
     }
-    if executor == "native":
+    if uses_host_compiler(executor):
         found |= _kernel_environment()
     return found
 

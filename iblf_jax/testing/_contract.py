@@ -42,7 +42,7 @@ class Findings:
         self.remarks: list[str] = []
         """Properties that the user should know and that violate no contract."""
         self.kind = ""
-        """What labels of the present check end with: the type of its arguments."""
+        """Suffix of all labels of the current check: the type of its arguments."""
 
     def add(self, problem: str, remedy: str = "") -> None:
         """Records a problem, once."""
@@ -179,6 +179,12 @@ def shape_of(findings: Findings, label: str, call: Callable, *args: Any) -> Any:
         if isinstance(error, jax.errors.JAXTypeError):
             remedy = "It is called with tracers: use jax.numpy, and `jnp.where` in place of `if`"
         findings.stop(f"{label}{findings.kind} raised {first_line(error)}", remedy)
+
+
+def abstract_shape(x: Any) -> tuple[int, ...]:
+    """The shape of an abstract result; () for objects that are not arrays."""
+    shape: tuple[int, ...] = getattr(x, "shape", ())
+    return shape
 
 
 def has_shape(
@@ -409,4 +415,4 @@ def find_jump(
 
 
 GRID = 2001
-"""Points of the grids on which jumps are sought."""
+"""Number of points of the grids that `find_jump` searches."""

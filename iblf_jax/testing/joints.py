@@ -24,11 +24,11 @@ from iblf_jax.world.robots import PlanarChain
 
 T = TypeVar("T")
 
-USUAL = 2
+DEFAULT_JOINTS = 2
 """Number of joints that is assumed for a component whose leaves are all scalars."""
 
 
-def joints_of(member: Any, default: int = USUAL) -> int:
+def joints_of(member: Any, default: int = DEFAULT_JOINTS) -> int:
     """The number of joints of a member's leaves; the default if they are scalars or disagree."""
     sizes = _sizes(member)
     return sizes.pop() if len(sizes) == 1 else default
@@ -128,7 +128,7 @@ def fitted_to(member: T, n: int, family: str) -> T:
 
 def arm_of(n: int) -> Any:
     """An arm of n joints: the customary two-link arm, or a planar chain like it."""
-    if n == USUAL:
+    if n == DEFAULT_JOINTS:
         return customary_two_link()
     shrink = 0.8 ** np.arange(n)
     mass, length = 2.0 * shrink, 0.35 * shrink
@@ -137,7 +137,7 @@ def arm_of(n: int) -> Any:
 
 def scenario_of(n: int) -> Scenario:
     """A scenario of n joints: the paper's, or one with similar reference, bounds and gains."""
-    if n == USUAL:
+    if n == DEFAULT_JOINTS:
         return zhang_yan_2024()
     quarter = np.pi / 2
     phases = np.resize([0.0, quarter], n)

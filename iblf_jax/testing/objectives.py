@@ -19,6 +19,7 @@ from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import Sample
 from iblf_jax.testing._contract import (
     Findings,
+    abstract_shape,
     check_function,
     examine,
     first_line,
@@ -140,7 +141,7 @@ def _structure(findings: Findings, quantity: Any, first: Any) -> None:
     findings.result_is(three, "finish(acc)", result, remedy)
     for name, value in zip(("smooth value", "exact value"), result[:2], strict=True):
         has_shape(findings, f"the {name} of finish(acc)", value, ())
-    shape = _shape(result[2])
+    shape = abstract_shape(result[2])
     findings.require(
         len(shape) == 1,
         f"the pieces of finish(acc) have shape {shape}",
@@ -158,17 +159,11 @@ def _structure(findings: Findings, quantity: Any, first: Any) -> None:
     outer = shape_of(findings, label, curvature, acc, first)
     remedy = "It must be an iblf_jax.engine.derivatives.Outer"
     findings.result_is(isinstance(outer, Outer), label, outer, remedy)
-    size, weight = _shape(outer.vector), _shape(outer.weight)
+    size, weight = abstract_shape(outer.vector), abstract_shape(outer.weight)
     findings.require(len(size) == 1, f"Outer.vector has shape {size}", "It must be (m,)")
     findings.require(
         weight in ((), size), f"Outer.weight has shape {weight}", f"It must be () or {size}"
     )
-
-
-def _shape(x: Any) -> tuple[int, ...]:
-    """The shape of an abstract result; () for objects that are not arrays."""
-    shape: tuple[int, ...] = getattr(x, "shape", ())
-    return shape
 
 
 def _second_order(

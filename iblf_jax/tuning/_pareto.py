@@ -38,7 +38,7 @@ import numpy as np
 from iblf_jax.core import checks, notices
 from iblf_jax.core.presentation import present
 from iblf_jax.core.progress import bar
-from iblf_jax.engine import FORWARD_MOST, differentiates_forward
+from iblf_jax.engine import MAX_FORWARD_NUMBERS, differentiates_forward
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.designs import MAX_RUNS
@@ -182,7 +182,7 @@ def pareto(
     )
     if not differentiates_forward(problem.size):
         came = f"{problem.size} numbers"
-        expected = f"at most {FORWARD_MOST} for a front"
+        expected = f"at most {MAX_FORWARD_NUMBERS} for a front"
         raise checks.fail("parameters", came, expected, "Tie or leave out some.")
     checks.fits("points", points, 8.0 * POINTS_BETWEEN * problem.runs * NUMBERS_A_RUN)
     search = FrontSearch(problem, min(points, MAX_BATCH), iterations, tolerance)

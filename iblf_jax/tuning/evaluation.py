@@ -38,7 +38,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core.status import UNTRUSTED
-from iblf_jax.engine import run_for_reverse, starts_together
+from iblf_jax.engine import run_for_reverse, starts_per_batch
 from iblf_jax.simulation.noise import NOISE_NAME
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.studies.draws import same_place
@@ -325,7 +325,7 @@ class Evaluator:
         self.evaluations = 0
         """Number of evaluated points."""
         starts, runs = candidates.index.shape
-        self.group = starts_together(starts, runs)
+        self.group = starts_per_batch(starts, runs)
         self.active = np.ones(starts, bool)
         """Which starts are evaluated; the others are returned as invalid."""
 

@@ -211,6 +211,13 @@ def checked(objective: Any) -> Objective:
     raise checks.fail("objective", objective, WHAT_IT_IS, remedy)
 
 
+def _composed(objective: Any) -> Objective:
+    if isinstance(objective, Objective):
+        return objective
+    remedy = "Such as ij.objectives.tracking()."
+    raise checks.fail("objective", objective, "an objective", remedy)
+
+
 def is_complete(objective: Objective) -> bool:
     """Whether no scale or limit is missing."""
     return all(term.is_complete for term in objective.terms)
@@ -224,7 +231,7 @@ def complete(objective: Objective, start: Any) -> Objective:
       start: the exact values of the terms' quantities at the start, (n_terms,).
     """
     values = np.asarray(checks.as_floats("start", start), float)
-    checks.shape_is("start", values, (len(objective.terms),))
+    checks.shape_is("start", values, (len(_composed(objective).terms),))
     terms = tuple(_completed(t, x) for t, x in zip(objective.terms, values, strict=True))
     return Objective(terms, objective.requirements)
 
@@ -251,7 +258,7 @@ def sharper(objective: Objective, factor: float) -> Objective:
     structure stays the same.
     """
     terms = []
-    for term in objective.terms:
+    for term in _composed(objective).terms:
         smoothing = quantity_member(term.quantity, "smoothing")
         if smoothing is not None:
             quantity: Any = term.quantity
@@ -263,7 +270,9 @@ def sharper(objective: Objective, factor: float) -> Objective:
 
 def is_smoothed(objective: Objective) -> bool:
     """Whether a term of the objective is smoothed, so that `sharper` changes it."""
-    return any(quantity_member(t.quantity, "smoothing") is not None for t in objective.terms)
+    return any(
+        quantity_member(t.quantity, "smoothing") is not None for t in _composed(objective).terms
+    )
 
 
 def depends_on_torque(objective: Objective) -> bool:
@@ -272,7 +281,7 @@ def depends_on_torque(objective: Objective) -> bool:
     """
     return any(
         quantity_member(q, "signal") in ("torque", "torque_rate")
-        for q in objective.quantities
+        for q in _composed(objective).quantities
         if not (isinstance(q, MetricResult) and isinstance(q.fold, Tracking | Settling))
     )
 
@@ -304,7 +313,7 @@ def for_scenario(objective: Objective, scenario: Scenario) -> Objective:
         message names the function.
     """
     names = joint_names(scenario.plant, scenario.n)
-    terms = tuple(_part_of(t, t.name, names) for t in objective.terms)
+    terms = tuple(_part_of(t, t.name, names) for t in _composed(objective).terms)
     requirements = tuple(_part_of(r, r.function or r.name, names) for r in objective.requirements)
     return Objective(terms, requirements)
 

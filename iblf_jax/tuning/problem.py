@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.engine import RunRequest, values_together
+from iblf_jax.engine import RunRequest, points_per_batch
 from iblf_jax.simulation.noise import has_noise
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.scenario import Scenario, canonical, check_step
@@ -240,7 +240,7 @@ class TuningProblem:
         Where many points will be evaluated later, one point is evaluated by their program.
         """
         many = points > 1 or self.runs > 1 or self.multimodal or self.on_front
-        return values_together(self.runs) if many else 1
+        return points_per_batch(self.runs) if many else 1
 
     def exact_at_start(self) -> np.ndarray:
         """Each quantity at the start without smoothing, averaged over the runs, (K + 1,)."""

@@ -27,7 +27,7 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.core.status import Status
-from iblf_jax.engine import RunRequest, fresh_together
+from iblf_jax.engine import RunRequest, report_runs_per_batch
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.draws import Cases, targets_of
@@ -334,7 +334,7 @@ def _fresh_runs(
         varied, admissible = draw_runs(cases, own, index[rows], targets=targets, nominal=not runs)
         return rollouts(scenario, varied, objective, step, request=of_run), admissible
 
-    batch = fresh_together(runs * len(scenarios) * steps, request.batch)
+    batch = report_runs_per_batch(runs * len(scenarios) * steps, request.batch)
     found, admissible = in_groups(run, len(owner), batch)
     if len(scenarios) > 1:  # once in a report
         warn_of_step(found.status, found.fastest_mode, found.relative_error, dt, method)

@@ -14,7 +14,7 @@ import numpy as np
 from iblf_jax.core import checks, notices
 from iblf_jax.core.presentation import present
 from iblf_jax.core.status import UNTRUSTED
-from iblf_jax.engine import RunRequest, run_batch, run_rollout, values_together
+from iblf_jax.engine import RunRequest, points_per_batch, run_batch, run_rollout
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.metrics import as_folds
 from iblf_jax.simulation.results import Rollout
@@ -279,7 +279,7 @@ class TuneResult:
             objective=setup.objective,
             run=setup,
             report=dataclasses.replace(report, runs=runs, seed=seed),
-            batch=setup.runs * values_together(setup.runs) if searched_in_batches else 1,
+            batch=setup.runs * points_per_batch(setup.runs) if searched_in_batches else 1,
             at_limits=at_limits,
             multipliers=tuple(self.limit_multipliers.values()),
             notes=self.notes,

@@ -1,8 +1,8 @@
-"""Bounds on the joints, k_lc(t) < q < k_uc(t), and the tube that they make around the reference;
-bounds on their velocities alike.
+"""Bounds on joint positions, k_lc(t) < q < k_uc(t), and the tube that they form around the
+reference; bounds on joint velocities have the same form.
 
-Each side is a component of its own: constant, sinusoidal, or a funnel that shrinks onto the
-reference.  The law works with the errors' bounds
+Each side is a component: constant, sinusoidal, or a funnel that shrinks onto the reference.  The
+law uses the bounds of the error
 
     k_l = q_d - k_lc > 0,   k_u = k_uc - q_d > 0,   -k_l < e1 < k_u,    (paper, below Assumption 2)
 
@@ -26,17 +26,17 @@ from iblf_jax.world.robots._base import robot_member
 
 
 class Side(Protocol):
-    """What the package asks of one side of the bounds.
+    """The contract of one side of the bounds.
 
-    One that is switched at some times also has `jump_times()`, the times at which it or its rate
-    jumps, (m,) [s], as disturbances have: steps of a run are divided there.
+    A side that is discontinuous in time also has `jump_times()`, the times (m,) [s] at which it or
+    its rate jumps; steps of a run are divided there, as for disturbances.
     """
 
     def at(self, t: jax.Array, q_d: jax.Array) -> jax.Array:
-        """The bound on q at time t [s], (n,) [rad]; `q_d` (n,) [rad] is the reference at t, for
-        bounds that follow it.
+        """The bound on q at time t [s], (n,) [rad]; a bound may depend on the reference q_d at t,
+        (n,) [rad].
 
-        As a bound on q' it is given q_d' and is in rad/s.
+        A bound on q' is in rad/s and receives q_d' in place of q_d.
         """
         ...
 
@@ -121,14 +121,14 @@ class Bounds:
     upper: Side
 
     def check(self) -> None:
-        """Raises ValueError for a side that is not one."""
+        """Raises ValueError if a side does not fit `Side`."""
         remedy = "A constant bound is iblf_jax.bounds.Constant(value)."
         checks.conforms("Bounds.lower", self.lower, Side, remedy)
         checks.conforms("Bounds.upper", self.upper, Side, remedy)
 
 
 def _distance(name: str, value: Any, n: int, sign: str | None) -> jax.Array:
-    """One number, or one a joint, from a user's argument."""
+    """A user's argument as one number, or one number per joint."""
     array = checks.as_floats(name, value)
     checks.check_values(name, array, sign)
     if array.shape not in ((), (n,)):
@@ -137,9 +137,7 @@ def _distance(name: str, value: Any, n: int, sign: str | None) -> jax.Array:
 
 
 def _limits_of(robot: Robot, member: str, what: str, unlimited: Any) -> tuple[Any, Any]:
-    """Limits that a robot declares, and what replaces them where a joint has none, which is 0 if
-    every joint has limits.
-    """
+    """The limits that a robot declares, and the value for joints without limits."""
     limits = robot_member(robot, member)
     if limits is None:
         expected, remedy = f"a robot with {what} limits, such as an Arm", "Give bounds of your own."
@@ -158,7 +156,7 @@ def from_limits(robot: Robot, *, margin: float = 0.0, unlimited: float | None = 
         lower + margin < q < upper - margin
 
     Args:
-      robot: one with `limits`, such as `iblf_jax.robots.Arm`.
+      robot: a robot with `limits`, such as `iblf_jax.robots.Arm`.
       margin: distance that is kept from the limits [rad].
       unlimited: bounds of joints without limits, -unlimited and unlimited [rad].
 
@@ -166,10 +164,10 @@ def from_limits(robot: Robot, *, margin: float = 0.0, unlimited: float | None = 
       ValueError: a robot without `limits`, or with joints that have none and no `unlimited`; a
         margin that leaves nothing.
     """
-    limits, far = _limits_of(robot, "limits", "joint", unlimited)
+    limits, replacement = _limits_of(robot, "limits", "joint", unlimited)
     margins = _distance("margin", margin, robot.n, None)
-    lower = jnp.where(jnp.isfinite(limits[0]), limits[0] + margins, -far)
-    upper = jnp.where(jnp.isfinite(limits[1]), limits[1] - margins, far)
+    lower = jnp.where(jnp.isfinite(limits[0]), limits[0] + margins, -replacement)
+    upper = jnp.where(jnp.isfinite(limits[1]), limits[1] - margins, replacement)
     if checks.is_concrete((lower, upper)) and not np.all(np.asarray(lower) < np.asarray(upper)):
         expected = "a margin that leaves room between the limits"
         narrowest = float(np.min(np.diff(limits, axis=0)))
@@ -186,24 +184,22 @@ def from_speed_limits(
         -share speed < q' < share speed
 
     Args:
-      robot: one with `speed`, such as `iblf_jax.robots.Arm`.
-      share: of the largest speeds, > 0 [1].
+      robot: a robot with `speed`, such as `iblf_jax.robots.Arm`.
+      share: fraction of the largest speeds, > 0 [1].
       unlimited: largest speed of joints that have none [rad/s].
 
     Raises:
       ValueError: a robot without `speed`, or with joints that have no limit and no `unlimited`; a
         share that is not positive.
     """
-    speed, far = _limits_of(robot, "speed", "speed", unlimited)
+    speed, replacement = _limits_of(robot, "speed", "speed", unlimited)
     share = checks.positive_number("share", share, "1")
-    most = share * jnp.where(jnp.isfinite(speed), speed, far)
-    return Bounds(lower=Constant(-most), upper=Constant(most))
+    limit = share * jnp.where(jnp.isfinite(speed), speed, replacement)
+    return Bounds(lower=Constant(-limit), upper=Constant(limit))
 
 
 class Tube(NamedTuple):
-    """Reference, bounds and their rates at one time; everything that a barrier needs to know of the
-    world.
-    """
+    """Reference, bounds and their rates at one time: the inputs of a barrier besides q."""
 
     q_d: jax.Array
     """Reference, (n,) [rad]."""
@@ -218,8 +214,8 @@ class Tube(NamedTuple):
     dupper: jax.Array
     """Rate of k_uc, (n,) [rad/s]."""
     ddq_d: jax.Array | None = None
-    """Its acceleration, (n,) [rad/s^2], for laws that feed it forward; None in a tube that barriers
-    take alpha from."""
+    """Its acceleration, (n,) [rad/s^2], for laws with feedforward; None in a tube from which only
+    alpha follows."""
 
     @property
     def k_l(self) -> jax.Array:
@@ -248,8 +244,8 @@ class Tube(NamedTuple):
 
 
 NARROWEST = 1e-6
-"""rad.  A reference that comes nearer to its bound than this is called infeasible; widths are held
-above it so that a run with a bad reference gives large numbers and a flag instead of NaN."""
+"""Least distance of a feasible reference to its bounds [rad].  Smaller widths are replaced by it,
+so that a run with an infeasible reference gives large numbers and a status flag instead of NaN."""
 
 
 def positive_width(k: jax.Array) -> jax.Array:
@@ -267,14 +263,14 @@ def tube_at(
     Args:
       reference, bounds: the components.
       t: time, () [s].
-      acceleration: whether q_d" is wanted; False where the tube is itself differentiated in time,
-        so that a reference need not have a third derivative.
+      acceleration: whether to compute q_d"; False where the tube is differentiated in time, so
+        that a reference needs no third derivative.
 
     Returns:
-      `Tube`; its ddq_d costs nothing where it is not used, as what is not used is not compiled.
+      `Tube`; JAX does not compile ddq_d where it is not used.
 
     Raises:
-      ValueError: something that is no reference, no bounds or no time.
+      ValueError: an argument that is not a reference, bounds or a time.
     """
     expected = "a reference, as iblf_jax.references.Reference"
     checks.offers("reference", reference, ("position",), expected)
@@ -299,8 +295,8 @@ def tube_at(
 def speed_limits_at(
     reference: Reference, bounds: Bounds, t: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """The bounds v_l, v_u on the velocities at time t [s], (n,) each [rad/s]; sides that follow
-    something follow q_d'.
+    """The bounds v_l, v_u on the velocities at time t [s], (n,) each [rad/s]; a side
+    that depends on the reference receives q_d'.
     """
     dq_d = jax.jvp(reference.position, (t,), (jnp.ones_like(t),))[1]
     return bounds.lower.at(t, dq_d), bounds.upper.at(t, dq_d)

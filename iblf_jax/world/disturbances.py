@@ -1,14 +1,14 @@
-"""Disturbances: the generalised torque that acts on the plant and that the law does not know.
+"""Disturbances: generalised torques that act on the plant and that the law does not know.
 
     M q" + C q' + G = tau + (disturbance)          for the simulated plant
 
-What the observer should estimate is the lumped uncertain term of (2.1),
+The observer estimates the lumped uncertain term of (2.1),
 
     f = M0 q" + C0 q' + G0 - tau,
 
 evaluated along the run with the *model*.  It equals the disturbance here when the plant is the
 model; if the plant has other masses, a payload or friction, f holds those as well.  f must be
-differentiable (Assumption 1), so a disturbance that jumps says when: `jump_times`.
+differentiable (Assumption 1), so a discontinuous disturbance declares its `jump_times`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from iblf_jax.world.robots import Robot
 
 
 class Disturbance(Protocol):
-    """What the package asks of a disturbance."""
+    """The contract of a disturbance."""
 
     def torque(
         self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot
@@ -39,8 +39,8 @@ class Disturbance(Protocol):
     def jump_times(self) -> jax.Array:
         """Times at which `torque` is discontinuous, (m,) [s]; empty if it never is.
 
-        Steps of a run are divided there, so a torque that jumps and does not say so costs accuracy.
-        How many there are is fixed; the times are computed from leaves with jnp, may differ between
+        Steps of a run are divided at these times; an undeclared jump reduces the accuracy.  The
+        number of times is fixed.  The times are computed from leaves with jnp, may differ between
         runs, and have derivatives.
         """
         ...
@@ -81,7 +81,7 @@ class ModelShaped:
       velocity_amplitude: amplitude of b, () or (n,) [rad/s].
       velocity_frequency: angular frequency of b, () or (n,) [rad/s].
       velocity_phase: phase of b at t = 0, () or (n,) [rad].
-      phase: shift of all of it, () [rad]; 0 if not given.
+      phase: shift of both signals, () [rad]; 0 if not given.
 
     Source: Zhang & Yan 2024, (4.3).
     """
@@ -138,11 +138,11 @@ class Sinusoids:
 
 @component
 class Step:
-    """Joint torques that appear at one time: `size` from `time` on.
+    """A step of the joint torques: `size` from `time` on, zero before.
 
     Args:
       size: the torques, () or (n,) [N m].
-      time: when they appear, () [s].
+      time: time of the step, () [s].
     """
 
     size: Leaf = leaf("N m")
@@ -167,7 +167,8 @@ class TipForce:
     (The paper's f_ext in (2.1) is the force that the tip exerts, hence its minus sign: F = -f_ext.)
 
     Args:
-      amplitude: one number a coordinate of the tip, () or (2,) for a planar arm, (3,) in space [N].
+      amplitude: one number per coordinate of the tip, () or (2,) for a planar arm, (3,) in space
+        [N].
       frequency: angular frequency, of the same shape or () [rad/s]; 0 if not given.
       phase: phase at t = 0, of the same shape or () [rad]; 0 if not given.
       offset: mean force, of the same shape or () [N]; 0 if not given.

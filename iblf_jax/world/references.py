@@ -1,8 +1,8 @@
 """Reference trajectories q_d(t).
 
-A reference says where each joint should be, `position(t)`; its velocity and acceleration are taken
-by automatic differentiation where they are needed, never written by hand.  So a reference must be
-smooth: the law needs q_d' and q_d", and its derivative alpha' is continuous only if q_d" is.
+A reference gives the desired position of each joint, `position(t)`; its velocity and acceleration
+follow by automatic differentiation.  A reference must therefore be smooth: the law needs q_d' and
+q_d", and its derivative alpha' is continuous only if q_d" is.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from iblf_jax.core.pytree import Leaf, component, leaf, static
 
 
 class Reference(Protocol):
-    """What the package asks of a reference.
+    """The contract of a reference.
 
-    One that is switched at some times also has `jump_times()`, the times at which q_d, q_d' or q_d"
-    jumps, (m,) [s], as disturbances have: steps of a run are divided there.
+    A reference that is discontinuous in time also has `jump_times()`, the times (m,) [s] at which
+    q_d, q_d' or q_d" jumps; steps of a run are divided there, as for disturbances.
     """
 
     def position(self, t: jax.Array) -> jax.Array:
@@ -63,9 +63,9 @@ class Quintic:
     Velocity and acceleration vanish at both ends.
 
     Args:
-      start: where it begins, () or (n,) [rad].
-      end: where it ends, () or (n,) [rad].
-      duration: how long it takes, () [s], > 0.
+      start: initial position, () or (n,) [rad].
+      end: final position, () or (n,) [rad].
+      duration: duration of the motion, () [s], > 0.
 
     Source: T. Flash, N. Hogan, J. Neuroscience 5 (1985) 1688-1703.
     """
@@ -90,7 +90,7 @@ class WaypointSpline:
 
     Args:
       times: strictly increasing times of the waypoints, a tuple of m numbers [s].
-      waypoints: one row a time, (m, n) [rad].
+      waypoints: one row per time, (m, n) [rad].
 
     Source: C. de Boor, A Practical Guide to Splines, 1978 (basis computed by SciPy's
       `make_interp_spline`).

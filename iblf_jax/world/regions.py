@@ -1,15 +1,14 @@
 """Regions in which points of the robot must stay: half-spaces and spheres, for its tip or the
 origin of any joint.
 
-With x(q) the point in the base's frame and h the region's `level`, positive inside and 0 on the
-wall,
+With x(q) the point in the base's frame and h the region's `level`, positive inside and 0 at the
+boundary,
 
     h' = dh/dq q',   h" = dh/dq q" + c,   c = d/ds (dh/dq q')(q + s q') at s = 0
     [m/s], [m/s^2]
 
-so conditions on h" are linear in the accelerations: `along` gives h, h', dh/dq and c.  What a run
-has left of a region is the `distance` to its wall, whatever the law; a `controllers.SafetyFilter`
-keeps h.
+so conditions on h" are linear in the accelerations: `along` gives h, h', dh/dq and c.  Every run
+records the `distance` to the boundary as its margin; a `controllers.SafetyFilter` keeps h >= 0.
 """
 
 from __future__ import annotations
@@ -28,22 +27,22 @@ KEEPS = ("inside", "outside")
 
 
 class Region(Protocol):
-    """What the package asks of a region: a component that also says, in a static field, which point
-    it is for.
+    """The contract of a region: a component with a static field that names the point of the
+    robot.
     """
 
     point: str | int
-    """ "tip", or the joint by its name or number whose origin it is."""
+    """ "tip", or the name or number of a joint, for the origin of this joint."""
 
     def distance(self, x: jax.Array) -> jax.Array:
-        """Distance of a point (2,) or (3,) [m] to the boundary, () [m]: positive where it may be,
-        negative beyond.
+        """Distance of a point (2,) or (3,) [m] to the boundary, () [m]: positive inside,
+        negative outside.
         """
         ...
 
     def level(self, x: jax.Array) -> jax.Array:
-        """A function, () [m], with the distance's sign and, at the boundary, its slope, that can be
-        differentiated twice inside.
+        """A function, () [m], that is twice differentiable inside; it has the sign of the distance
+        and, at the boundary, its slope.
         """
         ...
 
@@ -57,7 +56,7 @@ class HalfSpace:
         points [1]; its length does not matter.
       offset: distance of the boundary from the base's origin along the normal, () [m]; 0 if not
         given.
-      point: "tip", or the joint by its name or number whose origin is kept; "tip" if not given.
+      point: "tip", or the name or number of a joint, for its origin; "tip" if not given.
 
     Source: textbook.
     """
@@ -84,7 +83,7 @@ class HalfSpace:
 
 @component
 class Sphere:
-    """Inside or outside of a sphere, in the plane of a circle.
+    """The inside or outside of a sphere, or of a circle in the plane.
 
     Distance and level are |x - centre| - radius outside.  Inside, where the distance radius - |x -
     centre| has an edge at the centre, the level is (radius^2 - |x - centre|^2)/(2 radius).
@@ -93,7 +92,7 @@ class Sphere:
       centre: in the base's frame, (2,) or (3,) as the robot's points [m].
       radius: its radius, () [m], > 0.
       keep: "inside" or "outside"; "outside" if not given.
-      point: "tip", or the joint by its name or number whose origin is kept; "tip" if not given.
+      point: "tip", or the name or number of a joint, for its origin; "tip" if not given.
 
     Source: textbook.
     """
@@ -104,9 +103,7 @@ class Sphere:
     point: str | int = static(default=TIP)
 
     def check(self) -> None:
-        """Raises ValueError for a centre that is no point, or another word than inside and
-        outside.
-        """
+        """Raises ValueError for a centre that is not a point, or an unknown `keep`."""
         _is_point("Sphere.centre", self.centre)
         checks.one_of("Sphere.keep", self.keep, KEEPS)
 
@@ -132,8 +129,8 @@ def _is_point(name: str, value: jax.Array) -> None:
 
 
 def row_of(robot: Robot, point: str | int) -> int:
-    """Which row of the robot's skeleton a region's point is; ValueError for a joint that it does
-    not have.
+    """The row of the robot's skeleton that holds a region's point; ValueError for an unknown
+    joint.
     """
     names = joint_names(robot, robot.n)
     if point == TIP and TIP not in names:
@@ -146,18 +143,18 @@ def row_of(robot: Robot, point: str | int) -> int:
 
 
 def position_of(robot: Robot, point: str | int, q: jax.Array) -> jax.Array:
-    """Where a region's point is at q, (2,) or (3,) [m]."""
+    """Position of a region's point at q, (2,) or (3,) [m]."""
     row = row_of(robot, point)
     return robot.tip(q) if row == robot.n else robot.skeleton(q)[row]
 
 
 def margins(regions: tuple[Region, ...], robot: Robot, q: jax.Array) -> jax.Array:
-    """Distance of every region's point to its wall, (m,) [m] for m regions."""
+    """Distance of every region's point to the boundary, (m,) [m] for m regions."""
     return jnp.stack([region.distance(position_of(robot, region.point, q)) for region in regions])
 
 
 def in_words(region: Region, robot: Robot) -> str:
-    """Whose region it is: the tip, or a joint by its name."""
+    """The point of a region in messages: the tip, or the origin of a joint."""
     row = row_of(robot, region.point)
     return f"the {TIP}" if row == robot.n else f"the origin of {joint_names(robot, robot.n)[row]}"
 

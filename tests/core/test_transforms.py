@@ -339,7 +339,7 @@ def test_where_kernels_cannot_the_scan_differentiates(paper, monkeypatch):
         raise UnsupportedError("made up")
 
     for place, name, value in (
-        (thresholds, "KEPT_NUMBERS", 10),
+        (thresholds, "MAX_KEPT_NUMBERS", 10),
         (thresholds, "MAX_COLUMNS", 1),
         (registry, "automatic", lambda: registry.Availability("vmap", "no compiler")),
         (transformable, "_columns", no_kernel),

@@ -91,7 +91,7 @@ def test_every_shape_is_the_same_run(short_loop, run):
     for shape in shapes[:1] if run.record_every == 1 else shapes:
         assert_same(outcome(inputs, run, shape, DRAWS), together)
     whole = jax.jit(
-        lambda inputs: compile.scanned(
+        lambda inputs: compile.run_by_scan(
             plan.BatchLayout("vmap", "loop", True),
             inputs,
             None,

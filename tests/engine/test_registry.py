@@ -119,7 +119,7 @@ def test_where_no_kernel_can_be_compiled_auto_runs_by_the_scan(scenario, monkeyp
     )
     monkeypatch.setattr(registry, "EXECUTORS", {"native": without})
     CACHE.clear(compile.WARNINGS)
-    assert registry.automatic() == ("vmap", reason)
+    assert registry.default_backend() == ("vmap", reason)
     expected = ij.simulate(scenario, **SHORT, backend="vmap")
     with pytest.warns(compile.BackendWarning, match=r"iblf_jax\[export\].*running on vmap"):
         found = ij.simulate(scenario, **SHORT)

@@ -78,7 +78,7 @@ def both(scenario, varied=()):
     """What a step gives by its program and by JAX."""
     batch, carries, program = lowered(scenario, varied)
     carry, lane = (jax.tree.map(lambda x: x[0], x) for x in (carries, batch.leaves.per_run))
-    inputs = batch.leaves.together(batch.leaves.shared, lane)
+    inputs = batch.leaves.unflatten(batch.leaves.shared, lane)
     values = (numbers(x) for x in (batch.leaves.shared, lane, jax.tree.leaves(carry)))
     index = jnp.int32(3)
     return evaluate(program, *values, index), numbers(by_jax(inputs, carry, index))
@@ -121,7 +121,7 @@ def test_what_differs_between_runs_is_never_compiled_in(path):
         x[0] + 0.01 * np.cos(1.0 + np.arange(x[0].size).reshape(x[0].shape))
         for x in batch.leaves.per_run
     ]
-    inputs = batch.leaves.together(batch.leaves.shared, moved)
+    inputs = batch.leaves.unflatten(batch.leaves.shared, moved)
     values = (numbers(x) for x in (batch.leaves.shared, moved, jax.tree.leaves(carry)))
     expected = numbers(by_jax(inputs, carry, jnp.int32(3)))
     np.testing.assert_allclose(evaluate(program, *values, 3), expected, rtol=1e-10, atol=1e-12)
@@ -197,7 +197,7 @@ def test_derivatives_by_the_geometry(monkeypatch):
         )(scenario, start)
 
     known, plain = by("native", robot_constants(scenario)), by("vmap", None)
-    no_tangents = registry.NATIVE._replace(limits=registry.Limits(derivatives=0))
+    no_tangents = registry.NATIVE._replace(limits=registry.Limits(derivative_nodes=0))
     monkeypatch.setitem(registry.EXECUTORS, "native", no_tangents)
     column_by_column = by("auto", robot_constants(scenario))
     for name, expected in plain.items():

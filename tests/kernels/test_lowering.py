@@ -122,7 +122,7 @@ def carry_of(inputs, varied, method):
         )
         return start(inputs, method, jacobian - jnp.eye(size, dtype=inputs.dt.dtype))
 
-    return Batch.of(inputs, varied).each(one)
+    return Batch.of(inputs, varied).map_runs(one)
 
 
 def evaluate(p: program.Program, shared, lane, carry, index):
@@ -163,7 +163,7 @@ def test_every_member_lowers_and_its_program_is_its_step(family, name, monkeypat
     whole, step = Inputs(scenario, STANDARD, dt, jnp.asarray(10.0)), TimeStep("heun")
     run, carries = Batch.of(whole, varied), carry_of(whole, varied, "heun")
     carry = jax.tree.map(lambda x: x[0], carries)
-    inputs = run.leaves.together(run.leaves.shared, [x[0] for x in run.leaves.per_run])
+    inputs = run.leaves.unflatten(run.leaves.shared, [x[0] for x in run.leaves.per_run])
     p, _ = program_of(step, run, carries)
     expected = numbers(
         jax.tree.leaves(

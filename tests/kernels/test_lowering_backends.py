@@ -93,7 +93,7 @@ def recorded_steps():
 
     def steps(loop, values):
         batch = Batch.of(inputs, values)
-        carry = batch.each(lambda inputs: start(inputs, "euler", jnp.zeros((6, 6))))
+        carry = batch.map_runs(lambda inputs: start(inputs, "euler", jnp.zeros((6, 6))))
         return loop(step, batch, carry, 40, 5)
 
     values = {k: jnp.asarray(v) for k, v in draws(19).items()}
@@ -296,8 +296,8 @@ def test_a_long_step_is_cut_into_functions(monkeypatch, parts, record_every):
     places of some products with sums differ."""
     whole = batch(record_every=record_every)
     if parts != "calls":
-        monkeypatch.setattr(thresholds, "LONGEST_C_FUNCTION", 0)
-        monkeypatch.setattr(thresholds, "NODES_OF_A_C_FUNCTION", 50)
+        monkeypatch.setattr(thresholds, "MAX_C_FUNCTION_NODES", 0)
+        monkeypatch.setattr(thresholds, "SEGMENT_NODES", 50)
     if parts != "functions":
         limits = thresholds.LOWERING_LIMITS._replace(written_out=10)
         monkeypatch.setattr(thresholds, "LOWERING_LIMITS", limits)
@@ -337,7 +337,7 @@ def test_forward_sensitivities(monkeypatch, written_out):
         with monkeypatch.context() as patch:
             if by_columns:
                 executor = registry.EXECUTORS["native"]
-                limits = executor.limits._replace(derivatives=0)
+                limits = executor.limits._replace(derivative_nodes=0)
                 patch.setitem(registry.EXECUTORS, "native", executor._replace(limits=limits))
                 patch.setattr(execute, "run_with_tangents", None)
             outcome, tangents, products = pushed("auto" if by_columns else "native")

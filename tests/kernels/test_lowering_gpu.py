@@ -334,7 +334,7 @@ def test_auto_on_a_gpu_without_nvrtc_runs_on_vmap(monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(gpu, "architecture", lambda: "sm_90")
     monkeypatch.setattr(nvrtc, "library", missing)
-    assert registry.automatic() == ("vmap", "there is no NVRTC")
+    assert registry.default_backend() == ("vmap", "there is no NVRTC")
     with pytest.warns(
         compile.BackendWarning,
         match="gpu backend is not available .there is no NVRTC.: running on vmap",
@@ -342,7 +342,7 @@ def test_auto_on_a_gpu_without_nvrtc_runs_on_vmap(monkeypatch):
         assert with_fallback("auto", lambda name: name, lambda: "vmap") == "vmap"
     monkeypatch.setattr(nvrtc, "library", lambda: None)
     monkeypatch.setattr(gpu, "compiler", lambda: None)
-    assert registry.automatic() == ("gpu", None)
+    assert registry.default_backend() == ("gpu", None)
 
 
 @needs_a_cpu
@@ -358,7 +358,7 @@ def test_the_default_device_decides_on_a_machine_with_a_gpu(paper, monkeypatch):
         ij.monte_carlo(paper, perturbations, runs=3, duration=0.05, devices=jax.devices("cpu"))
     monkeypatch.setattr(jax, "local_devices", lambda **_: pytest.fail("these would be GPUs"))
     with jax.default_device(jax.devices("cpu")[0]):
-        assert registry.automatic() == ("native", None)
+        assert registry.default_backend() == ("native", None)
         run = ij.simulate(paper, duration=0.05, dt=1e-3)
         study = ij.monte_carlo(paper, perturbations, runs=600, duration=0.05, dt=1e-3)
     assert study.backend == "native"

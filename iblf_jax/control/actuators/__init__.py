@@ -1,4 +1,6 @@
-"""Actuators: what becomes of a commanded torque.  The contract is `Actuator` in `_base.py`."""
+"""Actuators: from the commanded to the delivered torque.  The contract is `Actuator` in
+`_base.py`.
+"""
 
 from iblf_jax.control.actuators._base import Actuator as Actuator
 from iblf_jax.control.actuators._base import Delivered as Delivered

@@ -1,7 +1,7 @@
 """The contract of an actuator: it takes the law's command and gives a torque.
 
-Its state is integrated with the plant.  Friction is the plant's, delay the sampled loop's
-(`Sampling`).
+Its state is integrated with the plant.  Friction belongs to the plant, and delay to the sampled
+loop (`Sampling`).
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ State = Any
 
 
 class Delivered(NamedTuple):
-    """What an actuator does at one instant; torque and flag are (n,)."""
+    """The output of an actuator at one instant; torque and flag are (n,)."""
 
     tau: jax.Array
     """Torque on the joint [N m]."""
     limited: jax.Array
-    """bool: a limit was at work."""
+    """bool: a limit was active."""
     rate: State
     """Rate of its state."""
 
 
 class Actuator(Protocol):
-    """What the package asks of an actuator.
+    """The contract of an actuator.
 
     The command of a law is a torque.  An actuator may take another input, such as a voltage, under
     a law that commands one; an observer is given the command, so such a loop needs one that does
@@ -36,8 +36,8 @@ class Actuator(Protocol):
 
     An actuator with limits also has the property `unlimited`, the same actuator without them; the
     fastest mode of a loop is computed with it.  An actuator that changes with time, such as a drive
-    that fails, has `at(t)`, the actuator as it is at time t [s], and, if it jumps, `jump_times()`,
-    (m,) [s], as disturbances have: steps of a run are divided there.
+    that fails, has `at(t)`, the actuator at time t [s], and, if it is discontinuous in time,
+    `jump_times()`, (m,) [s]; steps of a run are divided there, as for disturbances.
     """
 
     def init(self, tau: jax.Array) -> State:
@@ -56,7 +56,7 @@ class Actuator(Protocol):
 
 
 actuator_member = OptionalMembers(unlimited=None, advice=list)
-"""Reads what an actuator may lack."""
+"""Reads optional members of an actuator."""
 
 
 def unlimited(actuator: Actuator) -> Actuator:

@@ -1,4 +1,4 @@
-"""Actuators one behind the other."""
+"""Actuators in series."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from iblf_jax.core.time import as_at, joined, jump_times_of
 
 @component
 class Chain:
-    """Each receives what the one before it delivers: `Chain((Motor(bandwidth=2000.0, limit=40.0),
-    Motor(bandwidth=300.0)))`.
+    """Each actuator receives the torque of the previous one: `Chain((Motor(bandwidth=2000.0,
+    limit=40.0), Motor(bandwidth=300.0)))`.
 
     Args:
       parts: any actuators, a tuple or a list, from the command to the joint; at least one.

@@ -40,7 +40,7 @@ without a unit."""
 
 
 class Barrier(Protocol):
-    """What the package asks of a barrier.  All arrays are (n,), one number a joint, and joints do
+    """The contract of a barrier.  All arrays are (n,), one number a joint, and joints do
     not mix.
     """
 

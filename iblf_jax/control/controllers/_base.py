@@ -25,7 +25,7 @@ State = Any
 
 
 class LawContext(NamedTuple):
-    """What a law knows of the world: model, reference and bounds."""
+    """The inputs of a law besides measurements: model, reference and bounds."""
 
     model: Robot
     reference: Reference
@@ -38,15 +38,13 @@ class LawContext(NamedTuple):
         return _tube(self.reference, self.bounds, t, acceleration)
 
     def speed_limits(self, t: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """The bounds on the velocities at time t [s], (n,) each [rad/s]; only where there are
-        any.
+        """The bounds on the velocities at time t [s], (n,) each [rad/s]; requires velocity
+        bounds.
         """
         return speed_limits_at(self.reference, self.velocity_bounds, t)  # type: ignore[arg-type]
 
     def regions_along(self, q: jax.Array, dq: jax.Array) -> Along:
-        """How the model's points move through the regions at q [rad] and dq [rad/s]; only where
-        there are any.
-        """
+        """Levels of all regions and their rates at q [rad] and dq [rad/s]; requires regions."""
         return along(self.regions, self.model, q, dq)
 
 
@@ -76,7 +74,7 @@ class Command(NamedTuple):
 
 
 class Controller(Protocol):
-    """What the package asks of a law.
+    """The contract of a tracking law.
 
     A law with a proof of its own may also fit `LyapunovLaw`; then `certify` checks what it states.
 
@@ -145,8 +143,8 @@ law_member = OptionalMembers(
     weight=None,
     reading="",
 )
-"""Reads what a law may lack: the members that `Controller` and `LyapunovLaw` describe as optional,
-and some fields that laws with a barrier have."""
+"""Reads optional members of a law: those that `Controller` and `LyapunovLaw` describe, and some
+fields of laws with a barrier."""
 
 
 def switching_functions(
@@ -190,14 +188,14 @@ def rigid_body_torque(
 
 
 class LyapunovLaw(Protocol):
-    """What a law that states a claim of its own has besides: a Lyapunov function V and its decay W,
-    for `certify` to check.
+    """The additional methods of a law with a Lyapunov function V and its decay W, which `certify`
+    checks.
 
         V' <= -W + T
 
-    `certify` differentiates V along the vector field of the loop and holds the inequality against
-    every step of a run.  T is what `disturbance_terms` returns.  A law without that method is given
-    what the uncertain term adds to V' whatever the law is, T = dV/dq' . M0^-1 f_tilde + dV/df_tilde
+    `certify` differentiates V along the vector field of the loop and tests the inequality at every
+    step of a run.  T is the result of `disturbance_terms`, by default the contribution of the
+    uncertain term to V' for any law, T = dV/dq' . M0^-1 f_tilde + dV/df_tilde
     . f'.  V, W and T are (), or (n,) and then summed; unit and scale of V are the law's choice.
     """
 

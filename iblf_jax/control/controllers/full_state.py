@@ -26,8 +26,8 @@ A weight w_i > 0 of each joint scales the first barrier, V1 = sum_i w_i V1_i: th
 s1 in (F.1), the cross term cancels as before, and all claims hold with this V1.
 
 The integral and the logarithmic barrier have another e2/s2 on either side of e2 = 0 where K_u and
-K_l differ: there the torque jumps by M0 s1 (K_u^2 - K_l^2)/2, which the exact cancellation asks
-  for.  `Tan`, `State`, `Mapping` and `PrescribedPerformance` have no jump.
+K_l differ: there the torque jumps by M0 s1 (K_u^2 - K_l^2)/2, which the exact cancellation
+requires.  `Tan`, `State`, `Mapping` and `PrescribedPerformance` have no jump.
 
 **Derivatives across the jump.**  In a continuous loop the derivative of a step that reaches e2_i =
 0 is that of the hybrid flow, with the jump of a perturbation at the crossing (`engine.switching`,
@@ -101,7 +101,7 @@ class FullState:
       k1: gain of the virtual velocity, () or (n,) [1/s], > 0.
       K2: gain of the velocity error, () or (n,) [1/s], > 0; an acceleration's, not a torque's as
         `Backstepping.K2`.
-      c: how hard the slope s2 is resisted while the observer has not found f, () or (n,)
+      c: gain of the slope s2, which limits the effect of the estimation error f_tilde, () or (n,)
         [rad^2/s^3] (1/s where phi is in rad^2/s^2), > 0; the claim of case 2 asks for c > 1/(4 (kf
         - 1/2) lambda_min(M0)^2).
       o: margin under the roots of both kappas, () or (n,) [1/s^2], > 0, for barriers that have them

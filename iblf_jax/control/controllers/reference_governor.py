@@ -35,7 +35,7 @@ from iblf_jax.core.pytree import Leaf, component, leaf
 
 
 class GovernorState(NamedTuple):
-    """What a governed law remembers."""
+    """State of `ReferenceGovernor`."""
 
     g: jax.Array
     """The reference that the law is given, (n,) [rad]."""
@@ -45,10 +45,10 @@ class GovernorState(NamedTuple):
 
 @component
 class _AtRest:
-    """A reference that stays where it is.
+    """A constant reference.
 
     Args:
-      g: where, () or (n,) [rad].
+      g: the position, () or (n,) [rad].
 
     Source: none.
     """
@@ -69,12 +69,12 @@ class ReferenceGovernor:
     wrapped law's Kp.
 
     Args:
-      law: what is governed, `PDGravity` or `ComputedTorque`.
-      eta: how fast g moves, () or (n,) [rad/(N m s)] (1/(rad s) around computed torque), > 0; 50 if
-        not given.
+      law: the governed law, `PDGravity` or `ComputedTorque`.
+      eta: gain of the rate of g, () or (n,) [rad/(N m s)] (1/(rad s) around computed torque), > 0;
+        50 if not given.
       margin: distance that is kept from the bounds, () or (n,) [rad], >= 0; 0.02 if not given.
-      width: distance at which walls repel g and over which the attraction ends, () or (n,) [rad], >
-        0; 0.02 if not given.
+      width: distance at which bounds repel g and over which the attraction ends, () or (n,) [rad],
+        > 0; 0.02 if not given.
 
     Source: M. M. Nicotra, E. Garone, IEEE Control Systems Magazine 38 (2018) 89-107; E. Gilbert, I.
       Kolmanovsky, Automatica 38 (2002)
@@ -100,10 +100,10 @@ class ReferenceGovernor:
 
     def init(self, q: jax.Array, dq: jax.Array, context: LawContext) -> GovernorState:
         """g(0) = q(0), moved inside the margin where it is not."""
-        low, high = self._walls(jnp.zeros((), q.dtype), context)
+        low, high = self._allowed_range(jnp.zeros((), q.dtype), context)
         return GovernorState(jnp.minimum(jnp.maximum(q, low), high), self.law.init(q, dq, context))
 
-    def _walls(self, t: jax.Array, context: LawContext) -> tuple[jax.Array, jax.Array]:
+    def _allowed_range(self, t: jax.Array, context: LawContext) -> tuple[jax.Array, jax.Array]:
         """The bounds less the margin, (n,) each [rad]."""
         tube = context.tube(t, acceleration=False)
         return tube.lower + self.margin, tube.upper - self.margin
@@ -119,7 +119,7 @@ class ReferenceGovernor:
     def level(self, t: jax.Array, g: jax.Array, context: LawContext) -> jax.Array:
         """Gamma, () in the unit of V; 0 for a g outside."""
         law: Any = self.law
-        low, high = self._walls(t, context)
+        low, high = self._allowed_range(t, context)
         return 0.5 * jnp.min(law.Kp * jnp.maximum(jnp.minimum(g - low, high - g), 0.0) ** 2)
 
     def switching(
@@ -139,7 +139,7 @@ class ReferenceGovernor:
         state: GovernorState,
     ) -> tuple[Command, GovernorState]:
         """The law's command for the reference g, and the rates of g and of the law's state."""
-        g, (low, high) = state.g, self._walls(t, context)
+        g, (low, high) = state.g, self._allowed_range(t, context)
         command, rate = self.law.command(
             t, q, dq, f_hat, context._replace(reference=_AtRest(g)), state.law
         )

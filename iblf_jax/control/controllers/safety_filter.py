@@ -65,7 +65,7 @@ class SafetyFilter:
     "controller.K2" is the wrapped law's K2.
 
     Args:
-      law: whose torque is filtered, any `Controller`.
+      law: the law whose torque is filtered, any `Controller`.
       a1: first rate of the position's conditions, () or (n,) [1/s] ([rad/s] for "atan"), > 0; 10 if
         not given.
       a2: second rate of these, () or (n,) [1/s] ([s/rad^2] for "cubic"), > 0; 10 if not given.
@@ -154,13 +154,13 @@ class SafetyFilter:
         command, rate = self.law.command(t, q, dq, f_hat, context, state)
         model, tau_law = context.model, command.tau
         M = model.mass_matrix(q)
-        planned = solve_spd(M, tau_law + f_hat - model.coriolis(q, dq, dq) - model.gravity(q))
+        nominal = solve_spd(M, tau_law + f_hat - model.coriolis(q, dq, dq) - model.gravity(q))
         lowest, highest = self.box(t, q, dq, context)
         if self.nearest == "acceleration" and self.limit is None and not context.regions:
-            # An empty box is broken on both sides alike.
+            # An empty box is violated equally on both sides.
             slack = jnp.maximum(0.5 * (lowest - highest), 0.0)
-            admitted = jnp.clip(planned, lowest - slack, highest + slack)
-            tau = tau_law + matvec(M, admitted - planned)
+            admitted = jnp.clip(nominal, lowest - slack, highest + slack)
+            tau = tau_law + matvec(M, admitted - nominal)
             return command._replace(tau=tau, slack=slack), rate
         unit = jnp.eye(context.model.n, dtype=tau_law.dtype)
         # The unknown is the change of the torque or of the acceleration; the columns of these two
@@ -168,16 +168,16 @@ class SafetyFilter:
         torque, acceleration = M, unit
         if self.nearest == "torque":
             torque, acceleration = unit, jnp.stack([solve_spd(M, row) for row in unit])
-        rows = [(acceleration, highest - planned, 1.0), (-acceleration, planned - lowest, 1.0)]
+        rows = [(acceleration, highest - nominal, 1.0), (-acceleration, nominal - lowest, 1.0)]
         if context.regions:
-            at = context.regions_along(q, dq)
+            levels = context.regions_along(q, dq)
             room = (
-                matvec(at.slope, planned)
-                + at.bend
-                + (self.b1 + self.b2) * at.rate
-                + self.b1 * self.b2 * at.level
+                matvec(levels.slope, nominal)
+                + levels.bend
+                + (self.b1 + self.b2) * levels.rate
+                + self.b1 * self.b2 * levels.level
             )
-            rows.append((-matmul(at.slope, acceleration), room, 1.0))
+            rows.append((-matmul(levels.slope, acceleration), room, 1.0))
         saturated = command.saturated
         if self.limit is not None:
             rows += [(torque, self.limit - tau_law, 0.0), (-torque, self.limit + tau_law, 0.0)]
@@ -193,11 +193,11 @@ class SafetyFilter:
 
 
 def _nearest(rows: list[tuple[jax.Array, jax.Array, float]]) -> Solution:
-    """The least change x with  row x <= room  for all rows, each with its room and whether it may
-    be broken; none where all have room.
+    """The smallest x with  row x <= room  for all rows (row, room, 1 if it may be violated, else
+    0); zero if no row has a negative room.
     """
     room = jnp.concatenate([room for _, room, _ in rows])
-    soft = jnp.concatenate([jnp.full_like(room, may_break) for _, room, may_break in rows])
+    soft = jnp.concatenate([jnp.full_like(room, is_soft) for _, room, is_soft in rows])
     G = jnp.concatenate([row for row, _, _ in rows])
     found = quadratic_program(jnp.eye(G.shape[1], dtype=G.dtype), G, room, soft)
     free = jnp.all(room >= 0)

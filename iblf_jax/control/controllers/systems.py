@@ -1,9 +1,7 @@
-"""The systems that the paper names, each by its name: which law with which barrier, and the gains
-of the yardsticks.
+"""Laws by name: the systems of the paper with their barriers, and the baselines with their gains.
 
-All barrier laws take the same k1, K2 and o, so that they are compared at equal gains; computed
-torque and PD have their own.  So have the laws that keep other constraints, or keep them otherwise:
-full state, a governor, a filter.
+All barrier laws take the same k1, K2 and o, so that they are compared at equal gains.  Computed
+torque, PD and the laws for other constraints (full state, governor, filter) have their own gains.
 """
 
 from __future__ import annotations
@@ -58,9 +56,9 @@ paper's bounds."""
 LAWS = (*BARRIERS, "adaptive_rbf", "dynamic_surface", *BASELINES)
 """Every system of the paper by the name that `law_by_name`, the presets and `compare` take."""
 KEEPERS = ("full_state", "reference_governor", "safety_filter")
-"""Laws for other constraints by the names that these take too: full state (for scenarios with
-`velocity_bounds`; K2 in 1/s), a reference governor around the yardstick "pd", a safety filter
-around the unconstrained "backstepping"."""
+"""Further names that `law_by_name`, the presets and `compare` take: full state (for scenarios with
+`velocity_bounds`; K2 in 1/s), a reference governor around "pd", and a safety filter around the
+unconstrained "backstepping"."""
 
 _WITHOUT_OBSERVER = ("adaptive_rbf", "pd", "reference_governor")
 

@@ -19,7 +19,7 @@ State = Any
 
 
 class Observer(Protocol):
-    """What the package asks of an observer.
+    """The contract of a disturbance observer.
 
     An observer may have two further methods for sampled loops, which use a step of Euler without
     them.  `advance(t, q, dq, tau, model, state, period)` returns its state a period [s] later for
@@ -47,4 +47,4 @@ class Observer(Protocol):
 
 
 observer_member = OptionalMembers(advance=None, at_period=None, advice=list)
-"""Reads what an observer may lack."""
+"""Reads optional members of an observer."""

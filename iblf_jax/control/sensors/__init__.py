@@ -1,4 +1,4 @@
-"""Sensors: what a law that runs at a period knows of q and q'.  The contracts are `Sensor` and
+"""Sensors: the measurements of q and q' for a sampled law.  The contracts are `Sensor` and
 `Velocity` in `_base.py`.
 """
 
@@ -15,7 +15,7 @@ from iblf_jax.control.sensors.tracking import Tracking as Tracking
 MEMBERS = {"ideal": Ideal, "encoder": Encoder}
 """Every sensor by the name that a scenario file gives it."""
 VELOCITIES = {"measured": Measured, "filtered_difference": FilteredDifference, "tracking": Tracking}
-"""Every way to a velocity by the name that a scenario file gives it."""
+"""Every velocity estimate by the name that a scenario file gives it."""
 
 __all__ = [
     "MEMBERS",

@@ -1,7 +1,7 @@
 """The contracts of a sensor, and of the velocity estimate of a sensor that measures positions.
 
-A sensor is read once a period, at its start.  What it draws are standard normal numbers, which the
-loop gives it: they depend on seed, run, sample and joint alone.  Torque is never measured.
+A sensor is read once per period, at its start.  The loop passes it standard normal numbers that
+depend only on seed, run, sample and joint.  Torque is never measured.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ State = Any
 
 
 class Measurement(NamedTuple):
-    """What law and observer receive."""
+    """The measurement that law and observer receive."""
 
     q: jax.Array
     """Position, (n,) [rad]."""
@@ -28,7 +28,7 @@ class Measurement(NamedTuple):
 
 
 class Sensor(Protocol):
-    """What the package asks of a sensor.
+    """The contract of a sensor.
 
     A sensor that rounds also has the properties `unrounded`, the same sensor without rounding, with
     which the fastest mode of a loop is computed, and `resolution`, the size of a count, () or (n,)
@@ -38,7 +38,7 @@ class Sensor(Protocol):
 
     @property
     def draws(self) -> int:
-        """How many normal numbers a joint it takes for a sample."""
+        """Number of normal numbers per joint and sample."""
         ...
 
     def init(self, q: jax.Array, dq: jax.Array, period: jax.Array) -> State:
@@ -50,10 +50,10 @@ class Sensor(Protocol):
     def measure(
         self, q: jax.Array, dq: jax.Array, normal: jax.Array, period: jax.Array, state: State
     ) -> tuple[Measurement, State]:
-        """What is measured, and the next state.
+        """The measurement, and the next state.
 
         Args:
-          q, dq: position [rad] and velocity [rad/s] as they are, (n,).
+          q, dq: true position [rad] and velocity [rad/s], (n,).
           normal: independent standard normal numbers, (draws, n).
           period: () [s].
           state: of the sample before.
@@ -62,18 +62,19 @@ class Sensor(Protocol):
 
 
 class Velocity(Protocol):
-    """How a velocity follows from measured positions.  It may have a method `advice(period)`, a
-    list of warnings.
+    """The contract of a velocity estimate from measured positions.
+
+    It may have a method `advice(period)`, which returns a list of warnings.
     """
 
     @property
     def draws(self) -> int:
-        """How many normal numbers a joint it takes for a sample."""
+        """Number of normal numbers per joint and sample."""
         ...
 
     def init(self, y: jax.Array, dq: jax.Array, period: jax.Array) -> State:
-        """State before the first sample, as if the joint had come to y [rad] with the velocity dq
-        [rad/s].
+        """State before the first sample, for a joint that arrives at y [rad] with the velocity
+        dq [rad/s].
         """
         ...
 
@@ -84,7 +85,7 @@ class Velocity(Protocol):
 
         Args:
           y: measured position, (n,) [rad].
-          dq: velocity as it is, (n,) [rad/s], for what measures it.
+          dq: true velocity, (n,) [rad/s], for members that measure it.
           normal: independent standard normal numbers, (draws, n).
           period: () [s].
           state: of the sample before.
@@ -95,7 +96,7 @@ class Velocity(Protocol):
 sensor_member = OptionalMembers(
     unrounded=None, resolution=0.0, velocity=None, advice=lambda period: []
 )
-"""Reads what a sensor, or its velocity, may lack."""
+"""Reads optional members of a sensor or of its velocity estimate."""
 
 
 def unrounded(sensor: Sensor) -> Sensor:
@@ -105,9 +106,7 @@ def unrounded(sensor: Sensor) -> Sensor:
 
 
 def above_nyquist(name: str, cutoff: jax.Array, period: jax.Array) -> list[str]:
-    """What to tell a user whose filter is faster than what is sampled; nothing for traced
-    values.
-    """
+    """A warning about a cutoff above the Nyquist frequency; none for traced values."""
     if not checks.is_concrete((cutoff, period)) or not np.any(
         np.asarray(cutoff) > np.pi / np.asarray(period)
     ):

@@ -19,14 +19,14 @@ from iblf_jax.core.pytree import Leaf, component, leaf
 class Encoder:
     """y = step round((q + offset + noise w) / step),   step = 2 pi / counts,   w standard normal.
 
-    The derivative of y by q is taken as 1, that of what is read before it is rounded: that of the
-    rounding is 0 almost everywhere.
+    The derivative of y by q is defined as 1, that of the reading before rounding, because the
+    derivative of the rounding is 0 almost everywhere.
 
     Args:
-      velocity: how a velocity follows, any of `iblf_jax.sensors.VELOCITIES`.
-      counts: in a turn, () or (n,) [1], > 0; not rounded if not given.
-      offset: what a joint reads where it is 0, () or (n,) [rad]; 0 if not given.
-      noise: standard deviation, () or (n,) [rad], >= 0; none if not given.
+      velocity: the velocity estimate, any of `iblf_jax.sensors.VELOCITIES`.
+      counts: counts per turn, () or (n,) [1], > 0; not rounded if not given.
+      offset: reading at the position 0, () or (n,) [rad]; 0 if not given.
+      noise: standard deviation of the reading, () or (n,) [rad], >= 0; none if not given.
 
     Source: none; the construction is common.
     """
@@ -37,7 +37,7 @@ class Encoder:
     noise: Leaf = leaf("rad", sign="nonnegative", default=None)
 
     def check(self) -> None:
-        """Raises ValueError for a velocity that is none."""
+        """Raises ValueError if `velocity` does not fit `Velocity`."""
         checks.conforms(
             "Encoder.velocity", self.velocity, Velocity, "iblf_jax.sensors.VELOCITIES has them."
         )
@@ -58,11 +58,11 @@ class Encoder:
 
     @property
     def resolution(self) -> jax.Array | float:
-        """What a count is, () or (n,) [rad]; 0 if not rounded."""
+        """Size of a count, () or (n,) [rad]; 0 if not rounded."""
         return 0.0 if self.counts is None else 2.0 * math.pi / self.counts
 
     def _read(self, q: jax.Array) -> jax.Array:
-        """The counts that a position is read as, in [rad]."""
+        """A position rounded to counts, (n,) [rad]."""
         if self.counts is None:
             return q
         step = self.resolution

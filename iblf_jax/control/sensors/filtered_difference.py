@@ -1,4 +1,4 @@
-"""The velocity that most drives use: a difference of positions through a low pass."""
+"""The velocity estimate of most drives: a low-pass filtered difference of positions."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ class FilteredDifferenceValues(NamedTuple):
     """State of `FilteredDifference`."""
 
     y: jax.Array
-    """The position before, (n,) [rad]."""
+    """The previous position, (n,) [rad]."""
     v: jax.Array
-    """The velocity before, (n,) [rad/s]."""
+    """The previous velocity, (n,) [rad/s]."""
 
 
 @component

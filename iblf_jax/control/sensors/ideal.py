@@ -23,5 +23,5 @@ class Ideal:
     def measure(
         self, q: jax.Array, dq: jax.Array, normal: jax.Array, period: jax.Array, state: tuple[()]
     ) -> tuple[Measurement, tuple[()]]:
-        """The truth."""
+        """The true position and velocity."""
         return Measurement(q, dq), ()

@@ -1,4 +1,4 @@
-"""A velocity that is measured, by a tachometer say."""
+"""A measured velocity, for example by a tachometer."""
 
 from __future__ import annotations
 

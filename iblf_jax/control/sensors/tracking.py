@@ -1,4 +1,4 @@
-"""A velocity from a copy of the joint that follows what is measured."""
+"""A velocity estimate from a model of the joint that tracks the measured position."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class TrackingValues(NamedTuple):
     """State of `Tracking`."""
 
     q_hat: jax.Array
-    """Position of the copy, (n,) [rad]."""
+    """Position of the model, (n,) [rad]."""
     v_hat: jax.Array
     """Its velocity, (n,) [rad/s]."""
 
@@ -25,10 +25,10 @@ class Tracking:
     """r = y - q_hat - T v_hat;   q_hat <- y - a^2 r,   v_hat <- v_hat + (1 - a)^2 r / T,   a =
     exp(-bandwidth T).
 
-    Both poles are at a, so a constant velocity is found without a lag.
+    Both poles are at a, so a constant velocity is estimated without lag.
 
     Args:
-      bandwidth: of the copy, () or (n,) [rad/s], > 0.
+      bandwidth: bandwidth of the model, () or (n,) [rad/s], > 0.
 
     Source: alpha-beta filter, P. R. Kalata, IEEE Trans. Aerospace and Electronic Systems 20 (1984)
       174-182, critically damped.
@@ -53,7 +53,7 @@ class Tracking:
         period: jax.Array,
         state: TrackingValues,
     ) -> tuple[jax.Array, TrackingValues]:
-        """The copy's velocity, (n,) [rad/s]."""
+        """The velocity of the model, (n,) [rad/s]."""
         a = jnp.exp(-self.bandwidth * period)
         r = y - state.q_hat - period * state.v_hat
         v = state.v_hat + (1.0 - a) ** 2 * r / period

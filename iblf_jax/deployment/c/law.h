@@ -4,7 +4,7 @@
      ${name}_parameters p = ${name}_defaults;      gains and model parameters of the scenario
      ${name}_state s;
      ${name}_init(&p, &s, q, ${dq_argument}${reference_arguments});    once, at t = 0
-     status = ${name}_step(&p, &s, t, q, ${dq_argument}${reference_arguments}, tau);    once a period of p.${period} s
+     status = ${name}_step(&p, &s, t, q, ${dq_argument}${reference_arguments}, tau);    once a period of p.${period_parameter} s
 
    SI units, radians.  t is the time since init, at which bounds and reference begin.
    Operations per sample: ${operations}. */

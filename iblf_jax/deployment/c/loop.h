@@ -14,7 +14,7 @@
 
 #define ${upper}_JOINTS ${joints}
 #define ${upper}_SETTINGS ${settings}
-#define ${upper}_TOLD ${told}
+#define ${upper}_TOLD ${output_count}
 #define ${upper}_MEMORY ${memory_size}
 
 typedef ${type} ${name}_real;

@@ -4,7 +4,7 @@
 #include <string.h>
 
 #define EXPORT(name) __attribute__((export_name(#name)))
-enum { ROWS = ${rows} };
+enum { ROWS = ${buffer_rows} };
 
 static ${name}_parameters parameters;
 static ${name}_real settings[${upper}_SETTINGS], records[ROWS * ${upper}_TOLD];

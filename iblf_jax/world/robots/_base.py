@@ -1,9 +1,9 @@
-"""The contract of a robot, and what follows from its energies alone.
+"""The contract of a robot, and the methods that follow from its energies.
 
     M(q) q" + C(q, q') q' + G(q) = tau + f                                                  (2.1)
 
-A robot is known by its mass matrix M(q) and its potential U(q): then G = dU/dq, and C follows from
-the Christoffel symbols,
+The mass matrix M(q) and the potential U(q) define a robot: G = dU/dq, and C follows from the
+Christoffel symbols,
 
     C(q, v) u = 1/2 [ (dM/dq . v) u + (dM/dq . u) v - d/dq (u^T M v) ],
 
@@ -31,8 +31,8 @@ T = TypeVar("T")
 
 
 class Robot(Protocol):
-    """What the package asks of a robot with n joints.  All methods are for one configuration, in SI
-    units, and pure.
+    """The contract of a robot with n joints.  All methods are pure functions of one configuration,
+    in SI units.
 
     A member is a component (`iblf_jax.component`) whose inertial parameters are leaves; `payload`
     [kg], a point mass at the tip, is one of them in every member, so that any robot can carry what
@@ -95,8 +95,8 @@ robot_member = OptionalMembers(
     friction_torque=jnp.zeros_like,
     energy_gradient=None,
 )
-"""Reads what a robot may lack: the members that `Robot` describes as optional, and what a robot
-from a file has: names, kinds and limits of its joints."""
+"""Reads optional members of a robot: those that `Robot` describes, and the names, kinds and limits
+of joints that a robot from a file has."""
 
 
 def at_time(robot: T, t: jax.Array) -> T:
@@ -111,7 +111,7 @@ def _mass_matrix(robot: Robot, q: jax.Array) -> jax.Array:
 
 
 def mass_matrix_at(robot: Robot, q: jax.Array) -> jax.Array:
-    """M(q), (n, n) [kg m^2], compiled once for all robots of one structure: of many joints that
+    """M(q), (n, n) [kg m^2], compiled once for all robots of one structure: for many joints, this
     takes seconds.
     """
     keep_programs()
@@ -123,8 +123,8 @@ def mass_matrix_at(robot: Robot, q: jax.Array) -> jax.Array:
 
 
 def friction_torque(robot: Robot, dq: jax.Array) -> jax.Array:
-    """What the joints put against their motion, (n,) [N m], against q' in sign: zero, unless the
-    robot has a method of this name.
+    """Friction torque of the joints, (n,) [N m], opposite to q'; zero unless the robot has a method
+    of this name.
     """
     (dq,) = checks.vectors(dq=dq)
     return robot_member(robot, "friction_torque")(dq)  # type: ignore[no-any-return]
@@ -159,9 +159,7 @@ def coriolis_from_mass_matrix(mass_matrix, q: jax.Array, v: jax.Array, u: jax.Ar
 
 
 def joint_names(robot: Any, n: int) -> tuple[str, ...]:
-    """What the n joints of a robot are called: by its `joints`, the names in its file, else "joint
-    0", "joint 1", ...
-    """
+    """Names of the n joints of a robot: its `joints`, else "joint 0", "joint 1", ..."""
     n = checks.positive_integer("n", n, least=0, most=checks.MAX_JOINTS)
     names = tuple(map(str, robot_member(robot, "joints")))
     if len(names) == n:
@@ -203,7 +201,7 @@ def from_energy(cls: type[T]) -> type[T]:
         class MyArm: ...
 
     Raises:
-      ValueError: something that is no class, or a class that lacks what a method is to follow from.
+      ValueError: something that is no class, or a class that lacks the source of a method.
     """
     sources = {"coriolis": "mass_matrix", "gravity": "potential", "jacobian": "tip"}
     if not isinstance(cls, type):

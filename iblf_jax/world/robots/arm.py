@@ -12,8 +12,8 @@ and I_i the inertia of link i about the world's origin:
     C = sum_i J_i^T (I_i J_i' + B(I_i, V_i) J_i),   V_i = J_i v
     B(I, V) u = 1/2 (V x* (I u) - I (V x u) + u x* (I V))
 
-x and x* are the rates of a motion and of a wrench that are carried along (`spatial.along`).  B +
-B^T = I', so M' - 2 C is skew-symmetric; C is the one of the Christoffel symbols (Echeandia &
+x and x* are the cross products of a motion with a motion and with a wrench (`spatial`).  Since
+B + B^T = I', M' - 2 C is skew-symmetric; C is the one of the Christoffel symbols (Echeandia &
 Wensing 2021).  All links are computed at once; only the positions of the frames go from link to
 link.
 
@@ -40,7 +40,7 @@ from iblf_jax.world.robots._base import broadcast_fields
 from iblf_jax.world.robots.payload import Payload
 
 KINDS = ("revolute", "prismatic")
-"""What a joint can be; one without limits is revolute with infinite ones."""
+"""Kinds of joints; a continuous joint is a revolute one with infinite limits."""
 
 
 class Limits(NamedTuple):
@@ -51,7 +51,7 @@ class Limits(NamedTuple):
 
 
 class Pose(NamedTuple):
-    """Where a frame is."""
+    """Position and orientation of a frame."""
 
     position: jax.Array
     """(3,) [m]."""
@@ -65,12 +65,12 @@ compile hundreds of programs of one operation each."""
 
 
 class Frames(NamedTuple):
-    """The links' frames in the world, and what their joints allow."""
+    """The frames and joint axes of the links in the world."""
 
     placement: jax.Array
     """[R, p] of each, (n, 3, 4)."""
-    allowed: jax.Array
-    """S, the links' motion per unit of joint speed, (n, 2, 3)."""
+    motion_subspaces: jax.Array
+    """S, the motion of each link per unit of its joint's speed, (n, 2, 3)."""
 
 
 NUMBERS_OF_A_JOINT = (
@@ -107,16 +107,16 @@ class Arm:
         origin if not given.
       tip_rotation: orientation of the tip's frame there, a quaternion (w, x, y, z), (4,) [1]; the
         identity if not given.
-      g: acceleration of gravity in the base's frame, (3,) [m/s^2]: it says how the arm is mounted;
+      g: acceleration of gravity in the base's frame, (3,) [m/s^2], which depends on the mounting;
         (0, 0, -9.81) if not given.
       payload: point mass at the tip, () [kg], >= 0; 0 if not given.
-      lower: lower ends of the joints' ranges, () or (n,) [rad]; of the dynamics nothing depends on
+      lower: lower ends of the joints' ranges, () or (n,) [rad]; the dynamics do not depend on
         them; -infinite if not given.
       upper: upper ends of the joints' ranges, () or (n,) [rad]; infinite if not given.
-      effort: largest torques (forces) of the actuators, () or (n,) [N m], > 0; of the dynamics
-        nothing depends on them; infinite if not given.
-      speed: largest speeds of the joints, () or (n,) [rad/s], > 0; of the dynamics nothing depends
-        on them; infinite if not given.
+      effort: largest torques (forces) of the actuators, () or (n,) [N m], > 0; the dynamics do
+        not depend on them; infinite if not given.
+      speed: largest speeds of the joints, () or (n,) [rad/s], > 0; the dynamics do not depend on
+        them; infinite if not given.
       carried: a load with an extent of its own, which may be picked up at a time, a `Payload`;
         nothing if not given.
       kinds: "revolute" or "prismatic", one a joint, (n,); all revolute if not given.
@@ -162,14 +162,14 @@ class Arm:
         "tip_rotation",
         "g",
     )
-    """Fields of which it may be compiled in which numbers are 0, 1 or -1, and which are equal
+    """Fields of which zeros, ones, minus ones and equal numbers may be compiled in
     (`engine.structural_constants`)."""
     rows: ClassVar[dict[str, tuple[str, tuple[str, ...]]]] = {
         "link": ("links", ("mass", "centre", "inertia")),
         "joint": ("joints", ("position", "rotation", "axis", *NUMBERS_OF_A_JOINT)),
     }
-    """What a path may call by name: word -> (the field that holds the names, the fields with one
-    row a name)."""
+    """Elements that a path may address by name: word -> (field of the names, fields with one row
+    per name)."""
 
     def check(self) -> None:
         """Gives every field one row a link, and names; raises ValueError if the fields do not fit
@@ -241,7 +241,7 @@ class Arm:
         return Limits(self.lower, self.upper)
 
     def at(self, t: jax.Array) -> Arm:
-        """The arm as it is at time t [s]: with what it carries then."""
+        """The arm with the load that it carries at time t [s]."""
         if self.carried.start is None:
             return self
         now = copy.copy(self)
@@ -249,37 +249,38 @@ class Arm:
         return now
 
     def jump_times(self) -> jax.Array:
-        """When the arm picks up its load, and when all of the load hangs on it, (2,) [s]; (0,)
-        where it does not pick one up.
+        """Times at which the arm begins and ends to pick up its load, (2,) [s]; (0,) if it picks up
+        none.
         """
         return self.carried.jump_times()
 
     @traced_once
     def _frames(self, q: jax.Array) -> Frames:
         """Frames of the links and directions of the joints at q."""
-        turns = np.array([kind == "revolute" for kind in self.kinds])
+        is_revolute = np.array([kind == "revolute" for kind in self.kinds])
         a, fixed = spatial.unit(self.axis), spatial.rotation(self.rotation)
         axis = spatial.apply(fixed, a)
         along = axis[:, :, None] * a[:, None, :]
         angle = q
-        if not turns.all():
-            angle = jnp.where(turns, q, jnp.zeros_like(q))
+        if not is_revolute.all():
+            angle = jnp.where(is_revolute, q, jnp.zeros_like(q))
         sine, cosine = jnp.sin(angle)[:, None, None], jnp.cos(angle)[:, None, None]
         turned = along + cosine * (fixed - along) + sine * spatial.cross(fixed, a[:, None, :])
         shifted = self.position
-        if not turns.all():
-            shifted = shifted + jnp.where(turns, jnp.zeros_like(q), q)[:, None] * axis
+        if not is_revolute.all():
+            shifted = shifted + jnp.where(is_revolute, jnp.zeros_like(q), q)[:, None] * axis
         H = spatial.chained(spatial.placement(turned, shifted))
         z = spatial.apply(H[:, :, :3], a)
         w, v = z, spatial.cross(H[:, :, 3], z)
-        if not turns.all():
-            w, v = jnp.where(turns[:, None], w, jnp.zeros_like(z)), jnp.where(turns[:, None], v, z)
+        if not is_revolute.all():
+            w = jnp.where(is_revolute[:, None], w, jnp.zeros_like(z))
+            v = jnp.where(is_revolute[:, None], v, z)
         return Frames(H, jnp.stack([w, v], axis=1))
 
     @traced_once
     def _bodies(self, frames: Frames) -> tuple[jax.Array, jax.Array]:
         """Upper rows of the links' pseudo-inertias in the world, (n, 3, 4), and masses, (n, 1); the
-        last with all that the tip carries.
+        last with the load at the tip.
         """
         P = spatial.pseudo_inertia(self.mass, self.centre, self.inertia)
         tip = jnp.concatenate([self._tip_placement(), jnp.asarray([[0.0, 0.0, 0.0, 1.0]], P.dtype)])
@@ -316,15 +317,15 @@ class Arm:
         """The tip's velocity (first three rows) and angular velocity (last three) per unit of joint
         speed, (6, n).
         """
-        w, v = jnp.unstack(self._frames(q).allowed, axis=1)
+        w, v = jnp.unstack(self._frames(q).motion_subspaces, axis=1)
         return jnp.concatenate([(v + spatial.cross(w, self.tip(q)[None])).T, w.T])
 
     @traced_once
     def mass_matrix(self, q: jax.Array) -> jax.Array:
         """M(q), (n, n) [kg m^2]."""
         frames = self._frames(q)
-        composite = spatial.inertia(*map(_outward, self._bodies(frames)))
-        S = frames.allowed
+        composite = spatial.inertia(*map(_suffix_sums, self._bodies(frames)))
+        S = frames.motion_subspaces
         upper = jnp.sum(S[:, None] * spatial.momentum(composite, S), axis=(-1, -2))
         above, diagonal = np.triu(np.ones((self.n, self.n), bool)), np.eye(self.n, dtype=bool)
         return jnp.where(above, upper, upper.T) + jnp.where(
@@ -334,28 +335,30 @@ class Arm:
     def coriolis(self, q: jax.Array, v: jax.Array, u: jax.Array) -> jax.Array:
         """C(q, v) u, (n,) [N m], with the C of the Christoffel symbols."""
         frames = self._frames(q)
-        S, bodies = frames.allowed, spatial.inertia(*self._bodies(frames))
+        S, bodies = frames.motion_subspaces, spatial.inertia(*self._bodies(frames))
         V = _velocities(S, v)
-        carried = _velocities(spatial.along(V, S), u)
+        carried = _velocities(spatial.motion_cross(V, S), u)
         if u is v:  # the usual case: V x V = 0
-            forces = spatial.momentum(bodies, carried) + spatial.along_wrench(
+            forces = spatial.momentum(bodies, carried) + spatial.wrench_cross(
                 V, spatial.momentum(bodies, V)
             )
         else:
             U = _velocities(S, u)
-            L = spatial.momentum(bodies, jnp.stack([carried - 0.5 * spatial.along(V, U), U, V]))
-            forces = L[0] + 0.5 * jnp.sum(spatial.along_wrench(jnp.stack([V, U]), L[1:]), axis=0)
-        return _felt(S, forces)
+            L = spatial.momentum(
+                bodies, jnp.stack([carried - 0.5 * spatial.motion_cross(V, U), U, V])
+            )
+            forces = L[0] + 0.5 * jnp.sum(spatial.wrench_cross(jnp.stack([V, U]), L[1:]), axis=0)
+        return _joint_torques(S, forces)
 
     @traced_once
     def energy_gradient(self, q: jax.Array, v: jax.Array) -> jax.Array:
-        """dT/dq with T = 1/2 v^T M v, (n,) [N m]: each joint's axis, carried along, times the
-        momentum of all beyond it.
+        """dT/dq with T = 1/2 v^T M v, (n,) [N m]: the rate of each joint's motion subspace times
+        the momentum of all links beyond it.
         """
         frames = self._frames(q)
-        S, bodies = frames.allowed, spatial.inertia(*self._bodies(frames))
+        S, bodies = frames.motion_subspaces, spatial.inertia(*self._bodies(frames))
         V = _velocities(S, v)
-        return _felt(spatial.along(V, S), spatial.momentum(bodies, V))
+        return _joint_torques(spatial.motion_cross(V, S), spatial.momentum(bodies, V))
 
     @traced_once
     def potential(self, q: jax.Array) -> jax.Array:
@@ -368,12 +371,10 @@ class Arm:
         frames = self._frames(q)
         upper, mass = self._bodies(frames)
         weight = jnp.stack([spatial.cross(upper[:, :, 3], self.g), mass * self.g], axis=1)
-        return -_felt(frames.allowed, weight)
+        return -_joint_torques(frames.motion_subspaces, weight)
 
     def friction_torque(self, dq: jax.Array) -> jax.Array:
-        """-(damping q' + friction tanh(q' / friction_width)), (n,) [N m]: what the joints
-        themselves put against the motion.
-        """
+        """Joint friction, -(damping q' + friction tanh(q' / friction_width)), (n,) [N m]."""
         return -(self.damping * dq + self.friction * jnp.tanh(dq / self.friction_width))
 
 
@@ -381,13 +382,13 @@ def _numbered(word: str, n: int) -> tuple[str, ...]:
     return tuple(f"{word}{i + 1}" for i in range(n))
 
 
-def _inward(rows: jax.Array) -> jax.Array:
-    """Row i: the sum of the rows up to i, (n, ...): what a link has from the joints before it."""
+def _prefix_sums(rows: jax.Array) -> jax.Array:
+    """Row i: the sum of rows 0 to i, (n, ...), over the joints that move link i."""
     return _summed(rows, np.tril)
 
 
-def _outward(rows: jax.Array) -> jax.Array:
-    """Row i: the sum of the rows from i on, (n, ...): what a joint bears of the links beyond it."""
+def _suffix_sums(rows: jax.Array) -> jax.Array:
+    """Row i: the sum of rows i to n - 1, (n, ...), over the links that joint i moves."""
     return _summed(rows, np.triu)
 
 
@@ -399,9 +400,9 @@ def _summed(rows: jax.Array, triangle: Callable) -> jax.Array:
 
 def _velocities(S: jax.Array, speeds: jax.Array) -> jax.Array:
     """J_i u, the motion of every link when the joints move at `speeds`, (n, 2, 3)."""
-    return _inward(S * speeds[:, None, None])
+    return _prefix_sums(S * speeds[:, None, None])
 
 
-def _felt(S: jax.Array, forces: jax.Array) -> jax.Array:
-    """sum_i J_i^T F_i, (n,): what the joints feel of wrenches on the links."""
-    return jnp.sum(S * _outward(forces), axis=(-1, -2))
+def _joint_torques(S: jax.Array, forces: jax.Array) -> jax.Array:
+    """sum_i J_i^T F_i, (n,): the joint torques that correspond to wrenches on the links."""
+    return jnp.sum(S * _suffix_sums(forces), axis=(-1, -2))

@@ -1,11 +1,10 @@
-"""Reading a robot's description, URDF or MJCF, without trusting it.
+"""Reads a robot's description, URDF or MJCF, from an untrusted file.
 
-A file from elsewhere may be malformed, huge, a bomb of entities, or just not what its ending says.
-Here it is read with limits, parsed by a parser that knows no entities, and copied: only the
-elements and attributes that say how links move and what they weigh go on, to the library that
-understands them.  What draws, what collides and what senses stays behind; files that MJCF includes
-are read here, under the same limits.  The only other files are meshes that a body of an MJCF takes
-its weight from (`meshes`).
+Such a file may be malformed, very large, an entity expansion attack, or of another format than its
+ending.  It is read with limits and parsed without entities, and so are the files that an MJCF
+includes.  The `mujoco` library receives a copy with only the elements and attributes that define
+kinematics and inertias, without visuals, collision geometry and sensors.  The only other files that
+are read are meshes that define the weight of a body of an MJCF (`meshes`).
 """
 
 from __future__ import annotations
@@ -31,9 +30,9 @@ MAX_ELEMENTS = 30_000
 MAX_BODIES = 1000
 """Links or bodies."""
 LARGEST_NUMBER = 1e10
-"""No length, mass or inertia of a robot in SI units is beyond."""
+"""Largest length, mass or inertia of a robot in SI units."""
 MAX_RANGE = 1e20
-"""A range or a friction may be, where it stands for "none" or "locked"."""
+"""Largest range or friction; a very large number may mean "none" or "locked"."""
 MAX_NUMBERS = 100
 """Numbers of an attribute, except those of a mesh."""
 DECIMAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
@@ -42,7 +41,7 @@ DECIMAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 Python's `float` also accepts "2_5", digits of other scripts, "infinity" and "nan".
 """
 ARGUMENTS = ("base: ", "tip: ", "locked: ", "locked[", "gravity: ")
-"""How messages about an argument of `load`, and not about what is in the file, begin."""
+"""Beginnings of messages about an argument of `load` instead of the content of the file."""
 SPACES = " \t\r\n"
 """What separates the numbers of an attribute: the white space of XML."""
 
@@ -97,7 +96,7 @@ class _Reader:
         self.elements_left = MAX_ELEMENTS
 
     def parse(self, path: Path, nesting: int = 0) -> ET.Element:
-        """The root element of one file, what it includes in its place."""
+        """The root element of a file, with included files in place of their <include>."""
         data = self._bytes(path)
         builder, parser = ET.TreeBuilder(), expat.ParserCreate()
         depth = 0
@@ -188,9 +187,7 @@ class _Reader:
 
 
 def contents(field: str, path: Path, most: int, expected: str, remedy: str = "") -> bytes:
-    """What a file holds, no more than a byte beyond `most`; ValueError, with `field`, unless it is
-    a file that can be read.
-    """
+    """The first `most` + 1 bytes of a file; ValueError with `field` unless the file can be read."""
     try:
         if not path.is_file():
             found = "Nothing is there."
@@ -207,7 +204,7 @@ def contents(field: str, path: Path, most: int, expected: str, remedy: str = "")
 
 
 def label(element: ET.Element) -> str:
-    """How an element is called in messages: link "forearm"."""
+    """The name of an element in messages, such as link 'forearm'."""
     name = element.get("name")
     if not name:
         return f"<{element.tag[:40]}>"

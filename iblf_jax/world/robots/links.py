@@ -1,5 +1,5 @@
-"""The links of a chain, all that is welded to them added up, and whether their masses hold its mass
-matrix positive definite.
+"""The links of a chain with the bodies that are welded to them, and the test whether its mass
+matrix is positive definite.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from iblf_jax.world.robots.repair import (
 Pose = tuple[np.ndarray, np.ndarray]
 """Position and rotation matrix."""
 SINGULAR_FRACTION = 1e-12
-"""Share of a joint's inertia, left when the joints beyond it are free, that is rounding."""
+"""Share of a joint's inertia below which the rest, with the joints beyond it free, is rounding."""
 CONFIGURATIONS = 8
-"""Configurations, beside zero and the middle of the ranges, at which the mass matrix is looked
-at."""
+"""Random configurations, besides zero and the middle of the ranges, at which the mass matrix is
+tested."""
 
 
 class Links(NamedTuple):
-    """The links of a chain, with all that is welded to them."""
+    """The links of a chain, with the bodies that are welded to them."""
 
     names: tuple[str, ...]
     position: np.ndarray
@@ -60,7 +60,7 @@ class Links(NamedTuple):
         for i, P in enumerate(self.moments):
             if P[3, 3] > 0 and is_nothing(_about_centre(P), P[3, 3]):
                 links = links._compact(i, repairs)
-        while (k := links._unresisting(joints)) is not None:
+        while (k := links._without_inertia(joints)) is not None:
             if not links.moments[k, 3, 3] > 0:
                 remedy = "Give it an inertial, lock or fix its joint, or take a tip before it."
                 raise links._massless(k, remedy).error
@@ -69,12 +69,12 @@ class Links(NamedTuple):
             if not self.between[i] and not P[3, 3] > 0:
                 kept = "no mass, as it is: the mass matrix is positive definite all the same"
                 remedy = "Give it an inertial, or fix its joint."
-                repairs.meet(self._massless(i, remedy, kept))
+                repairs.handle(self._massless(i, remedy, kept))
         return links
 
-    def _massless(self, i: int, remedy: str, to: str = "") -> Fault:
+    def _massless(self, i: int, remedy: str, repaired: str = "") -> Fault:
         expected = "a mass [kg] of each link that moves"
-        return fault(f"link {self.names[i]!r}", Shown("no mass"), expected, to, remedy=remedy)
+        return fault(f"link {self.names[i]!r}", Shown("no mass"), expected, repaired, remedy=remedy)
 
     def _compact(self, i: int, repairs: Repairs) -> Links:
         """The links, with link i as a compact body where it is a point, or a rod along its
@@ -87,17 +87,17 @@ class Links(NamedTuple):
         expected, remedy = POSITIVE_DEFINITE
         nearest = thickened(J, m * (GYRATION_FRACTION * self._longest()) ** 2)
         found = fault(where, moments_of(J), expected, moments_of(nearest), remedy=remedy)
-        # All of the file may be in one point, or far heavier beyond.
+        # All links may be in one point, or the links beyond may be far heavier.
         if not np.trace(nearest) > np.trace(J) * (1.0 + ROUNDING):
             raise found.error
-        repairs.meet(found)
+        repairs.handle(found)
         moments = self.moments.copy()
         moments[i, :3, :3] += second_moments(nearest) - second_moments(J)
         return self._replace(moments=moments)
 
     def _longest(self) -> float:
-        """Length [m] of the longest link; from the base to the first joint where all is in one
-        point.
+        """Length [m] of the longest link; if all links are in one point, the distance from the base
+        to the first joint.
         """
         centres = self.moments[:, :3, 3] / np.maximum(self.moments[:, 3, 3], 1e-300)[:, None]
         places = [p for body, (p, _) in self.frames.items() if self.carrier[body] >= 0]
@@ -106,38 +106,40 @@ class Links(NamedTuple):
             return longest
         return float(np.linalg.norm(self.position[0]))
 
-    def _unresisting(self, joints: dict[str, Any]) -> int | None:
-        """The link nearest to the tip that, at some configuration, does not resist its joint when
-        those beyond are free; None if all do.
+    def _without_inertia(self, joints: dict[str, Any]) -> int | None:
+        """The link nearest to the tip that, at some configuration, adds no inertia to its joint
+        when the joints beyond are free; None if all links add some.
         """
-        turns = np.array([kind == "revolute" for kind in joints["kinds"]])
-        wide = np.where(turns, np.pi, 1.0)
+        is_revolute = np.array([kind == "revolute" for kind in joints["kinds"]])
+        wide = np.where(is_revolute, np.pi, 1.0)
         lower, upper = np.clip(joints["lower"], -wide, wide), np.clip(joints["upper"], -wide, wide)
-        shares = np.random.default_rng(0).uniform(size=(CONFIGURATIONS, len(turns)))
+        shares = np.random.default_rng(0).uniform(size=(CONFIGURATIONS, len(is_revolute)))
         q = np.stack(
-            [np.zeros(len(turns)), 0.5 * (lower + upper), *(lower + shares * (upper - lower))]
+            [np.zeros(len(is_revolute)), 0.5 * (lower + upper), *(lower + shares * (upper - lower))]
         )
         found: list[int] = []
-        for M in self._mass_matrices(q, turns, joints["axis"]) + np.diag(joints["armature"]):
-            none = SINGULAR_FRACTION * np.diag(M) + np.where(
-                turns, self.moments[:, 3, 3] * LENGTH_RESOLUTION**2, 0.0
+        for M in self._mass_matrices(q, is_revolute, joints["axis"]) + np.diag(joints["armature"]):
+            threshold = SINGULAR_FRACTION * np.diag(M) + np.where(
+                is_revolute, self.moments[:, 3, 3] * LENGTH_RESOLUTION**2, 0.0
             )
-            for k in reversed(range(len(turns))):
-                if not M[k, k] > none[k]:
+            for k in reversed(range(len(is_revolute))):
+                if not M[k, k] > threshold[k]:
                     found.append(k)
                     break
                 M[:k, :k] -= np.outer(M[:k, k], M[k, :k]) / M[k, k]
         return max(found, default=None)
 
-    def _mass_matrices(self, q: np.ndarray, turns: np.ndarray, axes: np.ndarray) -> np.ndarray:
-        """M_jk = tr(X_j C_k X_k^T), j <= k, at each row of q: C the moments of all beyond, X the 4
-        x 4 matrices of the joints' motions.
+    def _mass_matrices(
+        self, q: np.ndarray, is_revolute: np.ndarray, axes: np.ndarray
+    ) -> np.ndarray:
+        """M_jk = tr(X_j C_k X_k^T), j <= k, at each row of q; C_k are the moments of all links from
+        k on, X_j the 4 x 4 matrix of the motion of joint j.
         """
         H, motions, moments = np.broadcast_to(np.eye(4), (len(q), 4, 4)), [], []
         for i, axis in enumerate(axes):
             fixed, X, moved = np.eye(4), np.zeros((4, 4)), np.tile(np.eye(4), (len(q), 1, 1))
             fixed[:3, :3], fixed[:3, 3] = self.rotation[i], self.position[i]
-            if turns[i]:
+            if is_revolute[i]:
                 x, y, z = axis
                 X[:3, :3] = K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
                 moved[:, :3, :3] += np.sin(q[:, i])[:, None, None] * K + (1.0 - np.cos(q[:, i]))[

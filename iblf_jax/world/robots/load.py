@@ -38,21 +38,21 @@ def load(
 
     Fixed joints are fused; joints that are not between base and tip are locked, and their links'
     masses and inertias are added to the link that carries them.  A mesh is opened only where a body
-    of an MJCF takes its weight from it.  What is wrong with links that the chain does not carry,
-    and with joints that do not move in it, does not matter; nor do moments of inertia that are off
-    by rounding, 1e-6 of them or m (1 um)^2.
+    of an MJCF takes its weight from it.  Faults of links that the chain does not
+    carry and of joints that do not move in it are ignored, and so are errors of moments of inertia
+    within rounding, 1e-6 of them or m (1 um)^2.
 
     With `repair` the other faults are corrected where a rule exists, with the least change, and
     listed: with J = V diag(...) V^T an inertia about the centre of mass m,
 
         S = 1/2 tr(J) 1 - J = V diag(s) V^T,   S' = V diag(max(s, f)) V^T,   J' = tr(S') 1 - S',
 
-    the nearest that a body can have, f = 0; f = m (L / 100)^2, L the length of the longest link,
-    where a link that moves would resist its joint with nothing.  No mass is made up: a link without
-    one is kept so if the mass matrix is positive definite all the same, and refused else.  A range
-    that is none, and a torque or speed below 0, become no limits; friction below 0 becomes 0; a
-    spring is left out, and so is MuJoCo's compensation of a body's gravity; a joint of the chain
-    that is tied to another (a mimic, a coupling) moves by itself.
+    is the nearest inertia that a body can have, with f = 0, or f = m (L / 100)^2 for a moving link
+    that adds no inertia to its joint, where L is the length of the longest link.  No mass is
+    invented: a link without mass is kept if the mass matrix is positive definite nevertheless, and
+    refused otherwise.  Invalid ranges and negative torques or speeds are replaced by no limits, and
+    negative friction by 0.  Springs and MuJoCo's gravity compensation are left out.  A joint of the
+    chain that is coupled to another one (a mimic) moves independently.
 
     Args:
       path: the file; `<robot>` is read as URDF, `<mujoco>` as MJCF, whatever its ending.
@@ -60,9 +60,8 @@ def load(
         if not given.
       tip: name of the link (body, or site of an MJCF) whose frame is the tip; the end of the chain
         if there is only one.
-      locked: joint name -> position [rad or m] for joints that are not to move; a joint between
-        base and tip may be among them.  Others that are left out are locked at 0 (an MJCF's at
-        `ref`).
+      locked: joint name -> position [rad or m] of locked joints, which may be between base and tip.
+        All other joints outside the chain are locked at 0 (those of an MJCF at `ref`).
       gravity: (3,) [m/s^2] in the file's world; the file's own, (0, 0, -9.81) if it has none.
       repair: whether to correct the faults that have a rule; a warning and the arm's `repaired`
         then list the changes, a line a link or joint.
@@ -73,7 +72,7 @@ def load(
       (an MJCF has no speeds).
 
     Raises:
-      ValueError: what is wrong with the file or the chain; the message names the element and the
+      ValueError: a fault of the file or the chain; the message names the element and the
         remedy.
       ImportError: the extra `robots` is not installed.
 
@@ -150,8 +149,8 @@ class _Chain(NamedTuple):
         return _Chain(tree, first, last, at_tip, joints, positions)
 
     def following(self, file: urdf.Urdf, repairs: Repairs) -> _Chain:
-        """The chain with all mimic joints outside it locked where the joints that they follow are;
-        handles the faults of its joints.
+        """The chain, with each mimic joint outside it locked at the position that its master gives;
+        handles the faults of the chain's joints.
         """
         tree, locked = self.tree, dict(self.locked)
         free = {tree.joint_names[j] for j in self.joints}
@@ -161,11 +160,11 @@ class _Chain(NamedTuple):
         displaced = [j for j, position in locked.items() if position]
         for j in (*self.joints, *displaced):
             name = tree.joint_names[j]
-            if name in file.axes:
-                repairs.meet(file.axes[name])
+            if name in file.axis_faults:
+                repairs.handle(file.axis_faults[name])
             if name in free:
-                for fault in file.motions[name]:
-                    repairs.meet(fault)
+                for fault in file.motion_faults[name]:
+                    repairs.handle(fault)
         for name, mimic in file.mimics.items():
             if name in free or mimic.master in free:
                 coupled, repaired = mimic.master, "one that is locked"
@@ -175,13 +174,13 @@ class _Chain(NamedTuple):
                 error = checks.fail(
                     f"joint {name!r}", Shown(mimic.shown), "joints that move by themselves", remedy
                 )
-                repairs.meet(Fault(f"joint {name!r}", mimic.shown, error, repaired))
+                repairs.handle(Fault(f"joint {name!r}", mimic.shown, error, repaired))
         path = tree.path(0, self.tip) or []
         for b in range(1, tree.model.nbody):
             ancestors = tree.path(0, b) or ()
             carried = any(j in self.joints for c in ancestors for j in tree.joints_of(c))
-            if tree.bodies[b] in file.places and (carried or b in path):
-                repairs.meet(file.places[tree.bodies[b]])
+            if tree.bodies[b] in file.pose_faults and (carried or b in path):
+                repairs.handle(file.pose_faults[tree.bodies[b]])
         return self._replace(locked=locked)
 
     def _mimicked(self, name: str, mimics: dict[str, urdf.Mimic]) -> float:
@@ -200,16 +199,16 @@ class _Chain(NamedTuple):
         return offset + factor * at.get(name, 0.0)
 
     def arm(self, gravity: Any, file: urdf.Urdf | mjcf.Mjcf, repairs: Repairs) -> Arm:
-        """The Arm, all bodies welded to the links that carry them."""
+        """The Arm, in which each body is welded to the link that carries it."""
         tree = self.tree
         g = tree.gravity
         if gravity is not None:
             g = np.asarray(checks.as_floats("gravity", gravity), float)
         checks.shape_is("gravity", g, (3,))
         _, upright = tree.pose(self.base, self.locked)
-        joints = tree.of_joints(self.joints)
+        joints = tree.joint_fields(self.joints)
         links = tree.welded(self.base, self.joints, self.locked, repairs)
-        tree.check_closed(links, self.joints, file.tendons, repairs)
+        tree.handle_constraints(links, self.joints, file.tendons, repairs)
         links = links.repaired(joints, repairs)
         p, R = links.frames[self.tip]
         tip_p, tip_R = p + R @ self.at_tip[0], R @ self.at_tip[1]
@@ -226,7 +225,7 @@ class _Chain(NamedTuple):
 
 
 def locked_position(name: str, value: Any) -> float:
-    """Where a joint is locked [rad or m], checked."""
+    """The checked position of a locked joint [rad or m]."""
     number = checks.as_floats(f"locked[{name!r}]", value)
     checks.check_values(f"locked[{name!r}]", number, None)
     if number.shape != ():

@@ -1,4 +1,4 @@
-"""The meshes that bodies of an MJCF are weighed by.
+"""The meshes from which masses and inertias of bodies of an MJCF are computed.
 
 A mesh is opened only where a body has no other weight.  Its file is read here, under a limit, and
 the library computes its mass properties in a separate model, so that a missing or broken mesh is a
@@ -15,7 +15,7 @@ from iblf_jax.core.optional import attributes
 from iblf_jax.world.robots.description import Shown, contents
 
 LARGEST_MESHES = 512 << 20
-"""Bytes of the meshes that one model is weighed by, together."""
+"""Largest total size of the meshes of a model [bytes]."""
 OF_MESH = (
     "name",
     "file",
@@ -34,8 +34,8 @@ REMEDY = "Or give the body an <inertial>."
 
 
 class Meshes:
-    """The meshes of a specification: each is opened when a geom needs it, and those that none
-    needed leave.
+    """The meshes of a specification, each of which is opened when a geom needs it; `leave` removes
+    the others.
     """
 
     def __init__(self, spec: Any, folder: Path, bare: bool) -> None:
@@ -47,7 +47,7 @@ class Meshes:
         self.opened: dict[str, Path | None] = {}
         """Mesh -> its file, if it has one."""
         self.files: dict[str, bytes] = {}
-        """Name by which the library gets a file -> what it holds."""
+        """Name of a file for the library -> its content."""
         self.problems: dict[str, ValueError | None] = {}
 
     def problem(self, geom: Any) -> ValueError | None:
@@ -65,8 +65,8 @@ class Meshes:
         return self.problems[shape]
 
     def leave(self) -> None:
-        """Takes the meshes that nothing is weighed by out of the specification, and gives it the
-        files of the others.
+        """Removes the meshes that no geom needed from the specification, and gives it the files of
+        the others.
         """
         for name, mesh in self.meshes.items():
             if name not in self.opened:

@@ -64,9 +64,9 @@ KEPT = {
     "general": f"{ACTUATOR} gaintype gainprm biastype biasprm",
     **dict.fromkeys(("motor", "position", "velocity", "intvelocity", "damper"), ACTUATOR),
 }
-"""Element -> the attributes of it that go on."""
+"""Element -> its attributes that the copy keeps."""
 COUPLING = "name class active joint1 joint2 polycoef"
-"""The attributes of a <joint> in <equality>, which is another thing."""
+"""The attributes of a <joint> in <equality>, which is a constraint between joints."""
 REFUSED = {
     "replicate": "Write the bodies out.",
     "composite": "Write the bodies out.",
@@ -81,30 +81,29 @@ WORDS = (
 MESH_TYPES = ("mjGEOM_MESH", "mjGEOM_SDF", "mjGEOM_HFIELD")
 """The library's names of geoms whose shape is in a file."""
 LONG_ATTRIBUTES = "vertex face"
-"""Attributes that may hold as many numbers as a file has."""
+"""Attributes whose number of numbers is limited only by the size of the file."""
 SCALAR_ATTRIBUTES = "gravcomp mass density ref stiffness damping frictionloss armature"
 """Attributes that hold one number."""
 RANGE_ATTRIBUTES = "damping frictionloss range ctrlrange forcerange actuatorfrcrange"
-"""Attributes that may stand for "none" or "locked" by their size."""
+"""Attributes in which a very large number may mean "none" or "locked"."""
 SWITCHES = ("true", "false", "auto", "enable", "disable")
 MIN_INERTIA = 1e-15
 """Mass [kg] and moments [kg m^2] below which the library refuses a body that moves."""
 
 Tendons = dict[str, tuple[set[str], set[str]]]
-"""What the constraints on tendons tie together: label -> (joints, sites)."""
+"""Constraints on tendons: label -> (joints, sites) that they couple."""
 
 
 class Mjcf(NamedTuple):
-    """What an MJCF holds, checked."""
+    """The checked content of an MJCF."""
 
     text: str
-    """The copy."""
+    """The copy for the library."""
     tendons: Tendons
     folder: Path
     """Where its meshes are."""
     bare: bool
-    """Whether they are there under their bare names, without the folders that the file gives
-    them."""
+    """Whether `folder` has them under their bare names, without the folders in the file."""
     root: str = "world"
     """Name of the body that no joint moves."""
     speeds: dict[str, float] = {}  # noqa: RUF012
@@ -223,9 +222,7 @@ def _tendons(root: ET.Element) -> Tendons:
 
 
 def _explicit(body: Any, where: str, balanced: bool) -> Weight | None:
-    """What a body's <inertial> says, or nothing if it has none; None if the library takes it as it
-    is.
-    """
+    """The weight in a body's <inertial>, zero if it has none; None if the library accepts it."""
     if not body.explicitinertial:
         return Weight()
     J = np.diag(body.inertia)

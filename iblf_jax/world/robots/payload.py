@@ -1,14 +1,13 @@
-"""What an arm carries: a rigid body at its tip, from the start or from a time on.
+"""The load of an arm: a rigid body at its tip, from the start or from a given time on.
 
-A load that is picked up is at rest relative to the gripper when it is gripped: it brings its own
-momentum along, so there is no impulse and q' does not jump.  Its weight goes over from where it lay
-to the gripper within `rise` seconds, by the share
+A load that is picked up is at rest relative to the gripper when it is gripped, so there is no
+impulse and q' does not jump.  The gripper takes over its weight within `rise` seconds, by the share
 
     s(t) = x^3 (10 - 15 x + 6 x^2),   x = (t - start) / rise, clipped to [0, 1],
 
 and the arm moves as one with the mass s m and the inertia s I at each instant: M(q; s) q" + C(q,
 q'; s) q' + G(q; s) = tau + f.  So f is differentiable (Assumption 1).  The law's model does not
-know a time: a load with a `start` is in the plant only.
+depend on time: only the plant can have a load with a `start`.
 """
 
 from __future__ import annotations
@@ -33,8 +32,8 @@ class Payload:
       centre: its centre of mass in the tip's frame, (3,) [m]; the tip if not given.
       inertia: about its centre, along the tip's axes, (6,): xx, yy, zz, xy, xz, yz [kg m^2]; 0 if
         not given.
-      start: when it is picked up, () [s]; it is there from the start if not given.
-      rise: how long its weight takes to come to rest on the gripper, () [s], > 0; 0.1 if not given.
+      start: time at which it is picked up, () [s]; present from the start if not given.
+      rise: time in which the gripper takes over its weight, () [s], > 0; 0.1 if not given.
     """
 
     mass: Leaf = leaf("kg", sign="nonnegative", shape="scalar", default=0.0)
@@ -49,13 +48,13 @@ class Payload:
         checks.shape_is("Payload.inertia", self.inertia, (6,))
 
     def share(self, t: jax.Array) -> jax.Array:
-        """s(t), the share of the load that hangs on the gripper, () [1]."""
+        """s(t), the share of the load that the gripper carries, () [1]."""
         x = jnp.clip((t - self.start) / self.rise, 0.0, 1.0)
         return x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
 
     def at(self, t: jax.Array) -> Payload:
-        """The load that counts at time t [s]: itself if it has no start, else with s(t) of its mass
-        and inertia, and no start.
+        """The load at time t [s]: itself if it has no start, else s(t) of its mass and inertia,
+        without a start.
         """
         if self.start is None:
             return self
@@ -69,19 +68,19 @@ class Payload:
         return now
 
     def jump_times(self) -> jax.Array:
-        """When the share begins to rise, and when it is 1, (2,) [s]; none for a load that is there
-        from the start.
+        """Times at which the share begins to rise and reaches 1, (2,) [s]; none for a load without
+        a start.
 
-        The third derivative of the share jumps there.  Within a step that is longer than `rise`,
-        the load itself does.
+        The third derivative of the share jumps there.  For a step longer than `rise`, the load
+        itself jumps.
         """
         if self.start is None:
             return no_times()
         return jnp.stack([self.start, self.start + self.rise])
 
     def moments(self) -> jax.Array:
-        """Its pseudo-inertia about the tip's origin, (4, 4); zero while it has a start that no `at`
-        has looked at.
+        """Its pseudo-inertia about the tip's origin, (4, 4); zero for a load with a start, whose
+        inertia is that of `at(t)`.
         """
         P = pseudo_inertia(self.mass, self.centre, self.inertia)
         if self.start is None:

@@ -27,11 +27,9 @@ from iblf_jax.world.robots.description import Shown
 ROUNDING = 1e-6
 """Relative error of a body's moments in a file that has seven digits."""
 LENGTH_RESOLUTION = 1e-6
-"""[m]: no length of a link is known better, so moments below mass LENGTH_RESOLUTION^2 count as
-zero."""
+"""Accuracy of the lengths of links [m]; moments below mass LENGTH_RESOLUTION^2 count as zero."""
 GYRATION_FRACTION = 0.01
-"""Radius of gyration, along each axis, of a link that had no inertia, relative to the length of the
-longest link."""
+"""Radius of gyration that a link without inertia receives, relative to the longest link."""
 
 
 POSITIVE_DEFINITE = ("a positive definite inertia [kg m^2]", "A body that moves needs one.")
@@ -44,12 +42,12 @@ class Fault(NamedTuple):
     where: str
     got: str
     error: ValueError
-    to: str = ""
+    repaired: str = ""
     """The value after the repair; empty if there is no repair."""
 
 
 def fault(
-    field: str, got: Any, expected: str, to: str = "", *, remedy: str = "", where: str = ""
+    field: str, got: Any, expected: str, repaired: str = "", *, remedy: str = "", where: str = ""
 ) -> Fault:
     """A fault with its error.
 
@@ -57,11 +55,11 @@ def fault(
       field: the faulty field, for the error.
       got: its value, as `checks.fail` takes it.
       expected: what the field must be.
-      to: the value after the repair; empty if there is no repair.
+      repaired: the value after the repair; empty if there is no repair.
       remedy: what a user can do in place of a repair.
       where: what the list of repairs calls the place; the field if not given.
     """
-    return Fault(where or field, str(got), checks.fail(field, got, expected, remedy), to)
+    return Fault(where or field, str(got), checks.fail(field, got, expected, remedy), repaired)
 
 
 class Repairs:
@@ -71,15 +69,15 @@ class Repairs:
         self.enabled = enabled
         self.lines: list[str] = []
 
-    def meet(self, fault: Fault) -> None:
+    def handle(self, fault: Fault) -> None:
         """Lists the repair of a fault; raises its error if no repair exists or is allowed."""
-        if not fault.to:
+        if not fault.repaired:
             raise fault.error
         if not self.enabled:
             raise ValueError(
-                f"{fault.error} Or load it with repair=True, which makes of it: {fault.to}."
+                f"{fault.error} Or load it with repair=True, which makes of it: {fault.repaired}."
             )
-        line = f"{fault.where}: from {fault.got} to {fault.to}"
+        line = f"{fault.where}: from {fault.got} to {fault.repaired}"
         if line not in self.lines:
             self.lines.append(line)
 
@@ -98,7 +96,7 @@ class Weight(NamedTuple):
         """The weight after the repair of its fault."""
         if self.fault is None:
             return self
-        repairs.meet(self.fault)
+        repairs.handle(self.fault)
         if self.nearest is None:
             return Weight(self.mass, self.inertia)
         return Weight(self.mass, self.nearest)

@@ -101,14 +101,12 @@ def placement(R: jax.Array, p: jax.Array) -> jax.Array:
 
 
 def joined(outer: jax.Array, inner: jax.Array) -> jax.Array:
-    """The placement of what is placed by `inner` in a frame that is placed by `outer`, (..., 3,
-    4).
-    """
+    """Composition of placements, (..., 3, 4): `inner` is given in the frame placed by `outer`."""
     return product(outer[..., :3], inner) + placement(jnp.zeros_like(outer[..., :3]), outer[..., 3])
 
 
 def chained(steps: jax.Array) -> jax.Array:
-    """Row i: steps 0 to i joined, (n, 3, 4); all rows at once, in log2 n rounds."""
+    """Row i: the composition of steps 0 to i, (n, 3, 4), by a parallel scan of log2 n rounds."""
     reach = 1
     while reach < steps.shape[0]:
         steps = jnp.concatenate([steps[:reach], joined(steps[:-reach], steps[reach:])])
@@ -125,9 +123,7 @@ def moved(H: jax.Array, P: jax.Array) -> jax.Array:
 
 
 def inertia(upper: jax.Array, mass: jax.Array) -> Inertia:
-    """The blocks by which bodies resist, from the upper rows of their pseudo-inertias, (m, 3, 4),
-    and their masses, (m, 1).
-    """
+    """Spatial inertias from the upper rows of pseudo-inertias, (m, 3, 4), and masses, (m, 1)."""
     second, diagonal = upper[..., :3], np.eye(3, dtype=bool)
     trace = jnp.sum(jnp.where(diagonal, second, jnp.zeros_like(second)), axis=(-1, -2))
     return Inertia(
@@ -144,9 +140,9 @@ def momentum(body: Inertia, motion: jax.Array) -> jax.Array:
     return straight + cross(body.first[..., None, :], jnp.stack([v, -w], axis=-2))
 
 
-def along(motion: jax.Array, other: jax.Array) -> jax.Array:
-    """The rate of the motion `other` when it is carried along by `motion`: (w x w', w x v' + v x
-    w').
+def motion_cross(motion: jax.Array, other: jax.Array) -> jax.Array:
+    """Cross product of two motions, (w x w', w x v' + v x w'): the rate of `other` when it moves
+    with `motion`.
     """
     lever = cross(motion[..., 1:, :], other[..., :1, :])
     return cross(motion[..., :1, :], other) + jnp.concatenate(
@@ -154,8 +150,10 @@ def along(motion: jax.Array, other: jax.Array) -> jax.Array:
     )
 
 
-def along_wrench(motion: jax.Array, wrench: jax.Array) -> jax.Array:
-    """The rate of a wrench that is carried along by `motion`: (w x n + v x f, w x f)."""
+def wrench_cross(motion: jax.Array, wrench: jax.Array) -> jax.Array:
+    """Cross product of a motion and a wrench, (w x n + v x f, w x f): the rate of a wrench that
+    moves with `motion`.
+    """
     lever = cross(motion[..., 1:, :], wrench[..., 1:, :])
     return cross(motion[..., :1, :], wrench) + jnp.concatenate(
         [lever, jnp.zeros_like(lever)], axis=-2

@@ -1,4 +1,4 @@
-"""The tree of bodies that `mujoco` makes of a file, and the quantities of an arm read from it.
+"""The tree of bodies that `mujoco` makes of a file, and the fields of an `Arm` that follow from it.
 
 Quantities are NumPy arrays in float64.  A pose is (position, rotation matrix).
 """
@@ -26,7 +26,7 @@ gain and bias."""
 
 
 def mujoco_package() -> Any:
-    """The package, where it is installed."""
+    """The package `mujoco`; ImportError with a remedy if it is not installed."""
     try:
         import mujoco
     except ImportError as error:
@@ -37,12 +37,12 @@ def mujoco_package() -> Any:
 
 
 class Tree:
-    """A compiled model, by names."""
+    """A compiled model whose bodies, joints and sites are found by name."""
 
     def __init__(self, model: Any, mujoco: Any, root: str, weights: dict[int, Weight]):
         self.model = model
         self.weights = weights
-        """Body -> what it weighs in its inertial frame, where that is not the model's number."""
+        """Body -> its mass and inertia in its inertial frame, where these are not the model's."""
 
         def names(kind: Any, count: int) -> list[str | None]:
             return [mujoco.mj_id2name(model, kind, i) for i in range(count)]
@@ -113,7 +113,7 @@ class Tree:
         )
 
     def joints_of(self, body: int) -> range:
-        """The joints that move a body against its parent, in their order."""
+        """The joints between a body and its parent, in their order."""
         start = int(self.model.body_jntadr[body])
         return range(start, start + int(self.model.body_jntnum[body]))
 
@@ -128,10 +128,10 @@ class Tree:
         return path[::-1]
 
     def only_tip(self, first: int, locked: dict[int, float]) -> int:
-        """The body at the end of the only chain that moves, beyond `first`.
+        """The body at the end of the only moving chain beyond `first`.
 
-        The end is the last body there if the links do not branch behind the last joint, else the
-        link that this joint moves.
+        It is the last body of the chain, or the link that the last joint moves if the bodies branch
+        beyond this joint.
         """
         m = self.model
         beyond = [b for b in range(m.nbody) if self.path(first, b) is not None]
@@ -162,16 +162,16 @@ class Tree:
             raise checks.fail(f"joint {name!r}", Shown(f"a {kind} joint"), expected, remedy)
         stiffness = float(m.jnt_stiffness[j])
         if stiffness:
-            expected, to = "0: springs are not modelled", "0: the spring is left out"
+            expected, repaired = "0: springs are not modelled", "0: the spring is left out"
             where = f"joint {name!r}: stiffness"
-            repairs.meet(fault(where, stiffness, expected, to, remedy="Remove it."))
+            repairs.handle(fault(where, stiffness, expected, repaired, remedy="Remove it."))
 
     def placed(self, body: int) -> Pose:
-        """Pose of a body in its parent's frame, its joints at their reference."""
+        """Pose of a body in its parent's frame, with its joints at their reference positions."""
         return np.array(self.model.body_pos[body]), matrix(self.model.body_quat[body])
 
     def _after_locked(self, pose: Pose, j: int, locked: dict[int, float]) -> Pose:
-        """`pose` of a body after its joint j, which is locked."""
+        """`pose` of a body after the motion of its locked joint j."""
         m = self.model
         if m.jnt_type[j] not in (HINGE, SLIDE):
             return pose
@@ -183,7 +183,7 @@ class Tree:
         return joined(pose, (anchor - R @ anchor, R))
 
     def pose(self, body: int, locked: dict[int, float]) -> Pose:
-        """Pose of a body in the world, every joint locked."""
+        """Pose of a body in the world, with every joint locked."""
         pose: Pose = (np.zeros(3), np.eye(3))
         for b in self.path(0, body) or ():
             pose = joined(pose, self.placed(b))
@@ -194,9 +194,7 @@ class Tree:
     def welded(
         self, base: int, joints: tuple[int, ...], locked: dict[int, float], repairs: Repairs
     ) -> Links:
-        """The links that `joints` move, and each body beyond the base with the link that carries
-        it.
-        """
+        """The links that `joints` move, with the bodies beyond the base that they carry."""
         m, origin = self.model, (np.zeros(3), np.eye(3))
         names, position, rotation, between = [], [], [], []
         frames: dict[int, Pose] = {base: origin}
@@ -242,7 +240,7 @@ class Tree:
         )
 
     def _moments(self, body: int, pose: Pose, repairs: Repairs) -> np.ndarray:
-        """Pseudo-inertia of one body in the frame in which its pose is given."""
+        """Pseudo-inertia of a body in the frame of `pose`."""
         m = self.model
         p, R = joined(pose, (np.array(m.body_ipos[body]), matrix(m.body_iquat[body])))
         own = self.weights.get(body) or Weight(
@@ -253,13 +251,13 @@ class Tree:
         if compensated and mass:
             where = f"body {self.bodies[body]!r}: gravcomp"
             expected = "0: compensation of gravity is not modelled, it is the law's to do"
-            to = "0: gravity acts on it"
-            repairs.meet(fault(where, compensated, expected, to, remedy="Remove it."))
+            repaired = "0: gravity acts on it"
+            repairs.handle(fault(where, compensated, expected, repaired, remedy="Remove it."))
         second = R @ second_moments(inertia) @ R.T + mass * np.outer(p, p)
         return np.block([[second, mass * p[:, None]], [mass * p[None, :], np.array([[mass]])]])
 
-    def of_joints(self, joints: tuple[int, ...]) -> dict[str, Any]:
-        """The fields of an Arm that its joints have."""
+    def joint_fields(self, joints: tuple[int, ...]) -> dict[str, Any]:
+        """The fields of an Arm that describe its joints."""
         m, at = self.model, list(joints)
         dofs = m.jnt_dofadr[at]
         limited, driven = m.jnt_limited[at].astype(bool), m.jnt_actfrclimited[at].astype(bool)
@@ -278,8 +276,8 @@ class Tree:
         }
 
     def _actuators(self, j: int) -> float:
-        """The largest torque (force) that the actuators of a joint give together; infinite if one
-        has no limit or there are none.
+        """The largest sum of torques (forces) of a joint's actuators; infinite if one has no limit
+        or there are none.
         """
         m, total = self.model, 0.0
         on_it = [
@@ -298,11 +296,11 @@ class Tree:
             total += limit * abs(float(m.actuator_gear[a, 0]))
         return total
 
-    def check_closed(
+    def handle_constraints(
         self, links: Links, joints: tuple[int, ...], tendons: Tendons, repairs: Repairs
     ) -> None:
-        """Meets constraints that tie bodies of different links together, or a joint of the chain to
-        another.
+        """Handles constraints between bodies of different links, and between a joint of the chain
+        and another joint.
 
         Args:
           links, joints: the chain.
@@ -316,41 +314,43 @@ class Tree:
                 continue
             where = f"equality {self.equalities[e] or f'number {e}'!r}"
             if m.eq_type[e] == COUPLED:
-                self._meet_coupling(where, {first, second} & set(joints), repairs)
+                self._handle_coupling(where, {first, second} & set(joints), repairs)
             if m.eq_type[e] in (CONNECT, WELD):
                 bodies = [first, second]
                 if m.eq_objtype[e] == self.site_type:
                     bodies = [int(m.site_bodyid[site]) for site in bodies]
-                self._meet_tie(where, bodies, links, repairs)
+                self._handle_tie(where, bodies, links, repairs)
         for where, (named, sites) in tendons.items():
-            self._meet_coupling(where, {j for j in joints if self.joint_names[j] in named}, repairs)
+            self._handle_coupling(
+                where, {j for j in joints if self.joint_names[j] in named}, repairs
+            )
             tied = [int(m.site_bodyid[i]) for i, site in enumerate(self.sites) if site in sites]
-            self._meet_tie(where, tied, links, repairs)
+            self._handle_tie(where, tied, links, repairs)
 
-    def _meet_coupling(self, where: str, coupled: set[int], repairs: Repairs) -> None:
+    def _handle_coupling(self, where: str, coupled: set[int], repairs: Repairs) -> None:
         for j in sorted(coupled):
             name = self.joint_names[j]
             remedy = f"Lock it: locked={{{name!r}: 0.0}}, or remove the constraint."
             tied = Shown(f"joint {name!r} tied to another")
             error = checks.fail(where, tied, "joints that move by themselves", remedy)
-            got, to = f"one tied to another by {where}", "one that moves by itself"
-            repairs.meet(Fault(f"joint {name!r}", got, error, to))
+            got, repaired = f"one tied to another by {where}", "one that moves by itself"
+            repairs.handle(Fault(f"joint {name!r}", got, error, repaired))
 
-    def _meet_tie(self, where: str, bodies: list[int], links: Links, repairs: Repairs) -> None:
-        """Meets a tie of bodies: what ties to a motion-capture body drives the arm, what ties its
-        links closes the chain.
+    def _handle_tie(self, where: str, bodies: list[int], links: Links, repairs: Repairs) -> None:
+        """Handles a constraint between bodies: with a motion-capture body it drives the arm,
+        between links of the arm it closes the chain.
         """
         if len({links.carrier.get(b, -1) for b in bodies}) > 1:
             tied = f"{' and '.join(repr(self.bodies[b]) for b in bodies)} tied together"
             remedy = "A closed chain has no serial one: cut it open, or lock its joints."
-            to = ""
+            repaired = ""
             if any(self.model.body_mocapid[b] >= 0 for b in bodies):
-                to = "no tie: a motion-capture body is no link"
-            repairs.meet(fault(where, Shown(tied), "an open chain", to, remedy=remedy))
+                repaired = "no tie: a motion-capture body is no link"
+            repairs.handle(fault(where, Shown(tied), "an open chain", repaired, remedy=remedy))
 
 
 def unknown(what: str, name: Any, expected: str, known: list[str]) -> ValueError:
-    """An error with the names that are near, or all of them."""
+    """An error that lists similar names, or the first names if none is similar."""
     near = difflib.get_close_matches(str(name), known, n=3) or known[:12]
     names = ", ".join(map(repr, near))
     if len(known) > 12:
@@ -373,5 +373,5 @@ def turn(axis: np.ndarray, angle: float) -> np.ndarray:
 
 
 def joined(outer: Pose, inner: Pose) -> Pose:
-    """The pose of what is at `inner` in a frame at `outer`."""
+    """Composition of poses: `inner` is given in the frame of `outer`."""
     return outer[0] + outer[1] @ inner[0], outer[1] @ inner[1]

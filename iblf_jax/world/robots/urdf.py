@@ -1,9 +1,8 @@
-"""The check of a URDF, element by element, and the part of it that defines how links move and what
-they weigh.
+"""Checks a URDF and copies the elements that define the kinematics and the inertias of its links.
 
-The copy that the library receives holds links and joints, and each of its numbers is checked.
-Weights of links, faults of links and joints, and mimic joints are kept separately: they matter only
-for those links and joints that the chain contains.
+The `mujoco` library receives a copy with links and joints, of which every number is checked. Masses
+and inertias, faults of links and joints, and mimic joints are kept separately, because they matter
+only for the links and joints of the chain.
 """
 
 from __future__ import annotations
@@ -38,30 +37,32 @@ class Mimic(NamedTuple):
 
 
 class Urdf(NamedTuple):
-    """What a URDF holds, checked."""
+    """The checked content of a URDF."""
 
     text: str
-    """The copy."""
+    """The copy for the library."""
     root: str
     """Name of the link that no joint moves."""
     mimics: dict[str, Mimic]
     weights: dict[str, Weight]
-    """Link -> what it weighs, about the centre that the copy has and along the link's axes."""
-    places: dict[str, Fault]
-    """Link -> what is wrong with where it is: matters for each link that hangs on the base."""
-    axes: dict[str, Fault]
-    """Joint -> what is wrong with its kind or axis: matters where it moves, or is locked away from
-    0."""
-    motions: dict[str, list[Fault]]
-    """Joint -> what is wrong with its range, torque, speed or friction: matters where it moves."""
+    """Link -> its mass and inertia about the centre of mass in the copy, along the link's axes."""
+    pose_faults: dict[str, Fault]
+    """Link -> fault of its origin; matters for a link in the chain or carried by it."""
+    axis_faults: dict[str, Fault]
+    """Joint -> fault of its kind or axis; matters if the joint moves or is locked at another
+    position than 0."""
+    motion_faults: dict[str, list[Fault]]
+    """Joint -> faults of its range, torque, speed or friction; matter if the joint moves."""
     speeds: dict[str, float]
-    """Joint -> its largest speed, which the library does not keep; none for one without."""
+    """Joint -> its largest speed, if it has one; the library does not keep it."""
     tendons: Tendons = {}  # noqa: RUF012
-    """What constraints on tendons tie together, which a URDF does not have."""
+    """Constraints on tendons; a URDF has none."""
 
     def separate_weights(self, spec: Any) -> list[tuple[Any, Weight]]:
-        """The library's bodies with their weights, which the copy does not contain: the library
-        would reject faults of bodies that the chain does not carry.
+        """The library's bodies with their weights.
+
+        The copy does not contain them, because the library would also reject faults of bodies that
+        the chain does not carry.
         """
         return [
             (body, self.weights[body.name]) for body in spec.bodies if body.name in self.weights
@@ -69,10 +70,10 @@ class Urdf(NamedTuple):
 
 
 def checked(robot: ET.Element) -> Urdf:
-    """The copy of a URDF.
+    """The checked content of a URDF.
 
     Raises:
-      ValueError: what is wrong, with the name of the link or joint.
+      ValueError: a fault of the tree of links, with the name of the link or joint.
     """
     links = _by_name(robot, "link")
     joints = _by_name(robot, "joint")
@@ -98,8 +99,8 @@ def checked(robot: ET.Element) -> Urdf:
     for name, mimic in found.mimics.items():
         if mimic.master not in joints:
             error = checks.fail(f"joint {name!r}: mimic", mimic.master, "the name of a joint")
-            to = "one that moves by itself"
-            found.motions[name].append(Fault(f"joint {name!r}", mimic.shown, error, to))
+            repaired = "one that moves by itself"
+            found.motion_faults[name].append(Fault(f"joint {name!r}", mimic.shown, error, repaired))
     return found._replace(text=ET.tostring(copy, encoding="unicode"))
 
 
@@ -126,7 +127,7 @@ def _end(joint: ET.Element, which: str, links: dict[str, ET.Element]) -> str:
 def _is_tree(
     links: dict[str, ET.Element], joints: dict[str, ET.Element], parent_of: dict[str, str]
 ) -> None:
-    """Raises where a link has two parents, or none of the links is the root of all."""
+    """Raises ValueError unless the links form one tree."""
     seen: dict[str, str] = {}
     for name, joint in joints.items():
         child = _end(joint, "child", links)
@@ -170,7 +171,7 @@ def _origin(parent: ET.Element, where: str) -> tuple[list[float], list[float]]:
 
 
 def _weight(link: ET.Element) -> tuple[Weight, list[float]]:
-    """What a link weighs, and its centre."""
+    """Mass and inertia of a link, and its centre of mass."""
     where = label(link)
     try:
         inertial = _one(link, "inertial")
@@ -206,7 +207,7 @@ def _inertial(where: str, inertial: ET.Element) -> tuple[Weight, list[float]]:
 
 
 def _joint(joint: ET.Element, found: Urdf) -> ET.Element:
-    """The copy of a joint, with something harmless in the place of what is wrong with it."""
+    """The copy of a joint, with default values in place of faulty ones; `found` gets the faults."""
     where, name, kind = label(joint), str(joint.get("name")), joint.get("type", "")
     parent, child = (str(joint.findall(which)[0].get("link")) for which in ("parent", "child"))
     copied_kind = "continuous"  # a revolute joint too, until its range is known
@@ -217,7 +218,7 @@ def _joint(joint: ET.Element, found: Urdf) -> ET.Element:
     try:
         xyz, rpy = _origin(joint, where)
     except ValueError as error:
-        found.places[child] = Fault(where, "", error)
+        found.pose_faults[child] = Fault(where, "", error)
     ET.SubElement(copy, "origin", xyz=_words(xyz), rpy=_words(rpy))
     ET.SubElement(copy, "parent", link=parent)
     ET.SubElement(copy, "child", link=child)
@@ -227,9 +228,9 @@ def _joint(joint: ET.Element, found: Urdf) -> ET.Element:
     try:
         axis = _axis(joint, where, kind)
     except ValueError as error:
-        found.axes[name] = Fault(where, "", error)
+        found.axis_faults[name] = Fault(where, "", error)
     ET.SubElement(copy, "axis", xyz=_words(axis))
-    faults = found.motions[name] = []
+    faults = found.motion_faults[name] = []
     for read in (_limit, _dynamics, _mimic):
         try:
             faults += read(joint, where, copy, found)
@@ -260,26 +261,26 @@ def _axis(joint: ET.Element, where: str, kind: str) -> list[float]:
 
 
 def _limit(joint: ET.Element, where: str, copy: ET.Element, found: Urdf) -> list[Fault]:
-    """Range and largest torque of a joint, into the copy, and its largest speed; what cannot be,
-    and is left out there.
+    """Copies the range and the largest torque of a joint, and adds its largest speed to `found`;
+    returns the faults of values that are left out.
     """
     limit = _one(joint, "limit")
-    endless = joint.get("type") == "continuous"
+    is_continuous = joint.get("type") == "continuous"
     faults = []
     if limit is None:
-        if endless:
+        if is_continuous:
             return []
         remedy = 'Add <limit lower="..." upper="..."/>, or make it continuous.'
         expected = "the range of a joint that is not continuous"
         return [fault(f"{where}: limit", Shown("nothing"), expected, "no limits", remedy=remedy)]
     names = ["effort", "velocity"]
-    if not endless:
+    if not is_continuous:
         names = ["lower", "upper", *names]
     values = {
         name: floats(f"{where}: limit {name}", limit.get(name, "0"), 1, most=MAX_RANGE)[0]
         for name in names
     }
-    if not endless and not values["lower"] < values["upper"]:
+    if not is_continuous and not values["lower"] < values["upper"]:
         got = (values.pop("lower"), values.pop("upper"))
         faults.append(fault(f"{where}: limit", got, "lower < upper", "no limits"))
     if values["effort"] < 0:
@@ -296,7 +297,7 @@ def _limit(joint: ET.Element, where: str, copy: ET.Element, found: Urdf) -> list
 
 
 def _dynamics(joint: ET.Element, where: str, copy: ET.Element, _: Urdf) -> list[Fault]:
-    """Damping and friction of a joint, into the copy."""
+    """Copies damping and friction of a joint; returns their faults."""
     dynamics, faults = _one(joint, "dynamics"), []
     if dynamics is None:
         return []
@@ -312,7 +313,7 @@ def _dynamics(joint: ET.Element, where: str, copy: ET.Element, _: Urdf) -> list[
 
 
 def _mimic(joint: ET.Element, where: str, _: ET.Element, found: Urdf) -> list[Fault]:
-    """The joint that a joint follows, into `found`."""
+    """Adds the joint that a mimic joint follows to `found`."""
     mimic = _one(joint, "mimic")
     if mimic is not None:
         (multiplier,) = floats(f"{where}: mimic multiplier", mimic.get("multiplier", "1"), 1)
