@@ -128,13 +128,14 @@ def _check_same(scenario: Scenario, of_run: Scenario, *, numbers: bool) -> None:
     batch may differ.
     """
     structure: Any = jax.tree.structure(scenario)
-    got = "a run of a scenario with other numbers"
-    same = not numbers
+    got = ""
     if structure != jax.tree.structure(of_run):
-        got, same = "a run of another kind of scenario", False
+        got = "a run of another kind of scenario"
     elif numbers:
-        same = all(map(np.array_equal, jax.tree.leaves(scenario), jax.tree.leaves(of_run)))
-    if not same:
+        pairs = zip(jax.tree.leaves(scenario), jax.tree.leaves(of_run), strict=True)
+        if not all(np.array_equal(a, b) for a, b in pairs):
+            got = "a run of a scenario with other numbers"
+    if got:
         remedy = "Pass run.scenario as the scenario."
         raise checks.fail("run", got, "a run of `scenario`", remedy)
 
@@ -185,18 +186,19 @@ def _certificate_of(run: Rollout) -> Certificate:
     shares: dict[str, float] = {}
     traces = []
     for segment in segments:
-        of_theorem, found = theorem_lines.segment_lines(segment)
-        checked += [*law_claim_lines.own_segment_lines(segment), *of_theorem]
-        if not summary.claims.no_weights:
+        about_theorem, segment_shares = theorem_lines.segment_lines(segment)
+        checked += [*law_claim_lines.own_segment_lines(segment), *about_theorem]
+        if not summary.claims.why_no_weights:
             weighted += decay_lines.decay_lines(segment, WEIGHTED)
-        for name, share in found.items():
+        for name, share in segment_shares.items():
             shares[name] = max(share, shares.get(name, 0.0))
         traces.append(_traces(segment))
     by_name = _merged(checked)
     for name, share in shares.items():
         note = f"at most {100 * share:.3g} % of that margin at one instant"
         by_name[name] = dataclasses.replace(by_name[name], note=note)
-    assumptions = [by_name.pop(name) for name in theorem_lines.ASSUMPTIONS if name in by_name]
+    names = [statement.name for statement in theorem_lines.ASSUMPTIONS]
+    assumptions = [by_name.pop(name) for name in names if name in by_name]
     all_lines = (
         *assumptions,
         *rate_lines.rate_lines(summary),
@@ -256,7 +258,7 @@ def _numbers(summary: RunSummary) -> dict[str, Any]:
         "lambda_searched": summary.over_box.searched,
         "q_of_lambda_max_box": summary.over_box.q_max,
         "jump_times": summary.jumps,
-        "lambda_min_K2_over_M0_run": summary.slowest,
+        "lambda_min_K2_over_M0_run": summary.mu,
         **weighted,
         "samples": summary.samples,
         "samples_left_out": summary.excluded,
@@ -325,7 +327,7 @@ def _certificate_of_sampled(run: Rollout) -> Certificate:
             duration=grid.duration,
             dt=float(run.dt),
             method=run.method,
-            record_every=grid.every,
+            record_every=grid.record_every,
         )
     continuous = _on_host(simulated)
     certificate = _certificate_of(continuous)

@@ -96,11 +96,11 @@ class Claims(NamedTuple):
     """The law without its wrappers (torque limits)."""
     constants: Claim | FullClaim | None
     """Of Theorem 2, or of (F.3); None where neither applies."""
-    no_theorem: str
+    why_no_theorem: str
     """Why neither applies; "" if one does."""
     bounds_velocities: bool
     """Whether the law is a `FullState`."""
-    no_weights: str
+    why_no_weights: str
     """Why the claim with weights does not apply; "" if it does."""
     other_weights: bool
     """Whether the barriers have weights other than the paper's, which are 1."""
@@ -118,15 +118,15 @@ def claims_of(scenario: Scenario) -> Claims:
     no_theorem = why_no_theorem(scenario)
     weight = optional_member(law, "weight")
     is_corrected = isinstance(law, Backstepping) and law.reading == "corrected"
-    no_weights = "the claim with weights is about the corrected law with a momentum observer"
+    why_no_weights = "the claim with weights is about the corrected law with a momentum observer"
     if is_corrected and isinstance(scenario.observer, Momentum) and not no_theorem:
-        no_weights = ""
+        why_no_weights = ""
     return Claims(
         law=law,
         constants=None if no_theorem else constants_of(scenario),
-        no_theorem=no_theorem,
+        why_no_theorem=no_theorem,
         bounds_velocities=isinstance(law, FullState),
-        no_weights=no_weights,
+        why_no_weights=why_no_weights,
         other_weights=weight is not None and bool(np.any(np.asarray(weight) != 1.0)),
         own=own_claim(scenario),
     )
@@ -229,26 +229,24 @@ class WeightedConstants(NamedTuple):
     """[N m rad/s]."""
 
 
-def weighted_rate_terms(
-    constants: Claim, slowest: float, a: float, b: float, w_f: float
-) -> np.ndarray:
+def weighted_rate_terms(constants: Claim, mu: float, a: float, b: float, w_f: float) -> np.ndarray:
     """The three terms of which rho is the least, (3,) [1/s].
     (W.2)
 
     Args:
       constants: gains and decay rates.
-      slowest: mu, the smallest eigenvalue of M0^-1 K2, () [1/s].
+      mu: the smallest eigenvalue of M0^-1 K2, () [1/s].
       a, b, w_f: as in the docstring of this module.
     """
     decay, K2, kf = (np.asarray(x, float) for x in constants)
-    by_K2 = 2.0 * (1.0 - a) * slowest
+    by_K2 = 2.0 * (1.0 - a) * mu
     by_kf = 2.0 * np.min(kf - b / 2.0 - 0.25 / (a * K2 * w_f))
     return np.array([np.min(decay), by_K2, by_kf])
 
 
 def best_constants(
     constants: Claim,
-    slowest: float,
+    mu: float,
     V_rest: float,
     half_square: float,
     F_d: float,
@@ -262,7 +260,7 @@ def best_constants(
 
     Args:
       constants: gains and decay rates.
-      slowest: mu over the run, () [1/s].
+      mu: the same over the run, () [1/s].
       V_rest: V_w(0) without f_tilde, () [N m rad].
       half_square: |f_tilde(0)|^2 / 2, () [(N m)^2].
       F_d: sup |f'|, () [N m/s].
@@ -270,12 +268,12 @@ def best_constants(
       case: 1 for f' = 0, 2 for bounded f'.
     """
     decay, K2, kf = (np.asarray(x, float) for x in constants)
-    top = min(float(np.min(decay)), 2.0 * slowest, 2.0 * float(np.min(kf)))
+    top = min(float(np.min(decay)), 2.0 * mu, 2.0 * float(np.min(kf)))
     if not (np.all(np.isfinite([top, V_rest, half_square, F_d])) and top > 0):
         return None
     # Axes: rates rho, then fractions of the largest b.
     rho = top * GRID[:, None]
-    a = 1.0 - rho / (2.0 * slowest)
+    a = 1.0 - rho / (2.0 * mu)
     fractions = {1: np.zeros((1, 1)), 2: GRID[None, :]}[case]
     b = 2.0 * (np.min(kf) - rho / 2.0) * fractions
     kf_margin = kf - (b + rho)[..., None] / 2.0

@@ -107,7 +107,7 @@ def _inequality(segment: Segment, kind: str, case: int) -> Line:
     if reason:
         return not_applicable(statement, reason)
     decay = summary.decays[kind, case]
-    size = max(1.0, decay.w_f) * proof.terms + decay.rho * weighted_lyapunov(proof, decay.w_f)
+    size = max(1.0, decay.w_f) * proof.dV_size + decay.rho * weighted_lyapunov(proof, decay.w_f)
     margins, note = -left_side(segment, kind, case), summary.exclusion_note
     return check_steps(segment, statement, margins, summary.eps * size, note=note)
 
@@ -198,7 +198,7 @@ def _why_no_bound(segment: Segment, name: str, bounds: dict[str, np.ndarray]) ->
     """Why a bound does not follow from the envelope, "" if it does.
 
     The bound on xi by V2 needs xi^2/2 <= V1 (Theorem 1), which holds where the barrier's own bound
-    is the stronger one.
+    is smaller.
     """
     if name.startswith("xi") and not np.all(segment.proof.excluded):
         by_barrier, by_V2 = bounds["xi, by V1"], bounds["xi"]
@@ -206,7 +206,7 @@ def _why_no_bound(segment: Segment, name: str, bounds: dict[str, np.ndarray]) ->
             return NO_BOUND
         stronger = by_barrier <= by_V2 * (1 + 1e-9)
         if name == "xi" and not np.all(stronger | np.isnan(by_V2)):
-            return "xi^2/2 <= V1 (Theorem 1) is not so for this barrier"
+            return "xi^2/2 <= V1 (Theorem 1) does not hold for this barrier"
     if name == "xi2, by phi" and np.all(np.isnan(bounds[name])):
         return "the velocity barrier states no bound on xi2 from phi"
     return ""

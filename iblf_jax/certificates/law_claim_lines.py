@@ -35,12 +35,12 @@ def why_not_own(summary: RunSummary) -> str:
         return f"{about}, not about {checks.with_article(type(actuator).__name__)}"
     if summary.excluded == summary.samples:
         return ALWAYS_EXCLUDED
-    return summary.invalid
+    return summary.why_invalid
 
 
 def own_left_side(proof: Any) -> np.ndarray:
     """V' + W - T, which must not be positive, (T,)."""
-    return proof.own.dV + proof.own.decay - proof.own.terms
+    return proof.own.dV + proof.own.decay - proof.own.disturbance_terms
 
 
 def own_segment_lines(segment: Segment) -> list[Line]:

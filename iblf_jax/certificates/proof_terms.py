@@ -27,7 +27,7 @@ where the second term is zero for a V without f_tilde. For a law that does not u
 uncertain term f takes the place of f_tilde.
 
 Rounding: V2' is a sum of large terms that cancel, so its error is some units in the last place of
-those terms. `ProofTerms.terms` is the sum of their absolute values.
+those terms. `ProofTerms.dV_size` is the sum of their absolute values.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class OwnTerms(NamedTuple):
     """V', exact, in the unit of V a second."""
     decay: jax.Array
     """W."""
-    terms: jax.Array
+    disturbance_terms: jax.Array
     """T."""
     size: jax.Array
     """Sum of the absolute values of the terms of V': rounding is relative to it."""
@@ -120,14 +120,12 @@ class ProofTerms(NamedTuple):
     excluded: jax.Array
     """Whether the claims exclude this instant, () bool: the guard at the bound or a torque limit is
     active, or alpha is outside its bounds."""
-    terms: jax.Array
+    dV_size: jax.Array
     """Sum of the absolute values of the terms of V2', () [1/s]: `rounding` times this is the error
     of V2'."""
-    df_terms: jax.Array
-    """Sum of the absolute values of the terms of f', (n,) [N m/s]."""
-    V_terms: jax.Array
-    """Error of sqrt(2 V2) per unit of relative error, ()."""
-    slowest: jax.Array
+    sqrt_V_size: jax.Array
+    """Error of sqrt(2 V2) for a relative error of 1, ()."""
+    mu: jax.Array
     """Smallest eigenvalue of M0^-1 K2, () [1/s]; NaN for a law whose K2 is no torque gain."""
     full: Any = ()
     """`FullTerms` of a law that bounds velocities."""
@@ -150,10 +148,8 @@ def terms_at(scenario: Scenario, t: jax.Array, state: LoopState) -> ProofTerms:
     """
     terms, M0, _ = terms_and_sample(scenario, t, state)
     eigenvalues = jnp.linalg.eigvalsh(M0)
-    slowest = 1.0 / jnp.linalg.eigvalsh(mass_over_gain(scenario, M0))[-1]
-    return ProofTerms(
-        **terms, lambda_min=eigenvalues[0], lambda_max=eigenvalues[-1], slowest=slowest
-    )
+    mu = 1.0 / jnp.linalg.eigvalsh(mass_over_gain(scenario, M0))[-1]
+    return ProofTerms(**terms, lambda_min=eigenvalues[0], lambda_max=eigenvalues[-1], mu=mu)
 
 
 def mass_over_gain(scenario: Scenario, M0: Any) -> Any:
@@ -181,7 +177,7 @@ def terms_and_sample(
     dM0 = mass_matrix_rate(scenario.model, state.q, state.dq)
     f_tilde = now["disturbance"] - now["disturbance_estimate"]
     dropped_e2, dropped_f = _dropped_terms(scenario, dM0, state.dq, now["e2"], f_tilde)
-    terms, df_terms, V_terms = _term_sizes(scenario, t, state, M0, now, rates, f_tilde)
+    dV_size, sqrt_V_size = _term_sizes(scenario, t, state, M0, now, rates, f_tilde)
     plant_is_model = _are_equal(at_time(scenario.plant, t), scenario.model)
     proof = {
         "V": now["V"],
@@ -199,9 +195,8 @@ def terms_and_sample(
             jnp.any(sample.guard_active | sample.saturated)
             | _torque_was_limited(scenario, t, state, now)
         ),
-        "terms": terms,
-        "df_terms": df_terms,
-        "V_terms": V_terms,
+        "dV_size": dV_size,
+        "sqrt_V_size": sqrt_V_size,
     }
     if own_claim(scenario) is not None:
         proof["own"] = _own_terms(scenario, t, state, state_rate, now, rates)
@@ -319,10 +314,8 @@ def _gap(xi: jax.Array, guard: float) -> jax.Array:
 
 def _term_sizes(
     scenario: Scenario, t: jax.Array, state: LoopState, M0, now, rates, f_tilde
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Sums of the absolute values of the terms of V2' and f', and the error of sqrt(2 V2) per unit
-    of relative error.
-    """
+) -> tuple[jax.Array, jax.Array]:
+    """`dV_size` and `sqrt_V_size` of `ProofTerms`."""
     law, zero = unwrapped(scenario.controller), jnp.zeros_like(state.q)
     K2 = _leaf(law, "K2", zero)
     kf = _leaf(scenario.observer, "kf", zero)
@@ -346,13 +339,13 @@ def _term_sizes(
         + (jnp.abs(rates["s"]) + jnp.abs(now["s"]) * speeds) / gap
     )
     df, df_tilde = rates["disturbance"], rates["disturbance"] - rates["disturbance_estimate"]
-    terms = (
+    dV_size = (
         speeds @ (jnp.abs(now["s"]) / gap + torque)
         + (jnp.abs(f_tilde) + jnp.abs(df)) @ torque_rate
         + torque @ jnp.abs(df_tilde)
     )
     if isinstance(law, FullState):
-        terms += _phi_term_sizes(law, scenario, t, state, M0, torque, accelerations)
+        dV_size += _phi_term_sizes(law, scenario, t, state, M0, torque, accelerations)
     tube = scenario.context.tube(t)
     width = jnp.minimum(tube.k_l, tube.k_u)
     weight = _leaf(law, "weight", jnp.ones_like(width))
@@ -361,7 +354,7 @@ def _term_sizes(
         + speeds @ (jnp.abs(M0) @ speeds)
         + torque @ torque
     )
-    return terms, torque_rate, jnp.sqrt(V_size)
+    return dV_size, jnp.sqrt(V_size)
 
 
 def _phi_term_sizes(
@@ -413,11 +406,11 @@ def _own_terms(
     decay = jnp.sum(law.decay(t, q, dq, f_tilde, context, state.controller))
     slopes = jax.grad(lyapunov, argnums=(0, 1, 2, 3, 4))(*point)
     M0 = scenario.model.mass_matrix(q)
-    disturbance_terms = optional_member(law, "disturbance_terms")
-    if disturbance_terms is None:
+    stated = optional_member(law, "disturbance_terms")
+    if stated is None:
         terms = slopes[2] @ solve_spd(M0, f_tilde) + slopes[3] @ df
     else:
-        terms = jnp.sum(disturbance_terms(t, q, dq, f_tilde, df, context, state.controller))
+        terms = jnp.sum(stated(t, q, dq, f_tilde, df, context, state.controller))
     size = _own_term_sizes(M0, slopes, tangent, now) + jnp.abs(decay) + jnp.abs(terms)
     limited = jnp.zeros((), bool)
     if law is not scenario.controller:

@@ -45,7 +45,7 @@ def rate_lines(summary: RunSummary) -> list[Line]:
 
 def weighted_rate_lines(summary: RunSummary) -> list[Line]:
     """The rates of the claim with weights; no lines for a loop without the claim."""
-    if summary.claims.no_weights:
+    if summary.claims.why_no_weights:
         return []
     return [_weighted_rate(summary, case) for case in CASES]
 
@@ -57,7 +57,7 @@ def _gains(summary: RunSummary) -> list[Line]:
     kf_1 = Statement("kf, case 1", "(3.17)", "lambda_min(kf - I/2) > 0", "1/s")
     kf_2 = Statement("kf, case 2", "(3.25)", "lambda_min(kf - I) > 0", "1/s")
     if not isinstance(constants, claims.Claim):
-        return [not_applicable(s, summary.claims.no_theorem) for s in (K2, kf_1, kf_2)]
+        return [not_applicable(s, summary.claims.why_no_theorem) for s in (K2, kf_1, kf_2)]
     conditions = (
         (K2, constants.K2 - claims.LOWEST_K2, True),
         (kf_1, constants.kf - claims.LOWEST_KF[1], True),
@@ -85,7 +85,7 @@ def _full_gains(summary: RunSummary) -> list[Line]:
         text = f"lambda_min(kf){FURTHER_TERM[case]} - 1/(4 c lambda_min(M0)^2) > 0"
         statement = Statement(f"kf and c, case {case}", "(F.3)", text, "1/s")
         if not isinstance(constants, FullClaim):
-            lines.append(not_applicable(statement, summary.claims.no_theorem))
+            lines.append(not_applicable(statement, summary.claims.why_no_theorem))
             continue
         margin = 0.5 * float(summary.rho_terms[case, "run"][2])
         needed = np.asarray(constants.kf).min() - claims.LOWEST_FULL[case]
@@ -103,21 +103,21 @@ def _rate(summary: RunSummary, case: int, domain: str) -> Line:
     """The rate rho of one case, with the eigenvalues of M0 along the run or over the admissible
     box.
     """
-    full = summary.claims.bounds_velocities
+    bounds_velocities = summary.claims.bounds_velocities
     name = f"rho, case {case}" + {"run": "", "box": ", over the box"}[domain]
     equation = RHO[case]
     text = (
         "rho = min(decay of V1, 2 (K2 - 1/2)/lambda_max(M0), 2 (kf -"
         f" {claims.LOWEST_KF[case]:g})) > 0"
     )
-    if full:
+    if bounds_velocities:
         equation = "(F.3)"
         text = (
             "rho = min(decay of V1, decay of phi, 2 (kf"
             f"{FURTHER_TERM[case]} - 1/(4 c lambda_min(M0)^2))) > 0"
         )
     statement = Statement(name, equation, text, "1/s")
-    reason = summary.claims.no_theorem
+    reason = summary.claims.why_no_theorem
     if case == 1 and summary.case == 2:
         reason = summary.why_not(THEOREM, 1)
     if reason:
@@ -125,7 +125,7 @@ def _rate(summary: RunSummary, case: int, domain: str) -> Line:
     source: Any = {"run": summary, "box": summary.over_box}[domain]
     least = ["the decay rate of V1", "K2 over lambda_max(M0)", "kf"]
     eigenvalue = f"lambda_max(M0) = {source.lambda_max:.4g} kg m^2"
-    if full:
+    if bounds_velocities:
         least = ["the decay rate of V1", "the decay rate of phi", "kf and c"]
         eigenvalue = f"lambda_min(M0) = {source.lambda_min:.4g} kg m^2"
     searched = {"run": "", "box": f" ({summary.over_box.searched})"}[domain]
@@ -155,17 +155,17 @@ def _weighted_rate(summary: RunSummary, case: int) -> Line:
     constants, reason = summary.claims.constants, summary.why_not(WEIGHTED, case)
     if reason or not isinstance(constants, claims.Claim):
         return not_applicable(statement, reason)
-    chosen, slowest = summary.weighted_constants[case], summary.slowest
-    limits = (np.min(constants.decay), 2.0 * slowest, 2.0 * np.min(constants.kf))
+    chosen, mu = summary.weighted_constants[case], summary.mu
+    limits = (np.min(constants.decay), 2.0 * mu, 2.0 * np.min(constants.kf))
     least = ("the decay rate of V1", "K2 over M0", "kf")[int(np.argmin(limits))]
     numbers = f"a = {chosen.a:.4g}, w_f = {chosen.w_f:.4g} rad/(N m)"
     if case == 2:
         numbers += f", b = {chosen.b:.4g} 1/s"
     note = (
         f"chosen for the smallest mean of the envelope: {numbers}; lambda_min(M0^-1 K2) ="
-        f" {slowest:.4g} 1/s; limited by {least}"
+        f" {mu:.4g} 1/s; limited by {least}"
     )
-    terms = claims.weighted_rate_terms(constants, slowest, chosen.a, chosen.b, chosen.w_f)
+    terms = claims.weighted_rate_terms(constants, mu, chosen.a, chosen.b, chosen.w_f)
     counts = not (case == 2 and summary.case == 1)
     margin = float(np.min(terms))
     return check_positive(statement, margin, value=chosen.rho, note=note, counts=counts)

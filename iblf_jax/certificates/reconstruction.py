@@ -50,7 +50,7 @@ STATES = (
 class TimeGrid(NamedTuple):
     """The steps of a run."""
 
-    every: int
+    record_every: int
     """Steps from one recorded sample to the next."""
     last: int
     """Number of the last step."""
@@ -116,7 +116,7 @@ def steps_of(run: Any, grid: TimeGrid) -> Iterator[Steps]:
     for index, states in blocks:
         steps = _with_proof(run, index, states, grid)
         if valid:
-            _check_signals(run, steps, index[steps.recorded] // grid.every, sizes)
+            _check_signals(run, steps, index[steps.recorded] // grid.record_every, sizes)
         yield steps
 
 
@@ -138,7 +138,7 @@ def _as_recorded(run: Any, grid: TimeGrid) -> Iterator[tuple[np.ndarray, LoopSta
     states = _recorded_states(run)
     for first in range(0, run.t.size, BLOCK_STEPS):
         rows = np.arange(first, min(first + BLOCK_STEPS, run.t.size))
-        yield rows * grid.every, _rows(states, rows)
+        yield rows * grid.record_every, _rows(states, rows)
 
 
 def _integrated_again(run: Any, grid: TimeGrid) -> Iterator[tuple[np.ndarray, LoopState]]:
@@ -147,29 +147,31 @@ def _integrated_again(run: Any, grid: TimeGrid) -> Iterator[tuple[np.ndarray, Lo
     A block holds the intervals of several samples where these are short, and a part of one interval
     where it is long.
     """
-    recorded, count, every = _recorded_states(run), run.t.size, grid.every
-    intervals, length = max(1, BLOCK_STEPS // every), min(every, BLOCK_STEPS)
+    recorded = _recorded_states(run)
+    count, every = run.t.size, grid.record_every
+    intervals, length = max(1, BLOCK_STEPS // every), min(every, BLOCK_STEPS)  # of a block
     start = jax.tree.map(lambda x: np.asarray(x)[None], initial_state(run.scenario))
     _check_arrival(run, _rows(recorded, slice(0, 1)), start, np.zeros(1, int))
     for first_row in range(0, count, intervals):
-        numbers = np.arange(first_row, first_row + intervals)
-        rows = np.minimum(numbers, count - 1)  # the last block repeats the last sample
+        samples = np.arange(first_row, first_row + intervals)
+        rows = np.minimum(samples, count - 1)  # the last block repeats the last sample
         states = _rows(recorded, rows)
         for offset in range(0, every, length):
             first = rows * every + offset
             states, path = _advance(run, first, states, length)
             index = first[:, None] + np.arange(length)
             in_interval = np.arange(offset, offset + length) < every
-            keep = (numbers < count)[:, None] & in_interval & (index <= grid.last)
+            keep = (samples < count)[:, None] & in_interval & (index <= grid.last)
             if not keep.any():
                 return
             path = jax.tree.map(np.asarray, path)
             yield index[keep], _rows(path, keep)
         # The last part of an interval may be shorter than `length`: its end lies on the path.
-        arrived, rest = jax.tree.map(np.asarray, states), every - offset
-        if rest < length:
-            arrived = _rows(path, (slice(None), rest))
-        has_next = numbers < count - 1
+        arrived = jax.tree.map(np.asarray, states)
+        remaining = every - offset
+        if remaining < length:
+            arrived = _rows(path, (slice(None), remaining))
+        has_next = samples < count - 1
         following = rows[has_next] + 1
         _check_arrival(run, _rows(recorded, following), _rows(arrived, has_next), following)
 
@@ -223,11 +225,11 @@ class AdvanceStep:
         return at._replace(state=result.state), (at.state, energies)
 
 
-def _positions(index: np.ndarray, states: LoopState, dt: Any, parts: int = 1) -> Position:
-    """Positions of some steps, in time steps of dt divided by `parts`."""
+def _positions(index: np.ndarray, states: LoopState, dt: Any, substeps: int = 1) -> Position:
+    """Positions of some steps, in time steps of dt divided by `substeps`."""
     dtype = np.asarray(dt).dtype
-    steps = (parts * index).astype(dtype)
-    size = np.full(index.shape, float(dt) / parts, dtype)
+    steps = (substeps * index).astype(dtype)
+    size = np.full(index.shape, float(dt) / substeps, dtype)
     return Position(jax.device_put(steps), jax.device_put(size), states)
 
 
@@ -256,7 +258,7 @@ def _with_proof(run: Any, index: np.ndarray, states: LoopState, grid: TimeGrid) 
     padded_states = _rows(jax.tree.map(np.asarray, states), padded)
     found = proof_along(run.scenario, index[padded], padded_states, run.dt, method=run.method)
     proof, sample, defect, defect_f = _rows(found, slice(0, size))
-    return Steps(t, sample, proof, index % grid.every == 0, defect, defect_f)
+    return Steps(t, sample, proof, index % grid.record_every == 0, defect, defect_f)
 
 
 def proof_along(
@@ -274,7 +276,7 @@ def proof_along(
       `ProofTerms`, `Sample`, and the errors of the integrator in V2 and in |f_tilde|^2/2 over one
       step, on the host; (T, ...) each.
     """
-    full, halves = (_positions(index, states, dt, parts) for parts in (1, 2))
+    full, halves = (_positions(index, states, dt, substeps) for substeps in (1, 2))
     found = step_states(scenario, dt, full, step=ObserveStep())[1]
     # One step is compared with two half steps, because the envelopes are compared with a run in
     # which V2 has fallen below what the integrator resolves. Both are advanced three times, so that
@@ -285,7 +287,7 @@ def proof_along(
     terms, M0, sample = jax.tree.map(lambda x: np.asarray(x)[:, 0], found)
     eigenvalues = _eigenvalues(M0)
     terms["lambda_min"], terms["lambda_max"] = eigenvalues[:, 0], eigenvalues[:, -1]
-    terms["slowest"] = 1.0 / _eigenvalues(np.asarray(mass_over_gain(scenario, M0)))[:, -1]
+    terms["mu"] = 1.0 / _eigenvalues(np.asarray(mass_over_gain(scenario, M0)))[:, -1]
     return ProofTerms(**terms), sample, *map(_defect, energies)
 
 
@@ -328,19 +330,21 @@ def tolerances(run: Any) -> dict[str, float]:
     }
 
 
-def _check_arrival(run: Any, recorded: LoopState, made: LoopState, rows: np.ndarray) -> None:
+def _check_arrival(
+    run: Any, recorded: LoopState, reconstructed: LoopState, rows: np.ndarray
+) -> None:
     """Raises ValueError if the reconstructed states are not those that the run recorded."""
     sizes = tolerances(run)
-    expected, reached = recorded._asdict(), made._asdict()
+    expected, reached = recorded._asdict(), reconstructed._asdict()
     for field, label, kind in STATES:
         leaves = (jax.tree.leaves(expected[field]), jax.tree.leaves(reached[field]))
-        for kept, again in zip(*leaves, strict=True):
+        for kept, made in zip(*leaves, strict=True):
             tolerance = sizes[kind]
             if label.endswith("state"):
                 # A state of law or observer has its own unit, hence its own scale if larger.
                 own = np.max(np.abs(kept), initial=0.0)
                 tolerance = max(tolerance, np.sqrt(np.finfo(kept.dtype).eps) * own)
-            _compare(run, label, kept, again, rows, tolerance)
+            _compare(run, label, kept, made, rows, tolerance)
 
 
 def _check_signals(run: Any, steps: Steps, rows: np.ndarray, sizes: dict[str, float]) -> None:
@@ -348,24 +352,33 @@ def _check_signals(run: Any, steps: Steps, rows: np.ndarray, sizes: dict[str, fl
     run recorded.
     """
     for names, kind in ((POSITIONS, "position"), (SPEEDS, "speed"), (TORQUES, "torque")):
-        again = attributes(steps.sample, names)
+        reconstructed = attributes(steps.sample, names)
         for name, recorded in attributes(run, names).items():
-            _compare(run, name, recorded[rows], again[name][steps.recorded], rows, sizes[kind])
+            _compare(
+                run, name, recorded[rows], reconstructed[name][steps.recorded], rows, sizes[kind]
+            )
 
 
 def _compare(
-    run: Any, name: str, kept: np.ndarray, made: np.ndarray, rows: np.ndarray, tolerance: float
+    run: Any,
+    name: str,
+    recorded: np.ndarray,
+    reconstructed: np.ndarray,
+    rows: np.ndarray,
+    tolerance: float,
 ) -> None:
     """Raises ValueError if a reconstructed signal differs from the recorded one."""
-    far = np.any(~(np.abs(made - kept) <= tolerance), axis=tuple(range(1, np.ndim(kept))))
+    far = np.any(
+        ~(np.abs(reconstructed - recorded) <= tolerance), axis=tuple(range(1, np.ndim(recorded)))
+    )
     if not far.any():
         return
     k = int(np.argmax(far))
     where = f"{name} of sample {int(rows[k])} (t = {float(run.t[rows[k]]):.6g} s)"
     remedy = (
-        f"Its scenario, dt and method do not reproduce the run: {where} is {kept[k]}, and {made[k]}"
-        " when integrated again. Simulate it again; a loop that amplifies rounding that much needs"
-        " record_every=1."
+        f"Its scenario, dt and method do not reproduce the run: {where} is {recorded[k]}, and"
+        f" {reconstructed[k]} when integrated again. Simulate it again; a loop that amplifies"
+        " rounding that much needs record_every=1."
     )
     raise checks.fail(
         "run", "samples that its scenario does not give", "the run of run.scenario", remedy

@@ -57,7 +57,7 @@ class RunSummary:
     """The Rollout, its arrays on the host."""
     claims: Claims
     """The claims about its scenario."""
-    invalid: str
+    why_invalid: str
     """Why nothing can be claimed about this run; "" if something can."""
     eps: float
     """Relative error attributed to rounding."""
@@ -79,12 +79,12 @@ class RunSummary:
     """Largest eigenvalue of M0 along the run [kg m^2]."""
     over_box: Extremes
     samples: int
-    """Number of steps, and the last instant."""
+    """Number of samples, one for each step and one for the last instant."""
     excluded: int
-    """Those of them at which the guard or a torque limit was active."""
+    """Number of samples at which the guard or a torque limit was active."""
     V_ends: tuple[float, float]
-    """V2 at the first and at the last."""
-    slowest: float
+    """V2 at the first and at the last sample."""
+    mu: float
     """Smallest eigenvalue of M0^-1 K2 along the run [1/s]."""
     weighted_constants: dict[int, WeightedConstants]
     """The numbers of the claim with weights, by case, for a loop that has one."""
@@ -96,11 +96,12 @@ class RunSummary:
           kind: THEOREM or WEIGHTED.
           case: 1 or 2.
         """
-        unclaimed = self.claims.no_theorem
+        unclaimed = self.claims.why_no_theorem
         if kind == WEIGHTED:
-            unclaimed = self.claims.no_weights
-        if unclaimed or self.invalid:
-            return unclaimed or self.invalid
+            unclaimed = self.claims.why_no_weights
+        unclaimed = unclaimed or self.why_invalid
+        if unclaimed:
+            return unclaimed
         if case == 1 and self.case == 2:
             return f"case 1 is for f' = 0; here |f'| reaches {self.F_d:.4g} N m/s, see case 2"
         if kind == WEIGHTED and case not in self.weighted_constants:
@@ -226,7 +227,7 @@ class _Extrema:
         self.F_d = -np.inf
         self.lambda_min = np.inf
         self.lambda_max = -np.inf
-        self.slowest = np.inf
+        self.mu = np.inf
         self.steady = True
         self.samples = 0
         self.excluded = 0
@@ -249,7 +250,7 @@ class _Extrema:
         self.F_d = np.maximum(self.F_d, np.linalg.norm(proof.df, axis=1).max())
         self.lambda_min = np.minimum(self.lambda_min, proof.lambda_min.min())
         self.lambda_max = np.maximum(self.lambda_max, proof.lambda_max.max())
-        self.slowest = np.minimum(self.slowest, proof.slowest.min())
+        self.mu = np.minimum(self.mu, proof.mu.min())
         self.steady = self.steady and bool(proof.steady.all())
         self.samples += steps.t.size
         self.excluded += int(proof.excluded.sum())
@@ -260,11 +261,11 @@ def _summary(run: Any, grid: TimeGrid, all_steps: Iterable[Steps]) -> RunSummary
     extrema = _Extrema()
     for steps in all_steps:
         extrema.add(steps)
-    invalid = ""
+    why_invalid = ""
     if is_valid(run):
         check_status(run, float(extrema.bound_distance))
     else:
-        invalid = f"the run is not valid: {describe(int(run.status) & int(UNTRUSTED))}"
+        why_invalid = f"the run is not valid: {describe(int(run.status) & int(UNTRUSTED))}"
     scenario = run.scenario
     claimed = claims.claims_of(scenario)
     over_box = eigenvalues_over(scenario.model, extrema.low, extrema.high)
@@ -276,7 +277,7 @@ def _summary(run: Any, grid: TimeGrid, all_steps: Iterable[Steps]) -> RunSummary
     return RunSummary(
         run=run,
         claims=claimed,
-        invalid=invalid,
+        why_invalid=why_invalid,
         eps=rounding(run.q.dtype),
         jumps=jumps[(jumps > 0) & (jumps <= grid.duration)],
         case=case,
@@ -290,7 +291,7 @@ def _summary(run: Any, grid: TimeGrid, all_steps: Iterable[Steps]) -> RunSummary
         samples=extrema.samples,
         excluded=extrema.excluded,
         V_ends=(float(extrema.V_start), float(extrema.V_end)),
-        slowest=float(extrema.slowest),
+        mu=float(extrema.mu),
         weighted_constants=_weighted_constants(claimed, extrema, F_d, grid.duration),
     )
 
@@ -314,14 +315,14 @@ def _weighted_constants(
     claimed: Claims, extrema: _Extrema, F_d: float, duration: float
 ) -> dict[int, WeightedConstants]:
     """The numbers of the claim with weights, by case; none for a loop that has no such claim."""
-    if not isinstance(claimed.constants, claims.Claim) or claimed.no_weights:
+    if not isinstance(claimed.constants, claims.Claim) or claimed.why_no_weights:
         return {}
     half_square = float(extrema.half_square_start)
     V_rest = float(extrema.V_start) - half_square
     found = {}
     for case in CASES:
         best = claims.best_constants(
-            claimed.constants, float(extrema.slowest), V_rest, half_square, F_d, duration, case
+            claimed.constants, float(extrema.mu), V_rest, half_square, F_d, duration, case
         )
         if best is not None:
             found[case] = best
@@ -387,7 +388,7 @@ def _envelope(
     V = weighted_lyapunov(proof, w_f)
     eps = float(np.finfo(proof.V.dtype).eps)
     # The rounding error of sqrt(2 V), and the error of the integrator in V over one step.
-    noise = ENERGY_ROUNDING * eps * proof.V_terms * max(1.0, w_f) ** 0.5
+    noise = ENERGY_ROUNDING * eps * proof.sqrt_V_size * max(1.0, w_f) ** 0.5
     defects = steps.defect + abs(w_f - 1.0) * steps.defect_f
     if anchor is None:
         anchor = _Anchor(t[0], V[0], noise[0], 0.0)

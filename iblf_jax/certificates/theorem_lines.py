@@ -40,14 +40,14 @@ START_INSIDE = Statement("start inside", "Theorem 2", "k_lc(0) < q(0) < k_uc(0)"
 ALPHA_INSIDE = Statement("alpha inside", "(F.1)", "v_l < alpha < v_u", "rad/s")
 START_SPEED_INSIDE = Statement("start speed inside", "(F.1)", "v_l(0) < q'(0) < v_u(0)", "rad/s")
 ASSUMPTIONS = (
-    "f bounded",
-    "f' bounded",
-    "reference inside",
-    "start inside",
-    "alpha inside",
-    "start speed inside",
+    BOUNDED,
+    RATE_BOUNDED,
+    REFERENCE_INSIDE,
+    START_INSIDE,
+    ALPHA_INSIDE,
+    START_SPEED_INSIDE,
 )
-"""Names of the lines that a certificate shows before those of the gains."""
+"""The statements that a certificate shows before those of the gains."""
 
 
 def segment_lines(segment: Segment) -> tuple[list[Line], dict[str, float]]:
@@ -72,21 +72,21 @@ def segment_lines(segment: Segment) -> tuple[list[Line], dict[str, float]]:
 def _assumptions(segment: Segment) -> list[Line]:
     """Bounds of Assumption 1 along the run, and feasibility of the reference, Assumption 2."""
     summary, sample, proof = segment.summary, segment.sample, segment.proof
-    speed = np.linalg.norm(proof.df, axis=1)
+    df_norm = np.linalg.norm(proof.df, axis=1)
     if summary.case == 1:
-        speed = 0.0 * speed
-    jumps = ""
+        df_norm = 0.0 * df_norm
+    jump_note = ""
     if summary.jumps.size:
-        jumps = f"Assumption 1 is broken by a jump of f: {summary.exclusion_note}"
+        jump_note = f"Assumption 1 is broken by a jump of f: {summary.exclusion_note}"
     distance = np.minimum(sample.q_d - sample.lower, sample.upper - sample.q_d)
     reference = check_smallest(REFERENCE_INSIDE, segment.t, distance)
     if not has(summary.run, "slack"):
-        # The status of a safety filter says nothing about this: the filter keeps its bounds
-        # wherever the reference is, but the theorem needs it inside.
+        # A safety filter keeps its bounds for any reference, so its status does not show whether
+        # the reference is inside them.
         reference = _with_status(summary, reference, Status.INFEASIBLE_REFERENCE)
     lines = [
         _finite(BOUNDED, segment.t, np.linalg.norm(proof.f, axis=1)),
-        _finite(RATE_BOUNDED, segment.t, speed, jumps),
+        _finite(RATE_BOUNDED, segment.t, df_norm, jump_note),
         reference,
     ]
     if segment.t[0] == 0:
@@ -130,10 +130,10 @@ def _barriers_inequality(segment: Segment) -> Line:
     summary, proof = segment.summary, segment.proof
     text = "(V1 + phi)' + decay of V1 and phi - s2 . M0^-1 f_tilde + c |s2|^2 <= 0"
     statement = Statement("barriers", "(F.2)", text, "1/s")
-    reason = summary.claims.no_theorem or summary.invalid
+    reason = summary.claims.why_no_theorem or summary.why_invalid
     if reason:
         return not_applicable(statement, reason)
-    tolerance, note = summary.eps * proof.terms, summary.exclusion_note
+    tolerance, note = summary.eps * proof.dV_size, summary.exclusion_note
     return check_steps(segment, statement, -proof.full.left, tolerance, note=note)
 
 
@@ -157,7 +157,7 @@ def _dropped_terms(segment: Segment) -> tuple[list[Line], dict[str, float]]:
         "-f_tilde^T kf M0' q' <= the margin that the proof leaves",
         "1/s",
     )
-    unclaimed = summary.claims.no_theorem or summary.invalid
+    why_unclaimed = summary.claims.why_no_theorem or summary.why_invalid
     why_no_case = summary.why_not(THEOREM, case or summary.case)
     terms = (
         (by_law, proof.dropped_e2, _why_law_is_exact(summary)),
@@ -165,13 +165,13 @@ def _dropped_terms(segment: Segment) -> tuple[list[Line], dict[str, float]]:
     )
     lines: list[Line] = []
     shares: dict[str, float] = {}
-    for statement, term, exact in terms:
-        reason = unclaimed or exact or why_no_case
+    for statement, term, why_exact in terms:
+        reason = why_unclaimed or why_exact or why_no_case
         if reason or case is None:
             lines.append(not_applicable(statement, reason, counts=False))
             continue
         margin = proof.dropped_e2 + proof.dropped_f - left_side(segment, THEOREM, case)
-        tolerance = summary.eps * proof.terms
+        tolerance = summary.eps * proof.dV_size
         included = ~proof.excluded
         share = np.where(included, term / np.maximum(margin, tolerance), 0.0)
         shares[statement.name] = float(np.max(share))

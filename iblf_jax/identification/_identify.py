@@ -16,6 +16,7 @@ from iblf_jax.identification.assessment import assessed
 from iblf_jax.identification.coordinates import (
     DELAY_PATH,
     DELAY_SCALE,
+    LARGEST_DELAY,
     Coordinates,
     coordinates,
     to_x,
@@ -24,11 +25,7 @@ from iblf_jax.identification.coordinates import (
 )
 from iblf_jax.identification.log import Log, read
 from iblf_jax.identification.problem import IdentificationProblem
-from iblf_jax.identification.regression import (
-    LARGEST_DELAY,
-    coordinate_scales,
-    initial_estimate,
-)
+from iblf_jax.identification.regression import coordinate_scales, initial_estimate
 from iblf_jax.identification.result import INCOMPLETE_RATIO, MIN_NOISE, Identification
 from iblf_jax.identification.shooting import Prior, Refinement, Windows, windows
 from iblf_jax.identification.smoothing import smooth_logs
@@ -131,7 +128,9 @@ def _checked(options: Options, log: Any) -> Options:
     if torque is None:
         runs = log if isinstance(log, list | tuple) else [log]
         continuous = all(isinstance(x, Rollout) and x.scenario.sampling is None for x in runs)
-        torque = TORQUES[int(continuous)]
+        torque = "held"
+        if continuous:
+            torque = "interpolated"
     checks.one_of("torque", torque, TORQUES)
     checks.one_of("loss", options.loss, LOSSES)
     if delay is not None:
@@ -178,10 +177,10 @@ def _problem(
         coordinates=c,
         logs=logs,
         windows=fitted_windows,
-        smooth=smooth_logs([front for front in fronts if len(front.t)], hold),
+        motion=smooth_logs([front for front in fronts if len(front.t)], hold),
         prior=_prior(c, options.priors),
         requested=len([path for path in paths if path != DELAY_PATH]),
-        fixed_delay=None if c.delay else options.delay,
+        fixed_delay=None if c.has_delay_path else options.delay,
         zero_order_hold=hold,
         loss=options.loss,
         iterations=options.iterations,
@@ -190,30 +189,32 @@ def _problem(
 
 def _solved(problem: IdentificationProblem, began: float) -> Identification:
     """The result: regression, free torques near standstill, then the friction law."""
-    c, noise = problem.coordinates, np.maximum(problem.smooth.noise, 1e-9)
-    guess = initial_estimate(problem.simulated, c, problem.smooth, problem.limits)
-    by_law = no_free_torques(problem.windows.y.shape, len(c.x))
-    before = problem.replay(c.x, by_law).best_starts(np.append(to_z(c, c.x), guess.delay), noise)[1]
-    scale = np.append(coordinate_scales(c, guess.scale), DELAY_SCALE)
-    search = _Search(problem, np.append(guess.z, guess.delay), noise, scale)
+    c, noise = problem.coordinates, np.maximum(problem.motion.noise, 1e-9)
+    initial = initial_estimate(problem.simulated, c, problem.motion, problem.limits)
+    no_free = no_free_torques(problem.windows.y.shape, len(c.x))
+    z_of_scenario = np.append(to_z(c, c.x), initial.delay)
+    _, residuals_before = problem.shooting(c.x, no_free).best_starts(z_of_scenario, noise)
+    scale = np.append(coordinate_scales(c, initial.scale), DELAY_SCALE)
+    search = _Search(problem, np.append(initial.z, initial.delay), noise, scale)
     free_fit = search.with_free_torques()
-    end, friction_ratio = search.with_friction_law(by_law, free_fit)
-    return assessed(problem, guess, end, before, friction_ratio, time.monotonic() - began)
+    fit, friction_ratio = search.with_friction_law(no_free, free_fit)
+    seconds = time.monotonic() - began
+    return assessed(problem, initial, fit, residuals_before, friction_ratio, seconds)
 
 
 class _Search(NamedTuple):
     """The nonlinear search: simulation error over windows, by `ShootingProblem.refine`."""
 
     problem: IdentificationProblem
-    first: np.ndarray
-    """z at the start, (p + 1,), the delay last."""
+    z_start: np.ndarray
+    """z at the start of the search, (p + 1,), the delay last."""
     noise: np.ndarray
     """First noise level of each joint, (n,) [rad]."""
     scale: np.ndarray
     """Scales of z, (p + 1,)."""
 
     def refine(
-        self, x: np.ndarray, z: np.ndarray, free: FreeTorques, hopeless: Any = np.inf
+        self, x: np.ndarray, z: np.ndarray, free: FreeTorques, rms_limit: Any = np.inf
     ) -> Refinement:
         """The fit from z on, with these free torques.
 
@@ -221,11 +222,11 @@ class _Search(NamedTuple):
           x: parameters at which the steps of the integrator are chosen.
           z: start of the search, the delay last.
           free: torques that are free near standstill.
-          hopeless: residuals at which the search is given up.
+          rms_limit: residual of each joint above which the search stops, (n,) [rad].
         """
         problem = self.problem
-        return problem.replay(x, free).refine(
-            z, problem.limits, self.scale, self.noise, problem.prior, problem.iterations, hopeless
+        return problem.shooting(x, free).refine(
+            z, problem.limits, self.scale, self.noise, problem.prior, problem.iterations, rms_limit
         )
 
     def with_free_torques(self) -> Refinement | None:
@@ -235,8 +236,8 @@ class _Search(NamedTuple):
         larger range of speeds is tried only if the smaller one leaves more than noise.
         """
         problem = self.problem
-        noise = np.maximum(problem.smooth.noise, MIN_NOISE)
-        size = np.std(problem.smooth.tau, axis=0)
+        noise = np.maximum(problem.motion.noise, MIN_NOISE)
+        size = np.std(problem.motion.tau, axis=0)
         best: Refinement | None = None
         for speed in SPEED_THRESHOLDS:
             free = free_torques_at_standstill(
@@ -249,7 +250,7 @@ class _Search(NamedTuple):
             )
             if not free.fixed.any():
                 break
-            z = self.first if best is None else best.z
+            z = self.z_start if best is None else best.z
             x = np.where(free.fixed, NO_FRICTION_WIDTH, to_x(problem.coordinates, z[:-1])[0])
             found = self.refine(x, z, free)
             residual = np.max(found.rms / noise)
@@ -261,7 +262,7 @@ class _Search(NamedTuple):
         return best
 
     def with_friction_law(
-        self, by_law: FreeTorques, free_fit: Refinement | None
+        self, no_free: FreeTorques, free_fit: Refinement | None
     ) -> tuple[Refinement, float]:
         """The fit with the friction law, or the one with free torques if that is clearly better.
 
@@ -269,13 +270,13 @@ class _Search(NamedTuple):
           The fit, and the residual of the friction law relative to that of free torques, 0 without
           these.
         """
-        z = self.first if free_fit is None else free_fit.z
+        z = self.z_start if free_fit is None else free_fit.z
         x = to_x(self.problem.coordinates, z[:-1])[0]
         if free_fit is None:
-            return self.refine(x, z, by_law), 0.0
+            return self.refine(x, z, no_free), 0.0
         # A log of a simulation has no noise: a smaller residual is no improvement.
         smallest = np.maximum(free_fit.rms, MIN_NOISE)
-        law_fit = self.refine(x, z, by_law, REJECTED_RATIO * smallest)
+        law_fit = self.refine(x, z, no_free, REJECTED_RATIO * smallest)
         ratio = float(np.max(law_fit.rms / smallest))
         chosen = free_fit if ratio > ACCEPTED_RATIO else law_fit
         return chosen._replace(steps=free_fit.steps + law_fit.steps), ratio

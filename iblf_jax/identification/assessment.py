@@ -11,10 +11,11 @@ from iblf_jax.identification.missing_terms import (
     MissingTerms,
     biased,
     describe_finding,
+    missing_terms,
     remedy_for,
 )
-from iblf_jax.identification.problem import IdentificationProblem, missing_terms_of_fit
-from iblf_jax.identification.regression import InitialEstimate
+from iblf_jax.identification.problem import IdentificationProblem
+from iblf_jax.identification.regression import InitialEstimate, inverse_dynamics_along
 from iblf_jax.identification.result import (
     BIASED,
     IDENTIFIED,
@@ -27,6 +28,7 @@ from iblf_jax.identification.result import (
     Number,
 )
 from iblf_jax.identification.shooting import Refinement
+from iblf_jax.identification.smoothing import SmoothedMotion
 from iblf_jax.identification.statistics import (
     IDENTIFIABLE_BELOW,
     Uncertainty,
@@ -50,9 +52,9 @@ LIMIT_TOLERANCE = 1e-6
 
 def assessed(
     problem: IdentificationProblem,
-    guess: InitialEstimate,
-    end: Refinement,
-    before: np.ndarray,
+    initial: InitialEstimate,
+    refinement: Refinement,
+    residuals_before: np.ndarray,
     friction_ratio: float,
     seconds: float,
 ) -> Identification:
@@ -60,25 +62,25 @@ def assessed(
 
     Args:
       problem: what was identified from which data.
-      guess: the regression.
-      end: the fit.
-      before: residuals with the parameters of the start.
+      initial: the regression.
+      refinement: the fit.
+      residuals_before: residuals with the parameters of the start.
       friction_ratio: residual of the friction law relative to that of free torques (0 without).
       seconds: computing time.
     """
     start, c, windows = problem.start, problem.coordinates, problem.windows
-    residuals = end.statistics.residuals
+    residuals = refinement.statistics.residuals
     white = [whiteness(joint) for joint in np.moveaxis(residuals[windows.kept], -1, 0)]
-    fit = _fits(problem, residuals, before, white, guess)
-    scale = np.append(guess.scale, DELAY_SCALE)
-    found = _statistics(problem, end, scale, max(one.lacking for one in fit))
-    x = np.where(end.free.fixed, c.x, to_x(c, end.z[:-1])[0])
+    fit = _fits(problem, residuals, residuals_before, white, initial)
+    scale = np.append(initial.scale, DELAY_SCALE)
+    found = _statistics(problem, refinement, scale, max(one.lacking for one in fit))
+    x = np.where(refinement.free.fixed, c.x, to_x(c, refinement.z[:-1])[0])
     missing = MissingTerms((), np.zeros(len(x)))
     if any(one.has_structure for one in fit):
         fitted = found.estimated & ~found.at_limits.any(axis=0)
-        missing = missing_terms_of_fit(problem.simulated, c, problem.smooth, end.z, fitted)
-    numbers = _numbers(c, x, end, found, biased(missing, x, found.errors[:-1]), scale)
-    scenario, scenario_notes = _with_numbers(start, c, x, end.z[-1], found.errors[-1])
+        missing = missing_terms_of_fit(problem.simulated, c, problem.motion, refinement.z, fitted)
+    numbers = _numbers(c, x, refinement, found, biased(missing, x, found.errors[:-1]), scale)
+    scenario, scenario_notes = _with_numbers(start, c, x, refinement.z[-1], found.errors[-1])
     return Identification(
         scenario=scenario,
         start=start,
@@ -86,7 +88,7 @@ def assessed(
         requested=problem.requested,
         numbers=numbers,
         covariance=found.covariance[:-1, :-1],
-        delay=float(end.z[-1]),
+        delay=float(refinement.z[-1]),
         delay_error=found.delay_error,
         singular_values=found.uncertainty.singular,
         combinations=found.combinations,
@@ -100,12 +102,12 @@ def assessed(
         notes=(
             *_notes_on_missing_terms(start, missing, numbers),
             *scenario_notes,
-            *_notes_on_limits(c, numbers, found.beyond, problem.limits),
+            *_notes_on_limits(c, numbers, found.unlimited_step, problem.limits),
             *_notes_on_residuals(found.uncertainty, numbers, fit),
-            *_notes_on_standstill(start, end, friction_ratio),
+            *_notes_on_standstill(start, refinement, friction_ratio),
         ),
         logs=tuple(log.name for log in problem.logs),
-        steps=end.steps,
+        steps=refinement.steps,
         seconds=seconds,
     )
 
@@ -123,7 +125,7 @@ class _Statistics(NamedTuple):
     """Standard errors, (p + 1,); infinite where an entry is not estimated."""
     covariance: np.ndarray
     """(p + 1, p + 1); zero where an entry is not estimated."""
-    beyond: np.ndarray
+    unlimited_step: np.ndarray
     """The Gauss-Newton step without limits, (p + 1,)."""
     at_limits: np.ndarray
     """Whether an entry is at its lower and at its upper limit, (2, p + 1) bool."""
@@ -145,26 +147,26 @@ class _Statistics(NamedTuple):
 
 
 def _statistics(
-    problem: IdentificationProblem, end: Refinement, scale: np.ndarray, lacking: float
+    problem: IdentificationProblem, refinement: Refinement, scale: np.ndarray, lacking: float
 ) -> _Statistics:
     """The statistics of a fit.
 
     Args:
       problem: what was identified from which data.
-      end: the fit.
+      refinement: the fit.
       scale: of the parameters and the delay, (p + 1,).
       lacking: the largest residual, relative to the noise of the positions.
     """
     kept = problem.windows.kept
-    x, slope = to_x(problem.coordinates, end.z[:-1])
+    x, slope = to_x(problem.coordinates, refinement.z[:-1])
     p = len(x)
     z_by_x = np.eye(p + 1)
     z_by_x[:p, :p] = np.linalg.inv(slope)
-    estimated = np.append(~end.free.fixed, problem.fixed_delay is None)
+    estimated = np.append(~refinement.free.fixed, problem.fixed_delay is None)
     both = np.ix_(estimated, estimated)
-    information = z_by_x.T @ end.statistics.information[kept] @ z_by_x
+    information = z_by_x.T @ refinement.statistics.information[kept] @ z_by_x
     information = information[:, estimated][:, :, estimated]
-    scores = (end.statistics.scores[kept] @ z_by_x)[:, estimated]
+    scores = (refinement.statistics.scores[kept] @ z_by_x)[:, estimated]
     precision = np.zeros((p + 1, p + 1))
     precision[:p, :p] = problem.prior.precision
     if lacking <= INCOMPLETE_RATIO:  # the residuals are noise
@@ -179,19 +181,38 @@ def _statistics(
     all_scores = scores + from_prior[estimated] / len(scores)
     A = np.sum(information, axis=0) * own_scale[:, None] * own_scale
     g = np.sum(all_scores, axis=0) * own_scale
-    beyond = np.zeros(p + 1)
-    beyond[estimated] = -own_scale * np.linalg.lstsq(A, g, rcond=MIN_INFORMATION)[0]
-    at_limits = np.abs(end.z - np.stack(problem.limits)) < LIMIT_TOLERANCE * scale
+    unlimited_step = np.zeros(p + 1)
+    unlimited_step[estimated] = -own_scale * np.linalg.lstsq(A, g, rcond=MIN_INFORMATION)[0]
+    at_limits = np.abs(refinement.z - np.stack(problem.limits)) < LIMIT_TOLERANCE * scale
     all_names = np.array([*problem.coordinates.names, "the torque's delay"])
     names = tuple(all_names[estimated])
     combinations = tuple(describe_direction(column, names) for column in found.directions.T)
-    return _Statistics(estimated, found, errors, covariance, beyond, at_limits, combinations)
+    return _Statistics(
+        estimated, found, errors, covariance, unlimited_step, at_limits, combinations
+    )
+
+
+def missing_terms_of_fit(
+    simulated: Scenario, c: Coordinates, motion: SmoothedMotion, z: np.ndarray, fitted: np.ndarray
+) -> MissingTerms:
+    """The terms that a fit lacks.
+
+    Args:
+      simulated: scenario whose plant was simulated.
+      c: coordinates of the parameters.
+      motion: the smoothed logs.
+      z: end of the fit, (p + 1,), the delay last.
+      fitted: entries of z that the fit could move, (p + 1,) bool.
+    """
+    at_end = inverse_dynamics_along(simulated, c, to_x(c, z[:-1])[0], motion)
+    torque, by_x = np.asarray(at_end.torque), np.asarray(at_end.by_x)
+    return missing_terms(motion, torque, by_x, float(z[-1]), fitted)
 
 
 def _numbers(
     c: Coordinates,
     x: np.ndarray,
-    end: Refinement,
+    refinement: Refinement,
     found: _Statistics,
     bias: np.ndarray,
     scale: np.ndarray,
@@ -200,14 +221,14 @@ def _numbers(
     numbers = []
     for i, (name, unit) in enumerate(zip(c.names, c.units, strict=True)):
         at_low, at_high = found.at_limits[:, i]
-        beyond = found.beyond[i] / scale[i]
-        outwards = (at_low and beyond < -LIMIT_TOLERANCE) or (at_high and beyond > LIMIT_TOLERANCE)
+        step = found.unlimited_step[i] / scale[i]
+        outwards = (at_low and step < -LIMIT_TOLERANCE) or (at_high and step > LIMIT_TOLERANCE)
         value: float | None = float(x[i])
         error: float | None = None
         if np.isfinite(found.errors[i]):
             error = float(found.errors[i])
         verdict = IDENTIFIED
-        if end.free.fixed[i]:
+        if refinement.free.fixed[i]:
             value, error, verdict = None, None, NOT_ESTIMATED
         elif error is None and not outwards:
             value, verdict = None, NOT_IDENTIFIABLE
@@ -225,9 +246,9 @@ def _numbers(
 def _fits(
     problem: IdentificationProblem,
     residuals: np.ndarray,
-    before: np.ndarray,
+    residuals_before: np.ndarray,
     white: list[Whiteness],
-    guess: InitialEstimate,
+    initial: InitialEstimate,
 ) -> tuple[Fit, ...]:
     """The fit of each joint."""
 
@@ -250,12 +271,12 @@ def _fits(
         )
         for joint, first, fitted, other, test, explained, noise in zip(
             joint_names(problem.start.plant, problem.start.n),
-            rms(before, kept),
+            rms(residuals_before, kept),
             rms(residuals, kept),
             rms(residuals, ~kept),
             white,
-            guess.explained.tolist(),
-            guess.noise.tolist(),
+            initial.explained.tolist(),
+            initial.noise.tolist(),
             strict=True,
         )
     )
@@ -277,7 +298,7 @@ def _with_numbers(
             scenario = with_parameters(scenario, {f"model.{rest}": own})
         except ValueError:
             notes.append(f"The model has no model.{rest}: only the plant has this parameter.")
-    if c.delay:
+    if c.has_delay_path:
         scenario = with_parameters(scenario, {DELAY_PATH: max(delay, 0.0)})
         if delay < -3.0 * delay_error:
             notes.append(EARLY_TORQUE)
@@ -306,7 +327,7 @@ def _notes_on_missing_terms(
     moved = [f"{x.name} by about {x.bias:+.2g} {x.unit}" for x in numbers if x.verdict == BIASED]
     if moved:
         lines.append(
-            f"These numbers make up for what was left out, and are biased: {', '.join(moved)}."
+            f"These parameters compensate for missing terms, and are biased: {', '.join(moved)}."
         )
     return lines
 
@@ -319,28 +340,30 @@ def _notes_on_residuals(
     widest = float(np.max(found.widened))
     if not all(one.is_white for one in fit) and widest > REPORTED_RATIO:
         notes.append(
-            f"What is left is coloured: standard errors are up to {widest:.2g} times those of white"
-            " noise."
+            f"The residuals are coloured: standard errors are up to {widest:.2g} times those of"
+            " white noise."
         )
     worst = max(fit, key=lambda one: one.lacking)
     if worst.lacking <= INCOMPLETE_RATIO:
         return notes
-    likely = "dry friction that is not looked for, play, a torque in between samples"
+    likely = "dry friction that is not identified, backlash, a torque that changes between samples"
     if any(number.verdict == LIMITED for number in numbers):
-        likely = f"what a limit excludes, {likely}"
+        likely = f"a value that a limit excludes, {likely}"
     end = "."
     if any(number.value is None for number in numbers):
-        end = "; a model that fits tells more."
+        end = "; with a complete model, more parameters may be identifiable."
     notes.append(
-        f"What is left of {worst.joint} is {worst.lacking:.2g} times the noise of its"
-        f" positions: the model lacks something ({likely}), and all standard errors are that"
-        f" much larger for it{end}"
+        f"The residual of {worst.joint} is {worst.lacking:.2g} times the noise of its positions:"
+        f" the model is incomplete ({likely}), and all standard errors contain this factor{end}"
     )
     return notes
 
 
 def _notes_on_limits(
-    c: Coordinates, numbers: tuple[Number, ...], beyond: np.ndarray, limits: tuple[np.ndarray, ...]
+    c: Coordinates,
+    numbers: tuple[Number, ...],
+    unlimited_step: np.ndarray,
+    limits: tuple[np.ndarray, ...],
 ) -> list[str]:
     """Notes on active limits, and the values that the log suggests."""
     notes = []
@@ -353,15 +376,16 @@ def _notes_on_limits(
             side = "lower" if to_low < to_high else "upper"
             notes.append(
                 f"{x.name} is at its limit, {x.value:.4g} {x.unit}, and the log asks for about"
-                f" {x.value + beyond[i]:.4g}: its standard error says nothing, and other"
-                f" numbers make up for it.  The {side} end of limits[{path!r}] moves it."
+                f" {x.value + unlimited_step[i]:.4g}: its standard error has no meaning,"
+                f" and other parameters compensate for it.  The {side} end of limits[{path!r}]"
+                " changes it."
             )
     return notes
 
 
-def _notes_on_standstill(start: Scenario, end: Refinement, ratio: float) -> list[str]:
+def _notes_on_standstill(start: Scenario, refinement: Refinement, ratio: float) -> list[str]:
     """A note on free torques near standstill; none without them."""
-    share = end.free.share
+    share = refinement.free.share
     if not np.any(share):
         return []
     names = [
@@ -374,7 +398,7 @@ def _notes_on_standstill(start: Scenario, end: Refinement, ratio: float) -> list
     percent = [f"{100 * part:.{int(part <= 0.1)}f}" for part in ends]
     parts = " to ".join(dict.fromkeys(percent))
     return [
-        f"About standstill (slower than {end.free.slow:g} rad/s: {parts} % of the time) torques"
-        f" were free in place of the friction of {whose}: coulomb tanh(q' / width) leaves"
-        f" {ratio:.2g} times as much.  The widths are the scenario's."
+        f"Near standstill (slower than {refinement.free.speed_threshold:g} rad/s: {parts} % of the"
+        f" time) free torques replaced the friction of {whose}: with coulomb tanh(q' / width) the"
+        f" residual is {ratio:.2g} times as large.  The widths are the scenario's."
     ]

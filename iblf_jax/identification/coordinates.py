@@ -41,8 +41,8 @@ STARTING_GYRATION_RADIUS = 0.01
 positive definite."""
 DELAY_PATH = "sampling.delay"
 """The path of the torque's delay."""
-DELAY_SCALE = 0.01
-"""The scale of the delay [s]."""
+DELAY_SCALE, LARGEST_DELAY = 0.01, 0.1
+"""The scale of the delay, and its largest absolute value [s]."""
 PARTS = ("plant", "model", "robot", "disturbance")
 
 
@@ -62,7 +62,7 @@ class Coordinates(NamedTuple):
     low: np.ndarray
     """Lower limits of z; infinite for log-Cholesky coordinates."""
     high: np.ndarray
-    delay: bool
+    has_delay_path: bool
     """Whether the path of the torque's delay was given."""
 
 
@@ -173,7 +173,7 @@ def coordinates(
         x=x,
         low=low,
         high=high,
-        delay=DELAY_PATH in requested,
+        has_delay_path=DELAY_PATH in requested,
     )
 
 

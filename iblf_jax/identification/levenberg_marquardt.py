@@ -64,7 +64,7 @@ def levenberg_marquardt(
     scale: np.ndarray,
     evaluate: Callable,
     linearize: Callable,
-    most: int,
+    max_steps: int,
 ) -> tuple[np.ndarray, QuadraticModel, int]:
     """The minimum inside limits.
 
@@ -76,13 +76,13 @@ def levenberg_marquardt(
       evaluate: function (QuadraticModel, z, step) -> (cost, results) after the step; an infinite
         cost where the objective is undefined.
       linearize: function (z, results) -> QuadraticModel.
-      most: steps at most.
+      max_steps: largest number of steps.
 
     Returns:
       z, the quadratic model there, and the number of steps.
     """
     damping, steps = FIRST_DAMPING, 0
-    while steps < most and damping < LARGEST_DAMPING and len(z):
+    while steps < max_steps and damping < LARGEST_DAMPING and len(z):
         steps += 1
         scaled_hessian = scale[:, None] * here.hessian * scale
         diagonal = np.diag(scaled_hessian)

@@ -102,7 +102,7 @@ class _Design(NamedTuple):
 
     columns: np.ndarray
     """Columns of the k parameters and of the c candidates, (P n, k + c)."""
-    rest: np.ndarray
+    residuals: np.ndarray
     """Residuals, (P n,)."""
     block: np.ndarray
     """In which block each row is, (P n,)."""
@@ -136,23 +136,23 @@ def missing_terms(
     Args:
       motion: the smoothed log at P times.
       torque: torques of the model with the estimate, (P, n) [N m].
-      by_x: its derivative by the numbers, (P, n, p).
+      by_x: their derivative by the parameters, (P, n, p).
       delay: of the logged torque [s].
       fitted: parameters, the delay last, that are estimated and not at a limit, (p + 1,) bool.
     """
     p = by_x.shape[-1]
-    names, of_candidates = candidates(motion)
-    rest = motion.tau - delay * motion.dtau - torque
-    numbers = np.concatenate([by_x, motion.dtau[..., None]], axis=-1)[..., fitted]
-    design = _weighted_regression(motion, rest, numbers, of_candidates)
-    k = numbers.shape[-1]
+    names, candidate_columns = candidates(motion)
+    residuals = motion.tau - delay * motion.dtau - torque
+    parameter_columns = np.concatenate([by_x, motion.dtau[..., None]], axis=-1)[..., fitted]
+    design = _weighted_regression(motion, residuals, parameter_columns, candidate_columns)
+    k = parameter_columns.shape[-1]
     significant = _backward_elimination(design, k, _forward_selection(design, k, names), len(names))
     without = _least_squares(design, range(k))
     thetas = _least_squares(design, [*range(k), *significant])[k:]
-    unit = _rms(of_candidates)
+    unit = _rms(candidate_columns)
     least = np.maximum(
         SMALLEST_TORQUE_SHARE * _rms(motion.tau),
-        SMALLEST_RESIDUAL_SHARE * _rms(rest - numbers @ without),
+        SMALLEST_RESIDUAL_SHARE * _rms(residuals - parameter_columns @ without),
     )
     found = []
     for i, theta in zip(significant, thetas, strict=True):
@@ -162,11 +162,11 @@ def missing_terms(
     if not found:
         return MissingTerms((), np.zeros(p))
     chosen = [*range(k), *found]
-    with_them, errors = _least_squares(design, chosen), _errors(design, chosen)
+    with_terms, errors = _least_squares(design, chosen), _errors(design, chosen)
     bias = np.zeros(p + 1)
-    bias[fitted] = without - with_them[:k]
+    bias[fitted] = without - with_terms[:k]
     findings = []
-    for i, theta, error in zip(found, with_them[k:].tolist(), errors[k:].tolist(), strict=True):
+    for i, theta, error in zip(found, with_terms[k:].tolist(), errors[k:].tolist(), strict=True):
         joint, kind = names[i - k]
         findings.append(Finding(joint, kind, theta, error, _gain(design, chosen, i, joint)))
     return MissingTerms(tuple(sorted(findings, key=lambda one: -one.gain)), bias[:p])
@@ -177,19 +177,22 @@ def _rms(x: np.ndarray) -> np.ndarray:
 
 
 def _weighted_regression(
-    motion: SmoothedMotion, rest: np.ndarray, numbers: np.ndarray, of_candidates: np.ndarray
+    motion: SmoothedMotion,
+    residuals: np.ndarray,
+    parameter_columns: np.ndarray,
+    candidate_columns: np.ndarray,
 ) -> _Design:
     """The regression, joints weighted by their residual with all candidates."""
-    P, n = rest.shape
-    columns = np.concatenate([numbers, of_candidates], axis=-1)
+    P, n = residuals.shape
+    columns = np.concatenate([parameter_columns, candidate_columns], axis=-1)
     spacing = float(np.median(np.abs(np.diff(motion.t)))) if P > 1 else BLOCK_LENGTH
     block = np.arange(P) // max(1, round(BLOCK_LENGTH / max(spacing, 1e-9)))
-    sigma = np.std(rest, axis=0) + 1e-12
+    sigma = np.std(residuals, axis=0) + 1e-12
     for _ in range(2):
         weight = 1.0 / sigma
         design = _Design(
             (columns * weight[:, None]).reshape(P * n, -1),
-            (rest * weight).ravel(),
+            (residuals * weight).ravel(),
             np.repeat(block, n),
             np.tile(np.arange(n), P),
         )
@@ -211,22 +214,22 @@ def _inverse(A: np.ndarray) -> np.ndarray:
 
 def _least_squares(design: _Design, chosen: Any) -> np.ndarray:
     X = design.columns[:, list(chosen)]
-    return _inverse(X.T @ X) @ (X.T @ design.rest)
+    return _inverse(X.T @ X) @ (X.T @ design.residuals)
 
 
 def _residual(design: _Design, chosen: Any) -> np.ndarray:
     chosen = list(chosen)
-    return design.rest - design.columns[:, chosen] @ _least_squares(design, chosen)
+    return design.residuals - design.columns[:, chosen] @ _least_squares(design, chosen)
 
 
 def _errors(design: _Design, chosen: Any) -> np.ndarray:
     """Cluster-robust standard errors of the chosen columns."""
     chosen = list(chosen)
-    X, left = design.columns[:, chosen], _residual(design, chosen)
+    X, residuals = design.columns[:, chosen], _residual(design, chosen)
     bread = _inverse(X.T @ X)
     count = int(design.block[-1]) + 1
     scores = np.zeros((count, len(chosen)))
-    np.add.at(scores, design.block, X * left[:, None])
+    np.add.at(scores, design.block, X * residuals[:, None])
     return np.sqrt(
         np.maximum(np.diag(bread @ (scores.T @ scores) @ bread) * count / (count - 1), 0.0)
     )
@@ -248,7 +251,7 @@ def _forward_selection(design: _Design, k: int, names: list[tuple[int, str]]) ->
     X = design.columns
     for _ in names:
         base = [*range(k), *chosen]
-        inverse, left = _inverse(X[:, base].T @ X[:, base]), _residual(design, base)
+        inverse, residuals = _inverse(X[:, base].T @ X[:, base]), _residual(design, base)
         best, most = None, SMALLEST_GAIN
         for c in range(len(names)):
             column = X[:, k + c]
@@ -256,8 +259,8 @@ def _forward_selection(design: _Design, k: int, names: list[tuple[int, str]]) ->
             part = column - X[:, base] @ (inverse @ (X[:, base].T @ column))
             if k + c in chosen or float(part @ part) < SMALLEST_OWN_SHARE * size:
                 continue
-            less = float(part @ left) ** 2 / float(part @ part)
-            gain = less / max(float(np.sum(left[own[c]] ** 2)), 1e-300)
+            less = float(part @ residuals) ** 2 / float(part @ part)
+            gain = less / max(float(np.sum(residuals[own[c]] ** 2)), 1e-300)
             if gain > most:
                 best, most = k + c, gain
         if best is None:
@@ -312,9 +315,9 @@ def describe_finding(finding: Finding, joint: str, remedy: str) -> str:
     kind = KINDS[finding.kind]
     more = "more" if finding.size > 0 else "less"
     return (
-        f"What is left of the torque of {joint} follows {kind.follows}: the robot has"
+        f"The residual torque of {joint} depends on {kind.follows}: the robot has"
         f" {abs(finding.size):.3g} +- {finding.error:.1g} {kind.unit} {more} of {kind.term} there"
-        f" than the model, which explains {finding.gain:.0%} of what is left. {remedy}"
+        f" than the model, which explains {finding.gain:.0%} of this residual. {remedy}"
     )
 
 
@@ -333,7 +336,7 @@ def remedy_for(finding: Finding, available: Any, names: tuple[str, ...]) -> str:
     if missing:
         return f"Add {missing[0].replace('plant.', 'robot.', 1)!r} to the paths."
     if same:
-        return f"{same[0]} is looked for, so it is of another form than the model's."
+        return f"{same[0]} is identified already, so the term has another form than the model's."
     if finding.kind in ("sign", "velocity"):
         return (
             "Give the scenario ij.disturbances.Friction(...) and add"

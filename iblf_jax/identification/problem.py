@@ -7,11 +7,9 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.identification.coordinates import Coordinates, to_x
+from iblf_jax.identification.coordinates import LARGEST_DELAY, Coordinates
 from iblf_jax.identification.log import Log
-from iblf_jax.identification.missing_terms import MissingTerms, missing_terms
-from iblf_jax.identification.regression import LARGEST_DELAY, inverse_dynamics_at
-from iblf_jax.identification.replay import inverse_dynamics_under
+from iblf_jax.identification.replay import inverse_dynamics_for_torque
 from iblf_jax.identification.shooting import Prior, ShootingProblem, Windows, substeps_for
 from iblf_jax.identification.smoothing import SmoothedMotion
 from iblf_jax.identification.standstill import FreeTorques
@@ -31,8 +29,8 @@ class IdentificationProblem(NamedTuple):
     coordinates: Coordinates
     logs: list[Log]
     windows: Windows
-    smooth: SmoothedMotion
-    """Smoothed data of the logs, without the parts that are held back."""
+    motion: SmoothedMotion
+    """The smoothed logs, without the parts that are held back."""
     prior: Prior
     requested: int
     """Number of paths that the user named, without that of the delay."""
@@ -51,8 +49,8 @@ class IdentificationProblem(NamedTuple):
             low = high = self.fixed_delay
         return np.append(self.coordinates.low, low), np.append(self.coordinates.high, high)
 
-    def replay(self, x: np.ndarray, free: FreeTorques) -> ShootingProblem:
-        """The simulation of all windows under the logged torque.
+    def shooting(self, x: np.ndarray, free: FreeTorques) -> ShootingProblem:
+        """The multiple-shooting problem of all windows under the logged torque.
 
         Args:
           x: parameters at which the steps of the integrator are chosen.
@@ -71,26 +69,9 @@ class IdentificationProblem(NamedTuple):
 
     def _substeps(self, x: np.ndarray) -> int:
         """Number of integrator steps between two samples."""
-        data = self.smooth
-        points = [jnp.asarray(a) for a in (data.t, data.q, data.dq, data.tau)]
-        sensitivities = inverse_dynamics_under(
+        motion = self.motion
+        points = [jnp.asarray(a) for a in (motion.t, motion.q, motion.dq, motion.tau)]
+        sensitivities = inverse_dynamics_for_torque(
             self.simulated, jnp.asarray(x), *points, places=self.coordinates.places
         )
         return substeps_for(sensitivities, min(log.step for log in self.logs))
-
-
-def missing_terms_of_fit(
-    simulated: Scenario, c: Coordinates, data: SmoothedMotion, z: np.ndarray, fitted: np.ndarray
-) -> MissingTerms:
-    """The terms that a fit lacks.
-
-    Args:
-      simulated: scenario whose plant was simulated.
-      c: coordinates of the parameters.
-      data: the smoothed logs.
-      z: end of the fit, (p + 1,), the delay last.
-      fitted: entries of z that the fit could move, (p + 1,) bool.
-    """
-    at_end = inverse_dynamics_at(simulated, c, to_x(c, z[:-1])[0], data)
-    torque, by_x = np.asarray(at_end.torque), np.asarray(at_end.by_x)
-    return missing_terms(data, torque, by_x, float(z[-1]), fitted)

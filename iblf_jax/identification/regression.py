@@ -65,8 +65,6 @@ STANDSTILL_RANGE = 0.1
 the times are in another unit."""
 RANGE_TOLERANCE = 0.1
 """Share of a joint's range by which a log may be outside the range."""
-LARGEST_DELAY = 0.1
-"""[s]"""
 
 
 class InitialEstimate(NamedTuple):
@@ -97,7 +95,7 @@ def initial_estimate(
       ValueError: the log does not belong to the scenario.
     """
     _check_motion(scenario, motion)
-    first = inverse_dynamics_at(scenario, c, c.x, motion)
+    first = inverse_dynamics_along(scenario, c, c.x, motion)
     _check_torque_size(scenario, first.torque, motion)
     scale = scales(c, scenario, np.asarray(first.by_x), motion.tau)
     z = np.append(to_z(c, c.x), np.clip(0.0, limits[0][-1], limits[1][-1]))
@@ -142,7 +140,7 @@ class _Regression(NamedTuple):
     def dynamics(self, z: np.ndarray) -> InverseDynamics:
         """The torques of the model at z, and their derivatives."""
         x, _ = to_x(self.coordinates, z[:-1])
-        return inverse_dynamics_at(self.scenario, self.coordinates, x, self.motion)
+        return inverse_dynamics_along(self.scenario, self.coordinates, x, self.motion)
 
     def residual(self, dynamics: InverseDynamics, z: np.ndarray) -> np.ndarray:
         """Logged less modelled torques, (P, n) [N m]."""
@@ -178,7 +176,7 @@ def coordinate_scales(c: Coordinates, scale: np.ndarray) -> np.ndarray:
     return scale
 
 
-def inverse_dynamics_at(
+def inverse_dynamics_along(
     scenario: Any, c: Coordinates, x: np.ndarray, motion: SmoothedMotion
 ) -> InverseDynamics:
     """The torques that a smoothed motion needs with parameters x, and their derivatives."""
@@ -344,11 +342,11 @@ def _check_explained(
     """Raises ValueError if other columns or units explain the torques, or if nothing does."""
     unexplained = _unexplained_share(residual, motion.tau)
     best, best_reading = unexplained, ""
-    same = inverse_dynamics_at(scenario, c, c.x, motion)
+    same = inverse_dynamics_along(scenario, c, c.x, motion)
     for reading, other in _alternative_readings(motion):
         dynamics = same
         if other.q is not motion.q:
-            dynamics = inverse_dynamics_at(scenario, c, c.x, other)
+            dynamics = inverse_dynamics_along(scenario, c, c.x, other)
         share = _unexplained_by_regression(dynamics, other)
         if share < min(0.5 * best, 1.0 - BARELY_EXPLAINED):
             best, best_reading = share, reading

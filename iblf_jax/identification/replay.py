@@ -1,14 +1,14 @@
-"""The plant under logged torques, for many segments of a log at once, and its sensitivities.
+"""The plant under logged torques, for many windows of a log at once, and its sensitivities.
 
     q"(t) = acceleration(x; t, q, q', tau_k)   for t_k <= t < t_{k+1}
     tau_k: the mean torque of a step
     e(x; t, q, q', q") = M q" + C q' + G - disturbance - friction:  the torque that a motion needs
 
-x are the identified parameters.  The sensitivities of a segment follow from the derivatives of e at
-one point of each step: e = tau for the simulated motion, so d(q")/dx = -M^-1 de/dx, and n reverse
-passes give the derivatives of the n rows of e by any number of parameters.  The points of a segment
-are evaluated one after another, because a small working set in the cache is faster than a batch
-(7 joints and 28 leaves: 0.08 ms a point, 1.4 ms with a batch of one tangent for each leaf).
+x are the identified parameters.  The sensitivities of a window follow from the derivatives of e at
+one point of each step: e = tau for the simulated motion, so d(q")/dx = -M^-1 de/dx, and n reverse-
+mode passes give the derivatives of the n rows of e by any number of parameters.  The points are
+evaluated one after another, because a small working set in the cache is faster than a batch (7
+joints and 28 leaves: 0.08 ms a point, 1.4 ms with a batch of one tangent for each leaf).
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ class LeafSlice(NamedTuple):
     size: int
 
 
-class Segments(NamedTuple):
-    """W segments of a log, of K steps each."""
+class WindowInputs(NamedTuple):
+    """Initial states and torques of W windows of a log, of K steps each."""
 
     t: Any
     """Times of the samples, (W, K + 1) [s]."""
@@ -74,15 +74,15 @@ def values_by_path(places: tuple[LeafSlice, ...], x: Any) -> Mapping[str, Any]:
 
 
 @partial(jax.jit, static_argnames=("places", "substeps"))
-def simulate_segments(
+def simulate_windows(
     scenario: Scenario,
     x: jax.Array,
-    segments: Segments,
+    inputs: WindowInputs,
     *,
     places: tuple[LeafSlice, ...],
     substeps: int,
 ) -> tuple[jax.Array, ...]:
-    """Positions and velocities at the samples of all segments, (W, K + 1, n) each, by `substeps`
+    """Positions and velocities at the samples of all windows, (W, K + 1, n) each, by `substeps`
     steps of RK4 from sample to sample.
     """
     scenario = with_parameters(scenario, values_by_path(places, x))
@@ -99,13 +99,13 @@ def simulate_segments(
         state = jax.lax.fori_loop(0, substeps, small, state)
         return state, state
 
-    def one(segment):
-        dt = jnp.diff(segment.t) / substeps
-        start = segment.q, segment.dq
-        _, later = jax.lax.scan(advanced, start, (segment.t[:-1], dt, segment.tau))
+    def one(window):
+        dt = jnp.diff(window.t) / substeps
+        start = window.q, window.dq
+        _, later = jax.lax.scan(advanced, start, (window.t[:-1], dt, window.tau))
         return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), start, later)
 
-    return jax.lax.map(one, segments)
+    return jax.lax.map(one, inputs)
 
 
 @partial(jax.jit, static_argnames="places")
@@ -128,7 +128,7 @@ def inverse_dynamics(
 
 
 @partial(jax.jit, static_argnames="places")
-def inverse_dynamics_under(
+def inverse_dynamics_for_torque(
     scenario: Scenario,
     x: jax.Array,
     t: jax.Array,
@@ -163,7 +163,7 @@ def _inverse_dynamics_at(
 
 
 def position_sensitivities(
-    segments: Segments, along: InverseDynamics, by_input: np.ndarray
+    inputs: WindowInputs, along: InverseDynamics, by_input: np.ndarray
 ) -> np.ndarray:
     """Derivatives of q at the samples by the initial state, x and inputs, by the implicit midpoint
     rule.
@@ -172,7 +172,7 @@ def position_sensitivities(
         de/dx
 
     Args:
-      segments: W segments of K steps.
+      inputs: of W windows of K steps.
       along: at the middle of each step, P = W K points.
       by_input: derivative of each step's torque by m further inputs, (W, K, n, m).
 
@@ -184,7 +184,7 @@ def position_sensitivities(
         [-along.by_q, -along.by_dq, -along.by_x, by_input.reshape(W * K, n, -1)], axis=-1
     )
     rates = np.linalg.solve(along.mass, forces).reshape(W, K, n, -1)
-    half = 0.5 * np.diff(np.asarray(segments.t))
+    half = 0.5 * np.diff(np.asarray(inputs.t))
     X = np.zeros((W, 2 * n, rates.shape[-1]))
     X[:, np.arange(2 * n), np.arange(2 * n)] = 1.0
     positions = np.empty((W, K + 1, n, rates.shape[-1]))

@@ -40,7 +40,7 @@ FIT = (
     "rms after [rad]",
     "rms held back [rad]",
     "autocorrelation",
-    "what is left is",
+    "residuals",
     "torque explained",
 )
 
@@ -88,7 +88,8 @@ class Fit(NamedTuple):
     explained: float
     """Share of the torque's variation that the regression explained."""
     noise: float
-    """Logged positions about smooth curves: noise and quantisation of the encoder [rad]."""
+    """Standard deviation of the logged positions about smooth curves, caused by noise and by the
+    quantisation of the encoder [rad]."""
 
     @property
     def lacking(self) -> float:
@@ -257,12 +258,12 @@ class Identification:
     def _heading(self) -> str:
         W, back = int(np.sum(self.kept)), int(np.sum(~self.kept))
         length = float(np.mean(self.times[:, -1] - self.times[:, 0]))
-        looked = [number for number in self.numbers if number.verdict != NOT_ESTIMATED]
-        count = sum(number.value is not None for number in looked)
+        estimated = [number for number in self.numbers if number.verdict != NOT_ESTIMATED]
+        count = sum(number.value is not None for number in estimated)
         windows = f"{W} windows of {length:.3g} s fitted, {back} held back"
         return (
-            f"Identification: {count} of {len(looked)} numbers told; {windows}; {self.steps} steps,"
-            f" {self.seconds:.3g} s"
+            f"Identification: {count} of {len(estimated)} numbers told; {windows};"
+            f" {self.steps} steps, {self.seconds:.3g} s"
         )
 
     def _rows(self) -> list[tuple[str, ...]]:
@@ -295,7 +296,7 @@ class Identification:
 
     def _delay_in_words(self) -> str:
         if self.delay_error == math.inf:
-            return "is late by what the log cannot tell"
+            return "has a delay that the log does not identify"
         error = "given"
         if self.delay_error is not None:
             error = f"+- {1e3 * self.delay_error:.2g} ms"

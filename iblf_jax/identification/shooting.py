@@ -42,10 +42,10 @@ from iblf_jax.identification.levenberg_marquardt import (
 from iblf_jax.identification.log import Log
 from iblf_jax.identification.replay import (
     InverseDynamics,
-    Segments,
-    inverse_dynamics_under,
+    WindowInputs,
+    inverse_dynamics_for_torque,
     position_sensitivities,
-    simulate_segments,
+    simulate_windows,
 )
 from iblf_jax.identification.smoothing import local_polynomial
 from iblf_jax.identification.standstill import NO_FRICTION_WIDTH, FreeTorques
@@ -82,7 +82,7 @@ class Windows(NamedTuple):
     dq: np.ndarray
 
 
-class Torque:
+class TorqueIntegral:
     """The integral of a log's torque over time; the torque is constant between samples (zero-order
     hold) or interpolated.
     """
@@ -165,7 +165,7 @@ class Prior(NamedTuple):
 
 
 class Refinement(NamedTuple):
-    """The end of the search."""
+    """The fit at the end of the search."""
 
     z: np.ndarray
     """(p + 1,), the delay last."""
@@ -183,7 +183,7 @@ class Simulation(NamedTuple):
 
     starts: np.ndarray
     """Initial states and free torques, (W, s)."""
-    segments: Segments
+    inputs: WindowInputs
     q: np.ndarray
     """(W, K + 1, n) [rad]."""
     dq: np.ndarray
@@ -246,9 +246,9 @@ class ShootingProblem:
     free: FreeTorques
 
     @cached_property
-    def torques(self) -> list[Torque]:
-        """The torque of each log."""
-        return [Torque(log, self.hold) for log in self.logs]
+    def torque_integrals(self) -> list[TorqueIntegral]:
+        """The integral of the torque of each log."""
+        return [TorqueIntegral(log, self.hold) for log in self.logs]
 
     @cached_property
     def step(self) -> float:
@@ -258,9 +258,9 @@ class ShootingProblem:
     def torque(self, delay: float) -> np.ndarray:
         """Mean torque of each step, (W, K, n) [N m]."""
         found = np.empty((*self.w.t[:, 1:].shape, self.w.y.shape[-1]))
-        for i, torque in enumerate(self.torques):
-            own = self.w.log == i
-            found[own] = torque.means(self.w.t[own], delay)
+        for i, integral in enumerate(self.torque_integrals):
+            of_log = self.w.log == i
+            found[of_log] = integral.means(self.w.t[of_log], delay)
         return found
 
     def _parameters_at(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -271,18 +271,18 @@ class ShootingProblem:
 
     def simulate(
         self, z: np.ndarray, starts: np.ndarray
-    ) -> tuple[Segments, np.ndarray, np.ndarray]:
-        """The motion in the windows: the segments that are simulated, q and q' (W, K + 1, n)."""
+    ) -> tuple[WindowInputs, np.ndarray, np.ndarray]:
+        """The motion in the windows: what is simulated, q and q' (W, K + 1, n)."""
         n = self.w.y.shape[-1]
         x, _ = self._parameters_at(z)
         free_torque = np.einsum("wknm,wm->wkn", self.free.torque, starts[:, 2 * n :])
         tau = self.torque(z[-1]) + self.free.by_x @ x + free_torque
-        inputs = (self.w.t, starts[:, :n], starts[:, n : 2 * n], tau)
-        segments = Segments(*(jnp.asarray(a) for a in inputs))
-        q, dq = simulate_segments(
-            self.scenario, jnp.asarray(x), segments, places=self.c.places, substeps=self.substeps
+        arrays = (self.w.t, starts[:, :n], starts[:, n : 2 * n], tau)
+        inputs = WindowInputs(*(jnp.asarray(a) for a in arrays))
+        q, dq = simulate_windows(
+            self.scenario, jnp.asarray(x), inputs, places=self.c.places, substeps=self.substeps
         )
-        return segments, np.asarray(q), np.asarray(dq)
+        return inputs, np.asarray(q), np.asarray(dq)
 
     def weights(self, r: np.ndarray, sigma: np.ndarray) -> np.ndarray:
         """The weight of each residual, (W, K + 1, n): 1 / sigma^2, and with the Huber loss less
@@ -309,8 +309,8 @@ class ShootingProblem:
         scale: np.ndarray,
         sigma: np.ndarray,
         prior: Prior,
-        most: int,
-        hopeless: Any = np.inf,
+        max_steps: int,
+        rms_limit: Any = np.inf,
     ) -> Refinement:
         """The minimum, by Gauss-Newton steps that alternate with estimates of sigma.
 
@@ -320,8 +320,8 @@ class ShootingProblem:
           scale: scale of z.
           sigma: first noise level of each joint, (n,) [rad].
           prior: prior knowledge of x.
-          most: Gauss-Newton steps for the first sigma, at most.
-          hopeless: residual of a joint at which the search stops after the first sigma, (n,) [rad].
+          max_steps: largest number of Gauss-Newton steps for the first sigma.
+          rms_limit: `Refinement.rms` above which the search stops early, (n,) [rad].
 
         Raises:
           ValueError: the simulation from the start diverges.
@@ -336,7 +336,7 @@ class ShootingProblem:
         total = 0
         for again in range(MAX_NOISE_UPDATES):
             if again:
-                most = LATER_STEPS
+                max_steps = LATER_STEPS
             here = self._linearized(z, simulation, sigma, penalty)
             z, here, steps = levenberg_marquardt(
                 here,
@@ -345,14 +345,14 @@ class ShootingProblem:
                 scale,
                 partial(self._trial, sigma=sigma, penalty=penalty),
                 partial(self._linearized, sigma=sigma, penalty=penalty),
-                most,
+                max_steps,
             )
             total += steps
             simulation, statistics = here.data.simulation, here.data.statistics
             previous = sigma
             sigma = self._noise_levels(statistics.residuals)
             rms = self._rms(statistics.residuals)
-            if np.any(rms > hopeless):
+            if np.any(rms > rms_limit):
                 break
             substeps = substeps_for(simulation.sensitivities[1], self.step)
             change = np.abs(sigma / previous - 1.0)
@@ -368,7 +368,7 @@ class ShootingProblem:
     ) -> QuadraticModel:
         """The quadratic model of the objective at z."""
         if simulation.sensitivities is None:
-            found = self._sensitivities(z, simulation.segments, simulation.q, simulation.dq)
+            found = self._sensitivities(z, simulation.inputs, simulation.q, simulation.dq)
             simulation = simulation._replace(sensitivities=found)
         J, _ = simulation.sensitivities
         residuals = self.w.y - simulation.q
@@ -406,8 +406,8 @@ class ShootingProblem:
         free_torques = np.zeros((len(self.w.q), self.free.torque.shape[-1]))
         starts = np.concatenate([self.w.q, self.w.dq, free_torques], axis=1)
         for _ in range(2):
-            segments, q, dq = self.simulate(z, starts)
-            J, _ = self._sensitivities(z, segments, q, dq)
+            inputs, q, dq = self.simulate(z, starts)
+            J, _ = self._sensitivities(z, inputs, q, dq)
             _, step, _ = self._eliminate_starts(self.w.y - q, J, sigma, starts)
             starts = starts + step
         return starts, self.w.y - self.simulate(z, starts)[1]
@@ -429,7 +429,7 @@ class ShootingProblem:
         return K / np.maximum(K - 2.0 - self.free.pieces, 1.0)
 
     def _sensitivities(
-        self, z: np.ndarray, segments: Segments, q: np.ndarray, dq: np.ndarray
+        self, z: np.ndarray, inputs: WindowInputs, q: np.ndarray, dq: np.ndarray
     ) -> tuple[np.ndarray, InverseDynamics]:
         """dq/d(start, z), (W, K + 1, n, s + p + 1), and the inverse dynamics that it is made of."""
         n = q.shape[-1]
@@ -438,9 +438,9 @@ class ShootingProblem:
         middle_t = self.w.t[:, :-1] + 0.5 * h[..., 0]
         middle_q = 0.5 * (q[:, 1:] + q[:, :-1]) - 0.125 * h * np.diff(dq, axis=1)
         middle_dq = 0.5 * (dq[:, 1:] + dq[:, :-1])
-        points = (middle_t, middle_q, middle_dq, np.asarray(segments.tau))
+        points = (middle_t, middle_q, middle_dq, np.asarray(inputs.tau))
         flat = [jnp.asarray(a.reshape(-1, *a.shape[2:])) for a in points]
-        dynamics = inverse_dynamics_under(
+        dynamics = inverse_dynamics_for_torque(
             self.scenario, jnp.asarray(x), *flat, places=self.c.places
         )
         dynamics = InverseDynamics(*(np.asarray(a) for a in dynamics))
@@ -449,7 +449,7 @@ class ShootingProblem:
         late, early = self.torque(z[-1] + 0.5 * self.step), self.torque(z[-1] - 0.5 * self.step)
         torque_by_delay = ((late - early) / self.step)[..., None]
         torque_by_input = np.concatenate([self.free.torque, torque_by_delay], axis=-1)
-        J = position_sensitivities(segments, dynamics, torque_by_input)
+        J = position_sensitivities(inputs, dynamics, torque_by_input)
         columns = [2 * n, 2 * n + len(x), J.shape[-1] - 1]
         by_start, by_x, by_free, by_delay = np.split(J, columns, axis=-1)
         return np.concatenate([by_start, by_free, by_x @ x_by_z, by_delay], axis=-1), dynamics

@@ -64,19 +64,20 @@ def local_polynomial(
 def smooth_logs(logs: list[Log], hold: bool) -> SmoothedMotion:
     """The motion at some times of all logs."""
     spacing = max(sum(log.t[-1] - log.t[0] for log in logs) / MAX_TIMES, logs[0].step)
-    rows, left = [], []
+    rows, variances = [], []
     for log in logs:
         for segment in log.segments:
             t = log.t[segment]
             if len(t) < 2 * MIN_SAMPLES:
                 continue
             for centre in np.arange(t[0] + HALF_WIDTH, t[-1] - HALF_WIDTH, spacing):
-                a, b, rest = local_polynomial(log, segment, centre, hold)
+                a, b, residuals = local_polynomial(log, segment, centre, hold)
                 near = int(np.argmin(np.abs(t - centre)))
                 dq = np.full(a.shape[1], np.nan) if log.dq is None else log.dq[segment][near]
                 rows.append((np.full(1, centre), a[0], a[1], 2.0 * a[2], b[0], b[1], dq))
-                left.append(np.mean(rest**2, axis=0) * len(rest) / max(len(rest) - 4, 1))
+                freedom = max(len(residuals) - 4, 1)
+                variances.append(np.mean(residuals**2, axis=0) * len(residuals) / freedom)
     t, q, dq, ddq, tau, dtau, measured = (np.array(column) for column in zip(*rows, strict=True))
     return SmoothedMotion(
-        t[:, 0], q, dq, ddq, tau, dtau, np.sqrt(np.median(left, axis=0)), measured
+        t[:, 0], q, dq, ddq, tau, dtau, np.sqrt(np.median(variances, axis=0)), measured
     )

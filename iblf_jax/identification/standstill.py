@@ -4,13 +4,14 @@
     tau_j + s_j u_a                 near its standstill, on piece a,    u_a ~ N(0, 1)
 
 replace tau_j - coulomb_j tanh(q_j' / width_j).  Dry friction obeys Coulomb's law only away from
-standstill; near it a joint sticks, creeps, breaks away or deflects a bristle, and no friction law
-is assumed.  While a joint is slower than a threshold, and TIME_MARGIN before and after, a torque
-that is constant over each piece of PIECE s therefore replaces its Coulomb friction; its standard
-deviation s is that of the joint's torque.  Elsewhere the log determines the direction of friction.
+standstill.  Near standstill a joint sticks, creeps, breaks away or deflects a bristle, so no
+friction law is assumed: while a joint is slower than a threshold, and for TIME_MARGIN before and
+after, a free torque replaces its Coulomb friction.  This torque is constant over pieces of
+PIECE_DURATION, and its standard deviation s_j is that of the joint's torque.  Elsewhere the
+direction of friction is that of the logged motion.
 
-A joint that hardly moves then contributes no information through its own equation, because its
-friction is unknown; the equations of the other joints do.  The simulation has no jumps, so that the
+A joint that hardly moves then contributes no information by its own equation of motion, because its
+friction is unknown, but the equations of the other joints do.  The simulation has no jumps, so the
 search converges from any start.  The free torques are eliminated with the starts of the windows
 (`shooting`).
 """
@@ -45,15 +46,15 @@ class FreeTorques(NamedTuple):
     """The terms that replace the friction law in W windows of K steps."""
 
     by_x: np.ndarray
-    """Torque of each step and joint for one unit of each number, (W, K, n, p): the direction of the
-    motion, for Coulomb friction."""
+    """Derivative of the torque of each step and joint by the parameters, (W, K, n, p): minus the
+    direction of motion for Coulomb friction, else 0."""
     torque: np.ndarray
-    """The same for each of the m free torques of a window, (W, K, n, m) [N m]."""
+    """Derivative of the same torque by the m free torques u of a window, (W, K, n, m) [N m]."""
     pieces: np.ndarray
     """Number of free torques of each joint, (W, n)."""
     fixed: np.ndarray
     """Parameters that are not estimated: the widths, (p,) bool."""
-    slow: float = 0.0
+    speed_threshold: float = 0.0
     """Speed below which a joint is near standstill [rad/s]."""
 
     @property
@@ -71,7 +72,12 @@ def no_free_torques(shape: tuple[int, ...], p: int) -> FreeTorques:
 
 
 def free_torques_at_standstill(
-    scenario: Scenario, c: Coordinates, w: Any, logs: list[Log], size: np.ndarray, slow: float
+    scenario: Scenario,
+    c: Coordinates,
+    w: Any,
+    logs: list[Log],
+    size: np.ndarray,
+    speed_threshold: float,
 ) -> FreeTorques:
     """The free torques of the joints whose Coulomb friction and its width are identified.
 
@@ -81,27 +87,32 @@ def free_torques_at_standstill(
       w: the windows.
       logs: all.
       size: s, (n,) [N m].
-      slow: speed below which a joint is near standstill [rad/s].
+      speed_threshold: speed below which a joint is near standstill [rad/s].
     """
-    found, joints = no_free_torques(w.y.shape, len(c.x)), list(friction_pairs(scenario, c))
+    found = no_free_torques(w.y.shape, len(c.x))
+    pairs = list(friction_pairs(scenario, c))
     W, K, n = found.torque.shape[:3]
     direction = np.empty((W, K, n))
     for i, log in enumerate(logs):
-        own = w.log == i
-        direction[own] = _motion_direction(log, slow)[np.searchsorted(log.t, w.t[own][:, :-1])]
+        of_log = w.log == i
+        samples = np.searchsorted(log.t, w.t[of_log][:, :-1])
+        direction[of_log] = _motion_direction(log, speed_threshold)[samples]
     length = max(2, round(PIECE_DURATION / float(np.mean(np.diff(w.t)))))
-    free = sorted({j for *_, j in joints})
+    free = sorted({j for *_, j in pairs})
     parts = [
         [(j, part) for j in free for part in _pieces(direction[i, :, j] == 0.0, length)]
         for i in range(W)
     ]
-    found = found._replace(torque=np.zeros((W, K, n, max(map(len, parts), default=0))), slow=slow)
+    found = found._replace(
+        torque=np.zeros((W, K, n, max(map(len, parts), default=0))), speed_threshold=speed_threshold
+    )
     for i, own in enumerate(parts):
         for a, (j, part) in enumerate(own):
             found.torque[i, part, j, a] = size[j]
             found.pieces[i, j] += 1
-    for coulomb, width, j in joints:
-        found.by_x[:, :, j, coulomb], found.fixed[width] = -direction[:, :, j], True
+    for coulomb, width, j in pairs:
+        found.by_x[:, :, j, coulomb] = -direction[:, :, j]
+        found.fixed[width] = True
     return found
 
 
@@ -120,7 +131,7 @@ def friction_pairs(scenario: Scenario, c: Coordinates) -> Iterator[tuple[int, in
             yield coulomb, width, int(j)
 
 
-def _motion_direction(log: Log, slow: float) -> np.ndarray:
+def _motion_direction(log: Log, speed_threshold: float) -> np.ndarray:
     """The direction of motion of each joint, 1 or -1, and 0 near standstill, (N, n)."""
     found = np.zeros(log.q.shape)
     for segment in log.segments:
@@ -128,7 +139,7 @@ def _motion_direction(log: Log, slow: float) -> np.ndarray:
             continue
         t = log.t[segment]
         speed = _speed(t, log.q[segment], log.step)
-        slow_samples = _cumulative(np.abs(speed) < slow)
+        slow_samples = _cumulative(np.abs(speed) < speed_threshold)
         first, last = (
             np.searchsorted(t, t - TIME_MARGIN),
             np.searchsorted(t, t + TIME_MARGIN, side="right"),

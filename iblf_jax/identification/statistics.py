@@ -1,15 +1,15 @@
 """Uncertainty of the parameters: standard errors, identifiability, and whiteness of the residuals.
 
-With A = sum_w A_w (`shooting`) in the scales of the parameters, A = V diag(lambda) V^T, and along
-v_i the standard error is lambda_i^-1/2.  1 / A is the covariance if the residuals are white with
-one variance.  For residuals of any kind,
+With A = sum_w A_w (`shooting`) in the scales of the parameters and A = V diag(lambda) V^T, the
+standard error along the direction v_i is lambda_i^-1/2.  A^-1 is the covariance if the residuals
+are white with one variance.  For residuals of any kind,
 
     C' = (W - 1) / W sum_w (d_w - d)(d_w - d)^T,     d_w = (A - A_w)^-1 g_w,
 
-is the jackknife covariance, d_w being the change of z without window w.  The standard error of a
-parameter is the larger of the two; correlations are those of 1 / A.  An error of the model is the
-same in all windows and in neither estimate: where the residuals are clearly larger than the noise
-of the positions, both are multiplied by the ratio.
+is the jackknife covariance, where d_w is the change of z without window w, and d the mean of d_w.
+The standard error of a parameter is the larger of the two; correlations are those of A^-1.  An
+error of the model is the same in all windows, so neither estimate contains it: where the residuals
+are clearly larger than the noise of the positions, both are multiplied by their ratio.
 
 Source: B. Efron, C. Stein, Ann. Statist. 9 (1981) 586-596; G. M. Ljung, G. E. P. Box, Biometrika 65
 (1978) 297-303.
@@ -58,24 +58,26 @@ def uncertainty(
     """The uncertainty of the parameters from the statistics of the windows.
 
     Args:
-      information, scores: A_w (W, p, p) and g_w (W, p) by the numbers themselves.
+      information, scores: A_w (W, p, p) and g_w (W, p), without scales.
       prior: precision of the prior, (p, p).
-      scale: of each number, (p,).
+      scale: of each parameter, (p,).
       lacking: residual relative to the noise, >= 1.
     """
-    own, g = information * scale[:, None] * scale / lacking**2, scores * scale / lacking**2
-    size, V = np.linalg.eigh(np.sum(own, axis=0) + prior * scale[:, None] * scale)
-    order = np.argsort(size)[::-1]
-    size, V = np.maximum(size[order], 1e-13 * size.max(initial=1e-300)), V[:, order]
+    information = information * scale[:, None] * scale / lacking**2
+    scores = scores * scale / lacking**2
+    eigenvalues, V = np.linalg.eigh(np.sum(information, axis=0) + prior * scale[:, None] * scale)
+    order = np.argsort(eigenvalues)[::-1]
+    smallest = 1e-13 * eigenvalues.max(initial=1e-300)
+    eigenvalues, V = np.maximum(eigenvalues[order], smallest), V[:, order]
     share = np.where(V**2 < 1e-10, 0.0, V**2)
-    clear = size > IDENTIFIABLE_BELOW**-2
-    inverse = (V[:, clear] / size[clear]) @ V[:, clear].T
+    clear = eigenvalues > IDENTIFIABLE_BELOW**-2
+    inverse = (V[:, clear] / eigenvalues[clear]) @ V[:, clear].T
     errors = np.sqrt(np.diag(inverse))
-    spread = lacking * np.sqrt(
-        np.maximum(np.diag(_jackknife(own, g, V[:, clear], size[clear])), 0.0)
-    )
-    widened = np.where(errors > 0, np.maximum(1.0, spread / np.maximum(errors, 1e-300)), 1.0)
-    identifiable = np.sqrt(share @ (1.0 / size)) * widened < IDENTIFIABLE_BELOW
+    jackknife = _jackknife(information, scores, V[:, clear], eigenvalues[clear])
+    jackknife_errors = lacking * np.sqrt(np.maximum(np.diag(jackknife), 0.0))
+    ratio = jackknife_errors / np.maximum(errors, 1e-300)
+    widened = np.where(errors > 0, np.maximum(1.0, ratio), 1.0)
+    identifiable = np.sqrt(share @ (1.0 / eigenvalues)) * widened < IDENTIFIABLE_BELOW
     covariance = (
         np.where(identifiable[:, None] & identifiable, inverse * widened[:, None] * widened, 0.0)
         * scale[:, None]
@@ -84,30 +86,31 @@ def uncertainty(
     return Uncertainty(
         np.where(identifiable, errors * widened * scale, np.inf),
         covariance,
-        np.sqrt(size),
+        np.sqrt(eigenvalues),
         V,
         widened,
     )
 
 
-def _jackknife(own: np.ndarray, g: np.ndarray, V: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """The jackknife's covariance; zero where there are too few windows."""
-    W = len(own)
+def _jackknife(
+    information: np.ndarray, scores: np.ndarray, V: np.ndarray, eigenvalues: np.ndarray
+) -> np.ndarray:
+    """The jackknife covariance along the directions V; zero if there are too few windows."""
+    W = len(information)
     if W < MIN_WINDOWS:
         return np.zeros((len(V), len(V)))
-    parts, pushes = V.T @ own @ V, g @ V
-    moved = np.stack(
+    changes = np.stack(
         [
-            np.linalg.lstsq(np.diag(size) - part, push, rcond=1e-12)[0]
-            for part, push in zip(parts, pushes, strict=True)
+            np.linalg.lstsq(np.diag(eigenvalues) - A_w, g_w, rcond=1e-12)[0]
+            for A_w, g_w in zip(V.T @ information @ V, scores @ V, strict=True)
         ]
     )
-    moved = (moved - moved.mean(axis=0)) @ V.T
-    return (W - 1) / W * moved.T @ moved
+    changes = (changes - changes.mean(axis=0)) @ V.T
+    return (W - 1) / W * changes.T @ changes
 
 
 def describe_direction(direction: np.ndarray, names: tuple[str, ...]) -> str:
-    """A combination of numbers, each in its scale, by their paths: "0.71 plant.mass[0] - 0.70
+    """A combination of parameters, each in its scale, as text: "0.71 plant.mass[0] - 0.70
     plant.inertia[0]".
     """
     most = np.max(np.abs(direction))
@@ -133,17 +136,17 @@ class Whiteness(NamedTuple):
     """Probability of such correlations in white noise (Ljung and Box)."""
 
 
-def whiteness(rest: np.ndarray) -> Whiteness:
+def whiteness(residuals: np.ndarray) -> Whiteness:
     """The whiteness of the residuals of one joint, (W, K)."""
     from scipy.stats import chi2
 
-    rest = rest - rest.mean()
-    W, K = rest.shape
+    residuals = residuals - residuals.mean()
+    W, K = residuals.shape
     lags = min(LAGS, K - 2)
-    power = float(np.mean(rest**2)) or 1.0
+    power = float(np.mean(residuals**2)) or 1.0
     found = np.array(
         [
-            np.sum(rest[:, lag:] * rest[:, :-lag]) / (W * (K - lag) * power)
+            np.sum(residuals[:, lag:] * residuals[:, :-lag]) / (W * (K - lag) * power)
             for lag in range(1, lags + 1)
         ]
     )

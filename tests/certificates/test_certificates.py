@@ -85,7 +85,7 @@ def test_the_rate_of_V2_is_the_proofs_plus_the_dropped_terms(reading, observer, 
     assert proof.dV.dtype == dtype
     assert not np.any(proof.excluded)
     error = np.abs(np.asarray(jax.jit(jax.vmap(proven_rate))(batch, t, state, proof) - proof.dV))
-    allowed = rounding(dtype) * np.asarray(proof.terms)
+    allowed = rounding(dtype) * np.asarray(proof.dV_size)
     assert np.all(error <= allowed)
     # The tolerance is small beside what it judges, so that it hides nothing.
     assert np.median(allowed / np.abs(proof.dV)) < (1e-11 if dtype == "float64" else 5e-3)
@@ -102,7 +102,7 @@ def test_corrected_keeps_the_inequality_at_every_state(barrier):
         proof = terms_of(batch, t, state)
         free = ~np.asarray(proof.excluded)
         assert np.mean(free) > 0.9
-        left, allowed = left_side(batch, proof), rounding("float64") * np.asarray(proof.terms)
+        left, allowed = left_side(batch, proof), rounding("float64") * np.asarray(proof.dV_size)
         assert np.all(np.isfinite(left[free]))
         assert np.all(left[free] <= allowed[free])
 
@@ -151,7 +151,7 @@ def test_the_claim_with_weights_holds_at_every_state_for_every_positive_gain(nam
     b = 2.0 * kf.min(axis=1) * rng.uniform(0.02, 0.9, t.size)
     least = 0.25 / (a[:, None] * K2 * (kf - b[:, None] / 2.0))
     w_f = least.max(axis=1) * 10 ** rng.uniform(0.0, 2.0, t.size)
-    numbers = zip(decay, K2, kf, proof.slowest, a, b, w_f, strict=True)
+    numbers = zip(decay, K2, kf, proof.mu, a, b, w_f, strict=True)
     terms = np.array(
         [claims.weighted_rate_terms(claims.Claim(*each[:3]), *each[3:]) for each in numbers]
     )
@@ -160,7 +160,7 @@ def test_the_claim_with_weights_holds_at_every_state_for_every_positive_gain(nam
     V = proof.V + (w_f - 1.0) * half_square
     rate = proof.dV + (w_f - 1.0) * np.sum(proof.f_tilde * proof.df_tilde, axis=1)
     left = rate + rho * V - w_f / (2.0 * b) * np.sum(proof.df**2, axis=1)
-    allowed = rounding("float64") * np.maximum(1.0, w_f) * proof.terms
+    allowed = rounding("float64") * np.maximum(1.0, w_f) * proof.dV_size
     free = ~proof.excluded
     assert np.mean(free) > 0.9
     assert np.all(left[free] <= allowed[free])
@@ -182,7 +182,7 @@ def test_the_claim_with_weights_holds_at_every_state_for_every_positive_gain(nam
 def test_the_weights_that_are_chosen_give_the_smallest_mean_of_the_envelope():
     """No other a, b and w_f that (W.2) admits is better by more than the grid is coarse."""
     constants = claims.Claim(*(np.array(x) for x in ([4.0, 3.0], [0.2, 0.05], [0.7, 0.4])))
-    given = {"slowest": 0.9, "V_rest": 0.3, "half_square": 0.05, "F_d": 0.2, "duration": 10.0}
+    given = {"mu": 0.9, "V_rest": 0.3, "half_square": 0.05, "F_d": 0.2, "duration": 10.0}
 
     def mean(rho, w_f, rho2):
         fading = (1.0 - np.exp(-rho * 10.0)) / (rho * 10.0)

@@ -25,11 +25,11 @@ from iblf_jax import cli
 from iblf_jax.core.pytree import astype
 from iblf_jax.files.identification import load_identification_file
 from iblf_jax.identification import statistics
+from iblf_jax.identification.assessment import missing_terms_of_fit
 from iblf_jax.identification.coordinates import coordinates, to_x, to_z, with_widths
 from iblf_jax.identification.log import read
-from iblf_jax.identification.problem import missing_terms_of_fit
 from iblf_jax.identification.replay import inverse_dynamics
-from iblf_jax.identification.shooting import ShootingProblem, Torque, windows
+from iblf_jax.identification.shooting import ShootingProblem, TorqueIntegral, windows
 from iblf_jax.identification.smoothing import smooth_logs
 from iblf_jax.identification.standstill import (
     free_torques_at_standstill,
@@ -207,7 +207,7 @@ def test_friction_that_sticks_is_left_to_the_log(scenario):
     )
     assert "6 of 6 numbers told" in repr(
         known
-    ) and "in place of the friction of all joints: coulomb tanh" in repr(known)
+    ) and "the friction of all joints: with coulomb tanh" in repr(known)
     np.testing.assert_array_equal(known.scenario.disturbance.width, scenario.disturbance.width)
 
 
@@ -302,9 +302,9 @@ def test_the_torque_of_a_step_is_its_mean(log):
     """Held, it is the logged number whatever the times are; late by half a step, that of two
     samples."""
     jittered = log["t"] + np.random.default_rng(1).uniform(-1e-3, 1e-3, len(log["t"]))
-    torque = Torque(read({**log, "t": jittered}, 2)[0], hold=True)
+    torque = TorqueIntegral(read({**log, "t": jittered}, 2)[0], hold=True)
     np.testing.assert_allclose(torque.means(jittered, 0.0), log["tau"][:-1], rtol=1e-9, atol=1e-9)
-    late = Torque(read(log, 2)[0], hold=True).means(log["t"], 2e-3)
+    late = TorqueIntegral(read(log, 2)[0], hold=True).means(log["t"], 2e-3)
     np.testing.assert_allclose(
         late[1:], 0.5 * (log["tau"][:-2] + log["tau"][1:-1]), rtol=1e-9, atol=1e-9
     )
@@ -388,7 +388,7 @@ def test_coulomb_friction_that_was_left_out_is_found_and_what_makes_up_for_it_is
     it is too large."""
     start = ij.with_parameters(scenario, {"disturbance.coulomb": 0.0})
     known = ij.identify(start, other_logs[0], PATHS[:2])
-    found = [note for note in known.notes if "follows the sign of its velocity" in note]
+    found = [note for note in known.notes if "depends on the sign of its velocity" in note]
     assert len(found) == 2
     sizes = {
         re.search(r"joint (\d)", note)[1]: float(re.search(r"has ([\d.]+) ", note)[1])
@@ -401,14 +401,14 @@ def test_coulomb_friction_that_was_left_out_is_found_and_what_makes_up_for_it_is
         if number.value is not None and number.value > 1.2 * truth:
             assert 0.3 < number.bias / (number.value - truth) < 3.0
     assert any(number.verdict == "biased" for number in known.numbers)
-    assert "biased" in repr(known) and "make up for what was left out" in repr(known)
+    assert "biased" in repr(known) and "compensate for missing terms" in repr(known)
     assert "biased" in known.tables_html()["Numbers"]
     assert not any("viscous" in path for path in known.perturbations)
     assert json.dumps(known.to_dict(), allow_nan=False)
 
 
 def test_a_fit_that_lacks_nothing_has_no_finding(known, scenario, other_logs):
-    assert not any("What is left of the torque" in note or "biased" in note for note in known.notes)
+    assert not any("The residual torque of" in note or "biased" in note for note in known.notes)
     assert all(number.bias is None for number in known.numbers)
     for log in other_logs:
         for paths in (PATHS, PATHS[:1]):
