@@ -106,7 +106,7 @@ def compare(
         name: _at_effort_of(first, rollouts[first], rollouts[name], one, options)
         for name, one in others.items()
     }
-    found[first] = _Equal(1.0, rollouts[first])
+    found[first] = _EqualEffort(1.0, rollouts[first])
     ordered = {name: found[name] for name in rollouts}
     return Comparison(
         rollouts,
@@ -199,7 +199,7 @@ def gain_names(law: Controller) -> tuple[str, ...]:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class _Equal:
+class _EqualEffort:
     """A law at the first one's effort, or why there is no such thing."""
 
     factor: float
@@ -210,15 +210,15 @@ class _Equal:
 
 def _at_effort_of(
     title: str, reference: Rollout, own: Rollout, scenario: Scenario, options: Mapping[str, Any]
-) -> _Equal:
+) -> _EqualEffort:
     """A law with gains scaled so that it has the first one's effort."""
     if int(reference.status) & NO_EFFORT:
         reason = f"the first law, {title}, failed itself, so it sets no effort"
-        return _Equal(float("nan"), reason=reason)
+        return _EqualEffort(float("nan"), reason=reason)
     names = gain_names(scenario.controller)
     if not names:
         reason = "it has no gains to scale: no k1, K2, and no class attribute `gains`"
-        return _Equal(float("nan"), reason=reason)
+        return _EqualEffort(float("nan"), reason=reason)
     target = float(reference.metrics.effort_above_gravity)
 
     def dt_for(trials: Trials) -> float | None:
@@ -231,8 +231,8 @@ def _at_effort_of(
     for factor in found.crossings:
         run = _run(with_parameters(scenario, _scaled(scenario, names, factor)), options)
         if not int(run.status) & NO_EFFORT:
-            return _Equal(factor, run, search=found)
-    return _Equal(float("nan"), reason=found.in_words(), search=found)
+            return _EqualEffort(factor, run, search=found)
+    return _EqualEffort(float("nan"), reason=found.in_words(), search=found)
 
 
 def _scaled(scenario: Scenario, names: Sequence[str], factor: Any) -> dict[str, Any]:

@@ -32,7 +32,7 @@ from iblf_jax.studies import statistics
 from iblf_jax.studies.blocks import case_bytes, result_shapes
 from iblf_jax.studies.designs import MAX_SOBOL, split
 from iblf_jax.studies.distributions import Perturbation
-from iblf_jax.studies.draws import sample_size
+from iblf_jax.studies.draws import draw_shapes
 from iblf_jax.studies.execution import run_all_cases
 from iblf_jax.studies.options import RunOptions, ThisProcess, check_deprecated, executor_of
 from iblf_jax.studies.study_setup import PreparedStudy, prepare
@@ -157,22 +157,22 @@ def sensitivity(
     prepared = prepare(scenario, perturbations, options.checked(), metrics)
     if isinstance(output, str):
         checks.one_of("output", output, sorted(result_shapes(prepared).metrics))
-    shapes = sample_size(prepared.program.targets, prepared.shared.cases.perturbations)
-    names = [name for path, shape in shapes.items() for name in statistics.entries(path, shape)]
+    shapes = draw_shapes(prepared.program.targets, prepared.shared.uncertain.perturbations)
+    names = [name for path, shape in shapes.items() for name in statistics.entry_paths(path, shape)]
     runs = points * (len(names) + 2)
     checks.fits("points", points, (len(names) + 2) * (case_bytes(prepared) + 3 * 8.0 * len(names)))
     with bar(progress, runs) as shown:
-        search = _Evaluation(prepared, shapes, output, executor, shown.update)
-        indices, ends = _indices(search, points, len(names))
+        evaluation = _Evaluation(prepared, shapes, output, executor, shown.update)
+        indices, ends = _indices(evaluation, points, len(names))
     return Sensitivity(
         tuple(names),
         np.ravel(indices.first_order[0]),
         np.ravel(indices.total_order[0]),
         _ends(ends.first_order),
         _ends(ends.total_order),
-        search.label,
+        evaluation.label,
         runs,
-        search.failed,
+        evaluation.failed,
     )
 
 
@@ -290,7 +290,7 @@ class _Evaluation:
 
     def _output_of(self, metrics: dict[str, Any]) -> np.ndarray:
         if isinstance(self.output, str):
-            return statistics.one_number(metrics, self.output)
+            return statistics.worst_joint(metrics, self.output)
         try:
             return np.asarray(
                 self.output(Metrics(metrics, metric_units(self.prepared.shared.folds)))

@@ -81,7 +81,7 @@ def describe(prepared: PreparedStudy, points: Points, design: str) -> dict[str, 
     def place(path: str) -> dict[str, Any]:
         return {
             "along": points.along[path],
-            "values": points.ticks[path].tolist(),
+            "values": points.axis_values[path].tolist(),
             "unit": unit_at(scenario, path),
             "shape": list(np.shape(get(scenario, path))),
         }
