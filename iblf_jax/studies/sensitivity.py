@@ -60,11 +60,11 @@ class Sensitivity:
     total_order_interval: np.ndarray
     """95 % bootstrap interval, (d, 2)."""
     output: str
-    """What was explained."""
+    """Name of the metric or function."""
     runs: int
-    """Runs that were made: n (d + 2)."""
+    """Number of runs: n (d + 2)."""
     failed: int
-    """How many of them failed; they are part of the estimate."""
+    """Number of failed runs, which the estimate includes."""
 
     def to_xarray(self) -> xarray.Dataset:
         """The indices along the dimension `parameter`."""
@@ -197,8 +197,7 @@ def _indices(evaluation: _Evaluation, points: int, dimension: int) -> tuple[Any,
 
     def evaluate(u: np.ndarray) -> np.ndarray:
         y = evaluation(u.T)
-        # Twice, as if there were two outputs: for a single number and a single output SciPy makes
-        # scalars, into which it then fails to write.
+        # SciPy fails for a single number with a single output, so the output is given twice.
         return np.stack([y, y])
 
     indices = stats.sobol_indices(
@@ -207,7 +206,7 @@ def _indices(evaluation: _Evaluation, points: int, dimension: int) -> tuple[Any,
         dists=[stats.uniform()] * dimension,
         rng=np.random.default_rng(evaluation.prepared.options.seed),
     )
-    # The first two evaluations are the runs whose variance all others are divided by.
+    # The variance of the first two evaluations is the denominator of all indices.
     if np.ptp(np.concatenate(evaluation.values[:2])) == 0:
         raise checks.fail(
             evaluation.label,
@@ -222,9 +221,7 @@ def _indices(evaluation: _Evaluation, points: int, dimension: int) -> tuple[Any,
 
 
 def _ends(bootstrapped: Any) -> np.ndarray:
-    """The interval of each index, (d, 2); where all resamples have the same, or BCa has none for
-    another reason, their percentiles.
-    """
+    """The BCa interval of each index, (d, 2); percentiles of the resamples where not finite."""
     interval = bootstrapped.confidence_interval
     ends = np.stack([np.ravel(interval.low[0]), np.ravel(interval.high[0])], -1)
     resampled = np.atleast_2d(bootstrapped.bootstrap_distribution[0])
