@@ -61,7 +61,7 @@ from iblf_jax.engine import RunRequest
 from iblf_jax.engine.execute import run_batch
 from iblf_jax.engine.structural_constants import robot_constants
 from iblf_jax.simulation.scenario import canonical
-from iblf_jax.studies.perturbation_cube import bounded
+from iblf_jax.studies.perturbation_cube import unit_cube
 from iblf_jax.tuning import TuningProblem, _falsify, evaluation
 from iblf_jax.tuning.quantities import Peak, Quantities
 
@@ -668,7 +668,7 @@ def margins_of(scenario: ij.Scenario, sets: dict[str, Any], timing: dict[str, fl
     d), and d.
     """
     scenario = canonical(scenario)
-    cube = bounded(scenario, sets)
+    cube = unit_cube(scenario, sets)
     run = RunRequest(
         round(timing["duration"] / timing["dt"]), "rk4", constants=robot_constants(scenario)
     )

@@ -36,7 +36,7 @@ from iblf_jax.simulation.closed_loop import initial_state
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.distributions import Perturbation
-from iblf_jax.studies.perturbation_cube import bounded
+from iblf_jax.studies.perturbation_cube import unit_cube
 
 EXCLUDED = "The guard or a torque limit is active at the start, where nothing is claimed."
 
@@ -96,7 +96,7 @@ def counterexample(
     _check_claimed(scenario)
     starts = checks.positive_integer("starts", starts)
     seed = checks.positive_integer("seed", seed, least=0, most=2**32 - 1)
-    cube = bounded(scenario, perturbations, signs=False)
+    cube = unit_cube(scenario, perturbations, signs=False)
     checks.fits_memory("starts", starts, 8.0 * 2 * cube.size)
     search = _Search(scenario, cube)
     for point in cube.admissible_points(starts, seed, search.why_unusable):
@@ -139,7 +139,7 @@ class _Search:
         """Why a point is unusable ("" if it is usable), and g and its gradient there; the best
         point is kept.
         """
-        why = self.cube.refused(point)
+        why = self.cube.why_inadmissible(point)
         if why:
             return why, -np.inf, np.zeros(self.cube.size)
         (g, excluded), gradient = self._growth(jnp.asarray(point, self.dtype))

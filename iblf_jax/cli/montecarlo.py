@@ -56,14 +56,14 @@ def report(study: Study) -> str:
     import numpy as np
 
     from iblf_jax.cli._common import number
-    from iblf_jax.studies.statistics import one_number
+    from iblf_jax.studies.statistics import worst_joint
 
     rows = [["metric, worst joint", "unit", "5 %", "50 %", "95 %"]]
     names: list[str] = []
     if study.made.any():
         names = list(study.metrics)
     for name in names:
-        numbers = one_number(study.metrics, name)[study.made]
+        numbers = worst_joint(study.metrics, name)[study.made]
         levels = np.quantile(numbers, (0.05, 0.5, 0.95), method="inverted_cdf")
         rows.append([name, study.metrics.units.get(name, ""), *map(number, levels)])
     worst = study.worst(5)

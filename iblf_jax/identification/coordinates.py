@@ -28,7 +28,7 @@ from iblf_jax.core import checks
 from iblf_jax.identification.replay import LeafSlice
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Scenario, with_parts
-from iblf_jax.studies.draws import check_paths, same_place
+from iblf_jax.studies.draws import check_paths, paths_overlap
 from iblf_jax.world.robots._base import robot_member
 
 MIN_POSITIVE_FACTOR = 1e-3
@@ -107,7 +107,7 @@ def with_widths(scenario: Scenario, given: Any) -> Any:
 
     def new(path):
         try:
-            return not any(same_place(scenario, path, other) for other in found)
+            return not any(paths_overlap(scenario, path, other) for other in found)
         except ValueError:  # the scenario has no such width
             return False
 

@@ -149,7 +149,7 @@ def histograms(study: Study, metrics: Sequence[str] | None = None, *, bins: int 
     names = list(study.metrics)
     if metrics is not None:
         names = checks.nonempty_list("metrics", metrics, '["margin", "rmse"]')
-    values = {name: statistics.one_number(study.metrics, name) for name in names}
+    values = {name: statistics.worst_joint(study.metrics, name) for name in names}
     if metrics is None:
         values = {name: x for name, x in values.items() if _varies(x)}
     if not values:
@@ -198,7 +198,7 @@ def scatter(study: Study, metric: str = "margin") -> Figure:
       ValueError: not a Study, or an unknown metric.
     """
     _check(study)
-    drawn = statistics.columns(study.samples)
+    drawn = statistics.scalar_samples(study.samples)
     figure, panels = _grid(len(drawn), 2.2)
     for axes, (path, x) in zip(panels, drawn.items(), strict=True):
         _draw_scatter(axes, study, metric, path, x)
@@ -208,7 +208,7 @@ def scatter(study: Study, metric: str = "margin") -> Figure:
 
 
 def _draw_scatter(axes: Axes, study: Study, metric: str, path: str, x: np.ndarray) -> None:
-    y = statistics.one_number(study.metrics, metric)
+    y = statistics.worst_joint(study.metrics, metric)
     failed = _is_failed(study)
     known = study.made & np.isfinite(y)
     good = np.flatnonzero(known & ~failed)
@@ -246,9 +246,9 @@ def study_overview(study: Study, *, runs: int = 512) -> Figure:
     """
     _check(study)
     n = study.scenario.n
-    drawn = statistics.columns(study.samples)
+    drawn = statistics.scalar_samples(study.samples)
     data = study.bands(runs=runs)
-    margins = statistics.one_number(study.metrics, "margin")
+    margins = statistics.worst_joint(study.metrics, "margin")
     figure, panels = _grid(n + 1 + len(drawn), 2.3)
     for joint in range(n):
         _draw_bands(panels[joint], data, joint, study)

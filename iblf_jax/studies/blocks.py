@@ -38,7 +38,7 @@ from iblf_jax.studies.study_setup import PreparedStudy, SharedInputs, StudyProgr
 
 
 class BlockResults(NamedTuple):
-    """What runs return, run axis first."""
+    """The results of runs, run axis first."""
 
     metrics: dict[str, Any]
     status: Any
@@ -78,7 +78,7 @@ def _without_inadmissible(admissible: jax.Array, x: jax.Array) -> jax.Array:
 def _block(program: StudyProgram, shared: SharedInputs, inputs: CaseInputs) -> BlockResults:
     """Draws and runs one block."""
     varied, drawn, admissible = drawn_leaves(program.targets, shared, inputs)
-    outcome = program.batch(shared.cases.scenario, varied, shared.folds, shared.dt)
+    outcome = program.batch(shared.uncertain.scenario, varied, shared.folds, shared.dt)
     metrics = {name: _without_inadmissible(admissible, x) for name, x in outcome.metrics.items()}
     status = jnp.where(admissible, outcome.status, flag(~admissible, Status.INADMISSIBLE_DRAW))
     mode = _without_inadmissible(admissible, outcome.fastest_mode)
@@ -88,18 +88,14 @@ def _block(program: StudyProgram, shared: SharedInputs, inputs: CaseInputs) -> B
 def _record_block(
     program: StudyProgram, shared: SharedInputs, inputs: CaseInputs, record_every: int
 ):
-    """The recorded positions of a block of runs.
-
-    Returns:
-      Signal -> (B, T, n); times (B, T); status (B,); and which draws are admissible, (B,).
-    """
-    varied, _, admissible = drawn_leaves(program.targets, shared, inputs)
+    """The recorded positions of a block of runs: signal -> (B, T, n); and the times, (B, T)."""
+    varied, _, _ = drawn_leaves(program.targets, shared, inputs)
     outcome = program.batch(
-        shared.cases.scenario, varied, shared.folds, shared.dt, record_every=record_every
+        shared.uncertain.scenario, varied, shared.folds, shared.dt, record_every=record_every
     )
     arrays = outcome.records[0]
     recorded = {name: arrays[name] for name in ("q", "e1", "lower", "upper", "q_d")}
-    return recorded, arrays["t"], outcome.status, admissible
+    return recorded, arrays["t"]
 
 
 @partial(jax.jit, static_argnames=("program", "record_every"))
@@ -128,42 +124,44 @@ def run_blocks(
       prepared: what to run.
       blocks: numbers of the blocks; each is taken when the block is started.
       here: devices and limits; all devices and the default memory if not given.
-      record_every: records trajectories, every so-many-th step, instead of metrics.
+      record_every: steps between two records; if given, trajectories are returned instead of
+        metrics.
     """
     here = here or ThisProcess()
     remaining = iter(blocks)
     devices = here.devices or default_devices()
-    # A block for each device, in order to know how many devices are needed.
+    # No more devices are used than there are blocks.
     first_blocks = list(itertools.islice(remaining, len(devices)))
     if not first_blocks:
         return
-    places, chosen_device = devices[: len(first_blocks)], user_default()
-    call = partial(_execute, program=prepared.program, record_every=record_every)
-    copies = [jax.device_put(prepared.shared, place) for place in places]
-    if len(places) > 1:
+    devices = devices[: len(first_blocks)]
+    default_device = user_default()
+    execute = partial(_execute, program=prepared.program, record_every=record_every)
+    copies = [jax.device_put(prepared.shared, device) for device in devices]
+    if len(devices) > 1:
         inputs = prepared.inputs_of(np.arange(block_size()))
-        _compile(call, copies, [jax.device_put(inputs, place) for place in places])
+        _compile(execute, copies, [jax.device_put(inputs, device) for device in devices])
 
-    def results(place: int, block: int) -> tuple[Any, int]:
-        """Those of a block on the device `places[place]`, and the bytes that it took."""
+    def compute(block: int, device: int) -> tuple[Any, int]:
+        """The results of a block on the device of this number, and the bytes that it took."""
         cases = np.arange(block * block_size(), (block + 1) * block_size())
-        inputs = jax.device_put(prepared.inputs_of(cases), places[place])
-        with jax.default_device(chosen_device):  # it is local to a thread
-            out = call(copies[place], inputs)
+        inputs = jax.device_put(prepared.inputs_of(cases), devices[device])
+        with jax.default_device(default_device):  # JAX keeps it for each thread
+            out = execute(copies[device], inputs)
         wait_until_ready(out)
         return jax.tree.map(np.asarray, out), sum(x.nbytes for x in jax.tree.leaves((inputs, out)))
 
-    # The first block runs by itself: each program is compiled once, and the bytes of a block are
-    # known afterwards.
-    first, bytes_taken = results(0, first_blocks[0])
+    # The first block runs before the others: it compiles the program and gives the bytes of one.
+    first, bytes_taken = compute(first_blocks[0], 0)
     yield first_blocks[0], first
-    in_flight = blocks_in_flight(here.chunk, here.memory, bytes_taken, len(places))
-    # One thread for each block in flight: draws, start and results of one block are made while
-    # another block is integrated.
-    pool, waiting = ThreadPoolExecutor(in_flight, "block"), deque[tuple[int, Future]]()
+    in_flight = blocks_in_flight(here.chunk, here.memory, bytes_taken, len(devices))
+    # Each block in flight has a thread, which draws, starts or copies results while the block of
+    # another thread is integrated.
+    pool = ThreadPoolExecutor(in_flight, "block")
+    waiting = deque[tuple[int, Future]]()
     try:
         for k, block in enumerate(itertools.chain(first_blocks[1:], remaining), start=1):
-            waiting.append((block, pool.submit(results, k % len(places), block)))
+            waiting.append((block, pool.submit(compute, block, k % len(devices))))
             if len(waiting) == in_flight:
                 block, future = waiting.popleft()
                 yield block, future.result()[0]
@@ -173,17 +171,17 @@ def run_blocks(
         pool.shutdown(cancel_futures=True)
 
 
-def _compile(call: partial, copies: list[SharedInputs], inputs: list[CaseInputs]) -> None:
+def _compile(execute: partial, copies: list[SharedInputs], inputs: list[CaseInputs]) -> None:
     """Compiles the block for several devices at the same time; it is traced once for all."""
-    program: Any = call.func
-    options = call.keywords
+    program: Any = execute.func
+    options = execute.keywords
     program.trace(copies[0], inputs[0], **options)
 
-    def one(shared, inputs_there):
-        program.lower(shared, inputs_there, **options).compile()
+    def compile_on_device(shared, inputs):
+        program.lower(shared, inputs, **options).compile()
 
     with ThreadPoolExecutor(len(copies)) as pool:
-        list(pool.map(one, copies, inputs))
+        list(pool.map(compile_on_device, copies, inputs))
 
 
 def run_spans_here(

@@ -102,19 +102,16 @@ def compare(
         return Comparison(rollouts, {}, {}, {}, gains)
     first = next(iter(rollouts))
     others = {name: one for name, one in scenarios.items() if name != first}
-    found = {
-        name: _at_effort_of(first, rollouts[first], rollouts[name], one, options)
-        for name, one in others.items()
-    }
-    found[first] = _Equal(1.0, rollouts[first])
-    ordered = {name: found[name] for name in rollouts}
+    equal = {first: _EqualEffort(1.0, rollouts[first])}
+    for name, one in others.items():
+        equal[name] = _at_effort_of(first, rollouts[first], rollouts[name], one, options)
     return Comparison(
         rollouts,
-        {name: one.run for name, one in ordered.items() if one.run is not None},
-        {name: one.factor for name, one in ordered.items()},
-        {name: one.reason for name, one in ordered.items() if one.reason},
+        {name: one.run for name, one in equal.items() if one.run is not None},
+        {name: one.factor for name, one in equal.items()},
+        {name: one.reason for name, one in equal.items() if one.reason},
         gains,
-        {name: one.search for name, one in ordered.items() if one.search is not None},
+        {name: one.search for name, one in equal.items() if one.search is not None},
     )
 
 
@@ -137,10 +134,11 @@ def _named_laws(laws: Laws) -> dict[str, str | Controller]:
             checks.one_of("laws", law, NAMES)
         else:
             checks.conforms(f"laws[{name!r}]", law, Controller, f"Or a name: {', '.join(NAMES)}.")
-        count = 2
         shown = name
+        count = 1
         while shown in named:
-            shown, count = f"{name} {count}", count + 1
+            count += 1
+            shown = f"{name} {count}"
         named[shown] = law
     return named
 
@@ -175,14 +173,14 @@ def _with_law(scenario: Scenario, law: str | Controller) -> Scenario:
 
 
 def _limited_as(controller: Controller, law: Controller) -> Controller:
-    """A law within the torque limits of another one."""
+    """A law with the torque limits of another one."""
     if not isinstance(controller, Saturated):
         return law
     return dataclasses.replace(controller, law=_limited_as(controller.law, law))
 
 
 def _run(scenario: Scenario, options: Mapping[str, Any]) -> Rollout:
-    """One run; a failure is named in the table, not warned of."""
+    """One run; the table reports its failure, so there is no warning."""
     with notices.muted(UserWarning):
         return simulate(
             scenario, metrics=(*standard(), *optional_folds(scenario), AboveGravity()), **options
@@ -190,8 +188,8 @@ def _run(scenario: Scenario, options: Mapping[str, Any]) -> Rollout:
 
 
 def gain_names(law: Controller) -> tuple[str, ...]:
-    """The leaves of a law that are scaled together: its class attribute `gains`, else those of k1
-    and K2 that it has.
+    """The leaves of a law that are scaled together: those of its class attribute `gains`, or k1 and
+    K2 by default.
     """
     inner = unwrapped(law)
     values = field_values(inner)
@@ -199,8 +197,8 @@ def gain_names(law: Controller) -> tuple[str, ...]:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class _Equal:
-    """A law at the first one's effort, or why there is no such thing."""
+class _EqualEffort:
+    """A law at the effort of the first one, or the reason why no gain factor gives it."""
 
     factor: float
     run: Rollout | None = None
@@ -210,19 +208,19 @@ class _Equal:
 
 def _at_effort_of(
     title: str, reference: Rollout, own: Rollout, scenario: Scenario, options: Mapping[str, Any]
-) -> _Equal:
-    """A law with gains scaled so that it has the first one's effort."""
+) -> _EqualEffort:
+    """Scales the gains of a law until its effort is that of the first law."""
     if int(reference.status) & NO_EFFORT:
         reason = f"the first law, {title}, failed itself, so it sets no effort"
-        return _Equal(float("nan"), reason=reason)
+        return _EqualEffort(float("nan"), reason=reason)
     names = gain_names(scenario.controller)
     if not names:
         reason = "it has no gains to scale: no k1, K2, and no class attribute `gains`"
-        return _Equal(float("nan"), reason=reason)
+        return _EqualEffort(float("nan"), reason=reason)
     target = float(reference.metrics.effort_above_gravity)
 
     def dt_for(trials: Trials) -> float | None:
-        """The largest step [s] that would do for all of these trials."""
+        """The largest time step [s] at which none of these trials would be flagged."""
         dt, method = options["dt"], options["method"]
         return needed_dt(trials.status, trials.mode, trials.error, dt, method)
 
@@ -231,8 +229,8 @@ def _at_effort_of(
     for factor in found.crossings:
         run = _run(with_parameters(scenario, _scaled(scenario, names, factor)), options)
         if not int(run.status) & NO_EFFORT:
-            return _Equal(factor, run, search=found)
-    return _Equal(float("nan"), reason=found.in_words(), search=found)
+            return _EqualEffort(factor, run, search=found)
+    return _EqualEffort(float("nan"), reason=found.in_words(), search=found)
 
 
 def _scaled(scenario: Scenario, names: Sequence[str], factor: Any) -> dict[str, Any]:
@@ -247,8 +245,8 @@ def _scaled(scenario: Scenario, names: Sequence[str], factor: Any) -> dict[str, 
 def _trials_of(
     scenario: Scenario, names: Sequence[str], options: Mapping[str, Any]
 ) -> Callable[[np.ndarray], Trials]:
-    """A function of factors (N,) that runs all of them in one batch, of one size, so that it is
-    compiled once.
+    """A function that runs all given factors, (N,), in one batch.  The batch has a fixed size, so
+    that it is compiled once.
     """
     with notices.muted(UserWarning):
         scenario = canonical(scenario)

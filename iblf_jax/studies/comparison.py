@@ -31,9 +31,7 @@ OWN_GAINS = "Laws whose gains differ are comparable at equal effort only."
 
 
 class Row(NamedTuple):
-    """One law's line.  Of several joints, the worst one's; efforts and chatter are over all
-    joints.
-    """
+    """The line of one law: values of its worst joint, but efforts and chatter of all joints."""
 
     law: str
     factor: float
@@ -62,7 +60,7 @@ class Row(NamedTuple):
 
 
 OPTIONAL = ("velocity_margin", "region_margin")
-"""Of constraints that not every scenario has."""
+"""Columns of constraints that not every scenario has."""
 
 HEADINGS = (
     "law",
@@ -115,16 +113,16 @@ def row_of(law: str, factor: float, run: Rollout) -> Row:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Comparison:
-    """Several laws on one scenario.  Prints as two tables, with what was held equal in words."""
+    """Several laws on one scenario.  Prints as two tables, each with what is equal in it."""
 
     rollouts: dict[str, Rollout]
     """Law -> run at the gains it has."""
     equal_effort: dict[str, Rollout]
     """Law -> run at the first law's effort; without the laws for which there is no factor."""
     factors: dict[str, float]
-    """Law -> what its gains were multiplied by for that; NaN where there is no such factor."""
+    """Law -> the factor of its gains at equal effort; NaN where none was found."""
     reasons: dict[str, str]
-    """Law -> why there is none."""
+    """Law -> why no factor was found."""
     gains: dict[str, str]
     """Law -> its gains in words."""
     searches: dict[str, EffortSearch] = dataclasses.field(default_factory=dict)
@@ -254,7 +252,7 @@ class Comparison:
 
 
 def _columns(rows: tuple[Row, ...]) -> list[tuple[str, ...]]:
-    """Headings and lines, without the margins of constraints that there are none of."""
+    """Headings and lines, without the columns of constraints that the scenario does not have."""
     shown = [
         name not in OPTIONAL or any(math.isfinite(row._asdict()[name]) for row in rows)
         for name in Row._fields

@@ -18,13 +18,13 @@ if TYPE_CHECKING:
 
 RUN = "run"
 DRAWN = "drawn_"
-"""Begins the name of a drawn parameter in flat data."""
+"""Prefix of the names of drawn parameters in flat data."""
 FIRST_TIMES = {
     "first_violation_time": Status.BOUND_VIOLATED,
     "first_velocity_violation_time": Status.VELOCITY_VIOLATED,
     "first_region_violation_time": Status.REGION_VIOLATED,
 }
-"""Metric that says when a constraint was violated first -> the flag that says that it was."""
+"""Metric with the time of the first violation of a constraint -> the flag of its violation."""
 
 
 def to_dataset(
@@ -36,13 +36,13 @@ def to_dataset(
     """The Dataset from flat data.
 
     Args:
-      config: what `store_config.describe` gave.
+      config: the result of `store_config.describe`.
       flat: name -> (cases, ...); case = point * runs + run.
       units: name -> unit.
-      done: which cases are there, (cases,) bool.
+      done: which cases are computed, (cases,) bool.
 
     Returns:
-      Dimensions as the design's, then `run` if runs are perturbed, then `joint`.
+      A Dataset with the dimensions of the design, `run` if runs are perturbed, and `joint`.
     """
     import xarray
 
@@ -59,7 +59,7 @@ def to_dataset(
         )
         attributes = {"units": units.get(name, "")}
         by_point = values.reshape(-1, config["runs"], *values.shape[1:])
-        if name.startswith(DRAWN) and np.all(done) and _is_the_same_at_every_point(by_point):
+        if name.startswith(DRAWN) and np.all(done) and _is_constant(by_point):
             path = name.removeprefix(DRAWN)
             coordinates[path] = ((RUN, *dims[len(outer) :]), by_point[0], attributes)
         else:
@@ -76,7 +76,7 @@ def to_dataset(
     return xarray.Dataset(variables, coordinates, _attributes(config, done))
 
 
-def _is_the_same_at_every_point(values: np.ndarray) -> bool:
+def _is_constant(values: np.ndarray) -> bool:
     """Whether values, (points, runs, ...), do not depend on the point."""
     return np.array_equal(values, np.broadcast_to(values[:1], values.shape), equal_nan=True)
 

@@ -1,5 +1,4 @@
-"""Where the uniform numbers of a study come from: independent draws, a Latin hypercube or Sobol
-points.
+"""The uniform numbers of a study: independent draws, a Latin hypercube or Sobol points.
 
 Independent draws are made run by run inside the compiled block (`draws`).  A design covers the unit
 cube more evenly, so means converge faster, but its points are not independent: no Clopper-Pearson
@@ -22,7 +21,7 @@ from iblf_jax.core import checks
 
 SAMPLERS = ("independent", "latin_hypercube", "sobol")
 MAX_RUNS = 2**32
-"""A run's draws come from its number, which is a uint32."""
+"""The draws of a run depend on its number, which is a uint32."""
 MAX_SOBOL = (21201, 2**30)
 """Dimensions and points that SciPy's Sobol sequence has."""
 
@@ -66,7 +65,7 @@ def unit_points(
     another.
 
     Raises:
-      ValueError: more than the memory holds, or than the sequence has.
+      ValueError: more points than fit the memory or the sequence has.
     """
     checks.fits_memory("runs" if not salt else "points", runs, 3 * 8.0 * dimension)
     if sampler == "sobol" and (dimension > MAX_SOBOL[0] or runs // replicates > MAX_SOBOL[1]):

@@ -1,6 +1,6 @@
-"""What an uncertain parameter may be: distributions, and how a draw acts on a leaf.
+"""Distributions of uncertain parameters, and how a draw acts on a leaf.
 
-A distribution is known by its quantile function F^-1, which turns a uniform number u in (0, 1) into
+A distribution is defined by its quantile function F^-1, which maps a uniform number u in (0, 1) to
 a draw:
 
     uniform       low + u (high - low)
@@ -38,10 +38,10 @@ KINDS = ("factor", "offset", "value")
 
 @runtime_checkable
 class Distribution(Protocol):
-    """What the package asks of a distribution: a component with these two methods.
+    """A distribution: a component with these two methods.
 
-    One whose leaves vary together has, as `group`, the name of the draws that they share, and, as
-    `draws`, how many uniform numbers these are: its `quantile` is given all of them.
+    A distribution of leaves that vary together has two more attributes: `group`, the name of the
+    draws that they share, and `draws`, the number of uniform numbers that `quantile` takes.
     """
 
     def quantile(self, u: jax.Array) -> jax.Array:
@@ -49,7 +49,7 @@ class Distribution(Protocol):
         ...
 
     def support(self) -> tuple[np.ndarray, np.ndarray]:
-        """The least and the greatest draw; infinite where there is none."""
+        """The smallest and the largest draw; infinite where the distribution is unbounded."""
         ...
 
 
@@ -230,7 +230,7 @@ class Perturbation:
 
     @property
     def group(self) -> str:
-        """Name of the draws that the leaf shares with others; "" if it has draws of its own."""
+        """Name of the draws that the leaf shares with others; "" if it shares none."""
         return distribution_member(self.distribution, "group")
 
     def apply(self, nominal: jax.Array, u: jax.Array) -> jax.Array:
@@ -364,9 +364,7 @@ def choice(values: Any, weights: Any = None) -> Choice:
 
 
 def _perturbation(kind: str, distribution: Any, shared: Any) -> Perturbation:
-    """A perturbation; what is no distribution is refused before the fields of the component are
-    read.
-    """
+    """A perturbation; ValueError for an invalid distribution."""
     if not isinstance(distribution, Distribution):
         raise _no_distribution(kind, distribution)
     return Perturbation(distribution, kind, shared)

@@ -35,15 +35,15 @@ class Target(NamedTuple):
     """One leaf (or entry) that is perturbed; static."""
 
     path: str
-    """Where the value goes."""
+    """The leaf that the value replaces."""
     source: str
-    """The path that the user wrote: it names the draw."""
+    """The path that the user wrote; the draw depends on it."""
     shape: tuple[int, ...]
     sign: str | None
 
 
-class Cases(NamedTuple):
-    """What is needed to draw the parameters of any run: shared by all blocks, traced."""
+class UncertainScenario(NamedTuple):
+    """A scenario with perturbed parameters, from which any run is drawn; traced."""
 
     scenario: Scenario
     perturbations: dict[str, Perturbation]
@@ -52,7 +52,7 @@ class Cases(NamedTuple):
 
 
 class CaseInputs(NamedTuple):
-    """What differs between the cases of a block, case axis first."""
+    """The inputs that differ between the cases of a block, case axis first."""
 
     index: Any
     """Run number: what the draw depends on, (B,) uint32."""
@@ -68,7 +68,7 @@ def case_inputs(
     points: Mapping[str, np.ndarray],
     designed: Mapping[str, np.ndarray],
 ) -> CaseInputs:
-    """What differs between cases of these numbers.
+    """The inputs of the cases with these numbers.
 
     Args:
       cases: numbers, case = point * runs + run.
@@ -84,7 +84,7 @@ def case_inputs(
     )
 
 
-def same_place(scenario: Scenario, path: str, other: str) -> bool:
+def paths_overlap(scenario: Scenario, path: str, other: str) -> bool:
     """Whether two paths address an entry in common."""
     pairs = itertools.product(paths.places(scenario, path), paths.places(scenario, other))
     return any(all(x == y for x, y in zip(a, b, strict=False)) for a, b in pairs)
@@ -99,7 +99,7 @@ def check_paths(scenario: Scenario, chosen: Iterable[str], what: str) -> None:
             if any(isinstance(token, int) and token < 0 for token in paths.parse(full)):
                 raise checks.fail(f"{what}: path", path, "an index >= 0", "Count from the front.")
         for other in seen:
-            if same_place(scenario, path, other):
+            if paths_overlap(scenario, path, other):
                 raise checks.fail(
                     what,
                     (other, path),
@@ -117,13 +117,13 @@ def targets_of(
     Args:
       scenario: what is perturbed.
       perturbations: path -> perturbation.
-      what: the user's word for them.
-      signs: whether distributions that can leave the admissible range by design are refused.
+      what: their name in error messages.
+      signs: whether to refuse bounded distributions that reach inadmissible values.
 
     Raises:
       ValueError: not a mapping of perturbations, an unknown or overlapping path, a distribution
-        that does not fit the leaf or can only leave its admissible range by design (a factor from
-        -1 to 1 on a mass).
+        that does not fit the leaf or reaches inadmissible values (a factor from -1 to 1 on a
+        mass).
     """
     checks.mapping(what, perturbations, '{"plant.mass[1]": ij.factor(ij.uniform(0.7, 1.3))}')
     check_paths(scenario, perturbations, what)
@@ -147,9 +147,7 @@ def targets_of(
 
 
 def _remedy_for(given: Any) -> str:
-    """The remedy for a range or a distribution in the place of a perturbation, with the user's
-    numbers.
-    """
+    """The remedy for a range or a distribution that was given instead of a perturbation."""
     if isinstance(given, tuple | list) and len(given) == 2 and checks.is_concrete(given):
         ends = [
             np.asarray(x).tolist() if isinstance(x, np.ndarray | jax.Array) else x for x in given
@@ -163,7 +161,7 @@ def _remedy_for(given: Any) -> str:
 
 
 def _targets(scenario: Scenario, source: str, perturbation: Perturbation) -> list[str]:
-    """The source itself, or plant and model apart where their nominal values differ."""
+    """The source itself, or separate paths of plant and model where their nominal values differ."""
     full = paths.expand(source)
     nominal = [np.asarray(paths.get(scenario, path)) for path in full]
     if perturbation.kind == "value" or all(np.array_equal(x, nominal[0]) for x in nominal):
@@ -203,11 +201,13 @@ def _check_sign(name: str, target: Target, perturbation: Perturbation, nominal: 
         )
 
 
-def sample_size(
+def draw_shapes(
     targets: tuple[Target, ...], perturbations: Mapping[str, Perturbation]
 ) -> dict[str, tuple[int, ...]]:
-    """Name of the draws -> shape of their u: path of the user, the leaf's or () where one draw is
-    shared; or a group, and its size.
+    """Name of each draw -> shape of its u.
+
+    The name is the path that the user wrote, with the shape of the leaf, or () where its entries
+    share one draw; or it is that of a group, with the number of its draws.
     """
     shapes = {}
     for target in targets:
@@ -230,7 +230,7 @@ def uniform_numbers(
 
 
 def draw(
-    cases: Cases,
+    uncertain: UncertainScenario,
     targets: tuple[Target, ...],
     index: jax.Array,
     point: Mapping[str, Any],
@@ -239,7 +239,7 @@ def draw(
     """The perturbed leaves of one run.
 
     Args:
-      cases: scenario, perturbations and key.
+      uncertain: scenario, perturbations and key.
       targets: what is perturbed, static.
       index: run number, () uint32.
       point: path -> value that replaces the scenario's first.
@@ -249,40 +249,41 @@ def draw(
       Path -> value for the targets, with the nominal value where the draw was inadmissible; path ->
       value as drawn; and whether all draws were admissible.
     """
-    scenario = paths.with_parameters(cases.scenario, point)
+    scenario = paths.with_parameters(uncertain.scenario, point)
     dtype = scenario.initial.q.dtype
     numbers = u or {
-        source: uniform_numbers(cases.key, index, source, shape, dtype)
-        for source, shape in sample_size(targets, cases.perturbations).items()
+        source: uniform_numbers(uncertain.key, index, source, shape, dtype)
+        for source, shape in draw_shapes(targets, uncertain.perturbations).items()
     }
     used, drawn, admissible = {}, {}, jnp.asarray(True)
     for target in targets:
         nominal = jnp.asarray(paths.get(scenario, target.path))
-        perturbation = cases.perturbations[target.path]
+        perturbation = uncertain.perturbations[target.path]
         u_of_target = numbers[perturbation.group or target.source]
         value = perturbation.apply(nominal, u_of_target.astype(dtype))
-        fine = jnp.all(jnp.isfinite(value))
+        is_admissible = jnp.all(jnp.isfinite(value))
         if target.sign == "positive":
-            fine &= jnp.all(value > 0)
+            is_admissible &= jnp.all(value > 0)
         elif target.sign is not None:
-            fine &= jnp.all(value >= 0)
-        admissible &= fine
+            is_admissible &= jnp.all(value >= 0)
+        admissible &= is_admissible
         drawn[target.path] = value
-        used[target.path] = jnp.where(fine, value, nominal)
+        used[target.path] = jnp.where(is_admissible, value, nominal)
     return used, drawn, admissible
 
 
-def merge(scenario: Scenario, point: Mapping[str, Any], drawn: Mapping[str, Any]) -> dict[str, Any]:
-    """What a run replaces, from its point and its draws: each place once, whole leaves where the
-    two overlap.
+def replaced_leaves(
+    scenario: Scenario, point: Mapping[str, Any], drawn: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Path -> value of everything that a run replaces, from its point and its draws.
+
+    Where a path of the point and one of the draws overlap, the whole leaf is replaced, so that no
+    entry is set twice.
     """
-    overlapping = {
-        path
-        for at_point in point
-        for of_draw in drawn
-        if same_place(scenario, at_point, of_draw)
-        for path in (at_point, of_draw)
-    }
+    overlapping: set[str] = set()
+    for pair in itertools.product(point, drawn):
+        if paths_overlap(scenario, *pair):
+            overlapping.update(pair)
     replaced = {**point, **drawn}
     if not overlapping:
         return replaced
@@ -293,6 +294,6 @@ def merge(scenario: Scenario, point: Mapping[str, Any], drawn: Mapping[str, Any]
     rest = {
         path: value
         for path, value in replaced.items()
-        if not any(same_place(scenario, path, leaf) for leaf in leaves)
+        if not any(paths_overlap(scenario, path, leaf) for leaf in leaves)
     }
     return {**rest, **{leaf: paths.get(changed, leaf) for leaf in leaves}}

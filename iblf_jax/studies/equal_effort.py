@@ -28,18 +28,21 @@ import numpy as np
 
 from iblf_jax.core.status import FAILED, WORDS, Status, describe, has_flag
 
-FINE_POINTS, FINE_OCTAVES = 16, 2
-"""Grid points in a factor of two, and the powers of two up to which the grid has so many."""
-COARSE_POINTS, MAX_OCTAVES = 4, 5
-"""The same beyond: factors from 1/32 to 32."""
+FINE_POINTS = 16
+"""Grid points an octave (a factor of two) for factors from 1/4 to 4."""
+FINE_OCTAVES = 2
+COARSE_POINTS = 4
+"""Grid points an octave beyond, to 1/32 and 32."""
+MAX_OCTAVES = 5
 BRACKET_WIDTH = 1e-6
 """Width of a bracket, in powers of two, from which a straight line gives the crossing."""
 MAX_REFINEMENTS = 9
-"""Batches of refinement at most: a bracket takes three or four."""
+"""Largest number of refinement batches; a bracket takes three or four."""
 HIDDEN_REFINEMENTS = 2
-"""Batches in which places are refined where a crossing may hide."""
+"""Refinement batches that also refine the intervals where a crossing may hide."""
 JUMP_TOLERANCE = 1e-3
-"""Part of the target by which a trial must come near it for a crossing to be none of a jump."""
+"""Relative distance to the target within which a neighbour of a crossing must be; else the effort
+jumps there."""
 
 MAX_NAMED = 4
 """Crossings, and groups of failed trials, that the text names."""
@@ -50,7 +53,7 @@ obstacle."""
 
 
 class Trials(NamedTuple):
-    """What a batch of factors gave, (N,) each."""
+    """The results of a batch of factors, (N,) each."""
 
     effort: np.ndarray
     """RMS torque above gravity [N m]."""
@@ -63,7 +66,7 @@ class Trials(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class EffortSearch:
-    """Which factors were tried for a law, what they gave, and where its effort is the target."""
+    """All trials of the search for the factor at which the effort of a law is the target."""
 
     target: float
     """[N m]."""
@@ -88,7 +91,7 @@ class EffortSearch:
 
     @property
     def valid(self) -> np.ndarray:
-        """Which trials count, (N,) bool."""
+        """Which trials are valid, (N,) bool."""
         return is_valid(self.efforts, self.status, self.accepts_inaccurate)
 
     @property
@@ -199,18 +202,18 @@ def invalid_flags(accepts_inaccurate: bool) -> int:
 
 
 def is_valid(efforts: np.ndarray, status: np.ndarray, inaccurate: bool) -> np.ndarray:
-    """Which trials count, (N,) bool.
+    """Which trials are valid, (N,) bool.
 
     Args:
       efforts, status: of the trials, (N,).
-      inaccurate: whether those count that are flagged INACCURATE.
+      inaccurate: whether trials flagged INACCURATE are valid.
     """
     bad = invalid_flags(inaccurate)
     return np.isfinite(efforts) & (status & bad == 0)
 
 
 def grid() -> np.ndarray:
-    """Powers of two of the factors that are tried first, growing; 0, the factor 1, is among
+    """Exponents, to base 2, of the factors that are tried first, in increasing order; 0 is one of
     them.
     """
     fine = np.arange(-FINE_POINTS * FINE_OCTAVES, FINE_POINTS * FINE_OCTAVES + 1) / FINE_POINTS
@@ -226,14 +229,13 @@ def search(
     needed_dt: Callable[[Trials], float | None] = lambda trials: None,
     inaccurate: bool = False,
 ) -> EffortSearch:
-    """Looks for all factors at which an effort is the target.
+    """Finds the factors at which the effort is the target.
 
     Args:
-      run: factors (N,) -> what their runs gave; called with at most as many factors as the grid
-        has.
+      run: factors (N,) -> their trials; called with at most as many factors as the grid has.
       target: the effort to reach [N m].
-      needed_dt: trials whose step is too large -> one that would do [s].
-      inaccurate: whether trials flagged INACCURATE count as valid.
+      needed_dt: trials with too large a time step -> one that is small enough [s].
+      inaccurate: whether trials flagged INACCURATE are valid.
     """
     powers = grid()
     trials = run(2.0**powers)
@@ -250,11 +252,11 @@ def search(
 def _hidden(
     powers: np.ndarray, trials: Trials, valid: np.ndarray, crossings: Sequence[float]
 ) -> np.ndarray:
-    """The failed trials that may hide a crossing nearer to 1, with nothing but their step known to
-    be to blame, (N,) bool.
+    """The trials that failed only because of their time step and may hide a crossing nearer to 1,
+    (N,) bool.
 
-    Where the step is beyond its stability limit the other flags say nothing.  Where no crossing was
-    found the trials are those nearest to 1 on each side.
+    Beyond the stability limit of the time step the other flags carry no information.  Where no
+    crossing was found, the trials are those nearest to 1 on each side.
     """
     unstable = has_flag(trials.status, Status.STEP_TOO_LARGE)
     inaccurate = has_flag(trials.status, Status.INACCURATE)
@@ -277,7 +279,7 @@ def _refined(
     trials: Trials,
     inaccurate: bool,
 ) -> tuple[np.ndarray, Trials, list[float]]:
-    """The trials with those of the refinement among them, growing, and the powers of the
+    """The trials with those of the refinement, in increasing order, and the exponents of the
     crossings.
     """
     for count in range(MAX_REFINEMENTS):
@@ -302,23 +304,24 @@ def _excess(trials: Trials, target: float, inaccurate: bool) -> np.ndarray:
 
 
 def _open_brackets(powers: np.ndarray, excess: np.ndarray) -> list[int]:
-    """The intervals, by the number of their lower end, with a crossing that is not yet known well
-    enough.
+    """The intervals that contain a crossing and are wider than `BRACKET_WIDTH`, by the index of
+    their lower end.
     """
     opposite = excess[:-1] * excess[1:] < 0.0
     return np.flatnonzero(opposite & (np.diff(powers) > BRACKET_WIDTH)).tolist()
 
 
 def _hiding_places(powers: np.ndarray, excess: np.ndarray) -> list[int]:
-    """The intervals in which a crossing may hide: at the edge of what is valid, and where the
-    effort turns back before the target.
+    """The intervals in which a crossing may hide: next to failed trials, and where the effort turns
+    back before the target.
     """
     finite = np.isfinite(excess)
     found = set(np.flatnonzero(finite[:-1] != finite[1:]).tolist())
     for i in range(1, len(powers) - 1):
         before, here, after = excess[i - 1 : i + 2]
-        turns = abs(here) <= min(abs(before), abs(after)) and min(before * here, here * after) > 0.0
-        if turns:
+        is_nearest = abs(here) <= min(abs(before), abs(after))
+        same_side = min(before * here, here * after) > 0.0
+        if is_nearest and same_side:
             found |= {i - 1, i}
     valid = np.flatnonzero(finite).tolist()
     for a, b in itertools.pairwise(valid):
@@ -329,8 +332,8 @@ def _hiding_places(powers: np.ndarray, excess: np.ndarray) -> list[int]:
 
 
 def _between(powers: np.ndarray, places: list[int], most: int) -> np.ndarray:
-    """Powers inside these intervals, equally many in each, of those nearest to 1 if there are too
-    many.
+    """Exponents inside these intervals, equally many in each; at most `most`, in the intervals
+    nearest to the factor 1.
     """
     chosen = sorted(places, key=lambda i: min(abs(powers[i]), abs(powers[i + 1])))[:most]
     each = max(1, most // len(chosen))
@@ -339,8 +342,8 @@ def _between(powers: np.ndarray, places: list[int], most: int) -> np.ndarray:
 
 
 def _crossings(powers: np.ndarray, excess: np.ndarray, target: float) -> list[float]:
-    """The powers at which the excess is zero, by straight lines between neighbours of opposite
-    sign.
+    """The exponents at which the excess is zero, by linear interpolation between neighbours of
+    opposite sign.
     """
     found = powers[excess == 0.0].tolist()
     for i in np.flatnonzero(excess[:-1] * excess[1:] < 0.0).tolist():
@@ -352,7 +355,7 @@ def _crossings(powers: np.ndarray, excess: np.ndarray, target: float) -> list[fl
 
 
 def _distinct(powers: list[float]) -> list[float]:
-    """Without repetitions: rounding makes several crossings of one."""
+    """Without crossings that differ by rounding only."""
     kept: list[float] = []
     for power in sorted(powers, key=abs):
         if all(abs(power - other) > 10.0 * BRACKET_WIDTH for other in kept):

@@ -41,17 +41,17 @@ class StopRequest:
 
     def __init__(self) -> None:
         self.requested = False
-        self._before: dict[signal.Signals, Any] = {}
+        self._replaced: dict[signal.Signals, Any] = {}
 
     def __enter__(self) -> StopRequest:
         if threading.current_thread() is threading.main_thread():
             now = {number: signal.getsignal(number) for number in STOP_SIGNALS}
-            self._before = {
+            self._replaced = {
                 number: now[number]
-                for number, (_, usual) in STOP_SIGNALS.items()
-                if now[number] in usual
+                for number, (_, defaults) in STOP_SIGNALS.items()
+                if now[number] in defaults
             }
-            for number in self._before:
+            for number in self._replaced:
                 signal.signal(number, self._handle)
         return self
 
@@ -61,21 +61,20 @@ class StopRequest:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self._give_back()
+        self._restore_handlers()
 
-    def _give_back(self) -> None:
-        for number, handler in reversed(self._before.items()):
+    def _restore_handlers(self) -> None:
+        for number, handler in reversed(self._replaced.items()):
             signal.signal(number, handler)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         if self.requested:
-            # before it raises: that may be inside __enter__ or __exit__, which then do not come to
-            # their end
-            self._give_back()
-            before = self._before[signal.Signals(number)]
+            # Restored first, because the handler below may raise inside __enter__ or __exit__.
+            self._restore_handlers()
+            before = self._replaced[signal.Signals(number)]
             (before if callable(before) else signal.default_int_handler)(number, frame)
         self.requested = True
-        with contextlib.suppress(Exception):  # nobody may be there to read it
+        with contextlib.suppress(Exception):  # stderr may be closed
             sys.stderr.write(
                 f"\n{STOP_SIGNALS[signal.Signals(number)][0]}: stopping after the unit at hand;"
                 " again to stop at once.\n"

@@ -21,7 +21,7 @@ from iblf_jax.simulation.integrators import tableau
 from iblf_jax.studies.designs import MAX_RUNS, check_sampler
 
 MAX_MEMORY = 2.0**60
-"""Bytes.  No machine has more."""
+"""Largest accepted `memory` [bytes]."""
 WRITERS = ("client", "worker")
 
 
@@ -36,7 +36,7 @@ class RunOptions:
     method: str
     """The integrator."""
     backend: str
-    """As requested: perhaps "auto".  `engine.RunRequest` checks it."""
+    """As requested, "auto" included; `engine.RunRequest` checks it."""
     runs: int
     """Runs at each point."""
     seed: int
@@ -95,8 +95,8 @@ class StoreOptions:
     unit: int | None = None
     """Cases that are written together; None for an automatic choice."""
     writer: str = "client"
-    """Who writes the units that an executor's workers compute: "client", to which they return
-    their results, or "worker", where all workers see `path` on a shared disk."""
+    """Which process writes the units that an executor's workers compute: the "client", to which
+    they return their results, or the "worker", if all workers see `path` on a shared disk."""
     shared: bool = False
     """Whether several processes run the same sweep on this store at the same time.  They need not
     know each other: each takes the remaining units in a random order and skips those that another
@@ -196,8 +196,8 @@ def design_of(design: Any, deprecated: Mapping[str, Any]) -> Design:
 
 
 def _replaced(argument: str, is_object: bool, deprecated: Mapping[str, Any]) -> dict[str, Any]:
-    """The deprecated keyword arguments that an argument replaces; ValueError where that is given
-    as an object, too.
+    """The deprecated keyword arguments that an argument replaces; ValueError if the argument is
+    given as an object, too.
     """
     found = {name: x for name, x in deprecated.items() if REPLACED[name][0] == argument}
     if found and is_object:

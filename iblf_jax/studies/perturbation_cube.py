@@ -20,18 +20,20 @@ import numpy as np
 from iblf_jax.core import checks
 from iblf_jax.simulation.paths import get, why_inadmissible
 from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.studies.draws import Cases, Target, draw, sample_size, targets_of
+from iblf_jax.studies.draws import Target, UncertainScenario, draw, draw_shapes, targets_of
 
 MAX_BATCHES = 64
-"""How often as many points as are wanted are drawn, to find admissible ones."""
+"""Batches of random points that are drawn at most in the search for admissible ones."""
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=["cases"], meta_fields=["targets", "shapes"])
+@partial(
+    jax.tree_util.register_dataclass, data_fields=["uncertain"], meta_fields=["targets", "shapes"]
+)
 @dataclasses.dataclass(frozen=True, eq=False)
 class Cube:
-    """The u of a scenario's perturbations; made by `bounded`."""
+    """The unit cube of the u of a scenario's perturbations; made by `unit_cube`."""
 
-    cases: Cases
+    uncertain: UncertainScenario
     targets: tuple[Target, ...]
     shapes: tuple[tuple[str, tuple[int, ...]], ...]
     """Path -> shape of its u."""
@@ -48,23 +50,24 @@ class Cube:
             size = int(np.prod(shape, dtype=int))
             parts[path] = u[at : at + size].reshape(shape)
             at += size
-        return draw(self.cases, self.targets, jnp.uint32(0), {}, parts)[1]
+        return draw(self.uncertain, self.targets, jnp.uint32(0), {}, parts)[1]
 
-    def refused(self, u: np.ndarray) -> str:
-        """Why a point cannot be run, in words; "" if it can."""
+    def why_inadmissible(self, u: np.ndarray) -> str:
+        """Why a point cannot be run; "" if it can."""
         return why_inadmissible(
-            self.cases.scenario, _values(self, jnp.asarray(u, self.cases.scenario.initial.q.dtype))
+            self.uncertain.scenario,
+            _values(self, jnp.asarray(u, self.uncertain.scenario.initial.q.dtype)),
         )
 
     def admissible_points(
-        self, count: int, seed: Any, refused: Callable[[np.ndarray], str] | None = None
+        self, count: int, seed: Any, rejection: Callable[[np.ndarray], str] | None = None
     ) -> np.ndarray:
-        """Random points at which nothing is refused, (count, d); repeated where few were found.
+        """Random accepted points, (count, d); repeated where fewer than `count` were found.
 
         Args:
           count, seed: of the points.
-          refused: why a point is no answer, in words; "" if it is one.  `Cube.refused` if not
-            given.
+          rejection: returns why a point is rejected, or "" for an accepted one;
+            `Cube.why_inadmissible` if not given.
 
         Raises:
           ValueError: no such point was found.
@@ -72,24 +75,24 @@ class Cube:
         rng, found, reason = np.random.default_rng(seed), [], ""
         for _ in range(MAX_BATCHES):
             for point in rng.uniform(size=(count, self.size)):
-                why = (refused or self.refused)(point)
+                why = (rejection or self.why_inadmissible)(point)
                 if not why:
                     found.append(point)
                 reason = why or reason
             if len(found) >= count:
                 break
         if not found:
-            raise self.nothing(
+            raise self.no_admissible_point(
                 f"None of {MAX_BATCHES * count} random points is; the last: {reason} Narrow or move"
                 " the ranges."
             )
         return np.resize(np.array(found), (count, self.size))
 
-    def nothing(self, remedy: str) -> ValueError:
-        """The error for perturbations in which there is nothing to look at."""
+    def no_admissible_point(self, remedy: str) -> ValueError:
+        """The error for perturbations without an admissible point."""
         ranges = {
-            path: p.range(np.asarray(get(self.cases.scenario, path)))
-            for path, p in self.cases.perturbations.items()
+            path: p.range(np.asarray(get(self.uncertain.scenario, path)))
+            for path, p in self.uncertain.perturbations.items()
         }
         shown = {
             path: (np.asarray(low).tolist(), np.asarray(high).tolist())
@@ -101,14 +104,14 @@ class Cube:
 _values = jax.jit(Cube.values)
 
 
-def bounded(scenario: Scenario, perturbations: Any, *, signs: bool = True) -> Cube:
+def unit_cube(scenario: Scenario, perturbations: Any, *, signs: bool = True) -> Cube:
     """The cube of a user's perturbations.
 
     Args:
       scenario: canonical.
       perturbations: path -> `factor`, `offset` or `value` of a distribution that has two ends.
-      signs: whether ranges that reach beyond what a leaf may be are refused; their points are, in
-        either case.
+      signs: whether to refuse ranges that contain inadmissible values of a leaf.  Points with
+        such values are rejected in either case.
 
     Raises:
       ValueError: nothing that varies, a distribution without ends, or as `draws.targets_of`.
@@ -132,7 +135,7 @@ def bounded(scenario: Scenario, perturbations: Any, *, signs: bool = True) -> Cu
             )
     by_path = jax.tree.map(lambda x: jnp.asarray(x, scenario.initial.q.dtype), by_path)
     return Cube(
-        Cases(scenario, by_path, jax.random.PRNGKey(0)),
+        UncertainScenario(scenario, by_path, jax.random.PRNGKey(0)),
         targets,
-        tuple(sample_size(targets, by_path).items()),
+        tuple(draw_shapes(targets, by_path).items()),
     )

@@ -32,7 +32,7 @@ from iblf_jax.studies import statistics
 from iblf_jax.studies.blocks import case_bytes, result_shapes
 from iblf_jax.studies.designs import MAX_SOBOL, split
 from iblf_jax.studies.distributions import Perturbation
-from iblf_jax.studies.draws import sample_size
+from iblf_jax.studies.draws import draw_shapes
 from iblf_jax.studies.execution import run_all_cases
 from iblf_jax.studies.options import RunOptions, ThisProcess, check_deprecated, executor_of
 from iblf_jax.studies.study_setup import PreparedStudy, prepare
@@ -60,11 +60,11 @@ class Sensitivity:
     total_order_interval: np.ndarray
     """95 % bootstrap interval, (d, 2)."""
     output: str
-    """What was explained."""
+    """Name of the metric or function."""
     runs: int
-    """Runs that were made: n (d + 2)."""
+    """Number of runs: n (d + 2)."""
     failed: int
-    """How many of them failed; they are part of the estimate."""
+    """Number of failed runs, which the estimate includes."""
 
     def to_xarray(self) -> xarray.Dataset:
         """The indices along the dimension `parameter`."""
@@ -157,24 +157,24 @@ def sensitivity(
     prepared = prepare(scenario, perturbations, options.checked(), metrics)
     if isinstance(output, str):
         checks.one_of("output", output, sorted(result_shapes(prepared).metrics))
-    shapes = sample_size(prepared.program.targets, prepared.shared.cases.perturbations)
-    names = [name for path, shape in shapes.items() for name in statistics.entries(path, shape)]
+    shapes = draw_shapes(prepared.program.targets, prepared.shared.uncertain.perturbations)
+    names = [name for path, shape in shapes.items() for name in statistics.entry_paths(path, shape)]
     runs = points * (len(names) + 2)
     checks.fits_memory(
         "points", points, (len(names) + 2) * (case_bytes(prepared) + 3 * 8.0 * len(names))
     )
     with bar(progress, runs) as shown:
-        search = _Evaluation(prepared, shapes, output, executor, shown.update)
-        indices, ends = _indices(search, points, len(names))
+        evaluation = _Evaluation(prepared, shapes, output, executor, shown.update)
+        indices, ends = _indices(evaluation, points, len(names))
     return Sensitivity(
         tuple(names),
         np.ravel(indices.first_order[0]),
         np.ravel(indices.total_order[0]),
         _ends(ends.first_order),
         _ends(ends.total_order),
-        search.label,
+        evaluation.label,
         runs,
-        search.failed,
+        evaluation.failed,
     )
 
 
@@ -199,8 +199,7 @@ def _indices(evaluation: _Evaluation, points: int, dimension: int) -> tuple[Any,
 
     def evaluate(u: np.ndarray) -> np.ndarray:
         y = evaluation(u.T)
-        # Twice, as if there were two outputs: for a single number and a single output SciPy makes
-        # scalars, into which it then fails to write.
+        # SciPy fails for a single number with a single output, so the output is given twice.
         return np.stack([y, y])
 
     indices = stats.sobol_indices(
@@ -209,7 +208,7 @@ def _indices(evaluation: _Evaluation, points: int, dimension: int) -> tuple[Any,
         dists=[stats.uniform()] * dimension,
         rng=np.random.default_rng(evaluation.prepared.options.seed),
     )
-    # The first two evaluations are the runs whose variance all others are divided by.
+    # The variance of the first two evaluations is the denominator of all indices.
     if np.ptp(np.concatenate(evaluation.values[:2])) == 0:
         raise checks.fail(
             evaluation.label,
@@ -224,9 +223,7 @@ def _indices(evaluation: _Evaluation, points: int, dimension: int) -> tuple[Any,
 
 
 def _ends(bootstrapped: Any) -> np.ndarray:
-    """The interval of each index, (d, 2); where all resamples have the same, or BCa has none for
-    another reason, their percentiles.
-    """
+    """The BCa interval of each index, (d, 2); percentiles of the resamples where not finite."""
     interval = bootstrapped.confidence_interval
     ends = np.stack([np.ravel(interval.low[0]), np.ravel(interval.high[0])], -1)
     resampled = np.atleast_2d(bootstrapped.bootstrap_distribution[0])
@@ -292,7 +289,7 @@ class _Evaluation:
 
     def _output_of(self, metrics: dict[str, Any]) -> np.ndarray:
         if isinstance(self.output, str):
-            return statistics.one_number(metrics, self.output)
+            return statistics.worst_joint(metrics, self.output)
         try:
             return np.asarray(
                 self.output(Metrics(metrics, metric_units(self.prepared.shared.folds)))

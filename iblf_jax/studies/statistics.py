@@ -18,16 +18,21 @@ import numpy as np
 from iblf_jax.core import checks
 
 SMALLER_IS_WORSE = (
-    *("margin", "xi_margin", "first_violation_time"),
-    *("velocity_margin", "alpha_margin", "first_velocity_violation_time"),
-    *("region_margin", "first_region_violation_time"),
+    "margin",
+    "xi_margin",
+    "first_violation_time",
+    "velocity_margin",
+    "alpha_margin",
+    "first_velocity_violation_time",
+    "region_margin",
+    "first_region_violation_time",
 )
 """Metrics of which the smallest value, over joints and over runs, is the worst."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Probability:
-    """How often something happened, with an interval for how often it would."""
+    """The estimated probability of an event, with its confidence interval."""
 
     estimate: float
     """count / runs."""
@@ -37,9 +42,9 @@ class Probability:
     confidence: float
     count: int
     runs: int
-    """Runs that count: those that were made."""
+    """Runs that were made, which the estimate is over."""
     method: str
-    """How the interval was made, or why there is none."""
+    """The method of the interval, or why there is none."""
 
     def __str__(self) -> str:
         ends = (
@@ -72,49 +77,45 @@ def probability(
     """
     from scipy import stats  # a second to import
 
-    count, runs = int(np.sum(events & valid)), int(np.sum(valid))
-    estimate = count / runs if runs else float("nan")
-    low, high, method = None, None, "no run was made"
-    if runs and sampler == "independent":
-        ends = stats.binomtest(count, runs).proportion_ci(
-            confidence_level=confidence, method="exact"
-        )
+    events = events & valid
+    count = int(np.sum(events))
+    runs = int(np.sum(valid))
+    if not runs:
+        return Probability(float("nan"), None, None, confidence, 0, 0, "no run was made")
+    if sampler != "independent":
+        low, high, method = _replicate_interval(events, valid, confidence, sampler, replicates)
+    else:
+        test = stats.binomtest(count, runs)
+        ends = test.proportion_ci(confidence_level=confidence, method="exact")
         low, high, method = float(ends.low), float(ends.high), "Clopper-Pearson"
-    elif runs:
-        low, high, method = _between_replicates(
-            events & valid, valid, confidence, sampler, replicates
-        )
-    return Probability(estimate, low, high, confidence, count, runs, method)
+    return Probability(count / runs, low, high, confidence, count, runs, method)
 
 
-def _between_replicates(
+def _replicate_interval(
     events: np.ndarray, valid: np.ndarray, confidence: float, sampler: str, replicates: int
-):
+) -> tuple[float | None, float | None, str]:
+    """The ends of the interval from the means of the replicates, and its method."""
     if replicates < 2:
         return None, None, f"runs of one {sampler} design are not independent; ask for replicates"
-    counts, sizes = events.reshape(replicates, -1).sum(1), valid.reshape(replicates, -1).sum(1)
+    counts = events.reshape(replicates, -1).sum(1)
+    sizes = valid.reshape(replicates, -1).sum(1)
     means = counts / np.maximum(sizes, 1)
-    spread = means.std(ddof=1) / np.sqrt(replicates)
-    if spread == 0:
-        return (
-            None,
-            None,
-            (
-                "all replicates agree, so their spread says nothing; ask for more runs or"
-                " independent draws"
-            ),
+    standard_error = means.std(ddof=1) / np.sqrt(replicates)
+    if standard_error == 0:
+        reason = (
+            "all replicates agree, so their spread says nothing; ask for more runs or independent"
+            " draws"
         )
+        return None, None, reason
     from scipy import stats
 
-    half = stats.t.ppf(0.5 + confidence / 2, replicates - 1) * spread
-    return (
-        float(max(0.0, means.mean() - half)),
-        float(min(1.0, means.mean() + half)),
-        f"Student t over {replicates} replicates",
-    )
+    half = stats.t.ppf(0.5 + confidence / 2, replicates - 1) * standard_error
+    low = float(max(0.0, means.mean() - half))
+    high = float(min(1.0, means.mean() + half))
+    return low, high, f"Student t over {replicates} replicates"
 
 
-def one_number(metrics: Mapping[str, Any], name: str) -> np.ndarray:
+def worst_joint(metrics: Mapping[str, Any], name: str) -> np.ndarray:
     """A metric as one number a run: the worst joint's, (N,)."""
     checks.one_of("metric", name, metrics)
     values = np.asarray(metrics[name])
@@ -126,18 +127,18 @@ def one_number(metrics: Mapping[str, Any], name: str) -> np.ndarray:
     return flat.max(1)
 
 
-def entries(path: str, shape: tuple[int, ...]) -> list[str]:
+def entry_paths(path: str, shape: tuple[int, ...]) -> list[str]:
     """The paths of the entries of a leaf: "plant.mass[0]", "plant.mass[1]"."""
     return [path + "".join(f"[{i}]" for i in place) for place in np.ndindex(shape)]
 
 
-def columns(samples: Mapping[str, Any]) -> dict[str, np.ndarray]:
+def scalar_samples(samples: Mapping[str, Any]) -> dict[str, np.ndarray]:
     """The drawn parameters entry by entry, "plant.mass[0]" -> (N,)."""
     out: dict[str, np.ndarray] = {}
     for path, values in samples.items():
         values = np.asarray(values)
         flat = values.reshape(len(values), -1)
-        out |= zip(entries(path, values.shape[1:]), flat.T, strict=True)
+        out |= zip(entry_paths(path, values.shape[1:]), flat.T, strict=True)
     return out
 
 

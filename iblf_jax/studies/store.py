@@ -37,7 +37,7 @@ from iblf_jax.kernels import draft
 
 FORMAT = 1
 ABSENT = object()
-"""In the place of an entry that a configuration does not have."""
+"""Stands for an entry that a configuration does not have."""
 DONE = "done"
 CASE = "case"
 _MARK = "iblf_jax_store"
@@ -58,7 +58,7 @@ class StoreWriteError(StoreError):
 
 
 class Variable(NamedTuple):
-    """One array of a store, by its rows: one row a case."""
+    """One array of a store, without its first axis, which numbers the cases."""
 
     shape: tuple[int, ...]
     dtype: str
@@ -114,10 +114,11 @@ class Store:
         self.units = checks.ceil_div(self.cases, self.unit)
         self._salt = zlib.crc32(json.dumps(self.config, sort_keys=True).encode())
         self._arrays = {
-            name: _numbers(group, name, self.cases, self.unit) for name in attributes["variables"]
+            name: _checked_array(group, name, self.cases, self.unit)
+            for name in attributes["variables"]
         }
-        self._done = _numbers(group, DONE, self.units, 1)
-        self._description = self._described()
+        self._done = _checked_array(group, DONE, self.units, 1)
+        self._metadata = self._read_metadata()
 
     def span(self, unit: int) -> slice:
         """The cases of a unit."""
@@ -130,7 +131,7 @@ class Store:
 
     def marks(self) -> np.ndarray:
         """Which units are marked as done, (units,) bool."""
-        self._check_it_is_there()
+        self._check_unchanged()
         try:
             return np.asarray(self._done[:]) != 0
         except Exception as error:
@@ -152,15 +153,15 @@ class Store:
         """Writes one unit: its data, then its mark.
 
         Raises:
-          StoreWriteError: it cannot be written, or somebody has deleted or replaced the store;
-            nothing of the unit stays then.
+          StoreWriteError: it cannot be written, or the store was deleted or replaced; no part of
+            the unit is kept.
         """
-        self._check_it_is_there()
+        self._check_unchanged()
         try:
             self._write(unit, data)
-            self._check_it_is_there()
+            self._check_unchanged()
         except StoreWriteError:
-            self._take_back(unit)
+            self._remove_unit(unit)
             raise
 
     def _write(self, unit: int, data: Mapping[str, np.ndarray]) -> None:
@@ -173,12 +174,10 @@ class Store:
                 f" {self.marks().sum()} of {self.units} units are written and valid: start the"
                 " same call again to go on."
             )
-            raise _why(self.path, error, kept) from error
+            raise _write_error(self.path, error, kept) from error
 
-    def _described(self) -> list[bytes | None]:
-        """What describes this store on disk: the group's file and those of its arrays; None for one
-        that is not there.
-        """
+    def _read_metadata(self) -> list[bytes | None]:
+        """The metadata files of the group and of its arrays; None for a missing file."""
 
         def content(file: Path) -> bytes | None:
             try:
@@ -188,19 +187,17 @@ class Store:
 
         return [content(self.path / name / "zarr.json") for name in ("", *self._arrays, DONE)]
 
-    def _check_it_is_there(self) -> None:
-        """StoreWriteError if the store was deleted, wholly or in part, or another one is in its
-        place.
-        """
-        now = self._described()
-        if now == self._description:
+    def _check_unchanged(self) -> None:
+        """Raises StoreWriteError if the store was deleted, wholly or in part, or replaced."""
+        now = self._read_metadata()
+        if now == self._metadata:
             return
         if now[0] is None:
             text = (
                 "was deleted while it was in use. Start the same call again to begin anew, or"
                 " choose another path."
             )
-        elif now[0] != self._description[0]:
+        elif now[0] != self._metadata[0]:
             text = (
                 "was replaced by another store while it was in use. Choose another path, and start"
                 " the same call again."
@@ -212,9 +209,9 @@ class Store:
             )
         raise StoreWriteError(f"{self.path}: {text}")
 
-    def _take_back(self, unit: int) -> None:
-        """Removes what was written of a unit into a store that was deleted meanwhile, with the
-        folders that came to be by it.
+    def _remove_unit(self, unit: int) -> None:
+        """Removes the chunks of a unit that were written after the store was deleted, and the
+        folders that became empty.
         """
         if (self.path / "zarr.json").exists():
             return
@@ -251,8 +248,8 @@ class Store:
         return sorted([*map(int, np.flatnonzero(~marks)), *damaged]), damaged
 
     def read_all(self) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        """Everything that is done, (cases, ...), and which cases are, (cases,) bool; StoreError if
-        a unit is damaged.
+        """The arrays, (cases, ...), and which cases are computed, (cases,) bool; StoreError if a
+        unit is damaged.
         """
         done = np.zeros(self.cases, bool)
         out = {
@@ -272,10 +269,8 @@ class Store:
         return out, done
 
 
-def _numbers(group: Any, name: str, rows: int, chunk: int) -> Any:
-    """An array of a group; ValueError if it is none of numbers that this package could have
-    written.
-    """
+def _checked_array(group: Any, name: str, rows: int, chunk: int) -> Any:
+    """An array of a group; ValueError if this package could not have written it."""
     array = group[name]
     is_array = isinstance(array, _zarr().Array)
     if not is_array or array.metadata.zarr_format != 3 or array.dtype.kind not in _NUMBERS:
@@ -293,8 +288,8 @@ def _one_line(error: Exception) -> str:
     return f"{type(error).__name__}: {' '.join(str(error).split())}"[:300]
 
 
-def _why(path: Path, error: OSError, kept: str = "") -> StoreWriteError:
-    """The error for a failed write, in words."""
+def _write_error(path: Path, error: OSError, kept: str = "") -> StoreWriteError:
+    """The error for a failed write, with its remedy."""
     text = f"cannot be written ({error.strerror or error})."
     if error.errno in _FULL:
         text = f"no space left to write to ({error.strerror}). Make room, or take another disk."
@@ -307,33 +302,33 @@ def load_store(path: str | os.PathLike) -> Store:
     """Opens a store that exists.
 
     Raises:
-      StoreError: there is none, or something else is in its place.
+      StoreError: there is no store at this path, or something else is there.
     """
-    zarr, place = _zarr(), Path(path)
-    if not place.exists():
-        raise StoreError(f"{place}: there is no store here.")
+    zarr, folder = _zarr(), Path(path)
+    if not folder.exists():
+        raise StoreError(f"{folder}: there is no store here.")
     try:
         # Not the consolidated metadata, in which arrays of the older format may hide.
-        group = zarr.open_group(str(place), mode="r+", zarr_format=3, use_consolidated=False)
+        group = zarr.open_group(str(folder), mode="r+", zarr_format=3, use_consolidated=False)
         known = group.attrs.get(_MARK)
     except PermissionError as error:
-        raise StoreError(f"{place}: cannot be read ({error.strerror}).") from error
+        raise StoreError(f"{folder}: cannot be read ({error.strerror}).") from error
     except Exception as error:
         raise StoreError(
-            f"{place}: is not a store of iblf_jax ({type(error).__name__}). Choose another path."
+            f"{folder}: is not a store of iblf_jax ({type(error).__name__}). Choose another path."
         ) from error
     if known != FORMAT:
         came = f"a store of format {known}"
         if known is None:
             came = "something that iblf_jax did not write"
         raise StoreError(
-            f"{place}: holds {came}, expected a store of format {FORMAT}. Choose another path."
+            f"{folder}: holds {came}, expected a store of format {FORMAT}. Choose another path."
         )
     try:
-        return Store(place, group)
+        return Store(folder, group)
     except Exception as error:
         raise StoreError(
-            f"{place}: is damaged: its description is wrong ({_one_line(error)}). Delete it, or"
+            f"{folder}: is damaged: its description is wrong ({_one_line(error)}). Delete it, or"
             " choose another path."
         ) from error
 
@@ -347,7 +342,7 @@ def open_store(
     *,
     any_unit: bool = False,
 ) -> Store:
-    """Opens a store to go on with it, or makes it.
+    """Opens a store to resume it, or creates it.
 
     Args:
       path: its folder.
@@ -361,25 +356,25 @@ def open_store(
       StoreError: it was made with another configuration, is foreign or damaged, or cannot be
         written.
     """
-    place, config = Path(path), json.loads(json.dumps(config))
-    if not _exists(place):
-        _make(place, config, variables, cases, unit)
-    store = load_store(place)
+    folder, config = Path(path), json.loads(json.dumps(config))
+    if not _is_occupied(folder):
+        _create(folder, config, variables, cases, unit)
+    store = load_store(folder)
     found = differences(store.config, config)
-    # Where anything else differs, the program differs because of that.
-    found = [text for text in found if not text.startswith("program:")] or [
-        text + " (the code of a law, a robot or a metric has changed)" for text in found
-    ]
+    # Any other difference changes the program as well, and explains more than its digest.
+    explained = [text for text in found if not text.startswith("program:")]
+    code_changed = " (the code of a law, a robot or a metric has changed)"
+    found = explained or [text + code_changed for text in found]
     if not any_unit:
         found += differences({"unit": store.unit}, {"unit": unit})
     if found:
-        raise StoreError(_of_another_configuration(place, found))
-    if not os.access(place, os.W_OK):
-        raise _why(place, PermissionError(errno.EACCES, os.strerror(errno.EACCES)))
+        raise StoreError(_of_another_configuration(folder, found))
+    if not os.access(folder, os.W_OK):
+        raise _write_error(folder, PermissionError(errno.EACCES, os.strerror(errno.EACCES)))
     return store
 
 
-def _of_another_configuration(place: Path, found: list[str]) -> str:
+def _of_another_configuration(folder: Path, found: list[str]) -> str:
     remedy = "Go on with the same arguments, or choose another path."
     if any(text.startswith("kernel.") for text in found):
         remedy = (
@@ -390,30 +385,30 @@ def _of_another_configuration(place: Path, found: list[str]) -> str:
     shown = "; ".join(found[:3])
     if len(found) > 3:
         shown += f" (and {len(found) - 3} more)"
-    return f"{place}: was made with another configuration: {shown}. {remedy}"
+    return f"{folder}: was made with another configuration: {shown}. {remedy}"
 
 
-def _exists(place: Path) -> bool:
+def _is_occupied(folder: Path) -> bool:
     """Whether something is there (an empty folder is nothing)."""
     try:
-        if place.is_dir():
-            return any(place.iterdir())
-        return place.exists()
+        if folder.is_dir():
+            return any(folder.iterdir())
+        return folder.exists()
     except OSError as error:
-        raise _why(place, error) from error
+        raise _write_error(folder, error) from error
 
 
-def _make(
-    place: Path, config: dict[str, Any], variables: Mapping[str, Variable], cases: int, unit: int
+def _create(
+    folder: Path, config: dict[str, Any], variables: Mapping[str, Variable], cases: int, unit: int
 ) -> None:
-    """Makes a store beside its place and renames it in; if another process was first, its store
-    stays.
+    """Creates a store in a temporary folder and renames it; a store that another process created
+    in the meantime is kept.
     """
     zarr = _zarr()
     try:
-        place.parent.mkdir(parents=True, exist_ok=True)
-        with draft(place.parent, place.name) as folder:
-            group = zarr.open_group(str(folder / "store"), mode="w", zarr_format=3)
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with draft(folder.parent, folder.name) as temporary:
+            group = zarr.open_group(str(temporary / "store"), mode="w", zarr_format=3)
             for name, v in variables.items():
                 array = group.create_array(
                     name,
@@ -439,7 +434,7 @@ def _make(
                 # zarr says that consolidated metadata are not in its specification yet.
                 warnings.simplefilter("ignore")
                 zarr.consolidate_metadata(group.store)
-            os.rename(folder / "store", place)
+            os.rename(temporary / "store", folder)
     except OSError as error:
-        if error.errno not in (errno.ENOTEMPTY, errno.EEXIST) or not place.is_dir():
-            raise _why(place, error) from error
+        if error.errno not in (errno.ENOTEMPTY, errno.EEXIST) or not folder.is_dir():
+            raise _write_error(folder, error) from error

@@ -24,7 +24,7 @@ from iblf_jax.studies.sweep_points import Points
 
 
 def describe_component(part: Any) -> Any:
-    """A component as JSON: its class, its structural fields and its numbers, all the way down."""
+    """A component as JSON: its class and the values of all its fields, recursively."""
     if isinstance(part, str | bool | None):
         return part
     if isinstance(part, tuple | list):
@@ -38,7 +38,7 @@ def describe_component(part: Any) -> Any:
 
 
 def structure(part: Any) -> Any:
-    """As `describe_component`, without the numbers: what a parameter table does not show."""
+    """The classes and static fields of a component, without its numbers."""
     if isinstance(part, tuple | list):
         return [structure(x) for x in part]
     if not dataclasses.is_dataclass(part) or isinstance(part, type):
@@ -61,9 +61,7 @@ def values_of(scenario: Scenario) -> dict[str, Any]:
 
 
 def program_digest(prepared: PreparedStudy) -> str:
-    """A digest of what a run computes: it differs if the code of a law, a robot or a metric has
-    changed.
-    """
+    """A digest of the traced program, which changes with the code of a law, a robot or a metric."""
     inputs = prepared.inputs_of(np.arange(block_size()))
     traced = _execute.trace(prepared.shared, inputs, program=prepared.program)
     text = re.sub(r"0x[0-9a-f]+", "", str(traced.jaxpr))
@@ -81,7 +79,7 @@ def describe(prepared: PreparedStudy, points: Points, design: str) -> dict[str, 
     def place(path: str) -> dict[str, Any]:
         return {
             "along": points.along[path],
-            "values": points.ticks[path].tolist(),
+            "values": points.axis_values[path].tolist(),
             "unit": unit_at(scenario, path),
             "shape": list(np.shape(get(scenario, path))),
         }

@@ -24,7 +24,7 @@ import numpy as np
 from iblf_jax.core import checks, notices
 from iblf_jax.core.presentation import present
 from iblf_jax.core.status import FAILED, Status, describe, has_flag
-from iblf_jax.core.status import VIOLATED as LEFT
+from iblf_jax.core.status import VIOLATED as CONSTRAINT_VIOLATED
 from iblf_jax.engine import RunRequest, block_size, run_rollout
 from iblf_jax.engine.simulate import SimulationWarning
 from iblf_jax.simulation import paths
@@ -43,9 +43,9 @@ from iblf_jax.world.robots import joint_names
 if TYPE_CHECKING:
     import xarray
 
-VIOLATED = LEFT | Status.NOT_FINITE
-"""What `violation_probability` counts: a run that did not keep its bounds or regions, or that ran
-away, after which nothing is known about its bounds."""
+VIOLATED = CONSTRAINT_VIOLATED | Status.NOT_FINITE
+"""The flags that `violation_probability` counts: a bound or region was violated, or the run
+diverged, so that it is unknown whether its bounds would have held."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -80,15 +80,15 @@ class Study:
 
     @classmethod
     def of(cls, setup: PreparedStudy, results: BlockResults) -> Study:
-        """The study with these results."""
+        """Builds the study from its checked arguments and the results of its runs."""
         units = metric_units(setup.shared.folds)
-        # In the order of the metrics; jit sorts the names.
+        # jit sorts the names; here they are in the order of the folds.
         names = [name for name, _ in units if name in results.metrics]
-        order = {**dict.fromkeys(names), **results.metrics}
+        metrics = {name: results.metrics[name] for name in names} | results.metrics
         samples = {target.path: results.samples[target.path] for target in setup.program.targets}
         return cls(
             setup.scenario,
-            Metrics(order, units),
+            Metrics(metrics, units),
             results.status,
             results.fastest_mode,
             samples,
@@ -140,7 +140,7 @@ class Study:
 
     @property
     def failed(self) -> np.ndarray:
-        """Numbers of the runs that did not do their job (`status.FAILED`)."""
+        """Indices of the runs with a flag of `status.FAILED`."""
         return np.flatnonzero(self.status & int(FAILED))
 
     @property
@@ -153,17 +153,17 @@ class Study:
         """Whether each run violated a bound or a region at t = 0 already, (N,) bool: drawn there,
         so that no law could keep it.
         """
-        first = summaries.first_margins(self.scenario, self.samples)
+        first = summaries.initial_margins(self.scenario, self.samples)
         inside = [np.min(margins, axis=1) > 0 for margins in first.values()]
-        return self.made & has_flag(self.status, LEFT) & ~np.all(inside, axis=0)
+        return self.made & has_flag(self.status, CONSTRAINT_VIOLATED) & ~np.all(inside, axis=0)
 
     @property
     def status_counts(self) -> dict[str, int]:
-        """How many runs there are of each kind.
+        """The number of runs with each status.
 
-        OK, FLAGGED and FAILED add up to all runs: no flag, flags that are no failure, and a flag of
-        `status.FAILED`.  Then how many have each flag, of which a run may have several, and how
-        many of those that violated a bound did so at t = 0 (`started_outside`).
+        OK (no flag), FAILED (a flag of `status.FAILED`) and FLAGGED (other flags only) add up to
+        all runs.  The other entries count the runs with each flag, of which a run may have several,
+        and STARTED_OUTSIDE those that violated a bound at t = 0 already (`started_outside`).
         """
         flagged = self.status != 0
         failed = has_flag(self.status, FAILED)
@@ -174,13 +174,12 @@ class Study:
 
     @property
     def violation_probability(self) -> Probability:
-        """How probable it is that a run leaves its bounds or regions, or runs away, with the 95 %
+        """The probability that a run violates its bounds or regions, or diverges, with the 95 %
         Clopper-Pearson interval.
 
-        Runs that started outside their bounds count, for they have violated them; `started_outside`
-        says which they are.  That a law violates them has the probability
-        `probability((study.status & VIOLATED != 0) & ~study.started_outside)`, with `VIOLATED =
-        ij.status.VIOLATED | Status.NOT_FINITE`.
+        Runs that started outside their bounds count as violations; `started_outside` marks them.
+        The probability without them is `probability((study.status & VIOLATED != 0) &
+        ~study.started_outside)`, with `VIOLATED = ij.status.VIOLATED | Status.NOT_FINITE`.
         """
         return self.probability(VIOLATED)
 
@@ -210,7 +209,7 @@ class Study:
             happened = np.asarray(event)
             if isinstance(event, int):
                 happened = has_flag(self.status, event)
-        except Exception:  # a number of more bits than flags, or nothing that is an array
+        except Exception:  # more bits than there are flags, or not convertible to an array
             happened = np.zeros(0)
         if happened.shape != (self.runs,) or happened.dtype != bool:
             raise checks.fail("event", event, f"flags of Status, or {self.runs} booleans")
@@ -237,7 +236,7 @@ class Study:
         Source: design of this package.
         """
         count = checks.positive_integer("count", count)
-        values = statistics.one_number(self.metrics, metric)
+        values = statistics.worst_joint(self.metrics, metric)
         if metric not in statistics.SMALLER_IS_WORSE:
             values = -values
         order = np.argsort(values, kind="stable")
@@ -248,7 +247,7 @@ class Study:
         return paths.unit_at(self.scenario, path)
 
     def chosen(self, exclude_failed: bool = False) -> tuple[np.ndarray, dict[str, Any]]:
-        """Which runs a statistic is over, (N,) bool, and the counts that go with it."""
+        """The runs that a statistic includes, (N,) bool, and their counts."""
         exclude_failed = checks.boolean("exclude_failed", exclude_failed)
         has_failed = has_flag(self.status, FAILED)
         used = self.made
@@ -264,7 +263,7 @@ class Study:
 
     @property
     def included(self) -> str:
-        """In words: which runs statistics are over, unless failed ones are left out."""
+        """A sentence that states which runs the statistics include by default."""
         _, counts = self.chosen()
         failed = "none of them failed"
         if counts["failed_included"]:
@@ -318,17 +317,17 @@ class Study:
         samples: int = 200,
         exclude_failed: bool = False,
     ) -> xarray.Dataset:
-        """The tube with the quantiles of the runs along time, (quantile, time, joint), from the
-        first `runs` runs, made again.
+        """The tube and the quantiles of position and error along time, (quantile, time, joint),
+        from the first `runs` runs, which are computed again.
 
         Args:
           quantiles: numbers from 0 to 1.
           runs: how many of the runs; their decimated trajectories are in memory together.
-          samples: about how many times.
+          samples: approximate number of recorded times.
           exclude_failed: leave out failed runs, as in `quantiles`.
 
         Raises:
-          ValueError: bad arguments, or no run that is left.
+          ValueError: bad arguments, or every run was excluded.
         """
         used, _ = self.chosen(exclude_failed)
         failed = has_flag(self.status, FAILED)
@@ -350,7 +349,7 @@ class Study:
 
     @notices.each_warning_once
     def replay(self, index: int, *, record_every: int = 1) -> Rollout:
-        """Makes one run again, with its whole trajectory.
+        """Computes one run again, with its whole trajectory.
 
         Metrics, status and fastest mode are bit-identical to those of run `index`: its block is run
         again by the same compiled program.  The trajectory comes from the program for a single run,
@@ -359,7 +358,7 @@ class Study:
 
         Args:
           index: run number.
-          record_every: record every so-many-th step.
+          record_every: steps between two records.
 
         Returns:
           A `Rollout`, with the drawn parameters in its scenario.
@@ -378,14 +377,14 @@ class Study:
             raise checks.fail(
                 f"run {i}", drawn, "admissible draws", "It was not made; see study.made."
             )
-        again = self._computed_again(i)
+        again = self._recompute(i)
         drawn = {path: x[i] for path, x in self.samples.items()}
         scenario = paths.with_parameters(self.scenario, drawn)
         request = RunRequest.of(
             scenario, steps=options.steps, method=options.method, record_every=record_every
         )
         number = setup.inputs_of(np.asarray([i])).index[0]
-        noise = noise_values(self.scenario, setup.shared.cases.key, number).get(NOISE_NAME)
+        noise = noise_values(self.scenario, setup.shared.uncertain.key, number).get(NOISE_NAME)
         run = run_rollout(scenario, setup.shared.folds, setup.shared.dt, request, noise)
         self._warn_of_start(i)
         metrics = Metrics(again.metrics, self.metrics.unit_pairs)
@@ -393,8 +392,8 @@ class Study:
             run, metrics=metrics, status=again.status, fastest_mode=again.fastest_mode
         )
 
-    def _computed_again(self, i: int) -> BlockResults:
-        """The results of run i, from its block; warns if they are not those of the study."""
+    def _recompute(self, i: int) -> BlockResults:
+        """The results of run i, from its block; warns if they differ from those of the study."""
         block, place = divmod(i, block_size())
         ((_, results),) = run_blocks(self.setup, [block])
         again = jax.tree.map(lambda x: x[place], results)
@@ -411,7 +410,7 @@ class Study:
     def _warn_of_start(self, i: int) -> None:
         if not self.started_outside[i]:
             return
-        margins = summaries.first_margins(self.scenario, self.samples)
+        margins = summaries.initial_margins(self.scenario, self.samples)
         first = {unit: x[i] for unit, x in margins.items()}
         unit = next(unit for unit, x in first.items() if not np.min(x) > 0)
         worst, plant = int(np.argmin(first[unit])), self.scenario.plant

@@ -24,19 +24,19 @@ from iblf_jax.studies.designs import designed_numbers
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.draws import (
     CaseInputs,
-    Cases,
     Target,
+    UncertainScenario,
     case_inputs,
     draw,
-    merge,
-    sample_size,
+    draw_shapes,
+    replaced_leaves,
     targets_of,
 )
 from iblf_jax.studies.options import RunOptions
 
 
 class StudyProgram(NamedTuple):
-    """What every block of a study computes; static."""
+    """The program that computes a block of a study; static."""
 
     targets: tuple[Target, ...]
     """The leaves that are drawn."""
@@ -45,9 +45,9 @@ class StudyProgram(NamedTuple):
 
 
 class SharedInputs(NamedTuple):
-    """What all runs of a study share; traced."""
+    """The inputs that all runs of a study share; traced."""
 
-    cases: Cases
+    uncertain: UncertainScenario
     folds: Any
     dt: jax.Array
 
@@ -76,7 +76,7 @@ class PreparedStudy:
     @property
     def scenario(self) -> Scenario:
         """The nominal scenario, canonical."""
-        return self.shared.cases.scenario
+        return self.shared.uncertain.scenario
 
     @property
     def dt(self) -> float:
@@ -94,7 +94,7 @@ class PreparedStudy:
         return self.program.batch.backend
 
     def inputs_of(self, cases: np.ndarray) -> CaseInputs:
-        """What differs between these cases; numbers past the last case repeat it."""
+        """The inputs of these cases; numbers beyond the last case repeat it."""
         cases = np.minimum(cases, self.cases - 1)
         return case_inputs(cases, self.options.runs, self.points, self.designed)
 
@@ -102,17 +102,17 @@ class PreparedStudy:
 def drawn_leaves(
     targets: tuple[Target, ...], shared: SharedInputs, inputs: CaseInputs
 ) -> tuple[dict[str, Any], dict[str, Any], jax.Array]:
-    """The leaves that the runs of a block replace, the draws, and whether they were admissible."""
+    """The leaves that the runs of a block replace, the draws, and whether each is admissible."""
 
-    def one(case: CaseInputs):
-        used, drawn, admissible = draw(shared.cases, targets, case.index, case.points, case.u)
-        scenario = shared.cases.scenario
-        noise = noise_values(scenario, shared.cases.key, case.index)
-        return merge(scenario, case.points, used) | noise, drawn, admissible
+    def draw_case(case: CaseInputs):
+        used, drawn, admissible = draw(shared.uncertain, targets, case.index, case.points, case.u)
+        scenario = shared.uncertain.scenario
+        noise = noise_values(scenario, shared.uncertain.key, case.index)
+        return replaced_leaves(scenario, case.points, used) | noise, drawn, admissible
 
     # Without the barrier XLA fuses the random numbers into every operation of the run, and
     # compiles for 18 s instead of 5 s.
-    return jax.lax.optimization_barrier(jax.vmap(one)(inputs))
+    return jax.lax.optimization_barrier(jax.vmap(draw_case)(inputs))
 
 
 def prepare(
@@ -145,13 +145,15 @@ def prepare(
     if options.sampler != "independent":
         designed = designed_numbers(
             options.sampler,
-            sample_size(targets, by_path),
+            draw_shapes(targets, by_path),
             options.runs,
             options.replicates,
             options.seed,
             dtype,
         )
-    shared = SharedInputs(Cases(scenario, by_path, jax.random.PRNGKey(options.seed)), folds, dt)
+    shared = SharedInputs(
+        UncertainScenario(scenario, by_path, jax.random.PRNGKey(options.seed)), folds, dt
+    )
     points = dict(points or {})
     inputs = case_inputs(np.zeros(block_size(), int), options.runs, points, designed)
     varied, _, _ = jax.eval_shape(partial(drawn_leaves, targets), shared, inputs)

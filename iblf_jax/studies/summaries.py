@@ -32,13 +32,13 @@ if TYPE_CHECKING:
     import xarray
 
 BANDS = ("q", "e1")
-"""Signals that bands are made of."""
-EDGES: dict[str, tuple[Any, str]] = {
+"""Signals whose quantile bands are computed."""
+ENVELOPES: dict[str, tuple[Any, str]] = {
     "lower": (np.max, "tightest lower bound"),
     "upper": (np.min, "tightest upper bound"),
     "q_d": (np.median, "median reference"),
 }
-"""Signal -> how one curve is made of those of the runs, and its description."""
+"""Signal -> the function that reduces the curves of all runs to one, and its description."""
 
 
 def check_quantiles(quantiles: Sequence[float]) -> np.ndarray:
@@ -51,19 +51,18 @@ def check_quantiles(quantiles: Sequence[float]) -> np.ndarray:
     return values
 
 
-def first_margins(scenario: Scenario, samples: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """How far each run is inside its constraints at t = 0; not above zero where it starts on or
-    outside them.
+def initial_margins(scenario: Scenario, samples: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """The margin of each run to its constraints at t = 0; positive where it starts inside them.
 
     By unit: "rad" and, where velocities have bounds, "rad/s", (N, n); "m" where there are m
     regions, (N, m).
     """
-    return jax.tree.map(np.asarray, _first_margins(scenario, samples))
+    return jax.tree.map(np.asarray, _initial_margins(scenario, samples))
 
 
 @jax.jit
-def _first_margins(scenario: Scenario, samples: Mapping[str, Any]) -> dict[str, jax.Array]:
-    def one(drawn: Mapping[str, Any]) -> dict[str, jax.Array]:
+def _initial_margins(scenario: Scenario, samples: Mapping[str, Any]) -> dict[str, jax.Array]:
+    def margins_of_run(drawn: Mapping[str, Any]) -> dict[str, jax.Array]:
         perturbed = with_parameters(scenario, drawn)
         q, dq = perturbed.initial.q, perturbed.initial.dq
         zero = jnp.zeros((), q.dtype)
@@ -76,7 +75,7 @@ def _first_margins(scenario: Scenario, samples: Mapping[str, Any]) -> dict[str, 
             found["m"] = margins(perturbed.regions, perturbed.plant, q)
         return found
 
-    return jax.vmap(one)(samples)
+    return jax.vmap(margins_of_run)(samples)
 
 
 def metric_quantiles(
@@ -111,7 +110,7 @@ def metric_quantiles(
 
 
 def _quantile(values: np.ndarray, levels: np.ndarray) -> np.ndarray:
-    """Quantiles that are values of some run, so that infinite ones do no harm."""
+    """Quantiles without interpolation, which infinite values would make NaN."""
     return np.quantile(values, levels, axis=0, method="inverted_cdf")
 
 
@@ -130,10 +129,10 @@ def correlations(
     if names is None:
         names = list(metrics)
     names = checks.nonempty_list("metrics", names, '["margin", "rmse"]')
-    drawn = statistics.columns(samples)
+    drawn = statistics.scalar_samples(samples)
     found = np.full((len(drawn), len(names), 2), np.nan)
     for j, name in enumerate(names):
-        y = statistics.one_number(metrics, name)[used]
+        y = statistics.worst_joint(metrics, name)[used]
         for i, x in enumerate(drawn.values()):
             found[i, j] = statistics.rank_correlation(x[used], y)
     dims = ("parameter", "metric")
@@ -182,7 +181,7 @@ def bands(
     one_block_at_a_time = ThisProcess(chunk=size)
     parts = [
         (arrays, t[0])
-        for _, (arrays, t, _, _) in run_blocks(
+        for _, (arrays, t) in run_blocks(
             prepared, blocks, one_block_at_a_time, record_every=record_every
         )
     ]
@@ -195,9 +194,9 @@ def bands(
         name: (dims, _quantile(recorded[name], levels), {"units": SIGNALS[name].unit})
         for name in BANDS
     }
-    for name, (edge, words) in EDGES.items():
+    for name, (reduce, words) in ENVELOPES.items():
         attributes = {"units": "rad", "description": f"{words} of the runs"}
-        variables[name] = (dims[1:], edge(recorded[name], axis=0), attributes)
+        variables[name] = (dims[1:], reduce(recorded[name], axis=0), attributes)
     counts = {
         "runs": int(used.sum()),
         "excluded": int(count - used.sum()),

@@ -125,7 +125,7 @@ def sweep(
     check_deprecated("sweep", deprecated, tuple(REPLACED))
     executor = executor_of(executor, deprecated)
     store_options = store_of(store, deprecated)
-    chosen = design_of(design, deprecated)
+    design = design_of(design, deprecated)
     progress = checks.boolean("progress", progress, optional=True)
     if perturbations is None:
         perturbations = {}
@@ -141,10 +141,10 @@ def sweep(
     )
     options = options.checked()
     _check_something_varies(grid, perturbations, options.runs)
-    points = make_points(canonical(scenario), grid, chosen.kind, chosen.points, options.seed)
+    points = make_points(canonical(scenario), grid, design.kind, design.points, options.seed)
     prepared = prepare(scenario, perturbations, options, metrics, points.values)
     checks.fits_memory("runs at all points", prepared.cases, case_bytes(prepared))
-    config = store_config.describe(prepared, points, chosen.kind)
+    config = store_config.describe(prepared, points, design.kind)
     if store_options is None:
         result = _in_memory(prepared, config, executor, progress)
     else:
@@ -205,9 +205,10 @@ def _variables(prepared: PreparedStudy, config: dict[str, Any]) -> dict[str, Var
     units = dict(metric_units(prepared.shared.folds))
     units |= {"status": "1", "fastest_mode": "1/s"}
     units |= {DRAWN + path: p["unit"] for path, p in config["perturbed"].items()}
-    names = dict.fromkeys([name for name in units if name in shapes]) | dict.fromkeys(shapes)
+    ordered = [name for name in units if name in shapes]
+    without_unit = [name for name in shapes if name not in units]
     variables = {}
-    for name in names:
+    for name in ordered + without_unit:
         shape = shapes[name].shape[1:]
         dims = dimension_names(name.removeprefix(DRAWN), shape, config["joints"])
         variables[name] = Variable(shape, str(shapes[name].dtype), dims, units.get(name, ""))
@@ -252,9 +253,9 @@ def _into_store(
     with StopRequest() as stop, bar(progress, cases, cases_done) as shown:
         spans = _spans(store, pending, set(damaged), options, shown.update)
         with closing(_results(prepared, spans, executor, store, options, shown.update)) as results:
-            for span, part in results:
-                if part is not None:
-                    store.write(span.start // store.unit, named_arrays(part))
+            for span, computed in results:
+                if computed is not None:
+                    store.write(span.start // store.unit, named_arrays(computed))
                 if stop.requested:
                     _interrupt(store)
     return _dataset(store)
@@ -305,7 +306,7 @@ def _spans(
 
 
 def _interrupt(store: Store) -> None:
-    """Raises Interrupted if units are left to be computed."""
+    """Raises Interrupted unless all units are computed."""
     marks = store.marks()
     if not marks.all():
         raise Interrupted(

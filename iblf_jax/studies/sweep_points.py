@@ -22,12 +22,12 @@ from iblf_jax.studies.designs import MAX_RUNS, designed_numbers
 from iblf_jax.studies.distributions import Distribution, Perturbation, value
 from iblf_jax.studies.draws import (
     CaseInputs,
-    Cases,
     Target,
+    UncertainScenario,
     case_inputs,
     check_paths,
     draw,
-    sample_size,
+    draw_shapes,
     targets_of,
 )
 
@@ -36,25 +36,20 @@ MAX_DIMS = 60
 DESIGNS = ("grid", "random", "latin_hypercube")
 POINT = "point"
 _SALT = 0x706F696E
-"""Keeps the draws of a design apart from those of the runs."""
+"""Makes the draws of a design independent of those of the runs."""
 
 
 class Points(NamedTuple):
-    """Where a sweep goes."""
+    """The points of a sweep."""
 
     dims: dict[str, int]
     """Dimension -> size; P is their product."""
     along: dict[str, str]
     """Path -> the dimension that it varies along."""
-    ticks: dict[str, np.ndarray]
+    axis_values: dict[str, np.ndarray]
     """Path -> its values along that dimension, (size,) or (size, ...)."""
     values: dict[str, np.ndarray]
     """Path -> its value at every point, (P,) or (P, ...)."""
-
-    @property
-    def total(self) -> int:
-        """Number of points P."""
-        return int(np.prod(list(self.dims.values()), dtype=int))
 
 
 def make_points(
@@ -85,22 +80,24 @@ def make_points(
 
 
 def _grid(scenario: Scenario, grid: Mapping[str, Any]) -> Points:
-    ticks = {path: _ticks(scenario, path, values) for path, values in grid.items()}
-    dims = {path: len(values) for path, values in ticks.items()}
+    axis_values = {path: _axis_values(scenario, path, values) for path, values in grid.items()}
+    dims = {path: len(values) for path, values in axis_values.items()}
     if len(dims) > MAX_DIMS:
         raise checks.fail(
             "grid", f"{len(dims)} paths", f"at most {MAX_DIMS}, as many dimensions as an array has"
         )
     total = math.prod(dims.values())
     checks.fits_memory(
-        "points of the grid", total, sum(8.0 * (2 + values[0].size) for values in ticks.values())
+        "points of the grid",
+        total,
+        sum(8.0 * (2 + values[0].size) for values in axis_values.values()),
     )
     places = np.indices(tuple(dims.values())).reshape(len(dims), total)
-    values = {path: ticks[path][place] for path, place in zip(dims, places, strict=True)}
-    return Points(dims, {path: path for path in grid}, ticks, values)
+    values = {path: axis_values[path][place] for path, place in zip(dims, places, strict=True)}
+    return Points(dims, {path: path for path in grid}, axis_values, values)
 
 
-def _ticks(scenario: Scenario, path: str, values: Any) -> np.ndarray:
+def _axis_values(scenario: Scenario, path: str, values: Any) -> np.ndarray:
     """The values of one path of a grid, (m,) for numbers that fill the leaf, or (m, ...) for whole
     leaves.
     """
@@ -139,10 +136,10 @@ def _design(
     )
     if design == "latin_hypercube":
         designed = designed_numbers(
-            design, sample_size(targets, by_path), count, 1, seed, dtype, _SALT
+            design, draw_shapes(targets, by_path), count, 1, seed, dtype, _SALT
         )
     key = jax.random.fold_in(jax.random.PRNGKey(seed), _SALT)
-    values = _draw_points(Cases(scenario, by_path, key), targets, count, designed)
+    values = _draw_points(UncertainScenario(scenario, by_path, key), targets, count, designed)
     return Points({POINT: count}, dict.fromkeys(values, POINT), values, values)
 
 
@@ -160,17 +157,20 @@ def _perturbation(path: str, given: Any) -> Perturbation:
 
 
 def _draw_points(
-    cases: Cases, targets: tuple[Target, ...], count: int, designed: dict[str, np.ndarray]
+    uncertain: UncertainScenario,
+    targets: tuple[Target, ...],
+    count: int,
+    designed: dict[str, np.ndarray],
 ) -> dict[str, np.ndarray]:
     inputs = case_inputs(np.arange(count), count, {}, designed)
 
-    def one(point: CaseInputs):
-        _, drawn, admissible = draw(cases, targets, point.index, point.points, point.u)
+    def draw_point(point: CaseInputs):
+        _, drawn, admissible = draw(uncertain, targets, point.index, point.points, point.u)
         return drawn, admissible
 
-    drawn, fine = jax.jit(jax.vmap(one))(inputs)
-    if not np.all(fine):
-        bad = int(np.argmin(np.asarray(fine)))
+    drawn, admissible = jax.jit(jax.vmap(draw_point))(inputs)
+    if not np.all(admissible):
+        bad = int(np.argmin(np.asarray(admissible)))
         shown = {path: np.asarray(x[bad]).tolist() for path, x in drawn.items()}
         raise checks.fail(
             f"grid: point {bad}",

@@ -32,16 +32,15 @@ def recommended_dt(
     perturbations: Mapping[str, Perturbation] | None = None,
     seed: int = 0,
 ) -> float:
-    """A round time step [s] with which `simulate`, or a study, is stable and accurate on this
-    scenario.
+    """A rounded time step [s] at which `simulate`, or a study, is stable and accurate.
 
-    For one run: at most dt = 1.5 / max |eigenvalue of the closed loop's Jacobian|, at the start,
-    along the reference and where the run comes nearest to a bound; and so small that the run agrees
-    with one in steps of about a third to 0.1 % of the tube, and its own estimate of its error is
-    below 0.5 %.  Rounded down to 1, 2 or 5 times a power of ten.
+    For one run the step is at most 1.5 / max |eigenvalue of the closed loop's Jacobian|, at the
+    start, along the reference and where the run is nearest to a bound.  At this step the run agrees
+    with one of about a third of the step to 0.1 % of the tube, and its error estimate is below
+    0.5 %.  The step is rounded down to 1, 2 or 5 times a power of ten.
 
-    With perturbations: so small that no run of a first block of the study (256 runs on CPU) is
-    flagged STEP_TOO_LARGE or INACCURATE.
+    With perturbations the step is so small that no run of a first block of the study (256 runs on
+    CPU) is flagged STEP_TOO_LARGE or INACCURATE.
 
     Args:
       scenario: what is to run.
@@ -51,8 +50,8 @@ def recommended_dt(
       seed: of the draws.
 
     Returns:
-      The step [s].  If no step is accurate (of a loop that amplifies every error, say), the one for
-      the modes only, with a warning.
+      The step [s].  If no step is accurate (for example of a loop that amplifies every error), the
+      step of the eigenvalue criterion alone, with a warning.
 
     Raises:
       ValueError: bad scenario, duration, method, perturbations or seed.
@@ -92,8 +91,7 @@ def recommended_dt(
 def needed_dt(
     status: np.ndarray, modes: np.ndarray, errors: np.ndarray, dt: float, method: str
 ) -> float | None:
-    """A smaller step for the runs that were flagged because of theirs; None if there is no such
-    run.
+    """A smaller step for the runs that were flagged for their time step; None if there are none.
 
     Args:
       status, modes, errors: flags, fastest mode [1/s] and estimated error relative to the tube of

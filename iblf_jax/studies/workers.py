@@ -80,7 +80,7 @@ def initialize_worker(x64: bool = True, threads: int | None = 1) -> None:
 
     Args:
       x64: whether the worker computes in float64, as the client must do.
-      threads: threads of one worker; None leaves their number alone.  With one worker for each
+      threads: threads of one worker; None does not change their number.  With one worker for each
         processor, 1 is the fastest.
     """
     jax.config.update("jax_enable_x64", x64)
@@ -92,11 +92,11 @@ def initialize_worker(x64: bool = True, threads: int | None = 1) -> None:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def environment(executor: str) -> dict[str, Any]:
-    """What the bits of a result depend on besides the study.
+def environment(backend: str) -> dict[str, Any]:
+    """The versions and settings of this process that the bits of a result depend on.
 
     Args:
-      executor: the engine's executor; a native kernel is tied to processor and compiler.
+      backend: the backend of the runs; a native kernel depends on processor and compiler.
     """
     import jaxlib
 
@@ -110,7 +110,7 @@ def environment(executor: str) -> dict[str, Any]:
         "jax_enable_x64": bool(jax.config.jax_enable_x64),  # type: ignore[attr-defined]
         "platform": devices.platform(),
     }
-    if uses_host_compiler(executor):
+    if uses_host_compiler(backend):
         found |= _kernel_environment()
     return found
 
@@ -133,9 +133,9 @@ REMEDIES = {
 }
 
 
-def check_environment(client: dict[str, Any], executor: str) -> None:
-    """Raises WorkerError if this worker would compute other numbers than the client."""
-    here = environment(executor)
+def check_environment(client: dict[str, Any], backend: str) -> None:
+    """Raises WorkerError if the results of this worker could differ from the client's."""
+    here = environment(backend)
     for name, expected in client.items():
         if here.get(name) == expected:
             continue
@@ -177,8 +177,8 @@ def packed(task: WorkerTask) -> bytes:
 
 @lru_cache(maxsize=2)
 def _unpacked(payload: bytes) -> WorkerTask:
-    client, executor, content = pickle.loads(payload)
-    check_environment(client, executor)
+    client, backend, content = pickle.loads(payload)
+    check_environment(client, backend)
     task, components = pickle.loads(content)
     for cls in components:
         register_component(cls)
@@ -192,13 +192,13 @@ def run_task(payload: bytes, first: int, last: int) -> BlockResults | None:
       The results, or None if this worker has written them to the store.
 
     Raises:
-      WorkerError: this worker is not fit to compute them.
+      WorkerError: the environment of this worker differs from the client's.
       StoreError: the store cannot be written here.
     """
     task = _unpacked(payload)
     store = None
     if task.store is not None:
-        store = _opened(task.store)
+        store = _open_shared(task.store)
         unit = first // store.unit
         if store.marks()[unit] and store.read(unit) is not None:
             return None
@@ -209,7 +209,7 @@ def run_task(payload: bytes, first: int, last: int) -> BlockResults | None:
     return None
 
 
-def _opened(shared: SharedStore) -> Any:
+def _open_shared(shared: SharedStore) -> Any:
     try:
         store = load_store(shared.path)
     except StoreError as error:
@@ -231,8 +231,8 @@ def run_on_workers(
     executor: Executor,
     store: SharedStore | None = None,
 ) -> Iterator[tuple[slice, Any]]:
-    """Computes spans of cases on an executor's workers and yields each with what `run_task`
-    returns, in the order in which they are done.
+    """Computes spans of cases on an executor's workers and yields each with the result of
+    `run_task`, in the order of completion.
 
     Args:
       prepared: what to run.
@@ -241,7 +241,7 @@ def run_on_workers(
       store: written by the workers; None if they return their results.
 
     Raises:
-      WorkerError: a worker was lost, or is not fit.
+      WorkerError: a worker was lost, or its environment differs from the client's.
       ValueError: the study cannot be sent to another process.
     """
     payload = packed(WorkerTask(prepared, store))
@@ -255,7 +255,7 @@ def run_on_workers(
             for future in wait(waiting, return_when=FIRST_COMPLETED).done:
                 yield waiting.pop(future), future.result()
     except Exception as error:
-        if not _is_of_the_executor(error):
+        if not _is_executor_error(error):
             raise
         raise WorkerError(
             f"A worker of the executor was lost ({type(error).__name__}: {error}). What is written"
@@ -267,8 +267,8 @@ def run_on_workers(
             future.cancel()
 
 
-def _is_of_the_executor(error: Exception) -> bool:
-    """Whether an error says that a worker or its executor has gone, not that a task has failed."""
+def _is_executor_error(error: Exception) -> bool:
+    """Whether an error reports a lost worker or executor, and not a failed task."""
     if isinstance(error, BrokenExecutor | CancelledError):
         return True
     return type(error).__module__.partition(".")[0] == "distributed"

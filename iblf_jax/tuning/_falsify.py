@@ -41,7 +41,7 @@ from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical, check_step
 from iblf_jax.studies.distributions import Perturbation
-from iblf_jax.studies.perturbation_cube import Cube, bounded
+from iblf_jax.studies.perturbation_cube import Cube, unit_cube
 from iblf_jax.tuning.evaluation import Derivatives, Value
 from iblf_jax.tuning.parameters import Box
 from iblf_jax.tuning.quantities import DEFICITS, Peak, Quantities
@@ -161,7 +161,7 @@ def falsify(
     iterations = checks.positive_integer("iterations", iterations, most=checks.MAX_STEPS)
     checks.fits_memory("iterations", iterations, 8 * starts)
     seed = checks.seed(seed)
-    cube = bounded(scenario, perturbations)
+    cube = unit_cube(scenario, perturbations)
     checks.fits_memory("starts", starts, 8.0 * (1 + cube.size) * NUMBERS_A_RUN)
     checks.one_of("margin", margin, MARGINS)
     one: Any = 1.0
@@ -182,12 +182,12 @@ def _result(cube: Cube, evaluate: MarginEvaluator, timing: dict[str, Any]) -> At
             "In every run that was tried the reference leaves the bounds (Assumption 2) or the step"
             " is too large: narrow the perturbations, widen the bounds, or take a smaller dt."
         )
-        raise cube.nothing(remedy)
+        raise cube.no_admissible_point(remedy)
     point = cube.values(jnp.asarray(worst.u, evaluate.dtype))
     values = {path: np.asarray(x) for path, x in point.items()}
     history = np.stack(evaluate.history)
     return Attack(
-        scenario=with_parameters(cube.cases.scenario, values),
+        scenario=with_parameters(cube.uncertain.scenario, values),
         values=values,
         margin=worst.margin,
         first_margin=next(float(np.nanmin(row)) for row in history if not np.all(np.isnan(row))),
@@ -205,7 +205,7 @@ def _attack(cube: Cube, evaluate: MarginEvaluator, seed: int, iterations: int, s
     state = SOLVER.init(evaluate.space, cube.admissible_points(starts, [seed, 3]))
     for step in range(iterations + 1):
         for attack in state:
-            attack.trial = _admissible(cube.refused, attack.z, attack.trial)
+            attack.trial = _admissible(cube.why_inadmissible, attack.z, attack.trial)
         SOLVER.step(evaluate, state, SOLVER.tolerance)
         converged = np.flatnonzero(SOLVER.converged(state)).tolist()
         if converged:
@@ -237,7 +237,7 @@ class MarginEvaluator:
     """
 
     def __init__(self, cube: Cube, peak: Peak, dt: float, request: RunRequest, starts: int):
-        self.dtype = cube.cases.scenario.initial.q.dtype
+        self.dtype = cube.uncertain.scenario.initial.q.dtype
         step = jnp.asarray(dt, self.dtype)
         self.margins = partial(_margins, cube, astype(peak, self.dtype), step, request=request)
         self.unit = DEFICITS[peak.signal]
@@ -282,7 +282,7 @@ def _margins(
     varied = jax.vmap(cube.values)(u)
     jacobians = jax.vmap(jax.jacfwd(cube.values))(u)
     folds = (Quantities((peak,)),)
-    found = tangents_of_runs(cube.cases.scenario, varied, jacobians, folds, dt, request)
+    found = tangents_of_runs(cube.uncertain.scenario, varied, jacobians, folds, dt, request)
     deficits = found.outcome.metrics["tuning_pieces"]
     slopes = found.tangents["tuning_pieces"]
     worst = jnp.argmax(deficits, axis=1)

@@ -41,7 +41,7 @@ from iblf_jax.core.status import UNTRUSTED
 from iblf_jax.engine import run_for_reverse, starts_per_batch
 from iblf_jax.simulation.noise import NOISE_NAME
 from iblf_jax.simulation.paths import with_parameters
-from iblf_jax.studies.draws import same_place
+from iblf_jax.studies.draws import paths_overlap
 from iblf_jax.tuning.objectives import Objective
 from iblf_jax.tuning.problem import NO_LEVEL, Candidate, TuningProblem, of_runs
 from iblf_jax.tuning.quantities import Quantities
@@ -271,7 +271,7 @@ def _uniform_paths(problem: TuningProblem) -> list[str]:
 
 
 def _overlaps(problem: TuningProblem, path: str, others: list[str]) -> bool:
-    return any(same_place(problem.scenario, path, other) for other in others)
+    return any(paths_overlap(problem.scenario, path, other) for other in others)
 
 
 @jax.jit

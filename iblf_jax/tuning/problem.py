@@ -21,7 +21,7 @@ from iblf_jax.engine import RunRequest, points_per_batch
 from iblf_jax.simulation.noise import has_noise
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.scenario import Scenario, canonical, check_step
-from iblf_jax.studies.draws import Cases, Target, targets_of
+from iblf_jax.studies.draws import Target, UncertainScenario, targets_of
 from iblf_jax.studies.time_step import recommended_dt
 from iblf_jax.tuning.objectives import (
     Objective,
@@ -75,7 +75,7 @@ class Candidate(NamedTuple):
 class TuningProblem:
     """A tuning: parameters with ranges, an objective with requirements, and options of its runs."""
 
-    cases: Cases
+    cases: UncertainScenario
     """The scenario, canonical, with the perturbations of its leaves and the key of the draws."""
     objective: Objective
     """Terms and requirements, with all scales and limits."""
@@ -137,7 +137,7 @@ class TuningProblem:
         scaled, by_path, dt = jax.tree.map(lambda x: jnp.asarray(x, dtype), arrays)
         steps = checks.whole_steps(run.duration, run.dt)
         problem = TuningProblem(
-            cases=Cases(scenario, by_path, jax.random.PRNGKey(run.seed)),
+            cases=UncertainScenario(scenario, by_path, jax.random.PRNGKey(run.seed)),
             objective=scaled,
             dt=dt,
             box=box,

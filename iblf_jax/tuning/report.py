@@ -30,7 +30,7 @@ from iblf_jax.core.status import Status
 from iblf_jax.engine import RunRequest, report_runs_per_batch
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Scenario, canonical
-from iblf_jax.studies.draws import Cases, targets_of
+from iblf_jax.studies.draws import UncertainScenario, targets_of
 from iblf_jax.studies.statistics import Probability, probability
 from iblf_jax.studies.study import VIOLATED
 from iblf_jax.studies.time_step import warn_of_step
@@ -318,7 +318,7 @@ def _fresh_runs(
     targets, by_path = targets_of(scenario, request.run.perturbations or {})
     arrays = by_path, request.objective, dt
     by_path, objective, step = jax.tree.map(lambda x: jnp.asarray(x, dtype), arrays)
-    cases = Cases(scenario, by_path, jax.random.PRNGKey(int(request.report.seed or 0)))
+    cases = UncertainScenario(scenario, by_path, jax.random.PRNGKey(int(request.report.seed or 0)))
     method = request.run.method
     steps = checks.whole_steps(request.run.duration, dt)
     of_run = RunRequest.of(scenario, steps=steps, method=method, backend=request.run.backend)

@@ -19,7 +19,7 @@ from iblf_jax.simulation.metrics import Torque
 from iblf_jax.simulation.noise import noise_values
 from iblf_jax.simulation.paths import get, with_parameters
 from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.studies.draws import Cases, Target, draw, merge
+from iblf_jax.studies.draws import Target, UncertainScenario, draw, replaced_leaves
 from iblf_jax.tuning.objectives import Objective
 from iblf_jax.tuning.quantities import Peak, Quantities
 
@@ -59,7 +59,7 @@ def piece_counts(objective: Objective, scenario: Scenario, duration: float) -> t
 
 
 def draw_run(
-    cases: Cases,
+    cases: UncertainScenario,
     targets: tuple[Target, ...],
     point: dict[str, jax.Array],
     index: jax.Array,
@@ -76,12 +76,12 @@ def draw_run(
         scenario = with_parameters(cases.scenario, point)
         drawn = {path: jnp.asarray(get(scenario, path)) for path in drawn}
         admissible = jnp.asarray(True)
-    return merge(cases.scenario, point, drawn) | noise, admissible
+    return replaced_leaves(cases.scenario, point, drawn) | noise, admissible
 
 
 @partial(jax.jit, static_argnames=("targets", "nominal"))
 def draw_runs(
-    cases: Cases,
+    cases: UncertainScenario,
     points: dict[str, jax.Array],
     index: jax.Array,
     *,

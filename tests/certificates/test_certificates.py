@@ -22,7 +22,7 @@ from iblf_jax.certificates.proof_terms import rounding, terms_at
 from iblf_jax.certificates.run_summary import restarts, summarise
 from iblf_jax.simulation.closed_loop import LoopState, initial_state
 from iblf_jax.simulation.scenario import canonical
-from iblf_jax.studies.perturbation_cube import bounded
+from iblf_jax.studies.perturbation_cube import unit_cube
 
 
 def between(low, high):
@@ -1079,11 +1079,11 @@ def test_search_takes_the_perturbations_of_a_study(paper):
         "controller.K2": ij.factor(ij.uniform(0.9, 1.1), shared=True),
         "robot.mass": ij.factor(ij.log_uniform(0.8, 1.25)),
     }
-    cube = bounded(canonical(paper), ways)
+    cube = unit_cube(canonical(paper), ways)
     values = cube.values(jnp.array([0.25, 0.5, 1.0]))
     np.testing.assert_allclose(values["controller.K2"], 0.95 * paper.controller.K2)
     np.testing.assert_allclose(values["robot.mass"], np.array([1.0, 1.25]) * paper.plant.mass)
-    assert cube.size == 3 and not cube.refused(np.ones(3))
+    assert cube.size == 3 and not cube.why_inadmissible(np.ones(3))
 
 
 @pytest.mark.parametrize(("search", "old"), [(counterexample, "ranges"), (ij.falsify, "sets")])

@@ -143,7 +143,7 @@ def test_a_worker_that_would_compute_other_numbers_is_refused(
 def test_a_workers_path_that_is_not_shared_is_named(tmp_path):
     shared = workers.SharedStore(str(tmp_path / "nothing.zarr"), {})
     with pytest.raises(ij.StoreError, match=r"no store here.*writer='client' does not"):
-        workers._opened(shared)
+        workers._open_shared(shared)
 
 
 @pytest.mark.parametrize("wrong", ["dask", 3, object()])
