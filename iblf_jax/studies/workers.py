@@ -31,12 +31,12 @@ from concurrent.futures import (
     Future,
     wait,
 )
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import jax
 
 from iblf_jax.core import devices
+from iblf_jax.core.caches import CACHE
 from iblf_jax.core.pytree import is_component_class, register_component
 from iblf_jax.engine import uses_host_compiler
 from iblf_jax.studies.blocks import BlockResults, named_arrays, run_spans_here
@@ -175,7 +175,7 @@ def packed(task: WorkerTask) -> bytes:
     return pickle.dumps((environment(backend), backend, file.getvalue()))
 
 
-@lru_cache(maxsize=2)
+@CACHE.memoised(2)
 def _unpacked(payload: bytes) -> WorkerTask:
     client, backend, content = pickle.loads(payload)
     check_environment(client, backend)

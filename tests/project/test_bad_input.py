@@ -533,7 +533,7 @@ LONG_NAME = "a" * 300
 
 REFUSED = {
     # function and argument: values, words of the message besides the argument's name
-    "simulate backend": ((*NO_WORDS, "vmap"), ["'auto'"]),
+    "simulate backend": (NO_WORDS, ["'auto'"]),
     "simulate method": (NO_WORDS, ["'rk4'"]),
     "simulate record_every": (NO_COUNTS, ["whole number"]),
     "simulate seed": (NO_SEEDS, ["whole number"]),
