@@ -98,7 +98,7 @@ def law_rows(base: ij.Scenario, laws, duration: float, runs: int) -> tuple[list,
     """A row a law, and the starts."""
     found = ij.compare(base, laws, duration=duration, dt=DT)
     print(found)
-    folds, rows = (*metrics.standard(), *metrics.watched(base), metrics.AboveGravity()), []
+    folds, rows = (*metrics.standard(), *metrics.optional_folds(base), metrics.AboveGravity()), []
     starts = {"initial.q": ij.offset(ij.uniform(-0.03, 0.03))}
     for name in laws:
         one = found.equal_effort.get(name, found.rollouts[name]).scenario

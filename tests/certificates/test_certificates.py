@@ -132,7 +132,7 @@ def test_inequality_is_an_equality_where_the_proof_leaves_nothing():
     rho = rho_of(scenario, seen.lambda_max, 2)
     assert float(rho) == pytest.approx(rate, rel=1e-12)
     left = float(seen.dV + rho * seen.V - 0.5 * seen.df @ seen.df)
-    assert abs(left) <= rounding("float64") * float(seen.terms) < 1e-11
+    assert abs(left) <= rounding("float64") * float(seen.dV_size) < 1e-11
 
 
 @pytest.mark.parametrize(

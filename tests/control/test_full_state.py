@@ -219,7 +219,7 @@ def test_any_two_barriers_keep_their_inequality_at_every_state(first, second):
     t, states = random_states(scenario)
     proof = jax.jit(jax.vmap(lambda t, state: terms_at(scenario, t, state)))(t, states)
     assert not np.any(proof.excluded)
-    allowed = rounding("float64") * np.asarray(proof.terms)
+    allowed = rounding("float64") * np.asarray(proof.dV_size)
     assert np.all(proof.full.left <= allowed)
     assert np.median(allowed / np.abs(proof.dV)) < 1e-10  # small beside what it judges
 
@@ -239,7 +239,7 @@ def test_weights_of_the_first_barrier_keep_the_inequality_at_every_state(first, 
     t, states = random_states(scenario)
     proof = jax.jit(jax.vmap(lambda t, state: terms_at(scenario, t, state)))(t, states)
     assert not np.any(proof.excluded)
-    assert np.all(proof.full.left <= rounding("float64") * np.asarray(proof.terms))
+    assert np.all(proof.full.left <= rounding("float64") * np.asarray(proof.dV_size))
     V1 = jax.vmap(lambda t, q: law.barrier.value(scenario.context.tube(t), q))(t, states.q)
     phi = jax.vmap(
         lambda t, q, dq: law.velocity_barrier.value(law.tubes(t, q, dq, scenario.context)[1], dq)

@@ -341,7 +341,7 @@ def test_where_kernels_cannot_the_scan_differentiates(paper, monkeypatch):
     for place, name, value in (
         (thresholds, "MAX_KEPT_NUMBERS", 10),
         (thresholds, "MAX_COLUMNS", 1),
-        (registry, "automatic", lambda: registry.Availability("vmap", "no compiler")),
+        (registry, "default_backend", lambda: registry.Availability("vmap", "no compiler")),
         (transformable, "_columns", no_kernel),
     ):
         calls.clear()
