@@ -70,7 +70,7 @@ class Findings:
     def result_is(self, condition: Any, label: str, got: Any, remedy: str) -> None:
         """Stops the check unless a result has the type that the condition requires."""
         if not condition:
-            self.stop(f"{label}{self.kind} gives {type(got).__name__}", remedy)
+            self.stop(f"{label} gives {type(got).__name__}", remedy)
 
     def stop_if_any(self) -> None:
         """Raises ContractError if there are problems."""
