@@ -5,7 +5,6 @@ constrained robots, in JAX.
 from iblf_jax import _start as _start
 
 # isort: split
-import importlib as _importlib
 import sys as _sys
 from importlib.metadata import version as _version
 from typing import TYPE_CHECKING
@@ -19,6 +18,7 @@ from iblf_jax.control import sensors as sensors
 from iblf_jax.core import linalg as linalg
 from iblf_jax.core import pytree as pytree
 from iblf_jax.core import status as status
+from iblf_jax.core.first_use import on_first_use as _on_first_use
 from iblf_jax.core.process_end import finish_at_exit as _finish_at_exit
 from iblf_jax.core.programs import bound_programs as _bound_programs
 from iblf_jax.core.pytree import Leaf as Leaf
@@ -175,20 +175,4 @@ _ON_FIRST_USE = {
 """Public name -> (module, attribute or None for the module itself): imported when first used, so
 that `import iblf_jax` stays quick and brings neither matplotlib nor optax nor xarray."""
 
-
-def __getattr__(name: str):
-    if name not in _ON_FIRST_USE:
-        raise AttributeError(f"module 'iblf_jax' has no attribute {name!r}")
-    module, attribute = _ON_FIRST_USE[name]
-    imported = _importlib.import_module(module)
-    value = imported if attribute is None else getattr(imported, attribute)
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted(
-        name
-        for name in {*globals(), *_ON_FIRST_USE}
-        if not name.startswith("_") or name == "__version__"
-    )
+__getattr__, __dir__ = _on_first_use(__name__, _ON_FIRST_USE)

@@ -14,8 +14,9 @@ The public functions are those of `iblf_jax`; `distributions` has those of param
 below are options and errors of the functions.
 """
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from iblf_jax.core.first_use import on_first_use as _on_first_use
 
 if TYPE_CHECKING:
     from iblf_jax.studies.options import Design as Design
@@ -25,22 +26,12 @@ if TYPE_CHECKING:
     from iblf_jax.studies.workers import initialize_worker as initialize_worker
 
 _ON_FIRST_USE = {
-    "Design": "iblf_jax.studies.options",
-    "StoreOptions": "iblf_jax.studies.options",
-    "ThisProcess": "iblf_jax.studies.options",
-    "WorkerError": "iblf_jax.studies.workers",
-    "initialize_worker": "iblf_jax.studies.workers",
+    "Design": ("iblf_jax.studies.options", "Design"),
+    "StoreOptions": ("iblf_jax.studies.options", "StoreOptions"),
+    "ThisProcess": ("iblf_jax.studies.options", "ThisProcess"),
+    "WorkerError": ("iblf_jax.studies.workers", "WorkerError"),
+    "initialize_worker": ("iblf_jax.studies.workers", "initialize_worker"),
 }
-"""Public name -> its module: imported when first used, so that `import iblf_jax` stays quick."""
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _ON_FIRST_USE:
-        raise AttributeError(f"module 'iblf_jax.studies' has no attribute {name!r}")
-    value = vars(importlib.import_module(_ON_FIRST_USE[name]))[name]
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *_ON_FIRST_USE})
+"""Public name -> (module, attribute): imported when first used, so that `import iblf_jax` stays
+quick."""
+__getattr__, __dir__ = _on_first_use(__name__, _ON_FIRST_USE)

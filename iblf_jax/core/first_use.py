@@ -1,0 +1,36 @@
+"""Names of a package that Python imports when they are first used, so that importing the package
+stays quick.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Callable, Mapping
+from typing import Any
+
+
+def on_first_use(
+    package: str, table: Mapping[str, tuple[str, str | None]]
+) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+    """`__getattr__` and `__dir__` of a package.
+
+    Args:
+      package: its `__name__`.
+      table: public name -> (module, attribute or None for the module itself).
+    """
+    names = vars(sys.modules[package])
+
+    def get(name: str) -> Any:
+        if name not in table:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        module, attribute = table[name]
+        imported = importlib.import_module(module)
+        names[name] = imported if attribute is None else getattr(imported, attribute)
+        return names[name]
+
+    def public_names() -> list[str]:
+        listed = {*names, *table}
+        return sorted(x for x in listed if not x.startswith("_") or x == "__version__")
+
+    return get, public_names
