@@ -42,7 +42,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from iblf_jax.core.optional import OptionalMembers, attributes
+from iblf_jax.core.optional import attributes
 from iblf_jax.engine import thresholds
 from iblf_jax.engine.batch import Batch, StepLoop, finalize, initialize
 from iblf_jax.engine.carry import Carry, Inputs, StepOptions
@@ -52,6 +52,7 @@ from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.time_step import Advanced, advance
 from iblf_jax.simulation import error_estimate
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
+from iblf_jax.simulation.metrics import fold_member
 from iblf_jax.simulation.paths import get, with_parameters
 from iblf_jax.simulation.signals import Sample
 
@@ -62,8 +63,9 @@ FLAG_FIELDS = ("guard_active", "saturated")
 class DerivativeSizes(NamedTuple):
     """What decides how a derivative is computed."""
 
-    kept_numbers: int
-    """Numbers of the derivative that are kept along the run, with one tangent per run."""
+    count_kept_numbers: Callable[[], int]
+    """Counts the numbers of the derivative that are kept along the run, with one tangent per run.
+    It traces a step, and is called only where the count decides."""
     order: int = 1
     columns: int = 1
     """Numbers of a transformed run by which it is differentiated, the most of any order."""
@@ -79,11 +81,11 @@ def choose_derivatives(sizes: DerivativeSizes) -> str:
     """
     if thresholds.is_within(sizes.nodes_together, sizes.max_nodes):
         return "together"
-    is_small = sizes.kept_numbers <= thresholds.MAX_KEPT_NUMBERS
-    is_low_order = sizes.order <= thresholds.MAX_COLUMN_ORDER
-    if is_small and is_low_order and sizes.columns <= thresholds.MAX_COLUMNS:
-        return "one per run"
-    return "scan"
+    if sizes.order > thresholds.MAX_COLUMN_ORDER or sizes.columns > thresholds.MAX_COLUMNS:
+        return "scan"
+    if sizes.count_kept_numbers() > thresholds.MAX_KEPT_NUMBERS:
+        return "scan"
+    return "one per run"
 
 
 class Outer(NamedTuple):
@@ -248,10 +250,6 @@ def preaccumulated(scenario, directions: Directions, eps: jax.Array) -> Callable
         return slope, Sample(**values, **numbers(*jax.lax.stop_gradient(at))[1])
 
     return loop
-
-
-fold_member = OptionalMembers(curvatures=0)
-"""Optional members of a fold: how many `Outer` its `curvature` returns."""
 
 
 def count_curvatures(folds: Any) -> int:

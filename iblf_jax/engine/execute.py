@@ -203,9 +203,13 @@ def _derivative_sizes(
     """The sizes that decide how an executor computes tangents."""
     carry = carry_shapes(batch, request.method)
     nodes = program_of(TimeStep(request.method), batch, carry).program.size
-    samples = request.instants * (batch.runs or 1)
+
+    def count_kept_numbers() -> int:
+        samples = request.instants * (batch.runs or 1)
+        return numbers_of(batch.leaves.first, outer_vectors) * along.tangents * samples
+
     return DerivativeSizes(
-        kept_numbers=numbers_of(batch.leaves.first, outer_vectors) * along.tangents * samples,
+        count_kept_numbers,
         nodes_together=nodes * (1 + along.tangents),
         max_nodes=executor.limits.derivative_nodes,
     )

@@ -16,11 +16,13 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from iblf_jax.control.controllers._base import law_member
 from iblf_jax.core import checks
-from iblf_jax.core.optional import OptionalMembers, attributes
+from iblf_jax.core.optional import attributes
 from iblf_jax.core.pytree import layers, wrapped_field
 from iblf_jax.kernels import Known
 from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.world.robots._base import robot_member
 
 QUATERNIONS = ("rotation", "tip_rotation")
 """Fields whose rows have equal numbers for a systematic reason: a right angle."""
@@ -60,16 +62,10 @@ class StructuralConstants(NamedTuple):
         return tuple(found)
 
 
-declared_fields = OptionalMembers(geometry_fields=(), unit_factors=())
-"""Class attributes of robots and laws that name fields."""
-
-
-def _declared(part: Any, attribute: str) -> tuple[str, ...]:
-    """The fields that a class declares in an attribute; empty if it does not declare any.
-
-    A class of a user may lack the attribute, or use the name for something else.
+def _field_names(names: Any) -> tuple[str, ...]:
+    """The fields that a class declares; empty if a class of a user uses the attribute for something
+    else.
     """
-    names = declared_fields(type(part), attribute)
     if isinstance(names, tuple) and all(isinstance(name, str) for name in names):
         return names
     return ()
@@ -85,7 +81,7 @@ def robot_constants(scenario: Scenario) -> StructuralConstants | None:
     geometry.
     """
     robots = {
-        name: _declared(robot, "geometry_fields")
+        name: _field_names(robot_member(type(robot), "geometry_fields"))
         for name, robot in (("plant", scenario.plant), ("model", scenario.model))
     }
     if not any(robots.values()) or not checks.is_concrete((scenario.plant, scenario.model)):
@@ -165,7 +161,8 @@ def _unit_factors(scenario: Scenario) -> dict[tuple[str, ...], Any]:
     path: tuple[str, ...] = ("controller",)
     found: dict[tuple[str, ...], Any] = {}
     for law in layers(scenario.controller):
-        for name, factor in attributes(law, _declared(law, "unit_factors")).items():
+        names = _field_names(law_member(type(law), "unit_factors"))
+        for name, factor in attributes(law, names).items():
             if checks.is_concrete(factor):
                 found[*path, name] = factor
         path = (*path, wrapped_field(law) or "")

@@ -217,16 +217,17 @@ def _by_scan(runs: Runs, places: Places, leaves: tuple) -> Any:
 
 def _derivative_sizes(runs: Runs, places: Places, leaves: tuple) -> DerivativeSizes:
     """The sizes that decide how a derivative of one run's records and metrics is computed."""
-    every, recorded_numbers = runs.request.record_every, 0
-    if every is not None:
-        samples = runs.request.steps // every + 1
-        recorded_numbers = numbers_of(jax.tree.unflatten(runs.treedef, leaves), recorded) * samples
+    every = runs.request.record_every
     columns = [sum(jnp.size(leaves[i]) for i in level) for level in places]
-    return DerivativeSizes(
-        kept_numbers=recorded_numbers * math.prod(columns),
-        order=len(places),
-        columns=max(columns),
-    )
+
+    def count_kept_numbers() -> int:
+        if every is None:
+            return 0
+        samples = runs.request.steps // every + 1
+        inputs = jax.tree.unflatten(runs.treedef, leaves)
+        return numbers_of(inputs, recorded) * samples * math.prod(columns)
+
+    return DerivativeSizes(count_kept_numbers, order=len(places), columns=max(columns))
 
 
 def _over_runs(function: Callable, runs: Runs, *static: Any) -> Callable:

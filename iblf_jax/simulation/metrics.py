@@ -60,8 +60,9 @@ class Fold(Protocol):
         ...
 
 
-fold_member = OptionalMembers(needs=None, units=MappingProxyType({}))
-"""Reads the members that a metric may lack."""
+fold_member = OptionalMembers(needs=None, units=MappingProxyType({}), curvatures=0)
+"""Reads the members that a metric may lack; `curvatures` is the number of `Outer` that its
+`curvature` returns (`engine.derivatives`)."""
 
 
 def _root_mean_square(integral: jax.Array, time: jax.Array) -> jax.Array:
