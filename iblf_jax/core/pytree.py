@@ -162,7 +162,7 @@ def layers(part: Any) -> list[Any]:
     """
     found = [part]
     while field := wrapped_field(found[-1]):
-        found.append(field_values(found[-1])[field])
+        found.append(vars(found[-1])[field])
     return found
 
 
@@ -183,7 +183,7 @@ def rewrapped(part: Any, inner: Any) -> Any:
     name = wrapped_field(part)
     if not name:
         return inner
-    return dataclasses.replace(part, **{name: rewrapped(field_values(part)[name], inner)})
+    return dataclasses.replace(part, **{name: rewrapped(vars(part)[name], inner)})
 
 
 def field_values(part: Any) -> dict[str, Any]:

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.core import checks
 from iblf_jax.core.caches import CACHE
 from iblf_jax.engine import thresholds
 from iblf_jax.engine.batch import Batch, Leaves, StepLoop
@@ -72,7 +73,7 @@ def _scan_run(step: Callable, carry: Any, steps: int, every: int | None) -> tupl
         carry_and_record, _ = jax.lax.scan(one_step, carry_and_record, indices)
         return carry_and_record, carry_and_record[1]
 
-    intervals = -(-steps // every)
+    intervals = checks.ceil_div(steps, every)
     (carry, _), records = jax.lax.scan(one_interval, (carry, blank), every * jnp.arange(intervals))
     return carry, records
 

@@ -100,10 +100,8 @@ def _checked_record(record_every: int, steps: int) -> int:
     record_every = checks.recorded_every(record_every, steps)
     if steps // record_every <= MAX_SAMPLES:
         return record_every
-    remedy = (
-        f"Take record_every={-(-steps // MAX_SAMPLES)} or more; metrics cover every step all"
-        " the same."
-    )
+    fewest = checks.ceil_div(steps, MAX_SAMPLES)
+    remedy = f"Take record_every={fewest} or more; metrics cover every step all the same."
     raise checks.fail(
         "record_every",
         record_every,

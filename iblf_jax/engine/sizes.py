@@ -5,7 +5,7 @@ No result depends on these numbers, except the layout of a stored study.
 
 from __future__ import annotations
 
-from iblf_jax.core import devices
+from iblf_jax.core import checks, devices
 
 RUNS_PER_BLOCK = {"cpu": 256}
 """Runs in a block of a study, by platform."""
@@ -67,7 +67,7 @@ def whole_blocks(cases: int, runs: float) -> int:
 
 def points_per_batch(runs: int) -> int:
     """Points of a tuning that are evaluated in one batch, each with so many runs."""
-    return -(-MIN_RUNS_PER_BATCH // runs)
+    return checks.ceil_div(MIN_RUNS_PER_BATCH, runs)
 
 
 def starts_per_batch(starts: int, runs: int) -> int:

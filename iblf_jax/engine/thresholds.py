@@ -6,6 +6,7 @@ This module imports nothing else of the engine, so that executors and the plan c
 
 from __future__ import annotations
 
+from iblf_jax.core import checks
 from iblf_jax.kernels import LoweringLimits
 
 # Machine functions (`machine_function`) on a CPU.  Operations are those of a jaxpr.
@@ -135,7 +136,7 @@ def steps_per_call(nodes: int, steps: int, every: int | None) -> int:
 
 def gpu_threads(runs: int, multiprocessors: int) -> int:
     """Threads of a block, in complete warps: few enough that every multiprocessor has a block."""
-    warps = max(-(-runs // (multiprocessors * WARP)), 1)
+    warps = max(checks.ceil_div(runs, multiprocessors * WARP), 1)
     return min(warps * WARP, MAX_THREADS_PER_BLOCK)
 
 
@@ -157,7 +158,7 @@ def checkpoint_edge(steps: int) -> tuple[int, int]:
     candidates = range(edge, edge - max(1, edge // 3), -1)
 
     def blocks(inner: int) -> int:
-        return -(-steps // inner**2)
+        return checks.ceil_div(steps, inner**2)
 
     inner = min(candidates, key=lambda inner: blocks(inner) * inner**2)
     return inner, blocks(inner)

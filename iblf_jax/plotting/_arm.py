@@ -39,7 +39,7 @@ class Motion:
 
 
 @dataclass(frozen=True, eq=False)
-class Target:
+class ReferenceMotion:
     """Reference and bounds of the first run at the times of the frames."""
 
     t: np.ndarray
@@ -67,7 +67,7 @@ def _fans(robot: Any, q: jax.Array, lower: jax.Array, upper: jax.Array) -> jax.A
     return jnp.concatenate([centre, centre + FAN_RADIUS * links, centre], axis=1)
 
 
-def motions_of(curves: Sequence[Curve], t: np.ndarray) -> tuple[Target, list[Motion]]:
+def motions_of(curves: Sequence[Curve], t: np.ndarray) -> tuple[ReferenceMotion, list[Motion]]:
     """The runs at the times t [s] of the frames, (F,).
 
     Raises:
@@ -87,7 +87,7 @@ def motions_of(curves: Sequence[Curve], t: np.ndarray) -> tuple[Target, list[Mot
     q_d, lower, upper = (first.at(field, t) for field in ("q_d", "lower", "upper"))
     desired = skeletons(robot, q_d)
     fans = jax.jit(jax.vmap(lambda *args: _fans(robot, *args)))(motions[0].q, lower, upper)
-    return Target(t, q_d, lower, upper, desired, np.asarray(fans)), motions
+    return ReferenceMotion(t, q_d, lower, upper, desired, np.asarray(fans)), motions
 
 
 def _set_points(line: Any, points: np.ndarray) -> None:
@@ -101,7 +101,9 @@ def _set_points(line: Any, points: np.ndarray) -> None:
 class Scene:
     """The figure of an animation; `move_to(frame)` moves its parts to their places."""
 
-    def __init__(self, curves: Sequence[Curve], target: Target, motions: Sequence[Motion]) -> None:
+    def __init__(
+        self, curves: Sequence[Curve], target: ReferenceMotion, motions: Sequence[Motion]
+    ) -> None:
         self.target = target
         self.motions = motions
         self.figure = _style.new_figure(6.4, 3.8)

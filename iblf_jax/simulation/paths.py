@@ -274,7 +274,7 @@ def _metadata(scenario: Scenario, path: str) -> Mapping[str, Any]:
                 "unit": _unit(field, {**component_member(part, "leaf_units")(), **units}),
             }
             units |= field.metadata.get("units", {})
-            part = field_values(part)[token]
+            part = vars(part)[token]
     return metadata
 
 
@@ -319,7 +319,7 @@ def _steps(part: Any, tokens: list[str | int]) -> tuple[list[str | int], list[st
         row, field = tokens[1:3]
         if field not in fields:
             raise KeyError(field)
-        index = row if isinstance(row, int) else field_values(part)[names].index(row)
+        index = row if isinstance(row, int) else vars(part)[names].index(row)
         return [field, index], tokens[3:]
     wrapped = wrapped_field(part)
     if wrapped:
@@ -338,7 +338,7 @@ def _member(part: Any, step: str | int) -> Any:
     if isinstance(step, str):
         if step not in [f.name for f in dataclasses.fields(part) if not f.metadata.get("static")]:
             raise AttributeError(step)
-        return field_values(part)[step]
+        return vars(part)[step]
     if not isinstance(part, tuple | list | jax.Array | np.ndarray):
         raise TypeError(part)
     if not -len(part) <= step < len(part):

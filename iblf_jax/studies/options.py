@@ -11,7 +11,7 @@ import dataclasses
 import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 
@@ -22,6 +22,7 @@ from iblf_jax.studies.designs import MAX_RUNS, check_sampler
 
 MAX_MEMORY = 2.0**60
 """Largest accepted `memory` [bytes]."""
+T = TypeVar("T")
 WRITERS = ("client", "worker")
 
 
@@ -46,23 +47,34 @@ class RunOptions:
 
     def checked(self) -> RunOptions:
         """The same options with valid values; ValueError names an invalid one."""
-        runs = checks.positive_integer("runs", self.runs, most=MAX_RUNS)
-        replicates = check_sampler(self.sampler, runs, self.replicates)
-        tableau(self.method)
-        checks.whole_steps(self.duration, self.dt)
-        return dataclasses.replace(
-            self,
-            duration=float(self.duration),
-            dt=float(self.dt),
-            runs=runs,
-            seed=checks.seed(self.seed),
-            replicates=replicates,
-        )
+        options = checked_run_options(self)
+        replicates = check_sampler(self.sampler, options.runs, self.replicates)
+        return dataclasses.replace(options, replicates=replicates)
 
     @property
     def steps(self) -> int:
         """Time steps of a run."""
         return checks.whole_steps(self.duration, self.dt)
+
+
+def checked_run_options(options: T) -> T:
+    """The options of runs with a valid number of runs, integrator, duration, time step and seed;
+    ValueError names an invalid one.
+
+    Args:
+      options: dataclass with the fields `runs`, `method`, `duration`, `dt` and `seed`.
+    """
+    given: Any = options
+    runs = checks.positive_integer("runs", given.runs, most=MAX_RUNS)
+    tableau(given.method)
+    checks.whole_steps(given.duration, given.dt)
+    return dataclasses.replace(
+        given,
+        duration=float(given.duration),
+        dt=float(given.dt),
+        runs=runs,
+        seed=checks.seed(given.seed),
+    )
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,8 +13,8 @@ import jax
 
 from iblf_jax.core import checks, notices
 from iblf_jax.engine import check_backend, differentiates_forward
-from iblf_jax.simulation.integrators import tableau
 from iblf_jax.studies.designs import MAX_RUNS
+from iblf_jax.studies.options import checked_run_options
 from iblf_jax.studies.statistics import check_confidence
 from iblf_jax.tuning.robust import as_risk
 from iblf_jax.tuning.solvers import SOLVERS, Solver
@@ -30,7 +30,7 @@ EARLIER_NAMES = {"auto": "auto", "newton": "sqp", "lbfgs": "lbfgs", "adam": "ada
     meta_fields=("method", "backend", "runs", "risk"),
 )
 @dataclasses.dataclass(frozen=True, eq=False)
-class RunOptions:
+class TuningRunOptions:
     """The options of the runs of a tuning, which its problem, its result and its report share.
 
     A further option is a field of this class, a keyword argument of `tune`, and what uses it.
@@ -60,17 +60,10 @@ class RunOptions:
         Raises:
           ValueError: an option that is not valid; the message names it and the remedy.
         """
-        tableau(self.method)
-        backend = check_backend(self.backend)
-        checks.whole_steps(self.duration, self.dt)
         return dataclasses.replace(
-            self,
-            duration=float(self.duration),
-            dt=float(self.dt),
-            backend=backend,
+            checked_run_options(self),
+            backend=check_backend(self.backend),
             perturbations={} if self.perturbations is None else self.perturbations,
-            seed=checks.seed(self.seed),
-            runs=checks.positive_integer("runs", self.runs, most=MAX_RUNS),
             risk=as_risk(self.risk),
         )
 
@@ -116,7 +109,7 @@ OF_REPORT = {"report_runs": "runs", "report_seed": "seed", "confidence": "confid
 """Option of a report in earlier versions and in stored files -> its name in `Report`."""
 ARGUMENTS = (
     *("scenario", "parameters", "objective"),
-    *(field.name for field in dataclasses.fields(RunOptions)),
+    *(field.name for field in dataclasses.fields(TuningRunOptions)),
     *("solver", "iterations", "report", "checkpoint", "progress"),
 )
 """Of `tune`."""

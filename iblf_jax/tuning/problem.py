@@ -30,7 +30,7 @@ from iblf_jax.tuning.objectives import (
     fitted,
     is_complete,
 )
-from iblf_jax.tuning.options import RunOptions
+from iblf_jax.tuning.options import TuningRunOptions
 from iblf_jax.tuning.parameters import Block, Box, Tunable, layout, values_at
 from iblf_jax.tuning.ranges import sampled_too_slowly
 from iblf_jax.tuning.rollouts import Rollouts, draw_run, piece_counts, rollouts
@@ -83,7 +83,7 @@ class TuningProblem:
     """Time step as an array of the runs' type, () [s]."""
     box: Box
     """Start and range of the coordinates z."""
-    options: RunOptions
+    options: TuningRunOptions
     """Options of the runs, checked."""
     blocks: tuple[Block, ...]
     """The tuned leaves, as parts of z."""
@@ -115,12 +115,12 @@ class TuningProblem:
         Args:
           scenario, parameters, objective: as `tune`.
           on_front: whether the terms are objectives of a front.
-          options: of the runs, the fields of `RunOptions`.
+          options: of the runs, the fields of `TuningRunOptions`.
 
         Raises:
           ValueError: an argument that is not valid; the message names it and the remedy.
         """
-        run = RunOptions(**options).checked()
+        run = TuningRunOptions(**options).checked()
         goal = checked(objective)
         scenario = canonical(scenario)
         check_step(scenario, run.dt)

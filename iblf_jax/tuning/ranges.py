@@ -32,11 +32,12 @@ import numpy as np
 
 from iblf_jax.control.actuators._base import actuator_member
 from iblf_jax.control.sensors._base import sensor_member, unrounded
+from iblf_jax.engine.period import radius_at
+from iblf_jax.engine.step_size import fastest_along, start_and_along
 from iblf_jax.simulation.closed_loop import LoopState, run_sampled_law
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.tuning.runs import fastest_along, radius_at, start_and_along
 
 THEOREM_LIMITS = {"controller.k1": 0.05, "controller.K2": 0.505, "observer.kf": 1.01}
 """Default lower limits: just inside Theorem 2's conditions (3.17), (3.25) on the gains of the

@@ -35,7 +35,7 @@ from iblf_jax.studies.statistics import Probability, probability
 from iblf_jax.studies.study import VIOLATED
 from iblf_jax.studies.time_step import warn_of_step
 from iblf_jax.tuning.objectives import Objective
-from iblf_jax.tuning.options import Report, RunOptions
+from iblf_jax.tuning.options import Report, TuningRunOptions
 from iblf_jax.tuning.quantities import OF_LIMIT
 from iblf_jax.tuning.robust import Risk, worst_share
 from iblf_jax.tuning.rollouts import Rollouts, draw_runs, rollouts
@@ -257,7 +257,7 @@ class ReportRequest(NamedTuple):
     """Paths of the tuned leaves."""
     objective: Objective
     """With scales and limits."""
-    run: RunOptions
+    run: TuningRunOptions
     """As in the tuning, except for the number of runs and their seed."""
     report: Report
     """With a seed."""

@@ -20,7 +20,7 @@ from iblf_jax.simulation.metrics import as_folds
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.tuning.objectives import Objective, depends_on_torque
-from iblf_jax.tuning.options import Report, RunOptions
+from iblf_jax.tuning.options import Report, TuningRunOptions
 from iblf_jax.tuning.quantities import Quantities
 from iblf_jax.tuning.report import ReportRequest, TuningReport, make_report
 from iblf_jax.tuning.runs import NUMBERS_A_RUN
@@ -60,7 +60,7 @@ def _slice(
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
-class TuneSetup(RunOptions):
+class TuneSetup(TuningRunOptions):
     """The options of a tuning that its report needs: those of its runs, and these."""
 
     objective: Objective

@@ -19,9 +19,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.engine import RunRequest, Tangents, run_batch_jvp
-from iblf_jax.engine.period import radius_at as radius_at
-from iblf_jax.engine.step_size import fastest_along as fastest_along
-from iblf_jax.engine.step_size import start_and_along as start_and_along
 from iblf_jax.simulation.scenario import Scenario
 
 NUMBERS_A_RUN = 100

@@ -31,6 +31,7 @@ from typing import Any
 
 import numpy as np
 
+from iblf_jax.core import checks
 from iblf_jax.tuning.evaluation import Derivatives, Evaluator
 from iblf_jax.tuning.objectives import is_smoothed, sharper
 from iblf_jax.tuning.problem import FIRST_PENALTY
@@ -158,7 +159,7 @@ class Search:
         state = self.state
         left = np.flatnonzero(~state["retired"]).tolist()
         order = sorted(left, key=lambda s: tuple(state["best_key"][s]))
-        half = -(-len(order) // 2)
+        half = checks.ceil_div(len(order), 2)
         for s in order[:half]:
             state["finished"][s] = False
             state["steps_since_update"][s] = 0

@@ -30,7 +30,7 @@ from iblf_jax.simulation.scenario import canonical
 from iblf_jax.tuning import LBFGS, SQP, Adam, Report, evaluation, starts
 from iblf_jax.tuning.checkpoints import load_checkpoint, save_checkpoint
 from iblf_jax.tuning.evaluation import Derivatives, Evaluator, Value
-from iblf_jax.tuning.options import RunOptions
+from iblf_jax.tuning.options import TuningRunOptions
 from iblf_jax.tuning.parameters import Box, layout, squash, unsquash
 from iblf_jax.tuning.problem import Candidate, TuningProblem
 from iblf_jax.tuning.quantities import Peak, Quantities, TimeIntegral
@@ -832,7 +832,7 @@ def test_a_change_that_is_not_significant_is_called_so(robust, paper):
         after=paper,
         tuned=tuple(robust.values),
         objective=robust.setup.objective,
-        run=RunOptions(perturbations=DRAWS, risk=Risk("mean"), **SHORT),
+        run=TuningRunOptions(perturbations=DRAWS, risk=Risk("mean"), **SHORT),
         report=Report(runs=256, seed=5),
     )
     report = make_report(request)

@@ -24,7 +24,7 @@ import numpy as np
 from iblf_jax.core import checks
 from iblf_jax.core.disk_cache import keep_programs
 from iblf_jax.core.linalg import inner, matvec
-from iblf_jax.core.optional import OptionalMembers, attributes, has_members, missing_members
+from iblf_jax.core.optional import OptionalMembers, attributes, has_members
 from iblf_jax.core.time import as_at
 
 T = TypeVar("T")
@@ -211,7 +211,7 @@ def from_energy(cls: type[T]) -> type[T]:
     missing = [
         source
         for method, source in sources.items()
-        if len(missing_members(cls, (method, source))) == 2
+        if not has_members(cls, method) and not has_members(cls, source)
     ]
     if missing:
         raise checks.fail(

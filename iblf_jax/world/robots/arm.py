@@ -34,7 +34,7 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.core.optional import attributes
-from iblf_jax.core.pytree import Leaf, component, field_values, leaf, static
+from iblf_jax.core.pytree import Leaf, component, leaf, static
 from iblf_jax.world.robots import spatial
 from iblf_jax.world.robots._base import broadcast_fields
 from iblf_jax.world.robots.payload import Payload
@@ -185,8 +185,9 @@ class Arm:
         for name, value in attributes(self, widths).items():
             checks.shape_is(f"Arm.{name}", value, (n, widths[name]))
         broadcast_fields(self, NUMBERS_OF_A_JOINT, (n,))
-        for name, width in (("tip_position", 3), ("tip_rotation", 4), ("g", 3)):
-            checks.shape_is(f"Arm.{name}", field_values(self)[name], (width,))
+        checks.shape_is("Arm.tip_position", self.tip_position, (3,))
+        checks.shape_is("Arm.tip_rotation", self.tip_rotation, (4,))
+        checks.shape_is("Arm.g", self.g, (3,))
         for name, value in attributes(self, ("rotation", "axis", "tip_rotation")).items():
             if checks.is_concrete(value) and not np.all(
                 np.linalg.norm(np.asarray(value), axis=-1) > 1e-6
