@@ -27,7 +27,7 @@ import numpy as np
 from iblf_jax.certificates.proof_terms import ProofTerms, mass_over_gain, terms_and_sample
 from iblf_jax.core import checks
 from iblf_jax.core.optional import attributes
-from iblf_jax.core.status import UNTRUSTED, Status, describe
+from iblf_jax.core.status import UNTRUSTED, Status, describe, has_flag
 from iblf_jax.engine import step_states
 from iblf_jax.simulation import discontinuities
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
@@ -389,7 +389,7 @@ def check_status(run: Any, distance: float) -> None:
     """Raises ValueError if the status of a run contradicts the smallest distance to a bound over
     all its steps [rad] beyond rounding.
     """
-    flagged = bool(int(run.status) & int(Status.BOUND_VIOLATED))
+    flagged = has_flag(int(run.status), Status.BOUND_VIOLATED)
     # Without the number of steps, the run may have left its bounds after its last sample.
     after_last_sample = flagged and distance > 0 and run.steps is None
     agrees = flagged == (not distance > 0)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from iblf_jax.core.status import Status
+from iblf_jax.core.status import Status, has_flag
 
 if TYPE_CHECKING:
     from iblf_jax.simulation.results import Rollout
@@ -97,7 +97,9 @@ def _metric(runs: Pair, name: str) -> ByName:
 def bounds_kept(runs: Pair) -> PaperClaim:
     """Claim: the constraint boundaries are not broken."""
     margins = _metric(runs, "margin")
-    flagged = [name for name, run in runs.items() if int(run.status) & int(Status.BOUND_VIOLATED)]
+    flagged = [
+        name for name, run in runs.items() if has_flag(int(run.status), Status.BOUND_VIOLATED)
+    ]
     confirmed = not flagged and all(np.all(m > 0) for m in margins.values())
     detail = f"smallest distance to a bound, joint by joint: {_versus(margins, 'rad')}."
     return PaperClaim(

@@ -58,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Runs the command."""
     from iblf_jax.cli._claims import assumed, paper_claims, remark
-    from iblf_jax.core.status import FAILED, describe
+    from iblf_jax.core.status import FAILED, describe, has_flag
 
     begin = time.perf_counter()
     folder = output_folder(args.out)
@@ -85,7 +85,7 @@ def run(args: argparse.Namespace) -> int:
         f"written to {folder}: figure_1 ... figure_6 (.png, .pdf), arm.gif, rollouts.nc,"
         " metrics.json"
     )
-    return int(any(int(one.status) & int(FAILED) for one in runs.values()))
+    return int(any(has_flag(int(one.status), FAILED) for one in runs.values()))
 
 
 def _simulate_both(args: argparse.Namespace) -> tuple[dict[str, Rollout], dict[str, float]]:

@@ -44,14 +44,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Runs the command."""
-    from iblf_jax.core.status import FAILED, describe
+    from iblf_jax.core.status import FAILED, describe, has_flag
     from iblf_jax.engine.simulate import simulate
 
     file = scenario_of(args)
     options = run_options(args, file)
     folder = optional_folder(args.out)
     result = simulate(file.scenario, **options, seed=args.seed)
-    failed = bool(int(result.status) & int(FAILED))
+    failed = has_flag(int(result.status), FAILED)
     print(
         f"{args.scenario}: {options['duration']:g} s, dt = {options['dt']:g} s, {options['method']}"
     )

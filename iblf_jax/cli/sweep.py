@@ -41,7 +41,7 @@ def run(args: argparse.Namespace) -> int:
     """Runs the command."""
 
     def work(execution: dict[str, Any]) -> int:
-        from iblf_jax.core.status import FAILED
+        from iblf_jax.core.status import FAILED, has_flag
         from iblf_jax.files.study import load_study_file
         from iblf_jax.studies import StoreOptions, distributed
         from iblf_jax.studies.sweep import sweep
@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
         if distributed.rank() == 0:
             print(report(data))
         write_netcdf(data, args.out)
-        return int((data.status & int(FAILED)).any())
+        return int(has_flag(data.status, FAILED).any())
 
     return run_study(args, work)
 
@@ -74,11 +74,11 @@ def report(data: xarray.Dataset) -> str:
     import numpy as np
 
     from iblf_jax.cli._common import number
-    from iblf_jax.core.status import FAILED
+    from iblf_jax.core.status import FAILED, has_flag
 
     config = json.loads(data.attrs["config"])
     runs = config["runs"]
-    failed = ((data.status & int(FAILED)) != 0).values.reshape(-1, runs).sum(1)
+    failed = has_flag(data.status, FAILED).values.reshape(-1, runs).sum(1)
     rows = [[*(config["points"] or ["point"]), "failed"]]
     margin = None
     if "margin" in data:

@@ -15,7 +15,7 @@ import numpy as np
 
 from iblf_jax.core import checks, notices
 from iblf_jax.core.pytree import astype
-from iblf_jax.core.status import FAILED, Status, describe
+from iblf_jax.core.status import FAILED, Status, describe, has_flag
 from iblf_jax.deployment.build import write_files
 from iblf_jax.deployment.c_names import FILES, RESERVED
 from iblf_jax.deployment.control_law import SampleInputs, control_law, sample, start
@@ -287,7 +287,7 @@ def vectors(scenario: Scenario, external_reference: bool) -> Vectors:
     torques = np.asarray(_torques(scenario, first, inputs))
     _check_torques(scenario, first, inputs, torques, " of the simulated run")
     status = int(run.status)
-    if status & int(FAILED | Status.SAMPLING_TOO_SLOW):
+    if has_flag(status, FAILED | Status.SAMPLING_TOO_SLOW):
         notices.warn(
             f"the simulated run with this law every {period:g} s: {describe(status)}. The exported"
             " code is that law; ij.recommended_period(scenario) returns how long a period may be."

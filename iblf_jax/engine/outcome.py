@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.core.status import Status, flag
+from iblf_jax.core.status import Status, flag, has_flag
 from iblf_jax.engine.carry import Carry, Inputs
 from iblf_jax.engine.linearization import Linearization, fastest_mode
 from iblf_jax.engine.metric_folds import finished
@@ -51,7 +51,7 @@ def outcome_of(
         instants.jacobian, inputs.scenario.sampling is not None
     ) & (inputs.dt * steepest > limit)
     status |= flag(~(estimate.relative <= error_estimate.TOLERANCE), Status.INACCURATE)
-    suffers = status & int(Status.STEP_TOO_LARGE | Status.INACCURATE) != 0
+    suffers = has_flag(status, Status.STEP_TOO_LARGE | Status.INACCURATE)
     status |= flag(jnp.any(steep) & suffers, Status.INFINITE_SLOPE)
     metrics = error_estimate.results(estimate)
     if inputs.scenario.sampling is not None:

@@ -20,7 +20,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from iblf_jax.core import checks, notices
-from iblf_jax.core.status import VELOCITY_LIMIT, Status
+from iblf_jax.core.status import VELOCITY_LIMIT, Status, has_flag
 from iblf_jax.engine.machine_function import machine_function
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.single_run import run_one
@@ -282,7 +282,7 @@ def _find_part(scenario: Scenario, duration: float, method: str) -> float:
         dt = jnp.asarray(period / parts, scenario.initial.q.dtype)
         found = run_one(scenario, (), dt, RunRequest(periods * parts, method, parts), noise)
         q, width = found.records[0]["q"], found.records[0]["upper"] - found.records[0]["lower"]
-        poor = int(found.status) & int(Status.STEP_TOO_LARGE | Status.INACCURATE)
+        poor = has_flag(int(found.status), Status.STEP_TOO_LARGE | Status.INACCURATE)
         if (
             before is not None
             and not poor_before

@@ -141,7 +141,7 @@ class Study:
     @property
     def failed(self) -> np.ndarray:
         """Indices of the runs with a flag of `status.FAILED`."""
-        return np.flatnonzero(self.status & int(FAILED))
+        return np.flatnonzero(has_flag(self.status, FAILED))
 
     @property
     def made(self) -> np.ndarray:

@@ -33,7 +33,7 @@ import numpy as np
 from iblf_jax.core import checks, notices
 from iblf_jax.core.progress import bar
 from iblf_jax.core.pytree import astype
-from iblf_jax.core.status import VIOLATED, Status, describe
+from iblf_jax.core.status import VIOLATED, Status, describe, has_flag
 from iblf_jax.engine import RunRequest
 from iblf_jax.engine.simulate import simulate
 from iblf_jax.simulation.metrics import check_needs
@@ -87,7 +87,7 @@ class Attack:
         """Whether the scenario was falsified: a run within the sets did not keep its bounds or
         regions, or ran away.
         """
-        return bool(self.status & int(VIOLATED | Status.NOT_FINITE))
+        return has_flag(self.status, VIOLATED | Status.NOT_FINITE)
 
     def replay(self, record_every: int = 1) -> Rollout:
         """The worst run, in full."""

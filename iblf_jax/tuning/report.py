@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.core.status import Status
+from iblf_jax.core.status import Status, has_flag
 from iblf_jax.engine import RunRequest, report_runs_per_batch
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Scenario, canonical
@@ -245,7 +245,7 @@ class _Sample(NamedTuple):
 
     def left_bounds(self) -> np.ndarray:
         """Whether each run left its bounds or diverged, (N,)."""
-        return self.status & int(VIOLATED) != 0
+        return has_flag(self.status, VIOLATED)
 
 
 class ReportRequest(NamedTuple):
@@ -461,7 +461,7 @@ def _broken(objective: Objective, r: int, sample: _Sample) -> np.ndarray:
         return sample.left_bounds()
     values = jnp.asarray(sample.exact[:, len(objective.terms) + r])
     satisfied = np.asarray(requirement.excess(values)) < 0
-    return ~satisfied | (sample.status & int(Status.NOT_FINITE) != 0)
+    return ~satisfied | has_flag(sample.status, Status.NOT_FINITE)
 
 
 def _at_half_the_step(objective: Objective, full: _Sample, half: _Sample) -> str:
