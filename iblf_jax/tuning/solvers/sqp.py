@@ -70,7 +70,17 @@ RATIO_TO_GROW = 0.7
 SHRINK_FACTOR = 0.4
 GROWTH_FACTOR = 2.0
 SMALLEST_EIGENVALUE = 1e-6
-"""Of the model's matrix, relative to its largest."""
+"""Of the model's matrix, relative to the largest of the Gauss-Newton matrix: a wrong secant matrix
+can have much larger ones, which must not limit the others."""
+LARGEST_LOSS_FACTOR = 10.0
+"""A trial whose loss is so many times the accepted one says nothing of the curvature there."""
+MOST_REJECTIONS = 4
+"""Rejected steps one after the other, after which the secant matrices are set to zero."""
+CUTS = 3
+CUT_RATIO = RATIO_TO_ACCEPT
+CUT_REACH = 3.0
+STATIONARITY_TOLERANCE = 1e-3
+"""Largest entry of the Lagrangian's gradient at convergence, relative to the objective."""
 TARGET_EXCESS = 1e-5
 """How far inside its limit a requirement is aimed at, in its scale, so that rounding does not
 violate it."""
@@ -246,10 +256,10 @@ def _pieces_that_may_bind(
     return Selected(run[order], own[piece[order]])
 
 
-def positive_definite(matrix: np.ndarray) -> np.ndarray:
-    """The symmetric matrix with its eigenvalues increased to a positive lower limit."""
+def positive_definite(matrix: np.ndarray, scale: float) -> np.ndarray:
+    """The symmetric matrix with its eigenvalues increased to SMALLEST_EIGENVALUE * scale."""
     values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
-    largest = max(float(np.max(np.abs(values))), 1e-12)
+    largest = max(min(scale, float(np.max(np.abs(values)))), 1e-12)
     return (vectors * np.maximum(values, SMALLEST_EIGENVALUE * largest)) @ vectors.T
 
 
@@ -324,6 +334,14 @@ class SQPState:
     """Whether z has been evaluated with the present loss."""
     done: Any
     stuck: Any
+    rejections: Any
+    """Rejected steps since the last accepted one."""
+    cut_z: np.ndarray
+    """Trials of which the pieces are also constraints, (CUTS, p); NaN where there is none."""
+    cut_pieces: np.ndarray
+    """Their e, (CUTS, B, M)."""
+    cut_gradients: np.ndarray
+    """Their a, (CUTS, B, p, M)."""
 
     @property
     def size(self) -> float:
@@ -414,6 +432,10 @@ class SQP:
             evaluated=False,
             done=False,
             stuck=False,
+            rejections=0,
+            cut_z=np.full((CUTS, size), np.nan),
+            cut_pieces=np.zeros((CUTS, runs, pieces)),
+            cut_gradients=np.zeros((CUTS, runs, size, pieces)),
         )
 
     def restart(
@@ -467,7 +489,13 @@ def _advance(space: SearchSpace, state: SQPState, found: Point, tolerance: float
     ratio = -np.inf
     if valid:
         ratio = _decrease_ratio(space, state, found)
-        _update_curvatures(state, step, found)
+        if abs(found.loss - state.here.loss) <= LARGEST_LOSS_FACTOR * state.size:
+            _update_curvatures(state, step, found)
+    state.rejections = 0 if ratio > RATIO_TO_ACCEPT else state.rejections + 1
+    if state.rejections >= MOST_REJECTIONS:
+        _forget_curvatures(state)
+    if valid and ratio < CUT_RATIO:
+        keep_cut(state, state.trial, found)
     if ratio > RATIO_TO_ACCEPT:
         _accept(space, state, found)
     elif valid and not state.corrected and _correct(space, state, step, found.pieces):
@@ -477,6 +505,13 @@ def _advance(space: SearchSpace, state: SQPState, found: Point, tolerance: float
     elif ratio > RATIO_TO_GROW and length > 0.9 * state.radius:
         state.radius = min(GROWTH_FACTOR * state.radius, LARGEST_RADIUS)
     _plan(space, state, tolerance)
+
+
+def _forget_curvatures(state: SQPState) -> None:
+    """Sets A and every C_j to zero, as the model that they are part of has failed repeatedly."""
+    state.correction[:] = 0.0
+    state.curvatures[:] = 0.0
+    state.rejections = 0
 
 
 def _merit(space: SearchSpace, state: SQPState, loss: float, pieces: np.ndarray) -> float:
@@ -527,24 +562,58 @@ def _solve(space: SearchSpace, state: SQPState, pieces: np.ndarray, penalty: flo
     """The subproblem at the accepted point, with `pieces` as c."""
     multipliers = state.piece_multipliers.ravel()[state.curved]
     of_pieces = np.einsum("k,kpq->pq", multipliers, state.curvatures)
-    matrix = positive_definite(state.here.matrix + state.correction + of_pieces)
+    scale = float(np.linalg.norm(state.here.matrix, 2))
+    matrix = positive_definite(state.here.matrix + state.correction + of_pieces, scale)
     low = np.maximum(space.box.low - state.z, -state.radius)
     high = np.minimum(space.box.high - state.z, state.radius)
-    return solve_subproblem(
+    cuts = near_cuts(state)
+    constraints = with_cuts(space.constraints, len(cuts))
+    found = solve_subproblem(
         state.here.gradient,
         matrix,
         low,
         high,
-        space.constraints,
-        pieces,
-        state.here.piece_gradients,
+        constraints,
+        np.concatenate([pieces, *(cut_values(state, c) for c in cuts)], axis=1),
+        np.concatenate([state.here.piece_gradients, *state.cut_gradients[cuts]], axis=2),
         penalty,
     )
+    by_cut = found.piece_multipliers.reshape(len(pieces), 1 + len(cuts), -1)
+    return found._replace(piece_multipliers=by_cut.sum(axis=1))
+
+
+def near_cuts(state: SQPState) -> list[int]:
+    distance = np.max(np.abs(state.cut_z - state.z), axis=1)
+    return [c for c in range(CUTS) if 0 < distance[c] <= CUT_REACH * state.radius]
+
+
+def cut_values(state: SQPState, c: int) -> np.ndarray:
+    """A cut at the accepted point, lowered where it would be above the piece itself."""
+    change = np.einsum("p,bpm->bm", state.z - state.cut_z[c], state.cut_gradients[c])
+    return np.minimum(state.cut_pieces[c] + change, state.here.pieces)
+
+
+def with_cuts(constraints: Constraints, cuts: int) -> Constraints:
+    return constraints._replace(owner=np.tile(constraints.owner, 1 + cuts))
+
+
+def keep_cut(state: SQPState, z: np.ndarray, found: Point) -> None:
+    for old, new in (
+        (state.cut_z, z),
+        (state.cut_pieces, found.pieces),
+        (state.cut_gradients, found.piece_gradients),
+    ):
+        old[1:] = old[:-1].copy()
+        old[0] = new
 
 
 def _predicted_decrease(space: SearchSpace, state: SQPState, step: np.ndarray) -> float:
     """Decrease of the penalty function by the quadratic models of objective and pieces."""
     pieces = state.here.pieces + state.here.linear_change(step) + state.curvature_along(step)
+    cuts = near_cuts(state)
+    for c in cuts:
+        change = np.einsum("p,bpm->bm", step, state.cut_gradients[c])
+        pieces = np.maximum(pieces, cut_values(state, c) + change)
     matrix = state.here.matrix + state.correction
     change = float(state.here.gradient @ step + 0.5 * step @ matrix @ step)
     return _merit(space, state, 0.0, state.here.pieces) - _merit(space, state, change, pieces)
@@ -590,9 +659,11 @@ def _plan(space: SearchSpace, state: SQPState, tolerance: float) -> None:
     length = np.max(np.abs(found.step))
     is_feasible = violation <= TARGET_EXCESS or reduction < 1e-3 * violation
     is_flat = is_feasible and linear_decrease < tolerance * state.size
-    state.done = bool(length < 1e-7 or is_flat)
-    limited_by_radius = length > 0.9 * state.radius
-    state.stuck = bool(state.done and limited_by_radius and state.radius < COLLAPSED_RADIUS)
+    slope_scale = state.size if violation <= TARGET_EXCESS else state.penalty
+    is_stationary = state.residuals[0] <= STATIONARITY_TOLERANCE * slope_scale
+    is_optimal = bool(length < 1e-7 or (is_flat and is_stationary))
+    state.stuck = bool(not is_optimal and state.radius < COLLAPSED_RADIUS)
+    state.done = is_optimal or state.stuck
 
 
 def _best_with_curvature(
