@@ -211,6 +211,7 @@ def _derivative_sizes(
     return DerivativeSizes(
         count_kept_numbers,
         nodes_together=nodes * (1 + along.tangents),
+        nodes_per_operation=nodes / operations(batch.leaves.first),
         max_nodes=executor.limits.derivative_nodes,
     )
 

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.optional import has_members
 from iblf_jax.core.pytree import field_values
 from iblf_jax.tuning.parameters import Box
 from iblf_jax.tuning.robust import worst_count
@@ -180,10 +181,10 @@ def _word(name: str, value: Any, allowed: tuple[str, ...]) -> str:
 
 
 def _optimiser(name: str, value: Any) -> Any:
-    """An optimiser of optax, or None."""
+    """An optimiser of optax, which is a tuple of functions, or None."""
     expected = "an optax.GradientTransformation such as optax.lion(1e-3)"
-    if value is not None:
-        checks.offers(name, value, ("init", "update"), expected)
+    if value is not None and not has_members(value, "init", "update"):
+        raise checks.fail(name, value, expected)
     return value
 
 

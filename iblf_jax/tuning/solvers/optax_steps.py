@@ -7,9 +7,9 @@ back towards its last valid point, and its rate stays halved.
 With `batch`, a step evaluates and differentiates only so many of the runs.  An epoch goes through a
 permutation of the runs that depends on the seed and the number of the epoch; the remainder of a
 division of the runs by `batch` is left out, and is another one in each epoch.  With `resample`,
-each step has new runs.  Either way a low loss may be due to the runs of a step.  So every CHECK_STEPS
-steps, and at the last one, the search gets the value on all of the tuning's own runs, without
-derivatives; other steps are not candidates for the result.
+each step has new runs.  Either way a low loss may be due to the runs of a step.  So every
+CHECK_STEPS steps, and at the last one, the search gets the value on all of the tuning's own runs,
+without derivatives; other steps are not candidates for the result.
 
 What a mini-batch minimises, for the losses L_b of all runs:
 
@@ -138,7 +138,7 @@ def init(solver: Any, space: SearchSpace, z: np.ndarray) -> dict[str, Any]:
             " ij.tuning.LBFGS()."
         )
         expected = "an optimiser that needs gradients, parameters and the loss only"
-        raise checks.fail("optimiser", solver.transformation, expected, remedy) from error
+        raise checks.fail("optimiser", solver.optimiser, expected, remedy) from error
     return {
         "w": w,
         "last_valid": w.copy(),
@@ -241,7 +241,7 @@ def _warn_of_bias(solver: Any, problem: Any) -> None:
 
 
 def _value_on_all_runs(solver: Any, evaluate: Any, z: np.ndarray, value: Any, number: int) -> Any:
-    """The value at z on all runs where it is due; otherwise the given one, not valid as a result."""
+    """The value at z on all runs where it is due; otherwise the given one, marked as not valid."""
     interval = min(CHECK_STEPS, solver.patience)
     is_last = number + 1 >= evaluate.space.iterations
     if number % interval and not is_last:
