@@ -221,6 +221,7 @@ def test_other_optimisers_survive_points_without_a_finite_loss(optimiser):
         (lambda: Adam(batch=0), "batch"),
         (lambda: Optax("lion"), "optax.GradientTransformation"),
         (lambda: Optax(optax.lbfgs()), "LBFGS"),
+        (lambda: Optax(optax.add_noise(0.1, 0.5, key=1)), "random key"),
     ],
 )
 def test_options_that_do_not_fit_are_refused(solver, words):

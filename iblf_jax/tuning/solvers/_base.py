@@ -10,6 +10,7 @@ import numpy as np
 from iblf_jax.core import checks
 from iblf_jax.core.optional import has_members
 from iblf_jax.core.pytree import field_values
+from iblf_jax.studies.designs import MAX_RUNS
 from iblf_jax.tuning.parameters import Box
 from iblf_jax.tuning.robust import worst_count
 
@@ -189,7 +190,7 @@ def _optimiser(name: str, value: Any) -> Any:
 
 
 def _batch(name: str, value: Any) -> int | None:
-    return None if value is None else checks.positive_integer(name, value)
+    return None if value is None else checks.positive_integer(name, value, most=MAX_RUNS)
 
 
 CHECKS: dict[str, Any] = {

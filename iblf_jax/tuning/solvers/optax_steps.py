@@ -58,7 +58,7 @@ class Optax:
 
     Args:
       optimiser: an `optax.GradientTransformation` that needs gradients, parameters and the loss
-        only; `optax.adam(1e-2)` if not given.
+        only, and no random key; `optax.adam(1e-2)` if not given.
       batch: number of the runs that a step evaluates; all of them if not given.  A mini-batch of
         the worst runs or of requirements is biased, see the head of this module; the result is
         chosen on all runs.
@@ -132,17 +132,18 @@ def init(solver: Any, space: SearchSpace, z: np.ndarray) -> dict[str, Any]:
     try:
         inner = jax.vmap(solver.transformation(space.iterations).init)(jnp.asarray(w))
         jax.eval_shape(partial(_updated, solver, space.iterations), w, inner, w, w[:, 0])
+        inner = jax.tree.map(np.array, inner)
     except Exception as error:
         remedy = (
-            f"It raised {type(error).__name__}: {error}. Line searches are not supported: take"
-            " ij.tuning.LBFGS()."
+            f"It raised {type(error).__name__}: {error}. For a line search take ij.tuning.LBFGS();"
+            " noise comes from batch=... and resample=True, not from a random key in its state."
         )
         expected = "an optimiser that needs gradients, parameters and the loss only"
         raise checks.fail("optimiser", solver.optimiser, expected, remedy) from error
     return {
         "w": w,
         "last_valid": w.copy(),
-        "inner": jax.tree.map(np.array, inner),
+        "inner": inner,
         "rate": np.ones(len(z)),
         "steps": np.asarray(0),
     }
