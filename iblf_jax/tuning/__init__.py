@@ -20,7 +20,7 @@ and validates the result on fresh runs.
 | `problem` | `TuningProblem`: all of the above in one object |
 | `rollouts`, `runs` | batches of runs without and with derivatives |
 | `evaluation` | value and derivatives of the problem |
-| `solvers` | the Protocol `Solver`; `SQP`, `LBFGS`, `Adam` |
+| `solvers` | the Protocol `Solver`; `SQP`, `LBFGS`, `Adam`, `Optax` |
 | `starts`, `search`, `checkpoints` | where a search begins, its steps, its stored state |
 | `result`, `report` | what `tune` returns, and its validation on fresh runs |
 | `_tune` | `tune`, which calls these in this order |
@@ -43,6 +43,7 @@ from iblf_jax.tuning.solvers import LBFGS as LBFGS
 from iblf_jax.tuning.solvers import SOLVERS as SOLVERS
 from iblf_jax.tuning.solvers import SQP as SQP
 from iblf_jax.tuning.solvers import Adam as Adam
+from iblf_jax.tuning.solvers import Optax as Optax
 from iblf_jax.tuning.solvers import Optimality as Optimality
 from iblf_jax.tuning.solvers import SearchSpace as SearchSpace
 from iblf_jax.tuning.solvers import Solver as Solver

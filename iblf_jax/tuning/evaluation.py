@@ -347,6 +347,17 @@ class Evaluator:
             return found
         return _scattered(found, active, len(z))
 
+    def values(self, z: np.ndarray) -> Value:
+        """Value at z, (S, p), on the problem's own runs, without derivatives."""
+        candidates = self.candidates._replace(
+            z=np.asarray(z, self.problem.dt.dtype), index=self.problem.candidates(z).index
+        )
+
+        def of_rows(rows: np.ndarray) -> Value:
+            return value(self.problem, jax.tree.map(lambda x: np.asarray(x)[rows], candidates))
+
+        return in_groups(of_rows, len(z), self.problem.points_together(len(z)))
+
     def row(self, start: int) -> tuple[TuningProblem, Candidate]:
         """The problem, and the candidate of one start as a batch of one."""
         one = jax.tree.map(lambda x: np.asarray(x)[start : start + 1], self.candidates)

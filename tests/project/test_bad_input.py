@@ -469,6 +469,7 @@ GOOD = {
     "SQP": lambda **x: ij.tuning.SQP(**x),
     "LBFGS": lambda **x: ij.tuning.LBFGS(**x),
     "Adam": lambda **x: ij.tuning.Adam(**x),
+    "Optax": lambda **x: ij.tuning.Optax(**x),
     "Report": lambda **x: ij.tuning.Report(**x),
     "falsify": lambda **x: ij.falsify(**({"scenario": WEAK, "perturbations": DRAWN, **SHORT} | x)),
     "pareto": lambda **x: ij.pareto(
@@ -568,6 +569,8 @@ REFUSED = {
     "tune solver": (("nope", "", LONG_NAME, 3, [], ij.tuning.SQP), ["'sqp'"]),
     "tune report": ((3, [], "x", ij.tuning.Report), ["ij.tuning.Report"]),
     "tune risk": (NO_WORDS, ["'cvar'"]),
+    "Adam batch": (NO_COUNTS[1:], ["whole number"]),
+    "Optax optimiser": (("lion", 3, [], {}), ["optax.GradientTransformation"]),
     "Adam resample": (NO_FLAGS, ["True or False"]),
     "falsify starts": (NO_COUNTS, []),
     "falsify iterations": (NO_COUNTS, ["whole number"]),

@@ -406,6 +406,7 @@ ENTRIES = {
         ij.tuning.Adam,
         {"learning_rate": 0.1, "schedule": "cosine", "resample": False, "mode": "auto"},
     ),
+    "Optax": (ij.tuning.Optax, {"optimiser": None, "batch": None, "mode": "auto"}),
     "tuning.Report": (ij.tuning.Report, {"runs": 4, "seed": None, "confidence": 0.9}),
     "pareto": (
         ij.pareto,

@@ -644,6 +644,7 @@ class Bowl:
         )
 
     def __call__(self, z):
+        self.evaluations += 1
         candidates = self.row(0)[1]._replace(z=jnp.asarray(z))
         return jax.tree.map(np.asarray, self.derivatives(None, candidates))
 

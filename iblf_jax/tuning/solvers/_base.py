@@ -8,7 +8,9 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.optional import has_members
 from iblf_jax.core.pytree import field_values
+from iblf_jax.studies.designs import MAX_RUNS
 from iblf_jax.tuning.parameters import Box
 from iblf_jax.tuning.robust import worst_count
 
@@ -179,7 +181,21 @@ def _word(name: str, value: Any, allowed: tuple[str, ...]) -> str:
     return value
 
 
+def _optimiser(name: str, value: Any) -> Any:
+    """An optimiser of optax, which is a tuple of functions, or None."""
+    expected = "an optax.GradientTransformation such as optax.lion(1e-3)"
+    if value is not None and not has_members(value, "init", "update"):
+        raise checks.fail(name, value, expected)
+    return value
+
+
+def _batch(name: str, value: Any) -> int | None:
+    return None if value is None else checks.positive_integer(name, value, most=MAX_RUNS)
+
+
 CHECKS: dict[str, Any] = {
+    "optimiser": _optimiser,
+    "batch": _batch,
     "mode": lambda name, x: _word(name, x, MODES),
     "resample": checks.boolean,
     "starts": checks.positive_integer,
@@ -200,3 +216,8 @@ def check_options(options: Any) -> None:
     """Checks the fields of a frozen dataclass of options, and converts them to their types."""
     for name, value in field_values(options).items():
         object.__setattr__(options, name, CHECKS[name](name, value))
+
+
+def where_rows(mask: np.ndarray, new: Any, old: Any) -> np.ndarray:
+    """Rows of `new` where the mask, (S,), is true, of `old` otherwise."""
+    return np.where(mask.reshape((-1,) + (1,) * (np.ndim(new) - 1)), new, old)
