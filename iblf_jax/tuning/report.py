@@ -127,7 +127,8 @@ class Verdict:
             return ""
         if self.unit == OF_LIMIT:
             return f"; the worst joint is at {100 * self.value:.4g} % of its limit"
-        text = f"; {self.value:.5g} {self.unit}"
+        what = "margin of the worst runs " if self.event == "violated" else ""
+        text = f"; {what}{self.value:.5g} {self.unit}"
         if self.verdict != "fail":
             return text
         side = "above" if self.value > self.limit else "below"

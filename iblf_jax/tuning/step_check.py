@@ -46,6 +46,9 @@ class RequirementAtSteps:
     """The limited quantity: its mean over the worst allowed share of the runs."""
     limit: float
     unit: str
+    event: str = "value"
+    """"violated" for a limit of the probability that bounds are violated, which the search replaces
+    by the margin of the worst runs."""
 
     @property
     def is_broken(self) -> tuple[bool, bool]:
@@ -55,7 +58,8 @@ class RequirementAtSteps:
 
     def __str__(self) -> str:
         full, half = (self._with_unit(value) for value in self.value)
-        text = f"{self.name}: {full}, at dt / 2 {half}"
+        what = "margin of the worst runs " if self.event == "violated" else ""
+        text = f"{self.name}: {what}{full}, at dt / 2 {half}"
         if self.is_broken[0]:
             return f"{text}: BROKEN by {self._amount(0)}"
         if not self.is_broken[1]:
@@ -287,4 +291,5 @@ def _requirement_at_steps(
     full, half = (combined_excess(objective, r, x) for x in samples)
     limit, scale = float(requirement.limit), float(requirement.scale)
     values = sign * (limit + scale * full), sign * (limit + scale * half)
-    return RequirementAtSteps(requirement.name, (full, half), values, sign * limit, unit)
+    event = requirement.event
+    return RequirementAtSteps(requirement.name, (full, half), values, sign * limit, unit, event)

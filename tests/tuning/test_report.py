@@ -214,6 +214,8 @@ def test_a_requirement_that_half_the_step_breaks_is_named_with_its_amount():
     )
     assert str(at_steps(0.03, 0.02)).endswith("BROKEN by 0.3 N m")
     assert str(at_steps(-0.1, -0.1)).endswith(": kept")
+    margin = dataclasses.replace(at_steps(-0.1, -0.1, "p < 0.1"), event="violated")
+    assert str(margin).startswith("p < 0.1: margin of the worst runs 9 N m")
     within = made_up_check(at_steps(-1e-5, 5e-4))
     assert not within.worst.is_broken and not within.warnings_of_requirements()
     assert "broken there by 0.0005 of its scale, within the tolerance of 0.001" in str(within)
@@ -437,3 +439,19 @@ def test_without_failures_there_is_no_explanation(paper):
     request = ReportRequest(paper, paper, ("controller.K2",), goal, options, Report(runs=8, seed=2))
     report = make_report(request)
     assert report.failures == () and report.step_check is None and report.halved == ""
+
+
+@pytest.mark.slow
+def test_runs_that_differ_in_noise_only_are_fresh_too(paper):
+    sensor = ij.sensors.Encoder(velocity=ij.sensors.Measured(noise=0.05))
+    noisy = dataclasses.replace(paper, sampling=ij.Sampling(period=2e-3), sensor=sensor)
+    gains = {"controller.K2": np.array([4.0, 1.0])}
+    result = result_of(noisy, gains, goal_of(paper, 8.0), runs=4)
+    assert (result.step_check.runs, result.step_check.seed) == (4, 0)
+    report = result.report
+    assert (report.runs, report.seed) == (200, 7)
+    (found,) = report.failures
+    assert 0 < found.count < 200 and found.influence is None
+    assert "no perturbation differs between the runs" in str(report)
+    with pytest.raises(ValueError, match="fresh"):
+        result.check(seed=0)
