@@ -19,7 +19,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -27,7 +27,7 @@ import numpy as np
 from iblf_jax.simulation.paths import unit_at
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.draws import Target, UncertainScenario, draw
-from iblf_jax.studies.statistics import scalar_samples
+from iblf_jax.studies.summaries import initial_margins
 
 FEWEST_FAILURES = 3
 """Failed runs from which a perturbation is called influential."""
@@ -90,6 +90,8 @@ class FailedRuns:
     runs: int
     diverged: int
     """How many of them diverged."""
+    started_outside: int
+    """How many of them were drawn outside their bounds at t = 0, so that no gains keep these."""
     first: tuple[int, ...]
     """Numbers of the first of them, at most LISTED_RUNS: of the runs of `ij.monte_carlo` with the
     same perturbations and the seed of the report."""
@@ -110,9 +112,12 @@ class FailedRuns:
         if self.requirement is not None:
             event = f"broke {self.requirement}"
         text = f"{self.count} of {self.runs} runs {event}"
+        details = []
+        if self.started_outside:
+            details.append(f"{self.started_outside} of them started outside")
         if self.diverged:
-            text += f" ({self.diverged} of them diverged)"
-        return text
+            details.append(f"{self.diverged} of them diverged")
+        return f"{text} ({'; '.join(details)})" if details else text
 
     def cause_in_words(self) -> str:
         """The most influential perturbation, or why none is named."""
@@ -136,36 +141,43 @@ class FailedRuns:
         return f"most influential: {found}"
 
 
-def failed_runs(
-    requirement: str | None,
-    failed: np.ndarray,
-    diverged: np.ndarray,
-    admissible: np.ndarray,
-    numbers: Mapping[str, np.ndarray],
-    scenario: Scenario,
-) -> FailedRuns | None:
+class FreshRuns(NamedTuple):
+    """What is known of N fresh runs besides which of them failed."""
+
+    diverged: np.ndarray
+    """(N,) bool."""
+    admissible: np.ndarray
+    """Whether each run was made, (N,)."""
+    started_outside: np.ndarray
+    """Whether each run was drawn outside its bounds at t = 0, (N,)."""
+    numbers: Mapping[str, np.ndarray]
+    """Path -> perturbed number, (N,)."""
+    scenario: Scenario
+    """For units."""
+
+
+def failed_runs(requirement: str | None, failed: np.ndarray, fresh: FreshRuns) -> FailedRuns | None:
     """The explanation of failed runs; None where no run failed.
 
     Args:
       requirement: that they broke; None for bounds.
-      failed, diverged: whether each run did, (N,).
-      admissible: whether each run was made, (N,).
-      numbers: path -> perturbed number of each run, (N,).
-      scenario: for units.
+      failed: whether each run did, (N,).
+      fresh: these and the other runs.
     """
-    failed = failed & admissible
+    made = fresh.admissible
+    failed = failed & made
     count = int(np.sum(failed))
     if not count:
         return None
+    numbers = {path: x[made] for path, x in fresh.numbers.items()}
     return FailedRuns(
         requirement=requirement,
         count=count,
-        runs=int(np.sum(admissible)),
-        diverged=int(np.sum(failed & diverged)),
+        runs=int(np.sum(made)),
+        diverged=int(np.sum(failed & fresh.diverged)),
+        started_outside=int(np.sum(failed & fresh.started_outside)),
         first=tuple(np.flatnonzero(failed)[:LISTED_RUNS].tolist()),
-        influence=most_influential(
-            {path: x[admissible] for path, x in numbers.items()}, failed[admissible], scenario
-        ),
+        influence=most_influential(numbers, failed[made], fresh.scenario),
     )
 
 
@@ -253,24 +265,26 @@ def _distinct_draws(x: np.ndarray) -> list[int]:
     return found
 
 
-def drawn_numbers(
-    cases: UncertainScenario, targets: tuple[Target, ...], point: Mapping[str, Any], runs: int
-) -> dict[str, np.ndarray]:
-    """Path -> perturbed number of runs 0 to `runs` - 1, (N,), entry by entry of each leaf.
+@partial(jax.jit, static_argnames="targets")
+def drawn_leaves(
+    cases: UncertainScenario, point: Any, index: jax.Array, *, targets: tuple[Target, ...]
+) -> dict[str, jax.Array]:
+    """Path -> values of the perturbed leaves in the runs with these numbers, (N, ...).
 
     Args:
       cases: scenario, perturbations and key.
-      targets: what is perturbed.
       point: path -> value that replaces the scenario's before the perturbation.
-      runs: N.
+      index: numbers of the runs, (N,) uint32.
+      targets: what is perturbed.
     """
-    if not targets:
-        return {}
-    return scalar_samples(_draws(cases, point, np.arange(runs, dtype=np.uint32), targets=targets))
-
-
-@partial(jax.jit, static_argnames="targets")
-def _draws(
-    cases: UncertainScenario, point: Any, index: jax.Array, *, targets: tuple[Target, ...]
-) -> dict[str, jax.Array]:
     return jax.vmap(lambda i: draw(cases, targets, i, point, {})[1])(index)
+
+
+def is_outside(scenario: Scenario, leaves: Mapping[str, Any], runs: int) -> np.ndarray:
+    """Whether each of N runs starts outside its bounds, (N,), from their perturbed leaves."""
+    outside = np.zeros(runs, bool)
+    if not leaves:
+        return outside
+    for margins in initial_margins(scenario, dict(leaves)).values():
+        outside |= ~(np.min(margins, axis=1) > 0)
+    return outside

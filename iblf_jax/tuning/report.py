@@ -31,8 +31,14 @@ import numpy as np
 from iblf_jax.core.status import Status, has_flag
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.studies.statistics import Probability, probability
-from iblf_jax.tuning.failures import FailedRuns, drawn_numbers, failed_runs
+from iblf_jax.studies.statistics import Probability, probability, scalar_samples
+from iblf_jax.tuning.failures import (
+    FailedRuns,
+    FreshRuns,
+    drawn_leaves,
+    failed_runs,
+    is_outside,
+)
 from iblf_jax.tuning.objectives import Objective
 from iblf_jax.tuning.options import Report, TuningRunOptions
 from iblf_jax.tuning.quantities import OF_LIMIT
@@ -197,13 +203,13 @@ class TuningReport:
     @property
     def failed(self) -> bool:
         """Whether bounds are violated more often than a requirement allows, or at all where none
-        limits the probability, a requirement failed, or one is broken at dt / 2 beyond the
-        tolerance.
+        limits the probability, a requirement failed, or the runs of the tuning break one at dt / 2
+        that they keep at dt.
         """
         check = self.step_check
         if any(v.verdict == "fail" for v in self.verdicts):
             return True
-        if check is not None and check.worst.is_broken:
+        if check is not None and check.newly_broken:
             return True
         allows_violations = any(v.event == "violated" for v in self.verdicts)
         return not (self.bounds_kept or allows_violations)
@@ -244,7 +250,7 @@ class TuningReport:
             words.append(f"{counts['undecided']} of {total} requirements undecided")
         if counts["pass"]:
             words.append(f"{counts['pass']} of {total} requirements passed")
-        if self.step_check is not None and self.step_check.worst.is_broken:
+        if self.step_check is not None and self.step_check.newly_broken:
             words.append("a requirement is BROKEN at dt / 2")
         return words
 
@@ -394,12 +400,17 @@ def _failures(
         return ()
     cases, targets = uncertain_scenario(draws)
     point = {path: np.asarray(paths.get(request.after, path)) for path in request.tuned}
-    numbers = drawn_numbers(cases, targets, point, draws.runs)
-    diverged = has_flag(sample.status, Status.NOT_FINITE)
-    found = [
-        failed_runs(name, failed, diverged, sample.admissible, numbers, request.after)
-        for name, failed in events
-    ]
+    index = np.arange(draws.runs, dtype=np.uint32)
+    scenario = paths.with_parameters(cases.scenario, point)
+    leaves = drawn_leaves(cases, point, index, targets=targets)
+    fresh = FreshRuns(
+        diverged=has_flag(sample.status, Status.NOT_FINITE),
+        admissible=sample.admissible,
+        started_outside=is_outside(scenario, leaves, draws.runs),
+        numbers=scalar_samples(leaves),
+        scenario=scenario,
+    )
+    found = [failed_runs(name, failed, fresh) for name, failed in events]
     return tuple(failure for failure in found if failure is not None)
 
 

@@ -21,7 +21,7 @@ from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.tuning.objectives import Objective
 from iblf_jax.tuning.options import TuningRunOptions
-from iblf_jax.tuning.robust import combine, worst_share
+from iblf_jax.tuning.robust import combine, worst_count, worst_share
 from iblf_jax.tuning.samples import Sample, SampleRequest, is_random, sample_runs
 
 STEP_TOLERANCE = 1e-3
@@ -46,6 +46,8 @@ class RequirementAtSteps:
     """The limited quantity: its mean over the worst allowed share of the runs."""
     limit: float
     unit: str
+    averaged: int = 1
+    """How many of the worst runs the value is the mean of: the allowed share."""
     event: str = "value"
     """"violated" for a limit of the probability that bounds are violated, which the search replaces
     by the margin of the worst runs."""
@@ -58,7 +60,9 @@ class RequirementAtSteps:
 
     def __str__(self) -> str:
         full, half = (self._with_unit(value) for value in self.value)
-        what = "margin of the worst runs " if self.event == "violated" else ""
+        what = "margin " if self.event == "violated" else ""
+        if self.averaged > 1:
+            what = f"mean {what}of the worst {self.averaged} runs "
         text = f"{self.name}: {what}{full}, at dt / 2 {half}"
         if self.is_broken[0]:
             return f"{text}: BROKEN by {self._amount(0)}"
@@ -121,6 +125,13 @@ class StepCheck:
         return worst_of([(r.excess[1], r.name) for r in self.requirements], self.violated[1])
 
     @property
+    def newly_broken(self) -> tuple[RequirementAtSteps, ...]:
+        """The requirements that are kept at dt and broken at dt / 2 beyond the tolerance."""
+        return tuple(
+            r for r in self.requirements if not r.is_broken[0] and r.excess[1] > STEP_TOLERANCE
+        )
+
+    @property
     def depends_on_step(self) -> bool:
         """Whether the objective at dt / 2 differs by more than `LARGEST_DIFFERENCE`."""
         full, half = self.objective
@@ -152,10 +163,11 @@ class StepCheck:
         the nominal run only those that are kept at dt, as its report has a verdict on the others.
         """
         rows = []
+        newly_broken = self.newly_broken
         for r in sorted(self.requirements, key=lambda r: -max(r.excess)):
             if r.is_broken[0] and self.seed is not None:
                 rows.append(f"WARNING: {self.subject}: {r}")
-            elif not r.is_broken[0] and r.excess[1] > STEP_TOLERANCE:
+            elif r in newly_broken:
                 remedy = "leave it some room, or take a smaller dt"
                 rows.append(f"WARNING: {self.subject}: {r}; {remedy}")
         return rows
@@ -291,5 +303,12 @@ def _requirement_at_steps(
     full, half = (combined_excess(objective, r, x) for x in samples)
     limit, scale = float(requirement.limit), float(requirement.scale)
     values = sign * (limit + scale * full), sign * (limit + scale * half)
-    event = requirement.event
-    return RequirementAtSteps(requirement.name, (full, half), values, sign * limit, unit, event)
+    return RequirementAtSteps(
+        name=requirement.name,
+        excess=(full, half),
+        value=values,
+        limit=sign * limit,
+        unit=unit,
+        averaged=worst_count(len(samples[0].status), float(requirement.allowed)),
+        event=requirement.event,
+    )

@@ -12,7 +12,13 @@ import iblf_jax as ij
 from iblf_jax import objectives, reports
 from iblf_jax.cli.tune import _has_failed
 from iblf_jax.studies.statistics import probability
-from iblf_jax.tuning.failures import FailedRuns, Influence, failed_runs, most_influential
+from iblf_jax.tuning.failures import (
+    FailedRuns,
+    FreshRuns,
+    Influence,
+    failed_runs,
+    most_influential,
+)
 from iblf_jax.tuning.objectives import complete
 from iblf_jax.tuning.options import Report, TuningRunOptions
 from iblf_jax.tuning.report import Change, ReportRequest, TuningReport, Verdict, make_report
@@ -41,9 +47,10 @@ def drawn(names: str, runs: int = 400, seed: int = 0) -> dict[str, np.ndarray]:
     return dict(zip(names.split(), numbers, strict=True))
 
 
-def explained(paper, numbers, failed, diverged=False) -> FailedRuns:
+def explained(paper, numbers, failed, diverged=False, outside=False) -> FailedRuns:
     every = np.ones(len(failed), bool)
-    return failed_runs(None, failed, every & diverged, every, numbers, paper)
+    fresh = FreshRuns(every & diverged, every, every & outside, numbers, paper)
+    return failed_runs(None, failed, fresh)
 
 
 NAMES = "plant.mass[0] plant.mass[1] initial.q[0] plant.length[1]"
@@ -126,7 +133,8 @@ def test_no_runs_are_left_or_nothing_differs(paper):
         found = explained(paper, numbers, some)
         assert found.influence is None and not found.is_explained
         assert str(found).endswith("no perturbation differs between the runs")
-    assert "(5 of them diverged)" in str(explained(paper, {}, some, diverged=True))
+    found = explained(paper, {}, some, diverged=True, outside=True)
+    assert "(5 of them started outside; 5 of them diverged)" in str(found)
 
 
 def test_numbers_of_one_draw_are_named_together(paper):
@@ -214,8 +222,8 @@ def test_a_requirement_that_half_the_step_breaks_is_named_with_its_amount():
     )
     assert str(at_steps(0.03, 0.02)).endswith("BROKEN by 0.3 N m")
     assert str(at_steps(-0.1, -0.1)).endswith(": kept")
-    margin = dataclasses.replace(at_steps(-0.1, -0.1, "p < 0.1"), event="violated")
-    assert str(margin).startswith("p < 0.1: margin of the worst runs 9 N m")
+    margin = dataclasses.replace(at_steps(-0.1, -0.1, "p < 0.1"), event="violated", averaged=7)
+    assert str(margin).startswith("p < 0.1: mean margin of the worst 7 runs 9 N m")
     within = made_up_check(at_steps(-1e-5, 5e-4))
     assert not within.worst.is_broken and not within.warnings_of_requirements()
     assert "broken there by 0.0005 of its scale, within the tolerance of 0.001" in str(within)
@@ -260,7 +268,7 @@ def made_up_report(
         step_check=check,
         notes=("stopped: converged",),
         failures=tuple(
-            FailedRuns(name, count, 100, 0, (3, 8), cause) for name, count in events if count
+            FailedRuns(name, count, 100, 0, 0, (3, 8), cause) for name, count in events if count
         ),
     )
 
@@ -428,6 +436,20 @@ def test_a_violated_bound_is_in_every_presentation(paper):
     assert result.report.headline.startswith("bounds VIOLATED")
     assert "Tuning: bounds VIOLATED" in result._repr_html_()
     assert _has_failed(result.report)
+
+
+@pytest.mark.slow
+def test_runs_that_were_drawn_outside_their_bounds_are_counted(paper):
+    """The upper bound is 0.1 rad above the start, which is drawn up to 0.12 rad away."""
+    drawn_start = {"initial.q": ij.offset(ij.uniform([0.0, -0.12], [1e-6, 0.12]))}
+    gains = {"controller.K2": np.array([4.0, 1.0])}
+    result = result_of(paper, gains, goal_of(paper, 12.0), perturbations=drawn_start, runs=2)
+    first = result.report.failures[0]
+    study = ij.monte_carlo(result.scenario, drawn_start, runs=200, seed=7, progress=False, **BRIEF)
+    assert first.started_outside == study.started_outside.sum() > 10
+    assert first.count == result.report.violation[1].count == study.violation_probability.count
+    assert first.influence.path == "initial.q[1]" and first.influence.side == "larger"
+    assert f"({first.started_outside} of them started outside" in str(result.report)
 
 
 @pytest.mark.slow
