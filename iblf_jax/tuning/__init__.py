@@ -23,6 +23,7 @@ and validates the result on fresh runs.
 | `solvers` | the Protocol `Solver`; `SQP`, `LBFGS`, `Adam`, `Optax` |
 | `starts`, `search`, `checkpoints` | where a search begins, its steps, its stored state |
 | `result`, `report` | what `tune` returns, and its validation on fresh runs |
+| `samples`, `failures`, `step_check` | runs for the report, why fresh runs failed, and dt / 2 |
 | `_tune` | `tune`, which calls these in this order |
 | `_pareto`, `_falsify` | fronts of two objectives, and attacks on a result |
 """
@@ -33,6 +34,7 @@ from iblf_jax.tuning._falsify import falsify as falsify
 from iblf_jax.tuning._pareto import Front as Front
 from iblf_jax.tuning._pareto import pareto as pareto
 from iblf_jax.tuning._tune import tune as tune
+from iblf_jax.tuning.failures import FailedRuns as FailedRuns
 from iblf_jax.tuning.options import Report as Report
 from iblf_jax.tuning.parameters import tunable as tunable
 from iblf_jax.tuning.problem import TuningProblem as TuningProblem
@@ -47,3 +49,4 @@ from iblf_jax.tuning.solvers import Optax as Optax
 from iblf_jax.tuning.solvers import Optimality as Optimality
 from iblf_jax.tuning.solvers import SearchSpace as SearchSpace
 from iblf_jax.tuning.solvers import Solver as Solver
+from iblf_jax.tuning.step_check import StepCheck as StepCheck

@@ -24,6 +24,8 @@ from iblf_jax.tuning.options import Report, TuningRunOptions
 from iblf_jax.tuning.quantities import Quantities
 from iblf_jax.tuning.report import ReportRequest, TuningReport, make_report
 from iblf_jax.tuning.runs import NUMBERS_A_RUN
+from iblf_jax.tuning.samples import is_random
+from iblf_jax.tuning.step_check import StepCheck, check_step_size
 
 LARGE_CHANGE = 100.0
 """Factor by which a gain may change before a warning is given."""
@@ -236,6 +238,20 @@ class TuneResult:
         return RunRequest.of(scenario, steps=steps, method=self.setup.method, **options)
 
     @cached_property
+    def step_check(self) -> StepCheck:
+        """All runs of the tuning, with the tuned gains, at dt and at dt / 2."""
+        setup = self.setup
+        batch = self._runs_per_batch
+        return check_step_size(self.start, self.values, setup.objective, setup, batch=batch)
+
+    @property
+    def _runs_per_batch(self) -> int:
+        """Runs in a batch of the search's values, whose compiled program the report uses again."""
+        if self.probes or self.setup.runs > 1:
+            return self.setup.runs * points_per_batch(self.setup.runs)
+        return 1
+
+    @cached_property
     def report(self) -> TuningReport:
         """Before and after, requirement by requirement: on fresh draws where something is
         perturbed, else on the one nominal run.
@@ -251,8 +267,8 @@ class TuneResult:
           seed: of their draws; not the tuning's.
 
         Returns:
-          A `TuningReport`, which prints as text; without perturbations it is on the one nominal
-          run, for any `runs` and `seed`.
+          A `TuningReport`, which prints as text; if the tuning drew no runs, it is on the one
+          nominal run, for any `runs` and `seed`.
 
         Raises:
           ValueError: the seed of the tuning itself.
@@ -262,7 +278,7 @@ class TuneResult:
         setup = self.setup
         report = setup.report
         seed = report.seed if seed is None else checks.seed(seed)
-        if setup.perturbations and seed == setup.seed:
+        if is_random(setup) and seed == setup.seed:
             expected = "another seed than the tuning's"
             raise checks.fail("seed", seed, expected, "Held-out runs must be fresh.")
         if runs is None:
@@ -271,7 +287,6 @@ class TuneResult:
         at_limits = None
         if setup.limits:
             at_limits = tuple(f"{name} {end}" for name, end in self.at_limits.items())
-        searched_in_batches = self.probes or setup.runs > 1
         request = ReportRequest(
             before=self.start,
             after=self.scenario,
@@ -279,7 +294,8 @@ class TuneResult:
             objective=setup.objective,
             run=setup,
             report=dataclasses.replace(report, runs=runs, seed=seed),
-            batch=setup.runs * points_per_batch(setup.runs) if searched_in_batches else 1,
+            batch=self._runs_per_batch,
+            step_check=self.step_check,
             at_limits=at_limits,
             multipliers=tuple(self.limit_multipliers.values()),
             notes=self.notes,
@@ -366,6 +382,7 @@ class TuneResult:
             f"TuneResult({self.optimiser}, {self.mode} mode, {steps} steps,"
             f" {self.evaluations} evaluations{probes}, {self.seconds:.3g} s; {self.stopped})"
         ]
+        lines += [f"  {words}" for words in self._bounds_and_requirements()]
         for path, value in self.values.items():
             before = np.array2string(np.asarray(paths.get(self.start, path)), precision=5)
             lines.append(f"  {path}: {before} -> {np.array2string(np.asarray(value), precision=5)}")
@@ -373,6 +390,21 @@ class TuneResult:
         peaks = [np.max(np.asarray(run.metrics.peak_torque)) for run in self.nominal]
         lines.append(f"  peak torque of the nominal run: {peaks[0]:.5g} -> {peaks[1]:.5g} N m")
         return "\n".join(lines)
+
+    def _bounds_and_requirements(self) -> list[str]:
+        """Bounds and requirements on the runs of the tuning, and on fresh runs if a report on them
+        was made.
+        """
+        check = self.step_check
+        rows = [check.bounds_in_words()]
+        failed_first = sorted(check.requirements, key=lambda r: -max(r.excess))
+        rows += [f"requirement {r}" for r in failed_first]
+        if not is_random(self.setup):
+            return rows
+        report = vars(self).get("report")
+        if report is None:
+            return [*rows, "fresh runs: not made yet; `.report` makes them"]
+        return [f"{report.runs} fresh runs: {report.headline}", *rows]
 
     def _repr_html_(self) -> str:
         return present("card", self)
