@@ -162,11 +162,7 @@ class TuningProblem:
 
     def for_solver(self, solver: Solver) -> TuningProblem:
         """The problem as a solver needs it."""
-        return dataclasses.replace(
-            self,
-            requirements_in_loss=not solver.handles_requirements,
-            request=self.request._replace(nested=solver.traces_evaluation),
-        )
+        return dataclasses.replace(self, requirements_in_loss=not solver.handles_requirements)
 
     # -------------------------------------------------------------------------------- properties
 

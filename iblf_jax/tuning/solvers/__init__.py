@@ -6,7 +6,6 @@ is.
 """
 
 from iblf_jax.tuning.solvers._base import Constraints as Constraints
-from iblf_jax.tuning.solvers._base import Optimality as Optimality
 from iblf_jax.tuning.solvers._base import SearchSpace as SearchSpace
 from iblf_jax.tuning.solvers._base import Solver as Solver
 from iblf_jax.tuning.solvers.adam import Adam as Adam

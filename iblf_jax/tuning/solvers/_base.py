@@ -68,20 +68,6 @@ class SearchSpace(NamedTuple):
     """Steps of the search at most, for schedules."""
 
 
-class Optimality(NamedTuple):
-    """How far the accepted point of a start is from an optimum."""
-
-    z: np.ndarray
-    """The accepted point, (p,)."""
-    multipliers: np.ndarray
-    """Of each requirement, (R,)."""
-    residuals: np.ndarray
-    """Largest entry of the Lagrangian's gradient that no range blocks, largest excess, and
-    complementarity, (3,)."""
-    stuck: bool
-    """Whether the solver ended without an optimum."""
-
-
 class Solver(Protocol):
     """An algorithm with its options; a frozen dataclass without state of its own.
 
@@ -100,13 +86,6 @@ class Solver(Protocol):
     def handles_requirements(self) -> bool:
         """Whether requirements are constraints of the solver.  Otherwise the loss is an augmented
         Lagrangian, of which the search updates the multipliers.
-        """
-        ...
-
-    @property
-    def traces_evaluation(self) -> bool:
-        """Whether a step evaluates inside of a compiled loop, by `evaluate.derivatives(problem,
-        candidate)` with the two of `evaluate.row(start)`.
         """
         ...
 
@@ -169,10 +148,6 @@ class Solver(Protocol):
         """Begins one start anew at z, (p,).  Without z the start goes on where it is, and forgets
         what no longer holds because the loss has changed.
         """
-        ...
-
-    def optimality(self, state: Any, start: int) -> Optimality | None:
-        """Multipliers and residuals of one start; None if the solver does not compute them."""
         ...
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import optax
 
 from iblf_jax.tuning.solvers import optax_steps
-from iblf_jax.tuning.solvers._base import Optimality, SearchSpace, check_options
+from iblf_jax.tuning.solvers._base import SearchSpace, check_options
 
 FINAL_RATE = 0.02
 """Last learning rate of the cosine schedule, relative to the first."""
@@ -44,7 +44,6 @@ class Adam:
     batch: int | None = None
     name: ClassVar[str] = "adam"
     handles_requirements: ClassVar[bool] = False
-    traces_evaluation: ClassVar[bool] = False
     sharpenings: ClassVar[int] = 0
 
     def __post_init__(self) -> None:

@@ -26,7 +26,7 @@ import numpy as np
 import optax
 
 from iblf_jax.tuning.parameters import squashed, unsquash
-from iblf_jax.tuning.solvers._base import Optimality, SearchSpace, check_options, where_rows
+from iblf_jax.tuning.solvers._base import SearchSpace, check_options, where_rows
 
 SUFFICIENT_DECREASE = 1e-4
 """c1."""
@@ -60,7 +60,6 @@ class LBFGS:
     patience: int = 15
     name: ClassVar[str] = "lbfgs"
     handles_requirements: ClassVar[bool] = False
-    traces_evaluation: ClassVar[bool] = False
     resample: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
@@ -91,10 +90,6 @@ class LBFGS:
     def converged(self, state: dict[str, Any]) -> np.ndarray:
         """As `Solver.converged`."""
         return state["done"].copy()
-
-    def optimality(self, state: dict[str, Any], start: int) -> Optimality | None:
-        """None."""
-        return None
 
     def step(
         self, evaluate: Any, state: dict[str, Any], tolerance: float

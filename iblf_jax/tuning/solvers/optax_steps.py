@@ -35,7 +35,7 @@ import optax
 
 from iblf_jax.core import checks, notices
 from iblf_jax.tuning.parameters import squashed, unsquash
-from iblf_jax.tuning.solvers._base import Optimality, SearchSpace, check_options, where_rows
+from iblf_jax.tuning.solvers._base import SearchSpace, check_options, where_rows
 
 CHECK_STEPS = 5
 """Steps from one value on all runs to the next, where the runs of the steps differ; at most the
@@ -78,7 +78,6 @@ class Optax:
     tolerance: float = 1e-5
     name: ClassVar[str] = "optax"
     handles_requirements: ClassVar[bool] = False
-    traces_evaluation: ClassVar[bool] = False
     sharpenings: ClassVar[int] = 0
 
     def __post_init__(self) -> None:
@@ -110,9 +109,6 @@ class Optax:
         """Never: the search ends by the number of iterations, or without a better result."""
         return np.zeros(len(state["w"]), bool)
 
-    def optimality(self, state: dict[str, Any], start: int) -> Optimality | None:
-        """None."""
-        return None
 
 
 def init(solver: Any, space: SearchSpace, z: np.ndarray) -> dict[str, Any]:

@@ -53,7 +53,7 @@ from scipy.linalg import block_diag
 
 from iblf_jax.core import checks
 from iblf_jax.tuning.solvers import quadratic
-from iblf_jax.tuning.solvers._base import Constraints, Optimality, SearchSpace, check_options
+from iblf_jax.tuning.solvers._base import Constraints, SearchSpace, check_options
 
 INITIAL_RADIUS = 1.0
 """First |s_i|; 1 is a factor e for a gain."""
@@ -377,7 +377,6 @@ class SQP:
     radius: float | None = None
     name: ClassVar[str] = "sqp"
     handles_requirements: ClassVar[bool] = True
-    traces_evaluation: ClassVar[bool] = False
     mode: ClassVar[str] = "forward"
     resample: ClassVar[bool] = False
 
@@ -455,11 +454,6 @@ class SQP:
     def converged(self, state: list[SQPState]) -> np.ndarray:
         """As `Solver.converged`."""
         return np.array([start.done for start in state], bool)
-
-    def optimality(self, state: list[SQPState], start: int) -> Optimality:
-        """As `Solver.optimality`."""
-        own = state[start]
-        return Optimality(own.z, own.multipliers, own.residuals, bool(own.stuck))
 
     def step(
         self, evaluate: Any, state: list[SQPState], tolerance: float
