@@ -1,9 +1,12 @@
 """Default ranges of what is tuned: within the conditions of Theorem 2, and within the capabilities
 of time step, sampling period and drive.
 
-The lower end of a leaf is k1 > 0, K2 > 1/2 (for a barrier of weight 1) or kf > 1 where all its
-entries start there, otherwise its sign decides.  The upper end of a gain x is f x0 with the largest
-f <= MAX_FACTOR for which the loop at the start and along its reference satisfies
+The lower end of a gain of a continuous law is k1 > 0, K2 > 1/2 (for a barrier of weight 1) or
+kf > 1 where all its entries start there, otherwise its sign decides.  Theorem 2 does not hold for
+sampled laws, and a light joint needs a smaller K2: there these gains may fall to x0 / MAX_FACTOR.
+
+The upper end of a gain x is f x0 with the largest f <= MAX_FACTOR for which the loop at the start
+and along its reference satisfies
 
     dt |lambda|_max <= STABILITY_FRACTION R                     for a continuous law,
     rho(map from a period to the next) < 1                      for a sampled law,
@@ -167,11 +170,13 @@ def default_lows(
 def _default_low(conditions: Conditions, path: str, start: np.ndarray) -> End:
     scenario = conditions.scenario
     leaf = re.sub(r"(\[\d+\])+$", "", path)
+    if np.all(start > 0) and (_is_time(scenario, path) or FREQUENCY.match(path)):
+        return _single_end(conditions, path, start, 1.0 / MAX_FACTOR, BY_SMALL_FACTOR)
+    if scenario.sampling is not None and leaf in THEOREM_LIMITS:
+        return End(start / MAX_FACTOR, BY_SMALL_FACTOR)
     has_condition = leaf in THEOREM_LIMITS and (leaf != K2 or has_weight_of_the_paper(scenario))
     if has_condition and np.all(start >= THEOREM_LIMITS[leaf]):
         return End(np.asarray(THEOREM_LIMITS[leaf]), BY_THEOREM)
-    if np.all(start > 0) and (_is_time(scenario, path) or FREQUENCY.match(path)):
-        return _single_end(conditions, path, start, 1.0 / MAX_FACTOR, BY_SMALL_FACTOR)
     if path == PERIOD:
         return _shortest_period(conditions, start)
     if paths.sign_at(scenario, path) in ("positive", "nonnegative"):

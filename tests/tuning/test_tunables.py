@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import iblf_jax as ij
+from iblf_jax.simulation.paths import get
 from iblf_jax.simulation.scenario import canonical
 from iblf_jax.tuning import evaluation, ranges
 from iblf_jax.tuning.multiples import best_multiple
@@ -68,16 +69,19 @@ def test_a_limit_that_is_infinite_cannot_be_tuned():
         layout(arm, ["plant.effort"], DT, "rk4")
 
 
-def test_only_a_barrier_of_weight_one_limits_k2_from_below(lab):
-    assert ends(lab, "controller.K2")[2][0] == ranges.BY_THEOREM
-    light = ij.with_parameters(lab, {"controller.weight": [1.0, 0.1]})
+def test_theorem_2_limits_gains_from_below_where_it_holds(lab):
+    paper = canonical(ij.presets.zhang_yan_2024())
+    for path in ("controller.k1", "controller.K2", "observer.kf"):
+        start = np.asarray(get(lab, path))
+        low, _, (below, _) = ends(lab, path)
+        assert below == ranges.BY_SMALL_FACTOR
+        np.testing.assert_allclose(low, start / ranges.MAX_FACTOR)
+        assert ends(paper, path)[2][0] == ranges.BY_THEOREM
+    light = ij.with_parameters(paper, {"controller.weight": [1.0, 0.1]})
     low, _, (below, _) = ends(light, "controller.K2")
     assert below == ranges.BY_SIGN
     assert np.all(low == 0)
-    pd = ij.controllers.PDGravity(Kp=10.0, Kd=1.0)
-    assert ends(canonical(ij.with_parts(lab, controller=pd)), "controller.Kd")[2][0] == (
-        ranges.BY_SIGN
-    )
+    assert ends(light, "observer.kf")[2][0] == ranges.BY_THEOREM
 
 
 def test_scales_of_a_start_that_leaves_its_bounds_are_announced():
