@@ -194,6 +194,15 @@ def test_all_kinds_together_have_the_derivatives_of_simulate(lab):
     others = np.delete(np.asarray(found.gradient[0]), period)
     assert np.all(np.abs(others) > 1e-6)
 
+    best = ij.tune(scenario, TOGETHER, goal, iterations=2, progress=False, **SHORT)
+    tuned = in_units(problem.blocks, values_of(best, problem))
+    assert np.all(in_units(problem.blocks, problem.box.low) <= tuned * (1 + 1e-9))
+    assert np.all(tuned <= in_units(problem.blocks, problem.box.high) * (1 + 1e-9))
+    assert float(best.values["sampling.period"]) / DT == pytest.approx(
+        round(float(best.values["sampling.period"]) / DT)
+    )
+    assert loss_of(best.scenario) < loss_of(scenario)
+
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:sampling.period is a whole number")
