@@ -313,6 +313,7 @@ RESULT = (
     "multipliers",
     "residuals",
     "probes",
+    "tried",
 )
 """Fields of a result that are words and numbers."""
 SETUP = tuple(
@@ -344,6 +345,7 @@ def save_tuning(result: TuneResult, path: str | os.PathLike) -> None:
         "setup": attributes(setup, SETUP) | of_report,
         "risk": list(setup.risk),
         "objective": components.encode_fields(setup.objective, "objective"),
+        "tuned_objective": result.objective,
         "perturbations": {
             key: components.encode_fields(x, key) for key, x in setup.perturbations.items()
         },
@@ -432,6 +434,18 @@ def _decoded_history(table: dict[str, Any], count: int) -> dict[str, np.ndarray]
     return history
 
 
+def _tuned_objective(data: dict[str, Any], history: dict[str, np.ndarray]) -> float:
+    """The objective at the tuned gains; earlier versions stored it in the history only, where it is
+    the lowest one without a violation.
+    """
+    if "tuned_objective" in data:
+        return float(data["tuned_objective"])
+    violation = np.maximum(np.sum(np.maximum(history["excess"], 0.0), axis=-1), 0.0)
+    violation = np.where(history["valid"], violation + np.maximum(-history["margin"], 0.0), np.inf)
+    is_best = violation == np.min(violation)
+    return float(np.min(np.where(is_best, history["objective"], np.inf)))
+
+
 def _decoded(data: dict[str, Any]) -> TuneResult:
     """The result that `save_tuning` encoded."""
     start = from_dict(data["start"]).scenario
@@ -461,5 +475,7 @@ def _decoded(data: dict[str, Any]) -> TuneResult:
         multipliers=tuple(map(float, data["multipliers"])),
         residuals=tuple(map(float, data["residuals"])),
         probes=checks.positive_integer("probes", data["probes"], least=0),
+        objective=_tuned_objective(data, history),
+        tried=tuple(checks.string("tried", x, "a string") for x in data.get("tried", ())),
         **words,
     )

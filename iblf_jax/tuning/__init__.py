@@ -35,6 +35,7 @@ from iblf_jax.tuning._pareto import Front as Front
 from iblf_jax.tuning._pareto import pareto as pareto
 from iblf_jax.tuning._tune import tune as tune
 from iblf_jax.tuning.failures import FailedRuns as FailedRuns
+from iblf_jax.tuning.options import Effort as Effort
 from iblf_jax.tuning.options import Report as Report
 from iblf_jax.tuning.parameters import tunable as tunable
 from iblf_jax.tuning.problem import TuningProblem as TuningProblem
@@ -46,7 +47,6 @@ from iblf_jax.tuning.solvers import SOLVERS as SOLVERS
 from iblf_jax.tuning.solvers import SQP as SQP
 from iblf_jax.tuning.solvers import Adam as Adam
 from iblf_jax.tuning.solvers import Optax as Optax
-from iblf_jax.tuning.solvers import Optimality as Optimality
 from iblf_jax.tuning.solvers import SearchSpace as SearchSpace
 from iblf_jax.tuning.solvers import Solver as Solver
 from iblf_jax.tuning.step_check import StepCheck as StepCheck

@@ -164,6 +164,16 @@ class TuningProblem:
         """The problem as a solver needs it."""
         return dataclasses.replace(self, requirements_in_loss=not solver.handles_requirements)
 
+    def at_half_the_step(self) -> TuningProblem:
+        """The problem with half the time step."""
+        half = 0.5 * float(self.options.dt)
+        return dataclasses.replace(
+            self,
+            dt=jnp.asarray(half, self.dt.dtype),
+            options=dataclasses.replace(self.options, dt=half),
+            request=self.request._replace(steps=2 * self.request.steps),
+        )
+
     # -------------------------------------------------------------------------------- properties
 
     @property

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import os
 from functools import cached_property, partial
 from typing import Any, NamedTuple
@@ -33,7 +34,7 @@ STUCK = (
     "the steps became too small: the model of objective and requirements does not hold near these"
     " gains"
 )
-"""Why a search ended whose trust region collapsed before the conditions of an optimum were met."""
+"""Why a solver ended before the conditions of an optimum hold."""
 LIMIT_TOLERANCE = 0.01
 """A number is at a limit if it differs from it by no more than this part of it (of the range, where
 the limit is 0)."""
@@ -104,25 +105,26 @@ class TuneResult:
     """"forward" or "reverse"."""
     seconds: float
     setup: TuneSetup
+    objective: float = math.nan
+    """The objective at the tuned gains, on the runs that it was tuned on."""
     multipliers: tuple[float, ...] = ()
-    """Lagrange multiplier of each requirement: the decrease of the objective if its limit is
-    loosened by one `scale`.  None where one is violated; NaN where the result is not the point at
-    which the solver ended."""
+    """Lagrange multiplier of each requirement at the tuned gains: the decrease of the objective if
+    its limit is loosened by one `scale`.  Where a requirement is violated, the weights, with sum 1,
+    with which the gradients of the excesses balance."""
     residuals: tuple[float, ...] = ()
-    """Of the optimality conditions at the end, by SQP: the largest entry of the Lagrangian's
+    """Of the optimality conditions at the tuned gains: the largest entry of the Lagrangian's
     gradient by the coordinates z that no range blocks, the largest excess g of a requirement, and
-    the sum of multipliers times distances from the limits; all 0 at an optimum."""
+    the sum of multipliers times distances from the limits; all 0 at an optimum.  Where a
+    requirement is violated, the conditions are those of the least largest excess."""
     probes: int = 0
-    """Number of evaluations without derivatives to find a start, each of `setup.runs` rollouts."""
+    """Number of evaluations without derivatives, each of `setup.runs` rollouts."""
+    tried: tuple[str, ...] = ()
+    """What the search did, in words: how many starts, how many valleys, further phases."""
 
     @property
-    def objective(self) -> float:
-        """The objective at the tuned gains, on the runs that it was tuned on."""
-        rounding = 100 * np.finfo(self.tuned.dtype).eps * np.abs(self.tuned)
-        valid = self.history["valid"] & np.all(
-            np.abs(self.history["x"] - self.tuned) <= rounding, axis=-1
-        )
-        return float(np.min(np.where(valid, self.history["objective"], np.inf)))
+    def is_violated(self) -> bool:
+        """Whether the tuned gains violate a requirement on the runs that they were tuned on."""
+        return len(self.residuals) > 1 and bool(self.residuals[1] > 0)
 
     @property
     def tuned(self) -> np.ndarray:
@@ -182,20 +184,22 @@ class TuneResult:
                 f" (gradient of the Lagrangian {gradient:.2g}, largest excess {excess:.2g},"
                 f" complementarity {complementarity:.2g}; objective {self.objective:.5g})"
             )
-        if objective.requirements and not self.multipliers:
+        lines += self.tried
+        if objective.requirements and self.is_violated:
             lines.append(
-                "WARNING: these gains break the requirements as little as was found: loosen one, or"
-                " add parameters or starts"
+                "WARNING: these gains break the requirements as little as was found: loosen one,"
+                ' add parameters, or take effort="thorough"'
             )
         if self.stopped == "iterations used up":
             steps = len(self.history["evaluations"])
             lines.append(
-                f"WARNING: not converged: give more iterations than {steps}, or several starts"
+                f'WARNING: not converged after {steps} steps: take effort="thorough", or'
+                " ij.tuning.Effort(iterations=...)"
             )
         if self.stopped == STUCK:
             lines.append(
-                "WARNING: no optimum: give several starts, a smaller dt, or an objective whose"
-                " slope does not jump"
+                "WARNING: no optimum: the slope of the objective or of a requirement jumps here, or"
+                ' the time step is too long; take effort="thorough" or a smaller dt'
             )
         lines += self._distant_gains()
         if not depends_on_torque(objective):

@@ -34,6 +34,8 @@ class Constraints(NamedTuple):
     """Number k of worst runs, for each requirement, (R,)."""
     runs: int
     """Number B of runs."""
+    largest_only: bool = False
+    """Whether the violation is the largest excess of all requirements, and not their sum."""
 
     @staticmethod
     def of(counts: Sequence[int], shares: Sequence[float], runs: int) -> Constraints:
@@ -46,6 +48,13 @@ class Constraints(NamedTuple):
     def pieces_of(self, requirement: int) -> np.ndarray:
         """Indices of the pieces of a requirement."""
         return np.flatnonzero(self.owner == requirement)
+
+    def violation(self, excess: np.ndarray) -> float:
+        """The violation from the excess of each requirement, (R,)."""
+        positive = np.maximum(excess, 0.0)
+        if self.largest_only:
+            return float(np.max(positive, initial=0.0))
+        return float(np.sum(positive))
 
     def excess(self, pieces: np.ndarray) -> np.ndarray:
         """G_r, (R,), from the pieces' values, (B, M)."""
@@ -100,8 +109,10 @@ class Solver(Protocol):
         ...
 
     @property
-    def starts(self) -> int:
-        """Number of starting points."""
+    def starts(self) -> int | None:
+        """Number of starting points.  Where it is None the tuning decides: it evaluates many points
+        without derivatives, begins at several of them, and goes on with the best (`search`).
+        """
         ...
 
     @property
@@ -173,7 +184,7 @@ CHECKS: dict[str, Any] = {
     "batch": _batch,
     "mode": lambda name, x: _word(name, x, MODES),
     "resample": checks.boolean,
-    "starts": checks.positive_integer,
+    "starts": lambda name, x: None if x is None else checks.positive_integer(name, x),
     "tolerance": lambda name, x: checks.number_between(name, x, 0.0, 1.0, "1"),
     "sharpenings": lambda name, x: checks.positive_integer(name, x, least=0, most=MAX_SHARPENINGS),
     "patience": lambda name, x: checks.positive_integer(name, x, most=checks.MAX_STEPS),

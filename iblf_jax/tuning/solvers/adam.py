@@ -75,7 +75,3 @@ class Adam:
     def converged(self, state: dict[str, Any]) -> np.ndarray:
         """Never: Adam ends by the number of iterations, or without a better result."""
         return np.zeros(len(state["w"]), bool)
-
-    def optimality(self, state: dict[str, Any], start: int) -> Optimality | None:
-        """None."""
-        return None
