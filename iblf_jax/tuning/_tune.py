@@ -27,7 +27,7 @@ from iblf_jax.tuning.optimality import Conditions
 from iblf_jax.tuning.options import Effort, Report, SearchOptions, chosen_solver, options_of
 from iblf_jax.tuning.parameters import Tunable, in_units, names_of, values_at
 from iblf_jax.tuning.problem import TuningProblem
-from iblf_jax.tuning.result import STUCK, TuneResult, TuneSetup
+from iblf_jax.tuning.result import AT_KINK, STUCK, TuneResult, TuneSetup
 from iblf_jax.tuning.robust import Risk
 from iblf_jax.tuning.runs import NUMBERS_A_RUN
 from iblf_jax.tuning.search import REPAIR, REPAIR_STARTS, SECOND, Search, Strategy
@@ -274,6 +274,8 @@ def _why_ended(search: Search, stopped: str, found: Conditions) -> str:
     if search.is_violated:
         repaired = search.strategy is None or bool(search.state["repair_ended"])
         return INFEASIBLE if repaired and found.hold else NOT_FEASIBLE
+    if found.at_kink:
+        return AT_KINK
     return "converged" if found.hold else STUCK
 
 

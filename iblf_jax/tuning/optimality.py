@@ -4,6 +4,10 @@ For a minimum of f subject to G_r <= 0 there are multipliers y_r >= 0 with
 
     grad f + sum_r y_r grad G_r = 0,     y_r G_r = 0.
 
+Largest values over time have kinks: at gains where two peaks are equally large the gradient jumps,
+and an optimum may be there.  The conditions then hold with gradients of both peaks only, one of
+which is known from nearby gains.
+
 Where no gains are known that keep the requirements, the conditions are those of the least largest
 excess: sum_r y_r grad G_r = 0 with sum_r y_r = 1.
 """
@@ -21,6 +25,7 @@ from iblf_jax.tuning.solvers.sqp import (
     conditions_at,
     free_slope,
     slope_size,
+    with_nearby_pieces,
 )
 
 
@@ -34,16 +39,29 @@ class Conditions(NamedTuple):
     the multipliers times the distances from the limits, (3,); NaN without a finite gradient."""
     size: float
     """What the residuals are compared with; 1 where the objective does not count."""
+    at_kink: bool = False
+    """Whether the conditions hold together with gradients from nearby points."""
 
     @property
     def hold(self) -> bool:
+        """Whether gradient and complementarity are small, or the point is an optimum at a kink."""
+        return self.at_kink or self.are_small
+
+    @property
+    def are_small(self) -> bool:
         """Whether gradient and complementarity are small."""
         stationarity, _, complementarity = self.residuals
         return bool(max(stationarity, complementarity) <= STATIONARITY_TOLERANCE * self.size)
 
 
 def conditions(
-    evaluate: Evaluator, found: Derivatives, row: int, z: np.ndarray, *, violated: bool
+    evaluate: Evaluator,
+    found: Derivatives,
+    row: int,
+    z: np.ndarray,
+    *,
+    violated: bool,
+    nearby: list[Point],
 ) -> Conditions:
     """The conditions for a solver that has the requirements as constraints.
 
@@ -53,6 +71,7 @@ def conditions(
       row: which one.
       z: where it was evaluated, (p,).
       violated: whether the conditions are those of the least largest excess.
+      nearby: points whose pieces may be at their limits too.
     """
     space = evaluate.space
     point = Point.of(space, found, row)
@@ -63,8 +82,12 @@ def conditions(
     if violated:
         space = space._replace(constraints=space.constraints._replace(largest_only=True))
         size = 1.0
-    multipliers, residuals = conditions_at(space, z, point)
-    return Conditions(multipliers, residuals, size)
+    result = Conditions(*conditions_at(space, z, point), size)
+    if result.are_small or not nearby:
+        return result
+    space, point = with_nearby_pieces(space, point, nearby)
+    with_others = Conditions(*conditions_at(space, z, point), size)
+    return result._replace(at_kink=with_others.are_small)
 
 
 def conditions_of_penalty(

@@ -153,7 +153,8 @@ class TuningProblem:
         )
         if is_complete(goal):
             return problem
-        goal = complete(goal, problem.exact_at_start()[: len(goal.terms)])
+        *at_start, deficit = problem.exact_at_start()
+        goal = complete(goal, at_start[: len(goal.terms)], margin=-float(deficit))
         return problem.with_objective(jax.tree.map(lambda x: jnp.asarray(x, dtype), goal))
 
     def with_objective(self, objective: Objective) -> TuningProblem:

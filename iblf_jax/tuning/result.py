@@ -30,6 +30,8 @@ from iblf_jax.tuning.step_check import StepCheck, check_step_size
 
 LARGE_CHANGE = 100.0
 """Factor by which a gain may change before a warning is given."""
+AT_KINK = "converged at a kink: the slope of a requirement jumps from one peak to another here"
+"""Why a solver ended where the conditions hold with gradients from gains nearby only."""
 STUCK = "the solver ended at gains where the conditions of an optimum do not hold"
 """Why a solver ended before the conditions of an optimum hold."""
 LIMIT_TOLERANCE = 0.01

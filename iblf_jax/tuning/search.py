@@ -42,8 +42,9 @@ from iblf_jax.core import checks
 from iblf_jax.tuning.evaluation import Derivatives, Evaluator, Value
 from iblf_jax.tuning.objectives import is_smoothed, sharper
 from iblf_jax.tuning.optimality import Conditions, conditions, conditions_of_penalty
+from iblf_jax.tuning.parameters import along
 from iblf_jax.tuning.problem import FIRST_PENALTY
-from iblf_jax.tuning.solvers import SearchSpace, Solver
+from iblf_jax.tuning.solvers import SQP, SearchSpace, Solver
 from iblf_jax.tuning.starts import EXCESS_WEIGHT, Screening, distinct
 
 STEPS_PER_UPDATE = 12
@@ -66,6 +67,10 @@ OPTIMISE, REPAIR, SECOND = range(3)
 REPAIR_STEPS = 30
 """Steps at most in which the largest excess is minimised."""
 REPAIR_STARTS = 3
+MOST_MULTIPLES = 32
+"""Multiples of a leaf that are compared, the nearest ones."""
+KINK_REACH = 0.05
+"""Distance at most of points whose peaks may be at their limits too at a kink."""
 SAME_VALLEY = 0.5
 """Largest distance, in any coordinate z, of two starts that ended in one valley."""
 
@@ -204,6 +209,7 @@ class Search:
         phase = int(self.state["phase"])
         if phase == OPTIMISE:
             self.state["valleys"] = self._valleys()
+            self._compare_multiples()
             if self.is_violated:
                 self._begin(REPAIR, self._least_violated())
                 return True
@@ -218,27 +224,81 @@ class Search:
         self._begin(SECOND, self._unexplored())
         return True
 
-    def conditions(self) -> Conditions:
-        """The optimality conditions at the best point, which is evaluated once more."""
-        evaluate = self.evaluate
+    def _compare_multiples(self) -> None:
+        """Evaluates other multiples of leaves that are whole numbers of steps, with all else as at
+        the best point: the sampling period, by which there is no derivative.
+        """
+        problem = self.evaluate.problem
         z = self.state["incumbent_z"]
-        row = self.best
+        others = along(problem.blocks, problem.box, z, MOST_MULTIPLES)
+        if len(others):
+            self.evaluate.values(others)
+
+    def conditions(self) -> Conditions:
+        """The optimality conditions at the best point, which is evaluated once more.
+
+        Where a start has converged to a point that is as good up to the tolerance of the solver,
+        that one becomes the best point: an earlier trial beside it may be better by less.
+        """
+        state = self.state
+        row, z = self._end_beside_incumbent()
+        found = self._evaluated(row, z)
+        if self._is_as_good(found.value, row):
+            state["incumbent_z"] = np.array(z)
+            state["incumbent_key"] = np.array(_key(found.value, row))
+        elif not np.array_equal(z, state["incumbent_z"]):
+            z = state["incumbent_z"]
+            found = self._evaluated(row, z)
+        if not self.solver.handles_requirements:
+            return conditions_of_penalty(self.evaluate, found, row, z, state)
+        nearby = []
+        if isinstance(self.solver, SQP):
+            nearby = self.solver.nearby_pieces(state["solver"], z, KINK_REACH)
+        return conditions(self.evaluate, found, row, z, violated=self.is_violated, nearby=nearby)
+
+    def _end_beside_incumbent(self) -> tuple[int, np.ndarray]:
+        """A start that has converged in the valley of the best point, and where; otherwise the best
+        point itself.
+        """
+        z = self.state["incumbent_z"]
+        if not isinstance(self.solver, SQP):
+            return self.best, z
+        ends = {
+            s: own.z
+            for s, own in enumerate(self.state["solver"])
+            if own.done and np.max(np.abs(own.z - z)) <= SAME_VALLEY
+        }
+        if not ends:
+            return self.best, z
+        nearest = min(ends, key=lambda s: float(np.max(np.abs(ends[s] - z))))
+        return nearest, ends[nearest]
+
+    def _is_as_good(self, found: Value, row: int) -> bool:
+        """Whether a point is as good as the best one, up to the tolerance of the solver."""
+        if not found.valid[row]:
+            return False
+        violation, objective = _key(found, row)
+        least, best = self.state["incumbent_key"]
+        small = self.solver.tolerance * max(1e-3, abs(float(best)))
+        return violation <= least and objective <= best + small
+
+    def _evaluated(self, row: int, z: np.ndarray) -> Derivatives:
+        """The derivatives at one point, in one row."""
+        evaluate = self.evaluate
         before = evaluate.evaluations
         self._prepare_evaluation()
         evaluate.active = np.arange(len(evaluate.active)) == row
         found = evaluate(np.tile(z, (len(evaluate.active), 1)))
         self.state["evaluations"] = self.state["evaluations"] + evaluate.evaluations - before
         self.history["evaluations"][-1] = self.state["evaluations"]
-        if self.solver.handles_requirements:
-            return conditions(evaluate, found, row, z, violated=self.is_violated)
-        return conditions_of_penalty(evaluate, found, row, z, self.state)
+        return found
 
     def _ended_at_incumbent(self) -> bool:
-        """Whether the best point is one of a start that went on to its end: others may be better in
-        an instance, but their search was cut off.
+        """Whether the best point belongs to a start that went on to its end: the search of others
+        was cut off.
         """
-        at_best = np.all(self.state["best_z"] == self.state["incumbent_z"], axis=1)
-        return bool(np.any(at_best & ~self.state["retired"]))
+        distance = np.max(np.abs(self.state["best_z"] - self.state["incumbent_z"]), axis=1)
+        return bool(np.any((distance <= SAME_VALLEY) & ~self.state["retired"]))
 
     def _begin(self, phase: int, z: np.ndarray) -> None:
         """Begins a phase at some points, (k, p), k <= S; the other starts are retired."""

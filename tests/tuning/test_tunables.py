@@ -8,7 +8,6 @@ import iblf_jax as ij
 from iblf_jax.simulation.paths import get
 from iblf_jax.simulation.scenario import canonical
 from iblf_jax.tuning import evaluation, ranges
-from iblf_jax.tuning.multiples import best_multiple
 from iblf_jax.tuning.objectives import complete
 from iblf_jax.tuning.parameters import along, by_values, in_units, layout, values_at
 from iblf_jax.tuning.problem import TuningProblem
@@ -210,22 +209,18 @@ def test_all_kinds_together_have_the_derivatives_of_simulate(lab):
 def test_periods_are_compared_by_values(lab):
     parameters = ["controller.K2", ij.tunable("sampling.period", 1e-3, 4e-3)]
     goal = ij.objectives.tracking(scale=1e-4)
-    problem = TuningProblem.build(smooth(lab), parameters, goal, duration=0.2, dt=DT)
-    best = best_multiple(problem, problem.box.z)
-    assert best.evaluated == 7
-    np.testing.assert_allclose(best.z[:2], problem.box.z[:2])
-    (i,) = by_values(problem.blocks)
-    points = along(problem.blocks, problem.box, problem.box.z, 9)
-    losses = [
-        float(np.sum(run.metrics.ise))
-        for period in in_units(problem.blocks, points)[:, i]
-        for run in [
-            ij.simulate(
-                ij.with_parameters(problem.scenario, {"sampling.period": period}),
-                duration=0.2,
-                dt=DT,
+    options = {"duration": 0.2, "dt": DT}
+    best = ij.tune(smooth(lab), parameters, goal, effort="quick", progress=False, **options)
+    assert best.probes >= 7
+    losses = {
+        period: float(
+            np.sum(
+                ij.simulate(
+                    ij.with_parameters(best.scenario, {"sampling.period": period}), **options
+                ).metrics.ise
             )
-        ]
-    ]
-    shortest = points[int(np.argmin(losses))]
-    np.testing.assert_allclose(best.z, shortest)
+        )
+        for period in DT * np.arange(2, 9)
+    }
+    shortest = min(losses, key=losses.get)
+    np.testing.assert_allclose(best.values["sampling.period"], shortest)

@@ -430,6 +430,7 @@ class Counted(Valleys):
             allowed=(0.0,),
             objective=objectives.tracking(),
             box=space.box,
+            blocks=(),
             size=len(space.box.z),
             sampled_too_slowly=lambda z: False,
         )

@@ -89,11 +89,16 @@ CUTS = 3
 """Rejected trials whose pieces are kept as constraints."""
 CUT_REACH = 3.0
 """Distance of such a trial at most, relative to the radius."""
-BETA = 10.0
+BETA = 1.0
 """Curvature, relative to the objective, with which multipliers are determined at a point."""
+MULTIPLIER_LIMIT = 1e3
+"""Largest multiplier that is determined at a point, relative to the objective; with 1e6 the
+programme's precision would not be enough."""
+AT_LIMIT = 1e-4
+"""Distance of a piece from its limit, in its scale, within which it counts as at its limit."""
 STATIONARITY_TOLERANCE = 1e-3
-"""Largest entry of the Lagrangian's gradient at convergence, relative to the larger of the objective
-and its gradient."""
+"""Largest entry of the Lagrangian's gradient at convergence, relative to the larger of the
+objective and its gradient."""
 TARGET_EXCESS = 1e-5
 """How far inside its limit a requirement is aimed at, in its scale, so that rounding does not
 violate it."""
@@ -478,6 +483,18 @@ class SQP:
         """As `Solver.converged`."""
         return np.array([start.done for start in state], bool)
 
+    def nearby_pieces(self, state: list[SQPState], z: np.ndarray, reach: float) -> list[Point]:
+        """The pieces of rejected trials within `reach` of a point, linear around them, as values
+        and gradients at the point.
+        """
+        found = []
+        for own in state:
+            for c in np.flatnonzero(np.max(np.abs(own.cut_z - z), axis=1) <= reach):
+                gradients = own.cut_gradients[c]
+                values = own.cut_pieces[c] + np.einsum("p,bpm->bm", z - own.cut_z[c], gradients)
+                found.append(own.here._replace(pieces=values, piece_gradients=gradients))
+        return found
+
     def step(
         self, evaluate: Any, state: list[SQPState], tolerance: float
     ) -> tuple[np.ndarray, Any]:
@@ -723,6 +740,19 @@ def free_slope(box: Box, z: np.ndarray, slope: np.ndarray) -> float:
     return float(np.max(np.abs(np.where(blocked_below | blocked_above, 0.0, slope))))
 
 
+def with_nearby_pieces(
+    space: SearchSpace, found: Point, nearby: list[Point]
+) -> tuple[SearchSpace, Point]:
+    """A point whose pieces are its own and those of nearby points, none above its own."""
+    pieces = [found.pieces, *(np.minimum(x.pieces, found.pieces) for x in nearby)]
+    gradients = [found.piece_gradients, *(x.piece_gradients for x in nearby)]
+    owner = np.tile(space.constraints.owner, len(pieces))
+    space = space._replace(constraints=space.constraints._replace(owner=owner))
+    return space, found._replace(
+        pieces=np.concatenate(pieces, axis=1), piece_gradients=np.concatenate(gradients, axis=2)
+    )
+
+
 def conditions_at(space: SearchSpace, z: np.ndarray, found: Point) -> tuple[np.ndarray, np.ndarray]:
     """Multipliers of each requirement, (R,), and residuals of the optimality conditions, (3,), at
     any point z.
@@ -736,7 +766,7 @@ def conditions_at(space: SearchSpace, z: np.ndarray, found: Point) -> tuple[np.n
     excess itself.
     """
     size = max(1e-3, abs(found.loss))
-    penalty = LARGEST_PENALTY * size
+    penalty = MULTIPLIER_LIMIT * size
     if space.constraints.largest_only:
         size = penalty = 1.0
         found = found._replace(gradient=np.zeros_like(found.gradient))
@@ -746,7 +776,7 @@ def conditions_at(space: SearchSpace, z: np.ndarray, found: Point) -> tuple[np.n
         np.maximum(space.box.low - z, -1.0),
         np.minimum(space.box.high - z, 1.0),
         space.constraints,
-        found.pieces,
+        np.where(np.abs(found.pieces) < AT_LIMIT, -TARGET_EXCESS, found.pieces),
         found.piece_gradients,
         penalty,
     )
