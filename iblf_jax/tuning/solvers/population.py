@@ -204,6 +204,6 @@ def _best_of(seen: list[tuple[np.ndarray, Any]]) -> tuple[np.ndarray, Values]:
     excess = np.where(value.valid, violation(value), np.inf)
     best = int(np.lexsort((objective, excess))[0])
     one = jax.tree.map(lambda x: x[best : best + 1], value)
-    unknown = np.full(points[best : best + 1].shape, np.nan)
-    hessian = np.full((*unknown.shape, unknown.shape[1]), np.nan)
-    return points[best : best + 1], Values(one, unknown, hessian)
+    size = points.shape[1]
+    unknown = Values(one, np.full((1, size), np.nan), np.full((1, size, size), np.nan))
+    return points[best : best + 1], unknown

@@ -28,6 +28,8 @@ INVALID_OBJECTIVE = 1e3
 """f / |f0| where a run is invalid."""
 REACH = 1.0
 """Distance in z within which the first constraints may bind: a factor e for a gain."""
+SMALLEST_CHANGE = 1e-9
+"""Of a piece within REACH, below which no gain changes it."""
 MAX_RUNS_OF_LIBRARY = 4
 POINTS_KEPT = 8
 """Evaluated points whose numbers are kept for the library's next calls."""
@@ -182,9 +184,13 @@ class Programme:
     # -------------------------------------------------------------------------- constraints
 
     def _pieces_that_may_bind(self, row: Row) -> np.ndarray:
-        """Which pieces may be the largest, or at their limit, within REACH; of many, the worst."""
+        """Which pieces may be at their limit within REACH; of many, the worst.
+
+        A piece that no gain changes, such as the margin at t = 0, is none of them: if it is at its
+        limit, it cannot be moved inside by TARGET_EXCESS.
+        """
         change = REACH * np.sum(np.abs(row.piece_gradients), axis=1)
-        may_bind = row.pieces + change >= -TARGET_EXCESS
+        may_bind = (row.pieces + change >= -TARGET_EXCESS) & (change > SMALLEST_CHANGE)
         for r in range(len(self.space.constraints.worst)):
             own = self.space.constraints.owner == r
             values = np.where(may_bind & own, row.pieces + change, -np.inf)
