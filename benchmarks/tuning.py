@@ -265,7 +265,7 @@ def run_ours(
             "seed": seed,
             "progress": callback or False,
         }
-        timing = {"duration": duration, "iterations": iterations}
+        timing = {"duration": duration, "effort": ij.tuning.Effort(iterations=iterations)}
         return ij.tune(scenario, parameters, loss.objective(SMOOTHING), **timing, **options)
 
     def timed(seed: int) -> Search:
@@ -521,7 +521,13 @@ def limited_searches(name: str, quick: bool) -> tuple[list[Search], float, ij.Tu
     seconds = interleaved(calls, 2 if quick else 10)
     cost, began = seconds["slope"] / seconds["value"], time.perf_counter()
     best = ij.tune(
-        scenario, tunables, goal, iterations=4 if quick else 60, progress=False, **timing, **study
+        scenario,
+        tunables,
+        goal,
+        effort=ij.tuning.Effort(iterations=4 if quick else 60),
+        progress=False,
+        **timing,
+        **study,
     )
     history = best.history
     feasible = history["valid"] & np.all(history["excess"] <= 0, axis=-1)

@@ -6,7 +6,7 @@ is that of a study file (`files.study`):
     preset = "zhang_yan_2024"
     [run]                                   # duration, dt, method
     duration = 5.0
-    [tune]                                  # runs, seed, risk, level, iterations of `tune`
+    [tune]                                  # runs, seed, risk, level, effort of `tune`
     parameters = [
       "controller.k1",
       { path = "controller.K2", low = 0.6, high = 40.0, tied = true },
@@ -70,7 +70,14 @@ from iblf_jax.studies.draws import targets_of
 from iblf_jax.tuning import objectives, quantities
 from iblf_jax.tuning._tune import tune
 from iblf_jax.tuning.objectives import Objective, checked
-from iblf_jax.tuning.options import EARLIER_NAMES, OF_REPORT, REPLACED, Report
+from iblf_jax.tuning.options import (
+    EARLIER_NAMES,
+    OF_REPORT,
+    REPLACED,
+    Effort,
+    Report,
+    effort_of,
+)
 from iblf_jax.tuning.parameters import tunable
 from iblf_jax.tuning.result import TuneResult, TuneSetup
 from iblf_jax.tuning.robust import KINDS, Risk, cvar
@@ -108,8 +115,8 @@ HISTORY = dict.fromkeys(
     "evaluations": "iu",
 }
 """Name of an array in the history of a result -> the kinds of number that it may have."""
-ARGUMENTS = ("runs", "seed", "backend", "iterations")
-"""Keys of [tune] besides `parameters`, `risk`, `level`, `solver` and `report`."""
+ARGUMENTS = ("runs", "seed", "backend")
+"""Keys of [tune] besides `parameters`, `risk`, `level`, `solver`, `effort` and `report`."""
 EARLIER_ARGUMENTS = tuple(name for name in REPLACED if name != "callback")
 """Keys that [tune] had in earlier versions."""
 
@@ -148,7 +155,8 @@ def tune_file(path: str | os.PathLike, **options: Any) -> TuneResult:
 
 def _options(table: dict[str, Any]) -> dict[str, Any]:
     """The arguments of `tune` in the table [tune]."""
-    allowed = ("parameters", "risk", "level", "solver", "report", *ARGUMENTS, *EARLIER_ARGUMENTS)
+    own = ("parameters", "risk", "level", "solver", "effort", "report")
+    allowed = (*own, *ARGUMENTS, *EARLIER_ARGUMENTS)
     known_keys(table, "tune", allowed)
     parameters = table.get("parameters", Words("nothing"))
     if not isinstance(parameters, list):
@@ -160,6 +168,11 @@ def _options(table: dict[str, Any]) -> dict[str, Any]:
     options |= {key: table[key] for key in (*ARGUMENTS, *EARLIER_ARGUMENTS) if key in table}
     if "solver" in table:
         options["solver"] = _solver(table["solver"])
+    if isinstance(table.get("effort"), dict):
+        known_keys(table["effort"], "tune.effort", [x.name for x in dataclasses.fields(Effort)])
+        options["effort"] = components.construct(Effort, dict(table["effort"]), "tune.effort")
+    elif "effort" in table:
+        options["effort"] = effort_of(table["effort"])
     if "report" in table:
         report = as_table(table["report"], "tune.report")
         known_keys(report, "tune.report", [field.name for field in dataclasses.fields(Report)])

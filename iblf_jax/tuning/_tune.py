@@ -21,8 +21,9 @@ from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.tuning.checkpoints import fingerprint, load_checkpoint, save_checkpoint
-from iblf_jax.tuning.evaluation import Derivatives, Evaluator, values
+from iblf_jax.tuning.evaluation import Evaluator, values
 from iblf_jax.tuning.objectives import Objective
+from iblf_jax.tuning.optimality import Conditions
 from iblf_jax.tuning.options import Effort, Report, SearchOptions, chosen_solver, options_of
 from iblf_jax.tuning.parameters import Tunable, in_units, names_of, values_at
 from iblf_jax.tuning.problem import TuningProblem
@@ -31,13 +32,7 @@ from iblf_jax.tuning.robust import Risk
 from iblf_jax.tuning.runs import NUMBERS_A_RUN
 from iblf_jax.tuning.search import REPAIR, REPAIR_STARTS, SECOND, Search, Strategy
 from iblf_jax.tuning.solvers import Solver
-from iblf_jax.tuning.solvers.sqp import (
-    SQP,
-    STATIONARITY_TOLERANCE,
-    Point,
-    conditions_at,
-    free_slope,
-)
+from iblf_jax.tuning.solvers.sqp import SQP
 from iblf_jax.tuning.starts import (
     MAX_SCREENED_RUNS,
     Screening,
@@ -181,8 +176,14 @@ def _search_of(problem: TuningProblem, solver: Solver, mode: str, effort: Effort
         z = usable_starts(problem, seed, z, values(problem, problem.box.z[None]))
     problem = problem.for_solver(solver)
     space = problem.search_space(effort.iterations)
+    starts_used = rows = len(z)
+    if strategy is not None and problem.allowed:
+        rows = max(rows, REPAIR_STARTS)  # for later phases
+    z = z[np.minimum(np.arange(rows), len(z) - 1)]
     evaluate = Evaluator(problem, problem.candidates(z), mode, space)
-    return Search(evaluate, solver, z, strategy)
+    search = Search(evaluate, solver, z, strategy)
+    search.retire(slice(starts_used, None))
+    return search
 
 
 def _chosen_starts(problem: TuningProblem, screening: Screening, starts: int) -> np.ndarray:
@@ -259,64 +260,21 @@ class Outcome(NamedTuple):
 
 def _outcome(search: Search, stopped: str) -> Outcome:
     """The best point of a search with its multipliers and residuals, and why the search ended."""
-    z = search.state["incumbent_z"]
-    multipliers, residuals = _conditions(search, z)
+    found = search.conditions()
     if stopped == "converged" or search.is_violated:
-        stopped = _why_ended(search, stopped, residuals)
-    return Outcome(search, z, stopped, multipliers, residuals, _tried(search))
+        stopped = _why_ended(search, stopped, found)
+    z = search.state["incumbent_z"]
+    return Outcome(search, z, stopped, found.multipliers, found.residuals, _tried(search))
 
 
-def _why_ended(search: Search, stopped: str, residuals: np.ndarray) -> str:
+def _why_ended(search: Search, stopped: str, found: Conditions) -> str:
     """Why a search ended whose starts have converged, or that found no feasible gains."""
-    if not np.all(np.isfinite(residuals)):
+    if not np.all(np.isfinite(found.residuals)):
         return NO_GRADIENT
-    stationarity, _, complementarity = residuals
     if search.is_violated:
-        # The multipliers of the largest excess add up to 1.
         repaired = search.strategy is None or bool(search.state["repair_ended"])
-        is_least = repaired and stationarity <= STATIONARITY_TOLERANCE
-        return INFEASIBLE if is_least else NOT_FEASIBLE
-    size = max(1e-3, abs(float(search.state["incumbent_key"][1])))
-    is_optimal = max(stationarity, complementarity) <= STATIONARITY_TOLERANCE * size
-    return "converged" if is_optimal else STUCK
-
-
-def _conditions(search: Search, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Multipliers and residuals of the optimality conditions at a point, which is evaluated once
-    more.  Where the point violates a requirement they are those of the least largest excess.
-    """
-    evaluate = search.evaluate
-    starts = len(evaluate.active)
-    evaluate.active = np.arange(starts) == search.best
-    found = evaluate(np.tile(z, (starts, 1)))
-    search.state["evaluations"] = search.state["evaluations"] + 1
-    search.history["evaluations"][-1] = search.state["evaluations"]
-    if not search.solver.handles_requirements:
-        return _conditions_of_loss(search, z, found)
-    space = evaluate.space
-    point = Point.of(space, found, search.best)
-    if not point.is_finite:
-        return np.full(len(search.evaluate.problem.allowed), np.nan), np.full(3, np.nan)
-    if search.is_violated:
-        space = space._replace(constraints=space.constraints._replace(largest_only=True))
-        nothing = np.zeros_like(point.gradient), np.zeros_like(point.matrix)
-        point = point._replace(loss=1.0, gradient=nothing[0], matrix=nothing[1])
-    return conditions_at(space, z, point)
-
-
-def _conditions_of_loss(
-    search: Search, z: np.ndarray, found: Derivatives
-) -> tuple[np.ndarray, np.ndarray]:
-    """The same where the requirements are penalties: the gradient of the augmented Lagrangian is
-    that of the Lagrangian with max(0, y + mu G) as multipliers.
-    """
-    s = search.best
-    excess = found.value.smooth_excess[s]
-    y = search.state["multipliers"][s] + search.state["penalty"][s] * excess
-    multipliers = np.maximum(y, 0.0)
-    stationarity = free_slope(search.evaluate.space.box, z, found.gradient[s])
-    worst = max(float(np.max(found.value.exact_excess[s], initial=0.0)), 0.0)
-    return multipliers, np.array([stationarity, worst, np.sum(np.abs(multipliers * excess))])
+        return INFEASIBLE if repaired and found.hold else NOT_FEASIBLE
+    return "converged" if found.hold else STUCK
 
 
 def _tried(search: Search) -> tuple[str, ...]:

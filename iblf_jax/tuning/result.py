@@ -30,10 +30,7 @@ from iblf_jax.tuning.step_check import StepCheck, check_step_size
 
 LARGE_CHANGE = 100.0
 """Factor by which a gain may change before a warning is given."""
-STUCK = (
-    "the steps became too small: the model of objective and requirements does not hold near these"
-    " gains"
-)
+STUCK = "the solver ended at gains where the conditions of an optimum do not hold"
 """Why a solver ended before the conditions of an optimum hold."""
 LIMIT_TOLERANCE = 0.01
 """A number is at a limit if it differs from it by no more than this part of it (of the range, where
@@ -161,8 +158,10 @@ class TuneResult:
     def limit_multipliers(self) -> dict[str, float]:
         """Multiplier of each requirement by its name and in the unit of its limit: the decrease of
         the objective if the limit is loosened by one unit.  For a violation probability, by one
-        radian of the margin of its worst runs.
+        radian of the margin of its worst runs.  Empty where a requirement is violated.
         """
+        if self.is_violated:
+            return {}
         pairs = zip(self.setup.objective.requirements, self.multipliers, strict=False)
         return {r.name: multiplier / float(r.scale) for r, multiplier in pairs}
 

@@ -41,6 +41,7 @@ import numpy as np
 from iblf_jax.core import checks
 from iblf_jax.tuning.evaluation import Derivatives, Evaluator, Value
 from iblf_jax.tuning.objectives import is_smoothed, sharper
+from iblf_jax.tuning.optimality import Conditions, conditions, conditions_of_penalty
 from iblf_jax.tuning.problem import FIRST_PENALTY
 from iblf_jax.tuning.solvers import SearchSpace, Solver
 from iblf_jax.tuning.starts import EXCESS_WEIGHT, Screening, distinct
@@ -206,16 +207,31 @@ class Search:
             if self.is_violated:
                 self._begin(REPAIR, self._least_violated())
                 return True
-            if stopped == "converged" and self._ended_at_incumbent():
+            if stopped == "converged" and self._ended_at_incumbent() and self.conditions().hold:
                 return False
         elif phase == REPAIR:
-            self.state["repair_ended"] = np.asarray(stopped == "converged")
             if self.is_violated:
+                self.state["repair_ended"] = np.asarray(self.conditions().hold)
                 return False
         else:
             return False
         self._begin(SECOND, self._unexplored())
         return True
+
+    def conditions(self) -> Conditions:
+        """The optimality conditions at the best point, which is evaluated once more."""
+        evaluate = self.evaluate
+        z = self.state["incumbent_z"]
+        row = self.best
+        before = evaluate.evaluations
+        self._prepare_evaluation()
+        evaluate.active = np.arange(len(evaluate.active)) == row
+        found = evaluate(np.tile(z, (len(evaluate.active), 1)))
+        self.state["evaluations"] = self.state["evaluations"] + evaluate.evaluations - before
+        self.history["evaluations"][-1] = self.state["evaluations"]
+        if self.solver.handles_requirements:
+            return conditions(evaluate, found, row, z, violated=self.is_violated)
+        return conditions_of_penalty(evaluate, found, row, z, self.state)
 
     def _ended_at_incumbent(self) -> bool:
         """Whether the best point is one of a start that went on to its end: others may be better in

@@ -467,6 +467,7 @@ GOOD = {
         **({"scenario": WEAK, "parameters": ["controller.K2"], "objective": TRACKING, **SHORT} | x)
     ),
     "SQP": lambda **x: ij.tuning.SQP(**x),
+    "Effort": lambda **x: ij.tuning.Effort(**x),
     "LBFGS": lambda **x: ij.tuning.LBFGS(**x),
     "Adam": lambda **x: ij.tuning.Adam(**x),
     "Optax": lambda **x: ij.tuning.Optax(**x),
@@ -563,7 +564,8 @@ REFUSED = {
     "tune backend": (NO_WORDS, ["'auto'"]),
     "Report seed": (NO_SEEDS[1:], ["whole number"]),
     "SQP patience": (NO_COUNTS, ["whole number"]),
-    "tune iterations": (NO_COUNTS, ["whole number"]),
+    "Effort iterations": (NO_COUNTS, ["whole number"]),
+    "tune effort": ((None, "x", "", 3, [], ij.tuning.Effort), ["'thorough'"]),
     "SQP tolerance": ((None, "x", -1.0, float("nan"), 1.5, 1e300, 10**30), ["from 0 to 1"]),
     "Adam learning_rate": ((None, "x", 0.0, -1.0, float("nan"), 5e-324, 1e300, 10**30), ["number"]),
     "tune checkpoint": ((*NO_PATHS, f"{NO_FOLDER}/state.npz"), []),

@@ -78,7 +78,14 @@ def test_the_gradient_by_208_numbers_is_that_of_central_differences(scheduled):
 
 
 def test_208_numbers_are_tuned_with_the_same_report(scheduled):
-    best = ij.tune(scheduled, PATHS, goal(), report=ij.tuning.Report(runs=50), iterations=8, **RUN)
+    best = ij.tune(
+        scheduled,
+        PATHS,
+        goal(),
+        report=ij.tuning.Report(runs=50),
+        effort=ij.tuning.Effort(iterations=8),
+        **RUN,
+    )
     assert (best.optimiser, best.mode) == ("lbfgs", "reverse")
     report = best.report
     objective = report.changes[0]
@@ -249,7 +256,7 @@ def test_a_tuning_by_mini_batches_continues_from_a_checkpoint(tmp_path):
             perturbations=DRAWS,
             runs=8,
             solver=Optax(optax.chain(optax.clip_by_global_norm(1.0), optax.lion(0.1)), batch=4),
-            iterations=iterations,
+            effort=ij.tuning.Effort(iterations=iterations),
             checkpoint=checkpoint,
             progress=False,
         )

@@ -195,7 +195,9 @@ def test_all_kinds_together_have_the_derivatives_of_simulate(lab):
     others = np.delete(np.asarray(found.gradient[0]), period)
     assert np.all(np.abs(others) > 1e-6)
 
-    best = ij.tune(scenario, TOGETHER, goal, iterations=2, progress=False, **SHORT)
+    best = ij.tune(
+        scenario, TOGETHER, goal, effort=ij.tuning.Effort(iterations=2), progress=False, **SHORT
+    )
     tuned = np.concatenate([np.ravel(best.values[block.path]) for block in problem.blocks])
     low, high = (in_units(problem.blocks, z) for z in (problem.box.low, problem.box.high))
     assert np.all((low * (1 - 1e-9) <= tuned) & (tuned <= high * (1 + 1e-9)))

@@ -110,7 +110,6 @@ class Optax:
         return np.zeros(len(state["w"]), bool)
 
 
-
 def init(solver: Any, space: SearchSpace, z: np.ndarray) -> dict[str, Any]:
     """The state of S starts at z, (S, p).
 

@@ -92,7 +92,8 @@ CUT_REACH = 3.0
 BETA = 10.0
 """Curvature, relative to the objective, with which multipliers are determined at a point."""
 STATIONARITY_TOLERANCE = 1e-3
-"""Largest entry of the Lagrangian's gradient at convergence, relative to the objective."""
+"""Largest entry of the Lagrangian's gradient at convergence, relative to the larger of the objective
+and its gradient."""
 TARGET_EXCESS = 1e-5
 """How far inside its limit a requirement is aimed at, in its scale, so that rounding does not
 violate it."""
@@ -682,7 +683,9 @@ def _plan(space: SearchSpace, state: SQPState, tolerance: float) -> None:
     length = np.max(np.abs(found.step))
     is_feasible = violation <= TARGET_EXCESS or reduction < 1e-3 * violation
     is_flat = is_feasible and linear_decrease < tolerance * state.size
-    slope_scale = state.size if violation <= TARGET_EXCESS else state.penalty
+    slope_scale = slope_size(state.here)
+    if violation > TARGET_EXCESS:
+        slope_scale = max(slope_scale, state.penalty)
     is_stationary = state.residuals[0] <= STATIONARITY_TOLERANCE * slope_scale
     is_optimal = bool(length < 1e-7 or (is_flat and is_stationary))
     state.done = is_optimal or bool(state.radius < COLLAPSED_RADIUS)
@@ -706,6 +709,13 @@ def _best_with_curvature(
     return best, decrease
 
 
+def slope_size(here: Point) -> float:
+    """What the gradient of the Lagrangian is compared with: the larger of the objective and its
+    gradient.
+    """
+    return max(1e-3, abs(here.loss), float(np.max(np.abs(here.gradient))))
+
+
 def free_slope(box: Box, z: np.ndarray, slope: np.ndarray) -> float:
     """The largest entry of a gradient that no range blocks."""
     blocked_below = (z < box.low + RANGE_TOLERANCE) & (slope > 0)
@@ -721,9 +731,15 @@ def conditions_at(space: SearchSpace, z: np.ndarray, found: Point) -> tuple[np.n
 
         minimise over y >= 0    |g + sum_j y_j a_j|^2 / (2 BETA |f|) - sum_j y_j e_j,
 
-    so that a multiplier is not zero only where the piece is at its limit.
+    so that a multiplier is not zero only where the piece is at its limit.  Where the largest
+    violation alone counts, f is left out, the multipliers add up to 1, and the limit is the largest
+    excess itself.
     """
     size = max(1e-3, abs(found.loss))
+    penalty = LARGEST_PENALTY * size
+    if space.constraints.largest_only:
+        size = penalty = 1.0
+        found = found._replace(gradient=np.zeros_like(found.gradient))
     solved = solve_subproblem(
         found.gradient,
         BETA * size * np.eye(len(z)),
@@ -732,10 +748,13 @@ def conditions_at(space: SearchSpace, z: np.ndarray, found: Point) -> tuple[np.n
         space.constraints,
         found.pieces,
         found.piece_gradients,
-        LARGEST_PENALTY * size,
+        penalty,
     )
     excess = space.constraints.excess(found.pieces)
-    return solved.multipliers, _residuals(space, z, found.pieces, solved, excess)
+    over_limit = found.pieces
+    if space.constraints.largest_only:
+        over_limit = found.pieces - max(float(np.max(excess)), 0.0)
+    return solved.multipliers, _residuals(space, z, over_limit, solved, excess)
 
 
 def _residuals(
