@@ -69,7 +69,8 @@ def reference(arm, goal):
 @pytest.mark.parametrize("name", [*DERIVATIVES, *POPULATIONS])
 def test_it_reaches_the_optimum_and_keeps_the_requirements(arm, before, goal, reference, name):
     needs_its_package(name)
-    best = ij.tune(arm, GAINS, goal, solver=name, **RUN)
+    solver = TrustConstr(starts=1) if name == "trust-constr" else name  # it takes long
+    best = ij.tune(arm, GAINS, goal, solver=solver, **RUN)
     within = 1.005 if name in DERIVATIVES else 1.02
     assert best.optimiser == name
     assert best.objective <= within * reference.objective

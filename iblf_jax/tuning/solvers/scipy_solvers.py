@@ -29,8 +29,8 @@ class SLSQP(RunsToItsEnd):
 
     Args:
       tolerance: relative change of the objective below which a run ends.
-      starts: number of starting points, whose runs follow one another; by the effort of the tuning
-        if None.
+      starts: number of starting points, whose runs follow one another, each to its end; by the
+        effort of the tuning if not given.
       sharpenings: how often the smoothing of peaks in the objective is divided by 4, each time
         after a run.
       patience: runs without a better result after which the search ends.
@@ -39,7 +39,7 @@ class SLSQP(RunsToItsEnd):
     """
 
     tolerance: float = 1e-6
-    starts: int | None = 1
+    starts: int | None = None
     sharpenings: int = 2
     patience: int = 15
     name: ClassVar[str] = "slsqp"
@@ -80,8 +80,8 @@ class TrustConstr(RunsToItsEnd):
     Args:
       tolerance: of a run: largest entry of the Lagrangian's gradient relative to the objective,
         smallest barrier parameter and smallest radius.
-      starts: number of starting points, whose runs follow one another; by the effort of the tuning
-        if None.
+      starts: number of starting points, whose runs follow one another, each to its end; by the
+        effort of the tuning if not given.
       sharpenings: how often the smoothing of peaks in the objective is divided by 4, each time
         after a run.
       patience: runs without a better result after which the search ends.
@@ -90,7 +90,7 @@ class TrustConstr(RunsToItsEnd):
     """
 
     tolerance: float = 1e-5
-    starts: int | None = 1
+    starts: int | None = None
     sharpenings: int = 2
     patience: int = 15
     name: ClassVar[str] = "trust-constr"

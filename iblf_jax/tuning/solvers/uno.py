@@ -24,8 +24,8 @@ class Uno(RunsToItsEnd):
     Args:
       preset: "filtersqp", "ipopt" or "filterslp", combinations of methods as in these solvers.
       tolerance: of stationarity and complementarity, relative to the objective.
-      starts: number of starting points, whose runs follow one another; by the effort of the tuning
-        if None.
+      starts: number of starting points, whose runs follow one another, each to its end; by the
+        effort of the tuning if not given.
       sharpenings: how often the smoothing of peaks in the objective is divided by 4, each time
         after a run.
       patience: runs without a better result after which the search ends.
@@ -36,7 +36,7 @@ class Uno(RunsToItsEnd):
 
     preset: str = "filtersqp"
     tolerance: float = 1e-5
-    starts: int | None = 1
+    starts: int | None = None
     sharpenings: int = 2
     patience: int = 15
     name: ClassVar[str] = "uno"
