@@ -12,8 +12,8 @@ is that of a study file (`files.study`):
       { path = "controller.K2", low = 0.6, high = 40.0, tied = true },
     ]
     [tune.solver]                           # or solver = "sqp"; without it, `tune` chooses one
-    kind = "sqp"                            # "sqp", "lbfgs" or "adam", with the options of
-    starts = 4                              # ij.tuning.SQP, LBFGS or Adam
+    kind = "sqp"                            # a name in ij.tuning.SOLVERS, with the options of its
+    starts = 4                              # class, such as ij.tuning.SQP
     [tune.report]                           # the options of ij.tuning.Report
     runs = 2000
     [[objective]]                           # functions of iblf_jax.objectives with their arguments,

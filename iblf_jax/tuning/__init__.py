@@ -20,7 +20,7 @@ and validates the result on fresh runs.
 | `problem` | `TuningProblem`: all of the above in one object |
 | `rollouts`, `runs` | batches of runs without and with derivatives |
 | `evaluation` | value and derivatives of the problem |
-| `solvers` | the Protocol `Solver`; `SQP`, `LBFGS`, `Adam`, `Optax` |
+| `solvers` | the Protocol `Solver`; `SQP`, `LBFGS`, `Adam`, `Optax`, and those of other libraries |
 | `starts`, `search`, `checkpoints` | where a search begins, its steps, its stored state |
 | `result`, `report` | what `tune` returns, and its validation on fresh runs |
 | `samples`, `failures`, `step_check` | runs for the report, why fresh runs failed, and dt / 2 |
@@ -42,11 +42,17 @@ from iblf_jax.tuning.problem import TuningProblem as TuningProblem
 from iblf_jax.tuning.report import TuningReport as TuningReport
 from iblf_jax.tuning.result import TuneResult as TuneResult
 from iblf_jax.tuning.robust import cvar as cvar
+from iblf_jax.tuning.solvers import CMAES as CMAES
 from iblf_jax.tuning.solvers import LBFGS as LBFGS
+from iblf_jax.tuning.solvers import SLSQP as SLSQP
 from iblf_jax.tuning.solvers import SOLVERS as SOLVERS
 from iblf_jax.tuning.solvers import SQP as SQP
 from iblf_jax.tuning.solvers import Adam as Adam
+from iblf_jax.tuning.solvers import DifferentialEvolution as DifferentialEvolution
 from iblf_jax.tuning.solvers import Optax as Optax
+from iblf_jax.tuning.solvers import Optuna as Optuna
 from iblf_jax.tuning.solvers import SearchSpace as SearchSpace
 from iblf_jax.tuning.solvers import Solver as Solver
+from iblf_jax.tuning.solvers import TrustConstr as TrustConstr
+from iblf_jax.tuning.solvers import Uno as Uno
 from iblf_jax.tuning.step_check import StepCheck as StepCheck

@@ -19,6 +19,9 @@ SCHEDULES = ("cosine", "constant")
 MAX_SHARPENINGS = 60
 """With more, the smoothing is not representable in float32."""
 LEARNING_RATES = (1e-12, 1e3)
+SAMPLERS = ("tpe", "qmc", "random")
+PRESETS = ("filtersqp", "ipopt", "filterslp")
+POPULATIONS = (5, 100_000)
 
 
 class Constraints(NamedTuple):
@@ -193,6 +196,14 @@ CHECKS: dict[str, Any] = {
     "memory": lambda name, x: checks.positive_integer(name, x, most=1000),
     "line_steps": lambda name, x: checks.positive_integer(name, x, most=1000),
     "radius": lambda name, x: None if x is None else checks.positive_number(name, x, "1"),
+    "population": lambda name, x: checks.positive_integer(
+        name, x, least=POPULATIONS[0], most=POPULATIONS[1]
+    ),
+    "step_size": lambda name, x: checks.positive_number(name, x, "1"),
+    "reach": lambda name, x: checks.positive_number(name, x, "1"),
+    "seed": lambda name, x: checks.seed(x, name),
+    "sampler": lambda name, x: _word(name, x, SAMPLERS),
+    "preset": lambda name, x: _word(name, x, PRESETS),
 }
 """Option -> function of its name and value that returns the value in its type, or raises
 ValueError."""
