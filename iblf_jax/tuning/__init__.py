@@ -6,7 +6,7 @@ and validates the result on fresh runs.
         ["controller.k1", "controller.K2", "observer.kf"],
         ij.objectives.tracking() + 0.5 * ij.objectives.effort() + ij.objectives.margin_above(0.05),
         duration=5.0,
-        solver=ij.tuning.SQP(starts=4),
+        effort="thorough",
         report=ij.tuning.Report(runs=2000),
     )
     best.scenario, best.report, best.plot()
@@ -22,6 +22,7 @@ and validates the result on fresh runs.
 | `evaluation` | value and derivatives of the problem |
 | `solvers` | the Protocol `Solver`; `SQP`, `LBFGS`, `Adam`, `Optax`, and those of other libraries |
 | `starts`, `search`, `checkpoints` | where a search begins, its steps, its stored state |
+| `optimality` | multipliers and residuals at the returned gains |
 | `result`, `report` | what `tune` returns, and its validation on fresh runs |
 | `samples`, `failures`, `step_check` | runs for the report, why fresh runs failed, and dt / 2 |
 | `_tune` | `tune`, which calls these in this order |

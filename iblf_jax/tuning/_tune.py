@@ -169,8 +169,8 @@ def _search_of(problem: TuningProblem, solver: Solver, mode: str, effort: Effort
     if solver.starts is None:
         count = min(effort.values, MAX_SCREENED_RUNS // problem.runs)
         screening = screen(problem, count, seed)
-        strategy = Strategy(screening, effort.selection)
         z = _chosen_starts(problem, screening, starts)
+        strategy = Strategy(screening, effort.selection, len(z))
     else:
         z = starting_points(problem.box, starts, seed)
         z = usable_starts(problem, seed, z, values(problem, problem.box.z[None]))
@@ -261,7 +261,7 @@ class Outcome(NamedTuple):
 def _outcome(search: Search, stopped: str) -> Outcome:
     """The best point of a search with its multipliers and residuals, and why the search ended."""
     found = search.conditions()
-    if stopped == "converged" or search.is_violated:
+    if stopped == "converged" or search.is_violated or found.hold:
         stopped = _why_ended(search, stopped, found)
     z = search.state["incumbent_z"]
     return Outcome(search, z, stopped, found.multipliers, found.residuals, _tried(search))
@@ -284,12 +284,12 @@ def _tried(search: Search) -> tuple[str, ...]:
     if search.strategy is None:
         return ()
     valleys, reached = search.state["valleys"].tolist()
-    starts = len(search.state["finished"])
+    starts = search.strategy.starts
     lines = []
     if starts > 1:
         lines.append(
-            f"searches from {starts} of {len(search.strategy.screening.points)} points: {valleys}"
-            f" valleys seen, the best one reached by {reached}"
+            f"searches from {starts} of {len(search.strategy.screening.points)} points: they were"
+            f" in {valleys} valleys when they ended or were dropped, {reached} in the best one"
         )
     phase = int(search.state["phase"])
     if phase == REPAIR or search.state["repair_ended"]:
@@ -297,7 +297,7 @@ def _tried(search: Search) -> tuple[str, ...]:
         how = "to a stationary point" if search.state["repair_ended"] else "without converging"
         lines.append(
             f"no gains that keep the requirements were found; the largest excess was minimised from"
-            f" {min(REPAIR_STARTS, starts)} points, {how}: {least:.3g}"
+            f" up to {REPAIR_STARTS} points, {how}: {least:.3g}"
         )
     elif phase == SECOND:
         lines.append("a second search followed, from the best gains and from another valley")

@@ -22,9 +22,9 @@ A tuning that begins at several of many points (`starts`) is a search in phases:
 
 1. All starts take steps as one batch.  After `selection` steps the better half of them goes on, and
    after twice as many only the best (successive halving).
-2. If no point that keeps the requirements is known at the end, the largest excess alone is
-   minimised, from the points with the smallest ones, until a point keeps the requirements, or all
-   starts are at stationary points of the largest excess.
+2. If no point that keeps the requirements is known at the end, as many further points are
+   evaluated, and the largest excess alone is minimised from those with the smallest ones, until a
+   point keeps the requirements, or all starts are at stationary points of the largest excess.
 3. If phase 1 did not converge, or phase 2 found such a point, a second search begins at the best
    point and at the best one that is far from all earlier starts.
 
@@ -36,6 +36,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from iblf_jax.core import checks
@@ -45,10 +46,19 @@ from iblf_jax.tuning.optimality import Conditions, conditions, conditions_of_pen
 from iblf_jax.tuning.parameters import along
 from iblf_jax.tuning.problem import FIRST_PENALTY
 from iblf_jax.tuning.solvers import SQP, SearchSpace, Solver
-from iblf_jax.tuning.starts import EXCESS_WEIGHT, Screening, distinct
+from iblf_jax.tuning.starts import (
+    EXCESS_WEIGHT,
+    FEW_POINTS,
+    Screening,
+    distinct,
+    ranked,
+    spread_points,
+)
 
 STEPS_PER_UPDATE = 12
 """Steps at most between two updates of the multipliers."""
+SECOND_DRAW = 1000
+"""Added to the seed for the points of the second phase."""
 MAX_UPDATES = 12
 """Updates of the multipliers in a stage."""
 PENALTY_FACTOR = 5.0
@@ -66,7 +76,8 @@ OPTIMISE, REPAIR, SECOND = range(3)
 """The phases."""
 REPAIR_STEPS = 30
 """Steps at most in which the largest excess is minimised."""
-REPAIR_STARTS = 3
+REPAIR_STARTS = 6
+"""Points from which it is minimised."""
 MOST_MULTIPLES = 32
 """Multiples of a leaf that are compared, the nearest ones."""
 KINK_REACH = 0.05
@@ -82,6 +93,8 @@ class Strategy(NamedTuple):
     """The points that were evaluated without derivatives."""
     selection: int
     """Steps after which the better half of the starts goes on."""
+    starts: int
+    """Number of starts; further rows of the search belong to later phases."""
 
 
 class Search:
@@ -323,14 +336,21 @@ class Search:
 
     def _least_violated(self) -> np.ndarray:
         """The points from which the largest excess is minimised: the best one of all, and those
-        with the smallest excess of the points without derivatives.
+        with the smallest excess among as many new points as there were before.
         """
         assert self.strategy is not None
-        screening = self.strategy.screening
+        problem = self.evaluate.problem
+        first = self.strategy.screening
+        count = max(len(first.points) - 1, FEW_POINTS)
+        points = spread_points(problem.box, count, int(problem.options.seed) + SECOND_DRAW)
+        new = ranked(points, self.evaluate.values(points))
+        both = Screening(*(_joined(x, y) for x, y in zip(first, new, strict=True)))
         best = self.state["incumbent_z"][None]
-        count = min(REPAIR_STARTS, len(self.state["finished"])) - 1
-        order = np.argsort(screening.excess, kind="stable")
-        return np.concatenate([best, self._distinct(order, count, best)])
+        if not self.is_violated:
+            return best
+        starts = min(REPAIR_STARTS, len(self.state["finished"])) - 1
+        order = np.argsort(both.excess, kind="stable")
+        return np.concatenate([best, self._distinct(both, order, starts, best)])
 
     def _unexplored(self) -> np.ndarray:
         """The best point, and the best one that is far from all starts."""
@@ -339,15 +359,17 @@ class Search:
         explored = np.concatenate([best, self.history["z"][0], self.state["best_z"]])
         order = np.argsort(self.strategy.screening.merit, kind="stable")
         count = min(2, len(self.state["finished"])) - 1
-        return np.concatenate([best, self._distinct(order, count, explored)])
+        further = self._distinct(self.strategy.screening, order, count, explored)
+        return np.concatenate([best, further])
 
-    def _distinct(self, order: np.ndarray, count: int, others: np.ndarray) -> np.ndarray:
-        assert self.strategy is not None
+    def _distinct(
+        self, screening: Screening, order: np.ndarray, count: int, others: np.ndarray
+    ) -> np.ndarray:
         problem = self.evaluate.problem
         refused = problem.sampled_too_slowly
         if count == 0:
             return np.zeros((0, problem.size))
-        return distinct(self.strategy.screening, order, count, problem.box, refused, others)
+        return distinct(screening, order, count, problem.box, refused, others)
 
     def _valleys(self) -> np.ndarray:
         """In how many valleys the starts ended or were retired, and how many of them in the best
@@ -519,6 +541,11 @@ class Search:
         state["updates"][s] += 1
         state["steps_without_better"] = np.asarray(0)
         self.solver.restart(self.evaluate.space, state["solver"], s)
+
+
+def _joined(first: Any, second: Any) -> Any:
+    """Two arrays, or tuples of arrays, one after the other."""
+    return jax.tree.map(lambda x, y: np.concatenate([x, y]), first, second)
 
 
 def _key(found: Value, row: int) -> tuple[float, float]:

@@ -411,7 +411,7 @@ def test_files_that_are_torn_or_others(paper, tuned, tmp_path):
         complete | {key: value}
         for key in complete
         for value in (None, 3, [[1]])
-        if key not in ("report", "best_start", "seconds", "probes")
+        if key not in ("report", "best_start", "seconds", "probes", "tried", "tuned_objective")
     ]
     for data in (*map(json.dumps, bad), saved[:200], "[]", "[" * 100_000):
         (tmp_path / "bad.json").write_text(data)
