@@ -53,7 +53,7 @@ def main() -> None:
         perturbations=PERTURBATIONS,
         runs=runs,
         risk=ij.cvar(0.9),
-        iterations=iterations,
+        effort=ij.tuning.Effort(iterations=iterations),
         report=ij.tuning.Report(runs=fresh),
         progress=False,
         **timing,

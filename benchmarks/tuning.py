@@ -1,7 +1,7 @@
 """Gain tuning against black-box search, on the same compiled rollout.
 
     python benchmarks/tuning.py [--quick] [--problem NAME] [--starts 8] [--seeds 3] [--json FILE]
-    [--picture FILE]
+    [--picture FILE] [--solvers all]
 
 The loss, without smoothing, is
 
@@ -33,6 +33,10 @@ Their table has the best objective that keeps the limits; a search counts what i
 within 0.5 % of the best of all.  Peers: CMA-ES and differential evolution with an exact penalty,
 SciPy's SLSQP from ten starts with central differences, and SLSQP from the one start with the exact
 values and slopes that `tune` has, of the largest peak of each requirement.
+
+With `--solvers` the limited problems are solved by `tune(..., solver=name)` for each of the names
+(or "all"), and nothing else is done.  Each solver has its default options; methods without
+derivatives have up to 300 generations.  Seconds are those of a second call, without compilation.
 
 `ATTACKED` are scenarios of which a few in 10,000 random runs leave their bounds: `falsify` (values
 with derivatives, which cost several values each) beside random search and CMA-ES of one and several
@@ -261,7 +265,7 @@ def run_ours(
             "seed": seed,
             "progress": callback or False,
         }
-        timing = {"duration": duration, "iterations": iterations}
+        timing = {"duration": duration, "effort": ij.tuning.Effort(iterations=iterations)}
         return ij.tune(scenario, parameters, loss.objective(SMOOTHING), **timing, **options)
 
     def timed(seed: int) -> Search:
@@ -517,7 +521,13 @@ def limited_searches(name: str, quick: bool) -> tuple[list[Search], float, ij.Tu
     seconds = interleaved(calls, 2 if quick else 10)
     cost, began = seconds["slope"] / seconds["value"], time.perf_counter()
     best = ij.tune(
-        scenario, tunables, goal, iterations=4 if quick else 60, progress=False, **timing, **study
+        scenario,
+        tunables,
+        goal,
+        effort=ij.tuning.Effort(iterations=4 if quick else 60),
+        progress=False,
+        **timing,
+        **study,
     )
     history = best.history
     feasible = history["valid"] & np.all(history["excess"] <= 0, axis=-1)
@@ -632,6 +642,57 @@ def compare_limited(name: str, quick: bool, picture: str | None = None) -> list[
             ]
         )
     return rows
+
+
+BY_DERIVATIVES = ("sqp", "slsqp", "trust-constr", "uno")
+WITHOUT_DERIVATIVES = ("differential-evolution", "cma", "optuna")
+GENERATIONS = 300
+
+
+def compare_solvers(name: str, solvers: list[str], quick: bool) -> list[list[Any]]:
+    """A row for every solver of one limited problem."""
+    scenario, tunables, goal, timing, study = limited_problem(name, quick)
+    results = {}
+    for solver in solvers:
+        steps = GENERATIONS if solver in WITHOUT_DERIVATIVES else 60
+        effort = ij.tuning.Effort(iterations=4 if quick else steps)
+        for _ in range(1 if quick else 2):  # the first call compiles
+            results[solver] = ij.tune(
+                scenario,
+                tunables,
+                goal,
+                solver=solver,
+                effort=effort,
+                progress=False,
+                **timing,
+                **study,
+            )
+    best = {solver: limited_objective(result) for solver, result in results.items()}
+    least = min(best.values())
+    return [
+        [
+            name,
+            solver,
+            f"{best[solver]:.5f}" if np.isfinite(best[solver]) else "none",
+            100 * (best[solver] / least - 1) if np.isfinite(best[solver]) else "",
+            int(result.history["evaluations"][-1]),
+            int(result.probes),
+            result.seconds,
+            result.stopped.split(":")[0],
+        ]
+        for solver, result in results.items()
+    ]
+
+
+def limited_objective(result: ij.TuneResult) -> float:
+    """The objective of the returned gains, infinite where they do not keep the limits."""
+    setup = result.setup
+    names = ("duration", "dt", "method", "backend", "perturbations", "runs", "seed", "risk")
+    options = {name: getattr(setup, name) for name in names}
+    built = TuningProblem.build(result.scenario, list(result.values), setup.objective, **options)
+    found = evaluation.values(built, built.box.z[None])
+    keeps = found.valid[0] and np.all(found.exact_excess[0] <= 0) and found.margin[0] >= 0
+    return float(found.objective[0]) if keeps else np.inf
 
 
 def attacked_problem(name: str) -> tuple[ij.Scenario, dict[str, Any], dict[str, float]]:
@@ -768,6 +829,26 @@ def compare_attacks(name: str, quick: bool) -> list[list[Any]]:
     return rows
 
 
+def report_solvers(args: argparse.Namespace) -> None:
+    """Only the table of `compare_solvers`."""
+    solvers = args.solvers.split(",")
+    if args.solvers == "all":
+        solvers = [*BY_DERIVATIVES, *WITHOUT_DERIVATIVES]
+    problems = [args.problem] if args.problem else list(LIMITED)[: 1 if args.quick else None]
+    rows = [row for name in problems for row in compare_solvers(name, solvers, args.quick)]
+    columns = [
+        "problem",
+        "solver",
+        "best within the limits",
+        "above the best [%]",
+        "values with derivatives",
+        "plain values",
+        "seconds",
+        "ended by",
+    ]
+    report("Solvers of the same problem", columns, rows, args.json)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -794,7 +875,15 @@ def main() -> None:
         "--picture",
         help="draw the ways of the searches on the limited problem of two gains into this file",
     )
+    parser.add_argument(
+        "--solvers",
+        help='names of solvers with commas between them, or "all": only compare these on the'
+        " limited problems",
+    )
     args = parser.parse_args()
+    if args.solvers:
+        report_solvers(args)
+        return
     names = (
         [args.problem]
         if args.problem

@@ -35,8 +35,9 @@ PAGES: dict[str, tuple[str, str]] = {
         "Tuning",
         (
             "tune TuneResult tunable pareto Front falsify Attack cvar tune_file save_tuning"
-            " load_tuning tuning.SQP tuning.LBFGS tuning.Adam tuning.Report tuning.Solver"
-            " objectives.Quantity objectives.Outer"
+            " load_tuning tuning.SQP tuning.LBFGS tuning.Adam tuning.Optax tuning.SLSQP"
+            " tuning.TrustConstr tuning.DifferentialEvolution tuning.CMAES tuning.Optuna tuning.Uno"
+            " tuning.Report tuning.Solver objectives.Quantity objectives.Outer"
         ),
     ),
     "identification": ("Identification", "identify Identification excitation"),

@@ -203,7 +203,8 @@ def _tuning(found: TuneResult) -> Shown:
     gains = tables.as_html(("tuned", "unit", "before", "after"), rows)
     words = [*str(found.report).splitlines(), f"Search: {_described(found)[0]}"]
     figures = {"The search, and runs before and after": found.plot}
-    return Shown("Tuning", words, {"Gains": gains}, figures, found.scenario)
+    title = f"Tuning: {found.report.headline}"
+    return Shown(title, words, {"Gains": gains}, figures, found.scenario)
 
 
 def _identification(found: Identification) -> Shown:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -14,7 +15,10 @@ DESCRIPTION = (
     "Tune the parameters of a tuning file (its format: iblf_jax.files.tuning); print the"
     " report, on new random runs if there are perturbations."
 )
-EPILOG = "Exit code 1 if a requirement failed or the objective did not decrease."
+EPILOG = (
+    "Exit code 1 if a bound is violated (more often than a requirement allows, if there is one), a"
+    " requirement failed, also at half the time step, or the objective did not decrease."
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -31,10 +35,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="save the state to this file after each step, and resume from it if it exists",
     )
     parser.add_argument(
+        "--effort",
+        choices=("quick", "normal", "thorough"),
+        help="how much is evaluated at most (default: the file's, else normal)",
+    )
+    parser.add_argument(
         "--iterations",
         type=int,
         metavar="N",
-        help="largest number of steps (default: the file's, else 60)",
+        help="largest number of steps of the solver (default: that of the effort)",
     )
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
 
@@ -43,9 +52,13 @@ def run(args: argparse.Namespace) -> int:
     """Runs the command."""
     from iblf_jax.cli._common import given_options, optional_folder
     from iblf_jax.files.tuning import tune_file
+    from iblf_jax.tuning.options import effort_of
 
     folder = optional_folder(args.out)
-    options = given_options(args, "checkpoint", "iterations")
+    options = given_options(args, "checkpoint", "effort")
+    if args.iterations is not None:
+        effort = effort_of(args.effort or "normal")
+        options["effort"] = dataclasses.replace(effort, iterations=args.iterations)
     if args.quiet:
         options["progress"] = False
     result = tune_file(args.file, **options)
@@ -69,9 +82,12 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _has_failed(report: TuningReport) -> bool:
-    """Whether a requirement failed, or the objective went up although not all requirements pass."""
+    """Whether bounds or requirements failed, or the objective went up although not all requirements
+    pass.
+    """
+    if report.failed:
+        return True
     if report.verdicts and report.passed:
         return False
     objective = report.changes[0]
-    any_failed = any(verdict.verdict == "fail" for verdict in report.verdicts)
-    return any_failed or objective.after > objective.before
+    return objective.after > objective.before

@@ -73,12 +73,17 @@ class DerivativeSizes(NamedTuple):
     """Nodes of the kernel that carries all tangents; infinite where records are differentiated."""
     max_nodes: float | None = 0
     """Nodes up to which the executor compiles such a kernel (`Limits.derivative_nodes`)."""
+    nodes_per_operation: float = 0.0
+    """Nodes of a step without tangents for each operation of the closed loop; large where arrays
+    are, such as the weights of a network."""
 
 
 def choose_derivatives(sizes: DerivativeSizes) -> str:
     """How a derivative is computed where a kernel can be built: "together" (all tangents of a run
     in one kernel), "one per run" or "scan".
     """
+    if sizes.nodes_per_operation > thresholds.MAX_NODES_PER_OPERATION:
+        return "scan"
     if thresholds.is_within(sizes.nodes_together, sizes.max_nodes):
         return "together"
     if sizes.order > thresholds.MAX_COLUMN_ORDER or sizes.columns > thresholds.MAX_COLUMNS:

@@ -6,14 +6,14 @@ is that of a study file (`files.study`):
     preset = "zhang_yan_2024"
     [run]                                   # duration, dt, method
     duration = 5.0
-    [tune]                                  # runs, seed, risk, level, iterations of `tune`
+    [tune]                                  # runs, seed, risk, level, effort of `tune`
     parameters = [
       "controller.k1",
       { path = "controller.K2", low = 0.6, high = 40.0, tied = true },
     ]
     [tune.solver]                           # or solver = "sqp"; without it, `tune` chooses one
-    kind = "sqp"                            # "sqp", "lbfgs" or "adam", with the options of
-    starts = 4                              # ij.tuning.SQP, LBFGS or Adam
+    kind = "sqp"                            # a name in ij.tuning.SOLVERS, with the options of its
+    starts = 4                              # class, such as ij.tuning.SQP
     [tune.report]                           # the options of ij.tuning.Report
     runs = 2000
     [[objective]]                           # functions of iblf_jax.objectives with their arguments,
@@ -70,7 +70,14 @@ from iblf_jax.studies.draws import targets_of
 from iblf_jax.tuning import objectives, quantities
 from iblf_jax.tuning._tune import tune
 from iblf_jax.tuning.objectives import Objective, checked
-from iblf_jax.tuning.options import EARLIER_NAMES, OF_REPORT, REPLACED, Report
+from iblf_jax.tuning.options import (
+    EARLIER_NAMES,
+    OF_REPORT,
+    REPLACED,
+    Effort,
+    Report,
+    effort_of,
+)
 from iblf_jax.tuning.parameters import tunable
 from iblf_jax.tuning.result import TuneResult, TuneSetup
 from iblf_jax.tuning.robust import KINDS, Risk, cvar
@@ -108,8 +115,8 @@ HISTORY = dict.fromkeys(
     "evaluations": "iu",
 }
 """Name of an array in the history of a result -> the kinds of number that it may have."""
-ARGUMENTS = ("runs", "seed", "backend", "iterations")
-"""Keys of [tune] besides `parameters`, `risk`, `level`, `solver` and `report`."""
+ARGUMENTS = ("runs", "seed", "backend")
+"""Keys of [tune] besides `parameters`, `risk`, `level`, `solver`, `effort` and `report`."""
 EARLIER_ARGUMENTS = tuple(name for name in REPLACED if name != "callback")
 """Keys that [tune] had in earlier versions."""
 
@@ -148,7 +155,8 @@ def tune_file(path: str | os.PathLike, **options: Any) -> TuneResult:
 
 def _options(table: dict[str, Any]) -> dict[str, Any]:
     """The arguments of `tune` in the table [tune]."""
-    allowed = ("parameters", "risk", "level", "solver", "report", *ARGUMENTS, *EARLIER_ARGUMENTS)
+    own = ("parameters", "risk", "level", "solver", "effort", "report")
+    allowed = (*own, *ARGUMENTS, *EARLIER_ARGUMENTS)
     known_keys(table, "tune", allowed)
     parameters = table.get("parameters", Words("nothing"))
     if not isinstance(parameters, list):
@@ -160,6 +168,11 @@ def _options(table: dict[str, Any]) -> dict[str, Any]:
     options |= {key: table[key] for key in (*ARGUMENTS, *EARLIER_ARGUMENTS) if key in table}
     if "solver" in table:
         options["solver"] = _solver(table["solver"])
+    if isinstance(table.get("effort"), dict):
+        known_keys(table["effort"], "tune.effort", [x.name for x in dataclasses.fields(Effort)])
+        options["effort"] = components.construct(Effort, dict(table["effort"]), "tune.effort")
+    elif "effort" in table:
+        options["effort"] = effort_of(table["effort"])
     if "report" in table:
         report = as_table(table["report"], "tune.report")
         known_keys(report, "tune.report", [field.name for field in dataclasses.fields(Report)])
@@ -313,6 +326,7 @@ RESULT = (
     "multipliers",
     "residuals",
     "probes",
+    "tried",
 )
 """Fields of a result that are words and numbers."""
 SETUP = tuple(
@@ -344,6 +358,7 @@ def save_tuning(result: TuneResult, path: str | os.PathLike) -> None:
         "setup": attributes(setup, SETUP) | of_report,
         "risk": list(setup.risk),
         "objective": components.encode_fields(setup.objective, "objective"),
+        "tuned_objective": result.objective,
         "perturbations": {
             key: components.encode_fields(x, key) for key, x in setup.perturbations.items()
         },
@@ -432,6 +447,18 @@ def _decoded_history(table: dict[str, Any], count: int) -> dict[str, np.ndarray]
     return history
 
 
+def _tuned_objective(data: dict[str, Any], history: dict[str, np.ndarray]) -> float:
+    """The objective at the tuned gains; earlier versions stored it in the history only, where it is
+    the lowest one without a violation.
+    """
+    if "tuned_objective" in data:
+        return float(data["tuned_objective"])
+    violation = np.maximum(np.sum(np.maximum(history["excess"], 0.0), axis=-1), 0.0)
+    violation = np.where(history["valid"], violation + np.maximum(-history["margin"], 0.0), np.inf)
+    is_best = violation == np.min(violation)
+    return float(np.min(np.where(is_best, history["objective"], np.inf)))
+
+
 def _decoded(data: dict[str, Any]) -> TuneResult:
     """The result that `save_tuning` encoded."""
     start = from_dict(data["start"]).scenario
@@ -461,5 +488,7 @@ def _decoded(data: dict[str, Any]) -> TuneResult:
         multipliers=tuple(map(float, data["multipliers"])),
         residuals=tuple(map(float, data["residuals"])),
         probes=checks.positive_integer("probes", data["probes"], least=0),
+        objective=_tuned_objective(data, history),
+        tried=tuple(checks.string("tried", x, "a string") for x in data.get("tried", ())),
         **words,
     )

@@ -6,7 +6,7 @@ and validates the result on fresh runs.
         ["controller.k1", "controller.K2", "observer.kf"],
         ij.objectives.tracking() + 0.5 * ij.objectives.effort() + ij.objectives.margin_above(0.05),
         duration=5.0,
-        solver=ij.tuning.SQP(starts=4),
+        effort="thorough",
         report=ij.tuning.Report(runs=2000),
     )
     best.scenario, best.report, best.plot()
@@ -20,9 +20,11 @@ and validates the result on fresh runs.
 | `problem` | `TuningProblem`: all of the above in one object |
 | `rollouts`, `runs` | batches of runs without and with derivatives |
 | `evaluation` | value and derivatives of the problem |
-| `solvers` | the Protocol `Solver`; `SQP`, `LBFGS`, `Adam` |
+| `solvers` | the Protocol `Solver`; `SQP`, `LBFGS`, `Adam`, `Optax`, and those of other libraries |
 | `starts`, `search`, `checkpoints` | where a search begins, its steps, its stored state |
+| `optimality` | multipliers and residuals at the returned gains |
 | `result`, `report` | what `tune` returns, and its validation on fresh runs |
+| `samples`, `failures`, `step_check` | runs for the report, why fresh runs failed, and dt / 2 |
 | `_tune` | `tune`, which calls these in this order |
 | `_pareto`, `_falsify` | fronts of two objectives, and attacks on a result |
 """
@@ -33,16 +35,25 @@ from iblf_jax.tuning._falsify import falsify as falsify
 from iblf_jax.tuning._pareto import Front as Front
 from iblf_jax.tuning._pareto import pareto as pareto
 from iblf_jax.tuning._tune import tune as tune
+from iblf_jax.tuning.failures import FailedRuns as FailedRuns
+from iblf_jax.tuning.options import Effort as Effort
 from iblf_jax.tuning.options import Report as Report
 from iblf_jax.tuning.parameters import tunable as tunable
 from iblf_jax.tuning.problem import TuningProblem as TuningProblem
 from iblf_jax.tuning.report import TuningReport as TuningReport
 from iblf_jax.tuning.result import TuneResult as TuneResult
 from iblf_jax.tuning.robust import cvar as cvar
+from iblf_jax.tuning.solvers import CMAES as CMAES
 from iblf_jax.tuning.solvers import LBFGS as LBFGS
+from iblf_jax.tuning.solvers import SLSQP as SLSQP
 from iblf_jax.tuning.solvers import SOLVERS as SOLVERS
 from iblf_jax.tuning.solvers import SQP as SQP
 from iblf_jax.tuning.solvers import Adam as Adam
-from iblf_jax.tuning.solvers import Optimality as Optimality
+from iblf_jax.tuning.solvers import DifferentialEvolution as DifferentialEvolution
+from iblf_jax.tuning.solvers import Optax as Optax
+from iblf_jax.tuning.solvers import Optuna as Optuna
 from iblf_jax.tuning.solvers import SearchSpace as SearchSpace
 from iblf_jax.tuning.solvers import Solver as Solver
+from iblf_jax.tuning.solvers import TrustConstr as TrustConstr
+from iblf_jax.tuning.solvers import Uno as Uno
+from iblf_jax.tuning.step_check import StepCheck as StepCheck

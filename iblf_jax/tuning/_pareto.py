@@ -250,7 +250,8 @@ class FrontSearch:
         The first searches begin at the scenario's gains, and at the best of some points that are
         spread over their ranges.
         """
-        points, found, violation = screened(self.problem, seed, self.problem.box.z[None])
+        screening = screened(self.problem, seed, self.problem.box.z[None])
+        points, found, violation = screening.points, screening.found, screening.excess
         self.first = found.terms[0]
         self._keep_values(points, found)
         best = [_best_of(found, violation, k) for k in (0, 1)]

@@ -8,10 +8,10 @@ import dataclasses
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -23,18 +23,32 @@ from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.tuning.checkpoints import fingerprint, load_checkpoint, save_checkpoint
 from iblf_jax.tuning.evaluation import Evaluator, values
 from iblf_jax.tuning.objectives import Objective
-from iblf_jax.tuning.options import Report, SearchOptions, chosen_solver, options_of
+from iblf_jax.tuning.optimality import Conditions
+from iblf_jax.tuning.options import Effort, Report, SearchOptions, chosen_solver, options_of
 from iblf_jax.tuning.parameters import Tunable, in_units, names_of, values_at
 from iblf_jax.tuning.problem import TuningProblem
-from iblf_jax.tuning.result import STUCK, TuneResult, TuneSetup
+from iblf_jax.tuning.result import AT_KINK, STUCK, TuneResult, TuneSetup
 from iblf_jax.tuning.robust import Risk
 from iblf_jax.tuning.runs import NUMBERS_A_RUN
-from iblf_jax.tuning.search import Search
-from iblf_jax.tuning.solvers import Optimality, Solver
-from iblf_jax.tuning.starts import NearbyStarts, feasible_starts, starting_points
+from iblf_jax.tuning.search import REPAIR, REPAIR_STARTS, SECOND, Search, Strategy
+from iblf_jax.tuning.solvers import Solver
+from iblf_jax.tuning.solvers.sqp import SQP
+from iblf_jax.tuning.starts import (
+    MAX_SCREENED_RUNS,
+    Screening,
+    distinct,
+    screen,
+    starting_points,
+    usable_starts,
+)
+from iblf_jax.tuning.step_check import excess_at_half_step
 
 INFEASIBLE = "the requirements cannot be kept together near these gains"
-"""Why a search ended that converged to gains with the least possible violation."""
+"""Why a search ended at gains where the largest excess of a requirement is stationary."""
+NOT_FEASIBLE = "no gains that keep the requirements were found"
+"""Why a search ended without such gains, and without having shown that there are none."""
+POLISH_STEPS = 15
+"""Steps at most at half the time step."""
 NO_GRADIENT = "the objective has no finite derivative at the start"
 """Why a search ended that could not make a step."""
 
@@ -54,7 +68,7 @@ def tune(
     seed: int = 0,
     risk: str | Risk = "mean",
     solver: Solver | str | None = None,
-    iterations: int = 60,
+    effort: str | Effort = "normal",
     report: Report | None = None,
     checkpoint: str | os.PathLike | None = None,
     progress: bool | Callable[[Search], None] | None = None,
@@ -64,6 +78,13 @@ def tune(
 
         minimise    risk_b [ sum_k w_k term_k ]
         subject to  the requirements and the ranges of the parameters
+
+    The default solver evaluates 384 points without derivatives, begins at six of them, and goes on
+    with the best; this takes about 60 evaluations with derivatives, and more where no gains that
+    keep the requirements are known, or where the first search did not converge.  For a planar arm
+    with nine gains and 1,000 steps that is one to three seconds on two cores, besides the
+    compilation.  Where a requirement that is kept at `dt` is broken at half of it by more than
+    `step_check.STEP_TOLERANCE`, some steps at half of it follow, and the result is one of dt / 2.
 
     Args:
       scenario: with the gains to start from, of n joints.
@@ -82,10 +103,12 @@ def tune(
       seed: of these runs, and of further starts.
       risk: "mean", "worst", "cvar" or `cvar(level)`.
       solver: `ij.tuning.SQP()` (sequential quadratic programming; requirements are constraints),
-        `ij.tuning.LBFGS()` or `ij.tuning.Adam()` (requirements are penalties), with their options,
-        or one of their names "sqp", "lbfgs", "adam".  If not given, SQP up to 32 numbers, and
-        L-BFGS with reverse mode above.
-      iterations: steps of the solver at most.
+        `ij.tuning.LBFGS()`, `ij.tuning.Adam()` or `ij.tuning.Optax()` (requirements are penalties),
+        with their options, or the name of one in `ij.tuning.SOLVERS`.  If not given, SQP up to 32
+        numbers, and L-BFGS with reverse mode above.
+      effort: "quick" (one search, from the scenario's gains), "normal" or "thorough" (4,096 points
+        without derivatives and twelve starts, some 400 evaluations with derivatives), or
+        `ij.tuning.Effort(values=..., starts=..., iterations=...)`.
       report: `ij.tuning.Report(runs=..., seed=..., confidence=...)`: options of the report on fresh
         runs.
       checkpoint: a file that stores the state after each step; if it exists, the search continues
@@ -105,8 +128,7 @@ def tune(
     Source: design of this package; see the modules of `iblf_jax.tuning` for the methods.
     """
     began = time.perf_counter()
-    iterations = checks.positive_integer("iterations", iterations, most=checks.MAX_STEPS)
-    options = options_of(solver, report, progress, deprecated)
+    options = options_of(solver, effort, report, progress, deprecated)
     if checkpoint is not None:
         checkpoint = checks.file_to_write("checkpoint", checkpoint)
     problem = TuningProblem.build(
@@ -123,42 +145,59 @@ def tune(
         risk=risk,
     )
     solver, mode = chosen_solver(options, problem.size)
-    search, probes = _search_of(problem, solver, mode, iterations)
-    stopped = _run(search, mode, iterations, checkpoint, options)
-    if not np.any(np.isfinite(search.state["best_key"])):
+    search = _search_of(problem, solver, mode, options.effort)
+    stopped = _run(search, mode, options.effort.iterations, checkpoint, options)
+    if not np.any(np.isfinite(search.state["incumbent_key"])):
         raise problem.unstable_error()
+    outcome = _outcome(search, stopped)
+    polished = _polished(search, outcome, mode)
     seconds = time.perf_counter() - began
     setup = _setup(problem, options.report)
-    return _result(search, setup, stopped, mode=mode, seconds=seconds, probes=probes)
+    return _result(outcome, polished, setup, mode=mode, seconds=seconds)
 
 
-def _search_of(
-    problem: TuningProblem, solver: Solver, mode: str, iterations: int
-) -> tuple[Search, int]:
-    """The search from its starting points, and the number of points that were evaluated without
-    derivatives to find them.
+def _search_of(problem: TuningProblem, solver: Solver, mode: str, effort: Effort) -> Search:
+    """The search from its starting points.
 
     Values come first, so that an error does not wait for the derivatives' compilation.  With a
     checkpoint the starting points are determined again, and are the same.
     """
-    checks.fits_memory("starts", solver.starts, 8.0 * problem.size * NUMBERS_A_RUN)
+    starts = solver.starts or effort.starts
+    checks.fits_memory("starts", starts, 8.0 * problem.size * NUMBERS_A_RUN)
     seed = int(problem.options.seed)
-    second_start = None
-    probes = 0
-    if solver.starts == 1 and solver.handles_requirements and problem.multimodal:
-        nearby = NearbyStarts(
-            partial(values, problem), problem.box, seed, problem.sampled_too_slowly
-        )
-        z = feasible_starts(problem, seed, np.stack([nearby.points[0]] * 2), nearby.first)
-        second_start = nearby.away_from
-        probes = nearby.count
+    strategy = None
+    if solver.starts is None:
+        count = min(effort.values, MAX_SCREENED_RUNS // problem.runs)
+        screening = screen(problem, count, seed)
+        z = _chosen_starts(problem, screening, starts)
+        strategy = Strategy(screening, effort.selection, len(z))
     else:
-        z = starting_points(problem.box, solver.starts, seed)
-        z = feasible_starts(problem, seed, z, values(problem, problem.box.z[None]))
+        z = starting_points(problem.box, starts, seed)
+        z = usable_starts(problem, seed, z, values(problem, problem.box.z[None]))
     problem = problem.for_solver(solver)
-    space = problem.search_space(iterations)
+    space = problem.search_space(effort.iterations)
+    starts_used = rows = len(z)
+    if strategy is not None and problem.allowed:
+        rows = max(rows, REPAIR_STARTS)  # for later phases
+    z = z[np.minimum(np.arange(rows), len(z) - 1)]
     evaluate = Evaluator(problem, problem.candidates(z), mode, space)
-    return Search(evaluate, solver, z, second_start), probes
+    search = Search(evaluate, solver, z, strategy)
+    search.retire(slice(starts_used, None))
+    return search
+
+
+def _chosen_starts(problem: TuningProblem, screening: Screening, starts: int) -> np.ndarray:
+    """Where the searches begin: at the best points that differ from one another."""
+    seed = int(problem.options.seed)
+    order = np.argsort(screening.merit, kind="stable")
+    is_refused = problem.sampled_too_slowly
+    z = distinct(screening, order, starts, problem.box, is_refused)
+    if len(z):
+        best = jax.tree.map(lambda x: x[order[:1]], screening.found)
+        if len(screening.points) > 1 or best.margin[0] > 0:
+            return z
+    first = jax.tree.map(lambda x: x[:1], screening.found)
+    return usable_starts(problem, seed, problem.box.z[None], first)
 
 
 def _run(
@@ -206,21 +245,114 @@ def _setup(problem: TuningProblem, report: Report) -> TuneSetup:
     )
 
 
-def _result(
-    search: Search, setup: TuneSetup, stopped: str, *, mode: str, seconds: float, probes: int
-) -> TuneResult:
+class Outcome(NamedTuple):
+    """What a search found."""
+
+    search: Search
+    z: np.ndarray
+    """The best point, (p,)."""
+    stopped: str
+    multipliers: np.ndarray
+    residuals: np.ndarray
+    tried: tuple[str, ...] = ()
+    """What was done, in words."""
+
+
+def _outcome(search: Search, stopped: str) -> Outcome:
+    """The best point of a search with its multipliers and residuals, and why the search ended."""
+    found = search.conditions()
+    if stopped == "converged" or search.is_violated or found.hold:
+        stopped = _why_ended(search, stopped, found)
+    z = search.state["incumbent_z"]
+    return Outcome(search, z, stopped, found.multipliers, found.residuals, _tried(search))
+
+
+def _why_ended(search: Search, stopped: str, found: Conditions) -> str:
+    """Why a search ended whose starts have converged, or that found no feasible gains."""
+    if not np.all(np.isfinite(found.residuals)):
+        return NO_GRADIENT
+    if search.is_violated:
+        repaired = search.strategy is None or bool(search.state["repair_ended"])
+        return INFEASIBLE if repaired and found.hold else NOT_FEASIBLE
+    if found.at_kink:
+        return AT_KINK
+    return "converged" if found.hold else STUCK
+
+
+def _tried(search: Search) -> tuple[str, ...]:
+    """What a search in phases did, in words."""
+    if search.strategy is None:
+        return ()
+    valleys, reached = search.state["valleys"].tolist()
+    starts = search.strategy.starts
+    lines = []
+    if starts > 1:
+        lines.append(
+            f"searches from {starts} of {len(search.strategy.screening.points)} points: they were"
+            f" in {valleys} valleys when they ended or were dropped, {reached} in the best one"
+        )
+    phase = int(search.state["phase"])
+    if phase == REPAIR or search.state["repair_ended"]:
+        least = float(search.state["incumbent_key"][0])
+        how = "to a stationary point" if search.state["repair_ended"] else "without converging"
+        lines.append(
+            f"no gains that keep the requirements were found; the largest excess was minimised from"
+            f" up to {REPAIR_STARTS} points, {how}: {least:.3g}"
+        )
+    elif phase == SECOND:
+        lines.append("a second search followed, from the best gains and from another valley")
+    return tuple(lines)
+
+
+# ---------------------------------------------------------------------- at half the time step
+
+
+def _polished(search: Search, outcome: Outcome, mode: str) -> Outcome | None:
+    """A short search at half the time step, where a requirement that is kept is broken there; None
+    where none is needed.
+    """
     problem = search.evaluate.problem
-    state = search.state
+    can_polish = search.solver.handles_requirements and mode == "forward" and problem.allowed
+    if search.is_violated or not can_polish:
+        return None
+    worst = excess_at_half_step(
+        problem.scenario,
+        _tuned_values(problem, outcome.z),
+        problem.objective,
+        problem.options,
+        batch=problem.runs * problem.points_together(1),
+    )
+    if not worst.is_broken:
+        return None
+    finer = problem.at_half_the_step()
+    space = finer.search_space(POLISH_STEPS)
+    z = outcome.z[None]
+    second = Search(Evaluator(finer, finer.candidates(z), mode, space), SQP(sharpenings=0), z)
+    stopped = second.run(POLISH_STEPS)
+    if second.is_violated:
+        return None
+    found = _outcome(second, stopped)
+    line = (
+        f"{worst.requirement} was broken at dt / 2 by {worst.excess:.2g} of its scale, so that"
+        f" {len(second.history['z'])} steps at dt / 2 followed; the result is one of dt / 2"
+    )
+    return found._replace(tried=(*outcome.tried, line))
+
+
+def _result(
+    outcome: Outcome, polished: Outcome | None, setup: TuneSetup, *, mode: str, seconds: float
+) -> TuneResult:
+    search = outcome.search
+    problem = search.evaluate.problem
+    history = _history(search)
     best = search.best
-    optimality = search.solver.optimality(state["solver"], best)
-    violated = bool(state["best_key"][best][0] > 0)
-    if stopped == "converged":
-        stopped = _why_converged(optimality, violated)
-    multipliers, residuals = _multipliers(search, optimality, stopped, violated)
-    point = values_at(problem.blocks, jnp.asarray(state["best_z"][best]))
-    tuned = {path: np.asarray(x) for path, x in point.items()}
-    history = {name: np.stack(x) for name, x in search.history.items()}
+    if polished is not None:
+        history = _joined(history, _history(polished.search))
+        setup = dataclasses.replace(setup, dt=0.5 * float(setup.dt))
+        outcome = polished
+        best = 0
     history["x"] = in_units(problem.blocks, history["z"])
+    tuned = _tuned_values(problem, outcome.z)
     return TuneResult(
         scenario=with_parameters(problem.scenario, tuned),
         start=problem.scenario,
@@ -228,49 +360,40 @@ def _result(
         names=tuple(names_of(problem.blocks)),
         history=history,
         best_start=best,
-        stopped=stopped,
+        stopped=outcome.stopped,
         optimiser=search.solver.name,
         mode=mode,
         seconds=seconds,
         setup=setup,
-        multipliers=tuple(map(float, multipliers)),
-        residuals=tuple(map(float, residuals)),
-        probes=probes,
+        multipliers=tuple(map(float, outcome.multipliers)),
+        residuals=tuple(map(float, outcome.residuals)),
+        probes=int(search.state["plain_values"]),
+        tried=outcome.tried,
+        objective=float(outcome.search.state["incumbent_key"][1]),
     )
 
 
-def _why_converged(optimality: Optimality | None, violated: bool) -> str:
-    """Why a search ended of which all starts have converged."""
-    if optimality is not None and not np.all(np.isfinite(optimality.residuals)):
-        return NO_GRADIENT
-    if optimality is not None and optimality.stuck:
-        return STUCK
-    return INFEASIBLE if violated else "converged"
+def _tuned_values(problem: TuningProblem, z: np.ndarray) -> dict[str, np.ndarray]:
+    point = values_at(problem.blocks, jnp.asarray(z))
+    return {path: np.asarray(x) for path, x in point.items()}
 
 
-def _multipliers(
-    search: Search, optimality: Optimality | None, stopped: str, violated: bool
-) -> tuple[np.ndarray, np.ndarray]:
-    """Multipliers and residuals at the best result.
+def _history(search: Search) -> dict[str, np.ndarray]:
+    return {name: np.stack(x) for name, x in search.history.items()}
 
-    Multipliers are known at the point where the solver ended only, and are NaN elsewhere.  Where
-    requirements are violated they are those of the penalty function, and are left out.
+
+def _joined(first: dict[str, np.ndarray], last: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Two histories, one after the other; the last one is of one start, and the others are invalid
+    in it.
     """
-    none = np.zeros(0)
-    best_z = search.state["best_z"][search.best]
-    if optimality is None:
-        multipliers = search.state["multipliers"][search.best]
-        residuals = none
-        is_here = stopped == "converged"
-    else:
-        multipliers = optimality.multipliers
-        residuals = optimality.residuals
-        is_here = np.array_equal(best_z, optimality.z)
-    unknown = np.full(len(multipliers), np.nan)
-    if violated:
-        return none, none
-    if stopped == STUCK:
-        return unknown, residuals
-    if not is_here or stopped == NO_GRADIENT:
-        return unknown, none
-    return multipliers, residuals
+    starts = first["valid"].shape[1]
+    joined = {"evaluations": np.concatenate([first["evaluations"], last["evaluations"]])}
+    joined["evaluations"][len(first["evaluations"]) :] += first["evaluations"][-1]
+    for name, x in last.items():
+        if name == "evaluations":
+            continue
+        rows = np.repeat(x, starts, axis=1)
+        if name == "valid":
+            rows[:, 1:] = False
+        joined[name] = np.concatenate([first[name], rows])
+    return joined

@@ -14,9 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+import optax
 
 from iblf_jax.core import checks
+from iblf_jax.core.optional import has_members
 from iblf_jax.core.pytree import field_values
 from iblf_jax.tuning.problem import TuningProblem
 from iblf_jax.tuning.search import Search
@@ -33,6 +36,9 @@ def fingerprint(problem: TuningProblem, solver: Solver, mode: str, iterations: i
         options = field_values(solver)
     for name in NOT_PART_OF_THE_PROBLEM:
         options.pop(name, None)
+    for name, value in options.items():
+        if has_members(value, "init", "update"):
+            options[name] = _program_of(value)
     if "schedule" in options:
         options["iterations"] = iterations  # a schedule ends with the last step
     leaves, structure = jax.tree.flatten(problem)
@@ -40,6 +46,17 @@ def fingerprint(problem: TuningProblem, solver: Solver, mode: str, iterations: i
     for x in leaves:
         digest.update(np.asarray(x).tobytes() + str(np.shape(x)).encode())
     return digest.hexdigest()
+
+
+def _program_of(optimiser: Any) -> str:
+    """The program of an optimiser of optax with its constants: its functions print as addresses,
+    which differ between processes.
+    """
+    w = jnp.zeros(1)
+    update = optax.with_extra_args_support(optimiser).update
+    with jax.numpy_dtype_promotion("standard"):  # optax mixes integers of several types
+        program = jax.make_jaxpr(update)(w, optimiser.init(w), w, value=w[0])
+    return f"{program} {program.consts}"
 
 
 def _named_leaves(state: Any) -> dict[str, np.ndarray]:

@@ -30,6 +30,7 @@ of L only.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -323,7 +324,11 @@ class Evaluator:
         self.derivatives = DERIVATIVES[mode]
         self.space = space
         self.evaluations = 0
-        """Number of evaluated points."""
+        """Number of points that were evaluated with derivatives."""
+        self.plain_values = 0
+        """Number of points that were evaluated without derivatives."""
+        self.on_values: Callable[[np.ndarray, Value], None] = lambda z, found: None
+        """Called with points and their values after each evaluation without derivatives."""
         starts, runs = candidates.index.shape
         self.group = starts_per_batch(starts, runs)
         self.active = np.ones(starts, bool)
@@ -347,10 +352,14 @@ class Evaluator:
             return found
         return _scattered(found, active, len(z))
 
-    def row(self, start: int) -> tuple[TuningProblem, Candidate]:
-        """The problem, and the candidate of one start as a batch of one."""
-        one = jax.tree.map(lambda x: np.asarray(x)[start : start + 1], self.candidates)
-        return self.problem, one
+    def values(self, z: np.ndarray) -> Value:
+        """Value at any number of points z, (N, p), on the problem's own runs, without
+        derivatives.
+        """
+        found = values(self.problem, z)
+        self.plain_values += len(z)
+        self.on_values(z, found)
+        return found
 
 
 def _scattered(found: Derivatives, rows: np.ndarray, starts: int) -> Derivatives:

@@ -90,7 +90,59 @@ class Report:
         object.__setattr__(self, "confidence", check_confidence(self.confidence))
 
 
+@dataclasses.dataclass(frozen=True)
+class Effort:
+    """How much a tuning evaluates at most.
+
+    With K starts a search takes about 10 K evaluations with derivatives up to the end of one
+    start: all starts for `selection` steps, half of them for as many, and the best one on.
+
+    Args:
+      values: points that are evaluated without derivatives, to find the starts.  With many runs
+        there are fewer: at most 50,000 runs are spent on them.
+      starts: points that searches begin from, all in one batch.
+      iterations: steps of the solver at most; each evaluates every start that is still active.
+      selection: steps after which the better half of the starts goes on; after twice as many only
+        the best one does.
+    """
+
+    values: int = 384
+    starts: int = 6
+    iterations: int = 60
+    selection: int = 5
+
+    def __post_init__(self) -> None:
+        limits = {"values": (0, MAX_RUNS), "starts": (1, 1000)}
+        for field in dataclasses.fields(self):
+            least, most = limits.get(field.name, (1, checks.MAX_STEPS))
+            number = getattr(self, field.name)
+            name = f"effort.{field.name}" if field.name != "iterations" else "iterations"
+            checked = checks.positive_integer(name, number, least=least, most=most)
+            object.__setattr__(self, field.name, checked)
+
+
+EFFORTS = {
+    "quick": Effort(values=0, starts=1),
+    "normal": Effort(),
+    "thorough": Effort(values=4096, starts=12, iterations=120, selection=20),
+}
+"""Word -> how much is evaluated."""
+
+
+def effort_of(given: str | Effort) -> Effort:
+    """An effort by its name, or as it is.
+
+    Raises:
+      ValueError: neither.
+    """
+    if isinstance(given, Effort):
+        return given
+    checks.one_of("effort", given, EFFORTS)
+    return EFFORTS[given]
+
+
 REPLACED = {
+    "iterations": "effort=ij.tuning.Effort(iterations=...)",
     "optimiser": "solver=ij.tuning.SQP(), ij.tuning.LBFGS() or ij.tuning.Adam()",
     "mode": "solver=ij.tuning.LBFGS(mode=...)",
     "resample": "solver=ij.tuning.Adam(resample=...)",
@@ -110,7 +162,7 @@ OF_REPORT = {"report_runs": "runs", "report_seed": "seed", "confidence": "confid
 ARGUMENTS = (
     *("scenario", "parameters", "objective"),
     *(field.name for field in dataclasses.fields(TuningRunOptions)),
-    *("solver", "iterations", "report", "checkpoint", "progress"),
+    *("solver", "effort", "report", "checkpoint", "progress"),
 )
 """Of `tune`."""
 
@@ -127,10 +179,12 @@ class SearchOptions(NamedTuple):
     """Whether a progress bar is shown."""
     callback: Callable[[Any], None] | None
     """Called with the search after each step."""
+    effort: Effort
 
 
 def options_of(
     solver: Solver | str | None,
+    effort: str | Effort,
     report: Report | None,
     progress: bool | Callable[[Any], None] | None,
     deprecated: Mapping[str, Any],
@@ -138,7 +192,7 @@ def options_of(
     """Checks options of `tune`.
 
     Args:
-      solver, report, progress: as the user gave them.
+      solver, effort, report, progress: as the user gave them.
       deprecated: further keyword arguments.
 
     Raises:
@@ -155,6 +209,9 @@ def options_of(
             DeprecationWarning,
         )
     given = dict(deprecated)
+    budget = effort_of(effort)
+    if "iterations" in given:
+        budget = dataclasses.replace(budget, iterations=given.pop("iterations"))
     callback = given.pop("callback", None)
     if callback is not None and not callable(callback):
         expected = "a function that is called with the search after each step"
@@ -170,7 +227,7 @@ def options_of(
         remedy = "Such as ij.tuning.Report(runs=200)."
         raise checks.fail("report", report, "an ij.tuning.Report", remedy)
     checked = {name: _checked(name, value) for name, value in given.items()}
-    return SearchOptions(_solver(solver), checked, report, progress, callback)
+    return SearchOptions(_solver(solver), checked, report, progress, callback, budget)
 
 
 def _check_not_given_twice(name: str, value: Any, further: Mapping[str, Any]) -> None:

@@ -8,6 +8,10 @@ solvers of optax have no bounds, so they use an unbounded w that is squashed int
     z = z_low + softplus(w)   or   z = z_high - softplus(w)      with one limit.
 
 Default limits are those of `ranges`.
+
+The sampling period is a whole number of time steps, so the loss is constant between two of them:
+its coordinate z is rounded, the derivative by it is 0, and the loss has to be compared at its
+multiples by values (`along`).
 """
 
 from __future__ import annotations
@@ -21,14 +25,27 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.core import checks
+from iblf_jax.core import checks, notices
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.draws import check_paths
-from iblf_jax.tuning.ranges import AS_GIVEN, default_highs, default_low
+from iblf_jax.tuning.ranges import (
+    AS_GIVEN,
+    PERIOD,
+    WHOLE_TOLERANCE,
+    End,
+    default_highs,
+    default_lows,
+)
 
 LIMIT_DISTANCE = 1e-3
 """Smallest distance of the start of a squashed coordinate from a limit, relative to the box."""
+
+PERIOD_NOTICE = (
+    f"{PERIOD} is a whole number of steps dt, so that the loss has no derivative by it: periods are"
+    " compared by values only, and a search that follows derivatives keeps the period that it"
+    " begins with."
+)
 
 
 class Tunable(NamedTuple):
@@ -49,6 +66,8 @@ class Block(NamedTuple):
     start: int
     size: int
     log: bool
+    step: float = 0.0
+    """The leaf is a whole multiple of this; 0 if it takes any value."""
 
 
 @partial(
@@ -133,46 +152,55 @@ def layout(
     Args:
       scenario: canonical.
       parameters: paths or `Tunable`s.
-      dt, method: of the runs, for the default upper limits (`ranges`).
+      dt, method: of the runs, for the default limits (`ranges`).
 
     Raises:
-      ValueError: an unknown or overlapping path, limits that exclude the start or are not
-        admissible.
+      ValueError: an unknown or overlapping path, a start that is not finite, limits that exclude
+        the start or are not admissible.
     """
     given = checks.nonempty_list("parameters", parameters, '["controller.k1", "controller.K2"]')
     tunables = [_as_tunable(i, x) for i, x in enumerate(given)]
     check_paths(scenario, [x.path for x in tunables], "parameters")
     starts = {item.path: _start_of(scenario, item) for item in tunables}
-    without_end = {item.path: starts[item.path][0] for item in tunables if item.high is None}
-    highs = default_highs(scenario, without_end, dt, method)
+    lows = _starts_without(starts, [x.path for x in tunables if x.low is None])
+    highs = _starts_without(starts, [x.path for x in tunables if x.high is None])
+    default_ends = (
+        default_lows(scenario, lows, dt, method),
+        default_highs(scenario, highs, dt, method),
+    )
     blocks: list[Block] = []
     parts = []
     reasons: list[tuple[str, str]] = []
     for item in tunables:
-        value, log, sign = starts[item.path]
-        low, below = item.low, AS_GIVEN
-        if low is None:
-            low, below = default_low(item.path, sign, value)
-        high, above = highs.get(item.path, (item.high, AS_GIVEN))
-        low, high = _limit(item, "low", low, value), _limit(item, "high", high, value)
-        if not np.all((low <= value) & (value <= high) & (low < high)):
-            expected = f"a start between its limits {low.tolist()} and {high.tolist()}"
-            raise checks.fail(f"tunable({item.path!r})", value, expected, "Widen the limits.")
-        size = 1 if item.tied else value.size
-        blocks.append(Block(item.path, value.shape, len(reasons), size, log))
-        parts.append([_coordinate(x.reshape(-1)[:size], log) for x in (value, low, high)])
-        reasons += [(below, above)] * size
+        start = starts[item.path]
+        step = dt if item.path == PERIOD else 0.0
+        low, high = _ends_of(item, start.value, step, default_ends)
+        size = 1 if item.tied else start.value.size
+        blocks.append(Block(item.path, start.value.shape, len(reasons), size, start.log, step))
+        numbers = (start.value, low.value, high.value)
+        parts.append([_coordinate(x.reshape(-1)[:size], start.log) for x in numbers])
+        reasons += [(low.reason, high.reason)] * size
+    if by_values(tuple(blocks)):
+        notices.warn(PERIOD_NOTICE)
     z, lowest, highest = (np.concatenate(x) for x in zip(*parts, strict=True))
     return tuple(blocks), Box(z, lowest, highest, tuple(reasons))
 
 
-def _start_of(scenario: Scenario, item: Tunable) -> tuple[np.ndarray, bool, str | None]:
-    """Value of a leaf at the start, whether its coordinate is a logarithm, and the sign that it
-    must have.
-    """
+class Start(NamedTuple):
+    """The start of a leaf."""
+
+    value: np.ndarray
+    log: bool
+    """Whether its coordinate is a logarithm."""
+
+
+def _start_of(scenario: Scenario, item: Tunable) -> Start:
+    """Value of a leaf at the start, and whether its coordinate is a logarithm."""
     value = np.asarray(paths.get(scenario, item.path), float)
-    sign = paths.sign_at(scenario, item.path)
-    log = sign == "positive"
+    if not np.all(np.isfinite(value)):
+        remedy = f'Such as ij.with_parameters(scenario, {{"{item.path}": 1.0}}).'
+        raise checks.fail(item.path, value, "finite numbers that tuning can start from", remedy)
+    log = paths.sign_at(scenario, item.path) == "positive"
     if item.scale:
         log = item.scale == "log"
     if log and not np.all(value > 0):
@@ -181,7 +209,50 @@ def _start_of(scenario: Scenario, item: Tunable) -> tuple[np.ndarray, bool, str 
     if item.tied and not np.all(value == value.flat[0]):
         common = np.exp(np.mean(np.log(value))) if log else np.mean(value)
         value = np.full_like(value, common)
-    return value, log, sign
+    return Start(value, log)
+
+
+def _starts_without(starts: dict[str, Start], names: list[str]) -> dict[str, np.ndarray]:
+    """Path -> start of the leaves that have no limit of the user's own."""
+    return {path: starts[path].value for path in names}
+
+
+def _ends_of(
+    item: Tunable, start: np.ndarray, step: float, default_ends: tuple[dict[str, End], ...]
+) -> tuple[End, End]:
+    """The lower and the upper end of a leaf's range, one number for each entry.
+
+    A leaf with one number for all joints keeps the limits of every joint.
+    """
+    ends = []
+    for name, given, defaults, tightest in (
+        ("low", item.low, default_ends[0], np.max),
+        ("high", item.high, default_ends[1], np.min),
+    ):
+        end = defaults.get(item.path, End(given, AS_GIVEN))
+        limit = _limit(item, name, end.value, start)
+        if item.tied:
+            limit = np.full_like(limit, tightest(limit))
+        ends.append(end._replace(value=limit))
+    low, high = ends
+    if step:
+        low, high = _whole_steps(low, high, step)
+    if np.all((low.value <= start) & (start <= high.value) & (low.value < high.value)):
+        return low, high
+    expected = f"a start between its limits {low.value.tolist()} and {high.value.tolist()}"
+    if step:
+        expected += f", and at least two multiples of dt = {step:g} s between these"
+    remedy = "Widen the limits."
+    if AS_GIVEN not in (low.reason, high.reason):
+        remedy = f"Give limits of your own; the lower one is {low.reason}, the upper {high.reason}."
+    raise checks.fail(f"tunable({item.path!r})", start, expected, remedy)
+
+
+def _whole_steps(low: End, high: End, step: float) -> tuple[End, End]:
+    """The outermost multiples of the time step within a range."""
+    first = np.maximum(np.ceil(low.value / step - WHOLE_TOLERANCE), 1.0)
+    last = np.floor(high.value / step + WHOLE_TOLERANCE)
+    return low._replace(value=first * step), high._replace(value=last * step)
 
 
 def _limit(item: Tunable, name: str, given: Any, value: np.ndarray) -> np.ndarray:
@@ -200,12 +271,16 @@ def _coordinate(x: np.ndarray, log: bool) -> np.ndarray:
 
 
 def values_at(blocks: tuple[Block, ...], z: Any) -> dict[str, jax.Array]:
-    """Path -> value of the leaf at coordinates z, (p,); differentiable."""
+    """Path -> value of the leaf at coordinates z, (p,); differentiable, with the derivative 0 of a
+    constant where the leaf is a multiple of a step.
+    """
     values = {}
     for block in blocks:
         part = z[block.start : block.start + block.size]
         if block.log:
             part = jnp.exp(part)
+        if block.step:
+            part = block.step * jnp.maximum(jnp.round(part / block.step), 1.0)
         if block.size == 1:
             part = jnp.broadcast_to(part[0], block.shape)
         values[block.path] = part.reshape(block.shape)
@@ -215,7 +290,40 @@ def values_at(blocks: tuple[Block, ...], z: Any) -> dict[str, jax.Array]:
 def in_units(blocks: tuple[Block, ...], z: np.ndarray) -> np.ndarray:
     """Coordinates z, (..., p), as numbers in the units of their leaves."""
     log = np.concatenate([np.full(b.size, b.log) for b in blocks])
-    return np.where(log, np.exp(np.where(log, z, 0.0)), z)
+    numbers = np.where(log, np.exp(np.where(log, z, 0.0)), z)
+    step = np.concatenate([np.full(b.size, b.step) for b in blocks])
+    divisor = np.where(step > 0, step, 1.0)
+    multiples = divisor * np.maximum(np.round(numbers / divisor), 1.0)
+    return np.where(step > 0, multiples, numbers)
+
+
+def by_values(blocks: tuple[Block, ...]) -> list[int]:
+    """The coordinates by which the loss has no derivative: the leaf is a multiple of a step, so
+    that the loss is constant between two of them.
+    """
+    return [block.start for block in blocks if block.step]
+
+
+def along(blocks: tuple[Block, ...], box: Box, z: np.ndarray, most: int) -> np.ndarray:
+    """Points at which every coordinate of `by_values` takes other multiples within its range, with
+    all else as at z: (k, p), the nearest multiples first, at most `most` for each coordinate.
+    """
+    points = [np.empty((0, len(z)))]
+    for block in blocks:
+        if not block.step:
+            continue
+        i = block.start
+        first, here, last = (
+            round(float(in_units(blocks, x)[i]) / block.step) for x in (box.low, z, box.high)
+        )
+        every = np.arange(first, last + 1, dtype=float)
+        others = every[every != here]
+        nearest = np.argsort(np.abs(np.log(others / here)), kind="stable")
+        steps = others[nearest[:most]]
+        rows = np.repeat(z[None], len(steps), axis=0)
+        rows[:, i] = _coordinate(steps * block.step, block.log)
+        points.append(rows)
+    return np.concatenate(points)
 
 
 def names_of(blocks: tuple[Block, ...]) -> list[str]:

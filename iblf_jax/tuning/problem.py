@@ -153,7 +153,8 @@ class TuningProblem:
         )
         if is_complete(goal):
             return problem
-        goal = complete(goal, problem.exact_at_start()[: len(goal.terms)])
+        *at_start, deficit = problem.exact_at_start()
+        goal = complete(goal, at_start[: len(goal.terms)], margin=-float(deficit))
         return problem.with_objective(jax.tree.map(lambda x: jnp.asarray(x, dtype), goal))
 
     def with_objective(self, objective: Objective) -> TuningProblem:
@@ -162,10 +163,16 @@ class TuningProblem:
 
     def for_solver(self, solver: Solver) -> TuningProblem:
         """The problem as a solver needs it."""
+        return dataclasses.replace(self, requirements_in_loss=not solver.handles_requirements)
+
+    def at_half_the_step(self) -> TuningProblem:
+        """The problem with half the time step."""
+        half = 0.5 * float(self.options.dt)
         return dataclasses.replace(
             self,
-            requirements_in_loss=not solver.handles_requirements,
-            request=self.request._replace(nested=solver.traces_evaluation),
+            dt=jnp.asarray(half, self.dt.dtype),
+            options=dataclasses.replace(self.options, dt=half),
+            request=self.request._replace(steps=2 * self.request.steps),
         )
 
     # -------------------------------------------------------------------------------- properties

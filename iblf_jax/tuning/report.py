@@ -13,6 +13,10 @@ mean of paired differences D_i with the interval
 quantile).  A change is called significant if that interval excludes zero.  A requirement is
 satisfied with a probability: it passes if the upper Clopper-Pearson limit of its violation is
 within what is allowed, fails if the lower limit is beyond, and is undecided otherwise.
+
+Violated bounds come first, then requirements, the objective with its terms, and the rest.
+`failures` explains which perturbation the failed runs have in common, and `step_check` repeats the
+runs of the tuning at half the step.
 """
 
 from __future__ import annotations
@@ -21,25 +25,32 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.core import checks
 from iblf_jax.core.status import Status, has_flag
-from iblf_jax.engine import RunRequest, report_runs_per_batch
 from iblf_jax.simulation import paths
-from iblf_jax.simulation.scenario import Scenario, canonical
-from iblf_jax.studies.draws import UncertainScenario, targets_of
-from iblf_jax.studies.statistics import Probability, probability
-from iblf_jax.studies.study import VIOLATED
-from iblf_jax.studies.time_step import warn_of_step
+from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.studies.statistics import Probability, probability, scalar_samples
+from iblf_jax.tuning.failures import (
+    FailedRuns,
+    FreshRuns,
+    drawn_leaves,
+    failed_runs,
+    is_outside,
+)
 from iblf_jax.tuning.objectives import Objective
 from iblf_jax.tuning.options import Report, TuningRunOptions
 from iblf_jax.tuning.quantities import OF_LIMIT
 from iblf_jax.tuning.robust import Risk, worst_share
-from iblf_jax.tuning.rollouts import Rollouts, draw_runs, rollouts
-from iblf_jax.tuning.runs import in_groups
+from iblf_jax.tuning.samples import (
+    Sample,
+    SampleRequest,
+    is_random,
+    sample_runs,
+    uncertain_scenario,
+)
+from iblf_jax.tuning.step_check import StepCheck
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,6 +102,8 @@ class Verdict:
     multiplier: float | None = None
     """Decrease of the tuning's objective for each unit by which the limit is loosened; None where
     it is not known."""
+    event: str = "value"
+    """"value", or "violated" for a limit of the probability that bounds are violated."""
 
     def __str__(self) -> str:
         return self._change_in_words() + self._value_in_words() + self._sensitivity_in_words()
@@ -120,7 +133,8 @@ class Verdict:
             return ""
         if self.unit == OF_LIMIT:
             return f"; the worst joint is at {100 * self.value:.4g} % of its limit"
-        text = f"; {self.value:.5g} {self.unit}"
+        what = "margin of the worst runs " if self.event == "violated" else ""
+        text = f"; {what}{self.value:.5g} {self.unit}"
         if self.verdict != "fail":
             return text
         side = "above" if self.value > self.limit else "below"
@@ -159,10 +173,13 @@ class TuningReport:
     """The largest torque of all runs, joint by joint, before and after [N m]."""
     at_limits: tuple[str, ...] | None = None
     """The tuned numbers at an end of their range, in words; None where the ranges are not known."""
-    halved: str = ""
-    """The nominal run with the tuned gains at dt / 2, in words."""
+    step_check: StepCheck | None = None
+    """All runs of the tuning, with the tuned gains, at dt and at dt / 2."""
     notes: tuple[str, ...] = ()
     """Why the search ended, and warnings."""
+    failures: tuple[FailedRuns, ...] = ()
+    """Fresh runs that failed with the tuned gains: those that left their bounds or diverged, then
+    those that broke each requirement, with the most influential perturbation."""
 
     @property
     def passed(self) -> bool:
@@ -175,35 +192,118 @@ class TuningReport:
         first = self.changes[0]
         return first.after < first.before and first.significant is not False
 
+    @property
+    def bounds_kept(self) -> bool:
+        """Whether no run leaves its bounds or diverges with the tuned gains: of the report's runs,
+        and of the tuning's runs at dt and at dt / 2.
+        """
+        check = self.step_check
+        return not self.violation[1].count and not (check and any(check.violated))
+
+    @property
+    def failed(self) -> bool:
+        """Whether bounds are violated more often than a requirement allows, or at all where none
+        limits the probability, a requirement failed, or the runs of the tuning break one at dt / 2
+        that they keep at dt.
+        """
+        check = self.step_check
+        if any(v.verdict == "fail" for v in self.verdicts):
+            return True
+        if check is not None and check.newly_broken:
+            return True
+        allows_violations = any(v.event == "violated" for v in self.verdicts)
+        return not (self.bounds_kept or allows_violations)
+
+    @property
+    def halved(self) -> str:
+        """`step_check` in words, as earlier versions had it; empty if there is none."""
+        return str(self.step_check or "")
+
+    @property
+    def headline(self) -> str:
+        """Bounds and requirements in a few words, what failed first."""
+        return "; ".join([*self._bounds_in_few_words(), *self._requirements_in_few_words()])
+
+    def _bounds_in_few_words(self) -> list[str]:
+        """Whether bounds are kept."""
+        left = self.violation[1]
+        if left.count and self.seed is None:
+            return ["bounds VIOLATED"]
+        if left.count:
+            return [f"bounds VIOLATED in {left.count} of {left.runs} runs"]
+        if not self.bounds_kept:
+            return ["bounds VIOLATED in the runs of the tuning"]
+        return ["bounds kept"]
+
+    def _requirements_in_few_words(self) -> list[str]:
+        """How many requirements failed, are undecided, passed, or are broken in the tuning's
+        runs.
+        """
+        if not self.verdicts:
+            return []
+        total = len(self.verdicts)
+        counts = {kind: sum(v.verdict == kind for v in self.verdicts) for kind in WORST_FIRST}
+        words = []
+        if counts["fail"]:
+            words.append(f"{counts['fail']} of {total} requirements FAILED")
+        if counts["undecided"]:
+            words.append(f"{counts['undecided']} of {total} requirements undecided")
+        if counts["pass"]:
+            words.append(f"{counts['pass']} of {total} requirements passed")
+        if self.step_check is not None and self.step_check.newly_broken:
+            words.append("a requirement is BROKEN at dt / 2")
+        return words
+
     def __str__(self) -> str:
         """Bounds first, then requirements, the objective, and the rest."""
         heading = "Report on one nominal run: no statistics"
-        violated: list[Any] = [p.count for p in self.violation]
         of_all = ""
         if self.seed is not None:
             heading = (
                 f"Report on {self.runs} fresh runs (seed {self.seed}),"
                 f" {self.confidence:.0%} confidence"
             )
-            violated = list(self.violation)
             of_all = " of all runs"
-        bounds = f"bounds violated: {violated[0]} -> {violated[1]}"
-        if self.violation[1].count:
-            bounds += "; WARNING: with the tuned gains the bounds are not kept"
-        verdicts = sorted(self.verdicts, key=lambda verdict: WORST_FIRST.index(verdict.verdict))
         torques = [", ".join(f"{x:.5g}" for x in row) for row in self.peak_torque]
         rows = [
-            bounds,
-            f"smallest margin: {self.margin[0]:.4g} -> {self.margin[1]:.4g} rad",
-            *(f"requirement {verdict}" for verdict in verdicts),
+            *self._bounds_in_words(),
+            *self._requirements_in_words(),
             *map(str, self.changes),
             *self._doubts(),
             f"peak torque{of_all}, joint by joint: {torques[0]} -> {torques[1]} N m",
         ]
         if self.at_limits is not None:
             rows += self.at_limits or ["gains at an end of their range: none"]
-        rows += [words for words in (self.halved, *self.notes) if words]
-        return "\n  ".join([heading, *rows])
+        if self.step_check is not None:
+            rows.append(self.step_check.numbers_in_words())
+        return "\n  ".join([heading, *rows, *self.notes])
+
+    def _bounds_in_words(self) -> list[str]:
+        """Violated bounds with their explanation, those of the tuning's runs, smallest margin."""
+        violated: list[Any] = list(self.violation)
+        if self.seed is None:
+            violated = [p.count for p in self.violation]
+        bounds = f"bounds violated: {violated[0]} -> {violated[1]}"
+        if self.violation[1].count:
+            bounds += "; WARNING: with the tuned gains the bounds are not kept"
+        check = self.step_check
+        rows = [bounds, *(str(x) for x in self.failures if x.requirement is None)]
+        if check is not None and (any(check.violated) or any(check.untrusted)):
+            rows.append(check.bounds_in_words())
+        return [*rows, f"smallest margin: {self.margin[0]:.4g} -> {self.margin[1]:.4g} rad"]
+
+    def _requirements_in_words(self) -> list[str]:
+        """The requirements, the failed first, with the explanation of the runs that broke them;
+        then those that the tuning's runs break.
+        """
+        rows = []
+        for verdict in sorted(self.verdicts, key=lambda v: WORST_FIRST.index(v.verdict)):
+            rows.append(f"requirement {verdict}")
+            own = [x for x in self.failures if x.requirement == verdict.name]
+            rows += [f"  {x.cause_in_words()}" for x in own]
+        if self.step_check is not None:
+            rows += self.step_check.warnings_of_requirements()
+        return rows
 
     def _doubts(self) -> list[str]:
         """What to say about the objective where it did not become lower."""
@@ -220,32 +320,8 @@ class TuningReport:
     def to_dict(self) -> dict[str, Any]:
         """Everything as numbers and strings."""
         changes = [{**dataclasses.asdict(c), "significant": c.significant} for c in self.changes]
-        return dataclasses.asdict(self) | {"changes": changes}
-
-
-LARGEST_DIFFERENCE = 0.01
-"""Of the objective at half the step, relative, before the report warns."""
-
-
-class _Sample(NamedTuple):
-    """The numbers of N runs with one set of gains that a report needs."""
-
-    exact: np.ndarray
-    """Each quantity of the objective, and minus the margin, (N, K + 1)."""
-    torque: np.ndarray
-    """The largest of each joint, (N, n)."""
-    status: np.ndarray
-    admissible: np.ndarray
-    """Whether the draws of the run were admissible; the others do not count, (N,)."""
-
-    @property
-    def margin(self) -> np.ndarray:
-        """Of each run, (N,) [rad]."""
-        return -self.exact[:, -1]
-
-    def left_bounds(self) -> np.ndarray:
-        """Whether each run left its bounds or diverged, (N,)."""
-        return has_flag(self.status, VIOLATED)
+        further = {"changes": changes, "halved": self.halved, "headline": self.headline}
+        return dataclasses.asdict(self) | further
 
 
 class ReportRequest(NamedTuple):
@@ -263,6 +339,8 @@ class ReportRequest(NamedTuple):
     """With a seed."""
     batch: int = 1
     """Runs in a batch of the search's values, whose compiled program is used again."""
+    step_check: StepCheck | None = None
+    """The runs of the tuning at half the step; the report contains none if not given."""
     at_limits: tuple[str, ...] | None = None
     """The tuned numbers at an end of their range, in words."""
     multipliers: tuple[float, ...] = ()
@@ -273,23 +351,27 @@ class ReportRequest(NamedTuple):
 
 def make_report(request: ReportRequest) -> TuningReport:
     """Runs both scenarios on the same fresh draws and compares them."""
-    is_perturbed = bool(request.run.perturbations)
+    fresh = is_random(request.run)
     confidence = request.report.confidence
-    dt = request.run.dt
-    before, after = samples = _fresh_runs(
-        request, (request.before, request.after), request.report.runs if is_perturbed else 0, dt
+    draws = SampleRequest(
+        scenario=request.before,
+        tuned=request.tuned,
+        objective=request.objective,
+        options=request.run,
+        dt=request.run.dt,
+        runs=request.report.runs if fresh else 1,
+        seed=int(request.report.seed or 0),
+        batch=request.batch,
+        nominal=not fresh,
     )
-    full = after
-    if is_perturbed:
-        (full,) = _fresh_runs(request, (request.after,), 0, dt)
-    (half,) = _fresh_runs(request, (request.after,), 0, 0.5 * dt)
+    before, after = samples = sample_runs(draws, (request.before, request.after))
 
     def each(function: Any) -> tuple[Any, Any]:
         return function(before), function(after)
 
     return TuningReport(
         runs=int(np.sum(before.admissible & after.admissible)),
-        seed=request.report.seed if is_perturbed else None,
+        seed=request.report.seed if fresh else None,
         confidence=confidence,
         changes=_changes(request, samples),
         verdicts=tuple(
@@ -299,59 +381,49 @@ def make_report(request: ReportRequest) -> TuningReport:
         margin=each(lambda x: float(x.margin[x.admissible].min())),
         peak_torque=each(lambda x: tuple(x.torque[x.admissible].max(axis=0).tolist())),
         at_limits=request.at_limits,
-        halved=_at_half_the_step(request.objective, full, half),
+        step_check=request.step_check,
         notes=request.notes,
+        failures=_failures(request, draws, after) if fresh else (),
     )
 
 
-def _fresh_runs(
-    request: ReportRequest, scenarios: Sequence[Scenario], runs: int, dt: float
-) -> list[_Sample]:
-    """The runs of each scenario on the same draws: so many drawn ones, or the nominal one where
-    `runs` is 0.
-
-    They are made by the program of a search's values.  The nominal run replaces the perturbed
-    leaves too, so that one kernel serves all.
-    """
-    scenario = canonical(request.before)
-    dtype = scenario.initial.q.dtype
-    targets, by_path = targets_of(scenario, request.run.perturbations or {})
-    arrays = by_path, request.objective, dt
-    by_path, objective, step = jax.tree.map(lambda x: jnp.asarray(x, dtype), arrays)
-    cases = UncertainScenario(scenario, by_path, jax.random.PRNGKey(int(request.report.seed or 0)))
-    method = request.run.method
-    steps = checks.whole_steps(request.run.duration, dt)
-    of_run = RunRequest.of(scenario, steps=steps, method=method, backend=request.run.backend)
-    points = {
-        path: np.stack([np.asarray(paths.get(s, path), dtype) for s in scenarios])
-        for path in request.tuned
-    }
-    index = np.tile(np.arange(runs or 1, dtype=np.uint32), len(scenarios))
-    owner = np.repeat(np.arange(len(scenarios)), runs or 1)
-
-    def run(rows: np.ndarray) -> tuple[Rollouts, jax.Array]:
-        own = {path: x[owner[rows]] for path, x in points.items()}
-        varied, admissible = draw_runs(cases, own, index[rows], targets=targets, nominal=not runs)
-        return rollouts(scenario, varied, objective, step, request=of_run), admissible
-
-    batch = report_runs_per_batch(runs * len(scenarios) * steps, request.batch)
-    found, admissible = in_groups(run, len(owner), batch)
-    if len(scenarios) > 1:  # once in a report
-        warn_of_step(found.status, found.fastest_mode, found.relative_error, dt, method)
-    samples = _Sample(found.exact, found.peak_torque, found.status, admissible)
-    return [_Sample(*(x[owner == s] for x in samples)) for s in range(len(scenarios))]
+def _failures(
+    request: ReportRequest, draws: SampleRequest, sample: Sample
+) -> tuple[FailedRuns, ...]:
+    """The explanations of fresh runs that failed with the tuned gains, bounds first."""
+    objective = request.objective
+    events: list[tuple[str | None, np.ndarray]] = [(None, sample.left_bounds())]
+    for r, requirement in enumerate(objective.requirements):
+        if requirement.event == "value":
+            events.append((requirement.name, sample.is_broken(objective, r)))
+    if not any(np.any(failed & sample.admissible) for _, failed in events):
+        return ()
+    cases, targets = uncertain_scenario(draws)
+    point = {path: np.asarray(paths.get(request.after, path)) for path in request.tuned}
+    index = np.arange(draws.runs, dtype=np.uint32)
+    scenario = paths.with_parameters(cases.scenario, point)
+    leaves = drawn_leaves(cases, point, index, targets=targets)
+    fresh = FreshRuns(
+        diverged=has_flag(sample.status, Status.NOT_FINITE),
+        admissible=sample.admissible,
+        started_outside=is_outside(scenario, leaves, draws.runs),
+        numbers=scalar_samples(leaves),
+        scenario=scenario,
+    )
+    found = [failed_runs(name, failed, fresh) for name, failed in events]
+    return tuple(failure for failure in found if failure is not None)
 
 
 # --------------------------------------------------------------------------------------- changes
 
 
-def _changes(request: ReportRequest, samples: Sequence[_Sample]) -> tuple[Change, ...]:
+def _changes(request: ReportRequest, samples: Sequence[Sample]) -> tuple[Change, ...]:
     """The objective first, then its terms."""
     risk: Any = request.run.risk
     confidence = request.report.confidence
     terms = request.objective.terms
     both = samples[0].admissible & samples[1].admissible
-    before, after = (_terms(request.objective, x.exact[both]) for x in samples)
+    before, after = (x.losses(request.objective)[both] for x in samples)
     is_cvar = risk.kind == "cvar"
     of_risk, of_mean = (f" (cvar {risk.level:g})" if is_cvar else f" ({risk.kind})"), " (mean)"
     if len(before) == 1:
@@ -364,12 +436,6 @@ def _changes(request: ReportRequest, samples: Sequence[_Sample]) -> tuple[Change
             one = slice(i, i + 1)
             found.append(_objective_change(risk, tail, before[:, one], after[:, one], confidence))
     return tuple(found)
-
-
-def _terms(objective: Objective, exact: np.ndarray) -> np.ndarray:
-    """The value of each term in each run, (N, n_terms)."""
-    columns = [t.value(jnp.asarray(exact[:, i])) for i, t in enumerate(objective.terms)]
-    return np.stack([np.asarray(x) for x in columns], axis=1)
 
 
 def _objective_change(
@@ -410,11 +476,11 @@ def _change(name: str, before: np.ndarray, after: np.ndarray, confidence: float)
 # -------------------------------------------------------------------------------------- verdicts
 
 
-def _verdict(request: ReportRequest, r: int, samples: Sequence[_Sample]) -> Verdict:
+def _verdict(request: ReportRequest, r: int, samples: Sequence[Sample]) -> Verdict:
     """The verdict on requirement r."""
     requirement = request.objective.requirements[r]
     before, after = (
-        _probability(_broken(request.objective, r, x), x, request.report.confidence)
+        _probability(x.is_broken(request.objective, r), x, request.report.confidence)
         for x in samples
     )
     allowed = float(requirement.allowed)
@@ -436,10 +502,11 @@ def _verdict(request: ReportRequest, r: int, samples: Sequence[_Sample]) -> Verd
         limit=sign * float(requirement.limit),
         unit=unit,
         multiplier=multiplier,
+        event=requirement.event,
     )
 
 
-def _probability(event: np.ndarray, sample: _Sample, confidence: float) -> Probability:
+def _probability(event: np.ndarray, sample: Sample, confidence: float) -> Probability:
     return probability(event, sample.admissible, confidence, "independent", 1)
 
 
@@ -452,34 +519,3 @@ def verdict_of(p: Probability, allowed: float) -> str:
     if p.low > allowed:
         return "fail"
     return "undecided"
-
-
-def _broken(objective: Objective, r: int, sample: _Sample) -> np.ndarray:
-    """Whether each run violates a requirement, (N,)."""
-    requirement = objective.requirements[r]
-    if requirement.event == "violated":
-        return sample.left_bounds()
-    values = jnp.asarray(sample.exact[:, len(objective.terms) + r])
-    satisfied = np.asarray(requirement.excess(values)) < 0
-    return ~satisfied | has_flag(sample.status, Status.NOT_FINITE)
-
-
-def _at_half_the_step(objective: Objective, full: _Sample, half: _Sample) -> str:
-    """The nominal run at dt and at dt / 2, in words: a result that depends on the step is not
-    valid.
-    """
-    value_full, value_half = (float(_terms(objective, x.exact[:1]).sum()) for x in (full, half))
-    text = (
-        f"the nominal run at dt / 2: objective {value_half:.5g} instead of {value_full:.5g},"
-        f" smallest margin {half.margin[0]:.4g} rad, peak torque {np.max(half.torque):.5g} N m"
-    )
-    requirements = range(len(objective.requirements))
-    broken_full, broken_half = (
-        [_broken(objective, r, x)[0] for r in requirements] for x in (full, half)
-    )
-    if any(b and not a for a, b in zip(broken_full, broken_half, strict=True)):
-        remedy = "a requirement is broken there: leave it some room, or take a smaller dt"
-        return f"WARNING: {text}; {remedy}"
-    if abs(value_half - value_full) > LARGEST_DIFFERENCE * abs(value_full):
-        return f"WARNING: {text}, more than {LARGEST_DIFFERENCE:.0%} apart: take a smaller dt"
-    return text

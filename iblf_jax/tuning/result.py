@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import os
 from functools import cached_property, partial
 from typing import Any, NamedTuple
@@ -24,14 +25,15 @@ from iblf_jax.tuning.options import Report, TuningRunOptions
 from iblf_jax.tuning.quantities import Quantities
 from iblf_jax.tuning.report import ReportRequest, TuningReport, make_report
 from iblf_jax.tuning.runs import NUMBERS_A_RUN
+from iblf_jax.tuning.samples import is_random
+from iblf_jax.tuning.step_check import StepCheck, check_step_size
 
 LARGE_CHANGE = 100.0
 """Factor by which a gain may change before a warning is given."""
-STUCK = (
-    "the steps became too small: the model of objective and requirements does not hold near these"
-    " gains"
-)
-"""Why a search ended whose trust region collapsed before the conditions of an optimum were met."""
+AT_KINK = "converged at a kink: the slope of a requirement jumps from one peak to another here"
+"""Why a solver ended where the conditions hold with gradients from gains nearby only."""
+STUCK = "the solver ended at gains where the conditions of an optimum do not hold"
+"""Why a solver ended before the conditions of an optimum hold."""
 LIMIT_TOLERANCE = 0.01
 """A number is at a limit if it differs from it by no more than this part of it (of the range, where
 the limit is 0)."""
@@ -102,25 +104,26 @@ class TuneResult:
     """"forward" or "reverse"."""
     seconds: float
     setup: TuneSetup
+    objective: float = math.nan
+    """The objective at the tuned gains, on the runs that it was tuned on."""
     multipliers: tuple[float, ...] = ()
-    """Lagrange multiplier of each requirement: the decrease of the objective if its limit is
-    loosened by one `scale`.  None where one is violated; NaN where the result is not the point at
-    which the solver ended."""
+    """Lagrange multiplier of each requirement at the tuned gains: the decrease of the objective if
+    its limit is loosened by one `scale`.  Where a requirement is violated, the weights, with sum 1,
+    with which the gradients of the excesses balance."""
     residuals: tuple[float, ...] = ()
-    """Of the optimality conditions at the end, by SQP: the largest entry of the Lagrangian's
+    """Of the optimality conditions at the tuned gains: the largest entry of the Lagrangian's
     gradient by the coordinates z that no range blocks, the largest excess g of a requirement, and
-    the sum of multipliers times distances from the limits; all 0 at an optimum."""
+    the sum of multipliers times distances from the limits; all 0 at an optimum.  Where a
+    requirement is violated, the conditions are those of the least largest excess."""
     probes: int = 0
-    """Number of evaluations without derivatives to find a start, each of `setup.runs` rollouts."""
+    """Number of evaluations without derivatives, each of `setup.runs` rollouts."""
+    tried: tuple[str, ...] = ()
+    """What the search did, in words: how many starts, how many valleys, further phases."""
 
     @property
-    def objective(self) -> float:
-        """The objective at the tuned gains, on the runs that it was tuned on."""
-        rounding = 100 * np.finfo(self.tuned.dtype).eps * np.abs(self.tuned)
-        valid = self.history["valid"] & np.all(
-            np.abs(self.history["x"] - self.tuned) <= rounding, axis=-1
-        )
-        return float(np.min(np.where(valid, self.history["objective"], np.inf)))
+    def is_violated(self) -> bool:
+        """Whether the tuned gains violate a requirement on the runs that they were tuned on."""
+        return len(self.residuals) > 1 and bool(self.residuals[1] > 0)
 
     @property
     def tuned(self) -> np.ndarray:
@@ -157,8 +160,10 @@ class TuneResult:
     def limit_multipliers(self) -> dict[str, float]:
         """Multiplier of each requirement by its name and in the unit of its limit: the decrease of
         the objective if the limit is loosened by one unit.  For a violation probability, by one
-        radian of the margin of its worst runs.
+        radian of the margin of its worst runs.  Empty where a requirement is violated.
         """
+        if self.is_violated:
+            return {}
         pairs = zip(self.setup.objective.requirements, self.multipliers, strict=False)
         return {r.name: multiplier / float(r.scale) for r, multiplier in pairs}
 
@@ -180,20 +185,22 @@ class TuneResult:
                 f" (gradient of the Lagrangian {gradient:.2g}, largest excess {excess:.2g},"
                 f" complementarity {complementarity:.2g}; objective {self.objective:.5g})"
             )
-        if objective.requirements and not self.multipliers:
+        lines += self.tried
+        if objective.requirements and self.is_violated:
             lines.append(
-                "WARNING: these gains break the requirements as little as was found: loosen one, or"
-                " add parameters or starts"
+                "WARNING: these gains break the requirements as little as was found: loosen one,"
+                ' add parameters, or take effort="thorough"'
             )
         if self.stopped == "iterations used up":
             steps = len(self.history["evaluations"])
             lines.append(
-                f"WARNING: not converged: give more iterations than {steps}, or several starts"
+                f'WARNING: not converged after {steps} steps: take effort="thorough", or'
+                " ij.tuning.Effort(iterations=...)"
             )
         if self.stopped == STUCK:
             lines.append(
-                "WARNING: no optimum: give several starts, a smaller dt, or an objective whose"
-                " slope does not jump"
+                "WARNING: no optimum: the slope of the objective or of a requirement jumps here, or"
+                ' the time step is too long; take effort="thorough" or a smaller dt'
             )
         lines += self._distant_gains()
         if not depends_on_torque(objective):
@@ -236,6 +243,20 @@ class TuneResult:
         return RunRequest.of(scenario, steps=steps, method=self.setup.method, **options)
 
     @cached_property
+    def step_check(self) -> StepCheck:
+        """All runs of the tuning, with the tuned gains, at dt and at dt / 2."""
+        setup = self.setup
+        batch = self._runs_per_batch
+        return check_step_size(self.start, self.values, setup.objective, setup, batch=batch)
+
+    @property
+    def _runs_per_batch(self) -> int:
+        """Runs in a batch of the search's values, whose compiled program the report uses again."""
+        if self.probes or self.setup.runs > 1:
+            return self.setup.runs * points_per_batch(self.setup.runs)
+        return 1
+
+    @cached_property
     def report(self) -> TuningReport:
         """Before and after, requirement by requirement: on fresh draws where something is
         perturbed, else on the one nominal run.
@@ -251,8 +272,8 @@ class TuneResult:
           seed: of their draws; not the tuning's.
 
         Returns:
-          A `TuningReport`, which prints as text; without perturbations it is on the one nominal
-          run, for any `runs` and `seed`.
+          A `TuningReport`, which prints as text; if the tuning drew no runs, it is on the one
+          nominal run, for any `runs` and `seed`.
 
         Raises:
           ValueError: the seed of the tuning itself.
@@ -262,7 +283,7 @@ class TuneResult:
         setup = self.setup
         report = setup.report
         seed = report.seed if seed is None else checks.seed(seed)
-        if setup.perturbations and seed == setup.seed:
+        if is_random(setup) and seed == setup.seed:
             expected = "another seed than the tuning's"
             raise checks.fail("seed", seed, expected, "Held-out runs must be fresh.")
         if runs is None:
@@ -271,7 +292,6 @@ class TuneResult:
         at_limits = None
         if setup.limits:
             at_limits = tuple(f"{name} {end}" for name, end in self.at_limits.items())
-        searched_in_batches = self.probes or setup.runs > 1
         request = ReportRequest(
             before=self.start,
             after=self.scenario,
@@ -279,7 +299,8 @@ class TuneResult:
             objective=setup.objective,
             run=setup,
             report=dataclasses.replace(report, runs=runs, seed=seed),
-            batch=setup.runs * points_per_batch(setup.runs) if searched_in_batches else 1,
+            batch=self._runs_per_batch,
+            step_check=self.step_check,
             at_limits=at_limits,
             multipliers=tuple(self.limit_multipliers.values()),
             notes=self.notes,
@@ -366,6 +387,7 @@ class TuneResult:
             f"TuneResult({self.optimiser}, {self.mode} mode, {steps} steps,"
             f" {self.evaluations} evaluations{probes}, {self.seconds:.3g} s; {self.stopped})"
         ]
+        lines += [f"  {words}" for words in self._bounds_and_requirements()]
         for path, value in self.values.items():
             before = np.array2string(np.asarray(paths.get(self.start, path)), precision=5)
             lines.append(f"  {path}: {before} -> {np.array2string(np.asarray(value), precision=5)}")
@@ -373,6 +395,21 @@ class TuneResult:
         peaks = [np.max(np.asarray(run.metrics.peak_torque)) for run in self.nominal]
         lines.append(f"  peak torque of the nominal run: {peaks[0]:.5g} -> {peaks[1]:.5g} N m")
         return "\n".join(lines)
+
+    def _bounds_and_requirements(self) -> list[str]:
+        """Bounds and requirements on the runs of the tuning, and on fresh runs if a report on them
+        was made.
+        """
+        check = self.step_check
+        rows = [check.bounds_in_words()]
+        failed_first = sorted(check.requirements, key=lambda r: -max(r.excess))
+        rows += [f"requirement {r}" for r in failed_first]
+        if not is_random(self.setup):
+            return rows
+        report = vars(self).get("report")
+        if report is None:
+            return [*rows, "fresh runs: not made yet; `.report` makes them"]
+        return [f"{report.runs} fresh runs: {report.headline}", *rows]
 
     def _repr_html_(self) -> str:
         return present("card", self)

@@ -526,7 +526,13 @@ def test_their_gains_can_be_tuned(name, path):
         + ij.objectives.velocity_margin_above(0.05)
     )
     result = ij.tune(
-        scenario, [path], objective, duration=0.2, dt=5e-4, iterations=4, progress=False
+        scenario,
+        [path],
+        objective,
+        duration=0.2,
+        dt=5e-4,
+        effort=ij.tuning.Effort(iterations=4),
+        progress=False,
     )
     assert result.report.verdicts[0].verdict == "pass"
     assert result.history["objective"][-1, 0] <= result.history["objective"][0, 0]
@@ -671,7 +677,7 @@ def test_weights_are_tuned():
         goal,
         duration=0.1,
         dt=1e-3,
-        iterations=3,
+        effort=ij.tuning.Effort(iterations=3),
         progress=False,
     )
     assert np.any(np.abs(np.asarray(found.scenario.controller.weight) - 1.0) > 1e-3)

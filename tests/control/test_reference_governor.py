@@ -159,7 +159,7 @@ def test_its_speed_is_tuned():
         ij.objectives.tracking(),
         duration=0.4,
         dt=2e-3,
-        iterations=3,
+        effort=ij.tuning.Effort(iterations=3),
         progress=False,
     )
     assert float(np.min(result.values["controller.eta"])) > 3.0  # a faster one tracks better

@@ -142,7 +142,13 @@ def test_requirements_on_velocities():
     scenario = paper(velocity_bounds=speeds((-0.6, -0.6)))
     objective = ij.objectives.tracking() + ij.objectives.velocity_margin_above(0.02)
     result = ij.tune(
-        scenario, ["controller.k1"], objective, duration=0.3, dt=1e-3, iterations=12, progress=False
+        scenario,
+        ["controller.k1"],
+        objective,
+        duration=0.3,
+        dt=1e-3,
+        effort=ij.tuning.Effort(iterations=12),
+        progress=False,
     )
     line = result.report.verdicts[0]
     assert (line.name, line.unit, line.verdict) == ("velocity margin > 0.02 rad/s", "rad/s", "pass")

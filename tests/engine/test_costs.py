@@ -106,7 +106,7 @@ CALLS = {
                 paper,
                 ["controller.K2"],
                 ij.objectives.tracking(),
-                iterations=2,
+                effort=ij.tuning.Effort(iterations=2),
                 progress=False,
                 **SHORT,
             ).report

@@ -28,6 +28,9 @@ reports and files through `core/presentation.py`."""
 ONLY_IN = {
     "matplotlib": ("plotting",),
     "optax": ("tuning",),
+    "cma": ("tuning",),
+    "optuna": ("tuning",),
+    "unopy": ("tuning",),
     "argparse": ("cli",),
     "mujoco": ("world", "deployment"),
     "xarray": ("files", "studies", "identification", "cli", "plotting"),

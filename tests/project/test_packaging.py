@@ -87,7 +87,7 @@ def test_the_tests_run_on_every_python_with_and_without_extras():
     lists = re.findall(r"^ +(python|extras): (\[.*\])$", workflow, re.MULTILINE)
     matrix = {name: json.loads(values) for name, values in lists}
     assert [tuple(map(int, version.split("."))) for version in matrix["python"]] == CLASSIFIED
-    all_extras = {"test", "sweep", "robots", "export", "docs", "bench"}
+    all_extras = {"test", "sweep", "robots", "tuning", "export", "docs", "bench"}
     assert [set(extras.split(",")) for extras in matrix["extras"]] == [{"test"}, all_extras]
     assert all_extras <= set(PROJECT["optional-dependencies"])
 

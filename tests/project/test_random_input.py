@@ -386,7 +386,7 @@ ENTRIES = {
             "objective": GOAL,
             "runs": 1,
             "seed": 0,
-            "iterations": 2,
+            "effort": "quick",
             "solver": None,
             "report": None,
         }
@@ -406,6 +406,8 @@ ENTRIES = {
         ij.tuning.Adam,
         {"learning_rate": 0.1, "schedule": "cosine", "resample": False, "mode": "auto"},
     ),
+    "Optax": (ij.tuning.Optax, {"optimiser": None, "batch": None, "mode": "auto"}),
+    "Effort": (ij.tuning.Effort, {"values": 4, "starts": 2, "iterations": 2, "selection": 1}),
     "tuning.Report": (ij.tuning.Report, {"runs": 4, "seed": None, "confidence": 0.9}),
     "pareto": (
         ij.pareto,

@@ -117,8 +117,7 @@ def made_up_report(violated: int, verdicts: list[str], seed: int | None = 3) -> 
         (0.1, -0.2),
         ((1.0,), (2.0,)),
         (),
-        "half",
-        ("stopped",),
+        notes=("stopped",),
     )
 
 
@@ -138,7 +137,6 @@ def test_the_tuning_report_begins_with_bounds_then_requirements_then_the_objecti
         "objective (mean)",
         "rmse (mean)",
         "peak torque",
-        "half",
         "stopped",
     ]
     places = [text.index(words) for words in order]

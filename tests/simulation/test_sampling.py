@@ -548,7 +548,13 @@ def test_tuning_hears_the_noise():
     scenario = ij.with_parts(SLOW, sampling=ij.Sampling(period=1e-3), sensor=sensor)
     objective = ij.objectives.tracking() + 0.1 * ij.objectives.torque_rate()
     result = ij.tune(
-        scenario, ["controller.K2"], objective, duration=0.2, dt=5e-4, runs=4, iterations=4
+        scenario,
+        ["controller.K2"],
+        objective,
+        duration=0.2,
+        dt=5e-4,
+        runs=4,
+        effort=ij.tuning.Effort(iterations=4),
     )
     assert float(result.tuned[0]) != 4.0 and np.isfinite(result.objective)
     _, box = layout(canonical(scenario), ["controller.K2"], 5e-4, "rk4")
@@ -642,7 +648,7 @@ def test_tuning_finds_its_way_out_of_a_loop_that_is_sampled_too_slowly():
         goal,
         duration=0.2,
         dt=1e-3,
-        iterations=6,
+        effort=ij.tuning.Effort(iterations=6),
         progress=False,
     )
     run = ij.simulate(best.scenario, duration=0.1, dt=1e-3, metrics=())

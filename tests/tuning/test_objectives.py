@@ -127,7 +127,11 @@ def test_what_it_refuses():
 @pytest.mark.slow
 def test_a_metric_is_tuned_for_and_its_result_saved(paper, tmp_path):
     best = ij.tune(
-        paper, ["controller.k1"], ij.objectives.metric(Swing(), "swing"), iterations=3, **TUNING
+        paper,
+        ["controller.k1"],
+        ij.objectives.metric(Swing(), "swing"),
+        effort=ij.tuning.Effort(iterations=3),
+        **TUNING,
     )
     losses = best.history["loss"]
     assert np.min(losses) < losses[0].min()
@@ -544,7 +548,13 @@ def test_tuning_and_a_front_under_limits_of_single_joints(paper, tmp_path):
         + o.peak_torque_below(limits)
         + o.margin_above([0.02, 0.05])
     )
-    best = ij.tune(paper, ["controller.k1", "controller.K2"], goal, iterations=25, **TUNING)
+    best = ij.tune(
+        paper,
+        ["controller.k1", "controller.K2"],
+        goal,
+        effort=ij.tuning.Effort(iterations=25),
+        **TUNING,
+    )
     peaks = np.asarray(ij.simulate(best.scenario, duration=0.5, dt=1e-3).metrics.peak_torque)
     assert np.all(peaks < np.array(limits) * 1.001)
     assert "peak torque < [16, 14] N m" in str(best.report) and "% of its limit" in str(best.report)

@@ -38,10 +38,10 @@ from iblf_jax.tuning.ranges import BY_STEP, BY_THEOREM, STABILITY_FRACTION, TIME
 from iblf_jax.tuning.result import STUCK
 from iblf_jax.tuning.robust import Risk, combine
 from iblf_jax.tuning.rollouts import fold_of
-from iblf_jax.tuning.search import Search
+from iblf_jax.tuning.search import REPAIR, Search, Strategy
 from iblf_jax.tuning.solvers import Constraints, SearchSpace, quadratic, sqp
 from iblf_jax.tuning.solvers.sqp import solve_subproblem
-from iblf_jax.tuning.starts import MIN_DISTANCE, PROBE_RANGE, NearbyStarts, screened
+from iblf_jax.tuning.starts import FAR, NEAR, distinct, ranked, screened, spread_points
 
 jax.config.update("jax_enable_x64", True)
 
@@ -366,9 +366,12 @@ def test_a_region_that_has_collapsed_is_no_optimum(sign):
         return Derivatives(value, 2 * sign * z, np.zeros((len(z), 2, 2)))
 
     state = steps_of_sqp(evaluate, SearchSpace(SQUARE), [3.0, -1.0], 40, 1e-6)
-    assert state.done and state.stuck == (sign < 0)
+    assert state.done
     if sign > 0:
         np.testing.assert_allclose(state.z, 0.0, atol=1e-3)
+        assert state.residuals[0] < 1e-3
+    else:
+        assert state.residuals[0] > 1.0
 
 
 def test_limits_that_cannot_be_kept_are_broken_as_little_as_can_be():
@@ -414,50 +417,112 @@ class Valleys:
         )
 
 
-class Turns(Valleys):
+class Counted(Valleys):
     """As an `Evaluator`: only active starts are counted."""
 
-    def __init__(self, space):
+    def __init__(self, space, starts):
         self.space = space
-        self.evaluations, self.active = 0, np.ones(2, bool)
+        self.evaluations, self.active = 0, np.ones(starts, bool)
         self.candidates = SimpleNamespace(
-            index=np.zeros((2, 1)), _replace=lambda **changes: self.candidates
+            index=np.zeros((starts, 1)), _replace=lambda **changes: self.candidates
         )
         self.problem = SimpleNamespace(
             allowed=(0.0,),
             objective=objectives.tracking(),
-            with_objective=lambda objective: self.problem,
+            box=space.box,
+            blocks=(),
+            size=len(space.box.z),
+            options=SimpleNamespace(seed=0),
+            sampled_too_slowly=lambda z: False,
         )
 
     def __call__(self, z):
         self.evaluations += int(self.active.sum())
         return super().__call__(z)
 
+    def values(self, z):
+        found = self(z).value
+        self.on_values(z, found)
+        return found
 
-def test_a_second_search_begins_elsewhere_and_the_better_goes_on():
+
+def test_points_are_spread_near_and_far_and_the_starts_differ():
+    box = Box(np.full(7, -0.6), np.full(7, -4.0), np.full(7, 1.0))
+    points = spread_points(box, 120, seed=0)
+    distance = np.max(np.abs(points - box.z), axis=1)
+    assert np.sum(distance <= NEAR) >= 40 and NEAR < np.max(distance) <= FAR
+    assert np.all(points <= 1.0)
+    screening = ranked(points, Valleys()(points).value)
+    order = np.argsort(screening.merit)
+    z = distinct(screening, order, 5, box, lambda z: np.array_equal(z, points[order[0]]))
+    assert not np.any(np.all(z == points[order[0]], axis=1))  # the best one is refused
+    for i in range(5):
+        for j in range(i):
+            assert np.max(np.abs(z[i] - z[j])) >= 1.0
+
+
+def test_a_search_from_several_starts_goes_on_in_the_deeper_valley():
     box = Box(np.full(7, -0.6), np.full(7, -4.0), np.full(7, 4.0))
-    valleys = Valleys()
-    nearby = NearbyStarts(lambda z: valleys(z).value, box, 0, lambda z: False)
-    assert nearby.count == len(nearby.points) == 14 * 7 and np.all(
-        np.abs(nearby.points - box.z) <= PROBE_RANGE
-    )
-    first = nearby.points[0]
-    assert np.sum((first + 1) ** 2) < np.sum((nearby.points[-1] + 1) ** 2)
-    assert np.max(np.abs(nearby.away_from(first[None]) - first)) > MIN_DISTANCE
-    # From a second start that is given to it, it finds the deeper valley, and its minimum.
-    evaluate = Turns(SearchSpace(box, Constraints.of((1,), (0.0,), 1)))
-    calls = []
-    search = Search(
-        evaluate,
-        SQP(),
-        np.stack([first] * 2),
-        second_start=lambda used: calls.append(used) or np.full(7, 0.5),
-    )
+    starts = np.stack([np.full(7, x) for x in (-1.6, -0.4, 0.5, 1.9)])
+    evaluate = Counted(SearchSpace(box, Constraints.of((1,), (0.0,), 1)), 4)
+    screening = ranked(starts, Valleys()(starts).value)
+    search = Search(evaluate, SQP(), starts, Strategy(screening, selection=2, starts=len(starts)))
     assert search.run(60) == "converged"
-    assert search.best == 1 and search.state["best_key"][1][1] == pytest.approx(Valleys.DEEP)
-    np.testing.assert_allclose(calls[0], [first, -np.ones(7)], atol=1e-2)
-    # One at a time: as many values as steps.
-    assert evaluate.evaluations == len(search.history["z"]) <= 40
+    assert search.state["incumbent_key"][1] == pytest.approx(Valleys.DEEP)
+    np.testing.assert_allclose(search.state["incumbent_z"], np.ones(7), atol=1e-3)
+    assert search.state["retired"].sum() >= 2 and search.state["phase"] == 0
+    found = search.conditions()
+    assert found.hold and np.max(np.abs(found.residuals)) < 1e-3
+
+
+class Ring(Counted):
+    """Feasible inside a small ball around 2 only, while the objective grows from 0: its minimum
+    under a penalty of the requirement is elsewhere, as the excess is flat far away."""
+
+    def __call__(self, z):
+        self.evaluations += int(self.active.sum())
+        size = z.shape[1]
+        f, slope = 0.1 + np.sum(z**2, axis=1), 2 * z
+        away = z - self.centre
+        distance = np.sum(away**2, axis=1)
+        excess = self.least + 1.0 - np.exp(-0.5 * distance)
+        gradient = away * np.exp(-0.5 * distance)[:, None]
+        valid = np.ones(len(z), bool)
+        margin = np.ones(len(z))
+        value = Value(f, f, f[:, None], excess[:, None], excess[:, None], margin, valid, margin)
+        hessian = np.tile(2 * np.eye(size), (len(z), 1, 1))
+        return Derivatives(value, slope, hessian, excess[:, None, None], gradient[:, None, :, None])
+
+
+@pytest.mark.parametrize(("least", "feasible"), [(-0.01, True), (0.2, False)])
+def test_the_excess_alone_is_minimised_before_requirements_are_called_infeasible(least, feasible):
+    box = Box(np.full(3, -2.0), np.full(3, -4.0), np.full(3, 4.0))
+    evaluate = Ring(SearchSpace(box, Constraints.of((1,), (0.0,), 1)), 3)
+    evaluate.centre, evaluate.least = np.full(3, 1.5), least
+    starts = np.stack([np.full(3, x) for x in (-3.0, -2.0, 0.3)])
+    screening = ranked(starts, evaluate(starts).value)
+    search = Search(evaluate, SQP(), starts, Strategy(screening, selection=2, starts=len(starts)))
+    search.run(40)
+    assert search.is_violated is not feasible
+    if feasible:
+        np.testing.assert_allclose(search.state["incumbent_z"], evaluate.centre, atol=0.2)
+        return
+    assert search.state["phase"] == REPAIR
+    assert search.state["incumbent_key"][0] == pytest.approx(least, abs=1e-3)
+    assert search.conditions().residuals[1] == pytest.approx(least, abs=1e-3)
+
+
+def test_a_feasible_point_without_derivatives_is_never_lost():
+    box = Box(np.full(3, -2.0), np.full(3, -4.0), np.full(3, 4.0))
+    evaluate = Ring(SearchSpace(box, Constraints.of((1,), (0.0,), 1)), 1)
+    evaluate.centre, evaluate.least = np.full(3, 1.5), -0.01
+    points = np.stack([np.full(3, -3.0), evaluate.centre])
+    search = Search(evaluate, SQP(), points[:1])
+    search.run(2)
+    assert search.is_violated
+    evaluate.on_values(points, evaluate(points).value)
+    assert not search.is_violated
+    np.testing.assert_array_equal(search.state["incumbent_z"], evaluate.centre)
 
 
 # -------------------------------------------------------------------------------------- the loop
@@ -470,9 +535,8 @@ def test_tuning_lowers_the_loss_and_keeps_to_its_limits(paper):
         ij.tunable("controller.K2", 0.6, 40),
         ij.tunable("observer.kf", 1.01, 100),
     ]
-    best = ij.tune(paper, parameters, objective(), iterations=25, **SHORT)
-    first = best.history["objective"][0, 0]
-    assert best.objective < 0.75 * first
+    best = ij.tune(paper, parameters, objective(), effort=ij.tuning.Effort(iterations=25), **SHORT)
+    assert best.report.changes[0].after < 0.75 * best.report.changes[0].before
     x = best.history["x"]
     assert np.all(x[..., 2:4] >= 0.6 - 1e-12)
     assert np.all(x[..., 0:2] <= 100 + 1e-9)
@@ -499,7 +563,13 @@ def test_an_infeasible_start_finds_its_way_in(paper):
         + objectives.margin_above(0.06)
         + objectives.violation_probability_below(0.01)
     )
-    best = ij.tune(weak, ["controller.k1", "controller.K2"], goal, iterations=60, **SHORT)
+    best = ij.tune(
+        weak,
+        ["controller.k1", "controller.K2"],
+        goal,
+        effort=ij.tuning.Effort(iterations=60),
+        **SHORT,
+    )
     assert int(plain_status(best.scenario)) & ij.Status.BOUND_VIOLATED == 0
     assert best.report.passed, best.report
     assert best.report.margin[0] < 0 < 0.06 < best.report.margin[1]
@@ -510,7 +580,13 @@ def test_a_start_that_breaks_a_requirement_finds_its_way_in(paper):
     """Nothing leaves the bounds, but the torque is too large: the multipliers make it feasible, and
     just so."""
     goal = objectives.tracking() + 0.05 * objectives.effort() + objectives.peak_torque_below(12.0)
-    best = ij.tune(paper, ["controller.k1", "controller.K2"], goal, iterations=60, **SHORT)
+    best = ij.tune(
+        paper,
+        ["controller.k1", "controller.K2"],
+        goal,
+        effort=ij.tuning.Effort(iterations=60),
+        **SHORT,
+    )
     assert best.report.verdicts[0].before.count == 1 and best.report.passed, best.report
     assert 11.0 < float(np.max(ij.simulate(best.scenario, **SHORT).metrics.peak_torque)) < 12.0
 
@@ -530,7 +606,7 @@ def test_a_multiplier_is_what_a_looser_limit_is_worth(paper):
     tight, best, loose = (tuned(9.0 * factor) for factor in (0.99, 1.0, 1.01))
     price = (tight.objective - loose.objective) / 0.18
     assert best.prices == pytest.approx({"peak torque < 9 N m": price}, rel=0.02)
-    assert price > 1e-3 and best.stopped == "converged" and best.evaluations <= 30
+    assert price > 1e-3 and best.stopped == "converged" and best.evaluations <= 60
     assert 8.99 < float(np.max(ij.simulate(best.scenario, **SHORT).metrics.peak_torque)) < 9.0
     assert f"would fall by {best.prices['peak torque < 9 N m']:.3g} for each N m" in str(
         best.report
@@ -538,6 +614,19 @@ def test_a_multiplier_is_what_a_looser_limit_is_worth(paper):
     gradient, excess, complementarity = best.residuals
     assert gradient < 1e-2 * best.objective and excess == 0 and complementarity < 1e-4
     assert "dt / 2: objective" in str(best.report)
+
+
+@pytest.mark.slow
+def test_a_requirement_that_breaks_at_half_the_step_is_polished_there(paper):
+    """Euler's method at 1 ms: the error binds there, and is larger at half the step."""
+    goal = objectives.effort() + objectives.error_below(0.01, after=0.4)
+    options = {"duration": 0.8, "method": "euler", "progress": False}
+    best = ij.tune(paper, ["controller.k1", "controller.K2"], goal, dt=1e-3, **options)
+    assert best.setup.dt == 5e-4 and "steps at dt / 2 followed" in str(best.report)
+    run = ij.simulate(best.scenario, duration=0.8, dt=5e-4, method="euler")
+    error = np.max(np.abs(run.e1[np.asarray(run.t) >= 0.4]))
+    assert 0.0099 < error <= 0.01
+    assert best.history["valid"].shape[0] == len(best.history["evaluations"])
 
 
 @pytest.mark.slow
@@ -560,13 +649,19 @@ def test_requirements_that_cannot_be_kept_are_named_with_how_much(paper):
                 > peak - 1e-3
             )
     assert best.prices == {}
-    priceless = ij.tune(paper, ["controller.k1"], objectives.tracking(), iterations=1, **SHORT)
+    priceless = ij.tune(
+        paper,
+        ["controller.k1"],
+        objectives.tracking(),
+        effort=ij.tuning.Effort(iterations=1),
+        **SHORT,
+    )
     assert any("no price on torque" in line for line in priceless.notes)
     assert any(
-        "WARNING: not converged: give more iterations than 1" in line for line in priceless.notes
+        'not converged after 2 steps: take effort="thorough"' in line for line in priceless.notes
     )
     assert any(
-        "WARNING: no optimum: give several starts" in line
+        "WARNING: no optimum: the slope of the objective" in line
         for line in dataclasses.replace(priceless, stopped=STUCK).notes
     )
     far = dataclasses.replace(priceless, values={"controller.k1": np.array([2.0, 210.0])})
@@ -644,6 +739,7 @@ class Bowl:
         )
 
     def __call__(self, z):
+        self.evaluations += 1
         candidates = self.row(0)[1]._replace(z=jnp.asarray(z))
         return jax.tree.map(np.asarray, self.derivatives(None, candidates))
 
@@ -755,8 +851,10 @@ def test_only_active_starts_are_evaluated_in_groups_of_one_shape(nominal):
 
 @pytest.mark.slow
 def test_lbfgs_tunes_the_paper_as_well_as_sqp(paper):
-    best = ij.tune(paper, GAINS, objective(), solver=LBFGS(), iterations=40, **SHORT)
-    by_sqp = ij.tune(paper, GAINS, objective(), iterations=30, **SHORT)
+    best = ij.tune(
+        paper, GAINS, objective(), solver=LBFGS(), effort=ij.tuning.Effort(iterations=40), **SHORT
+    )
+    by_sqp = ij.tune(paper, GAINS, objective(), effort="quick", **SHORT)
     assert best.optimiser == "lbfgs"
     assert best.objective < 1.01 * by_sqp.objective
 
@@ -764,11 +862,17 @@ def test_lbfgs_tunes_the_paper_as_well_as_sqp(paper):
 @pytest.mark.slow
 def test_a_start_too_stiff_for_the_step_is_brought_in_or_refused(paper, monkeypatch):
     stiff = ij.with_parameters(paper, {"controller.K2": 60.0})
-    assert ij.tune(stiff, GAINS, objective(), iterations=2, **SHORT).history["valid"].all()
+    assert (
+        ij.tune(stiff, GAINS, objective(), effort=ij.tuning.Effort(0, 1, iterations=2), **SHORT)
+        .history["valid"]
+        .all()
+    )
     # An error does not wait for derivatives: it follows from values.
     monkeypatch.setitem(evaluation.DERIVATIVES, "forward", None)
     with pytest.raises(ValueError, match=r"Take dt=\S+, not 0.001 s"):
-        ij.tune(stiff, ["controller.k1"], objective(), iterations=2, **SHORT)
+        ij.tune(
+            stiff, ["controller.k1"], objective(), effort=ij.tuning.Effort(iterations=2), **SHORT
+        )
 
 
 def test_a_start_of_which_some_runs_are_too_stiff_says_how_many(nominal, monkeypatch):
@@ -803,7 +907,7 @@ def robust(paper):
         perturbations=DRAWS,
         runs=8,
         risk=ij.cvar(0.75),
-        iterations=8,
+        effort=ij.tuning.Effort(iterations=8),
         report=ij.tuning.Report(runs=256),
         **SHORT,
     )
@@ -851,7 +955,7 @@ def test_starts_run_as_one_batch_and_resampling_needs_adam(paper):
         perturbations=DRAWS,
         runs=4,
         solver=Adam(starts=2, resample=True),
-        iterations=3,
+        effort=ij.tuning.Effort(iterations=3),
         **SHORT,
     )
     assert best.optimiser == "adam"
@@ -918,7 +1022,7 @@ def test_signature_of_tune_is_short_and_solvers_fit_their_protocol():
     assert {"init", "step", "converged"} <= set(members)
     for name, solver in ij.tuning.SOLVERS.items():
         assert solver.name == name
-        assert [member for member in members if not hasattr(solver(), member)] == []
+        assert [member for member in members if not hasattr(solver, member)] == []
 
 
 def test_keyword_arguments_of_earlier_versions_warn_and_mean_the_same(paper):
@@ -928,7 +1032,7 @@ def test_keyword_arguments_of_earlier_versions_warn_and_mean_the_same(paper):
             paper,
             ["controller.k1"],
             objectives.tracking(),
-            iterations=2,
+            effort=ij.tuning.Effort(iterations=2),
             progress=False,
             callback=calls.append,
             **NAMES_OF_EARLIER_VERSIONS,
@@ -942,7 +1046,7 @@ def test_keyword_arguments_of_earlier_versions_warn_and_mean_the_same(paper):
         paper,
         ["controller.k1"],
         objectives.tracking(),
-        iterations=2,
+        effort=ij.tuning.Effort(iterations=2),
         solver=Adam(learning_rate=0.2, mode="forward", tolerance=1e-4, patience=5),
         report=ij.tuning.Report(runs=7, seed=3, confidence=0.9),
         progress=calls.append,
@@ -972,7 +1076,7 @@ def test_options_that_do_not_exist_or_fit_are_errors(paper, options, error, word
 
 @dataclasses.dataclass(frozen=True)
 class Halving(Adam):
-    """A user's solver: Adam that halves its learning rate at each step, and always converges."""
+    """A user's solver: Adam that halves its learning rate at each step, and soon ends."""
 
     name = "halving"
 
@@ -987,7 +1091,9 @@ class Halving(Adam):
 
 def test_a_solver_of_the_users_own(paper):
     best = ij.tune(paper, ["controller.k1"], objectives.tracking(), solver=Halving(), **SHORT)
-    assert (best.optimiser, best.stopped) == ("halving", "converged")
+    # It says that it has converged, but the gradient is not small.
+    assert (best.optimiser, best.stopped) == ("halving", STUCK)
+    assert best.residuals[0] > 1e-2
     assert len(best.history["loss"]) == 3
 
 
@@ -1082,9 +1188,18 @@ def test_a_killed_tuning_goes_on_bit_identically(tmp_path, monkeypatch):
 
 def test_a_checkpoint_of_another_problem_is_refused(paper, tmp_path):
     file = tmp_path / "c.npz"
-    ij.tune(paper, GAINS, objective(), iterations=2, checkpoint=file, **SHORT)
+    ij.tune(
+        paper, GAINS, objective(), effort=ij.tuning.Effort(iterations=2), checkpoint=file, **SHORT
+    )
     with pytest.raises(ValueError, match="this very problem"):
-        ij.tune(paper, GAINS, 2 * objective(), iterations=2, checkpoint=file, **SHORT)
+        ij.tune(
+            paper,
+            GAINS,
+            2 * objective(),
+            effort=ij.tuning.Effort(iterations=2),
+            checkpoint=file,
+            **SHORT,
+        )
 
 
 def test_more_peaks_than_the_memory_holds_are_refused(paper, monkeypatch):

@@ -379,7 +379,7 @@ def test_tune_21_gains():
         gains,
         ij.objectives.tracking(),
         method="euler",
-        iterations=2,
+        effort=ij.tuning.Effort(iterations=2),
         report=ij.tuning.Report(runs=2),
         **BRIEF,
     )

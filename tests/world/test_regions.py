@@ -324,7 +324,9 @@ def test_a_requirement_on_regions_and_an_attack_on_them():
         + 0.1 * ij.objectives.effort()
         + ij.objectives.region_margin_above(0.01)
     )
-    result = ij.tune(scenario, ["controller.Kd"], objective, **short, iterations=8)
+    result = ij.tune(
+        scenario, ["controller.Kd"], objective, **short, effort=ij.tuning.Effort(iterations=8)
+    )
     line = result.report.verdicts[0]
     assert (line.name, line.unit, line.verdict) == ("region margin > 0.01 m", "m", "pass")
     run = result.nominal[1]

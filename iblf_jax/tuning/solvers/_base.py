@@ -8,7 +8,9 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.optional import has_members
 from iblf_jax.core.pytree import field_values
+from iblf_jax.studies.designs import MAX_RUNS
 from iblf_jax.tuning.parameters import Box
 from iblf_jax.tuning.robust import worst_count
 
@@ -17,6 +19,9 @@ SCHEDULES = ("cosine", "constant")
 MAX_SHARPENINGS = 60
 """With more, the smoothing is not representable in float32."""
 LEARNING_RATES = (1e-12, 1e3)
+SAMPLERS = ("tpe", "qmc", "random")
+PRESETS = ("filtersqp", "ipopt", "filterslp")
+POPULATIONS = (5, 100_000)
 
 
 class Constraints(NamedTuple):
@@ -32,6 +37,8 @@ class Constraints(NamedTuple):
     """Number k of worst runs, for each requirement, (R,)."""
     runs: int
     """Number B of runs."""
+    largest_only: bool = False
+    """Whether the violation is the largest excess of all requirements, and not their sum."""
 
     @staticmethod
     def of(counts: Sequence[int], shares: Sequence[float], runs: int) -> Constraints:
@@ -44,6 +51,13 @@ class Constraints(NamedTuple):
     def pieces_of(self, requirement: int) -> np.ndarray:
         """Indices of the pieces of a requirement."""
         return np.flatnonzero(self.owner == requirement)
+
+    def violation(self, excess: np.ndarray) -> float:
+        """The violation from the excess of each requirement, (R,)."""
+        positive = np.maximum(excess, 0.0)
+        if self.largest_only:
+            return float(np.max(positive, initial=0.0))
+        return float(np.sum(positive))
 
     def excess(self, pieces: np.ndarray) -> np.ndarray:
         """G_r, (R,), from the pieces' values, (B, M)."""
@@ -64,20 +78,6 @@ class SearchSpace(NamedTuple):
     """Whether several local minima are expected."""
     iterations: int = 60
     """Steps of the search at most, for schedules."""
-
-
-class Optimality(NamedTuple):
-    """How far the accepted point of a start is from an optimum."""
-
-    z: np.ndarray
-    """The accepted point, (p,)."""
-    multipliers: np.ndarray
-    """Of each requirement, (R,)."""
-    residuals: np.ndarray
-    """Largest entry of the Lagrangian's gradient that no range blocks, largest excess, and
-    complementarity, (3,)."""
-    stuck: bool
-    """Whether the solver ended without an optimum."""
 
 
 class Solver(Protocol):
@@ -102,13 +102,6 @@ class Solver(Protocol):
         ...
 
     @property
-    def traces_evaluation(self) -> bool:
-        """Whether a step evaluates inside of a compiled loop, by `evaluate.derivatives(problem,
-        candidate)` with the two of `evaluate.row(start)`.
-        """
-        ...
-
-    @property
     def mode(self) -> str:
         """Differentiation: "forward", "reverse", or "auto", by the number of coordinates."""
         ...
@@ -119,8 +112,10 @@ class Solver(Protocol):
         ...
 
     @property
-    def starts(self) -> int:
-        """Number of starting points."""
+    def starts(self) -> int | None:
+        """Number of starting points.  Where it is None the tuning decides: it evaluates many points
+        without derivatives, begins at several of them, and goes on with the best (`search`).
+        """
         ...
 
     @property
@@ -169,20 +164,30 @@ class Solver(Protocol):
         """
         ...
 
-    def optimality(self, state: Any, start: int) -> Optimality | None:
-        """Multipliers and residuals of one start; None if the solver does not compute them."""
-        ...
-
 
 def _word(name: str, value: Any, allowed: tuple[str, ...]) -> str:
     checks.one_of(name, value, allowed)
     return value
 
 
+def _optimiser(name: str, value: Any) -> Any:
+    """An optimiser of optax, which is a tuple of functions, or None."""
+    expected = "an optax.GradientTransformation such as optax.lion(1e-3)"
+    if value is not None and not has_members(value, "init", "update"):
+        raise checks.fail(name, value, expected)
+    return value
+
+
+def _batch(name: str, value: Any) -> int | None:
+    return None if value is None else checks.positive_integer(name, value, most=MAX_RUNS)
+
+
 CHECKS: dict[str, Any] = {
+    "optimiser": _optimiser,
+    "batch": _batch,
     "mode": lambda name, x: _word(name, x, MODES),
     "resample": checks.boolean,
-    "starts": checks.positive_integer,
+    "starts": lambda name, x: None if x is None else checks.positive_integer(name, x),
     "tolerance": lambda name, x: checks.number_between(name, x, 0.0, 1.0, "1"),
     "sharpenings": lambda name, x: checks.positive_integer(name, x, least=0, most=MAX_SHARPENINGS),
     "patience": lambda name, x: checks.positive_integer(name, x, most=checks.MAX_STEPS),
@@ -191,6 +196,14 @@ CHECKS: dict[str, Any] = {
     "memory": lambda name, x: checks.positive_integer(name, x, most=1000),
     "line_steps": lambda name, x: checks.positive_integer(name, x, most=1000),
     "radius": lambda name, x: None if x is None else checks.positive_number(name, x, "1"),
+    "population": lambda name, x: checks.positive_integer(
+        name, x, least=POPULATIONS[0], most=POPULATIONS[1]
+    ),
+    "step_size": lambda name, x: checks.positive_number(name, x, "1"),
+    "reach": lambda name, x: checks.positive_number(name, x, "1"),
+    "seed": lambda name, x: checks.seed(x, name),
+    "sampler": lambda name, x: _word(name, x, SAMPLERS),
+    "preset": lambda name, x: _word(name, x, PRESETS),
 }
 """Option -> function of its name and value that returns the value in its type, or raises
 ValueError."""
@@ -200,3 +213,8 @@ def check_options(options: Any) -> None:
     """Checks the fields of a frozen dataclass of options, and converts them to their types."""
     for name, value in field_values(options).items():
         object.__setattr__(options, name, CHECKS[name](name, value))
+
+
+def where_rows(mask: np.ndarray, new: Any, old: Any) -> np.ndarray:
+    """Rows of `new` where the mask, (S,), is true, of `old` otherwise."""
+    return np.where(mask.reshape((-1,) + (1,) * (np.ndim(new) - 1)), new, old)

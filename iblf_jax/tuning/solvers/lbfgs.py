@@ -1,30 +1,44 @@
-"""L-BFGS with a zoom line search, by optax, on coordinates that are squashed into the box.
+"""L-BFGS, on coordinates that are squashed into the box.
 
-It suits many parameters (reverse mode); for few gains `sqp` needs fewer rollouts.  The line search
-takes the loss of a point with an invalid run for very large.
+It suits many parameters (reverse mode); for few gains `sqp` needs fewer rollouts.  The direction is
+that of `optax.scale_by_lbfgs`.  The line search runs on the host and calls one compiled function,
+so that the gradient, whose compilation takes longer than many evaluations, is compiled once.  It
+finds a step t along the direction d with
+
+    L(w + t d) <= L(w) + c1 t g.d     and     g(w + t d).d >= c2 g.d
+
+by doubling and bisection: t is too long where the first condition fails, and too short where only
+the second one does.  A point with an invalid run is too far.  The method needs no smooth loss, and
+the second condition keeps the curvature along the step positive.
+
+Source: A. S. Lewis, M. L. Overton, Math. Program. 141 (2013) 135-163, algorithm 2.6.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 
-from iblf_jax.tuning.parameters import squash, squashed, unsquash
-from iblf_jax.tuning.solvers._base import Optimality, SearchSpace, check_options
+from iblf_jax.tuning.parameters import squashed, unsquash
+from iblf_jax.tuning.solvers._base import SearchSpace, check_options, where_rows
 
-INVALID_LOSS = 1e6
-"""What a line search gets in place of an infinite loss."""
+SUFFICIENT_DECREASE = 1e-4
+"""c1."""
+CURVATURE = 0.9
+"""c2."""
 
 
 @dataclasses.dataclass(frozen=True)
 class LBFGS:
     """L-BFGS; requirements are penalties.
+
+    All starts take the steps of their line searches together, in one batch.
 
     Args:
       memory: number of previous steps in the approximation of the Hessian.
@@ -46,7 +60,6 @@ class LBFGS:
     patience: int = 15
     name: ClassVar[str] = "lbfgs"
     handles_requirements: ClassVar[bool] = False
-    traces_evaluation: ClassVar[bool] = True
     resample: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
@@ -55,108 +68,182 @@ class LBFGS:
     def init(self, space: SearchSpace, z: np.ndarray) -> dict[str, Any]:
         """As `Solver.init`."""
         w = np.stack([unsquash(x, space.box) for x in z])
-        inner = jax.vmap(_optimiser(self.memory, self.line_steps).init)(jnp.asarray(w))
         return {
             "w": w,
-            "inner": jax.tree.map(np.array, inner),
             "loss": np.full(len(z), np.inf),
+            "gradient": np.zeros_like(w),
+            "evaluated": np.zeros(len(z), bool),
+            "inner": self._memory_at(w),
             "done": np.zeros(len(z), bool),
         }
 
     def restart(
         self, space: SearchSpace, state: dict[str, Any], start: int, z: np.ndarray | None = None
     ) -> None:
-        """As `Solver.restart`; forgets curvature and line search."""
+        """As `Solver.restart`; forgets the curvature, and the loss at the present point."""
         if z is not None:
             state["w"][start] = unsquash(z, space.box)
-        w = jnp.asarray(state["w"][start])
-        _set_row(state["inner"], start, _optimiser(self.memory, self.line_steps).init(w))
+        state["evaluated"][start] = False
         state["done"][start] = False
+        self._forget(state, np.arange(len(state["w"])) == start)
 
     def converged(self, state: dict[str, Any]) -> np.ndarray:
         """As `Solver.converged`."""
         return state["done"].copy()
 
-    def optimality(self, state: dict[str, Any], start: int) -> Optimality | None:
-        """None."""
-        return None
-
     def step(
         self, evaluate: Any, state: dict[str, Any], tolerance: float
     ) -> tuple[np.ndarray, Any]:
         """One line search of every active start, as `Solver.step`."""
-        box = evaluate.space.box
-        for s in np.flatnonzero(evaluate.active).tolist():
-            problem, candidate = evaluate.row(s)
-            w, inner = _line_search(
-                problem,
-                candidate,
-                box,
-                jnp.asarray(state["w"][s]),
-                jax.tree.map(lambda x, s=s: jnp.asarray(x[s]), state["inner"]),
-                derivatives=evaluate.derivatives,
-                memory=self.memory,
-                line_steps=self.line_steps,
-            )
-            evaluate.evaluations += int(np.asarray(optax.tree.get(inner, "num_linesearch_steps")))
-            _set_row(state["inner"], s, inner)
-            state["w"][s] = np.asarray(w)
-        z, _ = squashed(box, state["w"])
+        active = evaluate.active.copy()
+        found = None
+        if not np.all(state["evaluated"][active]):
+            found = self._evaluate_here(evaluate, state)
+        search = LineSearch(evaluate, self._directions(state), state, found)
+        search.run(active & state["evaluated"], self.line_steps)
+        evaluate.active = active
+
+        change = np.abs(state["loss"] - search.loss)
+        small = change < tolerance * np.maximum(1e-3, np.abs(search.loss))
+        state["done"] = np.where(active, small | ~search.improved, state["done"])
+        for name in ("w", "loss", "gradient"):
+            state[name] = where_rows(search.improved, getattr(search, name), state[name])
+        return search.z, search.found
+
+    def _evaluate_here(self, evaluate: Any, state: dict[str, Any]) -> Any:
+        """Evaluates the present points of the active starts."""
+        z, pull = squashed(evaluate.space.box, state["w"])
         found = evaluate(z)
-        change = np.abs(state["loss"] - found.value.loss)
-        small = change < tolerance * np.maximum(1e-3, np.abs(found.value.loss))
-        state["done"] = np.where(evaluate.active, small, state["done"])
-        state["loss"] = np.array(found.value.loss)
-        return z, found
+        gradient = pull(found.gradient)
+        valid = evaluate.active & _is_finite(found.value.loss, gradient)
+        state["loss"] = np.where(valid, found.value.loss, state["loss"])
+        state["gradient"] = where_rows(valid, gradient, state["gradient"])
+        state["evaluated"] = state["evaluated"] | valid
+        return found
+
+    def _directions(self, state: dict[str, Any]) -> np.ndarray:
+        """The direction of descent of each start, (S, p), by a curvature that includes its last
+        step; a curvature that gives no descent is forgotten.
+        """
+        directions = self._updated(state)
+        ascends = np.sum(directions * state["gradient"], axis=1) >= 0
+        if np.any(ascends):
+            self._forget(state, ascends)
+            directions = where_rows(ascends, self._updated(state), directions)
+        return directions
+
+    def _updated(self, state: dict[str, Any]) -> np.ndarray:
+        scaled, inner = _scaled(state["gradient"], state["inner"], state["w"], self.memory)
+        # The update of a row with the same point and gradient once more would add an empty pair.
+        moved = np.any(np.asarray(state["inner"].params) != state["w"], axis=1)
+        new = moved | (state["inner"].count == 0)
+        state["inner"] = jax.tree.map(partial(where_rows, new), inner, state["inner"])
+        return -np.asarray(scaled)
+
+    def _forget(self, state: dict[str, Any], rows: np.ndarray) -> None:
+        """Forgets the curvature of the starts for which `rows`, (S,), is true."""
+        blank = self._memory_at(state["w"])
+        state["inner"] = jax.tree.map(partial(where_rows, rows), blank, state["inner"])
+
+    def _memory_at(self, w: np.ndarray) -> Any:
+        blank = jax.vmap(optax.scale_by_lbfgs(self.memory).init)(jnp.asarray(w))
+        return jax.tree.map(np.array, blank)
 
 
-def _optimiser(memory: int, line_steps: int) -> optax.GradientTransformationExtraArgs:
-    search = optax.scale_by_zoom_linesearch(
-        max_linesearch_steps=line_steps, initial_guess_strategy="one"
-    )
-    return optax.lbfgs(memory_size=memory, linesearch=search)
-
-
-@partial(jax.jit, static_argnames=("derivatives", "memory", "line_steps"))
-def _line_search(
-    problem: Any,
-    candidate: Any,
-    box: Any,
-    w: jax.Array,
-    inner: Any,
-    *,
-    derivatives: Any,
-    memory: int,
-    line_steps: int,
-) -> tuple[jax.Array, Any]:
-    """One line search of one start; `candidate` has one row."""
-    optimiser = _optimiser(memory, line_steps)
-
-    def loss_and_gradient(w: jax.Array) -> tuple[jax.Array, jax.Array]:
-        z, pull = jax.vjp(partial(squash, box=box), w)
-        found = derivatives(problem, candidate._replace(z=z[None]))
-        loss = found.value.loss[0]
-        gradient = pull(found.gradient[0])[0]
-        valid = jnp.isfinite(loss) & jnp.all(jnp.isfinite(gradient))
-        return jnp.where(valid, loss, INVALID_LOSS), jnp.where(valid, gradient, 0.0)
-
-    @jax.custom_jvp
-    def loss(w: jax.Array) -> jax.Array:
-        return loss_and_gradient(w)[0]
-
-    @loss.defjvp
-    def _(primals: Any, tangents: Any) -> Any:
-        value, gradient = loss_and_gradient(*primals)
-        return value, gradient @ tangents[0]
-
-    value, gradient = optax.value_and_grad_from_state(loss)(w, state=inner)
+@partial(jax.jit, static_argnames="memory")
+def _scaled(gradient: jax.Array, inner: Any, w: jax.Array, memory: int) -> Any:
+    """The gradients times the approximate inverse of the Hessian, and the new memory."""
     with jax.numpy_dtype_promotion("standard"):  # optax mixes integers of several types
-        move, inner = optimiser.update(
-            gradient, inner, w, value=value, grad=gradient, value_fn=loss
-        )
-    return optax.apply_updates(w, move), inner
+        return jax.vmap(optax.scale_by_lbfgs(memory).update)(gradient, inner, w)
 
 
-def _set_row(tree: Any, row: int, values: Any) -> None:
-    """Writes one start's values into arrays that have the starts first."""
-    jax.tree.map(lambda old, new: old.__setitem__(row, np.asarray(new)), tree, values)
+def _is_finite(loss: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+    return np.isfinite(loss) & np.all(np.isfinite(gradient), axis=1)
+
+
+class LineSearch:
+    """The line searches of S starts; each keeps the trial with the lowest loss that has a
+    sufficient decrease.
+
+    Args:
+      evaluate: as of `Solver.step`.
+      directions: (S, p).
+      state: of the solver.
+      here: `Derivatives` at the present points, or None.
+    """
+
+    def __init__(self, evaluate: Any, directions: np.ndarray, state: dict[str, Any], here: Any):
+        self.evaluate = evaluate
+        self.directions = directions
+        self.origin = state["w"]
+        self.loss_at_origin = state["loss"]
+        self.slopes = np.sum(directions * state["gradient"], axis=1)
+        self.improved = np.zeros(len(self.origin), bool)
+        """Whether a start has found a sufficient decrease."""
+        self.w = self.origin.copy()
+        self.z = squashed(evaluate.space.box, self.w)[0].copy()
+        self.loss = self.loss_at_origin.copy()
+        self.gradient = state["gradient"].copy()
+        self.found = here
+        """`Derivatives` at `z`: of the best trials; where there is none, of the present points if
+        they have been evaluated in this step, otherwise of the last trials."""
+        self.keeps_failures = here is None
+
+    def run(self, searching: np.ndarray, line_steps: int) -> None:
+        """The line searches of the starts for which `searching`, (S,), is true."""
+        t = np.ones(len(self.origin))
+        low = np.zeros(len(t))
+        high = np.full(len(t), np.inf)
+        for _ in range(line_steps):
+            if self.found is not None and not np.any(searching):
+                return
+            trial = self._tried(searching, t)
+            fits = searching & trial.decreased
+            flat = trial.slopes >= CURVATURE * self.slopes
+            self._keep(trial, searching, fits & (trial.loss < self.loss))
+            low = np.where(fits, t, low)
+            high = np.where(searching & ~fits, t, high)
+            searching = searching & ~(fits & flat)
+            t = np.where(np.isfinite(high), 0.5 * (low + high), 2.0 * t)
+
+    def _tried(self, searching: np.ndarray, t: np.ndarray) -> Trial:
+        """The points at steps t, (S,), along the directions."""
+        self.evaluate.active = searching
+        w = self.origin + np.where(searching, t, 0.0)[:, None] * self.directions
+        z, pull = squashed(self.evaluate.space.box, w)
+        found = self.evaluate(z)
+        gradient = pull(found.gradient)
+        loss = np.asarray(found.value.loss)
+        limit = self.loss_at_origin + SUFFICIENT_DECREASE * t * self.slopes
+        decreased = _is_finite(loss, gradient) & (loss <= limit)
+        slopes = np.sum(np.where(decreased[:, None], gradient, 0.0) * self.directions, axis=1)
+        return Trial(w, z, found, loss, gradient, decreased, slopes)
+
+    def _keep(self, trial: Trial, searching: np.ndarray, better: np.ndarray) -> None:
+        self.improved = self.improved | better
+        self.w = where_rows(better, trial.w, self.w)
+        self.loss = np.where(better, trial.loss, self.loss)
+        self.gradient = where_rows(better, trial.gradient, self.gradient)
+        shown = better
+        if self.keeps_failures:
+            shown = better | (searching & ~self.improved)
+        self.z = where_rows(shown, trial.z, self.z)
+        if self.found is None:
+            self.found = trial.found
+            return
+        self.found = jax.tree.map(partial(where_rows, shown), trial.found, self.found)
+
+
+class Trial(NamedTuple):
+    """One evaluation of a line search, of S starts."""
+
+    w: np.ndarray
+    z: np.ndarray
+    found: Any
+    loss: np.ndarray
+    gradient: np.ndarray
+    """By w, (S, p)."""
+    decreased: np.ndarray
+    """Whether the decrease is sufficient, (S,)."""
+    slopes: np.ndarray
+    """Along the directions, (S,)."""

@@ -28,10 +28,18 @@ piece.  Both are estimated from changes of gradients by the symmetric rank-one u
     A <- A + r r^T / (r.s),      r = (change of g) - B s;
     C_j likewise,                r = (change of a_j) - C_j s,
 
-also after rejected steps.  With many runs, C_j is stored for the worst pieces of each requirement
+also after rejected steps, but not where the loss of a trial is far above: such a trial has become
+unstable, and its gradients say nothing of the curvature at z.  A is set to zero after
+MOST_REJECTIONS rejected steps in a row.  A piece is the maximum of a signal over time, whose
+gradient jumps where another peak becomes the largest.  So the pieces of the last CUTS rejected
+trials, linear around them, are further pieces of the subproblem, as in a bundle method.  With many
+runs, C_j is stored for the worst pieces of each requirement
 only.  delta grows and shrinks with the ratio of actual to predicted decrease.  A rejected step is
 tried once more with c_j such that c_j + a_j.s is the value found (second-order correction).  A
 trial with an invalid run is rejected, and delta shrinks: non-finite numbers never reach z.
+
+A start has converged where the model predicts no decrease and the gradient of the Lagrangian is
+below STATIONARITY_TOLERANCE.  Where delta falls below COLLAPSED_RADIUS before that, it ends too.
 
 Source: R. Fletcher, Practical Methods of Optimization, 2nd ed., section 14.4 (the subproblem and
 its correction);
@@ -52,8 +60,9 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from iblf_jax.core import checks
+from iblf_jax.tuning.parameters import Box
 from iblf_jax.tuning.solvers import quadratic
-from iblf_jax.tuning.solvers._base import Constraints, Optimality, SearchSpace, check_options
+from iblf_jax.tuning.solvers._base import Constraints, SearchSpace, check_options
 
 INITIAL_RADIUS = 1.0
 """First |s_i|; 1 is a factor e for a gain."""
@@ -70,7 +79,26 @@ RATIO_TO_GROW = 0.7
 SHRINK_FACTOR = 0.4
 GROWTH_FACTOR = 2.0
 SMALLEST_EIGENVALUE = 1e-6
-"""Of the model's matrix, relative to its largest."""
+"""Of the model's matrix, relative to the largest of the Gauss-Newton matrix: a wrong secant matrix
+can have much larger ones, which must not limit the others."""
+LARGEST_LOSS_FACTOR = 10.0
+"""A trial whose loss is so many times the accepted one says nothing of the curvature there."""
+MOST_REJECTIONS = 4
+"""Rejected steps one after the other, after which the secant matrices are set to zero."""
+CUTS = 3
+"""Rejected trials whose pieces are kept as constraints."""
+CUT_REACH = 3.0
+"""Distance of such a trial at most, relative to the radius."""
+BETA = 1.0
+"""Curvature, relative to the objective, with which multipliers are determined at a point."""
+MULTIPLIER_LIMIT = 1e3
+"""Largest multiplier that is determined at a point, relative to the objective; with 1e6 the
+programme's precision would not be enough."""
+AT_LIMIT = 1e-4
+"""Distance of a piece from its limit, in its scale, within which it counts as at its limit."""
+STATIONARITY_TOLERANCE = 1e-3
+"""Largest entry of the Lagrangian's gradient at convergence, relative to the larger of the
+objective and its gradient."""
 TARGET_EXCESS = 1e-5
 """How far inside its limit a requirement is aimed at, in its scale, so that rounding does not
 violate it."""
@@ -83,7 +111,7 @@ PENALTY_FACTOR = 10.0
 CURVATURE_SOLVES = 3
 """Subproblems with the curvature of the pieces."""
 COLLAPSED_RADIUS = 1e-3
-"""delta below which a start is stuck: the model does not predict the objective even so near."""
+"""delta below which a start ends: the model does not predict the objective even so near."""
 RANGE_TOLERANCE = 1e-6
 """Distance in z from the end of a range within which the range blocks a gain."""
 MAX_PIECES = 200
@@ -161,11 +189,9 @@ def solve_subproblem(
         gradients = piece_gradients[chosen.run, :, chosen.piece]
         step_columns.append(np.pad(gradients, ((0, added), (0, 0))))
         limits.append(np.pad(-pieces[chosen.run, chosen.piece] - TARGET_EXCESS, (0, added)))
-    own_block = block_diag(np.zeros((2 * size, 0)), *own_columns)
+    own_block, violation_columns = _columns_of_requirements(size, own_columns, constraints)
     A = np.hstack([np.vstack(step_columns), own_block])
     H = block_diag(matrix, np.zeros((own_block.shape[1], own_block.shape[1])))
-    widths = [own.shape[1] for own in own_columns]
-    violation_columns = size + np.cumsum([0, *widths])[:-1]
     c = np.zeros(A.shape[1])
     c[:size] = gradient
     c[violation_columns] = penalty
@@ -188,6 +214,21 @@ def solve_subproblem(
         multipliers=multipliers,
         lagrangian=gradient + np.einsum("bm,bpm->p", piece_multipliers, piece_gradients),
     )
+
+
+def _columns_of_requirements(
+    size: int, own_columns: list[np.ndarray], constraints: Constraints
+) -> tuple[np.ndarray, np.ndarray]:
+    """The columns of all requirements' own unknowns, below zeros in the 2 p rows of the step, and
+    which columns are v_r, (R,): one and the same where the largest violation counts.
+    """
+    if not constraints.largest_only:
+        widths = [own.shape[1] for own in own_columns]
+        block = block_diag(np.zeros((2 * size, 0)), *own_columns)
+        return block, size + np.cumsum([0, *widths])[:-1]
+    shared = np.concatenate([np.zeros(2 * size), *(own[:, 0] for own in own_columns)])
+    others = block_diag(np.zeros((2 * size, 0)), *(own[:, 1:] for own in own_columns))
+    return np.hstack([shared[:, None], others]), np.full(len(own_columns), size)
 
 
 def _own_columns(run: np.ndarray, k: int) -> np.ndarray:
@@ -246,10 +287,10 @@ def _pieces_that_may_bind(
     return Selected(run[order], own[piece[order]])
 
 
-def positive_definite(matrix: np.ndarray) -> np.ndarray:
-    """The symmetric matrix with its eigenvalues increased to a positive lower limit."""
+def positive_definite(matrix: np.ndarray, scale: float) -> np.ndarray:
+    """The symmetric matrix with its eigenvalues increased to SMALLEST_EIGENVALUE * scale."""
     values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
-    largest = max(float(np.max(np.abs(values))), 1e-12)
+    largest = max(min(scale, float(np.max(np.abs(values)))), 1e-12)
     return (vectors * np.maximum(values, SMALLEST_EIGENVALUE * largest)) @ vectors.T
 
 
@@ -323,7 +364,14 @@ class SQPState:
     evaluated: Any
     """Whether z has been evaluated with the present loss."""
     done: Any
-    stuck: Any
+    rejections: Any
+    """Rejected steps since the last accepted one."""
+    cut_z: np.ndarray
+    """Trials of which the pieces are also constraints, (CUTS, p); NaN where there is none."""
+    cut_pieces: np.ndarray
+    """Their e, (CUTS, B, M)."""
+    cut_gradients: np.ndarray
+    """Their a, (CUTS, B, p, M)."""
 
     @property
     def size(self) -> float:
@@ -343,8 +391,7 @@ class SQP:
 
     Args:
       tolerance: relative change of the loss below which a start has converged.
-      starts: number of starting points; with one, and requirements on six gains and more, the best
-        of some points near the scenario's gains (`starts`).
+      starts: number of starting points; by the effort of the tuning if not given.
       sharpenings: how often the smoothing of peaks in the objective is divided by 4, each time once
         the starts have converged.
       patience: steps without a better result after which the search ends.
@@ -353,13 +400,12 @@ class SQP:
     """
 
     tolerance: float = 1e-5
-    starts: int = 1
+    starts: int | None = None
     sharpenings: int = 2
     patience: int = 15
     radius: float | None = None
     name: ClassVar[str] = "sqp"
     handles_requirements: ClassVar[bool] = True
-    traces_evaluation: ClassVar[bool] = False
     mode: ClassVar[str] = "forward"
     resample: ClassVar[bool] = False
 
@@ -413,7 +459,10 @@ class SQP:
             residuals=np.full(3, np.nan),
             evaluated=False,
             done=False,
-            stuck=False,
+            rejections=0,
+            cut_z=np.full((CUTS, size), np.nan),
+            cut_pieces=np.zeros((CUTS, runs, pieces)),
+            cut_gradients=np.zeros((CUTS, runs, size, pieces)),
         )
 
     def restart(
@@ -434,10 +483,17 @@ class SQP:
         """As `Solver.converged`."""
         return np.array([start.done for start in state], bool)
 
-    def optimality(self, state: list[SQPState], start: int) -> Optimality:
-        """As `Solver.optimality`."""
-        own = state[start]
-        return Optimality(own.z, own.multipliers, own.residuals, bool(own.stuck))
+    def nearby_pieces(self, state: list[SQPState], z: np.ndarray, reach: float) -> list[Point]:
+        """The pieces of rejected trials within `reach` of a point, linear around them, as values
+        and gradients at the point.
+        """
+        found = []
+        for own in state:
+            for c in np.flatnonzero(np.max(np.abs(own.cut_z - z), axis=1) <= reach):
+                gradients = own.cut_gradients[c]
+                values = own.cut_pieces[c] + np.einsum("p,bpm->bm", z - own.cut_z[c], gradients)
+                found.append(own.here._replace(pieces=values, piece_gradients=gradients))
+        return found
 
     def step(
         self, evaluate: Any, state: list[SQPState], tolerance: float
@@ -467,7 +523,13 @@ def _advance(space: SearchSpace, state: SQPState, found: Point, tolerance: float
     ratio = -np.inf
     if valid:
         ratio = _decrease_ratio(space, state, found)
-        _update_curvatures(state, step, found)
+        if _is_comparable(state, found):
+            _update_curvatures(state, step, found)
+    state.rejections = 0 if ratio > RATIO_TO_ACCEPT else state.rejections + 1
+    if state.rejections >= MOST_REJECTIONS:
+        _forget_curvatures(state)
+    if valid and not ratio > RATIO_TO_ACCEPT:
+        _keep_cut(state, found)
     if ratio > RATIO_TO_ACCEPT:
         _accept(space, state, found)
     elif valid and not state.corrected and _correct(space, state, step, found.pieces):
@@ -479,10 +541,25 @@ def _advance(space: SearchSpace, state: SQPState, found: Point, tolerance: float
     _plan(space, state, tolerance)
 
 
+def _is_comparable(state: SQPState, found: Point) -> bool:
+    """Whether loss and pieces of a trial are of the size of those at the accepted point."""
+    worst = float(np.max(found.pieces, initial=0.0))
+    largest = LARGEST_LOSS_FACTOR * (1.0 + float(np.max(state.here.pieces, initial=0.0)))
+    rise = found.loss - state.here.loss
+    return rise <= LARGEST_LOSS_FACTOR * state.size and worst <= largest
+
+
+def _forget_curvatures(state: SQPState) -> None:
+    """Sets A and every C_j to zero, as the model that they are part of has failed repeatedly."""
+    state.correction[:] = 0.0
+    state.curvatures[:] = 0.0
+    state.rejections = 0
+
+
 def _merit(space: SearchSpace, state: SQPState, loss: float, pieces: np.ndarray) -> float:
     """The exact penalty function."""
     excess = space.constraints.excess(pieces) + TARGET_EXCESS
-    return loss + state.penalty * float(np.sum(np.maximum(excess, 0.0)))
+    return loss + state.penalty * space.constraints.violation(excess)
 
 
 def _decrease_ratio(space: SearchSpace, state: SQPState, found: Point) -> float:
@@ -527,24 +604,55 @@ def _solve(space: SearchSpace, state: SQPState, pieces: np.ndarray, penalty: flo
     """The subproblem at the accepted point, with `pieces` as c."""
     multipliers = state.piece_multipliers.ravel()[state.curved]
     of_pieces = np.einsum("k,kpq->pq", multipliers, state.curvatures)
-    matrix = positive_definite(state.here.matrix + state.correction + of_pieces)
+    scale = float(np.linalg.norm(state.here.matrix, 2))
+    matrix = positive_definite(state.here.matrix + state.correction + of_pieces, scale)
     low = np.maximum(space.box.low - state.z, -state.radius)
     high = np.minimum(space.box.high - state.z, state.radius)
-    return solve_subproblem(
+    cuts = _near_cuts(state)
+    owner = np.tile(space.constraints.owner, 1 + len(cuts))
+    found = solve_subproblem(
         state.here.gradient,
         matrix,
         low,
         high,
-        space.constraints,
-        pieces,
-        state.here.piece_gradients,
+        space.constraints._replace(owner=owner),
+        np.concatenate([pieces, *(_cut_values(state, c) for c in cuts)], axis=1),
+        np.concatenate([state.here.piece_gradients, *state.cut_gradients[cuts]], axis=2),
         penalty,
     )
+    by_point = found.piece_multipliers.reshape(len(pieces), 1 + len(cuts), -1)
+    return found._replace(piece_multipliers=by_point.sum(axis=1))
+
+
+def _near_cuts(state: SQPState) -> list[int]:
+    """The rejected trials that are within reach of the trust region."""
+    distance = np.max(np.abs(state.cut_z - state.z), axis=1)
+    return np.flatnonzero((distance > 0) & (distance <= CUT_REACH * state.radius)).tolist()
+
+
+def _cut_values(state: SQPState, c: int) -> np.ndarray:
+    """The linear models of the pieces from a rejected trial, at the accepted point, (B, M); lowered
+    where they are above the pieces there, which a concave piece is.
+    """
+    change = np.einsum("p,bpm->bm", state.z - state.cut_z[c], state.cut_gradients[c])
+    return np.minimum(state.cut_pieces[c] + change, state.here.pieces)
+
+
+def _keep_cut(state: SQPState, found: Point) -> None:
+    """Keeps the pieces of a rejected trial; the oldest ones are dropped."""
+    new = (state.trial, found.pieces, found.piece_gradients)
+    kept = (state.cut_z, state.cut_pieces, state.cut_gradients)
+    for stored, x in zip(kept, new, strict=True):
+        stored[1:] = stored[:-1].copy()
+        stored[0] = x
 
 
 def _predicted_decrease(space: SearchSpace, state: SQPState, step: np.ndarray) -> float:
     """Decrease of the penalty function by the quadratic models of objective and pieces."""
     pieces = state.here.pieces + state.here.linear_change(step) + state.curvature_along(step)
+    for c in _near_cuts(state):
+        change = np.einsum("p,bpm->bm", step, state.cut_gradients[c])
+        pieces = np.maximum(pieces, _cut_values(state, c) + change)
     matrix = state.here.matrix + state.correction
     change = float(state.here.gradient @ step + 0.5 * step @ matrix @ step)
     return _merit(space, state, 0.0, state.here.pieces) - _merit(space, state, change, pieces)
@@ -556,10 +664,11 @@ def _with_penalty(space: SearchSpace, state: SQPState) -> tuple[Step, float]:
     largest = LARGEST_PENALTY * size
     twice = 2.0 * float(np.max(state.multipliers, initial=0.0))
     penalty = min(max(twice, MIN_PENALTY * size), largest)
+    total = space.constraints.violation
     found = _solve(space, state, state.here.pieces, penalty)
-    while found.violation.sum() > TARGET_EXCESS and penalty < largest:
+    while total(found.violation) > TARGET_EXCESS and penalty < largest:
         other = _solve(space, state, state.here.pieces, PENALTY_FACTOR * penalty)
-        if found.violation.sum() - other.violation.sum() < 0.01 * found.violation.sum():
+        if total(other.violation) > 0.99 * total(found.violation):
             break
         found = other
         penalty = PENALTY_FACTOR * penalty
@@ -570,14 +679,15 @@ def _plan(space: SearchSpace, state: SQPState, tolerance: float) -> None:
     """Plans the next trial of one start, or ends it."""
     found, penalty = _with_penalty(space, state)
     state.penalty = penalty
-    if found.violation.sum() <= TARGET_EXCESS:
+    predicted_violation = space.constraints.violation(found.violation)
+    if predicted_violation <= TARGET_EXCESS:
         state.penalty = max(penalty, 2.0 * float(np.max(found.multipliers, initial=0.0)))
     state.piece_multipliers = found.piece_multipliers
     state.multipliers = found.multipliers
 
     excess = space.constraints.excess(state.here.pieces)
-    violation = float(np.sum(np.maximum(excess + TARGET_EXCESS, 0.0)))
-    reduction = violation - float(np.sum(found.violation))
+    violation = space.constraints.violation(excess + TARGET_EXCESS)
+    reduction = violation - predicted_violation
     linear_decrease = -found.change + state.penalty * reduction
     step, decrease = _best_with_curvature(space, state, found, penalty)
     state.trial = np.clip(state.z + step, space.box.low, space.box.high)
@@ -586,13 +696,16 @@ def _plan(space: SearchSpace, state: SQPState, tolerance: float) -> None:
         state.predicted = decrease
     state.corrected = False
 
-    state.residuals = _residuals(space, state, found, excess)
+    state.residuals = _residuals(space, state.z, state.here.pieces, found, excess)
     length = np.max(np.abs(found.step))
     is_feasible = violation <= TARGET_EXCESS or reduction < 1e-3 * violation
     is_flat = is_feasible and linear_decrease < tolerance * state.size
-    state.done = bool(length < 1e-7 or is_flat)
-    limited_by_radius = length > 0.9 * state.radius
-    state.stuck = bool(state.done and limited_by_radius and state.radius < COLLAPSED_RADIUS)
+    slope_scale = slope_size(state.here)
+    if violation > TARGET_EXCESS:
+        slope_scale = max(slope_scale, state.penalty)
+    is_stationary = state.residuals[0] <= STATIONARITY_TOLERANCE * slope_scale
+    is_optimal = bool(length < 1e-7 or (is_flat and is_stationary))
+    state.done = is_optimal or bool(state.radius < COLLAPSED_RADIUS)
 
 
 def _best_with_curvature(
@@ -613,13 +726,75 @@ def _best_with_curvature(
     return best, decrease
 
 
-def _residuals(space: SearchSpace, state: SQPState, found: Step, excess: np.ndarray) -> np.ndarray:
-    """Residuals of the optimality conditions, as in `Optimality`."""
-    slope = found.lagrangian
-    blocked_below = (state.z < space.box.low + RANGE_TOLERANCE) & (slope > 0)
-    blocked_above = (state.z > space.box.high - RANGE_TOLERANCE) & (slope < 0)
-    stationarity = np.max(np.abs(np.where(blocked_below | blocked_above, 0.0, slope)))
-    products = np.sum(found.piece_multipliers * state.here.pieces, axis=0)
+def slope_size(here: Point) -> float:
+    """What the gradient of the Lagrangian is compared with: the larger of the objective and its
+    gradient.
+    """
+    return max(1e-3, abs(here.loss), float(np.max(np.abs(here.gradient))))
+
+
+def free_slope(box: Box, z: np.ndarray, slope: np.ndarray) -> float:
+    """The largest entry of a gradient that no range blocks."""
+    blocked_below = (z < box.low + RANGE_TOLERANCE) & (slope > 0)
+    blocked_above = (z > box.high - RANGE_TOLERANCE) & (slope < 0)
+    return float(np.max(np.abs(np.where(blocked_below | blocked_above, 0.0, slope))))
+
+
+def with_nearby_pieces(
+    space: SearchSpace, found: Point, nearby: list[Point]
+) -> tuple[SearchSpace, Point]:
+    """A point whose pieces are its own and those of nearby points, none above its own."""
+    pieces = [found.pieces, *(np.minimum(x.pieces, found.pieces) for x in nearby)]
+    gradients = [found.piece_gradients, *(x.piece_gradients for x in nearby)]
+    owner = np.tile(space.constraints.owner, len(pieces))
+    space = space._replace(constraints=space.constraints._replace(owner=owner))
+    return space, found._replace(
+        pieces=np.concatenate(pieces, axis=1), piece_gradients=np.concatenate(gradients, axis=2)
+    )
+
+
+def conditions_at(space: SearchSpace, z: np.ndarray, found: Point) -> tuple[np.ndarray, np.ndarray]:
+    """Multipliers of each requirement, (R,), and residuals of the optimality conditions, (3,), at
+    any point z.
+
+    They are those of the subproblem with a matrix of BETA |f|,
+
+        minimise over y >= 0    |g + sum_j y_j a_j|^2 / (2 BETA |f|) - sum_j y_j e_j,
+
+    so that a multiplier is not zero only where the piece is at its limit.  Where the largest
+    violation alone counts, f is left out, the multipliers add up to 1, and the limit is the largest
+    excess itself.
+    """
+    size = max(1e-3, abs(found.loss))
+    penalty = MULTIPLIER_LIMIT * size
+    if space.constraints.largest_only:
+        size = penalty = 1.0
+        found = found._replace(gradient=np.zeros_like(found.gradient))
+    solved = solve_subproblem(
+        found.gradient,
+        BETA * size * np.eye(len(z)),
+        np.maximum(space.box.low - z, -1.0),
+        np.minimum(space.box.high - z, 1.0),
+        space.constraints,
+        np.where(np.abs(found.pieces) < AT_LIMIT, -TARGET_EXCESS, found.pieces),
+        found.piece_gradients,
+        penalty,
+    )
+    excess = space.constraints.excess(found.pieces)
+    over_limit = found.pieces
+    if space.constraints.largest_only:
+        over_limit = found.pieces - max(float(np.max(excess)), 0.0)
+    return solved.multipliers, _residuals(space, z, over_limit, solved, excess)
+
+
+def _residuals(
+    space: SearchSpace, z: np.ndarray, pieces: np.ndarray, found: Step, excess: np.ndarray
+) -> np.ndarray:
+    """The largest entry of the Lagrangian's gradient that no range blocks, the largest excess, and
+    the complementarity, (3,).
+    """
+    stationarity = free_slope(space.box, z, found.lagrangian)
+    products = np.sum(found.piece_multipliers * pieces, axis=0)
     complementarity = sum(
         abs(float(np.sum(products[space.constraints.pieces_of(r)]))) for r in range(len(excess))
     )

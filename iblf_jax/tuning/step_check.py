@@ -1,0 +1,314 @@
+"""The runs that gains were tuned on are repeated at half the time step: gains whose objective or
+requirements depend on the step are not valid.
+
+The comparison covers all runs of the tuning, with its perturbations, its seed and its number of
+runs, or the nominal run where nothing is drawn.  Objective and requirements are combined over the
+runs as in the search,
+
+    f = risk_b [ sum_k w_k term_k ],      G_r = mean of g_r over the worst `allowed` share.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax.simulation.paths import with_parameters
+from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.tuning.objectives import Objective
+from iblf_jax.tuning.options import TuningRunOptions
+from iblf_jax.tuning.robust import combine, worst_count, worst_share
+from iblf_jax.tuning.samples import Sample, SampleRequest, is_random, sample_runs
+
+STEP_TOLERANCE = 1e-3
+"""Largest excess of a requirement at half the step, in its scale, that needs no repair.
+
+A requirement that binds at dt has no room left, so that every difference between the two steps may
+appear as an excess.  At the step of `recommended_dt` largest torques, margins and errors of the
+presets change by at most 1e-4 (of `printed_gap`, which runs along its bound, by 4e-3).  An excess
+beyond ten times this is an error of the step, and no limit of a machine is known more exactly."""
+LARGEST_DIFFERENCE = 0.01
+"""Of the objective at half the step, relative, before the report warns."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RequirementAtSteps:
+    """One requirement on the runs of a tuning; each pair is at dt and at dt / 2."""
+
+    name: str
+    excess: tuple[float, float]
+    """G, in the requirement's scale: below 0 where the requirement holds."""
+    value: tuple[float, float]
+    """The limited quantity: its mean over the worst allowed share of the runs."""
+    limit: float
+    unit: str
+    averaged: int = 1
+    """How many of the worst runs the value is the mean of: the allowed share."""
+    event: str = "value"
+    """"violated" for a limit of the probability that bounds are violated, which the search replaces
+    by the margin of the worst runs."""
+
+    @property
+    def is_broken(self) -> tuple[bool, bool]:
+        """Whether it is violated at dt, and at dt / 2."""
+        full, half = (not excess < 0 for excess in self.excess)
+        return full, half
+
+    def __str__(self) -> str:
+        full, half = (self._with_unit(value) for value in self.value)
+        what = "margin " if self.event == "violated" else ""
+        if self.averaged > 1:
+            what = f"mean {what}of the worst {self.averaged} runs "
+        text = f"{self.name}: {what}{full}, at dt / 2 {half}"
+        if self.is_broken[0]:
+            return f"{text}: BROKEN by {self._amount(0)}"
+        if not self.is_broken[1]:
+            return f"{text}: kept"
+        if self.excess[1] <= STEP_TOLERANCE:
+            return f"{text}: kept at dt, and at dt / 2 within the tolerance"
+        return f"{text}: kept at dt, BROKEN at dt / 2 by {self._amount(1)}"
+
+    def _amount(self, step: int) -> str:
+        """By how much the limit is exceeded."""
+        return self._with_unit(abs(self.value[step] - self.limit), 3)
+
+    def _with_unit(self, value: float, digits: int = 5) -> str:
+        return f"{value:.{digits}g} {self.unit}".rstrip()
+
+
+class WorstExcess(NamedTuple):
+    """The requirement with the largest excess at half the time step."""
+
+    excess: float
+    """G in the requirement's scale; minus infinity without requirements."""
+    requirement: str
+    """Its name; empty without requirements."""
+    violated: int
+    """Number of runs that leave their bounds or diverge at half the step."""
+
+    @property
+    def is_broken(self) -> bool:
+        """Whether the excess is beyond `STEP_TOLERANCE`."""
+        return self.excess > STEP_TOLERANCE
+
+
+@dataclasses.dataclass(frozen=True)
+class StepCheck:
+    """The runs of a tuning with the tuned gains at dt and at dt / 2; each pair is in this order.
+    Prints as text.
+    """
+
+    runs: int
+    seed: int | None
+    """Of the draws; None for the one nominal run."""
+    dt: float
+    """The time step of the tuning [s]."""
+    objective: tuple[float, float]
+    """Combined over the runs by the risk of the tuning."""
+    requirements: tuple[RequirementAtSteps, ...]
+    margin: tuple[float, float]
+    """The smallest of all runs [rad]."""
+    peak_torque: tuple[tuple[float, ...], tuple[float, ...]]
+    """The largest of all runs, joint by joint [N m]."""
+    violated: tuple[int, int]
+    """Number of runs that leave their bounds or diverge."""
+    untrusted: tuple[int, int]
+    """Number of runs that diverge or are integrated unstably."""
+
+    @property
+    def worst(self) -> WorstExcess:
+        """The requirement with the largest excess at dt / 2."""
+        return worst_of([(r.excess[1], r.name) for r in self.requirements], self.violated[1])
+
+    @property
+    def newly_broken(self) -> tuple[RequirementAtSteps, ...]:
+        """The requirements that are kept at dt and broken at dt / 2 beyond the tolerance."""
+        return tuple(
+            r for r in self.requirements if not r.is_broken[0] and r.excess[1] > STEP_TOLERANCE
+        )
+
+    @property
+    def depends_on_step(self) -> bool:
+        """Whether the objective at dt / 2 differs by more than `LARGEST_DIFFERENCE`."""
+        full, half = self.objective
+        return not abs(half - full) <= LARGEST_DIFFERENCE * abs(full)
+
+    @property
+    def subject(self) -> str:
+        """The runs in words."""
+        if self.seed is None:
+            return "the nominal run"
+        return f"the {self.runs} runs of the tuning" if self.runs > 1 else "the run of the tuning"
+
+    def bounds_in_words(self) -> str:
+        """Whether the runs keep their bounds at both steps."""
+        if not (any(self.violated) or any(self.untrusted)):
+            return f"bounds: kept by {self.subject}, at dt and at dt / 2"
+        parts = []
+        if any(self.violated):
+            full, half = self.violated
+            parts.append(f"leave their bounds or diverge: {full} at dt, {half} at dt / 2")
+        if any(self.untrusted):
+            full, half = self.untrusted
+            parts.append(f"not trustworthy: {full} at dt, {half} at dt / 2")
+        counted = "run" if self.runs == 1 else "runs"
+        return f"WARNING: of {self.runs} {counted} of the tuning, {'; '.join(parts)}"
+
+    def warnings_of_requirements(self) -> list[str]:
+        """The requirements that are broken on these runs beyond the tolerance, one line each; of
+        the nominal run only those that are kept at dt, as its report has a verdict on the others.
+        """
+        rows = []
+        newly_broken = self.newly_broken
+        for r in sorted(self.requirements, key=lambda r: -max(r.excess)):
+            if r.is_broken[0] and self.seed is not None:
+                rows.append(f"WARNING: {self.subject}: {r}")
+            elif r in newly_broken:
+                remedy = "leave it some room, or take a smaller dt"
+                rows.append(f"WARNING: {self.subject}: {r}; {remedy}")
+        return rows
+
+    def numbers_in_words(self) -> str:
+        """Objective, smallest margin, largest torque and largest excess, at dt / 2 and at dt."""
+        full, half = self.objective
+        torques = [max(x, default=float("nan")) for x in self.peak_torque]
+        text = (
+            f"{self.subject} at dt / 2: objective {half:.5g} instead of {full:.5g}, smallest margin"
+            f" {self.margin[1]:.4g} instead of {self.margin[0]:.4g} rad, peak torque"
+            f" {torques[1]:.5g} instead of {torques[0]:.5g} N m"
+        )
+        worst = self.worst
+        if 0 <= worst.excess <= STEP_TOLERANCE:
+            text += (
+                f"; {worst.requirement} is broken there by {worst.excess:.2g} of its scale, within"
+                f" the tolerance of {STEP_TOLERANCE:g}"
+            )
+        if not self.depends_on_step:
+            return text
+        return f"WARNING: {text}; more than {LARGEST_DIFFERENCE:.0%} apart: take a smaller dt"
+
+    def __str__(self) -> str:
+        """Bounds, then requirements, then the numbers."""
+        requirements = [f"requirement {r}" for r in self.requirements]
+        return "\n".join([self.bounds_in_words(), *requirements, self.numbers_in_words()])
+
+
+def worst_of(excesses: list[tuple[float, str]], violated: int) -> WorstExcess:
+    """The largest of pairs of an excess and a requirement's name."""
+    excess, name = max(excesses, key=lambda pair: pair[0], default=(float("-inf"), ""))
+    return WorstExcess(excess, name, violated)
+
+
+def check_step_size(
+    scenario: Scenario,
+    values: Mapping[str, Any],
+    objective: Objective,
+    options: TuningRunOptions,
+    *,
+    batch: int = 1,
+) -> StepCheck:
+    """Compares the runs of a tuning at its step and at half of it.
+
+    Args:
+      scenario: that the tuning started from.
+      values: path -> tuned value.
+      objective: of the tuning, with all scales and limits.
+      options: of its runs.
+      batch: runs in a batch of the search's values, whose compiled program is used again.
+    """
+    full, half = (
+        _tuned_runs(scenario, values, objective, options, dt, batch)
+        for dt in (float(options.dt), 0.5 * float(options.dt))
+    )
+
+    def pair(function: Any) -> tuple[Any, Any]:
+        return function(full), function(half)
+
+    return StepCheck(
+        runs=len(full.status),
+        seed=int(options.seed) if is_random(options) else None,
+        dt=float(options.dt),
+        objective=pair(lambda x: _combined_objective(objective, options, x)),
+        requirements=tuple(
+            _requirement_at_steps(objective, r, (full, half))
+            for r in range(len(objective.requirements))
+        ),
+        margin=pair(lambda x: float(x.margin.min())),
+        peak_torque=pair(lambda x: tuple(x.torque.max(axis=0).tolist())),
+        violated=pair(lambda x: int(np.sum(x.left_bounds()))),
+        untrusted=pair(lambda x: int(np.sum(x.is_untrusted()))),
+    )
+
+
+def excess_at_half_step(
+    scenario: Scenario,
+    values: Mapping[str, Any],
+    objective: Objective,
+    options: TuningRunOptions,
+    *,
+    batch: int = 1,
+) -> WorstExcess:
+    """The requirement with the largest excess at half the step, on all runs of a tuning; arguments
+    as `check_step_size`.
+    """
+    half = _tuned_runs(scenario, values, objective, options, 0.5 * float(options.dt), batch)
+    excesses = [
+        (combined_excess(objective, r, half), requirement.name)
+        for r, requirement in enumerate(objective.requirements)
+    ]
+    return worst_of(excesses, int(np.sum(half.left_bounds())))
+
+
+def _tuned_runs(
+    scenario: Scenario,
+    values: Mapping[str, Any],
+    objective: Objective,
+    options: TuningRunOptions,
+    dt: float,
+    batch: int,
+) -> Sample:
+    request = SampleRequest(
+        scenario=scenario,
+        tuned=tuple(values),
+        objective=objective,
+        options=options,
+        dt=dt,
+        runs=options.runs,
+        seed=int(options.seed),
+        batch=batch,
+    )
+    return sample_runs(request, [with_parameters(scenario, dict(values))])[0]
+
+
+def _combined_objective(objective: Objective, options: TuningRunOptions, sample: Sample) -> float:
+    losses = sample.losses(objective).sum(axis=1)
+    return float(combine(options.risk, jnp.asarray(losses)))
+
+
+def combined_excess(objective: Objective, r: int, sample: Sample) -> float:
+    """G of requirement r: the mean of g over the worst allowed share of the runs."""
+    share = float(objective.requirements[r].allowed)
+    return float(worst_share(jnp.asarray(sample.excess(objective, r)), share))
+
+
+def _requirement_at_steps(
+    objective: Objective, r: int, samples: tuple[Sample, Sample]
+) -> RequirementAtSteps:
+    requirement = objective.requirements[r]
+    sign, unit = requirement.measure
+    full, half = (combined_excess(objective, r, x) for x in samples)
+    limit, scale = float(requirement.limit), float(requirement.scale)
+    values = sign * (limit + scale * full), sign * (limit + scale * half)
+    return RequirementAtSteps(
+        name=requirement.name,
+        excess=(full, half),
+        value=values,
+        limit=sign * limit,
+        unit=unit,
+        averaged=worst_count(len(samples[0].status), float(requirement.allowed)),
+        event=requirement.event,
+    )

@@ -1,0 +1,298 @@
+"""Tuning of many numbers: reverse mode, L-BFGS, optimisers of optax and mini-batches of runs."""
+
+import copy
+import types
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+import iblf_jax as ij
+from iblf_jax import objectives
+from iblf_jax.engine import thresholds
+from iblf_jax.engine.derivatives import DerivativeSizes, choose_derivatives
+from iblf_jax.tuning import LBFGS, Adam, Optax, SearchSpace, TuningProblem, evaluation
+from iblf_jax.tuning.checkpoints import fingerprint
+from iblf_jax.tuning.evaluation import Derivatives, Value
+from iblf_jax.tuning.parameters import Box
+from iblf_jax.tuning.problem import Candidate
+from iblf_jax.tuning.robust import Risk
+from iblf_jax.tuning.solvers.optax_steps import CHECK_STEPS, runs_of_step
+
+KNOTS = 52
+DURATION = 0.4
+DRAWS = {"plant.mass": ij.factor(ij.uniform(0.9, 1.1))}
+RUN = {"duration": DURATION, "dt": 2e-3, "method": "heun", "perturbations": DRAWS, "runs": 3}
+PATHS = [
+    ij.tunable("controller.K", 1.0, 500.0, scale="log"),
+    ij.tunable("controller.D", 0.1, 100.0, scale="log"),
+]
+
+
+@ij.component
+class GainSchedule:
+    """tau = G0 + K(t) (q_d - q) - D(t) (q' - q_d'), with gains that are linear between knots."""
+
+    K: ij.Leaf = ij.leaf("N m/rad", sign="positive", shape="any")
+    D: ij.Leaf = ij.leaf("N m s/rad", sign="positive", shape="any")
+
+    def init(self, q, dq, context):
+        return ()
+
+    def command(self, t, q, dq, f_hat, context, state):
+        place = jnp.clip(t / DURATION, 0.0, 1.0) * (KNOTS - 1)
+        weights = jnp.maximum(0.0, 1.0 - jnp.abs(place - np.arange(float(KNOTS))))
+        tube, no = context.tube(t), jnp.zeros(q.shape, bool)
+        tau = context.model.gravity(q) + (weights @ self.K) * (tube.q_d - q)
+        tau = tau - (weights @ self.D) * (dq - tube.dq_d)
+        return ij.controllers.Command(tau, tube.dq_d, 0.0 * q, no, no), ()
+
+
+@pytest.fixture(scope="module")
+def scheduled():
+    law = GainSchedule(K=np.full((KNOTS, 2), 30.0), D=np.full((KNOTS, 2), 8.0))
+    scenario = ij.presets.zhang_yan_2024(law="pd")
+    return ij.with_parts(scenario, controller=law)
+
+
+def goal():
+    return objectives.tracking() + 0.1 * objectives.effort()
+
+
+def test_the_gradient_by_208_numbers_is_that_of_central_differences(scheduled):
+    problem = TuningProblem.build(scheduled, PATHS, goal(), **RUN).for_solver(LBFGS())
+    rng = np.random.default_rng(0)
+    z = problem.box.z + 0.1 * rng.normal(size=problem.size)
+    assert problem.size == 208
+    gradient = evaluation.reverse_derivatives(problem, problem.candidates(z[None])).gradient[0]
+    directions = np.concatenate(
+        [rng.normal(size=(2, problem.size)), np.eye(problem.size)[[3, 150]]]
+    )
+    step = 1e-4
+    points = np.concatenate([z + step * directions, z - step * directions])
+    losses = evaluation.values(problem, points).loss
+    slopes = (losses[:4] - losses[4:]) / (2 * step)
+    np.testing.assert_allclose(directions @ gradient, slopes, rtol=1e-5)
+
+
+def test_208_numbers_are_tuned_with_the_same_report(scheduled):
+    best = ij.tune(
+        scheduled,
+        PATHS,
+        goal(),
+        report=ij.tuning.Report(runs=50),
+        effort=ij.tuning.Effort(iterations=8),
+        **RUN,
+    )
+    assert (best.optimiser, best.mode) == ("lbfgs", "reverse")
+    report = best.report
+    objective = report.changes[0]
+    assert objective.after < 0.8 * objective.before and objective.significant
+    assert report.runs == 50 and report.violation[1].count == 0
+    # Fewer than two gradients an iteration.
+    assert best.evaluations < 16 and len(best.tuned) == 208
+    changed = best.scenario.controller.K / scheduled.controller.K
+    assert np.ptp(np.asarray(changed)) > 0.1
+
+
+# ----------------------------------------------------------------------------------- mini-batches
+
+
+class Bowls:
+    """An evaluator of the mean of |z - c_b|^2 over runs b, as `tuning.evaluation.Evaluator`."""
+
+    def __init__(self, runs=12, risk="mean", iterations=60):
+        self.centres = np.random.default_rng(3).normal(size=(runs, 2))
+        box = Box(np.zeros(2), np.full(2, -np.inf), np.full(2, np.inf))
+        constraints = SearchSpace(box).constraints._replace(runs=runs)
+        self.space = SearchSpace(box, constraints, iterations=iterations)
+        options = types.SimpleNamespace(seed=np.uint32(7), risk=Risk(risk))
+        self.problem = types.SimpleNamespace(options=options, runs=runs)
+        index = np.arange(runs, dtype=np.uint32)[None]
+        self.candidates = Candidate(np.zeros((1, 2)), index, *[np.zeros((1, 0))] * 3)
+        self.active = np.ones(1, bool)
+        self.evaluated_runs = []
+
+    def _value(self, z, runs):
+        loss = np.sum((z[:, None] - self.centres[runs]) ** 2, axis=2).mean(axis=1)
+        empty = z[:, :0]
+        valid = np.isfinite(loss)
+        return Value(np.where(valid, loss, np.inf), loss, empty, empty, empty, loss, valid, loss)
+
+    def values(self, z):
+        return self._value(z, np.arange(len(self.centres)))
+
+    def __call__(self, z):
+        runs = self.candidates.index[0]
+        self.evaluated_runs.append(runs)
+        gradient = 2 * (z - self.centres[runs].mean(axis=0))
+        return Derivatives(self._value(z, runs), gradient, np.zeros((len(z), 2, 2)))
+
+
+def steps(solver, evaluate, state, count):
+    found = [solver.step(evaluate, state, solver.tolerance) for _ in range(count)]
+    return np.concatenate([z for z, _ in found]), [x.value for _, x in found]
+
+
+def test_an_epoch_goes_through_the_runs_without_replacement():
+    epoch = [runs_of_step(12, 4, 5, number) for number in range(3)]
+    assert sorted(np.concatenate(epoch)) == list(range(12))
+    following = [runs_of_step(12, 4, 5, number) for number in range(3, 6)]
+    assert sorted(np.concatenate(following)) == list(range(12))
+    assert any(list(a) != list(b) for a, b in zip(epoch, following, strict=True))
+    assert all(len(runs_of_step(10, 4, 5, number)) == 4 for number in range(9))
+
+
+@pytest.mark.parametrize("solver", [Adam(0.2, batch=4), Optax(optax.sgd(0.05), batch=4)])
+def test_a_mini_batch_finds_the_optimum_of_all_runs_and_values_compare_all_of_them(solver):
+    evaluate = Bowls(iterations=150)
+    state = solver.init(evaluate.space, np.full((1, 2), 3.0))
+    z, found = steps(solver, evaluate, state, 150)
+    assert np.max(np.abs(z[-1] - evaluate.centres.mean(axis=0))) < 0.15
+    assert {len(runs) for runs in evaluate.evaluated_runs} == {4}
+    valid = [number for number, value in enumerate(found) if value.valid[0]]
+    assert valid == sorted({*range(0, 150, CHECK_STEPS), 149})
+    for number in valid:
+        assert found[number].loss == evaluate.values(z[number : number + 1]).loss
+    assert evaluate.candidates.index.shape == (1, 12)
+
+
+def test_a_search_by_mini_batches_continues_from_its_state_bit_by_bit():
+    solver = Optax(optax.adamw(0.1), batch=5)
+    evaluate = Bowls()
+    state = solver.init(evaluate.space, np.full((1, 2), 3.0))
+    steps(solver, evaluate, state, 4)
+    stored = copy.deepcopy(state)
+    whole = steps(solver, evaluate, state, 6)[0]
+    stored = jax.tree.map(np.array, stored)
+    np.testing.assert_array_equal(steps(solver, Bowls(), stored, 6)[0], whole)
+
+
+def test_the_result_of_resampled_runs_is_chosen_on_the_runs_of_the_tuning():
+    solver = Adam(resample=True)
+    evaluate = Bowls()
+    own = evaluate.candidates
+    evaluate.candidates = own._replace(index=own.index[:, ::-1][:, :4])
+    z, found = steps(solver, evaluate, solver.init(evaluate.space, np.ones((1, 2))), 2)
+    assert [bool(value.valid[0]) for value in found] == [True, False]
+    assert found[0].loss == evaluate.values(z[:1]).loss
+
+
+@pytest.mark.parametrize(("risk", "warns"), [("mean", False), ("worst", True), ("cvar", True)])
+def test_a_mini_batch_without_the_worst_runs_warns(risk, warns):
+    solver = Adam(batch=4)
+    evaluate = Bowls(risk=risk)
+    state = solver.init(evaluate.space, np.ones((1, 2)))
+    if warns:
+        with pytest.warns(UserWarning, match="batch=4"):
+            solver.step(evaluate, state, 0.0)
+        return
+    solver.step(evaluate, state, 0.0)
+
+
+@pytest.mark.parametrize(
+    "optimiser",
+    [
+        optax.lion(0.05),
+        optax.chain(optax.clip_by_global_norm(1.0), optax.adamw(0.1)),
+        optax.chain(optax.adam(0.1), optax.contrib.reduce_on_plateau()),
+        optax.sgd(optax.cosine_decay_schedule(0.1, 40), momentum=0.9),
+    ],
+    ids=("lion", "clipped adamw", "plateau", "scheduled sgd"),
+)
+def test_other_optimisers_survive_points_without_a_finite_loss(optimiser):
+    class Cliff(Bowls):
+        def __call__(self, z):
+            found = super().__call__(z)
+            beyond = z[:, :1] > 0.5
+            gradient = np.where(beyond, np.nan, found.gradient * 10.0)
+            return found._replace(gradient=gradient)
+
+    evaluate = Cliff()
+    evaluate.centres += 0.6 - evaluate.centres.mean(axis=0)
+    solver = Optax(optimiser)
+    state = solver.init(evaluate.space, np.full((1, 2), -1.0))
+    z, found = steps(solver, evaluate, state, 60)
+    assert np.all(np.isfinite(z))
+    assert min(value.loss[0] for value in found) < 0.7 * found[0].loss[0]
+    assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(state["inner"]))
+
+
+@pytest.mark.parametrize(
+    ("solver", "words"),
+    [
+        (lambda: Adam(batch=13), "12"),
+        (lambda: Adam(batch=4, resample=True), "resample"),
+        (lambda: Adam(batch=0), "batch"),
+        (lambda: Optax("lion"), "optax.GradientTransformation"),
+        (lambda: Optax(optax.lbfgs()), "LBFGS"),
+        (lambda: Optax(optax.add_noise(0.1, 0.5, key=1)), "random key"),
+    ],
+)
+def test_options_that_do_not_fit_are_refused(solver, words):
+    with pytest.raises(ValueError, match=words):
+        solver().init(Bowls().space, np.zeros((1, 2)))
+
+
+def test_a_checkpoint_knows_the_numbers_of_an_optimiser():
+    marks = [
+        fingerprint(None, Optax(optax.chain(optax.clip(1.0), optax.lion(rate))), "reverse", 60)
+        for rate in (1e-3, 1e-3, 2e-3)
+    ]
+    assert marks[0] == marks[1] != marks[2]
+
+
+@pytest.mark.slow
+def test_a_tuning_by_mini_batches_continues_from_a_checkpoint(tmp_path):
+    def tuned(iterations, checkpoint=None):
+        return ij.tune(
+            ij.presets.zhang_yan_2024(),
+            ["controller.K2"],
+            objectives.tracking() + 0.1 * objectives.effort(),
+            duration=0.2,
+            dt=2e-3,
+            perturbations=DRAWS,
+            runs=8,
+            solver=Optax(optax.chain(optax.clip_by_global_norm(1.0), optax.lion(0.1)), batch=4),
+            effort=ij.tuning.Effort(iterations=iterations),
+            checkpoint=checkpoint,
+            progress=False,
+        )
+
+    whole = tuned(12)
+    tuned(6, tmp_path / "search.npz")
+    resumed = tuned(12, tmp_path / "search.npz")
+    np.testing.assert_array_equal(resumed.history["z"], whole.history["z"])
+    assert whole.objective < whole.history["objective"][0, 0]
+    # The objective of the result is that of all runs.
+    problem = TuningProblem.build(
+        ij.presets.zhang_yan_2024(),
+        ["controller.K2"],
+        whole.setup.objective,
+        duration=0.2,
+        dt=2e-3,
+        perturbations=DRAWS,
+        runs=8,
+    )
+    here = evaluation.values(problem, np.log(whole.tuned)[None])
+    np.testing.assert_allclose(whole.objective, here.objective[0], rtol=1e-9)
+
+
+# ------------------------------------------------------------------------------------- derivatives
+
+
+def test_a_kernel_that_writes_out_large_arrays_is_not_built_for_derivatives():
+    def way(nodes_per_operation):
+        return choose_derivatives(
+            DerivativeSizes(
+                lambda: 0,
+                nodes_together=20_000,
+                max_nodes=150_000,
+                nodes_per_operation=nodes_per_operation,
+            )
+        )
+
+    limit = thresholds.MAX_NODES_PER_OPERATION
+    assert (way(limit), way(1.01 * limit)) == ("together", "scan")

@@ -1,0 +1,279 @@
+"""Solvers of other libraries behind the same tuning problem."""
+
+import importlib.util
+
+import numpy as np
+import pytest
+
+import iblf_jax as ij
+from iblf_jax import objectives
+from iblf_jax.files.tuning import load_tuning_file
+from iblf_jax.tuning import (
+    CMAES,
+    SLSQP,
+    SOLVERS,
+    SQP,
+    DifferentialEvolution,
+    Optuna,
+    TrustConstr,
+    TuningProblem,
+    evaluation,
+)
+from iblf_jax.tuning.evaluation import Evaluator
+from iblf_jax.tuning.solvers.programme import INVALID_OBJECTIVE, Programme
+from iblf_jax.tuning.solvers.sqp import TARGET_EXCESS
+
+DERIVATIVES = ("slsqp", "trust-constr", "uno")
+POPULATIONS = ("differential-evolution", "cma", "optuna")
+PACKAGES = {"cma": "cma", "optuna": "optuna", "uno": "unopy"}
+GAINS = [
+    ij.tunable("controller.k1", tied=True),
+    ij.tunable("controller.K2", tied=True),
+    ij.tunable("observer.kf", 1.0, 100.0, tied=True),
+]
+TIMING = {"duration": 0.4, "dt": 1e-3}
+RUN = {**TIMING, "progress": False}
+TORQUE = 0.9
+"""Limits relative to the start."""
+MARGIN = 0.99
+
+
+def needs_its_package(name):
+    if name in PACKAGES:
+        pytest.importorskip(PACKAGES[name])
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return ij.presets.zhang_yan_2024()
+
+
+@pytest.fixture(scope="module")
+def before(arm):
+    return ij.simulate(arm, **TIMING).metrics
+
+
+@pytest.fixture(scope="module")
+def goal(before):
+    torque = TORQUE * float(np.max(before.peak_torque))
+    margin = MARGIN * float(np.min(before.margin))
+    wanted = objectives.tracking() + 0.3 * objectives.effort()
+    return wanted + objectives.peak_torque_below(torque) + objectives.margin_above(margin)
+
+
+@pytest.fixture(scope="module")
+def reference(arm, goal):
+    return ij.tune(arm, GAINS, goal, solver=SQP(starts=1), **RUN)
+
+
+@pytest.mark.parametrize("name", [*DERIVATIVES, *POPULATIONS])
+def test_it_reaches_the_optimum_and_keeps_the_requirements(arm, before, goal, reference, name):
+    needs_its_package(name)
+    solver = TrustConstr(starts=1) if name == "trust-constr" else name  # it takes long
+    best = ij.tune(arm, GAINS, goal, solver=solver, **RUN)
+    within = 1.005 if name in DERIVATIVES else 1.02
+    assert best.optimiser == name
+    assert best.objective <= within * reference.objective
+    after = ij.simulate(best.scenario, **TIMING).metrics
+    assert np.max(after.peak_torque) <= TORQUE * np.max(before.peak_torque)
+    assert np.min(after.margin) >= MARGIN * np.min(before.margin)
+    tracking = np.sum(after.ise) / np.sum(before.ise)
+    effort = float(after.effort / before.effort)
+    np.testing.assert_allclose(best.objective, tracking + 0.3 * effort, rtol=1e-6)
+
+
+# ------------------------------------------------------------------------ nonlinear programme
+
+
+def programme_of(scenario, goal, z=None, **study):
+    problem = TuningProblem.build(scenario, GAINS, goal, **TIMING, **study).for_solver(SLSQP())
+    z = problem.box.z if z is None else z
+    space = problem.search_space(10)
+    evaluate = Evaluator(problem, problem.candidates(z[None]), "forward", space)
+    return Programme(evaluate, 0, z), problem
+
+
+def of_worst_runs(before):
+    limit = float(np.max(before.peak_torque))
+    return {
+        "objective": objectives.tracking() + objectives.peak_torque_below(limit, allowed=0.25),
+        "perturbations": {"plant.mass": ij.factor(ij.uniform(0.8, 1.2))},
+        "runs": 8,
+    }
+
+
+@pytest.mark.parametrize("kind", ["pieces", "worst runs"])
+def test_its_gradients_are_those_of_its_values(arm, before, goal, kind):
+    study = {"objective": goal} if kind == "pieces" else of_worst_runs(before)
+    programme, _ = programme_of(arm, study.pop("objective"), **study)
+    z = programme.z + np.array([0.1, -0.05, 0.02])
+    assert programme.constraints > 0
+    gradient, jacobian = programme.gradient(z), programme.jacobian(z)
+    for i, direction in enumerate(np.eye(len(z))):
+        ends = [z + 1e-5 * direction, z - 1e-5 * direction]
+        up, down = (programme.objective(end) for end in ends)
+        np.testing.assert_allclose(gradient[i], (up - down) / 2e-5, rtol=2e-4, atol=1e-6)
+        up, down = (programme.excess(end) for end in ends)
+        slopes = (up - down) / 2e-5
+        # The sample at which a peak is largest may change between the two points.
+        fine = np.isclose(jacobian[:, i], slopes, rtol=1e-3, atol=1e-4)
+        assert np.mean(fine) > 0.9
+
+
+def test_its_constraints_contain_what_the_requirements_are_violated_by(arm, before):
+    study = of_worst_runs(before)
+    programme, problem = programme_of(arm, study.pop("objective"), **study)
+    z = programme.z + 0.3
+    value = evaluation.values(problem, z[None])
+    assert programme.constraints == 1
+    np.testing.assert_allclose(programme.excess(z), value.exact_excess[0] + TARGET_EXCESS)
+
+
+def test_one_point_costs_one_evaluation(arm, goal):
+    programme, _ = programme_of(arm, goal)
+    before = programme.evaluate.evaluations
+    z = programme.z + 0.1
+    programme.objective(z), programme.gradient(z), programme.hessian(z)
+    programme.excess(z), programme.jacobian(z)
+    assert programme.evaluate.evaluations == before + 1
+
+
+def test_a_piece_that_no_gain_changes_is_no_constraint(arm, before):
+    """The margin at t = 0 may be at its limit, and cannot be moved inside."""
+    at_start = objectives.tracking() + objectives.margin_above(float(np.min(before.margin)))
+    programme, problem = programme_of(arm, at_start)
+    counts = problem.piece_counts
+    assert programme.constraints < sum(counts)
+    moved = np.any(np.abs(programme.jacobian(programme.z)) > 0, axis=1)
+    assert np.all(moved)
+
+
+def test_an_invalid_run_gives_finite_numbers(arm, goal):
+    programme, _ = programme_of(arm, goal)
+    real = programme.evaluate
+
+    class Diverged:
+        active = real.active
+
+        def __call__(self, z):
+            found = real(z)
+            no = found.value._replace(loss=np.array([np.inf]), valid=np.array([False]))
+            return found._replace(value=no, gradient=np.nan * found.gradient)
+
+    programme.evaluate = Diverged()
+    z = programme.z + 0.2
+    count = programme.constraints
+    assert programme.objective(z) == INVALID_OBJECTIVE
+    np.testing.assert_array_equal(programme.excess(z), np.ones(count))
+    np.testing.assert_array_equal(programme.jacobian(z), np.zeros((count, len(z))))
+    assert np.all(programme.gradient(z) == 0)
+    assert programme.best[1].tolist() == programme.z.tolist()
+
+
+def test_several_starts_end_at_the_best_of_their_ends(arm, goal, reference):
+    best = ij.tune(arm, GAINS, goal, solver=SLSQP(starts=3), **RUN)
+    assert best.history["z"].shape[1] == 3
+    assert best.objective <= 1.005 * reference.objective
+
+
+# -------------------------------------------------------------------------------- populations
+
+
+@pytest.mark.parametrize("make", [DifferentialEvolution, CMAES, Optuna])
+def test_a_search_that_was_stopped_goes_on_to_the_same_result(arm, goal, tmp_path, make):
+    needs_its_package(make.name)
+    options = {**RUN, "solver": make(population=8), "effort": ij.tuning.Effort(iterations=5)}
+
+    class StoppedError(Exception):
+        pass
+
+    def stop(search):
+        if int(search.state["iteration"]) == 3:
+            raise StoppedError
+
+    file = tmp_path / "state.npz"
+    with pytest.raises(StoppedError):
+        ij.tune(arm, GAINS, goal, checkpoint=file, **options | {"progress": stop})
+    resumed = ij.tune(arm, GAINS, goal, checkpoint=file, **options)
+    whole = ij.tune(arm, GAINS, goal, **options)
+    np.testing.assert_array_equal(resumed.history["z"], whole.history["z"])
+    assert resumed.objective == whole.objective
+    assert resumed.probes == whole.probes
+
+
+def test_other_random_numbers_are_left_alone(arm, goal):
+    pytest.importorskip("cma")
+    np.random.seed(3)
+    expected = np.random.random(2)
+    np.random.seed(3)
+    once = ij.tuning.Effort(iterations=2)
+    found = [
+        ij.tune(arm, GAINS, goal, solver=CMAES(population=8, seed=seed), effort=once, **RUN)
+        for seed in (0, 0, 1)
+    ]
+    np.testing.assert_array_equal(np.random.random(2), expected)
+    first, again, other = (x.history["z"] for x in found)
+    np.testing.assert_array_equal(first, again)
+    assert not np.array_equal(first, other)
+
+
+def test_points_stay_within_the_ranges_and_near_the_start(arm, goal):
+    needs_its_package("optuna")
+    once = ij.tuning.Effort(iterations=2)
+    near = ij.tune(arm, GAINS, goal, solver=Optuna(reach=0.1), effort=once, **RUN)
+    start = near.history["z"][0, 0]
+    assert np.all(np.abs(near.history["z"] - start) <= 0.2)
+    assert np.all(near.history["x"][..., 2] <= 100.0)
+
+
+# ------------------------------------------------------------------------- names and options
+
+
+@pytest.mark.parametrize("name", sorted(PACKAGES))
+def test_a_missing_package_is_named_with_its_extra(monkeypatch, name):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(ImportError, match=rf'{PACKAGES[name]} .*pip install "iblf_jax\[tuning\]"'):
+        SOLVERS[name]()
+
+
+@pytest.mark.parametrize(
+    ("table", "expected"),
+    [
+        ('solver = "slsqp"', SLSQP()),
+        ('[tune.solver]\nkind = "trust-constr"\nstarts = 2', TrustConstr(starts=2)),
+        (
+            '[tune.solver]\nkind = "differential-evolution"\npopulation = 16\nreach = 2.0',
+            DifferentialEvolution(population=16, reach=2.0),
+        ),
+    ],
+)
+def test_a_tuning_file_names_them(tmp_path, table, expected):
+    file = tmp_path / "tune.toml"
+    file.write_text(
+        f'preset = "zhang_yan_2024"\n[tune]\nparameters = ["controller.k1"]\n{table}\n'
+        '[[objective]]\nkind = "tracking"\n'
+    )
+    assert load_tuning_file(file)["solver"] == expected
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: DifferentialEvolution(population=4), "population: got 4"),
+        (lambda: DifferentialEvolution(reach=0.0), "reach: got 0"),
+        (lambda: DifferentialEvolution(seed=-1), "seed: got -1"),
+        (lambda: Optuna(sampler="grid"), "sampler: got 'grid', expected one of 'tpe'"),
+        (lambda: SOLVERS["uno"](preset="knitro"), "preset: got 'knitro'"),
+        (lambda: CMAES(step_size=-1.0), "step_size: got -1"),
+    ],
+)
+def test_wrong_options_are_named(make, words):
+    with pytest.raises(ValueError, match=words):
+        make()
+
+
+def test_every_name_is_that_of_its_class():
+    assert {name: solver.name for name, solver in SOLVERS.items()} == {
+        name: name for name in SOLVERS
+    }
+    assert set(SOLVERS) >= {*DERIVATIVES, *POPULATIONS}

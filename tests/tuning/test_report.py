@@ -1,0 +1,479 @@
+"""The report on a tuning: its order, the check at half the step, and why fresh runs failed."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+import iblf_jax as ij
+from iblf_jax import objectives, reports
+from iblf_jax.cli.tune import _has_failed
+from iblf_jax.studies.statistics import probability
+from iblf_jax.tuning.failures import (
+    FailedRuns,
+    FreshRuns,
+    Influence,
+    failed_runs,
+    most_influential,
+)
+from iblf_jax.tuning.objectives import complete
+from iblf_jax.tuning.options import Report, TuningRunOptions
+from iblf_jax.tuning.report import Change, ReportRequest, TuningReport, Verdict, make_report
+from iblf_jax.tuning.result import TuneResult, TuneSetup
+from iblf_jax.tuning.robust import Risk
+from iblf_jax.tuning.step_check import (
+    STEP_TOLERANCE,
+    RequirementAtSteps,
+    StepCheck,
+    check_step_size,
+    excess_at_half_step,
+)
+
+BRIEF = {"duration": 0.2, "dt": 2e-3, "method": "euler"}
+DRAWS = {
+    "plant.mass[1]": ij.factor(ij.uniform(0.5, 2.0)),
+    "initial.q": ij.offset(ij.uniform(-0.01, 0.01)),
+}
+
+
+# ---------------------------------------------------------------- the most influential perturbation
+
+
+def drawn(names: str, runs: int = 400, seed: int = 0) -> dict[str, np.ndarray]:
+    numbers = np.random.default_rng(seed).uniform(0.5, 1.5, (len(names.split()), runs))
+    return dict(zip(names.split(), numbers, strict=True))
+
+
+def explained(paper, numbers, failed, diverged=False, outside=False) -> FailedRuns:
+    every = np.ones(len(failed), bool)
+    fresh = FreshRuns(every & diverged, every, every & outside, numbers, paper)
+    return failed_runs(None, failed, fresh)
+
+
+NAMES = "plant.mass[0] plant.mass[1] initial.q[0] plant.length[1]"
+
+
+@pytest.mark.parametrize(
+    ("failing", "side"),
+    [
+        (lambda x: x > 1.4, "larger"),
+        (lambda x: x < 0.52, "smaller"),
+        (lambda x: np.abs(x - 1.0) > 0.46, "both ends"),
+    ],
+)
+def test_the_perturbation_that_decides_is_found_with_its_side(paper, failing, side):
+    """Statistic and medians against their definitions, pair by pair."""
+    numbers = drawn(NAMES)
+    x = numbers["plant.mass[1]"]
+    failed = failing(x)
+    found = explained(paper, numbers, failed)
+    influence = found.influence
+    assert (influence.path, influence.unit, influence.side) == ("plant.mass[1]", "kg", side)
+    compared = np.abs(x - np.median(x)) if side == "both ends" else x
+    larger = np.mean(compared[failed][:, None] > compared[~failed])
+    assert influence.statistic == pytest.approx(max(larger, 1 - larger), abs=1e-12)
+    assert influence.statistic > 0.98 and influence.p_value < 1e-3
+    assert influence.failed == pytest.approx(np.median(compared[failed]))
+    assert influence.kept == pytest.approx(np.median(compared[~failed]))
+    assert found.is_explained and influence.drawn_with == ()
+    assert str(found).startswith(
+        f"{failed.sum()} of 400 runs left their bounds; most influential: plant.mass[1], "
+    )
+    assert f"rank statistic {influence.statistic:.3g}" in str(found)
+
+
+def test_noise_is_seldom_called_an_influence(paper):
+    """Failures without a cause: with a level of 5 %, 200 of them are explained 10 times at most on
+    average."""
+    rng = np.random.default_rng(3)
+    found = [
+        explained(paper, drawn(NAMES, 200, seed), rng.uniform(size=200) < 0.1)
+        for seed in range(200)
+    ]
+    assert 0 < sum(x.is_explained for x in found) <= 16
+    example = next(x for x in found if not x.is_explained)
+    assert "no single perturbation separates them: the nearest is" in str(example)
+    assert "chance gives one as large with probability" in str(example)
+
+
+def test_a_weak_influence_is_called_unclear(paper):
+    rng = np.random.default_rng(1)
+    numbers = drawn(NAMES, 2000)
+    failed = rng.uniform(size=2000) < 0.2 + 0.3 * (numbers["plant.mass[0]"] - 0.5)
+    found = explained(paper, numbers, failed)
+    assert found.is_explained and 0.55 < found.influence.statistic < 0.75
+    assert "no single perturbation separates them clearly; most influential" in str(found)
+
+
+def test_few_failures_name_no_cause(paper):
+    numbers = drawn(NAMES, 1000)
+    order = np.argsort(numbers["plant.mass[1]"])
+    for count, words in ((1, f"run {order[-1]}"), (2, "runs ")):
+        failed = np.zeros(1000, bool)
+        failed[order[-count:]] = True
+        found = explained(paper, numbers, failed)
+        assert not found.is_explained and found.influence.path == "plant.mass[1]"
+        assert f"too few to name a cause ({words}" in str(found)
+        assert "most influential" not in str(found)
+    failed[order[-3:]] = True
+    three = explained(paper, numbers, failed)
+    assert three.is_explained and three.influence.p_value < 1e-6
+    assert three.first == tuple(sorted(order[-3:]))
+
+
+def test_no_runs_are_left_or_nothing_differs(paper):
+    everything = np.ones(50, bool)
+    some = np.arange(50) < 5
+    assert explained(paper, drawn(NAMES, 50), ~everything) is None
+    assert "no run is left to compare" in str(explained(paper, drawn(NAMES, 50), everything))
+    for numbers in ({}, {"plant.mass[0]": np.ones(50)}):
+        found = explained(paper, numbers, some)
+        assert found.influence is None and not found.is_explained
+        assert str(found).endswith("no perturbation differs between the runs")
+    found = explained(paper, {}, some, diverged=True, outside=True)
+    assert "(5 of them started outside; 5 of them diverged)" in str(found)
+
+
+def test_numbers_of_one_draw_are_named_together(paper):
+    numbers = drawn("plant.mass[0] plant.length[0]", 100)
+    numbers["plant.mass[1]"] = 3.0 * numbers["plant.mass[0]"]
+    numbers["plant.length[1]"] = -numbers["plant.mass[0]"]
+    found = most_influential(numbers, numbers["plant.mass[1]"] > 4.0, paper)
+    assert found.path == "plant.mass[0]"
+    assert set(found.drawn_with) == {"plant.mass[1]", "plant.length[1]"}
+    assert "with the same draw: plant.mass[1], plant.length[1]" in str(found)
+
+
+# ------------------------------------------------------------------------------------ half the step
+
+
+def goal_of(paper, limit: float, allowed: float = 0.25):
+    goal = objectives.tracking(scale=0.01) + objectives.peak_torque_below(limit, allowed=allowed)
+    return complete(goal + objectives.margin_above(0.05), [1.0])
+
+
+def test_the_step_check_of_a_nominal_run_agrees_with_simulate(paper):
+    goal = goal_of(paper, 12.0)
+    gains = {"controller.K2": np.array([10.0, 15.0])}
+    options = TuningRunOptions(**BRIEF).checked()
+    check = check_step_size(paper, gains, goal, options)
+    tuned = ij.with_parameters(paper, gains)
+    for i, dt in enumerate((2e-3, 1e-3)):
+        metrics = ij.simulate(tuned, **BRIEF | {"dt": dt}).metrics
+        peak = np.asarray(metrics.peak_torque)
+        assert check.peak_torque[i] == pytest.approx(peak)
+        assert check.margin[i] == pytest.approx(float(np.min(metrics.margin)))
+        assert check.objective[i] == pytest.approx(float(np.sum(metrics.ise)) / 0.01)
+        torque, margin = check.requirements
+        assert torque.value[i] == pytest.approx(peak.max())
+        assert torque.excess[i] == pytest.approx((peak.max() - 12.0) / 12.0)
+        assert margin.value[i] == pytest.approx(check.margin[i])
+    assert (check.runs, check.seed, check.violated, check.untrusted) == (1, None, (0, 0), (0, 0))
+    assert check.objective[0] != check.objective[1]
+    half = excess_at_half_step(paper, gains, goal, options)
+    assert half == check.worst
+    assert half.requirement == "peak torque < 12 N m" and half.violated == 0
+    assert half.is_broken == (half.excess > STEP_TOLERANCE)
+
+
+@pytest.mark.slow
+def test_the_step_check_covers_all_runs_of_a_tuning(paper):
+    """Against a study with the seed of the tuning, at both steps."""
+    goal = goal_of(paper, 16.0)
+    options = TuningRunOptions(
+        **BRIEF, perturbations=DRAWS, runs=8, seed=5, risk=Risk("worst")
+    ).checked()
+    check = check_step_size(paper, {"controller.K2": np.full(2, 20.0)}, goal, options, batch=16)
+    assert (check.runs, check.seed) == (8, 5)
+    for i, dt in enumerate((2e-3, 1e-3)):
+        study = ij.monte_carlo(
+            paper, DRAWS, runs=8, seed=5, progress=False, **BRIEF | {"dt": dt}
+        ).metrics
+        peak = np.asarray(study.peak_torque)
+        assert check.peak_torque[i] == pytest.approx(peak.max(axis=0))
+        assert check.margin[i] == pytest.approx(float(np.min(study.margin)))
+        assert check.objective[i] == pytest.approx(np.asarray(study.ise).sum(1).max() / 0.01)
+        # A quarter of eight runs may break the limit: the mean of the worst two.
+        worst_two = np.sort(peak.max(axis=1))[-2:].mean()
+        assert check.requirements[0].value[i] == pytest.approx(worst_two)
+
+
+def at_steps(full: float, half: float, name: str = "peak torque < 10 N m") -> RequirementAtSteps:
+    values = 10.0 * (1 + full), 10.0 * (1 + half)
+    return RequirementAtSteps(name, (full, half), values, 10.0, "N m")
+
+
+def made_up_check(*requirements, violated=(0, 0), objective=(1.0, 1.0), seed=0) -> StepCheck:
+    torques = ((1.0, 2.0), (1.0, 2.1))
+    runs = 1 if seed is None else 64
+    return StepCheck(
+        runs, seed, 1e-3, objective, requirements, (0.1, 0.09), torques, violated, (0, 0)
+    )
+
+
+def test_a_requirement_that_half_the_step_breaks_is_named_with_its_amount():
+    broken = at_steps(-0.01, 0.02)
+    assert broken.is_broken == (False, True)
+    assert str(broken) == (
+        "peak torque < 10 N m: 9.9 N m, at dt / 2 10.2 N m: kept at dt, BROKEN at dt / 2 by 0.2 N m"
+    )
+    assert str(at_steps(0.03, 0.02)).endswith("BROKEN by 0.3 N m")
+    assert str(at_steps(-0.1, -0.1)).endswith(": kept")
+    margin = dataclasses.replace(at_steps(-0.1, -0.1, "p < 0.1"), event="violated", averaged=7)
+    assert str(margin).startswith("p < 0.1: mean margin of the worst 7 runs 9 N m")
+    within = made_up_check(at_steps(-1e-5, 5e-4))
+    assert not within.worst.is_broken and not within.warnings_of_requirements()
+    assert "broken there by 0.0005 of its scale, within the tolerance of 0.001" in str(within)
+    (warning,) = made_up_check(broken, at_steps(-1.0, -1.0, "b")).warnings_of_requirements()
+    assert warning.startswith("WARNING: the 64 runs of the tuning: peak torque < 10 N m")
+    assert "leave it some room, or take a smaller dt" in warning
+    assert made_up_check(at_steps(0.3, 0.3), broken).worst == (0.3, "peak torque < 10 N m", 0)
+    assert made_up_check().worst == (-np.inf, "", 0)
+    assert not made_up_check(at_steps(0.3, 0.3), seed=None).warnings_of_requirements()
+
+
+def test_an_objective_that_depends_on_the_step_is_warned_of():
+    assert "WARNING" not in str(made_up_check(objective=(1.0, 1.009)))
+    for half in (1.011, np.nan):
+        assert "more than 1% apart: take a smaller dt" in str(made_up_check(objective=(1.0, half)))
+
+
+# ---------------------------------------------------------------------------------------- the order
+
+
+def made_up_report(
+    violated: int, verdicts: dict[str, str], check: StepCheck | None = None, seed: int | None = 1
+) -> TuningReport:
+    def of(count):
+        return probability(np.arange(100) < count, np.ones(100, bool), 0.95, "independent", 1)
+
+    cause = Influence("plant.mass[1]", "kg", "larger", 0.97, 1e-6, 1.38, 1.02)
+    events = [(None, violated), *((name, 7) for name, kind in verdicts.items() if kind == "fail")]
+    return TuningReport(
+        runs=100,
+        seed=seed,
+        confidence=0.95,
+        changes=(
+            Change("objective (mean)", 1.0, 0.5, -0.6, -0.4),
+            Change("tracking (mean)", 1.0, 0.5, -0.6, -0.4),
+        ),
+        verdicts=tuple(Verdict(name, 0.1, of(0), of(0), kind) for name, kind in verdicts.items()),
+        violation=(of(0), of(violated)),
+        margin=(0.1, -0.1),
+        peak_torque=((1.0,), (2.0,)),
+        at_limits=("k1 is at an end",),
+        step_check=check,
+        notes=("stopped: converged",),
+        failures=tuple(
+            FailedRuns(name, count, 100, 0, 0, (3, 8), cause) for name, count in events if count
+        ),
+    )
+
+
+MASS = "plant.mass[1], median 1.38 kg in them, 1.02 kg in the others (rank statistic 0.97)"
+
+
+def test_violated_bounds_come_first_then_requirements_then_the_objective():
+    check = made_up_check(at_steps(-0.01, 0.02, "c"), violated=(0, 2), objective=(1.0, 1.2))
+    report = made_up_report(5, {"a": "pass", "b": "fail"}, check)
+    assert [row.strip() for row in str(report).splitlines()[1:4]] == [
+        "bounds violated: 0 (0 of 100 runs; 95% interval 0 to 0.0362) -> 0.05 (5 of 100 runs; 95%"
+        " interval 0.0164 to 0.113); WARNING: with the tuned gains the bounds are not kept",
+        f"5 of 100 runs left their bounds; most influential: {MASS}",
+        "WARNING: of 64 runs of the tuning, leave their bounds or diverge: 0 at dt, 2 at dt / 2",
+    ]
+    order = [
+        "smallest margin: 0.1",
+        "requirement b",
+        f"    most influential: {MASS}",
+        "requirement a",
+        "WARNING: the 64 runs of the tuning: c",
+        "objective (mean)",
+        "tracking (mean)",
+        "peak torque",
+        "k1 is at an end",
+        "WARNING: the 64 runs of the tuning at dt / 2: objective",
+        "stopped: converged",
+    ]
+    places = [str(report).index(words) for words in order]
+    assert places == sorted(places)
+
+
+@pytest.mark.parametrize(
+    ("report", "headline", "failed"),
+    [
+        (made_up_report(0, {}), "bounds kept", False),
+        (made_up_report(5, {}), "bounds VIOLATED in 5 of 100 runs", True),
+        (made_up_report(1, {}, seed=None), "bounds VIOLATED", True),
+        (
+            made_up_report(0, {"a": "fail", "b": "pass"}),
+            "bounds kept; 1 of 2 requirements FAILED; 1 of 2 requirements passed",
+            True,
+        ),
+        (
+            made_up_report(0, {"a": "undecided"}),
+            "bounds kept; 1 of 1 requirements undecided",
+            False,
+        ),
+        (
+            made_up_report(0, {"a": "pass"}, made_up_check(at_steps(-0.1, 0.1))),
+            "bounds kept; 1 of 1 requirements passed; a requirement is BROKEN at dt / 2",
+            True,
+        ),
+        (
+            made_up_report(0, {"a": "pass"}, made_up_check(violated=(0, 1))),
+            "bounds VIOLATED in the runs of the tuning; 1 of 1 requirements passed",
+            True,
+        ),
+    ],
+)
+def test_bounds_and_requirements_decide_headline_and_exit_code(report, headline, failed):
+    assert report.headline == headline
+    assert report.failed is failed and _has_failed(report) is failed
+
+
+def test_violations_within_a_requirement_on_their_probability_are_no_failure():
+    report = made_up_report(1, {"violation probability < 0.05": "pass"})
+    assert report.failed
+    allowed = dataclasses.replace(report.verdicts[0], event="violated")
+    assert not dataclasses.replace(report, verdicts=(allowed,)).failed
+
+
+def test_a_report_as_numbers_goes_through_json():
+    report = made_up_report(5, {"a": "fail"}, made_up_check(at_steps(-0.01, 0.02)))
+    numbers = json.loads(json.dumps(report.to_dict()))
+    assert numbers["step_check"]["requirements"][0]["excess"] == [-0.01, 0.02]
+    first, second = numbers["failures"]
+    assert first["requirement"] is None and second["requirement"] == "a"
+    assert first["influence"]["statistic"] == 0.97 and first["first"] == [3, 8]
+    assert numbers["headline"] == report.headline
+    assert numbers["halved"] == report.halved == str(report.step_check)
+    assert made_up_report(0, {}).halved == ""
+
+
+# ----------------------------------------------------------------------------------- made from runs
+
+
+def result_of(scenario, gains, objective, **options) -> TuneResult:
+    """A result as a tuning that ended at these gains returns it."""
+    run = TuningRunOptions(**BRIEF, **options).checked()
+    setup = TuneSetup(**vars(run), objective=objective, report=Report(runs=200, seed=7))
+    first = np.concatenate([np.ravel(x) for x in gains.values()])
+    history = {
+        "valid": np.ones((1, 1), bool),
+        "x": first[None, None],
+        "z": np.log(first)[None, None],
+        "evaluations": np.ones(1, int),
+        "terms": np.ones((1, 1, len(objective.terms))),
+        "excess": np.ones((1, 1, len(objective.requirements))),
+    }
+    history |= dict.fromkeys(("loss", "objective", "margin", "gradient_norm"), np.ones((1, 1)))
+    names = tuple(f"{path}[{i}]" for path, x in gains.items() for i in range(len(x)))
+    tuned = ij.with_parameters(scenario, gains)
+    return TuneResult(
+        tuned, scenario, gains, names, history, 0, "converged", "sqp", "forward", 1.0, setup
+    )
+
+
+@pytest.fixture(scope="module")
+def loose(paper):
+    """Gains that exceed the torque where the second joint starts far from the reference."""
+    gains = {"controller.K2": np.array([20.0, 20.0])}
+    return result_of(paper, gains, goal_of(paper, 16.0), perturbations=DRAWS, runs=4)
+
+
+@pytest.mark.slow
+def test_failed_fresh_runs_are_those_of_a_study_with_the_seed_of_the_report(paper, loose):
+    """The run numbers, and the medians of the perturbation, against `monte_carlo`."""
+    (found,) = loose.report.failures
+    study = ij.monte_carlo(paper, DRAWS, runs=200, seed=7, progress=False, **BRIEF)
+    broken = np.asarray(study.metrics.peak_torque).max(axis=1) >= 16.0
+    start = np.asarray(study.samples["initial.q"])[:, 1]
+    assert (
+        5 < found.count < 195
+        and found.count == np.sum(broken) == loose.report.verdicts[0].after.count
+    )
+    assert found.requirement == "peak torque < 16 N m"
+    assert found.first == tuple(np.flatnonzero(broken)[:10])
+    assert found.influence.path == "initial.q[1]" and found.influence.side == "larger"
+    assert found.influence.failed == pytest.approx(np.median(start[broken]))
+    assert found.influence.kept == pytest.approx(np.median(start[~broken]))
+    assert found.cause_in_words() in str(loose.report)
+
+
+@pytest.mark.slow
+def test_text_card_and_file_begin_with_what_failed(loose, tmp_path):
+    card = loose._repr_html_()
+    assert "Tuning: bounds kept; 1 of 2 requirements FAILED" in card
+    assert reports.shown(loose).words[1].strip().startswith("bounds violated")
+    text = repr(loose)
+    assert text.index("200 fresh runs: bounds kept; 1 of 2") < text.index("controller.K2: ")
+    loose.save(tmp_path / "a.json")
+    saved = json.loads((tmp_path / "a.json").read_text())
+    assert saved["report"]["failures"][0]["influence"]["path"] == "initial.q[1]"
+    # Earlier versions stored the check at dt / 2 as text, and no failures.
+    for name in ("step_check", "failures", "headline"):
+        del saved["report"][name]
+    saved["report"]["halved"] = "the nominal run at dt / 2: objective 1 instead of 1"
+    (tmp_path / "b.json").write_text(json.dumps(saved))
+    for name in ("a.json", "b.json"):
+        again = ij.load_tuning(tmp_path / name)
+        assert "fresh runs: not made yet" in repr(again)
+        assert str(again.report) == str(loose.report)
+
+
+@pytest.mark.slow
+def test_a_violated_bound_is_in_every_presentation(paper):
+    weak = ij.with_parameters(paper, {"initial.dq": [10.0, 10.0]})
+    gains = {"controller.k1": np.full(2, 0.3), "controller.K2": np.full(2, 1.0)}
+    result = result_of(weak, gains, goal_of(weak, 12.0))
+    words = "WARNING: of 1 run of the tuning, leave their bounds or diverge: 1 at dt, 1 at dt / 2"
+    assert repr(result).splitlines()[1].strip() == words
+    assert words in str(result.report)
+    assert result.report.headline.startswith("bounds VIOLATED")
+    assert "Tuning: bounds VIOLATED" in result._repr_html_()
+    assert _has_failed(result.report)
+
+
+@pytest.mark.slow
+def test_runs_that_were_drawn_outside_their_bounds_are_counted(paper):
+    """The upper bound is 0.1 rad above the start, which is drawn up to 0.12 rad away."""
+    drawn_start = {"initial.q": ij.offset(ij.uniform([0.0, -0.12], [1e-6, 0.12]))}
+    gains = {"controller.K2": np.array([4.0, 1.0])}
+    result = result_of(paper, gains, goal_of(paper, 12.0), perturbations=drawn_start, runs=2)
+    first = result.report.failures[0]
+    study = ij.monte_carlo(result.scenario, drawn_start, runs=200, seed=7, progress=False, **BRIEF)
+    assert first.started_outside == study.started_outside.sum() > 10
+    assert first.count == result.report.violation[1].count == study.violation_probability.count
+    assert first.influence.path == "initial.q[1]" and first.influence.side == "larger"
+    assert f"({first.started_outside} of them started outside" in str(result.report)
+
+
+@pytest.mark.slow
+def test_without_failures_there_is_no_explanation(paper):
+    goal = complete(
+        objectives.tracking(scale=0.01) + 0.0 * objectives.effort(scale=1.0), [1.0, 1.0]
+    )
+    options = TuningRunOptions(**BRIEF, perturbations=DRAWS).checked()
+    request = ReportRequest(paper, paper, ("controller.K2",), goal, options, Report(runs=8, seed=2))
+    report = make_report(request)
+    assert report.failures == () and report.step_check is None and report.halved == ""
+
+
+@pytest.mark.slow
+def test_runs_that_differ_in_noise_only_are_fresh_too(paper):
+    sensor = ij.sensors.Encoder(velocity=ij.sensors.Measured(noise=0.05))
+    noisy = dataclasses.replace(paper, sampling=ij.Sampling(period=2e-3), sensor=sensor)
+    gains = {"controller.K2": np.array([4.0, 1.0])}
+    result = result_of(noisy, gains, goal_of(paper, 8.0), runs=4)
+    assert (result.step_check.runs, result.step_check.seed) == (4, 0)
+    report = result.report
+    assert (report.runs, report.seed) == (200, 7)
+    (found,) = report.failures
+    assert 0 < found.count < 200 and found.influence is None
+    assert "no perturbation differs between the runs" in str(report)
+    with pytest.raises(ValueError, match="fresh"):
+        result.check(seed=0)

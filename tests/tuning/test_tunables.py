@@ -1,0 +1,226 @@
+"""What can be tuned beside the gains: limits per joint, weights, filters, period and delay."""
+
+import jax
+import numpy as np
+import pytest
+
+import iblf_jax as ij
+from iblf_jax.simulation.paths import get
+from iblf_jax.simulation.scenario import canonical
+from iblf_jax.tuning import evaluation, ranges
+from iblf_jax.tuning.objectives import complete
+from iblf_jax.tuning.parameters import along, by_values, in_units, layout, values_at
+from iblf_jax.tuning.problem import TuningProblem
+
+jax.config.update("jax_enable_x64", True)
+
+DT = 5e-4
+SHORT = {"duration": 0.05, "dt": DT}
+TOGETHER = [
+    *("controller.k1", "controller.K2", "controller.weight", "observer.kf"),
+    *("sensor.velocity.cutoff", "actuator.bandwidth", "sampling.period"),
+]
+
+
+@pytest.fixture(scope="module")
+def lab():
+    """The paper's arm with a loop as a robot has it, at rest beside its reference."""
+    gains = {"controller.K2": [4.0, 3.0], "observer.kf": 4.0, "initial.q": [0.6, 0.7]}
+    paper = ij.with_parameters(ij.presets.zhang_yan_2024(reading="corrected"), gains)
+    return canonical(
+        ij.with_parts(
+            paper,
+            sampling=ij.Sampling(period=2e-3, delay=1.2e-3, queue=2),
+            sensor=ij.sensors.Encoder(
+                counts=2.0**16, velocity=ij.sensors.FilteredDifference(cutoff=400.0)
+            ),
+            actuator=ij.actuators.Motor(bandwidth=600.0, rate_limit=5000.0, limit=[40.0, 20.0]),
+        )
+    )
+
+
+def ends(scenario, path):
+    """The default range of one leaf in its unit, and its reasons."""
+    blocks, box = layout(scenario, [path], DT, "rk4")
+    return in_units(blocks, box.low), in_units(blocks, box.high), box.reasons[0]
+
+
+def test_limits_are_one_number_for_each_entry(lab):
+    low, high = np.array([1.0, 2.0]), np.array([np.inf, 9.0])
+    blocks, box = layout(lab, [ij.tunable("controller.K2", low, high)], DT, "rk4")
+    np.testing.assert_allclose(in_units(blocks, box.low), low)
+    np.testing.assert_allclose(in_units(blocks, box.high), high)
+    with pytest.raises(ValueError, match=r"controller.K2.*between its limits.*Widen"):
+        layout(lab, [ij.tunable("controller.K2", [1.0, 3.5], 9.0)], DT, "rk4")
+    with pytest.raises(ValueError, match=r"K2.*low.*one number, or shape \(2,\)"):
+        layout(lab, [ij.tunable("controller.K2", [1.0, 3.5, 2.0], 9.0)], DT, "rk4")
+
+
+def test_one_number_for_all_joints_keeps_the_limits_of_each(lab):
+    given = ij.tunable("controller.K2", [0.1, 1.0], [9.0, 7.0], tied=True)
+    blocks, box = layout(lab, [given], DT, "rk4")
+    np.testing.assert_allclose([in_units(blocks, box.low), in_units(blocks, box.high)], [[1], [7]])
+
+
+def test_a_limit_that_is_infinite_cannot_be_tuned():
+    arm = ij.with_parameters(ij.presets.ur5(), {"plant.effort": np.inf})
+    with pytest.raises(ValueError, match=r"plant.effort.*finite numbers that tuning can start"):
+        layout(arm, ["plant.effort"], DT, "rk4")
+
+
+def test_theorem_2_limits_gains_from_below_where_it_holds(lab):
+    paper = canonical(ij.presets.zhang_yan_2024())
+    for path in ("controller.k1", "controller.K2", "observer.kf"):
+        start = np.asarray(get(lab, path))
+        low, _, (below, _) = ends(lab, path)
+        assert below == ranges.BY_SMALL_FACTOR
+        np.testing.assert_allclose(low, start / ranges.MAX_FACTOR)
+        assert ends(paper, path)[2][0] == ranges.BY_THEOREM
+    light = ij.with_parameters(paper, {"controller.weight": [1.0, 0.1]})
+    low, _, (below, _) = ends(light, "controller.K2")
+    assert below == ranges.BY_SIGN
+    assert np.all(low == 0)
+    assert ends(light, "observer.kf")[2][0] == ranges.BY_THEOREM
+
+
+def test_scales_of_a_start_that_leaves_its_bounds_are_announced():
+    goal = ij.objectives.tracking() + ij.objectives.effort(scale=1.0)
+    with pytest.warns(UserWarning, match=r"scale of tracking is its value .* by 0.2 rad"):
+        complete(goal, [4.0, 3.0], margin=-0.2)
+    assert complete(goal, [4.0, 3.0], margin=0.1).terms[0].scale == 4.0
+
+
+def test_default_ranges_of_filters_keep_the_loop_stable(lab):
+    for path in ("sensor.velocity.cutoff", "actuator.bandwidth"):
+        low, high, (below, above) = ends(lab, path)
+        assert below == ranges.BY_PERIOD
+        value = ij.parameters(lab)
+        start = next(p.value for p in value if p.path == path)
+        assert np.all((low < start) & (start < high))
+        assert not ranges.sampled_too_slowly(ij.with_parameters(lab, {path: low}))
+        assert ranges.sampled_too_slowly(ij.with_parameters(lab, {path: 0.9 * low}))
+        assert above == {"s": ranges.BY_NYQUIST, "a": ranges.BY_STEP}[path[0]]
+    _, nyquist, _ = ends(lab, "sensor.velocity.cutoff[1]")
+    np.testing.assert_allclose(nyquist, np.pi / 2e-3)
+
+
+def test_a_cutoff_above_the_nyquist_frequency_starts_at_the_upper_end(lab):
+    fast = ij.with_parameters(lab, {"sensor.velocity.cutoff": [400.0, 2000.0]})
+    _, high, (_, above) = ends(fast, "sensor.velocity.cutoff")
+    assert above == ranges.BY_NYQUIST
+    np.testing.assert_allclose(high, [np.pi / 2e-3, 2020.0])
+
+
+def test_a_time_constant_has_a_lower_end_and_a_gain_an_upper_one(lab):
+    law = lab.controller
+    surface = ij.controllers.DynamicSurface(k1=law.k1, K2=law.K2, filter=0.01, weight=law.weight)
+    scenario = canonical(ij.with_parts(lab, controller=surface))
+    low, high, (below, _) = ends(scenario, "controller.filter")
+    assert below == ranges.BY_PERIOD
+    assert np.all((low < 0.01) & (high > 0.01))
+    assert not ranges.sampled_too_slowly(ij.with_parameters(scenario, {"controller.filter": low}))
+    below_it = ij.with_parameters(scenario, {"controller.filter": 0.9 * low})
+    assert ranges.sampled_too_slowly(below_it)
+
+
+@pytest.mark.filterwarnings("ignore:sampling.period is a whole number")
+def test_the_period_is_a_multiple_of_the_step_within_what_loop_and_queue_allow(lab):
+    low, high, (below, above) = ends(lab, "sampling.period")
+    low, high = low[0], high[0]
+    assert below == ranges.BY_QUEUE
+    assert above == ranges.BY_PERIOD
+    np.testing.assert_allclose(low / DT, np.round(low / DT))
+    np.testing.assert_allclose(high / DT, np.round(high / DT))
+    assert 1.2e-3 / low < 2 <= 1.2e-3 / (low - DT)
+    assert not ranges.sampled_too_slowly(ij.with_parameters(lab, {"sampling.period": high}))
+    assert ranges.sampled_too_slowly(ij.with_parameters(lab, {"sampling.period": high + DT}))
+    no_delay = ij.with_parameters(lab, {"sampling.delay": 0.0})
+    assert ends(no_delay, "sampling.period")[2][0] == ranges.BY_ONE_STEP
+
+
+def test_a_delay_needs_a_queue_that_holds_its_commands(lab):
+    low, high, (below, _) = ends(lab, "sampling.delay")
+    assert (low, below) == (0.0, ranges.BY_SIGN)
+    assert 1.2e-3 < high < 4e-3
+    at_once = ij.with_parts(lab, sampling=ij.Sampling(period=2e-3))
+    with pytest.raises(ValueError, match=r"Sampling.queue: got 0.*queue=1"):
+        layout(canonical(at_once), ["sampling.delay"], DT, "rk4")
+
+
+def test_a_period_says_that_it_has_no_derivative(lab):
+    with pytest.warns(UserWarning, match="no derivative by it"):
+        blocks, box = layout(lab, [ij.tunable("sampling.period", 0.8e-3, 3.2e-3)], DT, "rk4")
+    assert by_values(blocks) == [0]
+    np.testing.assert_allclose(in_units(blocks, box.low), 1e-3)
+    np.testing.assert_allclose(in_units(blocks, box.high), 3e-3)
+    found = [float(values_at(blocks, z)["sampling.period"]) for z in along(blocks, box, box.z, 9)]
+    np.testing.assert_allclose(found, [2.5e-3, 1.5e-3, 3e-3, 1e-3])
+    slope = jax.jacfwd(lambda z: values_at(blocks, z)["sampling.period"])(box.z)
+    assert np.all(np.asarray(slope) == 0)
+    with pytest.raises(ValueError, match="at least two multiples of dt"):
+        layout(lab, [ij.tunable("sampling.period", 1.8e-3, 2.2e-3)], DT, "rk4")
+
+
+def smooth(scenario):
+    """The loop with an encoder that does not round, so that differences have a limit."""
+    sensor = ij.sensors.Encoder(velocity=scenario.sensor.velocity)
+    return canonical(ij.with_parts(scenario, sensor=sensor))
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:sampling.period is a whole number")
+def test_all_kinds_together_have_the_derivatives_of_simulate(lab):
+    scenario = smooth(lab)
+    scales = {"tracking": 1e-4, "effort": 1.0}
+    goal = ij.objectives.tracking(scale=scales["tracking"])
+    goal += ij.objectives.effort(scale=scales["effort"])
+    goal += ij.objectives.peak_torque_below([30.0, 15.0])
+    problem = TuningProblem.build(scenario, TOGETHER, goal, **SHORT)
+    z = problem.box.z
+    found = evaluation.forward_derivatives(problem, problem.candidates(z[None]))
+
+    def loss_of(changed):
+        metrics = ij.simulate(changed, **SHORT).metrics
+        return float(np.sum(metrics.ise) / scales["tracking"] + metrics.effort / scales["effort"])
+
+    def loss(z):
+        return loss_of(ij.with_parameters(scenario, values_at(problem.blocks, z)))
+
+    h = 1e-4
+    gradient = [(loss(z + h * e) - loss(z - h * e)) / (2 * h) for e in np.eye(len(z))]
+    np.testing.assert_allclose(found.gradient[0], gradient, rtol=1e-3, atol=1e-6)
+    period = by_values(problem.blocks)
+    assert np.all(np.asarray(found.gradient[0])[period] == 0)
+    others = np.delete(np.asarray(found.gradient[0]), period)
+    assert np.all(np.abs(others) > 1e-6)
+
+    best = ij.tune(
+        scenario, TOGETHER, goal, effort=ij.tuning.Effort(iterations=2), progress=False, **SHORT
+    )
+    tuned = np.concatenate([np.ravel(best.values[block.path]) for block in problem.blocks])
+    low, high = (in_units(problem.blocks, z) for z in (problem.box.low, problem.box.high))
+    assert np.all((low * (1 - 1e-9) <= tuned) & (tuned <= high * (1 + 1e-9)))
+    assert np.isclose(tuned[period] / DT, np.round(tuned[period] / DT))
+    assert loss_of(best.scenario) < loss_of(scenario)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:sampling.period is a whole number")
+def test_periods_are_compared_by_values(lab):
+    parameters = ["controller.K2", ij.tunable("sampling.period", 1e-3, 4e-3)]
+    goal = ij.objectives.tracking(scale=1e-4)
+    options = {"duration": 0.2, "dt": DT}
+    best = ij.tune(smooth(lab), parameters, goal, effort="quick", progress=False, **options)
+    assert best.probes >= 7
+    losses = {
+        period: float(
+            np.sum(
+                ij.simulate(
+                    ij.with_parameters(best.scenario, {"sampling.period": period}), **options
+                ).metrics.ise
+            )
+        )
+        for period in DT * np.arange(2, 9)
+    }
+    shortest = min(losses, key=losses.get)
+    np.testing.assert_allclose(best.values["sampling.period"], shortest)
