@@ -145,7 +145,7 @@ def tune(
         risk=risk,
     )
     solver, mode = chosen_solver(options, problem.size)
-    search = _search_of(problem, solver, mode, options.effort)
+    search = search_of(problem, solver, mode, options.effort)
     stopped = _run(search, mode, options.effort.iterations, checkpoint, options)
     if not np.any(np.isfinite(search.state["incumbent_key"])):
         raise problem.unstable_error()
@@ -156,7 +156,7 @@ def tune(
     return _result(outcome, polished, setup, mode=mode, seconds=seconds)
 
 
-def _search_of(problem: TuningProblem, solver: Solver, mode: str, effort: Effort) -> Search:
+def search_of(problem: TuningProblem, solver: Solver, mode: str, effort: Effort) -> Search:
     """The search from its starting points.
 
     Values come first, so that an error does not wait for the derivatives' compilation.  With a
