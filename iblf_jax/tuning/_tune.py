@@ -345,12 +345,10 @@ def _result(
     search = outcome.search
     problem = search.evaluate.problem
     history = _history(search)
-    best = search.best
     if polished is not None:
         history = _joined(history, _history(polished.search))
         setup = dataclasses.replace(setup, dt=0.5 * float(setup.dt))
         outcome = polished
-        best = 0
     history["x"] = in_units(problem.blocks, history["z"])
     tuned = _tuned_values(problem, outcome.z)
     return TuneResult(
@@ -359,7 +357,7 @@ def _result(
         values=tuned,
         names=tuple(names_of(problem.blocks)),
         history=history,
-        best_start=best,
+        best_start=0,
         stopped=outcome.stopped,
         optimiser=search.solver.name,
         mode=mode,
@@ -379,7 +377,11 @@ def _tuned_values(problem: TuningProblem, z: np.ndarray) -> dict[str, np.ndarray
 
 
 def _history(search: Search) -> dict[str, np.ndarray]:
-    return {name: np.stack(x) for name, x in search.history.items()}
+    """The history with the start that found the best result in the first column."""
+    starts = len(search.state["finished"])
+    order = sorted(range(starts), key=lambda s: s != search.best)
+    history = {name: np.stack(x) for name, x in search.history.items()}
+    return {name: x if name == "evaluations" else x[:, order] for name, x in history.items()}
 
 
 def _joined(first: dict[str, np.ndarray], last: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -91,11 +91,11 @@ class TuneResult:
     names: tuple[str, ...]
     """What each coordinate is called, (p,)."""
     history: dict[str, np.ndarray]
-    """Per step, (steps, starts, ...), two starts where a second search followed: loss, objective,
-    terms, excess of the requirements, margin [rad], gradient_norm, valid, z and x (the gains tried,
-    in their units); evaluations is (steps,)."""
+    """Per step, (steps, starts, ...), the best start first; invalid, with NaN, where a start was
+    not evaluated: loss, objective, terms, excess of the requirements, margin [rad], gradient_norm,
+    valid, z and x (the gains tried, in their units); evaluations is (steps,)."""
     best_start: int
-    """The start that found the result."""
+    """The column of the start that found the result."""
     stopped: str
     """Why it stopped."""
     optimiser: str
