@@ -93,11 +93,10 @@ def tune(
     as constraints.
 
     Args:
-      scenario: with the gains to start from, of n joints.
+      scenario: robot, law and motion; its gains are the first point of the search.
       parameters: paths such as "controller.K2" (one number a joint) or `tunable(path, low, high,
         tied=...)`.
-      objective: composed from `iblf_jax.objectives` with + and weights; it may contain
-        requirements.
+      objective: sum of weighted terms and requirements of `iblf_jax.objectives`.
       duration: length of a run [s], a multiple of the step.
       dt: time step [s].
       method: integrator.
@@ -106,21 +105,21 @@ def tune(
       perturbations: path -> `factor`, `offset` or `value` of a distribution; without them there is
         one nominal run.
       runs: number of perturbed runs in the loss.
-      seed: of these runs, and of further starts.
+      seed: seed of these runs and of the points from which starts are chosen.
       risk: "mean", "worst", "cvar" or `cvar(level)`.
       solver: `ij.tuning.SQP()` (sequential quadratic programming; requirements are constraints),
         `ij.tuning.LBFGS()`, `ij.tuning.Adam()` or `ij.tuning.Optax()` (requirements are penalties),
-        with their options, or the name of one in `ij.tuning.SOLVERS`.  If not given, SQP up to 32
-        numbers, and L-BFGS with reverse mode above.
-      effort: "quick" (one search, from the scenario's gains), "normal" or "thorough" (4,096 points
-        without derivatives and twelve starts, some 400 evaluations with derivatives), or
+        with their options, or the name of one in `ij.tuning.SOLVERS`.  If not given, SQP for up to
+        32 numbers, and L-BFGS with reverse mode for more.
+      effort: "quick" (a search from the scenario's gains only), "normal", "thorough" (4,096 points
+        without derivatives and twelve starts, about 400 evaluations with derivatives), or
         `ij.tuning.Effort(values=..., starts=..., iterations=...)`.
-      report: `ij.tuning.Report(runs=..., seed=..., confidence=...)`: options of the report on fresh
-        runs.
+      report: options of the report on fresh runs, `ij.tuning.Report(runs=..., seed=...,
+        confidence=...)`.
       checkpoint: a file that stores the state after each step; if it exists, the search continues
         from it.
-      progress: whether to show a progress bar (on a terminal or in a notebook, if not given); or a
-        function that is called with the `Search` after each step.
+      progress: whether to show a progress bar, or a function that is called with the `Search` after
+        each step.  If not given, a progress bar is shown on a terminal and in a notebook.
       deprecated: keyword arguments of earlier versions, which are options of solver and report now.
 
     Returns:

@@ -15,11 +15,12 @@ and at equal violation by the objective without smoothing.  A feasible point has
 Every point that was evaluated, with derivatives or without, is a candidate for the incumbent.
 
 Stages.  A peak over time in the objective is replaced by a smooth maximum, which lies above the
-maximum by the smoothing times a logarithm.  Its minimum is at other gains, but it is found in few
-steps and has no narrow valleys.  The search therefore begins with much smoothing and divides it by
-SHARPENING at each stage.  A stage ends when all starts have converged to COARSE_TOLERANCE, after
-`patience` steps without a better result, or, without requirements, after COARSE_STEPS steps
-(STEPS_PER_UPDATE steps of a single start).
+maximum by the smoothing times a logarithm.  The smooth objective has its minimum at other gains,
+but no narrow valleys, and its minimum is found in few steps.  The search therefore begins with much
+smoothing and divides it by SHARPENING at each stage.  An objective without smoothing has one stage.
+A stage but the last one ends when all starts have converged to COARSE_TOLERANCE, after `patience`
+steps without a better result, or, in problems without requirements, after COARSE_STEPS steps of
+several starts or STEPS_PER_UPDATE steps of one.
 
 Phases.  A search with a `Strategy` has up to three phases:
 

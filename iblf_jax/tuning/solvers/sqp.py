@@ -179,9 +179,8 @@ def solve_subproblem(
 ) -> Step:
     """Solves the subproblem of this module as a quadratic programme.
 
-    The columns of the programme are the step, and then the unknowns of each requirement.  Its rows
-    are both bounds of the step, and then for each requirement its pieces and the conditions that
-    `_own_columns` adds to them.
+    The columns of the programme are the step and the unknowns of each requirement.  Its rows are
+    both bounds of the step, the pieces of each requirement and the conditions of `_own_columns`.
 
     Args:
       gradient, matrix: g, (p,), and B, (p, p), positive definite.
@@ -200,13 +199,11 @@ def solve_subproblem(
         _pieces_that_may_bind(constraints, r, pieces, piece_gradients, reach)
         for r in range(len(constraints.worst))
     ]
-    own_columns = [
-        _own_columns(chosen.run, k) for chosen, k in zip(selected, constraints.worst, strict=True)
-    ]
+    runs_and_counts = zip(selected, constraints.worst, strict=True)
+    own_columns = [_own_columns(chosen.run, k) for chosen, k in runs_and_counts]
     rows, limits = _rows_of_pieces(selected, own_columns, pieces, piece_gradients)
-    step_block = np.vstack([np.eye(size), -np.eye(size), *rows])
     own_block, violation_columns = _columns_of_requirements(size, own_columns, constraints)
-    A = np.hstack([step_block, own_block])
+    A = np.hstack([np.vstack([np.eye(size), -np.eye(size), *rows]), own_block])
     H = block_diag(matrix, np.zeros((own_block.shape[1], own_block.shape[1])))
     c = np.zeros(A.shape[1])
     c[:size] = gradient
@@ -216,7 +213,7 @@ def solve_subproblem(
     step = np.clip(x[:size], low, high)
     piece_multipliers = np.zeros_like(pieces)
     multipliers = np.zeros(len(selected))
-    row = 2 * size
+    row = 2 * size  # the first row of the pieces of requirement r
     for r, chosen in enumerate(selected):
         of_pieces = y[row : row + len(chosen.run)]
         piece_multipliers[chosen.run, chosen.piece] = of_pieces
@@ -438,11 +435,11 @@ class SQP:
     Args:
       tolerance: relative change of the loss below which a start has converged.
       starts: number of starting points; by the effort of the tuning if not given.
-      sharpenings: how often the smoothing of peaks in the objective is divided by 4, each time once
-        the starts have converged.
-      patience: steps without a better result after which the search ends.
-      radius: of the first trust region, in the coordinates z; 1, or 0.5 where several minima are
-        expected, if not given.
+      sharpenings: number of times that the smoothing of peaks in the objective is divided by 4,
+        each time after the starts have converged.
+      patience: number of steps without a better result after which a phase of the search ends.
+      radius: radius of the first trust region in the coordinates z.  If not given, it is 1, or 0.5
+        where several minima are expected.
     """
 
     tolerance: float = 1e-5
