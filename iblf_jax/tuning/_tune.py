@@ -150,7 +150,7 @@ def tune(
         risk=risk,
     )
     solver, mode = chosen_solver(options, problem.size)
-    search = _search_of(problem, solver, mode, options.effort)
+    search = search_of(problem, solver, mode, options.effort)
     stopped = _run(search, mode, options.effort.iterations, checkpoint, options)
     if not np.any(np.isfinite(search.state["incumbent_key"])):
         raise problem.unstable_error()
@@ -161,7 +161,7 @@ def tune(
     return _result(outcome, polished, setup, mode=mode, seconds=seconds)
 
 
-def _search_of(problem: TuningProblem, solver: Solver, mode: str, effort: Effort) -> Search:
+def search_of(problem: TuningProblem, solver: Solver, mode: str, effort: Effort) -> Search:
     """The search with its starting points and, if the solver leaves the number of starts open, a
     `Strategy` for several phases.
 
