@@ -27,10 +27,18 @@ from iblf_jax.tuning.optimality import Conditions
 from iblf_jax.tuning.options import Effort, Report, SearchOptions, chosen_solver, options_of
 from iblf_jax.tuning.parameters import Tunable, in_units, names_of, values_at
 from iblf_jax.tuning.problem import TuningProblem
-from iblf_jax.tuning.result import AT_KINK, STUCK, TuneResult, TuneSetup
+from iblf_jax.tuning.result import (
+    AT_KINK,
+    INFEASIBLE,
+    NO_GRADIENT,
+    NOT_FOUND_FEASIBLE,
+    STUCK,
+    TuneResult,
+    TuneSetup,
+)
 from iblf_jax.tuning.robust import Risk
 from iblf_jax.tuning.runs import NUMBERS_A_RUN
-from iblf_jax.tuning.search import REPAIR, REPAIR_STARTS, SECOND, Search, Strategy
+from iblf_jax.tuning.search import REPAIR, REPAIR_STARTS, SECOND_SEARCH, Search, Strategy
 from iblf_jax.tuning.solvers import Solver
 from iblf_jax.tuning.solvers.sqp import SQP
 from iblf_jax.tuning.starts import (
@@ -43,14 +51,8 @@ from iblf_jax.tuning.starts import (
 )
 from iblf_jax.tuning.step_check import excess_at_half_step
 
-INFEASIBLE = "the requirements cannot be kept together near these gains"
-"""Why a search ended at gains where the largest excess of a requirement is stationary."""
-NOT_FEASIBLE = "no gains that keep the requirements were found"
-"""Why a search ended without such gains, and without having shown that there are none."""
 POLISH_STEPS = 15
-"""Steps at most at half the time step."""
-NO_GRADIENT = "the objective has no finite derivative at the start"
-"""Why a search ended that could not make a step."""
+"""Largest number of steps of the short search at half the time step."""
 
 
 @notices.each_warning_once
@@ -79,42 +81,45 @@ def tune(
         minimise    risk_b [ sum_k w_k term_k ]
         subject to  the requirements and the ranges of the parameters
 
-    The default solver evaluates 384 points without derivatives, begins at six of them, and goes on
-    with the best; this takes about 60 evaluations with derivatives, and more where no gains that
-    keep the requirements are known, or where the first search did not converge.  For a planar arm
-    with nine gains and 1,000 steps that is one to three seconds on two cores, besides the
-    compilation.  Where a requirement that is kept at `dt` is broken at half of it by more than
-    `step_check.STEP_TOLERANCE`, some steps at half of it follow, and the result is one of dt / 2.
+    With the default solver and effort, the tuning evaluates 384 points besides the scenario's gains
+    without derivatives.  It begins a search at six of these points and continues from the best one.
+    This takes about 60 evaluations with derivatives.  It takes more if the search finds no gains
+    that keep the requirements, or if it does not converge.  For a planar arm with nine gains and
+    1,000 steps the evaluations take one to three seconds on two cores, besides the compilation.
+
+    The requirements of the result are evaluated again at half the time step.  If one of them is
+    then broken by more than `step_check.STEP_TOLERANCE`, a short search at dt / 2 follows, and its
+    result, with `setup.dt` equal to dt / 2, is returned.  This needs a solver with the requirements
+    as constraints.
 
     Args:
-      scenario: with the gains to start from, of n joints.
+      scenario: robot, law and motion; its gains are the first point of the search.
       parameters: paths such as "controller.K2" (one number a joint) or `tunable(path, low, high,
         tied=...)`.
-      objective: composed from `iblf_jax.objectives` with + and weights; it may contain
-        requirements.
+      objective: sum of weighted terms and requirements of `iblf_jax.objectives`.
       duration: length of a run [s], a multiple of the step.
       dt: time step [s].
       method: integrator.
-      backend: on what values and forward mode are executed, as in `monte_carlo`.  Reverse mode
-        always uses plain XLA.
+      backend: executor of values and of forward mode, as in `monte_carlo`.  Reverse mode always
+        uses plain XLA.
       perturbations: path -> `factor`, `offset` or `value` of a distribution; without them there is
         one nominal run.
       runs: number of perturbed runs in the loss.
-      seed: of these runs, and of further starts.
+      seed: seed of these runs and of the points from which starts are chosen.
       risk: "mean", "worst", "cvar" or `cvar(level)`.
       solver: `ij.tuning.SQP()` (sequential quadratic programming; requirements are constraints),
         `ij.tuning.LBFGS()`, `ij.tuning.Adam()` or `ij.tuning.Optax()` (requirements are penalties),
-        with their options, or the name of one in `ij.tuning.SOLVERS`.  If not given, SQP up to 32
-        numbers, and L-BFGS with reverse mode above.
-      effort: "quick" (one search, from the scenario's gains), "normal" or "thorough" (4,096 points
-        without derivatives and twelve starts, some 400 evaluations with derivatives), or
+        with their options, or the name of one in `ij.tuning.SOLVERS`.  If not given, SQP for up to
+        32 numbers, and L-BFGS with reverse mode for more.
+      effort: "quick" (a search from the scenario's gains only), "normal", "thorough" (4,096 points
+        without derivatives and twelve starts, about 400 evaluations with derivatives), or
         `ij.tuning.Effort(values=..., starts=..., iterations=...)`.
-      report: `ij.tuning.Report(runs=..., seed=..., confidence=...)`: options of the report on fresh
-        runs.
+      report: options of the report on fresh runs, `ij.tuning.Report(runs=..., seed=...,
+        confidence=...)`.
       checkpoint: a file that stores the state after each step; if it exists, the search continues
         from it.
-      progress: whether to show a progress bar (on a terminal or in a notebook, if not given); or a
-        function that is called with the `Search` after each step.
+      progress: whether to show a progress bar, or a function that is called with the `Search` after
+        each step.  If not given, a progress bar is shown on a terminal and in a notebook.
       deprecated: keyword arguments of earlier versions, which are options of solver and report now.
 
     Returns:
@@ -157,10 +162,11 @@ def tune(
 
 
 def search_of(problem: TuningProblem, solver: Solver, mode: str, effort: Effort) -> Search:
-    """The search from its starting points.
+    """The search with its starting points and, if the solver leaves the number of starts open, a
+    `Strategy` for several phases.
 
-    Values come first, so that an error does not wait for the derivatives' compilation.  With a
-    checkpoint the starting points are determined again, and are the same.
+    Values are evaluated before the derivatives are compiled, so that an error is raised early.
+    With a checkpoint the starting points are determined again; they are the same as before.
     """
     starts = solver.starts or effort.starts
     checks.fits_memory("starts", starts, 8.0 * problem.size * NUMBERS_A_RUN)
@@ -176,10 +182,11 @@ def search_of(problem: TuningProblem, solver: Solver, mode: str, effort: Effort)
         z = usable_starts(problem, seed, z, values(problem, problem.box.z[None]))
     problem = problem.for_solver(solver)
     space = problem.search_space(effort.iterations)
-    starts_used = rows = len(z)
+    starts_used = len(z)
+    rows = starts_used
     if strategy is not None and problem.allowed:
-        rows = max(rows, REPAIR_STARTS)  # for later phases
-    z = z[np.minimum(np.arange(rows), len(z) - 1)]
+        rows = max(rows, REPAIR_STARTS)  # a later phase may begin at more points
+    z = z[np.minimum(np.arange(rows), starts_used - 1)]  # the last start fills the further rows
     evaluate = Evaluator(problem, problem.candidates(z), mode, space)
     search = Search(evaluate, solver, z, strategy)
     search.retire(slice(starts_used, None))
@@ -187,7 +194,12 @@ def search_of(problem: TuningProblem, solver: Solver, mode: str, effort: Effort)
 
 
 def _chosen_starts(problem: TuningProblem, screening: Screening, starts: int) -> np.ndarray:
-    """Where the searches begin: at the best points that differ from one another."""
+    """The points that the search begins from, (k, p): the best screened points that differ from one
+    another.
+
+    If all of them are refused, or the scenario's gains are the only point and leave their bounds,
+    the start is found by `usable_starts`.
+    """
     seed = int(problem.options.seed)
     order = np.argsort(screening.merit, kind="stable")
     is_refused = problem.sampled_too_slowly
@@ -203,7 +215,7 @@ def _chosen_starts(problem: TuningProblem, screening: Screening, starts: int) ->
 def _run(
     search: Search, mode: str, iterations: int, checkpoint: Path | None, options: SearchOptions
 ) -> str:
-    """All steps of a search, from its checkpoint if there is one; returns why it ended."""
+    """Runs a search, from its checkpoint if there is one; returns why it ended."""
     mark = fingerprint(search.evaluate.problem, search.solver, mode, iterations)
     if checkpoint is not None and checkpoint.exists():
         load_checkpoint(checkpoint, search, mark)
@@ -220,7 +232,9 @@ def _run(
 
 
 def _show(shown: Any, search: Search) -> None:
-    """Writes the last step's numbers beside the progress bar."""
+    """Writes numbers of the last step beside the progress bar: those of the start with the smallest
+    loss.
+    """
     shown.update(1)
     last = {name: x[-1] for name, x in search.history.items()}
     s = int(np.argmin(np.where(last["valid"], last["loss"], np.inf)))
@@ -231,7 +245,7 @@ def _show(shown: Any, search: Search) -> None:
 
 
 def _setup(problem: TuningProblem, report: Report) -> TuneSetup:
-    """What the report needs to know of the call."""
+    """The options of the call that the report needs."""
     seed = int(problem.options.seed)
     if report.seed is None:
         report = dataclasses.replace(report, seed=(seed + 1) % 2**32)
@@ -246,41 +260,49 @@ def _setup(problem: TuningProblem, report: Report) -> TuneSetup:
 
 
 class Outcome(NamedTuple):
-    """What a search found."""
+    """The best point of a search and its optimality conditions."""
 
     search: Search
     z: np.ndarray
     """The best point, (p,)."""
     stopped: str
+    """As `TuneResult.stopped`."""
     multipliers: np.ndarray
+    """As `Conditions.multipliers`, (R,)."""
     residuals: np.ndarray
+    """As `Conditions.residuals`, (3,)."""
     tried: tuple[str, ...] = ()
-    """What was done, in words."""
+    """As `TuneResult.tried`."""
 
 
 def _outcome(search: Search, stopped: str) -> Outcome:
-    """The best point of a search with its multipliers and residuals, and why the search ended."""
+    """The best point of a search with its multipliers and residuals, and why the search ended.
+
+    The solver's own criterion is replaced by the conditions at the best point, unless a search that
+    ran out of iterations or patience is at feasible gains where they do not hold.
+    """
     found = search.conditions()
     if stopped == "converged" or search.is_violated or found.hold:
-        stopped = _why_ended(search, stopped, found)
+        stopped = _reason_from_conditions(search, found)
     z = search.state["incumbent_z"]
     return Outcome(search, z, stopped, found.multipliers, found.residuals, _tried(search))
 
 
-def _why_ended(search: Search, stopped: str, found: Conditions) -> str:
-    """Why a search ended whose starts have converged, or that found no feasible gains."""
+def _reason_from_conditions(search: Search, found: Conditions) -> str:
+    """`TuneResult.stopped`, from the conditions at the best point."""
     if not np.all(np.isfinite(found.residuals)):
         return NO_GRADIENT
     if search.is_violated:
-        repaired = search.strategy is None or bool(search.state["repair_ended"])
-        return INFEASIBLE if repaired and found.hold else NOT_FEASIBLE
+        # Without phases the search itself minimised the violation.
+        is_minimised = search.strategy is None or bool(search.state["repair_ended"])
+        return INFEASIBLE if is_minimised and found.hold else NOT_FOUND_FEASIBLE
     if found.at_kink:
         return AT_KINK
     return "converged" if found.hold else STUCK
 
 
 def _tried(search: Search) -> tuple[str, ...]:
-    """What a search in phases did, in words."""
+    """What a search in phases did, in words; empty for a search without phases."""
     if search.strategy is None:
         return ()
     valleys, reached = search.state["valleys"].tolist()
@@ -299,7 +321,7 @@ def _tried(search: Search) -> tuple[str, ...]:
             f"no gains that keep the requirements were found; the largest excess was minimised from"
             f" up to {REPAIR_STARTS} points, {how}: {least:.3g}"
         )
-    elif phase == SECOND:
+    elif phase == SECOND_SEARCH:
         lines.append("a second search followed, from the best gains and from another valley")
     return tuple(lines)
 
@@ -308,8 +330,11 @@ def _tried(search: Search) -> tuple[str, ...]:
 
 
 def _polished(search: Search, outcome: Outcome, mode: str) -> Outcome | None:
-    """A short search at half the time step, where a requirement that is kept is broken there; None
-    where none is needed.
+    """The outcome of a short search by `SQP` at half the time step.
+
+    None if no requirement is broken there by more than the tolerance, if the requirements are not
+    kept at the full step, or if the short search finds no gains that keep them.  Also None for a
+    solver that has no constraints, and in reverse mode.
     """
     problem = search.evaluate.problem
     can_polish = search.solver.handles_requirements and mode == "forward" and problem.allowed
@@ -332,16 +357,17 @@ def _polished(search: Search, outcome: Outcome, mode: str) -> Outcome | None:
     if second.is_violated:
         return None
     found = _outcome(second, stopped)
-    line = (
+    summary = (
         f"{worst.requirement} was broken at dt / 2 by {worst.excess:.2g} of its scale, so that"
         f" {len(second.history['z'])} steps at dt / 2 followed; the result is one of dt / 2"
     )
-    return found._replace(tried=(*outcome.tried, line))
+    return found._replace(tried=(*outcome.tried, summary))
 
 
 def _result(
     outcome: Outcome, polished: Outcome | None, setup: TuneSetup, *, mode: str, seconds: float
 ) -> TuneResult:
+    """The result, at half the time step if a short search there has one."""
     search = outcome.search
     problem = search.evaluate.problem
     history = _history(search)
@@ -372,6 +398,7 @@ def _result(
 
 
 def _tuned_values(problem: TuningProblem, z: np.ndarray) -> dict[str, np.ndarray]:
+    """Path -> tuned value in the unit of its leaf, at the coordinates z, (p,)."""
     point = values_at(problem.blocks, jnp.asarray(z))
     return {path: np.asarray(x) for path, x in point.items()}
 
@@ -385,8 +412,8 @@ def _history(search: Search) -> dict[str, np.ndarray]:
 
 
 def _joined(first: dict[str, np.ndarray], last: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Two histories, one after the other; the last one is of one start, and the others are invalid
-    in it.
+    """Two histories, one after the other.  The last one has one start: its entries are repeated for
+    the other starts and marked there as invalid.
     """
     starts = first["valid"].shape[1]
     joined = {"evaluations": np.concatenate([first["evaluations"], last["evaluations"]])}
@@ -394,8 +421,8 @@ def _joined(first: dict[str, np.ndarray], last: dict[str, np.ndarray]) -> dict[s
     for name, x in last.items():
         if name == "evaluations":
             continue
-        rows = np.repeat(x, starts, axis=1)
+        repeated = np.repeat(x, starts, axis=1)
         if name == "valid":
-            rows[:, 1:] = False
-        joined[name] = np.concatenate([first[name], rows])
+            repeated[:, 1:] = False
+        joined[name] = np.concatenate([first[name], repeated])
     return joined

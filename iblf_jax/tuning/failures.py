@@ -1,15 +1,18 @@
-"""Failed fresh runs are explained by the perturbed number that separates them from the others best.
+"""Explains failed fresh runs by the perturbed number that separates them best from the other runs.
 
-For a perturbed number x and the runs that failed F and were kept K, the rank statistic is the area
-under the ROC curve, the share of the pairs in which the failed run has the larger number (Mann and
-Whitney's U, divided by the number of pairs),
+Let F be the runs that failed, K the other runs, and x a perturbed number.  The rank statistic is
+the area under the ROC curve: the share of the pairs in which the failed run has the larger number,
+which is Mann and Whitney's U divided by the number of pairs,
 
     A = P(x_f > x_k) + P(x_f = x_k) / 2,      f in F, k in K;
 
-1/2 for a number without influence.  The reported statistic is the larger of A and 1 - A, with the
-side; the distance |x - median| takes the place of x where failures lie at both ends of a range.
-The largest statistic of m numbers is compared with chance by the p-value of the U test, corrected
-for m tests (Sidak): 1 - (1 - p)^m.
+A is 1/2 for a number without influence.  The reported statistic is the larger of A, for which the
+number is larger in failed runs, and 1 - A.  If failures lie at both ends of a range, the distance
+|x - median| takes the place of x.
+
+The reported number is the best of several, so that chance alone can make its statistic large.  The
+p-value of the U test is therefore corrected for m tests (Sidak): 1 - (1 - p)^m.  Every independent
+draw counts twice, for x and for its distance from the median.
 
 Source: H. B. Mann, D. R. Whitney, Ann. Math. Stat. 18 (1947) 50-60.
 """
@@ -30,21 +33,22 @@ from iblf_jax.studies.draws import Target, UncertainScenario, draw
 from iblf_jax.studies.summaries import initial_margins
 
 FEWEST_FAILURES = 3
-"""Failed runs from which a perturbation is called influential."""
+"""Smallest number of failed runs for which a perturbation is called influential."""
 SIGNIFICANCE = 0.05
-"""Largest corrected p-value of an influence."""
+"""Largest corrected p-value for which a perturbation is called influential."""
 CLEAR_STATISTIC = 0.75
-"""Rank statistic from which a perturbation separates failed runs clearly: three of four pairs."""
+"""Smallest rank statistic of a perturbation that separates failed runs clearly: three of four pairs
+are in order."""
 LEAD_OF_DISTANCE = 0.05
-"""By how much the statistic of a distance from the median has to exceed that of the number itself,
-which is easier to understand."""
+"""Smallest lead of the statistic of a distance from the median over that of the number itself for
+which the distance is reported, as the number itself is easier to understand."""
 FEWEST_ORDERED = 8
-"""Runs from which numbers that are in the same order in all runs are taken for one draw."""
+"""Smallest number of runs in which two numbers in the same order are assumed to be one draw."""
 LISTED_RUNS = 10
-"""Failed runs whose numbers are stored."""
+"""Largest number of failed runs whose indices are stored."""
 EXACT_PAIRS = 1_000_000
-"""Pairs of a failed and a kept run up to which the p-value of a few failures is exact: the time
-grows with the number of pairs."""
+"""Largest number of pairs of a failed and a kept run for which SciPy may compute the p-value
+exactly, as the time grows with the number of pairs."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,17 +58,18 @@ class Influence:
     path: str
     unit: str
     side: str
-    """In failed runs: "larger", "smaller", or "both ends" of the range."""
+    """Where the number is in failed runs: "larger", "smaller", or "both ends" of the range."""
     statistic: float
     """The rank statistic, from 0.5 (no influence) to 1 (all pairs are ordered)."""
     p_value: float
     """Probability of such a statistic by chance, for the best of all perturbed numbers."""
     failed: float
-    """Median in the failed runs; of the distance from the median of all runs for "both ends"."""
+    """Median in the failed runs; for "both ends" that of the distance from the median of all
+    runs."""
     kept: float
-    """The same in the others."""
+    """The same in the other runs."""
     drawn_with: tuple[str, ...] = ()
-    """Further numbers with the same draw, which separate the runs equally well."""
+    """Paths of further numbers with the same draw, which separate the runs equally well."""
 
     def __str__(self) -> str:
         name = self.path
@@ -87,20 +92,23 @@ class FailedRuns:
     requirement: str | None
     """The requirement that they broke; None for runs that left their bounds or diverged."""
     count: int
+    """Number of failed runs."""
     runs: int
+    """Number of fresh runs that were executed."""
     diverged: int
-    """How many of them diverged."""
+    """Number of failed runs that diverged."""
     started_outside: int
-    """How many of them were drawn outside their bounds at t = 0, so that no gains keep these."""
+    """Number of failed runs that were drawn outside their bounds at t = 0, so that no gains can
+    keep the bounds."""
     first: tuple[int, ...]
-    """Numbers of the first of them, at most LISTED_RUNS: of the runs of `ij.monte_carlo` with the
-    same perturbations and the seed of the report."""
+    """Indices of the first LISTED_RUNS failed runs.  They are those of the runs of `ij.monte_carlo`
+    with the same perturbations and the seed of the report."""
     influence: Influence | None
-    """None where nothing was perturbed, or no run was kept."""
+    """The perturbation that explains them; None where nothing was perturbed, or no run was kept."""
 
     @property
     def is_explained(self) -> bool:
-        """Whether the influence is larger than what chance gives, with enough failures."""
+        """Whether there are enough failures and the influence is significant."""
         found = self.influence
         return found is not None and self.count >= FEWEST_FAILURES and found.p_value <= SIGNIFICANCE
 
@@ -142,55 +150,56 @@ class FailedRuns:
 
 
 class FreshRuns(NamedTuple):
-    """What is known of N fresh runs besides which of them failed."""
+    """N fresh runs: what explains a failure, apart from which of them failed."""
 
     diverged: np.ndarray
-    """(N,) bool."""
+    """Whether each run diverged, (N,) bool."""
     admissible: np.ndarray
-    """Whether each run was made, (N,)."""
+    """Whether each run was executed, (N,) bool."""
     started_outside: np.ndarray
-    """Whether each run was drawn outside its bounds at t = 0, (N,)."""
+    """Whether each run was drawn outside its bounds at t = 0, (N,) bool."""
     numbers: Mapping[str, np.ndarray]
-    """Path -> perturbed number, (N,)."""
+    """Path -> perturbed number of each run, (N,)."""
     scenario: Scenario
-    """For units."""
+    """The scenario, from which units are read."""
 
 
 def failed_runs(requirement: str | None, failed: np.ndarray, fresh: FreshRuns) -> FailedRuns | None:
     """The explanation of failed runs; None where no run failed.
 
     Args:
-      requirement: that they broke; None for bounds.
-      failed: whether each run did, (N,).
-      fresh: these and the other runs.
+      requirement: name of the requirement that they broke; None for bounds.
+      failed: whether each run failed, (N,).
+      fresh: all fresh runs.
     """
-    made = fresh.admissible
-    failed = failed & made
+    executed = fresh.admissible
+    failed = failed & executed
     count = int(np.sum(failed))
     if not count:
         return None
-    numbers = {path: x[made] for path, x in fresh.numbers.items()}
+    numbers = {path: x[executed] for path, x in fresh.numbers.items()}
     return FailedRuns(
         requirement=requirement,
         count=count,
-        runs=int(np.sum(made)),
+        runs=int(np.sum(executed)),
         diverged=int(np.sum(failed & fresh.diverged)),
         started_outside=int(np.sum(failed & fresh.started_outside)),
         first=tuple(np.flatnonzero(failed)[:LISTED_RUNS].tolist()),
-        influence=most_influential(numbers, failed[made], fresh.scenario),
+        influence=most_influential(numbers, failed[executed], fresh.scenario),
     )
 
 
 def most_influential(
     numbers: Mapping[str, np.ndarray], failed: np.ndarray, scenario: Scenario
 ) -> Influence | None:
-    """The number that separates failed runs from the others best; None where no number varies, or
-    all runs failed.
+    """The number that separates failed runs best from the others.
+
+    None where no number varies, or where all or no runs failed.
 
     Args:
       numbers: path -> number of each run, (N,).
       failed: whether each run failed, (N,).
-      scenario: for units.
+      scenario: scenario from which units are read.
     """
     varying = {path: x for path, x in numbers.items() if np.ptp(x) > 0}
     if not varying or np.all(failed) or not np.any(failed):
@@ -198,16 +207,19 @@ def most_influential(
     names = list(varying)
     x = np.stack(list(varying.values()), axis=1)
     distance = np.abs(x - np.median(x, axis=0))
-    above = rank_statistic(x, failed)
-    apart = rank_statistic(distance, failed)
-    either = np.maximum(above, 1 - above)
-    column = int(np.argmax(either))
-    side = "larger" if above[column] >= 0.5 else "smaller"
-    statistic, compared = either, x
-    if np.max(apart) > either[column] + LEAD_OF_DISTANCE:
-        column, side = int(np.argmax(apart)), "both ends"
-        statistic, compared = apart, distance
-    chosen = compared[:, column]
+    of_number = rank_statistic(x, failed)
+    of_distance = rank_statistic(distance, failed)
+    of_either_side = np.maximum(of_number, 1 - of_number)
+    column = int(np.argmax(of_either_side))
+    if np.max(of_distance) > of_either_side[column] + LEAD_OF_DISTANCE:
+        column = int(np.argmax(of_distance))
+        side = "both ends"
+        statistic = float(of_distance[column])
+        chosen = distance[:, column]
+    else:
+        side = "larger" if of_number[column] >= 0.5 else "smaller"
+        statistic = float(of_either_side[column])
+        chosen = x[:, column]
     p = p_value(chosen[failed], chosen[~failed])
     # Each number is tested itself and by its distance from the median.
     tests = 2 * len(_distinct_draws(x))
@@ -217,7 +229,7 @@ def most_influential(
         path=path,
         unit=unit_at(scenario, path),
         side=side,
-        statistic=float(statistic[column]),
+        statistic=statistic,
         p_value=float(-np.expm1(tests * np.log1p(-p))) if p < 1 else 1.0,
         failed=float(np.median(chosen[failed])),
         kept=float(np.median(chosen[~failed])),
@@ -227,7 +239,7 @@ def most_influential(
 
 def rank_statistic(x: np.ndarray, failed: np.ndarray) -> np.ndarray:
     """The area A under the ROC curve of each column of x, (N, m), for N runs that failed or not."""
-    from scipy import stats  # a second to import
+    from scipy import stats  # imported here because the import takes a second
 
     count = int(np.sum(failed))
     ranks = stats.rankdata(x, axis=0)
@@ -244,38 +256,40 @@ def p_value(failed: np.ndarray, kept: np.ndarray) -> float:
 
 
 def _same_draw(x: np.ndarray, column: int) -> list[int]:
-    """The columns of x, (N, m), that order the runs as one column does, or in reverse."""
+    """The columns of x, (N, m), that order the runs as one column does, or in reverse: they are
+    functions of the same draw.  With fewer than FEWEST_ORDERED runs the column itself, as equal
+    orders are then likely by chance.
+    """
     if len(x) < FEWEST_ORDERED:
         return [column]
-    first = np.argsort(x[:, column], kind="stable")
-    ordered = np.diff(x[first], axis=0)
-    return [
-        i for i in range(x.shape[1]) if np.all(ordered[:, i] >= 0) or np.all(ordered[:, i] <= 0)
-    ]
+    order = np.argsort(x[:, column], kind="stable")
+    changes = np.diff(x[order], axis=0)
+    is_monotonic = np.all(changes >= 0, axis=0) | np.all(changes <= 0, axis=0)
+    return np.flatnonzero(is_monotonic).tolist()
 
 
 def _distinct_draws(x: np.ndarray) -> list[int]:
-    """The columns of x, (N, m), of which no earlier one orders the runs alike."""
-    found: list[int] = []
-    left = list(range(x.shape[1]))
-    while left:
-        found.append(left[0])
-        same = _same_draw(x, left[0])
-        left = [i for i in left if i not in same]
-    return found
+    """The columns of x, (N, m), without those that are of the same draw as an earlier one."""
+    distinct: list[int] = []
+    remaining = list(range(x.shape[1]))
+    while remaining:
+        distinct.append(remaining[0])
+        same = _same_draw(x, remaining[0])
+        remaining = [i for i in remaining if i not in same]
+    return distinct
 
 
 @partial(jax.jit, static_argnames="targets")
 def drawn_leaves(
     cases: UncertainScenario, point: Any, index: jax.Array, *, targets: tuple[Target, ...]
 ) -> dict[str, jax.Array]:
-    """Path -> values of the perturbed leaves in the runs with these numbers, (N, ...).
+    """Path -> values of the perturbed leaves in some runs, (N, ...).
 
     Args:
       cases: scenario, perturbations and key.
-      point: path -> value that replaces the scenario's before the perturbation.
-      index: numbers of the runs, (N,) uint32.
-      targets: what is perturbed.
+      point: path -> value that replaces that of the scenario before the perturbation.
+      index: indices of the runs, (N,) uint32.
+      targets: the perturbed leaves.
     """
     return jax.vmap(lambda i: draw(cases, targets, i, point, {})[1])(index)
 

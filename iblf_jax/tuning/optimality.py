@@ -1,15 +1,21 @@
 """Multipliers and residuals of the optimality conditions at any gains, from one evaluation there.
 
-For a minimum of f subject to G_r <= 0 there are multipliers y_r >= 0 with
+At a minimum of f subject to G_r <= 0 there are multipliers y_r >= 0 with
 
-    grad f + sum_r y_r grad G_r = 0,     y_r G_r = 0.
+    grad f + sum_r y_r grad G_r = 0     (stationarity),
+    y_r G_r = 0                         (complementarity).
 
-Largest values over time have kinks: at gains where two peaks are equally large the gradient jumps,
-and an optimum may be there.  The conditions then hold with gradients of both peaks only, one of
-which is known from nearby gains.
+The largest value of a signal over time has kinks: where two peaks are equally large its gradient
+jumps.  An optimum may be at a kink.  The conditions then hold only with the gradients of both
+peaks.  One evaluation gives the gradient of one peak; that of the other one is known from a
+rejected trial of the solver nearby.
 
-Where no gains are known that keep the requirements, the conditions are those of the least largest
-excess: sum_r y_r grad G_r = 0 with sum_r y_r = 1.
+If no feasible gains are known, the conditions are those of the smallest largest excess:
+
+    sum_r y_r grad G_r = 0     with sum_r y_r = 1.
+
+They hold at a stationary point of the largest excess, at which the requirements cannot be kept
+together by small changes of the gains.
 """
 
 from __future__ import annotations
@@ -30,26 +36,30 @@ from iblf_jax.tuning.solvers.sqp import (
 
 
 class Conditions(NamedTuple):
-    """Multipliers and residuals at a point."""
+    """Multipliers and residuals of the optimality conditions at a point."""
 
     multipliers: np.ndarray
-    """Of each requirement, (R,)."""
+    """Lagrange multiplier of each requirement, (R,)."""
     residuals: np.ndarray
-    """Largest entry of the Lagrangian's gradient that no range blocks, largest excess, and sum of
-    the multipliers times the distances from the limits, (3,); NaN without a finite gradient."""
+    """Stationarity, feasibility and complementarity, (3,): the largest entry of the Lagrangian's
+    gradient that no range blocks, the largest excess, and the sum of the multipliers times the
+    distances from the limits.  NaN where the gradient is not finite."""
     size: float
-    """What the residuals are compared with; 1 where the objective does not count."""
+    """The residuals are relative to this number; it is 1 where the objective does not count."""
     at_kink: bool = False
-    """Whether the conditions hold together with gradients from nearby points."""
+    """Whether the conditions do not hold with the gradients at the point, but hold if those of
+    nearby points are added."""
 
     @property
     def hold(self) -> bool:
-        """Whether gradient and complementarity are small, or the point is an optimum at a kink."""
+        """Whether the conditions of an optimum hold, at a kink or not.  The largest excess does not
+        count: whether the point is feasible is decided by the caller.
+        """
         return self.at_kink or self.are_small
 
     @property
     def are_small(self) -> bool:
-        """Whether gradient and complementarity are small."""
+        """Whether stationarity and complementarity are at most STATIONARITY_TOLERANCE * size."""
         stationarity, _, complementarity = self.residuals
         return bool(max(stationarity, complementarity) <= STATIONARITY_TOLERANCE * self.size)
 
@@ -67,11 +77,11 @@ def conditions(
 
     Args:
       evaluate: the problem.
-      found: its derivatives, of which one row counts.
-      row: which one.
-      z: where it was evaluated, (p,).
-      violated: whether the conditions are those of the least largest excess.
-      nearby: points whose pieces may be at their limits too.
+      found: its derivatives at S points.
+      row: the point of the conditions, an index into them.
+      z: coordinates of this point, (p,).
+      violated: whether the conditions are those of the smallest largest excess.
+      nearby: further points, whose pieces may be active together with those of this point.
     """
     space = evaluate.space
     point = Point.of(space, found, row)
@@ -86,19 +96,21 @@ def conditions(
     if result.are_small or not nearby:
         return result
     space, point = with_nearby_pieces(space, point, nearby)
-    with_others = Conditions(*conditions_at(space, z, point), size)
-    return result._replace(at_kink=with_others.are_small)
+    with_nearby = Conditions(*conditions_at(space, z, point), size)
+    return result._replace(at_kink=with_nearby.are_small)
 
 
 def conditions_of_penalty(
     evaluate: Evaluator, found: Derivatives, row: int, z: np.ndarray, state: dict[str, Any]
 ) -> Conditions:
-    """The same where the requirements are penalties: the gradient of the augmented Lagrangian is
-    that of the Lagrangian with max(0, y + mu G) as multipliers.
+    """The conditions for a solver with the requirements in an augmented Lagrangian.
+
+    The gradient of the augmented Lagrangian is that of the Lagrangian with the multipliers
+    max(0, y + mu G).
 
     Args:
       evaluate, found, row, z: as `conditions`.
-      state: of the search, with y and mu.
+      state: of the search, with y and mu of each start.
     """
     excess = found.value.smooth_excess[row]
     multipliers = np.maximum(state["multipliers"][row] + state["penalty"][row] * excess, 0.0)

@@ -1,5 +1,6 @@
-"""The options of `tune`: those of its runs, of its report and of its search, among them keyword
-arguments of earlier versions.
+"""The options of `tune`: those of its runs, of its report and of its search.
+
+Keyword arguments of earlier versions are still accepted; `options_of` maps them to these options.
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ EARLIER_NAMES = {"auto": "auto", "newton": "sqp", "lbfgs": "lbfgs", "adam": "ada
 class TuningRunOptions:
     """The options of the runs of a tuning, which its problem, its result and its report share.
 
-    A further option is a field of this class, a keyword argument of `tune`, and what uses it.
+    To add an option, add a field of this class and a keyword argument of `tune`, which passes it to
+    `TuningProblem.build`.
     """
 
     duration: float
@@ -43,19 +45,20 @@ class TuningRunOptions:
     method: str = "rk4"
     """Integrator."""
     backend: str = "auto"
-    """Executor of values and of forward mode."""
+    """Executor of runs without derivatives and in forward mode."""
     perturbations: Any = None
-    """Path -> `Perturbation`; one nominal run if empty."""
+    """Path -> `Perturbation`; if empty, there is one nominal run."""
     runs: int = 1
     """Number of perturbed runs in the loss."""
     seed: Any = 0
-    """Seed of their draws."""
+    """Seed of the draws of the perturbed runs."""
     risk: Any = "mean"
     """How the losses of the runs are combined; a `Risk` once it is checked."""
 
     def checked(self) -> Self:
-        """These options, valid and of their types; the perturbations depend on a scenario and are
-        checked with it.
+        """The options after a check, converted to their types.
+
+        The perturbations are not checked here, because that requires a scenario.
 
         Raises:
           ValueError: an option that is not valid; the message names it and the remedy.
@@ -73,9 +76,9 @@ class Report:
     """Options of the report on a tuning.
 
     Args:
-      runs: fresh runs; without perturbations the report is on the one nominal run.
-      seed: of their draws; the tuning's seed + 1 if not given.
-      confidence: of the intervals.
+      runs: number of fresh runs; without perturbations the report is on the one nominal run.
+      seed: of the draws of these runs; the tuning's seed + 1 if not given.
+      confidence: level of the confidence intervals.
     """
 
     runs: int = 1000
@@ -94,16 +97,18 @@ class Report:
 class Effort:
     """How much a tuning evaluates at most.
 
-    With K starts a search takes about 10 K evaluations with derivatives up to the end of one
-    start: all starts for `selection` steps, half of them for as many, and the best one on.
+    All K starts take `selection` steps, the better half of them takes as many again, and the best
+    one continues.  Until then a search takes 3 K selection / 2 evaluations with derivatives, which
+    are 45 with the defaults.
 
     Args:
-      values: points that are evaluated without derivatives, to find the starts.  With many runs
-        there are fewer: at most 50,000 runs are spent on them.
-      starts: points that searches begin from, all in one batch.
-      iterations: steps of the solver at most; each evaluates every start that is still active.
-      selection: steps after which the better half of the starts goes on; after twice as many only
-        the best one does.
+      values: number of points that are evaluated without derivatives to find the starts.  With many
+        runs there are fewer points, so that they need at most 50,000 runs.
+      starts: number of points that the search begins from, all in one batch.
+      iterations: largest number of steps of the solver in each phase of the search.  A step
+        evaluates every start that is still active.
+      selection: number of steps after which the better half of the starts continues; after twice as
+        many only the best one does.
     """
 
     values: int = 384
@@ -116,7 +121,9 @@ class Effort:
         for field in dataclasses.fields(self):
             least, most = limits.get(field.name, (1, checks.MAX_STEPS))
             number = getattr(self, field.name)
-            name = f"effort.{field.name}" if field.name != "iterations" else "iterations"
+            name = f"effort.{field.name}"
+            if field.name == "iterations":  # a keyword argument of `tune` in earlier versions
+                name = "iterations"
             checked = checks.positive_integer(name, number, least=least, most=most)
             object.__setattr__(self, field.name, checked)
 
@@ -126,14 +133,14 @@ EFFORTS = {
     "normal": Effort(),
     "thorough": Effort(values=4096, starts=12, iterations=120, selection=20),
 }
-"""Word -> how much is evaluated."""
+"""Name -> effort."""
 
 
 def effort_of(given: str | Effort) -> Effort:
-    """An effort by its name, or as it is.
+    """The effort that was given, or the one of a name in EFFORTS.
 
     Raises:
-      ValueError: neither.
+      ValueError: the argument is neither an effort nor a name of one.
     """
     if isinstance(given, Effort):
         return given
@@ -158,27 +165,27 @@ REPLACED = {
 }
 """Keyword argument of `tune` in earlier versions -> what replaces it."""
 OF_REPORT = {"report_runs": "runs", "report_seed": "seed", "confidence": "confidence"}
-"""Option of a report in earlier versions and in stored files -> its name in `Report`."""
+"""Name of an option in earlier versions and in stored files -> its name in `Report`."""
 ARGUMENTS = (
     *("scenario", "parameters", "objective"),
     *(field.name for field in dataclasses.fields(TuningRunOptions)),
     *("solver", "effort", "report", "checkpoint", "progress"),
 )
-"""Of `tune`."""
+"""The keyword arguments of `tune`."""
 
 
 class SearchOptions(NamedTuple):
     """The options of a search, of its report and of the progress that it shows."""
 
     solver: Solver | None
-    """The solver; None if the number of coordinates decides."""
+    """The solver; None if `chosen_solver` decides by the number of coordinates."""
     of_automatic: dict[str, Any]
-    """Options of a solver that is chosen automatically, from deprecated keyword arguments."""
+    """Options from deprecated keyword arguments, for a solver that is chosen automatically."""
     report: Report
     show: bool | None
-    """Whether a progress bar is shown."""
+    """Whether a progress bar is shown; None to show it on a terminal or in a notebook."""
     callback: Callable[[Any], None] | None
-    """Called with the search after each step."""
+    """Function that is called with the search after each step."""
     effort: Effort
 
 
@@ -189,25 +196,17 @@ def options_of(
     progress: bool | Callable[[Any], None] | None,
     deprecated: Mapping[str, Any],
 ) -> SearchOptions:
-    """Checks options of `tune`.
+    """Checks the options of the search and of the report.
 
     Args:
-      solver, effort, report, progress: as the user gave them.
-      deprecated: further keyword arguments.
+      solver, effort, report, progress: arguments of `tune`.
+      deprecated: further keyword arguments, those of earlier versions.
 
     Raises:
       TypeError: an unknown keyword argument.
       ValueError: an option that is not valid.
     """
-    for name in deprecated:
-        if name not in REPLACED:
-            near = checks.did_you_mean(name, (*ARGUMENTS, *REPLACED))
-            text = f"tune() got an unexpected keyword argument {name!r}. {near}".rstrip()
-            raise TypeError(f"{text} Its arguments are {', '.join(ARGUMENTS)}.")
-        notices.warn(
-            f"The keyword argument {name} of ij.tune is deprecated: write {REPLACED[name]}.",
-            DeprecationWarning,
-        )
+    _warn_of_deprecated(deprecated)
     given = dict(deprecated)
     budget = effort_of(effort)
     if "iterations" in given:
@@ -217,7 +216,8 @@ def options_of(
         expected = "a function that is called with the search after each step"
         raise checks.fail("callback", callback, expected)
     if callable(progress):
-        callback, progress = progress, False
+        callback = progress
+        progress = False
     of_report = {OF_REPORT[name]: given.pop(name) for name in OF_REPORT if name in given}
     _check_not_given_twice("report", report, of_report)
     _check_not_given_twice("solver", solver, given)
@@ -230,7 +230,23 @@ def options_of(
     return SearchOptions(_solver(solver), checked, report, progress, callback, budget)
 
 
+def _warn_of_deprecated(deprecated: Mapping[str, Any]) -> None:
+    """Warns of each keyword argument of an earlier version; raises TypeError if there was none of
+    this name.
+    """
+    for name in deprecated:
+        if name not in REPLACED:
+            near = checks.did_you_mean(name, (*ARGUMENTS, *REPLACED))
+            text = f"tune() got an unexpected keyword argument {name!r}. {near}".rstrip()
+            raise TypeError(f"{text} Its arguments are {', '.join(ARGUMENTS)}.")
+        notices.warn(
+            f"The keyword argument {name} of ij.tune is deprecated: write {REPLACED[name]}.",
+            DeprecationWarning,
+        )
+
+
 def _check_not_given_twice(name: str, value: Any, further: Mapping[str, Any]) -> None:
+    """Raises ValueError if an object is given together with deprecated arguments for its fields."""
     if further and value is not None:
         names = ", ".join(further)
         came = checks.Words(f"{name}= and {names}")
@@ -238,6 +254,7 @@ def _check_not_given_twice(name: str, value: Any, further: Mapping[str, Any]) ->
 
 
 def _checked(name: str, value: Any) -> Any:
+    """The value of a deprecated option of a solver after its check."""
     if name == "optimiser":
         checks.one_of(name, value, EARLIER_NAMES)
         return EARLIER_NAMES[value]
@@ -245,7 +262,7 @@ def _checked(name: str, value: Any) -> Any:
 
 
 def _solver(given: Any) -> Solver | None:
-    """A solver by its name, or as it is; None where one has to be chosen."""
+    """The solver that was given, or the one of a name in SOLVERS; None for "auto" and None."""
     if given is None:
         return None
     if isinstance(given, str):
@@ -258,7 +275,7 @@ def _solver(given: Any) -> Solver | None:
 
 
 def chosen_solver(options: SearchOptions, size: int) -> tuple[Solver, str]:
-    """The solver for so many coordinates, and the mode of differentiation."""
+    """The solver for a problem of `size` coordinates, and its mode of differentiation."""
     solver = options.solver or _automatic(options.of_automatic, size)
     if solver.mode != "auto":
         return solver, solver.mode
@@ -266,7 +283,10 @@ def chosen_solver(options: SearchOptions, size: int) -> tuple[Solver, str]:
 
 
 def _automatic(given: Mapping[str, Any], size: int) -> Solver:
-    """SQP where forward mode is used, else L-BFGS; Adam where runs are resampled."""
+    """The default solver: SQP in forward mode, L-BFGS in reverse mode, Adam if runs are resampled.
+
+    The deprecated arguments `mode`, `resample` and `optimiser` may change this choice.
+    """
     mode = given.get("mode", "auto")
     resample = given.get("resample", False)
     name = given.get("optimiser", "auto")

@@ -31,12 +31,22 @@ from iblf_jax.tuning.step_check import StepCheck, check_step_size
 LARGE_CHANGE = 100.0
 """Factor by which a gain may change before a warning is given."""
 AT_KINK = "converged at a kink: the slope of a requirement jumps from one peak to another here"
-"""Why a solver ended where the conditions hold with gradients from gains nearby only."""
+"""`TuneResult.stopped` where the conditions of an optimum hold only if the gradients of peaks at
+nearby gains are added."""
 STUCK = "the solver ended at gains where the conditions of an optimum do not hold"
-"""Why a solver ended before the conditions of an optimum hold."""
+"""`TuneResult.stopped` where the solver has converged by its own criterion at gains that keep the
+requirements, but the conditions of an optimum do not hold."""
+INFEASIBLE = "the requirements cannot be kept together near these gains"
+"""`TuneResult.stopped` where all gains that are known violate a requirement, and the returned gains
+are a stationary point of the largest excess: the problem is infeasible, locally."""
+NOT_FOUND_FEASIBLE = "no gains that keep the requirements were found"
+"""`TuneResult.stopped` where all gains that are known violate a requirement, and the returned gains
+are no stationary point of the largest excess: the problem may be feasible."""
+NO_GRADIENT = "the objective has no finite derivative at the start"
+"""`TuneResult.stopped` where the derivatives at the returned gains are not finite."""
 LIMIT_TOLERANCE = 0.01
-"""A number is at a limit if it differs from it by no more than this part of it (of the range, where
-the limit is 0)."""
+"""A number is at a limit if it differs from the limit by at most this share of the limit, or of the
+range where the limit is 0."""
 
 
 class AtLimit(NamedTuple):
@@ -78,8 +88,9 @@ class TuneSetup(TuningRunOptions):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class TuneResult:
-    """A tuned scenario, the history of its search, and its report: on runs that tuning did not use,
-    where something is perturbed.
+    """A tuned scenario, the history of its search, and its report.
+
+    With perturbations the report is on runs that the tuning did not use.
     """
 
     scenario: Scenario
@@ -89,15 +100,23 @@ class TuneResult:
     values: dict[str, np.ndarray]
     """Path -> tuned value, in the leaf's unit."""
     names: tuple[str, ...]
-    """What each coordinate is called, (p,)."""
+    """Name of each coordinate, (p,)."""
     history: dict[str, np.ndarray]
-    """Per step, (steps, starts, ...), the best start first; invalid, with NaN, where a start was
-    not evaluated: loss, objective, terms, excess of the requirements, margin [rad], gradient_norm,
-    valid, z and x (the gains tried, in their units); evaluations is (steps,)."""
+    """Numbers of each step, (steps, starts, ...), the best start first: loss, objective, terms, excess of the
+    requirements, margin [rad], gradient_norm, valid, z and x (the trial, in coordinates and in the
+    units of the gains); evaluations is (steps,).
+
+    With requirements there may be more rows than starts, as a later phase may begin at more points.
+    A row that takes no step is invalid there.  The second search uses the first two rows."""
     best_start: int
-    """The column of the start that found the result."""
+    """The column of the history with the start that found the result."""
     stopped: str
-    """Why it stopped."""
+    """Why the search ended.
+
+    "converged" means that the gains keep the requirements and satisfy the conditions of an optimum
+    (`optimality.Conditions.hold`).  "iterations used up" and "no improvement in N steps" mean that
+    the gains keep the requirements, but do not satisfy these conditions.  The other values are
+    AT_KINK, STUCK, INFEASIBLE, NOT_FOUND_FEASIBLE and NO_GRADIENT of this module."""
     optimiser: str
     """Name of the solver."""
     mode: str
@@ -108,17 +127,19 @@ class TuneResult:
     """The objective at the tuned gains, on the runs that it was tuned on."""
     multipliers: tuple[float, ...] = ()
     """Lagrange multiplier of each requirement at the tuned gains: the decrease of the objective if
-    its limit is loosened by one `scale`.  Where a requirement is violated, the weights, with sum 1,
-    with which the gradients of the excesses balance."""
+    its limit is loosened by one `scale`.  Where a requirement is violated, they are weights with
+    sum 1 for which the weighted sum of the gradients of the excesses vanishes."""
     residuals: tuple[float, ...] = ()
-    """Of the optimality conditions at the tuned gains: the largest entry of the Lagrangian's
-    gradient by the coordinates z that no range blocks, the largest excess g of a requirement, and
-    the sum of multipliers times distances from the limits; all 0 at an optimum.  Where a
-    requirement is violated, the conditions are those of the least largest excess."""
+    """Residuals of the optimality conditions at the tuned gains: the largest entry of the
+    Lagrangian's gradient by the coordinates z that no range blocks, the largest excess G of a
+    requirement, and the sum of multipliers times distances from the limits.  All are 0 at an
+    optimum.  Where a requirement is violated, the conditions are those of the smallest largest
+    excess."""
     probes: int = 0
     """Number of evaluations without derivatives, each of `setup.runs` rollouts."""
     tried: tuple[str, ...] = ()
-    """What the search did, in words: how many starts, how many valleys, further phases."""
+    """What the search did, in words: number of starts, number of valleys (regions around one local
+    minimum) and further phases."""
 
     @property
     def is_violated(self) -> bool:
@@ -141,8 +162,10 @@ class TuneResult:
 
     @property
     def at_limits(self) -> dict[str, AtLimit]:
-        """The tuned numbers at an end of their range, by name: a wider range, or a cost of what
-        they increase, would change them.
+        """The tuned numbers at an end of their range, by name.
+
+        A wider range would change such a number, and so would a term of the objective that limits
+        what the number increases.
         """
         found = {}
         all_reasons = self.setup.reasons or (("", ""),) * len(self.names)
@@ -158,9 +181,11 @@ class TuneResult:
 
     @property
     def limit_multipliers(self) -> dict[str, float]:
-        """Multiplier of each requirement by its name and in the unit of its limit: the decrease of
-        the objective if the limit is loosened by one unit.  For a violation probability, by one
-        radian of the margin of its worst runs.  Empty where a requirement is violated.
+        """Multiplier of each requirement by its name: the decrease of the objective if the limit is
+        loosened by one unit.
+
+        The unit is that of the limit; for a violation probability it is one radian of the margin of
+        its worst runs.  Empty where a requirement is violated.
         """
         if self.is_violated:
             return {}
@@ -227,7 +252,7 @@ class TuneResult:
 
     @cached_property
     def nominal(self) -> tuple[Rollout, Rollout]:
-        """The nominal run before and after, recorded at every step."""
+        """The nominal run with the gains before and after the tuning, recorded at every step."""
         step = jnp.asarray(self.setup.dt, self.start.initial.q.dtype)
         folds = as_folds(None, step.dtype, self.start)
 
@@ -238,7 +263,7 @@ class TuneResult:
         return run(self.start), run(self.scenario)
 
     def _request(self, scenario: Scenario, **options: Any) -> RunRequest:
-        """A run as those of the tuning."""
+        """A request for a run with the duration, time step and integrator of the tuning."""
         steps = checks.whole_steps(self.setup.duration, self.setup.dt)
         return RunRequest.of(scenario, steps=steps, method=self.setup.method, **options)
 
@@ -251,7 +276,9 @@ class TuneResult:
 
     @property
     def _runs_per_batch(self) -> int:
-        """Runs in a batch of the search's values, whose compiled program the report uses again."""
+        """Number of runs in a batch of the search's values.  The report uses batches of this size
+        too, so that the program that was compiled for the search serves again.
+        """
         if self.probes or self.setup.runs > 1:
             return self.setup.runs * points_per_batch(self.setup.runs)
         return 1
@@ -265,7 +292,7 @@ class TuneResult:
 
     @notices.each_warning_once
     def check(self, runs: int | None = None, seed: int | None = None) -> TuningReport:
-        """The report with another number of fresh runs, or another seed.
+        """Makes the report with another number of fresh runs, or another seed.
 
         Args:
           runs: number of fresh runs; as in `report` if not given.
@@ -345,7 +372,7 @@ class TuneResult:
         """
         changes = {}
         for name, x in ((first, np.repeat(a, len(b))), (second, np.tile(b, len(a)))):
-            # A name of a leaf is one number for all of its entries.
+            # Where a name is a whole leaf, one number replaces all of its entries.
             shape = np.shape(self.values.get(name, 0.0))
             changes[name] = np.broadcast_to(x.reshape(-1, *(1,) * len(shape)), (len(x), *shape))
         setup = self.setup

@@ -1,34 +1,46 @@
 """The search calls a solver step by step, updates multipliers and smoothing, and keeps the best
-result so far.
+point so far, the incumbent.
 
-Solvers that handle requirements (`SQP`) get them as constraints.  For the others they are part of
-an augmented Lagrangian, whose parameters are updated whenever a start has converged (or after
-STEPS_PER_UPDATE steps),
+Requirements.  A solver with `handles_requirements` gets the requirements as constraints.  For the
+other solvers they are part of an augmented Lagrangian.  Its multipliers y and penalty parameter mu
+are updated whenever a start has converged, or after STEPS_PER_UPDATE steps,
 
-    y <- max(0, y + mu G),     mu <- 5 mu where the largest G has not fallen to a quarter,
+    y <- max(0, y + mu G),     mu <- PENALTY_FACTOR mu  if the largest G is above a quarter of the
+                                                        largest G before,
 
-so that a start that violates them becomes feasible while the penalty stays finite everywhere.  The
-best result so far has the lowest objective of those that satisfy requirements and bounds, or, while
-there is none, the smallest violation, the largest positive G.
+so that a start that violates requirements becomes feasible while the penalty stays finite.
 
-A peak in the objective is smoothed in the loss.  The smooth maximum lies above the maximum by
-smoothing times a logarithm, so its minimum is at other gains; but it is found soon, and narrow
-valleys are not in it.  So the smoothing is reduced in stages: once all starts have converged to
-COARSE_TOLERANCE (or after STEPS_PER_UPDATE steps, COARSE_STEPS where several starts are left), it
-is divided by SHARPENING, the better half of the starts goes on and the others are retired.
-Results are always compared without smoothing.
+Comparison.  Points are compared by their violation, the largest excess G of a requirement or bound,
+and at equal violation by the objective without smoothing.  A feasible point has the violation 0.
+Every point that was evaluated, with derivatives or without, is a candidate for the incumbent.
 
-A tuning that begins at several of many points (`starts`) is a search in phases:
+Stages.  A peak over time in the objective is replaced by a smooth maximum, which lies above the
+maximum by the smoothing times a logarithm.  The smooth objective has its minimum at other gains,
+but no narrow valleys, and its minimum is found in few steps.  The search therefore begins with much
+smoothing and divides it by SHARPENING at each stage.  An objective without smoothing has one stage.
+A stage but the last one ends when all starts have converged to COARSE_TOLERANCE, after `patience`
+steps without a better result, or, in problems without requirements, after COARSE_STEPS steps of
+several starts or STEPS_PER_UPDATE steps of one.
 
-1. All starts take steps as one batch.  After `selection` steps the better half of them goes on, and
-   after twice as many only the best (successive halving).
-2. If no point that keeps the requirements is known at the end, as many further points are
-   evaluated, and the largest excess alone is minimised from those with the smallest ones, until a
-   point keeps the requirements, or all starts are at stationary points of the largest excess.
-3. If phase 1 did not converge, or phase 2 found such a point, a second search begins at the best
-   point and at the best one that is far from all earlier starts.
+Phases.  A search with a `Strategy` has up to three phases:
 
-Every point that was evaluated, with derivatives or without, is a candidate for the result.
+1. OPTIMISE.  All starts take steps as one batch.
+2. REPAIR, if phase 1 ends without a feasible point.  As many further points as before are
+   evaluated without derivatives.  From the points with the smallest excess the solver minimises
+   the largest excess alone.  The phase ends at the first feasible point, when all starts have
+   converged, or after REPAIR_STEPS steps.
+3. SECOND_SEARCH, if phase 2 found a feasible point, or if phase 1 found one but did not converge.
+   It begins at the incumbent and at the best screened point that is far from all earlier starts.
+
+Every phase also ends after `patience` steps without a better result.  A search without a strategy
+has phase 1 only.
+
+Retired starts.  A start that is `finished` takes no steps until the smoothing changes or a phase
+begins; a start that is `retired` is finished and takes no steps in the rest of its phase.  Starts
+are retired in three places: `_select` keeps the better half after `selection` steps and the best
+start after twice as many (successive halving), `_next_stage` keeps the better half at each stage,
+and `_begin_phase` retires all starts of the previous phase.  Rows that only fill up a batch are
+retired before the first step.
 """
 
 from __future__ import annotations
@@ -56,55 +68,78 @@ from iblf_jax.tuning.starts import (
 )
 
 STEPS_PER_UPDATE = 12
-"""Steps at most between two updates of the multipliers."""
-SECOND_DRAW = 1000
-"""Added to the seed for the points of the second phase."""
+"""Largest number of steps between two updates of the multipliers."""
+REPAIR_SEED_OFFSET = 1000
+"""Added to the seed for the points that are evaluated in the phase REPAIR."""
 MAX_UPDATES = 12
-"""Updates of the multipliers in a stage."""
+"""Largest number of updates of the multipliers in a stage."""
 PENALTY_FACTOR = 5.0
 """Factor by which the penalty parameter is increased."""
 MAX_PENALTY = 1e6
 EXCESS_TOLERANCE = 1e-3
-"""Largest |G| at which a converged start ends."""
+"""Largest |G| at which a start that has converged is finished."""
 SHARPENING = 4.0
 """Factor by which the smoothing is divided at each stage."""
 COARSE_TOLERANCE = 1e-3
-"""Tolerance before the last stage, whose result is a point to go on from."""
+"""Smallest tolerance of the solver in all stages but the last one."""
 COARSE_STEPS = 6
-"""Steps at most of a stage of several starts without requirements: enough to choose by."""
-OPTIMISE, REPAIR, SECOND = range(3)
-"""The phases."""
+"""Largest number of steps of a stage of several starts without requirements.  So many steps are
+enough to compare the starts."""
+OPTIMISE, REPAIR, SECOND_SEARCH = range(3)
+"""The phases of a search, in order."""
 REPAIR_STEPS = 30
-"""Steps at most in which the largest excess is minimised."""
+"""Largest number of steps of the phase REPAIR."""
 REPAIR_STARTS = 6
-"""Points from which it is minimised."""
+"""Largest number of starts of the phase REPAIR."""
 MOST_MULTIPLES = 32
-"""Multiples of a leaf that are compared, the nearest ones."""
+"""Largest number of sampling periods that are compared with that of the incumbent."""
 KINK_REACH = 0.05
-"""Distance at most of points whose peaks may be at their limits too at a kink."""
+"""Largest distance, in any coordinate z, of a rejected trial whose pieces may be active together
+with those of the incumbent (see `optimality`)."""
 SAME_VALLEY = 0.5
-"""Largest distance, in any coordinate z, of two starts that ended in one valley."""
+"""Two points whose distance in every coordinate z is at most this are in the same valley, the
+region around one local minimum."""
 
 
 class Strategy(NamedTuple):
-    """How a search goes on from several starts."""
+    """What a search in phases needs besides its starts."""
 
     screening: Screening
     """The points that were evaluated without derivatives."""
     selection: int
-    """Steps after which the better half of the starts goes on."""
+    """Number of steps after which the worse half of the starts is retired."""
     starts: int
-    """Number of starts; further rows of the search belong to later phases."""
+    """Number of starts in the first phase.  A search has more rows than that where a later phase
+    may begin at more points."""
 
 
 class Search:
-    """A search from S starts; `run` continues from its `state`, which is a pytree of arrays.
+    """A search from S starts; `run` continues from its `state`.
+
+    The state is a pytree of arrays, which a checkpoint stores.  Its entries are
+
+    | Entry | Shape | Meaning |
+    |---|---|---|
+    | `solver` | | state of the solver |
+    | `iteration`, `phase_steps`, `stage_steps` | () | steps in all, in this phase, in this stage |
+    | `evaluations`, `plain_values` | () | points evaluated with derivatives, and without |
+    | `phase`, `stage` | () | OPTIMISE, REPAIR or SECOND_SEARCH; 0 to the number of sharpenings |
+    | `steps_without_better` | () | steps since the best result of all starts improved |
+    | `multipliers`, `penalty` | (S, R), (S,) | y and mu of the augmented Lagrangian |
+    | `steps_since_update`, `updates` | (S,) | steps since y was updated, updates in this stage |
+    | `largest_excess` | (S,) | largest G at the last update of y |
+    | `finished`, `retired` | (S,) | see above |
+    | `best_z` | (S, p) | best trial of each start |
+    | `best_key` | (S, 2) | violation and objective at these trials |
+    | `incumbent_z`, `incumbent_key` | (p,), (2,) | the same for the incumbent |
+    | `valleys` | (2,) | see `_valleys` |
+    | `repair_ended` | () | whether REPAIR ended at a stationary point of the largest excess |
 
     Args:
       evaluate: the problem.
       solver: with its options.
       z: starting points, (S, p).
-      strategy: of a search in phases; without it there is the first one only, and no selection.
+      strategy: of a search in phases.  Without it the search has one phase and no selection.
     """
 
     def __init__(
@@ -148,12 +183,12 @@ class Search:
             "valleys": np.asarray([1, 1]),
             "repair_ended": np.asarray(False),
         }
-        evaluate.on_values = self.see
+        evaluate.on_values = self.consider_values
         if strategy is not None:
-            self.see(strategy.screening.points, strategy.screening.found)
+            self.consider_values(strategy.screening.points, strategy.screening.found)
 
     def retire(self, starts: Any) -> None:
-        """Ends some starts for good."""
+        """Ends some starts for the rest of the phase."""
         self.state["finished"][starts] = True
         self.state["retired"][starts] = True
 
@@ -165,25 +200,30 @@ class Search:
 
     @property
     def is_violated(self) -> bool:
-        """Whether no point is known that keeps requirements and bounds."""
+        """Whether the incumbent violates a requirement or a bound, so that no feasible point is
+        known.
+        """
         return bool(self.state["incumbent_key"][0] > 0)
 
-    def see(self, z: np.ndarray, found: Value) -> None:
-        """Remembers the best of some points, (N, p), that were evaluated without derivatives."""
+    def consider_values(self, z: np.ndarray, found: Value) -> None:
+        """Counts points, (N, p), that were evaluated without derivatives, and replaces the
+        incumbent where one of them is better.
+        """
         self.state["plain_values"] = self.state["plain_values"] + len(z)
         for i in np.flatnonzero(found.valid).tolist():
             self._consider(z[i], _key(found, i))
 
     def _consider(self, z: np.ndarray, key: tuple[float, float]) -> None:
+        """Replaces the incumbent by a point, (p,), where that is better."""
         if np.isfinite(key[1]) and key < tuple(self.state["incumbent_key"]):
             self.state["incumbent_key"] = np.array(key)
             self.state["incumbent_z"] = np.array(z)
 
     def run(self, iterations: int, on_step: Callable[[Search], None] = lambda search: None) -> str:
-        """Steps until the search ends; returns why it ended.
+        """Runs all phases; returns why the last one ended.
 
         Args:
-          iterations: number of steps at most in a phase, those before a checkpoint included.
+          iterations: largest number of steps of a phase, those before a checkpoint included.
           on_step: called with the search after each step.
         """
         while True:
@@ -192,7 +232,7 @@ class Search:
                 return stopped
 
     def _run_phase(self, iterations: int, on_step: Callable[[Search], None]) -> str:
-        """Steps until a phase ends; returns why it ended."""
+        """Takes steps until the phase ends; returns why it ended."""
         state = self.state
         patience = self.solver.patience
         if state["phase"] == REPAIR:
@@ -216,30 +256,38 @@ class Search:
     # ------------------------------------------------------------------------------------ phases
 
     def _next_phase(self, stopped: str) -> bool:
-        """Begins a further phase where one is due; whether it does."""
-        if self.strategy is None:
-            return False
+        """Begins a further phase where one is needed; returns whether it has."""
         phase = int(self.state["phase"])
-        if phase == OPTIMISE:
-            self.state["valleys"] = self._valleys()
-            self._compare_multiples()
-            if self.is_violated:
-                self._begin(REPAIR, self._least_violated())
-                return True
-            if stopped == "converged" and self._ended_at_incumbent() and self.conditions().hold:
-                return False
-        elif phase == REPAIR:
-            if self.is_violated:
-                self.state["repair_ended"] = np.asarray(self.conditions().hold)
-                return False
-        else:
+        if self.strategy is None or phase == SECOND_SEARCH:
             return False
-        self._begin(SECOND, self._unexplored())
+        if phase == OPTIMISE:
+            return self._after_optimise(stopped)
+        return self._after_repair()
+
+    def _after_optimise(self, stopped: str) -> bool:
+        """`_next_phase` after the first phase."""
+        self.state["valleys"] = self._valleys()
+        self._compare_multiples()
+        if self.is_violated:
+            self._begin_phase(REPAIR, self._repair_starts())
+            return True
+        if stopped == "converged" and self._is_incumbent_explored() and self.conditions().hold:
+            return False
+        self._begin_phase(SECOND_SEARCH, self._second_search_starts())
+        return True
+
+    def _after_repair(self) -> bool:
+        """`_next_phase` after the phase in which the largest excess was minimised."""
+        if self.is_violated:
+            self.state["repair_ended"] = np.asarray(self.conditions().hold)
+            return False
+        self._begin_phase(SECOND_SEARCH, self._second_search_starts())
         return True
 
     def _compare_multiples(self) -> None:
-        """Evaluates other multiples of leaves that are whole numbers of steps, with all else as at
-        the best point: the sampling period, by which there is no derivative.
+        """Evaluates the incumbent with other sampling periods.
+
+        A sampling period is a whole number of steps, so that no derivative by it exists.
         """
         problem = self.evaluate.problem
         z = self.state["incumbent_z"]
@@ -248,20 +296,21 @@ class Search:
             self.evaluate.values(others)
 
     def conditions(self) -> Conditions:
-        """The optimality conditions at the best point, which is evaluated once more.
+        """The optimality conditions at the incumbent, which is evaluated once more.
 
-        Where a start has converged to a point that is as good up to the tolerance of the solver,
-        that one becomes the best point: an earlier trial beside it may be better by less.
+        The incumbent may be a trial that is better than the point where a nearby start converged
+        by less than the tolerance of the solver.  That point then becomes the incumbent, as the
+        conditions hold there more exactly.
         """
         state = self.state
-        row, z = self._end_beside_incumbent()
-        found = self._evaluated(row, z)
+        row, z = self._converged_near_incumbent()
+        found = self._derivatives_at(row, z)
         if self._is_as_good(found.value, row):
             state["incumbent_z"] = np.array(z)
             state["incumbent_key"] = np.array(_key(found.value, row))
         elif not np.array_equal(z, state["incumbent_z"]):
             z = state["incumbent_z"]
-            found = self._evaluated(row, z)
+            found = self._derivatives_at(row, z)
         if not self.solver.handles_requirements:
             return conditions_of_penalty(self.evaluate, found, row, z, state)
         nearby = []
@@ -269,25 +318,29 @@ class Search:
             nearby = self.solver.nearby_pieces(state["solver"], z, KINK_REACH)
         return conditions(self.evaluate, found, row, z, violated=self.is_violated, nearby=nearby)
 
-    def _end_beside_incumbent(self) -> tuple[int, np.ndarray]:
-        """A start that has converged in the valley of the best point, and where; otherwise the best
-        point itself.
+    def _converged_near_incumbent(self) -> tuple[int, np.ndarray]:
+        """The start that has converged nearest to the incumbent in its valley, and its point.
+
+        Where there is none, or the solver is not `SQP`: the start that found the best result, and
+        the incumbent itself.
         """
         z = self.state["incumbent_z"]
-        if not isinstance(self.solver, SQP):
+        if not isinstance(self.solver, SQP):  # the state of another solver cannot be read
             return self.best, z
-        ends = {
-            s: own.z
-            for s, own in enumerate(self.state["solver"])
-            if own.done and np.max(np.abs(own.z - z)) <= SAME_VALLEY
-        }
-        if not ends:
+        converged = {}
+        distances = {}
+        for s, own in enumerate(self.state["solver"]):
+            distance = float(np.max(np.abs(own.z - z)))
+            if own.done and distance <= SAME_VALLEY:
+                converged[s] = own.z
+                distances[s] = distance
+        if not converged:
             return self.best, z
-        nearest = min(ends, key=lambda s: float(np.max(np.abs(ends[s] - z))))
-        return nearest, ends[nearest]
+        nearest = min(distances, key=distances.__getitem__)
+        return nearest, converged[nearest]
 
     def _is_as_good(self, found: Value, row: int) -> bool:
-        """Whether a point is as good as the best one, up to the tolerance of the solver."""
+        """Whether a point is as good as the incumbent, up to the tolerance of the solver."""
         if not found.valid[row]:
             return False
         violation, objective = _key(found, row)
@@ -295,8 +348,8 @@ class Search:
         small = self.solver.tolerance * max(1e-3, abs(float(best)))
         return violation <= least and objective <= best + small
 
-    def _evaluated(self, row: int, z: np.ndarray) -> Derivatives:
-        """The derivatives at one point, in one row."""
+    def _derivatives_at(self, row: int, z: np.ndarray) -> Derivatives:
+        """The derivatives at one point, (p,), with the multipliers of one start and in its row."""
         evaluate = self.evaluate
         before = evaluate.evaluations
         self._prepare_evaluation()
@@ -306,20 +359,23 @@ class Search:
         self.history["evaluations"][-1] = self.state["evaluations"]
         return found
 
-    def _ended_at_incumbent(self) -> bool:
-        """Whether the best point belongs to a start that went on to its end: the search of others
-        was cut off.
+    def _is_incumbent_explored(self) -> bool:
+        """Whether a start that was not retired has its best trial in the valley of the incumbent.
+        Otherwise only screened points or retired starts are known there.
         """
         distance = np.max(np.abs(self.state["best_z"] - self.state["incumbent_z"]), axis=1)
         return bool(np.any((distance <= SAME_VALLEY) & ~self.state["retired"]))
 
-    def _begin(self, phase: int, z: np.ndarray) -> None:
-        """Begins a phase at some points, (k, p), k <= S; the other starts are retired."""
+    def _begin_phase(self, phase: int, z: np.ndarray) -> None:
+        """Begins a phase with the first k starts at the points z, (k, p), k <= S; the other starts
+        are retired.
+        """
         state = self.state
         self.retire(slice(None))
         for s, start in enumerate(z):
             self.solver.restart(self._space(phase), state["solver"], s, start)
-            state["finished"][s] = state["retired"][s] = False
+            state["finished"][s] = False
+            state["retired"][s] = False
             state["best_z"][s] = start
             state["best_key"][s] = np.inf
         state["phase"] = np.asarray(phase)
@@ -329,20 +385,24 @@ class Search:
         state["steps_without_better"] = np.asarray(0)
 
     def _space(self, phase: int) -> SearchSpace:
+        """The solver's view of the problem, in which REPAIR counts the largest excess only."""
         space = self.evaluate.space
         if phase != REPAIR:
             return space
         return space._replace(constraints=space.constraints._replace(largest_only=True))
 
-    def _least_violated(self) -> np.ndarray:
-        """The points from which the largest excess is minimised: the best one of all, and those
-        with the smallest excess among as many new points as there were before.
+    def _repair_starts(self) -> np.ndarray:
+        """The points from which the largest excess is minimised, (k, p): the incumbent and the
+        screened points with the smallest excess.
+
+        As many new points as before, at least FEW_POINTS, are evaluated first.  If one of them is
+        feasible, it is the incumbent and the only start.
         """
         assert self.strategy is not None
         problem = self.evaluate.problem
         first = self.strategy.screening
         count = max(len(first.points) - 1, FEW_POINTS)
-        points = spread_points(problem.box, count, int(problem.options.seed) + SECOND_DRAW)
+        points = spread_points(problem.box, count, int(problem.options.seed) + REPAIR_SEED_OFFSET)
         new = ranked(points, self.evaluate.values(points))
         both = Screening(*(_joined(x, y) for x, y in zip(first, new, strict=True)))
         best = self.state["incumbent_z"][None]
@@ -352,8 +412,8 @@ class Search:
         order = np.argsort(both.excess, kind="stable")
         return np.concatenate([best, self._distinct(both, order, starts, best)])
 
-    def _unexplored(self) -> np.ndarray:
-        """The best point, and the best one that is far from all starts."""
+    def _second_search_starts(self) -> np.ndarray:
+        """The incumbent and the best screened point that is far from all earlier starts, (k, p)."""
         assert self.strategy is not None
         best = self.state["incumbent_z"][None]
         explored = np.concatenate([best, self.history["z"][0], self.state["best_z"]])
@@ -365,20 +425,21 @@ class Search:
     def _distinct(
         self, screening: Screening, order: np.ndarray, count: int, others: np.ndarray
     ) -> np.ndarray:
+        """`starts.distinct` with the ranges of this problem; empty where no point is requested."""
         problem = self.evaluate.problem
-        refused = problem.sampled_too_slowly
         if count == 0:
             return np.zeros((0, problem.size))
-        return distinct(screening, order, count, problem.box, refused, others)
+        return distinct(screening, order, count, problem.box, problem.sampled_too_slowly, others)
 
     def _valleys(self) -> np.ndarray:
-        """In how many valleys the starts ended or were retired, and how many of them in the best
-        one, (2,).
+        """Number of valleys in which the starts ended or were retired, and number of starts in the
+        best valley, (2,).
         """
         reached = np.flatnonzero(np.isfinite(self.state["best_key"][:, 1]))
         z = self.state["best_z"][reached]
         near = np.max(np.abs(z[:, None] - z[None]), axis=2) <= SAME_VALLEY
-        # Starts belong together where a chain of near ones connects them.
+        # Two starts are in one valley if a chain of near starts connects them: each product of
+        # the matrix with itself doubles the length of the chains.
         for _ in range(len(z)):
             near = near.astype(int) @ near.astype(int) > 0
         count = len(np.unique(near, axis=0))
@@ -386,19 +447,25 @@ class Search:
         return np.asarray([count, of_best])
 
     def _select(self) -> None:
-        """Retires the worse starts after the steps of the selection."""
+        """Retires the worse half of the starts after `selection` steps of the phase, and all but
+        the best one after twice as many.
+        """
         if self.strategy is None or self.state["phase"] == REPAIR:
             return
         steps = int(self.state["phase_steps"])
-        left = np.flatnonzero(~self.state["retired"]).tolist()
-        order = sorted(left, key=self._rank)
+        remaining = np.flatnonzero(~self.state["retired"]).tolist()
+        order = sorted(remaining, key=self._rank)
         if steps == self.strategy.selection:
             self.retire(order[checks.ceil_div(len(order), 2) :])
         elif steps == 2 * self.strategy.selection:
             self.retire(order[1:])
 
     def _rank(self, start: int) -> float:
-        """What the starts are selected by: a small violation may still vanish."""
+        """The merit of a start, the smaller the better: its objective relative to that of the
+        incumbent, plus a weight times its violation.
+
+        Starts are not ranked by the violation first, because a small violation may still vanish.
+        """
         violation, objective = self.state["best_key"][start]
         size = max(abs(float(self.state["incumbent_key"][1])), 1e-12)
         return float(objective) / size + EXCESS_WEIGHT * float(violation)
@@ -406,7 +473,9 @@ class Search:
     # ------------------------------------------------------------------------------------ stages
 
     def _stage_is_long(self) -> bool:
-        """Whether a stage without requirements has taken all of its steps."""
+        """Whether a stage has taken its largest number of steps, which only problems without
+        requirements have.
+        """
         if self.state["multipliers"].shape[1] > 0:
             return False
         if np.sum(~self.state["retired"]) > 1:
@@ -414,10 +483,10 @@ class Search:
         return int(self.state["stage_steps"]) >= STEPS_PER_UPDATE
 
     def _next_stage(self) -> None:
-        """Reduces the smoothing; the better half of the starts goes on."""
+        """Reduces the smoothing and retires the worse half of the starts."""
         state = self.state
-        left = np.flatnonzero(~state["retired"]).tolist()
-        order = sorted(left, key=lambda s: tuple(state["best_key"][s]))
+        remaining = np.flatnonzero(~state["retired"]).tolist()
+        order = sorted(remaining, key=lambda s: tuple(state["best_key"][s]))
         half = checks.ceil_div(len(order), 2)
         for s in order[:half]:
             state["finished"][s] = False
@@ -431,7 +500,7 @@ class Search:
         state["steps_without_better"] = np.asarray(0)
 
     def _tolerance(self) -> float:
-        """Of the present stage."""
+        """The tolerance of the solver in the present stage."""
         if int(self.state["stage"]) == self.stages:
             return self.solver.tolerance
         return max(self.solver.tolerance, COARSE_TOLERANCE)
@@ -439,7 +508,7 @@ class Search:
     # ------------------------------------------------------------------------------------- steps
 
     def _step(self) -> None:
-        """One step of the solver, and what follows from it."""
+        """Takes one step of the solver, stores it, and updates multipliers and selection."""
         state = self.state
         self._prepare_evaluation()
         before = self.evaluate.evaluations
@@ -480,7 +549,9 @@ class Search:
         evaluate.active = ~state["finished"]
 
     def _keep_best(self, z: np.ndarray, found: Derivatives) -> bool:
-        """Stores the best result of each start; whether the best of all has improved."""
+        """Stores the best trial of each start; returns whether the best of all has improved by
+        more than the tolerance.
+        """
         state = self.state
         tolerance = self.solver.tolerance
         improved = False
@@ -499,6 +570,7 @@ class Search:
         return improved
 
     def _record(self, z: np.ndarray, found: Derivatives) -> None:
+        """Appends one step to the history."""
         value = found.value
         entries = {
             "z": z,
@@ -515,7 +587,7 @@ class Search:
             self.history.setdefault(name, []).append(np.array(x))
 
     def _update_start(self, s: int, converged: bool, found: Derivatives) -> None:
-        """Updates the multipliers of one start when it is time, or marks it as finished."""
+        """Updates the multipliers of one start if an update is due, or marks it as finished."""
         state = self.state
         state["steps_since_update"][s] += 1
         is_due = converged or state["steps_since_update"][s] >= STEPS_PER_UPDATE
@@ -532,7 +604,8 @@ class Search:
         if converged and (abs(worst) < EXCESS_TOLERANCE or state["updates"][s] >= MAX_UPDATES):
             state["finished"][s] = True
             return
-        # The multipliers follow from the penalty parameter of the steps that have been made.
+        # The multipliers are updated with the penalty parameter of the past steps, and only then
+        # is that increased.
         state["multipliers"][s] = np.maximum(0.0, multipliers + penalty * excess)
         if max(worst, 0.0) > 0.25 * state["largest_excess"][s]:
             state["penalty"][s] = min(PENALTY_FACTOR * penalty, MAX_PENALTY)
@@ -544,13 +617,13 @@ class Search:
 
 
 def _joined(first: Any, second: Any) -> Any:
-    """Two arrays, or tuples of arrays, one after the other."""
+    """The rows of two arrays, or of the arrays of two tuples, one after the other."""
     return jax.tree.map(lambda x, y: np.concatenate([x, y]), first, second)
 
 
 def _key(found: Value, row: int) -> tuple[float, float]:
-    """What results are compared by: the largest excess of a requirement or bound, then the
-    objective.
+    """What points are compared by, in this order: the violation, which is the largest excess of a
+    requirement or bound, and the objective.
     """
     excess = float(np.max(found.exact_excess[row], initial=0.0))
     return max(excess, -float(found.margin[row]), 0.0), float(found.objective[row])
@@ -570,10 +643,11 @@ class ExcessOnly:
         self.active = evaluate.active
 
     def __call__(self, z: np.ndarray) -> Derivatives:
-        """As `Evaluator`, with loss, gradient and matrix zero."""
+        """As `Evaluator`, with loss, gradient and matrix zero; an infinite loss stays infinite."""
         found = self.inner(z)
         loss = np.where(np.isfinite(found.value.loss), 0.0, np.inf)
-        zeros = np.zeros_like(found.gradient), np.zeros_like(found.hessian)
-        gradient, hessian = zeros
-        value = found.value._replace(loss=loss)
-        return found._replace(value=value, gradient=gradient, hessian=hessian)
+        return found._replace(
+            value=found.value._replace(loss=loss),
+            gradient=np.zeros_like(found.gradient),
+            hessian=np.zeros_like(found.hessian),
+        )

@@ -1,19 +1,24 @@
-"""Finds the points that searches begin from, by values without derivatives.
+"""Finds the points that a search begins from, by values without derivatives.
 
-With requirements that are active at the optimum, a problem has several local minima: at each of
-them other peaks are at their limits.  They are far apart (other gains are the large ones) and the
-better ones are not always near the scenario's gains.  So `screen` evaluates points of a Sobol
-sequence, a third of them within |z_i - z0_i| <= NEAR and two thirds within FAR of it, and ranks
-them by
+A problem whose requirements are active at the optimum has several local minima: at each of them
+other peaks are at their limits.  These minima are far apart, as other gains are large at each of
+them, and the better ones are not always near the scenario's gains z0.  `screen` therefore evaluates
+points of a Sobol sequence, a third of them within |z_i - z0_i| <= NEAR and two thirds within
+|z_i - z0_i| <= FAR, and ranks them by the merit
 
-    f / |f0| + EXCESS_WEIGHT (max_r max(0, G_r) + max(0, -margin)),
+    f / |f0| + EXCESS_WEIGHT max(0, max_r G_r, -margin),
 
-with which points that keep the requirements come first.  `distinct` takes the best of them that
-differ from one another.
+where f0 is the objective at the first valid point.  The weight is so large that feasible points
+come before all that are not almost feasible.  `distinct` then takes the best points that differ
+from one another, and excludes those whose gains are too high for the sampling period.
 
-Twenty random starts on two problems of nine gains (three links, torque and margin limited), six
-searches each: 45 % ended within 0.5 % of the best known objective; with two thirds of the points
-near, 30 %.
+The shares of near and far points come from a comparison on two problems of nine gains (three links,
+limited torque and margin), with six searches from each of twenty random scenarios.  45 % of the
+searches ended within 0.5 % of the best known objective.  With two thirds of the points near z0,
+only 30 % did.
+
+`usable_starts` serves searches without screening, whose starts are near the scenario's gains, and
+searches for which `distinct` finds no point.
 """
 
 from __future__ import annotations
@@ -34,44 +39,48 @@ NEAR = 1.0
 FAR = 3.0
 """Half-width of the box of the far points: a factor 20."""
 MIN_DISTANCE = 1.0
-"""Between two starts, in at least one coordinate z; less where a range is narrow."""
+"""Smallest distance of two starts in the coordinate z in which they differ most; smaller where a
+range is narrow."""
 EXCESS_WEIGHT = 200.0
-"""Of the excess.  With 5 instead, six of eight searches of a problem of nine gains began and stayed
-where the requirements cannot be kept."""
+"""Weight of the largest excess in the merit.  With a weight of 5, six of eight searches of a
+problem of nine gains began, and ended, in regions where the requirements cannot be kept."""
 MAX_SCREENED_RUNS = 50_000
-"""Runs that are spent on points without derivatives."""
+"""Largest number of runs in a screening; with many runs for each point there are fewer points."""
 FEW_POINTS = 32
-"""Points that replace a start that leaves its bounds, where no others are evaluated."""
+"""Number of points that are evaluated where a search without screening needs another start."""
 
 
 class Screening(NamedTuple):
     """Points that were evaluated without derivatives."""
 
     points: np.ndarray
-    """(N, p); the scenario's gains first."""
+    """Coordinates z, (N, p)."""
     found: Value
+    """Their values."""
     merit: np.ndarray
-    """(N,); infinite where a run is invalid."""
+    """What they are ranked by, (N,), the smaller the better; infinite where a run is invalid."""
     excess: np.ndarray
-    """The largest excess of a requirement or bound, (N,)."""
+    """The largest excess of a requirement or bound, (N,); infinite where a run is invalid."""
 
 
 def largest_excess(found: Value) -> np.ndarray:
-    """By how much each point violates requirements (in their scales) and bounds [rad], (N,)."""
+    """The largest excess at each point, of requirements in their scales and of bounds in rad,
+    (N,).
+    """
     excess = np.max(np.maximum(found.exact_excess, 0.0), axis=1, initial=0.0)
     return np.maximum(excess, np.maximum(-found.margin, 0.0))
 
 
 def screen(problem: TuningProblem, count: int, seed: int) -> Screening:
-    """Evaluates the scenario's gains and `count` further points."""
-    drawn = problem.box.z[None]
+    """Evaluates the scenario's gains, the first point, and `count` further points."""
+    points = problem.box.z[None]
     if count:
-        drawn = np.concatenate([drawn, spread_points(problem.box, count, seed)])
-    return ranked(drawn, values(problem, drawn))
+        points = np.concatenate([points, spread_points(problem.box, count, seed)])
+    return ranked(points, values(problem, points))
 
 
 def ranked(points: np.ndarray, found: Value) -> Screening:
-    """Points with their merit, relative to the first of them that is valid."""
+    """Points with their merit, which is relative to the objective of the first valid point."""
     excess = largest_excess(found)
     usable = found.valid & np.isfinite(found.objective) & np.isfinite(excess)
     size = 1.0
@@ -84,9 +93,11 @@ def ranked(points: np.ndarray, found: Value) -> Screening:
 
 def spread_points(box: Box, count: int, seed: int) -> np.ndarray:
     """Points of a scrambled Sobol sequence around the start, (count, p): a third near it."""
-    from scipy.stats import qmc  # a second to import
+    from scipy.stats import qmc  # imported here because the import takes a second
 
-    with warnings.catch_warnings():  # a number of points that is no power of 2 loses no quality
+    with warnings.catch_warnings():
+        # SciPy warns of counts that are no power of 2.  They lose the balance of the sequence,
+        # which the search does not need.
         warnings.simplefilter("ignore", UserWarning)
         unit = qmc.Sobol(len(box.z), seed=np.random.default_rng([seed, 4])).random(count)
     near = np.arange(count) % 3 == 0
@@ -104,23 +115,26 @@ def distinct(
     is_refused: Callable[[np.ndarray], bool],
     others: np.ndarray | None = None,
 ) -> np.ndarray:
-    """The first points of an order that differ from one another, (at most `count`, p).
+    """The first points of an order that differ from one another and are not refused, (m, p) with m
+    at most `count`.
 
     Args:
       screening: the points.
       order: their indices, the best first.
-      count: how many at most.
+      count: largest number of points.
       box: the ranges.
-      is_refused: function of z (p,) -> whether no search can begin there; it takes long, so no
-        more points are tested than are needed.
-      others: from which they must differ too, (k, p).
+      is_refused: function of z, (p,), that returns whether no search can begin there.  It takes
+        long, so that no more points are tested than are needed.
+      others: further points that the result must differ from, (k, p).
     """
     distance = np.minimum(MIN_DISTANCE, 0.25 * (box.high - box.low))
     chosen: list[np.ndarray] = []
-    taken = list(np.zeros((0, len(box.z))) if others is None else others)
+    excluded: list[np.ndarray] = []
+    if others is not None:
+        excluded = list(others)
     for i in order[np.isfinite(screening.merit[order])].tolist():
         z = screening.points[i]
-        is_apart = all(np.any(np.abs(z - other) >= distance) for other in [*taken, *chosen])
+        is_apart = all(np.any(np.abs(z - other) >= distance) for other in [*excluded, *chosen])
         if is_apart and not is_refused(z):
             chosen.append(z)
         if len(chosen) == count:
@@ -136,17 +150,18 @@ def starting_points(box: Box, starts: int, seed: int) -> np.ndarray:
 
 
 def usable_starts(problem: TuningProblem, seed: int, z: np.ndarray, first: Value) -> np.ndarray:
-    """The starting points z, (S, p), or better ones where the first of them leaves its bounds,
-    cannot be integrated or is sampled too slowly.
+    """Starting points at which gradients are of use, (S, p).
 
-    Beyond a bound the motion is chaotic, as it is where it grows from sample to sample, and its
-    gradient is of no use.  So FEW_POINTS of the box are evaluated, and the starts are those that
-    are stable and violate requirements and bounds least.
+    Where the first of the points z leaves its bounds or is sampled too slowly, the motion is
+    chaotic and its gradient is of no use.  In these cases, and where that point cannot be
+    integrated, FEW_POINTS points of the box are evaluated.  The starts are then the valid and
+    stable points that violate requirements and bounds least; unstable and invalid points are used
+    only if there are not enough of them.  Otherwise the starts are the points z.
 
     Args:
       problem: what is tuned.
-      seed: of the draws.
-      z: (S, p).
+      seed: of the random points.
+      z: the starting points, (S, p).
       first: values at the first of them, (1, ...).
 
     Raises:
@@ -159,18 +174,20 @@ def usable_starts(problem: TuningProblem, seed: int, z: np.ndarray, first: Value
     order = np.lexsort((found.objective, screening.excess))
     chosen: list[int] = []
     for group in (order[found.valid[order]], order[~found.valid[order]]):
+        # The generator tests only as many points as are needed, because a test takes long.
         stable = (i for i in group if not problem.sampled_too_slowly(screening.points[i]))
-        # A test takes long, so no more are tested than are needed.
-        first_ones = list(itertools.islice(stable, max(len(z) - len(chosen), 0)))
-        chosen += [*first_ones, *(i for i in group if i not in first_ones)]
+        needed = max(len(z) - len(chosen), 0)
+        preferred = list(itertools.islice(stable, needed))
+        chosen += preferred
+        chosen += [i for i in group if i not in preferred]
     return screening.points[chosen[: len(z)]]
 
 
 def screened(problem: TuningProblem, seed: int, z: np.ndarray) -> Screening:
-    """The points z, (S, p), and FEW_POINTS of the box with their values.
+    """The points z, (S, p), and FEW_POINTS random points of the box, with their values.
 
     Raises:
-      ValueError: none of them can be integrated; the message names a step that is small enough.
+      ValueError: no point can be integrated; the message names a step that is small enough.
     """
     box = problem.box
     rng = np.random.default_rng([seed, 2])

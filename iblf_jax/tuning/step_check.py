@@ -1,8 +1,8 @@
-"""The runs that gains were tuned on are repeated at half the time step: gains whose objective or
-requirements depend on the step are not valid.
+"""Repeats the runs of a tuning at half the time step, to show whether objective and requirements
+depend on the step.
 
 The comparison covers all runs of the tuning, with its perturbations, its seed and its number of
-runs, or the nominal run where nothing is drawn.  Objective and requirements are combined over the
+runs; without perturbations it is the nominal run.  Objective and requirements are combined over the
 runs as in the search,
 
     f = risk_b [ sum_k w_k term_k ],      G_r = mean of g_r over the worst `allowed` share.
@@ -25,14 +25,16 @@ from iblf_jax.tuning.robust import combine, worst_count, worst_share
 from iblf_jax.tuning.samples import Sample, SampleRequest, is_random, sample_runs
 
 STEP_TOLERANCE = 1e-3
-"""Largest excess of a requirement at half the step, in its scale, that needs no repair.
+"""Largest excess of a requirement at half the step, in its scale, that is tolerated.
 
 A requirement that binds at dt has no room left, so that every difference between the two steps may
-appear as an excess.  At the step of `recommended_dt` largest torques, margins and errors of the
-presets change by at most 1e-4 (of `printed_gap`, which runs along its bound, by 4e-3).  An excess
-beyond ten times this is an error of the step, and no limit of a machine is known more exactly."""
+appear as an excess.  At the step of `recommended_dt`, largest torques, margins and errors of the
+presets change by at most 1e-4; only those of `printed_gap`, which moves along its bound, change by
+4e-3.  An excess above ten times 1e-4 is therefore an error of the step.  A smaller one does not
+matter, as the limits of a machine are not known more exactly."""
 LARGEST_DIFFERENCE = 0.01
-"""Of the objective at half the step, relative, before the report warns."""
+"""Largest relative difference of the objective at half the step for which the report does not
+warn."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,20 +43,20 @@ class RequirementAtSteps:
 
     name: str
     excess: tuple[float, float]
-    """G, in the requirement's scale: below 0 where the requirement holds."""
+    """G, in the requirement's scale; negative where the requirement holds."""
     value: tuple[float, float]
-    """The limited quantity: its mean over the worst allowed share of the runs."""
+    """Mean of the limited quantity over the worst allowed share of the runs."""
     limit: float
     unit: str
     averaged: int = 1
-    """How many of the worst runs the value is the mean of: the allowed share."""
+    """Number of runs in this share."""
     event: str = "value"
-    """"violated" for a limit of the probability that bounds are violated, which the search replaces
-    by the margin of the worst runs."""
+    """"violated" for a limit on the probability that bounds are violated, whose quantity is the
+    margin of the worst runs."""
 
     @property
     def is_broken(self) -> tuple[bool, bool]:
-        """Whether it is violated at dt, and at dt / 2."""
+        """Whether the requirement is violated at dt, and at dt / 2."""
         full, half = (not excess < 0 for excess in self.excess)
         return full, half
 
@@ -73,7 +75,7 @@ class RequirementAtSteps:
         return f"{text}: kept at dt, BROKEN at dt / 2 by {self._amount(1)}"
 
     def _amount(self, step: int) -> str:
-        """By how much the limit is exceeded."""
+        """The excess over the limit, with its unit, at dt (0) or dt / 2 (1)."""
         return self._with_unit(abs(self.value[step] - self.limit), 3)
 
     def _with_unit(self, value: float, digits: int = 5) -> str:
@@ -98,22 +100,23 @@ class WorstExcess(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class StepCheck:
-    """The runs of a tuning with the tuned gains at dt and at dt / 2; each pair is in this order.
-    Prints as text.
+    """The runs of a tuning with the tuned gains, at dt and at dt / 2; prints as text.
+
+    Each pair of numbers is in this order.
     """
 
     runs: int
     seed: int | None
-    """Of the draws; None for the one nominal run."""
+    """Seed of the draws; None for the one nominal run."""
     dt: float
     """The time step of the tuning [s]."""
     objective: tuple[float, float]
-    """Combined over the runs by the risk of the tuning."""
+    """The objective, combined over the runs by the risk of the tuning."""
     requirements: tuple[RequirementAtSteps, ...]
     margin: tuple[float, float]
-    """The smallest of all runs [rad]."""
+    """The smallest margin of all runs [rad]."""
     peak_torque: tuple[tuple[float, ...], tuple[float, ...]]
-    """The largest of all runs, joint by joint [N m]."""
+    """The largest torque of all runs at each joint [N m]."""
     violated: tuple[int, int]
     """Number of runs that leave their bounds or diverge."""
     untrusted: tuple[int, int]
@@ -126,20 +129,20 @@ class StepCheck:
 
     @property
     def newly_broken(self) -> tuple[RequirementAtSteps, ...]:
-        """The requirements that are kept at dt and broken at dt / 2 beyond the tolerance."""
+        """The requirements that are kept at dt and broken at dt / 2 by more than STEP_TOLERANCE."""
         return tuple(
             r for r in self.requirements if not r.is_broken[0] and r.excess[1] > STEP_TOLERANCE
         )
 
     @property
     def depends_on_step(self) -> bool:
-        """Whether the objective at dt / 2 differs by more than `LARGEST_DIFFERENCE`."""
+        """Whether the objectives at dt and dt / 2 differ by more than `LARGEST_DIFFERENCE`."""
         full, half = self.objective
         return not abs(half - full) <= LARGEST_DIFFERENCE * abs(full)
 
     @property
     def subject(self) -> str:
-        """The runs in words."""
+        """Words for the runs that are compared."""
         if self.seed is None:
             return "the nominal run"
         return f"the {self.runs} runs of the tuning" if self.runs > 1 else "the run of the tuning"
@@ -159,8 +162,11 @@ class StepCheck:
         return f"WARNING: of {self.runs} {counted} of the tuning, {'; '.join(parts)}"
 
     def warnings_of_requirements(self) -> list[str]:
-        """The requirements that are broken on these runs beyond the tolerance, one line each; of
-        the nominal run only those that are kept at dt, as its report has a verdict on the others.
+        """A warning for each requirement that is broken on these runs, the worst first.
+
+        Requirements that are kept at dt count if they are broken at dt / 2 by more than the
+        tolerance.  Those that are broken at dt already are omitted for the nominal run, because its
+        report lists them elsewhere.
         """
         rows = []
         newly_broken = self.newly_broken
@@ -173,7 +179,9 @@ class StepCheck:
         return rows
 
     def numbers_in_words(self) -> str:
-        """Objective, smallest margin, largest torque and largest excess, at dt / 2 and at dt."""
+        """Objective, smallest margin and largest torque at both steps, and the largest excess at
+        dt / 2 if it is within the tolerance.
+        """
         full, half = self.objective
         torques = [max(x, default=float("nan")) for x in self.peak_torque]
         text = (
@@ -198,7 +206,7 @@ class StepCheck:
 
 
 def worst_of(excesses: list[tuple[float, str]], violated: int) -> WorstExcess:
-    """The largest of pairs of an excess and a requirement's name."""
+    """The requirement with the largest excess, from pairs of an excess and a name."""
     excess, name = max(excesses, key=lambda pair: pair[0], default=(float("-inf"), ""))
     return WorstExcess(excess, name, violated)
 
@@ -214,16 +222,16 @@ def check_step_size(
     """Compares the runs of a tuning at its step and at half of it.
 
     Args:
-      scenario: that the tuning started from.
+      scenario: scenario that the tuning started from.
       values: path -> tuned value.
-      objective: of the tuning, with all scales and limits.
-      options: of its runs.
-      batch: runs in a batch of the search's values, whose compiled program is used again.
+      objective: objective of the tuning, with all scales and limits.
+      options: options of its runs.
+      batch: number of runs in a batch.  With that of the search's values, the compiled program of
+        the search is used again.
     """
-    full, half = (
-        _tuned_runs(scenario, values, objective, options, dt, batch)
-        for dt in (float(options.dt), 0.5 * float(options.dt))
-    )
+    dt = float(options.dt)
+    full = _tuned_runs(scenario, values, objective, options, dt, batch)
+    half = _tuned_runs(scenario, values, objective, options, 0.5 * dt, batch)
 
     def pair(function: Any) -> tuple[Any, Any]:
         return function(full), function(half)
@@ -231,7 +239,7 @@ def check_step_size(
     return StepCheck(
         runs=len(full.status),
         seed=int(options.seed) if is_random(options) else None,
-        dt=float(options.dt),
+        dt=dt,
         objective=pair(lambda x: _combined_objective(objective, options, x)),
         requirements=tuple(
             _requirement_at_steps(objective, r, (full, half))
@@ -252,8 +260,10 @@ def excess_at_half_step(
     *,
     batch: int = 1,
 ) -> WorstExcess:
-    """The requirement with the largest excess at half the step, on all runs of a tuning; arguments
-    as `check_step_size`.
+    """The requirement with the largest excess at half the step, on all runs of a tuning.
+
+    Args:
+      scenario, values, objective, options, batch: as `check_step_size`.
     """
     half = _tuned_runs(scenario, values, objective, options, 0.5 * float(options.dt), batch)
     excesses = [
@@ -271,6 +281,7 @@ def _tuned_runs(
     dt: float,
     batch: int,
 ) -> Sample:
+    """The runs of a tuning with the tuned gains at one time step."""
     request = SampleRequest(
         scenario=scenario,
         tuned=tuple(values),
@@ -285,12 +296,13 @@ def _tuned_runs(
 
 
 def _combined_objective(objective: Objective, options: TuningRunOptions, sample: Sample) -> float:
+    """The objective f of some runs."""
     losses = sample.losses(objective).sum(axis=1)
     return float(combine(options.risk, jnp.asarray(losses)))
 
 
 def combined_excess(objective: Objective, r: int, sample: Sample) -> float:
-    """G of requirement r: the mean of g over the worst allowed share of the runs."""
+    """The excess G of requirement r: the mean of g over the worst allowed share of the runs."""
     share = float(objective.requirements[r].allowed)
     return float(worst_share(jnp.asarray(sample.excess(objective, r)), share))
 
@@ -298,15 +310,16 @@ def combined_excess(objective: Objective, r: int, sample: Sample) -> float:
 def _requirement_at_steps(
     objective: Objective, r: int, samples: tuple[Sample, Sample]
 ) -> RequirementAtSteps:
+    """Requirement r on the runs at dt and at dt / 2."""
     requirement = objective.requirements[r]
     sign, unit = requirement.measure
     full, half = (combined_excess(objective, r, x) for x in samples)
-    limit, scale = float(requirement.limit), float(requirement.scale)
-    values = sign * (limit + scale * full), sign * (limit + scale * half)
+    limit = float(requirement.limit)
+    scale = float(requirement.scale)
     return RequirementAtSteps(
         name=requirement.name,
         excess=(full, half),
-        value=values,
+        value=(sign * (limit + scale * full), sign * (limit + scale * half)),
         limit=sign * limit,
         unit=unit,
         averaged=worst_count(len(samples[0].status), float(requirement.allowed)),

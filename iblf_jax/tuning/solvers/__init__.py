@@ -1,8 +1,20 @@
 """Solvers of tuning problems.
 
-The Protocol `Solver` in `_base` is the contract.  A new solver is one file in this folder and one
-entry of `SOLVERS`; an object of a class of your own can be passed as `tune(..., solver=...)` as it
-is.
+The Protocol `Solver` in `_base` is the contract of a solver.  An object that satisfies it can be
+passed as `tune(..., solver=...)` as it is.  A solver of this package needs
+
+1. a file in this folder with a frozen dataclass, whose fields are its options;
+2. a check in `_base.CHECKS` for each option with a new name;
+3. an entry of `OWN` or `OF_LIBRARIES` below, by which the solver gets its name;
+4. an import in `iblf_jax/tuning/__init__.py`, and a line in docs/how_to/tune_gains.md.
+
+Three base classes take over most of the contract:
+
+| If the algorithm | derive from | and write | Example |
+|---|---|---|---|
+| can be advanced step by step | nothing | all of `Solver` | `adam`, `lbfgs`, `sqp` |
+| belongs to a library with its own loop | `programme.RunsToItsEnd` | `minimise` | `uno` |
+| uses values of many points only | `population.Population` | `begin`, `generation` | `cma_es` |
 """
 
 from typing import Any

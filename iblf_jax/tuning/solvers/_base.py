@@ -27,8 +27,9 @@ POPULATIONS = (5, 100_000)
 class Constraints(NamedTuple):
     """The requirements as constraints of a programme, on the host.
 
-    A requirement consists of pieces: entries of a signal in windows of time.  In a run it is
-    violated by its largest piece; over the runs by the mean G_r of its k worst runs.
+    A requirement consists of pieces: the largest values of a signal in windows of time.  Its excess
+    in one run is that of the largest piece.  Its excess G_r over all runs is the mean of the k
+    worst runs.
     """
 
     owner: np.ndarray
@@ -42,8 +43,8 @@ class Constraints(NamedTuple):
 
     @staticmethod
     def of(counts: Sequence[int], shares: Sequence[float], runs: int) -> Constraints:
-        """From the number of pieces of each requirement and the share of the runs that may violate
-        it.
+        """The constraints from the number of pieces of each requirement and the share of the runs
+        that may violate it.
         """
         owner = np.repeat(np.arange(len(counts)), counts)
         return Constraints(owner, tuple(worst_count(runs, share) for share in shares), runs)
@@ -72,26 +73,31 @@ class SearchSpace(NamedTuple):
     """What a solver knows of a problem."""
 
     box: Box
-    """Start and range of the coordinates z."""
+    """Start and range of the coordinates z: logarithms of positive gains, other numbers as they
+    are."""
     constraints: Constraints = Constraints(np.zeros(0, int), (), 1)
     multimodal: bool = False
     """Whether several local minima are expected."""
     iterations: int = 60
-    """Steps of the search at most, for schedules."""
+    """Largest number of steps of the search, for schedules."""
 
 
 class Solver(Protocol):
     """An algorithm with its options; a frozen dataclass without state of its own.
 
     It advances S starts together.  `evaluate` is a function of coordinates z, (S, p), that returns
-    `Derivatives` as NumPy arrays; its attributes `space` (`SearchSpace`) and `active` ((S,), which
-    starts are still to be advanced) belong to the call.  The state is any pytree of NumPy arrays,
+    `Derivatives` as NumPy arrays.  Its attribute `space` is the `SearchSpace` of this step, and
+    `active`, (S,), says which starts are to be advanced.  The state is any pytree of NumPy arrays,
     which `step` and `restart` may change in place.
+
+    In the phase REPAIR of a search (see `search`) the loss is zero, and
+    `space.constraints.largest_only` is true: a solver with the requirements as constraints then
+    minimises the largest excess alone.
     """
 
     @property
     def name(self) -> str:
-        """In `SOLVERS`, in files and in results."""
+        """Name of the solver in `SOLVERS`, in files and in results."""
         ...
 
     @property
@@ -103,7 +109,9 @@ class Solver(Protocol):
 
     @property
     def mode(self) -> str:
-        """Differentiation: "forward", "reverse", or "auto", by the number of coordinates."""
+        """Mode of differentiation: "forward", "reverse", or "auto" to let the number of coordinates
+        decide.
+        """
         ...
 
     @property
@@ -113,8 +121,10 @@ class Solver(Protocol):
 
     @property
     def starts(self) -> int | None:
-        """Number of starting points.  Where it is None the tuning decides: it evaluates many points
-        without derivatives, begins at several of them, and goes on with the best (`search`).
+        """Number of starting points, or None to let the effort of the tuning decide.
+
+        With None, the tuning evaluates many points without derivatives, begins at several of them
+        and continues from the best one (see `search`).
         """
         ...
 
@@ -143,7 +153,7 @@ class Solver(Protocol):
         """Advances the active starts by one trial each.
 
         Args:
-          evaluate: see above.
+          evaluate: function of z, (S, p), with the attributes that are described above.
           state: of `init`, changed in place.
           tolerance: of this step; larger than the solver's own while peaks are still smoothed.
 
@@ -153,14 +163,16 @@ class Solver(Protocol):
         ...
 
     def converged(self, state: Any) -> np.ndarray:
-        """Which starts have converged in the last step, (S,)."""
+        """Whether each start has converged or cannot continue, (S,) bool."""
         ...
 
     def restart(
         self, space: SearchSpace, state: Any, start: int, z: np.ndarray | None = None
     ) -> None:
-        """Begins one start anew at z, (p,).  Without z the start goes on where it is, and forgets
-        what no longer holds because the loss has changed.
+        """Begins one start anew at z, (p,).
+
+        Without z the start continues from where it is.  As the loss has changed, what was stored of
+        the former loss, such as curvature, is discarded.
         """
         ...
 

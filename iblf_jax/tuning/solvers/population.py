@@ -1,15 +1,16 @@
 """Solvers that compare values of many points and use no derivatives.
 
-One step is one generation, whose points are evaluated in one batch.  Requirements and bounds are an
-exact penalty,
+One step is one generation, whose points are evaluated in one batch.  The loss contains requirements
+and bounds as an exact penalty,
 
     f / |f0| + PENALTY max(0, max_r G_r, -margin),
 
-with the objective f0 at the start, or at the first valid point.  Where a run is invalid the loss is
-INVALID_LOSS.
+where f0 is the objective at the start, or at the first valid point if the start is invalid.  Where
+a run is invalid the loss is INVALID_LOSS.
 
-The state holds the losses of all points so far.  With them the library's own state is restored from
-a checkpoint: it asks for the same points again, and gets the stored losses.
+A checkpoint cannot store the library's own object.  The state therefore holds the losses of all
+points so far.  To continue from a checkpoint, a new object of the library repeats all generations
+with these losses, which gives the same points again.
 """
 
 from __future__ import annotations
@@ -25,25 +26,28 @@ import numpy as np
 from iblf_jax.tuning.solvers._base import SearchSpace
 
 PENALTY = 200.0
-"""Of the largest excess, as that by which starts are chosen (`starts`)."""
+"""Weight of the largest excess in the loss; equal to `starts.EXCESS_WEIGHT`."""
 INVALID_LOSS = 1e6
 BATCHES_IN_FIRST_STEP = 2
-"""A library may evaluate a first population beside the first generation."""
+"""Largest number of populations in the first step: a library may evaluate an initial population
+besides the first generation."""
 
 Losses = Callable[[np.ndarray], np.ndarray]
 """Function of points, (N, p), that returns their losses, (N,)."""
 
 
 class Library:
-    """The library's own object, and how many points it has got the losses of."""
+    """The library's own object and its progress."""
 
     def __init__(self) -> None:
         self.inner: Any = None
+        """The object; None before it is needed."""
         self.count = 0
+        """Number of points whose losses the object has received."""
 
 
 class Values(NamedTuple):
-    """The fields of `Derivatives`, of which only the value is known."""
+    """The fields of `Derivatives` where only the value is known."""
 
     value: Any
     gradient: np.ndarray
@@ -62,27 +66,31 @@ class PopulationState:
     """The state of the one start."""
 
     z: np.ndarray
-    """Where it begins, (p,)."""
+    """The point where it begins, (p,)."""
     losses: np.ndarray
-    """Of all points so far, NaN where there is none yet."""
+    """Losses of all points so far, NaN in the places of later ones."""
     count: Any
     """Number of points so far."""
     generations: Any
+    """Number of generations so far."""
     reference: Any
     """|f0|; NaN before the first valid point."""
     done: Any
+    """Whether the library has converged."""
     library: Library
-    """Not part of a checkpoint."""
+    """The library's object; not part of a checkpoint."""
 
 
 class Population:
-    """Base of these solvers; a class has the options and the methods `begin` and `generation`.
+    """Base class of solvers that use values only.
 
-    There is one start.  Its `step` returns the best point of the generation, with NaN as its
-    derivatives.
+    A derived class defines its options, `begin`, `generation` and the members of `Solver` that are
+    not defined here.  The search has one start.  `step` returns the best point of the generation,
+    with NaN as its derivatives.
     """
 
     population: int
+    """Number of points of a generation."""
     handles_requirements: ClassVar[bool] = True
     mode: ClassVar[str] = "forward"
     resample: ClassVar[bool] = False
@@ -94,12 +102,14 @@ class Population:
         raise NotImplementedError
 
     def generation(self, library: Any, losses: Losses) -> bool:
-        """Advances the library's object by one generation; whether it has converged."""
+        """Advances the library's object by one generation; returns whether it has converged."""
         raise NotImplementedError
 
     @staticmethod
     def near(space: SearchSpace, z: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
-        """The limits of z within a reach of the start, (p,) each."""
+        """Lower and upper limits of z within a distance `reach` of the start and within the ranges,
+        (p,) each.
+        """
         return np.maximum(space.box.low, z - reach), np.minimum(space.box.high, z + reach)
 
     def init(self, space: SearchSpace, z: np.ndarray) -> list[PopulationState]:
@@ -107,6 +117,7 @@ class Population:
         return [self._state(space, start) for start in z]
 
     def _state(self, space: SearchSpace, z: np.ndarray) -> PopulationState:
+        """The state of a start at z, (p,), before its first generation."""
         points = self.population * (space.iterations + BATCHES_IN_FIRST_STEP)
         return PopulationState(
             z=np.array(z, float),
@@ -152,29 +163,33 @@ class Population:
         return _best_of(seen)
 
     def _library(self, space: SearchSpace, own: PopulationState) -> Library:
-        """The library's object, restored from the losses where it is not that of the state."""
+        """The library's object.  Where it is missing or of another state, a new one repeats all
+        generations with the stored losses.
+        """
         library = own.library
         if library.inner is not None and library.count == int(own.count):
             return library
         library.inner = self.begin(space, own.z)
-        first = 0
+        count = 0
 
-        def stored(points: np.ndarray) -> np.ndarray:
-            nonlocal first
-            first += len(points)
-            return own.losses[first - len(points) : first].copy()
+        def stored_losses(points: np.ndarray) -> np.ndarray:
+            nonlocal count
+            first = count
+            count += len(points)
+            return own.losses[first:count].copy()
 
         for _ in range(int(own.generations)):
-            self.generation(library.inner, stored)
-        library.count = first
+            self.generation(library.inner, stored_losses)
+        library.count = count
         return library
 
 
 def _losses(
     evaluate: Any, own: PopulationState, points: np.ndarray, seen: list[tuple[np.ndarray, Any]]
 ) -> np.ndarray:
-    """The losses of points, (N,), which are added to those seen; the first batch contains the
-    start too.
+    """Evaluates points, (N, p), appends them to `seen` and returns their losses, (N,).
+
+    The first batch also contains the start, whose objective is the reference of the losses.
     """
     batch = points
     if int(own.count) == 0:
@@ -183,7 +198,7 @@ def _losses(
     seen.append((batch, found))
     valid = found.valid & np.isfinite(found.objective)
     if np.isnan(own.reference) and np.any(valid):
-        first = -1 if valid[-1] else int(np.argmax(valid))
+        first = -1 if valid[-1] else int(np.argmax(valid))  # the start is the last point
         own.reference = np.asarray(max(abs(float(found.objective[first])), 1e-12))
     with np.errstate(invalid="ignore"):
         losses = found.objective / own.reference + PENALTY * violation(found)
@@ -197,7 +212,10 @@ def violation(value: Any) -> np.ndarray:
 
 
 def _best_of(seen: list[tuple[np.ndarray, Any]]) -> tuple[np.ndarray, Values]:
-    """Of all points of a generation the best one, as trial of one start."""
+    """The best point of a generation and its value, with shapes (1, ...) as for one start.
+
+    Points are compared by their violation and then by their objective.
+    """
     points = np.concatenate([batch for batch, _ in seen])
     value = jax.tree.map(lambda *x: np.concatenate(x), *(found for _, found in seen))
     objective = np.where(value.valid, value.objective, np.inf)

@@ -1,15 +1,15 @@
-"""A tuning problem as a nonlinear programme, for solvers of other libraries, which run their own
-loop.
+"""A tuning problem as a nonlinear programme, for libraries that run their own loop.
 
     minimise  f(z) / |f(z0)|   subject to  g_j(z) <= -TARGET_EXCESS,   low <= z <= high
 
-Of requirements that no run may violate, g_j are the pieces (`evaluation`), which are smooth: one
-constraint each, as in `sqp`.  Only those that may bind near the first point are handed to the
-library.  Where another one is violated at the end of a run, it is added and the library runs again
-from there; MAX_RUNS_OF_LIBRARY runs at most.  A requirement that some of the runs may violate is
-one constraint, the mean of its k worst runs; its gradient jumps where other runs become the worst.
+A requirement that no run may violate consists of smooth pieces (`evaluation`), each of which is
+one constraint g_j, as in `sqp`.  The library gets only the pieces that may bind near the first
+point.  If another piece is violated at the end of a run of the library, it becomes a constraint
+too, and the library runs again from there; it runs at most MAX_RUNS_OF_LIBRARY times.  A
+requirement that some of the runs may violate is one constraint, the mean of its k worst runs.  Its
+gradient jumps where other runs become the worst.
 
-Value, gradient, constraints and Jacobian at one point cost one evaluation.  Where a run is invalid
+One evaluation gives value, gradient, constraints and Jacobian at a point.  Where a run is invalid,
 the objective is INVALID_OBJECTIVE and each constraint is violated by 1, so that a line search
 shortens its step.
 """
@@ -25,14 +25,17 @@ from iblf_jax.tuning.solvers._base import SearchSpace
 from iblf_jax.tuning.solvers.sqp import MAX_PIECES, TARGET_EXCESS
 
 INVALID_OBJECTIVE = 1e3
-"""f / |f0| where a run is invalid."""
+"""Value of f / |f0| where a run is invalid."""
 REACH = 1.0
-"""Distance in z within which the first constraints may bind: a factor e for a gain."""
+"""Distance in z within which a piece must be able to bind to be among the first constraints; 1 is a
+factor e for a gain."""
 SMALLEST_CHANGE = 1e-9
-"""Of a piece within REACH, below which no gain changes it."""
+"""A piece that changes by less than this within REACH is assumed not to depend on the gains."""
 MAX_RUNS_OF_LIBRARY = 4
+"""Largest number of runs of the library from one start."""
 POINTS_KEPT = 8
-"""Evaluated points whose numbers are kept for the library's next calls."""
+"""Number of evaluated points that are stored, as a library requests objective, constraints and
+their derivatives at a point one after the other."""
 
 
 class Row(NamedTuple):
@@ -40,26 +43,26 @@ class Row(NamedTuple):
 
     objective: float
     gradient: np.ndarray
-    """(p,)."""
+    """Of the objective, (p,)."""
     hessian: np.ndarray
-    """Gauss-Newton approximation, (p, p)."""
+    """Gauss-Newton approximation for the objective, (p, p)."""
     pieces: np.ndarray
-    """Of requirements that no run may violate, (B, M); the others are -infinity."""
+    """Values of the pieces, (B, M); -infinity for requirements that some runs may violate."""
     piece_gradients: np.ndarray
-    """(B, p, M)."""
+    """Their gradients, (B, p, M)."""
     means: np.ndarray
-    """Of the k worst runs, for the requirements with k > 1, (R',)."""
+    """Mean of the k worst runs, for each of the R' requirements with k > 1, (R',)."""
     mean_gradients: np.ndarray
-    """(R', p)."""
+    """Their gradients, (R', p)."""
 
 
 class Programme:
     """One start of a tuning problem, as functions of z, (p,).
 
     Args:
-      evaluate: of `Solver.step`, for S starts.
-      start: which of them.
-      z: where the run begins, (p,).
+      evaluate: as in `Solver.step`, for S starts.
+      start: index of this start.
+      z: point where the run begins, (p,).
     """
 
     def __init__(self, evaluate: Any, start: int, z: np.ndarray):
@@ -74,9 +77,10 @@ class Programme:
         self.best: tuple[tuple[float, float], np.ndarray, Any] | None = None
         """Key, point and derivatives of the best point so far."""
         self.first = self.row(self.z)
+        """The numbers at the first point; None where they are not finite."""
         shape = (self.space.constraints.runs, len(self.space.constraints.owner))
         self.chosen = np.zeros(shape, bool)
-        """Which pieces are constraints."""
+        """Whether each piece of each run is a constraint."""
         if self.first is not None:
             self.scale = max(abs(self.first.objective), 1e-3)
             self.chosen = self._pieces_that_may_bind(self.first)
@@ -90,12 +94,12 @@ class Programme:
         return int(np.sum(self.chosen)) + means
 
     def objective(self, z: np.ndarray) -> float:
-        """F / |f0|."""
+        """The objective f / |f0|."""
         row = self.row(z)
         return INVALID_OBJECTIVE if row is None else row.objective / self.scale
 
     def gradient(self, z: np.ndarray) -> np.ndarray:
-        """Of the objective, (p,)."""
+        """Gradient of the objective, (p,)."""
         row = self.row(z)
         return np.zeros(len(z)) if row is None else row.gradient / self.scale
 
@@ -105,7 +109,7 @@ class Programme:
         return np.eye(len(z)) if row is None else row.hessian / self.scale
 
     def excess(self, z: np.ndarray) -> np.ndarray:
-        """G + TARGET_EXCESS of each constraint, (m,)."""
+        """Left-hand side of each constraint <= 0, (m,): g_j + TARGET_EXCESS."""
         row = self.row(z)
         if row is None:
             return np.ones(self.constraints)
@@ -122,16 +126,19 @@ class Programme:
     # ---------------------------------------------------------------------------- evaluation
 
     def row(self, z: np.ndarray) -> Row | None:
-        """The numbers at z; None where a run is invalid."""
+        """The numbers at z, from the stored ones if z is among them; None where they are not
+        finite.
+        """
         z = np.clip(np.asarray(z, float), self.low, self.high)
-        mark = z.tobytes()
-        if mark not in self.rows:
-            self.rows[mark] = self._evaluated(z)
+        point = z.tobytes()
+        if point not in self.rows:
+            self.rows[point] = self._evaluated(z)
             if len(self.rows) > POINTS_KEPT:
                 self.rows.popitem(last=False)
-        return self.rows[mark]
+        return self.rows[point]
 
     def _evaluated(self, z: np.ndarray) -> Row | None:
+        """Evaluates z with this start as the only active one, and stores it if it is the best."""
         evaluate = self.evaluate
         active = evaluate.active
         evaluate.active = np.arange(len(active)) == self.start
@@ -148,7 +155,7 @@ class Programme:
         return row if is_finite else None
 
     def _key(self, value: Any) -> tuple[float, float]:
-        """Violation and objective, infinite where a run is invalid."""
+        """Violation and loss, by which points are compared; infinite where a run is invalid."""
         s = self.start
         if not value.valid[s]:
             return np.inf, np.inf
@@ -156,6 +163,7 @@ class Programme:
         return max(float(excess), -float(value.margin[s]), 0.0), float(value.loss[s])
 
     def _row_of(self, found: Any) -> Row:
+        """The numbers of this start from `Derivatives` of all starts."""
         gradient = np.asarray(found.gradient[self.start], float)
         objective = float(found.value.loss[self.start])
         hessian = np.asarray(found.hessian[self.start], float)
@@ -184,10 +192,11 @@ class Programme:
     # -------------------------------------------------------------------------- constraints
 
     def _pieces_that_may_bind(self, row: Row) -> np.ndarray:
-        """Which pieces may be at their limit within REACH; of many, the worst.
+        """Whether each piece may be at its limit within REACH, (B, M).
 
-        A piece that no gain changes, such as the margin at t = 0, is none of them: if it is at its
-        limit, it cannot be moved inside by TARGET_EXCESS.
+        Of more than MAX_PIECES pieces of a requirement, the worst ones are taken.
+        A piece that no gain changes, such as the margin at t = 0, is excluded, because no step can
+        move it inside its limit by TARGET_EXCESS.
         """
         change = REACH * np.sum(np.abs(row.piece_gradients), axis=1)
         may_bind = (row.pieces + change >= -TARGET_EXCESS) & (change > SMALLEST_CHANGE)
@@ -199,8 +208,8 @@ class Programme:
         return may_bind & np.isfinite(row.pieces)
 
     def add_violated(self, z: np.ndarray) -> bool:
-        """Makes every piece a constraint that is violated at z and is not one; whether there are
-        any.
+        """Makes a constraint of every violated piece at z that is none yet; returns whether there
+        was any.
         """
         row = self.row(z)
         if row is None:
@@ -211,10 +220,11 @@ class Programme:
 
 
 class RunsToItsEnd:
-    """Base of solvers whose library runs its own loop: one step is a whole run of each start.
+    """Base class of solvers whose library runs its own loop.
 
-    A checkpoint therefore exists after such a run only.  A class has the method `minimise` and the
-    members of `Solver` that are not here.
+    One step is a whole run of the library from each start, so that a checkpoint exists only after
+    such a run.  A derived class defines `minimise` and the members of `Solver` that are not defined
+    here.
     """
 
     def minimise(self, programme: Programme, iterations: int, tolerance: float) -> np.ndarray:
@@ -238,7 +248,7 @@ class RunsToItsEnd:
             state["z"][start] = z
 
     def converged(self, state: dict[str, np.ndarray]) -> np.ndarray:
-        """The starts whose runs have ended."""
+        """Whether the run of each start has ended, (S,) bool."""
         return state["done"].copy()
 
     def step(
@@ -277,7 +287,7 @@ class RunsToItsEnd:
 
 
 def _with_row(tree: Any, other: Any, row: int) -> Any:
-    """Derivatives of several starts with one row of others."""
+    """Derivatives of several starts in which one row is replaced by that of `other`."""
     if isinstance(tree, tuple) and hasattr(tree, "_fields"):
         return type(tree)(*(_with_row(x, y, row) for x, y in zip(tree, other, strict=True)))
     if isinstance(tree, tuple):

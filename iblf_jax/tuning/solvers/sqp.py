@@ -1,45 +1,56 @@
 """Sequential quadratic programming with Gauss-Newton matrices in a trust region: the default solver
 for few gains.
 
-At z the objective is modelled by f + g.s + s.B.s/2, and every piece j of every requirement by
-e_j + a_j.s + s.C_j.s/2, with its value e_j = g_rj (`evaluation`) and its exact gradient a_j.  At an
-optimum several peaks are at their limit at once, and each of them is a constraint of its own.  The
-subproblem for the step s is, within |s_i| <= delta and the ranges of the gains,
+Model.  At the accepted point z the objective is modelled by f + g.s + s.B.s/2.  A requirement
+consists of pieces, the largest values of its signal in windows of time.  Every piece j is modelled
+by e_j + a_j.s + s.C_j.s/2, with its value e_j = g_rj (`evaluation`) and its exact gradient a_j.  At
+an optimum several peaks are at their limit at once, and each of them is a constraint of its own.
+
+Subproblem.  The step s solves, within |s_i| <= delta and the ranges of the gains,
 
     minimise  g.s + s.(B + sum_j y_j C_j).s/2 + rho sum_r v_r
     subject to     c_j + a_j.s <= v_r,  v_r >= 0      for the pieces j of r,
 
-first with c_j = e_j, and then, CURVATURE_SOLVES times, with c_j = e_j + s.C_j.s/2 at the last
-solution.  The trial is the solution of which the quadratic models predict the largest decrease.  y
-are the multipliers of the previous subproblem.  A requirement that a share of B runs may violate,
-k > 1 of them, has as G_r the mean of its k worst runs, which is exactly
+where y are the multipliers of the previous subproblem.  It is solved first with c_j = e_j, and then
+CURVATURE_SOLVES times with c_j = e_j + s.C_j.s/2 at the last solution.  The trial is z + s with the
+solution of which the quadratic models predict the largest decrease.
 
-    min over t of  t + sum_b max(0, max_j g_bj - t) / k,
+Requirements on a share of the runs.  If k > 1 of the B runs may violate a requirement, its G_r is
+the mean of its k worst runs, which equals
 
-so that t and one u_b >= 0 a run are unknowns beside s.  rho is larger than the multipliers, so that
-f + rho sum_r max(0, G_r) is an exact penalty function, by which a trial is accepted or rejected.
-rho is increased where that reduces the predicted violation.  Requirements that cannot be satisfied
-together are thus violated as little as possible.
+    min over t of  t + sum_b max(0, max_j g_bj - t) / k.
 
-B = N + A, where N is the Gauss-Newton matrix at z, which forward mode provides at no extra cost.  A
-approximates the omitted second derivatives of the motion, and C_j is the second derivative of a
-piece.  Both are estimated from changes of gradients by the symmetric rank-one update,
+In the subproblem t and one u_b >= 0 for each run are unknowns beside s.
+
+Penalty.  A trial is accepted or rejected by f + rho sum_r max(0, G_r).  rho is larger than the
+multipliers, so that this penalty function is exact.  rho is increased as long as that reduces the
+predicted violation.  Requirements that cannot be satisfied together are thus violated as little as
+possible.  Where only the largest excess counts (`Constraints.largest_only`), sum_r is replaced by
+max_r.
+
+Curvature.  B = N + A, where N is the Gauss-Newton matrix at z, which forward mode provides at no
+extra cost.  A approximates the omitted second derivatives of the motion, and C_j is the second
+derivative of a piece.  Both are estimated from changes of gradients by the symmetric rank-one
+update,
 
     A <- A + r r^T / (r.s),      r = (change of g) - B s;
-    C_j likewise,                r = (change of a_j) - C_j s,
+    C_j likewise,                r = (change of a_j) - C_j s.
 
-also after rejected steps, but not where the loss of a trial is far above: such a trial has become
-unstable, and its gradients say nothing of the curvature at z.  A is set to zero after
-MOST_REJECTIONS rejected steps in a row.  A piece is the maximum of a signal over time, whose
-gradient jumps where another peak becomes the largest.  So the pieces of the last CUTS rejected
-trials, linear around them, are further pieces of the subproblem, as in a bundle method.  With many
-runs, C_j is stored for the worst pieces of each requirement
-only.  delta grows and shrinks with the ratio of actual to predicted decrease.  A rejected step is
-tried once more with c_j such that c_j + a_j.s is the value found (second-order correction).  A
-trial with an invalid run is rejected, and delta shrinks: non-finite numbers never reach z.
+Rejected steps update them too, unless the loss of the trial is far above that at z: such a trial is
+unstable, and its gradients contain no information on the curvature at z.  A and C_j are set to zero
+after MOST_REJECTIONS rejected steps in a row.  With many runs, C_j is stored for the worst pieces
+of each requirement only.
 
-A start has converged where the model predicts no decrease and the gradient of the Lagrangian is
-below STATIONARITY_TOLERANCE.  Where delta falls below COLLAPSED_RADIUS before that, it ends too.
+Rejected trials.  delta grows and shrinks with the ratio of actual to predicted decrease.  After a
+rejected step the subproblem is solved once more, with c_j such that c_j + a_j.s is the value at the
+rejected trial (second-order correction).  The gradient of a piece jumps where another peak becomes
+the largest.  The pieces of the last CUTS rejected trials, linearised there, are therefore further
+constraints of the subproblem, as in a bundle method.  A trial with an invalid run is rejected, and
+delta shrinks, so that z is always finite.
+
+Convergence.  A start has converged if the model predicts no decrease and the gradient of the
+Lagrangian is below STATIONARITY_TOLERANCE.  It also ends if delta falls below COLLAPSED_RADIUS, or
+if its first evaluation is not finite.
 
 Source: R. Fletcher, Practical Methods of Optimization, 2nd ed., section 14.4 (the subproblem and
 its correction);
@@ -65,10 +76,10 @@ from iblf_jax.tuning.solvers import quadratic
 from iblf_jax.tuning.solvers._base import Constraints, SearchSpace, check_options
 
 INITIAL_RADIUS = 1.0
-"""First |s_i|; 1 is a factor e for a gain."""
+"""First delta in the coordinates z; 1 is a factor e for a gain."""
 INITIAL_RADIUS_IF_MULTIMODAL = 0.5
-"""Where several minima are expected.  With it, the mean gap to the best known optimum of ten
-problems fell from 6.1 % to 3.1 % (see `starts`)."""
+"""First delta where several minima are expected.  With 0.5 instead of 1, the mean gap to the best
+known optimum of ten problems fell from 6.1 % to 3.1 %."""
 LARGEST_RADIUS = 4.0
 RATIO_TO_ACCEPT = 1e-4
 """Ratio of actual to predicted decrease above which a trial is accepted."""
@@ -79,48 +90,52 @@ RATIO_TO_GROW = 0.7
 SHRINK_FACTOR = 0.4
 GROWTH_FACTOR = 2.0
 SMALLEST_EIGENVALUE = 1e-6
-"""Of the model's matrix, relative to the largest of the Gauss-Newton matrix: a wrong secant matrix
-can have much larger ones, which must not limit the others."""
+"""Smallest eigenvalue of the model's matrix, relative to the largest one of the model or of the
+Gauss-Newton matrix, whichever is smaller: that of the model is much too large where A or C_j is
+wrong."""
 LARGEST_LOSS_FACTOR = 10.0
-"""A trial whose loss is so many times the accepted one says nothing of the curvature there."""
+"""Largest rise of the loss, relative to that at the accepted point, with which a trial updates A
+and C_j."""
 MOST_REJECTIONS = 4
-"""Rejected steps one after the other, after which the secant matrices are set to zero."""
+"""Number of rejected steps in a row after which A and C_j are set to zero."""
 CUTS = 3
-"""Rejected trials whose pieces are kept as constraints."""
+"""Number of rejected trials whose pieces are kept as constraints."""
 CUT_REACH = 3.0
-"""Distance of such a trial at most, relative to the radius."""
+"""Largest distance of such a trial from the accepted point, relative to delta."""
 BETA = 1.0
-"""Curvature, relative to the objective, with which multipliers are determined at a point."""
+"""Curvature, relative to the objective, with which `conditions_at` determines multipliers."""
 MULTIPLIER_LIMIT = 1e3
-"""Largest multiplier that is determined at a point, relative to the objective; with 1e6 the
-programme's precision would not be enough."""
+"""Largest multiplier of `conditions_at`, relative to the objective.  With 1e6 the precision of the
+quadratic programme would not be sufficient."""
 AT_LIMIT = 1e-4
-"""Distance of a piece from its limit, in its scale, within which it counts as at its limit."""
+"""Largest distance of a piece from its limit, in its scale, at which `conditions_at` assumes it to
+be at its limit."""
 STATIONARITY_TOLERANCE = 1e-3
 """Largest entry of the Lagrangian's gradient at convergence, relative to the larger of the
 objective and its gradient."""
 TARGET_EXCESS = 1e-5
-"""How far inside its limit a requirement is aimed at, in its scale, so that rounding does not
-violate it."""
+"""Distance from its limit, in its scale, at which the solver keeps a requirement, so that rounding
+does not violate it."""
 MIN_PENALTY = 2.0
-"""rho at least, relative to the size of the objective."""
+"""Smallest rho, relative to the size of the objective."""
 LARGEST_PENALTY = 1e6
-"""rho at most, relative to the size of the objective."""
+"""Largest rho, relative to the size of the objective."""
 PENALTY_FACTOR = 10.0
 """Factor by which rho is increased."""
 CURVATURE_SOLVES = 3
-"""Subproblems with the curvature of the pieces."""
+"""Number of subproblems for one trial that contain the curvature of the pieces."""
 COLLAPSED_RADIUS = 1e-3
-"""delta below which a start ends: the model does not predict the objective even so near."""
+"""A start ends if delta is smaller, as the model does not predict the objective even so near."""
 RANGE_TOLERANCE = 1e-6
-"""Distance in z from the end of a range within which the range blocks a gain."""
+"""Largest distance in z from the end of a range at which the range blocks a gain."""
 MAX_PIECES = 200
-"""Largest number of pieces of one requirement in a subproblem; the worst are taken."""
+"""Largest number of pieces of one requirement in a subproblem, which contains the worst ones."""
 RUNS_PER_WORST = 3
-"""Where G_r is the mean of the k worst runs, this multiple of k runs is in a subproblem."""
+"""Where G_r is the mean of the k worst runs, a subproblem contains the worst RUNS_PER_WORST * k
+runs, as other runs may become the k worst ones."""
 MAX_CURVATURES = 4000
-"""Largest number of pieces of one requirement of which C_j is stored.  With the 200 of a subproblem
-only, 64 runs of two joints took 26 evaluations instead of 14."""
+"""Largest number of pieces of one requirement of which C_j is stored.  With the MAX_PIECES of a
+subproblem only, a tuning of two joints with 64 runs took 26 evaluations instead of 14."""
 
 
 # --------------------------------------------------------------------------------- the subproblem
@@ -130,6 +145,7 @@ class Step(NamedTuple):
     """The solution of a subproblem."""
 
     step: np.ndarray
+    """s, (p,)."""
     change: float
     """Predicted change of f."""
     violation: np.ndarray
@@ -143,10 +159,12 @@ class Step(NamedTuple):
 
 
 class Selected(NamedTuple):
-    """The pieces of one requirement that are constraints of a subproblem."""
+    """The m pieces of one requirement that are constraints of a subproblem."""
 
     run: np.ndarray
+    """Index of the run of each piece, (m,)."""
     piece: np.ndarray
+    """Index among all pieces of a run, (m,)."""
 
 
 def solve_subproblem(
@@ -159,7 +177,10 @@ def solve_subproblem(
     piece_gradients: np.ndarray,
     penalty: float,
 ) -> Step:
-    """The step of the subproblem above.
+    """Solves the subproblem of this module as a quadratic programme.
+
+    The columns of the programme are the step and the unknowns of each requirement.  Its rows are
+    both bounds of the step, the pieces of each requirement and the conditions of `_own_columns`.
 
     Args:
       gradient, matrix: g, (p,), and B, (p, p), positive definite.
@@ -169,6 +190,7 @@ def solve_subproblem(
       piece_gradients: a, (B, p, M).
       penalty: rho.
     """
+    # The interior-point method needs an interior, also where z is at the end of a range.
     low = np.minimum(low, -1e-12)
     high = np.maximum(high, 1e-12)
     reach = np.maximum(-low, high)
@@ -177,30 +199,21 @@ def solve_subproblem(
         _pieces_that_may_bind(constraints, r, pieces, piece_gradients, reach)
         for r in range(len(constraints.worst))
     ]
-    own_columns = [
-        _own_columns(chosen.run, k) for chosen, k in zip(selected, constraints.worst, strict=True)
-    ]
-    # The rows: both bounds of the step, and for each requirement its pieces and what `_own_columns`
-    # adds to them.
-    step_columns = [np.eye(size), -np.eye(size)]
-    limits = [high, -low]
-    for chosen, own in zip(selected, own_columns, strict=True):
-        added = len(own) - len(chosen.run)
-        gradients = piece_gradients[chosen.run, :, chosen.piece]
-        step_columns.append(np.pad(gradients, ((0, added), (0, 0))))
-        limits.append(np.pad(-pieces[chosen.run, chosen.piece] - TARGET_EXCESS, (0, added)))
+    runs_and_counts = zip(selected, constraints.worst, strict=True)
+    own_columns = [_own_columns(chosen.run, k) for chosen, k in runs_and_counts]
+    rows, limits = _rows_of_pieces(selected, own_columns, pieces, piece_gradients)
     own_block, violation_columns = _columns_of_requirements(size, own_columns, constraints)
-    A = np.hstack([np.vstack(step_columns), own_block])
+    A = np.hstack([np.vstack([np.eye(size), -np.eye(size), *rows]), own_block])
     H = block_diag(matrix, np.zeros((own_block.shape[1], own_block.shape[1])))
     c = np.zeros(A.shape[1])
     c[:size] = gradient
     c[violation_columns] = penalty
-    x, y = quadratic.solve(H, c, A, np.concatenate(limits))
+    x, y = quadratic.solve(H, c, A, np.concatenate([high, -low, *limits]))
 
     step = np.clip(x[:size], low, high)
     piece_multipliers = np.zeros_like(pieces)
     multipliers = np.zeros(len(selected))
-    row = 2 * size
+    row = 2 * size  # the first row of the pieces of requirement r
     for r, chosen in enumerate(selected):
         of_pieces = y[row : row + len(chosen.run)]
         piece_multipliers[chosen.run, chosen.piece] = of_pieces
@@ -216,11 +229,32 @@ def solve_subproblem(
     )
 
 
+def _rows_of_pieces(
+    selected: list[Selected],
+    own_columns: list[np.ndarray],
+    pieces: np.ndarray,
+    piece_gradients: np.ndarray,
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """The rows of each requirement in the columns of the step, and the right-hand sides: a_j and
+    -c_j - TARGET_EXCESS for its pieces, and zeros for the conditions on its own unknowns.
+    """
+    step_columns = []
+    limits = []
+    for chosen, own in zip(selected, own_columns, strict=True):
+        added = len(own) - len(chosen.run)
+        gradients = piece_gradients[chosen.run, :, chosen.piece]
+        step_columns.append(np.pad(gradients, ((0, added), (0, 0))))
+        limits.append(np.pad(-pieces[chosen.run, chosen.piece] - TARGET_EXCESS, (0, added)))
+    return step_columns, limits
+
+
 def _columns_of_requirements(
     size: int, own_columns: list[np.ndarray], constraints: Constraints
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The columns of all requirements' own unknowns, below zeros in the 2 p rows of the step, and
-    which columns are v_r, (R,): one and the same where the largest violation counts.
+    """The columns of the unknowns of all requirements, with zeros in the 2 p rows of the step's
+    bounds, and the index of the column of v_r, (R,).
+
+    Where only the largest excess counts, all requirements share one unknown v.
     """
     if not constraints.largest_only:
         widths = [own.shape[1] for own in own_columns]
@@ -261,14 +295,15 @@ def _pieces_that_may_bind(
     piece_gradients: np.ndarray,
     reach: np.ndarray,
 ) -> Selected:
-    """The pieces of a requirement that may become active within steps |s_i| <= reach; of many, the
-    worst.
+    """The pieces of a requirement that may become active within steps |s_i| <= reach.  Of more than
+    MAX_PIECES the worst ones are taken.
     """
     own = constraints.pieces_of(r)
     k = constraints.worst[r]
     values = pieces[:, own]
     change = np.einsum("bpm,p->bm", np.abs(piece_gradients[:, :, own]), reach)
-    # What a piece reaches at most is compared with what the largest of its run reaches at least.
+    # A piece may become the largest of its run if the largest value that it can reach is at least
+    # the smallest value that the largest piece can reach.
     threshold = np.max(values - change, axis=1, keepdims=True)
     if k == 1:
         may_bind = values + change >= np.maximum(threshold, -TARGET_EXCESS)
@@ -276,10 +311,10 @@ def _pieces_that_may_bind(
         order = np.argsort(-values[run, piece], kind="stable")[:MAX_PIECES]
         return Selected(run[order], own[piece[order]])
     may_bind = values + change >= threshold
-    from_worst = np.argsort(-np.max(values, axis=1), kind="stable")
-    may_bind[from_worst[RUNS_PER_WORST * k :]] = False
+    runs_from_worst = np.argsort(-np.max(values, axis=1), kind="stable")
+    may_bind[runs_from_worst[RUNS_PER_WORST * k :]] = False
     run, piece = np.nonzero(may_bind)
-    # A mean of k runs needs k runs: the worst piece of each run comes before all others.
+    # The mean of k runs needs pieces of k runs.  So the worst piece of each run is always selected.
     worst_of_run = np.argmax(np.where(may_bind, values, -np.inf), axis=1)
     is_further = piece != worst_of_run[run]
     count = max(MAX_PIECES, int(np.sum(~is_further)))
@@ -288,7 +323,9 @@ def _pieces_that_may_bind(
 
 
 def positive_definite(matrix: np.ndarray, scale: float) -> np.ndarray:
-    """The symmetric matrix with its eigenvalues increased to SMALLEST_EIGENVALUE * scale."""
+    """The symmetric matrix with its eigenvalues increased to SMALLEST_EIGENVALUE times the smaller
+    of `scale` and its largest eigenvalue.
+    """
     values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
     largest = max(min(scale, float(np.max(np.abs(values)))), 1e-12)
     return (vectors * np.maximum(values, SMALLEST_EIGENVALUE * largest)) @ vectors.T
@@ -298,10 +335,12 @@ def positive_definite(matrix: np.ndarray, scale: float) -> np.ndarray:
 
 
 class Point(NamedTuple):
-    """What the evaluation at one trial gave."""
+    """The loss and the pieces at one point, with their derivatives."""
 
     loss: float
+    """f."""
     gradient: np.ndarray
+    """g, (p,)."""
     matrix: np.ndarray
     """Gauss-Newton matrix N."""
     pieces: np.ndarray
@@ -311,7 +350,7 @@ class Point(NamedTuple):
 
     @staticmethod
     def of(space: SearchSpace, found: Any, start: int) -> Point:
-        """What was found for one start, in double precision."""
+        """The numbers of one start from `Derivatives` of all, in double precision."""
         gradient = np.asarray(found.gradient[start], float)
         runs = space.constraints.runs
         pieces = np.zeros((runs, 0))
@@ -338,9 +377,9 @@ class SQPState:
     """The state of one start."""
 
     z: np.ndarray
-    """The accepted point."""
+    """The accepted point, (p,)."""
     here: Point
-    """What the evaluation at z gave."""
+    """Loss, pieces and derivatives at z."""
     correction: np.ndarray
     """A."""
     piece_multipliers: np.ndarray
@@ -350,24 +389,28 @@ class SQPState:
     curvatures: np.ndarray
     """Their C_j, (len(curved), p, p)."""
     multipliers: np.ndarray
+    """Multiplier of each requirement, (R,)."""
     penalty: Any
     """rho."""
     radius: Any
     """delta."""
     trial: np.ndarray
-    """Where the next evaluation is."""
+    """The point of the next evaluation, (p,)."""
     predicted: Any
     """Decrease of the penalty function that the model predicts for the trial."""
     corrected: Any
     """Whether the trial is a second-order correction."""
     residuals: np.ndarray
+    """As `optimality.Conditions.residuals`, at z, (3,)."""
     evaluated: Any
     """Whether z has been evaluated with the present loss."""
     done: Any
+    """Whether the start has converged or cannot continue."""
     rejections: Any
     """Rejected steps since the last accepted one."""
     cut_z: np.ndarray
-    """Trials of which the pieces are also constraints, (CUTS, p); NaN where there is none."""
+    """Rejected trials of which the pieces are also constraints, (CUTS, p); NaN where there is
+    none."""
     cut_pieces: np.ndarray
     """Their e, (CUTS, B, M)."""
     cut_gradients: np.ndarray
@@ -392,11 +435,11 @@ class SQP:
     Args:
       tolerance: relative change of the loss below which a start has converged.
       starts: number of starting points; by the effort of the tuning if not given.
-      sharpenings: how often the smoothing of peaks in the objective is divided by 4, each time once
-        the starts have converged.
-      patience: steps without a better result after which the search ends.
-      radius: of the first trust region, in the coordinates z; 1, or 0.5 where several minima are
-        expected, if not given.
+      sharpenings: number of times that the smoothing of peaks in the objective is divided by 4,
+        each time after the starts have converged.
+      patience: number of steps without a better result after which a phase of the search ends.
+      radius: radius of the first trust region in the coordinates z.  If not given, it is 1, or 0.5
+        where several minima are expected.
     """
 
     tolerance: float = 1e-5
@@ -416,7 +459,7 @@ class SQP:
         """The state of each start.
 
         Raises:
-          ValueError: more runs than the memory holds, as each has a gradient for every piece.
+          ValueError: more runs than the memory holds, as each run has a gradient for every piece.
         """
         starts, size = z.shape
         constraints = space.constraints
@@ -427,6 +470,7 @@ class SQP:
         return [self._new_start(space, x, curved) for x in z]
 
     def _first_radius(self, space: SearchSpace) -> float:
+        """The option `radius`, or its default for this problem."""
         if self.radius is not None:
             return self.radius
         if space.multimodal:
@@ -434,6 +478,9 @@ class SQP:
         return INITIAL_RADIUS
 
     def _new_start(self, space: SearchSpace, z: np.ndarray, curved: int) -> SQPState:
+        """The state of a start at z, (p,), before its first evaluation; `curved` matrices C_j are
+        stored.
+        """
         size = len(z)
         runs = space.constraints.runs
         pieces = len(space.constraints.owner)
@@ -484,8 +531,8 @@ class SQP:
         return np.array([start.done for start in state], bool)
 
     def nearby_pieces(self, state: list[SQPState], z: np.ndarray, reach: float) -> list[Point]:
-        """The pieces of rejected trials within `reach` of a point, linear around them, as values
-        and gradients at the point.
+        """The pieces of all rejected trials within `reach` of a point, linearised at each trial and
+        evaluated at the point.
         """
         found = []
         for own in state:
@@ -508,7 +555,11 @@ class SQP:
 
 
 def _advance(space: SearchSpace, state: SQPState, found: Point, tolerance: float) -> None:
-    """Accepts or rejects the trial of one start, and plans the next."""
+    """Accepts or rejects the trial of one start, and determines the next one.
+
+    The first evaluation of a start, or the first one after the loss has changed, is accepted
+    without a comparison.
+    """
     valid = found.is_finite
     state.done = False
     if not state.evaluated:
@@ -525,15 +576,16 @@ def _advance(space: SearchSpace, state: SQPState, found: Point, tolerance: float
         ratio = _decrease_ratio(space, state, found)
         if _is_comparable(state, found):
             _update_curvatures(state, step, found)
-    state.rejections = 0 if ratio > RATIO_TO_ACCEPT else state.rejections + 1
+    is_accepted = ratio > RATIO_TO_ACCEPT
+    state.rejections = 0 if is_accepted else state.rejections + 1
     if state.rejections >= MOST_REJECTIONS:
-        _forget_curvatures(state)
-    if valid and not ratio > RATIO_TO_ACCEPT:
-        _keep_cut(state, found)
-    if ratio > RATIO_TO_ACCEPT:
+        _reset_curvatures(state)
+    if is_accepted:
         _accept(space, state, found)
-    elif valid and not state.corrected and _correct(space, state, step, found.pieces):
-        return
+    elif valid:
+        _keep_cut(state, found)
+        if not state.corrected and _correct(space, state, step, found.pieces):
+            return
     if ratio < RATIO_TO_SHRINK:
         state.radius = SHRINK_FACTOR * length
     elif ratio > RATIO_TO_GROW and length > 0.9 * state.radius:
@@ -542,22 +594,24 @@ def _advance(space: SearchSpace, state: SQPState, found: Point, tolerance: float
 
 
 def _is_comparable(state: SQPState, found: Point) -> bool:
-    """Whether loss and pieces of a trial are of the size of those at the accepted point."""
+    """Whether loss and pieces of a trial are of the same order of magnitude as at the accepted
+    point, so that changes of gradients are estimates of the curvature.
+    """
     worst = float(np.max(found.pieces, initial=0.0))
     largest = LARGEST_LOSS_FACTOR * (1.0 + float(np.max(state.here.pieces, initial=0.0)))
     rise = found.loss - state.here.loss
     return rise <= LARGEST_LOSS_FACTOR * state.size and worst <= largest
 
 
-def _forget_curvatures(state: SQPState) -> None:
-    """Sets A and every C_j to zero, as the model that they are part of has failed repeatedly."""
+def _reset_curvatures(state: SQPState) -> None:
+    """Sets A and every C_j to zero, because their model has failed repeatedly."""
     state.correction[:] = 0.0
     state.curvatures[:] = 0.0
     state.rejections = 0
 
 
 def _merit(space: SearchSpace, state: SQPState, loss: float, pieces: np.ndarray) -> float:
-    """The exact penalty function."""
+    """The exact penalty function, with each requirement TARGET_EXCESS inside of its limit."""
     excess = space.constraints.excess(pieces) + TARGET_EXCESS
     return loss + state.penalty * space.constraints.violation(excess)
 
@@ -571,7 +625,11 @@ def _decrease_ratio(space: SearchSpace, state: SQPState, found: Point) -> float:
 
 
 def _accept(space: SearchSpace, state: SQPState, found: Point) -> None:
-    """Moves to the trial; curvatures of pieces that are no longer among the worst are dropped."""
+    """Makes the trial the accepted point.
+
+    The C_j of pieces that are no longer among the worst ones are dropped, and those of new ones are
+    zero.
+    """
     state.z = state.trial.copy()
     state.here = found
     curved = _worst_pieces(space.constraints, found.pieces)
@@ -603,9 +661,9 @@ def _worst_pieces(constraints: Constraints, pieces: np.ndarray) -> np.ndarray:
 def _solve(space: SearchSpace, state: SQPState, pieces: np.ndarray, penalty: float) -> Step:
     """The subproblem at the accepted point, with `pieces` as c."""
     multipliers = state.piece_multipliers.ravel()[state.curved]
-    of_pieces = np.einsum("k,kpq->pq", multipliers, state.curvatures)
+    curvature_of_pieces = np.einsum("k,kpq->pq", multipliers, state.curvatures)
     scale = float(np.linalg.norm(state.here.matrix, 2))
-    matrix = positive_definite(state.here.matrix + state.correction + of_pieces, scale)
+    matrix = positive_definite(state.here.matrix + state.correction + curvature_of_pieces, scale)
     low = np.maximum(space.box.low - state.z, -state.radius)
     high = np.minimum(space.box.high - state.z, state.radius)
     cuts = _near_cuts(state)
@@ -620,26 +678,29 @@ def _solve(space: SearchSpace, state: SQPState, pieces: np.ndarray, penalty: flo
         np.concatenate([state.here.piece_gradients, *state.cut_gradients[cuts]], axis=2),
         penalty,
     )
+    # A piece and its copies from rejected trials are one constraint, which has one multiplier.
     by_point = found.piece_multipliers.reshape(len(pieces), 1 + len(cuts), -1)
     return found._replace(piece_multipliers=by_point.sum(axis=1))
 
 
 def _near_cuts(state: SQPState) -> list[int]:
-    """The rejected trials that are within reach of the trust region."""
+    """Indices of the rejected trials within CUT_REACH radii of the accepted point."""
     distance = np.max(np.abs(state.cut_z - state.z), axis=1)
     return np.flatnonzero((distance > 0) & (distance <= CUT_REACH * state.radius)).tolist()
 
 
 def _cut_values(state: SQPState, c: int) -> np.ndarray:
-    """The linear models of the pieces from a rejected trial, at the accepted point, (B, M); lowered
-    where they are above the pieces there, which a concave piece is.
+    """The pieces of a rejected trial, linearised there and evaluated at the accepted point, (B, M).
+
+    The linear model of a concave piece is above the piece itself.  It is lowered to the piece, so
+    that the accepted point does not seem to violate it.
     """
     change = np.einsum("p,bpm->bm", state.z - state.cut_z[c], state.cut_gradients[c])
     return np.minimum(state.cut_pieces[c] + change, state.here.pieces)
 
 
 def _keep_cut(state: SQPState, found: Point) -> None:
-    """Keeps the pieces of a rejected trial; the oldest ones are dropped."""
+    """Stores the pieces of a rejected trial in place of the oldest ones."""
     new = (state.trial, found.pieces, found.piece_gradients)
     kept = (state.cut_z, state.cut_pieces, state.cut_gradients)
     for stored, x in zip(kept, new, strict=True):
@@ -659,11 +720,13 @@ def _predicted_decrease(space: SearchSpace, state: SQPState, step: np.ndarray) -
 
 
 def _with_penalty(space: SearchSpace, state: SQPState) -> tuple[Step, float]:
-    """The step and rho, which is increased as long as that reduces the predicted violation."""
+    """The step of the subproblem and rho, which is increased as long as that reduces the predicted
+    violation.
+    """
     size = state.size
     largest = LARGEST_PENALTY * size
-    twice = 2.0 * float(np.max(state.multipliers, initial=0.0))
-    penalty = min(max(twice, MIN_PENALTY * size), largest)
+    smallest = max(2.0 * float(np.max(state.multipliers, initial=0.0)), MIN_PENALTY * size)
+    penalty = min(smallest, largest)
     total = space.constraints.violation
     found = _solve(space, state, state.here.pieces, penalty)
     while total(found.violation) > TARGET_EXCESS and penalty < largest:
@@ -676,7 +739,7 @@ def _with_penalty(space: SearchSpace, state: SQPState) -> tuple[Step, float]:
 
 
 def _plan(space: SearchSpace, state: SQPState, tolerance: float) -> None:
-    """Plans the next trial of one start, or ends it."""
+    """Determines the next trial of one start, or ends the start."""
     found, penalty = _with_penalty(space, state)
     state.penalty = penalty
     predicted_violation = space.constraints.violation(found.violation)
@@ -691,6 +754,7 @@ def _plan(space: SearchSpace, state: SQPState, tolerance: float) -> None:
     linear_decrease = -found.change + state.penalty * reduction
     step, decrease = _best_with_curvature(space, state, found, penalty)
     state.trial = np.clip(state.z + step, space.box.low, space.box.high)
+    # The quadratic models are used unless their prediction is far below that of the linear pieces.
     state.predicted = linear_decrease
     if decrease > 0.1 * linear_decrease:
         state.predicted = decrease
@@ -711,7 +775,9 @@ def _plan(space: SearchSpace, state: SQPState, tolerance: float) -> None:
 def _best_with_curvature(
     space: SearchSpace, state: SQPState, found: Step, penalty: float
 ) -> tuple[np.ndarray, float]:
-    """Of the steps of all rounds, the one with the largest predicted decrease, and the decrease."""
+    """The step with the largest predicted decrease, and the decrease, among the given step and
+    CURVATURE_SOLVES steps of subproblems with the curvature of the pieces.
+    """
     best = found.step
     decrease = _predicted_decrease(space, state, best)
     if not state.here.pieces.size:
@@ -727,8 +793,8 @@ def _best_with_curvature(
 
 
 def slope_size(here: Point) -> float:
-    """What the gradient of the Lagrangian is compared with: the larger of the objective and its
-    gradient.
+    """The larger of the objective and the largest entry of its gradient.  The gradient of the
+    Lagrangian counts as zero if it is small relative to this number.
     """
     return max(1e-3, abs(here.loss), float(np.max(np.abs(here.gradient))))
 
@@ -743,7 +809,9 @@ def free_slope(box: Box, z: np.ndarray, slope: np.ndarray) -> float:
 def with_nearby_pieces(
     space: SearchSpace, found: Point, nearby: list[Point]
 ) -> tuple[SearchSpace, Point]:
-    """A point whose pieces are its own and those of nearby points, none above its own."""
+    """A point with its own pieces and those of nearby points as further pieces of the same
+    requirements.  A further piece is lowered to the point's own where it is above it.
+    """
     pieces = [found.pieces, *(np.minimum(x.pieces, found.pieces) for x in nearby)]
     gradients = [found.piece_gradients, *(x.piece_gradients for x in nearby)]
     owner = np.tile(space.constraints.owner, len(pieces))
@@ -757,13 +825,13 @@ def conditions_at(space: SearchSpace, z: np.ndarray, found: Point) -> tuple[np.n
     """Multipliers of each requirement, (R,), and residuals of the optimality conditions, (3,), at
     any point z.
 
-    They are those of the subproblem with a matrix of BETA |f|,
+    The multipliers are those of the subproblem with the matrix BETA |f| I.  Its dual problem is
 
         minimise over y >= 0    |g + sum_j y_j a_j|^2 / (2 BETA |f|) - sum_j y_j e_j,
 
-    so that a multiplier is not zero only where the piece is at its limit.  Where the largest
-    violation alone counts, f is left out, the multipliers add up to 1, and the limit is the largest
-    excess itself.
+    in which a piece has a multiplier only if it is at its limit.  Where only the largest excess
+    counts, f is omitted, the multipliers add up to 1, and a piece is at its limit if its excess is
+    the largest one.
     """
     size = max(1e-3, abs(found.loss))
     penalty = MULTIPLIER_LIMIT * size
@@ -790,8 +858,8 @@ def conditions_at(space: SearchSpace, z: np.ndarray, found: Point) -> tuple[np.n
 def _residuals(
     space: SearchSpace, z: np.ndarray, pieces: np.ndarray, found: Step, excess: np.ndarray
 ) -> np.ndarray:
-    """The largest entry of the Lagrangian's gradient that no range blocks, the largest excess, and
-    the complementarity, (3,).
+    """The residuals of `optimality.Conditions`, (3,): stationarity, largest excess and
+    complementarity.
     """
     stationarity = free_slope(space.box, z, found.lagrangian)
     products = np.sum(found.piece_multipliers * pieces, axis=0)
@@ -803,7 +871,9 @@ def _residuals(
 
 
 def _correct(space: SearchSpace, state: SQPState, step: np.ndarray, pieces: np.ndarray) -> bool:
-    """Plans the second-order correction of a rejected step; whether it differs from the step."""
+    """Makes the second-order correction of a rejected step the next trial; returns whether it
+    differs from the rejected one.
+    """
     if not len(space.constraints.owner):
         return False
     found = _solve(space, state, pieces - state.here.linear_change(step), state.penalty)
@@ -822,13 +892,14 @@ def _update_curvatures(state: SQPState, step: np.ndarray, found: Point) -> None:
 
 
 def _rank_one_update(matrix: np.ndarray, change: np.ndarray, step: np.ndarray) -> None:
-    """Makes matrix @ step the change of a gradient, (..., p), where that is well determined; in
-    place.
+    """Updates matrices, (..., p, p), in place, so that matrix @ step is the change of a gradient,
+    (..., p).  A matrix whose denominator r.s is too small is not updated.
     """
     error = change - matrix @ step
     along = error @ step
     scale = np.linalg.norm(error, axis=-1) * np.linalg.norm(step)
-    fine = np.abs(along) > 1e-8 * scale
-    inverse = np.where(fine, 1 / np.where(fine, np.abs(along), 1.0), 0.0)
+    is_determined = np.abs(along) > 1e-8 * scale
+    denominator = np.where(is_determined, np.abs(along), 1.0)
+    inverse = np.where(is_determined, 1 / denominator, 0.0)
     error *= np.sqrt(inverse)[..., None]
     matrix += np.sign(along)[..., None, None] * error[..., :, None] * error[..., None, :]
