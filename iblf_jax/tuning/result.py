@@ -102,9 +102,9 @@ class TuneResult:
     names: tuple[str, ...]
     """Name of each coordinate, (p,)."""
     history: dict[str, np.ndarray]
-    """Numbers of each step, (steps, starts, ...), the best start first: loss, objective, terms, excess of the
-    requirements, margin [rad], gradient_norm, valid, z and x (the trial, in coordinates and in the
-    units of the gains); evaluations is (steps,).
+    """Numbers of each step, (steps, starts, ...), the best start first: loss, objective, terms,
+    excess of the requirements, margin [rad], gradient_norm, valid, z and x (the trial, in
+    coordinates and in the units of the gains); evaluations is (steps,).
 
     With requirements there may be more rows than starts, as a later phase may begin at more points.
     A row that takes no step is invalid there.  The second search uses the first two rows."""
