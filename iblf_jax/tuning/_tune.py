@@ -322,7 +322,7 @@ def _tried(search: Search) -> tuple[str, ...]:
             f" up to {REPAIR_STARTS} points, {how}: {least:.3g}"
         )
     elif phase == SECOND_SEARCH:
-        lines.append("a second search followed, from the best gains and from another valley")
+        lines.append("a second search followed, from the best gains and, if any, another valley")
     return tuple(lines)
 
 

@@ -142,7 +142,7 @@ class Verdict:
 
     def _sensitivity_in_words(self) -> str:
         multiplier = self.multiplier
-        if multiplier is None or self.verdict == "fail" or not multiplier > 0:
+        if multiplier is None or self.verdict == "fail" or not multiplier > LEAST_MULTIPLIER:
             return ""
         change = f"{multiplier:.3g} for each {self.unit} that the limit is"
         if self.unit == OF_LIMIT:
@@ -150,6 +150,8 @@ class Verdict:
         return f"; the objective would fall by {change} loosened by"
 
 
+LEAST_MULTIPLIER = 1e-6
+"""Smallest change of the objective by a unit of a limit that the report mentions."""
 WORST_FIRST = ("fail", "undecided", "pass")
 """Verdicts in the order of a report."""
 
