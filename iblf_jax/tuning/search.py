@@ -58,8 +58,8 @@ from iblf_jax.tuning.optimality import Conditions, conditions, conditions_of_pen
 from iblf_jax.tuning.parameters import along
 from iblf_jax.tuning.problem import FIRST_PENALTY
 from iblf_jax.tuning.solvers import SQP, SearchSpace, Solver
+from iblf_jax.tuning.solvers._base import EXCESS_WEIGHT, violations
 from iblf_jax.tuning.starts import (
-    EXCESS_WEIGHT,
     FEW_POINTS,
     Screening,
     distinct,
@@ -159,6 +159,8 @@ class Search:
         starts = len(z)
         requirements = len(evaluate.problem.allowed)
         self.history: dict[str, list[np.ndarray]] = {}
+        self.last_conditions: tuple[int, Conditions] | None = None
+        """The number of steps before the conditions were determined, and the conditions."""
         self.state: dict[str, Any] = {
             "solver": solver.init(evaluate.space, z),
             "iteration": np.asarray(0),
@@ -210,8 +212,9 @@ class Search:
         incumbent where one of them is better.
         """
         self.state["plain_values"] = self.state["plain_values"] + len(z)
+        keys = _keys(found)
         for i in np.flatnonzero(found.valid).tolist():
-            self._consider(z[i], _key(found, i))
+            self._consider(z[i], keys[i])
 
     def _consider(self, z: np.ndarray, key: tuple[float, float]) -> None:
         """Replaces the incumbent by a point, (p,), where that is better."""
@@ -296,6 +299,15 @@ class Search:
             self.evaluate.values(others)
 
     def conditions(self) -> Conditions:
+        """The optimality conditions at the incumbent, which is evaluated once more; determined once
+        if no step follows.
+        """
+        iteration = int(self.state["iteration"])
+        if self.last_conditions is None or self.last_conditions[0] != iteration:
+            self.last_conditions = iteration, self._conditions()
+        return self.last_conditions[1]
+
+    def _conditions(self) -> Conditions:
         """The optimality conditions at the incumbent, which is evaluated once more.
 
         The incumbent may be a trial that is better than the point where a nearby start converged
@@ -307,7 +319,7 @@ class Search:
         found = self._derivatives_at(row, z)
         if self._is_as_good(found.value, row):
             state["incumbent_z"] = np.array(z)
-            state["incumbent_key"] = np.array(_key(found.value, row))
+            state["incumbent_key"] = np.array(_keys(found.value)[row])
         elif not np.array_equal(z, state["incumbent_z"]):
             z = state["incumbent_z"]
             found = self._derivatives_at(row, z)
@@ -343,7 +355,7 @@ class Search:
         """Whether a point is as good as the incumbent, up to the tolerance of the solver."""
         if not found.valid[row]:
             return False
-        violation, objective = _key(found, row)
+        violation, objective = _keys(found)[row]
         least, best = self.state["incumbent_key"]
         small = self.solver.tolerance * max(1e-3, abs(float(best)))
         return violation <= least and objective <= best + small
@@ -555,8 +567,9 @@ class Search:
         state = self.state
         tolerance = self.solver.tolerance
         improved = False
+        keys = _keys(found.value)
         for s in np.flatnonzero(found.value.valid).tolist():
-            key = _key(found.value, s)
+            key = keys[s]
             self._consider(z[s], key)
             if not np.isfinite(key[1]) or key >= tuple(state["best_key"][s]):
                 continue
@@ -621,12 +634,11 @@ def _joined(first: Any, second: Any) -> Any:
     return jax.tree.map(lambda x, y: np.concatenate([x, y]), first, second)
 
 
-def _key(found: Value, row: int) -> tuple[float, float]:
-    """What points are compared by, in this order: the violation, which is the largest excess of a
-    requirement or bound, and the objective.
+def _keys(found: Value) -> list[tuple[float, float]]:
+    """What each point is compared by, in this order: the violation, which is the largest excess of
+    a requirement or bound, and the objective.
     """
-    excess = float(np.max(found.exact_excess[row], initial=0.0))
-    return max(excess, -float(found.margin[row]), 0.0), float(found.objective[row])
+    return list(zip(violations(found).tolist(), found.objective.tolist(), strict=True))
 
 
 class ExcessOnly:

@@ -33,6 +33,7 @@ import numpy as np
 from iblf_jax.tuning.evaluation import Value, values
 from iblf_jax.tuning.parameters import Box
 from iblf_jax.tuning.problem import TuningProblem
+from iblf_jax.tuning.solvers._base import EXCESS_WEIGHT, violations
 
 NEAR = 1.0
 """Half-width of the box of the near points, in the coordinates z: a factor e for gains."""
@@ -41,9 +42,6 @@ FAR = 3.0
 MIN_DISTANCE = 1.0
 """Smallest distance of two starts in the coordinate z in which they differ most; smaller where a
 range is narrow."""
-EXCESS_WEIGHT = 200.0
-"""Weight of the largest excess in the merit.  With a weight of 5, six of eight searches of a
-problem of nine gains began, and ended, in regions where the requirements cannot be kept."""
 MAX_SCREENED_RUNS = 50_000
 """Largest number of runs in a screening; with many runs for each point there are fewer points."""
 FEW_POINTS = 32
@@ -63,14 +61,6 @@ class Screening(NamedTuple):
     """The largest excess of a requirement or bound, (N,); infinite where a run is invalid."""
 
 
-def largest_excess(found: Value) -> np.ndarray:
-    """The largest excess at each point, of requirements in their scales and of bounds in rad,
-    (N,).
-    """
-    excess = np.max(np.maximum(found.exact_excess, 0.0), axis=1, initial=0.0)
-    return np.maximum(excess, np.maximum(-found.margin, 0.0))
-
-
 def screen(problem: TuningProblem, count: int, seed: int) -> Screening:
     """Evaluates the scenario's gains, the first point, and `count` further points."""
     points = problem.box.z[None]
@@ -81,7 +71,7 @@ def screen(problem: TuningProblem, count: int, seed: int) -> Screening:
 
 def ranked(points: np.ndarray, found: Value) -> Screening:
     """Points with their merit, which is relative to the objective of the first valid point."""
-    excess = largest_excess(found)
+    excess = violations(found)
     usable = found.valid & np.isfinite(found.objective) & np.isfinite(excess)
     size = 1.0
     if np.any(usable):

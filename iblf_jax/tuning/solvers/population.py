@@ -3,7 +3,7 @@
 One step is one generation, whose points are evaluated in one batch.  The loss contains requirements
 and bounds as an exact penalty,
 
-    f / |f0| + PENALTY max(0, max_r G_r, -margin),
+    f / |f0| + EXCESS_WEIGHT max(0, max_r G_r, -margin),
 
 where f0 is the objective at the start, or at the first valid point if the start is invalid.  Where
 a run is invalid the loss is INVALID_LOSS.
@@ -23,10 +23,8 @@ from typing import Any, ClassVar, NamedTuple
 import jax
 import numpy as np
 
-from iblf_jax.tuning.solvers._base import SearchSpace
+from iblf_jax.tuning.solvers._base import EXCESS_WEIGHT, SearchSpace, violations
 
-PENALTY = 200.0
-"""Weight of the largest excess in the loss; equal to `starts.EXCESS_WEIGHT`."""
 INVALID_LOSS = 1e6
 BATCHES_IN_FIRST_STEP = 2
 """Largest number of populations in the first step: a library may evaluate an initial population
@@ -201,14 +199,8 @@ def _losses(
         first = -1 if valid[-1] else int(np.argmax(valid))  # the start is the last point
         own.reference = np.asarray(max(abs(float(found.objective[first])), 1e-12))
     with np.errstate(invalid="ignore"):
-        losses = found.objective / own.reference + PENALTY * violation(found)
+        losses = found.objective / own.reference + EXCESS_WEIGHT * violations(found)
     return np.where(valid, np.nan_to_num(losses, nan=INVALID_LOSS), INVALID_LOSS)[: len(points)]
-
-
-def violation(value: Any) -> np.ndarray:
-    """The largest excess of a requirement or bound at each point, (N,)."""
-    excess = np.max(value.exact_excess, axis=1, initial=0.0)
-    return np.maximum(excess, -value.margin)
 
 
 def _best_of(seen: list[tuple[np.ndarray, Any]]) -> tuple[np.ndarray, Values]:
@@ -219,7 +211,7 @@ def _best_of(seen: list[tuple[np.ndarray, Any]]) -> tuple[np.ndarray, Values]:
     points = np.concatenate([batch for batch, _ in seen])
     value = jax.tree.map(lambda *x: np.concatenate(x), *(found for _, found in seen))
     objective = np.where(value.valid, value.objective, np.inf)
-    excess = np.where(value.valid, violation(value), np.inf)
+    excess = np.where(value.valid, violations(value), np.inf)
     best = int(np.lexsort((objective, excess))[0])
     one = jax.tree.map(lambda x: x[best : best + 1], value)
     size = points.shape[1]

@@ -19,9 +19,10 @@ from __future__ import annotations
 from collections import OrderedDict
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
-from iblf_jax.tuning.solvers._base import SearchSpace
+from iblf_jax.tuning.solvers._base import SearchSpace, violations
 from iblf_jax.tuning.solvers.sqp import MAX_PIECES, TARGET_EXCESS
 
 INVALID_OBJECTIVE = 1e3
@@ -159,8 +160,7 @@ class Programme:
         s = self.start
         if not value.valid[s]:
             return np.inf, np.inf
-        excess = np.max(value.exact_excess[s], initial=0.0)
-        return max(float(excess), -float(value.margin[s]), 0.0), float(value.loss[s])
+        return float(violations(value)[s]), float(value.loss[s])
 
     def _row_of(self, found: Any) -> Row:
         """The numbers of this start from `Derivatives` of all starts."""
@@ -288,10 +288,10 @@ class RunsToItsEnd:
 
 def _with_row(tree: Any, other: Any, row: int) -> Any:
     """Derivatives of several starts in which one row is replaced by that of `other`."""
-    if isinstance(tree, tuple) and hasattr(tree, "_fields"):
-        return type(tree)(*(_with_row(x, y, row) for x, y in zip(tree, other, strict=True)))
-    if isinstance(tree, tuple):
-        return tree
-    joined = np.array(tree)
-    joined[row] = other[row]
-    return joined
+
+    def replaced(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        joined = np.array(x)
+        joined[row] = y[row]
+        return joined
+
+    return jax.tree.map(replaced, tree, other)
