@@ -267,7 +267,11 @@ def _is_number_like(value: Any, depth: int = 0) -> bool:
     return isinstance(value, numbers.Number | np.ndarray | np.generic | jax.Array)
 
 
-MAX_AXES = {"scalar": (0, "one number"), "joint": (1, "one number, or one a joint, (n,)")}
+MAX_AXES = {
+    "scalar": (0, "one number"),
+    "joint": (1, "one number, or one a joint, (n,)"),
+    "level": (2, "one number a level, or one a level and joint, (m, n)"),
+}
 """Shape of a leaf -> largest number of its axes, and what is expected."""
 
 
@@ -290,6 +294,8 @@ def as_leaf(owner: str, field: dataclasses.Field, value: Any) -> Any:
         if declared:
             raise fail(name, value, expected)
         return value
+    if declared and field.metadata["shape"] == "level":
+        value = _with_equal_rows(name, value)
     array = as_floats(name, value)
     if declared:
         shape = f"Its shape is {array.shape}."
@@ -300,6 +306,21 @@ def as_leaf(owner: str, field: dataclasses.Field, value: Any) -> Any:
             raise fail(name, value, expected, shape)
     check_values(name, array, field.metadata.get("sign"))
     return array
+
+
+def _with_equal_rows(name: str, value: Any) -> Any:
+    """The rows of a leaf of the shape "level", where some are single numbers and some have one
+    number a joint: each with one number a joint.
+    """
+    if not isinstance(value, tuple | list):
+        return value
+    rows = [as_floats(f"{name}[{i}]", row) for i, row in enumerate(value)]
+    try:
+        shape = np.broadcast_shapes(*[row.shape for row in rows])
+    except ValueError:
+        got = [row.shape for row in rows]
+        raise fail(name, got, "rows of one number, or of one a joint each") from None
+    return jnp.stack([jnp.broadcast_to(row, shape) for row in rows])
 
 
 def as_floats(name: str, value: Any) -> jax.Array:

@@ -99,6 +99,44 @@ def _solve_spd_jvp(primals, tangents):
     return x, solve_spd(matrix, rhs_dot - matvec(matrix_dot, x))
 
 
+@jax.custom_jvp
+def solve_gain(matrix: jax.Array, rhs: jax.Array) -> jax.Array:
+    """The solution x of matrix x = rhs, (n,), for any (n, n) matrix, unrolled, with partial
+    pivoting.
+
+    A singular matrix gives NaN. The derivative is that of the equation, as that of `solve_spd`.
+    """
+    n = len(rhs)
+    smallest = jnp.finfo(matrix.dtype).eps * jnp.max(jnp.abs(matrix))
+    rows = [[*[matrix[i, j] for j in range(n)], rhs[i]] for i in range(n)]
+    for k in range(n):
+        for i in range(k + 1, n):
+            larger = jnp.abs(rows[i][k]) > jnp.abs(rows[k][k])
+            upper = [jnp.where(larger, b, a) for a, b in zip(rows[k], rows[i], strict=True)]
+            lower = [jnp.where(larger, a, b) for a, b in zip(rows[k], rows[i], strict=True)]
+            rows[k], rows[i] = upper, lower
+        pivot = rows[k][k]
+        inverse = 1.0 / jnp.where(jnp.abs(pivot) > smallest, pivot, jnp.nan)
+        rows[k] = [x * inverse for x in rows[k]]
+        for i in range(k + 1, n):
+            factor = rows[i][k]
+            rows[i] = [b - factor * a for a, b in zip(rows[k], rows[i], strict=True)]
+    x: list[jax.Array] = [jnp.zeros(())] * n
+    for i in reversed(range(n)):
+        rest = rows[i][n]
+        for j in range(i + 1, n):
+            rest = rest - rows[i][j] * x[j]
+        x[i] = rest
+    return jnp.stack(x)
+
+
+@solve_gain.defjvp
+def _solve_gain_jvp(primals, tangents):
+    (matrix, rhs), (matrix_dot, rhs_dot) = primals, tangents
+    x = solve_gain(matrix, rhs)
+    return x, solve_gain(matrix, rhs_dot - matvec(matrix_dot, x))
+
+
 def solve(matrix: jax.Array, rhs: jax.Array) -> jax.Array:
     """The solution X of matrix X = rhs, (m, k), for any (m, m) matrix, by Gauss-Jordan elimination
     with pivoting.

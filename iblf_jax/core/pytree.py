@@ -50,8 +50,9 @@ def leaf(
       unit: SI unit for tables and axes, such as "kg m^2" ("1" for a pure number).
       sign: None, "positive" or "nonnegative"; "limit" or "positive limit" for what may be infinite,
         because there is no limit. Checked at construction and at the entry points.
-      shape: "joint" for one number a joint, (n,), where a scalar is repeated; "scalar" for ();
-        "any" for neither.
+      shape: "joint" for one number a joint, (n,), where a scalar is repeated; "level" for m rows of
+        one number a joint, (m, n), where a scalar in a row is repeated; "scalar" for (); "any" for
+        neither.
       default: the value if none is given.
     """
     metadata = {"unit": unit, "sign": sign, "shape": shape, "leaf": True}

@@ -64,8 +64,19 @@ class Status(enum.IntFlag):
     nearly infinite at one of the sampled instants.  Examples: |e2|^a sign(e2) with a < 1 at e2 = 0,
     and sharp dry friction at a reversal."""
 
+    STATE_BOUND_VIOLATED = 32768
+    """A level of the state, from the third on, touched or left its bound."""
+    SINGULAR_GAIN = 65536
+    """The input of the law was not finite: the gain of a level was singular, or a term of the law
+    had no value there."""
 
-VIOLATED = Status.BOUND_VIOLATED | Status.VELOCITY_VIOLATED | Status.REGION_VIOLATED
+
+VIOLATED = (
+    Status.BOUND_VIOLATED
+    | Status.VELOCITY_VIOLATED
+    | Status.REGION_VIOLATED
+    | Status.STATE_BOUND_VIOLATED
+)
 """The flags of violated constraints."""
 
 FAILED = (
@@ -74,6 +85,7 @@ FAILED = (
     | Status.STEP_TOO_LARGE
     | Status.INFEASIBLE_REFERENCE
     | Status.INADMISSIBLE_DRAW
+    | Status.SINGULAR_GAIN
 )
 """The flags of a failed run."""
 
@@ -101,6 +113,8 @@ WORDS = {
     Status.INFINITE_SLOPE: (
         "a derivative of the loop is infinite, or nearly so, at an isolated instant"
     ),
+    Status.STATE_BOUND_VIOLATED: "a bound of a level above the second was violated",
+    Status.SINGULAR_GAIN: "the law's input was not finite: a level's gain was singular",
     Status.ALPHA_INFEASIBLE: "the virtual velocity left the velocity bounds",
 }
 """The text of each flag, in the order in which `describe` lists them."""

@@ -5,12 +5,12 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.core.status import VELOCITY_LIMIT, Status, flag
+from iblf_jax.core.status import Status, flag
 from iblf_jax.simulation.closed_loop import (
     LoopState,
     integrated_part,
 )
-from iblf_jax.simulation.signals import Sample, has, speed_margin
+from iblf_jax.simulation.signals import Sample, has, level_margin, speed_margin
 from iblf_jax.world.bounds import NARROWEST
 
 
@@ -30,6 +30,8 @@ def sample_status(sample: Sample) -> jax.Array:
     for slack in (sample.slack, sample.region_slack):
         if not isinstance(slack, tuple):
             found |= flag(jnp.any(slack > 0), Status.FILTER_INFEASIBLE)
+    if has(sample, "higher"):
+        found |= _level_flags(sample)
     if has(sample, "region_margin"):
         found |= flag(jnp.any(~(sample.region_margin > 0)), Status.REGION_VIOLATED)
     if not has(sample, "dq_lower"):
@@ -40,8 +42,23 @@ def sample_status(sample: Sample) -> jax.Array:
     )
 
 
-def is_valid(state: LoopState) -> jax.Array:
-    """Whether a state is finite and slow enough to be a robot's, () bool."""
-    slow = jnp.all(jnp.abs(state.dq) < VELOCITY_LIMIT)
+def _level_flags(sample: Sample) -> jax.Array:
+    """The flags of the levels from the third on, and of an input that has no value."""
+    found = flag(jnp.any(~jnp.isfinite(sample.tau)), Status.SINGULAR_GAIN)
+    if not has(sample, "higher_lower"):
+        return found
+    violated = ~(level_margin(sample, sample.higher) > 0)
+    found |= flag(jnp.any(violated), Status.STATE_BOUND_VIOLATED)
+    if not has(sample, "e_higher"):
+        return found
+    alphas = sample.higher - sample.e_higher
+    return found | flag(
+        jnp.any(~(level_margin(sample, alphas) > NARROWEST)), Status.ALPHA_INFEASIBLE
+    )
+
+
+def is_valid(state: LoopState, limit: float) -> jax.Array:
+    """Whether a state is finite, and its second level below a limit, () bool."""
+    slow = jnp.all(jnp.abs(state.dq) < limit)
     others = jax.tree.leaves((state.q, integrated_part(state)[2:]))
     return jnp.all(jnp.stack([slow, *(jnp.all(jnp.isfinite(x)) for x in others)]))

@@ -43,6 +43,7 @@ import jax.numpy as jnp
 from iblf_jax.control.controllers._base import switching_functions
 from iblf_jax.simulation.closed_loop import LoopState
 from iblf_jax.simulation.integrators import StepResult, stage_states, tableau
+from iblf_jax.simulation.levels import law_state
 from iblf_jax.simulation.scenario import Scenario
 
 SURFACE_CLEARANCE = 1e-4
@@ -139,7 +140,8 @@ def surfaces(scenario: Scenario, t: jax.Array, state: LoopState) -> jax.Array | 
     not jump.
     """
     law, context = scenario.controller, scenario.context
-    return switching_functions(law, t, state.q, state.dq, context, state.controller)
+    measured = law_state(scenario, state.q, state.dq, state.higher)
+    return switching_functions(law, t, *measured, context, state.controller)
 
 
 def with_hybrid_derivative(
@@ -390,15 +392,17 @@ def _on_its_side(
     """The state, moved to the given side of every surface, at least as far as the clearance."""
     fixed: Any = jax.lax.stop_gradient((scenario, t, state))
 
-    def functions(q, dq):
-        return surfaces(fixed[0], fixed[1], fixed[2]._replace(q=q, dq=dq))
+    def functions(q, dq, higher):
+        return surfaces(fixed[0], fixed[1], fixed[2]._replace(q=q, dq=dq, higher=higher))
 
-    g, pull = jax.vjp(functions, fixed[2].q, fixed[2].dq)
+    g, pull = jax.vjp(functions, fixed[2].q, fixed[2].dq, fixed[2].higher)
     missing = jnp.where(above, jnp.maximum(clearance - g, 0.0), jnp.minimum(-clearance - g, 0.0))
-    q, dq = state.q, state.dq
+    levels = state.q, state.dq, state.higher
     for i, unit in enumerate(jnp.eye(g.size, dtype=g.dtype)):
-        by_q, by_dq = pull(unit)
-        square = jnp.sum(by_q**2) + jnp.sum(by_dq**2)
+        slopes = pull(unit)
+        squares = [jnp.sum(x**2) for x in jax.tree.leaves(slopes)]
+        square = sum(squares[1:], squares[0])
         step = jnp.where(square > 0, missing[i], 0.0) / jnp.where(square > 0, square, 1.0)
-        q, dq = q + step * by_q, dq + step * by_dq
-    return state._replace(q=q, dq=dq)
+        levels = jax.tree.map(lambda x, slope, step=step: x + step * slope, levels, slopes)
+    q, dq, higher = levels
+    return state._replace(q=q, dq=dq, higher=higher)

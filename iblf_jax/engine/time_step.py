@@ -42,6 +42,7 @@ from iblf_jax.simulation.closed_loop import (
 )
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import SIGNALS, Sample
+from iblf_jax.world import plants
 
 
 @dataclasses.dataclass(frozen=True)
@@ -187,7 +188,8 @@ def _concluded(
     status = carry.status | sample_status(sample)
     if raised is not None:
         status = status | raised
-    valid = is_valid(after) & (status & int(Status.NOT_FINITE) == 0)
+    limit = plants.speed_limit(inputs.scenario.plant)
+    valid = is_valid(after, limit) & (status & int(Status.NOT_FINITE) == 0)
     status |= flag(~valid & goes_on, Status.NOT_FINITE)
     return keep_if(valid & goes_on, after, before), status, nearest, estimate
 

@@ -23,7 +23,7 @@ from iblf_jax.core import checks, notices
 from iblf_jax.core.pytree import astype
 from iblf_jax.identification.coordinates import Coordinates, coordinates, drive_limit, scales
 from iblf_jax.identification.replay import LeafSlice, inverse_dynamics
-from iblf_jax.simulation.closed_loop import torque_needed
+from iblf_jax.simulation.levels import torque_needed
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.world.references import WaypointSpline
 from iblf_jax.world.robots._base import robot_member

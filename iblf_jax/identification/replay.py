@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.simulation import integrators
-from iblf_jax.simulation.closed_loop import acceleration, torque_needed
+from iblf_jax.simulation.levels import acceleration, torque_needed
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.world.robots import at_time

@@ -28,19 +28,34 @@ import jax.numpy as jnp
 from iblf_jax.control.actuators import Ideal
 from iblf_jax.control.actuators._base import unlimited
 from iblf_jax.control.controllers import Command
-from iblf_jax.control.controllers._base import law_member
+from iblf_jax.control.controllers._base import law_member, state_of_levels
 from iblf_jax.control.observers._base import observer_member
 from iblf_jax.control.sensors import Measurement
 from iblf_jax.control.sensors._base import unrounded
-from iblf_jax.core.linalg import inner, matvec, solve_spd
+from iblf_jax.core.linalg import inner, matvec
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.time import as_at
+from iblf_jax.simulation.levels import (
+    Motion,
+    estimate_as_rates,
+    law_state,
+    model_state,
+    motion,
+    observer_arguments,
+    observer_estimate,
+    observer_initial,
+    sensor_state,
+    start_levels,
+    steady_input,
+    uncertain_term,
+)
 from iblf_jax.simulation.noise import normals
 from iblf_jax.simulation.sampling import Instant
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import Sample
+from iblf_jax.world import plants
+from iblf_jax.world.bounds import bounds_at
 from iblf_jax.world.regions import margins
-from iblf_jax.world.robots import at_time, friction_torque
 
 # --- the state ---------------------------------------------------------------------------------
 
@@ -58,10 +73,15 @@ class LawSignals(NamedTuple):
     saturated: jax.Array
     slack: Any = ()
     region_slack: Any = ()
+    alpha_higher: Any = ()
+    torque: Any = ()
+    """The torque that a law of a robot commanded through another input, (n,) [N m]; `()` where the
+    input is the torque."""
 
 
 def law_signals(command: Command, f_hat: jax.Array) -> LawSignals:
     """The signals of a law that answered with `command` to the estimate `f_hat`."""
+    has_other_input = not isinstance(command.input, tuple)
     return LawSignals(
         command.alpha,
         command.V1,
@@ -70,7 +90,14 @@ def law_signals(command: Command, f_hat: jax.Array) -> LawSignals:
         command.saturated,
         command.slack,
         command.region_slack,
+        command.alpha_higher,
+        command.tau if has_other_input else (),
     )
+
+
+def plant_input(command: Command) -> jax.Array:
+    """The input of the plant that a law commands, (n,): its torque, unless it has another input."""
+    return command.tau if isinstance(command.input, tuple) else command.input
 
 
 class SampledState(NamedTuple):
@@ -96,22 +123,31 @@ class LoopState(NamedTuple):
     actuator: Any = ()
     sampled: Any = ()
     """A `SampledState` where the law is sampled."""
+    higher: Any = ()
+    """Levels of the plant from the third on, (r - 2, n); `()` for a robot, which has q and q'."""
+
+    @property
+    def x(self) -> jax.Array:
+        """The state of the plant, (r, n)."""
+        return state_of_levels(self.q, self.dq, self.higher)
 
 
 # inline, so that JAX traces it once for all of its call sites
 @partial(jax.jit, inline=True)
 def initial_state(scenario: Scenario) -> LoopState:
     """The state at t = 0; an actuator starts with the torque that balances the model's gravity."""
-    q, dq = scenario.initial.q, scenario.initial.dq
+    q, dq, higher = start_levels(scenario)
+    law: Any = scenario.controller
     state = LoopState(
         q,
         dq,
-        scenario.controller.init(q, dq, scenario.context),
-        discrete_observer(scenario).init(q, dq, scenario.model),
+        law.init(*law_state(scenario, q, dq, higher), scenario.context),
+        observer_initial(scenario, discrete_observer(scenario), q, dq, higher),
+        higher=higher,
     )
     if scenario.sampling is None and isinstance(scenario.actuator, Ideal):
         return state
-    balance = scenario.model.gravity(q)
+    balance = steady_input(scenario, q)
     state = state._replace(actuator=scenario.actuator.init(balance))
     if scenario.sampling is None:
         return state
@@ -121,18 +157,27 @@ def initial_state(scenario: Scenario) -> LoopState:
 def _initial_sampled_state(scenario: Scenario, state: LoopState, tau: jax.Array) -> SampledState:
     """State of a sampled loop before its first sample: every command in transit is `tau`."""
     sampling: Any = scenario.sampling
+    part: Any = scenario.sensor
     q, dq = state.q, state.dq
-    zero, no = jnp.zeros_like(q), jnp.zeros(q.shape, bool)
-    command, _ = jax.eval_shape(
-        scenario.controller.command, zero[0], q, dq, zero, scenario.context, state.controller
+    zero = jnp.zeros_like(q)
+    f_hat = jax.eval_shape(
+        partial(observer_estimate, scenario, scenario.observer),
+        *(zero[0], q, dq, state.higher, state.observer),
     )
-    slacks = (command.slack, command.region_slack)
-    slack, region_slack = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), slacks)
+    command, _ = jax.eval_shape(
+        scenario.controller.command,
+        zero[0],
+        *law_state(scenario, q, dq, state.higher),
+        f_hat,
+        scenario.context,
+        state.controller,
+    )
+    blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), law_signals(command, f_hat))
     return SampledState(
         commands=jnp.repeat(tau[None], sampling.queue + 1, axis=0),
-        sensor=scenario.sensor.init(q, dq, sampling.period),
-        measured=Measurement(q, dq),
-        signals=LawSignals(zero, zero, zero, no, no, slack, region_slack),
+        sensor=part.init(*sensor_state(scenario, q, dq, state.higher), sampling.period),
+        measured=Measurement(q, dq, state.higher),
+        signals=blank,
     )
 
 
@@ -151,33 +196,10 @@ def with_integrated_part(state: LoopState, part: LoopState) -> LoopState:
     """The state with its `integrated_part` replaced."""
     if state.sampled == ():
         return part
-    return state._replace(q=part.q, dq=part.dq, actuator=part.actuator)
+    return state._replace(q=part.q, dq=part.dq, higher=part.higher, actuator=part.actuator)
 
 
 # --- continuous time: the rate of the state ------------------------------------------------------
-
-
-def acceleration(
-    scenario: Scenario, t: jax.Array, q: jax.Array, dq: jax.Array, tau: jax.Array
-) -> jax.Array:
-    """Acceleration of the plant under the torque `tau`, (n,) [rad/s^2]."""
-    plant = at_time(scenario.plant, t)
-    external = scenario.disturbance.torque(t, q, dq, plant, scenario.model)
-    applied = tau + external + friction_torque(plant, dq)
-    return solve_spd(plant.mass_matrix(q), applied - plant.coriolis(q, dq, dq) - plant.gravity(q))
-
-
-def torque_needed(
-    scenario: Scenario, t: jax.Array, q: jax.Array, dq: jax.Array, ddq: jax.Array
-) -> jax.Array:
-    """The torque for which the plant has the acceleration `ddq`, (n,) [N m]: the inverse of
-    `acceleration`.
-    """
-    plant = at_time(scenario.plant, t)
-    external = scenario.disturbance.torque(t, q, dq, plant, scenario.model)
-    passive = external + friction_torque(plant, dq)
-    inertial = matvec(plant.mass_matrix(q), ddq)
-    return inertial + plant.coriolis(q, dq, dq) + plant.gravity(q) - passive
 
 
 # jit, so that JAX traces it once for all of its call sites and `kernels` compiles one function
@@ -199,23 +221,32 @@ def evaluate(
       torque: command at the actuator, (n,) [N m], where the law is sampled; the newest command if
         not given.
     """
-    model, q, dq = scenario.model, state.q, state.dq
+    q, dq, higher, observer = state.q, state.dq, state.higher, scenario.observer
     controller_rate: Any = ()
     observer_rate: Any = ()
     if scenario.sampling is None:
-        f_hat = scenario.observer.estimate(t, q, dq, model, state.observer)
-        law, context = scenario.controller, scenario.context
-        answer, controller_rate = law.command(t, q, dq, f_hat, context, state.controller)
-        command, signals = answer.tau, law_signals(answer, f_hat)
+        f_hat = observer_estimate(scenario, observer, t, q, dq, higher, state.observer)
+        law: Any = scenario.controller
+        context = scenario.context
+        measured = law_state(scenario, q, dq, higher)
+        answer, controller_rate = law.command(t, *measured, f_hat, context, state.controller)
+        command, signals = plant_input(answer), law_signals(answer, f_hat)
     else:
         command = state.sampled.commands[0] if torque is None else torque
         signals = state.sampled.signals
     delivered = as_at(scenario.actuator, t).deliver(command, dq, state.actuator)
-    ddq = acceleration(scenario, t, q, dq, delivered.tau)
+    moved = motion(scenario, t, q, dq, higher, delivered.tau)
     if scenario.sampling is None:
-        observer_rate = scenario.observer.derivative(t, q, dq, command, model, state.observer)
-    rate = LoopState(dq, ddq, controller_rate, observer_rate, delivered.rate)
-    sample = sample_at(scenario, t, dt, q, dq, ddq, delivered.tau, delivered.limited, signals)
+        arguments = observer_arguments(
+            scenario, observer, t, q, dq, higher, answer.tau, state.observer
+        )
+        observer_rate = observer.derivative(*arguments)
+    rate = LoopState(
+        moved.dq, moved.ddq, controller_rate, observer_rate, delivered.rate, (), moved.higher
+    )
+    sample = sample_at(
+        scenario, t, dt, q, dq, moved, delivered.tau, delivered.limited, signals, higher
+    )
     return rate, sample
 
 
@@ -230,10 +261,11 @@ def sample_at(
     dt: jax.Array | float,
     q: jax.Array,
     dq: jax.Array,
-    ddq: jax.Array,
+    moved: Motion,
     tau: jax.Array,
     limited: jax.Array,
     signals: LawSignals,
+    higher: Any = (),
 ) -> Sample:
     """The sample at time t of a loop with a given motion, torque and signals of the law.
 
@@ -241,22 +273,19 @@ def sample_at(
       scenario: its reference, bounds and model are used.
       t: time, () [s].
       dt: weight of the sample in an integral over time, () [s].
-      q, dq, ddq: motion, (n,) each.
-      tau: torque on the joints, (n,) [N m].
+      q, dq: the first two levels, (n,) each.
+      moved: the rate of the plant's state.
+      tau: input of the plant, (n,): of a robot the torque on the joints [N m].
       limited: whether the actuator delivered less than the command, (n,) bool.
       signals: of the law.
+      higher: levels from the third on, (r - 2, n); `()` for a robot.
     """
-    model, tube = scenario.model, scenario.context.tube(t)
-    M0, G0 = model.mass_matrix(q), model.gravity(q)
-    f = matvec(M0, ddq) + model.coriolis(q, dq, dq) + G0 - tau
-    e2, f_tilde = dq - signals.alpha, f - signals.f_hat
-    if law_member(unwrapped(scenario.controller), "includes_e2"):
-        V = jnp.sum(signals.V1) + 0.5 * inner(f_tilde, f_tilde)
-    else:
-        V = jnp.sum(signals.V1) + 0.5 * (inner(e2, matvec(M0, e2)) + inner(f_tilde, f_tilde))
-    optional: dict[str, Any] = {}
-    if scenario.velocity_bounds is not None:
-        optional["dq_lower"], optional["dq_upper"] = scenario.context.speed_limits(t)
+    tube = scenario.context.tube(t)
+    uncertain = _uncertain_signals
+    if not plants.is_chain(scenario.model):
+        uncertain = _robot_uncertain_signals
+    terms = uncertain(scenario, t, q, dq, moved, tau, signals, higher)
+    optional = _level_signals(scenario, t, higher, signals)
     if scenario.regions:
         optional["region_margin"] = margins(scenario.regions, scenario.plant, q)
     return Sample(
@@ -267,23 +296,109 @@ def sample_at(
         dq=dq,
         tau=tau,
         e1=q - tube.q_d,
-        e2=e2,
+        e2=dq - signals.alpha,
         xi=tube.xi(q),
         q_d=tube.q_d,
         dq_d=tube.dq_d,
         lower=tube.lower,
         upper=tube.upper,
         alpha=signals.alpha,
-        gravity=G0,
-        disturbance=f,
-        disturbance_estimate=signals.f_hat,
-        V=V,
+        gravity=terms.gravity,
+        disturbance=terms.disturbance,
+        disturbance_estimate=terms.estimate,
+        V=terms.V,
         guard_active=signals.guard_active,
         saturated=signals.saturated | limited,
         slack=signals.slack,
         region_slack=signals.region_slack,
         **optional,
     )
+
+
+class _UncertainSignals(NamedTuple):
+    """Signals of a sample that depend on the model's equation of motion."""
+
+    gravity: jax.Array
+    disturbance: jax.Array
+    estimate: jax.Array
+    V: jax.Array
+
+
+def _robot_uncertain_signals(
+    scenario: Scenario,
+    t: jax.Array,
+    q: jax.Array,
+    dq: jax.Array,
+    moved: Motion,
+    tau: jax.Array,
+    signals: LawSignals,
+    higher: Any,
+) -> _UncertainSignals:
+    """The signals of a model that is a robot: f of (2.1) and V2 of (3.12)."""
+    model = scenario.model
+    if not isinstance(signals.torque, tuple):
+        tau = signals.torque
+    M0, G0 = model.mass_matrix(q), model.gravity(q)
+    f = matvec(M0, moved.ddq) + model.coriolis(q, dq, dq) + G0 - tau
+    e2, f_tilde = dq - signals.alpha, f - signals.f_hat
+    V = jnp.sum(signals.V1)
+    if law_member(unwrapped(scenario.controller), "includes_e2"):
+        V = V + 0.5 * inner(f_tilde, f_tilde)
+    else:
+        V = V + 0.5 * (inner(e2, matvec(M0, e2)) + inner(f_tilde, f_tilde))
+    return _UncertainSignals(G0, f, signals.f_hat, V)
+
+
+def _uncertain_signals(
+    scenario: Scenario,
+    t: jax.Array,
+    q: jax.Array,
+    dq: jax.Array,
+    moved: Motion,
+    tau: jax.Array,
+    signals: LawSignals,
+    higher: Any,
+) -> _UncertainSignals:
+    """The signals of a model in strict-feedback form: d_i of (S.1), and the law's sum w_i V_i."""
+    robot = plants.robot_of(scenario.model)
+    gravity = jnp.zeros_like(q) if robot is None else robot.gravity(q)
+    d = uncertain_term(scenario, t, q, dq, higher, moved, tau)
+    x = model_state(scenario, q, dq, higher)
+    d_hat = estimate_as_rates(scenario, x, signals.f_hat)
+    return _UncertainSignals(gravity, d, d_hat, jnp.sum(signals.V1))
+
+
+def _level_signals(
+    scenario: Scenario, t: jax.Array, higher: Any, signals: LawSignals
+) -> dict[str, Any]:
+    """The optional signals of the levels from the second on.
+
+    The bounds of the velocities of a robot may follow q_d'; those of the levels of another plant
+    may follow the virtual control alpha_{i-1} of the law.
+    """
+    context, found = scenario.context, {}
+    if scenario.velocity_bounds is not None:
+        found["dq_lower"], found["dq_upper"] = context.speed_limits(t)
+    elif (bounds := context.level_bounds(2)) is not None:
+        found["dq_lower"], found["dq_upper"] = bounds_at(bounds, t, signals.alpha)
+    if isinstance(higher, tuple):
+        return found
+    found["higher"] = higher
+    centre = jnp.zeros_like(higher)
+    if not isinstance(signals.alpha_higher, tuple):
+        centre = signals.alpha_higher
+        found["e_higher"] = higher - centre
+    bounds_of_levels = [context.level_bounds(i + 3) for i in range(len(higher))]
+    if all(bounds is None for bounds in bounds_of_levels):
+        return found
+    infinite = jnp.full_like(higher[0], jnp.inf)
+    sides = [
+        (-infinite, infinite) if bounds is None else bounds_at(bounds, t, middle)
+        for bounds, middle in zip(bounds_of_levels, centre, strict=True)
+    ]
+    found["higher_lower"] = jnp.stack([lower for lower, _ in sides])
+    found["higher_upper"] = jnp.stack([upper for _, upper in sides])
+    return found
 
 
 # --- discrete time: a sampled law ----------------------------------------------------------------
@@ -328,13 +443,14 @@ def law_update(
       controller, observer: their states at t.
     """
     sampling: Any = scenario.sampling
-    q, dq = measured.q, measured.dq
+    q, dq, higher = measured
     running = discrete_observer(scenario)
-    f_hat = running.estimate(t, q, dq, scenario.model, observer)
-    command, controller_rate = scenario.controller.command(
-        t, q, dq, f_hat, scenario.context, controller
+    f_hat = observer_estimate(scenario, running, t, q, dq, higher, observer)
+    law: Any = scenario.controller
+    command, controller_rate = law.command(
+        t, *law_state(scenario, q, dq, higher), f_hat, scenario.context, controller
     )
-    arguments = (t, q, dq, command.tau, scenario.model, observer)
+    arguments = observer_arguments(scenario, running, t, q, dq, higher, command.tau, observer)
     next_observer = _next_observer_state(sampling, running, arguments)
     next_controller = _euler(controller, controller_rate, sampling.period)
     return LawUpdate(command, f_hat, next_controller, next_observer)
@@ -367,11 +483,17 @@ def run_sampled_law(
     """
     before, sampling = state.sampled, scenario.sampling
     assert sampling is not None
-    measured, sensor = scenario.sensor.measure(
-        state.q, state.dq, normal, sampling.period, before.sensor
+    part: Any = scenario.sensor
+    measured, sensor = part.measure(
+        *sensor_state(scenario, state.q, state.dq, state.higher),
+        normal,
+        sampling.period,
+        before.sensor,
     )
+    if isinstance(measured.higher, tuple):
+        measured = measured._replace(higher=state.higher)
     update = law_update(scenario, t, measured, state.controller, state.observer)
-    commands = jnp.concatenate([update.command.tau[None], before.commands[:-1]])
+    commands = jnp.concatenate([plant_input(update.command)[None], before.commands[:-1]])
     signals = law_signals(update.command, update.f_hat)
     return state._replace(
         controller=update.controller,

@@ -43,13 +43,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core.linalg import matvec, solve, solve_spd
+from iblf_jax.core.time import as_at
 from iblf_jax.simulation.closed_loop import LoopState, perturbed_state
 from iblf_jax.simulation.discontinuities import has_jump
 from iblf_jax.simulation.integrators import Tableau, tableau
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.stability import SLOWEST_RATE
+from iblf_jax.world import plants
 from iblf_jax.world.bounds import Tube
-from iblf_jax.world.robots import at_time
 
 TOLERANCE = 0.005
 """Estimated position error, relative to the width of the tube, above which a run is flagged
@@ -93,11 +94,11 @@ class Accuracy(NamedTuple):
 
 
 def _watched(state: LoopState, values: LoopState) -> list:
-    """The leaves of `values` at the positions, velocities and floating-point observer and actuator
-    states of `state`. The state of the law is not watched.
+    """The leaves of `values` at the positions, velocities, floating-point observer and actuator
+    states and further levels of `state`. The state of the law is not watched.
     """
-    kinds = jax.tree.leaves((state.q, state.dq, state.observer, state.actuator))
-    found = jax.tree.leaves((values.q, values.dq, values.observer, values.actuator))
+    kinds = jax.tree.leaves((state.q, state.dq, state.observer, state.actuator, state.higher))
+    found = jax.tree.leaves((values.q, values.dq, values.observer, values.actuator, values.higher))
     pairs = zip(kinds, found, strict=True)
     return [x for kind, x in pairs if jnp.issubdtype(kind.dtype, jnp.floating)]
 
@@ -392,7 +393,12 @@ def _disturbance_error(
     """
 
     def torque(t: jax.Array, q: jax.Array, dq: jax.Array) -> jax.Array:
-        return scenario.disturbance.torque(t, q, dq, at_time(scenario.plant, t), scenario.model)
+        plant = as_at(scenario.plant, t)
+        robot = plants.robot_of(plant)
+        if robot is None:
+            return jnp.zeros_like(q)
+        known = plants.robot_of(scenario.model)
+        return scenario.disturbance.torque(t, q, dq, robot, known)
 
     stages = len(table.c)
     own = np.asarray(table.b, times.dtype)[:, None]
@@ -407,9 +413,11 @@ def _disturbance_error(
 
 def with_acceleration(scenario: Scenario, found: UnresolvedSignals) -> UnresolvedSignals:
     """`found` with the error of the disturbance as an acceleration of the plant at the start."""
-    M = at_time(scenario.plant, jnp.zeros_like(found.disturbance_error[0])).mass_matrix(
-        scenario.initial.q
-    )
+    plant = as_at(scenario.plant, jnp.zeros_like(found.disturbance_error[0]))
+    robot = plants.robot_of(plant)
+    if robot is None:
+        return found
+    M = robot.mass_matrix(scenario.initial.q)
     return found._replace(
         disturbance_error=jax.lax.stop_gradient(solve_spd(M, found.disturbance_error))
     )

@@ -21,7 +21,7 @@ import numpy as np
 from iblf_jax.control.actuators import Actuator
 from iblf_jax.control.actuators import Ideal as IdealActuator
 from iblf_jax.control.controllers import Controller, LawContext
-from iblf_jax.control.controllers._base import law_member
+from iblf_jax.control.controllers._base import law_member, state_of_levels
 from iblf_jax.control.observers import NoObserver, Observer
 from iblf_jax.control.observers._base import observer_member
 from iblf_jax.control.sensors import Ideal as IdealSensor
@@ -38,14 +38,17 @@ from iblf_jax.core.pytree import (
     is_leaf_field,
     layers,
     leaf,
+    rewrapped,
     unwrapped,
 )
 from iblf_jax.core.status import VELOCITY_LIMIT
 from iblf_jax.core.time import joined, jump_times_of
+from iblf_jax.simulation.levels import model_state, start_levels
 from iblf_jax.simulation.sampling import PERIOD_TOLERANCE, Sampling
-from iblf_jax.world import regions
-from iblf_jax.world.bounds import Bounds, Side, speed_limits_at
+from iblf_jax.world import plants, regions
+from iblf_jax.world.bounds import Bounds, Funnel, Side, bounds_at, speed_limits_at
 from iblf_jax.world.disturbances import Disturbance, Nothing
+from iblf_jax.world.plants import Plant
 from iblf_jax.world.references import Reference
 from iblf_jax.world.robots import Robot
 from iblf_jax.world.robots._base import mass_matrix_at
@@ -53,21 +56,54 @@ from iblf_jax.world.robots._base import mass_matrix_at
 
 @component
 class Initial:
-    """Initial position and velocity of a run.
+    """The state of the plant at the start of a run: position and velocity, or all levels.
+
+    A plant in strict-feedback form with more than two levels takes x.  A flexible joint given by q
+    and q' alone starts at the static equilibrium of its springs, and a drive with the current that
+    holds gravity.
 
     Args:
       q: position, () or (n,) [rad].
       dq: velocity, () or (n,) [rad/s]; 0 if not given.
+      higher: the levels from the third on, (r - 2, n) [1], in the units of the plant; the steady
+        state if not given.  `Initial(x=...)` takes all levels, (r, n), in the place of q, dq and
+        higher.
     """
 
     q: Leaf = leaf("rad")
     dq: Leaf = leaf("rad/s", default=0.0)
+    higher: Leaf = leaf("1", shape="level", default=None)
+
+    def __init__(self, q: Any = None, dq: Any = None, higher: Any = None, *, x: Any = None) -> None:
+        if x is not None:
+            if any(value is not None for value in (q, dq, higher)):
+                expected = "either x, or q and dq"
+                raise checks.fail("Initial.x", x, expected, "x is q, dq and the other levels.")
+            q, dq, higher = _split_levels(x)
+        for name, value in (("q", q), ("dq", 0.0 if dq is None else dq), ("higher", higher)):
+            object.__setattr__(self, name, value)
+
+    @property
+    def x(self) -> jax.Array:
+        """All given levels, (2, n) or (r, n)."""
+        first = jnp.stack(jnp.broadcast_arrays(self.q, self.dq))
+        return first if self.higher is None else jnp.concatenate([first, self.higher])
+
+
+def _split_levels(x: Any) -> tuple[Any, Any, Any]:
+    """The first two levels of a state (r, n), and the others; ValueError for another shape."""
+    array = checks.as_floats("Initial.x", x)
+    if array.ndim != 2 or len(array) < 2:
+        expected = "one row a level, shape (r, n)"
+        got = f"shape {array.shape}"
+        remedy = "Such as x=[[0.3], [0.0], [0.0]] for three levels of one number."
+        raise checks.fail("Initial.x", got, expected, remedy)
+    return array[0], array[1], array[2:] if len(array) > 2 else None
 
 
 ROBOTS = "iblf_jax.robots has them; write your own with from_energy."
+PLANTS = "iblf_jax.plants has them; iblf_jax.testing.check_plant checks your own."
 PROTOCOLS = {
-    "plant": (Robot, ROBOTS),
-    "model": (Robot, ROBOTS),
     "reference": (Reference, "iblf_jax.references has them."),
     "controller": (
         Controller,
@@ -85,6 +121,10 @@ CLASSES: dict[str, tuple[Any, str]] = {
     "velocity_bounds": (
         Bounds | None,
         "a Bounds, or None, such as Bounds(lower=Constant(-1.0), upper=Constant(1.0))",
+    ),
+    "state_bounds": (
+        tuple | list,
+        "a tuple of Bounds or None, one for each level from the second on",
     ),
     "sampling": (Sampling | None, "a Sampling, or None, such as ij.Sampling(period=2e-3)"),
     "regions": (
@@ -111,7 +151,7 @@ class Scenario:
     joints.
 
     Args:
-      plant: the simulated robot, any of `iblf_jax.robots`.
+      plant: the simulated plant, any of `iblf_jax.robots` or `iblf_jax.plants`.
       reference: the desired trajectory, any of `iblf_jax.references`.
       bounds: constraints on the joint positions, a `bounds.Bounds`.
       controller: the law, any of `iblf_jax.controllers`.
@@ -119,7 +159,9 @@ class Scenario:
       observer: estimator of f, any of `iblf_jax.observers`; `NoObserver()` if not given.
       disturbance: torque on the plant that is unknown to the law, any of `iblf_jax.disturbances`;
         `Nothing()` if not given.
-      model: the robot that law and observer know; the plant itself if not given.
+      model: the robot or plant that law and observer know; the plant itself if not given.  A robot
+        may be the model of a plant of higher order, under a law of robots; of an `ElectricDrive`
+        the law then needs an input map (`controllers.WithDrive`).
       sampling: timing of law and observer, a `Sampling`; continuous time if not given.
       sensor: measurement of q and q', any of `iblf_jax.sensors`; `Ideal()` if not given.  Others
         need a sampling.
@@ -127,6 +169,10 @@ class Scenario:
       velocity_bounds: constraints on the joint velocities, a `bounds.Bounds` [rad/s] whose funnels
         follow q_d'; none if not given.  Runs record their margins under every law;
         `controllers.FullState` enforces them.
+      state_bounds: constraints on the levels x_2 ... x_r of the plant, a tuple of `bounds.Bounds`,
+        or None for a level without; () if not given.  Those of a robot's second level are its
+        `velocity_bounds`, which take their place.  Runs record their margins under every law;
+        `controllers.BarrierBackstepping` enforces them.
       regions: sets in which points of the robot must stay, a tuple of any of `iblf_jax.regions`; ()
         if not given.  Runs record their margins under every law; `controllers.SafetyFilter`
         enforces them.
@@ -149,6 +195,7 @@ class Scenario:
     actuator: Actuator = IdealActuator()
     velocity_bounds: Bounds | None = dataclasses.field(default=None, metadata=VELOCITY_UNITS)
     regions: tuple[regions.Region, ...] = ()
+    state_bounds: tuple[Bounds | None, ...] = ()
 
     def check(self) -> None:
         """Checks the parts, makes the plant the model if none is given, and repeats scalars for the
@@ -156,14 +203,57 @@ class Scenario:
         """
         if self.model is None:
             object.__setattr__(self, "model", self.plant)
+        for name in ("plant", "model"):
+            check_plant_or_robot(f"Scenario.{name}", vars(self)[name])
         parts = field_values(self)
         for name, (protocol, remedy) in PROTOCOLS.items():
             checks.conforms(f"Scenario.{name}", parts[name], protocol, remedy, OPTIONAL_MEMBERS)
         self._check_classes()
+        self._fit_state_bounds()
         self._check_combination()
+        check_levels(self)
         self._check_regions()
         for name, part in field_values(self).items():
             object.__setattr__(self, name, fit_joints(part, self.plant.n, name))
+        self._complete_law()
+
+    def _complete_law(self) -> None:
+        """Gives the law what it derives from its model and the start, such as weights."""
+        law = unwrapped(self.controller)
+        completed = law_member(law, "completed")
+        if completed is None:
+            return
+        with jax.ensure_compile_time_eval():
+            new = completed(self.context, model_state(self, *start_levels(self)))
+        if new is not law:
+            object.__setattr__(self, "controller", rewrapped(self.controller, new))
+
+    def _fit_state_bounds(self) -> None:
+        """Makes a tuple of the bounds of the levels; those of a robot's velocities are its
+        `velocity_bounds`.
+        """
+        given = tuple(self.state_bounds)
+        order = plants.order_of(self.plant)
+        for i, bounds in enumerate(given):
+            if not isinstance(bounds, Bounds | None):
+                expected = "a Bounds, or None for a level without bounds"
+                raise checks.fail(f"Scenario.state_bounds[{i}]", bounds, expected)
+        if len(given) > order - 1:
+            expected = f"at most {order - 1}, for the levels 2 to {order}"
+            raise checks.fail("Scenario.state_bounds", f"{len(given)} bounds", expected)
+        velocity, second = self.velocity_bounds, given[0] if given else None
+        if velocity is not None and second is not None:
+            expected = "either velocity_bounds or state_bounds[0]"
+            remedy = "Both are the bounds of the second level."
+            raise checks.fail("Scenario.state_bounds", second, expected, remedy)
+        second = second if velocity is None else velocity
+        if not plants.is_chain(self.plant):
+            object.__setattr__(self, "velocity_bounds", second)
+            object.__setattr__(self, "state_bounds", ())
+            return
+        levels = (second, *given[1:])
+        object.__setattr__(self, "velocity_bounds", None)
+        object.__setattr__(self, "state_bounds", () if levels == (None,) else levels)
 
     def _check_classes(self) -> None:
         """Raises ValueError for a part of the wrong class."""
@@ -178,7 +268,7 @@ class Scenario:
             got, expected = f"{self.model.n} joints", f"{self.plant.n} joints, as the plant has"
             raise checks.fail("Scenario.model", got, expected)
         law = unwrapped(self.controller)
-        if self.velocity_bounds is None and law_member(law, "needs_velocity_bounds"):
+        if self.context.level_bounds(2) is None and law_member(law, "needs_velocity_bounds"):
             expected = f"the bounds that {type(law).__name__} keeps"
             remedy = "Such as velocity_bounds=Bounds(lower=Constant(-1.0), upper=Constant(1.0))."
             raise checks.fail("Scenario.velocity_bounds", None, expected, remedy)
@@ -195,7 +285,11 @@ class Scenario:
         for i, region in enumerate(self.regions):
             name = f"Scenario.regions[{i}]"
             checks.conforms(name, region, regions.Region, "iblf_jax.regions has them.")
-            for robot in (self.plant, self.model):
+            for part in (self.plant, self.model):
+                robot = plants.robot_of(part)
+                if robot is None:
+                    expected = "no regions, as this plant has no points in space"
+                    raise checks.fail(name, region, expected, "Use bounds or state_bounds.")
                 _check_region(name, region, robot)
 
     @property
@@ -212,6 +306,10 @@ class Scenario:
             if bounds is not None:
                 parts[f"{name}.lower"] = bounds.lower
                 parts[f"{name}.upper"] = bounds.upper
+        for i, bounds in enumerate(self.state_bounds):
+            if bounds is not None:
+                parts[f"state_bounds[{i}].lower"] = bounds.lower
+                parts[f"state_bounds[{i}].upper"] = bounds.upper
         for i, law in enumerate(layers(self.controller)):
             parts[f"controller[{i}]"] = law
         parts["observer"] = self.observer
@@ -224,7 +322,12 @@ class Scenario:
     def context(self) -> LawContext:
         """The information of the law: model, reference, bounds and regions."""
         return LawContext(
-            self.model, self.reference, self.bounds, self.velocity_bounds, self.regions
+            self.model,
+            self.reference,
+            self.bounds,
+            self.velocity_bounds,
+            self.regions,
+            self.state_bounds,
         )
 
     @property
@@ -234,6 +337,55 @@ class Scenario:
 
     def _repr_html_(self) -> str:
         return present("card", self)
+
+
+def check_plant_or_robot(name: str, part: Any) -> None:
+    """Raises ValueError for something that is neither a robot nor a plant in strict-feedback
+    form.
+    """
+    if plants.is_chain(part):
+        checks.conforms(name, part, Plant, PLANTS)
+        plants.check_dimensions(name, part)
+        return
+    checks.conforms(name, part, Robot, f"{ROBOTS} {PLANTS}", OPTIONAL_MEMBERS)
+
+
+def check_levels(scenario: Scenario) -> None:
+    """Raises ValueError for a model, a law, an observer or a start that does not fit the levels of
+    the plant.
+    """
+    plant, model = scenario.plant, scenario.model
+    order, known = plants.order_of(plant), plants.order_of(model)
+    if known != order and known != 2:
+        expected = f"a robot, or a plant of order {order}, as the plant is"
+        raise checks.fail("Scenario.model", f"a plant of order {known}", expected)
+    law = unwrapped(scenario.controller)
+    kind = type(law).__name__
+    if plants.is_chain(model) and not law_member(law, "receives_x"):
+        expected = f"a robot as the model of the law {kind}"
+        robot = plants.robot_of(model)
+        remedy = "Take controllers.BarrierBackstepping"
+        remedy += "." if robot is None else ", or model=plant.robot."
+        raise checks.fail("Scenario.model", type(model).__name__, expected, remedy)
+    _check_observer(scenario)
+    higher = scenario.initial.higher
+    if higher is not None and len(higher) != order - 2:
+        expected = f"{order} levels, as the plant has"
+        raise checks.fail("Scenario.initial.x", f"{len(higher) + 2} levels", expected)
+    if order > 2 and higher is None and plants.plant_member(plant, "steady_levels") is None:
+        remedy = f"Give all levels: Initial(x=...), shape ({order}, {plant.n})."
+        raise checks.fail("Scenario.initial", "q and dq", f"{order} levels", remedy)
+
+
+def _check_observer(scenario: Scenario) -> None:
+    """Raises ValueError for an observer of robots with a model that contains no robot."""
+    observer, model = scenario.observer, scenario.model
+    if isinstance(observer, NoObserver) or observer_member(observer, "receives_x"):
+        return
+    if plants.is_chain(model) and plants.plant_member(model, "joint_torque") is None:
+        expected = "an observer of plants in strict-feedback form, such as LevelObserver"
+        remedy = f"{type(model).__name__} contains no robot."
+        raise checks.fail("Scenario.observer", type(observer).__name__, expected, remedy)
 
 
 def _check_region(name: str, region: regions.Region, robot: Robot) -> None:
@@ -299,7 +451,7 @@ def _with_both_robots(scenario: Scenario, parts: dict[str, Any]) -> dict[str, An
         others = {name: part for name, part in parts.items() if name != "robot"}
         return {**others, "plant": parts["robot"], "model": parts["robot"]}
     if "plant" in parts and "model" not in parts:
-        checks.conforms("Scenario.plant", parts["plant"], *PROTOCOLS["plant"], OPTIONAL_MEMBERS)
+        check_plant_or_robot("Scenario.plant", parts["plant"])
         n, joints = scenario.model.n, parts["plant"].n
         if joints != n:
             expected = f"{n} joints, as the model has"
@@ -327,6 +479,8 @@ def fit_joints(part: Any, n: int, path: str) -> Any:
             value = fit_joints(old, n, name)
         elif field.metadata["shape"] == "joint" and old is not None:
             value = _fit_leaf(old, n, name)
+        elif field.metadata["shape"] == "level" and old is not None:
+            value = _fit_rows(old, n, name)
         else:
             value = old
         if value is not old:
@@ -345,6 +499,17 @@ def _fit_leaf(value: Any, n: int, name: str) -> Any:
         return jnp.broadcast_to(value, (n,))
     if jnp.shape(value) != (n,):
         expected = f"one number, or {n} (one a joint)"
+        raise checks.fail(name, value, expected, f"Its shape is {jnp.shape(value)}.")
+    return value
+
+
+def _fit_rows(value: Any, n: int, name: str) -> Any:
+    """A leaf of one row a level, with n entries a row."""
+    if jnp.ndim(value) < 2:
+        rows = jnp.shape(value)
+        return jnp.broadcast_to(jnp.asarray(value)[..., None], (*rows, n))
+    if jnp.shape(value)[1] != n:
+        expected = f"rows of one number, or of {n} (one a component)"
         raise checks.fail(name, value, expected, f"Its shape is {jnp.shape(value)}.")
     return value
 
@@ -495,11 +660,18 @@ def _initial_values(scenario: Scenario) -> _InitialValues:
 
     lower = limit("bounds.lower.at(t, q_d)", scenario.bounds.lower)
     upper = limit("bounds.upper.at(t, q_d)", scenario.bounds.upper)
-    for name, robot in (("plant", plant), ("model", model)):
-        _shaped(f"{name}.mass_matrix(q)", partial(robot.mass_matrix, q), n, n)
-        _shaped(f"{name}.coriolis(q, v, u)", partial(robot.coriolis, q, dq, dq), n)
-        _shaped(f"{name}.gravity(q)", partial(robot.gravity, q), n)
-    torque = partial(scenario.disturbance.torque, t, q, dq, plant, model)
+    parts: dict[str, Any] = {"plant": plant, "model": model}
+    for name, part in parts.items():
+        robot = plants.robot_of(part)
+        if plants.is_chain(part):
+            x = state_of_levels(q, dq, start_levels(scenario)[2])[: part.order]
+            _check_shapes_of_plant(name, part, t, x)
+        if robot is not None:
+            _shaped(f"{name}.mass_matrix(q)", partial(robot.mass_matrix, q), n, n)
+            _shaped(f"{name}.coriolis(q, v, u)", partial(robot.coriolis, q, dq, dq), n)
+            _shaped(f"{name}.gravity(q)", partial(robot.gravity, q), n)
+    disturbed = [part if (r := plants.robot_of(part)) is None else r for part in (plant, model)]
+    torque = partial(scenario.disturbance.torque, t, q, dq, *disturbed)
     _shaped("disturbance.torque(t, q, dq, plant, model)", torque, n)
     speed_limits = None
     if velocity_bounds is not None:
@@ -508,8 +680,17 @@ def _initial_values(scenario: Scenario) -> _InitialValues:
         speed_limits = speed_limits_at(reference, velocity_bounds, t)
     margins = q[:0]
     if scenario.regions:
-        margins = regions.margins(scenario.regions, plant, q)
+        margins = regions.margins(scenario.regions, plants.robot_of(plant), q)
     return _InitialValues(q_d, lower, upper, speed_limits, margins)
+
+
+def _check_shapes_of_plant(name: str, plant: Plant, t: jax.Array, x: jax.Array) -> None:
+    """Raises ValueError where drift or gain of a plant has another shape than its state."""
+    order, n = x.shape
+    _shaped(f"{name}.drift(t, x)", partial(plant.drift, t, x), order, n)
+    diagonal = jnp.ndim(jax.eval_shape(plant.gain, t, x)) == 2
+    shape = (order, n) if diagonal else (order, n, n)
+    _shaped(f"{name}.gain(t, x)", partial(plant.gain, t, x), *shape)
 
 
 def _shaped(name: str, call: Callable[[], jax.Array], *shape: int) -> jax.Array:
@@ -550,12 +731,52 @@ def _check_start(scenario: Scenario) -> None:
             got = f"{point} {-margin:.4g} m beyond its boundary"
             expected = "a start inside all regions"
             raise checks.fail("initial.q", got, expected, "Move the start or the region.")
-    if not np.all(np.abs(dq) < VELOCITY_LIMIT):
+    _check_levels_at_start(scenario)
+    if not np.all(np.abs(dq) < plants.speed_limit(scenario.plant)):
         expected = f"speeds below {VELOCITY_LIMIT:g} rad/s"
         raise checks.fail("initial.dq", dq, expected, "A run that fast counts as diverged.")
-    for name, robot in (("plant", scenario.plant), ("model", scenario.model)):
+    for name, part in (("plant", scenario.plant), ("model", scenario.model)):
+        robot = plants.robot_of(part)
+        if robot is None:
+            continue
         matrix = np.asarray(mass_matrix_at(robot, scenario.initial.q))
         _check_mass_matrix(f"{name}.mass_matrix(initial.q)", matrix)
+
+
+def _check_levels_at_start(scenario: Scenario) -> None:
+    """Raises ValueError for a start outside the bounds of a level from the second on, or a gain
+    that is singular there.
+    """
+    if not plants.is_chain(scenario.plant):
+        return
+    x = state_of_levels(*start_levels(scenario))
+    t = jnp.zeros((), x.dtype)
+    if not np.all(np.isfinite(x)):
+        raise checks.fail("initial.x", x, "finite levels at the start")
+    for i, bounds in enumerate(scenario.state_bounds):
+        if bounds is None:
+            continue
+        lower, upper = (np.asarray(side) for side in bounds_at(bounds, t, jnp.zeros_like(x[0])))
+        if isinstance(bounds.lower, Funnel) or isinstance(bounds.upper, Funnel):
+            continue  # around alpha, which the law computes
+        _check_order(f"state_bounds[{i}]", lower, upper)
+        remedy = "Move the start or widen the bounds."
+        level = f"initial.x[{i + 1}][{{}}]"
+        _check_inside(level, f"bounds of level {i + 2}", np.asarray(x[i + 1]), lower, upper, remedy)
+    parts: dict[str, Any] = {"plant": scenario.plant, "model": scenario.model}
+    for name, plant in parts.items():
+        if plants.is_chain(plant):
+            _check_gains(name, np.asarray(plant.gain(t, x[: plant.order])))
+
+
+def _check_gains(name: str, gains: np.ndarray) -> None:
+    """Raises ValueError for a gain of a level that is singular or not finite."""
+    for i, gain in enumerate(gains):
+        matrix = np.diag(gain) if gain.ndim == 1 else gain
+        remedy = "Every level must act on the level below it."
+        expected = f"an invertible gain of level {i + 1} at the start"
+        if not np.all(np.isfinite(matrix)) or np.linalg.matrix_rank(matrix) < len(matrix):
+            raise checks.fail(f"{name}.gain(t, x)[{i}]", matrix, expected, remedy)
 
 
 def _check_order(name: str, lower: np.ndarray, upper: np.ndarray) -> None:

@@ -53,6 +53,13 @@ class Signals:
         Any, Recorded("m/s^2", "violation of the safety filter's conditions on the regions")
     ] = ()
     """`()` without regions or without a filter."""
+    higher: Annotated[Any, Recorded("1", "levels of the state from the third on")] = ()
+    """One row a level; `()` for robots."""
+    e_higher: Annotated[Any, Recorded("1", "errors x_i - alpha_{i-1} of these levels")] = ()
+    """`()` for robots, and under laws without virtual controls for these levels."""
+    higher_lower: Annotated[Any, Recorded("1", "lower bounds of these levels")] = ()
+    """-infinity for a level without bounds; `()` where none has bounds."""
+    higher_upper: Annotated[Any, Recorded("1", "upper bounds of these levels")] = ()
 
 
 @jax.tree_util.register_dataclass
@@ -81,6 +88,11 @@ def has(sample: Signals, signal: str) -> bool:
     of regions.
     """
     return not isinstance(getattr(sample, signal), tuple)
+
+
+def level_margin(sample: Sample, levels: Array) -> Array:
+    """Distances of levels from the third on to the nearer of their bounds, (r - 2, n)."""
+    return jnp.minimum(levels - sample.higher_lower, sample.higher_upper - levels)
 
 
 def speed_margin(sample: Sample, velocity: Array) -> Array:

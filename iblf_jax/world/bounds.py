@@ -292,6 +292,11 @@ def tube_at(
     return Tube(q_d, dq_d, lower, upper, dlower, dupper, ddq_d)
 
 
+def bounds_at(bounds: Bounds, t: jax.Array, centre: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Lower and upper side at time t [s] around a centre, (n,) each."""
+    return bounds.lower.at(t, centre), bounds.upper.at(t, centre)
+
+
 def speed_limits_at(
     reference: Reference, bounds: Bounds, t: jax.Array
 ) -> tuple[jax.Array, jax.Array]:

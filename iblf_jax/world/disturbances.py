@@ -20,13 +20,20 @@ import jax.numpy as jnp
 
 from iblf_jax.core import checks
 from iblf_jax.core.linalg import matvec
+from iblf_jax.core.optional import OptionalMembers
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.core.time import joined, jump_times_of, no_times
 from iblf_jax.world.robots import Robot
 
 
 class Disturbance(Protocol):
-    """The contract of a disturbance."""
+    """The contract of a disturbance.
+
+    A disturbance of a plant in strict-feedback form may have `rates(t, x, plant, model)`, (r, n):
+    d_1 ... d_r of (S.1), which are added to x'; it returns None if there is nothing to add.  The
+    torque of a disturbance acts on the robot inside such a plant; of a plant without a robot it is
+    added to the input.
+    """
 
     def torque(
         self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot
@@ -44,6 +51,18 @@ class Disturbance(Protocol):
         runs, and have derivatives.
         """
         ...
+
+
+disturbance_member = OptionalMembers(rates=None)
+"""Reads optional members of a disturbance."""
+
+
+def rates_of(
+    disturbance: Disturbance, t: jax.Array, x: jax.Array, plant: Any, model: Any
+) -> jax.Array | None:
+    """What a disturbance adds to x', (r, n); None for one that is a torque only."""
+    rates = disturbance_member(disturbance, "rates")
+    return None if rates is None else rates(t, x, plant, model)  # type: ignore[no-any-return]
 
 
 def _never(disturbance: Any) -> jax.Array:
@@ -251,6 +270,66 @@ class Sum:
         """The parts' jump times together, (m,) [s]."""
         return joined([jump_times_of(f"Sum.parts[{i}]", part) for i, part in enumerate(self.parts)])
 
+    def rates(self, t: jax.Array, x: jax.Array, plant: Any, model: Any) -> jax.Array | None:
+        """The sum over the parts that disturb levels, (r, n); None if none does."""
+        total = None
+        for part in self.parts:
+            found = rates_of(part, t, x, plant, model)
+            if found is not None:
+                total = found if total is None else total + found
+        return total
+
+
+@component
+class Levels:
+    """d_1 ... d_r of (S.1): one disturbance for each level of the plant.
+
+        x_i' = f_i + G_i x_{i+1} + d_i
+
+    d_i is the `torque` of part i, which receives the first two levels as q and q'; its numbers are
+    in the unit of level i per second.
+
+    Args:
+      parts: a disturbance for each level, or None for a level without one, a tuple or a list; fewer
+        parts than levels leave the last levels undisturbed.
+    """
+
+    parts: tuple[Disturbance | None, ...]
+
+    def check(self) -> None:
+        """Takes a list for a tuple; raises ValueError for a part that is not a disturbance."""
+        if not isinstance(self.parts, tuple | list):
+            remedy = "Such as Levels((None, Sinusoids(0.3, 1.0)))."
+            raise checks.fail("Levels.parts", self.parts, "a tuple of disturbances or None", remedy)
+        object.__setattr__(self, "parts", tuple(self.parts))
+        for i, part in enumerate(self.parts):
+            if part is not None:
+                checks.conforms(f"Levels.parts[{i}]", part, Disturbance)
+
+    def torque(
+        self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot
+    ) -> jax.Array:
+        """No torque, (n,) [N m]."""
+        return jnp.zeros_like(q)
+
+    def rates(self, t: jax.Array, x: jax.Array, plant: Any, model: Any) -> jax.Array:
+        """d_1 ... d_r, (r, n)."""
+        rows = [
+            jnp.zeros_like(x[0]) if part is None else part.torque(t, x[0], x[1], plant, model)
+            for part in self.parts[: len(x)]
+        ]
+        rows += [jnp.zeros_like(x[0])] * (len(x) - len(rows))
+        return jnp.stack(rows)
+
+    def jump_times(self) -> jax.Array:
+        """The parts' jump times together, (m,) [s]."""
+        found = [
+            jump_times_of(f"Levels.parts[{i}]", part)
+            for i, part in enumerate(self.parts)
+            if part is not None
+        ]
+        return joined(found)
+
 
 MEMBERS = {
     "nothing": Nothing,
@@ -260,5 +339,6 @@ MEMBERS = {
     "tip_force": TipForce,
     "friction": Friction,
     "sum": Sum,
+    "levels": Levels,
 }
 """Every disturbance by the name that a scenario file gives it."""

@@ -7,7 +7,8 @@ q_d", and its derivative alpha' is continuous only if q_d" is.
 
 from __future__ import annotations
 
-from typing import Protocol
+import math
+from typing import ClassVar, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +17,7 @@ import numpy as np
 from iblf_jax.core import checks
 from iblf_jax.core.caches import memoised
 from iblf_jax.core.linalg import matvec
+from iblf_jax.core.optional import OptionalMembers
 from iblf_jax.core.pytree import Leaf, component, leaf, static
 
 
@@ -23,12 +25,18 @@ class Reference(Protocol):
     """The contract of a reference.
 
     A reference that is discontinuous in time also has `jump_times()`, the times (m,) [s] at which
-    q_d, q_d' or q_d" jumps; steps of a run are divided there, as for disturbances.
+    q_d, q_d' or q_d" jumps; steps of a run are divided there, as for disturbances.  A reference
+    that is not smooth has `continuous_derivatives`, the number of its continuous derivatives; a law
+    for a plant of order r needs r of them.
     """
 
     def position(self, t: jax.Array) -> jax.Array:
         """q_d(t), (n,) [rad], twice differentiable in t [s]."""
         ...
+
+
+reference_member = OptionalMembers(continuous_derivatives=math.inf)
+"""Reads optional members of a reference."""
 
 
 @component
@@ -73,6 +81,7 @@ class Quintic:
     start: Leaf = leaf("rad")
     end: Leaf = leaf("rad")
     duration: Leaf = leaf("s", sign="positive", shape="scalar")
+    continuous_derivatives: ClassVar[int] = 2
 
     def position(self, t: jax.Array) -> jax.Array:
         """q_d(t), (n,) [rad]."""
@@ -98,6 +107,7 @@ class WaypointSpline:
 
     times: tuple[float, ...] = static()
     waypoints: Leaf = leaf("rad", shape="any")
+    continuous_derivatives: ClassVar[int] = 2
 
     def check(self) -> None:
         """Raises ValueError for times that do not increase or do not match the waypoints."""

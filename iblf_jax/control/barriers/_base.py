@@ -20,6 +20,7 @@ velocities (`controllers.FullState`).
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple, Protocol
 
 import jax
@@ -98,7 +99,9 @@ class Barrier(Protocol):
         order there.
 
         A class attribute `ratio_jumps = False` states that the ratio is continuous at e1 = 0 in an
-        asymmetric tube, too; without it a law assumes that it may jump there.
+        asymmetric tube, too; without it a law assumes that it may jump there.  A class attribute
+        or property `slope_derivatives` states how many continuous derivatives the slope has there;
+        without it a law assumes that it is smooth.
         """
         ...
 
@@ -107,6 +110,7 @@ barrier_member = OptionalMembers(
     uses_o=True,
     value_unit="1",
     ratio_jumps=True,
+    slope_derivatives=math.inf,
     decay_rate=lambda k1: None,
     xi_bound=lambda V, tube: None,
     error_over_slope=lambda tube, q: None,

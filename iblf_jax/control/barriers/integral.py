@@ -39,6 +39,7 @@ class Integral:
     guard: float = static(default=GUARD)
     uses_o: ClassVar[bool] = True
     value_unit: ClassVar[str] = "1"
+    slope_derivatives: ClassVar[int] = 0
 
     def check(self) -> None:
         """Raises ValueError for a guard outside (0, 1)."""

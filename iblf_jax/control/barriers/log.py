@@ -40,6 +40,11 @@ class Log:
     uses_o: ClassVar[bool] = True
     value_unit: ClassVar[str] = "1"
 
+    @property
+    def slope_derivatives(self) -> int:
+        """Continuous derivatives of the slope at e1 = 0 in an asymmetric tube, 2p - 2."""
+        return 2 * self.p - 2
+
     def check(self) -> None:
         """Raises ValueError unless p is a whole number >= 1 and the guard in (0, 1)."""
         check_guard("Log", self.guard)

@@ -9,6 +9,9 @@ from iblf_jax.control.controllers._base import LyapunovLaw as LyapunovLaw
 from iblf_jax.control.controllers._base import State as State
 from iblf_jax.control.controllers.adaptive_rbf import AdaptiveRBF as AdaptiveRBF
 from iblf_jax.control.controllers.backstepping import Backstepping as Backstepping
+from iblf_jax.control.controllers.barrier_backstepping import (
+    BarrierBackstepping as BarrierBackstepping,
+)
 from iblf_jax.control.controllers.computed_torque import ComputedTorque as ComputedTorque
 from iblf_jax.control.controllers.dynamic_surface import DynamicSurface as DynamicSurface
 from iblf_jax.control.controllers.full_state import FullState as FullState
@@ -27,6 +30,7 @@ Setting = LawContext
 
 MEMBERS = {
     "backstepping": Backstepping,
+    "barrier_backstepping": BarrierBackstepping,
     "full_state": FullState,
     "dynamic_surface": DynamicSurface,
     "adaptive_rbf": AdaptiveRBF,
@@ -45,6 +49,7 @@ __all__ = [
     "MEMBERS",
     "AdaptiveRBF",
     "Backstepping",
+    "BarrierBackstepping",
     "Command",
     "ComputedTorque",
     "Controller",

@@ -12,9 +12,11 @@ from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import jax
+import jax.numpy as jnp
 
 from iblf_jax.core.linalg import matvec
 from iblf_jax.core.optional import OptionalMembers
+from iblf_jax.core.pytree import unwrapped
 from iblf_jax.world.bounds import Bounds, Tube, speed_limits_at, tube_at
 from iblf_jax.world.references import Reference
 from iblf_jax.world.regions import Along, Region, along
@@ -32,6 +34,18 @@ class LawContext(NamedTuple):
     bounds: Bounds
     velocity_bounds: Bounds | None = None
     regions: tuple[Region, ...] = ()
+    state_bounds: tuple[Bounds | None, ...] = ()
+    """Bounds of the levels from the second on of a plant in strict-feedback form."""
+
+    def level_bounds(self, level: int) -> Bounds | None:
+        """The bounds of a level, counted from 1; None where it has none."""
+        if level == 1:
+            return self.bounds
+        if level == 2 and self.velocity_bounds is not None:
+            return self.velocity_bounds
+        if len(self.state_bounds) < level - 1:
+            return None
+        return self.state_bounds[level - 2]
 
     def tube(self, t: jax.Array, *, acceleration: bool = True) -> Tube:
         """Reference, bounds and their rates at time t [s]; arguments as `bounds.tube_at`."""
@@ -71,6 +85,12 @@ class Command(NamedTuple):
     """The violation of a filter's conditions, (n,) [rad/s^2]; `()` for laws without a filter."""
     region_slack: Any = ()
     """The violation of its conditions on m regions, (m,) [m/s^2]; `()` without regions."""
+    alpha_higher: Any = ()
+    """alpha_2 ... alpha_{r-1} of a plant of order r > 2, (r - 2, n), in the units of the levels
+    that they are for; `()` for laws of robots."""
+    input: Any = ()
+    """The input of the plant, (n,), where it is not the torque `tau`: the voltage of a drive, say.
+    Observers receive `tau`."""
 
 
 class Controller(Protocol):
@@ -85,14 +105,19 @@ class Controller(Protocol):
     - `needs_velocity_bounds`: True if it requires `LawContext.velocity_bounds`.
     - `includes_e2`: True if its V1 contains its term of e2, so that V2 adds no 1/2 e2^T M0 e2.
     - `filters`: True if its commands have a `slack`.
+    - `receives_x`: True for a law of plants in strict-feedback form, which receives the state x,
+      (r, n), in the place of q and q': `init(x, context)`, `command(t, x, d_hat, context, state)`
+      and `switching(t, x, context, state)`, with d_hat as the observer gives it, (r, n) or (n,).
     - `wraps`: the name of the field that holds another law.  Paths then reach through it
       ("controller.K2").
     - `unit_factors`: the names of leaves that are factors only.  Which of their numbers are 1 may
       be compiled in (`engine.structural_constants`).
 
-    It may have these methods: `advice()` returns a list of warnings; `check_start(context)` raises
-    ValueError for fields that do not fit together, once the number of joints is known;
-    `leaf_units()` returns the units of leaves that depend on other fields, by name.
+    It may have these methods: `completed(context, x)` returns the law with values that depend on
+    the model and on the start x, (r, n), where none were given; `advice()` returns a list of
+    warnings; `check_start(context)` raises ValueError for fields that do not fit together, once the
+    number of joints is known; `leaf_units()` returns the units of leaves that depend on other
+    fields, by name.
 
     A law whose command is discontinuous, such as a sliding-mode law or `FullState` with some
     barriers, has `switching(t, q, dq, context, state)`.  It returns (m,) functions of q or q', and
@@ -133,6 +158,8 @@ law_member = OptionalMembers(
     needs_velocity_bounds=False,
     includes_e2=False,
     filters=False,
+    receives_x=False,
+    completed=None,
     advice=list,
     check_start=lambda context: None,
     switching=lambda t, q, dq, context, state: None,
@@ -145,14 +172,37 @@ law_member = OptionalMembers(
 fields of laws with a barrier."""
 
 
-def switching_functions(
-    law: Controller, t: jax.Array, q: jax.Array, dq: jax.Array, context: LawContext, state: State
-) -> jax.Array | None:
+def switching_functions(law: Controller, *arguments: Any) -> jax.Array | None:
     """The functions at whose zeros a law's command jumps, (m,), or None if it declares none;
-    arguments as `Controller.command`.
+    arguments as `Controller.command`, without the estimate.
     """
-    functions: jax.Array | None = law_member(law, "switching")(t, q, dq, context, state)
+    default = law_member.defaults["switching"]
+    own = law_member(law, "switching")
+    if own is default:
+        return None
+    functions: jax.Array | None = own(*arguments)
     return functions
+
+
+def measured_arguments(
+    law: Controller, q: jax.Array, dq: jax.Array, higher: Any
+) -> tuple[jax.Array, ...]:
+    """How a law receives the state of the plant: (q, q'), or (x,) if it `receives_x`.
+
+    Args:
+      law: any.
+      q, dq: the first two levels, (n,).
+      higher: the levels from the third on, (r - 2, n); `()` for a robot.
+    """
+    if not law_member(unwrapped(law), "receives_x"):
+        return q, dq
+    return (state_of_levels(q, dq, higher),)
+
+
+def state_of_levels(q: jax.Array, dq: jax.Array, higher: Any) -> jax.Array:
+    """The state x of a plant, (r, n), from its first two levels and the others."""
+    first = jnp.stack([q, dq])
+    return first if isinstance(higher, tuple) else jnp.concatenate([first, higher])
 
 
 def no_state(law: Any, q: jax.Array, dq: jax.Array, context: LawContext) -> tuple[()]:
@@ -165,16 +215,14 @@ def wrapped_advice(law: Any) -> list[str]:
     return law_member(law.law, "advice")()  # type: ignore[no-any-return]
 
 
-def wrapped_state(law: Any, q: jax.Array, dq: jax.Array, context: LawContext) -> State:
+def wrapped_state(law: Any, *arguments: Any) -> State:
     """`init` of a law that wraps another and has no state of its own."""
-    return law.law.init(q, dq, context)
+    return law.law.init(*arguments)
 
 
-def wrapped_switching(
-    law: Any, t: jax.Array, q: jax.Array, dq: jax.Array, context: LawContext, state: State
-) -> jax.Array | None:
+def wrapped_switching(law: Any, *arguments: Any) -> jax.Array | None:
     """`switching` of a law that wraps another and has no state of its own: the other's."""
-    return switching_functions(law.law, t, q, dq, context, state)
+    return switching_functions(law.law, *arguments)
 
 
 def rigid_body_torque(

@@ -129,16 +129,17 @@ def check_barrier(law, field: str, barrier: Any, example: str = "Integral") -> N
     checks.conforms(name, barrier, Barrier, f"Such as iblf_jax.barriers.{example}().", CLAIMS)
 
 
-def fit_o(law, *barriers: Barrier) -> None:
+def fit_o(law, *barriers: Barrier, like: jax.Array | None = None) -> None:
     """Fits `o` of a law under construction to its barriers: 0.1, the paper's, if one of them needs
-    it and none was given.
+    it and none was given; of the shape of `like`, which is k1 if not given.
 
     Raises:
       ValueError: an `o` for barriers of which none has a kappa.
     """
     uses_o = any(barrier_member(barrier, "uses_o") for barrier in barriers)
     if uses_o and law.o is None:
-        object.__setattr__(law, "o", jnp.full_like(law.k1, 0.1))
+        shape_of = law.k1 if like is None else like
+        object.__setattr__(law, "o", jnp.full_like(shape_of, 0.1))
     if not uses_o and law.o is not None:
         names = " and ".join(type(barrier).__name__ for barrier in barriers)
         expected = f"None with the barrier {names}"

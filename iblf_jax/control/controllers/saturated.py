@@ -6,7 +6,7 @@ torque that was cut.  The claims of a law hold only while its torque is not cut.
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,6 @@ import numpy as np
 from iblf_jax.control.controllers._base import (
     Command,
     Controller,
-    LawContext,
     State,
     wrapped_advice,
     wrapped_state,
@@ -59,19 +58,11 @@ class Saturated:
         checks.conforms("Saturated.law", self.law, Controller, "iblf_jax.controllers has them.")
         checks.one_of("Saturated.edge", self.edge, EDGES)
 
-    def command(
-        self,
-        t: jax.Array,
-        q: jax.Array,
-        dq: jax.Array,
-        f_hat: jax.Array,
-        context: LawContext,
-        state: State,
-    ) -> tuple[Command, State]:
+    def command(self, *arguments: Any) -> tuple[Command, State]:
         """The wrapped law's command with its torque limited; `saturated` says where it commanded
-        more than the limit.
+        more than the limit.  Arguments as those of the wrapped law.
         """
-        command, rate = self.law.command(t, q, dq, f_hat, context, state)
+        command, rate = self.law.command(*arguments)
         saturated = command.saturated | (jnp.abs(command.tau) > self.limit)
         if self.edge == "hard":
             tau = jnp.clip(command.tau, -self.limit, self.limit)

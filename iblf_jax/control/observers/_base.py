@@ -25,6 +25,11 @@ class Observer(Protocol):
     them.  `advance(t, q, dq, tau, model, state, period)` returns its state a period [s] later for
     constant measurements and torque.  `at_period(period)` returns the observer with gains for which
     a step of Euler has the same poles as the continuous observer has over one period.
+
+    An observer of plants in strict-feedback form has the class attribute `receives_x = True`.  Its
+    methods then receive the state x, (r, n), in the place of q and q', a `plants.Plant` as the
+    model and the input u as `tau`; its estimate is d_hat, (r, n), what the disturbance adds to x'.
+    Other observers serve the robot inside such a plant, and `tau` is the torque on its joints.
     """
 
     def init(self, q: jax.Array, dq: jax.Array, model: Robot) -> State:
@@ -46,5 +51,5 @@ class Observer(Protocol):
         ...
 
 
-observer_member = OptionalMembers(advance=None, at_period=None, advice=list)
+observer_member = OptionalMembers(receives_x=False, advance=None, at_period=None, advice=list)
 """Reads optional members of an observer."""

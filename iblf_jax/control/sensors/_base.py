@@ -25,6 +25,9 @@ class Measurement(NamedTuple):
     """Position, (n,) [rad]."""
     dq: jax.Array
     """Velocity, (n,) [rad/s]."""
+    higher: Any = ()
+    """The levels from the third on of a plant in strict-feedback form, (r - 2, n); `()` for a
+    robot."""
 
 
 class Sensor(Protocol):
@@ -34,6 +37,10 @@ class Sensor(Protocol):
     which the fastest mode of a loop is computed, and `resolution`, the size of a count, () or (n,)
     [rad], for the default ranges of gains.  A sensor may have a method `advice(period)`, a list of
     warnings.
+
+    A sensor of all levels of a plant in strict-feedback form has the class attribute
+    `receives_x = True`; its methods then receive the state x, (r, n), in the place of q and q'.
+    With any other sensor the levels from the third on are measured without error.
     """
 
     @property
@@ -94,7 +101,7 @@ class Velocity(Protocol):
 
 
 sensor_member = OptionalMembers(
-    unrounded=None, resolution=0.0, velocity=None, advice=lambda period: []
+    receives_x=False, unrounded=None, resolution=0.0, velocity=None, advice=lambda period: []
 )
 """Reads optional members of a sensor or of its velocity estimate."""
 

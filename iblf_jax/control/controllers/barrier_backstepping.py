@@ -1,0 +1,509 @@
+"""Backstepping with a barrier on every level of a plant in strict-feedback form.
+
+With alpha_0 = x_d and e_i = x_i - alpha_{i-1}, the bounds of x_i give e_i the tube
+
+    -K_l < e_i < K_u,   K_u = upper_i - alpha_{i-1},   K_l = alpha_{i-1} - lower_i.
+
+Each level has a barrier V_i with a weight w_i > 0; s_i is its slope and a_i its "virtual velocity",
+for which s_i (a_i - alpha_{i-1}') + dV_i/dt <= -decay_i.  Level i chooses the level above,
+
+    alpha_i = G_i^-1 [ a_i - c_i s_i - (e_i/(w_i s_i)) G_{i-1}^T (w_{i-1} s_{i-1})
+                       - f_i - d_hat_i ],   u = alpha_r,                                     (S.2)
+
+without the third term for i = 1, which cancels (w_{i-1} s_{i-1})^T G_{i-1} e_i exactly.  Without
+disturbances (sum w_i V_i)' <= -sum w_i decay_i - sum c_i w_i |s_i|^2.
+
+**Weights.**  They give sum w_i V_i one unit, and they set how fast the levels exchange energy: by
+G_{i-1}^T w_{i-1} G_{i-1} / w_i [1/s^2].  With weights of 1 on a flexible joint that is (K/M)^2, and
+with those of the energy K/M.  The plants of this package state the scales of their levels'
+energies (`weights`); for others w = 1.
+
+**Derivatives.**  alpha_{i-1}' is the derivative along the flow of the model, x_j' = f_j + G_j
+x_{j+1} + d_hat_j, with the output of the observer held.  All derivatives are along one trajectory,
+so that they follow from Taylor coefficients in time (`core.taylor`): those of x_j of the orders up
+to r - j, those of the reference and of the bounds, and then, level by level, those of alpha_i and
+of w_i s_i up to the order r - i.
+
+**Dynamic surface.**  With a `filter`, mu_i beta_i' + beta_i = alpha_i, e_{i+1} = x_{i+1} - beta_i,
+and beta_i' = (alpha_i - beta_i)/mu_i takes the place of alpha_i'.  No derivative is formed; the lag
+of the filters remains as an error, and the bound above becomes ultimate boundedness.
+
+**Smoothness.**  u contains the slope s_i of a level differentiated r - i - 1 times.  `Integral` and
+`Log` have a kink of the slope at e_i = 0 in an asymmetric tube, and on levels above the first
+their e_i/s_i jumps there.  Such a barrier is refused below the last level.  On the last level u
+jumps at e_r = 0 (`switching`), as the exact cancellation requires.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax.control.barriers import Barrier, Mapping, Quadratic
+from iblf_jax.control.barriers._base import (
+    barrier_member,
+    guard_is_active,
+    ratio_jumps,
+)
+from iblf_jax.control.controllers._base import Command, LawContext
+from iblf_jax.control.controllers.backstepping import check_barrier, fit_o
+from iblf_jax.core import checks, taylor
+from iblf_jax.core.pytree import Leaf, component, leaf
+from iblf_jax.world import plants
+from iblf_jax.world.bounds import Bounds, Funnel, Tube
+from iblf_jax.world.plants import Plant
+from iblf_jax.world.references import reference_member
+
+
+class Below(NamedTuple):
+    """What a level receives from the level below."""
+
+    tube: Tube
+    """The tube of x_i around alpha_{i-1}; "positions" are in the unit of the level."""
+    slope: Any
+    """w_{i-1} s_{i-1}, (n,); None for the first level."""
+
+
+class Level(NamedTuple):
+    """What a level computes."""
+
+    alpha: jax.Array
+    """alpha_i, the level above as this level needs it, (n,); u for the last level."""
+    slope: jax.Array
+    """w_i s_i, (n,)."""
+
+
+@component
+class BarrierBackstepping:
+    """u = alpha_r of (S.2), for a plant of any order r (head of this module).
+
+    The law receives the state x, (r, n), of any plant in strict-feedback form, robots included.
+    It keeps the bounds of every level that has a barrier, as long as alpha_{i-1} is inside the
+    bounds of level i (`alpha_margin` > 0).
+
+    Args:
+      k: gain of each level, r numbers or (r, n) [1/s], > 0.
+      barriers: a `Barrier` for each level, `Quadratic()` where a level has no bounds.  A single
+        barrier is that of the first level, with `Quadratic()` above; `(Mapping(),)` if not given.
+      c: gain of each level's slope s_i, which limits the effect of estimation errors, one number, r
+        numbers or (r, n) [1], >= 0; 0 if not given.
+      weights: w_i of each level's V_i, r numbers or (r, n) [1], > 0; those of the model's energy if
+        not given, with which w_i V_i is about half the scale of the level times e_i^2 near e_i = 0;
+        1 for a model that states none.
+      o: margin under the root of kappa, one number, r numbers or (r, n) [1/s^2], > 0, for barriers
+        that have it and for no others; 0.1 for these, if not given.
+      filter: mu_i of the filters of a dynamic surface, r - 1 numbers or (r - 1, n) [s], > 0; exact
+        derivatives if not given.
+
+    Source: M. Krstic, I. Kanellakopoulos, P. Kokotovic, Nonlinear and Adaptive Control Design,
+      1995 (backstepping); K. P. Tee, S. S. Ge, Automatica 47 (2011) 2511-2516 (barriers); weights
+      and full-state bounds as at the head of this module.
+    """
+
+    k: Leaf = leaf("1/s", sign="positive", shape="level")
+    barriers: tuple[Barrier, ...] = (Mapping(),)
+    c: Leaf = leaf("1", sign="nonnegative", shape="level", default=0.0)
+    weights: Leaf = leaf("1", sign="positive", shape="level", default=None)
+    o: Leaf = leaf("1/s^2", sign="positive", shape="level", default=None)
+    filter: Leaf = leaf("s", sign="positive", shape="level", default=None)
+    gains: ClassVar[tuple[str, ...]] = ("k",)
+    receives_x: ClassVar[bool] = True
+    includes_e2: ClassVar[bool] = True
+
+    def check(self) -> None:
+        """Raises ValueError for barriers and gains that do not fit together; completes `c` and
+        `o`.
+        """
+        if isinstance(self.barriers, list):
+            object.__setattr__(self, "barriers", tuple(self.barriers))
+        if not isinstance(self.barriers, tuple):
+            object.__setattr__(self, "barriers", (self.barriers,))
+        order = self._check_gains()
+        above = order - len(self.barriers)
+        if len(self.barriers) == 1:
+            object.__setattr__(self, "barriers", (*self.barriers, *[Quadratic()] * above))
+        elif above:
+            expected = f"{order} barriers, one a level, as k has {order} rows"
+            remedy = "Quadratic() is for a level without bounds."
+            got = f"{len(self.barriers)} barriers"
+            raise checks.fail("BarrierBackstepping.barriers", got, expected, remedy)
+        for i, barrier in enumerate(self.barriers):
+            check_barrier(self, f"barriers[{i}]", barrier, "Mapping")
+        fit_o(self, *self.barriers, like=jnp.zeros(order, self.k.dtype))
+        for name, rows in (("c", order), ("weights", order), ("o", order), ("filter", order - 1)):
+            self._fit_rows(name, rows)
+
+    def _check_gains(self) -> int:
+        """The order r, which is the number of rows of `k`; ValueError for a single number."""
+        if jnp.ndim(self.k) == 0 or self.k.shape[0] < 2:
+            expected = "one gain a level, for at least two levels"
+            remedy = "Such as k=(3.0, 20.0, 60.0)."
+            raise checks.fail("BarrierBackstepping.k", self.k, expected, remedy)
+        return int(self.k.shape[0])
+
+    def _fit_rows(self, name: str, rows: int) -> None:
+        """Repeats a single number for the levels; ValueError for another number of rows."""
+        value = vars(self)[name]
+        if value is None:
+            return
+        if jnp.ndim(value) == 0:
+            object.__setattr__(self, name, jnp.broadcast_to(value, (rows,)))
+        elif value.shape[0] != rows:
+            expected = f"one number, or {rows} rows"
+            got = f"shape {value.shape}"
+            raise checks.fail(f"BarrierBackstepping.{name}", got, expected)
+
+    @property
+    def order(self) -> int:
+        """Number of levels r."""
+        return len(self.barriers)
+
+    # --- checks against a scenario ----------------------------------------------------------------
+
+    def completed(self, context: LawContext, x: jax.Array) -> BarrierBackstepping:
+        """The law with weights, (r, n), that belong to its model and to a state x."""
+        if self.weights is not None or plants.order_of(context.model) != self.order:
+            return self
+        scale = plants.plant_member(plants.as_plant(context.model), "weights")
+        weights = jnp.ones_like(x)
+        if scale is not None:
+            weights = scale(x) * self._centre_ratios(context, x)
+        copy = object.__new__(type(self))
+        for name, value in vars(self).items():
+            object.__setattr__(copy, name, value)
+        object.__setattr__(copy, "weights", weights)
+        return copy
+
+    def _centre_ratios(self, context: LawContext, x: jax.Array) -> jax.Array:
+        """e_i/s_i at e_i = 0 and t = 0, (r, n), with which the weights have the scale of e_i^2."""
+        t = jnp.zeros((), x.dtype)
+        ratios = [_ratio(self.barriers[0], context.tube(t), context.tube(t).q_d)]
+        for i in range(1, self.order):
+            tube = _still_tube(context.level_bounds(i + 1), t, jnp.zeros_like(x[i]))
+            ratios.append(_ratio(self.barriers[i], tube, tube.q_d))
+        return jnp.stack(ratios)
+
+    def check_start(self, context: LawContext) -> None:
+        """Raises ValueError for a model, bounds or a reference that do not fit the law."""
+        order = plants.order_of(context.model)
+        if order != self.order:
+            kind = type(context.model).__name__
+            expected = f"{order} levels, as the model ({kind}) has"
+            remedy = "Give k, barriers and weights one entry a level."
+            raise checks.fail("controller.k", f"{self.order} levels", expected, remedy)
+        self._check_reference(context)
+        for i, barrier in enumerate(self.barriers):
+            self._check_level(context, i, barrier)
+
+    def _check_reference(self, context: LawContext) -> None:
+        """Raises ValueError for a reference with too few continuous derivatives."""
+        if self.filter is not None:
+            return
+        smooth = reference_member(context.reference, "continuous_derivatives")
+        if smooth >= self.order:
+            return
+        expected = f"a reference with {self.order} continuous derivatives, as u contains them"
+        got = f"{type(context.reference).__name__}, which has {smooth}"
+        remedy = (
+            "Sinusoid is smooth; SmoothStep and WaypointSpline take `derivatives`; or filter the"
+            " virtual controls: BarrierBackstepping(filter=...)."
+        )
+        raise checks.fail("reference", got, expected, remedy)
+
+    def _check_level(self, context: LawContext, i: int, barrier: Barrier) -> None:
+        """Raises ValueError for a barrier without bounds, or one that is not smooth enough."""
+        name, kind = f"controller.barriers[{i}]", type(barrier).__name__
+        if isinstance(barrier, Quadratic):
+            return
+        bounds = context.level_bounds(i + 1)
+        if bounds is None:
+            field = f"state_bounds[{i - 1}]"
+            expected = f"bounds of level {i + 1} for the barrier {kind}"
+            remedy = "Or take barriers.Quadratic() for that level."
+            raise checks.fail(field, None, expected, remedy)
+        last = i == self.order - 1
+        if i > 0 and _ratio_of(barrier) is None:
+            expected = "a barrier with `error_over_slope` above the first level"
+            raise checks.fail(name, kind, expected, "Such as Mapping().")
+        if last or self.filter is not None or _is_symmetric(context, i, bounds):
+            return
+        needed = self.order - i - 2
+        smooth = barrier_member(barrier, "slope_derivatives")
+        if smooth >= needed and not (i > 0 and ratio_jumps(barrier)):
+            return
+        expected = f"a barrier whose slope has {max(needed, 0)} continuous derivatives at e = 0"
+        if i > 0:
+            expected += " and whose e/s does not jump there"
+        remedy = f"{_smooth_alternatives(i, self.order)} The tube of this level is asymmetric."
+        raise checks.fail(name, kind, expected, remedy)
+
+    # --- the law ----------------------------------------------------------------------------------
+
+    def init(self, x: jax.Array, context: LawContext) -> Any:
+        """beta_i(0) = alpha_i(0), (r - 1, n), of a dynamic surface; no state otherwise."""
+        if self.filter is None:
+            return ()
+        t = jnp.zeros((), x.dtype)
+        betas: list[jax.Array] = []
+        zero = jnp.zeros_like(x[0])
+        for _ in range(self.order - 1):
+            padded = [*betas, *[zero] * (self.order - 1 - len(betas))]
+            found = self._surface_levels(t, x, zero, context, jnp.stack(padded))
+            betas.append(found[len(betas)].alpha)
+        return jnp.stack(betas)
+
+    def command(
+        self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext, state: Any
+    ) -> tuple[Command, Any]:
+        """The input u, what belongs to it, and the rates of the filters.
+
+        Args:
+          t: time, () [s].
+          x: state, (r, n).
+          d_hat: estimate of the disturbance of each level, (r, n); or of the torque on the robot
+            inside the plant, (n,) [N m].
+          context: model, reference and bounds.
+          state: beta, (r - 1, n), of a dynamic surface.
+        """
+        if self.filter is None:
+            levels, tubes = self._exact_levels(t, x, d_hat, context)
+            alphas = [level.alpha for level in levels[:-1]]
+            rates: Any = ()
+        else:
+            levels = self._surface_levels(t, x, d_hat, context, state)
+            tubes = [self._surface_tube(i, t, context, state, levels) for i in range(self.order)]
+            alphas = list(state)
+            found = jnp.stack([level.alpha for level in levels[:-1]])
+            rates = (found - state) / self.filter
+        V = jnp.zeros_like(x[0])
+        guard_active = jnp.zeros(x[0].shape, bool)
+        for i, (barrier, tube) in enumerate(zip(self.barriers, tubes, strict=True)):
+            V = V + self.weights[i] * barrier.value(tube, x[i])
+            guard_active |= guard_is_active(tube, x[i], barrier.guard)
+        command = Command(levels[-1].alpha, alphas[0], V, guard_active, guard_active & False)
+        if self.order > 2:
+            command = command._replace(alpha_higher=jnp.stack(alphas[1:]))
+        return command, rates
+
+    def switching(
+        self, t: jax.Array, x: jax.Array, context: LawContext, state: Any
+    ) -> jax.Array | None:
+        """e_r, (n,), where u jumps at e_r = 0; None for a last barrier without a jump."""
+        if not ratio_jumps(self.barriers[-1]):
+            return None
+        command, _ = self.command(t, x, jnp.zeros_like(x), context, state)
+        if self.order == 2:
+            return x[-1] - command.alpha
+        return x[-1] - command.alpha_higher[-1]
+
+    def _exact_levels(
+        self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext
+    ) -> tuple[list[Level], list[Tube]]:
+        """All levels and their tubes, with the derivatives along the flow of the model."""
+        plant, order = plants.as_plant(context.model), self.order
+        states = _curve_of_state(plant, t, x, d_hat)
+        times = _curve_of_time(t, order + 1)
+        centre = taylor.along(context.reference.position, times)
+        levels: list[Level] = []
+        tubes: list[Tube] = []
+        slope: list[Any] = [None] * order
+        for i in range(order):
+            terms = order - i  # Taylor coefficients of alpha_i
+            sides = _curve_of_bounds(context, i + 1, times[: terms + 1], centre[: terms + 1])
+            tube_curve = _curve_of_tube(centre, *sides, terms)
+
+            def level(t, x, tube, slope, i=i):
+                return self._level(i, plant, t, x, Below(tube, slope), d_hat)
+
+            curve = [(times[m][0], states[m], tube_curve[m], slope[m]) for m in range(terms)]
+            found = taylor.along(level, curve)
+            levels.append(found[0])
+            tubes.append(tube_curve[0])
+            centre = [x.alpha for x in found]
+            slope = [x.slope for x in found]
+        return levels, tubes
+
+    def _level(
+        self, i: int, plant: Plant, t: jax.Array, x: jax.Array, below: Below, d_hat: jax.Array
+    ) -> Level:
+        """Alpha and the weighted slope of level i + 1."""
+        barrier, tube, at = self.barriers[i], below.tube, x[i]
+        w = self.weights[i]
+        margin = None if self.o is None else self.o[i]
+        s = barrier.slope(tube, at)
+        rate = barrier.virtual_velocity(tube, at, self.k[i], margin) - self.c[i] * s
+        if below.slope is not None:
+            ratio: Any = barrier.error_over_slope(tube, at)
+            rate = rate - ratio / w * plants.transposed_gain(plant, i, t, x, below.slope)
+        rates, torque = _split(d_hat)
+        if rates is not None:
+            rate = rate - rates[i]
+        return Level(plants.level_input(plant, i + 1, t, x, rate, torque), w * s)
+
+    def _surface_levels(
+        self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext, state: jax.Array
+    ) -> list[Level]:
+        """All levels of a dynamic surface with the filters' states."""
+        plant = plants.as_plant(context.model)
+        levels: list[Level] = []
+        slope = None
+        for i in range(self.order):
+            tube = self._surface_tube(i, t, context, state, levels)
+            levels.append(self._level(i, plant, t, x, Below(tube, slope), d_hat))
+            slope = levels[-1].slope
+        return levels
+
+    def _surface_tube(
+        self, i: int, t: jax.Array, context: LawContext, state: jax.Array, levels: list[Level]
+    ) -> Tube:
+        """The tube of level i + 1 of a dynamic surface."""
+        if i == 0:
+            return context.tube(t, acceleration=False)
+        centre, alpha = state[i - 1], levels[i - 1].alpha
+        rate = (alpha - centre) / self.filter[i - 1]
+        times = _curve_of_time(t, 2)
+        lower, upper = _curve_of_bounds(context, i + 1, times, [centre, rate])
+        return Tube(centre, rate, lower[0], upper[0], lower[1], upper[1])
+
+
+# --- curves in time -----------------------------------------------------------------------------
+
+
+def _curve_of_time(t: jax.Array, count: int) -> list[tuple[jax.Array]]:
+    """`count` Taylor coefficients of the time itself."""
+    one, zero = jnp.ones_like(t), jnp.zeros_like(t)
+    return [(t,), (one,), *[(zero,)] * (count - 2)][:count]
+
+
+def _curve_of_state(plant: Plant, t: jax.Array, x: jax.Array, d_hat: jax.Array) -> list[jax.Array]:
+    """The Taylor coefficients of the state along the flow of the model, r of them, (r, n) each.
+
+    Level j, counted from 1, is known up to the order r - j, because the input is not known yet.
+    Entries beyond that are 0 and are not used.
+    """
+    rates, torque = _split(d_hat)
+    order = plant.order
+    zero = jnp.zeros_like(x[0])
+
+    def flow(t, x):
+        rows = []
+        for level in range(1, order):
+            rate = plants.level_rate(plant, level, t, x, x[level], torque)
+            rows.append(rate if rates is None else rate + rates[level - 1])
+        return jnp.stack(rows)
+
+    curve = [x]
+    for m in range(1, order):
+        times = _curve_of_time(t, m)
+        latest = taylor.along(flow, [(times[j][0], curve[j]) for j in range(m)])[-1]
+        known = [latest[j] * (1.0 / m) for j in range(order - m)]
+        curve.append(jnp.stack([*known, *[zero] * m]))
+    return curve
+
+
+def _curve_of_bounds(
+    context: LawContext, level: int, times: list, centre: list[jax.Array]
+) -> tuple[list[jax.Array], list[jax.Array]]:
+    """The Taylor coefficients of the bounds of a level, as many as those of its centre.
+
+    A level without bounds has a tube of constant width, which no `Quadratic` uses.
+    """
+    bounds = context.level_bounds(level)
+    if bounds is None:
+        return (
+            [centre[0] - 1.0, *centre[1:]],
+            [centre[0] + 1.0, *centre[1:]],
+        )
+    at: list[Any] = centre
+    if level == 2 and not plants.is_chain(context.model):
+        # Bounds on the velocities of a robot follow q_d'.
+        with_next = [*times, (jnp.zeros_like(times[0][0]),)]
+        at = taylor.derivative(taylor.along(context.reference.position, with_next))
+
+    def sides(t, x):
+        return bounds.lower.at(t, x), bounds.upper.at(t, x)
+
+    found = taylor.along(sides, [(t[0], x) for t, x in zip(times, at, strict=True)])
+    return [x[0] for x in found], [x[1] for x in found]
+
+
+def _curve_of_tube(
+    centre: list[jax.Array], lower: list[jax.Array], upper: list[jax.Array], terms: int
+) -> list[Tube]:
+    """The Taylor coefficients of a tube and of its rates, `terms` of them."""
+    rates = [taylor.derivative(curve[: terms + 1]) for curve in (centre, lower, upper)]
+    return [
+        Tube(centre[m], rates[0][m], lower[m], upper[m], rates[1][m], rates[2][m])
+        for m in range(terms)
+    ]
+
+
+def _split(d_hat: jax.Array) -> tuple[jax.Array | None, jax.Array | float]:
+    """An estimate as the rates that it adds to the levels, (r, n), and as a torque on the robot,
+    (n,) [N m]; the other is None, or 0.0.
+    """
+    return (d_hat, 0.0) if d_hat.ndim == 2 else (None, d_hat)
+
+
+# --- checks ---------------------------------------------------------------------------------------
+
+
+def _ratio_of(barrier: Barrier) -> jax.Array | None:
+    """e/s of a barrier in the middle of a tube, or None if it has no such ratio."""
+    zero, one = jnp.zeros(1), jnp.ones(1)
+    tube = Tube(zero, zero, -one, one, zero, zero)
+    return barrier_member(barrier, "error_over_slope")(tube, zero)  # type: ignore[no-any-return]
+
+
+def _ratio(barrier: Barrier, tube: Tube, x: jax.Array) -> jax.Array:
+    """e/s of a barrier; 1 for a barrier without one."""
+    found = barrier_member(barrier, "error_over_slope")(tube, x)
+    return jnp.ones_like(x) if found is None else found
+
+
+def _still_tube(bounds: Bounds | None, t: jax.Array, like: jax.Array) -> Tube:
+    """The tube of a level at time t around the middle of its bounds; of width 1 without bounds."""
+    zero = jnp.zeros_like(like)
+    if bounds is None:
+        return Tube(zero, zero, zero - 1.0, zero + 1.0, zero, zero)
+    lower, upper = bounds.lower.at(t, zero), bounds.upper.at(t, zero)
+    return Tube(0.5 * (lower + upper), zero, lower, upper, zero, zero)
+
+
+TIMES = (0.0, 0.37, 1.1, 2.9, 7.3, 19.7)
+"""Times [s] at which the bounds of the first level are compared with the reference."""
+
+
+def _is_symmetric(context: LawContext, i: int, bounds: Bounds) -> bool:
+    """Whether the tube of level i + 1 is symmetric about its centre at all times of a list; True
+    for traced values, which an earlier call has checked.
+    """
+    if not checks.is_concrete((bounds, context.reference)):
+        return True
+    if i > 0:
+        if not isinstance(bounds.lower, Funnel) or not isinstance(bounds.upper, Funnel):
+            return False
+        sides = [(bounds.lower, bounds.upper)]
+        return all(_are_opposite(lower, upper) for lower, upper in sides)
+    tubes = [context.tube(jnp.asarray(t)) for t in TIMES]
+    return all(np.allclose(tube.k_l, tube.k_u, rtol=1e-9, atol=0.0) for tube in tubes)
+
+
+def _are_opposite(lower: Funnel, upper: Funnel) -> bool:
+    """Whether two funnels are at the same distance on both sides."""
+    return bool(
+        np.allclose(lower.initial, -np.asarray(upper.initial))
+        and np.allclose(lower.final, -np.asarray(upper.final))
+        and np.allclose(lower.rate, upper.rate)
+    )
+
+
+def _smooth_alternatives(i: int, order: int) -> str:
+    """The barriers that are smooth enough on a level, in words."""
+    if i > 0:
+        return "Mapping() and PrescribedPerformance() are smooth."
+    p = -(-order // 2)
+    return f"Mapping(), PrescribedPerformance() and Log(p={p}) are smooth enough."

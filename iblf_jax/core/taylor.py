@@ -1,0 +1,422 @@
+"""Taylor coefficients of a function along a curve, for derivatives of higher order in time.
+
+A curve is a list of pytrees of one structure, its Taylor coefficients in time,
+
+    x(t0 + s) = x[0] + x[1] s + x[2] s^2 + ... + x[K] s^K,
+
+so that x[m] is the m-th derivative divided by m!.  `along` returns the coefficients of
+f(x(t0 + s)).  Nested forward differentiation computes the same numbers, but the number of its
+operations grows exponentially with K and that of Taylor arithmetic like K^2.
+
+The rules of the primitives are those of `jax.experimental.jet`, except for a few that are cheaper
+or more accurate here.  A function with a primitive that has no rule is differentiated by nested
+forward differentiation.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.experimental import jet
+from jax.extend import core
+
+Coefficients = list[Any]
+"""Taylor coefficients of one array; None for a coefficient that is zero."""
+
+
+class NoRuleError(Exception):
+    """A primitive has no rule for Taylor coefficients."""
+
+
+def along(function: Callable, curve: Sequence[tuple]) -> list[Any]:
+    """The Taylor coefficients of `function(*arguments)` where the arguments follow a curve.
+
+    Args:
+      function: a function of pytrees of floating-point arrays.
+      curve: the coefficients of the arguments, curve[m] a tuple of all arguments; K + 1 of them.
+
+    Returns:
+      K + 1 pytrees: the value of the function, and its coefficients of the orders 1 to K.
+    """
+    order = len(curve) - 1
+    if order == 0:
+        return [function(*curve[0])]
+    if order == 1:
+        return list(jax.jvp(function, curve[0], curve[1]))
+    try:
+        return _by_taylor_arithmetic(function, curve)
+    except NoRuleError:
+        return by_nested_jvp(function, curve)
+
+
+def by_nested_jvp(function: Callable, curve: Sequence[tuple]) -> list[Any]:
+    """`along` by nested forward differentiation, for every function that JAX differentiates."""
+    order = len(curve) - 1
+    first = jax.tree.leaves(curve[0])[0]
+    one = jnp.ones((), jnp.result_type(first))
+
+    def point(s: jax.Array) -> tuple:
+        def value(*coefficients):
+            total = coefficients[-1]
+            for coefficient in reversed(coefficients[:-1]):
+                total = total * s + coefficient
+            return total
+
+        return jax.tree.map(value, *curve)
+
+    def derivatives(order: int) -> Callable:
+        if order == 0:
+            return lambda s: [function(*point(s))]
+
+        def of_next_order(s):
+            values, rates = jax.jvp(derivatives(order - 1), (s,), (one,))
+            return [*values, rates[-1]]
+
+        return of_next_order
+
+    found = derivatives(order)(jnp.zeros_like(one))
+    return [
+        jax.tree.map(lambda x, m=m: x * (1.0 / math.factorial(m)), value)
+        for m, value in enumerate(found)
+    ]
+
+
+def derivative(curve: Sequence[Any]) -> list[Any]:
+    """The curve of the time derivative of a curve, one coefficient shorter."""
+    return [
+        jax.tree.map(lambda x, m=m: float(m) * x if m > 1 else x, coefficient)
+        for m, coefficient in enumerate(curve[1:], start=1)
+    ]
+
+
+# --- Taylor arithmetic on a traced function -----------------------------------------------------
+
+
+def _by_taylor_arithmetic(function: Callable, curve: Sequence[tuple]) -> list[Any]:
+    """`along` by Taylor arithmetic; NoRuleError for a primitive without a rule."""
+    traced, shape = jax.make_jaxpr(function, return_shape=True)(*curve[0])
+    rows = [jax.tree.leaves(coefficient) for coefficient in curve]
+    inputs = [list(coefficients) for coefficients in zip(*rows, strict=True)]
+    outputs = _evaluated(traced.jaxpr, traced.consts, inputs, len(curve) - 1)
+    structure = jax.tree.structure(shape)
+    dense = [_with_zeros(coefficients) for coefficients in outputs]
+    return [jax.tree.unflatten(structure, row) for row in zip(*dense, strict=True)]
+
+
+def _with_zeros(coefficients: Coefficients) -> list[jax.Array]:
+    """Coefficients with arrays of zeros in the place of None."""
+    zero = jnp.zeros_like(coefficients[0])
+    return [zero if x is None else x for x in coefficients]
+
+
+def _is_constant(coefficients: Coefficients) -> bool:
+    return all(x is None for x in coefficients[1:])
+
+
+def _evaluated(jaxpr: Any, consts: Sequence, inputs: list[Coefficients], order: int) -> list:
+    """The coefficients of the outputs of a jaxpr.
+
+    Calls are evaluated in place: the rules of functions with derivatives of their own
+    (`jax.custom_jvp`) are of first order only.
+    """
+    known: dict[Any, Coefficients] = {}
+    constant = [None] * order
+
+    def read(atom) -> Coefficients:
+        if isinstance(atom, core.Literal):
+            return [jnp.asarray(atom.val, atom.val.dtype), *constant]
+        return known[atom]
+
+    for variable, value in zip(jaxpr.constvars, consts, strict=True):
+        known[variable] = [value, *constant]
+    known.update(zip(jaxpr.invars, inputs, strict=True))
+    for equation in jaxpr.eqns:
+        found = _evaluated_equation(equation, [read(x) for x in equation.invars], order)
+        known.update(zip(equation.outvars, found, strict=True))
+    return [read(x) for x in jaxpr.outvars]
+
+
+CALLED_JAXPR = {
+    "jit": "jaxpr",
+    "pjit": "jaxpr",
+    "closed_call": "call_jaxpr",
+    "core_call": "call_jaxpr",
+    "remat2": "jaxpr",
+    "checkpoint": "jaxpr",
+    "custom_jvp_call": "call_jaxpr",
+    "custom_vjp_call": "call_jaxpr",
+}
+"""Primitive that calls a function -> the parameter that holds its jaxpr."""
+
+
+def _evaluated_equation(equation: Any, inputs: list[Coefficients], order: int) -> list:
+    """The coefficients of the outputs of one equation."""
+    primitive, params = equation.primitive, equation.params
+    if all(_is_constant(x) for x in inputs):
+        value = primitive.bind(*[x[0] for x in inputs], **params)
+        values = value if primitive.multiple_results else [value]
+        return [[x, *[None] * order] for x in values]
+    if primitive.name in CALLED_JAXPR:
+        called = params[CALLED_JAXPR[primitive.name]]
+        return _evaluated(called.jaxpr, called.consts, inputs, order)
+    if primitive.name == "scan":
+        return _evaluated_scan(params, inputs, order)
+    if primitive in RULES:
+        return [RULES[primitive](inputs, params)]
+    if primitive in LINEAR:
+        return [_termwise(partial(primitive.bind, **params), inputs)]
+    if primitive not in jet.jet_rules:
+        raise NoRuleError(primitive.name)
+    dense = [_with_zeros(x) for x in inputs]
+    values, series = jet.jet_rules[primitive](
+        [x[0] for x in dense], [x[1:] for x in dense], **params
+    )
+    if not primitive.multiple_results:
+        values, series = [values], [series]
+    return [
+        [value, *([None] * order if terms is jet.zero_series else terms)]
+        for value, terms in zip(values, series, strict=True)
+    ]
+
+
+def _evaluated_scan(params: dict, inputs: list[Coefficients], order: int) -> list:
+    """The coefficients of the outputs of a loop of fixed length, written out."""
+    consts_count, carry_count = params["num_consts"], params["num_carry"]
+    consts = inputs[:consts_count]
+    carry = inputs[consts_count : consts_count + carry_count]
+    sequences = inputs[consts_count + carry_count :]
+    steps = range(params["length"])
+    body = params["jaxpr"]
+    collected: list[list] = []
+    for i in reversed(steps) if params["reverse"] else steps:
+        entries = [[None if x is None else x[i] for x in sequence] for sequence in sequences]
+        found = _evaluated(body.jaxpr, body.consts, [*consts, *carry, *entries], order)
+        carry = found[:carry_count]
+        collected.append(found[carry_count:])
+    if params["reverse"]:
+        collected.reverse()
+    stacked = []
+    for outputs in zip(*collected, strict=True):
+        rows = [_with_zeros(output) for output in outputs]
+        stacked.append([jnp.stack(terms) for terms in zip(*rows, strict=True)])
+    return [*carry, *stacked]
+
+
+# --- rules ----------------------------------------------------------------------------------------
+
+
+def _total(terms: list) -> Any:
+    """The sum of the terms that are not None; None for no term."""
+    total = None
+    for term in terms:
+        if term is not None:
+            total = term if total is None else total + term
+    return total
+
+
+def _product(a: Any, b: Any, times: Callable = lax.mul) -> Any:
+    return None if a is None or b is None else times(a, b)
+
+
+def _scaled(x: Any, factor: float) -> Any:
+    return x if x is None or factor == 1.0 else x * factor
+
+
+def _termwise(operation: Callable, inputs: list[Coefficients]) -> Coefficients:
+    """A linear operation, applied to every coefficient on its own."""
+    found: Coefficients = []
+    for terms in zip(*inputs, strict=True):
+        if all(term is None for term in terms):
+            found.append(None)
+            continue
+        dense = [
+            jnp.zeros_like(coefficients[0]) if term is None else term
+            for term, coefficients in zip(terms, inputs, strict=True)
+        ]
+        found.append(operation(*dense))
+    return found
+
+
+def _add(inputs: list[Coefficients], params: dict) -> Coefficients:
+    a, b = inputs
+    return [_total([x, y]) for x, y in zip(a, b, strict=True)]
+
+
+def _subtract(inputs: list[Coefficients], params: dict) -> Coefficients:
+    a, b = inputs
+    return [x if y is None else -y if x is None else x - y for x, y in zip(a, b, strict=True)]
+
+
+def _bilinear(primitive: Any, inputs: list[Coefficients], params: dict) -> Coefficients:
+    a, b = inputs
+    times = partial(primitive.bind, **params)
+    return [_total([_product(a[j], b[k - j], times) for j in range(k + 1)]) for k in range(len(a))]
+
+
+def _convolved(a: Coefficients, b: Coefficients, k: int, first: int = 0) -> Any:
+    """The coefficient k of a product, from the term a[first] on, without a term that is not known
+    yet.
+    """
+    return _total([_product(a[j], b[k - j]) for j in range(first, k + 1) if k - j < len(b)])
+
+
+def _divide(inputs: list[Coefficients], params: dict) -> Coefficients:
+    a, b = inputs
+    quotient: Coefficients = [a[0] / b[0]]
+    reciprocal = 1.0 / b[0]
+    for k in range(1, len(a)):
+        rest = _total([_product(quotient[j], b[k - j]) for j in range(k)])
+        numerator = a[k] if rest is None else -rest if a[k] is None else a[k] - rest
+        quotient.append(_product(numerator, reciprocal))
+    return quotient
+
+
+def _integrated(factor: Coefficients, x: Coefficients, k: int) -> Any:
+    """Coefficient k of y with y' = factor x'."""
+    terms = [_product(_scaled(x[j], float(j)), factor[k - j]) for j in range(1, k + 1)]
+    return _scaled(_total(terms), 1.0 / k)
+
+
+def _sine_and_cosine(x: Coefficients) -> tuple[Coefficients, Coefficients]:
+    sine: Coefficients = [jnp.sin(x[0])]
+    cosine: Coefficients = [jnp.cos(x[0])]
+    for k in range(1, len(x)):
+        sine_k = _integrated(cosine, x, k)
+        cosine_k = _integrated(sine, x, k)
+        sine.append(sine_k)
+        cosine.append(None if cosine_k is None else -cosine_k)
+    return sine, cosine
+
+
+def _exponential(x: Coefficients, value: jax.Array) -> Coefficients:
+    found: Coefficients = [value]
+    for k in range(1, len(x)):
+        found.append(_integrated(found, x, k))
+    return found
+
+
+def _exp(inputs: list[Coefficients], params: dict) -> Coefficients:
+    return _exponential(inputs[0], jnp.exp(inputs[0][0]))
+
+
+def _expm1(inputs: list[Coefficients], params: dict) -> Coefficients:
+    found = _exponential(inputs[0], jnp.exp(inputs[0][0]))
+    return [jnp.expm1(inputs[0][0]), *found[1:]]
+
+
+def _logarithm(argument: Coefficients, value: jax.Array) -> Coefficients:
+    """Ln of the argument, whose value is passed."""
+    rate = _divide([[jnp.ones_like(argument[0]), *[None] * (len(argument) - 1)], argument], {})
+    return [value, *[_integrated(rate, argument, k) for k in range(1, len(argument))]]
+
+
+def _log(inputs: list[Coefficients], params: dict) -> Coefficients:
+    return _logarithm(inputs[0], jnp.log(inputs[0][0]))
+
+
+def _log1p(inputs: list[Coefficients], params: dict) -> Coefficients:
+    x = inputs[0]
+    return _logarithm([1.0 + x[0], *x[1:]], jnp.log1p(x[0]))
+
+
+def _sqrt(inputs: list[Coefficients], params: dict) -> Coefficients:
+    x = inputs[0]
+    root: Coefficients = [jnp.sqrt(x[0])]
+    half = 0.5 / root[0]
+    for k in range(1, len(x)):
+        rest = _total([_product(root[j], root[k - j]) for j in range(1, k)])
+        numerator = x[k] if rest is None else -rest if x[k] is None else x[k] - rest
+        root.append(_product(numerator, half))
+    return root
+
+
+def _square(inputs: list[Coefficients], params: dict) -> Coefficients:
+    return _bilinear(lax.mul_p, [inputs[0], inputs[0]], {})
+
+
+def _integer_power(inputs: list[Coefficients], params: dict) -> Coefficients:
+    exponent = params["y"]
+    one = [jnp.ones_like(inputs[0][0]), *[None] * (len(inputs[0]) - 1)]
+    if exponent == 0:
+        return one
+    base, power = inputs[0], None
+    rest = abs(exponent)
+    while rest:
+        if rest % 2:
+            power = base if power is None else _bilinear(lax.mul_p, [power, base], {})
+        rest //= 2
+        if rest:
+            base = _bilinear(lax.mul_p, [base, base], {})
+    assert power is not None
+    if exponent < 0:
+        power = _divide([one, power], {})
+    return [lax.integer_pow(inputs[0][0], exponent), *power[1:]]
+
+
+def _select(inputs: list[Coefficients], params: dict) -> Coefficients:
+    which, *cases = inputs
+    return _termwise(partial(lax.select_n, which[0]), cases)
+
+
+def _larger(inputs: list[Coefficients], params: dict) -> Coefficients:
+    a, b = inputs
+    return [lax.max(a[0], b[0]), *_chosen(a[0] >= b[0], a, b)]
+
+
+def _smaller(inputs: list[Coefficients], params: dict) -> Coefficients:
+    a, b = inputs
+    return [lax.min(a[0], b[0]), *_chosen(a[0] <= b[0], a, b)]
+
+
+def _chosen(first: jax.Array, a: Coefficients, b: Coefficients) -> Coefficients:
+    """The higher coefficients of the first argument where it is chosen, else of the second."""
+
+    def choice(x, y):
+        return jnp.where(first, x, y)
+
+    return _termwise(choice, [[a[0], *a[1:]], [b[0], *b[1:]]])[1:]
+
+
+RULES: dict[Any, Callable[[list[Coefficients], dict], Coefficients]] = {
+    lax.add_p: _add,
+    lax.sub_p: _subtract,
+    lax.mul_p: partial(_bilinear, lax.mul_p),
+    lax.dot_general_p: partial(_bilinear, lax.dot_general_p),
+    lax.div_p: _divide,
+    lax.sin_p: lambda inputs, params: _sine_and_cosine(inputs[0])[0],
+    lax.cos_p: lambda inputs, params: _sine_and_cosine(inputs[0])[1],
+    lax.exp_p: _exp,
+    lax.expm1_p: _expm1,
+    lax.log_p: _log,
+    lax.log1p_p: _log1p,
+    lax.sqrt_p: _sqrt,
+    lax.square_p: _square,
+    lax.integer_pow_p: _integer_power,
+    lax.select_n_p: _select,
+    lax.max_p: _larger,
+    lax.min_p: _smaller,
+}
+"""Primitive -> the coefficients of its output from those of its inputs."""
+
+LINEAR = {
+    lax.neg_p,
+    lax.convert_element_type_p,
+    lax.broadcast_in_dim_p,
+    lax.concatenate_p,
+    lax.pad_p,
+    lax.reshape_p,
+    lax.squeeze_p,
+    lax.rev_p,
+    lax.transpose_p,
+    lax.slice_p,
+    lax.reduce_sum_p,
+    lax.copy_p,
+    lax.cumsum_p,
+}
+"""Primitives that are linear in all their inputs."""

@@ -1,0 +1,225 @@
+"""Levels of the plant in the closed loop: what each part of a scenario receives of the state.
+
+A robot has the levels q and q'.  A plant in strict-feedback form of order r has further levels,
+`higher`, (r - 2, n), which is `()` for a robot.  Parts that users wrote for robots receive q and
+q', the robot inside the plant and the torque on its joints; parts for plants receive x, (r, n).
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from iblf_jax.control.controllers._base import law_member, state_of_levels
+from iblf_jax.control.observers import NoObserver
+from iblf_jax.control.observers._base import observer_member
+from iblf_jax.control.sensors._base import sensor_member
+from iblf_jax.core.linalg import matvec, solve_spd
+from iblf_jax.core.pytree import unwrapped
+from iblf_jax.core.time import as_at
+from iblf_jax.world import plants
+from iblf_jax.world.disturbances import rates_of
+from iblf_jax.world.robots import at_time, friction_torque
+
+# --- the start ------------------------------------------------------------------------------------
+
+
+def start_levels(scenario: Any) -> tuple[jax.Array, jax.Array, Any]:
+    """Q and q', (n,), and the levels from the third on, (r - 2, n), at t = 0.
+
+    A start given by q and q' alone is in the steady state of the plant: the static equilibrium of a
+    flexible joint, the current that holds gravity.
+    """
+    initial, plant = scenario.initial, scenario.plant
+    if plants.order_of(plant) == 2:
+        return initial.q, initial.dq, ()
+    if initial.higher is not None:
+        return initial.q, initial.dq, initial.higher
+    steady = plants.plant_member(plant, "steady_levels")
+    return initial.q, initial.dq, steady(initial.q, initial.dq)
+
+
+def steady_input(scenario: Any, q: jax.Array) -> jax.Array:
+    """The input with which an actuator starts, (n,): it balances the gravity of the model; of a
+    plant that states no such input, 0.
+    """
+    model = scenario.model
+    if plants.is_chain(scenario.plant) and not plants.is_chain(model):
+        # A law of a robot on another plant: the plant's own input.
+        model = scenario.plant
+    if not plants.is_chain(model):
+        return model.gravity(q)  # type: ignore[no-any-return]
+    own = plants.plant_member(model, "steady_input")
+    return jnp.zeros_like(q) if own is None else own(q)
+
+
+# --- law and sensor -----------------------------------------------------------------------------
+
+
+def model_state(scenario: Any, q: jax.Array, dq: jax.Array, higher: Any) -> jax.Array:
+    """The levels that the model has, (r, n), from those of the plant or of a measurement."""
+    order = plants.order_of(scenario.model)
+    return state_of_levels(q, dq, () if order == 2 else higher[: order - 2])
+
+
+def law_state(scenario: Any, q: jax.Array, dq: jax.Array, higher: Any) -> tuple[jax.Array, ...]:
+    """The state as the law receives it: (q, q'), or (x,)."""
+    if law_member(unwrapped(scenario.controller), "receives_x"):
+        return (model_state(scenario, q, dq, higher),)
+    return q, dq
+
+
+def sensor_state(scenario: Any, q: jax.Array, dq: jax.Array, higher: Any) -> tuple[jax.Array, ...]:
+    """The state as the sensor receives it: (q, q'), or (x,)."""
+    if sensor_member(scenario.sensor, "receives_x"):
+        return (state_of_levels(q, dq, higher),)
+    return q, dq
+
+
+# --- observer -------------------------------------------------------------------------------------
+
+
+def observer_initial(scenario: Any, observer: Any, q: jax.Array, dq: jax.Array, higher: Any) -> Any:
+    """The state of an observer at the start."""
+    if observer_member(observer, "receives_x"):
+        plant = plants.as_plant(scenario.model)
+        return observer.init(model_state(scenario, q, dq, higher), plant)
+    return observer.init(q, dq, _observed_robot(scenario))
+
+
+def observer_estimate(
+    scenario: Any, observer: Any, t: jax.Array, q: jax.Array, dq: jax.Array, higher: Any, state: Any
+) -> jax.Array:
+    """The estimate that the law receives: the torque f_hat, (n,) [N m], or d_hat, (r, n)."""
+    if observer_member(observer, "receives_x"):
+        x, plant = model_state(scenario, q, dq, higher), plants.as_plant(scenario.model)
+        return observer.estimate(t, x, plant, state)  # type: ignore[no-any-return]
+    if plants.is_chain(scenario.model) and isinstance(observer, NoObserver):
+        return jnp.zeros((scenario.model.order, *q.shape), q.dtype)
+    return observer.estimate(t, q, dq, _observed_robot(scenario), state)  # type: ignore[no-any-return]
+
+
+def observer_arguments(
+    scenario: Any,
+    observer: Any,
+    t: jax.Array,
+    q: jax.Array,
+    dq: jax.Array,
+    higher: Any,
+    u: jax.Array,
+    state: Any,
+) -> tuple:
+    """The arguments of `Observer.derivative` and `advance`, given the input u of the model."""
+    if observer_member(observer, "receives_x"):
+        x = model_state(scenario, q, dq, higher)
+        return t, x, u, plants.as_plant(scenario.model), state
+    if plants.is_chain(scenario.model) and not isinstance(observer, NoObserver):
+        x = model_state(scenario, q, dq, higher)
+        u = plants.plant_member(scenario.model, "joint_torque")(x, u)
+    return t, q, dq, u, _observed_robot(scenario), state
+
+
+def _observed_robot(scenario: Any) -> Any:
+    """The robot that an observer of robots serves: the model, or the robot inside it."""
+    robot = plants.robot_of(scenario.model)
+    return scenario.model if robot is None else robot
+
+
+# --- motion of the plant --------------------------------------------------------------------------
+
+
+class Motion(NamedTuple):
+    """The rate of the plant's state."""
+
+    dq: jax.Array
+    """Rate of the first level, (n,)."""
+    ddq: jax.Array
+    """Rate of the second level, (n,)."""
+    higher: Any
+    """Rates of the other levels, (r - 2, n); `()` for a robot."""
+
+
+def motion(
+    scenario: Any, t: jax.Array, q: jax.Array, dq: jax.Array, higher: Any, u: jax.Array
+) -> Motion:
+    """The rate of the plant's state under the input u, (n,)."""
+    if not plants.is_chain(scenario.plant):
+        return _robot_motion(scenario, t, q, dq, u)
+    plant = as_at(scenario.plant, t)
+    x, model = state_of_levels(q, dq, higher), scenario.model
+    robot = plants.robot_of(plant)
+    disturbance = scenario.disturbance
+    if robot is None:
+        torque: jax.Array | float = 0.0
+        u = u + disturbance.torque(t, q, dq, plant, model)
+    else:
+        known = plants.robot_of(model)
+        torque = disturbance.torque(t, q, dq, robot, known) + friction_torque(robot, dq)
+    rate = plants.flow(plant, t, x, u, torque)
+    added = rates_of(disturbance, t, x, plant, model)
+    if added is not None:
+        rate = rate + added
+    return Motion(rate[0], rate[1], rate[2:] if len(rate) > 2 else ())
+
+
+def _robot_motion(
+    scenario: Any, t: jax.Array, q: jax.Array, dq: jax.Array, tau: jax.Array
+) -> Motion:
+    """The rate of q and q' of a robot."""
+    ddq = acceleration(scenario, t, q, dq, tau)
+    x = jnp.stack([q, dq])
+    added = rates_of(scenario.disturbance, t, x, scenario.plant, scenario.model)
+    if added is None:
+        return Motion(dq, ddq, ())
+    return Motion(dq + added[0], ddq + added[1], ())
+
+
+def acceleration(
+    scenario: Any, t: jax.Array, q: jax.Array, dq: jax.Array, tau: jax.Array
+) -> jax.Array:
+    """Acceleration of a robot under the torque `tau`, (n,) [rad/s^2]."""
+    plant = at_time(scenario.plant, t)
+    external = scenario.disturbance.torque(t, q, dq, plant, scenario.model)
+    applied = tau + external + friction_torque(plant, dq)
+    return solve_spd(plant.mass_matrix(q), applied - plant.coriolis(q, dq, dq) - plant.gravity(q))
+
+
+def torque_needed(
+    scenario: Any, t: jax.Array, q: jax.Array, dq: jax.Array, ddq: jax.Array
+) -> jax.Array:
+    """The torque for which a robot has the acceleration `ddq`, (n,) [N m]: the inverse of
+    `acceleration`.
+    """
+    plant = at_time(scenario.plant, t)
+    external = scenario.disturbance.torque(t, q, dq, plant, scenario.model)
+    passive = external + friction_torque(plant, dq)
+    inertial = matvec(plant.mass_matrix(q), ddq)
+    return inertial + plant.coriolis(q, dq, dq) + plant.gravity(q) - passive
+
+
+# --- the uncertain term ---------------------------------------------------------------------------
+
+
+def uncertain_term(
+    scenario: Any,
+    t: jax.Array,
+    q: jax.Array,
+    dq: jax.Array,
+    higher: Any,
+    moved: Motion,
+    u: jax.Array,
+) -> jax.Array:
+    """d_1 ... d_r of the model, (r, n): x' less the flow of the model under the input u."""
+    model = scenario.model
+    x = model_state(scenario, q, dq, higher)
+    rate = model_state(scenario, moved.dq, moved.ddq, moved.higher)
+    return rate - plants.flow(model, t, x, u)
+
+
+def estimate_as_rates(scenario: Any, x: jax.Array, estimate: jax.Array) -> jax.Array:
+    """An estimate as d_hat, (r, n), of a model in strict-feedback form."""
+    if estimate.ndim == 2:
+        return estimate
+    return plants.torque_as_rates(scenario.model, x, estimate)

@@ -1,0 +1,55 @@
+"""Plants in strict-feedback form.  The contract is `Plant` in `_base.py`; robots are of order 2."""
+
+from typing import Any
+
+from iblf_jax.world.plants._base import Plant as Plant
+from iblf_jax.world.plants._base import check_dimensions as check_dimensions
+from iblf_jax.world.plants._base import flow as flow
+from iblf_jax.world.plants._base import is_chain as is_chain
+from iblf_jax.world.plants._base import level_input as level_input
+from iblf_jax.world.plants._base import level_rate as level_rate
+from iblf_jax.world.plants._base import order_of as order_of
+from iblf_jax.world.plants._base import plant_member as plant_member
+from iblf_jax.world.plants._base import robot_of as robot_of
+from iblf_jax.world.plants._base import speed_limit as speed_limit
+from iblf_jax.world.plants._base import torque_as_rates as torque_as_rates
+from iblf_jax.world.plants._base import transposed_gain as transposed_gain
+from iblf_jax.world.plants._base import units_of as units_of
+from iblf_jax.world.plants.electric_drive import ElectricDrive as ElectricDrive
+from iblf_jax.world.plants.flexible_joint import FlexibleJoint as FlexibleJoint
+from iblf_jax.world.plants.rigid import Rigid as Rigid
+from iblf_jax.world.plants.strict_feedback import StrictFeedback as StrictFeedback
+
+
+def as_plant(part: Any) -> Plant:
+    """A plant in strict-feedback form: the part itself, or a robot as a `Rigid`."""
+    return part if is_chain(part) else Rigid(part)  # type: ignore[no-any-return]
+
+
+MEMBERS = {
+    "rigid": Rigid,
+    "electric_drive": ElectricDrive,
+    "flexible_joint": FlexibleJoint,
+    "strict_feedback": StrictFeedback,
+}
+"""Every plant by the name that a scenario file gives it."""
+
+__all__ = [
+    "MEMBERS",
+    "ElectricDrive",
+    "FlexibleJoint",
+    "Plant",
+    "Rigid",
+    "StrictFeedback",
+    "as_plant",
+    "flow",
+    "is_chain",
+    "level_input",
+    "level_rate",
+    "order_of",
+    "plant_member",
+    "robot_of",
+    "torque_as_rates",
+    "transposed_gain",
+    "units_of",
+]

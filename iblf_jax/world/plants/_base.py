@@ -1,0 +1,237 @@
+"""The contract of a plant in strict-feedback form, and what follows from it.
+
+    x_i' = f_i(t, x_1..x_i) + G_i(t, x_1..x_i) x_{i+1} + d_i,   i = 1..r,   x_{r+1} = u      (S.1)
+
+A plant has r levels (`order`) of n numbers each; the state x is (r, n), and level i is x[i - 1].
+The output x_1 tracks the reference, and every gain G_i is invertible.  A robot is a plant of order
+2, x = (q, q') with f_2 = -M^-1 (C q' + G) and G_2 = M^-1: `as_plant` wraps it as a `Rigid`.
+
+Functions of this module take the number of a level, which counts from 1.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+
+from iblf_jax.core import checks
+from iblf_jax.core.linalg import matvec, solve_gain, solve_spd
+from iblf_jax.core.optional import OptionalMembers, has_members
+from iblf_jax.core.status import VELOCITY_LIMIT
+
+Units = str | tuple[str, ...]
+"""The unit of a level: one for all its components, or one for each."""
+
+
+class Plant(Protocol):
+    """The contract of a plant in strict-feedback form.  All methods are pure functions of one
+    state.
+
+    A plant may have further members; `plant_member` holds their defaults.
+
+    - `units`: the units of the levels and of the input, a tuple of order + 1 `Units`.
+    - `level_names`, `input_name`: words for figures and tables.
+    - `component_names`: names of the n components.
+    - `robot`: the robot inside a plant whose first two levels are its q and q'.  Disturbances,
+      friction and observers of robots then act on it, as the torque that is added to it.
+    - `level_rate(level, t, x, above, torque)`: f_i + G_i above, (n,), where a member has a shorter
+      formula than `drift` and `gain`.  `torque`, (n,) [N m], is added to a robot; 0.0 for none.
+    - `level_input(level, t, x, rate, torque)`: its inverse, the x_{i+1} for which x_i' is `rate`.
+    - `transposed_gain(level, t, x, s)`: G_i^T s, (n,).
+    - `joint_torque(x, u)`: the torque on the joints of the robot, (n,) [N m].
+    - `steady_levels(q, dq)`: the levels from the third on, (order - 2, n), of a plant that starts
+      with given q and q'; without it a start needs all levels, `Initial(x=...)`.
+    - `steady_input(q)`: the input that holds the plant at q.
+    - `weights(x)`: the scale of each level's energy, (order, n); `BarrierBackstepping` weighs its
+      barriers with it.
+    - `at(t)` and `jump_times()`: as `iblf_jax.robots.Robot`.
+    """
+
+    @property
+    def n(self) -> int:
+        """Numbers per level."""
+        ...
+
+    @property
+    def order(self) -> int:
+        """Number of levels r, at least 2."""
+        ...
+
+    def drift(self, t: jax.Array, x: jax.Array) -> jax.Array:
+        """f_1 ... f_r, (order, n), in the unit of each level per second.  Row i may depend on t and
+        on x[0] ... x[i] only.
+
+        Args:
+          t: time, () [s].
+          x: state, (order, n).
+        """
+        ...
+
+    def gain(self, t: jax.Array, x: jax.Array) -> jax.Array:
+        """G_1 ... G_r, (order, n, n), or (order, n) for diagonal gains; dependence as `drift`."""
+        ...
+
+
+plant_member = OptionalMembers(
+    units=None,
+    level_names=None,
+    input_name="input",
+    component_names=(),
+    robot=None,
+    level_rate=None,
+    level_input=None,
+    transposed_gain=None,
+    joint_torque=None,
+    steady_levels=None,
+    steady_input=None,
+    weights=None,
+)
+"""Reads optional members of a plant."""
+
+
+def is_chain(part: Any) -> bool:
+    """Whether this is a plant in strict-feedback form; a robot is none, but `as_plant` makes one of
+    it.
+    """
+    return has_members(part, "drift", "gain", "order")
+
+
+def order_of(part: Any) -> int:
+    """Number of levels of a plant; 2 for a robot."""
+    return int(part.order) if is_chain(part) else 2
+
+
+def robot_of(part: Any) -> Any:
+    """The robot itself, the robot inside a plant, or None."""
+    return plant_member(part, "robot") if is_chain(part) else part
+
+
+def level_rate(
+    plant: Plant,
+    level: int,
+    t: jax.Array,
+    x: jax.Array,
+    above: jax.Array,
+    torque: jax.Array | float = 0.0,
+) -> jax.Array:
+    """x_i' = f_i + G_i above of a level, (n,), without a disturbance.
+
+    Args:
+      plant: any.
+      level: i, from 1 to order.
+      t: time, () [s].
+      x: state, (order, n).
+      above: x_{i+1}, or the input u for the last level, (n,).
+      torque: added to the robot inside the plant, (n,) [N m]; 0.0 for none.
+    """
+    own = plant_member(plant, "level_rate")
+    if own is not None:
+        return own(level, t, x, above, torque)  # type: ignore[no-any-return]
+    gain = plant.gain(t, x)[level - 1]
+    return plant.drift(t, x)[level - 1] + _times(gain, above)
+
+
+def level_input(
+    plant: Plant,
+    level: int,
+    t: jax.Array,
+    x: jax.Array,
+    rate: jax.Array,
+    torque: jax.Array | float = 0.0,
+) -> jax.Array:
+    """G_i^-1 (rate - f_i) of a level, (n,): the inverse of `level_rate`.  A singular gain gives
+    NaN.
+    """
+    own = plant_member(plant, "level_input")
+    if own is not None:
+        return own(level, t, x, rate, torque)  # type: ignore[no-any-return]
+    gain = plant.gain(t, x)[level - 1]
+    rest = rate - plant.drift(t, x)[level - 1]
+    if gain.ndim == 2:
+        return solve_gain(gain, rest)
+    return rest / jnp.where(gain == 0.0, jnp.nan, gain)
+
+
+def transposed_gain(
+    plant: Plant, level: int, t: jax.Array, x: jax.Array, s: jax.Array
+) -> jax.Array:
+    """G_i^T s of a level, (n,)."""
+    own = plant_member(plant, "transposed_gain")
+    if own is not None:
+        return own(level, t, x, s)  # type: ignore[no-any-return]
+    gain = plant.gain(t, x)[level - 1]
+    return _times(gain.T, s)
+
+
+def _times(gain: jax.Array, v: jax.Array) -> jax.Array:
+    """The product of a gain, (n, n) or its diagonal (n,), and a vector."""
+    return matvec(gain, v) if gain.ndim == 2 else gain * v
+
+
+def flow(
+    plant: Plant,
+    t: jax.Array,
+    x: jax.Array,
+    u: jax.Array,
+    torque: jax.Array | float = 0.0,
+) -> jax.Array:
+    """X' without a disturbance, (order, n); arguments as `level_rate`, u is the input."""
+    inputs = [*x[1:], u]
+    return jnp.stack(
+        [level_rate(plant, i + 1, t, x, above, torque) for i, above in enumerate(inputs)]
+    )
+
+
+def torque_as_rates(plant: Plant, x: jax.Array, torque: jax.Array) -> jax.Array:
+    """What a torque on the robot inside a plant adds to x', (order, n): M^-1 torque in the second
+    level.
+    """
+    rate = solve_spd(robot_of(plant).mass_matrix(x[0]), torque)
+    zero = jnp.zeros_like(rate)
+    return jnp.stack([zero, rate, *[zero] * (plant.order - 2)])
+
+
+def units_of(part: Any) -> tuple[Units, ...]:
+    """The units of the levels of a plant and of its input: order + 1 of them."""
+    if not is_chain(part):
+        return ("rad", "rad/s", "N m")
+    units = plant_member(part, "units")
+    if units is None:
+        return ("1",) * (order_of(part) + 1)
+    return tuple(units)
+
+
+def speed_limit(part: Any) -> float:
+    """The size of the second level above which a run counts as diverged: of a robot
+    `status.VELOCITY_LIMIT`; other plants may have any units.
+    """
+    return VELOCITY_LIMIT if robot_of(part) is not None else OTHER_LIMIT
+
+
+OTHER_LIMIT = 1e12
+"""As `status.VELOCITY_LIMIT`, for plants without a robot, whose levels may have any units."""
+
+
+def check_dimensions(name: str, plant: Plant) -> None:
+    """Raises ValueError for numbers of components and levels that are no whole numbers, or units
+    that do not fit them.
+    """
+    checks.positive_integer(f"{name}.n", plant.n, most=checks.MAX_JOINTS)
+    checks.positive_integer(f"{name}.order", plant.order, least=2, most=MAX_ORDER)
+    units = units_of(plant)
+    if len(units) != plant.order + 1:
+        expected = f"{plant.order + 1} units, of {plant.order} levels and of the input"
+        raise checks.fail(f"{name}.units", units, expected)
+    for unit in units:
+        if not isinstance(unit, str) and len(unit) != plant.n:
+            raise checks.fail(f"{name}.units", unit, f"one unit, or {plant.n} (one a component)")
+
+
+EXCHANGE_RATE = 10.0
+"""Square of the frequency at which neighbouring levels exchange energy, in the default weights of
+this package's plants [1/s^2]: slow against the gains that a tracking task needs."""
+
+MAX_ORDER = 12
+"""Largest number of levels; every level adds an order to the derivatives of the law."""

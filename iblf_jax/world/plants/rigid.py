@@ -1,0 +1,111 @@
+"""A rigid robot as a plant of order 2."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+
+from iblf_jax.core import checks
+from iblf_jax.core.linalg import matvec, solve_spd
+from iblf_jax.core.pytree import component
+from iblf_jax.world.robots import Robot
+
+
+@component
+class Rigid:
+    """q' = x_2,   M(q) x_2' + C(q, x_2) x_2 + G(q) = u,   x = (q, q').
+
+    A scenario takes robots as they are; this class gives a robot the methods of a plant.
+
+    Args:
+      robot: any of `iblf_jax.robots`.
+
+    Source: Zhang & Yan 2024, (2.1).
+    """
+
+    robot: Robot
+    order: ClassVar[int] = 2
+    units: ClassVar[tuple[str, ...]] = ("rad", "rad/s", "N m")
+    level_names: ClassVar[tuple[str, ...]] = ("position", "velocity")
+    input_name: ClassVar[str] = "torque"
+
+    def check(self) -> None:
+        """Raises ValueError for something that is no robot."""
+        checks.conforms(
+            "Rigid.robot", self.robot, Robot, "iblf_jax.robots has them.", ("skeleton",)
+        )
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return self.robot.n
+
+    def drift(self, t: jax.Array, x: jax.Array) -> jax.Array:
+        """f, (2, n): 0 and -M^-1 (C q' + G)."""
+        zero = jnp.zeros_like(x[0])
+        return jnp.stack([zero, self.level_rate(2, t, x, zero, 0.0)])
+
+    def gain(self, t: jax.Array, x: jax.Array) -> jax.Array:
+        """G, (2, n, n): 1 and M^-1."""
+        return jnp.stack([jnp.eye(self.n, dtype=x.dtype), inverse_mass_matrix(self.robot, x[0])])
+
+    def level_rate(
+        self, level: int, t: jax.Array, x: jax.Array, above: jax.Array, torque: jax.Array | float
+    ) -> jax.Array:
+        """x_i', (n,) [rad/s, rad/s^2]."""
+        if level == 1:
+            return above
+        return robot_acceleration(self.robot, x[0], x[1], above + torque)
+
+    def level_input(
+        self, level: int, t: jax.Array, x: jax.Array, rate: jax.Array, torque: jax.Array | float
+    ) -> jax.Array:
+        """The velocity, or the torque, (n,), for which x_i' is `rate`."""
+        if level == 1:
+            return rate
+        return torque_of(self.robot, x[0], x[1], rate) - torque
+
+    def transposed_gain(self, level: int, t: jax.Array, x: jax.Array, s: jax.Array) -> jax.Array:
+        """G_i^T s, (n,)."""
+        if level == 1:
+            return s
+        return solve_spd(self.robot.mass_matrix(x[0]), s)
+
+    def joint_torque(self, x: jax.Array, u: jax.Array) -> jax.Array:
+        """The input itself, (n,) [N m]."""
+        return u
+
+    def steady_levels(self, q: jax.Array, dq: jax.Array) -> jax.Array:
+        """There are no levels above the second, (0, n)."""
+        return jnp.zeros((0, self.n), q.dtype)
+
+    def steady_input(self, q: jax.Array) -> jax.Array:
+        """G(q), (n,) [N m]."""
+        return self.robot.gravity(q)
+
+
+def robot_acceleration(robot: Robot, q: jax.Array, dq: jax.Array, torque: jax.Array) -> jax.Array:
+    """M^-1 (torque - C q' - G), (n,) [rad/s^2]."""
+    rest = torque - robot.coriolis(q, dq, dq) - robot.gravity(q)
+    return solve_spd(robot.mass_matrix(q), rest)
+
+
+def torque_of(robot: Robot, q: jax.Array, dq: jax.Array, acceleration: jax.Array) -> jax.Array:
+    """C q' + G + M acceleration, (n,) [N m]."""
+    coriolis, gravity = robot.coriolis(q, dq, dq), robot.gravity(q)
+    return coriolis + gravity + matvec(robot.mass_matrix(q), acceleration)
+
+
+def inverse_mass_matrix(robot: Robot, q: jax.Array) -> jax.Array:
+    """M^-1, (n, n) [1/(kg m^2)]."""
+    M = robot.mass_matrix(q)
+    columns = [solve_spd(M, column) for column in jnp.eye(robot.n, dtype=M.dtype)]
+    return jnp.stack(columns, axis=-1)
+
+
+def diagonal_inertia(robot: Robot, q: jax.Array) -> jax.Array:
+    """The diagonal of M(q), (n,) [kg m^2]."""
+    M = robot.mass_matrix(q)
+    return jnp.stack([M[i, i] for i in range(robot.n)])
