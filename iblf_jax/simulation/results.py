@@ -68,6 +68,7 @@ class Metrics(Mapping):
             shown = str(value)
             if checks.is_concrete(value):
                 shown = np.array2string(np.asarray(value), precision=4, threshold=8)
+                shown = " ".join(shown.split("\n "))
             rows.append(f"  {name:22s} {shown} {self.units.get(name, '')}".rstrip())
         return "Metrics(\n" + "\n".join(rows) + "\n)"
 

@@ -10,9 +10,9 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -43,6 +43,7 @@ from iblf_jax.core.pytree import (
 )
 from iblf_jax.core.status import VELOCITY_LIMIT
 from iblf_jax.core.time import joined, jump_times_of
+from iblf_jax.core.units import HIGHER, POSITION, VELOCITY, Unit
 from iblf_jax.simulation.levels import model_state, start_levels
 from iblf_jax.simulation.sampling import PERIOD_TOLERANCE, Sampling
 from iblf_jax.world import plants, regions
@@ -70,9 +71,10 @@ class Initial:
         higher.
     """
 
-    q: Leaf = leaf("rad")
-    dq: Leaf = leaf("rad/s", default=0.0)
-    higher: Leaf = leaf("1", shape="level", default=None)
+    q: Leaf = leaf(POSITION)
+    dq: Leaf = leaf(VELOCITY, default=0.0)
+    higher: Leaf = leaf(HIGHER, shape="level", default=None)
+    stacked: ClassVar[dict[str, tuple[str, ...]]] = {"x": ("q", "dq", "higher")}
 
     def __init__(self, q: Any = None, dq: Any = None, higher: Any = None, *, x: Any = None) -> None:
         if x is not None:
@@ -137,10 +139,19 @@ OPTIONAL_MEMBERS = ("skeleton",)
 """Members of these protocols that a part may lack."""
 
 HOW_TO_MAKE = "Make one with ij.presets or ij.Scenario."
-VELOCITY_UNITS = {
-    "units": dict.fromkeys(("value", "offset", "amplitude", "initial", "final"), "rad/s")
-}
-"""Units of the leaves of bounds on velocities: leaf -> unit."""
+
+
+def _of_level(level: int) -> Callable[[Mapping[str, Unit], int], Mapping[str, Unit]]:
+    """The units of the parameters of bounds, of which part 0 bounds this level."""
+
+    def units_of_part(units: Mapping[str, Unit], part: int) -> Mapping[str, Unit]:
+        return {**units, "x1": units[f"x{level + part}"]}
+
+    return units_of_part
+
+
+BOUNDS_OF_SECOND_LEVEL = {"part_units": _of_level(2)}
+"""Metadata of the bounds of the levels from the second on."""
 
 
 @component
@@ -193,9 +204,13 @@ class Scenario:
     sampling: Sampling | None = None
     sensor: Sensor = IdealSensor()
     actuator: Actuator = IdealActuator()
-    velocity_bounds: Bounds | None = dataclasses.field(default=None, metadata=VELOCITY_UNITS)
+    velocity_bounds: Bounds | None = dataclasses.field(
+        default=None, metadata=BOUNDS_OF_SECOND_LEVEL
+    )
     regions: tuple[regions.Region, ...] = ()
-    state_bounds: tuple[Bounds | None, ...] = ()
+    state_bounds: tuple[Bounds | None, ...] = dataclasses.field(
+        default=(), metadata=BOUNDS_OF_SECOND_LEVEL
+    )
 
     def check(self) -> None:
         """Checks the parts, makes the plant the model if none is given, and repeats scalars for the

@@ -81,7 +81,7 @@ class Study:
     @classmethod
     def of(cls, setup: PreparedStudy, results: BlockResults) -> Study:
         """Builds the study from its checked arguments and the results of its runs."""
-        units = metric_units(setup.shared.folds)
+        units = metric_units(setup.shared.folds, setup.scenario)
         # jit sorts the names; here they are in the order of the folds.
         names = [name for name, _ in units if name in results.metrics]
         metrics = {name: results.metrics[name] for name in names} | results.metrics

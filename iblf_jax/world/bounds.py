@@ -20,6 +20,7 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf
+from iblf_jax.core.units import POSITION
 from iblf_jax.world.references import Reference
 from iblf_jax.world.robots import Robot
 from iblf_jax.world.robots._base import robot_member
@@ -49,7 +50,7 @@ class Constant:
       value: the bound, () or (n,) [rad].
     """
 
-    value: Leaf = leaf("rad")
+    value: Leaf = leaf(POSITION)
 
     def at(self, t: jax.Array, q_d: jax.Array) -> jax.Array:
         """The bound, (n,) [rad]."""
@@ -69,8 +70,8 @@ class Sinusoid:
     Source: Zhang & Yan 2024, section 4 (k_lc and k_uc).
     """
 
-    offset: Leaf = leaf("rad")
-    amplitude: Leaf = leaf("rad")
+    offset: Leaf = leaf(POSITION)
+    amplitude: Leaf = leaf(POSITION)
     frequency: Leaf = leaf("rad/s", default=1.0)
     phase: Leaf = leaf("rad", default=0.0)
 
@@ -96,8 +97,8 @@ class Funnel:
     Source: F. Chen, D. V. Dimarogonas, IEEE Trans. Control Networks Syst. 8 (2021) 450-461.
     """
 
-    initial: Leaf = leaf("rad")
-    final: Leaf = leaf("rad")
+    initial: Leaf = leaf(POSITION)
+    final: Leaf = leaf(POSITION)
     rate: Leaf = leaf("1/s", sign="nonnegative")
 
     def at(self, t: jax.Array, q_d: jax.Array) -> jax.Array:

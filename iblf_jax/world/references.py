@@ -19,6 +19,7 @@ from iblf_jax.core.caches import memoised
 from iblf_jax.core.linalg import matvec
 from iblf_jax.core.optional import OptionalMembers
 from iblf_jax.core.pytree import Leaf, component, leaf, static
+from iblf_jax.core.units import POSITION
 
 
 class Reference(Protocol):
@@ -52,8 +53,8 @@ class Sinusoid:
     Source: Zhang & Yan 2024, equation (4.2).
     """
 
-    offset: Leaf = leaf("rad")
-    amplitude: Leaf = leaf("rad")
+    offset: Leaf = leaf(POSITION)
+    amplitude: Leaf = leaf(POSITION)
     frequency: Leaf = leaf("rad/s", default=1.0)
     phase: Leaf = leaf("rad", default=0.0)
 
@@ -78,8 +79,8 @@ class Quintic:
     Source: T. Flash, N. Hogan, J. Neuroscience 5 (1985) 1688-1703.
     """
 
-    start: Leaf = leaf("rad")
-    end: Leaf = leaf("rad")
+    start: Leaf = leaf(POSITION)
+    end: Leaf = leaf(POSITION)
     duration: Leaf = leaf("s", sign="positive", shape="scalar")
     continuous_derivatives: ClassVar[int] = 2
 
@@ -106,7 +107,7 @@ class WaypointSpline:
     """
 
     times: tuple[float, ...] = static()
-    waypoints: Leaf = leaf("rad", shape="any")
+    waypoints: Leaf = leaf(POSITION, shape="any")
     continuous_derivatives: ClassVar[int] = 2
 
     def check(self) -> None:

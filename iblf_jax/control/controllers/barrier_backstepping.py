@@ -47,11 +47,13 @@ from iblf_jax.control.barriers._base import (
     barrier_member,
     guard_is_active,
     ratio_jumps,
+    value_unit,
 )
 from iblf_jax.control.controllers._base import Command, LawContext
 from iblf_jax.control.controllers.backstepping import check_barrier, fit_o
 from iblf_jax.core import checks, taylor
 from iblf_jax.core.pytree import Leaf, component, leaf
+from iblf_jax.core.units import ByLevel, PlantUnit
 from iblf_jax.world import plants
 from iblf_jax.world.bounds import Bounds, Funnel, Tube
 from iblf_jax.world.plants import Plant
@@ -160,6 +162,19 @@ class BarrierBackstepping:
     def order(self) -> int:
         """Number of levels r."""
         return len(self.barriers)
+
+    def leaf_units(self) -> dict[str, ByLevel]:
+        """The units of c and of the weights, by those of each level's V_i."""
+        c, weights = [], []
+        for i, barrier in enumerate(self.barriers):
+            level = f"x{i + 1}"
+            if value_unit(barrier) == "1":
+                c.append(PlantUnit("1", f"{level}^2/s"))
+                weights.append(PlantUnit("1", "energy"))
+            else:
+                c.append(PlantUnit("1", "1/s"))
+                weights.append(PlantUnit("1", f"energy/{level}^2"))
+        return {"c": ByLevel(c), "weights": ByLevel(weights)}
 
     # --- checks against a scenario ----------------------------------------------------------------
 

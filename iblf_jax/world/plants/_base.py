@@ -11,6 +11,7 @@ Functions of this module take the number of a level, which counts from 1.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, Protocol
 
 import jax
@@ -20,6 +21,8 @@ from iblf_jax.core import checks
 from iblf_jax.core.linalg import matvec, solve_gain, solve_spd
 from iblf_jax.core.optional import OptionalMembers, has_members
 from iblf_jax.core.status import VELOCITY_LIMIT
+from iblf_jax.core.units import ByLevel, Unit, per_second, product
+from iblf_jax.world.robots import joint_names
 
 Units = str | tuple[str, ...]
 """The unit of a level: one for all its components, or one for each."""
@@ -34,6 +37,8 @@ class Plant(Protocol):
     - `units`: the units of the levels and of the input, a tuple of order + 1 `Units`.
     - `level_names`, `input_name`: words for figures and tables.
     - `component_names`: names of the n components.
+    - `outline(x1)`: corners of the plant's shape in the plane at a first level, (k, 2) [m], for
+      figures; the first corner is drawn as its path.
     - `robot`: the robot inside a plant whose first two levels are its q and q'.  Disturbances,
       friction and observers of robots then act on it, as the torque that is added to it.
     - `level_rate(level, t, x, above, torque)`: f_i + G_i above, (n,), where a member has a shorter
@@ -79,6 +84,7 @@ plant_member = OptionalMembers(
     level_names=None,
     input_name="input",
     component_names=(),
+    outline=None,
     robot=None,
     level_rate=None,
     level_input=None,
@@ -201,6 +207,62 @@ def units_of(part: Any) -> tuple[Units, ...]:
     if units is None:
         return ("1",) * (order_of(part) + 1)
     return tuple(units)
+
+
+def unit_symbols(plant: Any, model: Any) -> Mapping[str, Unit]:
+    """The unit of each symbol of `core.units`, for a plant under a law that knows a model."""
+    *levels, of_input = units_of(plant)
+    rates = ByLevel(per_second(unit) for unit in levels)
+    torque: Unit = "N m"
+    if robot_of(plant) is None:
+        torque = of_input
+    energy: Unit = "1"
+    if robot_of(plant) is not None or plant_member(plant, "weights") is not None:
+        energy = product(torque, levels[0])
+    uncertain: Unit = rates if is_chain(model) else "N m"
+    return {
+        **{f"x{i + 1}": unit for i, unit in enumerate(levels)},
+        "levels": ByLevel(levels),
+        "higher": ByLevel(levels[2:]),
+        "rates": rates,
+        "u": of_input,
+        "f": uncertain,
+        "tau": torque,
+        "energy": energy,
+    }
+
+
+def level_names(part: Any) -> tuple[str, ...]:
+    """Names of the levels: those that the plant states, else "level 1", "level 2", ..."""
+    if not is_chain(part):
+        return ("position", "velocity")
+    own = plant_member(part, "level_names")
+    if own is None:
+        return tuple(f"level {i + 1}" for i in range(order_of(part)))
+    return tuple(own)
+
+
+def input_name(part: Any) -> str:
+    """The name of the input: "torque" of a robot."""
+    return plant_member(part, "input_name") if is_chain(part) else "torque"
+
+
+def component_names(part: Any) -> tuple[str, ...]:
+    """Names of the n components of a level: the joints of a robot, or of the robot inside a plant;
+    else those that the plant states, or "component 0", "component 1", ...
+    """
+    own = plant_member(part, "component_names") if is_chain(part) else ()
+    if own:
+        return tuple(own)
+    robot = robot_of(part)
+    if robot is not None:
+        return joint_names(robot, part.n)
+    return tuple(f"component {i}" for i in range(part.n))
+
+
+def component_noun(part: Any) -> str:
+    """The word for a component of a level: "joint" where there is a robot."""
+    return "component" if robot_of(part) is None else "joint"
 
 
 def speed_limit(part: Any) -> float:
