@@ -450,8 +450,11 @@ def phase_portrait(runs: Runs, joints: tuple[int | str, int | str] = (0, 1)) -> 
         raise checks.fail("joints", joints, expected)
     figure = _style.new_figure(4.6, 4.9)
     draw_phase_portrait(figure.subplots(), curves, (first, second))
-    name = quantity_of(curves[0].run.scenario, "q").name
-    _style.set_title(figure, f"Phase portrait of the {name}s", curves)
+    title = "Phase portrait of the positions"
+    plant = curves[0].run.scenario.plant
+    if plants.is_chain(plant):
+        title = f"Phase portrait: {plants.level_names(plant)[0]}"
+    _style.set_title(figure, title, curves)
     _style.legend_below(figure, 4)
     return figure
 

@@ -426,11 +426,12 @@ def show(
     axes.set_xlim(*window)
     owners = [curve for curve, _ in drawn]
     samples = [y for _, y in drawn]
+    kept = [y for curve, y in drawn if not curve.failed]
     always_shown: list = []
     if quantity.guide_sets_limits and not bounds:
-        always_shown = guides
+        always_shown = guides + kept
     if bounds and tight:
-        always_shown = guides + [y for curve, y in drawn if not curve.failed]
+        always_shown = guides + kept
     elif bounds:
         always_shown = guides + bounds
     set_limits(axes, owners, samples, always_shown, farthest_bound=quantity.farthest_bound)
