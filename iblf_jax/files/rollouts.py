@@ -37,7 +37,7 @@ from iblf_jax.files.values import Words
 from iblf_jax.simulation.paths import parameters
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.signals import SIGNALS, dimension_names
-from iblf_jax.simulation.units import signal_meanings, signal_unit
+from iblf_jax.simulation.units import signal_meanings, signal_unit, status_words
 from iblf_jax.world import plants
 
 if TYPE_CHECKING:
@@ -226,7 +226,8 @@ def _status_variables(run: Rollout, batch: tuple[str, ...]) -> dict[str, Any]:
     attrs: dict[str, Any] = _attrs("1", "bit flags; 0 is ok")
     attrs["flag_masks"] = np.array([int(f) for f in flags], np.int32)
     attrs["flag_meanings"] = " ".join(f.name.lower() for f in flags if f.name)
-    described = {value: describe(value) for value in np.unique(status).tolist()}
+    texts = status_words(run.scenario)
+    described = {value: describe(value, texts) for value in np.unique(status).tolist()}
     words = np.vectorize(described.get, otypes=[str])(status)
     fastest = _attrs("1/s", "largest measured mode of the closed loop")
     return {
@@ -270,7 +271,7 @@ def _parameters(run: Rollout, batch: tuple[str, ...]) -> tuple[dict[str, Any], d
         "jax_version": jax.__version__,
     }
     if not batch:
-        attrs["status"] = describe(int(run.status))
+        attrs["status"] = describe(int(run.status), status_words(run.scenario))
         try:
             attrs["scenario"] = scenario_to_toml(run.scenario)
         except ValueError as error:

@@ -19,6 +19,7 @@ from iblf_jax.core import checks
 from iblf_jax.core.optional import attributes
 from iblf_jax.core.status import FAILED, Status, describe
 from iblf_jax.simulation.results import Rollout
+from iblf_jax.simulation.units import status_words
 from iblf_jax.world import plants
 from iblf_jax.world.robots import joint_names
 
@@ -172,7 +173,7 @@ class Curve:
     @property
     def status(self) -> str:
         """The run's status flags in words."""
-        return describe(int(self.run.status))
+        return describe(int(self.run.status), status_words(self.run.scenario))
 
     def disturbed_levels(self) -> list[int]:
         """The levels of a model in strict-feedback form, counted from 1, with a disturbance, or an

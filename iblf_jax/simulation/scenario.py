@@ -41,9 +41,8 @@ from iblf_jax.core.pytree import (
     rewrapped,
     unwrapped,
 )
-from iblf_jax.core.status import VELOCITY_LIMIT
 from iblf_jax.core.time import joined, jump_times_of
-from iblf_jax.core.units import HIGHER, POSITION, VELOCITY, Unit
+from iblf_jax.core.units import HIGHER, POSITION, VELOCITY, Unit, as_text
 from iblf_jax.simulation.levels import model_state, start_levels
 from iblf_jax.simulation.sampling import PERIOD_TOLERANCE, Sampling
 from iblf_jax.world import plants, regions
@@ -280,7 +279,8 @@ class Scenario:
     def _check_combination(self) -> None:
         """Raises ValueError for parts that do not fit together."""
         if self.model.n != self.plant.n:
-            got, expected = f"{self.model.n} joints", f"{self.plant.n} joints, as the plant has"
+            noun = plants.component_noun(self.plant)
+            got, expected = f"{self.model.n} {noun}s", f"{self.plant.n} {noun}s, as the plant has"
             raise checks.fail("Scenario.model", got, expected)
         law = unwrapped(self.controller)
         if self.context.level_bounds(2) is None and law_member(law, "needs_velocity_bounds"):
@@ -731,14 +731,17 @@ def _check_start(scenario: Scenario) -> None:
     for name, values in finite.items():
         if not np.all(np.isfinite(values)):
             raise checks.fail(name, values, "finite values at t = 0")
-    _check_order("bounds", start.lower, start.upper)
+    noun = plants.component_noun(scenario.plant)
+    _check_order(f"bounds of {noun}", start.lower, start.upper)
     remedy = "Move the reference or widen the bounds (Assumption 2)."
-    _check_inside("reference of joint {}", "bounds", start.q_d, start.lower, start.upper, remedy)
+    _check_inside(
+        f"reference of {noun} {{}}", "bounds", start.q_d, start.lower, start.upper, remedy
+    )
     remedy = "Move the start or widen the bounds."
     _check_inside("initial.q[{}]", "bounds", q, start.lower, start.upper, remedy)
     if start.speed_limits is not None:
         slowest, fastest = start.speed_limits
-        _check_order("velocity_bounds", slowest, fastest)
+        _check_order("velocity_bounds of joint", slowest, fastest)
         _check_inside("initial.dq[{}]", "velocity bounds", dq, slowest, fastest, remedy)
     for region, margin in zip(scenario.regions, start.region_margins, strict=True):
         if not margin > 0:
@@ -748,7 +751,9 @@ def _check_start(scenario: Scenario) -> None:
             raise checks.fail("initial.q", got, expected, "Move the start or the region.")
     _check_levels_at_start(scenario)
     if not np.all(np.abs(dq) < plants.speed_limit(scenario.plant)):
-        expected = f"speeds below {VELOCITY_LIMIT:g} rad/s"
+        limit = plants.speed_limit(scenario.plant)
+        unit = as_text(plants.units_of(scenario.plant)[1])
+        expected = f"speeds below {limit:g} {unit}"
         raise checks.fail("initial.dq", dq, expected, "A run that fast counts as diverged.")
     for name, part in (("plant", scenario.plant), ("model", scenario.model)):
         robot = plants.robot_of(part)
@@ -774,7 +779,8 @@ def _check_levels_at_start(scenario: Scenario) -> None:
         lower, upper = (np.asarray(side) for side in bounds_at(bounds, t, jnp.zeros_like(x[0])))
         if isinstance(bounds.lower, Funnel) or isinstance(bounds.upper, Funnel):
             continue  # around alpha, which the law computes
-        _check_order(f"state_bounds[{i}]", lower, upper)
+        noun = plants.component_noun(scenario.plant)
+        _check_order(f"state_bounds[{i}] of {noun}", lower, upper)
         remedy = "Move the start or widen the bounds."
         level = f"initial.x[{i + 1}][{{}}]"
         _check_inside(level, f"bounds of level {i + 2}", np.asarray(x[i + 1]), lower, upper, remedy)
@@ -799,7 +805,7 @@ def _check_order(name: str, lower: np.ndarray, upper: np.ndarray) -> None:
     for i, (low, high) in enumerate(zip(lower, upper, strict=True)):
         if not low < high:
             expected, remedy = "finite lower < upper at t = 0", "Exchange or widen them."
-            raise checks.fail(f"{name} of joint {i}", (low, high), expected, remedy)
+            raise checks.fail(f"{name} {i}", (low, high), expected, remedy)
 
 
 def _check_inside(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from iblf_jax.core.status import WORDS, WORDS_OF_LEVELS, Status
 from iblf_jax.core.units import ROBOT, Unit, as_text, of_component, resolved
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import SIGNALS
@@ -35,6 +36,11 @@ def unit_text(scenario: Scenario, unit: Unit, component: int | None = None) -> s
 def signal_unit(scenario: Scenario, name: str, component: int | None = None) -> str:
     """The unit of a recorded signal in runs of a scenario; arguments as `unit_text`."""
     return unit_text(scenario, SIGNALS[name].unit, component)
+
+
+def status_words(scenario: Scenario) -> Mapping[Status, str]:
+    """The text of each status flag for runs of a scenario."""
+    return WORDS_OF_LEVELS if plants.is_chain(scenario.plant) else WORDS
 
 
 def signal_meanings(scenario: Scenario) -> dict[str, str]:
