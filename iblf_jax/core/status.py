@@ -124,7 +124,9 @@ WORDS = {
 WORDS_OF_LEVELS = WORDS | {
     Status.TORQUE_SATURATED: "the input was saturated",
     Status.VELOCITY_VIOLATED: "a bound of the second level was violated",
-    Status.INACCURATE: "the components of the first level are inaccurate: the time step is too large",
+    Status.INACCURATE: (
+        "the components of the first level are inaccurate: the time step is too large"
+    ),
     Status.ALPHA_INFEASIBLE: "a virtual control left the bounds of its level",
 }
 """The text of each flag for plants in strict-feedback form."""

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 Exponents: TypeAlias = dict[str, int]
 """Name of a factor of a unit -> its exponent."""
@@ -47,13 +47,14 @@ class PlantUnit(str):
         unit.formula = formula
         return unit
 
-    def __getnewargs__(self) -> tuple[str, str]:
+    def __getnewargs__(self) -> tuple[str, str]:  # type: ignore[override]
         """The arguments with which a copy is made."""
         return str(self), self.formula
 
 
-Unit: TypeAlias = str | tuple[str, ...] | ByLevel
-"""One unit for all components, one for each component, or either of these for each level."""
+Unit: TypeAlias = str | tuple[Any, ...]
+"""One unit for all components, one for each component, or, as a `ByLevel`, either of these for each
+level."""
 
 POSITION = PlantUnit("rad", "x1")
 VELOCITY = PlantUnit("rad/s", "x2")

@@ -169,7 +169,7 @@ def _level_remedy(scenario: Scenario, level: int) -> str:
 def _singular_gain(result: Rollout) -> str:
     """Which gain is singular where a run ends, in words; empty if none is."""
     scenario = result.scenario
-    model = scenario.model
+    model: Any = scenario.model
     if not plants.is_chain(model):
         return ""
     x, t = np.asarray(result.x)[:, : model.order], np.asarray(result.t)

@@ -230,7 +230,7 @@ class Scene:
                 fan.set_xy(outline)
             else:
                 _set_points(fan, outline)
-        for joint in rows:
+        for joint in range(len(rows)):
             ends = [target.lower[frame, joint], target.upper[frame, joint]]
             self.ranges[joint].set_data(ends, [joint, joint])
         _set_points(self.reference, target.desired[frame])

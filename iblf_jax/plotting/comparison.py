@@ -20,6 +20,7 @@ from iblf_jax.plotting._figures import PanelRow, windows
 from iblf_jax.plotting._panels import Window, draw, quantity_of, set_limits
 from iblf_jax.simulation.metrics import Settling
 from iblf_jax.studies.comparison import Comparison
+from iblf_jax.world import plants
 
 SMALLEST = 1e-5
 """Errors below this, in the unit of the error, are drawn at the lower end of the logarithmic
@@ -57,7 +58,8 @@ def comparison(result: Comparison, joint: int = 0, *, zoom: float | None = None)
     start, end = windows(given, [error], zoom)[1]
     columns = {"gains as given": given}
     if result.factors:
-        columns["equal effort (RMS torque above gravity)"] = curves_of(result.equal_effort)
+        name = plants.input_name(scenario.plant)
+        columns[f"equal effort (RMS {name} above gravity)"] = curves_of(result.equal_effort)
     figure = _style.new_figure(_style.WIDTH, 6.6)
     table = figure.subplots(
         3, len(columns), squeeze=False, sharey="row", height_ratios=(1.5, 1.5, 1.0)

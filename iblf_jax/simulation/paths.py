@@ -186,13 +186,13 @@ def _stacked_rows(part: Any, path: str, symbols: Symbols) -> Iterator[Parameter]
     values = field_values(part)
     for kind, names in component_member(type(part), "stacked").items():
         for i, (name, *index) in enumerate(_rows_of(part, names)):
-            unit = _unit(part, fields[name], symbols)
-            value = values[name][tuple(index)]
-            row = as_text(of_entry(unit, tuple(index), jnp.ndim(values[name])))
+            at = tuple(index)
+            unit = of_entry(_unit(part, fields[name], symbols), at, jnp.ndim(values[name]))
+            value, row = values[name][at], as_text(unit)
             yield Parameter(_joined(path, f"{kind}[{i}]"), jnp.shape(value), row, value)
 
 
-def _rows_of(part: Any, names: Sequence[str]) -> list[list[str | int]]:
+def _rows_of(part: Any, names: Sequence[str]) -> list[list[Any]]:
     """The steps to each row of a stack of leaves, of which the last one has several rows; none if
     the component does not have it.
     """

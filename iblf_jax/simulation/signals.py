@@ -80,7 +80,8 @@ class Sample(Signals):
     each with half of the time to its neighbour.
     """
     gravity: Array
-    """G0(q), the torque that balances the gravity of the model [N m]."""
+    """The input that balances the gravity of the model: the torque G0(q) [N m] of a robot, of
+    another plant its own `steady_input`, 0 if it states none."""
     guard_active: Array
     saturated: Array
     step: Any = dataclasses.field(default=0.0, kw_only=True)

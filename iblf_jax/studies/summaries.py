@@ -206,14 +206,10 @@ def bands(
         name: np.concatenate([arrays[name] for arrays, _ in parts])[:count][used] for name in first
     }
     dims = ("quantile", "time", "joint")
-    variables: dict[str, Any] = {
-        name: (
-            dims,
-            _quantile(recorded[name], levels),
-            {"units": signal_unit(prepared.scenario, name)},
-        )
-        for name in BANDS
-    }
+    variables: dict[str, Any] = {}
+    for name in BANDS:
+        attributes = {"units": signal_unit(prepared.scenario, name)}
+        variables[name] = (dims, _quantile(recorded[name], levels), attributes)
     for name, (reduce, words) in ENVELOPES.items():
         attributes = {
             "units": signal_unit(prepared.scenario, name),

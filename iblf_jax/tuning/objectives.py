@@ -56,8 +56,8 @@ from iblf_jax.world.robots import joint_names
 A_SHARE = "a share of the runs, from 0 to 1"
 UNSUITABLE_SCALES = (
     "objective: the scale of {names} is its value at the start, where a run leaves its bounds by"
-    " {distance:.3g} rad. Such values are far larger than those of good gains, and so the terms are"
-    " not comparable. Start from gains that keep the bounds, or give each term a scale=."
+    " {distance:.3g} {unit}. Such values are far larger than those of good gains, and so the"
+    " terms are not comparable. Start from gains that keep the bounds, or give each term a scale=."
 )
 
 
@@ -228,7 +228,9 @@ def is_complete(objective: Objective) -> bool:
     return all(term.is_complete for term in objective.terms)
 
 
-def complete(objective: Objective, start: Any, margin: float | None = None) -> Objective:
+def complete(
+    objective: Objective, start: Any, margin: float | None = None, unit: str = "rad"
+) -> Objective:
     """The objective with every missing scale and limit set to the value at the start.
 
     Args:
@@ -236,12 +238,14 @@ def complete(objective: Objective, start: Any, margin: float | None = None) -> O
       start: the exact values of the terms' quantities at the start, (n_terms,).
       margin: the smallest margin of the runs at the start [rad]; a negative one gives a warning, as
         the values of runs that leave their bounds are no scales.
+      unit: of the margin.
     """
     values = np.asarray(checks.as_floats("start", start), float)
     checks.shape_is("start", values, (len(_composed(objective).terms),))
     missing = [term.name for term in objective.terms if not term.is_complete]
     if missing and margin is not None and margin < 0:
-        notices.warn(UNSUITABLE_SCALES.format(names=", ".join(missing), distance=-margin))
+        names = ", ".join(missing)
+        notices.warn(UNSUITABLE_SCALES.format(names=names, distance=-margin, unit=unit))
     terms = tuple(_completed(t, x) for t, x in zip(objective.terms, values, strict=True))
     return Objective(terms, objective.requirements)
 
