@@ -121,7 +121,9 @@ def product(first: Unit, second: Unit) -> Unit:
 
 def _entries(unit: Unit, kind: type, count: int) -> tuple:
     """The entries of a unit of this kind; another unit is repeated."""
-    return unit if isinstance(unit, kind) else (unit,) * count
+    if isinstance(unit, tuple) and isinstance(unit, kind):
+        return unit
+    return (unit,) * count
 
 
 def per_second(unit: Unit) -> Unit:
