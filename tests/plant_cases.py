@@ -1,5 +1,5 @@
-"""Small scenarios of plants in strict-feedback form: a motor-driven pendulum of order 3 and a body in
-the plane whose components have different units.
+"""Small scenarios of plants in strict-feedback form: a motor-driven pendulum of order 3, and a body
+in the plane whose components have different units.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Units that follow the plant: their algebra, and that a robot keeps the texts that are declared."""
+"""Units that follow the plant: their algebra, and the texts that robots keep."""
 
 import dataclasses
 import pickle
