@@ -396,12 +396,8 @@ def filter_rate(case, i, alpha, beta):
 
 
 def filter_start(case, t, x, d_hat):
-    """The filters' outputs with beta_i = alpha_i at every level, found from below."""
-    beta = []
-    for i in range(case.order - 1):
-        alpha = law(case, t, x, d_hat, beta, levels=i + 1).alpha
-        beta.append(alpha[i])
-    return beta
+    """The filters' outputs at the virtual controls of the law without filters."""
+    return law(replace(case, filter=None), t, x, d_hat).alpha[:-1]
 
 
 def along_flow(case, function, used, t, x, d_hat, h):

@@ -255,16 +255,13 @@ def _subtract(inputs: list[Coefficients], params: dict) -> Coefficients:
 
 
 def _bilinear(primitive: Any, inputs: list[Coefficients], params: dict) -> Coefficients:
-    a, b = inputs
-    times = partial(primitive.bind, **params)
+    first, second = inputs
+    return _product_of(first, second, partial(primitive.bind, **params))
+
+
+def _product_of(a: Coefficients, b: Coefficients, times: Callable = lax.mul) -> Coefficients:
+    """The coefficients of a product."""
     return [_total([_product(a[j], b[k - j], times) for j in range(k + 1)]) for k in range(len(a))]
-
-
-def _convolved(a: Coefficients, b: Coefficients, k: int, first: int = 0) -> Any:
-    """The coefficient k of a product, from the term a[first] on, without a term that is not known
-    yet.
-    """
-    return _total([_product(a[j], b[k - j]) for j in range(first, k + 1) if k - j < len(b)])
 
 
 def _divide(inputs: list[Coefficients], params: dict) -> Coefficients:
@@ -338,7 +335,7 @@ def _sqrt(inputs: list[Coefficients], params: dict) -> Coefficients:
 
 
 def _square(inputs: list[Coefficients], params: dict) -> Coefficients:
-    return _bilinear(lax.mul_p, [inputs[0], inputs[0]], {})
+    return _product_of(inputs[0], inputs[0])
 
 
 def _integer_power(inputs: list[Coefficients], params: dict) -> Coefficients:
@@ -350,10 +347,10 @@ def _integer_power(inputs: list[Coefficients], params: dict) -> Coefficients:
     rest = abs(exponent)
     while rest:
         if rest % 2:
-            power = base if power is None else _bilinear(lax.mul_p, [power, base], {})
+            power = base if power is None else _product_of(power, base)
         rest //= 2
         if rest:
-            base = _bilinear(lax.mul_p, [base, base], {})
+            base = _product_of(base, base)
     assert power is not None
     if exponent < 0:
         power = _divide([one, power], {})
