@@ -750,8 +750,8 @@ def _check_start(scenario: Scenario) -> None:
             expected = "a start inside all regions"
             raise checks.fail("initial.q", got, expected, "Move the start or the region.")
     _check_levels_at_start(scenario)
-    if not np.all(np.abs(dq) < plants.speed_limit(scenario.plant)):
-        limit = plants.speed_limit(scenario.plant)
+    limit = plants.speed_limit(scenario.plant)
+    if not np.all(np.abs(dq) < limit):
         unit = as_text(plants.units_of(scenario.plant)[1])
         expected = f"speeds below {limit:g} {unit}"
         raise checks.fail("initial.dq", dq, expected, "A run that fast counts as diverged.")

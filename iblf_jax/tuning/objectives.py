@@ -43,6 +43,7 @@ from iblf_jax.core.pytree import component, leaf, static
 from iblf_jax.engine import Outer as Outer
 from iblf_jax.simulation.metrics import Fold, Settling, Tracking, check_needs
 from iblf_jax.simulation.scenario import Scenario, fit_joints
+from iblf_jax.simulation.units import unit_text
 from iblf_jax.tuning.quantities import (
     TUNED_SIGNALS,
     MetricResult,
@@ -51,7 +52,7 @@ from iblf_jax.tuning.quantities import (
     quantity_member,
 )
 from iblf_jax.tuning.quantities import Quantity as Quantity
-from iblf_jax.world.robots import joint_names
+from iblf_jax.world import plants
 
 A_SHARE = "a share of the runs, from 0 to 1"
 UNSUITABLE_SCALES = (
@@ -326,10 +327,22 @@ def for_scenario(objective: Objective, scenario: Scenario) -> Objective:
       ValueError: a joint that the robot does not have, or another number of weights or limits; the
         message names the function.
     """
-    names = joint_names(scenario.plant, scenario.n)
+    names = plants.component_names(scenario.plant)
     terms = tuple(_part_of(t, t.name, names) for t in _composed(objective).terms)
-    requirements = tuple(_part_of(r, r.function or r.name, names) for r in objective.requirements)
+    requirements = tuple(
+        _in_units_of(scenario, _part_of(r, r.function or r.name, names))
+        for r in objective.requirements
+    )
     return Objective(terms, requirements)
+
+
+def _in_units_of(scenario: Scenario, requirement: Requirement) -> Requirement:
+    """A requirement whose name has the unit of the plant in the place of that of a robot."""
+    _, unit = requirement.measure
+    text = unit_text(scenario, unit)
+    if text == unit:
+        return requirement
+    return dataclasses.replace(requirement, name=requirement.name.replace(f" {unit}", f" {text}"))
 
 
 def _part_of(part: Any, function: str, names: tuple[str, ...]) -> Any:
