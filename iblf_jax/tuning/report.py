@@ -174,14 +174,14 @@ class TuningReport:
     """The smallest margin of all runs, before and after [rad]."""
     peak_torque: tuple[tuple[float, ...], tuple[float, ...]] = ((), ())
     """The largest torque of all runs, joint by joint, before and after [N m]."""
-    quantities: ReportedQuantities = ReportedQuantities()
-    """Names and units."""
     at_limits: tuple[str, ...] | None = None
     """The tuned numbers at an end of their range, in words; None where the ranges are not known."""
     step_check: StepCheck | None = None
     """All runs of the tuning, with the tuned gains, at dt and at dt / 2."""
     notes: tuple[str, ...] = ()
     """Why the search ended, and warnings."""
+    quantities: ReportedQuantities = ReportedQuantities()
+    """Names and units of margins and inputs."""
     failures: tuple[FailedRuns, ...] = ()
     """Fresh runs that failed with the tuned gains: those that left their bounds or diverged, then
     those that broke each requirement, with the most influential perturbation."""
