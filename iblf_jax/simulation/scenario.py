@@ -164,8 +164,9 @@ class Scenario:
         may be the model of a plant of higher order, under a law of robots; of an `ElectricDrive`
         the law then needs an input map (`controllers.WithDrive`).
       sampling: timing of law and observer, a `Sampling`; continuous time if not given.
-      sensor: measurement of q and q', any of `iblf_jax.sensors`; `Ideal()` if not given.  Others
-        need a sampling.
+      sensor: measurement of q and q', or of all levels of a plant (`sensors.Levels`), any of
+        `iblf_jax.sensors`; `Ideal()` if not given.  Others need a sampling.  A level that is not
+        measured needs an observer that estimates it, such as `observers.StateObserver`.
       actuator: map from command to torque, any of `iblf_jax.actuators`; `Ideal()` if not given.
       velocity_bounds: constraints on the joint velocities, a `bounds.Bounds` [rad/s] whose funnels
         follow q_d'; none if not given.  Runs record their margins under every law;

@@ -34,8 +34,8 @@ class LevelObserver:
     Args:
       gain: kappa of each level, one number, r numbers or (r, n) [1/s], >= 0; 0 for a level without
         an estimate.
-      eta0: eta(0), added to what `start` says, one number, r numbers or (r, n), in the unit of each
-        level per second; 0 if not given.
+      eta0: eta(0), added to what `start` says, one number, r numbers or (r, n) [1], in the unit of
+        each level per second; 0 if not given.
       start: "matched": eta(0) = eta0 - kappa x(0), so that d_hat(0) = eta0; "zero": eta(0) = eta0;
         "matched" if not given.
 

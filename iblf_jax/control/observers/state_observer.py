@@ -75,8 +75,8 @@ class StateObserver:
         not given.
       disturbance: whether it estimates the disturbance of the last level of each segment, as a
         constant; True if not given.
-      offset: error of the estimate at the start, one number, r numbers or (r, n), in the unit of
-        each level; 0 if not given.  It has no effect on measured levels.
+      offset: error of the estimate at the start, one number, r numbers or (r, n) [1], in the unit
+        of each level; 0 if not given.  It has no effect on measured levels.
 
     Source: J. P. Gauthier, H. Hammouri, S. Othman, IEEE Trans. Automatic Control 37 (1992) 875-880
       (high gain); N. Morrison, Introduction to Sequential Smoothing and Prediction, 1969 (fading

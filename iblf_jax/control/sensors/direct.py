@@ -19,9 +19,9 @@ class Direct:
     derivative of y by x is defined as 1.
 
     Args:
-      noise: standard deviation of the reading, () or (n,), >= 0; none if not given.
-      resolution: step of the readings, () or (n,), > 0; not rounded if not given.
-      offset: reading where the level is 0, () or (n,); 0 if not given.
+      noise: standard deviation of the reading, () or (n,) [1], >= 0; none if not given.
+      resolution: step of the readings, () or (n,) [1], > 0; not rounded if not given.
+      offset: reading where the level is 0, () or (n,) [1]; 0 if not given.
 
     Source: none; the construction is common.
     """
