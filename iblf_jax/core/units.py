@@ -62,6 +62,8 @@ INPUT = PlantUnit("N m", "u")
 UNCERTAIN = PlantUnit("N m", "f")
 TORQUE = PlantUnit("N m", "tau")
 HIGHER = PlantUnit("1", "higher")
+LEVELS = PlantUnit("1", "levels")
+RATES = PlantUnit("1", "rates")
 
 ROBOT: Mapping[str, Unit] = {
     "x1": "rad",

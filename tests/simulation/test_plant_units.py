@@ -71,6 +71,12 @@ def test_weights_of_a_plant_with_a_robot_are_energies():
     assert unit_at(scenario, "controller.weights") == expected
 
 
+def test_an_estimate_has_the_units_of_the_levels_per_second():
+    scenario = pendulum(observer=ij.observers.LevelObserver(gain=20.0, eta0=[0.0, 0.1, 0.0]))
+    assert unit_at(scenario, "observer.eta0") == "rad/s; rad/s^2; A/s"
+    assert unit_at(scenario, "observer.eta0[2]") == "A/s"
+
+
 def test_a_barrier_without_a_unit_changes_the_units_of_c_and_weights():
     barriers = (ij.barriers.PrescribedPerformance(), *[ij.barriers.Quadratic()] * 2)
     law = ij.controllers.BarrierBackstepping(k=(3.0, 10.0, 30.0), barriers=barriers)
