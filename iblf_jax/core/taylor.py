@@ -255,7 +255,11 @@ def _subtract(inputs: list[Coefficients], params: dict) -> Coefficients:
 
 def _bilinear(primitive: Any, inputs: list[Coefficients], params: dict) -> Coefficients:
     a, b = inputs
-    times = partial(primitive.bind, **params)
+    return _cauchy_product(a, b, partial(primitive.bind, **params))
+
+
+def _cauchy_product(a: Coefficients, b: Coefficients, times: Callable = lax.mul) -> Coefficients:
+    """The coefficients of a product of two curves."""
     return [_total([_product(a[j], b[k - j], times) for j in range(k + 1)]) for k in range(len(a))]
 
 
@@ -337,7 +341,7 @@ def _sqrt(inputs: list[Coefficients], params: dict) -> Coefficients:
 
 
 def _square(inputs: list[Coefficients], params: dict) -> Coefficients:
-    return _bilinear(lax.mul_p, [inputs[0], inputs[0]], {})
+    return _cauchy_product(inputs[0], inputs[0])
 
 
 def _integer_power(inputs: list[Coefficients], params: dict) -> Coefficients:
@@ -349,10 +353,10 @@ def _integer_power(inputs: list[Coefficients], params: dict) -> Coefficients:
     rest = abs(exponent)
     while rest:
         if rest % 2:
-            power = base if power is None else _bilinear(lax.mul_p, [power, base], {})
+            power = base if power is None else _cauchy_product(power, base)
         rest //= 2
         if rest:
-            base = _bilinear(lax.mul_p, [base, base], {})
+            base = _cauchy_product(base, base)
     assert power is not None
     if exponent < 0:
         power = _divide([one, power], {})

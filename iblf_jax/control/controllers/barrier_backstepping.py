@@ -268,16 +268,12 @@ class BarrierBackstepping:
           context: model, reference and bounds.
           state: beta, (r - 1, n), of a dynamic surface.
         """
-        if self.filter is None:
-            levels, tubes = self._exact_levels(t, x, d_hat, context)
-            alphas = [level.alpha for level in levels[:-1]]
-            rates: Any = ()
-        else:
-            levels = self._surface_levels(t, x, d_hat, context, state)
-            tubes = [self._surface_tube(i, t, context, state, levels) for i in range(self.order)]
+        levels, tubes = self.levels(t, x, d_hat, context, state)
+        alphas = [level.alpha for level in levels[:-1]]
+        rates: Any = ()
+        if self.filter is not None:
+            rates = (jnp.stack(alphas) - state) / self.filter
             alphas = list(state)
-            found = jnp.stack([level.alpha for level in levels[:-1]])
-            rates = (found - state) / self.filter
         V = jnp.zeros_like(x[0])
         guard_active = jnp.zeros(x[0].shape, bool)
         for i, (barrier, tube) in enumerate(zip(self.barriers, tubes, strict=True)):
@@ -298,6 +294,18 @@ class BarrierBackstepping:
         if self.order == 2:
             return x[-1] - command.alpha
         return x[-1] - command.alpha_higher[-1]
+
+    def levels(
+        self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext, state: Any
+    ) -> tuple[list[Level], list[Tube]]:
+        """What each level computes, and the tube of x_i around alpha_{i-1}, or around beta_{i-1}
+        with filters; arguments as `command`.
+        """
+        if self.filter is None:
+            return self._exact_levels(t, x, d_hat, context)
+        levels = self._surface_levels(t, x, d_hat, context, state)
+        tubes = [self._surface_tube(i, t, context, state, levels) for i in range(self.order)]
+        return levels, tubes
 
     def _exact_levels(
         self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext

@@ -30,6 +30,10 @@ class Observer(Protocol):
     methods then receive the state x, (r, n), in the place of q and q', a `plants.Plant` as the
     model and the input u as `tau`; its estimate is d_hat, (r, n), what the disturbance adds to x'.
     Other observers serve the robot inside such a plant, and `tau` is the torque on its joints.
+
+    An observer may claim that the error of its estimate obeys f_tilde' = f' - kappa f_tilde: its
+    attribute `error_gain` is kappa, (n,) [1/s], or of d_tilde, (r,) or (r, n) [1/s].  `certify`
+    checks it under laws of plants in strict-feedback form.
     """
 
     def init(self, q: jax.Array, dq: jax.Array, model: Robot) -> State:
@@ -51,5 +55,7 @@ class Observer(Protocol):
         ...
 
 
-observer_member = OptionalMembers(receives_x=False, advance=None, at_period=None, advice=list)
+observer_member = OptionalMembers(
+    receives_x=False, advance=None, at_period=None, advice=list, error_gain=None
+)
 """Reads optional members of an observer."""
