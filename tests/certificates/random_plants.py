@@ -79,7 +79,7 @@ def bounds_between(lower, upper):
 
 def tube_widths(order):
     """Both sides of every level's bounds, (order, 2)."""
-    above = [(60.0 * 9.0**i, 90.0 * 9.0**i) for i in range(order - 1)]
+    above = [(60.0 * 30.0**i, 90.0 * 30.0**i) for i in range(order - 1)]
     return np.array([(1.5, 2.5), *above])
 
 
