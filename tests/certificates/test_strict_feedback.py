@@ -19,6 +19,7 @@ from iblf_jax.certificates.level_lines import LEVEL_ROUNDING
 from iblf_jax.certificates.level_terms import level_terms_at
 from iblf_jax.certificates.proof_terms import rounding
 from iblf_jax.simulation.closed_loop import evaluate
+from iblf_jax.world import plants
 
 MAPPING, PERFORMANCE = ij.barriers.Mapping(), ij.barriers.PrescribedPerformance()
 ORDERS = (2, pytest.param(3, marks=pytest.mark.slow), pytest.param(4, marks=pytest.mark.slow))
@@ -273,20 +274,29 @@ class WrongEstimator:
 
 @ij.component
 class WithoutExchange(ij.controllers.BarrierBackstepping):
-    """A law that does not cancel the effect of e_{i+1} on V_i."""
+    """A law whose input does not cancel the effect of e_r on V_{r-1}."""
 
-    def _level(self, i, plant, t, x, below, d_hat):
-        return super()._level(i, plant, t, x, below._replace(slope=None), d_hat)
+    def _added(self, plant, t, x, levels, tubes):
+        last = self.order - 1
+        ratio = self.barriers[last].error_over_slope(tubes[last], x[last])
+        exchanged = plants.transposed_gain(plant, last, t, x, levels[last - 1].slope)
+        return ratio / self.weights[last] * exchanged
+
+    def levels(self, t, x, d_hat, context, state):
+        levels, tubes = super().levels(t, x, d_hat, context, state)
+        plant, order = context.model, self.order
+        rate = self._added(plant, t, x, levels, tubes)
+        zero = plants.level_input(plant, order, t, x, 0.0 * rate)
+        u = levels[-1].alpha + plants.level_input(plant, order, t, x, rate) - zero
+        return [*levels[:-1], levels[-1]._replace(alpha=u)], tubes
 
 
 @ij.component
-class WithWrongFeedback(ij.controllers.BarrierBackstepping):
-    """A law that feeds the slope back with the wrong sign."""
+class WithWrongFeedback(WithoutExchange):
+    """A law that feeds the slope of the last level back with the wrong sign."""
 
-    def _level(self, i, plant, t, x, below, d_hat):
-        level = super()._level(i, plant, t, x, below, d_hat)
-        barrier, tube = self.barriers[i], below.tube
-        return level._replace(alpha=level.alpha + 2.0 * self.c[i] * barrier.slope(tube, x[i]))
+    def _added(self, plant, t, x, levels, tubes):
+        return 2.0 * self.c[-1] * levels[-1].slope / self.weights[-1]
 
 
 @pytest.mark.parametrize("law", [WithoutExchange, WithWrongFeedback])
