@@ -13,7 +13,6 @@ import numpy as np
 import iblf_jax as ij
 from iblf_jax.simulation.closed_loop import LoopState
 from iblf_jax.simulation.scenario import canonical
-from iblf_jax.world import plants
 from iblf_jax.world.bounds import Tube
 
 N = 2
@@ -41,32 +40,6 @@ class RandomPlant:
         """G, (order, n, n)."""
         rows = [jnp.sin(self._inner(self.B, i, x) + 0.2 * t) for i in range(self.order)]
         return jnp.eye(N) + 0.3 * jnp.stack(rows)
-
-
-@ij.component
-class Estimator:
-    """d_hat = eta + kappa x, eta' = -kappa (flow + d_hat): d_tilde' = d' - kappa d_tilde."""
-
-    kappa: ij.Leaf = ij.leaf("1/s", shape="level")
-    receives_x: ClassVar[bool] = True
-
-    @property
-    def error_gain(self):
-        """kappa."""
-        return self.kappa
-
-    def init(self, x, plant):
-        """eta with d_hat = 0."""
-        return -self.kappa * x
-
-    def estimate(self, t, x, plant, state):
-        """d_hat."""
-        return state + self.kappa * x
-
-    def derivative(self, t, x, u, plant, state):
-        """eta'."""
-        d_hat = self.estimate(t, x, plant, state)
-        return -self.kappa * (plants.flow(plant, t, x, u) + d_hat)
 
 
 def bounds_between(lower, upper):
@@ -114,7 +87,7 @@ def random_scenario(
         ij.disturbances.Sinusoids(rng.normal(0.0, 0.5, N), rng.uniform(0.5, 2.0, N))
         for _ in range(order)
     )
-    estimator = Estimator(kappa=rng.uniform(1.0, 5.0, (order, N)))
+    estimator = ij.observers.LevelObserver(gain=rng.uniform(1.0, 5.0, (order, N)))
     return canonical(
         ij.Scenario(
             plant=plant,
@@ -145,8 +118,8 @@ def random_states(scenario: ij.Scenario, seed: int = 0, *, nearest: float = 0.6)
             tube = tubes[i]
             x = x.at[i].set(tube.q_d + xi[i] * jnp.where(xi[i] > 0, tube.k_u, tube.k_l))
         eta = ()
-        if isinstance(scenario.observer, Estimator):
-            eta = d_hat - scenario.observer.kappa * x
+        if isinstance(scenario.observer, ij.observers.LevelObserver):
+            eta = d_hat - scenario.observer.gain * x
         higher = x[2:] if order > 2 else ()
         return LoopState(x[0], x[1], (), eta, higher=higher)
 

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from random_plants import Estimator, random_scenario, random_states
+from random_plants import random_scenario, random_states
 
 import iblf_jax as ij
 from iblf_jax.certificates import certify, counterexample
@@ -47,7 +47,7 @@ def rate_along_the_flow(scenario, t, state):
 
 def right_side(scenario, t, state):
     """The right side of (S.3), level by level as it is printed."""
-    law, context, kappa = scenario.controller, scenario.context, scenario.observer.kappa
+    law, context, kappa = scenario.controller, scenario.context, scenario.observer.gain
     x = state.x
     d_hat = scenario.observer.estimate(t, x, scenario.model, state.observer)
     d_tilde = scenario.disturbance.rates(t, x, scenario.plant, scenario.model) - d_hat
@@ -243,12 +243,12 @@ def test_a_disturbed_run_has_the_true_terms():
 
 
 def test_an_observer_states_kappa_and_a_wrong_one_fails():
-    observer = Estimator(kappa=[[20.0], [20.0], [20.0]])
+    observer = ij.observers.LevelObserver(gain=(20.0, 20.0, 20.0))
     certificate = certify(pendulum(disturbance=DISTURBANCES, observer=observer), duration=1.0)
     assert certificate.holds
     assert certificate["estimate"].verdict == "holds"
     assert np.all(certificate.numbers["d_tilde_largest"] < certificate.numbers["d_largest"])
-    wrong = pendulum(disturbance=DISTURBANCES, observer=WrongEstimator(kappa=[[20.0]] * 3))
+    wrong = pendulum(disturbance=DISTURBANCES, observer=WrongObserver(gain=20.0))
     certificate = certify(wrong, duration=1.0)
     assert certificate["estimate"].verdict == "fails"
     assert not certificate.holds
@@ -257,19 +257,13 @@ def test_an_observer_states_kappa_and_a_wrong_one_fails():
 
 
 @ij.component
-class WrongEstimator:
+class WrongObserver(ij.observers.LevelObserver):
     """States twice the gain with which it estimates."""
-
-    kappa: ij.Leaf = ij.leaf("1/s", shape="level")
-    receives_x: ClassVar[bool] = True
-    init = Estimator.init
-    estimate = Estimator.estimate
-    derivative = Estimator.derivative
 
     @property
     def error_gain(self):
         """Not kappa."""
-        return 2.0 * self.kappa
+        return 2.0 * self.gain
 
 
 @ij.component
@@ -432,6 +426,17 @@ def test_a_robot_with_drives_is_certified_with_the_observer_of_the_robot():
         LINK, torque_constant=0.5, inductance=0.01, resistance=0.5, back_emf=0.1
     )
     check_torque_observer(drive, 3)
+
+
+def test_levels_of_a_robot_are_observed():
+    rates = ij.disturbances.Levels((ij.disturbances.Sinusoids(0.1, 2.0),))
+    observer = ij.observers.LevelObserver(gain=20.0)
+    certificate = certify(
+        robot_scenario(LINK, 2, disturbance=rates, observer=observer), duration=0.3
+    )
+    assert certificate.holds
+    assert certificate["estimate"].verdict == "holds"
+    assert certificate["equality"].verdict == "holds"
 
 
 def test_a_disturbance_of_q_has_no_torque_observer():
