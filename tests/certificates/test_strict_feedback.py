@@ -105,11 +105,11 @@ def test_both_sides_of_the_claim_are_equal(order, barrier):
     assert np.all(np.abs(left - right) <= 1e-10 * np.max(np.abs(left)))
     # Every state has terms of its own size: the terms of V' are the scale of rounding.
     assert np.all(np.abs(left - right) <= 1e-13 * claim.size)
-    assert np.median(claim.size / np.abs(left)) < 1e3
+    tolerance = LEVEL_ROUNDING * rounding("float64") * claim.size
+    assert np.median(tolerance / np.abs(left)) < 1e-10
     certified = claim.disturbance_terms - claim.decay - claim.by_slopes
     assert np.all(np.abs(right - certified) <= 1e-13 * claim.size)
     assert np.all(np.abs(left - claim.dV) <= 1e-13 * claim.size)
-    tolerance = LEVEL_ROUNDING * rounding("float64") * claim.size
     assert np.all(np.abs(claim.dV - certified) <= 0.2 * tolerance)
     # The disturbance terms decide: without them nothing is equal.
     assert np.median(np.abs(claim.disturbance_terms) / tolerance) > 1e6
