@@ -3,7 +3,9 @@
 from typing import Any
 
 from iblf_jax.world.plants._base import Plant as Plant
+from iblf_jax.world.plants._base import check_dependence as check_dependence
 from iblf_jax.world.plants._base import check_dimensions as check_dimensions
+from iblf_jax.world.plants._base import dependence_on_levels as dependence_on_levels
 from iblf_jax.world.plants._base import flow as flow
 from iblf_jax.world.plants._base import is_chain as is_chain
 from iblf_jax.world.plants._base import level_input as level_input
@@ -19,6 +21,7 @@ from iblf_jax.world.plants.electric_drive import ElectricDrive as ElectricDrive
 from iblf_jax.world.plants.flexible_joint import FlexibleJoint as FlexibleJoint
 from iblf_jax.world.plants.rigid import Rigid as Rigid
 from iblf_jax.world.plants.strict_feedback import StrictFeedback as StrictFeedback
+from iblf_jax.world.plants.vessel import Vessel as Vessel
 
 
 def as_plant(part: Any) -> Plant:
@@ -31,8 +34,12 @@ MEMBERS = {
     "electric_drive": ElectricDrive,
     "flexible_joint": FlexibleJoint,
     "strict_feedback": StrictFeedback,
+    "vessel": Vessel,
 }
 """Every plant by the name that a scenario file gives it."""
+
+OF_KNOWN_STRUCTURE = (Rigid, ElectricDrive, FlexibleJoint, Vessel)
+"""Plants whose drift and gain have the structure of (S.1) for all numbers of their leaves."""
 
 __all__ = [
     "MEMBERS",
@@ -41,6 +48,7 @@ __all__ = [
     "Plant",
     "Rigid",
     "StrictFeedback",
+    "Vessel",
     "as_plant",
     "flow",
     "is_chain",
