@@ -15,6 +15,7 @@ from iblf_jax.testing._contract import (
     call_has_shape,
     check_function,
     examine,
+    in_both_types,
     in_dtype,
     shape_of,
 )
@@ -50,8 +51,7 @@ def check_plant(plant: Any, *, x: Any = None) -> None:
         plant = fit_joints(in_dtype(plant, "float64"), plant.n, "plant")
         points = _points(plant, x)
         t = jnp.asarray(0.7)
-        _shapes(findings, plant, t, points[0])
-        findings.stop_if_any()
+        in_both_types(findings, _shapes, plant, t, points[0])
         _structure(findings, plant, t, points)
         rng = np.random.default_rng(2)
         vectors = jnp.asarray(rng.normal(size=(2, plant.n)))
@@ -108,11 +108,16 @@ def _shapes(findings: Findings, plant: Any, t: jax.Array, x: jax.Array) -> None:
         method = plant_member(plant, name)
         if method is not None:
             call_has_shape(findings, name, method, args, shape)
-    by_level = {"level_rate": (t, x, v, 0.0), "level_input": (t, x, v, 0.0)}
-    by_level["transposed_gain"] = (t, x, v)
+    by_level: dict[str, tuple[Any, ...]] = {
+        "level_rate": (t, x, v, 0.0),
+        "level_input": (t, x, v, 0.0),
+        "transposed_gain": (t, x, v),
+    }
     for name, args in by_level.items():
         method = plant_member(plant, name)
-        for level in range(1, order + 1) if method is not None else ():
+        if method is None:
+            continue
+        for level in range(1, order + 1):
             call_has_shape(findings, f"{name}({level}, ...)", _at(method, level), args, (n,))
 
 

@@ -202,6 +202,45 @@ class WaypointSpline:
         return matvec(self.waypoints.T, basis)
 
 
+@component
+class Ellipse:
+    """A motion on an ellipse in the plane with the heading along its tangent, for a vessel.
+
+        north = centre_1 + axes_1 cos(frequency t),   east = centre_2 + axes_2 sin(frequency t)
+        heading = frequency t + pi/2 + atan((axes_1 - axes_2) s c / (axes_1 s^2 + axes_2 c^2))
+
+    with s = sin(frequency t) and c = cos(frequency t).  The motion turns from north to east; the
+    heading grows by 2 pi a revolution, so that bounds on it follow the reference (`bounds.Funnel`).
+    All derivatives are continuous.
+
+    Args:
+      axes: half lengths of the axes to the north and to the east, (2,) [m], > 0.
+      frequency: angular frequency of the motion, () [rad/s], > 0.
+      centre: of the ellipse, (2,) [m]; the origin if not given.
+
+    Source: this package.
+    """
+
+    axes: Leaf = leaf("m", sign="positive", shape="any")
+    frequency: Leaf = leaf("rad/s", sign="positive", shape="scalar")
+    centre: Leaf = leaf("m", shape="any", default=(0.0, 0.0))
+
+    def check(self) -> None:
+        """Raises ValueError for axes or a centre that are not two numbers."""
+        checks.shape_is("Ellipse.axes", self.axes, (2,))
+        checks.shape_is("Ellipse.centre", self.centre, (2,))
+
+    def position(self, t: jax.Array) -> jax.Array:
+        """North, east and heading, (3,) [m, m, rad]."""
+        angle = self.frequency * t
+        sine, cosine = jnp.sin(angle), jnp.cos(angle)
+        a, b = self.axes
+        turned = (a - b) * sine * cosine / (a * sine**2 + b * cosine**2)
+        heading = angle + 0.5 * math.pi + jnp.arctan(turned)
+        north, east = self.centre[0] + a * cosine, self.centre[1] + b * sine
+        return jnp.stack([north, east, heading])
+
+
 @memoised(32)
 def _cardinal_splines(times: tuple[float, ...], derivatives: int) -> tuple[np.ndarray, np.ndarray]:
     """Breakpoints (p + 1,) and coefficients (2 derivatives + 2, p, m), highest power first, of the
@@ -237,5 +276,6 @@ MEMBERS = {
     "quintic": Quintic,
     "smooth_step": SmoothStep,
     "waypoint_spline": WaypointSpline,
+    "ellipse": Ellipse,
 }
 """Every reference by the name that a scenario file gives it."""

@@ -17,6 +17,7 @@ from iblf_jax.world.plants._base import speed_limit as speed_limit
 from iblf_jax.world.plants._base import torque_as_rates as torque_as_rates
 from iblf_jax.world.plants._base import transposed_gain as transposed_gain
 from iblf_jax.world.plants._base import units_of as units_of
+from iblf_jax.world.plants.driven_pendulum import DrivenPendulum as DrivenPendulum
 from iblf_jax.world.plants.electric_drive import ElectricDrive as ElectricDrive
 from iblf_jax.world.plants.flexible_joint import FlexibleJoint as FlexibleJoint
 from iblf_jax.world.plants.rigid import Rigid as Rigid
@@ -31,6 +32,7 @@ def as_plant(part: Any) -> Plant:
 
 MEMBERS = {
     "rigid": Rigid,
+    "driven_pendulum": DrivenPendulum,
     "electric_drive": ElectricDrive,
     "flexible_joint": FlexibleJoint,
     "strict_feedback": StrictFeedback,
@@ -38,11 +40,12 @@ MEMBERS = {
 }
 """Every plant by the name that a scenario file gives it."""
 
-OF_KNOWN_STRUCTURE = (Rigid, ElectricDrive, FlexibleJoint, Vessel)
+OF_KNOWN_STRUCTURE = (Rigid, DrivenPendulum, ElectricDrive, FlexibleJoint, Vessel)
 """Plants whose drift and gain have the structure of (S.1) for all numbers of their leaves."""
 
 __all__ = [
     "MEMBERS",
+    "DrivenPendulum",
     "ElectricDrive",
     "FlexibleJoint",
     "Plant",

@@ -10,7 +10,12 @@ import jax.numpy as jnp
 from iblf_jax.core import checks
 from iblf_jax.core.linalg import matvec, solve_spd
 from iblf_jax.core.pytree import Leaf, component, leaf
-from iblf_jax.world.plants._base import EXCHANGE_RATE, Units
+from iblf_jax.world.plants._base import Units
+
+EXCHANGE_RATE = 0.1
+"""Square of the frequency at which the levels exchange energy in the default weights [1/s^2]: slow
+against gains of 0.3 to 1 1/s, which suit a model ship.  A larger ship is slower, by the square root
+of its length, and needs weights of its own."""
 
 
 @component
@@ -190,7 +195,7 @@ class Vessel:
         return jnp.zeros((0, 3), q.dtype)
 
     def weights(self, x: jax.Array) -> jax.Array:
-        """(10 1/s^2) M and M, (2, 3), with the diagonal of M."""
+        """(0.1 1/s^2) M and M, (2, 3), with the diagonal of M."""
         m11, m22, _, m33 = self._inertias()
         diagonal = jnp.stack([m11, m22, m33])
         return jnp.stack([EXCHANGE_RATE * diagonal, diagonal])
