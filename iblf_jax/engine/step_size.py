@@ -20,7 +20,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from iblf_jax.core import checks, notices
-from iblf_jax.core.status import VELOCITY_LIMIT, Status, has_flag
+from iblf_jax.core.status import Status, has_flag
 from iblf_jax.engine.machine_function import machine_function
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.single_run import run_one
@@ -28,8 +28,10 @@ from iblf_jax.engine.thresholds import STEP_SIZE_CHUNK
 from iblf_jax.simulation import discontinuities, error_estimate
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
 from iblf_jax.simulation.integrators import tableau
+from iblf_jax.simulation.levels import levels_on_reference
 from iblf_jax.simulation.scenario import Initial, Scenario, canonical
 from iblf_jax.simulation.stability import SLOWEST_RATE, jacobian
+from iblf_jax.world import plants
 
 RECOMMENDED_PHASE = 1.5
 """|dt * mode| that is recommended: RK4 follows the fastest mode itself to a few per cent there."""
@@ -163,7 +165,8 @@ def _one_step(scenario: Scenario, times: jax.Array, dt: jax.Array, pair: Pair, m
         partial(jnp.where, near > pair.nearest[0]), (near, begin, pair.fine), pair.nearest
     )
     off = jnp.max(jnp.abs(coarse[:n] - fine[:n]) / width)
-    going = jnp.all(jnp.isfinite(fine)) & jnp.all(jnp.abs(fine[n : 2 * n]) < VELOCITY_LIMIT)
+    limit = plants.speed_limit(scenario.plant)
+    going = jnp.all(jnp.isfinite(fine)) & jnp.all(jnp.abs(fine[n : 2 * n]) < limit)
     larger = jnp.maximum(pair.difference, jnp.where(off <= 1.0, off, jnp.inf))
     difference = jnp.where(going, larger, pair.difference)
     return Pair(pair.step + 1, coarse, fine, estimate, difference, nearest, going)
@@ -176,8 +179,8 @@ def start_and_along(scenario: Scenario, times: jax.Array) -> LoopState:
     """
 
     def at(t):
-        tube = scenario.context.tube(t)
-        return initial_state(dataclasses.replace(scenario, initial=Initial(tube.q_d, tube.dq_d)))
+        start = Initial(*levels_on_reference(scenario, t))
+        return initial_state(dataclasses.replace(scenario, initial=start))
 
     return jax.tree.map(
         lambda x, xs: jnp.concatenate([x[None], xs]), initial_state(scenario), jax.vmap(at)(times)
