@@ -45,6 +45,7 @@ ROBOTS = {
         payload=0.3,
     ),
     "arm": random_arm(3, seed=1, armature=0.1, payload=0.4),
+    "with_motors": robots.WithMotors(TWO_LINK, inertia=[0.02, 0.01], damping=0.1),
 }
 
 PLANTS = {
@@ -142,6 +143,12 @@ OBSERVERS = {
     "momentum": observers.Momentum(kf=[20.0, 10.0]),
     "extended_state": observers.ExtendedState(bandwidth=[40.0, 30.0]),
     "extended_state_two_gains": observers.ExtendedState(l1=80.0, l2=[1600.0, 900.0]),
+    "level": observers.LevelObserver(gain=(0.0, [20.0, 10.0], 30.0), eta0=(0.0, 0.1, 0.2)),
+    "level_zero": observers.LevelObserver(gain=20.0, start="zero"),
+    "state_observer": observers.StateObserver(bandwidth=[40.0, 30.0], offset=(0.0, 0.1, 0.2, 0.0)),
+    "state_observer_two_encoders": observers.StateObserver(
+        bandwidth=40.0, measured=(1, 3), disturbance=False
+    ),
 }
 
 VELOCITIES = {
@@ -157,6 +164,14 @@ SENSORS = {
         f"encoder_{name}": sensors.Encoder(counts=4096, offset=[0.1, 0.0], noise=1e-4, velocity=v)
         for name, v in VELOCITIES.items()
     },
+}
+
+SENSORS |= {
+    "levels": sensors.Levels((SENSORS["encoder_tracking"], sensors.Direct(noise=[0.1, 0.2]))),
+    "levels_encoders": sensors.Levels(
+        (SENSORS["encoder_filtered_difference"], SENSORS["encoder_measured"])
+    ),
+    "levels_unmeasured": sensors.Levels((sensors.Direct(resolution=1e-3, offset=0.1), None)),
 }
 
 ACTUATORS = {
@@ -226,6 +241,12 @@ LAWS = {
     ),
     "saturated_smooth": controllers.Saturated(
         law=controllers.ComputedTorque(Kp=25.0, Kd=10.0), limit=[7.2, 1.5], edge="smooth"
+    ),
+    "with_drive": controllers.WithDrive(
+        law=controllers.PDGravity(Kp=60.0, Kd=20.0),
+        drive=plants.ElectricDrive(
+            TWO_LINK, torque_constant=[2.0, 1.5], inductance=0.02, resistance=1.0, back_emf=0.5
+        ),
     ),
 }
 
