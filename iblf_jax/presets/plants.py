@@ -15,7 +15,7 @@ import numpy as np
 
 from iblf_jax.control.barriers import Barrier, Mapping, Quadratic
 from iblf_jax.control.controllers import BarrierBackstepping
-from iblf_jax.control.observers import Momentum
+from iblf_jax.control.observers import LevelObserver, Momentum
 from iblf_jax.presets.arms import iiwa14
 from iblf_jax.presets.paper import customary_two_link, zhang_yan_2024
 from iblf_jax.simulation.scenario import Initial, Scenario
@@ -35,6 +35,11 @@ def _within(limit: float | list[float]) -> Bounds:
 def _law(k: tuple[float, ...], *barriers: Barrier) -> Any:
     """The law with gains k [1/s] and one barrier a level."""
     return BarrierBackstepping(k=k, barriers=barriers)
+
+
+def _observer(*gain: float) -> Any:
+    """The observer of the disturbances, with one gain a level [1/s]."""
+    return LevelObserver(gain=gain)
 
 
 def cybership_ii() -> Vessel:
@@ -80,8 +85,9 @@ def vessel(*, current: float = 0.05, waves: float = 0.5) -> Scenario:
     Funnels around the reference shrink from 1.5 m to 0.4 m and from 0.8 rad to 0.3 rad; the surge
     velocity stays between -0.2 and 0.8 m/s, the sway velocity within 0.3 m/s and the yaw rate
     within 0.5 rad/s.  The current is a disturbance of the position, which no force opposes
-    directly.  Bounds, disturbances and gains are ASSUMPTIONS of this package, as is a force in
-    every direction: CyberShip II has two propellers of about 4 N each and a bow thruster.
+    directly; the observer of both levels estimates it.  Bounds, disturbances and gains are
+    ASSUMPTIONS of this package, as is a force in every direction: CyberShip II has two propellers
+    of about 4 N each and a bow thruster.
 
     Args:
       current: its speed to the north and to the east, which varies as a sinusoid [m/s].
@@ -106,6 +112,7 @@ def vessel(*, current: float = 0.05, waves: float = 0.5) -> Scenario:
         state_bounds=(Bounds(lower=Constant([-0.2, -0.3, -0.5]), upper=Constant([0.8, 0.3, 0.5])),),
         disturbance=Sum((Levels((drift,)), force)),
         controller=_law((0.2, 1.0), Mapping(), Mapping()),
+        observer=_observer(0.5, 2.0),
         initial=Initial(q=[5.3, -0.3, 1.5], dq=0.0),
     )
 
@@ -117,7 +124,7 @@ def motor_driven_pendulum() -> Scenario:
     The motor and the link are those of a one-link arm with J = 1.625e-3 kg m^2, m = 0.506 kg,
     M0 = 0.434 kg, L0 = 0.305 m, R0 = 0.023 m, B0 = 16.25e-3 N m s/rad, L = 25 mH, R = 5 ohm and
     Kt = Kb = 0.9 N m/A.  Bounds, disturbance and gains are ASSUMPTIONS of this package.  The
-    disturbance is a torque on the pendulum, in its second level.
+    disturbance is a torque on the pendulum, in its second level, which an observer estimates.
 
     Returns:
       A Scenario of order 3 with 1 component, for runs of 20 s at dt = 2e-3 s.
@@ -146,6 +153,7 @@ def motor_driven_pendulum() -> Scenario:
         state_bounds=(_within(2.2), _within(2.6)),
         disturbance=Levels((None, Sinusoids(amplitude=1.5, frequency=3.0))),
         controller=_law((2.0, 15.0, 60.0), Mapping(), Mapping(), Mapping()),
+        observer=_observer(0.0, 20.0, 0.0),
         initial=Initial(q=0.6, dq=0.0),
     )
 

@@ -154,8 +154,8 @@ def _structure(findings: Findings, plant: Any, t: jax.Array, points: jax.Array) 
 
 def _derivatives_along(plant: Any, t: jax.Array, x: jax.Array) -> jax.Array:
     """The Taylor coefficients of drift and gain along a straight line, all in one vector."""
-    still = [(jnp.zeros_like(t), jnp.zeros_like(x))] * (plant.order - 2)
-    curve = [(t, x), (jnp.ones_like(t), jnp.ones_like(x)), *still]
+    constant = [(jnp.zeros_like(t), jnp.zeros_like(x))] * (plant.order - 2)
+    curve = [(t, x), (jnp.ones_like(t), jnp.ones_like(x)), *constant]
     found = taylor.along(lambda t, x: (plant.drift(t, x), plant.gain(t, x)), curve)
     return jnp.concatenate([jnp.ravel(value) for value in jax.tree.leaves(found)])
 

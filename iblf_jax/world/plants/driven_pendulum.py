@@ -20,12 +20,12 @@ class DrivenPendulum:
     the motor, M = L/Kt, H = R/Kt and Km = Kb.
 
     Args:
-      D: moment of inertia of pendulum and motor, () [kg m^2], > 0.
-      B: viscous friction, () [N m s/rad], >= 0.
-      N: torque of gravity at 90 degrees, () [N m].
-      M: inductance over torque constant, () [V s/(N m)], > 0.
-      H: resistance over torque constant, () [V/(N m)], >= 0.
-      Km: back-emf constant, () [V s/rad], >= 0.
+      D: moment of inertia of pendulum and motor, () or (n,) [kg m^2], > 0.
+      B: viscous friction, () or (n,) [N m s/rad], >= 0.
+      N: torque of gravity at 90 degrees, () or (n,) [N m].
+      M: inductance over torque constant, () or (n,) [V s/(N m)], > 0.
+      H: resistance over torque constant, () or (n,) [V/(N m)], >= 0.
+      Km: back-emf constant, () or (n,) [V s/rad], >= 0.
 
     Source: D. M. Dawson, J. Hu, T. C. Burg, Nonlinear Control of Electric Machinery, 1998.
     """

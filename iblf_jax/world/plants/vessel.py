@@ -41,21 +41,26 @@ class Vessel:
       mass: of the vessel, () [kg], > 0.
       yaw_inertia: moment of inertia about the origin of the body, () [kg m^2], > 0.
       centre: distance of the centre of mass ahead of the origin, () [m]; 0 if not given.
-      X_du, Y_dv: added mass in surge and in sway, () [kg], usually < 0; 0 if not given.
+      X_du: added mass in surge, usually < 0, () [kg]; 0 if not given.
+      Y_dv: added mass in sway, usually < 0, () [kg]; 0 if not given.
       Y_dr: added mass that couples sway and yaw, the same in both equations, () [kg m]; 0 if not
         given.
-      N_dr: added moment of inertia in yaw, () [kg m^2], usually < 0; 0 if not given.
-      X_u, Y_v: linear damping, () [N s/m]; this and all further damping is 0 if not given.
-      X_uu, Y_vv: quadratic damping, () [N s^2/m^2].
-      X_uuu: cubic damping, () [N s^3/m^3].
-      Y_r: sway force by the yaw rate, () [N s/rad].
-      N_v: yaw moment by the sway velocity, () [N s].
-      N_r: linear damping in yaw, () [N m s/rad].
-      Y_rv, Y_vr: sway force by |r| v and by |v| r, () [N s^2/(m rad)].
-      Y_rr: sway force by |r| r, () [N s^2/rad^2].
-      N_vv: yaw moment by |v| v, () [N s^2/m].
-      N_rv, N_vr: yaw moment by |r| v and by |v| r, () [N s^2/rad].
-      N_rr: quadratic damping in yaw, () [N m s^2/rad^2].
+      N_dr: added moment of inertia in yaw, usually < 0, () [kg m^2]; 0 if not given.
+      X_u: linear damping in surge, () [N s/m]; 0 if not given.
+      X_uu: quadratic damping in surge, () [N s^2/m^2]; 0 if not given.
+      X_uuu: cubic damping in surge, () [N s^3/m^3]; 0 if not given.
+      Y_v: linear damping in sway, () [N s/m]; 0 if not given.
+      Y_vv: quadratic damping in sway, () [N s^2/m^2]; 0 if not given.
+      Y_rv: sway force by |r| v, () [N s^2/(m rad)]; 0 if not given.
+      Y_r: sway force by the yaw rate, () [N s/rad]; 0 if not given.
+      Y_vr: sway force by |v| r, () [N s^2/(m rad)]; 0 if not given.
+      Y_rr: sway force by |r| r, () [N s^2/rad^2]; 0 if not given.
+      N_v: yaw moment by the sway velocity, () [N s]; 0 if not given.
+      N_vv: yaw moment by |v| v, () [N s^2/m]; 0 if not given.
+      N_rv: yaw moment by |r| v, () [N s^2/rad]; 0 if not given.
+      N_r: linear damping in yaw, () [N m s/rad]; 0 if not given.
+      N_vr: yaw moment by |v| r, () [N s^2/rad]; 0 if not given.
+      N_rr: quadratic damping in yaw, () [N m s^2/rad^2]; 0 if not given.
 
     Source: T. I. Fossen, Handbook of Marine Craft Hydrodynamics and Motion Control, 2011,
       chapters 6 and 7; R. Skjetne, O. Smogeli, T. I. Fossen, Modeling, Identification and Control
