@@ -143,6 +143,9 @@ OBSERVERS = {
     "momentum": observers.Momentum(kf=[20.0, 10.0]),
     "extended_state": observers.ExtendedState(bandwidth=[40.0, 30.0]),
     "extended_state_two_gains": observers.ExtendedState(l1=80.0, l2=[1600.0, 900.0]),
+}
+
+LEVEL_OBSERVERS = {
     "level": observers.LevelObserver(gain=(0.0, [20.0, 10.0], 30.0), eta0=(0.0, 0.1, 0.2)),
     "level_zero": observers.LevelObserver(gain=20.0, start="zero"),
     "state_observer": observers.StateObserver(bandwidth=[40.0, 30.0], offset=(0.0, 0.1, 0.2, 0.0)),
@@ -150,6 +153,7 @@ OBSERVERS = {
         bandwidth=40.0, measured=(1, 3), disturbance=False
     ),
 }
+"""Observers of plants in strict-feedback form, some of more levels than a robot has."""
 
 VELOCITIES = {
     "measured": sensors.Measured(noise=[0.01, 0.02]),
@@ -242,6 +246,9 @@ LAWS = {
     "saturated_smooth": controllers.Saturated(
         law=controllers.ComputedTorque(Kp=25.0, Kd=10.0), limit=[7.2, 1.5], edge="smooth"
     ),
+}
+
+INPUT_MAPS = {
     "with_drive": controllers.WithDrive(
         law=controllers.PDGravity(Kp=60.0, Kd=20.0),
         drive=plants.ElectricDrive(
@@ -249,6 +256,7 @@ LAWS = {
         ),
     ),
 }
+"""Laws that command another input than a torque, for a plant of their own."""
 
 OPTIONAL_FOLDS = (
     metrics.AboveGravity(),
@@ -267,10 +275,10 @@ FAMILIES = {
     "region": (REGIONS, regions.MEMBERS, ij.testing.check_region),
     "disturbance": (DISTURBANCES, disturbances.MEMBERS, ij.testing.check_disturbance),
     "barrier": (BARRIERS, barriers.MEMBERS, ij.testing.check_barrier),
-    "observer": (OBSERVERS, observers.MEMBERS, ij.testing.check_observer),
+    "observer": (OBSERVERS | LEVEL_OBSERVERS, observers.MEMBERS, ij.testing.check_observer),
     "sensor": (SENSORS, sensors.MEMBERS, ij.testing.check_sensor),
     "actuator": (ACTUATORS, actuators.MEMBERS, ij.testing.check_actuator),
-    "law": (LAWS, controllers.MEMBERS, ij.testing.check_law),
+    "law": (LAWS | INPUT_MAPS, controllers.MEMBERS, ij.testing.check_law),
     "fold": (FOLDS, {cls.__name__: cls for cls in metrics.MEMBERS.values()}, ij.testing.check_fold),
 }
 """Family -> (instances by name, the package's registry, the checker)."""

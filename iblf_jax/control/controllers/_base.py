@@ -246,6 +246,10 @@ class LyapunovLaw(Protocol):
     step of a run.  T is the result of `disturbance_terms`, by default the contribution of the
     uncertain term to V' for any law, T = dV/dq' . M0^-1 f_tilde + dV/df_tilde
     . f'.  V, W and T are (), or (n,) and then summed; unit and scale of V are the law's choice.
+
+    A law that `receives_x` has these methods with x, (r, n), in the place of q and q', and with
+    d_tilde, (r, n), in the place of f_tilde: `lyapunov(t, x, d_tilde, context, state)`.  T is then
+    dV/dx . d_tilde + dV/dd_tilde . d' by default.
     """
 
     def lyapunov(

@@ -38,6 +38,10 @@ class Observer(Protocol):
     - `measured`: the levels, counted from 1, that it reads; all if not given.
     - `complete(t, x, model, state)`: x, (r, n), with its estimates in the place of the other
       levels, which the sensor need not measure.
+
+    An observer may claim that the error of its estimate obeys f_tilde' = f' - kappa f_tilde: its
+    attribute `error_gain` is kappa, (n,) [1/s], or of d_tilde, (r,) or (r, n) [1/s].  `certify`
+    checks it under laws of plants in strict-feedback form.
     """
 
     def init(self, q: jax.Array, dq: jax.Array, model: Robot) -> State:
@@ -68,5 +72,6 @@ observer_member = OptionalMembers(
     noise_gain=None,
     measured=None,
     complete=None,
+    error_gain=None,
 )
 """Reads optional members of an observer."""

@@ -62,6 +62,11 @@ class LevelObserver:
         """The factor from the noise of x to that of d_hat: kappa, (), (r,) or (r, n) [1/s]."""
         return self.gain
 
+    @property
+    def error_gain(self) -> jax.Array:
+        """Kappa of d_tilde' = d' - kappa d_tilde, (), (r,) or (r, n) [1/s]."""
+        return self.gain
+
     def init(self, x: jax.Array, model: Plant) -> jax.Array:
         """eta(0), (r, n)."""
         eta0 = jnp.broadcast_to(self.eta0, x.shape)
