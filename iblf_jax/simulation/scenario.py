@@ -883,7 +883,20 @@ def _check_levels_at_start(scenario: Scenario) -> None:
     parts: dict[str, Any] = {"plant": scenario.plant, "model": scenario.model}
     for name, plant in parts.items():
         if plants.is_chain(plant):
-            _check_gains(name, np.asarray(plant.gain(t, x[: plant.order])))
+            levels = x[: plant.order]
+            _check_gains(name, np.asarray(plant.gain(t, levels)))
+            if not isinstance(plant, plants.OF_KNOWN_STRUCTURE):
+                plants.check_dependence(name, _dependence_near(plant, t, levels))
+
+
+@jax.jit
+def _dependence_near(plant: Plant, t: jax.Array, x: jax.Array) -> Any:
+    """The dependence of drift and gain on the levels at the start and at a state near it, where
+    even functions of a level that starts at 0 have a slope.
+    """
+    nearby = x + 0.1 * (1.0 + jnp.abs(x))
+    points = jnp.stack([x, nearby])
+    return jax.vmap(partial(plants.dependence_on_levels, plant, t))(points)
 
 
 def _check_gains(name: str, gains: np.ndarray) -> None:

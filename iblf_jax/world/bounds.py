@@ -12,6 +12,7 @@ and with their rates.  `tube_at` computes them by automatic differentiation and 
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -19,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.optional import OptionalMembers
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.core.units import POSITION
 from iblf_jax.world.references import Reference
@@ -30,7 +32,9 @@ class Side(Protocol):
     """The contract of one side of the bounds.
 
     A side that is discontinuous in time also has `jump_times()`, the times (m,) [s] at which it or
-    its rate jumps; steps of a run are divided there, as for disturbances.
+    its rate jumps; steps of a run are divided there, as for disturbances.  A side that is not
+    smooth has `continuous_derivatives`, the number of its continuous derivatives in time and in
+    q_d; a law for a plant of order r needs r - i + 1 of them on level i.
     """
 
     def at(self, t: jax.Array, q_d: jax.Array) -> jax.Array:
@@ -40,6 +44,10 @@ class Side(Protocol):
         A bound on q' is in rad/s and receives q_d' in place of q_d.
         """
         ...
+
+
+side_member = OptionalMembers(continuous_derivatives=math.inf)
+"""Reads optional members of a side."""
 
 
 @component

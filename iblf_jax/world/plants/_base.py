@@ -12,10 +12,11 @@ Functions of this module take the number of a level, which counts from 1.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.extend import core as jax_core
 
 from iblf_jax.core import checks
@@ -218,6 +219,60 @@ def torque_as_rates(plant: Plant, x: jax.Array, torque: jax.Array) -> jax.Array:
     rate = solve_spd(robot_of(plant).mass_matrix(x[0]), torque)
     zero = jnp.zeros_like(rate)
     return jnp.stack([zero, rate, *[zero] * (plant.order - 2)])
+
+
+class Dependence(NamedTuple):
+    """The largest derivatives of f_i and G_i by the components of each level, (order, order) each;
+    row i, column j is that of f_i by x_j.
+    """
+
+    drift: jax.Array
+    gain: jax.Array
+
+
+def dependence_on_levels(plant: Plant, t: jax.Array, x: jax.Array) -> Dependence:
+    """On which levels f_i and G_i depend at a state, by their Jacobians.
+
+    Args:
+      plant: any.
+      t: time, () [s].
+      x: state, (order, n).
+    """
+
+    def largest(function: Callable) -> jax.Array:
+        slopes = jnp.abs(jax.jacfwd(function, argnums=1)(t, x))
+        rows = slopes.reshape(x.shape[0], -1, *x.shape)
+        return jnp.max(rows, axis=(1, 3))
+
+    return Dependence(largest(plant.drift), largest(plant.gain))
+
+
+def check_dependence(name: str, dependence: Dependence) -> None:
+    """Raises ValueError for a row of drift or gain that depends on a later level.
+
+    Args:
+      name: of the plant, for the message.
+      dependence: of `dependence_on_levels`, at one or more states, (..., order, order).
+    """
+    for function, slopes in dependence._asdict().items():
+        sizes = np.asarray(slopes)
+        known = np.where(np.isfinite(sizes), sizes, 0.0).reshape(-1, *sizes.shape[-2:])
+        later = np.triu(np.max(known, axis=0), k=1)
+        if not np.any(later > ROUNDING * np.max(known)):
+            continue
+        i, j = np.unravel_index(np.argmax(later), later.shape)
+        got = f"a row {i} that depends on x[{j}]"
+        expected = f"row {i} to depend on x[0] ... x[{i}] only (strict-feedback form)"
+        if i == 0:
+            expected = "row 0 to depend on x[0] only (strict-feedback form)"
+        remedy = "Choose other levels, or other coordinates."
+        if function == "drift" and j == i + 1:
+            remedy = f"The factor of x[{j}] in x[{i}]' belongs in row {i} of the gain."
+        raise checks.fail(f"{name}.{function}(t, x)", checks.Words(got), expected, remedy)
+
+
+ROUNDING = 1e-9
+"""Derivatives below this share of the largest one are rounding errors."""
 
 
 def units_of(part: Any) -> tuple[Units, ...]:
