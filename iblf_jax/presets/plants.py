@@ -54,6 +54,8 @@ def cybership_ii() -> Vessel:
     """
     return Vessel(
         mass=23.8,
+        length=1.255,
+        beam=0.29,
         yaw_inertia=1.76,
         centre=0.046,
         X_du=-2.0,

@@ -110,8 +110,8 @@ class SmoothStep:
       Procedural Approach, 2003 (smoothstep); the general degree follows from Hermite interpolation.
     """
 
-    start: Leaf = leaf("rad")
-    end: Leaf = leaf("rad")
+    start: Leaf = leaf(POSITION)
+    end: Leaf = leaf(POSITION)
     duration: Leaf = leaf("s", sign="positive", shape="scalar")
     derivatives: int = static(default=4)
 

@@ -61,6 +61,8 @@ class Vessel:
       N_r: linear damping in yaw, () [N m s/rad]; 0 if not given.
       N_vr: yaw moment by |v| r, () [N s^2/rad]; 0 if not given.
       N_rr: quadratic damping in yaw, () [N m s^2/rad^2]; 0 if not given.
+      length: of the hull, for drawings only, () [m], > 0; 1 if not given.
+      beam: width of the hull, for drawings only, () [m], > 0; 0.25 if not given.
 
     Source: T. I. Fossen, Handbook of Marine Craft Hydrodynamics and Motion Control, 2011,
       chapters 6 and 7; R. Skjetne, O. Smogeli, T. I. Fossen, Modeling, Identification and Control
@@ -89,6 +91,8 @@ class Vessel:
     N_r: Leaf = leaf("N m s/rad", shape="scalar", default=0.0)
     N_vr: Leaf = leaf("N s^2/rad", shape="scalar", default=0.0)
     N_rr: Leaf = leaf("N m s^2/rad^2", shape="scalar", default=0.0)
+    length: Leaf = leaf("m", sign="positive", shape="scalar", default=1.0)
+    beam: Leaf = leaf("m", sign="positive", shape="scalar", default=0.25)
     n: ClassVar[int] = 3
     order: ClassVar[int] = 2
     units: ClassVar[tuple[Units, ...]] = (
@@ -111,6 +115,14 @@ class Vessel:
         expected = "m11 > 0, m22 > 0 and m22 m33 > m23^2, a positive definite inertia matrix"
         remedy = "Added masses (X_du, Y_dv, N_dr) are negative numbers in this convention."
         raise checks.fail("Vessel", checks.Words(got), expected, remedy)
+
+    def outline(self, eta: jax.Array) -> jax.Array:
+        """Corners of the hull in the plane (east, north), the bow first, (5, 2) [m]."""
+        ahead = 0.5 * self.length * jnp.array([1.0, 0.4, -1.0, -1.0, 0.4])
+        aside = 0.5 * self.beam * jnp.array([0.0, 1.0, 1.0, -1.0, -1.0])
+        north, east, heading = eta[0], eta[1], eta[2]
+        s, c = jnp.sin(heading), jnp.cos(heading)
+        return jnp.stack([east + ahead * s + aside * c, north + ahead * c - aside * s], axis=-1)
 
     # --- matrices -----------------------------------------------------------------------------
 
