@@ -20,7 +20,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from iblf_jax.core import checks, notices
-from iblf_jax.core.status import VELOCITY_LIMIT, Status, has_flag
+from iblf_jax.core.status import Status, has_flag
 from iblf_jax.engine.machine_function import machine_function
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.single_run import run_one
@@ -30,6 +30,7 @@ from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.scenario import Initial, Scenario, canonical
 from iblf_jax.simulation.stability import SLOWEST_RATE, jacobian
+from iblf_jax.world import plants
 
 RECOMMENDED_PHASE = 1.5
 """|dt * mode| that is recommended: RK4 follows the fastest mode itself to a few per cent there."""
@@ -163,7 +164,8 @@ def _one_step(scenario: Scenario, times: jax.Array, dt: jax.Array, pair: Pair, m
         partial(jnp.where, near > pair.nearest[0]), (near, begin, pair.fine), pair.nearest
     )
     off = jnp.max(jnp.abs(coarse[:n] - fine[:n]) / width)
-    going = jnp.all(jnp.isfinite(fine)) & jnp.all(jnp.abs(fine[n : 2 * n]) < VELOCITY_LIMIT)
+    limit = plants.speed_limit(scenario.plant)
+    going = jnp.all(jnp.isfinite(fine)) & jnp.all(jnp.abs(fine[n : 2 * n]) < limit)
     larger = jnp.maximum(pair.difference, jnp.where(off <= 1.0, off, jnp.inf))
     difference = jnp.where(going, larger, pair.difference)
     return Pair(pair.step + 1, coarse, fine, estimate, difference, nearest, going)
@@ -176,12 +178,20 @@ def start_and_along(scenario: Scenario, times: jax.Array) -> LoopState:
     """
 
     def at(t):
-        tube = scenario.context.tube(t)
-        return initial_state(dataclasses.replace(scenario, initial=Initial(tube.q_d, tube.dq_d)))
+        return initial_state(dataclasses.replace(scenario, initial=_reference_state(scenario, t)))
 
     return jax.tree.map(
         lambda x, xs: jnp.concatenate([x[None], xs]), initial_state(scenario), jax.vmap(at)(times)
     )
+
+
+def _reference_state(scenario: Scenario, t: jax.Array) -> Initial:
+    """The state of a plant that follows the reference exactly at time t [s]."""
+    if plants.is_chain(scenario.plant):
+        x = plants.state_along(scenario.plant, scenario.reference.position, t)
+        return Initial(x=x)
+    tube = scenario.context.tube(t)
+    return Initial(tube.q_d, tube.dq_d)
 
 
 def fastest_along(scenario: Scenario, times: np.ndarray) -> float:

@@ -162,10 +162,19 @@ def begin(method: str, jacobian: jax.Array, state: LoopState) -> Accuracy:
     none = jnp.zeros((2 * n,), jacobian.dtype)
     pending = (none,) * steps_back(method)
     if state.sampled:
-        # Only a method of one stage uses an earlier rate; only velocities have a local error.
+        # Only a method of one stage uses an earlier rate; only the plant has a local error.
         pending = (none,) if len(tableau(method).c) == 1 else ()
-        R = R[:, :n]
+        R = _columns_of_plant(R, state)
     return Accuracy(pending, none, R, none[:n], none[0])
+
+
+def _columns_of_plant(R: jax.Array, state: LoopState) -> jax.Array:
+    """The columns of R that belong to q' and to the further levels of a sampled loop."""
+    n = state.q.size
+    if isinstance(state.higher, tuple):
+        return R[:, :n]
+    first = n + sum(x.size for x in jax.tree.leaves(state.actuator))
+    return jnp.concatenate([R[:, :n], R[:, first : first + state.higher.size]], axis=1)
 
 
 def update(

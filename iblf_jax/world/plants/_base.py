@@ -16,7 +16,7 @@ from typing import Any, Protocol
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.core import checks
+from iblf_jax.core import checks, taylor
 from iblf_jax.core.linalg import matvec, solve_gain, solve_spd
 from iblf_jax.core.optional import OptionalMembers, has_members
 from iblf_jax.core.status import VELOCITY_LIMIT
@@ -182,6 +182,38 @@ def flow(
     return jnp.stack(
         [level_rate(plant, i + 1, t, x, above, torque) for i, above in enumerate(inputs)]
     )
+
+
+def state_along(plant: Plant, position: Any, t: jax.Array) -> jax.Array:
+    """The state with which a plant without disturbances follows x_1 = position(t), (order, n):
+
+        x_{i+1} = G_i^-1 (x_i' - f_i),
+
+    with the derivatives in time by Taylor coefficients.
+
+    Args:
+      plant: any.
+      position: function t -> x_1, (n,), with order - 1 derivatives.
+      t: time, () [s].
+    """
+    order = plant.order
+    one, zero = jnp.ones_like(t), jnp.zeros_like(t)
+    times = [t, one, *[zero] * (order - 2)]
+    curves = [taylor.along(position, [(x,) for x in times])]
+    for level in range(1, order):
+        terms = order - level
+        rates = taylor.derivative(curves[-1][: terms + 1])
+        unknown = [jnp.zeros_like(rates[0])] * terms
+
+        def above(t, x, rate, level=level):
+            return level_input(plant, level, t, x, rate)
+
+        along = [
+            (times[m], jnp.stack([*[curve[m] for curve in curves], *unknown]), rates[m])
+            for m in range(terms)
+        ]
+        curves.append(taylor.along(above, along))
+    return jnp.stack([curve[0] for curve in curves])
 
 
 def torque_as_rates(plant: Plant, x: jax.Array, torque: jax.Array) -> jax.Array:
