@@ -158,7 +158,7 @@ def model_description(
 
 def _add_units(root: Xml.Element, variables: Sequence[Variable]) -> set[str]:
     """Adds the definitions of the units; returns their names."""
-    exponents = {"s": BASE["s"]}
+    exponents: dict[str, tuple[int, ...]] = {"s": BASE["s"]}
     for v in variables:
         found = unit_exponents(v.unit)
         if found is not None and any(found):

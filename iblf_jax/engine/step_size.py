@@ -187,8 +187,9 @@ def start_and_along(scenario: Scenario, times: jax.Array) -> LoopState:
 
 def _reference_state(scenario: Scenario, t: jax.Array) -> Initial:
     """The state of a plant that follows the reference exactly at time t [s]."""
-    if plants.is_chain(scenario.plant):
-        x = plants.state_along(scenario.plant, scenario.reference.position, t)
+    plant: Any = scenario.plant
+    if plants.is_chain(plant):
+        x = plants.state_along(plant, scenario.reference.position, t)
         return Initial(x=x)
     tube = scenario.context.tube(t)
     return Initial(tube.q_d, tube.dq_d)
