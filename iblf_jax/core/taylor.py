@@ -1,12 +1,13 @@
-"""Taylor coefficients of a function along a curve, for derivatives of higher order in time.
+"""Derivatives of higher order of a function along a curve in time, by Taylor arithmetic.
 
-A curve is a list of pytrees of one structure, its Taylor coefficients in time,
+A curve is a list of pytrees of one structure, the derivatives x(t0), x'(t0), x"(t0), ... of its
+arguments.  `along` returns the derivatives of f(x(t)).  Nested forward differentiation computes the
+same numbers, but the number of its operations grows exponentially with the order.  Taylor
+arithmetic carries the coefficients x[m] of
 
-    x(t0 + s) = x[0] + x[1] s + x[2] s^2 + ... + x[K] s^K,
+    x(t0 + s) = x[0] + x[1] s + x[2] s^2 + ... + x[K] s^K,   x[m] = (m-th derivative) / m!,
 
-so that x[m] is the m-th derivative divided by m!.  `along` returns the coefficients of
-f(x(t0 + s)).  Nested forward differentiation computes the same numbers, but the number of its
-operations grows exponentially with K and that of Taylor arithmetic like K^2.
+through the operations of f, and the number of operations grows like K^2.
 
 The rules of the primitives are those of `jax.experimental.jet`, except for a few that are cheaper
 or more accurate here.  A function with a primitive that has no rule is differentiated by nested
@@ -35,14 +36,14 @@ class NoRuleError(Exception):
 
 
 def along(function: Callable, curve: Sequence[tuple]) -> list[Any]:
-    """The Taylor coefficients of `function(*arguments)` where the arguments follow a curve.
+    """The derivatives of `function(*arguments)` where the arguments follow a curve.
 
     Args:
       function: a function of pytrees of floating-point arrays.
-      curve: the coefficients of the arguments, curve[m] a tuple of all arguments; K + 1 of them.
+      curve: the derivatives of the arguments, curve[m] a tuple of the m-th ones; K + 1 of them.
 
     Returns:
-      K + 1 pytrees: the value of the function, and its coefficients of the orders 1 to K.
+      K + 1 pytrees: the value of the function, and its derivatives of the orders 1 to K.
     """
     order = len(curve) - 1
     if order == 0:
@@ -52,47 +53,43 @@ def along(function: Callable, curve: Sequence[tuple]) -> list[Any]:
     try:
         return _by_taylor_arithmetic(function, curve)
     except NoRuleError:
-        return by_nested_jvp(function, curve)
+        return _by_nested_jvp(function, curve)
 
 
-def by_nested_jvp(function: Callable, curve: Sequence[tuple]) -> list[Any]:
+def in_time(function: Callable, t: jax.Array, order: int) -> list[Any]:
+    """The value of a function of time and its derivatives up to an order, by nested forward
+    differentiation: for the short formulas of references.
+    """
+    if order == 0:
+        return [function(t)]
+
+    def lower(t):
+        return in_time(function, t, order - 1)
+
+    values, rates = jax.jvp(lower, (t,), (jnp.ones_like(t),))
+    return [*values, rates[-1]]
+
+
+def _by_nested_jvp(function: Callable, curve: Sequence[tuple]) -> list[Any]:
     """`along` by nested forward differentiation, for every function that JAX differentiates."""
-    order = len(curve) - 1
-    first = jax.tree.leaves(curve[0])[0]
-    one = jnp.ones((), jnp.result_type(first))
+    coefficients = [_divided(x, math.factorial(m)) for m, x in enumerate(curve)]
 
-    def point(s: jax.Array) -> tuple:
-        def value(*coefficients):
-            total = coefficients[-1]
-            for coefficient in reversed(coefficients[:-1]):
-                total = total * s + coefficient
+    def value(s: jax.Array) -> Any:
+        def polynomial(*terms):
+            total = terms[-1]
+            for term in reversed(terms[:-1]):
+                total = total * s + term
             return total
 
-        return jax.tree.map(value, *curve)
+        return function(*jax.tree.map(polynomial, *coefficients))
 
-    def derivatives(order: int) -> Callable:
-        if order == 0:
-            return lambda s: [function(*point(s))]
-
-        def of_next_order(s):
-            values, rates = jax.jvp(derivatives(order - 1), (s,), (one,))
-            return [*values, rates[-1]]
-
-        return of_next_order
-
-    found = derivatives(order)(jnp.zeros_like(one))
-    return [
-        jax.tree.map(lambda x, m=m: x * (1.0 / math.factorial(m)), value)
-        for m, value in enumerate(found)
-    ]
+    dtype = jnp.result_type(jax.tree.leaves(curve[0])[0])
+    return in_time(value, jnp.zeros((), dtype), len(curve) - 1)
 
 
-def derivative(curve: Sequence[Any]) -> list[Any]:
-    """The curve of the time derivative of a curve, one coefficient shorter."""
-    return [
-        jax.tree.map(lambda x, m=m: float(m) * x if m > 1 else x, coefficient)
-        for m, coefficient in enumerate(curve[1:], start=1)
-    ]
+def _divided(tree: Any, divisor: int) -> Any:
+    """A pytree divided by a whole number."""
+    return tree if divisor == 1 else jax.tree.map(lambda x: x * (1.0 / divisor), tree)
 
 
 # --- Taylor arithmetic on a traced function -----------------------------------------------------
@@ -101,12 +98,16 @@ def derivative(curve: Sequence[Any]) -> list[Any]:
 def _by_taylor_arithmetic(function: Callable, curve: Sequence[tuple]) -> list[Any]:
     """`along` by Taylor arithmetic; NoRuleError for a primitive without a rule."""
     traced, shape = jax.make_jaxpr(function, return_shape=True)(*curve[0])
-    rows = [jax.tree.leaves(coefficient) for coefficient in curve]
+    rows = [jax.tree.leaves(_divided(x, math.factorial(m))) for m, x in enumerate(curve)]
     inputs = [list(coefficients) for coefficients in zip(*rows, strict=True)]
     outputs = _evaluated(traced.jaxpr, traced.consts, inputs, len(curve) - 1)
     structure = jax.tree.structure(shape)
     dense = [_with_zeros(coefficients) for coefficients in outputs]
-    return [jax.tree.unflatten(structure, row) for row in zip(*dense, strict=True)]
+    found = []
+    for m, row in enumerate(zip(*dense, strict=True)):
+        scaled = [_scaled(x, float(math.factorial(m))) for x in row]
+        found.append(jax.tree.unflatten(structure, scaled))
+    return found
 
 
 def _with_zeros(coefficients: Coefficients) -> list[jax.Array]:
@@ -254,16 +255,13 @@ def _subtract(inputs: list[Coefficients], params: dict) -> Coefficients:
 
 
 def _bilinear(primitive: Any, inputs: list[Coefficients], params: dict) -> Coefficients:
-    a, b = inputs
-    times = partial(primitive.bind, **params)
+    first, second = inputs
+    return _product_of(first, second, partial(primitive.bind, **params))
+
+
+def _product_of(a: Coefficients, b: Coefficients, times: Callable = lax.mul) -> Coefficients:
+    """The coefficients of a product."""
     return [_total([_product(a[j], b[k - j], times) for j in range(k + 1)]) for k in range(len(a))]
-
-
-def _convolved(a: Coefficients, b: Coefficients, k: int, first: int = 0) -> Any:
-    """The coefficient k of a product, from the term a[first] on, without a term that is not known
-    yet.
-    """
-    return _total([_product(a[j], b[k - j]) for j in range(first, k + 1) if k - j < len(b)])
 
 
 def _divide(inputs: list[Coefficients], params: dict) -> Coefficients:
@@ -337,7 +335,7 @@ def _sqrt(inputs: list[Coefficients], params: dict) -> Coefficients:
 
 
 def _square(inputs: list[Coefficients], params: dict) -> Coefficients:
-    return _bilinear(lax.mul_p, [inputs[0], inputs[0]], {})
+    return _product_of(inputs[0], inputs[0])
 
 
 def _integer_power(inputs: list[Coefficients], params: dict) -> Coefficients:
@@ -349,10 +347,10 @@ def _integer_power(inputs: list[Coefficients], params: dict) -> Coefficients:
     rest = abs(exponent)
     while rest:
         if rest % 2:
-            power = base if power is None else _bilinear(lax.mul_p, [power, base], {})
+            power = base if power is None else _product_of(power, base)
         rest //= 2
         if rest:
-            base = _bilinear(lax.mul_p, [base, base], {})
+            base = _product_of(base, base)
     assert power is not None
     if exponent < 0:
         power = _divide([one, power], {})

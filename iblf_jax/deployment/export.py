@@ -373,10 +373,7 @@ def _reference(scenario: Scenario, t: jax.Array, order: int) -> list[jax.Array]:
     """The scenario's own reference and its derivatives up to an order at times (K,), (K, n)
     each.
     """
-    one, zero = jnp.ones_like(t), jnp.zeros_like(t)
-    times = [(t,), (one,), *[(zero,)] * (order - 1)]
-    curve = taylor.along(jax.vmap(scenario.reference.position), times)
-    return [math.factorial(k) * x for k, x in enumerate(curve)]
+    return taylor.in_time(jax.vmap(scenario.reference.position), t, order)
 
 
 @jax.jit

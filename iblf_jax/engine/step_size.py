@@ -28,6 +28,7 @@ from iblf_jax.engine.thresholds import STEP_SIZE_CHUNK
 from iblf_jax.simulation import discontinuities, error_estimate
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
 from iblf_jax.simulation.integrators import tableau
+from iblf_jax.simulation.levels import levels_on_reference
 from iblf_jax.simulation.scenario import Initial, Scenario, canonical
 from iblf_jax.simulation.stability import SLOWEST_RATE, jacobian
 from iblf_jax.world import plants
@@ -178,21 +179,12 @@ def start_and_along(scenario: Scenario, times: jax.Array) -> LoopState:
     """
 
     def at(t):
-        return initial_state(dataclasses.replace(scenario, initial=_reference_state(scenario, t)))
+        start = Initial(*levels_on_reference(scenario, t))
+        return initial_state(dataclasses.replace(scenario, initial=start))
 
     return jax.tree.map(
         lambda x, xs: jnp.concatenate([x[None], xs]), initial_state(scenario), jax.vmap(at)(times)
     )
-
-
-def _reference_state(scenario: Scenario, t: jax.Array) -> Initial:
-    """The state of a plant that follows the reference exactly at time t [s]."""
-    plant: Any = scenario.plant
-    if plants.is_chain(plant):
-        x = plants.state_along(plant, scenario.reference.position, t)
-        return Initial(x=x)
-    tube = scenario.context.tube(t)
-    return Initial(tube.q_d, tube.dq_d)
 
 
 def fastest_along(scenario: Scenario, times: np.ndarray) -> float:

@@ -16,6 +16,7 @@ from iblf_jax.control.controllers._base import law_member, state_of_levels
 from iblf_jax.control.observers import NoObserver
 from iblf_jax.control.observers._base import observer_member
 from iblf_jax.control.sensors._base import sensor_member
+from iblf_jax.core import taylor
 from iblf_jax.core.linalg import matvec, solve_spd
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.time import as_at
@@ -39,6 +40,36 @@ def start_levels(scenario: Any) -> tuple[jax.Array, jax.Array, Any]:
         return initial.q, initial.dq, initial.higher
     steady = plants.plant_member(plant, "steady_levels")
     return initial.q, initial.dq, steady(initial.q, initial.dq)
+
+
+def levels_on_reference(scenario: Any, t: jax.Array) -> tuple[jax.Array, jax.Array, Any]:
+    """The levels of a plant that follows its reference exactly and without disturbance: q and q',
+    (n,), and those from the third on, (r - 2, n), or None for a robot.
+    """
+    plant, position = scenario.plant, scenario.reference.position
+    if not plants.is_chain(plant):
+        tube = scenario.context.tube(t)
+        return tube.q_d, tube.dq_d, None
+    order = plant.order
+    curves = [taylor.in_time(position, t, order - 1)]
+    for level in range(1, order):
+        curves.append(_curve_of_next_level(plant, level, t, curves))
+    x = jnp.stack([curve[0] for curve in curves])
+    return x[0], x[1], x[2:] if order > 2 else None
+
+
+def _curve_of_next_level(plant: Any, level: int, t: jax.Array, curves: list) -> list[jax.Array]:
+    """The level above a level, with its derivatives, from those of the levels up to this one."""
+    count = len(curves[-1]) - 1
+    one, zero = jnp.ones_like(t), jnp.zeros_like(t)
+    times = [t, one, *[zero] * count][:count]
+    unknown = [jnp.zeros_like(curves[0][0])] * (plant.order - level)
+
+    def above(t, known, rate):
+        return plants.level_input(plant, level, t, jnp.stack([*known, *unknown]), rate)
+
+    points = [(times[m], [curve[m] for curve in curves], curves[-1][m + 1]) for m in range(count)]
+    return taylor.along(above, points)
 
 
 def steady_input(scenario: Any, q: jax.Array) -> jax.Array:

@@ -41,7 +41,6 @@ from iblf_jax.core.pytree import (
     rewrapped,
     unwrapped,
 )
-from iblf_jax.core.status import VELOCITY_LIMIT
 from iblf_jax.core.time import joined, jump_times_of
 from iblf_jax.simulation.levels import model_state, start_levels
 from iblf_jax.simulation.sampling import PERIOD_TOLERANCE, Sampling
@@ -732,8 +731,9 @@ def _check_start(scenario: Scenario) -> None:
             expected = "a start inside all regions"
             raise checks.fail("initial.q", got, expected, "Move the start or the region.")
     _check_levels_at_start(scenario)
-    if not np.all(np.abs(dq) < plants.speed_limit(scenario.plant)):
-        expected = f"speeds below {VELOCITY_LIMIT:g} rad/s"
+    limit = plants.speed_limit(scenario.plant)
+    if not np.all(np.abs(dq) < limit):
+        expected = f"speeds below {limit:g} rad/s"
         raise checks.fail("initial.dq", dq, expected, "A run that fast counts as diverged.")
     for name, part in (("plant", scenario.plant), ("model", scenario.model)):
         robot = plants.robot_of(part)

@@ -19,10 +19,7 @@ with those of the energy K/M.  The plants of this package state the scales of th
 energies (`weights`); for others w = 1.
 
 **Derivatives.**  alpha_{i-1}' is the derivative along the flow of the model, x_j' = f_j + G_j
-x_{j+1} + d_hat_j, with the output of the observer held.  All derivatives are along one trajectory,
-so that they follow from Taylor coefficients in time (`core.taylor`): those of x_j of the orders up
-to r - j, those of the reference and of the bounds, and then, level by level, those of alpha_i and
-of w_i s_i up to the order r - i.
+x_{j+1} + d_hat_j, with the output of the observer held.
 
 **Dynamic surface.**  With a `filter`, mu_i beta_i' + beta_i = alpha_i, e_{i+1} = x_{i+1} - beta_i,
 and beta_i' = (alpha_i - beta_i)/mu_i takes the place of alpha_i'.  No derivative is formed; the lag
@@ -36,7 +33,7 @@ jumps at e_r = 0 (`switching`), as the exact cancellation requires.
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -49,31 +46,13 @@ from iblf_jax.control.barriers._base import (
     ratio_jumps,
 )
 from iblf_jax.control.controllers._base import Command, LawContext
+from iblf_jax.control.controllers._levels import Design, Level, exact_levels, surface_levels
 from iblf_jax.control.controllers.backstepping import check_barrier, fit_o
-from iblf_jax.core import checks, taylor
+from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.world import plants
 from iblf_jax.world.bounds import Bounds, Funnel, Tube
-from iblf_jax.world.plants import Plant
 from iblf_jax.world.references import reference_member
-
-
-class Below(NamedTuple):
-    """What a level receives from the level below."""
-
-    tube: Tube
-    """The tube of x_i around alpha_{i-1}; "positions" are in the unit of the level."""
-    slope: Any
-    """w_{i-1} s_{i-1}, (n,); None for the first level."""
-
-
-class Level(NamedTuple):
-    """What a level computes."""
-
-    alpha: jax.Array
-    """alpha_i, the level above as this level needs it, (n,); u for the last level."""
-    slope: jax.Array
-    """w_i s_i, (n,)."""
 
 
 @component
@@ -242,18 +221,26 @@ class BarrierBackstepping:
 
     # --- the law ----------------------------------------------------------------------------------
 
+    @property
+    def _designs(self) -> list[Design]:
+        """The numbers of each level."""
+        o: Any = [None] * self.order if self.o is None else self.o
+        return [
+            Design(barrier, self.k[i], o[i], self.c[i], self.weights[i])
+            for i, barrier in enumerate(self.barriers)
+        ]
+
     def init(self, x: jax.Array, context: LawContext) -> Any:
-        """beta_i(0) = alpha_i(0), (r - 1, n), of a dynamic surface; no state otherwise."""
+        """beta_i(0) = alpha_i(0) of (S.2), (r - 1, n), of a dynamic surface; no state otherwise.
+
+        With the derivatives of the virtual controls at the start, the filters begin without a
+        transient, and the motion tends to that of (S.2) as they become faster.
+        """
         if self.filter is None:
             return ()
         t = jnp.zeros((), x.dtype)
-        betas: list[jax.Array] = []
-        zero = jnp.zeros_like(x[0])
-        for _ in range(self.order - 1):
-            padded = [*betas, *[zero] * (self.order - 1 - len(betas))]
-            found = self._surface_levels(t, x, zero, context, jnp.stack(padded))
-            betas.append(found[len(betas)].alpha)
-        return jnp.stack(betas)
+        levels, _ = exact_levels(self._designs, t, x, jnp.zeros_like(x), context)
+        return jnp.stack([level.alpha for level in levels[:-1]])
 
     def command(
         self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext, state: Any
@@ -268,25 +255,29 @@ class BarrierBackstepping:
           context: model, reference and bounds.
           state: beta, (r - 1, n), of a dynamic surface.
         """
-        if self.filter is None:
-            levels, tubes = self._exact_levels(t, x, d_hat, context)
-            alphas = [level.alpha for level in levels[:-1]]
-            rates: Any = ()
-        else:
-            levels = self._surface_levels(t, x, d_hat, context, state)
-            tubes = [self._surface_tube(i, t, context, state, levels) for i in range(self.order)]
-            alphas = list(state)
-            found = jnp.stack([level.alpha for level in levels[:-1]])
-            rates = (found - state) / self.filter
+        levels, tubes = self._levels(t, x, d_hat, context, state)
+        rates: Any = ()
+        if self.filter is not None:
+            alphas = jnp.stack([level.alpha for level in levels[:-1]])
+            rates = (alphas - state) / self.filter
         V = jnp.zeros_like(x[0])
         guard_active = jnp.zeros(x[0].shape, bool)
         for i, (barrier, tube) in enumerate(zip(self.barriers, tubes, strict=True)):
             V = V + self.weights[i] * barrier.value(tube, x[i])
             guard_active |= guard_is_active(tube, x[i], barrier.guard)
-        command = Command(levels[-1].alpha, alphas[0], V, guard_active, guard_active & False)
+        saturated = jnp.zeros_like(guard_active)
+        command = Command(levels[-1].alpha, tubes[1].q_d, V, guard_active, saturated)
         if self.order > 2:
-            command = command._replace(alpha_higher=jnp.stack(alphas[1:]))
+            command = command._replace(alpha_higher=jnp.stack([tube.q_d for tube in tubes[2:]]))
         return command, rates
+
+    def _levels(
+        self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext, state: Any
+    ) -> tuple[list[Level], list[Tube]]:
+        """All levels and their tubes; arguments as `command`."""
+        if self.filter is None:
+            return exact_levels(self._designs, t, x, d_hat, context)
+        return surface_levels(self._designs, self.filter, t, x, d_hat, context, state)
 
     def switching(
         self, t: jax.Array, x: jax.Array, context: LawContext, state: Any
@@ -294,158 +285,8 @@ class BarrierBackstepping:
         """e_r, (n,), where u jumps at e_r = 0; None for a last barrier without a jump."""
         if not ratio_jumps(self.barriers[-1]):
             return None
-        command, _ = self.command(t, x, jnp.zeros_like(x), context, state)
-        if self.order == 2:
-            return x[-1] - command.alpha
-        return x[-1] - command.alpha_higher[-1]
-
-    def _exact_levels(
-        self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext
-    ) -> tuple[list[Level], list[Tube]]:
-        """All levels and their tubes, with the derivatives along the flow of the model."""
-        plant, order = plants.as_plant(context.model), self.order
-        states = _curve_of_state(plant, t, x, d_hat)
-        times = _curve_of_time(t, order + 1)
-        centre = taylor.along(context.reference.position, times)
-        levels: list[Level] = []
-        tubes: list[Tube] = []
-        slope: list[Any] = [None] * order
-        for i in range(order):
-            terms = order - i  # Taylor coefficients of alpha_i
-            sides = _curve_of_bounds(context, i + 1, times[: terms + 1], centre[: terms + 1])
-            tube_curve = _curve_of_tube(centre, *sides, terms)
-
-            def level(t, x, tube, slope, i=i):
-                return self._level(i, plant, t, x, Below(tube, slope), d_hat)
-
-            curve = [(times[m][0], states[m], tube_curve[m], slope[m]) for m in range(terms)]
-            found = taylor.along(level, curve)
-            levels.append(found[0])
-            tubes.append(tube_curve[0])
-            centre = [x.alpha for x in found]
-            slope = [x.slope for x in found]
-        return levels, tubes
-
-    def _level(
-        self, i: int, plant: Plant, t: jax.Array, x: jax.Array, below: Below, d_hat: jax.Array
-    ) -> Level:
-        """Alpha and the weighted slope of level i + 1."""
-        barrier, tube, at = self.barriers[i], below.tube, x[i]
-        w = self.weights[i]
-        margin = None if self.o is None else self.o[i]
-        s = barrier.slope(tube, at)
-        rate = barrier.virtual_velocity(tube, at, self.k[i], margin) - self.c[i] * s
-        if below.slope is not None:
-            ratio: Any = barrier.error_over_slope(tube, at)
-            rate = rate - ratio / w * plants.transposed_gain(plant, i, t, x, below.slope)
-        rates, torque = _split(d_hat)
-        if rates is not None:
-            rate = rate - rates[i]
-        return Level(plants.level_input(plant, i + 1, t, x, rate, torque), w * s)
-
-    def _surface_levels(
-        self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext, state: jax.Array
-    ) -> list[Level]:
-        """All levels of a dynamic surface with the filters' states."""
-        plant = plants.as_plant(context.model)
-        levels: list[Level] = []
-        slope = None
-        for i in range(self.order):
-            tube = self._surface_tube(i, t, context, state, levels)
-            levels.append(self._level(i, plant, t, x, Below(tube, slope), d_hat))
-            slope = levels[-1].slope
-        return levels
-
-    def _surface_tube(
-        self, i: int, t: jax.Array, context: LawContext, state: jax.Array, levels: list[Level]
-    ) -> Tube:
-        """The tube of level i + 1 of a dynamic surface."""
-        if i == 0:
-            return context.tube(t, acceleration=False)
-        centre, alpha = state[i - 1], levels[i - 1].alpha
-        rate = (alpha - centre) / self.filter[i - 1]
-        times = _curve_of_time(t, 2)
-        lower, upper = _curve_of_bounds(context, i + 1, times, [centre, rate])
-        return Tube(centre, rate, lower[0], upper[0], lower[1], upper[1])
-
-
-# --- curves in time -----------------------------------------------------------------------------
-
-
-def _curve_of_time(t: jax.Array, count: int) -> list[tuple[jax.Array]]:
-    """`count` Taylor coefficients of the time itself."""
-    one, zero = jnp.ones_like(t), jnp.zeros_like(t)
-    return [(t,), (one,), *[(zero,)] * (count - 2)][:count]
-
-
-def _curve_of_state(plant: Plant, t: jax.Array, x: jax.Array, d_hat: jax.Array) -> list[jax.Array]:
-    """The Taylor coefficients of the state along the flow of the model, r of them, (r, n) each.
-
-    Level j, counted from 1, is known up to the order r - j, because the input is not known yet.
-    Entries beyond that are 0 and are not used.
-    """
-    rates, torque = _split(d_hat)
-    order = plant.order
-    zero = jnp.zeros_like(x[0])
-
-    def flow(t, x):
-        rows = []
-        for level in range(1, order):
-            rate = plants.level_rate(plant, level, t, x, x[level], torque)
-            rows.append(rate if rates is None else rate + rates[level - 1])
-        return jnp.stack(rows)
-
-    curve = [x]
-    for m in range(1, order):
-        times = _curve_of_time(t, m)
-        latest = taylor.along(flow, [(times[j][0], curve[j]) for j in range(m)])[-1]
-        known = [latest[j] * (1.0 / m) for j in range(order - m)]
-        curve.append(jnp.stack([*known, *[zero] * m]))
-    return curve
-
-
-def _curve_of_bounds(
-    context: LawContext, level: int, times: list, centre: list[jax.Array]
-) -> tuple[list[jax.Array], list[jax.Array]]:
-    """The Taylor coefficients of the bounds of a level, as many as those of its centre.
-
-    A level without bounds has a tube of constant width, which no `Quadratic` uses.
-    """
-    bounds = context.level_bounds(level)
-    if bounds is None:
-        return (
-            [centre[0] - 1.0, *centre[1:]],
-            [centre[0] + 1.0, *centre[1:]],
-        )
-    at: list[Any] = centre
-    if level == 2 and not plants.is_chain(context.model):
-        # Bounds on the velocities of a robot follow q_d'.
-        with_next = [*times, (jnp.zeros_like(times[0][0]),)]
-        at = taylor.derivative(taylor.along(context.reference.position, with_next))
-
-    def sides(t, x):
-        return bounds.lower.at(t, x), bounds.upper.at(t, x)
-
-    found = taylor.along(sides, [(t[0], x) for t, x in zip(times, at, strict=True)])
-    return [x[0] for x in found], [x[1] for x in found]
-
-
-def _curve_of_tube(
-    centre: list[jax.Array], lower: list[jax.Array], upper: list[jax.Array], terms: int
-) -> list[Tube]:
-    """The Taylor coefficients of a tube and of its rates, `terms` of them."""
-    rates = [taylor.derivative(curve[: terms + 1]) for curve in (centre, lower, upper)]
-    return [
-        Tube(centre[m], rates[0][m], lower[m], upper[m], rates[1][m], rates[2][m])
-        for m in range(terms)
-    ]
-
-
-def _split(d_hat: jax.Array) -> tuple[jax.Array | None, jax.Array | float]:
-    """An estimate as the rates that it adds to the levels, (r, n), and as a torque on the robot,
-    (n,) [N m]; the other is None, or 0.0.
-    """
-    return (d_hat, 0.0) if d_hat.ndim == 2 else (None, d_hat)
+        _, tubes = self._levels(t, x, jnp.zeros_like(x), context, state)
+        return x[-1] - tubes[-1].q_d
 
 
 # --- checks ---------------------------------------------------------------------------------------

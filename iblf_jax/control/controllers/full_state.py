@@ -49,7 +49,7 @@ jump of its integrand.  Limits:
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -61,7 +61,8 @@ from iblf_jax.control.barriers._base import (
     ratio_jumps,
     value_unit,
 )
-from iblf_jax.control.controllers._base import Command, LawContext, no_state, rigid_body_torque
+from iblf_jax.control.controllers._base import Command, LawContext, no_state
+from iblf_jax.control.controllers._levels import Design, exact_levels
 from iblf_jax.control.controllers.backstepping import (
     alpha_and_rate,
     check_barrier,
@@ -181,18 +182,19 @@ class FullState:
         state: tuple[()],
     ) -> tuple[Command, tuple[()]]:
         """The torque and what belongs to it; V1 is V1 + phi."""
-        outer, inner = self.tubes(t, q, dq, context)
         first, second = self.barrier, self.velocity_barrier
-        a2 = second.virtual_velocity(inner, dq, self.K2, self.o)
-        ratio: Any = second.error_over_slope(inner, dq)
-        crossed = self.weight * first.slope(outer, q) * ratio
-        acceleration = a2 - crossed - self.c * second.slope(inner, dq)
-        tau = rigid_body_torque(context.model, q, dq, dq, acceleration) - f_hat
+        designs = [
+            Design(first, self.k1, self.o, None, self.weight),
+            Design(second, self.K2, self.o, self.c, None),
+        ]
+        levels, tubes = exact_levels(designs, t, jnp.stack([q, dq]), f_hat, context)
+        outer, inner = tubes
         guard_active = guard_is_active(outer, q, first.guard) | guard_is_active(
             inner, dq, second.guard
         )
         value = self.weight * first.value(outer, q) + second.value(inner, dq)
-        return Command(tau, inner.q_d, value, guard_active, jnp.zeros_like(guard_active)), ()
+        saturated = jnp.zeros_like(guard_active)
+        return Command(levels[1].alpha, inner.q_d, value, guard_active, saturated), ()
 
 
 def _ratio_of(barrier: Barrier) -> jax.Array | None:

@@ -12,7 +12,6 @@ from iblf_jax.world.plants._base import order_of as order_of
 from iblf_jax.world.plants._base import plant_member as plant_member
 from iblf_jax.world.plants._base import robot_of as robot_of
 from iblf_jax.world.plants._base import speed_limit as speed_limit
-from iblf_jax.world.plants._base import state_along as state_along
 from iblf_jax.world.plants._base import torque_as_rates as torque_as_rates
 from iblf_jax.world.plants._base import transposed_gain as transposed_gain
 from iblf_jax.world.plants._base import units_of as units_of
@@ -50,7 +49,6 @@ __all__ = [
     "order_of",
     "plant_member",
     "robot_of",
-    "state_along",
     "torque_as_rates",
     "transposed_gain",
     "units_of",

@@ -11,12 +11,14 @@ Functions of this module take the number of a level, which counts from 1.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
+from jax.extend import core as jax_core
 
-from iblf_jax.core import checks, taylor
+from iblf_jax.core import checks
 from iblf_jax.core.linalg import matvec, solve_gain, solve_spd
 from iblf_jax.core.optional import OptionalMembers, has_members
 from iblf_jax.core.status import VELOCITY_LIMIT
@@ -129,8 +131,8 @@ def level_rate(
     own = plant_member(plant, "level_rate")
     if own is not None:
         return own(level, t, x, above, torque)  # type: ignore[no-any-return]
-    gain = plant.gain(t, x)[level - 1]
-    return plant.drift(t, x)[level - 1] + _times(gain, above)
+    gain = _row(plant.gain, t, x, level)
+    return _row(plant.drift, t, x, level) + _times(gain, above)
 
 
 def level_input(
@@ -147,8 +149,8 @@ def level_input(
     own = plant_member(plant, "level_input")
     if own is not None:
         return own(level, t, x, rate, torque)  # type: ignore[no-any-return]
-    gain = plant.gain(t, x)[level - 1]
-    rest = rate - plant.drift(t, x)[level - 1]
+    gain = _row(plant.gain, t, x, level)
+    rest = rate - _row(plant.drift, t, x, level)
     if gain.ndim == 2:
         return solve_gain(gain, rest)
     return rest / jnp.where(gain == 0.0, jnp.nan, gain)
@@ -161,8 +163,28 @@ def transposed_gain(
     own = plant_member(plant, "transposed_gain")
     if own is not None:
         return own(level, t, x, s)  # type: ignore[no-any-return]
-    gain = plant.gain(t, x)[level - 1]
-    return _times(gain.T, s)
+    return _times(_row(plant.gain, t, x, level).T, s)
+
+
+def _row(
+    function: Callable[[jax.Array, jax.Array], jax.Array], t: jax.Array, x: jax.Array, level: int
+) -> jax.Array:
+    """One row of drift or gain, without the computation of the others.
+
+    Most plants stack their rows.  The row is then taken before it is stacked, which keeps the
+    program small, and keeps XLA's compiler from simplifying functions whose inputs become unused,
+    at which it aborts (`engine.machine_function`).
+    """
+    traced = jax.make_jaxpr(function)(t, x)
+    jaxpr = traced.jaxpr
+    if not jaxpr.eqns or jaxpr.eqns[-1].outvars != jaxpr.outvars:
+        return function(t, x)[level - 1]
+    last = jaxpr.eqns[-1]
+    if last.primitive.name != "stack" or last.params["axis"] != 0:
+        return function(t, x)[level - 1]
+    one_row = jaxpr.replace(eqns=jaxpr.eqns[:-1], outvars=[last.invars[level - 1]])
+    (row,) = jax_core.jaxpr_as_fun(traced.replace(jaxpr=one_row))(t, x)
+    return row
 
 
 def _times(gain: jax.Array, v: jax.Array) -> jax.Array:
@@ -182,38 +204,6 @@ def flow(
     return jnp.stack(
         [level_rate(plant, i + 1, t, x, above, torque) for i, above in enumerate(inputs)]
     )
-
-
-def state_along(plant: Plant, position: Any, t: jax.Array) -> jax.Array:
-    """The state with which a plant without disturbances follows x_1 = position(t), (order, n):
-
-        x_{i+1} = G_i^-1 (x_i' - f_i),
-
-    with the derivatives in time by Taylor coefficients.
-
-    Args:
-      plant: any.
-      position: function t -> x_1, (n,), with order - 1 derivatives.
-      t: time, () [s].
-    """
-    order = plant.order
-    one, zero = jnp.ones_like(t), jnp.zeros_like(t)
-    times = [t, one, *[zero] * (order - 2)]
-    curves = [taylor.along(position, [(x,) for x in times])]
-    for level in range(1, order):
-        terms = order - level
-        rates = taylor.derivative(curves[-1][: terms + 1])
-        unknown = [jnp.zeros_like(rates[0])] * terms
-
-        def above(t, x, rate, level=level):
-            return level_input(plant, level, t, x, rate)
-
-        along = [
-            (times[m], jnp.stack([*[curve[m] for curve in curves], *unknown]), rates[m])
-            for m in range(terms)
-        ]
-        curves.append(taylor.along(above, along))
-    return jnp.stack([curve[0] for curve in curves])
 
 
 def torque_as_rates(plant: Plant, x: jax.Array, torque: jax.Array) -> jax.Array:

@@ -1,0 +1,253 @@
+"""The equations of barrier backstepping, level by level, for a plant in strict-feedback form.
+
+`exact_levels` computes (S.2) with the derivatives of the virtual controls along the flow of the
+model, and `surface_levels` with filters in their place; `barrier_backstepping` has the equations.
+
+All derivatives are along one trajectory (`core.taylor`): those of x_j of the orders up to r - j,
+those of the reference and of the bounds, and then, level by level, those of alpha_i and of w_i s_i
+of the orders up to r - i.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from iblf_jax.control.barriers import Barrier
+from iblf_jax.control.controllers._base import LawContext
+from iblf_jax.core import taylor
+from iblf_jax.world import plants
+from iblf_jax.world.bounds import Tube, bounds_at
+from iblf_jax.world.plants import Plant
+
+
+class Design(NamedTuple):
+    """The numbers of one level of the law."""
+
+    barrier: Barrier
+    k: jax.Array
+    """Gain, (n,) [1/s]."""
+    o: jax.Array | None = None
+    """Margin under the root of kappa, (n,) [1/s^2]; None for barriers without it."""
+    c: jax.Array | None = None
+    """Gain of the slope, (n,); None for 0."""
+    weight: jax.Array | None = None
+    """w_i, (n,); None for 1."""
+
+
+class Level(NamedTuple):
+    """What a level computes."""
+
+    alpha: jax.Array
+    """alpha_i, the level above as this level needs it, (n,); u for the last level."""
+    slope: jax.Array
+    """w_i s_i, (n,)."""
+
+
+def exact_levels(
+    designs: Sequence[Design],
+    t: jax.Array,
+    x: jax.Array,
+    d_hat: jax.Array,
+    context: LawContext,
+) -> tuple[list[Level], list[Tube]]:
+    """All levels of (S.2) and their tubes, with the derivatives along the flow of the model.
+
+    Args:
+      designs: one for each level.
+      t: time, () [s].
+      x: state, (r, n).
+      d_hat: estimate of what disturbances add to x', (r, n), or of the torque on the robot inside
+        the plant, (n,) [N m].
+      context: model, reference and bounds.
+    """
+    plant, order = plants.as_plant(context.model), len(designs)
+    states = _curve_of_state(plant, t, x, d_hat)
+    times = _curve_of_time(t, order + 1)
+    centre = taylor.in_time(context.reference.position, t, order)
+    levels: list[Level] = []
+    tubes: list[Tube] = []
+    slope: list[Any] = [None] * order
+    for i, design in enumerate(designs):
+        terms = order - i  # alpha_i and its derivatives
+        sides = _curve_of_bounds(context, i + 1, times[: terms + 1], centre[: terms + 1])
+        tube_curve = _curve_of_tube(centre, *sides, terms)
+
+        def level(t, x, tube, slope, i=i, design=design):
+            return _level(design, i, plant, t, x, tube, slope, d_hat)
+
+        curve = [(times[m][0], states[m], tube_curve[m], slope[m]) for m in range(terms)]
+        found = taylor.along(level, curve)
+        levels.append(found[0])
+        tubes.append(tube_curve[0])
+        centre = [x.alpha for x in found]
+        slope = [x.slope for x in found]
+    return levels, tubes
+
+
+def surface_levels(
+    designs: Sequence[Design],
+    filters: jax.Array,
+    t: jax.Array,
+    x: jax.Array,
+    d_hat: jax.Array,
+    context: LawContext,
+    state: jax.Array,
+) -> tuple[list[Level], list[Tube]]:
+    """All levels of a dynamic surface and their tubes; arguments as `exact_levels`.
+
+    Args:
+      filters: mu_i, (r - 1, n) [s].
+      state: beta_i, (r - 1, n).
+    """
+    plant = plants.as_plant(context.model)
+    levels: list[Level] = []
+    tubes = [context.tube(t, acceleration=False)]
+    slope = None
+    for i, design in enumerate(designs):
+        levels.append(_level(design, i, plant, t, x, tubes[i], slope, d_hat))
+        slope = levels[i].slope
+        if i < len(designs) - 1:
+            rate = (levels[i].alpha - state[i]) / filters[i]
+            tubes.append(_filtered_tube(context, i + 2, t, state[i], rate))
+    return levels, tubes
+
+
+def _filtered_tube(
+    context: LawContext, level: int, t: jax.Array, centre: jax.Array, rate: jax.Array
+) -> Tube:
+    """The tube of a level around the output of a filter and its rate."""
+    lower, upper = _curve_of_bounds(context, level, _curve_of_time(t, 2), [centre, rate])
+    return Tube(centre, rate, lower[0], upper[0], lower[1], upper[1])
+
+
+def _level(
+    design: Design,
+    i: int,
+    plant: Plant,
+    t: jax.Array,
+    x: jax.Array,
+    tube: Tube,
+    below: Any,
+    d_hat: jax.Array,
+) -> Level:
+    """The virtual control alpha and the weighted slope of level i + 1 of (S.2).
+
+    Args:
+      design: of the level.
+      i: its row in x.
+      plant: the model.
+      t, x, d_hat: as `exact_levels`.
+      tube: of x_i around alpha_{i-1}; its positions are in the unit of the level.
+      below: w_{i-1} s_{i-1}, (n,); None for the first level.
+    """
+    barrier, at = design.barrier, x[i]
+    s = barrier.slope(tube, at)
+    rate = barrier.virtual_velocity(tube, at, design.k, design.o)
+    if below is not None:
+        ratio: Any = barrier.error_over_slope(tube, at)
+        exchanged = plants.transposed_gain(plant, i, t, x, below) * ratio
+        rate = rate - (exchanged if design.weight is None else exchanged / design.weight)
+    if design.c is not None:
+        rate = rate - design.c * s
+    rates, torque = _split(d_hat)
+    if rates is not None:
+        rate = rate - rates[i]
+    alpha = plants.level_input(plant, i + 1, t, x, rate, torque)
+    return Level(alpha, s if design.weight is None else design.weight * s)
+
+
+# --- curves in time -----------------------------------------------------------------------------
+
+
+def _curve_of_time(t: jax.Array, count: int) -> list[tuple[jax.Array]]:
+    """The time itself and its derivatives, `count` of them."""
+    one, zero = jnp.ones_like(t), jnp.zeros_like(t)
+    return [(t,), (one,), *[(zero,)] * (count - 2)][:count]
+
+
+def _curve_of_state(plant: Plant, t: jax.Array, x: jax.Array, d_hat: jax.Array) -> list[jax.Array]:
+    """The state and its derivatives along the flow of the model, r of them, (r, n) each.
+
+    Level j, counted from 1, is known up to the order r - j, because the input is not known yet.
+    Entries beyond that are 0 and are not used.
+    """
+    rates, torque = _split(d_hat)
+    order = plant.order
+    zero = jnp.zeros_like(x[0])
+
+    def flow(t, x):
+        rows = []
+        for level in range(1, order):
+            rate = plants.level_rate(plant, level, t, x, x[level], torque)
+            rows.append(rate if rates is None else rate + rates[level - 1])
+        return jnp.stack(rows)
+
+    curve = [x]
+    for m in range(1, order):
+        times = _curve_of_time(t, m)
+        latest = taylor.along(flow, [(times[j][0], curve[j]) for j in range(m)])[-1]
+        known = [latest[j] for j in range(order - m)]
+        curve.append(jnp.stack([*known, *[zero] * m]))
+    return curve
+
+
+def _curve_of_bounds(
+    context: LawContext, level: int, times: list, centre: list[jax.Array]
+) -> tuple[list[jax.Array], list[jax.Array]]:
+    """The bounds of a level and their derivatives, as many as those of its centre.
+
+    A level without bounds has a tube of constant width, which no `Quadratic` uses.
+    """
+    bounds = context.level_bounds(level)
+    if bounds is None:
+        return (
+            [centre[0] - 1.0, *centre[1:]],
+            [centre[0] + 1.0, *centre[1:]],
+        )
+    follows = _followed(context, level)
+    if follows is not None:
+
+        def sides_in_time(t):
+            return bounds_at(bounds, t, follows(t))
+
+        found = taylor.in_time(sides_in_time, times[0][0], len(times) - 1)
+    else:
+
+        def sides(t, x):
+            return bounds_at(bounds, t, x)
+
+        found = taylor.along(sides, [(t[0], x) for t, x in zip(times, centre, strict=True)])
+    return [x[0] for x in found], [x[1] for x in found]
+
+
+def _followed(context: LawContext, level: int) -> Callable | None:
+    """The function of time that the bounds of a level may follow, such as a funnel does: x_d, or
+    x_d' for the velocities of a robot; None for the virtual control below the level.
+    """
+    position = context.reference.position
+    if level == 1:
+        return position
+    if level == 2 and not plants.is_chain(context.model):
+        return lambda t: jax.jvp(position, (t,), (jnp.ones_like(t),))[1]
+    return None
+
+
+def _curve_of_tube(
+    centre: list[jax.Array], lower: list[jax.Array], upper: list[jax.Array], terms: int
+) -> list[Tube]:
+    """A tube with its rates, and its derivatives, `terms` of them."""
+    return [
+        Tube(centre[m], centre[m + 1], lower[m], upper[m], lower[m + 1], upper[m + 1])
+        for m in range(terms)
+    ]
+
+
+def _split(d_hat: jax.Array) -> tuple[jax.Array | None, jax.Array | float]:
+    """An estimate as the rates that it adds to the levels, (r, n), and as a torque on the robot,
+    (n,) [N m]; the other is None, or 0.0.
+    """
+    return (d_hat, 0.0) if d_hat.ndim == 2 else (None, d_hat)

@@ -1,0 +1,225 @@
+"""`BarrierBackstepping` against the independent program, and against `FullState`."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import chain_cases
+import independent_chains as other
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import iblf_jax as ij
+from iblf_jax import barriers, bounds, controllers, plants, references
+
+DATA = np.load(other.FILE)
+
+
+@partial(jax.jit, static_argnames="filtered")
+def commanded(scenario, t, x, d_hat, beta, filtered):
+    """The law's command at one state."""
+    state = beta if filtered else ()
+    return scenario.controller.command(t, x, d_hat, scenario.context, state)[0]
+
+
+@pytest.mark.parametrize("name", other.CASES)
+def test_input_and_virtual_controls_at_random_states(name):
+    scenario, case = chain_cases.scenario(name), other.CASES[name]
+    points = {key: DATA[f"{name}.points.{key}"] for key in ("t", "x", "d_hat", "alpha", "u", "V")}
+    filtered = case.filter is not None
+    betas = DATA[f"{name}.points.beta"] if filtered else np.zeros((len(points["t"]), 0))
+    for i, beta in enumerate(betas):
+        found = commanded(
+            scenario, points["t"][i], points["x"][i], points["d_hat"][i], beta, filtered
+        )
+        np.testing.assert_allclose(found.tau, points["u"][i], rtol=1e-10)
+        np.testing.assert_allclose(jnp.sum(found.V1), points["V"][i], rtol=1e-11)
+        if not filtered:
+            alphas = [found.alpha, *found.alpha_higher]
+            np.testing.assert_allclose(alphas, points["alpha"][i][:-1], rtol=1e-10, atol=1e-12)
+
+
+def test_a_torque_estimate_is_held_and_not_the_acceleration_that_it_causes():
+    """The estimate of a robot's observer is f_hat; d_hat_2 = M^-1(q) f_hat moves with q."""
+    scenario = chain_cases.scenario("flexible")
+    plant, t = scenario.plant, jnp.asarray(0.4)
+    x = jnp.asarray(DATA["flexible.points.x"][0])
+    f_hat = jnp.asarray([0.7, -0.4])
+
+    @ij.component
+    class WithTorque:
+        """The same plant, with the estimate as a part of its drift."""
+
+        inner: plants.FlexibleJoint
+        f_hat: ij.Leaf = ij.leaf("N m")
+        n, order = 2, 4
+
+        def drift(self, t, x):
+            added = plants.torque_as_rates(self.inner, x, self.f_hat)
+            return self.inner.drift(t, x) + added
+
+        def gain(self, t, x):
+            return self.inner.gain(t, x)
+
+    law = scenario.controller
+    expected, _ = law.command(
+        t, x, jnp.zeros((4, 2)), scenario.context._replace(model=WithTorque(plant, f_hat)), ()
+    )
+    found, _ = law.command(t, x, f_hat, scenario.context, ())
+    np.testing.assert_allclose(found.tau, expected.tau, rtol=1e-9)
+
+
+PAIRS = {
+    "integral": (barriers.Integral(), barriers.Integral()),
+    "mapping and prescribed performance": (barriers.Mapping(), barriers.PrescribedPerformance()),
+    "log and mapping": (barriers.Log(), barriers.Mapping()),
+    "tan": (barriers.Tan(), barriers.Tan()),
+}
+
+
+@pytest.mark.parametrize("pair", PAIRS)
+def test_order_two_is_full_state(pair):
+    preset = ij.presets.zhang_yan_2024_full_state()
+    first, second = PAIRS[pair]
+    o = 0.1 if pair in ("integral", "log and mapping") else None
+    full = controllers.FullState(
+        k1=[2.0, 3.0], K2=20.0, c=0.7, o=o, barrier=first, velocity_barrier=second, weight=1.3
+    )
+    chain = controllers.BarrierBackstepping(
+        k=(full.k1, full.K2), barriers=(first, second), c=(0.0, 0.7), weights=(1.3, 1.0), o=o
+    )
+    found = ij.simulate(ij.with_parts(preset, controller=chain), duration=0.5, dt=1e-3)
+    expected = ij.simulate(ij.with_parts(preset, controller=full), duration=0.5, dt=1e-3)
+    np.testing.assert_allclose(found.q, expected.q, atol=1e-12)
+    np.testing.assert_allclose(found.tau, expected.tau, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(found.V, expected.V, rtol=1e-9, atol=1e-12)
+
+
+def flexible(**parts):
+    return chain_cases.scenario("flexible", **parts)
+
+
+def law(**fields):
+    given = {"k": (3.0, 20.0, 60.0), "barriers": (barriers.Mapping(),)}
+    return controllers.BarrierBackstepping(**(given | fields))
+
+
+def third_order(**parts):
+    """The pendulum with its motor, with constant bounds."""
+    constant = ij.Bounds(lower=bounds.Constant(-20.0), upper=bounds.Constant(20.0))
+    given = {
+        "plant": chain_cases.pendulum(),
+        "reference": references.Sinusoid(offset=0.1, amplitude=0.5),
+        "bounds": ij.Bounds(lower=bounds.Constant(-1.0), upper=bounds.Constant(1.0)),
+        "state_bounds": (constant, constant),
+        "controller": law(),
+        "initial": ij.Initial(x=[[0.0], [0.0], [0.0]]),
+    }
+    return ij.Scenario(**(given | parts))
+
+
+MAPPING = barriers.Mapping()
+REFUSED = {
+    "a kink of the slope on the first level": (
+        {"controller": law(barriers=(barriers.Integral(), MAPPING, MAPPING))},
+        r"barriers\[0\].*Integral.*Log\(p=2\)",
+    ),
+    "a ratio that jumps on a level in the middle": (
+        {"controller": law(barriers=(MAPPING, barriers.Integral(), MAPPING))},
+        r"barriers\[1\].*Integral.*Mapping\(\)",
+    ),
+    "a barrier without a ratio": (
+        {"controller": law(barriers=(MAPPING, MAPPING, barriers.Log(p=2)))},
+        r"barriers\[2\].*error_over_slope",
+    ),
+    "a barrier on a level without bounds": (
+        {"controller": law(barriers=(MAPPING,) * 3), "state_bounds": ()},
+        r"state_bounds\[0\]",
+    ),
+    "a reference with two continuous derivatives": (
+        {"reference": references.Quintic(start=0.0, end=0.5, duration=2.0)},
+        "reference.*Quintic.*2.*Sinusoid",
+    ),
+    "gains of another order": ({"controller": law(k=(3.0, 20.0))}, "controller.k.*3 levels"),
+    "a start outside the bounds of a level": (
+        {"initial": ij.Initial(x=[[0.0], [0.0], [25.0]])},
+        r"initial.x\[2\]\[0\].*level 3",
+    ),
+    "a start without the third level": (
+        {"initial": ij.Initial(q=0.0)},
+        r"Initial\(x=\.\.\.\)",
+    ),
+    "a law of robots": (
+        {"controller": controllers.Backstepping(k1=1.0, K2=1.0)},
+        "BarrierBackstepping",
+    ),
+    "an observer of robots": (
+        {"observer": ij.observers.Momentum(kf=10.0)},
+        "Scenario.observer.*LevelObserver",
+    ),
+    "a singular gain": (
+        {"plant": plants.StrictFeedback(lambda t, x: 0.0 * x, lambda t, x: x, n=1, order=3)},
+        r"gain\(t, x\)\[0\].*invertible",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_refused_with_a_remedy(what):
+    parts, message = REFUSED[what]
+    with pytest.raises(ValueError, match=message):
+        ij.simulate(third_order(**parts), duration=0.01, dt=1e-3)
+
+
+ALLOWED = {
+    "log with a sufficient exponent": law(barriers=(barriers.Log(p=2), MAPPING, MAPPING)),
+    "a jump on the last level": law(barriers=(MAPPING, MAPPING, barriers.Integral())),
+    "a dynamic surface": law(barriers=(barriers.Integral(), MAPPING, MAPPING), filter=0.01),
+}
+
+
+@pytest.mark.parametrize("what", ALLOWED)
+def test_allowed(what):
+    run = ij.simulate(third_order(controller=ALLOWED[what]), duration=0.3, dt=1e-3)
+    assert run.ok, run
+
+
+def test_a_symmetric_tube_needs_no_smooth_barrier():
+    """Integral has no kink where both sides are at the same distance."""
+    tube = ij.Bounds(lower=bounds.Funnel(-0.6, -0.6, 0.0), upper=bounds.Funnel(0.6, 0.6, 0.0))
+    wide = ij.Bounds(lower=bounds.Funnel(-60.0, -60.0, 0.0), upper=bounds.Funnel(60.0, 60.0, 0.0))
+    narrow = ij.Bounds(lower=bounds.Funnel(-5.0, -5.0, 0.0), upper=bounds.Funnel(5.0, 5.0, 0.0))
+    integral = barriers.Integral()
+    scenario = third_order(
+        bounds=tube,
+        state_bounds=(narrow, wide),
+        controller=law(barriers=(integral, integral, integral), weights=(1.0, 10.0, 1000.0)),
+    )
+    run = ij.simulate(scenario, duration=0.5, dt=1e-3)
+    assert run.ok, run
+
+
+def test_a_gain_that_becomes_singular_is_flagged():
+    """The gain of the last level, cos(t), is zero at t = pi/2."""
+
+    def gain(t, x):
+        one = jnp.ones_like(x[0])
+        return jnp.stack([one, one, jnp.where(t < 0.2, 1.0, 0.0) * one])
+
+    plant = plants.StrictFeedback(lambda t, x: jnp.zeros_like(x), gain, n=1, order=3)
+    with pytest.warns(ij.SimulationWarning):
+        run = ij.simulate(third_order(plant=plant), duration=0.4, dt=1e-3)
+    assert int(run.status) & ij.Status.SINGULAR_GAIN
+
+
+def test_a_virtual_control_outside_the_bounds_of_its_level_is_flagged():
+    narrow = ij.Bounds(lower=bounds.Constant(-0.3), upper=bounds.Constant(0.3))
+    wide = ij.Bounds(lower=bounds.Constant(-50.0), upper=bounds.Constant(50.0))
+    scenario = third_order(
+        state_bounds=(narrow, wide), controller=law(barriers=(MAPPING, MAPPING, MAPPING))
+    )
+    with pytest.warns(ij.SimulationWarning):
+        run = ij.simulate(scenario, duration=1.0, dt=1e-3)
+    assert int(run.status) & ij.Status.ALPHA_INFEASIBLE
