@@ -32,7 +32,7 @@ def flexible_joint(**parts) -> ij.Scenario:
 
 def rigid_law(**parts) -> ij.Scenario:
     """A law for rigid arms on stiff joints with damped motors; its model is the robot inside."""
-    plant = ij.plants.FlexibleJoint(ROBOT, stiffness=3e3, motor_inertia=0.02, motor_damping=1.0)
+    plant = ij.plants.FlexibleJoint(ROBOT, stiffness=3e3, motor_inertia=0.02, motor_damping=3.0)
     law = controllers.Backstepping(k1=3.0, K2=1.0, barrier=barriers.Mapping())
     return flexible_joint(**({"plant": plant, "model": plant.robot, "controller": law} | parts))
 
