@@ -136,3 +136,8 @@ def test_units_of_inputs_and_outputs():
     assert per_time("N m/rad", 2) == "N m/(rad s^2)"
     assert one_unit(("m", "m", "rad")) == "1"
     assert one_unit(("m", "m")) == "m"
+
+
+def test_mujoco_refuses_what_is_no_robot():
+    with pytest.raises(ValueError, match=r"scenario\.plant: got 'FlexibleJoint'.*plant\.robot"):
+        ij.cosimulate(plant_cases.flexible_joint(), "arm.xml", period=PERIOD, duration=0.1)
