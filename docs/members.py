@@ -43,6 +43,12 @@ FAMILIES = (
     ("Disturbances", disturbances, "`iblf_jax.disturbances`", ()),
     ("Sensors", sensors, "`iblf_jax.sensors`", ()),
     (
+        "Sensors of one level",
+        SimpleNamespace(MEMBERS=sensors.LEVELS),
+        "`iblf_jax.sensors`, parts of `Levels`",
+        (),
+    ),
+    (
         "Velocities of an encoder",
         SimpleNamespace(MEMBERS=sensors.VELOCITIES),
         "`iblf_jax.sensors`",

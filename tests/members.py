@@ -15,6 +15,7 @@ from iblf_jax import (
     controllers,
     disturbances,
     observers,
+    plants,
     references,
     regions,
     robots,
@@ -43,6 +44,7 @@ ROBOTS = {
         payload=0.3,
     ),
     "arm": random_arm(3, seed=1, armature=0.1, payload=0.4),
+    "with_motors": robots.WithMotors(TWO_LINK, inertia=[0.02, 0.01], damping=0.1),
 }
 
 REFERENCES = {
@@ -108,6 +110,16 @@ OBSERVERS = {
     "extended_state_two_gains": observers.ExtendedState(l1=80.0, l2=[1600.0, 900.0]),
 }
 
+LEVEL_OBSERVERS = {
+    "level": observers.LevelObserver(gain=(0.0, [20.0, 10.0], 30.0), eta0=(0.0, 0.1, 0.2)),
+    "level_zero": observers.LevelObserver(gain=20.0, start="zero"),
+    "state_observer": observers.StateObserver(bandwidth=[40.0, 30.0], offset=(0.0, 0.1, 0.2, 0.0)),
+    "state_observer_two_encoders": observers.StateObserver(
+        bandwidth=40.0, measured=(1, 3), disturbance=False
+    ),
+}
+"""Observers of plants in strict-feedback form, some of more levels than a robot has."""
+
 VELOCITIES = {
     "measured": sensors.Measured(noise=[0.01, 0.02]),
     "filtered_difference": sensors.FilteredDifference(cutoff=[200.0, 300.0]),
@@ -121,6 +133,14 @@ SENSORS = {
         f"encoder_{name}": sensors.Encoder(counts=4096, offset=[0.1, 0.0], noise=1e-4, velocity=v)
         for name, v in VELOCITIES.items()
     },
+}
+
+SENSORS |= {
+    "levels": sensors.Levels((SENSORS["encoder_tracking"], sensors.Direct(noise=[0.1, 0.2]))),
+    "levels_encoders": sensors.Levels(
+        (SENSORS["encoder_filtered_difference"], SENSORS["encoder_measured"])
+    ),
+    "levels_unmeasured": sensors.Levels((sensors.Direct(resolution=1e-3, offset=0.1), None)),
 }
 
 ACTUATORS = {
@@ -193,6 +213,16 @@ LAWS = {
     ),
 }
 
+INPUT_MAPS = {
+    "with_drive": controllers.WithDrive(
+        law=controllers.PDGravity(Kp=60.0, Kd=20.0),
+        drive=plants.ElectricDrive(
+            TWO_LINK, torque_constant=[2.0, 1.5], inductance=0.02, resistance=1.0, back_emf=0.5
+        ),
+    ),
+}
+"""Laws that command another input than a torque, for a plant of their own."""
+
 OPTIONAL_FOLDS = (
     metrics.AboveGravity(),
     metrics.VelocityMargin(),
@@ -209,10 +239,10 @@ FAMILIES = {
     "region": (REGIONS, regions.MEMBERS, ij.testing.check_region),
     "disturbance": (DISTURBANCES, disturbances.MEMBERS, ij.testing.check_disturbance),
     "barrier": (BARRIERS, barriers.MEMBERS, ij.testing.check_barrier),
-    "observer": (OBSERVERS, observers.MEMBERS, ij.testing.check_observer),
+    "observer": (OBSERVERS | LEVEL_OBSERVERS, observers.MEMBERS, ij.testing.check_observer),
     "sensor": (SENSORS, sensors.MEMBERS, ij.testing.check_sensor),
     "actuator": (ACTUATORS, actuators.MEMBERS, ij.testing.check_actuator),
-    "law": (LAWS, controllers.MEMBERS, ij.testing.check_law),
+    "law": (LAWS | INPUT_MAPS, controllers.MEMBERS, ij.testing.check_law),
     "fold": (FOLDS, {cls.__name__: cls for cls in metrics.MEMBERS.values()}, ij.testing.check_fold),
 }
 """Family -> (instances by name, the package's registry, the checker)."""

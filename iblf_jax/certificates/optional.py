@@ -19,6 +19,7 @@ optional_member = OptionalMembers(
     guard=-1.0,
     K2=None,
     kf=None,
+    barriers=(),
     # studies
     scenario=None,
     made=True,

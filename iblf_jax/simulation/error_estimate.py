@@ -83,7 +83,7 @@ class Accuracy(NamedTuple):
     drift: jax.Array
     """Accumulated error L of the same 2 n numbers."""
     response: jax.Array
-    """R, (n, m - n)."""
+    """R, (n, m - n); of a sampled loop its columns of the levels from the second on."""
     error: jax.Array
     """Largest position error so far, (n,) [rad]."""
     relative: jax.Array
@@ -125,6 +125,18 @@ def response(jacobian: jax.Array, n: int) -> jax.Array:
     return jnp.where(jnp.isfinite(found), found, 0.0)
 
 
+def _of_levels(response: jax.Array, state: LoopState) -> jax.Array:
+    """The columns of the response of a sampled loop that belong to the plant's levels from the
+    second on, between which the state of the actuator lies.
+    """
+    n = state.dq.size
+    if isinstance(state.higher, tuple):
+        return response[:, :n]
+    first = n + sum(x.size for x in jax.tree.leaves(state.actuator))
+    higher = response[:, first : first + state.higher.size]
+    return jnp.concatenate([response[:, :n], higher], axis=1)
+
+
 def _rate(accuracy: Accuracy, slope: LoopState) -> jax.Array:
     """The rate of the positions and of their final displacement, (2 n,)."""
     n = slope.q.size
@@ -162,19 +174,10 @@ def begin(method: str, jacobian: jax.Array, state: LoopState) -> Accuracy:
     none = jnp.zeros((2 * n,), jacobian.dtype)
     pending = (none,) * steps_back(method)
     if state.sampled:
-        # Only a method of one stage uses an earlier rate; only the plant has a local error.
+        # Only a method of one stage uses an earlier rate; only levels have a local error.
         pending = (none,) if len(tableau(method).c) == 1 else ()
-        R = _columns_of_plant(R, state)
+        R = _of_levels(R, state)
     return Accuracy(pending, none, R, none[:n], none[0])
-
-
-def _columns_of_plant(R: jax.Array, state: LoopState) -> jax.Array:
-    """The columns of R that belong to q' and to the further levels of a sampled loop."""
-    n = state.q.size
-    if isinstance(state.higher, tuple):
-        return R[:, :n]
-    first = n + sum(x.size for x in jax.tree.leaves(state.actuator))
-    return jnp.concatenate([R[:, :n], R[:, first : first + state.higher.size]], axis=1)
 
 
 def update(

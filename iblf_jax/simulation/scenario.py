@@ -43,13 +43,14 @@ from iblf_jax.core.pytree import (
 )
 from iblf_jax.core.time import joined, jump_times_of
 from iblf_jax.simulation.levels import model_state, start_levels
+from iblf_jax.simulation.measurement_noise import noise_advice
 from iblf_jax.simulation.sampling import PERIOD_TOLERANCE, Sampling
 from iblf_jax.world import plants, regions
 from iblf_jax.world.bounds import Bounds, Funnel, Side, bounds_at, speed_limits_at
 from iblf_jax.world.disturbances import Disturbance, Nothing
 from iblf_jax.world.plants import Plant
 from iblf_jax.world.references import Reference
-from iblf_jax.world.robots import Robot
+from iblf_jax.world.robots import Robot, WithMotors
 from iblf_jax.world.robots._base import mass_matrix_at
 
 
@@ -162,8 +163,9 @@ class Scenario:
         may be the model of a plant of higher order, under a law of robots; of an `ElectricDrive`
         the law then needs an input map (`controllers.WithDrive`).
       sampling: timing of law and observer, a `Sampling`; continuous time if not given.
-      sensor: measurement of q and q', any of `iblf_jax.sensors`; `Ideal()` if not given.  Others
-        need a sampling.
+      sensor: measurement of q and q', or of all levels of a plant (`sensors.Levels`), any of
+        `iblf_jax.sensors`; `Ideal()` if not given.  Others need a sampling.  A level that is not
+        measured needs an observer that estimates it, such as `observers.StateObserver`.
       actuator: map from command to torque, any of `iblf_jax.actuators`; `Ideal()` if not given.
       velocity_bounds: constraints on the joint velocities, a `bounds.Bounds` [rad/s] whose funnels
         follow q_d'; none if not given.  Runs record their margins under every law;
@@ -366,7 +368,9 @@ def check_levels(scenario: Scenario) -> None:
         remedy = "Take controllers.BarrierBackstepping"
         remedy += "." if robot is None else ", or model=plant.robot."
         raise checks.fail("Scenario.model", type(model).__name__, expected, remedy)
+    _check_input(scenario)
     _check_observer(scenario)
+    _check_measured_levels(scenario)
     higher = scenario.initial.higher
     if higher is not None and len(higher) != order - 2:
         expected = f"{order} levels, as the plant has"
@@ -377,14 +381,75 @@ def check_levels(scenario: Scenario) -> None:
 
 
 def _check_observer(scenario: Scenario) -> None:
-    """Raises ValueError for an observer of robots with a model that contains no robot."""
+    """Raises ValueError for an observer of robots with a model that contains no robot, or one of
+    levels with a model that does not fit its fields.
+    """
     observer, model = scenario.observer, scenario.model
-    if isinstance(observer, NoObserver) or observer_member(observer, "receives_x"):
+    if isinstance(observer, NoObserver):
+        return
+    if observer_member(observer, "receives_x"):
+        observer_member(observer, "check_model")(plants.as_plant(model))
         return
     if plants.is_chain(model) and plants.plant_member(model, "joint_torque") is None:
         expected = "an observer of plants in strict-feedback form, such as LevelObserver"
         remedy = f"{type(model).__name__} contains no robot."
         raise checks.fail("Scenario.observer", type(observer).__name__, expected, remedy)
+
+
+def _check_input(scenario: Scenario) -> None:
+    """Raises ValueError for a law that commands another quantity than the plant's input: a torque
+    for a voltage, say.
+    """
+    outermost, *wrapped = layers(scenario.controller)
+    for law in wrapped:
+        if law_member(law, "input_unit") is not None:
+            kind = type(law).__name__
+            expected = f"{kind} as the outermost law"
+            remedy = f"Such as {kind}(law={type(outermost).__name__}(...), ...)."
+            raise checks.fail("Scenario.controller", type(outermost).__name__, expected, remedy)
+    needed = plants.units_of(scenario.plant)[-1]
+    given = law_member(outermost, "input_unit") or plants.units_of(scenario.model)[-1]
+    if given == needed or UNKNOWN_UNIT in (given, needed):
+        return
+    kind = type(scenario.plant).__name__
+    expected = f"a law that commands the input of {kind} [{needed}]"
+    remedy = "Take the plant as the model, with controllers.BarrierBackstepping."
+    if isinstance(scenario.plant, plants.ElectricDrive):
+        remedy = "Such as controllers.WithDrive(law, drive=plant), or model=plant."
+    got = f"{type(outermost).__name__}, which commands [{given}]"
+    raise checks.fail("Scenario.controller", got, expected, remedy)
+
+
+UNKNOWN_UNIT = "1"
+"""Unit of the levels and of the input of a plant that states none."""
+
+
+def _check_measured_levels(scenario: Scenario) -> None:
+    """Raises ValueError for levels that are neither measured nor estimated."""
+    order = plants.order_of(scenario.plant)
+    covered = sensor_member(scenario.sensor, "order")
+    if covered not in (None, order):
+        expected = f"sensors of {order} levels, as the plant has"
+        remedy = "None is for a level that is not measured."
+        raise checks.fail("Scenario.sensor", f"sensors of {covered} levels", expected, remedy)
+    every = tuple(range(1, plants.order_of(scenario.model) + 1))
+    measured = sensor_member(scenario.sensor, "measured") or every
+    observer = scenario.observer
+    needed = every
+    if observer_member(observer, "complete") is not None:
+        needed = observer_member(observer, "measured") or every
+    missing = [str(level) for level in needed if level not in measured]
+    if not missing:
+        return
+    which = ", ".join(missing)
+    expected = f"level {which} measured, which {type(observer).__name__} reads"
+    if needed is every:
+        expected = "every level of the model measured, or estimated by an observer"
+    levels = tuple(level for level in every if level in measured)
+    remedy = f"Such as observers.StateObserver(bandwidth=..., measured={levels})."
+    if 1 not in levels:
+        remedy = "The levels below a measured one do not follow from it: measure level 1."
+    raise checks.fail("Scenario.sensor", f"no measurement of level {which}", expected, remedy)
 
 
 def _check_region(name: str, region: regions.Region, robot: Robot) -> None:
@@ -504,7 +569,9 @@ def _fit_leaf(value: Any, n: int, name: str) -> Any:
 
 def _fit_rows(value: Any, n: int, name: str) -> Any:
     """A leaf of one row a level, with n entries a row."""
-    if jnp.ndim(value) < 2:
+    if jnp.ndim(value) == 0:
+        return value  # the same number for all levels and components
+    if jnp.ndim(value) == 1:
         rows = jnp.shape(value)
         return jnp.broadcast_to(jnp.asarray(value)[..., None], (*rows, n))
     if jnp.shape(value)[1] != n:
@@ -580,9 +647,38 @@ def _advice(scenario: Scenario) -> list[str]:
     """The warnings of the parts about their parameter values."""
     advice = law_member(scenario.controller, "advice")()
     advice = advice + observer_member(scenario.observer, "advice")()
+    advice = advice + motors_advice(scenario)
     if scenario.sampling is not None:
         advice = advice + sensor_member(scenario.sensor, "advice")(scenario.sampling.period)
+        advice = advice + noise_advice(scenario)
     return advice
+
+
+def motors_advice(scenario: Scenario) -> list[str]:
+    """A warning about a robot as the model of a flexible joint whose inertia lacks that of the
+    motors.
+    """
+    plant, model = scenario.plant, scenario.model
+    if not isinstance(plant, plants.FlexibleJoint) or plants.is_chain(model):
+        return []
+    if isinstance(model, WithMotors):
+        return []
+    q = scenario.initial.q
+    links, known = (np.diag(mass_matrix_at(robot, q)) for robot in (plant.robot, model))
+    inertia = np.asarray(plant.motor_inertia)
+    share = float(np.min((known - links) / inertia))
+    if share > LEAST_SHARE_OF_MOTORS:
+        return []
+    return [
+        f"model: the inertia of this robot contains {max(share, 0.0):.0%} of that of the motors"
+        f" (plant.motor_inertia = {inertia} kg m^2), although a law of robots commands their"
+        " torque. Take model=plant.rigid(), whose inertia is M + diag(J)."
+    ]
+
+
+LEAST_SHARE_OF_MOTORS = 0.5
+"""Share of the inertia of a motor below which a model counts as one of the links alone.  A robot
+may contain that inertia in other ways than `WithMotors`, such as the armature of an `Arm`."""
 
 
 def _typed(x: Any, dtype) -> jax.Array:

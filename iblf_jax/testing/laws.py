@@ -8,7 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.control.controllers import Command, Controller
+from iblf_jax.control.controllers import Command, Controller, WithDrive
 from iblf_jax.control.controllers._base import law_member
 from iblf_jax.core import notices
 from iblf_jax.core.pytree import unwrapped
@@ -50,6 +50,8 @@ def check_law(
     """Checks a tracking law: shapes, the state's structure, derivatives, float32, finite values
     inside the bounds, and a short closed loop.
 
+    A law inside a `WithDrive` runs on the plant that this contains.
+
     Args:
       law: an instance.
       scenario: the scenario of the closed loop; if not given the paper's simulation, or a similar
@@ -71,8 +73,11 @@ def check_law(
         speeds = base.velocity_bounds
         if speeds is None and law_member(unwrapped(law), "needs_velocity_bounds"):
             speeds = Bounds(lower=Constant(-SPEED), upper=Constant(SPEED))
+        plant = law.drive if isinstance(law, WithDrive) else base.plant
         try:
-            base = dataclasses.replace(base, controller=law, velocity_bounds=speeds)
+            base = dataclasses.replace(
+                base, controller=law, velocity_bounds=speeds, plant=plant, model=base.model
+            )
             base = in_dtype(base, "float64")
             law_member(unwrapped(law), "check_start")(base.context)
         except ValueError as error:
@@ -88,7 +93,8 @@ def check_law(
             own = law.init(*measured, context)
             command, rate = law.command(t, *measured, f_hat, context, own)
             rates = leaves_by_name("its state's rate", rate)
-            return {"tau": command.tau, "alpha": command.alpha, "V1": command.V1} | rates
+            found = {"tau": command.tau, "alpha": command.alpha, "V1": command.V1}
+            return found | leaves_by_name("input", command.input) | rates
 
         check_function(findings, outputs, base.controller, (t, measured, f_hat, base.context))
         check_claims(findings, base)

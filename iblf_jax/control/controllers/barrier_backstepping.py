@@ -255,7 +255,7 @@ class BarrierBackstepping:
           context: model, reference and bounds.
           state: beta, (r - 1, n), of a dynamic surface.
         """
-        levels, tubes = self._levels(t, x, d_hat, context, state)
+        levels, tubes = self.levels(t, x, d_hat, context, state)
         rates: Any = ()
         if self.filter is not None:
             alphas = jnp.stack([level.alpha for level in levels[:-1]])
@@ -271,10 +271,12 @@ class BarrierBackstepping:
             command = command._replace(alpha_higher=jnp.stack([tube.q_d for tube in tubes[2:]]))
         return command, rates
 
-    def _levels(
+    def levels(
         self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext, state: Any
     ) -> tuple[list[Level], list[Tube]]:
-        """All levels and their tubes; arguments as `command`."""
+        """What each level computes, and the tube of x_i around alpha_{i-1}, or around beta_{i-1}
+        with filters; arguments as `command`.
+        """
         if self.filter is None:
             return exact_levels(self._designs, t, x, d_hat, context)
         return surface_levels(self._designs, self.filter, t, x, d_hat, context, state)
@@ -285,7 +287,7 @@ class BarrierBackstepping:
         """e_r, (n,), where u jumps at e_r = 0; None for a last barrier without a jump."""
         if not ratio_jumps(self.barriers[-1]):
             return None
-        _, tubes = self._levels(t, x, jnp.zeros_like(x), context, state)
+        _, tubes = self.levels(t, x, jnp.zeros_like(x), context, state)
         return x[-1] - tubes[-1].q_d
 
 

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from iblf_jax.world.plants._base import MAX_ORDER as MAX_ORDER
 from iblf_jax.world.plants._base import Plant as Plant
 from iblf_jax.world.plants._base import check_dimensions as check_dimensions
 from iblf_jax.world.plants._base import flow as flow
