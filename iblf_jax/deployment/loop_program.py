@@ -22,6 +22,7 @@ from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import Sample
 from iblf_jax.world import plants
 
+
 class LoopOutput(NamedTuple):
     """An output of a step, n numbers."""
 
@@ -84,8 +85,8 @@ class Loop(NamedTuple):
     start: Program
     """Its results are the carry before the first step."""
     step: Program
-    """Its carry is state and status; its results are `loop_outputs` and the status, both at the start of
-    the step."""
+    """Its carry is state and status; its results are `loop_outputs` and the status, both at the
+    start of the step."""
     carry_size: int
     """Number of floating-point numbers in the carry."""
 

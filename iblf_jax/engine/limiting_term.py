@@ -199,6 +199,4 @@ def _instants(scenario: Scenario, run: Any) -> Iterator[tuple[jax.Array, LoopSta
 @jax.jit
 def _states_at(scenario: Scenario, x: jax.Array) -> LoopState:
     """Initial states of a loop at these states of the plant, (INSTANTS, r, n)."""
-    return jax.vmap(
-        lambda x: initial_state(dataclasses.replace(scenario, initial=Initial(x=x)))
-    )(x)
+    return jax.vmap(lambda x: initial_state(dataclasses.replace(scenario, initial=Initial(x=x))))(x)

@@ -3,7 +3,7 @@ structure and bit-identical numbers.
 
 A complete file has one table per component, and `kind` names the member of the family:
 
-    [robot]                         # plant and model, or [plant]; [plant] and [model] if they differ
+    [robot]                         # plant and model, or [plant]; both tables if they differ
     kind = "two_link"
     mass = [2.0, 0.85]
     ...

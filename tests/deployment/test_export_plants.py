@@ -31,8 +31,13 @@ def self_test(folder):
     return ran.stdout
 
 
+QUICK = ("user class", "electric drive")
+
+
 @pytest.mark.parametrize("reference", ["inside", "given"])
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    "case", [x if x in QUICK else pytest.param(x, marks=pytest.mark.slow) for x in CASES]
+)
 @pytest.mark.filterwarnings("ignore:the simulated run")
 def test_the_c_of_a_law_gives_the_inputs_of_simulate(tmp_path, case, reference, monkeypatch):
     monkeypatch.setattr("iblf_jax.deployment.export.VECTORS_DURATION", 0.2)
@@ -87,7 +92,9 @@ def test_a_law_as_an_fmu_receives_all_levels(tmp_path):
     assert units == {"x_3": "A", "tau": "V", "alpha": "rad/s", "d_hat_3": "A/s"}
 
 
-@pytest.mark.parametrize("case", ["flexible joint", "user functions"])
+@pytest.mark.parametrize(
+    "case", [pytest.param("flexible joint", marks=pytest.mark.slow), "user functions"]
+)
 def test_a_closed_loop_as_an_fmu_is_simulate(tmp_path, case):
     fmpy = pytest.importorskip("fmpy")
     pytest.importorskip("fmpy.validation")
@@ -105,6 +112,7 @@ def test_a_closed_loop_as_an_fmu_is_simulate(tmp_path, case):
         np.testing.assert_allclose(values, expected, atol=1e-9, err_msg=name)
 
 
+@pytest.mark.slow
 def test_a_closed_loop_in_webassembly_is_simulate(tmp_path):
     wasmtime = pytest.importorskip("wasmtime")
     pytest.importorskip("ziglang")

@@ -5,12 +5,14 @@ from __future__ import annotations
 import jax.numpy as jnp
 import plant_cases
 import pytest
-
-import iblf_jax as ij
 from iblf_jax.controllers import Command
 
+import iblf_jax as ij
 
-@pytest.mark.parametrize("case", ["electric drive", "user functions"])
+
+@pytest.mark.parametrize(
+    "case", [pytest.param("electric drive", marks=pytest.mark.slow), "user functions"]
+)
 def test_laws_of_plants_pass_in_their_scenario(case):
     scenario = plant_cases.CASES[case]()
     assert ij.testing.check_law(scenario.controller, scenario=scenario) == ()
