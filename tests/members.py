@@ -5,6 +5,7 @@ Whoever adds a member adds it here; `test_contracts.test_every_member_is_listed`
 
 from __future__ import annotations
 
+import jax.numpy as jnp
 from arm_cases import random_arm
 
 import iblf_jax as ij
@@ -47,11 +48,44 @@ ROBOTS = {
     "with_motors": robots.WithMotors(TWO_LINK, inertia=[0.02, 0.01], damping=0.1),
 }
 
+PLANTS = {
+    "rigid": plants.Rigid(TWO_LINK),
+    "driven_pendulum": ij.presets.motor_driven_pendulum().plant,
+    "electric_drive": plants.ElectricDrive(
+        TWO_LINK, torque_constant=[0.9, 0.5], inductance=0.025, resistance=5.0, back_emf=0.9
+    ),
+    "flexible_joint": plants.FlexibleJoint(
+        TWO_LINK, stiffness=[300.0, 200.0], motor_inertia=0.02, motor_damping=0.1
+    ),
+    "vessel": ij.presets.cybership_ii(),
+    "strict_feedback": plants.StrictFeedback(
+        drift=lambda t, x: jnp.stack([x[0] * x[0, ::-1], jnp.sin(x[0] * x[1]) - 0.2 * t]),
+        gain=lambda t, x: jnp.stack(
+            [jnp.diag(2.0 + x[0] ** 2), jnp.eye(2, dtype=x.dtype) + 0.1 * x[1, 0]]
+        ),
+        n=2,
+        order=2,
+        units=(("m", "rad"), "1/s", "N"),
+        component_names=("cart", "pole"),
+    ),
+    "strict_feedback_diagonal": plants.StrictFeedback(
+        drift=lambda t, x: jnp.stack([jnp.cos(x[0]), x[0] * x[1], -x[2]]),
+        gain=lambda t, x: jnp.stack([jnp.ones_like(x[0]), 2.0 + x[1] ** 2, jnp.exp(x[0])]),
+        n=1,
+        order=3,
+    ),
+}
+
 REFERENCES = {
     "sinusoid": references.Sinusoid(
         offset=0.5, amplitude=[0.14, 0.1], frequency=1.0, phase=[0.0, 1.57]
     ),
     "quintic": references.Quintic(start=[0.1, 0.2], end=[0.8, -0.3], duration=3.0),
+    "smooth_step": references.SmoothStep(start=[0.1, 0.2], end=[0.8, -0.3], duration=3.0),
+    "ellipse": references.Ellipse(axes=(5.0, 3.0), frequency=0.4, centre=(1.0, -2.0)),
+    "waypoint_spline_smooth": references.WaypointSpline(
+        times=(0.0, 1.0, 2.5), waypoints=[[0.0, 0.1], [0.4, 0.3], [0.2, 0.8]], derivatives=4
+    ),
     "waypoint_spline": references.WaypointSpline(
         times=(0.0, 1.0, 2.5, 4.0), waypoints=[[0.0, 0.1], [0.4, 0.3], [0.2, 0.8], [0.5, 0.5]]
     ),
@@ -86,6 +120,7 @@ DISTURBANCES = {
     "sum": disturbances.Sum(
         (disturbances.Friction(viscous=0.1), disturbances.Step(size=1.0, time=2.0))
     ),
+    "levels": disturbances.Levels((None, disturbances.Step(size=1.0, time=2.0))),
     "sum_of_none": disturbances.Sum(()),
 }
 
@@ -234,6 +269,7 @@ FOLDS = {type(fold).__name__: fold for fold in (*metrics.standard(), *OPTIONAL_F
 
 FAMILIES = {
     "robot": (ROBOTS, robots.MEMBERS, ij.testing.check_robot),
+    "plant": (PLANTS, plants.MEMBERS, ij.testing.check_plant),
     "reference": (REFERENCES, references.MEMBERS, ij.testing.check_reference),
     "side": (SIDES, bounds.MEMBERS, ij.testing.check_side),
     "region": (REGIONS, regions.MEMBERS, ij.testing.check_region),

@@ -1,112 +1,106 @@
-"""Scenarios of plants in strict-feedback form: a flexible joint, a motor-driven arm with bounds on
-all levels, a user's two functions and a user's class."""
+"""Small scenarios of plants in strict-feedback form: a motor-driven pendulum of order 3, and a body
+in the plane whose components have different units.
+"""
 
 from __future__ import annotations
 
+from typing import Any, ClassVar
+
+import jax
 import jax.numpy as jnp
+from iblf_jax.bounds import Bounds, Constant
 
 import iblf_jax as ij
-from iblf_jax import barriers, bounds, controllers, references
 
-ROBOT = ij.robots.TwoLink(mass=[1.2, 0.9], length=[0.4, 0.3], centre=[0.2, 0.15], inertia=0.02)
-
-
-def band(low, high) -> bounds.Bounds:
-    """Constant bounds."""
-    return bounds.Bounds(lower=bounds.Constant(low), upper=bounds.Constant(high))
+WITH_MAPPING = (ij.barriers.Mapping(),) * 3
 
 
-ARM = {
-    "reference": references.Sinusoid(offset=[0.5, 0.5], amplitude=0.14, frequency=1.0),
-    "bounds": band(0.1, 0.9),
-    "initial": ij.Initial(q=[0.6, 0.55]),
-}
+def _pendulum_drift(t: jax.Array, x: jax.Array) -> jax.Array:
+    torque = -2.0 * x[1] - 10.0 * jnp.sin(x[0])
+    return jnp.stack([jnp.zeros_like(x[0]), torque, -10.0 * x[2] - 0.2 * x[1]])
 
 
-def flexible_joint(**parts) -> ij.Scenario:
-    """Order 4: two links on springs."""
-    plant = ij.plants.FlexibleJoint(ROBOT, stiffness=300.0, motor_inertia=0.02, motor_damping=0.1)
-    law = controllers.BarrierBackstepping(k=(3.0, 20.0, 60.0, 150.0))
-    return ij.Scenario(**({"plant": plant, "controller": law, **ARM} | parts))
+def _pendulum_gain(t: jax.Array, x: jax.Array) -> jax.Array:
+    one = jnp.ones_like(x[0])
+    return jnp.stack([one, one, 5.0 * one])
 
 
-def rigid_law(**parts) -> ij.Scenario:
-    """A law for rigid arms on stiff joints with damped motors; its model is the robot inside."""
-    plant = ij.plants.FlexibleJoint(ROBOT, stiffness=3e3, motor_inertia=0.02, motor_damping=3.0)
-    law = controllers.Backstepping(k1=3.0, K2=1.0, barrier=barriers.Mapping())
-    return flexible_joint(**({"plant": plant, "model": plant.robot, "controller": law} | parts))
+PENDULUM = ij.plants.StrictFeedback(
+    drift=_pendulum_drift,
+    gain=_pendulum_gain,
+    n=1,
+    order=3,
+    units=("rad", "rad/s", "A", "V"),
+    level_names=("angle", "speed", "current"),
+    component_names=("pendulum",),
+)
 
 
-def electric_drive(**parts) -> ij.Scenario:
-    """Order 3: two links with motors, and bounds on positions, velocities and currents."""
-    plant = ij.plants.ElectricDrive(
-        ROBOT, torque_constant=0.9, inductance=0.02, resistance=1.1, back_emf=0.9
-    )
-    law = controllers.BarrierBackstepping(
-        k=(3.0, 20.0, 60.0), barriers=(barriers.Mapping(),) * 3, c=(0.0, 0.1, 0.1)
-    )
-    levels = (band(-4.0, 4.0), band(-60.0, 60.0))
-    defaults = {"plant": plant, "controller": law, "state_bounds": levels}
-    return ij.Scenario(**(defaults | ARM | parts))
+def symmetric(size: Any) -> Bounds:
+    """Constant bounds at the same distance on both sides of 0."""
+    return Bounds(lower=Constant(-jnp.asarray(size)), upper=Constant(size))
+
+
+def pendulum(**parts: Any) -> ij.Scenario:
+    """A pendulum that follows a sinusoid, with bounds and barriers on all levels; parts replace its
+    own.
+    """
+    disturbance = ij.disturbances.Sinusoids(amplitude=0.3, frequency=1.0)
+    own: dict[str, Any] = {
+        "plant": PENDULUM,
+        "reference": ij.references.Sinusoid(offset=0.0, amplitude=0.5),
+        "bounds": symmetric(1.0),
+        "state_bounds": (symmetric(3.0), symmetric(20.0)),
+        "controller": ij.controllers.BarrierBackstepping(
+            k=(3.0, 10.0, 30.0), barriers=WITH_MAPPING
+        ),
+        "initial": ij.Initial(x=[[0.3], [0.0], [0.0]]),
+        "disturbance": ij.disturbances.Levels((None, disturbance)),
+    }
+    return ij.Scenario(**own | parts)
 
 
 @ij.component
-class MotorPendulum:
-    """x1' = x2,  D x2' = x3 - B x2 - N sin x1,  M x3' = u - H x3 - Km x2."""
+class Body:
+    """pose' = R(heading) velocity,   mass velocity' = force - 0.5 mass velocity."""
 
-    D: ij.Leaf = ij.leaf("kg m^2", sign="positive", default=1.0)
-    B: ij.Leaf = ij.leaf("N m s/rad", default=1.0)
-    N: ij.Leaf = ij.leaf("N m", default=10.0)
-    M: ij.Leaf = ij.leaf("H", sign="positive", default=0.1)
-    H: ij.Leaf = ij.leaf("ohm", default=1.0)
-    Km: ij.Leaf = ij.leaf("N m/A", default=0.2)
-    n = 1
-    order = 3
+    mass: ij.Leaf = ij.leaf("kg", sign="positive")
+    n: ClassVar[int] = 3
+    order: ClassVar[int] = 2
+    units: ClassVar[tuple] = (("m", "m", "rad"), ("m/s", "m/s", "rad/s"), ("N", "N", "N m"))
+    level_names: ClassVar[tuple] = ("pose", "velocity")
+    component_names: ClassVar[tuple] = ("north", "east", "heading")
+    input_name: ClassVar[str] = "force"
 
-    def drift(self, t, x):
-        """f, (3, 1)."""
-        load = self.B * x[1] + self.N * jnp.sin(x[0])
-        return jnp.stack([0.0 * x[0], -load / self.D, -(self.H * x[2] + self.Km * x[1]) / self.M])
+    def rotation(self, x1: jax.Array) -> jax.Array:
+        """R, (3, 3)."""
+        c, s, zero = jnp.cos(x1[2]), jnp.sin(x1[2]), jnp.zeros_like(x1[2])
+        rows = [[c, -s, zero], [s, c, zero], [zero, zero, zero + 1.0]]
+        return jnp.stack([jnp.stack(row) for row in rows])
 
-    def gain(self, t, x):
-        """The diagonal of G, (3, 1)."""
-        one = jnp.ones_like(x[0])
-        return jnp.stack([one, one / self.D, one / self.M])
+    def drift(self, t: jax.Array, x: jax.Array) -> jax.Array:
+        """F, (2, 3)."""
+        return jnp.stack([jnp.zeros_like(x[0]), -0.5 * x[1]])
 
+    def gain(self, t: jax.Array, x: jax.Array) -> jax.Array:
+        """G, (2, 3, 3)."""
+        return jnp.stack([self.rotation(x[0]), jnp.diag(1.0 / self.mass)])
 
-def pendulum_drift(t, x):
-    """f of a `MotorPendulum`, with its default numbers."""
-    return MotorPendulum().drift(t, x)
-
-
-def pendulum_gain(t, x):
-    """G of a `MotorPendulum` as full matrices."""
-    return MotorPendulum().gain(t, x)[..., None]
+    def outline(self, x1: jax.Array) -> jax.Array:
+        """Corners of a triangle that points to the heading, (3, 2) [m]."""
+        corners = jnp.array([[0.6, 0.0], [-0.4, 0.3], [-0.4, -0.3]])
+        return x1[:2] + corners @ self.rotation(x1)[:2, :2].T
 
 
-PENDULUM = {
-    "controller": controllers.BarrierBackstepping(k=(2.0, 10.0, 30.0)),
-    "reference": references.Sinusoid(offset=0.0, amplitude=0.4, frequency=1.0),
-    "bounds": band(-0.8, 0.8),
-    "initial": ij.Initial(x=[[0.2], [0.0], [0.0]]),
-}
-
-
-def user_class(**parts) -> ij.Scenario:
-    """Order 3, one component: a user's class."""
-    return ij.Scenario(**({"plant": MotorPendulum()} | PENDULUM | parts))
-
-
-def user_functions(**parts) -> ij.Scenario:
-    """The same from two functions."""
-    plant = ij.plants.StrictFeedback(pendulum_drift, pendulum_gain, n=1, order=3)
-    return ij.Scenario(**({"plant": plant} | PENDULUM | parts))
-
-
-CASES = {
-    "flexible joint": flexible_joint,
-    "electric drive": electric_drive,
-    "user class": user_class,
-    "user functions": user_functions,
-}
-"""Name -> scenario; all laws are `BarrierBackstepping`."""
+def body(**parts: Any) -> ij.Scenario:
+    """A body that follows an ellipse; parts replace its own."""
+    own: dict[str, Any] = {
+        "plant": Body(mass=[20.0, 20.0, 3.0]),
+        "reference": ij.references.Sinusoid(
+            offset=[0.0, 0.0, 0.5], amplitude=[4.0, 2.0, 0.6], frequency=0.2, phase=[0.0, 1.5, 0.3]
+        ),
+        "bounds": symmetric([6.0, 6.0, 2.0]),
+        "controller": ij.controllers.BarrierBackstepping(k=(1.0, 3.0)),
+        "initial": ij.Initial(q=[0.5, 1.0, 0.2]),
+    }
+    return ij.Scenario(**own | parts)

@@ -19,7 +19,6 @@ optional_member = OptionalMembers(
     guard=-1.0,
     K2=None,
     kf=None,
-    barriers=(),
     # studies
     scenario=None,
     made=True,

@@ -342,6 +342,7 @@ def _robot_uncertain_signals(
     if not isinstance(signals.torque, tuple):
         tau = signals.torque
     M0, G0 = model.mass_matrix(q), model.gravity(q)
+    balance = G0 if isinstance(signals.torque, tuple) else steady_input(scenario, q)
     f = matvec(M0, moved.ddq) + model.coriolis(q, dq, dq) + G0 - tau
     f_hat = estimate_as_torque(model, q, signals.f_hat)
     e2, f_tilde = dq - signals.alpha, f - f_hat
@@ -350,7 +351,7 @@ def _robot_uncertain_signals(
         V = V + 0.5 * inner(f_tilde, f_tilde)
     else:
         V = V + 0.5 * (inner(e2, matvec(M0, e2)) + inner(f_tilde, f_tilde))
-    return _UncertainSignals(G0, f, f_hat, V)
+    return _UncertainSignals(balance, f, f_hat, V)
 
 
 def _uncertain_signals(
@@ -364,8 +365,7 @@ def _uncertain_signals(
     higher: Any,
 ) -> _UncertainSignals:
     """The signals of a model in strict-feedback form: d_i of (S.1), and the law's sum w_i V_i."""
-    robot = plants.robot_of(scenario.model)
-    gravity = jnp.zeros_like(q) if robot is None else robot.gravity(q)
+    gravity = steady_input(scenario, q)
     d = uncertain_term(scenario, t, q, dq, higher, moved, tau)
     x = model_state(scenario, q, dq, higher)
     d_hat = estimate_as_rates(scenario, x, signals.f_hat)

@@ -44,6 +44,7 @@ import numpy as np
 
 from iblf_jax.core.linalg import matvec, solve, solve_spd
 from iblf_jax.core.time import as_at
+from iblf_jax.core.units import POSITION
 from iblf_jax.simulation.closed_loop import LoopState, perturbed_state
 from iblf_jax.simulation.discontinuities import has_jump
 from iblf_jax.simulation.integrators import Tableau, tableau
@@ -64,7 +65,7 @@ GAUSS = ((0.5 - 0.15**0.5, 5 / 18), (0.5, 8 / 18), (0.5 + 0.15**0.5, 5 / 18))
 """Nodes and weights of Gauss's quadrature, the reference for the quadrature of a method."""
 GOLDEN_RATIO = 0.6180339887498949
 ERROR, RELATIVE = "numerical_error", "relative_numerical_error"
-ACCURACY_UNITS = ((ERROR, "rad"), (RELATIVE, "1"))
+ACCURACY_UNITS = ((ERROR, POSITION), (RELATIVE, "1"))
 """Name and unit of the accuracy results that every run has beside its metrics."""
 
 

@@ -10,9 +10,9 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -42,6 +42,7 @@ from iblf_jax.core.pytree import (
     unwrapped,
 )
 from iblf_jax.core.time import joined, jump_times_of
+from iblf_jax.core.units import HIGHER, POSITION, VELOCITY, Unit, as_text
 from iblf_jax.simulation.levels import model_state, start_levels
 from iblf_jax.simulation.measurement_noise import noise_advice
 from iblf_jax.simulation.sampling import PERIOD_TOLERANCE, Sampling
@@ -70,9 +71,10 @@ class Initial:
         higher.
     """
 
-    q: Leaf = leaf("rad")
-    dq: Leaf = leaf("rad/s", default=0.0)
-    higher: Leaf = leaf("1", shape="level", default=None)
+    q: Leaf = leaf(POSITION)
+    dq: Leaf = leaf(VELOCITY, default=0.0)
+    higher: Leaf = leaf(HIGHER, shape="level", default=None)
+    stacked: ClassVar[dict[str, tuple[str, ...]]] = {"x": ("q", "dq", "higher")}
 
     def __init__(self, q: Any = None, dq: Any = None, higher: Any = None, *, x: Any = None) -> None:
         if x is not None:
@@ -137,10 +139,19 @@ OPTIONAL_MEMBERS = ("skeleton",)
 """Members of these protocols that a part may lack."""
 
 HOW_TO_MAKE = "Make one with ij.presets or ij.Scenario."
-VELOCITY_UNITS = {
-    "units": dict.fromkeys(("value", "offset", "amplitude", "initial", "final"), "rad/s")
-}
-"""Units of the leaves of bounds on velocities: leaf -> unit."""
+
+
+def _of_level(level: int) -> Callable[[Mapping[str, Unit], int], Mapping[str, Unit]]:
+    """The units of the parameters of bounds, of which part 0 bounds this level."""
+
+    def units_of_part(units: Mapping[str, Unit], part: int) -> Mapping[str, Unit]:
+        return {**units, "x1": units[f"x{level + part}"]}
+
+    return units_of_part
+
+
+BOUNDS_OF_SECOND_LEVEL = {"part_units": _of_level(2)}
+"""Metadata of the bounds of the levels from the second on."""
 
 
 @component
@@ -194,9 +205,13 @@ class Scenario:
     sampling: Sampling | None = None
     sensor: Sensor = IdealSensor()
     actuator: Actuator = IdealActuator()
-    velocity_bounds: Bounds | None = dataclasses.field(default=None, metadata=VELOCITY_UNITS)
+    velocity_bounds: Bounds | None = dataclasses.field(
+        default=None, metadata=BOUNDS_OF_SECOND_LEVEL
+    )
     regions: tuple[regions.Region, ...] = ()
-    state_bounds: tuple[Bounds | None, ...] = ()
+    state_bounds: tuple[Bounds | None, ...] = dataclasses.field(
+        default=(), metadata=BOUNDS_OF_SECOND_LEVEL
+    )
 
     def check(self) -> None:
         """Checks the parts, makes the plant the model if none is given, and repeats scalars for the
@@ -266,7 +281,8 @@ class Scenario:
     def _check_combination(self) -> None:
         """Raises ValueError for parts that do not fit together."""
         if self.model.n != self.plant.n:
-            got, expected = f"{self.model.n} joints", f"{self.plant.n} joints, as the plant has"
+            noun = plants.component_noun(self.plant)
+            got, expected = f"{self.model.n} {noun}s", f"{self.plant.n} {noun}s, as the plant has"
             raise checks.fail("Scenario.model", got, expected)
         law = unwrapped(self.controller)
         if self.context.level_bounds(2) is None and law_member(law, "needs_velocity_bounds"):
@@ -811,14 +827,17 @@ def _check_start(scenario: Scenario) -> None:
     for name, values in finite.items():
         if not np.all(np.isfinite(values)):
             raise checks.fail(name, values, "finite values at t = 0")
-    _check_order("bounds", start.lower, start.upper)
+    noun = plants.component_noun(scenario.plant)
+    _check_order(f"bounds of {noun}", start.lower, start.upper)
     remedy = "Move the reference or widen the bounds (Assumption 2)."
-    _check_inside("reference of joint {}", "bounds", start.q_d, start.lower, start.upper, remedy)
+    _check_inside(
+        f"reference of {noun} {{}}", "bounds", start.q_d, start.lower, start.upper, remedy
+    )
     remedy = "Move the start or widen the bounds."
     _check_inside("initial.q[{}]", "bounds", q, start.lower, start.upper, remedy)
     if start.speed_limits is not None:
         slowest, fastest = start.speed_limits
-        _check_order("velocity_bounds", slowest, fastest)
+        _check_order("velocity_bounds of joint", slowest, fastest)
         _check_inside("initial.dq[{}]", "velocity bounds", dq, slowest, fastest, remedy)
     for region, margin in zip(scenario.regions, start.region_margins, strict=True):
         if not margin > 0:
@@ -829,7 +848,8 @@ def _check_start(scenario: Scenario) -> None:
     _check_levels_at_start(scenario)
     limit = plants.speed_limit(scenario.plant)
     if not np.all(np.abs(dq) < limit):
-        expected = f"speeds below {limit:g} rad/s"
+        unit = as_text(plants.units_of(scenario.plant)[1])
+        expected = f"speeds below {limit:g} {unit}"
         raise checks.fail("initial.dq", dq, expected, "A run that fast counts as diverged.")
     for name, part in (("plant", scenario.plant), ("model", scenario.model)):
         robot = plants.robot_of(part)
@@ -855,14 +875,28 @@ def _check_levels_at_start(scenario: Scenario) -> None:
         lower, upper = (np.asarray(side) for side in bounds_at(bounds, t, jnp.zeros_like(x[0])))
         if isinstance(bounds.lower, Funnel) or isinstance(bounds.upper, Funnel):
             continue  # around alpha, which the law computes
-        _check_order(f"state_bounds[{i}]", lower, upper)
+        noun = plants.component_noun(scenario.plant)
+        _check_order(f"state_bounds[{i}] of {noun}", lower, upper)
         remedy = "Move the start or widen the bounds."
         level = f"initial.x[{i + 1}][{{}}]"
         _check_inside(level, f"bounds of level {i + 2}", np.asarray(x[i + 1]), lower, upper, remedy)
     parts: dict[str, Any] = {"plant": scenario.plant, "model": scenario.model}
     for name, plant in parts.items():
         if plants.is_chain(plant):
-            _check_gains(name, np.asarray(plant.gain(t, x[: plant.order])))
+            levels = x[: plant.order]
+            _check_gains(name, np.asarray(plant.gain(t, levels)))
+            if not isinstance(plant, plants.OF_KNOWN_STRUCTURE):
+                plants.check_dependence(name, _dependence_near(plant, t, levels))
+
+
+@jax.jit
+def _dependence_near(plant: Plant, t: jax.Array, x: jax.Array) -> Any:
+    """The dependence of drift and gain on the levels at the start and at a state near it, where
+    even functions of a level that starts at 0 have a slope.
+    """
+    nearby = x + 0.1 * (1.0 + jnp.abs(x))
+    points = jnp.stack([x, nearby])
+    return jax.vmap(partial(plants.dependence_on_levels, plant, t))(points)
 
 
 def _check_gains(name: str, gains: np.ndarray) -> None:
@@ -880,7 +914,7 @@ def _check_order(name: str, lower: np.ndarray, upper: np.ndarray) -> None:
     for i, (low, high) in enumerate(zip(lower, upper, strict=True)):
         if not low < high:
             expected, remedy = "finite lower < upper at t = 0", "Exchange or widen them."
-            raise checks.fail(f"{name} of joint {i}", (low, high), expected, remedy)
+            raise checks.fail(f"{name} {i}", (low, high), expected, remedy)
 
 
 def _check_inside(

@@ -8,8 +8,8 @@ import subprocess
 
 import jax
 import jax.numpy as jnp
+import loops_of_plants
 import numpy as np
-import plant_cases
 import pytest
 
 import iblf_jax as ij
@@ -18,7 +18,7 @@ from iblf_jax.deployment.signal_units import one_unit, per_time
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-Wconversion")
 PERIOD = 1e-3
-CASES = plant_cases.CASES | {"rigid law": plant_cases.rigid_law}
+CASES = loops_of_plants.CASES | {"rigid law": loops_of_plants.rigid_law}
 
 
 def self_test(folder):
@@ -50,7 +50,7 @@ def test_the_c_of_a_law_gives_the_inputs_of_simulate(tmp_path, case, reference, 
 
 
 def test_a_law_of_a_rigid_model_has_no_parameters_of_the_plant(tmp_path):
-    exported = ij.export(plant_cases.rigid_law(), tmp_path, period=PERIOD)
+    exported = ij.export(loops_of_plants.rigid_law(), tmp_path, period=PERIOD)
     assert not [path for path in exported.parameters if path.startswith("plant")]
 
 
@@ -67,7 +67,7 @@ def test_a_given_reference_has_the_derivatives_that_it_is_given():
 def test_a_law_as_an_fmu_receives_all_levels(tmp_path):
     fmpy = pytest.importorskip("fmpy")
     pytest.importorskip("fmpy.validation")
-    scenario = plant_cases.electric_drive(sampling=ij.Sampling(PERIOD))
+    scenario = loops_of_plants.electric_drive(sampling=ij.Sampling(PERIOD))
     ij.export(scenario, tmp_path, target="fmu")
     file = str(tmp_path / "iblf_law.fmu")
     assert fmpy.validation.validate_fmu(file) == []
@@ -116,7 +116,7 @@ def test_a_closed_loop_as_an_fmu_is_simulate(tmp_path, case):
 def test_a_closed_loop_in_webassembly_is_simulate(tmp_path):
     wasmtime = pytest.importorskip("wasmtime")
     pytest.importorskip("ziglang")
-    scenario = plant_cases.electric_drive()
+    scenario = loops_of_plants.electric_drive()
     ij.export(scenario, tmp_path, target="wasm", dt=1e-3)
     store = wasmtime.Store()
     module = wasmtime.Module.from_file(store.engine, str(tmp_path / "iblf_loop.wasm"))
@@ -148,4 +148,4 @@ def test_units_of_inputs_and_outputs():
 
 def test_mujoco_refuses_what_is_no_robot():
     with pytest.raises(ValueError, match=r"scenario\.plant: got 'FlexibleJoint'.*plant\.robot"):
-        ij.cosimulate(plant_cases.flexible_joint(), "arm.xml", period=PERIOD, duration=0.1)
+        ij.cosimulate(loops_of_plants.flexible_joint(), "arm.xml", period=PERIOD, duration=0.1)

@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import loops_of_plants
 import numpy as np
-import plant_cases
 import pytest
 from scipy.integrate import solve_ivp
 
@@ -15,7 +15,7 @@ from iblf_jax.engine.structural_constants import robot_constants
 from iblf_jax.simulation.paths import get
 
 SHORT = {"duration": 0.3, "dt": 1e-3}
-CASES = plant_cases.CASES
+CASES = loops_of_plants.CASES
 
 
 @pytest.mark.parametrize("case", ["user class", "electric drive"])
@@ -112,11 +112,11 @@ def test_the_geometry_of_the_robot_inside_a_plant_is_compiled_in():
         axis=axis,
     )
     plant = ij.plants.FlexibleJoint(arm, stiffness=300.0, motor_inertia=0.02)
-    rigid = plant_cases.rigid_law(plant=arm, model=arm)
-    flexible = plant_cases.flexible_joint(plant=plant)
-    mixed = plant_cases.rigid_law(plant=plant, model=arm)
+    rigid = loops_of_plants.rigid_law(plant=arm, model=arm)
+    flexible = loops_of_plants.flexible_joint(plant=plant)
+    mixed = loops_of_plants.rigid_law(plant=plant, model=arm)
     expected = [x for x in robot_constants(rigid).numbers if x is not None]
     for scenario in (flexible, mixed):
         found = [x for x in robot_constants(scenario).numbers if x is not None]
         assert [x.value for x in found] == [x.value for x in expected]
-    assert robot_constants(plant_cases.user_class()) is None
+    assert robot_constants(loops_of_plants.user_class()) is None

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import loops_of_plants
 import numpy as np
-import plant_cases
 import pytest
 
 import iblf_jax as ij
@@ -20,7 +20,7 @@ UNKNOWN = {
     "case", [x if x == "user class" else pytest.param(x, marks=pytest.mark.slow) for x in UNKNOWN]
 )
 def test_executors_give_the_same_numbers(case):
-    scenario = plant_cases.CASES[case]()
+    scenario = loops_of_plants.CASES[case]()
     runs = [
         ij.monte_carlo(scenario, UNKNOWN[case], runs=8, backend=name, progress=False, **SHORT)
         for name in ("native", "vmap")
@@ -34,16 +34,16 @@ def test_a_sweep_over_a_gain_of_a_level_is_stored(tmp_path):
     pytest.importorskip("zarr")
     options = {"store": str(tmp_path / "sweep.zarr"), "progress": False, **SHORT}
     grid = {"controller.k[2]": [20.0, 30.0]}
-    first = ij.sweep(plant_cases.user_class(), grid, **options)
-    again = ij.sweep(plant_cases.user_class(), grid, **options)
+    first = ij.sweep(loops_of_plants.user_class(), grid, **options)
+    again = ij.sweep(loops_of_plants.user_class(), grid, **options)
     np.testing.assert_array_equal(first["rmse"], again["rmse"])
     assert first.sizes["controller.k[2]"] == 2
 
 
 def test_a_rigid_law_is_compared_with_one_of_all_levels():
-    rigid = plant_cases.rigid_law()
-    scenario = plant_cases.flexible_joint(plant=rigid.plant)
+    rigid = loops_of_plants.rigid_law()
+    scenario = loops_of_plants.flexible_joint(plant=rigid.plant)
     laws = {"all levels": scenario.controller, "rigid": rigid.controller}
     found = ij.compare(scenario, laws, equal_effort=False, **SHORT)
-    assert type(found.rollouts["rigid"].scenario.model) is type(plant_cases.ROBOT)
+    assert type(found.rollouts["rigid"].scenario.model) is type(loops_of_plants.ROBOT)
     assert found.rollouts["all levels"].scenario.model.order == 4

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
-import plant_cases
+import loops_of_plants
 import pytest
 from iblf_jax.controllers import Command
 
@@ -14,7 +14,7 @@ import iblf_jax as ij
     "case", [pytest.param("electric drive", marks=pytest.mark.slow), "user functions"]
 )
 def test_laws_of_plants_pass_in_their_scenario(case):
-    scenario = plant_cases.CASES[case]()
+    scenario = loops_of_plants.CASES[case]()
     assert ij.testing.check_law(scenario.controller, scenario=scenario) == ()
 
 
@@ -46,6 +46,6 @@ class WrongShape:
 
 
 def test_an_input_of_the_wrong_shape_is_found():
-    scenario = plant_cases.user_class()
+    scenario = loops_of_plants.user_class()
     with pytest.raises(ij.testing.ContractError, match=r"Command\.tau"):
         ij.testing.check_law(WrongShape(), scenario=scenario)

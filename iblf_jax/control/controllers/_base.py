@@ -168,6 +168,7 @@ law_member = OptionalMembers(
     switching=lambda t, q, dq, context, state: None,
     disturbance_terms=None,
     barrier=None,
+    barriers=(),
     weight=None,
     reading="",
 )

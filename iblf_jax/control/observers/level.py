@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from iblf_jax.control.observers._eta import STARTS
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf, static
+from iblf_jax.core.units import RATES
 from iblf_jax.world import plants
 from iblf_jax.world.plants import Plant
 
@@ -44,7 +45,7 @@ class LevelObserver:
     """
 
     gain: Leaf = leaf("1/s", sign="nonnegative", shape="level")
-    eta0: Leaf = leaf("1", shape="level", default=0.0)
+    eta0: Leaf = leaf(RATES, shape="level", default=0.0)
     start: str = static(default="matched")
     receives_x: ClassVar[bool] = True
 

@@ -35,6 +35,7 @@ import numpy as np
 from iblf_jax.control.observers.level import check_rows
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf, static
+from iblf_jax.core.units import LEVELS
 from iblf_jax.world import plants
 from iblf_jax.world.plants import Plant
 
@@ -87,7 +88,7 @@ class StateObserver:
     bandwidth: Leaf = leaf("1/s", sign="positive")
     measured: tuple[int, ...] = static(default=(1,))
     disturbance: bool = static(default=True)
-    offset: Leaf = leaf("1", shape="level", default=0.0)
+    offset: Leaf = leaf(LEVELS, shape="level", default=0.0)
     receives_x: ClassVar[bool] = True
 
     def check(self) -> None:

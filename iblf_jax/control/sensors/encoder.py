@@ -12,6 +12,7 @@ import jax
 from iblf_jax.control.sensors._base import Measurement, State, Velocity, rounded, sensor_member
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf
+from iblf_jax.core.units import POSITION
 
 
 @component
@@ -32,8 +33,8 @@ class Encoder:
 
     velocity: Velocity
     counts: Leaf = leaf("1", sign="positive", default=None)
-    offset: Leaf = leaf("rad", default=0.0)
-    noise: Leaf = leaf("rad", sign="nonnegative", default=None)
+    offset: Leaf = leaf(POSITION, default=0.0)
+    noise: Leaf = leaf(POSITION, sign="nonnegative", default=None)
 
     def check(self) -> None:
         """Raises ValueError if `velocity` does not fit `Velocity`."""
