@@ -207,6 +207,13 @@ LAWS = {
     "backstepping_corrected_log": controllers.Backstepping(
         k1=[2.0, 3.0], K2=20.0, o=0.1, barrier=barriers.Log(p=2), reading="corrected"
     ),
+    "barrier_backstepping": controllers.BarrierBackstepping(k=(2.0, [20.0, 15.0])),
+    "barrier_backstepping_two_barriers": controllers.BarrierBackstepping(
+        k=(2.0, 20.0), barriers=(barriers.Tan(), barriers.Mapping()), c=(0.0, 0.1), weights=2.0
+    ),
+    "barrier_backstepping_filtered": controllers.BarrierBackstepping(
+        k=(2.0, 20.0), barriers=(barriers.Integral(),), filter=[0.02]
+    ),
     "full_state": controllers.FullState(k1=2.0, K2=[20.0, 15.0], c=1.0, o=0.1),
     "full_state_mixed": controllers.FullState(
         k1=2.0,
