@@ -268,6 +268,7 @@ INPUT_MAPS = {
 OPTIONAL_FOLDS = (
     metrics.AboveGravity(),
     metrics.VelocityMargin(),
+    metrics.LevelMargin(),
     metrics.RegionMargin(),
     metrics.Slack(),
     metrics.RegionSlack(),

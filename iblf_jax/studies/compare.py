@@ -74,8 +74,9 @@ def compare(
     Args:
       scenario: plant, reference, bounds, disturbance, observer and start, shared by all laws; a law
         of robots takes the rigid limit of a plant in strict-feedback form as its model, that of a
-        `FlexibleJoint` with the inertia of the motors, or the robot inside the plant.  The k1, K2, o and reading of its own law are those of the laws that are given by name, and a
-        torque limit around its law is put around them too.
+        `FlexibleJoint` with the inertia of the motors, or the robot inside the plant.  The k1, K2,
+        o and reading of its own law are those of the laws that are given by name, and a torque
+        limit around its law is put around them too.
       laws: names (`iblf_jax.controllers.LAWS` or `KEEPERS`) or laws, or a dict of either by the
         name to show.  The first one sets the effort.
       duration, dt, method, record_every: as `simulate`.

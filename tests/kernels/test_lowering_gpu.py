@@ -246,9 +246,7 @@ def test_a_plant_of_higher_order_agrees_with_the_reference(case, runs_here):
     found, expected = batch("gpu"), batch("vmap")
     np.testing.assert_array_equal(found.status, expected.status)
     for name, value in expected.metrics.items():
-        np.testing.assert_allclose(
-            found.metrics[name], value, rtol=1e-7, atol=1e-9, err_msg=name
-        )
+        np.testing.assert_allclose(found.metrics[name], value, rtol=1e-7, atol=1e-9, err_msg=name)
     assert np.ptp(np.asarray(expected.metrics["rmse"])) > 1e-3
 
 
