@@ -51,8 +51,9 @@ PAGES: dict[str, tuple[str, str]] = {
     "testing": (
         "Checkers for user-written classes",
         (
-            "testing.check_law testing.check_barrier testing.check_observer testing.check_sensor"
-            " testing.check_actuator testing.check_robot testing.check_reference testing.check_side"
+            "testing.check_law testing.check_barrier testing.check_observer"
+            " testing.check_sensor testing.check_actuator testing.check_robot"
+            " testing.check_plant testing.check_reference testing.check_side"
             " testing.check_region testing.check_disturbance testing.check_fold"
             " testing.check_objective testing.ContractError"
         ),
@@ -64,6 +65,7 @@ FAMILIES = (
     "barriers",
     "observers",
     "robots",
+    "plants",
     "references",
     "bounds",
     "regions",

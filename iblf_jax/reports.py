@@ -23,9 +23,10 @@ import numpy as np
 from iblf_jax.core import checks, notices, tables
 from iblf_jax.core.optional import has_members
 from iblf_jax.core.pytree import wrapped_field
+from iblf_jax.core.units import as_text
 from iblf_jax.simulation.paths import get, parameters, unit_at
 from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.world.robots import joint_names
+from iblf_jax.world import plants
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -120,9 +121,34 @@ def _scenario(scenario: Scenario) -> Shown:
         figures["Reference and bounds"] = lambda: plotting.tube(scenario)
     rows = [(p.path, p.unit, _short(p.value)) for p in parameters(scenario, named=False)]
     leaves = tables.as_html(("path", "unit", "value"), rows)
-    words = [f"{scenario.n} joints: {', '.join(joint_names(scenario.plant, scenario.n))}"]
+    plant = scenario.plant
+    noun = plants.component_noun(plant)
+    words = [f"{scenario.n} {noun}s: {', '.join(plants.component_names(plant))}"]
+    if plants.is_chain(plant):
+        words.append(_levels_in_words(plant))
     content = {"Parts": _parts_of(scenario), "Parameters": leaves}
     return Shown("Scenario", words, content, figures, scenario)
+
+
+def _levels_in_words(plant: Any) -> str:
+    """The levels and the input of a plant in strict-feedback form, with their units."""
+    names = [*plants.level_names(plant), plants.input_name(plant)]
+    texts = [
+        f"{name} [{as_text(unit)}]"
+        for name, unit in zip(names, plants.units_of(plant), strict=True)
+    ]
+    return f"{plants.order_of(plant)} levels: {', '.join(texts[:-1])}; input: {texts[-1]}"
+
+
+def _entries(values: Any, n: int) -> list[str]:
+    """The columns of a metric: one number, or one for each of n components; the numbers of several
+    levels in one column are joined by "; ".
+    """
+    array = np.asarray(values)
+    if array.ndim < 2:
+        numbers = [f"{x:.4g}" for x in np.ravel(array)[:n]]
+        return numbers + [""] * (n - len(numbers))
+    return ["; ".join(f"{x:.4g}" for x in column) for column in array.T]
 
 
 def _rollout(run: Rollout) -> Shown:
@@ -132,15 +158,14 @@ def _rollout(run: Rollout) -> Shown:
         return Shown("Run", _described(run))
     rows = []
     for name, value in run.metrics.items():
-        entries = [f"{x:.4g}" for x in np.ravel(value)[: run.n]]
-        entries += [""] * (run.n - len(entries))
-        rows.append((name, run.metrics.units.get(name, ""), *entries))
-    table = tables.as_html(("metric", "unit", *joint_names(run.scenario.plant, run.n)), rows)
+        rows.append((name, run.metrics.units.get(name, ""), *_entries(value, run.n)))
+    plant = run.scenario.plant
+    table = tables.as_html(("metric", "unit", *plants.component_names(plant)), rows)
     figures: dict[str, Callable[[], Figure]] = {
-        "Positions": lambda: plotting.positions(run),
+        f"{plants.level_names(plant)[0].capitalize()}s": lambda: plotting.positions(run),
         "Overview": lambda: plotting.overview(run),
         "Relative errors": lambda: plotting.errors(run),
-        "Torques": lambda: plotting.torques(run),
+        f"{plants.input_name(plant).capitalize()}s": lambda: plotting.torques(run),
         "Uncertain terms": lambda: plotting.uncertain_terms(run),
     }
     return Shown("Run", _described(run), {"Metrics": table}, figures, run.scenario)

@@ -41,6 +41,11 @@ class Holder:
     actuator: object = ij.actuators.Ideal()
     regions: tuple = ()
 
+    @property
+    def model(self) -> object:
+        """The plant itself."""
+        return self.plant
+
 
 jax.tree_util.register_pytree_node(Holder, lambda holder: ((), holder), lambda holder, _: holder)
 

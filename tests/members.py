@@ -5,6 +5,7 @@ Whoever adds a member adds it here; `test_contracts.test_every_member_is_listed`
 
 from __future__ import annotations
 
+import jax.numpy as jnp
 from arm_cases import random_arm
 
 import iblf_jax as ij
@@ -15,6 +16,7 @@ from iblf_jax import (
     controllers,
     disturbances,
     observers,
+    plants,
     references,
     regions,
     robots,
@@ -43,6 +45,35 @@ ROBOTS = {
         payload=0.3,
     ),
     "arm": random_arm(3, seed=1, armature=0.1, payload=0.4),
+    "with_motors": robots.WithMotors(TWO_LINK, inertia=[0.02, 0.01], damping=0.1),
+}
+
+PLANTS = {
+    "rigid": plants.Rigid(TWO_LINK),
+    "driven_pendulum": ij.presets.motor_driven_pendulum().plant,
+    "electric_drive": plants.ElectricDrive(
+        TWO_LINK, torque_constant=[0.9, 0.5], inductance=0.025, resistance=5.0, back_emf=0.9
+    ),
+    "flexible_joint": plants.FlexibleJoint(
+        TWO_LINK, stiffness=[300.0, 200.0], motor_inertia=0.02, motor_damping=0.1
+    ),
+    "vessel": ij.presets.cybership_ii(),
+    "strict_feedback": plants.StrictFeedback(
+        drift=lambda t, x: jnp.stack([x[0] * x[0, ::-1], jnp.sin(x[0] * x[1]) - 0.2 * t]),
+        gain=lambda t, x: jnp.stack(
+            [jnp.diag(2.0 + x[0] ** 2), jnp.eye(2, dtype=x.dtype) + 0.1 * x[1, 0]]
+        ),
+        n=2,
+        order=2,
+        units=(("m", "rad"), "1/s", "N"),
+        component_names=("cart", "pole"),
+    ),
+    "strict_feedback_diagonal": plants.StrictFeedback(
+        drift=lambda t, x: jnp.stack([jnp.cos(x[0]), x[0] * x[1], -x[2]]),
+        gain=lambda t, x: jnp.stack([jnp.ones_like(x[0]), 2.0 + x[1] ** 2, jnp.exp(x[0])]),
+        n=1,
+        order=3,
+    ),
 }
 
 REFERENCES = {
@@ -50,6 +81,11 @@ REFERENCES = {
         offset=0.5, amplitude=[0.14, 0.1], frequency=1.0, phase=[0.0, 1.57]
     ),
     "quintic": references.Quintic(start=[0.1, 0.2], end=[0.8, -0.3], duration=3.0),
+    "smooth_step": references.SmoothStep(start=[0.1, 0.2], end=[0.8, -0.3], duration=3.0),
+    "ellipse": references.Ellipse(axes=(5.0, 3.0), frequency=0.4, centre=(1.0, -2.0)),
+    "waypoint_spline_smooth": references.WaypointSpline(
+        times=(0.0, 1.0, 2.5), waypoints=[[0.0, 0.1], [0.4, 0.3], [0.2, 0.8]], derivatives=4
+    ),
     "waypoint_spline": references.WaypointSpline(
         times=(0.0, 1.0, 2.5, 4.0), waypoints=[[0.0, 0.1], [0.4, 0.3], [0.2, 0.8], [0.5, 0.5]]
     ),
@@ -84,6 +120,7 @@ DISTURBANCES = {
     "sum": disturbances.Sum(
         (disturbances.Friction(viscous=0.1), disturbances.Step(size=1.0, time=2.0))
     ),
+    "levels": disturbances.Levels((None, disturbances.Step(size=1.0, time=2.0))),
     "sum_of_none": disturbances.Sum(()),
 }
 
@@ -108,6 +145,16 @@ OBSERVERS = {
     "extended_state_two_gains": observers.ExtendedState(l1=80.0, l2=[1600.0, 900.0]),
 }
 
+LEVEL_OBSERVERS = {
+    "level": observers.LevelObserver(gain=(0.0, [20.0, 10.0], 30.0), eta0=(0.0, 0.1, 0.2)),
+    "level_zero": observers.LevelObserver(gain=20.0, start="zero"),
+    "state_observer": observers.StateObserver(bandwidth=[40.0, 30.0], offset=(0.0, 0.1, 0.2, 0.0)),
+    "state_observer_two_encoders": observers.StateObserver(
+        bandwidth=40.0, measured=(1, 3), disturbance=False
+    ),
+}
+"""Observers of plants in strict-feedback form, some of more levels than a robot has."""
+
 VELOCITIES = {
     "measured": sensors.Measured(noise=[0.01, 0.02]),
     "filtered_difference": sensors.FilteredDifference(cutoff=[200.0, 300.0]),
@@ -121,6 +168,14 @@ SENSORS = {
         f"encoder_{name}": sensors.Encoder(counts=4096, offset=[0.1, 0.0], noise=1e-4, velocity=v)
         for name, v in VELOCITIES.items()
     },
+}
+
+SENSORS |= {
+    "levels": sensors.Levels((SENSORS["encoder_tracking"], sensors.Direct(noise=[0.1, 0.2]))),
+    "levels_encoders": sensors.Levels(
+        (SENSORS["encoder_filtered_difference"], SENSORS["encoder_measured"])
+    ),
+    "levels_unmeasured": sensors.Levels((sensors.Direct(resolution=1e-3, offset=0.1), None)),
 }
 
 ACTUATORS = {
@@ -193,6 +248,16 @@ LAWS = {
     ),
 }
 
+INPUT_MAPS = {
+    "with_drive": controllers.WithDrive(
+        law=controllers.PDGravity(Kp=60.0, Kd=20.0),
+        drive=plants.ElectricDrive(
+            TWO_LINK, torque_constant=[2.0, 1.5], inductance=0.02, resistance=1.0, back_emf=0.5
+        ),
+    ),
+}
+"""Laws that command another input than a torque, for a plant of their own."""
+
 OPTIONAL_FOLDS = (
     metrics.AboveGravity(),
     metrics.VelocityMargin(),
@@ -204,15 +269,16 @@ FOLDS = {type(fold).__name__: fold for fold in (*metrics.standard(), *OPTIONAL_F
 
 FAMILIES = {
     "robot": (ROBOTS, robots.MEMBERS, ij.testing.check_robot),
+    "plant": (PLANTS, plants.MEMBERS, ij.testing.check_plant),
     "reference": (REFERENCES, references.MEMBERS, ij.testing.check_reference),
     "side": (SIDES, bounds.MEMBERS, ij.testing.check_side),
     "region": (REGIONS, regions.MEMBERS, ij.testing.check_region),
     "disturbance": (DISTURBANCES, disturbances.MEMBERS, ij.testing.check_disturbance),
     "barrier": (BARRIERS, barriers.MEMBERS, ij.testing.check_barrier),
-    "observer": (OBSERVERS, observers.MEMBERS, ij.testing.check_observer),
+    "observer": (OBSERVERS | LEVEL_OBSERVERS, observers.MEMBERS, ij.testing.check_observer),
     "sensor": (SENSORS, sensors.MEMBERS, ij.testing.check_sensor),
     "actuator": (ACTUATORS, actuators.MEMBERS, ij.testing.check_actuator),
-    "law": (LAWS, controllers.MEMBERS, ij.testing.check_law),
+    "law": (LAWS | INPUT_MAPS, controllers.MEMBERS, ij.testing.check_law),
     "fold": (FOLDS, {cls.__name__: cls for cls in metrics.MEMBERS.values()}, ij.testing.check_fold),
 }
 """Family -> (instances by name, the package's registry, the checker)."""

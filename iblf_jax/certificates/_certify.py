@@ -1,4 +1,4 @@
-"""`certify`: checks one run, a batch of runs or a study against Theorem 2.
+"""`certify`: checks one run, a batch of runs or a study against Theorem 2, or against (S.3).
 
 `certify` checks what the caller passed and lists the runs. `_certificate_of` takes one run through
 its summary and its segments (`run_summary`, which runs the engine), the lines about them
@@ -16,16 +16,21 @@ import jax
 import numpy as np
 
 from iblf_jax.certificates import decay_lines, law_claim_lines, lines, rate_lines, theorem_lines
+from iblf_jax.certificates._level_certificate import (
+    heading_of,
+    level_certificate,
+    unclaimed_level_traces,
+)
 from iblf_jax.certificates.claims import own_claim
+from iblf_jax.certificates.level_terms import is_about_levels
 from iblf_jax.certificates.lines import FAILS, NOT_APPLICABLE, Line, Statement, not_applicable
 from iblf_jax.certificates.optional import optional_member
 from iblf_jax.certificates.reconstruction import is_valid, time_grid
-from iblf_jax.certificates.result import Certificate, Traces
+from iblf_jax.certificates.result import Certificate, LevelTraces, Traces
 from iblf_jax.certificates.run_summary import THEOREM, WEIGHTED, RunSummary, Segment, summarise
 from iblf_jax.control import actuators, sensors
 from iblf_jax.core import checks, notices
 from iblf_jax.core.optional import has_members
-from iblf_jax.core.pytree import unwrapped
 from iblf_jax.engine.simulate import SimulationWarning, simulate
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical, with_parts
@@ -36,7 +41,7 @@ MAX_RECORDED = 20_000
 reconstructed."""
 DEFAULT_WORST = 16
 """Runs of a study that are checked if the caller does not say how many."""
-SAMPLED = "the loop is sampled, and Theorem 2 is about a law that runs at every instant"
+SAMPLED = "the loop is sampled, and the claim is about a law that runs at every instant"
 MEASURED = "how far the sampled run is from the continuous one; no claim of the theorem"
 
 
@@ -50,9 +55,16 @@ def certify(
     method: str = "rk4",
     worst: int | None = DEFAULT_WORST,
 ) -> Certificate:
-    """Checks every inequality of Theorem 2 on a run, with margins.
+    """Checks every inequality of Theorem 2, or of (S.3), on a run, with margins.
 
         V2' + rho V2 - 1/2 |f'|^2 <= 0  at every step, and what follows from it       (3.17)-(3.31)
+
+    `controllers.BarrierBackstepping`, on a plant in strict-feedback form or on a robot, is checked
+    against the claim about V = sum w_i V_i, with d_tilde = d - d_hat of the run,
+
+        V' <= -sum w_i decay_i - sum c_i w_i |s_i|^2 + dV/dx . d_tilde + dV/dd_hat . d_hat'    (S.3)
+
+    and what follows from it: the decay of V and a bound on the error of every level.
 
     A law that states a Lyapunov function V of its own and its decay W (`controllers.LyapunovLaw`)
     is checked against
@@ -80,7 +92,8 @@ def certify(
         scenario, dt and method do not reproduce (or whose samples do not determine its number of
         steps), or arguments of the wrong kind.
 
-    Source: Zhang & Yan 2024, Theorem 2 and its proof, (3.16)-(3.31).
+    Source: Zhang & Yan 2024, Theorem 2 and its proof, (3.16)-(3.31); (S.3) as at the head of
+      `iblf_jax.certificates.level_terms`.
     """
     scenario = canonical(scenario)
     if not checks.is_concrete(scenario):
@@ -180,6 +193,8 @@ def _certificate_of(run: Rollout) -> Certificate:
     """The certificate of one run, its arrays on the host."""
     if run.scenario.sampling is not None:
         return _certificate_of_sampled(run)
+    if is_about_levels(run.scenario):
+        return level_certificate(run)
     summary, segments = summarise(run)
     checked: list[Line] = []
     weighted: list[Line] = []
@@ -193,7 +208,7 @@ def _certificate_of(run: Rollout) -> Certificate:
         for name, share in segment_shares.items():
             shares[name] = max(share, shares.get(name, 0.0))
         traces.append(_traces(segment))
-    by_name = _merged(checked)
+    by_name = lines.merged(checked)
     for name, share in shares.items():
         note = f"at most {100 * share:.3g} % of that margin at one instant"
         by_name[name] = dataclasses.replace(by_name[name], note=note)
@@ -204,35 +219,15 @@ def _certificate_of(run: Rollout) -> Certificate:
         *rate_lines.rate_lines(summary),
         *by_name.values(),
         *rate_lines.weighted_rate_lines(summary),
-        *_merged(weighted).values(),
+        *lines.merged(weighted).values(),
     )
     return Certificate(
-        _heading(run.scenario),
+        heading_of(run.scenario),
         all_lines,
         _numbers(summary),
         Traces(*map(np.concatenate, zip(*traces, strict=True))),
         joints=joint_names(run.scenario.plant, run.n),
     )
-
-
-def _merged(checked: list[Line]) -> dict[str, Line]:
-    """One line per name from those of all segments."""
-    by_name: dict[str, list[Line]] = {}
-    for line in checked:
-        by_name.setdefault(line.name, []).append(line)
-    return {name: lines.over_segments(same) for name, same in by_name.items()}
-
-
-def _heading(scenario: Scenario) -> str:
-    """Law, barrier, reading and observer, in words."""
-    law = unwrapped(scenario.controller)
-    barrier, reading = optional_member(law, "barrier"), optional_member(law, "reading")
-    parts = [type(law).__name__]
-    if barrier is not None:
-        parts.append(f"barrier {type(barrier).__name__}")
-    if reading:
-        parts.append(f"reading {reading}")
-    return ", ".join([*parts, f"observer {type(scenario.observer).__name__}"])
 
 
 def _numbers(summary: RunSummary) -> dict[str, Any]:
@@ -336,13 +331,19 @@ def _certificate_of_sampled(run: Rollout) -> Certificate:
         dataclasses.replace(line, verdict=NOT_APPLICABLE, note=SAMPLED, **cleared)
         for line in certificate.lines
     )
-    return Certificate(
-        _heading(scenario),
-        (*unclaimed, *_compared(run, continuous)),
-        certificate.numbers,
-        _unclaimed_traces(run.t, run.V, run.xi, run.e2, run.disturbance - run.disturbance_estimate),
-        joints=joint_names(scenario.plant, run.n),
+    return dataclasses.replace(
+        certificate,
+        lines=(*unclaimed, *_compared(run, continuous)),
+        traces=_traces_without_claim(run),
     )
+
+
+def _traces_without_claim(run: Rollout) -> Traces | LevelTraces:
+    """The curves of a run of which nothing is claimed."""
+    if is_about_levels(run.scenario):
+        return unclaimed_level_traces(run)
+    f_tilde = run.disturbance - run.disturbance_estimate
+    return _unclaimed_traces(run.t, run.V, run.xi, run.e2, f_tilde)
 
 
 def _compared(run: Rollout, continuous: Rollout) -> tuple[Line, Line]:
@@ -399,14 +400,11 @@ def _over_runs(runs: Iterable[tuple[int, Rollout]]) -> Certificate:
     if worst is None:
         raise checks.fail("run", "no runs", "at least one run")
     _, worst_index, certificate = worst
-    return Certificate(
-        certificate.heading,
-        tuple(lines.over_runs(same, invalid) for same in by_name.values()),
-        certificate.numbers,
-        certificate.traces,
-        tuple(indices),
-        certificate.joints,
-        worst_index,
+    return dataclasses.replace(
+        certificate,
+        lines=tuple(lines.over_runs(same, invalid) for same in by_name.values()),
+        runs=tuple(indices),
+        worst_run=worst_index,
     )
 
 

@@ -13,6 +13,12 @@ claim itself, (3.18) and (3.26) for every rho > 0: V2 grows where the theorem cl
 law and observer as printed such starts exist, because the terms that the proof drops grow with the
 cube of the joint velocity, and Q with its square.
 
+For `controllers.BarrierBackstepping` g compares both sides of (S.3) in the same way,
+
+    g = (V' - T) / Q,   Q = sum w_i decay_i + sum c_i w_i |s_i|^2
+
+with V = sum w_i V_i, and g is -1 for barriers that decay exactly, at most -1 for the others.
+
 Points at which the scenario cannot run (a start outside its bounds, a negative mass), or at which
 nothing is claimed (the guard or a torque limit is active), are no counterexamples and are skipped.
 """
@@ -28,6 +34,8 @@ import numpy as np
 
 from iblf_jax.certificates import claims
 from iblf_jax.certificates.eigenvalues import maximise
+from iblf_jax.certificates.level_summary import why_no_level_claim
+from iblf_jax.certificates.level_terms import is_about_levels, level_terms_at
 from iblf_jax.certificates.proof_terms import terms_at
 from iblf_jax.control.controllers import Backstepping
 from iblf_jax.core import checks
@@ -48,15 +56,21 @@ class Counterexample(NamedTuple):
     parameters: dict[str, np.ndarray]
     """Path -> value."""
     growth: float
-    """g, largest found; at most -1 where the proof is exact, positive where V2 grows against the
-    claim."""
+    """The largest g that was found; at most -1 where the proof is exact, positive where V2 grows
+    against the claim."""
 
 
 def _growth(scenario: Scenario) -> tuple[jax.Array, jax.Array]:
-    """The growth g = (V2' - 1/2 |f'|^2) / Q at the start of a scenario, (), and whether the claim
-    excludes the start.                                                                   (3.24)
+    """The growth g at the start of a scenario, (), and whether the claim excludes the start.
+    (3.24), (S.3)
     """
-    proof = terms_at(scenario, jnp.zeros((), scenario.initial.q.dtype), initial_state(scenario))
+    t, state = jnp.zeros((), scenario.initial.q.dtype), initial_state(scenario)
+    if is_about_levels(scenario):
+        terms = level_terms_at(scenario, t, state)
+        claim = terms.claim
+        growth = claim.dV - claim.disturbance_terms - claim.lag
+        return growth / (claim.decay + claim.by_slopes), terms.excluded
+    proof = terms_at(scenario, t, state)
     constants: Any = claims.constants_of(scenario)
     M0 = scenario.model.mass_matrix(scenario.initial.q)
     V1 = proof.V - 0.5 * (proof.e2 @ (M0 @ proof.e2) + proof.f_tilde @ proof.f_tilde)
@@ -77,7 +91,7 @@ def counterexample(
     """Maximises V2' - 1/2 |f'|^2, relative to the -Q of the proof, over starts and gains.    (3.24)
 
     Args:
-      scenario: a scenario about which Theorem 2 makes a claim.
+      scenario: a scenario about which Theorem 2 or (S.3) makes a claim.
       perturbations: path -> `factor`, `offset` or `value` of a bounded distribution, as in
         `ij.falsify`: what varies, and in which range; inadmissible points (a start outside its
         bounds) are skipped.
@@ -107,14 +121,22 @@ def counterexample(
 
 
 def _check_claimed(scenario: Scenario) -> None:
-    """Raises ValueError for a scenario about which Theorem 2 makes no claim."""
+    """Raises ValueError for a scenario about which neither Theorem 2 nor (S.3) makes a claim."""
+    reason = _why_unclaimed(scenario)
+    if reason:
+        got = type(scenario.controller).__name__
+        raise checks.fail("scenario", got, "a scenario with a claim", f"{reason}.")
+
+
+def _why_unclaimed(scenario: Scenario) -> str:
+    """Why the search has no claim to break, in words; "" if it has one."""
+    if is_about_levels(scenario):
+        return why_no_level_claim(scenario)
     law = unwrapped(scenario.controller)
     reason = claims.why_no_theorem(scenario)
     if not reason and not isinstance(law, Backstepping):
         reason = f"Q is Theorem 2's; {type(law).__name__} has a claim of its own"
-    if reason:
-        got = type(scenario.controller).__name__
-        raise checks.fail("scenario", got, "a scenario with a claim", f"{reason}.")
+    return reason
 
 
 class _Search:

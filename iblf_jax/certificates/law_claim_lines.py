@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from iblf_jax.certificates.decay_lines import check_steps
+from iblf_jax.certificates.level_terms import LEVEL_TERMS, is_about_levels
 from iblf_jax.certificates.lines import (
     OWN_INEQUALITY,
     Line,
@@ -17,7 +18,6 @@ from iblf_jax.certificates.optional import optional_member
 from iblf_jax.certificates.proof_terms import GENERAL_TERMS
 from iblf_jax.certificates.run_summary import (
     ALWAYS_EXCLUDED,
-    RunSummary,
     Segment,
 )
 from iblf_jax.control.actuators import Ideal
@@ -27,7 +27,7 @@ OWN_ROUNDING = 8.0
 """Relative errors of the derivatives of a law's own V, in those of their terms."""
 
 
-def why_not_own(summary: RunSummary) -> str:
+def why_not_own(summary: Any) -> str:
     """Why the law's claim about itself does not apply to a run; "" if it does."""
     actuator = summary.run.scenario.actuator
     if not isinstance(actuator, Ideal):
@@ -50,7 +50,8 @@ def own_segment_lines(segment: Segment) -> list[Line]:
         return []
     own = proof.own
     states_terms = optional_member(law, "disturbance_terms") is not None
-    right_side = "what the law states" if states_terms else GENERAL_TERMS
+    general = LEVEL_TERMS if is_about_levels(summary.run.scenario) else GENERAL_TERMS
+    right_side = "what the law states" if states_terms else general
     decay = "W >= 0: the decay that the law states"
     inequality = f"V' <= -W + T,  T: {right_side}"
     # Near 0, V and W are differences of numbers as large as their largest values.

@@ -194,6 +194,14 @@ def over_segments(same: list[Line]) -> Line:
     return dataclasses.replace(worst, value=max(values))
 
 
+def merged(checked: list[Line]) -> dict[str, Line]:
+    """One line per name from those of all segments of a run."""
+    by_name: dict[str, list[Line]] = {}
+    for line in checked:
+        by_name.setdefault(line.name, []).append(line)
+    return {name: over_segments(same) for name, same in by_name.items()}
+
+
 def over_runs(same: list[Line], invalid_runs: list[int]) -> Line:
     """One line from those of many runs: the worst, with the number of runs in which it fails or is
     not claimed.

@@ -44,11 +44,13 @@ from iblf_jax.control.controllers import Backstepping, FullState
 from iblf_jax.control.observers import Printed
 from iblf_jax.core.linalg import matvec, solve_spd
 from iblf_jax.core.pytree import unwrapped
+from iblf_jax.core.time import as_at
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, rate
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import Sample
+from iblf_jax.world import plants
 from iblf_jax.world.bounds import NARROWEST
-from iblf_jax.world.robots import at_time, friction_torque, mass_matrix_rate
+from iblf_jax.world.robots import friction_torque, mass_matrix_rate
 
 DECAY_ROUNDING = 2.0
 """Error of V2' in units of the last place, relative to the sizes of its terms; the largest that
@@ -178,7 +180,7 @@ def terms_and_sample(
     f_tilde = now["disturbance"] - now["disturbance_estimate"]
     dropped_e2, dropped_f = _dropped_terms(scenario, dM0, state.dq, now["e2"], f_tilde)
     dV_size, sqrt_V_size = _term_sizes(scenario, t, state, M0, now, rates, f_tilde)
-    plant_is_model = _are_equal(at_time(scenario.plant, t), scenario.model)
+    plant_is_model = _are_equal(as_at(scenario.plant, t), scenario.model)
     proof = {
         "V": now["V"],
         "dV": rates["V"],
@@ -215,9 +217,12 @@ def _signals(scenario: Scenario, t: jax.Array, state: LoopState):
     barrier_slope = jnp.zeros_like(state.q)
     if isinstance(law, Backstepping | FullState):
         barrier_slope = law.weight * law.barrier.slope(scenario.context.tube(t), state.q)
-    plant = at_time(scenario.plant, t)
     # All of f where the plant is the model: the torques besides that of the law.
-    disturbance = scenario.disturbance.torque(t, state.q, state.dq, plant, scenario.model)
+    external = jnp.zeros_like(state.q)
+    robot = plants.robot_of(as_at(scenario.plant, t))
+    if robot is not None:
+        external = scenario.disturbance.torque(t, state.q, state.dq, robot, scenario.model)
+        external += friction_torque(robot, state.dq)
     signals = {
         "V": sample.V,
         "disturbance": sample.disturbance,
@@ -229,7 +234,7 @@ def _signals(scenario: Scenario, t: jax.Array, state: LoopState):
         "dq_d": sample.dq_d,
         "ddq": state_rate.dq,
         "s": barrier_slope,
-        "external": disturbance + friction_torque(plant, state.dq),
+        "external": external,
     }
     return signals, sample
 

@@ -16,7 +16,7 @@ This is the only module of the package that runs the engine step by step. It wor
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any, ClassVar, NamedTuple
 
@@ -24,6 +24,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.certificates.level_terms import is_about_levels, level_terms_and_sample
 from iblf_jax.certificates.proof_terms import ProofTerms, mass_over_gain, terms_and_sample
 from iblf_jax.core import checks
 from iblf_jax.core.optional import attributes
@@ -32,6 +33,7 @@ from iblf_jax.engine import step_states
 from iblf_jax.simulation import discontinuities
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
 from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.world import plants
 
 BLOCK_STEPS = 1024
 """Steps in a block: memory does not grow with the length of a run, and one program serves every
@@ -43,8 +45,11 @@ STATES = (
     ("dq", "dq", "speed"),
     ("controller", "controller_state", "torque"),
     ("observer", "observer_state", "torque"),
+    ("higher", "higher", "speed"),
 )
 """Field of `LoopState`, name of the recorded signal, and kind of its tolerance."""
+OWN_UNITS = ("controller", "observer", "higher")
+"""Fields with units of their own, hence with their own scale if it is larger."""
 
 
 class TimeGrid(NamedTuple):
@@ -65,7 +70,7 @@ class Steps(NamedTuple):
     sample: Any
     """`Sample` at each step."""
     proof: Any
-    """`ProofTerms` at each step."""
+    """`ProofTerms`, or `LevelTerms`, at each step."""
     recorded: np.ndarray
     """Whether the run recorded the step, bool."""
     defect: np.ndarray
@@ -125,7 +130,14 @@ def steps_of(run: Any, grid: TimeGrid) -> Iterator[Steps]:
 
 def _recorded_states(run: Any) -> LoopState:
     """The states at the recorded samples."""
-    return LoopState(run.q, run.dq, run.controller_state, run.observer_state, run.actuator_state)
+    return LoopState(
+        run.q,
+        run.dq,
+        run.controller_state,
+        run.observer_state,
+        run.actuator_state,
+        higher=run.higher,
+    )
 
 
 def _rows(tree: Any, rows: Any) -> Any:
@@ -193,11 +205,14 @@ class Position(NamedTuple):
 class ObserveStep:
     """A step of the engine that keeps its position and records the proof terms there."""
 
+    terms: Callable = terms_and_sample
+    """Function of a scenario, a time and a state."""
+
     is_derivative: ClassVar[bool] = True
 
     def __call__(self, inputs, at: Position, index: jax.Array, form):
-        """The position, and its `terms_and_sample`."""
-        return at, terms_and_sample(inputs.scenario, at.steps * at.size, at.state)
+        """The position, and its terms."""
+        return at, self.terms(inputs.scenario, at.steps * at.size, at.state)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -273,22 +288,35 @@ def proof_along(
       dt, method: of the run.
 
     Returns:
-      `ProofTerms`, `Sample`, and the errors of the integrator in V2 and in |f_tilde|^2/2 over one
-      step, on the host; (T, ...) each.
+      `ProofTerms`, or `LevelTerms` for a law that receives the levels; `Sample`; and the errors of
+      the integrator in V2 and in |f_tilde|^2/2 over one step, on the host; (T, ...) each.
     """
     full, halves = (_positions(index, states, dt, substeps) for substeps in (1, 2))
-    found = step_states(scenario, dt, full, step=ObserveStep())[1]
     # One step is compared with two half steps, because the envelopes are compared with a run in
     # which V2 has fallen below what the integrator resolves. Both are advanced three times, so that
     # they are one call of one program.
     both = jax.tree.map(lambda *xs: np.concatenate(xs), full, halves)
     energies = step_states(scenario, dt, both, step=AdvanceStep(method), steps=3)[1][1]
+    proof, sample = _terms_along(scenario, dt, full)
+    defect, defect_f = map(_defect, energies)
+    if is_about_levels(scenario) and not plants.is_chain(scenario.model):
+        # V of a robot's sample includes |f_tilde|^2/2, which the sum of w_i V_i does not.
+        defect = defect + defect_f
+    return proof, sample, defect, defect_f
+
+
+def _terms_along(scenario: Scenario, dt: jax.Array, at: Position) -> tuple[Any, Any]:
+    """Terms and samples at some positions, on the host; (T, ...) each."""
+    if is_about_levels(scenario):
+        found = step_states(scenario, dt, at, step=ObserveStep(level_terms_and_sample))[1]
+        return jax.tree.map(lambda x: np.asarray(x)[:, 0], found)  # type: ignore[no-any-return]
+    found = step_states(scenario, dt, at, step=ObserveStep())[1]
     terms: dict[str, Any]
     terms, M0, sample = jax.tree.map(lambda x: np.asarray(x)[:, 0], found)
     eigenvalues = _eigenvalues(M0)
     terms["lambda_min"], terms["lambda_max"] = eigenvalues[:, 0], eigenvalues[:, -1]
     terms["mu"] = 1.0 / _eigenvalues(np.asarray(mass_over_gain(scenario, M0)))[:, -1]
-    return ProofTerms(**terms), sample, *map(_defect, energies)
+    return ProofTerms(**terms), sample
 
 
 def _eigenvalues(matrices: np.ndarray) -> np.ndarray:
@@ -340,8 +368,7 @@ def _check_arrival(
         leaves = (jax.tree.leaves(expected[field]), jax.tree.leaves(reached[field]))
         for kept, made in zip(*leaves, strict=True):
             tolerance = sizes[kind]
-            if label.endswith("state"):
-                # A state of law or observer has its own unit, hence its own scale if larger.
+            if field in OWN_UNITS:
                 own = np.max(np.abs(kept), initial=0.0)
                 tolerance = max(tolerance, np.sqrt(np.finfo(kept.dtype).eps) * own)
             _compare(run, label, kept, made, rows, tolerance)

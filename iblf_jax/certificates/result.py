@@ -56,9 +56,42 @@ class Traces(NamedTuple):
         raise AttributeError(name)
 
 
+class LevelTraces(NamedTuple):
+    """The curves of `Certificate.plot` for a plant in strict-feedback form, at the T recorded
+    samples of one run; NaN where nothing is claimed.
+    """
+
+    t: np.ndarray
+    V: np.ndarray
+    """sum w_i V_i."""
+    envelope: np.ndarray
+    """Right-hand side of (S.4)."""
+    left: np.ndarray
+    """The left less the right side of (S.3) [1/s]."""
+    disturbance_terms: np.ndarray
+    """T of (S.3), with the lag of filters [1/s]."""
+    error: np.ndarray
+    """Xi of levels with bounds, e_i of the others, (T, r, n)."""
+    error_bound: np.ndarray
+    """Bounds on |error| by the envelope, (T, r, n)."""
+    d_tilde: np.ndarray
+    """|d_tilde_i|, (T, r)."""
+    excluded: np.ndarray
+    """bool: the claim excludes this sample."""
+
+
+class LevelLabel(NamedTuple):
+    """A level of a plant in words."""
+
+    name: str
+    unit: str
+    """Of the errors; the units of the components if they differ."""
+    is_bounded: bool
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Certificate:
-    """Theorem 2, inequality by inequality, for one run or for many.  `holds`, `lines`,
+    """Theorem 2, or (S.3), inequality by inequality, for one run or for many.  `holds`, `lines`,
     `cert["inequality, case 2"]`, `plot()`.
     """
 
@@ -67,7 +100,7 @@ class Certificate:
     lines: tuple[Line, ...]
     numbers: dict[str, Any]
     """The constants of the claim: rho, rho2, lambda_min, lambda_max, V2(0), F_d, F_m, the case."""
-    traces: Traces
+    traces: Traces | LevelTraces
     """Of the run, or of the worst of many."""
     runs: tuple[int, ...] = ()
     """The runs that were checked, if there were many."""
@@ -76,6 +109,10 @@ class Certificate:
     worst_run: int | None = None
     """The run whose inequality has the smallest margin (or fails), if there were many; the traces
     are those of this run."""
+    claim: str = "the paper's theorem"
+    """The claim that the lines are about, besides one that the law states about itself."""
+    levels: tuple[LevelLabel, ...] = ()
+    """The levels of a plant in strict-feedback form, of which `traces` are `LevelTraces` then."""
 
     @property
     def verdict(self) -> str:
@@ -156,9 +193,9 @@ class Certificate:
         count = sum(map(len, reasons.values()))
         if count == 0:
             return ""
-        subject = f"{count} lines of the paper's theorem do not apply"
+        subject = f"{count} lines of {self.claim} do not apply"
         if count == 1:
-            subject = "1 line of the paper's theorem does not apply"
+            subject = f"1 line of {self.claim} does not apply"
         if len(reasons) == 1:
             return f"{subject}, because {next(iter(reasons))}."
         parts = [f"{_listed(names)}, because {reason}" for reason, names in reasons.items()]

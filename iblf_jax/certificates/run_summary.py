@@ -18,7 +18,7 @@ again, so that memory stays bounded.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -192,8 +192,8 @@ class Envelope(NamedTuple):
 class Segment(NamedTuple):
     """Consecutive steps of a run, and the envelopes along them."""
 
-    summary: RunSummary
-    """Of the whole run."""
+    summary: Any
+    """Of the whole run, a `RunSummary` or a `LevelSummary`."""
     t: np.ndarray
     sample: Any
     proof: Any
@@ -204,12 +204,21 @@ class Segment(NamedTuple):
 
 def summarise(run: Any) -> tuple[RunSummary, Iterator[Segment]]:
     """The summary of one run, its arrays on the host, and its segments in order."""
+    return in_two_passes(run, _summary)
+
+
+def in_two_passes(
+    run: Any, summary_of: Callable[[Any, TimeGrid, Iterable[Steps]], Any]
+) -> tuple[Any, Iterator[Segment]]:
+    """The summary of one run that a function makes from all its steps, and its segments in
+    order.
+    """
     grid = time_grid(run)
     if grid.last <= KEPT_STEPS:
         kept = list(steps_of(run, grid))
-        summary = _summary(run, grid, kept)
+        summary = summary_of(run, grid, kept)
         return summary, _segments(summary, kept)
-    summary = _summary(run, grid, steps_of(run, grid))
+    summary = summary_of(run, grid, steps_of(run, grid))
     return summary, _segments(summary, steps_of(run, grid))
 
 
@@ -343,7 +352,7 @@ class _Anchor(NamedTuple):
     """Error of the integrator since then, at the first step of the next segment."""
 
 
-def _segments(summary: RunSummary, all_steps: Iterable[Steps]) -> Iterator[Segment]:
+def _segments(summary: Any, all_steps: Iterable[Steps]) -> Iterator[Segment]:
     """The segments, with the envelopes that run through them."""
     decays = summary.decays
     anchors: dict[tuple[str, int], _Anchor] = {}

@@ -83,10 +83,10 @@ def _assumptions(segment: Segment) -> list[Line]:
     if not has(summary.run, "slack"):
         # A safety filter keeps its bounds for any reference, so its status does not show whether
         # the reference is inside them.
-        reference = _with_status(summary, reference, Status.INFEASIBLE_REFERENCE)
+        reference = with_status(summary, reference, Status.INFEASIBLE_REFERENCE)
     lines = [
-        _finite(BOUNDED, segment.t, np.linalg.norm(proof.f, axis=1)),
-        _finite(RATE_BOUNDED, segment.t, df_norm, jump_note),
+        finite(BOUNDED, segment.t, np.linalg.norm(proof.f, axis=1)),
+        finite(RATE_BOUNDED, segment.t, df_norm, jump_note),
         reference,
     ]
     if segment.t[0] == 0:
@@ -95,7 +95,7 @@ def _assumptions(segment: Segment) -> list[Line]:
     return lines
 
 
-def _finite(statement: Statement, t: np.ndarray, values: np.ndarray, note: str = "") -> Line:
+def finite(statement: Statement, t: np.ndarray, values: np.ndarray, note: str = "") -> Line:
     """The line of a quantity that must be finite at every step, with its largest value."""
     at = int(np.argmax(np.nan_to_num(values, nan=np.inf)))
     verdict = verdict_of(bool(np.all(np.isfinite(values))))
@@ -106,14 +106,14 @@ def _velocity_assumptions(segment: Segment) -> list[Line]:
     """The assumptions on the virtual velocity and on the velocity at the start."""
     sample = segment.sample
     alpha = check_smallest(ALPHA_INSIDE, segment.t, segment.proof.full.alpha_distance)
-    lines = [_with_status(segment.summary, alpha, Status.ALPHA_INFEASIBLE)]
+    lines = [with_status(segment.summary, alpha, Status.ALPHA_INFEASIBLE)]
     if segment.t[0] == 0:
         start = np.minimum(sample.dq - sample.dq_lower, sample.dq_upper - sample.dq)[:1]
         lines.append(check_smallest(START_SPEED_INSIDE, segment.t, start))
     return lines
 
 
-def _with_status(summary: RunSummary, line: Line, flag: Status) -> Line:
+def with_status(summary: RunSummary, line: Line, flag: Status) -> Line:
     """A line about something that the run's status reports, too: the verdict is that of the status,
     which covers every step of the run itself.
     """
@@ -207,15 +207,15 @@ def _joints_inside(segment: Segment) -> Line:
     summary = segment.summary
     statement = Statement("joints inside", "(I), (II)", "|xi_i| < 1: -k_l < e1 < k_u")
     line = check_smallest(statement, segment.t, 1.0 - np.abs(segment.sample.xi))
-    line = _with_status(summary, line, Status.BOUND_VIOLATED)
+    line = with_status(summary, line, Status.BOUND_VIOLATED)
     case = summary.theorem_case
     if case is None and summary.weights_replace_theorem:
         case = summary.weighted_case
     if case is None:
-        return _observed_only(line, summary.why_not(THEOREM, summary.case))
+        return observed_only(line, summary.why_not(THEOREM, summary.case))
     scenario, first = summary.run.scenario, segment.proof.V[:1]
     if xi_bound(scenario, segment.t[:1], first) is None:
-        return _observed_only(line, NO_BOUND)
+        return observed_only(line, NO_BOUND)
     return line
 
 
@@ -225,12 +225,12 @@ def _velocities_inside(segment: Segment) -> Line:
     statement = Statement("velocities inside", "(F.3)", "v_l < q' < v_u", "rad/s")
     distance = np.minimum(sample.dq - sample.dq_lower, sample.dq_upper - sample.dq)
     line = check_smallest(statement, segment.t, distance)
-    line = _with_status(summary, line, Status.VELOCITY_VIOLATED)
+    line = with_status(summary, line, Status.VELOCITY_VIOLATED)
     if summary.theorem_case is None:
-        return _observed_only(line, summary.why_not(THEOREM, summary.case))
+        return observed_only(line, summary.why_not(THEOREM, summary.case))
     return line
 
 
-def _observed_only(line: Line, reason: str) -> Line:
+def observed_only(line: Line, reason: str) -> Line:
     """A line that no claim covers."""
     return dataclasses.replace(line, verdict=NOT_APPLICABLE, note=f"{OBSERVED_ONLY}{reason})")

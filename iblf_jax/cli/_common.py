@@ -223,24 +223,32 @@ def number(value: Any) -> str:
     return f"{value:.4g}"
 
 
+NUMBERED = tuple(f"violation_{what}" for what in ("joint", "region", "level", "component"))
+"""Ends of the names of metrics that are a number of something, -1 for none."""
+
+
 def metrics_table(runs: Mapping[str, Rollout]) -> str:
     """Metrics of runs side by side, one column per joint, with units."""
     from iblf_jax.core import tables
-    from iblf_jax.simulation.signals import PER_REGION
-    from iblf_jax.world.robots import joint_names
+    from iblf_jax.simulation.signals import PER_HIGHER_LEVEL, PER_LEVEL, PER_REGION
+    from iblf_jax.world import plants
 
     first = next(iter(runs.values()))
     n = first.n
-    rows = [["metric", "unit", *joint_names(first.scenario.plant, n) * len(runs)]]
+    rows = [["metric", "unit", *plants.component_names(first.scenario.plant) * len(runs)]]
     for name, unit in first.metrics.units.items():
         values = [np.ravel(run.metrics[name]) for run in runs.values()]
-        if name.endswith(("violation_joint", "violation_region")):
+        if name.endswith(NUMBERED):
             values = [np.where(x < 0, np.nan, x) for x in values]  # -1: no violation
-        lines = {name: values}
+        lines, units = {name: values}, {name: unit}
+        if values[0].size > n and name in (*PER_LEVEL, *PER_HIGHER_LEVEL):
+            rows_of = range(values[0].size // n)
+            lines = {f"{name}[{i}]": [x[i * n : (i + 1) * n] for x in values] for i in rows_of}
+            units = dict(zip(lines, unit.split("; "), strict=False))
         if name in PER_REGION:  # one row per region: there can be more regions than joints
             lines = {f"{name}[{i}]": [x[i : i + 1] for x in values] for i in range(values[0].size)}
         for label, numbers in lines.items():
-            row = [label, unit]
+            row = [label, units.get(label, unit)]
             for x in numbers:
                 row += _padded(map(number, x), n)
             rows.append(row)

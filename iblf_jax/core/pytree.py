@@ -35,9 +35,12 @@ Leaf: TypeAlias = Any
 """Type of a field declared with `leaf`: a number, a list or an array when a person writes it, a
 `jax.Array` from then on."""
 
-component_member = OptionalMembers(wraps=None, rows=MappingProxyType({}), leaf_units=dict)
+component_member = OptionalMembers(
+    wraps=None, rows=MappingProxyType({}), stacked=MappingProxyType({}), leaf_units=dict
+)
 """Reads what a component may declare: the field that holds a wrapped component, rows with names,
-and a function of the units of leaves that depend on other fields."""
+names for several leaves as the rows of one array, and a function of the units of leaves that depend
+on other fields."""
 
 
 def leaf(

@@ -8,6 +8,7 @@ end.
 from __future__ import annotations
 
 import enum
+from collections.abc import Mapping
 
 import jax.numpy as jnp
 
@@ -120,9 +121,20 @@ WORDS = {
 """The text of each flag, in the order in which `describe` lists them."""
 
 
-def describe(status: int) -> str:
-    """The flags of one run in words, "ok" if there is none."""
-    words = [text for flag, text in WORDS.items() if int(status) & flag]
+WORDS_OF_LEVELS = WORDS | {
+    Status.TORQUE_SATURATED: "the input was saturated",
+    Status.VELOCITY_VIOLATED: "a bound of the second level was violated",
+    Status.INACCURATE: (
+        "the components of the first level are inaccurate: the time step is too large"
+    ),
+    Status.ALPHA_INFEASIBLE: "a virtual control left the bounds of its level",
+}
+"""The text of each flag for plants in strict-feedback form."""
+
+
+def describe(status: int, texts: Mapping[Status, str] = WORDS) -> str:
+    """The flags of one run in words, "ok" if there is none; `texts` are those of each flag."""
+    words = [text for flag, text in texts.items() if int(status) & flag]
     return "; ".join(words) or "ok"
 
 

@@ -411,7 +411,7 @@ def _rollout(
         scenario=scenario,
         controller_state=states.controller,
         observer_state=states.observer,
-        metrics=Metrics(results, metric_units(folds)),
+        metrics=Metrics(results, metric_units(folds, scenario)),
         status=jnp.int32(status),
         fastest_mode=jnp.full_like(step_size, jnp.nan),
         dt=step_size,

@@ -6,25 +6,30 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.control.barriers import Quadratic
 from iblf_jax.control.controllers._base import law_member
 from iblf_jax.core import checks, notices
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import FAILED, Status, describe
+from iblf_jax.core.units import POSITION, VELOCITY
 from iblf_jax.engine.limiting_term import limiting_term
 from iblf_jax.engine.step_size import comfortable_dt, find_dt
 from iblf_jax.simulation.error_estimate import ERROR, RELATIVE, TOLERANCE
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.results import Rollout
+from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import has
 from iblf_jax.simulation.stability import RADIUS, THIRD_SIZE
-from iblf_jax.world.bounds import tube_at
+from iblf_jax.simulation.units import status_words, unit_text
+from iblf_jax.world import plants
+from iblf_jax.world.bounds import NARROWEST, tube_at
 from iblf_jax.world.regions import in_words
-from iblf_jax.world.robots import joint_names
 
 REPORTED = (
     Status.INACCURATE
@@ -51,7 +56,8 @@ def report(result: Rollout, steps: int, throw: bool) -> None:
         raise _infeasible(result, steps)
     failed = status & FAILED
     reported = failed | status & REPORTED
-    if law_member(unwrapped(result.scenario.controller), "needs_velocity_bounds"):
+    law = unwrapped(result.scenario.controller)
+    if law_member(law, "needs_velocity_bounds") or law_member(law, "receives_x"):
         reported |= status & Status.ALPHA_INFEASIBLE
     if not reported:
         return
@@ -61,7 +67,12 @@ def report(result: Rollout, steps: int, throw: bool) -> None:
     explained = status
     if not reported & Status.ALPHA_INFEASIBLE:
         explained &= ~Status.ALPHA_INFEASIBLE
-    text = " ".join([f"{heading}: {describe(reported)}.", *_explanations(result, explained, steps)])
+    text = " ".join(
+        [
+            f"{heading}: {describe(reported, status_words(result.scenario))}.",
+            *_explanations(result, explained, steps),
+        ]
+    )
     if throw and failed:
         raise SimulationError(text)
     notices.warn(text, SimulationWarning)
@@ -70,8 +81,13 @@ def report(result: Rollout, steps: int, throw: bool) -> None:
 def _explanations(result: Rollout, status: Status, steps: int) -> list[str]:
     """The explanations of the flags of a status that have one."""
     texts = [text(result) for flag, text in BOUND_EXPLANATIONS.items() if status & flag]
+    singular = ""
+    if status & (Status.SINGULAR_GAIN | Status.NOT_FINITE):
+        singular = _singular_gain(result)
     if status & Status.STEP_TOO_LARGE:
         texts.append(_unstable_step(result))
+    elif singular:
+        texts.append(singular)
     elif status & Status.NOT_FINITE and np.isfinite(result.fastest_mode):
         texts.append(
             "The step was small enough for the fastest mode: look at the gains, the start and the"
@@ -83,14 +99,123 @@ def _explanations(result: Rollout, status: Status, steps: int) -> list[str]:
     return [text for text in texts if text]
 
 
-def _joint_violation(bounds: str, prefix: str, margin: str, unit: str, result: Rollout) -> str:
-    """Which joint violated its bounds first; `prefix` and `margin` are names of metrics."""
-    metrics = result.metrics
+def _joint_violation(
+    level: int, bounds: str, prefix: str, margin: str, unit: str, result: Rollout
+) -> str:
+    """Which joint violated the bounds of its first or second level first; `prefix` and `margin` are
+    names of metrics.
+    """
+    metrics, scenario = result.metrics, result.scenario
     if f"{prefix}_time" not in metrics:
         return ""
     joint = int(metrics[f"{prefix}_joint"])
+    text = unit_text(scenario, unit, joint)
     what = f"{_joint_in_words(result, joint)} left its {bounds} first"
-    return _first_violation(what, metrics[f"{prefix}_time"], metrics[margin][joint], unit)
+    if plants.is_chain(scenario.plant):
+        what = f"{_level_in_words(scenario, level, joint)} left its bounds first"
+    found = _first_violation(what, metrics[f"{prefix}_time"], metrics[margin][joint], text)
+    if plants.is_chain(scenario.plant) and level > 1:
+        return f"{found} {_level_remedy(scenario, level)}"
+    return found
+
+
+def _higher_level_violation(result: Rollout) -> str:
+    """Which level from the third on violated its bounds first."""
+    metrics, scenario = result.metrics, result.scenario
+    if "first_level_violation_time" not in metrics:
+        return ""
+    level = int(metrics["first_level_violation_level"])
+    joint = int(metrics["first_level_violation_component"])
+    what = f"{_level_in_words(scenario, level, joint)} left its bounds first"
+    margin = metrics["level_margin"][level - 3, joint]
+    unit = unit_text(scenario, plants.units_of(scenario.plant)[level - 1], joint)
+    found = _first_violation(what, metrics["first_level_violation_time"], margin, unit)
+    return f"{found} {_level_remedy(scenario, level)}"
+
+
+def _level_in_words(scenario: Scenario, level: int, joint: int) -> str:
+    """One component of a level, counted from 1, with their names."""
+    name = _level_name(scenario, level).capitalize()
+    return f"{name} of {plants.component_names(scenario.plant)[joint]}"
+
+
+def _level_name(scenario: Scenario, level: int) -> str:
+    """A level by its number, from 1, and by its name if it has one."""
+    name = plants.level_names(scenario.plant)[level - 1]
+    return name if name == f"level {level}" else f"level {level} ({name})"
+
+
+def _level_remedy(scenario: Scenario, level: int) -> str:
+    """How the bounds of a level above the first can be kept, in words."""
+    law = unwrapped(scenario.controller)
+    field = f"state_bounds[{level - 2}]"
+    if not law_member(law, "receives_x"):
+        return (
+            f"{type(law).__name__} knows no bounds of that level; controllers.BarrierBackstepping"
+            " keeps them."
+        )
+    barriers = law_member(law, "barriers")
+    if level <= len(barriers) and isinstance(barriers[level - 1], Quadratic):
+        return (
+            "The law has barriers.Quadratic() on that level, which keeps no bounds: give it"
+            " barriers.Mapping() there."
+        )
+    return (
+        f"Widen {field}, start nearer to the virtual control, reduce the disturbances or take a"
+        " smaller dt."
+    )
+
+
+def _singular_gain(result: Rollout) -> str:
+    """Which gain is singular where a run ends, in words; empty if none is."""
+    scenario = result.scenario
+    model: Any = scenario.model
+    if not plants.is_chain(model):
+        return ""
+    x, t = np.asarray(result.x)[:, : model.order], np.asarray(result.t)
+    at = _last_valid_sample(result)
+    ahead = range(EXAMINED_AHEAD + 1)
+    states = [x[0], *[x[at] + k * (x[at] - x[max(at - 1, 0)]) for k in ahead]]
+    times = [t[0], *[t[at]] * len(ahead)]
+    smallest = np.array([_smallest_gains(model, *each) for each in zip(times, states, strict=True)])
+    worst = np.min(smallest[1:] / smallest[0], axis=0)
+    level = int(np.argmin(worst)) + 1
+    if not worst[level - 1] < NEARLY_SINGULAR:
+        return ""
+    name = _level_name(scenario, level)
+    state = np.array2string(x[at].ravel(), precision=4, threshold=8)
+    return (
+        f"At t = {t[at]:.4g} s the gain of {name} is singular, or nearly so, at or"
+        f" next to x = {state}, so that the law's input has no value: bound the levels so that they"
+        " stay away from that state, or change the reference or the start."
+    )
+
+
+def _last_valid_sample(result: Rollout) -> int:
+    """The index of the last recorded sample at which the state still moved and the input was
+    finite.
+    """
+    x, tau = np.asarray(result.x), np.asarray(result.tau)
+    moved = np.any(np.diff(x, axis=0) != 0, axis=(1, 2))
+    valid = np.flatnonzero(np.append(True, moved) & np.isfinite(tau).all(axis=-1))
+    return int(valid[-1]) if valid.size else 0
+
+
+def _smallest_gains(model: Any, t: Any, x: np.ndarray) -> np.ndarray:
+    """The smallest singular value of the gain of each level, 0 where it is not finite, (order,)."""
+    found = []
+    for gain in np.asarray(model.gain(jnp.asarray(t), jnp.asarray(x))):
+        matrix = np.diag(gain) if gain.ndim == 1 else gain
+        finite = bool(np.all(np.isfinite(matrix)))
+        found.append(np.linalg.norm(matrix, -2) if finite else 0.0)
+    return np.array(found)
+
+
+EXAMINED_AHEAD = 3
+"""Recorded samples by which the motion is continued beyond the last valid one."""
+NEARLY_SINGULAR = 1e-3
+"""A gain counts as nearly singular where its smallest singular value is below this share of that
+at the start."""
 
 
 def _region_violation(result: Rollout) -> str:
@@ -98,7 +223,8 @@ def _region_violation(result: Rollout) -> str:
     if "first_region_violation_time" not in metrics:
         return ""
     i = int(metrics["first_region_violation_region"])
-    region = in_words(result.scenario.regions[i], result.scenario.plant)
+    robot = plants.robot_of(result.scenario.plant)
+    region = in_words(result.scenario.regions[i], robot)
     return _first_violation(
         f"regions[{i}]: {region} crossed its boundary",
         metrics["first_region_violation_time"],
@@ -126,10 +252,18 @@ def _infinite_slope(result: Rollout) -> str:
         "At an isolated instant the derivative of the closed loop with respect to a state is"
         " infinite or nearly so, as that of |e2|^a sign(e2) with a < 1 is with respect to e2 ="
         " q' - alpha where e2 = 0, or that of sharp dry friction at a reversal. That is no"
-        f" fast mode, so the time step is assessed by differences of {THIRD_SIZE:g} rad/s there."
+        f" fast mode, so the time step is assessed by differences of {THIRD_SIZE:g}"
+        f" {_unit_of_differences(result.scenario)} there."
         " Derivatives of the run are not reliable; replace such a power by e2 (e2^2 +"
         " delta^2)^((a - 1)/2) with a small delta."
     )
+
+
+def _unit_of_differences(scenario: Scenario) -> str:
+    """The unit of a difference of the state, in words."""
+    if plants.is_chain(scenario.plant):
+        return "(in the unit of each level)"
+    return "rad/s"
 
 
 def _sampling_too_slow(result: Rollout) -> str:
@@ -152,6 +286,8 @@ def _filter_infeasible(result: Rollout) -> str:
 
 
 def _alpha_infeasible(result: Rollout) -> str:
+    if plants.is_chain(result.scenario.plant):
+        return _alphas_infeasible(result)
     worst = "at some time"
     if "alpha_margin" in result.metrics:
         worst = f"by up to {-float(np.min(result.metrics['alpha_margin'])):.3g} rad/s"
@@ -162,6 +298,57 @@ def _alpha_infeasible(result: Rollout) -> str:
     )
 
 
+def _alphas_infeasible(result: Rollout) -> str:
+    """Which virtual controls left the bounds of the levels that they are for, and by how much."""
+    scenario = result.scenario
+    found = []
+    for level in range(2, plants.order_of(scenario.plant) + 1):
+        margin = _alpha_margin(result, level)
+        if margin is None or np.min(margin) > NARROWEST:
+            continue
+        joint = int(np.argmin(margin))
+        unit = unit_text(scenario, plants.units_of(scenario.plant)[level - 1], joint)
+        found.append(
+            f"Alpha_{level - 1}, the virtual control for level {level}, left the bounds by up to"
+            f" {-margin[joint]:.3g} {unit}{_first_time_outside(result, level)}:"
+            f" {_level_in_words(scenario, level, joint)} cannot follow it inside them."
+        )
+    if not found:
+        found.append("A virtual control left the bounds of the level that it is for.")
+    found.append(
+        "As for a reference outside its bounds (Assumption 2), nothing is claimed there. Start"
+        " nearer to the reference, slow it down, widen state_bounds or lower controller.k of the"
+        " levels below."
+    )
+    return " ".join(found)
+
+
+def _alpha_margin(result: Rollout, level: int) -> np.ndarray | None:
+    """The smallest distance of a level's virtual control to the bounds of the level, (n,); None
+    where the run has no such metric.
+    """
+    if level == 2 and "alpha_margin" in result.metrics:
+        return np.asarray(result.metrics["alpha_margin"])
+    if level > 2 and "level_alpha_margin" in result.metrics:
+        return np.asarray(result.metrics["level_alpha_margin"])[level - 3]
+    return None
+
+
+def _first_time_outside(result: Rollout, level: int) -> str:
+    """When a virtual control is outside the bounds of its level first, among the recorded
+    samples, in words; empty if it is inside at all of them.
+    """
+    alpha, lower, upper = result.alpha, result.dq_lower, result.dq_upper
+    if level > 2:
+        i = level - 3
+        alpha = result.higher[:, i] - result.e_higher[:, i]
+        lower, upper = result.higher_lower[:, i], result.higher_upper[:, i]
+    outside = np.any(np.minimum(alpha - lower, upper - alpha) <= 0, axis=-1)
+    if not outside.any():
+        return ""
+    return f", first at t = {float(result.t[int(np.argmax(outside))]):.4g} s"
+
+
 def _guard_stayed(result: Rollout) -> str:
     return (
         "While the guard is active the barrier is softer than the requested one: what ran there is"
@@ -170,10 +357,18 @@ def _guard_stayed(result: Rollout) -> str:
 
 
 BOUND_EXPLANATIONS: dict[Status, Callable[[Rollout], str]] = {
-    Status.BOUND_VIOLATED: partial(_joint_violation, "bounds", "first_violation", "margin", "rad"),
-    Status.VELOCITY_VIOLATED: partial(
-        _joint_violation, "velocity bounds", "first_velocity_violation", "velocity_margin", "rad/s"
+    Status.BOUND_VIOLATED: partial(
+        _joint_violation, 1, "bounds", "first_violation", "margin", POSITION
     ),
+    Status.VELOCITY_VIOLATED: partial(
+        _joint_violation,
+        2,
+        "velocity bounds",
+        "first_velocity_violation",
+        "velocity_margin",
+        VELOCITY,
+    ),
+    Status.STATE_BOUND_VIOLATED: _higher_level_violation,
     Status.REGION_VIOLATED: _region_violation,
 }
 """The explanation of each flag of a violated bound."""
@@ -189,11 +384,13 @@ LOOP_EXPLANATIONS: dict[Status, Callable[[Rollout], str]] = {
 
 def _inaccurate(result: Rollout, status: Status, steps: int) -> str:
     """The estimated error of a run, and the remedy."""
-    error = float(np.max(result.metrics[ERROR]))
+    errors = np.asarray(result.metrics[ERROR])
+    worst = int(np.argmax(errors))
+    unit = unit_text(result.scenario, POSITION, worst)
     relative = float(np.max(result.metrics[RELATIVE]))
     estimate = (
-        f"Their error is estimated at {error:.2g} rad, {100 * relative:.2g} % of the tube, where"
-        f" {100 * TOLERANCE:g} % are tolerated"
+        f"Their error is estimated at {errors[worst]:.2g} {unit}, {100 * relative:.2g} % of the"
+        f" tube, where {100 * TOLERANCE:g} % are tolerated"
     )
     if status & Status.SAMPLING_TOO_SLOW:
         return (
@@ -231,10 +428,11 @@ def _alternative_remedy(result: Rollout) -> str:
 
 def _joint_in_words(result: Rollout, joint: int) -> str:
     """A joint by its number, and by its name if it has one."""
-    name = joint_names(result.scenario.plant, result.n)[joint]
-    if name == f"joint {joint}":
-        return f"Joint {joint}"
-    return f"Joint {joint} ({name})"
+    plant = result.scenario.plant
+    name, noun = plants.component_names(plant)[joint], plants.component_noun(plant)
+    if name == f"{noun} {joint}":
+        return name.capitalize()
+    return f"{noun.capitalize()} {joint} ({name})"
 
 
 def _infeasible(result: Rollout, steps: int) -> ValueError:
@@ -246,7 +444,7 @@ def _infeasible(result: Rollout, steps: int) -> ValueError:
     sample, joint = np.unravel_index(np.argmin(np.minimum(q_d - lower, upper - q_d)), q_d.shape)
     where = f"t = {float(times[sample]):.4g} s"
     return checks.fail(
-        f"reference of {joint_names(result.scenario.plant, result.n)[joint]}",
+        f"reference of {plants.component_names(result.scenario.plant)[joint]}",
         float(q_d[sample, joint]),
         f"a value inside the bounds ({float(lower[sample, joint]):.6g},"
         f" {float(upper[sample, joint]):.6g}) at {where}",

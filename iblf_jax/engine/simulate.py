@@ -135,7 +135,7 @@ def run_rollout(
         scenario=scenario,
         controller_state=controller_state,
         observer_state=observer_state,
-        metrics=Metrics(outcome.metrics, metric_units(folds)),
+        metrics=Metrics(outcome.metrics, metric_units(folds, scenario)),
         status=outcome.status,
         fastest_mode=outcome.fastest_mode,
         dt=dt,

@@ -57,6 +57,17 @@ def _level_flags(sample: Sample) -> jax.Array:
     )
 
 
+def has_no_input(slope: LoopState) -> jax.Array:
+    """Whether the input of a plant in strict-feedback form is not finite, by the rates of its
+    levels: only that of the last level contains the input, () bool.
+    """
+    rates = [slope.q, slope.dq]
+    if not isinstance(slope.higher, tuple):
+        rates += list(slope.higher)
+    *others, last = (jnp.all(jnp.isfinite(rate)) for rate in rates)
+    return jnp.all(jnp.stack(others)) & ~last
+
+
 def is_valid(state: LoopState, limit: float) -> jax.Array:
     """Whether a state is finite, and its second level below a limit, () bool."""
     slow = jnp.all(jnp.abs(state.dq) < limit)

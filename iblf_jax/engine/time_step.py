@@ -29,7 +29,7 @@ from iblf_jax.core.status import Status, flag
 from iblf_jax.engine.carry import Carry, Inputs, Nearest, StepOptions, keep_if
 from iblf_jax.engine.metric_folds import begun_at, updated, weighed
 from iblf_jax.engine.request import RunRequest
-from iblf_jax.engine.status_flags import is_valid, sample_status
+from iblf_jax.engine.status_flags import has_no_input, is_valid, sample_status
 from iblf_jax.engine.step_pieces import MetricSample, across_jumps, integrated, later_pieces
 from iblf_jax.engine.step_start import continuous_start, sampled_start
 from iblf_jax.simulation import discontinuities, error_estimate
@@ -191,6 +191,10 @@ def _concluded(
     limit = plants.speed_limit(inputs.scenario.plant)
     valid = is_valid(after, limit) & (status & int(Status.NOT_FINITE) == 0)
     status |= flag(~valid & goes_on, Status.NOT_FINITE)
+    if plants.is_chain(inputs.scenario.plant):
+        stages = [slope for _, slopes in parts for slope in slopes]
+        lost = jnp.any(jnp.stack([has_no_input(slope) for slope in stages]))
+        status |= flag(lost & goes_on, Status.SINGULAR_GAIN)
     return keep_if(valid & goes_on, after, before), status, nearest, estimate
 
 

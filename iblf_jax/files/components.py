@@ -48,6 +48,7 @@ FAMILIES: dict[Any, tuple[str, dict[str, Any]]] = {
     barriers.Barrier: ("barriers", barriers.MEMBERS),
     observers.Observer: ("observers", observers.MEMBERS),
     sensors.Sensor: ("sensors", sensors.MEMBERS),
+    sensors.Part: ("sensors", sensors.MEMBERS | sensors.LEVELS),
     sensors.Velocity: ("sensors", sensors.VELOCITIES),
     actuators.Actuator: ("actuators", actuators.MEMBERS),
 }

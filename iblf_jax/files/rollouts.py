@@ -37,6 +37,8 @@ from iblf_jax.files.values import Words
 from iblf_jax.simulation.paths import parameters
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.signals import SIGNALS, dimension_names
+from iblf_jax.simulation.units import signal_meanings, signal_unit, status_words
+from iblf_jax.world import plants
 
 if TYPE_CHECKING:
     import xarray
@@ -65,8 +67,10 @@ def rollout_to_xarray(run: Rollout) -> xarray.Dataset:
 
     Returns:
       A Dataset with the dimensions time (T), joint (n), region if the scenario has regions, and run
-      (B) first for a batch.  Its variables are the Rollout's fields and metrics, each with `units`
-      and `description`.  A metric with the name of another variable is called `metric_<name>`.
+      (B) first for a batch; for plants in strict-feedback form level (r) and higher_level (r - 2,
+      the levels from the third on).  Its variables are the Rollout's fields and metrics, each with
+      `units` and `description`.  A metric with the name of another variable is called
+      `metric_<name>`.
 
     Raises:
       ValueError: not a Rollout, or a traced one.
@@ -88,7 +92,7 @@ def rollout_to_xarray(run: Rollout) -> xarray.Dataset:
         variables[label] = (dims, np.asarray(value), attrs)
     variables |= _status_variables(run, batch)
     varying, attrs = _parameters(run, batch)
-    coordinates: dict[str, Any] = {"joint": _index("joint", run.n)}
+    coordinates = _components_and_levels(run, variables)
     if len(batch) == 1:
         coordinates["run"] = _index("run", len(run))
     coordinates["time"], more = _time(run, batch)
@@ -171,6 +175,24 @@ def _index(name: str, size: int) -> tuple[str, np.ndarray, dict[str, str]]:
     return name, np.arange(size, dtype=np.int32), _attrs("1", f"{name}, from 0")
 
 
+def _components_and_levels(run: Rollout, variables: Mapping[str, Any]) -> dict[str, Any]:
+    """The coordinates of the components and, for plants in strict-feedback form, of the levels."""
+    plant = run.scenario.plant
+    found: dict[str, Any] = {"joint": _index("joint", run.n)}
+    if not plants.is_chain(plant):
+        return found
+    names = ", ".join(plants.component_names(plant))
+    found["joint"][2]["description"] = f"component of a level, from 0: {names}"
+    levels = plants.level_names(plant)
+    used = {dimension for dims, *_ in variables.values() for dimension in dims}
+    for dimension, first in (("level", 1), ("higher_level", 3)):
+        if dimension in used:
+            numbers = np.arange(first, len(levels) + 1, dtype=np.int32)
+            text = f"level of the plant, from {first}: {', '.join(levels[first - 1 :])}"
+            found[dimension] = (dimension, numbers, _attrs("1", text))
+    return found
+
+
 def _batch_dims(run: Rollout) -> tuple[str, ...]:
     depth = np.ndim(run.status)
     if depth == 1:
@@ -186,9 +208,10 @@ def _trajectories(run: Rollout, batch: tuple[str, ...]) -> dict[str, Any]:
         dims = (*batch, "time", *dimension_names(name, np.shape(value)[len(batch) + 1 :], run.n))
         variables[name] = (dims, np.asarray(value), _attrs(unit, description))
 
+    meanings = signal_meanings(run.scenario)
     for name, value in attributes(run, SIGNALS).items():
         if name != "t" and not isinstance(value, tuple):  # The scenario has such a signal.
-            add(name, value, SIGNALS[name].unit, SIGNALS[name].meaning)
+            add(name, value, signal_unit(run.scenario, name), meanings[name])
     for state, tree in attributes(run, STATES).items():
         for keys, value in jax.tree_util.tree_leaves_with_path(tree):
             name = re.sub(r"\W+", "_", state + jax.tree_util.keystr(keys)).strip("_")
@@ -203,7 +226,8 @@ def _status_variables(run: Rollout, batch: tuple[str, ...]) -> dict[str, Any]:
     attrs: dict[str, Any] = _attrs("1", "bit flags; 0 is ok")
     attrs["flag_masks"] = np.array([int(f) for f in flags], np.int32)
     attrs["flag_meanings"] = " ".join(f.name.lower() for f in flags if f.name)
-    described = {value: describe(value) for value in np.unique(status).tolist()}
+    texts = status_words(run.scenario)
+    described = {value: describe(value, texts) for value in np.unique(status).tolist()}
     words = np.vectorize(described.get, otypes=[str])(status)
     fastest = _attrs("1/s", "largest measured mode of the closed loop")
     return {
@@ -247,7 +271,7 @@ def _parameters(run: Rollout, batch: tuple[str, ...]) -> tuple[dict[str, Any], d
         "jax_version": jax.__version__,
     }
     if not batch:
-        attrs["status"] = describe(int(run.status))
+        attrs["status"] = describe(int(run.status), status_words(run.scenario))
         try:
             attrs["scenario"] = scenario_to_toml(run.scenario)
         except ValueError as error:

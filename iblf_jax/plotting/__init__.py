@@ -12,6 +12,7 @@ select one run of a batch first.
 
 from iblf_jax.plotting._figures import errors as errors
 from iblf_jax.plotting._figures import joint as joint
+from iblf_jax.plotting._figures import levels as levels
 from iblf_jax.plotting._figures import paper_figures as paper_figures
 from iblf_jax.plotting._figures import phase_portrait as phase_portrait
 from iblf_jax.plotting._figures import positions as positions

@@ -21,7 +21,9 @@ from matplotlib.artist import Artist
 from iblf_jax.core import checks
 from iblf_jax.plotting import _style
 from iblf_jax.plotting._curves import Curve, joint_labels
-from iblf_jax.plotting._workspace import draw_boundaries, set_limits, skeletons
+from iblf_jax.plotting._panels import quantity_of
+from iblf_jax.plotting._workspace import draw_boundaries, has_outline, set_limits, skeletons
+from iblf_jax.world import plants
 
 FAN_POINTS = 13
 FAN_RADIUS = 0.42
@@ -35,7 +37,9 @@ class Motion:
     q: np.ndarray
     """(F, n) [rad]."""
     skeleton: np.ndarray
-    """(F, n + 1, d) [m]."""
+    """(F, n + 1, d) [m], or the closed outline of another plant, (F, k + 1, 2) [m]."""
+    motors: np.ndarray | None = None
+    """Positions of the motors of flexible joints, (F, n) [rad]; None for other plants."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +54,8 @@ class ReferenceMotion:
     desired: np.ndarray
     """Skeleton of the reference, (F, n + 1, d) [m]."""
     fans: np.ndarray
-    """Outline of each joint's fan, (F, n, FAN_POINTS + 2, d) [m]."""
+    """Outline of each joint's fan, (F, n, FAN_POINTS + 2, d) [m]; (F, 0) for a plant that is drawn
+    by its outline."""
 
 
 def _fans(robot: Any, q: jax.Array, lower: jax.Array, upper: jax.Array) -> jax.Array:
@@ -78,16 +83,27 @@ def motions_of(curves: Sequence[Curve], t: np.ndarray) -> tuple[ReferenceMotion,
     motions: list[Motion] = []
     for curve in curves:
         q = curve.at("q", t)
-        motions.append(Motion(q, skeletons(curve.run.scenario.plant, q)))
+        plant = curve.run.scenario.plant
+        motions.append(Motion(q, skeletons(plant, q), _motors(curve, t)))
         shape = motions[-1].skeleton.shape[1:]
         if shape != motions[0].skeleton.shape[1:]:
             expected = "points in the plane or in space, the same for all runs"
             raise checks.fail("plant.skeleton(q)", shape, expected)
-    robot = first.run.scenario.plant
+    plant = first.run.scenario.plant
     q_d, lower, upper = (first.at(field, t) for field in ("q_d", "lower", "upper"))
-    desired = skeletons(robot, q_d)
+    desired = skeletons(plant, q_d)
+    if has_outline(plant):
+        return ReferenceMotion(t, q_d, lower, upper, desired, np.zeros((len(t), 0))), motions
+    robot = plants.robot_of(plant)
     fans = jax.jit(jax.vmap(lambda *args: _fans(robot, *args)))(motions[0].q, lower, upper)
     return ReferenceMotion(t, q_d, lower, upper, desired, np.asarray(fans)), motions
+
+
+def _motors(curve: Curve, t: np.ndarray) -> np.ndarray | None:
+    """The positions of the motors at the times t [s], of a plant with flexible joints."""
+    if isinstance(curve.run.scenario.plant, plants.FlexibleJoint):
+        return curve.at("level_3", t)
+    return None
 
 
 def _set_points(line: Any, points: np.ndarray) -> None:
@@ -115,15 +131,19 @@ class Scene:
         self.parts: list[tuple[Any, Artist]] = []
 
         self.dots: list[Any] = []
+        self.motors: dict[int, Any] = {}
         points = np.concatenate([target.desired, *(motion.skeleton for motion in motions)])
         scenario = curves[0].run.scenario
         limits = set_limits(self.arm, points, scenario.regions)
-        draw_boundaries(self.arm, scenario.plant, scenario.regions, limits)
+        draw_boundaries(self.arm, plants.robot_of(scenario.plant), scenario.regions, limits)
         self._add_fans()
         self._add_arms(curves)
         self._add_bars(curves)
         self.time = self._animated(self.bars.text(0.0, 1.03, "t = ", transform=self.bars.transAxes))
-        _style.set_title(self.figure, "The arm within its joint limits", curves)
+        title = "The arm within its joint limits"
+        if has_outline(scenario.plant):
+            title = "The plant and its reference"
+        _style.set_title(self.figure, title, curves)
         _style.legend_below(self.figure, 4)
 
     def _animated(self, artist: Any) -> Any:
@@ -146,8 +166,9 @@ class Scene:
         return self._animated(area)
 
     def _add_fans(self) -> None:
-        self.fans = [self._fan() for _ in range(self.target.q_d.shape[1])]
-        self.fans[0].set_label("joint limits")
+        self.fans = [self._fan() for _ in range(self.target.fans.shape[1])]
+        if self.fans:
+            self.fans[0].set_label("joint limits")
 
     def _add_arms(self, curves: Sequence[Curve]) -> None:
         path = {"linewidth": 0.8, "color": _style.blend(0.533)}
@@ -159,8 +180,11 @@ class Scene:
             self._line(self.arm, color=_style.colour(i), linewidth=0.9) for i in range(len(curves))
         ]
         style = {"linewidth": 2.6, "marker": "o", "markersize": 5}
+        name = "arm"
+        if has_outline(curves[0].run.scenario.plant):
+            name, style["marker"] = "plant", ""
         self.arms = [
-            self._line(self.arm, label=curve.name or "arm", **style, **_style.series(i))
+            self._line(self.arm, label=curve.name or name, **style, **_style.series(i))
             for i, curve in enumerate(curves)
         ]
 
@@ -172,7 +196,7 @@ class Scene:
         self.bars.set(
             xlim=(shown.min() - room, shown.max() + room),
             ylim=(len(rows) - 0.4, -0.6),
-            xlabel=_style.label("position $q$", "rad"),
+            xlabel=quantity_of(curves[0].run.scenario, "q").label,
         )
         self.bars.set_yticks(rows, joint_labels(curves[0].run.scenario.plant, len(rows)))
         self.bars.spines["left"].set_visible(False)
@@ -185,10 +209,14 @@ class Scene:
         style: dict[str, Any] = {"linestyle": "none", "marker": "|", "markersize": width + 3}
         style |= {"color": _style.text_colour(), "markeredgewidth": 1.6}
         self.desired = self._line(self.bars, **style)
-        for i in range(len(curves)):
+        for i, curve in enumerate(curves):
             style = {"linestyle": "none", "marker": "oDs^v"[i % 5], "color": _style.colour(i)}
             style["markersize"] = max(3.0, min(5.5, width / len(curves)))
             self.dots.append(self._line(self.bars, **style))
+            if self.motions[i].motors is not None:
+                hollow = style | {"markerfacecolor": "none", "markersize": style["markersize"] + 4}
+                label = f"{curve.name} motor".strip()
+                self.motors[i] = self._line(self.bars, label=label, **hollow)
 
     def move_to(self, frame: int) -> list[tuple[Any, Artist]]:
         """Moves every part to its place in a frame; returns (axes, part) in the order of
@@ -202,6 +230,7 @@ class Scene:
                 fan.set_xy(outline)
             else:
                 _set_points(fan, outline)
+        for joint in range(len(rows)):
             ends = [target.lower[frame, joint], target.upper[frame, joint]]
             self.ranges[joint].set_data(ends, [joint, joint])
         _set_points(self.reference, target.desired[frame])
@@ -211,6 +240,10 @@ class Scene:
             _set_points(self.arms[i], motion.skeleton[frame])
             _set_points(self.trails[i], motion.skeleton[: frame + 1, -1])
             q = np.clip(motion.q[frame], *self.bars.get_xlim())
-            self.dots[i].set_data(q, rows + 0.14 * (i - middle))
+            heights = rows + 0.14 * (i - middle)
+            self.dots[i].set_data(q, heights)
+            if motion.motors is not None:
+                motors = np.clip(motion.motors[frame], *self.bars.get_xlim())
+                self.motors[i].set_data(motors, heights)
         self.time.set_text(f"t = {target.t[frame]:.2f} s")
         return self.parts

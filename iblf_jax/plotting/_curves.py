@@ -6,7 +6,8 @@ loses no peak: every interval of the time axis keeps its first, lowest and highe
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +19,8 @@ from iblf_jax.core import checks
 from iblf_jax.core.optional import attributes
 from iblf_jax.core.status import FAILED, Status, describe
 from iblf_jax.simulation.results import Rollout
+from iblf_jax.simulation.units import status_words
+from iblf_jax.world import plants
 from iblf_jax.world.robots import joint_names
 
 POINTS = 2400
@@ -38,8 +41,35 @@ DERIVED = {
 """Signals computed from those of a Rollout: the bounds -k_l and k_u of e1, the bounds of xi, the
 error f - f_hat, the measurements, and the boundary of a region."""
 
+LEVEL_SIGNAL = re.compile(r"level_(\d+)(?:_(\w+))?")
+"""A signal of one level, counted from 1: "level_3" is x_3; `LEVEL_PARTS` has the others."""
+
+LEVEL_PARTS: dict[str | None, Callable[[Rollout, int], Any]] = {
+    None: lambda run, i: run.x[:, i],
+    "lower": lambda run, i: _row(run.higher_lower, i - 2),
+    "upper": lambda run, i: _row(run.higher_upper, i - 2),
+    "alpha": lambda run, i: _row(run.higher, i - 2) - _row(run.e_higher, i - 2),
+    "d": lambda run, i: _row(run.disturbance, i),
+    "estimate": lambda run, i: _row(run.disturbance_estimate, i),
+    "estimate_error": (lambda run, i: _row(run.disturbance, i) - _row(run.disturbance_estimate, i)),
+}
+"""Part of the name of a signal of a level -> the signal, (T, n), given the index of the level from
+0: the level, its bounds (from the third level on), the virtual control that it follows, and its
+disturbance with estimate and error."""
+
+
+def _row(values: Any, i: int) -> np.ndarray:
+    """One row of a signal (T, m, n) with infinite entries as NaN; NaN for a run without it."""
+    if isinstance(values, tuple):
+        return np.full((1, 1), np.nan)
+    row = np.asarray(values)[:, i]
+    return np.where(np.isfinite(row), row, np.nan)
+
+
 SAMPLED = {"tau", "alpha", "disturbance_estimate", "measured_q", "measured_dq"}
 """Signals that are constant between the samples of a sampled law."""
+SAMPLED_PARTS = {"alpha", "estimate"}
+"""Parts of `LEVEL_PARTS` that are constant between the samples of a sampled law."""
 
 EXTERNAL = {
     "t",
@@ -56,6 +86,9 @@ EXTERNAL = {
     "region_boundary",
 }
 """Signals that do not depend on the state; figures draw them to the end of a failed run too."""
+
+NEGLIGIBLE = 1e-6
+"""A disturbance below this share of the largest rate of its level is not shown."""
 
 SAME_SIGNAL = 0.03
 """Signals that differ by less than this fraction of their range are drawn once for all runs."""
@@ -76,7 +109,11 @@ class Curve:
     """Number of samples before the state was frozen."""
 
     def __getitem__(self, field: str) -> np.ndarray:
-        if field in DERIVED:
+        level = LEVEL_SIGNAL.fullmatch(field)
+        if level is not None:
+            values = LEVEL_PARTS[level[2]](self.run, int(level[1]) - 1)
+            values = np.broadcast_to(values, self.run.q.shape)
+        elif field in DERIVED:
             values = DERIVED[field](self.run)
         else:
             values = attributes(self.run, [field])[field]
@@ -105,9 +142,11 @@ class Curve:
         actuator is ideal.
         """
         scenario = self.run.scenario
+        level = LEVEL_SIGNAL.fullmatch(field)
+        is_of_law = field in SAMPLED if level is None else level[2] in SAMPLED_PARTS
         return (
             scenario.sampling is not None
-            and field in SAMPLED
+            and is_of_law
             and (field != "tau" or isinstance(scenario.actuator, IdealActuator))
         )
 
@@ -134,7 +173,23 @@ class Curve:
     @property
     def status(self) -> str:
         """The run's status flags in words."""
-        return describe(int(self.run.status))
+        return describe(int(self.run.status), status_words(self.run.scenario))
+
+    def disturbed_levels(self) -> list[int]:
+        """The levels of a model in strict-feedback form, counted from 1, with a disturbance, or an
+        estimate of one, that is more than the rounding of the levels' rates.
+        """
+        scenario = self.run.scenario
+        if not plants.is_chain(scenario.model):
+            return []
+        found = []
+        steps = np.diff(self.t[: self.samples])
+        for level in range(1, plants.order_of(scenario.model) + 1):
+            sizes = [self[f"level_{level}_{part}"] for part in ("d", "estimate")]
+            rates = np.diff(self[f"level_{level}"], axis=0) / steps[:, None]
+            if np.nanmax(np.abs(sizes)) > NEGLIGIBLE * np.nanmax(np.abs(rates), initial=0.0):
+                found.append(level)
+        return found
 
     def joint_label(self, joint: int) -> str:
         """The label of a joint in a figure."""
@@ -146,6 +201,9 @@ class Curve:
         """
         lower, upper = self["lower"][: self.samples], self["upper"][: self.samples]
         inside = ((lower < self["q"]) & (self["q"] < upper)).all(axis=1)
+        for level in range(3, plants.order_of(self.run.scenario.plant) + 1):
+            x, low, high = (self[f"level_{level}{part}"] for part in ("", "_lower", "_upper"))
+            inside &= ~((x <= low) | (x >= high)).any(axis=1)
         if self.has_regions:
             inside &= (self["region_margin"] > 0).all(axis=1)
         outside = np.flatnonzero(~inside)
@@ -157,7 +215,11 @@ class Curve:
 
 
 def joint_labels(robot: Any, n: int) -> list[str]:
-    """The labels of a robot's joints: the names in the robot's file, if it has names."""
+    """The labels of a robot's joints: the names in the robot's file, if it has names; or of the
+    components of a plant.
+    """
+    if plants.is_chain(robot):
+        return [escaped(name) for name in plants.component_names(robot)]
     return [escaped(name) for name in joint_names(robot, n)]
 
 
@@ -230,11 +292,12 @@ def check_joint(curves: Sequence[Curve], joint: Any, field: str = "joint") -> in
       ValueError: the robot has no such joint.
     """
     n = curves[0].run.n
-    names = joint_names(curves[0].run.scenario.plant, n)
+    plant = curves[0].run.scenario.plant
+    names = plants.component_names(plant)
     if isinstance(joint, str) and joint in names:
         return names.index(joint)
     if isinstance(joint, bool) or not isinstance(joint, int | np.integer) or not 0 <= joint < n:
-        raise checks.fail(field, joint, f"a joint, 0 to {n - 1}")
+        raise checks.fail(field, joint, f"a {plants.component_noun(plant)}, 0 to {n - 1}")
     return int(joint)
 
 

@@ -25,14 +25,17 @@ from iblf_jax.plotting._panels import (
     QUANTITIES,
     PanelQuantity,
     Window,
+    disturbance_quantity,
+    level_quantity,
+    quantity_of,
     run_style,
     show,
     transient_end,
 )
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.world import plants
 from iblf_jax.world.regions import in_words
-from iblf_jax.world.robots import joint_names
 
 Runs = Rollout | Mapping[str, Rollout]
 
@@ -114,17 +117,29 @@ def _outline(main: Axes, inset: Axes) -> None:
 def _every_joint(title: str, runs: Runs, field: str, zoom: float | None) -> Figure:
     """A figure with one row per joint."""
     curves = curves_of(runs)
+    scenario = curves[0].run.scenario
+    quantities = [quantity_of(scenario, field, joint) for joint in range(curves[0].run.n)]
     names = [curves[0].joint_label(joint) for joint in range(curves[0].run.n)]
-    return _named_rows(title, curves, field, names, zoom)
+    return _named_rows(title, curves, quantities, names, zoom)
 
 
 def _named_rows(
-    title: str, curves: Sequence[Curve], field: str, names: Sequence[str], zoom: float | None
+    title: str,
+    curves: Sequence[Curve],
+    quantities: Sequence[PanelQuantity],
+    names: Sequence[str],
+    zoom: float | None,
+    entries: Sequence[int] | None = None,
 ) -> Figure:
-    """A figure with one row per entry of a signal, each with its name."""
-    quantity = QUANTITIES[field]
-    unit = _style.label(quantity.symbol, quantity.unit)
-    rows = [PanelRow(quantity, i, f"{name}\n{unit}") for i, name in enumerate(names)]
+    """A figure with one row per entry of a signal, each with its quantity and its name; `entries`
+    are the indices of the entries, 0, 1, ... if not given.
+    """
+    rows = []
+    if entries is None:
+        entries = range(len(names))
+    for entry, quantity, name in zip(entries, quantities, names, strict=True):
+        unit = _style.label(quantity.symbol, quantity.unit)
+        rows.append(PanelRow(quantity, entry, f"{name}\n{unit}"))
     height = 1.75
     if len(rows) > 3:
         height = 1.25
@@ -152,16 +167,17 @@ def tube(scenario: Scenario, *, duration: float = 20.0) -> Figure:
     tube = jax.vmap(scenario.context.tube)(jnp.asarray(t, scenario.initial.q.dtype))
     figure = _style.new_figure(7.2, 0.6 + 1.4 * scenario.n)
     panels = figure.subplots(scenario.n, 1, sharex=True, squeeze=False)[:, 0]
-    names = joint_names(scenario.plant, scenario.n)
+    names = plants.component_names(scenario.plant)
     start = {"color": _style.colour(0), "clip_on": False, "zorder": 5, "label": "start"}
     for i, (axes, name) in enumerate(zip(panels, names, strict=True)):
         lower, upper = tube.lower[:, i], tube.upper[:, i]
         axes.fill_between(t, lower, upper, color=_style.tube(), linewidth=0, zorder=0)
         for side, text in ((lower, "bounds"), (upper, "_")):
             axes.plot(t, side, color=_style.bound(), linewidth=1.0, label=text)
-        axes.plot(t, tube.q_d[:, i], **_style.reference(), label="reference $q_d$")
+        quantity = quantity_of(scenario, "q", i)
+        axes.plot(t, tube.q_d[:, i], **_style.reference(), label=quantity.guide_label)
         axes.plot(0.0, scenario.initial.q[i], "o", **start)
-        axes.set_ylabel(f"{name}\n{_style.label('$q$', 'rad')}")
+        axes.set_ylabel(f"{name}\n{_style.label(quantity.symbol, quantity.unit)}")
         axes.margins(x=0)
     panels[-1].set_xlabel(_style.label("$t$", "s"))
     _style.legend_below(figure, 3, of=[panels[0]])
@@ -185,8 +201,12 @@ def joint(runs: Runs, joint: int = 0, *, zoom: float | None = None) -> Figure:
     """
     curves = curves_of(runs)
     joint = check_joint(curves, joint)
-    rows = [PanelRow(QUANTITIES[field], joint, QUANTITIES[field].label) for field in ("q", "e1")]
-    title = f"Position and tracking error of {curves[0].joint_label(joint)}"
+    scenario = curves[0].run.scenario
+    quantities = [quantity_of(scenario, field, joint) for field in ("q", "e1")]
+    rows = [PanelRow(quantity, joint, quantity.label) for quantity in quantities]
+    title = (
+        f"{quantities[0].name.capitalize()} and tracking error of {curves[0].joint_label(joint)}"
+    )
     return _rows_with_zoom(title, curves, rows, zoom, 2.1)
 
 
@@ -203,7 +223,7 @@ def positions(runs: Runs, *, zoom: float | None = None) -> Figure:
     Raises:
       ValueError: no run, a batch, or a zoom that is not a positive number.
     """
-    return _every_joint("Position", runs, "q", zoom)
+    return _every_joint(_title_of(runs, "q"), runs, "q", zoom)
 
 
 def errors(runs: Runs, *, zoom: float | None = None) -> Figure:
@@ -235,7 +255,7 @@ def velocity_errors(runs: Runs, *, zoom: float | None = None) -> Figure:
     Raises:
       ValueError: no run, a batch, or a zoom that is not a positive number.
     """
-    return _every_joint("Velocity error", runs, "e2", zoom)
+    return _every_joint(f"{_title_of(runs, 'dq')} error", runs, "e2", zoom)
 
 
 def velocities(runs: Runs, *, zoom: float | None = None) -> Figure:
@@ -251,7 +271,7 @@ def velocities(runs: Runs, *, zoom: float | None = None) -> Figure:
     Raises:
       ValueError: no run, a batch, or a zoom that is not a positive number.
     """
-    return _every_joint("Velocity", runs, "dq", zoom)
+    return _every_joint(_title_of(runs, "dq"), runs, "dq", zoom)
 
 
 def region_margins(runs: Runs, *, zoom: float | None = None) -> Figure:
@@ -275,11 +295,13 @@ def region_margins(runs: Runs, *, zoom: float | None = None) -> Figure:
         raise checks.fail("runs", came, "runs with the same number of regions, at least one")
     scenario = curves[0].run.scenario
     names = [escaped(in_words(region, scenario.plant)) for region in scenario.regions]
-    return _named_rows("Distance to the boundaries", curves, "region_margin", names, zoom)
+    quantities = [QUANTITIES["region_margin"]] * len(names)
+    return _named_rows("Distance to the boundaries", curves, quantities, names, zoom)
 
 
 def uncertain_terms(runs: Runs, *, zoom: float | None = None) -> Figure:
-    """The uncertain term f [N m] of every joint and its estimate f_hat: the paper's figure 4.
+    """The uncertain term f [N m] of every joint and its estimate f_hat: the paper's figure 4; of a
+    model in strict-feedback form the disturbance of every level and component.
 
     Args:
       runs: one run, or a dict of runs by name.
@@ -291,9 +313,64 @@ def uncertain_terms(runs: Runs, *, zoom: float | None = None) -> Figure:
     Raises:
       ValueError: no run, a batch, or a zoom that is not a positive number.
     """
+    curves = curves_of(runs)
+    if all(plants.is_chain(curve.run.scenario.model) for curve in curves):
+        return _disturbances(curves, zoom)
     return _every_joint(
         r"Uncertain term $f$ and its estimate $\hat f$", runs, "disturbance_estimate", zoom
     )
+
+
+def _disturbances(curves: Sequence[Curve], zoom: float | None) -> Figure:
+    """The disturbance of every component and its estimate, for the levels that have one in a
+    run.
+    """
+    scenario, n = curves[0].run.scenario, curves[0].run.n
+    disturbed = {level for curve in curves for level in curve.disturbed_levels()}
+    quantities, names, joints = [], [], []
+    for level in sorted(disturbed) or range(1, plants.order_of(scenario.model) + 1):
+        for joint in range(n):
+            quantities.append(disturbance_quantity(scenario, level, joint))
+            names.append(curves[0].joint_label(joint))
+            joints.append(joint)
+    title = "Disturbances of the levels and their estimates"
+    return _named_rows(title, curves, quantities, names, zoom, joints)
+
+
+def levels(runs: Runs, joint: int | str = 0, *, zoom: float | None = None) -> Figure:
+    """Every level of one component between its bounds, with the virtual control that it follows,
+    and the input.
+
+    Args:
+      runs: one run, or a dict of runs by name, of plants with the same number of levels.
+      joint: which component, from 0, or its name.
+      zoom: length of the magnified start [s]; the transient if not given.
+
+    Returns:
+      The figure, one row per level and one for the input.
+
+    Raises:
+      ValueError: no run, a batch, plants that differ in their number of levels, no such component,
+        or a zoom that is not a positive number.
+    """
+    curves = curves_of(runs)
+    joint = check_joint(curves, joint)
+    orders = {curve.name: plants.order_of(curve.run.scenario.plant) for curve in curves}
+    if len(set(orders.values())) > 1:
+        expected = "runs of plants with the same number of levels"
+        raise checks.fail("runs", orders, expected, "Draw them one by one.")
+    scenario = curves[0].run.scenario
+    order = plants.order_of(scenario.plant)
+    quantities = [level_quantity(scenario, level, joint) for level in range(1, order + 1)]
+    quantities.append(quantity_of(scenario, "tau", joint))
+    rows = [PanelRow(quantity, joint, quantity.label) for quantity in quantities]
+    title = f"Levels and input: {curves[0].joint_label(joint)}"
+    return _rows_with_zoom(title, curves, rows, zoom, 1.6)
+
+
+def _title_of(runs: Runs, field: str) -> str:
+    """The name of a signal of the plant, as a title."""
+    return quantity_of(curves_of(runs)[0].run.scenario, field).name.capitalize()
 
 
 def torques(runs: Runs, *, zoom: float | None = None) -> Figure:
@@ -309,7 +386,7 @@ def torques(runs: Runs, *, zoom: float | None = None) -> Figure:
     Raises:
       ValueError: no run, a batch, or a zoom that is not a positive number.
     """
-    return _every_joint("Torque", runs, "tau", zoom)
+    return _every_joint(_title_of(runs, "tau"), runs, "tau", zoom)
 
 
 def draw_phase_portrait(axes: Axes, curves: Sequence[Curve], joints: tuple[int, int]) -> None:
@@ -317,9 +394,10 @@ def draw_phase_portrait(axes: Axes, curves: Sequence[Curve], joints: tuple[int, 
     reference and the successful runs.
     """
     shown = []
+    positions = [quantity_of(curves[0].run.scenario, "q", joint) for joint in joints]
     for i, curve in enumerate(distinct(curves, ["q_d"], joints)):
         path = curve["q_d"][:, joints]
-        style = _style.reference() | {"zorder": 3, "label": "reference $q_d$"}
+        style = _style.reference() | {"zorder": 3, "label": positions[0].guide_label}
         if i > 0:
             style |= {"color": _style.colour(curves.index(curve)), "alpha": 0.6}
         axes.plot(*path.T, **style)
@@ -331,7 +409,7 @@ def draw_phase_portrait(axes: Axes, curves: Sequence[Curve], joints: tuple[int, 
     for i, curve in enumerate(curves):
         path = curve["q"][:, joints]
         thin = path[:: max(1, len(path) // POINTS)]
-        axes.plot(*thin.T, label=curve.name or "$q$", **run_style(curves, i))
+        axes.plot(*thin.T, label=curve.name or positions[0].symbol, **run_style(curves, i))
         if curve.failed:
             path = path[:1]
         shown.append(path)
@@ -342,8 +420,9 @@ def draw_phase_portrait(axes: Axes, curves: Sequence[Curve], joints: tuple[int, 
     low, high = points.min(axis=0), points.max(axis=0)
     half = 0.55 * max(float(np.max(high - low)), 1e-3)
     middle = 0.5 * (low + high)
-    for axis, joint, centre in zip("xy", joints, middle, strict=True):
-        text = _style.label(f"position of {curves[0].joint_label(joint)}", "rad")
+    for axis, joint, quantity, centre in zip("xy", joints, positions, middle, strict=True):
+        name = f"{quantity.name} of {curves[0].joint_label(joint)}"
+        text = _style.label(name, quantity.unit)
         axes.set(**{f"{axis}lim": (centre - half, centre + half), f"{axis}label": text})
     axes.set_aspect("equal")
 
@@ -371,7 +450,11 @@ def phase_portrait(runs: Runs, joints: tuple[int | str, int | str] = (0, 1)) -> 
         raise checks.fail("joints", joints, expected)
     figure = _style.new_figure(4.6, 4.9)
     draw_phase_portrait(figure.subplots(), curves, (first, second))
-    _style.set_title(figure, "Phase portrait of the positions", curves)
+    title = "Phase portrait of the positions"
+    plant = curves[0].run.scenario.plant
+    if plants.is_chain(plant):
+        title = f"Phase portrait: {plants.level_names(plant)[0]}"
+    _style.set_title(figure, title, curves)
     _style.legend_below(figure, 4)
     return figure
 
@@ -408,9 +491,13 @@ def velocity_portrait(runs: Runs, joint: int = 0) -> Figure:
         q, dq = curve["q"][:, joint], curve["dq"][:, joint]
         axes.plot(q, dq, label=curve.name or "run", **style)
         axes.plot(q[0], dq[0], marker="o", color=style["color"], linestyle="none", label="_")
-    axes.set_xlabel(_style.label(f"position of {curves[0].joint_label(joint)}", "rad"))
-    axes.set_ylabel(_style.label(r"velocity $\dot q$", "rad/s"))
-    _style.set_title(figure, "Velocity against position", curves)
+    scenario = curves[0].run.scenario
+    position, velocity = (quantity_of(scenario, field, joint) for field in ("q", "dq"))
+    of_joint = f"{position.name} of {curves[0].joint_label(joint)}"
+    axes.set_xlabel(_style.label(of_joint, position.unit))
+    axes.set_ylabel(velocity.label)
+    title = f"{velocity.name.capitalize()} against {position.name}"
+    _style.set_title(figure, title, curves)
     _style.legend_below(figure, 4)
     return figure
 

@@ -20,13 +20,17 @@ from iblf_jax.plotting._panels import (
     PanelQuantity,
     Window,
     annotate_clipped_peak,
+    disturbance_quantity,
     draw,
     draw_bounds,
+    level_quantity,
+    quantity_of,
     set_limits,
     show,
 )
 from iblf_jax.plotting._workspace import draw_paths
 from iblf_jax.simulation.results import Rollout
+from iblf_jax.world import plants
 from iblf_jax.world.regions import in_words
 
 WIDTH = 10.0
@@ -39,10 +43,12 @@ def overview(run: Rollout, *, title: str = "Overview of the run") -> Figure:
     """The overview of one run, its status in the title: what `run.plot()` shows.
 
     The first panels show the position of every joint between its bounds, and the velocity if it has
-    bounds or is measured.  Further panels show all joints together: e1, xi, the phase portrait of
-    the first two joints, the torque, the uncertain term with its estimate, and the Lyapunov
-    function.  For scenarios with regions, the last panels show the distances to the boundaries and
-    the path of the tip.
+    bounds or is measured; of a plant in strict-feedback form every level, with the virtual control
+    that it follows.  Further panels show all joints together: e1, xi, the phase portrait of
+    the first two joints, the torque, the uncertain term with its estimate (of a model in
+    strict-feedback form e2, and the disturbances of the levels in a row of their own), and the
+    Lyapunov function.  For scenarios with regions, the last panels show the distances to the
+    boundaries and the path of the tip.
 
     Args:
       run: one run of n joints.
@@ -58,53 +64,87 @@ def overview(run: Rollout, *, title: str = "Overview of the run") -> Figure:
     checks.string("title", title, "a text")
     (curve,) = curves_of(run)
     rows = len(_style.row_sizes(run.n, COLUMNS))
-    tubes = ["q"]
-    if curve.has_speed_limits or curve.is_measured:
-        tubes.append("dq")
-    heights = [2.0 * rows] * len(tubes) + [4.4]
+    levels = _shown_levels(curve)
+    disturbed = curve.disturbed_levels()
+    heights = [2.0 * rows] * len(levels) + [4.4]
+    if disturbed:
+        heights.append(2.2)
     if curve.has_regions:
         heights.append(3.2)
     figure = _style.new_figure(WIDTH, 1.3 + sum(heights))
     parts = figure.add_gridspec(len(heights), 1, height_ratios=heights)
     window = (0.0, float(np.asarray(run.t)[-1]) or 1e-3)
-    for i, field in enumerate(tubes):
-        _tubes(figure, parts[i], curve, QUANTITIES[field], window)
-    _together(figure, parts[len(tubes)], curve, window)
+    for i, level in enumerate(levels):
+        _level(figure, parts[i], curve, level, window)
+    _together(figure, parts[len(levels)], curve, window)
+    if disturbed:
+        _disturbances(figure, parts[len(levels) + 1], curve, disturbed, window)
     if curve.has_regions:
-        _regions(figure, parts[len(tubes) + 1], curve, window)
+        _regions(figure, parts[len(heights) - 1], curve, window)
     _style.set_title(figure, title, [curve], always=True)
     _style.legend_below(figure, 8)
     return figure
 
 
-def _tubes(
-    figure: Figure, where: SubplotSpec, curve: Curve, quantity: PanelQuantity, window: Window
-) -> None:
-    """Position, or velocity, of every joint between its bounds."""
+def _shown_levels(curve: Curve) -> list[int]:
+    """The levels that the first panels show, counted from 1."""
+    plant = curve.run.scenario.plant
+    if plants.is_chain(plant):
+        return list(range(1, plants.order_of(plant) + 1))
+    if curve.has_speed_limits or curve.is_measured:
+        return [1, 2]
+    return [1]
+
+
+def _level(figure: Figure, where: SubplotSpec, curve: Curve, level: int, window: Window) -> None:
+    """One level of every joint between its bounds."""
+    scenario = curve.run.scenario
     rows = _style.panel_rows(figure, curve.run.n, COLUMNS, where)
+    labels = []
     for joint, axes in enumerate(axes for row in rows for axes in row):
+        quantity = level_quantity(scenario, level, joint)
+        labels.append(quantity.label)
         show(axes, [curve], quantity, joint, window)
         for line in axes.get_lines():
             if line.get_label() == quantity.symbol:
                 line.set(**_style.series(joint), label="_")
         axes.set_title(curve.joint_label(joint))
+    units_differ = len(set(labels)) > 1
+    first = 0
     for row in rows:
-        row[0].set_ylabel(quantity.label)
+        for axes, label in zip(row, labels[first:], strict=False):
+            if units_differ or axes is row[0]:
+                axes.set_ylabel(label)
+        first += len(row)
     for axes in rows[-1]:
         _style.time_axis(axes)
+
+
+def _disturbances(
+    figure: Figure, where: SubplotSpec, curve: Curve, levels: list[int], window: Window
+) -> None:
+    """The disturbances of the levels with their estimates, one panel a level."""
+    grid = where.subgridspec(1, len(levels))
+    for i, level in enumerate(levels):
+        quantity = disturbance_quantity(curve.run.scenario, level)
+        _joints(figure.add_subplot(grid[i]), curve, quantity, window)
 
 
 def _together(figure: Figure, where: SubplotSpec, curve: Curve, window: Window) -> None:
     """The panels that show all joints together."""
     grid = where.subgridspec(2, 3)
+    scenario = curve.run.scenario
     places = {(0, 0): "e1", (0, 1): "xi", (1, 0): "tau", (1, 1): "disturbance_estimate"}
+    if plants.is_chain(scenario.model):
+        places[1, 1] = "e2"
     for place, field in places.items():
-        _joints(figure.add_subplot(grid[place]), curve, QUANTITIES[field], window)
+        _joints(figure.add_subplot(grid[place]), curve, quantity_of(scenario, field), window)
     if curve.run.n > 1:
         axes = figure.add_subplot(grid[0, 2])
         draw_phase_portrait(axes, [curve], (0, 1))
+        symbol = quantity_of(scenario, "q").symbol
         for line in axes.get_lines():
-            if line.get_label() == "$q$":
+            if line.get_label() == symbol:
                 line.set(color=_style.blend(0.396), linewidth=2.4)
             line.set_label("_")
     _lyapunov(figure.add_subplot(grid[1, 2]), curve, window)
@@ -123,11 +163,12 @@ def _joints(axes: Axes, curve: Curve, quantity: PanelQuantity, window: Window) -
             drawn.append(draw(axes, curve, quantity.truth, joint, window, label="_", **broad))
         style["label"] = curve.joint_label(joint)
         drawn.append(draw(axes, curve, quantity.field, joint, window, **style))
-    set_limits(axes, [curve] * len(drawn), drawn, bounds, spikes=quantity.unit == "N m")
+    set_limits(axes, [curve] * len(drawn), drawn, bounds, spikes=quantity.has_spikes)
     annotate_clipped_peak(axes, [curve] * len(drawn), drawn, quantity.unit)
     axes.set_ylabel(quantity.label)
     if quantity.truth:
-        axes.set_ylabel(r"$f$ (broad), $\hat f$ [N m]")
+        symbols = f"{quantity.symbol} (broad), {quantity.estimate_symbol}"
+        axes.set_ylabel(_style.label(symbols, quantity.unit))
     _style.time_axis(axes, window)
 
 
@@ -156,5 +197,6 @@ def _lyapunov(axes: Axes, curve: Curve, window: Window) -> None:
     axes.plot(*thinned(curve.t[: len(V)], positive), color=_style.blend(0.733))
     if np.isfinite(positive).any():
         axes.set_yscale("log")
-    axes.set_ylabel("Lyapunov function $V_2$")
+    symbol = r"$\sum w_i V_i$" if plants.is_chain(curve.run.scenario.model) else "$V_2$"
+    axes.set_ylabel(f"Lyapunov function {symbol}")
     _style.time_axis(axes, window)

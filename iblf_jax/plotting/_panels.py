@@ -8,6 +8,7 @@ limits clip a signal states the signal's peak.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -15,9 +16,13 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
+from iblf_jax.core.units import per_second
 from iblf_jax.plotting import _style
 from iblf_jax.plotting._curves import Curve, distinct, thinned
 from iblf_jax.plotting._style import FAINT, label, series
+from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.simulation.units import signal_unit, unit_text
+from iblf_jax.world import plants
 
 Window = tuple[float, float]
 
@@ -49,6 +54,8 @@ class PanelQuantity:
     guide: str | None = None
     """The signal that the quantity should follow; it is drawn once for all runs."""
     guide_label: str = ""
+    guide_sets_limits: bool = False
+    """Whether the limits of the axis follow the guide where there are no bounds."""
     truth: str | None = None
     """The signal that the quantity estimates.  It is drawn as a broad pale line under them, and
     only once if it is the same in all runs."""
@@ -56,11 +63,20 @@ class PanelQuantity:
     """The signal that is a measurement of the quantity."""
     transient: str = ""
     """The signal whose transient a zoom shows; that of the quantity itself if empty."""
+    has_spikes: bool = False
+    """Whether an axis that shows all joints clips short peaks."""
+    farthest_bound: float = FARTHEST_BOUND
+    """Bounds farther from the runs do not set the limits of the axis, in the unit."""
 
     @property
     def label(self) -> str:
         """The label of the axis."""
         return label(f"{self.name} {self.symbol}", self.unit)
+
+    @property
+    def estimate_symbol(self) -> str:
+        """The symbol of an estimate of the quantity."""
+        return rf"$\hat {self.symbol.strip('$')}$"
 
 
 QUANTITIES = {
@@ -100,7 +116,7 @@ QUANTITIES = {
         PanelQuantity(
             "region_margin", "distance", "$h$", "m", guide="region_boundary", guide_label="boundary"
         ),
-        PanelQuantity("tau", "torque", r"$\tau$", "N m"),
+        PanelQuantity("tau", "torque", r"$\tau$", "N m", has_spikes=True),
         PanelQuantity(
             "disturbance_estimate",
             "uncertain term",
@@ -108,10 +124,82 @@ QUANTITIES = {
             "N m",
             truth="disturbance",
             transient="estimate_error",
+            has_spikes=True,
         ),
     )
 }
-"""Signal -> the panel that shows it."""
+"""Signal -> the panel that shows it, for robots."""
+
+VIRTUAL_CONTROL = r"virtual control $\alpha_{i-1}$"
+"""The label of the signal that a level above the first should follow."""
+
+UNRELATED_TO_LEVELS = ("xi", "region_margin")
+"""Panels that do not depend on the plant."""
+
+
+def quantity_of(scenario: Scenario, field: str, joint: int | None = None) -> PanelQuantity:
+    """The panel of a signal with the names and units of the plant.
+
+    Args:
+      scenario: any.
+      field: a key of `QUANTITIES`.
+      joint: the component whose unit is shown; None for the units of all components.
+    """
+    quantity, plant = QUANTITIES[field], scenario.plant
+    if not plants.is_chain(plant) or field in UNRELATED_TO_LEVELS:
+        return quantity
+    names = plants.level_names(plant)
+    of_plant: dict[str, dict[str, Any]] = {
+        "q": {"name": names[0], "symbol": "$x_1$", "guide_label": "reference $x_d$"},
+        "e1": {},
+        "e2": {},
+        "dq": {
+            "name": names[1],
+            "symbol": "$x_2$",
+            "guide": "alpha",
+            "guide_label": VIRTUAL_CONTROL,
+            "guide_sets_limits": True,
+        },
+        "tau": {"name": plants.input_name(plant), "symbol": "$u$"},
+        "disturbance_estimate": {},
+    }
+    changed = of_plant[field] | {"unit": signal_unit(scenario, field, joint)}
+    return dataclasses.replace(quantity, farthest_bound=np.inf, **changed)
+
+
+def level_quantity(scenario: Scenario, level: int, joint: int | None = None) -> PanelQuantity:
+    """The panel of one level, counted from 1, of a plant in strict-feedback form; other arguments
+    as `quantity_of`.
+    """
+    if level <= 2:
+        return quantity_of(scenario, ("q", "dq")[level - 1], joint)
+    plant = scenario.plant
+    return PanelQuantity(
+        f"level_{level}",
+        plants.level_names(plant)[level - 1],
+        f"$x_{{{level}}}$",
+        unit_text(scenario, plants.units_of(plant)[level - 1], joint),
+        bounds=(f"level_{level}_lower", f"level_{level}_upper"),
+        guide=f"level_{level}_alpha",
+        guide_label=VIRTUAL_CONTROL,
+        guide_sets_limits=True,
+        farthest_bound=np.inf,
+    )
+
+
+def disturbance_quantity(scenario: Scenario, level: int, joint: int | None = None) -> PanelQuantity:
+    """The panel of the disturbance of one level and of its estimate; arguments as
+    `level_quantity`.
+    """
+    return PanelQuantity(
+        f"level_{level}_estimate",
+        "disturbance",
+        f"$d_{{{level}}}$",
+        unit_text(scenario, per_second(plants.units_of(scenario.plant)[level - 1]), joint),
+        truth=f"level_{level}_d",
+        transient=f"level_{level}_estimate_error",
+        has_spikes=True,
+    )
 
 
 def draw(
@@ -188,6 +276,7 @@ def set_limits(
     always_shown: Sequence[np.ndarray],
     *,
     spikes: bool = False,
+    farthest_bound: float = FARTHEST_BOUND,
 ) -> None:
     """Sets the limits of the vertical axis.
 
@@ -200,6 +289,7 @@ def set_limits(
       drawn: the drawn samples of each run.
       always_shown: bounds and reference; empty if there are none.
       spikes: clip short peaks.
+      farthest_bound: bounds farther from the runs than this do not set the limits.
     """
     successful, failed = [], []
     for curve, y in zip(curves, drawn, strict=True):
@@ -210,7 +300,7 @@ def set_limits(
         else:
             successful.append(y)
     low, high = _span([*successful, *failed]) or (-1.0, 1.0)
-    near = [y[(y > low - FARTHEST_BOUND) & (y < high + FARTHEST_BOUND)] for y in always_shown]
+    near = [y[(y > low - farthest_bound) & (y < high + farthest_bound)] for y in always_shown]
     base = _span(near) or _span(successful)
     if base:
         room = 0.4 * (base[1] - base[0])
@@ -270,7 +360,7 @@ def _draw_bounds_and_guide(
         if i > 0:
             own = {"color": series(curves.index(curve))["color"], "alpha": 0.6}
         bounds += draw_bounds(axes, curve, quantity, joint, window, **own)
-        if quantity.guide:
+        if quantity.guide and not np.isnan(curve[quantity.guide]).all():
             style = _style.reference() | {"zorder": 3, "label": quantity.guide_label} | own
             guides.append(draw(axes, curve, quantity.guide, joint, window, **style))
     return bounds, guides
@@ -336,12 +426,15 @@ def show(
     axes.set_xlim(*window)
     owners = [curve for curve, _ in drawn]
     samples = [y for _, y in drawn]
+    kept = [y for curve, y in drawn if not curve.failed]
     always_shown: list = []
+    if quantity.guide_sets_limits and not bounds:
+        always_shown = guides + kept
     if bounds and tight:
-        always_shown = guides + [y for curve, y in drawn if not curve.failed]
+        always_shown = guides + kept
     elif bounds:
         always_shown = guides + bounds
-    set_limits(axes, owners, samples, always_shown)
+    set_limits(axes, owners, samples, always_shown, farthest_bound=quantity.farthest_bound)
     if not tight:
         annotate_clipped_peak(axes, owners, samples, quantity.unit)
     for curve in curves:
@@ -358,7 +451,7 @@ def run_style(curves: Sequence[Curve], index: int) -> dict[str, Any]:
 
 def _run_label(curve: Curve, quantity: PanelQuantity) -> str:
     if quantity.truth:
-        return rf"{curve.name} $\hat f$".strip()
+        return f"{curve.name} {quantity.estimate_symbol}".strip()
     return curve.name or quantity.symbol
 
 

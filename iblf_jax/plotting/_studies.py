@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from iblf_jax.core import checks
 from iblf_jax.plotting import _style
 from iblf_jax.plotting._curves import check_class, escaped, joint_labels
+from iblf_jax.plotting._panels import quantity_of
 from iblf_jax.studies import statistics
 from iblf_jax.studies.study import Study
 
@@ -120,10 +121,11 @@ def _draw_bands(axes: Axes, data: xarray.Dataset, joint: int, study: Study) -> N
     if len(levels) % 2:
         middle = order[len(levels) // 2]
         axes.plot(t, q[middle], color=_style.colour(0), label=f"{100 * levels[middle]:g} %")
-    axes.plot(t, data.q_d.values[:, joint], label="reference $q_d$", **_style.reference())
+    quantity = quantity_of(study.scenario, "q", joint)
+    axes.plot(t, data.q_d.values[:, joint], label=quantity.guide_label, **_style.reference())
     axes.set_title(joint_labels(study.scenario.plant, study.scenario.n)[joint])
     _style.time_axis(axes)
-    axes.set_ylabel(_style.label("position $q$", "rad"))
+    axes.set_ylabel(quantity.label)
 
 
 # --- histograms and scatters

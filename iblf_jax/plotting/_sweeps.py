@@ -56,8 +56,9 @@ def summary(data: xarray.Dataset, metric: str) -> tuple[xarray.DataArray, str]:
     values = data[metric]
     label = metric.replace("_", " ")
     unit = values.attrs.get("units", "1")
-    if "joint" in values.dims:
-        values = values.min("joint") if metric in SMALLER_IS_WORSE else values.max("joint")
+    entries = [name for name in ("level", "higher_level", "joint") if name in values.dims]
+    if entries:
+        values = values.min(entries) if metric in SMALLER_IS_WORSE else values.max(entries)
         label = f"{label} of the worst joint"
     if "run" in values.dims:
         values = values.median("run")

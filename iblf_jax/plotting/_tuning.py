@@ -15,10 +15,10 @@ from iblf_jax.core import checks
 from iblf_jax.plotting import _style
 from iblf_jax.plotting._curves import Curve, curves_of, escaped
 from iblf_jax.plotting._panels import (
-    QUANTITIES,
     Window,
     annotate_clipped_peak,
     draw,
+    quantity_of,
     set_limits,
     show,
 )
@@ -77,8 +77,9 @@ def tuning(
     _torque(figure.add_subplot(grid[2, 1]), curves, window)
     tubes = _style.panel_rows(figure, n, columns, grid[3, :])
     for i, axes in enumerate(axes for row in tubes for axes in row):
-        show(axes, curves, QUANTITIES["q"], i, window)
-        axes.set_ylabel(_style.label(curves[0].joint_label(i), "rad"))
+        quantity = quantity_of(result.scenario, "q", i)
+        show(axes, curves, quantity, i, window)
+        axes.set_ylabel(_style.label(curves[0].joint_label(i), quantity.unit))
     for axes in tubes[-1]:
         _style.time_axis(axes)
     heading = ["Gain tuning"]
@@ -110,7 +111,8 @@ def _peaks(axes: Axes, curves: list[Curve]) -> None:
     axes.margins(y=margin)
     _style.name_ticks(axes, [curves[0].joint_label(i) for i in range(n)], 30)
     axes.grid(axis="x", visible=False)
-    axes.set_ylabel(_style.label("peak torque", "N m"))
+    quantity = quantity_of(curves[0].run.scenario, "tau")
+    axes.set_ylabel(_style.label(f"peak {quantity.name}", quantity.unit))
 
 
 def _torque(axes: Axes, curves: list[Curve], window: Window) -> None:
@@ -120,8 +122,10 @@ def _torque(axes: Axes, curves: list[Curve], window: Window) -> None:
     for i, curve in enumerate(curves):
         drawn.append(draw(axes, curve, "tau", joint, window, **_style.series(i)))
     set_limits(axes, curves, drawn, [], spikes=True)
-    annotate_clipped_peak(axes, curves, drawn, "N m")
-    axes.set_ylabel(_style.label(f"torque of {curves[0].joint_label(joint)}", "N m"))
+    quantity = quantity_of(curves[0].run.scenario, "tau", joint)
+    annotate_clipped_peak(axes, curves, drawn, quantity.unit)
+    name = f"{quantity.name} of {curves[0].joint_label(joint)}"
+    axes.set_ylabel(_style.label(name, quantity.unit))
     _style.time_axis(axes, window)
 
 
@@ -158,7 +162,8 @@ def _margin(axes: Axes, result: TuneResult) -> None:
     axes.plot(np.arange(1, len(margin) + 1), margin, marker=".", markersize=3, **_style.series(2))
     axes.axhline(0.0, color=_style.failure(), linewidth=0.8)
     axes.set_xlabel("step")
-    axes.set_ylabel(_style.label("smallest margin", "rad"))
+    unit = quantity_of(result.scenario, "q").unit
+    axes.set_ylabel(_style.label("smallest margin", unit))
 
 
 def _gains(axes: Axes, result: TuneResult) -> None:

@@ -17,10 +17,12 @@ from matplotlib.gridspec import SubplotSpec
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from iblf_jax.core import checks
+from iblf_jax.core.optional import has_members
 from iblf_jax.plotting import _style
 from iblf_jax.plotting._curves import Curve, curves_of, escaped
 from iblf_jax.plotting._figures import Runs
 from iblf_jax.plotting._panels import run_style
+from iblf_jax.world import plants
 from iblf_jax.world.regions import HalfSpace, Region, Sphere, in_words, row_of
 
 GRID = 301
@@ -28,20 +30,37 @@ GRID = 301
 SPHERE_CIRCLES = (13, 25)
 """Circles of latitude and of longitude of a sphere."""
 PATH_POINTS = 400
+OUTLINES = 9
+"""Number of times at which the outline of a plant is drawn along its path."""
 LINES = ("-", "--", ":", "-.")
 """Line styles of the boundaries, one per confined point."""
 
 
-def skeletons(robot: Any, q: np.ndarray) -> np.ndarray:
-    """Base, joints and tip at the positions q of a run, (T, n + 1, d) [m].
+def has_outline(plant: Any) -> bool:
+    """Whether a plant is drawn by its outline in the plane."""
+    return plants.is_chain(plant) and plants.plant_member(plant, "outline") is not None
+
+
+def skeletons(plant: Any, q: np.ndarray) -> np.ndarray:
+    """Base, joints and tip at the positions q of a run, (T, n + 1, d) [m]; of a plant with an
+    outline its corners, (T, k + 1, 2) [m], of which the first one is repeated at the end.
 
     Args:
-      robot: the robot.
-      q: positions, (T, n) [rad].
+      plant: a robot, a plant that contains one, or a plant with an outline.
+      q: positions, the first level, (T, n).
 
     Raises:
-      ValueError: the robot's `skeleton` does not return (n + 1, 2) or (n + 1, 3) points.
+      ValueError: a plant without a shape, or a robot whose `skeleton` does not return (n + 1, 2) or
+        (n + 1, 3) points.
     """
+    if has_outline(plant):
+        outline = plants.plant_member(plant, "outline")
+        corners = np.asarray(jax.jit(jax.vmap(outline))(q))
+        return np.concatenate([corners, corners[:, :1]], axis=1)
+    robot = plants.robot_of(plant)
+    if robot is None or not has_members(robot, "skeleton"):
+        remedy = "A robot has a skeleton(q); another plant may have an outline(x1), (k, 2) [m]."
+        raise checks.fail("plant", type(plant).__name__, "a plant with a shape", remedy)
     found = np.asarray(jax.jit(jax.vmap(robot.skeleton))(q))
     if found.shape[1:] not in ((q.shape[1] + 1, 2), (q.shape[1] + 1, 3)):
         expected = "n + 1 points in the plane or in space, the same for all runs"
@@ -168,7 +187,7 @@ def _plane_in_box(normal: np.ndarray, offset: float, limits: np.ndarray) -> np.n
 @_style.styled()
 def workspace(runs: Runs) -> Figure:
     """The paths of the tip and of other confined points [m], the boundaries of the regions, and the
-    arm at the end of the run.
+    arm at the end of the run; of a plant with an outline its path, and the outline at some times.
 
     Args:
       runs: one run, or a dict of runs by name; boundaries and reference are those of the first.
@@ -177,7 +196,8 @@ def workspace(runs: Runs) -> Figure:
       The figure.
 
     Raises:
-      ValueError: no run, a batch, or robots in the plane and in space together.
+      ValueError: no run, a batch, a plant without a shape, or robots in the plane and in space
+        together.
     """
     curves = curves_of(runs)
     figure = _style.new_figure(4.9, 4.9)
@@ -190,10 +210,11 @@ def workspace(runs: Runs) -> Figure:
 def draw_paths(figure: Figure, where: SubplotSpec, curves: Sequence[Curve]) -> Any:
     """Draws the paths of the runs and the boundaries of the first run; returns the panel."""
     first = curves[0]
-    robot = first.run.scenario.plant
+    plant = first.run.scenario.plant
+    robot = plants.robot_of(plant)
     regions = first.run.scenario.regions
     actual = [skeletons(curve.run.scenario.plant, curve.at("q", _times(curve))) for curve in curves]
-    desired = skeletons(robot, first.at("q_d", _times(first)))
+    desired = skeletons(plant, first.at("q_d", _times(first)))
     d = desired.shape[-1]
     if any(x.shape[-1] != d for x in actual):
         came = "arms in the plane and in space"
@@ -207,12 +228,22 @@ def draw_paths(figure: Figure, where: SubplotSpec, curves: Sequence[Curve]) -> A
     arm: dict[str, Any] = {"linewidth": 2.4, "marker": "o", "markersize": 4, "label": "_"}
     for i, (curve, skeleton) in enumerate(zip(curves, actual, strict=True)):
         style = run_style(curves, i)
-        for row in sorted(confined - {robot.n}):
+        pale = _style.blend(0.45, style["color"])
+        for row in sorted(confined - {len(skeleton[0]) - 1}):
             axes.plot(*skeleton[:, row].T, **(style | {"label": "_", "linewidth": 0.9}))
-        tip = {"label": curve.name or "tip", "linewidth": 1.6}
-        axes.plot(*skeleton[:, -1].T, **(style | tip))
-        axes.plot(*skeleton[-1].T, color=_style.blend(0.45, style["color"]), **arm)
+        name = "path" if has_outline(plant) else "tip"
+        axes.plot(*skeleton[:, -1].T, **(style | {"label": curve.name or name, "linewidth": 1.6}))
+        if has_outline(plant):
+            _draw_outlines(axes, skeleton, pale)
+        else:
+            axes.plot(*skeleton[-1].T, color=pale, **arm)
     return axes
+
+
+def _draw_outlines(axes: Any, outlines: np.ndarray, colour: str) -> None:
+    """Draws the outline of a plant at times that are evenly spread over its run."""
+    for index in np.linspace(0, len(outlines) - 1, OUTLINES).astype(int):
+        axes.plot(*outlines[index].T, color=colour, linewidth=1.0, label="_")
 
 
 def _times(curve: Curve) -> np.ndarray:

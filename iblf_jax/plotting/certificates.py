@@ -13,12 +13,14 @@ from matplotlib.figure import Figure
 
 from iblf_jax.certificates import Certificate, Traces
 from iblf_jax.certificates.lines import Line
+from iblf_jax.certificates.result import LevelTraces
 from iblf_jax.core import checks
 from iblf_jax.plotting import _style
 from iblf_jax.plotting._curves import check_class, escaped, thinned
 
 WIDTH = 10.0
 HEIGHT = 5.4
+COLUMNS = 3
 LEGEND: dict[str, Any] = {"frameon": True, "framealpha": 0.85, "edgecolor": "none"}
 
 
@@ -31,7 +33,9 @@ def certificate(
     It shows V2 with its envelope (3.20) or (3.28); the left side of the differential inequality
     (3.18) or (3.26), which must stay below zero, with the terms that the printed proof drops; and
     xi, |e2| and |f_tilde| with their bounds.  Samples without a claim are left out.  For a law with
-    its own claim, V and the left side are those of that claim.
+    its own claim, V and the left side are those of that claim.  For a plant in strict-feedback form
+    it shows V with its envelope (S.4), the left side of (S.3) with its disturbance terms, the error
+    of every level with its bounds, and |d_tilde| of every level.
 
     Args:
       shown: the certificate; of many runs, the figure shows the worst one.
@@ -46,6 +50,10 @@ def certificate(
     """
     check_class("shown", shown, Certificate, "Draw what ij.certify returned.")
     traces = _until(shown.traces, until)
+    if isinstance(traces, LevelTraces):
+        figure = _level_panels(shown, traces)
+        _title(figure, shown, title, _level_subject(shown))
+        return figure
     subject, V = "Theorem 2", Bounded("Lyapunov function", "$V_2$", "1")
     if shown.is_of_own_claim:
         subject, V = "The law's own claim", Bounded("Lyapunov function", "$V$", "1")
@@ -60,19 +68,69 @@ def certificate(
     _draw_bounded(panels[1, 1], traces.t, traces.f_tilde, traces.f_tilde_bound, f_tilde)
     _verdicts(panels[1, 2], shown)
     _mark_excluded(panels.flat[:5], traces)
+    _title(figure, shown, title, subject)
+    return figure
+
+
+def _title(figure: Figure, shown: Certificate, title: str | None, subject: str) -> None:
+    """The heading with the verdict."""
     if title is None:
         title = f"{subject} along the run"
     if shown.worst_run is not None:
         title += f", worst run {shown.worst_run}"
     lines = [f"{title}: {shown.verdict}", shown.heading]
     _style.set_heading(figure, lines, color=_verdict_colour(shown.verdict))
-    return figure
 
 
 def _verdict_colour(verdict: str) -> str:
     if verdict == "fails":
         return _style.failure()
     return _style.text_colour()
+
+
+def _level_subject(shown: Certificate) -> str:
+    """What the figure of a plant in strict-feedback form is about."""
+    return "The law's own claim" if shown.is_of_own_claim else "The claim (S.3)"
+
+
+def _level_panels(shown: Certificate, traces: LevelTraces) -> Figure:
+    """The panels of a plant in strict-feedback form, the verdicts last."""
+    levels, t = shown.levels, traces.t
+    rows = math.ceil((len(levels) + 4) / COLUMNS)
+    figure = _style.new_figure(WIDTH, HEIGHT / 2 * rows)
+    panels = list(figure.subplots(rows, COLUMNS).flat)
+    V = Bounded("Lyapunov function", "$V$", "1")
+    _draw_bounded(panels[0], t, traces.V, traces.envelope, V)
+    _draw_inequality(panels[1], t, traces.left, traces.disturbance_terms, "disturbance terms")
+    for i, level in enumerate(levels):
+        axes, name = panels[2 + i], f"{level.name} error"
+        _draw_errors(axes, t, traces.error[:, i], traces.error_bound[:, i], shown.joints)
+        if level.is_bounded:
+            _finish_relative_error(axes, t, shown.joints, rf"{name} $\xi_{i + 1}$")
+            continue
+        _set_axes(axes, t, f"{name} $e_{i + 1}$", level.unit)
+        axes.legend(loc="best", **LEGEND)
+    _disturbances(panels[2 + len(levels)], traces)
+    _mark_excluded(panels[: len(levels) + 3], traces)
+    verdicts, *unused = panels[len(levels) + 3 :]
+    _verdicts(verdicts, shown)
+    for axes in unused:
+        axes.set_axis_off()
+    return figure
+
+
+def _disturbances(axes: Axes, traces: LevelTraces) -> None:
+    """The size of d_tilde of every level that has one, on a logarithmic axis."""
+    for i in range(traces.d_tilde.shape[1]):
+        if not np.any(traces.d_tilde[:, i] > 0):
+            continue
+        size = np.where(traces.d_tilde[:, i] > 0, traces.d_tilde[:, i], np.nan)
+        label = rf"$|\tilde d_{i + 1}|$"
+        axes.plot(*thinned(traces.t, size), label=label, **_style.series(i))
+    axes.set_yscale("log")
+    _set_axes(axes, traces.t, r"error of the estimate $|\tilde d_i|$", "unit of the level/s")
+    if axes.get_lines():
+        axes.legend(loc="best", **LEGEND)
 
 
 class Bounded(NamedTuple):
@@ -83,7 +141,7 @@ class Bounded(NamedTuple):
     unit: str
 
 
-def _until(traces: Traces, until: float | None) -> Traces:
+def _until(traces: Traces | LevelTraces, until: float | None) -> Traces | LevelTraces:
     """The traces up to a time, if one is given."""
     if until is None:
         return traces
@@ -91,7 +149,7 @@ def _until(traces: Traces, until: float | None) -> Traces:
     if np.sum(keep) < 2:
         expected = f"a time after the second sample, {float(traces.t[1]):g} s"
         raise checks.fail("until", until, expected)
-    return Traces(*(x[keep] for x in traces))
+    return type(traces)(*(x[keep] for x in traces))
 
 
 def _bound_style() -> dict[str, Any]:
@@ -117,21 +175,27 @@ def _draw_bounded(
 
 
 def _inequality(axes: Axes, traces: Traces) -> None:
+    """The left side of the inequality of Theorem 2, and the terms that the printed proof drops."""
+    _draw_inequality(axes, traces.t, traces.left, traces.dropped, "dropped terms")
+
+
+def _draw_inequality(
+    axes: Axes, t: np.ndarray, left: np.ndarray, terms: np.ndarray, name: str
+) -> None:
     """The left side of the inequality, on an axis that is logarithmic on both sides of zero."""
-    _set_axes(axes, traces.t, "left side of the inequality", "1/s")
-    left = traces.left
+    _set_axes(axes, t, "left side of the inequality", "1/s")
     if not np.isfinite(left).any():
         axes.text(0.5, 0.5, "no claim applies", transform=axes.transAxes, ha="center", va="center")
         return
     sizes = np.abs(left[np.isfinite(left) & (left != 0)])
     smallest = 1.0
     if sizes.size:
-        smallest = max(float(sizes.min()), 1e-12 * float(sizes.max()))
+        largest = max(float(sizes.max()), float(np.max(np.abs(terms))))
+        smallest = max(float(sizes.min()), 1e-12 * largest)
     axes.set_yscale("symlog", linthresh=10.0 ** np.floor(np.log10(smallest)))
-    axes.plot(*thinned(traces.t, left), label="left side", **_style.series(0))
-    if np.any(traces.dropped != 0):
-        dropped = thinned(traces.t, traces.dropped)
-        axes.plot(*dropped, label="dropped terms", linewidth=0.9, **_style.series(1))
+    axes.plot(*thinned(t, left), label="left side", **_style.series(0))
+    if np.any(terms != 0):
+        axes.plot(*thinned(t, terms), label=name, linewidth=0.9, **_style.series(1))
     axes.axhline(0.0, color=_style.text_colour(), linewidth=0.9)
     low, high = axes.get_ylim()
     axes.set_ylim(low, max(high, -0.02 * low))
@@ -141,29 +205,43 @@ def _inequality(axes: Axes, traces: Traces) -> None:
 
 def _relative_error(axes: Axes, traces: Traces, joints: tuple[str, ...]) -> None:
     """The relative error xi of every joint, its claimed bounds, and the bounds -1 and 1."""
-    n = traces.xi.shape[1]
-    bounds_differ = np.ptp(traces.xi_bound, axis=1).max(initial=0.0) > 1e-3
-    for joint in range(n):
+    _draw_errors(axes, traces.t, traces.xi, traces.xi_bound, joints)
+    _finish_relative_error(axes, traces.t, joints)
+
+
+def _draw_errors(
+    axes: Axes, t: np.ndarray, errors: np.ndarray, bounds: np.ndarray, joints: tuple[str, ...]
+) -> None:
+    """An error of every joint, with the bounds on its size."""
+    bounds_differ = np.ptp(bounds, axis=1).max(initial=0.0) > 1e-3
+    for joint in range(errors.shape[1]):
         style = _style.series(joint)
-        axes.plot(*thinned(traces.t, traces.xi[:, joint]), label=escaped(joints[joint]), **style)
+        axes.plot(*thinned(t, errors[:, joint]), label=escaped(joints[joint]), **style)
         own = _bound_style()
         if bounds_differ:
             own |= {"color": style["color"], "alpha": 0.45}
-        t, bound = thinned(traces.t, traces.xi_bound[:, joint])
-        axes.plot(t, bound, label="_" if joint else "bound", **own)
-        axes.plot(t, -bound, label="_", **own)
+        shown_t, bound = thinned(t, bounds[:, joint])
+        axes.plot(shown_t, bound, label="_" if joint else "bound", **own)
+        axes.plot(shown_t, -bound, label="_", **own)
+
+
+def _finish_relative_error(
+    axes: Axes, t: np.ndarray, joints: tuple[str, ...], name: str = r"relative error $\xi$"
+) -> None:
+    """Limits, label and legend of a panel of relative errors."""
+    n = len(joints)
     # Joint names may be long: the legend has as many columns as fit, the axis room for its rows.
     columns = int(np.clip(44 // (max(map(len, joints)) + 4), 1, 4 if n > 5 else 3))
     top = 1.3 + 0.15 * math.ceil((n + 1) / columns)
     axes.axhspan(1.0, top, color=_style.forbidden(), linewidth=0, zorder=0)
     axes.axhspan(-1.08, -1.0, color=_style.forbidden(), linewidth=0, zorder=0)
     axes.set_ylim(-1.08, top)
-    _set_axes(axes, traces.t, r"relative error $\xi$", "1")
+    _set_axes(axes, t, name, "1")
     small = {"fontsize": _style.size(6.5), "handlelength": 1.8, "columnspacing": 0.8}
     axes.legend(loc="upper center", ncols=columns, **LEGEND, **small)
 
 
-def _mark_excluded(panels: Any, traces: Traces) -> None:
+def _mark_excluded(panels: Any, traces: Traces | LevelTraces) -> None:
     """Shades the samples without a claim."""
     if not traces.excluded.any():
         return
@@ -178,6 +256,8 @@ def _verdicts(axes: Axes, shown: Certificate) -> None:
     axes.set_axis_off()
     applicable = [line for line in shown.lines if line.verdict != "not applicable"]
     names = ["K2", "kf", "own", "inequality", "envelope", "xi", "e2", "f_tilde", "joints"]
+    if shown.levels:
+        names = ["own", "inequality", "equality", "estimate", "alpha", "envelope", "xi", "e,"]
     if not any(line.name.startswith("inequality") for line in applicable):
         names.append("weighted")  # The claim of the paper does not apply.
     lines = [line for line in applicable if line.name.startswith(tuple(names)) and line.counts]

@@ -17,12 +17,14 @@ from matplotlib.figure import Figure
 from iblf_jax.plotting import _style
 from iblf_jax.plotting._curves import Curve, check_class, check_joint, curves_of, thinned
 from iblf_jax.plotting._figures import PanelRow, windows
-from iblf_jax.plotting._panels import QUANTITIES, Window, draw, set_limits
+from iblf_jax.plotting._panels import Window, draw, quantity_of, set_limits
 from iblf_jax.simulation.metrics import Settling
 from iblf_jax.studies.comparison import Comparison
+from iblf_jax.world import plants
 
 SMALLEST = 1e-5
-"""Errors below this [rad] are drawn at the lower end of the logarithmic axis."""
+"""Errors below this, in the unit of the error, are drawn at the lower end of the logarithmic
+axis."""
 
 TORQUE_SHARE = 0.1
 """Time that the torque panel shows, as a share of the time of the error panel."""
@@ -50,11 +52,14 @@ def comparison(result: Comparison, joint: int = 0, *, zoom: float | None = None)
     check_class("result", result, Comparison, "Draw what ij.compare returns.")
     given = curves_of(result.rollouts)
     joint = check_joint(given, joint)
-    error = PanelRow(QUANTITIES["e1"], joint, QUANTITIES["e1"].label)
+    scenario = given[0].run.scenario
+    quantity = quantity_of(scenario, "e1", joint)
+    error = PanelRow(quantity, joint, quantity.label)
     start, end = windows(given, [error], zoom)[1]
     columns = {"gains as given": given}
     if result.factors:
-        columns["equal effort (RMS torque above gravity)"] = curves_of(result.equal_effort)
+        name = plants.input_name(scenario.plant)
+        columns[f"equal effort (RMS {name} above gravity)"] = curves_of(result.equal_effort)
     figure = _style.new_figure(_style.WIDTH, 6.6)
     table = figure.subplots(
         3, len(columns), squeeze=False, sharey="row", height_ratios=(1.5, 1.5, 1.0)
@@ -65,8 +70,8 @@ def comparison(result: Comparison, joint: int = 0, *, zoom: float | None = None)
         _errors(column[0], curves, order, joint, (start, end))
         _torques(column[1], curves, order, joint, (start, TORQUE_SHARE * end))
         _settling(column[2], curves, order)
-    table[0, 0].set_ylabel(_style.label("error $|e_1|$", "rad"))
-    table[1, 0].set_ylabel(QUANTITIES["tau"].label)
+    table[0, 0].set_ylabel(_style.label("error $|e_1|$", quantity.unit))
+    table[1, 0].set_ylabel(quantity_of(scenario, "tau", joint).label)
     table[2, 0].set_ylabel(_style.label("settling", "s"))
     figure.align_ylabels(table[:, 0])
     _style.set_title(figure, f"Laws compared: {given[0].joint_label(joint)}", given)

@@ -13,4 +13,10 @@ from iblf_jax.presets.paper import zhang_yan_2024 as zhang_yan_2024
 from iblf_jax.presets.paper import zhang_yan_2024_full_state as zhang_yan_2024_full_state
 from iblf_jax.presets.paper import zhang_yan_2024_funnel as zhang_yan_2024_funnel
 from iblf_jax.presets.paper import zhang_yan_2024_saturated as zhang_yan_2024_saturated
+from iblf_jax.presets.plants import cybership_ii as cybership_ii
+from iblf_jax.presets.plants import flexible_joint_iiwa14 as flexible_joint_iiwa14
+from iblf_jax.presets.plants import flexible_joint_two_link as flexible_joint_two_link
+from iblf_jax.presets.plants import motor_driven_pendulum as motor_driven_pendulum
+from iblf_jax.presets.plants import motor_driven_two_link as motor_driven_two_link
+from iblf_jax.presets.plants import vessel as vessel
 from iblf_jax.presets.table import PRESETS as PRESETS

@@ -37,7 +37,9 @@ from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.time import as_at
 from iblf_jax.simulation.levels import (
     Motion,
+    completed,
     estimate_as_rates,
+    estimate_as_torque,
     law_state,
     model_state,
     motion,
@@ -228,7 +230,8 @@ def evaluate(
         f_hat = observer_estimate(scenario, observer, t, q, dq, higher, state.observer)
         law: Any = scenario.controller
         context = scenario.context
-        measured = law_state(scenario, q, dq, higher)
+        known = completed(scenario, observer, t, Measurement(q, dq, higher), state.observer)
+        measured = law_state(scenario, *known)
         answer, controller_rate = law.command(t, *measured, f_hat, context, state.controller)
         command, signals = plant_input(answer), law_signals(answer, f_hat)
     else:
@@ -339,14 +342,16 @@ def _robot_uncertain_signals(
     if not isinstance(signals.torque, tuple):
         tau = signals.torque
     M0, G0 = model.mass_matrix(q), model.gravity(q)
+    balance = G0 if isinstance(signals.torque, tuple) else steady_input(scenario, q)
     f = matvec(M0, moved.ddq) + model.coriolis(q, dq, dq) + G0 - tau
-    e2, f_tilde = dq - signals.alpha, f - signals.f_hat
+    f_hat = estimate_as_torque(model, q, signals.f_hat)
+    e2, f_tilde = dq - signals.alpha, f - f_hat
     V = jnp.sum(signals.V1)
     if law_member(unwrapped(scenario.controller), "includes_e2"):
         V = V + 0.5 * inner(f_tilde, f_tilde)
     else:
         V = V + 0.5 * (inner(e2, matvec(M0, e2)) + inner(f_tilde, f_tilde))
-    return _UncertainSignals(G0, f, signals.f_hat, V)
+    return _UncertainSignals(balance, f, f_hat, V)
 
 
 def _uncertain_signals(
@@ -360,8 +365,7 @@ def _uncertain_signals(
     higher: Any,
 ) -> _UncertainSignals:
     """The signals of a model in strict-feedback form: d_i of (S.1), and the law's sum w_i V_i."""
-    robot = plants.robot_of(scenario.model)
-    gravity = jnp.zeros_like(q) if robot is None else robot.gravity(q)
+    gravity = steady_input(scenario, q)
     d = uncertain_term(scenario, t, q, dq, higher, moved, tau)
     x = model_state(scenario, q, dq, higher)
     d_hat = estimate_as_rates(scenario, x, signals.f_hat)
@@ -407,6 +411,8 @@ def _level_signals(
 class LawUpdate(NamedTuple):
     """Result of one run of a sampled law and its observer."""
 
+    measured: Measurement
+    """The measurement, with the observer's estimates of levels that are not measured."""
     command: Command
     f_hat: jax.Array
     controller: Any
@@ -443,8 +449,9 @@ def law_update(
       controller, observer: their states at t.
     """
     sampling: Any = scenario.sampling
-    q, dq, higher = measured
     running = discrete_observer(scenario)
+    measured = completed(scenario, running, t, measured, observer)
+    q, dq, higher = measured
     f_hat = observer_estimate(scenario, running, t, q, dq, higher, observer)
     law: Any = scenario.controller
     command, controller_rate = law.command(
@@ -453,7 +460,7 @@ def law_update(
     arguments = observer_arguments(scenario, running, t, q, dq, higher, command.tau, observer)
     next_observer = _next_observer_state(sampling, running, arguments)
     next_controller = _euler(controller, controller_rate, sampling.period)
-    return LawUpdate(command, f_hat, next_controller, next_observer)
+    return LawUpdate(measured, command, f_hat, next_controller, next_observer)
 
 
 def _next_observer_state(sampling: Any, observer: Any, arguments: tuple) -> Any:
@@ -498,7 +505,7 @@ def run_sampled_law(
     return state._replace(
         controller=update.controller,
         observer=update.observer,
-        sampled=SampledState(commands, sensor, measured, signals),
+        sampled=SampledState(commands, sensor, update.measured, signals),
     )
 
 

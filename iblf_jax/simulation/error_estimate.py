@@ -44,6 +44,7 @@ import numpy as np
 
 from iblf_jax.core.linalg import matvec, solve, solve_spd
 from iblf_jax.core.time import as_at
+from iblf_jax.core.units import POSITION
 from iblf_jax.simulation.closed_loop import LoopState, perturbed_state
 from iblf_jax.simulation.discontinuities import has_jump
 from iblf_jax.simulation.integrators import Tableau, tableau
@@ -64,7 +65,7 @@ GAUSS = ((0.5 - 0.15**0.5, 5 / 18), (0.5, 8 / 18), (0.5 + 0.15**0.5, 5 / 18))
 """Nodes and weights of Gauss's quadrature, the reference for the quadrature of a method."""
 GOLDEN_RATIO = 0.6180339887498949
 ERROR, RELATIVE = "numerical_error", "relative_numerical_error"
-ACCURACY_UNITS = ((ERROR, "rad"), (RELATIVE, "1"))
+ACCURACY_UNITS = ((ERROR, POSITION), (RELATIVE, "1"))
 """Name and unit of the accuracy results that every run has beside its metrics."""
 
 
@@ -83,7 +84,7 @@ class Accuracy(NamedTuple):
     drift: jax.Array
     """Accumulated error L of the same 2 n numbers."""
     response: jax.Array
-    """R, (n, m - n)."""
+    """R, (n, m - n); of a sampled loop its columns of the levels from the second on."""
     error: jax.Array
     """Largest position error so far, (n,) [rad]."""
     relative: jax.Array
@@ -125,6 +126,18 @@ def response(jacobian: jax.Array, n: int) -> jax.Array:
     return jnp.where(jnp.isfinite(found), found, 0.0)
 
 
+def _of_levels(response: jax.Array, state: LoopState) -> jax.Array:
+    """The columns of the response of a sampled loop that belong to the plant's levels from the
+    second on, between which the state of the actuator lies.
+    """
+    n = state.dq.size
+    if isinstance(state.higher, tuple):
+        return response[:, :n]
+    first = n + sum(x.size for x in jax.tree.leaves(state.actuator))
+    higher = response[:, first : first + state.higher.size]
+    return jnp.concatenate([response[:, :n], higher], axis=1)
+
+
 def _rate(accuracy: Accuracy, slope: LoopState) -> jax.Array:
     """The rate of the positions and of their final displacement, (2 n,)."""
     n = slope.q.size
@@ -162,9 +175,9 @@ def begin(method: str, jacobian: jax.Array, state: LoopState) -> Accuracy:
     none = jnp.zeros((2 * n,), jacobian.dtype)
     pending = (none,) * steps_back(method)
     if state.sampled:
-        # Only a method of one stage uses an earlier rate; only velocities have a local error.
+        # Only a method of one stage uses an earlier rate; only levels have a local error.
         pending = (none,) if len(tableau(method).c) == 1 else ()
-        R = R[:, :n]
+        R = _of_levels(R, state)
     return Accuracy(pending, none, R, none[:n], none[0])
 
 

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from iblf_jax.control.controllers._base import law_member, state_of_levels
 from iblf_jax.control.observers import NoObserver
 from iblf_jax.control.observers._base import observer_member
-from iblf_jax.control.sensors._base import sensor_member
+from iblf_jax.control.sensors._base import Measurement, sensor_member
 from iblf_jax.core import taylor
 from iblf_jax.core.linalg import matvec, solve_spd
 from iblf_jax.core.pytree import unwrapped
@@ -126,7 +126,10 @@ def observer_estimate(
     """The estimate that the law receives: the torque f_hat, (n,) [N m], or d_hat, (r, n)."""
     if observer_member(observer, "receives_x"):
         x, plant = model_state(scenario, q, dq, higher), plants.as_plant(scenario.model)
-        return observer.estimate(t, x, plant, state)  # type: ignore[no-any-return]
+        d_hat: jax.Array = observer.estimate(t, x, plant, state)
+        if law_member(unwrapped(scenario.controller), "receives_x"):
+            return d_hat
+        return estimate_as_torque(scenario.model, q, d_hat)
     if plants.is_chain(scenario.model) and isinstance(observer, NoObserver):
         return jnp.zeros((scenario.model.order, *q.shape), q.dtype)
     return observer.estimate(t, q, dq, _observed_robot(scenario), state)  # type: ignore[no-any-return]
@@ -150,6 +153,22 @@ def observer_arguments(
         x = model_state(scenario, q, dq, higher)
         u = plants.plant_member(scenario.model, "joint_torque")(x, u)
     return t, q, dq, u, _observed_robot(scenario), state
+
+
+def completed(
+    scenario: Any, observer: Any, t: jax.Array, measured: Measurement, state: Any
+) -> Measurement:
+    """The levels that the law receives: those of a measurement, with the estimates of an observer
+    in the place of the levels that it does not read.
+    """
+    complete = observer_member(observer, "complete")
+    if complete is None:
+        return measured
+    q, dq, higher = measured
+    x = complete(t, model_state(scenario, q, dq, higher), plants.as_plant(scenario.model), state)
+    if len(x) == 2:
+        return Measurement(x[0], x[1], higher)
+    return Measurement(x[0], x[1], x[2:])
 
 
 def _observed_robot(scenario: Any) -> Any:
@@ -254,3 +273,10 @@ def estimate_as_rates(scenario: Any, x: jax.Array, estimate: jax.Array) -> jax.A
     if estimate.ndim == 2:
         return estimate
     return plants.torque_as_rates(scenario.model, x, estimate)
+
+
+def estimate_as_torque(model: Any, q: jax.Array, estimate: jax.Array) -> jax.Array:
+    """An estimate as the torque f_hat, (n,) [N m], of a model that is a robot: M0 d_hat_2."""
+    if estimate.ndim == 1:
+        return estimate
+    return matvec(model.mass_matrix(q), estimate[1])

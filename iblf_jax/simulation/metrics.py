@@ -29,10 +29,20 @@ from iblf_jax.control.controllers._base import law_member
 from iblf_jax.core import checks
 from iblf_jax.core.optional import OptionalMembers
 from iblf_jax.core.pytree import Leaf, component, layers, leaf
+from iblf_jax.core.units import (
+    HIGHER,
+    INPUT,
+    POSITION,
+    UNCERTAIN,
+    VELOCITY,
+    PlantUnit,
+)
 from iblf_jax.simulation.error_estimate import ACCURACY_UNITS
 from iblf_jax.simulation.scenario import Scenario, fit_joints
 from iblf_jax.simulation.signals import Sample as Sample
-from iblf_jax.simulation.signals import speed_margin
+from iblf_jax.simulation.signals import has, level_margin, speed_margin
+from iblf_jax.simulation.units import unit_text
+from iblf_jax.world import plants
 
 
 class Fold(Protocol):
@@ -88,11 +98,11 @@ class Tracking:
     """
 
     units: ClassVar[dict[str, str]] = {
-        "rmse": "rad",
-        "ise": "rad^2 s",
-        "iae": "rad s",
-        "itae": "rad s^2",
-        "peak_error": "rad",
+        "rmse": POSITION,
+        "ise": PlantUnit("rad^2 s", "x1^2 s"),
+        "iae": PlantUnit("rad s", "x1 s"),
+        "itae": PlantUnit("rad s^2", "x1 s^2"),
+        "peak_error": POSITION,
     }
 
     def init(self, sample: Sample) -> _TrackingSums:
@@ -142,8 +152,8 @@ class Settling:
       tolerance: below which |e1| counts as settled, () or (n,) [rad], > 0; 0.01 if not given.
     """
 
-    tolerance: Leaf = leaf("rad", sign="positive", default=0.01)
-    units: ClassVar[dict[str, str]] = {"settling_time": "s", "overshoot": "rad"}
+    tolerance: Leaf = leaf(POSITION, sign="positive", default=0.01)
+    units: ClassVar[dict[str, str]] = {"settling_time": "s", "overshoot": POSITION}
 
     def init(self, sample: Sample) -> _SettlingState:
         """Settled since the start, until a sample is outside."""
@@ -201,7 +211,7 @@ class Margin:
     """
 
     units: ClassVar[dict[str, str]] = {
-        "margin": "rad",
+        "margin": POSITION,
         "xi_margin": "1",
         "first_violation_time": "s",
         "first_violation_joint": "1",
@@ -234,12 +244,13 @@ class VelocityMargin:
     velocity_margin = min(q' - v_l, v_u - q') and alpha_margin = min(alpha - v_l, v_u - alpha), both
     continuous through zero; a law that follows an alpha outside the bounds cannot keep them.
     first_velocity_violation_time is infinite and first_velocity_violation_joint -1 on a run that
-    keeps them.  Only for scenarios with `velocity_bounds`, whose runs carry it by default.
+    keeps them.  Only for scenarios with bounds of the second level (`velocity_bounds`, or
+    `state_bounds[0]` of a plant), whose runs carry it by default.
     """
 
     units: ClassVar[dict[str, str]] = {
-        "velocity_margin": "rad/s",
-        "alpha_margin": "rad/s",
+        "velocity_margin": VELOCITY,
+        "alpha_margin": VELOCITY,
         "first_velocity_violation_time": "s",
         "first_velocity_violation_joint": "1",
     }
@@ -264,6 +275,61 @@ class VelocityMargin:
             "first_velocity_violation_time": acc.time,
             "first_velocity_violation_joint": acc.first,
         }
+
+
+@component
+class LevelMargin:
+    """Smallest distance of the levels from the third on, and of the virtual controls that they
+    follow, to the bounds of these levels, and the first violation.
+
+    level_margin = min(x_i - lower_i, upper_i - x_i) and level_alpha_margin = min(alpha_{i-1} -
+    lower_i, upper_i - alpha_{i-1}), both continuous through zero, and infinite for a level without
+    bounds; a law that follows an alpha_{i-1} outside the bounds cannot keep them.
+    first_level_violation_time is infinite, first_level_violation_level (counted from 1) and
+    first_level_violation_component (from 0) are -1 on a run that keeps them.  Only for scenarios
+    with `state_bounds` of such levels, whose runs carry it by default.
+    """
+
+    units: ClassVar[dict[str, str]] = {
+        "level_margin": HIGHER,
+        "level_alpha_margin": HIGHER,
+        "first_level_violation_time": "s",
+        "first_level_violation_level": "1",
+        "first_level_violation_component": "1",
+    }
+    needs: ClassVar[str] = "higher_lower"
+
+    def init(self, sample: Sample) -> _MarginState:
+        """Infinitely far from the bounds."""
+        return _no_violation(sample.t, *_level_margins(sample))
+
+    def update(self, acc: _MarginState, sample: Sample) -> _MarginState:
+        """Adds one sample."""
+        return _with_margins(acc, sample.t, *_level_margins(sample))
+
+    def finish(self, acc: _MarginState) -> dict[str, jax.Array]:
+        """level_margin, (r - 2, n), and level_alpha_margin, the same, under a law with virtual
+        controls of these levels; the others ().
+        """
+        found = dict(zip(("level_margin", "level_alpha_margin"), acc.smallest, strict=False))
+        n = acc.smallest[0].shape[-1]
+        level, component = acc.first // n + 3, acc.first % n
+        return {
+            **found,
+            "first_level_violation_time": acc.time,
+            "first_level_violation_level": jnp.where(acc.first < 0, -1, level),
+            "first_level_violation_component": jnp.where(acc.first < 0, -1, component),
+        }
+
+
+def _level_margins(sample: Sample) -> list[jax.Array]:
+    """The margins of the levels from the third on, and of the virtual controls for them, (r - 2, n)
+    each; the latter only under a law that has them.
+    """
+    found = [level_margin(sample, sample.higher)]
+    if has(sample, "e_higher"):
+        found.append(level_margin(sample, sample.higher - sample.e_higher))
+    return found
 
 
 @component
@@ -310,7 +376,7 @@ class Slack:
     Only for laws with a filter (`controllers.SafetyFilter`), whose runs carry it by default.
     """
 
-    units: ClassVar[dict[str, str]] = {"largest_slack": "rad/s^2"}
+    units: ClassVar[dict[str, str]] = {"largest_slack": PlantUnit("rad/s^2", "x2/s")}
     needs: ClassVar[str] = "slack"
 
     def init(self, sample: Sample) -> jax.Array:
@@ -360,7 +426,7 @@ class _TorqueSums(NamedTuple):
 
 @component
 class Torque:
-    """Size and variation of the torque.
+    """Size and variation of the torque, or of another plant's input.
 
     effort = int |tau|^2 over all joints; and joint by joint torque_rms, peak_torque,
     torque_variation = sum |tau_k+1 - tau_k| (chatter), and saturated_share, the fraction of the
@@ -368,10 +434,10 @@ class Torque:
     """
 
     units: ClassVar[dict[str, str]] = {
-        "effort": "N^2 m^2 s",
-        "torque_rms": "N m",
-        "peak_torque": "N m",
-        "torque_variation": "N m",
+        "effort": PlantUnit("N^2 m^2 s", "u^2 s"),
+        "torque_rms": INPUT,
+        "peak_torque": INPUT,
+        "torque_variation": INPUT,
         "saturated_share": "1",
     }
 
@@ -415,7 +481,7 @@ class AboveGravity:
     `compare` scales the gains of laws so that they are equal in it.
     """
 
-    units: ClassVar[dict[str, str]] = {"effort_above_gravity": "N m"}
+    units: ClassVar[dict[str, str]] = {"effort_above_gravity": INPUT}
 
     def init(self, sample: Sample) -> _SquareSums:
         """Zeros."""
@@ -435,9 +501,11 @@ class AboveGravity:
 
 @component
 class Estimation:
-    """Error of the observer: estimate_rmse = sqrt(mean f_tilde^2), f_tilde = f - f_hat."""
+    """Error of the observer: estimate_rmse = sqrt(mean f_tilde^2), f_tilde = f - f_hat, or the
+    same of d_1 ... d_r of a model in strict-feedback form.
+    """
 
-    units: ClassVar[dict[str, str]] = {"estimate_rmse": "N m"}
+    units: ClassVar[dict[str, str]] = {"estimate_rmse": UNCERTAIN}
 
     def init(self, sample: Sample) -> _SquareSums:
         """Zeros."""
@@ -449,12 +517,13 @@ class Estimation:
         return _SquareSums(acc.time + sample.dt, acc.square + sample.dt * f_tilde**2)
 
     def finish(self, acc: _SquareSums) -> dict[str, jax.Array]:
-        """estimate_rmse, (n,)."""
+        """estimate_rmse, (n,), or (r, n) for a model in strict-feedback form."""
         return {"estimate_rmse": _root_mean_square(acc.square, acc.time)}
 
 
 SIGNAL_SOURCES = {
     "dq_lower": "velocity_bounds, such as Bounds(lower=Constant(-1.0), upper=Constant(1.0))",
+    "higher_lower": "state_bounds of a level from the third on",
     "region_margin": "regions, such as (ij.regions.HalfSpace(normal=[0, 1], offset=0.1),)",
     "slack": "a law with a filter, such as ij.controllers.SafetyFilter(law)",
     "region_slack": "regions and a law with a filter, such as ij.controllers.SafetyFilter(law)",
@@ -464,8 +533,12 @@ SIGNAL_SOURCES = {
 
 def has_signal(scenario: Scenario, signal: str) -> bool:
     """Whether runs of a scenario have an optional signal, one of `SIGNAL_SOURCES`."""
+    context = scenario.context
     if signal == "dq_lower":
-        return scenario.velocity_bounds is not None
+        return context.level_bounds(2) is not None
+    if signal == "higher_lower":
+        levels = range(3, plants.order_of(scenario.plant) + 1)
+        return any(context.level_bounds(level) is not None for level in levels)
     has_regions = len(scenario.regions) > 0
     if signal == "region_margin":
         return has_regions
@@ -536,10 +609,13 @@ def _in_type(name: str, fold: Fold, dtype: jax.typing.DTypeLike) -> Fold:
         raise checks.fail(name, fold, "a fold whose fields are numbers", remedy) from error
 
 
-def metric_units(folds: Sequence[Fold]) -> tuple[tuple[str, str], ...]:
-    """Name and unit of every result of a run with these folds, its accuracy results included."""
+def metric_units(folds: Sequence[Fold], scenario: Scenario) -> tuple[tuple[str, str], ...]:
+    """Name and unit of every result of a run of a scenario with these folds, its accuracy results
+    included.
+    """
     of_folds = [fold_member(fold, "units") for fold in folds]
-    return tuple(pair for units in of_folds for pair in units.items()) + ACCURACY_UNITS
+    pairs = [pair for units in of_folds for pair in units.items()]
+    return tuple((name, unit_text(scenario, unit)) for name, unit in (*pairs, *ACCURACY_UNITS))
 
 
 def standard() -> tuple[Fold, ...]:
@@ -552,12 +628,12 @@ def standard() -> tuple[Fold, ...]:
 
 
 def optional_folds(scenario: Scenario) -> tuple[Fold, ...]:
-    """The folds that runs of a scenario carry besides the standard ones: margins of velocity bounds
-    and regions, and slacks of a filter.
+    """The folds that runs of a scenario carry besides the standard ones: margins of bounds of
+    further levels and of regions, and slacks of a filter.
     """
     return tuple(
         fold
-        for fold in (VelocityMargin(), RegionMargin(), Slack(), RegionSlack())
+        for fold in (VelocityMargin(), LevelMargin(), RegionMargin(), Slack(), RegionSlack())
         if has_signal(scenario, fold.needs)
     )
 
@@ -567,6 +643,7 @@ MEMBERS = {
     "settling": Settling,
     "margin": Margin,
     "velocity_margin": VelocityMargin,
+    "level_margin": LevelMargin,
     "region_margin": RegionMargin,
     "slack": Slack,
     "region_slack": RegionSlack,

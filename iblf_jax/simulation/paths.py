@@ -10,6 +10,8 @@ Sweeps, perturbations, tuning and scenario files address leaves by these paths.
   name without a letter, or with a bracket, a line break or the like, is written as a JSON string:
   'plant.link["a]b"].mass'.
 - `robot.` stands for `plant.` and `model.` together and changes both robots alike.
+- Several leaves may be addressed as the rows of one array (class attribute `stacked`):
+  "initial.x[2]" is the third level of the start of a plant, "initial.x[0]" its initial.q.
 - A component that wraps another (class attribute `wraps`, such as `controllers.Saturated`) is
   transparent: "controller.K2" is the wrapped law's K2, and "controller.law.K2" works too.
 """
@@ -19,8 +21,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
-from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +30,12 @@ import numpy as np
 
 from iblf_jax.core import checks, notices, tables
 from iblf_jax.core.pytree import component_member, field_values, wrapped_field
+from iblf_jax.core.units import Unit, as_text, of_entry, resolved
 from iblf_jax.simulation.scenario import HOW_TO_MAKE, NUMBERS, Scenario, canonical
+from iblf_jax.simulation.units import symbols_of
+
+Symbols: TypeAlias = Mapping[str, Unit]
+"""Symbol of a formula of a unit -> its unit."""
 
 _BARE = r"[^\[\]]*[^\W\d_][^\[\]]*"
 """The name of a row that needs no quotes."""
@@ -84,7 +91,8 @@ def parameters(scenario: Scenario, *, named: bool = True) -> ParameterTable:
       A tuple of `Parameter`, which prints as a table.
     """
     _check_component(scenario)
-    return ParameterTable(_walk(scenario, "", checks.boolean("named", named)))
+    named = checks.boolean("named", named)
+    return ParameterTable(_walk(scenario, "", named, symbols_of(scenario)))
 
 
 def _check_component(scenario: Any) -> None:
@@ -102,18 +110,14 @@ def _joined(path: str, name: str) -> str:
     return f"{path}.{name}" if path else name
 
 
-def _walk(
-    part: Any, path: str, named: bool, units: Mapping[str, str] | None = None
-) -> Iterator[Parameter]:
-    """The leaves below a part; `units` are those that the field of the part declares."""
-    units = units or {}
+def _walk(part: Any, path: str, named: bool, symbols: Symbols) -> Iterator[Parameter]:
+    """The leaves below a part; `symbols` has the unit of each symbol there."""
     if isinstance(part, tuple | list):
         for i, x in enumerate(part):
-            yield from _walk(x, f"{path}[{i}]", named, units)
+            yield from _walk(x, f"{path}[{i}]", named, symbols)
         return
     if not _is_component(part):
         return
-    leaf_units = {**component_member(part, "leaf_units")(), **units}
     values = field_values(part)
     for field in dataclasses.fields(part):
         if field.metadata.get("static"):
@@ -121,31 +125,43 @@ def _walk(
         value = values[field.name]
         name = _joined(path, field.name)
         if field.name == wrapped_field(part):
-            yield from _walk_wrapped(part, value, path, name, named)
+            yield from _walk_wrapped(part, value, path, name, named, symbols)
         elif isinstance(value, NUMBERS):
-            yield Parameter(name, jnp.shape(value), _unit(field, leaf_units), value)
+            unit = as_text(_unit(part, field, symbols))
+            yield Parameter(name, jnp.shape(value), unit, value)
+        elif isinstance(value, tuple | list):
+            for i, x in enumerate(value):
+                yield from _walk(x, f"{name}[{i}]", named, _symbols_below(field, symbols, i))
         else:
-            yield from _walk(value, name, named, {**units, **field.metadata.get("units", {})})
+            yield from _walk(value, name, named, _symbols_below(field, symbols))
     if named:
         yield from _named_rows(part, path)
+        yield from _stacked_rows(part, path, symbols)
+
+
+def _symbols_below(field: dataclasses.Field, symbols: Symbols, index: int = 0) -> Symbols:
+    """The unit of each symbol in the part that a field holds, or in one of its parts."""
+    change = field.metadata.get("part_units")
+    return symbols if change is None else change(symbols, index)  # type: ignore[no-any-return]
 
 
 def _walk_wrapped(
-    wrapper: Any, inner: Any, path: str, name: str, named: bool
+    wrapper: Any, inner: Any, path: str, name: str, named: bool, symbols: Symbols
 ) -> Iterator[Parameter]:
     """The leaves of a wrapped component under the path of its wrapper, except for those that have
     the name of a field of the wrapper.
     """
-    for parameter in _walk(inner, path, named):
+    for parameter in _walk(inner, path, named, symbols):
         rest = parameter.path[len(path) :].lstrip(".")
         if _has_field(wrapper, str(parse(rest)[0])):
             parameter = parameter._replace(path=f"{name}.{rest}")
         yield parameter
 
 
-def _unit(field: dataclasses.Field, units: Mapping[str, str]) -> str:
-    """The unit of a leaf: that of `units`, if it is there, else its own."""
-    return str(units.get(field.name, field.metadata.get("unit", "")))
+def _unit(part: Any, field: dataclasses.Field, symbols: Symbols) -> Unit:
+    """The unit of a leaf of a component, as the component or the field states it."""
+    stated = component_member(part, "leaf_units")()
+    return resolved(stated.get(field.name, field.metadata.get("unit", "")), symbols)
 
 
 def _named_rows(part: Any, path: str) -> Iterator[Parameter]:
@@ -160,6 +176,31 @@ def _named_rows(part: Any, path: str) -> Iterator[Parameter]:
                 row = value[..., i] if jnp.ndim(value) == 1 else value[i]
                 full = _joined(path, f"{kind}[{_quoted(name)}].{field}")
                 yield Parameter(full, jnp.shape(row), units[field], row)
+
+
+def _stacked_rows(part: Any, path: str, symbols: Symbols) -> Iterator[Parameter]:
+    """The rows of leaves that may be addressed as those of one array, of a component that has the
+    last of these leaves.
+    """
+    fields = {field.name: field for field in dataclasses.fields(part)}
+    values = field_values(part)
+    for kind, names in component_member(type(part), "stacked").items():
+        for i, (name, *index) in enumerate(_rows_of(part, names)):
+            at = tuple(index)
+            unit = of_entry(_unit(part, fields[name], symbols), at, jnp.ndim(values[name]))
+            value, row = values[name][at], as_text(unit)
+            yield Parameter(_joined(path, f"{kind}[{i}]"), jnp.shape(value), row, value)
+
+
+def _rows_of(part: Any, names: Sequence[str]) -> list[list[Any]]:
+    """The steps to each row of a stack of leaves, of which the last one has several rows; none if
+    the component does not have it.
+    """
+    *single, last = names
+    values = field_values(part)
+    if values[last] is None:
+        return []
+    return [*[[name] for name in single], *[[last, i] for i in range(len(values[last]))]]
 
 
 def _quoted(name: str) -> str:
@@ -247,7 +288,7 @@ def _written(token: str | int) -> str:
 
 def unit_at(scenario: Scenario, path: str) -> str:
     """The unit of the leaf at a path."""
-    return str(_metadata(scenario, path).get("unit", ""))
+    return as_text(_metadata(scenario, path).get("unit", ""))
 
 
 def sign_at(scenario: Scenario, path: str) -> str | None:
@@ -261,21 +302,29 @@ def sign_at(scenario: Scenario, path: str) -> str | None:
 def _metadata(scenario: Scenario, path: str) -> Mapping[str, Any]:
     """The declared metadata of the leaf at a path, with its unit."""
     part: Any = scenario
-    metadata: Mapping[str, Any] = {}
-    units: dict[str, str] = {}
-    for token in places(scenario, path)[0]:
-        if isinstance(token, int):
-            if isinstance(part, tuple | list):
-                part = part[token]
-        else:
-            field = next(f for f in dataclasses.fields(part) if f.name == token)
-            metadata = {
-                **field.metadata,
-                "unit": _unit(field, {**component_member(part, "leaf_units")(), **units}),
-            }
-            units |= field.metadata.get("units", {})
-            part = vars(part)[token]
-    return metadata
+    symbols = symbols_of(scenario)
+    tokens = places(scenario, path)[0]
+    while True:
+        name, index, tokens = _next_field(tokens)
+        field = next(f for f in dataclasses.fields(part) if f.name == name)
+        value = vars(part)[name]
+        if not tokens:
+            unit = of_entry(_unit(part, field, symbols), index, jnp.ndim(value))
+            return {**field.metadata, "unit": unit}
+        symbols = _symbols_below(field, symbols, *index[:1])
+        part = value
+        for i in index:
+            part = part[i]
+
+
+def _next_field(
+    tokens: list[str | int],
+) -> tuple[str, tuple[int, ...], list[str | int]]:
+    """The first field of a full path, the indices after it, and the tokens that are left."""
+    count = 1
+    while count < len(tokens) and isinstance(tokens[count], int):
+        count += 1
+    return str(tokens[0]), tuple(int(i) for i in tokens[1:count]), tokens[count:]
 
 
 def _resolved(scenario: Scenario, path: str, full: str) -> tuple[list[str | int], Any]:
@@ -321,6 +370,12 @@ def _steps(part: Any, tokens: list[str | int]) -> tuple[list[str | int], list[st
             raise KeyError(field)
         index = row if isinstance(row, int) else vars(part)[names].index(row)
         return [field, index], tokens[3:]
+    stacked = component_member(type(part), "stacked")
+    if token in stacked:
+        row = tokens[1]
+        if not isinstance(row, int):
+            raise KeyError(row)
+        return _rows_of(part, stacked[token])[row], tokens[2:]
     wrapped = wrapped_field(part)
     if wrapped:
         return [wrapped], tokens

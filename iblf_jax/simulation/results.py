@@ -20,6 +20,8 @@ from iblf_jax.core.status import Status, describe
 from iblf_jax.simulation.error_estimate import RELATIVE
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import Signals
+from iblf_jax.simulation.units import status_words
+from iblf_jax.world import plants
 
 
 @jax.tree_util.register_dataclass
@@ -68,6 +70,7 @@ class Metrics(Mapping):
             shown = str(value)
             if checks.is_concrete(value):
                 shown = np.array2string(np.asarray(value), precision=4, threshold=8)
+                shown = " ".join(shown.split("\n "))
             rows.append(f"  {name:22s} {shown} {self.units.get(name, '')}".rstrip())
         return "Metrics(\n" + "\n".join(rows) + "\n)"
 
@@ -160,8 +163,9 @@ class Rollout(Signals):
     def __repr__(self) -> str:
         if not checks.is_concrete(self):
             return "Rollout(being traced)"
+        noun = plants.component_noun(self.scenario.plant)
         shape = (
-            f"{self.q.shape[-2]} samples, {self.n} joints, dt = {float(np.ravel(self.dt)[0]):g} s,"
+            f"{self.q.shape[-2]} samples, {self.n} {noun}s, dt = {float(np.ravel(self.dt)[0]):g} s,"
             f" {self.method}"
         )
         if self.is_batch:
@@ -170,7 +174,8 @@ class Rollout(Signals):
         accuracy = ""
         if RELATIVE in self.metrics:
             accuracy = f"; accurate to {float(self.metrics[RELATIVE]):.1g} of the tube"
-        return f"Rollout({shape}; status: {describe(int(self.status))}{accuracy})"
+        status = describe(int(self.status), status_words(self.scenario))
+        return f"Rollout({shape}; status: {status}{accuracy})"
 
     def _repr_html_(self) -> str:
         return present("card", self)

@@ -10,9 +10,9 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -42,14 +42,16 @@ from iblf_jax.core.pytree import (
     unwrapped,
 )
 from iblf_jax.core.time import joined, jump_times_of
+from iblf_jax.core.units import HIGHER, POSITION, VELOCITY, Unit, as_text
 from iblf_jax.simulation.levels import model_state, start_levels
+from iblf_jax.simulation.measurement_noise import noise_advice
 from iblf_jax.simulation.sampling import PERIOD_TOLERANCE, Sampling
 from iblf_jax.world import plants, regions
 from iblf_jax.world.bounds import Bounds, Funnel, Side, bounds_at, speed_limits_at
 from iblf_jax.world.disturbances import Disturbance, Nothing
 from iblf_jax.world.plants import Plant
 from iblf_jax.world.references import Reference
-from iblf_jax.world.robots import Robot
+from iblf_jax.world.robots import Robot, WithMotors
 from iblf_jax.world.robots._base import mass_matrix_at
 
 
@@ -69,9 +71,10 @@ class Initial:
         higher.
     """
 
-    q: Leaf = leaf("rad")
-    dq: Leaf = leaf("rad/s", default=0.0)
-    higher: Leaf = leaf("1", shape="level", default=None)
+    q: Leaf = leaf(POSITION)
+    dq: Leaf = leaf(VELOCITY, default=0.0)
+    higher: Leaf = leaf(HIGHER, shape="level", default=None)
+    stacked: ClassVar[dict[str, tuple[str, ...]]] = {"x": ("q", "dq", "higher")}
 
     def __init__(self, q: Any = None, dq: Any = None, higher: Any = None, *, x: Any = None) -> None:
         if x is not None:
@@ -136,10 +139,19 @@ OPTIONAL_MEMBERS = ("skeleton",)
 """Members of these protocols that a part may lack."""
 
 HOW_TO_MAKE = "Make one with ij.presets or ij.Scenario."
-VELOCITY_UNITS = {
-    "units": dict.fromkeys(("value", "offset", "amplitude", "initial", "final"), "rad/s")
-}
-"""Units of the leaves of bounds on velocities: leaf -> unit."""
+
+
+def _of_level(level: int) -> Callable[[Mapping[str, Unit], int], Mapping[str, Unit]]:
+    """The units of the parameters of bounds, of which part 0 bounds this level."""
+
+    def units_of_part(units: Mapping[str, Unit], part: int) -> Mapping[str, Unit]:
+        return {**units, "x1": units[f"x{level + part}"]}
+
+    return units_of_part
+
+
+BOUNDS_OF_SECOND_LEVEL = {"part_units": _of_level(2)}
+"""Metadata of the bounds of the levels from the second on."""
 
 
 @component
@@ -162,8 +174,9 @@ class Scenario:
         may be the model of a plant of higher order, under a law of robots; of an `ElectricDrive`
         the law then needs an input map (`controllers.WithDrive`).
       sampling: timing of law and observer, a `Sampling`; continuous time if not given.
-      sensor: measurement of q and q', any of `iblf_jax.sensors`; `Ideal()` if not given.  Others
-        need a sampling.
+      sensor: measurement of q and q', or of all levels of a plant (`sensors.Levels`), any of
+        `iblf_jax.sensors`; `Ideal()` if not given.  Others need a sampling.  A level that is not
+        measured needs an observer that estimates it, such as `observers.StateObserver`.
       actuator: map from command to torque, any of `iblf_jax.actuators`; `Ideal()` if not given.
       velocity_bounds: constraints on the joint velocities, a `bounds.Bounds` [rad/s] whose funnels
         follow q_d'; none if not given.  Runs record their margins under every law;
@@ -192,9 +205,13 @@ class Scenario:
     sampling: Sampling | None = None
     sensor: Sensor = IdealSensor()
     actuator: Actuator = IdealActuator()
-    velocity_bounds: Bounds | None = dataclasses.field(default=None, metadata=VELOCITY_UNITS)
+    velocity_bounds: Bounds | None = dataclasses.field(
+        default=None, metadata=BOUNDS_OF_SECOND_LEVEL
+    )
     regions: tuple[regions.Region, ...] = ()
-    state_bounds: tuple[Bounds | None, ...] = ()
+    state_bounds: tuple[Bounds | None, ...] = dataclasses.field(
+        default=(), metadata=BOUNDS_OF_SECOND_LEVEL
+    )
 
     def check(self) -> None:
         """Checks the parts, makes the plant the model if none is given, and repeats scalars for the
@@ -264,7 +281,8 @@ class Scenario:
     def _check_combination(self) -> None:
         """Raises ValueError for parts that do not fit together."""
         if self.model.n != self.plant.n:
-            got, expected = f"{self.model.n} joints", f"{self.plant.n} joints, as the plant has"
+            noun = plants.component_noun(self.plant)
+            got, expected = f"{self.model.n} {noun}s", f"{self.plant.n} {noun}s, as the plant has"
             raise checks.fail("Scenario.model", got, expected)
         law = unwrapped(self.controller)
         if self.context.level_bounds(2) is None and law_member(law, "needs_velocity_bounds"):
@@ -366,7 +384,9 @@ def check_levels(scenario: Scenario) -> None:
         remedy = "Take controllers.BarrierBackstepping"
         remedy += "." if robot is None else ", or model=plant.robot."
         raise checks.fail("Scenario.model", type(model).__name__, expected, remedy)
+    _check_input(scenario)
     _check_observer(scenario)
+    _check_measured_levels(scenario)
     higher = scenario.initial.higher
     if higher is not None and len(higher) != order - 2:
         expected = f"{order} levels, as the plant has"
@@ -377,14 +397,75 @@ def check_levels(scenario: Scenario) -> None:
 
 
 def _check_observer(scenario: Scenario) -> None:
-    """Raises ValueError for an observer of robots with a model that contains no robot."""
+    """Raises ValueError for an observer of robots with a model that contains no robot, or one of
+    levels with a model that does not fit its fields.
+    """
     observer, model = scenario.observer, scenario.model
-    if isinstance(observer, NoObserver) or observer_member(observer, "receives_x"):
+    if isinstance(observer, NoObserver):
+        return
+    if observer_member(observer, "receives_x"):
+        observer_member(observer, "check_model")(plants.as_plant(model))
         return
     if plants.is_chain(model) and plants.plant_member(model, "joint_torque") is None:
         expected = "an observer of plants in strict-feedback form, such as LevelObserver"
         remedy = f"{type(model).__name__} contains no robot."
         raise checks.fail("Scenario.observer", type(observer).__name__, expected, remedy)
+
+
+def _check_input(scenario: Scenario) -> None:
+    """Raises ValueError for a law that commands another quantity than the plant's input: a torque
+    for a voltage, say.
+    """
+    outermost, *wrapped = layers(scenario.controller)
+    for law in wrapped:
+        if law_member(law, "input_unit") is not None:
+            kind = type(law).__name__
+            expected = f"{kind} as the outermost law"
+            remedy = f"Such as {kind}(law={type(outermost).__name__}(...), ...)."
+            raise checks.fail("Scenario.controller", type(outermost).__name__, expected, remedy)
+    needed = plants.units_of(scenario.plant)[-1]
+    given = law_member(outermost, "input_unit") or plants.units_of(scenario.model)[-1]
+    if given == needed or UNKNOWN_UNIT in (given, needed):
+        return
+    kind = type(scenario.plant).__name__
+    expected = f"a law that commands the input of {kind} [{needed}]"
+    remedy = "Take the plant as the model, with controllers.BarrierBackstepping."
+    if isinstance(scenario.plant, plants.ElectricDrive):
+        remedy = "Such as controllers.WithDrive(law, drive=plant), or model=plant."
+    got = f"{type(outermost).__name__}, which commands [{given}]"
+    raise checks.fail("Scenario.controller", got, expected, remedy)
+
+
+UNKNOWN_UNIT = "1"
+"""Unit of the levels and of the input of a plant that states none."""
+
+
+def _check_measured_levels(scenario: Scenario) -> None:
+    """Raises ValueError for levels that are neither measured nor estimated."""
+    order = plants.order_of(scenario.plant)
+    covered = sensor_member(scenario.sensor, "order")
+    if covered not in (None, order):
+        expected = f"sensors of {order} levels, as the plant has"
+        remedy = "None is for a level that is not measured."
+        raise checks.fail("Scenario.sensor", f"sensors of {covered} levels", expected, remedy)
+    every = tuple(range(1, plants.order_of(scenario.model) + 1))
+    measured = sensor_member(scenario.sensor, "measured") or every
+    observer = scenario.observer
+    needed = every
+    if observer_member(observer, "complete") is not None:
+        needed = observer_member(observer, "measured") or every
+    missing = [str(level) for level in needed if level not in measured]
+    if not missing:
+        return
+    which = ", ".join(missing)
+    expected = f"level {which} measured, which {type(observer).__name__} reads"
+    if needed is every:
+        expected = "every level of the model measured, or estimated by an observer"
+    levels = tuple(level for level in every if level in measured)
+    remedy = f"Such as observers.StateObserver(bandwidth=..., measured={levels})."
+    if 1 not in levels:
+        remedy = "The levels below a measured one do not follow from it: measure level 1."
+    raise checks.fail("Scenario.sensor", f"no measurement of level {which}", expected, remedy)
 
 
 def _check_region(name: str, region: regions.Region, robot: Robot) -> None:
@@ -504,7 +585,9 @@ def _fit_leaf(value: Any, n: int, name: str) -> Any:
 
 def _fit_rows(value: Any, n: int, name: str) -> Any:
     """A leaf of one row a level, with n entries a row."""
-    if jnp.ndim(value) < 2:
+    if jnp.ndim(value) == 0:
+        return value  # the same number for all levels and components
+    if jnp.ndim(value) == 1:
         rows = jnp.shape(value)
         return jnp.broadcast_to(jnp.asarray(value)[..., None], (*rows, n))
     if jnp.shape(value)[1] != n:
@@ -580,9 +663,38 @@ def _advice(scenario: Scenario) -> list[str]:
     """The warnings of the parts about their parameter values."""
     advice = law_member(scenario.controller, "advice")()
     advice = advice + observer_member(scenario.observer, "advice")()
+    advice = advice + motors_advice(scenario)
     if scenario.sampling is not None:
         advice = advice + sensor_member(scenario.sensor, "advice")(scenario.sampling.period)
+        advice = advice + noise_advice(scenario)
     return advice
+
+
+def motors_advice(scenario: Scenario) -> list[str]:
+    """A warning about a robot as the model of a flexible joint whose inertia lacks that of the
+    motors.
+    """
+    plant, model = scenario.plant, scenario.model
+    if not isinstance(plant, plants.FlexibleJoint) or plants.is_chain(model):
+        return []
+    if isinstance(model, WithMotors):
+        return []
+    q = scenario.initial.q
+    links, known = (np.diag(mass_matrix_at(robot, q)) for robot in (plant.robot, model))
+    inertia = np.asarray(plant.motor_inertia)
+    share = float(np.min((known - links) / inertia))
+    if share > LEAST_SHARE_OF_MOTORS:
+        return []
+    return [
+        f"model: the inertia of this robot contains {max(share, 0.0):.0%} of that of the motors"
+        f" (plant.motor_inertia = {inertia} kg m^2), although a law of robots commands their"
+        " torque. Take model=plant.rigid(), whose inertia is M + diag(J)."
+    ]
+
+
+LEAST_SHARE_OF_MOTORS = 0.5
+"""Share of the inertia of a motor below which a model counts as one of the links alone.  A robot
+may contain that inertia in other ways than `WithMotors`, such as the armature of an `Arm`."""
 
 
 def _typed(x: Any, dtype) -> jax.Array:
@@ -715,14 +827,17 @@ def _check_start(scenario: Scenario) -> None:
     for name, values in finite.items():
         if not np.all(np.isfinite(values)):
             raise checks.fail(name, values, "finite values at t = 0")
-    _check_order("bounds", start.lower, start.upper)
+    noun = plants.component_noun(scenario.plant)
+    _check_order(f"bounds of {noun}", start.lower, start.upper)
     remedy = "Move the reference or widen the bounds (Assumption 2)."
-    _check_inside("reference of joint {}", "bounds", start.q_d, start.lower, start.upper, remedy)
+    _check_inside(
+        f"reference of {noun} {{}}", "bounds", start.q_d, start.lower, start.upper, remedy
+    )
     remedy = "Move the start or widen the bounds."
     _check_inside("initial.q[{}]", "bounds", q, start.lower, start.upper, remedy)
     if start.speed_limits is not None:
         slowest, fastest = start.speed_limits
-        _check_order("velocity_bounds", slowest, fastest)
+        _check_order("velocity_bounds of joint", slowest, fastest)
         _check_inside("initial.dq[{}]", "velocity bounds", dq, slowest, fastest, remedy)
     for region, margin in zip(scenario.regions, start.region_margins, strict=True):
         if not margin > 0:
@@ -733,7 +848,8 @@ def _check_start(scenario: Scenario) -> None:
     _check_levels_at_start(scenario)
     limit = plants.speed_limit(scenario.plant)
     if not np.all(np.abs(dq) < limit):
-        expected = f"speeds below {limit:g} rad/s"
+        unit = as_text(plants.units_of(scenario.plant)[1])
+        expected = f"speeds below {limit:g} {unit}"
         raise checks.fail("initial.dq", dq, expected, "A run that fast counts as diverged.")
     for name, part in (("plant", scenario.plant), ("model", scenario.model)):
         robot = plants.robot_of(part)
@@ -759,14 +875,28 @@ def _check_levels_at_start(scenario: Scenario) -> None:
         lower, upper = (np.asarray(side) for side in bounds_at(bounds, t, jnp.zeros_like(x[0])))
         if isinstance(bounds.lower, Funnel) or isinstance(bounds.upper, Funnel):
             continue  # around alpha, which the law computes
-        _check_order(f"state_bounds[{i}]", lower, upper)
+        noun = plants.component_noun(scenario.plant)
+        _check_order(f"state_bounds[{i}] of {noun}", lower, upper)
         remedy = "Move the start or widen the bounds."
         level = f"initial.x[{i + 1}][{{}}]"
         _check_inside(level, f"bounds of level {i + 2}", np.asarray(x[i + 1]), lower, upper, remedy)
     parts: dict[str, Any] = {"plant": scenario.plant, "model": scenario.model}
     for name, plant in parts.items():
         if plants.is_chain(plant):
-            _check_gains(name, np.asarray(plant.gain(t, x[: plant.order])))
+            levels = x[: plant.order]
+            _check_gains(name, np.asarray(plant.gain(t, levels)))
+            if not isinstance(plant, plants.OF_KNOWN_STRUCTURE):
+                plants.check_dependence(name, _dependence_near(plant, t, levels))
+
+
+@jax.jit
+def _dependence_near(plant: Plant, t: jax.Array, x: jax.Array) -> Any:
+    """The dependence of drift and gain on the levels at the start and at a state near it, where
+    even functions of a level that starts at 0 have a slope.
+    """
+    nearby = x + 0.1 * (1.0 + jnp.abs(x))
+    points = jnp.stack([x, nearby])
+    return jax.vmap(partial(plants.dependence_on_levels, plant, t))(points)
 
 
 def _check_gains(name: str, gains: np.ndarray) -> None:
@@ -784,7 +914,7 @@ def _check_order(name: str, lower: np.ndarray, upper: np.ndarray) -> None:
     for i, (low, high) in enumerate(zip(lower, upper, strict=True)):
         if not low < high:
             expected, remedy = "finite lower < upper at t = 0", "Exchange or widen them."
-            raise checks.fail(f"{name} of joint {i}", (low, high), expected, remedy)
+            raise checks.fail(f"{name} {i}", (low, high), expected, remedy)
 
 
 def _check_inside(

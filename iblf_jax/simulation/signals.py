@@ -9,11 +9,14 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from iblf_jax.core.units import HIGHER, INPUT, POSITION, UNCERTAIN, VELOCITY, PlantUnit
+
 
 class Recorded(NamedTuple):
     """SI unit and meaning of a recorded signal."""
 
     unit: str
+    """A `PlantUnit` where it depends on the plant."""
     meaning: str
 
 
@@ -22,28 +25,30 @@ class Signals:
     """The recorded signals.  At an instant vectors are (n,); the time axis of a run comes first."""
 
     t: Annotated[Array, Recorded("s", "time")]
-    q: Annotated[Array, Recorded("rad", "joint position")]
-    dq: Annotated[Array, Recorded("rad/s", "joint velocity")]
-    tau: Annotated[Array, Recorded("N m", "applied torque")]
-    e1: Annotated[Array, Recorded("rad", "position error q - q_d")]
-    e2: Annotated[Array, Recorded("rad/s", "velocity error dq - alpha")]
+    q: Annotated[Array, Recorded(POSITION, "joint position")]
+    dq: Annotated[Array, Recorded(VELOCITY, "joint velocity")]
+    tau: Annotated[Array, Recorded(INPUT, "applied torque")]
+    e1: Annotated[Array, Recorded(POSITION, "position error q - q_d")]
+    e2: Annotated[Array, Recorded(VELOCITY, "velocity error dq - alpha")]
     xi: Annotated[Array, Recorded("1", "position error relative to its bound")]
     """Inside the bounds if |xi| < 1."""
-    q_d: Annotated[Array, Recorded("rad", "reference position")]
-    dq_d: Annotated[Array, Recorded("rad/s", "reference velocity")]
-    lower: Annotated[Array, Recorded("rad", "lower bound of q")]
-    upper: Annotated[Array, Recorded("rad", "upper bound of q")]
-    alpha: Annotated[Array, Recorded("rad/s", "virtual velocity")]
-    disturbance: Annotated[Array, Recorded("N m", "lumped uncertain term f")]
+    q_d: Annotated[Array, Recorded(POSITION, "reference position")]
+    dq_d: Annotated[Array, Recorded(VELOCITY, "reference velocity")]
+    lower: Annotated[Array, Recorded(POSITION, "lower bound of q")]
+    upper: Annotated[Array, Recorded(POSITION, "upper bound of q")]
+    alpha: Annotated[Array, Recorded(VELOCITY, "virtual velocity")]
+    disturbance: Annotated[Array, Recorded(UNCERTAIN, "lumped uncertain term f")]
     """Of (2.1)."""
-    disturbance_estimate: Annotated[Array, Recorded("N m", "estimate of the uncertain term")]
+    disturbance_estimate: Annotated[Array, Recorded(UNCERTAIN, "estimate of the uncertain term")]
     V: Annotated[Array, Recorded("1", "Lyapunov function V2")]
     """Of (3.12), ()."""
     _: dataclasses.KW_ONLY
-    dq_lower: Annotated[Any, Recorded("rad/s", "lower bound of dq")] = ()
+    dq_lower: Annotated[Any, Recorded(VELOCITY, "lower bound of dq")] = ()
     """`()` where velocities have no bounds."""
-    dq_upper: Annotated[Any, Recorded("rad/s", "upper bound of dq")] = ()
-    slack: Annotated[Any, Recorded("rad/s^2", "violation of the safety filter's conditions")] = ()
+    dq_upper: Annotated[Any, Recorded(VELOCITY, "upper bound of dq")] = ()
+    slack: Annotated[
+        Any, Recorded(PlantUnit("rad/s^2", "x2/s"), "violation of the safety filter's conditions")
+    ] = ()
     """`()` under laws without a filter."""
     region_margin: Annotated[
         Any, Recorded("m", "distance of the regions' points to their boundaries")
@@ -53,13 +58,13 @@ class Signals:
         Any, Recorded("m/s^2", "violation of the safety filter's conditions on the regions")
     ] = ()
     """`()` without regions or without a filter."""
-    higher: Annotated[Any, Recorded("1", "levels of the state from the third on")] = ()
+    higher: Annotated[Any, Recorded(HIGHER, "levels of the state from the third on")] = ()
     """One row a level; `()` for robots."""
-    e_higher: Annotated[Any, Recorded("1", "errors x_i - alpha_{i-1} of these levels")] = ()
+    e_higher: Annotated[Any, Recorded(HIGHER, "errors x_i - alpha_{i-1} of these levels")] = ()
     """`()` for robots, and under laws without virtual controls for these levels."""
-    higher_lower: Annotated[Any, Recorded("1", "lower bounds of these levels")] = ()
+    higher_lower: Annotated[Any, Recorded(HIGHER, "lower bounds of these levels")] = ()
     """-infinity for a level without bounds; `()` where none has bounds."""
-    higher_upper: Annotated[Any, Recorded("1", "upper bounds of these levels")] = ()
+    higher_upper: Annotated[Any, Recorded(HIGHER, "upper bounds of these levels")] = ()
 
 
 @jax.tree_util.register_dataclass
@@ -75,7 +80,8 @@ class Sample(Signals):
     each with half of the time to its neighbour.
     """
     gravity: Array
-    """G0(q), the torque that balances the gravity of the model [N m]."""
+    """The input that balances the gravity of the model: the torque G0(q) [N m] of a robot, of
+    another plant its own `steady_input`, 0 if it states none."""
     guard_active: Array
     saturated: Array
     step: Any = dataclasses.field(default=0.0, kw_only=True)
@@ -102,16 +108,32 @@ def speed_margin(sample: Sample, velocity: Array) -> Array:
 
 PER_REGION = ("region_margin", "region_slack", "largest_region_slack")
 """Signals and metrics with one number per region."""
+PER_LEVEL = ("disturbance", "disturbance_estimate", "estimate_rmse")
+"""Signals and metrics of a model in strict-feedback form with one row per level."""
+PER_HIGHER_LEVEL = (
+    "higher",
+    "e_higher",
+    "higher_lower",
+    "higher_upper",
+    "level_margin",
+    "level_alpha_margin",
+)
+"""Signals and metrics with one row per level from the third on."""
 
 
 def dimension_names(name: str, shape: tuple[int, ...], joints: int) -> tuple[str, ...]:
     """Names of the dimensions of a signal at one instant, or of a metric of one run: "joint" for
-    (n,), "region" for one number per region, else names of its own.
+    (n,), "level" or "higher_level" and "joint" for one row per level, "region" for one number per
+    region, else names of its own.
     """
     if name in PER_REGION:
         return ("region",)
     if shape == (joints,):
         return ("joint",)
+    if len(shape) == 2 and name in PER_LEVEL:
+        return ("level", "joint")
+    if name in PER_HIGHER_LEVEL:
+        return ("higher_level", "joint")
     return tuple(f"{name}_axis_{i}" for i in range(len(shape)))
 
 

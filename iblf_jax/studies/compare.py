@@ -36,6 +36,7 @@ from iblf_jax.core import checks, notices
 from iblf_jax.core.optional import attributes
 from iblf_jax.core.pytree import field_values, unwrapped
 from iblf_jax.core.status import Status
+from iblf_jax.core.units import INPUT
 from iblf_jax.engine import Outcome, RunRequest, run_batch
 from iblf_jax.engine.simulate import simulate
 from iblf_jax.simulation.error_estimate import RELATIVE
@@ -44,6 +45,7 @@ from iblf_jax.simulation.noise import noise_values
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical
+from iblf_jax.simulation.units import unit_text
 from iblf_jax.studies.comparison import Comparison
 from iblf_jax.studies.equal_effort import NO_EFFORT, EffortSearch, Trials, grid, search
 from iblf_jax.studies.time_step import needed_dt
@@ -225,7 +227,8 @@ def _at_effort_of(
         return needed_dt(trials.status, trials.mode, trials.error, dt, method)
 
     inaccurate = bool((int(reference.status) | int(own.status)) & Status.INACCURATE)
-    found = search(_trials_of(scenario, names, options), target, dt_for, inaccurate)
+    unit = unit_text(scenario, INPUT)
+    found = search(_trials_of(scenario, names, options), target, dt_for, inaccurate, unit)
     for factor in found.crossings:
         run = _run(with_parameters(scenario, _scaled(scenario, names, factor)), options)
         if not int(run.status) & NO_EFFORT:

@@ -18,8 +18,12 @@ from iblf_jax.core import tables
 from iblf_jax.core.presentation import present
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import FAILED, describe
+from iblf_jax.core.units import INPUT, POSITION, VELOCITY
 from iblf_jax.simulation.results import Rollout
+from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.simulation.units import status_words, unit_text
 from iblf_jax.studies.equal_effort import NO_EFFORT, EffortSearch
+from iblf_jax.world import plants
 
 TITLES = {"gains": "Gains as given", "effort": "Equal effort"}
 
@@ -62,27 +66,35 @@ class Row(NamedTuple):
 OPTIONAL = ("velocity_margin", "region_margin")
 """Columns of constraints that not every scenario has."""
 
-HEADINGS = (
-    "law",
-    "factor",
-    "settling [s]",
-    "rmse [rad]",
-    "margin [rad]",
-    "1-max|xi|",
-    "velocity margin [rad/s]",
-    "region margin [m]",
-    "peak tau [N m]",
-    "rms tau [N m]",
-    "above gravity",
-    "chatter [N m]",
-    "status",
-)
+
+def headings(scenario: Scenario) -> tuple[str, ...]:
+    """The heading of each column of `Row`, with the units of the plant."""
+    plant = scenario.plant
+    first, second, of_input = (unit_text(scenario, unit) for unit in (POSITION, VELOCITY, INPUT))
+    torque, speed = "tau", "velocity"
+    if plants.is_chain(plant):
+        torque, speed = plants.input_name(plant), plants.level_names(plant)[1]
+    return (
+        "law",
+        "factor",
+        "settling [s]",
+        f"rmse [{first}]",
+        f"margin [{first}]",
+        "1-max|xi|",
+        f"{speed} margin [{second}]",
+        "region margin [m]",
+        f"peak {torque} [{of_input}]",
+        f"rms {torque} [{of_input}]",
+        "above gravity",
+        f"chatter [{of_input}]",
+        "status",
+    )
 
 
-def _verdict(status: int) -> str:
-    if status & FAILED:
-        return f"FAILED: {describe(status)}"
-    return describe(status)
+def _verdict(run: Rollout) -> str:
+    status = int(run.status)
+    text = describe(status, status_words(run.scenario))
+    return f"FAILED: {text}" if status & FAILED else text
 
 
 def row_of(law: str, factor: float, run: Rollout) -> Row:
@@ -107,7 +119,7 @@ def row_of(law: str, factor: float, run: Rollout) -> Row:
         float(np.sqrt(np.sum(np.asarray(m["torque_rms"]) ** 2))),
         float(m["effort_above_gravity"]),
         worst("torque_variation", np.sum),
-        _verdict(int(run.status)),
+        _verdict(run),
     )
 
 
@@ -155,7 +167,7 @@ class Comparison:
     def failed(self) -> dict[str, str]:
         """Law -> what went wrong, for the runs at given gains that failed."""
         return {
-            name: describe(int(run.status) & FAILED)
+            name: describe(int(run.status) & FAILED, status_words(run.scenario))
             for name, run in self.rollouts.items()
             if int(run.status) & FAILED
         }
@@ -182,10 +194,12 @@ class Comparison:
             if int(self.rollouts[first].status) & NO_EFFORT:
                 equal = "Nothing could be held equal."
             else:
-                effort = float(self.rollouts[first].metrics.effort_above_gravity)
+                metrics = self.rollouts[first].metrics
+                effort = float(metrics.effort_above_gravity)
+                unit = metrics.units["effort_above_gravity"]
                 equal = (
-                    "Held equal: the RMS torque above gravity, sqrt(mean |tau - G0(q)|^2) ="
-                    f" {effort:.4g} N m, that of {first}."
+                    f"Held equal: the RMS {self._input_in_words} = {effort:.4g} {unit}, that of"
+                    f" {first}."
                 )
             scaled = (
                 "Each law's gains (k1 and K2, or its own) are scaled by one factor: of those found"
@@ -193,6 +207,20 @@ class Comparison:
             )
             notes["effort"] = [f"{equal} {scaled}", *self._searches_in_words()]
         return notes
+
+    @property
+    def scenario(self) -> Scenario:
+        """The scenario of the first law."""
+        return next(iter(self.rollouts.values())).scenario
+
+    @property
+    def _input_in_words(self) -> str:
+        """The input that is held equal at equal effort, with its formula."""
+        plant = self.scenario.plant
+        if not plants.is_chain(plant):
+            return "torque above gravity, sqrt(mean |tau - G0(q)|^2)"
+        name = plants.input_name(plant)
+        return f"{name} above the one that balances gravity, sqrt(mean |u - u_0(x)|^2)"
 
     def _searches_in_words(self) -> list[str]:
         """Why a law has no factor, and for the others what was searched where that says more than
@@ -206,12 +234,13 @@ class Comparison:
 
     def __repr__(self) -> str:
         run = next(iter(self.rollouts.values()))
+        noun = plants.component_noun(run.scenario.plant)
         parts = [
             f"Comparison of {len(self.rollouts)} laws, {float(run.t[-1]):g} s, dt ="
-            f" {float(run.dt):g} s, {run.method}; worst joint"
+            f" {float(run.dt):g} s, {run.method}; worst {noun}"
         ]
         for kind, rows in self.table.items():
-            lines = _columns(rows)
+            lines = _columns(rows, self.scenario)
             parts += [
                 "",
                 TITLES[kind],
@@ -228,8 +257,8 @@ class Comparison:
         found = {}
         for kind, rows in self.table.items():
             notes = "".join(f"<p>{html.escape(note)}</p>" for note in self.notes[kind])
-            headings, *lines = _columns(rows)
-            found[TITLES[kind]] = tables.as_html(headings, lines) + notes
+            heading, *lines = _columns(rows, self.scenario)
+            found[TITLES[kind]] = tables.as_html(heading, lines) + notes
         return found
 
     def to_pandas(self):
@@ -251,13 +280,13 @@ class Comparison:
         return present("comparison figure", self, joint, **options)
 
 
-def _columns(rows: tuple[Row, ...]) -> list[tuple[str, ...]]:
+def _columns(rows: tuple[Row, ...], scenario: Scenario) -> list[tuple[str, ...]]:
     """Headings and lines, without the columns of constraints that the scenario does not have."""
     shown = [
         name not in OPTIONAL or any(math.isfinite(row._asdict()[name]) for row in rows)
         for name in Row._fields
     ]
-    lines = [HEADINGS, *(tuple(map(_cell, row)) for row in rows)]
+    lines = [headings(scenario), *(tuple(map(_cell, row)) for row in rows)]
     return [tuple(itertools.compress(line, shown)) for line in lines]
 
 

@@ -22,6 +22,7 @@ DRAWN = "drawn_"
 FIRST_TIMES = {
     "first_violation_time": Status.BOUND_VIOLATED,
     "first_velocity_violation_time": Status.VELOCITY_VIOLATED,
+    "first_level_violation_time": Status.STATE_BOUND_VIOLATED,
     "first_region_violation_time": Status.REGION_VIOLATED,
 }
 """Metric with the time of the first violation of a constraint -> the flag of its violation."""

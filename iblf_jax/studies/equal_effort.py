@@ -83,6 +83,8 @@ class EffortSearch:
     smaller_dt: float | None = None
     """A step [s] for the failed trials that may hide a better factor, where nothing but the step is
     to blame; None without such."""
+    unit: str = "N m"
+    """Of the efforts."""
 
     @property
     def factor(self) -> float:
@@ -122,7 +124,7 @@ class EffortSearch:
         if not self.crossings:
             return self._nothing_found()
         crossings = _few([f"{x:.4g}" for x in self.crossings])
-        text = f"the effort is {self.target:.4g} N m at {crossings}"
+        text = f"the effort is {self.target:.4g} {self.unit} at {crossings}"
         if len(self.crossings) > 1:
             text += f", of which {self.factor:.4g} is the nearest to 1"
         if self.accepts_inaccurate:
@@ -132,7 +134,8 @@ class EffortSearch:
     def _nothing_found(self) -> str:
         efforts = self.efforts[self.valid]
         if not efforts.size:
-            return f"none of them is valid, so no effort can be compared with {self.target:.4g} N m"
+            target = f"{self.target:.4g} {self.unit}"
+            return f"none of them is valid, so no effort can be compared with {target}"
         if efforts.max() < self.target:
             side = "stays below"
         elif efforts.min() > self.target:
@@ -140,10 +143,9 @@ class EffortSearch:
         else:
             side = "does not pass through"
         factor, effort = self.nearest
-        where = (
-            f"its effort {side} {self.target:.4g} N m ({efforts.min():.4g} to {efforts.max():.4g})"
-        )
-        return f"{where}; the nearest of them has {effort:.4g} N m, at {factor:.4g}"
+        tried = f"{efforts.min():.4g} to {efforts.max():.4g}"
+        where = f"its effort {side} {self.target:.4g} {self.unit} ({tried})"
+        return f"{where}; the nearest of them has {effort:.4g} {self.unit}, at {factor:.4g}"
 
     def _failures(self) -> list[str]:
         """Each group of neighbouring trials that failed for one reason."""
@@ -228,6 +230,7 @@ def search(
     target: float,
     needed_dt: Callable[[Trials], float | None] = lambda trials: None,
     inaccurate: bool = False,
+    unit: str = "N m",
 ) -> EffortSearch:
     """Finds the factors at which the effort is the target.
 
@@ -236,6 +239,7 @@ def search(
       target: the effort to reach [N m].
       needed_dt: trials with too large a time step -> one that is small enough [s].
       inaccurate: whether trials flagged INACCURATE are valid.
+      unit: of the efforts.
     """
     powers = grid()
     trials = run(2.0**powers)
@@ -246,7 +250,9 @@ def search(
     dt = None
     if np.any(hidden):
         dt = needed_dt(Trials(*(x[hidden] for x in trials)))
-    return EffortSearch(target, 2.0**powers, trials.effort, trials.status, ordered, inaccurate, dt)
+    return EffortSearch(
+        target, 2.0**powers, trials.effort, trials.status, ordered, inaccurate, dt, unit
+    )
 
 
 def _hidden(

@@ -291,9 +291,8 @@ class _Evaluation:
         if isinstance(self.output, str):
             return statistics.worst_joint(metrics, self.output)
         try:
-            return np.asarray(
-                self.output(Metrics(metrics, metric_units(self.prepared.shared.folds)))
-            )
+            units = metric_units(self.prepared.shared.folds, self.prepared.scenario)
+            return np.asarray(self.output(Metrics(metrics, units)))
         except Exception as error:
             expected = "a function of the metrics that returns one number a run"
             raise checks.fail("output", f"{type(error).__name__}: {error}", expected) from error

@@ -24,6 +24,9 @@ SMALLER_IS_WORSE = (
     "velocity_margin",
     "alpha_margin",
     "first_velocity_violation_time",
+    "level_margin",
+    "level_alpha_margin",
+    "first_level_violation_time",
     "region_margin",
     "first_region_violation_time",
 )

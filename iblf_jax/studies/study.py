@@ -32,13 +32,14 @@ from iblf_jax.simulation.metrics import metric_units
 from iblf_jax.simulation.noise import NOISE_NAME, noise_values
 from iblf_jax.simulation.results import Metrics, Rollout
 from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.simulation.units import status_words, unit_text
 from iblf_jax.studies import statistics, summaries
 from iblf_jax.studies.blocks import BlockResults, run_blocks
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.statistics import Probability
 from iblf_jax.studies.study_setup import PreparedStudy
+from iblf_jax.world import plants
 from iblf_jax.world.regions import in_words
-from iblf_jax.world.robots import joint_names
 
 if TYPE_CHECKING:
     import xarray
@@ -81,7 +82,7 @@ class Study:
     @classmethod
     def of(cls, setup: PreparedStudy, results: BlockResults) -> Study:
         """Builds the study from its checked arguments and the results of its runs."""
-        units = metric_units(setup.shared.folds)
+        units = metric_units(setup.shared.folds, setup.scenario)
         # jit sorts the names; here they are in the order of the folds.
         names = [name for name, _ in units if name in results.metrics]
         metrics = {name: results.metrics[name] for name in names} | results.metrics
@@ -411,16 +412,20 @@ class Study:
         if not self.started_outside[i]:
             return
         margins = summaries.initial_margins(self.scenario, self.samples)
-        first = {unit: x[i] for unit, x in margins.items()}
-        unit = next(unit for unit, x in first.items() if not np.min(x) > 0)
-        worst, plant = int(np.argmin(first[unit])), self.scenario.plant
-        if unit == "m":
-            name = in_words(self.scenario.regions[worst], plant)
+        first = {bounded: x[i] for bounded, x in margins.items()}
+        bounded = next(bounded for bounded, x in first.items() if not np.min(x) > 0)
+        worst, plant = int(np.argmin(first[bounded])), self.scenario.plant
+        if bounded == summaries.REGIONS:
+            name, unit = in_words(self.scenario.regions[worst], plant), "m"
         else:
-            name = joint_names(plant, self.scenario.n)[worst]
+            level = summaries.LEVELS.index(bounded)
+            name = plants.component_names(plant)[worst]
+            if plants.is_chain(plant):
+                name = f"{plants.level_names(plant)[level]} of {name}"
+            unit = unit_text(self.scenario, plants.units_of(plant)[level], worst)
         notices.warn(
-            f"Run {i} started outside its bounds: {name} was drawn {-first[unit][worst]:.3g} {unit}"
-            " beyond one at t = 0. That violation is the draw's, not the law's: narrow the"
+            f"Run {i} started outside its bounds: {name} was drawn {-first[bounded][worst]:.3g}"
+            f" {unit} beyond one at t = 0. That violation is the draw's, not the law's: narrow the"
             " perturbations of the start, or leave such runs out (study.started_outside).",
             SimulationWarning,
         )
@@ -443,8 +448,11 @@ class Study:
             f"  failed: {counts['FAILED']}; flagged, but not failed: {counts['FLAGGED']}; ok:"
             f" {counts['OK']}"
         )
+        texts = status_words(self.scenario)
         flags = [
-            f"{count} {describe(flag)}" for flag in Status if (count := counts[flag.name or ""])
+            f"{count} {describe(flag, texts)}"
+            for flag in Status
+            if (count := counts[flag.name or ""])
         ]
         if flags:
             lines.append(f"  flags, of which a run may have several: {'; '.join(flags)}")

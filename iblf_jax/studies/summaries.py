@@ -12,20 +12,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.control.controllers._base import state_of_levels
 from iblf_jax.core import checks
 from iblf_jax.core.status import FAILED, has_flag
 from iblf_jax.engine import block_size
+from iblf_jax.simulation.levels import start_levels
 from iblf_jax.simulation.paths import get, unit_at, with_parameters
 from iblf_jax.simulation.results import Metrics
 from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.simulation.signals import SIGNALS, dimension_names
+from iblf_jax.simulation.signals import dimension_names
+from iblf_jax.simulation.units import signal_unit
 from iblf_jax.studies import statistics
 from iblf_jax.studies.blocks import run_blocks
 from iblf_jax.studies.dataset import status_attributes
 from iblf_jax.studies.options import ThisProcess
 from iblf_jax.studies.store_config import describe_component, values_of
 from iblf_jax.studies.study_setup import PreparedStudy
-from iblf_jax.world.bounds import tube_at
+from iblf_jax.world import plants
+from iblf_jax.world.bounds import Funnel, bounds_at, tube_at
 from iblf_jax.world.regions import margins
 
 if TYPE_CHECKING:
@@ -51,11 +55,17 @@ def check_quantiles(quantiles: Sequence[float]) -> np.ndarray:
     return values
 
 
+LEVELS = tuple(f"level {i:02d}" for i in range(1, plants.MAX_ORDER + 1))
+"""Names of the levels in `initial_margins`, in an order that sorting keeps."""
+REGIONS = "distance to regions"
+"""Name of the regions in `initial_margins`."""
+
+
 def initial_margins(scenario: Scenario, samples: Mapping[str, Any]) -> dict[str, np.ndarray]:
     """The margin of each run to its constraints at t = 0; positive where it starts inside them.
 
-    By unit: "rad" and, where velocities have bounds, "rad/s", (N, n); "m" where there are m
-    regions, (N, m).
+    By what is bounded: the levels that have bounds, by their name in `LEVELS`, (N, n), and
+    `REGIONS`, (N, m) for m regions.  Bounds that follow a virtual control are left out.
     """
     return jax.tree.map(np.asarray, _initial_margins(scenario, samples))
 
@@ -67,12 +77,18 @@ def _initial_margins(scenario: Scenario, samples: Mapping[str, Any]) -> dict[str
         q, dq = perturbed.initial.q, perturbed.initial.dq
         zero = jnp.zeros((), q.dtype)
         tube = tube_at(perturbed.reference, perturbed.bounds, zero)
-        found = {"rad": jnp.minimum(q - tube.lower, tube.upper - q)}
+        found = {LEVELS[0]: jnp.minimum(q - tube.lower, tube.upper - q)}
         if perturbed.velocity_bounds is not None:
             low, high = perturbed.context.speed_limits(zero)
-            found["rad/s"] = jnp.minimum(dq - low, high - dq)
+            found[LEVELS[1]] = jnp.minimum(dq - low, high - dq)
+        for i, bounds in enumerate(perturbed.state_bounds):
+            if bounds is None or Funnel in (type(bounds.lower), type(bounds.upper)):
+                continue
+            x = state_of_levels(*start_levels(perturbed))[i + 1]
+            low, high = bounds_at(bounds, zero, jnp.zeros_like(x))
+            found[LEVELS[i + 1]] = jnp.minimum(x - low, high - x)
         if perturbed.regions:
-            found["m"] = margins(perturbed.regions, perturbed.plant, q)
+            found[REGIONS] = margins(perturbed.regions, plants.robot_of(perturbed.plant), q)
         return found
 
     return jax.vmap(margins_of_run)(samples)
@@ -190,12 +206,15 @@ def bands(
         name: np.concatenate([arrays[name] for arrays, _ in parts])[:count][used] for name in first
     }
     dims = ("quantile", "time", "joint")
-    variables: dict[str, Any] = {
-        name: (dims, _quantile(recorded[name], levels), {"units": SIGNALS[name].unit})
-        for name in BANDS
-    }
+    variables: dict[str, Any] = {}
+    for name in BANDS:
+        attributes = {"units": signal_unit(prepared.scenario, name)}
+        variables[name] = (dims, _quantile(recorded[name], levels), attributes)
     for name, (reduce, words) in ENVELOPES.items():
-        attributes = {"units": "rad", "description": f"{words} of the runs"}
+        attributes = {
+            "units": signal_unit(prepared.scenario, name),
+            "description": f"{words} of the runs",
+        }
         variables[name] = (dims[1:], reduce(recorded[name], axis=0), attributes)
     counts = {
         "runs": int(used.sum()),

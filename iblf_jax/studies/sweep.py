@@ -202,7 +202,7 @@ def _dataset(store: Store) -> xarray.Dataset:
 def _variables(prepared: PreparedStudy, config: dict[str, Any]) -> dict[str, Variable]:
     """The arrays of a sweep; metrics first, in their own order."""
     shapes = named_arrays(result_shapes(prepared))
-    units = dict(metric_units(prepared.shared.folds))
+    units = dict(metric_units(prepared.shared.folds, prepared.scenario))
     units |= {"status": "1", "fastest_mode": "1/s"}
     units |= {DRAWN + path: p["unit"] for path, p in config["perturbed"].items()}
     ordered = [name for name in units if name in shapes]

@@ -13,7 +13,7 @@ from jax.flatten_util import ravel_pytree
 
 from iblf_jax.control.actuators import Actuator, Delivered
 from iblf_jax.control.sensors import Measurement, Sensor
-from iblf_jax.control.sensors._base import unrounded
+from iblf_jax.control.sensors._base import sensor_member, unrounded
 from iblf_jax.core.optional import has_members
 from iblf_jax.testing._contract import (
     Findings,
@@ -24,7 +24,7 @@ from iblf_jax.testing._contract import (
     same_structure,
     shape_of,
 )
-from iblf_jax.testing.joints import examine_joints
+from iblf_jax.testing.joints import DEFAULT_LEVELS, examine_joints
 
 SMALL_TORQUES = (0.1, 1e-3)
 """Torques, one of which an actuator must deliver at a standstill [N m]."""
@@ -42,6 +42,8 @@ UNSTABLE = 1e-6
 def check_sensor(sensor: Any, *, n: int | None = None) -> None:
     """Checks a sensor: shapes, the state's structure, derivatives, float32.
 
+    A sensor with `receives_x` is checked with its `order` levels, 4 if it has no such property.
+
     Args:
       sensor: an instance.
       n: number of joints; that of its leaves if not given, 2 if these are scalars.
@@ -52,28 +54,41 @@ def check_sensor(sensor: Any, *, n: int | None = None) -> None:
     """
     with examine_joints(sensor, Sensor, n, "sensor") as (findings, fitted, joints):
         rng = np.random.default_rng(3)
-        q, dq = jnp.asarray(rng.uniform(-1, 1, (2, joints)))
+        given = _state_for(fitted, rng, joints)
         normal, period = jnp.asarray(rng.normal(size=(fitted.draws, joints))), jnp.asarray(1e-3)
-        in_both_types(findings, _measures, fitted, q, dq, normal, period)
+        in_both_types(findings, _measures, fitted, given, normal, period)
 
-        def outputs(sensor, q, dq, normal, period):
+        def outputs(sensor, given, normal, period):
             sensor = unrounded(sensor)
-            measured, state = sensor.measure(q, dq, normal, period, sensor.init(q, dq, period))
-            return {"q": measured.q, "dq": measured.dq} | leaves_by_name("state", state)
+            measured, state = sensor.measure(*given, normal, period, sensor.init(*given, period))
+            found = leaves_by_name("further levels", measured.higher)
+            return found | {"q": measured.q, "dq": measured.dq} | leaves_by_name("state", state)
 
-        check_function(findings, outputs, fitted, (q, dq, normal, period))
+        check_function(findings, outputs, fitted, (given, normal, period))
 
 
-def _measures(findings: Findings, sensor, q, dq, normal, period) -> None:
-    state = shape_of(findings, "init(q, dq, period)", sensor.init, q, dq, period)
-    label = "measure(q, dq, normal, period, state)"
-    found = shape_of(findings, label, sensor.measure, q, dq, normal, period, state)
+def _state_for(sensor: Any, rng: np.random.Generator, joints: int) -> tuple[jax.Array, ...]:
+    """A random state as the sensor receives it: (q, q'), or (x,)."""
+    if not sensor_member(sensor, "receives_x"):
+        return tuple(jnp.asarray(rng.uniform(-1, 1, (2, joints))))
+    order = sensor_member(sensor, "order") or DEFAULT_LEVELS
+    return (jnp.asarray(rng.uniform(-1, 1, (order, joints))),)
+
+
+def _measures(findings: Findings, sensor, given, normal, period) -> None:
+    names = "q, dq" if len(given) == 2 else "x"
+    q = given[0] if len(given) == 2 else given[0][0]
+    state = shape_of(findings, f"init({names}, period)", sensor.init, *given, period)
+    label = f"measure({names}, normal, period, state)"
+    found = shape_of(findings, label, sensor.measure, *given, normal, period, state)
     is_pair = isinstance(found, tuple) and len(found) == 2 and isinstance(found[0], Measurement)
     remedy = "It must be a pair (iblf_jax.sensors.Measurement(q, dq), next state)"
     findings.result_is(is_pair, label, found, remedy)
     measured, after = found
     has_shape(findings, label + ", q", measured.q, q.shape)
     has_shape(findings, label + ", dq", measured.dq, q.shape)
+    if len(given) == 1 and len(given[0]) > 2:
+        has_shape(findings, label + ", higher", measured.higher, given[0][2:].shape)
     same_structure(findings, label + ", state", after, state)
 
 

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from typing import Any, TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.control.controllers import Backstepping
@@ -19,6 +20,7 @@ from iblf_jax.simulation.scenario import Initial, Scenario, fit_joints
 from iblf_jax.testing._contract import Findings, examine, in_dtype
 from iblf_jax.world.bounds import Bounds, Sinusoid
 from iblf_jax.world.disturbances import Sinusoids
+from iblf_jax.world.plants import ElectricDrive, FlexibleJoint, Rigid, StrictFeedback
 from iblf_jax.world.references import Sinusoid as SinusoidalReference
 from iblf_jax.world.robots import PlanarChain
 
@@ -26,6 +28,8 @@ T = TypeVar("T")
 
 DEFAULT_JOINTS = 2
 """Number of joints that is assumed for a component whose leaves are all scalars."""
+DEFAULT_LEVELS = 4
+"""Number of levels that is assumed for a component for plants in strict-feedback form."""
 
 
 def joints_of(member: Any, default: int = DEFAULT_JOINTS) -> int:
@@ -57,6 +61,8 @@ def _declared_sizes(member: Any) -> Iterator[int]:
             yield from _declared_sizes(value)
         elif field.metadata["shape"] == "joint" and np.ndim(value) == 1:
             yield np.shape(value)[0]
+        elif field.metadata["shape"] == "level" and np.ndim(value) == 2:
+            yield np.shape(value)[1]
 
 
 def _undeclared(member: Any) -> list[Any]:
@@ -133,6 +139,38 @@ def arm_of(n: int) -> Any:
     shrink = 0.8 ** np.arange(n)
     mass, length = 2.0 * shrink, 0.35 * shrink
     return PlanarChain(mass=mass, length=length, centre=length / 2, inertia=mass * length**2 / 4)
+
+
+def levels_of(member: Any) -> int:
+    """The number of levels of a component for plants in strict-feedback form: that of the rows of
+    its leaves, or `DEFAULT_LEVELS` if these are single numbers.
+    """
+    values = field_values(member) if dataclasses.is_dataclass(member) else {}
+    rows = [
+        np.shape(values[field.name])[0]
+        for field in dataclasses.fields(member)
+        if is_leaf_field(field)
+        if field.metadata["shape"] == "level" and np.ndim(values[field.name]) > 0
+    ]
+    return max(rows, default=DEFAULT_LEVELS)
+
+
+def plant_of(order: int, n: int) -> Any:
+    """A plant in strict-feedback form with this number of levels, of n components: an arm that is
+    rigid, has electric drives or flexible joints, or a chain of integrators.
+    """
+    arm = arm_of(n)
+    if order == 2:
+        return Rigid(arm)
+    if order == 3:
+        return ElectricDrive(
+            arm, torque_constant=1.5, inductance=0.02, resistance=0.8, back_emf=0.4
+        )
+    if order == 4:
+        return FlexibleJoint(arm, stiffness=300.0, motor_inertia=0.02, motor_damping=0.1)
+    return StrictFeedback(
+        drift=lambda t, x: -x, gain=lambda t, x: jnp.ones_like(x), n=n, order=order
+    )
 
 
 def scenario_of(n: int) -> Scenario:

@@ -8,7 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.control.controllers import Command, Controller
+from iblf_jax.control.controllers import Command, Controller, WithDrive
 from iblf_jax.control.controllers._base import law_member
 from iblf_jax.core import notices
 from iblf_jax.core.pytree import unwrapped
@@ -44,6 +44,8 @@ def check_law(
     """Checks a tracking law: shapes, the state's structure, derivatives, float32, finite values
     inside the bounds, and a short closed loop.
 
+    A law inside a `WithDrive` runs on the plant that this contains.
+
     Args:
       law: an instance.
       scenario: the scenario of the closed loop; if not given the paper's simulation, or a similar
@@ -65,8 +67,11 @@ def check_law(
         speeds = base.velocity_bounds
         if speeds is None and law_member(unwrapped(law), "needs_velocity_bounds"):
             speeds = Bounds(lower=Constant(-SPEED), upper=Constant(SPEED))
+        plant = law.drive if isinstance(law, WithDrive) else base.plant
         try:
-            base = dataclasses.replace(base, controller=law, velocity_bounds=speeds)
+            base = dataclasses.replace(
+                base, controller=law, velocity_bounds=speeds, plant=plant, model=base.model
+            )
             base = in_dtype(base, "float64")
         except ValueError as error:
             findings.stop(f"a Scenario does not accept it ({error})")
@@ -79,7 +84,8 @@ def check_law(
         def outputs(law, t, q, dq, f_hat, context):
             command, rate = law.command(t, q, dq, f_hat, context, law.init(q, dq, context))
             rates = leaves_by_name("its state's rate", rate)
-            return {"tau": command.tau, "alpha": command.alpha, "V1": command.V1} | rates
+            found = {"tau": command.tau, "alpha": command.alpha, "V1": command.V1}
+            return found | leaves_by_name("input", command.input) | rates
 
         check_function(findings, outputs, base.controller, (t, q, dq, f_hat, base.context))
         check_claims(findings, base)

@@ -17,8 +17,10 @@ import numpy as np
 
 from iblf_jax.core import checks, notices
 from iblf_jax.core.progress import bar
+from iblf_jax.core.units import POSITION
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.simulation.units import unit_text
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.tuning.checkpoints import fingerprint, load_checkpoint, save_checkpoint
 from iblf_jax.tuning.evaluation import Evaluator, values
@@ -220,27 +222,28 @@ def _run(
     if checkpoint is not None and checkpoint.exists():
         load_checkpoint(checkpoint, search, mark)
     with bar(options.show, iterations, int(search.state["iteration"]), unit="steps") as shown:
+        unit = unit_text(search.evaluate.problem.scenario, POSITION)
 
         def on_step(search: Search) -> None:
             if checkpoint is not None:
                 save_checkpoint(search, checkpoint, mark)
-            _show(shown, search)
+            _show(shown, search, unit)
             if options.callback is not None:
                 options.callback(search)
 
         return search.run(iterations, on_step)
 
 
-def _show(shown: Any, search: Search) -> None:
+def _show(shown: Any, search: Search, unit: str) -> None:
     """Writes numbers of the last step beside the progress bar: those of the start with the smallest
-    loss.
+    loss; `unit` is that of the margin.
     """
     shown.update(1)
     last = {name: x[-1] for name, x in search.history.items()}
     s = int(np.argmin(np.where(last["valid"], last["loss"], np.inf)))
     shown.set_postfix_str(
         f"loss {last['loss'][s]:.5g}, |gradient| {last['gradient_norm'][s]:.2g}, margin"
-        f" {last['margin'][s]:.3g} rad"
+        f" {last['margin'][s]:.3g} {unit}"
     )
 
 

@@ -43,6 +43,7 @@ from iblf_jax.core.pytree import component, leaf, static
 from iblf_jax.engine import Outer as Outer
 from iblf_jax.simulation.metrics import Fold, Settling, Tracking, check_needs
 from iblf_jax.simulation.scenario import Scenario, fit_joints
+from iblf_jax.simulation.units import unit_text
 from iblf_jax.tuning.quantities import (
     TUNED_SIGNALS,
     MetricResult,
@@ -51,13 +52,13 @@ from iblf_jax.tuning.quantities import (
     quantity_member,
 )
 from iblf_jax.tuning.quantities import Quantity as Quantity
-from iblf_jax.world.robots import joint_names
+from iblf_jax.world import plants
 
 A_SHARE = "a share of the runs, from 0 to 1"
 UNSUITABLE_SCALES = (
     "objective: the scale of {names} is its value at the start, where a run leaves its bounds by"
-    " {distance:.3g} rad. Such values are far larger than those of good gains, and so the terms are"
-    " not comparable. Start from gains that keep the bounds, or give each term a scale=."
+    " {distance:.3g} {unit}. Such values are far larger than those of good gains, and so the"
+    " terms are not comparable. Start from gains that keep the bounds, or give each term a scale=."
 )
 
 
@@ -228,7 +229,9 @@ def is_complete(objective: Objective) -> bool:
     return all(term.is_complete for term in objective.terms)
 
 
-def complete(objective: Objective, start: Any, margin: float | None = None) -> Objective:
+def complete(
+    objective: Objective, start: Any, margin: float | None = None, unit: str = "rad"
+) -> Objective:
     """The objective with every missing scale and limit set to the value at the start.
 
     Args:
@@ -236,12 +239,14 @@ def complete(objective: Objective, start: Any, margin: float | None = None) -> O
       start: the exact values of the terms' quantities at the start, (n_terms,).
       margin: the smallest margin of the runs at the start [rad]; a negative one gives a warning, as
         the values of runs that leave their bounds are no scales.
+      unit: of the margin.
     """
     values = np.asarray(checks.as_floats("start", start), float)
     checks.shape_is("start", values, (len(_composed(objective).terms),))
     missing = [term.name for term in objective.terms if not term.is_complete]
     if missing and margin is not None and margin < 0:
-        notices.warn(UNSUITABLE_SCALES.format(names=", ".join(missing), distance=-margin))
+        names = ", ".join(missing)
+        notices.warn(UNSUITABLE_SCALES.format(names=names, distance=-margin, unit=unit))
     terms = tuple(_completed(t, x) for t, x in zip(objective.terms, values, strict=True))
     return Objective(terms, objective.requirements)
 
@@ -322,10 +327,22 @@ def for_scenario(objective: Objective, scenario: Scenario) -> Objective:
       ValueError: a joint that the robot does not have, or another number of weights or limits; the
         message names the function.
     """
-    names = joint_names(scenario.plant, scenario.n)
+    names = plants.component_names(scenario.plant)
     terms = tuple(_part_of(t, t.name, names) for t in _composed(objective).terms)
-    requirements = tuple(_part_of(r, r.function or r.name, names) for r in objective.requirements)
+    requirements = tuple(
+        _in_units_of(scenario, _part_of(r, r.function or r.name, names))
+        for r in objective.requirements
+    )
     return Objective(terms, requirements)
+
+
+def _in_units_of(scenario: Scenario, requirement: Requirement) -> Requirement:
+    """A requirement whose name has the unit of the plant in the place of that of a robot."""
+    _, unit = requirement.measure
+    text = unit_text(scenario, unit)
+    if text == unit:
+        return requirement
+    return dataclasses.replace(requirement, name=requirement.name.replace(f" {unit}", f" {text}"))
 
 
 def _part_of(part: Any, function: str, names: tuple[str, ...]) -> Any:

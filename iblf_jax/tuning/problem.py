@@ -17,10 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.units import POSITION
 from iblf_jax.engine import RunRequest, points_per_batch
 from iblf_jax.simulation.noise import has_noise
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.scenario import Scenario, canonical, check_step
+from iblf_jax.simulation.units import unit_text
 from iblf_jax.studies.draws import Target, UncertainScenario, targets_of
 from iblf_jax.studies.time_step import recommended_dt
 from iblf_jax.tuning.objectives import (
@@ -154,7 +156,8 @@ class TuningProblem:
         if is_complete(goal):
             return problem
         *at_start, deficit = problem.exact_at_start()
-        goal = complete(goal, at_start[: len(goal.terms)], margin=-float(deficit))
+        unit = unit_text(scenario, POSITION)
+        goal = complete(goal, at_start[: len(goal.terms)], margin=-float(deficit), unit=unit)
         return problem.with_objective(jax.tree.map(lambda x: jnp.asarray(x, dtype), goal))
 
     def with_objective(self, objective: Objective) -> TuningProblem:

@@ -35,6 +35,7 @@ from iblf_jax.core import checks
 from iblf_jax.core.joints import Selection, indices, selection
 from iblf_jax.core.optional import OptionalMembers
 from iblf_jax.core.pytree import component, leaf, static
+from iblf_jax.core.units import INPUT, POSITION, VELOCITY, PlantUnit
 from iblf_jax.engine import Outer
 from iblf_jax.simulation.metrics import Fold, fold_member
 from iblf_jax.simulation.signals import Sample
@@ -66,12 +67,17 @@ class Quantity(Protocol):
 quantity_member = OptionalMembers(hessian=None, curvature=None, smoothing=None, signal="torque")
 """Reads the members for second-order methods, which a quantity may lack, and those of `Peak`.  A
 quantity without a signal is assumed to depend on the torque."""
-DEFICITS = {"deficit": "rad", "velocity_deficit": "rad/s", "region_deficit": "m"}
+DEFICITS = {"deficit": POSITION, "velocity_deficit": VELOCITY, "region_deficit": "m"}
 """Signals of which the largest is minus a margin -> unit; their sign counts, not their absolute
 value."""
 OF_LIMIT = "of the limit"
 """Unit of a peak that is measured in limits, one for each joint."""
-TUNED_SIGNALS = {"error": "rad", "torque": "N m", "torque_rate": "N m/s", "outside": "1"} | DEFICITS
+TUNED_SIGNALS = {
+    "error": POSITION,
+    "torque": INPUT,
+    "torque_rate": PlantUnit("N m/s", "u/s"),
+    "outside": "1",
+} | DEFICITS
 """Signal -> unit."""
 NEEDS = {"velocity_deficit": "dq_lower", "region_deficit": "region_margin"}
 """Signal -> the optional signal of the run that it is computed from."""
@@ -178,12 +184,12 @@ class TimeIntegral:
     signal: str = static(default="error")
     weights: jax.Array = leaf("1", shape="any", default=1.0)
     after: jax.Array = leaf("s", shape="scalar", default=0.0)
-    tolerance: jax.Array | None = leaf("rad", sign="positive", shape="scalar", default=None)
+    tolerance: jax.Array | None = leaf(POSITION, sign="positive", shape="scalar", default=None)
     joints: tuple | None = static(default=None)
     units: ClassVar[dict[str, str]] = {
-        "error": "rad^2 s",
-        "torque": "N^2 m^2 s",
-        "torque_rate": "N^2 m^2/s",
+        "error": PlantUnit("rad^2 s", "x1^2 s"),
+        "torque": PlantUnit("N^2 m^2 s", "u^2 s"),
+        "torque_rate": PlantUnit("N^2 m^2/s", "u^2/s"),
         "outside": "s",
     }
 

@@ -56,6 +56,7 @@ from iblf_jax.engine.step_size import fastest_along, start_and_along
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.closed_loop import LoopState, run_sampled_law
 from iblf_jax.simulation.integrators import tableau
+from iblf_jax.simulation.levels import sensor_state
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.sampling import commands_in_transit
 from iblf_jax.simulation.scenario import Scenario
@@ -361,22 +362,32 @@ def drive_exceeded(scenario: Scenario) -> str:
 
 @jax.jit
 def _command_steps(scenario: Scenario, times: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Steps of the command by one count of each joint (T + 1, n, n), and the standard deviation by
-    the noise (T + 1, n), [N m].
+    """Steps of the command by one count of each joint, or of each level and component of a sensor
+    of levels (T + 1, m, n), and the standard deviation by the noise (T + 1, n), [N m].
     """
     sensor = scenario.sensor
     # A sensor without rounding or resolution has no counts.
     smooth = dataclasses.replace(scenario, sensor=unrounded(sensor))
     resolution = jnp.asarray(sensor_member(sensor, "resolution"), times.dtype)
-    count = jnp.broadcast_to(resolution, (scenario.n,))
 
-    def command(t: jax.Array, state: LoopState, q: jax.Array, normal: jax.Array) -> jax.Array:
-        return run_sampled_law(smooth, t, state._replace(q=q), normal).sampled.commands[0]
+    def command(t: jax.Array, state: LoopState, y: jax.Array, normal: jax.Array) -> jax.Array:
+        moved = _with_levels_of_sensor(state, y)
+        return run_sampled_law(smooth, t, moved, normal).sampled.commands[0]
 
     def at(t: jax.Array, state: LoopState) -> tuple[jax.Array, jax.Array]:
         normal = jnp.zeros((sensor.draws, scenario.n), times.dtype)
-        by_q, by_noise = jax.jacfwd(partial(command, t, state), argnums=(0, 1))(state.q, normal)
-        return by_q.T * count[:, None], jnp.sqrt(jnp.sum(by_noise**2, axis=(1, 2)))
+        y, *_ = sensor_state(scenario, state.q, state.dq, state.higher)
+        by_y, by_noise = jax.jacfwd(partial(command, t, state), argnums=(0, 1))(y, normal)
+        by_count = (by_y * jnp.broadcast_to(resolution, y.shape)).reshape(scenario.n, -1).T
+        return by_count, jnp.sqrt(jnp.sum(by_noise**2, axis=(1, 2)))
 
     from_start = jnp.concatenate([jnp.zeros_like(times[:1]), times])
     return jax.vmap(at)(from_start, start_and_along(scenario, times))
+
+
+def _with_levels_of_sensor(state: LoopState, y: jax.Array) -> LoopState:
+    """The state with other levels, (r, n), or with another q, (n,), as the sensor receives them."""
+    if y.ndim == 1:
+        return state._replace(q=y)
+    higher = y[2:] if len(y) > 2 else ()
+    return state._replace(q=y[0], dq=y[1], higher=higher)

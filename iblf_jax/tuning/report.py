@@ -31,6 +31,7 @@ import numpy as np
 from iblf_jax.core.status import Status, has_flag
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.simulation.units import unit_text
 from iblf_jax.studies.statistics import Probability, probability, scalar_samples
 from iblf_jax.tuning.failures import (
     FailedRuns,
@@ -50,7 +51,7 @@ from iblf_jax.tuning.samples import (
     sample_runs,
     uncertain_scenario,
 )
-from iblf_jax.tuning.step_check import StepCheck
+from iblf_jax.tuning.step_check import ReportedQuantities, StepCheck
 
 
 @dataclasses.dataclass(frozen=True)
@@ -179,6 +180,8 @@ class TuningReport:
     """All runs of the tuning, with the tuned gains, at dt and at dt / 2."""
     notes: tuple[str, ...] = ()
     """Why the search ended, and warnings."""
+    quantities: ReportedQuantities = ReportedQuantities()
+    """Names and units of margins and inputs."""
     failures: tuple[FailedRuns, ...] = ()
     """Fresh runs that failed with the tuned gains: those that left their bounds or diverged, then
     those that broke each requirement, with the most influential perturbation."""
@@ -258,6 +261,7 @@ class TuningReport:
 
     def __str__(self) -> str:
         """Bounds first, then requirements, the objective, and the rest."""
+        shown = self.quantities
         heading = "Report on one nominal run: no statistics"
         of_all = ""
         if self.seed is not None:
@@ -272,7 +276,8 @@ class TuningReport:
             *self._requirements_in_words(),
             *map(str, self.changes),
             *self._doubts(),
-            f"peak torque{of_all}, joint by joint: {torques[0]} -> {torques[1]} N m",
+            f"peak {shown.input}{of_all}, {shown.component} by {shown.component}:"
+            f" {torques[0]} -> {torques[1]} {shown.input_unit}",
         ]
         if self.at_limits is not None:
             rows += self.at_limits or ["gains at an end of their range: none"]
@@ -292,7 +297,8 @@ class TuningReport:
         rows = [bounds, *(str(x) for x in self.failures if x.requirement is None)]
         if check is not None and (any(check.violated) or any(check.untrusted)):
             rows.append(check.bounds_in_words())
-        return [*rows, f"smallest margin: {self.margin[0]:.4g} -> {self.margin[1]:.4g} rad"]
+        margins = f"{self.margin[0]:.4g} -> {self.margin[1]:.4g} {self.quantities.margin_unit}"
+        return [*rows, f"smallest margin: {margins}"]
 
     def _requirements_in_words(self) -> list[str]:
         """The requirements, the failed first, with the explanation of the runs that broke them;
@@ -382,6 +388,7 @@ def make_report(request: ReportRequest) -> TuningReport:
         violation=each(lambda x: _probability(x.left_bounds(), x, confidence)),
         margin=each(lambda x: float(x.margin[x.admissible].min())),
         peak_torque=each(lambda x: tuple(x.torque[x.admissible].max(axis=0).tolist())),
+        quantities=ReportedQuantities.of(request.before),
         at_limits=request.at_limits,
         step_check=request.step_check,
         notes=request.notes,
@@ -502,7 +509,7 @@ def _verdict(request: ReportRequest, r: int, samples: Sequence[Sample]) -> Verdi
         verdict=verdict_of(after, allowed),
         value=sign * float(worst_share(jnp.asarray(values), allowed)),
         limit=sign * float(requirement.limit),
-        unit=unit,
+        unit=unit_text(request.before, unit),
         multiplier=multiplier,
         event=requirement.event,
     )

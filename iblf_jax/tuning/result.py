@@ -26,7 +26,7 @@ from iblf_jax.tuning.quantities import Quantities
 from iblf_jax.tuning.report import ReportRequest, TuningReport, make_report
 from iblf_jax.tuning.runs import NUMBERS_A_RUN
 from iblf_jax.tuning.samples import is_random
-from iblf_jax.tuning.step_check import StepCheck, check_step_size
+from iblf_jax.tuning.step_check import ReportedQuantities, StepCheck, check_step_size
 
 LARGE_CHANGE = 100.0
 """Factor by which a gain may change before a warning is given."""
@@ -420,7 +420,9 @@ class TuneResult:
             lines.append(f"  {path}: {before} -> {np.array2string(np.asarray(value), precision=5)}")
         lines += [f"  {name} {end}" for name, end in self.at_limits.items()]
         peaks = [np.max(np.asarray(run.metrics.peak_torque)) for run in self.nominal]
-        lines.append(f"  peak torque of the nominal run: {peaks[0]:.5g} -> {peaks[1]:.5g} N m")
+        shown = ReportedQuantities.of(self.scenario)
+        peak_change = f"{peaks[0]:.5g} -> {peaks[1]:.5g} {shown.input_unit}"
+        lines.append(f"  peak {shown.input} of the nominal run: {peak_change}")
         return "\n".join(lines)
 
     def _bounds_and_requirements(self) -> list[str]:

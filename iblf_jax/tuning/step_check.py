@@ -17,12 +17,15 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.core.units import INPUT, POSITION
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.simulation.units import unit_text
 from iblf_jax.tuning.objectives import Objective
 from iblf_jax.tuning.options import TuningRunOptions
 from iblf_jax.tuning.robust import combine, worst_count, worst_share
 from iblf_jax.tuning.samples import Sample, SampleRequest, is_random, sample_runs
+from iblf_jax.world import plants
 
 STEP_TOLERANCE = 1e-3
 """Largest excess of a requirement at half the step, in its scale, that is tolerated.
@@ -82,6 +85,28 @@ class RequirementAtSteps:
         return f"{value:.{digits}g} {self.unit}".rstrip()
 
 
+class ReportedQuantities(NamedTuple):
+    """Names and units with which a report shows margins and inputs; those of a robot if not
+    given.
+    """
+
+    margin_unit: str = str(POSITION)
+    input: str = "torque"
+    input_unit: str = str(INPUT)
+    component: str = "joint"
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> ReportedQuantities:
+        """Those of the plant of a scenario."""
+        plant = scenario.plant
+        return cls(
+            unit_text(scenario, POSITION),
+            plants.input_name(plant),
+            unit_text(scenario, INPUT),
+            plants.component_noun(plant),
+        )
+
+
 class WorstExcess(NamedTuple):
     """The requirement with the largest excess at half the time step."""
 
@@ -121,6 +146,8 @@ class StepCheck:
     """Number of runs that leave their bounds or diverge."""
     untrusted: tuple[int, int]
     """Number of runs that diverge or are integrated unstably."""
+    quantities: ReportedQuantities = ReportedQuantities()
+    """Names and units."""
 
     @property
     def worst(self) -> WorstExcess:
@@ -183,11 +210,12 @@ class StepCheck:
         dt / 2 if it is within the tolerance.
         """
         full, half = self.objective
+        shown = self.quantities
         torques = [max(x, default=float("nan")) for x in self.peak_torque]
         text = (
             f"{self.subject} at dt / 2: objective {half:.5g} instead of {full:.5g}, smallest margin"
-            f" {self.margin[1]:.4g} instead of {self.margin[0]:.4g} rad, peak torque"
-            f" {torques[1]:.5g} instead of {torques[0]:.5g} N m"
+            f" {self.margin[1]:.4g} instead of {self.margin[0]:.4g} {shown.margin_unit}, peak"
+            f" {shown.input} {torques[1]:.5g} instead of {torques[0]:.5g} {shown.input_unit}"
         )
         worst = self.worst
         if 0 <= worst.excess <= STEP_TOLERANCE:
@@ -242,11 +270,12 @@ def check_step_size(
         dt=dt,
         objective=pair(lambda x: _combined_objective(objective, options, x)),
         requirements=tuple(
-            _requirement_at_steps(objective, r, (full, half))
+            _requirement_at_steps(scenario, objective, r, (full, half))
             for r in range(len(objective.requirements))
         ),
         margin=pair(lambda x: float(x.margin.min())),
         peak_torque=pair(lambda x: tuple(x.torque.max(axis=0).tolist())),
+        quantities=ReportedQuantities.of(scenario),
         violated=pair(lambda x: int(np.sum(x.left_bounds()))),
         untrusted=pair(lambda x: int(np.sum(x.is_untrusted()))),
     )
@@ -308,7 +337,7 @@ def combined_excess(objective: Objective, r: int, sample: Sample) -> float:
 
 
 def _requirement_at_steps(
-    objective: Objective, r: int, samples: tuple[Sample, Sample]
+    scenario: Scenario, objective: Objective, r: int, samples: tuple[Sample, Sample]
 ) -> RequirementAtSteps:
     """Requirement r on the runs at dt and at dt / 2."""
     requirement = objective.requirements[r]
@@ -321,7 +350,7 @@ def _requirement_at_steps(
         excess=(full, half),
         value=(sign * (limit + scale * full), sign * (limit + scale * half)),
         limit=sign * limit,
-        unit=unit,
+        unit=unit_text(scenario, unit),
         averaged=worst_count(len(samples[0].status), float(requirement.allowed)),
         event=requirement.event,
     )

@@ -12,6 +12,7 @@ and with their rates.  `tube_at` computes them by automatic differentiation and 
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -19,7 +20,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.optional import OptionalMembers
 from iblf_jax.core.pytree import Leaf, component, leaf
+from iblf_jax.core.units import POSITION
 from iblf_jax.world.references import Reference
 from iblf_jax.world.robots import Robot
 from iblf_jax.world.robots._base import robot_member
@@ -29,7 +32,9 @@ class Side(Protocol):
     """The contract of one side of the bounds.
 
     A side that is discontinuous in time also has `jump_times()`, the times (m,) [s] at which it or
-    its rate jumps; steps of a run are divided there, as for disturbances.
+    its rate jumps; steps of a run are divided there, as for disturbances.  A side that is not
+    smooth has `continuous_derivatives`, the number of its continuous derivatives in time and in
+    q_d; a law for a plant of order r needs r - i + 1 of them on level i.
     """
 
     def at(self, t: jax.Array, q_d: jax.Array) -> jax.Array:
@@ -41,6 +46,10 @@ class Side(Protocol):
         ...
 
 
+side_member = OptionalMembers(continuous_derivatives=math.inf)
+"""Reads optional members of a side."""
+
+
 @component
 class Constant:
     """The bound is `value`, for all time.
@@ -49,7 +58,7 @@ class Constant:
       value: the bound, () or (n,) [rad].
     """
 
-    value: Leaf = leaf("rad")
+    value: Leaf = leaf(POSITION)
 
     def at(self, t: jax.Array, q_d: jax.Array) -> jax.Array:
         """The bound, (n,) [rad]."""
@@ -69,8 +78,8 @@ class Sinusoid:
     Source: Zhang & Yan 2024, section 4 (k_lc and k_uc).
     """
 
-    offset: Leaf = leaf("rad")
-    amplitude: Leaf = leaf("rad")
+    offset: Leaf = leaf(POSITION)
+    amplitude: Leaf = leaf(POSITION)
     frequency: Leaf = leaf("rad/s", default=1.0)
     phase: Leaf = leaf("rad", default=0.0)
 
@@ -96,8 +105,8 @@ class Funnel:
     Source: F. Chen, D. V. Dimarogonas, IEEE Trans. Control Networks Syst. 8 (2021) 450-461.
     """
 
-    initial: Leaf = leaf("rad")
-    final: Leaf = leaf("rad")
+    initial: Leaf = leaf(POSITION)
+    final: Leaf = leaf(POSITION)
     rate: Leaf = leaf("1/s", sign="nonnegative")
 
     def at(self, t: jax.Array, q_d: jax.Array) -> jax.Array:

@@ -13,6 +13,8 @@ differentiable (Assumption 1), so a discontinuous disturbance declares its `jump
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Mapping
 from typing import Any, Protocol
 
 import jax
@@ -23,6 +25,7 @@ from iblf_jax.core.linalg import matvec
 from iblf_jax.core.optional import OptionalMembers
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.core.time import joined, jump_times_of, no_times
+from iblf_jax.core.units import TORQUE, VELOCITY, PlantUnit, Unit
 from iblf_jax.world.robots import Robot
 
 
@@ -139,10 +142,10 @@ class Sinusoids:
       offset: mean torque, () or (n,) [N m]; 0 if not given.
     """
 
-    amplitude: Leaf = leaf("N m")
+    amplitude: Leaf = leaf(TORQUE)
     frequency: Leaf = leaf("rad/s")
     phase: Leaf = leaf("rad", default=0.0)
-    offset: Leaf = leaf("N m", default=0.0)
+    offset: Leaf = leaf(TORQUE, default=0.0)
 
     def torque(
         self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot
@@ -164,7 +167,7 @@ class Step:
       time: time of the step, () [s].
     """
 
-    size: Leaf = leaf("N m")
+    size: Leaf = leaf(TORQUE)
     time: Leaf = leaf("s", shape="scalar")
 
     def torque(
@@ -221,9 +224,9 @@ class Friction:
         sharper and stiffer; 0.05 if not given.
     """
 
-    viscous: Leaf = leaf("N m s/rad", sign="nonnegative", default=0.0)
-    coulomb: Leaf = leaf("N m", sign="nonnegative", default=0.0)
-    width: Leaf = leaf("rad/s", sign="positive", default=0.05)
+    viscous: Leaf = leaf(PlantUnit("N m s/rad", "tau/x2"), sign="nonnegative", default=0.0)
+    coulomb: Leaf = leaf(TORQUE, sign="nonnegative", default=0.0)
+    width: Leaf = leaf(VELOCITY, sign="positive", default=0.05)
 
     def torque(
         self, t: jax.Array, q: jax.Array, dq: jax.Array, plant: Robot, model: Robot
@@ -280,6 +283,12 @@ class Sum:
         return total
 
 
+def _rate_of_level(units: Mapping[str, Unit], i: int) -> Mapping[str, Unit]:
+    """The units of the parameters of part i of `Levels`: its torque is a rate of level i + 1."""
+    rates = units["rates"]
+    return {**units, "tau": rates[i] if i < len(rates) else "1"}
+
+
 @component
 class Levels:
     """d_1 ... d_r of (S.1): one disturbance for each level of the plant.
@@ -294,7 +303,9 @@ class Levels:
         parts than levels leave the last levels undisturbed.
     """
 
-    parts: tuple[Disturbance | None, ...]
+    parts: tuple[Disturbance | None, ...] = dataclasses.field(
+        metadata={"part_units": _rate_of_level}
+    )
 
     def check(self) -> None:
         """Takes a list for a tuple; raises ValueError for a part that is not a disturbance."""

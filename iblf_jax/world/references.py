@@ -19,6 +19,7 @@ from iblf_jax.core.caches import memoised
 from iblf_jax.core.linalg import matvec
 from iblf_jax.core.optional import OptionalMembers
 from iblf_jax.core.pytree import Leaf, component, leaf, static
+from iblf_jax.core.units import POSITION
 
 
 class Reference(Protocol):
@@ -52,8 +53,8 @@ class Sinusoid:
     Source: Zhang & Yan 2024, equation (4.2).
     """
 
-    offset: Leaf = leaf("rad")
-    amplitude: Leaf = leaf("rad")
+    offset: Leaf = leaf(POSITION)
+    amplitude: Leaf = leaf(POSITION)
     frequency: Leaf = leaf("rad/s", default=1.0)
     phase: Leaf = leaf("rad", default=0.0)
 
@@ -78,8 +79,8 @@ class Quintic:
     Source: T. Flash, N. Hogan, J. Neuroscience 5 (1985) 1688-1703.
     """
 
-    start: Leaf = leaf("rad")
-    end: Leaf = leaf("rad")
+    start: Leaf = leaf(POSITION)
+    end: Leaf = leaf(POSITION)
     duration: Leaf = leaf("s", sign="positive", shape="scalar")
     continuous_derivatives: ClassVar[int] = 2
 
@@ -90,27 +91,79 @@ class Quintic:
 
 
 @component
-class WaypointSpline:
-    """The quintic spline through waypoints, at rest at both ends and constant beyond them.
+class SmoothStep:
+    """A motion from `start` to `end` with m continuous derivatives, at rest before and after.
 
-    It has four continuous derivatives between the ends, and zero velocity and acceleration at them.
-    It is linear in the waypoints, q_d(t) = sum_j B_j(t) waypoints_j, so they are leaves: sweep them
-    or differentiate by them.
+        q_d = start + (end - start) s^(m+1) sum_{k=0}^{m} (m+k)!/(m! k!) (1 - s)^k
+        s = clip(t / duration, 0, 1)
+
+    The polynomial has the degree 2 m + 1.  The derivatives of the orders 1 to m vanish at both
+    ends; m = 2 is `Quintic`.  A law for a plant of order r needs m >= r.
+
+    Args:
+      start: initial position, () or (n,) [rad].
+      end: final position, () or (n,) [rad].
+      duration: duration of the motion, () [s], > 0.
+      derivatives: m, the number of continuous derivatives, 1 to 12; 4 if not given.
+
+    Source: D. S. Ebert, F. K. Musgrave, D. Peachey, K. Perlin, S. Worley, Texturing and Modeling: A
+      Procedural Approach, 2003 (smoothstep); the general degree follows from Hermite interpolation.
+    """
+
+    start: Leaf = leaf(POSITION)
+    end: Leaf = leaf(POSITION)
+    duration: Leaf = leaf("s", sign="positive", shape="scalar")
+    derivatives: int = static(default=4)
+
+    def check(self) -> None:
+        """Raises ValueError for a number of derivatives that is no whole number from 1 to 12."""
+        checks.positive_integer("SmoothStep.derivatives", self.derivatives, most=MOST_STEP)
+
+    @property
+    def continuous_derivatives(self) -> int:
+        """Number of continuous derivatives."""
+        return self.derivatives
+
+    def position(self, t: jax.Array) -> jax.Array:
+        """q_d(t), (n,) [rad]."""
+        m = self.derivatives
+        s = jnp.clip(t / self.duration, 0.0, 1.0)
+        rest = 1.0 - s
+        total = jnp.zeros_like(s)
+        for k in reversed(range(m + 1)):
+            total = total * rest + float(math.comb(m + k, k))
+        return self.start + (self.end - self.start) * (s ** (m + 1) * total)
+
+
+@component
+class WaypointSpline:
+    """The quintic spline through waypoints, at rest at both ends and constant beyond them; of a
+    higher degree for more derivatives.
+
+    With d = `derivatives` the spline has the degree 2 d + 1.  It has 2 d continuous derivatives
+    between the ends, and its derivatives of the orders 1 to d vanish at them, so that d derivatives
+    are continuous.  A law for a plant of order r needs d >= r.  The spline is linear in the
+    waypoints, q_d(t) = sum_j B_j(t) waypoints_j, so they are leaves: sweep them or differentiate by
+    them.
 
     Args:
       times: strictly increasing times of the waypoints, a tuple of m numbers [s].
       waypoints: one row per time, (m, n) [rad].
+      derivatives: number of continuous derivatives, 1 to 6; 2 if not given.
 
     Source: C. de Boor, A Practical Guide to Splines, 1978 (basis computed by SciPy's
       `make_interp_spline`).
     """
 
     times: tuple[float, ...] = static()
-    waypoints: Leaf = leaf("rad", shape="any")
-    continuous_derivatives: ClassVar[int] = 2
+    waypoints: Leaf = leaf(POSITION, shape="any")
+    derivatives: int = static(default=2)
 
     def check(self) -> None:
-        """Raises ValueError for times that do not increase or do not match the waypoints."""
+        """Raises ValueError for times that do not increase or do not match the waypoints, or a
+        number of derivatives that is no whole number from 1 to 6.
+        """
+        checks.positive_integer("WaypointSpline.derivatives", self.derivatives, most=MOST_SPLINE)
         try:
             times = np.asarray(self.times, float)
         except (TypeError, ValueError, OverflowError):
@@ -132,9 +185,14 @@ class WaypointSpline:
                 "Give one row a time.",
             )
 
+    @property
+    def continuous_derivatives(self) -> int:
+        """Number of continuous derivatives."""
+        return self.derivatives
+
     def position(self, t: jax.Array) -> jax.Array:
         """q_d(t), (n,) [rad]."""
-        knots, coefficients = _cardinal_splines(self.times)
+        knots, coefficients = _cardinal_splines(self.times, self.derivatives)
         dtype = self.waypoints.dtype
         t = jnp.clip(t, self.times[0], self.times[-1])
         piece = jnp.sum(t >= jnp.asarray(knots[1:-1], t.dtype))
@@ -145,22 +203,80 @@ class WaypointSpline:
         return matvec(self.waypoints.T, basis)
 
 
+@component
+class Ellipse:
+    """A motion on an ellipse in the plane with the heading along its tangent, for a vessel.
+
+        north = centre_1 + axes_1 cos(frequency t),   east = centre_2 + axes_2 sin(frequency t)
+        heading = frequency t + pi/2 + atan((axes_1 - axes_2) s c / (axes_1 s^2 + axes_2 c^2))
+
+    with s = sin(frequency t) and c = cos(frequency t).  The motion turns from north to east; the
+    heading grows by 2 pi a revolution, so that bounds on it follow the reference (`bounds.Funnel`).
+    All derivatives are continuous.
+
+    Args:
+      axes: half lengths of the axes to the north and to the east, (2,) [m], > 0.
+      frequency: angular frequency of the motion, () [rad/s], > 0.
+      centre: of the ellipse, (2,) [m]; the origin if not given.
+
+    Source: this package.
+    """
+
+    axes: Leaf = leaf("m", sign="positive", shape="any")
+    frequency: Leaf = leaf("rad/s", sign="positive", shape="scalar")
+    centre: Leaf = leaf("m", shape="any", default=(0.0, 0.0))
+
+    def check(self) -> None:
+        """Raises ValueError for axes or a centre that are not two numbers."""
+        checks.shape_is("Ellipse.axes", self.axes, (2,))
+        checks.shape_is("Ellipse.centre", self.centre, (2,))
+
+    def position(self, t: jax.Array) -> jax.Array:
+        """North, east and heading, (3,) [m, m, rad]."""
+        angle = self.frequency * t
+        sine, cosine = jnp.sin(angle), jnp.cos(angle)
+        a, b = self.axes
+        turned = (a - b) * sine * cosine / (a * sine**2 + b * cosine**2)
+        heading = angle + 0.5 * math.pi + jnp.arctan(turned)
+        north, east = self.centre[0] + a * cosine, self.centre[1] + b * sine
+        return jnp.stack([north, east, heading])
+
+
 @memoised(32)
-def _cardinal_splines(times: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Breakpoints (p + 1,) and coefficients (6, p, m), highest power first, of the splines that are
-    1 at one waypoint.
+def _cardinal_splines(times: tuple[float, ...], derivatives: int) -> tuple[np.ndarray, np.ndarray]:
+    """Breakpoints (p + 1,) and coefficients (2 derivatives + 2, p, m), highest power first, of the
+    splines that are 1 at one waypoint.
     """
     from scipy.interpolate import PPoly, make_interp_spline
 
-    rest = [(1, np.zeros(len(times))), (2, np.zeros(len(times)))]
+    degree = 2 * derivatives + 1
+    rest = [(i, np.zeros(len(times))) for i in range(1, derivatives + 1)]
     spline = make_interp_spline(
-        np.asarray(times, float), np.eye(len(times)), k=5, bc_type=(rest, rest)
+        np.asarray(times, float), np.eye(len(times)), k=degree, bc_type=(rest, rest)
     )
-    pieces = [PPoly.from_spline((spline.t, spline.c[:, j], 5)) for j in range(len(times))]
-    distinct = np.concatenate([[True], np.diff(pieces[0].x) > 0])
+    breakpoints = np.unique(spline.t)
+    if degree > FITPACK_DEGREE:
+        rates = [spline(breakpoints[:-1], nu=i) for i in range(degree + 1)]
+        terms = [rate / math.factorial(i) for i, rate in enumerate(rates)]
+        return breakpoints, np.stack(terms[::-1])
+    pieces = [PPoly.from_spline((spline.t, spline.c[:, j], degree)) for j in range(len(times))]
     starts = np.flatnonzero(np.diff(pieces[0].x) > 0)
-    return pieces[0].x[distinct], np.stack([piece.c[:, starts] for piece in pieces], axis=-1)
+    return breakpoints, np.stack([piece.c[:, starts] for piece in pieces], axis=-1)
 
 
-MEMBERS = {"sinusoid": Sinusoid, "quintic": Quintic, "waypoint_spline": WaypointSpline}
+FITPACK_DEGREE = 5
+"""Largest degree for which FITPACK, which `PPoly.from_spline` calls, is defined; it overruns its
+memory at the degree 9."""
+
+MOST_STEP, MOST_SPLINE = 12, 6
+"""Largest numbers of continuous derivatives: the order of a plant is at most 12, and a spline of a
+higher degree than 13 is computed inaccurately."""
+
+MEMBERS = {
+    "sinusoid": Sinusoid,
+    "quintic": Quintic,
+    "smooth_step": SmoothStep,
+    "waypoint_spline": WaypointSpline,
+    "ellipse": Ellipse,
+}
 """Every reference by the name that a scenario file gives it."""

@@ -55,8 +55,18 @@ SCENARIOS = {
     f"zhang_yan_2024, {law}": lambda law=law: ij.presets.zhang_yan_2024(law=law)
     for law in ij.presets.LAWS
 }
+PLANTS = (
+    "motor_driven_pendulum",
+    "motor_driven_two_link",
+    "flexible_joint_two_link",
+    "flexible_joint_iiwa14",
+    "vessel",
+)
+"""Presets without a mass of a robot at "plant.mass[1]"."""
 SCENARIOS |= {
-    name: preset for name, preset in ij.presets.PRESETS.items() if name != "zhang_yan_2024"
+    name: preset
+    for name, preset in ij.presets.PRESETS.items()
+    if name not in ("zhang_yan_2024", *PLANTS)
 }
 SCENARIOS["planar chain of 3"] = lambda: planar_chain(3)
 LONG = ("ur5", "iiwa14")

@@ -80,6 +80,78 @@ def test_spline_passes_its_waypoints_and_rests_at_the_ends():
             )
 
 
+@pytest.mark.parametrize("m", [1, 3, 4])
+def test_spline_with_more_derivatives_rests_at_its_ends(m):
+    """Its first m derivatives vanish at the ends, where the next one jumps."""
+    spline = references.WaypointSpline(TIMES, POINTS, derivatives=m)
+    assert references.reference_member(spline, "continuous_derivatives") == m
+    at = derivatives(spline.position, m + 1)
+    for t, point in zip(TIMES, POINTS, strict=True):
+        np.testing.assert_allclose(at(t)[0], point, atol=1e-12)
+    for t in (TIMES[0] + 1e-12, TIMES[-1] - 1e-12):
+        _, *rates, next_one = at(t)
+        np.testing.assert_allclose(rates, 0, atol=1e-7)
+        assert np.max(np.abs(next_one)) > 0.5
+    for t in TIMES[1:-1]:
+        before, after = at(t - 1e-9), at(t + 1e-9)
+        for order in range(m + 2):
+            np.testing.assert_allclose(before[order], after[order], atol=1e-5 * 10**order)
+
+
+@pytest.mark.parametrize("m", [1, 2, 4])
+def test_smooth_step_has_the_derivatives_that_it_states(m):
+    start, end, duration = np.asarray([0.1, 0.5]), np.asarray([0.9, -0.2]), 2.5
+    step = references.SmoothStep(start, end, duration, derivatives=m)
+    assert references.reference_member(step, "continuous_derivatives") == m
+    at = derivatives(step.position, m + 1)
+    for t, expected in ((1e-12, start), (duration - 1e-12, end)):
+        q, *rates, next_one = at(t)
+        np.testing.assert_allclose(q, expected, atol=1e-14)
+        np.testing.assert_allclose(rates, 0, atol=1e-8)
+        assert np.max(np.abs(next_one)) > 0.1
+    q, *_ = at(0.5 * duration)
+    np.testing.assert_allclose(q, (start + end) / 2, atol=1e-14)
+    np.testing.assert_allclose(at(9.0)[0], end)
+
+
+def test_smooth_step_of_two_derivatives_is_the_quintic():
+    numbers = ([0.1, 0.5], [0.9, -0.2], 2.5)
+    one, other = references.Quintic(*numbers), references.SmoothStep(*numbers, derivatives=2)
+    for t in np.linspace(-0.5, 3.0, 15):
+        np.testing.assert_allclose(one.position(t), other.position(t), atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("reference", "name"),
+    [
+        (lambda m: references.SmoothStep(0.0, 1.0, 1.0, derivatives=m), "SmoothStep"),
+        (
+            lambda m: references.WaypointSpline((0.0, 1.0), [[0.0], [1.0]], derivatives=m),
+            "WaypointSpline",
+        ),
+    ],
+    ids=["step", "spline"],
+)
+@pytest.mark.parametrize("m", [0, 13, 2.5])
+def test_numbers_of_derivatives_that_are_refused(reference, name, m):
+    with pytest.raises(ValueError, match=f"{name}.derivatives: got {m}"):
+        reference(m)
+
+
+def test_the_heading_on_an_ellipse_is_along_its_tangent():
+    ellipse = references.Ellipse(axes=(5.0, 3.0), frequency=0.4, centre=(1.0, -2.0))
+    at = derivatives(ellipse.position, 1)
+    for t in np.linspace(0.0, 20.0, 41):
+        (north, east, heading), rate = (np.asarray(x) for x in at(t))
+        assert ((north - 1.0) / 5.0) ** 2 + ((east + 2.0) / 3.0) ** 2 == pytest.approx(1.0)
+        speed = np.hypot(*rate[:2])
+        np.testing.assert_allclose([np.cos(heading), np.sin(heading)], rate[:2] / speed, atol=1e-12)
+        assert rate[2] > 0.0
+    turn = 2.0 * np.pi / 0.4
+    grown = ellipse.position(1.0 + turn)[2] - ellipse.position(1.0)[2]
+    assert grown == pytest.approx(2.0 * np.pi)
+
+
 def test_spline_is_differentiable_by_its_waypoints():
     gradient = jax.jacobian(lambda w: references.WaypointSpline(TIMES, w).position(1.7)[0])(
         jnp.asarray(POINTS)

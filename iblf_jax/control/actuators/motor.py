@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from iblf_jax.control.actuators._base import Delivered
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf
+from iblf_jax.core.units import INPUT, VELOCITY, PlantUnit
 
 
 @component
@@ -37,10 +38,10 @@ class Motor:
     """
 
     bandwidth: Leaf = leaf("1/s", sign="positive", default=None)
-    limit: Leaf = leaf("N m", sign="positive", default=None)
-    rate_limit: Leaf = leaf("N m/s", sign="positive", default=None)
-    stall: Leaf = leaf("N m", sign="positive", default=None)
-    no_load_speed: Leaf = leaf("rad/s", sign="positive", default=None)
+    limit: Leaf = leaf(INPUT, sign="positive", default=None)
+    rate_limit: Leaf = leaf(PlantUnit("N m/s", "u/s"), sign="positive", default=None)
+    stall: Leaf = leaf(INPUT, sign="positive", default=None)
+    no_load_speed: Leaf = leaf(VELOCITY, sign="positive", default=None)
 
     def check(self) -> None:
         """Raises ValueError for half a torque-speed line, or a limit of the rate without a

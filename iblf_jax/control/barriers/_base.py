@@ -81,6 +81,8 @@ class Barrier(Protocol):
     def decay_rate(self, k1: jax.Array) -> jax.Array | None:
         """The claim of step one: rate_i [1/s] with V1_i' <= -rate_i V1_i where e2 = 0 and no guard
         is active, or None for no claim.
+
+        A class attribute `exact_decay = True` states that it is an equality.
         """
         ...
 
@@ -111,6 +113,7 @@ barrier_member = OptionalMembers(
     value_unit="1",
     ratio_jumps=True,
     slope_derivatives=math.inf,
+    exact_decay=False,
     decay_rate=lambda k1: None,
     xi_bound=lambda V, tube: None,
     error_over_slope=lambda tube, q: None,

@@ -36,6 +36,7 @@ class PrescribedPerformance:
     uses_o: ClassVar[bool] = False
     value_unit: ClassVar[str] = "1"
     ratio_jumps: ClassVar[bool] = False
+    exact_decay: ClassVar[bool] = True
 
     def check(self) -> None:
         """Raises ValueError for a guard outside (0, 1)."""

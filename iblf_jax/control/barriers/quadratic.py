@@ -25,6 +25,7 @@ class Quadratic:
     uses_o: ClassVar[bool] = False
     value_unit: ClassVar[str] = "rad^2"
     ratio_jumps: ClassVar[bool] = False
+    exact_decay: ClassVar[bool] = True
 
     def value(self, tube: Tube, q: jax.Array) -> jax.Array:
         """V1, (n,) [rad^2]."""

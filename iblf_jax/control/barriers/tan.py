@@ -36,6 +36,7 @@ class Tan:
     uses_o: ClassVar[bool] = False
     value_unit: ClassVar[str] = "rad^2"
     ratio_jumps: ClassVar[bool] = False
+    exact_decay: ClassVar[bool] = True
     slope_derivatives: ClassVar[int] = 4
 
     def check(self) -> None:

@@ -24,6 +24,7 @@ from iblf_jax.control.controllers.surface_barrier import SurfaceBarrier as Surfa
 from iblf_jax.control.controllers.systems import KEEPERS as KEEPERS
 from iblf_jax.control.controllers.systems import LAWS as LAWS
 from iblf_jax.control.controllers.systems import law_by_name as law_by_name
+from iblf_jax.control.controllers.with_drive import WithDrive as WithDrive
 
 Setting = LawContext
 """The name that earlier versions gave `LawContext`."""
@@ -40,6 +41,7 @@ MEMBERS = {
     "saturated": Saturated,
     "safety_filter": SafetyFilter,
     "reference_governor": ReferenceGovernor,
+    "with_drive": WithDrive,
 }
 """Every law by the name that a scenario file gives it."""
 
@@ -64,6 +66,7 @@ __all__ = [
     "Setting",
     "State",
     "SurfaceBarrier",
+    "WithDrive",
     "law_by_name",
     "within_effort",
 ]

@@ -110,6 +110,8 @@ class Controller(Protocol):
       and `switching(t, x, context, state)`, with d_hat as the observer gives it, (r, n) or (n,).
     - `wraps`: the name of the field that holds another law.  Paths then reach through it
       ("controller.K2").
+    - `input_unit`: the unit of the input that an input map such as `WithDrive` commands; None for
+      the input of the model, which is the torque for a robot.
     - `unit_factors`: the names of leaves that are factors only.  Which of their numbers are 1 may
       be compiled in (`engine.structural_constants`).
 
@@ -159,12 +161,14 @@ law_member = OptionalMembers(
     includes_e2=False,
     filters=False,
     receives_x=False,
+    input_unit=None,
     completed=None,
     advice=list,
     check_start=lambda context: None,
     switching=lambda t, q, dq, context, state: None,
     disturbance_terms=None,
     barrier=None,
+    barriers=(),
     weight=None,
     reading="",
 )
@@ -243,6 +247,10 @@ class LyapunovLaw(Protocol):
     step of a run.  T is the result of `disturbance_terms`, by default the contribution of the
     uncertain term to V' for any law, T = dV/dq' . M0^-1 f_tilde + dV/df_tilde
     . f'.  V, W and T are (), or (n,) and then summed; unit and scale of V are the law's choice.
+
+    A law that `receives_x` has these methods with x, (r, n), in the place of q and q', and with
+    d_tilde, (r, n), in the place of f_tilde: `lyapunov(t, x, d_tilde, context, state)`.  T is then
+    dV/dx . d_tilde + dV/dd_tilde . d' by default.
     """
 
     def lyapunov(

@@ -44,14 +44,16 @@ from iblf_jax.control.barriers._base import (
     barrier_member,
     guard_is_active,
     ratio_jumps,
+    value_unit,
 )
 from iblf_jax.control.controllers._base import Command, LawContext
 from iblf_jax.control.controllers._levels import Design, Level, exact_levels, surface_levels
 from iblf_jax.control.controllers.backstepping import check_barrier, fit_o
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf
+from iblf_jax.core.units import ByLevel, PlantUnit
 from iblf_jax.world import plants
-from iblf_jax.world.bounds import Bounds, Funnel, Tube
+from iblf_jax.world.bounds import Bounds, Funnel, Tube, side_member
 from iblf_jax.world.references import reference_member
 
 
@@ -140,6 +142,19 @@ class BarrierBackstepping:
         """Number of levels r."""
         return len(self.barriers)
 
+    def leaf_units(self) -> dict[str, ByLevel]:
+        """The units of c and of the weights, by those of each level's V_i."""
+        c, weights = [], []
+        for i, barrier in enumerate(self.barriers):
+            level = f"x{i + 1}"
+            if value_unit(barrier) == "1":
+                c.append(PlantUnit("1", f"{level}^2/s"))
+                weights.append(PlantUnit("1", "energy"))
+            else:
+                c.append(PlantUnit("1", "1/s"))
+                weights.append(PlantUnit("1", f"energy/{level}^2"))
+        return {"c": ByLevel(c), "weights": ByLevel(weights)}
+
     # --- checks against a scenario ----------------------------------------------------------------
 
     def completed(self, context: LawContext, x: jax.Array) -> BarrierBackstepping:
@@ -175,6 +190,7 @@ class BarrierBackstepping:
             raise checks.fail("controller.k", f"{self.order} levels", expected, remedy)
         self._check_reference(context)
         for i, barrier in enumerate(self.barriers):
+            self._check_sides(context, i)
             self._check_level(context, i, barrier)
 
     def _check_reference(self, context: LawContext) -> None:
@@ -187,10 +203,29 @@ class BarrierBackstepping:
         expected = f"a reference with {self.order} continuous derivatives, as u contains them"
         got = f"{type(context.reference).__name__}, which has {smooth}"
         remedy = (
-            "Sinusoid is smooth; SmoothStep and WaypointSpline take `derivatives`; or filter the"
-            " virtual controls: BarrierBackstepping(filter=...)."
+            f"SmoothStep and WaypointSpline take derivatives={self.order}, and Sinusoid is smooth;"
+            " or filter the virtual controls: BarrierBackstepping(filter=...)."
         )
-        raise checks.fail("reference", got, expected, remedy)
+        raise checks.fail("reference", checks.Words(got), expected, remedy)
+
+    def _check_sides(self, context: LawContext, i: int) -> None:
+        """Raises ValueError for bounds of level i + 1 with too few continuous derivatives."""
+        bounds = context.level_bounds(i + 1)
+        if self.filter is not None or bounds is None or isinstance(self.barriers[i], Quadratic):
+            return
+        name = "bounds" if i == 0 else f"state_bounds[{i - 1}]"
+        needed = self.order - i
+        for side_name, side in (("lower", bounds.lower), ("upper", bounds.upper)):
+            smooth = side_member(side, "continuous_derivatives")
+            if smooth >= needed:
+                continue
+            expected = f"a side with {needed} continuous derivatives, as u contains them"
+            got = f"{type(side).__name__}, which has {smooth}"
+            remedy = (
+                "bounds.Constant, Sinusoid and Funnel are smooth; or filter the virtual controls:"
+                " BarrierBackstepping(filter=...)."
+            )
+            raise checks.fail(f"{name}.{side_name}", checks.Words(got), expected, remedy)
 
     def _check_level(self, context: LawContext, i: int, barrier: Barrier) -> None:
         """Raises ValueError for a barrier without bounds, or one that is not smooth enough."""
@@ -255,7 +290,7 @@ class BarrierBackstepping:
           context: model, reference and bounds.
           state: beta, (r - 1, n), of a dynamic surface.
         """
-        levels, tubes = self._levels(t, x, d_hat, context, state)
+        levels, tubes = self.levels(t, x, d_hat, context, state)
         rates: Any = ()
         if self.filter is not None:
             alphas = jnp.stack([level.alpha for level in levels[:-1]])
@@ -271,10 +306,12 @@ class BarrierBackstepping:
             command = command._replace(alpha_higher=jnp.stack([tube.q_d for tube in tubes[2:]]))
         return command, rates
 
-    def _levels(
+    def levels(
         self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext, state: Any
     ) -> tuple[list[Level], list[Tube]]:
-        """All levels and their tubes; arguments as `command`."""
+        """What each level computes, and the tube of x_i around alpha_{i-1}, or around beta_{i-1}
+        with filters; arguments as `command`.
+        """
         if self.filter is None:
             return exact_levels(self._designs, t, x, d_hat, context)
         return surface_levels(self._designs, self.filter, t, x, d_hat, context, state)
@@ -285,7 +322,7 @@ class BarrierBackstepping:
         """e_r, (n,), where u jumps at e_r = 0; None for a last barrier without a jump."""
         if not ratio_jumps(self.barriers[-1]):
             return None
-        _, tubes = self._levels(t, x, jnp.zeros_like(x), context, state)
+        _, tubes = self.levels(t, x, jnp.zeros_like(x), context, state)
         return x[-1] - tubes[-1].q_d
 
 

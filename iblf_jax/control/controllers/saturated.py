@@ -22,6 +22,7 @@ from iblf_jax.control.controllers._base import (
 )
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf, static
+from iblf_jax.core.units import INPUT
 from iblf_jax.world.robots import Robot
 from iblf_jax.world.robots._base import robot_member
 
@@ -46,7 +47,7 @@ class Saturated:
     """
 
     law: Controller
-    limit: Leaf = leaf("N m", sign="positive")
+    limit: Leaf = leaf(INPUT, sign="positive")
     edge: str = static(default="hard")
     wraps: ClassVar[str] = "law"
     advice = wrapped_advice

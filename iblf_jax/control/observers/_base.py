@@ -30,6 +30,18 @@ class Observer(Protocol):
     methods then receive the state x, (r, n), in the place of q and q', a `plants.Plant` as the
     model and the input u as `tau`; its estimate is d_hat, (r, n), what the disturbance adds to x'.
     Other observers serve the robot inside such a plant, and `tau` is the torque on its joints.
+    An observer of levels may have these members; `observer_member` holds their defaults.
+
+    - `check_model(model)`: raises ValueError for a plant that does not fit its fields.
+    - `noise_gain`: the factor from the noise of the measured levels to that of d_hat, (), (r,) or
+      (r, n) [1/s].  A scenario whose sensor has noise warns with the product.
+    - `measured`: the levels, counted from 1, that it reads; all if not given.
+    - `complete(t, x, model, state)`: x, (r, n), with its estimates in the place of the other
+      levels, which the sensor need not measure.
+
+    An observer may claim that the error of its estimate obeys f_tilde' = f' - kappa f_tilde: its
+    attribute `error_gain` is kappa, (n,) [1/s], or of d_tilde, (r,) or (r, n) [1/s].  `certify`
+    checks it under laws of plants in strict-feedback form.
     """
 
     def init(self, q: jax.Array, dq: jax.Array, model: Robot) -> State:
@@ -51,5 +63,15 @@ class Observer(Protocol):
         ...
 
 
-observer_member = OptionalMembers(receives_x=False, advance=None, at_period=None, advice=list)
+observer_member = OptionalMembers(
+    receives_x=False,
+    advance=None,
+    at_period=None,
+    advice=list,
+    check_model=lambda model: None,
+    noise_gain=None,
+    measured=None,
+    complete=None,
+    error_gain=None,
+)
 """Reads optional members of an observer."""

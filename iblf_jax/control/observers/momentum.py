@@ -48,6 +48,11 @@ class Momentum:
         """Raises ValueError for an unknown `start`."""
         checks.one_of("Momentum.start", self.start, STARTS)
 
+    @property
+    def error_gain(self) -> jax.Array:
+        """kf: f_tilde' = f' - kf f_tilde, (n,) [1/s]."""
+        return self.kf
+
     def derivative(
         self,
         t: jax.Array,

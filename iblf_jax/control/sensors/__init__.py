@@ -1,32 +1,45 @@
-"""Sensors: the measurements of q and q' for a sampled law.  The contracts are `Sensor` and
-`Velocity` in `_base.py`.
+"""Sensors: the measurements of q and q', or of all levels of a plant, for a sampled law.  The
+contracts are `Sensor`, `LevelSensor` and `Velocity` in `_base.py`.
 """
 
+from iblf_jax.control.sensors._base import LevelSensor as LevelSensor
 from iblf_jax.control.sensors._base import Measurement as Measurement
+from iblf_jax.control.sensors._base import Part as Part
 from iblf_jax.control.sensors._base import Sensor as Sensor
 from iblf_jax.control.sensors._base import State as State
 from iblf_jax.control.sensors._base import Velocity as Velocity
+from iblf_jax.control.sensors.direct import Direct as Direct
 from iblf_jax.control.sensors.encoder import Encoder as Encoder
 from iblf_jax.control.sensors.filtered_difference import FilteredDifference as FilteredDifference
 from iblf_jax.control.sensors.ideal import Ideal as Ideal
+from iblf_jax.control.sensors.levels import Levels as Levels
 from iblf_jax.control.sensors.measured import Measured as Measured
 from iblf_jax.control.sensors.tracking import Tracking as Tracking
+from iblf_jax.control.sensors.unmeasured import Unmeasured as Unmeasured
 
-MEMBERS = {"ideal": Ideal, "encoder": Encoder}
+MEMBERS = {"ideal": Ideal, "encoder": Encoder, "levels": Levels}
 """Every sensor by the name that a scenario file gives it."""
+LEVELS = {"direct": Direct, "unmeasured": Unmeasured}
+"""Every sensor of one level by the name that a scenario file gives it."""
 VELOCITIES = {"measured": Measured, "filtered_difference": FilteredDifference, "tracking": Tracking}
 """Every velocity estimate by the name that a scenario file gives it."""
 
 __all__ = [
+    "LEVELS",
     "MEMBERS",
     "VELOCITIES",
+    "Direct",
     "Encoder",
     "FilteredDifference",
     "Ideal",
+    "LevelSensor",
+    "Levels",
     "Measured",
     "Measurement",
+    "Part",
     "Sensor",
     "State",
     "Tracking",
+    "Unmeasured",
     "Velocity",
 ]

@@ -1,4 +1,5 @@
-"""The contracts of a sensor, and of the velocity estimate of a sensor that measures positions.
+"""The contracts of a sensor, of the sensor of one level of a plant, and of the velocity estimate of
+a sensor that measures positions.
 
 A sensor is read once per period, at its start.  The loop passes it standard normal numbers that
 depend only on seed, run, sample and joint.  Torque is never measured.
@@ -9,6 +10,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple, Protocol
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
@@ -40,7 +42,9 @@ class Sensor(Protocol):
 
     A sensor of all levels of a plant in strict-feedback form has the class attribute
     `receives_x = True`; its methods then receive the state x, (r, n), in the place of q and q'.
-    With any other sensor the levels from the third on are measured without error.
+    With any other sensor the levels from the third on are measured without error.  The `resolution`
+    of such a sensor is (r, n), and it may have the properties `order`, the number of levels r, and
+    `measured`, the levels that it measures, counted from 1; without it it measures all.
     """
 
     @property
@@ -65,6 +69,50 @@ class Sensor(Protocol):
           period: () [s].
           state: of the sample before.
         """
+        ...
+
+
+class LevelSensor(Protocol):
+    """The contract of a sensor of one level of a plant in strict-feedback form, a part of `Levels`.
+
+    A member that rounds has a leaf `resolution` and a property `unrounded`, as a `Sensor`; one that
+    measures nothing has `is_measured = False`.
+    """
+
+    @property
+    def draws(self) -> int:
+        """Number of normal numbers per component and sample."""
+        ...
+
+    @property
+    def levels(self) -> int:
+        """1, by which `Levels` distinguishes it from a sensor of position and velocity."""
+        ...
+
+    def init_level(self, x: jax.Array, period: jax.Array) -> State:
+        """State before the first sample, given the level there, (n,), and the period, () [s]."""
+        ...
+
+    def measure_level(
+        self, x: jax.Array, normal: jax.Array, period: jax.Array, state: State
+    ) -> tuple[jax.Array, State]:
+        """The measured level, (n,), and the next state.
+
+        Args:
+          x: true level, (n,), in its unit.
+          normal: independent standard normal numbers, (draws, n).
+          period: () [s].
+          state: of the sample before.
+        """
+        ...
+
+
+class Part(Protocol):
+    """A part of `Levels`: a `Sensor` of a position and its velocity, or a `LevelSensor`."""
+
+    @property
+    def draws(self) -> int:
+        """Number of normal numbers per component and sample."""
         ...
 
 
@@ -101,15 +149,32 @@ class Velocity(Protocol):
 
 
 sensor_member = OptionalMembers(
-    receives_x=False, unrounded=None, resolution=0.0, velocity=None, advice=lambda period: []
+    receives_x=False,
+    unrounded=None,
+    resolution=0.0,
+    velocity=None,
+    advice=lambda period: [],
+    order=None,
+    measured=None,
+    levels=2,
+    is_measured=True,
 )
-"""Reads optional members of a sensor or of its velocity estimate."""
+"""Reads optional members of a sensor, of the sensor of a level or of a velocity estimate."""
 
 
 def unrounded(sensor: Sensor) -> Sensor:
     """A sensor without its rounding; itself if it does not round."""
     found = sensor_member(sensor, "unrounded")
     return sensor if found is None else found
+
+
+def rounded(x: jax.Array, step: jax.Array | float) -> jax.Array:
+    """A reading rounded to multiples of `step`.
+
+    Its derivative is defined as 1, that of the reading before rounding, because the derivative of
+    the rounding is 0 almost everywhere.
+    """
+    return x + jax.lax.stop_gradient(step * jnp.round(x / step) - x)
 
 
 def above_nyquist(name: str, cutoff: jax.Array, period: jax.Array) -> list[str]:

@@ -8,11 +8,11 @@ import dataclasses
 import math
 
 import jax
-import jax.numpy as jnp
 
-from iblf_jax.control.sensors._base import Measurement, State, Velocity, sensor_member
+from iblf_jax.control.sensors._base import Measurement, State, Velocity, rounded, sensor_member
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf
+from iblf_jax.core.units import POSITION
 
 
 @component
@@ -33,8 +33,8 @@ class Encoder:
 
     velocity: Velocity
     counts: Leaf = leaf("1", sign="positive", default=None)
-    offset: Leaf = leaf("rad", default=0.0)
-    noise: Leaf = leaf("rad", sign="nonnegative", default=None)
+    offset: Leaf = leaf(POSITION, default=0.0)
+    noise: Leaf = leaf(POSITION, sign="nonnegative", default=None)
 
     def check(self) -> None:
         """Raises ValueError if `velocity` does not fit `Velocity`."""
@@ -65,8 +65,7 @@ class Encoder:
         """A position rounded to counts, (n,) [rad]."""
         if self.counts is None:
             return q
-        step = self.resolution
-        return q + jax.lax.stop_gradient(step * jnp.round(q / step) - q)
+        return rounded(q, self.resolution)
 
     def init(self, q: jax.Array, dq: jax.Array, period: jax.Array) -> State:
         """The velocity's, for the position that is read without noise."""

@@ -7,6 +7,7 @@ from typing import ClassVar
 import jax
 
 from iblf_jax.core.pytree import Leaf, component, leaf
+from iblf_jax.core.units import VELOCITY
 
 
 @component
@@ -19,7 +20,7 @@ class Measured:
     Source: none; the construction is common.
     """
 
-    noise: Leaf = leaf("rad/s", sign="nonnegative", default=0.0)
+    noise: Leaf = leaf(VELOCITY, sign="nonnegative", default=0.0)
     draws: ClassVar[int] = 1
 
     def init(self, y: jax.Array, dq: jax.Array, period: jax.Array) -> tuple[()]:

@@ -2,11 +2,18 @@
 
 from typing import Any
 
+from iblf_jax.world.plants._base import MAX_ORDER as MAX_ORDER
 from iblf_jax.world.plants._base import Plant as Plant
+from iblf_jax.world.plants._base import check_dependence as check_dependence
 from iblf_jax.world.plants._base import check_dimensions as check_dimensions
+from iblf_jax.world.plants._base import component_names as component_names
+from iblf_jax.world.plants._base import component_noun as component_noun
+from iblf_jax.world.plants._base import dependence_on_levels as dependence_on_levels
 from iblf_jax.world.plants._base import flow as flow
+from iblf_jax.world.plants._base import input_name as input_name
 from iblf_jax.world.plants._base import is_chain as is_chain
 from iblf_jax.world.plants._base import level_input as level_input
+from iblf_jax.world.plants._base import level_names as level_names
 from iblf_jax.world.plants._base import level_rate as level_rate
 from iblf_jax.world.plants._base import order_of as order_of
 from iblf_jax.world.plants._base import plant_member as plant_member
@@ -14,11 +21,14 @@ from iblf_jax.world.plants._base import robot_of as robot_of
 from iblf_jax.world.plants._base import speed_limit as speed_limit
 from iblf_jax.world.plants._base import torque_as_rates as torque_as_rates
 from iblf_jax.world.plants._base import transposed_gain as transposed_gain
+from iblf_jax.world.plants._base import unit_symbols as unit_symbols
 from iblf_jax.world.plants._base import units_of as units_of
+from iblf_jax.world.plants.driven_pendulum import DrivenPendulum as DrivenPendulum
 from iblf_jax.world.plants.electric_drive import ElectricDrive as ElectricDrive
 from iblf_jax.world.plants.flexible_joint import FlexibleJoint as FlexibleJoint
 from iblf_jax.world.plants.rigid import Rigid as Rigid
 from iblf_jax.world.plants.strict_feedback import StrictFeedback as StrictFeedback
+from iblf_jax.world.plants.vessel import Vessel as Vessel
 
 
 def as_plant(part: Any) -> Plant:
@@ -28,28 +38,40 @@ def as_plant(part: Any) -> Plant:
 
 MEMBERS = {
     "rigid": Rigid,
+    "driven_pendulum": DrivenPendulum,
     "electric_drive": ElectricDrive,
     "flexible_joint": FlexibleJoint,
     "strict_feedback": StrictFeedback,
+    "vessel": Vessel,
 }
 """Every plant by the name that a scenario file gives it."""
 
+OF_KNOWN_STRUCTURE = (Rigid, DrivenPendulum, ElectricDrive, FlexibleJoint, Vessel)
+"""Plants whose drift and gain have the structure of (S.1) for all numbers of their leaves."""
+
 __all__ = [
     "MEMBERS",
+    "DrivenPendulum",
     "ElectricDrive",
     "FlexibleJoint",
     "Plant",
     "Rigid",
     "StrictFeedback",
+    "Vessel",
     "as_plant",
+    "component_names",
+    "component_noun",
     "flow",
+    "input_name",
     "is_chain",
     "level_input",
+    "level_names",
     "level_rate",
     "order_of",
     "plant_member",
     "robot_of",
     "torque_as_rates",
     "transposed_gain",
+    "unit_symbols",
     "units_of",
 ]

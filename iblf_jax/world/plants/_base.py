@@ -11,17 +11,20 @@ Functions of this module take the number of a level, which counts from 1.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, Protocol
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.extend import core as jax_core
 
 from iblf_jax.core import checks
 from iblf_jax.core.linalg import matvec, solve_gain, solve_spd
 from iblf_jax.core.optional import OptionalMembers, has_members
 from iblf_jax.core.status import VELOCITY_LIMIT
+from iblf_jax.core.units import ByLevel, Unit, per_second, product
+from iblf_jax.world.robots import joint_names
 
 Units = str | tuple[str, ...]
 """The unit of a level: one for all its components, or one for each."""
@@ -36,6 +39,8 @@ class Plant(Protocol):
     - `units`: the units of the levels and of the input, a tuple of order + 1 `Units`.
     - `level_names`, `input_name`: words for figures and tables.
     - `component_names`: names of the n components.
+    - `outline(x1)`: corners of the plant's shape in the plane at a first level, (k, 2) [m], for
+      figures; the first corner is drawn as its path.
     - `robot`: the robot inside a plant whose first two levels are its q and q'.  Disturbances,
       friction and observers of robots then act on it, as the torque that is added to it.
     - `level_rate(level, t, x, above, torque)`: f_i + G_i above, (n,), where a member has a shorter
@@ -81,6 +86,7 @@ plant_member = OptionalMembers(
     level_names=None,
     input_name="input",
     component_names=(),
+    outline=None,
     robot=None,
     level_rate=None,
     level_input=None,
@@ -215,6 +221,60 @@ def torque_as_rates(plant: Plant, x: jax.Array, torque: jax.Array) -> jax.Array:
     return jnp.stack([zero, rate, *[zero] * (plant.order - 2)])
 
 
+class Dependence(NamedTuple):
+    """The largest derivatives of f_i and G_i by the components of each level, (order, order) each;
+    row i, column j is that of f_i by x_j.
+    """
+
+    drift: jax.Array
+    gain: jax.Array
+
+
+def dependence_on_levels(plant: Plant, t: jax.Array, x: jax.Array) -> Dependence:
+    """On which levels f_i and G_i depend at a state, by their Jacobians.
+
+    Args:
+      plant: any.
+      t: time, () [s].
+      x: state, (order, n).
+    """
+
+    def largest(function: Callable) -> jax.Array:
+        slopes = jnp.abs(jax.jacfwd(function, argnums=1)(t, x))
+        rows = slopes.reshape(x.shape[0], -1, *x.shape)
+        return jnp.max(rows, axis=(1, 3))
+
+    return Dependence(largest(plant.drift), largest(plant.gain))
+
+
+def check_dependence(name: str, dependence: Dependence) -> None:
+    """Raises ValueError for a row of drift or gain that depends on a later level.
+
+    Args:
+      name: of the plant, for the message.
+      dependence: of `dependence_on_levels`, at one or more states, (..., order, order).
+    """
+    for function, slopes in dependence._asdict().items():
+        sizes = np.asarray(slopes)
+        known = np.where(np.isfinite(sizes), sizes, 0.0).reshape(-1, *sizes.shape[-2:])
+        later = np.triu(np.max(known, axis=0), k=1)
+        if not np.any(later > ROUNDING * np.max(known)):
+            continue
+        i, j = np.unravel_index(np.argmax(later), later.shape)
+        got = f"a row {i} that depends on x[{j}]"
+        expected = f"row {i} to depend on x[0] ... x[{i}] only (strict-feedback form)"
+        if i == 0:
+            expected = "row 0 to depend on x[0] only (strict-feedback form)"
+        remedy = "Choose other levels, or other coordinates."
+        if function == "drift" and j == i + 1:
+            remedy = f"The factor of x[{j}] in x[{i}]' belongs in row {i} of the gain."
+        raise checks.fail(f"{name}.{function}(t, x)", checks.Words(got), expected, remedy)
+
+
+ROUNDING = 1e-9
+"""Derivatives below this share of the largest one are rounding errors."""
+
+
 def units_of(part: Any) -> tuple[Units, ...]:
     """The units of the levels of a plant and of its input: order + 1 of them."""
     if not is_chain(part):
@@ -223,6 +283,62 @@ def units_of(part: Any) -> tuple[Units, ...]:
     if units is None:
         return ("1",) * (order_of(part) + 1)
     return tuple(units)
+
+
+def unit_symbols(plant: Any, model: Any) -> Mapping[str, Unit]:
+    """The unit of each symbol of `core.units`, for a plant under a law that knows a model."""
+    *levels, of_input = units_of(plant)
+    rates = ByLevel(per_second(unit) for unit in levels)
+    torque: Unit = "N m"
+    if robot_of(plant) is None:
+        torque = of_input
+    energy: Unit = "1"
+    if robot_of(plant) is not None or plant_member(plant, "weights") is not None:
+        energy = product(torque, levels[0])
+    uncertain: Unit = rates if is_chain(model) else "N m"
+    return {
+        **{f"x{i + 1}": unit for i, unit in enumerate(levels)},
+        "levels": ByLevel(levels),
+        "higher": ByLevel(levels[2:]),
+        "rates": rates,
+        "u": of_input,
+        "f": uncertain,
+        "tau": torque,
+        "energy": energy,
+    }
+
+
+def level_names(part: Any) -> tuple[str, ...]:
+    """Names of the levels: those that the plant states, else "level 1", "level 2", ..."""
+    if not is_chain(part):
+        return ("position", "velocity")
+    own = plant_member(part, "level_names")
+    if own is None:
+        return tuple(f"level {i + 1}" for i in range(order_of(part)))
+    return tuple(own)
+
+
+def input_name(part: Any) -> str:
+    """The name of the input: "torque" of a robot."""
+    return plant_member(part, "input_name") if is_chain(part) else "torque"
+
+
+def component_names(part: Any) -> tuple[str, ...]:
+    """Names of the n components of a level: the joints of a robot, or of the robot inside a plant;
+    else those that the plant states, or "component 0", "component 1", ...
+    """
+    own = plant_member(part, "component_names") if is_chain(part) else ()
+    if own:
+        return tuple(own)
+    robot = robot_of(part)
+    if robot is not None:
+        return joint_names(robot, part.n)
+    return tuple(f"component {i}" for i in range(part.n))
+
+
+def component_noun(part: Any) -> str:
+    """The word for a component of a level: "joint" where there is a robot."""
+    return "component" if robot_of(part) is None else "joint"
 
 
 def speed_limit(part: Any) -> float:

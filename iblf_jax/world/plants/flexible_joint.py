@@ -19,7 +19,7 @@ from iblf_jax.world.plants.rigid import (
     robot_acceleration,
     torque_of,
 )
-from iblf_jax.world.robots import Robot
+from iblf_jax.world.robots import Robot, WithMotors
 
 
 @component
@@ -34,6 +34,10 @@ class FlexibleJoint:
       stiffness: K of each joint, () or (n,) [N m/rad], > 0.
       motor_inertia: J of each motor, () or (n,) [kg m^2], > 0.
       motor_damping: D of each motor, () or (n,) [N m s/rad], >= 0; 0 if not given.
+
+    A law of robots commands the torque of the motors directly.  Its model is `rigid()`, with the
+    inertia of the motors, or `rigid(motors=False)`, the links alone; for the latter a scenario
+    warns.
 
     Source: M. W. Spong, ASME J. Dynamic Systems, Measurement, and Control 109 (1987) 310-319.
     """
@@ -62,6 +66,18 @@ class FlexibleJoint:
     def n(self) -> int:
         """Number of joints."""
         return self.robot.n
+
+    def rigid(self, *, motors: bool = True) -> Robot:
+        """The robot with rigid joints, to which this plant tends for a large stiffness: the model
+        of a law of robots.
+
+        Args:
+          motors: whether its inertia contains that of the motors, M + diag(J), and its friction
+            their damping; otherwise it is the links alone.
+        """
+        if not motors:
+            return self.robot
+        return WithMotors(self.robot, inertia=self.motor_inertia, damping=self.motor_damping)
 
     def drift(self, t: jax.Array, x: jax.Array) -> jax.Array:
         """f, (4, n): 0, -M^-1 (C q' + G + K q), 0, -J^-1 (D theta' + K (theta - q))."""

@@ -28,7 +28,8 @@ class StrictFeedback:
       order: number of levels, at least 2.
       units: of the levels and of the input, order + 1 texts, or tuples of n texts where components
         differ; "1" for all if not given.
-      level_names: words for the levels, order texts; "x_1", "x_2", ... if not given.
+      level_names: words for the levels, order texts; "level 1", "level 2", ... if not
+        given.
       component_names: names of the n components; "component 0", ... if not given.
 
     Source: M. Krstic, I. Kanellakopoulos, P. Kokotovic, Nonlinear and Adaptive Control Design,

@@ -17,8 +17,9 @@ from iblf_jax.world.robots.load import load as load
 from iblf_jax.world.robots.payload import Payload as Payload
 from iblf_jax.world.robots.planar_chain import PlanarChain as PlanarChain
 from iblf_jax.world.robots.two_link import TwoLink as TwoLink
+from iblf_jax.world.robots.with_motors import WithMotors as WithMotors
 
-MEMBERS = {"two_link": TwoLink, "planar_chain": PlanarChain, "arm": Arm}
+MEMBERS = {"two_link": TwoLink, "planar_chain": PlanarChain, "arm": Arm, "with_motors": WithMotors}
 """Every robot by the name that a scenario file gives it."""
 
 __all__ = [
@@ -30,6 +31,7 @@ __all__ = [
     "Pose",
     "Robot",
     "TwoLink",
+    "WithMotors",
     "at_time",
     "coriolis_from_mass_matrix",
     "energy_gradient",

@@ -1,0 +1,270 @@
+"""A high-gain observer of the levels that are not measured, and of the disturbance.
+
+The measured levels divide a plant in strict-feedback form (S.1) into segments: each begins with a
+measured level s and ends before the next one, with level e.  Within a segment the derivatives of
+x_s are a chain of integrators, xi_1 = x_s, xi_2 = x_s', ... up to terms of the levels below, and a
+correction of xi_{k+1} by v is one of x_{s+k} by (G_s ... G_{s+k-1})^-1 v.  The observer is a copy
+of the model that the error of the measured level corrects in these coordinates:
+
+    x_hat_{s+k}' = f + G x_hat_{s+k+1} + d_hat + (G_s ... G_{s+k-1})^-1 l_{k+1} (x_s - x_hat_s),
+    d_hat_e'     = (G_s ... G_{e-1})^-1 l_{m+1} (x_s - x_hat_s),
+
+with m levels in the segment, d_hat_e an estimate of the disturbance of its last level, and l the
+coefficients of (z + bandwidth)^(m + 1): all poles of a chain of integrators are at -bandwidth.
+A disturbance of another level of a segment appears as one of its last level, together with the
+levels in between that would have the same effect on x_s.
+
+The bandwidth must exceed the rates of the plant itself, such as sqrt(K/M + K/J) of a flexible
+joint, because the copy of the model reproduces the other terms only as well as x_hat is known.
+
+**Sampled.**  Between two samples the copy of the model moves by one step of the classical
+Runge-Kutta method with the command held.  The gains of a period T are those of a polynomial filter
+with fading memory, with which all poles of the chain are at a = exp(-bandwidth T).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax.control.observers.level import check_rows
+from iblf_jax.core import checks
+from iblf_jax.core.pytree import Leaf, component, leaf, static
+from iblf_jax.core.units import LEVELS
+from iblf_jax.world import plants
+from iblf_jax.world.plants import Plant
+
+
+class StateObserverValues(NamedTuple):
+    """State of `StateObserver`."""
+
+    x_hat: jax.Array
+    """Estimate of all levels, (r, n)."""
+    d_hat: Any
+    """Estimate of the disturbance of each level, (r, n), 0 but for the last level of each segment;
+    `()` where it is not estimated."""
+
+
+class Segment(NamedTuple):
+    """Levels, counted from 1, of which the first alone is measured."""
+
+    first: int
+    last: int
+
+    @property
+    def length(self) -> int:
+        """Number of levels."""
+        return self.last - self.first + 1
+
+
+@component
+class StateObserver:
+    """x_hat' = f + G x_hat_+ + d_hat + correction by (x_s - x_hat_s) at each measured level s.
+
+    The law receives x_hat in the place of the levels that are not measured (head of this module).
+    Level 1 must be measured, because the levels below a measured one do not follow from it.  A law
+    of robots receives the torque M0(q) d_hat_2.
+
+    Args:
+      bandwidth: of the errors, () or (n,) [1/s], > 0.
+      measured: the levels that the sensor measures, counted from 1, in ascending order; (1,) if
+        not given.
+      disturbance: whether it estimates the disturbance of the last level of each segment, as a
+        constant; True if not given.
+      offset: error of the estimate at the start, one number, r numbers or (r, n) [1], in the unit
+        of each level; 0 if not given.  It has no effect on measured levels.
+
+    Source: J. P. Gauthier, H. Hammouri, S. Othman, IEEE Trans. Automatic Control 37 (1992) 875-880
+      (high gain); N. Morrison, Introduction to Sequential Smoothing and Prediction, 1969 (fading
+      memory); the extension by a disturbance as J. Han, IEEE Trans. Industrial Electronics 56
+      (2009) 900-906.
+    """
+
+    bandwidth: Leaf = leaf("1/s", sign="positive")
+    measured: tuple[int, ...] = static(default=(1,))
+    disturbance: bool = static(default=True)
+    offset: Leaf = leaf(LEVELS, shape="level", default=0.0)
+    receives_x: ClassVar[bool] = True
+
+    def check(self) -> None:
+        """Raises ValueError for levels that are not ascending from 1, or no bool."""
+        name = "StateObserver.measured"
+        if not isinstance(self.disturbance, bool):
+            raise checks.fail("StateObserver.disturbance", self.disturbance, "True or False")
+        expected = "levels in ascending order, from 1"
+        remedy = "Such as measured=(1, 3) for the encoders of link and motor."
+        if not isinstance(self.measured, tuple) or not self.measured:
+            raise checks.fail(name, self.measured, expected, remedy)
+        for level in self.measured:
+            checks.positive_integer(name, level, most=plants.MAX_ORDER)
+        if self.measured[0] != 1 or list(self.measured) != sorted(set(self.measured)):
+            raise checks.fail(name, self.measured, expected, remedy)
+
+    def check_model(self, model: Plant) -> None:
+        """Raises ValueError for a model that does not have the measured levels."""
+        check_rows("observer.offset", self.offset, model)
+        if self.measured[-1] > model.order:
+            expected = f"levels from 1 to {model.order}, as the model has"
+            raise checks.fail("observer.measured", self.measured, expected)
+
+    def _segments(self, order: int) -> Iterator[Segment]:
+        """The segments of a plant with this number of levels."""
+        ends = [*(first - 1 for first in self.measured[1:]), order]
+        for first, last in zip(self.measured, ends, strict=True):
+            yield Segment(first, last)
+
+    def init(self, x: jax.Array, model: Plant) -> StateObserverValues:
+        """The levels at the start with the offset, and no disturbance."""
+        offset = jnp.broadcast_to(self.offset, x.shape)
+        rows = [x[i] if i + 1 in self.measured else x[i] + offset[i] for i in range(model.order)]
+        d_hat: Any = jnp.zeros_like(x) if self.disturbance else ()
+        return StateObserverValues(jnp.stack(rows), d_hat)
+
+    def estimate(
+        self, t: jax.Array, x: jax.Array, model: Plant, state: StateObserverValues
+    ) -> jax.Array:
+        """d_hat, (r, n); 0 where it is not estimated."""
+        return state.d_hat if self.disturbance else jnp.zeros_like(x)
+
+    def complete(
+        self, t: jax.Array, x: jax.Array, model: Plant, state: StateObserverValues
+    ) -> jax.Array:
+        """The levels that the law receives, (r, n): the measured rows of x, and else x_hat."""
+        rows = [x[i] if i + 1 in self.measured else state.x_hat[i] for i in range(model.order)]
+        return jnp.stack(rows)
+
+    def derivative(
+        self,
+        t: jax.Array,
+        x: jax.Array,
+        u: jax.Array,
+        model: Plant,
+        state: StateObserverValues,
+    ) -> StateObserverValues:
+        """x_hat' and d_hat'."""
+
+        def gains(count: int) -> list[jax.Array]:
+            return [math.comb(count, i) * self.bandwidth**i for i in range(1, count + 1)]
+
+        correction = self._correction(t, x, model, state, gains)
+        moved = self._flow(t, model, u, state.d_hat)(t, state.x_hat)
+        return StateObserverValues(moved + correction.x_hat, correction.d_hat)
+
+    def advance(
+        self,
+        t: jax.Array,
+        x: jax.Array,
+        u: jax.Array,
+        model: Plant,
+        state: StateObserverValues,
+        period: jax.Array,
+    ) -> StateObserverValues:
+        """The prediction for the next sample: corrected by the measurement x, then moved by a
+        period with the input u.
+        """
+        a = jnp.exp(-self.bandwidth * period)
+
+        def gains(count: int) -> list[jax.Array]:
+            return fading_memory_gains(a, count, period)
+
+        correction = self._correction(t, x, model, state, gains)
+        x_hat = state.x_hat + correction.x_hat
+        d_hat = jax.tree.map(jnp.add, state.d_hat, correction.d_hat)
+        flow = self._flow(t, model, u, d_hat)
+        return StateObserverValues(_runge_kutta(flow, t, x_hat, period), d_hat)
+
+    def _flow(self, t: jax.Array, model: Plant, u: jax.Array, d_hat: Any) -> Any:
+        """The rate of the model's state with the estimated disturbance, a function of t and x."""
+
+        def flow(t: jax.Array, x: jax.Array) -> jax.Array:
+            rate = plants.flow(model, t, x, u)
+            return rate + d_hat if self.disturbance else rate
+
+        return flow
+
+    def _correction(
+        self, t: jax.Array, x: jax.Array, model: Plant, state: StateObserverValues, gains: Any
+    ) -> StateObserverValues:
+        """The correction of x_hat and d_hat by the errors of the measured levels.
+
+        `gains(count)` are the gains of the first `count` derivatives of a measured level, from 0.
+        """
+        x_hat = state.x_hat
+        zero = jnp.zeros_like(x_hat[0])
+        states: list[jax.Array] = []
+        disturbances: list[jax.Array] = []
+        for segment in self._segments(model.order):
+            error = x[segment.first - 1] - x_hat[segment.first - 1]
+            known = gains(segment.length + self.disturbance)
+            last = segment.length - 1
+            for k in range(segment.length):
+                level = segment.first + k
+                states.append(
+                    _through_gains(model, segment.first, level, t, x_hat, known[k] * error)
+                )
+                disturbances.append(zero)
+            if self.disturbance:
+                rate = known[last + 1] * error
+                disturbances[-1] = _through_gains(
+                    model, segment.first, segment.last, t, x_hat, rate
+                )
+        d_hat: Any = jnp.stack(disturbances) if self.disturbance else ()
+        return StateObserverValues(jnp.stack(states), d_hat)
+
+
+def _through_gains(
+    model: Plant, first: int, level: int, t: jax.Array, x: jax.Array, v: jax.Array
+) -> jax.Array:
+    """(G_first ... G_{level-1})^-1 v, (n,)."""
+    for i in range(first, level):
+
+        def needed(rate: jax.Array, i: int = i) -> jax.Array:
+            return plants.level_input(model, i, t, x, rate)
+
+        # `level_input` is affine in the rate, so its derivative is the inverse of the gain.
+        v = jax.jvp(needed, (jnp.zeros_like(v),), (v,))[1]
+    return v
+
+
+def fading_memory_gains(a: jax.Array, count: int, period: jax.Array) -> list[jax.Array]:
+    """Gains by which an error of a measured signal corrects its derivatives of the orders 0 to
+    `count` - 1, so that all poles of a chain of integrators are at a.
+
+    With F the map of a chain of integrators from one sample to the next and C its output, the gain
+    L of the correction places the eigenvalues of F - F L C at a:  L = F^-1 (F - a)^count O^-1 e,
+    O = (C; C F; ...; C F^(count-1)), e the last unit vector (Ackermann's formula).
+
+    Args:
+      a: pole, () or (n,) [1].
+      count: number of derivatives, with that of order 0.
+      period: () [s].
+
+    Returns:
+      `count` gains, () or (n,) each [1/s^k for the derivative of order k].
+    """
+    # In the coordinates xi_k T^k / k! the map F has the binomial coefficients as its entries.
+    F = np.array([[math.comb(j, i) for j in range(count)] for i in range(count)], float)
+    powers = [np.linalg.matrix_power(F, j) for j in range(count)]
+    observability = np.stack([power[0] for power in powers])
+    last = np.linalg.solve(observability, np.eye(count)[-1])
+    terms = [
+        math.comb(count, j) * np.linalg.solve(F, np.linalg.matrix_power(F, count - j) @ last)
+        for j in range(count + 1)
+    ]
+    scaled = [sum(float(term[k]) * (-a) ** j for j, term in enumerate(terms)) for k in range(count)]
+    return [gain * math.factorial(k) / period**k for k, gain in enumerate(scaled)]
+
+
+def _runge_kutta(flow: Any, t: jax.Array, x: jax.Array, period: jax.Array) -> jax.Array:
+    """The state a period later, by one step of the classical Runge-Kutta method."""
+    half = 0.5 * period
+    first = flow(t, x)
+    second = flow(t + half, x + half * first)
+    third = flow(t + half, x + half * second)
+    fourth = flow(t + period, x + period * third)
+    return x + period / 6.0 * (first + 2.0 * second + 2.0 * third + fourth)

@@ -1,0 +1,151 @@
+"""Sensors of all levels of a plant in strict-feedback form."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from iblf_jax.control.sensors._base import (
+    LevelSensor,
+    Measurement,
+    Part,
+    Sensor,
+    State,
+    sensor_member,
+    unrounded,
+)
+from iblf_jax.control.sensors.unmeasured import Unmeasured
+from iblf_jax.core import checks
+from iblf_jax.core.pytree import component
+
+
+class Span(NamedTuple):
+    """The levels and the normal numbers of a part."""
+
+    part: Any
+    first: int
+    """Index of its first level."""
+    end: int
+    """Index after its last level."""
+    first_draw: int
+    end_draw: int
+
+
+@component
+class Levels:
+    """One sensor after the other, for the levels of a plant in their order.
+
+    An ordinary sensor, such as `Encoder`, measures two levels: a position and its velocity.  The
+    sensor of a single level, such as `Direct`, measures one.  A flexible joint with encoders on
+    link and motor has `Levels((Encoder(...), Encoder(...)))`, and a drive with a current sensor
+    `Levels((Encoder(...), Direct(noise=0.01)))`.
+
+    Args:
+      parts: any of `iblf_jax.sensors.MEMBERS` or `iblf_jax.sensors.LEVELS`; None for a level that
+        is not measured.
+
+    Source: none; the construction is common.
+    """
+
+    parts: tuple[Part, ...]
+    receives_x: ClassVar[bool] = True
+
+    def check(self) -> None:
+        """Raises ValueError for a part that is no sensor; replaces None by `Unmeasured()`."""
+        name, remedy = "Levels.parts", "iblf_jax.sensors.MEMBERS and LEVELS have them."
+        if not isinstance(self.parts, tuple | list) or not self.parts:
+            raise checks.fail(name, self.parts, "a tuple of sensors", remedy)
+        parts = tuple(Unmeasured() if part is None else part for part in self.parts)
+        for i, part in enumerate(parts):
+            protocol = LevelSensor if sensor_member(part, "levels") == 1 else Sensor
+            checks.conforms(f"{name}[{i}]", part, protocol, remedy)
+            if sensor_member(part, "receives_x"):
+                expected = "a sensor of one or two levels"
+                raise checks.fail(f"{name}[{i}]", type(part).__name__, expected, remedy)
+        object.__setattr__(self, "parts", parts)
+
+    def _spans(self) -> Iterator[Span]:
+        """The levels of each part, and its share of the normal numbers."""
+        level, draw = 0, 0
+        for part in self.parts:
+            end, end_draw = level + sensor_member(part, "levels"), draw + part.draws
+            yield Span(part, level, end, draw, end_draw)
+            level, draw = end, end_draw
+
+    @property
+    def order(self) -> int:
+        """Number of levels."""
+        return sum(sensor_member(part, "levels") for part in self.parts)
+
+    @property
+    def measured(self) -> tuple[int, ...]:
+        """The levels that are measured, counted from 1."""
+        found: list[int] = []
+        for span in self._spans():
+            if sensor_member(span.part, "is_measured"):
+                found += range(span.first + 1, span.end + 1)
+        return tuple(found)
+
+    @property
+    def draws(self) -> int:
+        """Those of all parts."""
+        return sum(part.draws for part in self.parts)
+
+    @property
+    def unrounded(self) -> Levels:
+        """The same without rounding."""
+        return dataclasses.replace(
+            self, parts=tuple(unrounded(span.part) for span in self._spans())
+        )
+
+    @property
+    def resolution(self) -> jax.Array:
+        """Size of a step of each level, (r, 1) or (r, n); 0 for a level that is not rounded."""
+        rows: list[Any] = []
+        for span in self._spans():
+            step = sensor_member(span.part, "resolution")
+            rows.append(0.0 if step is None else step)
+            rows += [0.0] * (span.end - span.first - 1)
+        return jnp.stack(jnp.broadcast_arrays(*map(jnp.atleast_1d, rows)))
+
+    def advice(self, period: jax.Array) -> list[str]:
+        """The warnings of the parts."""
+        found: list[str] = []
+        for i, part in enumerate(self.parts):
+            texts = sensor_member(part, "advice")(period)
+            found += [text.replace("sensor.", f"sensor.parts[{i}].", 1) for text in texts]
+        return found
+
+    def init(self, x: jax.Array, period: jax.Array) -> State:
+        """The states of the parts."""
+        states = []
+        for span in self._spans():
+            levels = x[span.first : span.end]
+            if len(levels) == 1:
+                states.append(span.part.init_level(levels[0], period))
+            else:
+                states.append(span.part.init(levels[0], levels[1], period))
+        return tuple(states)
+
+    def measure(
+        self, x: jax.Array, normal: jax.Array, period: jax.Array, state: State
+    ) -> tuple[Measurement, State]:
+        """The measurements of the parts, and their next states."""
+        rows: list[jax.Array] = []
+        states = []
+        for span, before in zip(self._spans(), state, strict=True):
+            levels = x[span.first : span.end]
+            own = normal[span.first_draw : span.end_draw]
+            if len(levels) == 1:
+                y, after = span.part.measure_level(levels[0], own, period, before)
+                rows.append(y)
+            else:
+                found, after = span.part.measure(levels[0], levels[1], own, period, before)
+                rows += [found.q, found.dq]
+            states.append(after)
+        higher = jnp.stack(rows[2:]) if len(rows) > 2 else ()
+        return Measurement(rows[0], rows[1], higher), tuple(states)

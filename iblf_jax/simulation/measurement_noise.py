@@ -1,0 +1,134 @@
+"""The noise of the measured levels, and how an observer amplifies it.
+
+Around a constant state a sensor is a linear system whose inputs are its normal numbers and its
+rounding errors,
+
+    z_{k+1} = F z_k + B w_k,   y_k = H z_k + D w_k,
+
+with the rounding of a step r as white noise of the standard deviation r / sqrt(12).  In the steady
+state P = F P F^T + B W B^T, and the covariance of the measurement is H P H^T + D W D^T.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from iblf_jax.control.observers._base import observer_member
+from iblf_jax.control.sensors._base import sensor_member, unrounded
+from iblf_jax.simulation.levels import model_state, sensor_state, start_levels
+from iblf_jax.world import plants
+
+DOUBLINGS = 40
+"""Steps of the doubling algorithm for P, which then contains 2^40 samples."""
+
+
+class LinearSensor(NamedTuple):
+    """The matrices of a sensor around a constant state, one row an entry."""
+
+    F: jax.Array
+    B: jax.Array
+    H: jax.Array
+    D: jax.Array
+
+
+def standard_deviations(scenario: Any) -> np.ndarray:
+    """Standard deviations of the measured levels of the model, (r, n), each in the unit of its
+    level; 0 for a level that is not measured.
+
+    Args:
+      scenario: with a sampling and concrete numbers.
+    """
+    matrices = [np.asarray(matrix, float) for matrix in _linear_sensor(scenario)]
+    F, B, H, D = matrices
+    P = B @ B.T
+    for _ in range(DOUBLINGS):
+        P = P + F @ P @ F.T
+        F = F @ F
+    variance = np.diag(H @ P @ H.T + D @ D.T)
+    return np.sqrt(variance).reshape(-1, scenario.n)
+
+
+@jax.jit
+def _linear_sensor(scenario: Any) -> LinearSensor:
+    """The matrices of the sensor at the start, for inputs of the standard deviation 1."""
+    sensor, period = scenario.sensor, scenario.sampling.period
+    smooth: Any = unrounded(sensor)
+    levels = start_levels(scenario)
+    given = sensor_state(scenario, *levels)
+    steps = jnp.broadcast_to(jnp.asarray(sensor_member(sensor, "resolution")), given[0].shape)
+    start, rebuild = ravel_pytree(smooth.init(*given, period))
+    dtype = given[0].dtype  # which the vector of a sensor without memory may lack
+
+    def sample(z: jax.Array, normal: jax.Array, error: jax.Array) -> tuple[jax.Array, jax.Array]:
+        read = (given[0] + error * steps / np.sqrt(12.0), *given[1:])
+        found, after = smooth.measure(*read, normal, period, rebuild(z.astype(start.dtype)))
+        higher = levels[2] if isinstance(found.higher, tuple) else found.higher
+        x = model_state(scenario, found.q, found.dq, higher)
+        return ravel_pytree(after)[0].astype(dtype), x.reshape(-1)
+
+    zero = jnp.zeros((sensor.draws, scenario.n), dtype)
+    arguments = (start.astype(dtype), zero, jnp.zeros_like(given[0]))
+    by_z, by_normal, by_error = jax.jacfwd(lambda *at: _joined(*sample(*at)), argnums=(0, 1, 2))(
+        *arguments
+    )
+    count = start.size
+    inputs = jnp.concatenate(
+        [by_normal.reshape(len(by_z), -1), by_error.reshape(len(by_z), -1)], axis=1
+    )
+    return LinearSensor(by_z[:count], inputs[:count], by_z[count:], inputs[count:])
+
+
+def _joined(z: jax.Array, y: jax.Array) -> jax.Array:
+    """Next state and measurement as one vector."""
+    return jnp.concatenate([z, y])
+
+
+def noise_advice(scenario: Any) -> list[str]:
+    """A warning about an observer that amplifies the noise of the sensor, with the numbers of each
+    level; none for an observer without `noise_gain`, or a sensor without noise.
+    """
+    gain = observer_member(scenario.observer, "noise_gain")
+    if gain is None:
+        return []
+    noise = standard_deviations(scenario)
+    kappa = np.asarray(gain, float)
+    if kappa.ndim == 1:
+        kappa = kappa[:, None]
+    kappa = np.broadcast_to(kappa, noise.shape)
+    rows = [
+        _row(scenario, level, noise[level], kappa[level])
+        for level in range(len(noise))
+        if np.any(noise[level] * kappa[level] > 0)
+    ]
+    if not rows:
+        return []
+    kind = type(scenario.observer).__name__
+    return [
+        f"observer: {kind} amplifies the sensor's noise by its gain (standard deviations):"
+        f" {'; '.join(rows)}. The law adds the estimate to the rate of each level. A smaller gain,"
+        " or 0 for a noisy level without a disturbance, reduces it."
+    ]
+
+
+def _row(scenario: Any, level: int, noise: np.ndarray, kappa: np.ndarray) -> str:
+    """The noise of a level and of its estimate in words, for its worst component."""
+    worst = int(np.argmax(noise * kappa))
+    unit = plants.units_of(scenario.model)[level]
+    if not isinstance(unit, str):
+        unit = unit[worst]
+    return (
+        f"level {level + 1}: {noise[worst]:.3g} {unit} times {kappa[worst]:.3g} 1/s give"
+        f" {noise[worst] * kappa[worst]:.3g} {_per_second(unit)} in d_hat_{level + 1}"
+    )
+
+
+def _per_second(unit: str) -> str:
+    """The unit of a rate, such as "rad/s^2" for "rad/s"."""
+    if unit.endswith("/s"):
+        return f"{unit}^2"
+    return f"{unit}/s"

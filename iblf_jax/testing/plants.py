@@ -1,0 +1,240 @@
+"""The checker for plants in strict-feedback form: the contract is `iblf_jax.plants.Plant`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax.core import checks, taylor
+from iblf_jax.simulation.scenario import fit_joints
+from iblf_jax.testing._contract import (
+    Findings,
+    call_has_shape,
+    check_function,
+    examine,
+    in_both_types,
+    in_dtype,
+    shape_of,
+)
+from iblf_jax.world import plants
+from iblf_jax.world.plants import Plant, plant_member
+
+POINTS = 4
+"""Number of random states at which a plant is tested."""
+TOLERANCE = 1e-9
+"""Relative, float64: two formulas of one quantity agree to rounding."""
+SMALLEST_RATIO = 1e-12
+"""Least ratio of the singular values of a gain that counts as invertible."""
+Numbers = dict[str, Any]
+
+
+def check_plant(plant: Any, *, x: Any = None) -> None:
+    """Checks a plant in strict-feedback form: shapes, derivatives, float32, the dependence of drift
+    and gain on the levels, invertible gains, units, and optional members that agree with both.
+
+        x_i' = f_i(t, x_1..x_i) + G_i(t, x_1..x_i) x_{i+1},   i = 1..r,   x_{r+1} = u       (S.1)
+
+    Args:
+      plant: an instance.
+      x: states of the test, (m, order, n), in the units of the levels; random ones between -1 and 1
+        if not given.  Give states for a plant that is defined in a part of the space only.
+
+    Raises:
+      ContractError: lists what does not hold, with the remedy.
+      ValueError: `x` is not an array of shape (m, order, n).
+    """
+    with examine(plant, "Plant", Plant) as findings:
+        _dimensions(findings, plant)
+        plant = fit_joints(in_dtype(plant, "float64"), plant.n, "plant")
+        points = _points(plant, x)
+        t = jnp.asarray(0.7)
+        in_both_types(findings, _shapes, plant, t, points[0])
+        _structure(findings, plant, t, points)
+        rng = np.random.default_rng(2)
+        vectors = jnp.asarray(rng.normal(size=(2, plant.n)))
+        check_function(findings, _functions, plant, (t, points[0]))
+        found = jax.jit(jax.vmap(_identities, in_axes=(None, None, 0, None, None)))
+        values = found(plant, t, points, *vectors)
+        _agreement(findings, {name: np.asarray(value) for name, value in values.items()})
+
+
+def _dimensions(findings: Findings, plant: Any) -> None:
+    """Requires whole numbers of components and levels, and names and units that fit them."""
+    try:
+        plants.check_dimensions(type(plant).__name__, plant)
+    except ValueError as error:
+        findings.stop(str(error).removesuffix("."))
+    expected = {"level_names": plant.order, "component_names": plant.n}
+    for name, count in expected.items():
+        given = plant_member(plant, name)
+        problem = f"{name} has {len(given or ())} names"
+        findings.require(not given or len(given) == count, problem, f"It must have {count}")
+
+
+def _points(plant: Any, x: Any) -> jax.Array:
+    """The states of the test, (m, order, n)."""
+    shape = (plant.order, plant.n)
+    if x is None:
+        rng = np.random.default_rng(1)
+        return jnp.asarray(rng.uniform(-1.0, 1.0, (POINTS, *shape)))
+    points = checks.as_floats("x", x)
+    checks.check_values("x", points, None)
+    points = points[None] if points.ndim == 2 else points
+    if points.ndim != 3 or points.shape[1:] != shape or not len(points):
+        expected = f"states, shape (m, {plant.order}, {plant.n})"
+        raise checks.fail("x", points, expected, f"Its shape is {points.shape}.")
+    return points
+
+
+def _shapes(findings: Findings, plant: Any, t: jax.Array, x: jax.Array) -> None:
+    """Requires the shapes of drift, gain and the optional members."""
+    order, n = x.shape
+    call_has_shape(findings, "drift(t, x)", plant.drift, (t, x), (order, n))
+    gain = shape_of(findings, "gain(t, x)", plant.gain, t, x)
+    problem = f"gain(t, x) has shape {gain.shape}"
+    remedy = f"It must be {(order, n, n)}, or {(order, n)} for diagonal gains"
+    findings.require(gain.shape in ((order, n), (order, n, n)), problem, remedy)
+    v = x[0]
+    optional = {
+        "weights": ((x,), (order, n)),
+        "steady_levels": ((v, v), (order - 2, n)),
+        "steady_input": ((v,), (n,)),
+        "joint_torque": ((x, v), (n,)),
+    }
+    for name, (args, shape) in optional.items():
+        method = plant_member(plant, name)
+        if method is not None:
+            call_has_shape(findings, name, method, args, shape)
+    by_level: dict[str, tuple[Any, ...]] = {
+        "level_rate": (t, x, v, 0.0),
+        "level_input": (t, x, v, 0.0),
+        "transposed_gain": (t, x, v),
+    }
+    for name, args in by_level.items():
+        method = plant_member(plant, name)
+        if method is None:
+            continue
+        for level in range(1, order + 1):
+            call_has_shape(findings, f"{name}({level}, ...)", _at(method, level), args, (n,))
+
+
+def _at(method: Any, level: int) -> Any:
+    """A method of the optional members with its level."""
+    return lambda *args: method(level, *args)
+
+
+def _structure(findings: Findings, plant: Any, t: jax.Array, points: jax.Array) -> None:
+    """Requires rows that depend on no later level, invertible gains, and finite derivatives."""
+    of_points = jax.vmap(lambda x: plants.dependence_on_levels(plant, t, x))
+    try:
+        plants.check_dependence("the plant", jax.jit(of_points)(points))
+    except ValueError as error:
+        findings.stop(str(error).removesuffix("."))
+    gains = np.asarray(jax.vmap(lambda x: plant.gain(t, x))(points))
+    finite = np.isfinite(gains).all()
+    findings.require(finite, "gain(t, x) is not finite", "Give states by x=..., or look at poles")
+    findings.stop_if_any()
+    for i in range(plant.order):
+        matrices = gains[:, i]
+        if gains.ndim == 3:
+            matrices = matrices[:, None, :] * np.eye(plant.n)
+        values = np.linalg.svd(matrices, compute_uv=False)
+        invertible = np.all(values[:, -1] > SMALLEST_RATIO * values[:, 0])
+        problem = f"row {i} of gain(t, x) is singular"
+        findings.require(invertible, problem, "Every level must act on the level below it")
+    findings.stop_if_any()
+    slopes = jax.jit(jax.vmap(lambda x: _derivatives_along(plant, t, x)))(points)
+    problem = f"a derivative of order up to {plant.order - 1} of drift or gain is not finite"
+    remedy = "Laws differentiate them that often: look at roots, norms and divisions"
+    findings.require(np.isfinite(np.asarray(slopes)).all(), problem, remedy)
+
+
+def _derivatives_along(plant: Any, t: jax.Array, x: jax.Array) -> jax.Array:
+    """The Taylor coefficients of drift and gain along a straight line, all in one vector."""
+    constant = [(jnp.zeros_like(t), jnp.zeros_like(x))] * (plant.order - 2)
+    curve = [(t, x), (jnp.ones_like(t), jnp.ones_like(x)), *constant]
+    found = taylor.along(lambda t, x: (plant.drift(t, x), plant.gain(t, x)), curve)
+    return jnp.concatenate([jnp.ravel(value) for value in jax.tree.leaves(found)])
+
+
+def _functions(plant: Any, t: jax.Array, x: jax.Array) -> Numbers:
+    """The functions of a plant whose derivatives are tested."""
+    values = {"drift(t, x)": plant.drift(t, x), "gain(t, x)": plant.gain(t, x)}
+    arguments = {
+        "weights": (x,),
+        "steady_levels": (x[0], x[1]),
+        "steady_input": (x[0],),
+        "joint_torque": (x, x[-1]),
+    }
+    for name, args in arguments.items():
+        method = plant_member(plant, name)
+        if method is not None and not (name == "steady_levels" and plant.order == 2):
+            values[name] = method(*args)
+    return values
+
+
+def _identities(plant: Any, t: jax.Array, x: jax.Array, v: jax.Array, s: jax.Array) -> Numbers:
+    """The differences between optional members and what follows from drift and gain, one array a
+    member, relative to its size.
+    """
+    found: Numbers = {}
+    drift, gain = plant.drift(t, x), plant.gain(t, x)
+    matrices = gain if gain.ndim == 3 else gain[:, None, :] * jnp.eye(plant.n)
+    levels = range(1, plant.order + 1)
+    rates = jnp.stack([drift[i] + matrices[i] @ v for i in range(plant.order)])
+    if plant_member(plant, "level_rate") is not None:
+        own = jnp.stack([plant.level_rate(i, t, x, v, 0.0) for i in levels])
+        found["level_rate"] = _relative(own, rates)
+    if plant_member(plant, "level_input") is not None:
+        own = jnp.stack([plant.level_input(i, t, x, rates[i - 1], 0.0) for i in levels])
+        found["level_input"] = _relative(own, jnp.broadcast_to(v, own.shape))
+    if plant_member(plant, "transposed_gain") is not None:
+        own = jnp.stack([plant.transposed_gain(i, t, x, s) for i in levels])
+        found["transposed_gain"] = _relative(own, jnp.swapaxes(matrices, 1, 2) @ s)
+    if plant_member(plant, "weights") is not None:
+        found["weights"] = jnp.maximum(-plant.weights(x), 0.0)
+    steady_levels = plant_member(plant, "steady_levels")
+    steady_input = plant_member(plant, "steady_input")
+    if steady_levels is not None and steady_input is not None:
+        rest = jnp.zeros_like(x[0])
+        state = jnp.concatenate([jnp.stack([x[0], rest]), steady_levels(x[0], rest)])
+        rate = plants.flow(plant, t, state, steady_input(x[0]))
+        found["steady_input"] = rate / (1.0 + jnp.abs(plants.flow(plant, t, x, v)))
+    if plants.robot_of(plant) is not None and "level_rate" in found:
+        added = plant.level_rate(2, t, x, v, s) - plant.level_rate(2, t, x, v, 0.0)
+        found["torque"] = _relative(added, plants.torque_as_rates(plant, x, s)[1])
+    return found
+
+
+def _relative(found: jax.Array, expected: jax.Array) -> jax.Array:
+    """The difference of two rows of vectors, relative to the size of each row."""
+    size = jnp.max(jnp.abs(expected), axis=-1, keepdims=True)
+    return (found - expected) / (1e-12 + size)
+
+
+REMEDIES = {
+    "level_rate": ("level_rate is not f_i + G_i x_{i+1}", "Let it follow from drift and gain"),
+    "level_input": ("level_input is not the inverse of f_i + G_i x_{i+1}", "Solve it for x_{i+1}"),
+    "transposed_gain": ("transposed_gain is not G_i^T s", "Transpose the gain"),
+    "weights": ("weights has negative entries", "The scale of an energy is positive"),
+    "steady_input": (
+        "steady_input and steady_levels do not hold the plant at q",
+        "With them and q' = 0 all rates are 0",
+    ),
+    "torque": (
+        "level_rate does not add the torque to the robot",
+        "A torque adds M^-1 torque to the second level",
+    ),
+}
+"""Optional member -> the problem where it does not agree with the others, and the remedy."""
+
+
+def _agreement(findings: Findings, differences: dict[str, np.ndarray]) -> None:
+    """Requires that optional members agree with drift and gain."""
+    for name, difference in differences.items():
+        problem, remedy = REMEDIES[name]
+        size = float(np.max(np.abs(difference)))
+        findings.require(size <= TOLERANCE, f"{problem} (by {size:.2g})", remedy)

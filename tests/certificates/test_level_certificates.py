@@ -1,0 +1,560 @@
+"""The claim (S.3) about plants in strict-feedback form: at random states, along runs, and where it
+fails or does not apply.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from random_plants import random_scenario, random_states
+
+import iblf_jax as ij
+from iblf_jax.certificates import certify, counterexample
+from iblf_jax.certificates.level_lines import LEVEL_ROUNDING
+from iblf_jax.certificates.level_terms import level_terms_at
+from iblf_jax.certificates.proof_terms import rounding
+from iblf_jax.simulation.closed_loop import evaluate
+from iblf_jax.world import plants
+
+MAPPING, PERFORMANCE = ij.barriers.Mapping(), ij.barriers.PrescribedPerformance()
+ORDERS = (2, pytest.param(3, marks=pytest.mark.slow), pytest.param(4, marks=pytest.mark.slow))
+
+
+def lyapunov(scenario, t, x, d_hat):
+    """Sum w_i V_i, from the law's levels."""
+    law = scenario.controller
+    _, tubes = law.levels(t, x, d_hat, scenario.context, ())
+    return sum(
+        jnp.sum(law.weights[i] * law.barriers[i].value(tubes[i], x[i])) for i in range(law.order)
+    )
+
+
+def rate_along_the_flow(scenario, t, state):
+    """V' by jvp of the sum along the true flow of plant, disturbance and observer."""
+    rates, _ = evaluate(scenario, t, state)
+
+    def value(t, state):
+        d_hat = scenario.observer.estimate(t, state.x, scenario.model, state.observer)
+        return lyapunov(scenario, t, state.x, d_hat)
+
+    return jax.jvp(value, (t, state), (jnp.ones_like(t), rates))[1]
+
+
+def right_side(scenario, t, state):
+    """The right side of (S.3), level by level as it is printed."""
+    law, context, kappa = scenario.controller, scenario.context, scenario.observer.gain
+    x = state.x
+    d_hat = scenario.observer.estimate(t, x, scenario.model, state.observer)
+    d_tilde = scenario.disturbance.rates(t, x, scenario.plant, scenario.model) - d_hat
+    _, tubes = law.levels(t, x, d_hat, context, ())
+    total = 0.0
+    for i in range(law.order):
+        w, barrier = law.weights[i], law.barriers[i]
+        s = barrier.slope(tubes[i], x[i])
+        decay = barrier.decay_rate(law.k[i]) * barrier.value(tubes[i], x[i])
+        total += jnp.sum(w * (-decay - law.c[i] * s**2 + s * d_tilde[i]))
+        if i == 0:
+            continue
+        bounds = context.level_bounds(i + 1)
+
+        def value(centre, i=i, barrier=barrier, bounds=bounds):
+            tube = tubes[i]._replace(
+                q_d=centre, lower=bounds.lower.at(t, centre), upper=bounds.upper.at(t, centre)
+            )
+            return barrier.value(tube, x[i])
+
+        def alpha(below, d_hat, i=i):
+            at = x.at[:i].set(below)
+            return law.levels(t, at, d_hat, context, ())[0][i - 1].alpha
+
+        moved = jnp.zeros_like(d_hat).at[:i].set((kappa * d_tilde)[:i])
+        _, dalpha = jax.jvp(alpha, (x[:i], d_hat), (d_tilde[:i], moved))
+        _, dV = jax.jvp(value, (tubes[i].q_d,), (dalpha,))
+        total += jnp.sum(w * dV)
+    return total
+
+
+def both_sides(scenario, seed):
+    """Left and right side of (S.3) at random states, and the terms of the certificate there."""
+    t, state = random_states(scenario, seed)
+
+    @jax.jit
+    @jax.vmap
+    def at(t, state):
+        terms = level_terms_at(scenario, t, state)
+        return rate_along_the_flow(scenario, t, state), right_side(scenario, t, state), terms
+
+    left, right, terms = jax.tree.map(np.asarray, at(t, state))
+    assert not np.any(terms.excluded)
+    return left, right, terms
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize(
+    "barrier", [MAPPING, pytest.param(PERFORMANCE, marks=pytest.mark.slow)], ids=["map", "pp"]
+)
+def test_both_sides_of_the_claim_are_equal(order, barrier):
+    scenario = random_scenario(order, (barrier,) * order, seed=order)
+    left, right, terms = both_sides(scenario, order)
+    claim = terms.claim
+    assert np.all(np.abs(left - right) <= 1e-10 * np.max(np.abs(left)))
+    # Every state has terms of its own size: the terms of V' are the scale of rounding.
+    assert np.all(np.abs(left - right) <= 1e-13 * claim.size)
+    tolerance = LEVEL_ROUNDING * rounding("float64") * claim.size
+    assert np.median(tolerance / np.abs(left)) < 1e-10
+    certified = claim.disturbance_terms - claim.decay - claim.by_slopes
+    assert np.all(np.abs(right - certified) <= 1e-13 * claim.size)
+    assert np.all(np.abs(left - claim.dV) <= 1e-13 * claim.size)
+    assert np.all(np.abs(claim.dV - certified) <= 0.2 * tolerance)
+    # The disturbance terms decide: without them nothing is equal.
+    assert np.median(np.abs(claim.disturbance_terms) / tolerance) > 1e6
+    assert np.all(
+        np.abs(terms.estimate_error)
+        <= 0.2 * LEVEL_ROUNDING * rounding("float64") * terms.estimate_size
+    )
+
+
+def test_an_integral_barrier_gives_an_inequality():
+    scenario = random_scenario(2, (ij.barriers.Integral(), MAPPING), seed=5)
+    left, right, _ = both_sides(scenario, 5)
+    assert np.all(left < right)
+
+
+@pytest.mark.slow
+def test_a_mixed_design_of_order_three_keeps_the_inequality():
+    # The kink of the slope at e_1 = 0 makes u jump there, so that the law refuses this barrier in a
+    # scenario; at other states its functions have the claim.
+    scenario = random_scenario(3, (MAPPING,) * 3, seed=6)
+    law = scenario.controller
+    width = 1.5 * 2.5
+    mixed = ij.controllers.BarrierBackstepping(
+        k=law.k,
+        barriers=(ij.barriers.Integral(), MAPPING, MAPPING),
+        c=law.c,
+        weights=law.weights.at[0].multiply(width),
+    )
+    with pytest.raises(ValueError, match=r"barriers\[0\]"):
+        mixed.check_start(scenario.context)
+    scenario = replaced(scenario, controller=mixed)
+    left, right, _ = both_sides(scenario, 6)
+    assert np.all(left < right)
+
+
+def replaced(scenario, **parts):
+    """A scenario with other parts, unchecked."""
+    copy = object.__new__(type(scenario))
+    for field in dataclasses.fields(scenario):
+        object.__setattr__(copy, field.name, parts.get(field.name, getattr(scenario, field.name)))
+    return copy
+
+
+# --- runs -----------------------------------------------------------------------------------------
+
+
+def drift(t, x):
+    """A pendulum with a motor."""
+    return jnp.stack(
+        [
+            -0.3 * jnp.sin(x[0]),
+            -x[1] - 2.0 * jnp.sin(x[0]),
+            -0.5 * x[2] - 0.2 * x[1],
+        ]
+    )
+
+
+def gain(t, x):
+    """Diagonal."""
+    return jnp.ones_like(x) * jnp.array([[1.0], [1.0], [4.0]])
+
+
+def between(lower, upper):
+    """Constant bounds."""
+    return ij.bounds.Bounds(lower=ij.bounds.Constant(lower), upper=ij.bounds.Constant(upper))
+
+
+PENDULUM = ij.plants.StrictFeedback(
+    drift=drift, gain=gain, n=1, order=3, units=("rad", "rad/s", "A", "V")
+)
+DISTURBANCES = ij.disturbances.Levels(
+    (
+        ij.disturbances.Sinusoids(0.1, 1.0),
+        ij.disturbances.Sinusoids(0.3, 2.0),
+        ij.disturbances.Sinusoids(1.0, 1.5),
+    )
+)
+GAINS = {"k": (2.0, 5.0, 10.0), "barriers": (MAPPING,) * 3, "c": 0.1}
+
+
+def pendulum(law=None, **parts):
+    """A loop of order 3 with bounds on all levels."""
+    chosen = {
+        "plant": PENDULUM,
+        "reference": ij.references.Sinusoid(offset=0.1, amplitude=0.4),
+        "bounds": between(-0.8, 1.0),
+        "state_bounds": (between(-8.0, 9.0), between(-60.0, 60.0)),
+        "controller": ij.controllers.BarrierBackstepping(**GAINS) if law is None else law,
+        "initial": ij.Initial(x=[[0.3], [0.0], [0.0]]),
+    }
+    return ij.Scenario(**(chosen | parts))
+
+
+@pytest.fixture(scope="module")
+def undisturbed():
+    """The certificate of a run without disturbance."""
+    return certify(pendulum(), duration=2.0, dt=2e-3)
+
+
+def test_without_disturbance_V_decays_at_its_rate(undisturbed):
+    assert undisturbed.holds
+    assert undisturbed.numbers["rho"] == 4.0
+    assert undisturbed.numbers["rho2"] == 0.0
+    assert undisturbed.numbers["V_end"] < undisturbed.numbers["V_start"] * np.exp(-4.0 * 2.0)
+    for name in ("inequality, levels", "equality", "envelope", "smooth", "alpha_2 inside"):
+        assert undisturbed[name].verdict == "holds"
+    assert "no observer" in undisturbed["estimate"].note
+    # The error at the end is below what V <= V(0) exp(-rho t) leaves.
+    for level in (1, 2, 3):
+        assert undisturbed[f"xi, level {level}"].verdict == "holds"
+        assert 0 < undisturbed[f"xi, level {level}"].margin < 0.1
+    assert undisturbed["level 3 inside"].unit == "A"
+    text = repr(undisturbed)
+    assert "(S.3)" in text
+    assert "of the claim (S.3) does not apply" in text
+
+
+def test_a_disturbed_run_has_the_true_terms():
+    scenario = pendulum(disturbance=DISTURBANCES)
+    run = ij.simulate(scenario, duration=2.0, dt=2e-3)
+    certificate = certify(scenario, run)
+    assert certificate.holds
+    terms = certificate.traces.disturbance_terms
+    assert np.max(terms) == pytest.approx(certificate["observer terms"].value)
+    assert np.max(terms) > 0.1
+    np.testing.assert_allclose(certificate.numbers["d_largest"], [0.1, 0.3, 1.0], rtol=1e-4)
+    # Without the terms V would have to decay, which it does not.
+    assert np.max(certificate.traces.left + terms) > 0.1
+    assert certificate.numbers["rho2"] > 0
+    assert certificate["envelope"].verdict == "holds"
+
+
+def test_an_observer_states_kappa_and_a_wrong_one_fails():
+    observer = ij.observers.LevelObserver(gain=(20.0, 20.0, 20.0))
+    certificate = certify(pendulum(disturbance=DISTURBANCES, observer=observer), duration=1.0)
+    assert certificate.holds
+    assert certificate["estimate"].verdict == "holds"
+    assert np.all(certificate.numbers["d_tilde_largest"] < certificate.numbers["d_largest"])
+    wrong = pendulum(disturbance=DISTURBANCES, observer=WrongObserver(gain=20.0))
+    certificate = certify(wrong, duration=1.0)
+    assert certificate["estimate"].verdict == "fails"
+    assert not certificate.holds
+    # (S.3) is evaluated with the true rate of the estimate.
+    assert certificate["inequality, levels"].verdict == "holds"
+
+
+@ij.component
+class WrongObserver(ij.observers.LevelObserver):
+    """States twice the gain with which it estimates."""
+
+    @property
+    def error_gain(self):
+        """Not kappa."""
+        return 2.0 * self.gain
+
+
+@ij.component
+class WithoutExchange(ij.controllers.BarrierBackstepping):
+    """A law whose input does not cancel the effect of e_r on V_{r-1}."""
+
+    def _added(self, plant, t, x, levels, tubes):
+        last = self.order - 1
+        ratio = self.barriers[last].error_over_slope(tubes[last], x[last])
+        exchanged = plants.transposed_gain(plant, last, t, x, levels[last - 1].slope)
+        return ratio / self.weights[last] * exchanged
+
+    def levels(self, t, x, d_hat, context, state):
+        levels, tubes = super().levels(t, x, d_hat, context, state)
+        plant, order = context.model, self.order
+        rate = self._added(plant, t, x, levels, tubes)
+        zero = plants.level_input(plant, order, t, x, 0.0 * rate)
+        u = levels[-1].alpha + plants.level_input(plant, order, t, x, rate) - zero
+        return [*levels[:-1], levels[-1]._replace(alpha=u)], tubes
+
+
+@ij.component
+class WithWrongFeedback(WithoutExchange):
+    """A law that feeds the slope of the last level back with the wrong sign."""
+
+    def _added(self, plant, t, x, levels, tubes):
+        return 2.0 * self.c[-1] * levels[-1].slope / self.weights[-1]
+
+
+@pytest.mark.parametrize("law", [WithoutExchange, WithWrongFeedback])
+def test_a_wrong_law_fails(law):
+    certificate = certify(pendulum(law(**GAINS)), duration=0.5, dt=2e-3)
+    assert certificate["inequality, levels"].verdict == "fails"
+    assert certificate["inequality, levels"].margin < -1e-3
+    assert certificate["equality"].verdict == "fails"
+    assert certificate.verdict == "fails"
+
+
+def test_a_dynamic_surface_claims_ultimate_boundedness():
+    law = ij.controllers.BarrierBackstepping(filter=0.01, **GAINS)
+    certificate = certify(pendulum(law, disturbance=DISTURBANCES), duration=1.0)
+    assert certificate.holds
+    assert certificate["equality"].verdict == "holds"
+    assert "ultimate boundedness" in certificate["envelope"].note
+    assert certificate["lag of the filters"].value > 0
+    assert certificate["smooth"].verdict == "not applicable"
+
+
+@ij.component
+class TwoLevels:
+    """u = -x_1 - x_2 for a double integrator around 0, with V = 3/2 x_1^2 + x_1 x_2 + x_2^2."""
+
+    k: ij.Leaf = ij.leaf("1/s", default=1.0)
+    receives_x: ClassVar[bool] = True
+    uses_observer: ClassVar[bool] = False
+    includes_e2: ClassVar[bool] = True
+
+    def init(self, x, context):
+        """No state."""
+        return ()
+
+    def command(self, t, x, d_hat, context, state):
+        """u."""
+        zero = jnp.zeros_like(x[0])
+        no = zero > 1.0
+        return ij.controllers.Command(-x[0] - x[1], zero, 0.0 * zero, no, no), ()
+
+
+@ij.component
+class WithClaim(TwoLevels):
+    """`TwoLevels` with its Lyapunov function: V' = -x_1^2 - x_2^2 without disturbance."""
+
+    factor: ij.Leaf = ij.leaf("1", shape="scalar", default=1.0)
+
+    def lyapunov(self, t, x, d_tilde, context, state):
+        """V."""
+        return 1.5 * x[0] ** 2 + x[0] * x[1] + x[1] ** 2
+
+    def decay(self, t, x, d_tilde, context, state):
+        """W, or a multiple of it that is wrong."""
+        return self.factor * (x[0] ** 2 + x[1] ** 2)
+
+
+DOUBLE = ij.plants.StrictFeedback(
+    drift=lambda t, x: jnp.zeros_like(x), gain=lambda t, x: jnp.ones_like(x), n=1, order=2
+)
+
+
+def double_integrator(law, **parts):
+    """A disturbed double integrator."""
+    chosen = {
+        "plant": DOUBLE,
+        "reference": ij.references.Sinusoid(offset=0.0, amplitude=0.0),
+        "bounds": between(-3.0, 3.0),
+        "controller": law,
+        "disturbance": ij.disturbances.Levels((None, ij.disturbances.Sinusoids(0.2, 1.0))),
+        "initial": ij.Initial(x=[[1.0], [0.5]]),
+    }
+    return ij.Scenario(**(chosen | parts))
+
+
+def test_a_users_law_on_levels_states_its_own_claim():
+    certificate = certify(double_integrator(WithClaim()), duration=1.0, dt=5e-3)
+    assert certificate.holds
+    assert certificate.is_of_own_claim
+    assert "dV/dx . d_tilde" in certificate["inequality, own V"].statement
+    assert "TwoLevels" not in certificate.omitted
+    wrong = certify(double_integrator(WithClaim(factor=1.2)), duration=1.0, dt=5e-3)
+    assert wrong["inequality, own V"].verdict == "fails"
+
+
+def test_a_law_without_a_claim_is_not_applicable():
+    certificate = certify(double_integrator(TwoLevels()), duration=0.5, dt=5e-3)
+    assert certificate.verdict == "not applicable"
+    assert "TwoLevels has no claim of this kind" in certificate["inequality, levels"].note
+    assert certificate["level 1 inside"].margin > 0
+
+
+# --- robots ---------------------------------------------------------------------------------------
+
+
+LINK = ij.robots.PlanarChain(mass=[1.3], length=[0.4], centre=[0.2], inertia=[0.02])
+
+
+def robot_scenario(plant, order, robot_law=None, **parts):
+    """A loop of a robot, of a robot with drives or with flexible joints, under disturbance."""
+    n = plant.n
+    gains = (3.0, 15.0, 40.0, 100.0)[:order]
+    law = ij.controllers.BarrierBackstepping(k=gains, barriers=MAPPING)
+    chosen = {
+        "plant": plant,
+        "reference": ij.references.Sinusoid(offset=[0.3] * n, amplitude=[0.3] * n),
+        "bounds": between(-0.5, 1.0),
+        "controller": law if robot_law is None else robot_law,
+        "observer": ij.observers.Momentum(kf=20.0),
+        "disturbance": ij.disturbances.Sinusoids(0.4, 2.0),
+        "initial": ij.Initial(q=[0.4] * n, dq=[0.0] * n),
+    }
+    return ij.Scenario(**(chosen | parts))
+
+
+def check_torque_observer(plant, order):
+    """The claim with the observer of the robot inside a plant."""
+    certificate = certify(robot_scenario(plant, order), duration=0.5)
+    assert certificate.holds
+    assert certificate["equality"].verdict == "holds"
+    assert certificate["estimate"].verdict == "holds"
+    assert certificate["estimate"].unit == "N m/s"
+    assert certificate.numbers["d_tilde_largest"][1] > 0.1
+    assert certificate[f"e, level {order}"].margin > 0
+
+
+def test_a_robot_is_certified_with_its_observer():
+    check_torque_observer(LINK, 2)
+
+
+@pytest.mark.slow
+def test_a_robot_with_drives_is_certified_with_the_observer_of_the_robot():
+    drive = ij.plants.ElectricDrive(
+        LINK, torque_constant=0.5, inductance=0.01, resistance=0.5, back_emf=0.1
+    )
+    check_torque_observer(drive, 3)
+
+
+def test_levels_of_a_robot_are_observed():
+    rates = ij.disturbances.Levels((ij.disturbances.Sinusoids(0.1, 2.0),))
+    observer = ij.observers.LevelObserver(gain=20.0)
+    certificate = certify(
+        robot_scenario(LINK, 2, disturbance=rates, observer=observer), duration=0.3
+    )
+    assert certificate.holds
+    assert certificate["estimate"].verdict == "holds"
+    assert certificate["equality"].verdict == "holds"
+
+
+def test_a_disturbance_of_q_has_no_torque_observer():
+    rates = ij.disturbances.Levels((ij.disturbances.Sinusoids(0.1, 2.0),))
+    certificate = certify(robot_scenario(LINK, 2, disturbance=rates), duration=0.3)
+    assert certificate["estimate"].verdict == "not applicable"
+    assert "without d_1" in certificate["estimate"].note
+    assert certificate["equality"].verdict == "holds"
+    assert certificate.holds
+
+
+@pytest.mark.slow
+def test_the_flexible_two_link_arm_is_certified():
+    paper = ij.presets.zhang_yan_2024()
+    flexible = ij.plants.FlexibleJoint(paper.plant, stiffness=300.0, motor_inertia=0.02)
+    law = ij.controllers.BarrierBackstepping(k=(3.0, 20.0, 60.0, 150.0), barriers=MAPPING)
+    scenario = dataclasses.replace(
+        paper, plant=flexible, model=flexible, controller=law, observer=ij.observers.Momentum(kf=20)
+    )
+    certificate = certify(scenario, duration=1.0, dt=5e-4)
+    assert certificate.holds
+    assert certificate["equality"].verdict == "holds"
+    assert len(certificate.levels) == 4
+    assert certificate.levels[2].name == "motor position"
+
+
+def test_the_rigid_law_on_a_flexible_arm_has_the_flexibility_in_f():
+    flexible = ij.plants.FlexibleJoint(LINK, stiffness=300.0, motor_inertia=0.01)
+    law = ij.controllers.Backstepping(k1=2.0, K2=5.0, barrier=ij.barriers.Integral())
+    scenario = robot_scenario(flexible, 2, law, model=LINK)
+    certificate = certify(scenario, duration=0.05, dt=5e-4)
+    assert certificate["inequality, case 2"].verdict == "holds"
+    assert certificate.numbers["case"] == 2
+    # The spring's torque less the motor's is a part of f.
+    rigid = certify(robot_scenario(LINK, 2, law), duration=0.05, dt=5e-4)
+    assert certificate.numbers["F_d"] > 3 * rigid.numbers["F_d"]
+
+
+# --- many runs, other loops -----------------------------------------------------------------------
+
+
+def test_many_runs_name_the_worst():
+    scenario = pendulum(disturbance=DISTURBANCES)
+    gains = {"controller.k": ij.factor(ij.uniform(0.8, 1.2))}
+    study = ij.monte_carlo(scenario, gains, runs=3, duration=0.4, dt=2e-3)
+    certificate = certify(scenario, study, worst=None)
+    assert certificate.holds
+    assert certificate.runs == (0, 1, 2)
+    assert certificate["rho"].run is not None
+    assert "3 runs" in certificate.subject
+    assert certificate.to_dict()["verdict"] == "holds"
+    certificate.plot()
+
+
+def test_limits_of_the_input_and_the_guard_are_excluded():
+    law = ij.controllers.BarrierBackstepping(**GAINS)
+    limited = pendulum(ij.controllers.Saturated(law, limit=5.0))
+    certificate = certify(limited, duration=0.3)
+    assert 0 < certificate.numbers["samples_left_out"] < certificate.numbers["samples"]
+    assert "a limit of the input was active" in certificate["inequality, levels"].note
+    assert certificate["equality"].verdict == "holds"
+    always = pendulum(ij.controllers.Saturated(law, limit=1e-3))
+    certificate = certify(always, duration=0.1)
+    assert "all the time" in certificate["inequality, levels"].note
+    assert certificate.verdict == "not applicable"
+
+
+def test_alpha_outside_the_bounds_of_its_level_fails():
+    law = ij.controllers.BarrierBackstepping(k=(2.0, 5.0), barriers=(MAPPING, MAPPING))
+    scenario = double_integrator(
+        law,
+        reference=ij.references.Sinusoid(offset=0.0, amplitude=0.4),
+        state_bounds=(between(-0.38, 0.38),),
+        initial=ij.Initial(x=[[0.05], [0.0]]),
+    )
+    with pytest.warns(ij.SimulationWarning):
+        certificate = certify(scenario, duration=1.0)
+    assert certificate["level 2 starts inside"].verdict == "holds"
+    assert certificate["alpha_1 inside"].verdict == "fails"
+    assert certificate["alpha_1 inside"].margin < 0
+    assert certificate.verdict == "fails"
+    assert "not valid" in certificate["inequality, levels"].note
+
+
+def test_a_sampled_loop_and_an_actuator_have_no_claim():
+    sampled = pendulum(sampling=ij.Sampling(period=4e-3))
+    certificate = certify(sampled, duration=0.2, dt=2e-3)
+    assert certificate.verdict == "not applicable"
+    assert "sampled" in certificate["inequality, levels"].note
+    assert certificate["V2, sampled less continuous"].value is not None
+    certificate.plot()
+    lag = pendulum(actuator=ij.actuators.Motor(bandwidth=100.0))
+    certificate = certify(lag, duration=0.2, dt=2e-3)
+    assert certificate.verdict == "not applicable"
+    assert "Motor has no claim" in certificate["inequality, levels"].note
+
+
+def test_a_search_for_counterexamples_finds_one_of_a_wrong_law_only():
+    gains = {"k": (0.5, 1.0), "barriers": (MAPPING, ij.barriers.Quadratic())}
+    start = {
+        "initial.q": ij.offset(ij.uniform(-1.0, 1.0)),
+        "initial.dq": ij.offset(ij.uniform(-2.0, 2.0)),
+    }
+    exact = ij.controllers.BarrierBackstepping(**gains)
+    found = counterexample(double_integrator(exact), start, starts=2)
+    assert found.growth == pytest.approx(-1.0, abs=1e-9)
+    found = counterexample(double_integrator(WithoutExchange(**gains)), start, starts=2)
+    assert found.growth > 0
+    broken = certify(found.scenario, duration=0.01)
+    assert broken["inequality, levels"].verdict == "fails"
+    with pytest.raises(ValueError, match="TwoLevels has no claim"):
+        counterexample(double_integrator(TwoLevels()), start)
+
+
+def test_the_figure_has_a_panel_for_every_level(undisturbed):
+    figure = undisturbed.plot(until=1.5)
+    labels = [axes.get_ylabel() for axes in figure.axes]
+    assert sum(r"$\xi_" in label for label in labels) == 3
+    assert any("Lyapunov" in label for label in labels)
+    shown = [text.get_text() for axes in figure.axes for text in axes.texts]
+    assert "equality" in shown

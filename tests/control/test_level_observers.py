@@ -1,0 +1,266 @@
+"""Observers of plants in strict-feedback form: the error equations that they obey, their sampled
+forms, and the levels that they estimate."""
+
+from __future__ import annotations
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import iblf_jax as ij
+from iblf_jax.control.observers.state_observer import StateObserverValues, fading_memory_gains
+from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
+from iblf_jax.world import plants
+
+ROBOT = ij.presets.customary_two_link()
+PAPER = ij.presets.zhang_yan_2024()
+PLANTS = {
+    2: plants.Rigid(ROBOT),
+    3: plants.ElectricDrive(
+        ROBOT, torque_constant=[2.0, 1.5], inductance=0.02, resistance=1.0, back_emf=0.5
+    ),
+    4: plants.FlexibleJoint(ROBOT, stiffness=300.0, motor_inertia=0.02, motor_damping=0.1),
+}
+KAPPA = {2: (0.0, 20.0), 3: (0.0, [20.0, 10.0], 40.0), 4: (3.0, 20.0, 0.0, 60.0)}
+DISTURBANCE = ij.disturbances.Sinusoids(amplitude=[1.0, 0.5], frequency=3.0, offset=0.2)
+
+
+def scenario(order, observer, **parts):
+    """The paper's reference and bounds on another plant."""
+    gains = {"k": (3.0, 20.0, 60.0, 80.0)[:order]}
+    values = {"plant": PLANTS[order], "disturbance": DISTURBANCE} | parts
+    return ij.Scenario(
+        reference=PAPER.reference,
+        bounds=PAPER.bounds,
+        controller=ij.controllers.BarrierBackstepping(**gains),
+        initial=PAPER.initial,
+        observer=observer,
+        **values,
+    )
+
+
+@jax.jit
+def estimate_and_rate(scenario, t, state):
+    """The observer's estimate, its rate along the closed loop, and the true disturbance d."""
+    rate, sample = evaluate(scenario, t, state)
+    model = scenario.model
+
+    def estimate(x, memory):
+        if isinstance(scenario.observer, ij.observers.LevelObserver):
+            return scenario.observer.estimate(t, x, model, memory)
+        return scenario.observer.estimate(t, x[0], x[1], model.robot, memory)
+
+    found, dot = jax.jvp(estimate, (state.x, state.observer), (rate.x, rate.observer))
+    return found, dot, sample.disturbance
+
+
+def random_state(scenario, rng):
+    """A state of the loop with a random x near the start."""
+    state = initial_state(scenario)
+    x = state.x + jnp.asarray(rng.normal(size=state.x.shape)) * 0.05
+    memory = jax.tree.map(lambda z: z + jnp.asarray(rng.normal(size=z.shape)), state.observer)
+    higher = x[2:] if len(x) > 2 else ()
+    return LoopState(x[0], x[1], state.controller, memory, higher=higher)
+
+
+@pytest.mark.parametrize("order", [2, 3, 4])
+def test_each_level_of_a_level_observer_obeys_its_equation(order, rng):
+    """d_hat_j' = kappa_j d_tilde_j, with the true d along the run: then d_tilde_j' = d_j' - kappa_j
+    d_tilde_j."""
+    loop = scenario(order, ij.observers.LevelObserver(gain=KAPPA[order]))
+    kappa = np.asarray(loop.observer.gain)
+    for _ in range(3):
+        d_hat, dot, d = estimate_and_rate(loop, jnp.asarray(0.4), random_state(loop, rng))
+        np.testing.assert_allclose(dot, kappa * (d - d_hat), rtol=1e-9, atol=1e-8)
+        assert np.max(np.abs(d[1])) > 1e-2
+
+
+@pytest.mark.parametrize("order", [3, 4])
+@pytest.mark.parametrize(
+    "observer",
+    [
+        ij.observers.Momentum(kf=[20.0, 12.0]),
+        ij.observers.Printed(kf=[20.0, 12.0]),
+        ij.observers.ExtendedState(bandwidth=[40.0, 30.0]),
+    ],
+    ids=lambda observer: type(observer).__name__,
+)
+def test_an_observer_of_robots_serves_level_2(order, observer, rng):
+    """With f = M d_2: f_hat' = kf f_tilde (momentum), less kf M' q' as printed, and with
+    p_tilde = M q' - p_hat: p_tilde' = f_tilde - l1 p_tilde, f_hat' = l2 p_tilde."""
+    loop = scenario(order, observer)
+    robot = loop.model.robot
+    for _ in range(3):
+        state = random_state(loop, rng)
+        f_hat, dot, d = estimate_and_rate(loop, jnp.asarray(0.4), state)
+        f = robot.mass_matrix(state.q) @ d[1]
+        rest = ij.robots.mass_matrix_rate(robot, state.q, state.dq) @ state.dq
+        assert np.max(np.abs(f)) > 1e-2
+        if isinstance(observer, ij.observers.ExtendedState):
+            rate, _ = jax.jit(evaluate)(loop, jnp.asarray(0.4), state)
+            momentum = robot.mass_matrix(state.q) @ state.dq
+            p_tilde = momentum - state.observer.p_hat
+            p_dot = rest + robot.mass_matrix(state.q) @ rate.dq - rate.observer.p_hat
+            np.testing.assert_allclose(dot, loop.observer.bandwidth**2 * p_tilde, atol=1e-9)
+            expected = f - f_hat - 2.0 * loop.observer.bandwidth * p_tilde
+            np.testing.assert_allclose(p_dot, expected, rtol=1e-8, atol=1e-8)
+            continue
+        expected = loop.observer.kf * (f - f_hat)
+        if isinstance(observer, ij.observers.Printed):
+            expected = expected + loop.observer.kf * rest
+        np.testing.assert_allclose(dot, expected, rtol=1e-8, atol=1e-8)
+
+
+def test_a_level_observer_finds_a_constant_disturbance_of_each_level():
+    """d' = 0: d_tilde decays as exp(-kappa t), without any law."""
+    plant = PLANTS[3]
+    observer = ij.observers.LevelObserver(gain=(5.0, 20.0, 40.0))
+    d = np.array([[0.1, -0.2], [3.0, -1.0], [10.0, 5.0]])
+    kappa = np.array([[5.0], [20.0], [40.0]])
+    shape = (2, 3, 2)
+
+    @jax.jit
+    def rate(t, z):
+        x, eta = z.reshape(shape)
+        u = jnp.stack([3.0 * jnp.sin(5.0 * t), jnp.cos(3.0 * t)])
+        moved = plants.flow(plant, t, x, u) + d
+        observed = observer.derivative(t, x, u, plant, eta)
+        return jnp.stack([moved, observed]).reshape(-1)
+
+    x = jnp.array([[0.3, 0.2], [0.1, -0.1], [1.0, 0.5]])
+    observer = ij.observers.LevelObserver(gain=observer.gain[:, None] * jnp.ones(2))
+    start = jnp.stack([x, observer.init(x, plant)]).reshape(-1)
+    found = solve_ivp(rate, (0.0, 0.2), start, rtol=1e-10, atol=1e-12)
+    end = jnp.asarray(found.y[:, -1]).reshape(shape)
+    d_hat = observer.estimate(0.2, end[0], plant, end[1])
+    np.testing.assert_allclose(d - d_hat, d * np.exp(-kappa * 0.2), atol=1e-7)
+
+
+def test_the_start_of_a_level_observer():
+    x, plant = jnp.ones((3, 2)), PLANTS[3]
+    for start, expected in (("matched", 0.3), ("zero", np.array([[0.3], [2.3], [4.3]]))):
+        observer = ij.observers.LevelObserver(
+            gain=[[0.0, 0.0], [2.0, 2.0], [4.0, 4.0]], eta0=0.3, start=start
+        )
+        d_hat = observer.estimate(0.0, x, plant, observer.init(x, plant))
+        np.testing.assert_allclose(d_hat, np.broadcast_to(expected, (3, 2)))
+
+
+def test_a_period_of_a_level_observer_is_exact():
+    """`advance` against the rate integrated with the same measurement and input; a level with the
+    gain 0 included."""
+    plant, t, period = PLANTS[3], jnp.asarray(0.0), jnp.asarray(0.05)
+    gain = jnp.array([[0.0, 0.0], [20.0, 30.0], [50.0, 1e-9]])
+    observer = ij.observers.LevelObserver(gain=gain)
+    x = jnp.array([[0.3, 0.2], [0.1, -0.1], [1.0, 0.5]])
+    u, eta = jnp.array([2.0, -1.0]), jnp.array([[0.0, 0.0], [1.0, 2.0], [3.0, 4.0]])
+
+    @jax.jit
+    def rate(t, z):
+        return observer.derivative(t, x, u, plant, z.reshape(3, 2)).reshape(-1)
+
+    found = solve_ivp(rate, (0.0, 0.05), eta.reshape(-1), rtol=1e-11, atol=1e-12)
+    after = observer.advance(t, x, u, plant, eta, period)
+    np.testing.assert_allclose(after, found.y[:, -1].reshape(3, 2), atol=1e-8)
+    euler = observer.at_period(period)
+    shift = (euler.gain - gain) * x  # the same d_hat belongs to another eta
+    step = eta - shift + period * euler.derivative(t, x, u, plant, eta - shift)
+    np.testing.assert_allclose(step + shift, after, atol=1e-8)
+
+
+def test_a_law_of_robots_receives_the_torque():
+    """M0 d_hat_2 of a LevelObserver is the f_hat of a Momentum observer in the continuous loop,
+    where M is constant only; here the loops agree in their estimates of a slow disturbance."""
+    slow = ij.disturbances.Step(size=[0.5, -0.3], time=0.0)
+    estimates = []
+    for observer in (
+        ij.observers.LevelObserver(gain=(0.0, 30.0)),
+        ij.observers.Momentum(kf=30.0, start="matched"),
+    ):
+        run = ij.simulate(
+            ij.with_parts(PAPER, observer=observer, disturbance=slow), duration=0.5, dt=1e-3
+        )
+        assert run.disturbance_estimate.shape == run.q.shape
+        estimates.append(run.disturbance_estimate[-1])
+    np.testing.assert_allclose(estimates[0], [0.5, -0.3], atol=1e-3)
+    np.testing.assert_allclose(estimates[1], [0.5, -0.3], atol=1e-3)
+
+
+# --- StateObserver --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 5])
+def test_the_gains_of_a_period_place_all_poles(count):
+    """The characteristic polynomial of F - F L C is (z - a)^count; for two derivatives the gains
+    are those of the filter `sensors.Tracking`."""
+    a, period = 0.8, 1e-3
+    L = np.array(fading_memory_gains(jnp.asarray(a), count, jnp.asarray(period)))
+    F = np.array(
+        [
+            [period ** (j - i) / math.factorial(j - i) if j >= i else 0.0 for j in range(count)]
+            for i in range(count)
+        ]
+    )
+    error = F - np.outer(F @ L, np.eye(count)[0])
+    expected = np.poly(np.full(count, a))
+    np.testing.assert_allclose(np.poly(error), expected, atol=1e-9 * np.max(np.abs(expected)))
+    if count == 2:
+        np.testing.assert_allclose(L, [1 - a**2, (1 - a) ** 2 / period], rtol=1e-12)
+
+
+def test_a_state_observer_of_a_short_period_is_the_continuous_one():
+    bandwidth, period = 100.0, 1e-6
+    found = fading_memory_gains(jnp.exp(-bandwidth * period), 3, jnp.asarray(period))
+    rates = np.array(found) / period
+    np.testing.assert_allclose(rates, [3e2, 3e4, 1e6], rtol=1e-3)
+
+
+@pytest.mark.parametrize("measured", [(1,), (1, 3), (1, 2, 3, 4)])
+def test_a_state_observer_converges_to_the_levels_and_the_disturbance(measured):
+    """A flexible joint under an input that no law computes, with a constant disturbance of the last
+    level of each segment."""
+    plant = PLANTS[4]
+    ends = [*(level - 2 for level in measured[1:]), 3]
+    d = np.zeros((4, 2))
+    d[ends] = [2.0, -1.0]
+    observer = ij.observers.StateObserver(bandwidth=jnp.full(2, 400.0), measured=measured)
+
+    @jax.jit
+    def rate(t, z):
+        x, x_hat, d_hat = z.reshape(3, 4, 2)
+        u = jnp.stack([0.5 * jnp.sin(5.0 * t), 0.2 * jnp.cos(3.0 * t)])
+        state = StateObserverValues(x_hat, d_hat)
+        moved = observer.derivative(t, x, u, plant, state)
+        return jnp.stack([plants.flow(plant, t, x, u) + d, *moved]).reshape(-1)
+
+    x = jnp.array([[0.3, 0.2], [0.1, -0.1], [0.31, 0.21], [0.1, -0.1]])
+    start = jnp.stack([x, x.at[1].add(0.1).at[3].add(-0.1), jnp.zeros_like(x)]).reshape(-1)
+    found = solve_ivp(rate, (0.0, 0.3), start, rtol=1e-9, atol=1e-10, method="LSODA")
+    x, x_hat, d_hat = found.y[:, -1].reshape(3, 4, 2)
+    np.testing.assert_allclose(x_hat[:2], x[:2], atol=1e-5)
+    np.testing.assert_allclose(x_hat[2:], x[2:], atol=1e-4)
+    np.testing.assert_allclose(d_hat, d, atol=1e-3)
+
+
+def test_fields_that_do_not_fit_are_refused():
+    observers = ij.observers
+    for make, text in (
+        (lambda: observers.LevelObserver(gain=-1.0), "gain"),
+        (lambda: observers.LevelObserver(gain=1.0, start="off"), "start"),
+        (lambda: observers.StateObserver(bandwidth=9.0, measured=(2, 3)), "measured"),
+        (lambda: observers.StateObserver(bandwidth=9.0, measured=(1, 1)), "measured"),
+        (lambda: observers.StateObserver(bandwidth=9.0, measured=()), "measured"),
+        (lambda: observers.StateObserver(bandwidth=9.0, disturbance=1), "disturbance"),
+        (lambda: scenario(3, observers.LevelObserver(gain=(1.0, 2.0))), "observer.gain.*3 rows"),
+        (lambda: scenario(3, observers.StateObserver(bandwidth=9.0, measured=(1, 4))), "1 to 3"),
+        (
+            lambda: scenario(3, observers.StateObserver(bandwidth=9.0, offset=(1.0, 2.0))),
+            "observer.offset",
+        ),
+    ):
+        with pytest.raises(ValueError, match=text):
+            make()

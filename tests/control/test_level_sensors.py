@@ -1,0 +1,92 @@
+"""Sensors of the levels of a plant: each part measures its own levels with its own noise."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from iblf_jax.sensors import (
+    Direct,
+    Encoder,
+    FilteredDifference,
+    Ideal,
+    Levels,
+    Measured,
+    Unmeasured,
+)
+
+import iblf_jax as ij
+
+PERIOD = jnp.asarray(1e-3)
+ENCODER = Encoder(
+    counts=4096, noise=1e-3, offset=0.1, velocity=Measured(noise=jnp.array([0.01, 0.02]))
+)
+FILTERED = Encoder(noise=1e-3, velocity=FilteredDifference(cutoff=700.0))
+
+
+def test_the_parts_measure_their_levels_with_their_normal_numbers(rng):
+    """Two encoders and a current sensor, against the parts called one by one."""
+    current = Direct(noise=0.5, resolution=0.25, offset=0.1)
+    sensor = Levels((ENCODER, FILTERED, current))
+    x, normal = jnp.asarray(rng.normal(size=(5, 2))), jnp.asarray(rng.normal(size=(4, 2)))
+    assert (sensor.draws, sensor.order, sensor.measured) == (4, 5, (1, 2, 3, 4, 5))
+    measured, after = sensor.measure(x, normal, PERIOD, sensor.init(x, PERIOD))
+    first, _ = ENCODER.measure(x[0], x[1], normal[:2], PERIOD, ())
+    before = FILTERED.init(x[2], x[3], PERIOD)
+    second, values = FILTERED.measure(x[2], x[3], normal[2:3], PERIOD, before)
+    third = 0.25 * np.round((x[4] + 0.1 + 0.5 * normal[3]) / 0.25)
+    np.testing.assert_array_equal(measured.q, first.q)
+    np.testing.assert_array_equal(measured.dq, first.dq)
+    np.testing.assert_allclose(measured.higher, [second.q, second.dq, third], rtol=1e-15)
+    jax.tree.map(np.testing.assert_array_equal, after, ((), values, ()))
+
+
+def test_what_is_not_rounded_and_what_a_step_is():
+    sensor = Levels((ENCODER, None, Direct(resolution=0.25)))
+    step = 2.0 * np.pi / 4096
+    np.testing.assert_allclose(sensor.resolution, [[step], [0.0], [0.0], [0.25]])
+    smooth = sensor.unrounded
+    np.testing.assert_array_equal(smooth.resolution, np.zeros((4, 1)))
+    x = jnp.full((4, 2), 0.3)
+    found = smooth.measure(x, jnp.zeros((2, 2)), PERIOD, smooth.init(x, PERIOD))[0]
+    np.testing.assert_allclose(found.q, 0.4)
+    np.testing.assert_allclose(found.higher, [[0.0, 0.0], [0.3, 0.3]])
+
+
+def test_the_derivative_of_a_rounded_reading_is_1():
+    slope = jax.grad(lambda x: Direct(resolution=0.25).measure_level(x, None, PERIOD, ())[0].sum())
+    np.testing.assert_array_equal(slope(jnp.array([0.3, -0.1])), [1.0, 1.0])
+
+
+def test_levels_that_are_not_measured():
+    sensor = Levels((Ideal(), None, Unmeasured(), Direct()))
+    assert sensor.measured == (1, 2, 5)
+    assert isinstance(sensor.parts[1], Unmeasured)
+
+
+def test_the_advice_names_the_part():
+    fast = Encoder(velocity=FilteredDifference(cutoff=1e5))
+    (text,) = Levels((Direct(), fast)).advice(PERIOD)
+    assert text.startswith("sensor.parts[1].velocity.cutoff = 100000 rad/s")
+
+
+@pytest.mark.parametrize("parts", [(), ENCODER, (3.0,), (Levels((ENCODER,)),), (Measured(),)])
+def test_what_is_no_sensor_is_refused(parts):
+    with pytest.raises(ValueError, match=r"Levels\.parts"):
+        Levels(parts)
+
+
+def test_a_scenario_file_keeps_the_parts(tmp_path):
+    base = ij.presets.zhang_yan_2024()
+    sensor = Levels((ENCODER, Direct(noise=0.1)))
+    names = [type(part).__name__ for part in sensor.parts]
+    scenario = ij.with_parts(
+        base, sampling=ij.Sampling(period=1e-3), sensor=Levels((Direct(noise=[0.1, 0.2]), Direct()))
+    )
+    path = tmp_path / "scenario.toml"
+    ij.save_scenario(scenario, path)
+    loaded = ij.load_scenario(path).sensor
+    assert [type(part) for part in loaded.parts] == [Direct, Direct]
+    np.testing.assert_array_equal(loaded.parts[0].noise, [0.1, 0.2])
+    assert names == ["Encoder", "Direct"]

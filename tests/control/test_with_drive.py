@@ -1,0 +1,147 @@
+"""The input map of a law of robots on electric drives, and models of flexible joints."""
+
+from __future__ import annotations
+
+import warnings
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from iblf_jax.controllers import BarrierBackstepping, PDGravity, Saturated, WithDrive
+
+import iblf_jax as ij
+from iblf_jax.simulation.scenario import canonical
+
+PAPER = ij.presets.zhang_yan_2024()
+ROBOT = PAPER.plant
+DRIVE = ij.plants.ElectricDrive(
+    ROBOT, torque_constant=[2.0, 1.5], inductance=0.02, resistance=[1.0, 0.5], back_emf=0.5
+)
+FLEXIBLE = ij.plants.FlexibleJoint(
+    ROBOT, stiffness=3000.0, motor_inertia=[0.1, 0.02], motor_damping=[0.3, 0.2]
+)
+PD = PDGravity(Kp=60.0, Kd=20.0)
+
+
+def on(plant, law, **parts):
+    return ij.with_parts(
+        PAPER, plant=plant, controller=law, observer=ij.observers.NoObserver(), **parts
+    )
+
+
+def test_the_voltage_is_that_of_the_steady_current():
+    """u = R tau/Kt + Kb q'; tau is still the torque."""
+    law = WithDrive(PD, drive=DRIVE)
+    q, dq = jnp.array([0.7, 0.6]), jnp.array([0.2, -0.4])
+    arguments = (jnp.asarray(0.1), q, dq, jnp.zeros(2), PAPER.context, ())
+    torque = PD.command(*arguments)[0].tau
+    command, _ = law.command(*arguments)
+    np.testing.assert_array_equal(command.tau, torque)
+    expected = np.array([1.0, 0.5]) * torque / np.array([2.0, 1.5]) + 0.5 * dq
+    np.testing.assert_allclose(command.input, expected, rtol=1e-15)
+
+
+def test_the_voltage_of_a_law_that_receives_x():
+    rigid = BarrierBackstepping(k=(2.0, 10.0), weights=np.ones((2, 2)))
+    x = jnp.array([[0.7, 0.6], [0.2, -0.4]])
+    arguments = (jnp.asarray(0.1), x, jnp.zeros((2, 2)), PAPER.context, ())
+    torque = rigid.command(*arguments)[0].tau
+    voltage = WithDrive(rigid, drive=DRIVE).command(*arguments)[0].input
+    np.testing.assert_allclose(voltage, DRIVE.voltage(torque / DRIVE.torque_constant, x[1]))
+
+
+def test_paths_reach_the_law_and_the_drive():
+    scenario = on(DRIVE, WithDrive(PD, drive=DRIVE))
+    changed = ij.with_parameters(
+        scenario, {"controller.Kp": 30.0, "controller.drive.resistance": 2.0}
+    )
+    np.testing.assert_array_equal(changed.controller.law.Kp, [30.0, 30.0])
+    np.testing.assert_array_equal(changed.controller.drive.resistance, [2.0, 2.0])
+
+
+def test_an_observer_receives_the_torque():
+    """Momentum under WithDrive estimates the torque that the current lacks, Kt i - tau, besides the
+    disturbance; a run shows that it is finite and that tau is recorded as the voltage."""
+    parts = {"observer": ij.observers.Momentum(kf=20.0), "plant": DRIVE, "model": ROBOT}
+    scenario = ij.with_parts(PAPER, controller=WithDrive(PD, drive=DRIVE), **parts)
+    run = ij.simulate(scenario, duration=0.5, dt=1e-3)
+    assert np.all(np.isfinite(run.x)) and run.x.shape[1:] == (3, 2)
+    final = run.tau[-1]
+    current = run.x[-1, 2]
+    np.testing.assert_allclose(DRIVE.voltage(current, run.dq[-1]), final, atol=0.2)
+
+
+@pytest.mark.parametrize(
+    ("plant", "law", "text"),
+    [
+        (DRIVE, PD, r"PDGravity, which commands \[N m\].*\[V\].*WithDrive\(law, drive=plant\)"),
+        (ROBOT, WithDrive(PD, drive=DRIVE), r"WithDrive, which commands \[V\]"),
+        (DRIVE, Saturated(WithDrive(PD, drive=DRIVE), limit=9.0), "outermost"),
+    ],
+)
+def test_a_law_that_commands_another_quantity_is_refused(plant, law, text):
+    with pytest.raises(ValueError, match=text):
+        on(plant, law, model=ROBOT)
+
+
+@pytest.mark.parametrize("arguments", [(PD, ROBOT), (DRIVE, DRIVE)])
+def test_what_is_no_law_or_no_drive_is_refused(arguments):
+    with pytest.raises(ValueError, match=r"WithDrive\.(law|drive)"):
+        WithDrive(*arguments)
+
+
+# --- robots as models of flexible joints ----------------------------------------------------------
+
+
+def test_a_rigid_model_has_the_motors_or_the_links_alone():
+    q, v = jnp.array([0.4, -0.3]), jnp.array([0.5, 0.2])
+    rigid, links = FLEXIBLE.rigid(), FLEXIBLE.rigid(motors=False)
+    assert links is ROBOT
+    np.testing.assert_allclose(
+        rigid.mass_matrix(q), ROBOT.mass_matrix(q) + np.diag([0.1, 0.02]), rtol=1e-15
+    )
+    np.testing.assert_array_equal(rigid.coriolis(q, v, v), ROBOT.coriolis(q, v, v))
+    np.testing.assert_allclose(ij.robots.friction_torque(rigid, v), [-0.15, -0.04], rtol=1e-15)
+
+
+def test_a_robot_with_motors_keeps_the_members_of_its_robot():
+    arm = ij.presets.iiwa14().plant
+    motors = ij.robots.WithMotors(arm, inertia=0.1)
+    assert ij.robots.joint_names(motors, 7) == ij.robots.joint_names(arm, 7)
+    np.testing.assert_array_equal(motors.effort, arm.effort)
+    np.testing.assert_array_equal(motors.limits.upper, arm.limits.upper)
+
+
+def test_a_robot_with_the_inertia_of_the_motors_in_another_form_is_accepted():
+    """Such as the armature of an Arm, which is one robot less its motors here."""
+    links = ij.robots.PlanarChain(mass=[1.3], length=[0.4], centre=[0.2], inertia=[0.02])
+    whole = ij.robots.PlanarChain(mass=[1.3], length=[0.4], centre=[0.2], inertia=[0.05])
+    plant = ij.plants.FlexibleJoint(links, stiffness=3000.0, motor_inertia=0.03)
+    scenario = on(
+        plant,
+        PD,
+        model=whole,
+        reference=ij.references.Sinusoid(offset=0.5, amplitude=0.1, frequency=1.0),
+        initial=ij.Initial(q=0.6),
+        bounds=ij.Bounds(lower=ij.bounds.Constant(0.1), upper=ij.bounds.Constant(0.9)),
+        disturbance=ij.disturbances.Nothing(),
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        canonical(scenario)
+
+
+def test_a_model_without_the_motors_says_so():
+    with pytest.warns(UserWarning, match=r"contains 0% of that of the motors.*plant\.rigid\(\)"):
+        canonical(on(FLEXIBLE, PD, model=ROBOT))
+
+
+@pytest.mark.parametrize("payload", [0.0, 0.2])
+def test_a_model_with_the_motors_is_accepted(payload):
+    """Also where the links of plant and model differ."""
+    plant = ij.with_parameters(
+        on(FLEXIBLE, PD, model=FLEXIBLE.rigid()), {"plant.robot.payload": payload}
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        canonical(plant)

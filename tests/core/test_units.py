@@ -1,0 +1,90 @@
+"""Units that follow the plant: their algebra, and the texts that robots keep."""
+
+import dataclasses
+import pickle
+
+import pytest
+
+import iblf_jax as ij
+from iblf_jax.core.units import (
+    INPUT,
+    ROBOT,
+    ByLevel,
+    PlantUnit,
+    as_text,
+    exponents,
+    of_entry,
+    per_second,
+    power,
+    product,
+    resolved,
+    written,
+)
+from iblf_jax.simulation import metrics
+from iblf_jax.simulation.error_estimate import ACCURACY_UNITS
+from iblf_jax.simulation.signals import SIGNALS
+from iblf_jax.tuning.quantities import TUNED_SIGNALS, TimeIntegral
+
+VESSEL = {"x1": ("m", "m", "rad"), "u": ("N", "N", "N m")}
+OF_SEVERAL_LEVELS = ("higher", "levels", "rates")
+
+
+def _declared() -> list[tuple[str, PlantUnit]]:
+    """Where a `PlantUnit` is declared in this package, and the unit."""
+    found = [(name, signal.unit) for name, signal in SIGNALS.items()]
+    found += [pair for fold in metrics.MEMBERS.values() for pair in fold.units.items()]
+    found += [*ACCURACY_UNITS, *TUNED_SIGNALS.items(), *TimeIntegral.units.items()]
+    families = (ij.references, ij.bounds, ij.disturbances, ij.sensors, ij.actuators, ij.controllers)
+    classes = [kind for family in families for kind in vars(family).values()]
+    classes += [ij.Initial, metrics.Settling]
+    for kind in classes:
+        if isinstance(kind, type) and dataclasses.is_dataclass(kind):
+            fields = dataclasses.fields(kind)
+            found += [(f"{kind.__name__}.{f.name}", f.metadata.get("unit", "")) for f in fields]
+    return [(name, unit) for name, unit in found if isinstance(unit, PlantUnit)]
+
+
+def test_every_formula_gives_the_unit_of_a_robot():
+    declared = _declared()
+    assert len(declared) > 50
+    for name, unit in declared:
+        if unit.formula not in OF_SEVERAL_LEVELS:
+            assert as_text(resolved(unit, ROBOT)) == str(unit), name
+
+
+@pytest.mark.parametrize("unit", ["1", "rad", "N m s/rad", "N^2 m^2 s", "rad/(N m s)", "1/s"])
+def test_a_unit_is_read_and_written(unit):
+    assert written(exponents(unit)) == unit
+
+
+def test_products_powers_and_rates():
+    assert product("N m s", "1/s") == "N m"
+    assert power("rad/s", 2) == "rad^2/s^2"
+    assert per_second(("m", "rad")) == ("m/s", "rad/s")
+    by_level = ByLevel(("m", ("m/s", "rad/s")))
+    assert product(by_level, ("s", "A")) == ByLevel((("m s", "m A"), ("m", "rad A/s")))
+    assert per_second("m^0.5") == "m^0.5/s"  # not an integer power: it counts as a name
+
+
+def test_components_and_levels_are_resolved_and_shown():
+    ise = resolved(PlantUnit("rad^2 s", "x1^2 s"), VESSEL)
+    assert ise == ("m^2 s", "m^2 s", "rad^2 s")
+    assert as_text(ise) == "m^2 s, m^2 s, rad^2 s"
+    assert as_text(resolved(INPUT, VESSEL)) == "N, N, N m"
+    assert as_text(ByLevel((("m", "rad"), "A"))) == "m, rad; A"
+    assert as_text(("A", "A")) == "A"
+    assert resolved("rad", VESSEL) == "rad"  # a plain text is a unit of its own
+
+
+def test_the_unit_of_an_entry():
+    weights = ByLevel((("m", "rad"), ("m/s", "rad/s")))
+    assert of_entry(weights, (1,), 2) == ("m/s", "rad/s")
+    assert of_entry(weights, (1, 1), 2) == "rad/s"
+    assert of_entry(("m", "rad"), (1,), 1) == "rad"
+    assert of_entry(("m", "rad"), (3,), 2) == ("m", "rad")  # a row of waypoints
+
+
+def test_a_plant_unit_survives_pickling():
+    unit = pickle.loads(pickle.dumps(INPUT))
+    assert unit == INPUT
+    assert unit.formula == "u"

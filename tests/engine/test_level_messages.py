@@ -1,0 +1,131 @@
+"""Messages about the levels of a plant in strict-feedback form: which one, when, and what to do."""
+
+import jax.numpy as jnp
+import pytest
+from plant_cases import body, pendulum, symmetric
+
+import iblf_jax as ij
+from iblf_jax.core.status import Status
+from iblf_jax.engine.diagnosis import SimulationWarning
+
+Mapping, Quadratic = ij.barriers.Mapping, ij.barriers.Quadratic
+
+
+def law(*barriers):
+    return ij.controllers.BarrierBackstepping(k=(3.0, 10.0, 30.0), barriers=barriers)
+
+
+def message_of(scenario, duration=0.5, dt=1e-3) -> str:
+    """The warning about a run, after those about the scenario."""
+    with pytest.warns(SimulationWarning) as found:
+        ij.simulate(scenario, duration=duration, dt=dt)
+    (text,) = [str(w.message) for w in found if w.category is SimulationWarning]
+    return text
+
+
+def test_a_violated_level_is_named_with_time_margin_unit_and_remedy():
+    plain = law(Mapping(), Quadratic(), Quadratic())
+    text = message_of(pendulum(controller=plain, state_bounds=(None, symmetric(2.0))))
+    assert "Level 3 (current) of pendulum left its bounds first, at t = 0.0" in text
+    assert " A. The law has barriers.Quadratic() on that level" in text
+    assert "give it barriers.Mapping() there" in text
+
+
+def test_a_violated_second_level_has_the_unit_of_the_level():
+    plain = law(Mapping(), Quadratic(), Quadratic())
+    text = message_of(pendulum(controller=plain, state_bounds=(symmetric(0.1),)))
+    assert "a bound of the second level was violated" in text
+    assert "Level 2 (speed) of pendulum left its bounds first" in text
+    assert "rad/s. The law has barriers.Quadratic()" in text
+    assert "velocity bounds" not in text
+
+
+def test_a_virtual_control_outside_its_level_is_reported_like_assumption_2():
+    plain = law(Mapping(), Quadratic(), Quadratic())
+    scenario = pendulum(controller=plain, state_bounds=(symmetric(3.0), symmetric(2.0)))
+    run = None
+    with pytest.warns(SimulationWarning, match="Assumption 2") as found:
+        run = ij.simulate(scenario, duration=0.5, dt=1e-3)
+    text = str(found[0].message)
+    worst = -float(run.metrics.level_alpha_margin[0, 0])
+    alpha = run.higher[:, 0, 0] - run.e_higher[:, 0, 0]
+    first = float(run.t[jnp.argmax(jnp.abs(alpha) >= 2.0)])
+    assert f"left the bounds by up to {worst:.3g} A, first at t = {first:.4g} s" in text
+    assert "Alpha_2, the virtual control for level 3" in text
+    assert "Alpha_1" not in text  # it stays inside the bounds of level 2
+    assert "widen state_bounds or lower controller.k" in text
+
+
+def test_a_law_of_robots_is_told_who_keeps_the_bounds_of_levels():
+    rigid = ij.presets.zhang_yan_2024()
+    plant = ij.plants.FlexibleJoint(rigid.plant, stiffness=3e3, motor_inertia=0.02)
+    scenario = ij.Scenario(
+        plant=plant,
+        model=rigid.plant,
+        reference=rigid.reference,
+        bounds=rigid.bounds,
+        controller=rigid.controller,
+        initial=rigid.initial,
+        state_bounds=(None, None, symmetric(0.5)),
+    )
+    text = message_of(scenario, duration=0.05, dt=2e-4)
+    assert "Level 4 (motor velocity) of joint" in text
+    assert "controllers.BarrierBackstepping keeps them" in text
+
+
+def test_a_gain_that_becomes_singular_is_named():
+    def gain(t, x):
+        one = jnp.ones_like(x[0])
+        return jnp.stack([one, jnp.where(x[0] > 0.45, 0.0, 1.0), one])
+
+    plant = ij.plants.StrictFeedback(
+        drift=lambda t, x: jnp.zeros_like(x), gain=gain, n=1, order=3, level_names=("a", "b", "c")
+    )
+    scenario = pendulum(
+        plant=plant,
+        state_bounds=(),
+        controller=law(Mapping(), Quadratic(), Quadratic()),
+        disturbance=ij.disturbances.Nothing(),
+    )
+    with pytest.warns(SimulationWarning) as found:
+        run = ij.simulate(scenario, duration=1.5, dt=1e-3)
+    assert int(run.status) & Status.SINGULAR_GAIN
+    text = str(found[0].message)
+    assert "the law's input was not finite" in text
+    assert "the gain of level 2 (b) is singular" in text
+    assert "bound the levels so that they stay away" in text
+
+
+def test_an_inaccurate_run_names_the_unit_of_the_worst_component():
+    text = message_of(body(), duration=10.0, dt=0.5)
+    assert "the components of the first level are inaccurate" in text
+    assert " m, " in text
+    assert " rad, " not in text
+
+
+def test_errors_before_a_run_name_components():
+    far = ij.references.Sinusoid(offset=0.0, amplitude=[4.0, 2.0, 3.0], frequency=1.0)
+    with pytest.raises(ValueError, match="reference of heading"):
+        ij.simulate(body(reference=far), duration=10.0, dt=1e-2)
+    outside = ij.references.Sinusoid(offset=[9.0, 0.0, 0.0], amplitude=0.0)
+    with pytest.raises(ValueError, match="reference of component 0"):
+        ij.simulate(body(reference=outside), duration=1.0, dt=1e-2)
+    with pytest.raises(ValueError, match=r"speeds below 1e\+12 m/s, m/s, rad/s"):
+        ij.simulate(body(initial=ij.Initial(q=[0.5, 1.0, 0.2], dq=1e13)), duration=1.0, dt=1e-2)
+
+
+def test_a_run_that_starts_outside_a_level_is_named_in_a_study():
+    draws = {"initial.x[2]": ij.offset(ij.uniform(24.0, 25.0))}
+    study = ij.monte_carlo(pendulum(), draws, runs=2, duration=0.01, dt=1e-4)
+    assert study.started_outside.all()
+    with pytest.warns(SimulationWarning, match=r"current of pendulum was drawn 4\.\d* A beyond"):
+        study.replay(0)
+
+
+def test_a_robot_keeps_its_words():
+    bounds = symmetric(0.1)
+    robot = ij.with_parts(ij.presets.zhang_yan_2024(), velocity_bounds=bounds)
+    text = message_of(robot, duration=0.5)
+    assert "a velocity bound was violated. Joint 1 left its velocity bounds first" in text
+    assert "2 joints" in repr(ij.simulate(ij.presets.zhang_yan_2024(), duration=0.02, dt=1e-3))
+    assert "1 components" in repr(ij.simulate(pendulum(), duration=0.02, dt=1e-3))

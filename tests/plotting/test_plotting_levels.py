@@ -1,0 +1,183 @@
+"""Figures and animations of plants in strict-feedback form: rows of levels, names and units."""
+
+import numpy as np
+import pytest
+from plant_cases import body, pendulum, symmetric
+
+import iblf_jax as ij
+from iblf_jax import plotting
+from iblf_jax.plotting._curves import curves_of
+from iblf_jax.presets.paper import customary_two_link
+
+
+@pytest.fixture(scope="module")
+def run():
+    return ij.simulate(pendulum(), duration=1.0, dt=1e-3)
+
+
+@pytest.fixture(scope="module")
+def body_run():
+    return ij.simulate(body(), duration=5.0, dt=1e-2)
+
+
+@pytest.fixture(scope="module")
+def flexible_run():
+    plant = ij.plants.FlexibleJoint(customary_two_link(), stiffness=300.0, motor_inertia=0.02)
+    scenario = ij.Scenario(
+        plant=plant,
+        reference=ij.references.Sinusoid(offset=0.5, amplitude=0.3),
+        bounds=ij.Bounds(lower=ij.bounds.Constant(-0.2), upper=ij.bounds.Constant(1.2)),
+        controller=ij.controllers.BarrierBackstepping(k=(3.0, 20.0, 60.0, 150.0)),
+        initial=ij.Initial(q=[0.7, 0.3]),
+    )
+    return ij.simulate(scenario, duration=0.3, dt=1e-3)
+
+
+def labels_of(figure) -> list[str]:
+    """The vertical labels of a figure."""
+    return [axes.get_ylabel() for axes in figure.axes]
+
+
+def line_of(axes, label):
+    """The line of a panel with a label."""
+    return next(line for line in axes.get_lines() if line.get_label() == label)
+
+
+def test_the_overview_has_a_row_for_every_level(run):
+    labels = labels_of(run.plot())
+    assert labels[:3] == ["angle $x_1$ [rad]", "speed $x_2$ [rad/s]", "current $x_{3}$ [A]"]
+    assert "input $u$ [V]" in labels
+    assert "error $e_2$ [rad/s]" in labels
+    # Only level 2 is disturbed.
+    assert [x for x in labels if "$d_" in x] == [r"$d_{2}$ (broad), $\hat d_{2}$ [rad/s^2]"]
+
+
+def test_a_level_is_drawn_with_its_bounds_and_virtual_control(run):
+    current = run.plot().axes[2]
+    guide = line_of(current, r"virtual control $\alpha_{i-1}$")
+    alpha = np.asarray(run.higher - run.e_higher)[:, 0, 0]
+    assert np.allclose(guide.get_ydata(), alpha[: len(guide.get_ydata())])
+    assert np.allclose(line_of(current, "bounds").get_ydata(), -20.0)
+    low, high = current.get_ylim()
+    assert low < -20.0
+    assert high > 20.0
+
+
+def test_a_level_without_bounds_shows_none_and_keeps_its_virtual_control_in_view():
+    law = ij.controllers.BarrierBackstepping(k=(3.0, 10.0, 30.0))
+    only_third = pendulum(controller=law, state_bounds=(None, symmetric(20.0)))
+    speed = ij.simulate(only_third, duration=0.5, dt=1e-3).plot().axes[1]
+    assert not [line for line in speed.get_lines() if line.get_label() == "bounds"]
+    guide = line_of(speed, r"virtual control $\alpha_{i-1}$").get_ydata()
+    low, high = speed.get_ylim()
+    assert low < np.min(guide)
+    assert high > np.max(guide)
+
+
+def test_components_of_different_units_have_labels_of_their_own(body_run):
+    labels = labels_of(body_run.plot())
+    assert labels[:3] == ["pose $x_1$ [m]", "pose $x_1$ [m]", "pose $x_1$ [rad]"]
+    assert "force $u$ [N, N, N m]" in labels
+
+
+def test_figures_have_the_names_and_units_of_the_plant(run, body_run):
+    assert labels_of(plotting.levels(run))[::2] == [
+        "angle $x_1$ [rad]",
+        "speed $x_2$ [rad/s]",
+        "current $x_{3}$ [A]",
+        "input $u$ [V]",
+    ]
+    assert "north\n$u$ [N]" in labels_of(plotting.torques(body_run))
+    assert "heading\n$x_2$ [rad/s]" in labels_of(plotting.velocities(body_run))
+    assert plotting.positions(body_run).get_suptitle() == "Pose"
+    assert plotting.velocity_portrait(body_run, "heading").axes[0].get_xlabel() == (
+        "pose of heading [rad]"
+    )
+    (axes,) = plotting.phase_portrait(body_run).axes
+    assert axes.get_xlabel() == "pose of north [m]"
+    assert labels_of(plotting.uncertain_terms(run))[0] == "pendulum\n$d_{2}$ [rad/s^2]"
+    assert labels_of(plotting.tube(body()))[2] == "heading\n$x_1$ [rad]"
+
+
+def test_levels_of_plants_of_different_orders_are_refused(run, body_run):
+    one = pendulum(plant=ij.plants.StrictFeedback(_rows, _ones, n=1, order=2), **_ORDER_2)
+    other = ij.simulate(one, duration=0.1, dt=1e-3)
+    with pytest.raises(ValueError, match="the same number of levels"):
+        plotting.levels({"third": run, "second": other})
+    with pytest.raises(ValueError, match="a component, 0 to 2"):
+        plotting.levels(body_run, 3)
+
+
+def _rows(t, x):
+    return 0.0 * x
+
+
+def _ones(t, x):
+    return 0.0 * x + 1.0
+
+
+_ORDER_2 = {
+    "controller": ij.controllers.BarrierBackstepping(k=(3.0, 10.0)),
+    "state_bounds": (),
+    "initial": ij.Initial(x=[[0.3], [0.0]]),
+    "disturbance": ij.disturbances.Nothing(),
+}
+
+
+def test_bounds_of_levels_mark_where_a_run_failed():
+    law = ij.controllers.BarrierBackstepping(k=(3.0, 10.0, 30.0))
+    scenario = pendulum(controller=law, state_bounds=(None, symmetric(2.0)))
+    with pytest.warns(UserWarning, match="Level 3"):
+        run = ij.simulate(scenario, duration=0.3, dt=1e-3)
+    (curve,) = curves_of(run)
+    first = int(np.argmax(np.abs(np.asarray(run.higher)[:, 0, 0]) >= 2.0))
+    assert curve.break_index() == first
+
+
+def test_a_plant_with_an_outline_is_animated_and_drawn_along_its_path(body_run, tmp_path):
+    path = plotting.animate(body_run, tmp_path / "body.gif", fps=2)
+    assert path.stat().st_size > 1000
+    (axes,) = plotting.workspace(body_run).axes
+    triangles = [line for line in axes.get_lines() if len(line.get_xdata()) == 4]
+    assert len(triangles) == 9
+    start = body_run.scenario.plant.outline(body_run.q[0])
+    assert np.allclose(triangles[0].get_xydata()[:3], start, atol=1e-9)
+
+
+def test_a_flexible_arm_is_animated_with_its_motors(flexible_run, tmp_path):
+    from iblf_jax.plotting._arm import Scene, motions_of
+
+    t = np.array([0.0, 0.1])
+    curves = curves_of(flexible_run)
+    scene = Scene(curves, *motions_of(curves, t))
+    scene.move_to(1)
+    motors = scene.motors[0].get_xdata()
+    assert np.allclose(motors, flexible_run.higher[100, 0], atol=1e-12)
+    assert not np.allclose(motors, flexible_run.q[100], atol=1e-3)
+    assert plotting.animate(flexible_run, tmp_path / "arm.gif", fps=5).exists()
+
+
+def test_a_plant_without_a_shape_is_refused(run, tmp_path):
+    for draw in (plotting.workspace, lambda run: plotting.animate(run, tmp_path / "film.gif")):
+        with pytest.raises(ValueError, match="expected a plant with a shape"):
+            draw(run)
+
+
+def test_reports_show_levels_with_their_units(run, tmp_path):
+    text = ij.report(run, tmp_path / "run.html").read_text()
+    assert "rad/s; rad/s^2; A/s" in text
+    assert "<th>pendulum</th>" in text
+    scenario = ij.report(pendulum(), tmp_path / "scenario.html").read_text()
+    assert "3 levels: angle [rad], speed [rad/s], current [A]; input: input [V]" in scenario
+    assert "1 components: pendulum" in scenario
+
+
+def test_a_sweep_reduces_a_metric_of_levels_to_the_worst_one():
+    points = {"controller.k[2]": [20.0, 30.0], "initial.x[2][0]": [0.0, 10.0]}
+    data = ij.sweep(pendulum(), points, duration=0.1, dt=1e-3)
+    figure = plotting.heat_map(data, "level_margin", x="controller.k[2]", y="initial.x[2][0]")
+    axes = figure.axes[0]
+    assert axes.get_ylabel() == "initial.x[2][0] [A]"
+    shown = axes.collections[0].get_array() if axes.collections else axes.images[0].get_array()
+    expected = data["level_margin"].min(("higher_level", "joint")).values
+    assert np.allclose(np.sort(np.ravel(shown)), np.sort(np.ravel(expected)))

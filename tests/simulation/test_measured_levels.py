@@ -1,0 +1,236 @@
+"""Sampled loops of plants in strict-feedback form: sensors of single levels, levels that are not
+measured, and the noise that an observer of levels amplifies."""
+
+from __future__ import annotations
+
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from iblf_jax.sensors import Direct, Encoder, FilteredDifference, Levels, Tracking
+
+import iblf_jax as ij
+from iblf_jax.core import notices
+from iblf_jax.simulation.measurement_noise import noise_advice, standard_deviations
+from iblf_jax.simulation.scenario import canonical
+from iblf_jax.tuning import ranges
+
+LINK = ij.robots.PlanarChain(mass=[1.3], length=[0.4], centre=[0.2], inertia=[0.02])
+FLEXIBLE = ij.plants.FlexibleJoint(LINK, stiffness=300.0, motor_inertia=0.03, motor_damping=0.1)
+DRIVE = ij.plants.ElectricDrive(
+    LINK, torque_constant=2.0, inductance=0.02, resistance=1.0, back_emf=0.5
+)
+GAINS = {3: (3.0, 20.0, 60.0), 4: (3.0, 20.0, 40.0, 60.0)}
+FILTERED = Encoder(counts=65536, noise=2e-5, velocity=FilteredDifference(cutoff=500.0))
+TRACKED = Encoder(noise=1e-4, velocity=Tracking(bandwidth=300.0))
+
+
+def loop(plant, **parts):
+    """One joint that follows a sinusoid, sampled at 1 kHz."""
+    values = {
+        "controller": ij.controllers.BarrierBackstepping(k=GAINS[plant.order]),
+        "initial": ij.Initial(q=0.5, dq=0.4),
+        "sampling": ij.Sampling(period=1e-3),
+        "disturbance": ij.disturbances.Sinusoids(amplitude=0.2, frequency=3.0, offset=0.1),
+    } | parts
+    return ij.Scenario(
+        plant=plant,
+        reference=ij.references.Sinusoid(offset=0.5, amplitude=0.2, frequency=2.0),
+        bounds=ij.Bounds(lower=ij.bounds.Constant(0.1), upper=ij.bounds.Constant(0.9)),
+        **values,
+    )
+
+
+def simulated(scenario, duration=0.5):
+    """A run whose warnings are of no interest here."""
+    with notices.muted():
+        return ij.simulate(scenario, duration=duration, dt=5e-4, seed=3)
+
+
+# --- sensors of levels ----------------------------------------------------------------------------
+
+
+def test_a_current_sensor_in_the_loop():
+    """Its readings differ from the current by the noise alone, and q comes in counts."""
+    law = ij.controllers.WithDrive(ij.controllers.PDGravity(Kp=9.0, Kd=1.0), drive=DRIVE)
+    sensor = Levels((FILTERED, Direct(noise=0.02)))
+    run = simulated(loop(DRIVE, model=LINK, controller=law, sensor=sensor))
+    step = 2.0 * np.pi / 65536
+    counts = np.asarray(run.measured.q[::2]) / step
+    np.testing.assert_allclose(counts, np.round(counts), atol=1e-6)
+    error = np.asarray(run.measured.higher - run.higher)[::2]
+    assert 0.8 * 0.02 < error.std() < 1.2 * 0.02 and abs(error.mean()) < 5e-3
+
+
+@pytest.mark.slow
+def test_the_same_sensor_as_a_part_and_alone_give_the_same_run():
+    """With an ordinary sensor the levels from the third on are measured without error."""
+    alone = simulated(loop(DRIVE, sensor=FILTERED), duration=0.1)
+    part = simulated(loop(DRIVE, sensor=Levels((FILTERED, Direct()))), duration=0.1)
+    np.testing.assert_allclose(part.x, alone.x, rtol=1e-12)
+    np.testing.assert_array_equal(alone.measured.higher[::2], alone.higher[::2])
+
+
+@pytest.mark.parametrize(
+    ("parts", "observer", "text"),
+    [
+        ((FILTERED,), ij.observers.NoObserver(), "sensors of 2 levels.*sensors of 3 levels"),
+        ((FILTERED, None), ij.observers.NoObserver(), "level 3.*StateObserver.*measured=.1, 2."),
+        ((FILTERED, None), ij.observers.LevelObserver(gain=20.0), "level 3.*StateObserver"),
+        ((None, Direct(), Direct()), ij.observers.NoObserver(), "level 1.*measure level 1"),
+        (
+            (Direct(), None, Direct()),
+            ij.observers.StateObserver(bandwidth=200.0, measured=(1, 2)),
+            "level 2 measured, which StateObserver reads",
+        ),
+    ],
+)
+def test_a_level_that_is_neither_measured_nor_estimated_is_refused(parts, observer, text):
+    with pytest.raises(ValueError, match=rf"Scenario\.sensor.*{text}"):
+        loop(DRIVE, sensor=Levels(parts), observer=observer)
+
+
+# --- levels that an observer estimates ------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("motor", [None, Direct()], ids=["link encoder", "link and motor encoder"])
+def test_unmeasured_levels_of_a_flexible_joint(motor):
+    """Encoders without velocities track about as well as a measurement of all levels, under a
+    disturbance that the observer estimates.
+
+    With the link encoder alone the disturbance torque on the link appears as one of the motor, and
+    as a motor position of which K (theta - q) contains it."""
+    full = ij.observers.StateObserver(bandwidth=400.0, measured=(1, 2, 3, 4))
+    reference = simulated(loop(FLEXIBLE, observer=full), duration=1.0)
+    measured = (1,) if motor is None else (1, 3)
+    observer = ij.observers.StateObserver(
+        bandwidth=400.0, measured=measured, offset=(0.0, 0.02, 0.0, 0.02)
+    )
+    sensor = Levels((Direct(), None, motor, None))
+    run = simulated(loop(FLEXIBLE, observer=observer, sensor=sensor), duration=1.0)
+    late = slice(len(run.t) // 2, None, 2)
+    errors = [float(np.max(np.abs(r.e1[late]))) for r in (reference, run)]
+    assert errors[1] < 2.0 * errors[0] and errors[1] < 2e-3, errors
+    np.testing.assert_allclose(run.measured.dq[late], run.dq[late], atol=5e-4)
+    theta = run.higher[late, 0]
+    if motor is None:
+        inertia = np.asarray(LINK.mass_matrix(jnp.zeros(1)))[0]
+        theta = theta + inertia * run.disturbance[late, 1] / 300.0
+    np.testing.assert_allclose(run.measured.higher[late, 0], theta, atol=1e-5)
+
+
+def test_a_continuous_loop_by_output_feedback():
+    """The law of a continuous loop receives the estimates, too: their error at the start changes
+    the voltage, and the loop converges to the one that measures all levels."""
+    observer = ij.observers.StateObserver(bandwidth=300.0, offset=(0.0, 0.1, 0.5))
+    silent = ij.disturbances.Nothing()
+    scenario = loop(DRIVE, sampling=None, observer=observer, disturbance=silent)
+    run = simulated(scenario, duration=0.3)
+    x = run.x[0] + np.array([[0.0], [0.1], [0.5]])
+    command, _ = scenario.controller.command(
+        jnp.asarray(0.0), jnp.asarray(x), jnp.zeros((3, 1)), scenario.context, ()
+    )
+    np.testing.assert_allclose(run.tau[0], command.tau, rtol=1e-12)
+    np.testing.assert_allclose(run.observer_state.x_hat[-1], run.x[-1], atol=1e-4)
+
+
+@pytest.mark.slow
+def test_a_law_of_robots_without_a_velocity_sensor():
+    """A StateObserver on a robot estimates q' and f from positions."""
+    paper = ij.presets.zhang_yan_2024(reading="corrected")
+    push = ij.disturbances.Step(size=[0.5, -0.3], time=0.0)
+    sensor = Levels((Direct(), None))
+    observer = ij.observers.StateObserver(bandwidth=300.0)
+    slow = {"controller.K2": 4.0}
+    run = simulated(
+        ij.with_parameters(
+            ij.with_parts(
+                paper,
+                sampling=ij.Sampling(period=1e-3),
+                observer=observer,
+                sensor=sensor,
+                disturbance=push,
+            ),
+            slow,
+        )
+    )
+    assert run.disturbance_estimate.shape == run.q.shape
+    np.testing.assert_allclose(run.disturbance_estimate[-1], [0.5, -0.3], atol=0.01)
+    np.testing.assert_allclose(run.measured.dq[-2], run.dq[-2], atol=0.01)
+
+
+# --- noise ----------------------------------------------------------------------------------------
+
+
+FINE = Encoder(counts=2**18, noise=2e-5, velocity=FilteredDifference(cutoff=500.0))
+"""Its noise exceeds a step, so that the rounding error of a joint at rest is white."""
+
+
+@pytest.mark.parametrize("encoder", [FINE, TRACKED], ids=["filtered", "tracking"])
+def test_the_noise_of_measured_levels_is_that_of_many_samples(encoder, rng):
+    """Against the standard deviation of 40,000 readings of a drive at rest, rounding included."""
+    sensor = Levels((encoder, Direct(noise=0.03, resolution=0.05)))
+    scenario = canonical(loop(DRIVE, sensor=sensor, initial=ij.Initial(q=0.5, dq=0.0)))
+    found = standard_deviations(scenario)
+    sensor, period = scenario.sensor, scenario.sampling.period
+
+    @jax.jit
+    def readings(x, normal):
+        def sample(state, w):
+            measured, state = sensor.measure(x, w, period, state)
+            return state, jnp.concatenate([measured.q[None], measured.dq[None], measured.higher])
+
+        return jax.lax.scan(sample, sensor.init(x, period), normal)[1]
+
+    normal = jnp.asarray(rng.normal(size=(40_000, sensor.draws, 1)))
+    many = readings(jnp.array([[0.5], [0.0], [1.0]]), normal)
+    np.testing.assert_allclose(found, np.std(np.asarray(many)[200:], axis=0), rtol=0.03)
+
+
+def with_noise_in_the_current():
+    """A drive whose LevelObserver has a gain for the current only."""
+    sensor = Levels((TRACKED, Direct(noise=0.02)))
+    observer = ij.observers.LevelObserver(gain=(0.0, 0.0, 50.0))
+    return loop(DRIVE, sensor=sensor, observer=observer)
+
+
+def test_noise_through_a_level_observer_is_reported():
+    scenario = with_noise_in_the_current()
+    with pytest.warns(UserWarning, match="LevelObserver amplifies the sensor's noise"):
+        scenario = canonical(scenario)
+    (text,) = noise_advice(scenario)
+    assert "level 3: 0.02 A times 50 1/s give 1 A/s in d_hat_3" in text
+    assert "level 2" not in text
+    silent = ij.with_parts(scenario, sensor=Levels((Direct(), Direct(), Direct())))
+    assert noise_advice(canonical(silent)) == []
+    assert (
+        noise_advice(canonical(ij.with_parts(scenario, observer=ij.observers.NoObserver()))) == []
+    )
+
+
+@pytest.mark.slow
+def test_the_reported_noise_is_that_of_the_estimate():
+    """From sample to sample of a run, 1 A/s."""
+    run = simulated(with_noise_in_the_current())
+    estimate = np.asarray(run.disturbance_estimate)[200::2, 2, 0]
+    jitter = np.std(np.diff(estimate)) / np.sqrt(2.0)
+    assert 0.8 < jitter < 1.2
+
+
+def test_a_count_of_a_level_moves_the_command():
+    """`tuning.ranges`: the step of the command by a count of the encoder and by a step of the
+    current sensor, against differences."""
+    sensor = Levels((FILTERED, Direct(resolution=0.05)))
+    scenario = canonical(loop(DRIVE, sensor=sensor))
+    times = jnp.asarray([0.0])
+    by_count, by_noise = ranges._command_steps(scenario, times)
+    assert by_count.shape == (2, 3, 1) and by_noise.shape == (2, 1)
+    assert np.all(np.asarray(by_count)[:, 1] == 0.0)
+    assert np.all(np.abs(np.asarray(by_count)[:, [0, 2]]) > 0.0)
+    half = canonical(ij.with_parameters(scenario, {"sensor.parts[1].resolution": 0.025}))
+    smaller, _ = ranges._command_steps(half, times)
+    np.testing.assert_allclose(2.0 * smaller[:, 2], by_count[:, 2], rtol=1e-12)
+    assert re.match(ranges.FREQUENCY, "sensor.parts[0].velocity.cutoff")

@@ -1,0 +1,144 @@
+"""Closed loops of plants in strict-feedback form against the independent program."""
+
+from __future__ import annotations
+
+import chain_cases
+import independent_chains as other
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import iblf_jax as ij
+from iblf_jax import bounds, controllers, plants
+
+DATA = np.load(other.FILE)
+STEPS = {"coupled": 5e-4, "flexible": 2e-4, "pendulum": 1e-3, "surface": 5e-4}
+
+
+def closed_loop(name: str) -> ij.Scenario:
+    return chain_cases.scenario(name, observer=ij.observers.LevelObserver(other.CASES[name].kappa))
+
+
+@pytest.mark.parametrize("name", other.CASES)
+def test_equal_to_the_independent_program(name):
+    """Every fifth instant of its run: states, input, estimates and sum w_i V_i."""
+    run = {key: DATA[f"{name}.run.{key}"][::5] for key in ("x", "u", "d_hat", "V")}
+    dt = STEPS[name]
+    found = ij.simulate(
+        closed_loop(name), duration=4.0, dt=dt, record_every=round(0.05 / dt), throw=True
+    )
+    np.testing.assert_allclose(found.x, run["x"], rtol=1e-8, atol=2e-8)
+    np.testing.assert_allclose(found.tau, run["u"], rtol=1e-6, atol=1e-5)
+    np.testing.assert_allclose(found.disturbance_estimate, run["d_hat"], rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(found.V, run["V"], rtol=1e-6, atol=1e-9)
+
+
+def test_errors_and_uncertain_terms_of_the_levels():
+    """e_i = x_i - alpha_{i-1}, and d_i is the disturbance where plant and model agree."""
+    run = ij.simulate(closed_loop("coupled"), duration=1.0, dt=1e-3, record_every=50)
+    assert run.x.shape == run.e.shape == run.disturbance.shape == (21, 3, 2)
+    alphas = np.asarray(run.x - run.e)
+    expected = DATA["coupled.run.alpha"][:101:5]
+    np.testing.assert_allclose(alphas[:, 1:], expected[:, :2], rtol=1e-6, atol=1e-6)
+    d = [other.table_disturbance(float(t), None) for t in run.t]
+    np.testing.assert_allclose(run.disturbance, d, atol=1e-10)
+
+
+def test_a_flexible_joint_starts_at_the_equilibrium_of_its_springs():
+    scenario = chain_cases.scenario(
+        "flexible", initial=ij.Initial(q=other.ARM_START, dq=[0.1, 0.0])
+    )
+    run = ij.simulate(scenario, duration=0.01, dt=1e-3)
+    gravity = np.asarray(scenario.plant.robot.gravity(jnp.asarray(other.ARM_START)))
+    np.testing.assert_allclose(run.x[0, 2], other.ARM_START + gravity / other.STIFFNESS)
+    np.testing.assert_allclose(run.x[0, 3], [0.1, 0.0])
+
+
+def test_a_robot_keeps_its_bounds_of_velocities_by_either_name():
+    preset = ij.presets.zhang_yan_2024_full_state()
+    limits = preset.velocity_bounds
+    same = ij.with_parts(preset, velocity_bounds=None, state_bounds=(limits,))
+    assert same.velocity_bounds is limits
+    assert same.state_bounds == ()
+    with pytest.raises(ValueError, match="either velocity_bounds or state_bounds"):
+        ij.with_parts(preset, state_bounds=(limits,))
+
+
+def test_a_disturbance_of_the_first_level_of_a_robot():
+    """q' = x_2 + d_1, which no torque can compensate at once."""
+    drift = ij.disturbances.Levels((ij.disturbances.Sinusoids(amplitude=0.05, frequency=2.0),))
+    preset = ij.with_parts(ij.presets.zhang_yan_2024(), disturbance=drift)
+    run = ij.simulate(preset, duration=1.0, dt=1e-3)
+    rate = np.gradient(np.asarray(run.q), 1e-3, axis=0, edge_order=2)
+    expected = np.asarray(run.dq) + 0.05 * np.sin(2.0 * np.asarray(run.t))[:, None]
+    # behind the transient of the start, which differences do not resolve
+    np.testing.assert_allclose(rate[300:-2], expected[300:-2], atol=1e-5)
+
+
+def stiff_arm(robot):
+    """A flexible arm whose motors have the damping D > J K2/M with which a rigid law that measures
+    the links is stable.
+    """
+    return plants.FlexibleJoint(robot, stiffness=3000.0, motor_inertia=0.001, motor_damping=2.0)
+
+
+def test_a_rigid_law_controls_a_flexible_arm():
+    """Plant and model are separate objects: the model may be the robot inside the plant."""
+    preset = ij.presets.zhang_yan_2024()
+    plant = stiff_arm(preset.plant)
+    scenario = ij.with_parts(preset, plant=plant)
+    run = ij.simulate(scenario, duration=1.0, dt=2e-4)
+    assert run.ok, run
+    assert run.x.shape[1:] == (4, 2)
+    assert run.e.shape[1:] == (2, 2)
+    assert run.disturbance.shape[1:] == (2,)
+    expected = ij.simulate(preset, duration=1.0, dt=1e-3, record_every=100)
+    np.testing.assert_allclose(run.q[::500], expected.q, atol=0.01)
+
+
+def test_derivatives_of_a_run_by_its_leaves():
+    """By the gains, the stiffness, a weight, a bound and the start, against differences."""
+    scenario = chain_cases.scenario("flexible", initial=ij.Initial(q=other.ARM_START))
+    paths = ("controller.k[3][0]", "plant.stiffness[1]", "controller.weights[1][0]", "initial.q[0]")
+
+    def final(values):
+        changed = ij.with_parameters(scenario, dict(zip(paths, values, strict=True)))
+        run = ij.simulate(changed, duration=0.2, dt=1e-3, record_every=200)
+        return jnp.sum(run.q[-1] * jnp.asarray([1.0, 0.7]))
+
+    values = [float(ij.paths.get(scenario, path)) for path in paths]
+    found = jax.grad(final)(jnp.asarray(values))
+    for i, value in enumerate(values):
+        h = 1e-4 * abs(value)
+        sides = [[*values[:i], value + sign * h, *values[i + 1 :]] for sign in (1.0, -1.0)]
+        expected = (final(sides[0]) - final(sides[1])) / (2.0 * h)
+        np.testing.assert_allclose(found[i], expected, rtol=2e-4, atol=1e-10)
+
+
+def test_bounds_of_a_level_are_recorded_under_every_law():
+    preset = ij.presets.zhang_yan_2024()
+    plant = stiff_arm(preset.plant)
+    narrow = ij.Bounds(lower=bounds.Constant(-0.5), upper=bounds.Constant(0.5))
+    scenario = ij.with_parts(
+        preset, plant=plant, state_bounds=(None, None, narrow), controller=preset.controller
+    )
+    with pytest.warns(ij.SimulationWarning):
+        run = ij.simulate(scenario, duration=0.5, dt=2e-4)
+    assert int(run.status) & ij.Status.STATE_BOUND_VIOLATED
+    np.testing.assert_array_equal(run.higher_upper[:, 1], 0.5)
+    assert np.all(np.isinf(run.higher_upper[:, 0]))
+
+
+def test_a_law_of_order_two_is_a_law_of_robots():
+    preset = ij.presets.zhang_yan_2024()
+    law = controllers.BarrierBackstepping(k=(2.0, 20.0))
+    robot = ij.simulate(ij.with_parts(preset, controller=law), duration=0.3, dt=1e-3)
+    chain = plants.Rigid(preset.plant)
+    disturbance = ij.disturbances.Nothing()
+    quiet = ij.with_parts(preset, controller=law, disturbance=disturbance)
+    first = ij.simulate(quiet, duration=0.3, dt=1e-3)
+    second = ij.simulate(ij.with_parts(quiet, robot=chain), duration=0.3, dt=1e-3)
+    np.testing.assert_allclose(first.q, second.q, atol=1e-12)
+    np.testing.assert_allclose(first.tau, second.tau, atol=1e-9)
+    assert robot.ok

@@ -1,0 +1,201 @@
+"""Plants in strict-feedback form against published numbers, balances of energy and closed forms;
+and the class of a user, as the design of the public interface states it."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import iblf_jax as ij
+from iblf_jax import plants
+from iblf_jax.core.notices import muted
+
+SHIP = ij.presets.cybership_ii()
+
+# ------------------------------------------------------------ vessel
+
+
+def test_inertia_matrix_of_cybership_ii_is_the_published_one():
+    expected = [[25.8, 0.0, 0.0], [0.0, 33.8, 1.0948], [0.0, 1.0948, 2.76]]
+    np.testing.assert_allclose(SHIP.inertia_matrix(), expected, rtol=1e-12)
+
+
+def test_damping_of_cybership_ii_is_the_published_one():
+    u, v, r = 0.4, -0.2, 0.3
+    forces = np.asarray(SHIP.damping_matrix(jnp.asarray([u, v, r]))) @ [u, v, r]
+    surge = 0.72253 * u + 1.32742 * abs(u) * u + 5.86643 * u**3
+    sway = (0.88965 + 36.47287 * abs(v) + 0.805 * abs(r)) * v + (
+        7.25 + 0.845 * abs(v) + 3.45 * abs(r)
+    ) * r
+    yaw = (-0.0313 - 3.95645 * abs(v) - 0.13 * abs(r)) * v + (
+        1.9 - 0.08 * abs(v) + 0.75 * abs(r)
+    ) * r
+    np.testing.assert_allclose(forces, [surge, sway, yaw], rtol=1e-12)
+
+
+def test_coriolis_of_cybership_ii_is_the_published_one():
+    u, v, r = 0.4, -0.2, 0.3
+    C = np.asarray(SHIP.coriolis_matrix(jnp.asarray([u, v, r])))
+    c13, c23 = -(33.8 * v + 1.0948 * r), 25.8 * u
+    np.testing.assert_allclose(C, [[0, 0, c13], [0, 0, c23], [-c13, -c23, 0]], rtol=1e-12)
+
+
+def test_the_power_of_a_vessel_is_that_of_thrust_and_damping(rng):
+    """nu^T M nu' = nu^T (u - D nu): the Coriolis forces do no work."""
+    M = np.asarray(SHIP.inertia_matrix())
+    flow = jax.jit(lambda x, u: plants.flow(SHIP, jnp.zeros(()), x, u))
+    for _ in range(5):
+        x, u = rng.normal(size=(2, 3)), rng.normal(size=3)
+        rate = np.asarray(flow(x, u))
+        D = np.asarray(SHIP.damping_matrix(jnp.asarray(x[1])))
+        assert x[1] @ M @ rate[1] == pytest.approx(x[1] @ (u - D @ x[1]), rel=1e-10)
+        speed = np.hypot(*rate[0, :2])
+        assert speed == pytest.approx(np.hypot(*x[1, :2]), rel=1e-12)  # R turns only
+        assert rate[0, 2] == pytest.approx(x[1, 2])
+
+
+def test_a_vessel_with_heading_north_moves_north_in_surge():
+    x = jnp.asarray([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0]])
+    np.testing.assert_allclose(plants.flow(SHIP, 0.0, x, jnp.zeros(3))[0], [0.5, 0.0, 0.0])
+    x = x.at[0, 2].set(0.5 * np.pi)
+    np.testing.assert_allclose(plants.flow(SHIP, 0.0, x, jnp.zeros(3))[0], [0, 0.5, 0], atol=1e-15)
+
+
+def test_a_vessel_refuses_added_masses_of_the_wrong_sign():
+    with pytest.raises(ValueError, match=r"Vessel: got m11 = 13.*negative numbers") as caught:
+        plants.Vessel(mass=23.0, yaw_inertia=1.7, X_du=10.0, Y_dv=30.0)
+    assert "m22 = -7" in str(caught.value)
+
+
+# ------------------------------------------------------------ driven pendulum
+
+
+def test_the_driven_pendulum_is_an_electric_drive_on_a_pendulum(rng):
+    """With M = L/Kt, H = R/Kt and the motor's torque Kt i as the third level."""
+    link = ij.robots.PlanarChain(mass=[0.9], length=[0.4], centre=[0.3], inertia=[0.02], g=9.81)
+    D = float(link.mass_matrix(jnp.zeros(1))[0, 0])
+    drive = plants.ElectricDrive(
+        link, torque_constant=0.8, inductance=0.02, resistance=4.0, back_emf=0.7
+    )
+    pendulum = plants.DrivenPendulum(
+        D=[D], B=[0.0], N=[0.9 * 0.3 * 9.81], M=[0.02 / 0.8], H=[4.0 / 0.8], Km=[0.7]
+    )
+    x, u = rng.normal(size=(3, 1)), rng.normal(size=1)
+    of_drive = plants.flow(drive, 0.0, jnp.asarray(x), u)
+    # The angle of the chain counts from the horizontal.
+    shifted = np.stack([x[0] + 0.5 * np.pi, x[1], 0.8 * x[2]])
+    of_pendulum = plants.flow(pendulum, 0.0, jnp.asarray(shifted), u)
+    np.testing.assert_allclose(of_pendulum[:2], of_drive[:2], rtol=1e-12)
+    np.testing.assert_allclose(of_pendulum[2], 0.8 * of_drive[2], rtol=1e-12)
+
+
+# ------------------------------------------------------------ a user's class
+
+
+@ij.component
+class Pendulum:
+    """x1' = x2,  D x2' = x3 - B x2 - N sin x1,  M x3' = u - H x3 - Km x2."""
+
+    D: ij.Leaf = ij.leaf("kg m^2", sign="positive")
+    B: ij.Leaf = ij.leaf("N m s/rad")
+    N: ij.Leaf = ij.leaf("N m")
+    M: ij.Leaf = ij.leaf("s", sign="positive")
+    H: ij.Leaf = ij.leaf("1")
+    Km: ij.Leaf = ij.leaf("N m s/rad")
+    n = 1  # numbers per level
+    order = 3  # levels
+
+    def drift(self, t, x):
+        load = -(self.B * x[1] + self.N * jnp.sin(x[0])) / self.D
+        return jnp.stack([0.0 * x[0], load, -(self.H * x[2] + self.Km * x[1]) / self.M])
+
+    def gain(self, t, x):
+        one = jnp.ones_like(x[0])
+        return jnp.stack([one, one / self.D, one / self.M])
+
+
+NUMBERS = {"D": 1.0, "B": 1.0, "N": 10.0, "M": 0.1, "H": 1.0, "Km": 10.0}
+
+
+def scenario_of(plant, **parts):
+    return ij.Scenario(
+        plant=plant,
+        reference=ij.references.Sinusoid(offset=0.0, amplitude=0.5),
+        bounds=ij.Bounds(lower=ij.bounds.Constant(-0.8), upper=ij.bounds.Constant(0.9)),
+        controller=ij.controllers.BarrierBackstepping(k=(3.0, 10.0, 30.0)),
+        initial=ij.Initial(x=[[0.3], [0.0], [0.0]]),
+        **parts,
+    )
+
+
+def test_a_users_class_fits_the_contract_and_runs():
+    plant = Pendulum(**NUMBERS)
+    ij.testing.check_plant(plant)
+    run = ij.simulate(scenario_of(plant), duration=3.0, dt=2e-3)
+    assert int(run.status) == 0
+    assert run.x.shape == (1501, 3, 1)
+    assert np.abs(run.e1[-1]) < 1e-3
+    assert float(run.metrics.relative_numerical_error) < 1e-5
+
+
+def test_a_users_leaves_are_parameters_with_units_and_gradients():
+    scenario = scenario_of(Pendulum(**NUMBERS), model=Pendulum(**NUMBERS))
+    units = {p.path: p.unit for p in ij.parameters(scenario)}
+    assert units["plant.D"] == "kg m^2"
+    assert units["model.Km"] == "N m s/rad"
+
+    @jax.jit
+    def cost(values):
+        changed = ij.with_parameters(scenario, values)
+        return jnp.sum(ij.simulate(changed, duration=0.5, dt=5e-3, throw=False).metrics.ise)
+
+    values = {f"plant.{name}": jnp.asarray([x]) for name, x in NUMBERS.items()}
+    slopes = jax.grad(cost)(values)
+    for path, value in values.items():
+        h = 1e-5 * value
+        with muted():
+            difference = cost(values | {path: value + h}) - cost(values | {path: value - h})
+        assert float(slopes[path][0]) == pytest.approx(float(difference / (2 * h[0])), rel=1e-4)
+        assert abs(float(slopes[path][0])) > 1e-8, path
+
+
+# ------------------------------------------------------------ the structure, at the entry points
+
+
+def with_drift(drift):
+    return plants.StrictFeedback(
+        drift=drift, gain=lambda t, x: jnp.ones_like(x), n=1, order=3, units=("m", "m/s", "N", "V")
+    )
+
+
+@pytest.mark.parametrize(
+    ("drift", "words"),
+    [
+        (lambda t, x: jnp.stack([x[1], -x[0], -x[2]]), "row 0.*x.1.*belongs in row 0 of the gain"),
+        (lambda t, x: jnp.stack([-x[0], x[2] ** 2, -x[2]]), "row 1 that depends on x.2."),
+        (lambda t, x: jnp.stack([x[2] * x[0], -x[1], -x[2]]), "row 0.*x.2.*other levels"),
+    ],
+    ids=["complete-equation", "square-at-a-start-of-0", "two-levels-up"],
+)
+def test_a_drift_that_depends_on_later_levels_is_refused(drift, words):
+    with pytest.raises(ValueError, match=rf"plant.drift\(t, x\): got a {words}"):
+        ij.simulate(scenario_of(with_drift(drift)), duration=0.1, dt=1e-2)
+
+
+def test_a_gain_that_depends_on_later_levels_is_refused():
+    plant = plants.StrictFeedback(
+        drift=lambda t, x: -x, gain=lambda t, x: 1.0 + x[::-1] ** 2, n=1, order=3
+    )
+    with pytest.raises(ValueError, match=r"plant.gain\(t, x\): got a row 0 that depends on x\[2\]"):
+        ij.simulate(scenario_of(plant), duration=0.1, dt=1e-2)
+
+
+def test_a_drift_of_strict_feedback_form_is_accepted():
+    plant = with_drift(lambda t, x: jnp.stack([jnp.cos(x[0]), x[0] * x[1], x[0] * x[1] * x[2]]))
+    dependence = plants.dependence_on_levels(plant, jnp.zeros(()), jnp.asarray([[0.3], [1.0], [2]]))
+    np.testing.assert_array_equal(np.asarray(dependence.drift) > 0, np.tri(3, dtype=bool))
+    np.testing.assert_array_equal(dependence.gain, 0.0)
+    run = ij.simulate(scenario_of(plant), duration=0.1, dt=1e-3)
+    assert int(run.status) == 0
