@@ -22,31 +22,52 @@ from iblf_jax.core.optional import has_members
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.engine import LOWERING_LIMITS
 from iblf_jax.kernels import Program, Shapes, compile_step, written_out
-from iblf_jax.simulation.closed_loop import discrete_observer, law_update
+from iblf_jax.simulation.closed_loop import discrete_observer, law_update, plant_input
+from iblf_jax.simulation.levels import (
+    law_state,
+    model_state,
+    observer_initial,
+    start_levels,
+    steady_input,
+)
 from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.world import plants
 
 
 @component
 class GivenReference:
     """A reference that is an input of every sample: q_d(s) = q_d + q_d' (s - t) + q_d" (s - t)^2 /
-    2.
+    2 + ...
 
     Args:
       t: time of the sample, () [s].
       q_d: reference there, () or (n,) [rad].
       dq_d: its velocity, () or (n,) [rad/s].
       ddq_d: its acceleration, () or (n,) [rad/s^2].
+      further_d: its derivatives from the third on, (m, n) [1]; none if not given.
     """
 
     t: Leaf = leaf("s", shape="scalar")
     q_d: Leaf = leaf("rad")
     dq_d: Leaf = leaf("rad/s")
     ddq_d: Leaf = leaf("rad/s^2")
+    further_d: Leaf = leaf("1", shape="level", default=None)
 
     def position(self, t: jax.Array) -> jax.Array:
         """q_d(t), (n,) [rad]."""
         s = t - self.t
-        return self.q_d + s * (self.dq_d + 0.5 * s * self.ddq_d)
+        acceleration = self.ddq_d
+        if self.further_d is not None:
+            acceleration = acceleration + _further_terms(s, self.further_d)
+        return self.q_d + s * (self.dq_d + 0.5 * s * acceleration)
+
+
+def _further_terms(s: jax.Array, derivatives: jax.Array) -> jax.Array:
+    """The sum of 2 s^k/(k + 2)! times the derivative k + 2, from k = 1 on, (n,)."""
+    total = jnp.zeros_like(derivatives[0])
+    for k in range(len(derivatives), 0, -1):
+        total = s * (1.0 / (k + 2)) * (derivatives[k - 1] + total)
+    return total
 
 
 class LawState(NamedTuple):
@@ -65,17 +86,23 @@ class SampleInputs(NamedTuple):
     t: jax.Array
     q: jax.Array
     dq: jax.Array
+    higher: Any = ()
+    """Levels of the model from the third on, (r - 2, n); `()` for a model of two levels."""
     q_d: Any = ()
     dq_d: Any = ()
     ddq_d: Any = ()
+    further_d: Any = ()
+    """Derivatives of the reference from the third to the r-th, (r - 2, n)."""
 
 
 class Outputs(NamedTuple):
     """Outputs of the law at a sample."""
 
     tau: jax.Array
+    """Input of the plant, (n,): of a robot the torque [N m]."""
     alpha: jax.Array
     f_hat: jax.Array
+    """Estimate of the observer: a torque (n,) [N m], or rates of the levels (r, n)."""
     outside: jax.Array
     guarded: jax.Array
     saturated: jax.Array
@@ -90,21 +117,32 @@ def _with_reference(scenario: Scenario, inputs: SampleInputs) -> Scenario:
     """The scenario, with the reference of the inputs if these have one."""
     if isinstance(inputs.q_d, tuple):
         return scenario
-    return dataclasses.replace(
-        scenario, reference=GivenReference(inputs.t, inputs.q_d, inputs.dq_d, inputs.ddq_d)
-    )
+    reference = GivenReference(inputs.t, inputs.q_d, inputs.dq_d, inputs.ddq_d)
+    if not isinstance(inputs.further_d, tuple):
+        reference = dataclasses.replace(reference, further_d=inputs.further_d)
+    return dataclasses.replace(scenario, reference=reference)
+
+
+def inputs_at_start(scenario: Scenario) -> SampleInputs:
+    """The time 0 and the levels of the plant at the start that the law measures."""
+    x = model_state(scenario, *start_levels(scenario))
+    higher = x[2:] if len(x) > 2 else ()
+    return SampleInputs(jnp.zeros((), x.dtype), x[0], x[1], higher)
 
 
 def start(scenario: Scenario, inputs: SampleInputs) -> tuple[LawState, jax.Array]:
-    """The state before the first sample, and the torque that keeps the model at rest."""
+    """The state before the first sample, and the input that keeps the model at rest."""
     scenario = _with_reference(scenario, inputs)
-    q, dq = inputs.q, inputs.dq
-    controller = scenario.controller.init(q, dq, scenario.context)
-    observer = discrete_observer(scenario).init(q, dq, scenario.model)
+    q, dq, higher = inputs.q, inputs.dq, inputs.higher
+    law: Any = scenario.controller
+    controller = law.init(*law_state(scenario, q, dq, higher), scenario.context)
+    observer = observer_initial(scenario, discrete_observer(scenario), q, dq, higher)
     velocity_filter = _velocity_filter(scenario)
     filtered: Any = ()
     if velocity_filter is not None:
         filtered = velocity_filter.init(q, dq, scenario.sampling.period)  # type: ignore[union-attr]
+    if plants.is_chain(scenario.model):
+        return LawState(controller, observer, filtered), steady_input(scenario, q)
     return LawState(controller, observer, filtered), scenario.model.gravity(q)
 
 
@@ -120,16 +158,15 @@ def sample(scenario: Scenario, inputs: SampleInputs, state: LawState) -> tuple[L
         dq, filtered = velocity_filter.estimate(
             inputs.q, inputs.dq, normal, scenario.sampling.period, state.velocity
         )
-    update = law_update(
-        scenario, inputs.t, Measurement(inputs.q, dq), state.controller, state.observer
-    )
+    measured = Measurement(inputs.q, dq, inputs.higher)
+    update = law_update(scenario, inputs.t, measured, state.controller, state.observer)
     command = update.command
     tube = scenario.context.tube(inputs.t)
     infeasible = jnp.zeros((), bool)
     for slack in jax.tree.leaves((command.slack, command.region_slack)):
         infeasible |= jnp.any(slack > 0)
     outputs = Outputs(
-        command.tau,
+        plant_input(command),
         command.alpha,
         update.f_hat,
         ~jnp.all((inputs.q > tube.lower) & (inputs.q < tube.upper)),
@@ -153,13 +190,15 @@ class ControlLaw(NamedTuple):
     """
 
     start: Program
-    """The program of `start`; its results are the state and the torque."""
+    """The program of `start`; its results are the state and the input of the plant."""
     sample: Program
     """The program of `sample`; its carry is the state, and its results are `Outputs`."""
     state_names: tuple[str, ...]
     """Names of the numbers of the state."""
     reads_velocity: bool
     """Whether q' is an input."""
+    estimate_size: int
+    """Numbers of the observer's estimate."""
 
 
 def control_law(scenario: Scenario, external_reference: bool) -> ControlLaw:
@@ -180,9 +219,9 @@ def control_law(scenario: Scenario, external_reference: bool) -> ControlLaw:
         raise checks.fail("scenario.sensor", kind, expected, remedy)
     q = scenario.initial.q
     dtype = q.dtype
-    inputs = SampleInputs(jnp.zeros((), dtype), q, q)
+    inputs = inputs_at_start(scenario)
     if external_reference:
-        inputs = inputs._replace(q_d=q, dq_d=q, ddq_d=q)
+        inputs = inputs._replace(q_d=q, dq_d=q, ddq_d=q, further_d=inputs.higher)
     shapes, _ = jax.eval_shape(start, scenario, inputs)
     like = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
     state = as_floats(like, dtype)
@@ -201,7 +240,10 @@ def control_law(scenario: Scenario, external_reference: bool) -> ControlLaw:
     reads_velocity = any(
         node.op == "per_run" and node.value in velocities for node in sample_program.nodes
     )
-    return ControlLaw(start_program, sample_program, number_names(state), reads_velocity)
+    estimate = jax.eval_shape(sample, scenario, inputs, like)[1].f_hat
+    return ControlLaw(
+        start_program, sample_program, number_names(state), reads_velocity, estimate.size
+    )
 
 
 def as_floats(state: Any, dtype: Any) -> Any:

@@ -33,12 +33,14 @@ from iblf_jax.simulation.closed_loop import (
     sample_at,
 )
 from iblf_jax.simulation.discontinuities import JUMP_SEPARATION
+from iblf_jax.simulation.levels import Motion
 from iblf_jax.simulation.metrics import Fold, as_folds, metric_units
 from iblf_jax.simulation.noise import has_noise, noise_key
 from iblf_jax.simulation.results import Metrics, Rollout
 from iblf_jax.simulation.sampling import DELAY_TOLERANCE, Instant, Sampling, commands_in_transit
 from iblf_jax.simulation.scenario import Scenario, canonical, check_step
 from iblf_jax.simulation.signals import SIGNALS
+from iblf_jax.world import plants
 from iblf_jax.world.disturbances import Nothing
 from iblf_jax.world.robots import at_time
 from iblf_jax.world.robots._base import robot_member
@@ -97,8 +99,8 @@ def cosimulate(
       that is too long.
 
     Raises:
-      ValueError: bad arguments, or joints that are not in MuJoCo's model; the message names the
-        field, the value and the remedy.
+      ValueError: bad arguments, a plant or a model that is no robot, or joints that are not in
+        MuJoCo's model; the message names the field, the value and the remedy.
       SimulationError: with `throw`, when a bound was violated or the state ran away.
       ImportError: the extra `robots` is not installed.
 
@@ -107,6 +109,7 @@ def cosimulate(
     if integrator is not None:
         checks.one_of("integrator", integrator, INTEGRATORS)
     check_single(scenario)
+    _check_robots(scenario)
     scenario = canonical(with_period(scenario, period))
     seed, throw = checks.seed(seed), checks.boolean("throw", throw)
     names = tuple(robot_member(scenario.plant, "joints"))
@@ -134,6 +137,20 @@ def cosimulate(
     if film is not None:
         film_run(result, robot, rows.model_positions[rows.instant], dt, Path(film))
     return result
+
+
+def _check_robots(scenario: Scenario) -> None:
+    """Raises ValueError for a plant or a model in strict-feedback form: MuJoCo's robot has the
+    torques of its joints as inputs, and no levels beyond positions and velocities.
+    """
+    for name, part in (("plant", scenario.plant), ("model", scenario.model)):
+        if not plants.is_chain(part):
+            continue
+        remedy = "MuJoCo simulates the joints only, without drives or springs."
+        if plants.robot_of(part) is not None:
+            remedy += f" Take {name}=scenario.{name}.robot, and a law for robots."
+        expected = "a robot, whose inputs are torques"
+        raise checks.fail(f"scenario.{name}", type(part).__name__, expected, remedy)
 
 
 def _own_step(scenario: Scenario, robot: MujocoPlant) -> float:
@@ -386,8 +403,9 @@ def _observed(scenario: Scenario, folds, dt, motion: _Motion):
     weight = jnp.concatenate([zero, half]) + jnp.concatenate([half, zero])
     step = jnp.where(rows.instant & (t > 0), dt, 0.0)
     signals = jax.tree.map(lambda x: x[rows.sample], motion.states.sampled.signals)
+    moved = Motion(rows.dq, rows.ddq, ())
     samples = jax.vmap(partial(sample_at, scenario))(
-        t, weight, rows.q, rows.dq, rows.ddq, rows.tau, rows.limited, signals
+        t, weight, rows.q, rows.dq, moved, rows.tau, rows.limited, signals
     )
     samples = dataclasses.replace(samples, step=step)
     raised = jax.vmap(sample_status)(samples)

@@ -6,6 +6,7 @@ import dataclasses
 import math
 import re
 from collections import Counter
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +14,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.core import checks, notices
+from iblf_jax.core import checks, notices, taylor
 from iblf_jax.core.pytree import astype
 from iblf_jax.core.status import FAILED, Status, describe, has_flag
 from iblf_jax.deployment.build import write_files
 from iblf_jax.deployment.c_names import FILES, RESERVED
-from iblf_jax.deployment.control_law import SampleInputs, control_law, sample, start
+from iblf_jax.deployment.control_law import (
+    SampleInputs,
+    control_law,
+    inputs_at_start,
+    sample,
+    start,
+)
 from iblf_jax.deployment.cosimulate import check_single, with_period
 from iblf_jax.deployment.finite import check_finite
 from iblf_jax.deployment.fmu import law_fmu, loop_fmu
@@ -30,6 +37,7 @@ from iblf_jax.deployment.write_c import (
     describe_counts,
     generate,
     operations_of,
+    vectors_of,
 )
 from iblf_jax.deployment.write_loop import loop_files, wasm_files
 from iblf_jax.engine.simulate import simulate
@@ -39,6 +47,7 @@ from iblf_jax.simulation.closed_loop import evaluate, initial_state
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.noise import has_noise, noise_key
 from iblf_jax.simulation.scenario import Scenario, canonical, check_step
+from iblf_jax.world import plants
 from iblf_jax.world.robots._base import robot_member
 
 LAW_TARGETS = ("c", "fmu")
@@ -187,7 +196,7 @@ def _export_law(
         name=name,
         external_reference=external_reference,
         vectors=vectors(scenario, external_reference),
-        joints=tuple(robot_member(scenario.model, "joints")),
+        joints=_joint_names(scenario.model),
         scenario_toml=_scenario_toml(scenario),
     )
     generated = generate(law)
@@ -212,7 +221,7 @@ def _export_loop(
     check_step(scenario, dt)
     _check_start(scenario)
     loop = loop_program(scenario, method)
-    joints = tuple(robot_member(scenario.plant, "joints"))
+    joints = _joint_names(scenario.plant)
     generated = loop_files(scenario, loop, name, method, joints)
     run_settings = [dt]
     if has_noise(scenario):
@@ -226,6 +235,12 @@ def _export_loop(
     sizes = {"state": width * loop.carry_size + 8, "parameters": width * generated.parameters.size}
     paths = tuple(field.path for field in generated.parameters.fields)
     return Exported(folder, target, files, operations_of(loop.step), sizes, paths)
+
+
+def _joint_names(part: Any) -> tuple[str, ...]:
+    """The names of the joints of a robot, or of the robot inside a plant; () without names."""
+    robot = plants.robot_of(part)
+    return () if robot is None else tuple(robot_member(robot, "joints"))
 
 
 def checked_name(name: Any, default: str) -> str:
@@ -277,9 +292,12 @@ def vectors(scenario: Scenario, external_reference: bool) -> Vectors:
         run = simulate(scenario, duration=samples * period, dt=period / steps, record_every=steps)
     dtype = run.q.dtype
     t = jnp.asarray(np.arange(samples) * period, dtype)
-    measured = (_rounded(x, samples, dtype) for x in (run.measured.q, run.measured.dq))
-    inputs = SampleInputs(t, *measured)
-    first = SampleInputs(t[:1], scenario.initial.q[None], scenario.initial.dq[None])
+    at_start = inputs_at_start(scenario)
+    levels = [run.measured.q, run.measured.dq]
+    if not isinstance(at_start.higher, tuple):
+        levels.append(run.measured.higher[:, : len(at_start.higher)])
+    inputs = SampleInputs(t, *[_rounded(x, samples, dtype) for x in levels])
+    first = jax.tree.map(lambda x: x[None], at_start)
     if external_reference:
         inputs = _with_own_reference(scenario, inputs)
         first = _with_own_reference(scenario, first)
@@ -292,17 +310,16 @@ def vectors(scenario: Scenario, external_reference: bool) -> Vectors:
             f"the simulated run with this law every {period:g} s: {describe(status)}. The exported"
             " code is that law; ij.recommended_period(scenario) returns how long a period may be."
         )
-    at_start = tuple(map(np.asarray, jax.tree.leaves(first[1:])))  # without the time
-    references = tuple(map(np.asarray, jax.tree.leaves(inputs[3:])))
-    q, dq = np.asarray(inputs.q), np.asarray(inputs.dq)
-    return Vectors(at_start, q, dq, references, torques[::CHECK_INTERVAL])
+    return vectors_of(first, inputs, torques[::CHECK_INTERVAL])
 
 
 def _with_own_reference(scenario: Scenario, inputs: SampleInputs) -> SampleInputs:
     """Inputs with the scenario's own reference at their times, rounded."""
     count, dtype = len(inputs.t), inputs.q.dtype
-    reference = _reference(scenario, inputs.t)
-    return SampleInputs(*inputs[:3], *(_rounded(x, count, dtype) for x in reference))
+    reference = _reference(scenario, inputs.t, plants.order_of(scenario.model))
+    q_d, dq_d, ddq_d, *further = (_rounded(x, count, dtype) for x in reference)
+    given = inputs._replace(q_d=q_d, dq_d=dq_d, ddq_d=ddq_d)
+    return given._replace(further_d=jnp.stack(further, axis=1)) if further else given
 
 
 def _check_torques(
@@ -329,11 +346,10 @@ def _check_start(scenario: Scenario) -> None:
     if scenario.sampling is None:
         check_finite(scenario, _first_torque, np.asarray(_first_torque(scenario)), "at t = 0 s")
         return
-    q, dq = scenario.initial.q, scenario.initial.dq
-    count = (SAMPLES_AT_START, 1)
-    t = jnp.arange(SAMPLES_AT_START, dtype=q.dtype) * scenario.sampling.period
-    inputs = SampleInputs(t, jnp.tile(q, count), jnp.tile(dq, count))
-    first = jax.tree.map(lambda x: x[0], inputs)
+    first = inputs_at_start(scenario)
+    inputs = jax.tree.map(lambda x: jnp.stack([x] * SAMPLES_AT_START), first)
+    t = jnp.arange(SAMPLES_AT_START, dtype=first.q.dtype) * scenario.sampling.period
+    inputs = inputs._replace(t=t)
     _check_torques(scenario, first, inputs, np.asarray(_torques(scenario, first, inputs)), "")
 
 
@@ -352,11 +368,12 @@ def _rounded(x: Any, samples: int, dtype: Any) -> jax.Array:
     return jnp.asarray(np.round(np.asarray(x[:samples], float), DECIMALS), dtype)
 
 
-@jax.jit
-def _reference(scenario: Scenario, t: jax.Array) -> tuple[jax.Array, ...]:
-    """The scenario's own reference and its derivatives at times (K,), (K, n) each."""
-    tube = jax.vmap(scenario.context.tube)(t)
-    return tube.q_d, tube.dq_d, tube.ddq_d  # type: ignore[return-value]
+@partial(jax.jit, static_argnames="order")
+def _reference(scenario: Scenario, t: jax.Array, order: int) -> list[jax.Array]:
+    """The scenario's own reference and its derivatives up to an order at times (K,), (K, n)
+    each.
+    """
+    return taylor.in_time(jax.vmap(scenario.reference.position), t, order)
 
 
 @jax.jit

@@ -18,20 +18,34 @@ import numpy as np
 from iblf_jax import __version__
 from iblf_jax.deployment.build import build, c_compiler, fmi_platform, write_files
 from iblf_jax.deployment.c_names import Parameters
-from iblf_jax.deployment.loop_program import OUTPUTS
-from iblf_jax.deployment.write_c import GeneratedLaw, Law, fill_template, title_of
+from iblf_jax.deployment.loop_program import loop_outputs
+from iblf_jax.deployment.signal_units import one_unit, rate_units
+from iblf_jax.deployment.write_c import (
+    GeneratedLaw,
+    Law,
+    LawInput,
+    fill_template,
+    law_inputs,
+    title_of,
+)
 from iblf_jax.deployment.write_loop import GeneratedLoop
 from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.world import plants
 
 FLAGS = ("-std=c99", "-O2", "-fPIC", "-shared", "-fvisibility=hidden")
+BASE_UNITS = ("kg", "m", "s", "rad", "A")
 BASE = {
-    "rad": (0, 0, 0, 1),
-    "m": (0, 1, 0, 0),
-    "s": (0, 0, 1, 0),
-    "kg": (1, 0, 0, 0),
-    "N": (1, 1, -2, 0),
+    "rad": (0, 0, 0, 1, 0),
+    "m": (0, 1, 0, 0, 0),
+    "s": (0, 0, 1, 0, 0),
+    "kg": (1, 0, 0, 0, 0),
+    "N": (1, 1, -2, 0, 0),
+    "A": (0, 0, 0, 0, 1),
+    "V": (1, 2, -3, 0, -1),
+    "ohm": (1, 2, -3, 0, -2),
+    "H": (1, 2, -2, 0, -2),
 }
-"""Unit -> its exponents of kg, m, s and rad."""
+"""Unit -> its exponents of the BASE_UNITS."""
 CONSTANTS = ("sampling.period",)
 """Parameters that an FMU does not let its user change."""
 
@@ -46,11 +60,11 @@ class Variable(NamedTuple):
     start: np.ndarray | None = None
 
 
-def unit_exponents(unit: str) -> tuple[int, int, int, int] | None:
-    """The exponents of kg, m, s and rad in a unit such as "N m s/rad" or "kg m^2"; None for a unit
+def unit_exponents(unit: str) -> tuple[int, ...] | None:
+    """The exponents of the BASE_UNITS in a unit such as "N m s/rad" or "kg m^2"; None for a unit
     that is not a product of these.
     """
-    found = [0, 0, 0, 0]
+    found = [0] * len(BASE_UNITS)
     numerator, _, denominator = unit.partition("/")
     for sign, factors in ((1, numerator), (-1, denominator)):
         for factor in factors.replace("(", " ").replace(")", " ").split():
@@ -62,24 +76,31 @@ def unit_exponents(unit: str) -> tuple[int, int, int, int] | None:
                 return None
             for k, exponent in enumerate(BASE[name]):
                 found[k] += sign * int(power) * exponent
-    return tuple(found)  # type: ignore[return-value]
+    return tuple(found)
 
 
 def law_variables(law: Law, parameters: Parameters) -> list[Variable]:
     """The variables of an FMU of a law."""
-    units = {"q": "rad", "dq": "rad/s", "q_d": "rad", "dq_d": "rad/s", "ddq_d": "rad/s^2"}
-    names = ("q", "dq", *law.references)
+    model, n = law.scenario.model, law.scenario.n
+    units = [one_unit(unit) for unit in plants.units_of(model)]
+    first = (LawInput("q", units[0]), LawInput("dq", units[1]))
     inputs = [
-        Variable(name, "input", units[name], (law.scenario.n,), np.asarray(x, float))
-        for name, x in zip(names, law.vectors.first, strict=True)
+        Variable(x.name, "input", x.unit, (n,), np.asarray(start, float))
+        for x, start in zip(
+            (*first, *law_inputs(model, law.external_reference)), law.vectors.first, strict=True
+        )
     ]
-    outputs = _outputs({"tau": "N m", "alpha": "rad/s", "f_hat": "N m"}, law.scenario.n)
+    estimates = {"f_hat": "N m"}
+    if law.programs.estimate_size > n:
+        estimates = rate_units("d_hat", units)
+    outputs = _outputs({"tau": units[-1], "alpha": units[1], **estimates}, n)
     return [*_settable(parameters), *inputs, *outputs]
 
 
 def loop_variables(scenario: Scenario, parameters: Parameters) -> list[Variable]:
     """The variables of an FMU of a closed loop."""
-    return [*_settable(parameters), *_outputs(OUTPUTS, scenario.n)]
+    units = {x.name: x.unit for x in loop_outputs(scenario)}
+    return [*_settable(parameters), *_outputs(units, scenario.n)]
 
 
 def _outputs(units: dict[str, str], n: int) -> list[Variable]:
@@ -137,14 +158,14 @@ def model_description(
 
 def _add_units(root: Xml.Element, variables: Sequence[Variable]) -> set[str]:
     """Adds the definitions of the units; returns their names."""
-    exponents = {"s": BASE["s"]}
+    exponents: dict[str, tuple[int, ...]] = {"s": BASE["s"]}
     for v in variables:
         found = unit_exponents(v.unit)
         if found is not None and any(found):
             exponents[v.unit] = found
     definitions = Xml.SubElement(root, "UnitDefinitions")
     for unit, powers in sorted(exponents.items()):
-        pairs = zip(("kg", "m", "s", "rad"), powers, strict=True)
+        pairs = zip(BASE_UNITS, powers, strict=True)
         base = {name: str(power) for name, power in pairs if power}
         Xml.SubElement(Xml.SubElement(definitions, "Unit", name=unit), "BaseUnit", base)
     return set(exponents)
@@ -247,13 +268,13 @@ def law_fmu(law: Law, generated: GeneratedLaw, path: Path) -> None:
     n = law.scenario.n
     name = law.name
     step = float(law.scenario.sampling.period)  # type: ignore[union-attr]
-    places = "".join(f", q + {k * n}" for k, _ in enumerate(law.references, start=2))
+    places = "".join(f", q + {k * n}" for k, _ in enumerate(law.further_inputs, start=2))
     dq = "NULL"
     if law.programs.reads_velocity:
         dq = f"q + {n}"
     # The order counts: the token of the FMU is computed from the text of these values.
     values = {
-        "name": name, "upper": name.upper(), "joints": n, "step": repr(step), "reference": places,
+        "name": name, "upper": name.upper(), "joints": n, "step": repr(step), "further": places,
         "dq": dq,
     }  # fmt: skip
     sources = {file: generated.files[file] for file in (f"{name}.h", f"{name}.c")}

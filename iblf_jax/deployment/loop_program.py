@@ -11,6 +11,7 @@ import jax.numpy as jnp
 
 from iblf_jax.core.optional import attributes
 from iblf_jax.deployment.control_law import as_floats, of_floats, program_of
+from iblf_jax.deployment.signal_units import one_unit, rate_units
 from iblf_jax.engine.carry import Inputs, StepOptions, start
 from iblf_jax.engine.time_step import advance
 from iblf_jax.kernels import Program
@@ -18,21 +19,52 @@ from iblf_jax.simulation import error_estimate
 from iblf_jax.simulation.closed_loop import initial_state
 from iblf_jax.simulation.noise import has_noise
 from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.simulation.signals import Sample
+from iblf_jax.world import plants
 
-OUTPUTS = {
-    "q": "rad",
-    "dq": "rad/s",
-    "tau": "N m",
-    "e1": "rad",
-    "q_d": "rad",
-    "lower": "rad",
-    "upper": "rad",
-    "f": "N m",
-    "f_hat": "N m",
-}
-"""Outputs of a step, one number for each joint, at its start: name -> unit."""
-OF_SAMPLE = {"f": "disturbance", "f_hat": "disturbance_estimate"}
-"""Outputs that have another name in `Sample`."""
+
+class LoopOutput(NamedTuple):
+    """An output of a step, n numbers."""
+
+    name: str
+    unit: str
+    signal: str
+    """The name in `Sample`."""
+    row: int | None = None
+    """The row of a signal with one row a level; None for a signal of n numbers."""
+
+
+def loop_outputs(scenario: Scenario) -> tuple[LoopOutput, ...]:
+    """The outputs of a step, at its start, besides the status."""
+    plant, model = scenario.plant, scenario.model
+    units = [one_unit(unit) for unit in plants.units_of(plant)]
+    found = [
+        LoopOutput("q", units[0], "q"),
+        LoopOutput("dq", units[1], "dq"),
+        LoopOutput("tau", units[-1], "tau"),
+        LoopOutput("e1", units[0], "e1"),
+        LoopOutput("q_d", units[0], "q_d"),
+        LoopOutput("lower", units[0], "lower"),
+        LoopOutput("upper", units[0], "upper"),
+    ]
+    found += [LoopOutput(f"x_{i + 1}", units[i], "higher", i - 2) for i in range(2, len(units) - 1)]
+    if not plants.is_chain(model):
+        found.append(LoopOutput("f", "N m", "disturbance"))
+        found.append(LoopOutput("f_hat", "N m", "disturbance_estimate"))
+        return tuple(found)
+    known = [one_unit(unit) for unit in plants.units_of(model)]
+    for name, signal in (("d", "disturbance"), ("d_hat", "disturbance_estimate")):
+        rates = rate_units(name, known)
+        found += [LoopOutput(x, unit, signal, i) for i, (x, unit) in enumerate(rates.items())]
+    return tuple(found)
+
+
+def _value_of(output: LoopOutput, sample: Sample) -> jax.Array:
+    """The n numbers of an output in a sample."""
+    value = attributes(sample, [output.signal])[output.signal]
+    return value if output.row is None else value[output.row]
+
+
 UNLIMITED_STEPS = 2.0**52
 """Number of steps that stands for a run without an end."""
 
@@ -53,8 +85,8 @@ class Loop(NamedTuple):
     start: Program
     """Its results are the carry before the first step."""
     step: Program
-    """Its carry is state and status; its results are OUTPUTS and the status, both at the start of
-    the step."""
+    """Its carry is state and status; its results are `loop_outputs` and the status, both at the
+    start of the step."""
     carry_size: int
     """Number of floating-point numbers in the carry."""
 
@@ -89,8 +121,8 @@ def loop_program(scenario: Scenario, method: str) -> Loop:
         before = start(inputs, method, jnp.zeros((size, size), dtype))
         before = before._replace(state=state, status=status)
         done = advance(inputs, before, index, method, StepOptions(scalar=True))
-        names = [OF_SAMPLE.get(name, name) for name in OUTPUTS]
-        outputs = (*attributes(done.sample, names).values(), done.carry.status.astype(dtype))
+        values = [_value_of(output, done.sample) for output in loop_outputs(scenario)]
+        outputs = (*values, done.carry.status.astype(dtype))
         return as_floats((done.carry.state, done.carry.status), dtype), outputs
 
     carry = as_floats(like, dtype)

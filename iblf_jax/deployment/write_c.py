@@ -9,20 +9,22 @@ from importlib.resources import files
 from string import Template
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from iblf_jax import __version__
 from iblf_jax.deployment.c_names import Parameters, comment, number
-from iblf_jax.deployment.control_law import FLAGS, ControlLaw
+from iblf_jax.deployment.control_law import FLAGS, ControlLaw, SampleInputs
+from iblf_jax.deployment.signal_units import one_unit, per_time
 from iblf_jax.kernels import INPUTS, OPERATIONS, Program, header, plain_function
 from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.world import plants
 
 SEGMENT = 500
 """Largest number of operations of a C function: the compile time grows with the square of its
 length, and so does its stack without optimisation."""
 ELEMENTARY_COST = 16
 """Cost (`operations.OPERATIONS`) above which an operation is an elementary function."""
-REFERENCE = ("q_d", "dq_d", "ddq_d")
 LOOKUP = """static F f_lookup(const I *table, I size, I i) {
   F x;
   memcpy(&x, &table[i < 0 ? 0 : i < size ? i : size - 1], sizeof x);
@@ -100,13 +102,42 @@ class Vectors(NamedTuple):
     """Reference data of the self-test: the samples of a run, (K, n) each, and the law's torques."""
 
     first: tuple[np.ndarray, ...]
-    """q, q' and the reference at the start."""
+    """All inputs at the start, (n,) each."""
     q: np.ndarray
     dq: np.ndarray
-    reference: tuple[np.ndarray, ...]
-    """q_d, q_d', q_d"; empty if the reference is internal."""
+    further: tuple[np.ndarray, ...]
+    """Levels from the third on, and q_d and its derivatives if the reference is an input."""
     tau: np.ndarray
     """Torque of every CHECK_INTERVAL-th sample."""
+
+
+def vectors_of(first: SampleInputs, inputs: SampleInputs, tau: np.ndarray) -> Vectors:
+    """The reference data from the inputs at the start, those of K samples, and torques."""
+    n = first.q.size
+    at_start = [np.asarray(x).reshape(-1, n) for x in jax.tree.leaves(first[1:])]
+    rows = [np.asarray(x) for x in jax.tree.leaves(inputs[3:])]
+    further = [level for x in rows for level in np.moveaxis(x.reshape(len(x), -1, n), 1, 0)]
+    q, dq = np.asarray(inputs.q), np.asarray(inputs.dq)
+    return Vectors(tuple(np.concatenate(at_start)), q, dq, tuple(further), tau)
+
+
+class LawInput(NamedTuple):
+    """An input of n numbers of a law."""
+
+    name: str
+    unit: str
+
+
+def law_inputs(model: Any, external_reference: bool) -> tuple[LawInput, ...]:
+    """The inputs of a law besides q and q', in the order of `SampleInputs`: the levels of its model
+    from the third on, and an external reference with its derivatives.
+    """
+    order, units = plants.order_of(model), [one_unit(x) for x in plants.units_of(model)]
+    found = [LawInput(f"x_{i + 1}", units[i]) for i in range(2, order)]
+    if not external_reference:
+        return tuple(found)
+    names = ("q_d", "dq_d", "ddq_d", *(f"d{k}q_d" for k in range(3, order + 1)))
+    return (*found, *(LawInput(name, per_time(units[0], k)) for k, name in enumerate(names)))
 
 
 class Law(NamedTuple):
@@ -122,11 +153,10 @@ class Law(NamedTuple):
     """The scenario as TOML; None if a file cannot hold it."""
 
     @property
-    def references(self) -> tuple[str, ...]:
-        """Names of the inputs that give the reference; none if the reference is internal."""
-        if self.external_reference:
-            return REFERENCE
-        return ()
+    def further_inputs(self) -> tuple[str, ...]:
+        """Names of the inputs besides q and q'."""
+        inputs = law_inputs(self.scenario.model, self.external_reference)
+        return tuple(x.name for x in inputs)
 
     @property
     def is_float(self) -> bool:
@@ -153,7 +183,7 @@ def generate(law: Law) -> GeneratedLaw:
     real_bytes = np.dtype(programs.sample.dtype).itemsize
     start, sample = _functions(law, parameters)
     operations = operations_of(programs.sample)
-    state_bytes = real_bytes * (max(size, 1) + 3 * n)
+    state_bytes = real_bytes * (max(size, 1) + 2 * n + programs.estimate_size)
     parameter_bytes = real_bytes * max(1, parameters.size)
     result_bytes = real_bytes * (size + len(programs.sample.outputs))
     stack_bytes = max(stack_bytes_of(text, real_bytes) for text in (start, sample)) + result_bytes
@@ -173,7 +203,7 @@ def _functions(law: Law, parameters: Parameters) -> tuple[str, str]:
     """The C functions that compute the start and a sample."""
     programs, name = law.programs, law.name
     size = len(programs.state_names)
-    arrays = ("q", "dq", *law.references)
+    arrays = ("q", "dq", *law.further_inputs)
     per_run = ["t[0]", *(f"{x}[{i}]" for x in arrays for i in range(law.scenario.n))]
     parameter_argument = f"const {name}_parameters *p"
     arguments = [f"const F *{x}" for x in ("t", *arrays)]
@@ -205,6 +235,8 @@ def _law_values(law: Law, operations: Counter[str]) -> dict[str, Any]:
         "memory_size": max(len(state), 1),
         "memory_count": len(state),
         "flags": len(FLAGS),
+        "estimate_size": law.programs.estimate_size,
+        "output_meanings": _output_meanings(law.scenario),
         "keep_start": "",
         "keep_sample": "",
         "default_dq": "if (dq == NULL) dq = zero;",
@@ -213,7 +245,7 @@ def _law_values(law: Law, operations: Counter[str]) -> dict[str, Any]:
         "dq_of_k": "NULL",
         "dq_of_0": "NULL",
         "velocity": "Its inputs are positions; the scenario's filter computes the velocities.",
-        **_reference_values(law),
+        **_input_values(law),
     }
     if state:
         keep = "memcpy(s->memory, result, sizeof s->memory);\n"
@@ -264,22 +296,31 @@ def title_of(scenario: Scenario) -> str:
     return comment(f"The law {law} with the observer {observer}, for {scenario.n} joints")
 
 
-def _reference_values(law: Law) -> dict[str, str]:
-    """The values that depend on whether the reference is an input."""
+def _output_meanings(scenario: Scenario) -> str:
+    """The outputs of a law in words, with their units."""
+    if not plants.is_chain(scenario.model):
+        return "torque [N m], virtual velocity [rad/s], estimate of the uncertain term [N m]"
+    units = [comment(one_unit(x)) for x in plants.units_of(scenario.model)]
+    estimate = "estimate of the uncertain terms"
+    return f"input [{units[-1]}], virtual control of the second level [{units[1]}], {estimate}"
+
+
+def _input_values(law: Law) -> dict[str, str]:
+    """The values that depend on the inputs besides q and q'."""
     text = "The reference is an internal function of t."
     if law.external_reference:
         text = "The reference is an input of every sample."
     forms = {
-        "reference_arguments": ", {}",
-        "reference_declarations": f", const {law.name}_real *{{}}",
-        "reference_parameters": ", const real *{}",
-        "reference_finite": f" && are_finite({{}}, {law.scenario.n})",
-        "reference_values": "{}, ",
-        "reference_of_k": ", {}[k]",
-        "reference_of_0": ", {}[0]",
-        "first_reference": ", first_{}",
+        "further_arguments": ", {}",
+        "further_declarations": f", const {law.name}_real *{{}}",
+        "further_parameters": ", const real *{}",
+        "further_finite": f" && are_finite({{}}, {law.scenario.n})",
+        "further_values": "{}, ",
+        "further_of_k": ", {}[k]",
+        "further_of_0": ", {}[0]",
+        "first_further": ", first_{}",
     }
-    texts = {key: "".join(map(form.format, law.references)) for key, form in forms.items()}
+    texts = {key: "".join(map(form.format, law.further_inputs)) for key, form in forms.items()}
     return {"reference": text, **texts}
 
 
@@ -310,7 +351,7 @@ def _supporting_files(
     arrays = {"q": v.q, "torque": v.tau}
     if law.programs.reads_velocity:
         arrays["dq"] = v.dq
-    arrays |= dict(zip(law.references, v.reference, strict=True))
+    arrays |= dict(zip(law.further_inputs, v.further, strict=True))
     if law.scenario_toml is not None:
         values["scenario_row"] = _scenario_row(law)
     texts = {
@@ -357,7 +398,7 @@ def _vectors(law: Law, arrays: dict[str, np.ndarray]) -> str:
 
     lines = ["/* Samples of a simulated run, for selftest.c; the torque of every CHECKED-th. */"]
     lines.append(f"enum {{ SAMPLES = {len(v.q)}, CHECKED = {CHECK_INTERVAL} }};")
-    names = ("q", "dq", *REFERENCE)[: len(v.first)]
+    names = ("q", "dq", *law.further_inputs)
     lines += [
         f"static const {real} first_{x}[{n}] = {row(y)};"
         for x, y in zip(names, v.first, strict=True)

@@ -12,7 +12,7 @@ import numpy as np
 from iblf_jax import __version__
 from iblf_jax.deployment.build import build, write_files, zig
 from iblf_jax.deployment.c_names import Parameters
-from iblf_jax.deployment.loop_program import OUTPUTS, Loop
+from iblf_jax.deployment.loop_program import Loop, LoopOutput, loop_outputs
 from iblf_jax.deployment.write_c import SEGMENT, fill_template, shared_values
 from iblf_jax.kernels import plain_function
 from iblf_jax.simulation.noise import has_noise
@@ -28,6 +28,7 @@ class GeneratedLoop(NamedTuple):
 
     files: dict[str, str]
     parameters: Parameters
+    outputs: tuple[LoopOutput, ...]
     values: dict[str, Any]
     """The values for the placeholders of the templates."""
 
@@ -40,6 +41,7 @@ def loop_files(
     setting_count, noise_setting = 1, ""
     if has_noise(scenario):
         setting_count, noise_setting = 5, ", then the four words of the noise's key"
+    outputs = loop_outputs(scenario)
     output_count = len(loop.step.outputs)
     inputs = {
         "shared": parameters.numbers,
@@ -59,13 +61,13 @@ def loop_files(
         "settings": setting_count,
         "output_count": output_count,
         "memory_size": loop.carry_size,
-        "outputs": ", ".join(OUTPUTS),
+        "outputs": ", ".join(output.name for output in outputs),
         "noise_setting": noise_setting,
         "buffer_rows": RECORD_BUFFER,
         "real_bytes": loop.step.dtype.itemsize,
     }
     texts = {f"{name}.{ending}": fill_template(f"loop.{ending}", values) for ending in "hc"}
-    return GeneratedLoop(texts, parameters, values)
+    return GeneratedLoop(texts, parameters, outputs, values)
 
 
 def _json_numbers(value: np.ndarray) -> Any:
@@ -84,10 +86,10 @@ def table(generated: GeneratedLoop, run_settings: list[float]) -> dict[str, Any]
         offset += math.prod(field.shape)
     values, n = generated.values, generated.values["joints"]
     columns = [
-        {"name": name, "unit": unit, "offset": k * n, "size": n}
-        for k, (name, unit) in enumerate(OUTPUTS.items())
+        {"name": output.name, "unit": output.unit, "offset": k * n, "size": n}
+        for k, output in enumerate(generated.outputs)
     ]
-    columns.append({"name": "status", "unit": "1", "offset": len(OUTPUTS) * n, "size": 1})
+    columns.append({"name": "status", "unit": "1", "offset": len(columns) * n, "size": 1})
     return {
         "parameters": rows,
         "count": offset,

@@ -192,13 +192,11 @@ def _instants(scenario: Scenario, run: Any) -> Iterator[tuple[jax.Array, LoopSta
         return
     by_decreasing_xi = inside[np.argsort(xi[inside])[::-1]]
     nearest = np.resize(by_decreasing_xi, INSTANTS)
-    q, dq = (jnp.asarray(np.asarray(x)[nearest], dtype) for x in (run.q, run.dq))
-    yield jnp.asarray(recorded[nearest], dtype), _states_at(scenario, q, dq)
+    x = jnp.asarray(np.asarray(run.x)[nearest], dtype)
+    yield jnp.asarray(recorded[nearest], dtype), _states_at(scenario, x)
 
 
 @jax.jit
-def _states_at(scenario: Scenario, q: jax.Array, dq: jax.Array) -> LoopState:
-    """Initial states of a loop at these positions and velocities, (INSTANTS, ...)."""
-    return jax.vmap(
-        lambda q, dq: initial_state(dataclasses.replace(scenario, initial=Initial(q, dq)))
-    )(q, dq)
+def _states_at(scenario: Scenario, x: jax.Array) -> LoopState:
+    """Initial states of a loop at these states of the plant, (INSTANTS, r, n)."""
+    return jax.vmap(lambda x: initial_state(dataclasses.replace(scenario, initial=Initial(x=x))))(x)

@@ -22,6 +22,7 @@ from iblf_jax.core.optional import attributes
 from iblf_jax.core.pytree import layers, wrapped_field
 from iblf_jax.kernels import Known
 from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.world import plants
 from iblf_jax.world.robots._base import robot_member
 
 QUATERNIONS = ("rotation", "tip_rotation")
@@ -76,28 +77,43 @@ def _names(path: Sequence[Any]) -> tuple[str, ...]:
     return tuple(key.name if isinstance(key, jax.tree_util.GetAttrKey) else "" for key in path)
 
 
-def robot_constants(scenario: Scenario) -> StructuralConstants | None:
-    """The structural constants of a scenario's robots; None if the robots are traced or declare no
-    geometry.
+def _geometry_fields(scenario: Scenario) -> dict[tuple[str, ...], tuple[str, ...]]:
+    """The names of the geometry fields of the robots of a scenario, by the paths of the robots.
+
+    A robot is the plant or the model itself, or the field `robot` of either.
     """
-    robots = {
-        name: _field_names(robot_member(type(robot), "geometry_fields"))
-        for name, robot in (("plant", scenario.plant), ("model", scenario.model))
+    parts: dict[str, Any] = {"plant": scenario.plant, "model": scenario.model}
+    robots: dict[tuple[str, ...], Any] = {}
+    for name, part in parts.items():
+        robots[name,] = part
+        if plants.is_chain(part):
+            robots[name, "robot"] = plants.robot_of(part)
+    return {
+        path: _field_names(robot_member(type(robot), "geometry_fields"))
+        for path, robot in robots.items()
     }
+
+
+def robot_constants(scenario: Scenario) -> StructuralConstants | None:
+    """The structural constants of a scenario's robots, also of those inside a plant in
+    strict-feedback form; None if the robots are traced or declare no geometry.
+    """
+    robots = _geometry_fields(scenario)
     if not any(robots.values()) or not checks.is_concrete((scenario.plant, scenario.model)):
         return None
     numbers: list[Known | None] = []
     first_of_field: dict[str, tuple[int, np.ndarray]] = {}
     for path, leaf in jax.tree_util.tree_flatten_with_path(scenario)[0]:
         names = _names(path)
-        if len(names) != 2 or names[1] not in robots.get(names[0], ()):
+        robot, field = names[:-1], names[-1]
+        if field not in robots.get(robot, ()):
             numbers += [None] * int(np.size(leaf))
             continue
         values = np.asarray(leaf, float)
-        twin = first_of_field.get(names[1])
-        first_of_field.setdefault(names[1], (len(numbers), values))
+        twin = first_of_field.get(field)
+        first_of_field.setdefault(field, (len(numbers), values))
         row = 1
-        if names[1] in QUATERNIONS:
+        if field in QUATERNIONS:
             row = values.shape[-1]
         for i in range(values.size):
             numbers.append(_of_entry(values, i, row, numbers, twin))

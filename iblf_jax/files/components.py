@@ -36,10 +36,11 @@ from iblf_jax.files.values import (
     numbers,
     without_none,
 )
-from iblf_jax.world import bounds, disturbances, references, regions, robots
+from iblf_jax.world import bounds, disturbances, plants, references, regions, robots
 
 FAMILIES: dict[Any, tuple[str, dict[str, Any]]] = {
     robots.Robot: ("robots", robots.MEMBERS),
+    plants.Plant: ("plants", plants.MEMBERS),
     references.Reference: ("references", references.MEMBERS),
     bounds.Side: ("bounds", bounds.MEMBERS),
     regions.Region: ("regions", regions.MEMBERS),
@@ -58,17 +59,33 @@ FAMILIES: dict[Any, tuple[str, dict[str, Any]]] = {
 def field_hints(cls: Any) -> dict[str, Any]:
     """Field name -> annotation of a component class; empty if they cannot be resolved."""
     try:
-        return typing.get_type_hints(cls)
+        return typing.get_type_hints(cls, include_extras=True)
     except (NameError, TypeError, AttributeError):
         return {}
 
 
+def families_of(hint: Any) -> list[Any]:
+    """The protocols of the families of which an annotation allows the members; none if it allows
+    other classes.
+
+    `Annotated[Robot, Plant]` allows those of both families.
+    """
+    options = [without_none(hint)[0]]
+    if typing.get_origin(hint) is typing.Annotated:
+        options = [hint.__origin__, *hint.__metadata__]
+    if all(option in FAMILIES for option in options):
+        return options
+    return []
+
+
 def members_of(hint: Any) -> tuple[str, dict[str, Any]]:
-    """Name and members of the family that an annotation names; for other annotations all members
+    """Name and members of the families that an annotation names; for other annotations all members
     whose names are unique.
     """
-    if hint in FAMILIES:
-        return FAMILIES[hint]
+    named = families_of(hint)
+    if named:
+        words = " or ".join(FAMILIES[family][0] for family in named)
+        return words, {name: x for family in named for name, x in FAMILIES[family][1].items()}
     seen: dict[str, list[Any]] = {}
     for _, members in FAMILIES.values():
         for name, cls in members.items():
@@ -90,6 +107,9 @@ def encode(part: Any, hint: Any, path: str) -> Any:
     Raises:
       ValueError: a class that is in no MEMBERS, or an object that a file cannot hold.
     """
+    if part is None:
+        return NONE
+    family = hint
     hint, _ = without_none(hint)
     if isinstance(part, jax.Array | np.ndarray | np.generic | float | int):
         return encode_numbers(part)
@@ -99,18 +119,25 @@ def encode(part: Any, hint: Any, path: str) -> Any:
         raise not_storable(path, part, "a component, an array or a tuple of these")
     if type(part) is hint:
         return encode_fields(part, path)
-    family, members = members_of(hint)
+    words, members = members_of(family)
     name = next((name for name, cls in members.items() if cls is type(part)), None)
     if name is None:
         cls = type(part).__name__
-        where = family if hint in FAMILIES else "<family>"
-        expected = f"a member of {family} that a file can name ({', '.join(members)})"
+        expected = f"a member of {words} that a file can name ({', '.join(members)})"
         remedy = (
             "Name your class before saving and loading:"
-            f' iblf_jax.{where}.MEMBERS["my_name"] = {cls}.'
+            f' iblf_jax.{_module_of(part, family)}.MEMBERS["my_name"] = {cls}.'
         )
         raise checks.fail(path, Words(f"an object of class {cls}"), expected, remedy)
     return {"kind": name, **encode_fields(part, path)}
+
+
+def _module_of(part: Any, hint: Any) -> str:
+    """The module of the family to which an object of an unknown class belongs, in words."""
+    named = families_of(hint)
+    if plants.is_chain(part) and plants.Plant in named:
+        return "plants"
+    return FAMILIES[named[0]][0] if named else "<family>"
 
 
 def encode_fields(part: Any, path: str) -> dict[str, Any]:
@@ -148,9 +175,12 @@ def decode(value: Any, hint: Any, path: str) -> Any:
     Raises:
       ValueError: a value that does not fit; the message names the dotted key.
     """
-    hint, _ = without_none(hint)
-    if hint in FAMILIES:
-        return _decode_member(as_table(value, path), hint, path)
+    family = hint
+    hint, is_optional = without_none(hint)
+    if is_optional and value == NONE:
+        return None
+    if families_of(family):
+        return _decode_member(as_table(value, path), family, path)
     if dataclasses.is_dataclass(hint):
         return decode_fields(hint, value, path)
     is_tuple = typing.get_origin(hint) is tuple
@@ -200,7 +230,12 @@ def _decode_field(value: Any, field: dataclasses.Field, hint: Any, key: str) -> 
     return numbers(value, key, field.metadata["unit"])
 
 
-SHAPES = {"joint": ", or one per joint", "any": " or a list of numbers", "scalar": ""}
+SHAPES = {
+    "joint": ", or one per joint",
+    "level": ", or one per level",
+    "any": " or a list of numbers",
+    "scalar": "",
+}
 """Shape of a leaf -> the words of an error message."""
 
 

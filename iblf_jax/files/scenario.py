@@ -3,7 +3,7 @@ structure and bit-identical numbers.
 
 A complete file has one table per component, and `kind` names the member of the family:
 
-    [robot]                         # plant and model; or [plant] and [model] if they differ
+    [robot]                         # plant and model, or [plant]; both tables if they differ
     kind = "two_link"
     mass = [2.0, 0.85]
     ...
@@ -59,6 +59,7 @@ from iblf_jax.presets import PRESETS
 from iblf_jax.simulation.integrators import TABLEAUS
 from iblf_jax.simulation.paths import parameters, with_parameters
 from iblf_jax.simulation.scenario import Scenario, check_leaves
+from iblf_jax.world import plants
 
 COMPONENTS = ("robot", *(field.name for field in dataclasses.fields(Scenario)))
 RUN = ("duration", "dt", "method", "record_every")
@@ -155,7 +156,8 @@ def scenario_to_dict(scenario: Scenario) -> dict[str, Any]:
     tables = encode_fields(scenario, "")
     robots = {name: tables.pop(name) for name in ("plant", "model")}
     if _equal(scenario.plant, scenario.model):
-        robots = {"robot": robots["plant"]}
+        name = "plant" if plants.is_chain(scenario.plant) else "robot"
+        robots = {name: robots["plant"]}
     tables = robots | tables
     if dtype != jnp.result_type(float):
         tables = {"dtype": str(dtype), **tables}

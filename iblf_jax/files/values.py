@@ -170,6 +170,13 @@ def encode_static(value: Any, path: str) -> Any:
         raise not_storable(path, value, "text without unpaired surrogates")
     if isinstance(value, bool | str | int) or (isinstance(value, float) and math.isfinite(value)):
         return value
+    if callable(value):
+        expected = "a class whose fields a file can hold"
+        remedy = (
+            "Write the function as a method of a class (iblf_jax.component), and name the class in"
+            " the MEMBERS of its family before saving and loading."
+        )
+        raise checks.fail(path, Words("a function"), expected, remedy)
     raise not_storable(path, value, "a finite number, a string, a bool or a tuple of these")
 
 

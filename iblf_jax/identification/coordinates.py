@@ -29,6 +29,7 @@ from iblf_jax.identification.replay import LeafSlice
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Scenario, with_parts
 from iblf_jax.studies.draws import check_paths, paths_overlap
+from iblf_jax.world import plants
 from iblf_jax.world.robots._base import robot_member
 
 MIN_POSITIVE_FACTOR = 1e-3
@@ -124,6 +125,22 @@ def with_widths(scenario: Scenario, given: Any) -> Any:
     return found
 
 
+def _check_robot(scenario: Scenario) -> None:
+    """Raises ValueError for a plant in strict-feedback form: a log holds the positions of joints
+    and the torques on them.
+    """
+    if not plants.is_chain(scenario.plant):
+        return
+    remedy = "Its equation of motion gives the torques of a log."
+    if plants.robot_of(scenario.plant) is not None:
+        remedy = (
+            "Identify the robot inside from torques on its joints, in a scenario with"
+            " plant=scenario.plant.robot."
+        )
+    kind = type(scenario.plant).__name__
+    raise checks.fail("scenario.plant", kind, "a robot", remedy)
+
+
 def coordinates(
     scenario: Scenario, given: Any, limits: Mapping[str, Any]
 ) -> tuple[Scenario, Coordinates]:
@@ -135,9 +152,10 @@ def coordinates(
       limits: path -> (low, high), in the leaf's unit.
 
     Raises:
-      ValueError: an unknown or overlapping path, one that does not move the plant, or limits that
-        exclude the start.
+      ValueError: a plant that is no robot, an unknown or overlapping path, one that does not move
+        the plant, or limits that exclude the start.
     """
+    _check_robot(scenario)
     requested = _checked_paths(scenario, given)
     scenario, plant_paths = scenario_of_plant(scenario, requested)
     for path in limits:

@@ -290,7 +290,7 @@ def sample_at(
     terms = uncertain(scenario, t, q, dq, moved, tau, signals, higher)
     optional = _level_signals(scenario, t, higher, signals)
     if scenario.regions:
-        optional["region_margin"] = margins(scenario.regions, scenario.plant, q)
+        optional["region_margin"] = margins(scenario.regions, plants.robot_of(scenario.plant), q)
     return Sample(
         t=t,
         dt=jnp.asarray(dt, t.dtype),

@@ -135,6 +135,14 @@ def observer_estimate(
     return observer.estimate(t, q, dq, _observed_robot(scenario), state)  # type: ignore[no-any-return]
 
 
+def estimate_shape(scenario: Any) -> tuple[int, ...]:
+    """The shape of the estimate that a law without an observer receives: (n,), or (r, n) for a
+    model in strict-feedback form.
+    """
+    n = scenario.plant.n
+    return (scenario.model.order, n) if plants.is_chain(scenario.model) else (n,)
+
+
 def observer_arguments(
     scenario: Any,
     observer: Any,

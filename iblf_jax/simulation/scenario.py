@@ -12,7 +12,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any, ClassVar, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -194,14 +194,14 @@ class Scenario:
         sensor comes without a sampling.
     """
 
-    plant: Robot
+    plant: Annotated[Robot, Plant]
     reference: Reference
     bounds: Bounds
     controller: Controller
     initial: Initial
     observer: Observer = NoObserver()
     disturbance: Disturbance = Nothing()
-    model: Robot = None  # type: ignore[assignment]
+    model: Annotated[Robot, Plant] = None  # type: ignore[assignment]
     sampling: Sampling | None = None
     sensor: Sensor = IdealSensor()
     actuator: Actuator = IdealActuator()
@@ -841,7 +841,7 @@ def _check_start(scenario: Scenario) -> None:
         _check_inside("initial.dq[{}]", "velocity bounds", dq, slowest, fastest, remedy)
     for region, margin in zip(scenario.regions, start.region_margins, strict=True):
         if not margin > 0:
-            point = regions.in_words(region, scenario.plant)
+            point = regions.in_words(region, plants.robot_of(scenario.plant))
             got = f"{point} {-margin:.4g} m beyond its boundary"
             expected = "a start inside all regions"
             raise checks.fail("initial.q", got, expected, "Move the start or the region.")

@@ -78,13 +78,17 @@ class VectorField:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What each entry of x is, m names: "q[0]" [rad], "dq[0]" [rad/s], then "controller..." and
-        "observer..." in units of their own.
+        """What each entry of x is, m names: "q[0]" [rad], "dq[0]" [rad/s], "controller..." and
+        "observer..." in units of their own, and "x[2, 0]" for the levels from the third on of a
+        plant in strict-feedback form.
         """
         found = []
         for path, leaf in jax.tree_util.tree_leaves_with_path(_layout(self.scenario)):
             name = jax.tree_util.keystr(path).lstrip(".")
             for index in np.ndindex(leaf.shape):
+                if name == "higher":
+                    found.append(f"x[{index[0] + 2}, {index[1]}]")
+                    continue
                 entry = ", ".join(map(str, index))
                 found.append(f"{name}[{entry}]" if index else name)
         return tuple(found)

@@ -49,6 +49,7 @@ from iblf_jax.simulation.units import unit_text
 from iblf_jax.studies.comparison import Comparison
 from iblf_jax.studies.equal_effort import NO_EFFORT, EffortSearch, Trials, grid, search
 from iblf_jax.studies.time_step import needed_dt
+from iblf_jax.world import plants
 
 NAMES = (*LAWS, *KEEPERS)
 Laws = Sequence[str | Controller] | Mapping[str, str | Controller]
@@ -71,7 +72,8 @@ def compare(
                    rms|tau - G0(q)| of law i at gains c k1, c K2  =  that of the first law
 
     Args:
-      scenario: plant, reference, bounds, disturbance, observer and start, shared by all laws; the
+      scenario: plant, reference, bounds, disturbance, observer and start, shared by all laws; a law
+        of robots takes the robot inside a plant in strict-feedback form as its model.  The
         k1, K2, o and reading of its own law are those of the laws that are given by name, and a
         torque limit around its law is put around them too.
       laws: names (`iblf_jax.controllers.LAWS` or `KEEPERS`) or laws, or a dict of either by the
@@ -171,7 +173,17 @@ def _with_law(scenario: Scenario, law: str | Controller) -> Scenario:
         observer = scenario.observer
         if not law_member(unwrapped(law), "uses_observer"):
             observer = NoObserver()
-    return dataclasses.replace(scenario, controller=controller, observer=observer)
+    model = _model_for(controller, scenario)
+    return dataclasses.replace(scenario, controller=controller, observer=observer, model=model)
+
+
+def _model_for(law: Controller, scenario: Scenario) -> Any:
+    """The scenario's model; the robot inside it for a law of robots."""
+    model = scenario.model
+    if law_member(unwrapped(law), "receives_x") or not plants.is_chain(model):
+        return model
+    robot = plants.robot_of(model)
+    return model if robot is None else robot
 
 
 def _limited_as(controller: Controller, law: Controller) -> Controller:

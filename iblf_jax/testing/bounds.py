@@ -11,6 +11,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.simulation.levels import (
+    estimate_shape,
+    law_state,
+    levels_on_reference,
+    start_levels,
+)
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.testing._contract import Findings
 
@@ -53,10 +59,12 @@ def check_at_the_bounds(findings: Findings, scenario: Scenario) -> bool:
 def _command(
     scenario: Scenario, law: Any, q: jax.Array, dq: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Torque, alpha and V1 without a disturbance."""
-    context = scenario.context
-    state = law.init(scenario.initial.q, scenario.initial.dq, context)
-    command = law.command(jnp.asarray(TIME), q, dq, jnp.zeros_like(q), context, state)[0]
+    """Torque, alpha and V1 without a disturbance; further levels are those on the reference."""
+    context, t = scenario.context, jnp.asarray(TIME)
+    state = law.init(*law_state(scenario, *start_levels(scenario)), context)
+    measured = law_state(scenario, q, dq, levels_on_reference(scenario, t)[2])
+    f_hat = jnp.zeros(estimate_shape(scenario), q.dtype)
+    command = law.command(t, *measured, f_hat, context, state)[0]
     return command.tau, command.alpha, command.V1
 
 
@@ -67,7 +75,8 @@ def _infinite_in_e2(findings: Findings, scenario: Scenario) -> bool:
     def slope(scenario, e2):
         law, tube = scenario.controller, scenario.context.tube(jnp.asarray(TIME))
         q = tube.q_d + 0.3 * tube.k_u
-        alpha = _command(scenario, law, q, tube.dq_d)[1]
+        dq = levels_on_reference(scenario, jnp.asarray(TIME))[1]
+        alpha = _command(scenario, law, q, dq)[1]
         one = jnp.ones_like(alpha)
         return jax.jvp(lambda dq: _command(scenario, law, q, dq)[0], (alpha + e2,), (one,))[1]
 
@@ -142,7 +151,7 @@ def _at_points(scenario: Scenario, axis: str) -> Points:
         def at(xi):
             law, context, t = scenario.controller, scenario.context, jnp.asarray(TIME)
             tube = context.tube(t)
-            q, dq = tube.q_d, tube.dq_d
+            q, dq = levels_on_reference(scenario, t)[:2]
             limits: Any = () if scenario.velocity_bounds is None else context.speed_limits(t)
             if axis == "xi":
                 q = tube.q_d + xi * jnp.where(xi > 0, tube.k_u, tube.k_l)

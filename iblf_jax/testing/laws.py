@@ -14,6 +14,12 @@ from iblf_jax.core import notices
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import VIOLATED, Status
 from iblf_jax.engine.simulate import simulate
+from iblf_jax.simulation.levels import (
+    estimate_shape,
+    law_state,
+    levels_on_reference,
+    start_levels,
+)
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.testing._contract import (
     Findings,
@@ -49,7 +55,7 @@ def check_law(
     Args:
       law: an instance.
       scenario: the scenario of the closed loop; if not given the paper's simulation, or a similar
-        one for the number of joints of the law.
+        one for the number of joints of the law.  A law for plants of order > 2 needs one.
       n: number of joints, if no scenario is given; that of its leaves if not given, 2 if these
         are scalars.
 
@@ -73,21 +79,24 @@ def check_law(
                 base, controller=law, velocity_bounds=speeds, plant=plant, model=base.model
             )
             base = in_dtype(base, "float64")
+            law_member(unwrapped(law), "check_start")(base.context)
         except ValueError as error:
             findings.stop(f"a Scenario does not accept it ({error})")
         in_both_types(findings, _structure, base)
         t = jnp.asarray(0.7)
         tube = base.context.tube(t)
-        q, dq = tube.q_d + 0.3 * tube.k_u, tube.dq_d - 0.2
-        f_hat = jnp.linspace(0.1, 0.2, base.n)
+        _, dq, higher = levels_on_reference(base, t)
+        measured = law_state(base, tube.q_d + 0.3 * tube.k_u, dq - 0.2, higher)
+        f_hat = jnp.broadcast_to(jnp.linspace(0.1, 0.2, base.n), estimate_shape(base))
 
-        def outputs(law, t, q, dq, f_hat, context):
-            command, rate = law.command(t, q, dq, f_hat, context, law.init(q, dq, context))
+        def outputs(law, t, measured, f_hat, context):
+            own = law.init(*measured, context)
+            command, rate = law.command(t, *measured, f_hat, context, own)
             rates = leaves_by_name("its state's rate", rate)
             found = {"tau": command.tau, "alpha": command.alpha, "V1": command.V1}
             return found | leaves_by_name("input", command.input) | rates
 
-        check_function(findings, outputs, base.controller, (t, q, dq, f_hat, base.context))
+        check_function(findings, outputs, base.controller, (t, measured, f_hat, base.context))
         check_claims(findings, base)
         is_defined_beyond = check_at_the_bounds(findings, base)
         findings.stop_if_any()
@@ -98,11 +107,14 @@ def check_law(
 def _structure(findings: Findings, scenario: Scenario) -> None:
     law = scenario.controller
     context = scenario.context
-    q, dq = scenario.initial.q, scenario.initial.dq
+    q = scenario.initial.q
     t = jnp.zeros((), q.dtype)
-    state = shape_of(findings, "init(q, dq, context)", law.init, q, dq, context)
-    label = "command(t, q, dq, f_hat, context, state)"
-    answer = shape_of(findings, label, law.command, t, q, dq, jnp.zeros_like(q), context, state)
+    measured = law_state(scenario, *start_levels(scenario))
+    names = "x" if law_member(unwrapped(law), "receives_x") else "q, dq"
+    state = shape_of(findings, f"init({names}, context)", law.init, *measured, context)
+    label = f"command(t, {names}, f_hat, context, state)"
+    f_hat = jnp.zeros(estimate_shape(scenario), q.dtype)
+    answer = shape_of(findings, label, law.command, t, *measured, f_hat, context, state)
     is_pair = isinstance(answer, tuple) and len(answer) == 2 and isinstance(answer[0], Command)
     findings.result_is(is_pair, label, answer, "It must be a pair (Command, rate of the state)")
     command, rate = answer

@@ -73,7 +73,7 @@ def against_jax(folder, scenario, *, external_reference=False, dtype="float64"):
     scenario = canonical(ij.astype(scenario, dtype))
     inputs, tube = walk(scenario, dtype)
     if external_reference:
-        inputs = SampleInputs(*inputs[:3], tube.q_d, tube.dq_d, tube.ddq_d)
+        inputs = inputs._replace(q_d=tube.q_d, dq_d=tube.dq_d, ddq_d=tube.ddq_d)
     first = jax.tree.map(lambda x: x[0], inputs)
 
     def answers(scenario, first, inputs):

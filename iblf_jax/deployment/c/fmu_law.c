@@ -9,7 +9,7 @@ static void write_outputs(fmu *f) {
 
 static int begin(fmu *f) {
   const double *q = f->inputs;
-  if (${name}_init(&f->p, &f->s, q, q + ${joints}${reference}) != 0) return failed(f, "an input is not finite");
+  if (${name}_init(&f->p, &f->s, q, q + ${joints}${further}) != 0) return failed(f, "an input is not finite");
   write_outputs(f);
   return OK;
 }
@@ -18,9 +18,9 @@ static int begin(fmu *f) {
 static int advance(fmu *f) {
   const double *q = f->inputs;
   double tau[${joints}];
-  const int status = ${name}_step(&f->p, &f->s, STEP * (double)f->index, q, ${dq}${reference}, tau);
+  const int status = ${name}_step(&f->p, &f->s, STEP * (double)f->index, q, ${dq}${further}, tau);
   f->index += 1;
-  f->outputs[3 * ${joints}] = (double)status;
+  f->outputs[OUTPUTS - 1] = (double)status;
   if ((status & ${upper}_NOT_FINITE) == 0) return OK;
   if (f->log) f->log(f->environment, WARNING, "logStatusWarning", "an input or a result is not finite: the torque is the last valid one");
   return WARNING;

@@ -6,33 +6,33 @@ ${prelude}static int are_finite(const real *x, int count) {
   return all_finite;
 }
 
-int ${name}_init(const ${name}_parameters *p, ${name}_state *s, const real *q, const real *dq${reference_parameters}) {
+int ${name}_init(const ${name}_parameters *p, ${name}_state *s, const real *q, const real *dq${further_parameters}) {
   static const real zero[${joints}] = {0};
   real result[${memory_count} + ${joints}];
   int valid;
   ${default_dq}
   memset(s, 0, sizeof *s);
-  valid = are_finite(q, ${joints}) && dq != NULL && are_finite(dq, ${joints})${reference_finite};
+  valid = are_finite(q, ${joints}) && dq != NULL && are_finite(dq, ${joints})${further_finite};
   if (!valid) return ${upper}_NOT_FINITE;
-  ${name}_start(p, zero, q, dq, ${reference_values}result);
+  ${name}_start(p, zero, q, dq, ${further_values}result);
   if (!are_finite(result, ${memory_count} + ${joints})) return ${upper}_NOT_FINITE;
   ${keep_start}memcpy(s->tau, result + ${memory_count}, sizeof s->tau);
   return 0;
 }
 
-int ${name}_step(const ${name}_parameters *p, ${name}_state *s, real t, const real *q, const real *dq${reference_parameters}, real *tau) {
-  enum { N = ${joints}, M = ${memory_count} };
+int ${name}_step(const ${name}_parameters *p, ${name}_state *s, real t, const real *q, const real *dq${further_parameters}, real *tau) {
+  enum { N = ${joints}, M = ${memory_count}, E = ${estimate_size} };
   static const real zero[N] = {0};
-  real result[M + 3 * N + ${flags}];
-  int k, status = 0, valid = are_finite(&t, 1) && are_finite(q, N)${reference_finite};
+  real result[M + 2 * N + E + ${flags}];
+  int k, status = 0, valid = are_finite(&t, 1) && are_finite(q, N)${further_finite};
   ${default_dq}
   valid = valid && dq != NULL && are_finite(dq, N);
-  if (valid) ${name}_sample(p, s->memory, &t, q, dq, ${reference_values}result);
-  if (valid && are_finite(result, M + 3 * N)) {
+  if (valid) ${name}_sample(p, s->memory, &t, q, dq, ${further_values}result);
+  if (valid && are_finite(result, M + 2 * N + E)) {
     ${keep_sample}memcpy(s->tau, result + M, sizeof s->tau);
     memcpy(s->alpha, result + M + N, sizeof s->alpha);
     memcpy(s->f_hat, result + M + 2 * N, sizeof s->f_hat);
-    for (k = 0; k < ${flags}; k++) status |= result[M + 3 * N + k] > (real)0 ? 2 << k : 0;
+    for (k = 0; k < ${flags}; k++) status |= result[M + 2 * N + E + k] > (real)0 ? 2 << k : 0;
   } else {
     status = ${upper}_NOT_FINITE;
   }

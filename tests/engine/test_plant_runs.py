@@ -1,0 +1,122 @@
+"""Runs of plants in strict-feedback form by every executor, their derivatives, and the tools that
+choose a step or a period."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import loops_of_plants
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import iblf_jax as ij
+from iblf_jax.engine.structural_constants import robot_constants
+from iblf_jax.simulation.paths import get
+
+SHORT = {"duration": 0.3, "dt": 1e-3}
+CASES = loops_of_plants.CASES
+
+
+@pytest.mark.parametrize("case", ["user class", "electric drive"])
+def test_names_and_a_solution_of_scipy(case):
+    scenario = CASES[case]()
+    field = ij.vector_field(scenario)
+    assert "x[2, 0]" in field.names
+    found = solve_ivp(
+        field, (0.0, 0.3), np.asarray(field.start), rtol=1e-10, atol=1e-12, method="LSODA"
+    )
+    run = ij.simulate(scenario, **SHORT)
+    np.testing.assert_allclose(found.y[: scenario.n, -1], run.q[-1], atol=1e-9)
+    np.testing.assert_array_equal(field.unpack(found.y.T).higher.shape[1:], run.higher.shape[1:])
+
+
+LEAVES = {
+    "user class": ("plant.D", "model.N", "controller.k[2]", "initial.higher"),
+    "electric drive": ("plant.inductance", "plant.robot.mass[1]", "state_bounds[1].upper.value"),
+    "flexible joint": ("plant.stiffness", "model.motor_inertia", "initial.q"),
+}
+
+
+@pytest.mark.parametrize(
+    "case",
+    [x if x == "user class" else pytest.param(x, marks=pytest.mark.slow) for x in LEAVES],
+)
+def test_derivatives_by_leaves_are_differences(case):
+    scenario = CASES[case]()
+    for path in LEAVES[case]:
+        start = jnp.asarray(get(scenario, path))
+
+        def error(value, path=path):
+            run = ij.simulate(ij.with_parameters(scenario, {path: value}), **SHORT)
+            return 1e4 * jnp.sum(run.e1[-1] ** 2)
+
+        one = jnp.ones_like(start)
+        size = 1e-6 * max(1.0, float(jnp.max(jnp.abs(start))))
+        difference = (error(start + size * one) - error(start - size * one)) / (2.0 * size)
+        reverse = jnp.sum(jax.grad(error)(start))
+        forward = jax.jvp(error, (start,), (one,))[1]
+        np.testing.assert_allclose(reverse, forward, rtol=1e-9, err_msg=path)
+        np.testing.assert_allclose(forward, difference, rtol=1e-3, atol=1e-6, err_msg=path)
+
+
+def test_float32_follows_float64():
+    scenario = CASES["user class"]()
+    exact = ij.simulate(scenario, **SHORT)
+    coarse = ij.simulate(ij.astype(scenario, "float32"), **SHORT)
+    assert coarse.x.dtype == jnp.float32
+    np.testing.assert_allclose(coarse.x, exact.x, atol=1e-4)
+
+
+def test_a_batch_is_its_runs():
+    scenario = CASES["user class"]()
+    starts = jnp.asarray([[[0.2], [0.0], [0.0]], [[0.1], [0.1], [-0.2]]])
+
+    def run(x):
+        return ij.simulate(ij.with_parts(scenario, initial=ij.Initial(x=x)), **SHORT).x
+
+    batch = jax.vmap(run)(starts)
+    np.testing.assert_allclose(batch[1], run(starts[1]), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "case", ["user class", pytest.param("flexible joint", marks=pytest.mark.slow)]
+)
+def test_a_step_and_a_period_are_found(case):
+    scenario = CASES[case]()
+    dt = ij.recommended_dt(scenario, duration=2.0)
+    run = ij.simulate(scenario, duration=2.0, dt=dt)
+    assert int(run.status) == 0
+    period = ij.recommended_period(scenario, duration=2.0)
+    sampled = ij.with_parts(scenario, sampling=ij.Sampling(period))
+    run = ij.simulate(sampled, duration=10 * period, dt=period)
+    assert int(run.status) == 0
+
+
+def test_the_error_of_a_sampled_loop_includes_all_levels():
+    sampled = CASES["electric drive"](
+        sampling=ij.Sampling(2e-3), actuator=ij.actuators.Motor(bandwidth=300.0, limit=60.0)
+    )
+    run, finer = (ij.simulate(sampled, duration=0.2, dt=dt) for dt in (2e-3, 1e-4))
+    error = float(jnp.max(jnp.abs(run.q[-1] - finer.q[-1])))
+    assert 0.1 * error < float(jnp.max(run.metrics.numerical_error)) < 1e-3
+
+
+def test_the_geometry_of_the_robot_inside_a_plant_is_compiled_in():
+    axis = [[0.0, 0.0, 1.0], [0.0, 0.0, 1.0]]
+    arm = ij.robots.Arm(
+        mass=[2.0, 1.0],
+        centre=[[0.1, 0.0, 0.0], [0.2, 0.0, 0.0]],
+        inertia=[[0.02, 0.03, 0.03, 0.0, 0.0, 0.0], [0.01, 0.01, 0.02, 0.0, 0.0, 0.0]],
+        position=[[0.0, 0.0, 0.3], [0.4, 0.0, 0.0]],
+        axis=axis,
+    )
+    plant = ij.plants.FlexibleJoint(arm, stiffness=300.0, motor_inertia=0.02)
+    rigid = loops_of_plants.rigid_law(plant=arm, model=arm)
+    flexible = loops_of_plants.flexible_joint(plant=plant)
+    mixed = loops_of_plants.rigid_law(plant=plant, model=arm)
+    expected = [x for x in robot_constants(rigid).numbers if x is not None]
+    for scenario in (flexible, mixed):
+        found = [x for x in robot_constants(scenario).numbers if x is not None]
+        assert [x.value for x in found] == [x.value for x in expected]
+    assert robot_constants(loops_of_plants.user_class()) is None
