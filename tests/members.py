@@ -208,8 +208,8 @@ LAWS = {
         k1=[2.0, 3.0], K2=20.0, o=0.1, barrier=barriers.Log(p=2), reading="corrected"
     ),
     "barrier_backstepping": controllers.BarrierBackstepping(k=(2.0, [20.0, 15.0])),
-    "barrier_backstepping_two_barriers": controllers.BarrierBackstepping(
-        k=(2.0, 20.0), barriers=(barriers.Tan(), barriers.Mapping()), c=(0.0, 0.1), weights=2.0
+    "barrier_backstepping_weighted": controllers.BarrierBackstepping(
+        k=(2.0, 20.0), barriers=(barriers.Tan(),), c=(0.0, 0.1), weights=[[1.0, 2.0], [0.5, 0.1]]
     ),
     "barrier_backstepping_filtered": controllers.BarrierBackstepping(
         k=(2.0, 20.0), barriers=(barriers.Integral(),), filter=[0.02]
