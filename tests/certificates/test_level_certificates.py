@@ -22,7 +22,21 @@ from iblf_jax.simulation.closed_loop import evaluate
 from iblf_jax.world import plants
 
 MAPPING, PERFORMANCE = ij.barriers.Mapping(), ij.barriers.PrescribedPerformance()
-ORDERS = (2, pytest.param(3, marks=pytest.mark.slow), pytest.param(4, marks=pytest.mark.slow))
+DESIGNS = {
+    "mapping, order 2": (2, MAPPING),
+    "mapping, order 3": (3, MAPPING),
+    "mapping, order 4": (4, MAPPING),
+    "prescribed performance, order 2": (2, PERFORMANCE),
+    "prescribed performance, order 3": (3, PERFORMANCE),
+    "prescribed performance, order 4": (4, PERFORMANCE),
+}
+SLOW, RELEASE = pytest.mark.slow, pytest.mark.release
+MARKS = {
+    "mapping, order 2": (),
+    "mapping, order 3": SLOW,
+    "prescribed performance, order 2": SLOW,
+}
+"""The others compile for minutes and run before a release."""
 
 
 def lyapunov(scenario, t, x, d_hat):
@@ -94,11 +108,9 @@ def both_sides(scenario, seed):
     return left, right, terms
 
 
-@pytest.mark.parametrize("order", ORDERS)
-@pytest.mark.parametrize(
-    "barrier", [MAPPING, pytest.param(PERFORMANCE, marks=pytest.mark.slow)], ids=["map", "pp"]
-)
-def test_both_sides_of_the_claim_are_equal(order, barrier):
+@pytest.mark.parametrize("design", [pytest.param(x, marks=MARKS.get(x, RELEASE)) for x in DESIGNS])
+def test_both_sides_of_the_claim_are_equal(design):
+    order, barrier = DESIGNS[design]
     scenario = random_scenario(order, (barrier,) * order, seed=order)
     left, right, terms = both_sides(scenario, order)
     claim = terms.claim
@@ -521,6 +533,7 @@ def test_alpha_outside_the_bounds_of_its_level_fails():
     assert "not valid" in certificate["inequality, levels"].note
 
 
+@pytest.mark.slow
 def test_a_sampled_loop_and_an_actuator_have_no_claim():
     sampled = pendulum(sampling=ij.Sampling(period=4e-3))
     certificate = certify(sampled, duration=0.2, dt=2e-3)
@@ -534,6 +547,7 @@ def test_a_sampled_loop_and_an_actuator_have_no_claim():
     assert "Motor has no claim" in certificate["inequality, levels"].note
 
 
+@pytest.mark.slow
 def test_a_search_for_counterexamples_finds_one_of_a_wrong_law_only():
     gains = {"k": (0.5, 1.0), "barriers": (MAPPING, ij.barriers.Quadratic())}
     start = {

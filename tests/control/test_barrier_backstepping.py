@@ -79,7 +79,12 @@ PAIRS = {
 }
 
 
-@pytest.mark.parametrize("pair", PAIRS)
+QUICK_PAIR = "mapping and prescribed performance"
+
+
+@pytest.mark.parametrize(
+    "pair", [x if x == QUICK_PAIR else pytest.param(x, marks=pytest.mark.slow) for x in PAIRS]
+)
 def test_order_two_is_full_state(pair):
     preset = ij.presets.zhang_yan_2024_full_state()
     first, second = PAIRS[pair]

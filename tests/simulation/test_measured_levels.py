@@ -122,6 +122,7 @@ def test_unmeasured_levels_of_a_flexible_joint(motor):
     np.testing.assert_allclose(run.measured.higher[late, 0], theta, atol=1e-5)
 
 
+@pytest.mark.release
 def test_a_continuous_loop_by_output_feedback():
     """The law of a continuous loop receives the estimates, too: their error at the start changes
     the voltage, and the loop converges to the one that measures all levels."""
