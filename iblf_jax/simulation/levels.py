@@ -28,8 +28,8 @@ from iblf_jax.world.robots import at_time, friction_torque
 
 
 def start_levels(scenario: Any) -> tuple[jax.Array, jax.Array, Any]:
-    """The levels q and q', (n,), and those from the third on, (r - 2, n), at t = 0; `()` for a plant
-    of order 2.
+    """The levels q and q', (n,), and those from the third on, (r - 2, n), at t = 0; `()` in their
+    place for a plant of order 2.
 
     A start given by q and q' alone is in the steady state of the plant: the static equilibrium of a
     flexible joint, the current that holds gravity.

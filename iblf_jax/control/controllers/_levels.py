@@ -43,7 +43,7 @@ class Level(NamedTuple):
     """The results of one level of the law."""
 
     alpha: jax.Array
-    """alpha_i, the virtual control: the desired value of level i + 1, (n,); u for the last level."""
+    """alpha_i, the desired value of level i + 1, (n,); u for the last level."""
     slope: jax.Array
     """w_i s_i, (n,)."""
 
