@@ -73,11 +73,11 @@ def _with_unit(line: Line, unit: Unit) -> Line:
     """A line with the unit of a level, or with that of the component that the line is about; with
     "1" for a line about components of several units.
     """
-    if isinstance(unit, str):
-        return dataclasses.replace(line, unit=unit)
-    if line.joint is None:
-        return dataclasses.replace(line, unit="1")
-    return dataclasses.replace(line, unit=of_component(unit, line.joint))
+    if line.joint is not None:
+        unit = of_component(unit, line.joint)
+    if not isinstance(unit, str):
+        unit = "1"
+    return dataclasses.replace(line, unit=unit)
 
 
 # --- the whole run --------------------------------------------------------------------------------

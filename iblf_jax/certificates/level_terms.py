@@ -338,8 +338,10 @@ def _gap(xi: jax.Array, guard: float) -> jax.Array:
 
 def _ratio_at_centre(barrier: Any, tube: Tube) -> jax.Array:
     """e/s at e = 0, (n,); that of k^2/2 for a barrier without one."""
-    found = optional_member(barrier, "error_over_slope")(tube, tube.q_d)
-    return 0.5 * jnp.minimum(tube.k_l, tube.k_u) ** 2 if found is None else found
+    stated = optional_member(barrier, "error_over_slope")(tube, tube.q_d)
+    if stated is None:
+        return 0.5 * jnp.minimum(tube.k_l, tube.k_u) ** 2
+    return stated  # type: ignore[no-any-return]
 
 
 def _rate_sizes(

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import partial, reduce
 from typing import Any
 
 import jax
@@ -385,10 +385,9 @@ def _integer_power(inputs: list[Coefficients], params: dict) -> Coefficients:
     base, power = inputs[0], None
     rest = abs(exponent)
     while rest:
-        if rest % 2 and power is None:
-            power = base
-        elif rest % 2:
-            power = _product_of(power, base)
+        if rest % 2:
+            factors = [x for x in (power, base) if x is not None]
+            power = reduce(_product_of, factors)
         rest //= 2
         if rest:
             base = _product_of(base, base)

@@ -33,6 +33,7 @@ jumps at e_r = 0 (`switching`), as the exact cancellation requires.
 
 from __future__ import annotations
 
+import copy
 import math
 from typing import Any, ClassVar
 
@@ -166,13 +167,10 @@ class BarrierBackstepping:
         weights = jnp.ones_like(x)
         if scale is not None:
             weights = scale(x) * self._centre_ratios(context, x)
-        # Not `dataclasses.replace`, which calls `check`: it has no place for weights of this shape
-        # where the law is traced.
-        copy = object.__new__(type(self))
-        for name, value in vars(self).items():
-            object.__setattr__(copy, name, value)
-        object.__setattr__(copy, "weights", weights)
-        return copy
+        # The fields are checked already; `dataclasses.replace` would check them again.
+        found = copy.copy(self)
+        object.__setattr__(found, "weights", weights)
+        return found
 
     def _centre_ratios(self, context: LawContext, x: jax.Array) -> jax.Array:
         """e_i/s_i at e_i = 0 and t = 0, (r, n), with which the weights have the scale of e_i^2."""
@@ -374,8 +372,9 @@ def _is_symmetric(context: LawContext, i: int, bounds: Bounds) -> bool:
         return True
     lower, upper = bounds.lower, bounds.upper
     if i > 0:
-        are_funnels = isinstance(lower, Funnel) and isinstance(upper, Funnel)
-        return are_funnels and _are_opposite(lower, upper)
+        if not isinstance(lower, Funnel) or not isinstance(upper, Funnel):
+            return False
+        return _are_opposite(lower, upper)
     tubes = [context.tube(jnp.asarray(t)) for t in TIMES]
     return all(np.allclose(tube.k_l, tube.k_u, rtol=1e-9, atol=0.0) for tube in tubes)
 

@@ -67,7 +67,7 @@ class Levels:
         object.__setattr__(self, "parts", parts)
 
     def _spans(self) -> Iterator[Span]:
-        """The parts with their levels and their normal random numbers, in the order of the levels."""
+        """The parts with their levels and their normal random numbers."""
         level, draw = 0, 0
         for part in self.parts:
             next_level = level + sensor_member(part, "levels")
@@ -97,11 +97,12 @@ class Levels:
     @property
     def unrounded(self) -> Levels:
         """The same without rounding."""
-        return dataclasses.replace(self, parts=tuple(unrounded(part) for part in self.parts))
+        parts = tuple(unrounded(span.part) for span in self._spans())
+        return dataclasses.replace(self, parts=parts)
 
     @property
     def resolution(self) -> jax.Array:
-        """Step of the readings of each level, (r, 1) or (r, n); 0 for a level that is not rounded."""
+        """Step of the readings of each level, (r, 1) or (r, n); 0 for a level without rounding."""
         rows: list[Any] = [0.0] * self.order
         for span in self._spans():
             step = sensor_member(span.part, "resolution")
