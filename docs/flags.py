@@ -49,6 +49,33 @@ def _weak(limit: list[float]) -> ij.Scenario:
     )
 
 
+def _flexible() -> ij.Scenario:
+    """A flexible arm with bounds on the velocities of its motors that its law does not know."""
+    narrow = ij.Bounds(lower=ij.bounds.Constant(-0.3), upper=ij.bounds.Constant(0.3))
+    return ij.with_parts(
+        ij.presets.flexible_joint_two_link(),
+        state_bounds=(None, None, narrow),
+        controller=ij.controllers.BarrierBackstepping(k=(3.0, 20.0, 60.0, 150.0)),
+    )
+
+
+def _singular() -> ij.Scenario:
+    """A chain of three integrators that loses its input."""
+
+    def gain(t, x):
+        one = jnp.ones_like(x[0])
+        return jnp.stack([one, one, jnp.where(t < 0.2, one, 0.0 * one)])
+
+    wide = ij.Bounds(lower=ij.bounds.Constant(-1.0), upper=ij.bounds.Constant(1.0))
+    return ij.Scenario(
+        plant=ij.plants.StrictFeedback(lambda t, x: jnp.zeros_like(x), gain, n=1, order=3),
+        reference=ij.references.Sinusoid(offset=0.0, amplitude=0.5),
+        bounds=wide,
+        controller=ij.controllers.BarrierBackstepping(k=(2.0, 10.0, 30.0)),
+        initial=ij.Initial(x=[[0.1], [0.0], [0.0]]),
+    )
+
+
 def _meeting() -> ij.Scenario:
     """A scenario whose upper bound decreases to the reference of the first joint."""
     upper = ij.bounds.Sinusoid(offset=0.66, amplitude=0.2, frequency=1.0, phase=1.5707963)
@@ -219,6 +246,22 @@ CASES: dict[str, Case] = {
         "Wrap the law in a `controllers.SafetyFilter`, or change the reference."
         " `run.metrics.region_margin` is the size of the violation.",
         plotting.workspace,
+    ),
+    "STATE_BOUND_VIOLATED": Case(
+        lambda: _run(_flexible(), dt=5e-4),
+        "A level of the state above the second touched or left its bound: in this example the"
+        " velocity of a motor of a flexible arm, whose law has no barrier on that level.",
+        "Use `controllers.BarrierBackstepping` with a barrier on that level, reduce the gains, or"
+        " widen the bounds. `run.metrics.level_margin` is the size of the violation.",
+        plotting.levels,
+    ),
+    "SINGULAR_GAIN": Case(
+        lambda: _run(_singular(), duration=0.4),
+        "The input of the law was not finite: the gain of a level was singular, so that the level"
+        " cannot be controlled there. In this example the gain of the last level is zero after"
+        " 0.2 s.",
+        "Keep the state away from the singularity by bounds, or change the plant's coordinates.",
+        plotting.levels,
     ),
     "INADMISSIBLE_DRAW": Case(
         lambda: None,

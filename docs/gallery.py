@@ -121,9 +121,9 @@ def index() -> str:
     """The page that shows all of them, by their first picture."""
     words = "Each figure has a script in `examples/gallery`, which the tests run."
     others = (
-        "Published examples of other authors, as scenario files in `examples/reproductions`. Each"
-        " page lists the printed and the missing parameters, the results of this package, and what"
-        " could not be reproduced."
+        "Published examples of other authors, in `examples/reproductions`: as scenario files, or as"
+        " scripts where the plant is a function of the example. Each page lists the printed and the"
+        " missing parameters, the results of this package, and what could not be reproduced."
     )
     toctree = "```{toctree}\n:hidden:\n\n" + "\n".join(script.stem for script in PAGES) + "\n```"
     parts = [

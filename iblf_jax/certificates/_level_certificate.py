@@ -81,10 +81,9 @@ def _labels(scenario: Scenario) -> tuple[LevelLabel, ...]:
     """The levels of the model, in words."""
     plant = plants.as_plant(scenario.model)
     *units, _ = plants.units_of(plant)
+    named = zip(plants.level_names(plant), units, strict=True)
     labels = []
-    for level, (name, unit) in enumerate(
-        zip(plants.level_names(plant), units, strict=True), start=1
-    ):
+    for level, (name, unit) in enumerate(named, start=1):
         bounded = scenario.context.level_bounds(level) is not None
         labels.append(LevelLabel(name, as_text(unit), bounded))
     return tuple(labels)

@@ -3,6 +3,8 @@ and the class of a user, as the design of the public interface states it."""
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -205,7 +207,8 @@ def test_a_drift_of_strict_feedback_form_is_accepted():
 
 
 def test_a_robot_as_a_plant_picks_up_its_load_when_the_robot_does():
-    arm = ij.presets.ur5(payload=ij.robots.Payload(mass=2.0, start=1.0, rise=0.1)).plant
+    load = ij.robots.Payload(mass=2.0, start=1.0, rise=0.1)
+    arm = dataclasses.replace(ij.presets.ur5().plant, carried=load)
     plant = plants.Rigid(arm)
     np.testing.assert_allclose(plant.jump_times(), [1.0, 1.1])
     q = jnp.asarray([0.3, -0.8, 0.5, 0.1, -0.2, 0.4])

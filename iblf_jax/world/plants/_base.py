@@ -378,10 +378,26 @@ def check_dimensions(name: str, plant: Plant) -> None:
     """
     checks.positive_integer(f"{name}.n", plant.n, most=checks.MAX_JOINTS)
     checks.positive_integer(f"{name}.order", plant.order, least=2, most=MAX_ORDER)
+    _check_texts(f"{name}.level_names", plant_member(plant, "level_names"), plant.order)
+    _check_texts(f"{name}.component_names", plant_member(plant, "component_names") or None, plant.n)
+    given = plant_member(plant, "units")
+    if not isinstance(given, tuple | list | None):
+        expected = "a tuple of units, of every level and of the input"
+        raise checks.fail(f"{name}.units", given, expected)
     units = units_of(plant)
     if len(units) != plant.order + 1:
         expected = f"{plant.order + 1} units, of {plant.order} levels and of the input"
         raise checks.fail(f"{name}.units", units, expected)
     for unit in units:
-        if not isinstance(unit, str) and len(unit) != plant.n:
+        is_tuple = isinstance(unit, tuple | list) and all(isinstance(x, str) for x in unit)
+        if not isinstance(unit, str) and not (is_tuple and len(unit) == plant.n):
             raise checks.fail(f"{name}.units", unit, f"one unit, or {plant.n} (one a component)")
+
+
+def _check_texts(name: str, value: Any, count: int) -> None:
+    """Raises ValueError for something that is neither None nor a tuple of so many texts."""
+    if value is None:
+        return
+    is_tuple = isinstance(value, tuple | list)
+    if not is_tuple or len(value) != count or not all(isinstance(x, str) for x in value):
+        raise checks.fail(name, value, f"a tuple of {count} texts")
