@@ -207,6 +207,13 @@ LAWS = {
     "backstepping_corrected_log": controllers.Backstepping(
         k1=[2.0, 3.0], K2=20.0, o=0.1, barrier=barriers.Log(p=2), reading="corrected"
     ),
+    "barrier_backstepping": controllers.BarrierBackstepping(k=(2.0, [20.0, 15.0])),
+    "barrier_backstepping_weighted": controllers.BarrierBackstepping(
+        k=(2.0, 20.0), barriers=(barriers.Tan(),), c=(0.0, 0.1), weights=[[1.0, 2.0], [0.5, 0.1]]
+    ),
+    "barrier_backstepping_filtered": controllers.BarrierBackstepping(
+        k=(2.0, 20.0), barriers=(barriers.Integral(),), filter=[0.02]
+    ),
     "full_state": controllers.FullState(k1=2.0, K2=[20.0, 15.0], c=1.0, o=0.1),
     "full_state_mixed": controllers.FullState(
         k1=2.0,
@@ -261,6 +268,7 @@ INPUT_MAPS = {
 OPTIONAL_FOLDS = (
     metrics.AboveGravity(),
     metrics.VelocityMargin(),
+    metrics.LevelMargin(),
     metrics.RegionMargin(),
     metrics.Slack(),
     metrics.RegionSlack(),

@@ -294,7 +294,8 @@ def region_margins(runs: Runs, *, zoom: float | None = None) -> Figure:
         came = f"runs with {', '.join(map(str, counts))} regions"
         raise checks.fail("runs", came, "runs with the same number of regions, at least one")
     scenario = curves[0].run.scenario
-    names = [escaped(in_words(region, scenario.plant)) for region in scenario.regions]
+    robot = plants.robot_of(scenario.plant)
+    names = [escaped(in_words(region, robot)) for region in scenario.regions]
     quantities = [QUANTITIES["region_margin"]] * len(names)
     return _named_rows("Distance to the boundaries", curves, quantities, names, zoom)
 

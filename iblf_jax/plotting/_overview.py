@@ -178,10 +178,11 @@ def _regions(figure: Figure, where: SubplotSpec, curve: Curve, window: Window) -
     axes = figure.add_subplot(grid[0])
     quantity = QUANTITIES["region_margin"]
     scenario = curve.run.scenario
+    robot = plants.robot_of(scenario.plant)
     names = []
     for i, region in enumerate(scenario.regions):
         draw(axes, curve, quantity.field, i, window, label="_", **_style.series(i))
-        names.append(escaped(f"{i}: {in_words(region, scenario.plant)}"))
+        names.append(escaped(f"{i}: {in_words(region, robot)}"))
     axes.legend(axes.get_lines(), names, title="regions")
     axes.axhline(0.0, color=_style.failure(), linewidth=1.0)
     _style.time_axis(axes, window)

@@ -73,9 +73,10 @@ def compare(
 
     Args:
       scenario: plant, reference, bounds, disturbance, observer and start, shared by all laws; a law
-        of robots takes the robot inside a plant in strict-feedback form as its model.  The
-        k1, K2, o and reading of its own law are those of the laws that are given by name, and a
-        torque limit around its law is put around them too.
+        of robots takes the rigid limit of a plant in strict-feedback form as its model, that of a
+        `FlexibleJoint` with the inertia of the motors, or the robot inside the plant.  The k1, K2,
+        o and reading of its own law are those of the laws that are given by name, and a torque
+        limit around its law is put around them too.
       laws: names (`iblf_jax.controllers.LAWS` or `KEEPERS`) or laws, or a dict of either by the
         name to show.  The first one sets the effort.
       duration, dt, method, record_every: as `simulate`.
@@ -178,10 +179,13 @@ def _with_law(scenario: Scenario, law: str | Controller) -> Scenario:
 
 
 def _model_for(law: Controller, scenario: Scenario) -> Any:
-    """The scenario's model; the robot inside it for a law of robots."""
+    """The scenario's model; for a law of robots its rigid limit, or the robot inside it."""
     model = scenario.model
     if law_member(unwrapped(law), "receives_x") or not plants.is_chain(model):
         return model
+    rigid = plants.plant_member(model, "rigid")
+    if rigid is not None:
+        return rigid()
     robot = plants.robot_of(model)
     return model if robot is None else robot
 

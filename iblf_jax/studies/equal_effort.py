@@ -47,7 +47,9 @@ jumps there."""
 MAX_NAMED = 4
 """Crossings, and groups of failed trials, that the text names."""
 
-NO_EFFORT = FAILED & ~(Status.VELOCITY_VIOLATED | Status.REGION_VIOLATED)
+NO_EFFORT = FAILED & ~(
+    Status.VELOCITY_VIOLATED | Status.REGION_VIOLATED | Status.STATE_BOUND_VIOLATED
+)
 """Flags of runs whose effort is not to be compared; constraints that a law does not know of are no
 obstacle."""
 

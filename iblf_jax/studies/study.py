@@ -416,7 +416,7 @@ class Study:
         bounded = next(bounded for bounded, x in first.items() if not np.min(x) > 0)
         worst, plant = int(np.argmin(first[bounded])), self.scenario.plant
         if bounded == summaries.REGIONS:
-            name, unit = in_words(self.scenario.regions[worst], plant), "m"
+            name, unit = in_words(self.scenario.regions[worst], plants.robot_of(plant)), "m"
         else:
             level = summaries.LEVELS.index(bounded)
             name = plants.component_names(plant)[worst]

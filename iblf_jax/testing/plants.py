@@ -67,11 +67,6 @@ def _dimensions(findings: Findings, plant: Any) -> None:
         plants.check_dimensions(type(plant).__name__, plant)
     except ValueError as error:
         findings.stop(str(error).removesuffix("."))
-    expected = {"level_names": plant.order, "component_names": plant.n}
-    for name, count in expected.items():
-        given = plant_member(plant, name)
-        problem = f"{name} has {len(given or ())} names"
-        findings.require(not given or len(given) == count, problem, f"It must have {count}")
 
 
 def _points(plant: Any, x: Any) -> jax.Array:

@@ -30,9 +30,13 @@ Other leaves are examined one at a time, with everything else at the start:
 | time constant of the law | the conditions | the conditions |
 | period T of the sampling | the conditions, T >= dt, the queue | the conditions |
 | delay of the sampling | 0 | the conditions, the queue |
+| own positive number of a plant in strict-feedback form | the conditions | the conditions |
+| constant upper bound of a level above the first | the start of the level | none |
+| constant lower bound of a level above the first | none | the start of the level |
 
-The period is a whole number of steps dt, and so are both ends of its range.  The queue of the
-sampling has to hold all commands in transit, delay / T + 1 of them.
+Numbers of a robot inside a plant have the ranges of a robot's.  The period is a whole number of
+steps dt, and so are both ends of its range.  The queue of the sampling has to hold all commands in
+transit, delay / T + 1 of them.
 """
 
 from __future__ import annotations
@@ -56,10 +60,11 @@ from iblf_jax.engine.step_size import fastest_along, start_and_along
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.closed_loop import LoopState, run_sampled_law
 from iblf_jax.simulation.integrators import tableau
-from iblf_jax.simulation.levels import sensor_state
+from iblf_jax.simulation.levels import sensor_state, start_levels
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.sampling import commands_in_transit
 from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.world import plants
 
 THEOREM_LIMITS = {"controller.k1": 0.05, "controller.K2": 0.505, "observer.kf": 1.01}
 """Default lower limits: just inside Theorem 2's conditions (3.17), (3.25) on the gains of the
@@ -77,7 +82,8 @@ QUEUE_FRACTION = 0.999
 """Longest delay by default, relative to the one that the queue of the sampling no longer holds."""
 LEAST_SHARE = 0.01
 """Upper end of a delay, as a share of the way to the longest one, where already the start violates
-a condition."""
+a condition; and the least distance of a bound to the start of its level, relative to that at the
+start."""
 FACTOR_BEYOND_CONDITION = 1.01
 """Upper end of a gain, relative to its start, where already the start violates a condition."""
 AS_GIVEN = "as given"
@@ -98,6 +104,7 @@ BY_NOISE = (
 )
 BY_NYQUIST = "the Nyquist frequency of the sampling"
 BY_ONE_STEP = "one time step dt, of which a period is a whole multiple"
+BY_LEVEL = "beyond it the run starts outside the bound"
 BY_QUEUE = "beyond it more commands are in transit than Sampling.queue holds"
 TOGETHER = ", with all gains at their upper ends"
 K2 = "controller.K2"
@@ -105,6 +112,8 @@ PERIOD = "sampling.period"
 DELAY = "sampling.delay"
 FREQUENCY = re.compile(r"(sensor|actuator)\..*?(cutoff|bandwidth)(\[\d+\])*$")
 """Paths of cut-off frequencies and bandwidths."""
+LEVEL_BOUND = re.compile(r"state_bounds\[(\d+)\]\.(lower|upper)\.value((?:\[\d+\])*)$")
+"""Paths of constant bounds of the levels above the first."""
 
 
 class End(NamedTuple):
@@ -170,8 +179,11 @@ def default_lows(
 
 def _default_low(conditions: Conditions, path: str, start: np.ndarray) -> End:
     scenario = conditions.scenario
+    if LEVEL_BOUND.match(path) and ".upper." in path:
+        return _bound_at_start(scenario, path, start)
     leaf = re.sub(r"(\[\d+\])+$", "", path)
-    if np.all(start > 0) and (_is_time(scenario, path) or FREQUENCY.match(path)):
+    is_examined = _is_time(scenario, path) or _is_of_chain(scenario, path)
+    if np.all(start > 0) and (is_examined or FREQUENCY.match(path)):
         return _single_end(conditions, path, start, 1.0 / MAX_FACTOR, BY_SMALL_FACTOR)
     if scenario.sampling is not None and leaf in THEOREM_LIMITS:
         return End(start / MAX_FACTOR, BY_SMALL_FACTOR)
@@ -199,6 +211,28 @@ def _is_time(scenario: Scenario, path: str) -> bool:
     return of_law and paths.unit_at(scenario, path) == "s"
 
 
+def _is_of_chain(scenario: Scenario, path: str) -> bool:
+    """Whether a leaf is a positive number of a plant or model in strict-feedback form itself, such
+    as a stiffness or an inductance: the fastest mode of the loop depends on it.
+    """
+    part, _, own = path.partition(".")
+    if part not in ("plant", "model") or own.startswith("robot."):
+        return False
+    is_chain = plants.is_chain(getattr(scenario, part))
+    return is_chain and paths.sign_at(scenario, path) == "positive"
+
+
+def _bound_at_start(scenario: Scenario, path: str, start: np.ndarray) -> End:
+    """The end of the range of a constant bound of a level towards the start of the level."""
+    found: Any = LEVEL_BOUND.match(path)
+    _, second, higher = start_levels(scenario)
+    levels = np.stack([second, *higher])
+    level = levels[int(found[1])]
+    for entry in re.findall(r"\d+", found[3]):
+        level = level[int(entry)]
+    return End(level + LEAST_SHARE * (start - level), BY_LEVEL)
+
+
 def default_highs(
     scenario: Scenario, starts: dict[str, np.ndarray], dt: float, method: str
 ) -> dict[str, End]:
@@ -220,6 +254,10 @@ def _default_high(conditions: Conditions, path: str, start: np.ndarray) -> End:
         return _longest_period(conditions, start)
     if path == DELAY:
         return _longest_delay(conditions, start)
+    if LEVEL_BOUND.match(path) and ".lower." in path:
+        return _bound_at_start(conditions.scenario, path, start)
+    if np.all(start > 0) and _is_of_chain(conditions.scenario, path):
+        return _single_end(conditions, path, start, MAX_FACTOR, BY_FACTOR)
     if not FREQUENCY.match(path):
         return End(np.full(start.shape, np.inf), UNLIMITED)
     end = _single_end(conditions, path, start, MAX_FACTOR, BY_FACTOR)

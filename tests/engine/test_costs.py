@@ -62,21 +62,18 @@ PLANTS = (
     "flexible_joint_iiwa14",
     "vessel",
 )
-"""Presets without a mass of a robot at "plant.mass[1]"."""
-SCENARIOS |= {
-    name: preset
-    for name, preset in ij.presets.PRESETS.items()
-    if name not in ("zhang_yan_2024", *PLANTS)
-}
+"""Presets without a mass of a robot at "plant.mass[1]"; their runs differ in their start only."""
+SCENARIOS |= {name: x for name, x in ij.presets.PRESETS.items() if name != "zhang_yan_2024"}
 SCENARIOS["planar chain of 3"] = lambda: planar_chain(3)
-LONG = ("ur5", "iiwa14")
+LONG = ("ur5", "iiwa14", "flexible_joint_iiwa14")
 """Six and seven joints: a count takes seconds."""
 
 
 def step_counts(name: str) -> dict[str, dict[str, int]]:
     """How often -> operation -> how many in a step of Runge-Kutta with the standard metrics, where
-    runs differ in start and a mass."""
-    counts = ij.explain(SCENARIOS[name](), varied=["plant.mass[1]"]).counts
+    runs differ in start and, where a robot is the plant, in a mass."""
+    varied = "initial.q" if name in PLANTS else "plant.mass[1]"
+    counts = ij.explain(SCENARIOS[name](), varied=[varied]).counts
     return {often: dict(sorted(counter.items())) for often, counter in counts.items()}
 
 

@@ -16,10 +16,11 @@ import warnings
 import gpu_on_cpu
 import jax
 import jax.numpy as jnp
+import loops_of_plants
 import numpy as np
 import pytest
 from fallback import with_fallback
-from test_lowering import DT, MEMBERS, STANDARD, carry_of, evaluate, with_member
+from test_lowering import DT, MASS, MEMBERS, STANDARD, carry_of, evaluate, with_member
 from test_lowering_backends import TOLERANCE, assert_same, draws, needs_compiler
 
 import iblf_jax as ij
@@ -37,6 +38,7 @@ from iblf_jax.kernels.packed import Shapes, pack
 from iblf_jax.kernels.passes import written_out
 from iblf_jax.kernels.toolchain import ToolchainError
 from iblf_jax.simulation.metrics import standard
+from iblf_jax.simulation.paths import get
 from iblf_jax.simulation.scenario import canonical
 
 
@@ -88,7 +90,8 @@ def stepped(program, shared, lane, carry, steps: int) -> np.ndarray:
 @needs_compiler
 @pytest.mark.parametrize(("family", "name"), MEMBERS, ids=[f"{f}-{n}" for f, n in MEMBERS])
 def test_the_kernel_of_every_member_does_what_its_program_says(family, name):
-    varied = {"initial.q": [[0.8, 0.8], [0.81, 0.79], [0.5, 0.6]], "plant.mass[1]": [0.9, 0.7, 0.8]}
+    mass = MASS.get(name, "plant.mass[1]")
+    varied = {"initial.q": [[0.8, 0.8], [0.81, 0.79], [0.5, 0.6]], mass: [0.9, 0.7, 0.8]}
     program, shared, lane, carry = step_of(
         with_member(family, name, getattr(ij, family).MEMBERS[name]), varied
     )
@@ -220,6 +223,31 @@ def test_every_run_has_its_own_jump(runs_here, paper, dtype):
     rtol = {"float64": 1e-9, "float32": 2e-3}[dtype]
     for name in ("rmse", "effort", "torque_variation", "estimate_rmse"):
         np.testing.assert_allclose(found[name], expected[name], rtol=rtol, err_msg=name)
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    "case", ["user class", pytest.param("flexible joint", marks=pytest.mark.slow)]
+)
+def test_a_plant_of_higher_order_agrees_with_the_reference(case, runs_here):
+    """Orders 3 and 4, each run with its own start and its own plant."""
+    leaf = {"user class": "plant.D", "flexible joint": "plant.stiffness"}[case]
+    scenario = canonical(loops_of_plants.CASES[case]())
+    start, plant = scenario.initial.q, get(scenario, leaf)
+    shares = jnp.asarray([-0.1, -0.05, 0.0, 0.05, 0.1])[:, None]
+    varied = {"initial.q": start + 0.2 * shares, leaf: plant * (1.0 + shares)}
+    dt = jnp.asarray(DT)
+
+    def batch(backend):
+        request = RunRequest(100, "rk4", backend=backend)
+        run = jax.jit(lambda v: execute.run_batch(scenario, v, standard(), dt, request))
+        return run(varied)
+
+    found, expected = batch("gpu"), batch("vmap")
+    np.testing.assert_array_equal(found.status, expected.status)
+    for name, value in expected.metrics.items():
+        np.testing.assert_allclose(found.metrics[name], value, rtol=1e-7, atol=1e-9, err_msg=name)
+    assert np.ptp(np.asarray(expected.metrics["rmse"])) > 1e-3
 
 
 @pytest.mark.slow

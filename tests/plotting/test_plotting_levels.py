@@ -63,6 +63,19 @@ def test_a_level_is_drawn_with_its_bounds_and_virtual_control(run):
     assert high > 20.0
 
 
+def test_regions_are_named_by_the_robot_inside_a_plant(flexible_run):
+    scenario = flexible_run.scenario
+    wall = ij.regions.HalfSpace(normal=[1.0, 0.0], offset=-0.1)
+    beside = ij.with_parts(scenario, regions=(wall,))
+    run = ij.simulate(beside, duration=0.05, dt=1e-3)
+    assert int(run.status) == 0
+    legends = [axes.get_legend() for axes in run.plot().axes]
+    texts = [text.get_text() for x in legends if x is not None for text in x.get_texts()]
+    assert "0: the tip" in texts
+    labels = labels_of(plotting.region_margins(run))
+    assert any("the tip" in label for label in labels), labels
+
+
 def test_a_level_without_bounds_shows_none_and_keeps_its_virtual_control_in_view():
     law = ij.controllers.BarrierBackstepping(k=(3.0, 10.0, 30.0))
     only_third = pendulum(controller=law, state_bounds=(None, symmetric(20.0)))

@@ -45,5 +45,24 @@ def test_a_rigid_law_is_compared_with_one_of_all_levels():
     scenario = loops_of_plants.flexible_joint(plant=rigid.plant)
     laws = {"all levels": scenario.controller, "rigid": rigid.controller}
     found = ij.compare(scenario, laws, equal_effort=False, **SHORT)
-    assert type(found.rollouts["rigid"].scenario.model) is type(loops_of_plants.ROBOT)
+    model = found.rollouts["rigid"].scenario.model
+    assert type(model) is ij.robots.WithMotors
+    np.testing.assert_array_equal(model.inertia, rigid.plant.motor_inertia)
     assert found.rollouts["all levels"].scenario.model.order == 4
+
+
+@pytest.mark.slow
+def test_a_rigid_law_and_one_of_all_levels_at_equal_effort():
+    """Neither has a barrier above the first level: leaving the bounds there is no obstacle."""
+    preset = ij.presets.flexible_joint_two_link(stiffness=1000.0)
+    damped = ij.with_parameters(preset, {f"{x}.motor_damping": 1.0 for x in ("plant", "model")})
+    scenario = ij.with_parts(damped, observer=ij.observers.Momentum(kf=5.0))
+    rigid = ij.controllers.Backstepping(k1=2.0, K2=0.9, reading="corrected")
+    all_levels = ij.controllers.BarrierBackstepping(k=(2.0, 10.0, 30.0, 60.0))
+    laws = {"rigid": rigid, "all levels": all_levels}
+    found = ij.compare(scenario, laws, duration=1.0, dt=5e-4)
+    assert int(found.rollouts["rigid"].status) & ij.Status.STATE_BOUND_VIOLATED
+    efforts = [x.metrics.effort_above_gravity for x in found.equal_effort.values()]
+    assert list(found.equal_effort) == ["rigid", "all levels"]
+    np.testing.assert_allclose(efforts[1], efforts[0], rtol=1e-4)
+    assert "k = " in str(found)

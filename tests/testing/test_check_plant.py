@@ -98,7 +98,7 @@ BROKEN = {
     ),
     "names": (
         lambda: altered(level_names=("angle", "speed")),
-        ["level_names has 2 names", "It must have 3"],
+        ["level_names", "expected a tuple of 3 texts"],
     ),
     "units": (lambda: altered(units=("rad", "rad/s", "V")), ["4 units"]),
 }

@@ -1,10 +1,12 @@
 """What can be tuned beside the gains: limits per joint, weights, filters, period and delay."""
 
 import jax
+import loops_of_plants
 import numpy as np
 import pytest
 
 import iblf_jax as ij
+from iblf_jax.simulation.levels import start_levels
 from iblf_jax.simulation.paths import get
 from iblf_jax.simulation.scenario import canonical
 from iblf_jax.tuning import evaluation, ranges
@@ -145,6 +147,50 @@ def test_a_delay_needs_a_queue_that_holds_its_commands(lab):
     at_once = ij.with_parts(lab, sampling=ij.Sampling(period=2e-3))
     with pytest.raises(ValueError, match=r"Sampling.queue: got 0.*queue=1"):
         layout(canonical(at_once), ["sampling.delay"], DT, "rk4")
+
+
+def test_gains_of_all_levels_reach_what_the_step_follows():
+    drive = canonical(loops_of_plants.electric_drive())
+    low, high, (below, above) = ends(drive, "controller.k")
+    assert (below, above) == (ranges.BY_SIGN, ranges.BY_STEP)
+    np.testing.assert_array_equal(low, np.zeros_like(low))
+    gains = np.reshape(high, drive.controller.k.shape)
+    conditions = ranges.Conditions(drive, DT, "rk4")
+    assert not conditions.violated({"controller.k": gains})
+    assert conditions.violated({"controller.k": 1.05 * gains}) == ranges.BY_STEP
+    alone = ends(drive, "controller.k[0]")[1]
+    assert np.all(alone > gains[0])
+
+
+def test_numbers_of_a_plant_keep_the_loop_within_the_step():
+    flexible = canonical(loops_of_plants.flexible_joint())
+    stiffness, inertia = "model.stiffness", "plant.motor_inertia"
+    low, high, (below, above) = ends(flexible, stiffness)
+    assert (below, above) == (ranges.BY_SMALL_FACTOR, ranges.BY_STEP)
+    np.testing.assert_allclose(low, 3.0)
+    conditions = ranges.Conditions(flexible, DT, "rk4")
+    assert not conditions.violated({stiffness: high})
+    assert conditions.violated({stiffness: 1.05 * high}) == ranges.BY_STEP
+    low, _, (below, above) = ends(flexible, inertia)
+    assert (below, above) == (ranges.BY_STEP, ranges.BY_FACTOR)
+    assert conditions.violated({inertia: 0.95 * low}) == ranges.BY_STEP
+    assert ends(flexible, "plant.robot.mass")[2] == (ranges.BY_SIGN, ranges.UNLIMITED)
+
+
+def test_bounds_of_levels_contain_the_start():
+    drive = canonical(loops_of_plants.electric_drive())
+    current = start_levels(drive)[2][0]
+    low, _, reasons = ends(drive, "state_bounds[1].upper.value")
+    assert reasons == (ranges.BY_LEVEL, ranges.UNLIMITED)
+    np.testing.assert_allclose(low, current + ranges.LEAST_SHARE * (60.0 - current))
+    one = ends(drive, "state_bounds[1].upper.value[1]")[0]
+    np.testing.assert_allclose(one, low[1:])
+    _, high, reasons = ends(drive, "state_bounds[0].lower.value")
+    assert reasons == (ranges.UNLIMITED, ranges.BY_LEVEL)
+    np.testing.assert_allclose(high, -4.0 * ranges.LEAST_SHARE)
+    # A start outside its bounds is refused.
+    narrow = ij.with_parameters(drive, {"state_bounds[1].upper.value": low})
+    assert float(ij.simulate(narrow, **SHORT).higher[0, 0, 0]) < low[0]
 
 
 def test_a_period_says_that_it_has_no_derivative(lab):

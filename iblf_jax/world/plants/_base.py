@@ -56,6 +56,8 @@ class Plant(Protocol):
       figures; the first corner is drawn as its path.
     - `robot`: the robot inside a plant whose first two levels are its q and q'.  Disturbances,
       friction and observers of robots then act on it, as the torque that is added to it.
+    - `rigid()`: the robot to which the plant tends in its rigid limit, such as that for a large
+      stiffness: the model of a law of robots, where it is not `robot`.
     - `level_rate(level, t, x, above, torque)`: f_i + G_i above, (n,), where a member has a shorter
       formula than `drift` and `gain`.  `torque`, (n,) [N m], is added to a robot; 0.0 for none.
     - `level_input(level, t, x, rate, torque)`: its inverse, the x_{i+1} for which x_i' is `rate`.
@@ -101,6 +103,7 @@ plant_member = OptionalMembers(
     component_names=(),
     outline=None,
     robot=None,
+    rigid=None,
     level_rate=None,
     level_input=None,
     transposed_gain=None,
