@@ -13,6 +13,7 @@ from iblf_jax.certificates.optional import optional_member
 from iblf_jax.certificates.result import Certificate, LevelLabel, LevelTraces
 from iblf_jax.certificates.run_summary import Segment, in_two_passes
 from iblf_jax.core.pytree import unwrapped
+from iblf_jax.core.units import as_text
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.world import plants
@@ -79,14 +80,12 @@ def _numbers(summary: LevelSummary) -> dict[str, Any]:
 def _labels(scenario: Scenario) -> tuple[LevelLabel, ...]:
     """The levels of the model, in words."""
     plant = plants.as_plant(scenario.model)
-    names = plants.plant_member(plant, "level_names")
-    if names is None:
-        names = tuple(f"level {i + 1}" for i in range(plant.order))
+    *units, _ = plants.units_of(plant)
+    named = zip(plants.level_names(plant), units, strict=True)
     labels = []
-    for i, (name, unit) in enumerate(zip(names, plants.units_of(plant), strict=False)):
-        shown = unit if isinstance(unit, str) else ", ".join(dict.fromkeys(unit))
-        bounded = scenario.context.level_bounds(i + 1) is not None
-        labels.append(LevelLabel(name, shown, bounded))
+    for level, (name, unit) in enumerate(named, start=1):
+        bounded = scenario.context.level_bounds(level) is not None
+        labels.append(LevelLabel(name, as_text(unit), bounded))
     return tuple(labels)
 
 

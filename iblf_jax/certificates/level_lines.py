@@ -32,6 +32,7 @@ from iblf_jax.control.observers import NoObserver
 from iblf_jax.control.observers._base import observer_member
 from iblf_jax.core import checks
 from iblf_jax.core.status import Status
+from iblf_jax.core.units import Unit, of_component, per_second
 from iblf_jax.world import plants
 from iblf_jax.world.bounds import Tube
 from iblf_jax.world.plants._base import Units
@@ -68,21 +69,15 @@ ULTIMATE = "the lag of the filters does not vanish with d_tilde: only ultimate b
 NO_ESTIMATE = "the observer states no kappa; T uses the rate of its estimate along the run"
 
 
-# --- units ----------------------------------------------------------------------------------------
-
-
-def rate_unit(unit: str) -> str:
-    """The unit of a rate, from that of the quantity."""
-    if unit == "1":
-        return "1/s"
-    return f"{unit}^2" if unit.endswith("/s") else f"{unit}/s"
-
-
-def _with_unit(line: Line, unit: Units, of_rate: bool = False) -> Line:
-    """A line with the unit of a level, or with that of the component that the line is about."""
+def _with_unit(line: Line, unit: Unit) -> Line:
+    """A line with the unit of a level, or with that of the component that the line is about; with
+    "1" for a line about components of several units.
+    """
+    if line.joint is not None:
+        unit = of_component(unit, line.joint)
     if not isinstance(unit, str):
-        unit = "1" if line.joint is None else unit[line.joint]
-    return dataclasses.replace(line, unit=rate_unit(unit) if of_rate else unit)
+        unit = "1"
+    return dataclasses.replace(line, unit=unit)
 
 
 # --- the whole run --------------------------------------------------------------------------------
@@ -108,8 +103,9 @@ def _smoothness(summary: LevelSummary) -> Line:
     note = f"{law.order} derivatives of the reference are needed, and of the bounds of level 1"
     if summary.jumps.size:
         note = join_notes(note, summary.exclusion_note)
-    margin = None if np.isinf(spare) else spare
-    return SMOOTH.line(verdict_of(True), margin=margin, note=note)
+    if np.isinf(spare):
+        return SMOOTH.line(verdict_of(True), note=note)
+    return SMOOTH.line(verdict_of(True), margin=spare, note=note)
 
 
 def _rate(summary: LevelSummary) -> Line:
@@ -157,7 +153,7 @@ def _assumptions(segment: Segment) -> list[Line]:
     for i, unit in enumerate(units):
         statement = Statement(f"d_{i + 1} bounded", "(S.1)", f"|d_{i + 1}| is finite")
         line = finite(statement, segment.t, np.linalg.norm(proof.d[:, i], axis=1))
-        lines.append(_with_unit(line, unit, of_rate=True))
+        lines.append(_with_unit(line, per_second(unit)))
     distance = np.minimum(sample.q_d - sample.lower, sample.upper - sample.q_d)
     reference = check_smallest(REFERENCE_INSIDE, segment.t, distance)
     reference = with_status(summary, reference, Status.INFEASIBLE_REFERENCE)
@@ -294,11 +290,10 @@ def _bounds(segment: Segment) -> list[Line]:
 
 
 def errors(segment: Segment) -> np.ndarray:
-    """Xi of the levels with bounds and e of the others, (T, r, n)."""
+    """The relative errors xi of levels with bounds, and the errors e of the others, (T, r, n)."""
     summary, claim = segment.summary, segment.proof.claim
-    order = claim.xi.shape[1]
-    rows = [claim.xi[:, i] if is_bounded(summary, i) else claim.e[:, i] for i in range(order)]
-    return np.stack(rows, axis=1)
+    bounded = [is_bounded(summary, i) for i in range(claim.e.shape[1])]
+    return np.where(np.reshape(bounded, (-1, 1)), claim.xi, claim.e)
 
 
 def error_bounds(segment: Segment, V: np.ndarray) -> np.ndarray:
@@ -317,7 +312,9 @@ def error_bounds(segment: Segment, V: np.ndarray) -> np.ndarray:
         k_l, k_u = claim.k_l[:, i], claim.k_u[:, i]
         tube = Tube(zero, zero, -k_l, k_u, zero, zero)
         stated = optional_member(barrier, "xi_bound")(level, tube)
-        rows.append(np.full_like(zero, np.nan) if stated is None else np.asarray(stated))
+        if stated is None:
+            stated = np.full_like(zero, np.nan)
+        rows.append(np.asarray(stated))
     return np.stack(rows, axis=1)
 
 

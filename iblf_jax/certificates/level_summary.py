@@ -186,7 +186,7 @@ class _Extrema:
 
 
 def growth_along(claim: Any) -> np.ndarray:
-    """G = T - sum c_i w_i |s_i|^2 with the lag of filters in T, (T,)."""
+    """The term g = T - sum c_i w_i |s_i|^2 with the lag of filters in T, (T,)."""
     return claim.disturbance_terms + claim.lag - claim.by_slopes  # type: ignore[no-any-return]
 
 

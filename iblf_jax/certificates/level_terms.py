@@ -142,7 +142,7 @@ def level_terms_and_sample(
     law = unwrapped(scenario.controller)
     at, tangent = _point_and_rate(scenario, t, state, state_rate)
     d = _disturbance(scenario, state, state_rate, sample)
-    d_tilde = d - _as_rates(scenario, at.x, at.estimate)
+    d_tilde = d - estimate_as_rates(scenario, at.x, at.estimate)
     sizes = _rate_sizes(scenario, at, d, d_tilde, tangent.x)
     estimate_error, estimate_size = _estimate_error(scenario, at, tangent, d_tilde, sizes)
     excluded = jnp.any(sample.guard_active | sample.saturated)
@@ -204,13 +204,6 @@ def _disturbance(
     # The sample of a robot has a torque.
     rates = solve_spd(scenario.model.mass_matrix(state.q), sample.disturbance)
     return jnp.stack([state_rate.q - state.dq, rates])
-
-
-def _as_rates(scenario: Scenario, x: jax.Array, estimate: jax.Array) -> jax.Array:
-    """An estimate as d_hat, (r, n)."""
-    if plants.is_chain(scenario.model) or estimate.ndim == 2:
-        return estimate_as_rates(scenario, x, estimate)
-    return plants.torque_as_rates(plants.as_plant(scenario.model), x, estimate)
 
 
 def _distances(scenario: Scenario, sample: Sample, x: jax.Array) -> jax.Array:
@@ -345,8 +338,10 @@ def _gap(xi: jax.Array, guard: float) -> jax.Array:
 
 def _ratio_at_centre(barrier: Any, tube: Tube) -> jax.Array:
     """e/s at e = 0, (n,); that of k^2/2 for a barrier without one."""
-    found = optional_member(barrier, "error_over_slope")(tube, tube.q_d)
-    return 0.5 * jnp.minimum(tube.k_l, tube.k_u) ** 2 if found is None else found
+    stated = optional_member(barrier, "error_over_slope")(tube, tube.q_d)
+    if stated is None:
+        return 0.5 * jnp.minimum(tube.k_l, tube.k_u) ** 2
+    return stated  # type: ignore[no-any-return]
 
 
 def _rate_sizes(
@@ -400,7 +395,7 @@ def _own_terms(
         state_rate, sample = evaluate(scenario, t, state)
         d = _disturbance(scenario, state, state_rate, sample)
         at, _ = _point_and_rate(scenario, t, state, state_rate)
-        return d, d - _as_rates(scenario, at.x, at.estimate)
+        return d, d - estimate_as_rates(scenario, at.x, at.estimate)
 
     along = (jnp.ones_like(t), state_rate)
     (d, d_tilde), (dd, dd_tilde) = jax.jvp(disturbances, (t, state), along)

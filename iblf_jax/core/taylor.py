@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import partial, reduce
 from typing import Any
 
 import jax
@@ -70,6 +70,12 @@ def in_time(function: Callable, t: jax.Array, order: int) -> list[Any]:
     return [*values, rates[-1]]
 
 
+def curve_of_time(t: jax.Array, count: int) -> list[jax.Array]:
+    """The time as a curve: t and its derivatives 1, 0, 0, ..., `count` in all, () each."""
+    one, zero = jnp.ones_like(t), jnp.zeros_like(t)
+    return [t, one, *[zero] * count][:count]
+
+
 def _by_nested_jvp(function: Callable, curve: Sequence[tuple]) -> list[Any]:
     """`along` by nested forward differentiation, for every function that JAX differentiates."""
     coefficients = [_divided(x, math.factorial(m)) for m, x in enumerate(curve)]
@@ -89,7 +95,9 @@ def _by_nested_jvp(function: Callable, curve: Sequence[tuple]) -> list[Any]:
 
 def _divided(tree: Any, divisor: int) -> Any:
     """A pytree divided by a whole number."""
-    return tree if divisor == 1 else jax.tree.map(lambda x: x * (1.0 / divisor), tree)
+    if divisor == 1:
+        return tree
+    return jax.tree.map(lambda x: x * (1.0 / divisor), tree)
 
 
 # --- Taylor arithmetic on a traced function -----------------------------------------------------
@@ -117,6 +125,7 @@ def _with_zeros(coefficients: Coefficients) -> list[jax.Array]:
 
 
 def _is_constant(coefficients: Coefficients) -> bool:
+    """Whether all coefficients above the first are zero."""
     return all(x is None for x in coefficients[1:])
 
 
@@ -160,8 +169,9 @@ def _evaluated_equation(equation: Any, inputs: list[Coefficients], order: int) -
     """The coefficients of the outputs of one equation."""
     primitive, params = equation.primitive, equation.params
     if all(_is_constant(x) for x in inputs):
-        value = primitive.bind(*[x[0] for x in inputs], **params)
-        values = value if primitive.multiple_results else [value]
+        values = primitive.bind(*[x[0] for x in inputs], **params)
+        if not primitive.multiple_results:
+            values = [values]
         return [[x, *[None] * order] for x in values]
     if primitive.name in CALLED_JAXPR:
         called = params[CALLED_JAXPR[primitive.name]]
@@ -180,10 +190,12 @@ def _evaluated_equation(equation: Any, inputs: list[Coefficients], order: int) -
     )
     if not primitive.multiple_results:
         values, series = [values], [series]
-    return [
-        [value, *([None] * order if terms is jet.zero_series else terms)]
-        for value, terms in zip(values, series, strict=True)
-    ]
+    found = []
+    for value, terms in zip(values, series, strict=True):
+        if terms is jet.zero_series:
+            terms = [None] * order
+        found.append([value, *terms])
+    return found
 
 
 def _evaluated_scan(params: dict, inputs: list[Coefficients], order: int) -> list:
@@ -192,10 +204,12 @@ def _evaluated_scan(params: dict, inputs: list[Coefficients], order: int) -> lis
     consts = inputs[:consts_count]
     carry = inputs[consts_count : consts_count + carry_count]
     sequences = inputs[consts_count + carry_count :]
-    steps = range(params["length"])
+    steps = list(range(params["length"]))
+    if params["reverse"]:
+        steps.reverse()
     body = params["jaxpr"]
     collected: list[list] = []
-    for i in reversed(steps) if params["reverse"] else steps:
+    for i in steps:
         entries = [[None if x is None else x[i] for x in sequence] for sequence in sequences]
         found = _evaluated(body.jaxpr, body.consts, [*consts, *carry, *entries], order)
         carry = found[:carry_count]
@@ -214,19 +228,36 @@ def _evaluated_scan(params: dict, inputs: list[Coefficients], order: int) -> lis
 
 def _total(terms: list) -> Any:
     """The sum of the terms that are not None; None for no term."""
-    total = None
-    for term in terms:
-        if term is not None:
-            total = term if total is None else total + term
+    known = [term for term in terms if term is not None]
+    if not known:
+        return None
+    total = known[0]
+    for term in known[1:]:
+        total = total + term
     return total
 
 
+def _difference(a: Any, b: Any) -> Any:
+    """The difference of two coefficients, where None is zero."""
+    if b is None:
+        return a
+    if a is None:
+        return -b
+    return a - b
+
+
 def _product(a: Any, b: Any, times: Callable = lax.mul) -> Any:
-    return None if a is None or b is None else times(a, b)
+    """The product of two coefficients, where None is zero."""
+    if a is None or b is None:
+        return None
+    return times(a, b)
 
 
 def _scaled(x: Any, factor: float) -> Any:
-    return x if x is None or factor == 1.0 else x * factor
+    """A coefficient times a number, where None is zero."""
+    if x is None or factor == 1.0:
+        return x
+    return x * factor
 
 
 def _termwise(operation: Callable, inputs: list[Coefficients]) -> Coefficients:
@@ -251,7 +282,7 @@ def _add(inputs: list[Coefficients], params: dict) -> Coefficients:
 
 def _subtract(inputs: list[Coefficients], params: dict) -> Coefficients:
     a, b = inputs
-    return [x if y is None else -y if x is None else x - y for x, y in zip(a, b, strict=True)]
+    return [_difference(x, y) for x, y in zip(a, b, strict=True)]
 
 
 def _bilinear(primitive: Any, inputs: list[Coefficients], params: dict) -> Coefficients:
@@ -261,17 +292,21 @@ def _bilinear(primitive: Any, inputs: list[Coefficients], params: dict) -> Coeff
 
 def _product_of(a: Coefficients, b: Coefficients, times: Callable = lax.mul) -> Coefficients:
     """The coefficients of a product."""
-    return [_total([_product(a[j], b[k - j], times) for j in range(k + 1)]) for k in range(len(a))]
+    found: Coefficients = []
+    for k in range(len(a)):
+        terms = [_product(a[j], b[k - j], times) for j in range(k + 1)]
+        found.append(_total(terms))
+    return found
 
 
 def _divide(inputs: list[Coefficients], params: dict) -> Coefficients:
+    """By a = y b:  y[k] b[0] = a[k] - sum of y[j] b[k - j], j = 0 ... k - 1."""
     a, b = inputs
     quotient: Coefficients = [a[0] / b[0]]
     reciprocal = 1.0 / b[0]
     for k in range(1, len(a)):
         rest = _total([_product(quotient[j], b[k - j]) for j in range(k)])
-        numerator = a[k] if rest is None else -rest if a[k] is None else a[k] - rest
-        quotient.append(_product(numerator, reciprocal))
+        quotient.append(_product(_difference(a[k], rest), reciprocal))
     return quotient
 
 
@@ -282,17 +317,19 @@ def _integrated(factor: Coefficients, x: Coefficients, k: int) -> Any:
 
 
 def _sine_and_cosine(x: Coefficients) -> tuple[Coefficients, Coefficients]:
+    """Both together, because each contains the other's lower coefficients."""
     sine: Coefficients = [jnp.sin(x[0])]
     cosine: Coefficients = [jnp.cos(x[0])]
     for k in range(1, len(x)):
         sine_k = _integrated(cosine, x, k)
-        cosine_k = _integrated(sine, x, k)
+        cosine_k = _difference(None, _integrated(sine, x, k))
         sine.append(sine_k)
-        cosine.append(None if cosine_k is None else -cosine_k)
+        cosine.append(cosine_k)
     return sine, cosine
 
 
 def _exponential(x: Coefficients, value: jax.Array) -> Coefficients:
+    """The exponential y of x, by y' = y x'; its value is passed."""
     found: Coefficients = [value]
     for k in range(1, len(x)):
         found.append(_integrated(found, x, k))
@@ -309,8 +346,9 @@ def _expm1(inputs: list[Coefficients], params: dict) -> Coefficients:
 
 
 def _logarithm(argument: Coefficients, value: jax.Array) -> Coefficients:
-    """Ln of the argument, whose value is passed."""
-    rate = _divide([[jnp.ones_like(argument[0]), *[None] * (len(argument) - 1)], argument], {})
+    """The natural logarithm y of the argument x, by y' = x'/x; its value is passed."""
+    one = [jnp.ones_like(argument[0]), *[None] * (len(argument) - 1)]
+    rate = _divide([one, argument], {})
     return [value, *[_integrated(rate, argument, k) for k in range(1, len(argument))]]
 
 
@@ -324,13 +362,13 @@ def _log1p(inputs: list[Coefficients], params: dict) -> Coefficients:
 
 
 def _sqrt(inputs: list[Coefficients], params: dict) -> Coefficients:
+    """By x = y y:  2 y[0] y[k] = x[k] - sum of y[j] y[k - j], j = 1 ... k - 1."""
     x = inputs[0]
     root: Coefficients = [jnp.sqrt(x[0])]
     half = 0.5 / root[0]
     for k in range(1, len(x)):
         rest = _total([_product(root[j], root[k - j]) for j in range(1, k)])
-        numerator = x[k] if rest is None else -rest if x[k] is None else x[k] - rest
-        root.append(_product(numerator, half))
+        root.append(_product(_difference(x[k], rest), half))
     return root
 
 
@@ -339,6 +377,7 @@ def _square(inputs: list[Coefficients], params: dict) -> Coefficients:
 
 
 def _integer_power(inputs: list[Coefficients], params: dict) -> Coefficients:
+    """By repeated squaring, which is regular where the base is 0."""
     exponent = params["y"]
     one = [jnp.ones_like(inputs[0][0]), *[None] * (len(inputs[0]) - 1)]
     if exponent == 0:
@@ -347,7 +386,8 @@ def _integer_power(inputs: list[Coefficients], params: dict) -> Coefficients:
     rest = abs(exponent)
     while rest:
         if rest % 2:
-            power = base if power is None else _product_of(power, base)
+            factors = [x for x in (power, base) if x is not None]
+            power = reduce(_product_of, factors)
         rest //= 2
         if rest:
             base = _product_of(base, base)
@@ -378,7 +418,7 @@ def _chosen(first: jax.Array, a: Coefficients, b: Coefficients) -> Coefficients:
     def choice(x, y):
         return jnp.where(first, x, y)
 
-    return _termwise(choice, [[a[0], *a[1:]], [b[0], *b[1:]]])[1:]
+    return _termwise(choice, [a, b])[1:]
 
 
 RULES: dict[Any, Callable[[list[Coefficients], dict], Coefficients]] = {

@@ -106,15 +106,13 @@ def power(unit: Unit, exponent: int) -> Unit:
 
 def product(first: Unit, second: Unit) -> Unit:
     """The product of two units, for each level and each component that one of them has."""
+    # A level may have components, and never the reverse: levels are divided first.
     for kind in (ByLevel, tuple):
-        rows = [unit for unit in (first, second) if isinstance(unit, kind)]
-        if rows:
-            pairs = zip(
-                _entries(first, kind, len(rows[0])),
-                _entries(second, kind, len(rows[0])),
-                strict=True,
-            )
-            return kind(product(a, b) for a, b in pairs)
+        several = [unit for unit in (first, second) if isinstance(unit, kind)]
+        if several:
+            count = len(several[0])
+            rows = zip(_entries(first, kind, count), _entries(second, kind, count), strict=True)
+            return kind(product(a, b) for a, b in rows)
     total = exponents(str(first))
     for name, exponent in exponents(str(second)).items():
         total[name] = total.get(name, 0) + exponent
@@ -163,7 +161,10 @@ def written(factors: Exponents) -> str:
 
 
 def _factor(name: str, exponent: int) -> str:
-    return name if exponent == 1 else f"{name}^{exponent}"
+    """A factor with its exponent, such as "s^2"."""
+    if exponent == 1:
+        return name
+    return f"{name}^{exponent}"
 
 
 def as_text(unit: Unit) -> str:
@@ -175,14 +176,18 @@ def as_text(unit: Unit) -> str:
         return "1"
     if len(set(texts)) == 1:
         return texts[0]
-    return ("; " if isinstance(unit, ByLevel) else ", ").join(texts)
+    if isinstance(unit, ByLevel):
+        return "; ".join(texts)
+    return ", ".join(texts)
 
 
 def of_component(unit: Unit, component: int) -> Unit:
     """The unit of one component, of one level or of every level."""
     if isinstance(unit, ByLevel):
         return ByLevel(of_component(entry, component) for entry in unit)
-    return unit if isinstance(unit, str) else unit[component]
+    if isinstance(unit, str):
+        return unit
+    return unit[component]
 
 
 def of_entry(unit: Unit, index: tuple[int, ...], dimensions: int) -> Unit:

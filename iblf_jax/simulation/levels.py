@@ -28,7 +28,8 @@ from iblf_jax.world.robots import at_time, friction_torque
 
 
 def start_levels(scenario: Any) -> tuple[jax.Array, jax.Array, Any]:
-    """Q and q', (n,), and the levels from the third on, (r - 2, n), at t = 0.
+    """The levels q and q', (n,), and those from the third on, (r - 2, n), at t = 0; `()` in their
+    place for a plant of order 2.
 
     A start given by q and q' alone is in the steady state of the plant: the static equilibrium of a
     flexible joint, the current that holds gravity.
@@ -44,7 +45,7 @@ def start_levels(scenario: Any) -> tuple[jax.Array, jax.Array, Any]:
 
 def levels_on_reference(scenario: Any, t: jax.Array) -> tuple[jax.Array, jax.Array, Any]:
     """The levels of a plant that follows its reference exactly and without disturbance: q and q',
-    (n,), and those from the third on, (r - 2, n), or None for a robot.
+    (n,), and those from the third on, (r - 2, n), or None for a plant of order 2.
     """
     plant, position = scenario.plant, scenario.reference.position
     if not plants.is_chain(plant):
@@ -55,35 +56,43 @@ def levels_on_reference(scenario: Any, t: jax.Array) -> tuple[jax.Array, jax.Arr
     for level in range(1, order):
         curves.append(_curve_of_next_level(plant, level, t, curves))
     x = jnp.stack([curve[0] for curve in curves])
-    return x[0], x[1], x[2:] if order > 2 else None
+    if order == 2:
+        return x[0], x[1], None
+    return x[0], x[1], x[2:]
 
 
 def _curve_of_next_level(plant: Any, level: int, t: jax.Array, curves: list) -> list[jax.Array]:
     """The level above a level, with its derivatives, from those of the levels up to this one."""
     count = len(curves[-1]) - 1
-    one, zero = jnp.ones_like(t), jnp.zeros_like(t)
-    times = [t, one, *[zero] * count][:count]
     unknown = [jnp.zeros_like(curves[0][0])] * (plant.order - level)
 
     def above(t, known, rate):
         return plants.level_input(plant, level, t, jnp.stack([*known, *unknown]), rate)
 
-    points = [(times[m], [curve[m] for curve in curves], curves[-1][m + 1]) for m in range(count)]
+    points = []
+    for m, time in enumerate(taylor.curve_of_time(t, count)):
+        known = [curve[m] for curve in curves]
+        rate = curves[-1][m + 1]
+        points.append((time, known, rate))
     return taylor.along(above, points)
 
 
 def steady_input(scenario: Any, q: jax.Array) -> jax.Array:
-    """The input with which an actuator starts, (n,): it balances the gravity of the model; of a
-    plant that states no such input, 0.
+    """The input with which an actuator starts, (n,): it balances the gravity of the model, and is 0
+    for a plant that states no such input.
+
+    A law of robots on another plant has a model without the plant's input: the input is then the
+    one that balances the gravity of the plant.
     """
     model = scenario.model
-    if plants.is_chain(scenario.plant) and not plants.is_chain(model):
-        # A law of a robot on another plant: the plant's own input.
+    if not plants.is_chain(model):
         model = scenario.plant
     if not plants.is_chain(model):
-        return model.gravity(q)  # type: ignore[no-any-return]
+        return scenario.model.gravity(q)  # type: ignore[no-any-return]
     own = plants.plant_member(model, "steady_input")
-    return jnp.zeros_like(q) if own is None else own(q)
+    if own is None:
+        return jnp.zeros_like(q)
+    return own(q)  # type: ignore[no-any-return]
 
 
 # --- law and sensor -----------------------------------------------------------------------------
@@ -92,7 +101,9 @@ def steady_input(scenario: Any, q: jax.Array) -> jax.Array:
 def model_state(scenario: Any, q: jax.Array, dq: jax.Array, higher: Any) -> jax.Array:
     """The levels that the model has, (r, n), from those of the plant or of a measurement."""
     order = plants.order_of(scenario.model)
-    return state_of_levels(q, dq, () if order == 2 else higher[: order - 2])
+    if order == 2:
+        return state_of_levels(q, dq, ())
+    return state_of_levels(q, dq, higher[: order - 2])
 
 
 def law_state(scenario: Any, q: jax.Array, dq: jax.Array, higher: Any) -> tuple[jax.Array, ...]:
@@ -139,8 +150,9 @@ def estimate_shape(scenario: Any) -> tuple[int, ...]:
     """The shape of the estimate that a law without an observer receives: (n,), or (r, n) for a
     model in strict-feedback form.
     """
-    n = scenario.plant.n
-    return (scenario.model.order, n) if plants.is_chain(scenario.model) else (n,)
+    if plants.is_chain(scenario.model):
+        return scenario.model.order, scenario.n
+    return (scenario.n,)
 
 
 def observer_arguments(
@@ -175,14 +187,19 @@ def completed(
     q, dq, higher = measured
     x = complete(t, model_state(scenario, q, dq, higher), plants.as_plant(scenario.model), state)
     if len(x) == 2:
+        # The plant may have more levels than the model; they remain those of the sensor.
         return Measurement(x[0], x[1], higher)
     return Measurement(x[0], x[1], x[2:])
 
 
 def _observed_robot(scenario: Any) -> Any:
-    """The robot that an observer of robots serves: the model, or the robot inside it."""
+    """The model as observers of robots receive it: the robot, or the robot inside the model; the
+    model itself where there is none, for `NoObserver`, which does not use it.
+    """
     robot = plants.robot_of(scenario.model)
-    return scenario.model if robot is None else robot
+    if robot is None:
+        return scenario.model
+    return robot
 
 
 # --- motion of the plant --------------------------------------------------------------------------
@@ -219,7 +236,9 @@ def motion(
     added = rates_of(disturbance, t, x, plant, model)
     if added is not None:
         rate = rate + added
-    return Motion(rate[0], rate[1], rate[2:] if len(rate) > 2 else ())
+    if len(rate) == 2:
+        return Motion(rate[0], rate[1], ())
+    return Motion(rate[0], rate[1], rate[2:])
 
 
 def _robot_motion(
@@ -277,10 +296,10 @@ def uncertain_term(
 
 
 def estimate_as_rates(scenario: Any, x: jax.Array, estimate: jax.Array) -> jax.Array:
-    """An estimate as d_hat, (r, n), of a model in strict-feedback form."""
+    """An estimate as d_hat, (r, n): M0^-1 f_hat in the second level for a torque f_hat."""
     if estimate.ndim == 2:
         return estimate
-    return plants.torque_as_rates(scenario.model, x, estimate)
+    return plants.torque_as_rates(plants.as_plant(scenario.model), x, estimate)
 
 
 def estimate_as_torque(model: Any, q: jax.Array, estimate: jax.Array) -> jax.Array:

@@ -20,6 +20,7 @@ from jax.flatten_util import ravel_pytree
 
 from iblf_jax.control.observers._base import observer_member
 from iblf_jax.control.sensors._base import sensor_member, unrounded
+from iblf_jax.core.units import of_component, per_second
 from iblf_jax.simulation.levels import model_state, sensor_state, start_levels
 from iblf_jax.world import plants
 
@@ -28,12 +29,16 @@ DOUBLINGS = 40
 
 
 class LinearSensor(NamedTuple):
-    """The matrices of a sensor around a constant state, one row an entry."""
+    """The matrices of a sensor around a constant state: z of m numbers, w of p, y of r n."""
 
     F: jax.Array
+    """Next z by z, (m, m)."""
     B: jax.Array
+    """Next z by w, (m, p)."""
     H: jax.Array
+    """y by z, (r n, m)."""
     D: jax.Array
+    """y by w, (r n, p)."""
 
 
 def standard_deviations(scenario: Any) -> np.ndarray:
@@ -43,8 +48,7 @@ def standard_deviations(scenario: Any) -> np.ndarray:
     Args:
       scenario: with a sampling and concrete numbers.
     """
-    matrices = [np.asarray(matrix, float) for matrix in _linear_sensor(scenario)]
-    F, B, H, D = matrices
+    F, B, H, D = (np.asarray(matrix, float) for matrix in _linear_sensor(scenario))
     P = B @ B.T
     for _ in range(DOUBLINGS):
         P = P + F @ P @ F.T
@@ -64,28 +68,24 @@ def _linear_sensor(scenario: Any) -> LinearSensor:
     start, rebuild = ravel_pytree(smooth.init(*given, period))
     dtype = given[0].dtype  # which the vector of a sensor without memory may lack
 
-    def sample(z: jax.Array, normal: jax.Array, error: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def sample(z: jax.Array, normal: jax.Array, error: jax.Array) -> jax.Array:
+        """The next state and the measurement, in one vector."""
         read = (given[0] + error * steps / np.sqrt(12.0), *given[1:])
         found, after = smooth.measure(*read, normal, period, rebuild(z.astype(start.dtype)))
-        higher = levels[2] if isinstance(found.higher, tuple) else found.higher
+        higher = found.higher
+        if isinstance(higher, tuple):
+            # The sensor measures two levels; the others are constant, without noise.
+            higher = levels[2]
         x = model_state(scenario, found.q, found.dq, higher)
-        return ravel_pytree(after)[0].astype(dtype), x.reshape(-1)
+        return jnp.concatenate([ravel_pytree(after)[0].astype(dtype), x.reshape(-1)])
 
     zero = jnp.zeros((sensor.draws, scenario.n), dtype)
     arguments = (start.astype(dtype), zero, jnp.zeros_like(given[0]))
-    by_z, by_normal, by_error = jax.jacfwd(lambda *at: _joined(*sample(*at)), argnums=(0, 1, 2))(
-        *arguments
-    )
+    by_z, by_normal, by_error = jax.jacfwd(sample, argnums=(0, 1, 2))(*arguments)
+    by_inputs = [slopes.reshape(len(by_z), -1) for slopes in (by_normal, by_error)]
+    by_w = jnp.concatenate(by_inputs, axis=1)
     count = start.size
-    inputs = jnp.concatenate(
-        [by_normal.reshape(len(by_z), -1), by_error.reshape(len(by_z), -1)], axis=1
-    )
-    return LinearSensor(by_z[:count], inputs[:count], by_z[count:], inputs[count:])
-
-
-def _joined(z: jax.Array, y: jax.Array) -> jax.Array:
-    """Next state and measurement as one vector."""
-    return jnp.concatenate([z, y])
+    return LinearSensor(by_z[:count], by_w[:count], by_z[count:], by_w[count:])
 
 
 def noise_advice(scenario: Any) -> list[str]:
@@ -100,11 +100,10 @@ def noise_advice(scenario: Any) -> list[str]:
     if kappa.ndim == 1:
         kappa = kappa[:, None]
     kappa = np.broadcast_to(kappa, noise.shape)
-    rows = [
-        _row(scenario, level, noise[level], kappa[level])
-        for level in range(len(noise))
-        if np.any(noise[level] * kappa[level] > 0)
-    ]
+    rows = []
+    for level in range(len(noise)):
+        if np.any(noise[level] * kappa[level] > 0):
+            rows.append(_row(scenario, level, noise[level], kappa[level]))
     if not rows:
         return []
     kind = type(scenario.observer).__name__
@@ -118,17 +117,8 @@ def noise_advice(scenario: Any) -> list[str]:
 def _row(scenario: Any, level: int, noise: np.ndarray, kappa: np.ndarray) -> str:
     """The noise of a level and of its estimate in words, for its worst component."""
     worst = int(np.argmax(noise * kappa))
-    unit = plants.units_of(scenario.model)[level]
-    if not isinstance(unit, str):
-        unit = unit[worst]
+    unit = of_component(plants.units_of(scenario.model)[level], worst)
     return (
         f"level {level + 1}: {noise[worst]:.3g} {unit} times {kappa[worst]:.3g} 1/s give"
-        f" {noise[worst] * kappa[worst]:.3g} {_per_second(unit)} in d_hat_{level + 1}"
+        f" {noise[worst] * kappa[worst]:.3g} {per_second(unit)} in d_hat_{level + 1}"
     )
-
-
-def _per_second(unit: str) -> str:
-    """The unit of a rate, such as "rad/s^2" for "rad/s"."""
-    if unit.endswith("/s"):
-        return f"{unit}^2"
-    return f"{unit}/s"

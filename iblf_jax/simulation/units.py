@@ -30,7 +30,9 @@ def unit_text(scenario: Scenario, unit: Unit, component: int | None = None) -> s
       component: one component of a level; None for all of them.
     """
     found = resolved(unit, symbols_of(scenario))
-    return as_text(found if component is None else of_component(found, component))
+    if component is not None:
+        found = of_component(found, component)
+    return as_text(found)
 
 
 def signal_unit(scenario: Scenario, name: str, component: int | None = None) -> str:
@@ -40,7 +42,9 @@ def signal_unit(scenario: Scenario, name: str, component: int | None = None) -> 
 
 def status_words(scenario: Scenario) -> Mapping[Status, str]:
     """The text of each status flag for runs of a scenario."""
-    return WORDS_OF_LEVELS if plants.is_chain(scenario.plant) else WORDS
+    if plants.is_chain(scenario.plant):
+        return WORDS_OF_LEVELS
+    return WORDS
 
 
 def signal_meanings(scenario: Scenario) -> dict[str, str]:

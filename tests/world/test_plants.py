@@ -3,6 +3,8 @@ and the class of a user, as the design of the public interface states it."""
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -199,3 +201,18 @@ def test_a_drift_of_strict_feedback_form_is_accepted():
     np.testing.assert_array_equal(dependence.gain, 0.0)
     run = ij.simulate(scenario_of(plant), duration=0.1, dt=1e-3)
     assert int(run.status) == 0
+
+
+# ------------------------------------------------------------ rigid robots
+
+
+def test_a_robot_as_a_plant_picks_up_its_load_when_the_robot_does():
+    load = ij.robots.Payload(mass=2.0, start=1.0, rise=0.1)
+    arm = dataclasses.replace(ij.presets.ur5().plant, carried=load)
+    plant = plants.Rigid(arm)
+    np.testing.assert_allclose(plant.jump_times(), [1.0, 1.1])
+    q = jnp.asarray([0.3, -0.8, 0.5, 0.1, -0.2, 0.4])
+    before, after = (np.asarray(plant.at(jnp.asarray(t)).steady_input(q)) for t in (0.5, 2.0))
+    np.testing.assert_allclose(before, arm.at(jnp.asarray(0.5)).gravity(q))
+    np.testing.assert_allclose(after, arm.at(jnp.asarray(2.0)).gravity(q))
+    assert np.max(np.abs(after - before)) > 1.0  # the load's torque [N m]

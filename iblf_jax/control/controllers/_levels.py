@@ -5,7 +5,8 @@ model, and `surface_levels` with filters in their place; `barrier_backstepping` 
 
 All derivatives are along one trajectory (`core.taylor`): those of x_j of the orders up to r - j,
 those of the reference and of the bounds, and then, level by level, those of alpha_i and of w_i s_i
-of the orders up to r - i.
+of the orders up to r - i.  A curve is a list: a value, and its derivatives by time of the orders
+1, 2, ...  The index i of a loop is that of a row of x, so that level i + 1 is in row i.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from iblf_jax.world.plants import Plant
 
 
 class Design(NamedTuple):
-    """The numbers of one level of the law."""
+    """The barrier and the gains of one level of the law."""
 
     barrier: Barrier
     k: jax.Array
@@ -39,10 +40,10 @@ class Design(NamedTuple):
 
 
 class Level(NamedTuple):
-    """What a level computes."""
+    """The results of one level of the law."""
 
     alpha: jax.Array
-    """alpha_i, the level above as this level needs it, (n,); u for the last level."""
+    """alpha_i, the desired value of level i + 1, (n,); u for the last level."""
     slope: jax.Array
     """w_i s_i, (n,)."""
 
@@ -65,26 +66,28 @@ def exact_levels(
       context: model, reference and bounds.
     """
     plant, order = plants.as_plant(context.model), len(designs)
-    states = _curve_of_state(plant, t, x, d_hat)
-    times = _curve_of_time(t, order + 1)
-    centre = taylor.in_time(context.reference.position, t, order)
+    state_curve = _curve_of_state(plant, t, x, d_hat)
+    time_curve = taylor.curve_of_time(t, order + 1)
+    centre_curve = taylor.in_time(context.reference.position, t, order)
+    slope_curve: list[Any] = [None] * order
     levels: list[Level] = []
     tubes: list[Tube] = []
-    slope: list[Any] = [None] * order
     for i, design in enumerate(designs):
-        terms = order - i  # alpha_i and its derivatives
-        sides = _curve_of_bounds(context, i + 1, times[: terms + 1], centre[: terms + 1])
-        tube_curve = _curve_of_tube(centre, *sides, terms)
+        terms = order - i  # the virtual control, and its derivatives that the levels above need
+        lower, upper = _curve_of_bounds(
+            context, i + 1, time_curve[: terms + 1], centre_curve[: terms + 1]
+        )
+        tube_curve = _curve_of_tube(centre_curve, lower, upper, terms)
 
-        def level(t, x, tube, slope, i=i, design=design):
-            return _level(design, i, plant, t, x, tube, slope, d_hat)
+        def level_at(t, x, tube, slope_below, i=i, design=design):
+            return _level(design, i, plant, t, x, tube, slope_below, d_hat)
 
-        curve = [(times[m][0], states[m], tube_curve[m], slope[m]) for m in range(terms)]
-        found = taylor.along(level, curve)
-        levels.append(found[0])
+        curves = (time_curve[:terms], state_curve[:terms], tube_curve, slope_curve[:terms])
+        level_curve = taylor.along(level_at, list(zip(*curves, strict=True)))
+        levels.append(level_curve[0])
         tubes.append(tube_curve[0])
-        centre = [x.alpha for x in found]
-        slope = [x.slope for x in found]
+        centre_curve = [level.alpha for level in level_curve]
+        slope_curve = [level.slope for level in level_curve]
     return levels, tubes
 
 
@@ -120,7 +123,7 @@ def _filtered_tube(
     context: LawContext, level: int, t: jax.Array, centre: jax.Array, rate: jax.Array
 ) -> Tube:
     """The tube of a level around the output of a filter and its rate."""
-    lower, upper = _curve_of_bounds(context, level, _curve_of_time(t, 2), [centre, rate])
+    lower, upper = _curve_of_bounds(context, level, taylor.curve_of_time(t, 2), [centre, rate])
     return Tube(centre, rate, lower[0], upper[0], lower[1], upper[1])
 
 
@@ -131,7 +134,7 @@ def _level(
     t: jax.Array,
     x: jax.Array,
     tube: Tube,
-    below: Any,
+    slope_below: Any,
     d_hat: jax.Array,
 ) -> Level:
     """The virtual control alpha and the weighted slope of level i + 1 of (S.2).
@@ -141,87 +144,84 @@ def _level(
       i: its row in x.
       plant: the model.
       t, x, d_hat: as `exact_levels`.
-      tube: of x_i around alpha_{i-1}; its positions are in the unit of the level.
-      below: w_{i-1} s_{i-1}, (n,); None for the first level.
+      tube: of x[i] around the virtual control of level i; its positions are in the unit of the
+        level.
+      slope_below: the weighted slope of level i, (n,); None for the first level.
     """
-    barrier, at = design.barrier, x[i]
-    s = barrier.slope(tube, at)
-    rate = barrier.virtual_velocity(tube, at, design.k, design.o)
-    if below is not None:
-        ratio: Any = barrier.error_over_slope(tube, at)
-        exchanged = plants.transposed_gain(plant, i, t, x, below) * ratio
-        rate = rate - (exchanged if design.weight is None else exchanged / design.weight)
+    barrier = design.barrier
+    slope = barrier.slope(tube, x[i])
+    rate = barrier.virtual_velocity(tube, x[i], design.k, design.o)
+    if slope_below is not None:
+        ratio: Any = barrier.error_over_slope(tube, x[i])
+        coupling = plants.transposed_gain(plant, i, t, x, slope_below) * ratio
+        if design.weight is not None:
+            coupling = coupling / design.weight
+        rate = rate - coupling
     if design.c is not None:
-        rate = rate - design.c * s
-    rates, torque = _split(d_hat)
+        rate = rate - design.c * slope
+    rates, torque = _rates_and_torque(d_hat)
     if rates is not None:
         rate = rate - rates[i]
     alpha = plants.level_input(plant, i + 1, t, x, rate, torque)
-    return Level(alpha, s if design.weight is None else design.weight * s)
+    if design.weight is not None:
+        slope = design.weight * slope
+    return Level(alpha, slope)
 
 
 # --- curves in time -----------------------------------------------------------------------------
 
 
-def _curve_of_time(t: jax.Array, count: int) -> list[tuple[jax.Array]]:
-    """The time itself and its derivatives, `count` of them."""
-    one, zero = jnp.ones_like(t), jnp.zeros_like(t)
-    return [(t,), (one,), *[(zero,)] * (count - 2)][:count]
-
-
 def _curve_of_state(plant: Plant, t: jax.Array, x: jax.Array, d_hat: jax.Array) -> list[jax.Array]:
-    """The state and its derivatives along the flow of the model, r of them, (r, n) each.
+    """The state and its derivatives along the flow of the model, of the orders 0 to r - 1, (r, n)
+    each.
 
     Level j, counted from 1, is known up to the order r - j, because the input is not known yet.
     Entries beyond that are 0 and are not used.
     """
-    rates, torque = _split(d_hat)
+    rates, torque = _rates_and_torque(d_hat)
     order = plant.order
     zero = jnp.zeros_like(x[0])
 
-    def flow(t, x):
+    def rates_below_the_last(t, x):
         rows = []
         for level in range(1, order):
             rate = plants.level_rate(plant, level, t, x, x[level], torque)
-            rows.append(rate if rates is None else rate + rates[level - 1])
+            if rates is not None:
+                rate = rate + rates[level - 1]
+            rows.append(rate)
         return jnp.stack(rows)
 
     curve = [x]
     for m in range(1, order):
-        times = _curve_of_time(t, m)
-        latest = taylor.along(flow, [(times[j][0], curve[j]) for j in range(m)])[-1]
+        points = list(zip(taylor.curve_of_time(t, m), curve, strict=True))
+        # Derivative m of the state is derivative m - 1 of its rate.
+        latest = taylor.along(rates_below_the_last, points)[-1]
         known = [latest[j] for j in range(order - m)]
         curve.append(jnp.stack([*known, *[zero] * m]))
     return curve
 
 
 def _curve_of_bounds(
-    context: LawContext, level: int, times: list, centre: list[jax.Array]
+    context: LawContext, level: int, times: list[jax.Array], centre: list[jax.Array]
 ) -> tuple[list[jax.Array], list[jax.Array]]:
     """The bounds of a level and their derivatives, as many as those of its centre.
 
-    A level without bounds has a tube of constant width, which no `Quadratic` uses.
+    A level without bounds has a tube of constant width.  Its barrier is `Quadratic`, which does not
+    use the width.
     """
     bounds = context.level_bounds(level)
     if bounds is None:
-        return (
-            [centre[0] - 1.0, *centre[1:]],
-            [centre[0] + 1.0, *centre[1:]],
-        )
-    follows = _followed(context, level)
-    if follows is not None:
+        return [centre[0] - 1.0, *centre[1:]], [centre[0] + 1.0, *centre[1:]]
 
-        def sides_in_time(t):
-            return bounds_at(bounds, t, follows(t))
+    def sides(t, centre):
+        return bounds_at(bounds, t, centre)
 
-        found = taylor.in_time(sides_in_time, times[0][0], len(times) - 1)
+    followed = _followed(context, level)
+    if followed is None:
+        curve = taylor.along(sides, list(zip(times, centre, strict=True)))
     else:
-
-        def sides(t, x):
-            return bounds_at(bounds, t, x)
-
-        found = taylor.along(sides, [(t[0], x) for t, x in zip(times, centre, strict=True)])
-    return [x[0] for x in found], [x[1] for x in found]
+        curve = taylor.in_time(lambda t: sides(t, followed(t)), times[0], len(times) - 1)
+    return [lower for lower, _ in curve], [upper for _, upper in curve]
 
 
 def _followed(context: LawContext, level: int) -> Callable | None:
@@ -246,8 +246,10 @@ def _curve_of_tube(
     ]
 
 
-def _split(d_hat: jax.Array) -> tuple[jax.Array | None, jax.Array | float]:
-    """An estimate as the rates that it adds to the levels, (r, n), and as a torque on the robot,
-    (n,) [N m]; the other is None, or 0.0.
+def _rates_and_torque(d_hat: jax.Array) -> tuple[jax.Array | None, jax.Array | float]:
+    """The rates that an estimate adds to the levels, (r, n), and the torque that it adds to the
+    robot, (n,) [N m].  An estimate is one of the two; the other is None, or 0.0.
     """
-    return (d_hat, 0.0) if d_hat.ndim == 2 else (None, d_hat)
+    if d_hat.ndim == 2:
+        return d_hat, 0.0
+    return None, d_hat

@@ -26,13 +26,15 @@ and beta_i' = (alpha_i - beta_i)/mu_i takes the place of alpha_i'.  No derivativ
 of the filters remains as an error, and the bound above becomes ultimate boundedness.
 
 **Smoothness.**  u contains the slope s_i of a level differentiated r - i - 1 times.  `Integral` and
-`Log` have a kink of the slope at e_i = 0 in an asymmetric tube, and on levels above the first
+`Log(p=1)` have a kink of the slope at e_i = 0 in an asymmetric tube, and on levels above the first
 their e_i/s_i jumps there.  Such a barrier is refused below the last level.  On the last level u
 jumps at e_r = 0 (`switching`), as the exact cancellation requires.
 """
 
 from __future__ import annotations
 
+import copy
+import math
 from typing import Any, ClassVar
 
 import jax
@@ -165,18 +167,17 @@ class BarrierBackstepping:
         weights = jnp.ones_like(x)
         if scale is not None:
             weights = scale(x) * self._centre_ratios(context, x)
-        copy = object.__new__(type(self))
-        for name, value in vars(self).items():
-            object.__setattr__(copy, name, value)
-        object.__setattr__(copy, "weights", weights)
-        return copy
+        # The fields are checked already; `dataclasses.replace` would check them again.
+        found = copy.copy(self)
+        object.__setattr__(found, "weights", weights)
+        return found
 
     def _centre_ratios(self, context: LawContext, x: jax.Array) -> jax.Array:
         """e_i/s_i at e_i = 0 and t = 0, (r, n), with which the weights have the scale of e_i^2."""
         t = jnp.zeros((), x.dtype)
         ratios = [_ratio(self.barriers[0], context.tube(t), context.tube(t).q_d)]
         for i in range(1, self.order):
-            tube = _still_tube(context.level_bounds(i + 1), t, jnp.zeros_like(x[i]))
+            tube = _tube_at_rest(context.level_bounds(i + 1), t, jnp.zeros_like(x[i]))
             ratios.append(_ratio(self.barriers[i], tube, tube.q_d))
         return jnp.stack(ratios)
 
@@ -239,11 +240,12 @@ class BarrierBackstepping:
             remedy = "Or take barriers.Quadratic() for that level."
             raise checks.fail(field, None, expected, remedy)
         last = i == self.order - 1
-        if i > 0 and _ratio_of(barrier) is None:
+        if i > 0 and not _has_ratio(barrier):
             expected = "a barrier with `error_over_slope` above the first level"
             raise checks.fail(name, kind, expected, "Such as Mapping().")
         if last or self.filter is not None or _is_symmetric(context, i, bounds):
             return
+        # Row i is level i + 1, whose slope u contains with r - (i + 1) - 1 derivatives.
         needed = self.order - i - 2
         smooth = barrier_member(barrier, "slope_derivatives")
         if smooth >= needed and not (i > 0 and ratio_jumps(barrier)):
@@ -258,12 +260,12 @@ class BarrierBackstepping:
 
     @property
     def _designs(self) -> list[Design]:
-        """The numbers of each level."""
-        o: Any = [None] * self.order if self.o is None else self.o
-        return [
-            Design(barrier, self.k[i], o[i], self.c[i], self.weights[i])
-            for i, barrier in enumerate(self.barriers)
-        ]
+        """The barrier and the gains of each level."""
+        o: Any = self.o
+        if o is None:
+            o = [None] * self.order
+        rows = zip(self.barriers, self.k, o, self.c, self.weights, strict=True)
+        return [Design(*row) for row in rows]
 
     def init(self, x: jax.Array, context: LawContext) -> Any:
         """beta_i(0) = alpha_i(0) of (S.2), (r - 1, n), of a dynamic surface; no state otherwise.
@@ -329,21 +331,25 @@ class BarrierBackstepping:
 # --- checks ---------------------------------------------------------------------------------------
 
 
-def _ratio_of(barrier: Barrier) -> jax.Array | None:
-    """e/s of a barrier in the middle of a tube, or None if it has no such ratio."""
+def _has_ratio(barrier: Barrier) -> bool:
+    """Whether a barrier states the ratio e/s."""
     zero, one = jnp.zeros(1), jnp.ones(1)
     tube = Tube(zero, zero, -one, one, zero, zero)
-    return barrier_member(barrier, "error_over_slope")(tube, zero)  # type: ignore[no-any-return]
+    return barrier_member(barrier, "error_over_slope")(tube, zero) is not None
 
 
 def _ratio(barrier: Barrier, tube: Tube, x: jax.Array) -> jax.Array:
-    """e/s of a barrier; 1 for a barrier without one."""
-    found = barrier_member(barrier, "error_over_slope")(tube, x)
-    return jnp.ones_like(x) if found is None else found
+    """The ratio e/s of a barrier; 1 for a barrier that does not state it."""
+    stated = barrier_member(barrier, "error_over_slope")(tube, x)
+    if stated is None:
+        return jnp.ones_like(x)
+    return stated  # type: ignore[no-any-return]
 
 
-def _still_tube(bounds: Bounds | None, t: jax.Array, like: jax.Array) -> Tube:
-    """The tube of a level at time t around the middle of its bounds; of width 1 without bounds."""
+def _tube_at_rest(bounds: Bounds | None, t: jax.Array, like: jax.Array) -> Tube:
+    """The tube of a level at time t around the middle of its bounds, without rates; without bounds
+    it reaches from -1 to 1.
+    """
     zero = jnp.zeros_like(like)
     if bounds is None:
         return Tube(zero, zero, zero - 1.0, zero + 1.0, zero, zero)
@@ -356,16 +362,19 @@ TIMES = (0.0, 0.37, 1.1, 2.9, 7.3, 19.7)
 
 
 def _is_symmetric(context: LawContext, i: int, bounds: Bounds) -> bool:
-    """Whether the tube of level i + 1 is symmetric about its centre at all times of a list; True
-    for traced values, which an earlier call has checked.
+    """Whether the tube of level i + 1 is symmetric about its centre at all `TIMES`; True for traced
+    values, which an earlier call has checked.
+
+    The centre of a tube above the first level is a virtual control, about which only two opposite
+    funnels are symmetric, because they follow it.
     """
     if not checks.is_concrete((bounds, context.reference)):
         return True
+    lower, upper = bounds.lower, bounds.upper
     if i > 0:
-        if not isinstance(bounds.lower, Funnel) or not isinstance(bounds.upper, Funnel):
+        if not isinstance(lower, Funnel) or not isinstance(upper, Funnel):
             return False
-        sides = [(bounds.lower, bounds.upper)]
-        return all(_are_opposite(lower, upper) for lower, upper in sides)
+        return _are_opposite(lower, upper)
     tubes = [context.tube(jnp.asarray(t)) for t in TIMES]
     return all(np.allclose(tube.k_l, tube.k_u, rtol=1e-9, atol=0.0) for tube in tubes)
 
@@ -383,5 +392,5 @@ def _smooth_alternatives(i: int, order: int) -> str:
     """The barriers that are smooth enough on a level, in words."""
     if i > 0:
         return "Mapping() and PrescribedPerformance() are smooth."
-    p = -(-order // 2)
+    p = math.ceil(order / 2)
     return f"Mapping(), PrescribedPerformance() and Log(p={p}) are smooth enough."

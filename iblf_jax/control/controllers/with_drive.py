@@ -70,7 +70,7 @@ class WithDrive:
         return command._replace(input=voltage), rate
 
     def _velocity(self, t: jax.Array, *state: Any) -> jax.Array:
-        """Q' among the arguments of a law, (n,) [rad/s]."""
+        """The velocity q' among the arguments t, q, q' or t, x of a law, (n,) [rad/s]."""
         if law_member(unwrapped(self.law), "receives_x"):
             return state[0][1]  # type: ignore[no-any-return]
         return state[1]  # type: ignore[no-any-return]

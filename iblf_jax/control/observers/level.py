@@ -65,7 +65,7 @@ class LevelObserver:
 
     @property
     def error_gain(self) -> jax.Array:
-        """Kappa of d_tilde' = d' - kappa d_tilde, (), (r,) or (r, n) [1/s]."""
+        """The rate kappa of d_tilde' = d' - kappa d_tilde, (), (r,) or (r, n) [1/s]."""
         return self.gain
 
     def init(self, x: jax.Array, model: Plant) -> jax.Array:
@@ -95,9 +95,10 @@ class LevelObserver:
         state: jax.Array,
         period: jax.Array,
     ) -> jax.Array:
-        """Eta a period later for constant x and u, (r, n).
+        """The state eta a period later for constant x and u, (r, n).
 
-        It is exact: eta' = kappa (eta* - eta), so that eta* - eta falls by exp(-kappa period).
+        It is exact: eta' = kappa (eta* - eta) with a constant eta*, so that eta* - eta falls by the
+        factor exp(-kappa period).
         """
         rate = self.derivative(t, x, u, model, state)
         return state + period * _mean_decay(self.gain * period) * rate

@@ -25,8 +25,8 @@ with fading memory, with which all poles of the chain are at a = exp(-bandwidth 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from typing import Any, ClassVar, NamedTuple
+from collections.abc import Callable, Iterator
+from typing import Any, ClassVar, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -56,10 +56,12 @@ class Segment(NamedTuple):
     first: int
     last: int
 
-    @property
-    def length(self) -> int:
-        """Number of levels."""
-        return self.last - self.first + 1
+
+Flow: TypeAlias = Callable[[jax.Array, jax.Array], jax.Array]
+"""The rate of the state as a function of the time and the state."""
+
+Gains: TypeAlias = Callable[[int], list[jax.Array]]
+"""Number of derivatives -> the gain of each."""
 
 
 @component
@@ -120,22 +122,30 @@ class StateObserver:
 
     def init(self, x: jax.Array, model: Plant) -> StateObserverValues:
         """The levels at the start with the offset, and no disturbance."""
-        offset = jnp.broadcast_to(self.offset, x.shape)
-        rows = [x[i] if i + 1 in self.measured else x[i] + offset[i] for i in range(model.order)]
-        d_hat: Any = jnp.zeros_like(x) if self.disturbance else ()
-        return StateObserverValues(jnp.stack(rows), d_hat)
+        x_hat = self._with_measured(x, x + jnp.broadcast_to(self.offset, x.shape))
+        if not self.disturbance:
+            return StateObserverValues(x_hat, ())
+        return StateObserverValues(x_hat, jnp.zeros_like(x))
 
     def estimate(
         self, t: jax.Array, x: jax.Array, model: Plant, state: StateObserverValues
     ) -> jax.Array:
         """d_hat, (r, n); 0 where it is not estimated."""
-        return state.d_hat if self.disturbance else jnp.zeros_like(x)
+        if not self.disturbance:
+            return jnp.zeros_like(x)
+        return state.d_hat  # type: ignore[no-any-return]
 
     def complete(
         self, t: jax.Array, x: jax.Array, model: Plant, state: StateObserverValues
     ) -> jax.Array:
         """The levels that the law receives, (r, n): the measured rows of x, and else x_hat."""
-        rows = [x[i] if i + 1 in self.measured else state.x_hat[i] for i in range(model.order)]
+        return self._with_measured(x, state.x_hat)
+
+    def _with_measured(self, x: jax.Array, x_hat: jax.Array) -> jax.Array:
+        """The measured rows of x and the other rows of x_hat, (r, n)."""
+        rows = list(x_hat)
+        for level in self.measured:
+            rows[level - 1] = x[level - 1]
         return jnp.stack(rows)
 
     def derivative(
@@ -152,8 +162,8 @@ class StateObserver:
             return [math.comb(count, i) * self.bandwidth**i for i in range(1, count + 1)]
 
         correction = self._correction(t, x, model, state, gains)
-        moved = self._flow(t, model, u, state.d_hat)(t, state.x_hat)
-        return StateObserverValues(moved + correction.x_hat, correction.d_hat)
+        predicted = self._flow(model, u, state.d_hat)(t, state.x_hat)
+        return StateObserverValues(predicted + correction.x_hat, correction.d_hat)
 
     def advance(
         self,
@@ -175,46 +185,46 @@ class StateObserver:
         correction = self._correction(t, x, model, state, gains)
         x_hat = state.x_hat + correction.x_hat
         d_hat = jax.tree.map(jnp.add, state.d_hat, correction.d_hat)
-        flow = self._flow(t, model, u, d_hat)
+        flow = self._flow(model, u, d_hat)
         return StateObserverValues(_runge_kutta(flow, t, x_hat, period), d_hat)
 
-    def _flow(self, t: jax.Array, model: Plant, u: jax.Array, d_hat: Any) -> Any:
+    def _flow(self, model: Plant, u: jax.Array, d_hat: Any) -> Flow:
         """The rate of the model's state with the estimated disturbance, a function of t and x."""
 
         def flow(t: jax.Array, x: jax.Array) -> jax.Array:
             rate = plants.flow(model, t, x, u)
-            return rate + d_hat if self.disturbance else rate
+            if self.disturbance:
+                rate = rate + d_hat
+            return rate
 
         return flow
 
     def _correction(
-        self, t: jax.Array, x: jax.Array, model: Plant, state: StateObserverValues, gains: Any
+        self, t: jax.Array, x: jax.Array, model: Plant, state: StateObserverValues, gains: Gains
     ) -> StateObserverValues:
         """The correction of x_hat and d_hat by the errors of the measured levels.
 
-        `gains(count)` are the gains of the first `count` derivatives of a measured level, from 0.
+        `gains(count)` are those of the derivatives of a measured level of the orders 0 to
+        `count` - 1.
         """
         x_hat = state.x_hat
         zero = jnp.zeros_like(x_hat[0])
         states: list[jax.Array] = []
         disturbances: list[jax.Array] = []
-        for segment in self._segments(model.order):
-            error = x[segment.first - 1] - x_hat[segment.first - 1]
-            known = gains(segment.length + self.disturbance)
-            last = segment.length - 1
-            for k in range(segment.length):
-                level = segment.first + k
-                states.append(
-                    _through_gains(model, segment.first, level, t, x_hat, known[k] * error)
-                )
+        for first, last in self._segments(model.order):
+            error = x[first - 1] - x_hat[first - 1]
+            levels = range(first, last + 1)
+            # The disturbance of the last level is one more derivative.
+            of_states = gains(len(levels) + self.disturbance)
+            for level, gain in zip(levels, of_states, strict=False):
+                states.append(_through_gains(model, first, level, t, x_hat, gain * error))
                 disturbances.append(zero)
             if self.disturbance:
-                rate = known[last + 1] * error
-                disturbances[-1] = _through_gains(
-                    model, segment.first, segment.last, t, x_hat, rate
-                )
-        d_hat: Any = jnp.stack(disturbances) if self.disturbance else ()
-        return StateObserverValues(jnp.stack(states), d_hat)
+                rate = of_states[-1] * error
+                disturbances[-1] = _through_gains(model, first, last, t, x_hat, rate)
+        if not self.disturbance:
+            return StateObserverValues(jnp.stack(states), ())
+        return StateObserverValues(jnp.stack(states), jnp.stack(disturbances))
 
 
 def _through_gains(
@@ -249,18 +259,21 @@ def fading_memory_gains(a: jax.Array, count: int, period: jax.Array) -> list[jax
     """
     # In the coordinates xi_k T^k / k! the map F has the binomial coefficients as its entries.
     F = np.array([[math.comb(j, i) for j in range(count)] for i in range(count)], float)
-    powers = [np.linalg.matrix_power(F, j) for j in range(count)]
-    observability = np.stack([power[0] for power in powers])
+    powers = [np.linalg.matrix_power(F, j) for j in range(count + 1)]
+    observability = np.stack([power[0] for power in powers[:count]])
     last = np.linalg.solve(observability, np.eye(count)[-1])
-    terms = [
-        math.comb(count, j) * np.linalg.solve(F, np.linalg.matrix_power(F, count - j) @ last)
-        for j in range(count + 1)
+    # (F - a)^count by the binomial theorem: coefficient j is that of (-a)^j.
+    coefficients = [
+        math.comb(count, j) * np.linalg.solve(F, powers[count - j] @ last) for j in range(count + 1)
     ]
-    scaled = [sum(float(term[k]) * (-a) ** j for j, term in enumerate(terms)) for k in range(count)]
-    return [gain * math.factorial(k) / period**k for k, gain in enumerate(scaled)]
+    gains = []
+    for k in range(count):
+        scaled = sum(float(vector[k]) * (-a) ** j for j, vector in enumerate(coefficients))
+        gains.append(scaled * math.factorial(k) / period**k)
+    return gains
 
 
-def _runge_kutta(flow: Any, t: jax.Array, x: jax.Array, period: jax.Array) -> jax.Array:
+def _runge_kutta(flow: Flow, t: jax.Array, x: jax.Array, period: jax.Array) -> jax.Array:
     """The state a period later, by one step of the classical Runge-Kutta method."""
     half = 0.5 * period
     first = flow(t, x)

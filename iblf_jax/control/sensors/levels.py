@@ -24,15 +24,13 @@ from iblf_jax.core.pytree import component
 
 
 class Span(NamedTuple):
-    """The levels and the normal numbers of a part."""
+    """A part, and its share of the levels and of the normal random numbers."""
 
     part: Any
-    first: int
-    """Index of its first level."""
-    end: int
-    """Index after its last level."""
-    first_draw: int
-    end_draw: int
+    levels: slice
+    """Its rows of x."""
+    draws: slice
+    """Its rows of the normal random numbers."""
 
 
 @component
@@ -69,12 +67,13 @@ class Levels:
         object.__setattr__(self, "parts", parts)
 
     def _spans(self) -> Iterator[Span]:
-        """The levels of each part, and its share of the normal numbers."""
+        """The parts with their levels and their normal random numbers."""
         level, draw = 0, 0
         for part in self.parts:
-            end, end_draw = level + sensor_member(part, "levels"), draw + part.draws
-            yield Span(part, level, end, draw, end_draw)
-            level, draw = end, end_draw
+            next_level = level + sensor_member(part, "levels")
+            next_draw = draw + part.draws
+            yield Span(part, slice(level, next_level), slice(draw, next_draw))
+            level, draw = next_level, next_draw
 
     @property
     def order(self) -> int:
@@ -87,29 +86,29 @@ class Levels:
         found: list[int] = []
         for span in self._spans():
             if sensor_member(span.part, "is_measured"):
-                found += range(span.first + 1, span.end + 1)
+                found += range(span.levels.start + 1, span.levels.stop + 1)
         return tuple(found)
 
     @property
     def draws(self) -> int:
-        """Those of all parts."""
+        """The normal random numbers of a sample: those of all parts."""
         return sum(part.draws for part in self.parts)
 
     @property
     def unrounded(self) -> Levels:
         """The same without rounding."""
-        return dataclasses.replace(
-            self, parts=tuple(unrounded(span.part) for span in self._spans())
-        )
+        parts = tuple(unrounded(span.part) for span in self._spans())
+        return dataclasses.replace(self, parts=parts)
 
     @property
     def resolution(self) -> jax.Array:
-        """Size of a step of each level, (r, 1) or (r, n); 0 for a level that is not rounded."""
-        rows: list[Any] = []
+        """Step of the readings of each level, (r, 1) or (r, n); 0 for a level without rounding."""
+        rows: list[Any] = [0.0] * self.order
         for span in self._spans():
             step = sensor_member(span.part, "resolution")
-            rows.append(0.0 if step is None else step)
-            rows += [0.0] * (span.end - span.first - 1)
+            if step is not None:
+                # A sensor of two levels rounds the position; its velocity follows from it.
+                rows[span.levels.start] = step
         return jnp.stack(jnp.broadcast_arrays(*map(jnp.atleast_1d, rows)))
 
     def advice(self, period: jax.Array) -> list[str]:
@@ -124,7 +123,7 @@ class Levels:
         """The states of the parts."""
         states = []
         for span in self._spans():
-            levels = x[span.first : span.end]
+            levels = x[span.levels]
             if len(levels) == 1:
                 states.append(span.part.init_level(levels[0], period))
             else:
@@ -138,8 +137,7 @@ class Levels:
         rows: list[jax.Array] = []
         states = []
         for span, before in zip(self._spans(), state, strict=True):
-            levels = x[span.first : span.end]
-            own = normal[span.first_draw : span.end_draw]
+            levels, own = x[span.levels], normal[span.draws]
             if len(levels) == 1:
                 y, after = span.part.measure_level(levels[0], own, period, before)
                 rows.append(y)
@@ -147,5 +145,6 @@ class Levels:
                 found, after = span.part.measure(levels[0], levels[1], own, period, before)
                 rows += [found.q, found.dq]
             states.append(after)
-        higher = jnp.stack(rows[2:]) if len(rows) > 2 else ()
-        return Measurement(rows[0], rows[1], higher), tuple(states)
+        if len(rows) == 2:
+            return Measurement(rows[0], rows[1]), tuple(states)
+        return Measurement(rows[0], rows[1], jnp.stack(rows[2:])), tuple(states)

@@ -33,7 +33,9 @@ from iblf_jax.world.plants.vessel import Vessel as Vessel
 
 def as_plant(part: Any) -> Plant:
     """A plant in strict-feedback form: the part itself, or a robot as a `Rigid`."""
-    return part if is_chain(part) else Rigid(part)  # type: ignore[no-any-return]
+    if is_chain(part):
+        return part  # type: ignore[no-any-return]
+    return Rigid(part)
 
 
 MEMBERS = {

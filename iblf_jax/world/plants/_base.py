@@ -29,6 +29,19 @@ from iblf_jax.world.robots import joint_names
 Units = str | tuple[str, ...]
 """The unit of a level: one for all its components, or one for each."""
 
+MAX_ORDER = 12
+"""Largest number of levels; every level adds an order to the derivatives of the law."""
+
+EXCHANGE_RATE = 10.0
+"""Square of the frequency at which neighbouring levels exchange energy, in the default weights of
+this package's plants [1/s^2]: slow against the gains that a tracking task needs."""
+
+ROUNDING = 1e-9
+"""Derivatives below this share of the largest one are rounding errors."""
+
+LIMIT_WITHOUT_ROBOT = 1e12
+"""As `status.VELOCITY_LIMIT`, for plants without a robot, whose levels may have any units."""
+
 
 class Plant(Protocol):
     """The contract of a plant in strict-feedback form.  All methods are pure functions of one
@@ -103,20 +116,24 @@ plant_member = OptionalMembers(
 
 
 def is_chain(part: Any) -> bool:
-    """Whether this is a plant in strict-feedback form; a robot is none, but `as_plant` makes one of
-    it.
+    """Whether a part has the methods of a plant in strict-feedback form.  A robot has them only
+    inside a `Rigid`, which `as_plant` makes of it.
     """
     return has_members(part, "drift", "gain", "order")
 
 
 def order_of(part: Any) -> int:
     """Number of levels of a plant; 2 for a robot."""
-    return int(part.order) if is_chain(part) else 2
+    if is_chain(part):
+        return int(part.order)
+    return 2
 
 
 def robot_of(part: Any) -> Any:
     """The robot itself, the robot inside a plant, or None."""
-    return plant_member(part, "robot") if is_chain(part) else part
+    if is_chain(part):
+        return plant_member(part, "robot")
+    return part
 
 
 def level_rate(
@@ -162,6 +179,7 @@ def level_input(
     rest = rate - _row(plant.drift, t, x, level)
     if gain.ndim == 2:
         return solve_gain(gain, rest)
+    # NaN, as `solve_gain` gives; a division by 0 would give an infinite input.
     return rest / jnp.where(gain == 0.0, jnp.nan, gain)
 
 
@@ -198,7 +216,9 @@ def _row(
 
 def _times(gain: jax.Array, v: jax.Array) -> jax.Array:
     """The product of a gain, (n, n) or its diagonal (n,), and a vector."""
-    return matvec(gain, v) if gain.ndim == 2 else gain * v
+    if gain.ndim == 2:
+        return matvec(gain, v)
+    return gain * v
 
 
 def flow(
@@ -208,11 +228,11 @@ def flow(
     u: jax.Array,
     torque: jax.Array | float = 0.0,
 ) -> jax.Array:
-    """X' without a disturbance, (order, n); arguments as `level_rate`, u is the input."""
-    inputs = [*x[1:], u]
-    return jnp.stack(
-        [level_rate(plant, i + 1, t, x, above, torque) for i, above in enumerate(inputs)]
-    )
+    """The rate x' without a disturbance, (order, n); arguments as `level_rate`, u is the input."""
+    rows = []
+    for level, above in enumerate([*x[1:], u], start=1):
+        rows.append(level_rate(plant, level, t, x, above, torque))
+    return jnp.stack(rows)
 
 
 def torque_as_rates(plant: Plant, x: jax.Array, torque: jax.Array) -> jax.Array:
@@ -274,10 +294,6 @@ def check_dependence(name: str, dependence: Dependence) -> None:
         raise checks.fail(f"{name}.{function}(t, x)", checks.Words(got), expected, remedy)
 
 
-ROUNDING = 1e-9
-"""Derivatives below this share of the largest one are rounding errors."""
-
-
 def units_of(part: Any) -> tuple[Units, ...]:
     """The units of the levels of a plant and of its input: order + 1 of them."""
     if not is_chain(part):
@@ -323,16 +339,20 @@ def level_names(part: Any) -> tuple[str, ...]:
 
 def input_name(part: Any) -> str:
     """The name of the input: "torque" of a robot."""
-    return plant_member(part, "input_name") if is_chain(part) else "torque"
+    if is_chain(part):
+        return str(plant_member(part, "input_name"))
+    return "torque"
 
 
 def component_names(part: Any) -> tuple[str, ...]:
-    """Names of the n components of a level: the joints of a robot, or of the robot inside a plant;
-    else those that the plant states, or "component 0", "component 1", ...
+    """Names of the n components of a level: those that the plant states, else those of the joints
+    of the robot or of the robot inside the plant, else "component 0", "component 1", ...
     """
-    own = plant_member(part, "component_names") if is_chain(part) else ()
+    own: tuple[str, ...] = ()
+    if is_chain(part):
+        own = tuple(plant_member(part, "component_names"))
     if own:
-        return tuple(own)
+        return own
     robot = robot_of(part)
     if robot is not None:
         return joint_names(robot, part.n)
@@ -341,18 +361,18 @@ def component_names(part: Any) -> tuple[str, ...]:
 
 def component_noun(part: Any) -> str:
     """The word for a component of a level: "joint" where there is a robot."""
-    return "component" if robot_of(part) is None else "joint"
+    if robot_of(part) is None:
+        return "component"
+    return "joint"
 
 
 def speed_limit(part: Any) -> float:
     """The size of the second level above which a run counts as diverged: of a robot
     `status.VELOCITY_LIMIT`; other plants may have any units.
     """
-    return VELOCITY_LIMIT if robot_of(part) is not None else OTHER_LIMIT
-
-
-OTHER_LIMIT = 1e12
-"""As `status.VELOCITY_LIMIT`, for plants without a robot, whose levels may have any units."""
+    if robot_of(part) is None:
+        return LIMIT_WITHOUT_ROBOT
+    return VELOCITY_LIMIT
 
 
 def check_dimensions(name: str, plant: Plant) -> None:
@@ -384,11 +404,3 @@ def _check_texts(name: str, value: Any, count: int) -> None:
     is_tuple = isinstance(value, tuple | list)
     if not is_tuple or len(value) != count or not all(isinstance(x, str) for x in value):
         raise checks.fail(name, value, f"a tuple of {count} texts")
-
-
-EXCHANGE_RATE = 10.0
-"""Square of the frequency at which neighbouring levels exchange energy, in the default weights of
-this package's plants [1/s^2]: slow against the gains that a tracking task needs."""
-
-MAX_ORDER = 12
-"""Largest number of levels; every level adds an order to the derivatives of the law."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import ClassVar
 
 import jax
@@ -10,6 +11,7 @@ import jax.numpy as jnp
 from iblf_jax.core import checks
 from iblf_jax.core.linalg import matvec, solve_spd
 from iblf_jax.core.pytree import component
+from iblf_jax.core.time import as_at, jump_times_of
 from iblf_jax.world.robots import Robot
 
 
@@ -84,6 +86,14 @@ class Rigid:
     def steady_input(self, q: jax.Array) -> jax.Array:
         """G(q), (n,) [N m]."""
         return self.robot.gravity(q)
+
+    def at(self, t: jax.Array) -> Rigid:
+        """The plant at time t [s], with the robot as it is then."""
+        return dataclasses.replace(self, robot=as_at(self.robot, t))
+
+    def jump_times(self) -> jax.Array:
+        """The times at which the robot jumps, (m,) [s]."""
+        return jump_times_of("robot", self.robot)
 
 
 def robot_acceleration(robot: Robot, q: jax.Array, dq: jax.Array, torque: jax.Array) -> jax.Array:
