@@ -16,7 +16,6 @@ import jax.numpy as jnp
 
 from iblf_jax.core.linalg import matvec
 from iblf_jax.core.optional import OptionalMembers
-from iblf_jax.core.pytree import unwrapped
 from iblf_jax.world.bounds import Bounds, Tube, speed_limits_at, tube_at
 from iblf_jax.world.references import Reference
 from iblf_jax.world.regions import Along, Region, along
@@ -186,21 +185,6 @@ def switching_functions(law: Controller, *arguments: Any) -> jax.Array | None:
         return None
     functions: jax.Array | None = own(*arguments)
     return functions
-
-
-def measured_arguments(
-    law: Controller, q: jax.Array, dq: jax.Array, higher: Any
-) -> tuple[jax.Array, ...]:
-    """How a law receives the state of the plant: (q, q'), or (x,) if it `receives_x`.
-
-    Args:
-      law: any.
-      q, dq: the first two levels, (n,).
-      higher: the levels from the third on, (r - 2, n); `()` for a robot.
-    """
-    if not law_member(unwrapped(law), "receives_x"):
-        return q, dq
-    return (state_of_levels(q, dq, higher),)
 
 
 def state_of_levels(q: jax.Array, dq: jax.Array, higher: Any) -> jax.Array:
