@@ -297,7 +297,8 @@ def check_joint(curves: Sequence[Curve], joint: Any, field: str = "joint") -> in
     if isinstance(joint, str) and joint in names:
         return names.index(joint)
     if isinstance(joint, bool) or not isinstance(joint, int | np.integer) or not 0 <= joint < n:
-        raise checks.fail(field, joint, f"a {plants.component_noun(plant)}, 0 to {n - 1}")
+        noun = checks.with_article(plants.component_noun(plant))
+        raise checks.fail(field, joint, f"{noun}, 0 to {n - 1}")
     return int(joint)
 
 

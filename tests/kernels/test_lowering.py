@@ -42,6 +42,7 @@ SPECIAL = {
         times=(0.0, 1.0, 2.5), waypoints=[[0.5, 0.6], [0.6, 0.4], [0.5, 0.5]]
     ),
     "quintic": lambda cls: cls(start=0.5, end=0.6, duration=2.0),
+    "smooth_step": lambda cls: cls(start=0.5, end=0.6, duration=2.0),
     "sum": lambda cls: cls(
         (ij.disturbances.Friction(viscous=0.1, coulomb=0.2), ij.disturbances.Step(1.0, 0.0))
     ),
