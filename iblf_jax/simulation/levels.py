@@ -143,7 +143,8 @@ def observer_estimate(
         return estimate_as_torque(scenario.model, q, d_hat)
     if plants.is_chain(scenario.model) and isinstance(observer, NoObserver):
         return jnp.zeros((scenario.model.order, *q.shape), q.dtype)
-    return observer.estimate(t, q, dq, _observed_robot(scenario), state)  # type: ignore[no-any-return]
+    estimate: jax.Array = observer.estimate(t, q, dq, _observed_robot(scenario), state)
+    return estimate
 
 
 def estimate_shape(scenario: Any) -> tuple[int, ...]:
