@@ -7,6 +7,9 @@ Cholesky factor is written out as scalar operations, and products are sums of el
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 
@@ -92,11 +95,16 @@ def solve_spd(matrix: jax.Array, rhs: jax.Array) -> jax.Array:
     return jnp.stack(x)
 
 
-@solve_spd.defjvp
-def _solve_spd_jvp(primals, tangents):
+def _solution_jvp(solver: Callable, primals: tuple, tangents: tuple) -> tuple:
+    """The solution x of matrix x = rhs and its derivative, which solves the equation
+    matrix dx = drhs - dmatrix x.
+    """
     (matrix, rhs), (matrix_dot, rhs_dot) = primals, tangents
-    x = solve_spd(matrix, rhs)
-    return x, solve_spd(matrix, rhs_dot - matvec(matrix_dot, x))
+    x = solver(matrix, rhs)
+    return x, solver(matrix, rhs_dot - matvec(matrix_dot, x))
+
+
+solve_spd.defjvp(partial(_solution_jvp, solve_spd))
 
 
 @jax.custom_jvp
@@ -130,11 +138,7 @@ def solve_gain(matrix: jax.Array, rhs: jax.Array) -> jax.Array:
     return jnp.stack(x)
 
 
-@solve_gain.defjvp
-def _solve_gain_jvp(primals, tangents):
-    (matrix, rhs), (matrix_dot, rhs_dot) = primals, tangents
-    x = solve_gain(matrix, rhs)
-    return x, solve_gain(matrix, rhs_dot - matvec(matrix_dot, x))
+solve_gain.defjvp(partial(_solution_jvp, solve_gain))
 
 
 def solve(matrix: jax.Array, rhs: jax.Array) -> jax.Array:

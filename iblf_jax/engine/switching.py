@@ -40,10 +40,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.controllers._base import switching_functions
+from iblf_jax.control.controllers._base import law_member, switching_functions
+from iblf_jax.core.pytree import unwrapped
 from iblf_jax.simulation.closed_loop import LoopState
 from iblf_jax.simulation.integrators import StepResult, stage_states, tableau
-from iblf_jax.simulation.levels import law_state
+from iblf_jax.simulation.levels import law_state, observer_estimate
 from iblf_jax.simulation.scenario import Scenario
 
 SURFACE_CLEARANCE = 1e-4
@@ -140,8 +141,13 @@ def surfaces(scenario: Scenario, t: jax.Array, state: LoopState) -> jax.Array | 
     not jump.
     """
     law, context = scenario.controller, scenario.context
-    measured = law_state(scenario, state.q, state.dq, state.higher)
-    return switching_functions(law, t, *measured, context, state.controller)
+    arguments = law_state(scenario, state.q, state.dq, state.higher)
+    if law_member(unwrapped(law), "receives_x"):
+        levels = (state.q, state.dq, state.higher)
+        observer = scenario.observer
+        d_hat = observer_estimate(scenario, observer, t, *levels, state.observer)
+        arguments = (*arguments, d_hat)
+    return switching_functions(law, t, *arguments, context, state.controller)
 
 
 def with_hybrid_derivative(

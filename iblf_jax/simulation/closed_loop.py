@@ -339,10 +339,11 @@ def _robot_uncertain_signals(
 ) -> _UncertainSignals:
     """The signals of a model that is a robot: f of (2.1) and V2 of (3.12)."""
     model = scenario.model
-    if not isinstance(signals.torque, tuple):
-        tau = signals.torque
     M0, G0 = model.mass_matrix(q), model.gravity(q)
-    balance = G0 if isinstance(signals.torque, tuple) else steady_input(scenario, q)
+    balance = G0
+    if not isinstance(signals.torque, tuple):
+        # The plant has another input than the torque of the law.
+        tau, balance = signals.torque, steady_input(scenario, q)
     f = matvec(M0, moved.ddq) + model.coriolis(q, dq, dq) + G0 - tau
     f_hat = estimate_as_torque(model, q, signals.f_hat)
     e2, f_tilde = dq - signals.alpha, f - f_hat

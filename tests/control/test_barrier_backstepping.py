@@ -13,6 +13,8 @@ import pytest
 
 import iblf_jax as ij
 from iblf_jax import barriers, bounds, controllers, plants, references
+from iblf_jax.engine.switching import surfaces
+from iblf_jax.simulation.closed_loop import evaluate, initial_state
 
 DATA = np.load(other.FILE)
 
@@ -228,3 +230,14 @@ def test_a_virtual_control_outside_the_bounds_of_its_level_is_flagged():
     with pytest.warns(ij.SimulationWarning):
         run = ij.simulate(scenario, duration=1.0, dt=1e-3)
     assert int(run.status) & ij.Status.ALPHA_INFEASIBLE
+
+
+def test_the_input_jumps_where_the_last_error_is_zero():
+    """The error contains the estimates of the observer, as the command does."""
+    scenario = third_order(
+        controller=law(barriers=(MAPPING, MAPPING, barriers.Integral())),
+        observer=ij.observers.LevelObserver(gain=(0.0, 5.0, 5.0), eta0=(0.3, -2.0, 4.0)),
+    )
+    state, t = initial_state(scenario), jnp.asarray(0.2)
+    sample = evaluate(scenario, t, state)[1]
+    np.testing.assert_allclose(surfaces(scenario, t, state), sample.e_higher[-1], rtol=1e-12)

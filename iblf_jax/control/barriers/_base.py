@@ -128,6 +128,13 @@ def value_unit(barrier: Barrier) -> str:
     return barrier_member(barrier, "value_unit")  # type: ignore[no-any-return]
 
 
+def has_ratio(barrier: Barrier) -> bool:
+    """Whether a barrier states the ratio e/s, which laws need above the first level."""
+    zero, one = jnp.zeros(1), jnp.ones(1)
+    tube = Tube(zero, zero, -one, one, zero, zero)
+    return barrier_member(barrier, "error_over_slope")(tube, zero) is not None
+
+
 def ratio_jumps(barrier: Barrier) -> bool:
     """Whether `error_over_slope` of a barrier may jump at e1 = 0."""
     return bool(barrier_member(barrier, "ratio_jumps"))

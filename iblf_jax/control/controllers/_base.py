@@ -106,7 +106,8 @@ class Controller(Protocol):
     - `filters`: True if its commands have a `slack`.
     - `receives_x`: True for a law of plants in strict-feedback form, which receives the state x,
       (r, n), in the place of q and q': `init(x, context)`, `command(t, x, d_hat, context, state)`
-      and `switching(t, x, context, state)`, with d_hat as the observer gives it, (r, n) or (n,).
+      and `switching(t, x, d_hat, context, state)`, with d_hat as the observer gives it, (r, n) or
+      (n,).
     - `wraps`: the name of the field that holds another law.  Paths then reach through it
       ("controller.K2").
     - `input_unit`: the unit of the input that an input map such as `WithDrive` commands; None for

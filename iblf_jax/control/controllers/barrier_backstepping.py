@@ -45,6 +45,7 @@ from iblf_jax.control.barriers import Barrier, Mapping, Quadratic
 from iblf_jax.control.barriers._base import (
     barrier_member,
     guard_is_active,
+    has_ratio,
     ratio_jumps,
     value_unit,
 )
@@ -240,7 +241,7 @@ class BarrierBackstepping:
             remedy = "Or take barriers.Quadratic() for that level."
             raise checks.fail(field, None, expected, remedy)
         last = i == self.order - 1
-        if i > 0 and not _has_ratio(barrier):
+        if i > 0 and not has_ratio(barrier):
             expected = "a barrier with `error_over_slope` above the first level"
             raise checks.fail(name, kind, expected, "Such as Mapping().")
         if last or self.filter is not None or _is_symmetric(context, i, bounds):
@@ -319,23 +320,16 @@ class BarrierBackstepping:
         return surface_levels(self._designs, self.filter, t, x, d_hat, context, state)
 
     def switching(
-        self, t: jax.Array, x: jax.Array, context: LawContext, state: Any
+        self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext, state: Any
     ) -> jax.Array | None:
         """e_r, (n,), where u jumps at e_r = 0; None for a last barrier without a jump."""
         if not ratio_jumps(self.barriers[-1]):
             return None
-        _, tubes = self.levels(t, x, jnp.zeros_like(x), context, state)
+        _, tubes = self.levels(t, x, d_hat, context, state)
         return x[-1] - tubes[-1].q_d
 
 
 # --- checks ---------------------------------------------------------------------------------------
-
-
-def _has_ratio(barrier: Barrier) -> bool:
-    """Whether a barrier states the ratio e/s."""
-    zero, one = jnp.zeros(1), jnp.ones(1)
-    tube = Tube(zero, zero, -one, one, zero, zero)
-    return barrier_member(barrier, "error_over_slope")(tube, zero) is not None
 
 
 def _ratio(barrier: Barrier, tube: Tube, x: jax.Array) -> jax.Array:

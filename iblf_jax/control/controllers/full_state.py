@@ -56,8 +56,8 @@ import jax.numpy as jnp
 
 from iblf_jax.control.barriers import Barrier, Integral
 from iblf_jax.control.barriers._base import (
-    barrier_member,
     guard_is_active,
+    has_ratio,
     ratio_jumps,
     value_unit,
 )
@@ -137,7 +137,7 @@ class FullState:
         barriers = {"barrier": self.barrier, "velocity_barrier": self.velocity_barrier}
         for name, barrier in barriers.items():
             check_barrier(self, name, barrier)
-        if _ratio_of(self.velocity_barrier) is None:
+        if not has_ratio(self.velocity_barrier):
             remedy = (
                 "iblf_jax.barriers.Integral() and Log() with p = 1 are such; one of your own needs"
                 " `error_over_slope`."
@@ -195,10 +195,3 @@ class FullState:
         value = self.weight * first.value(outer, q) + second.value(inner, dq)
         saturated = jnp.zeros_like(guard_active)
         return Command(levels[1].alpha, inner.q_d, value, guard_active, saturated), ()
-
-
-def _ratio_of(barrier: Barrier) -> jax.Array | None:
-    """e/s of a barrier in the middle of a tube, or None if it has no such ratio."""
-    zero, one = jnp.zeros(1), jnp.ones(1)
-    tube = Tube(zero, zero, -one, one, zero, zero)
-    return barrier_member(barrier, "error_over_slope")(tube, zero)  # type: ignore[no-any-return]
