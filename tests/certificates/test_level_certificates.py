@@ -33,7 +33,6 @@ DESIGNS = {
 SLOW, RELEASE = pytest.mark.slow, pytest.mark.release
 MARKS = {
     "mapping, order 2": (),
-    "mapping, order 3": SLOW,
     "prescribed performance, order 2": SLOW,
 }
 """The others compile for minutes and run before a release."""
@@ -137,7 +136,7 @@ def test_an_integral_barrier_gives_an_inequality():
     assert np.all(left < right)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_mixed_design_of_order_three_keeps_the_inequality():
     # The kink of the slope at e_1 = 0 makes u jump there, so that the law refuses this barrier in a
     # scenario; at other states its functions have the claim.

@@ -554,7 +554,11 @@ def test_derivatives_across_the_jumps_are_those_of_runs_in_pieces(factor):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("time", [0.0031, 0.00366], ids=["before", "behind"])
+@pytest.mark.parametrize(
+    "time",
+    [pytest.param(0.0031, marks=pytest.mark.release), 0.00366],
+    ids=["before", "behind"],
+)
 def test_a_disturbance_and_the_command_jump_in_one_step(time):
     """Joint 0 crosses e2 = 0 at 3.3 ms, in the step of 1 ms in which a disturbance appears:
     derivatives by its time and by k1."""
@@ -583,7 +587,7 @@ def test_a_disturbance_and_the_command_jump_in_one_step(time):
     np.testing.assert_allclose(found, np.stack([by_time, by_k1], axis=1), rtol=0.02)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_every_mode_and_executor_has_the_same_derivative_across_the_jumps():
     gains = jnp.array([*GAINS.values()])
     native = jax.jacfwd(outcome_by(0.12, 2e-3))(gains)[0]

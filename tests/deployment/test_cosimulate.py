@@ -135,6 +135,7 @@ FINGER = (
 )
 
 
+@pytest.mark.release
 def test_what_else_moves_on_the_arm_is_locked_and_what_stands_apart_is_free():
     ball = '<body name="ball" pos="9 9 9"><freejoint/><geom size="0.1"/></body>'
     named = ij.robots.load(_written("arm.xml", two_link(PAPER.plant, inside=FINGER)), tip="fore")

@@ -433,7 +433,12 @@ def test_derivatives_by_a_jump_time_are_those_of_the_split_flow(time):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "sampling", [None, ij.Sampling(period=1e-2, delay=0.0033)], ids=["continuous", "sampled"]
+    "sampling",
+    [
+        pytest.param(None, marks=pytest.mark.release),
+        ij.Sampling(period=1e-2, delay=0.0033),
+    ],
+    ids=["continuous", "sampled"],
 )
 def test_tangents_beside_a_batch_and_reverse_mode_go_through_a_jump(sampling):
     """What `tune` and `sensitivity` use: losses and their derivatives by jump time and gain,

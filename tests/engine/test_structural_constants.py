@@ -180,6 +180,7 @@ def test_a_robot_of_a_user_may_have_a_field_of_that_name():
     )
 
 
+@pytest.mark.release
 def test_derivatives_by_the_geometry(monkeypatch):
     """A direction moves numbers that are compiled in as zeros: their derivatives are there all the
     same."""

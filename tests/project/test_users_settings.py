@@ -45,8 +45,13 @@ def test_the_testers_own_flags_come_last():
     )
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("what", AGAIN)
+@pytest.mark.parametrize(
+    "what",
+    [
+        pytest.param(name, marks=pytest.mark.release if name == "shapes" else pytest.mark.slow)
+        for name in AGAIN
+    ],
+)
 def test_the_same_as_users_compile(what):
     plain = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
     names = [str(ROOT / "tests" / name) for name in (SETTINGS, *AGAIN[what])]

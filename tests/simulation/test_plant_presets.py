@@ -31,7 +31,7 @@ LARGEST_INPUT = {
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(x, marks=pytest.mark.slow) if "iiwa" in x else x for x in RUNS]
+    "name", [pytest.param(x, marks=pytest.mark.release) if "iiwa" in x else x for x in RUNS]
 )
 def test_a_preset_runs_inside_its_bounds(name):
     duration, dt = RUNS[name]

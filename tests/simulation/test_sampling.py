@@ -659,8 +659,8 @@ def test_tuning_finds_its_way_out_of_a_loop_that_is_sampled_too_slowly():
 @pytest.mark.parametrize(
     "observer",
     [
-        ij.observers.Momentum(kf=[50.0, 300.0]),
-        ij.observers.ExtendedState(bandwidth=100.0),
+        pytest.param(ij.observers.Momentum(kf=[50.0, 300.0]), marks=pytest.mark.release),
+        pytest.param(ij.observers.ExtendedState(bandwidth=100.0), marks=pytest.mark.release),
         ij.observers.ExtendedState(l1=100.0, l2=6000.0),
     ],
     ids=["momentum", "double pole", "complex poles"],

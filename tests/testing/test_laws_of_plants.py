@@ -11,7 +11,7 @@ import iblf_jax as ij
 
 
 @pytest.mark.parametrize(
-    "case", [pytest.param("electric drive", marks=pytest.mark.slow), "user functions"]
+    "case", [pytest.param("electric drive", marks=pytest.mark.release), "user functions"]
 )
 def test_laws_of_plants_pass_in_their_scenario(case):
     scenario = loops_of_plants.CASES[case]()

@@ -538,7 +538,7 @@ def test_a_result_that_was_saved_with_weights_as_joints_means_what_it_meant():
     assert all(quantity.joints is None for quantity in found.quantities)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_tuning_and_a_front_under_limits_of_single_joints(paper, tmp_path):
     o = ij.objectives
     limits = [16.0, 14.0]

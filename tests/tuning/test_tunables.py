@@ -213,7 +213,7 @@ def smooth(scenario):
     return canonical(ij.with_parts(scenario, sensor=sensor))
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.filterwarnings("ignore:sampling.period is a whole number")
 def test_all_kinds_together_have_the_derivatives_of_simulate(lab):
     scenario = smooth(lab)
