@@ -228,6 +228,9 @@ LAWS = {
     ),
     "adaptive_rbf": controllers.AdaptiveRBF(k1=2.0, K2=[20.0, 15.0], o=0.1, nodes=8),
     "surface_barrier": controllers.SurfaceBarrier(a=2.0, K=[4.0, 3.0], surface=SURFACE),
+    "terminal_sliding_mode": controllers.TerminalSlidingMode(
+        beta=[1.0, 2.0], K=[20.0, 15.0], layer=0.02
+    ),
     "computed_torque": controllers.ComputedTorque(Kp=25.0, Kd=[10.0, 12.0]),
     "pd_gravity": controllers.PDGravity(Kp=60.0, Kd=[20.0, 10.0]),
     "reference_governor": controllers.ReferenceGovernor(

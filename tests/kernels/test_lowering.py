@@ -60,6 +60,7 @@ SPECIAL = {
     ),
     "safety_filter": lambda cls: cls(PRESET.controller, nearest="acceleration"),
     "saturated": lambda cls: cls(PRESET.controller, limit=8.0),
+    "terminal_sliding_mode": lambda cls: cls(beta=1.0, K=20.0, layer=0.02),
     "extended_state": lambda cls: cls(bandwidth=40.0),
 }
 """Members whose fields do not fit together when each holds a small positive number."""

@@ -24,6 +24,9 @@ from iblf_jax.control.controllers.surface_barrier import SurfaceBarrier as Surfa
 from iblf_jax.control.controllers.systems import KEEPERS as KEEPERS
 from iblf_jax.control.controllers.systems import LAWS as LAWS
 from iblf_jax.control.controllers.systems import law_by_name as law_by_name
+from iblf_jax.control.controllers.terminal_sliding_mode import (
+    TerminalSlidingMode as TerminalSlidingMode,
+)
 from iblf_jax.control.controllers.with_drive import WithDrive as WithDrive
 
 Setting = LawContext
@@ -36,6 +39,7 @@ MEMBERS = {
     "dynamic_surface": DynamicSurface,
     "adaptive_rbf": AdaptiveRBF,
     "surface_barrier": SurfaceBarrier,
+    "terminal_sliding_mode": TerminalSlidingMode,
     "computed_torque": ComputedTorque,
     "pd_gravity": PDGravity,
     "saturated": Saturated,
@@ -66,6 +70,7 @@ __all__ = [
     "Setting",
     "State",
     "SurfaceBarrier",
+    "TerminalSlidingMode",
     "WithDrive",
     "law_by_name",
     "within_effort",
