@@ -152,6 +152,9 @@ LEVEL_OBSERVERS = {
     "state_observer_two_encoders": observers.StateObserver(
         bandwidth=40.0, measured=(1, 3), disturbance=False
     ),
+    "state_observer_limited": observers.StateObserver(
+        bandwidth=40.0, limit=5.0, disturbance_limit=50.0
+    ),
 }
 """Observers of plants in strict-feedback form, some of more levels than a robot has."""
 
@@ -275,6 +278,7 @@ OPTIONAL_FOLDS = (
     metrics.RegionMargin(),
     metrics.Slack(),
     metrics.RegionSlack(),
+    metrics.LevelEstimation(),
 )
 FOLDS = {type(fold).__name__: fold for fold in (*metrics.standard(), *OPTIONAL_FOLDS)}
 

@@ -40,6 +40,7 @@ from iblf_jax.simulation.levels import (
     completed,
     estimate_as_rates,
     estimate_as_torque,
+    estimated_levels,
     law_state,
     model_state,
     motion,
@@ -79,9 +80,11 @@ class LawSignals(NamedTuple):
     torque: Any = ()
     """The torque that a law of a robot commanded through another input, (n,) [N m]; `()` where the
     input is the torque."""
+    estimated: Any = ()
+    """`EstimatedLevels` under an observer that completes a measurement; `()` under others."""
 
 
-def law_signals(command: Command, f_hat: jax.Array) -> LawSignals:
+def law_signals(command: Command, f_hat: jax.Array, estimated: Any = ()) -> LawSignals:
     """The signals of a law that answered with `command` to the estimate `f_hat`."""
     has_other_input = not isinstance(command.input, tuple)
     return LawSignals(
@@ -94,6 +97,7 @@ def law_signals(command: Command, f_hat: jax.Array) -> LawSignals:
         command.region_slack,
         command.alpha_higher,
         command.tau if has_other_input else (),
+        estimated,
     )
 
 
@@ -174,7 +178,13 @@ def _initial_sampled_state(scenario: Scenario, state: LoopState, tau: jax.Array)
         scenario.context,
         state.controller,
     )
-    blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), law_signals(command, f_hat))
+    here = Measurement(q, dq, state.higher)
+    estimated = jax.eval_shape(
+        partial(estimated_levels, scenario, scenario.observer),
+        *(zero[0], here, here, here, state.observer),
+    )
+    signals = law_signals(command, f_hat, estimated)
+    blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), signals)
     return SampledState(
         commands=jnp.repeat(tau[None], sampling.queue + 1, axis=0),
         sensor=part.init(*sensor_state(scenario, q, dq, state.higher), sampling.period),
@@ -230,10 +240,15 @@ def evaluate(
         f_hat = observer_estimate(scenario, observer, t, q, dq, higher, state.observer)
         law: Any = scenario.controller
         context = scenario.context
-        known = completed(scenario, observer, t, Measurement(q, dq, higher), state.observer)
+        measurement = Measurement(q, dq, higher)
+        known = completed(scenario, observer, t, measurement, state.observer)
         measured = law_state(scenario, *known)
         answer, controller_rate = law.command(t, *measured, f_hat, context, state.controller)
-        command, signals = plant_input(answer), law_signals(answer, f_hat)
+        command = plant_input(answer)
+        estimated = estimated_levels(
+            scenario, observer, t, measurement, known, measurement, state.observer
+        )
+        signals = law_signals(answer, f_hat, estimated)
     else:
         command = state.sampled.commands[0] if torque is None else torque
         signals = state.sampled.signals
@@ -291,6 +306,8 @@ def sample_at(
     optional = _level_signals(scenario, t, higher, signals)
     if scenario.regions:
         optional["region_margin"] = margins(scenario.regions, plants.robot_of(scenario.plant), q)
+    if signals.estimated != ():
+        optional |= signals.estimated._asdict()
     return Sample(
         t=t,
         dt=jnp.asarray(dt, t.dtype),
@@ -420,6 +437,8 @@ class LawUpdate(NamedTuple):
     """State of the law at the next sample."""
     observer: Any
     """State of the observer at the next sample."""
+    reading: Measurement
+    """The measurement without estimates."""
 
 
 def discrete_observer(scenario: Scenario) -> Any:
@@ -451,7 +470,8 @@ def law_update(
     """
     sampling: Any = scenario.sampling
     running = discrete_observer(scenario)
-    measured = completed(scenario, running, t, measured, observer)
+    reading = measured
+    measured = completed(scenario, running, t, reading, observer)
     q, dq, higher = measured
     f_hat = observer_estimate(scenario, running, t, q, dq, higher, observer)
     law: Any = scenario.controller
@@ -461,7 +481,7 @@ def law_update(
     arguments = observer_arguments(scenario, running, t, q, dq, higher, command.tau, observer)
     next_observer = _next_observer_state(sampling, running, arguments)
     next_controller = _euler(controller, controller_rate, sampling.period)
-    return LawUpdate(measured, command, f_hat, next_controller, next_observer)
+    return LawUpdate(measured, command, f_hat, next_controller, next_observer, reading)
 
 
 def _next_observer_state(sampling: Any, observer: Any, arguments: tuple) -> Any:
@@ -502,7 +522,16 @@ def run_sampled_law(
         measured = measured._replace(higher=state.higher)
     update = law_update(scenario, t, measured, state.controller, state.observer)
     commands = jnp.concatenate([plant_input(update.command)[None], before.commands[:-1]])
-    signals = law_signals(update.command, update.f_hat)
+    estimated = estimated_levels(
+        scenario,
+        discrete_observer(scenario),
+        t,
+        update.reading,
+        update.measured,
+        Measurement(state.q, state.dq, state.higher),
+        state.observer,
+    )
+    signals = law_signals(update.command, update.f_hat, estimated)
     return state._replace(
         controller=update.controller,
         observer=update.observer,

@@ -193,6 +193,49 @@ def completed(
     return Measurement(x[0], x[1], x[2:])
 
 
+class EstimatedLevels(NamedTuple):
+    """The levels that a law receives from an observer that completes a measurement."""
+
+    x_hat: jax.Array
+    """The levels, measured or estimated, (r, n)."""
+    level_error: jax.Array
+    """x_hat less the levels of the plant at the same instant, (r, n)."""
+    limit_excess: Any
+    """Of `Observer`, () [1]; `()` where the estimates have no limits."""
+
+
+def estimated_levels(
+    scenario: Any,
+    observer: Any,
+    t: jax.Array,
+    reading: Measurement,
+    known: Measurement,
+    true: Measurement,
+    state: Any,
+) -> EstimatedLevels | tuple[()]:
+    """The levels that a law receives, with their error; `()` for an observer that estimates none.
+
+    Args:
+      scenario: its model has the levels.
+      observer: as the loop runs it.
+      t: time, () [s].
+      reading: the measurement.
+      known: the same, with the estimates of the observer.
+      true: the levels of the plant.
+      state: of the observer.
+    """
+    if observer_member(observer, "complete") is None:
+        return ()
+    x_hat = model_state(scenario, *known)
+    error = x_hat - model_state(scenario, *true)
+    excess: Any = ()
+    own = observer_member(observer, "limit_excess")
+    if own is not None:
+        x = model_state(scenario, *reading)
+        excess = own(t, x, plants.as_plant(scenario.model), state)
+    return EstimatedLevels(x_hat, error, excess)
+
+
 def _observed_robot(scenario: Any) -> Any:
     """The model as observers of robots receive it: the robot, or the robot inside the model; the
     model itself where there is none, for `NoObserver`, which does not use it.

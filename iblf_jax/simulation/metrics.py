@@ -26,12 +26,14 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.control.controllers._base import law_member
+from iblf_jax.control.observers._base import observer_member
 from iblf_jax.core import checks
 from iblf_jax.core.optional import OptionalMembers
 from iblf_jax.core.pytree import Leaf, component, layers, leaf
 from iblf_jax.core.units import (
     HIGHER,
     INPUT,
+    LEVELS,
     POSITION,
     UNCERTAIN,
     VELOCITY,
@@ -521,7 +523,63 @@ class Estimation:
         return {"estimate_rmse": _root_mean_square(acc.square, acc.time)}
 
 
+class _LevelErrorState(NamedTuple):
+    peak: jax.Array
+    time: jax.Array
+    """For which a limit was active [s]."""
+    t: jax.Array
+    """Time of the last sample [s]."""
+    excess: Any
+    """Of the last sample."""
+
+
+@component
+class LevelEstimation:
+    """Error of the levels that the law receives from an observer, and the time of their limits.
+
+    peak_level_error = max |x_hat - x| of each level, at the instants at which the law runs; of a
+    measured level it is the error of the sensor.  limited_time is the time for which a limit of the
+    estimates was active, with its ends interpolated linearly between samples.  Only for scenarios
+    whose observer estimates levels (`observers.StateObserver`), whose runs carry it by default.
+    """
+
+    units: ClassVar[dict[str, str]] = {"peak_level_error": LEVELS, "limited_time": "s"}
+    needs: ClassVar[str] = "x_hat"
+
+    def init(self, sample: Sample) -> _LevelErrorState:
+        """Zeros."""
+        zero = jnp.zeros_like(sample.t)
+        peak = jnp.zeros_like(sample.level_error)
+        return _LevelErrorState(peak, zero, sample.t, sample.limit_excess)
+
+    def update(self, acc: _LevelErrorState, sample: Sample) -> _LevelErrorState:
+        """Adds one sample."""
+        time = acc.time
+        if has(sample, "limit_excess"):
+            share = _positive_share(acc.excess, sample.limit_excess)
+            time = time + (sample.t - acc.t) * share
+        peak = jnp.maximum(acc.peak, jnp.abs(sample.level_error))
+        return _LevelErrorState(peak, time, sample.t, sample.limit_excess)
+
+    def finish(self, acc: _LevelErrorState) -> dict[str, jax.Array]:
+        """peak_level_error, (r, n); limited_time, (), where the estimates have limits."""
+        if isinstance(acc.excess, tuple):
+            return {"peak_level_error": acc.peak}
+        return {"peak_level_error": acc.peak, "limited_time": acc.time}
+
+
+def _positive_share(first: jax.Array, last: jax.Array) -> jax.Array:
+    """Share of an interval in which a function with these values at its ends is positive, if it is
+    linear between them.
+    """
+    high, low = jnp.maximum(first, last), jnp.minimum(first, last)
+    crosses = (high > 0) & (low < 0)
+    width = jnp.where(crosses, high - low, 1.0)
+    return jnp.where(crosses, high / width, jnp.where(high > 0, 1.0, 0.0))
+
+
 SIGNAL_SOURCES = {
+    "x_hat": "an observer of levels, such as ij.observers.StateObserver(bandwidth=100.0)",
     "dq_lower": "velocity_bounds, such as Bounds(lower=Constant(-1.0), upper=Constant(1.0))",
     "higher_lower": "state_bounds of a level from the third on",
     "region_margin": "regions, such as (ij.regions.HalfSpace(normal=[0, 1], offset=0.1),)",
@@ -539,6 +597,8 @@ def has_signal(scenario: Scenario, signal: str) -> bool:
     if signal == "higher_lower":
         levels = range(3, plants.order_of(scenario.plant) + 1)
         return any(context.level_bounds(level) is not None for level in levels)
+    if signal == "x_hat":
+        return observer_member(scenario.observer, "complete") is not None
     has_regions = len(scenario.regions) > 0
     if signal == "region_margin":
         return has_regions
@@ -629,11 +689,18 @@ def standard() -> tuple[Fold, ...]:
 
 def optional_folds(scenario: Scenario) -> tuple[Fold, ...]:
     """The folds that runs of a scenario carry besides the standard ones: margins of bounds of
-    further levels and of regions, and slacks of a filter.
+    further levels and of regions, slacks of a filter, and errors of estimated levels.
     """
     return tuple(
         fold
-        for fold in (VelocityMargin(), LevelMargin(), RegionMargin(), Slack(), RegionSlack())
+        for fold in (
+            VelocityMargin(),
+            LevelMargin(),
+            RegionMargin(),
+            Slack(),
+            RegionSlack(),
+            LevelEstimation(),
+        )
         if has_signal(scenario, fold.needs)
     )
 
@@ -650,5 +717,6 @@ MEMBERS = {
     "torque": Torque,
     "above_gravity": AboveGravity,
     "estimation": Estimation,
+    "level_estimation": LevelEstimation,
 }
 """Every fold by its name in a saved tuning result."""

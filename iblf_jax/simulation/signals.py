@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from iblf_jax.core.units import HIGHER, INPUT, POSITION, UNCERTAIN, VELOCITY, PlantUnit
+from iblf_jax.core.units import HIGHER, INPUT, LEVELS, POSITION, UNCERTAIN, VELOCITY, PlantUnit
 
 
 class Recorded(NamedTuple):
@@ -65,6 +65,8 @@ class Signals:
     higher_lower: Annotated[Any, Recorded(HIGHER, "lower bounds of these levels")] = ()
     """-infinity for a level without bounds; `()` where none has bounds."""
     higher_upper: Annotated[Any, Recorded(HIGHER, "upper bounds of these levels")] = ()
+    x_hat: Annotated[Any, Recorded(LEVELS, "levels that the law received")] = ()
+    """One row a level; `()` without an observer that estimates levels."""
 
 
 @jax.tree_util.register_dataclass
@@ -87,6 +89,10 @@ class Sample(Signals):
     step: Any = dataclasses.field(default=0.0, kw_only=True)
     """Time since the previous instant, () [s]; 0 for the first instant and the two samples at a
     jump."""
+    level_error: Any = dataclasses.field(default=(), kw_only=True)
+    """`x_hat` less the levels at the instant at which the law ran, (r, n); `()` without it."""
+    limit_excess: Any = dataclasses.field(default=(), kw_only=True)
+    """Positive where a limit of an observer's estimates is active, () [1]; `()` without limits."""
 
 
 def has(sample: Signals, signal: str) -> bool:
@@ -108,8 +114,15 @@ def speed_margin(sample: Sample, velocity: Array) -> Array:
 
 PER_REGION = ("region_margin", "region_slack", "largest_region_slack")
 """Signals and metrics with one number per region."""
-PER_LEVEL = ("disturbance", "disturbance_estimate", "estimate_rmse")
-"""Signals and metrics of a model in strict-feedback form with one row per level."""
+PER_LEVEL = (
+    "disturbance",
+    "disturbance_estimate",
+    "estimate_rmse",
+    "x_hat",
+    "peak_level_error",
+)
+"""Signals and metrics with one row per level: the estimates of levels of every model, and the
+others of a model in strict-feedback form."""
 PER_HIGHER_LEVEL = (
     "higher",
     "e_higher",

@@ -38,6 +38,8 @@ class Observer(Protocol):
     - `measured`: the levels, counted from 1, that it reads; all if not given.
     - `complete(t, x, model, state)`: x, (r, n), with its estimates in the place of the other
       levels, which the sensor need not measure.
+    - `limit_excess(t, x, model, state)`: positive where a limit of the estimates that the law
+      receives is active, () [1]; `()` for an observer without limits.
 
     An observer may claim that the error of its estimate obeys f_tilde' = f' - kappa f_tilde: its
     attribute `error_gain` is kappa, (n,) [1/s], or of d_tilde, (r,) or (r, n) [1/s].  `certify`
@@ -72,6 +74,7 @@ observer_member = OptionalMembers(
     noise_gain=None,
     measured=None,
     complete=None,
+    limit_excess=None,
     error_gain=None,
 )
 """Reads optional members of an observer."""

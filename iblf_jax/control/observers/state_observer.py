@@ -14,11 +14,27 @@ coefficients of (z + bandwidth)^(m + 1): all poles of a chain of integrators are
 A disturbance of another level of a segment appears as one of its last level, together with the
 levels in between that would have the same effect on x_s.
 
+In continuous time f and G are taken at the measured levels, and at x_hat for the others.  For a
+robot of which q is measured, with e = q - q_hat and without d_hat_1,
+
+    q_hat' = v_hat + 3 w e,    v_hat' = M0^-1 (tau - C0 v_hat - G0) + d_hat + 3 w^2 e,
+    d_hat' = w^3 e,    M0 = M0(q), C0 = C0(q, v_hat), G0 = G0(q),    f_hat = M0 d_hat.
+
+A function of q alone is then exact, and the error of q_hat does not act through dG0/dq.  M0(q),
+G0(q) and their factors are those that law and plant compute as well.  The estimate is constant as
+an acceleration: a constant torque f is followed with the lag 3/w of d = M0^-1 f.
+
 The bandwidth must exceed the rates of the plant itself, such as sqrt(K/M + K/J) of a flexible
 joint, because the copy of the model reproduces the other terms only as well as x_hat is known.
 
+**Peaking.**  An error of the velocity at the start, v0, appears in d_hat as a peak of the size w v0
+whose integral is v0, whatever w is.  So the loop tends to that with measured velocity for w ->
+infinity only if the law receives a limited d_hat: `disturbance_limit`, and `limit` for the levels,
+saturate the estimates outside the domain of interest.  They do not change the observer's state.
+
 **Sampled.**  Between two samples the copy of the model moves by one step of the classical
-Runge-Kutta method with the command held.  The gains of a period T are those of a polynomial filter
+Runge-Kutta method with the command held, from the corrected estimate: the measurement is not
+constant over the period, so f and G are taken at x_hat.  The gains of a period T are those of a polynomial filter
 with fading memory, with which all poles of the chain are at a = exp(-bandwidth T).
 """
 
@@ -35,7 +51,7 @@ import numpy as np
 from iblf_jax.control.observers.level import check_rows
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf, static
-from iblf_jax.core.units import LEVELS
+from iblf_jax.core.units import LEVELS, RATES
 from iblf_jax.world import plants
 from iblf_jax.world.plants import Plant
 
@@ -80,17 +96,24 @@ class StateObserver:
         constant; True if not given.
       offset: error of the estimate at the start, one number, r numbers or (r, n) [1], in the unit
         of each level; 0 if not given.  It has no effect on measured levels.
+      limit: largest |x_hat| of the levels that the law receives, one number, r numbers or (r, n)
+        [1], in the unit of each level, > 0; none if not given.  It has no effect on measured levels.
+      disturbance_limit: largest |d_hat| that the law receives, one number, r numbers or (r, n) [1],
+        in the unit of each level per second, > 0; none if not given.
 
     Source: J. P. Gauthier, H. Hammouri, S. Othman, IEEE Trans. Automatic Control 37 (1992) 875-880
       (high gain); N. Morrison, Introduction to Sequential Smoothing and Prediction, 1969 (fading
       memory); the extension by a disturbance as J. Han, IEEE Trans. Industrial Electronics 56
-      (2009) 900-906.
+      (2009) 900-906; limits of the estimates: F. Esfandiari, H. K. Khalil, Int. J. Control 56
+      (1992) 1007-1037.
     """
 
     bandwidth: Leaf = leaf("1/s", sign="positive")
     measured: tuple[int, ...] = static(default=(1,))
     disturbance: bool = static(default=True)
     offset: Leaf = leaf(LEVELS, shape="level", default=0.0)
+    limit: Leaf = leaf(LEVELS, sign="positive limit", shape="level", default=None)
+    disturbance_limit: Leaf = leaf(RATES, sign="positive limit", shape="level", default=None)
     receives_x: ClassVar[bool] = True
 
     def check(self) -> None:
@@ -106,10 +129,21 @@ class StateObserver:
             checks.positive_integer(name, level, most=plants.MAX_ORDER)
         if self.measured[0] != 1 or list(self.measured) != sorted(set(self.measured)):
             raise checks.fail(name, self.measured, expected, remedy)
+        if self.disturbance_limit is not None and not self.disturbance:
+            expected = "None with disturbance=False"
+            remedy = "There is no estimate to limit; leave it out."
+            name = "StateObserver.disturbance_limit"
+            raise checks.fail(name, self.disturbance_limit, expected, remedy)
 
     def check_model(self, model: Plant) -> None:
         """Raises ValueError for a model that does not have the measured levels."""
-        check_rows("observer.offset", self.offset, model)
+        for name, value in (
+            ("offset", self.offset),
+            ("limit", self.limit),
+            ("disturbance_limit", self.disturbance_limit),
+        ):
+            if value is not None:
+                check_rows(f"observer.{name}", value, model)
         if self.measured[-1] > model.order:
             expected = f"levels from 1 to {model.order}, as the model has"
             raise checks.fail("observer.measured", self.measured, expected)
@@ -130,16 +164,34 @@ class StateObserver:
     def estimate(
         self, t: jax.Array, x: jax.Array, model: Plant, state: StateObserverValues
     ) -> jax.Array:
-        """d_hat, (r, n); 0 where it is not estimated."""
+        """d_hat within its limit, (r, n); 0 where it is not estimated."""
         if not self.disturbance:
             return jnp.zeros_like(x)
-        return state.d_hat  # type: ignore[no-any-return]
+        return _limited(state.d_hat, self.disturbance_limit)
 
     def complete(
         self, t: jax.Array, x: jax.Array, model: Plant, state: StateObserverValues
     ) -> jax.Array:
-        """The levels that the law receives, (r, n): the measured rows of x, and else x_hat."""
-        return self._with_measured(x, state.x_hat)
+        """The levels that the law receives, (r, n): the measured rows of x, and else x_hat within
+        its limit.
+        """
+        return self._with_measured(x, _limited(state.x_hat, self.limit))
+
+    def limit_excess(
+        self, t: jax.Array, x: jax.Array, model: Plant, state: StateObserverValues
+    ) -> Any:
+        """The largest ratio of an estimate to its limit, less 1, () [1]: positive where a limit is
+        active; `()` without limits.
+        """
+        ratios = []
+        if self.limit is not None:
+            estimated = self._with_measured(jnp.zeros_like(x), state.x_hat)
+            ratios.append(jnp.max(jnp.abs(estimated) / self.limit))
+        if self.disturbance_limit is not None:
+            ratios.append(jnp.max(jnp.abs(state.d_hat) / self.disturbance_limit))
+        if not ratios:
+            return ()
+        return jnp.max(jnp.stack(ratios)) - 1.0
 
     def _with_measured(self, x: jax.Array, x_hat: jax.Array) -> jax.Array:
         """The measured rows of x and the other rows of x_hat, (r, n)."""
@@ -161,8 +213,9 @@ class StateObserver:
         def gains(count: int) -> list[jax.Array]:
             return [math.comb(count, i) * self.bandwidth**i for i in range(1, count + 1)]
 
-        correction = self._correction(t, x, model, state, gains)
-        predicted = self._flow(model, u, state.d_hat)(t, state.x_hat)
+        known = self._with_measured(x, state.x_hat)
+        correction = self._correction(t, x, model, state, gains, known)
+        predicted = self._flow(model, u, state.d_hat)(t, known)
         return StateObserverValues(predicted + correction.x_hat, correction.d_hat)
 
     def advance(
@@ -182,7 +235,7 @@ class StateObserver:
         def gains(count: int) -> list[jax.Array]:
             return fading_memory_gains(a, count, period)
 
-        correction = self._correction(t, x, model, state, gains)
+        correction = self._correction(t, x, model, state, gains, state.x_hat)
         x_hat = state.x_hat + correction.x_hat
         d_hat = jax.tree.map(jnp.add, state.d_hat, correction.d_hat)
         flow = self._flow(model, u, d_hat)
@@ -200,12 +253,18 @@ class StateObserver:
         return flow
 
     def _correction(
-        self, t: jax.Array, x: jax.Array, model: Plant, state: StateObserverValues, gains: Gains
+        self,
+        t: jax.Array,
+        x: jax.Array,
+        model: Plant,
+        state: StateObserverValues,
+        gains: Gains,
+        known: jax.Array,
     ) -> StateObserverValues:
         """The correction of x_hat and d_hat by the errors of the measured levels.
 
         `gains(count)` are those of the derivatives of a measured level of the orders 0 to
-        `count` - 1.
+        `count` - 1, and `known` the levels at which G is taken, (r, n).
         """
         x_hat = state.x_hat
         zero = jnp.zeros_like(x_hat[0])
@@ -217,14 +276,21 @@ class StateObserver:
             # The disturbance of the last level is one more derivative.
             of_states = gains(len(levels) + self.disturbance)
             for level, gain in zip(levels, of_states, strict=False):
-                states.append(_through_gains(model, first, level, t, x_hat, gain * error))
+                states.append(_through_gains(model, first, level, t, known, gain * error))
                 disturbances.append(zero)
             if self.disturbance:
                 rate = of_states[-1] * error
-                disturbances[-1] = _through_gains(model, first, last, t, x_hat, rate)
+                disturbances[-1] = _through_gains(model, first, last, t, known, rate)
         if not self.disturbance:
             return StateObserverValues(jnp.stack(states), ())
         return StateObserverValues(jnp.stack(states), jnp.stack(disturbances))
+
+
+def _limited(x: jax.Array, limit: Any) -> jax.Array:
+    """An estimate within its limit; unchanged without one."""
+    if limit is None:
+        return x
+    return jnp.clip(x, -limit, limit)
 
 
 def _through_gains(
