@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import jax
 import numpy as np
 
 from iblf_jax.certificates.decay_lines import check_steps
@@ -21,8 +22,11 @@ from iblf_jax.certificates.run_summary import (
     Segment,
 )
 from iblf_jax.control.actuators import Ideal
+from iblf_jax.control.observers._base import observer_member
 from iblf_jax.core import checks
 
+TORQUE_OF_ESTIMATES = " + dV/dq' . M0^-1 (tau(x_hat) - tau(x))"
+"""What the error of estimated levels adds to T."""
 OWN_ROUNDING = 8.0
 """Relative errors of the derivatives of a law's own V, in those of their terms."""
 
@@ -33,9 +37,34 @@ def why_not_own(summary: Any) -> str:
     if not isinstance(actuator, Ideal):
         about = "the law's own claim is about a torque that acts as it is commanded"
         return f"{about}, not about {checks.with_article(type(actuator).__name__)}"
+    reason = _why_not_with_estimates(summary.run.scenario, summary.claims.own)
+    if reason:
+        return reason
     if summary.excluded == summary.samples:
         return ALWAYS_EXCLUDED
-    return summary.why_invalid
+    return summary.why_invalid  # type: ignore[no-any-return]
+
+
+def _why_not_with_estimates(scenario: Any, law: Any) -> str:
+    """Why the law's claim does not apply to estimated levels; "" if it does.
+
+    The claim is about a measured state.  For a law of robots without a state of its own and with
+    the general T, the error of the estimates acts through the torque alone, which T then contains.
+    """
+    if observer_member(scenario.observer, "complete") is None:
+        return ""
+    kind = type(scenario.observer).__name__
+    about = f"the law's own claim is about a measured state, and {kind} estimates levels"
+    if is_about_levels(scenario):
+        return about
+    if optional_member(law, "disturbance_terms") is not None:
+        return f"{about}; the T that the law states does not contain their error"
+    start = jax.eval_shape(
+        law.init, scenario.initial.q, scenario.initial.dq, scenario.context
+    )
+    if jax.tree.leaves(start):
+        return f"{about}, which act on the law's own state"
+    return ""
 
 
 def own_left_side(proof: Any) -> np.ndarray:
@@ -52,6 +81,8 @@ def own_segment_lines(segment: Segment) -> list[Line]:
     states_terms = optional_member(law, "disturbance_terms") is not None
     general = LEVEL_TERMS if is_about_levels(summary.run.scenario) else GENERAL_TERMS
     right_side = "what the law states" if states_terms else general
+    if observer_member(summary.run.scenario.observer, "complete") is not None:
+        right_side += TORQUE_OF_ESTIMATES
     decay = "W >= 0: the decay that the law states"
     inequality = f"V' <= -W + T,  T: {right_side}"
     # Near 0, V and W are differences of numbers as large as their largest values.

@@ -23,7 +23,9 @@ an exact estimate, plus M0^-1 f_tilde, and f_tilde' = f' - f_hat', so
 
     T = dV/dq' . M0^-1 f_tilde + dV/df_tilde . f',
 
-where the second term is zero for a V without f_tilde. For a law that does not use the estimate, the
+where the second term is zero for a V without f_tilde.  Where the law receives estimates x_hat of
+levels (`observers.StateObserver`), T also has dV/dq' . M0^-1 (tau(x_hat) - tau(x)), with the true
+error of the estimates: it says how much of V' they explain, and bounds nothing in advance. For a law that does not use the estimate, the
 uncertain term f takes the place of f_tilde.
 
 Rounding: V2' is a sum of large terms that cancel, so its error is some units in the last place of
@@ -42,6 +44,7 @@ from iblf_jax.certificates.claims import decay_phi, decay_rate, own_claim
 from iblf_jax.certificates.optional import optional_member
 from iblf_jax.control.controllers import Backstepping, FullState
 from iblf_jax.control.observers import Printed
+from iblf_jax.control.observers._base import observer_member
 from iblf_jax.core.linalg import matvec, solve_spd
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.time import as_at
@@ -414,6 +417,11 @@ def _own_terms(
     stated = optional_member(law, "disturbance_terms")
     if stated is None:
         terms = slopes[2] @ solve_spd(M0, f_tilde) + slopes[3] @ df
+        if observer_member(scenario.observer, "complete") is not None:
+            # The law received estimates: what that changes of the torque acts like f_tilde.
+            f_hat = now["disturbance_estimate"]
+            command, _ = law.command(t, q, dq, f_hat, context, state.controller)
+            terms += slopes[2] @ solve_spd(M0, now["tau"] - command.tau)
     else:
         terms = jnp.sum(stated(t, q, dq, f_tilde, df, context, state.controller))
     size = _own_term_sizes(M0, slopes, tangent, now) + jnp.abs(decay) + jnp.abs(terms)
