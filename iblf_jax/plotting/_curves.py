@@ -34,12 +34,20 @@ DERIVED = {
     "estimate_error": (
         lambda run: np.asarray(run.disturbance) - np.asarray(run.disturbance_estimate)
     ),
-    "measured_q": lambda run: run.measured.q,
-    "measured_dq": lambda run: run.measured.dq,
+    "measured_q": lambda run: _received(run, 0),
+    "measured_dq": lambda run: _received(run, 1),
     "region_boundary": lambda run: np.zeros(np.shape(run.region_margin)),
 }
 """Signals computed from those of a Rollout: the bounds -k_l and k_u of e1, the bounds of xi, the
-error f - f_hat, the measurements, and the boundary of a region."""
+error f - f_hat, the levels that the law received, and the boundary of a region."""
+
+
+def _received(run: Rollout, i: int) -> Any:
+    """A level, counted from 0, as the law received it: estimated or measured."""
+    if not isinstance(run.x_hat, tuple):
+        return np.asarray(run.x_hat)[:, i]
+    return (run.measured.q, run.measured.dq)[i]
+
 
 LEVEL_SIGNAL = re.compile(r"level_(\d+)(?:_(\w+))?")
 """A signal of one level, counted from 1: "level_3" is x_3; `LEVEL_PARTS` has the others."""
@@ -49,13 +57,21 @@ LEVEL_PARTS: dict[str | None, Callable[[Rollout, int], Any]] = {
     "lower": lambda run, i: _row(run.higher_lower, i - 2),
     "upper": lambda run, i: _row(run.higher_upper, i - 2),
     "alpha": lambda run, i: _row(run.higher, i - 2) - _row(run.e_higher, i - 2),
+    "received": lambda run, i: _row_if_any(run.x_hat, i),
     "d": lambda run, i: _row(run.disturbance, i),
     "estimate": lambda run, i: _row(run.disturbance_estimate, i),
     "estimate_error": (lambda run, i: _row(run.disturbance, i) - _row(run.disturbance_estimate, i)),
 }
 """Part of the name of a signal of a level -> the signal, (T, n), given the index of the level from
-0: the level, its bounds (from the third level on), the virtual control that it follows, and its
-disturbance with estimate and error."""
+0: the level, its bounds (from the third level on), the virtual control that it follows, its
+estimate that the law received, and its disturbance with estimate and error."""
+
+
+def _row_if_any(values: Any, i: int) -> np.ndarray:
+    """As `_row`; NaN for a level that the model does not have."""
+    if isinstance(values, tuple) or i < values.shape[1]:
+        return _row(values, i)
+    return np.full((1, 1), np.nan)
 
 
 def _row(values: Any, i: int) -> np.ndarray:
@@ -68,7 +84,7 @@ def _row(values: Any, i: int) -> np.ndarray:
 
 SAMPLED = {"tau", "alpha", "disturbance_estimate", "measured_q", "measured_dq"}
 """Signals that are constant between the samples of a sampled law."""
-SAMPLED_PARTS = {"alpha", "estimate"}
+SAMPLED_PARTS = {"alpha", "estimate", "received"}
 """Parts of `LEVEL_PARTS` that are constant between the samples of a sampled law."""
 
 EXTERNAL = {
@@ -152,8 +168,13 @@ class Curve:
 
     @property
     def is_measured(self) -> bool:
-        """Whether the law received measurements that differ from the state."""
-        return not isinstance(self.run.scenario.sensor, IdealSensor)
+        """Whether the law received measurements or estimates that differ from the state."""
+        return self.is_estimated or not isinstance(self.run.scenario.sensor, IdealSensor)
+
+    @property
+    def is_estimated(self) -> bool:
+        """Whether the law received estimates of levels from an observer."""
+        return not isinstance(self.run.x_hat, tuple)
 
     @property
     def has_speed_limits(self) -> bool:

@@ -60,7 +60,7 @@ class PanelQuantity:
     """The signal that the quantity estimates.  It is drawn as a broad pale line under them, and
     only once if it is the same in all runs."""
     measured: str = ""
-    """The signal that is a measurement of the quantity."""
+    """The signal that is a measurement or an estimate of the quantity, which the law received."""
     transient: str = ""
     """The signal whose transient a zoom shows; that of the quantity itself if empty."""
     has_spikes: bool = False
@@ -181,6 +181,7 @@ def level_quantity(scenario: Scenario, level: int, joint: int | None = None) -> 
         unit_text(scenario, plants.units_of(plant)[level - 1], joint),
         bounds=(f"level_{level}_lower", f"level_{level}_upper"),
         guide=f"level_{level}_alpha",
+        measured=f"level_{level}_received",
         guide_label=VIRTUAL_CONTROL,
         guide_sets_limits=True,
         farthest_bound=np.inf,
@@ -389,8 +390,10 @@ def _draw_measured(
     """Draws the measurements as pale lines under the signals; returns their samples."""
     drawn = []
     for i, curve in enumerate(curves):
-        if quantity.measured and curve.is_measured:
-            style: dict[str, Any] = {"label": f"{curve.name} measured".strip()}
+        has_values = quantity.measured and curve.is_measured
+        if has_values and not np.isnan(curve[quantity.measured]).all():
+            word = "received by the law" if curve.is_estimated else "measured"
+            style: dict[str, Any] = {"label": f"{curve.name} {word}".strip()}
             style |= {"color": _style.blend(0.45, series(i)["color"])}
             style |= {"linewidth": 0.8, "zorder": 1.9}
             drawn.append((curve, draw(axes, curve, quantity.measured, joint, window, **style)))

@@ -206,9 +206,9 @@ def test_batches_files_and_gradients(tmp_path):
     observer = StateObserver(bandwidth=60.0, limit=(1.0, 2.0), disturbance_limit=5.0)
     scenario = loop(observer, sampling=PERIOD, sensor=POSITIONS)
     path = tmp_path / "loop.toml"
-    ij.save(scenario, path)
+    ij.save_scenario(scenario, path)
     with notices.muted():
-        again = ij.simulate(ij.load(path), duration=0.1, dt=5e-4)
+        again = ij.simulate(ij.load_scenario(path), duration=0.1, dt=5e-4)
         once = ij.simulate(scenario, duration=0.1, dt=5e-4)
         study = ij.monte_carlo(
             scenario,

@@ -1,0 +1,71 @@
+"""Output feedback: the velocity from an observer, its bandwidth against noise and peaking.
+
+A positioning law that measures angles alone needs an estimate of the velocity. A larger bandwidth
+makes the loop more like the one that measures the velocity, until the noise of the encoder becomes
+torque.
+"""
+
+import numpy as np
+from matplotlib.figure import Figure
+
+import iblf_jax as ij
+
+push = ij.disturbances.Sinusoids(amplitude=[0.5, 0.2], frequency=2.0)
+base = ij.with_parts(
+    ij.with_parameters(ij.presets.zhang_yan_2024(reading="corrected"), {"controller.K2": 4.0}),
+    sampling=ij.Sampling(period=1e-3),
+    disturbance=push,
+)
+START = np.array([[0.0, 0.0], [0.5, -0.5]])  # the observer's error at the start [rad], [rad/s]
+BANDWIDTHS = np.geomspace(20.0, 400.0, 9)
+NOISE = {"no noise": 0.0, "noise 1e-5 rad": 1e-5, "noise 1e-4 rad": 1e-4}
+
+
+def observed(noise, bandwidth, **limits):
+    """The loop that measures positions with this noise."""
+    return ij.with_parts(
+        base,
+        sensor=ij.sensors.Levels((ij.sensors.Direct(noise=noise), None)),
+        observer=ij.observers.StateObserver(bandwidth=bandwidth, offset=START, **limits),
+    )
+
+
+figure = Figure(figsize=(9.0, 3.4), layout="constrained")
+accuracy, chatter = figure.subplots(1, 2)
+for name, noise in NOISE.items():
+    scenario = observed(noise, 100.0, limit=(1.0, 3.0), disturbance_limit=30.0)
+    found = ij.sweep(
+        scenario, {"observer.bandwidth": BANDWIDTHS}, duration=4.0, dt=1e-3, progress=False
+    )
+    accuracy.loglog(BANDWIDTHS, found["rmse"].max("joint").squeeze(), "o-", label=name)
+    chatter.loglog(BANDWIDTHS, found["torque_variation"].max("joint").squeeze(), "o-", label=name)
+measured = ij.simulate(
+    ij.with_parts(base, observer=ij.observers.Momentum(kf=20.0)), duration=4.0, dt=1e-3
+)
+for axes, metric, words in (
+    (accuracy, "rmse", "rmse of the worse joint [rad]"),
+    (chatter, "torque_variation", "sum of torque changes [N m]"),
+):
+    level = float(np.max(measured.metrics[metric]))
+    axes.axhline(level, color="0.4", linestyle="--", label="velocity measured, Momentum(kf=20)")
+    axes.set_xlabel("bandwidth of the observer [1/s]")
+    axes.set_ylabel(words)
+accuracy.legend()
+
+# %% Peaking: the error of the estimated velocity at the start becomes a peak of the estimated
+# uncertain term, which grows with the bandwidth. A limit on what the law receives removes it.
+unlimited = ij.simulate(observed(0.0, 200.0), duration=1.0, dt=1e-3)
+limited = ij.simulate(observed(0.0, 200.0, disturbance_limit=30.0), duration=1.0, dt=1e-3)
+peaking = Figure(figsize=(9.0, 3.4), layout="constrained")
+torque, velocity = peaking.subplots(1, 2)
+for name, run in {"unlimited": unlimited, "limited to 30 rad/s²": limited}.items():
+    start = run.t < 0.15
+    torque.plot(run.t[start], run.tau[start, 0], label=name)
+    velocity.plot(run.t[start], run.x_hat[start, 1, 0] - run.dq[start, 0], label=name)
+torque.set_ylabel("torque of joint 1 [N m]")
+velocity.set_ylabel("error of the velocity that the law received [rad/s]")
+for axes in (torque, velocity):
+    axes.set_xlabel("time [s]")
+torque.legend()
+print("peak torque [N m]:", unlimited.metrics.peak_torque, limited.metrics.peak_torque)
+print("time of the limit [s]:", limited.metrics.limited_time)
