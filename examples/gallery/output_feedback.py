@@ -16,24 +16,26 @@ base = ij.with_parts(
     sampling=ij.Sampling(period=1e-3),
     disturbance=push,
 )
-START = np.array([[0.0, 0.0], [0.5, -0.5]])  # the observer's error at the start [rad], [rad/s]
+tube = base.context.tube(np.zeros(()))
+base = ij.with_parts(base, initial=ij.Initial(q=tube.q_d, dq=tube.dq_d))
+START = np.array([[0.0, 0.0], [1.0, -1.0]])  # the observer's error at the start [rad], [rad/s]
 BANDWIDTHS = np.geomspace(20.0, 400.0, 9)
 NOISE = {"no noise": 0.0, "noise 1e-5 rad": 1e-5, "noise 1e-4 rad": 1e-4}
 
 
-def observed(noise, bandwidth, **limits):
+def observed(noise, bandwidth, **fields):
     """The loop that measures positions with this noise."""
     return ij.with_parts(
         base,
         sensor=ij.sensors.Levels((ij.sensors.Direct(noise=noise), None)),
-        observer=ij.observers.StateObserver(bandwidth=bandwidth, offset=START, **limits),
+        observer=ij.observers.StateObserver(bandwidth=bandwidth, **fields),
     )
 
 
 figure = Figure(figsize=(9.0, 3.4), layout="constrained")
 accuracy, chatter = figure.subplots(1, 2)
 for name, noise in NOISE.items():
-    scenario = observed(noise, 100.0, limit=(1.0, 3.0), disturbance_limit=30.0)
+    scenario = observed(noise, 100.0)
     found = ij.sweep(
         scenario, {"observer.bandwidth": BANDWIDTHS}, duration=4.0, dt=1e-3, progress=False
     )
@@ -48,17 +50,21 @@ for axes, metric, words in (
 ):
     level = float(np.max(measured.metrics[metric]))
     axes.axhline(level, color="0.4", linestyle="--", label="velocity measured, Momentum(kf=20)")
+    axes.set_xticks([20, 50, 100, 200, 400], labels=["20", "50", "100", "200", "400"])
+    axes.minorticks_off()
     axes.set_xlabel("bandwidth of the observer [1/s]")
     axes.set_ylabel(words)
 accuracy.legend()
 
 # %% Peaking: the error of the estimated velocity at the start becomes a peak of the estimated
 # uncertain term, which grows with the bandwidth. A limit on what the law receives removes it.
-unlimited = ij.simulate(observed(0.0, 200.0), duration=1.0, dt=1e-3)
-limited = ij.simulate(observed(0.0, 200.0, disturbance_limit=30.0), duration=1.0, dt=1e-3)
+unlimited = ij.simulate(observed(0.0, 200.0, offset=START), duration=1.0, dt=1e-3)
+limited = ij.simulate(
+    observed(0.0, 200.0, offset=START, disturbance_limit=15.0), duration=1.0, dt=1e-3
+)
 peaking = Figure(figsize=(9.0, 3.4), layout="constrained")
 torque, velocity = peaking.subplots(1, 2)
-for name, run in {"unlimited": unlimited, "limited to 30 rad/s²": limited}.items():
+for name, run in {"unlimited": unlimited, "limited to 15 rad/s²": limited}.items():
     start = run.t < 0.15
     torque.plot(run.t[start], run.tau[start, 0], label=name)
     velocity.plot(run.t[start], run.x_hat[start, 1, 0] - run.dq[start, 0], label=name)

@@ -59,9 +59,7 @@ def _why_not_with_estimates(scenario: Any, law: Any) -> str:
         return about
     if optional_member(law, "disturbance_terms") is not None:
         return f"{about}; the T that the law states does not contain their error"
-    start = jax.eval_shape(
-        law.init, scenario.initial.q, scenario.initial.dq, scenario.context
-    )
+    start = jax.eval_shape(law.init, scenario.initial.q, scenario.initial.dq, scenario.context)
     if jax.tree.leaves(start):
         return f"{about}, which act on the law's own state"
     return ""

@@ -158,9 +158,7 @@ def test_the_error_on_the_surface_settles_within_the_stated_time():
         grid = np.geomspace(smallest, e0, 2001)
         rates = np.array([1.0 / speed(e) for e in grid])
         time = float(np.sum(0.5 * (rates[1:] + rates[:-1]) * np.diff(grid)))
-        stated = (
-            p / (p - 1) * (2.0 ** ((p - 1) / 2) / beta) ** (1.0 / p) * e0 ** (1.0 - 1.0 / p)
-        )
+        stated = p / (p - 1) * (2.0 ** ((p - 1) / 2) / beta) ** (1.0 / p) * e0 ** (1.0 - 1.0 / p)
         assert 0.3 * stated < time < stated
 
 

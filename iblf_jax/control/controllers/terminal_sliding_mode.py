@@ -15,8 +15,8 @@ joint by joint, where (M0^-1 f_tilde)_i is a component of M0^-1 f_tilde.  So V =
 
     V' = -sum g'(e1')/beta K sigma sat(sigma/phi) + dV/dq' . M0^-1 f_tilde,                   (T.2)
 
-an equality.  If |(M0^-1 f_tilde)_i| <= F < K, then |sigma| decreases wherever |sigma| > phi F/K, and
-e1' has the sign of sigma - e1, so every joint converges to the band
+an equality.  If |(M0^-1 f_tilde)_i| <= F < K, then |sigma| decreases wherever |sigma| > phi F/K,
+and e1' has the sign of sigma - e1, so every joint converges to the band
 
     |e1| <= phi F/K,    |e1'| <= (2 beta phi F/K)^(1/p).                                      (T.3)
 
@@ -95,7 +95,7 @@ class TerminalSlidingMode:
         tube = context.tube(t)
         sigma, slope = self._surface(q - tube.q_d, dq - tube.dq_d)
         along_surface = (dq - tube.dq_d) / slope
-        acceleration = tube.ddq_d - along_surface - self.K * self._saturated(sigma)
+        acceleration = tube.ddq_d - self.K * self._saturated(sigma) - along_surface
         tau = rigid_body_torque(context.model, q, dq, dq, acceleration) - f_hat
         never = jnp.zeros(q.shape, bool)
         return Command(tau, tube.dq_d, 0.5 * sigma**2, never, never), ()

@@ -34,8 +34,9 @@ saturate the estimates outside the domain of interest.  They do not change the o
 
 **Sampled.**  Between two samples the copy of the model moves by one step of the classical
 Runge-Kutta method with the command held, from the corrected estimate: the measurement is not
-constant over the period, so f and G are taken at x_hat.  The gains of a period T are those of a polynomial filter
-with fading memory, with which all poles of the chain are at a = exp(-bandwidth T).
+constant over the period, so f and G are taken at x_hat.  The gains of a period T are those of a
+polynomial filter with fading memory, with which all poles of the chain are at
+a = exp(-bandwidth T).
 """
 
 from __future__ import annotations
@@ -97,9 +98,10 @@ class StateObserver:
       offset: error of the estimate at the start, one number, r numbers or (r, n) [1], in the unit
         of each level; 0 if not given.  It has no effect on measured levels.
       limit: largest |x_hat| of the levels that the law receives, one number, r numbers or (r, n)
-        [1], in the unit of each level, > 0; none if not given.  It has no effect on measured levels.
-      disturbance_limit: largest |d_hat| that the law receives, one number, r numbers or (r, n) [1],
-        in the unit of each level per second, > 0; none if not given.
+        [1], in the unit of each level, > 0; none if not given.  It has no effect on measured
+        levels.
+      disturbance_limit: largest |d_hat| that the law receives, one number, r numbers or (r, n)
+        [1], in the unit of each level per second, > 0; none if not given.
 
     Source: J. P. Gauthier, H. Hammouri, S. Othman, IEEE Trans. Automatic Control 37 (1992) 875-880
       (high gain); N. Morrison, Introduction to Sequential Smoothing and Prediction, 1969 (fading
