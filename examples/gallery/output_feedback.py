@@ -69,7 +69,7 @@ for name, run in {"unlimited": unlimited, "limited to 15 rad/s²": limited}.item
     torque.plot(run.t[start], run.tau[start, 0], label=name)
     velocity.plot(run.t[start], run.x_hat[start, 1, 0] - run.dq[start, 0], label=name)
 torque.set_ylabel("torque of joint 1 [N m]")
-velocity.set_ylabel("error of the velocity that the law received [rad/s]")
+velocity.set_ylabel("error of the velocity in the law [rad/s]")
 for axes in (torque, velocity):
     axes.set_xlabel("time [s]")
 torque.legend()

@@ -25,9 +25,8 @@ an exact estimate, plus M0^-1 f_tilde, and f_tilde' = f' - f_hat', so
 
 where the second term is zero for a V without f_tilde.  Where the law receives estimates x_hat of
 levels (`observers.StateObserver`), T also has dV/dq' . M0^-1 (tau(x_hat) - tau(x)), with the true
-error of the estimates: it says how much of V' they explain, and bounds nothing in advance.
-For a law that does not use the estimate, the
-uncertain term f takes the place of f_tilde.
+error of the estimates: it says how much of V' they explain, and bounds nothing in advance.  For a
+law that does not use the estimate, the uncertain term f takes the place of f_tilde.
 
 Rounding: V2' is a sum of large terms that cancel, so its error is some units in the last place of
 those terms. `ProofTerms.dV_size` is the sum of their absolute values.

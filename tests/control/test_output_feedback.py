@@ -80,13 +80,11 @@ def test_the_vector_field_at_random_states(rng):
         z, t = rng.normal(size=(5, 2)), rng.uniform(0.0, 3.0)
         z[4] *= 3.0
         state = initial_state(scenario)
-        inner = state.observer._replace(
-            x_hat=jnp.asarray(z[2:4]), d_hat=jnp.stack([jnp.zeros(2), jnp.asarray(z[4])])
-        )
+        inner = state.observer._replace(x_hat=jnp.asarray(z[2:4]), d_hat=jnp.asarray(z[4])[None])
         state = state._replace(q=jnp.asarray(z[0]), dq=jnp.asarray(z[1]), observer=inner)
         found = field(scenario, jnp.asarray(t), state)
         x_hat, d_hat = found.observer
-        rates = np.concatenate([found.q, found.dq, *np.asarray(x_hat), d_hat[1]])
+        rates = np.concatenate([found.q, found.dq, *np.asarray(x_hat), d_hat[0]])
         expected = reference_rate(w, limit, push, t, z.reshape(-1))
         np.testing.assert_allclose(rates, expected, atol=1e-12 * np.max(np.abs(expected)))
 
@@ -190,7 +188,7 @@ def test_the_share_of_an_interval_with_a_positive_function():
 
 
 def test_limits_and_metrics_that_do_not_fit_are_refused():
-    with pytest.raises(ValueError, match="disturbance_limit.*disturbance=False"):
+    with pytest.raises(ValueError, match=r"disturbance_limit.*disturbance=False"):
         StateObserver(bandwidth=9.0, disturbance=False, disturbance_limit=1.0)
     with pytest.raises(ValueError, match=r"observer\.limit.*2 rows"):
         loop(StateObserver(bandwidth=9.0, limit=(1.0, 2.0, 3.0)))

@@ -55,7 +55,7 @@ class TerminalSlidingMode:
       K: largest acceleration against the surface, () or (n,) [rad/s^2], > 0; larger than the
         components of M0^-1 f_tilde.
       layer: half width phi of the boundary layer, () or (n,) [rad], > 0.
-      p: exponent, () or (n,) [1], between 1 and 2; 1.5 if not given.
+      p: exponent, () or (n,) [1], > 0, between 1 and 2; 1.5 if not given.
       smoothing: delta, () or (n,) [rad/s], > 0; 0.01 if not given.  The error below the smoothed
         part falls at the rate beta smoothing^(1-p) [1/s], which the time step must resolve.
 

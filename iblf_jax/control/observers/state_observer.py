@@ -63,8 +63,8 @@ class StateObserverValues(NamedTuple):
     x_hat: jax.Array
     """Estimate of all levels, (r, n)."""
     d_hat: Any
-    """Estimate of the disturbance of each level, (r, n), 0 but for the last level of each segment;
-    `()` where it is not estimated."""
+    """Estimate of the disturbance of the last level of each segment, one row a segment; `()` where
+    it is not estimated."""
 
 
 class Segment(NamedTuple):
@@ -161,7 +161,7 @@ class StateObserver:
         x_hat = self._with_measured(x, x + jnp.broadcast_to(self.offset, x.shape))
         if not self.disturbance:
             return StateObserverValues(x_hat, ())
-        return StateObserverValues(x_hat, jnp.zeros_like(x))
+        return StateObserverValues(x_hat, jnp.zeros_like(x)[: len(self.measured)])
 
     def estimate(
         self, t: jax.Array, x: jax.Array, model: Plant, state: StateObserverValues
@@ -169,7 +169,14 @@ class StateObserver:
         """d_hat within its limit, (r, n); 0 where it is not estimated."""
         if not self.disturbance:
             return jnp.zeros_like(x)
-        return _limited(state.d_hat, self.disturbance_limit)
+        return _limited(self._of_levels(state.d_hat, model.order), self.disturbance_limit)
+
+    def _of_levels(self, d_hat: jax.Array, order: int) -> jax.Array:
+        """The disturbances of all levels from those of the segments, (r, n)."""
+        rows = [jnp.zeros_like(d_hat[0])] * order
+        for segment, row in zip(self._segments(order), d_hat, strict=True):
+            rows[segment.last - 1] = row
+        return jnp.stack(rows)
 
     def complete(
         self, t: jax.Array, x: jax.Array, model: Plant, state: StateObserverValues
@@ -190,7 +197,8 @@ class StateObserver:
             estimated = self._with_measured(jnp.zeros_like(x), state.x_hat)
             ratios.append(jnp.max(jnp.abs(estimated) / self.limit))
         if self.disturbance_limit is not None:
-            ratios.append(jnp.max(jnp.abs(state.d_hat) / self.disturbance_limit))
+            d_hat = self._of_levels(state.d_hat, model.order)
+            ratios.append(jnp.max(jnp.abs(d_hat) / self.disturbance_limit))
         if not ratios:
             return ()
         return jnp.max(jnp.stack(ratios)) - 1.0
@@ -249,7 +257,7 @@ class StateObserver:
         def flow(t: jax.Array, x: jax.Array) -> jax.Array:
             rate = plants.flow(model, t, x, u)
             if self.disturbance:
-                rate = rate + d_hat
+                rate = rate + self._of_levels(d_hat, model.order)
             return rate
 
         return flow
@@ -269,7 +277,6 @@ class StateObserver:
         `count` - 1, and `known` the levels at which G is taken, (r, n).
         """
         x_hat = state.x_hat
-        zero = jnp.zeros_like(x_hat[0])
         states: list[jax.Array] = []
         disturbances: list[jax.Array] = []
         for first, last in self._segments(model.order):
@@ -279,10 +286,9 @@ class StateObserver:
             of_states = gains(len(levels) + self.disturbance)
             for level, gain in zip(levels, of_states, strict=False):
                 states.append(_through_gains(model, first, level, t, known, gain * error))
-                disturbances.append(zero)
             if self.disturbance:
                 rate = of_states[-1] * error
-                disturbances[-1] = _through_gains(model, first, last, t, known, rate)
+                disturbances.append(_through_gains(model, first, last, t, known, rate))
         if not self.disturbance:
             return StateObserverValues(jnp.stack(states), ())
         return StateObserverValues(jnp.stack(states), jnp.stack(disturbances))
