@@ -150,7 +150,7 @@ LEVEL_OBSERVERS = {
     "level_zero": observers.LevelObserver(gain=20.0, start="zero"),
     "state_observer": observers.StateObserver(bandwidth=[40.0, 30.0], offset=(0.0, 0.1, 0.2, 0.0)),
     "state_observer_two_encoders": observers.StateObserver(
-        bandwidth=40.0, measured=(1, 3), disturbance=False
+        bandwidth=200.0, measured=(1, 3), disturbance=False
     ),
     "state_observer_limited": observers.StateObserver(
         bandwidth=40.0, limit=5.0, disturbance_limit=50.0
