@@ -51,7 +51,7 @@ class DynamicSurface:
       barrier: any `Barrier`; `Integral()` if not given.
       weight: w of the barrier's V1, () or (n,) [N m rad] ([N m/rad] for a barrier whose V1 is in
         rad^2), > 0; 1, the paper's, if not given.
-      decays: as `Backstepping.decays`.
+      decays: as `Backstepping.decays`; exponential in k1 and K2 if not given.
 
     Source: D. Swaroop, J. K. Hedrick, P. P. Yip, J. C. Gerdes, IEEE Trans. Automatic Control 45
     (2000) 1893-1899; with barriers as at the head of this module.

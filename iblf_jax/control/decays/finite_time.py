@@ -23,7 +23,7 @@ class FiniteTime:
 
     Args:
       k_a: additional gain at 2V + delta^2 = 1 in the unit of V, () or (n,) [1/s], > 0.
-      a: power of the error, () or (n,) [1], in (0, 1]; 0.5 if not given.
+      a: power of the error, () or (n,) [1], > 0 and at most 1; 0.5 if not given.
       delta: size of z below which the power is smoothed, () or (n,) [rad], > 0, in the unit of z =
         sqrt(2V) of the level; 0.01 if not given.
 

@@ -1,5 +1,4 @@
-"""Settling in a time that does not depend on the start, by powers of the error below and above 1.
-"""
+"""Settling in a time that does not depend on the start, by two powers of the error."""
 
 from __future__ import annotations
 
@@ -16,8 +15,8 @@ from iblf_jax.core.pytree import Leaf, component, leaf
 class FixedTime:
     """k(t, V) = k + k_a (2V + delta^2)^((a-1)/2) + k_b (2V + delta^2)^((b-1)/2),   a < 1 < b.
 
-    With z = sqrt(2V), z' = -k z - k_a z (z^2 + delta^2)^((a-1)/2) - k_b z (z^2 + delta^2)^((b-1)/2).
-    The term of b dominates far from 0, that of a near 0.  |z| <= delta holds from
+    With z = sqrt(2V) and delta = 0 it is z' = -k z - k_a z^a - k_b z^b.  The term of b dominates
+    far from 0, that of a near 0.  |z| <= delta holds from
 
         T = 2^((1-a)/2)/(k_a (1 - a)) + 1/(k_b (b - 1))
 
@@ -28,8 +27,8 @@ class FixedTime:
       k_a: additional gain by the power a at 2V + delta^2 = 1 in the unit of V, () or (n,) [1/s], >
         0.
       k_b: additional gain by the power b there, () or (n,) [1/s], > 0.
-      a: lower power of the error, () or (n,) [1], in (0, 1]; 0.5 if not given.
-      b: upper power of the error, () or (n,) [1], at least 1; 1.5 if not given.
+      a: lower power of the error, () or (n,) [1], > 0 and at most 1; 0.5 if not given.
+      b: upper power of the error, () or (n,) [1], > 0 and at least 1; 1.5 if not given.
       delta: size of z below which the powers are smoothed, () or (n,) [rad], > 0, in the unit of z
         = sqrt(2V) of the level; 0.01 if not given.
 
