@@ -57,7 +57,7 @@ TIME = Statement(
 AT_DEADLINE = Statement("prescribed time", "(D.3)", "E(T) <= v(T),  v' = -D(t, v) + rho2")
 
 INEQUALITY = Statement(
-    "decays",
+    "inequality, decays",
     "(D.2)",
     "E' <= -sum w V1 rate(k1(t, V1)) - e2^T K2 e2 - 2 g(t, W) W + e2 . f_tilde",
     "1/s",
@@ -132,9 +132,7 @@ def least_decay(law: Any, mu: jax.Array, t: jax.Array, E: jax.Array) -> jax.Arra
         rows += list(jax.vmap(of_share)(values).T)
     if isinstance(law, Backstepping):
         decay = decay_of(law, 1)
-        rows.append(
-            jax.vmap(lambda W: 2.0 * (mu + energy_gain(decay, t, W, law.k1)) * W)(values)
-        )
+        rows.append(jax.vmap(lambda W: 2.0 * (mu + energy_gain(decay, t, W, law.k1)) * W)(values))
     # Row m of the table has the indices m - i, where i is the share of the parts before.
     rest = np.arange(SHARES + 1)[:, None] - np.arange(SHARES + 1)[None, :]
     total = rows[0]
@@ -148,7 +146,7 @@ def least_decay(law: Any, mu: jax.Array, t: jax.Array, E: jax.Array) -> jax.Arra
 def predicted(
     law: Any, mu: jax.Array, E: jax.Array, rho2: jax.Array, end: jax.Array, count: int
 ) -> jax.Array:
-    """v of (D.3) at `count` + 1 times from 0 to `end`, (count + 1,)."""
+    """The prediction v of (D.3) at `count` + 1 times from 0 to `end`, (count + 1,)."""
     h = end / count
 
     def rate(t, logarithm):
@@ -176,7 +174,8 @@ class Course(NamedTuple):
     """What the lines need of the steps of a segment or of a run, (T,) each."""
 
     t: np.ndarray
-    E: np.ndarray
+    total: np.ndarray
+    """E, the sum of w_j V_j."""
     growth: np.ndarray
     """g of (D.2)."""
     noise: np.ndarray
@@ -250,7 +249,7 @@ def settling_lines(summary: Any, courses: list[Course], why_not: str, mu: float)
     if why_not:
         return [not_applicable(statement, why_not) for statement in statements]
     rho2 = max(float(np.max(course.growth)), 0.0)
-    numbers = (jnp.asarray(x, law_dtype(law)) for x in (mu, course.E[0], rho2, course.t[-1]))
+    numbers = (jnp.asarray(x, law_dtype(law)) for x in (mu, course.total[0], rho2, course.t[-1]))
     v = np.asarray(predicted(law, *numbers, INTERVALS), float)
     times = np.linspace(0.0, course.t[-1], INTERVALS + 1)
     lines = []
@@ -272,7 +271,7 @@ def _why_not_from_the_start(summary: Any, course: Course) -> str:
         return "the prediction is from t = 0 on, and the claim excludes some samples"
     if summary.jumps.size:
         return "the prediction is from t = 0 on, and the disturbance jumps within the run"
-    if not course.E[0] > 0.0:
+    if not course.total[0] > 0.0:
         return "the run starts without an error"
     return ""
 
@@ -310,7 +309,7 @@ def _time_line(course: Course, times: Any, v: Any, band: float, rho2: float) -> 
         reason = f"the prediction falls to {v.min():.4g} within the run, and not into the {note}"
         return not_applicable(TIME, reason)
     time = float(times[reached[0]]) * (1.0 + RELATIVE_ERROR)
-    outside = np.flatnonzero(course.E > band)
+    outside = np.flatnonzero(course.total > band)
     entered = 0.0
     if outside.size:
         entered = np.inf
@@ -330,14 +329,14 @@ def _deadline_line(course: Course, times: Any, v: Any, deadline: float, rho2: fl
         return not_applicable(AT_DEADLINE, f"the run ends before T = {deadline:.4g} s")
     bound = float(np.exp(np.interp(course.t[at], times, np.log(v)))) * (1.0 + RELATIVE_ERROR)
     tolerance = 0.5 * (np.sqrt(2.0 * bound) + course.noise[at]) ** 2 - bound
-    margin = bound - float(course.E[at])
+    margin = bound - float(course.total[at])
     verdict = "holds" if margin >= -tolerance else "fails"
     note = f"T = {deadline:.4g} s, v(T) = {bound:.4g}, {_note(rho2)}"
     return AT_DEADLINE.line(
         verdict,
         margin=margin,
         tolerance=float(tolerance),
-        value=float(course.E[at]),
+        value=float(course.total[at]),
         time=float(course.t[at]),
         note=note,
     )

@@ -315,7 +315,7 @@ def _metadata(scenario: Scenario, path: str) -> Mapping[str, Any]:
         if not tokens:
             unit = of_entry(_unit(part, field, symbols), index, jnp.ndim(value))
             return {**field.metadata, "unit": unit}
-        symbols = _symbols_below(field, symbols, *index[:1])
+        symbols = _symbols_below(part, field, symbols, *index[:1])
         part = value
         for i in index:
             part = part[i]

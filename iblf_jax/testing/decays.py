@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.control.decays import Decay
-from iblf_jax.control.decays._base import MEMBERS_TO_LEAVE_OUT, decay_member
+from iblf_jax.control.decays._base import decay_member
 from iblf_jax.testing._contract import Findings, call_has_shape, check_function, has_shape
 from iblf_jax.testing.joints import examine_joints
 
@@ -32,8 +32,7 @@ def check_decay(decay: Any, *, n: int | None = None) -> None:
       ContractError: lists what does not hold, with the remedy.
       ValueError: `n` is not a number of joints, or not that of the leaves.
     """
-    optional = MEMBERS_TO_LEAVE_OUT
-    with examine_joints(decay, Decay, n, "decay", optional) as (findings, decay, joints):
+    with examine_joints(decay, Decay, n, "decay") as (findings, decay, joints):
         k = jnp.asarray(np.resize([2.0, 3.0], joints))
         t, V = jnp.asarray(0.4), jnp.asarray(np.resize([0.02, 0.7], joints))
         call_has_shape(findings, LABEL, _gain, (decay, t, k, V), (joints,))

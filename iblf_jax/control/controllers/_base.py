@@ -219,7 +219,9 @@ def wrapped_switching(law: Any, *arguments: Any) -> jax.Array | None:
 def decay_of(law: Any, i: int) -> Decay:
     """The decay of level i + 1 of a law: `Exponential` for a law that has no `decays`."""
     decays = law_member(law, "decays")
-    return decays[i] if decays else Exponential()  # type: ignore[no-any-return]
+    if not decays:
+        return Exponential()
+    return decays[i]  # type: ignore[no-any-return]
 
 
 def rigid_body_torque(

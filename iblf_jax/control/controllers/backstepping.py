@@ -47,7 +47,6 @@ from iblf_jax.control.controllers._base import (
 )
 from iblf_jax.control.decays import Decay
 from iblf_jax.control.decays._base import (
-    MEMBERS_TO_LEAVE_OUT,
     decay_member,
     energy_gain,
     gain_at,
@@ -211,7 +210,7 @@ def fit_decays(law, count: int) -> None:
         decays = (decays,)
     for i, decay in enumerate(decays):
         remedy = "Such as iblf_jax.decays.FiniteTime(k_a=2.0)."
-        checks.conforms(f"{name}[{i}]", decay, Decay, remedy, MEMBERS_TO_LEAVE_OUT)
+        checks.conforms(f"{name}[{i}]", decay, Decay, remedy)
     if len(decays) == 1:
         decays = tuple(decays) * count
     if len(decays) not in (0, count):

@@ -30,9 +30,6 @@ from iblf_jax.core import checks
 from iblf_jax.core.optional import OptionalMembers
 from iblf_jax.core.units import PlantUnit
 
-MEMBERS_TO_LEAVE_OUT = ("constant", "band", "deadline", "smooth_derivatives")
-"""Members that a decay may lack: it then varies, and states no band and no time."""
-
 SIZE = PlantUnit("rad", "z")
 """Unit of z = sqrt(2V)."""
 
@@ -40,9 +37,15 @@ SIZE = PlantUnit("rad", "z")
 class Decay(Protocol):
     """The contract of a decay.  All arrays are (n,), one number a joint, and joints do not mix.
 
-    A class attribute `constant = True` states that the gain is k at all times, so that a law does
-    not compute V for it.  A class attribute `smooth_derivatives` states how many continuous
-    derivatives the gain has; without it a law assumes that it is smooth.
+    A decay may also have these members; `decay_member` holds their defaults.
+
+    - `constant`: a class attribute, True if the gain is k at all times, so that a law does not
+      compute V for it.
+    - `smooth_derivatives`: a class attribute, the number of continuous derivatives that the gain
+      has as a function of t and V; infinite by default.
+    - `band()`: the V below which nothing more is claimed, (n,); None by default.
+    - `deadline()`: the time by which V has decayed to what the gain until then implies, (n,) [s];
+      None by default.
     """
 
     def effective_gain(self, t: jax.Array, k: jax.Array, V: jax.Array) -> jax.Array:
@@ -52,16 +55,6 @@ class Decay(Protocol):
           t: time, () [s].
           k: constant gain of the level, (n,) [1/s], >= 0.
           V: value of the barrier, (n,), in its unit, >= 0.
-        """
-        ...
-
-    def band(self) -> jax.Array | None:
-        """The V below which nothing more is claimed, (n,); None if no such band is stated."""
-        ...
-
-    def deadline(self) -> jax.Array | None:
-        """The time by which V has decayed to what the gain until then implies, (n,) [s]; None if no
-        such time is stated.
         """
         ...
 
