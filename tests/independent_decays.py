@@ -131,9 +131,12 @@ def _sine_at(parts, t):
     return offset + amplitude * np.sin(angle), amplitude * frequency * np.cos(angle)
 
 
+QUADRATURE = np.polynomial.legendre.leggauss(80)
+
+
 def time_to_band(k, powers, z0, z1):
     """The time in which z' = -(k + g(z)) z leads from z0 to z1, by quadrature over ln z."""
-    points, weights = np.polynomial.legendre.leggauss(200)
+    points, weights = QUADRATURE
     low, high = math.log(z1), math.log(z0)
     nodes = np.exp(0.5 * (high - low) * points + 0.5 * (high + low))
     values = [1.0 / (k + powers.gain(0.0, 0.5 * z * z)) for z in nodes]

@@ -26,7 +26,6 @@ grid of shares of E, one joint of one level after the other, and (D.3) is integr
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -47,8 +46,10 @@ from iblf_jax.simulation.scenario import Scenario
 
 SHARES = 48
 """Number of intervals of the grid of shares of E."""
-INTERVALS = 2000
-"""Number of steps of the integration of (D.3)."""
+INTERVALS = (400, 20_000)
+"""Least and largest number of steps of the integration of (D.3)."""
+VANISHING = 1e-12
+"""Share of E(0) at which the gain of a vanishing error is taken."""
 RELATIVE_ERROR = 2e-3
 """Error of D and of the integration of (D.3), relative to the predicted value."""
 TIME = Statement(
@@ -142,29 +143,55 @@ def least_decay(law: Any, mu: jax.Array, t: jax.Array, E: jax.Array) -> jax.Arra
     return total[-1]
 
 
-@partial(jax.jit, static_argnames="count")
 def predicted(
-    law: Any, mu: jax.Array, E: jax.Array, rho2: jax.Array, end: jax.Array, count: int
+    law: Any, mu: float, start: float, rho2: float, end: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Times from 0 to `end`, and the prediction v of (D.3) at them, by RK4 in ln v.
+
+    Args:
+      law: with decays.
+      mu: as `least_decay`.
+      start: E(0), > 0.
+      rho2: of (D.3).
+      end: end of the run [s].
+    """
+    dtype = jax.tree.leaves(law)[0].dtype
+    gain = jnp.asarray(mu, dtype)
+    fastest = max(
+        float(_least_decay(law, gain, jnp.asarray(t, dtype), jnp.asarray(E, dtype))) / E
+        for t in (0.0, end)
+        for E in (start, VANISHING * start)
+    )
+    count = int(np.clip(np.ceil(end * fastest), *INTERVALS))
+    h = jnp.asarray(end / count, dtype)
+    growth = jnp.asarray(rho2, dtype)
+    logarithm = jnp.log(jnp.asarray(start, dtype))
+    found = [logarithm]
+    for i in range(count):
+        logarithm = _step(law, gain, growth, h, jnp.asarray(i, dtype), logarithm)
+        found.append(logarithm)
+    return np.linspace(0.0, end, count + 1), np.exp(np.asarray(found, float))
+
+
+_least_decay = jax.jit(least_decay)
+
+
+@jax.jit
+def _step(
+    law: Any, mu: jax.Array, rho2: jax.Array, h: jax.Array, i: jax.Array, logarithm: jax.Array
 ) -> jax.Array:
-    """The prediction v of (D.3) at `count` + 1 times from 0 to `end`, (count + 1,)."""
-    h = end / count
+    """The step i of `predicted`."""
 
     def rate(t, logarithm):
         v = jnp.exp(logarithm)
         return (rho2 - least_decay(law, mu, t, v)) / v
 
-    def step(logarithm, i):
-        t = i * h
-        k_1 = rate(t, logarithm)
-        k_2 = rate(t + 0.5 * h, logarithm + 0.5 * h * k_1)
-        k_3 = rate(t + 0.5 * h, logarithm + 0.5 * h * k_2)
-        k_4 = rate(t + h, logarithm + h * k_3)
-        after = logarithm + h / 6.0 * (k_1 + 2.0 * k_2 + 2.0 * k_3 + k_4)
-        return after, after
-
-    start = jnp.log(E)
-    _, rows = jax.lax.scan(step, start, jnp.arange(count, dtype=E.dtype))
-    return jnp.exp(jnp.append(start, rows))
+    t = i * h
+    k_1 = rate(t, logarithm)
+    k_2 = rate(t + 0.5 * h, logarithm + 0.5 * h * k_1)
+    k_3 = rate(t + 0.5 * h, logarithm + 0.5 * h * k_2)
+    k_4 = rate(t + h, logarithm + h * k_3)
+    return logarithm + h / 6.0 * (k_1 + 2.0 * k_2 + 2.0 * k_3 + k_4)
 
 
 # --- the lines ----------------------------------------------------------------------------------
@@ -249,20 +276,13 @@ def settling_lines(summary: Any, courses: list[Course], why_not: str, mu: float)
     if why_not:
         return [not_applicable(statement, why_not) for statement in statements]
     rho2 = max(float(np.max(course.growth)), 0.0)
-    numbers = (jnp.asarray(x, law_dtype(law)) for x in (mu, course.total[0], rho2, course.t[-1]))
-    v = np.asarray(predicted(law, *numbers, INTERVALS), float)
-    times = np.linspace(0.0, course.t[-1], INTERVALS + 1)
+    times, v = predicted(law, mu, float(course.total[0]), rho2, float(course.t[-1]))
     lines = []
     if np.isfinite(band):
         lines.append(_time_line(course, times, v, band, rho2))
     if np.isfinite(deadline):
         lines.append(_deadline_line(course, times, v, deadline, rho2))
     return lines
-
-
-def law_dtype(law: Any) -> Any:
-    """The floating-point type of the leaves of a law."""
-    return jax.tree.leaves(law)[0].dtype
 
 
 def _why_not_from_the_start(summary: Any, course: Course) -> str:
@@ -308,7 +328,9 @@ def _time_line(course: Course, times: Any, v: Any, band: float, rho2: float) -> 
     if not reached.size:
         reason = f"the prediction falls to {v.min():.4g} within the run, and not into the {note}"
         return not_applicable(TIME, reason)
-    time = float(times[reached[0]]) * (1.0 + RELATIVE_ERROR)
+    # From there backward v is above the band: ln v is interpolated over the last interval.
+    last = slice(max(reached[0] - 1, 0), reached[0] + 1)
+    time = float(np.interp(-np.log(band), -np.log(v[last]), times[last])) * (1.0 + RELATIVE_ERROR)
     outside = np.flatnonzero(course.total > band)
     entered = 0.0
     if outside.size:

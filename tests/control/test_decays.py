@@ -362,6 +362,7 @@ def test_files_units_batches_and_gradients(tmp_path):
     np.testing.assert_allclose(slope, difference, rtol=1e-5)
 
 
+@pytest.mark.filterwarnings("ignore:the simulated run")
 def test_the_c_of_a_law_with_decays_gives_the_torques_of_simulate(tmp_path, monkeypatch):
     monkeypatch.setattr("iblf_jax.deployment.export.VECTORS_DURATION", 0.2)
     ij.export(arm_scenario(PAIRS["mixed"], K2=4.0), tmp_path, period=1e-3)
