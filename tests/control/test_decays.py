@@ -387,8 +387,7 @@ def test_units_of_the_levels_of_a_plant():
 @pytest.mark.parametrize(
     ("make", "match"),
     [
-        (lambda: decays.FiniteTime(k_a=1.0, a=1.2), r"FiniteTime\.a"),
-        (lambda: decays.FixedTime(1.0, 1.0, b=0.8), r"FixedTime\.b"),
+        (lambda: decays.FiniteTime(k_a=1.0, a=-0.2), r"FiniteTime\.a"),
         (lambda: decays.FiniteTime(k_a=1.0, delta=0.0), r"FiniteTime\.delta"),
         (
             lambda: controllers.Backstepping(2.0, 20.0, decays=(decays.Exponential(),) * 3),

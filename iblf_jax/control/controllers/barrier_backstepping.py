@@ -25,6 +25,10 @@ x_{j+1} + d_hat_j, with the output of the observer held.
 and beta_i' = (alpha_i - beta_i)/mu_i takes the place of alpha_i'.  No derivative is formed; the lag
 of the filters remains as an error, and the bound above becomes ultimate boundedness.
 
+**Decays.**  The gain k_i of a level may depend on the time and on V_i (`decays`, for settling in
+finite, fixed or prescribed time); decay_i then is that of the gain of the instant, and u contains
+the derivatives of k_i(t, V_i).
+
 **Smoothness.**  u contains the slope s_i of a level differentiated r - i - 1 times.  `Integral` and
 `Log(p=1)` have a kink of the slope at e_i = 0 in an asymmetric tube, and on levels above the first
 their e_i/s_i jumps there.  Such a barrier is refused below the last level.  On the last level u

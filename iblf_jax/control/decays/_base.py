@@ -26,7 +26,6 @@ from typing import Any, Protocol
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.core import checks
 from iblf_jax.core.optional import OptionalMembers
 from iblf_jax.core.units import PlantUnit
 
@@ -96,12 +95,3 @@ def energy_gain(decay: Decay, t: jax.Array, W: jax.Array, like: jax.Array) -> ja
 def power(square: jax.Array, exponent: jax.Array) -> jax.Array:
     """A positive number to the power of a number, with derivatives of every order."""
     return jnp.exp(exponent * jnp.log(square))
-
-
-def check_range(name: str, value: Any, lowest: float, highest: float, remedy: str) -> None:
-    """Raises ValueError unless all entries are in [lowest, highest]; traced values pass."""
-    if not checks.is_concrete(value):
-        return
-    if jnp.all((value >= lowest) & (value <= highest)):
-        return
-    raise checks.fail(name, value, f"numbers from {lowest:g} to {highest:g}", remedy)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import jax
 
-from iblf_jax.control.decays._base import SIZE, check_range, power
+from iblf_jax.control.decays._base import SIZE, power
 from iblf_jax.core.pytree import Leaf, component, leaf
 
 
@@ -23,7 +23,8 @@ class FiniteTime:
 
     Args:
       k_a: additional gain at 2V + delta^2 = 1 in the unit of V, () or (n,) [1/s], > 0.
-      a: power of the error, () or (n,) [1], > 0 and at most 1; 0.5 if not given.
+      a: power of the error, () or (n,) [1], > 0; settling in finite time needs a < 1; 0.5 if not
+        given.
       delta: size of z below which the power is smoothed, () or (n,) [rad], > 0, in the unit of z =
         sqrt(2V) of the level; 0.01 if not given.
 
@@ -34,10 +35,6 @@ class FiniteTime:
     k_a: Leaf = leaf("1/s", sign="positive")
     a: Leaf = leaf("1", sign="positive", default=0.5)
     delta: Leaf = leaf(SIZE, sign="positive", default=0.01)
-
-    def check(self) -> None:
-        """Raises ValueError for a power above 1."""
-        check_range("FiniteTime.a", self.a, 0.0, 1.0, "FixedTime has a second power above 1.")
 
     def effective_gain(self, t: jax.Array, k: jax.Array, V: jax.Array) -> jax.Array:
         """k(t, V), (n,) [1/s]."""

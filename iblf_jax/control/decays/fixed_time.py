@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
 
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.decays._base import SIZE, check_range
+from iblf_jax.control.decays._base import SIZE
 from iblf_jax.core.pytree import Leaf, component, leaf
 
 
@@ -27,8 +26,9 @@ class FixedTime:
       k_a: additional gain by the power a at 2V + delta^2 = 1 in the unit of V, () or (n,) [1/s], >
         0.
       k_b: additional gain by the power b there, () or (n,) [1/s], > 0.
-      a: lower power of the error, () or (n,) [1], > 0 and at most 1; 0.5 if not given.
-      b: upper power of the error, () or (n,) [1], > 0 and at least 1; 1.5 if not given.
+      a: lower power of the error, () or (n,) [1], > 0; settling needs a < 1; 0.5 if not given.
+      b: upper power of the error, () or (n,) [1], > 0; a time for every start needs b > 1; 1.5 if
+        not given.
       delta: size of z below which the powers are smoothed, () or (n,) [rad], > 0, in the unit of z
         = sqrt(2V) of the level; 0.01 if not given.
 
@@ -40,11 +40,6 @@ class FixedTime:
     a: Leaf = leaf("1", sign="positive", default=0.5)
     b: Leaf = leaf("1", sign="positive", default=1.5)
     delta: Leaf = leaf(SIZE, sign="positive", default=0.01)
-
-    def check(self) -> None:
-        """Raises ValueError for a lower power above 1, or an upper one below 1."""
-        check_range("FixedTime.a", self.a, 0.0, 1.0, "The upper power is b.")
-        check_range("FixedTime.b", self.b, 1.0, math.inf, "The lower power is a.")
 
     def effective_gain(self, t: jax.Array, k: jax.Array, V: jax.Array) -> jax.Array:
         """k(t, V), (n,) [1/s]."""
