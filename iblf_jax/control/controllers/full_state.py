@@ -26,7 +26,8 @@ A weight w_i > 0 of each joint scales the first barrier, V1 = sum_i w_i V1_i: th
 s1 in (F.1), the cross term cancels as before, and all claims hold with this V1.
 
 The gains k1 and K2 may depend on the time and on V1 or phi (`decays`): the decays in (F.2) then are
-those of the gains of the instant, which are at no time below k1 and K2, so that (F.3) holds as well.
+those of the gains of the instant.  These are at no time below k1 and K2, so that (F.3) holds as
+well.
 
 The integral and the logarithmic barrier have another e2/s2 on either side of e2 = 0 where K_u and
 K_l differ: there the torque jumps by M0 s1 (K_u^2 - K_l^2)/2, which the exact cancellation
