@@ -229,9 +229,6 @@ LAWS = {
         reading="corrected",
         decays=(DECAYS["finite_time"], decays.PrescribedTime(T=1.0)),
     ),
-    "barrier_backstepping_decays": controllers.BarrierBackstepping(
-        k=(2.0, 20.0), decays=(decays.PrescribedTime(T=[1.0, 2.0]), DECAYS["fixed_time"])
-    ),
     "full_state": controllers.FullState(k1=2.0, K2=[20.0, 15.0], c=1.0, o=0.1),
     "full_state_mixed": controllers.FullState(
         k1=2.0,
