@@ -46,7 +46,7 @@ from iblf_jax.kernels import UnsupportedError
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.noise import has_noise, noise_key
-from iblf_jax.simulation.scenario import Scenario, canonical, check_step
+from iblf_jax.simulation.scenario import Scenario, canonical, fitted_to_step
 from iblf_jax.world import plants
 from iblf_jax.world.robots._base import robot_member
 
@@ -218,7 +218,7 @@ def _export_law(
 def _export_loop(
     scenario: Scenario, folder: Path, target: str, name: str, dt: float, method: str, seed: int
 ) -> Exported:
-    check_step(scenario, dt)
+    scenario = fitted_to_step(scenario, dt)
     _check_start(scenario)
     loop = loop_program(scenario, method)
     joints = _joint_names(scenario.plant)
