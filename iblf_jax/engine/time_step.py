@@ -162,7 +162,7 @@ def _with_commands(
     them.
     """
     sent = [
-        delays.PieceCommands(length, piece.exists, [slope.delayed for slope in slopes])
+        delays.PieceCommands(piece.begin, length, piece.exists, [slope.delayed for slope in slopes])
         for piece, (length, slopes) in zip(pieces, parts, strict=True)
     ]
     commands = delays.with_step(along.state.delayed, method, along.arriving, sent)

@@ -142,12 +142,12 @@ def _of_step(commands: jax.Array, position: jax.Array) -> jax.Array:
     return found
 
 
-def interpolated(method: str, commands: jax.Array, position: Any) -> jax.Array:
+def interpolated(method: str, commands: Any, position: Any) -> jax.Array:
     """The polynomial through the commands of a step at a position in it, (n,).
 
     Args:
       method: the integrator.
-      commands: of its stages, (STAGES, n).
+      commands: of its stages, (n,) each.
       position: () [steps].
     """
     c = tableau(method).c
@@ -166,6 +166,8 @@ def interpolated(method: str, commands: jax.Array, position: Any) -> jax.Array:
 class PieceCommands(NamedTuple):
     """The commands of the stages of a piece of a step."""
 
+    begin: jax.Array
+    """() [s]."""
     length: jax.Array
     """() [s]."""
     exists: Any
@@ -194,8 +196,22 @@ def with_step(
     stages = [start + each * (end - start) for each in c]
     for piece in pieces:
         is_full = piece.length >= (1.0 - arrived.tolerance) * arrived.dt
-        stages = [
-            jnp.where(is_full, own, line) for own, line in zip(piece.commands, stages, strict=True)
-        ]
+        on_grid = _on_grid(method, arrived, piece)
+        stages = [jnp.where(is_full, own, line) for own, line in zip(on_grid, stages, strict=True)]
     stages = stages + [stages[-1]] * (STAGES - len(stages))
     return jnp.concatenate([jnp.stack(stages)[None], before[:-1]])
+
+
+def _on_grid(method: str, arrived: ArrivingCommands, piece: PieceCommands) -> list[jax.Array]:
+    """The commands of the stages of a piece that fills its step, (n,) each, at the times of an
+    undivided step.
+
+    The times of such a piece are these, but they have a derivative by the jump time at which it
+    ends.
+    """
+    found = []
+    for c, own in zip(tableau(method).c, piece.commands, strict=True):
+        late = (piece.begin + c * piece.length - arrived.start) / arrived.dt - c
+        moved = interpolated(method, piece.commands, c - late)
+        found.append(own + moved - interpolated(method, piece.commands, c))
+    return found
