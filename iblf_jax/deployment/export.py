@@ -14,6 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.control.actuators import Ideal
+from iblf_jax.control.actuators._base import input_delay
 from iblf_jax.core import checks, notices, taylor
 from iblf_jax.core.pytree import astype
 from iblf_jax.core.status import FAILED, Status, describe, has_flag
@@ -150,6 +152,9 @@ def export(
     dt, seed = checks.time_span("dt", dt), checks.seed(seed)
     name = checked_name(name, "iblf_loop" if is_loop else "iblf_law")
     check_single(scenario)
+    if not is_loop and input_delay(scenario.actuator) is not None:
+        # The program of a law does not contain the way of its commands.
+        scenario = dataclasses.replace(scenario, actuator=Ideal())
     if not is_loop or period is not None:
         scenario = with_period(scenario, period)
     scenario = canonical(astype(scenario, _available(dtype)))

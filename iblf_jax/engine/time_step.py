@@ -128,7 +128,9 @@ def advance(
     parts = [(first.length, stepped.slopes), *later.parts]
     state_after = with_integrated_part(state, later.moved)
     if along.arriving:
-        state_after, parts = _with_commands(along, method, times.division.pieces, state_after, parts)
+        state_after, parts = _with_commands(
+            along, method, times.division.pieces, state_after, parts
+        )
     after, status, nearest, estimate = options.piece(partial(_concluded, method))(
         inputs,
         carry,

@@ -1,9 +1,9 @@
 """Commands of a continuous loop that reach the actuator later: the method of steps.
 
-The loop keeps the commands of the integrator's stages of the last steps. With a delay of m steps the
-stage s of step k receives the command of the stage s of step k - m. This is the integrator applied
-to the ordinary differential equation of all intervals of the length of the delay, so a run has the
-order of the integrator.
+The loop keeps the commands of the integrator's stages of the last steps. With a delay of m steps
+the stage s of step k receives the command of the stage s of step k - m. This is the integrator
+applied to the ordinary differential equation of all intervals of the length of the delay, so a run
+has the order of the integrator.
 
 Otherwise a stage receives the value of the polynomial in time through the commands of a past step:
 the mean of those stages that belong to the same time, at each such time. For rk4 it is quadratic

@@ -35,9 +35,9 @@ class Actuator(Protocol):
     not use it.
 
     An actuator with limits also has the property `unlimited`, the same actuator without them; the
-    fastest mode of a sampled loop is computed with it.  One with a dead zone, a play or rounding has
-    the property `smooth`, an actuator without these that has the same state; the fastest mode of
-    every loop is computed with it.  An actuator that changes with time, such as a drive
+    fastest mode of a sampled loop is computed with it.  One with a dead zone, a play or rounding
+    has the property `smooth`, an actuator without these that has the same state; the fastest mode
+    of every loop is computed with it.  An actuator that changes with time, such as a drive
     that fails, has `at(t)`, the actuator at time t [s], and, if it is discontinuous in time,
     `jump_times()`, (m,) [s]; steps of a run are divided there, as for disturbances.
     """

@@ -28,8 +28,8 @@ class Chain:
     limit=40.0), Motor(bandwidth=300.0)))`.
 
     Args:
-      parts: any actuators, a tuple or a list, from the command to the joint; at least one.  A `Delay`
-        comes first.
+      parts: any actuators, a tuple or a list, from the command to the joint; at least one.  A
+        `Delay` comes first.
 
     Source: none; what a current loop and a transmission with a lag of its own make together.
     """

@@ -23,13 +23,12 @@ class Delay:
     The loop keeps the commands of the integrator's stages of the last steps
     (`simulation.delays`).  With a delay of a whole number of steps a run has the order of the
     integrator; with another delay it is of second order.  In a chain it comes first, because it is
-    the command that is late.  The commands of an observer are not delayed: it receives the command
-    of the instant, as a law on a computer passes it on.  The commands of a sampled law have the
+    the command that is late.  An observer receives the command of the instant, before the delay.  The commands of a sampled law have the
     delay of their `Sampling`.
 
     The fastest mode of a run is that of the loop without the delay.  A derivative by the delay is
-    exact but for the interpolation between the stages, of second order; derivatives of laws whose
-    command jumps lack the terms of these jumps.
+    of second order in the time step with a whole number of steps, and of first order otherwise.
+    Derivatives of a loop whose law has a command that jumps lack the terms of these jumps.
 
     Args:
       delay: () [s], > 0; at least one time step.

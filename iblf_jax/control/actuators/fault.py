@@ -16,9 +16,9 @@ from iblf_jax.core.units import INPUT
 class Fault:
     """tau = u for t < time,   tau = effectiveness u + bias for t >= time.
 
-    Several faults are a `Chain` of them: Chain((Fault(0.7, 0.0, 1.0), Fault(0.5, 0.2, 2.0))).  Steps
-    of a run are divided at the time, so a run has a derivative by it.  An observer receives the
-    command u, so its estimate contains the torque that is lost.
+    Several faults are a `Chain` of them: Chain((Fault(0.7, 0.0, 1.0), Fault(0.5, 0.2, 2.0))).
+    Steps of a run are divided at the time, so a run has a derivative by it.  An observer receives
+    the command u, so its estimate contains the torque that is lost.
 
     Args:
       effectiveness: share of the command that is delivered, () or (n,) [1], >= 0; 1 is no loss.
