@@ -61,10 +61,6 @@ SPECIAL = {
     "safety_filter": lambda cls: cls(PRESET.controller, nearest="acceleration"),
     "saturated": lambda cls: cls(PRESET.controller, limit=8.0),
     "extended_state": lambda cls: cls(bandwidth=40.0),
-    "fault": lambda cls: cls(effectiveness=[0.7, 0.9], bias=0.1, time=0.01),
-    "dead_zone": lambda cls: cls(lower=-0.2, upper=[0.3, 0.1]),
-    "backlash": lambda cls: cls(gap=0.2, bandwidth=300.0),
-    "delay": lambda cls: cls(delay=3e-3, history=5),
 }
 """Members whose fields do not fit together when each holds a small positive number."""
 
