@@ -42,6 +42,9 @@ MODE_INSTANTS = 33
 """Instants along the reference at which modes are computed."""
 MAX_TRIED = 5_000_000
 """Steps of a run that is tried, at most."""
+MAX_STEPS_IN_DELAY = 20
+"""Steps in the delay of an input that are tried, at most: each number of them is a program of its
+own, which contains all commands on their way."""
 INTERVALS = ((0.0, 1.0), (0.0, 0.382), (0.382, 0.618), (0.618, 1.0))
 """Start and end of the intervals that are integrated for each step, in steps: the whole step and
 its three parts."""
@@ -244,7 +247,7 @@ def find_dt(scenario: Scenario, *, duration: float, method: str) -> float:
         return _find_part(scenario, float(scenario.sampling.period), duration, method)
     delay = input_delay(scenario.actuator)
     if delay is not None:
-        return _find_part(scenario, float(delay.delay), duration, method)
+        return _find_part(scenario, float(delay.delay), duration, method, MAX_STEPS_IN_DELAY)
     mode = fastest_along(scenario, np.linspace(0.0, duration, MODE_INSTANTS))
     if not np.isfinite(mode):
         raise checks.fail(
@@ -276,15 +279,18 @@ def find_dt(scenario: Scenario, *, duration: float, method: str) -> float:
     return for_modes
 
 
-def _find_part(scenario: Scenario, period: float, duration: float, method: str) -> float:
+def _find_part(
+    scenario: Scenario, period: float, duration: float, method: str, most_parts: int = MAX_TRIED
+) -> float:
     """`find_dt` for a sampled law or a delayed input: the largest accurate fraction of the sampling
-    period or of the delay [s].  The divisor is 1, 2 or 5 times a power of ten.
+    period or of the delay [s].  The divisor is 1, 2 or 5 times a power of ten, at most
+    `most_parts`.
     """
     noise = jnp.zeros((4,)) if scenario.sampling is not None else None
     _can_be_tried(duration, period)
     periods = max(math.ceil(duration / period - 1e-9), 1)
     parts, before, poor_before, coarser = 1, None, 0, period
-    while periods * parts <= MAX_TRIED:
+    while periods * parts <= MAX_TRIED and parts <= most_parts:
         dt = jnp.asarray(period / parts, scenario.initial.q.dtype)
         fitted = with_history(scenario, period / parts)
         found = run_one(fitted, (), dt, RunRequest(periods * parts, method, parts), noise)

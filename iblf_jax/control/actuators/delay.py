@@ -21,10 +21,11 @@ class Delay:
     """tau(t) = u(t - delay) for t >= delay,   the torque that balances gravity before.
 
     The loop keeps the commands of the integrator's stages of the last steps
-    (`simulation.delays`).  With a delay of a whole number of steps a run has the order of the
-    integrator; with another delay it is of second order.  In a chain it comes first, because it is
-    the command that is late.  An observer receives the command of the instant, before the delay.  The commands of a sampled law have the
-    delay of their `Sampling`.
+    (`simulation.delays`), and a step costs more the more there are.  With a delay of a whole number
+    of steps a run has the order of the integrator; with another delay it is of second order.  In a
+    chain a delay comes first, because it is the command that is late.  An observer receives the
+    command of the instant, before the delay.  The commands of a sampled law have the delay of their
+    `Sampling`.
 
     The fastest mode of a run is that of the loop without the delay.  A derivative by the delay is
     of second order in the time step with a whole number of steps, and of first order otherwise.

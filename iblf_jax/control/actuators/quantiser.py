@@ -18,11 +18,13 @@ class Quantiser:
 
     The torque jumps at surfaces in the state that steps of a run are not divided at: in a
     continuous loop a run is of first order in the time step, and where the loop chatters between
-    two levels the time step decides how fast.  In a sampled loop the torque is constant between the samples,
-    and the order of the integrator remains.  The derivative of tau by u is defined as 1, that of
-    the torque before rounding, because the derivative of the rounding is 0 almost everywhere; the
-    derivatives of a run are therefore those of a loop whose quantisation error is a given
-    disturbance.  The fastest mode is computed without the rounding (`smooth`).
+    two levels the time step decides how fast.  In a sampled loop the torque is constant between the
+    samples, and the order of the integrator remains.
+
+    The derivative of tau by u is defined as 1, that of the torque before rounding, because the
+    derivative of the rounding is 0 almost everywhere; the derivatives of a run are therefore those
+    of a loop whose quantisation error is a given disturbance.  The fastest mode is computed without
+    the rounding (`smooth`).
 
     Args:
       step: distance of two levels, () or (n,) [N m], > 0.
