@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.control.actuators._base import input_delay
 from iblf_jax.control.barriers import Quadratic
 from iblf_jax.control.controllers._base import law_member
-from iblf_jax.control.actuators._base import input_delay
 from iblf_jax.core import checks, notices
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import FAILED, Status, describe
