@@ -153,7 +153,7 @@ def export(
     name = checked_name(name, "iblf_loop" if is_loop else "iblf_law")
     check_single(scenario)
     if not is_loop and input_delay(scenario.actuator) is not None:
-        # The program of a law does not contain the way of its commands.
+        # The program of a law ends with its command; a delay belongs to the computer that runs it.
         scenario = dataclasses.replace(scenario, actuator=Ideal())
     if not is_loop or period is not None:
         scenario = with_period(scenario, period)

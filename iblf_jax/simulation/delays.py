@@ -114,21 +114,21 @@ def arriving(
     tolerance = WHOLE_TOLERANCE + 4.0 * jnp.finfo(dt.dtype).eps * jnp.maximum(steps, number)
     nearest = jnp.round(steps)
     is_whole = jnp.abs(steps - nearest) < tolerance
-    whole = jax.lax.stop_gradient(jnp.where(is_whole, nearest, jnp.ceil(steps)))
+    number_of_steps = jax.lax.stop_gradient(jnp.where(is_whole, nearest, jnp.ceil(steps)))
     rounding = jax.lax.stop_gradient(jnp.where(is_whole, nearest - steps, 0.0))
-    consistent = (whole >= 1.0) & (whole <= len(commands))
-    earlier = jnp.where(consistent, _of_step(commands, whole - 1.0), jnp.nan)
+    consistent = (number_of_steps >= 1.0) & (number_of_steps <= len(commands))
+    earlier = jnp.where(consistent, _of_step(commands, number_of_steps - 1.0), jnp.nan)
     return ArrivingCommands(
         method,
         number * dt,
         dt,
         delay,
-        whole - (steps + rounding),
+        number_of_steps - (steps + rounding),
         is_whole,
         tolerance,
-        number + 1.0 == whole,
+        number + 1.0 == number_of_steps,
         earlier,
-        _of_step(commands, whole - 2.0),
+        _of_step(commands, number_of_steps - 2.0),
     )
 
 

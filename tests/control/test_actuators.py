@@ -16,6 +16,7 @@ from scipy.integrate import solve_ivp
 from scipy.special import lambertw
 
 import iblf_jax as ij
+from iblf_jax.certificates.claims import why_no_theorem
 from iblf_jax.core.status import Status
 from iblf_jax.simulation.closed_loop import LoopState, evaluate
 
@@ -215,6 +216,7 @@ def test_delay_of_whole_steps_has_the_order_of_the_integrator():
     assert error(1e-3, "heun") < 1e-4
 
 
+@pytest.mark.release
 def test_delay_of_other_lengths_is_of_second_order():
     errors = []
     for steps in (4.3, 8.6):
@@ -324,3 +326,83 @@ def test_falsify_finds_a_loss_of_effectiveness_that_leaves_the_bounds():
     )
     assert attack.margin < 0
     assert np.min(attack.values["actuator.effectiveness"]) < 0.5
+
+
+# --- what is refused, and what is reported --------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: ij.actuators.DeadZone(lower=0.1, upper=0.2), "DeadZone.lower"),
+        (lambda: ij.actuators.Delay(0.01, history=0), "Delay.history"),
+        (
+            lambda: with_actuator(ij.actuators.Ideal(), ij.actuators.Delay(0.01)),
+            "a Delay as the first part only",
+        ),
+        (
+            lambda: ij.with_parts(
+                with_actuator(ij.actuators.Delay(0.01)), sampling=ij.Sampling(period=1e-3)
+            ),
+            "Sampling",
+        ),
+        (lambda: ij.vector_field(with_actuator(ij.actuators.Delay(0.01))), "past states"),
+        (
+            lambda: ij.simulate(with_actuator(ij.actuators.Delay(1e-3)), duration=0.1, dt=2e-3),
+            "at least one time step",
+        ),
+        (
+            lambda: ij.simulate(
+                with_actuator(ij.actuators.Delay(0.01)), duration=0.1, dt=1e-3, method="euler"
+            ),
+            "heun",
+        ),
+        (
+            lambda: jax.grad(
+                lambda h: (
+                    ij.simulate(with_actuator(ij.actuators.Delay(h)), duration=0.1, dt=1e-3)
+                    .q[-1]
+                    .sum()
+                )
+            )(0.01),
+            "Delay.history",
+        ),
+    ],
+)
+def test_refusals_name_the_field_and_the_remedy(call, words):
+    with pytest.raises(ValueError, match=words):
+        call()
+
+
+def test_certificate_of_a_delayed_run_claims_nothing(tmp_path):
+    scenario = with_actuator(ij.actuators.Delay(2e-3))
+    ij.save_scenario(scenario, tmp_path / "delayed.toml")
+    run = ij.simulate(ij.load_scenario(tmp_path / "delayed.toml"), duration=0.05, dt=1e-3)
+    assert int(run.scenario.actuator.history) == 2
+    certificate = ij.certify(scenario, run=run)
+    lines = {line.name: line for line in certificate.lines}
+    assert {line.verdict for line in certificate.lines} == {"not applicable"}
+    assert lines["V2, delayed less continuous"].value > 0
+
+
+@pytest.mark.parametrize(
+    "actuator",
+    [
+        ij.actuators.Fault(effectiveness=0.9, time=0.02),
+        ij.actuators.DeadZone(lower=-0.1, upper=0.1),
+    ],
+)
+def test_theorem_claims_nothing_about_a_torque_that_is_not_the_command(actuator):
+    reason = why_no_theorem(with_actuator(actuator))
+    assert type(actuator).__name__ in reason
+
+
+@pytest.mark.release
+def test_law_is_exported_without_the_delay_of_its_input(tmp_path):
+    for name, scenario in (("with", with_actuator(ij.actuators.Delay(2e-3))), ("without", SLOW)):
+        ij.export(scenario, tmp_path / name, period=1e-3)
+    sources = [p.name for p in sorted((tmp_path / "without").glob("*.c"))]
+    assert sources
+    for source in sources:
+        with_delay, without = (tmp_path / name / source for name in ("with", "without"))
+        assert with_delay.read_text() == without.read_text()

@@ -73,7 +73,9 @@ def unlimited(actuator: Actuator) -> Actuator:
 def smooth(actuator: Actuator) -> Actuator:
     """An actuator without dead zone, play and rounding; itself if it declares none."""
     found = actuator_member(actuator, "smooth")
-    return actuator if found is None else found
+    if found is None:
+        return actuator
+    return found  # type: ignore[no-any-return]
 
 
 def input_delay(actuator: Actuator) -> Any:

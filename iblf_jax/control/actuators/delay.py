@@ -45,7 +45,9 @@ class Delay:
     history: int = static(default=None)
 
     def check(self) -> None:
-        """Raises ValueError for a delay that no loop has, or a history that is no number."""
+        """Raises ValueError for a delay that no loop has, or a history that is not a positive
+        whole number.
+        """
         if checks.is_concrete(self.delay):
             checks.time_span("Delay.delay", self.delay)
         if self.history is not None:
