@@ -45,8 +45,8 @@ for (law, name), run in runs.items():
     margin = float(np.min(run.metrics["margin"]))
     print(f"{name:32s} {law:22s} {margin:13.4f} {np.sqrt(np.mean(late**2)):26.2e}")
 
-# %% `falsify` searches the effectiveness at which a law leaves its bounds. The smallest one that
-# keeps them lies between the last two columns.
+# %% `falsify` searches an effectiveness at which a law leaves its bounds. As far as the search
+# finds, the smallest one that keeps them lies between the last two columns.
 print(f"{'law':22s} {'leaves at':>10s} {'keeps from':>11s}")
 for law, scenario in laws.items():
     faulty = ij.with_parts(scenario, actuator=ij.actuators.Fault(effectiveness=1.0, time=1.0))
