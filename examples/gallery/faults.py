@@ -27,9 +27,9 @@ runs = {
 }
 figure, axes = plt.subplots(1, 2, figsize=(11, 4), sharey=True, layout="constrained")
 for axis, law in zip(axes, laws, strict=True):
-    for name in actuators:
+    for i, name in enumerate(actuators):
         run = runs[law, name]
-        axis.plot(run.t, run.xi[:, 0], label=name)
+        axis.plot(run.t, run.xi[:, 0], label=name, zorder=len(actuators) - i)
     for bound in (-1.0, 1.0):
         axis.axhline(bound, color="black", linestyle="--", linewidth=0.8)
     axis.set(title=law, xlabel="time [s]", ylim=(-1.2, 1.2))
