@@ -197,6 +197,14 @@ ACTUATORS = {
             actuators.Motor(bandwidth=300.0),
         )
     ),
+    "fault": actuators.Fault(effectiveness=[0.7, 0.5], bias=[0.3, -0.2], time=0.5),
+    "dead_zone": actuators.DeadZone(lower=[-0.2, -0.4], upper=[0.5, 0.3], slope=[0.9, 1.1]),
+    "quantiser": actuators.Quantiser(step=[0.01, 0.02]),
+    "backlash": actuators.Backlash(gap=[0.2, 0.1], bandwidth=400.0),
+    "delay": actuators.Delay(delay=3e-3),
+    "delay_chain": actuators.Chain(
+        (actuators.Delay(delay=3e-3), actuators.Fault(effectiveness=0.8, time=0.1))
+    ),
     "motor": actuators.Motor(
         bandwidth=300.0,
         limit=[40.0, 20.0],
