@@ -13,6 +13,7 @@ from iblf_jax.engine.carry import Carry, Inputs
 from iblf_jax.engine.linearization import Linearization, fastest_mode
 from iblf_jax.engine.metric_folds import finished
 from iblf_jax.simulation import error_estimate, integrators, stability
+from iblf_jax.world import plants
 
 
 class Outcome(NamedTuple):
@@ -40,7 +41,14 @@ def outcome_of(
       unresolved: what a `LinearizationStep` has found for the run.
       instants: what it has found at some of them.
     """
+    scenario = inputs.scenario
     estimate = error_estimate.with_unresolved(carry.accuracy, unresolved)
+    switching = plants.plant_member(scenario.plant, "switching")
+    switching_results = {}
+    if switching is not None:
+        end = inputs.dt * inputs.steps
+        switching_results = switching(end)
+        estimate = error_estimate.unless(estimate, scenario.plant.has_complete_path(end))
     modes = jax.vmap(partial(fastest_mode, inputs.scenario))(instants)
     mode = jnp.max(jnp.where(jnp.isfinite(modes), modes, 0.0))
     limit = integrators.tableau(method).stability
@@ -50,10 +58,17 @@ def outcome_of(
     steep = stability.has_infinite_derivative(
         instants.jacobian, inputs.scenario.sampling is not None
     ) & (inputs.dt * steepest > limit)
-    status |= flag(~(estimate.relative <= error_estimate.TOLERANCE), Status.INACCURATE)
+    is_accurate = estimate.relative <= error_estimate.TOLERANCE
+    if scenario.process_noise is not None:
+        # There is no estimate under process noise; a path of modes may be incomplete all the same.
+        is_accurate = estimate.relative < jnp.inf
+    status |= flag(~is_accurate, Status.INACCURATE)
     suffers = has_flag(status, Status.STEP_TOO_LARGE | Status.INACCURATE)
     status |= flag(jnp.any(steep) & suffers, Status.INFINITE_SLOPE)
     metrics = error_estimate.results(estimate)
+    if scenario.process_noise is not None:
+        metrics = error_estimate.unknown(metrics)
+    metrics |= switching_results
     if inputs.scenario.sampling is not None:
         maps = jax.vmap(partial(stability.period_map, inputs.scenario, carry.state))(
             stability.resolved_jacobian(instants.jacobian, sampled=True)

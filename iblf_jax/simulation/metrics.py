@@ -615,6 +615,8 @@ def metric_units(folds: Sequence[Fold], scenario: Scenario) -> tuple[tuple[str, 
     """
     of_folds = [fold_member(fold, "units") for fold in folds]
     pairs = [pair for units in of_folds for pair in units.items()]
+    if plants.plant_member(scenario.plant, "switching") is not None:
+        pairs += plants.SWITCHING_UNITS.items()
     return tuple((name, unit_text(scenario, unit)) for name, unit in (*pairs, *ACCURACY_UNITS))
 
 
