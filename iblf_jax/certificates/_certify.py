@@ -42,7 +42,11 @@ reconstructed."""
 DEFAULT_WORST = 16
 """Runs of a study that are checked if the caller does not say how many."""
 SAMPLED = "the loop is sampled, and the claim is about a law that runs at every instant"
-MEASURED = "how far the sampled run is from the continuous one; no claim of the theorem"
+NOISY = (
+    "the plant has process noise, and the claim is about its drift; a study with"
+    " metrics.LyapunovValue estimates E[V]"
+)
+MEASURED = "how far this run is from the ideal one; no claim of the theorem"
 
 
 @notices.each_warning_once
@@ -191,8 +195,10 @@ def _replayed(study: Any, index: int) -> Rollout:
 
 def _certificate_of(run: Rollout) -> Certificate:
     """The certificate of one run, its arrays on the host."""
+    if run.scenario.process_noise is not None:
+        return _certificate_without_claim(run, NOISY)
     if run.scenario.sampling is not None:
-        return _certificate_of_sampled(run)
+        return _certificate_without_claim(run, SAMPLED)
     if is_about_levels(run.scenario):
         return level_certificate(run)
     summary, segments = summarise(run)
@@ -307,33 +313,38 @@ def _unclaimed_traces(t: Any, V: Any, xi: Any, e2: Any, f_tilde: Any) -> Traces:
     )
 
 
-# --- one run of a sampled loop -------------------------------------------------------------------
+# --- one run of which nothing is claimed -------------------------------------------------------
 
 
-def _certificate_of_sampled(run: Rollout) -> Certificate:
-    """The certificate of a run with a sampled law: nothing is claimed about it, and it is compared
-    with the continuous run instead.
+def _certificate_without_claim(run: Rollout, reason: str) -> Certificate:
+    """The certificate of a run with a sampled law or with process noise: nothing is claimed about
+    it, and it is compared with the continuous run without noise instead.
     """
     scenario, grid = run.scenario, time_grid(run)
-    ideal = with_parts(scenario, sampling=None, sensor=sensors.Ideal(), actuator=actuators.Ideal())
+    parts = {"sampling": None, "sensor": sensors.Ideal(), "actuator": actuators.Ideal()}
+    method = run.method
+    if scenario.sampling is None:
+        parts = {}
+    if scenario.process_noise is not None:
+        parts["process_noise"], method = None, "heun"
     with notices.muted(SimulationWarning):
         simulated = simulate(
-            ideal,
+            with_parts(scenario, **parts),
             duration=grid.duration,
             dt=float(run.dt),
-            method=run.method,
+            method=method,
             record_every=grid.record_every,
         )
-    continuous = _on_host(simulated)
-    certificate = _certificate_of(continuous)
+    ideal = _on_host(simulated)
+    certificate = _certificate_of(ideal)
     cleared: dict[str, Any] = dict.fromkeys(("margin", "value", "joint", "time", "first"))
     unclaimed = tuple(
-        dataclasses.replace(line, verdict=NOT_APPLICABLE, note=SAMPLED, **cleared)
+        dataclasses.replace(line, verdict=NOT_APPLICABLE, note=reason, **cleared)
         for line in certificate.lines
     )
     return dataclasses.replace(
         certificate,
-        lines=(*unclaimed, *_compared(run, continuous)),
+        lines=(*unclaimed, *_compared(run, ideal)),
         traces=_traces_without_claim(run),
     )
 
@@ -347,18 +358,23 @@ def _traces_without_claim(run: Rollout) -> Traces | LevelTraces:
 
 
 def _compared(run: Rollout, continuous: Rollout) -> tuple[Line, Line]:
-    """The differences of V2 and of the margin between a sampled and its continuous run."""
+    """The differences of V2 and of the margin between a run and the ideal one: that of the
+    continuous loop without noise.
+    """
+    this, ideal = "sampled", "continuous"
+    if run.scenario.process_noise is not None:
+        this, ideal = "with noise", "without"
     V_excess = run.V - continuous.V
     at = int(np.argmax(V_excess))
     margin_excess = _margins(run) - _margins(continuous)
     joint = int(np.argmin(margin_excess))
     by_V = Statement(
-        "V2, sampled less continuous",
+        f"V2, {this} less {ideal}",
         "(3.12)",
-        "max over t of V2 of this run less V2 of the continuous one",
+        "max over t of V2 of this run less V2 of the ideal one",
     )
     by_margin = Statement(
-        "margin, sampled less continuous",
+        f"margin, {this} less {ideal}",
         "(2.2)",
         "smallest distance to a bound, less that of the continuous run",
         "rad",
