@@ -43,12 +43,12 @@ def outcome_of(
     """
     scenario = inputs.scenario
     estimate = error_estimate.with_unresolved(carry.accuracy, unresolved)
-    switching = plants.plant_member(scenario.plant, "switching")
-    switching_results = {}
-    if switching is not None:
+    plant: Any = scenario.plant
+    switching_results: dict[str, jax.Array] = {}
+    if plants.plant_member(plant, "switching") is not None:
         end = inputs.dt * inputs.steps
-        switching_results = switching(end)
-        estimate = error_estimate.unless(estimate, scenario.plant.has_complete_path(end))
+        switching_results = plant.switching(end)
+        estimate = error_estimate.unless(estimate, plant.has_complete_path(end))
     modes = jax.vmap(partial(fastest_mode, inputs.scenario))(instants)
     mode = jnp.max(jnp.where(jnp.isfinite(modes), modes, 0.0))
     limit = integrators.tableau(method).stability

@@ -57,8 +57,8 @@ def simulate(
       scenario: what to run, of n joints.
       duration: length of the run [s], a whole number of steps.
       dt: time step [s]; `recommended_dt(scenario)` returns a suitable one.
-      method: "rk4", "heun" or "euler"; with process noise "euler_maruyama" or, where it is additive,
-        "stochastic_heun".
+      method: "rk4", "heun" or "euler"; with process noise "euler_maruyama" or, where the noise is
+        additive, "stochastic_heun".
       record_every: interval of the recorded samples in steps; metrics and status cover every step.
       metrics: the folds to run; None for `iblf_jax.metrics.standard()`.
       throw: whether to raise instead of warn if the run failed.
@@ -67,8 +67,8 @@ def simulate(
         default device supports.  Under `jit` or `vmap` of the caller, a run uses JAX without
         kernels.  Kernels compute its derivatives with respect to the scenario, except on "vmap",
         and differentiate everything that is recorded: increase `record_every` if metrics suffice.
-      seed: seed of the noise of a sensor, of process noise and of random switching times; the run is
-        run 0 of a study with this seed.
+      seed: seed of the noise of a sensor, of process noise and of random switching times; the run
+        is run 0 of a study with this seed.
 
     Returns:
       A `Rollout` with T = steps // record_every + 1 samples.

@@ -1,5 +1,5 @@
-"""The random numbers of a run: noise of the sensor of a sampled law, process noise of the plant, and
-the switching times of a plant whose modes are a Markov chain.
+"""The random numbers of a run: noise of the sensor of a sampled law, process noise of the plant,
+and the switching times of a plant whose modes are a Markov chain.
 
 They depend only on the key of the run and on the number of the sample or step.  The three uses have
 streams of their own, which are independent.

@@ -72,7 +72,8 @@ class Plant(Protocol):
       model.
     - `mode_draws`, `with_path(uniforms)`: how many pairs of random numbers give the modes of a run,
       and the plant with these modes.
-    - `switching(end)`: results about the modes of a run that ends at this time, by name.
+    - `switching(end)`: results about the modes of a run that ends at this time, by name;
+      `has_complete_path(end)`: whether all of its switches are known.
     - `at(t)` and `jump_times()`: as `iblf_jax.robots.Robot`.
     """
 

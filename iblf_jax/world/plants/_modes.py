@@ -26,8 +26,8 @@ class ModeValues:
 
     Args:
       path: of the parameter in the plant, such as "mass[1]" or "robot.payload".
-      values: in the unit of the parameter, (modes,), or (modes, ...) for a parameter that is an
-        array [unit of the parameter].
+      values: in the unit of the parameter, (modes,), or (modes, ...) with the shape of the
+        parameter [unit of the parameter].
     """
 
     path: str = static()
@@ -51,7 +51,8 @@ def as_parameters(owner: str, plant: Any, parameters: Any) -> tuple[ModeValues, 
         except LookupError:
             expected = f"the path of a parameter of {type(plant).__name__}, such as mass[1]"
             raise checks.fail(name, part.path, expected) from None
-        if jnp.ndim(part.values) == 0 or jnp.shape(part.values)[1:] != jnp.shape(old):
+        of_mode = jnp.shape(part.values)[1:]
+        if jnp.ndim(part.values) == 0 or of_mode not in ((), jnp.shape(old)):
             expected = f"one value of shape {jnp.shape(old)} for each mode"
             got = f"shape {jnp.shape(part.values)}"
             raise checks.fail(f"{name}[{part.path!r}]", got, expected)

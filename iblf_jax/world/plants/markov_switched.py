@@ -31,7 +31,7 @@ ROUNDING = 1e-6
 
 @component
 class MarkovSwitched:
-    """x' = f_s(t, x, u), P(s(t + h) = j | s(t) = i) = q_ij h + o(h): parameters that jump at random.
+    """x' = f_s(t, x, u), P(s(t + h) = j | s(t) = i) = q_ij h + o(h): random jumps of parameters.
 
     A run draws its path from its key, as a sensor draws its noise: the time in mode i has an
     exponential distribution with the mean -1/q_ii, and the next mode is j with the probability
@@ -46,10 +46,10 @@ class MarkovSwitched:
       rates: Q, (M, M) [1/s]: q_ij >= 0 of the switch from mode i to mode j, and rows of sum 0.
       start: mode at t = 0, from 0; 0 if not given.
       switches: largest number of switches in a run; 16 if not given.
-      times: of the switches of the last run, (switches + 1,) [s]; none if not given.  A run replaces
+      times: of the switches of a run, (switches + 1,) [s]; none if not given.  Every run replaces
         them.
-      sequence: mode after each of them, (switches + 1,) [1]; `start` if not given.  A run replaces
-        it.
+      sequence: mode after each of them, (switches + 1,) [1]; `start` if not given.  Every run
+        replaces it.
 
     Source: O. L. V. Costa, M. D. Fragoso, M. G. Todorov, Continuous-Time Markov Jump Linear
       Systems, 2013, chapter 2; the path by D. T. Gillespie, J. Physical Chemistry 81 (1977) 2340.
