@@ -43,12 +43,6 @@ def outcome_of(
     """
     scenario = inputs.scenario
     estimate = error_estimate.with_unresolved(carry.accuracy, unresolved)
-    plant: Any = scenario.plant
-    switching_results: dict[str, jax.Array] = {}
-    if plants.plant_member(plant, "switching") is not None:
-        end = inputs.dt * inputs.steps
-        switching_results = plant.switching(end)
-        estimate = error_estimate.unless(estimate, plant.has_complete_path(end))
     modes = jax.vmap(partial(fastest_mode, inputs.scenario))(instants)
     mode = jnp.max(jnp.where(jnp.isfinite(modes), modes, 0.0))
     limit = integrators.tableau(method).stability
@@ -58,17 +52,18 @@ def outcome_of(
     steep = stability.has_infinite_derivative(
         instants.jacobian, inputs.scenario.sampling is not None
     ) & (inputs.dt * steepest > limit)
-    is_accurate = estimate.relative <= error_estimate.TOLERANCE
-    if scenario.process_noise is not None:
-        # There is no estimate under process noise; a path of modes may be incomplete all the same.
-        is_accurate = estimate.relative < jnp.inf
-    status |= flag(~is_accurate, Status.INACCURATE)
+    if scenario.process_noise is None:
+        status |= flag(~(estimate.relative <= error_estimate.TOLERANCE), Status.INACCURATE)
     suffers = has_flag(status, Status.STEP_TOO_LARGE | Status.INACCURATE)
     status |= flag(jnp.any(steep) & suffers, Status.INFINITE_SLOPE)
     metrics = error_estimate.results(estimate)
     if scenario.process_noise is not None:
         metrics = error_estimate.unknown(metrics)
-    metrics |= switching_results
+    plant: Any = scenario.plant
+    if plants.plant_member(plant, "switching") is not None:
+        end = inputs.dt * inputs.steps
+        metrics |= plant.switching(end)
+        status |= flag(~plant.has_complete_path(end), Status.MODES_EXHAUSTED)
     if inputs.scenario.sampling is not None:
         maps = jax.vmap(partial(stability.period_map, inputs.scenario, carry.state))(
             stability.resolved_jacobian(instants.jacobian, sampled=True)

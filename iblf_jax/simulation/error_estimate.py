@@ -462,12 +462,4 @@ def unknown(results: dict[str, jax.Array]) -> dict[str, jax.Array]:
     """The accuracy results of a run with process noise, NaN: differences of rates show the noise
     and not the error of the method.
     """
-    return {name: jnp.where(x < jnp.inf, jnp.nan, x) for name, x in results.items()}
-
-
-def unless(accuracy: Accuracy, is_complete: jax.Array) -> Accuracy:
-    """The estimate, infinite for a run that is not the requested one."""
-    return accuracy._replace(
-        error=jnp.where(is_complete, accuracy.error, jnp.inf),
-        relative=jnp.where(is_complete, accuracy.relative, jnp.inf),
-    )
+    return {name: jnp.full_like(x, jnp.nan) for name, x in results.items()}

@@ -543,8 +543,8 @@ def with_parts(scenario: Scenario, **parts: Any) -> Scenario:
       scenario: the original; it stays as it is.
       parts: any of plant, model, robot, reference, bounds, controller, observer, disturbance,
         initial, sampling, sensor, actuator, velocity_bounds, regions, process_noise; each as
-        `Scenario` takes it, so that a scalar stands for one number per joint.  Numbers take the scenario's
-        floating-point type.
+        `Scenario` takes it, so that a scalar stands for one number per joint.  Numbers take the
+        scenario's floating-point type.
 
     Returns:
       A new Scenario; it runs like any other, and compiles where the structure is new.

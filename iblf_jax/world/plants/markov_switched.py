@@ -36,8 +36,8 @@ class MarkovSwitched:
     A run draws its path from its key, as a sensor draws its noise: the time in mode i has an
     exponential distribution with the mean -1/q_ii, and the next mode is j with the probability
     -q_ij/q_ii.  Every run of a study has a path of its own.  Derivatives of a run are those for its
-    path; that by `rates` is 0.  A run with more than `switches` switches is not the requested one:
-    its `numerical_error` is infinite, and it is flagged as inaccurate.
+    path; that by `rates` is 0.  A run that would have more than `switches` switches is flagged
+    MODES_EXHAUSTED.
 
     Args:
       plant: any of `iblf_jax.robots` or `iblf_jax.plants`; the default model of a scenario.
