@@ -70,6 +70,7 @@ FAMILIES = (
     "bounds",
     "regions",
     "disturbances",
+    "process_noise",
     "sensors",
     "actuators",
     "metrics",

@@ -1,5 +1,5 @@
-"""Process noise: white noise on the acceleration drives an arm towards its bounds. At equal effort a
-law with a barrier keeps them, where a PD law does not.
+"""Process noise: white noise on the acceleration drives an arm towards its bounds. At equal effort
+a law with a barrier keeps them, where a PD law does not.
 """
 
 import numpy as np

@@ -73,8 +73,8 @@ def first_exit_of(study: Study, joint: int | None, instants: int, confidence: fl
     times = np.asarray(study.metrics[name], float)
     if joint is not None:
         times = times[:, joint]
-    unseen = has_flag(study.status, Status.NOT_FINITE) & ~np.isfinite(times)
-    times = np.where(unseen, study.duration, times)
+    diverged = has_flag(study.status, Status.NOT_FINITE) & ~np.isfinite(times)
+    times = np.where(diverged, study.duration, times)
     t = np.linspace(0.0, study.duration, instants)
     found = [study.probability(times <= instant, confidence) for instant in t]
     ends = [(p.low, p.high) for p in found]
@@ -86,5 +86,5 @@ def first_exit_of(study: Study, joint: int | None, instants: int, confidence: fl
         low=low,
         high=high,
         confidence=confidence,
-        diverged=int(np.sum(unseen & study.made)),
+        diverged=int(np.sum(diverged & study.made)),
     )
