@@ -46,9 +46,9 @@ class MarkovSwitched:
       rates: Q, (M, M) [1/s]: q_ij >= 0 of the switch from mode i to mode j, and rows of sum 0.
       start: mode at t = 0, from 0; 0 if not given.
       switches: largest number of switches in a run; 16 if not given.
-      times: of the switches of a run, (switches + 1,) [s]; none if not given.  Every run replaces
-        them.
-      sequence: mode after each of them, (switches + 1,) [1]; `start` if not given.  Every run
+      times: of the switches of a run, shape (m,) with m = switches + 1 [s], > 0; none if not given.
+        Every run replaces them.
+      sequence: mode after each of them, shape (m,) [1], >= 0; `start` if not given.  Every run
         replaces it.
 
     Source: O. L. V. Costa, M. D. Fragoso, M. G. Todorov, Continuous-Time Markov Jump Linear
