@@ -45,7 +45,7 @@ from iblf_jax.files.scenario import scenario_to_toml
 from iblf_jax.kernels import UnsupportedError
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
 from iblf_jax.simulation.integrators import tableau
-from iblf_jax.simulation.noise import has_noise, noise_key
+from iblf_jax.simulation.noise import check_method, has_noise, noise_key, realised
 from iblf_jax.simulation.scenario import Scenario, canonical, check_step
 from iblf_jax.world import plants
 from iblf_jax.world.robots._base import robot_member
@@ -220,12 +220,15 @@ def _export_loop(
 ) -> Exported:
     check_step(scenario, dt)
     _check_start(scenario)
+    check_method(scenario, method)
+    key = np.asarray(noise_key(jax.random.key(seed)), float)
+    scenario = realised(scenario, jnp.asarray(key, scenario.initial.q.dtype))
     loop = loop_program(scenario, method)
     joints = _joint_names(scenario.plant)
     generated = loop_files(scenario, loop, name, method, joints)
     run_settings = [dt]
     if has_noise(scenario):
-        run_settings += np.asarray(noise_key(jax.random.key(seed)), float).tolist()
+        run_settings += key.tolist()
     if target == "wasm":
         files = tuple(wasm_files(generated, folder, run_settings))
     else:
