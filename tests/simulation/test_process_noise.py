@@ -280,7 +280,7 @@ def test_a_certificate_claims_nothing_under_noise():
     scenario = ij.with_parts(ij.presets.zhang_yan_2024(), process_noise=process_noise.Additive(0.2))
     certificate = ij.certify(scenario, duration=0.05, dt=1e-3, method="stochastic_heun")
     assert {line.verdict for line in certificate.lines} == {"not applicable"}
-    assert any("with noise" in line.name for line in certificate.lines)
+    assert any("noisy" in line.name for line in certificate.lines)
 
 
 @pytest.mark.parametrize(
