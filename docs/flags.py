@@ -49,6 +49,15 @@ def _weak(limit: list[float]) -> ij.Scenario:
     )
 
 
+def _switching() -> ij.Scenario:
+    """The paper's arm with a load that comes and goes more often than a run can follow."""
+    arm = ij.presets.zhang_yan_2024().plant
+    rates = [[-5.0, 5.0], [5.0, -5.0]]
+    return _paper(
+        plant=ij.plants.MarkovSwitched(arm, {"payload": (0.0, 0.5)}, rates=rates, switches=2)
+    )
+
+
 def _flexible() -> ij.Scenario:
     """A flexible arm with bounds on the velocities of its motors that its law does not know."""
     narrow = ij.Bounds(lower=ij.bounds.Constant(-0.3), upper=ij.bounds.Constant(0.3))
@@ -262,6 +271,12 @@ CASES: dict[str, Case] = {
         " 0.2 s.",
         "Keep the state away from the singularity by bounds, or change the plant's coordinates.",
         plotting.levels,
+    ),
+    "MODES_EXHAUSTED": Case(
+        lambda: _run(_switching()),
+        "The modes of the plant are a Markov chain, and its path in this run has more switches than"
+        " the plant allows. From then on the run remains in the last mode.",
+        "Increase `switches` of `MarkovSwitched`. A longer path makes a step slower.",
     ),
     "INADMISSIBLE_DRAW": Case(
         lambda: None,

@@ -20,6 +20,7 @@ from iblf_jax import (
     disturbances,
     observers,
     plants,
+    process_noise,
     references,
     regions,
     robots,
@@ -45,6 +46,7 @@ FAMILIES = (
     ("Bounds", bounds, "`iblf_jax.bounds`", ()),
     ("Regions", regions, "`iblf_jax.regions`", ()),
     ("Disturbances", disturbances, "`iblf_jax.disturbances`", ()),
+    ("Process noise", process_noise, "`iblf_jax.process_noise`", ()),
     ("Sensors", sensors, "`iblf_jax.sensors`", ()),
     (
         "Sensors of one level",

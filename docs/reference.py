@@ -71,6 +71,7 @@ FAMILIES = (
     "bounds",
     "regions",
     "disturbances",
+    "process_noise",
     "sensors",
     "actuators",
     "metrics",

@@ -59,6 +59,7 @@ from iblf_jax.studies.distributions import value as value
 from iblf_jax.world import bounds as bounds
 from iblf_jax.world import disturbances as disturbances
 from iblf_jax.world import plants as plants
+from iblf_jax.world import process_noise as process_noise
 from iblf_jax.world import references as references
 from iblf_jax.world import regions as regions
 from iblf_jax.world import robots as robots
@@ -70,7 +71,15 @@ _finish_at_exit()
 
 _PUBLIC_MODULES = {
     "control": ("actuators", "barriers", "controllers", "decays", "observers", "sensors"),
-    "world": ("bounds", "disturbances", "plants", "references", "regions", "robots"),
+    "world": (
+        "bounds",
+        "disturbances",
+        "plants",
+        "process_noise",
+        "references",
+        "regions",
+        "robots",
+    ),
 }
 """Folder -> its modules, which users import as `iblf_jax.NAME`."""
 

@@ -59,6 +59,17 @@ PLANTS = {
         TWO_LINK, stiffness=[300.0, 200.0], motor_inertia=0.02, motor_damping=0.1
     ),
     "vessel": ij.presets.cybership_ii(),
+    "switched": plants.Switched(
+        ij.presets.motor_driven_pendulum().plant,
+        {"D": (1.0, 1.5, 0.8)},
+        times=[0.3, 0.9],
+    ),
+    "markov_switched": plants.MarkovSwitched(
+        ij.presets.cybership_ii(),
+        {"mass": (23.8, 30.0)},
+        rates=[[-2.0, 2.0], [1.0, -1.0]],
+        switches=3,
+    ),
     "strict_feedback": plants.StrictFeedback(
         drift=lambda t, x: jnp.stack([x[0] * x[0, ::-1], jnp.sin(x[0] * x[1]) - 0.2 * t]),
         gain=lambda t, x: jnp.stack(
@@ -296,6 +307,8 @@ INPUT_MAPS = {
 
 OPTIONAL_FOLDS = (
     metrics.AboveGravity(),
+    metrics.FirstExit(),
+    metrics.LyapunovValue(),
     metrics.VelocityMargin(),
     metrics.LevelMargin(),
     metrics.RegionMargin(),

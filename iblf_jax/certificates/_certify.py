@@ -50,6 +50,10 @@ reconstructed."""
 DEFAULT_WORST = 16
 """Runs of a study that are checked if the caller does not say how many."""
 SAMPLED = "the loop is sampled, and the claim is about a law that runs at every instant"
+NOISY = (
+    "the plant has process noise, and the claim is about its drift; a study with"
+    " metrics.LyapunovValue estimates E[V]"
+)
 DELAYED = "the input has a delay, and the claim is about a torque that acts at once"
 
 
@@ -212,6 +216,8 @@ def _replayed(study: Any, index: int) -> Rollout:
 
 def _certificate_of(run: Rollout) -> Certificate:
     """The certificate of one run, its arrays on the host."""
+    if run.scenario.process_noise is not None:
+        return _certificate_by_comparison(run, "noisy", NOISY)
     if run.scenario.sampling is not None:
         return _certificate_by_comparison(run, "sampled", SAMPLED)
     if input_delay(run.scenario.actuator) is not None:
@@ -347,17 +353,26 @@ def _certificate_by_comparison(run: Rollout, kind: str, reason: str) -> Certific
 
     Args:
       run: the run.
-      kind: "sampled" or "delayed".
+      kind: "sampled", "delayed" or "noisy".
       reason: why nothing is claimed.
     """
     scenario, grid = run.scenario, time_grid(run)
-    ideal = with_parts(scenario, sampling=None, sensor=sensors.Ideal(), actuator=actuators.Ideal())
+    ideal = with_parts(
+        scenario,
+        sampling=None,
+        sensor=sensors.Ideal(),
+        actuator=actuators.Ideal(),
+        process_noise=None,
+    )
+    method = run.method
+    if scenario.process_noise is not None:
+        method = "heun"
     with notices.muted(SimulationWarning):
         simulated = simulate(
             ideal,
             duration=grid.duration,
             dt=float(run.dt),
-            method=run.method,
+            method=method,
             record_every=grid.record_every,
         )
     continuous = _on_host(simulated)

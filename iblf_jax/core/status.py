@@ -71,6 +71,10 @@ class Status(enum.IntFlag):
     """The input of the law was not finite: the gain of a level was singular, or a term of the law
     had no value there."""
 
+    MODES_EXHAUSTED = 1 << 21
+    """A plant whose modes are a Markov chain would have switched more often than a run of it can:
+    from then on the run is not one of the chain."""
+
 
 VIOLATED = (
     Status.BOUND_VIOLATED
@@ -117,6 +121,7 @@ WORDS = {
     Status.STATE_BOUND_VIOLATED: "a bound of a level above the second was violated",
     Status.SINGULAR_GAIN: "the law's input was not finite: a level's gain was singular",
     Status.ALPHA_INFEASIBLE: "the virtual velocity left the velocity bounds",
+    Status.MODES_EXHAUSTED: "the plant has more switches than its `switches`",
 }
 """The text of each flag, in the order in which `describe` lists them."""
 

@@ -47,7 +47,7 @@ from iblf_jax.files.scenario import scenario_to_toml
 from iblf_jax.kernels import UnsupportedError
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
 from iblf_jax.simulation.integrators import tableau
-from iblf_jax.simulation.noise import has_noise, noise_key
+from iblf_jax.simulation.noise import check_method, has_noise, noise_key, realised
 from iblf_jax.simulation.scenario import Scenario, canonical, fitted_to_step
 from iblf_jax.world import plants
 from iblf_jax.world.robots._base import robot_member
@@ -225,12 +225,15 @@ def _export_loop(
 ) -> Exported:
     scenario = fitted_to_step(scenario, dt)
     _check_start(scenario)
+    check_method(scenario, method)
+    key = np.asarray(noise_key(jax.random.key(seed)), float)
+    scenario = realised(scenario, jnp.asarray(key, scenario.initial.q.dtype))
     loop = loop_program(scenario, method)
     joints = _joint_names(scenario.plant)
     generated = loop_files(scenario, loop, name, method, joints)
     run_settings = [dt]
     if has_noise(scenario):
-        run_settings += np.asarray(noise_key(jax.random.key(seed)), float).tolist()
+        run_settings += key.tolist()
     if target == "wasm":
         files = tuple(wasm_files(generated, folder, run_settings))
     else:

@@ -27,7 +27,7 @@ from iblf_jax.engine.structural_constants import StructuralConstants
 from iblf_jax.engine.time_step import TimeStep
 from iblf_jax.simulation import error_estimate
 from iblf_jax.simulation.closed_loop import initial_state, perturbed_state
-from iblf_jax.simulation.noise import NOISE_NAME
+from iblf_jax.simulation.noise import NOISE_NAME, realised
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.stability import resolved_jacobian
 
@@ -79,6 +79,8 @@ def split(inputs: Inputs, varied: Mapping[str, jax.Array]) -> Leaves:
         if NOISE_NAME in values:
             noise = values[NOISE_NAME].astype(inputs.dt.dtype)
         scenario = with_parameters(inputs.scenario, leaves)
+        if NOISE_NAME in values:
+            scenario = realised(scenario, noise)
         return jax.tree.leaves(inputs._replace(scenario=scenario, noise=noise))
 
     # A leaf that no path replaces stays the same object, also under `vmap`.

@@ -35,7 +35,7 @@ class Inputs(NamedTuple):
     steps: jax.Array
     """(), a float: integers are not leaves of a scalar program."""
     noise: Any = ()
-    """Of a sampled loop, the key of each run's noise (`sampling.noise_key`)."""
+    """The key of the run's random numbers (`noise.noise_key`), where it has any."""
     direction: Any = ()
     """Tangents of leaves, where a step takes them as data."""
 

@@ -38,6 +38,7 @@ from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.time_step import TimeStep
 from iblf_jax.kernels import Program, Shapes, ToolchainError, UnsupportedError, stop_compilers
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
+from iblf_jax.simulation.noise import needs_key, realised
 from iblf_jax.simulation.scenario import Scenario
 
 T = TypeVar("T")
@@ -85,12 +86,13 @@ def first_that_works(
 def inputs_of(
     scenario: Scenario, folds: Any, dt: jax.Array, request: RunRequest, noise: Any = None
 ) -> Inputs:
-    """The inputs of a run; `noise` is the key of the noise of a sampled loop."""
+    """The inputs of a run; `noise` is the key of its random numbers."""
     key: Any = ()
-    if scenario.sampling is not None:
+    if needs_key(scenario):
         key = jnp.zeros((4,), dt.dtype)
         if noise is not None:
             key = noise.astype(dt.dtype)
+        scenario = realised(scenario, key)
     steps: Any = np.asarray(request.steps, dt.dtype)
     return Inputs(scenario, folds, dt, steps, noise=key)
 

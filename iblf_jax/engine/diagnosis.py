@@ -38,6 +38,7 @@ REPORTED = (
     | Status.SAMPLING_TOO_SLOW
     | Status.FILTER_INFEASIBLE
     | Status.INFINITE_SLOPE
+    | Status.MODES_EXHAUSTED
 )
 """The flags that a warning reports although the run did not fail."""
 
@@ -275,6 +276,14 @@ def _sampling_too_slow(result: Rollout) -> str:
     )
 
 
+def _modes_exhausted(result: Rollout) -> str:
+    plant: Any = result.scenario.plant
+    return (
+        f"The path of the plant's modes ends after {plant.switches} switches, before the end of the"
+        " run. Increase plant.switches."
+    )
+
+
 def _filter_infeasible(result: Rollout) -> str:
     worst = f"{float(np.max(result.slack)):.3g} rad/s^2 (run.slack)"
     if has(result, "region_slack"):
@@ -379,6 +388,7 @@ LOOP_EXPLANATIONS: dict[Status, Callable[[Rollout], str]] = {
     Status.FILTER_INFEASIBLE: _filter_infeasible,
     Status.ALPHA_INFEASIBLE: _alpha_infeasible,
     Status.GUARD_STAYED: _guard_stayed,
+    Status.MODES_EXHAUSTED: _modes_exhausted,
 }
 """The explanation of each flag of the control law and its sampling."""
 

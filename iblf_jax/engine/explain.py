@@ -21,9 +21,8 @@ from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.structural_constants import constants_of
 from iblf_jax.engine.time_step import TimeStep
 from iblf_jax.kernels import OPERATIONS, PER_RUN, SHARED, TIME, Program, written_out
-from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.metrics import as_folds
-from iblf_jax.simulation.noise import NOISE_NAME, has_noise
+from iblf_jax.simulation.noise import NOISE_NAME, check_method, has_noise
 from iblf_jax.simulation.paths import get
 from iblf_jax.simulation.scenario import Scenario, canonical, with_history
 
@@ -99,7 +98,7 @@ def explain(
     scenario = with_history(scenario, step)
     dtype = scenario.initial.q.dtype
     folds = as_folds(metrics, dtype, scenario)
-    tableau(method)
+    check_method(scenario, method)
     if not isinstance(varied, list | tuple) or not all(isinstance(path, str) for path in varied):
         raise checks.fail("varied", varied, 'a list of paths, such as ["controller.K2"]')
     leaves = {

@@ -13,6 +13,7 @@ from iblf_jax.engine.carry import Carry, Inputs
 from iblf_jax.engine.linearization import Linearization, fastest_mode
 from iblf_jax.engine.metric_folds import finished
 from iblf_jax.simulation import error_estimate, integrators, stability
+from iblf_jax.world import plants
 
 
 class Outcome(NamedTuple):
@@ -40,6 +41,7 @@ def outcome_of(
       unresolved: what a `LinearizationStep` has found for the run.
       instants: what it has found at some of them.
     """
+    scenario = inputs.scenario
     estimate = error_estimate.with_unresolved(carry.accuracy, unresolved)
     modes = jax.vmap(partial(fastest_mode, inputs.scenario))(instants)
     mode = jnp.max(jnp.where(jnp.isfinite(modes), modes, 0.0))
@@ -50,10 +52,18 @@ def outcome_of(
     steep = stability.has_infinite_derivative(
         instants.jacobian, inputs.scenario.sampling is not None
     ) & (inputs.dt * steepest > limit)
-    status |= flag(~(estimate.relative <= error_estimate.TOLERANCE), Status.INACCURATE)
+    if scenario.process_noise is None:
+        status |= flag(~(estimate.relative <= error_estimate.TOLERANCE), Status.INACCURATE)
     suffers = has_flag(status, Status.STEP_TOO_LARGE | Status.INACCURATE)
     status |= flag(jnp.any(steep) & suffers, Status.INFINITE_SLOPE)
     metrics = error_estimate.results(estimate)
+    if scenario.process_noise is not None:
+        metrics = error_estimate.unknown(metrics)
+    plant: Any = scenario.plant
+    if plants.plant_member(plant, "switching") is not None:
+        end = inputs.dt * inputs.steps
+        metrics |= plant.switching(end)
+        status |= flag(~plant.has_complete_path(end), Status.MODES_EXHAUSTED)
     if inputs.scenario.sampling is not None:
         maps = jax.vmap(partial(stability.period_map, inputs.scenario, carry.state))(
             stability.resolved_jacobian(instants.jacobian, sampled=True)

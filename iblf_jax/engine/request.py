@@ -13,6 +13,7 @@ from iblf_jax.core import checks, notices
 from iblf_jax.engine.registry import backends
 from iblf_jax.engine.structural_constants import StructuralConstants, constants_of
 from iblf_jax.simulation.integrators import tableau
+from iblf_jax.simulation.noise import check_method
 from iblf_jax.simulation.scenario import Scenario
 
 
@@ -50,13 +51,15 @@ class RunRequest(NamedTuple):
         Args:
           scenario: canonical scenario; numbers that are traced are not compiled in.
           steps: number of time steps (`checks.whole_steps`).
-          method: "rk4", "heun" or "euler".
+          method: a name in `integrators.METHODS`.
           record_every: interval of the recorded instants in steps; None for metrics only.
           backend: "auto", "native", "gpu" or "vmap".
 
         Raises:
-          ValueError: an unknown method or backend.
+          ValueError: an unknown method or backend, or a method that does not fit the process noise
+            of the plant.
         """
+        check_method(scenario, method)
         stages = tableau(method).c
         if len(stages) == 1 and input_delay(scenario.actuator) is not None:
             expected = '"rk4" or "heun" with a delay of the input'

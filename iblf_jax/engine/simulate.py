@@ -21,7 +21,7 @@ from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.single_run import run_one
 from iblf_jax.engine.transformable import run_transformable
 from iblf_jax.simulation.metrics import Fold, as_folds, metric_units
-from iblf_jax.simulation.noise import has_noise, noise_key
+from iblf_jax.simulation.noise import has_noise, noise_key, realised
 from iblf_jax.simulation.results import Metrics, Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical, fitted_to_step
 
@@ -57,7 +57,8 @@ def simulate(
       scenario: what to run, of n joints.
       duration: length of the run [s], a whole number of steps.
       dt: time step [s]; `recommended_dt(scenario)` returns a suitable one.
-      method: "rk4", "heun" or "euler".
+      method: "rk4", "heun" or "euler"; with process noise "euler_maruyama" or, where the noise is
+        additive, "stochastic_heun".
       record_every: interval of the recorded samples in steps; metrics and status cover every step.
       metrics: the folds to run; None for `iblf_jax.metrics.standard()`.
       throw: whether to raise instead of warn if the run failed.
@@ -66,7 +67,8 @@ def simulate(
         default device supports.  Under `jit` or `vmap` of the caller, a run uses JAX without
         kernels.  Kernels compute its derivatives with respect to the scenario, except on "vmap",
         and differentiate everything that is recorded: increase `record_every` if metrics suffice.
-      seed: seed of the noise of a sensor; the run is run 0 of a study with this seed.
+      seed: seed of the noise of a sensor, of process noise and of random switching times; the run
+        is run 0 of a study with this seed.
 
     Returns:
       A `Rollout` with T = steps // record_every + 1 samples.
@@ -123,8 +125,10 @@ def run_rollout(
       folds: the metrics, as `as_folds` returns them.
       dt: time step, () [s].
       request: the request; its `record_every` is not None.
-      noise: key of the noise of a sensor (`noise.noise_key`).
+      noise: key of the run's random numbers (`noise.noise_key`).
     """
+    if noise is not None:
+        scenario = realised(scenario, noise.astype(dt.dtype))
     if checks.is_concrete((scenario, folds, dt)):
         outcome = run_one(scenario, folds, dt, request, noise)
     else:

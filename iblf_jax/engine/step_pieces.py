@@ -23,7 +23,9 @@ from iblf_jax.simulation.closed_loop import (
     LoopState,
     evaluate,
     with_integrated_part,
+    with_process_noise,
 )
+from iblf_jax.simulation.noise import with_noise_rates
 from iblf_jax.simulation.signals import Sample
 
 
@@ -76,7 +78,11 @@ def step_times(inputs: Inputs, index: jax.Array, method: str, arrivals: tuple | 
     if times.size and inputs.scenario.sampling is None:
         reach = error_estimate.steps_back(method)
         restarts = discontinuities.has_jump(times, (number - reach) * dt, span.end)
-    return StepTimes(span, discontinuities.divide_step(times, span, here), behind, restarts)
+    division = discontinuities.divide_step(times, span, here)
+    if inputs.scenario.process_noise is not None:
+        pieces = with_noise_rates(inputs.scenario, inputs.noise, index, dt, division.pieces)
+        division = division._replace(pieces=pieces)
+    return StepTimes(span, division, behind, restarts)
 
 
 class LoopAlongStep(NamedTuple):
@@ -121,13 +127,12 @@ class LoopAlongStep(NamedTuple):
             torque = (torque[int(piece.command_arrived)],)
         elif torque:
             torque = (jnp.where(piece.command_arrived, torque[1], torque[0]),)
-        return self.evaluate(
-            self.inputs.scenario,
-            discontinuities.stage_time(piece, t),
-            with_integrated_part(self.state, moved),
-            self.inputs.dt,
-            *torque,
-        )
+        scenario, time = self.inputs.scenario, discontinuities.stage_time(piece, t)
+        state = with_integrated_part(self.state, moved)
+        rate, sample = self.evaluate(scenario, time, state, self.inputs.dt, *torque)
+        if piece.noise_rate is None:
+            return rate, sample
+        return with_process_noise(scenario, time, state, rate, piece.noise_rate), sample
 
 
 def _commands_at_stages(
@@ -187,7 +192,12 @@ def across_jumps(
     counts = piece.begin < (inputs.steps - 0.5) * dt
 
     def rate(t, state):
-        return evaluate(inputs.scenario, discontinuities.stage_time(piece, t), state, dt)
+        time = discontinuities.stage_time(piece, t)
+        slope, sample = evaluate(inputs.scenario, time, state, dt)
+        if piece.noise_rate is None:
+            return slope, sample
+        noisy = with_process_noise(inputs.scenario, time, state, slope, piece.noise_rate)
+        return noisy, sample
 
     def gains_of(sample):
         def sums(weight):

@@ -213,9 +213,11 @@ def _concluded(
     nearest = keep_if(near > carry.nearest.xi, here, carry.nearest)
     is_sampled = inputs.scenario.sampling is not None
     width = sample.upper - sample.lower
-    estimate = error_estimate.update(
-        carry.accuracy, method, inputs.dt, index, parts, width, is_sampled, restarts, too_many_jumps
-    )
+    estimate = carry.accuracy
+    if inputs.scenario.process_noise is None:
+        estimate = error_estimate.update(
+            estimate, method, inputs.dt, index, parts, width, is_sampled, restarts, too_many_jumps
+        )
     after, raised = later
     status = carry.status | sample_status(sample)
     if raised is not None:

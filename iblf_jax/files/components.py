@@ -36,7 +36,7 @@ from iblf_jax.files.values import (
     numbers,
     without_none,
 )
-from iblf_jax.world import bounds, disturbances, plants, references, regions, robots
+from iblf_jax.world import bounds, disturbances, plants, process_noise, references, regions, robots
 
 FAMILIES: dict[Any, tuple[str, dict[str, Any]]] = {
     robots.Robot: ("robots", robots.MEMBERS),
@@ -52,6 +52,7 @@ FAMILIES: dict[Any, tuple[str, dict[str, Any]]] = {
     sensors.Sensor: ("sensors", sensors.MEMBERS),
     sensors.Part: ("sensors", sensors.MEMBERS | sensors.LEVELS),
     sensors.Velocity: ("sensors", sensors.VELOCITIES),
+    process_noise.ProcessNoise: ("process_noise", process_noise.MEMBERS),
     actuators.Actuator: ("actuators", actuators.MEMBERS),
 }
 """Protocol -> the module of the family, and the family's members by name."""

@@ -56,7 +56,7 @@ from iblf_jax.files.values import (
     toml_tables,
 )
 from iblf_jax.presets import PRESETS
-from iblf_jax.simulation.integrators import TABLEAUS
+from iblf_jax.simulation.integrators import METHODS
 from iblf_jax.simulation.paths import parameters, with_parameters
 from iblf_jax.simulation.scenario import Scenario, check_leaves
 from iblf_jax.world import plants
@@ -371,7 +371,7 @@ def _run_table(table: Any) -> dict[str, Any]:
         if isinstance(value, np.generic):
             value = value.item()
         if key == "method":
-            checks.one_of("run.method", value, tuple(TABLEAUS))
+            checks.one_of("run.method", value, METHODS)
         elif key == "record_every":
             value = checks.positive_integer("run.record_every", value)
         else:

@@ -27,6 +27,7 @@ from iblf_jax.plotting._figures import velocity_portrait as velocity_portrait
 from iblf_jax.plotting._identification import identification as identification
 from iblf_jax.plotting._overview import overview as overview
 from iblf_jax.plotting._studies import bands as bands
+from iblf_jax.plotting._studies import first_exit as first_exit
 from iblf_jax.plotting._studies import histograms as histograms
 from iblf_jax.plotting._studies import scatter as scatter
 from iblf_jax.plotting._studies import study_overview as study_overview

@@ -4,7 +4,7 @@ and successful runs, and metrics against the drawn parameters.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from iblf_jax.plotting import _style
 from iblf_jax.plotting._curves import check_class, escaped, joint_labels
 from iblf_jax.plotting._panels import quantity_of
 from iblf_jax.studies import statistics
+from iblf_jax.studies.first_exit import FirstExit
 from iblf_jax.studies.study import Study
 
 if TYPE_CHECKING:
@@ -259,4 +260,44 @@ def study_overview(study: Study, *, runs: int = 512) -> Figure:
         _draw_scatter(axes, study, "margin", path, x)
     _style.set_heading(figure, [_failure_summary(study), f"bands: {_bands_title(data).lower()}"])
     _style.legend_below(figure, 6)
+    return figure
+
+
+# --- first exit
+
+
+@_style.styled()
+def first_exit(found: FirstExit | Mapping[str, FirstExit]) -> Figure:
+    """The distribution of the first exit from the bounds along time, with its intervals.
+
+    Args:
+      found: of `Study.first_exit`, one or a dict of them by name.
+
+    Returns:
+      The figure.
+
+    Raises:
+      ValueError: something else.
+    """
+    named = found if isinstance(found, Mapping) else {"": found}
+    if not named:
+        raise checks.fail("found", found, "at least one FirstExit")
+    for name, one in named.items():
+        check_class(f"found[{name!r}]", one, FirstExit, "study.first_exit() returns one.")
+    figure, (axes,) = _grid(1, 3.0)
+    figure.set_size_inches(6.0, 3.8)
+    for k, (name, one) in enumerate(named.items()):
+        colour = _style.colour(k)
+        label = escaped(name) or "share of runs"
+        axes.step(one.t, one.probability, where="post", color=colour, label=label)
+        axes.fill_between(
+            one.t, one.low, one.high, step="post", color=colour, alpha=0.25, linewidth=0
+        )
+    confidence = next(iter(named.values())).confidence
+    axes.set_xlabel("time [s]")
+    axes.set_ylabel("P(first exit up to t) [1]")
+    axes.set_ylim(bottom=0.0)
+    heading = f"First exit from the bounds, with {confidence:.0%} intervals"
+    _style.set_heading(figure, [heading.replace("%", " %")])
+    _style.legend_below(figure)
     return figure

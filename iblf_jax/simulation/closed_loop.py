@@ -290,6 +290,29 @@ def rate(scenario: Scenario, t: jax.Array, state: LoopState) -> LoopState:
     return evaluate(scenario, t, state)[0]
 
 
+def with_process_noise(
+    scenario: Scenario, t: jax.Array, state: LoopState, rate: LoopState, noise_rate: jax.Array
+) -> LoopState:
+    """The rate of the state with sigma(t, x) dW/dt of (P.1) added.
+
+    Args:
+      scenario: with process noise on m levels.
+      t: time, () [s].
+      state: state at t; law and observer may be missing.
+      rate: its rate without noise.
+      noise_rate: dW/dt, (m, n) [1/s^0.5].
+    """
+    noise: Any = scenario.process_noise
+    added = noise.diffusion(t, state.x) * noise_rate
+    rows = list(rate.x)
+    for row, level in zip(added, noise.levels, strict=True):
+        rows[level - 1] = rows[level - 1] + row
+    q, dq, *higher = rows
+    if not higher:
+        return rate._replace(q=q, dq=dq)
+    return rate._replace(q=q, dq=dq, higher=jnp.stack(higher))
+
+
 def sample_at(
     scenario: Scenario,
     t: jax.Array,

@@ -62,6 +62,9 @@ class Piece(NamedTuple):
     """Time after which no stage is evaluated, () [s]; None in scenarios without jump times."""
     command_arrived: Any
     """Whether the command that arrives within the step has arrived, () bool."""
+    noise_rate: Any = None
+    """The increment of the Brownian motion over the piece as a rate, (m, n) [1/s^0.5]; None for
+    plants without process noise."""
 
 
 class Division(NamedTuple):

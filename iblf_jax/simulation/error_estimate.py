@@ -27,6 +27,8 @@ The stages cannot resolve a reference or a disturbance with whole periods betwee
 (`discontinuities`). Differences are not taken across a jump: the stages of that step give its
 error.
 
+Under process noise there is no estimate, and the results are NaN (`unknown`).
+
 Compared with runs at a sixteenth of the step, the estimate is 1/3 to 30 times the error where the
 error exceeds 1e-4 of the tube, and larger below.
 """
@@ -454,3 +456,10 @@ def results(accuracy: Accuracy) -> dict[str, jax.Array]:
     """The accuracy results of a run; infinite where the estimate is not a number."""
     found = {ERROR: accuracy.error, RELATIVE: accuracy.relative}
     return {name: jnp.where(jnp.isnan(x), jnp.inf, x) for name, x in found.items()}
+
+
+def unknown(results: dict[str, jax.Array]) -> dict[str, jax.Array]:
+    """The accuracy results of a run with process noise, NaN: differences of rates show the noise
+    and not the error of the method.
+    """
+    return {name: jnp.full_like(x, jnp.nan) for name, x in results.items()}

@@ -55,11 +55,22 @@ TABLEAUS = {
     ),
 }
 
+STOCHASTIC = {
+    "euler_maruyama": TABLEAUS["euler"],
+    "stochastic_heun": TABLEAUS["heun"],
+}
+"""Methods for plants with process noise, as tableaus for the rate f + sigma dW/dt, in which the
+increment dW of the Brownian motion over a step makes a constant rate.  The Euler method is then
+that of Maruyama, of strong order 1/2, and of order 1 for additive noise; Heun's method is of strong
+order 1 for additive noise, and of order 2 where there is none."""
+METHODS = (*TABLEAUS, *STOCHASTIC)
+"""The names of all methods."""
+
 
 def tableau(method: str) -> Tableau:
     """The tableau of a method by name; ValueError for an unknown name."""
-    checks.one_of("method", method, tuple(TABLEAUS))
-    return TABLEAUS[method]
+    checks.one_of("method", method, METHODS)
+    return (TABLEAUS | STOCHASTIC)[method]
 
 
 class StepResult(NamedTuple):

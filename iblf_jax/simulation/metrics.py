@@ -239,6 +239,63 @@ class Margin:
 
 
 @component
+class FirstExit:
+    """Time at which each joint first reaches or leaves its bounds: first_exit_time.
+
+    It is infinite for a joint that keeps its bounds.  Bounds are compared at the instants of the
+    steps, so an excursion between two instants is not seen.
+    """
+
+    units: ClassVar[dict[str, str]] = {"first_exit_time": "s"}
+
+    def init(self, sample: Sample) -> jax.Array:
+        """No exit."""
+        return jnp.full_like(sample.q, jnp.inf)
+
+    def update(self, acc: jax.Array, sample: Sample) -> jax.Array:
+        """Adds one sample."""
+        margin = jnp.minimum(sample.q - sample.lower, sample.upper - sample.q)
+        return jnp.where(margin > 0, acc, jnp.minimum(acc, sample.t))
+
+    def finish(self, acc: jax.Array) -> dict[str, jax.Array]:
+        """first_exit_time, (n,)."""
+        return {"first_exit_time": acc}
+
+
+class _ValueSums(NamedTuple):
+    time: jax.Array
+    integral: jax.Array
+    last: jax.Array
+
+
+@component
+class LyapunovValue:
+    """The law's Lyapunov function: mean_V = int V / duration, and final_V at the end of the run.
+
+    Under process noise no bound on V is claimed: means over the runs of a study estimate E[V].
+    """
+
+    units: ClassVar[dict[str, str]] = {
+        "mean_V": PlantUnit("N m rad", "energy"),
+        "final_V": PlantUnit("N m rad", "energy"),
+    }
+
+    def init(self, sample: Sample) -> _ValueSums:
+        """Zeros."""
+        zero = jnp.zeros_like(sample.t)
+        return _ValueSums(zero, zero, zero)
+
+    def update(self, acc: _ValueSums, sample: Sample) -> _ValueSums:
+        """Adds one sample."""
+        integral = acc.integral + sample.dt * sample.V
+        return _ValueSums(acc.time + sample.dt, integral, sample.V)
+
+    def finish(self, acc: _ValueSums) -> dict[str, jax.Array]:
+        """mean_V and final_V, ()."""
+        return {"mean_V": acc.integral / acc.time, "final_V": acc.last}
+
+
+@component
 class VelocityMargin:
     """Smallest distance of the velocities, and of the virtual velocity alpha, to the velocity
     bounds, and the first violation.
@@ -675,6 +732,8 @@ def metric_units(folds: Sequence[Fold], scenario: Scenario) -> tuple[tuple[str, 
     """
     of_folds = [fold_member(fold, "units") for fold in folds]
     pairs = [pair for units in of_folds for pair in units.items()]
+    if plants.plant_member(scenario.plant, "switching") is not None:
+        pairs += plants.SWITCHING_UNITS.items()
     return tuple((name, unit_text(scenario, unit)) for name, unit in (*pairs, *ACCURACY_UNITS))
 
 
@@ -709,6 +768,8 @@ MEMBERS = {
     "tracking": Tracking,
     "settling": Settling,
     "margin": Margin,
+    "first_exit": FirstExit,
+    "lyapunov_value": LyapunovValue,
     "velocity_margin": VelocityMargin,
     "level_margin": LevelMargin,
     "region_margin": RegionMargin,

@@ -1,19 +1,36 @@
-"""Noise of the sensor of a sampled law: standard normal numbers that depend only on the run and the
-sample.
+"""The random numbers of a run: noise of the sensor of a sampled law, process noise of the plant,
+and the switching times of a plant whose modes are a Markov chain.
+
+They depend only on the key of the run and on the number of the sample or step.  The three uses have
+streams of their own, which are independent.
 """
 
 from __future__ import annotations
+
+import copy
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.core import checks
+from iblf_jax.simulation.discontinuities import Piece
+from iblf_jax.simulation.integrators import STOCHASTIC, TABLEAUS, tableau
 from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.world import plants
+from iblf_jax.world.process_noise import noise_member
 
 NOISE_NAME = "noise"
 """Name of the noise key among the replaced values of a run; no leaf of a scenario has this name."""
 NOISE_STREAM = 0x6E6F6973
 """Folded into a key so that the noise is independent of the draws of a study."""
+PROCESS_STREAM = 0x7072
+"""Distinguishes the increments of process noise from the noise of the sensor."""
+BRIDGE_STREAM = 0x6272
+"""And those that divide the increment of a step."""
+MODES_STREAM = 0x6D6F
+"""And the numbers from which switching times follow."""
 ROUNDS = 10
 MULTIPLIERS = (0x6A09, 0x5BB7)
 """Odd, below 2^15."""
@@ -30,9 +47,25 @@ def noise_key(key: jax.Array, run: int | jax.Array = 0) -> jax.Array:
     return jax.random.bits(own, (4,), jnp.uint16).astype(jnp.float32)
 
 
-def has_noise(scenario: Scenario) -> bool:
+def has_sensor_noise(scenario: Scenario) -> bool:
     """Whether the sensor of a scenario draws noise."""
     return scenario.sampling is not None and scenario.sensor.draws > 0
+
+
+def has_noise(scenario: Scenario) -> bool:
+    """Whether a run of a scenario draws random numbers: noise of the sensor, process noise, or
+    switching times.
+    """
+    if scenario.process_noise is not None or plants.plant_member(scenario.plant, "mode_draws"):
+        return True
+    return has_sensor_noise(scenario)
+
+
+def needs_key(scenario: Scenario) -> bool:
+    """Whether the inputs of a run contain a key: also where a sampled law has a sensor without
+    noise.
+    """
+    return scenario.sampling is not None or has_noise(scenario)
 
 
 def noise_values(scenario: Scenario, key: jax.Array, run: int | jax.Array) -> dict[str, jax.Array]:
@@ -44,7 +77,7 @@ def noise_values(scenario: Scenario, key: jax.Array, run: int | jax.Array) -> di
     return {NOISE_NAME: noise_key(key, run)}
 
 
-def normals(key: jax.Array, sample: jax.Array, draws: int, n: int) -> jax.Array:
+def normals(key: jax.Array, sample: jax.Array, draws: int, n: int, stream: int = 0) -> jax.Array:
     """Independent standard normal numbers of one sample, (draws, n); they depend on key, sample and
     index only.
 
@@ -57,8 +90,9 @@ def normals(key: jax.Array, sample: jax.Array, draws: int, n: int) -> jax.Array:
       sample: number of the sample, () int.
       draws: numbers a joint.
       n: number of joints.
+      stream: of the numbers, a word of 16 bits; 0 for those of a sensor.
     """
-    words = [w.astype(jnp.int32) for w in key]
+    words = _words(key, stream)
     count = draws * n
     flat: list[jax.Array] = []
     for pair in range((count + 1) // 2):
@@ -68,8 +102,26 @@ def normals(key: jax.Array, sample: jax.Array, draws: int, n: int) -> jax.Array:
     return jnp.stack(flat[:count]).reshape(draws, n)
 
 
+def _words(key: jax.Array, stream: int) -> list[jax.Array]:
+    """The words of a key for a stream."""
+    words = [w.astype(jnp.int32) for w in key]
+    if stream:
+        words[3] = words[3] ^ stream
+    return words
+
+
 def _pair(key: list[jax.Array], sample: jax.Array, pair: int, dtype) -> list[jax.Array]:
     """Two independent standard normal numbers."""
+    first, second = _uniforms(key, sample, pair, dtype)
+    size = jnp.sqrt(-2.0 * jnp.log(first))
+    angle = 2.0 * np.pi * second
+    return [size * jnp.cos(angle), size * jnp.sin(angle)]
+
+
+def _uniforms(
+    key: list[jax.Array], sample: jax.Array, pair: int, dtype
+) -> tuple[jax.Array, jax.Array]:
+    """Two independent numbers, uniform between 0 and 1."""
     low = WORD - 1
     x = [sample & low, _upper(sample) & low, key[2] ^ pair, key[3]]
     k = [key[0], key[1]]
@@ -81,13 +133,120 @@ def _pair(key: list[jax.Array], sample: jax.Array, pair: int, dtype) -> list[jax
     def uniform(high: jax.Array, low: jax.Array) -> jax.Array:
         return (high.astype(dtype) * WORD + low.astype(dtype) + 0.5) / float(WORD * WORD)
 
-    first = uniform(x[0], x[1])
-    second = uniform(x[2], x[3])
-    size = jnp.sqrt(-2.0 * jnp.log(first))
-    angle = 2.0 * np.pi * second
-    return [size * jnp.cos(angle), size * jnp.sin(angle)]
+    return uniform(x[0], x[1]), uniform(x[2], x[3])
 
 
 def _upper(x: jax.Array) -> jax.Array:
     """The bits of an integer above its lowest word."""
     return jax.lax.div(x, jnp.asarray(WORD, x.dtype))
+
+
+# --- process noise --------------------------------------------------------------------------------
+
+
+def check_method(scenario: Scenario, method: str) -> None:
+    """Raises ValueError for an unknown method, a deterministic one for a plant with process noise,
+    a stochastic one for a plant without, and one of strong order 1 for noise that is not additive.
+    """
+    tableau(method)
+    noise = scenario.process_noise
+    if noise is None:
+        if method in STOCHASTIC:
+            expected = f"one of {', '.join(TABLEAUS)}, as the plant has no process noise"
+            raise checks.fail("method", method, expected)
+        return
+    if method not in STOCHASTIC:
+        expected = f"one of {', '.join(STOCHASTIC)}, as the plant has process noise"
+        remedy = 'Take method="euler_maruyama", or with_parts(scenario, process_noise=None).'
+        raise checks.fail("method", method, expected, remedy)
+    if method == "stochastic_heun" and not noise_member(noise, "additive"):
+        expected = "euler_maruyama, as the noise depends on the state"
+        remedy = (
+            "The process noise is that of Ito, and Heun's method converges to the solution in the"
+            " sense of Stratonovich. Noise that does not depend on x states additive = True."
+        )
+        raise checks.fail("method", method, expected, remedy)
+
+
+def brownian_increment(scenario: Scenario, key: jax.Array, step: jax.Array, dt: Any) -> jax.Array:
+    """The increment of W over a step, (m, n) [s^0.5].
+
+    Args:
+      scenario: with process noise on m levels.
+      key: of the run.
+      step: number of the step, () int.
+      dt: its length, () [s].
+    """
+    noise: Any = scenario.process_noise
+    levels, parts = len(noise.levels), noise_member(noise, "substeps")
+    first = step.astype(jnp.int32) * parts
+    total = normals(key, first, levels, scenario.n, PROCESS_STREAM)
+    for part in range(1, parts):
+        total = total + normals(key, first + part, levels, scenario.n, PROCESS_STREAM)
+    return jnp.sqrt(dt / parts) * total
+
+
+def with_noise_rates(
+    scenario: Scenario, key: jax.Array, step: jax.Array, dt: jax.Array, pieces: tuple[Piece, ...]
+) -> tuple[Piece, ...]:
+    """The pieces of a step, each with its increment of W as a constant rate, `Piece.noise_rate`.
+
+    The increments of the pieces have the sum of the step's increment: of an increment D over the
+    time R that is left, a piece of the length l receives
+
+        l/R D + sqrt(l (R - l)/R) z,   z standard normal                   (Brownian bridge)
+
+    Args:
+      scenario: with process noise on m levels.
+      key, step, dt: as for `brownian_increment`.
+      pieces: of the step.
+    """
+    noise: Any = scenario.process_noise
+    left, rest = dt, brownian_increment(scenario, key, step, dt)
+    m, divisions = len(noise.levels), len(pieces) - 1
+    z = normals(key, step, m * divisions, scenario.n, BRIDGE_STREAM)
+    found = []
+    for i, piece in enumerate(pieces[:-1]):
+        part, rest = _split(piece.length, left, rest, z[m * i : m * (i + 1)])
+        left = left - piece.length
+        found.append(piece._replace(noise_rate=_per_time(part, piece.length)))
+    last = pieces[-1]
+    return (*found, last._replace(noise_rate=_per_time(rest, last.length)))
+
+
+def _split(
+    length: jax.Array, left: jax.Array, rest: jax.Array, z: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """The increment over the first `length` of the time that is left, and the remaining one."""
+    share = jnp.where(left > 0, length / jnp.where(left > 0, left, 1.0), 1.0)
+    variance = length * (1.0 - share)
+    deviation = jnp.where(variance > 0, jnp.sqrt(jnp.where(variance > 0, variance, 1.0)), 0.0)
+    part = share * rest + deviation * z
+    return part, rest - part
+
+
+def _per_time(increment: jax.Array, length: jax.Array) -> jax.Array:
+    """An increment as a rate; 0 for a piece without length."""
+    return jnp.where(length > 0, increment / jnp.where(length > 0, length, 1.0), 0.0)
+
+
+# --- switching times ------------------------------------------------------------------------------
+
+
+def realised(scenario: Scenario, key: Any) -> Scenario:
+    """The scenario with the switching times and modes of one run, where its plant draws them."""
+    draws = plants.plant_member(scenario.plant, "mode_draws")
+    if not draws:
+        return scenario
+    dtype = scenario.initial.q.dtype
+    words = _words(key, MODES_STREAM)
+    pairs = [jnp.stack(_uniforms(words, jnp.int32(0), k, dtype)) for k in range(draws)]
+    plant: Any = scenario.plant
+    return _with_plant(scenario, plant.with_path(jnp.stack(pairs)))
+
+
+def _with_plant(scenario: Scenario, plant: Any) -> Scenario:
+    """A copy with another plant, without checks: its numbers may be traced."""
+    new = copy.copy(scenario)
+    object.__setattr__(new, "plant", plant)
+    return new

@@ -95,7 +95,8 @@ class Rollout(Signals):
     metrics: Metrics
     """Results of the folds; and `numerical_error`, (n,) [rad], and `relative_numerical_error`, ()
     [1]: the estimated error of the positions that the time step causes, absolute and relative to
-    the width of the tube (`error_estimate`)."""
+    the width of the tube (`error_estimate`); NaN under process noise, for which there is no
+    estimate."""
     status: jax.Array
     """Bit flags of `Status`, () int32; 0 is ok."""
     fastest_mode: jax.Array
@@ -172,7 +173,7 @@ class Rollout(Signals):
             bad = int(np.sum(np.asarray(self.status) != 0))
             return f"Rollout({len(self)} runs, {shape}; {bad} with a flag)"
         accuracy = ""
-        if RELATIVE in self.metrics:
+        if RELATIVE in self.metrics and not np.isnan(self.metrics[RELATIVE]):
             accuracy = f"; accurate to {float(self.metrics[RELATIVE]):.1g} of the tube"
         status = describe(int(self.status), status_words(self.scenario))
         return f"Rollout({shape}; status: {status}{accuracy})"

@@ -29,6 +29,7 @@ from iblf_jax.control.sensors import Ideal as IdealSensor
 from iblf_jax.control.sensors import Sensor
 from iblf_jax.control.sensors._base import sensor_member
 from iblf_jax.core import checks, notices
+from iblf_jax.core.component_paths import NUMBERS
 from iblf_jax.core.disk_cache import keep_programs
 from iblf_jax.core.presentation import present
 from iblf_jax.core.pytree import (
@@ -47,10 +48,11 @@ from iblf_jax.core.units import HIGHER, POSITION, VELOCITY, Unit, as_text
 from iblf_jax.simulation.levels import model_state, start_levels
 from iblf_jax.simulation.measurement_noise import noise_advice
 from iblf_jax.simulation.sampling import PERIOD_TOLERANCE, Sampling
-from iblf_jax.world import plants, regions
+from iblf_jax.world import plants, process_noise, regions
 from iblf_jax.world.bounds import Bounds, Funnel, Side, bounds_at, speed_limits_at
 from iblf_jax.world.disturbances import Disturbance, Nothing
 from iblf_jax.world.plants import Plant
+from iblf_jax.world.process_noise import ProcessNoise
 from iblf_jax.world.references import Reference
 from iblf_jax.world.robots import Robot, WithMotors
 from iblf_jax.world.robots._base import mass_matrix_at
@@ -189,6 +191,8 @@ class Scenario:
       regions: sets in which points of the robot must stay, a tuple of any of `iblf_jax.regions`; ()
         if not given.  Runs record their margins under every law; `controllers.SafetyFilter`
         enforces them.
+      process_noise: white noise on levels of the plant, any of `iblf_jax.process_noise`; none if
+        not given.  Runs then need a method for stochastic differential equations.
 
     Raises:
       ValueError: if a leaf has the wrong number of joints, model and plant differ in theirs, or a
@@ -214,12 +218,14 @@ class Scenario:
         default=(), metadata=BOUNDS_OF_SECOND_LEVEL
     )
 
+    process_noise: ProcessNoise | None = None
+
     def check(self) -> None:
         """Checks the parts, makes the plant the model if none is given, and repeats scalars for the
         n joints.
         """
         if self.model is None:
-            object.__setattr__(self, "model", self.plant)
+            object.__setattr__(self, "model", plants.nominal_of(self.plant))
         for name in ("plant", "model"):
             check_plant_or_robot(f"Scenario.{name}", vars(self)[name])
         parts = field_values(self)
@@ -230,6 +236,8 @@ class Scenario:
         self._check_combination()
         check_levels(self)
         self._check_regions()
+        _check_process_noise(self)
+        _check_modes(self.plant)
         for name, part in field_values(self).items():
             object.__setattr__(self, name, fit_joints(part, self.plant.n, name))
         self._complete_law()
@@ -359,6 +367,45 @@ class Scenario:
 
     def _repr_html_(self) -> str:
         return present("card", self)
+
+
+def _check_process_noise(scenario: Scenario) -> None:
+    """Raises ValueError for something that is no process noise, or does not fit the plant."""
+    noise, name = scenario.process_noise, "Scenario.process_noise"
+    if noise is None:
+        return
+    checks.conforms(name, noise, ProcessNoise, "iblf_jax.process_noise has them.")
+    process_noise.check_structure(noise)
+    order = plants.order_of(scenario.plant)
+    if noise.levels[-1] > order:
+        expected = f"levels up to {order}, as the plant has"
+        raise checks.fail(f"{name}.levels", noise.levels, expected)
+    fitted: Any = fit_joints(noise, scenario.n, "process_noise")
+    t, x = jnp.zeros(()), jnp.zeros((order, scenario.n))
+    shape = (len(noise.levels), scenario.n)
+    try:
+        found = jax.eval_shape(fitted.diffusion, t, x).shape
+    except Exception as error:
+        got = f"{type(error).__name__}: {checks.one_line(str(error))}"
+        raise checks.fail(f"{name}.diffusion(t, x)", got, f"shape {shape}") from error
+    if found != shape:
+        remedy = "One row for each of its levels."
+        raise checks.fail(f"{name}.diffusion(t, x)", f"shape {found}", f"shape {shape}", remedy)
+
+
+def _check_modes(plant: Any) -> None:
+    """Raises ValueError for a part of the plant whose modes are a Markov chain: only the plant
+    itself can be.
+    """
+
+    def draws_modes(part: Any) -> bool:
+        return isinstance(part, plants.MarkovSwitched) and part is not plant
+
+    inside = [part for part in jax.tree.leaves(plant, is_leaf=draws_modes) if draws_modes(part)]
+    if inside:
+        expected = "MarkovSwitched as the plant itself"
+        remedy = "Such as MarkovSwitched(plant=FlexibleJoint(...), ...)."
+        raise checks.fail("Scenario.plant", type(plant).__name__, expected, remedy)
 
 
 def check_plant_or_robot(name: str, part: Any) -> None:
@@ -500,9 +547,9 @@ def with_parts(scenario: Scenario, **parts: Any) -> Scenario:
     Args:
       scenario: the original; it stays as it is.
       parts: any of plant, model, robot, reference, bounds, controller, observer, disturbance,
-        initial, sampling, sensor, actuator, velocity_bounds, regions; each as `Scenario` takes it,
-        so that a scalar stands for one number per joint.  Numbers take the scenario's
-        floating-point type.
+        initial, sampling, sensor, actuator, velocity_bounds, regions, process_noise; each as
+        `Scenario` takes it, so that a scalar stands for one number per joint.  Numbers take the
+        scenario's floating-point type.
 
     Returns:
       A new Scenario; it runs like any other, and compiles where the structure is new.
@@ -599,10 +646,6 @@ def _fit_rows(value: Any, n: int, name: str) -> Any:
         expected = f"rows of one number, or of {n} (one a component)"
         raise checks.fail(name, value, expected, f"Its shape is {jnp.shape(value)}.")
     return value
-
-
-NUMBERS = (jax.Array, np.ndarray, np.generic, float, int)
-"""Types of leaves."""
 
 
 def check_leaves(part: Any, path: str = "") -> None:

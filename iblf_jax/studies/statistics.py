@@ -21,6 +21,7 @@ SMALLER_IS_WORSE = (
     "margin",
     "xi_margin",
     "first_violation_time",
+    "first_exit_time",
     "velocity_margin",
     "alpha_margin",
     "first_velocity_violation_time",

@@ -36,6 +36,7 @@ from iblf_jax.simulation.units import status_words, unit_text
 from iblf_jax.studies import statistics, summaries
 from iblf_jax.studies.blocks import BlockResults, run_blocks
 from iblf_jax.studies.distributions import Perturbation
+from iblf_jax.studies.first_exit import INSTANTS, FirstExit, first_exit_of
 from iblf_jax.studies.statistics import Probability
 from iblf_jax.studies.study_setup import PreparedStudy
 from iblf_jax.world import plants
@@ -183,6 +184,30 @@ class Study:
         ~study.started_outside)`, with `VIOLATED = ij.status.VIOLATED | Status.NOT_FINITE`.
         """
         return self.probability(VIOLATED)
+
+    def first_exit(
+        self, *, joint: int | None = None, instants: int = INSTANTS, confidence: float = 0.95
+    ) -> FirstExit:
+        """The distribution of the time at which a run first leaves its bounds.
+
+        Bounds are compared at the instants of the steps: an excursion between two of them is not
+        seen.
+
+        Args:
+          joint: of this joint, from `metrics.FirstExit`; of any joint if None, from
+            `metrics.Margin`.
+          instants: number of instants from 0 to the end at which it is given.
+          confidence: of the interval at each instant, in (0, 1).
+
+        Returns:
+          A `FirstExit`, with a method `plot`.
+
+        Raises:
+          ValueError: a study without the metric, or an argument that is not valid.
+
+        Source: E. L. Kaplan, P. Meier, J. American Statistical Association 53 (1958) 457-481.
+        """
+        return first_exit_of(self, joint, instants, confidence)
 
     def probability(
         self, event: Status | np.ndarray = VIOLATED, confidence: float = 0.95

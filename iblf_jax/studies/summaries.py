@@ -91,6 +91,9 @@ def _initial_margins(scenario: Scenario, samples: Mapping[str, Any]) -> dict[str
             found[REGIONS] = margins(perturbed.regions, plants.robot_of(perturbed.plant), q)
         return found
 
+    if not samples:
+        # Every run has the same start, such as those that differ in their noise only.
+        return jax.tree.map(lambda margin: margin[None], margins_of_run({}))
     return jax.vmap(margins_of_run)(samples)
 
 

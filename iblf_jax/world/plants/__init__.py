@@ -15,6 +15,7 @@ from iblf_jax.world.plants._base import is_chain as is_chain
 from iblf_jax.world.plants._base import level_input as level_input
 from iblf_jax.world.plants._base import level_names as level_names
 from iblf_jax.world.plants._base import level_rate as level_rate
+from iblf_jax.world.plants._base import nominal_of as nominal_of
 from iblf_jax.world.plants._base import order_of as order_of
 from iblf_jax.world.plants._base import plant_member as plant_member
 from iblf_jax.world.plants._base import robot_of as robot_of
@@ -23,11 +24,15 @@ from iblf_jax.world.plants._base import torque_as_rates as torque_as_rates
 from iblf_jax.world.plants._base import transposed_gain as transposed_gain
 from iblf_jax.world.plants._base import unit_symbols as unit_symbols
 from iblf_jax.world.plants._base import units_of as units_of
+from iblf_jax.world.plants._modes import SWITCHING_UNITS as SWITCHING_UNITS
+from iblf_jax.world.plants._modes import ModeValues as ModeValues
 from iblf_jax.world.plants.driven_pendulum import DrivenPendulum as DrivenPendulum
 from iblf_jax.world.plants.electric_drive import ElectricDrive as ElectricDrive
 from iblf_jax.world.plants.flexible_joint import FlexibleJoint as FlexibleJoint
+from iblf_jax.world.plants.markov_switched import MarkovSwitched as MarkovSwitched
 from iblf_jax.world.plants.rigid import Rigid as Rigid
 from iblf_jax.world.plants.strict_feedback import StrictFeedback as StrictFeedback
+from iblf_jax.world.plants.switched import Switched as Switched
 from iblf_jax.world.plants.vessel import Vessel as Vessel
 
 
@@ -43,7 +48,9 @@ MEMBERS = {
     "driven_pendulum": DrivenPendulum,
     "electric_drive": ElectricDrive,
     "flexible_joint": FlexibleJoint,
+    "markov_switched": MarkovSwitched,
     "strict_feedback": StrictFeedback,
+    "switched": Switched,
     "vessel": Vessel,
 }
 """Every plant by the name that a scenario file gives it."""
@@ -56,9 +63,11 @@ __all__ = [
     "DrivenPendulum",
     "ElectricDrive",
     "FlexibleJoint",
+    "MarkovSwitched",
     "Plant",
     "Rigid",
     "StrictFeedback",
+    "Switched",
     "Vessel",
     "as_plant",
     "component_names",
@@ -69,6 +78,7 @@ __all__ = [
     "level_input",
     "level_names",
     "level_rate",
+    "nominal_of",
     "order_of",
     "plant_member",
     "robot_of",

@@ -68,6 +68,12 @@ class Plant(Protocol):
     - `steady_input(q)`: the input that holds the plant at q.
     - `weights(x)`: the scale of each level's energy, (order, n); `BarrierBackstepping` weighs its
       barriers with it.
+    - `nominal`: the plant whose parameters do not change, for one with modes; it is the default
+      model.
+    - `mode_draws`, `with_path(uniforms)`: how many pairs of random numbers give the modes of a run,
+      and the plant with these modes.
+    - `switching(end)`: results about the modes of a run that ends at this time, by name;
+      `has_complete_path(end)`: whether all of its switches are known.
     - `at(t)` and `jump_times()`: as `iblf_jax.robots.Robot`.
     """
 
@@ -111,6 +117,9 @@ plant_member = OptionalMembers(
     steady_levels=None,
     steady_input=None,
     weights=None,
+    nominal=None,
+    mode_draws=0,
+    switching=None,
 )
 """Reads optional members of a plant."""
 
@@ -127,6 +136,14 @@ def order_of(part: Any) -> int:
     if is_chain(part):
         return int(part.order)
     return 2
+
+
+def nominal_of(part: Any) -> Any:
+    """The plant that laws know: the part itself, or the plant inside one with modes."""
+    nominal = plant_member(part, "nominal")
+    if nominal is None:
+        return part
+    return nominal
 
 
 def robot_of(part: Any) -> Any:

@@ -1,0 +1,144 @@
+"""Modes of a plant: the values of its parameters in each mode, and the times between switches."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax.core import checks
+from iblf_jax.core.component_paths import replaced, resolve
+from iblf_jax.core.pytree import Leaf, component, leaf, static
+from iblf_jax.world.plants._base import Plant, is_chain
+from iblf_jax.world.robots import Robot
+
+NEVER = 1e30
+"""Time of a switch that does not happen [s]; an infinite one has no rounding error."""
+
+RobotOrPlant = Annotated[Robot, Plant]
+
+
+@component
+class ModeValues:
+    """The values of one parameter of a plant, one for each mode.
+
+    Args:
+      path: of the parameter in the plant, such as "mass[1]" or "robot.payload".
+      values: in the unit of the parameter, (modes,), or (modes, ...) with the shape of the
+        parameter [unit of the parameter].
+    """
+
+    path: str = static()
+    values: Leaf = leaf("unit of the parameter", shape="any")
+
+
+def as_parameters(owner: str, plant: Any, parameters: Any) -> tuple[ModeValues, ...]:
+    """The parameters of a plant with modes as a tuple; ValueError for what does not fit the
+    plant.
+    """
+    name = f"{owner}.parameters"
+    if isinstance(parameters, dict):
+        parameters = [ModeValues(path, values) for path, values in parameters.items()]
+    is_tuple = isinstance(parameters, tuple | list) and len(parameters) > 0
+    if not is_tuple or not all(isinstance(part, ModeValues) for part in parameters):
+        expected = 'path -> one value a mode, such as {"mass[1]": (0.85, 1.5)}'
+        raise checks.fail(name, parameters, expected)
+    for part in parameters:
+        try:
+            old = resolve(plant, part.path)[1]
+        except LookupError:
+            expected = f"the path of a parameter of {type(plant).__name__}, such as mass[1]"
+            raise checks.fail(name, part.path, expected) from None
+        of_mode = jnp.shape(part.values)[1:]
+        if jnp.ndim(part.values) == 0 or of_mode not in ((), jnp.shape(old)):
+            expected = f"one value of shape {jnp.shape(old)} for each mode"
+            got = f"shape {jnp.shape(part.values)}"
+            raise checks.fail(f"{name}[{part.path!r}]", got, expected)
+        changed(plant, part.path, part.values[0])
+    counts = {len(part.values) for part in parameters}
+    if len(counts) > 1:
+        expected = "the same number of modes for every parameter"
+        raise checks.fail(name, f"{sorted(counts)} values", expected)
+    return tuple(parameters)
+
+
+def check_inner(owner: str, plant: Any) -> None:
+    """Raises ValueError for something that is neither a robot nor a plant."""
+    name = f"{owner}.plant"
+    if is_chain(plant):
+        checks.conforms(name, plant, Plant, "iblf_jax.plants has them.")
+        return
+    checks.conforms(name, plant, Robot, "iblf_jax.robots has them.", ("skeleton",))
+
+
+def changed(plant: Any, path: str, value: jax.Array) -> Any:
+    """A copy of a plant with one parameter replaced."""
+    return replaced(plant, resolve(plant, path)[0], value, path, None)
+
+
+def in_turn(values: jax.Array, times: jax.Array, t: jax.Array) -> jax.Array:
+    """The value of which the turn is at time t: the first before times[0], then the next at each of
+    the times.
+
+    Args:
+      values: (k + 1, ...).
+      times: increasing, (k,) [s].
+      t: () [s].
+    """
+    found = values[0]
+    for k in range(len(times)):
+        found = jnp.where(t >= times[k], values[k + 1], found)
+    return found
+
+
+def of_mode(values: jax.Array, mode: jax.Array) -> jax.Array:
+    """The value of a mode, a whole number of floating-point type.
+
+    Args:
+      values: (modes, ...).
+      mode: () [1].
+    """
+    found = values[0]
+    for k in range(1, len(values)):
+        found = jnp.where(mode >= k - 0.5, values[k], found)
+    return found
+
+
+SWITCHING_UNITS = {"switches": "1", "shortest_dwell_time": "s", "mean_dwell_time": "s"}
+"""Name and unit of the results about the modes of a run."""
+
+
+def switching_results(times: jax.Array, end: jax.Array) -> dict[str, jax.Array]:
+    """How often a run switches, and the shortest and the mean time in a mode.
+
+    The time before the first switch counts, that after the last one, which the end of the run cuts
+    off, does not.  Both times are infinite for a run without switches.
+
+    Args:
+      times: increasing, (k,) [s].
+      end: of the run, () [s].
+    """
+    starts = jnp.concatenate([jnp.zeros_like(times[:1]), times[:-1]])
+    happens = times < end
+    count = jnp.sum(happens.astype(times.dtype))
+    dwell = jnp.where(happens, times - starts, jnp.inf)
+    total = jnp.max(jnp.where(happens, times, 0.0))
+    mean = jnp.where(count > 0, total / jnp.maximum(count, 1.0), jnp.inf)
+    return {
+        "switches": count,
+        "shortest_dwell_time": jnp.min(dwell),
+        "mean_dwell_time": mean,
+    }
+
+
+def check_times(name: str, times: Any) -> None:
+    """Raises ValueError for times that are not one row of increasing positive numbers."""
+    if jnp.ndim(times) != 1:
+        raise checks.fail(name, times, "one row of times [s], such as (2.0, 5.0)")
+    if not checks.is_concrete(times):
+        return
+    values = np.asarray(times)
+    if not np.all(np.diff(np.concatenate([[0.0], values])) > 0):
+        raise checks.fail(name, values, "positive increasing times [s]")

@@ -1,0 +1,176 @@
+"""A plant whose parameters follow a Markov chain in continuous time."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax.core import checks
+from iblf_jax.core.pytree import Leaf, component, leaf, static
+from iblf_jax.core.time import as_at, joined, jump_times_of
+from iblf_jax.world.plants._modes import (
+    NEVER,
+    ModeValues,
+    RobotOrPlant,
+    as_parameters,
+    changed,
+    check_inner,
+    in_turn,
+    of_mode,
+    switching_results,
+)
+
+MOST_SWITCHES = 64
+"""Largest number of switches of a run; each is written out in the compiled program."""
+ROUNDING = 1e-6
+"""Largest sum of a row of the rates, relative to their size."""
+
+
+@component
+class MarkovSwitched:
+    """x' = f_s(t, x, u), P(s(t + h) = j | s(t) = i) = q_ij h + o(h): random jumps of parameters.
+
+    A run draws its path from its key, as a sensor draws its noise: the time in mode i has an
+    exponential distribution with the mean -1/q_ii, and the next mode is j with the probability
+    -q_ij/q_ii.  Every run of a study has a path of its own.  Derivatives of a run are those for its
+    path; that by `rates` is 0.  A run that would have more than `switches` switches is flagged
+    MODES_EXHAUSTED.
+
+    Args:
+      plant: any of `iblf_jax.robots` or `iblf_jax.plants`; the default model of a scenario.
+      parameters: path of a parameter of the plant -> its value in each of M modes, such as
+        {"mass[1]": (0.85, 1.5)}.
+      rates: Q, (M, M) [1/s]: q_ij >= 0 of the switch from mode i to mode j, and rows of sum 0.
+      start: mode at t = 0, from 0; 0 if not given.
+      switches: largest number of switches in a run; 16 if not given.
+      times: of the switches of a run, shape (m,) with m = switches + 1 [s], > 0; none if not given.
+        Every run replaces them.
+      sequence: mode after each of them, shape (m,) [1], >= 0; `start` if not given.  Every run
+        replaces it.
+
+    Source: O. L. V. Costa, M. D. Fragoso, M. G. Todorov, Continuous-Time Markov Jump Linear
+      Systems, 2013, chapter 2; the path by D. T. Gillespie, J. Physical Chemistry 81 (1977) 2340.
+    """
+
+    plant: RobotOrPlant
+    parameters: tuple[ModeValues, ...]
+    rates: Leaf = leaf("1/s", shape="any")
+    start: int = static(default=0)
+    switches: int = static(default=16)
+    times: Leaf = leaf("s", sign="positive", shape="any", default=None)
+    sequence: Leaf = leaf("1", sign="nonnegative", shape="any", default=None)
+    wraps: ClassVar[str] = "plant"
+
+    def check(self) -> None:
+        """Raises ValueError for parameters or rates that do not fit the plant or each other."""
+        check_inner("MarkovSwitched", self.plant)
+        parameters = as_parameters("MarkovSwitched", self.plant, self.parameters)
+        object.__setattr__(self, "parameters", parameters)
+        modes = len(parameters[0].values)
+        self._check_rates(modes)
+        checks.positive_integer("MarkovSwitched.switches", self.switches, most=MOST_SWITCHES)
+        checks.positive_integer("MarkovSwitched.start", self.start, least=0, most=modes - 1)
+        shape = (self.switches + 1,)
+        for name, value in (("times", NEVER), ("sequence", float(self.start))):
+            given = vars(self)[name]
+            if given is None:
+                object.__setattr__(self, name, jnp.full(shape, value, self.rates.dtype))
+                continue
+            checks.shape_is(f"MarkovSwitched.{name}", given, shape)
+
+    def _check_rates(self, modes: int) -> None:
+        """Raises ValueError for a matrix that is not one of rates."""
+        name = "MarkovSwitched.rates"
+        checks.shape_is(name, self.rates, (modes, modes))
+        if not checks.is_concrete(self.rates):
+            return
+        Q = np.asarray(self.rates)
+        others = Q - np.diag(np.diag(Q))
+        is_zero = np.abs(Q.sum(axis=1)) <= ROUNDING * np.max(np.abs(Q))
+        if np.any(others < 0) or not np.all(is_zero):
+            expected = "q_ij >= 0 for i != j, and rows of sum 0"
+            raise checks.fail(name, Q, expected, "Such as [[-0.5, 0.5], [1.0, -1.0]].")
+
+    def __getattr__(self, name: str) -> Any:
+        """Members of the inner plant: names, units, limits, and its methods."""
+        if name.startswith("__") or name == "plant":
+            raise AttributeError(name)
+        return getattr(self.plant, name)
+
+    @property
+    def nominal(self) -> Any:
+        """The inner plant."""
+        return self.plant
+
+    @property
+    def mode_draws(self) -> int:
+        """Pairs of random numbers of a path: one a switch, and one for the switch after them."""
+        return self.switches + 1
+
+    def with_path(self, uniforms: jax.Array) -> MarkovSwitched:
+        """The plant with the path of a run.
+
+        Args:
+          uniforms: independent numbers between 0 and 1, (switches + 1, 2).
+        """
+        Q = jax.lax.stop_gradient(self.rates)
+        modes = len(Q)
+        t, mode = jnp.zeros((), Q.dtype), jnp.full((), self.start, Q.dtype)
+        times, sequence = [], []
+        for first, second in uniforms:
+            row = of_mode(Q, mode)
+            leaving = -of_mode(jnp.diagonal(Q), mode)
+            is_final = ~(leaving > 0)
+            rate = jnp.where(is_final, 1.0, leaving)
+            t = jnp.where(is_final, NEVER, jnp.minimum(t - jnp.log(first) / rate, NEVER))
+            mode = jnp.where(is_final, mode, _next_mode(row, mode, second * rate, modes))
+            times.append(t)
+            sequence.append(mode)
+        return self._with(jnp.stack(times), jnp.stack(sequence))
+
+    def _with(self, times: jax.Array, sequence: jax.Array) -> MarkovSwitched:
+        """A copy with another path, without checks: its numbers may be traced."""
+        leaves, structure = jax.tree.flatten(self)
+        return jax.tree.unflatten(structure, [*leaves[:-2], times, sequence])
+
+    def at(self, t: jax.Array) -> Any:
+        """The inner plant with its parameters at time t [s]."""
+        start = jnp.full((1,), self.start, self.sequence.dtype)
+        every = jnp.concatenate([start, self.sequence[:-1]])
+        mode = in_turn(every, self.times[:-1], t)
+        plant = self.plant
+        for part in self.parameters:
+            plant = changed(plant, part.path, of_mode(part.values, mode))
+        return as_at(plant, t)
+
+    def jump_times(self) -> jax.Array:
+        """The switching times and those of the inner plant, (m,) [s]."""
+        return joined([self.times[:-1], jump_times_of("plant", self.plant)])
+
+    def switching(self, end: jax.Array) -> dict[str, jax.Array]:
+        """`switches`, `shortest_dwell_time` and `mean_dwell_time` of a run until `end` [s]."""
+        return switching_results(self.times[:-1], end)
+
+    def has_complete_path(self, end: jax.Array) -> jax.Array:
+        """Whether a run until `end` [s] has no more than `switches` switches, () bool."""
+        return self.times[-1] >= end
+
+
+def _next_mode(row: jax.Array, mode: jax.Array, level: jax.Array, modes: int) -> jax.Array:
+    """The mode at which the sum of the rates to the modes up to it first exceeds a level."""
+    total = jnp.zeros_like(level)
+    last = found = mode
+    is_found = jnp.zeros((), bool)
+    for k in range(modes):
+        is_other = jnp.abs(mode - k) > 0.5
+        weight = jnp.where(is_other, row[k], 0.0)
+        total = total + weight
+        here = is_other & (total > level) & ~is_found
+        found = jnp.where(here, float(k), found)
+        is_found = is_found | here
+        last = jnp.where(weight > 0, float(k), last)
+    # Rounding may leave the sum of all rates below the level.
+    return jnp.where(is_found, found, last)

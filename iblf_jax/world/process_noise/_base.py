@@ -1,0 +1,82 @@
+"""The contract of process noise: white noise on levels of the plant.
+
+    dx_i = (f_i + G_i x_{i+1} + d_i) dt + sigma_i(t, x) dW_i                                (P.1)
+
+W has independent standard Brownian motions, one for each component of each level with noise.
+(P.1) is an equation in the sense of Ito.  Law and observer do not know the noise: it moves the
+state that they receive.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import jax
+
+from iblf_jax.core import checks
+from iblf_jax.core.optional import OptionalMembers
+from iblf_jax.core.units import ByLevel, PlantUnit
+
+MOST_SUBSTEPS = 1024
+"""Largest number of increments in a step; they are written out in the compiled step."""
+
+
+class ProcessNoise(Protocol):
+    """The contract of process noise.  All methods are pure functions of one state.
+
+    A member may have further attributes; `noise_member` holds their defaults.
+
+    - `additive`: whether `diffusion` does not depend on x.  Methods of strong order 1 need it.
+    - `substeps`: the increment of a step is the sum of so many increments.  Runs whose time steps
+      are in the ratio of their `substeps` have the same Brownian path at their common instants.
+    """
+
+    @property
+    def levels(self) -> tuple[int, ...]:
+        """The levels with noise, counted from 1; m of them."""
+        ...
+
+    def diffusion(self, t: jax.Array, x: jax.Array) -> jax.Array:
+        """Sigma of each level with noise, (m, n), in the unit of the level per sqrt(s).
+
+        Args:
+          t: time, () [s].
+          x: state of the plant, (r, n); of a robot q and q'.
+        """
+        ...
+
+
+noise_member = OptionalMembers(additive=False, substeps=1)
+"""Reads optional members of process noise."""
+
+
+def check_structure(noise: Any) -> None:
+    """Raises ValueError for levels that are not increasing whole numbers from 1 on, or a number of
+    substeps that is none.
+    """
+    name = type(noise).__name__
+    levels = noise.levels
+    if not isinstance(levels, tuple | list) or not levels:
+        expected = "the levels with noise, a tuple such as (2,)"
+        raise checks.fail(f"{name}.levels", levels, expected)
+    for level in levels:
+        checks.positive_integer(f"{name}.levels", level)
+    if list(levels) != sorted(set(levels)):
+        raise checks.fail(f"{name}.levels", levels, "increasing numbers of levels")
+    substeps = noise_member(noise, "substeps")
+    checks.positive_integer(f"{name}.substeps", substeps, most=MOST_SUBSTEPS)
+
+
+def intensity_unit(levels: tuple[int, ...], of_state: bool = True) -> ByLevel:
+    """The unit of an intensity of these levels: that of each level per sqrt(s), or 1/sqrt(s)."""
+    if not of_state:
+        return ByLevel("1/s^0.5" for _ in levels)
+    return ByLevel(PlantUnit("1/s^0.5", f"x{level}/s^0.5") for level in levels)
+
+
+def check_rows(name: str, value: Any, levels: tuple[int, ...]) -> None:
+    """Raises ValueError for a leaf that has neither one number nor one row for each level."""
+    if value.ndim and len(value) != len(levels):
+        expected = f"one number, or {len(levels)} rows, one a level of {tuple(levels)}"
+        remedy = "Such as intensity=[[0.3, 0.2]] for one level of two joints."
+        raise checks.fail(name, value, expected, remedy)

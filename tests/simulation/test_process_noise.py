@@ -1,0 +1,313 @@
+"""Process noise: the methods against exact solutions along the same Brownian path, an independent
+program, known moments, and the statistics of the first exit."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import iblf_jax as ij
+from iblf_jax import bounds, controllers, process_noise, references
+from iblf_jax.simulation import integrators
+from iblf_jax.simulation.closed_loop import evaluate, initial_state, with_process_noise
+from iblf_jax.simulation.discontinuities import Span, divide_step
+from iblf_jax.simulation.noise import brownian_increment, noise_key, with_noise_rates
+from iblf_jax.simulation.scenario import canonical
+
+INERTIA = 0.05 + 0.8 * 0.3**2
+START, SPEED = 0.2, 0.5
+
+
+def link(noise=None, stiffness: float = 1.2, damping: float = 0.4, g: float = 0.0, **parts):
+    """One link under a PD law about a constant reference at 0: q" = (-Kp q - Kd q')/I + noise."""
+    return ij.Scenario(
+        plant=ij.robots.PlanarChain(mass=[0.8], length=[0.5], centre=[0.3], inertia=[0.05], g=g),
+        reference=references.Sinusoid(offset=0.0, amplitude=0.0, frequency=1.0),
+        bounds=bounds.Bounds(lower=bounds.Constant(-1.0), upper=bounds.Constant(1.0)),
+        controller=controllers.PDGravity(Kp=stiffness, Kd=damping),
+        initial=ij.Initial(q=[START], dq=[SPEED]),
+        process_noise=noise,
+        **parts,
+    )
+
+
+# --- independent program --------------------------------------------------------------------------
+
+
+def independent_path(method, sigma, dW, dt, stiffness=1.2, damping=0.4, g=9.81):
+    """The same loop in NumPy: gravity in plant and law cancels, so only the PD terms remain."""
+    q, v = START, SPEED
+    found = [(q, v)]
+
+    def drift(q, v):
+        weight = 0.8 * g * 0.3 * np.cos(q)
+        torque = weight - stiffness * q - damping * v
+        return (torque - weight) / INERTIA
+
+    for k, w in enumerate(dW):
+        t = k * dt
+        q1, v1 = q + v * dt, v + drift(q, v) * dt + sigma(t, v) * w
+        if method == "stochastic_heun":
+            v_end = v + 0.5 * dt * (drift(q, v) + drift(q1, v1))
+            v_end += 0.5 * (sigma(t, v) + sigma(t + dt, v1)) * w
+            q, v = q + 0.5 * dt * (v + v1), v_end
+        else:
+            q, v = q1, v1
+        found.append((q, v))
+    return np.array(found)
+
+
+CASES = {
+    "euler_maruyama": (process_noise.Additive([[0.7]]), lambda t, v: 0.7),
+    "stochastic_heun": (
+        process_noise.Diffusion(
+            lambda t, x: (0.5 + 0.3 * jnp.sin(4.0 * t)) * jnp.ones_like(x[1:]), additive=True
+        ),
+        lambda t, v: 0.5 + 0.3 * np.sin(4.0 * t),
+    ),
+}
+
+
+@pytest.mark.parametrize("method", CASES)
+def test_trajectories_against_an_independent_program(method):
+    noise, sigma = CASES[method]
+    scenario = link(noise, g=9.81)
+    run = ij.simulate(scenario, duration=0.5, dt=5e-3, method=method, seed=4, backend="vmap")
+    key = noise_key(jax.random.PRNGKey(4)).astype(float)
+    steps = jnp.arange(100)
+    dW = jax.vmap(lambda k: brownian_increment(canonical(scenario), key, k, jnp.asarray(5e-3)))(
+        steps
+    )
+    path = independent_path(method, sigma, np.asarray(dW)[:, 0, 0], 5e-3)
+    assert np.ptp(np.asarray(dW)) > 0.1
+    np.testing.assert_allclose(run.x[:, :, 0], path, atol=1e-12)
+    assert np.all(np.isnan(run.metrics["numerical_error"]))
+    assert not int(run.status) & int(ij.Status.INACCURATE)
+
+
+# --- strong order ---------------------------------------------------------------------------------
+
+FINE, FINE_STEPS, RUNS = 1.0 / 256, 256, 400
+RATIOS = (4, 16)
+RATE = 0.05 / INERTIA
+
+
+def ends(noise, method, ratio):
+    """q' at t = 1 s of many runs with steps of `ratio` fine ones, on one family of paths."""
+    scenario = canonical(link(noise, stiffness=1e-9, damping=0.05))
+    dt = jnp.asarray(ratio * FINE)
+
+    def run(key):
+        def advance(state, k):
+            dW = brownian_increment(scenario, key, k, dt)
+
+            def rate(t, x):
+                slope = evaluate(scenario, t, x)[0]
+                return with_process_noise(scenario, t, x, slope, dW / dt), ()
+
+            return integrators.step(method, rate, k.astype(float) * dt, state, dt).state, ()
+
+        steps = jnp.arange(FINE_STEPS // ratio)
+        return jax.lax.scan(advance, initial_state(scenario), steps)[0].dq[0]
+
+    return np.asarray(jax.jit(jax.vmap(run))(KEYS))
+
+
+def fine_increments(noise):
+    scenario = canonical(link(noise))
+    of_key = jax.vmap(
+        lambda key, k: brownian_increment(scenario, key, k, jnp.asarray(FINE))[0, 0], (None, 0)
+    )
+    return np.asarray(jax.jit(jax.vmap(of_key, (0, None)))(KEYS, jnp.arange(FINE_STEPS)))
+
+
+KEYS = jax.vmap(lambda i: noise_key(jax.random.PRNGKey(0), i))(jnp.arange(RUNS)).astype(float)
+
+
+def additive_end(dW):
+    """exp(-a T) v0 + sigma int exp(-a (T - s)) dW, its integral by parts on the fine grid."""
+    W = np.concatenate([np.zeros((RUNS, 1)), np.cumsum(dW, axis=1)], axis=1)
+    s = np.arange(FINE_STEPS + 1) * FINE
+    weights = RATE * np.exp(-RATE * (1.0 - s))
+    integral = W[:, -1] - np.trapezoid(weights * W, dx=FINE, axis=1)
+    return np.exp(-RATE) * SPEED + 0.7 * integral
+
+
+def proportional_end(dW):
+    """v0 exp(-(a + sigma^2/2) T + sigma W_T): geometric Brownian motion in the sense of Ito."""
+    return SPEED * np.exp(-RATE - 0.5 * 0.6**2 + 0.6 * dW.sum(axis=1))
+
+
+@pytest.mark.parametrize(
+    ("method", "noise", "exact", "order"),
+    [
+        ("euler_maruyama", process_noise.Additive, additive_end, 1.0),
+        ("stochastic_heun", process_noise.Additive, additive_end, 1.0),
+        ("euler_maruyama", process_noise.Proportional, proportional_end, 0.5),
+    ],
+)
+def test_strong_order_on_one_brownian_path(method, noise, exact, order):
+    intensity = 0.7 if noise is process_noise.Additive else 0.6
+    end = exact(fine_increments(noise(intensity)))
+    errors = [
+        np.sqrt(np.mean((ends(noise(intensity, substeps=m), method, m) - end) ** 2)) for m in RATIOS
+    ]
+    measured = np.log(errors[1] / errors[0]) / np.log(RATIOS[1] / RATIOS[0])
+    assert measured == pytest.approx(order, abs=0.2), errors
+
+
+def test_a_divided_step_has_the_increment_of_the_step():
+    scenario, dt = canonical(link(process_noise.Additive(1.0))), jnp.asarray(0.1)
+    times = jnp.asarray([0.13, 0.16])
+
+    def increments(key):
+        pieces = divide_step(times, Span(dt, 2 * dt, dt)).pieces
+        noisy = with_noise_rates(scenario, key, jnp.int32(1), dt, pieces)
+        parts = [piece.noise_rate[0, 0] * piece.length for piece in noisy]
+        return jnp.stack([*parts, brownian_increment(scenario, key, jnp.int32(1), dt)[0, 0]])
+
+    keys = jax.vmap(lambda i: noise_key(jax.random.PRNGKey(1), i))(jnp.arange(20_000))
+    *parts, total = np.asarray(jax.jit(jax.vmap(increments))(keys.astype(float))).T
+    np.testing.assert_allclose(sum(parts), total, atol=1e-15)
+    covariance = np.cov(parts)
+    np.testing.assert_allclose(covariance, np.diag([0.03, 0.03, 0.04]), atol=2e-3)
+
+
+# --- a study: moments, chunks, first exit ---------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def study():
+    return make_study()
+
+
+INTENSITY = 2.6
+
+
+def make_study(runs=1500, **options):
+    """An Ornstein-Uhlenbeck process of second order that is stationary at the end."""
+    return ij.monte_carlo(
+        link(process_noise.Additive(INTENSITY), stiffness=0.6, damping=0.5),
+        {},
+        runs=runs,
+        duration=4.0,
+        dt=1e-2,
+        method="stochastic_heun",
+        metrics=(ij.metrics.Margin(), ij.metrics.FirstExit(), EndState()),
+        progress=False,
+        **options,
+    )
+
+
+@ij.component
+class EndState:
+    """The last position and velocity."""
+
+    units: ClassVar[dict[str, str]] = {"end_q": "rad", "end_dq": "rad/s"}
+
+    def init(self, sample):
+        return sample.q, sample.dq
+
+    def update(self, acc, sample):
+        return sample.q, sample.dq
+
+    def finish(self, acc):
+        return {"end_q": acc[0], "end_dq": acc[1]}
+
+
+def test_moments_of_an_ornstein_uhlenbeck_process(study):
+    a, b, sigma = 0.5 / INERTIA, 0.6 / INERTIA, INTENSITY
+    exact = np.array([sigma**2 / (2 * a * b), sigma**2 / (2 * a)])
+    ends_of_runs = np.hstack([study.metrics["end_q"], study.metrics["end_dq"]])
+    count = len(ends_of_runs)
+    assert np.all(np.abs(ends_of_runs.mean(axis=0)) < 4 * np.sqrt(exact / count))
+    assert np.all(np.abs(ends_of_runs.var(axis=0) / exact - 1) < 4 * np.sqrt(2 / count) + 0.02)
+
+
+def test_runs_do_not_depend_on_chunks_or_the_number_of_runs(study):
+    other = make_study(runs=300, executor=ij.studies.ThisProcess(chunk=256))
+    for name in ("end_q", "end_dq", "first_exit_time"):
+        np.testing.assert_array_equal(other.metrics[name], study.metrics[name][:300])
+    assert np.unique(study.metrics["end_q"]).size == len(study)
+
+
+def test_first_exit(study):
+    found = study.first_exit(joint=0, instants=9)
+    times = np.asarray(study.metrics["first_exit_time"])[:, 0]
+    expected = [np.mean(times <= t) for t in found.t]
+    assert 0.05 < expected[-1] < 0.95
+    np.testing.assert_allclose(found.probability, expected)
+    assert np.all(found.low <= found.probability) and np.all(found.probability <= found.high)
+    np.testing.assert_array_equal(study.first_exit(instants=9).probability, found.probability)
+    figure = found.plot()
+    assert figure.axes[0].get_xlabel() == "time [s]"
+    replayed = study.replay(3)
+    assert float(replayed.metrics["end_q"][0]) == pytest.approx(
+        float(study.metrics["end_q"][3, 0]), abs=1e-12
+    )
+
+
+# --- derivatives, files, certificates, refusals ---------------------------------------------------
+
+
+def test_pathwise_derivative_by_the_intensity():
+    scenario = link(process_noise.Additive([[0.7]]))
+
+    def end(intensity):
+        noisy = ij.with_parameters(scenario, {"process_noise.intensity": intensity})
+        run = ij.simulate(noisy, duration=0.2, dt=1e-2, method="stochastic_heun", backend="vmap")
+        return run.q[-1, 0]
+
+    slope = jax.grad(end)(0.7)
+    assert float(slope) == pytest.approx(float(end(0.8) - end(0.6)) / 0.2, rel=1e-8)
+    assert abs(float(slope)) > 1e-4
+
+
+def test_a_file_gives_the_noise_back():
+    from iblf_jax.files.scenario import from_dict, scenario_to_dict
+
+    tables = scenario_to_dict(link(process_noise.Proportional([[0.3]], levels=(1,), substeps=2)))
+    assert tables["process_noise"]["kind"] == "proportional"
+    noise = from_dict(tables).scenario.process_noise
+    assert (noise.levels, noise.substeps) == ((1,), 2)
+
+
+def test_a_certificate_claims_nothing_under_noise():
+    scenario = ij.with_parts(ij.presets.zhang_yan_2024(), process_noise=process_noise.Additive(0.2))
+    certificate = ij.certify(scenario, duration=0.05, dt=1e-3, method="stochastic_heun")
+    assert {line.verdict for line in certificate.lines} == {"not applicable"}
+    assert any("noisy" in line.name for line in certificate.lines)
+
+
+@pytest.mark.parametrize(
+    ("noise", "method", "words"),
+    [
+        (None, "euler_maruyama", "has no process noise"),
+        (process_noise.Additive(0.1), "rk4", "has process noise"),
+        (process_noise.Proportional(0.1), "stochastic_heun", "depends on the state"),
+    ],
+)
+def test_methods_that_do_not_fit_are_refused(noise, method, words):
+    with pytest.raises(ValueError, match=words):
+        ij.simulate(link(noise), duration=0.1, dt=1e-2, method=method)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: process_noise.Additive(0.1, levels=()), "levels"),
+        (lambda: process_noise.Additive(0.1, levels=(2, 1)), "increasing"),
+        (lambda: process_noise.Additive([[0.1], [0.2]]), "rows"),
+        (lambda: process_noise.Diffusion(3.0), "function"),
+        (lambda: link(process_noise.Additive(0.1, levels=(3,))), "levels up to 2"),
+        (lambda: link(process_noise.Diffusion(lambda t, x: x)), "shape"),
+        (lambda: link(3.0), "ProcessNoise"),
+    ],
+)
+def test_noise_that_does_not_fit_is_refused(make, words):
+    with pytest.raises(ValueError, match=words):
+        make()

@@ -1,0 +1,203 @@
+"""Plants whose parameters switch: an independent program, order of convergence, the distribution of
+a Markov chain's path, and what a run reports."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import iblf_jax as ij
+from iblf_jax import bounds, controllers, plants, references
+from iblf_jax.engine.diagnosis import report
+from iblf_jax.simulation.closed_loop import initial_state, rate
+from iblf_jax.simulation.noise import noise_key, realised
+from iblf_jax.simulation.scenario import canonical
+
+LINK = ij.robots.PlanarChain(mass=[0.8], length=[0.5], centre=[0.3], inertia=[0.05])
+MASSES, TIMES = (0.8, 1.6, 0.5), (0.313, 0.7021)
+Q = np.array([[-3.0, 2.0, 1.0], [1.0, -1.5, 0.5], [0.0, 4.0, -4.0]])
+
+
+def scenario_of(plant):
+    return ij.Scenario(
+        plant=plant,
+        reference=references.Sinusoid(offset=0.1, amplitude=0.3, frequency=2.0),
+        bounds=bounds.Bounds(lower=bounds.Constant(-2.0), upper=bounds.Constant(2.0)),
+        controller=controllers.PDGravity(Kp=9.0, Kd=2.0),
+        initial=ij.Initial(q=[0.2], dq=[0.5]),
+    )
+
+
+SWITCHED = plants.Switched(LINK, {"mass[0]": MASSES}, TIMES)
+
+
+def independent_rate(t, x, mass):
+    """The link under the PD law of a model with the first mass, with formulas of its own."""
+    q, v = x
+    desired, desired_rate = 0.1 + 0.3 * np.sin(2.0 * t), 0.6 * np.cos(2.0 * t)
+    weight = 9.81 * 0.3 * np.cos(q)
+    torque = MASSES[0] * weight - 9.0 * (q - desired) - 2.0 * (v - desired_rate)
+    return np.array([v, (torque - mass * weight) / (0.05 + mass * 0.3**2)])
+
+
+def independent_end(duration):
+    """The state at the end, by an adaptive method that restarts at each switch."""
+    x, edges = np.array([0.2, 0.5]), [0.0, *TIMES, duration]
+    for mass, begin, end in zip(MASSES, edges[:-1], edges[1:], strict=True):
+        solved = solve_ivp(
+            independent_rate, (begin, end), x, args=(mass,), rtol=1e-12, atol=1e-13, method="DOP853"
+        )
+        x = solved.y[:, -1]
+    return x
+
+
+def test_vector_field_against_an_independent_program():
+    scenario = canonical(scenario_of(SWITCHED))
+    field = jax.jit(
+        lambda t, q, dq: rate(scenario, t, initial_state(scenario)._replace(q=q, dq=dq))
+    )
+    rng = np.random.default_rng(3)
+    for _ in range(30):
+        t, q, v = rng.uniform((0.0, -1.0, -2.0), (1.2, 1.0, 2.0))
+        mass = MASSES[int(np.searchsorted(TIMES, t, side="right"))]
+        found = field(jnp.asarray(t), jnp.asarray([q]), jnp.asarray([v]))
+        np.testing.assert_allclose(
+            [found.q[0], found.dq[0]], independent_rate(t, (q, v), mass), atol=1e-11, rtol=1e-12
+        )
+
+
+def test_trajectory_and_order_with_switches_between_the_instants():
+    exact = independent_end(1.0)
+    errors = []
+    for dt in (1.0 / 40, 1.0 / 80):
+        run = ij.simulate(scenario_of(SWITCHED), duration=1.0, dt=dt, backend="vmap")
+        errors.append(np.max(np.abs(np.array([run.q[-1, 0], run.dq[-1, 0]]) - exact)))
+    assert errors[1] < 1e-5
+    assert np.log2(errors[0] / errors[1]) > 3.5
+    fine = ij.simulate(scenario_of(SWITCHED), duration=1.0, dt=1.0 / 320, backend="vmap")
+    np.testing.assert_allclose([fine.q[-1, 0], fine.dq[-1, 0]], exact, atol=1e-7)
+    assert float(fine.metrics["switches"]) == 2
+    assert float(fine.metrics["shortest_dwell_time"]) == pytest.approx(0.313)
+    assert float(fine.metrics["mean_dwell_time"]) == pytest.approx(0.7021 / 2)
+
+
+@pytest.mark.release
+def test_derivative_by_a_switching_time():
+    def end(time):
+        plant = plants.Switched(LINK, {"mass[0]": MASSES[:2]}, [0.31])
+        scenario = ij.with_parameters(scenario_of(plant), {"plant.times[0]": time})
+        return ij.simulate(scenario, duration=0.5, dt=1e-2, backend="vmap").q[-1, 0]
+
+    slope = float(jax.grad(end)(0.313))
+    assert slope == pytest.approx(float(end(0.314) - end(0.312)) / 2e-3, rel=1e-4)
+    assert abs(slope) > 1e-3
+
+
+def test_members_of_the_inner_plant_are_passed_through():
+    drive = plants.ElectricDrive(
+        LINK, torque_constant=0.9, inductance=0.025, resistance=5.0, back_emf=0.9
+    )
+    outer = plants.Switched(drive, {"resistance": (5.0, 6.0), "robot.mass[0]": (0.8, 1.0)}, [0.4])
+    assert (outer.n, outer.order) == (1, 3)
+    assert plants.units_of(outer) == plants.units_of(drive)
+    assert plants.level_names(outer) == plants.level_names(drive)
+    assert plants.input_name(outer) == plants.input_name(drive)
+    assert float(outer.at(jnp.asarray(0.5)).robot.mass[0]) == 1.0
+    assert float(outer.robot.mass[0]) == 0.8
+    scenario = scenario_of(SWITCHED)
+    assert scenario.model is LINK or scenario.model.mass is LINK.mass
+    both = ij.with_parameters(scenario, {"robot.mass[0]": 0.9})
+    assert float(both.model.mass[0]) == 0.9 == float(both.plant.mass[0])
+
+
+def test_a_file_gives_plants_with_modes_back():
+    from iblf_jax.files.scenario import from_dict, scenario_to_dict
+
+    markov = plants.MarkovSwitched(LINK, {"mass[0]": MASSES}, rates=Q, switches=4)
+    for plant in (SWITCHED, markov):
+        loaded = from_dict(scenario_to_dict(scenario_of(plant))).scenario
+        assert type(loaded.plant) is type(plant)
+        assert loaded.plant.parameters[0].path == "mass[0]"
+
+
+# --- a Markov chain -------------------------------------------------------------------------------
+
+
+def test_distribution_of_the_path():
+    scenario = canonical(
+        scenario_of(plants.MarkovSwitched(LINK, {"mass[0]": MASSES}, rates=Q, switches=3))
+    )
+    keys = jax.vmap(lambda i: noise_key(jax.random.PRNGKey(2), i))(jnp.arange(20_000))
+    found = jax.jit(jax.vmap(lambda key: realised(scenario, key).plant))(keys.astype(float))
+    times, modes = np.asarray(found.times), np.asarray(found.sequence)
+    before = np.concatenate([np.zeros((len(modes), 1)), modes[:, :-1]], axis=1)
+    dwell = np.diff(times, axis=1, prepend=0.0)
+    assert np.all(modes != before)
+    for i in range(3):
+        here = before == i
+        count = here.sum()
+        assert dwell[here].mean() == pytest.approx(-1 / Q[i, i], rel=4 / np.sqrt(count))
+        assert dwell[here].std() == pytest.approx(-1 / Q[i, i], rel=8 / np.sqrt(count))
+        for j in range(3):
+            share = 0.0 if i == j else -Q[i, j] / Q[i, i]
+            assert np.mean(modes[here] == j) == pytest.approx(share, abs=2.5 / np.sqrt(count))
+
+
+@pytest.mark.slow
+def test_every_run_of_a_study_has_a_path_of_its_own():
+    plant = plants.MarkovSwitched(LINK, {"mass[0]": MASSES}, rates=Q, switches=2)
+
+    def make(runs, chunk):
+        return ij.monte_carlo(
+            scenario_of(plant),
+            {},
+            runs=runs,
+            duration=0.5,
+            dt=1e-2,
+            metrics=(ij.metrics.Tracking(),),
+            progress=False,
+            executor=ij.studies.ThisProcess(chunk=chunk),
+        )
+
+    every, some = make(600, None), make(300, 256)
+    for name in ("ise", "switches", "shortest_dwell_time"):
+        np.testing.assert_array_equal(some.metrics[name], every.metrics[name][:300])
+    lost = (np.asarray(every.status) & int(ij.Status.MODES_EXHAUSTED)) != 0
+    times = [np.asarray(every.replay(i).scenario.plant.times) for i in (0, 1)]
+    assert not np.array_equal(*times)
+    assert 0 < lost.sum() < 300
+    with pytest.warns(ij.SimulationWarning, match=r"Increase plant\.switches"):
+        report(every.replay(int(np.flatnonzero(lost)[0])), 50, throw=False)
+    assert np.all(every.metrics["switches"][lost] == 2)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: plants.Switched(LINK, {"mass[0]": (1.0, 2.0)}, [0.5, 0.6]), "3 values"),
+        (lambda: plants.Switched(LINK, {"weight": (1.0, 2.0)}, [0.5]), "path of a parameter"),
+        (lambda: plants.Switched(LINK, {"mass[0]": (1.0, 2.0, 3.0)}, [0.6, 0.5]), "increasing"),
+        (lambda: plants.Switched(3.0, {"mass[0]": (1.0, 2.0)}, [0.5]), "Robot"),
+        (lambda: plants.Switched(LINK, {}, [0.5]), "parameters"),
+        (
+            lambda: plants.MarkovSwitched(LINK, {"mass[0]": (1.0, 2.0)}, [[-1.0, 2.0], [0, 0]]),
+            "sum",
+        ),
+        (
+            lambda: scenario_of(
+                plants.Switched(
+                    plants.MarkovSwitched(LINK, {"mass[0]": MASSES}, rates=Q),
+                    {"mass[0]": (1.0, 2.0)},
+                    [0.5],
+                )
+            ),
+            "as the plant itself",
+        ),
+    ],
+)
+def test_modes_that_do_not_fit_are_refused(make, words):
+    with pytest.raises(ValueError, match=words):
+        make()
