@@ -11,8 +11,9 @@ placeholders or axis numbers in their place.  Two operations are therefore separ
 
 `component` implements both: the constructor converts and checks, and the registered `unflatten`
 never calls it.  Fields are declared with `leaf` (a differentiable array with a unit), `static`
-(structure: changes recompile) or as an annotation only (another component).  Components are
-compared by identity (`eq=False`), because `==` of arrays is ambiguous.
+(structure: changes recompile) or as an annotation only (another component, or a module of another
+library, see `core.modules`).  Components are compared by identity (`eq=False`), because `==` of
+arrays is ambiguous.
 """
 
 from __future__ import annotations
@@ -22,11 +23,11 @@ import functools
 import operator
 from collections.abc import Callable
 from types import MappingProxyType
-from typing import Any, TypeAlias, TypeVar, dataclass_transform
+from typing import Any, NamedTuple, TypeAlias, TypeVar, dataclass_transform
 
 import jax
 
-from iblf_jax.core import checks
+from iblf_jax.core import checks, modules
 from iblf_jax.core.optional import OptionalMembers, has_members
 
 T = TypeVar("T")
@@ -100,13 +101,35 @@ def component(cls: type[T]) -> type[T]:
             if field.metadata.get("static"):
                 checks.structural(cls.__name__, field.name, value)
             else:
-                object.__setattr__(self, field.name, checks.as_leaf(cls.__name__, field, value))
+                object.__setattr__(self, field.name, _as_leaf_or_module(cls, field, value))
         if has_members(self, "check"):
             self.check()
+        _note_modules(self)
 
     cls.__init__ = checked_init  # type: ignore[method-assign]
 
     return register_component(cls)
+
+
+def _as_leaf_or_module(cls: type, field: dataclasses.Field, value: Any) -> Any:
+    """A user's value of a field that is not static, converted and checked."""
+    holds_numbers = is_leaf_field(field) or modules.is_list_of_numbers(value)
+    if holds_numbers or not modules.is_module(value):
+        return checks.as_leaf(cls.__name__, field, value)
+    return modules.as_module(f"{cls.__name__}.{field.name}", value)
+
+
+def _note_modules(part: Any) -> None:
+    """Stores the names of the fields that hold modules with more than numbers in them."""
+    values = field_values(part)
+    names = tuple(
+        field.name
+        for field in dataclasses.fields(part)
+        if not is_leaf_field(field) and not field.metadata.get("static")
+        if modules.is_module(values[field.name]) and modules.has_structure(values[field.name])
+    )
+    if names:
+        object.__setattr__(part, _MODULE_FIELDS, names)
 
 
 def register_component(cls: type[T]) -> type[T]:
@@ -123,13 +146,28 @@ def register_component(cls: type[T]) -> type[T]:
     keys = tuple(map(jax.tree_util.GetAttrKey, children))
 
     def flatten_with_keys(obj):
-        return tuple(zip(keys, children_of(obj), strict=True)), structure_of(obj)
+        values, aux = flatten(obj)
+        return tuple(zip(keys, values, strict=True)), aux
 
     def flatten(obj):
-        return children_of(obj), structure_of(obj)
+        names = obj._module_fields
+        if not names:
+            return children_of(obj), structure_of(obj)
+        pairs = zip(children, children_of(obj), strict=True)
+        values = tuple(
+            modules.with_structure_nodes(x) if name in names else x for name, x in pairs
+        )
+        return values, _WithModules(structure_of(obj), names)
 
     def unflatten(aux, values):
         obj = object.__new__(cls)
+        if type(aux) is _WithModules:
+            object.__setattr__(obj, _MODULE_FIELDS, aux.names)
+            pairs = zip(children, values, strict=True)
+            values = [
+                modules.without_structure_nodes(x) if name in aux.names else x for name, x in pairs
+            ]
+            aux = aux.structure
         for name, value in zip(children, values, strict=True):
             object.__setattr__(obj, name, value)
         for name, value in zip(structure, aux, strict=True):
@@ -138,9 +176,19 @@ def register_component(cls: type[T]) -> type[T]:
 
     jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
     setattr(cls, _REGISTERED, True)
+    setattr(cls, _MODULE_FIELDS, ())
     return cls
 
 
+class _WithModules(NamedTuple):
+    """The static fields of a component, and the names of its fields with modules."""
+
+    structure: tuple
+    names: tuple[str, ...]
+
+
+_MODULE_FIELDS = "_module_fields"
+"""Attribute with the names of the fields that hold modules with functions in them."""
 _REGISTERED = "_registered_component"
 """Attribute of a class that `register_component` has registered."""
 

@@ -12,12 +12,15 @@ Sweeps, perturbations, tuning and scenario files address leaves by these paths.
 - `robot.` stands for `plant.` and `model.` together and changes both robots alike.
 - Several leaves may be addressed as the rows of one array (class attribute `stacked`):
   "initial.x[2]" is the third level of the start of a plant, "initial.x[0]" its initial.q.
+- The arrays of a module of another library have the paths that its classes give them, with the
+  keys of dicts in brackets: "controller.net.layers[0].weight[1][2]", "disturbance.weights[hidden]".
 - A component that wraps another (class attribute `wraps`, such as `controllers.Saturated`) is
   transparent: "controller.K2" is the wrapped law's K2, and "controller.law.K2" works too.
 """
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import json
 import re
@@ -28,10 +31,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.core import checks, notices, tables
+from iblf_jax.core import checks, modules, notices, tables
+from iblf_jax.core.modules import NUMBERS, RowName
 from iblf_jax.core.pytree import component_member, field_values, wrapped_field
 from iblf_jax.core.units import Unit, as_text, of_entry, resolved
-from iblf_jax.simulation.scenario import HOW_TO_MAKE, NUMBERS, Scenario, canonical
+from iblf_jax.simulation.scenario import HOW_TO_MAKE, Scenario, canonical
 from iblf_jax.simulation.units import symbols_of
 
 Symbols: TypeAlias = Mapping[str, Unit]
@@ -42,12 +46,6 @@ _BARE = r"[^\[\]]*[^\W\d_][^\[\]]*"
 _TOKEN = re.compile(
     rf"""\.?([A-Za-z_]\w*)|\[(-?\d{{1,18}})\]|\[("(?:[^"\\]|\\.)*")\]|\[({_BARE})\]"""
 )
-
-
-class RowName(str):
-    """Token of a path: the name of a row, in brackets."""
-
-    __slots__ = ()
 
 
 class Parameter(NamedTuple):
@@ -112,10 +110,12 @@ def _joined(path: str, name: str) -> str:
 
 def _walk(part: Any, path: str, named: bool, symbols: Symbols) -> Iterator[Parameter]:
     """The leaves below a part; `symbols` has the unit of each symbol there."""
-    if isinstance(part, tuple | list):
-        for i, x in enumerate(part):
-            yield from _walk(x, f"{path}[{i}]", named, symbols)
+    if isinstance(part, tuple | list) or modules.is_module(part):
+        for token, x in modules.entries(part).items():
+            yield from _walk(x, path + _written(token), named, symbols)
         return
+    if modules.is_float_array(part):
+        yield Parameter(path, jnp.shape(part), "", part)
     if not _is_component(part):
         return
     values = field_values(part)
@@ -129,7 +129,7 @@ def _walk(part: Any, path: str, named: bool, symbols: Symbols) -> Iterator[Param
         elif isinstance(value, NUMBERS):
             unit = as_text(_unit(part, field, symbols))
             yield Parameter(name, jnp.shape(value), unit, value)
-        elif isinstance(value, tuple | list):
+        elif isinstance(value, tuple | list) and not modules.is_module(value):
             for i, x in enumerate(value):
                 yield from _walk(x, f"{name}[{i}]", named, _symbols_below(field, symbols, i))
         else:
@@ -273,16 +273,25 @@ def places(scenario: Scenario, path: str) -> list[list[str | int]]:
 def leaves(scenario: Scenario, path: str) -> list[str]:
     """The paths of the complete leaves that contain the numbers at a path."""
 
-    def leaf_path(tokens):
-        while isinstance(tokens[-1], int):
-            tokens = tokens[:-1]
-        return "".join(map(_written, tokens)).lstrip(".")
+    return [_leaf_path(scenario, tokens) for tokens in places(scenario, path)]
 
-    return [leaf_path(tokens) for tokens in places(scenario, path)]
+
+def _leaf_path(scenario: Scenario, tokens: Sequence[str | int]) -> str:
+    """The path of the complete leaf at a location."""
+    part: Any = scenario
+    path = ""
+    for token in tokens:
+        if isinstance(part, NUMBERS):
+            break
+        part = _member(part, token)
+        path += _written(token)
+    return path.lstrip(".")
 
 
 def _written(token: str | int) -> str:
-    """A field or an index as a path contains it."""
+    """A field, an index or a key as a path contains it."""
+    if isinstance(token, RowName):
+        return f"[{_quoted(token)}]"
     return f"[{token}]" if isinstance(token, int) else f".{token}"
 
 
@@ -304,17 +313,18 @@ def _metadata(scenario: Scenario, path: str) -> Mapping[str, Any]:
     part: Any = scenario
     symbols = symbols_of(scenario)
     tokens = places(scenario, path)[0]
-    while True:
+    while not modules.is_module(part):
         name, index, tokens = _next_field(tokens)
         field = next(f for f in dataclasses.fields(part) if f.name == name)
         value = vars(part)[name]
-        if not tokens:
+        if isinstance(value, NUMBERS):
             unit = of_entry(_unit(part, field, symbols), index, jnp.ndim(value))
             return {**field.metadata, "unit": unit}
         symbols = _symbols_below(field, symbols, *index[:1])
         part = value
-        for i in index:
+        for i in () if modules.is_module(value) else index:
             part = part[i]
+    return {}  # The numbers of a module have no declared unit.
 
 
 def _next_field(
@@ -342,8 +352,9 @@ def _resolved(scenario: Scenario, path: str, full: str) -> tuple[list[str | int]
                 value = _member(value, step)
         except (AttributeError, IndexError, TypeError, KeyError, ValueError):
             raise _unknown(scenario, path) from None
+        is_part = dataclasses.is_dataclass(value) or modules.is_module(value)
         is_entry = isinstance(value, jax.Array | np.ndarray | float)
-        if isinstance(steps[-1], int) and not (is_entry or dataclasses.is_dataclass(value)):
+        if isinstance(steps[-1], int) and not (is_entry or is_part):
             raise _unknown(scenario, path)
         found += steps
     if not isinstance(value, NUMBERS):
@@ -356,7 +367,7 @@ def _steps(part: Any, tokens: list[str | int]) -> tuple[list[str | int], list[st
     left.
     """
     token = tokens[0]
-    if isinstance(token, int):
+    if isinstance(token, int) or modules.is_module(part):
         return [token], tokens[1:]
     if isinstance(token, RowName):
         raise KeyError(token)
@@ -390,6 +401,8 @@ def _member(part: Any, step: str | int) -> Any:
     """The non-static field or the entry of a part.  An error if there is none: JAX would take the
     nearest entry.
     """
+    if modules.is_module(part) and not isinstance(part, tuple | list):
+        return modules.entries(part)[step]
     if isinstance(step, str):
         if step not in [f.name for f in dataclasses.fields(part) if not f.metadata.get("static")]:
             raise AttributeError(step)
@@ -406,18 +419,17 @@ def _replaced(part: Any, tokens: list[str | int], value: Any, path: str, sign: s
     if not tokens or isinstance(part, NUMBERS):
         return _new_value(part, tokens, value, path, sign)
     head, rest = tokens[0], tokens[1:]
+    if modules.is_module(part):
+        return modules.with_entry(part, head, _replaced(_member(part, head), rest, value, path, None))
     if isinstance(head, int):
         parts = list(part)
         parts[head] = _replaced(part[head], rest, value, path, sign)
         return tuple(parts)
-    copy = object.__new__(type(part))
-    values = field_values(part)
-    for field in dataclasses.fields(part):
-        member = values[field.name]
-        if field.name == head:
-            member = _replaced(member, rest, value, path, field.metadata.get("sign"))
-        object.__setattr__(copy, field.name, member)
-    return copy
+    changed = copy.copy(part)
+    sign = next(f.metadata.get("sign") for f in dataclasses.fields(part) if f.name == head)
+    member = _replaced(vars(part)[head], rest, value, path, sign)
+    object.__setattr__(changed, head, member)
+    return changed
 
 
 def _new_value(
