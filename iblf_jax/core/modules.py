@@ -155,22 +155,46 @@ def _can_be_leaf(value: Any) -> bool:
     return is_number or is_float_array(value)
 
 
-def with_structure_nodes(module: Any) -> Any:
-    """The module with everything that is not a floating-point array in `Structure` nodes."""
-    return jax.tree.map(_as_node, module)
+class Division(NamedTuple):
+    """Which entries of a module are leaves of the component and which are structure.
+
+    It is stored, because JAX rebuilds components with other objects in place of the arrays.
+    """
+
+    treedef: Any
+    is_structure: tuple[bool, ...]
+
+    @staticmethod
+    def of(module: Any) -> Division:
+        """The division of a module that holds numbers."""
+        values, treedef = jax.tree.flatten(module, is_leaf=_is_none)
+        return Division(treedef, tuple(not _is_leaf(x) for x in values))
+
+    def with_nodes(self, module: Any) -> Any:
+        """The module with its structure in nodes that have no leaves."""
+        values = self.treedef.flatten_up_to(module)
+        pairs = zip(values, self.is_structure, strict=True)
+        return self.treedef.unflatten([_as_node(x) if fixed else x for x, fixed in pairs])
+
+    def without_nodes(self, module: Any) -> Any:
+        """The inverse of `with_nodes`."""
+        values = self.treedef.flatten_up_to(module)
+        return self.treedef.unflatten([_from_node(x) for x in values])
 
 
-def _as_node(value: Any) -> Any:
-    if is_float_array(value) or isinstance(value, jax.core.Tracer):
-        return value
+def _is_none(value: Any) -> bool:
+    return value is None
+
+
+def _is_leaf(value: Any) -> bool:
+    """Whether an entry of a module that holds functions is a leaf."""
+    return is_float_array(value) or isinstance(value, jax.core.Tracer)
+
+
+def _as_node(value: Any) -> Structure:
     if isinstance(value, jax.Array | np.ndarray):
         return Structure(ConstantArray.of(value))
     return Structure(value)
-
-
-def without_structure_nodes(module: Any) -> Any:
-    """The inverse of `with_structure_nodes`."""
-    return jax.tree.map(_from_node, module, is_leaf=lambda x: isinstance(x, Structure))
 
 
 def _from_node(value: Any) -> Any:

@@ -122,14 +122,14 @@ def _as_leaf_or_module(cls: type, field: dataclasses.Field, value: Any) -> Any:
 def _note_modules(part: Any) -> None:
     """Stores the names of the fields that hold modules with more than numbers in them."""
     values = field_values(part)
-    names = tuple(
-        field.name
+    divisions = tuple(
+        (field.name, modules.Division.of(values[field.name]))
         for field in dataclasses.fields(part)
         if not is_leaf_field(field) and not field.metadata.get("static")
         if modules.is_module(values[field.name]) and modules.has_structure(values[field.name])
     )
-    if names:
-        object.__setattr__(part, _MODULE_FIELDS, names)
+    if divisions:
+        object.__setattr__(part, _DIVISIONS, divisions)
 
 
 def register_component(cls: type[T]) -> type[T]:
@@ -150,24 +150,22 @@ def register_component(cls: type[T]) -> type[T]:
         return tuple(zip(keys, values, strict=True)), aux
 
     def flatten(obj):
-        names = obj._module_fields
-        if not names:
+        divisions = obj._divisions
+        if not divisions:
             return children_of(obj), structure_of(obj)
-        pairs = zip(children, children_of(obj), strict=True)
-        values = tuple(
-            modules.with_structure_nodes(x) if name in names else x for name, x in pairs
-        )
-        return values, _WithModules(structure_of(obj), names)
+        values = dict(zip(children, children_of(obj), strict=True))
+        for name, division in divisions:
+            values[name] = division.with_nodes(values[name])
+        return tuple(values.values()), _WithModules(structure_of(obj), divisions)
 
     def unflatten(aux, values):
         obj = object.__new__(cls)
         if type(aux) is _WithModules:
-            object.__setattr__(obj, _MODULE_FIELDS, aux.names)
-            pairs = zip(children, values, strict=True)
-            values = [
-                modules.without_structure_nodes(x) if name in aux.names else x for name, x in pairs
-            ]
-            aux = aux.structure
+            object.__setattr__(obj, _DIVISIONS, aux.divisions)
+            whole = dict(zip(children, values, strict=True))
+            for name, division in aux.divisions:
+                whole[name] = division.without_nodes(whole[name])
+            values, aux = whole.values(), aux.structure
         for name, value in zip(children, values, strict=True):
             object.__setattr__(obj, name, value)
         for name, value in zip(structure, aux, strict=True):
@@ -176,19 +174,21 @@ def register_component(cls: type[T]) -> type[T]:
 
     jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
     setattr(cls, _REGISTERED, True)
-    setattr(cls, _MODULE_FIELDS, ())
+    setattr(cls, _DIVISIONS, ())
     return cls
 
 
 class _WithModules(NamedTuple):
-    """The static fields of a component, and the names of its fields with modules."""
+    """The structure of a component with modules that hold functions: its static fields, and the
+    divisions of these modules by the names of their fields.
+    """
 
     structure: tuple
-    names: tuple[str, ...]
+    divisions: tuple[tuple[str, modules.Division], ...]
 
 
-_MODULE_FIELDS = "_module_fields"
-"""Attribute with the names of the fields that hold modules with functions in them."""
+_DIVISIONS = "_divisions"
+"""Attribute with the divisions of those modules of a component that hold functions."""
 _REGISTERED = "_registered_component"
 """Attribute of a class that `register_component` has registered."""
 
