@@ -112,7 +112,7 @@ def _walk(part: Any, path: str, named: bool, symbols: Symbols) -> Iterator[Param
     """The leaves below a part; `symbols` has the unit of each symbol there."""
     if isinstance(part, tuple | list) or modules.is_module(part):
         for token, x in modules.entries(part).items():
-            yield from _walk(x, path + _written(token), named, symbols)
+            yield from _walk(x, path + written(token), named, symbols)
         return
     if modules.is_float_array(part):
         yield Parameter(path, jnp.shape(part), "", part)
@@ -137,6 +137,11 @@ def _walk(part: Any, path: str, named: bool, symbols: Symbols) -> Iterator[Param
     if named:
         yield from _named_rows(part, path)
         yield from _stacked_rows(part, path, symbols)
+
+
+def arrays_of_module(module: Any) -> dict[str, Any]:
+    """Path in the module -> array, of every leaf of a module, in the order of its leaves."""
+    return {p.path.lstrip("."): p.value for p in _walk(module, "", False, {})}
 
 
 def _symbols_below(field: dataclasses.Field, symbols: Symbols, index: int = 0) -> Symbols:
@@ -284,11 +289,11 @@ def _leaf_path(scenario: Scenario, tokens: Sequence[str | int]) -> str:
         if isinstance(part, NUMBERS):
             break
         part = _member(part, token)
-        path += _written(token)
+        path += written(token)
     return path.lstrip(".")
 
 
-def _written(token: str | int) -> str:
+def written(token: str | int) -> str:
     """A field, an index or a key as a path contains it."""
     if isinstance(token, RowName):
         return f"[{_quoted(token)}]"
