@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.optional import has_members
 
 NUMBERS = (jax.Array, np.ndarray, np.generic, float, int)
 """Types of leaves."""
@@ -170,6 +171,12 @@ class Division(NamedTuple):
         values, treedef = jax.tree.flatten(module, is_leaf=_is_none)
         return Division(treedef, tuple(not _is_leaf(x) for x in values))
 
+    def __reduce__(self) -> Any:
+        """A division for pickle, which cannot store the structure of classes of others: a module
+        with truth values in place of its entries.
+        """
+        return _division_from, (self.treedef.unflatten(self.is_structure),)
+
     def with_nodes(self, module: Any) -> Any:
         """The module with its structure in nodes that have no leaves."""
         values = self.treedef.flatten_up_to(module)
@@ -180,6 +187,12 @@ class Division(NamedTuple):
         """The inverse of `with_nodes`."""
         values = self.treedef.flatten_up_to(module)
         return self.treedef.unflatten([_from_node(x) for x in values])
+
+
+def _division_from(module: Any) -> Division:
+    """The division of which a module with truth values is the pickled form."""
+    values, treedef = jax.tree.flatten(module)
+    return Division(treedef, tuple(values))
 
 
 def _is_none(value: Any) -> bool:
@@ -285,7 +298,7 @@ def _hides_arrays(value: Any) -> bool:
     """Whether an object that JAX does not take apart has arrays among its attributes."""
     if isinstance(value, functools.partial):
         inside: Any = (value.args, value.keywords)
-    elif isinstance(value, type) or not hasattr(value, "__dict__"):
+    elif isinstance(value, type) or not has_members(value, "__dict__"):
         return False
     else:
         inside = list(vars(value).values())
@@ -295,5 +308,12 @@ def _hides_arrays(value: Any) -> bool:
 
 def number_of_leaves(module: Any) -> tuple[int, int]:
     """How many arrays and how many numbers a module has as leaves."""
-    arrays = [x for x in jax.tree.leaves(module) if _can_be_leaf(x)]
+    arrays = list(filter(_is_leaf, jax.tree.leaves(module)))
     return len(arrays), sum(int(np.size(x)) for x in arrays)
+
+
+def name_of(value: Any) -> str:
+    """A function or another entry of a structure in words that do not depend on the process."""
+    if callable(value) and has_members(value, "__qualname__", "__module__"):
+        return f"{value.__module__}:{value.__qualname__}"
+    return repr(value)

@@ -20,6 +20,7 @@ import dataclasses
 import hashlib
 import importlib
 import inspect
+import io
 import json
 import os
 import sys
@@ -33,6 +34,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks, modules
+from iblf_jax.core.optional import has_members
 from iblf_jax.files.values import Words, as_table, dotted, encode_numbers, known_keys, numbers
 from iblf_jax.simulation.paths import arrays_of_module, written
 
@@ -122,7 +124,8 @@ def _import_path(value: Any) -> str:
     A function without a path may be the default of an argument of a method:
     "equinox.nn:MLP.__init__(final_activation)".
     """
-    if not isinstance(getattr(value, "__qualname__", None), str):
+    has_name = has_members(value, "__qualname__", "__module__")
+    if not has_name or _is_of_python(value):
         raise _NoImportPathError(value)
     parts = str(value.__module__).split(".")
     places = [*PUBLIC, *(".".join(parts[: i + 1]) for i in range(len(parts)))]
@@ -131,10 +134,10 @@ def _import_path(value: Any) -> str:
         if _found(path) is value:
             return path
     owner = sys.modules.get(str(value.__module__))
-    for name, cls in inspect.getmembers(owner, inspect.isclass):
+    for _, cls in inspect.getmembers(owner, inspect.isclass):
         for argument, parameter in inspect.signature(cls.__init__).parameters.items():
             if parameter.default is value:
-                return f"{_import_path(cls)}.__init__({argument})" if name else ""
+                return f"{_import_path(cls)}.__init__({argument})"
     raise _NoImportPathError(value)
 
 
@@ -144,7 +147,9 @@ def _found(path: str) -> Any:
     name, _, argument = name.removesuffix(")").partition("(")
     value: Any = sys.modules.get(place)
     for part in name.split("."):
-        value = getattr(value, part, None)
+        if not has_members(value, part):
+            return None
+        value = getattr(value, part)
     if not argument:
         return value
     return inspect.signature(value).parameters[argument].default
@@ -182,8 +187,6 @@ def with_weights_in_file(tables: dict[str, Any], path: Path) -> bytes | None:
         found |= {f"{key}:{name}": np.asarray(x) for name, x in arrays.items()}
     if not found:
         return None
-    import io
-
     content = io.BytesIO()
     np.savez_compressed(content, allow_pickle=False, **found)
     return content.getvalue()
@@ -363,15 +366,22 @@ def _imported(path: Any, key: str) -> Any:
             importlib.import_module(package)
         except ImportError as error:
             raise checks.fail(key, text, expected, f"{error}. {remedy}") from error
-    if top in sys.stdlib_module_names and top != "__main__":
-        raise checks.fail(key, text, expected, "Python's own library has no parts of networks.")
     try:
         value = _found(text)
     except (TypeError, ValueError, KeyError):
         value = None
-    if not callable(value):
+    has_name = callable(value) and has_members(value, "__module__")
+    if not has_name or _is_of_python(value):
         raise checks.fail(key, text, expected, remedy)
     return value
+
+
+def _is_of_python(value: Any) -> bool:
+    """Whether a class or function belongs to Python's own library, which has no parts of networks
+    but has functions that act on the machine.
+    """
+    top = str(value.__module__).partition(".")[0]
+    return top != "__main__" and top in ("None", *sys.stdlib_module_names)
 
 
 def _object(cls: Any, values: dict[str, Any], key: str) -> Any:

@@ -23,6 +23,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import json
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, TypeAlias
@@ -58,10 +59,32 @@ class Parameter(NamedTuple):
 
 
 class ParameterTable(tuple[Parameter, ...]):
-    """The addressable leaves of a scenario; prints as a table, in notebooks too."""
+    """The addressable leaves of a scenario; prints as a table, in notebooks too.
+
+    The table shows one row for a module of another library with many arrays.
+    """
+
+    large_modules: tuple[str, ...] = ()
+    """Paths of the modules that are printed as one row."""
 
     def _rows(self) -> list[tuple[str, str, str, str]]:
-        return [(p.path, str(p.shape), p.unit, _value_text(p.value)) for p in self]
+        rows = []
+        inside = {path: self._of_module(path) for path in self.large_modules}
+        hidden = {p.path for leaves in inside.values() for p in leaves}
+        heads = {leaves[0].path: path for path, leaves in inside.items()}
+        for p in self:
+            if p.path in heads:
+                leaves = inside[heads[p.path]]
+                count = sum(math.prod(x.shape) for x in leaves)
+                words = f"{len(leaves)} arrays, {count} numbers"
+                rows.append((f"{heads[p.path]} ...", "", "", words))
+            if p.path not in hidden:
+                rows.append((p.path, str(p.shape), p.unit, _value_text(p.value)))
+        return rows
+
+    def _of_module(self, path: str) -> list[Parameter]:
+        """The leaves of a module."""
+        return [p for p in self if p.path.startswith((f"{path}.", f"{path}["))]
 
     def __repr__(self) -> str:
         return "\n".join(tables.as_text([Parameter._fields, *self._rows()]))
@@ -74,7 +97,14 @@ def _value_text(value: Any) -> str:
     """A value as a table shows it."""
     if not checks.is_concrete(value):
         return "traced"
-    return np.array2string(np.asarray(value), precision=6, threshold=8)
+    values = np.asarray(value)
+    if values.size > MAX_NUMBERS_OF_ROW:
+        return f"{values.size} numbers from {values.min():.4g} to {values.max():.4g}"
+    return np.array2string(values, precision=6, threshold=8)
+
+
+MAX_NUMBERS_OF_ROW = 32
+"""Most numbers of a leaf that a table shows by values."""
 
 
 def parameters(scenario: Scenario, *, named: bool = True) -> ParameterTable:
@@ -90,7 +120,29 @@ def parameters(scenario: Scenario, *, named: bool = True) -> ParameterTable:
     """
     _check_component(scenario)
     named = checks.boolean("named", named)
-    return ParameterTable(_walk(scenario, "", named, symbols_of(scenario)))
+    table = ParameterTable(_walk(scenario, "", named, symbols_of(scenario)))
+    table.large_modules = tuple(_large_modules(scenario, ""))
+    return table
+
+
+MAX_ROWS_OF_MODULE = 12
+"""Most arrays of a module that a table lists one by one."""
+
+
+def _large_modules(part: Any, path: str) -> Iterator[str]:
+    """The paths of the modules below a part with more arrays than a table lists."""
+    if modules.is_module(part):
+        if modules.number_of_leaves(part)[0] > MAX_ROWS_OF_MODULE:
+            yield path
+        return
+    if isinstance(part, tuple | list):
+        for i, x in enumerate(part):
+            yield from _large_modules(x, f"{path}[{i}]")
+    if not _is_component(part):
+        return
+    for name, value in field_values(part).items():
+        inner = path if name == wrapped_field(part) else _joined(path, name)
+        yield from _large_modules(value, inner)
 
 
 def _check_component(scenario: Any) -> None:
