@@ -258,7 +258,7 @@ def is_list_of_numbers(value: Any) -> bool:
 
 def _is_number(value: Any) -> bool:
     is_scalar = isinstance(value, jax.Array | np.ndarray) and value.ndim == 0
-    return is_scalar or isinstance(value, numbers.Number) and not isinstance(value, bool)
+    return is_scalar or (isinstance(value, numbers.Number) and not isinstance(value, bool))
 
 
 def _checked_entry(name: str, value: Any, has_functions: bool) -> Any:

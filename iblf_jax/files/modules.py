@@ -25,7 +25,7 @@ import json
 import os
 import sys
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -63,7 +63,7 @@ class _NoImportPathError(ValueError):
 
 def encode_module(module: Any) -> dict[str, Any]:
     """The table of a module with its arrays in it."""
-    arrays = {name: np.asarray(x) for name, x in arrays_of_module(module).items()}
+    arrays = {name: encode_numbers(x) for name, x in arrays_of_module(module).items()}
     try:
         structure = _described(module)
     except _NoImportPathError:
@@ -72,16 +72,17 @@ def encode_module(module: Any) -> dict[str, Any]:
         "kind": MODULE,
         "structure": json.dumps(structure),
         "digest": _digest(arrays),
-        "arrays": {name: encode_numbers(x) for name, x in arrays.items()},
+        "arrays": arrays,
     }
 
 
-def _digest(arrays: Mapping[str, np.ndarray]) -> str:
-    """SHA-256 of names, shapes and numbers, which does not depend on the precision of a file."""
+def _digest(arrays: Mapping[str, Any]) -> str:
+    """SHA-256 of names, shapes and numbers, which does not depend on the precision of JAX."""
     found = hashlib.sha256()
-    for name, array in sorted(arrays.items()):
+    for name, numbers_of_array in sorted(arrays.items()):
+        array = np.asarray(numbers_of_array, "<f8")
         found.update(json.dumps([name, array.shape]).encode())
-        found.update(np.asarray(array, "<f8").tobytes())
+        found.update(array.tobytes())
     return found.hexdigest()
 
 
@@ -242,10 +243,11 @@ def _module_of(
         raise checks.fail(f"{path}.digest", came, str(table.get("digest")), remedy)
     if given is not None:
         return _with_arrays(given, arrays, structure, path)
-    used: set[str] = set()
-    module = _rebuilt(structure, "", arrays, used, path)
-    if used != {*arrays}:
-        came = Words(f"arrays that the structure does not have: {sorted({*arrays} - used)}")
+    reader = _Reader(arrays, path)
+    module = reader.entry(structure, "")
+    if reader.used != {*arrays}:
+        unused = sorted({*arrays} - reader.used)
+        came = Words(f"arrays that the structure does not have: {unused}")
         raise checks.fail(f"{path}.arrays", came, "one array for each place of the structure")
     return module
 
@@ -284,7 +286,11 @@ def _arrays(table: dict[str, Any], path: str, folder: str | os.PathLike) -> dict
 
 
 def _array(value: Any, path: str) -> np.ndarray:
-    return np.asarray(checks.as_floats(path, numbers(value, path)))
+    """The array of a table in double precision, whatever the precision of JAX."""
+    try:
+        return np.asarray(numbers(value, path), float)
+    except ValueError as error:
+        raise checks.fail(path, value, "numbers in a rectangular array") from error
 
 
 def _with_arrays(module: Any, arrays: dict[str, np.ndarray], structure: Any, path: str) -> Any:
@@ -309,49 +315,75 @@ def _with_arrays(module: Any, arrays: dict[str, np.ndarray], structure: Any, pat
     )
 
 
-def _rebuilt(
-    node: Any, inside: str, arrays: Mapping[str, np.ndarray], used: set[str], path: str
-) -> Any:
-    """A module, or an entry of it, from its description; `inside` is its path in the module."""
-    key = f"{path}.structure"
-    if node == "array":
-        name = inside.lstrip(".")
-        if name not in arrays:
-            raise checks.fail(key, Words("no array"), f"an array {name}")
-        used.add(name)
-        return jnp.asarray(arrays[name])
+class _Reader:
+    """Rebuilds a module from its description and its arrays.
 
-    def entries(pairs: Iterator[tuple[str | int, Any]]) -> dict[Any, Any]:
-        return {
-            token: _rebuilt(x, inside + written(token), arrays, used, path) for token, x in pairs
-        }
+    Args:
+      arrays: path in the module -> array.
+      path: dotted key of the module in the file.
+    """
 
-    if not isinstance(node, dict) or not node:
-        raise checks.fail(key, node, "the description of an entry of a module")
-    kind, content = next(iter(node.items()))
-    if kind == "value" and isinstance(content, bool | int | float | str | None):
-        return content
-    if kind == "constant":
-        return np.asarray(content, np.dtype(str(node.get("dtype"))))
-    if kind in ("list", "tuple") and isinstance(content, list):
-        found = entries(enumerate(content)).values()
-        return list(found) if kind == "list" else tuple(found)
-    if kind == "dict" and isinstance(content, dict):
-        pairs = ((modules.RowName(k), x) for k, x in content.items())
-        return {str(k): x for k, x in entries(pairs).items()}
-    if kind == "import":
-        return _imported(content, key)
-    if kind == "class":
-        fields = as_table(node.get("fields"), key)
-        return _object(_imported(content, key), entries(iter(fields.items())), key)
-    if kind == "opaque":
+    def __init__(self, arrays: Mapping[str, np.ndarray], path: str) -> None:
+        self.arrays, self.path = arrays, path
+        self.used: set[str] = set()
+
+    @property
+    def key(self) -> str:
+        """The dotted key of the description, for messages."""
+        return f"{self.path}.structure"
+
+    def entry(self, node: Any, inside: str) -> Any:
+        """The entry of a description; `inside` is its path in the module."""
+        if node == "array":
+            return self.array(inside.lstrip("."))
+        if not isinstance(node, dict) or not node:
+            raise checks.fail(self.key, node, EXPECTED_NODE)
+        kind, content = next(iter(node.items()))
+        if kind == "value" and isinstance(content, bool | int | float | str | None):
+            return content
+        if kind == "constant":
+            return np.asarray(content, np.dtype(str(node.get("dtype"))))
+        if kind == "import":
+            return _imported(content, self.key)
+        if kind == "class":
+            fields = self.entries(as_table(node.get("fields"), self.key).items(), inside)
+            return _object(_imported(content, self.key), fields, self.key)
+        if kind == "opaque":
+            raise self.needs_a_module(content)
+        return self.container(kind, content, inside)
+
+    def container(self, kind: str, content: Any, inside: str) -> Any:
+        """A dict, list or tuple."""
+        if kind == "dict" and isinstance(content, dict):
+            pairs = [(modules.RowName(key), x) for key, x in content.items()]
+            return {str(key): x for key, x in self.entries(pairs, inside).items()}
+        if kind in ("list", "tuple") and isinstance(content, list):
+            found = list(self.entries(enumerate(content), inside).values())
+            return found if kind == "list" else tuple(found)
+        raise checks.fail(self.key, kind, EXPECTED_NODE)
+
+    def entries(self, pairs: Iterable[tuple[Any, Any]], inside: str) -> dict[Any, Any]:
+        """The entries of a container or an object by their tokens."""
+        return {token: self.entry(x, inside + written(token)) for token, x in pairs}
+
+    def array(self, name: str) -> jax.Array:
+        """The array at a path in the module."""
+        if name not in self.arrays:
+            raise checks.fail(self.key, Words("no array"), f"an array {name}")
+        self.used.add(name)
+        return jnp.asarray(self.arrays[name])
+
+    def needs_a_module(self, class_name: Any) -> ValueError:
+        """The error for a class that a file cannot describe."""
         remedy = (
-            f'Pass one: ij.load_scenario(path, modules={{"{path}": ...}}), whose arrays are then'
-            " replaced by those of the file."
+            f'Pass one: ij.load_scenario(path, modules={{"{self.path}": ...}}), whose arrays are'
+            " then replaced by those of the file."
         )
-        expected = "a module that a file describes completely"
-        raise checks.fail(path, Words(f"an object of class {content}"), expected, remedy)
-    raise checks.fail(key, kind, "the description of an entry of a module")
+        came = Words(f"an object of class {class_name}")
+        return checks.fail(self.path, came, "a module that a file describes completely", remedy)
+
+
+EXPECTED_NODE = "the description of an entry of a module"
 
 
 def _imported(path: Any, key: str) -> Any:

@@ -107,9 +107,7 @@ def save_scenario(
     target.write_text(text, encoding="utf-8")
 
 
-def load_scenario(
-    path: str | os.PathLike, *, modules: Mapping[str, Any] | None = None
-) -> Scenario:
+def load_scenario(path: str | os.PathLike, *, modules: Mapping[str, Any] | None = None) -> Scenario:
     """The scenario that a TOML file describes.
 
     Args:

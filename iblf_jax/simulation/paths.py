@@ -329,7 +329,6 @@ def places(scenario: Scenario, path: str) -> list[list[str | int]]:
 
 def leaves(scenario: Scenario, path: str) -> list[str]:
     """The paths of the complete leaves that contain the numbers at a path."""
-
     return [_leaf_path(scenario, tokens) for tokens in places(scenario, path)]
 
 
@@ -477,7 +476,9 @@ def _replaced(part: Any, tokens: list[str | int], value: Any, path: str, sign: s
         return _new_value(part, tokens, value, path, sign)
     head, rest = tokens[0], tokens[1:]
     if modules.is_module(part):
-        return modules.with_entry(part, head, _replaced(_member(part, head), rest, value, path, None))
+        return modules.with_entry(
+            part, head, _replaced(_member(part, head), rest, value, path, None)
+        )
     if isinstance(head, int):
         parts = list(part)
         parts[head] = _replaced(part[head], rest, value, path, sign)
