@@ -162,10 +162,10 @@ def register_component(cls: type[T]) -> type[T]:
         obj = object.__new__(cls)
         if type(aux) is _WithModules:
             object.__setattr__(obj, _DIVISIONS, aux.divisions)
-            whole = dict(zip(children, values, strict=True))
+            by_name = dict(zip(children, values, strict=True))
             for name, division in aux.divisions:
-                whole[name] = division.without_nodes(whole[name])
-            values, aux = whole.values(), aux.structure
+                by_name[name] = division.without_nodes(by_name[name])
+            values, aux = by_name.values(), aux.structure
         for name, value in zip(children, values, strict=True):
             object.__setattr__(obj, name, value)
         for name, value in zip(structure, aux, strict=True):
