@@ -113,8 +113,9 @@ def component(cls: type[T]) -> type[T]:
 
 def _as_leaf_or_module(cls: type, field: dataclasses.Field, value: Any) -> Any:
     """A user's value of a field that is not static, converted and checked."""
-    holds_numbers = is_leaf_field(field) or modules.is_list_of_numbers(value)
-    if holds_numbers or not modules.is_module(value):
+    # `is_module` comes first: it is False for lists that are nested without end.
+    holds_module = not is_leaf_field(field) and modules.is_module(value)
+    if not holds_module or modules.is_list_of_numbers(value):
         return checks.as_leaf(cls.__name__, field, value)
     return modules.as_module(f"{cls.__name__}.{field.name}", value)
 
