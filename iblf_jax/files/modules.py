@@ -25,7 +25,7 @@ import json
 import os
 import sys
 import zipfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -297,7 +297,7 @@ def _with_arrays(module: Any, arrays: dict[str, np.ndarray], structure: Any, pat
     """A module of the caller's with the arrays of a file."""
     name = f"modules[{path!r}]"
     module = modules.as_module(name, module)
-    expected_class = structure.get("opaque") if isinstance(structure, dict) else None
+    expected_class = as_table(structure, f"{path}.structure").get("opaque")
     if expected_class not in (None, _class_name(module)):
         raise checks.fail(name, Words(_class_name(module)), expected_class)
     own = arrays_of_module(module)
@@ -357,9 +357,8 @@ class _Reader:
         if kind == "dict" and isinstance(content, dict):
             pairs = [(modules.RowName(key), x) for key, x in content.items()]
             return {str(key): x for key, x in self.entries(pairs, inside).items()}
-        if kind in ("list", "tuple") and isinstance(content, list):
-            found = list(self.entries(enumerate(content), inside).values())
-            return found if kind == "list" else tuple(found)
+        if kind in SEQUENCES and isinstance(content, list):
+            return SEQUENCES[kind](self.entries(enumerate(content), inside).values())
         raise checks.fail(self.key, kind, EXPECTED_NODE)
 
     def entries(self, pairs: Iterable[tuple[Any, Any]], inside: str) -> dict[Any, Any]:
@@ -383,6 +382,8 @@ class _Reader:
         return checks.fail(self.path, came, "a module that a file describes completely", remedy)
 
 
+SEQUENCES: dict[str, Callable[[Iterable[Any]], Any]] = {"list": list, "tuple": tuple}
+"""Name in a description -> the container."""
 EXPECTED_NODE = "the description of an entry of a module"
 
 
