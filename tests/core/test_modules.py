@@ -335,4 +335,5 @@ def test_flax_modules_are_fields(paper):
     assert jax.tree.structure(changed) == jax.tree.structure(scenario)
     x = jnp.arange(4.0)
     torque = jax.jit(lambda s: s.disturbance.torque(0.0, x[:2], x[2:], s.plant, s.model))(changed)
-    assert np.allclose(torque, net(x) + jnp.asarray([1.0, -1.0]), atol=1e-6)
+    expected = np.asarray(net(x.astype("float32"))) + np.array([1.0, -1.0])
+    assert np.allclose(torque, expected, atol=1e-6)
