@@ -312,7 +312,7 @@ def _with_equal_rows(name: str, value: Any) -> Any:
     """The rows of a leaf of the shape "level", where some are single numbers and some have one
     number a joint: each with one number a joint.
     """
-    if not isinstance(value, tuple | list):
+    if not isinstance(value, tuple | list) or not value:
         return value
     rows = [as_floats(f"{name}[{i}]", row) for i, row in enumerate(value)]
     try:

@@ -6,6 +6,7 @@ the component with that leaf replaced.
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import json
 import re
@@ -16,22 +17,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.core import checks
+from iblf_jax.core import checks, modules
+from iblf_jax.core.modules import NUMBERS, RowName
 from iblf_jax.core.pytree import component_member, field_values, wrapped_field
 
-NUMBERS = (jax.Array, np.ndarray, np.generic, float, int)
-"""Types of leaves."""
 BARE = r"[^\[\]]*[^\W\d_][^\[\]]*"
 """The name of a row that needs no quotes."""
 _TOKEN = re.compile(
     rf"""\.?([A-Za-z_]\w*)|\[(-?\d{{1,18}})\]|\[("(?:[^"\\]|\\.)*")\]|\[({BARE})\]"""
 )
-
-
-class RowName(str):
-    """Token of a path: the name of a row, in brackets."""
-
-    __slots__ = ()
 
 
 def parse(path: str) -> list[str | int]:
@@ -87,8 +81,9 @@ def resolve(part: Any, path: str) -> tuple[list[str | int], Any]:
                 value = member_of(value, step)
         except (AttributeError, IndexError, TypeError, KeyError, ValueError):
             raise LookupError(path) from None
+        is_part = dataclasses.is_dataclass(value) or modules.is_module(value)
         is_entry = isinstance(value, jax.Array | np.ndarray | float)
-        if isinstance(steps[-1], int) and not (is_entry or dataclasses.is_dataclass(value)):
+        if isinstance(steps[-1], int) and not (is_entry or is_part):
             raise LookupError(path)
         found += steps
     if not isinstance(value, NUMBERS):
@@ -101,7 +96,7 @@ def steps_of(part: Any, tokens: list[str | int]) -> tuple[list[str | int], list[
     left.
     """
     token = tokens[0]
-    if isinstance(token, int):
+    if isinstance(token, int) or modules.is_module(part):
         return [token], tokens[1:]
     if isinstance(token, RowName):
         raise KeyError(token)
@@ -147,6 +142,8 @@ def member_of(part: Any, step: str | int) -> Any:
     """The non-static field or the entry of a part.  An error if there is none: JAX would take the
     nearest entry.
     """
+    if modules.is_module(part) and not isinstance(part, tuple | list):
+        return modules.entries(part)[step]
     if isinstance(step, str):
         if step not in [f.name for f in dataclasses.fields(part) if not f.metadata.get("static")]:
             raise AttributeError(step)
@@ -163,18 +160,18 @@ def replaced(part: Any, tokens: list[str | int], value: Any, path: str, sign: st
     if not tokens or isinstance(part, NUMBERS):
         return _new_value(part, tokens, value, path, sign)
     head, rest = tokens[0], tokens[1:]
+    if modules.is_module(part):
+        entry = replaced(member_of(part, head), rest, value, path, None)
+        return modules.with_entry(part, head, entry)
     if isinstance(head, int):
         parts = list(part)
         parts[head] = replaced(part[head], rest, value, path, sign)
         return tuple(parts)
-    copy = object.__new__(type(part))
-    values = field_values(part)
-    for field in dataclasses.fields(part):
-        member = values[field.name]
-        if field.name == head:
-            member = replaced(member, rest, value, path, field.metadata.get("sign"))
-        object.__setattr__(copy, field.name, member)
-    return copy
+    changed = copy.copy(part)
+    sign = next(f.metadata.get("sign") for f in dataclasses.fields(part) if f.name == head)
+    member = replaced(vars(part)[head], rest, value, path, sign)
+    object.__setattr__(changed, head, member)
+    return changed
 
 
 def _new_value(

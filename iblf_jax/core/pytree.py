@@ -11,8 +11,9 @@ placeholders or axis numbers in their place.  Two operations are therefore separ
 
 `component` implements both: the constructor converts and checks, and the registered `unflatten`
 never calls it.  Fields are declared with `leaf` (a differentiable array with a unit), `static`
-(structure: changes recompile) or as an annotation only (another component).  Components are
-compared by identity (`eq=False`), because `==` of arrays is ambiguous.
+(structure: changes recompile) or as an annotation only (another component, or a module of another
+library, see `core.modules`).  Components are compared by identity (`eq=False`), because `==` of
+arrays is ambiguous.
 """
 
 from __future__ import annotations
@@ -22,11 +23,11 @@ import functools
 import operator
 from collections.abc import Callable
 from types import MappingProxyType
-from typing import Any, TypeAlias, TypeVar, dataclass_transform
+from typing import Any, NamedTuple, TypeAlias, TypeVar, dataclass_transform
 
 import jax
 
-from iblf_jax.core import checks
+from iblf_jax.core import checks, modules
 from iblf_jax.core.optional import OptionalMembers, has_members
 
 T = TypeVar("T")
@@ -105,13 +106,36 @@ def component(cls: type[T]) -> type[T]:
             if field.metadata.get("static"):
                 checks.structural(cls.__name__, field.name, value)
             else:
-                object.__setattr__(self, field.name, checks.as_leaf(cls.__name__, field, value))
+                object.__setattr__(self, field.name, _as_leaf_or_module(cls, field, value))
         if has_members(self, "check"):
             self.check()
+        _note_modules(self)
 
     cls.__init__ = checked_init  # type: ignore[method-assign]
 
     return register_component(cls)
+
+
+def _as_leaf_or_module(cls: type, field: dataclasses.Field, value: Any) -> Any:
+    """A user's value of a field that is not static, converted and checked."""
+    # `is_module` comes first: it is False for lists that are nested without end.
+    holds_module = not is_leaf_field(field) and modules.is_module(value)
+    if not holds_module or modules.is_list_of_numbers(value):
+        return checks.as_leaf(cls.__name__, field, value)
+    return modules.as_module(f"{cls.__name__}.{field.name}", value)
+
+
+def _note_modules(part: Any) -> None:
+    """Stores the names of the fields that hold modules with more than numbers in them."""
+    values = field_values(part)
+    divisions = tuple(
+        (field.name, modules.Division.of(values[field.name]))
+        for field in dataclasses.fields(part)
+        if not is_leaf_field(field) and not field.metadata.get("static")
+        if modules.is_module(values[field.name]) and modules.has_structure(values[field.name])
+    )
+    if divisions:
+        object.__setattr__(part, _DIVISIONS, divisions)
 
 
 def register_component(cls: type[T]) -> type[T]:
@@ -128,13 +152,26 @@ def register_component(cls: type[T]) -> type[T]:
     keys = tuple(map(jax.tree_util.GetAttrKey, children))
 
     def flatten_with_keys(obj):
-        return tuple(zip(keys, children_of(obj), strict=True)), structure_of(obj)
+        values, aux = flatten(obj)
+        return tuple(zip(keys, values, strict=True)), aux
 
     def flatten(obj):
-        return children_of(obj), structure_of(obj)
+        divisions = obj._divisions
+        if not divisions:
+            return children_of(obj), structure_of(obj)
+        values = dict(zip(children, children_of(obj), strict=True))
+        for name, division in divisions:
+            values[name] = division.with_nodes(values[name])
+        return tuple(values.values()), _WithModules(structure_of(obj), divisions)
 
     def unflatten(aux, values):
         obj = object.__new__(cls)
+        if type(aux) is _WithModules:
+            object.__setattr__(obj, _DIVISIONS, aux.divisions)
+            by_name = dict(zip(children, values, strict=True))
+            for name, division in aux.divisions:
+                by_name[name] = division.without_nodes(by_name[name])
+            values, aux = by_name.values(), aux.structure
         for name, value in zip(children, values, strict=True):
             object.__setattr__(obj, name, value)
         for name, value in zip(structure, aux, strict=True):
@@ -143,9 +180,21 @@ def register_component(cls: type[T]) -> type[T]:
 
     jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
     setattr(cls, _REGISTERED, True)
+    setattr(cls, _DIVISIONS, ())
     return cls
 
 
+class _WithModules(NamedTuple):
+    """The structure of a component with modules that hold functions: its static fields, and the
+    divisions of these modules by the names of their fields.
+    """
+
+    structure: tuple
+    divisions: tuple[tuple[str, modules.Division], ...]
+
+
+_DIVISIONS = "_divisions"
+"""Attribute with the divisions of those modules of a component that hold functions."""
 _REGISTERED = "_registered_component"
 """Attribute of a class that `register_component` has registered."""
 

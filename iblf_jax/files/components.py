@@ -18,8 +18,9 @@ import jax
 import numpy as np
 
 from iblf_jax.control import actuators, barriers, controllers, decays, observers, sensors
-from iblf_jax.core import checks
+from iblf_jax.core import checks, modules
 from iblf_jax.core.pytree import field_values, is_leaf_field
+from iblf_jax.files.modules import ReadModule, encode_module
 from iblf_jax.files.values import (
     NONE,
     Words,
@@ -115,10 +116,12 @@ def encode(part: Any, hint: Any, path: str) -> Any:
     hint, _ = without_none(hint)
     if isinstance(part, jax.Array | np.ndarray | np.generic | float | int):
         return encode_numbers(part)
+    if modules.is_module(part) and not families_of(family):
+        return encode_module(part)
     if isinstance(part, tuple | list):
         return [encode(x, entry_hint(hint, i), f"{path}[{i}]") for i, x in enumerate(part)]
     if not dataclasses.is_dataclass(part) or isinstance(part, type):
-        raise not_storable(path, part, "a component, an array or a tuple of these")
+        raise not_storable(path, part, "a component, an array, a module or a tuple of these")
     if type(part) is hint:
         return encode_fields(part, path)
     words, members = members_of(family)
@@ -177,6 +180,8 @@ def decode(value: Any, hint: Any, path: str) -> Any:
     Raises:
       ValueError: a value that does not fit; the message names the dotted key.
     """
+    if isinstance(value, ReadModule):
+        return value.module
     family = hint
     hint, is_optional = without_none(hint)
     if is_optional and value == NONE:

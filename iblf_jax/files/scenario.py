@@ -42,6 +42,12 @@ import numpy as np
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import astype
 from iblf_jax.files.components import construct, decode_fields, encode_fields, field_hints
+from iblf_jax.files.modules import (
+    needs_a_module,
+    tables_of_modules,
+    with_modules_read,
+    with_weights_in_file,
+)
 from iblf_jax.files.robot import names_a_file, with_robots_read
 from iblf_jax.files.values import (
     Words,
@@ -57,12 +63,14 @@ from iblf_jax.files.values import (
 )
 from iblf_jax.presets import PRESETS
 from iblf_jax.simulation.integrators import METHODS
-from iblf_jax.simulation.paths import parameters, with_parameters
+from iblf_jax.simulation.paths import parameters, parse, with_parameters
 from iblf_jax.simulation.scenario import Scenario, check_leaves
 from iblf_jax.world import plants
 
 COMPONENTS = ("robot", *(field.name for field in dataclasses.fields(Scenario)))
 RUN = ("duration", "dt", "method", "record_every")
+WEIGHTS = ".weights.npz"
+"""Ending of the file with the arrays of modules, in place of that of the scenario file."""
 DTYPES = ("float64", "float32", "float16", "bfloat16")
 
 
@@ -81,7 +89,8 @@ def save_scenario(
 
     Args:
       scenario: one scenario (not a batch).
-      path: the file; its folder must exist.
+      path: the file; its folder must exist.  The arrays of modules of other libraries are written
+        beside it, NAME.weights.npz for NAME.toml.
       run: content of the table [run]: duration [s], dt [s], method, record_every.
 
     Raises:
@@ -89,27 +98,38 @@ def save_scenario(
       OSError: the file cannot be written.
     """
     target = checks.file_to_write("path", path)
-    target.write_text(scenario_to_toml(scenario, run=run), encoding="utf-8")
+    tables = scenario_to_dict(scenario)
+    beside = target.with_suffix(WEIGHTS)
+    weights = with_weights_in_file(tables, beside)
+    text = _as_toml(tables, scenario, run)
+    if weights is not None:
+        checks.file_to_write("path", beside).write_bytes(weights)
+    target.write_text(text, encoding="utf-8")
 
 
-def load_scenario(path: str | os.PathLike) -> Scenario:
+def load_scenario(path: str | os.PathLike, *, modules: Mapping[str, Any] | None = None) -> Scenario:
     """The scenario that a TOML file describes.
 
     Args:
       path: a file in the format that the docstring of this module describes.
+      modules: dotted key of the file -> a module with the structure of the saved one, whose arrays
+        are replaced by those of the file, {"controller.net": net}. Modules of classes that a file
+        cannot describe, such as those of Flax NNX, need it.
 
     Raises:
       ValueError: the file is not TOML or does not describe a scenario; the message names file, key
         and remedy.
       OSError: the file cannot be read.
     """
-    return load_scenario_file(path).scenario
+    return load_scenario_file(path, modules=modules).scenario
 
 
-def load_scenario_file(path: str | os.PathLike) -> ScenarioFile:
-    """Scenario and [run] table of a TOML file; raises as `load_scenario`."""
+def load_scenario_file(
+    path: str | os.PathLike, *, modules: Mapping[str, Any] | None = None
+) -> ScenarioFile:
+    """Scenario and [run] table of a TOML file; arguments and errors as `load_scenario`."""
     data = read_toml(path)
-    return from_dict(data, source=os.fspath(path), folder=Path(path).parent)
+    return from_dict(data, source=os.fspath(path), folder=Path(path).parent, modules=modules)
 
 
 def read_toml(path: str | os.PathLike) -> dict[str, Any]:
@@ -169,8 +189,13 @@ def _check_round_trip(scenario: Scenario, tables: dict[str, Any]) -> None:
     """Raises ValueError if the tables do not give an equal scenario."""
     expected = "one scenario that its tables reproduce"
     remedy = "Save the runs of a batch one by one."
+    opaque = {
+        path: _part_at(scenario, path)
+        for path, table in tables_of_modules(tables)
+        if needs_a_module(table)
+    }
     try:
-        same = _equal(from_dict(tables).scenario, scenario)
+        same = _equal(from_dict(tables, modules=opaque).scenario, scenario)
     except ValueError as error:
         came = Words(f"leaves that a scenario cannot have ({error})")
         raise checks.fail("scenario", came, expected, remedy) from error
@@ -179,11 +204,23 @@ def _check_round_trip(scenario: Scenario, tables: dict[str, Any]) -> None:
         raise checks.fail("scenario", came, expected, remedy)
 
 
+def _part_at(scenario: Scenario, path: str) -> Any:
+    """The part of a scenario at a dotted key of its file."""
+    part: Any = scenario
+    for token in parse(re.sub(r"^robot\b", "plant", path)):
+        part = part[token] if isinstance(token, int) else vars(part)[token]
+    return part
+
+
 def scenario_to_toml(scenario: Scenario, *, run: Mapping[str, Any] | None = None) -> str:
     """The text of a scenario's file; arguments and errors as `save_scenario`."""
+    return _as_toml(scenario_to_dict(scenario), scenario, run)
+
+
+def _as_toml(tables: dict[str, Any], scenario: Scenario, run: Mapping[str, Any] | None) -> str:
+    """The text of the tables of a scenario."""
     import tomli_w
 
-    tables = scenario_to_dict(scenario)
     if run is not None:
         tables["run"] = _run_table(dict(checks.mapping("run", run, '{"duration": 20.0}')))
     text = tomli_w.dumps(tables)
@@ -259,6 +296,7 @@ def from_dict(
     *,
     other_tables: Iterable[str] = (),
     folder: str | os.PathLike = "",
+    modules: Mapping[str, Any] | None = None,
 ) -> ScenarioFile:
     """Scenario and [run] table from the tables of a file.
 
@@ -266,7 +304,8 @@ def from_dict(
       data: the tables of the TOML file.
       source: name of the file, for messages.
       other_tables: names of further tables that the caller reads (those of a sweep, for example).
-      folder: folder of the file, to which the paths of robot files are relative.
+      folder: folder of the file, to which the paths of robot files and of weights are relative.
+      modules: modules of the caller's, as `load_scenario` takes them.
 
     Raises:
       ValueError: tables that do not fit; the message names source, dotted key and remedy.
@@ -274,7 +313,10 @@ def from_dict(
     try:
         others = set(other_tables)
         data = {key: x for key, x in as_table(data, "file").items() if key not in others}
-        scenario = _from_preset(data) if "preset" in data else _from_components(data, folder)
+        if "preset" in data:
+            scenario = _from_preset(data)
+        else:
+            scenario = _from_components(data, folder, modules)
         if "dtype" in data:
             scenario = astype(scenario, _dtype(data["dtype"]))
         changes = {"scenario": scenario, "values": numbers_by_path(data, "parameters")}
@@ -284,7 +326,9 @@ def from_dict(
         raise checks.with_location(source, error) from error
 
 
-def _from_components(data: dict[str, Any], folder: str | os.PathLike) -> Scenario:
+def _from_components(
+    data: dict[str, Any], folder: str | os.PathLike, modules: Mapping[str, Any] | None
+) -> Scenario:
     known_keys(data, "", (*COMPONENTS, "preset", "parameters", "run", "dtype"))
     tables = {key: value for key, value in data.items() if key in COMPONENTS}
     for present, absent in (("plant", "model"), ("model", "plant")):
@@ -292,8 +336,10 @@ def _from_components(data: dict[str, Any], folder: str | os.PathLike) -> Scenari
             came = Words("this table besides [robot]")
             remedy = f"Rename [robot] to [{absent}]."
             raise checks.fail(present, came, "only [robot], or [plant] and [model]", remedy)
+    tables = with_modules_read(tables, folder, modules)
     if names_a_file(tables):
-        tables = with_robots_read(tables, folder)
+        # A law that is limited to the robot's torques is written as tables again.
+        tables = with_modules_read(with_robots_read(tables, folder), folder, {})
     robot = tables.pop("robot", None)
     if robot is None:
         if "plant" not in tables:

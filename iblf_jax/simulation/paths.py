@@ -12,6 +12,8 @@ Sweeps, perturbations, tuning and scenario files address leaves by these paths.
 - `robot.` stands for `plant.` and `model.` together and changes both robots alike.
 - Several leaves may be addressed as the rows of one array (class attribute `stacked`):
   "initial.x[2]" is the third level of the start of a plant, "initial.x[0]" its initial.q.
+- The arrays of a module of another library have the paths that its classes give them, with the
+  keys of dicts in brackets: "controller.net.layers[0].weight[1][2]", "disturbance.weights[hidden]".
 - A component that wraps another (class attribute `wraps`, such as `controllers.Saturated`) is
   transparent: "controller.K2" is the wrapped law's K2, and "controller.law.K2" works too.
 """
@@ -20,24 +22,25 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.core import checks, notices, tables
+from iblf_jax.core import checks, modules, notices, tables
 from iblf_jax.core.component_paths import (
     BARE,
-    NUMBERS,
     has_field,
+    member_of,
     parse,
     replaced,
     resolve,
     rows_of,
 )
-from iblf_jax.core.component_paths import RowName as RowName
+from iblf_jax.core.modules import NUMBERS, RowName
 from iblf_jax.core.pytree import component_member, field_values, wrapped_field
 from iblf_jax.core.units import Unit, as_text, of_entry, resolved
 from iblf_jax.simulation.scenario import HOW_TO_MAKE, Scenario, canonical
@@ -57,10 +60,32 @@ class Parameter(NamedTuple):
 
 
 class ParameterTable(tuple[Parameter, ...]):
-    """The addressable leaves of a scenario; prints as a table, in notebooks too."""
+    """The addressable leaves of a scenario; prints as a table, in notebooks too.
+
+    The table shows one row for a module of another library with many arrays.
+    """
+
+    large_modules: tuple[str, ...] = ()
+    """Paths of the modules that are printed as one row."""
 
     def _rows(self) -> list[tuple[str, str, str, str]]:
-        return [(p.path, str(p.shape), p.unit, _value_text(p.value)) for p in self]
+        rows = []
+        inside = {path: self._of_module(path) for path in self.large_modules}
+        hidden = {p.path for leaves in inside.values() for p in leaves}
+        heads = {leaves[0].path: path for path, leaves in inside.items()}
+        for p in self:
+            if p.path in heads:
+                leaves = inside[heads[p.path]]
+                count = sum(math.prod(x.shape) for x in leaves)
+                words = f"{len(leaves)} arrays, {count} numbers"
+                rows.append((f"{heads[p.path]} ...", "", "", words))
+            if p.path not in hidden:
+                rows.append((p.path, str(p.shape), p.unit, _value_text(p.value)))
+        return rows
+
+    def _of_module(self, path: str) -> list[Parameter]:
+        """The leaves of a module."""
+        return [p for p in self if p.path.startswith((f"{path}.", f"{path}["))]
 
     def __repr__(self) -> str:
         return "\n".join(tables.as_text([Parameter._fields, *self._rows()]))
@@ -73,7 +98,14 @@ def _value_text(value: Any) -> str:
     """A value as a table shows it."""
     if not checks.is_concrete(value):
         return "traced"
-    return np.array2string(np.asarray(value), precision=6, threshold=8)
+    values = np.asarray(value)
+    if values.size > MAX_NUMBERS_OF_ROW:
+        return f"{values.size} numbers from {values.min():.4g} to {values.max():.4g}"
+    return np.array2string(values, precision=6, threshold=8)
+
+
+MAX_NUMBERS_OF_ROW = 32
+"""Most numbers of a leaf that a table shows by values."""
 
 
 def parameters(scenario: Scenario, *, named: bool = True) -> ParameterTable:
@@ -89,7 +121,29 @@ def parameters(scenario: Scenario, *, named: bool = True) -> ParameterTable:
     """
     _check_component(scenario)
     named = checks.boolean("named", named)
-    return ParameterTable(_walk(scenario, "", named, symbols_of(scenario)))
+    table = ParameterTable(_walk(scenario, "", named, symbols_of(scenario)))
+    table.large_modules = tuple(_large_modules(scenario, ""))
+    return table
+
+
+MAX_ROWS_OF_MODULE = 12
+"""Most arrays of a module that a table lists one by one."""
+
+
+def _large_modules(part: Any, path: str) -> Iterator[str]:
+    """The paths of the modules below a part with more arrays than a table lists."""
+    if modules.is_module(part):
+        if modules.number_of_leaves(part)[0] > MAX_ROWS_OF_MODULE:
+            yield path
+        return
+    if isinstance(part, tuple | list):
+        for i, x in enumerate(part):
+            yield from _large_modules(x, f"{path}[{i}]")
+    if not _is_component(part):
+        return
+    for name, value in field_values(part).items():
+        inner = path if name == wrapped_field(part) else _joined(path, name)
+        yield from _large_modules(value, inner)
 
 
 def _check_component(scenario: Any) -> None:
@@ -109,10 +163,12 @@ def _joined(path: str, name: str) -> str:
 
 def _walk(part: Any, path: str, named: bool, symbols: Symbols) -> Iterator[Parameter]:
     """The leaves below a part; `symbols` has the unit of each symbol there."""
-    if isinstance(part, tuple | list):
-        for i, x in enumerate(part):
-            yield from _walk(x, f"{path}[{i}]", named, symbols)
+    if isinstance(part, tuple | list) or modules.is_module(part):
+        for token, x in modules.entries(part).items():
+            yield from _walk(x, path + written(token), named, symbols)
         return
+    if modules.is_float_array(part):
+        yield Parameter(path, jnp.shape(part), "", part)
     if not _is_component(part):
         return
     values = field_values(part)
@@ -126,7 +182,7 @@ def _walk(part: Any, path: str, named: bool, symbols: Symbols) -> Iterator[Param
         elif isinstance(value, NUMBERS):
             unit = as_text(_unit(part, field, symbols))
             yield Parameter(name, jnp.shape(value), unit, value)
-        elif isinstance(value, tuple | list):
+        elif isinstance(value, tuple | list) and not modules.is_module(value):
             for i, x in enumerate(value):
                 below = _symbols_below(part, field, symbols, i)
                 yield from _walk(x, f"{name}[{i}]", named, below)
@@ -135,6 +191,11 @@ def _walk(part: Any, path: str, named: bool, symbols: Symbols) -> Iterator[Param
     if named:
         yield from _named_rows(part, path)
         yield from _stacked_rows(part, path, symbols)
+
+
+def arrays_of_module(module: Any) -> dict[str, Any]:
+    """Path in the module -> array, of every leaf of a module, in the order of its leaves."""
+    return {p.path.lstrip("."): p.value for p in _walk(module, "", False, {})}
 
 
 def _symbols_below(
@@ -228,17 +289,25 @@ def places(scenario: Scenario, path: str) -> list[list[str | int]]:
 
 def leaves(scenario: Scenario, path: str) -> list[str]:
     """The paths of the complete leaves that contain the numbers at a path."""
-
-    def leaf_path(tokens):
-        while isinstance(tokens[-1], int):
-            tokens = tokens[:-1]
-        return "".join(map(_written, tokens)).lstrip(".")
-
-    return [leaf_path(tokens) for tokens in places(scenario, path)]
+    return [_leaf_path(scenario, tokens) for tokens in places(scenario, path)]
 
 
-def _written(token: str | int) -> str:
-    """A field or an index as a path contains it."""
+def _leaf_path(scenario: Scenario, tokens: Sequence[str | int]) -> str:
+    """The path of the complete leaf at a location."""
+    part: Any = scenario
+    path = ""
+    for token in tokens:
+        if isinstance(part, NUMBERS):
+            break
+        part = member_of(part, token)
+        path += written(token)
+    return path.lstrip(".")
+
+
+def written(token: str | int) -> str:
+    """A field, an index or a key as a path contains it."""
+    if isinstance(token, RowName):
+        return f"[{_quoted(token)}]"
     return f"[{token}]" if isinstance(token, int) else f".{token}"
 
 
@@ -260,17 +329,18 @@ def _metadata(scenario: Scenario, path: str) -> Mapping[str, Any]:
     part: Any = scenario
     symbols = symbols_of(scenario)
     tokens = places(scenario, path)[0]
-    while True:
+    while not modules.is_module(part):
         name, index, tokens = _next_field(tokens)
         field = next(f for f in dataclasses.fields(part) if f.name == name)
         value = vars(part)[name]
-        if not tokens:
+        if isinstance(value, NUMBERS):
             unit = of_entry(_unit(part, field, symbols), index, jnp.ndim(value))
             return {**field.metadata, "unit": unit}
         symbols = _symbols_below(part, field, symbols, *index[:1])
         part = value
-        for i in index:
+        for i in () if modules.is_module(value) else index:
             part = part[i]
+    return {}  # The numbers of a module have no declared unit.
 
 
 def _next_field(

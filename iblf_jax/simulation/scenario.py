@@ -28,9 +28,9 @@ from iblf_jax.control.observers._base import observer_member
 from iblf_jax.control.sensors import Ideal as IdealSensor
 from iblf_jax.control.sensors import Sensor
 from iblf_jax.control.sensors._base import sensor_member
-from iblf_jax.core import checks, notices
-from iblf_jax.core.component_paths import NUMBERS
+from iblf_jax.core import checks, modules, notices
 from iblf_jax.core.disk_cache import keep_programs
+from iblf_jax.core.modules import NUMBERS
 from iblf_jax.core.presentation import present
 from iblf_jax.core.pytree import (
     Leaf,
@@ -596,6 +596,8 @@ def fit_joints(part: Any, n: int, path: str) -> Any:
     """`part` with its per-joint scalars repeated n times; ValueError where a leaf has another
     number of joints.
     """
+    if modules.is_module(part):
+        return part
     if isinstance(part, tuple):
         parts = tuple(fit_joints(x, n, f"{path}[{i}]") for i, x in enumerate(part))
         unchanged = all(a is b for a, b in zip(parts, part, strict=True))
@@ -652,6 +654,11 @@ def check_leaves(part: Any, path: str = "") -> None:
     """Raises ValueError for the first concrete leaf that is not finite or has the wrong sign, with
     its path.
     """
+    if modules.is_module(part):
+        for keys, leaf in jax.tree_util.tree_leaves_with_path(part):
+            if modules.is_float_array(leaf):
+                checks.check_values(path + jax.tree_util.keystr(keys), leaf, None)
+        return
     if isinstance(part, tuple):
         for i, x in enumerate(part):
             check_leaves(x, f"{path}[{i}]")
@@ -762,8 +769,8 @@ def _shared_dtype(scenario: Scenario) -> jax.typing.DTypeLike:
     for path, x in jax.tree_util.tree_leaves_with_path(scenario):
         if not isinstance(x, NUMBERS):
             name = jax.tree_util.keystr(path).lstrip(".")
-            remedy = "Other things belong in a static field."
-            raise checks.fail(name, x, "an array of numbers", remedy)
+            expected = "a component, numbers, or a module of arrays that JAX can take apart"
+            raise checks.fail(name, x, expected, HOW_TO_HOLD)
         # `result_type` would not see the type of a weakly typed array.
         types.add(x.dtype if isinstance(x, jax.Array) else jnp.result_type(x))
     supported = {jnp.dtype("float32"), jnp.dtype("float64")}
@@ -775,6 +782,13 @@ def _shared_dtype(scenario: Scenario) -> jax.typing.DTypeLike:
         remedy = 'Use iblf_jax.astype(scenario, "float32").'
         raise checks.fail("scenario", got, "float32 or float64", remedy)
     return jnp.result_type(float)
+
+
+HOW_TO_HOLD = (
+    "Declare a function or a setting with iblf_jax.static(); register the class of an object with"
+    " arrays with JAX (jax.tree_util.register_dataclass), or decorate it with iblf_jax.component."
+)
+"""The remedy for a field that JAX cannot take apart."""
 
 
 def fitted_to_step(scenario: Scenario, dt: float) -> Scenario:

@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from iblf_jax.core import devices
+from iblf_jax.core import devices, modules
 from iblf_jax.core.pytree import field_values, is_leaf_field
 from iblf_jax.engine import block_size, uses_host_compiler
 from iblf_jax.kernels import built_for
@@ -31,16 +31,24 @@ def describe_component(part: Any) -> Any:
         return [describe_component(x) for x in part]
     if isinstance(part, jax.Array | np.ndarray | np.generic | float | int):
         return np.asarray(part).tolist()
+    if modules.is_module(part):
+        inner = {str(k): describe_component(x) for k, x in modules.entries(part).items()}
+        return {"class": type(part).__qualname__, **inner}
     if not dataclasses.is_dataclass(part) or isinstance(part, type):
-        return repr(part)
+        return modules.name_of(part)
     fields = {name: describe_component(value) for name, value in field_values(part).items()}
     return {"class": type(part).__qualname__, **fields}
 
 
 def structure(part: Any) -> Any:
     """The classes and static fields of a component, without its numbers."""
+    if modules.is_module(part) and not isinstance(part, tuple | list):
+        inner = {str(k): structure(x) for k, x in modules.entries(part).items()}
+        return {"class": type(part).__qualname__, **inner}
     if isinstance(part, tuple | list):
         return [structure(x) for x in part]
+    if callable(part) and not modules.is_component(part):
+        return modules.name_of(part)
     if not dataclasses.is_dataclass(part) or isinstance(part, type):
         return None
     found: dict[str, Any] = {"class": type(part).__qualname__}

@@ -14,6 +14,7 @@ import numpy as np
 from iblf_jax.control.controllers import Backstepping
 from iblf_jax.control.observers import Printed
 from iblf_jax.core import checks
+from iblf_jax.core.modules import is_module
 from iblf_jax.core.pytree import field_values, is_leaf_field
 from iblf_jax.presets import customary_two_link, zhang_yan_2024
 from iblf_jax.simulation.scenario import Initial, Scenario, fit_joints
@@ -67,9 +68,12 @@ def _declared_sizes(member: Any) -> Iterator[int]:
 
 def _undeclared(member: Any) -> list[Any]:
     """Leaves of a class that was registered by hand, which no field declares."""
-    if dataclasses.is_dataclass(member) and any(map(is_leaf_field, dataclasses.fields(member))):
+    if not dataclasses.is_dataclass(member):
+        return jax.tree.leaves(member)
+    if any(map(is_leaf_field, dataclasses.fields(member))):
         return []
-    return jax.tree.leaves(member)
+    # The sizes of a network say nothing about the number of joints.
+    return jax.tree.leaves([x for x in field_values(member).values() if not is_module(x)])
 
 
 @contextmanager

@@ -318,6 +318,26 @@ CASES = {
     ),
     "gradient": (lambda x: jax.grad(lambda x: jnp.sum(jnp.sin(x) @ jnp.cos(x).T))(x), X),
     "gradient of a gather": (lambda x: jax.grad(lambda x: jnp.sum(x[0, :2] * x[1, 1:]))(x), X),
+    "activations of networks": (
+        lambda x: jnp.stack(
+            [
+                activation(x)
+                for activation in (
+                    jax.nn.relu,
+                    jax.nn.gelu,
+                    partial(jax.nn.gelu, approximate=False),
+                    jax.nn.softplus,
+                    jax.nn.silu,
+                    jax.nn.elu,
+                    jax.nn.mish,
+                    jax.nn.leaky_relu,
+                    jax.nn.softmax,
+                    jax.nn.standardize,
+                )
+            ]
+        ),
+        X,
+    ),
     "determinant": (lambda x: jnp.linalg.norm(x, axis=1), X),
 }
 

@@ -1,0 +1,339 @@
+"""Networks of Equinox and Flax NNX, and plain pytrees, as fields of components."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import pickle
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import SHORT
+
+import iblf_jax as ij
+from iblf_jax.core import modules
+from iblf_jax.studies.store_config import describe_component, structure
+
+
+@ij.component
+class Learned:
+    """Torque of a network of q and q'."""
+
+    net: Any
+
+    def torque(self, t, q, dq, plant, model):
+        return self.net(jnp.concatenate([q, dq]))
+
+    def jump_times(self):
+        return jnp.zeros(0)
+
+
+@ij.component
+class Plain:
+    """The same with the weights in a dict."""
+
+    net: Any
+
+    def torque(self, t, q, dq, plant, model):
+        hidden = jnp.concatenate([q, dq])
+        for (weight, bias), activation in zip(
+            self.net["layers"], self.net["activations"], strict=True
+        ):
+            hidden = activation(weight @ hidden + bias)
+        return self.net["out"] @ hidden
+
+    def jump_times(self):
+        return jnp.zeros(0)
+
+
+@ij.component
+class NetworkObserver:
+    """f_hat = net(q') + the estimate of the rest by the inner observer."""
+
+    observer: Any
+    net: Any
+
+    def init(self, q, dq, model):
+        return self.observer.init(q, dq, model)
+
+    def estimate(self, t, q, dq, model, state):
+        return self.observer.estimate(t, q, dq, model, state) + self.net(dq)
+
+    def derivative(self, t, q, dq, tau, model, state):
+        return self.observer.derivative(t, q, dq, tau + self.net(dq), model, state)
+
+
+@ij.component
+class NetworkLaw:
+    """tau = G0 + K (q_d - q) - D q' + net(q')."""
+
+    K: ij.Leaf = ij.leaf("N m/rad", sign="positive")
+    D: ij.Leaf = ij.leaf("N m s/rad", sign="positive")
+    net: Any
+
+    def init(self, q, dq, context):
+        return ()
+
+    def command(self, t, q, dq, f_hat, context, state):
+        tube, no = context.tube(t), jnp.zeros(q.shape, bool)
+        tau = context.model.gravity(q) + self.K * (tube.q_d - q) - self.D * dq + self.net(dq)
+        return ij.controllers.Command(tau, tube.dq_d, 0.0 * q, no, no), ()
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Layer:
+    """A registered dataclass with an array and a setting."""
+
+    weight: Any
+    scale: int = dataclasses.field(default=2, metadata={"static": True})
+
+    def __call__(self, x):
+        return self.scale * jnp.tanh(self.weight @ x)
+
+
+def mlp(seed=0, activation=jnp.tanh, size=4, width=3):
+    return eqx.nn.MLP(size, 2, width, 1, activation=activation, key=jax.random.key(seed))
+
+
+def weights_of(seed=0, *activations):
+    rng = np.random.default_rng(seed)
+    layers = [[rng.normal(size=(4, 4)), rng.normal(size=4)] for _ in activations]
+    return {"layers": layers, "activations": activations, "out": 0.1 * rng.normal(size=(2, 4))}
+
+
+@pytest.fixture(scope="module")
+def paper():
+    return ij.presets.zhang_yan_2024()
+
+
+@pytest.fixture(scope="module")
+def scenario(paper):
+    return ij.with_parts(paper, disturbance=Learned(mlp()))
+
+
+def paths_below(part):
+    return [p.path for p in ij.parameters(part)]
+
+
+def test_arrays_are_leaves_with_paths_and_the_rest_is_structure(scenario):
+    net = scenario.disturbance.net
+    assert isinstance(net, eqx.nn.MLP) and net.activation is jnp.tanh
+    assert paths_below(scenario.disturbance) == [
+        f"net.layers[{i}].{name}" for i in (0, 1) for name in ("weight", "bias")
+    ]
+    assert all(isinstance(x, jax.Array) for x in jax.tree.leaves(scenario))
+    plain = Plain(weights_of(0, jnp.tanh))
+    assert paths_below(plain) == ["net[layers][0][0]", "net[layers][0][1]", "net[out]"]
+    assert paths_below(Learned(Layer(np.ones((2, 4))))) == ["net.weight"]
+    assert paths_below(Learned((np.ones((2, 4)), [np.ones(3)]))) == ["net[0]", "net[1][0]"]
+    assert paths_below(Learned({"a b": [[1.0, 2.0]], "[": 3.0})) == ['net["["]', "net[a b]"]
+
+
+def test_a_path_changes_one_number_and_keeps_the_structure(scenario):
+    path = "disturbance.net.layers[0].weight[1][2]"
+    changed = ij.with_parameters(scenario, {path: 0.25})
+    before, after = (s.disturbance.net.layers[0].weight for s in (scenario, changed))
+    assert np.array_equal(after, before.at[1, 2].set(0.25))
+    assert jax.tree.structure(changed) == jax.tree.structure(scenario)
+    assert changed.disturbance.net.activation is jnp.tanh
+    for wrong in ("net.layers[2].bias", "net.activation", "net.in_size", "net.layers[0]"):
+        with pytest.raises(ValueError, match="the path of a leaf"):
+            ij.with_parameters(scenario, {f"disturbance.{wrong}": 1.0})
+    plain = ij.with_parts(scenario, disturbance=Plain(weights_of(0, jnp.tanh)))
+    new = ij.with_parameters(plain, {"disturbance.net[layers][0][1][3]": 7.0})
+    assert new.disturbance.net["layers"][0][1][3] == 7.0
+    assert isinstance(new.disturbance.net["layers"], list)
+
+
+def test_programs_are_found_by_structure(scenario):
+    traces = []
+
+    @jax.jit
+    def torque(s):
+        traces.append(1)
+        return s.disturbance.torque(0.0, s.initial.q, s.initial.dq, s.plant, s.model)
+
+    for seed in range(3):
+        torque(ij.with_parts(scenario, disturbance=Learned(mlp(seed))))
+    assert len(traces) == 1
+    torque(ij.with_parts(scenario, disturbance=Learned(mlp(activation=jax.nn.relu))))
+    assert len(traces) == 2
+    # 1, 1.0 and True are equal, but not the same structure.
+    nodes = [jax.tree.structure(modules.Structure(x)) for x in (1, 1.0, True)]
+    assert len({*nodes}) == 3
+
+
+def numpy_torque(net, x):
+    weight, bias = (np.asarray(y) for y in (net.layers[0].weight, net.layers[0].bias))
+    hidden = np.tanh(weight @ x + bias)
+    return np.asarray(net.layers[1].weight) @ hidden + np.asarray(net.layers[1].bias)
+
+
+def test_the_torque_of_a_run_is_that_of_numpy(scenario):
+    run = ij.simulate(scenario, **SHORT)
+    for k in (0, 7, len(run.t) - 1):
+        x = np.concatenate([run.q[k], run.dq[k]])
+        expected = numpy_torque(scenario.disturbance.net, x)
+        assert np.allclose(run.disturbance[k], expected, rtol=0, atol=1e-9)
+
+
+def test_a_compiled_batch_over_weights_is_its_single_runs(paper):
+    deep = ij.with_parts(paper, disturbance=Plain(weights_of(1, jnp.tanh)))
+    spread = {"disturbance.net[layers][0][0]": ij.factor(ij.uniform(0.5, 1.5))}
+    batch = ij.monte_carlo(deep, spread, runs=3, seed=2, **SHORT)
+    assert len({*np.asarray(batch.metrics.rmse)[:, 0].tolist()}) == 3
+    again = batch.replay(1)
+    assert np.allclose(again.metrics.rmse, batch.metrics.rmse[1], rtol=1e-10, atol=0)
+    first = [x.disturbance.net["layers"][0][0] for x in (again.scenario, deep)]
+    assert not np.array_equal(*first)
+
+
+def test_gradient_by_a_weight_and_single_precision(scenario):
+    path = "disturbance.net.layers[1].bias"
+    start = scenario.disturbance.net.layers[1].bias
+
+    def position(bias):
+        return ij.simulate(ij.with_parameters(scenario, {path: bias}), **SHORT).q[-1, 0]
+
+    slope = jax.grad(position)(start)
+    step = jnp.asarray([1e-4, 0.0])
+    difference = (position(start + step) - position(start - step)) / 2e-4
+    assert np.isclose(slope[0], difference, rtol=1e-6)
+    single = ij.simulate(ij.astype(scenario, "float32"), **SHORT)
+    assert single.q.dtype == jnp.float32
+    assert np.allclose(single.q, ij.simulate(scenario, **SHORT).q, atol=1e-5)
+
+
+@pytest.mark.release
+def test_the_checkers_accept_members_with_networks():
+    ij.testing.check_disturbance(Learned(mlp(width=7)))
+    ij.testing.check_disturbance(Plain(weights_of(0, jnp.tanh)))
+    ij.testing.check_observer(NetworkObserver(ij.observers.Momentum(20.0), mlp(size=2, width=7)))
+    ij.testing.check_law(NetworkLaw(60.0, 20.0, mlp(size=2, width=7)))
+
+
+@pytest.mark.release
+def test_studies_over_weights(scenario, tmp_path):
+    path = "disturbance.net.layers[1].bias[0]"
+    points = {path: [0.0, 1.0]}
+    table = ij.sweep(scenario, points, store=tmp_path / "s.zarr", **SHORT)
+    fresh = ij.with_parts(scenario, disturbance=Learned(mlp()))
+    again = ij.sweep(fresh, points, store=tmp_path / "s.zarr", **SHORT)
+    assert np.array_equal(table.rmse, again.rmse)
+    assert float(table.rmse[0, 0]) != float(table.rmse[1, 0])
+    result = ij.tune(
+        scenario, [ij.tunable(path, -1.0, 1.0)], ij.objectives.tracking(), effort="quick", **SHORT
+    )
+    assert result.scenario.disturbance.net.activation is jnp.tanh
+
+
+@pytest.mark.release
+def test_certify_evaluates_a_loop_with_a_network(scenario):
+    quiet = eqx.tree_at(lambda n: n.layers[1], mlp(), jax.tree.map(jnp.zeros_like, mlp().layers[1]))
+    none = ij.with_parts(scenario, disturbance=ij.disturbances.Nothing())
+    names = [line.name for line in ij.certify(none).lines]
+    found = ij.certify(ij.with_parts(scenario, disturbance=Learned(quiet)))
+    assert [line.name for line in found.lines] == names
+
+
+def test_components_with_modules_are_copied_by_pickle(scenario):
+    division = scenario.disturbance._divisions[0][1]
+    again = pickle.loads(pickle.dumps(division))
+    assert again == division and hash(again) == hash(division)
+
+
+def test_stores_describe_modules_without_addresses(scenario):
+    for describe in (describe_component, structure):
+        text = str(describe(scenario.disturbance))
+        assert "0x" not in text and "tanh" in text
+        assert text == str(describe(Learned(mlp())))
+    assert "relu" in str(structure(Learned(mlp(activation=jax.nn.relu))))
+
+
+def test_tables_show_a_large_module_as_one_row(paper):
+    deep = eqx.nn.MLP(4, 2, 16, 7, key=jax.random.key(0))
+    table = ij.parameters(ij.with_parts(paper, disturbance=Learned(deep)))
+    rows = [row for row in repr(table).splitlines() if "disturbance" in row]
+    numbers = sum(x.size for x in jax.tree.leaves(eqx.filter(deep, eqx.is_array)))
+    assert len(rows) == 1 and f"16 arrays, {numbers} numbers" in rows[0]
+    assert sum("disturbance" in p.path for p in table) == 16
+    small = repr(ij.parameters(Learned(mlp(width=16))))
+    assert "64 numbers from" in small
+
+
+class Unregistered:
+    """A network that JAX does not know."""
+
+    def __init__(self):
+        self.weight = jnp.ones((2, 4))
+
+    def __call__(self, x):
+        return self.weight @ x
+
+
+REFUSED = {
+    "hidden arrays": ({"net": Unregistered()}, "register_dataclass"),
+    "partial": ({"f": functools.partial(jnp.add, jnp.ones(2))}, "register_dataclass"),
+    "no hash": ({"w": np.ones(2), "set": {1, 2}}, "hashable"),
+    "complex": ({"w": np.ones(2) * 1j}, "real numbers"),
+    "random state": ({"w": np.ones(2), "key": jax.random.key(0)}, "random state"),
+    "keys": ({"w": {1: np.ones(2)}}, "strings"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_is_no_module_is_refused_by_name(case):
+    value, words = REFUSED[case]
+    with pytest.raises(ValueError, match=words) as caught:
+        Learned(value)
+    assert str(caught.value).startswith("Learned.net")
+
+
+@pytest.mark.parametrize("value", [Unregistered(), lambda x: x], ids=["object", "function"])
+def test_an_object_that_jax_does_not_know_is_refused_with_a_remedy(paper, value):
+    with pytest.raises(ValueError, match=r"disturbance\.net: .*register_dataclass"):
+        ij.simulate(ij.with_parts(paper, disturbance=Learned(value)), **SHORT)
+
+
+def test_weights_that_are_not_finite_are_refused_with_their_path(paper):
+    net = eqx.tree_at(lambda n: n.layers[0].bias, mlp(), jnp.full(3, jnp.nan))
+    with pytest.raises(ValueError, match=r"disturbance\.net\.layers\[0\]\.bias: .*finite"):
+        ij.simulate(ij.with_parts(paper, disturbance=Learned(net)), **SHORT)
+
+
+def test_arrays_of_integers_are_structure():
+    part = Learned({"w": np.ones(3), "order": np.array([2, 0, 1])})
+    assert paths_below(part) == ["net[w]"]
+    again = jax.tree.map(lambda x: 2.0 * x, part)
+    assert np.array_equal(again.net["order"], [2, 0, 1]) and again.net["w"][0] == 2.0
+    other = Learned({"w": np.ones(3), "order": np.array([2, 1, 0])})
+    assert jax.tree.structure(part) != jax.tree.structure(other)
+
+
+def test_flax_modules_are_fields(paper):
+    nnx = pytest.importorskip("flax.nnx")
+
+    class Net(nnx.Module):
+        def __init__(self, rngs):
+            self.hidden = nnx.Linear(4, 3, rngs=rngs)
+            self.out = nnx.Linear(3, 2, rngs=rngs)
+            self.activation = nnx.gelu
+
+        def __call__(self, x):
+            return self.out(self.activation(self.hidden(x)))
+
+    net = Net(nnx.Rngs(0))
+    scenario = ij.with_parts(paper, disturbance=Learned(net))
+    path = "disturbance.net.out.bias.value"
+    assert path in paths_below(scenario)
+    changed = ij.with_parameters(scenario, {path: [1.0, -1.0]})
+    assert jax.tree.structure(changed) == jax.tree.structure(scenario)
+    x = jnp.arange(4.0)
+    torque = jax.jit(lambda s: s.disturbance.torque(0.0, x[:2], x[2:], s.plant, s.model))(changed)
+    expected = np.asarray(net(x.astype("float32"))) + np.array([1.0, -1.0])
+    assert np.allclose(torque, expected, atol=1e-6)

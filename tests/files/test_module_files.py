@@ -1,0 +1,215 @@
+"""Scenario files with modules of other libraries: structure in the text, weights beside it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import iblf_jax as ij
+from iblf_jax.files.scenario import scenario_to_dict, scenario_to_toml
+
+
+@ij.component
+class Learned:
+    """Torque of a network of q and q'."""
+
+    net: Any
+
+    def torque(self, t, q, dq, plant, model):
+        return self.net(jnp.concatenate([q, dq]))
+
+    def jump_times(self):
+        return jnp.zeros(0)
+
+
+@ij.component
+class NetworkObserver:
+    """f_hat = net(q') + the estimate of the rest by the inner observer."""
+
+    observer: ij.observers.Observer
+    net: Any
+
+    def init(self, q, dq, model):
+        return self.observer.init(q, dq, model)
+
+    def estimate(self, t, q, dq, model, state):
+        return self.observer.estimate(t, q, dq, model, state) + self.net(dq)
+
+    def derivative(self, t, q, dq, tau, model, state):
+        return self.observer.derivative(t, q, dq, tau + self.net(dq), model, state)
+
+
+@jax.tree_util.register_pytree_with_keys_class
+class Opaque:
+    """A module whose structure a file cannot describe."""
+
+    def __init__(self, gain):
+        self.gain = gain
+
+    def __call__(self, x):
+        return self.gain @ x
+
+    def tree_flatten_with_keys(self):
+        return ((jax.tree_util.GetAttrKey("gain"), self.gain),), None
+
+    @classmethod
+    def tree_unflatten(cls, aux, children):
+        return cls(*children)
+
+
+@pytest.fixture(autouse=True)
+def named(monkeypatch):
+    monkeypatch.setitem(ij.disturbances.MEMBERS, "learned", Learned)
+    monkeypatch.setitem(ij.observers.MEMBERS, "network_observer", NetworkObserver)
+
+
+def mlp(seed=0, size=4, activation=jnp.tanh):
+    return eqx.nn.MLP(size, 2, 3, 1, activation=activation, key=jax.random.key(seed))
+
+
+def with_net(net):
+    return ij.with_parts(ij.presets.zhang_yan_2024(), disturbance=Learned(net))
+
+
+def same(a, b):
+    pairs = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
+    return jax.tree.structure(a) == jax.tree.structure(b) and all(
+        np.array_equal(x, y) and x.dtype == y.dtype for x, y in pairs
+    )
+
+
+SAVED = {
+    "equinox": lambda: mlp(activation=jax.nn.gelu),
+    "dict": lambda: {"w": [np.ones((2, 4)), (np.zeros(2),)], "f": jnp.tanh, "name": "a", "k": None},
+    "integers": lambda: {"w": np.ones(2), "order": np.array([1, 0])},
+    "list": lambda: [np.ones((2, 4)), np.ones(2)],
+}
+
+
+@pytest.mark.parametrize("name", SAVED)
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_a_saved_scenario_is_the_same(name, dtype, tmp_path):
+    scenario = ij.astype(with_net(SAVED[name]()), dtype)
+    ij.save_scenario(scenario, tmp_path / "a.toml")
+    assert same(ij.load_scenario(tmp_path / "a.toml"), scenario)
+    text = (tmp_path / "a.toml").read_text()
+    assert 'weights = "a.weights.npz"' in text and "arrays" not in text
+    assert "arrays" in scenario_to_toml(scenario)  # a text alone is complete
+
+
+def test_the_weights_of_another_scenario_are_refused(tmp_path):
+    for name, seed in {"a": 0, "b": 1}.items():
+        ij.save_scenario(with_net(mlp(seed)), tmp_path / f"{name}.toml")
+    (tmp_path / "b.weights.npz").rename(tmp_path / "a.weights.npz")
+    with pytest.raises(ValueError, match=r"disturbance\.net\.digest: .*beside it"):
+        ij.load_scenario(tmp_path / "a.toml")
+    (tmp_path / "a.weights.npz").write_bytes(b"PK no archive")
+    with pytest.raises(ValueError, match=r"disturbance\.net\.weights"):
+        ij.load_scenario(tmp_path / "a.toml")
+    (tmp_path / "a.weights.npz").unlink()
+    with pytest.raises(ValueError, match="Nothing is there"):
+        ij.load_scenario(tmp_path / "a.toml")
+
+
+def test_a_module_that_a_file_cannot_describe_is_passed(tmp_path):
+    scenario = with_net(Opaque(0.1 * jnp.arange(8.0).reshape(2, 4)))
+    ij.save_scenario(scenario, tmp_path / "a.toml")
+    with pytest.raises(ValueError, match=r'modules=\{"disturbance.net"'):
+        ij.load_scenario(tmp_path / "a.toml")
+    given = {"disturbance.net": Opaque(jnp.zeros((2, 4)))}
+    assert same(ij.load_scenario(tmp_path / "a.toml", modules=given), scenario)
+    for wrong in (Opaque(jnp.zeros((2, 3))), mlp()):
+        with pytest.raises(ValueError, match=r"modules\['disturbance.net'\]"):
+            ij.load_scenario(tmp_path / "a.toml", modules={"disturbance.net": wrong})
+    with pytest.raises(ValueError, match=r"Did you mean disturbance\.net"):
+        ij.load_scenario(tmp_path / "a.toml", modules={"disturbance.nets": mlp()})
+    # A lambda has no import path.
+    scenario = with_net(mlp(activation=lambda x: jnp.tanh(2.0 * x)))
+    ij.save_scenario(scenario, tmp_path / "b.toml")
+    given = {"disturbance.net": scenario.disturbance.net}
+    assert same(ij.load_scenario(tmp_path / "b.toml", modules=given), scenario)
+
+
+def test_flax_modules_are_passed(tmp_path):
+    nnx = pytest.importorskip("flax.nnx")
+    net = nnx.Linear(4, 2, rngs=nnx.Rngs(0))
+    scenario = with_net(net)
+    ij.save_scenario(scenario, tmp_path / "a.toml")
+    given = {"disturbance.net": nnx.Linear(4, 2, rngs=nnx.Rngs(1))}
+    again = ij.load_scenario(tmp_path / "a.toml", modules=given)
+    assert np.allclose(again.disturbance.net.kernel[...], net.kernel[...])
+
+
+MALICIOUS = {
+    "os:system": "import path",
+    "builtins:eval": "import path",
+    "json:os.system": "import path",
+    "jax:os.system": "import path",
+    "not_a_package:f": "import path",
+    "jax.nn:no_such_function": "import path",
+}
+
+
+@pytest.mark.parametrize("path", MALICIOUS)
+def test_files_lead_to_no_function_of_python_and_import_nothing(path, tmp_path):
+    ij.save_scenario(with_net(mlp()), tmp_path / "a.toml")
+    text = (tmp_path / "a.toml").read_text()
+    assert "jax.nn:tanh" in text
+    (tmp_path / "a.toml").write_text(text.replace("jax.nn:tanh", path))
+    with pytest.raises(ValueError, match=MALICIOUS[path]):
+        ij.load_scenario(tmp_path / "a.toml")
+
+
+BROKEN = {
+    "no JSON": "{",
+    "a number": "3",
+    "an unknown kind": '{"pickle": "x"}',
+    "no array": '{"dict": {"v": "array"}}',
+    "too few arrays": '{"dict": {}}',
+    "no dataclass": '{"class": "jax.nn:relu", "fields": {}}',
+    "other fields": '{"class": "equinox.nn:Linear", "fields": {"weight": "array"}}',
+    "nested": "[" * 60 + "]" * 60,
+}
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_a_broken_description_is_refused_with_its_key(case):
+    tables = scenario_to_dict(with_net({"w": np.ones(2)}))
+    tables["disturbance"]["net"]["structure"] = BROKEN[case]
+    from iblf_jax.files.scenario import from_dict
+
+    with pytest.raises(ValueError, match=r"disturbance\.net\.(structure|arrays)"):
+        from_dict(tables)
+
+
+def test_a_network_is_part_of_an_exported_law(tmp_path):
+    observer = NetworkObserver(ij.observers.Momentum(kf=20.0), mlp(size=2))
+    scenario = ij.with_parts(
+        ij.presets.zhang_yan_2024(), observer=observer, sampling=ij.Sampling(1e-3)
+    )
+    ij.save_scenario(scenario, tmp_path / "a.toml")
+    assert same(ij.load_scenario(tmp_path / "a.toml"), scenario)
+    written = ij.export(scenario, tmp_path / "c")
+    header = (tmp_path / "c" / "iblf_law.h").read_text()
+    assert "weight[3][2]" in header and "observer.net.layers[0].weight" in written.parameters
+    command = ["gcc", "-O1", "iblf_law.c", "selftest.c", "-lm", "-o", "selftest"]
+    subprocess.run(command, cwd=tmp_path / "c", check=True)
+    done = subprocess.run(["./selftest"], cwd=tmp_path / "c", capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_the_description_is_json_of_import_paths():
+    table = scenario_to_dict(with_net(mlp()))["disturbance"]["net"]
+    structure = json.loads(table["structure"])
+    assert structure["class"] == "equinox.nn:MLP"
+    assert structure["fields"]["activation"] == {"import": "jax.nn:tanh"}
+    assert [*table["arrays"]] == [
+        f"layers[{i}].{name}" for i in (0, 1) for name in ("weight", "bias")
+    ]
