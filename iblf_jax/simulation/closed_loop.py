@@ -52,7 +52,7 @@ from iblf_jax.simulation.levels import (
     uncertain_term,
 )
 from iblf_jax.simulation.noise import normals
-from iblf_jax.simulation.sampling import Instant
+from iblf_jax.simulation.sampling import Instant, SentCommand, nothing_sent
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import Sample
 from iblf_jax.world import plants
@@ -79,10 +79,14 @@ class LawSignals(NamedTuple):
     torque: Any = ()
     """The torque that a law of a robot commanded through another input, (n,) [N m]; `()` where the
     input is the torque."""
+    auxiliary: Any = ()
+    events: Any = ()
 
 
-def law_signals(command: Command, f_hat: jax.Array) -> LawSignals:
-    """The signals of a law that answered with `command` to the estimate `f_hat`."""
+def law_signals(command: Command, f_hat: jax.Array, sent: Any = ()) -> LawSignals:
+    """The signals of a law that answered with `command` to the estimate `f_hat`; `sent` is the
+    `SentCommand` of an event trigger, or `()`.
+    """
     has_other_input = not isinstance(command.input, tuple)
     return LawSignals(
         command.alpha,
@@ -94,6 +98,8 @@ def law_signals(command: Command, f_hat: jax.Array) -> LawSignals:
         command.region_slack,
         command.alpha_higher,
         command.tau if has_other_input else (),
+        command.auxiliary,
+        sent.count if sent else (),
     )
 
 
@@ -113,6 +119,8 @@ class SampledState(NamedTuple):
     """The last measurement."""
     signals: LawSignals
     """Signals of the law at its last run."""
+    sent: Any = ()
+    """The `SentCommand` of a loop with an event trigger."""
 
 
 class LoopState(NamedTuple):
@@ -174,12 +182,15 @@ def _initial_sampled_state(scenario: Scenario, state: LoopState, tau: jax.Array)
         scenario.context,
         state.controller,
     )
-    blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), law_signals(command, f_hat))
+    sent = () if sampling.trigger is None else nothing_sent(tau)
+    shapes = law_signals(command, f_hat, sent)
+    blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
     return SampledState(
         commands=jnp.repeat(tau[None], sampling.queue + 1, axis=0),
         sensor=part.init(*sensor_state(scenario, q, dq, state.higher), sampling.period),
         measured=Measurement(q, dq, state.higher),
         signals=blank,
+        sent=sent,
     )
 
 
@@ -314,6 +325,8 @@ def sample_at(
         saturated=signals.saturated | limited,
         slack=signals.slack,
         region_slack=signals.region_slack,
+        auxiliary=signals.auxiliary,
+        events=signals.events,
         **optional,
     )
 
@@ -415,11 +428,14 @@ class LawUpdate(NamedTuple):
     measured: Measurement
     """The measurement, with the observer's estimates of levels that are not measured."""
     command: Command
+    """That of the law; with an event trigger its torque and its input are those that were sent."""
     f_hat: jax.Array
     controller: Any
     """State of the law at the next sample."""
     observer: Any
     """State of the observer at the next sample."""
+    sent: Any = ()
+    """The `SentCommand` of a loop with an event trigger."""
 
 
 def discrete_observer(scenario: Scenario) -> Any:
@@ -438,7 +454,12 @@ def discrete_observer(scenario: Scenario) -> Any:
 
 
 def law_update(
-    scenario: Scenario, t: jax.Array, measured: Measurement, controller: Any, observer: Any
+    scenario: Scenario,
+    t: jax.Array,
+    measured: Measurement,
+    controller: Any,
+    observer: Any,
+    sent: Any = (),
 ) -> LawUpdate:
     """Command and next states of law and observer for one measurement: the program that runs on
     the robot's computer.
@@ -448,6 +469,7 @@ def law_update(
       t: start of the period, () [s].
       measured: measurement at t.
       controller, observer: their states at t.
+      sent: the `SentCommand` before t of a loop with an event trigger.
     """
     sampling: Any = scenario.sampling
     running = discrete_observer(scenario)
@@ -458,10 +480,20 @@ def law_update(
     command, controller_rate = law.command(
         t, *law_state(scenario, q, dq, higher), f_hat, scenario.context, controller
     )
+    if sampling.trigger is not None:
+        sent = sampling.trigger.sent(plant_input(command), command.tau, sent)
+        command = _with_sent_input(command, sent)
     arguments = observer_arguments(scenario, running, t, q, dq, higher, command.tau, observer)
     next_observer = _next_observer_state(sampling, running, arguments)
     next_controller = _euler(controller, controller_rate, sampling.period)
-    return LawUpdate(measured, command, f_hat, next_controller, next_observer)
+    return LawUpdate(measured, command, f_hat, next_controller, next_observer, sent)
+
+
+def _with_sent_input(command: Command, sent: SentCommand) -> Command:
+    """A command with the torque and the input that an event trigger sent."""
+    if isinstance(command.input, tuple):
+        return command._replace(tau=sent.input)
+    return command._replace(tau=sent.torque, input=sent.input)
 
 
 def _next_observer_state(sampling: Any, observer: Any, arguments: tuple) -> Any:
@@ -500,13 +532,13 @@ def run_sampled_law(
     )
     if isinstance(measured.higher, tuple):
         measured = measured._replace(higher=state.higher)
-    update = law_update(scenario, t, measured, state.controller, state.observer)
+    update = law_update(scenario, t, measured, state.controller, state.observer, before.sent)
     commands = jnp.concatenate([plant_input(update.command)[None], before.commands[:-1]])
-    signals = law_signals(update.command, update.f_hat)
+    signals = law_signals(update.command, update.f_hat, update.sent)
     return state._replace(
         controller=update.controller,
         observer=update.observer,
-        sampled=SampledState(commands, sensor, update.measured, signals),
+        sampled=SampledState(commands, sensor, update.measured, signals, update.sent),
     )
 
 
@@ -557,9 +589,9 @@ def perturbed_rate(
     """The function whose derivative linearises the loop.
 
     For a continuous loop it is the rate of the state. For a sampled loop it is the rate of the
-    plant, the next command, and the next states of law, observer and sensor. Rounding of a sensor
-    and limits of an actuator are left out (`Sensor.unrounded`, `Actuator.unlimited`), because their
-    derivatives vanish and would show an open loop.
+    plant, the next command, and the next states of law, observer and sensor. Rounding of a sensor,
+    limits of an actuator and an event trigger are left out (`Sensor.unrounded`,
+    `Actuator.unlimited`), because their derivatives vanish and would show an open loop.
 
     Args:
       scenario: the scenario.
@@ -575,7 +607,10 @@ def perturbed_rate(
             arguments.append(dt)
         return compiled(evaluate)(*arguments)[0]
     scenario = dataclasses.replace(
-        scenario, sensor=unrounded(scenario.sensor), actuator=unlimited(scenario.actuator)
+        scenario,
+        sensor=unrounded(scenario.sensor),
+        actuator=unlimited(scenario.actuator),
+        sampling=dataclasses.replace(scenario.sampling, trigger=None),
     )
     controller, observer, sensor = perturbed.memory
     state = with_integrated_part(initial_state(scenario), perturbed.plant)

@@ -74,6 +74,8 @@ def exact_levels(
     tubes: list[Tube] = []
     for i, design in enumerate(designs):
         terms = order - i  # the virtual control, and its derivatives that the levels above need
+        if i == order - 1:
+            centre_curve = list(context.shifted(*centre_curve[:2]))
         lower, upper = _curve_of_bounds(
             context, i + 1, time_curve[: terms + 1], centre_curve[: terms + 1]
         )
@@ -114,8 +116,10 @@ def surface_levels(
         levels.append(_level(design, i, plant, t, x, tubes[i], slope, d_hat))
         slope = levels[i].slope
         if i < len(designs) - 1:
-            rate = (levels[i].alpha - state[i]) / filters[i]
-            tubes.append(_filtered_tube(context, i + 2, t, state[i], rate))
+            centre, rate = state[i], (levels[i].alpha - state[i]) / filters[i]
+            if i == len(designs) - 2:
+                centre, rate = context.shifted(centre, rate)
+            tubes.append(_filtered_tube(context, i + 2, t, centre, rate))
     return levels, tubes
 
 

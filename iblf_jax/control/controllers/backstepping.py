@@ -67,6 +67,7 @@ class Backstepping:
     weight: Leaf = leaf("N m rad", sign="positive", default=None)
     gains: ClassVar[tuple[str, ...]] = ("k1", "K2")
     unit_factors: ClassVar[tuple[str, ...]] = ("weight",)
+    takes_shift: ClassVar[bool] = True
     leaf_units = weight_units
     init = no_state
 
@@ -111,7 +112,8 @@ class Backstepping:
         feedforward = rigid_body_torque(context.model, q, dq, v, dalpha)
         tau = feedforward - f_hat - self.K2 * (dq - alpha)
         tau = tau - self.weight * self.barrier.slope(tube, q)
-        return barrier_command(self, tube, q, alpha, tau), ()
+        command = barrier_command(self, tube, q, alpha, tau)
+        return command._replace(input_slope=dq - alpha), ()
 
 
 def barrier_command(law, tube: Tube, q: jax.Array, alpha: jax.Array, tau: jax.Array) -> Command:
@@ -164,10 +166,10 @@ def alpha_and_rate(
     law, t: jax.Array, q: jax.Array, dq: jax.Array, context: LawContext
 ) -> tuple[jax.Array, jax.Array]:
     """Virtual velocity [rad/s] and its total time derivative alpha' [rad/s^2] along q', each (n,),
-    for a law with `barrier`, `k1`, `o`.
+    for a law with `barrier`, `k1`, `o`; with the context's shift.
     """
 
     def alpha_at(t, q):
         return virtual_velocity(law, t, q, context)
 
-    return jax.jvp(alpha_at, (t, q), (jnp.ones_like(t), dq))
+    return context.shifted(*jax.jvp(alpha_at, (t, q), (jnp.ones_like(t), dq)))

@@ -60,6 +60,7 @@ class DynamicSurface:
     weight: Leaf = leaf("N m rad", sign="positive", default=None)
     gains: ClassVar[tuple[str, ...]] = ("k1", "K2")
     unit_factors: ClassVar[tuple[str, ...]] = ("weight",)
+    takes_shift: ClassVar[bool] = True
     leaf_units = weight_units
 
     def check(self) -> None:
@@ -84,7 +85,9 @@ class DynamicSurface:
         """The torque, what belongs to it, and beta'."""
         tube, beta = context.tube(t), state
         dbeta = (virtual_velocity(self, t, q, context) - beta) / self.filter
-        feedforward = rigid_body_torque(context.model, q, dq, beta, dbeta)
-        tau = feedforward - f_hat - self.K2 * (dq - beta)
+        centre, rate = context.shifted(beta, dbeta)
+        feedforward = rigid_body_torque(context.model, q, dq, centre, rate)
+        tau = feedforward - f_hat - self.K2 * (dq - centre)
         tau = tau - self.weight * self.barrier.slope(tube, q)
-        return barrier_command(self, tube, q, beta, tau), dbeta
+        command = barrier_command(self, tube, q, centre, tau)
+        return command._replace(input_slope=dq - centre), dbeta
