@@ -99,7 +99,7 @@ def law_signals(command: Command, f_hat: jax.Array, sent: Any = ()) -> LawSignal
         command.alpha_higher,
         command.tau if has_other_input else (),
         command.auxiliary,
-        sent.count if sent else (),
+        sent.number if sent else (),
     )
 
 
@@ -606,11 +606,12 @@ def perturbed_rate(
         if dt is not None:
             arguments.append(dt)
         return compiled(evaluate)(*arguments)[0]
+    sampling: Any = scenario.sampling
     scenario = dataclasses.replace(
         scenario,
         sensor=unrounded(scenario.sensor),
         actuator=unlimited(scenario.actuator),
-        sampling=dataclasses.replace(scenario.sampling, trigger=None),
+        sampling=dataclasses.replace(sampling, trigger=None),
     )
     controller, observer, sensor = perturbed.memory
     state = with_integrated_part(initial_state(scenario), perturbed.plant)

@@ -547,7 +547,7 @@ class Auxiliary:
 
 
 class _EventTimes(NamedTuple):
-    count: jax.Array
+    events: jax.Array
     """Commands sent so far."""
     first: jax.Array
     """Time of the first event."""
@@ -579,8 +579,8 @@ class Events:
 
     def update(self, acc: _EventTimes, sample: Sample) -> _EventTimes:
         """Adds one sample."""
-        is_first = (sample.events > acc.count) & (acc.count == 0.0)
-        is_later = (sample.events > acc.count) & (acc.count > 0.0)
+        is_first = (sample.events > acc.events) & (acc.events == 0.0)
+        is_later = (sample.events > acc.events) & (acc.events > 0.0)
         interval = jnp.where(is_later, sample.t - acc.last, jnp.inf)
         return _EventTimes(
             sample.events,
@@ -591,10 +591,10 @@ class Events:
 
     def finish(self, acc: _EventTimes) -> dict[str, jax.Array]:
         """event_count, shortest_interval and mean_interval, () each."""
-        intervals = acc.count - 1.0
+        intervals = acc.events - 1.0
         mean = (acc.last - acc.first) / jnp.maximum(intervals, 1.0)
         return {
-            "event_count": acc.count,
+            "event_count": acc.events,
             "shortest_interval": acc.shortest,
             "mean_interval": jnp.where(intervals > 0.0, mean, jnp.inf),
         }

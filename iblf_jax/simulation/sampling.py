@@ -33,7 +33,7 @@ class SentCommand(NamedTuple):
     torque: jax.Array
     """Torque of the law, (n,) [N m], which observers receive; the input itself, unless an input map
     such as `controllers.WithDrive` has another."""
-    count: jax.Array
+    number: jax.Array
     """Number of commands sent so far, () of floating-point type."""
 
 
@@ -76,11 +76,11 @@ class EventTrigger:
           last: the command that was sent last.
         """
         threshold = self.relative * jnp.abs(last.input) + self.absolute
-        fires = jnp.any(jnp.abs(u - last.input) > threshold) | (last.count == 0.0)
+        fires = jnp.any(jnp.abs(u - last.input) > threshold) | (last.number == 0.0)
         return SentCommand(
             jnp.where(fires, u, last.input),
             jnp.where(fires, torque, last.torque),
-            last.count + jnp.where(fires, 1.0, 0.0).astype(last.count.dtype),
+            last.number + jnp.where(fires, 1.0, 0.0).astype(last.number.dtype),
         )
 
 

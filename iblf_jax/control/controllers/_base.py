@@ -58,6 +58,17 @@ class LawContext(NamedTuple):
             return alpha, rate
         return alpha + self.shift.value, rate + self.shift.rate
 
+    def shifted_tube(self, tube: Tube) -> Tube:
+        """The tube of the last level, moved by the shift if there is one: the error and its
+        distances to the bounds are then those of x_r - lambda.
+        """
+        if self.shift is None:
+            return tube
+        q_d, dq_d = self.shifted(tube.q_d, tube.dq_d)
+        lower, dlower = self.shifted(tube.lower, tube.dlower)
+        upper, dupper = self.shifted(tube.upper, tube.dupper)
+        return Tube(q_d, dq_d, lower, upper, dlower, dupper)
+
     def level_bounds(self, level: int) -> Bounds | None:
         """The bounds of a level, counted from 1; None where it has none."""
         if level == 1:

@@ -74,12 +74,12 @@ def exact_levels(
     tubes: list[Tube] = []
     for i, design in enumerate(designs):
         terms = order - i  # the virtual control, and its derivatives that the levels above need
-        if i == order - 1:
-            centre_curve = list(context.shifted(*centre_curve[:2]))
         lower, upper = _curve_of_bounds(
             context, i + 1, time_curve[: terms + 1], centre_curve[: terms + 1]
         )
         tube_curve = _curve_of_tube(centre_curve, lower, upper, terms)
+        if i == order - 1:
+            tube_curve = [context.shifted_tube(tube_curve[0])]
 
         def level_at(t, x, tube, slope_below, i=i, design=design):
             return _level(design, i, plant, t, x, tube, slope_below, d_hat)
@@ -116,10 +116,11 @@ def surface_levels(
         levels.append(_level(design, i, plant, t, x, tubes[i], slope, d_hat))
         slope = levels[i].slope
         if i < len(designs) - 1:
-            centre, rate = state[i], (levels[i].alpha - state[i]) / filters[i]
+            rate = (levels[i].alpha - state[i]) / filters[i]
+            tube = _filtered_tube(context, i + 2, t, state[i], rate)
             if i == len(designs) - 2:
-                centre, rate = context.shifted(centre, rate)
-            tubes.append(_filtered_tube(context, i + 2, t, centre, rate))
+                tube = context.shifted_tube(tube)
+            tubes.append(tube)
     return levels, tubes
 
 

@@ -162,6 +162,8 @@ class FullState:
         """
         alpha, dalpha = alpha_and_rate(self, t, q, dq, context)
         (lower, upper), (dlower, dupper) = jax.jvp(context.speed_limits, (t,), (jnp.ones_like(t),))
+        lower, dlower = context.shifted(lower, dlower)
+        upper, dupper = context.shifted(upper, dupper)
         return context.tube(t), Tube(alpha, dalpha, lower, upper, dlower, dupper)
 
     def switching(

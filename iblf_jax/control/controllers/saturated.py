@@ -19,7 +19,9 @@ The level below has x_r = alpha_{r-1} + z + lambda, so that with z in the place 
 
     V' = (V' of the law without limits) + (w_{r-1} s_{r-1})^T G_{r-1} lambda,                 (A.3)
 
-which is w s . lambda for a robot.  The claims hold as far as lambda is small; runs record it.
+which is w s . lambda for a robot.  Bounds of the last level become bounds of x_r - lambda, so that
+(A.3) holds for barriers on that level, too.  The claims hold as far as lambda is small; runs record
+it.
 
 **Choice of k.**  (A.2) is the law without lambda, plus (C0 + K2 - k M0) lambda.  For k M0 = K2 + C0
 the applied torque is that of the limit alone.  A smaller k reduces the command while the torque is
@@ -152,10 +154,11 @@ class Saturated:
             command, rate = self.law.command(*arguments)
             return self._limited(command), rate
         *measured, context, state = arguments
-        shift = self._shift(state)
-        if law_member(self.law, "takes_shift"):
+        law: Any = self.law
+        shift = self.shift(state)
+        if law_member(law, "takes_shift"):
             shifted = context._replace(shift=shift)
-            command, rate = self.law.command(*measured, shifted, state.law)
+            command, rate = law.command(*measured, shifted, state.law)
         else:
             command, rate = self._command_at_shifted_state(measured, context, state.law, shift)
         limited = self._limited(command)
@@ -174,7 +177,7 @@ class Saturated:
             tau = self.limit * _smooth_clip(command.tau / self.limit)
         return command._replace(tau=tau, saturated=saturated)
 
-    def _shift(self, state: AuxiliaryState) -> Shift:
+    def shift(self, state: AuxiliaryState) -> Shift:
         """The shift of the virtual control: lambda and -k lambda."""
         return Shift(state.auxiliary, -self.auxiliary * state.auxiliary)
 
@@ -198,8 +201,9 @@ class Saturated:
         self, measured: Sequence[Any], context: LawContext, state: State, shift: Shift
     ) -> tuple[Command, State]:
         """The command of (A.4), for a law that does not take the shift."""
+        law: Any = self.law
         moved = self._at_shifted_state(measured, shift.value)
-        command, rate = self.law.command(*moved, context, state)
+        command, rate = law.command(*moved, context, state)
         plant, t = plants.as_plant(context.model), measured[0]
         x, y = self._levels(measured), self._levels(moved)
         without_limit = plants.level_rate(plant, plant.order, t, y, command.tau)
@@ -213,7 +217,7 @@ class Saturated:
         if self.auxiliary is None:
             return switching_functions(self.law, *arguments)
         *measured, context, state = arguments
-        shift = self._shift(state)
+        shift = self.shift(state)
         if law_member(self.law, "takes_shift"):
             shifted = context._replace(shift=shift)
             return switching_functions(self.law, *measured, shifted, state.law)
