@@ -339,7 +339,8 @@ def _levels_inside(segment: Segment) -> list[Line]:
     """Every level inside its bounds, at every step."""
     summary = segment.summary
     flags = {0: Status.BOUND_VIOLATED, 1: Status.VELOCITY_VIOLATED}
-    lines, last = [], summary.claims.law.order - 1
+    lines = []
+    last = len(level_units(summary)) - 1
     for i, unit in enumerate(level_units(summary)):
         if not is_bounded(summary, i):
             continue

@@ -579,13 +579,15 @@ class Events:
 
     def update(self, acc: _EventTimes, sample: Sample) -> _EventTimes:
         """Adds one sample."""
-        is_first = (sample.events > acc.events) & (acc.events == 0.0)
-        is_later = (sample.events > acc.events) & (acc.events > 0.0)
+        # The numbers are integers of floating-point type.
+        is_event = sample.events > acc.events + 0.5
+        is_first = is_event & (acc.events < 0.5)
+        is_later = is_event & (acc.events > 0.5)
         interval = jnp.where(is_later, sample.t - acc.last, jnp.inf)
         return _EventTimes(
             sample.events,
             jnp.where(is_first, sample.t, acc.first),
-            jnp.where(is_first | is_later, sample.t, acc.last),
+            jnp.where(is_event, sample.t, acc.last),
             jnp.minimum(acc.shortest, interval),
         )
 
@@ -596,7 +598,7 @@ class Events:
         return {
             "event_count": acc.events,
             "shortest_interval": acc.shortest,
-            "mean_interval": jnp.where(intervals > 0.0, mean, jnp.inf),
+            "mean_interval": jnp.where(intervals > 0.5, mean, jnp.inf),
         }
 
 
