@@ -118,19 +118,6 @@ class Saturated:
         """Whether there is an auxiliary state."""
         return self.auxiliary is not None
 
-    def check_start(self, context: LawContext) -> None:
-        """Raises ValueError for an auxiliary state beside a law that does not receive all levels of
-        its model.
-        """
-        order = plants.order_of(context.model)
-        if not self.has_auxiliary or order == 2 or self._receives_x:
-            return
-        got = f"a law of q and q' with a model of {order} levels"
-        remedy = "Leave `auxiliary` out, or take controllers.BarrierBackstepping."
-        raise checks.fail(
-            "controller.auxiliary", checks.Words(got), "a law that receives x", remedy
-        )
-
     @property
     def _receives_x(self) -> bool:
         """Whether the wrapped law receives the levels x in the place of q and q'."""
