@@ -29,8 +29,11 @@ from iblf_jax.certificates.reconstruction import is_valid, time_grid
 from iblf_jax.certificates.result import Certificate, LevelTraces, Traces
 from iblf_jax.certificates.run_summary import THEOREM, WEIGHTED, RunSummary, Segment, summarise
 from iblf_jax.control import actuators, sensors
+from iblf_jax.control.controllers import EventCompensated
+from iblf_jax.control.controllers.event_compensated import excess
 from iblf_jax.core import checks, notices
 from iblf_jax.core.optional import has_members
+from iblf_jax.core.pytree import unwrapped
 from iblf_jax.engine.simulate import SimulationWarning, simulate
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical, with_parts
@@ -42,7 +45,21 @@ reconstructed."""
 DEFAULT_WORST = 16
 """Runs of a study that are checked if the caller does not say how many."""
 SAMPLED = "the loop is sampled, and the claim is about a law that runs at every instant"
+HELD = Statement(
+    "event trigger",
+    "(E.1)",
+    "max over t of sum |e2_i| (delta_i |tau_i| + m_i), which held commands may add to V2'",
+    "N m rad/s",
+)
+COMPENSATED = Statement(
+    "event trigger, compensated",
+    "(E.2)",
+    "sum 0.557 epsilon_i, which held commands may add to V' at a check",
+    "N m rad/s",
+)
 MEASURED = "how far the sampled run is from the continuous one; no claim of the theorem"
+
+AT_CHECKS = "measured; it holds at the instants at which the condition of the trigger is checked"
 
 
 @notices.each_warning_once
@@ -333,7 +350,7 @@ def _certificate_of_sampled(run: Rollout) -> Certificate:
     )
     return dataclasses.replace(
         certificate,
-        lines=(*unclaimed, *_compared(run, continuous)),
+        lines=(*unclaimed, *_compared(run, continuous), *_held(run)),
         traces=_traces_without_claim(run),
     )
 
@@ -369,6 +386,29 @@ def _compared(run: Rollout, continuous: Rollout) -> tuple[Line, Line]:
         dataclasses.replace(V_line, value=float(V_excess[at]), time=float(run.t[at])),
         dataclasses.replace(margin_line, value=float(margin_excess[joint]), joint=joint),
     )
+
+
+def _held(run: Rollout) -> tuple[Line, ...]:
+    """What the held commands of an event trigger may add to V' at a check, for laws whose
+    derivative of V along the input is e2, and for compensated ones.
+    """
+    scenario = run.scenario
+    trigger, law = scenario.sampling.trigger, scenario.controller
+    if trigger is None:
+        return ()
+    if isinstance(law, EventCompensated):
+        value = float(excess(law))
+        return (
+            dataclasses.replace(not_applicable(COMPENSATED, AT_CHECKS, counts=False), value=value),
+        )
+    inner = unwrapped(law)
+    if is_about_levels(scenario) or law is not inner or optional_member(inner, "includes_e2"):
+        return ()
+    threshold = np.asarray(trigger.relative) * np.abs(run.tau) + np.asarray(trigger.absolute)
+    added = np.sum(np.abs(run.e2) * threshold, axis=1)
+    at = int(np.argmax(added))
+    line = not_applicable(HELD, AT_CHECKS, counts=False)
+    return (dataclasses.replace(line, value=float(added[at]), time=float(run.t[at])),)
 
 
 def _margins(run: Rollout) -> np.ndarray:

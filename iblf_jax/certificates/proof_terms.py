@@ -97,8 +97,6 @@ class AuxiliaryTerms(NamedTuple):
 
     growth: jax.Array
     """w s . lambda, ()."""
-    largest: jax.Array
-    """Largest |lambda_i|, () [rad/s]."""
     excluded: jax.Array
     """Whether the guard at the bound is active, or alpha outside its bounds, () bool."""
 
@@ -231,8 +229,7 @@ def _auxiliary_terms(sample: Sample, slope: jax.Array) -> AuxiliaryTerms:
     excluded = jnp.any(sample.guard_active)
     if has(sample, "dq_lower"):
         excluded |= jnp.any(speed_margin(sample, sample.alpha - sample.auxiliary) <= NARROWEST)
-    largest = jnp.max(jnp.abs(sample.auxiliary))
-    return AuxiliaryTerms(jnp.sum(slope * sample.auxiliary), largest, excluded)
+    return AuxiliaryTerms(jnp.sum(slope * sample.auxiliary), excluded)
 
 
 def _signals(scenario: Scenario, t: jax.Array, state: LoopState):

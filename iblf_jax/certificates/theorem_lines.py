@@ -91,7 +91,7 @@ def _limited_inequality(segment: Segment) -> Line:
         return not_applicable(LIMITED, reason)
     margins = terms.growth - left_side(segment, THEOREM, case)
     size = proof.dV_size + summary.rho[case, "run"] * proof.V + np.abs(terms.growth)
-    largest = float(np.max(terms.largest))
+    largest = float(np.max(np.abs(summary.run.auxiliary)))
     note = f"max |lambda| = {largest:.4g} rad/s; instants with a limited torque are included"
     return check_margins(LIMITED, segment.t, terms.excluded, margins, summary.eps * size, note=note)
 

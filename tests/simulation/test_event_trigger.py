@@ -80,9 +80,7 @@ def test_a_compensated_chain_is_that_of_the_independent_program():
         return other.compensated(z, v, delta, m_bar, epsilon)
 
     def law(inner):
-        return controllers.EventCompensated(
-            inner, relative=delta, absolute=m_bar, epsilon=epsilon
-        )
+        return controllers.EventCompensated(inner, relative=delta, absolute=m_bar, epsilon=epsilon)
 
     expected = other.triggered_chain(case, PERIOD, delta, m, count=250, adjust=adjust)
     against_the_independent_program(free_scenario(case, law, relative=delta, absolute=m), expected)
@@ -157,9 +155,7 @@ def test_commands_are_held_within_the_threshold():
 
 def test_a_run_of_a_batch_is_the_run_alone():
     perturbations = {"plant.mass": ij.factor(ij.uniform(0.9, 1.1))}
-    study = ij.monte_carlo(
-        TRIGGERED, perturbations, runs=4, duration=0.2, dt=1e-3, progress=False
-    )
+    study = ij.monte_carlo(TRIGGERED, perturbations, runs=4, duration=0.2, dt=1e-3, progress=False)
     alone = study.replay(2)
     assert float(study.metrics["event_count"][2]) == float(alone.metrics.event_count)
     assert len(set(np.asarray(study.metrics["event_count"]).tolist())) > 1
@@ -202,3 +198,10 @@ def test_a_law_without_a_lyapunov_function_has_no_compensation():
     )
     with pytest.raises(ValueError, match="input_slope"):
         ij.simulate(ij.with_parts(PAPER, controller=law), duration=0.1, dt=1e-3)
+
+
+def test_a_certificate_states_what_held_commands_may_add():
+    run = ij.simulate(TRIGGERED, duration=0.1, dt=1e-3)
+    line = ij.certify(TRIGGERED, run)["event trigger"]
+    threshold = 0.1 * np.abs(run.tau) + np.array([0.3, 0.1])
+    np.testing.assert_allclose(line.value, np.max(np.sum(np.abs(run.e2) * threshold, axis=1)))
