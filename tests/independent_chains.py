@@ -371,7 +371,8 @@ def law(case, t, x, d_hat, beta=None, levels=None, shift=None):
     """alpha_1 .. alpha_levels and the Lyapunov function of these levels; all of them if not given.
 
     `shift` is the auxiliary state lambda of a limited input and -k lambda, n numbers each, which
-    the last error x_r - alpha_{r-1} - lambda contains.  The results are numbers of the kind of the arguments.
+    the last error x_r - alpha_{r-1} - lambda contains.  The results are numbers of the kind of the
+    arguments.
     """
     levels = case.order if levels is None else levels
     now = clock(t, levels + 1)

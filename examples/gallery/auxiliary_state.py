@@ -17,9 +17,9 @@ for name, k in {"limit alone": None, "k = 5 1/s": 5.0, "k = 500 1/s": 500.0}.ite
 
 figure, (left, right) = plt.subplots(1, 2, figsize=(9.0, 3.4), layout="constrained")
 for name, run in runs.items():
-    left.plot(run.t, run.e1[:, 1], label=name)
+    (line,) = left.plot(run.t, run.e1[:, 1], label=name)
     if run.scenario.controller.auxiliary is not None:
-        right.plot(run.t, run.auxiliary[:, 1], label=name)
+        right.plot(run.t, run.auxiliary[:, 1], label=name, color=line.get_color())
 left.set(xlabel="time [s]", ylabel="e1 of joint 2 [rad]", xlim=(0.0, 1.5))
 right.set(xlabel="time [s]", ylabel="lambda of joint 2 [rad/s]", xlim=(0.0, 1.5))
 left.legend()

@@ -28,8 +28,8 @@ for name, run in runs.items():
     )
 errors = plotting.errors(runs)
 
-# %% The compensation bounds the Lyapunov rate whatever the threshold is. On the paper's arm it sends
-# more commands than the law itself, because it holds the weight of the arm by a steep function of e2.
+# %% The compensation bounds the Lyapunov rate whatever the threshold is. On the paper's arm it
+# sends more commands than the law itself, as a steep function of e2 holds the weight of the arm.
 arm = ij.presets.zhang_yan_2024(reading="corrected")
 trigger = ij.EventTrigger(relative=0.05, absolute=0.1)
 laws = {

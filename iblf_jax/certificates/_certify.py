@@ -393,14 +393,13 @@ def _held(run: Rollout) -> tuple[Line, ...]:
     derivative of V along the input is e2, and for compensated ones.
     """
     scenario = run.scenario
-    trigger, law = scenario.sampling.trigger, scenario.controller
+    sampling: Any = scenario.sampling
+    trigger, law = sampling.trigger, scenario.controller
     if trigger is None:
         return ()
     if isinstance(law, EventCompensated):
-        value = float(excess(law))
-        return (
-            dataclasses.replace(not_applicable(COMPENSATED, AT_CHECKS, counts=False), value=value),
-        )
+        line = not_applicable(COMPENSATED, AT_CHECKS, counts=False)
+        return (dataclasses.replace(line, value=float(excess(law))),)
     inner = unwrapped(law)
     if is_about_levels(scenario) or law is not inner or optional_member(inner, "includes_e2"):
         return ()
