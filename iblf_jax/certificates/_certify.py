@@ -45,7 +45,7 @@ reconstructed."""
 DEFAULT_WORST = 16
 """Runs of a study that are checked if the caller does not say how many."""
 SAMPLED = "the loop is sampled, and the claim is about a law that runs at every instant"
-HELD = Statement(
+TRIGGERED = Statement(
     "event trigger",
     "(E.1)",
     "max over t of sum |e2_i| (delta_i |tau_i| + m_i), which held commands may add to V2'",
@@ -350,7 +350,7 @@ def _certificate_of_sampled(run: Rollout) -> Certificate:
     )
     return dataclasses.replace(
         certificate,
-        lines=(*unclaimed, *_compared(run, continuous), *_held(run)),
+        lines=(*unclaimed, *_compared(run, continuous), *_trigger_lines(run)),
         traces=_traces_without_claim(run),
     )
 
@@ -388,7 +388,7 @@ def _compared(run: Rollout, continuous: Rollout) -> tuple[Line, Line]:
     )
 
 
-def _held(run: Rollout) -> tuple[Line, ...]:
+def _trigger_lines(run: Rollout) -> tuple[Line, ...]:
     """What the held commands of an event trigger may add to V' at a check, for laws whose
     derivative of V along the input is e2, and for compensated ones.
     """
@@ -406,7 +406,7 @@ def _held(run: Rollout) -> tuple[Line, ...]:
     threshold = np.asarray(trigger.relative) * np.abs(run.tau) + np.asarray(trigger.absolute)
     added = np.sum(np.abs(run.e2) * threshold, axis=1)
     at = int(np.argmax(added))
-    line = not_applicable(HELD, AT_CHECKS, counts=False)
+    line = not_applicable(TRIGGERED, AT_CHECKS, counts=False)
     return (dataclasses.replace(line, value=float(added[at]), time=float(run.t[at])),)
 
 

@@ -53,8 +53,8 @@ class EventTrigger:
     events have no derivative.
 
     Args:
-      relative: delta, () or (n,) [1], 0 <= delta < 1; 0 if not given.
-      absolute: m, () or (n,) [N m], >= 0; 0 if not given.
+      relative: delta, () or (n,) [1], >= 0 and < 1; 0 if not given.
+      absolute: m, threshold of the error itself, () or (n,) [N m], >= 0; 0 if not given.
 
     Source: L. Xing, C. Wen, Z. Liu, H. Su, J. Cai, IEEE Trans. Automatic Control 62 (2017)
       2071-2076 (relative threshold, one input); for several inputs as said above.

@@ -217,13 +217,13 @@ def test_the_rate_that_gives_the_limit_alone():
         disturbance=ij.disturbances.Nothing(),
         observer=ij.observers.Momentum(kf=20.0),
         initial=ij.Initial(q=[0.8], dq=[0.0]),
-        controller=controllers.Saturated(law, limit=1.6),
+        controller=controllers.Saturated(law, limit=1.5),
     )
     inertia = float(chain.mass_matrix(jnp.zeros(1))[0, 0])
     alone = ij.simulate(scenario, duration=1.0, dt=1e-3)
     distances = []
     for k in (0.6 / inertia, 60.0 / inertia):
-        limited = ij.with_parts(scenario, controller=_limited(law, 1.6, k))
+        limited = ij.with_parts(scenario, controller=_limited(law, 1.5, k))
         run = ij.simulate(limited, duration=1.0, dt=1e-3)
         distances.append(np.max(np.abs(run.q - alone.q)))
     assert np.any(alone.metrics.saturated_share > 0.01)

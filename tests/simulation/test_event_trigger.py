@@ -200,6 +200,7 @@ def test_a_law_without_a_lyapunov_function_has_no_compensation():
         ij.simulate(ij.with_parts(PAPER, controller=law), duration=0.1, dt=1e-3)
 
 
+@pytest.mark.release
 def test_a_certificate_states_what_held_commands_may_add():
     run = ij.simulate(TRIGGERED, duration=0.1, dt=1e-3)
     line = ij.certify(TRIGGERED, run)["event trigger"]

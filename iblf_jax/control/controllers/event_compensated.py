@@ -60,7 +60,7 @@ class EventCompensated:
 
     Args:
       law: any `Controller` with an `input_slope`, such as `Backstepping` or `BarrierBackstepping`.
-      relative: delta of the trigger, () or (n,) [1], 0 <= delta < 1.
+      relative: delta of the trigger, () or (n,) [1], >= 0 and < 1.
       absolute: m_bar, () or (n,) [N m], >= 0: more than m/(1 - delta) of the trigger.
       epsilon: width of the tanh, () or (n,) in the unit of z times that of v [N m rad/s], > 0.
 
