@@ -167,7 +167,7 @@ def test_the_rate_of_V_of_a_chain_with_bounds_of_every_level(coupled, rng):
 
 def test_a_certificate_covers_the_limited_torque():
     scenario = ij.with_parts(LIMITED, observer=ij.observers.Momentum(kf=20.0))
-    run = ij.simulate(scenario, duration=1.0, dt=1e-3)
+    run = ij.simulate(scenario, duration=1.5, dt=1e-3)
     line = ij.certify(scenario, run)["inequality, limited torque"]
     assert np.any(run.metrics.saturated_share > 0)
     assert line.verdict == "holds"
@@ -217,14 +217,14 @@ def test_the_rate_that_gives_the_limit_alone():
         disturbance=ij.disturbances.Nothing(),
         observer=ij.observers.Momentum(kf=20.0),
         initial=ij.Initial(q=[0.8], dq=[0.0]),
-        controller=controllers.Saturated(law, limit=1.5),
+        controller=controllers.Saturated(law, limit=1.53),
     )
     inertia = float(chain.mass_matrix(jnp.zeros(1))[0, 0])
-    alone = ij.simulate(scenario, duration=1.0, dt=1e-3)
+    alone = ij.simulate(scenario, duration=1.5, dt=1e-3)
     distances = []
     for k in (0.6 / inertia, 60.0 / inertia):
-        limited = ij.with_parts(scenario, controller=_limited(law, 1.5, k))
-        run = ij.simulate(limited, duration=1.0, dt=1e-3)
+        limited = ij.with_parts(scenario, controller=_limited(law, 1.53, k))
+        run = ij.simulate(limited, duration=1.5, dt=1e-3)
         distances.append(np.max(np.abs(run.q - alone.q)))
     assert np.any(alone.metrics.saturated_share > 0.01)
     assert distances[0] < 1e-9
