@@ -42,6 +42,7 @@ from iblf_jax.simulation.paths import parameters as parameters
 from iblf_jax.simulation.paths import with_parameters as with_parameters
 from iblf_jax.simulation.results import Metrics as Metrics
 from iblf_jax.simulation.results import Rollout as Rollout
+from iblf_jax.simulation.sampling import EventTrigger as EventTrigger
 from iblf_jax.simulation.sampling import Sampling as Sampling
 from iblf_jax.simulation.scenario import Initial as Initial
 from iblf_jax.simulation.scenario import Scenario as Scenario

@@ -364,10 +364,21 @@ def sides_of(case, i, now, reference):
     return lower, [p.rate() for p in lower], upper, [p.rate() for p in upper]
 
 
-def law(case, t, x, d_hat, beta=None, levels=None):
+def shifted(tubes, shift):
+    """The tubes of the last level with lambda and its assumed rate in the error only."""
+    values, rates = shift
+    return [
+        tube._replace(e=tube.e - value, dalpha=tube.dalpha + rate)
+        for tube, value, rate in zip(tubes, values, rates, strict=True)
+    ]
+
+
+def law(case, t, x, d_hat, beta=None, levels=None, shift=None):
     """alpha_1 .. alpha_levels and the Lyapunov function of these levels; all of them if not given.
 
-    The results are numbers of the kind of the arguments.
+    `shift` is the auxiliary state lambda of a limited input and -k lambda, n numbers each, which
+    the last error x_r - alpha_{r-1} - lambda contains.  The results are numbers of the kind of the
+    arguments.
     """
     levels = case.order if levels is None else levels
     now = clock(t, levels + 1)
@@ -380,6 +391,8 @@ def law(case, t, x, d_hat, beta=None, levels=None):
     alphas, slopes, V, decay = [], [], 0.0, 0.0
     for i in range(levels):
         tubes = tubes_of(states[i], alpha, dalpha, sides_of(case, i, now, reference))
+        if shift is not None and i == case.order - 1:
+            tubes = shifted(tubes, shift)
         alpha, terms = level(case, i, now, states, d_hat, tubes, terms)
         alphas.append([p.c[0] for p in alpha])
         slopes.append([p.s.c[0] for p in terms])

@@ -290,6 +290,23 @@ LAWS = {
     "saturated": controllers.Saturated(
         law=controllers.PDGravity(Kp=60.0, Kd=20.0), limit=[7.2, 1.5]
     ),
+    "saturated_auxiliary": controllers.Saturated(
+        law=controllers.Backstepping(k1=2.0, K2=20.0, o=0.1, reading="corrected"),
+        limit=[7.2, 1.5],
+        auxiliary=[5.0, 8.0],
+    ),
+    "saturated_auxiliary_of_levels": controllers.Saturated(
+        law=controllers.BarrierBackstepping(k=(2.0, 20.0)), limit=[7.2, 1.5], auxiliary=5.0
+    ),
+    "saturated_auxiliary_of_state": controllers.Saturated(
+        law=controllers.ComputedTorque(Kp=25.0, Kd=10.0), limit=[7.2, 1.5], auxiliary=5.0
+    ),
+    "event_compensated": controllers.EventCompensated(
+        law=controllers.Backstepping(k1=2.0, K2=20.0, o=0.1),
+        relative=0.1,
+        absolute=[0.3, 0.2],
+        epsilon=0.5,
+    ),
     "saturated_smooth": controllers.Saturated(
         law=controllers.ComputedTorque(Kp=25.0, Kd=10.0), limit=[7.2, 1.5], edge="smooth"
     ),
@@ -315,6 +332,8 @@ OPTIONAL_FOLDS = (
     metrics.Slack(),
     metrics.RegionSlack(),
     metrics.LevelEstimation(),
+    metrics.Auxiliary(),
+    metrics.Events(),
 )
 FOLDS = {type(fold).__name__: fold for fold in (*metrics.standard(), *OPTIONAL_FOLDS)}
 

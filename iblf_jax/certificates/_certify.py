@@ -37,8 +37,11 @@ from iblf_jax.certificates.result import Certificate, LevelTraces, Traces
 from iblf_jax.certificates.run_summary import THEOREM, WEIGHTED, RunSummary, Segment, summarise
 from iblf_jax.control import actuators, sensors
 from iblf_jax.control.actuators._base import input_delay
+from iblf_jax.control.controllers import EventCompensated
+from iblf_jax.control.controllers.event_compensated import excess
 from iblf_jax.core import checks, notices
 from iblf_jax.core.optional import has_members
+from iblf_jax.core.pytree import unwrapped
 from iblf_jax.engine.simulate import SimulationWarning, simulate
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical, with_history, with_parts
@@ -54,7 +57,21 @@ NOISY = (
     "the plant has process noise, and the claim is about its drift; a study with"
     " metrics.LyapunovValue estimates E[V]"
 )
+TRIGGERED = Statement(
+    "event trigger",
+    "(E.1)",
+    "max over t of sum |e2_i| (delta_i |tau_i| + m_i), which held commands may add to V2'",
+    "N m rad/s",
+)
+COMPENSATED = Statement(
+    "event trigger, compensated",
+    "(E.2)",
+    "sum 0.557 epsilon_i, which held commands may add to V' at a check",
+    "N m rad/s",
+)
 DELAYED = "the input has a delay, and the claim is about a torque that acts at once"
+
+AT_CHECKS = "measured; it holds at the instants at which the condition of the trigger is checked"
 
 
 @notices.each_warning_once
@@ -384,7 +401,7 @@ def _certificate_by_comparison(run: Rollout, kind: str, reason: str) -> Certific
     )
     return dataclasses.replace(
         certificate,
-        lines=(*unclaimed, *_compared(run, continuous, kind)),
+        lines=(*unclaimed, *_compared(run, continuous, kind), *_trigger_lines(run)),
         traces=_traces_without_claim(run),
     )
 
@@ -423,6 +440,28 @@ def _compared(run: Rollout, continuous: Rollout, kind: str) -> tuple[Line, Line]
         dataclasses.replace(V_line, value=float(V_excess[at]), time=float(run.t[at])),
         dataclasses.replace(margin_line, value=float(margin_excess[joint]), joint=joint),
     )
+
+
+def _trigger_lines(run: Rollout) -> tuple[Line, ...]:
+    """What the held commands of an event trigger may add to V' at a check, for laws whose
+    derivative of V along the input is e2, and for compensated ones.
+    """
+    scenario = run.scenario
+    sampling, law = scenario.sampling, scenario.controller
+    if sampling is None or sampling.trigger is None:
+        return ()
+    trigger: Any = sampling.trigger
+    if isinstance(law, EventCompensated):
+        line = not_applicable(COMPENSATED, AT_CHECKS, counts=False)
+        return (dataclasses.replace(line, value=float(excess(law))),)
+    inner = unwrapped(law)
+    if is_about_levels(scenario) or law is not inner or optional_member(inner, "includes_e2"):
+        return ()
+    threshold = np.asarray(trigger.relative) * np.abs(run.tau) + np.asarray(trigger.absolute)
+    added = np.sum(np.abs(run.e2) * threshold, axis=1)
+    at = int(np.argmax(added))
+    line = not_applicable(TRIGGERED, AT_CHECKS, counts=False)
+    return (dataclasses.replace(line, value=float(added[at]), time=float(run.t[at])),)
 
 
 def _margins(run: Rollout) -> np.ndarray:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from iblf_jax.certificates.auxiliary import covers_limit
 from iblf_jax.certificates.decay_lines import check_steps
 from iblf_jax.certificates.level_summary import LEVELS, LevelSummary, growth_along
 from iblf_jax.certificates.lines import (
@@ -57,6 +58,9 @@ SURFACE_INEQUALITY = Statement(
 EQUALITY = Statement("equality", "(S.3)", "both sides of (S.3) are equal", "1/s")
 ESTIMATE = Statement("estimate", "(S.3)", "d_hat' = kappa d_tilde")
 TERMS = Statement("observer terms", "(S.3)", "T along the run", "1/s")
+AUXILIARY = Statement(
+    "auxiliary state", "(A.3)", "(w_{r-1} s_{r-1})^T G_{r-1} lambda of the limited input", "1/s"
+)
 LAG = Statement("lag of the filters", "(S.3)", "sum w_i s_i . G_i (beta_i - alpha_i)", "1/s")
 RHO = Statement("rho", "(S.4)", "rho = min_i decay rate of V_i > 0", "1/s")
 ENVELOPE = Statement("envelope", "(S.4)", "V(t) <= V(0) exp(-rho t) + rho2/rho")
@@ -66,6 +70,9 @@ SMOOTH = Statement(
     "reference and slopes of the barriers have the derivatives that u contains",
 )
 ULTIMATE = "the lag of the filters does not vanish with d_tilde: only ultimate boundedness follows"
+LIMIT_COVERED = (
+    "with the term (w_{r-1} s_{r-1})^T G_{r-1} lambda of the auxiliary state (A.3) on the right"
+)
 NO_ESTIMATE = "the observer states no kappa; T uses the rate of its estimate along the run"
 
 
@@ -183,6 +190,8 @@ def _inequalities(segment: Segment) -> list[Line]:
     statement = INEQUALITY
     if law.filter is not None:
         statement, note = SURFACE_INEQUALITY, join_notes(ULTIMATE, note)
+    if covers_limit(summary.run.scenario):
+        note = join_notes(LIMIT_COVERED, note)
     left = left_side(proof.claim)
     tolerance = LEVEL_ROUNDING * summary.eps * proof.claim.size
     inequality = check_steps(segment, statement, -left, tolerance, note=note)
@@ -228,6 +237,8 @@ def _measured_terms(segment: Segment) -> list[Line]:
     lines = [_largest(segment, TERMS, claim.disturbance_terms)]
     if summary.claims.law.filter is not None:
         lines.append(_largest(segment, LAG, claim.lag))
+    elif covers_limit(summary.run.scenario):
+        lines.append(_largest(segment, AUXILIARY, claim.lag))
     return lines
 
 
@@ -329,6 +340,7 @@ def _levels_inside(segment: Segment) -> list[Line]:
     summary = segment.summary
     flags = {0: Status.BOUND_VIOLATED, 1: Status.VELOCITY_VIOLATED}
     lines = []
+    last = len(level_units(summary)) - 1
     for i, unit in enumerate(level_units(summary)):
         if not is_bounded(summary, i):
             continue
@@ -341,6 +353,8 @@ def _levels_inside(segment: Segment) -> list[Line]:
         reason = summary.why_not
         if not reason and _states_no_bound(segment, i):
             reason = _no_bound(summary, i)
+        if not reason and i == last and covers_limit(summary.run.scenario):
+            reason = "the claim is about x_r - lambda"
         if reason:
             line = observed_only(line, reason)
         lines.append(line)

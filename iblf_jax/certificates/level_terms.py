@@ -22,6 +22,10 @@ With filters, beta_i takes the place of alpha_i in the errors and its rate is kn
 T = sum w_i s_i . d_tilde_i + sum w_i s_i . G_i (beta_i - alpha_i).  The last sum is the effect of
 the filters' lag; it does not vanish with d_tilde, and only ultimate boundedness follows.
 
+The auxiliary state lambda of a limited input (`controllers.Saturated`) moves the centre of the last
+tube to alpha_{r-1} + lambda.  The claim then includes the instants at which the input is limited,
+and T has the term (w_{r-1} s_{r-1})^T G_{r-1} lambda of (A.3), which is of the form of the lag.
+
 V' is exact: dV/d(t, x, d_hat, state of the law), by forward-mode differentiation, times the rates
 of these along the vector field of the whole loop.
 """
@@ -34,6 +38,7 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
+from iblf_jax.certificates.auxiliary import covers_limit, inner_context, inner_state
 from iblf_jax.certificates.claims import own_claim
 from iblf_jax.certificates.optional import optional_member
 from iblf_jax.certificates.proof_terms import TORQUE_ROUNDING, OwnTerms
@@ -72,7 +77,8 @@ class ClaimTerms(NamedTuple):
     disturbance_terms: jax.Array
     """T, without the lag of filters."""
     lag: jax.Array
-    """sum w_i s_i . G_i (beta_i - alpha_i) of a law with filters, else 0."""
+    """sum w_i s_i . G_i (c_i - alpha_i), c_i the centre of the tube of level i + 1, of a law with
+    filters or with an auxiliary state, else 0."""
     size: jax.Array
     """Sum of the absolute values of the terms of V': rounding is relative to it."""
     sqrt_V_size: jax.Array
@@ -147,8 +153,9 @@ def level_terms_and_sample(
     d_tilde = d - estimate_as_rates(scenario, at.x, at.estimate)
     sizes = _rate_sizes(scenario, at, d, d_tilde, tangent.x)
     estimate_error, estimate_size = _estimate_error(scenario, at, tangent, d_tilde, sizes)
-    excluded = jnp.any(sample.guard_active | sample.saturated)
-    excluded |= _input_was_limited(scenario, at, state, sample)
+    excluded = jnp.any(sample.guard_active)
+    if not covers_limit(scenario):
+        excluded |= jnp.any(sample.saturated) | _input_was_limited(scenario, at, state, sample)
     V = sample.V
     claim: Any = ()
     own: Any = ()
@@ -231,7 +238,8 @@ def _input_was_limited(
     law: Any = unwrapped(scenario.controller)
     if law is scenario.controller:
         return jnp.zeros((), bool)
-    own, _ = law.command(*at[:3], scenario.context, at.law_state)
+    own_state = inner_state(scenario, at.law_state)
+    own, _ = law.command(*at[:3], scenario.context, own_state)
     measured = law_state(scenario, state.q, state.dq, state.higher)
     outer: Any = scenario.controller
     limited, _ = outer.command(at.t, *measured, at.estimate, scenario.context, at.law_state)
@@ -252,7 +260,9 @@ def _claim_terms(
 
     def value(flat):
         point = unflattened(flat)
-        levels, tubes = law.levels(*point[:3], scenario.context, point.law_state)
+        context = inner_context(scenario, point.law_state)
+        own_state = inner_state(scenario, point.law_state)
+        levels, tubes = law.levels(*point[:3], context, own_state)
         values = [
             jnp.sum(w * barrier.value(tube, x))
             for w, barrier, tube, x in zip(law.weights, law.barriers, tubes, point.x, strict=True)
@@ -295,23 +305,25 @@ def _claim_terms(
         decay,
         by_slopes,
         disturbance_terms,
-        _lag(scenario, at, levels),
+        _lag(scenario, at, levels, tubes),
         size,
         jnp.sqrt(square),
         *(jnp.stack(row) for row in rows.values()),
     )
 
 
-def _lag(scenario: Scenario, at: _Point, levels: list) -> jax.Array:
-    """Sum of w_i s_i . G_i (beta_i - alpha_i), (); 0 for a law without filters."""
+def _lag(scenario: Scenario, at: _Point, levels: list, tubes: list) -> jax.Array:
+    """Sum of w_i s_i . G_i (c_i - alpha_i), c_i the centre of the tube of level i + 1, (); 0 for a
+    law without filters and without an auxiliary state.
+    """
     law: Any = unwrapped(scenario.controller)
     total = jnp.zeros_like(at.t)
-    if law.filter is None:
+    if law.filter is None and not covers_limit(scenario):
         return total
     plant = plants.as_plant(scenario.model)
-    for i, (level, beta) in enumerate(zip(levels, at.law_state, strict=False)):
+    for i, (level, above) in enumerate(zip(levels[:-1], tubes[1:], strict=True)):
         effect = plants.transposed_gain(plant, i + 1, at.t, at.x, level.slope)
-        total += jnp.sum(effect * (beta - level.alpha))
+        total += jnp.sum(effect * (above.q_d - level.alpha))
     return total
 
 
@@ -406,6 +418,8 @@ def _own_terms(
     if not uses_observer:
         d_tilde, dd_tilde = d, dd
     at, tangent = _point_and_rate(scenario, t, state, state_rate)
+    at = at._replace(law_state=inner_state(scenario, at.law_state))
+    tangent = tangent._replace(law_state=inner_state(scenario, tangent.law_state))
 
     def lyapunov(t, x, d_tilde, law_state):
         return jnp.sum(law.lyapunov(t, x, d_tilde, context, law_state))

@@ -40,6 +40,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from iblf_jax.certificates.auxiliary import covers_limit, inner_state
 from iblf_jax.certificates.claims import decay_phi, decay_rate, own_claim
 from iblf_jax.certificates.optional import optional_member
 from iblf_jax.control.controllers import Backstepping, FullState
@@ -52,7 +53,7 @@ from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.time import as_at
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, rate
 from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.simulation.signals import Sample
+from iblf_jax.simulation.signals import Sample, has, speed_margin
 from iblf_jax.world import plants
 from iblf_jax.world.bounds import NARROWEST
 from iblf_jax.world.robots import friction_torque, mass_matrix_rate
@@ -98,6 +99,15 @@ class OwnTerms(NamedTuple):
     """Whether a torque limit changed the law's torque, () bool: the claim does not apply then."""
 
 
+class AuxiliaryTerms(NamedTuple):
+    """The terms of (A.3) at one instant; along a run a time axis comes first."""
+
+    growth: jax.Array
+    """w s . lambda, ()."""
+    excluded: jax.Array
+    """Whether the guard at the bound is active, or alpha outside its bounds, () bool."""
+
+
 class ProofTerms(NamedTuple):
     """The terms of the proof at one instant; along a run a time axis comes first."""
 
@@ -140,6 +150,8 @@ class ProofTerms(NamedTuple):
     """`FullTerms` of a law that bounds velocities."""
     own: Any = ()
     """`OwnTerms` of a law that states a claim about itself."""
+    auxiliary: Any = ()
+    """`AuxiliaryTerms` of a law that takes the shift of the limit around it."""
     decay: Any = ()
     """sum w V1 rate(k1(t, V1)) + e2^T K2 e2 + 2 g(t, W) W of a `Backstepping` law with decays, ()
     [1/s]."""
@@ -213,6 +225,8 @@ def terms_and_sample(
     if own_claim(scenario) is not None:
         proof["own"] = _own_terms(scenario, t, state, state_rate, now, rates)
         proof["excluded"] |= proof["own"].limited
+    if covers_limit(scenario):
+        proof["auxiliary"] = _auxiliary_terms(sample, now["s"])
     if isinstance(unwrapped(scenario.controller), Backstepping):
         proof["decay"] = _decay_of_backstepping(scenario, t, state, M0, now["e2"])
     if isinstance(unwrapped(scenario.controller), FullState):
@@ -220,6 +234,14 @@ def terms_and_sample(
         # e2 has no tube where alpha is outside the velocity bounds.
         proof["excluded"] |= jnp.any(proof["full"].alpha_distance <= NARROWEST)
     return proof, M0, sample
+
+
+def _auxiliary_terms(sample: Sample, slope: jax.Array) -> AuxiliaryTerms:
+    """The terms of (A.3) for a robot, given w s."""
+    excluded = jnp.any(sample.guard_active)
+    if has(sample, "dq_lower"):
+        excluded |= jnp.any(speed_margin(sample, sample.alpha - sample.auxiliary) <= NARROWEST)
+    return AuxiliaryTerms(jnp.sum(slope * sample.auxiliary), excluded)
 
 
 def _signals(scenario: Scenario, t: jax.Array, state: LoopState):
@@ -435,6 +457,8 @@ def _own_terms(
     """
     law: Any = own_claim(scenario)
     context, q, dq = scenario.context, state.q, state.dq
+    own_state = inner_state(scenario, state.controller)
+    own_rate = inner_state(scenario, state_rate.controller)
     df = rates["disturbance"]
     f_tilde, df_tilde = now["disturbance"], df
     if optional_member(law, "uses_observer"):
@@ -444,10 +468,10 @@ def _own_terms(
     def lyapunov(t, q, dq, f_tilde, law_state):
         return jnp.sum(law.lyapunov(t, q, dq, f_tilde, context, law_state))
 
-    point = (t, q, dq, f_tilde, state.controller)
-    tangent = (jnp.ones_like(t), state_rate.q, state_rate.dq, df_tilde, state_rate.controller)
+    point = (t, q, dq, f_tilde, own_state)
+    tangent = (jnp.ones_like(t), state_rate.q, state_rate.dq, df_tilde, own_rate)
     V, dV = jax.jvp(lyapunov, point, tangent)
-    decay = jnp.sum(law.decay(t, q, dq, f_tilde, context, state.controller))
+    decay = jnp.sum(law.decay(t, q, dq, f_tilde, context, own_state))
     slopes = jax.grad(lyapunov, argnums=(0, 1, 2, 3, 4))(*point)
     M0 = scenario.model.mass_matrix(q)
     stated = optional_member(law, "disturbance_terms")
@@ -459,11 +483,11 @@ def _own_terms(
             command, _ = law.command(t, q, dq, f_hat, context, state.controller)
             terms += slopes[2] @ solve_spd(M0, now["tau"] - command.tau)
     else:
-        terms = jnp.sum(stated(t, q, dq, f_tilde, df, context, state.controller))
+        terms = jnp.sum(stated(t, q, dq, f_tilde, df, context, own_state))
     size = _own_term_sizes(M0, slopes, tangent, now) + jnp.abs(decay) + jnp.abs(terms)
     limited = jnp.zeros((), bool)
     if law is not scenario.controller:
-        limited = _differs_from_command(scenario, law, t, state, now, state.controller)
+        limited = _differs_from_command(scenario, law, t, state, now, own_state)
     return OwnTerms(V, dV, decay, terms, size, limited)
 
 

@@ -23,6 +23,7 @@ from iblf_jax.certificates.lines import (
     OBSERVED_ONLY,
     Line,
     Statement,
+    check_margins,
     check_smallest,
     not_applicable,
     verdict_of,
@@ -39,6 +40,12 @@ REFERENCE_INSIDE = Statement("reference inside", "Assumption 2", "k_lc < x_d < k
 START_INSIDE = Statement("start inside", "Theorem 2", "k_lc(0) < q(0) < k_uc(0)", "rad")
 ALPHA_INSIDE = Statement("alpha inside", "(F.1)", "v_l < alpha < v_u", "rad/s")
 START_SPEED_INSIDE = Statement("start speed inside", "(F.1)", "v_l(0) < q'(0) < v_u(0)", "rad/s")
+LIMITED = Statement(
+    "inequality, limited torque",
+    "(A.3)",
+    "V2' + rho V2 - |f'|^2/2 - w s . lambda <= 0  (without |f'|^2/2 in case 1)",
+    "1/s",
+)
 ASSUMPTIONS = (
     BOUNDED,
     RATE_BOUNDED,
@@ -59,11 +66,34 @@ def segment_lines(segment: Segment) -> tuple[list[Line], dict[str, float]]:
     if bounds_velocities:
         lines += [*_velocity_assumptions(segment), _barriers_inequality(segment)]
     lines += decay_lines(segment, THEOREM)
+    if segment.proof.auxiliary:
+        lines.append(_limited_inequality(segment))
     dropped, shares = _dropped_terms(segment)
     lines += [*dropped, _joints_inside(segment)]
     if bounds_velocities:
         lines.append(_velocities_inside(segment))
     return lines, shares
+
+
+# --- the auxiliary state of a limited torque -----------------------------------------------------
+
+
+def _limited_inequality(segment: Segment) -> Line:
+    """The differential inequality with the auxiliary state, at every step, those with a limited
+    torque included.
+    """
+    summary, proof = segment.summary, segment.proof
+    case, terms = summary.case, segment.proof.auxiliary
+    reason = summary.claims.why_no_theorem or summary.why_invalid
+    if not reason and not summary.rho[case, "run"] > 0:
+        reason = "the gain conditions are not met"
+    if reason:
+        return not_applicable(LIMITED, reason)
+    margins = terms.growth - left_side(segment, THEOREM, case)
+    size = proof.dV_size + summary.rho[case, "run"] * proof.V + np.abs(terms.growth)
+    largest = float(np.max(np.abs(summary.run.auxiliary)))
+    note = f"max |lambda| = {largest:.4g} rad/s; instants with a limited torque are included"
+    return check_margins(LIMITED, segment.t, terms.excluded, margins, summary.eps * size, note=note)
 
 
 # --- assumptions ---------------------------------------------------------------------------------

@@ -5,6 +5,7 @@ the units of its levels and of its input.  Such a quantity declares a `PlantUnit
 unit for a robot, and a formula in these symbols.
 
     x1 ... xr       units of the levels
+    last            unit of the last level
     levels, higher  units of all levels, and of those from the third on, one a level
     rates           units of the rates of all levels, one a level
     u               unit of the input
@@ -58,6 +59,7 @@ level."""
 
 POSITION = PlantUnit("rad", "x1")
 VELOCITY = PlantUnit("rad/s", "x2")
+LAST_LEVEL = PlantUnit("rad/s", "last")
 INPUT = PlantUnit("N m", "u")
 UNCERTAIN = PlantUnit("N m", "f")
 TORQUE = PlantUnit("N m", "tau")
@@ -68,6 +70,7 @@ RATES = PlantUnit("1", "rates")
 ROBOT: Mapping[str, Unit] = {
     "x1": "rad",
     "x2": "rad/s",
+    "last": "rad/s",
     "levels": ByLevel(("rad", "rad/s")),
     "higher": "1",
     "rates": ByLevel(("rad/s", "rad/s^2")),

@@ -30,6 +30,7 @@ from iblf_jax.simulation.levels import (
     start_levels,
     steady_input,
 )
+from iblf_jax.simulation.sampling import nothing_sent
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.world import plants
 
@@ -76,6 +77,8 @@ class LawState(NamedTuple):
     controller: Any
     observer: Any
     velocity: Any
+    sent: Any = ()
+    """The `SentCommand` of a law with an event trigger."""
 
 
 class SampleInputs(NamedTuple):
@@ -142,8 +145,13 @@ def start(scenario: Scenario, inputs: SampleInputs) -> tuple[LawState, jax.Array
     if velocity_filter is not None:
         filtered = velocity_filter.init(q, dq, scenario.sampling.period)  # type: ignore[union-attr]
     if plants.is_chain(scenario.model):
-        return LawState(controller, observer, filtered), steady_input(scenario, q)
-    return LawState(controller, observer, filtered), scenario.model.gravity(q)
+        balance = steady_input(scenario, q)
+    else:
+        balance = scenario.model.gravity(q)
+    sent: Any = ()
+    if scenario.sampling.trigger is not None:  # type: ignore[union-attr]
+        sent = nothing_sent(balance)
+    return LawState(controller, observer, filtered, sent), balance
 
 
 def sample(scenario: Scenario, inputs: SampleInputs, state: LawState) -> tuple[LawState, Outputs]:
@@ -159,7 +167,7 @@ def sample(scenario: Scenario, inputs: SampleInputs, state: LawState) -> tuple[L
             inputs.q, inputs.dq, normal, scenario.sampling.period, state.velocity
         )
     measured = Measurement(inputs.q, dq, inputs.higher)
-    update = law_update(scenario, inputs.t, measured, state.controller, state.observer)
+    update = law_update(scenario, inputs.t, measured, state.controller, state.observer, state.sent)
     command = update.command
     tube = scenario.context.tube(inputs.t)
     infeasible = jnp.zeros((), bool)
@@ -174,7 +182,7 @@ def sample(scenario: Scenario, inputs: SampleInputs, state: LawState) -> tuple[L
         jnp.any(command.saturated),
         infeasible,
     )
-    return LawState(update.controller, update.observer, filtered), outputs
+    return LawState(update.controller, update.observer, filtered, update.sent), outputs
 
 
 def _velocity_filter(scenario: Scenario) -> Any:

@@ -21,6 +21,7 @@ from iblf_jax.plotting import _style
 from iblf_jax.plotting._curves import Curve, distinct, thinned
 from iblf_jax.plotting._style import FAINT, label, series
 from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.simulation.signals import has
 from iblf_jax.simulation.units import signal_unit, unit_text
 from iblf_jax.world import plants
 
@@ -400,6 +401,24 @@ def _draw_measured(
     return drawn
 
 
+MAX_MARKS = 200
+"""More events than this in a window are not marked: the marks would cover the curve."""
+
+
+def _mark_events(axes: Axes, curve: Curve, joint: int, window: Window, color: Any) -> None:
+    """Marks the instants at which an event trigger sent a command."""
+    run = curve.run
+    if not has(run, "events"):
+        return
+    t, number = np.asarray(run.t), np.asarray(run.events)
+    sent = np.diff(number, prepend=0.0) > 0.5
+    at = np.flatnonzero(sent & (t >= window[0]) & (t <= window[1]))
+    if not 0 < at.size <= MAX_MARKS:
+        return
+    style: dict[str, Any] = {"linestyle": "none", "marker": "o", "markersize": 3.0, "zorder": 3}
+    axes.plot(t[at], np.asarray(run.tau)[at, joint], color=color, **style)
+
+
 def show(
     axes: Axes,
     curves: Sequence[Curve],
@@ -426,6 +445,8 @@ def show(
         style = run_style(curves, i)
         style["label"] = _run_label(curve, quantity)
         drawn.append((curve, draw(axes, curve, quantity.field, joint, window, **style)))
+        if quantity.field == "tau":
+            _mark_events(axes, curve, joint, window, style["color"])
     axes.set_xlim(*window)
     owners = [curve for curve, _ in drawn]
     samples = [y for _, y in drawn]

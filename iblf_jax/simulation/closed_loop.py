@@ -54,7 +54,7 @@ from iblf_jax.simulation.levels import (
     uncertain_term,
 )
 from iblf_jax.simulation.noise import normals
-from iblf_jax.simulation.sampling import Instant
+from iblf_jax.simulation.sampling import Instant, SentCommand, nothing_sent
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import Sample
 from iblf_jax.world import plants
@@ -83,10 +83,17 @@ class LawSignals(NamedTuple):
     input is the torque."""
     estimated: Any = ()
     """`EstimatedLevels` under an observer that completes a measurement; `()` under others."""
+    auxiliary: Any = ()
+    events: Any = ()
 
 
-def law_signals(command: Command, f_hat: jax.Array, estimated: Any = ()) -> LawSignals:
-    """The signals of a law that answered with `command` to the estimate `f_hat`."""
+def law_signals(
+    command: Command, f_hat: jax.Array, estimated: Any = (), sent: Any = ()
+) -> LawSignals:
+    """The signals of a law that answered with `command` to the estimate `f_hat`; `estimated` are
+    the levels that it received from an observer, and `sent` is the `SentCommand` of an event
+    trigger, or `()`.
+    """
     has_other_input = not isinstance(command.input, tuple)
     return LawSignals(
         command.alpha,
@@ -99,6 +106,8 @@ def law_signals(command: Command, f_hat: jax.Array, estimated: Any = ()) -> LawS
         command.alpha_higher,
         command.tau if has_other_input else (),
         estimated,
+        command.auxiliary,
+        sent.number if sent else (),
     )
 
 
@@ -118,6 +127,8 @@ class SampledState(NamedTuple):
     """The last measurement."""
     signals: LawSignals
     """Signals of the law at its last run."""
+    sent: Any = ()
+    """The `SentCommand` of a loop with an event trigger."""
 
 
 class LoopState(NamedTuple):
@@ -187,13 +198,15 @@ def _initial_sampled_state(scenario: Scenario, state: LoopState, tau: jax.Array)
         partial(estimated_levels, scenario, scenario.observer),
         *(zero[0], here, here, here, state.observer),
     )
-    signals = law_signals(command, f_hat, estimated)
+    sent = () if sampling.trigger is None else nothing_sent(tau)
+    signals = law_signals(command, f_hat, estimated, sent)
     blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), signals)
     return SampledState(
         commands=jnp.repeat(tau[None], sampling.queue + 1, axis=0),
         sensor=part.init(*sensor_state(scenario, q, dq, state.higher), sampling.period),
         measured=Measurement(q, dq, state.higher),
         signals=blank,
+        sent=sent,
     )
 
 
@@ -371,6 +384,8 @@ def sample_at(
         saturated=signals.saturated | limited,
         slack=signals.slack,
         region_slack=signals.region_slack,
+        auxiliary=signals.auxiliary,
+        events=signals.events,
         **optional,
     )
 
@@ -472,6 +487,7 @@ class LawUpdate(NamedTuple):
     measured: Measurement
     """The measurement, with the observer's estimates of levels that are not measured."""
     command: Command
+    """That of the law; with an event trigger its torque and its input are those that were sent."""
     f_hat: jax.Array
     controller: Any
     """State of the law at the next sample."""
@@ -479,6 +495,8 @@ class LawUpdate(NamedTuple):
     """State of the observer at the next sample."""
     reading: Measurement
     """The measurement without estimates."""
+    sent: Any = ()
+    """The `SentCommand` of a loop with an event trigger."""
 
 
 def discrete_observer(scenario: Scenario) -> Any:
@@ -497,7 +515,12 @@ def discrete_observer(scenario: Scenario) -> Any:
 
 
 def law_update(
-    scenario: Scenario, t: jax.Array, measured: Measurement, controller: Any, observer: Any
+    scenario: Scenario,
+    t: jax.Array,
+    measured: Measurement,
+    controller: Any,
+    observer: Any,
+    sent: Any = (),
 ) -> LawUpdate:
     """Command and next states of law and observer for one measurement: the program that runs on
     the robot's computer.
@@ -507,6 +530,7 @@ def law_update(
       t: start of the period, () [s].
       measured: measurement at t.
       controller, observer: their states at t.
+      sent: the `SentCommand` before t of a loop with an event trigger.
     """
     sampling: Any = scenario.sampling
     running = discrete_observer(scenario)
@@ -518,10 +542,20 @@ def law_update(
     command, controller_rate = law.command(
         t, *law_state(scenario, q, dq, higher), f_hat, scenario.context, controller
     )
+    if sampling.trigger is not None:
+        sent = sampling.trigger.sent(plant_input(command), command.tau, sent)
+        command = _with_sent_input(command, sent)
     arguments = observer_arguments(scenario, running, t, q, dq, higher, command.tau, observer)
     next_observer = _next_observer_state(sampling, running, arguments)
     next_controller = _euler(controller, controller_rate, sampling.period)
-    return LawUpdate(measured, command, f_hat, next_controller, next_observer, reading)
+    return LawUpdate(measured, command, f_hat, next_controller, next_observer, reading, sent)
+
+
+def _with_sent_input(command: Command, sent: SentCommand) -> Command:
+    """A command with the torque and the input that an event trigger sent."""
+    if isinstance(command.input, tuple):
+        return command._replace(tau=sent.input)
+    return command._replace(tau=sent.torque, input=sent.input)
 
 
 def _next_observer_state(sampling: Any, observer: Any, arguments: tuple) -> Any:
@@ -560,7 +594,7 @@ def run_sampled_law(
     )
     if isinstance(measured.higher, tuple):
         measured = measured._replace(higher=state.higher)
-    update = law_update(scenario, t, measured, state.controller, state.observer)
+    update = law_update(scenario, t, measured, state.controller, state.observer, before.sent)
     commands = jnp.concatenate([plant_input(update.command)[None], before.commands[:-1]])
     estimated = estimated_levels(
         scenario,
@@ -571,11 +605,11 @@ def run_sampled_law(
         Measurement(state.q, state.dq, state.higher),
         state.observer,
     )
-    signals = law_signals(update.command, update.f_hat, estimated)
+    signals = law_signals(update.command, update.f_hat, estimated, update.sent)
     return state._replace(
         controller=update.controller,
         observer=update.observer,
-        sampled=SampledState(commands, sensor, update.measured, signals),
+        sampled=SampledState(commands, sensor, update.measured, signals, update.sent),
     )
 
 
@@ -626,10 +660,11 @@ def perturbed_rate(
     """The function whose derivative linearises the loop.
 
     For a continuous loop it is the rate of the state. For a sampled loop it is the rate of the
-    plant, the next command, and the next states of law, observer and sensor. Rounding of a sensor
-    and limits of an actuator are left out (`Sensor.unrounded`, `Actuator.unlimited`), because their
-    derivatives vanish and would show an open loop; so are dead zone, play and rounding of an
-    actuator in every loop (`Actuator.smooth`), and the delay of the input of a continuous loop.
+    plant, the next command, and the next states of law, observer and sensor. Rounding of a sensor,
+    limits of an actuator and an event trigger are left out (`Sensor.unrounded`,
+    `Actuator.unlimited`), because their derivatives vanish and would show an open loop; so are dead
+    zone, play and rounding of an actuator in every loop (`Actuator.smooth`), and the delay of the
+    input of a continuous loop.
 
     Args:
       scenario: the scenario.
@@ -647,8 +682,12 @@ def perturbed_rate(
         if dt is not None:
             arguments.append(dt)
         return compiled(evaluate)(*arguments)[0]
+    sampling: Any = scenario.sampling
     scenario = dataclasses.replace(
-        scenario, sensor=unrounded(scenario.sensor), actuator=smooth(unlimited(scenario.actuator))
+        scenario,
+        sensor=unrounded(scenario.sensor),
+        actuator=smooth(unlimited(scenario.actuator)),
+        sampling=dataclasses.replace(sampling, trigger=None),
     )
     controller, observer, sensor = perturbed.memory
     state = with_integrated_part(initial_state(scenario), perturbed.plant)

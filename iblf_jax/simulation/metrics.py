@@ -33,6 +33,7 @@ from iblf_jax.core.pytree import Leaf, component, layers, leaf
 from iblf_jax.core.units import (
     HIGHER,
     INPUT,
+    LAST_LEVEL,
     LEVELS,
     POSITION,
     UNCERTAIN,
@@ -635,6 +636,86 @@ def _positive_share(first: jax.Array, last: jax.Array) -> jax.Array:
     return jnp.where(crosses, high / width, jnp.where(high > 0, 1.0, 0.0))
 
 
+@component
+class Auxiliary:
+    """Largest size of the auxiliary state of a limited torque: largest_auxiliary = max |lambda|.
+
+    Only for laws that have one (`controllers.Saturated` with `auxiliary`), whose runs carry it by
+    default.
+    """
+
+    units: ClassVar[dict[str, str]] = {"largest_auxiliary": LAST_LEVEL}
+    needs: ClassVar[str] = "auxiliary"
+
+    def init(self, sample: Sample) -> jax.Array:
+        """Zero."""
+        return jnp.zeros_like(sample.auxiliary)
+
+    def update(self, acc: jax.Array, sample: Sample) -> jax.Array:
+        """Adds one sample."""
+        return jnp.maximum(acc, jnp.abs(sample.auxiliary))
+
+    def finish(self, acc: jax.Array) -> dict[str, jax.Array]:
+        """largest_auxiliary, (n,)."""
+        return {"largest_auxiliary": acc}
+
+
+class _EventTimes(NamedTuple):
+    events: jax.Array
+    """Commands sent so far."""
+    first: jax.Array
+    """Time of the first event."""
+    last: jax.Array
+    """Time of the latest event."""
+    shortest: jax.Array
+
+
+@component
+class Events:
+    """Number of the commands that an event trigger sent, and the intervals between them.
+
+    shortest_interval and mean_interval are those between consecutive events, infinite on a run with
+    fewer than two.  Only for scenarios with `Sampling(trigger=...)`, whose runs carry it by
+    default.
+    """
+
+    units: ClassVar[dict[str, str]] = {
+        "event_count": "1",
+        "shortest_interval": "s",
+        "mean_interval": "s",
+    }
+    needs: ClassVar[str] = "events"
+
+    def init(self, sample: Sample) -> _EventTimes:
+        """No event."""
+        zero, infinite = jnp.zeros_like(sample.t), jnp.full_like(sample.t, jnp.inf)
+        return _EventTimes(zero, zero, zero, infinite)
+
+    def update(self, acc: _EventTimes, sample: Sample) -> _EventTimes:
+        """Adds one sample."""
+        # The numbers are integers of floating-point type.
+        is_event = sample.events > acc.events + 0.5
+        is_first = is_event & (acc.events < 0.5)
+        is_later = is_event & (acc.events > 0.5)
+        interval = jnp.where(is_later, sample.t - acc.last, jnp.inf)
+        return _EventTimes(
+            sample.events,
+            jnp.where(is_first, sample.t, acc.first),
+            jnp.where(is_event, sample.t, acc.last),
+            jnp.minimum(acc.shortest, interval),
+        )
+
+    def finish(self, acc: _EventTimes) -> dict[str, jax.Array]:
+        """event_count, shortest_interval and mean_interval, () each."""
+        intervals = acc.events - 1.0
+        mean = (acc.last - acc.first) / jnp.maximum(intervals, 1.0)
+        return {
+            "event_count": acc.events,
+            "shortest_interval": acc.shortest,
+            "mean_interval": jnp.where(intervals > 0.5, mean, jnp.inf),
+        }
+
+
 SIGNAL_SOURCES = {
     "x_hat": "an observer of levels, such as ij.observers.StateObserver(bandwidth=100.0)",
     "dq_lower": "velocity_bounds, such as Bounds(lower=Constant(-1.0), upper=Constant(1.0))",
@@ -642,6 +723,8 @@ SIGNAL_SOURCES = {
     "region_margin": "regions, such as (ij.regions.HalfSpace(normal=[0, 1], offset=0.1),)",
     "slack": "a law with a filter, such as ij.controllers.SafetyFilter(law)",
     "region_slack": "regions and a law with a filter, such as ij.controllers.SafetyFilter(law)",
+    "auxiliary": "an auxiliary state, such as ij.controllers.Saturated(law, limit, auxiliary=5.0)",
+    "events": "a trigger, such as ij.Sampling(period, trigger=ij.EventTrigger(relative=0.1))",
 }
 """Optional signal -> the part of a scenario that it needs, with an example."""
 
@@ -659,6 +742,10 @@ def has_signal(scenario: Scenario, signal: str) -> bool:
     has_regions = len(scenario.regions) > 0
     if signal == "region_margin":
         return has_regions
+    if signal == "auxiliary":
+        return any(law_member(law, "has_auxiliary") for law in layers(scenario.controller))
+    if signal == "events":
+        return scenario.sampling is not None and scenario.sampling.trigger is not None
     has_filter = any(law_member(law, "filters") for law in layers(scenario.controller))
     return has_filter and (signal == "slack" or has_regions)
 
@@ -746,22 +833,25 @@ def standard() -> tuple[Fold, ...]:
     return (Tracking(), Settling(), Margin(), Torque(), Estimation())
 
 
+OPTIONAL: tuple[type[Any], ...] = (
+    VelocityMargin,
+    LevelMargin,
+    RegionMargin,
+    Slack,
+    RegionSlack,
+    LevelEstimation,
+    Auxiliary,
+    Events,
+)
+"""The folds that read an optional signal."""
+
+
 def optional_folds(scenario: Scenario) -> tuple[Fold, ...]:
     """The folds that runs of a scenario carry besides the standard ones: margins of bounds of
-    further levels and of regions, slacks of a filter, and errors of estimated levels.
+    further levels and of regions, slacks of a filter, errors of estimated levels, the auxiliary
+    state of a limited torque, and the events of a trigger.
     """
-    return tuple(
-        fold
-        for fold in (
-            VelocityMargin(),
-            LevelMargin(),
-            RegionMargin(),
-            Slack(),
-            RegionSlack(),
-            LevelEstimation(),
-        )
-        if has_signal(scenario, fold.needs)
-    )
+    return tuple(fold() for fold in OPTIONAL if has_signal(scenario, fold.needs))
 
 
 MEMBERS = {
@@ -775,6 +865,8 @@ MEMBERS = {
     "region_margin": RegionMargin,
     "slack": Slack,
     "region_slack": RegionSlack,
+    "auxiliary": Auxiliary,
+    "events": Events,
     "torque": Torque,
     "above_gravity": AboveGravity,
     "estimation": Estimation,

@@ -13,14 +13,80 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from iblf_jax.control.controllers.event_compensated import check_relative
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf, static
+from iblf_jax.core.units import INPUT
 
 OBSERVER_STEPS = ("exact", "poles", "euler")
 DELAY_TOLERANCE = 1e-6
 """Largest distance [steps] at which a delay is rounded to a whole number of steps."""
 PERIOD_TOLERANCE = 1e-4
 """Largest relative distance of a period from a whole number of steps."""
+
+
+class SentCommand(NamedTuple):
+    """The command that an event trigger sent last."""
+
+    input: jax.Array
+    """Input of the plant, (n,): of a robot the torque [N m]."""
+    torque: jax.Array
+    """Torque of the law, (n,) [N m], which observers receive; the input itself, unless an input map
+    such as `controllers.WithDrive` has another."""
+    number: jax.Array
+    """Number of commands sent so far, () of floating-point type."""
+
+
+@component
+class EventTrigger:
+    """The command of a sample is sent where it differs enough from the last one that was sent.
+
+        |u_i - u_held,i| > relative_i |u_held,i| + absolute_i   for any component i
+
+    Otherwise the actuator and the observer keep the held command.  One component beyond its
+    threshold sends all of them: a message to the drives carries the commands of all joints, so that
+    the number of events is the number of messages, and the error |u_i - u_held,i| of each component
+    is bounded by its own threshold all the same.  The first sample is always sent.  With a period
+    of one step dt the condition is checked at every step, as for a law in continuous time.
+
+    The derivative of a held command is that of the command that was sent; the instants of the
+    events have no derivative.
+
+    Args:
+      relative: delta, () or (n,) [1], >= 0 and < 1; 0 if not given.
+      absolute: m, threshold of the error itself, () or (n,) [N m], >= 0; 0 if not given.
+
+    Source: L. Xing, C. Wen, Z. Liu, H. Su, J. Cai, IEEE Trans. Automatic Control 62 (2017)
+      2071-2076 (relative threshold, one input); for several inputs as said above.
+    """
+
+    relative: Leaf = leaf("1", sign="nonnegative", default=0.0)
+    absolute: Leaf = leaf(INPUT, sign="nonnegative", default=0.0)
+
+    def check(self) -> None:
+        """Raises ValueError for a relative threshold of 1 or more."""
+        check_relative("EventTrigger.relative", self.relative)
+
+    def sent(self, u: jax.Array, torque: jax.Array, last: SentCommand) -> SentCommand:
+        """The command that is sent, or held, at a sample.
+
+        Args:
+          u: input of the plant that the law commands, (n,).
+          torque: of the law, (n,) [N m].
+          last: the command that was sent last.
+        """
+        threshold = self.relative * jnp.abs(last.input) + self.absolute
+        fires = jnp.any(jnp.abs(u - last.input) > threshold) | (last.number == 0.0)
+        return SentCommand(
+            jnp.where(fires, u, last.input),
+            jnp.where(fires, torque, last.torque),
+            last.number + jnp.where(fires, 1.0, 0.0).astype(last.number.dtype),
+        )
+
+
+def nothing_sent(u: jax.Array) -> SentCommand:
+    """The command before the first sample: the input u, (n,), which was not sent."""
+    return SentCommand(u, u, jnp.zeros((), u.dtype))
 
 
 @component
@@ -45,6 +111,7 @@ class Sampling:
         kf period = 2 on.
       queue: largest number of commands in transit at once; as many as the delay needs if not given.
         A study with longer delays needs more.
+      trigger: an `EventTrigger`; every command is sent if not given.
 
     Source: K. J. Astrom, B. Wittenmark, Computer-Controlled Systems, 3rd ed. 1997, chapters 2 and
       3.
@@ -54,9 +121,16 @@ class Sampling:
     delay: Leaf = leaf("s", sign="nonnegative", shape="scalar", default=0.0)
     observer: str = static(default="exact")
     queue: int = static(default=None)
+    trigger: EventTrigger | None = None
 
     def check(self) -> None:
-        """Raises ValueError for an unknown step of the observer or a queue that is too short."""
+        """Raises ValueError for an unknown step of the observer, a queue that is too short, or
+        something else than an event trigger.
+        """
+        if not isinstance(self.trigger, EventTrigger | None):
+            remedy = "Such as ij.EventTrigger(relative=0.1, absolute=0.05)."
+            expected = "an EventTrigger, or None"
+            raise checks.fail("Sampling.trigger", self.trigger, expected, remedy)
         checks.one_of("Sampling.observer", self.observer, OBSERVER_STEPS)
         name, queue, least = "Sampling.queue", self.queue, 0
         if checks.is_concrete(self):

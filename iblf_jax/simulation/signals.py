@@ -9,7 +9,16 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from iblf_jax.core.units import HIGHER, INPUT, LEVELS, POSITION, UNCERTAIN, VELOCITY, PlantUnit
+from iblf_jax.core.units import (
+    HIGHER,
+    INPUT,
+    LAST_LEVEL,
+    LEVELS,
+    POSITION,
+    UNCERTAIN,
+    VELOCITY,
+    PlantUnit,
+)
 
 
 class Recorded(NamedTuple):
@@ -58,6 +67,12 @@ class Signals:
         Any, Recorded("m/s^2", "violation of the safety filter's conditions on the regions")
     ] = ()
     """`()` without regions or without a filter."""
+    auxiliary: Annotated[
+        Any, Recorded(LAST_LEVEL, "auxiliary state lambda of the limited torque")
+    ] = ()
+    """`()` under laws without one."""
+    events: Annotated[Any, Recorded("1", "number of commands that the event trigger has sent")] = ()
+    """(); `()` without an event trigger."""
     higher: Annotated[Any, Recorded(HIGHER, "levels of the state from the third on")] = ()
     """One row a level; `()` for robots."""
     e_higher: Annotated[Any, Recorded(HIGHER, "errors x_i - alpha_{i-1} of these levels")] = ()

@@ -110,6 +110,8 @@ def samples(rng: np.random.Generator, n: int = 2, step: float = 0.01) -> Sample:
         "dt": dt,
         "step": since,
     }
+    signals["events"] = 1.0 + np.floor(np.sqrt(index))  # intervals that differ
+    signals["auxiliary"] = 0.1 * np.cos(angle) * signals["e2"]
     for name in ("guard_active", "saturated"):
         signals[name] = rng.uniform(size=(LENGTH, n)) < 0.3
     return Sample(**jax.tree.map(jnp.asarray, signals))

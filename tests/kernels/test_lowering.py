@@ -58,6 +58,7 @@ SPECIAL = {
         K=5.0,
         surface=ij.Bounds(ij.bounds.Funnel(-9.0, -0.5, 1.5), ij.bounds.Constant([8.0, 6.0])),
     ),
+    "event_compensated": lambda cls: cls(PRESET.controller, 0.1, 0.2, 0.5),
     "safety_filter": lambda cls: cls(PRESET.controller, nearest="acceleration"),
     "saturated": lambda cls: cls(PRESET.controller, limit=8.0),
     "terminal_sliding_mode": lambda cls: cls(beta=1.0, K=20.0, layer=0.02),

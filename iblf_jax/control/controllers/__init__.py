@@ -14,6 +14,7 @@ from iblf_jax.control.controllers.barrier_backstepping import (
 )
 from iblf_jax.control.controllers.computed_torque import ComputedTorque as ComputedTorque
 from iblf_jax.control.controllers.dynamic_surface import DynamicSurface as DynamicSurface
+from iblf_jax.control.controllers.event_compensated import EventCompensated as EventCompensated
 from iblf_jax.control.controllers.full_state import FullState as FullState
 from iblf_jax.control.controllers.pd_gravity import PDGravity as PDGravity
 from iblf_jax.control.controllers.reference_governor import ReferenceGovernor as ReferenceGovernor
@@ -42,6 +43,7 @@ MEMBERS = {
     "terminal_sliding_mode": TerminalSlidingMode,
     "computed_torque": ComputedTorque,
     "pd_gravity": PDGravity,
+    "event_compensated": EventCompensated,
     "saturated": Saturated,
     "safety_filter": SafetyFilter,
     "reference_governor": ReferenceGovernor,
@@ -60,6 +62,7 @@ __all__ = [
     "ComputedTorque",
     "Controller",
     "DynamicSurface",
+    "EventCompensated",
     "FullState",
     "LawContext",
     "LyapunovLaw",

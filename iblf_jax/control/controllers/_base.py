@@ -26,6 +26,17 @@ State = Any
 """A pytree of arrays; `()` for a law without memory."""
 
 
+class Shift(NamedTuple):
+    """The auxiliary state lambda of a limited input (`Saturated`), which shifts the virtual control
+    of the last level.
+    """
+
+    value: jax.Array
+    """lambda, (n,) in the unit of the last level, [rad/s] for a robot."""
+    rate: jax.Array
+    """-k lambda, (n,)."""
+
+
 class LawContext(NamedTuple):
     """The inputs of a law besides measurements: model, reference and bounds."""
 
@@ -36,6 +47,28 @@ class LawContext(NamedTuple):
     regions: tuple[Region, ...] = ()
     state_bounds: tuple[Bounds | None, ...] = ()
     """Bounds of the levels from the second on of a plant in strict-feedback form."""
+    shift: Shift | None = None
+    """What a law that `takes_shift` adds to the virtual control of the last level, and to its
+    rate."""
+
+    def shifted(self, alpha: jax.Array, rate: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """The virtual control of the last level and its rate, (n,) each, with the shift if there is
+        one.
+        """
+        if self.shift is None:
+            return alpha, rate
+        return alpha + self.shift.value, rate + self.shift.rate
+
+    def shifted_tube(self, tube: Tube) -> Tube:
+        """The tube of the last level, moved by the shift if there is one: the error and its
+        distances to the bounds are then those of x_r - lambda.
+        """
+        if self.shift is None:
+            return tube
+        q_d, dq_d = self.shifted(tube.q_d, tube.dq_d)
+        lower, dlower = self.shifted(tube.lower, tube.dlower)
+        upper, dupper = self.shifted(tube.upper, tube.dupper)
+        return Tube(q_d, dq_d, lower, upper, dlower, dupper)
 
     def level_bounds(self, level: int) -> Bounds | None:
         """The bounds of a level, counted from 1; None where it has none."""
@@ -91,6 +124,11 @@ class Command(NamedTuple):
     input: Any = ()
     """The input of the plant, (n,), where it is not the torque `tau`: the voltage of a drive, say.
     Observers receive `tau`."""
+    input_slope: Any = ()
+    """dV/dx_r G_r, (n,): the derivative of the law's Lyapunov function along the input, e2 for
+    V = V1 + 1/2 e2^T M0 e2; `()` for a law without a Lyapunov function."""
+    auxiliary: Any = ()
+    """The auxiliary state lambda of a limited input, (n,); `()` for laws without one."""
 
 
 class Controller(Protocol):
@@ -105,6 +143,9 @@ class Controller(Protocol):
     - `needs_velocity_bounds`: True if it requires `LawContext.velocity_bounds`.
     - `includes_e2`: True if its V1 contains its term of e2, so that V2 adds no 1/2 e2^T M0 e2.
     - `filters`: True if its commands have a `slack`.
+    - `takes_shift`: True if it adds `LawContext.shift` to the virtual control of the last level and
+      to its rate (`LawContext.shifted`).
+    - `has_auxiliary`: True if its commands have an `auxiliary`.
     - `receives_x`: True for a law of plants in strict-feedback form, which receives the state x,
       (r, n), in the place of q and q': `init(x, context)`, `command(t, x, d_hat, context, state)`
       and `switching(t, x, d_hat, context, state)`, with d_hat as the observer gives it, (r, n) or
@@ -161,6 +202,8 @@ law_member = OptionalMembers(
     needs_velocity_bounds=False,
     includes_e2=False,
     filters=False,
+    takes_shift=False,
+    has_auxiliary=False,
     receives_x=False,
     input_unit=None,
     completed=None,

@@ -82,6 +82,8 @@ def exact_levels(
             context, i + 1, time_curve[: terms + 1], centre_curve[: terms + 1]
         )
         tube_curve = _curve_of_tube(centre_curve, lower, upper, terms)
+        if i == order - 1:
+            tube_curve = [context.shifted_tube(tube_curve[0])]
 
         def level_at(t, x, tube, slope_below, i=i, design=design):
             return _level(design, i, plant, t, x, tube, slope_below, d_hat)
@@ -119,7 +121,10 @@ def surface_levels(
         slope = levels[i].slope
         if i < len(designs) - 1:
             rate = (levels[i].alpha - state[i]) / filters[i]
-            tubes.append(_filtered_tube(context, i + 2, t, state[i], rate))
+            tube = _filtered_tube(context, i + 2, t, state[i], rate)
+            if i == len(designs) - 2:
+                tube = context.shifted_tube(tube)
+            tubes.append(tube)
     return levels, tubes
 
 

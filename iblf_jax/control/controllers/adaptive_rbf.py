@@ -85,6 +85,7 @@ class AdaptiveRBF:
     gains: ClassVar[tuple[str, ...]] = ("k1", "K2")
     unit_factors: ClassVar[tuple[str, ...]] = ("weight",)
     uses_observer: ClassVar[bool] = False
+    takes_shift: ClassVar[bool] = True
     leaf_units = weight_units
 
     def check(self) -> None:
@@ -121,7 +122,7 @@ class AdaptiveRBF:
         S = self.basis(q, dq, alpha, dalpha)
         learned = jnp.sum(S[:, None] * state, axis=0)
         tau = learned - self.K2 * e2 - self.weight * self.barrier.slope(tube, q)
-        command = barrier_command(self, tube, q, alpha, tau)
+        command = barrier_command(self, tube, q, alpha, tau)._replace(input_slope=e2)
         return command, -self.Gamma * (S[:, None] * e2 + self.sigma * state)
 
 

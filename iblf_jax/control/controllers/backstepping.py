@@ -107,6 +107,7 @@ class Backstepping:
     decays: tuple[Decay, ...] = ()
     gains: ClassVar[tuple[str, ...]] = ("k1", "K2")
     unit_factors: ClassVar[tuple[str, ...]] = ("weight",)
+    takes_shift: ClassVar[bool] = True
     leaf_units = weight_units
     symbols_of_part = symbols_of_energy
     init = no_state
@@ -154,7 +155,8 @@ class Backstepping:
         tau = feedforward - f_hat - self.K2 * (dq - alpha)
         tau = tau - self.weight * self.barrier.slope(tube, q)
         tau = with_energy_decay(self, t, q, dq - alpha, context, tau)
-        return barrier_command(self, tube, q, alpha, tau), ()
+        command = barrier_command(self, tube, q, alpha, tau)
+        return command._replace(input_slope=dq - alpha), ()
 
 
 def barrier_command(law, tube: Tube, q: jax.Array, alpha: jax.Array, tau: jax.Array) -> Command:
@@ -250,10 +252,10 @@ def alpha_and_rate(
     law, t: jax.Array, q: jax.Array, dq: jax.Array, context: LawContext
 ) -> tuple[jax.Array, jax.Array]:
     """Virtual velocity [rad/s] and its total time derivative alpha' [rad/s^2] along q', each (n,),
-    for a law with `barrier`, `k1`, `o`.
+    for a law with `barrier`, `k1`, `o`; with the context's shift.
     """
 
     def alpha_at(t, q):
         return virtual_velocity(law, t, q, context)
 
-    return jax.jvp(alpha_at, (t, q), (jnp.ones_like(t), dq))
+    return context.shifted(*jax.jvp(alpha_at, (t, q), (jnp.ones_like(t), dq)))

@@ -104,6 +104,7 @@ class BarrierBackstepping:
     decays: tuple[Decay, ...] = ()
     gains: ClassVar[tuple[str, ...]] = ("k",)
     receives_x: ClassVar[bool] = True
+    takes_shift: ClassVar[bool] = True
     includes_e2: ClassVar[bool] = True
 
     def check(self) -> None:
@@ -342,6 +343,9 @@ class BarrierBackstepping:
             guard_active |= guard_is_active(tube, x[i], barrier.guard)
         saturated = jnp.zeros_like(guard_active)
         command = Command(levels[-1].alpha, tubes[1].q_d, V, guard_active, saturated)
+        plant = plants.as_plant(context.model)
+        slope = plants.transposed_gain(plant, self.order, t, x, levels[-1].slope)
+        command = command._replace(input_slope=slope)
         if self.order > 2:
             command = command._replace(alpha_higher=jnp.stack([tube.q_d for tube in tubes[2:]]))
         return command, rates

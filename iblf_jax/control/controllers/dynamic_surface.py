@@ -66,6 +66,7 @@ class DynamicSurface:
     decays: tuple[Decay, ...] = ()
     gains: ClassVar[tuple[str, ...]] = ("k1", "K2")
     unit_factors: ClassVar[tuple[str, ...]] = ("weight",)
+    takes_shift: ClassVar[bool] = True
     leaf_units = weight_units
     symbols_of_part = symbols_of_energy
 
@@ -92,8 +93,10 @@ class DynamicSurface:
         """The torque, what belongs to it, and beta'."""
         tube, beta = context.tube(t), state
         dbeta = (virtual_velocity(self, t, q, context) - beta) / self.filter
-        feedforward = rigid_body_torque(context.model, q, dq, beta, dbeta)
-        tau = feedforward - f_hat - self.K2 * (dq - beta)
+        centre, rate = context.shifted(beta, dbeta)
+        feedforward = rigid_body_torque(context.model, q, dq, centre, rate)
+        tau = feedforward - f_hat - self.K2 * (dq - centre)
         tau = tau - self.weight * self.barrier.slope(tube, q)
-        tau = with_energy_decay(self, t, q, dq - beta, context, tau)
-        return barrier_command(self, tube, q, beta, tau), dbeta
+        tau = with_energy_decay(self, t, q, dq - centre, context, tau)
+        command = barrier_command(self, tube, q, centre, tau)
+        return command._replace(input_slope=dq - centre), dbeta

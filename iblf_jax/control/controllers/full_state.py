@@ -77,6 +77,7 @@ from iblf_jax.control.controllers.backstepping import (
 )
 from iblf_jax.control.decays import Decay
 from iblf_jax.core import checks
+from iblf_jax.core.linalg import solve_spd
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.world.bounds import Tube
 
@@ -137,6 +138,7 @@ class FullState:
     unit_factors: ClassVar[tuple[str, ...]] = ("weight",)
     needs_velocity_bounds: ClassVar[bool] = True
     includes_e2: ClassVar[bool] = True
+    takes_shift: ClassVar[bool] = True
     init = no_state
 
     def check(self) -> None:
@@ -177,6 +179,8 @@ class FullState:
         """
         alpha, dalpha = alpha_and_rate(self, t, q, dq, context)
         (lower, upper), (dlower, dupper) = jax.jvp(context.speed_limits, (t,), (jnp.ones_like(t),))
+        lower, dlower = context.shifted(lower, dlower)
+        upper, dupper = context.shifted(upper, dupper)
         return context.tube(t), Tube(alpha, dalpha, lower, upper, dlower, dupper)
 
     def switching(
@@ -187,7 +191,8 @@ class FullState:
         """
         if not ratio_jumps(self.velocity_barrier):
             return None
-        return dq - virtual_velocity(self, t, q, context)
+        alpha = virtual_velocity(self, t, q, context)
+        return dq - context.shifted(alpha, jnp.zeros_like(alpha))[0]
 
     def command(
         self,
@@ -211,4 +216,6 @@ class FullState:
         )
         value = self.weight * first.value(outer, q) + second.value(inner, dq)
         saturated = jnp.zeros_like(guard_active)
-        return Command(levels[1].alpha, inner.q_d, value, guard_active, saturated), ()
+        command = Command(levels[1].alpha, inner.q_d, value, guard_active, saturated)
+        slope = solve_spd(context.model.mass_matrix(q), levels[1].slope)
+        return command._replace(input_slope=slope), ()

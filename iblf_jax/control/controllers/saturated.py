@@ -1,12 +1,50 @@
-"""Actuator limits around any law; the paper leaves them to future work.
+"""Actuator limits around any law, without and with an auxiliary state; the paper leaves them to
+future work.
 
 The loop passes the applied torque to observer and plant, so the observer estimates f without the
-torque that was cut.  The claims of a law hold only while its torque is not cut.
+torque that was cut.
+
+**Auxiliary state.**  The level of the input, x_r, has the rate f_r + G_r sat(u) + d_r.  With
+
+    lambda' = -k lambda + G_r (sat(u) - u),   lambda(0) = 0,                                  (A.1)
+
+the error z = x_r - alpha_{r-1} - lambda obeys z' = f_r + G_r u + d_r - alpha_{r-1}' + k lambda, in
+which the limit does not appear.  A law that takes alpha_{r-1} + lambda for alpha_{r-1}, and
+alpha_{r-1}' - k lambda for its rate, is therefore not disturbed by the limit in this level.  For a
+robot, where G_2 = M0^-1, the corrected law becomes
+
+    tau = C0 (alpha + lambda) + G0 + M0 (alpha' - k lambda) - f_hat - K2 z - w s.             (A.2)
+
+The level below has x_r = alpha_{r-1} + z + lambda, so that with z in the place of e_r
+
+    V' = (V' of the law without limits) + (w_{r-1} s_{r-1})^T G_{r-1} lambda,                 (A.3)
+
+which is w s . lambda for a robot.  Bounds of the last level become bounds of x_r - lambda, so that
+(A.3) holds for barriers on that level, too.  The claims hold as far as lambda is small; runs record
+it.
+
+**Choice of k.**  (A.2) is the law without lambda, plus (C0 + K2 - k M0) lambda.  For k M0 = K2 + C0
+the applied torque is that of the limit alone.  A smaller k reduces the command while the torque is
+limited; a larger one keeps the torque at its limit until lambda has returned to 0.  While it is
+limited, lambda' does not depend on k:
+
+    lambda' = M0^-1 (sat(tau) - tau_0 - (C0 + K2) lambda),   tau_0 the torque for lambda = 0.
+
+A large k therefore does not give the limit alone.
+
+**Laws that do not take the shift** (`takes_shift`), such as those of users, are evaluated at the
+state with x_r - lambda in the place of x_r, and the input is the one for which x_r - lambda moves
+as x_r does without limits:
+
+    f_r(x) + G_r(x) u = f_r(y) + G_r(y) u_law(y) - k lambda,   y = x with x_r - lambda.       (A.4)
+
+Then V(t, y) has the rate that it has without limits, plus (dV/dx_{r-1})^T G_{r-1} lambda.
 """
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from collections.abc import Sequence
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,14 +53,17 @@ import numpy as np
 from iblf_jax.control.controllers._base import (
     Command,
     Controller,
+    LawContext,
+    Shift,
     State,
+    law_member,
+    switching_functions,
     wrapped_advice,
-    wrapped_state,
-    wrapped_switching,
 )
 from iblf_jax.core import checks
-from iblf_jax.core.pytree import Leaf, component, leaf, static
+from iblf_jax.core.pytree import Leaf, component, leaf, static, unwrapped
 from iblf_jax.core.units import INPUT
+from iblf_jax.world import plants
 from iblf_jax.world.robots import Robot
 from iblf_jax.world.robots._base import robot_member
 
@@ -31,45 +72,155 @@ SHARPNESS = 8
 """Even exponent of the smooth limit: at half the limit it takes off 0.05 %, at the limit 8 %."""
 
 
+class AuxiliaryState(NamedTuple):
+    """State of a `Saturated` with an auxiliary state."""
+
+    law: State
+    """State of the wrapped law."""
+    auxiliary: jax.Array
+    """lambda, (n,)."""
+
+
 @component
 class Saturated:
     """tau = clip(tau_law, -limit, limit) (hard), or tau_law / (1 + |tau_law/limit|^8)^(1/8)
     (smooth, for gradients).
 
-    Paths reach through: "controller.K2" is the wrapped law's K2.
+    With `auxiliary` the law has the auxiliary state lambda of (A.1), and e2 is q' - alpha - lambda
+    (head of this module).  Paths reach through: "controller.K2" is the wrapped law's K2.
 
     Args:
       law: the law whose torque is limited, any `Controller`.
       limit: largest torque of each joint, () or (n,) [N m], > 0.
       edge: "hard" or "smooth"; "hard" if not given.
+      auxiliary: rate k of the auxiliary state, () or (n,) [1/s], > 0; no auxiliary state if not
+        given.  A sampled law needs one below 2 divided by its period.
 
-    Source: none; the construction is common.
+    Source: the limit is a common construction; the auxiliary state as in M. Chen, S. S. Ge, B. Ren,
+      Automatica 47 (2011) 452-465, with a linear filter; (A.1)-(A.4) as derived at the head of this
+      module.
     """
 
     law: Controller
     limit: Leaf = leaf(INPUT, sign="positive")
     edge: str = static(default="hard")
+    auxiliary: Leaf = leaf("1/s", sign="positive", default=None)
     wraps: ClassVar[str] = "law"
     advice = wrapped_advice
-    init = wrapped_state
-    switching = wrapped_switching
 
     def check(self) -> None:
         """Raises ValueError for something that is not a law, or an unknown edge."""
         checks.conforms("Saturated.law", self.law, Controller, "iblf_jax.controllers has them.")
         checks.one_of("Saturated.edge", self.edge, EDGES)
 
+    @property
+    def has_auxiliary(self) -> bool:
+        """Whether there is an auxiliary state."""
+        return self.auxiliary is not None
+
+    @property
+    def _receives_x(self) -> bool:
+        """Whether the wrapped law receives the levels x in the place of q and q'."""
+        return bool(law_member(unwrapped(self.law), "receives_x"))
+
+    def init(self, *arguments: Any) -> State:
+        """State of the wrapped law, and lambda(0) = 0.  Arguments as those of the wrapped law."""
+        state = self.law.init(*arguments)
+        if self.auxiliary is None:
+            return state
+        last_level = arguments[-2]
+        if self._receives_x:
+            last_level = last_level[-1]
+        return AuxiliaryState(state, jnp.zeros_like(last_level))
+
     def command(self, *arguments: Any) -> tuple[Command, State]:
         """The wrapped law's command with its torque limited; `saturated` says where it commanded
         more than the limit.  Arguments as those of the wrapped law.
         """
-        command, rate = self.law.command(*arguments)
+        if self.auxiliary is None:
+            command, rate = self.law.command(*arguments)
+            return self._limited(command), rate
+        *measured, context, state = arguments
+        law: Any = self.law
+        shift = self.shift(state)
+        if law_member(law, "takes_shift"):
+            shifted = context._replace(shift=shift)
+            command, rate = law.command(*measured, shifted, state.law)
+        else:
+            command, rate = self._command_at_shifted_state(measured, context, state.law, shift)
+        limited = self._limited(command)
+        plant = plants.as_plant(context.model)
+        cut = limited.tau - command.tau
+        effect = plants.gain_times(plant, plant.order, measured[0], self._levels(measured), cut)
+        auxiliary_rate = AuxiliaryState(rate, shift.rate + effect)
+        return limited._replace(auxiliary=state.auxiliary), auxiliary_rate
+
+    def _limited(self, command: Command) -> Command:
+        """A command with its torque limited."""
         saturated = command.saturated | (jnp.abs(command.tau) > self.limit)
         if self.edge == "hard":
             tau = jnp.clip(command.tau, -self.limit, self.limit)
         else:
             tau = self.limit * _smooth_clip(command.tau / self.limit)
-        return command._replace(tau=tau, saturated=saturated), rate
+        return command._replace(tau=tau, saturated=saturated)
+
+    def shift(self, state: AuxiliaryState) -> Shift:
+        """The shift of the virtual control: lambda and -k lambda."""
+        return Shift(state.auxiliary, -self.auxiliary * state.auxiliary)
+
+    def _levels(self, measured: Sequence[Any]) -> jax.Array:
+        """The levels x, (r, n), among the arguments t, q, q' or t, x of a law."""
+        if self._receives_x:
+            return measured[1]  # type: ignore[no-any-return]
+        return jnp.stack(measured[1:3])
+
+    def _at_shifted_state(self, arguments: Sequence[Any], value: jax.Array) -> list[Any]:
+        """The arguments t, q, q' or t, x of a law, and further ones, with x_r - lambda in the place
+        of x_r.
+        """
+        if self._receives_x:
+            t, x, *further = arguments
+            return [t, jnp.concatenate([x[:-1], (x[-1] - value)[None]]), *further]
+        t, q, dq, *further = arguments
+        return [t, q, dq - value, *further]
+
+    def _command_at_shifted_state(
+        self, measured: Sequence[Any], context: LawContext, state: State, shift: Shift
+    ) -> tuple[Command, State]:
+        """The command of (A.4), for a law that does not take the shift."""
+        law: Any = self.law
+        moved = self._at_shifted_state(measured, shift.value)
+        command, rate = law.command(*moved, context, state)
+        plant, t = plants.as_plant(context.model), measured[0]
+        x, y = self._levels(measured), self._levels(moved)
+        without_limit = plants.level_rate(plant, plant.order, t, y, command.tau)
+        tau = plants.level_input(plant, plant.order, t, x, without_limit + shift.rate)
+        return _with_shifted_control(command._replace(tau=tau), plant.order, shift.value), rate
+
+    def switching(self, *arguments: Any) -> jax.Array | None:
+        """The wrapped law's switching functions, at which its command jumps.  Arguments as those of
+        the wrapped law.
+        """
+        if self.auxiliary is None:
+            return switching_functions(self.law, *arguments)
+        *measured, context, state = arguments
+        shift = self.shift(state)
+        if law_member(self.law, "takes_shift"):
+            shifted = context._replace(shift=shift)
+            return switching_functions(self.law, *measured, shifted, state.law)
+        moved = self._at_shifted_state(measured, shift.value)
+        return switching_functions(self.law, *moved, context, state.law)
+
+
+def _with_shifted_control(command: Command, order: int, value: jax.Array) -> Command:
+    """A command with lambda added to its virtual control of the last level, if it has one."""
+    if order == 2:
+        return command._replace(alpha=command.alpha + value)
+    higher = command.alpha_higher
+    if isinstance(higher, tuple):
+        return command
+    last = (higher[-1] + value)[None]
+    return command._replace(alpha_higher=jnp.concatenate([higher[:-1], last]))
 
 
 UNLIMITED = 1e6

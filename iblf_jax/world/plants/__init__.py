@@ -10,6 +10,7 @@ from iblf_jax.world.plants._base import component_names as component_names
 from iblf_jax.world.plants._base import component_noun as component_noun
 from iblf_jax.world.plants._base import dependence_on_levels as dependence_on_levels
 from iblf_jax.world.plants._base import flow as flow
+from iblf_jax.world.plants._base import gain_times as gain_times
 from iblf_jax.world.plants._base import input_name as input_name
 from iblf_jax.world.plants._base import is_chain as is_chain
 from iblf_jax.world.plants._base import level_input as level_input
@@ -73,6 +74,7 @@ __all__ = [
     "component_names",
     "component_noun",
     "flow",
+    "gain_times",
     "input_name",
     "is_chain",
     "level_input",

@@ -200,6 +200,15 @@ def level_input(
     return rest / jnp.where(gain == 0.0, jnp.nan, gain)
 
 
+def gain_times(plant: Plant, level: int, t: jax.Array, x: jax.Array, v: jax.Array) -> jax.Array:
+    """G_i v of a level, (n,): the derivative of x_i' along the level above."""
+
+    def rate(above: jax.Array) -> jax.Array:
+        return level_rate(plant, level, t, x, above)
+
+    return jax.jvp(rate, (jnp.zeros_like(v),), (v,))[1]
+
+
 def transposed_gain(
     plant: Plant, level: int, t: jax.Array, x: jax.Array, s: jax.Array
 ) -> jax.Array:
@@ -334,6 +343,7 @@ def unit_symbols(plant: Any, model: Any) -> Mapping[str, Unit]:
     uncertain: Unit = rates if is_chain(model) else "N m"
     return {
         **{f"x{i + 1}": unit for i, unit in enumerate(levels)},
+        "last": levels[-1],
         "levels": ByLevel(levels),
         "higher": ByLevel(levels[2:]),
         "rates": rates,

@@ -1,0 +1,231 @@
+"""The auxiliary state of a limited torque, against the independent programs, its Lyapunov rate and
+its limits."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import chain_cases
+import independent_chains as chains
+import independent_inputs as other
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from independent import Loop
+
+import iblf_jax as ij
+from iblf_jax import barriers, controllers
+from iblf_jax.certificates.level_summary import growth_along
+from iblf_jax.certificates.level_terms import level_terms_at
+from iblf_jax.certificates.proof_terms import terms_at
+from iblf_jax.control.controllers.saturated import AuxiliaryState
+from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
+from iblf_jax.simulation.scenario import canonical
+
+PAPER = ij.presets.zhang_yan_2024(reading="corrected")
+LIMIT = np.array([9.0, 3.0])
+K = 6.0
+SATURATED = controllers.Saturated(PAPER.controller, limit=LIMIT, auxiliary=K)
+LIMITED = canonical(ij.with_parts(PAPER, controller=SATURATED))
+LAWS = {
+    "full_state": controllers.FullState(k1=2.0, K2=20.0, c=1.0),
+    "dynamic_surface": controllers.DynamicSurface(k1=2.0, K2=20.0, filter=0.02),
+    "barrier_backstepping": controllers.BarrierBackstepping(k=(2.0, 20.0)),
+    "adaptive_rbf": controllers.AdaptiveRBF(k1=2.0, K2=20.0, nodes=4),
+    "computed_torque": controllers.ComputedTorque(Kp=25.0, Kd=10.0),
+}
+"""Laws besides `Backstepping`; the last one does not take the shift."""
+
+
+def with_numbers(scenario, limit, k, **gains):
+    """The scenario with other numbers of its law."""
+    inner = dataclasses.replace(scenario.controller.law, **gains)
+    law = controllers.Saturated(inner, limit=limit, auxiliary=k)
+    return canonical(ij.with_parts(scenario, controller=law))
+
+
+def near(rng, tube):
+    """A random position inside the tube of an instant."""
+    return tube.lower + rng.uniform(0.1, 0.9, 2) * (tube.upper - tube.lower)
+
+
+# --- the independent programs ---------------------------------------------------------------------
+
+
+def test_the_vector_field_of_an_arm_is_that_of_the_independent_program(rng):
+    field = jax.jit(evaluate)
+    for _ in range(40):
+        numbers = {"k1": rng.uniform(1, 4, 2), "K2": rng.uniform(5, 30, 2)}
+        kf, k, limit = rng.uniform(5, 30, 2), rng.uniform(1, 30), rng.uniform(1, 15, 2)
+        t = rng.uniform(0, 10)
+        scenario = with_numbers(LIMITED, limit, k, **numbers)
+        scenario = ij.with_parameters(scenario, {"observer.kf": kf})
+        q = near(rng, scenario.context.tube(jnp.asarray(t)))
+        dq, eta, aux = rng.normal(size=(3, 2))
+        state = LoopState(q, dq, AuxiliaryState((), aux), eta)
+        rate, sample = field(scenario, t, jax.tree.map(jnp.asarray, state))
+        loop = Loop(corrected=True, kf=kf, **numbers)
+        y = np.concatenate([q, dq, eta, aux])
+        expected, signals = other.limited_arm(loop, limit, k, t, y)
+        found = [rate.q, rate.dq, rate.observer, rate.controller.auxiliary]
+        size = np.max(np.abs(expected))
+        np.testing.assert_allclose(np.concatenate(found), expected, rtol=1e-12, atol=1e-12 * size)
+        np.testing.assert_allclose(sample.tau, signals["tau"], rtol=1e-12, atol=1e-12 * size)
+        np.testing.assert_allclose(sample.V, signals["V"], rtol=1e-12)
+
+
+@pytest.mark.release
+def test_a_run_of_an_arm_is_that_of_the_independent_program():
+    run = ij.simulate(LIMITED, duration=2.0, dt=1e-4, record_every=500, throw=True)
+    expected = other.arm_run(Loop(corrected=True), LIMIT, K, np.asarray(run.t))
+    assert np.max(np.abs(expected[:, 6:])) > 0.01
+    np.testing.assert_allclose(run.q, expected[:, :2], atol=1e-7)
+    np.testing.assert_allclose(run.auxiliary, expected[:, 6:], atol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def coupled():
+    """A chain of order 3 with coupled gains and bounds of all levels, under a tight limit."""
+    scenario = chain_cases.scenario("coupled")
+    law = controllers.Saturated(scenario.controller, limit=0.5, auxiliary=K)
+    return canonical(ij.with_parts(scenario, controller=law))
+
+
+def random_points(case, rng, count):
+    """States of a chain, estimates, and auxiliary states, by which the last level is moved."""
+    nothing = [0.0] * case.order
+    for t, x, _, _ in chains.random_states(case, (0.0,) * case.order, nothing, count=count):
+        aux = 0.1 * rng.normal(size=case.n)
+        x = [*x[:-1], [a + b for a, b in zip(x[-1], aux, strict=True)]]
+        yield t, x, aux
+
+
+def test_the_input_of_a_chain_is_that_of_the_independent_program(coupled, rng):
+    case = chains.CASES["coupled"]
+    field = jax.jit(evaluate)
+    estimate = np.zeros((case.order, case.n))
+    for t, x, aux in random_points(case, rng, 20):
+        limit, k = rng.uniform(0.1, 20), rng.uniform(1, 30)
+        scenario = with_numbers(coupled, limit, k)
+        state = LoopState(x[0], x[1], AuxiliaryState((), aux), (), higher=x[2:])
+        rate, sample = field(scenario, t, jax.tree.map(jnp.asarray, _arrays(state)))
+        found = other.limited_chain(case, limit, k, t, x, estimate.tolist(), aux)
+        _, applied, aux_rate, control = found
+        np.testing.assert_allclose(sample.tau, applied, rtol=1e-12, atol=1e-12)
+        size = np.max(np.abs(aux_rate))
+        found_rate = rate.controller.auxiliary
+        np.testing.assert_allclose(found_rate, aux_rate, rtol=1e-11, atol=1e-12 * size)
+        np.testing.assert_allclose(sample.V, control.V, rtol=1e-11)
+
+
+def _arrays(state):
+    """The state with arrays in the place of lists."""
+    return state._replace(
+        q=np.asarray(state.q), dq=np.asarray(state.dq), higher=np.asarray(state.higher)
+    )
+
+
+# --- the Lyapunov rate ----------------------------------------------------------------------------
+
+
+def test_the_rate_of_V2_of_an_arm(rng):
+    """(A.3), with equality for a barrier that decays exactly, while the torque is limited."""
+    law = controllers.Backstepping(
+        k1=2.0, K2=20.0, barrier=barriers.Mapping(), reading="corrected", weight=[0.5, 2.0]
+    )
+    scenario = with_numbers(ij.with_parts(LIMITED, controller=_limited(law)), [2.0, 1.0], K)
+    terms, field = jax.jit(terms_at), jax.jit(evaluate)
+    for _ in range(20):
+        t = jnp.asarray(rng.uniform(0, 10))
+        tube = scenario.context.tube(t)
+        q, (dq, eta, aux) = near(rng, tube), rng.normal(size=(3, 2))
+        state = jax.tree.map(jnp.asarray, LoopState(q, dq, AuxiliaryState((), aux), eta))
+        proof, sample = terms(scenario, t, state), field(scenario, t, state)[1]
+        assert np.any(sample.saturated)
+        value = law.weight * law.barrier.value(tube, q)
+        slope = law.weight * law.barrier.slope(tube, q)
+        decay = jnp.sum(law.barrier.decay_rate(law.k1) * value)
+        z, f_tilde = proof.e2, proof.f_tilde
+        expected = -decay - z @ (law.K2 * z) + z @ f_tilde + f_tilde @ proof.df_tilde
+        expected += slope @ aux
+        np.testing.assert_allclose(proof.dV, expected, rtol=1e-9, atol=1e-12 * proof.dV_size)
+        np.testing.assert_allclose(proof.auxiliary.growth, slope @ aux, rtol=1e-12)
+
+
+def test_the_rate_of_V_of_a_chain_with_bounds_of_every_level(coupled, rng):
+    terms = jax.jit(level_terms_at)
+    case = chains.CASES["coupled"]
+    for t, x, aux in random_points(case, rng, 10):
+        state = _arrays(LoopState(x[0], x[1], AuxiliaryState((), aux), (), higher=x[2:]))
+        proof = terms(coupled, jnp.asarray(t), jax.tree.map(jnp.asarray, state))
+        claim = proof.claim
+        left = claim.dV + claim.decay - growth_along(claim)
+        assert not proof.excluded
+        np.testing.assert_allclose(left, 0.0, atol=1e-12 * claim.size)
+
+
+def test_a_certificate_covers_the_limited_torque():
+    scenario = ij.with_parts(LIMITED, observer=ij.observers.Momentum(kf=20.0))
+    run = ij.simulate(scenario, duration=1.5, dt=1e-3)
+    line = ij.certify(scenario, run)["inequality, limited torque"]
+    assert np.any(run.metrics.saturated_share > 0)
+    assert line.verdict == "holds"
+    largest = float(np.max(np.abs(run.auxiliary)))
+    assert f"max |lambda| = {largest:.4g}" in line.note
+    np.testing.assert_array_equal(
+        run.metrics.largest_auxiliary, np.max(np.abs(run.auxiliary), axis=0)
+    )
+
+
+# --- limits ---------------------------------------------------------------------------------------
+
+
+def _limited(law, limit=LIMIT, auxiliary=K):
+    return controllers.Saturated(law, limit=limit, auxiliary=auxiliary)
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_without_a_reached_limit_it_is_the_law_without_it(name):
+    part = {}
+    if name == "full_state":
+        part["velocity_bounds"] = ij.Bounds(ij.bounds.Constant(-9.0), ij.bounds.Constant(9.0))
+    scenario = canonical(ij.with_parts(PAPER, controller=LAWS[name], **part))
+    limited = canonical(ij.with_parts(scenario, controller=_limited(LAWS[name], 1e4)))
+    field, t = jax.jit(evaluate), jnp.asarray(0.0)
+    rate, sample = field(scenario, t, initial_state(scenario))
+    limited_rate, limited_sample = field(limited, t, initial_state(limited))
+    np.testing.assert_allclose(limited_sample.tau, sample.tau, rtol=1e-13)
+    np.testing.assert_array_equal(limited_rate.controller.auxiliary, 0.0)
+    for one, same in zip(
+        jax.tree.leaves(rate.controller), jax.tree.leaves(limited_rate.controller.law), strict=True
+    ):
+        np.testing.assert_array_equal(one, same)
+
+
+def test_the_rate_that_gives_the_limit_alone():
+    """One joint without Coriolis torques: for k M0 = K2 the torque is that of the limit alone,
+    and a large k does not tend to it."""
+    chain = ij.robots.PlanarChain(mass=[1.0], length=0.4, centre=0.2, inertia=0.02)
+    law = controllers.Backstepping(k1=2.0, K2=0.6, reading="corrected")
+    scenario = ij.with_parts(
+        PAPER,
+        plant=chain,
+        model=chain,
+        reference=ij.references.Sinusoid(offset=0.5, amplitude=0.2, frequency=2.0),
+        bounds=ij.Bounds(ij.bounds.Constant(-1.0), ij.bounds.Constant(2.0)),
+        disturbance=ij.disturbances.Nothing(),
+        observer=ij.observers.Momentum(kf=20.0),
+        initial=ij.Initial(q=[0.8], dq=[0.0]),
+        controller=controllers.Saturated(law, limit=1.53),
+    )
+    inertia = float(chain.mass_matrix(jnp.zeros(1))[0, 0])
+    alone = ij.simulate(scenario, duration=1.5, dt=1e-3)
+    distances = []
+    for k in (0.6 / inertia, 60.0 / inertia):
+        limited = ij.with_parts(scenario, controller=_limited(law, 1.53, k))
+        run = ij.simulate(limited, duration=1.5, dt=1e-3)
+        distances.append(np.max(np.abs(run.q - alone.q)))
+    assert np.any(alone.metrics.saturated_share > 0.01)
+    assert distances[0] < 1e-9
+    assert distances[1] > 1e-4

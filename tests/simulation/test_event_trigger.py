@@ -1,0 +1,208 @@
+"""Event-triggered commands: against the independent program, and what a trigger must do."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import chain_cases
+import independent_chains as chains
+import independent_inputs as other
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import iblf_jax as ij
+from iblf_jax import controllers
+from iblf_jax.control.controllers.event_compensated import TANH_GAP, excess
+from iblf_jax.simulation.closed_loop import initial_state, run_sampled_law
+from iblf_jax.simulation.metrics import Events
+from iblf_jax.simulation.scenario import canonical
+
+PERIOD = 4e-3
+PAPER = ij.with_parts(ij.presets.zhang_yan_2024(reading="corrected"), sampling=ij.Sampling(1e-3))
+TRIGGER = ij.EventTrigger(relative=0.1, absolute=[0.3, 0.1])
+TRIGGERED = ij.with_parts(PAPER, sampling=ij.Sampling(1e-3, trigger=TRIGGER))
+
+
+def free_case():
+    """The pendulum of order 3 without disturbance, with a bound of its first level only."""
+    case = chains.CASES["pendulum"]
+    return dataclasses.replace(
+        case,
+        bounds=(case.bounds[0], None, None),
+        barriers=(chains.mapping, chains.quadratic, chains.quadratic),
+        k=((2.0,), (5.0,), (10.0,)),
+    )
+
+
+def free_scenario(case, law=lambda inner: inner, **trigger):
+    """The same loop in the package's terms, with an event trigger."""
+    inner = controllers.BarrierBackstepping(k=case.k, c=case.c, weights=case.w)
+    return chain_cases.scenario(
+        "pendulum",
+        controller=law(inner),
+        state_bounds=(),
+        disturbance=ij.disturbances.Nothing(),
+        sampling=ij.Sampling(PERIOD, trigger=ij.EventTrigger(**trigger)),
+    )
+
+
+def against_the_independent_program(scenario, expected):
+    """A run of the scenario; states, commands and events are those of the program."""
+    states, commands, sent = expected
+    run = ij.simulate(scenario, duration=PERIOD * len(commands), dt=5e-4, throw=True)
+    every = round(PERIOD / 5e-4)
+    np.testing.assert_allclose(run.x[::every], states, atol=1e-7)
+    np.testing.assert_allclose(run.tau[:-1:every], commands, rtol=1e-6, atol=1e-6)
+    number = np.asarray(run.events)[:-1:every]
+    np.testing.assert_array_equal(np.flatnonzero(np.diff(number, prepend=0.0)), sent)
+    between = other.intervals(sent, PERIOD)
+    np.testing.assert_allclose(run.metrics.shortest_interval, min(between))
+    last = float(run.events[-1]) - len(sent)
+    if last == 0:
+        np.testing.assert_allclose(run.metrics.mean_interval, np.mean(between))
+    assert 5 < len(sent) < 0.8 * len(commands)
+    return run
+
+
+def test_a_chain_of_order_three_is_that_of_the_independent_program():
+    case = free_case()
+    expected = other.triggered_chain(case, PERIOD, 0.01, 0.002, count=250)
+    against_the_independent_program(free_scenario(case, relative=0.01, absolute=0.002), expected)
+
+
+@pytest.mark.release
+def test_a_compensated_chain_is_that_of_the_independent_program():
+    case, delta, m, m_bar, epsilon = free_case(), 0.05, 0.02, 0.03, 0.5
+
+    def adjust(z, v):
+        return other.compensated(z, v, delta, m_bar, epsilon)
+
+    def law(inner):
+        return controllers.EventCompensated(inner, relative=delta, absolute=m_bar, epsilon=epsilon)
+
+    expected = other.triggered_chain(case, PERIOD, delta, m, count=250, adjust=adjust)
+    against_the_independent_program(free_scenario(case, law, relative=delta, absolute=m), expected)
+
+
+def test_the_compensation_bounds_what_a_held_command_adds(rng):
+    """(E.2) at random z, v and held commands within the threshold."""
+    size = (20_000,)
+    z, v = rng.normal(size=size) * 10.0 ** rng.uniform(-3, 1, size), rng.normal(size=size) * 5
+    delta, m, epsilon = rng.uniform(0, 0.9, (3, *size))
+    m_bar = m / (1 - delta) * rng.uniform(1.0, 2.0, size)
+
+    @ij.component
+    class Given:
+        """A law with a given input and a given slope."""
+
+        v: ij.Leaf
+        z: ij.Leaf
+
+        def init(self, q, dq, context):
+            """No state."""
+            return ()
+
+        def command(self, t, q, dq, f_hat, context, state):
+            """The given numbers."""
+            never = jnp.zeros_like(self.v, bool)
+            command = controllers.Command(self.v, q, q, never, never)
+            return command._replace(input_slope=self.z), ()
+
+    law = controllers.EventCompensated(Given(v, z), delta, m_bar, epsilon)
+    u = np.asarray(law.command(*[0.0] * 6)[0].tau)
+    np.testing.assert_allclose(u, other.compensated(z, v, delta, m_bar, epsilon), rtol=1e-12)
+    a, b = rng.uniform(-1, 1, (2, *size))
+    held = (u - b * m) / (1 + a * delta)
+    # u = (1 + a delta) u_held + b m is within the threshold for all |a|, |b| <= 1.
+    assert np.all(np.abs(u - held) <= delta * np.abs(held) + m + 1e-12)
+    grows = z * held - z * v
+    assert np.all(grows <= 2 * TANH_GAP * epsilon + 1e-12)
+    np.testing.assert_allclose(excess(law), np.sum(2 * TANH_GAP * epsilon))
+    assert np.max(grows / epsilon) > TANH_GAP
+
+
+def test_a_threshold_of_zero_sends_every_command_that_changes():
+    always = ij.with_parts(PAPER, sampling=ij.Sampling(1e-3, trigger=ij.EventTrigger()))
+    run = ij.simulate(always, duration=0.2, dt=1e-3)
+    same = ij.simulate(PAPER, duration=0.2, dt=1e-3)
+    np.testing.assert_array_equal(run.q, same.q)
+    assert float(run.metrics.event_count) == 201
+
+
+def test_commands_are_held_within_the_threshold():
+    """Between events the torque is constant and within the threshold of the law's; the observer
+    receives the held torque."""
+    scenario = canonical(TRIGGERED)
+    run = ij.simulate(scenario, duration=0.3, dt=1e-3)
+    number, tau = np.asarray(run.events), np.asarray(run.tau)
+    sent = np.diff(number) > 0
+    assert 0.05 < np.mean(sent) < 0.9
+    np.testing.assert_array_equal(np.any(np.diff(tau, axis=0) != 0, axis=1), sent)
+    free = canonical(PAPER)
+    step = jax.jit(run_sampled_law)
+    noise = jnp.zeros((free.sensor.draws, free.n))
+    for k in np.flatnonzero(~sent)[:5] + 1:
+        state = initial_state(free)._replace(
+            q=run.q[k], dq=run.dq[k], observer=run.observer_state[k - 1]
+        )
+        # The observer's state of a record is the one after its sample.
+        wanted = np.asarray(step(free, run.t[k], state, noise).sampled.commands[0])
+        threshold = 0.1 * np.abs(tau[k]) + [0.3, 0.1]
+        assert np.all(np.abs(wanted - tau[k]) <= threshold)
+
+
+def test_a_run_of_a_batch_is_the_run_alone():
+    perturbations = {"plant.mass": ij.factor(ij.uniform(0.9, 1.1))}
+    study = ij.monte_carlo(TRIGGERED, perturbations, runs=4, duration=0.2, dt=1e-3, progress=False)
+    alone = study.replay(2)
+    assert float(study.metrics["event_count"][2]) == float(alone.metrics.event_count)
+    assert len(set(np.asarray(study.metrics["event_count"]).tolist())) > 1
+
+
+def test_the_derivative_of_a_held_command():
+    """Between the instants of events a run is smooth in a gain."""
+
+    def end(K2):
+        scenario = ij.with_parameters(TRIGGERED, {"controller.K2": K2})
+        return ij.simulate(scenario, duration=0.05, dt=1e-3).metrics.ise
+
+    K2, h = jnp.array([20.0, 20.0]), 1e-6
+    slope = jax.jacfwd(end)(K2)[:, 0]
+    move = jnp.array([h, 0.0])
+    differences = (end(K2 + move) - end(K2 - move)) / (2 * h)
+    np.testing.assert_allclose(slope, differences, rtol=1e-4, atol=1e-10)
+
+
+def test_a_run_with_one_event_has_no_interval():
+    fold = Events()
+    sample = ij.testing.metrics.samples(np.random.default_rng(0))
+    first = jax.tree.map(lambda x: x[0], sample)
+    found = fold.finish(fold.update(fold.init(first), first))
+    assert float(found["event_count"]) == 1.0
+    assert np.isinf(found["mean_interval"])
+    assert np.isinf(found["shortest_interval"])
+
+
+@pytest.mark.parametrize("field", ["relative", "absolute"])
+def test_bad_thresholds_are_refused(field):
+    value = {"relative": 1.0, "absolute": -0.1}[field]
+    with pytest.raises(ValueError, match=f"EventTrigger.{field}"):
+        ij.EventTrigger(**{field: value})
+
+
+def test_a_law_without_a_lyapunov_function_has_no_compensation():
+    law = controllers.EventCompensated(
+        controllers.PDGravity(Kp=6.0, Kd=2.0), relative=0.1, absolute=0.2, epsilon=0.5
+    )
+    with pytest.raises(ValueError, match="input_slope"):
+        ij.simulate(ij.with_parts(PAPER, controller=law), duration=0.1, dt=1e-3)
+
+
+@pytest.mark.release
+def test_a_certificate_states_what_held_commands_may_add():
+    run = ij.simulate(TRIGGERED, duration=0.1, dt=1e-3)
+    line = ij.certify(TRIGGERED, run)["event trigger"]
+    threshold = 0.1 * np.abs(run.tau) + np.array([0.3, 0.1])
+    np.testing.assert_allclose(line.value, np.max(np.sum(np.abs(run.e2) * threshold, axis=1)))
