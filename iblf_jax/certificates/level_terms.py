@@ -389,7 +389,8 @@ def _own_terms(
     d_tilde in the place of f_tilde.
     """
     law: Any = own_claim(scenario)
-    context, uses_observer = scenario.context, optional_member(law, "uses_observer")
+    context = scenario.context._replace(plant=scenario.plant)
+    uses_observer = optional_member(law, "uses_observer")
 
     def disturbances(t, state):
         state_rate, sample = evaluate(scenario, t, state)

@@ -395,7 +395,7 @@ def _own_terms(
       now, rates: the `_signals` and their rates.
     """
     law: Any = own_claim(scenario)
-    context, q, dq = scenario.context, state.q, state.dq
+    context, q, dq = scenario.context._replace(plant=scenario.plant), state.q, state.dq
     df = rates["disturbance"]
     f_tilde, df_tilde = now["disturbance"], df
     if optional_member(law, "uses_observer"):

@@ -21,33 +21,30 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple, TypeAlias
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks, notices, tables
+from iblf_jax.core.component_paths import (
+    BARE,
+    NUMBERS,
+    has_field,
+    parse,
+    replaced,
+    resolve,
+    rows_of,
+)
+from iblf_jax.core.component_paths import RowName as RowName
 from iblf_jax.core.pytree import component_member, field_values, wrapped_field
 from iblf_jax.core.units import Unit, as_text, of_entry, resolved
-from iblf_jax.simulation.scenario import HOW_TO_MAKE, NUMBERS, Scenario, canonical
+from iblf_jax.simulation.scenario import HOW_TO_MAKE, Scenario, canonical
 from iblf_jax.simulation.units import symbols_of
 
 Symbols: TypeAlias = Mapping[str, Unit]
 """Symbol of a formula of a unit -> its unit."""
-
-_BARE = r"[^\[\]]*[^\W\d_][^\[\]]*"
-"""The name of a row that needs no quotes."""
-_TOKEN = re.compile(
-    rf"""\.?([A-Za-z_]\w*)|\[(-?\d{{1,18}})\]|\[("(?:[^"\\]|\\.)*")\]|\[({_BARE})\]"""
-)
-
-
-class RowName(str):
-    """Token of a path: the name of a row, in brackets."""
-
-    __slots__ = ()
 
 
 class Parameter(NamedTuple):
@@ -153,7 +150,7 @@ def _walk_wrapped(
     """
     for parameter in _walk(inner, path, named, symbols):
         rest = parameter.path[len(path) :].lstrip(".")
-        if _has_field(wrapper, str(parse(rest)[0])):
+        if has_field(wrapper, str(parse(rest)[0])):
             parameter = parameter._replace(path=f"{name}.{rest}")
         yield parameter
 
@@ -185,62 +182,17 @@ def _stacked_rows(part: Any, path: str, symbols: Symbols) -> Iterator[Parameter]
     fields = {field.name: field for field in dataclasses.fields(part)}
     values = field_values(part)
     for kind, names in component_member(type(part), "stacked").items():
-        for i, (name, *index) in enumerate(_rows_of(part, names)):
+        for i, (name, *index) in enumerate(rows_of(part, names)):
             at = tuple(index)
             unit = of_entry(_unit(part, fields[name], symbols), at, jnp.ndim(values[name]))
             value, row = values[name][at], as_text(unit)
             yield Parameter(_joined(path, f"{kind}[{i}]"), jnp.shape(value), row, value)
 
 
-def _rows_of(part: Any, names: Sequence[str]) -> list[list[Any]]:
-    """The steps to each row of a stack of leaves, of which the last one has several rows; none if
-    the component does not have it.
-    """
-    *single, last = names
-    values = field_values(part)
-    if values[last] is None:
-        return []
-    return [*[[name] for name in single], *[[last, i] for i in range(len(values[last]))]]
-
-
 def _quoted(name: str) -> str:
     """The name of a row as a path contains it."""
-    needs_no_quotes = re.fullmatch(_BARE, name) and name.isprintable() and not name.startswith('"')
+    needs_no_quotes = re.fullmatch(BARE, name) and name.isprintable() and not name.startswith('"')
     return name if needs_no_quotes else json.dumps(name)
-
-
-def parse(path: str) -> list[str | int]:
-    """The tokens of a path: names, indices and names of rows.  ValueError if it is not a path."""
-    tokens: list[str | int] = []
-    position = 0
-    while isinstance(path, str) and position < len(path):
-        match = _TOKEN.match(path, position)
-        if match is None or (position == 0) == path[position].startswith((".", "[")):
-            break
-        token = _token(match)
-        if token is None:
-            break
-        tokens.append(token)
-        position = match.end()
-    if not isinstance(path, str) or not path or position < len(path):
-        expected = 'names joined by dots, with [i] for an entry, such as "plant.mass[1]"'
-        raise checks.fail("path", path, expected)
-    return tokens
-
-
-def _token(match: re.Match) -> str | int | None:
-    """The token that `_TOKEN` matched; None for an invalid JSON string."""
-    field, index, quoted, bare = match.groups()
-    if field is not None:
-        return field
-    if index is not None:
-        return int(index)
-    if bare is not None:
-        return RowName(bare)
-    try:
-        return RowName(json.loads(quoted))
-    except ValueError:
-        return None
 
 
 def expand(path: str) -> list[str]:
@@ -332,107 +284,10 @@ def _resolved(scenario: Scenario, path: str, full: str) -> tuple[list[str | int]
 
     The names of wrapped components are inserted, and the name of a row becomes an index.
     """
-    value: Any = scenario
-    found: list[str | int] = []
-    tokens = parse(full)
-    while tokens:
-        try:
-            steps, tokens = _steps(value, tokens)
-            for step in steps:
-                value = _member(value, step)
-        except (AttributeError, IndexError, TypeError, KeyError, ValueError):
-            raise _unknown(scenario, path) from None
-        is_entry = isinstance(value, jax.Array | np.ndarray | float)
-        if isinstance(steps[-1], int) and not (is_entry or dataclasses.is_dataclass(value)):
-            raise _unknown(scenario, path)
-        found += steps
-    if not isinstance(value, NUMBERS):
-        raise _unknown(scenario, path)
-    return found, value
-
-
-def _steps(part: Any, tokens: list[str | int]) -> tuple[list[str | int], list[str | int]]:
-    """The fields and indices of the first tokens of a path in a component, and the tokens that are
-    left.
-    """
-    token = tokens[0]
-    if isinstance(token, int):
-        return [token], tokens[1:]
-    if isinstance(token, RowName):
-        raise KeyError(token)
-    if _has_field(part, token):
-        return [token], tokens[1:]
-    rows = component_member(type(part), "rows")
-    if token in rows:
-        names, fields = rows[token]
-        row, field = tokens[1:3]
-        if field not in fields:
-            raise KeyError(field)
-        index = row if isinstance(row, int) else vars(part)[names].index(row)
-        return [field, index], tokens[3:]
-    stacked = component_member(type(part), "stacked")
-    if token in stacked:
-        row = tokens[1]
-        if not isinstance(row, int):
-            raise KeyError(row)
-        return _rows_of(part, stacked[token])[row], tokens[2:]
-    wrapped = wrapped_field(part)
-    if wrapped:
-        return [wrapped], tokens
-    return [token], tokens[1:]
-
-
-def _has_field(part: Any, name: str) -> bool:
-    return any(field.name == name for field in dataclasses.fields(part))
-
-
-def _member(part: Any, step: str | int) -> Any:
-    """The non-static field or the entry of a part.  An error if there is none: JAX would take the
-    nearest entry.
-    """
-    if isinstance(step, str):
-        if step not in [f.name for f in dataclasses.fields(part) if not f.metadata.get("static")]:
-            raise AttributeError(step)
-        return vars(part)[step]
-    if not isinstance(part, tuple | list | jax.Array | np.ndarray):
-        raise TypeError(part)
-    if not -len(part) <= step < len(part):
-        raise IndexError(step)
-    return part[step]
-
-
-def _replaced(part: Any, tokens: list[str | int], value: Any, path: str, sign: str | None) -> Any:
-    """A copy of `part` with the leaf at `tokens` replaced: checked, and of the same structure."""
-    if not tokens or isinstance(part, NUMBERS):
-        return _new_value(part, tokens, value, path, sign)
-    head, rest = tokens[0], tokens[1:]
-    if isinstance(head, int):
-        parts = list(part)
-        parts[head] = _replaced(part[head], rest, value, path, sign)
-        return tuple(parts)
-    copy = object.__new__(type(part))
-    values = field_values(part)
-    for field in dataclasses.fields(part):
-        member = values[field.name]
-        if field.name == head:
-            member = _replaced(member, rest, value, path, field.metadata.get("sign"))
-        object.__setattr__(copy, field.name, member)
-    return copy
-
-
-def _new_value(
-    old: Any, tokens: list[str | int], value: Any, path: str, sign: str | None
-) -> jax.Array:
-    """The new array of a leaf of which all, or one entry, is replaced."""
-    old = jnp.asarray(old)
-    index = tuple(t for t in tokens if isinstance(t, int))
-    shape = old[index].shape if index else old.shape
-    new = checks.as_floats(path, value)
-    if new.shape not in ((), shape):
-        raise checks.fail(path, value, f"one number or shape {shape}", f"Its shape is {new.shape}.")
-    checks.check_values(path, new, sign)
-    new = jnp.broadcast_to(new, shape).astype(old.dtype)
-    return old.at[index].set(new) if index else new
+    try:
+        return resolve(scenario, full)
+    except LookupError:
+        raise _unknown(scenario, path) from None
 
 
 def with_parameters(scenario: Scenario, values: Mapping[str, Any]) -> Scenario:
@@ -457,7 +312,7 @@ def with_parameters(scenario: Scenario, values: Mapping[str, Any]) -> Scenario:
         raise checks.fail("values", values, expected)
     for path, value in values.items():
         for full in expand(path):
-            scenario = _replaced(scenario, _resolved(scenario, path, full)[0], value, full, None)
+            scenario = replaced(scenario, _resolved(scenario, path, full)[0], value, full, None)
     return scenario
 
 

@@ -28,6 +28,7 @@ from iblf_jax.control.sensors import Ideal as IdealSensor
 from iblf_jax.control.sensors import Sensor
 from iblf_jax.control.sensors._base import sensor_member
 from iblf_jax.core import checks, notices
+from iblf_jax.core.component_paths import NUMBERS
 from iblf_jax.core.disk_cache import keep_programs
 from iblf_jax.core.presentation import present
 from iblf_jax.core.pytree import (
@@ -594,10 +595,6 @@ def _fit_rows(value: Any, n: int, name: str) -> Any:
         expected = f"rows of one number, or of {n} (one a component)"
         raise checks.fail(name, value, expected, f"Its shape is {jnp.shape(value)}.")
     return value
-
-
-NUMBERS = (jax.Array, np.ndarray, np.generic, float, int)
-"""Types of leaves."""
 
 
 def check_leaves(part: Any, path: str = "") -> None:

@@ -7,6 +7,10 @@ from iblf_jax.control.controllers._base import Controller as Controller
 from iblf_jax.control.controllers._base import LawContext as LawContext
 from iblf_jax.control.controllers._base import LyapunovLaw as LyapunovLaw
 from iblf_jax.control.controllers._base import State as State
+from iblf_jax.control.controllers.adaptive_parameters import (
+    AdaptiveParameters as AdaptiveParameters,
+)
+from iblf_jax.control.controllers.adaptive_parameters import AdaptiveState as AdaptiveState
 from iblf_jax.control.controllers.adaptive_rbf import AdaptiveRBF as AdaptiveRBF
 from iblf_jax.control.controllers.backstepping import Backstepping as Backstepping
 from iblf_jax.control.controllers.barrier_backstepping import (
@@ -35,6 +39,7 @@ MEMBERS = {
     "full_state": FullState,
     "dynamic_surface": DynamicSurface,
     "adaptive_rbf": AdaptiveRBF,
+    "adaptive_parameters": AdaptiveParameters,
     "surface_barrier": SurfaceBarrier,
     "computed_torque": ComputedTorque,
     "pd_gravity": PDGravity,
@@ -49,7 +54,9 @@ __all__ = [
     "KEEPERS",
     "LAWS",
     "MEMBERS",
+    "AdaptiveParameters",
     "AdaptiveRBF",
+    "AdaptiveState",
     "Backstepping",
     "BarrierBackstepping",
     "Command",

@@ -35,6 +35,9 @@ class LawContext(NamedTuple):
     regions: tuple[Region, ...] = ()
     state_bounds: tuple[Bounds | None, ...] = ()
     """Bounds of the levels from the second on of a plant in strict-feedback form."""
+    plant: Any = None
+    """The plant, for the methods of a `LyapunovLaw` whose V contains its true parameters; None
+    where a law commands, because it does not know them."""
 
     def level_bounds(self, level: int) -> Bounds | None:
         """The bounds of a level, counted from 1; None where it has none."""
@@ -90,6 +93,9 @@ class Command(NamedTuple):
     input: Any = ()
     """The input of the plant, (n,), where it is not the torque `tau`: the voltage of a drive, say.
     Observers receive `tau`."""
+    input_slope: Any = ()
+    """dV/dx_r G_r, (n,): the derivative of the law's Lyapunov function along the input, e2 for
+    V = V1 + 1/2 e2^T M0 e2; `()` for a law without a Lyapunov function."""
 
 
 class Controller(Protocol):
@@ -114,6 +120,11 @@ class Controller(Protocol):
       the input of the model, which is the torque for a robot.
     - `unit_factors`: the names of leaves that are factors only.  Which of their numbers are 1 may
       be compiled in (`engine.structural_constants`).
+
+    - `energy`, `energy_decay`: methods of a law with an `input_slope`, which `AdaptiveParameters`
+      uses.  They return the law's Lyapunov function without a term of the estimate, (), and how
+      fast it decays, (), where the plant equals the model and there is no disturbance; arguments
+      (t, q, dq, context), or (t, x, context).
 
     It may have these methods: `completed(context, x)` returns the law with values that depend on
     the model and on the start x, (r, n), where none were given; `advice()` returns a list of
@@ -160,12 +171,16 @@ law_member = OptionalMembers(
     needs_velocity_bounds=False,
     includes_e2=False,
     filters=False,
+    filter=None,
+    unit_symbols=lambda model: {},
     receives_x=False,
     input_unit=None,
     completed=None,
     advice=list,
     check_start=lambda context: None,
     switching=lambda t, q, dq, context, state: None,
+    energy=None,
+    energy_decay=None,
     disturbance_terms=None,
     barrier=None,
     barriers=(),

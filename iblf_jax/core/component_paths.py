@@ -1,0 +1,192 @@
+"""The paths of leaves within a component: their tokens, the leaf that they lead to, and copies of
+the component with that leaf replaced.
+
+`simulation.paths` describes the language and applies it to scenarios.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax.core import checks
+from iblf_jax.core.pytree import component_member, field_values, wrapped_field
+
+NUMBERS = (jax.Array, np.ndarray, np.generic, float, int)
+"""Types of leaves."""
+BARE = r"[^\[\]]*[^\W\d_][^\[\]]*"
+"""The name of a row that needs no quotes."""
+_TOKEN = re.compile(
+    rf"""\.?([A-Za-z_]\w*)|\[(-?\d{{1,18}})\]|\[("(?:[^"\\]|\\.)*")\]|\[({BARE})\]"""
+)
+
+
+class RowName(str):
+    """Token of a path: the name of a row, in brackets."""
+
+    __slots__ = ()
+
+
+def parse(path: str) -> list[str | int]:
+    """The tokens of a path: names, indices and names of rows.  ValueError if it is not a path."""
+    tokens: list[str | int] = []
+    position = 0
+    while isinstance(path, str) and position < len(path):
+        match = _TOKEN.match(path, position)
+        if match is None or (position == 0) == path[position].startswith((".", "[")):
+            break
+        token = _token(match)
+        if token is None:
+            break
+        tokens.append(token)
+        position = match.end()
+    if not isinstance(path, str) or not path or position < len(path):
+        expected = 'names joined by dots, with [i] for an entry, such as "plant.mass[1]"'
+        raise checks.fail("path", path, expected)
+    return tokens
+
+
+def _token(match: re.Match) -> str | int | None:
+    """The token that `_TOKEN` matched; None for an invalid JSON string."""
+    field, index, quoted, bare = match.groups()
+    if field is not None:
+        return field
+    if index is not None:
+        return int(index)
+    if bare is not None:
+        return RowName(bare)
+    try:
+        return RowName(json.loads(quoted))
+    except ValueError:
+        return None
+
+
+def resolve(part: Any, path: str) -> tuple[list[str | int], Any]:
+    """Fields and indices of the path of a leaf of a component, and the value there.
+
+    The names of wrapped components are inserted, and the name of a row becomes an index.
+
+    Raises:
+      LookupError: the path leads to no leaf.
+      ValueError: it is not a path.
+    """
+    value = part
+    found: list[str | int] = []
+    tokens = parse(path)
+    while tokens:
+        try:
+            steps, tokens = steps_of(value, tokens)
+            for step in steps:
+                value = member_of(value, step)
+        except (AttributeError, IndexError, TypeError, KeyError, ValueError):
+            raise LookupError(path) from None
+        is_entry = isinstance(value, jax.Array | np.ndarray | float)
+        if isinstance(steps[-1], int) and not (is_entry or dataclasses.is_dataclass(value)):
+            raise LookupError(path)
+        found += steps
+    if not isinstance(value, NUMBERS):
+        raise LookupError(path)
+    return found, value
+
+
+def steps_of(part: Any, tokens: list[str | int]) -> tuple[list[str | int], list[str | int]]:
+    """The fields and indices of the first tokens of a path in a component, and the tokens that are
+    left.
+    """
+    token = tokens[0]
+    if isinstance(token, int):
+        return [token], tokens[1:]
+    if isinstance(token, RowName):
+        raise KeyError(token)
+    if has_field(part, token):
+        return [token], tokens[1:]
+    rows = component_member(type(part), "rows")
+    if token in rows:
+        names, fields = rows[token]
+        row, field = tokens[1:3]
+        if field not in fields:
+            raise KeyError(field)
+        index = row if isinstance(row, int) else vars(part)[names].index(row)
+        return [field, index], tokens[3:]
+    stacked = component_member(type(part), "stacked")
+    if token in stacked:
+        row = tokens[1]
+        if not isinstance(row, int):
+            raise KeyError(row)
+        return rows_of(part, stacked[token])[row], tokens[2:]
+    wrapped = wrapped_field(part)
+    if wrapped:
+        return [wrapped], tokens
+    return [token], tokens[1:]
+
+
+def rows_of(part: Any, names: Sequence[str]) -> list[list[Any]]:
+    """The steps to each row of a stack of leaves, of which the last one has several rows; none if
+    the component does not have it.
+    """
+    *single, last = names
+    values = field_values(part)
+    if values[last] is None:
+        return []
+    return [*[[name] for name in single], *[[last, i] for i in range(len(values[last]))]]
+
+
+def has_field(part: Any, name: str) -> bool:
+    """Whether a component has a field of this name."""
+    return any(field.name == name for field in dataclasses.fields(part))
+
+
+def member_of(part: Any, step: str | int) -> Any:
+    """The non-static field or the entry of a part.  An error if there is none: JAX would take the
+    nearest entry.
+    """
+    if isinstance(step, str):
+        if step not in [f.name for f in dataclasses.fields(part) if not f.metadata.get("static")]:
+            raise AttributeError(step)
+        return vars(part)[step]
+    if not isinstance(part, tuple | list | jax.Array | np.ndarray):
+        raise TypeError(part)
+    if not -len(part) <= step < len(part):
+        raise IndexError(step)
+    return part[step]
+
+
+def replaced(part: Any, tokens: list[str | int], value: Any, path: str, sign: str | None) -> Any:
+    """A copy of `part` with the leaf at `tokens` replaced: checked, and of the same structure."""
+    if not tokens or isinstance(part, NUMBERS):
+        return _new_value(part, tokens, value, path, sign)
+    head, rest = tokens[0], tokens[1:]
+    if isinstance(head, int):
+        parts = list(part)
+        parts[head] = replaced(part[head], rest, value, path, sign)
+        return tuple(parts)
+    copy = object.__new__(type(part))
+    values = field_values(part)
+    for field in dataclasses.fields(part):
+        member = values[field.name]
+        if field.name == head:
+            member = replaced(member, rest, value, path, field.metadata.get("sign"))
+        object.__setattr__(copy, field.name, member)
+    return copy
+
+
+def _new_value(
+    old: Any, tokens: list[str | int], value: Any, path: str, sign: str | None
+) -> jax.Array:
+    """The new array of a leaf of which all, or one entry, is replaced."""
+    old = jnp.asarray(old)
+    index = tuple(t for t in tokens if isinstance(t, int))
+    shape = old[index].shape if index else old.shape
+    new = checks.as_floats(path, value)
+    if new.shape not in ((), shape):
+        raise checks.fail(path, value, f"one number or shape {shape}", f"Its shape is {new.shape}.")
+    checks.check_values(path, new, sign)
+    new = jnp.broadcast_to(new, shape).astype(old.dtype)
+    return old.at[index].set(new) if index else new
