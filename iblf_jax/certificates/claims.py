@@ -147,7 +147,7 @@ def why_no_theorem(scenario: Scenario) -> str:
     if not isinstance(law, Backstepping | FullState):
         about = f"Theorem 2 is about the backstepping law (3.14); {type(law).__name__}"
         return f"{about} has no claim of this kind{_why_no_own_claim(scenario)}"
-    if adapts(scenario):
+    if adaptive_law(scenario) is not None:
         return "Theorem 2 is about a constant model, and AdaptiveParameters changes it"
     rates = [(law.barrier, decay_rate(law))]
     if isinstance(law, FullState):
@@ -165,9 +165,12 @@ def why_no_theorem(scenario: Scenario) -> str:
     return ""
 
 
-def adapts(scenario: Scenario) -> bool:
-    """Whether a law changes the parameters of its model."""
-    return any(isinstance(law, AdaptiveParameters) for law in layers(scenario.controller))
+def adaptive_law(scenario: Scenario) -> AdaptiveParameters | None:
+    """The law that changes the parameters of the model, or None."""
+    for law in layers(scenario.controller):
+        if isinstance(law, AdaptiveParameters):
+            return law
+    return None
 
 
 def decay_rate(law: Backstepping | FullState) -> jax.Array | None:

@@ -34,7 +34,7 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-from iblf_jax.certificates.claims import own_claim
+from iblf_jax.certificates.claims import adaptive_law, own_claim
 from iblf_jax.certificates.optional import optional_member
 from iblf_jax.certificates.proof_terms import TORQUE_ROUNDING, OwnTerms
 from iblf_jax.control.controllers import BarrierBackstepping
@@ -226,7 +226,7 @@ def _input_was_limited(
     """Whether a wrapper around the law changed its input, () bool.  A smooth limit changes it
     before the limit is reached, which the status flags do not show.
     """
-    law: Any = unwrapped(scenario.controller)
+    law: Any = adaptive_law(scenario) or unwrapped(scenario.controller)
     if law is scenario.controller:
         return jnp.zeros((), bool)
     own, _ = law.command(*at[:3], scenario.context, at.law_state)

@@ -38,7 +38,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.certificates.claims import decay_phi, decay_rate, own_claim
+from iblf_jax.certificates.claims import adaptive_law, decay_phi, decay_rate, own_claim
 from iblf_jax.certificates.optional import optional_member
 from iblf_jax.control.controllers import Backstepping, FullState
 from iblf_jax.control.observers import Printed
@@ -262,7 +262,9 @@ def _dropped_terms(scenario: Scenario, dM0, dq, e2, f_tilde) -> tuple[jax.Array,
 def _torque_was_limited(scenario: Scenario, t: jax.Array, state: LoopState, now) -> jax.Array:
     """Whether a wrapper around the law of Theorem 2 changed its torque, () bool."""
     law = unwrapped(scenario.controller)
-    if law is scenario.controller or not isinstance(law, Backstepping | FullState):
+    is_law_of_theorem = isinstance(law, Backstepping | FullState)
+    adapts = adaptive_law(scenario) is not None
+    if law is scenario.controller or not is_law_of_theorem or adapts:
         return jnp.zeros((), bool)
     return _differs_from_command(scenario, law, t, state, now, ())
 

@@ -7,6 +7,7 @@ from iblf_jax.control.controllers._base import Controller as Controller
 from iblf_jax.control.controllers._base import LawContext as LawContext
 from iblf_jax.control.controllers._base import LyapunovLaw as LyapunovLaw
 from iblf_jax.control.controllers._base import State as State
+from iblf_jax.control.controllers.adaptive_network import AdaptiveNetwork as AdaptiveNetwork
 from iblf_jax.control.controllers.adaptive_parameters import (
     AdaptiveParameters as AdaptiveParameters,
 )
@@ -39,6 +40,7 @@ MEMBERS = {
     "full_state": FullState,
     "dynamic_surface": DynamicSurface,
     "adaptive_rbf": AdaptiveRBF,
+    "adaptive_network": AdaptiveNetwork,
     "adaptive_parameters": AdaptiveParameters,
     "surface_barrier": SurfaceBarrier,
     "computed_torque": ComputedTorque,
@@ -54,6 +56,7 @@ __all__ = [
     "KEEPERS",
     "LAWS",
     "MEMBERS",
+    "AdaptiveNetwork",
     "AdaptiveParameters",
     "AdaptiveRBF",
     "AdaptiveState",

@@ -274,9 +274,8 @@ class AdaptiveParameters:
 
     def projected(self, theta: jax.Array, rate: jax.Array) -> jax.Array:
         """P(rate), (p,): 0 at the bound that an estimate moves to, unchanged at `band` from it."""
-        up = jnp.clip((self.upper - theta) / self.band, 0.0, 1.0)
-        down = jnp.clip((theta - self.lower) / self.band, 0.0, 1.0)
-        return rate * jnp.where(rate > 0.0, up, down)
+        distance = jnp.where(rate > 0.0, self.upper - theta, theta - self.lower)
+        return rate * jnp.clip(distance / self.band, 0.0, 1.0)
 
     def switching(self, t: jax.Array, *arguments: Any) -> jax.Array | None:
         """The functions at whose zeros the wrapped law's command jumps; arguments as its
