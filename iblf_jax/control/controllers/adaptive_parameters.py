@@ -196,7 +196,7 @@ class AdaptiveParameters:
         """Raises ValueError for a parameter in which the torque is not affine, or of which the
         virtual controls or the slope of V depend, or that has no effect.
         """
-        t, x = _points(context)
+        t, x = _points(context, self.Gamma.dtype)
         torque, others = (np.asarray(part) for part in _dependence(self, context, t, x))
         scale = np.sqrt(np.finfo(torque.dtype).eps)
         for j, path in enumerate(self.parameters):
@@ -420,21 +420,21 @@ def _acceleration(model: Any, q: jax.Array, dq: jax.Array, torque: jax.Array) ->
 # --- dependence on the parameters ---------------------------------------------------------------
 
 
-def _points(context: LawContext) -> tuple[jax.Array, jax.Array]:
+def _points(context: LawContext, dtype: Any) -> tuple[jax.Array, jax.Array]:
     """Times (POINTS,) and states (POINTS, r, n) inside the bounds of the first level."""
     rng = np.random.default_rng(0)
     plant = plants.as_plant(context.model)
     steady = plants.plant_member(plant, "steady_levels")
-    times = jnp.asarray(rng.uniform(0.0, 5.0, POINTS))
+    times = jnp.asarray(rng.uniform(0.0, 5.0, POINTS), dtype)
+    spread = jnp.asarray(rng.uniform(-0.5, 0.5, (POINTS, plant.order, plant.n)), dtype)
     states = []
-    for t in times:
+    for t, (q, dq, *higher) in zip(times, spread, strict=True):
         tube = context.tube(t)
-        q, dq = rng.uniform(-0.5, 0.5, (2, plant.n))
         q = tube.q_d + q * jnp.minimum(tube.k_l, tube.k_u)
-        higher = jnp.asarray(rng.uniform(-0.5, 0.5, (plant.order - 2, plant.n)))
-        if steady is not None and plant.order > 2:
-            higher = higher + steady(q, tube.dq_d + dq)
-        states.append(jnp.concatenate([jnp.stack([q, tube.dq_d + dq]), higher]))
+        dq = tube.dq_d + dq
+        if steady is not None and higher:
+            higher = [*(jnp.stack(higher) + steady(q, dq))]
+        states.append(jnp.stack([q, dq, *higher]))
     return times, jnp.stack(states)
 
 
