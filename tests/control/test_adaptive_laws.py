@@ -262,12 +262,12 @@ def test_without_an_error_the_law_is_the_wrapped_one_and_nothing_adapts():
 @pytest.mark.release
 def test_true_parameters_stay_and_slow_adaptation_tends_to_the_wrapped_law():
     quiet = dataclasses.replace(ARM, disturbance=ij.disturbances.Nothing())
-    q = quiet.initial.q
-    on_surface = MAPPED.command(jnp.zeros(()), q, q, jnp.zeros(2), quiet.context, ())[0].alpha
-    started = ij.with_parameters(quiet, {"initial.dq": on_surface, "controller.sigma": 0.0})
+    tube = quiet.context.tube(jnp.zeros(()))
+    on_reference = {"initial.q": tube.q_d, "initial.dq": tube.dq_d, "controller.sigma": 0.0}
+    started = ij.with_parameters(quiet, on_reference)
     run = ij.simulate(started, duration=1.0, dt=5e-4, record_every=100)
     theta = run.controller_state.theta
-    np.testing.assert_allclose(theta - theta[0], 0.0, atol=1e-6)
+    np.testing.assert_allclose(theta - theta[0], 0.0, atol=1e-9)
     heavier = ij.with_parameters(quiet, {"plant.mass": [2.4, 1.0]})
     plain = ij.simulate(
         dataclasses.replace(heavier, controller=MAPPED), duration=1.0, dt=1e-3, record_every=10
@@ -315,7 +315,10 @@ def test_both_layers_descend_the_lyapunov_function(rng):
         e2 = np.asarray(dq - command.alpha)
         slope = np.asarray(law.barrier.slope(scenario.context.tube(t), jnp.asarray(q)))
         learned = np.asarray(command.tau) + np.asarray(law.K2) * e2 + slope
-        z = -(np.asarray(rates.hidden) / float(law.Gamma_h) + 0.1 * (V - np.asarray(first.hidden)))
+        z = -(
+            np.asarray(rates.hidden) / float(law.Gamma_h)
+            + float(law.sigma_h) * (V - np.asarray(first.hidden))
+        )
         # z is known from the rate of V up to a factor; its last entry, the threshold's, is 1.
         back = z[-1]
         z = z[:, 0] / back[0]

@@ -81,9 +81,9 @@ class AdaptiveNetwork:
       Gamma: rate of adaptation of the output weights of each joint, () or (n,) [N m/rad], > 0; 50
         if not given.
       Gamma_h: rate of adaptation of the hidden weights, () [1/(N m rad)], >= 0, where 0 leaves the
-        hidden layer as it starts; 0.5 if not given.
-      sigma: leak that bounds the output weights, () or (n,) [rad/(N m s)], > 0; 0.005 if not given.
-      sigma_h: leak of the hidden weights towards their start, () [N m rad/s], > 0; 0.1 if not
+        hidden layer as it starts; 5 if not given.
+      sigma: leak that bounds the output weights, () or (n,) [rad/(N m s)], > 0; 0.001 if not given.
+      sigma_h: leak of the hidden weights towards their start, () [N m rad/s], > 0; 0.01 if not
         given.
       middle: position at the centre of the inputs' range, () or (n,) [rad]; 0.5 if not given.
       span_q: half the range of q, () or (n,) [rad], > 0; 0.5 if not given.
@@ -103,9 +103,9 @@ class AdaptiveNetwork:
     K2: Leaf = leaf("N m s/rad", sign="positive")
     o: Leaf = leaf("1/s^2", sign="positive", default=None)
     Gamma: Leaf = leaf("N m/rad", sign="positive", default=50.0)
-    Gamma_h: Leaf = leaf("1/(N m rad)", sign="nonnegative", shape="scalar", default=0.5)
-    sigma: Leaf = leaf("rad/(N m s)", sign="positive", default=0.005)
-    sigma_h: Leaf = leaf("N m rad/s", sign="positive", shape="scalar", default=0.1)
+    Gamma_h: Leaf = leaf("1/(N m rad)", sign="nonnegative", shape="scalar", default=5.0)
+    sigma: Leaf = leaf("rad/(N m s)", sign="positive", default=0.001)
+    sigma_h: Leaf = leaf("N m rad/s", sign="positive", shape="scalar", default=0.01)
     middle: Leaf = leaf("rad", default=0.5)
     span_q: Leaf = leaf("rad", sign="positive", default=0.5)
     span_dq: Leaf = leaf("rad/s", sign="positive", default=1.0)
