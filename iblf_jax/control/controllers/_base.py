@@ -130,7 +130,7 @@ class Controller(Protocol):
     the model and on the start x, (r, n), where none were given; `advice()` returns a list of
     warnings; `check_start(context)` raises ValueError for fields that do not fit together, once the
     number of joints is known; `leaf_units()` returns the units of leaves that depend on other
-    fields, by name.
+    fields, by name; `unit_symbols(model)` returns the units of symbols in the units of its leaves.
 
     A law whose command is discontinuous, such as a sliding-mode law or `FullState` with some
     barriers, has `switching(t, q, dq, context, state)`.  It returns (m,) functions of q or q', and

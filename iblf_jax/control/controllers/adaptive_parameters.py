@@ -83,17 +83,19 @@ class AdaptiveParameters:
     estimate of an observer is not used.  Paths reach through: "controller.K2" is the wrapped law's
     K2.  The state is an `AdaptiveState`: `run.controller_state.theta` has theta_hat of a run.
 
+    In units, theta stands for that of the parameter, and N m rad for that of V.
+
     Args:
       law: the law whose model adapts: `Backstepping` with reading="corrected", or
         `BarrierBackstepping` without filters.
       parameters: paths of p numbers of the model, without "model.": ("mass[0]", "payload").
-      Gamma: rate of adaptation of each parameter, () or (p,) [unit of theta^2 / unit of V], > 0.
-      lower: lower bound of each estimate, () or (p,) [unit of theta].
-      upper: upper bound of each estimate, () or (p,) [unit of theta].
-      sigma: leak towards the model's values, () or (p,) [unit of V / (unit of theta^2 s)], >= 0; 0
-        if not given.
-      band: distance from a bound within which the projection acts, () or (p,) [unit of theta], > 0;
-        a twentieth of the box if not given.
+      Gamma: rate of adaptation of each parameter, () or (p,) [theta^2/(N m rad)], > 0.
+      lower: lower bound of each estimate, () or (p,) [theta].
+      upper: upper bound of each estimate, () or (p,) [theta].
+      sigma: leak towards the model's values, () or (p,) [N m rad/(theta^2 s)], >= 0; 0 if not
+        given.
+      band: distance from a bound within which the projection acts, () or (p,) [theta], > 0; a
+        twentieth of the box if not given.
 
     Source: J. J. E. Slotine, W. Li, Int. J. Robotics Research 6 (1987) 49-59 (regressor);
       P. A. Ioannou, J. Sun, Robust Adaptive Control, 1996, sections 4.4 and 8.5 (projection, leak);
@@ -149,7 +151,8 @@ class AdaptiveParameters:
         """Raises ValueError for a law whose Lyapunov function does not contain the torque's error
         as `input_slope` states.
         """
-        field, law = "AdaptiveParameters.law", self.law
+        law: Any = self.law
+        field = "AdaptiveParameters.law"
         if law_member(law, "energy") is None or law_member(law, "energy_decay") is None:
             raise checks.fail(field, type(law).__name__, "a law with an `energy`", LAWS)
         if law_member(law, "reading") == "printed":
@@ -251,11 +254,12 @@ class AdaptiveParameters:
         self, t: jax.Array, measured: Any, estimate: jax.Array, context: LawContext, state: Any
     ) -> tuple[Command, Any, jax.Array]:
         """The wrapped law's command and the rate of its state with theta_hat, and Y^T s, (p,)."""
+        law: Any = self.law
         zero = jnp.zeros_like(estimate)
 
         def torque(theta):
             informed = self._informed(context, theta)
-            command, rate = self.law.command(t, *measured, zero, informed, state.law)
+            command, rate = law.command(t, *measured, zero, informed, state.law)
             return command.tau, (command, rate)
 
         _, pull, (command, rate) = jax.vjp(torque, state.theta, has_aux=True)
