@@ -418,3 +418,14 @@ def test_operations_are_at_most_half_more_than_those_of_the_law_that_is_extended
     fuzzy = controllers.AdaptiveRBF(k1=2.0, K2=20.0, normalised=True)
     assert operations(network(fuzzy)) < 1.1 * gaussian
     assert operations(network(controllers.AdaptiveNetwork(k1=2.0, K2=20.0))) < 0.6 * gaussian
+
+
+@pytest.mark.release
+def test_a_certificate_checks_the_claim_with_the_parameters_of_the_plant():
+    loaded = ij.with_parameters(ARM, {"plant.payload": 0.4})
+    certificate = ij.certify(loaded, duration=0.2, dt=1e-3)
+    own = {line.name: line for line in certificate.lines if line.equation == "own"}
+    assert {line.verdict for line in own.values()} == {"holds"}
+    assert certificate.heading.startswith("AdaptiveParameters of 3, Backstepping")
+    theorem = next(line for line in certificate.lines if line.name.startswith("K2"))
+    assert "AdaptiveParameters changes it" in theorem.note
