@@ -15,7 +15,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from iblf_jax.certificates import decay_lines, law_claim_lines, lines, rate_lines, theorem_lines
+from iblf_jax.certificates import (
+    decay_lines,
+    law_claim_lines,
+    lines,
+    rate_lines,
+    settling,
+    theorem_lines,
+)
 from iblf_jax.certificates._level_certificate import (
     heading_of,
     level_certificate,
@@ -29,11 +36,12 @@ from iblf_jax.certificates.reconstruction import is_valid, time_grid
 from iblf_jax.certificates.result import Certificate, LevelTraces, Traces
 from iblf_jax.certificates.run_summary import THEOREM, WEIGHTED, RunSummary, Segment, summarise
 from iblf_jax.control import actuators, sensors
+from iblf_jax.control.actuators._base import input_delay
 from iblf_jax.core import checks, notices
 from iblf_jax.core.optional import has_members
 from iblf_jax.engine.simulate import SimulationWarning, simulate
 from iblf_jax.simulation.results import Rollout
-from iblf_jax.simulation.scenario import Scenario, canonical, with_parts
+from iblf_jax.simulation.scenario import Scenario, canonical, with_history, with_parts
 from iblf_jax.world.robots import joint_names
 
 MAX_RECORDED = 20_000
@@ -42,7 +50,7 @@ reconstructed."""
 DEFAULT_WORST = 16
 """Runs of a study that are checked if the caller does not say how many."""
 SAMPLED = "the loop is sampled, and the claim is about a law that runs at every instant"
-MEASURED = "how far the sampled run is from the continuous one; no claim of the theorem"
+DELAYED = "the input has a delay, and the claim is about a torque that acts at once"
 
 
 @notices.each_warning_once
@@ -65,6 +73,10 @@ def certify(
         V' <= -sum w_i decay_i - sum c_i w_i |s_i|^2 + dV/dx . d_tilde + dV/dd_hat . d_hat'    (S.3)
 
     and what follows from it: the decay of V and a bound on the error of every level.
+
+    A law with `decays` is also checked against the settling time that these predict,
+
+        E' <= -sum w_j rate_j(k_j(t, V_j)) V_j + g,   E = sum w_j V_j                         (D.2)
 
     A law that states a Lyapunov function V of its own and its decay W (`controllers.LyapunovLaw`)
     is checked against
@@ -93,9 +105,9 @@ def certify(
         steps), or arguments of the wrong kind.
 
     Source: Zhang & Yan 2024, Theorem 2 and its proof, (3.16)-(3.31); (S.3) as at the head of
-      `iblf_jax.certificates.level_terms`.
+      `iblf_jax.certificates.level_terms`, (D.2) at that of `iblf_jax.certificates.settling`.
     """
-    scenario = canonical(scenario)
+    scenario = _with_history_of(canonical(scenario), run, dt)
     if not checks.is_concrete(scenario):
         remedy = "certify works on the host: call it outside jit, vmap and grad."
         raise checks.fail("scenario", "traced values", "numbers", remedy)
@@ -112,6 +124,15 @@ def certify(
             return _certificate_of(run)
         return _over_runs((i, run[i]) for i in range(len(run)))
     return _over_runs(_runs_of_study(scenario, run, worst))
+
+
+def _with_history_of(scenario: Scenario, run: Any, dt: float) -> Scenario:
+    """The scenario with as many past commands as the run has, where its input has a delay."""
+    if run is not None:
+        dt = optional_member(run, "dt")
+    if dt is None or input_delay(scenario.actuator) is None:
+        return scenario
+    return with_history(scenario, float(dt))
 
 
 # --- the runs ------------------------------------------------------------------------------------
@@ -192,7 +213,9 @@ def _replayed(study: Any, index: int) -> Rollout:
 def _certificate_of(run: Rollout) -> Certificate:
     """The certificate of one run, its arrays on the host."""
     if run.scenario.sampling is not None:
-        return _certificate_of_sampled(run)
+        return _certificate_by_comparison(run, "sampled", SAMPLED)
+    if input_delay(run.scenario.actuator) is not None:
+        return _certificate_by_comparison(run, "delayed", DELAYED)
     if is_about_levels(run.scenario):
         return level_certificate(run)
     summary, segments = summarise(run)
@@ -200,11 +223,18 @@ def _certificate_of(run: Rollout) -> Certificate:
     weighted: list[Line] = []
     shares: dict[str, float] = {}
     traces = []
+    courses: list[settling.Course] = []
+    has_settling = settling.has_settling_claim(run.scenario)
+    why_no_settling = settling.why_no_settling(summary)
     for segment in segments:
         about_theorem, segment_shares = theorem_lines.segment_lines(segment)
         checked += [*law_claim_lines.own_segment_lines(segment), *about_theorem]
         if not summary.claims.why_no_weights:
             weighted += decay_lines.decay_lines(segment, WEIGHTED)
+        if has_settling:
+            courses.append(settling.robot_course(segment))
+        if has_settling and not summary.claims.bounds_velocities:
+            checked.append(settling.decay_line(segment, why_no_settling))
         for name, share in segment_shares.items():
             shares[name] = max(share, shares.get(name, 0.0))
         traces.append(_traces(segment))
@@ -220,6 +250,7 @@ def _certificate_of(run: Rollout) -> Certificate:
         *by_name.values(),
         *rate_lines.weighted_rate_lines(summary),
         *lines.merged(weighted).values(),
+        *settling.settling_lines(summary, courses, why_no_settling, summary.mu),
     )
     return Certificate(
         heading_of(run.scenario),
@@ -307,12 +338,17 @@ def _unclaimed_traces(t: Any, V: Any, xi: Any, e2: Any, f_tilde: Any) -> Traces:
     )
 
 
-# --- one run of a sampled loop -------------------------------------------------------------------
+# --- one run of a sampled or delayed loop --------------------------------------------------------
 
 
-def _certificate_of_sampled(run: Rollout) -> Certificate:
-    """The certificate of a run with a sampled law: nothing is claimed about it, and it is compared
-    with the continuous run instead.
+def _certificate_by_comparison(run: Rollout, kind: str, reason: str) -> Certificate:
+    """The certificate of a run whose law is sampled or whose input has a delay: nothing is claimed
+    about it, and it is compared with the continuous run instead.
+
+    Args:
+      run: the run.
+      kind: "sampled" or "delayed".
+      reason: why nothing is claimed.
     """
     scenario, grid = run.scenario, time_grid(run)
     ideal = with_parts(scenario, sampling=None, sensor=sensors.Ideal(), actuator=actuators.Ideal())
@@ -328,12 +364,12 @@ def _certificate_of_sampled(run: Rollout) -> Certificate:
     certificate = _certificate_of(continuous)
     cleared: dict[str, Any] = dict.fromkeys(("margin", "value", "joint", "time", "first"))
     unclaimed = tuple(
-        dataclasses.replace(line, verdict=NOT_APPLICABLE, note=SAMPLED, **cleared)
+        dataclasses.replace(line, verdict=NOT_APPLICABLE, note=reason, **cleared)
         for line in certificate.lines
     )
     return dataclasses.replace(
         certificate,
-        lines=(*unclaimed, *_compared(run, continuous)),
+        lines=(*unclaimed, *_compared(run, continuous, kind)),
         traces=_traces_without_claim(run),
     )
 
@@ -346,25 +382,28 @@ def _traces_without_claim(run: Rollout) -> Traces | LevelTraces:
     return _unclaimed_traces(run.t, run.V, run.xi, run.e2, f_tilde)
 
 
-def _compared(run: Rollout, continuous: Rollout) -> tuple[Line, Line]:
-    """The differences of V2 and of the margin between a sampled and its continuous run."""
+def _compared(run: Rollout, continuous: Rollout, kind: str) -> tuple[Line, Line]:
+    """The differences of V2 and of the margin between a sampled or delayed run and its continuous
+    one.
+    """
+    measured = f"how far the {kind} run is from the continuous one; no claim of the theorem"
     V_excess = run.V - continuous.V
     at = int(np.argmax(V_excess))
     margin_excess = _margins(run) - _margins(continuous)
     joint = int(np.argmin(margin_excess))
     by_V = Statement(
-        "V2, sampled less continuous",
+        f"V2, {kind} less continuous",
         "(3.12)",
         "max over t of V2 of this run less V2 of the continuous one",
     )
     by_margin = Statement(
-        "margin, sampled less continuous",
+        f"margin, {kind} less continuous",
         "(2.2)",
         "smallest distance to a bound, less that of the continuous run",
         "rad",
     )
-    V_line = not_applicable(by_V, MEASURED, counts=False)
-    margin_line = not_applicable(by_margin, MEASURED, counts=False)
+    V_line = not_applicable(by_V, measured, counts=False)
+    margin_line = not_applicable(by_margin, measured, counts=False)
     return (
         dataclasses.replace(V_line, value=float(V_excess[at]), time=float(run.t[at])),
         dataclasses.replace(margin_line, value=float(margin_excess[joint]), joint=joint),

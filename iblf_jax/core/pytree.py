@@ -36,11 +36,16 @@ Leaf: TypeAlias = Any
 `jax.Array` from then on."""
 
 component_member = OptionalMembers(
-    wraps=None, rows=MappingProxyType({}), stacked=MappingProxyType({}), leaf_units=dict
+    wraps=None,
+    rows=MappingProxyType({}),
+    stacked=MappingProxyType({}),
+    leaf_units=dict,
+    symbols_of_part=lambda field, index, symbols: symbols,
 )
 """Reads what a component may declare: the field that holds a wrapped component, rows with names,
-names for several leaves as the rows of one array, and a function of the units of leaves that depend
-on other fields."""
+names for several leaves as the rows of one array, a function of the units of leaves that depend on
+other fields, and one of the units of the symbols in its parts, `symbols_of_part(field, index,
+symbols)`."""
 
 
 def leaf(

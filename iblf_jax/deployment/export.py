@@ -14,6 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.control.actuators import Ideal
+from iblf_jax.control.actuators._base import input_delay
 from iblf_jax.core import checks, notices, taylor
 from iblf_jax.core.pytree import astype
 from iblf_jax.core.status import FAILED, Status, describe, has_flag
@@ -46,7 +48,7 @@ from iblf_jax.kernels import UnsupportedError
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.noise import has_noise, noise_key
-from iblf_jax.simulation.scenario import Scenario, canonical, check_step
+from iblf_jax.simulation.scenario import Scenario, canonical, fitted_to_step
 from iblf_jax.world import plants
 from iblf_jax.world.robots._base import robot_member
 
@@ -150,6 +152,9 @@ def export(
     dt, seed = checks.time_span("dt", dt), checks.seed(seed)
     name = checked_name(name, "iblf_loop" if is_loop else "iblf_law")
     check_single(scenario)
+    if not is_loop and input_delay(scenario.actuator) is not None:
+        # The program of a law ends with its command; a delay belongs to the computer that runs it.
+        scenario = dataclasses.replace(scenario, actuator=Ideal())
     if not is_loop or period is not None:
         scenario = with_period(scenario, period)
     scenario = canonical(astype(scenario, _available(dtype)))
@@ -218,7 +223,7 @@ def _export_law(
 def _export_loop(
     scenario: Scenario, folder: Path, target: str, name: str, dt: float, method: str, seed: int
 ) -> Exported:
-    check_step(scenario, dt)
+    scenario = fitted_to_step(scenario, dt)
     _check_start(scenario)
     loop = loop_program(scenario, method)
     joints = _joint_names(scenario.plant)

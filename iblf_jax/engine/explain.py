@@ -10,6 +10,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.control.actuators._base import input_delay
 from iblf_jax.core import checks, notices
 from iblf_jax.core.devices import threads
 from iblf_jax.engine.batch import Batch, carry_shapes
@@ -24,8 +25,10 @@ from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.metrics import as_folds
 from iblf_jax.simulation.noise import NOISE_NAME, has_noise
 from iblf_jax.simulation.paths import get
-from iblf_jax.simulation.scenario import Scenario, canonical
+from iblf_jax.simulation.scenario import Scenario, canonical, with_history
 
+EXPLAINED_STEP = 1e-3
+"""Time step of the explained loop [s]; one delay, where the input has a shorter one."""
 LIBRARY_CALL = 40
 """Vector instructions that a function of the C library takes for a run, roughly."""
 NAMES = {
@@ -90,6 +93,10 @@ def explain(
       UnsupportedError: the step does not lower; the message says why.
     """
     scenario = canonical(scenario)
+    delay, step = input_delay(scenario.actuator), EXPLAINED_STEP
+    if delay is not None:
+        step = min(step, float(delay.delay))
+    scenario = with_history(scenario, step)
     dtype = scenario.initial.q.dtype
     folds = as_folds(metrics, dtype, scenario)
     tableau(method)
@@ -102,7 +109,7 @@ def explain(
     if has_noise(scenario):
         leaves[NOISE_NAME] = jnp.zeros((1, 4), jnp.float32)
     one = Batch.of(
-        inputs_of(scenario, folds, jnp.asarray(1e-3, dtype), RunRequest(1), None),
+        inputs_of(scenario, folds, jnp.asarray(step, dtype), RunRequest(1), None),
         leaves,
         constants=constants_of(scenario),
     )

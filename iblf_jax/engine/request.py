@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from iblf_jax.control.actuators._base import input_delay
 from iblf_jax.core import checks, notices
 from iblf_jax.engine.registry import backends
 from iblf_jax.engine.structural_constants import StructuralConstants, constants_of
@@ -56,7 +57,11 @@ class RunRequest(NamedTuple):
         Raises:
           ValueError: an unknown method or backend.
         """
-        tableau(method)
+        stages = tableau(method).c
+        if len(stages) == 1 and input_delay(scenario.actuator) is not None:
+            expected = '"rk4" or "heun" with a delay of the input'
+            remedy = "Between two steps of Euler's method the command has no value."
+            raise checks.fail("method", method, expected, remedy)
         backend = check_backend(backend)
         return RunRequest(steps, method, record_every, constants_of(scenario), backend)
 

@@ -23,7 +23,7 @@ from iblf_jax.engine.transformable import run_transformable
 from iblf_jax.simulation.metrics import Fold, as_folds, metric_units
 from iblf_jax.simulation.noise import has_noise, noise_key
 from iblf_jax.simulation.results import Metrics, Rollout
-from iblf_jax.simulation.scenario import Scenario, canonical, check_step
+from iblf_jax.simulation.scenario import Scenario, canonical, fitted_to_step
 
 MAX_SAMPLES = 20_000_000
 """Largest number of recorded samples, so that a mistake in `duration` or `dt` does not fill the
@@ -81,8 +81,7 @@ def simulate(
     every = _checked_record(record_every, steps)
     throw = checks.boolean("throw", throw)
     seed = checks.seed(seed)
-    scenario = canonical(scenario)
-    check_step(scenario, dt)
+    scenario = fitted_to_step(canonical(scenario), dt)
     request = RunRequest.of(
         scenario, steps=steps, method=method, record_every=every, backend=backend
     )

@@ -89,13 +89,35 @@ class LoopAlongStep(NamedTuple):
     torques: tuple
     """For a sampled law, the torques at the actuator before and after a command arrives within the
     step."""
+    arriving: Any = ()
+    """The `ArrivingCommands` of a continuous loop whose input has a delay; `()` without one."""
+
+    @property
+    def jumps_with_law(self) -> bool:
+        """Whether the input jumps at once where the command of the law does."""
+        return self.inputs.scenario.sampling is None and not self.arriving
 
     def at(
-        self, piece: discontinuities.Piece, t: jax.Array, moved: LoopState
+        self,
+        piece: discontinuities.Piece,
+        t: jax.Array,
+        moved: LoopState,
+        command: jax.Array | None = None,
     ) -> tuple[LoopState, Sample]:
-        """Rate and sample within a piece of the step."""
+        """Rate and sample within a piece of the step.
+
+        Args:
+          piece: of the step.
+          t: time, () [s].
+          moved: the `integrated_part` of the state.
+          command: that arrives, (n,), where the input has a delay; that of the time t if not given.
+        """
         torque = self.torques
-        if torque and isinstance(piece.command_arrived, bool):
+        if self.arriving:
+            if command is None:
+                command = self.arriving.at(discontinuities.stage_time(piece, t))
+            torque = (command,)
+        elif torque and isinstance(piece.command_arrived, bool):
             torque = (torque[int(piece.command_arrived)],)
         elif torque:
             torque = (jnp.where(piece.command_arrived, torque[1], torque[0]),)
@@ -108,6 +130,19 @@ class LoopAlongStep(NamedTuple):
         )
 
 
+def _commands_at_stages(
+    along: LoopAlongStep, piece: discontinuities.Piece, method: str
+) -> list[jax.Array] | None:
+    """The commands that arrive at the stages of a piece, (n,) each; None without a delay."""
+    if not along.arriving:
+        return None
+    times = [
+        discontinuities.stage_time(piece, piece.begin + c * piece.length)
+        for c in integrators.tableau(method).c
+    ]
+    return along.arriving.at_stages(times, piece.length)  # type: ignore[no-any-return]
+
+
 def integrated(
     along: LoopAlongStep,
     piece: discontinuities.Piece,
@@ -118,11 +153,12 @@ def integrated(
     """One step of the integrator over a piece."""
     return integrators.step(
         method,
-        lambda t, x: along.at(piece, t, x),
+        lambda t, x, *command: along.at(piece, t, x, *command),
         piece.begin,
         moved,
         piece.length,
         rolled=options.rolled,
+        inputs=_commands_at_stages(along, piece, method),
     )
 
 
@@ -139,7 +175,7 @@ def across_jumps(
     values are unchanged.
 
     Args:
-      along: the loop, whose law is not sampled.
+      along: the loop, whose law is not sampled and whose input has no delay.
       piece: of the step.
       before: state at its start.
       method: the integrator.
@@ -217,7 +253,7 @@ def later_pieces(
             accumulators = ()
             if folds:
                 accumulators = updated(folds, between, right)
-            if along.inputs.scenario.sampling is None:
+            if along.jumps_with_law:
                 made, accumulators = across_jumps(
                     along, piece, moved, method, made, between, accumulators
                 )

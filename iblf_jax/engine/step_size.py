@@ -12,13 +12,14 @@ from __future__ import annotations
 import dataclasses
 import math
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from iblf_jax.control.actuators._base import input_delay
 from iblf_jax.core import checks, notices
 from iblf_jax.core.status import Status, has_flag
 from iblf_jax.engine.machine_function import machine_function
@@ -29,7 +30,7 @@ from iblf_jax.simulation import discontinuities, error_estimate
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.levels import levels_on_reference
-from iblf_jax.simulation.scenario import Initial, Scenario, canonical
+from iblf_jax.simulation.scenario import Initial, Scenario, canonical, with_history
 from iblf_jax.simulation.stability import SLOWEST_RATE, jacobian
 from iblf_jax.world import plants
 
@@ -41,6 +42,9 @@ MODE_INSTANTS = 33
 """Instants along the reference at which modes are computed."""
 MAX_TRIED = 5_000_000
 """Steps of a run that is tried, at most."""
+MAX_STEPS_IN_DELAY = 20
+"""Steps in the delay of an input that are tried, at most: each number of them is a program of its
+own, which contains all commands on their way."""
 INTERVALS = ((0.0, 1.0), (0.0, 0.382), (0.382, 0.618), (0.618, 1.0))
 """Start and end of the intervals that are integrated for each step, in steps: the whole step and
 its three parts."""
@@ -240,7 +244,10 @@ def find_dt(scenario: Scenario, *, duration: float, method: str) -> float:
     scenario = canonical(scenario)
     duration = checks.positive_number("duration", duration, "s")
     if scenario.sampling is not None:
-        return _find_part(scenario, duration, method)
+        return _find_part(scenario, float(scenario.sampling.period), duration, method)
+    delay = input_delay(scenario.actuator)
+    if delay is not None:
+        return _find_part(scenario, float(delay.delay), duration, method, MAX_STEPS_IN_DELAY)
     mode = fastest_along(scenario, np.linspace(0.0, duration, MODE_INSTANTS))
     if not np.isfinite(mode):
         raise checks.fail(
@@ -272,18 +279,21 @@ def find_dt(scenario: Scenario, *, duration: float, method: str) -> float:
     return for_modes
 
 
-def _find_part(scenario: Scenario, duration: float, method: str) -> float:
-    """`find_dt` for a sampled law: the largest accurate fraction of a period.  The divisor is 1, 2
-    or 5 times a power of ten.
+def _find_part(
+    scenario: Scenario, period: float, duration: float, method: str, most_parts: int = MAX_TRIED
+) -> float:
+    """`find_dt` for a sampled law or a delayed input: the largest accurate fraction of the sampling
+    period or of the delay [s].  The divisor is 1, 2 or 5 times a power of ten, at most
+    `most_parts`.
     """
-    sampling: Any = scenario.sampling
-    period, noise = float(sampling.period), jnp.zeros((4,))
+    noise = jnp.zeros((4,)) if scenario.sampling is not None else None
     _can_be_tried(duration, period)
     periods = max(math.ceil(duration / period - 1e-9), 1)
     parts, before, poor_before, coarser = 1, None, 0, period
-    while periods * parts <= MAX_TRIED:
+    while periods * parts <= MAX_TRIED and parts <= most_parts:
         dt = jnp.asarray(period / parts, scenario.initial.q.dtype)
-        found = run_one(scenario, (), dt, RunRequest(periods * parts, method, parts), noise)
+        fitted = with_history(scenario, period / parts)
+        found = run_one(fitted, (), dt, RunRequest(periods * parts, method, parts), noise)
         q, width = found.records[0]["q"], found.records[0]["upper"] - found.records[0]["lower"]
         poor = has_flag(int(found.status), Status.STEP_TOO_LARGE | Status.INACCURATE)
         if (

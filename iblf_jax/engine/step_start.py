@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from iblf_jax.engine.carry import Carry, Inputs
 from iblf_jax.engine.metric_folds import updated, weighed
 from iblf_jax.engine.step_pieces import LoopAlongStep, MetricSample, StepTimes, run_if, step_times
-from iblf_jax.simulation import discontinuities, sampling
+from iblf_jax.simulation import delays, discontinuities, sampling
 from iblf_jax.simulation.closed_loop import (
     run_sampled_law_if_due,
 )
@@ -37,9 +37,10 @@ def continuous_start(
 ) -> StepStart:
     """The start of a step of a loop whose law acts continuously."""
     times = step_times(inputs, index, method, None)
-    return StepStart(
-        LoopAlongStep(evaluated, inputs, carry.state, ()), times, carry.accumulators, ()
-    )
+    number, commands = index.astype(inputs.dt.dtype), carry.state.delayed
+    arriving = delays.arriving(inputs.scenario, method, inputs.dt, number, commands)
+    along = LoopAlongStep(evaluated, inputs, carry.state, (), arriving)
+    return StepStart(along, times, carry.accumulators, ())
 
 
 def sampled_start(

@@ -30,9 +30,15 @@ from iblf_jax.engine.carry import Carry, Inputs, Nearest, StepOptions, keep_if
 from iblf_jax.engine.metric_folds import begun_at, updated, weighed
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.status_flags import has_no_input, is_valid, sample_status
-from iblf_jax.engine.step_pieces import MetricSample, across_jumps, integrated, later_pieces
+from iblf_jax.engine.step_pieces import (
+    LoopAlongStep,
+    MetricSample,
+    across_jumps,
+    integrated,
+    later_pieces,
+)
 from iblf_jax.engine.step_start import continuous_start, sampled_start
-from iblf_jax.simulation import discontinuities, error_estimate
+from iblf_jax.simulation import delays, discontinuities, error_estimate
 from iblf_jax.simulation.closed_loop import (
     LoopState,
     evaluate,
@@ -114,19 +120,24 @@ def advance(
     step = jnp.where(index > 0, inputs.dt, jnp.zeros_like(inputs.dt))
     sample = weighed(stepped.aux, times.span.start, 0.5 * (times.behind + ahead), step)
     begun, accumulators = options.piece(_observed)(inputs, index, start.accumulators, sample)
-    if inputs.scenario.sampling is None:
+    if along.jumps_with_law:
         stepped, accumulators = across_jumps(
             along, first, state, method, stepped, begun, accumulators
         )
     later = later_pieces(along, times.division.pieces, stepped, accumulators, method, options)
     parts = [(first.length, stepped.slopes), *later.parts]
+    state_after = with_integrated_part(state, later.moved)
+    if along.arriving:
+        state_after, parts = _with_commands(
+            along, method, times.division.pieces, state_after, parts
+        )
     after, status, nearest, estimate = options.piece(partial(_concluded, method))(
         inputs,
         carry,
         index,
         sample,
         parts,
-        (with_integrated_part(state, later.moved), later.status),
+        (state_after, later.status),
         state,
         times.span.in_run,
         times.restarts,
@@ -140,6 +151,27 @@ def advance(
     return Advanced(
         Carry(after, later.accumulators, status, nearest, estimate), metric_samples, state
     )
+
+
+def _with_commands(
+    along: LoopAlongStep,
+    method: str,
+    pieces: tuple[discontinuities.Piece, ...],
+    after: LoopState,
+    parts: list,
+) -> tuple[LoopState, list]:
+    """The state after a step with the commands of the step, and the slopes of its stages without
+    them.
+    """
+    sent = [
+        delays.PieceCommands(piece.begin, length, piece.exists, [slope.delayed for slope in slopes])
+        for piece, (length, slopes) in zip(pieces, parts, strict=True)
+    ]
+    commands = delays.with_step(along.state.delayed, method, along.arriving, sent)
+    without = [
+        (length, [slope._replace(delayed=()) for slope in slopes]) for length, slopes in parts
+    ]
+    return after._replace(delayed=commands), without
 
 
 def _observed(

@@ -26,7 +26,7 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.control.actuators import Ideal
-from iblf_jax.control.actuators._base import unlimited
+from iblf_jax.control.actuators._base import smooth, unlimited
 from iblf_jax.control.controllers import Command
 from iblf_jax.control.controllers._base import law_member, state_of_levels
 from iblf_jax.control.observers._base import observer_member
@@ -35,6 +35,7 @@ from iblf_jax.control.sensors._base import unrounded
 from iblf_jax.core.linalg import inner, matvec
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.time import as_at
+from iblf_jax.simulation.delays import initial_commands
 from iblf_jax.simulation.levels import (
     Motion,
     completed,
@@ -116,7 +117,7 @@ class SampledState(NamedTuple):
 
 
 class LoopState(NamedTuple):
-    """State of the closed loop; its rate has the same structure."""
+    """State of the closed loop; its rate has the structure of the `integrated_part`."""
 
     q: jax.Array
     dq: jax.Array
@@ -127,6 +128,9 @@ class LoopState(NamedTuple):
     """A `SampledState` where the law is sampled."""
     higher: Any = ()
     """Levels of the plant from the third on, (r - 2, n); `()` for a robot, which has q and q'."""
+    delayed: Any = ()
+    """Commands of the last steps, newest first, (history, stages, n) [N m], where the input of a
+    continuous loop has a delay; in the rate of the state the command itself, (n,)."""
 
     @property
     def x(self) -> jax.Array:
@@ -152,7 +156,7 @@ def initial_state(scenario: Scenario) -> LoopState:
     balance = steady_input(scenario, q)
     state = state._replace(actuator=scenario.actuator.init(balance))
     if scenario.sampling is None:
-        return state
+        return state._replace(delayed=initial_commands(scenario, balance))
     return state._replace(sampled=_initial_sampled_state(scenario, state, balance))
 
 
@@ -183,12 +187,20 @@ def _initial_sampled_state(scenario: Scenario, state: LoopState, tau: jax.Array)
     )
 
 
+def has_delay(state: LoopState) -> bool:
+    """Whether a state contains past commands, because the input has a delay."""
+    return not isinstance(state.delayed, tuple)
+
+
 def integrated_part(state: LoopState) -> LoopState:
     """The part of the state that the integrator advances.
 
-    This is the whole state of a continuous loop. Of a sampled loop it is the plant and the
-    actuator; law, observer and sensor change at samples only.
+    This is the whole state of a continuous loop, with the integral of the command, from 0 on, in
+    the place of past commands. Of a sampled loop it is the plant and the actuator; law, observer
+    and sensor change at samples only.
     """
+    if has_delay(state):
+        return state._replace(delayed=jnp.zeros_like(state.q))
     if state.sampled == ():
         return state
     return state._replace(controller=(), observer=(), sampled=())
@@ -197,7 +209,7 @@ def integrated_part(state: LoopState) -> LoopState:
 def with_integrated_part(state: LoopState, part: LoopState) -> LoopState:
     """The state with its `integrated_part` replaced."""
     if state.sampled == ():
-        return part
+        return part._replace(delayed=state.delayed)
     return state._replace(q=part.q, dq=part.dq, higher=part.higher, actuator=part.actuator)
 
 
@@ -220,12 +232,13 @@ def evaluate(
       t: time, () [s].
       state: state at t.
       dt: weight of the sample in an integral over time, () [s].
-      torque: command at the actuator, (n,) [N m], where the law is sampled; the newest command if
-        not given.
+      torque: command at the actuator, (n,) [N m], where the law is sampled or its command has a
+        delay; the newest command if not given.
     """
     q, dq, higher, observer = state.q, state.dq, state.higher, scenario.observer
     controller_rate: Any = ()
     observer_rate: Any = ()
+    sent: Any = ()
     if scenario.sampling is None:
         f_hat = observer_estimate(scenario, observer, t, q, dq, higher, state.observer)
         law: Any = scenario.controller
@@ -234,6 +247,10 @@ def evaluate(
         measured = law_state(scenario, *known)
         answer, controller_rate = law.command(t, *measured, f_hat, context, state.controller)
         command, signals = plant_input(answer), law_signals(answer, f_hat)
+        if has_delay(state):
+            sent = command
+        if torque is not None:
+            command = torque
     else:
         command = state.sampled.commands[0] if torque is None else torque
         signals = state.sampled.signals
@@ -245,7 +262,7 @@ def evaluate(
         )
         observer_rate = observer.derivative(*arguments)
     rate = LoopState(
-        moved.dq, moved.ddq, controller_rate, observer_rate, delivered.rate, (), moved.higher
+        moved.dq, moved.ddq, controller_rate, observer_rate, delivered.rate, (), moved.higher, sent
     )
     sample = sample_at(
         scenario, t, dt, q, dq, moved, delivered.tau, delivered.limited, signals, higher
@@ -538,11 +555,11 @@ class PerturbedState(NamedTuple):
 
 
 def perturbed_state(state: LoopState) -> Any:
-    """The variables by which the loop is linearised: its state, or the `PerturbedState` of a
-    sampled loop.
+    """The variables by which the loop is linearised: its state without past commands, or the
+    `PerturbedState` of a sampled loop.
     """
     if state.sampled == ():
-        return state
+        return state._replace(delayed=())
     memory = (state.controller, state.observer, state.sampled.sensor)
     return PerturbedState(integrated_part(state), state.sampled.commands[0], memory)
 
@@ -559,7 +576,8 @@ def perturbed_rate(
     For a continuous loop it is the rate of the state. For a sampled loop it is the rate of the
     plant, the next command, and the next states of law, observer and sensor. Rounding of a sensor
     and limits of an actuator are left out (`Sensor.unrounded`, `Actuator.unlimited`), because their
-    derivatives vanish and would show an open loop.
+    derivatives vanish and would show an open loop; so are dead zone, play and rounding of an
+    actuator in every loop (`Actuator.smooth`), and the delay of the input of a continuous loop.
 
     Args:
       scenario: the scenario.
@@ -570,12 +588,15 @@ def perturbed_rate(
       compiled: wrapper of functions that are compiled on their own.
     """
     if not isinstance(perturbed, PerturbedState):
+        actuator = smooth(scenario.actuator)
+        if actuator is not scenario.actuator:
+            scenario = dataclasses.replace(scenario, actuator=actuator)
         arguments = [scenario, t, perturbed]
         if dt is not None:
             arguments.append(dt)
         return compiled(evaluate)(*arguments)[0]
     scenario = dataclasses.replace(
-        scenario, sensor=unrounded(scenario.sensor), actuator=unlimited(scenario.actuator)
+        scenario, sensor=unrounded(scenario.sensor), actuator=smooth(unlimited(scenario.actuator))
     )
     controller, observer, sensor = perturbed.memory
     state = with_integrated_part(initial_state(scenario), perturbed.plant)

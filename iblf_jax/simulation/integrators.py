@@ -9,6 +9,7 @@ of two stages and rk4; a row of another kind needs a formula there.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -73,7 +74,14 @@ class StepResult(NamedTuple):
 
 
 def step(
-    method: str, evaluate, t: jax.Array, state, dt: jax.Array, *, rolled: bool = False
+    method: str,
+    evaluate,
+    t: jax.Array,
+    state,
+    dt: jax.Array,
+    *,
+    rolled: bool = False,
+    inputs: Sequence[jax.Array] | None = None,
 ) -> StepResult:
     """One step of an explicit Runge-Kutta method.
 
@@ -83,17 +91,22 @@ def step(
       t, dt: time and step, () [s].
       state: pytree of arrays.
       rolled: run the stages as a loop, so that `evaluate` is compiled once and not once a stage.
+      inputs: an array for each stage, which `evaluate` takes as a third argument; none if not
+        given.
     """
     take_step = _rolled if rolled else _unrolled
-    return take_step(tableau(method), evaluate, t, state, dt)
+    return take_step(tableau(method), evaluate, t, state, dt, inputs)
 
 
-def _unrolled(table: Tableau, evaluate, t, state, dt) -> StepResult:
+def _unrolled(table: Tableau, evaluate, t, state, dt, inputs) -> StepResult:
     """A step whose stages are written out."""
-    slope, aux = evaluate(t, state)
+    given: Sequence[tuple] = [()] * len(table.c)
+    if inputs is not None:
+        given = [(u,) for u in inputs]
+    slope, aux = evaluate(t, state, *given[0])
     slopes = [slope]
-    for c, row in zip(table.c[1:], table.a[1:], strict=True):
-        slopes.append(evaluate(t + c * dt, _combine(state, dt, row, slopes))[0])
+    for c, row, own in zip(table.c[1:], table.a[1:], given[1:], strict=True):
+        slopes.append(evaluate(t + c * dt, _combine(state, dt, row, slopes), *own)[0])
     return StepResult(_combine(state, dt, table.b, slopes), slopes, aux)
 
 
@@ -115,20 +128,22 @@ def _combine(state, dt, weights, slopes):
     return jax.tree.map(combine_leaf, state, *slopes)
 
 
-def _rolled(table: Tableau, evaluate, t, state, dt) -> StepResult:
+def _rolled(table: Tableau, evaluate, t, state, dt, inputs) -> StepResult:
     """A step whose stages are a loop over the rows of the tableau, on the flat state."""
     x, unflatten = ravel_pytree(state)
     stages = len(table.c)
     rows = jnp.asarray([(*row, *[0.0] * (stages - len(row))) for row in table.a], x.dtype)
 
     def stage(slopes, at):
-        index, c, row = at
+        index, c, row, *own = at
         stage_state = unflatten(x + dt * jnp.sum(row[:, None] * slopes, axis=0))
-        slope, other = evaluate(t + c * dt, stage_state)
+        slope, other = evaluate(t + c * dt, stage_state, *own)
         flat, _ = ravel_pytree(slope)
         return jax.lax.dynamic_update_index_in_dim(slopes, flat, index, 0), other
 
-    at_stages = (jnp.arange(stages), jnp.asarray(table.c, x.dtype), rows)
+    at_stages: tuple = (jnp.arange(stages), jnp.asarray(table.c, x.dtype), rows)
+    if inputs is not None:
+        at_stages = (*at_stages, jnp.stack(inputs))
     slopes, others = jax.lax.scan(stage, jnp.zeros((stages, x.size), x.dtype), at_stages)
     total = jnp.sum(jnp.asarray(table.b, x.dtype)[:, None] * slopes, axis=0)
     aux = jax.tree.map(lambda y: y[0], others)

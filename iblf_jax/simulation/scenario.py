@@ -20,6 +20,7 @@ import numpy as np
 
 from iblf_jax.control.actuators import Actuator
 from iblf_jax.control.actuators import Ideal as IdealActuator
+from iblf_jax.control.actuators._base import actuator_member, input_delay
 from iblf_jax.control.controllers import Controller, LawContext
 from iblf_jax.control.controllers._base import law_member, state_of_levels
 from iblf_jax.control.observers import NoObserver, Observer
@@ -294,6 +295,10 @@ class Scenario:
             got, expected = type(self.sensor).__name__, "an Ideal sensor where no law is sampled"
             remedy = "Add sampling=ij.Sampling(period=...): a sensor is read once a period."
             raise checks.fail("Scenario.sensor", got, expected, remedy)
+        if self.sampling is not None and input_delay(self.actuator) is not None:
+            expected = "no Delay where the law is sampled"
+            remedy = "Give ij.Sampling(period=..., delay=...) instead."
+            raise checks.fail("Scenario.actuator", self.actuator, expected, remedy)
 
     def _check_regions(self) -> None:
         """Makes a tuple of the regions; raises ValueError for one that is no region, or does not
@@ -724,6 +729,29 @@ def _shared_dtype(scenario: Scenario) -> jax.typing.DTypeLike:
         remedy = 'Use iblf_jax.astype(scenario, "float32").'
         raise checks.fail("scenario", got, "float32 or float64", remedy)
     return jnp.result_type(float)
+
+
+def fitted_to_step(scenario: Scenario, dt: float) -> Scenario:
+    """The scenario with a history of commands that is long enough for the delay of its input, for
+    steps dt [s].
+
+    Raises:
+      ValueError: the sampling period is not a whole number of steps, or the delay of the input is
+        shorter than a step.
+    """
+    check_step(scenario, dt)
+    return with_history(scenario, dt)
+
+
+def with_history(scenario: Scenario, dt: float) -> Scenario:
+    """`fitted_to_step` without the check of the sampling period."""
+    fitted = actuator_member(scenario.actuator, "with_history")
+    if fitted is None:
+        return scenario
+    actuator = fitted(dt)
+    if actuator is scenario.actuator:
+        return scenario
+    return dataclasses.replace(scenario, actuator=actuator)
 
 
 def check_step(scenario: Scenario, dt: float) -> None:

@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.control.actuators._base import input_delay
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import component
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
@@ -162,8 +163,8 @@ def vector_field(scenario: Scenario) -> VectorField:
         rest.
 
     Raises:
-      ValueError: as `simulate`, for a scenario that cannot run, or a law that is sampled; the
-        message names the field, the value and the remedy.
+      ValueError: as `simulate`, for a scenario that cannot run, a law that is sampled, or an
+        input with a delay; the message names the field, the value and the remedy.
 
     Source: design of this package; the closed loop is Zhang & Yan 2024, section 3.
     """
@@ -174,6 +175,13 @@ def vector_field(scenario: Scenario) -> VectorField:
             "a sampled law",
             "a law that runs at every instant",
             "Its torque jumps: use ij.simulate.",
+        )
+    if input_delay(field.scenario.actuator) is not None:
+        raise checks.fail(
+            "scenario.actuator",
+            "a Delay",
+            "a loop without a delay of its input",
+            "Its rate depends on past states, and no function (t, x) gives it: use ij.simulate.",
         )
     return field
 

@@ -19,7 +19,7 @@ import numpy as np
 from iblf_jax.engine import CompiledBatch, RunRequest, block_size, compile_batch
 from iblf_jax.simulation.metrics import Fold, as_folds
 from iblf_jax.simulation.noise import noise_values
-from iblf_jax.simulation.scenario import Scenario, canonical, check_step
+from iblf_jax.simulation.scenario import Scenario, canonical, fitted_to_step
 from iblf_jax.studies.designs import designed_numbers
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.draws import (
@@ -132,11 +132,10 @@ def prepare(
     Raises:
       ValueError: an argument that is not valid.
     """
-    scenario = canonical(scenario)
+    scenario = fitted_to_step(canonical(scenario), options.dt)
     request = RunRequest.of(
         scenario, steps=options.steps, method=options.method, backend=options.backend
     )
-    check_step(scenario, options.dt)
     targets, by_path = targets_of(scenario, perturbations)
     dtype = scenario.initial.q.dtype
     folds = as_folds(metrics, dtype, scenario)

@@ -12,6 +12,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from iblf_jax.control.actuators import Actuator, Delivered
+from iblf_jax.control.actuators._base import smooth
 from iblf_jax.control.sensors import Measurement, Sensor
 from iblf_jax.control.sensors._base import sensor_member, unrounded
 from iblf_jax.core.optional import has_members
@@ -96,7 +97,8 @@ def check_actuator(actuator: Any, *, n: int | None = None) -> None:
     """Checks an actuator: shapes, the state's structure, derivatives, float32, and the initial
     torque.
 
-    The input of an actuator may have any unit.  In the state `init(tau)` at a standstill, some
+    The input of an actuator may have any unit.  Derivatives and the initial torque are those of the
+    property `smooth`, if it has one.  In the state `init(tau)` at a standstill, some
     input must deliver tau, and the state must be stable at this input.
 
     Args:
@@ -112,11 +114,12 @@ def check_actuator(actuator: Any, *, n: int | None = None) -> None:
         in_both_types(findings, _delivers, fitted, command, dq)
 
         def outputs(actuator, command, dq):
+            actuator = smooth(actuator)
             delivered = actuator.deliver(command, dq, actuator.init(0.9 * command))
             return {"tau": delivered.tau} | leaves_by_name("rate", delivered.rate)
 
         check_function(findings, outputs, fitted, (command, dq))
-        _starts_at_its_torque(findings, fitted, command / jnp.max(jnp.abs(command)))
+        _starts_at_its_torque(findings, smooth(fitted), command / jnp.max(jnp.abs(command)))
 
 
 def _delivers(findings: Findings, actuator, command, dq) -> None:

@@ -39,7 +39,7 @@ from iblf_jax.engine.simulate import simulate
 from iblf_jax.simulation.metrics import check_needs
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.results import Rollout
-from iblf_jax.simulation.scenario import Scenario, canonical, check_step
+from iblf_jax.simulation.scenario import Scenario, canonical, fitted_to_step
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.perturbation_cube import Cube, unit_cube
 from iblf_jax.tuning.evaluation import Derivatives, Value
@@ -153,9 +153,8 @@ def falsify(
     Source: head of this module.
     """
     steps = checks.whole_steps(duration, dt)
-    scenario = canonical(scenario)
+    scenario = fitted_to_step(canonical(scenario), dt)
     request = RunRequest.of(scenario, steps=steps, method=method, backend=backend)
-    check_step(scenario, dt)
     starts = checks.positive_integer("starts", starts)
     checks.fits_memory("starts", starts, 8.0 * NUMBERS_A_RUN)
     iterations = checks.positive_integer("iterations", iterations, most=checks.MAX_STEPS)

@@ -21,7 +21,7 @@ from iblf_jax.core.units import POSITION
 from iblf_jax.engine import RunRequest, points_per_batch
 from iblf_jax.simulation.noise import has_noise
 from iblf_jax.simulation.paths import with_parameters
-from iblf_jax.simulation.scenario import Scenario, canonical, check_step
+from iblf_jax.simulation.scenario import Scenario, canonical, fitted_to_step
 from iblf_jax.simulation.units import unit_text
 from iblf_jax.studies.draws import Target, UncertainScenario, targets_of
 from iblf_jax.studies.time_step import recommended_dt
@@ -124,8 +124,7 @@ class TuningProblem:
         """
         run = TuningRunOptions(**options).checked()
         goal = checked(objective)
-        scenario = canonical(scenario)
-        check_step(scenario, run.dt)
+        scenario = fitted_to_step(canonical(scenario), run.dt)
         targets, by_path = targets_of(scenario, run.perturbations)
         if run.runs > 1 and not (targets or has_noise(scenario)):
             remedy = "All runs would be the same: give perturbations."

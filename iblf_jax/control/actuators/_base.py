@@ -1,7 +1,7 @@
 """The contract of an actuator: it takes the law's command and gives a torque.
 
-Its state is integrated with the plant.  Friction belongs to the plant, and delay to the sampled
-loop (`Sampling`).
+Its state is integrated with the plant.  Friction belongs to the plant.  The delay of a sampled law
+belongs to its `Sampling`, that of a continuous one is a `Delay`.
 """
 
 from __future__ import annotations
@@ -35,7 +35,9 @@ class Actuator(Protocol):
     not use it.
 
     An actuator with limits also has the property `unlimited`, the same actuator without them; the
-    fastest mode of a loop is computed with it.  An actuator that changes with time, such as a drive
+    fastest mode of a sampled loop is computed with it.  One with a dead zone, a play or rounding
+    has the property `smooth`, an actuator without these that has the same state; the fastest mode
+    of every loop is computed with it.  An actuator that changes with time, such as a drive
     that fails, has `at(t)`, the actuator at time t [s], and, if it is discontinuous in time,
     `jump_times()`, (m,) [s]; steps of a run are divided there, as for disturbances.
     """
@@ -55,11 +57,27 @@ class Actuator(Protocol):
         ...
 
 
-actuator_member = OptionalMembers(unlimited=None, advice=list)
-"""Reads optional members of an actuator."""
+actuator_member = OptionalMembers(
+    unlimited=None, smooth=None, input_delay=None, with_history=None, advice=list
+)
+"""Reads optional members of an actuator.  `input_delay` is the `Delay` of the loop's input, and
+`with_history(dt)` the actuator with a history that is long enough for steps dt [s]."""
 
 
 def unlimited(actuator: Actuator) -> Actuator:
     """An actuator without its limits; itself if it declares none."""
     found = actuator_member(actuator, "unlimited")
     return actuator if found is None else found
+
+
+def smooth(actuator: Actuator) -> Actuator:
+    """An actuator without dead zone, play and rounding; itself if it declares none."""
+    found = actuator_member(actuator, "smooth")
+    if found is None:
+        return actuator
+    return found  # type: ignore[no-any-return]
+
+
+def input_delay(actuator: Actuator) -> Any:
+    """The `Delay` of the input of a loop; None without one."""
+    return actuator_member(actuator, "input_delay")

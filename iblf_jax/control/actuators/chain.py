@@ -9,7 +9,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.actuators._base import Actuator, Delivered, unlimited
+from iblf_jax.control.actuators._base import (
+    Actuator,
+    Delivered,
+    actuator_member,
+    input_delay,
+    smooth,
+    unlimited,
+)
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import component
 from iblf_jax.core.time import as_at, joined, jump_times_of
@@ -21,7 +28,8 @@ class Chain:
     limit=40.0), Motor(bandwidth=300.0)))`.
 
     Args:
-      parts: any actuators, a tuple or a list, from the command to the joint; at least one.
+      parts: any actuators, a tuple or a list, from the command to the joint; at least one.  A
+        `Delay` comes first.
 
     Source: none; what a current loop and a transmission with a lag of its own make together.
     """
@@ -42,11 +50,33 @@ class Chain:
         object.__setattr__(self, "parts", tuple(self.parts))
         for i, part in enumerate(self.parts):
             checks.conforms(f"Chain.parts[{i}]", part, Actuator)
+            if i > 0 and input_delay(part) is not None:
+                expected = "a Delay as the first part only"
+                remedy = "It is the command that is late: Chain((Delay(...), ...))."
+                raise checks.fail(f"Chain.parts[{i}]", part, expected, remedy)
 
     @property
     def unlimited(self) -> Chain:
         """The same without limits."""
         return dataclasses.replace(self, parts=tuple(map(unlimited, self.parts)))
+
+    @property
+    def smooth(self) -> Chain:
+        """The same without dead zones, play and rounding."""
+        return dataclasses.replace(self, parts=tuple(map(smooth, self.parts)))
+
+    @property
+    def input_delay(self) -> Any:
+        """The `Delay` of the first part; None without one."""
+        return input_delay(self.parts[0])
+
+    def with_history(self, dt: float) -> Chain:
+        """The same with a history of its delay that is long enough for steps dt [s]."""
+        first = self.parts[0]
+        fitted = actuator_member(first, "with_history")
+        if fitted is None:
+            return self
+        return dataclasses.replace(self, parts=(fitted(dt), *self.parts[1:]))
 
     def at(self, t: jax.Array) -> Chain:
         """The chain as it is at time t [s]."""

@@ -1,0 +1,49 @@
+"""Backlash: play between the command and the torque."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+
+from iblf_jax.control.actuators._base import Delivered
+from iblf_jax.core.pytree import Leaf, component, leaf
+from iblf_jax.core.units import INPUT
+
+
+@component
+class Backlash:
+    """y' = bandwidth (max(u - y - gap/2, 0) + min(u - y + gap/2, 0)),   tau = y.
+
+    The torque stays constant while the command is within half of the gap of it, and otherwise
+    follows at a distance of gap/2 with a lag.  For bandwidth -> infinity it is the play operator;
+    with a finite one the rate is continuous.  A run is of second order in the time step where the
+    command enters or leaves the gap.  The fastest mode is computed without the gap (`smooth`).
+
+    Args:
+      gap: width of the play in terms of the command, () or (n,) [N m], >= 0.
+      bandwidth: of the contact, () or (n,) [1/s], > 0.
+
+    Source: the play operator, M. Brokate, J. Sprekels, Hysteresis and Phase Transitions, 1996,
+      section 2.1; the lag regularises it.
+    """
+
+    gap: Leaf = leaf(INPUT, sign="nonnegative")
+    bandwidth: Leaf = leaf("1/s", sign="positive")
+
+    @property
+    def smooth(self) -> Backlash:
+        """The same without the gap."""
+        return dataclasses.replace(self, gap=jnp.zeros_like(self.gap))
+
+    def init(self, tau: jax.Array) -> jax.Array:
+        """The torque that it delivers, (n,) [N m]."""
+        return tau
+
+    def deliver(self, command: jax.Array, dq: jax.Array, state: jax.Array) -> Delivered:
+        """The torque, and its rate."""
+        ahead = command - state
+        half = 0.5 * self.gap
+        beyond = jnp.maximum(ahead - half, 0.0) + jnp.minimum(ahead + half, 0.0)
+        return Delivered(state, jnp.zeros(command.shape, bool), self.bandwidth * beyond)

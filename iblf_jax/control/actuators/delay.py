@@ -1,0 +1,93 @@
+"""A constant delay of the input of a continuous loop."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+
+from iblf_jax.control.actuators._base import Delivered
+from iblf_jax.core import checks
+from iblf_jax.core.pytree import Leaf, component, leaf, static
+
+WHOLE_TOLERANCE = 1e-6
+"""Largest distance [steps] at which a delay is rounded to a whole number of steps."""
+
+
+@component
+class Delay:
+    """tau(t) = u(t - delay) for t >= delay,   the torque that balances gravity before.
+
+    The loop keeps the commands of the integrator's stages of the last steps
+    (`simulation.delays`), and a step costs more the more there are.  With a delay of a whole number
+    of steps a run has the order of the integrator; with another delay it is of second order.  In a
+    chain a delay comes first, because it is the command that is late.  An observer receives the
+    command of the instant, before the delay.  The commands of a sampled law have the delay of their
+    `Sampling`.
+
+    The fastest mode of a run is that of the loop without the delay.  A derivative by the delay is
+    of second order in the time step with a whole number of steps, and of first order otherwise.
+    Derivatives of a loop whose law has a command that jumps lack the terms of these jumps.
+
+    Args:
+      delay: () [s], > 0; at least one time step.
+      history: number of past steps whose commands are kept; as many as the delay needs if not
+        given.  A study with longer delays needs more, and so does a derivative by the delay, where
+        the delay has no value from which the number follows: at least delay / dt, rounded up.
+
+    Source: A. Bellen, M. Zennaro, Numerical Methods for Delay Differential Equations, 2003,
+      chapter 3: the method of steps.
+    """
+
+    delay: Leaf = leaf("s", sign="positive", shape="scalar")
+    history: int = static(default=None)
+
+    def check(self) -> None:
+        """Raises ValueError for a delay that no loop has, or a history that is not a positive
+        whole number.
+        """
+        if checks.is_concrete(self.delay):
+            checks.time_span("Delay.delay", self.delay)
+        if self.history is not None:
+            checks.positive_integer("Delay.history", self.history)
+
+    @property
+    def input_delay(self) -> Delay:
+        """Itself: the delay of the input that a loop has."""
+        return self
+
+    def with_history(self, dt: float) -> Delay:
+        """The same with a history that is long enough for steps dt [s].
+
+        Raises:
+          ValueError: a delay shorter than a step, or traced without a given history.
+        """
+        if not checks.is_concrete(self.delay):
+            if self.history is None:
+                expected = "a whole number of steps, where the delay is traced"
+                remedy = "Such as Delay(delay=0.01, history=10) for dt = 1 ms."
+                raise checks.fail("Delay.history", None, expected, remedy)
+            return self
+        steps = float(self.delay) / dt
+        if steps < 1.0 - WHOLE_TOLERANCE:
+            expected = f"a delay of at least one time step, {dt:g} s"
+            remedy = f"Take dt={float(self.delay):g}, or a part of it."
+            raise checks.fail("Delay.delay", float(self.delay), expected, remedy)
+        needed = max(math.ceil(steps - WHOLE_TOLERANCE), 1)
+        if self.history is not None and self.history >= needed:
+            return self
+        return dataclasses.replace(self, history=needed)
+
+    def jump_times(self) -> jax.Array:
+        """The time at which the first command arrives, (1,) [s]."""
+        return jnp.atleast_1d(self.delay)
+
+    def init(self, tau: jax.Array) -> tuple[()]:
+        """No state of its own; the loop keeps the commands."""
+        return ()
+
+    def deliver(self, command: jax.Array, dq: jax.Array, state: tuple[()]) -> Delivered:
+        """The command that arrives, which the loop has delayed."""
+        return Delivered(command, jnp.zeros(command.shape, bool), ())

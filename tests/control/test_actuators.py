@@ -1,0 +1,408 @@
+"""Faults, dead zone, levels, play and delay of the input, against programs in NumPy and SciPy that
+share nothing with the package: the paper's loop of `independent.py` with a torque that is not the
+command."""
+
+from __future__ import annotations
+
+import itertools
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from independent import Loop, sine
+from scipy.integrate import solve_ivp
+from scipy.special import lambertw
+
+import iblf_jax as ij
+from iblf_jax.certificates.claims import why_no_theorem
+from iblf_jax.core.status import Status
+from iblf_jax.simulation.closed_loop import LoopState, evaluate
+
+LOOP = Loop(corrected=True, K2=np.full(2, 4.0), kf=np.full(2, 4.0))
+SLOW = ij.with_parameters(
+    ij.presets.zhang_yan_2024(reading="corrected"), {"controller.K2": 4.0, "observer.kf": 4.0}
+)
+DURATION = 0.1
+RHO, BIAS = np.array([0.6, 0.8]), np.array([0.3, -0.2])
+LOWER, UPPER, SLOPE = np.array([-0.3, -0.2]), np.array([0.5, 0.1]), np.array([0.9, 1.2])
+GAP, BANDWIDTH = np.array([0.4, 0.2]), 300.0
+
+
+def with_actuator(*parts, scenario=SLOW) -> ij.Scenario:
+    actuator = parts[0] if len(parts) == 1 else ij.actuators.Chain(parts)
+    return ij.with_parts(scenario, actuator=actuator)
+
+
+def end_of(run) -> np.ndarray:
+    return np.concatenate([run.q[-1], run.dq[-1]])
+
+
+# --- formulas, written once more ------------------------------------------------------------------
+
+
+def faulty(u, failed):
+    return RHO * u + BIAS if failed else u
+
+
+def beyond(u, lower, upper):
+    """What of u lies beyond two limits."""
+    return np.where(u > upper, u - upper, np.where(u < lower, u - lower, 0.0))
+
+
+def moved(t, x, deliver):
+    """The rate of (q, q', eta) under a delivered torque, and the command; the observer receives the
+    command."""
+    rate, out = LOOP.evaluate(t, x)
+    M = LOOP.arm(x[:2])[0]
+    rate[2:4] += np.linalg.solve(M, deliver(out["tau"]) - out["tau"])
+    return rate, out["tau"]
+
+
+# --- the vector field -----------------------------------------------------------------------------
+
+
+def test_vector_field_of_a_chain_at_random_states(rng):
+    time, step = 0.5, np.array([0.03, 0.05])
+    scenario = with_actuator(
+        ij.actuators.Fault(RHO, BIAS, time),
+        ij.actuators.DeadZone(LOWER, UPPER, SLOPE),
+        ij.actuators.Quantiser(step),
+        ij.actuators.Backlash(GAP, BANDWIDTH),
+    )
+    times = rng.uniform(0.0, 2 * time, 40)
+    desired = np.array([sine(*LOOP.reference)(t)[0] for t in times])
+    q = desired + rng.uniform(-0.1, 0.1, (40, 2))
+    dq, eta = rng.uniform(-1.0, 1.0, (2, 40, 2))
+    y = rng.uniform(-2.0, 2.0, (40, 2))
+
+    def rate_at(t, q, dq, eta, y):
+        return evaluate(scenario, t, LoopState(q, dq, (), eta, ((), (), (), y)))[0]
+
+    found = jax.jit(jax.vmap(rate_at))(times, q, dq, eta, y)
+    for i, t in enumerate(times):
+        x = np.concatenate([q[i], dq[i], eta[i]])
+        rate, u = moved(t, x, lambda _, i=i: y[i])
+        v = SLOPE * beyond(faulty(u, t >= time), LOWER, UPPER)
+        v = step * np.round(v / step)
+        y_rate = BANDWIDTH * beyond(v - y[i], -GAP / 2, GAP / 2)
+        expected = np.concatenate([rate, y_rate])
+        got = np.concatenate([found.q[i], found.dq[i], found.observer[i], found.actuator[3][i]])
+        np.testing.assert_allclose(got, expected, rtol=1e-12, atol=1e-11)
+
+
+# --- trajectories ---------------------------------------------------------------------------------
+
+
+def test_fault_between_two_instants_against_scipy():
+    time = 0.0503
+    scenario = with_actuator(ij.actuators.Fault(RHO, BIAS, time))
+    run = ij.simulate(scenario, duration=DURATION, dt=1e-3)
+    x = np.concatenate([LOOP.q0, LOOP.dq0, np.zeros(2)])
+    for a, b in itertools.pairwise([0.0, time, DURATION]):
+        solution = solve_ivp(
+            lambda t, x, a=a: moved(t, x, lambda u: faulty(u, a >= time))[0],
+            (a, b),
+            x,
+            "DOP853",
+            rtol=1e-11,
+            atol=1e-13,
+        )
+        x = solution.y[:, -1]
+    np.testing.assert_allclose(end_of(run), x[:4], rtol=0, atol=1e-7)
+    # The estimate of the observer, which receives the command, contains the lost torque.
+    u = (np.asarray(run.tau[-1]) - BIAS) / RHO
+    bare = ij.simulate(SLOW, duration=DURATION, dt=1e-3)
+    assert np.all(np.abs(run.disturbance_estimate[-1] - bare.disturbance_estimate[-1]) > 1e-2)
+    expected = LOOP.evaluate(DURATION, x)[1]
+    np.testing.assert_allclose(u, expected["tau"], atol=1e-5)
+    np.testing.assert_allclose(run.disturbance_estimate[-1], expected["f_hat"], atol=1e-5)
+
+
+def test_dead_zone_and_play_against_scipy():
+    parts = ij.actuators.DeadZone(LOWER, UPPER, SLOPE), ij.actuators.Backlash(GAP, BANDWIDTH)
+    run = ij.simulate(with_actuator(*parts), duration=DURATION, dt=2e-5, record_every=5000)
+
+    def rate(t, x):
+        dx, u = moved(t, x[:6], lambda _: x[6:])
+        v = SLOPE * beyond(u, LOWER, UPPER)
+        return np.concatenate([dx, BANDWIDTH * beyond(v - x[6:], -GAP / 2, GAP / 2)])
+
+    balance = LOOP.arm(np.array(LOOP.q0))[2]
+    x0 = np.concatenate([LOOP.q0, LOOP.dq0, np.zeros(2), balance])
+    # The kinks of the right-hand side are resolved by short steps.
+    solution = solve_ivp(rate, (0.0, DURATION), x0, "DOP853", rtol=1e-11, atol=1e-12, max_step=5e-4)
+    np.testing.assert_allclose(end_of(run), solution.y[:4, -1], rtol=0, atol=1e-7)
+    held = np.abs(np.diff(solution.y[6:], axis=1)) == 0.0
+    assert np.any(held) and not np.all(held)
+
+
+def test_levels_in_a_sampled_loop_against_scipy():
+    step, period, samples = np.array([0.5, 0.2]), 5e-3, 20
+    law = ij.controllers.PDGravity(Kp=20.0, Kd=2.0)
+    scenario = ij.with_parts(
+        SLOW,
+        controller=law,
+        observer=ij.observers.NoObserver(),
+        sampling=ij.Sampling(period=period),
+        actuator=ij.actuators.Quantiser(step),
+    )
+    run = ij.simulate(scenario, duration=samples * period, dt=period / 10)
+    x = np.concatenate([LOOP.q0, LOOP.dq0, np.zeros(2)])
+    levels = []
+    for k in range(samples):
+        gravity = LOOP.arm(x[:2])[2]
+        desired, rate_desired, _ = sine(*LOOP.reference)(k * period)
+        u = gravity - 20.0 * (x[:2] - desired) - 2.0 * (x[2:4] - rate_desired)
+        tau = step * np.round(u / step)
+        levels.append(tau)
+        x = solve_ivp(
+            lambda t, x, tau=tau: moved(t, x, lambda _: tau)[0],
+            (k * period, (k + 1) * period),
+            x,
+            "DOP853",
+            rtol=1e-11,
+            atol=1e-13,
+        ).y[:, -1]
+    np.testing.assert_allclose(end_of(run), x[:4], rtol=0, atol=1e-7)
+    assert len(np.unique(np.round(levels, 9)[:, 0])) > 5
+
+
+# --- delay ----------------------------------------------------------------------------------------
+
+
+def delayed_end(delay: float, failing: float = np.inf) -> np.ndarray:
+    """(q, q') at the end of the loop with a delayed input, by the method of steps: DOP853 over one
+    delay after the other, whose command one delay ago comes from the dense output before."""
+    balance = LOOP.arm(np.array(LOOP.q0))[2]
+    x, before, begin = np.concatenate([LOOP.q0, LOOP.dq0, np.zeros(2)]), None, 0.0
+    while begin < DURATION - 1e-12:
+        end = min(begin + delay, DURATION)
+        middle = [failing] if begin < failing < end else []
+        pieces = []
+        for a, b in itertools.pairwise([begin, *middle, end]):
+
+            def rate(t, x, a=a, before=before):
+                u = balance if before is None else command(before, t - delay)
+                return moved(t, x, lambda _: faulty(u, a >= failing))[0]
+
+            solution = solve_ivp(
+                rate, (a, b), x, "DOP853", rtol=1e-12, atol=1e-14, dense_output=True
+            )
+            pieces.append((b, solution.sol))
+            x = solution.y[:, -1]
+        before, begin = pieces, end
+    return x[:4]
+
+
+def command(pieces, t):
+    """The command of a solution in pieces at time t."""
+    at = next((sol for b, sol in pieces if t <= b), pieces[-1][1])
+    return LOOP.evaluate(t, at(t))[1]["tau"]
+
+
+def test_delay_of_whole_steps_has_the_order_of_the_integrator():
+    expected = delayed_end(4e-3)
+
+    def error(dt, method):
+        scenario = with_actuator(ij.actuators.Delay(4e-3))
+        run = ij.simulate(scenario, duration=DURATION, dt=dt, method=method)
+        return np.max(np.abs(end_of(run) - expected))
+
+    coarse, fine = error(2e-3, "rk4"), error(1e-3, "rk4")
+    assert fine < 1e-7
+    assert 13.0 < coarse / fine < 20.0
+    assert error(1e-3, "heun") < 1e-4
+
+
+@pytest.mark.release
+def test_delay_of_other_lengths_is_of_second_order():
+    errors = []
+    for steps in (4.3, 8.6):
+        scenario = with_actuator(ij.actuators.Delay(4.3e-3))
+        run = ij.simulate(scenario, duration=DURATION, dt=4.3e-3 / steps)
+        errors.append(np.max(np.abs(end_of(run) - delayed_end(4.3e-3))))
+    assert errors[0] < 3e-4
+    assert errors[0] / errors[1] > 3.0
+
+
+def test_delay_and_fault_against_scipy():
+    scenario = with_actuator(ij.actuators.Delay(4e-3), ij.actuators.Fault(RHO, BIAS, 0.05))
+    run = ij.simulate(scenario, duration=DURATION, dt=5e-4)
+    np.testing.assert_allclose(end_of(run), delayed_end(4e-3, 0.05), rtol=0, atol=1e-7)
+    before = np.asarray(run.t) < 4e-3 - 1e-9
+    np.testing.assert_array_equal(
+        run.tau[before], np.broadcast_to(run.tau[0], run.tau[before].shape)
+    )
+    np.testing.assert_allclose(run.tau[0], LOOP.arm(np.array(LOOP.q0))[2], atol=1e-14)
+
+
+@pytest.mark.parametrize("product", [0.9, 1.1])
+def test_growth_under_a_delay_is_that_of_the_characteristic_root(product):
+    """M v' = -Kd v(t - h) has v ~ exp(s t), s = W(-k h)/h with k = Kd/M; stable for k h < pi/2."""
+    delay, inertia = 0.02, 0.5
+    k = product * np.pi / 2 / delay
+    scenario = ij.Scenario(
+        plant=ij.robots.PlanarChain(mass=[1.0], length=1.0, centre=0.0, inertia=inertia, g=0.0),
+        reference=ij.references.Sinusoid(offset=[0.0], amplitude=0.0, frequency=1.0),
+        bounds=ij.Bounds(ij.bounds.Constant(-9.0), ij.bounds.Constant(9.0)),
+        controller=ij.controllers.PDGravity(Kp=1e-9, Kd=k * inertia),
+        initial=ij.Initial(q=[0.1], dq=[1.0]),
+        actuator=ij.actuators.Delay(delay),
+    )
+    run = ij.simulate(scenario, duration=1.0, dt=5e-4)
+    root = complex(lambertw(-k * delay) / delay)
+    # A mode exp(s t) at three equidistant times: c = 2 Re(z) b - |z|^2 a with z = exp(s lag dt).
+    lag, late = 8, np.asarray(run.dq[-800:, 0])
+    a, b, c = late[: -2 * lag], late[lag:-lag], late[2 * lag :]
+    coefficients = np.linalg.lstsq(np.stack([b, -a], axis=1), c, rcond=None)[0]
+    found = np.log(coefficients[1]) / (2 * lag * 5e-4)
+    np.testing.assert_allclose(found, root.real, rtol=1e-5, atol=1e-4)
+    assert (found < 0) == (product < 1.0)
+
+
+def test_derivative_by_the_delay_and_by_the_time_of_a_fault():
+    def end(values):
+        scenario = with_actuator(
+            ij.actuators.Delay(values[0], history=5), ij.actuators.Fault(RHO, BIAS, values[1])
+        )
+        return ij.simulate(scenario, duration=0.05, dt=1e-3).q[-1]
+
+    values = jnp.asarray([4e-3, 0.0203])
+    slopes = np.asarray(jax.jacfwd(end)(values))
+    ahead = end(values + jnp.asarray([0.0, 1e-5])) - end(values - jnp.asarray([0.0, 1e-5]))
+    np.testing.assert_allclose(slopes[:, 1], ahead / 2e-5, rtol=1e-5)
+
+    def end_of_fine(delay):
+        scenario = with_actuator(
+            ij.actuators.Delay(delay, history=43), ij.actuators.Fault(RHO, BIAS, values[1])
+        )
+        return np.asarray(ij.simulate(scenario, duration=0.05, dt=1e-4).q[-1])
+
+    by_delay = (end_of_fine(4.1e-3) - end_of_fine(3.9e-3)) / 2e-4
+    np.testing.assert_allclose(slopes[:, 0], by_delay, rtol=2e-2)
+
+
+# --- studies --------------------------------------------------------------------------------------
+
+
+def test_monte_carlo_over_delays_repeats_single_runs():
+    scenario = with_actuator(ij.actuators.Delay(3e-3, history=6))
+    options = {"duration": 0.05, "dt": 1e-3}
+    study = ij.monte_carlo(
+        scenario,
+        {"actuator.delay": ij.value(ij.uniform(2e-3, 6e-3))},
+        runs=6,
+        progress=False,
+        **options,
+    )
+    for i in (0, 5):
+        run = study.replay(i)
+        assert 2e-3 <= float(run.scenario.actuator.delay) <= 6e-3
+        np.testing.assert_allclose(study.metrics["rmse"][i], run.metrics["rmse"], rtol=1e-9)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        longer = ij.monte_carlo(
+            scenario,
+            {"actuator.delay": ij.value(ij.uniform(6.5e-3, 8e-3))},
+            runs=2,
+            progress=False,
+            **options,
+        )
+    assert np.all(np.asarray(longer.status) & int(Status.NOT_FINITE))
+
+
+def test_falsify_finds_a_loss_of_effectiveness_that_leaves_the_bounds():
+    scenario = with_actuator(ij.actuators.Fault(effectiveness=1.0, time=0.1))
+    attack = ij.falsify(
+        scenario,
+        {"actuator.effectiveness": ij.value(ij.uniform(0.0, 1.0))},
+        duration=0.5,
+        dt=2e-3,
+        starts=4,
+        iterations=3,
+        progress=False,
+    )
+    assert attack.margin < 0
+    assert np.min(attack.values["actuator.effectiveness"]) < 0.5
+
+
+# --- what is refused, and what is reported --------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: ij.actuators.DeadZone(lower=0.1, upper=0.2), "DeadZone.lower"),
+        (lambda: ij.actuators.Delay(0.01, history=0), "Delay.history"),
+        (
+            lambda: with_actuator(ij.actuators.Ideal(), ij.actuators.Delay(0.01)),
+            "a Delay as the first part only",
+        ),
+        (
+            lambda: ij.with_parts(
+                with_actuator(ij.actuators.Delay(0.01)), sampling=ij.Sampling(period=1e-3)
+            ),
+            "Sampling",
+        ),
+        (lambda: ij.vector_field(with_actuator(ij.actuators.Delay(0.01))), "past states"),
+        (
+            lambda: ij.simulate(with_actuator(ij.actuators.Delay(1e-3)), duration=0.1, dt=2e-3),
+            "at least one time step",
+        ),
+        (
+            lambda: ij.simulate(
+                with_actuator(ij.actuators.Delay(0.01)), duration=0.1, dt=1e-3, method="euler"
+            ),
+            "heun",
+        ),
+        (
+            lambda: jax.grad(
+                lambda h: (
+                    ij.simulate(with_actuator(ij.actuators.Delay(h)), duration=0.1, dt=1e-3)
+                    .q[-1]
+                    .sum()
+                )
+            )(0.01),
+            "Delay.history",
+        ),
+    ],
+)
+def test_refusals_name_the_field_and_the_remedy(call, words):
+    with pytest.raises(ValueError, match=words):
+        call()
+
+
+def test_certificate_of_a_delayed_run_claims_nothing(tmp_path):
+    scenario = with_actuator(ij.actuators.Delay(2e-3))
+    ij.save_scenario(scenario, tmp_path / "delayed.toml")
+    run = ij.simulate(ij.load_scenario(tmp_path / "delayed.toml"), duration=0.05, dt=1e-3)
+    assert int(run.scenario.actuator.history) == 2
+    certificate = ij.certify(scenario, run=run)
+    lines = {line.name: line for line in certificate.lines}
+    assert {line.verdict for line in certificate.lines} == {"not applicable"}
+    assert lines["V2, delayed less continuous"].value > 0
+
+
+@pytest.mark.parametrize(
+    "actuator",
+    [
+        ij.actuators.Fault(effectiveness=0.9, time=0.02),
+        ij.actuators.DeadZone(lower=-0.1, upper=0.1),
+    ],
+)
+def test_theorem_claims_nothing_about_a_torque_that_is_not_the_command(actuator):
+    reason = why_no_theorem(with_actuator(actuator))
+    assert type(actuator).__name__ in reason
+
+
+@pytest.mark.release
+def test_law_is_exported_without_the_delay_of_its_input(tmp_path):
+    for name, scenario in (("with", with_actuator(ij.actuators.Delay(2e-3))), ("without", SLOW)):
+        ij.export(scenario, tmp_path / name, period=1e-3)
+    sources = [p.name for p in sorted((tmp_path / "without").glob("*.c"))]
+    assert sources
+    for source in sources:
+        with_delay, without = (tmp_path / name / source for name in ("with", "without"))
+        assert with_delay.read_text() == without.read_text()
