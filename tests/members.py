@@ -264,6 +264,31 @@ LAWS = {
         k1=2.0, K2=[20.0, 15.0], filter=[0.02, 0.03], o=0.1, weight=[0.5, 2.0]
     ),
     "adaptive_rbf": controllers.AdaptiveRBF(k1=2.0, K2=[20.0, 15.0], o=0.1, nodes=8),
+    "adaptive_rbf_fuzzy": controllers.AdaptiveRBF(
+        k1=2.0,
+        K2=[20.0, 15.0],
+        nodes=8,
+        barrier=barriers.PrescribedPerformance(),
+        normalised=True,
+    ),
+    "adaptive_network": controllers.AdaptiveNetwork(
+        k1=2.0, K2=[20.0, 15.0], nodes=4, barrier=barriers.Mapping(), weight=[0.5, 2.0]
+    ),
+    "adaptive_parameters": controllers.AdaptiveParameters(
+        law=controllers.Backstepping(k1=2.0, K2=[20.0, 15.0], reading="corrected"),
+        parameters=("mass[0]", "payload"),
+        Gamma=[3.0, 2.0],
+        lower=-0.5,
+        upper=[4.0, 2.0],
+        sigma=0.1,
+    ),
+    "adaptive_parameters_levels": controllers.AdaptiveParameters(
+        law=controllers.BarrierBackstepping(k=(2.0, 20.0)),
+        parameters=("g",),
+        Gamma=3.0,
+        lower=5.0,
+        upper=15.0,
+    ),
     "surface_barrier": controllers.SurfaceBarrier(a=2.0, K=[4.0, 3.0], surface=SURFACE),
     "terminal_sliding_mode": controllers.TerminalSlidingMode(
         beta=[1.0, 2.0], K=[20.0, 15.0], layer=0.02

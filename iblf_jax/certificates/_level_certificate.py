@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from iblf_jax.certificates import law_claim_lines, level_lines, lines, settling
+from iblf_jax.certificates.claims import adaptive_law
 from iblf_jax.certificates.level_summary import (
     LEVELS,
     LevelSummary,
@@ -32,7 +33,10 @@ def heading_of(scenario: Scenario) -> str:
     law = unwrapped(scenario.controller)
     barrier, reading = optional_member(law, "barrier"), optional_member(law, "reading")
     barriers = optional_member(law, "barriers")
+    adaptive = adaptive_law(scenario)
     parts = [type(law).__name__]
+    if adaptive is not None:
+        parts.insert(0, f"{type(adaptive).__name__} of {len(adaptive.parameters)}")
     if barrier is not None:
         parts.append(f"barrier {type(barrier).__name__}")
     if barriers:

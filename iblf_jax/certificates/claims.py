@@ -50,10 +50,16 @@ import numpy as np
 
 from iblf_jax.certificates.optional import optional_member
 from iblf_jax.control.actuators import Ideal
-from iblf_jax.control.controllers import Backstepping, FullState, LyapunovLaw, Saturated
+from iblf_jax.control.controllers import (
+    AdaptiveParameters,
+    Backstepping,
+    FullState,
+    LyapunovLaw,
+    Saturated,
+)
 from iblf_jax.control.observers import Momentum, Printed
 from iblf_jax.core import checks
-from iblf_jax.core.pytree import unwrapped
+from iblf_jax.core.pytree import layers, unwrapped
 from iblf_jax.simulation.scenario import Scenario
 
 CASES = (1, 2)
@@ -141,6 +147,8 @@ def why_no_theorem(scenario: Scenario) -> str:
     if not isinstance(law, Backstepping | FullState):
         about = f"Theorem 2 is about the backstepping law (3.14); {type(law).__name__}"
         return f"{about} has no claim of this kind{_why_no_own_claim(scenario)}"
+    if adaptive_law(scenario) is not None:
+        return "Theorem 2 is about a constant model, and AdaptiveParameters changes it"
     rates = [(law.barrier, decay_rate(law))]
     if isinstance(law, FullState):
         rates.append((law.velocity_barrier, decay_phi(law)))
@@ -155,6 +163,14 @@ def why_no_theorem(scenario: Scenario) -> str:
         about = "Theorem 2 is about a torque that acts as it is commanded"
         return f"{about}; {actuator} has no claim of this kind"
     return ""
+
+
+def adaptive_law(scenario: Scenario) -> AdaptiveParameters | None:
+    """The law that changes the parameters of the model, or None."""
+    for law in layers(scenario.controller):
+        if isinstance(law, AdaptiveParameters):
+            return law
+    return None
 
 
 def decay_rate(law: Backstepping | FullState, gain: Any = None) -> jax.Array | None:

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from iblf_jax.certificates.claims import own_claim
+from iblf_jax.certificates.claims import adaptive_law, own_claim
 from iblf_jax.certificates.lines import join_notes
 from iblf_jax.certificates.optional import optional_member
 from iblf_jax.certificates.proof_terms import DECAY_ROUNDING
@@ -141,6 +141,8 @@ def why_no_level_claim(scenario: Scenario) -> str:
     if not isinstance(law, BarrierBackstepping):
         about = f"(S.3) is about BarrierBackstepping; {type(law).__name__} has no claim of this"
         return f"{about} kind"
+    if adaptive_law(scenario) is not None:
+        return "(S.3) is about a constant model, and AdaptiveParameters changes it"
     for i, (barrier, k) in enumerate(zip(law.barriers, law.k, strict=True)):
         if optional_member(barrier, "decay_rate")(k) is None:
             kind = type(barrier).__name__

@@ -39,7 +39,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from iblf_jax.certificates.auxiliary import covers_limit, inner_context, inner_state
-from iblf_jax.certificates.claims import own_claim
+from iblf_jax.certificates.claims import adaptive_law, own_claim
 from iblf_jax.certificates.optional import optional_member
 from iblf_jax.certificates.proof_terms import TORQUE_ROUNDING, OwnTerms
 from iblf_jax.control.controllers import BarrierBackstepping
@@ -235,7 +235,7 @@ def _input_was_limited(
     """Whether a wrapper around the law changed its input, () bool.  A smooth limit changes it
     before the limit is reached, which the status flags do not show.
     """
-    law: Any = unwrapped(scenario.controller)
+    law: Any = adaptive_law(scenario) or unwrapped(scenario.controller)
     if law is scenario.controller:
         return jnp.zeros((), bool)
     own_state = inner_state(scenario, at.law_state)
@@ -405,7 +405,8 @@ def _own_terms(
     d_tilde in the place of f_tilde.
     """
     law: Any = own_claim(scenario)
-    context, uses_observer = scenario.context, optional_member(law, "uses_observer")
+    context = scenario.context._replace(plant=scenario.plant)
+    uses_observer = optional_member(law, "uses_observer")
 
     def disturbances(t, state):
         state_rate, sample = evaluate(scenario, t, state)

@@ -41,7 +41,7 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.certificates.auxiliary import covers_limit, inner_state
-from iblf_jax.certificates.claims import decay_phi, decay_rate, own_claim
+from iblf_jax.certificates.claims import adaptive_law, decay_phi, decay_rate, own_claim
 from iblf_jax.certificates.optional import optional_member
 from iblf_jax.control.controllers import Backstepping, FullState
 from iblf_jax.control.controllers._base import decay_of
@@ -296,7 +296,9 @@ def _dropped_terms(scenario: Scenario, dM0, dq, e2, f_tilde) -> tuple[jax.Array,
 def _torque_was_limited(scenario: Scenario, t: jax.Array, state: LoopState, now) -> jax.Array:
     """Whether a wrapper around the law of Theorem 2 changed its torque, () bool."""
     law = unwrapped(scenario.controller)
-    if law is scenario.controller or not isinstance(law, Backstepping | FullState):
+    is_law_of_theorem = isinstance(law, Backstepping | FullState)
+    adapts = adaptive_law(scenario) is not None
+    if law is scenario.controller or not is_law_of_theorem or adapts:
         return jnp.zeros((), bool)
     return _differs_from_command(scenario, law, t, state, now, ())
 
@@ -456,7 +458,7 @@ def _own_terms(
       now, rates: the `_signals` and their rates.
     """
     law: Any = own_claim(scenario)
-    context, q, dq = scenario.context, state.q, state.dq
+    context, q, dq = scenario.context._replace(plant=scenario.plant), state.q, state.dq
     own_state = inner_state(scenario, state.controller)
     own_rate = inner_state(scenario, state_rate.controller)
     df = rates["disturbance"]

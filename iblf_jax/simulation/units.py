@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from iblf_jax.control.controllers._base import law_member
+from iblf_jax.core.pytree import layers
 from iblf_jax.core.status import WORDS, WORDS_OF_LEVELS, Status
 from iblf_jax.core.units import ROBOT, Unit, as_text, of_component, resolved
 from iblf_jax.simulation.scenario import Scenario
@@ -18,7 +20,10 @@ def symbols_of(scenario: Any) -> Mapping[str, Unit]:
     """
     if not isinstance(scenario, Scenario):
         return ROBOT
-    return plants.unit_symbols(scenario.plant, scenario.model)
+    found = dict(plants.unit_symbols(scenario.plant, scenario.model))
+    for law in layers(scenario.controller):
+        found |= law_member(law, "unit_symbols")(scenario.model)
+    return found
 
 
 def unit_text(scenario: Scenario, unit: Unit, component: int | None = None) -> str:

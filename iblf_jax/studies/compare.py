@@ -34,7 +34,7 @@ from iblf_jax.control.controllers.systems import observer_of
 from iblf_jax.control.observers import NoObserver
 from iblf_jax.core import checks, notices
 from iblf_jax.core.optional import attributes
-from iblf_jax.core.pytree import field_values, unwrapped
+from iblf_jax.core.pytree import field_values, layers, unwrapped
 from iblf_jax.core.status import Status
 from iblf_jax.core.units import INPUT
 from iblf_jax.engine import Outcome, RunRequest, run_batch
@@ -172,7 +172,7 @@ def _with_law(scenario: Scenario, law: str | Controller) -> Scenario:
     else:
         controller = law
         observer = scenario.observer
-        if not law_member(unwrapped(law), "uses_observer"):
+        if not all(law_member(part, "uses_observer") for part in layers(law)):
             observer = NoObserver()
     model = _model_for(controller, scenario)
     return dataclasses.replace(scenario, controller=controller, observer=observer, model=model)

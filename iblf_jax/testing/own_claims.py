@@ -11,6 +11,8 @@ import numpy as np
 from iblf_jax.certificates.claims import OWN_CLAIM_METHODS
 from iblf_jax.control.controllers._base import law_member
 from iblf_jax.core.optional import attributes, has_members
+from iblf_jax.core.pytree import unwrapped
+from iblf_jax.simulation.levels import estimate_shape, law_state, start_levels
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.testing._contract import Findings, check_function, in_both_types, shape_of
 
@@ -36,19 +38,23 @@ def check_claims(findings: Findings, scenario: Scenario) -> None:
     in_both_types(findings, _shapes, scenario)
     t, q, dq, f_tilde = _near_the_reference(scenario, np.random.default_rng(5))
     context = scenario.context
+    f_tilde = jnp.broadcast_to(f_tilde, estimate_shape(scenario))
 
-    def outputs(law, t, q, dq, f_tilde, context):
-        own = law.init(q, dq, context)
+    def outputs(law, t, measured, f_tilde, context):
+        own = law.init(*measured, context)
         return {
-            name: method(t, q, dq, f_tilde, context, own)
+            name: method(t, *measured, f_tilde, context, own)
             for name, method in attributes(law, OWN_CLAIM_METHODS).items()
         }
 
-    check_function(findings, outputs, law, (t, q[0], dq[0], f_tilde, context))
+    *_, higher = start_levels(scenario)
+    first = law_state(scenario, q[0], dq[0], higher)
+    check_function(findings, outputs, law, (t, first, f_tilde, context))
 
     @jax.jit
     def sums(q, dq):
-        found = outputs(law, t, q, dq, jnp.zeros_like(q), context)
+        measured = law_state(scenario, q, dq, higher)
+        found = outputs(law, t, measured, jnp.zeros_like(f_tilde), context)
         return jax.tree.map(jnp.sum, found)
 
     for name, values in jax.vmap(sums)(q, dq).items():
@@ -72,17 +78,21 @@ def _near_the_reference(
 
 def _shapes(findings: Findings, scenario: Scenario) -> None:
     law: Any = scenario.controller
-    context, q, dq = scenario.context, scenario.initial.q, scenario.initial.dq
-    t, zero = jnp.zeros((), q.dtype), jnp.zeros_like(q)
-    own = law.init(q, dq, context)
-    arguments: tuple[Any, ...] = (t, q, dq, zero, context, own)
+    context, q = scenario.context, scenario.initial.q
+    measured = law_state(scenario, *start_levels(scenario))
+    t, zero = jnp.zeros((), q.dtype), jnp.zeros(estimate_shape(scenario), q.dtype)
+    own = law.init(*measured, context)
+    arguments: tuple[Any, ...] = (t, *measured, zero, context, own)
+    names = "q, dq, f_tilde"
+    if law_member(unwrapped(law), "receives_x"):
+        names = "x, d_tilde"
     for name, method in attributes(law, OWN_CLAIM_METHODS).items():
-        label = f"{name}(t, q, dq, f_tilde, context, state)"
+        label = f"{name}(t, {names}, context, state)"
         _is_summable(findings, label, shape_of(findings, label, method, *arguments), q)
     disturbance_terms = law_member(law, "disturbance_terms")
     if disturbance_terms is not None:
-        label = "disturbance_terms(t, q, dq, f_tilde, df, context, state)"
-        arguments = (t, q, dq, zero, zero, context, own)
+        label = f"disturbance_terms(t, {names}, rate, context, state)"
+        arguments = (t, *measured, zero, zero, context, own)
         _is_summable(findings, label, shape_of(findings, label, disturbance_terms, *arguments), q)
 
 

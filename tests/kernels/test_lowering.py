@@ -52,6 +52,13 @@ SPECIAL = {
     "levels": lambda cls: cls((None, ij.disturbances.Step([3.0, 1.0], 0.0))),
     "with_motors": lambda cls: cls(PRESET.plant, inertia=[0.02, 0.01], damping=0.1),
     "barrier_backstepping": lambda cls: cls(k=(2.0, 20.0)),
+    "adaptive_parameters": lambda cls: cls(
+        ij.controllers.Backstepping(k1=2.0, K2=20.0, reading="corrected"),
+        parameters=("mass[1]", "payload"),
+        Gamma=2.0,
+        lower=-0.5,
+        upper=4.0,
+    ),
     "reference_governor": lambda cls: cls(ij.controllers.PDGravity(Kp=60.0, Kd=20.0)),
     "surface_barrier": lambda cls: cls(
         a=2.0,

@@ -7,6 +7,11 @@ from iblf_jax.control.controllers._base import Controller as Controller
 from iblf_jax.control.controllers._base import LawContext as LawContext
 from iblf_jax.control.controllers._base import LyapunovLaw as LyapunovLaw
 from iblf_jax.control.controllers._base import State as State
+from iblf_jax.control.controllers.adaptive_network import AdaptiveNetwork as AdaptiveNetwork
+from iblf_jax.control.controllers.adaptive_parameters import (
+    AdaptiveParameters as AdaptiveParameters,
+)
+from iblf_jax.control.controllers.adaptive_parameters import AdaptiveState as AdaptiveState
 from iblf_jax.control.controllers.adaptive_rbf import AdaptiveRBF as AdaptiveRBF
 from iblf_jax.control.controllers.backstepping import Backstepping as Backstepping
 from iblf_jax.control.controllers.barrier_backstepping import (
@@ -39,6 +44,8 @@ MEMBERS = {
     "full_state": FullState,
     "dynamic_surface": DynamicSurface,
     "adaptive_rbf": AdaptiveRBF,
+    "adaptive_network": AdaptiveNetwork,
+    "adaptive_parameters": AdaptiveParameters,
     "surface_barrier": SurfaceBarrier,
     "terminal_sliding_mode": TerminalSlidingMode,
     "computed_torque": ComputedTorque,
@@ -55,7 +62,10 @@ __all__ = [
     "KEEPERS",
     "LAWS",
     "MEMBERS",
+    "AdaptiveNetwork",
+    "AdaptiveParameters",
     "AdaptiveRBF",
+    "AdaptiveState",
     "Backstepping",
     "BarrierBackstepping",
     "Command",

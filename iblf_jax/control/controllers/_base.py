@@ -50,6 +50,9 @@ class LawContext(NamedTuple):
     shift: Shift | None = None
     """What a law that `takes_shift` adds to the virtual control of the last level, and to its
     rate."""
+    plant: Any = None
+    """The plant, for the methods of a `LyapunovLaw` whose V contains its true parameters; None
+    where a law commands, because it does not know them."""
 
     def shifted(self, alpha: jax.Array, rate: jax.Array) -> tuple[jax.Array, jax.Array]:
         """The virtual control of the last level and its rate, (n,) each, with the shift if there is
@@ -157,11 +160,16 @@ class Controller(Protocol):
     - `unit_factors`: the names of leaves that are factors only.  Which of their numbers are 1 may
       be compiled in (`engine.structural_constants`).
 
+    - `energy`, `energy_decay`: methods of a law with an `input_slope`, which `AdaptiveParameters`
+      uses.  They return the law's Lyapunov function without a term of the estimate, (), and how
+      fast it decays, (), where the plant equals the model and there is no disturbance; arguments
+      (t, q, dq, context), or (t, x, context).
+
     It may have these methods: `completed(context, x)` returns the law with values that depend on
     the model and on the start x, (r, n), where none were given; `advice()` returns a list of
     warnings; `check_start(context)` raises ValueError for fields that do not fit together, once the
     number of joints is known; `leaf_units()` returns the units of leaves that depend on other
-    fields, by name.
+    fields, by name; `unit_symbols(model)` returns the units of symbols in the units of its leaves.
 
     A law whose command is discontinuous, such as a sliding-mode law or `FullState` with some
     barriers, has `switching(t, q, dq, context, state)`.  It returns (m,) functions of q or q', and
@@ -204,12 +212,16 @@ law_member = OptionalMembers(
     filters=False,
     takes_shift=False,
     has_auxiliary=False,
+    filter=None,
+    unit_symbols=lambda model: {},
     receives_x=False,
     input_unit=None,
     completed=None,
     advice=list,
     check_start=lambda context: None,
     switching=lambda t, q, dq, context, state: None,
+    energy=None,
+    energy_decay=None,
     disturbance_terms=None,
     barrier=None,
     barriers=(),

@@ -158,6 +158,22 @@ class Backstepping:
         command = barrier_command(self, tube, q, alpha, tau)
         return command._replace(input_slope=dq - alpha), ()
 
+    def energy(self, t: jax.Array, q: jax.Array, dq: jax.Array, context: LawContext) -> jax.Array:
+        """V1 + 1/2 e2^T M0 e2, () [N m rad]."""
+        e2 = dq - virtual_velocity(self, t, q, context)
+        V1 = self.weight * self.barrier.value(context.tube(t), q)
+        return jnp.sum(V1) + 0.5 * inner(e2, matvec(context.model.mass_matrix(q), e2))
+
+    def energy_decay(
+        self, t: jax.Array, q: jax.Array, dq: jax.Array, context: LawContext
+    ) -> jax.Array:
+        """The decay of V1, which is 0 for a barrier that states none, + e2^T K2 e2, ()
+        [N m rad/s], of the corrected reading.
+        """
+        e2 = dq - virtual_velocity(self, t, q, context)
+        V1 = self.weight * self.barrier.value(context.tube(t), q)
+        return jnp.sum(stated_decay(self.barrier, self.k1, V1)) + inner(e2, self.K2 * e2)
+
 
 def barrier_command(law, tube: Tube, q: jax.Array, alpha: jax.Array, tau: jax.Array) -> Command:
     """The command of a law with `barrier` and `weight` that cuts no torque: V1 is w times the
@@ -166,6 +182,14 @@ def barrier_command(law, tube: Tube, q: jax.Array, alpha: jax.Array, tau: jax.Ar
     guard_active = guard_is_active(tube, q, law.barrier.guard)
     V1 = law.weight * law.barrier.value(tube, q)
     return Command(tau, alpha, V1, guard_active, jnp.zeros_like(guard_active))
+
+
+def stated_decay(barrier: Barrier, gain: jax.Array, V: jax.Array) -> jax.Array:
+    """The decay of V, (n,), that a barrier states for a gain; 0 for one that states none."""
+    rate = barrier_member(barrier, "decay_rate")(gain)
+    if rate is None:
+        return jnp.zeros_like(V)
+    return rate * V  # type: ignore[no-any-return]
 
 
 def check_barrier(law, field: str, barrier: Any, example: str = "Integral") -> None:

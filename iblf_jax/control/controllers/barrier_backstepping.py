@@ -55,7 +55,12 @@ from iblf_jax.control.barriers._base import (
 )
 from iblf_jax.control.controllers._base import Command, LawContext, decay_of
 from iblf_jax.control.controllers._levels import Design, Level, exact_levels, surface_levels
-from iblf_jax.control.controllers.backstepping import check_barrier, fit_decays, fit_o
+from iblf_jax.control.controllers.backstepping import (
+    check_barrier,
+    fit_decays,
+    fit_o,
+    stated_decay,
+)
 from iblf_jax.control.decays import Decay
 from iblf_jax.control.decays._base import decay_member
 from iblf_jax.core import checks
@@ -359,6 +364,29 @@ class BarrierBackstepping:
         if self.filter is None:
             return exact_levels(self._designs, t, x, d_hat, context)
         return surface_levels(self._designs, self.filter, t, x, d_hat, context, state)
+
+    def energy(self, t: jax.Array, x: jax.Array, context: LawContext) -> jax.Array:
+        """Sum w_i V_i, (), of the law without filters."""
+        _, tubes = self.levels(t, x, jnp.zeros_like(x), context, ())
+        return jnp.sum(self._weighted_values(x, tubes))
+
+    def energy_decay(self, t: jax.Array, x: jax.Array, context: LawContext) -> jax.Array:
+        """Sum w_i decay_i + c_i w_i |s_i|^2, (), of the law without filters; the decay of a barrier
+        that states none is 0.
+        """
+        levels, tubes = self.levels(t, x, jnp.zeros_like(x), context, ())
+        values = self._weighted_values(x, tubes)
+        total = jnp.zeros_like(t)
+        for i, level in enumerate(levels):
+            decay = stated_decay(self.barriers[i], self.k[i], values[i])
+            total += jnp.sum(decay + self.c[i] * level.slope**2 / self.weights[i])
+        return total
+
+    def _weighted_values(self, x: jax.Array, tubes: list[Tube]) -> jax.Array:
+        """w_i V_i, (r, n)."""
+        pairs = zip(self.barriers, tubes, strict=True)
+        values = [barrier.value(tube, x[i]) for i, (barrier, tube) in enumerate(pairs)]
+        return jnp.stack([w * value for w, value in zip(self.weights, values, strict=True)])
 
     def switching(
         self, t: jax.Array, x: jax.Array, d_hat: jax.Array, context: LawContext, state: Any

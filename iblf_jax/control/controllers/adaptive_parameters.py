@@ -1,0 +1,467 @@
+"""Parameters of the model that adapt while the law runs.
+
+The law uses estimates theta_hat of some parameters of its model, such as masses, in the place of
+the model's values.  Where the torque is affine in them, tau(theta_hat) = tau(theta) + Y theta_tilde
+with theta_tilde = theta_hat - theta and the regressor Y = dtau/dtheta, which automatic
+differentiation gives.  With V of the wrapped law for the true parameters theta and its derivative
+along the input, s = dV/dx_r G_r (e2 for a robot),
+
+    V_a = V + 1/2 theta_tilde^T Gamma^-1 theta_tilde,                                        (A.1)
+    V_a' = -W + s . (Y theta_tilde + d) + theta_tilde^T Gamma^-1 theta_hat',
+
+where W is the decay of V and d is what the model with the true parameters does not explain.  The
+law of adaptation is the negative gradient of s . tau, a leak, and a projection P,
+
+    theta_hat' = P(-Gamma (Y^T s + sigma (theta_hat - theta_0))),   theta_hat(0) = theta_0,  (A.2)
+
+with theta_0 the values of the model.  Y theta_tilde cancels, and
+
+    V_a' <= -W - sigma/2 |theta_tilde|^2 + s . d + sigma/2 |theta - theta_0|^2.              (A.3)
+
+For d = 0 and sigma = 0, V_a does not grow and e1, e2 tend to 0; theta_hat tends to theta only if
+the motion makes the parameters identifiable.  With sigma > 0 everything is ultimately bounded.
+
+**Projection.**  P scales the rate of an estimate down to 0 within `band` of the bound that it moves
+to, so that lower <= theta_hat <= upper and the rate is continuous.  It does not increase V_a where
+lower + band <= theta <= upper - band.
+
+**Which laws.**  In the robot's equation M e2' is what the torque changes, so that the inertia need
+not be inverted: `Backstepping` in the corrected reading adapts all parameters in which M, C and G
+are linear.  `BarrierBackstepping` inverts the gain G_r.  It adapts parameters of the last level,
+f_r, on plants of any order, and refuses those of G_r and of the levels below, whose estimates the
+virtual controls would have to differentiate.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax.control.controllers._base import (
+    Command,
+    Controller,
+    LawContext,
+    law_member,
+    wrapped_advice,
+    wrapped_switching,
+)
+from iblf_jax.core import checks
+from iblf_jax.core.component_paths import member_of, replaced, resolve
+from iblf_jax.core.linalg import inner, matvec, solve_spd
+from iblf_jax.core.pytree import Leaf, component, leaf, static
+from iblf_jax.core.time import as_at
+from iblf_jax.core.units import PlantUnit, of_entry
+from iblf_jax.world import plants
+
+SHARE_OF_BAND = 0.05
+"""Width of the projection's band in that of the box, if none is given."""
+POINTS = 8
+"""Number of states at which `check_start` examines the dependence on the parameters."""
+THETA = "theta"
+"""Symbol of the units of the parameters, one for each."""
+BOUNDS = ("lower", "upper", "band")
+
+
+class AdaptiveState(NamedTuple):
+    """State of `AdaptiveParameters`."""
+
+    theta: jax.Array
+    """theta_hat, (p,)."""
+    law: Any
+    """State of the wrapped law."""
+
+
+@component
+class AdaptiveParameters:
+    """theta_hat' = P(-Gamma (Y^T s + sigma (theta_hat - theta_0))),   Y = dtau/dtheta,   s = e2 for
+    a robot.
+
+    The wrapped law commands with theta_hat in the model; symbols at the head of this module.  The
+    estimate of an observer is not used.  Paths reach through: "controller.K2" is the wrapped law's
+    K2.  The state is an `AdaptiveState`: `run.controller_state.theta` has theta_hat of a run.
+
+    In units, theta stands for that of the parameter, and N m rad for that of V.
+
+    Args:
+      law: the law whose model adapts: `Backstepping` with reading="corrected", or
+        `BarrierBackstepping` without filters.
+      parameters: paths of p numbers of the model, without "model.": ("mass[0]", "payload").
+      Gamma: rate of adaptation of each parameter, () or (p,) [theta^2/(N m rad)], > 0.
+      lower: lower bound of each estimate, () or (p,) [theta].
+      upper: upper bound of each estimate, () or (p,) [theta].
+      sigma: leak towards the model's values, () or (p,) [N m rad/(theta^2 s)], >= 0; 0 if not
+        given.
+      band: distance from a bound within which the projection acts, () or (p,) [theta], > 0; a
+        twentieth of the box if not given.
+
+    Source: J. J. E. Slotine, W. Li, Int. J. Robotics Research 6 (1987) 49-59 (regressor);
+      P. A. Ioannou, J. Sun, Robust Adaptive Control, 1996, sections 4.4 and 8.5 (projection, leak);
+      with barriers as derived at the head of this module.
+    """
+
+    law: Controller
+    parameters: tuple[str, ...] = static()
+    Gamma: Leaf = leaf(
+        PlantUnit("theta^2/(N m rad)", "theta^2/energy"), sign="positive", shape="any"
+    )
+    lower: Leaf = leaf(PlantUnit(THETA, THETA), shape="any")
+    upper: Leaf = leaf(PlantUnit(THETA, THETA), shape="any")
+    sigma: Leaf = leaf(
+        PlantUnit("N m rad/(theta^2 s)", "energy/(theta^2 s)"),
+        sign="nonnegative",
+        shape="any",
+        default=0.0,
+    )
+    band: Leaf = leaf(PlantUnit(THETA, THETA), sign="positive", shape="any", default=None)
+    wraps: ClassVar[str] = "law"
+    uses_observer: ClassVar[bool] = False
+    advice = wrapped_advice
+
+    def check(self) -> None:
+        """Raises ValueError for a law that states no slope, or numbers that do not fit the
+        parameters; completes `band` and repeats single numbers.
+        """
+        checks.conforms("AdaptiveParameters.law", self.law, Controller, LAWS)
+        self._check_law()
+        names = self.parameters
+        if not names or not all(isinstance(name, str) for name in names):
+            expected = 'a tuple of paths, such as ("mass[0]", "payload")'
+            raise checks.fail("AdaptiveParameters.parameters", names, expected)
+        if len(set(names)) < len(names):
+            raise checks.fail("AdaptiveParameters.parameters", names, "different paths")
+        for name in ("Gamma", "lower", "upper", "sigma"):
+            self._repeat(name)
+        if self.band is None:
+            object.__setattr__(self, "band", SHARE_OF_BAND * (self.upper - self.lower))
+        self._repeat("band")
+        if not checks.is_concrete((self.lower, self.upper, self.band)):
+            return
+        width = np.asarray(self.upper - self.lower)
+        if not np.all(width > 0):
+            expected = f"more than lower = {self.lower}"
+            raise checks.fail("AdaptiveParameters.upper", self.upper, expected)
+        if not np.all(2.0 * np.asarray(self.band) < width):
+            expected = "less than half of upper - lower"
+            raise checks.fail("AdaptiveParameters.band", self.band, expected)
+
+    def _check_law(self) -> None:
+        """Raises ValueError for a law whose Lyapunov function does not contain the torque's error
+        as `input_slope` states.
+        """
+        law: Any = self.law
+        field = "AdaptiveParameters.law"
+        if law_member(law, "energy") is None or law_member(law, "energy_decay") is None:
+            raise checks.fail(field, type(law).__name__, "a law with an `energy`", LAWS)
+        if law_member(law, "reading") == "printed":
+            remedy = "With C0 q' the term 1/2 e2^T M0' e2 remains. Take reading=\"corrected\"."
+            raise checks.fail(f"{field}.reading", "printed", "corrected", remedy)
+        if law_member(law, "filter") is not None:
+            expected = "exact derivatives"
+            remedy = "The lag of filters leaves a term in V'. Leave `filter` out."
+            raise checks.fail(f"{field}.filter", law.filter, expected, remedy)
+
+    def _repeat(self, name: str) -> None:
+        """Repeats a single number for all parameters; ValueError for another number of them."""
+        value, count = vars(self)[name], len(self.parameters)
+        if jnp.shape(value) not in ((), (count,)):
+            expected = f"one number, or {count}, one for each parameter"
+            raise checks.fail(f"AdaptiveParameters.{name}", value, expected)
+        object.__setattr__(self, name, jnp.broadcast_to(value, (count,)))
+
+    def unit_symbols(self, model: Any) -> dict[str, tuple[str, ...]]:
+        """The units of the parameters, one for each, as the symbol theta."""
+        units = []
+        for path in self.parameters:
+            try:
+                units.append(_unit_at(model, resolve(model, path)[0]))
+            except LookupError:
+                units.append("1")
+        return {THETA: tuple(units)}
+
+    # --- checks against a scenario ----------------------------------------------------------------
+
+    def check_start(self, context: LawContext) -> None:
+        """Raises ValueError for paths that lead to no number of the model, values outside the box,
+        or parameters for which (A.3) does not hold.
+        """
+        nominal = np.asarray(self._nominal(context.model))
+        for j, path in enumerate(self.parameters):
+            low, high = float(self.lower[j]), float(self.upper[j])
+            if not low <= nominal[j] <= high:
+                expected = f"between {low:g} and {high:g}, the box of AdaptiveParameters"
+                raise checks.fail(f"model.{path}", float(nominal[j]), expected)
+        self._check_dependence(context)
+
+    def _check_dependence(self, context: LawContext) -> None:
+        """Raises ValueError for a parameter in which the torque is not affine, or of which the
+        virtual controls or the slope of V depend, or that has no effect.
+        """
+        t, x = _points(context, self.Gamma.dtype)
+        torque, others = (np.asarray(part) for part in _dependence(self, context, t, x))
+        scale = np.sqrt(np.finfo(torque.dtype).eps)
+        for j, path in enumerate(self.parameters):
+            field = f"controller.parameters[{j}]"
+            rows = torque[..., j]
+            largest = np.nanmax(np.abs(rows))
+            if largest == 0.0:
+                expected = "a parameter that changes the torque of the law"
+                raise checks.fail(field, path, expected)
+            if np.nanmax(np.abs(others[..., j])) > 0.0:
+                expected = "a parameter of the last level that its gain does not contain"
+                remedy = (
+                    "Virtual controls and V contain this one. For a robot take Backstepping with"
+                    ' reading="corrected".'
+                )
+                raise checks.fail(field, path, expected, remedy)
+            if np.nanmax(np.abs(rows - rows[0])) > scale * largest:
+                expected = "a parameter in which the torque is affine"
+                remedy = "Masses and inertias are such, lengths are not."
+                raise checks.fail(field, path, expected, remedy)
+
+    def _nominal(self, model: Any) -> jax.Array:
+        """theta_0, (p,): the values of the model."""
+        return _values_at(model, self.parameters)
+
+    def _informed(self, context: LawContext, theta: jax.Array) -> LawContext:
+        """The context whose model has these parameters."""
+        model = context.model
+        for path, value in zip(self.parameters, theta, strict=True):
+            model = replaced(model, resolve(model, path)[0], value, path, None)
+        return context._replace(model=model)
+
+    # --- the law ----------------------------------------------------------------------------------
+
+    def init(self, *arguments: Any) -> AdaptiveState:
+        """theta_hat(0) = theta_0, and the state of the wrapped law; arguments as its `init`."""
+        theta = self._nominal(arguments[-1].model)
+        return AdaptiveState(theta, self.law.init(*arguments))
+
+    def command(self, t: jax.Array, *arguments: Any) -> tuple[Command, AdaptiveState]:
+        """The wrapped law's command with theta_hat in its model, and the rates of the states.
+        Arguments as those of the wrapped law; the estimate is not used.
+        """
+        *measured, estimate, context, state = arguments
+        command, law_rate, gradient = self._command_and_gradient(
+            t, measured, estimate, context, state
+        )
+        rate = self.projected(state.theta, self.unprojected(state.theta, gradient, context))
+        return command, AdaptiveState(rate, law_rate)
+
+    def _command_and_gradient(
+        self, t: jax.Array, measured: Any, estimate: jax.Array, context: LawContext, state: Any
+    ) -> tuple[Command, Any, jax.Array]:
+        """The wrapped law's command and the rate of its state with theta_hat, and Y^T s, (p,)."""
+        law: Any = self.law
+        zero = jnp.zeros_like(estimate)
+
+        def torque(theta):
+            informed = self._informed(context, theta)
+            command, rate = law.command(t, *measured, zero, informed, state.law)
+            return command.tau, (command, rate)
+
+        _, pull, (command, rate) = jax.vjp(torque, state.theta, has_aux=True)
+        return command, rate, pull(command.input_slope)[0]
+
+    def unprojected(self, theta: jax.Array, gradient: jax.Array, context: LawContext) -> jax.Array:
+        """-Gamma (Y^T s + sigma (theta_hat - theta_0)), (p,).
+
+        Args:
+          theta: theta_hat, (p,).
+          gradient: Y^T s, (p,).
+          context: its model has theta_0.
+        """
+        leak = self.sigma * (theta - self._nominal(context.model))
+        return -self.Gamma * (gradient + leak)
+
+    def projected(self, theta: jax.Array, rate: jax.Array) -> jax.Array:
+        """P(rate), (p,): 0 at the bound that an estimate moves to, unchanged at `band` from it."""
+        distance = jnp.where(rate > 0.0, self.upper - theta, theta - self.lower)
+        return rate * jnp.clip(distance / self.band, 0.0, 1.0)
+
+    def switching(self, t: jax.Array, *arguments: Any) -> jax.Array | None:
+        """The functions at whose zeros the wrapped law's command jumps; arguments as its
+        `switching`.
+        """
+        *measured, context, state = arguments
+        informed = self._informed(context, state.theta)
+        return wrapped_switching(self, t, *measured, informed, state.law)
+
+    # --- the claim (A.3) --------------------------------------------------------------------------
+
+    def lyapunov(self, t: jax.Array, *arguments: Any) -> jax.Array:
+        """V_a of (A.1), (), with the plant's parameters where the context has the plant, else the
+        model's; arguments as `LyapunovLaw.lyapunov`.
+        """
+        *measured, _, context, state = arguments
+        return self._value(t, measured, self._true(t, context), context, state)
+
+    def _value(
+        self, t: jax.Array, measured: Any, theta: jax.Array, context: LawContext, state: Any
+    ) -> jax.Array:
+        """V_a for parameters theta, ()."""
+        law: Any = self.law
+        energy = law.energy(t, *measured, self._informed(context, theta))
+        return energy + 0.5 * jnp.sum((state.theta - theta) ** 2 / self.Gamma)
+
+    def decay(self, t: jax.Array, *arguments: Any) -> jax.Array:
+        """W + sigma/2 |theta_tilde|^2 of (A.3), (); arguments as `lyapunov`."""
+        *measured, _, context, state = arguments
+        theta = self._true(t, context)
+        law: Any = self.law
+        decay = law.energy_decay(t, *measured, self._informed(context, theta))
+        return decay + 0.5 * jnp.sum(self.sigma * (state.theta - theta) ** 2)
+
+    def disturbance_terms(self, t: jax.Array, *arguments: Any) -> jax.Array:
+        """The other terms of (A.3), (): those of d and of the leak, what the projection adds for
+        parameters outside its inner box, and the effect of parameters that change with time.
+        Arguments as `LyapunovLaw.disturbance_terms`.
+        """
+        *measured, disturbance, _, context, state = arguments
+        theta = self._true(t, context)
+        error = state.theta - theta
+        command, _, gradient = self._command_and_gradient(t, measured, disturbance, context, state)
+        effect = self._effect_of_rest(t, measured, command, theta, disturbance, context)
+        leak = 0.5 * jnp.sum(self.sigma * (theta - self._nominal(context.model)) ** 2)
+        rate = self.unprojected(state.theta, gradient, context)
+        removed = self.projected(state.theta, rate) - rate
+        projection = jnp.sum(jnp.maximum(error * removed / self.Gamma, 0.0))
+
+        def value_at(now):
+            return self._value(t, measured, self._true(now, context), context, state)
+
+        change = jax.jvp(value_at, (t,), (jnp.ones_like(t),))[1]
+        return effect + leak + projection + change
+
+    def _effect_of_rest(
+        self,
+        t: jax.Array,
+        measured: Any,
+        command: Command,
+        theta: jax.Array,
+        disturbance: jax.Array,
+        context: LawContext,
+    ) -> jax.Array:
+        """dV/dx . d, (), with d the disturbance of the model with the parameters theta.
+
+        Args:
+          t, measured, context: as `command`.
+          command: of the law at this state.
+          theta: parameters, (p,).
+          disturbance: of the model itself, f (n,), or d (r, n).
+        """
+        true, law = self._informed(context, theta), self.law
+        if law_member(law, "receives_x"):
+            (x,) = measured
+            flow = plants.flow(plants.as_plant(context.model), t, x, command.tau)
+            true_flow = plants.flow(plants.as_plant(true.model), t, x, command.tau)
+            slopes = jax.grad(law.energy, argnums=1)(t, x, true)  # type: ignore[attr-defined]
+            return jnp.sum(slopes * (flow + disturbance - true_flow))
+        q, dq = measured
+        driving = command.tau + disturbance
+        ddq = _acceleration(context.model, q, dq, driving)
+        model = true.model
+        needed = matvec(model.mass_matrix(q), ddq) + model.coriolis(q, dq, dq) + model.gravity(q)
+        return inner(command.input_slope, needed - command.tau)
+
+    def _true(self, t: jax.Array, context: LawContext) -> jax.Array:
+        """Theta at time t, (p,): of the plant where the context has it and it has the parameters,
+        else of the model.
+        """
+        if context.plant is None:
+            return self._nominal(context.model)
+        try:
+            return _values_at(as_at(context.plant, t), self.parameters)
+        except ValueError:
+            return self._nominal(context.model)
+
+
+LAWS = (
+    'Such as iblf_jax.controllers.Backstepping(k1=..., K2=..., reading="corrected"). Limits of the'
+    " torque go around: Saturated(AdaptiveParameters(...))."
+)
+
+
+def _values_at(part: Any, names: tuple[str, ...]) -> jax.Array:
+    """The numbers at some paths, (p,); ValueError for a path that leads to no number."""
+    values = []
+    for path in names:
+        try:
+            _, value = resolve(part, path)
+        except LookupError:
+            expected = f"the path of a number of {type(part).__name__}"
+            raise checks.fail("controller.parameters", path, expected) from None
+        if jnp.ndim(value) != 0:
+            expected = f"the path of one number, such as {path}[0]"
+            raise checks.fail("controller.parameters", path, expected)
+        values.append(jnp.asarray(value))
+    return jnp.stack(values)
+
+
+def _unit_at(part: Any, tokens: list[str | int]) -> str:
+    """The unit that the field at a location declares."""
+    unit: Any = "1"
+    index: list[int] = []
+    for token in tokens:
+        if isinstance(token, str):
+            unit, index = type(part).__dataclass_fields__[token].metadata.get("unit", "1"), []
+        else:
+            index.append(token)
+        part = member_of(part, token)
+    if not isinstance(unit, tuple):
+        return str(unit)
+    return str(of_entry(unit, tuple(index), len(index)))
+
+
+def _acceleration(model: Any, q: jax.Array, dq: jax.Array, torque: jax.Array) -> jax.Array:
+    """q" of a robot under a torque, (n,) [rad/s^2]."""
+    rest = torque - model.coriolis(q, dq, dq) - model.gravity(q)
+    return solve_spd(model.mass_matrix(q), rest)
+
+
+# --- dependence on the parameters ---------------------------------------------------------------
+
+
+def _points(context: LawContext, dtype: Any) -> tuple[jax.Array, jax.Array]:
+    """Times (POINTS,) and states (POINTS, r, n) inside the bounds of the first level."""
+    rng = np.random.default_rng(0)
+    plant = plants.as_plant(context.model)
+    steady = plants.plant_member(plant, "steady_levels")
+    times = jnp.asarray(rng.uniform(0.0, 5.0, POINTS), dtype)
+    spread = jnp.asarray(rng.uniform(-0.5, 0.5, (POINTS, plant.order, plant.n)), dtype)
+    states = []
+    for t, (q, dq, *higher) in zip(times, spread, strict=True):
+        tube = context.tube(t)
+        q = tube.q_d + q * jnp.minimum(tube.k_l, tube.k_u)
+        dq = tube.dq_d + dq
+        if steady is not None and higher:
+            higher = [*(jnp.stack(higher) + steady(q, dq))]
+        states.append(jnp.stack([q, dq, *higher]))
+    return times, jnp.stack(states)
+
+
+@jax.jit
+def _dependence(
+    law: AdaptiveParameters, context: LawContext, t: jax.Array, x: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Derivatives by the parameters at both ends of their box and in its middle: of the torque, (3,
+    POINTS, n, p), and of virtual controls, V1 and the slope of V, (3, POINTS, m, p).
+    """
+    inner_law: Any = law.law
+
+    def outputs(theta, t, x):
+        informed = law._informed(context, theta)
+        measured, estimate = (x[0], x[1]), jnp.zeros_like(x[0])
+        if law_member(inner_law, "receives_x"):
+            measured, estimate = (x,), jnp.zeros_like(x)  # type: ignore[assignment]
+        state = inner_law.init(*measured, informed)
+        command, _ = inner_law.command(t, *measured, estimate, informed, state)
+        others = (command.alpha, command.V1, command.input_slope, command.alpha_higher)
+        return command.tau, jnp.concatenate([jnp.ravel(part) for part in jax.tree.leaves(others)])
+
+    derivatives = jax.vmap(jax.jacfwd(outputs), in_axes=(None, 0, 0))
+    middle = 0.5 * (law.lower + law.upper)
+    boxes = [derivatives(theta, t, x) for theta in (law.lower, middle, law.upper)]
+    return jax.tree.map(lambda *parts: jnp.stack(parts), *boxes)
