@@ -36,11 +36,15 @@ Leaf: TypeAlias = Any
 `jax.Array` from then on."""
 
 component_member = OptionalMembers(
-    wraps=None, rows=MappingProxyType({}), stacked=MappingProxyType({}), leaf_units=dict
+    wraps=None,
+    rows=MappingProxyType({}),
+    stacked=MappingProxyType({}),
+    leaf_units=dict,
+    own_joints=MappingProxyType({}),
 )
 """Reads what a component may declare: the field that holds a wrapped component, rows with names,
-names for several leaves as the rows of one array, and a function of the units of leaves that depend
-on other fields."""
+names for several leaves as the rows of one array, a function of the units of leaves that depend on
+other fields, and the number of joints of parts whose number differs from that of the scenario."""
 
 
 def leaf(

@@ -68,6 +68,10 @@ class Plant(Protocol):
     - `steady_input(q)`: the input that holds the plant at q.
     - `weights(x)`: the scale of each level's energy, (order, n); `BarrierBackstepping` weighs its
       barriers with it.
+    - `friction_torque(x)`: of a plant with several robots inside, the friction of their joints,
+      (n,) [N m], which belongs to the plant only and is passed to `level_rate` as its torque.
+    - `needs_filters`: whether the drift depends on a later level whose derivatives no law may form.
+      Such a plant is the model of a law with filters, and never the plant of a scenario.
     - `at(t)` and `jump_times()`: as `iblf_jax.robots.Robot`.
     """
 
@@ -111,6 +115,8 @@ plant_member = OptionalMembers(
     steady_levels=None,
     steady_input=None,
     weights=None,
+    friction_torque=None,
+    needs_filters=False,
 )
 """Reads optional members of a plant."""
 
