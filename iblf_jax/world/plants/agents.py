@@ -379,7 +379,8 @@ class NeighbourModel:
     def gain(self, t: jax.Array, x: jax.Array) -> jax.Array:
         """G, (order, n, n), block-diagonal."""
         m = self.stack.agents[0].n
-        blocks = jnp.kron(jnp.eye(len(self.stack.agents), dtype=x.dtype), jnp.ones((m, m)))
+        same = jnp.ones((m, m), x.dtype)
+        blocks = jnp.kron(jnp.eye(len(self.stack.agents), dtype=x.dtype), same)
         gain = self.stack.gain(t, x)
         return jnp.concatenate([(gain[0] * blocks)[None], gain[1:]])
 
