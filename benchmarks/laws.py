@@ -17,7 +17,8 @@ largest |e1| of both joints in the second half of a run, so that the start does 
 - `delay`: the longest delay of the torque of the list `DELAYS`, with this encoder at a period of
   1 ms, for which this and every shorter delay leaves the arm inside its bounds.
 
-"left" is a run that leaves the bounds or diverges, and "none" a law without a factor.  A new law is
+"left" is a run that leaves the bounds or diverges, and "own" a law that has no factor in [1/32, 32]
+at which its effort is that of the first law, and runs at its own gains.  A new law is
 one entry of `CHOICES`; `docs/choosing.py` makes the page.
 """
 
@@ -44,7 +45,7 @@ DELAYS = (1e-3, 2e-3, 4e-3, 8e-3, 16e-3, 32e-3)
 K2, COUNTS = 2.0, 65536
 """N m s/rad, a tenth of the paper's, so that periods of milliseconds are possible; counts of the
 encoder, as of a geared joint."""
-LEFT, NONE = "left", "none"
+LEFT, OWN = "left", "own"
 COLUMNS = [
     "law",
     "factor",
@@ -76,9 +77,7 @@ CHOICES = {
     "Backstepping(Log)": Choice("log"),
     "Backstepping(Tan)": Choice("tan"),
     "Backstepping(Mapping)": Choice(
-        controllers.Backstepping(
-            k1=2.0, K2=K2, barrier=barriers.Mapping(), reading="corrected"
-        )
+        controllers.Backstepping(k1=2.0, K2=K2, barrier=barriers.Mapping(), reading="corrected")
     ),
     "Backstepping, no bounds": Choice("backstepping"),
     "BarrierBackstepping(Mapping)": Choice(controllers.BarrierBackstepping(k=(2.0, 20.0))),
@@ -102,9 +101,10 @@ def row(name: str, duration: float = DURATION) -> list[Any]:
     base = ij.with_parts(base, **choice.parts)
     laws = {first: CHOICES[first].law, name: choice.law}
     compared = ij.compare(base, laws, duration=duration, dt=DT)
-    if name not in compared.equal_effort:
-        return [name, NONE, *[NONE] * (len(COLUMNS) - 2)]
-    run = compared.equal_effort[name]
+    run = compared.equal_effort.get(name, compared.rollouts[name])
+    factor: Any = OWN
+    if name in compared.equal_effort:
+        factor = float(compared.factors[name])
     one = run.scenario
     masses = []
     for factor in (0.7, 1.3):
@@ -117,7 +117,7 @@ def row(name: str, duration: float = DURATION) -> list[Any]:
     slow = ij.with_parameters(fast, {"sampling.period": 1e-2})
     return [
         name,
-        float(compared.factors[name]),
+        factor,
         _error(run),
         float(np.max(np.abs(run.tau))),
         _worst([_error(heavy) for heavy in masses]),

@@ -31,10 +31,10 @@ from iblf_jax.core import checks, notices
 from iblf_jax.core.disk_cache import keep_programs
 from iblf_jax.core.presentation import present
 from iblf_jax.core.pytree import (
-    component_member,
     Leaf,
     astype,
     component,
+    component_member,
     field_values,
     is_leaf_field,
     layers,

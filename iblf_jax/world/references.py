@@ -268,9 +268,7 @@ class Leader:
 
     def check(self) -> None:
         """Raises ValueError for something that is no reference, or no number of components."""
-        checks.conforms(
-            "Leader.motion", self.motion, Reference, "iblf_jax.references has them."
-        )
+        checks.conforms("Leader.motion", self.motion, Reference, "iblf_jax.references has them.")
         checks.positive_integer("Leader.components", self.components)
 
     @property

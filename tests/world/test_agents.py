@@ -105,9 +105,7 @@ def test_one_agent_that_measures_the_leader_is_the_single_plant(rng):
         "initial": ij.Initial(q=[0.25], dq=[0.1]),
     }
     alone = ij.vector_field(ij.Scenario(plant=single, reference=MOTION, **parts))
-    agent = ij.vector_field(
-        ij.Scenario(plant=stack, reference=stack.reference(MOTION), **parts)
-    )
+    agent = ij.vector_field(ij.Scenario(plant=stack, reference=stack.reference(MOTION), **parts))
     for t, x in zip(rng.uniform(0, 1, 5), rng.uniform(0.1, 0.3, (5, 2)), strict=True):
         np.testing.assert_allclose(agent(t, x), alone(t, x), rtol=1e-12, atol=1e-12)
 
@@ -240,9 +238,7 @@ REFUSED = {
         r"controller\.filter.*filter=0\.01",
     ),
     "as the plant": (
-        lambda: ij.simulate(
-            scenario(True, plant=STACK.neighbours()), duration=0.1, dt=1e-2
-        ),
+        lambda: ij.simulate(scenario(True, plant=STACK.neighbours()), duration=0.1, dt=1e-2),
         r"row 0 that depends on x\[1\]",
     ),
 }

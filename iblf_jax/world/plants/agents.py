@@ -120,13 +120,13 @@ class Agents:
         return tuple(tuple(row) for row in H.tolist())
 
     def relative_positions(self, positions: Any) -> jax.Array:
-        """y = (H kron I) p, (..., N m), of the agents' positions p, (..., N, m)."""
+        """Y = (H kron I) p, (..., N m), of the agents' positions p, (..., N, m)."""
         p = jnp.asarray(positions)
         rows = sparse.times(self.matrix, [p[..., i, :] for i in range(len(self.agents))])
         return jnp.concatenate(rows, axis=-1)
 
     def positions(self, relative: Any) -> jax.Array:
-        """p = (H kron I)^-1 y, (..., N, m), of the first level y, (..., N m), such as `run.q`."""
+        """P = (H kron I)^-1 y, (..., N, m), of the first level y, (..., N m), such as `run.q`."""
         return jnp.stack(self._positions(jnp.asarray(relative)), axis=-2)
 
     def reference(self, leader: Reference, offsets: Any = 0.0) -> Leader:
@@ -145,7 +145,7 @@ class Agents:
         return NeighbourModel(self)
 
     def _positions(self, y: jax.Array) -> list[jax.Array]:
-        """p of each agent, (..., m)."""
+        """P of each agent, (..., m)."""
         return sparse.solve(self.matrix, self._parts(y))
 
     def _parts(self, v: Any) -> list[Any]:
@@ -312,9 +312,9 @@ class NeighbourModel:
     The model of a distributed law: its motion is that of `Agents`, but only agent i's own velocity
     counts as the virtual input of y_i,
 
-        G_1 = diag(d_i + b_i) diag(G_1 of each agent),   f_1 = the neighbours' part,   d_i = sum_j a_ij,
+        G_1 = diag(d_i + b_i) diag(G_1 of each agent),   f_1 = the part of the neighbours,
 
-    so that agent i uses what it and its neighbours measure.  f_1 depends on the second level.  Its
+    d_i = sum_j a_ij, so that agent i uses what it and its neighbours measure.  f_1 depends on the second level.  Its
     derivative would contain the neighbours' inputs, which in turn contain that of agent i; the law
     therefore needs filters, `BarrierBackstepping(filter=...)`.  The filters' errors z_i obey
     (z/mu)' = -(1/mu) (D + diag(b))^-1 H (z/mu) + bounded terms.  The matrix is a nonsingular
