@@ -10,16 +10,16 @@ largest |e1| of both joints in the second half of a run, so that the start does 
 - `peak torque`: of the entire run.
 - `error, masses +-30 %`: the larger error of two plants whose masses are 0.7 and 1.3 times those of
   the model.
-- `error, 10 ms`: law and observer run once in 10 ms and read an encoder of 65536 counts, with
-  filtered differences as velocities.
+- `error, encoder and 10 ms`: law and observer run once in 10 ms and read an encoder of 65536
+  counts, with filtered differences as velocities.
 - `ripple`: the RMS difference of the torque with this encoder, at a period of 1 ms, from that of
   the continuous law.
 - `delay`: the longest delay of the torque of the list `DELAYS`, with this encoder at a period of
   1 ms, for which this and every shorter delay leaves the arm inside its bounds.
 
 "left" is a run that leaves the bounds or diverges, and "own" a law that has no factor in [1/32, 32]
-at which its effort is that of the first law, and runs at its own gains.  A new law is
-one entry of `CHOICES`; `docs/choosing.py` makes the page.
+at which its effort is that of the first law, and runs at its own gains.  A new law is one entry of
+`CHOICES`; `docs/choosing.py` makes the page.
 """
 
 from __future__ import annotations
@@ -107,9 +107,9 @@ def row(name: str, duration: float = DURATION) -> list[Any]:
         factor = float(compared.factors[name])
     one = run.scenario
     masses = []
-    for factor in (0.7, 1.3):
-        plant = ij.with_parts(one, plant=_heavier(one.plant, factor))
-        masses.append(_run(plant, duration))
+    for scale in (0.7, 1.3):
+        heavier = ij.with_parts(one, plant=_heavier(one.plant, scale))
+        masses.append(_run(heavier, duration))
     # One structure, and therefore one compiled program, for all periods and delays.
     encoder = sensors.Encoder(counts=COUNTS, velocity=sensors.FilteredDifference(cutoff=200.0))
     queue = round(DELAYS[-1] / DT) + 1
@@ -120,7 +120,7 @@ def row(name: str, duration: float = DURATION) -> list[Any]:
         factor,
         _error(run),
         float(np.max(np.abs(run.tau))),
-        _worst([_error(heavy) for heavy in masses]),
+        _worst([_error(changed) for changed in masses]),
         _error(_run(slow, duration)),
         _ripple(run, _run(fast, duration)),
         _longest_delay(fast, duration),

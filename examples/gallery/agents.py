@@ -10,7 +10,7 @@ pendulums = [
     ij.robots.PlanarChain(mass=[mass], length=[0.5], centre=[0.25], inertia=[0.02])
     for mass in masses
 ]
-leader = ij.references.Sinusoid(offset=0.5, amplitude=0.3, frequency=1.0)
+leader = ij.references.Sinusoid(offset=[0.5], amplitude=0.3, frequency=1.0)
 start = np.array([[0.65], [0.5], [0.6], [0.45]])
 tube = ij.Bounds(
     lower=bounds.Funnel(initial=-0.4, final=-0.05, rate=1.0),

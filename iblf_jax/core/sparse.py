@@ -76,8 +76,8 @@ def factorised(matrix: Rows) -> Factors:
 
 
 def _elimination_order(pattern: np.ndarray) -> list[int]:
-    """The order in which each eliminated row fills the fewest entries: those of the smallest product
-    of off-diagonal entries in row and column (H. M. Markowitz, Management Science 3 (1957) 255-269).
+    """The order in which each row fills few entries: that of the smallest product of off-diagonal
+    entries in row and column first (H. M. Markowitz, Management Science 3 (1957) 255-269).
     """
     filled = pattern | np.eye(len(pattern), dtype=bool)
     remaining = list(range(len(pattern)))

@@ -314,12 +314,12 @@ class NeighbourModel:
 
         G_1 = diag(d_i + b_i) diag(G_1 of each agent),   f_1 = the part of the neighbours,
 
-    d_i = sum_j a_ij, so that agent i uses what it and its neighbours measure.  f_1 depends on the second level.  Its
-    derivative would contain the neighbours' inputs, which in turn contain that of agent i; the law
-    therefore needs filters, `BarrierBackstepping(filter=...)`.  The filters' errors z_i obey
-    (z/mu)' = -(1/mu) (D + diag(b))^-1 H (z/mu) + bounded terms.  The matrix is a nonsingular
-    M-matrix, so that they decay for all mu_i > 0, and the errors are ultimately bounded by a
-    multiple of mu.
+    d_i = sum_j a_ij, so that agent i uses what it and its neighbours measure.  f_1 depends on the
+    second level.  Its derivative would contain the neighbours' inputs, which in turn contain that
+    of agent i; the law therefore needs filters, `BarrierBackstepping(filter=...)`.  The filters'
+    errors z_i obey (z/mu)' = -(1/mu) (D + diag(b))^-1 H (z/mu) + bounded terms.  The matrix is a
+    nonsingular M-matrix, so that they decay for all mu_i > 0, and the errors are ultimately bounded
+    by a multiple of mu.
 
     Args:
       stack: the agents with their graph.
