@@ -50,13 +50,13 @@ runs = {
 figure = plotting.positions(runs["chain"])
 
 # %% The figure has the positions relative to the neighbours and their tubes. The positions of the
-# pendulums follow from the graph, p = (H kron I)^-1 y. Before the load the law that knows the graph
-# has an error of at most 0.1 mrad left, and the distributed one an error of the order of its
+# pendulums follow from the graph, p = (H kron I)^-1 y. Before the load the law that knows the
+# graph has an error of at most 0.1 mrad left, and the distributed one an error of the order of its
 # filters, which grows along the chain. The load moves pendulum 2 alone where the reference is
-# shared. In the distributed law the pendulums behind it follow it, so that the group stays together,
-# and pendulum 1 is not moved. The law that knows the graph passes errors on in both directions, by
-# H^T, and moves all pendulums, by up to twice as much. A shared reference is the better choice where
-# every agent can know the leader, and the distributed law where it cannot.
+# shared. In the distributed law the pendulums behind it follow it, so that the group stays
+# together, and pendulum 1 is hardly moved. The law that knows the graph passes errors on in both
+# directions, by H^T, and moves all pendulums, by up to twice as much. A shared reference is the
+# better choice where every agent can know the leader, and the distributed law where it cannot.
 for name, run in runs.items():
     target = np.array([leader.position(t) for t in run.t])[:, None]
     error = 1e3 * np.abs(run.scenario.plant.positions(run.q) - target)[..., 0]
