@@ -51,7 +51,7 @@ PAGES: dict[str, tuple[str, str]] = {
     "testing": (
         "Checkers for user-written classes",
         (
-            "testing.check_law testing.check_barrier testing.check_observer"
+            "testing.check_law testing.check_barrier testing.check_decay testing.check_observer"
             " testing.check_sensor testing.check_actuator testing.check_robot"
             " testing.check_plant testing.check_reference testing.check_side"
             " testing.check_region testing.check_disturbance testing.check_fold"
@@ -63,6 +63,7 @@ PAGES: dict[str, tuple[str, str]] = {
 FAMILIES = (
     "controllers",
     "barriers",
+    "decays",
     "observers",
     "robots",
     "plants",

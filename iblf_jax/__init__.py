@@ -13,6 +13,7 @@ from iblf_jax import presets as presets
 from iblf_jax.control import actuators as actuators
 from iblf_jax.control import barriers as barriers
 from iblf_jax.control import controllers as controllers
+from iblf_jax.control import decays as decays
 from iblf_jax.control import observers as observers
 from iblf_jax.control import sensors as sensors
 from iblf_jax.core import linalg as linalg
@@ -68,7 +69,7 @@ _bound_programs()
 _finish_at_exit()
 
 _PUBLIC_MODULES = {
-    "control": ("actuators", "barriers", "controllers", "observers", "sensors"),
+    "control": ("actuators", "barriers", "controllers", "decays", "observers", "sensors"),
     "world": ("bounds", "disturbances", "plants", "references", "regions", "robots"),
 }
 """Folder -> its modules, which users import as `iblf_jax.NAME`."""

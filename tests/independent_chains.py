@@ -293,6 +293,8 @@ class Case:
     x0: tuple
     filter: tuple | None = None
     """mu_1 .. mu_{r-1} of the dynamic surface; None for exact derivatives."""
+    decays: tuple | None = None
+    """One a level, with which the gain of a level is k + gain(t, V); None for constant gains."""
 
 
 def model_rate(case, i, t, x, d_hat):
@@ -325,7 +327,11 @@ def tubes_of(x, alpha, dalpha, sides):
 def level(case, i, t, x, d_hat, tubes, below):
     """alpha_{i+1} and the terms of its barriers; `below` are those of the level below."""
     barrier = case.barriers[i]
-    terms = [barrier(tube, k) for tube, k in zip(tubes, case.k[i], strict=True)]
+    gains = case.k[i]
+    if case.decays is not None:
+        values = [barrier(tube, k).V for tube, k in zip(tubes, gains, strict=True)]
+        gains = [k + case.decays[i].gain(t, V) for k, V in zip(gains, values, strict=True)]
+    terms = [barrier(tube, k) for tube, k in zip(tubes, gains, strict=True)]
     wanted = [p.a - case.c[i] * p.s for p in terms]
     if below is not None:
         weighted = [w * p.s for w, p in zip(case.w[i - 1], below, strict=True)]

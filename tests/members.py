@@ -14,6 +14,7 @@ from iblf_jax import (
     barriers,
     bounds,
     controllers,
+    decays,
     disturbances,
     observers,
     plants,
@@ -149,6 +150,13 @@ BARRIERS = {
     "quadratic": barriers.Quadratic(),
 }
 
+DECAYS = {
+    "exponential": decays.Exponential(),
+    "finite_time": decays.FiniteTime(k_a=[2.0, 1.0], a=0.4, delta=[0.02, 0.01]),
+    "fixed_time": decays.FixedTime(k_a=2.0, k_b=[1.0, 0.5], a=[0.3, 0.5]),
+    "prescribed_time": decays.PrescribedTime(T=[0.9, 1.2], gain=3.0, cap=[30.0, 40.0]),
+}
+
 OBSERVERS = {
     "none": observers.NoObserver(),
     "printed": observers.Printed(kf=[20.0, 10.0]),
@@ -227,6 +235,13 @@ LAWS = {
     "barrier_backstepping_filtered": controllers.BarrierBackstepping(
         k=(2.0, 20.0), barriers=(barriers.Integral(),), filter=[0.02]
     ),
+    "backstepping_decays": controllers.Backstepping(
+        k1=2.0,
+        K2=[20.0, 15.0],
+        barrier=barriers.Mapping(),
+        reading="corrected",
+        decays=(DECAYS["finite_time"], decays.PrescribedTime(T=1.0)),
+    ),
     "full_state": controllers.FullState(k1=2.0, K2=[20.0, 15.0], c=1.0, o=0.1),
     "full_state_mixed": controllers.FullState(
         k1=2.0,
@@ -296,6 +311,7 @@ FAMILIES = {
     "region": (REGIONS, regions.MEMBERS, ij.testing.check_region),
     "disturbance": (DISTURBANCES, disturbances.MEMBERS, ij.testing.check_disturbance),
     "barrier": (BARRIERS, barriers.MEMBERS, ij.testing.check_barrier),
+    "decay": (DECAYS, decays.MEMBERS, ij.testing.check_decay),
     "observer": (OBSERVERS | LEVEL_OBSERVERS, observers.MEMBERS, ij.testing.check_observer),
     "sensor": (SENSORS, sensors.MEMBERS, ij.testing.check_sensor),
     "actuator": (ACTUATORS, actuators.MEMBERS, ij.testing.check_actuator),

@@ -15,7 +15,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from iblf_jax.certificates import decay_lines, law_claim_lines, lines, rate_lines, theorem_lines
+from iblf_jax.certificates import (
+    decay_lines,
+    law_claim_lines,
+    lines,
+    rate_lines,
+    settling,
+    theorem_lines,
+)
 from iblf_jax.certificates._level_certificate import (
     heading_of,
     level_certificate,
@@ -66,6 +73,10 @@ def certify(
 
     and what follows from it: the decay of V and a bound on the error of every level.
 
+    A law with `decays` is also checked against the settling time that these predict,
+
+        E' <= -sum w_j rate_j(k_j(t, V_j)) V_j + g,   E = sum w_j V_j                         (D.2)
+
     A law that states a Lyapunov function V of its own and its decay W (`controllers.LyapunovLaw`)
     is checked against
 
@@ -93,7 +104,7 @@ def certify(
         steps), or arguments of the wrong kind.
 
     Source: Zhang & Yan 2024, Theorem 2 and its proof, (3.16)-(3.31); (S.3) as at the head of
-      `iblf_jax.certificates.level_terms`.
+      `iblf_jax.certificates.level_terms`, (D.2) at that of `iblf_jax.certificates.settling`.
     """
     scenario = canonical(scenario)
     if not checks.is_concrete(scenario):
@@ -200,11 +211,18 @@ def _certificate_of(run: Rollout) -> Certificate:
     weighted: list[Line] = []
     shares: dict[str, float] = {}
     traces = []
+    courses: list[settling.Course] = []
+    has_settling = settling.has_settling_claim(run.scenario)
+    why_no_settling = settling.why_no_settling(summary)
     for segment in segments:
         about_theorem, segment_shares = theorem_lines.segment_lines(segment)
         checked += [*law_claim_lines.own_segment_lines(segment), *about_theorem]
         if not summary.claims.why_no_weights:
             weighted += decay_lines.decay_lines(segment, WEIGHTED)
+        if has_settling:
+            courses.append(settling.robot_course(segment))
+        if has_settling and not summary.claims.bounds_velocities:
+            checked.append(settling.decay_line(segment, why_no_settling))
         for name, share in segment_shares.items():
             shares[name] = max(share, shares.get(name, 0.0))
         traces.append(_traces(segment))
@@ -220,6 +238,7 @@ def _certificate_of(run: Rollout) -> Certificate:
         *by_name.values(),
         *rate_lines.weighted_rate_lines(summary),
         *lines.merged(weighted).values(),
+        *settling.settling_lines(summary, courses, why_no_settling, summary.mu),
     )
     return Certificate(
         heading_of(run.scenario),

@@ -6,8 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from iblf_jax.certificates import law_claim_lines, level_lines, lines
-from iblf_jax.certificates.level_summary import LEVELS, LevelSummary, level_summary
+from iblf_jax.certificates import law_claim_lines, level_lines, lines, settling
+from iblf_jax.certificates.level_summary import (
+    LEVELS,
+    LevelSummary,
+    growth_along,
+    level_summary,
+)
 from iblf_jax.certificates.lines import Line
 from iblf_jax.certificates.optional import optional_member
 from iblf_jax.certificates.result import Certificate, LevelLabel, LevelTraces
@@ -43,15 +48,21 @@ def level_certificate(run: Rollout) -> Certificate:
     checked: list[Line] = []
     own: list[Line] = []
     traces = []
+    courses: list[settling.Course] = []
+    has_settling = settling.has_settling_claim(run.scenario)
     for segment in segments:
         own += law_claim_lines.own_segment_lines(segment)
         checked += level_lines.segment_lines(segment)
         traces.append(_traces(segment))
+        if has_settling:
+            growth = growth_along(segment.proof.claim)
+            courses.append(settling.course_of(segment, segment.proof.V, growth))
     return Certificate(
         heading_of(run.scenario),
         (
             *level_lines.run_lines(summary),
             *lines.merged(checked).values(),
+            *settling.settling_lines(summary, courses, summary.why_not, 0.0),
             *lines.merged(own).values(),
         ),
         _numbers(summary),

@@ -157,14 +157,20 @@ def why_no_theorem(scenario: Scenario) -> str:
     return ""
 
 
-def decay_rate(law: Backstepping | FullState) -> jax.Array | None:
-    """Decay rate of the barrier's V1 along alpha, (n,) [1/s]; None if the barrier states none."""
-    return _decay_of(law.barrier, law.k1)
+def decay_rate(law: Backstepping | FullState, gain: Any = None) -> jax.Array | None:
+    """Decay rate of the barrier's V1 along alpha, (n,) [1/s]; None if the barrier states none.
+
+    For the gain k1, below which the gain of a law with `decays` is at no instant; or for the gain
+    of an instant.
+    """
+    return _decay_of(law.barrier, law.k1 if gain is None else gain)
 
 
-def decay_phi(law: FullState) -> jax.Array | None:
-    """Decay rate of the velocity barrier's phi, (n,) [1/s]; None if the barrier states none."""
-    return _decay_of(law.velocity_barrier, law.K2)
+def decay_phi(law: FullState, gain: Any = None) -> jax.Array | None:
+    """Decay rate of the velocity barrier's phi, (n,) [1/s], for the gain K2 or another one; None if
+    the barrier states none.
+    """
+    return _decay_of(law.velocity_barrier, law.K2 if gain is None else gain)
 
 
 def _decay_of(barrier: Any, gain: jax.Array) -> jax.Array | None:

@@ -38,7 +38,8 @@ from iblf_jax.certificates.claims import own_claim
 from iblf_jax.certificates.optional import optional_member
 from iblf_jax.certificates.proof_terms import TORQUE_ROUNDING, OwnTerms
 from iblf_jax.control.controllers import BarrierBackstepping
-from iblf_jax.control.controllers._base import law_member
+from iblf_jax.control.controllers._base import decay_of, law_member
+from iblf_jax.control.decays._base import gain_at
 from iblf_jax.control.observers._base import observer_member
 from iblf_jax.core.linalg import solve_spd
 from iblf_jax.core.pytree import unwrapped
@@ -64,7 +65,8 @@ class ClaimTerms(NamedTuple):
     dV: jax.Array
     """V', exact."""
     decay: jax.Array
-    """sum w_i decay_i, where decay_i is at least the barrier's stated rate times V_i."""
+    """sum w_i decay_i, where decay_i is at least the barrier's stated rate times V_i, for the gain
+    k_i(t, V_i) of the instant."""
     by_slopes: jax.Array
     """sum c_i w_i |s_i|^2."""
     disturbance_terms: jax.Array
@@ -268,14 +270,16 @@ def _claim_terms(
     gaps = []
     for i, (level, tube, barrier) in enumerate(zip(levels, tubes, law.barriers, strict=True)):
         w, x = law.weights[i], at.x[i]
-        stated = optional_member(barrier, "decay_rate")(law.k[i])
+        # The claim holds for the gain of the instant, which a decay makes a function of t and V_i.
+        gain = gain_at(decay_of(law, i), at.t, law.k[i], barrier, tube, x)
+        stated = optional_member(barrier, "decay_rate")(gain)
         if stated is not None:
             decay += jnp.sum(w * stated * barrier.value(tube, x))
         by_slopes += jnp.sum(law.c[i] * level.slope**2 / w)
         xi = _relative_error(scenario, i, tube, x)
         gap = _gap(xi, optional_member(barrier, "guard"))
         gaps.append(gap)
-        size += jnp.sum(jnp.abs(level.slope) / gap * (jnp.abs(tube.dq_d) + law.k[i] * jnp.abs(x)))
+        size += jnp.sum(jnp.abs(level.slope) / gap * (jnp.abs(tube.dq_d) + gain * jnp.abs(x)))
         near = jnp.abs(x) + jnp.abs(tube.q_d)
         square += jnp.sum(w * (near / gap) ** 2 / _ratio_at_centre(barrier, tube))
         rows["xi"].append(xi)

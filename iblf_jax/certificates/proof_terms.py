@@ -41,6 +41,8 @@ import jax.numpy as jnp
 from iblf_jax.certificates.claims import decay_phi, decay_rate, own_claim
 from iblf_jax.certificates.optional import optional_member
 from iblf_jax.control.controllers import Backstepping, FullState
+from iblf_jax.control.controllers._base import decay_of
+from iblf_jax.control.decays._base import decay_member, energy_gain, gain_at
 from iblf_jax.control.observers import Printed
 from iblf_jax.core.linalg import matvec, solve_spd
 from iblf_jax.core.pytree import unwrapped
@@ -73,6 +75,8 @@ class FullTerms(NamedTuple):
     """K of each joint's side, (n,) [rad/s]."""
     alpha_distance: jax.Array
     """Distance of alpha to the velocity bounds, (n,) [rad/s]."""
+    growth: jax.Array
+    """s2 . M0^-1 f_tilde - c |s2|^2, () [1/s]."""
 
 
 class OwnTerms(NamedTuple):
@@ -133,6 +137,9 @@ class ProofTerms(NamedTuple):
     """`FullTerms` of a law that bounds velocities."""
     own: Any = ()
     """`OwnTerms` of a law that states a claim about itself."""
+    decay: Any = ()
+    """sum w V1 rate(k1(t, V1)) + e2^T K2 e2 + 2 g(t, W) W of a `Backstepping` law with decays, ()
+    [1/s]."""
 
 
 def rounding(dtype) -> float:
@@ -203,6 +210,8 @@ def terms_and_sample(
     if own_claim(scenario) is not None:
         proof["own"] = _own_terms(scenario, t, state, state_rate, now, rates)
         proof["excluded"] |= proof["own"].limited
+    if isinstance(unwrapped(scenario.controller), Backstepping):
+        proof["decay"] = _decay_of_backstepping(scenario, t, state, M0, now["e2"])
     if isinstance(unwrapped(scenario.controller), FullState):
         proof["full"] = _full_terms(scenario, t, state, M0, rates, f_tilde)
         # e2 has no tube where alpha is outside the velocity bounds.
@@ -279,6 +288,26 @@ def _differs_from_command(
     return jnp.any(jnp.abs(now["tau"] - command.tau) > tolerance)
 
 
+def _decay_of_backstepping(scenario: Scenario, t: jax.Array, state: LoopState, M0, e2) -> Any:
+    """The decay of sum w V1 + 1/2 e2^T M0 e2 with the gains of this instant, (); `()` for a law
+    without decays or a barrier without a rate.
+    """
+    law: Any = unwrapped(scenario.controller)
+    if not law.decays:
+        return ()
+    tube = scenario.context.tube(t)
+    gain = gain_at(decay_of(law, 0), t, law.k1, law.barrier, tube, state.q)
+    stated = decay_rate(law, gain)
+    if stated is None:
+        return ()
+    decay = jnp.sum(law.weight * stated * law.barrier.value(tube, state.q)) + e2 @ (law.K2 * e2)
+    W = 0.5 * e2 @ (M0 @ e2)
+    second = decay_of(law, 1)
+    if decay_member(second, "constant"):
+        return decay
+    return decay + 2.0 * energy_gain(second, t, W, e2) * W
+
+
 def _full_terms(
     scenario: Scenario, t: jax.Array, state: LoopState, M0, rates, f_tilde
 ) -> FullTerms:
@@ -290,13 +319,20 @@ def _full_terms(
     phi = law.velocity_barrier.value(inner, state.dq)
     barriers_rate = rates["V"] - f_tilde @ (rates["disturbance"] - rates["disturbance_estimate"])
     decays = jnp.zeros_like(V1)
-    for stated, value in ((decay_rate(law), V1), (decay_phi(law), phi)):
+    gains = (
+        gain_at(decay_of(law, 0), t, law.k1, law.barrier, outer, state.q),
+        gain_at(decay_of(law, 1), t, law.K2, law.velocity_barrier, inner, state.dq),
+    )
+    rates_of_barriers = (decay_rate(law, gains[0]), decay_phi(law, gains[1]))
+    for stated, value in zip(rates_of_barriers, (V1, phi), strict=True):
         if stated is not None:
             decays = decays + stated * value
-    left = barriers_rate + jnp.sum(decays) - s2 @ solve_spd(M0, f_tilde) + jnp.sum(law.c * s2**2)
+    growth = s2 @ solve_spd(M0, f_tilde) - jnp.sum(law.c * s2**2)
+    left = barriers_rate + jnp.sum(decays) - growth
     above = state.dq > inner.q_d
     distance = jnp.minimum(inner.q_d - inner.lower, inner.upper - inner.q_d)
-    return FullTerms(left, inner.xi(state.dq), jnp.where(above, inner.k_u, inner.k_l), distance)
+    bound = jnp.where(above, inner.k_u, inner.k_l)
+    return FullTerms(left, inner.xi(state.dq), bound, distance, growth)
 
 
 # --- sizes of the terms, for rounding ------------------------------------------------------------

@@ -1,1 +1,3 @@
-"""What acts on a robot: barriers, control laws, disturbance observers, sensors and actuators."""
+"""What acts on a robot: barriers and decays, control laws, disturbance observers, sensors and
+actuators.
+"""

@@ -124,6 +124,16 @@ def _with_zeros(coefficients: Coefficients) -> list[jax.Array]:
     return [zero if x is None else x for x in coefficients]
 
 
+def _of_one_shape(coefficients: Coefficients) -> Coefficients:
+    """Coefficients of the shape of the first: one operand of an operation may be a scalar, and a
+    higher coefficient may be that of the scalar alone.
+    """
+    shape = coefficients[0].shape
+    return [
+        x if x is None or x.shape == shape else jnp.broadcast_to(x, shape) for x in coefficients
+    ]
+
+
 def _is_constant(coefficients: Coefficients) -> bool:
     """Whether all coefficients above the first are zero."""
     return all(x is None for x in coefficients[1:])
@@ -179,7 +189,7 @@ def _evaluated_equation(equation: Any, inputs: list[Coefficients], order: int) -
     if primitive.name == "scan":
         return _evaluated_scan(params, inputs, order)
     if primitive in RULES:
-        return [RULES[primitive](inputs, params)]
+        return [_of_one_shape(RULES[primitive](inputs, params))]
     if primitive in LINEAR:
         return [_termwise(partial(primitive.bind, **params), inputs)]
     if primitive not in jet.jet_rules:

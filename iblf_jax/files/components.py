@@ -17,7 +17,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from iblf_jax.control import actuators, barriers, controllers, observers, sensors
+from iblf_jax.control import actuators, barriers, controllers, decays, observers, sensors
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import field_values, is_leaf_field
 from iblf_jax.files.values import (
@@ -47,6 +47,7 @@ FAMILIES: dict[Any, tuple[str, dict[str, Any]]] = {
     disturbances.Disturbance: ("disturbances", disturbances.MEMBERS),
     controllers.Controller: ("controllers", controllers.MEMBERS),
     barriers.Barrier: ("barriers", barriers.MEMBERS),
+    decays.Decay: ("decays", decays.MEMBERS),
     observers.Observer: ("observers", observers.MEMBERS),
     sensors.Sensor: ("sensors", sensors.MEMBERS),
     sensors.Part: ("sensors", sensors.MEMBERS | sensors.LEVELS),

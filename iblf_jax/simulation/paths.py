@@ -131,16 +131,20 @@ def _walk(part: Any, path: str, named: bool, symbols: Symbols) -> Iterator[Param
             yield Parameter(name, jnp.shape(value), unit, value)
         elif isinstance(value, tuple | list):
             for i, x in enumerate(value):
-                yield from _walk(x, f"{name}[{i}]", named, _symbols_below(field, symbols, i))
+                below = _symbols_below(part, field, symbols, i)
+                yield from _walk(x, f"{name}[{i}]", named, below)
         else:
-            yield from _walk(value, name, named, _symbols_below(field, symbols))
+            yield from _walk(value, name, named, _symbols_below(part, field, symbols))
     if named:
         yield from _named_rows(part, path)
         yield from _stacked_rows(part, path, symbols)
 
 
-def _symbols_below(field: dataclasses.Field, symbols: Symbols, index: int = 0) -> Symbols:
+def _symbols_below(
+    part: Any, field: dataclasses.Field, symbols: Symbols, index: int = 0
+) -> Symbols:
     """The unit of each symbol in the part that a field holds, or in one of its parts."""
+    symbols = component_member(part, "symbols_of_part")(field.name, index, symbols)
     change = field.metadata.get("part_units")
     return symbols if change is None else change(symbols, index)  # type: ignore[no-any-return]
 
@@ -311,7 +315,7 @@ def _metadata(scenario: Scenario, path: str) -> Mapping[str, Any]:
         if not tokens:
             unit = of_entry(_unit(part, field, symbols), index, jnp.ndim(value))
             return {**field.metadata, "unit": unit}
-        symbols = _symbols_below(field, symbols, *index[:1])
+        symbols = _symbols_below(part, field, symbols, *index[:1])
         part = value
         for i in index:
             part = part[i]

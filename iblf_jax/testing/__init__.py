@@ -19,6 +19,7 @@ The checkers compute in float64 and leave the configuration of JAX unchanged.
 
 from iblf_jax.testing._contract import ContractError as ContractError
 from iblf_jax.testing.barriers import check_barrier as check_barrier
+from iblf_jax.testing.decays import check_decay as check_decay
 from iblf_jax.testing.devices import check_actuator as check_actuator
 from iblf_jax.testing.devices import check_sensor as check_sensor
 from iblf_jax.testing.laws import check_law as check_law
@@ -36,6 +37,7 @@ __all__ = [
     "ContractError",
     "check_actuator",
     "check_barrier",
+    "check_decay",
     "check_disturbance",
     "check_fold",
     "check_law",

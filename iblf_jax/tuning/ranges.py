@@ -115,6 +115,12 @@ FREQUENCY = re.compile(r"(sensor|actuator)\..*?(cutoff|bandwidth)(\[\d+\])*$")
 LEVEL_BOUND = re.compile(r"state_bounds\[(\d+)\]\.(lower|upper)\.value((?:\[\d+\])*)$")
 """Paths of constant bounds of the levels above the first."""
 
+SMOOTHING = re.compile(r"controller\.(law\.)*decays\[\d+\]\.(a|delta)(\[\d+\])*$")
+"""Paths of the numbers of a decay whose small values make the gain at zero error large."""
+LOWER_POWER = re.compile(r"controller\.(law\.)*decays\[\d+\]\.a(\[\d+\])*$")
+UPPER_POWER = re.compile(r"controller\.(law\.)*decays\[\d+\]\.b(\[\d+\])*$")
+BY_POWER = "beyond it the decay has no power on this side of 1"
+
 
 class End(NamedTuple):
     """An end of the range of a leaf."""
@@ -183,6 +189,9 @@ def _default_low(conditions: Conditions, path: str, start: np.ndarray) -> End:
         return _bound_at_start(scenario, path, start)
     leaf = re.sub(r"(\[\d+\])+$", "", path)
     is_examined = _is_time(scenario, path) or _is_of_chain(scenario, path)
+    if UPPER_POWER.match(path):
+        return End(np.ones(()), BY_POWER)
+    is_examined = is_examined or bool(SMOOTHING.match(path))
     if np.all(start > 0) and (is_examined or FREQUENCY.match(path)):
         return _single_end(conditions, path, start, 1.0 / MAX_FACTOR, BY_SMALL_FACTOR)
     if scenario.sampling is not None and leaf in THEOREM_LIMITS:
@@ -238,20 +247,23 @@ def default_highs(
 ) -> dict[str, End]:
     """The upper ends of the ranges of some leaves; arguments as `default_lows`."""
     conditions = Conditions(scenario, dt, method)
-    gains = {
-        path: x
-        for path, x in starts.items()
-        if path.startswith(("controller.", "observer.")) and np.all(x > 0)
-    }
+    gains = {path: x for path, x in starts.items() if _is_gain(path) and np.all(x > 0)}
     others = {path: x for path, x in starts.items() if path not in gains}
     ends = {path: _default_high(conditions, path, start) for path, start in others.items()}
     return ends | _highs_of_gains(conditions, gains)
+
+
+def _is_gain(path: str) -> bool:
+    """Whether a leaf is a gain of the law or of the observer, which may be scaled up."""
+    return path.startswith(("controller.", "observer.")) and not LOWER_POWER.match(path)
 
 
 def _default_high(conditions: Conditions, path: str, start: np.ndarray) -> End:
     """The upper end of the range of a leaf that is no gain."""
     if path == PERIOD:
         return _longest_period(conditions, start)
+    if LOWER_POWER.match(path):
+        return End(np.ones(()), BY_POWER)
     if path == DELAY:
         return _longest_delay(conditions, start)
     if LEVEL_BOUND.match(path) and ".lower." in path:

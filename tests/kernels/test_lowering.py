@@ -96,6 +96,11 @@ def with_member(family: str, name: str, cls):
     if family == "bounds":
         upper = PRESET.bounds.upper if name == "sinusoid" else part
         return dataclasses.replace(PRESET, bounds=ij.bounds.Bounds(PRESET.bounds.lower, upper))
+    if family == "decays":
+        law = ij.controllers.Backstepping(
+            2.0, 20.0, barrier=ij.barriers.Mapping(), decays=example(name, cls)
+        )
+        return dataclasses.replace(PRESET, controller=law)
     fields = {"robots": ("plant", "model")}.get(family, (family[:-1],))
     speeds = (
         ij.Bounds(ij.bounds.Constant(-2.0), ij.bounds.Constant(2.0))
@@ -109,6 +114,7 @@ FAMILIES = (
     "barriers",
     "bounds",
     "controllers",
+    "decays",
     "disturbances",
     "observers",
     "references",

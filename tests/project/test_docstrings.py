@@ -97,6 +97,7 @@ def test_the_members_of_every_family_are_among_them():
         ij.disturbances,
         ij.barriers,
         ij.controllers,
+        ij.decays,
         ij.observers,
         ij.metrics,
     )

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from iblf_jax import barriers, controllers, observers
+from iblf_jax import barriers, controllers, decays, observers
 
 PAGE = runpy.run_path(str(Path(__file__).resolve().parents[2] / "docs" / "members.py"))
 
@@ -18,7 +18,13 @@ def test_the_page_is_not_stale():
 
 
 @pytest.mark.parametrize(
-    "cls", [*barriers.MEMBERS.values(), *controllers.MEMBERS.values(), *observers.MEMBERS.values()]
+    "cls",
+    [
+        *barriers.MEMBERS.values(),
+        *controllers.MEMBERS.values(),
+        *decays.MEMBERS.values(),
+        *observers.MEMBERS.values(),
+    ],
 )
 def test_every_member_says_what_it_is_and_where_it_comes_from(cls):
     assert len(PAGE["first_line"](cls)) > 5

@@ -48,6 +48,7 @@ PROMISED = [
         "compare",
         "Comparison",
         "barriers",
+        "decays",
         "observers",
         "controllers",
         "metrics",

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 
+from iblf_jax.control.decays import Decay, Exponential
 from iblf_jax.core.linalg import matvec
 from iblf_jax.core.optional import OptionalMembers
 from iblf_jax.world.bounds import Bounds, Tube, speed_limits_at, tube_at
@@ -169,6 +170,7 @@ law_member = OptionalMembers(
     disturbance_terms=None,
     barrier=None,
     barriers=(),
+    decays=(),
     weight=None,
     reading="",
 )
@@ -212,6 +214,14 @@ def wrapped_state(law: Any, *arguments: Any) -> State:
 def wrapped_switching(law: Any, *arguments: Any) -> jax.Array | None:
     """`switching` of a law that wraps another and has no state of its own: the other's."""
     return switching_functions(law.law, *arguments)
+
+
+def decay_of(law: Any, i: int) -> Decay:
+    """The decay of level i + 1 of a law: `Exponential` for a law that has no `decays`."""
+    decays = law_member(law, "decays")
+    if not decays:
+        return Exponential()
+    return decays[i]  # type: ignore[no-any-return]
 
 
 def rigid_body_torque(

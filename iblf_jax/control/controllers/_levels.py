@@ -19,6 +19,8 @@ import jax.numpy as jnp
 
 from iblf_jax.control.barriers import Barrier
 from iblf_jax.control.controllers._base import LawContext
+from iblf_jax.control.decays import Decay, Exponential
+from iblf_jax.control.decays._base import gain_at
 from iblf_jax.core import taylor
 from iblf_jax.world import plants
 from iblf_jax.world.bounds import Tube, bounds_at
@@ -37,6 +39,8 @@ class Design(NamedTuple):
     """Gain of the slope, (n,); None for 0."""
     weight: jax.Array | None = None
     """w_i, (n,); None for 1."""
+    decay: Decay = Exponential()
+    """Of V_i, which makes the gain a function of the time and of V_i."""
 
 
 class Level(NamedTuple):
@@ -150,7 +154,8 @@ def _level(
     """
     barrier = design.barrier
     slope = barrier.slope(tube, x[i])
-    rate = barrier.virtual_velocity(tube, x[i], design.k, design.o)
+    gain = gain_at(design.decay, t, design.k, barrier, tube, x[i])
+    rate = barrier.virtual_velocity(tube, x[i], gain, design.o)
     if slope_below is not None:
         ratio: Any = barrier.error_over_slope(tube, x[i])
         coupling = plants.transposed_gain(plant, i, t, x, slope_below) * ratio

@@ -14,6 +14,18 @@ small inertia a sampled loop needs a small weight.
 That is the law as `printed`.  Its proof drops 1/2 e2^T M0' e2; the `corrected` reading has C0 alpha
 in place of C0 q', which cancels that term by skew symmetry, and then the claim of Theorem 2 is
 exact.
+
+**Decays.**  The gain k1 may depend on the time and on V1, k1(t, V1) >= k1 (`decays`), and then
+V1' <= -rate(k1(t, V1)) V1 + s . e2.  The second step has a decay of its own, of the energy
+W = 1/2 e2^T M0 e2 with a gain g(t, W) that all joints share:
+
+    tau = ... - g(t, W) M0 e2,   W' = -2 g(t, W) W - e2^T K2 e2 + e2 . f_tilde - w s . e2     (D.1)
+
+in the corrected reading, because e2^T (g M0 e2) = 2 g W.  V = sum w V1 + W then obeys
+
+    V' <= -sum w rate(k1(t, V1)) V1 - 2 (mu + g(t, W)) W + e2 . f_tilde,  mu = lambda_min(M0^-1 K2)
+
+With a decay of finite, fixed or prescribed time in both steps, so does V.
 """
 
 from __future__ import annotations
@@ -26,8 +38,21 @@ import numpy as np
 
 from iblf_jax.control.barriers import Barrier, Integral
 from iblf_jax.control.barriers._base import CLAIMS, barrier_member, guard_is_active, value_unit
-from iblf_jax.control.controllers._base import Command, LawContext, no_state, rigid_body_torque
+from iblf_jax.control.controllers._base import (
+    Command,
+    LawContext,
+    decay_of,
+    no_state,
+    rigid_body_torque,
+)
+from iblf_jax.control.decays import Decay
+from iblf_jax.control.decays._base import (
+    decay_member,
+    energy_gain,
+    gain_at,
+)
 from iblf_jax.core import checks
+from iblf_jax.core.linalg import inner, matvec
 from iblf_jax.core.pytree import Leaf, component, leaf, static
 from iblf_jax.world.bounds import Tube
 
@@ -37,6 +62,18 @@ READINGS = ("printed", "corrected")
 def weight_units(law: Any) -> dict[str, str]:
     """`leaf_units` of a law with a barrier: the weight w has a unit for which w s is a torque."""
     return {"weight": "N m/rad" if value_unit(law.barrier) == "rad^2" else "N m rad"}
+
+
+ROOT_OF_ENERGY = "N^0.5 m^0.5 rad^0.5"
+"""Unit of sqrt(2 W), W = 1/2 e2^T M0 e2."""
+
+
+def symbols_of_energy(law: Any, field: str, index: int, symbols: Any) -> Any:
+    """The units of the symbols in a part of a law whose second decay is that of the energy W."""
+    if field != "decays":
+        return symbols
+    sizes = ("rad" if value_unit(law.barrier) == "rad^2" else "1", ROOT_OF_ENERGY)
+    return {**symbols, "z": sizes[index]}
 
 
 @component
@@ -55,6 +92,8 @@ class Backstepping:
       reading: "printed" or "corrected"; "printed" if not given.
       weight: w of the barrier's V1, () or (n,) [N m rad] ([N m/rad] for a barrier whose V1 is in
         rad^2), > 0; 1, the paper's, if not given.
+      decays: a `Decay` of V1 and one of the energy 1/2 e2^T M0 e2; one alone is that of both;
+        exponential in k1 and K2 if not given.
 
     Source: Zhang & Yan 2024, (3.5), (3.14); `corrected` as said at the head of this module.
     """
@@ -65,9 +104,11 @@ class Backstepping:
     barrier: Barrier = Integral()
     reading: str = static(default="printed")
     weight: Leaf = leaf("N m rad", sign="positive", default=None)
+    decays: tuple[Decay, ...] = ()
     gains: ClassVar[tuple[str, ...]] = ("k1", "K2")
     unit_factors: ClassVar[tuple[str, ...]] = ("weight",)
     leaf_units = weight_units
+    symbols_of_part = symbols_of_energy
     init = no_state
 
     def check(self) -> None:
@@ -78,6 +119,7 @@ class Backstepping:
         check_barrier(self, "barrier", self.barrier)
         fit_o(self, self.barrier)
         fit_weight(self)
+        fit_decays(self, 2)
 
     def advice(self) -> list[str]:
         """What is lost of Theorem 2 where the paper's law, whose weight is 1, has a gain outside
@@ -111,6 +153,7 @@ class Backstepping:
         feedforward = rigid_body_torque(context.model, q, dq, v, dalpha)
         tau = feedforward - f_hat - self.K2 * (dq - alpha)
         tau = tau - self.weight * self.barrier.slope(tube, q)
+        tau = with_energy_decay(self, t, q, dq - alpha, context, tau)
         return barrier_command(self, tube, q, alpha, tau), ()
 
 
@@ -155,9 +198,52 @@ def fit_weight(law) -> None:
         object.__setattr__(law, "weight", jnp.full_like(law.k1, 1.0))
 
 
+def fit_decays(law, count: int) -> None:
+    """Fits `decays` of a law under construction to its levels: a single decay is that of each.
+
+    Raises:
+      ValueError: something that is no decay, or another number of them.
+    """
+    name = f"{type(law).__name__}.decays"
+    decays = law.decays
+    if not isinstance(decays, tuple | list):
+        decays = (decays,)
+    for i, decay in enumerate(decays):
+        remedy = "Such as iblf_jax.decays.FiniteTime(k_a=2.0)."
+        checks.conforms(f"{name}[{i}]", decay, Decay, remedy)
+    if len(decays) == 1:
+        decays = tuple(decays) * count
+    if len(decays) not in (0, count):
+        remedy = "decays.Exponential() is for a level with a constant gain."
+        expected = f"{count} decays, one a level, or one for all"
+        raise checks.fail(name, f"{len(decays)} decays", expected, remedy)
+    object.__setattr__(law, "decays", tuple(decays))
+
+
+def with_energy_decay(
+    law, t: jax.Array, q: jax.Array, e2: jax.Array, context: LawContext, tau: jax.Array
+) -> jax.Array:
+    """A torque with the decay of the energy W of e2 added, tau - g(t, W) M0 e2, (n,) [N m]; (D.1).
+
+    Args:
+      law: with `decays`.
+      t: time, () [s].
+      q, e2: position [rad] and velocity error [rad/s], (n,).
+      context: its model is used.
+      tau: torque, (n,) [N m].
+    """
+    decay = decay_of(law, 1)
+    if decay_member(decay, "constant"):
+        return tau
+    momentum = matvec(context.model.mass_matrix(q), e2)
+    return tau - energy_gain(decay, t, 0.5 * inner(e2, momentum), e2) * momentum
+
+
 def virtual_velocity(law, t: jax.Array, q: jax.Array, context: LawContext) -> jax.Array:
-    """Alpha, (n,) [rad/s], of a law with `barrier`, `k1`, `o`."""
-    return law.barrier.virtual_velocity(context.tube(t, acceleration=False), q, law.k1, law.o)
+    """Alpha, (n,) [rad/s], of a law with `barrier`, `k1`, `o`, and with `decays` or without."""
+    tube = context.tube(t, acceleration=False)
+    k1 = gain_at(decay_of(law, 0), t, law.k1, law.barrier, tube, q)
+    return law.barrier.virtual_velocity(tube, q, k1, law.o)
 
 
 def alpha_and_rate(

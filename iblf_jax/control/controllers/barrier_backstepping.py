@@ -25,6 +25,10 @@ x_{j+1} + d_hat_j, with the output of the observer held.
 and beta_i' = (alpha_i - beta_i)/mu_i takes the place of alpha_i'.  No derivative is formed; the lag
 of the filters remains as an error, and the bound above becomes ultimate boundedness.
 
+**Decays.**  The gain k_i of a level may depend on the time and on V_i (`decays`, for settling in
+finite, fixed or prescribed time); decay_i then is that of the gain of the instant, and u contains
+the derivatives of k_i(t, V_i).
+
 **Smoothness.**  u contains the slope s_i of a level differentiated r - i - 1 times.  `Integral` and
 `Log(p=1)` have a kink of the slope at e_i = 0 in an asymmetric tube, and on levels above the first
 their e_i/s_i jumps there.  Such a barrier is refused below the last level.  On the last level u
@@ -49,12 +53,14 @@ from iblf_jax.control.barriers._base import (
     ratio_jumps,
     value_unit,
 )
-from iblf_jax.control.controllers._base import Command, LawContext
+from iblf_jax.control.controllers._base import Command, LawContext, decay_of
 from iblf_jax.control.controllers._levels import Design, Level, exact_levels, surface_levels
-from iblf_jax.control.controllers.backstepping import check_barrier, fit_o
+from iblf_jax.control.controllers.backstepping import check_barrier, fit_decays, fit_o
+from iblf_jax.control.decays import Decay
+from iblf_jax.control.decays._base import decay_member
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf
-from iblf_jax.core.units import ByLevel, PlantUnit
+from iblf_jax.core.units import ByLevel, PlantUnit, resolved
 from iblf_jax.world import plants
 from iblf_jax.world.bounds import Bounds, Funnel, Tube, side_member
 from iblf_jax.world.references import reference_member
@@ -81,6 +87,8 @@ class BarrierBackstepping:
         that have it and for no others; 0.1 for these, if not given.
       filter: mu_i of the filters of a dynamic surface, r - 1 numbers or (r - 1, n) [s], > 0; exact
         derivatives if not given.
+      decays: a `Decay` for each level, by which its gain depends on the time and on V_i; one alone
+        is that of every level; exponential in k if not given.
 
     Source: M. Krstic, I. Kanellakopoulos, P. Kokotovic, Nonlinear and Adaptive Control Design,
       1995 (backstepping); K. P. Tee, S. S. Ge, Automatica 47 (2011) 2511-2516 (barriers); weights
@@ -93,6 +101,7 @@ class BarrierBackstepping:
     weights: Leaf = leaf("1", sign="positive", shape="level", default=None)
     o: Leaf = leaf("1/s^2", sign="positive", shape="level", default=None)
     filter: Leaf = leaf("s", sign="positive", shape="level", default=None)
+    decays: tuple[Decay, ...] = ()
     gains: ClassVar[tuple[str, ...]] = ("k",)
     receives_x: ClassVar[bool] = True
     includes_e2: ClassVar[bool] = True
@@ -119,6 +128,7 @@ class BarrierBackstepping:
         fit_o(self, *self.barriers, like=jnp.zeros(order, self.k.dtype))
         for name, rows in (("c", order), ("weights", order), ("o", order), ("filter", order - 1)):
             self._fit_rows(name, rows)
+        fit_decays(self, order)
 
     def _check_gains(self) -> int:
         """The order r, which is the number of rows of `k`; ValueError for a single number."""
@@ -157,6 +167,15 @@ class BarrierBackstepping:
                 c.append(PlantUnit("1", "1/s"))
                 weights.append(PlantUnit("1", f"energy/{level}^2"))
         return {"c": ByLevel(c), "weights": ByLevel(weights)}
+
+    def symbols_of_part(self, field: str, index: int, symbols: Any) -> Any:
+        """The units of the symbols in a part of the law: that of z = sqrt(2V) in a decay."""
+        if field != "decays":
+            return symbols
+        size: Any = "1"
+        if value_unit(self.barriers[index]) != "1":
+            size = resolved(PlantUnit("1", f"x{index + 1}"), symbols)
+        return {**symbols, "z": size}
 
     # --- checks against a scenario ----------------------------------------------------------------
 
@@ -199,6 +218,7 @@ class BarrierBackstepping:
         for i, barrier in enumerate(self.barriers):
             self._check_sides(context, i)
             self._check_level(context, i, barrier)
+            self._check_decay(i)
 
     def _check_reference(self, context: LawContext) -> None:
         """Raises ValueError for a reference with too few continuous derivatives."""
@@ -262,6 +282,22 @@ class BarrierBackstepping:
         remedy = f"{_smooth_alternatives(i, self.order)} The tube of this level is asymmetric."
         raise checks.fail(name, kind, expected, remedy)
 
+    def _check_decay(self, i: int) -> None:
+        """Raises ValueError for a decay of level i + 1 with too few continuous derivatives."""
+        if self.filter is not None:
+            return
+        decay = decay_of(self, i)
+        needed, smooth = self.order - i - 1, decay_member(decay, "smooth_derivatives")
+        if smooth >= needed:
+            return
+        expected = f"a decay with {needed} continuous derivatives, as u contains them"
+        got = f"{type(decay).__name__}, which has {smooth}"
+        remedy = (
+            "decays.FiniteTime and FixedTime are smooth; or filter the virtual controls:"
+            " BarrierBackstepping(filter=...)."
+        )
+        raise checks.fail(f"controller.decays[{i}]", checks.Words(got), expected, remedy)
+
     # --- the law ----------------------------------------------------------------------------------
 
     @property
@@ -270,7 +306,8 @@ class BarrierBackstepping:
         o: Any = self.o
         if o is None:
             o = [None] * self.order
-        rows = zip(self.barriers, self.k, o, self.c, self.weights, strict=True)
+        decays = [decay_of(self, i) for i in range(self.order)]
+        rows = zip(self.barriers, self.k, o, self.c, self.weights, decays, strict=True)
         return [Design(*row) for row in rows]
 
     def init(self, x: jax.Array, context: LawContext) -> Any:

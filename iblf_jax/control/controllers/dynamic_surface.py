@@ -23,11 +23,15 @@ from iblf_jax.control.controllers._base import Command, LawContext, rigid_body_t
 from iblf_jax.control.controllers.backstepping import (
     barrier_command,
     check_barrier,
+    fit_decays,
     fit_o,
     fit_weight,
+    symbols_of_energy,
     virtual_velocity,
     weight_units,
+    with_energy_decay,
 )
+from iblf_jax.control.decays import Decay
 from iblf_jax.core.pytree import Leaf, component, leaf
 
 
@@ -47,6 +51,7 @@ class DynamicSurface:
       barrier: any `Barrier`; `Integral()` if not given.
       weight: w of the barrier's V1, () or (n,) [N m rad] ([N m/rad] for a barrier whose V1 is in
         rad^2), > 0; 1, the paper's, if not given.
+      decays: as `Backstepping.decays`; exponential in k1 and K2 if not given.
 
     Source: D. Swaroop, J. K. Hedrick, P. P. Yip, J. C. Gerdes, IEEE Trans. Automatic Control 45
     (2000) 1893-1899; with barriers as at the head of this module.
@@ -58,15 +63,18 @@ class DynamicSurface:
     o: Leaf = leaf("1/s^2", sign="positive", default=None)
     barrier: Barrier = Integral()
     weight: Leaf = leaf("N m rad", sign="positive", default=None)
+    decays: tuple[Decay, ...] = ()
     gains: ClassVar[tuple[str, ...]] = ("k1", "K2")
     unit_factors: ClassVar[tuple[str, ...]] = ("weight",)
     leaf_units = weight_units
+    symbols_of_part = symbols_of_energy
 
     def check(self) -> None:
         """Raises ValueError for something that is no barrier; completes `o` and `weight`."""
         check_barrier(self, "barrier", self.barrier)
         fit_o(self, self.barrier)
         fit_weight(self)
+        fit_decays(self, 2)
 
     def init(self, q: jax.Array, dq: jax.Array, context: LawContext) -> jax.Array:
         """beta(0) = alpha(0), (n,) [rad/s]."""
@@ -87,4 +95,5 @@ class DynamicSurface:
         feedforward = rigid_body_torque(context.model, q, dq, beta, dbeta)
         tau = feedforward - f_hat - self.K2 * (dq - beta)
         tau = tau - self.weight * self.barrier.slope(tube, q)
+        tau = with_energy_decay(self, t, q, dq - beta, context, tau)
         return barrier_command(self, tube, q, beta, tau), dbeta

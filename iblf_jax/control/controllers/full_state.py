@@ -25,6 +25,10 @@ terms in brackets apply for f' != 0 (case 2).
 A weight w_i > 0 of each joint scales the first barrier, V1 = sum_i w_i V1_i: then w_i s1 replaces
 s1 in (F.1), the cross term cancels as before, and all claims hold with this V1.
 
+The gains k1 and K2 may depend on the time and on V1 or phi (`decays`): the decays in (F.2) then are
+those of the gains of the instant.  These are at no time below k1 and K2, so that (F.3) holds as
+well.
+
 The integral and the logarithmic barrier have another e2/s2 on either side of e2 = 0 where K_u and
 K_l differ: there the torque jumps by M0 s1 (K_u^2 - K_l^2)/2, which the exact cancellation
 requires.  `Tan`, `State`, `Mapping` and `PrescribedPerformance` have no jump.
@@ -49,7 +53,7 @@ jump of its integrand.  Limits:
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -61,15 +65,17 @@ from iblf_jax.control.barriers._base import (
     ratio_jumps,
     value_unit,
 )
-from iblf_jax.control.controllers._base import Command, LawContext, no_state
+from iblf_jax.control.controllers._base import Command, LawContext, decay_of, no_state
 from iblf_jax.control.controllers._levels import Design, exact_levels
 from iblf_jax.control.controllers.backstepping import (
     alpha_and_rate,
     check_barrier,
+    fit_decays,
     fit_o,
     fit_weight,
     virtual_velocity,
 )
+from iblf_jax.control.decays import Decay
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.world.bounds import Tube
@@ -112,6 +118,8 @@ class FullState:
         1); `Integral()` if not given.
       weight: w of the V1 of e1, () or (n,) [1], > 0; 1 if not given.  Where V1 is in rad^2 its unit
         has 1/rad^2 besides, where phi is in rad^2/s^2 it has rad^2/s^2.
+      decays: a `Decay` of V1 and one of phi; one alone is that of both; exponential in k1 and K2 if
+        not given.
 
     Source: W. He, Y. Chen, Z. Yin, IEEE Trans. Cybernetics 46 (2016) 620-629 (symmetric, constant,
     logarithms); asymmetric, time-varying and for any barrier as derived at the head of this module.
@@ -124,6 +132,7 @@ class FullState:
     barrier: Barrier = Integral()
     velocity_barrier: Barrier = Integral()
     weight: Leaf = leaf("1", sign="positive", default=None)
+    decays: tuple[Decay, ...] = ()
     gains: ClassVar[tuple[str, ...]] = ("k1", "K2")
     unit_factors: ClassVar[tuple[str, ...]] = ("weight",)
     needs_velocity_bounds: ClassVar[bool] = True
@@ -147,10 +156,18 @@ class FullState:
             raise checks.fail(field, self.velocity_barrier, expected, remedy)
         fit_o(self, *barriers.values())
         fit_weight(self)
+        fit_decays(self, 2)
 
     def leaf_units(self) -> dict[str, str]:
         """The unit of the weight, by those of V1 and phi."""
         return {"weight": WEIGHT_UNITS[value_unit(self.barrier), value_unit(self.velocity_barrier)]}
+
+    def symbols_of_part(self, field: str, index: int, symbols: Any) -> Any:
+        """The units of the symbols in a part of the law: that of z = sqrt(2V) in a decay."""
+        if field != "decays":
+            return symbols
+        barrier, unit = ((self.barrier, "rad"), (self.velocity_barrier, "rad/s"))[index]
+        return {**symbols, "z": unit if value_unit(barrier) == "rad^2" else "1"}
 
     def tubes(
         self, t: jax.Array, q: jax.Array, dq: jax.Array, context: LawContext
@@ -184,8 +201,8 @@ class FullState:
         """The torque and what belongs to it; V1 is V1 + phi."""
         first, second = self.barrier, self.velocity_barrier
         designs = [
-            Design(first, self.k1, self.o, None, self.weight),
-            Design(second, self.K2, self.o, self.c, None),
+            Design(first, self.k1, self.o, None, self.weight, decay_of(self, 0)),
+            Design(second, self.K2, self.o, self.c, None, decay_of(self, 1)),
         ]
         levels, tubes = exact_levels(designs, t, jnp.stack([q, dq]), f_hat, context)
         outer, inner = tubes

@@ -1,0 +1,364 @@
+"""The settling time that follows from the decays of a law, and the lines of a certificate about it.
+
+A law whose gains are k(t, V) (`iblf_jax.decays`) has, with E = sum w_j V_j over its levels and
+joints,
+
+    E' <= -sum_j w_j rate_j(k_j(t, V_j)) V_j + g                                              (D.2)
+
+with g = T - sum c_i w_i |s_i|^2 of (S.3) for `BarrierBackstepping`; for laws of robots E = V2
+without the term of f_tilde, and
+
+    g = e2 . f_tilde (+ 1/2 e2^T M0' e2 in the printed reading)         `Backstepping`
+    g = s2 . M0^-1 f_tilde - c |s2|^2                                   `FullState`
+
+The second step of `Backstepping` has V = W = 1/2 e2^T M0 e2 with w = 1 and
+e2^T K2 e2 + 2 g(t, W) W >= 2 (mu + g(t, W)) W, mu = lambda_min(M0^-1 K2).
+
+The levels exchange V, so that only its sum is known.  Let D(t, E) be the least value of the sum in
+(D.2) over all V_j >= 0 with sum w_j V_j = E.  Then E(t) <= v(t) with
+
+    v' = -D(t, v) + rho2,   v(0) = E(0),   rho2 = sup max(g, 0) along the run                 (D.3)
+
+v reaches the band of the decays, min_j w_j band_j, at the predicted settling time; every V_j is
+inside its own band then.  v at the latest of the prescribed times bounds E there.  D is found on a
+grid of shares of E, one joint of one level after the other, and (D.3) is integrated by RK4 in ln v.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax.certificates.decay_lines import check_steps
+from iblf_jax.certificates.lines import Line, Statement, not_applicable
+from iblf_jax.certificates.optional import optional_member
+from iblf_jax.certificates.run_summary import ALWAYS_EXCLUDED, ENERGY_ROUNDING, Segment
+from iblf_jax.control.actuators import Ideal
+from iblf_jax.control.controllers import Backstepping, BarrierBackstepping, FullState
+from iblf_jax.control.controllers._base import decay_of
+from iblf_jax.control.decays._base import decay_member, energy_gain
+from iblf_jax.core import checks
+from iblf_jax.core.pytree import unwrapped
+from iblf_jax.simulation.scenario import Scenario
+
+SHARES = 48
+"""Number of intervals of the grid of shares of E."""
+INTERVALS = (400, 20_000)
+"""Least and largest number of steps of the integration of (D.3)."""
+VANISHING = 1e-12
+"""Share of E(0) at which the gain of a vanishing error is taken."""
+RELATIVE_ERROR = 2e-3
+"""Error of D and of the integration of (D.3), relative to the predicted value."""
+TIME = Statement(
+    "settling time", "(D.3)", "E <= band from the predicted time on, v' = -D(t, v) + rho2", "s"
+)
+AT_DEADLINE = Statement("prescribed time", "(D.3)", "E(T) <= v(T),  v' = -D(t, v) + rho2")
+
+INEQUALITY = Statement(
+    "inequality, decays",
+    "(D.2)",
+    "E' <= -sum w V1 rate(k1(t, V1)) - e2^T K2 e2 - 2 g(t, W) W + e2 . f_tilde",
+    "1/s",
+)
+
+
+class Part(NamedTuple):
+    """One level of a law in (D.2)."""
+
+    decay: Any
+    gain: Any
+    """Constant gain, (n,) [1/s]."""
+    weight: Any
+    """(n,)."""
+    rate: Any
+    """Decay rate of V for a gain, a function."""
+
+
+def has_settling_claim(scenario: Scenario) -> bool:
+    """Whether the law of a scenario has a decay that is not exponential, and the claim (D.2)."""
+    law: Any = unwrapped(scenario.controller)
+    if not isinstance(law, Backstepping | FullState | BarrierBackstepping):
+        return False
+    if isinstance(law, BarrierBackstepping) and law.filter is not None:
+        return False
+    if any(part.rate(part.gain) is None for part in parts_of(law)):
+        return False
+    return any(not decay_member(decay, "constant") for decay in law.decays)
+
+
+def parts_of(law: Any) -> list[Part]:
+    """The levels of a law that have a barrier."""
+    if isinstance(law, BarrierBackstepping):
+        rows = zip(law.barriers, law.k, law.weights, strict=True)
+        return [
+            Part(decay_of(law, i), k, w, optional_member(barrier, "decay_rate"))
+            for i, (barrier, k, w) in enumerate(rows)
+        ]
+    rate = optional_member(law.barrier, "decay_rate")
+    first = Part(decay_of(law, 0), law.k1, law.weight, rate)
+    if isinstance(law, Backstepping):
+        return [first]
+    rate = optional_member(law.velocity_barrier, "decay_rate")
+    return [first, Part(decay_of(law, 1), law.K2, jnp.ones_like(law.K2), rate)]
+
+
+def effective_rate(part: Part, t: jax.Array, V: jax.Array) -> jax.Array:
+    """Decay rate of the V of each joint at a time and at these values, (n,) [1/s]."""
+    found: jax.Array = part.rate(part.decay.effective_gain(t, part.gain, V))
+    return found
+
+
+# --- the least decay of a sum -------------------------------------------------------------------
+
+
+def least_decay(law: Any, mu: jax.Array, t: jax.Array, E: jax.Array) -> jax.Array:
+    """D(t, E), ().
+
+    Args:
+      law: with decays.
+      mu: smallest eigenvalue of M0^-1 K2, () [1/s], for `Backstepping`.
+      t: time, () [s].
+      E: sum of w_j V_j, ().
+    """
+    values = E * jnp.linspace(0.0, 1.0, SHARES + 1)
+    rows = []
+    for part in parts_of(law):
+
+        def of_share(value, part=part):
+            return effective_rate(part, t, value / part.weight) * value
+
+        rows += list(jax.vmap(of_share)(values).T)
+    if isinstance(law, Backstepping):
+        decay = decay_of(law, 1)
+        rows.append(jax.vmap(lambda W: 2.0 * (mu + energy_gain(decay, t, W, law.k1)) * W)(values))
+    # Row m of the table has the indices m - i, where i is the share of the parts before.
+    rest = np.arange(SHARES + 1)[:, None] - np.arange(SHARES + 1)[None, :]
+    total = rows[0]
+    for row in rows[1:]:
+        sums = jnp.where(rest >= 0, total[None, :] + row[np.maximum(rest, 0)], jnp.inf)
+        total = jnp.min(sums, axis=1)
+    return total[-1]
+
+
+def predicted(
+    law: Any, mu: float, start: float, rho2: float, end: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Times from 0 to `end`, and the prediction v of (D.3) at them, by RK4 in ln v.
+
+    Args:
+      law: with decays.
+      mu: as `least_decay`.
+      start: E(0), > 0.
+      rho2: of (D.3).
+      end: end of the run [s].
+    """
+    dtype = jax.tree.leaves(law)[0].dtype
+    gain = jnp.asarray(mu, dtype)
+    fastest = max(
+        float(_least_decay(law, gain, jnp.asarray(t, dtype), jnp.asarray(E, dtype))) / E
+        for t in (0.0, end)
+        for E in (start, VANISHING * start)
+    )
+    count = int(np.clip(np.ceil(end * fastest), *INTERVALS))
+    h = jnp.asarray(end / count, dtype)
+    growth = jnp.asarray(rho2, dtype)
+    logarithm = jnp.log(jnp.asarray(start, dtype))
+    found = [logarithm]
+    for i in range(count):
+        logarithm = _step(law, gain, growth, h, jnp.asarray(i, dtype), logarithm)
+        found.append(logarithm)
+    return np.linspace(0.0, end, count + 1), np.exp(np.asarray(found, float))
+
+
+_least_decay = jax.jit(least_decay)
+
+
+@jax.jit
+def _step(
+    law: Any, mu: jax.Array, rho2: jax.Array, h: jax.Array, i: jax.Array, logarithm: jax.Array
+) -> jax.Array:
+    """The step i of `predicted`."""
+
+    def rate(t, logarithm):
+        v = jnp.exp(logarithm)
+        return (rho2 - least_decay(law, mu, t, v)) / v
+
+    t = i * h
+    k_1 = rate(t, logarithm)
+    k_2 = rate(t + 0.5 * h, logarithm + 0.5 * h * k_1)
+    k_3 = rate(t + 0.5 * h, logarithm + 0.5 * h * k_2)
+    k_4 = rate(t + h, logarithm + h * k_3)
+    return logarithm + h / 6.0 * (k_1 + 2.0 * k_2 + 2.0 * k_3 + k_4)
+
+
+# --- the lines ----------------------------------------------------------------------------------
+
+
+class Course(NamedTuple):
+    """What the lines need of the steps of a segment or of a run, (T,) each."""
+
+    t: np.ndarray
+    total: np.ndarray
+    """E, the sum of w_j V_j."""
+    growth: np.ndarray
+    """g of (D.2)."""
+    noise: np.ndarray
+    """Rounding error of sqrt(2 E)."""
+    excluded: np.ndarray
+
+
+def robot_course(segment: Segment) -> Course:
+    """The course of E = V2 - 1/2 |f_tilde|^2 along a segment, for a law of robots."""
+    proof = segment.proof
+    E = proof.V - 0.5 * np.sum(proof.f_tilde**2, axis=1)
+    if segment.summary.claims.bounds_velocities:
+        return course_of(segment, E, proof.full.growth)
+    growth = np.sum(proof.e2 * proof.f_tilde, axis=1) + proof.dropped_e2
+    return course_of(segment, E, growth)
+
+
+def decay_line(segment: Segment, why_not: str) -> Line:
+    """The inequality (D.2) at every step of a segment, with the gains of each instant, for
+    `Backstepping`.
+    """
+    if why_not:
+        return not_applicable(INEQUALITY, why_not)
+    proof = segment.proof
+    rate = proof.dV - np.sum(proof.f_tilde * proof.df_tilde, axis=1)
+    growth = robot_course(segment).growth
+    tolerance = segment.summary.eps * (proof.dV_size + np.abs(proof.decay))
+    note = segment.summary.exclusion_note
+    return check_steps(segment, INEQUALITY, growth - rate - proof.decay, tolerance, note=note)
+
+
+def why_no_settling(summary: Any) -> str:
+    """Why (D.2) does not apply to a run of a robot; "" if it does."""
+    actuator = summary.run.scenario.actuator
+    if not isinstance(actuator, Ideal):
+        name = checks.with_article(type(actuator).__name__)
+        return f"(D.2) is about a torque that acts as it is commanded, not about {name}"
+    if summary.excluded == summary.samples:
+        return ALWAYS_EXCLUDED
+    return summary.why_invalid  # type: ignore[no-any-return]
+
+
+def course_of(segment: Segment, E: np.ndarray, growth: np.ndarray) -> Course:
+    """The course of E along a segment."""
+    proof = segment.proof
+    eps = float(np.finfo(proof.V.dtype).eps)
+    noise = ENERGY_ROUNDING * eps * proof.sqrt_V_size
+    return Course(segment.t, E, growth, noise, proof.excluded)
+
+
+def settling_lines(summary: Any, courses: list[Course], why_not: str, mu: float) -> list[Line]:
+    """The lines about the settling time of one run.
+
+    Args:
+      summary: of the run.
+      courses: of its segments; none for a law without the claim (D.2).
+      why_not: why (D.2) does not apply to the run; "" if it does.
+      mu: smallest eigenvalue of M0^-1 K2 along the run [1/s]; not used for laws of levels.
+    """
+    if not courses:
+        return []
+    law: Any = summary.claims.law
+    course = Course(*map(np.concatenate, zip(*courses, strict=True)))
+    why_not = why_not or _why_not_from_the_start(summary, course)
+    band, deadline = _band(law), _deadline(law)
+    statements = []
+    if np.isfinite(band):
+        statements.append(TIME)
+    if np.isfinite(deadline):
+        statements.append(AT_DEADLINE)
+    if why_not:
+        return [not_applicable(statement, why_not) for statement in statements]
+    rho2 = max(float(np.max(course.growth)), 0.0)
+    times, v = predicted(law, mu, float(course.total[0]), rho2, float(course.t[-1]))
+    lines = []
+    if np.isfinite(band):
+        lines.append(_time_line(course, times, v, band, rho2))
+    if np.isfinite(deadline):
+        lines.append(_deadline_line(course, times, v, deadline, rho2))
+    return lines
+
+
+def _why_not_from_the_start(summary: Any, course: Course) -> str:
+    """Why (D.3) does not hold from the start of a run on; "" if it does."""
+    if np.any(course.excluded):
+        return "the prediction is from t = 0 on, and the claim excludes some samples"
+    if summary.jumps.size:
+        return "the prediction is from t = 0 on, and the disturbance jumps within the run"
+    if not course.total[0] > 0.0:
+        return "the run starts without an error"
+    return ""
+
+
+def _band(law: Any) -> float:
+    """The least w_j band_j of the decays that state a band; infinite if none does."""
+    found = [np.inf]
+    for part in parts_of(law):
+        stated = decay_member(part.decay, "band")()
+        if stated is not None:
+            found.append(float(np.min(np.asarray(part.weight * stated))))
+    if isinstance(law, Backstepping):
+        stated = decay_member(decay_of(law, 1), "band")()
+        if stated is not None:
+            found.append(float(np.min(np.asarray(stated))))
+    return min(found)
+
+
+def _deadline(law: Any) -> float:
+    """The latest time of the decays that state one [s]; infinite if none does."""
+    stated = [decay_member(decay, "deadline")() for decay in law.decays]
+    times = [float(np.max(np.asarray(time))) for time in stated if time is not None]
+    return max(times, default=np.inf)
+
+
+def _note(rho2: float) -> str:
+    return f"rho2 = {rho2:.4g}"
+
+
+def _time_line(course: Course, times: Any, v: Any, band: float, rho2: float) -> Line:
+    """The time from which E is inside the band, and the predicted one."""
+    note = f"band {band:.4g}, {_note(rho2)}"
+    reached = np.flatnonzero(v <= band)
+    if not reached.size:
+        reason = f"the prediction falls to {v.min():.4g} within the run, and not into the {note}"
+        return not_applicable(TIME, reason)
+    # From there backward v is above the band: ln v is interpolated over the last interval.
+    last = slice(max(reached[0] - 1, 0), reached[0] + 1)
+    time = float(np.interp(-np.log(band), -np.log(v[last]), times[last])) * (1.0 + RELATIVE_ERROR)
+    outside = np.flatnonzero(course.total > band)
+    entered = 0.0
+    if outside.size:
+        entered = np.inf
+        if outside[-1] + 1 < course.t.size:
+            entered = float(course.t[outside[-1] + 1])
+    step = float(course.t[1] - course.t[0])
+    margin = time - entered
+    verdict = "holds" if margin >= -step else "fails"
+    note = f"predicted {time:.4g} s, {note}"
+    return TIME.line(verdict, margin=margin, tolerance=step, value=entered, note=note)
+
+
+def _deadline_line(course: Course, times: Any, v: Any, deadline: float, rho2: float) -> Line:
+    """E at the prescribed time, and what is predicted for it."""
+    at = int(np.searchsorted(course.t, deadline))
+    if at >= course.t.size:
+        return not_applicable(AT_DEADLINE, f"the run ends before T = {deadline:.4g} s")
+    bound = float(np.exp(np.interp(course.t[at], times, np.log(v)))) * (1.0 + RELATIVE_ERROR)
+    tolerance = 0.5 * (np.sqrt(2.0 * bound) + course.noise[at]) ** 2 - bound
+    margin = bound - float(course.total[at])
+    verdict = "holds" if margin >= -tolerance else "fails"
+    note = f"T = {deadline:.4g} s, v(T) = {bound:.4g}, {_note(rho2)}"
+    return AT_DEADLINE.line(
+        verdict,
+        margin=margin,
+        tolerance=float(tolerance),
+        value=float(course.total[at]),
+        time=float(course.t[at]),
+        note=note,
+    )

@@ -1,0 +1,27 @@
+"""The decay with a constant gain."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import jax
+
+from iblf_jax.core.pytree import component
+
+
+@component
+class Exponential:
+    """k(t, V) = k:   z' = -k z, z = sqrt(2V).
+
+    z(t) = z(0) exp(-k t): the error tends to 0 and does not reach it.  This is the decay of a law
+    for which none is given; it is for a level of a law whose other levels have another one.
+
+    Source: M. Krstic, I. Kanellakopoulos, P. Kokotovic, Nonlinear and Adaptive Control Design,
+      1995.
+    """
+
+    constant: ClassVar[bool] = True
+
+    def effective_gain(self, t: jax.Array, k: jax.Array, V: jax.Array) -> jax.Array:
+        """k, (n,) [1/s]."""
+        return k

@@ -1,0 +1,447 @@
+"""Decays against the independent program, in their limits, and through files, batches and code."""
+
+from __future__ import annotations
+
+import dataclasses
+import subprocess
+from functools import partial
+from types import SimpleNamespace
+
+import chain_cases
+import independent_chains
+import independent_decays as other
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import iblf_jax as ij
+from iblf_jax import barriers, controllers, decays, disturbances, observers
+from iblf_jax.certificates import settling
+from iblf_jax.simulation.scenario import canonical
+from iblf_jax.tuning import ranges
+
+FINITE = other.Powers(((2.5, 0.45),), 0.02)
+FIXED = other.Powers(((1.5, 0.4), (0.8, 1.6)), 0.015)
+PRESCRIBED = other.Prescribed(0.8, 3.0, 25.0)
+SECOND = other.Prescribed(0.9, 2.0, 15.0)
+PAIRS = {
+    "finite": (FINITE, other.Powers(((3.0, 0.6),), 0.05)),
+    "fixed": (FIXED, other.Powers(((2.0, 0.5), (1.0, 1.4)), 0.04)),
+    "prescribed": (PRESCRIBED, SECOND),
+    "mixed": (FINITE, SECOND),
+}
+
+
+def of_package(decay):
+    """A decay of the independent program in the package's terms."""
+    if isinstance(decay, other.Prescribed):
+        return decays.PrescribedTime(T=decay.T, gain=decay.order, cap=decay.cap)
+    (k_a, a), *rest = decay.terms
+    if not rest:
+        return decays.FiniteTime(k_a=k_a, a=a, delta=decay.delta)
+    ((k_b, b),) = rest
+    return decays.FixedTime(k_a=k_a, k_b=k_b, a=a, b=b, delta=decay.delta)
+
+
+def arm_scenario(pair, K2=20.0, **parts):
+    """The paper's arm without disturbance, under Mapping with two decays."""
+    law = controllers.Backstepping(
+        k1=2.0,
+        K2=K2,
+        barrier=barriers.Mapping(),
+        reading="corrected",
+        decays=tuple(map(of_package, pair)),
+    )
+    given = {
+        "controller": law,
+        "observer": observers.NoObserver(),
+        "disturbance": disturbances.Nothing(),
+    }
+    return ij.with_parts(ij.presets.zhang_yan_2024(), **(given | parts))
+
+
+@jax.jit
+def torque(scenario, t, q, dq):
+    """The command at one state."""
+    return scenario.controller.command(t, q, dq, jnp.zeros_like(q), scenario.context, ())[0].tau
+
+
+@pytest.mark.parametrize("name", PAIRS)
+def test_torque_of_an_arm_at_random_states(name, rng):
+    first, second = PAIRS[name]
+    scenario, arm = arm_scenario(PAIRS[name]), other.Arm(first=first, second=second)
+    for t in rng.uniform(0.0, 1.1, 40):
+        (_, _), (low, _), (up, _) = arm.tube(t)
+        q = low + (up - low) * rng.uniform(0.05, 0.95, 2)
+        dq = rng.normal(size=2)
+        expected, _, _ = arm.torque(t, q, dq)
+        found = torque(scenario, t, q, dq)
+        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12 * max(abs(expected)))
+
+
+@pytest.mark.parametrize(
+    "name", [x if x == "mixed" else pytest.param(x, marks=pytest.mark.release) for x in PAIRS]
+)
+def test_trajectory_of_an_arm(name):
+    first, second = PAIRS[name]
+    scenario = arm_scenario(PAIRS[name], K2=4.0)
+    run = ij.simulate(scenario, duration=1.0, dt=5e-4, record_every=200)
+    least_smooth = [0.8 - 0.24, 0.8, 0.9 - 4.0 / 15.0, 0.9]
+    arm = other.Arm(K2=np.full(2, 4.0), first=first, second=second)
+    expected = arm.run_at(np.asarray(run.t), least_smooth)
+    np.testing.assert_allclose(run.q, expected[:, :2], atol=1e-7)
+    np.testing.assert_allclose(run.dq, expected[:, 2:], atol=1e-7)
+
+
+SLOWER = other.Prescribed(2.5, 3.0, 20.0)
+CHAINS = {
+    "pendulum": (other.Powers(((0.4, 0.5),), 0.05), FIXED, SLOWER),
+    "coupled": (SLOWER, FINITE, FIXED),
+    "surface": (FINITE, SLOWER, FIXED),
+    "flexible": (SLOWER, FIXED, FINITE, SLOWER),
+}
+
+
+def chain_with(name, levels):
+    """A case of the independent program, and its scenario, with a decay for each level."""
+    case = dataclasses.replace(independent_chains.CASES[name], decays=levels)
+    scenario = chain_cases.scenario(name)
+    law = dataclasses.replace(scenario.controller, decays=tuple(map(of_package, levels)))
+    return case, ij.with_parts(scenario, controller=law)
+
+
+@partial(jax.jit, static_argnames="filtered")
+def commanded(scenario, t, x, d_hat, beta, filtered):
+    """The command of a law of levels at one state."""
+    state = beta if filtered else ()
+    return scenario.controller.command(t, x, d_hat, scenario.context, state)[0]
+
+
+@pytest.mark.parametrize("name", CHAINS)
+def test_input_of_a_chain_at_random_states(name):
+    case, scenario = chain_with(name, CHAINS[name])
+    tables = (independent_chains.SPREAD, independent_chains.NOISE)
+    data = independent_chains.points(case, *(table.get(name) for table in tables))
+    filtered = case.filter is not None
+    betas = data["beta"] if filtered else np.zeros((len(data["t"]), 0))
+    worst = 0.0
+    for i, beta in enumerate(betas):
+        x, d_hat = data["x"][i], data["d_hat"][i]
+        found = commanded(scenario, data["t"][i], x, d_hat, beta, filtered)
+        size = np.max(np.abs(data["u"][i]))
+        worst = max(worst, np.max(np.abs(found.tau - data["u"][i])) / size)
+    assert worst < 1e-12
+
+
+PRESCRIBED_CHAIN = (SLOWER, other.Prescribed(2.0, 3.0, 15.0), other.Prescribed(1.5, 3.0, 12.0))
+
+
+def free_pendulum(levels):
+    """The pendulum with its motor without a disturbance, bounded on its first level, with decays:
+    a case of the independent program, and its scenario.
+    """
+    quadratic = independent_chains.quadratic
+    case = dataclasses.replace(
+        independent_chains.PENDULUM,
+        barriers=(independent_chains.prescribed_performance, quadratic, quadratic),
+        bounds=(independent_chains.PENDULUM.bounds[0], None, None),
+        disturbance=lambda t, x: [[0.0]] * 3,
+        kappa=(0.0, 0.0, 0.0),
+        decays=levels,
+    )
+    law = dataclasses.replace(
+        chain_cases.scenario("pendulum").controller,
+        barriers=(barriers.PrescribedPerformance(), barriers.Quadratic(), barriers.Quadratic()),
+        decays=tuple(map(of_package, levels)),
+    )
+    nothing = {"disturbance": disturbances.Nothing(), "observer": observers.NoObserver()}
+    return case, chain_cases.scenario(
+        "pendulum", controller=law, state_bounds=(None, None), **nothing
+    )
+
+
+@pytest.mark.parametrize(
+    "levels",
+    [PRESCRIBED_CHAIN, pytest.param((FINITE, FIXED, FINITE), marks=pytest.mark.release)],
+)
+def test_trajectory_of_order_three_and_its_settling_time(levels):
+    case, scenario = free_pendulum(levels)
+    run = ij.simulate(scenario, duration=3.0, dt=1e-3, record_every=100)
+    start = np.asarray(independent_chains.start(case))
+    expected = independent_chains.integrate(case, np.asarray(run.t), start)
+    np.testing.assert_allclose(run.x[..., 0], expected[:, :3], atol=1e-7)
+    certificate = ij.certify(scenario, run)
+    assert certificate["equality"].verdict == "holds"
+    name = "prescribed time" if levels is PRESCRIBED_CHAIN else "settling time"
+    assert certificate[name].verdict == "holds", certificate[name]
+    assert certificate.holds
+
+
+def test_settling_time_of_an_arm_and_the_case_in_which_it_is_broken():
+    scenario = arm_scenario(PAIRS["fixed"])
+    certificate = ij.certify(scenario, duration=0.6, dt=1e-3)
+    assert certificate.holds
+    assert certificate["inequality, decays"].verdict == "holds"
+    line = certificate["settling time"]
+    assert line.verdict == "holds"
+    assert 0.1 < line.value < line.value + line.margin < 0.6
+
+    law = canonical(scenario).controller
+    t = np.linspace(0.0, 1.0, 1001)
+    slow = settling.Course(t, 0.3 * np.exp(-2.0 * t), 0.0 * t, 0.0 * t, np.zeros(1001, bool))
+    summary = SimpleNamespace(claims=SimpleNamespace(law=law), jumps=np.zeros(0))
+    (broken,) = settling.settling_lines(summary, [slow], "", 20.0)
+    assert broken.verdict == "fails"
+
+
+@pytest.mark.release
+def test_settling_time_of_a_law_with_bounds_on_velocities():
+    scenario = ij.presets.zhang_yan_2024_full_state()
+    finite = decays.FiniteTime(k_a=1.0, delta=0.05)
+    scenario = ij.with_parts(
+        scenario,
+        controller=dataclasses.replace(scenario.controller, decays=finite),
+        disturbance=disturbances.Nothing(),
+        observer=observers.Momentum(kf=20.0),
+    )
+    certificate = ij.certify(scenario, duration=2.0, dt=1e-3)
+    assert certificate["barriers"].verdict == "holds"
+    assert certificate["settling time"].verdict == "holds"
+
+
+def test_the_least_decay_of_a_sum_is_that_of_the_worst_distribution(rng):
+    """D(t, E) against random distributions of E over the parts, and against their best."""
+    law = canonical(arm_scenario(PAIRS["fixed"])).controller
+    first, second = law.decays
+    mu, E, t = 20.0, 0.7, jnp.asarray(0.3)
+    least = float(settling.least_decay(law, jnp.asarray(mu), t, jnp.asarray(E)))
+
+    @jax.jit
+    @jax.vmap
+    def decay(shares):
+        V1, W = E * shares[:2], E * shares[2]
+        g = jnp.mean(second.effective_gain(t, jnp.zeros(2), jnp.full(2, W)))
+        gain = first.effective_gain(t, law.k1, V1)
+        return jnp.sum(2.0 * gain * V1) + 2.0 * (mu + g) * W
+
+    found = np.asarray(decay(jnp.asarray(rng.dirichlet([0.4, 0.4, 0.05], 20_000))))
+    assert least <= np.min(found) * (1.0 + settling.RELATIVE_ERROR)
+    assert least >= np.min(found) * 0.98
+
+
+# --- what a decay is by itself --------------------------------------------------------------------
+
+Z = jnp.asarray([1e-4, 3e-3, 0.05, 0.8, 6.0])
+K = jnp.full(5, 2.0)
+
+
+def gains(decay, t=0.0, k=K):
+    """The gain at several values of z = sqrt(2V)."""
+    return np.asarray(decay.effective_gain(jnp.asarray(t), k, 0.5 * Z**2))
+
+
+def test_limits():
+    np.testing.assert_allclose(gains(decays.FiniteTime(k_a=3.0, a=1.0)), 5.0)
+    np.testing.assert_allclose(gains(decays.FixedTime(3.0, 4.0, a=1.0, b=1.0)), 9.0)
+    np.testing.assert_allclose(gains(decays.PrescribedTime(T=1e9)), 2.0, rtol=1e-8)
+    capped = decays.PrescribedTime(T=1.0, gain=3.0, cap=30.0)
+    np.testing.assert_allclose(gains(capped, t=1.0), 32.0, rtol=1e-14)
+    np.testing.assert_allclose(gains(capped, t=70.0), 32.0, rtol=1e-14)
+    np.testing.assert_allclose(gains(capped, t=0.8 - 1e-9), 2.0 + 3.0 / 0.2, rtol=1e-7)
+    np.testing.assert_allclose(gains(decays.FiniteTime(1.5, 0.4, 1e-9)), 2.0 + 1.5 * Z**-0.6)
+
+
+def test_the_gain_of_prescribed_time_rises_from_the_start_to_the_cap():
+    decay = decays.PrescribedTime(T=1.0, gain=3.0, cap=30.0)
+    times = jnp.linspace(0.0, 1.5, 3001)
+    found = np.asarray(jax.vmap(lambda t: decay.effective_gain(t, K[:1], K[:1]))(times))[:, 0]
+    assert np.all(np.diff(found) >= -1e-12)
+    pole = 2.0 + 3.0 / np.maximum(1.0 - np.asarray(times), 1e-9)
+    assert np.all(found <= np.minimum(pole, 32.0) + 1e-12)
+
+
+def test_times_to_the_band_are_below_their_closed_forms(rng):
+    """The claims of the docstrings, by quadrature of the smoothed equations."""
+    for _ in range(60):
+        k, k_a, k_b = rng.uniform(0.2, 4.0, 3)
+        a, b = rng.uniform(0.2, 0.9), rng.uniform(1.1, 2.5)
+        delta, z0 = 10.0 ** rng.uniform(-4.0, -0.5), 10.0 ** rng.uniform(-0.2, 1.5)
+        smoothed = k_a * 2.0 ** ((a - 1.0) / 2.0)
+        finite = other.time_to_band(k, other.Powers(((k_a, a),), delta), z0, delta)
+        bound = np.log(1.0 + k * z0 ** (1.0 - a) / smoothed) / (k * (1.0 - a))
+        assert 0.0 < finite <= bound
+        powers = other.Powers(((k_a, a), (k_b, b)), delta)
+        fixed = other.time_to_band(0.0, powers, z0, delta)
+        assert 0.0 < fixed <= 1.0 / (smoothed * (1.0 - a)) + 1.0 / (k_b * (b - 1.0))
+
+
+BARRIERS = (
+    barriers.Integral(),
+    barriers.Log(p=2),
+    barriers.Tan(),
+    barriers.State(),
+    barriers.PrescribedPerformance(),
+    barriers.Mapping(),
+    barriers.Quadratic(),
+)
+
+
+@pytest.mark.parametrize("barrier", BARRIERS, ids=lambda barrier: type(barrier).__name__)
+def test_v_decays_at_the_rate_of_the_gain_of_the_instant(barrier, rng):
+    """V1' <= -rate(k(t, V1)) V1 along q' = alpha, an equality where the barrier states one."""
+    law = controllers.Backstepping(2.0, 20.0, barrier=barrier, decays=of_package(FIXED))
+    scenario = ij.with_parts(ij.presets.zhang_yan_2024(), controller=law)
+    context, decay = scenario.context, scenario.controller.decays[0]
+
+    @jax.jit
+    def rates(t, xi):
+        tube = context.tube(t)
+        q = tube.q_d + xi * jnp.where(xi > 0, tube.k_u, tube.k_l)
+        V = barrier.value(tube, q)
+        gain = decay.effective_gain(t, scenario.controller.k1, V)
+        alpha = barrier.virtual_velocity(tube, q, gain, scenario.controller.o)
+
+        def value(t, q):
+            return barrier.value(context.tube(t), q)
+
+        return jax.jvp(value, (t, q), (jnp.ones_like(t), alpha))[1], barrier.decay_rate(gain) * V
+
+    excess = []
+    for t in rng.uniform(0.0, 6.0, 60):
+        dV, decayed = rates(jnp.asarray(t), jnp.asarray(rng.uniform(-0.95, 0.95, 2)))
+        excess.append((dV + decayed) / (1.0 + decayed))
+    assert np.max(excess) < 1e-12
+    is_exact = isinstance(barrier, barriers.Mapping | barriers.Tan | barriers.Quadratic)
+    assert np.min(excess) > -1e-12 or not is_exact
+
+
+# --- in the package -------------------------------------------------------------------------------
+
+
+def test_a_law_with_exponential_decays_is_the_law_without():
+    plain = arm_scenario(())
+    constant = ij.with_parts(
+        plain, controller=dataclasses.replace(plain.controller, decays=decays.Exponential())
+    )
+    varied = ["initial.q"]
+    assert ij.explain(constant, varied=varied).counts == ij.explain(plain, varied=varied).counts
+
+
+@pytest.mark.parametrize("name", PAIRS)
+def test_operations_are_at_most_half_more_than_those_of_the_law(name):
+    def operations(pair):
+        counts = ij.explain(arm_scenario(pair), varied=["initial.q"]).counts
+        return sum(counts["a step and run"].values()) + sum(counts["a step, shared"].values())
+
+    assert operations(PAIRS[name]) < 1.5 * operations(())
+
+
+def test_files_units_batches_and_gradients(tmp_path):
+    scenario = arm_scenario(PAIRS["mixed"])
+    ij.save_scenario(scenario, tmp_path / "arm.toml")
+    loaded = ij.load_scenario(tmp_path / "arm.toml")
+    assert jax.tree.structure(loaded) == jax.tree.structure(scenario)
+    units = {p.path: p.unit for p in ij.parameters(loaded)}
+    assert units["controller.decays[0].delta"] == "rad"
+    assert units["controller.decays[1].T"] == "s"
+
+    paths = {"controller.decays[0].k_a": ij.factor(ij.uniform(0.5, 2.0))}
+    settings = {"duration": 0.3, "dt": 1e-3}
+    study = ij.monte_carlo(loaded, paths, runs=4, progress=False, **settings)
+    again = study.replay(2)
+    np.testing.assert_allclose(again.metrics.rmse, study.metrics.rmse[2], rtol=1e-12)
+
+    path = "controller.decays[1].T"
+
+    def last_error(value):
+        moved = ij.with_parameters(scenario, {path: value})
+        return jnp.sum(ij.simulate(moved, **settings).e1[-1] ** 2)
+
+    slope = jax.grad(last_error)(0.9)
+    difference = (last_error(0.9 + 1e-5) - last_error(0.9 - 1e-5)) / 2e-5
+    np.testing.assert_allclose(slope, difference, rtol=1e-5)
+
+
+@pytest.mark.filterwarnings("ignore:the simulated run")
+def test_the_c_of_a_law_with_decays_gives_the_torques_of_simulate(tmp_path, monkeypatch):
+    monkeypatch.setattr("iblf_jax.deployment.export.VECTORS_DURATION", 0.2)
+    ij.export(arm_scenario(PAIRS["mixed"], K2=4.0), tmp_path, period=1e-3)
+    files = ["iblf_law.c", "selftest.c", "-lm", "-o", "selftest"]
+    subprocess.run(["gcc", "-std=c99", *files], cwd=tmp_path, check=True)
+    subprocess.run(["./selftest"], cwd=tmp_path, check=True)
+
+
+def test_units_of_the_levels_of_a_plant():
+    law = controllers.BarrierBackstepping(
+        k=(2.0, 20.0, 60.0),
+        barriers=(barriers.PrescribedPerformance(), barriers.Quadratic(), barriers.Quadratic()),
+        decays=decays.FiniteTime(k_a=0.1),
+    )
+    scenario = ij.with_parts(ij.presets.motor_driven_pendulum(), controller=law, state_bounds=())
+    units = {p.path: p.unit for p in ij.parameters(scenario)}
+    found = [units[f"controller.decays[{i}].delta"] for i in range(3)]
+    levels = [ij.plants.units_of(scenario.plant)[i] for i in (1, 2)]
+    assert found == ["1", *levels]
+
+
+@pytest.mark.parametrize(
+    ("make", "match"),
+    [
+        (lambda: decays.FiniteTime(k_a=1.0, a=-0.2), r"FiniteTime\.a"),
+        (lambda: decays.FiniteTime(k_a=1.0, delta=0.0), r"FiniteTime\.delta"),
+        (
+            lambda: controllers.Backstepping(2.0, 20.0, decays=(decays.Exponential(),) * 3),
+            "2 decays, one a level",
+        ),
+        (
+            lambda: controllers.Backstepping(2.0, 20.0, decays=barriers.Log()),
+            r"Backstepping\.decays\[0\]",
+        ),
+    ],
+)
+def test_refusals(make, match):
+    with pytest.raises(ValueError, match=match):
+        make()
+
+
+def test_prescribed_time_is_refused_above_order_five():
+    plant = ij.plants.StrictFeedback(
+        lambda t, x: 0.0 * x, lambda t, x: jnp.ones_like(x), n=1, order=6
+    )
+    law = controllers.BarrierBackstepping(
+        k=(1.0,) * 6, barriers=barriers.Quadratic(), decays=decays.PrescribedTime(T=1.0)
+    )
+    scenario = ij.Scenario(
+        plant=plant,
+        reference=ij.references.Sinusoid(offset=0.0, amplitude=0.1, frequency=1.0),
+        bounds=ij.Bounds(ij.bounds.Constant(-1.0), ij.bounds.Constant(1.0)),
+        controller=law,
+        initial=ij.Initial(x=[[0.1]] * 6),
+    )
+    with pytest.raises(ValueError, match="5 continuous derivatives"):
+        ij.simulate(scenario, duration=0.1, dt=1e-2)
+
+
+def test_the_closed_form_of_prescribed_time_on_all_levels_of_order_three():
+    """With one decay and one gain on all levels V(t) = V(0) exp(-2 k t) ((T - t)/T)^(2 gain)."""
+    T, gain, cap, k = 1.0, 3.0, 30.0, 2.0
+    _, scenario = free_pendulum((other.Prescribed(T, gain, cap),) * 3)
+    law = dataclasses.replace(scenario.controller, k=(k,) * 3, c=0.0)
+    scenario = ij.with_parts(scenario, controller=law)
+    run = ij.simulate(scenario, duration=0.8, dt=5e-4, record_every=50)
+    t = np.asarray(run.t)
+    expected = run.V[0] * np.exp(-2.0 * k * t) * (1.0 - t / T) ** (2.0 * gain)
+    np.testing.assert_allclose(run.V, expected, rtol=1e-7)
+
+
+def test_ranges_of_the_powers_end_at_one():
+    scenario = canonical(arm_scenario(PAIRS["fixed"]))
+    a, b = (f"controller.decays[0].{name}" for name in "ab")
+    starts = {path: np.full(2, value) for path, value in ((a, 0.4), (b, 1.6))}
+    lows, highs = (
+        ends(scenario, {path: starts[path]}, 1e-3, "rk4")[path]
+        for ends, path in ((ranges.default_lows, b), (ranges.default_highs, a))
+    )
+    assert lows.value == highs.value == 1.0
+    assert "power" in lows.reason
