@@ -156,7 +156,7 @@ def test_friction_of_the_agents_robots_acts_on_the_plant(rng):
     np.testing.assert_allclose(difference, expected, rtol=1e-10)
 
 
-def test_studies_files_and_certificate(tmp_path):
+def test_studies_and_files(tmp_path):
     one = scenario()
     file = tmp_path / "agents.toml"
     ij.save_scenario(one, file)
@@ -171,7 +171,18 @@ def test_studies_files_and_certificate(tmp_path):
         dt=2e-3,
         progress=False,
     )
-    assert study.failed_count == 0
+    assert not np.any(study.failed)
+
+
+@pytest.mark.release
+@pytest.mark.parametrize("distributed", [False, True])
+def test_the_certificate_of_the_levels_holds(distributed):
+    """With filters the equality (S.3) contains their lag, which the certificate reports."""
+    found = ij.certify(scenario(distributed), duration=1.0, dt=1e-3)
+    assert found.holds
+    assert found["equality"].verdict == "holds"
+    if distributed:
+        assert any("ultimate boundedness" in note for note in repr(found).splitlines())
 
 
 def test_more_agents_cost_in_proportion_to_their_number():
