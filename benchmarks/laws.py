@@ -84,7 +84,6 @@ CHOICES = {
     "FullState": Choice("full_state", {"velocity_bounds": _box(3.0)}),
     "DynamicSurface": Choice("dynamic_surface"),
     "SurfaceBarrier": Choice(controllers.SurfaceBarrier(a=2.0, K=K2, surface=_box(9.0))),
-    "AdaptiveRBF": Choice("adaptive_rbf"),
     "SafetyFilter": Choice("safety_filter"),
     "ReferenceGovernor": Choice("reference_governor"),
     "ComputedTorque": Choice("computed_torque"),

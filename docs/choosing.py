@@ -53,10 +53,6 @@ WORDS = {
         "a single barrier on the combination of position and velocity suffices",
         "each position has a bound of its own, which it does not keep",
     ),
-    "AdaptiveRBF": Advice(
-        "the uncertain term depends on the state and repeats itself",
-        "an observer is at hand, which needs no time to learn",
-    ),
     "SafetyFilter": Advice(
         "a law without bounds exists already and must not leave them",
         "the law itself can have a barrier",
