@@ -52,6 +52,7 @@ def is_executed(notebook: Path) -> bool:
 def assemble() -> None:
     """Puts all pages together."""
     import barriers
+    import choosing
     import flags
     import gallery
     import measured
@@ -91,6 +92,7 @@ def assemble() -> None:
     reference.write(SOURCE / "reference")
     flags.write(SOURCE / "how_to")
     barriers.write(SOURCE / "theory")
+    choosing.write(SOURCE / "how_to")
     measured.write(SOURCE / "benchmarks.md")
     shutil.copy(ROOT / "benchmarks" / "README.md", SOURCE / "lab_notes.md")
     shutil.copy(ROOT / "CONTRIBUTING.md", SOURCE / "contributing.md")

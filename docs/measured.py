@@ -56,6 +56,11 @@ PLOTS = {
         "The constraints that each law satisfies, and the processor time of a step; less is"
         " better.",
     ),
+    "laws": Plot(
+        ("law",),
+        "error [mrad]",
+        "Laws at equal effort; the page on choosing a law has the details. Less is better.",
+    ),
     "tuning": Plot(
         ("search",),
         "rollouts to 0.5 %",

@@ -88,7 +88,20 @@ PLANTS = {
     ),
 }
 
+PAIR = plants.Agents(
+    agents=(
+        robots.PlanarChain(mass=[1.3], length=[0.4], centre=[0.2], inertia=[0.02]),
+        robots.PlanarChain(mass=[0.9], length=[0.5], centre=[0.3], inertia=[0.01]),
+    ),
+    adjacency=((0.0, 0.5), (1.0, 0.0)),
+    leader=(1.0, 0.0),
+)
+PLANTS |= {"agents": PAIR, "neighbour_model": PAIR.neighbours()}
+
 REFERENCES = {
+    "leader": references.Leader(
+        motion=references.Sinusoid(offset=0.5, amplitude=0.14), weights=(1.0, 0.4), components=1
+    ),
     "sinusoid": references.Sinusoid(
         offset=0.5, amplitude=[0.14, 0.1], frequency=1.0, phase=[0.0, 1.57]
     ),

@@ -41,11 +41,13 @@ component_member = OptionalMembers(
     rows=MappingProxyType({}),
     stacked=MappingProxyType({}),
     leaf_units=dict,
+    own_joints=MappingProxyType({}),
     symbols_of_part=lambda field, index, symbols: symbols,
 )
 """Reads what a component may declare: the field that holds a wrapped component, rows with names,
 names for several leaves as the rows of one array, a function of the units of leaves that depend on
-other fields, and one of the units of the symbols in its parts, `symbols_of_part(field, index,
+other fields, the number of joints of parts (field -> number) whose number differs from that of the
+scenario, and a function of the units of the symbols in its parts, `symbols_of_part(field, index,
 symbols)`."""
 
 

@@ -271,7 +271,8 @@ def motion(
     robot = plants.robot_of(plant)
     disturbance = scenario.disturbance
     if robot is None:
-        torque: jax.Array | float = 0.0
+        friction = plants.plant_member(plant, "friction_torque")
+        torque: jax.Array | float = 0.0 if friction is None else friction(x)
         u = u + disturbance.torque(t, q, dq, plant, model)
     else:
         known = plants.robot_of(model)

@@ -36,6 +36,7 @@ from iblf_jax.core.pytree import (
     Leaf,
     astype,
     component,
+    component_member,
     field_values,
     is_leaf_field,
     layers,
@@ -606,11 +607,12 @@ def fit_joints(part: Any, n: int, path: str) -> Any:
         return part
     new: dict[str, Any] = {}
     values = field_values(part)
+    own_joints = component_member(part, "own_joints")
     for field in dataclasses.fields(part):
         old = values[field.name]
         name = f"{path}.{field.name}"
         if not is_leaf_field(field):
-            value = fit_joints(old, n, name)
+            value = fit_joints(old, own_joints.get(field.name, n), name)
         elif field.metadata["shape"] == "joint" and old is not None:
             value = _fit_leaf(old, n, name)
         elif field.metadata["shape"] == "level" and old is not None:
@@ -970,7 +972,8 @@ def _check_levels_at_start(scenario: Scenario) -> None:
         if plants.is_chain(plant):
             levels = x[: plant.order]
             _check_gains(name, np.asarray(plant.gain(t, levels)))
-            if not isinstance(plant, plants.OF_KNOWN_STRUCTURE):
+            filtered = name == "model" and plants.plant_member(plant, "needs_filters")
+            if not filtered and not isinstance(plant, plants.OF_KNOWN_STRUCTURE):
                 plants.check_dependence(name, _dependence_near(plant, t, levels))
 
 

@@ -121,13 +121,21 @@ def _at(method: Any, level: int) -> Any:
     return lambda *args: method(level, *args)
 
 
-def _structure(findings: Findings, plant: Any, t: jax.Array, points: jax.Array) -> None:
-    """Requires rows that depend on no later level, invertible gains, and finite derivatives."""
+def _dependence(findings: Findings, plant: Any, t: jax.Array, points: jax.Array) -> None:
+    """Requires rows of drift and gain that depend on no later level."""
     of_points = jax.vmap(lambda x: plants.dependence_on_levels(plant, t, x))
     try:
         plants.check_dependence("the plant", jax.jit(of_points)(points))
     except ValueError as error:
         findings.stop(str(error).removesuffix("."))
+
+
+def _structure(findings: Findings, plant: Any, t: jax.Array, points: jax.Array) -> None:
+    """Requires rows that depend on no later level, except for the model of a law with filters;
+    invertible gains, and finite derivatives.
+    """
+    if not plant_member(plant, "needs_filters"):
+        _dependence(findings, plant, t, points)
     gains = np.asarray(jax.vmap(lambda x: plant.gain(t, x))(points))
     finite = np.isfinite(gains).all()
     findings.require(finite, "gain(t, x) is not finite", "Give states by x=..., or look at poles")

@@ -19,6 +19,7 @@ from iblf_jax.core.caches import memoised
 from iblf_jax.core.linalg import matvec
 from iblf_jax.core.optional import OptionalMembers
 from iblf_jax.core.pytree import Leaf, component, leaf, static
+from iblf_jax.core.time import jump_times_of
 from iblf_jax.core.units import POSITION
 
 
@@ -242,6 +243,55 @@ class Ellipse:
         return jnp.stack([north, east, heading])
 
 
+@component
+class Leader:
+    """y_d = b kron x_0 + offset: a leader's motion as the reference of `plants.Agents`.
+
+    y_d is the position of the agents relative to their neighbours when each follows the leader,
+    (H kron I)(1 x_0 + delta) = b kron x_0 + (H kron I) delta, because H 1 = b.
+    `plants.Agents.reference` makes it.
+
+    Args:
+      motion: x_0(t), any of `iblf_jax.references`, of m components.
+      weights: b_i with which each agent measures its position relative to the leader, N numbers.
+      components: m, the number of components of an agent.
+      offset: (H kron I) delta of a formation, (N m,) in the unit of the positions; 0 if not given.
+
+    Source: F. L. Lewis, H. Zhang, K. Hengster-Movric, A. Das, Cooperative Control of Multi-Agent
+      Systems, 2014, chapter 3.
+    """
+
+    motion: Reference
+    weights: tuple[float, ...] = static()
+    components: int = static()
+    offset: Leaf = leaf(POSITION, default=0.0)
+
+    def check(self) -> None:
+        """Raises ValueError for something that is no reference, or no number of components."""
+        checks.conforms("Leader.motion", self.motion, Reference, "iblf_jax.references has them.")
+        checks.positive_integer("Leader.components", self.components)
+
+    @property
+    def own_joints(self) -> dict[str, int]:
+        """The number of components for which the leaves of the motion are given."""
+        return {"motion": self.components}
+
+    @property
+    def continuous_derivatives(self) -> float:
+        """Number of continuous derivatives, those of the motion."""
+        return float(reference_member(self.motion, "continuous_derivatives"))
+
+    def position(self, t: jax.Array) -> jax.Array:
+        """y_d(t), (N m,), in the unit of the positions."""
+        x_0 = jnp.broadcast_to(self.motion.position(t), (self.components,))
+        followed = [weight * x_0 if weight else jnp.zeros_like(x_0) for weight in self.weights]
+        return jnp.concatenate(followed) + self.offset
+
+    def jump_times(self) -> jax.Array:
+        """The times at which the motion jumps, (k,) [s]."""
+        return jump_times_of("motion", self.motion)
+
+
 @memoised(32)
 def _cardinal_splines(times: tuple[float, ...], derivatives: int) -> tuple[np.ndarray, np.ndarray]:
     """Breakpoints (p + 1,) and coefficients (2 derivatives + 2, p, m), highest power first, of the
@@ -278,5 +328,6 @@ MEMBERS = {
     "smooth_step": SmoothStep,
     "waypoint_spline": WaypointSpline,
     "ellipse": Ellipse,
+    "leader": Leader,
 }
 """Every reference by the name that a scenario file gives it."""

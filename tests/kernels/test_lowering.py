@@ -41,6 +41,9 @@ SPECIAL = {
     "waypoint_spline": lambda cls: cls(
         times=(0.0, 1.0, 2.5), waypoints=[[0.5, 0.6], [0.6, 0.4], [0.5, 0.5]]
     ),
+    "leader": lambda cls: cls(
+        motion=ij.references.Sinusoid(offset=0.5, amplitude=0.14), weights=(1.0, 1.1), components=1
+    ),
     "quintic": lambda cls: cls(start=0.5, end=0.6, duration=2.0),
     "smooth_step": lambda cls: cls(start=0.5, end=0.6, duration=2.0),
     "sum": lambda cls: cls(

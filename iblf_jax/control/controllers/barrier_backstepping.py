@@ -215,6 +215,11 @@ class BarrierBackstepping:
             expected = f"{order} levels, as the model ({kind}) has"
             remedy = "Give k, barriers and weights one entry a level."
             raise checks.fail("controller.k", f"{self.order} levels", expected, remedy)
+        if self.filter is None and plants.plant_member(context.model, "needs_filters"):
+            kind = type(context.model).__name__
+            expected = f"filters in place of the derivatives that {kind} does not have"
+            remedy = "Such as BarrierBackstepping(..., filter=0.01)."
+            raise checks.fail("controller.filter", None, expected, remedy)
         self._check_reference(context)
         for i, barrier in enumerate(self.barriers):
             self._check_sides(context, i)

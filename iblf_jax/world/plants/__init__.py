@@ -27,6 +27,8 @@ from iblf_jax.world.plants._base import unit_symbols as unit_symbols
 from iblf_jax.world.plants._base import units_of as units_of
 from iblf_jax.world.plants._modes import SWITCHING_UNITS as SWITCHING_UNITS
 from iblf_jax.world.plants._modes import ModeValues as ModeValues
+from iblf_jax.world.plants.agents import Agents as Agents
+from iblf_jax.world.plants.agents import NeighbourModel as NeighbourModel
 from iblf_jax.world.plants.driven_pendulum import DrivenPendulum as DrivenPendulum
 from iblf_jax.world.plants.electric_drive import ElectricDrive as ElectricDrive
 from iblf_jax.world.plants.flexible_joint import FlexibleJoint as FlexibleJoint
@@ -45,6 +47,8 @@ def as_plant(part: Any) -> Plant:
 
 
 MEMBERS = {
+    "agents": Agents,
+    "neighbour_model": NeighbourModel,
     "rigid": Rigid,
     "driven_pendulum": DrivenPendulum,
     "electric_drive": ElectricDrive,
@@ -61,10 +65,12 @@ OF_KNOWN_STRUCTURE = (Rigid, DrivenPendulum, ElectricDrive, FlexibleJoint, Vesse
 
 __all__ = [
     "MEMBERS",
+    "Agents",
     "DrivenPendulum",
     "ElectricDrive",
     "FlexibleJoint",
     "MarkovSwitched",
+    "NeighbourModel",
     "Plant",
     "Rigid",
     "StrictFeedback",

@@ -74,6 +74,10 @@ class Plant(Protocol):
       and the plant with these modes.
     - `switching(end)`: results about the modes of a run that ends at this time, by name;
       `has_complete_path(end)`: whether all of its switches are known.
+    - `friction_torque(x)`: of a plant with several robots inside, the friction of their joints,
+      (n,) [N m], which belongs to the plant only and is passed to `level_rate` as its torque.
+    - `needs_filters`: whether the drift depends on a later level whose derivatives no law may form.
+      Such a plant is the model of a law with filters, and never the plant of a scenario.
     - `at(t)` and `jump_times()`: as `iblf_jax.robots.Robot`.
     """
 
@@ -120,6 +124,8 @@ plant_member = OptionalMembers(
     nominal=None,
     mode_draws=0,
     switching=None,
+    friction_torque=None,
+    needs_filters=False,
 )
 """Reads optional members of a plant."""
 

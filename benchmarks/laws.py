@@ -1,0 +1,200 @@
+"""Choosing a law: accuracy, peak torque and robustness of every law at equal effort.
+
+    python benchmarks/laws.py [--quick] [--json FILE] [--only NAME]
+
+The paper's arm, reference, bounds and disturbance.  The gains of each law are scaled by the factor
+at which its RMS torque above gravity is that of the first law (`ij.compare`).  Errors are the
+largest |e1| of both joints in the second half of a run, so that the start does not count:
+
+- `error`: continuous law, exact model.
+- `peak torque`: of the entire run.
+- `error, masses +-30 %`: the larger error of two plants whose masses are 0.7 and 1.3 times those of
+  the model.
+- `error, encoder and 10 ms`: law and observer run once in 10 ms and read an encoder of 65536
+  counts, with filtered differences as velocities.
+- `ripple`: the RMS difference of the torque with this encoder, at a period of 1 ms, from that of
+  the continuous law.
+- `delay`: the longest delay of the torque of the list `DELAYS`, with this encoder at a period of
+  1 ms, for which this and every shorter delay leaves the arm inside its bounds.
+
+"left" is a run that leaves the bounds or diverges, and "own" a law that has no factor in [1/32, 32]
+at which its effort is that of the first law, and runs at its own gains.  A new law is one entry of
+`CHOICES`; `docs/choosing.py` makes the page.
+"""
+
+from __future__ import annotations
+
+import argparse
+import warnings
+from typing import Any, NamedTuple
+
+import jax
+
+jax.config.update("jax_enable_x64", True)
+
+import numpy as np
+from _timing import report
+
+import iblf_jax as ij
+from iblf_jax import barriers, bounds, controllers, sensors
+
+DT, DURATION = 1e-3, 4.0
+"""s, s."""
+DELAYS = (1e-3, 2e-3, 4e-3, 8e-3, 16e-3, 32e-3)
+"""s."""
+K2, COUNTS = 2.0, 65536
+"""N m s/rad, a tenth of the paper's, so that periods of milliseconds are possible; counts of the
+encoder, as of a geared joint."""
+LEFT, OWN = "left", "own"
+COLUMNS = [
+    "law",
+    "factor",
+    "error [mrad]",
+    "peak torque [N m]",
+    "error, masses +-30 % [mrad]",
+    "error, encoder and 10 ms [mrad]",
+    "ripple [N m]",
+    "delay [ms]",
+]
+
+
+class Choice(NamedTuple):
+    """A law of the table."""
+
+    law: Any
+    """A name of `ij.compare`, or a law."""
+    parts: dict[str, Any] = {}  # noqa: RUF012 - a constant
+    """Parts of the scenario that the law needs, such as bounds on velocities."""
+
+
+def _box(limit: float) -> ij.Bounds:
+    """The same two constant bounds for all joints."""
+    return ij.Bounds(lower=bounds.Constant(-limit), upper=bounds.Constant(limit))
+
+
+CHOICES = {
+    "Backstepping(Integral)": Choice("integral"),
+    "Backstepping(Log)": Choice("log"),
+    "Backstepping(Tan)": Choice("tan"),
+    "Backstepping(Mapping)": Choice(
+        controllers.Backstepping(k1=2.0, K2=K2, barrier=barriers.Mapping(), reading="corrected")
+    ),
+    "Backstepping, no bounds": Choice("backstepping"),
+    "BarrierBackstepping(Mapping)": Choice(controllers.BarrierBackstepping(k=(2.0, 20.0))),
+    "FullState": Choice("full_state", {"velocity_bounds": _box(3.0)}),
+    "DynamicSurface": Choice("dynamic_surface"),
+    "SurfaceBarrier": Choice(controllers.SurfaceBarrier(a=2.0, K=K2, surface=_box(9.0))),
+    "SafetyFilter": Choice("safety_filter"),
+    "ReferenceGovernor": Choice("reference_governor"),
+    "ComputedTorque": Choice("computed_torque"),
+    "PDGravity": Choice("pd"),
+}
+"""Name in the table -> law.  The first one sets the effort."""
+
+
+def row(name: str, duration: float = DURATION) -> list[Any]:
+    """The numbers of a law."""
+    first = next(iter(CHOICES))
+    choice = CHOICES[name]
+    base = ij.with_parameters(ij.presets.zhang_yan_2024(reading="corrected"), {"controller.K2": K2})
+    base = ij.with_parts(base, **choice.parts)
+    laws = {first: CHOICES[first].law, name: choice.law}
+    compared = ij.compare(base, laws, duration=duration, dt=DT)
+    run = compared.equal_effort.get(name, compared.rollouts[name])
+    factor: Any = OWN
+    if name in compared.equal_effort:
+        factor = float(compared.factors[name])
+    one = run.scenario
+    masses = []
+    for scale in (0.7, 1.3):
+        heavier = ij.with_parts(one, plant=_heavier(one.plant, scale))
+        masses.append(_run(heavier, duration))
+    # One structure, and therefore one compiled program, for all periods and delays.
+    encoder = sensors.Encoder(counts=COUNTS, velocity=sensors.FilteredDifference(cutoff=200.0))
+    queue = round(DELAYS[-1] / DT) + 1
+    fast = ij.with_parts(one, sensor=encoder, sampling=ij.Sampling(period=DT, queue=queue))
+    slow = ij.with_parameters(fast, {"sampling.period": 1e-2})
+    return [
+        name,
+        factor,
+        _error(run),
+        float(np.max(np.abs(run.tau))),
+        _worst([_error(changed) for changed in masses]),
+        _error(_run(slow, duration)),
+        _ripple(run, _run(fast, duration)),
+        _longest_delay(fast, duration),
+    ]
+
+
+def _heavier(robot: Any, factor: float) -> Any:
+    """A robot with all its masses and inertias times a factor."""
+    values = {"mass": robot.mass * factor, "inertia": robot.inertia * factor}
+    fields = {name: vars(robot)[name] for name in ("length", "centre")}
+    return type(robot)(**fields, **values)
+
+
+def _run(scenario: ij.Scenario, duration: float) -> ij.Rollout:
+    return ij.simulate(scenario, duration=duration, dt=DT)
+
+
+def _has_left(run: ij.Rollout) -> bool:
+    """Whether a run left the bounds of the positions, or diverged."""
+    return bool(int(run.status) & int(ij.Status.BOUND_VIOLATED | ij.Status.NOT_FINITE))
+
+
+def _second_half(values: Any) -> np.ndarray:
+    return np.asarray(values)[len(values) // 2 :]
+
+
+def _error(run: ij.Rollout) -> Any:
+    """The largest |e1| in the second half of a run [mrad]."""
+    if _has_left(run):
+        return LEFT
+    return 1e3 * float(np.max(np.abs(_second_half(run.e1))))
+
+
+def _worst(errors: list[Any]) -> Any:
+    return LEFT if LEFT in errors else max(errors)
+
+
+def _ripple(ideal: ij.Rollout, noisy: ij.Rollout) -> Any:
+    """The RMS difference of two torques in the second half [N m]."""
+    if _has_left(ideal) or _has_left(noisy):
+        return LEFT
+    return float(np.sqrt(np.mean(_second_half(noisy.tau - ideal.tau) ** 2)))
+
+
+def _longest_delay(sampled: ij.Scenario, duration: float) -> float:
+    """The longest delay [ms] up to which the arm stays inside its bounds; 0 for none."""
+    longest = 0.0
+    for delay in DELAYS:
+        delayed = ij.with_parameters(sampled, {"sampling.delay": delay})
+        if _has_left(_run(delayed, duration)):
+            break
+        longest = 1e3 * delay
+    return longest
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--quick", action="store_true", help="0.2 s of motion, one law")
+    parser.add_argument("--only", nargs="+", choices=CHOICES, help="these rows")
+    parser.add_argument("--json", help="also write the table to this file")
+    args = parser.parse_args()
+    names = list(CHOICES)
+    if args.quick:
+        names = names[:1]
+    if args.only:
+        names = args.only
+    duration = 0.2 if args.quick else DURATION
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the table reports runs that leave the bounds
+        rows = [row(name, duration) for name in names]
+    title = f"Laws at equal effort: {duration:g} s of the paper's motion"
+    report(title, COLUMNS, rows, args.json)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,272 @@
+"""Agents on a graph against an independent program, limits, and what is refused."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import independent_agents as other
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import iblf_jax as ij
+from iblf_jax import barriers, bounds, controllers, plants, references
+from iblf_jax.core import sparse
+
+
+def pendulum(i: int) -> ij.robots.PlanarChain:
+    fields = ("mass", "length", "centre", "inertia")
+    rows = (other.MASS, other.LENGTH, other.CENTRE, other.INERTIA)
+    return ij.robots.PlanarChain(
+        **{name: [row[i]] for name, row in zip(fields, rows, strict=True)}, g=other.G
+    )
+
+
+def as_rows(matrix):
+    return tuple(tuple(row) for row in np.asarray(matrix).tolist())
+
+
+STACK = plants.Agents(
+    agents=tuple(pendulum(i) for i in range(4)),
+    adjacency=as_rows(other.ADJACENCY),
+    leader=tuple(other.LEADER.tolist()),
+)
+MOTION = references.Sinusoid(
+    offset=other.OFFSET, amplitude=other.AMPLITUDE, frequency=other.FREQUENCY
+)
+FUNNEL = {"final": other.NARROW, "rate": other.RATE}
+TUBE = ij.Bounds(
+    lower=bounds.Funnel(initial=-other.WIDE, **{**FUNNEL, "final": -other.NARROW}),
+    upper=bounds.Funnel(initial=other.WIDE, **FUNNEL),
+)
+
+
+def law(**fields):
+    given = {"k": [other.K1, other.K2], "weights": [other.W1, other.W2]}
+    return controllers.BarrierBackstepping(**(given | fields))
+
+
+def scenario(distributed: bool = False, **parts) -> ij.Scenario:
+    given = {
+        "plant": STACK,
+        "model": STACK.neighbours() if distributed else STACK,
+        "reference": STACK.reference(MOTION),
+        "bounds": TUBE,
+        "controller": law(filter=other.MU[None]) if distributed else law(),
+        "initial": ij.Initial(q=STACK.relative_positions(other.P0[:, None]), dq=np.zeros(4)),
+    }
+    return ij.Scenario(**(given | parts))
+
+
+@pytest.mark.parametrize("distributed", [False, True])
+def test_vector_field_and_trajectory_of_the_independent_program(distributed, rng):
+    one = scenario(distributed)
+    field = ij.vector_field(one)
+    points = 20
+    t = rng.uniform(0.0, 1.0, points)
+    e = rng.uniform(-0.2, 0.2, (points, 4))
+    x_0 = other.OFFSET + other.AMPLITUDE * np.sin(other.FREQUENCY * t)
+    state = [other.LEADER * x_0[:, None] + e, rng.normal(size=(points, 4))]
+    if distributed:
+        state.append(rng.normal(size=(points, 4)))
+    states = np.concatenate(state, axis=1)
+    found = jax.jit(jax.vmap(field))(jnp.asarray(t), jnp.asarray(states))
+    for i in range(points):
+        expected = other.field(t[i], states[i], distributed)
+        np.testing.assert_allclose(found[i], expected, rtol=1e-12, atol=1e-12)
+    run = ij.simulate(one, duration=other.END, dt=1e-3, record_every=100)
+    expected = other.trajectory(np.asarray(run.t), distributed)
+    np.testing.assert_allclose(run.q, expected[:, :4], atol=1e-7)
+    np.testing.assert_allclose(run.dq, expected[:, 4:8], atol=1e-7)
+    assert run.ok
+
+
+def test_the_filtered_law_tends_to_neighbours_velocities_with_mu():
+    """The filters' error is of the first order in mu, as the M-matrix (D + B)^-1 H promises."""
+    poles = np.linalg.eigvals(other.H / other.DEGREES[:, None])
+    assert np.all(poles.real > 0.0)
+    errors = []
+    for mu in (0.02, 0.01, 0.005):
+        run = ij.simulate(
+            scenario(True, controller=law(filter=mu)), duration=9.0, dt=2e-3, record_every=10
+        )
+        errors.append(float(np.max(np.abs(np.asarray(run.e1)[-150:]))))
+    ratios = np.asarray(errors[:-1]) / errors[1:]
+    np.testing.assert_allclose(ratios, 2.0, rtol=0.15)
+
+
+def test_one_agent_that_measures_the_leader_is_the_single_plant(rng):
+    single = plants.Rigid(pendulum(0))
+    stack = plants.Agents(agents=(single,), adjacency=((0.0,),), leader=(1.0,))
+    parts = {
+        "bounds": TUBE,
+        "controller": controllers.BarrierBackstepping(k=(2.0, 20.0)),
+        "initial": ij.Initial(q=[0.25], dq=[0.1]),
+    }
+    alone = ij.vector_field(ij.Scenario(plant=single, reference=MOTION, **parts))
+    agent = ij.vector_field(ij.Scenario(plant=stack, reference=stack.reference(MOTION), **parts))
+    for t, x in zip(rng.uniform(0, 1, 5), rng.uniform(0.1, 0.3, (5, 2)), strict=True):
+        np.testing.assert_allclose(agent(t, x), alone(t, x), rtol=1e-12, atol=1e-12)
+
+
+def test_agents_of_order_four_and_two_joints_follow_the_leader():
+    """Flexible joints: the start with given positions is the springs' equilibrium of each agent."""
+    arm = ij.presets.customary_two_link()
+    agents = [
+        plants.FlexibleJoint(arm, stiffness=stiffness, motor_inertia=0.02, motor_damping=0.5)
+        for stiffness in (200.0, 300.0)
+    ]
+    stack = plants.Agents(agents=agents, adjacency=((0, 0), (1, 0)), leader=(1, 0))
+    p = np.array([[0.5, 0.6], [0.4, 0.5]])
+    y = stack.relative_positions(p)
+    np.testing.assert_allclose(y, [0.5, 0.6, -0.1, -0.1], atol=1e-15)
+    np.testing.assert_allclose(stack.positions(y), p, atol=1e-15)
+    steady = stack.steady_levels(y, jnp.zeros(4))
+    torque = stack.steady_input(y)
+    x = jnp.concatenate([jnp.stack([y, jnp.zeros(4)]), steady])
+    np.testing.assert_allclose(plants.flow(stack, 0.0, x, torque), 0.0, atol=1e-10)
+    offsets = np.array([[0.0, 0.0], [0.1, -0.1]])
+    reference = stack.reference(references.Sinusoid(offset=[0.5, 0.6], amplitude=0.0), offsets)
+    expected = stack.relative_positions(np.array([0.5, 0.6]) + offsets)
+    np.testing.assert_allclose(reference.position(jnp.asarray(0.3)), expected, atol=1e-15)
+    assert stack.component_names[2] == "agent 2: joint 0"
+    assert stack.units == ("rad", "rad/s", "rad", "rad/s", "N m")
+
+
+def test_friction_of_the_agents_robots_acts_on_the_plant(rng):
+    """The friction of each agent enters its own acceleration, which no law knows."""
+    damping = [0.3, 0.5]
+    robots = [ij.robots.WithMotors(pendulum(i), inertia=0.0, damping=damping[i]) for i in (0, 1)]
+    adjacency = ((0, 0), (1, 0))
+    parts = {"bounds": TUBE, "controller": controllers.BarrierBackstepping(k=(2.0, 20.0))}
+
+    def acceleration(pair):
+        stack = plants.Agents(agents=pair, adjacency=adjacency, leader=(1, 0))
+        one = ij.Scenario(
+            plant=stack,
+            reference=stack.reference(MOTION),
+            initial=ij.Initial(q=[0.25, 0.05], dq=0.0),
+            **parts,
+        )
+        return ij.vector_field(one)(0.1, jnp.asarray([0.25, 0.05, 0.4, -0.6]))[2:]
+
+    difference = acceleration(robots) - acceleration([pendulum(0), pendulum(1)])
+    expected = -np.asarray(damping) * [0.4, -0.6] / other.M[:2]
+    np.testing.assert_allclose(difference, expected, rtol=1e-10)
+
+
+def test_studies_and_files(tmp_path):
+    one = scenario()
+    file = tmp_path / "agents.toml"
+    ij.save_scenario(one, file)
+    loaded = ij.load_scenario(file)
+    field, same = ij.vector_field(one), ij.vector_field(loaded)
+    np.testing.assert_array_equal(field(0.0, field.start), same(0.0, same.start))
+    study = ij.monte_carlo(
+        one,
+        {"plant.agents[1].robot.mass": ij.factor(ij.uniform(0.9, 1.1))},
+        runs=8,
+        duration=0.2,
+        dt=2e-3,
+        progress=False,
+    )
+    assert not np.any(study.failed)
+
+
+@pytest.mark.release
+@pytest.mark.parametrize("distributed", [False, True])
+def test_the_certificate_of_the_levels_holds(distributed):
+    """With filters the equality (S.3) contains their lag, which the certificate reports."""
+    found = ij.certify(scenario(distributed), duration=1.0, dt=1e-3)
+    assert found.holds
+    assert found["equality"].verdict == "holds"
+    if distributed:
+        assert any("ultimate boundedness" in note for note in repr(found).splitlines())
+
+
+def test_more_agents_cost_in_proportion_to_their_number():
+    """A chain and an undirected path: the operations of a law grow as N, not as N^2."""
+
+    def operations(count, undirected):
+        adjacency = np.eye(count, k=-1)
+        if undirected:
+            adjacency = adjacency + np.eye(count, k=1)
+        stack = plants.Agents(
+            agents=[pendulum(0)] * count,
+            adjacency=as_rows(adjacency),
+            leader=(1.0,) + (0.0,) * (count - 1),
+        )
+        parts = jnp.zeros((2, count))
+        rate = partial(plants.flow, stack, 0.0)
+        jaxpr = jax.make_jaxpr(lambda y: sparse.solve(stack.matrix, list(y)))(parts[0])
+        assert np.all(np.isfinite(rate(parts, parts[0])))
+        return sum(eqn.primitive.name in ("mul", "add", "sub", "div") for eqn in jaxpr.eqns)
+
+    for undirected in (False, True):
+        counts = [operations(count, undirected) for count in (4, 8, 16)]
+        steps = np.diff(counts) / [4, 8]
+        assert steps[0] == steps[1]
+
+
+def test_a_sparse_solution_is_that_of_numpy(rng):
+    adjacency = np.where(rng.uniform(size=(7, 7)) < 0.4, rng.uniform(size=(7, 7)), 0.0)
+    np.fill_diagonal(adjacency, 0.0)
+    H = np.diag(adjacency.sum(axis=1) + rng.uniform(0.1, 1.0, 7)) - adjacency
+    b = rng.normal(size=(7, 2))
+    found = sparse.solve(as_rows(H), list(b))
+    np.testing.assert_allclose(found, np.linalg.solve(H, b), rtol=1e-12)
+
+
+PAIR = (pendulum(0), pendulum(1))
+REFUSED = {
+    "unreached": (
+        lambda: plants.Agents(agents=PAIR, adjacency=((0, 0), (0, 0)), leader=(1, 0)),
+        r"no path from the leader to agent 2.*adjacency\[i\]\[j\] > 0 is a path",
+    ),
+    "loop": (
+        lambda: plants.Agents(agents=PAIR, adjacency=((1, 0), (1, 0)), leader=(1, 0)),
+        "a zero diagonal",
+    ),
+    "negative": (
+        lambda: plants.Agents(agents=PAIR, adjacency=((0, 0), (-1, 0)), leader=(1, 0)),
+        r"Agents\.adjacency.*numbers >= 0",
+    ),
+    "sizes": (
+        lambda: plants.Agents(
+            agents=(PAIR[0], ij.presets.customary_two_link()),
+            adjacency=((0, 0), (1, 0)),
+            leader=(1, 0),
+        ),
+        r"Agents\.agents\[1\]\.n: got 2, expected 1",
+    ),
+    "no plant": (
+        lambda: plants.Agents(agents=("arm",), adjacency=((0,),), leader=(1,)),
+        "a plant or a robot",
+    ),
+    "no filters": (
+        lambda: scenario(model=STACK.neighbours()),
+        r"controller\.filter.*filter=0\.01",
+    ),
+    "as the plant": (
+        lambda: ij.simulate(scenario(True, plant=STACK.neighbours()), duration=0.1, dt=1e-2),
+        r"row 0 that depends on x\[1\]",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_refused_with_a_remedy(what):
+    make, message = REFUSED[what]
+    with pytest.raises(ValueError, match=message):
+        ij.simulate(make(), duration=0.1, dt=1e-2)
+
+
+def test_bounds_of_the_agents_velocities_are_kept():
+    limits = ij.Bounds(lower=bounds.Constant(-1.5), upper=bounds.Constant(1.5))
+    one = scenario(
+        state_bounds=(limits,), controller=law(barriers=(barriers.Mapping(), barriers.Mapping()))
+    )
+    run = ij.simulate(one, duration=1.0, dt=1e-3, record_every=10)
+    assert run.ok
+    assert np.max(np.abs(run.dq)) < 1.5
