@@ -255,7 +255,8 @@ class Leader:
       motion: x_0(t), any of `iblf_jax.references`, of m components.
       weights: b_i with which each agent measures its position relative to the leader, N numbers.
       components: m, the number of components of an agent.
-      offset: (H kron I) delta of a formation, (N m,) in the unit of the positions; 0 if not given.
+      offset: (H kron I) delta of a formation, () or (n,) [rad], with n = N m, in the unit of the
+        positions; 0 if not given.
 
     Source: F. L. Lewis, H. Zhang, K. Hengster-Movric, A. Das, Cooperative Control of Multi-Agent
       Systems, 2014, chapter 3.
