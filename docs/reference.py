@@ -55,7 +55,7 @@ PAGES: dict[str, tuple[str, str]] = {
             " testing.check_sensor testing.check_actuator testing.check_robot"
             " testing.check_plant testing.check_reference testing.check_side"
             " testing.check_region testing.check_disturbance testing.check_fold"
-            " testing.check_objective testing.ContractError"
+            " testing.check_objective testing.check_process_noise testing.ContractError"
         ),
     ),
 }

@@ -18,6 +18,7 @@ from iblf_jax import (
     disturbances,
     observers,
     plants,
+    process_noise,
     references,
     regions,
     robots,
@@ -147,6 +148,15 @@ DISTURBANCES = {
     ),
     "levels": disturbances.Levels((None, disturbances.Step(size=1.0, time=2.0))),
     "sum_of_none": disturbances.Sum(()),
+}
+
+PROCESS_NOISES = {
+    "additive": process_noise.Additive([[0.3, 0.2], [0.1, 0.4]], levels=(1, 3)),
+    "proportional": process_noise.Proportional([[0.3, 0.2]], substeps=2),
+    "diffusion": process_noise.Diffusion(lambda t, x: jnp.exp(-t) * jnp.cos(x[:1])),
+    "diffusion_additive": process_noise.Diffusion(
+        lambda t, x: (2.0 + jnp.sin(t)) * jnp.ones_like(x[:1]), additive=True
+    ),
 }
 
 BARRIERS = {
@@ -382,6 +392,11 @@ FAMILIES = {
     "side": (SIDES, bounds.MEMBERS, ij.testing.check_side),
     "region": (REGIONS, regions.MEMBERS, ij.testing.check_region),
     "disturbance": (DISTURBANCES, disturbances.MEMBERS, ij.testing.check_disturbance),
+    "process_noise": (
+        PROCESS_NOISES,
+        process_noise.MEMBERS,
+        ij.testing.check_process_noise,
+    ),
     "barrier": (BARRIERS, barriers.MEMBERS, ij.testing.check_barrier),
     "decay": (DECAYS, decays.MEMBERS, ij.testing.check_decay),
     "observer": (OBSERVERS | LEVEL_OBSERVERS, observers.MEMBERS, ij.testing.check_observer),

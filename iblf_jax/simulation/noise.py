@@ -119,7 +119,7 @@ def _pair(key: list[jax.Array], sample: jax.Array, pair: int, dtype) -> list[jax
 
 
 def _uniforms(
-    key: list[jax.Array], sample: jax.Array, pair: int, dtype
+    key: list[jax.Array], sample: jax.Array, pair: int | jax.Array, dtype
 ) -> tuple[jax.Array, jax.Array]:
     """Two independent numbers, uniform between 0 and 1."""
     low = WORD - 1
@@ -240,9 +240,10 @@ def realised(scenario: Scenario, key: Any) -> Scenario:
         return scenario
     dtype = scenario.initial.q.dtype
     words = _words(key, MODES_STREAM)
-    pairs = [jnp.stack(_uniforms(words, jnp.int32(0), k, dtype)) for k in range(draws)]
+    numbers = jnp.arange(draws, dtype=jnp.int32)
+    pairs = jax.vmap(lambda k: jnp.stack(_uniforms(words, jnp.int32(0), k, dtype)))(numbers)
     plant: Any = scenario.plant
-    return _with_plant(scenario, plant.with_path(jnp.stack(pairs)))
+    return _with_plant(scenario, plant.with_path(pairs))
 
 
 def _with_plant(scenario: Scenario, plant: Any) -> Scenario:

@@ -27,6 +27,7 @@ from iblf_jax.testing.metrics import check_fold as check_fold
 from iblf_jax.testing.objectives import check_objective as check_objective
 from iblf_jax.testing.observers import check_observer as check_observer
 from iblf_jax.testing.plants import check_plant as check_plant
+from iblf_jax.testing.process_noise import check_process_noise as check_process_noise
 from iblf_jax.testing.robots import check_robot as check_robot
 from iblf_jax.testing.world import check_disturbance as check_disturbance
 from iblf_jax.testing.world import check_reference as check_reference
@@ -44,6 +45,7 @@ __all__ = [
     "check_objective",
     "check_observer",
     "check_plant",
+    "check_process_noise",
     "check_reference",
     "check_region",
     "check_robot",

@@ -117,19 +117,21 @@ class MarkovSwitched:
           uniforms: independent numbers between 0 and 1, (switches + 1, 2).
         """
         Q = jax.lax.stop_gradient(self.rates)
-        modes = len(Q)
-        t, mode = jnp.zeros((), Q.dtype), jnp.full((), self.start, Q.dtype)
-        times, sequence = [], []
-        for first, second in uniforms:
+
+        def switch(before, pair):
+            t, mode = before
             row = of_mode(Q, mode)
             leaving = -of_mode(jnp.diagonal(Q), mode)
             is_final = ~(leaving > 0)
             rate = jnp.where(is_final, 1.0, leaving)
-            t = jnp.where(is_final, NEVER, jnp.minimum(t - jnp.log(first) / rate, NEVER))
-            mode = jnp.where(is_final, mode, _next_mode(row, mode, second * rate, modes))
-            times.append(t)
-            sequence.append(mode)
-        return self._with(jnp.stack(times), jnp.stack(sequence))
+            t = jnp.where(is_final, NEVER, jnp.minimum(t - jnp.log(pair[0]) / rate, NEVER))
+            mode = jnp.where(is_final, mode, _next_mode(row, mode, pair[1] * rate, len(Q)))
+            return (t, mode), (t, mode)
+
+        # Written out, XLA repeats the earlier switches in the code of every later one.
+        start = jnp.zeros((), Q.dtype), jnp.full((), self.start, Q.dtype)
+        _, (times, sequence) = jax.lax.scan(switch, start, uniforms.astype(Q.dtype))
+        return self._with(times, sequence)
 
     def _with(self, times: jax.Array, sequence: jax.Array) -> MarkovSwitched:
         """A copy with another path, without checks: its numbers may be traced."""
