@@ -245,7 +245,7 @@ def _unstable_step(result: Rollout) -> str:
     return (
         f"The closed loop's fastest mode is {mode:.4g} 1/s, so {result.method} is stable up to"
         f" dt = {limit:.3g} s only; dt = {float(result.dt):g} s was requested. Take"
-        f" dt={comfortable_dt(mode):g}{_alternative_remedy(result)}."
+        f" dt={comfortable_dt(mode, result.method):g}{_alternative_remedy(result)}."
     )
 
 

@@ -30,12 +30,21 @@ from iblf_jax.simulation import discontinuities, error_estimate
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.levels import levels_on_reference
+from iblf_jax.simulation.noise import check_method
 from iblf_jax.simulation.scenario import Initial, Scenario, canonical, with_history
 from iblf_jax.simulation.stability import SLOWEST_RATE, jacobian
 from iblf_jax.world import plants
 
 RECOMMENDED_PHASE = 1.5
 """|dt * mode| that is recommended: RK4 follows the fastest mode itself to a few per cent there."""
+NOISY_PHASES = {"euler_maruyama": 0.09, "stochastic_heun": 0.4}
+"""|dt * mode| that is recommended under process noise.  A mode x' = -a x with additive noise has a
+stationary variance.  With z = a dt the variance of a method is that, times
+
+    1/(1 - z/2)                          Euler-Maruyama,
+    (1 - z/2)/(1 - z/2 + z^2/4)          stochastic Heun,
+
+so it is right to 5 % at these values, while both methods are stable up to z = 2."""
 RECOMMENDED_ERROR = error_estimate.TOLERANCE / 5
 """Difference of the two runs, relative to the tube, that a recommended step may leave."""
 MODE_INSTANTS = 33
@@ -222,9 +231,10 @@ def round_down(dt: float) -> float:
     return float(f"{factor * decade:.1g}")
 
 
-def comfortable_dt(mode: float) -> float:
+def comfortable_dt(mode: float, method: str) -> float:
     """A round step (1, 2 or 5 times a power of ten) that follows a mode [1/s] comfortably, [s]."""
-    return round_down(RECOMMENDED_PHASE / max(mode, SLOWEST_RATE))
+    phase = NOISY_PHASES.get(method, RECOMMENDED_PHASE)
+    return round_down(phase / max(mode, SLOWEST_RATE))
 
 
 def smaller(dt: float, excess: float, order: int) -> float:
@@ -242,6 +252,9 @@ def find_dt(scenario: Scenario, *, duration: float, method: str) -> float:
     """`iblf_jax.recommended_dt` for one scenario."""
     order = tableau(method).order
     scenario = canonical(scenario)
+    check_method(scenario, method)
+    # Runs with different steps have different noise, so their accuracy is compared without it.
+    scenario = dataclasses.replace(scenario, process_noise=None)
     duration = checks.positive_number("duration", duration, "s")
     if scenario.sampling is not None:
         return _find_part(scenario, float(scenario.sampling.period), duration, method)
@@ -255,7 +268,7 @@ def find_dt(scenario: Scenario, *, duration: float, method: str) -> float:
             "a Jacobian that is not finite",
             "a closed loop with finite derivatives along its reference",
         )
-    dt = for_modes = min(comfortable_dt(mode), round_down(duration))
+    dt = for_modes = min(comfortable_dt(mode, method), round_down(duration))
     _can_be_tried(duration, dt)
     as_state = ravel_pytree(initial_state(scenario))[1]
     while duration / dt <= MAX_TRIED:
@@ -265,7 +278,8 @@ def find_dt(scenario: Scenario, *, duration: float, method: str) -> float:
             float(pair.estimate.relative) / error_estimate.TOLERANCE,
         )
         if not excess > 1.0:
-            limit = comfortable_dt(_mode(scenario, pair.nearest[1], as_state(pair.nearest[2])))
+            nearest = _mode(scenario, pair.nearest[1], as_state(pair.nearest[2]))
+            limit = comfortable_dt(nearest, method)
             if dt <= limit:
                 return dt
             dt = for_modes = limit
@@ -296,6 +310,8 @@ def _find_part(
         found = run_one(fitted, (), dt, RunRequest(periods * parts, method, parts), noise)
         q, width = found.records[0]["q"], found.records[0]["upper"] - found.records[0]["lower"]
         poor = has_flag(int(found.status), Status.STEP_TOO_LARGE | Status.INACCURATE)
+        if method in NOISY_PHASES:
+            poor |= float(dt) * float(found.fastest_mode) > NOISY_PHASES[method]
         if (
             before is not None
             and not poor_before

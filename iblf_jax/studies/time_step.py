@@ -39,6 +39,12 @@ def recommended_dt(
     with one of about a third of the step to 0.1 % of the tube, and its error estimate is below
     0.5 %.  The step is rounded down to 1, 2 or 5 times a power of ten.
 
+    Under process noise the noise is left out, because runs of different steps have different noise,
+    and the step is at most 0.09 (euler_maruyama) or 0.4 (stochastic_heun) times the time constant
+    of the fastest mode: the stationary variance of that mode is then right to 5 %.  A run whose
+    step is beyond the limit of stability is flagged STEP_TOO_LARGE; no flag says that its
+    variances are inaccurate.
+
     With perturbations the step is so small that no run of a first block of the study (256 runs on
     CPU) is flagged STEP_TOO_LARGE or INACCURATE.
 
@@ -54,7 +60,8 @@ def recommended_dt(
       step of the eigenvalue criterion alone, with a warning.
 
     Raises:
-      ValueError: bad scenario, duration, method, perturbations or seed.
+      ValueError: bad scenario, duration, method, perturbations or seed, or a method that does not
+        fit the process noise.
     """
     tableau(method)
     seed = checks.seed(seed)
@@ -103,7 +110,7 @@ def needed_dt(
     inaccurate = has_flag(status, Status.INACCURATE) & ~stiff
     needed = []
     if np.any(stiff):
-        needed.append(step_size.comfortable_dt(float(np.max(modes[stiff]))))
+        needed.append(step_size.comfortable_dt(float(np.max(modes[stiff])), method))
     if np.any(inaccurate):
         excess = float(np.max(errors[inaccurate])) / TOLERANCE
         needed.append(step_size.smaller(dt, excess, tableau(method).order))

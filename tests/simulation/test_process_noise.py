@@ -12,6 +12,7 @@ import pytest
 
 import iblf_jax as ij
 from iblf_jax import bounds, controllers, process_noise, references
+from iblf_jax.engine.step_size import NOISY_PHASES
 from iblf_jax.simulation import integrators
 from iblf_jax.simulation.closed_loop import evaluate, initial_state, with_process_noise
 from iblf_jax.simulation.discontinuities import Span, divide_step
@@ -158,6 +159,36 @@ def test_strong_order_on_one_brownian_path(method, noise, exact, order):
     ]
     measured = np.log(errors[1] / errors[0]) / np.log(RATIOS[1] / RATIOS[0])
     assert measured == pytest.approx(order, abs=0.2), errors
+
+
+@pytest.mark.parametrize("method", NOISY_PHASES)
+def test_the_variance_of_a_mode_is_right_to_five_per_cent(method):
+    def after(x, noise_rate):
+        def rate(t, x):
+            return -x + noise_rate, ()
+
+        return float(integrators.step(method, rate, 0.0, jnp.asarray(x), z).state)
+
+    z = NOISY_PHASES[method]
+    own, of_noise = after(1.0, 0.0), after(0.0, 1.0 / z)
+    variance = of_noise**2 * z / (1 - own**2)
+    assert 0.03 < abs(variance / 0.5 - 1) < 0.05
+
+
+@pytest.mark.slow
+def test_the_recommended_step_is_that_of_a_noisy_mode():
+    scenario = link(process_noise.Additive(0.7), stiffness=3.0, damping=2.0)
+    dt = ij.recommended_dt(scenario, duration=1.0, method="stochastic_heun")
+    run = ij.simulate(scenario, duration=0.1, dt=dt, method="stochastic_heun", backend="vmap")
+    assert 0.1 < dt * float(run.fastest_mode) <= NOISY_PHASES["stochastic_heun"]
+    coarse = 2.1 / float(run.fastest_mode)
+    with pytest.warns(ij.SimulationWarning, match=f"Take dt={dt:g}"):
+        run = ij.simulate(
+            scenario, duration=2 * coarse, dt=coarse, method="stochastic_heun", backend="vmap"
+        )
+    assert int(run.status) & int(ij.Status.STEP_TOO_LARGE)
+    with pytest.raises(ValueError, match="has process noise"):
+        ij.recommended_dt(scenario, duration=1.0)
 
 
 def test_a_divided_step_has_the_increment_of_the_step():

@@ -101,6 +101,30 @@ def test_missing_methods_are_listed_with_their_meaning():
     )
 
 
+@ij.component
+class Gusts:
+    """A user's noise, which grows with the position."""
+
+    size: jax.Array
+    levels: ClassVar[tuple[int, ...]] = (2,)
+
+    def diffusion(self, t, x):
+        return self.size * (1.0 + x[:1] ** 2)
+
+
+def test_process_noise_of_a_user():
+    ij.testing.check_process_noise(Gusts(0.3))
+    for methods, words in (
+        ({"additive": True}, ("additive is True", "depends on x")),
+        ({"levels": (2, 1)}, ("increasing",)),
+        ({"levels": ()}, ("such as (2,)",)),
+        ({"diffusion": lambda self, t, x: x}, ("has shape (2, 2)", "It must be (1, 2)")),
+        ({"diffusion": lambda self, t, x: jnp.sqrt(x[:1] - 0.1)}, ("not finite somewhere",)),
+        ({"diffusion": lambda self, t, x: self.size * abs(float(t))}, ("use jax.numpy",)),
+    ):
+        rejects(ij.testing.check_process_noise, changed(Gusts, **methods)(0.3), *words)
+
+
 def test_a_check_in_post_init_is_found():
     @jax.tree_util.register_dataclass
     @dataclasses.dataclass(frozen=True)

@@ -146,6 +146,16 @@ def test_distribution_of_the_path():
             assert np.mean(modes[here] == j) == pytest.approx(share, abs=2.5 / np.sqrt(count))
 
 
+def test_the_code_of_a_path_does_not_grow_with_its_switches():
+    def size(switches):
+        markov = plants.MarkovSwitched(LINK, {"mass[0]": MASSES}, rates=Q, switches=switches)
+        scenario = canonical(scenario_of(markov))
+        path = jax.make_jaxpr(lambda key: realised(scenario, key).plant.times)(jnp.zeros(4))
+        return len(str(path).splitlines())
+
+    assert size(2) == size(40)
+
+
 @pytest.mark.slow
 def test_every_run_of_a_study_has_a_path_of_its_own():
     plant = plants.MarkovSwitched(LINK, {"mass[0]": MASSES}, rates=Q, switches=2)
