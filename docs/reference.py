@@ -18,8 +18,8 @@ PAGES: dict[str, tuple[str, str]] = {
     "runs": (
         "Scenarios and runs",
         (
-            "Scenario Initial Bounds Sampling with_parts simulate Rollout Metrics Status"
-            " SimulationError SimulationWarning parameters with_parameters recommended_dt"
+            "Scenario Initial Bounds Sampling EventTrigger with_parts simulate Rollout Metrics"
+            " Status SimulationError SimulationWarning parameters with_parameters recommended_dt"
             " recommended_period vector_field VectorField explain component leaf Leaf static astype"
         ),
     ),

@@ -69,8 +69,9 @@ METHODS = (*TABLEAUS, *STOCHASTIC)
 
 def tableau(method: str) -> Tableau:
     """The tableau of a method by name; ValueError for an unknown name."""
-    checks.one_of("method", method, METHODS)
-    return (TABLEAUS | STOCHASTIC)[method]
+    tableaus = TABLEAUS | STOCHASTIC
+    checks.one_of("method", method, tableaus)
+    return tableaus[method]
 
 
 class StepResult(NamedTuple):
