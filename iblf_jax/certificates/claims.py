@@ -57,6 +57,7 @@ from iblf_jax.control.controllers import (
     LyapunovLaw,
     Saturated,
 )
+from iblf_jax.control.controllers._base import law_member
 from iblf_jax.control.observers import Momentum, Printed
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import layers, unwrapped
@@ -163,6 +164,21 @@ def why_no_theorem(scenario: Scenario) -> str:
         about = "Theorem 2 is about a torque that acts as it is commanded"
         return f"{about}; {actuator} has no claim of this kind"
     return ""
+
+
+def why_excluded(scenario: Scenario) -> str:
+    """What excludes instants from the claims about the law inside its wrappers, in words."""
+    changing = []
+    for law in layers(scenario.controller)[:-1]:
+        if law_member(law, "has_auxiliary"):
+            changing.append(f"the auxiliary state of {type(law).__name__}")
+        elif not isinstance(law, Saturated | AdaptiveParameters):
+            changing.append(type(law).__name__)
+    reason = "the guard or a limit of the input was active"
+    if not changing:
+        return reason
+    inner = type(unwrapped(scenario.controller)).__name__
+    return f"{reason}, or {' or '.join(changing)} changed the input of {inner}"
 
 
 def adaptive_law(scenario: Scenario) -> AdaptiveParameters | None:

@@ -18,7 +18,6 @@ from iblf_jax.certificates.lines import (
 from iblf_jax.certificates.optional import optional_member
 from iblf_jax.certificates.proof_terms import GENERAL_TERMS
 from iblf_jax.certificates.run_summary import (
-    ALWAYS_EXCLUDED,
     Segment,
 )
 from iblf_jax.control.actuators import Ideal
@@ -41,7 +40,7 @@ def why_not_own(summary: Any) -> str:
     if reason:
         return reason
     if summary.excluded == summary.samples:
-        return ALWAYS_EXCLUDED
+        return f"{summary.why_excluded} all the time"
     return summary.why_invalid  # type: ignore[no-any-return]
 
 
@@ -95,8 +94,7 @@ def own_segment_lines(segment: Segment) -> list[Line]:
     note = ""
     if summary.excluded:
         note = (
-            f"{summary.excluded} of {summary.samples} samples are excluded: the guard or a torque"
-            " limit was active"
+            f"{summary.excluded} of {summary.samples} samples are excluded: {summary.why_excluded}"
         )
     return [
         check_steps(segment, statement, margins, OWN_ROUNDING * summary.eps * sizes, note=note)

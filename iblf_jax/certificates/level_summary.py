@@ -17,12 +17,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from iblf_jax.certificates.claims import adaptive_law, own_claim
+from iblf_jax.certificates.claims import adaptive_law, own_claim, why_excluded
 from iblf_jax.certificates.lines import join_notes
 from iblf_jax.certificates.optional import optional_member
 from iblf_jax.certificates.proof_terms import DECAY_ROUNDING
 from iblf_jax.certificates.reconstruction import Steps, TimeGrid, check_status, is_valid
-from iblf_jax.certificates.run_summary import ALWAYS_EXCLUDED, Decay
+from iblf_jax.certificates.run_summary import Decay
 from iblf_jax.control.actuators import Ideal
 from iblf_jax.control.controllers import BarrierBackstepping
 from iblf_jax.control.observers._base import observer_member
@@ -83,7 +83,7 @@ class LevelSummary:
         """Why (S.3) does not apply to this run; "" if it does."""
         reason = self.claims.why_not or self.why_invalid
         if not reason and self.excluded == self.samples:
-            return f"{ALWAYS_EXCLUDED}, or alpha was outside the bounds"
+            return f"{self.why_excluded} all the time, or alpha was outside the bounds"
         return reason
 
     @property
@@ -101,13 +101,18 @@ class LevelSummary:
         return {LEVELS: Decay(self.rho, self.rho2, 1.0, 0.0)}
 
     @property
+    def why_excluded(self) -> str:
+        """What excludes samples besides alpha outside the bounds, in words."""
+        return why_excluded(self.run.scenario)
+
+    @property
     def exclusion_note(self) -> str:
         """Which samples the claim excludes, and where it starts again, in words."""
         excluded = ""
         if self.excluded:
             excluded = (
-                f"{self.excluded} of {self.samples} samples are excluded: the guard or a limit of"
-                " the input was active, or alpha outside the bounds"
+                f"{self.excluded} of {self.samples} samples are excluded: {self.why_excluded}, or"
+                " alpha was outside the bounds"
             )
         restarts = ""
         if self.jumps.size:

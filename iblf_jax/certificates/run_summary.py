@@ -46,7 +46,6 @@ CONDITION = {1: "(3.17)", 2: "(3.25)"}
 """Gain condition of each case."""
 THEOREM, WEIGHTED = "theorem", "weighted"
 """Kinds of a claimed decay: that of Theorem 2 (and F.3), and the claim with weights."""
-ALWAYS_EXCLUDED = "the guard or a torque limit was active all the time"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,7 +111,7 @@ class RunSummary:
                 condition = "(F.3)"
             return f"the gain conditions {condition} are not met"
         if self.excluded == self.samples:
-            return ALWAYS_EXCLUDED
+            return f"{self.why_excluded} all the time"
         return ""
 
     def applicable_case(self, kind: str) -> int | None:
@@ -152,13 +151,18 @@ class RunSummary:
         return found
 
     @property
+    def why_excluded(self) -> str:
+        """What excludes samples from the claims, in words."""
+        return claims.why_excluded(self.run.scenario)
+
+    @property
     def exclusion_note(self) -> str:
         """Which samples the claims exclude, and where they start again, in words."""
         excluded = ""
         if self.excluded:
-            why = "the guard or a torque limit was active"
+            why = self.why_excluded
             if self.claims.bounds_velocities:
-                why = "alpha was outside, or the guard or a torque limit active"
+                why = f"alpha was outside, or {why}"
             excluded = f"{self.excluded} of {self.samples} samples are excluded: {why}"
         restarts = ""
         if self.jumps.size:

@@ -35,7 +35,7 @@ import numpy as np
 from iblf_jax.certificates.decay_lines import check_steps
 from iblf_jax.certificates.lines import Line, Statement, not_applicable
 from iblf_jax.certificates.optional import optional_member
-from iblf_jax.certificates.run_summary import ALWAYS_EXCLUDED, ENERGY_ROUNDING, Segment
+from iblf_jax.certificates.run_summary import ENERGY_ROUNDING, Segment
 from iblf_jax.control.actuators import Ideal
 from iblf_jax.control.controllers import Backstepping, BarrierBackstepping, FullState
 from iblf_jax.control.controllers._base import decay_of
@@ -241,7 +241,7 @@ def why_no_settling(summary: Any) -> str:
         name = checks.with_article(type(actuator).__name__)
         return f"(D.2) is about a torque that acts as it is commanded, not about {name}"
     if summary.excluded == summary.samples:
-        return ALWAYS_EXCLUDED
+        return f"{summary.why_excluded} all the time"
     return summary.why_invalid  # type: ignore[no-any-return]
 
 

@@ -200,6 +200,16 @@ def test_a_law_without_a_lyapunov_function_has_no_compensation():
         ij.simulate(ij.with_parts(PAPER, controller=law), duration=0.1, dt=1e-3)
 
 
+def test_a_certificate_says_that_the_compensation_changes_the_input():
+    law = controllers.EventCompensated(
+        TRIGGERED.controller, relative=0.1, absolute=0.4, epsilon=0.5
+    )
+    scenario = ij.with_parts(TRIGGERED, controller=law, sampling=None)
+    line = ij.certify(scenario, duration=0.05, dt=1e-3)["inequality, case 2"]
+    assert line.verdict == "not applicable"
+    assert "or EventCompensated changed the input of Backstepping all the time" in line.note
+
+
 @pytest.mark.release
 def test_a_certificate_states_what_held_commands_may_add():
     run = ij.simulate(TRIGGERED, duration=0.1, dt=1e-3)

@@ -281,8 +281,8 @@ class AdaptiveParameters:
           gradient: Y^T s, (p,).
           context: its model has theta_0.
         """
-        leak = self.sigma * (theta - self._nominal(context.model))
-        return -self.Gamma * (gradient + leak)
+        leak = self.sigma * (self._nominal(context.model) - theta)
+        return self.Gamma * (leak - gradient)
 
     def projected(self, theta: jax.Array, rate: jax.Array) -> jax.Array:
         """P(rate), (p,): 0 at the bound that an estimate moves to, unchanged at `band` from it."""
