@@ -8,7 +8,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import iblf_jax as ij
-from iblf_jax import controllers, observers
+from iblf_jax import controllers, observers, plotting
 
 scenario = ij.presets.zhang_yan_2024(reading="corrected")
 law = scenario.controller
@@ -67,6 +67,9 @@ for case, run in ((case, runs[case]["adaptive payload"]) for case in cases):
 axes[2].axhline(0.5, color="black", linewidth=0.6, linestyle="--")
 axes[2].set(title="estimate of the payload", xlabel="t [s]", ylabel="theta_hat [kg]")
 axes[2].legend(fontsize=7)
+
+# %% The estimate of the load alone, between its bounds: it tends to the value of the plant.
+estimates = plotting.adaptation(runs["load"]["adaptive payload"])
 
 # %% The root mean square of |e1| in the last six seconds [rad]. Adaptation is the best choice where
 # the error is one of parameters, also for a fast reference; the observer is where it is not. The

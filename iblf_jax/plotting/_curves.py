@@ -11,9 +11,16 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.control.actuators import Ideal as IdealActuator
+from iblf_jax.control.controllers.adaptive_parameters import (
+    AdaptiveParameters,
+    AdaptiveState,
+    adapting_part,
+)
 from iblf_jax.control.sensors import Ideal as IdealSensor
 from iblf_jax.core import checks
 from iblf_jax.core.optional import attributes
@@ -36,10 +43,48 @@ DERIVED = {
     ),
     "measured_q": lambda run: _received(run, 0),
     "measured_dq": lambda run: _received(run, 1),
+    "theta": lambda run: _adapting(run)[1].theta,
+    "theta_lower": lambda run: _repeated(run, _adapting(run)[0].lower),
+    "theta_upper": lambda run: _repeated(run, _adapting(run)[0].upper),
+    "theta_of_plant": lambda run: _parameters_of_plant(run),
     "region_boundary": lambda run: np.zeros(np.shape(run.region_margin)),
 }
 """Signals computed from those of a Rollout: the bounds -k_l and k_u of e1, the bounds of xi, the
-error f - f_hat, the levels that the law received, and the boundary of a region."""
+error f - f_hat, the levels that the law received, the parameters that a law adapts with their
+bounds and those of the plant, and the boundary of a region."""
+
+
+def _adapting(run: Rollout) -> tuple[AdaptiveParameters, AdaptiveState]:
+    """The law of a run that adapts parameters, and its state along the run."""
+    found = adapting_part(run.scenario.controller, run.controller_state)
+    if found is None:
+        expected = "runs of a law that adapts parameters"
+        remedy = "Such as iblf_jax.controllers.AdaptiveParameters."
+        came = type(run.scenario.controller).__name__
+        raise checks.fail("runs", f"a run of {came}", expected, remedy)
+    return found
+
+
+def adapting_law(run: Rollout) -> AdaptiveParameters:
+    """The law of a run that adapts parameters.
+
+    Raises:
+      ValueError: a run of another law.
+    """
+    return _adapting(run)[0]
+
+
+def _repeated(run: Rollout, values: Any) -> np.ndarray:
+    """Constants, (p,), at every sample of a run, (T, p)."""
+    return np.broadcast_to(values, (len(run.t), len(values)))
+
+
+def _parameters_of_plant(run: Rollout) -> np.ndarray:
+    """The parameters of the plant that the law adapts, (T, p)."""
+    law, _ = _adapting(run)
+    context = run.scenario.context._replace(plant=run.scenario.plant)
+    values = jax.vmap(lambda t: law.true_parameters(t, context))(jnp.asarray(run.t))
+    return np.asarray(values)
 
 
 def _received(run: Rollout, i: int) -> Any:
@@ -100,6 +145,9 @@ EXTERNAL = {
     "dq_lower",
     "dq_upper",
     "region_boundary",
+    "theta_lower",
+    "theta_upper",
+    "theta_of_plant",
 }
 """Signals that do not depend on the state; figures draw them to the end of a failed run too."""
 

@@ -8,6 +8,7 @@ Source: Zhang & Yan 2024, figures 1 to 6.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,9 +19,18 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from iblf_jax.control.controllers.adaptive_parameters import THETA
 from iblf_jax.core import checks
 from iblf_jax.plotting import _style
-from iblf_jax.plotting._curves import POINTS, Curve, check_joint, curves_of, distinct, escaped
+from iblf_jax.plotting._curves import (
+    POINTS,
+    Curve,
+    adapting_law,
+    check_joint,
+    curves_of,
+    distinct,
+    escaped,
+)
 from iblf_jax.plotting._panels import (
     QUANTITIES,
     PanelQuantity,
@@ -298,6 +308,31 @@ def region_margins(runs: Runs, *, zoom: float | None = None) -> Figure:
     names = [escaped(in_words(region, robot)) for region in scenario.regions]
     quantities = [QUANTITIES["region_margin"]] * len(names)
     return _named_rows("Distance to the boundaries", curves, quantities, names, zoom)
+
+
+def adaptation(runs: Runs, *, zoom: float | None = None) -> Figure:
+    """Every parameter that the law adapts (`controllers.AdaptiveParameters`), between its bounds,
+    and the value of the plant.
+
+    Args:
+      runs: one run, or a dict of runs by name, all of laws that adapt the same parameters.
+      zoom: length of the magnified start [s]; the transient if not given.
+
+    Returns:
+      The figure, one row per parameter.
+
+    Raises:
+      ValueError: no run, a batch, laws that adapt no parameters or different ones, or a zoom that
+        is not a positive number.
+    """
+    curves = curves_of(runs)
+    laws = [adapting_law(curve.run) for curve in curves]
+    if len({law.parameters for law in laws}) > 1:
+        came = " and ".join(str(law.parameters) for law in laws)
+        raise checks.fail("runs", came, "runs of laws that adapt the same parameters")
+    units = laws[0].unit_symbols(curves[0].run.scenario.model)[THETA]
+    quantities = [dataclasses.replace(QUANTITIES["theta"], unit=unit) for unit in units]
+    return _named_rows("Adapting parameters", curves, quantities, laws[0].parameters, zoom)
 
 
 def uncertain_terms(runs: Runs, *, zoom: float | None = None) -> Figure:

@@ -115,6 +115,15 @@ QUANTITIES = {
             measured="measured_dq",
         ),
         PanelQuantity(
+            "theta",
+            "estimate",
+            r"$\hat\theta$",
+            "",
+            bounds=("theta_lower", "theta_upper"),
+            guide="theta_of_plant",
+            guide_label="value of the plant",
+        ),
+        PanelQuantity(
             "region_margin", "distance", "$h$", "m", guide="region_boundary", guide_label="boundary"
         ),
         PanelQuantity("tau", "torque", r"$\tau$", "N m", has_spikes=True),
@@ -134,7 +143,7 @@ QUANTITIES = {
 VIRTUAL_CONTROL = r"virtual control $\alpha_{i-1}$"
 """The label of the signal that a level above the first should follow."""
 
-UNRELATED_TO_LEVELS = ("xi", "region_margin")
+UNRELATED_TO_LEVELS = ("xi", "region_margin", "theta")
 """Panels that do not depend on the plant."""
 
 

@@ -53,7 +53,7 @@ from iblf_jax.control.decays._base import decay_member
 from iblf_jax.core import checks
 from iblf_jax.core.component_paths import member_of, replaced, resolve
 from iblf_jax.core.linalg import inner, matvec, solve_spd
-from iblf_jax.core.pytree import Leaf, component, leaf, static
+from iblf_jax.core.pytree import Leaf, component, layers, leaf, static
 from iblf_jax.core.time import as_at
 from iblf_jax.core.units import PlantUnit, of_entry
 from iblf_jax.world import plants
@@ -304,7 +304,7 @@ class AdaptiveParameters:
         model's; arguments as `LyapunovLaw.lyapunov`.
         """
         *measured, _, context, state = arguments
-        return self._value(t, measured, self._true(t, context), context, state)
+        return self._value(t, measured, self.true_parameters(t, context), context, state)
 
     def _value(
         self, t: jax.Array, measured: Any, theta: jax.Array, context: LawContext, state: Any
@@ -317,7 +317,7 @@ class AdaptiveParameters:
     def decay(self, t: jax.Array, *arguments: Any) -> jax.Array:
         """W + sigma/2 |theta_tilde|^2 of (A.3), (); arguments as `lyapunov`."""
         *measured, _, context, state = arguments
-        theta = self._true(t, context)
+        theta = self.true_parameters(t, context)
         law: Any = self.law
         decay = law.energy_decay(t, *measured, self._informed(context, theta))
         return decay + 0.5 * jnp.sum(self.sigma * (state.theta - theta) ** 2)
@@ -328,7 +328,7 @@ class AdaptiveParameters:
         Arguments as `LyapunovLaw.disturbance_terms`.
         """
         *measured, disturbance, _, context, state = arguments
-        theta = self._true(t, context)
+        theta = self.true_parameters(t, context)
         error = state.theta - theta
         command, _, gradient = self._command_and_gradient(t, measured, disturbance, context, state)
         effect = self._effect_of_rest(t, measured, command, theta, disturbance, context)
@@ -338,7 +338,7 @@ class AdaptiveParameters:
         projection = jnp.sum(jnp.maximum(error * removed / self.Gamma, 0.0))
 
         def value_at(now):
-            return self._value(t, measured, self._true(now, context), context, state)
+            return self._value(t, measured, self.true_parameters(now, context), context, state)
 
         change = jax.jvp(value_at, (t,), (jnp.ones_like(t),))[1]
         return effect + leak + projection + change
@@ -374,7 +374,7 @@ class AdaptiveParameters:
         needed = matvec(model.mass_matrix(q), ddq) + model.coriolis(q, dq, dq) + model.gravity(q)
         return inner(command.input_slope, needed - command.tau)
 
-    def _true(self, t: jax.Array, context: LawContext) -> jax.Array:
+    def true_parameters(self, t: jax.Array, context: LawContext) -> jax.Array:
         """Theta at time t, (p,): of the plant where the context has it and it has the parameters,
         else of the model.
         """
@@ -390,6 +390,21 @@ LAWS = (
     'Such as iblf_jax.controllers.Backstepping(k1=..., K2=..., reading="corrected"). Limits of the'
     " torque go around: Saturated(AdaptiveParameters(...))."
 )
+
+
+def adapting_part(law: Controller, state: Any) -> tuple[AdaptiveParameters, AdaptiveState] | None:
+    """The law with adapting parameters among the layers of a law, and its state; None without one.
+
+    Args:
+      law: of a scenario.
+      state: of the law.
+    """
+    for part in layers(law):
+        if isinstance(part, AdaptiveParameters):
+            return part, state
+        if law_member(part, "has_auxiliary"):
+            state = state.law
+    return None
 
 
 def _values_at(part: Any, names: tuple[str, ...]) -> jax.Array:
