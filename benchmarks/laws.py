@@ -36,7 +36,7 @@ import numpy as np
 from _timing import report
 
 import iblf_jax as ij
-from iblf_jax import barriers, bounds, controllers, sensors
+from iblf_jax import barriers, bounds, controllers, decays, observers, sensors
 
 DT, DURATION = 1e-3, 4.0
 """s, s."""
@@ -72,12 +72,36 @@ def _box(limit: float) -> ij.Bounds:
     return ij.Bounds(lower=bounds.Constant(-limit), upper=bounds.Constant(limit))
 
 
+CORRECTED = controllers.Backstepping(k1=2.0, K2=K2, reading="corrected")
 CHOICES = {
     "Backstepping(Integral)": Choice("integral"),
     "Backstepping(Log)": Choice("log"),
     "Backstepping(Tan)": Choice("tan"),
     "Backstepping(Mapping)": Choice(
         controllers.Backstepping(k1=2.0, K2=K2, barrier=barriers.Mapping(), reading="corrected")
+    ),
+    "Backstepping(Mapping), finite time": Choice(
+        controllers.Backstepping(
+            k1=2.0,
+            K2=K2,
+            barrier=barriers.Mapping(),
+            reading="corrected",
+            decays=decays.FiniteTime(k_a=0.2),
+        )
+    ),
+    "Backstepping(Integral), q measured": Choice(
+        "integral", {"observer": observers.StateObserver(bandwidth=100.0)}
+    ),
+    "Saturated(auxiliary)": Choice(controllers.Saturated(law=CORRECTED, limit=7.0, auxiliary=10.0)),
+    "AdaptiveParameters(masses)": Choice(
+        controllers.AdaptiveParameters(
+            law=CORRECTED,
+            parameters=("mass[0]", "mass[1]"),
+            Gamma=[3.0, 3.0],
+            lower=0.1,
+            upper=4.0,
+            sigma=0.01,
+        )
     ),
     "Backstepping, no bounds": Choice("backstepping"),
     "BarrierBackstepping(Mapping)": Choice(controllers.BarrierBackstepping(k=(2.0, 20.0))),
@@ -86,6 +110,7 @@ CHOICES = {
     "SurfaceBarrier": Choice(controllers.SurfaceBarrier(a=2.0, K=K2, surface=_box(9.0))),
     "SafetyFilter": Choice("safety_filter"),
     "ReferenceGovernor": Choice("reference_governor"),
+    "TerminalSlidingMode": Choice(controllers.TerminalSlidingMode(beta=2.0, K=20.0, layer=0.05)),
     "ComputedTorque": Choice("computed_torque"),
     "PDGravity": Choice("pd"),
 }

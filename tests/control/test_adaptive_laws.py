@@ -349,6 +349,9 @@ def test_weights_of_both_layers_stay_below_their_bounds():
 # ------------------------------------------------------------------------- what is refused
 
 
+SETTLING = controllers.Backstepping(
+    k1=2.0, K2=20.0, reading="corrected", decays=ij.decays.FiniteTime(k_a=1.0)
+)
 REFUSED = [
     ({"parameters": ("length[0]",)}, "affine"),
     ({"parameters": ("mass[2]",)}, "the path of a number"),
@@ -372,6 +375,7 @@ def test_parameters_without_a_proof_are_refused(changes, message):
         ({"law": PAPER.controller, "upper": -2.0}, "more than lower"),
         ({"law": ij.presets.zhang_yan_2024().controller}, "corrected"),
         ({"law": controllers.PDGravity(Kp=60.0, Kd=20.0)}, "energy"),
+        ({"law": SETTLING}, r"decays\[1\]: got 'FiniteTime', expected Exponential"),
         ({"law": controllers.BarrierBackstepping(k=(2.0, 20.0), filter=[0.1])}, "derivatives"),
         ({"Gamma": [1.0, 2.0]}, "one for each parameter"),
         ({"parameters": ("payload", "payload")}, "different paths"),

@@ -18,6 +18,18 @@ from iblf_jax.testing._contract import Findings
 LONG = {"arm"}
 """Takes a minute to compile: the default run holds it to a part of its contract, in a test of its
 own."""
+BEFORE_A_RELEASE = {"full_state_mixed", "adaptive_parameters_levels", "backstepping_decays"}
+"""Further members of a class that compile long; another member of the class is in the default
+run."""
+
+
+def marks_of(name: str, is_further: bool) -> list:
+    """The marks of the test of a member; `is_further` says that its class has another one."""
+    if name in BEFORE_A_RELEASE:
+        return [pytest.mark.release]
+    if is_further or name in LONG:
+        return [pytest.mark.slow]
+    return []
 
 
 def cases():
@@ -26,7 +38,7 @@ def cases():
         for name, member in members.items():
             again = type(member) in seen
             seen.add(type(member))
-            marks = [pytest.mark.slow] if again or name in LONG else []
+            marks = marks_of(name, again)
             yield pytest.param(check, member, id=f"{family}-{name}", marks=marks)
 
 

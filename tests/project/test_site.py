@@ -34,8 +34,9 @@ PAGES = [
 """Every page with Python: README, CONTRIBUTING and what is beside them, and the documentation."""
 ELSEWHERE = {"other_solvers"}
 """`test_vector_field` runs the page about other solvers, which needs a library of theirs."""
-LONG = pytest.mark.release
-"""The guide takes two minutes of a processor; its short forms are the other pages."""
+LONG = {"guide", "tune_my_robot"}
+"""They take more than a minute of a processor each and run before a release. The other pages are
+the short forms of the guide; a notebook goes from the paper to a tuned robot."""
 
 
 def test_there_are_examples():
@@ -72,7 +73,7 @@ def test_every_name_on_a_page_exists(page):
 @pytest.mark.parametrize(
     "page",
     [
-        pytest.param(page, marks=LONG if page.stem == "guide" else pytest.mark.slow)
+        pytest.param(page, marks=pytest.mark.release if page.stem in LONG else pytest.mark.slow)
         for page in PAGES
         if page.stem not in ELSEWHERE
     ],
