@@ -96,7 +96,8 @@ WORDS = {
     ),
     "ComputedTorque": Advice(
         "the model is good and there are no bounds",
-        "disturbances act: with 6.7 times its gains, its error is four times that of the paper's law",
+        "disturbances act: with 6.7 times its gains, its error is four times that of the paper's"
+        " law",
     ),
     "PDGravity": Advice(
         "only the gravity of the model is known", "the masses are uncertain or the loop is slow"

@@ -16,9 +16,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.control.sensors import Ideal, Measurement
+from iblf_jax.control.sensors import Ideal, Levels, Measurement
+from iblf_jax.control.sensors._base import sensor_member
 from iblf_jax.core import checks
-from iblf_jax.core.optional import has_members
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.engine import LOWERING_LIMITS
 from iblf_jax.kernels import Program, Shapes, compile_step, written_out
@@ -77,6 +77,7 @@ class LawState(NamedTuple):
     controller: Any
     observer: Any
     velocity: Any
+    """The states of the sensor's velocity filters."""
     sent: Any = ()
     """The `SentCommand` of a law with an event trigger."""
 
@@ -140,10 +141,11 @@ def start(scenario: Scenario, inputs: SampleInputs) -> tuple[LawState, jax.Array
     law: Any = scenario.controller
     controller = law.init(*law_state(scenario, q, dq, higher), scenario.context)
     observer = observer_initial(scenario, discrete_observer(scenario), q, dq, higher)
-    velocity_filter = _velocity_filter(scenario)
-    filtered: Any = ()
-    if velocity_filter is not None:
-        filtered = velocity_filter.init(q, dq, scenario.sampling.period)  # type: ignore[union-attr]
+    period = scenario.sampling.period  # type: ignore[union-attr]
+    x = model_state(scenario, q, dq, higher)
+    filtered = tuple(
+        velocity.init(x[row - 1], x[row], period) for row, velocity in velocity_filters(scenario)
+    )
     if plants.is_chain(scenario.model):
         balance = steady_input(scenario, q)
     else:
@@ -157,16 +159,7 @@ def start(scenario: Scenario, inputs: SampleInputs) -> tuple[LawState, jax.Array
 def sample(scenario: Scenario, inputs: SampleInputs, state: LawState) -> tuple[LawState, Outputs]:
     """One sample: the state for the next sample, and the outputs."""
     scenario = _with_reference(scenario, inputs)
-    dq = inputs.dq
-    velocity_filter = _velocity_filter(scenario)
-    filtered: Any = ()
-    if velocity_filter is not None:
-        assert scenario.sampling is not None
-        normal = jnp.zeros((velocity_filter.draws, scenario.n), inputs.q.dtype)
-        dq, filtered = velocity_filter.estimate(
-            inputs.q, inputs.dq, normal, scenario.sampling.period, state.velocity
-        )
-    measured = Measurement(inputs.q, dq, inputs.higher)
+    measured, filtered = _measurement(scenario, inputs, state.velocity)
     update = law_update(scenario, inputs.t, measured, state.controller, state.observer, state.sent)
     command = update.command
     tube = scenario.context.tube(inputs.t)
@@ -185,11 +178,55 @@ def sample(scenario: Scenario, inputs: SampleInputs, state: LawState) -> tuple[L
     return LawState(update.controller, update.observer, filtered, update.sent), outputs
 
 
-def _velocity_filter(scenario: Scenario) -> Any:
-    """The velocity filter of the sensor; None where velocities are inputs."""
-    if isinstance(scenario.sensor, Ideal):
-        return None
-    return scenario.sensor.velocity  # type: ignore[attr-defined]
+def _measurement(
+    scenario: Scenario, inputs: SampleInputs, states: tuple[Any, ...]
+) -> tuple[Measurement, tuple[Any, ...]]:
+    """The levels of the inputs with the velocities of the sensor's filters, and the next states of
+    these.
+    """
+    period = scenario.sampling.period  # type: ignore[union-attr]
+    rows = list(model_state(scenario, inputs.q, inputs.dq, inputs.higher))
+    after = []
+    for (row, velocity), state in zip(velocity_filters(scenario), states, strict=True):
+        normal = jnp.zeros((velocity.draws, scenario.n), inputs.q.dtype)
+        rows[row], found = velocity.estimate(rows[row - 1], rows[row], normal, period, state)
+        after.append(found)
+    if len(rows) == 2:
+        return Measurement(rows[0], rows[1]), tuple(after)
+    return Measurement(rows[0], rows[1], jnp.stack(rows[2:])), tuple(after)
+
+
+class VelocityFilter(NamedTuple):
+    """A velocity filter of the sensor."""
+
+    row: int
+    """Of x, (r, n), that it computes from the row before."""
+    velocity: Any
+
+
+def velocity_filters(scenario: Scenario) -> list[VelocityFilter]:
+    """The velocity filters of the sensor for the levels of the model."""
+    order = plants.order_of(scenario.model)
+    parts = [(0, scenario.sensor)]
+    if isinstance(scenario.sensor, Levels):
+        parts = [(span.levels.start, span.part) for span in scenario.sensor.spans()]
+    filters = [VelocityFilter(row + 1, sensor_member(part, "velocity")) for row, part in parts]
+    return [x for x in filters if x.velocity is not None and x.row < order]
+
+
+def _check_sensor(scenario: Scenario) -> None:
+    """Raises ValueError for a sensor, or a part of one, of which only the robot has the reading."""
+    parts = {"scenario.sensor": scenario.sensor}
+    if isinstance(scenario.sensor, Levels):
+        spans = enumerate(scenario.sensor.spans())
+        parts = {f"scenario.sensor.parts[{i}]": span.part for i, span in spans}
+    for name, part in parts.items():
+        has_level = sensor_member(part, "levels") == 1
+        if has_level or isinstance(part, Ideal) or sensor_member(part, "velocity") is not None:
+            continue
+        expected = "one with a field `velocity`, sensors.Levels or sensors.Ideal()"
+        remedy = "The velocity filter computes q' from q."
+        raise checks.fail(name, type(part).__name__, expected, remedy)
 
 
 class ControlLaw(NamedTuple):
@@ -203,8 +240,8 @@ class ControlLaw(NamedTuple):
     """The program of `sample`; its carry is the state, and its results are `Outputs`."""
     state_names: tuple[str, ...]
     """Names of the numbers of the state."""
-    reads_velocity: bool
-    """Whether q' is an input."""
+    unread: tuple[int, ...]
+    """The levels, counted from 1, that a sample does not read; only the start does."""
     estimate_size: int
     """Numbers of the observer's estimate."""
 
@@ -220,11 +257,7 @@ def control_law(scenario: Scenario, external_reference: bool) -> ControlLaw:
       ValueError: a sensor whose velocity filter is not known.
       UnsupportedError: the law cannot be lowered; the message states the reason.
     """
-    if not isinstance(scenario.sensor, Ideal) and not has_members(scenario.sensor, "velocity"):
-        kind = type(scenario.sensor).__name__
-        expected = "one with a field `velocity`, or sensors.Ideal()"
-        remedy = "The velocity filter computes q' from q."
-        raise checks.fail("scenario.sensor", kind, expected, remedy)
+    _check_sensor(scenario)
     q = scenario.initial.q
     dtype = q.dtype
     inputs = inputs_at_start(scenario)
@@ -244,14 +277,13 @@ def control_law(scenario: Scenario, external_reference: bool) -> ControlLaw:
 
     start_program = program_of(start_step, scenario, inputs, ())
     sample_program = program_of(sample_step, scenario, inputs, state)
-    velocities = range(1 + scenario.n, 1 + 2 * scenario.n)  # after t and q
-    reads_velocity = any(
-        node.op == "per_run" and node.value in velocities for node in sample_program.nodes
-    )
+    # The levels follow the time, n numbers each.
+    levels = {
+        (node.value - 1) // scenario.n + 1 for node in sample_program.nodes if node.op == "per_run"
+    }
+    unread = tuple(i for i in range(2, plants.order_of(scenario.model) + 1) if i not in levels)
     estimate = jax.eval_shape(sample, scenario, inputs, like)[1].f_hat
-    return ControlLaw(
-        start_program, sample_program, number_names(state), reads_velocity, estimate.size
-    )
+    return ControlLaw(start_program, sample_program, number_names(state), unread, estimate.size)
 
 
 def as_floats(state: Any, dtype: Any) -> Any:

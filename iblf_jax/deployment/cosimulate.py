@@ -99,8 +99,8 @@ def cosimulate(
       that is too long.
 
     Raises:
-      ValueError: bad arguments, a plant or a model that is no robot, or joints that are not in
-        MuJoCo's model; the message names the field, the value and the remedy.
+      ValueError: bad arguments, a plant or a model that is no robot, process noise, or joints that
+        are not in MuJoCo's model; the message names the field, the value and the remedy.
       SimulationError: with `throw`, when a bound was violated or the state ran away.
       ImportError: the extra `robots` is not installed.
 
@@ -110,6 +110,7 @@ def cosimulate(
         checks.one_of("integrator", integrator, INTEGRATORS)
     check_single(scenario)
     _check_robots(scenario)
+    _check_no_process_noise(scenario)
     scenario = canonical(with_period(scenario, period))
     seed, throw = checks.seed(seed), checks.boolean("throw", throw)
     names = tuple(robot_member(scenario.plant, "joints"))
@@ -151,6 +152,16 @@ def _check_robots(scenario: Scenario) -> None:
             remedy += f" Take {name}=scenario.{name}.robot, and a law for robots."
         expected = "a robot, whose inputs are torques"
         raise checks.fail(f"scenario.{name}", type(part).__name__, expected, remedy)
+
+
+def _check_no_process_noise(scenario: Scenario) -> None:
+    """Raises ValueError for process noise, which MuJoCo's integrators do not have."""
+    noise = scenario.process_noise
+    if noise is None:
+        return
+    expected = "None, as MuJoCo integrates the motion without noise"
+    remedy = "Take ij.with_parts(scenario, process_noise=None), or ij.simulate with the noise."
+    raise checks.fail("scenario.process_noise", type(noise).__name__, expected, remedy)
 
 
 def _own_step(scenario: Scenario, robot: MujocoPlant) -> float:

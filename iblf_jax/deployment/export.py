@@ -119,9 +119,10 @@ def export(
     loop as `name.wasm` for a browser, and `name.json`, the table of its parameters and records.
 
     Args:
-      scenario: the scenario.  An exported law does not contain the effects of the encoder
+      scenario: the scenario.  An exported law does not contain the effects of the sensors
         (counts, offset, noise), the actuator and the delay, which are the robot's own; they are
-        part of the simulated run only.
+        part of the simulated run only.  The process noise of the plant is left out.  Levels that
+        the sensor does not measure are inputs of the start only.
       folder: output folder; it is created if it does not exist, and existing files are replaced.
       target: "c", "fmu", "fmu-loop" or "wasm".
       period: of the law [s]; the scenario's `sampling.period` if not given.  A closed loop need not
@@ -152,9 +153,8 @@ def export(
     dt, seed = checks.time_span("dt", dt), checks.seed(seed)
     name = checked_name(name, "iblf_loop" if is_loop else "iblf_law")
     check_single(scenario)
-    if not is_loop and input_delay(scenario.actuator) is not None:
-        # The program of a law ends with its command; a delay belongs to the computer that runs it.
-        scenario = dataclasses.replace(scenario, actuator=Ideal())
+    if not is_loop:
+        scenario = _without_parts_of_the_plant(scenario)
     if not is_loop or period is not None:
         scenario = with_period(scenario, period)
     scenario = canonical(astype(scenario, _available(dtype)))
@@ -169,6 +169,17 @@ def export(
     except UnsupportedError as error:
         came = f"what has no C ({error})"
         raise checks.fail("scenario", came, "a scenario whose operations are lowered") from None
+
+
+def _without_parts_of_the_plant(scenario: Scenario) -> Scenario:
+    """The scenario without process noise and without a delay of the input.
+
+    The program of a law ends with its command; the noise acts on the plant, and the delay belongs
+    to the computer that runs the law.
+    """
+    if input_delay(scenario.actuator) is not None:
+        scenario = dataclasses.replace(scenario, actuator=Ideal())
+    return dataclasses.replace(scenario, process_noise=None)
 
 
 def _current_name(reference: str) -> str:

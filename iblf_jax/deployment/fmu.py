@@ -268,14 +268,15 @@ def law_fmu(law: Law, generated: GeneratedLaw, path: Path) -> None:
     n = law.scenario.n
     name = law.name
     step = float(law.scenario.sampling.period)  # type: ignore[union-attr]
-    places = "".join(f", q + {k * n}" for k, _ in enumerate(law.further_inputs, start=2))
-    dq = "NULL"
-    if law.programs.reads_velocity:
-        dq = f"q + {n}"
+    names = ("dq", *law.further_inputs)
+    at_start = {name: f"q + {k * n}" for k, name in enumerate(names, start=1)}
+    further = [f", {at_start[name]}" for name in law.further_inputs]
+    at_sample = at_start | dict.fromkeys(law.unread_levels, "NULL")
+    sampled = ", ".join(at_sample[name] for name in names)
     # The order counts: the token of the FMU is computed from the text of these values.
     values = {
-        "name": name, "upper": name.upper(), "joints": n, "step": repr(step), "further": places,
-        "dq": dq,
+        "name": name, "upper": name.upper(), "joints": n, "step": repr(step),
+        "further": "".join(further), "sampled": sampled,
     }  # fmt: skip
     sources = {file: generated.files[file] for file in (f"{name}.h", f"{name}.c")}
     variables = law_variables(law, generated.parameters)

@@ -14,7 +14,7 @@ import numpy as np
 
 from iblf_jax import __version__
 from iblf_jax.deployment.c_names import Parameters, comment, number
-from iblf_jax.deployment.control_law import FLAGS, ControlLaw, SampleInputs
+from iblf_jax.deployment.control_law import FLAGS, ControlLaw, SampleInputs, velocity_filters
 from iblf_jax.deployment.signal_units import one_unit, per_time
 from iblf_jax.kernels import INPUTS, OPERATIONS, Program, header, plain_function
 from iblf_jax.simulation.scenario import Scenario
@@ -159,6 +159,16 @@ class Law(NamedTuple):
         return tuple(x.name for x in inputs)
 
     @property
+    def levels(self) -> tuple[str, ...]:
+        """Names of the inputs that are levels of the model."""
+        return ("q", "dq", *(x.name for x in law_inputs(self.scenario.model, False)))
+
+    @property
+    def unread_levels(self) -> tuple[str, ...]:
+        """Those that only the start reads."""
+        return tuple(self.levels[level - 1] for level in self.programs.unread)
+
+    @property
     def is_float(self) -> bool:
         """Whether its numbers are floats and not doubles."""
         return self.programs.sample.dtype == np.float32
@@ -239,21 +249,31 @@ def _law_values(law: Law, operations: Counter[str]) -> dict[str, Any]:
         "output_meanings": _output_meanings(law.scenario),
         "keep_start": "",
         "keep_sample": "",
-        "default_dq": "if (dq == NULL) dq = zero;",
-        "dq_argument": "NULL",
-        "dq_note": "\n   dq is the velocity that the filter starts with; NULL for 0.",
-        "dq_of_k": "NULL",
-        "dq_of_0": "NULL",
-        "velocity": "Its inputs are positions; the scenario's filter computes the velocities.",
         **_input_values(law),
+        **_unread_values(law),
     }
     if state:
         keep = "memcpy(s->memory, result, sizeof s->memory);\n"
         values |= {"keep_start": keep + "  ", "keep_sample": keep + "    "}
-    if law.programs.reads_velocity:
-        values |= {"default_dq": "(void)zero;", "dq_argument": "dq", "dq_note": ""}
-        values |= {"dq_of_k": "dq[k]", "dq_of_0": "dq[0]"}
-        values["velocity"] = "Its inputs are positions and velocities."
+    return values
+
+
+def _unread_values(law: Law) -> dict[str, str]:
+    """The values that depend on which levels a sample reads."""
+    unread = law.unread_levels
+    read = ", ".join(x for x in law.levels if x not in unread)
+    values = {
+        "default_unread": "(void)zero;",
+        "unread_note": "",
+        "measured": f"Measured at time t: {read}.",
+        "velocity": f"Its measured inputs are {read}.",
+    }
+    if not unread:
+        return values
+    names = ", ".join(unread)
+    values["default_unread"] = "\n  ".join(f"if ({x} == NULL) {x} = zero;" for x in unread)
+    values["unread_note"] = f"\n   Filters and observer start with {names}; NULL for 0."
+    values["velocity"] += f"  Filters and observer compute {names}, for which it receives NULL."
     return values
 
 
@@ -311,16 +331,16 @@ def _input_values(law: Law) -> dict[str, str]:
     if law.external_reference:
         text = "The reference is an input of every sample."
     forms = {
-        "further_arguments": ", {}",
         "further_declarations": f", const {law.name}_real *{{}}",
         "further_parameters": ", const real *{}",
         "further_finite": f" && are_finite({{}}, {law.scenario.n})",
         "further_values": "{}, ",
-        "further_of_k": ", {}[k]",
-        "further_of_0": ", {}[0]",
         "first_further": ", first_{}",
     }
     texts = {key: "".join(map(form.format, law.further_inputs)) for key, form in forms.items()}
+    for key, index in (("arguments", ""), ("arguments_of_k", "[k]"), ("arguments_of_0", "[0]")):
+        arguments = {name: name + index for name in ("dq", *law.further_inputs)}
+        texts[key] = ", ".join((arguments | dict.fromkeys(law.unread_levels, "NULL")).values())
     return {"reference": text, **texts}
 
 
@@ -349,9 +369,8 @@ def _supporting_files(
             "Time as a float loses a millisecond after four hours: start again before.  "
         )
     arrays = {"q": v.q, "torque": v.tau}
-    if law.programs.reads_velocity:
-        arrays["dq"] = v.dq
-    arrays |= dict(zip(law.further_inputs, v.further, strict=True))
+    rows = dict(zip(("dq", *law.further_inputs), (v.dq, *v.further), strict=True))
+    arrays |= {name: x for name, x in rows.items() if name not in law.unread_levels}
     if law.scenario_toml is not None:
         values["scenario_row"] = _scenario_row(law)
     texts = {
@@ -384,8 +403,7 @@ def _contents(law: Law) -> str:
         f"the model ({type(s.model).__name__})",
         "the bounds",
     ]
-    if not law.programs.reads_velocity:
-        velocity = s.sensor.velocity  # type: ignore[attr-defined]
+    for _, velocity in velocity_filters(s):
         parts.append(f"the filter {type(velocity).__name__}")
     return ", ".join(parts)
 

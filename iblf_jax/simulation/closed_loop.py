@@ -26,8 +26,9 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.control.actuators import Ideal
-from iblf_jax.control.actuators._base import smooth, unlimited
+from iblf_jax.control.actuators import _base as actuators
 from iblf_jax.control.controllers import Command
+from iblf_jax.control.controllers import _base as controllers
 from iblf_jax.control.controllers._base import law_member, state_of_levels
 from iblf_jax.control.observers._base import observer_member
 from iblf_jax.control.sensors import Measurement
@@ -661,10 +662,10 @@ def perturbed_rate(
 
     For a continuous loop it is the rate of the state. For a sampled loop it is the rate of the
     plant, the next command, and the next states of law, observer and sensor. Rounding of a sensor,
-    limits of an actuator and an event trigger are left out (`Sensor.unrounded`,
-    `Actuator.unlimited`), because their derivatives vanish and would show an open loop; so are dead
-    zone, play and rounding of an actuator in every loop (`Actuator.smooth`), and the delay of the
-    input of a continuous loop.
+    limits of an actuator or of a law and an event trigger are left out (`Sensor.unrounded`,
+    `Actuator.unlimited`, `Controller.unlimited`), because their derivatives vanish and would show
+    an open loop; so are dead zone, play and rounding of an actuator in every loop
+    (`Actuator.smooth`), and the delay of the input of a continuous loop.
 
     Args:
       scenario: the scenario.
@@ -675,7 +676,7 @@ def perturbed_rate(
       compiled: wrapper of functions that are compiled on their own.
     """
     if not isinstance(perturbed, PerturbedState):
-        actuator = smooth(scenario.actuator)
+        actuator = actuators.smooth(scenario.actuator)
         if actuator is not scenario.actuator:
             scenario = dataclasses.replace(scenario, actuator=actuator)
         arguments = [scenario, t, perturbed]
@@ -686,7 +687,8 @@ def perturbed_rate(
     scenario = dataclasses.replace(
         scenario,
         sensor=unrounded(scenario.sensor),
-        actuator=smooth(unlimited(scenario.actuator)),
+        controller=controllers.unlimited(scenario.controller),
+        actuator=actuators.smooth(actuators.unlimited(scenario.actuator)),
         sampling=dataclasses.replace(sampling, trigger=None),
     )
     controller, observer, sensor = perturbed.memory

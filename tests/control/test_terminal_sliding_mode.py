@@ -12,6 +12,8 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 import iblf_jax as ij
+from iblf_jax.core import notices
+from iblf_jax.core.status import Status
 from iblf_jax.simulation.scenario import canonical
 
 ARM = TwoLinkArm(mass=(1.2, 0.7), length=(0.4, 0.3), centre=(0.2, 0.16), inertia=(0.02, 0.01))
@@ -187,3 +189,24 @@ def test_an_exponent_without_a_law_is_refused():
     for p in (1.0, 2.0, [1.5, 2.5]):
         with pytest.raises(ValueError, match=r"TerminalSlidingMode\.p.*1 < p < 2"):
             ij.controllers.TerminalSlidingMode(beta=1.0, K=20.0, layer=0.1, p=p)
+
+
+def test_a_sampled_loop_is_assessed_with_the_slope_of_the_layer():
+    """Outside the layer the torque does not depend on the position, which says nothing about the
+    period.  A layer that is too thin for the period is reported."""
+    law = LAW | {"beta": 2.0, "K": 20.0, "layer": 0.05}
+    start = ij.Initial(q=[0.8, 0.6], dq=[0.0, 0.0])
+    wide = loop(law, initial=start, sampling=ij.Sampling(period=1e-3))
+    tube = wide.context.tube(jnp.zeros(()))
+    sigma, _ = surface(law, np.asarray(start.q) - tube.q_d, np.asarray(start.dq) - tube.dq_d)
+    assert np.all(np.abs(sigma) > law["layer"])
+    radii, reported = [], []
+    for layer in (0.05, 1e-4):
+        with notices.muted():
+            run = ij.simulate(
+                ij.with_parameters(wide, {"controller.layer": layer}), duration=0.1, dt=1e-3
+            )
+        radii.append(float(run.metrics.sampling_radius))
+        reported.append(bool(int(run.status) & int(Status.SAMPLING_TOO_SLOW)))
+    assert radii[0] < 1.0 < radii[1]
+    assert reported == [False, True]

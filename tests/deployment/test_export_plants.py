@@ -149,3 +149,11 @@ def test_units_of_inputs_and_outputs():
 def test_mujoco_refuses_what_is_no_robot():
     with pytest.raises(ValueError, match=r"scenario\.plant: got 'FlexibleJoint'.*plant\.robot"):
         ij.cosimulate(loops_of_plants.flexible_joint(), "arm.xml", period=PERIOD, duration=0.1)
+
+
+def test_mujoco_refuses_process_noise():
+    scenario = ij.with_parts(
+        ij.presets.zhang_yan_2024(), process_noise=ij.process_noise.Additive(0.2)
+    )
+    with pytest.raises(ValueError, match=r"process_noise: got 'Additive'.*process_noise=None"):
+        ij.cosimulate(scenario, "arm.xml", period=PERIOD, duration=0.1)

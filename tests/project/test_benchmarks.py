@@ -14,10 +14,18 @@ FOLDER = Path(__file__).parents[2] / "benchmarks"
 OF_THEIR_OWN = ("gpu.py", "monte_carlo.py", "throughput.py")
 """They choose JAX's type and devices, of which a process has one; the others spare themselves
 another start."""
+BEFORE_A_RELEASE = {"constraints.py", "tuning.py"}
+"""Their quick sizes compile for a quarter of a minute."""
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", sorted(path.name for path in FOLDER.glob("[a-z]*.py")))
+def benchmarks():
+    """Every benchmark, with its mark."""
+    for path in sorted(FOLDER.glob("[a-z]*.py")):
+        mark = pytest.mark.release if path.name in BEFORE_A_RELEASE else pytest.mark.slow
+        yield pytest.param(path.name, marks=mark)
+
+
+@pytest.mark.parametrize("name", benchmarks())
 def test_quick_benchmark(name, tmp_path, monkeypatch):
     output = tmp_path / "table.json"
     words = [str(FOLDER / name), "--quick", "--json", str(output)]

@@ -578,7 +578,7 @@ def killed_until_done(path, compiled, table, kills, seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kills", [8, pytest.param(20, marks=pytest.mark.release)])
+@pytest.mark.parametrize("kills", [4, pytest.param(20, marks=pytest.mark.release)])
 def test_many_kills(tmp_path, compiled, table, kills):
     killed_until_done(tmp_path / "sweep.zarr", compiled, table, kills, seed=kills)
 

@@ -153,6 +153,8 @@ class Controller(Protocol):
       (r, n), in the place of q and q': `init(x, context)`, `command(t, x, d_hat, context, state)`
       and `switching(t, x, d_hat, context, state)`, with d_hat as the observer gives it, (r, n) or
       (n,).
+    - `unlimited`: the same law without a limit of its own, by which a sampled loop is linearised;
+      None for a law without one.
     - `wraps`: the name of the field that holds another law.  Paths then reach through it
       ("controller.K2").
     - `input_unit`: the unit of the input that an input map such as `WithDrive` commands; None for
@@ -213,6 +215,7 @@ law_member = OptionalMembers(
     takes_shift=False,
     has_auxiliary=False,
     filter=None,
+    unlimited=None,
     unit_symbols=lambda model: {},
     receives_x=False,
     input_unit=None,
@@ -231,6 +234,14 @@ law_member = OptionalMembers(
 )
 """Reads optional members of a law: those that `Controller` and `LyapunovLaw` describe, and some
 fields of laws with a barrier."""
+
+
+def unlimited(law: Controller) -> Controller:
+    """A law without its own limit; itself if it declares none."""
+    found = law_member(law, "unlimited")
+    if found is None:
+        return law
+    return found  # type: ignore[no-any-return]
 
 
 def switching_functions(law: Controller, *arguments: Any) -> jax.Array | None:

@@ -26,6 +26,7 @@ within p/(p-1) (2^((p-1)/2)/beta)^(1/p) |e0|^(1-1/p), and below that size expone
 
 from __future__ import annotations
 
+import dataclasses
 from typing import ClassVar
 
 import jax
@@ -40,6 +41,9 @@ from iblf_jax.control.controllers._base import (
 )
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf
+
+BEYOND_LAYER = 1e6
+"""Width of the layer of `TerminalSlidingMode.unlimited`, relative to that of the law."""
 
 
 @component
@@ -81,6 +85,13 @@ class TerminalSlidingMode:
             expected = "1 < p < 2"
             remedy = "p = 1 is a linear surface, and the torque is singular from p = 2 on."
             raise checks.fail("TerminalSlidingMode.p", self.p, expected, remedy)
+
+    @property
+    def unlimited(self) -> TerminalSlidingMode:
+        """The law with the slope K/layer of the reaching term also outside the layer, where that
+        term is constant and the law has no feedback of the position.
+        """
+        return dataclasses.replace(self, K=BEYOND_LAYER * self.K, layer=BEYOND_LAYER * self.layer)
 
     def command(
         self,

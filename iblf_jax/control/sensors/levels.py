@@ -66,7 +66,7 @@ class Levels:
                 raise checks.fail(f"{name}[{i}]", type(part).__name__, expected, remedy)
         object.__setattr__(self, "parts", parts)
 
-    def _spans(self) -> Iterator[Span]:
+    def spans(self) -> Iterator[Span]:
         """The parts with their levels and their normal random numbers."""
         level, draw = 0, 0
         for part in self.parts:
@@ -84,7 +84,7 @@ class Levels:
     def measured(self) -> tuple[int, ...]:
         """The levels that are measured, counted from 1."""
         found: list[int] = []
-        for span in self._spans():
+        for span in self.spans():
             if sensor_member(span.part, "is_measured"):
                 found += range(span.levels.start + 1, span.levels.stop + 1)
         return tuple(found)
@@ -97,14 +97,14 @@ class Levels:
     @property
     def unrounded(self) -> Levels:
         """The same without rounding."""
-        parts = tuple(unrounded(span.part) for span in self._spans())
+        parts = tuple(unrounded(span.part) for span in self.spans())
         return dataclasses.replace(self, parts=parts)
 
     @property
     def resolution(self) -> jax.Array:
         """Step of the readings of each level, (r, 1) or (r, n); 0 for a level without rounding."""
         rows: list[Any] = [0.0] * self.order
-        for span in self._spans():
+        for span in self.spans():
             step = sensor_member(span.part, "resolution")
             if step is not None:
                 # A sensor of two levels rounds the position; its velocity follows from it.
@@ -122,7 +122,7 @@ class Levels:
     def init(self, x: jax.Array, period: jax.Array) -> State:
         """The states of the parts."""
         states = []
-        for span in self._spans():
+        for span in self.spans():
             levels = x[span.levels]
             if len(levels) == 1:
                 states.append(span.part.init_level(levels[0], period))
@@ -136,7 +136,7 @@ class Levels:
         """The measurements of the parts, and their next states."""
         rows: list[jax.Array] = []
         states = []
-        for span, before in zip(self._spans(), state, strict=True):
+        for span, before in zip(self.spans(), state, strict=True):
             levels, own = x[span.levels], normal[span.draws]
             if len(levels) == 1:
                 y, after = span.part.measure_level(levels[0], own, period, before)

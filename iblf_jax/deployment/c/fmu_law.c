@@ -18,7 +18,7 @@ static int begin(fmu *f) {
 static int advance(fmu *f) {
   const double *q = f->inputs;
   double tau[${joints}];
-  const int status = ${name}_step(&f->p, &f->s, STEP * (double)f->index, q, ${dq}${further}, tau);
+  const int status = ${name}_step(&f->p, &f->s, STEP * (double)f->index, q, ${sampled}, tau);
   f->index += 1;
   f->outputs[OUTPUTS - 1] = (double)status;
   if ((status & ${upper}_NOT_FINITE) == 0) return OK;

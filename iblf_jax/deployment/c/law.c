@@ -10,7 +10,7 @@ int ${name}_init(const ${name}_parameters *p, ${name}_state *s, const real *q, c
   static const real zero[${joints}] = {0};
   real result[${memory_count} + ${joints}];
   int valid;
-  ${default_dq}
+  ${default_unread}
   memset(s, 0, sizeof *s);
   valid = are_finite(q, ${joints}) && dq != NULL && are_finite(dq, ${joints})${further_finite};
   if (!valid) return ${upper}_NOT_FINITE;
@@ -24,9 +24,9 @@ int ${name}_step(const ${name}_parameters *p, ${name}_state *s, real t, const re
   enum { N = ${joints}, M = ${memory_count}, E = ${estimate_size} };
   static const real zero[N] = {0};
   real result[M + 2 * N + E + ${flags}];
-  int k, status = 0, valid = are_finite(&t, 1) && are_finite(q, N)${further_finite};
-  ${default_dq}
-  valid = valid && dq != NULL && are_finite(dq, N);
+  int k, status = 0, valid;
+  ${default_unread}
+  valid = are_finite(&t, 1) && are_finite(q, N) && dq != NULL && are_finite(dq, N)${further_finite};
   if (valid) ${name}_sample(p, s->memory, &t, q, dq, ${further_values}result);
   if (valid && are_finite(result, M + 2 * N + E)) {
     ${keep_sample}memcpy(s->tau, result + M, sizeof s->tau);

@@ -3,8 +3,8 @@
 
      ${name}_parameters p = ${name}_defaults;      gains and model parameters of the scenario
      ${name}_state s;
-     ${name}_init(&p, &s, q, ${dq_argument}${further_arguments});    once, at t = 0
-     status = ${name}_step(&p, &s, t, q, ${dq_argument}${further_arguments}, tau);    once a period of p.${period_parameter} s
+     ${name}_init(&p, &s, q, ${arguments});    once, at t = 0
+     status = ${name}_step(&p, &s, t, q, ${arguments}, tau);    once a period of p.${period_parameter} s
 
    SI units, radians.  t is the time since init, at which bounds and reference begin.
    Operations per sample: ${operations}. */
@@ -43,11 +43,11 @@ enum {
   ${upper}_INFEASIBLE = 16   /* no torque satisfies all conditions of the safety filter */
 };
 
-/* Initialises the state before the first sample; its torque keeps the model at rest.${dq_note}
+/* Initialises the state before the first sample; its torque keeps the model at rest.${unread_note}
    Returns ${upper}_NOT_FINITE, with torque 0, if an input or a result is not finite. */
 int ${name}_init(const ${name}_parameters *p, ${name}_state *s, const ${name}_real *q, const ${name}_real *dq${further_declarations});
 
-/* One sample: writes the torque tau [N m] and returns the status.  q and dq are measured at time t. */
+/* One sample: writes the torque tau [N m] and returns the status.  ${measured} */
 int ${name}_step(const ${name}_parameters *p, ${name}_state *s, ${name}_real t, const ${name}_real *q, const ${name}_real *dq${further_declarations},
     ${name}_real *tau);
 

@@ -23,7 +23,7 @@ int main(void) {
     for (i = 0; i < N; i++) largest = fmax(largest, fabs((double)torque[k][i]));
   if (${name}_init(&p, &s, first_q, first_dq${first_further}) != 0) return 1;
   for (k = 0; k < SAMPLES; k++) {
-    status = ${name}_step(&p, &s, (${name}_real)(k * period), q[k], ${dq_of_k}${further_of_k}, tau);
+    status = ${name}_step(&p, &s, (${name}_real)(k * period), q[k], ${arguments_of_k}, tau);
     if (status & ${upper}_NOT_FINITE) return 1;
     for (i = 0; i < N && k % CHECKED == 0; i++) {
       const double off = fabs((double)tau[i] - (double)torque[k / CHECKED][i]) / largest;
@@ -35,12 +35,12 @@ int main(void) {
   memcpy(bad, q[0], sizeof bad);
   bad[0] = (${name}_real)NAN;
   before = s;
-  status = ${name}_step(&p, &s, (${name}_real)0, bad, ${dq_of_0}${further_of_0}, tau);
+  status = ${name}_step(&p, &s, (${name}_real)0, bad, ${arguments_of_0}, tau);
   if (status != ${upper}_NOT_FINITE || memcmp(&before, &s, sizeof s) != 0 || memcmp(tau, s.tau, sizeof tau) != 0) failed = 1;
 
   begin = clock();
   for (round = 0; round < ROUNDS; round++)
-    for (k = 0; k < SAMPLES; k++) (void)${name}_step(&p, &s, (${name}_real)(k * period), q[k], ${dq_of_k}${further_of_k}, tau);
+    for (k = 0; k < SAMPLES; k++) (void)${name}_step(&p, &s, (${name}_real)(k * period), q[k], ${arguments_of_k}, tau);
   seconds = (double)(clock() - begin) / (double)CLOCKS_PER_SEC;
   printf("%s: torque within %.2g of the package's (of the largest, %.3g; at most %.0e), %.3g us a call, state %u bytes\n",
       failed ? "FAILED" : "ok", worst, largest, tolerance, 1e6 * seconds / ((double)ROUNDS * (double)SAMPLES), (unsigned)sizeof s);
