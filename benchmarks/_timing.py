@@ -13,6 +13,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import jax
@@ -74,9 +75,13 @@ def machine() -> dict[str, str]:
 
 
 def report(
-    title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]], json_path: str | None
+    title: str,
+    columns: Sequence[str],
+    rows: Sequence[Sequence[Any]],
+    json_path: str | None,
+    further: Mapping[str, Any] = MappingProxyType({}),
 ) -> None:
-    """Prints one table and, if asked, writes it as JSON."""
+    """Prints one table and, if asked, writes it as JSON, with further results beside it."""
     shown = [[f"{x:.4g}" if isinstance(x, float) else str(x) for x in row] for row in rows]
     widths = [max(len(line[i]) for line in [list(columns), *shown]) for i in range(len(columns))]
     print(title)
@@ -92,5 +97,5 @@ def report(
             if word not in ("--json", json_path, f"--json={json_path}")
         ]
         command = shlex.join(["python", f"benchmarks/{Path(sys.argv[0]).name}", *words])
-        found = {"title": title, "command": command, "machine": machine(), "rows": table}
+        found = {"title": title, "command": command, "machine": machine(), "rows": table, **further}
         Path(json_path).write_text(json.dumps(found, indent=1) + "\n")

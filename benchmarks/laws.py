@@ -19,12 +19,18 @@ largest |e1| of both joints in the second half of a run, so that the start does 
 
 "left" is a run that leaves the bounds or diverges, and "own" a law that has no factor in [1/32, 32]
 at which its effort is that of the first law, and runs at its own gains.  A new law is one entry of
-`CHOICES`; `docs/choosing.py` makes the page.
+`CHOICES`; `docs/choosing.py` makes the page.  `AdaptiveNetwork` has no row, because its program
+takes minutes to compile.
+
+The JSON file also has `settings`, the error of the first law at a period of 10 ms for other K2 and
+encoders, and `messages`, its commands with an event trigger.  A trigger belongs to the loop and not
+to a law, and is therefore no column.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import warnings
 from typing import Any, NamedTuple
 
@@ -43,8 +49,12 @@ DT, DURATION = 1e-3, 4.0
 DELAYS = (1e-3, 2e-3, 4e-3, 8e-3, 16e-3, 32e-3)
 """s."""
 K2, COUNTS = 2.0, 65536
-"""N m s/rad, a tenth of the paper's, so that periods of milliseconds are possible; counts of the
-encoder, as of a geared joint."""
+"""N m s/rad, a tenth of the paper's, so that a period of 10 ms is possible; counts of the encoder,
+as of a geared joint.  `settings` has the errors with others."""
+PERIOD = 1e-2
+"""s, the longer one."""
+ENCODER = sensors.Encoder(counts=COUNTS, velocity=sensors.FilteredDifference(cutoff=200.0))
+TRIGGER = ij.EventTrigger(relative=0.05, absolute=0.02)
 LEFT, OWN = "left", "own"
 COLUMNS = [
     "law",
@@ -72,6 +82,8 @@ def _box(limit: float) -> ij.Bounds:
     return ij.Bounds(lower=bounds.Constant(-limit), upper=bounds.Constant(limit))
 
 
+NODES = 16
+"""Of the networks; the time to compile grows with them."""
 CORRECTED = controllers.Backstepping(k1=2.0, K2=K2, reading="corrected")
 CHOICES = {
     "Backstepping(Integral)": Choice("integral"),
@@ -103,6 +115,12 @@ CHOICES = {
             sigma=0.01,
         )
     ),
+    "AdaptiveRBF": Choice(controllers.AdaptiveRBF(k1=2.0, K2=K2, nodes=NODES)),
+    "AdaptiveRBF, normalised": Choice(
+        controllers.AdaptiveRBF(
+            k1=2.0, K2=K2, nodes=NODES, normalised=True, Gamma=2000.0, sigma=1e-4, width=1.0
+        )
+    ),
     "Backstepping, no bounds": Choice("backstepping"),
     "BarrierBackstepping(Mapping)": Choice(controllers.BarrierBackstepping(k=(2.0, 20.0))),
     "FullState": Choice("full_state", {"velocity_bounds": _box(3.0)}),
@@ -121,8 +139,7 @@ def row(name: str, duration: float = DURATION) -> list[Any]:
     """The numbers of a law."""
     first = next(iter(CHOICES))
     choice = CHOICES[name]
-    base = ij.with_parameters(ij.presets.zhang_yan_2024(reading="corrected"), {"controller.K2": K2})
-    base = ij.with_parts(base, **choice.parts)
+    base = ij.with_parts(_first(K2), **choice.parts)
     laws = {first: CHOICES[first].law, name: choice.law}
     compared = ij.compare(base, laws, duration=duration, dt=DT)
     run = compared.equal_effort.get(name, compared.rollouts[name])
@@ -135,10 +152,9 @@ def row(name: str, duration: float = DURATION) -> list[Any]:
         heavier = ij.with_parts(one, plant=_heavier(one.plant, scale))
         masses.append(_run(heavier, duration))
     # One structure, and therefore one compiled program, for all periods and delays.
-    encoder = sensors.Encoder(counts=COUNTS, velocity=sensors.FilteredDifference(cutoff=200.0))
     queue = round(DELAYS[-1] / DT) + 1
-    fast = ij.with_parts(one, sensor=encoder, sampling=ij.Sampling(period=DT, queue=queue))
-    slow = ij.with_parameters(fast, {"sampling.period": 1e-2})
+    fast = ij.with_parts(one, sensor=ENCODER, sampling=ij.Sampling(period=DT, queue=queue))
+    slow = ij.with_parameters(fast, {"sampling.period": PERIOD})
     return [
         name,
         factor,
@@ -149,6 +165,43 @@ def row(name: str, duration: float = DURATION) -> list[Any]:
         _ripple(run, _run(fast, duration)),
         _longest_delay(fast, duration),
     ]
+
+
+def _first(gain: float) -> ij.Scenario:
+    """The paper's scenario under the first law."""
+    paper = ij.presets.zhang_yan_2024(reading="corrected")
+    return ij.with_parameters(paper, {"controller.K2": gain})
+
+
+def settings(duration: float = DURATION) -> list[dict[str, Any]]:
+    """The error of the first law at the longer period, by K2 and encoder."""
+    measured: dict[str, Any] = {
+        "none, velocity measured": sensors.Ideal(),
+        f"{COUNTS} counts": ENCODER,
+        "4096 counts": dataclasses.replace(ENCODER, counts=4096),
+    }
+    rows = []
+    for gain in (K2, 20.0):
+        for words, sensor in measured.items():
+            sampling = ij.Sampling(period=PERIOD)
+            sampled = ij.with_parts(_first(gain), sensor=sensor, sampling=sampling)
+            error = _error(_run(sampled, duration))
+            rows.append({"K2 [N m s/rad]": gain, "encoder": words, "error, 10 ms [mrad]": error})
+    return rows
+
+
+def messages(duration: float = DURATION) -> list[dict[str, Any]]:
+    """The commands that the first law sends with the encoder, without and with the trigger."""
+    named = f"EventTrigger(relative={TRIGGER.relative:g}, absolute={TRIGGER.absolute:g})"
+    rows = []
+    for words, trigger in {"none": None, named: TRIGGER}.items():
+        sampling = ij.Sampling(period=DT, trigger=trigger)
+        run = _run(ij.with_parts(_first(K2), sensor=ENCODER, sampling=sampling), duration)
+        rate = 1.0 / DT
+        if trigger is not None:
+            rate = float(run.metrics.event_count) / duration
+        rows.append({"trigger": words, "messages per s": rate, "error [mrad]": _error(run)})
+    return rows
 
 
 def _heavier(robot: Any, factor: float) -> Any:
@@ -217,8 +270,9 @@ def main() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the table reports runs that leave the bounds
         rows = [row(name, duration) for name in names]
+        further = {"settings": settings(duration), "messages": messages(duration)}
     title = f"Laws at equal effort: {duration:g} s of the paper's motion"
-    report(title, COLUMNS, rows, args.json)
+    report(title, COLUMNS, rows, args.json, further)
 
 
 if __name__ == "__main__":

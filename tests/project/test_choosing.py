@@ -42,6 +42,18 @@ def test_the_sentences_follow_the_numbers(scripts):
     assert choosing.page(STORED).startswith("# Choosing a law")
 
 
+def test_the_saving_of_the_trigger_is_that_of_the_file(scripts):
+    _, choosing = scripts
+    rows = [
+        {"trigger": words, "messages per s": rate, "error [mrad]": error}
+        for words, rate, error in (("none", 1000.0, 0.5), ("T", 12.0, 3.0))
+    ]
+    found = choosing.saving(rows)
+    assert "`T` the first law sends 12 messages a second in place of 1000" in found
+    assert "3 mrad in place of 0.5 mrad" in found
+    assert choosing.saving(STORED["messages"]) in choosing.page(STORED)
+
+
 @pytest.mark.release
 def test_a_row_regenerates_to_the_digits_of_the_page(scripts):
     laws, _ = scripts
