@@ -57,8 +57,8 @@ WORDS = {
     ),
     "AdaptiveParameters(masses)": Advice(
         "masses are unknown and constant, and other disturbances are small",
-        "there are other disturbances, as here: it uses no observer, and its error is ten times"
-        " that of the laws with one",
+        "there are other disturbances, as here: it uses no observer, its error is ten times that"
+        " of the paper's law, and wrong masses raise it by a larger factor",
     ),
     "AdaptiveRBF": Advice(
         "there is no model; wrong masses raise its error by a smaller factor than that of the"
