@@ -7,6 +7,7 @@ import numpy as np
 from conftest import ROOT
 
 import iblf_jax as ij
+from iblf_jax.simulation.scenario import canonical
 
 ARMS = ROOT / "tests" / "data" / "arms"
 REAL = {"ur5": "ur5.urdf", "iiwa14": "iiwa14.urdf", "xarm7": "xarm7.urdf"}
@@ -103,3 +104,22 @@ def dynamics_of(model, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.nda
     M = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(model, data, M)
     return M, data.qfrc_bias.copy()
+
+
+def loop_on(arm, law, **parts) -> ij.Scenario:
+    """A law on an `independent_arm.TwoLinkArm`, which follows a sinusoid inside wide bounds."""
+    plant = ij.robots.TwoLink(
+        mass=arm.mass, length=arm.length, centre=arm.centre, inertia=arm.inertia, g=arm.g
+    )
+    values = {"initial": ij.Initial(q=[0.45, 0.2], dq=[0.1, 0.2])} | parts
+    return canonical(
+        ij.Scenario(
+            plant=plant,
+            reference=ij.references.Sinusoid(
+                offset=0.3, amplitude=0.2, frequency=1.5, phase=[0.0, 0.4]
+            ),
+            bounds=ij.Bounds(lower=ij.bounds.Constant(-0.5), upper=ij.bounds.Constant(1.5)),
+            controller=law,
+            **values,
+        )
+    )

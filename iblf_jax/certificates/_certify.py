@@ -59,7 +59,7 @@ NOISY = (
 )
 TRIGGERED = Statement(
     "event trigger",
-    "(E.1)",
+    "(E.3)",
     "max over t of sum |e2_i| (delta_i |tau_i| + m_i), which held commands may add to V2'",
     "N m rad/s",
 )

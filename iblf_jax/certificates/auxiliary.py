@@ -9,8 +9,8 @@ from __future__ import annotations
 from typing import Any
 
 from iblf_jax.control.controllers import LawContext, Saturated
-from iblf_jax.control.controllers._base import law_member
-from iblf_jax.core.pytree import layers, unwrapped
+from iblf_jax.control.controllers._base import law_member, layers_with_states
+from iblf_jax.core.pytree import unwrapped
 from iblf_jax.simulation.scenario import Scenario
 
 
@@ -24,10 +24,8 @@ def covers_limit(scenario: Scenario) -> bool:
 
 def inner_state(scenario: Scenario, state: Any) -> Any:
     """The state of the innermost law, from the state of the controller or from its rate."""
-    for law in layers(scenario.controller):
-        if law_member(law, "has_auxiliary"):
-            state = state.law
-    return state
+    *_, (_, innermost) = layers_with_states(scenario.controller, state)
+    return innermost
 
 
 def inner_context(scenario: Scenario, state: Any) -> LawContext:

@@ -30,6 +30,16 @@ class OptionalMembers:
         """
         return getattr(part, name, self.defaults[name])
 
+    def variant(self, part: Any, name: str) -> Any:
+        """The variant of a part that its member `name` is, such as a sensor without rounding; the
+        part itself if it declares none.
+
+        Raises:
+          KeyError: a name that the family does not declare.
+        """
+        found = self(part, name)
+        return part if found is None else found
+
 
 def attributes(part: Any, names: Iterable[str]) -> dict[str, Any]:
     """Name -> value of these attributes of an object."""

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.control.actuators import Ideal
+from iblf_jax.control.actuators.delay import WHOLE_TOLERANCE
 from iblf_jax.core import checks, notices
 from iblf_jax.core.optional import attributes
 from iblf_jax.core.status import VELOCITY_LIMIT, Status
@@ -37,7 +38,7 @@ from iblf_jax.simulation.levels import Motion
 from iblf_jax.simulation.metrics import Fold, as_folds, metric_units
 from iblf_jax.simulation.noise import has_noise, noise_key
 from iblf_jax.simulation.results import Metrics, Rollout
-from iblf_jax.simulation.sampling import DELAY_TOLERANCE, Instant, Sampling, commands_in_transit
+from iblf_jax.simulation.sampling import Instant, Sampling, commands_in_transit
 from iblf_jax.simulation.scenario import Scenario, canonical, check_step
 from iblf_jax.simulation.signals import SIGNALS
 from iblf_jax.world import plants
@@ -167,7 +168,7 @@ def _check_no_process_noise(scenario: Scenario) -> None:
 def _own_step(scenario: Scenario, robot: MujocoPlant) -> float:
     """The model's own step, or the next shorter one that divides the period of the law [s]."""
     period = float(scenario.sampling.period)  # type: ignore[union-attr]
-    return period / max(1, math.ceil(period / robot.timestep - DELAY_TOLERANCE))
+    return period / max(1, math.ceil(period / robot.timestep - WHOLE_TOLERANCE))
 
 
 def check_single(scenario: Scenario) -> Scenario:
@@ -302,7 +303,7 @@ class _Run:
 
     def begin_step(self, index: int, t: float) -> None:
         """Samples the law if it is due, applies what changes at t, and records the instant."""
-        tolerance = DELAY_TOLERANCE * self.dt
+        tolerance = WHOLE_TOLERANCE * self.dt
         is_due = index % self.steps_per_period == 0
         changes = is_due or self.command_arrives(t + tolerance) or self.jumps(t + tolerance)
         if index > 0 and changes:
@@ -316,7 +317,7 @@ class _Run:
         """Advances MuJoCo from t to `end`; a step in which a command arrives or the scenario jumps
         is divided there.
         """
-        tolerance = DELAY_TOLERANCE * self.dt
+        tolerance = WHOLE_TOLERANCE * self.dt
         while t < end - tolerance:
             h = min(self.next_arrival(end), self.next_jump(end), end) - t
             self.stages.begin(t)

@@ -130,8 +130,6 @@ class LoopAlongStep(NamedTuple):
         scenario, time = self.inputs.scenario, discontinuities.stage_time(piece, t)
         state = with_integrated_part(self.state, moved)
         rate, sample = self.evaluate(scenario, time, state, self.inputs.dt, *torque)
-        if piece.noise_rate is None:
-            return rate, sample
         return with_process_noise(scenario, time, state, rate, piece.noise_rate), sample
 
 
@@ -194,10 +192,7 @@ def across_jumps(
     def rate(t, state):
         time = discontinuities.stage_time(piece, t)
         slope, sample = evaluate(inputs.scenario, time, state, dt)
-        if piece.noise_rate is None:
-            return slope, sample
-        noisy = with_process_noise(inputs.scenario, time, state, slope, piece.noise_rate)
-        return noisy, sample
+        return with_process_noise(inputs.scenario, time, state, slope, piece.noise_rate), sample
 
     def gains_of(sample):
         def sums(weight):

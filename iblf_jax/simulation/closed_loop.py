@@ -305,17 +305,19 @@ def rate(scenario: Scenario, t: jax.Array, state: LoopState) -> LoopState:
 
 
 def with_process_noise(
-    scenario: Scenario, t: jax.Array, state: LoopState, rate: LoopState, noise_rate: jax.Array
+    scenario: Scenario, t: jax.Array, state: LoopState, rate: LoopState, noise_rate: Any
 ) -> LoopState:
     """The rate of the state with sigma(t, x) dW/dt of (P.1) added.
 
     Args:
-      scenario: with process noise on m levels.
+      scenario: its process noise acts on m levels.
       t: time, () [s].
       state: state at t; law and observer may be missing.
       rate: its rate without noise.
-      noise_rate: dW/dt, (m, n) [1/s^0.5].
+      noise_rate: dW/dt, (m, n) [1/s^0.5]; None for a plant without process noise.
     """
+    if noise_rate is None:
+        return rate
     noise: Any = scenario.process_noise
     added = noise.diffusion(t, state.x) * noise_rate
     rows = list(rate.x)

@@ -26,6 +26,7 @@ import jax.numpy as jnp
 from iblf_jax.control.actuators._base import input_delay
 from iblf_jax.control.actuators.delay import WHOLE_TOLERANCE
 from iblf_jax.simulation.integrators import TABLEAUS, tableau
+from iblf_jax.simulation.sampling import command_at
 from iblf_jax.simulation.scenario import Scenario
 
 STAGES = max(len(table.c) for table in TABLEAUS.values())
@@ -117,7 +118,7 @@ def arriving(
     number_of_steps = jax.lax.stop_gradient(jnp.where(is_whole, nearest, jnp.ceil(steps)))
     rounding = jax.lax.stop_gradient(jnp.where(is_whole, nearest - steps, 0.0))
     consistent = (number_of_steps >= 1.0) & (number_of_steps <= len(commands))
-    earlier = jnp.where(consistent, _of_step(commands, number_of_steps - 1.0), jnp.nan)
+    earlier = jnp.where(consistent, command_at(commands, number_of_steps - 1.0), jnp.nan)
     return ArrivingCommands(
         method,
         number * dt,
@@ -128,18 +129,8 @@ def arriving(
         tolerance,
         number + 1.0 == number_of_steps,
         earlier,
-        _of_step(commands, number_of_steps - 2.0),
+        command_at(commands, number_of_steps - 2.0),
     )
-
-
-def _of_step(commands: jax.Array, position: jax.Array) -> jax.Array:
-    """The commands of a step at a position of the history, a whole number of floating-point type;
-    the newest for a negative one, (STAGES, n).
-    """
-    found = commands[0]
-    for k in range(1, len(commands)):
-        found = jnp.where(position >= k, commands[k], found)
-    return found
 
 
 def interpolated(method: str, commands: Any, position: Any) -> jax.Array:

@@ -13,14 +13,13 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from iblf_jax.control.actuators.delay import WHOLE_TOLERANCE
 from iblf_jax.control.controllers.event_compensated import check_relative
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf, static
 from iblf_jax.core.units import INPUT
 
 OBSERVER_STEPS = ("exact", "poles", "euler")
-DELAY_TOLERANCE = 1e-6
-"""Largest distance [steps] at which a delay is rounded to a whole number of steps."""
 PERIOD_TOLERANCE = 1e-4
 """Largest relative distance of a period from a whole number of steps."""
 
@@ -160,7 +159,7 @@ def commands_in_transit(delay: float, period: float) -> int:
     """
     if not delay > 0:
         return 0
-    return math.floor(delay / period + DELAY_TOLERANCE) + 1
+    return math.floor(delay / period + WHOLE_TOLERANCE) + 1
 
 
 class Instant(NamedTuple):
@@ -216,8 +215,8 @@ def step_torques(
         torque = _if_consistent(sampling, dt, sampling.delay, commands[0])
         return StepTorques(torque, commands[0], one, one < 0)
     age, arrival, arrives = _arrival(sampling, dt, now.phase)
-    old = _command_at(commands, age)
-    new = _command_at(commands, age - 1.0)
+    old = command_at(commands, age)
+    new = command_at(commands, age - 1.0)
     torque = _if_consistent(sampling, dt, age, old)
     return StepTorques(torque, new, jnp.where(arrives, arrival, 1.0), arrives)
 
@@ -234,7 +233,7 @@ def _arrival(
     """
     delay = sampling.delay / dt
     rounded = jnp.round(delay)
-    tolerance = DELAY_TOLERANCE + 4.0 * jnp.finfo(dt.dtype).eps * delay
+    tolerance = WHOLE_TOLERANCE + 4.0 * jnp.finfo(dt.dtype).eps * delay
     correction = jnp.where(jnp.abs(delay - rounded) < tolerance, rounded - delay, 0.0)
     delay = delay + jax.lax.stop_gradient(correction)
     steps, phase = _steps(sampling, dt), phase.astype(dt.dtype)
@@ -272,7 +271,7 @@ def torque_before(
     # A command that arrives with the sample belongs to the step before, so the active command is at
     # least one sample old.
     age, _, _ = _arrival(sampling, dt, jnp.zeros((), jnp.int32))
-    return _command_at(after, jnp.maximum(age, 1.0))
+    return command_at(after, jnp.maximum(age, 1.0))
 
 
 def _if_consistent(
@@ -286,8 +285,14 @@ def _if_consistent(
     return jnp.where((age <= sampling.queue) & is_whole, torque, jnp.nan)
 
 
-def _command_at(commands: jax.Array, position: jax.Array) -> jax.Array:
-    """The command at a position in the queue, a whole number of floating-point type."""
+def command_at(commands: jax.Array, position: jax.Array) -> jax.Array:
+    """The command at a position in a queue, a whole number of floating-point type; the newest for
+    a negative one.
+
+    Args:
+      commands: newest first, (queue + 1, ...).
+      position: () [1].
+    """
     found = commands[0]
     for k in range(1, len(commands)):
         found = jnp.where(position >= k, commands[k], found)

@@ -194,7 +194,7 @@ def test_a_run_is_that_of_an_independent_program(name):
     np.testing.assert_allclose(found, expected, atol=1e-7)
 
 
-# ------------------------------------------------------------------------- the claim (A.3)
+# ------------------------------------------------------------------------- the claim (R.3)
 
 
 MAPPED = controllers.Backstepping(k1=2.0, K2=20.0, barrier=barriers.Mapping(), reading="corrected")

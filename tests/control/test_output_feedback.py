@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from arm_cases import loop_on
 from iblf_jax.observers import StateObserver
 from iblf_jax.sensors import Direct, Levels
 from independent_arm import TwoLinkArm
@@ -18,7 +19,6 @@ import iblf_jax as ij
 from iblf_jax.core import notices
 from iblf_jax.simulation.closed_loop import initial_state, rate
 from iblf_jax.simulation.metrics import LevelEstimation, _positive_share
-from iblf_jax.simulation.scenario import canonical
 
 ARM = TwoLinkArm(mass=(1.2, 0.7), length=(0.4, 0.3), centre=(0.2, 0.16), inertia=(0.02, 0.01))
 KP, KD = np.array([40.0, 25.0]), np.array([12.0, 10.0])
@@ -28,22 +28,8 @@ V0 = np.array([0.4, -0.3])
 
 def loop(observer, **parts):
     """Computed torque on the arm of `ARM`, which follows a sinusoid."""
-    plant = ij.robots.TwoLink(
-        mass=ARM.mass, length=ARM.length, centre=ARM.centre, inertia=ARM.inertia, g=ARM.g
-    )
-    values = {"initial": ij.Initial(q=[0.45, 0.2], dq=[0.1, 0.2])} | parts
-    return canonical(
-        ij.Scenario(
-            plant=plant,
-            reference=ij.references.Sinusoid(
-                offset=0.3, amplitude=0.2, frequency=1.5, phase=[0.0, 0.4]
-            ),
-            bounds=ij.Bounds(lower=ij.bounds.Constant(-0.5), upper=ij.bounds.Constant(1.5)),
-            controller=ij.controllers.ComputedTorque(Kp=KP, Kd=KD),
-            observer=observer,
-            **values,
-        )
-    )
+    law = ij.controllers.ComputedTorque(Kp=KP, Kd=KD)
+    return loop_on(ARM, law, observer=observer, **parts)
 
 
 def reference_rate(w, limit, push, t, z):

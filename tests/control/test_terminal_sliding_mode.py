@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from arm_cases import loop_on
 from independent_arm import TwoLinkArm
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
@@ -14,7 +15,6 @@ from scipy.optimize import brentq
 import iblf_jax as ij
 from iblf_jax.core import notices
 from iblf_jax.core.status import Status
-from iblf_jax.simulation.scenario import canonical
 
 ARM = TwoLinkArm(mass=(1.2, 0.7), length=(0.4, 0.3), centre=(0.2, 0.16), inertia=(0.02, 0.01))
 LAW = {
@@ -59,21 +59,7 @@ def torque(law, arm, t, q, dq, f_hat):
 
 def loop(law, **parts):
     """The scenario of this law on the arm of `ARM`."""
-    plant = ij.robots.TwoLink(
-        mass=ARM.mass, length=ARM.length, centre=ARM.centre, inertia=ARM.inertia, g=ARM.g
-    )
-    values = {"initial": ij.Initial(q=[0.45, 0.2], dq=[0.1, 0.2])} | parts
-    return canonical(
-        ij.Scenario(
-            plant=plant,
-            reference=ij.references.Sinusoid(
-                offset=0.3, amplitude=0.2, frequency=1.5, phase=[0.0, 0.4]
-            ),
-            bounds=ij.Bounds(lower=ij.bounds.Constant(-0.5), upper=ij.bounds.Constant(1.5)),
-            controller=ij.controllers.TerminalSlidingMode(**law),
-            **values,
-        )
-    )
+    return loop_on(ARM, ij.controllers.TerminalSlidingMode(**law), **parts)
 
 
 def test_the_torque_at_random_states_and_parameters(rng):

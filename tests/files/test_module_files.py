@@ -4,46 +4,16 @@ from __future__ import annotations
 
 import json
 import subprocess
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from module_cases import Learned, NetworkObserver
 
 import iblf_jax as ij
 from iblf_jax.files.scenario import scenario_to_dict, scenario_to_toml
-
-
-@ij.component
-class Learned:
-    """Torque of a network of q and q'."""
-
-    net: Any
-
-    def torque(self, t, q, dq, plant, model):
-        return self.net(jnp.concatenate([q, dq]))
-
-    def jump_times(self):
-        return jnp.zeros(0)
-
-
-@ij.component
-class NetworkObserver:
-    """f_hat = net(q') + the estimate of the rest by the inner observer."""
-
-    observer: ij.observers.Observer
-    net: Any
-
-    def init(self, q, dq, model):
-        return self.observer.init(q, dq, model)
-
-    def estimate(self, t, q, dq, model, state):
-        return self.observer.estimate(t, q, dq, model, state) + self.net(dq)
-
-    def derivative(self, t, q, dq, tau, model, state):
-        return self.observer.derivative(t, q, dq, tau + self.net(dq), model, state)
 
 
 @jax.tree_util.register_pytree_with_keys_class

@@ -66,16 +66,12 @@ actuator_member = OptionalMembers(
 
 def unlimited(actuator: Actuator) -> Actuator:
     """An actuator without its limits; itself if it declares none."""
-    found = actuator_member(actuator, "unlimited")
-    return actuator if found is None else found
+    return actuator_member.variant(actuator, "unlimited")  # type: ignore[no-any-return]
 
 
 def smooth(actuator: Actuator) -> Actuator:
     """An actuator without dead zone, play and rounding; itself if it declares none."""
-    found = actuator_member(actuator, "smooth")
-    if found is None:
-        return actuator
-    return found  # type: ignore[no-any-return]
+    return actuator_member.variant(actuator, "smooth")  # type: ignore[no-any-return]
 
 
 def input_delay(actuator: Actuator) -> Any:

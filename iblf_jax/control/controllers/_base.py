@@ -8,6 +8,7 @@ was active.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import partial
 from typing import Any, NamedTuple, Protocol
 
@@ -17,6 +18,7 @@ import jax.numpy as jnp
 from iblf_jax.control.decays import Decay, Exponential
 from iblf_jax.core.linalg import matvec
 from iblf_jax.core.optional import OptionalMembers
+from iblf_jax.core.pytree import layers
 from iblf_jax.world.bounds import Bounds, Tube, speed_limits_at, tube_at
 from iblf_jax.world.references import Reference
 from iblf_jax.world.regions import Along, Region, along
@@ -238,10 +240,7 @@ fields of laws with a barrier."""
 
 def unlimited(law: Controller) -> Controller:
     """A law without its own limit; itself if it declares none."""
-    found = law_member(law, "unlimited")
-    if found is None:
-        return law
-    return found  # type: ignore[no-any-return]
+    return law_member.variant(law, "unlimited")  # type: ignore[no-any-return]
 
 
 def switching_functions(law: Controller, *arguments: Any) -> jax.Array | None:
@@ -280,6 +279,19 @@ def wrapped_state(law: Any, *arguments: Any) -> State:
 def wrapped_switching(law: Any, *arguments: Any) -> jax.Array | None:
     """`switching` of a law that wraps another and has no state of its own: the other's."""
     return switching_functions(law.law, *arguments)
+
+
+def layers_with_states(law: Any, state: Any) -> Iterator[tuple[Any, Any]]:
+    """A law and the laws that it wraps, the outermost first, each with its state.
+
+    Args:
+      law: any `Controller`.
+      state: of the law, or its rate.
+    """
+    for layer in layers(law):
+        yield layer, state
+        if law_member(layer, "has_auxiliary"):
+            state = state.law
 
 
 def decay_of(law: Any, i: int) -> Decay:

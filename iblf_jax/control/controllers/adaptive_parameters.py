@@ -6,17 +6,17 @@ with theta_tilde = theta_hat - theta and the regressor Y = dtau/dtheta, which au
 differentiation gives.  With V of the wrapped law for the true parameters theta and its derivative
 along the input, s = dV/dx_r G_r (e2 for a robot),
 
-    V_a = V + 1/2 theta_tilde^T Gamma^-1 theta_tilde,                                        (A.1)
+    V_a = V + 1/2 theta_tilde^T Gamma^-1 theta_tilde,                                        (R.1)
     V_a' = -W + s . (Y theta_tilde + d) + theta_tilde^T Gamma^-1 theta_hat',
 
 where W is the decay of V and d is what the model with the true parameters does not explain.  The
 law of adaptation is the negative gradient of s . tau, a leak, and a projection P,
 
-    theta_hat' = P(-Gamma (Y^T s + sigma (theta_hat - theta_0))),   theta_hat(0) = theta_0,  (A.2)
+    theta_hat' = P(-Gamma (Y^T s + sigma (theta_hat - theta_0))),   theta_hat(0) = theta_0,  (R.2)
 
 with theta_0 the values of the model.  Y theta_tilde cancels, and
 
-    V_a' <= -W - sigma/2 |theta_tilde|^2 + s . d + sigma/2 |theta - theta_0|^2.              (A.3)
+    V_a' <= -W - sigma/2 |theta_tilde|^2 + s . d + sigma/2 |theta - theta_0|^2.              (R.3)
 
 For d = 0 and sigma = 0, V_a does not grow and e1, e2 tend to 0; theta_hat tends to theta only if
 the motion makes the parameters identifiable.  With sigma > 0 everything is ultimately bounded.
@@ -46,6 +46,7 @@ from iblf_jax.control.controllers._base import (
     LawContext,
     decay_of,
     law_member,
+    layers_with_states,
     wrapped_advice,
     wrapped_switching,
 )
@@ -53,7 +54,7 @@ from iblf_jax.control.decays._base import decay_member
 from iblf_jax.core import checks
 from iblf_jax.core.component_paths import member_of, replaced, resolve
 from iblf_jax.core.linalg import inner, matvec, solve_spd
-from iblf_jax.core.pytree import Leaf, component, layers, leaf, static
+from iblf_jax.core.pytree import Leaf, component, leaf, static
 from iblf_jax.core.time import as_at
 from iblf_jax.core.units import PlantUnit, of_entry
 from iblf_jax.world import plants
@@ -193,7 +194,7 @@ class AdaptiveParameters:
 
     def check_start(self, context: LawContext) -> None:
         """Raises ValueError for paths that lead to no number of the model, values outside the box,
-        or parameters for which (A.3) does not hold.
+        or parameters for which (R.3) does not hold.
         """
         nominal = np.asarray(self._nominal(context.model))
         for j, path in enumerate(self.parameters):
@@ -297,10 +298,10 @@ class AdaptiveParameters:
         informed = self._informed(context, state.theta)
         return wrapped_switching(self, t, *measured, informed, state.law)
 
-    # --- the claim (A.3) --------------------------------------------------------------------------
+    # --- the claim (R.3) --------------------------------------------------------------------------
 
     def lyapunov(self, t: jax.Array, *arguments: Any) -> jax.Array:
-        """V_a of (A.1), (), with the plant's parameters where the context has the plant, else the
+        """V_a of (R.1), (), with the plant's parameters where the context has the plant, else the
         model's; arguments as `LyapunovLaw.lyapunov`.
         """
         *measured, _, context, state = arguments
@@ -315,7 +316,7 @@ class AdaptiveParameters:
         return energy + 0.5 * jnp.sum((state.theta - theta) ** 2 / self.Gamma)
 
     def decay(self, t: jax.Array, *arguments: Any) -> jax.Array:
-        """W + sigma/2 |theta_tilde|^2 of (A.3), (); arguments as `lyapunov`."""
+        """W + sigma/2 |theta_tilde|^2 of (R.3), (); arguments as `lyapunov`."""
         *measured, _, context, state = arguments
         theta = self.true_parameters(t, context)
         law: Any = self.law
@@ -323,7 +324,7 @@ class AdaptiveParameters:
         return decay + 0.5 * jnp.sum(self.sigma * (state.theta - theta) ** 2)
 
     def disturbance_terms(self, t: jax.Array, *arguments: Any) -> jax.Array:
-        """The other terms of (A.3), (): those of d and of the leak, what the projection adds for
+        """The other terms of (R.3), (): those of d and of the leak, what the projection adds for
         parameters outside its inner box, and the effect of parameters that change with time.
         Arguments as `LyapunovLaw.disturbance_terms`.
         """
@@ -399,11 +400,9 @@ def adapting_part(law: Controller, state: Any) -> tuple[AdaptiveParameters, Adap
       law: of a scenario.
       state: of the law.
     """
-    for part in layers(law):
+    for part, own in layers_with_states(law, state):
         if isinstance(part, AdaptiveParameters):
-            return part, state
-        if law_member(part, "has_auxiliary"):
-            state = state.law
+            return part, own
     return None
 
 

@@ -19,11 +19,14 @@ has z_i u_i <= 0, and |y| - y tanh(y/epsilon) <= 0.2785 epsilon for every y give
 so that V' exceeds that of the law in continuous time by 0.557 epsilon n at most.  (E.2) holds where
 the condition of the trigger is checked: at the samples.
 
-Without the compensation V' grows by sum_i |z_i| (delta_i |u_held,i| + m_i), which vanishes with z
-as fast as z: the error e_r stays in a band whose size grows with the threshold.  The compensation
-replaces v by (1 + delta) |v| with the sign of -z: a command of the size of v near z = 0 needs a
-z of the size epsilon/|v|, and the slope of u by z is about v^2/epsilon there.  A small epsilon
-therefore needs a short period.
+Without the compensation V' grows by at most
+
+    sum_i |z_i| (delta_i |u_held,i| + m_i),                                                   (E.3)
+
+which vanishes with z as fast as z: the error e_r stays in a band whose size grows with the
+threshold.  The compensation replaces v by (1 + delta) |v| with the sign of -z: a command of the size
+of v near z = 0 needs a z of the size epsilon/|v|, and the slope of u by z is about v^2/epsilon
+there.  A small epsilon therefore needs a short period.
 """
 
 from __future__ import annotations

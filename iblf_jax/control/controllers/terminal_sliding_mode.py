@@ -41,6 +41,7 @@ from iblf_jax.control.controllers._base import (
 )
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf
+from iblf_jax.world.bounds import Tube
 
 BEYOND_LAYER = 1e6
 """Width of the layer of `TerminalSlidingMode.unlimited`, relative to that of the law."""
@@ -104,15 +105,16 @@ class TerminalSlidingMode:
     ) -> tuple[Command, tuple[()]]:
         """The torque and what belongs to it."""
         tube = context.tube(t)
-        sigma, slope = self._surface(q - tube.q_d, dq - tube.dq_d)
+        sigma, slope = self._surface(tube, q, dq)
         along_surface = (dq - tube.dq_d) / slope
         acceleration = tube.ddq_d - self.K * self._saturated(sigma) - along_surface
         tau = rigid_body_torque(context.model, q, dq, dq, acceleration) - f_hat
         never = jnp.zeros(q.shape, bool)
         return Command(tau, tube.dq_d, 0.5 * sigma**2, never, never), ()
 
-    def _surface(self, e: jax.Array, v: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Sigma [rad] and dsigma/dv = g'(v)/beta [s], (n,) each."""
+    def _surface(self, tube: Tube, q: jax.Array, dq: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Sigma [rad] and dsigma/dq' = g'(e1')/beta [s], (n,) each."""
+        e, v = q - tube.q_d, dq - tube.dq_d
         square = v**2 + self.smoothing**2
         root = square ** (0.5 * (self.p - 1.0))
         slope = root * (self.p * v**2 + self.smoothing**2) / square
@@ -132,8 +134,7 @@ class TerminalSlidingMode:
         state: tuple[()],
     ) -> jax.Array:
         """V = 1/2 sigma^2, (n,) [rad^2]."""
-        tube = context.tube(t, acceleration=False)
-        sigma, _ = self._surface(q - tube.q_d, dq - tube.dq_d)
+        sigma, _ = self._surface(context.tube(t, acceleration=False), q, dq)
         return 0.5 * sigma**2
 
     def decay(
@@ -146,6 +147,5 @@ class TerminalSlidingMode:
         state: tuple[()],
     ) -> jax.Array:
         """W = g'(e1')/beta K sigma sat(sigma/layer), (n,) [rad^2/s].  (T.2)"""
-        tube = context.tube(t, acceleration=False)
-        sigma, slope = self._surface(q - tube.q_d, dq - tube.dq_d)
+        sigma, slope = self._surface(context.tube(t, acceleration=False), q, dq)
         return slope * self.K * sigma * self._saturated(sigma)

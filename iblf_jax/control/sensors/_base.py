@@ -164,8 +164,7 @@ sensor_member = OptionalMembers(
 
 def unrounded(sensor: Sensor) -> Sensor:
     """A sensor without its rounding; itself if it does not round."""
-    found = sensor_member(sensor, "unrounded")
-    return sensor if found is None else found
+    return sensor_member.variant(sensor, "unrounded")  # type: ignore[no-any-return]
 
 
 def rounded(x: jax.Array, step: jax.Array | float) -> jax.Array:

@@ -146,10 +146,7 @@ def order_of(part: Any) -> int:
 
 def nominal_of(part: Any) -> Any:
     """The plant that laws know: the part itself, or the plant inside one with modes."""
-    nominal = plant_member(part, "nominal")
-    if nominal is None:
-        return part
-    return nominal
+    return plant_member.variant(part, "nominal")
 
 
 def robot_of(part: Any) -> Any:

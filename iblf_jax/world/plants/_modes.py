@@ -34,7 +34,41 @@ class ModeValues:
     values: Leaf = leaf("unit of the parameter", shape="any")
 
 
-def as_parameters(owner: str, plant: Any, parameters: Any) -> tuple[ModeValues, ...]:
+def member_of_inner(part: Any, name: str) -> Any:
+    """`__getattr__` of a plant with modes: the members of the inner plant, such as names, units,
+    limits, and its methods.
+    """
+    if name.startswith("__") or name == "plant":
+        raise AttributeError(name)
+    return getattr(part.plant, name)
+
+
+def fit_modes(part: Any) -> int:
+    """Fits `parameters` of a plant with modes under construction to its inner plant.
+
+    Returns:
+      The number of modes.
+
+    Raises:
+      ValueError: something that is neither a robot nor a plant, or parameters that do not fit it.
+    """
+    owner = type(part).__name__
+    _check_inner(owner, part.plant)
+    parameters = _as_parameters(owner, part.plant, part.parameters)
+    object.__setattr__(part, "parameters", parameters)
+    return len(parameters[0].values)
+
+
+def _check_inner(owner: str, plant: Any) -> None:
+    """Raises ValueError for something that is neither a robot nor a plant."""
+    name = f"{owner}.plant"
+    if is_chain(plant):
+        checks.conforms(name, plant, Plant, "iblf_jax.plants has them.")
+        return
+    checks.conforms(name, plant, Robot, "iblf_jax.robots has them.", ("skeleton",))
+
+
+def _as_parameters(owner: str, plant: Any, parameters: Any) -> tuple[ModeValues, ...]:
     """The parameters of a plant with modes as a tuple; ValueError for what does not fit the
     plant.
     """
@@ -62,15 +96,6 @@ def as_parameters(owner: str, plant: Any, parameters: Any) -> tuple[ModeValues, 
         expected = "the same number of modes for every parameter"
         raise checks.fail(name, f"{sorted(counts)} values", expected)
     return tuple(parameters)
-
-
-def check_inner(owner: str, plant: Any) -> None:
-    """Raises ValueError for something that is neither a robot nor a plant."""
-    name = f"{owner}.plant"
-    if is_chain(plant):
-        checks.conforms(name, plant, Plant, "iblf_jax.plants has them.")
-        return
-    checks.conforms(name, plant, Robot, "iblf_jax.robots has them.", ("skeleton",))
 
 
 def changed(plant: Any, path: str, value: jax.Array) -> Any:

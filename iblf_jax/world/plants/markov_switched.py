@@ -15,10 +15,10 @@ from iblf_jax.world.plants._modes import (
     NEVER,
     ModeValues,
     RobotOrPlant,
-    as_parameters,
     changed,
-    check_inner,
+    fit_modes,
     in_turn,
+    member_of_inner,
     of_mode,
     switching_results,
 )
@@ -63,13 +63,11 @@ class MarkovSwitched:
     times: Leaf = leaf("s", sign="positive", shape="any", default=None)
     sequence: Leaf = leaf("1", sign="nonnegative", shape="any", default=None)
     wraps: ClassVar[str] = "plant"
+    __getattr__ = member_of_inner
 
     def check(self) -> None:
         """Raises ValueError for parameters or rates that do not fit the plant or each other."""
-        check_inner("MarkovSwitched", self.plant)
-        parameters = as_parameters("MarkovSwitched", self.plant, self.parameters)
-        object.__setattr__(self, "parameters", parameters)
-        modes = len(parameters[0].values)
+        modes = fit_modes(self)
         self._check_rates(modes)
         checks.positive_integer("MarkovSwitched.switches", self.switches, most=MOST_SWITCHES)
         checks.positive_integer("MarkovSwitched.start", self.start, least=0, most=modes - 1)
@@ -93,12 +91,6 @@ class MarkovSwitched:
         if np.any(others < 0) or not np.all(is_zero):
             expected = "q_ij >= 0 for i != j, and rows of sum 0"
             raise checks.fail(name, Q, expected, "Such as [[-0.5, 0.5], [1.0, -1.0]].")
-
-    def __getattr__(self, name: str) -> Any:
-        """Members of the inner plant: names, units, limits, and its methods."""
-        if name.startswith("__") or name == "plant":
-            raise AttributeError(name)
-        return getattr(self.plant, name)
 
     @property
     def nominal(self) -> Any:

@@ -12,11 +12,11 @@ from iblf_jax.core.time import as_at, joined, jump_times_of
 from iblf_jax.world.plants._modes import (
     ModeValues,
     RobotOrPlant,
-    as_parameters,
     changed,
-    check_inner,
     check_times,
+    fit_modes,
     in_turn,
+    member_of_inner,
     switching_results,
 )
 
@@ -43,23 +43,16 @@ class Switched:
     parameters: tuple[ModeValues, ...]
     times: Leaf = leaf("s", sign="positive", shape="any")
     wraps: ClassVar[str] = "plant"
+    __getattr__ = member_of_inner
 
     def check(self) -> None:
         """Raises ValueError for parameters or times that do not fit the plant or each other."""
-        check_inner("Switched", self.plant)
-        parameters = as_parameters("Switched", self.plant, self.parameters)
-        object.__setattr__(self, "parameters", parameters)
+        modes = fit_modes(self)
         check_times("Switched.times", self.times)
-        modes, switches = len(parameters[0].values), len(self.times)
+        switches = len(self.times)
         if modes != switches + 1:
             expected = f"{switches + 1} values of every parameter for {switches} switching times"
             raise checks.fail("Switched.parameters", f"{modes} values", expected)
-
-    def __getattr__(self, name: str) -> Any:
-        """Members of the inner plant: names, units, limits, and its methods."""
-        if name.startswith("__") or name == "plant":
-            raise AttributeError(name)
-        return getattr(self.plant, name)
 
     @property
     def nominal(self) -> Any:
