@@ -24,8 +24,8 @@ Without the compensation V' grows by at most
     sum_i |z_i| (delta_i |u_held,i| + m_i),                                                   (E.3)
 
 which vanishes with z as fast as z: the error e_r stays in a band whose size grows with the
-threshold.  The compensation replaces v by (1 + delta) |v| with the sign of -z: a command of the size
-of v near z = 0 needs a z of the size epsilon/|v|, and the slope of u by z is about v^2/epsilon
+threshold.  The compensation replaces v by (1 + delta) |v| with the sign of -z: a command of the
+size of v near z = 0 needs a z of the size epsilon/|v|, and the slope of u by z is about v^2/epsilon
 there.  A small epsilon therefore needs a short period.
 """
 
