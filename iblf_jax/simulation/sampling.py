@@ -75,7 +75,10 @@ class EventTrigger:
           last: the command that was sent last.
         """
         threshold = self.relative * jnp.abs(last.input) + self.absolute
-        fires = jnp.any(jnp.abs(u - last.input) > threshold) | (last.number == 0.0)
+        # A comparison with NaN is False: a command that is not finite is sent, too, and the run
+        # stops as it does without a trigger.
+        is_within = jnp.abs(u - last.input) <= threshold
+        fires = ~jnp.all(is_within) | (last.number == 0.0)
         return SentCommand(
             jnp.where(fires, u, last.input),
             jnp.where(fires, torque, last.torque),

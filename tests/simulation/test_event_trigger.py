@@ -131,6 +131,30 @@ def test_a_threshold_of_zero_sends_every_command_that_changes():
     assert float(run.metrics.event_count) == 201
 
 
+def test_a_command_that_is_not_finite_is_not_held():
+    """A run whose law computes NaN stops with a trigger as it does without one."""
+
+    @ij.component
+    class Failing:
+        """A law that computes NaN from a time on."""
+
+        law: controllers.Controller
+
+        def init(self, *arguments):
+            """The state of the law."""
+            return self.law.init(*arguments)
+
+        def command(self, t, *arguments):
+            """The command of the law; NaN after 10 ms."""
+            command, rate = self.law.command(t, *arguments)
+            return command._replace(tau=jnp.where(t > 0.01, jnp.nan, command.tau)), rate
+
+    scenario = ij.with_parts(TRIGGERED, controller=Failing(TRIGGERED.controller))
+    with pytest.warns(ij.SimulationWarning, match="ran away"):
+        run = ij.simulate(scenario, duration=0.05, dt=1e-3)
+    assert int(run.status) & int(ij.Status.NOT_FINITE)
+
+
 def test_commands_are_held_within_the_threshold():
     """Between events the torque is constant and within the threshold of the law's; the observer
     receives the held torque."""
