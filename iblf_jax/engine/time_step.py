@@ -116,6 +116,9 @@ def advance(
     state = along.state
     first = times.division.pieces[0]
     stepped = integrated(along, first, integrated_part(state), method, options)
+    if along.arriving:
+        commands = [slope.delayed for slope in stepped.slopes]
+        along = along._replace(arriving=along.arriving.with_commands_of_step(commands))
     ahead = jnp.where(times.span.in_run, first.length, jnp.zeros_like(inputs.dt))
     step = jnp.where(index > 0, inputs.dt, jnp.zeros_like(inputs.dt))
     sample = weighed(stepped.aux, times.span.start, 0.5 * (times.behind + ahead), step)

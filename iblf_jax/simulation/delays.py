@@ -62,12 +62,24 @@ class ArrivingCommands(NamedTuple):
     """Whether it is a whole number of steps, () bool."""
     tolerance: jax.Array
     """Difference that rounding may make, () [steps]."""
+    is_one_step: jax.Array
+    """Whether it is one step, () bool."""
     is_first: jax.Array
     """Whether the first command arrives within the step or at its end, () bool."""
     earlier: jax.Array
     """Commands of the past step that begins a whole number of steps ago, (STAGES, n)."""
     later: jax.Array
     """Those of the step after it, (STAGES, n)."""
+
+    def with_commands_of_step(self, commands: Sequence[jax.Array]) -> ArrivingCommands:
+        """The same with the commands of the step itself, the first of which arrives at its end
+        where the delay is one step.
+
+        Args:
+          commands: of the stages of the first piece of the step, (n,) each.
+        """
+        own = jnp.stack(_padded(commands))
+        return self._replace(later=jnp.where(self.is_one_step, own, self.later))
 
     def at(self, t: jax.Array) -> jax.Array:
         """The command that arrives at time t [s], (n,)."""
@@ -112,24 +124,27 @@ def arriving(
         return ()
     delay = found.delay
     steps = delay / dt
-    tolerance = WHOLE_TOLERANCE + 4.0 * jnp.finfo(dt.dtype).eps * jnp.maximum(steps, number)
+    rounding_error = 4.0 * jnp.finfo(dt.dtype).eps
     nearest = jnp.round(steps)
-    is_whole = jnp.abs(steps - nearest) < tolerance
+    is_whole = jnp.abs(steps - nearest) < WHOLE_TOLERANCE + rounding_error * steps
     number_of_steps = jax.lax.stop_gradient(jnp.where(is_whole, nearest, jnp.ceil(steps)))
-    rounding = jax.lax.stop_gradient(jnp.where(is_whole, nearest - steps, 0.0))
-    consistent = (number_of_steps >= 1.0) & (number_of_steps <= len(commands))
+    correction = jax.lax.stop_gradient(jnp.where(is_whole, nearest - steps, 0.0))
+    steps = steps + correction
+    consistent = (steps >= 1.0) & (number_of_steps <= len(commands))
     earlier = jnp.where(consistent, command_at(commands, number_of_steps - 1.0), jnp.nan)
     return ArrivingCommands(
-        method,
-        number * dt,
-        dt,
-        delay,
-        number_of_steps - (steps + rounding),
-        is_whole,
-        tolerance,
-        number + 1.0 == number_of_steps,
-        earlier,
-        command_at(commands, number_of_steps - 2.0),
+        method=method,
+        start=number * dt,
+        dt=dt,
+        delay=delay,
+        shift=number_of_steps - steps,
+        is_whole=is_whole,
+        # The times of a step have a rounding error that grows with its number.
+        tolerance=WHOLE_TOLERANCE + rounding_error * jnp.maximum(steps, number),
+        is_one_step=is_whole & (number_of_steps == 1.0),
+        is_first=number + 1.0 == number_of_steps,
+        earlier=earlier,
+        later=command_at(commands, number_of_steps - 2.0),
     )
 
 
@@ -189,8 +204,12 @@ def with_step(
         is_full = piece.length >= (1.0 - arrived.tolerance) * arrived.dt
         on_grid = _on_grid(method, arrived, piece)
         stages = [jnp.where(is_full, own, line) for own, line in zip(on_grid, stages, strict=True)]
-    stages = stages + [stages[-1]] * (STAGES - len(stages))
-    return jnp.concatenate([jnp.stack(stages)[None], before[:-1]])
+    return jnp.concatenate([jnp.stack(_padded(stages))[None], before[:-1]])
+
+
+def _padded(stages: Sequence[jax.Array]) -> list[jax.Array]:
+    """The commands of the stages of a step, (n,) each, with the last one repeated up to STAGES."""
+    return [*stages, *[stages[-1]] * (STAGES - len(stages))]
 
 
 def _on_grid(method: str, arrived: ArrivingCommands, piece: PieceCommands) -> list[jax.Array]:

@@ -19,6 +19,7 @@ import iblf_jax as ij
 from iblf_jax.certificates.claims import why_no_theorem
 from iblf_jax.core.status import Status
 from iblf_jax.simulation.closed_loop import LoopState, evaluate
+from iblf_jax.simulation.delays import STAGES, arriving
 
 LOOP = Loop(corrected=True, K2=np.full(2, 4.0), kf=np.full(2, 4.0))
 SLOW = ij.with_parameters(
@@ -284,33 +285,60 @@ def test_derivative_by_the_delay_and_by_the_time_of_a_fault():
     np.testing.assert_allclose(slopes[:, 0], by_delay, rtol=2e-2)
 
 
+def test_derivative_by_a_delay_of_one_step():
+    """The first command arrives at the end of the step in which the law computed it."""
+
+    def end(delay, dt=1e-3, history=2):
+        scenario = with_actuator(ij.actuators.Delay(delay, history=history))
+        return ij.simulate(scenario, duration=0.02, dt=dt).q[-1]
+
+    slope = np.asarray(jax.jacfwd(end)(1e-3))
+    ahead, behind = (np.asarray(end(1e-3 + sign * 5e-5, 5e-5, 21)) for sign in (1, -1))
+    np.testing.assert_allclose(slope, (ahead - behind) / 1e-4, rtol=3e-2)
+
+
+def test_a_long_run_in_float32_has_the_delay_of_a_short_one():
+    scenario = with_actuator(ij.actuators.Delay(4.45e-3, history=5))
+    commands, dt = jnp.zeros((5, STAGES, 2), jnp.float32), jnp.float32(1e-3)
+    for number in (10, 1_000_000):
+        found = arriving(ij.astype(scenario, "float32"), "rk4", dt, jnp.float32(number), commands)
+        assert not found.is_whole
+        np.testing.assert_allclose(found.shift, 0.55, rtol=1e-5)
+
+
 # --- studies --------------------------------------------------------------------------------------
 
 
 def test_monte_carlo_over_delays_repeats_single_runs():
     scenario = with_actuator(ij.actuators.Delay(3e-3, history=6))
-    options = {"duration": 0.05, "dt": 1e-3}
     study = ij.monte_carlo(
         scenario,
         {"actuator.delay": ij.value(ij.uniform(2e-3, 6e-3))},
         runs=6,
         progress=False,
-        **options,
+        duration=0.05,
+        dt=1e-3,
     )
     for i in (0, 5):
         run = study.replay(i)
         assert 2e-3 <= float(run.scenario.actuator.delay) <= 6e-3
         np.testing.assert_allclose(study.metrics["rmse"][i], run.metrics["rmse"], rtol=1e-9)
+
+
+@pytest.mark.parametrize("delays", [(6.5e-3, 8e-3), (1e-4, 9e-4)])
+def test_delays_beyond_the_history_or_below_a_step_are_flagged(delays):
+    scenario = with_actuator(ij.actuators.Delay(3e-3, history=6))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        longer = ij.monte_carlo(
+        study = ij.monte_carlo(
             scenario,
-            {"actuator.delay": ij.value(ij.uniform(6.5e-3, 8e-3))},
+            {"actuator.delay": ij.value(ij.uniform(*delays))},
             runs=2,
             progress=False,
-            **options,
+            duration=0.05,
+            dt=1e-3,
         )
-    assert np.all(np.asarray(longer.status) & int(Status.NOT_FINITE))
+    assert np.all(np.asarray(study.status) & int(Status.NOT_FINITE))
 
 
 def test_falsify_finds_a_loss_of_effectiveness_that_leaves_the_bounds():
