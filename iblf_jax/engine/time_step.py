@@ -163,8 +163,8 @@ def _with_commands(
     after: LoopState,
     parts: list,
 ) -> tuple[LoopState, list]:
-    """The state after a step with the commands of the step, and the slopes of its stages without
-    them.
+    """The state after a step, which keeps the commands of the step for a delayed input; and the
+    pieces of the step, whose slopes no longer contain the commands.
     """
     sent = [
         delays.PieceCommands(piece.begin, length, piece.exists, [slope.delayed for slope in slopes])

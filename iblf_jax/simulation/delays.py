@@ -1,18 +1,19 @@
-"""Commands of a continuous loop that reach the actuator later: the method of steps.
+"""The delay of the input of a continuous loop, by the method of steps.
 
-The loop keeps the commands of the integrator's stages of the last steps. With a delay of m steps
-the stage s of step k receives the command of the stage s of step k - m. This is the integrator
-applied to the ordinary differential equation of all intervals of the length of the delay, so a run
-has the order of the integrator.
+The loop keeps the commands at the integrator's stages over the last steps. With a delay of m steps
+the stage s of step k receives the command of the stage s of step k - m. On an interval of the
+length of the delay the input is a known function of time; the intervals together form an ordinary
+differential equation, and the scheme is the integrator applied to it. A run therefore has the order
+of the integrator.
 
-Otherwise a stage receives the value of the polynomial in time through the commands of a past step:
-the mean of those stages that belong to the same time, at each such time. For rk4 it is quadratic
-and right to third order, for Heun's method linear and right to second order. The motion has a kink
-where the first command arrives, hence the commands have one, and a run is of second order where
-the kink does not lie on an instant.
+With another delay a stage receives the value of a polynomial in time through the commands of one
+past step. Where several stages have the same time, the polynomial takes their mean. It is quadratic
+for rk4, with an error of third order, and linear for Heun's method, with an error of second order.
+The state has a kink where the first command arrives, so the command has one there, too. A run is of
+second order where this kink lies within a step.
 
-The first command arrives at the delay, where the actuator declares a jump; a step is divided there.
-Before it the input balances gravity, as in a sampled loop.
+The first command arrives at the time t = delay, which the actuator declares as a jump; a step is
+divided there. Before it the input balances gravity, as in a sampled loop.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from iblf_jax.simulation.sampling import command_at
 from iblf_jax.simulation.scenario import Scenario
 
 STAGES = max(len(table.c) for table in TABLEAUS.values())
-"""Commands that are kept of a step; a method of fewer stages repeats its last one."""
+"""Number of commands that are kept of a step; a method of fewer stages repeats its last one."""
 
 
 def initial_commands(scenario: Scenario, balance: jax.Array) -> Any:
@@ -50,30 +51,33 @@ class ArrivingCommands(NamedTuple):
     """The commands that arrive within a step."""
 
     method: str
+    """The integrator."""
     start: jax.Array
-    """Of the step, () [s]."""
+    """Start of the step, () [s]."""
     dt: jax.Array
-    """() [s]."""
+    """Length of the step, () [s]."""
     delay: jax.Array
-    """() [s]."""
+    """Delay of the input, () [s]."""
     shift: jax.Array
-    """Steps by which the delay is shorter than a whole number of steps, () in [0, 1)."""
+    """The delay rounded up to whole steps, less the delay, () [steps] in [0, 1)."""
     is_whole: jax.Array
-    """Whether it is a whole number of steps, () bool."""
+    """Whether the delay is a whole number of steps, () bool."""
     tolerance: jax.Array
-    """Difference that rounding may make, () [steps]."""
+    """Bound of the rounding error of a time within the step, () [steps]."""
     is_one_step: jax.Array
-    """Whether it is one step, () bool."""
+    """Whether the delay is one step, () bool."""
     is_first: jax.Array
     """Whether the first command arrives within the step or at its end, () bool."""
     earlier: jax.Array
-    """Commands of the past step that begins a whole number of steps ago, (STAGES, n)."""
+    """Commands of the past step that began the delay, rounded up to whole steps, ago,
+    (STAGES, n)."""
     later: jax.Array
-    """Those of the step after it, (STAGES, n)."""
+    """Commands of the step after that one, (STAGES, n)."""
 
     def with_commands_of_step(self, commands: Sequence[jax.Array]) -> ArrivingCommands:
-        """The same with the commands of the step itself, the first of which arrives at its end
-        where the delay is one step.
+        """The same with the commands of the step itself, where the delay is one step.
+
+        The first command of a run then arrives at the end of the step that computed it.
 
         Args:
           commands: of the stages of the first piece of the step, (n,) each.
@@ -96,13 +100,18 @@ class ArrivingCommands(NamedTuple):
           times: of the stages, () [s] each.
           length: of the piece of the step to which the stages belong, () [s].
         """
-        is_full = length >= (1.0 - self.tolerance) * self.dt
-        matches = self.is_whole & is_full
+        # The stages of an undivided step coincide with those of the past step, whose commands are
+        # passed on exactly. The polynomial contributes the derivative with respect to time.
+        coincides = self.is_whole & self.is_full(length)
         found = []
         for i, (c, t) in enumerate(zip(tableau(self.method).c, times, strict=True)):
             difference = self.earlier[i] - interpolated(self.method, self.earlier, c)
-            found.append(self.at(t) + jnp.where(matches, difference, 0.0))
+            found.append(self.at(t) + jnp.where(coincides, difference, 0.0))
         return found
+
+    def is_full(self, length: jax.Array) -> jax.Array:
+        """Whether a piece of this length, () [s], is the whole step, () bool."""
+        return length >= (1.0 - self.tolerance) * self.dt
 
 
 def arriving(
@@ -110,19 +119,20 @@ def arriving(
 ) -> Any:
     """The commands that arrive within a step; `()` without a delay.
 
-    They are NaN where the delay is shorter than a step, or longer than the history.
+    The commands are NaN where the delay is shorter than a step or longer than the history, so that
+    the run is flagged.
 
     Args:
       scenario: the scenario.
       method: the integrator.
-      dt: of the step, () [s].
-      number: of the step, () as a floating-point number.
+      dt: length of the step, () [s].
+      number: number of the step, () of floating-point type.
       commands: of the steps before it, newest first, (history, STAGES, n) [N m].
     """
-    found = input_delay(scenario.actuator)
-    if found is None:
+    actuator = input_delay(scenario.actuator)
+    if actuator is None:
         return ()
-    delay = found.delay
+    delay = actuator.delay
     steps = delay / dt
     rounding_error = 4.0 * jnp.finfo(dt.dtype).eps
     nearest = jnp.round(steps)
@@ -149,59 +159,61 @@ def arriving(
 
 
 def interpolated(method: str, commands: Any, position: Any) -> jax.Array:
-    """The polynomial through the commands of a step at a position in it, (n,).
+    """The value of the Lagrange polynomial through the commands of a step, (n,).
 
     Args:
       method: the integrator.
-      commands: of its stages, (n,) each.
-      position: () [steps].
+      commands: of the stages of the step, (n,) each.
+      position: time since the start of the step, () [steps].
     """
     c = tableau(method).c
     nodes = sorted(set(c))
     found = jnp.zeros_like(commands[0])
     for node in nodes:
-        rows = [commands[i] for i, each in enumerate(c) if each == node]
+        at_node = [commands[i] for i, each in enumerate(c) if each == node]
+        mean = sum(at_node[1:], at_node[0]) / len(at_node)
         weight = 1.0
         for other in nodes:
             if other != node:
                 weight = weight * (position - other) / (node - other)
-        found = found + weight * (sum(rows[1:], rows[0]) / len(rows))
+        found = found + weight * mean
     return found
 
 
 class PieceCommands(NamedTuple):
-    """The commands of the stages of a piece of a step."""
+    """The commands of the law at the stages of a piece of a step."""
 
     begin: jax.Array
-    """() [s]."""
+    """Time at which the piece begins, () [s]."""
     length: jax.Array
-    """() [s]."""
+    """Length of the piece, () [s]."""
     exists: Any
     """Whether the step has this piece, () bool."""
     commands: list[jax.Array]
-    """(n,) of each stage."""
+    """Commands at the stages, (n,) each."""
 
 
 def with_step(
     before: jax.Array, method: str, arrived: ArrivingCommands, pieces: Sequence[PieceCommands]
 ) -> jax.Array:
-    """The commands of the past steps after one more, newest first, (history, STAGES, n).
+    """The commands of the past steps with those of one more step, newest first,
+    (history, STAGES, n).
 
-    Of a step that is divided by a jump, the commands between its ends are those of a straight line.
+    The commands of a step that a jump divides are replaced by a straight line between its ends.
 
     Args:
-      before: those before the step.
+      before: the commands before the step, (history, STAGES, n).
       method: the integrator.
       arrived: the commands that arrived within the step.
-      pieces: of the step.
+      pieces: the commands that the law computed in each piece of the step.
     """
-    c = tableau(method).c
-    start, end = pieces[0].commands[0], pieces[0].commands[-1]
+    start = pieces[0].commands[0]
+    end = pieces[0].commands[-1]
     for piece in pieces[1:]:
         end = jnp.where(piece.exists, piece.commands[-1], end)
-    stages = [start + each * (end - start) for each in c]
+    stages = [start + c * (end - start) for c in tableau(method).c]
     for piece in pieces:
-        is_full = piece.length >= (1.0 - arrived.tolerance) * arrived.dt
+        is_full = arrived.is_full(piece.length)
         on_grid = _on_grid(method, arrived, piece)
         stages = [jnp.where(is_full, own, line) for own, line in zip(on_grid, stages, strict=True)]
     return jnp.concatenate([jnp.stack(_padded(stages))[None], before[:-1]])
@@ -213,15 +225,14 @@ def _padded(stages: Sequence[jax.Array]) -> list[jax.Array]:
 
 
 def _on_grid(method: str, arrived: ArrivingCommands, piece: PieceCommands) -> list[jax.Array]:
-    """The commands of the stages of a piece that fills its step, (n,) each, at the times of an
-    undivided step.
+    """The commands of a piece that fills its step, (n,) each, at the stages of an undivided step.
 
-    The times of such a piece are these, but they have a derivative by the jump time at which it
-    ends.
+    The stages of both have the same times. Those of the piece have a derivative with respect to the
+    jump time at which it ends, which the correction by the polynomial removes.
     """
     found = []
     for c, own in zip(tableau(method).c, piece.commands, strict=True):
-        late = (piece.begin + c * piece.length - arrived.start) / arrived.dt - c
-        moved = interpolated(method, piece.commands, c - late)
-        found.append(own + moved - interpolated(method, piece.commands, c))
+        offset = (piece.begin + c * piece.length - arrived.start) / arrived.dt - c
+        corrected = interpolated(method, piece.commands, c - offset)
+        found.append(own + corrected - interpolated(method, piece.commands, c))
     return found

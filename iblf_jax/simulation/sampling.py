@@ -42,21 +42,22 @@ class EventTrigger:
 
         |u_i - u_held,i| > relative_i |u_held,i| + absolute_i   for any component i
 
-    Otherwise the actuator and the observer keep the held command.  One component beyond its
-    threshold sends all of them: a message to the drives carries the commands of all joints, so that
-    the number of events is the number of messages, and the error |u_i - u_held,i| of each component
-    is bounded by its own threshold all the same.  The first sample is always sent.  With a period
-    of one step dt the condition is checked at every step, as for a law in continuous time.
+    Otherwise the actuator and the observer keep the held command.  A message to the drives carries
+    the commands of all joints, so one component beyond its threshold sends all components.  The
+    number of events is therefore the number of messages, and the error |u_i - u_held,i| of each
+    component at a sample is bounded by its own threshold.  The first command is always sent, and so
+    is a command that is not finite, which stops the run.  With a period of one step dt the
+    condition is checked at every step, as for a law in continuous time.
 
     The derivative of a held command is that of the command that was sent; the instants of the
     events have no derivative.
 
     Args:
-      relative: delta, () or (n,) [1], >= 0 and < 1; 0 if not given.
-      absolute: m, threshold of the error itself, () or (n,) [N m], >= 0; 0 if not given.
+      relative: relative threshold delta, () or (n,) [1], >= 0 and < 1; 0 if not given.
+      absolute: absolute threshold m, () or (n,) [N m], >= 0; 0 if not given.
 
     Source: L. Xing, C. Wen, Z. Liu, H. Su, J. Cai, IEEE Trans. Automatic Control 62 (2017)
-      2071-2076 (relative threshold, one input); for several inputs as said above.
+      2071-2076, for one input; the condition for several inputs is a design of this package.
     """
 
     relative: Leaf = leaf("1", sign="nonnegative", default=0.0)
@@ -67,7 +68,7 @@ class EventTrigger:
         check_relative("EventTrigger.relative", self.relative)
 
     def sent(self, u: jax.Array, torque: jax.Array, last: SentCommand) -> SentCommand:
-        """The command that is sent, or held, at a sample.
+        """The command after a sample: the new one if it is sent, else the held one.
 
         Args:
           u: input of the plant that the law commands, (n,).
@@ -75,8 +76,8 @@ class EventTrigger:
           last: the command that was sent last.
         """
         threshold = self.relative * jnp.abs(last.input) + self.absolute
-        # A comparison with NaN is False: a command that is not finite is sent, too, and the run
-        # stops as it does without a trigger.
+        # A comparison with NaN is False. Written this way, the trigger sends a command that is not
+        # finite, and the run stops as it does without a trigger.
         is_within = jnp.abs(u - last.input) <= threshold
         fires = ~jnp.all(is_within) | (last.number == 0.0)
         return SentCommand(
@@ -87,7 +88,7 @@ class EventTrigger:
 
 
 def nothing_sent(u: jax.Array) -> SentCommand:
-    """The command before the first sample: the input u, (n,), which was not sent."""
+    """The `SentCommand` before the first sample: the input u, (n,), and no event."""
     return SentCommand(u, u, jnp.zeros((), u.dtype))
 
 
@@ -126,8 +127,8 @@ class Sampling:
     trigger: EventTrigger | None = None
 
     def check(self) -> None:
-        """Raises ValueError for an unknown step of the observer, a queue that is too short, or
-        something else than an event trigger.
+        """Raises ValueError for an unknown step of the observer, a queue that is too short, or a
+        trigger that is not an `EventTrigger`.
         """
         if not isinstance(self.trigger, EventTrigger | None):
             remedy = "Such as ij.EventTrigger(relative=0.1, absolute=0.05)."
@@ -215,6 +216,7 @@ def step_torques(
     """
     if sampling.queue == 0:
         one = jnp.ones_like(dt)
+        # Only commands without a delay fit in an empty queue: any delay counts as too large an age.
         torque = _if_consistent(sampling, dt, sampling.delay, commands[0])
         return StepTorques(torque, commands[0], one, one < 0)
     age, arrival, arrives = _arrival(sampling, dt, now.phase)

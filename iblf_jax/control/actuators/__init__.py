@@ -1,6 +1,4 @@
-"""Actuators: from the commanded to the delivered torque.  The contract is `Actuator` in
-`_base.py`.
-"""
+"""Actuators map the command of a law to the delivered torque.  `_base.py` has their contract."""
 
 from iblf_jax.control.actuators._base import Actuator as Actuator
 from iblf_jax.control.actuators._base import Delivered as Delivered

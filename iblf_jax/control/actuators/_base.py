@@ -1,7 +1,8 @@
-"""The contract of an actuator: it takes the law's command and gives a torque.
+"""The contract of an actuator: it maps the command of a law to the torque on the joints.
 
-Its state is integrated with the plant.  Friction belongs to the plant.  The delay of a sampled law
-belongs to its `Sampling`, that of a continuous one is a `Delay`.
+The integrator advances the state of an actuator together with the plant.  Friction belongs to the
+plant.  The commands of a sampled law have the delay of its `Sampling`; the input of a continuous
+loop has the delay of the actuator `Delay`.
 """
 
 from __future__ import annotations
@@ -17,33 +18,36 @@ State = Any
 
 
 class Delivered(NamedTuple):
-    """The output of an actuator at one instant; torque and flag are (n,)."""
+    """The output of an actuator at one instant."""
 
     tau: jax.Array
-    """Torque on the joint [N m]."""
+    """Torque on the joints, (n,) [N m]."""
     limited: jax.Array
-    """bool: a limit was active."""
+    """Whether a limit is active, (n,) bool."""
     rate: State
-    """Rate of its state."""
+    """Rate of the actuator's state, per second."""
 
 
 class Actuator(Protocol):
     """The contract of an actuator.
 
-    The command of a law is a torque.  An actuator may take another input, such as a voltage, under
-    a law that commands one; an observer is given the command, so such a loop needs one that does
-    not use it.
+    The command of a law is a torque.  Under a law that commands another input, such as a voltage,
+    the actuator may take that input; the observer receives the command, so the observer of such a
+    loop may not use it as a torque.
 
-    An actuator with limits also has the property `unlimited`, the same actuator without them; the
-    fastest mode of a sampled loop is computed with it.  One with a dead zone, a play or rounding
-    has the property `smooth`, an actuator without these that has the same state; the fastest mode
-    of every loop is computed with it.  An actuator that changes with time, such as a drive
-    that fails, has `at(t)`, the actuator at time t [s], and, if it is discontinuous in time,
-    `jump_times()`, (m,) [s]; steps of a run are divided there, as for disturbances.
+    An actuator may have further members:
+
+    - `unlimited`: the same actuator without its limits.  The fastest mode of a sampled loop is
+      computed with it.
+    - `smooth`: an actuator with the same state, without a dead zone, play and rounding.  The
+      fastest mode of every loop is computed with it.
+    - `at(t)`: the actuator at time t [s], if it changes with time, such as a drive that fails.
+    - `jump_times()`: the times (m,) [s] at which it is discontinuous in time.  Steps of a run are
+      divided there, as for disturbances.
     """
 
     def init(self, tau: jax.Array) -> State:
-        """State at the start, where it delivers the torque `tau`, (n,) [N m]."""
+        """The state in which the actuator delivers the torque `tau`, (n,) [N m]."""
         ...
 
     def deliver(self, command: jax.Array, dq: jax.Array, state: State) -> Delivered:
@@ -52,16 +56,15 @@ class Actuator(Protocol):
         Args:
           command: the law's command, (n,): a torque [N m], or the actuator's own input in its unit.
           dq: velocity of the joints, (n,) [rad/s].
-          state: its own.
+          state: of the actuator.
         """
         ...
 
 
-actuator_member = OptionalMembers(
-    unlimited=None, smooth=None, input_delay=None, with_history=None, advice=list
-)
-"""Reads optional members of an actuator.  `input_delay` is the `Delay` of the loop's input, and
-`with_history(dt)` the actuator with a history that is long enough for steps dt [s]."""
+actuator_member = OptionalMembers(unlimited=None, smooth=None, input_delay=None, with_history=None)
+"""Reads optional members of an actuator.  Only `Delay` and a `Chain` with a `Delay` have the last
+two: `input_delay` is that `Delay`, and `with_history(dt)` is the actuator with a history that is
+long enough for steps dt [s]."""
 
 
 def unlimited(actuator: Actuator) -> Actuator:
@@ -75,5 +78,5 @@ def smooth(actuator: Actuator) -> Actuator:
 
 
 def input_delay(actuator: Actuator) -> Any:
-    """The `Delay` of the input of a loop; None without one."""
+    """The `Delay` of an actuator or of its first part; None without one."""
     return actuator_member(actuator, "input_delay")

@@ -24,21 +24,25 @@ from iblf_jax.core.time import as_at, joined, jump_times_of
 
 @component
 class Chain:
-    """Each actuator receives the torque of the previous one: `Chain((Motor(bandwidth=2000.0,
-    limit=40.0), Motor(bandwidth=300.0)))`.
+    """Each actuator receives the torque of the previous one as its command.
+
+        u_1 = u,   u_(i+1) = tau_i,   tau = tau_m   for parts 1 to m
+
+    Such as `Chain((Motor(bandwidth=2000.0, limit=40.0), Motor(bandwidth=300.0)))`.  An observer
+    receives the command u of the law.
 
     Args:
       parts: any actuators, a tuple or a list, from the command to the joint; at least one.  A
         `Delay` comes first.
 
-    Source: none; what a current loop and a transmission with a lag of its own make together.
+    Source: none; a series connection, such as that of a current loop and a transmission.
     """
 
     parts: tuple[Actuator, ...]
 
     def check(self) -> None:
-        """Takes a list for a tuple; raises ValueError for a part that is not an actuator, or none
-        at all.
+        """Makes a tuple of the parts; raises ValueError for no part, a part that is not an
+        actuator, or a `Delay` behind another part.
         """
         if not isinstance(self.parts, tuple | list) or not self.parts:
             raise checks.fail(
@@ -57,12 +61,12 @@ class Chain:
 
     @property
     def unlimited(self) -> Chain:
-        """The same without limits."""
+        """The same chain without limits."""
         return dataclasses.replace(self, parts=tuple(map(unlimited, self.parts)))
 
     @property
     def smooth(self) -> Chain:
-        """The same without dead zones, play and rounding."""
+        """The same chain without dead zones, play and rounding."""
         return dataclasses.replace(self, parts=tuple(map(smooth, self.parts)))
 
     @property
@@ -71,12 +75,12 @@ class Chain:
         return input_delay(self.parts[0])
 
     def with_history(self, dt: float) -> Chain:
-        """The same with a history of its delay that is long enough for steps dt [s]."""
-        first = self.parts[0]
+        """The same chain, whose delay has a history that is long enough for steps dt [s]."""
+        first, *others = self.parts
         fitted = actuator_member(first, "with_history")
         if fitted is None:
             return self
-        return dataclasses.replace(self, parts=(fitted(dt), *self.parts[1:]))
+        return dataclasses.replace(self, parts=(fitted(dt), *others))
 
     def at(self, t: jax.Array) -> Chain:
         """The chain as it is at time t [s]."""
@@ -85,20 +89,22 @@ class Chain:
         return now
 
     def jump_times(self) -> jax.Array:
-        """The parts' jump times together, (m,) [s]."""
-        return joined(
-            [jump_times_of(f"Chain.parts[{i}]", part) for i, part in enumerate(self.parts)]
-        )
+        """The jump times of all parts, (m,) [s]."""
+        times = [jump_times_of(f"Chain.parts[{i}]", part) for i, part in enumerate(self.parts)]
+        return joined(times)
 
     def init(self, tau: jax.Array) -> Any:
-        """The parts' states, each of which delivers the torque."""
+        """The states in which each part delivers the torque `tau`, (n,) [N m]."""
         return tuple(part.init(tau) for part in self.parts)
 
     def deliver(self, command: jax.Array, dq: jax.Array, state: Any) -> Delivered:
-        """What the last delivers; a limit of any is one of the chain."""
-        torque, limited, rates = command, jnp.zeros(command.shape, bool), []
-        for part, own in zip(self.parts, state, strict=True):
-            delivered = part.deliver(torque, dq, own)
-            torque, limited = delivered.tau, limited | delivered.limited
+        """The torque of the last part, and the rates of all; `limited` where any part is."""
+        torque = command
+        limited = jnp.zeros(command.shape, bool)
+        rates = []
+        for part, state_of_part in zip(self.parts, state, strict=True):
+            delivered = part.deliver(torque, dq, state_of_part)
+            torque = delivered.tau
+            limited = limited | delivered.limited
             rates.append(delivered.rate)
         return Delivered(torque, limited, tuple(rates))

@@ -18,10 +18,10 @@ from iblf_jax.core.units import INPUT, PlantUnit
 class DeadZone:
     """tau = slope (u - upper) for u > upper,   slope (u - lower) for u < lower,   0 between them.
 
-    The torque is continuous and has kinks at both ends.  A run is of second order in the time step
-    where the command crosses an end, and its derivatives are those of the branch on which the
-    command lies.  The fastest mode of a loop is computed without the dead zone (`smooth`), because
-    inside of it the loop is open.
+    The torque is a continuous function of the command with a kink at both ends of the zone.  A run
+    is of second order in the time step where the command crosses an end, and its derivatives are
+    those of the branch on which the command lies.  The fastest mode is computed without the dead
+    zone (`smooth`), because the loop is open inside it.
 
     Args:
       lower: command below which a torque is delivered, () or (n,) [N m], <= 0.
@@ -37,23 +37,23 @@ class DeadZone:
     slope: Leaf = leaf(PlantUnit("1", "1"), sign="positive", default=1.0)
 
     def check(self) -> None:
-        """Raises ValueError for a lower end above 0."""
+        """Raises ValueError for a `lower` above 0."""
         if checks.is_concrete(self.lower) and np.any(np.asarray(self.lower) > 0):
             remedy = "A command of 0 lies in the dead zone."
             raise checks.fail("DeadZone.lower", self.lower, "a command <= 0", remedy)
 
     @property
     def smooth(self) -> DeadZone:
-        """The same without the zone."""
-        none = jnp.zeros_like(self.upper)
-        return dataclasses.replace(self, lower=none, upper=none)
+        """The same actuator without the zone."""
+        zero = jnp.zeros_like(self.upper)
+        return dataclasses.replace(self, lower=zero, upper=zero)
 
     def init(self, tau: jax.Array) -> tuple[()]:
         """No state."""
         return ()
 
     def deliver(self, command: jax.Array, dq: jax.Array, state: tuple[()]) -> Delivered:
-        """The torque beyond the ends."""
+        """The torque of a command outside the zone; 0 inside it."""
         above = jnp.maximum(command - self.upper, 0.0)
         below = jnp.minimum(command - self.lower, 0.0)
         return Delivered(self.slope * (above + below), jnp.zeros(command.shape, bool), ())

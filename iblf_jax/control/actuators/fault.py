@@ -1,4 +1,4 @@
-"""A fault: loss of effectiveness and a bias from a time on."""
+"""A fault of a drive: a loss of effectiveness and a bias that begin at a given time."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from iblf_jax.core.units import INPUT
 class Fault:
     """tau = u for t < time,   tau = effectiveness u + bias for t >= time.
 
-    Several faults are a `Chain` of them: Chain((Fault(0.7, 0.0, 1.0), Fault(0.5, 0.2, 2.0))).
-    Steps of a run are divided at the time, so a run has a derivative by it.  An observer receives
-    the command u, so its estimate contains the torque that is lost.
+    A `Chain` describes several faults: Chain((Fault(0.7, 0.0, 1.0), Fault(0.5, 0.2, 2.0))).  Steps
+    of a run are divided at `time`, so that a run is differentiable with respect to it.  An observer
+    receives the command u, so its estimate contains the lost torque.
 
     Args:
-      effectiveness: share of the command that is delivered, () or (n,) [1], >= 0; 1 is no loss.
-      bias: torque that is added, () or (n,) [N m]; 0 if not given.
+      effectiveness: delivered share of the command, () or (n,) [1], >= 0; 1 without a loss.
+      bias: added torque, () or (n,) [N m]; 0 if not given.
       time: time of the fault, () [s]; 0 if not given.
 
     Source: M. Blanke et al., Diagnosis and Fault-Tolerant Control, 3rd ed. 2016, chapter 3.
@@ -33,7 +33,7 @@ class Fault:
     time: Leaf = leaf("s", shape="scalar", default=0.0)
 
     def at(self, t: jax.Array) -> Fault:
-        """The actuator as it is at time t [s]: without a loss and a bias before the fault."""
+        """The actuator at time t [s]: before the fault it has neither loss nor bias."""
         now = copy.copy(self)
         failed = t >= self.time
         object.__setattr__(now, "effectiveness", jnp.where(failed, self.effectiveness, 1.0))
@@ -49,6 +49,6 @@ class Fault:
         return ()
 
     def deliver(self, command: jax.Array, dq: jax.Array, state: tuple[()]) -> Delivered:
-        """The torque after the fault; `at` gives the actuator of another instant."""
+        """The torque with loss and bias; `at(t)` leaves them out before the fault."""
         tau = self.effectiveness * command + self.bias
         return Delivered(tau, jnp.zeros(command.shape, bool), ())

@@ -1,6 +1,4 @@
-"""An electric drive: a lag, limits of torque and of its rate, and the line between torque and
-speed.
-"""
+"""An electric drive: a first-order lag, limits of torque and rate, and a torque-speed line."""
 
 from __future__ import annotations
 
@@ -18,23 +16,29 @@ from iblf_jax.core.units import INPUT, VELOCITY, PlantUnit
 
 @component
 class Motor:
-    """v = clip(command, +-limit);   y' = clip(bandwidth (v - y), +-rate_limit);   tau = clip(y,
-    +-stall (1 - |q'|/no_load_speed)).
+    """A first-order lag with limits of torque and rate, and a torque-speed line.
 
-    What is not given is not there; without a bandwidth y = v.  Nothing is delivered beyond the
-    no-load speed.  The lag is integrated with the plant: behind a jump of the command the torque is
-    right to 1e-5 of the jump where dt bandwidth <= 0.2 (rk4), the positions far better.
+        v = clip(u, +-limit),   y' = clip(bandwidth (v - y), +-rate_limit),
+        tau = clip(y, +-stall max(1 - |q'|/no_load_speed, 0))
+
+    A limit or a lag that is not given is left out; without a bandwidth y = v.  Beyond the no-load
+    speed the torque is 0 in both directions.  The integrator of the run advances the lag: after a
+    jump of the command the error of the torque is below 1e-5 of the jump where
+    dt bandwidth <= 0.2 (rk4), and that of the positions is far smaller.  A run is of second order
+    in the time step where a limit becomes active or inactive.
 
     Args:
-      bandwidth: of the current loop, () or (n,) [1/s], > 0; no lag if not given.
+      bandwidth: inverse time constant of the current loop, () or (n,) [1/s], > 0; no lag if not
+        given.
       limit: largest torque, () or (n,) [N m], > 0; none if not given.
       rate_limit: largest rate of the torque, () or (n,) [N m/s], > 0; none if not given.  It needs
         a bandwidth.
-      stall: torque at a standstill, () or (n,) [N m], > 0; none if not given.  It comes with
+      stall: torque at a standstill, () or (n,) [N m], > 0; none if not given.  It needs a
         no_load_speed.
-      no_load_speed: speed at which no torque is left, () or (n,) [rad/s], > 0; none if not given.
+      no_load_speed: speed at which the torque is 0, () or (n,) [rad/s], > 0; none if not given.
 
-    Source: the torque-speed line of a DC motor, any text on drives.
+    Source: R. Krishnan, Electric Motor Drives, 2001, chapter 2: the torque-speed line of a DC
+      motor.
     """
 
     bandwidth: Leaf = leaf("1/s", sign="positive", default=None)
@@ -44,8 +48,8 @@ class Motor:
     no_load_speed: Leaf = leaf(VELOCITY, sign="positive", default=None)
 
     def check(self) -> None:
-        """Raises ValueError for half a torque-speed line, or a limit of the rate without a
-        bandwidth.
+        """Raises ValueError for one of stall and no_load_speed without the other, or a rate_limit
+        without a bandwidth.
         """
         if (self.stall is None) != (self.no_load_speed is None):
             name = "no_load_speed" if self.no_load_speed is None else "stall"
@@ -60,17 +64,17 @@ class Motor:
 
     @property
     def unlimited(self) -> Motor:
-        """The same without limits."""
+        """The same drive without limits."""
         return dataclasses.replace(
             self, limit=None, rate_limit=None, stall=None, no_load_speed=None
         )
 
     def init(self, tau: jax.Array) -> Any:
-        """The torque that it delivers, (n,) [N m]; no state without a lag."""
+        """The state y: the torque itself, (n,) [N m]; `()` without a lag."""
         return () if self.bandwidth is None else tau
 
     def deliver(self, command: jax.Array, dq: jax.Array, state: Any) -> Delivered:
-        """Lag and limits."""
+        """The torque, and the rate of the lag; `limited` where a limit changes one of them."""
         limited = jnp.zeros(command.shape, bool)
         v: jax.Array = command
         rate: Any = ()

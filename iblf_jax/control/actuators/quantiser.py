@@ -16,18 +16,18 @@ from iblf_jax.core.units import INPUT
 class Quantiser:
     """tau = step round(u / step).
 
-    The torque jumps at surfaces in the state that steps of a run are not divided at: in a
-    continuous loop a run is of first order in the time step, and where the loop chatters between
-    two levels the time step decides how fast.  In a sampled loop the torque is constant between the
-    samples, and the order of the integrator remains.
+    Steps of a run are not divided where the torque jumps from one level to the next.  A run of a
+    continuous loop is therefore of first order in the time step, and where the loop chatters
+    between two levels, the time step determines the frequency of the chatter.  In a sampled loop
+    the torque is constant between samples, and a run has the order of the integrator.
 
-    The derivative of tau by u is defined as 1, that of the torque before rounding, because the
-    derivative of the rounding is 0 almost everywhere; the derivatives of a run are therefore those
-    of a loop whose quantisation error is a given disturbance.  The fastest mode is computed without
-    the rounding (`smooth`).
+    The derivative of tau with respect to u is defined as 1, that of the torque before rounding,
+    because the derivative of the rounding is 0 almost everywhere; the derivatives of a run are
+    therefore those of a loop whose quantisation error is a given disturbance.  The fastest mode is
+    computed without the rounding (`smooth`).
 
     Args:
-      step: distance of two levels, () or (n,) [N m], > 0.
+      step: distance between two levels, () or (n,) [N m], > 0.
 
     Source: D. Liberzon, Switching in Systems and Control, 2003, section 5.3.
     """
@@ -36,7 +36,7 @@ class Quantiser:
 
     @property
     def smooth(self) -> Ideal:
-        """No rounding."""
+        """An actuator without rounding."""
         return Ideal()
 
     def init(self, tau: jax.Array) -> tuple[()]:
