@@ -8,11 +8,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from iblf_jax.control.actuators._base import input_delay
 from iblf_jax.core import checks, notices
 from iblf_jax.engine.registry import backends
 from iblf_jax.engine.structural_constants import StructuralConstants, constants_of
-from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.noise import check_method
 from iblf_jax.simulation.scenario import Scenario
 
@@ -56,15 +54,10 @@ class RunRequest(NamedTuple):
           backend: "auto", "native", "gpu" or "vmap".
 
         Raises:
-          ValueError: an unknown method or backend, or a method that does not fit the process noise
-            of the plant.
+          ValueError: an unknown method or backend, or a method that does not fit the scenario
+            (`noise.check_method`).
         """
         check_method(scenario, method)
-        stages = tableau(method).c
-        if len(stages) == 1 and input_delay(scenario.actuator) is not None:
-            expected = '"rk4" or "heun" with a delay of the input'
-            remedy = "Between two steps of Euler's method the command has no value."
-            raise checks.fail("method", method, expected, remedy)
         backend = check_backend(backend)
         return RunRequest(steps, method, record_every, constants_of(scenario), backend)
 

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.control.actuators._base import input_delay
 from iblf_jax.core import checks
 from iblf_jax.simulation.discontinuities import Piece
 from iblf_jax.simulation.integrators import STOCHASTIC, TABLEAUS, tableau
@@ -145,10 +146,34 @@ def _upper(x: jax.Array) -> jax.Array:
 
 
 def check_method(scenario: Scenario, method: str) -> None:
-    """Raises ValueError for an unknown method, a deterministic one for a plant with process noise,
-    a stochastic one for a plant without, and one of strong order 1 for noise that is not additive.
+    """Raises ValueError for a method that does not fit the scenario.
+
+    These are an unknown method, a deterministic one for a plant with process noise, a stochastic
+    one for a plant without, one of strong order 1 for noise that is not additive, and one of a
+    single stage for a loop whose input has a delay.
     """
-    tableau(method)
+    stages = tableau(method).c
+    _check_kind_of_method(scenario, method)
+    if len(stages) == 1 and input_delay(scenario.actuator) is not None:
+        raise _no_command_between_steps(scenario, method)
+
+
+def _no_command_between_steps(scenario: Scenario, method: str) -> ValueError:
+    """The error for a method of a single stage where the input has a delay."""
+    noise = scenario.process_noise
+    if noise is not None and not noise_member(noise, "additive"):
+        expected = "noise that does not depend on the state, as the input has a delay"
+        remedy = 'A delay needs method="stochastic_heun", which needs additive noise.'
+        return checks.fail("scenario.process_noise", type(noise).__name__, expected, remedy)
+    fitting = '"rk4" or "heun"'
+    if noise is not None:
+        fitting = '"stochastic_heun"'
+    remedy = "Between two steps of Euler's method the command has no value."
+    return checks.fail("method", method, f"{fitting}, as the input has a delay", remedy)
+
+
+def _check_kind_of_method(scenario: Scenario, method: str) -> None:
+    """Raises ValueError for a method that does not fit the process noise of the plant."""
     noise = scenario.process_noise
     if noise is None:
         if method in STOCHASTIC:

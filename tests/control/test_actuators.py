@@ -359,6 +359,11 @@ def test_falsify_finds_a_loss_of_effectiveness_that_leaves_the_bounds():
 # --- what is refused, and what is reported --------------------------------------------------------
 
 
+def noisy_delayed_run(noise):
+    scenario = ij.with_parts(with_actuator(ij.actuators.Delay(0.01)), process_noise=noise)
+    return ij.simulate(scenario, duration=0.1, dt=1e-3, method="euler_maruyama")
+
+
 @pytest.mark.parametrize(
     ("call", "words"),
     [
@@ -384,6 +389,20 @@ def test_falsify_finds_a_loss_of_effectiveness_that_leaves_the_bounds():
                 with_actuator(ij.actuators.Delay(0.01)), duration=0.1, dt=1e-3, method="euler"
             ),
             "heun",
+        ),
+        (
+            lambda: ij.recommended_dt(
+                with_actuator(ij.actuators.Delay(0.01)), duration=0.1, method="euler"
+            ),
+            "heun",
+        ),
+        (
+            lambda: noisy_delayed_run(ij.process_noise.Additive(0.1)),
+            'expected "stochastic_heun"',
+        ),
+        (
+            lambda: noisy_delayed_run(ij.process_noise.Proportional(0.1)),
+            "scenario.process_noise: got 'Proportional'",
         ),
         (
             lambda: jax.grad(
