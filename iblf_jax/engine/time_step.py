@@ -166,15 +166,15 @@ def _with_commands(
     """The state after a step, which keeps the commands of the step for a delayed input; and the
     pieces of the step, whose slopes no longer contain the commands.
     """
-    sent = [
+    of_pieces = [
         delays.PieceCommands(piece.begin, length, piece.exists, [slope.delayed for slope in slopes])
         for piece, (length, slopes) in zip(pieces, parts, strict=True)
     ]
-    commands = delays.with_step(along.state.delayed, method, along.arriving, sent)
-    without = [
+    commands = delays.with_step(along.state.delayed, method, along.arriving, of_pieces)
+    without_commands = [
         (length, [slope._replace(delayed=()) for slope in slopes]) for length, slopes in parts
     ]
-    return after._replace(delayed=commands), without
+    return after._replace(delayed=commands), without_commands
 
 
 def _observed(

@@ -146,7 +146,8 @@ class LoopState(NamedTuple):
     """Levels of the plant from the third on, (r - 2, n); `()` for a robot, which has q and q'."""
     delayed: Any = ()
     """Commands of the last steps, newest first, (history, stages, n) [N m], where the input of a
-    continuous loop has a delay; in the rate of the state the command itself, (n,)."""
+    continuous loop has a delay; `()` without one.  In the rate of the state it is the command of
+    the law, (n,)."""
 
     @property
     def x(self) -> jax.Array:
@@ -219,9 +220,9 @@ def has_delay(state: LoopState) -> bool:
 def integrated_part(state: LoopState) -> LoopState:
     """The part of the state that the integrator advances.
 
-    This is the whole state of a continuous loop, with the integral of the command, from 0 on, in
-    the place of past commands. Of a sampled loop it is the plant and the actuator; law, observer
-    and sensor change at samples only.
+    Of a continuous loop this is the whole state. Where the input has a delay, the integral of the
+    command over the step takes the place of the past commands. Of a sampled loop it is the plant
+    and the actuator; law, observer and sensor change at samples only.
     """
     if has_delay(state):
         return state._replace(delayed=jnp.zeros_like(state.q))
@@ -262,7 +263,7 @@ def evaluate(
     q, dq, higher, observer = state.q, state.dq, state.higher, scenario.observer
     controller_rate: Any = ()
     observer_rate: Any = ()
-    sent: Any = ()
+    undelayed: Any = ()
     if scenario.sampling is None:
         f_hat = observer_estimate(scenario, observer, t, q, dq, higher, state.observer)
         law: Any = scenario.controller
@@ -277,7 +278,7 @@ def evaluate(
         )
         signals = law_signals(answer, f_hat, estimated)
         if has_delay(state):
-            sent = command
+            undelayed = command
         if torque is not None:
             command = torque
     else:
@@ -291,7 +292,13 @@ def evaluate(
         )
         observer_rate = observer.derivative(*arguments)
     rate = LoopState(
-        moved.dq, moved.ddq, controller_rate, observer_rate, delivered.rate, (), moved.higher, sent
+        q=moved.dq,
+        dq=moved.ddq,
+        controller=controller_rate,
+        observer=observer_rate,
+        actuator=delivered.rate,
+        higher=moved.higher,
+        delayed=undelayed,
     )
     sample = sample_at(
         scenario, t, dt, q, dq, moved, delivered.tau, delivered.limited, signals, higher
