@@ -457,6 +457,8 @@ def _trigger_lines(run: Rollout) -> tuple[Line, ...]:
     inner = unwrapped(law)
     if is_about_levels(scenario) or law is not inner or optional_member(inner, "includes_e2"):
         return ()
+    if not isinstance(scenario.actuator, actuators.Ideal) or sampling.queue > 0:
+        return ()  # the torque of the run is not the command that the trigger holds
     threshold = np.asarray(trigger.relative) * np.abs(run.tau) + np.asarray(trigger.absolute)
     added = np.sum(np.abs(run.e2) * threshold, axis=1)
     at = int(np.argmax(added))

@@ -240,3 +240,11 @@ def test_a_certificate_states_what_held_commands_may_add():
     line = ij.certify(TRIGGERED, run)["event trigger"]
     threshold = 0.1 * np.abs(run.tau) + np.array([0.3, 0.1])
     np.testing.assert_allclose(line.value, np.max(np.sum(np.abs(run.e2) * threshold, axis=1)))
+
+
+@pytest.mark.release
+def test_a_certificate_says_nothing_of_held_commands_behind_a_lag():
+    motor = ij.actuators.Motor(bandwidth=500.0)
+    scenario = ij.with_parts(TRIGGERED, actuator=motor)
+    certificate = ij.certify(scenario, duration=0.1, dt=1e-3)
+    assert not any(line.name == "event trigger" for line in certificate.lines)
