@@ -142,8 +142,8 @@ def member_of(part: Any, step: str | int) -> Any:
     """The non-static field or the entry of a part.  An error if there is none: JAX would take the
     nearest entry.
     """
-    if modules.is_module(part) and not isinstance(part, tuple | list):
-        return modules.entries(part)[step]
+    if modules.is_module(part):
+        return modules.entry(part, step)
     if isinstance(step, str):
         if step not in [f.name for f in dataclasses.fields(part) if not f.metadata.get("static")]:
             raise AttributeError(step)
