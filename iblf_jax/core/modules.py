@@ -15,6 +15,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import numbers
+import re
 from typing import Any, NamedTuple
 
 import jax
@@ -333,4 +334,4 @@ def name_of(value: Any) -> str:
     """A function or another entry of a structure in words that do not depend on the process."""
     if callable(value) and has_members(value, "__qualname__", "__module__"):
         return f"{value.__module__}:{value.__qualname__}"
-    return repr(value)
+    return re.sub(r" at 0x[0-9a-f]+", "", repr(value))

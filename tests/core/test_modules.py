@@ -230,6 +230,10 @@ def test_stores_describe_modules_without_addresses(scenario):
         assert "0x" not in text and "tanh" in text
         assert text == str(describe(Learned(mlp())))
     assert "relu" in str(structure(Learned(mlp(activation=jax.nn.relu))))
+    partial = functools.partial(jax.nn.leaky_relu, negative_slope=0.3)
+    for describe in (describe_component, structure):
+        text = str(describe(Learned(mlp(activation=partial))))
+        assert "0x" not in text and "leaky_relu" in text and "0.3" in text
 
 
 def test_tables_show_a_large_module_as_one_row(paper):
