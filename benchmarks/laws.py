@@ -44,15 +44,18 @@ from _timing import report
 import iblf_jax as ij
 from iblf_jax import barriers, bounds, controllers, decays, observers, sensors
 
-DT, DURATION = 1e-3, 4.0
-"""s, s."""
+DT = 1e-3
+"""s."""
+DURATION = 4.0
+"""s."""
 DELAYS = (1e-3, 2e-3, 4e-3, 8e-3, 16e-3, 32e-3)
 """s."""
-K2, COUNTS = 2.0, 65536
-"""N m s/rad, a tenth of the paper's, so that a period of 10 ms is possible; counts of the encoder,
-as of a geared joint.  `settings` has the errors with others."""
+K2 = 2.0
+"""N m s/rad, a tenth of the paper's, so that a period of 10 ms is possible."""
+COUNTS = 65536
+"""Of the encoder, as of a geared joint.  `settings` has the errors with other K2 and counts."""
 PERIOD = 1e-2
-"""s, the longer one."""
+"""s, the longer period; the shorter one is `DT`."""
 ENCODER = sensors.Encoder(counts=COUNTS, velocity=sensors.FilteredDifference(cutoff=200.0))
 TRIGGER = ij.EventTrigger(relative=0.05, absolute=0.02)
 LEFT, OWN = "left", "own"
@@ -147,10 +150,10 @@ def row(name: str, duration: float = DURATION) -> list[Any]:
     if name in compared.equal_effort:
         factor = float(compared.factors[name])
     one = run.scenario
-    masses = []
+    errors_of_masses = []
     for scale in (0.7, 1.3):
-        heavier = ij.with_parts(one, plant=_heavier(one.plant, scale))
-        masses.append(_run(heavier, duration))
+        changed = ij.with_parts(one, plant=_with_masses_scaled(one.plant, scale))
+        errors_of_masses.append(_error(_run(changed, duration)))
     # One structure, and therefore one compiled program, for all periods and delays.
     queue = round(DELAYS[-1] / DT) + 1
     fast = ij.with_parts(one, sensor=ENCODER, sampling=ij.Sampling(period=DT, queue=queue))
@@ -160,7 +163,7 @@ def row(name: str, duration: float = DURATION) -> list[Any]:
         factor,
         _error(run),
         float(np.max(np.abs(run.tau))),
-        _worst([_error(changed) for changed in masses]),
+        _worst(errors_of_masses),
         _error(_run(slow, duration)),
         _ripple(run, _run(fast, duration)),
         _longest_delay(fast, duration),
@@ -204,7 +207,7 @@ def messages(duration: float = DURATION) -> list[dict[str, Any]]:
     return rows
 
 
-def _heavier(robot: Any, factor: float) -> Any:
+def _with_masses_scaled(robot: Any, factor: float) -> Any:
     """A robot with all its masses and inertias times a factor."""
     values = {"mass": robot.mass * factor, "inertia": robot.inertia * factor}
     fields = {name: vars(robot)[name] for name in ("length", "centre")}
@@ -243,7 +246,7 @@ def _ripple(ideal: ij.Rollout, noisy: ij.Rollout) -> Any:
 
 
 def _longest_delay(sampled: ij.Scenario, duration: float) -> float:
-    """The longest delay [ms] up to which the arm stays inside its bounds; 0 for none."""
+    """The longest of `DELAYS` [ms] up to which the arm stays inside its bounds; 0 for none."""
     longest = 0.0
     for delay in DELAYS:
         delayed = ij.with_parameters(sampled, {"sampling.delay": delay})

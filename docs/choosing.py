@@ -1,7 +1,7 @@
 """The page "Choosing a law": the table of `benchmarks/results/laws.json`, and what its numbers say.
 
 `python benchmarks/laws.py --json benchmarks/results/laws.json` measures the table again.  A law
-that is added to `CHOICES` there gets an entry in `WORDS` here.
+that is added to `CHOICES` there gets an entry in `ADVICE` here.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ class Advice(NamedTuple):
     worse: str
 
 
-WORDS = {
+ADVICE = {
     "Backstepping(Integral)": Advice(
         "the certificate of the paper's theorem counts, or the loop is slow: it stays inside the"
         " bounds at 10 ms, where `Backstepping` with the other barriers does not at this effort",
@@ -58,11 +58,11 @@ WORDS = {
     "AdaptiveParameters(masses)": Advice(
         "masses are unknown and constant, and other disturbances are small",
         "there are other disturbances, as here: it uses no observer, its error is ten times that"
-        " of the paper's law, and wrong masses raise it by a larger factor",
+        " of `Backstepping(Integral)`, and wrong masses raise it by a larger factor",
     ),
     "AdaptiveRBF": Advice(
-        "there is no model; wrong masses raise its error by a smaller factor than that of the"
-        " paper's law",
+        "there is no model; wrong masses raise its error by a smaller factor than that of"
+        " `Backstepping(Integral)`",
         "there is a model, or the peak torque counts: it has the largest one of the table",
     ),
     "AdaptiveRBF, normalised": Advice(
@@ -75,15 +75,15 @@ WORDS = {
     "BarrierBackstepping(Mapping)": Advice(
         "the plant has more than two levels, or several levels have bounds; it has the least error"
         " of the laws that keep bounds",
-        "the sensor is noisy: its ripple is twice that of the paper's law",
+        "the sensor is noisy: its ripple is more than twice that of `Backstepping(Integral)`",
     ),
     "FullState": Advice(
         "positions and velocities have bounds",
-        "the masses are uncertain: their error raises that of the law six times",
+        "the masses are uncertain: with masses that are 30 % wrong its error is six times as large",
     ),
     "DynamicSurface": Advice(
-        "derivatives of the virtual control are too expensive; its row is close to that of the law"
-        " with exact derivatives",
+        "derivatives of the virtual control are too expensive; its row is close to that of"
+        " `Backstepping(Integral)`, which has exact derivatives",
         "a claim of asymptotic stability is needed: its filter leaves ultimate boundedness",
     ),
     "SurfaceBarrier": Advice(
@@ -95,9 +95,9 @@ WORDS = {
         "the loop is slow: at 10 ms it keeps the bounds, but with a large error",
     ),
     "ReferenceGovernor": Advice(
-        "a law of the robot's controller cannot be changed, only its reference",
-        "the reference must be followed closely: the governor moves it, and the error is a hundred"
-        " times that of the paper's law",
+        "the law of the robot's controller cannot be changed, only its reference",
+        "the reference must be followed closely: the governor moves it, and the error is more than"
+        " a hundred times that of `Backstepping(Integral)`",
     ),
     "TerminalSlidingMode": Advice(
         "accuracy counts and no bound has to be guaranteed; it has the least errors of the table",
@@ -105,8 +105,8 @@ WORDS = {
     ),
     "ComputedTorque": Advice(
         "the model is good and there are no bounds",
-        "disturbances act: with 6.7 times its gains, its error is four times that of the paper's"
-        " law",
+        "disturbances act: with 6.7 times its gains, its error is more than four times that of"
+        " `Backstepping(Integral)`",
     ),
     "PDGravity": Advice(
         "only the gravity of the model is known", "the masses are uncertain or the loop is slow"
@@ -133,19 +133,20 @@ def write(folder: Path) -> None:
 def page(result: dict[str, Any]) -> str:
     """The page of a result of `benchmarks/laws.py`."""
     rows = result["rows"]
-    advice = [
-        {"law": name, "the better choice where": WORDS[name].better, "not where": WORDS[name].worse}
-        for name in (row["law"] for row in rows)
-    ]
+    advice = []
+    for name in (row["law"] for row in rows):
+        better, worse = ADVICE[name]
+        advice.append({"law": name, "the better choice where": better, "not where": worse})
     return "\n".join(
         [
             "# Choosing a law",
             "",
-            "The gains of every law are scaled to the same effort, the RMS torque above gravity of"
-            " the first law, on the paper's arm with K2 = 2 N m s/rad. A law that reaches this"
-            " effort with no factor runs at its own gains ('own'); compare its torques as well as"
-            " its errors. Errors are the largest ones in the second half of a run. 'left' is a run"
-            " that leaves the bounds. The program that measures the table describes every column:"
+            "The gains of every law are scaled by one factor to the same effort, the RMS torque"
+            " above gravity of the first law, on the paper's arm with K2 = 2 N m s/rad. A law that"
+            " reaches this effort with no factor runs at its own gains ('own'); compare its torques"
+            " as well as its errors. Errors are the largest ones in the second half of a run."
+            " 'left' is a run that leaves the bounds or diverges. The program that measures the"
+            " table describes every column:"
             f" `{result['command']}`.",
             "",
             table(rows),
@@ -194,7 +195,7 @@ def saving(rows: list[dict[str, Any]]) -> str:
 
 
 def best_of_each_column(rows: list[dict[str, Any]]) -> list[str]:
-    """A sentence for each column, from its numbers."""
+    """The best, the worst and the failed laws of each column; names of laws may have commas."""
     lines = []
     for column in LOWER_IS_BETTER:
         known = [row for row in rows if isinstance(row[column], float)]
@@ -205,13 +206,13 @@ def best_of_each_column(rows: list[dict[str, Any]]) -> list[str]:
         )
         left = [row["law"] for row in rows if row[column] == "left"]
         if left:
-            text += f"; {', '.join(left)} left the bounds"
+            text += f". Outside the bounds: {'; '.join(left)}"
         lines.append(text + ".")
     longest = max(row[LONGEST] for row in rows)
     names = [row["law"] for row in rows if row[LONGEST] == longest]
     none = [row["law"] for row in rows if row[LONGEST] == 0.0]
-    text = f"- **{LONGEST}**: {', '.join(names)} stayed inside the bounds up to {longest:g} ms"
+    text = f"- **{LONGEST}**: inside the bounds up to {longest:g} ms: {'; '.join(names)}"
     if none:
-        text += f"; {', '.join(none)} with none of the tested delays"
+        text += f". With none of the tested delays: {'; '.join(none)}"
     lines.append(text + ".")
     return lines

@@ -57,12 +57,13 @@ runs = {case: {name: simulated(name, changes) for name in laws} for case, change
 # the load causes. With a disturbance that no parameter explains, the estimate follows it, and the
 # observer leaves the smallest error.
 figure, axes = plt.subplots(1, 3, figsize=(12, 3.6), layout="constrained")
-for axis, case in zip(axes, ("load", "load and disturbance"), strict=False):
+for axis, case in zip(axes[:2], ("load", "load and disturbance"), strict=True):
     for name, run in runs[case].items():
         axis.semilogy(run.t, np.linalg.norm(run.e1, axis=1), label=name, linewidth=1.0)
     axis.set(title=case, xlabel="t [s]", ylabel="|e1| [rad]", ylim=(1e-7, 1.0))
 axes[1].legend(fontsize=7, loc="lower left")
-for case, run in ((case, runs[case]["adaptive payload"]) for case in cases):
+for case in cases:
+    run = runs[case]["adaptive payload"]
     axes[2].plot(run.t, run.controller_state.theta[:, 0], label=case, linewidth=1.0)
 axes[2].axhline(0.5, color="black", linewidth=0.6, linestyle="--")
 axes[2].set(title="estimate of the payload", xlabel="t [s]", ylabel="theta_hat [kg]")
@@ -76,5 +77,6 @@ estimates = plotting.adaptation(runs["load"]["adaptive payload"])
 # approximators need no model. The leak that bounds their weights leaves an error.
 print(f"{'':20s}" + "".join(f"{case:>24s}" for case in cases))
 for name in laws:
-    errors = [np.sqrt(np.mean(np.sum(runs[case][name].e1[-600:] ** 2, axis=1))) for case in cases]
+    late = [runs[case][name].e1[-600:] for case in cases]
+    errors = [np.sqrt(np.mean(np.sum(e1**2, axis=1))) for e1 in late]
     print(f"{name:20s}" + "".join(f"{error:24.2e}" for error in errors))

@@ -79,9 +79,10 @@ learned = ij.with_parameters(start, as_weights(jnp.asarray(found.x)))
 before = float(loss(numbers)[0])
 print(f"mean square error: {before:.3f} -> {found.fun:.3f} (1e-6 rad^2)")
 
-# %% The network is the better choice as long as the friction is about the one of the training; it
-# reacts without delay, and the observer only has to estimate the rest. Where the friction has
-# vanished, the network compensates a torque that is not there, and the observer alone is better.
+# %% The network is the better choice where the friction is that of the training or larger: it
+# reacts without delay, and the observer only has to estimate the rest. Where half of the friction
+# or less is left, the network compensates a torque that is not there, and the observer alone is
+# better.
 # A wider range of conditions needs a wider range of training runs.
 FACTORS = (0.0, 0.25, 0.5, 1.0, 1.5, 2.0)
 rmse: dict[str, list[float]] = {"observer alone": [], "with the network": []}

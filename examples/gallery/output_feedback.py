@@ -1,8 +1,8 @@
 """Output feedback: the velocity from an observer, its bandwidth against noise and peaking.
 
-A positioning law that measures angles alone needs an estimate of the velocity. A larger bandwidth
-makes the loop more like the one that measures the velocity, until the noise of the encoder becomes
-torque.
+A law whose sensors measure positions only needs an estimate of the velocity. A larger bandwidth of
+the observer reduces the tracking error, because the observer also estimates the disturbance, and
+turns more of the noise of the position sensor into torque.
 """
 
 import numpy as np
@@ -57,20 +57,21 @@ for axes, metric, words in (
 accuracy.legend()
 
 # %% Peaking: the error of the estimated velocity at the start becomes a peak of the estimated
-# uncertain term, which grows with the bandwidth. A limit on what the law receives removes it.
+# uncertain term, which grows with the bandwidth. A limit on the estimate that the law receives cuts
+# the peak off and halves the peak torque.
 unlimited = ij.simulate(observed(0.0, 200.0, offset=START), duration=1.0, dt=1e-3)
 limited = ij.simulate(
     observed(0.0, 200.0, offset=START, disturbance_limit=15.0), duration=1.0, dt=1e-3
 )
 peaking = Figure(figsize=(9.0, 3.4), layout="constrained")
-torque, velocity = peaking.subplots(1, 2)
+torque, estimate = peaking.subplots(1, 2)
 for name, run in {"unlimited": unlimited, "limited to 15 rad/s²": limited}.items():
     start = run.t < 0.15
     torque.plot(run.t[start], run.tau[start, 0], label=name)
-    velocity.plot(run.t[start], run.x_hat[start, 1, 0] - run.dq[start, 0], label=name)
+    estimate.plot(run.t[start], run.disturbance_estimate[start, 0], label=name)
 torque.set_ylabel("torque of joint 1 [N m]")
-velocity.set_ylabel("error of the velocity in the law [rad/s]")
-for axes in (torque, velocity):
+estimate.set_ylabel("estimate of f that the law receives [N m]")
+for axes in (torque, estimate):
     axes.set_xlabel("time [s]")
 torque.legend()
 print("peak torque [N m]:", unlimited.metrics.peak_torque, limited.metrics.peak_torque)

@@ -16,7 +16,10 @@ paper = ij.with_parts(
 
 
 def scenario(name, size, **parts):
-    """The arm with one decay in both steps of its law, of which one gain is scaled by `size`."""
+    """The arm with one decay in both steps of its law.
+
+    `size` scales the gains of the decay; the exponential one has none, and k1 is scaled.
+    """
     k1 = size if name == "exponential" else 0.5
     decay = {
         "exponential": decays.Exponential(),
@@ -37,7 +40,7 @@ def simulate(name, size):
 
 
 def size_for(name, effort):
-    """The scale of a decay for which a run has this effort above gravity, by bisection."""
+    """The scale of a decay for which a run has this effort above gravity [N m], by bisection."""
     low, high = 0.05, 30.0
     for _ in range(12):
         middle = np.sqrt(low * high)
@@ -49,7 +52,7 @@ def size_for(name, effort):
 
 
 def torque_noise(name, size):
-    """Standard deviation of the torques that the noise of an encoder causes in the last second."""
+    """Standard deviation of the torques that encoder noise causes in the last second [N m]."""
     sensor = ij.sensors.Encoder(noise=1e-5, velocity=ij.sensors.FilteredDifference(cutoff=300.0))
     quiet = ij.with_parameters(
         scenario(name, size, sampling=ij.Sampling(1e-3), sensor=sensor), {"sensor.noise": 0.0}
@@ -60,7 +63,7 @@ def torque_noise(name, size):
 
 
 def time_inside(run, tolerance):
-    """The time from which on the largest |e1| is at most a tolerance."""
+    """The time [s] from which on the largest |e1| is at most a tolerance [rad]."""
     outside = np.flatnonzero(np.max(np.abs(np.asarray(run.e1)), axis=1) > tolerance)
     if outside[-1] + 1 == run.t.size:
         return np.inf
@@ -73,7 +76,7 @@ def above_gravity(run):
 
 
 def peak_above_gravity(run):
-    """The largest torque of a joint beyond gravity."""
+    """The largest torque of a joint beyond gravity [N m]."""
     return float(np.max(np.abs(above_gravity(run))))
 
 
@@ -82,7 +85,7 @@ effort = simulate("exponential", 3.0).metrics.effort_above_gravity
 sizes = {name: size_for(name, effort) for name in names}
 runs = {name: simulate(name, size) for name, size in sizes.items()}
 
-figure, (errors, torques) = plt.subplots(2, 1, figsize=(7, 6), sharex=True)
+figure, (errors, torques) = plt.subplots(2, 1, figsize=(7, 6), sharex=True, layout="constrained")
 for name, run in runs.items():
     errors.semilogy(run.t, np.max(np.abs(np.asarray(run.e1)), axis=1) + 1e-12, label=name)
     torques.plot(run.t, np.max(np.abs(above_gravity(run)), axis=1), label=name)

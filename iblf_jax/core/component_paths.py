@@ -30,25 +30,29 @@ _TOKEN = re.compile(
 
 def parse(path: str) -> list[str | int]:
     """The tokens of a path: names, indices and names of rows.  ValueError if it is not a path."""
+    expected = 'names joined by dots, with [i] for an entry, such as "plant.mass[1]"'
+    if not isinstance(path, str) or not path:
+        raise checks.fail("path", path, expected)
     tokens: list[str | int] = []
     position = 0
-    while isinstance(path, str) and position < len(path):
+    while position < len(path):
+        # A path begins with a name; a dot or a bracket begins every later token.
+        is_separated = path[position] in ".["
         match = _TOKEN.match(path, position)
-        if match is None or (position == 0) == path[position].startswith((".", "[")):
-            break
-        token = _token(match)
-        if token is None:
-            break
+        token = None
+        if is_separated == (position > 0):
+            token = _token(match)
+        if match is None or token is None:
+            raise checks.fail("path", path, expected)
         tokens.append(token)
         position = match.end()
-    if not isinstance(path, str) or not path or position < len(path):
-        expected = 'names joined by dots, with [i] for an entry, such as "plant.mass[1]"'
-        raise checks.fail("path", path, expected)
     return tokens
 
 
-def _token(match: re.Match) -> str | int | None:
-    """The token that `_TOKEN` matched; None for an invalid JSON string."""
+def _token(match: re.Match | None) -> str | int | None:
+    """The token that `_TOKEN` matched; None without a match, and for an invalid JSON string."""
+    if match is None:
+        return None
     field, index, quoted, bare = match.groups()
     if field is not None:
         return field
@@ -142,8 +146,8 @@ def member_of(part: Any, step: str | int) -> Any:
     """The non-static field or the entry of a part.  An error if there is none: JAX would take the
     nearest entry.
     """
-    if modules.is_module(part) and not isinstance(part, tuple | list):
-        return modules.entries(part)[step]
+    if modules.is_module(part):
+        return modules.entry(part, step)
     if isinstance(step, str):
         if step not in [f.name for f in dataclasses.fields(part) if not f.metadata.get("static")]:
             raise AttributeError(step)

@@ -15,6 +15,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import numbers
+import re
 from typing import Any, NamedTuple
 
 import jax
@@ -110,11 +111,28 @@ def entries(part: Any) -> dict[str | int, Any]:
     return {_token(path[0]): value for path, value in _one_level(part)[0] if _is_named(path)}
 
 
+def entry(part: Any, token: str | int) -> Any:
+    """The entry of a module at a token of a path.
+
+    Raises:
+      KeyError: there is none.
+    """
+    return entries(part)[_from_the_start(part, token)]
+
+
 def with_entry(part: Any, token: str | int, value: Any) -> Any:
-    """A copy of a module with one entry replaced."""
+    """A copy of a module with one entry, which it must have, replaced."""
     pairs, structure = _one_level(part)
-    values = [value if _token(path[0]) == token else old for path, old in pairs]
-    return jax.tree.unflatten(structure, values)
+    values = {_token(path[0]): old for path, old in pairs}
+    values[_from_the_start(part, token)] = value
+    return jax.tree.unflatten(structure, values.values())
+
+
+def _from_the_start(part: Any, token: str | int) -> str | int:
+    """The token, with a negative index of a list or tuple counted from its start."""
+    if isinstance(part, tuple | list) and isinstance(token, int) and token < 0:
+        return token + len(part)
+    return token
 
 
 def _one_level(part: Any) -> Any:
@@ -316,4 +334,4 @@ def name_of(value: Any) -> str:
     """A function or another entry of a structure in words that do not depend on the process."""
     if callable(value) and has_members(value, "__qualname__", "__module__"):
         return f"{value.__module__}:{value.__qualname__}"
-    return repr(value)
+    return re.sub(r" at 0x[0-9a-f]+", "", repr(value))

@@ -20,7 +20,7 @@ import numpy as np
 from iblf_jax.control import actuators, barriers, controllers, decays, observers, sensors
 from iblf_jax.core import checks, modules
 from iblf_jax.core.pytree import field_values, is_leaf_field
-from iblf_jax.files.modules import ReadModule, encode_module
+from iblf_jax.files.modules import ReadPart, encode_module
 from iblf_jax.files.values import (
     NONE,
     Words,
@@ -180,8 +180,8 @@ def decode(value: Any, hint: Any, path: str) -> Any:
     Raises:
       ValueError: a value that does not fit; the message names the dotted key.
     """
-    if isinstance(value, ReadModule):
-        return value.module
+    if isinstance(value, ReadPart):
+        return value.part
     family = hint
     hint, is_optional = without_none(hint)
     if is_optional and value == NONE:

@@ -17,6 +17,7 @@ Every error is a ValueError that names the dotted key.
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -30,11 +31,14 @@ ARGUMENTS = ("window", "torque", "delay", "loss", "widths", "iterations")
 """Keys of [identify] besides `log`, `parameters` and `held_out`."""
 
 
-def load_identification_file(path: str | os.PathLike) -> dict[str, Any]:
+def load_identification_file(
+    path: str | os.PathLike, *, modules: Mapping[str, Any] | None = None
+) -> dict[str, Any]:
     """The arguments of `identify` in an identification file, including the scenario.
 
     Args:
       path: a file in the format that the docstring of this module describes.
+      modules: modules that the file cannot describe, as `load_scenario` takes them.
 
     Raises:
       ValueError: the file is not TOML or does not describe an identification; the message names
@@ -42,7 +46,7 @@ def load_identification_file(path: str | os.PathLike) -> dict[str, Any]:
       OSError: the file cannot be read.
     """
     data, source, folder = read_toml(path), os.fspath(path), Path(path).parent
-    file = from_dict(data, source=source, other_tables=TABLES, folder=folder)
+    file = from_dict(data, source, other_tables=TABLES, folder=folder, modules=modules)
     try:
         table = as_table(data.get("identify", {}), "identify")
         known_keys(table, "identify", ("log", "parameters", "held_out", *ARGUMENTS))
@@ -80,10 +84,17 @@ def _logs(given: Any, key: str, folder: Path) -> list[Path]:
     return found
 
 
-def identify_file(path: str | os.PathLike, **options: Any) -> Identification:
+def identify_file(
+    path: str | os.PathLike, *, modules: Mapping[str, Any] | None = None, **options: Any
+) -> Identification:
     """Runs `identify` on an identification file; options replace the file's.
+
+    Args:
+      path: an identification file.
+      modules: modules that the file cannot describe, as `load_scenario` takes them.
+      options: arguments of `identify`.
 
     Raises:
       ValueError, OSError: as `load_identification_file` and `identify`.
     """
-    return identify(**{**load_identification_file(path), **options})
+    return identify(**{**load_identification_file(path, modules=modules), **options})

@@ -9,9 +9,10 @@
 
 Containers of Python are rebuilt from the description.  Classes and functions are stored by their
 import paths, and rebuilt where these lead to the same objects: dataclasses that JAX knows, such as
-the modules of Equinox.  For other classes, such as those of Flax NNX, the caller of `load_scenario`
-passes a module of the same structure.  Nothing is unpickled, and no package is imported that the
-program has not imported itself, except for jax, equinox and flax.
+the modules of Equinox.  A module with another class, such as those of Flax NNX, or with a function
+without an import path has `structure = '{"opaque": CLASS}'`: the caller of `load_scenario` passes a
+module of the same structure.  Nothing is unpickled, and no package is imported that the program has
+not imported itself, except for jax, equinox and flax.
 """
 
 from __future__ import annotations
@@ -48,10 +49,10 @@ PUBLIC = ("jax.nn", "jax.numpy", "jax.lax")
 
 
 @dataclasses.dataclass(frozen=True)
-class ReadModule:
-    """A module that was read from its table, in place of the table."""
+class ReadPart:
+    """A part that was read from its table, in place of the table."""
 
-    module: Any
+    part: Any
 
 
 class _NoImportPathError(ValueError):
@@ -199,7 +200,7 @@ def with_weights_in_file(tables: dict[str, Any], path: Path) -> bytes | None:
 def with_modules_read(
     tables: dict[str, Any], folder: str | os.PathLike, given: Mapping[str, Any] | None
 ) -> dict[str, Any]:
-    """The tables with a `ReadModule` in place of the table of every module.
+    """The tables with a `ReadPart` in place of the table of every module.
 
     Args:
       tables: the tables of a scenario.
@@ -207,14 +208,16 @@ def with_modules_read(
       given: dotted key -> a module of the same structure, whose arrays are replaced.
 
     Raises:
-      ValueError: a description that cannot be rebuilt, or weights that do not belong to it.
+      ValueError: a description that cannot be rebuilt, weights that do not belong to it, or a key
+        of `given` at which the tables have no module.
     """
     given = checks.mapping("modules", given or {}, '{"controller.net": net}')
     known = [path for path, _ in tables_of_modules(tables)]
     for path in given:
         if path not in known:
             expected = "the dotted key of a module in the file"
-            raise checks.fail("modules", path, expected, checks.did_you_mean(path, known))
+            remedy = checks.did_you_mean(path, known) or "The file describes no module."
+            raise checks.fail("modules", path, expected, remedy)
 
     def read(value: Any, path: str) -> Any:
         if isinstance(value, list):
@@ -223,7 +226,7 @@ def with_modules_read(
             return value
         if value.get("kind") != MODULE:
             return {key: read(x, dotted(path, key)) for key, x in value.items()}
-        return ReadModule(_module_of(value, path, folder, given.get(path)))
+        return ReadPart(_module_of(value, path, folder, given.get(path)))
 
     if not known:
         return tables
@@ -374,12 +377,14 @@ class _Reader:
 
     def needs_a_module(self, class_name: Any) -> ValueError:
         """The error for a class that a file cannot describe."""
+        came = Words(f"only the arrays of a module of class {class_name}")
+        expected = "the module itself, because a file cannot rebuild its class or its functions"
         remedy = (
-            f'Pass one: ij.load_scenario(path, modules={{"{self.path}": ...}}), whose arrays are'
-            " then replaced by those of the file."
+            "Build a module of the same structure in Python and pass it,"
+            f" modules={{{json.dumps(self.path)}: module}}: its arrays are replaced by those of the"
+            " file."
         )
-        came = Words(f"an object of class {class_name}")
-        return checks.fail(self.path, came, "a module that a file describes completely", remedy)
+        return checks.fail(self.path, came, expected, remedy)
 
 
 SEQUENCES: dict[str, Callable[[Iterable[Any]], Any]] = {"list": list, "tuple": tuple}
@@ -392,7 +397,7 @@ def _imported(path: Any, key: str) -> Any:
     text = checks.string(key, path, "an import path")
     package = text.partition(":")[0]
     top = package.partition(".")[0]
-    remedy = "Import its package first, or pass the module: ij.load_scenario(path, modules=...)."
+    remedy = "Import its package first, or pass the module by `modules=`."
     expected = "the import path of a class or function of an imported package"
     if top in IMPORTABLE:
         try:

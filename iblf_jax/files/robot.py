@@ -23,7 +23,8 @@ from typing import Any
 
 from iblf_jax.control.controllers import Controller, within_effort
 from iblf_jax.core import checks
-from iblf_jax.files.components import construct, decode, encode, encode_fields
+from iblf_jax.files.components import construct, decode, encode_fields
+from iblf_jax.files.modules import ReadPart
 from iblf_jax.files.values import as_table, known_keys, missing, numbers
 from iblf_jax.presets.arms import arm_scenario
 from iblf_jax.world.disturbances import Disturbance
@@ -40,7 +41,7 @@ def names_a_file(tables: dict[str, Any]) -> bool:
 
 
 def with_robots_read(tables: dict[str, Any], folder: str | os.PathLike) -> dict[str, Any]:
-    """The tables of a scenario with the numbers of its robots, and defaults for missing tables.
+    """The tables of a scenario with its robots read, and defaults for missing tables.
 
     Args:
       tables: the tables of the scenario file.
@@ -66,10 +67,10 @@ def with_robots_read(tables: dict[str, Any], folder: str | os.PathLike) -> dict[
     if "controller" in given:
         law = within_effort(decode(given["controller"], Controller, "controller"), plant)
         if as_table(given["controller"], "controller").get("kind") != "saturated":
-            given["controller"] = encode(law, Controller, "controller")
+            given["controller"] = ReadPart(law)
     filled = encode_fields(default, "")
     del filled["plant"], filled["model"]
-    return {name: encode(robot, Robot, name) for name, robot in robots.items()} | filled | given
+    return {name: ReadPart(robot) for name, robot in robots.items()} | filled | given
 
 
 def _robot(table: Any, name: str, folder: str | os.PathLike) -> Robot:

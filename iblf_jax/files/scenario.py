@@ -112,9 +112,10 @@ def load_scenario(path: str | os.PathLike, *, modules: Mapping[str, Any] | None 
 
     Args:
       path: a file in the format that the docstring of this module describes.
-      modules: dotted key of the file -> a module with the structure of the saved one, whose arrays
-        are replaced by those of the file, {"controller.net": net}. Modules of classes that a file
-        cannot describe, such as those of Flax NNX, need it.
+      modules: dotted key of the file -> a module with the structure of the saved one, whose
+        floating-point arrays are replaced by those of the file, {"controller.net": net}. Modules
+        that a file cannot describe, such as those of Flax NNX, need it. Functions and settings are
+        those of the module that is passed; they are not compared with the saved ones.
 
     Raises:
       ValueError: the file is not TOML or does not describe a scenario; the message names file, key
@@ -314,6 +315,7 @@ def from_dict(
         others = set(other_tables)
         data = {key: x for key, x in as_table(data, "file").items() if key not in others}
         if "preset" in data:
+            with_modules_read({}, folder, modules)  # A preset has none: refuses any that is given.
             scenario = _from_preset(data)
         else:
             scenario = _from_components(data, folder, modules)
@@ -338,8 +340,7 @@ def _from_components(
             raise checks.fail(present, came, "only [robot], or [plant] and [model]", remedy)
     tables = with_modules_read(tables, folder, modules)
     if names_a_file(tables):
-        # A law that is limited to the robot's torques is written as tables again.
-        tables = with_modules_read(with_robots_read(tables, folder), folder, {})
+        tables = with_robots_read(tables, folder)
     robot = tables.pop("robot", None)
     if robot is None:
         if "plant" not in tables:

@@ -26,6 +26,7 @@ from __future__ import annotations
 
 import inspect
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -66,12 +67,15 @@ class StudyFile(NamedTuple):
     """duration, dt, method, and the entries of [study] or [sweep]."""
 
 
-def load_study_file(path: str | os.PathLike, kind: str) -> StudyFile:
+def load_study_file(
+    path: str | os.PathLike, kind: str, *, modules: Mapping[str, Any] | None = None
+) -> StudyFile:
     """Reads a study file.
 
     Args:
       path: the file.
       kind: "study" or "sweep", the table that it must have.
+      modules: modules that the file cannot describe, as `load_scenario` takes them.
 
     Raises:
       ValueError: the file is not TOML or does not describe such a study; the message names file,
@@ -80,15 +84,19 @@ def load_study_file(path: str | os.PathLike, kind: str) -> StudyFile:
     """
     checks.one_of("kind", kind, tuple(OPTIONS))
     data = read_toml(path)
-    return study_from_dict(data, kind, os.fspath(path), Path(path).parent)
+    return study_from_dict(data, kind, os.fspath(path), Path(path).parent, modules)
 
 
 def study_from_dict(
-    data: dict[str, Any], kind: str, source: str = "", folder: str | os.PathLike = ""
+    data: dict[str, Any],
+    kind: str,
+    source: str = "",
+    folder: str | os.PathLike = "",
+    modules: Mapping[str, Any] | None = None,
 ) -> StudyFile:
     """As `load_study_file`, from the tables of a file."""
     own = {"study": ("study", "perturbations"), "sweep": ("sweep", "perturbations", "grid")}
-    file = from_dict(data, source, other_tables=own[kind], folder=folder)
+    file = from_dict(data, source, other_tables=own[kind], folder=folder, modules=modules)
     try:
         if "record_every" in file.run:
             came = file.run["record_every"]

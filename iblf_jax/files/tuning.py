@@ -49,6 +49,7 @@ import dataclasses
 import inspect
 import json
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -121,19 +122,22 @@ EARLIER_ARGUMENTS = tuple(name for name in REPLACED if name != "callback")
 """Keys that [tune] had in earlier versions."""
 
 
-def load_tuning_file(path: str | os.PathLike) -> dict[str, Any]:
+def load_tuning_file(
+    path: str | os.PathLike, *, modules: Mapping[str, Any] | None = None
+) -> dict[str, Any]:
     """The arguments of `tune` that a tuning file describes, the scenario among them.
 
     Args:
       path: a file in the format that the docstring of this module describes.
+      modules: modules that the file cannot describe, as `load_scenario` takes them.
 
     Raises:
       ValueError: the file is not TOML or does not describe a tuning; the message names file, key
         and remedy.
       OSError: the file cannot be read.
     """
-    data, source = read_toml(path), os.fspath(path)
-    file = from_dict(data, source=source, other_tables=TABLES, folder=Path(path).parent)
+    data, source, folder = read_toml(path), os.fspath(path), Path(path).parent
+    file = from_dict(data, source, other_tables=TABLES, folder=folder, modules=modules)
     try:
         options = _options(as_table(data.get("tune", {}), "tune"))
         options["objective"] = _objective(data, joint_names(file.scenario.plant, file.scenario.n))
@@ -144,13 +148,20 @@ def load_tuning_file(path: str | os.PathLike) -> dict[str, Any]:
     return {"scenario": file.scenario, "duration": 5.0, **options, **timing}
 
 
-def tune_file(path: str | os.PathLike, **options: Any) -> TuneResult:
+def tune_file(
+    path: str | os.PathLike, *, modules: Mapping[str, Any] | None = None, **options: Any
+) -> TuneResult:
     """Runs `tune` on a tuning file; options replace the file's.
+
+    Args:
+      path: a tuning file.
+      modules: modules that the file cannot describe, as `load_scenario` takes them.
+      options: arguments of `tune`.
 
     Raises:
       ValueError, OSError: as `load_tuning_file` and `tune`.
     """
-    return tune(**{**load_tuning_file(path), **options})
+    return tune(**{**load_tuning_file(path, modules=modules), **options})
 
 
 def _options(table: dict[str, Any]) -> dict[str, Any]:
@@ -370,14 +381,15 @@ def save_tuning(result: TuneResult, path: str | os.PathLike) -> None:
     os.replace(temporary, target)
 
 
-def load_tuning(path: str | os.PathLike) -> TuneResult:
+def load_tuning(path: str | os.PathLike, *, modules: Mapping[str, Any] | None = None) -> TuneResult:
     """A saved result; its `report` is made again, on the same fresh draws.
 
     Args:
       path: a file that `TuneResult.save` wrote.
+      modules: modules that the file cannot describe, as `load_scenario` takes them.
 
     Raises:
-      ValueError: the file is something else.
+      ValueError: the file is something else, or a module that it cannot describe is missing.
       OSError: the file cannot be read.
     """
     place, expected = checks.file_to_read("path", path), "a file that TuneResult.save wrote"
@@ -388,7 +400,7 @@ def load_tuning(path: str | os.PathLike) -> TuneResult:
     except Exception as error:
         raise checks.fail("path", str(place), expected) from error
     try:
-        return _decoded(data)
+        return _decoded(data, modules)
     except Exception as error:  # A missing or wrong entry raises errors of many kinds.
         found = f"{type(error).__name__}: {error}"
         raise checks.fail("path", str(place), expected, found) from error
@@ -459,9 +471,9 @@ def _tuned_objective(data: dict[str, Any], history: dict[str, np.ndarray]) -> fl
     return float(np.min(np.where(is_best, history["objective"], np.inf)))
 
 
-def _decoded(data: dict[str, Any]) -> TuneResult:
+def _decoded(data: dict[str, Any], modules: Mapping[str, Any] | None) -> TuneResult:
     """The result that `save_tuning` encoded."""
-    start = from_dict(data["start"]).scenario
+    start = from_dict(data["start"], modules=modules).scenario
     values = {key: np.asarray(numbers(x, key)) for key, x in data["values"].items()}
     setup = _decoded_setup(data)
     targets_of(start, setup.perturbations)

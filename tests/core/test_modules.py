@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import pickle
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import SHORT
-from module_cases import Learned, NetworkObserver
+from module_cases import Learned, NetworkLaw, NetworkObserver
 
 import iblf_jax as ij
 from iblf_jax.core import modules
@@ -36,23 +36,6 @@ class Plain:
 
     def jump_times(self):
         return jnp.zeros(0)
-
-
-@ij.component
-class NetworkLaw:
-    """tau = G0 + K (q_d - q) - D q' + net(q')."""
-
-    K: ij.Leaf = ij.leaf("N m/rad", sign="positive")
-    D: ij.Leaf = ij.leaf("N m s/rad", sign="positive")
-    net: Any
-
-    def init(self, q, dq, context):
-        return ()
-
-    def command(self, t, q, dq, f_hat, context, state):
-        tube, no = context.tube(t), jnp.zeros(q.shape, bool)
-        tau = context.model.gravity(q) + self.K * (tube.q_d - q) - self.D * dq + self.net(dq)
-        return ij.controllers.Command(tau, tube.dq_d, 0.0 * q, no, no), ()
 
 
 @jax.tree_util.register_dataclass
@@ -119,6 +102,29 @@ def test_a_path_changes_one_number_and_keeps_the_structure(scenario):
     new = ij.with_parameters(plain, {"disturbance.net[layers][0][1][3]": 7.0})
     assert new.disturbance.net["layers"][0][1][3] == 7.0
     assert isinstance(new.disturbance.net["layers"], list)
+
+
+class Weights(NamedTuple):
+    """A module whose entries have names."""
+
+    w: Any
+    b: Any
+
+
+def test_a_negative_index_and_a_name_of_a_tuple_lead_to_an_entry(paper):
+    module = [np.ones(2), [np.ones(3)], Weights(np.ones(2), np.ones(1))]
+    scenario = ij.with_parts(paper, disturbance=Learned(module))
+    assert paths_below(scenario.disturbance)[-2:] == ["net[2].w", "net[2].b"]
+    for path, found in {
+        "net[-3][-1]": lambda net: net[0][1],
+        "net[-2][-1]": lambda net: net[1][0][0],
+        "net[-1].w": lambda net: net[2].w[0],
+    }.items():
+        changed = ij.with_parameters(scenario, {f"disturbance.{path}": 7.0})
+        assert found(changed.disturbance.net) == 7.0
+    for wrong in ("net[-4]", "net[3]", "net[2][0]", "net[2].c"):
+        with pytest.raises(ValueError, match="the path of a leaf"):
+            ij.with_parameters(scenario, {f"disturbance.{wrong}": 1.0})
 
 
 def test_programs_are_found_by_structure(scenario):
@@ -224,6 +230,10 @@ def test_stores_describe_modules_without_addresses(scenario):
         assert "0x" not in text and "tanh" in text
         assert text == str(describe(Learned(mlp())))
     assert "relu" in str(structure(Learned(mlp(activation=jax.nn.relu))))
+    partial = functools.partial(jax.nn.leaky_relu, negative_slope=0.3)
+    for describe in (describe_component, structure):
+        text = str(describe(Learned(mlp(activation=partial))))
+        assert "0x" not in text and "leaky_relu" in text and "0.3" in text
 
 
 def test_tables_show_a_large_module_as_one_row(paper):
@@ -305,6 +315,7 @@ def test_flax_modules_are_fields(paper):
     changed = ij.with_parameters(scenario, {path: [1.0, -1.0]})
     assert jax.tree.structure(changed) == jax.tree.structure(scenario)
     x = jnp.arange(4.0)
-    torque = jax.jit(lambda s: s.disturbance.torque(0.0, x[:2], x[2:], s.plant, s.model))(changed)
+    double = ij.astype(changed, "float64")
+    torque = jax.jit(lambda s: s.disturbance.torque(0.0, x[:2], x[2:], s.plant, s.model))(double)
     expected = np.asarray(net(x.astype("float32"))) + np.array([1.0, -1.0])
     assert np.allclose(torque, expected, atol=1e-6)

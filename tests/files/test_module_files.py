@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
+from pathlib import Path
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from module_cases import Learned, NetworkObserver
+from module_cases import Learned, NetworkLaw, NetworkObserver
 
 import iblf_jax as ij
+from iblf_jax.files.identification import load_identification_file
 from iblf_jax.files.scenario import scenario_to_dict, scenario_to_toml
+from iblf_jax.files.study import load_study_file
+from iblf_jax.files.tuning import load_tuning_file
 
 
 @jax.tree_util.register_pytree_with_keys_class
@@ -91,7 +96,8 @@ def test_the_weights_of_another_scenario_are_refused(tmp_path):
 def test_a_module_that_a_file_cannot_describe_is_passed(tmp_path):
     scenario = with_net(Opaque(0.1 * jnp.arange(8.0).reshape(2, 4)))
     ij.save_scenario(scenario, tmp_path / "a.toml")
-    with pytest.raises(ValueError, match=r'modules=\{"disturbance.net"'):
+    message = r'Opaque, expected the module itself.*modules=\{"disturbance.net": module\}'
+    with pytest.raises(ValueError, match=message):
         ij.load_scenario(tmp_path / "a.toml")
     given = {"disturbance.net": Opaque(jnp.zeros((2, 4)))}
     assert same(ij.load_scenario(tmp_path / "a.toml", modules=given), scenario)
@@ -107,11 +113,83 @@ def test_a_module_that_a_file_cannot_describe_is_passed(tmp_path):
     assert same(ij.load_scenario(tmp_path / "b.toml", modules=given), scenario)
 
 
+def test_modules_for_a_file_without_any_are_refused(tmp_path):
+    (tmp_path / "a.toml").write_text('preset = "zhang_yan_2024"\n')
+    with pytest.raises(ValueError, match=r"modules: .*The file describes no module"):
+        ij.load_scenario(tmp_path / "a.toml", modules={"disturbance.net": mlp()})
+
+
+RUN = "[run]\nduration = 0.1\ndt = 1e-3\n"
+FILES = {
+    "study": ("[study]\nruns = 2\n", lambda path, **given: load_study_file(path, "study", **given)),
+    "sweep": ("[sweep]\n[grid]\n", lambda path, **given: load_study_file(path, "sweep", **given)),
+    "tuning": (
+        '[tune]\nparameters = ["controller.K2"]\n[[objective]]\nkind = "tracking"\n',
+        load_tuning_file,
+    ),
+    "identification": (
+        '[identify]\nlog = "log.csv"\nparameters = ["plant.mass"]\n',
+        load_identification_file,
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_files_of_studies_receive_modules(kind, tmp_path):
+    tables, load = FILES[kind]
+    scenario = with_net(Opaque(jnp.ones((2, 4))))
+    path = tmp_path / "a.toml"
+    ij.save_scenario(scenario, path)
+    path.write_text(path.read_text() + RUN + tables)
+    with pytest.raises(ValueError, match=r'modules=\{"disturbance.net": module\}'):
+        load(path)
+    found = load(path, modules={"disturbance.net": Opaque(jnp.zeros((2, 4)))})
+    loaded = found["scenario"] if isinstance(found, dict) else found.scenario
+    assert same(loaded, scenario)
+
+
+def test_a_saved_tuning_receives_modules(tmp_path):
+    scenario = with_net(Opaque(0.1 * jnp.ones((2, 4))))
+    ij.save_scenario(scenario, tmp_path / "a.toml", run={"duration": 0.05, "dt": 1e-3})
+    text = (tmp_path / "a.toml").read_text()
+    (tmp_path / "a.toml").write_text(text + FILES["tuning"][0])
+    given = {"disturbance.net": Opaque(jnp.zeros((2, 4)))}
+    effort = ij.tuning.Effort(iterations=1, starts=1)
+    result = ij.tune_file(tmp_path / "a.toml", modules=given, effort=effort, progress=False)
+    result.save(tmp_path / "tuning.json")
+    with pytest.raises(ValueError, match=r'modules=\{"disturbance.net": module\}'):
+        ij.load_tuning(tmp_path / "tuning.json")
+    again = ij.load_tuning(tmp_path / "tuning.json", modules=given)
+    assert same(again.scenario, result.scenario)
+
+
+def test_a_law_with_a_module_on_a_robot_of_a_file(monkeypatch, tmp_path):
+    pytest.importorskip("mujoco")  # reads the robot
+    monkeypatch.setitem(ij.controllers.MEMBERS, "network_law", NetworkLaw)
+    examples = Path(__file__).parents[2] / "examples"
+    shutil.copy(examples / "arm.urdf", tmp_path)
+    arm = (examples / "arm.toml").read_text()
+    law = NetworkLaw(K=[60.0] * 3, D=[20.0] * 3, net=Opaque(0.1 * jnp.ones((3, 3))))
+    (tmp_path / "a.toml").write_text(arm)
+    ij.save_scenario(
+        ij.with_parts(ij.load_scenario(tmp_path / "a.toml"), controller=law), tmp_path / "b.toml"
+    )
+    tables = (tmp_path / "b.toml").read_text()
+    start, end = tables.index("[controller]"), tables.index("[initial]")
+    (tmp_path / "b.toml").write_text(arm + tables[start:end])
+    given = {"controller.net": Opaque(jnp.zeros((3, 3)))}
+    loaded = ij.load_scenario(tmp_path / "b.toml", modules=given)
+    assert same(loaded.controller.law, law)
+    assert (loaded.controller.limit > 0.0).all()
+
+
 def test_flax_modules_are_passed(tmp_path):
     nnx = pytest.importorskip("flax.nnx")
     net = nnx.Linear(4, 2, rngs=nnx.Rngs(0))
     scenario = with_net(net)
     ij.save_scenario(scenario, tmp_path / "a.toml")
+    with pytest.raises(ValueError, match=r"flax\.nnx.*Linear, expected the module itself"):
+        ij.load_scenario(tmp_path / "a.toml")
     given = {"disturbance.net": nnx.Linear(4, 2, rngs=nnx.Rngs(1))}
     again = ij.load_scenario(tmp_path / "a.toml", modules=given)
     assert np.allclose(again.disturbance.net.kernel[...], net.kernel[...])

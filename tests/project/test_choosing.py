@@ -24,7 +24,7 @@ def scripts(monkeypatch):
 def test_every_law_has_a_row_and_advice(scripts):
     laws, choosing = scripts
     names = [row["law"] for row in STORED["rows"]]
-    assert names == list(laws.CHOICES) == list(choosing.WORDS)
+    assert names == list(laws.CHOICES) == list(choosing.ADVICE)
     assert all(list(row) == laws.COLUMNS for row in STORED["rows"])
 
 
@@ -37,8 +37,8 @@ def test_the_sentences_follow_the_numbers(scripts):
     ]
     rows[1][column], rows[2][column], rows[0][choosing.LONGEST] = 1.0, "left", 0.0
     sentences = choosing.best_of_each_column(rows)
-    assert "least with b (1), largest with a (3); c left the bounds." in sentences[0]
-    assert "b, c stayed inside the bounds up to 3 ms; a with none" in sentences[-1]
+    assert "least with b (1), largest with a (3). Outside the bounds: c." in sentences[0]
+    assert "up to 3 ms: b; c. With none of the tested delays: a." in sentences[-1]
     assert choosing.page(STORED).startswith("# Choosing a law")
 
 
