@@ -10,7 +10,7 @@ import pytest
 import run_page
 from conftest import ROOT
 
-sys.path.insert(0, str(ROOT / "docs"))
+sys.path.append(str(ROOT / "docs"))
 import equations
 import flags
 import gallery
