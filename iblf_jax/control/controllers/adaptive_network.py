@@ -116,6 +116,7 @@ class AdaptiveNetwork:
     gains: ClassVar[tuple[str, ...]] = ("k1", "K2")
     unit_factors: ClassVar[tuple[str, ...]] = ("weight",)
     uses_observer: ClassVar[bool] = False
+    takes_shift: ClassVar[bool] = True
     leaf_units = weight_units
 
     def check(self) -> None:
@@ -158,4 +159,5 @@ class AdaptiveNetwork:
         back = slope * jnp.sum(state.output * e2, axis=1)
         moved = state.hidden - self._first_hidden(z.size, z.dtype)
         hidden_rate = -self.Gamma_h * (z[:, None] * back + self.sigma_h * moved)
-        return barrier_command(self, tube, q, alpha, tau), NetworkWeights(rate, hidden_rate)
+        command = barrier_command(self, tube, q, alpha, tau)._replace(input_slope=e2)
+        return command, NetworkWeights(rate, hidden_rate)
