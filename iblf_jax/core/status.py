@@ -45,7 +45,7 @@ class Status(enum.IntFlag):
 
     SAMPLING_TOO_SLOW = 512
     """Deviations of the loop grow from one period to the next (spectral radius above 1) at one of
-    the assessed instants: sample faster."""
+    the assessed instants, and not in continuous time: sample faster."""
 
     VELOCITY_VIOLATED = 1024
     """A joint's velocity touched or left its bound."""

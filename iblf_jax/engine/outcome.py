@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -65,11 +66,26 @@ def outcome_of(
         metrics |= plant.switching(end)
         status |= flag(~plant.has_complete_path(end), Status.MODES_EXHAUSTED)
     if inputs.scenario.sampling is not None:
-        maps = jax.vmap(partial(stability.period_map, inputs.scenario, carry.state))(
-            stability.resolved_jacobian(instants.jacobian, sampled=True)
-        )
-        radii = jax.lax.stop_gradient(jax.vmap(stability.spectral_radius)(maps))
+        radii, growth = jax.lax.stop_gradient(_sampling_radii(inputs, carry, instants))
         metrics[stability.RADIUS] = jnp.max(jnp.where(jnp.isfinite(radii), radii, 0.0))
-        status |= flag(metrics[stability.RADIUS] > 1.0, Status.SAMPLING_TOO_SLOW)
+        status |= flag(jnp.any(growth > 1.0), Status.SAMPLING_TOO_SLOW)
     metrics |= finished(inputs.folds, carry.accumulators)
     return Outcome(None, metrics, status, mode)
+
+
+def _sampling_radii(
+    inputs: Inputs, carry: Carry, instants: Linearization
+) -> tuple[jax.Array, jax.Array]:
+    """The spectral radius of the period map at each instant, and the growth by sampling, (k,) each
+    [1].
+    """
+    derivatives = stability.resolved_jacobian(instants.jacobian, sampled=True)
+
+    def radii_of(map_of: Callable) -> jax.Array:
+        maps = jax.vmap(partial(map_of, inputs.scenario, carry.state))(derivatives)
+        return jax.vmap(stability.spectral_radius)(maps)
+
+    radii = radii_of(stability.period_map)
+    continuous = radii_of(stability.continuous_map)
+    sampling: Any = inputs.scenario.sampling
+    return radii, stability.growth_by_sampling(radii, continuous, sampling.period)

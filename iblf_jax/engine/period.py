@@ -20,7 +20,12 @@ from iblf_jax.engine.step_size import MODE_INSTANTS, largest_eigenvalue, round_d
 from iblf_jax.simulation.closed_loop import LoopState, run_sampled_law
 from iblf_jax.simulation.sampling import Sampling, commands_in_transit
 from iblf_jax.simulation.scenario import Scenario, canonical
-from iblf_jax.simulation.stability import jacobian, period_map
+from iblf_jax.simulation.stability import (
+    continuous_map,
+    growth_by_sampling,
+    jacobian,
+    period_map,
+)
 
 SHORTEST_PERIOD, LONGEST_PERIOD = 1e-5, 0.2
 """Shortest and longest period that is tried [s]."""
@@ -37,7 +42,8 @@ RADIUS_RANGE, MARGIN_RANGE = (1e-3, 10.0), (1.0, 1000.0)
 
 def radius_at(scenario: Scenario, period: float, times: np.ndarray) -> float:
     """The largest spectral radius of the map from a period to the next, at the start and along the
-    reference [1].
+    reference [1], relative to the slow growth that the loop has at any period
+    (`stability.growth_by_sampling`).
 
     Args:
       scenario: canonical, with a sampling.
@@ -51,23 +57,33 @@ def radius_at(scenario: Scenario, period: float, times: np.ndarray) -> float:
         period=jnp.asarray(period, dtype),
         queue=commands_in_transit(float(sampling.delay), period),
     )
-    maps = np.asarray(
-        _maps(dataclasses.replace(scenario, sampling=changed), jnp.asarray(times, dtype)), float
+    changed_scenario = dataclasses.replace(scenario, sampling=changed)
+    maps, continuous = (
+        np.asarray(each, float) for each in _maps(changed_scenario, jnp.asarray(times, dtype))
     )
-    return largest_eigenvalue(maps)
+    return max(
+        float(growth_by_sampling(largest_eigenvalue(one), largest_eigenvalue(other), period))
+        for one, other in zip(maps, continuous, strict=True)
+    )
 
 
 @jax.jit
-def _maps(scenario: Scenario, times: jax.Array) -> jax.Array:
-    """The maps' derivatives, (T + 1, m, m)."""
+def _maps(scenario: Scenario, times: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The derivatives of the period maps, (T + 1, m, m), and the maps of the same loops in
+    continuous time, (T + 1, k, k).
+    """
     zero = jnp.zeros_like(scenario.initial.q[0])
 
-    def at(t: jax.Array, state: LoopState) -> jax.Array:
+    def at(t: jax.Array, state: LoopState) -> tuple[jax.Array, jax.Array]:
         # The torque of the instant is the one that the law commands there.
         state = run_sampled_law(
             scenario, t, state, jnp.zeros((scenario.sensor.draws, scenario.n), zero.dtype)
         )
-        return period_map(scenario, state, jacobian(scenario, t, state))
+        derivative = jacobian(scenario, t, state)
+        return (
+            period_map(scenario, state, derivative),
+            continuous_map(scenario, state, derivative),
+        )
 
     return jax.vmap(at)(jnp.concatenate([zero[None], times]), start_and_along(scenario, times))
 
@@ -83,8 +99,10 @@ def recommended_period(
         commands under way
 
     at the start and along the reference, for every period up to margin times the one that is
-    returned.  The condition is necessary, not sufficient: it takes account neither of noise nor of
-    the distance to the bounds.  The period is rounded down to 1, 2 or 5 times a power of ten.
+    returned.  Slow growth that the loop has in continuous time as well, at one of these instants,
+    does not count.  The condition is necessary, not sufficient: it takes account neither of noise
+    nor of the distance to the bounds.  The period is rounded down to 1, 2 or 5 times a power of
+    ten.
 
     Args:
       scenario: the loop; its delay [s], sensor and actuator count, its own period does not.

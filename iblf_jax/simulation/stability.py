@@ -19,7 +19,8 @@ ones gives much less than h0, the one of THIRD_SIZE counts (`resolved_jacobian`)
 Stability of a sampled loop is that of the map from one period to the next. The derivative of the
 map follows from those of plant and law: the plant's state evolves with exp(A t), A the derivative
 of its rate, while the torque is constant. The loop is stable only while the spectral radius of the
-map, taken over all states with memory, is below 1.
+map, taken over all states with memory, is below 1.  Slow growth that the derivatives show in
+continuous time as well does not count (`growth_by_sampling`).
 """
 
 from __future__ import annotations
@@ -62,6 +63,10 @@ MAX_BOUND_FRACTION = 0.25
 INFINITE_RATIO = 0.8
 """Ratio of the derivatives by differences of the second and the first size below which the
 derivative is taken to be infinite."""
+TRANSIENT_GROWTH = 10.0
+"""Largest rate that the derivatives at one instant may have in continuous time although the errors
+of the loop decay [1/s].  A lag of a sensor or an actuator that makes a loop unstable causes faster
+growth, and a slower one leaves the bounds."""
 SLOWEST_RATE = 1.0
 """Rate of the slowest mode of a loop that follows a reference [1/s]."""
 
@@ -302,6 +307,48 @@ def _plant_over_period(
         for k in range(sampling.queue + 1)
     ]
     return by_state, by_command
+
+
+def continuous_map(scenario: Scenario, state: LoopState, derivative: jax.Array) -> jax.Array:
+    """The map over one period of the same loop with a law in continuous time and without delay,
+    exp(A_c T), (m, m) [1].
+
+    It shows the growth that a loop has at any period: the derivatives at one instant of a loop
+    whose gains depend on the time or on the error may have an eigenvalue above 0, although the
+    errors decay.  The states of law and observer have their mean rates over a period, and those of
+    the sensor, which are past measurements, remain constant.
+
+    Args:
+      scenario, state, derivative: as `period_map`.
+    """
+    sampling: Any = scenario.sampling
+    n, size = scenario.n, len(derivative)
+    plant = ravel_pytree(integrated_part(state))[0].size
+    end = size - ravel_pytree(state.sampled.sensor)[0].size
+    x = jnp.concatenate([jnp.arange(plant), jnp.arange(plant + n, end)])
+    B = derivative[:plant, plant : plant + n]
+    by_command = matmul_in_order(B, derivative[plant : plant + n, x])
+    plant_rate = derivative[:plant, x] + by_command
+    unchanged = jnp.eye(len(x), dtype=derivative.dtype)[plant:]
+    memory_rate = (derivative[plant + n : end, x] - unchanged) / sampling.period
+    rate = jnp.concatenate([plant_rate, memory_rate])
+    return flow(rate, jnp.zeros((len(x), 0), rate.dtype), sampling.period)
+
+
+def growth_by_sampling(radius: Any, continuous_radius: Any, period: Any) -> Any:
+    """The spectral radius of a period map relative to the slow growth that sampling does not cause
+    [1]: above 1 the law is sampled too slowly.
+
+    It is the radius itself where the loop in continuous time is stable.  Otherwise that loop
+    explains a growth of up to twice its own rate, and of at most TRANSIENT_GROWTH.
+
+    Args:
+      radius: of the `period_map`.
+      continuous_radius: of the `continuous_map`.
+      period: of the sampling [s].
+    """
+    own = jnp.maximum(1.0, continuous_radius) ** 2
+    return radius / jnp.minimum(own, jnp.exp(TRANSIENT_GROWTH * period))
 
 
 def period_map_as_rate(scenario: Scenario, state: LoopState, derivative: jax.Array) -> jax.Array:

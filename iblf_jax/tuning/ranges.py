@@ -388,7 +388,7 @@ def _reach(violated: Callable[[float], str]) -> Reach:
 
 
 def sampled_too_slowly(scenario: Scenario) -> bool:
-    """Whether the law is sampled and its loop grows from one period to the next."""
+    """Whether the law is sampled and its loop therefore grows from one period to the next."""
     sampling = scenario.sampling
     return sampling is not None and not radius_at(scenario, float(sampling.period), TIMES) < 1.0
 

@@ -33,6 +33,7 @@ LAWS = {
     "dynamic_surface": controllers.DynamicSurface(k1=2.0, K2=20.0, filter=0.02),
     "barrier_backstepping": controllers.BarrierBackstepping(k=(2.0, 20.0)),
     "adaptive_rbf": controllers.AdaptiveRBF(k1=2.0, K2=20.0, nodes=4),
+    "adaptive_network": controllers.AdaptiveNetwork(k1=2.0, K2=20.0, nodes=4),
     "computed_torque": controllers.ComputedTorque(Kp=25.0, Kd=10.0),
 }
 """Laws besides `Backstepping`; the last one does not take the shift."""
@@ -217,6 +218,20 @@ def test_without_a_reached_limit_it_is_the_law_without_it(name):
         jax.tree.leaves(rate.controller), jax.tree.leaves(limited_rate.controller.law), strict=True
     ):
         np.testing.assert_array_equal(one, same)
+
+
+@pytest.mark.parametrize("name", ["adaptive_rbf", "adaptive_network"])
+def test_the_command_of_a_network_with_an_auxiliary_state_needs_no_model(name):
+    scenario = canonical(ij.with_parts(PAPER, controller=_limited(LAWS[name], 1e4)))
+    law, q, dq = scenario.controller, jnp.array([0.5, 0.6]), jnp.array([0.1, 0.2])
+    state = law.init(q, dq, scenario.context)._replace(auxiliary=jnp.array([0.3, -0.2]))
+    commands = []
+    for mass in (1.0, 3.0):
+        model = ij.with_parameters(scenario, {"model.mass": mass}).model
+        context = scenario.context._replace(model=model)
+        commands.append(law.command(jnp.asarray(0.0), q, dq, jnp.zeros(2), context, state)[0])
+    np.testing.assert_array_equal(commands[0].tau, commands[1].tau)
+    np.testing.assert_array_equal(commands[0].input_slope, dq - commands[0].alpha)
 
 
 def test_the_rate_that_gives_the_limit_alone():

@@ -18,6 +18,9 @@ import pytest
 import iblf_jax as ij
 from iblf_jax import barriers, controllers, decays, disturbances, observers
 from iblf_jax.certificates import settling
+from iblf_jax.core import notices
+from iblf_jax.core.status import Status
+from iblf_jax.simulation import stability
 from iblf_jax.simulation.scenario import canonical
 from iblf_jax.tuning import ranges
 
@@ -445,3 +448,33 @@ def test_ranges_of_the_powers_end_at_one():
     )
     assert lows.value == highs.value == 1.0
     assert "power" in lows.reason
+
+
+@pytest.mark.parametrize(
+    "decay",
+    [decays.FiniteTime(k_a=1.0), decays.PrescribedTime(T=1.0, gain=3.0, cap=40.0)],
+    ids=["finite", "prescribed"],
+)
+def test_growth_that_no_period_changes_is_not_reported_as_sampling(decay):
+    """At the start the derivatives of the loop grow slowly, at a rate that does not depend on the
+    period, although the errors decay.  A period that is too long for the law is still reported."""
+    law = controllers.Backstepping(
+        k1=1.0, K2=20.0, barrier=barriers.Mapping(), reading="corrected", decays=decay
+    )
+    growth, reported = [], []
+    for period in (1e-3, 1e-4, 4e-3):
+        scenario = ij.with_parts(
+            ij.presets.zhang_yan_2024(),
+            controller=law,
+            observer=observers.NoObserver(),
+            disturbance=disturbances.Nothing(),
+            sampling=ij.Sampling(period=period),
+        )
+        with notices.muted():
+            run = ij.simulate(scenario, duration=0.04, dt=period)
+        growth.append(np.log(float(run.metrics.sampling_radius)) / period)
+        reported.append(bool(int(run.status) & int(Status.SAMPLING_TOO_SLOW)))
+    assert 0.5 < growth[1] < stability.TRANSIENT_GROWTH
+    np.testing.assert_allclose(growth[0], growth[1], rtol=0.02)
+    assert reported == [False, False, True]
+    assert ij.recommended_period(scenario, duration=2.0) >= 2e-4

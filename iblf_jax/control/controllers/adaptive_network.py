@@ -116,6 +116,7 @@ class AdaptiveNetwork:
     gains: ClassVar[tuple[str, ...]] = ("k1", "K2")
     unit_factors: ClassVar[tuple[str, ...]] = ("weight",)
     uses_observer: ClassVar[bool] = False
+    takes_shift: ClassVar[bool] = True
     leaf_units = weight_units
 
     def check(self) -> None:
@@ -148,14 +149,15 @@ class AdaptiveNetwork:
         tube, e2 = context.tube(t), dq - alpha
         scaled = scaled_input(self, q, dq, alpha, dalpha)
         z = jnp.concatenate([scaled, jnp.ones_like(scaled[:1])])
-        entering = jnp.sum(z[:, None] * state.hidden, axis=0)
-        phi = jnp.tanh(entering)
+        activation = jnp.sum(z[:, None] * state.hidden, axis=0)
+        phi = jnp.tanh(activation)
         slope = 1.0 - phi**2
         learned = jnp.sum(phi[:, None] * state.output, axis=0)
         tau = learned - self.K2 * e2 - self.weight * self.barrier.slope(tube, q)
-        regressor = phi - slope * entering
+        regressor = phi - slope * activation
         rate = -self.Gamma * (regressor[:, None] * e2 + self.sigma * state.output)
-        back = slope * jnp.sum(state.output * e2, axis=1)
-        moved = state.hidden - self._first_hidden(z.size, z.dtype)
-        hidden_rate = -self.Gamma_h * (z[:, None] * back + self.sigma_h * moved)
-        return barrier_command(self, tube, q, alpha, tau), NetworkWeights(rate, hidden_rate)
+        hidden_error = slope * jnp.sum(state.output * e2, axis=1)
+        departure = state.hidden - self._first_hidden(z.size, z.dtype)
+        hidden_rate = -self.Gamma_h * (z[:, None] * hidden_error + self.sigma_h * departure)
+        command = barrier_command(self, tube, q, alpha, tau)._replace(input_slope=e2)
+        return command, NetworkWeights(rate, hidden_rate)

@@ -205,8 +205,8 @@ class AdaptiveParameters:
         self._check_dependence(context)
 
     def _check_dependence(self, context: LawContext) -> None:
-        """Raises ValueError for a parameter in which the torque is not affine, or of which the
-        virtual controls or the slope of V depend, or that has no effect.
+        """Raises ValueError for a parameter in which the torque is not affine, on which
+        the virtual controls or the slope of V depend, or that has no effect.
         """
         t, x = _points(context, self.Gamma.dtype)
         torque, others = (np.asarray(part) for part in _dependence(self, context, t, x))
@@ -234,7 +234,7 @@ class AdaptiveParameters:
         """theta_0, (p,): the values of the model."""
         return _values_at(model, self.parameters)
 
-    def _informed(self, context: LawContext, theta: jax.Array) -> LawContext:
+    def _with_parameters(self, context: LawContext, theta: jax.Array) -> LawContext:
         """The context whose model has these parameters."""
         model = context.model
         for path, value in zip(self.parameters, theta, strict=True):
@@ -267,12 +267,12 @@ class AdaptiveParameters:
         zero = jnp.zeros_like(estimate)
 
         def torque(theta):
-            informed = self._informed(context, theta)
-            command, rate = law.command(t, *measured, zero, informed, state.law)
+            changed = self._with_parameters(context, theta)
+            command, rate = law.command(t, *measured, zero, changed, state.law)
             return command.tau, (command, rate)
 
-        _, pull, (command, rate) = jax.vjp(torque, state.theta, has_aux=True)
-        return command, rate, pull(command.input_slope)[0]
+        _, pullback, (command, rate) = jax.vjp(torque, state.theta, has_aux=True)
+        return command, rate, pullback(command.input_slope)[0]
 
     def unprojected(self, theta: jax.Array, gradient: jax.Array, context: LawContext) -> jax.Array:
         """-Gamma (Y^T s + sigma (theta_hat - theta_0)), (p,).
@@ -295,8 +295,8 @@ class AdaptiveParameters:
         `switching`.
         """
         *measured, context, state = arguments
-        informed = self._informed(context, state.theta)
-        return wrapped_switching(self, t, *measured, informed, state.law)
+        changed = self._with_parameters(context, state.theta)
+        return wrapped_switching(self, t, *measured, changed, state.law)
 
     # --- the claim (R.3) --------------------------------------------------------------------------
 
@@ -312,7 +312,7 @@ class AdaptiveParameters:
     ) -> jax.Array:
         """V_a for parameters theta, ()."""
         law: Any = self.law
-        energy = law.energy(t, *measured, self._informed(context, theta))
+        energy = law.energy(t, *measured, self._with_parameters(context, theta))
         return energy + 0.5 * jnp.sum((state.theta - theta) ** 2 / self.Gamma)
 
     def decay(self, t: jax.Array, *arguments: Any) -> jax.Array:
@@ -320,7 +320,7 @@ class AdaptiveParameters:
         *measured, _, context, state = arguments
         theta = self.true_parameters(t, context)
         law: Any = self.law
-        decay = law.energy_decay(t, *measured, self._informed(context, theta))
+        decay = law.energy_decay(t, *measured, self._with_parameters(context, theta))
         return decay + 0.5 * jnp.sum(self.sigma * (state.theta - theta) ** 2)
 
     def disturbance_terms(self, t: jax.Array, *arguments: Any) -> jax.Array:
@@ -361,7 +361,7 @@ class AdaptiveParameters:
           theta: parameters, (p,).
           disturbance: of the model itself, f (n,), or d (r, n).
         """
-        true, law = self._informed(context, theta), self.law
+        true, law = self._with_parameters(context, theta), self.law
         if law_member(law, "receives_x"):
             (x,) = measured
             flow = plants.flow(plants.as_plant(context.model), t, x, command.tau)
@@ -376,8 +376,8 @@ class AdaptiveParameters:
         return inner(command.input_slope, needed - command.tau)
 
     def true_parameters(self, t: jax.Array, context: LawContext) -> jax.Array:
-        """Theta at time t, (p,): of the plant where the context has it and it has the parameters,
-        else of the model.
+        """The true parameters theta at time t, (p,): those of the plant where the context has one
+        with these parameters, else those of the model.
         """
         if context.plant is None:
             return self._nominal(context.model)
@@ -474,12 +474,12 @@ def _dependence(
     inner_law: Any = law.law
 
     def outputs(theta, t, x):
-        informed = law._informed(context, theta)
+        changed = law._with_parameters(context, theta)
         measured, estimate = (x[0], x[1]), jnp.zeros_like(x[0])
         if law_member(inner_law, "receives_x"):
             measured, estimate = (x,), jnp.zeros_like(x)  # type: ignore[assignment]
-        state = inner_law.init(*measured, informed)
-        command, _ = inner_law.command(t, *measured, estimate, informed, state)
+        state = inner_law.init(*measured, changed)
+        command, _ = inner_law.command(t, *measured, estimate, changed, state)
         others = (command.alpha, command.V1, command.input_slope, command.alpha_higher)
         return command.tau, jnp.concatenate([jnp.ravel(part) for part in jax.tree.leaves(others)])
 

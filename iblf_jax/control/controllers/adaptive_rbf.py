@@ -5,7 +5,8 @@ What the backstepping law takes from the model, M0 alpha' + C0 alpha + G0 - f, a
 Gaussians learns while it runs:
 
     W_hat^T S(Z),   S_j(Z) = exp(-|z - c_j|^2 / width^2),   Z = (q, q', alpha, alpha'),
-    z = Z over its spans,   W_hat' = Gamma (-S(Z) e2^T - sigma W_hat),   W_hat(0) = 0.
+    z = ((q - middle)/span_q, q'/span_dq, alpha/span_dq, alpha'/span_ddq),
+    W_hat' = Gamma (-S(Z) e2^T - sigma W_hat),   W_hat(0) = 0.
 
 The sigma-modification bounds the weights in every case: as |S| <= sqrt(nodes), the column of joint
 i obeys |W_hat_i| <= sqrt(nodes) sup|e2_i| / sigma.  The literature places the centres on a lattice,
@@ -13,7 +14,7 @@ which in the 4n dimensions of Z has nodes^(4n) points; here they are a fixed num
 Sobol sequence in the box [-1, 1]^(4n).
 
 **Fuzzy system.**  With `normalised`, S_j(Z)/sum_i S_i(Z) takes the place of S_j(Z).  That is a
-fuzzy system: rule j says "if z_1 is near c_j1 and ... and z_4n is near c_j4n, the torque is
+fuzzy system: rule j is "if z_1 is near c_j1 and ... and z_4n is near c_j4n, the torque is
 W_hat_j", with Gaussian membership functions, product inference, singleton consequents and the
 weighted mean of the rules.  Its basis sums to 1, so that the torque is a mean of the rows of W_hat,
 also between and beyond the centres, where Gaussians fade out.  The derivation of W_hat' does not
@@ -86,7 +87,7 @@ class AdaptiveRBF:
 
     Source: Y. J. Liu, S. Lu, S. Tong, IEEE Trans. Syst. Man Cybern. Syst. 47 (2017) 2060-2068;
       L. X. Wang, IEEE Trans. Fuzzy Systems 1 (1993) 146-155 (normalised: fuzzy basis functions);
-      numbers as said at the head of this module.
+      the numbers are those of this package.
     """
 
     k1: Leaf = leaf("1/s", sign="positive")
@@ -153,7 +154,9 @@ class AdaptiveRBF:
 def scaled_input(
     law: Any, q: jax.Array, dq: jax.Array, alpha: jax.Array, dalpha: jax.Array
 ) -> jax.Array:
-    """Z = Z over its spans, (4n,) [1], of a law with `middle`, `span_q`, `span_dq`, `span_ddq`."""
+    """The input z of a network, Z relative to its spans, (4n,) [1], of a law with `middle`,
+    `span_q`, `span_dq`, `span_ddq`.
+    """
     position = (q - law.middle) / law.span_q
     rates = [dq / law.span_dq, alpha / law.span_dq, dalpha / law.span_ddq]
     return jnp.concatenate([position, *rates])

@@ -69,7 +69,7 @@ from iblf_jax.world.robots._base import robot_member
 
 EDGES = ("hard", "smooth")
 SHARPNESS = 8
-"""Even exponent of the smooth limit: at half the limit it takes off 0.05 %, at the limit 8 %."""
+"""Even exponent of the smooth limit: it reduces half the limit by 0.05 %, and the limit by 8 %."""
 
 
 class AuxiliaryState(NamedTuple):
@@ -224,7 +224,8 @@ def _with_shifted_control(command: Command, order: int, value: jax.Array) -> Com
 
 
 UNLIMITED = 1e6
-"""N m; the limit of a joint without one among others that have theirs: beyond any actuator."""
+"""Limit of a joint without a limit of its own, where other joints have one: beyond any actuator
+[N m]."""
 
 
 def within_effort(law: Controller, robot: Robot, *, edge: str = "hard") -> Controller:
@@ -247,8 +248,8 @@ def within_effort(law: Controller, robot: Robot, *, edge: str = "hard") -> Contr
 
 
 def _smooth_clip(x: jax.Array) -> jax.Array:
-    """X / (1 + x^8)^(1/8), written so that nothing overflows; the scale m cancels, in derivatives
-    too.
+    """The smooth limit x / (1 + x^8)^(1/8) in a form that does not overflow.  The scale m cancels,
+    also in derivatives.
     """
     m = jax.lax.stop_gradient(jnp.maximum(jnp.abs(x), 1.0))
     return (x / m) / ((1.0 / m) ** SHARPNESS + (x / m) ** SHARPNESS) ** (1.0 / SHARPNESS)

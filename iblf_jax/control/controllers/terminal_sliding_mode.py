@@ -113,7 +113,9 @@ class TerminalSlidingMode:
         return Command(tau, tube.dq_d, 0.5 * sigma**2, never, never), ()
 
     def _surface(self, tube: Tube, q: jax.Array, dq: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Sigma [rad] and dsigma/dq' = g'(e1')/beta [s], (n,) each."""
+        """The surface sigma [rad] and its slope dsigma/dq' = g'(e1')/beta [s], (n,)
+        each.
+        """
         e, v = q - tube.q_d, dq - tube.dq_d
         square = v**2 + self.smoothing**2
         root = square ** (0.5 * (self.p - 1.0))

@@ -8,7 +8,7 @@ gives
 
 with equality for `Mapping`, `PrescribedPerformance`, `Quadratic` (rate 2k) and `Tan` (rate k).  In
 z = sqrt(2V), which is the size of the mapped error for the first three, this is z' = -k(t, V) z.
-For `Integral` (rate 2k) and `Log` (rate 2pk) it is an inequality, so that they are no slower.
+For `Integral` (rate 2k) and `Log` (rate 2pk) it is an inequality: z decays at least as fast.
 
 **Contract.**  k(t, V) >= k.  All claims that a law and a certificate state for the constant gain
 then remain true, and the decay adds its own: a time after which V is inside a band.
@@ -61,7 +61,7 @@ class Decay(Protocol):
 decay_member = OptionalMembers(
     constant=False, band=lambda: None, deadline=lambda: None, smooth_derivatives=math.inf
 )
-"""Reads what a decay may lack."""
+"""Reads the optional members of a decay."""
 
 
 def gain_at(decay: Decay, t: jax.Array, k: jax.Array, barrier: Any, tube: Any, x: jax.Array) -> Any:
@@ -88,10 +88,10 @@ def energy_gain(decay: Decay, t: jax.Array, W: jax.Array, like: jax.Array) -> ja
       W: energy 1/2 e2^T M0 e2, () [N m rad].
       like: an array of the shape (n,).
     """
-    none = jnp.zeros_like(like)
-    return jnp.mean(decay.effective_gain(t, none, none + W))
+    zero = jnp.zeros_like(like)
+    return jnp.mean(decay.effective_gain(t, zero, zero + W))
 
 
-def power(square: jax.Array, exponent: jax.Array) -> jax.Array:
-    """A positive number to the power of a number, with derivatives of every order."""
-    return jnp.exp(exponent * jnp.log(square))
+def power(base: jax.Array, exponent: jax.Array) -> jax.Array:
+    """base^exponent for a positive base, with derivatives of every order."""
+    return jnp.exp(exponent * jnp.log(base))

@@ -13,8 +13,9 @@ from iblf_jax.core.pytree import component
 class Exponential:
     """k(t, V) = k:   z' = -k z, z = sqrt(2V).
 
-    z(t) = z(0) exp(-k t): the error tends to 0 and does not reach it.  This is the decay of a law
-    for which none is given; it is for a level of a law whose other levels have another one.
+    z(t) = z(0) exp(-k t): the error tends to 0 and does not reach it.  A law for
+    which no decay is given has this one.  Name it for a level of a law whose other levels have
+    another decay.
 
     Source: M. Krstic, I. Kanellakopoulos, P. Kokotovic, Nonlinear and Adaptive Control Design,
       1995.

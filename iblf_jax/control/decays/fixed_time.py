@@ -42,9 +42,10 @@ class FixedTime:
 
     def effective_gain(self, t: jax.Array, k: jax.Array, V: jax.Array) -> jax.Array:
         """k(t, V), (n,) [1/s]."""
-        logarithm = 0.5 * jnp.log(2.0 * V + self.delta**2)
-        lower = self.k_a * jnp.exp((self.a - 1.0) * logarithm)
-        return k + lower + self.k_b * jnp.exp((self.b - 1.0) * logarithm)
+        log_size = 0.5 * jnp.log(2.0 * V + self.delta**2)  # one logarithm for both powers
+        near_zero = self.k_a * jnp.exp((self.a - 1.0) * log_size)
+        far_from_zero = self.k_b * jnp.exp((self.b - 1.0) * log_size)
+        return k + near_zero + far_from_zero
 
     def band(self) -> jax.Array:
         """The V of |z| = delta, (n,)."""

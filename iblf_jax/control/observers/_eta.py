@@ -60,7 +60,7 @@ def advanced_eta(
     state: jax.Array,
     period: jax.Array,
 ) -> jax.Array:
-    """Eta a period later for constant inputs, (n,) [N m].
+    """The state eta a period later for constant inputs, (n,) [N m].
 
     It is exact, because (3.11) is linear in eta: eta' = kf (eta* - eta), so eta* - eta falls by
     exp(-kf period).
