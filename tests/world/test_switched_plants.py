@@ -189,6 +189,8 @@ def test_every_run_of_a_study_has_a_path_of_its_own():
     [
         (lambda: plants.Switched(LINK, {"mass[0]": (1.0, 2.0)}, [0.5, 0.6]), "3 values"),
         (lambda: plants.Switched(LINK, {"weight": (1.0, 2.0)}, [0.5]), "path of a parameter"),
+        (lambda: plants.Switched(LINK, {"mass[0]": (1.0, -2.0)}, [0.5]), "positive values"),
+        (lambda: plants.MarkovSwitched(LINK, {"mass[0]": (1.0, 0.0)}, Q[:2, :2]), "positive"),
         (lambda: plants.Switched(LINK, {"mass[0]": (1.0, 2.0, 3.0)}, [0.6, 0.5]), "increasing"),
         (lambda: plants.Switched(3.0, {"mass[0]": (1.0, 2.0)}, [0.5]), "Robot"),
         (lambda: plants.Switched(LINK, {}, [0.5]), "parameters"),

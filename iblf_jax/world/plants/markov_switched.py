@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any, ClassVar
 
 import jax
@@ -17,16 +18,16 @@ from iblf_jax.world.plants._modes import (
     RobotOrPlant,
     changed,
     fit_modes,
-    in_turn,
     member_of_inner,
-    of_mode,
+    piecewise_constant,
     switching_results,
+    value_of_mode,
 )
 
 MOST_SWITCHES = 64
-"""Largest number of switches of a run; each is written out in the compiled program."""
+"""Largest `switches`; the compiled step compares the time with every switching time."""
 ROUNDING = 1e-6
-"""Largest sum of a row of the rates, relative to their size."""
+"""Largest sum of a row of the rates, relative to the largest rate."""
 
 
 @component
@@ -35,9 +36,9 @@ class MarkovSwitched:
 
     A run draws its path from its key, as a sensor draws its noise: the time in mode i has an
     exponential distribution with the mean -1/q_ii, and the next mode is j with the probability
-    -q_ij/q_ii.  Every run of a study has a path of its own.  Derivatives of a run are those for its
-    path; that by `rates` is 0.  A run that would have more than `switches` switches is flagged
-    MODES_EXHAUSTED.
+    -q_ij/q_ii.  Every run of a study has a path of its own.  Derivatives of a run are pathwise, so
+    that the derivative with respect to `rates` is 0.  A run that would have more than `switches`
+    switches stays in its last mode and is flagged MODES_EXHAUSTED.
 
     Args:
       plant: any of `iblf_jax.robots` or `iblf_jax.plants`; the default model of a scenario.
@@ -48,8 +49,8 @@ class MarkovSwitched:
       switches: largest number of switches in a run; 16 if not given.
       times: of the switches of a run, shape (m,) with m = switches + 1 [s], > 0; none if not given.
         Every run replaces them.
-      sequence: mode after each of them, shape (m,) [1], >= 0; `start` if not given.  Every run
-        replaces it.
+      sequence: mode after each of the switches, shape (m,) [1], >= 0; `start` if not given.  Every
+        run replaces it.
 
     Source: O. L. V. Costa, M. D. Fragoso, M. G. Todorov, Continuous-Time Markov Jump Linear
       Systems, 2013, chapter 2; the path by D. T. Gillespie, J. Physical Chemistry 81 (1977) 2340.
@@ -80,7 +81,7 @@ class MarkovSwitched:
             checks.shape_is(f"MarkovSwitched.{name}", given, shape)
 
     def _check_rates(self, modes: int) -> None:
-        """Raises ValueError for a matrix that is not one of rates."""
+        """Raises ValueError for `rates` that are no transition rate matrix."""
         name = "MarkovSwitched.rates"
         checks.shape_is(name, self.rates, (modes, modes))
         if not checks.is_concrete(self.rates):
@@ -99,21 +100,24 @@ class MarkovSwitched:
 
     @property
     def mode_draws(self) -> int:
-        """Pairs of random numbers of a path: one a switch, and one for the switch after them."""
+        """Number of pairs of random numbers of a path: one for each of `switches`, and one for the
+        next switch, which shows whether the path is complete.
+        """
         return self.switches + 1
 
     def with_path(self, uniforms: jax.Array) -> MarkovSwitched:
-        """The plant with the path of a run.
+        """The plant with the switching times and modes of a run.
 
         Args:
-          uniforms: independent numbers between 0 and 1, (switches + 1, 2).
+          uniforms: independent and uniform between 0 and 1, (switches + 1, 2).  The first of a pair
+            gives the dwell time, -log(u)/|q_ii|, the second one the next mode.
         """
         Q = jax.lax.stop_gradient(self.rates)
 
         def switch(before, pair):
             t, mode = before
-            row = of_mode(Q, mode)
-            leaving = -of_mode(jnp.diagonal(Q), mode)
+            row = value_of_mode(Q, mode)
+            leaving = -value_of_mode(jnp.diagonal(Q), mode)
             is_final = ~(leaving > 0)
             rate = jnp.where(is_final, 1.0, leaving)
             t = jnp.where(is_final, NEVER, jnp.minimum(t - jnp.log(pair[0]) / rate, NEVER))
@@ -127,17 +131,19 @@ class MarkovSwitched:
 
     def _with(self, times: jax.Array, sequence: jax.Array) -> MarkovSwitched:
         """A copy with another path, without checks: its numbers may be traced."""
-        leaves, structure = jax.tree.flatten(self)
-        return jax.tree.unflatten(structure, [*leaves[:-2], times, sequence])
+        new = copy.copy(self)
+        object.__setattr__(new, "times", times)
+        object.__setattr__(new, "sequence", sequence)
+        return new
 
     def at(self, t: jax.Array) -> Any:
         """The inner plant with its parameters at time t [s]."""
         start = jnp.full((1,), self.start, self.sequence.dtype)
-        every = jnp.concatenate([start, self.sequence[:-1]])
-        mode = in_turn(every, self.times[:-1], t)
+        modes = jnp.concatenate([start, self.sequence[:-1]])
+        mode = piecewise_constant(modes, self.times[:-1], t)
         plant = self.plant
         for part in self.parameters:
-            plant = changed(plant, part.path, of_mode(part.values, mode))
+            plant = changed(plant, part.path, value_of_mode(part.values, mode))
         return as_at(plant, t)
 
     def jump_times(self) -> jax.Array:
@@ -154,7 +160,14 @@ class MarkovSwitched:
 
 
 def _next_mode(row: jax.Array, mode: jax.Array, level: jax.Array, modes: int) -> jax.Array:
-    """The mode at which the sum of the rates to the modes up to it first exceeds a level."""
+    """The next mode: the first one k != mode with sum_{j <= k, j != mode} q_j > level.
+
+    Args:
+      row: rates from the mode, (modes,) [1/s].
+      mode: the present one, () [1].
+      level: uniform between 0 and the sum of the rates to other modes, () [1/s].
+      modes: their number.
+    """
     total = jnp.zeros_like(level)
     last = found = mode
     is_found = jnp.zeros((), bool)
