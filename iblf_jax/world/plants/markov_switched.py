@@ -44,7 +44,8 @@ class MarkovSwitched:
       plant: any of `iblf_jax.robots` or `iblf_jax.plants`; the default model of a scenario.
       parameters: path of a parameter of the plant -> its value in each of M modes, such as
         {"mass[1]": (0.85, 1.5)}.
-      rates: Q, (M, M) [1/s]: q_ij >= 0 of the switch from mode i to mode j, and rows of sum 0.
+      rates: Q, (M, M) [1/s]: q_ij >= 0 of the switch from mode i to mode j, and rows of sum 0.  A
+        run uses the rates with i != j only, so that a study may vary one of them alone.
       start: mode at t = 0, from 0; 0 if not given.
       switches: largest number of switches in a run; 16 if not given.
       times: of the switches of a run, shape (m,) with m = switches + 1 [s], > 0; none if not given.
@@ -113,15 +114,17 @@ class MarkovSwitched:
             gives the dwell time, -log(u)/|q_ii|, the second one the next mode.
         """
         Q = jax.lax.stop_gradient(self.rates)
+        # A replaced rate does not change the diagonal: the rate of leaving is a sum of the others.
+        to_others = jnp.where(np.eye(len(Q), dtype=bool), 0.0, Q)
 
         def switch(before, pair):
             t, mode = before
-            row = value_of_mode(Q, mode)
-            leaving = -value_of_mode(jnp.diagonal(Q), mode)
+            row = value_of_mode(to_others, mode)
+            leaving = jnp.sum(row)
             is_final = ~(leaving > 0)
             rate = jnp.where(is_final, 1.0, leaving)
             t = jnp.where(is_final, NEVER, jnp.minimum(t - jnp.log(pair[0]) / rate, NEVER))
-            mode = jnp.where(is_final, mode, _next_mode(row, mode, pair[1] * rate, len(Q)))
+            mode = jnp.where(is_final, mode, _next_mode(row, pair[1] * rate))
             return (t, mode), (t, mode)
 
         # Written out, XLA repeats the earlier switches in the code of every later one.
@@ -159,25 +162,22 @@ class MarkovSwitched:
         return self.times[-1] >= end
 
 
-def _next_mode(row: jax.Array, mode: jax.Array, level: jax.Array, modes: int) -> jax.Array:
-    """The next mode: the first one k != mode with sum_{j <= k, j != mode} q_j > level.
+def _next_mode(row: jax.Array, level: jax.Array) -> jax.Array:
+    """The next mode: the first k with sum_{j <= k} row_j > level.
 
     Args:
-      row: rates from the mode, (modes,) [1/s].
-      mode: the present one, () [1].
-      level: uniform between 0 and the sum of the rates to other modes, () [1/s].
-      modes: their number.
+      row: rates to other modes, and 0 for the present mode, (modes,) [1/s].
+      level: uniform between 0 and the sum of the row, () [1/s].
     """
     total = jnp.zeros_like(level)
-    last = found = mode
+    found = jnp.zeros_like(level)
+    last = jnp.zeros_like(level)
     is_found = jnp.zeros((), bool)
-    for k in range(modes):
-        is_other = jnp.abs(mode - k) > 0.5
-        weight = jnp.where(is_other, row[k], 0.0)
-        total = total + weight
-        here = is_other & (total > level) & ~is_found
-        found = jnp.where(here, float(k), found)
-        is_found = is_found | here
-        last = jnp.where(weight > 0, float(k), last)
+    for k in range(len(row)):
+        total = total + row[k]
+        is_first = (total > level) & ~is_found
+        found = jnp.where(is_first, float(k), found)
+        is_found = is_found | is_first
+        last = jnp.where(row[k] > 0, float(k), last)
     # Rounding may leave the sum of all rates below the level.
     return jnp.where(is_found, found, last)
