@@ -1,7 +1,7 @@
 """The distribution of the time at which a run first leaves its bounds.
 
-With N runs of one length, no run is censored before its end, and the estimate of Kaplan and Meier
-of the survival function is the share of runs that have not left their bounds yet,
+All N runs have the same length, so no run is censored before its end.  The estimate of Kaplan and
+Meier of the survival function is then the share of runs that have not left their bounds yet,
 
     P(first exit <= t) = k(t) / N,   k(t) the number of runs with a first exit up to t.
 
@@ -24,7 +24,9 @@ if TYPE_CHECKING:
     from iblf_jax.studies.study import Study
 
 INSTANTS = 101
-"""Instants at which the distribution is given, if the caller does not say how many."""
+"""Default number of instants at which the distribution is given."""
+ROUNDING_STEPS = 4.0
+"""Largest rounding error of a time of a run, in units of the last place of its duration."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -32,17 +34,18 @@ class FirstExit:
     """The distribution of the first exit from the bounds, over the runs of a study."""
 
     times: np.ndarray
-    """Time of the first exit of each run that was made, (N,) [s]; infinite without an exit."""
+    """Time of the first exit of each run that was made, (N,) [s]; infinite without an exit, and the
+    end of the run for one that diverged before an exit was seen."""
     t: np.ndarray
     """Instants, (K,) [s]."""
     probability: np.ndarray
     """P(first exit <= t), (K,)."""
     low: np.ndarray
-    """Lower end of its interval, (K,); NaN where no interval is valid."""
+    """Lower end of its confidence interval, (K,); NaN where no interval is valid."""
     high: np.ndarray
-    """Upper end, (K,)."""
+    """Upper end of its confidence interval, (K,); NaN where no interval is valid."""
     confidence: float
-    """Of the interval at each instant."""
+    """Confidence of the interval at each instant."""
     diverged: int
     """Runs that diverged before an exit was seen; they count as exits at the end of the run."""
 
@@ -61,30 +64,40 @@ class FirstExit:
 def first_exit_of(study: Study, joint: int | None, instants: int, confidence: float) -> FirstExit:
     """The distribution of the first exit; arguments as `Study.first_exit`."""
     instants = checks.positive_integer("instants", instants, least=2)
-    name = "first_violation_time"
-    if joint is not None:
-        joint = checks.entry("joint", joint, study.scenario.n, "joints")
-        name = "first_exit_time"
-    if name not in study.metrics:
-        got, remedy = list(study.metrics), "Run the study with metrics=(ij.metrics.Margin(),)."
-        if joint is not None:
-            remedy = "Run the study with metrics=(ij.metrics.FirstExit(),)."
-        raise checks.fail("study.metrics", got, f"the metric {name}", remedy)
-    times = np.asarray(study.metrics[name], float)
-    if joint is not None:
-        times = times[:, joint]
-    diverged = has_flag(study.status, Status.NOT_FINITE) & ~np.isfinite(times)
-    times = np.where(diverged, study.duration, times)
+    recorded = _recorded_times(study, joint)
+    is_diverged = has_flag(study.status, Status.NOT_FINITE) & ~np.isfinite(recorded)
+    times = np.where(is_diverged, study.duration, recorded.astype(float))
+    # A time of a run has the precision of its numbers: that of the last step may exceed the end.
+    rounding = ROUNDING_STEPS * float(np.finfo(recorded.dtype).eps) * study.duration
     t = np.linspace(0.0, study.duration, instants)
-    found = [study.probability(times <= instant, confidence) for instant in t]
-    ends = [(p.low, p.high) for p in found]
-    low, high = np.array(ends, float).T
+    found = [study.probability(times <= instant + rounding, confidence) for instant in t]
     return FirstExit(
         times=times[study.made],
         t=t,
         probability=np.array([p.estimate for p in found]),
-        low=low,
-        high=high,
+        low=np.array([p.low for p in found], float),
+        high=np.array([p.high for p in found], float),
         confidence=confidence,
-        diverged=int(np.sum(diverged & study.made)),
+        diverged=int(np.sum(is_diverged & study.made)),
     )
+
+
+def _recorded_times(study: Study, joint: int | None) -> np.ndarray:
+    """The first exit of a joint, or of any joint if None, in each run, (N,) [s].
+
+    Raises:
+      ValueError: a study without the metric, or a number that is not that of a joint.
+    """
+    name = "first_violation_time"
+    metric = "Margin"
+    if joint is not None:
+        joint = checks.entry("joint", joint, study.scenario.n, "joints")
+        name = "first_exit_time"
+        metric = "FirstExit"
+    if name not in study.metrics:
+        remedy = f"Run the study with metrics=(ij.metrics.{metric}(),)."
+        raise checks.fail("study.metrics", list(study.metrics), f"the metric {name}", remedy)
+    times = np.asarray(study.metrics[name])
+    if joint is None:
+        return times
+    return times[:, joint]

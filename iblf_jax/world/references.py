@@ -8,7 +8,8 @@ q_d", and its derivative alpha' is continuous only if q_d" is.
 from __future__ import annotations
 
 import math
-from typing import ClassVar, Protocol
+import numbers
+from typing import Any, ClassVar, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -253,7 +254,8 @@ class Leader:
 
     Args:
       motion: x_0(t), any of `iblf_jax.references`, of m components.
-      weights: b_i with which each agent measures its position relative to the leader, N numbers.
+      weights: b_i with which each agent measures its position relative to the leader, N numbers,
+        >= 0.
       components: m, the number of components of an agent.
       offset: (H kron I) delta of a formation, () or (n,) [rad], with n = N m, in the unit of the
         positions; 0 if not given.
@@ -268,9 +270,15 @@ class Leader:
     offset: Leaf = leaf(POSITION, default=0.0)
 
     def check(self) -> None:
-        """Raises ValueError for something that is no reference, or no number of components."""
+        """Raises ValueError for a motion that is no reference, or weights or components that are
+        not valid.
+        """
         checks.conforms("Leader.motion", self.motion, Reference, "iblf_jax.references has them.")
         checks.positive_integer("Leader.components", self.components)
+        is_tuple = isinstance(self.weights, tuple) and len(self.weights) > 0
+        if not is_tuple or not all(map(_is_weight, self.weights)):
+            expected = "a tuple of finite numbers >= 0, one for each agent"
+            raise checks.fail("Leader.weights", self.weights, expected)
 
     @property
     def own_joints(self) -> dict[str, int]:
@@ -291,6 +299,11 @@ class Leader:
     def jump_times(self) -> jax.Array:
         """The times at which the motion jumps, (k,) [s]."""
         return jump_times_of("motion", self.motion)
+
+
+def _is_weight(value: Any) -> bool:
+    """Whether a value is a finite number >= 0."""
+    return isinstance(value, numbers.Real) and 0.0 <= float(value) < math.inf
 
 
 @memoised(32)

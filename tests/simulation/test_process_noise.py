@@ -3,6 +3,7 @@ program, known moments, and the statistics of the first exit."""
 
 from __future__ import annotations
 
+import dataclasses
 from typing import ClassVar
 
 import jax
@@ -280,6 +281,37 @@ def test_first_exit(study):
     assert float(replayed.metrics["end_q"][0]) == pytest.approx(
         float(study.metrics["end_q"][3, 0]), abs=1e-12
     )
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_an_exit_at_the_last_instant_counts_in_every_precision(study, dtype):
+    """k dt, rounded to the precision of a run, may exceed the end of the study."""
+    steps = round(study.duration / study.dt)
+    last = np.nextafter(dtype(steps * study.dt), dtype(np.inf))
+    times = np.full(len(study), np.inf, dtype)
+    times[:600] = last
+    metrics = dict(study.metrics) | {"first_violation_time": times}
+    found = dataclasses.replace(study, metrics=metrics).first_exit(instants=3)
+    np.testing.assert_allclose(found.probability, [0.0, 0.0, 600 / len(study)])
+
+
+def test_a_run_that_diverged_before_an_exit_counts_at_the_end(study):
+    times = np.full(len(study), np.inf)
+    times[0] = 1.0
+    status = np.zeros(len(study), np.int32)
+    status[:3] = int(ij.Status.NOT_FINITE)
+    metrics = dict(study.metrics) | {"first_violation_time": times}
+    found = dataclasses.replace(study, metrics=metrics, status=status).first_exit(instants=3)
+    assert found.diverged == 2
+    np.testing.assert_array_equal(found.times[:4], [1.0, 4.0, 4.0, np.inf])
+    np.testing.assert_allclose(found.probability * len(study), [0.0, 1.0, 3.0])
+
+
+@pytest.mark.parametrize(("joint", "metric"), [(None, "Margin"), (0, "FirstExit")])
+def test_first_exit_names_the_missing_metric(study, joint, metric):
+    bare = dataclasses.replace(study, metrics={})
+    with pytest.raises(ValueError, match=rf"ij\.metrics\.{metric}\(\)"):
+        bare.first_exit(joint=joint)
 
 
 # --- derivatives, files, certificates, refusals ---------------------------------------------------

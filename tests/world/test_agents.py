@@ -244,6 +244,10 @@ REFUSED = {
         lambda: plants.Agents(agents=("arm",), adjacency=((0,),), leader=(1,)),
         "a plant or a robot",
     ),
+    "weights of the leader": (
+        lambda: references.Leader(motion=MOTION, weights=(1.0, -1.0), components=1),
+        r"Leader\.weights.*finite numbers >= 0",
+    ),
     "no filters": (
         lambda: scenario(model=STACK.neighbours()),
         r"controller\.filter.*filter=0\.01",

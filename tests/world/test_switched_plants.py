@@ -146,6 +146,16 @@ def test_distribution_of_the_path():
             assert np.mean(modes[here] == j) == pytest.approx(share, abs=2.5 / np.sqrt(count))
 
 
+def test_a_rate_that_is_varied_alone_changes_the_dwell_time():
+    """A study varies q_ij without q_ii: the mean time in mode i is 1/sum_{j != i} q_ij."""
+    one = scenario_of(plants.MarkovSwitched(LINK, {"mass[0]": MASSES}, rates=Q, switches=1))
+    scenario = canonical(ij.with_parameters(one, {"plant.rates[0][1]": 9.0}))
+    keys = jax.vmap(lambda i: noise_key(jax.random.PRNGKey(3), i))(jnp.arange(4_000))
+    found = jax.jit(jax.vmap(lambda key: realised(scenario, key).plant))(keys.astype(float))
+    assert np.mean(found.times[:, 0]) == pytest.approx(0.1, rel=4 / np.sqrt(4_000))
+    assert np.mean(np.asarray(found.sequence)[:, 0] == 1) == pytest.approx(0.9, abs=0.02)
+
+
 def test_the_code_of_a_path_does_not_grow_with_its_switches():
     def size(switches):
         markov = plants.MarkovSwitched(LINK, {"mass[0]": MASSES}, rates=Q, switches=switches)
@@ -189,6 +199,8 @@ def test_every_run_of_a_study_has_a_path_of_its_own():
     [
         (lambda: plants.Switched(LINK, {"mass[0]": (1.0, 2.0)}, [0.5, 0.6]), "3 values"),
         (lambda: plants.Switched(LINK, {"weight": (1.0, 2.0)}, [0.5]), "path of a parameter"),
+        (lambda: plants.Switched(LINK, {"mass[0]": (1.0, -2.0)}, [0.5]), "positive values"),
+        (lambda: plants.MarkovSwitched(LINK, {"mass[0]": (1.0, 0.0)}, Q[:2, :2]), "positive"),
         (lambda: plants.Switched(LINK, {"mass[0]": (1.0, 2.0, 3.0)}, [0.6, 0.5]), "increasing"),
         (lambda: plants.Switched(3.0, {"mass[0]": (1.0, 2.0)}, [0.5]), "Robot"),
         (lambda: plants.Switched(LINK, {}, [0.5]), "parameters"),

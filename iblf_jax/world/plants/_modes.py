@@ -35,8 +35,8 @@ class ModeValues:
 
 
 def member_of_inner(part: Any, name: str) -> Any:
-    """`__getattr__` of a plant with modes: the members of the inner plant, such as names, units,
-    limits, and its methods.
+    """`__getattr__` of a plant with modes: a member that it does not define is that of the inner
+    plant, such as names, units, limits and methods.
     """
     if name.startswith("__") or name == "plant":
         raise AttributeError(name)
@@ -44,13 +44,17 @@ def member_of_inner(part: Any, name: str) -> Any:
 
 
 def fit_modes(part: Any) -> int:
-    """Fits `parameters` of a plant with modes under construction to its inner plant.
+    """Checks `plant` and `parameters` of a plant with modes, and stores the parameters as a tuple.
+
+    Args:
+      part: a `Switched` or `MarkovSwitched` under construction.
 
     Returns:
       The number of modes.
 
     Raises:
-      ValueError: something that is neither a robot nor a plant, or parameters that do not fit it.
+      ValueError: an inner plant that is neither a robot nor a plant, or parameters that do not fit
+        it.
     """
     owner = type(part).__name__
     _check_inner(owner, part.plant)
@@ -69,8 +73,8 @@ def _check_inner(owner: str, plant: Any) -> None:
 
 
 def _as_parameters(owner: str, plant: Any, parameters: Any) -> tuple[ModeValues, ...]:
-    """The parameters of a plant with modes as a tuple; ValueError for what does not fit the
-    plant.
+    """The parameters of a plant with modes as a tuple; ValueError for parameters that do not fit
+    the plant.
     """
     name = f"{owner}.parameters"
     if isinstance(parameters, dict):
@@ -85,12 +89,13 @@ def _as_parameters(owner: str, plant: Any, parameters: Any) -> tuple[ModeValues,
         except LookupError:
             expected = f"the path of a parameter of {type(plant).__name__}, such as mass[1]"
             raise checks.fail(name, part.path, expected) from None
-        of_mode = jnp.shape(part.values)[1:]
-        if jnp.ndim(part.values) == 0 or of_mode not in ((), jnp.shape(old)):
+        shape = jnp.shape(part.values)
+        if not shape or shape[1:] not in ((), jnp.shape(old)):
             expected = f"one value of shape {jnp.shape(old)} for each mode"
-            got = f"shape {jnp.shape(part.values)}"
+            got = f"shape {shape}"
             raise checks.fail(f"{name}[{part.path!r}]", got, expected)
-        changed(plant, part.path, part.values[0])
+        for value in part.values:
+            changed(plant, part.path, value)  # Raises for a value that the parameter may not have.
     counts = {len(part.values) for part in parameters}
     if len(counts) > 1:
         expected = "the same number of modes for every parameter"
@@ -103,13 +108,13 @@ def changed(plant: Any, path: str, value: jax.Array) -> Any:
     return replaced(plant, resolve(plant, path)[0], value, path, None)
 
 
-def in_turn(values: jax.Array, times: jax.Array, t: jax.Array) -> jax.Array:
-    """The value of which the turn is at time t: the first before times[0], then the next at each of
-    the times.
+def piecewise_constant(values: jax.Array, times: jax.Array, t: jax.Array) -> jax.Array:
+    """A function of time that is constant between switches: values[k] for t_k <= t < t_{k+1}, with
+    t_0 = -inf.
 
     Args:
       values: (k + 1, ...).
-      times: increasing, (k,) [s].
+      times: of the switches, t_1 ... t_k, increasing, (k,) [s].
       t: () [s].
     """
     found = values[0]
@@ -118,12 +123,12 @@ def in_turn(values: jax.Array, times: jax.Array, t: jax.Array) -> jax.Array:
     return found
 
 
-def of_mode(values: jax.Array, mode: jax.Array) -> jax.Array:
-    """The value of a mode, a whole number of floating-point type.
+def value_of_mode(values: jax.Array, mode: jax.Array) -> jax.Array:
+    """The value of a mode, values[mode].
 
     Args:
       values: (modes, ...).
-      mode: () [1].
+      mode: from 0, a whole number of floating-point type, () [1].
     """
     found = values[0]
     for k in range(1, len(values)):
@@ -136,10 +141,11 @@ SWITCHING_UNITS = {"switches": "1", "shortest_dwell_time": "s", "mean_dwell_time
 
 
 def switching_results(times: jax.Array, end: jax.Array) -> dict[str, jax.Array]:
-    """How often a run switches, and the shortest and the mean time in a mode.
+    """The number of switches of a run, and its shortest and its mean dwell time.
 
-    The time before the first switch counts, that after the last one, which the end of the run cuts
-    off, does not.  Both times are infinite for a run without switches.
+    A dwell time is the time between two switches, or from the start to the first switch.  The time
+    from the last switch to the end does not count, as the end of the run cuts it off.  Both dwell
+    times are infinite for a run without switches.
 
     Args:
       times: increasing, (k,) [s].

@@ -76,8 +76,8 @@ class Agents:
     leader: tuple[float, ...] = static()
 
     def check(self) -> None:
-        """Makes plants of robots; raises ValueError for agents that do not fit together, or that
-        the leader does not reach.
+        """Replaces robots by `Rigid` plants; raises ValueError for agents that do not fit together
+        or to which no path leads from the leader.
         """
         if not isinstance(self.agents, tuple | list) or not self.agents:
             raise checks.fail("Agents.agents", self.agents, "a tuple of plants or robots")
@@ -120,13 +120,15 @@ class Agents:
         return tuple(tuple(row) for row in H.tolist())
 
     def relative_positions(self, positions: Any) -> jax.Array:
-        """Y = (H kron I) p, (..., N m), of the agents' positions p, (..., N, m)."""
+        """The relative positions y = (H kron I) p, (..., N m), of the agents at p, (..., N, m)."""
         p = jnp.asarray(positions)
         rows = sparse.times(self.matrix, [p[..., i, :] for i in range(len(self.agents))])
         return jnp.concatenate(rows, axis=-1)
 
     def positions(self, relative: Any) -> jax.Array:
-        """P = (H kron I)^-1 y, (..., N, m), of the first level y, (..., N m), such as `run.q`."""
+        """The positions p = (H kron I)^-1 y, (..., N, m), of the first level y, (..., N m), such as
+        `run.q`.
+        """
         return jnp.stack(self._positions(jnp.asarray(relative)), axis=-2)
 
     def reference(self, leader: Reference, offsets: Any = 0.0) -> Leader:
@@ -145,11 +147,11 @@ class Agents:
         return NeighbourModel(self)
 
     def _positions(self, y: jax.Array) -> list[jax.Array]:
-        """P of each agent, (..., m)."""
+        """The position of each agent, (..., m)."""
         return sparse.solve(self.matrix, self._parts(y))
 
     def _parts(self, v: Any) -> list[Any]:
-        """The components of each agent in a vector of the stack; a number is that of all agents."""
+        """The components of each agent in a vector of the stack; a scalar applies to all agents."""
         if jnp.ndim(v) == 0:
             return [v] * len(self.agents)
         m = self.agents[0].n
@@ -272,7 +274,9 @@ class Agents:
         return self._steady("steady_input", axis=0)
 
     def _steady(self, name: str, axis: int) -> Callable[..., jax.Array] | None:
-        """A method of q, or of q and q', for the stack, from those of the agents."""
+        """A method of the agents, called with their q, or q and q', as a method of the stack; None
+        where an agent does not have it.
+        """
         methods = [plant_member(agent, name) for agent in self.agents]
         if None in methods:
             return None
@@ -286,7 +290,7 @@ class Agents:
 
     def weights(self, x: jax.Array) -> jax.Array:
         """The scales of the agents' energies, (order, n), that of y divided by H_ii^2: with p_i
-        alone, y_i is H_ii p_i.  An agent that states none has 1.
+        alone, y_i is H_ii p_i.  An agent without the method has 1.
         """
         columns = []
         for i, (agent, z) in enumerate(zip(self.agents, self._states(x), strict=True)):
@@ -332,7 +336,7 @@ class NeighbourModel:
     needs_filters: ClassVar[bool] = True
 
     def check(self) -> None:
-        """Raises ValueError for something that is no `Agents`."""
+        """Raises ValueError for a stack that is not an `Agents`."""
         if not isinstance(self.stack, Agents):
             raise checks.fail("NeighbourModel.stack", self.stack, "an Agents")
 
@@ -426,7 +430,7 @@ class NeighbourModel:
         return -jnp.concatenate(parts)
 
     def steady_input(self, q: jax.Array) -> jax.Array:
-        """The input that holds the agents at y, (n,); 0 where an agent does not state it."""
+        """The input that holds the agents at y, (n,); 0 if an agent has no such method."""
         of_stack = self.stack.steady_input
         return jnp.zeros_like(q) if of_stack is None else of_stack(q)
 

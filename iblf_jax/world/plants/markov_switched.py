@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any, ClassVar
 
 import jax
@@ -17,16 +18,16 @@ from iblf_jax.world.plants._modes import (
     RobotOrPlant,
     changed,
     fit_modes,
-    in_turn,
     member_of_inner,
-    of_mode,
+    piecewise_constant,
     switching_results,
+    value_of_mode,
 )
 
 MOST_SWITCHES = 64
-"""Largest number of switches of a run; each is written out in the compiled program."""
+"""Largest `switches`; the compiled step compares the time with every switching time."""
 ROUNDING = 1e-6
-"""Largest sum of a row of the rates, relative to their size."""
+"""Largest sum of a row of the rates, relative to the largest rate."""
 
 
 @component
@@ -35,21 +36,22 @@ class MarkovSwitched:
 
     A run draws its path from its key, as a sensor draws its noise: the time in mode i has an
     exponential distribution with the mean -1/q_ii, and the next mode is j with the probability
-    -q_ij/q_ii.  Every run of a study has a path of its own.  Derivatives of a run are those for its
-    path; that by `rates` is 0.  A run that would have more than `switches` switches is flagged
-    MODES_EXHAUSTED.
+    -q_ij/q_ii.  Every run of a study has a path of its own.  Derivatives of a run are pathwise, so
+    that the derivative with respect to `rates` is 0.  A run that would have more than `switches`
+    switches stays in its last mode and is flagged MODES_EXHAUSTED.
 
     Args:
       plant: any of `iblf_jax.robots` or `iblf_jax.plants`; the default model of a scenario.
       parameters: path of a parameter of the plant -> its value in each of M modes, such as
         {"mass[1]": (0.85, 1.5)}.
-      rates: Q, (M, M) [1/s]: q_ij >= 0 of the switch from mode i to mode j, and rows of sum 0.
+      rates: Q, (M, M) [1/s]: q_ij >= 0 of the switch from mode i to mode j, and rows of sum 0.  A
+        run uses the rates with i != j only, so that a study may vary one of them alone.
       start: mode at t = 0, from 0; 0 if not given.
       switches: largest number of switches in a run; 16 if not given.
       times: of the switches of a run, shape (m,) with m = switches + 1 [s], > 0; none if not given.
         Every run replaces them.
-      sequence: mode after each of them, shape (m,) [1], >= 0; `start` if not given.  Every run
-        replaces it.
+      sequence: mode after each of the switches, shape (m,) [1], >= 0; `start` if not given.  Every
+        run replaces it.
 
     Source: O. L. V. Costa, M. D. Fragoso, M. G. Todorov, Continuous-Time Markov Jump Linear
       Systems, 2013, chapter 2; the path by D. T. Gillespie, J. Physical Chemistry 81 (1977) 2340.
@@ -80,7 +82,7 @@ class MarkovSwitched:
             checks.shape_is(f"MarkovSwitched.{name}", given, shape)
 
     def _check_rates(self, modes: int) -> None:
-        """Raises ValueError for a matrix that is not one of rates."""
+        """Raises ValueError for `rates` that are no transition rate matrix."""
         name = "MarkovSwitched.rates"
         checks.shape_is(name, self.rates, (modes, modes))
         if not checks.is_concrete(self.rates):
@@ -99,25 +101,30 @@ class MarkovSwitched:
 
     @property
     def mode_draws(self) -> int:
-        """Pairs of random numbers of a path: one a switch, and one for the switch after them."""
+        """Number of pairs of random numbers of a path: one for each of `switches`, and one for the
+        next switch, which shows whether the path is complete.
+        """
         return self.switches + 1
 
     def with_path(self, uniforms: jax.Array) -> MarkovSwitched:
-        """The plant with the path of a run.
+        """The plant with the switching times and modes of a run.
 
         Args:
-          uniforms: independent numbers between 0 and 1, (switches + 1, 2).
+          uniforms: independent and uniform between 0 and 1, (switches + 1, 2).  The first of a pair
+            gives the dwell time, -log(u)/|q_ii|, the second one the next mode.
         """
         Q = jax.lax.stop_gradient(self.rates)
+        # A replaced rate does not change the diagonal: the rate of leaving is a sum of the others.
+        to_others = jnp.where(np.eye(len(Q), dtype=bool), 0.0, Q)
 
         def switch(before, pair):
             t, mode = before
-            row = of_mode(Q, mode)
-            leaving = -of_mode(jnp.diagonal(Q), mode)
+            row = value_of_mode(to_others, mode)
+            leaving = jnp.sum(row)
             is_final = ~(leaving > 0)
             rate = jnp.where(is_final, 1.0, leaving)
             t = jnp.where(is_final, NEVER, jnp.minimum(t - jnp.log(pair[0]) / rate, NEVER))
-            mode = jnp.where(is_final, mode, _next_mode(row, mode, pair[1] * rate, len(Q)))
+            mode = jnp.where(is_final, mode, _next_mode(row, pair[1] * rate))
             return (t, mode), (t, mode)
 
         # Written out, XLA repeats the earlier switches in the code of every later one.
@@ -127,17 +134,19 @@ class MarkovSwitched:
 
     def _with(self, times: jax.Array, sequence: jax.Array) -> MarkovSwitched:
         """A copy with another path, without checks: its numbers may be traced."""
-        leaves, structure = jax.tree.flatten(self)
-        return jax.tree.unflatten(structure, [*leaves[:-2], times, sequence])
+        new = copy.copy(self)
+        object.__setattr__(new, "times", times)
+        object.__setattr__(new, "sequence", sequence)
+        return new
 
     def at(self, t: jax.Array) -> Any:
         """The inner plant with its parameters at time t [s]."""
         start = jnp.full((1,), self.start, self.sequence.dtype)
-        every = jnp.concatenate([start, self.sequence[:-1]])
-        mode = in_turn(every, self.times[:-1], t)
+        modes = jnp.concatenate([start, self.sequence[:-1]])
+        mode = piecewise_constant(modes, self.times[:-1], t)
         plant = self.plant
         for part in self.parameters:
-            plant = changed(plant, part.path, of_mode(part.values, mode))
+            plant = changed(plant, part.path, value_of_mode(part.values, mode))
         return as_at(plant, t)
 
     def jump_times(self) -> jax.Array:
@@ -153,18 +162,22 @@ class MarkovSwitched:
         return self.times[-1] >= end
 
 
-def _next_mode(row: jax.Array, mode: jax.Array, level: jax.Array, modes: int) -> jax.Array:
-    """The mode at which the sum of the rates to the modes up to it first exceeds a level."""
+def _next_mode(row: jax.Array, level: jax.Array) -> jax.Array:
+    """The next mode: the first k with sum_{j <= k} row_j > level.
+
+    Args:
+      row: rates to other modes, and 0 for the present mode, (modes,) [1/s].
+      level: uniform between 0 and the sum of the row, () [1/s].
+    """
     total = jnp.zeros_like(level)
-    last = found = mode
+    found = jnp.zeros_like(level)
+    last = jnp.zeros_like(level)
     is_found = jnp.zeros((), bool)
-    for k in range(modes):
-        is_other = jnp.abs(mode - k) > 0.5
-        weight = jnp.where(is_other, row[k], 0.0)
-        total = total + weight
-        here = is_other & (total > level) & ~is_found
-        found = jnp.where(here, float(k), found)
-        is_found = is_found | here
-        last = jnp.where(weight > 0, float(k), last)
+    for k in range(len(row)):
+        total = total + row[k]
+        is_first = (total > level) & ~is_found
+        found = jnp.where(is_first, float(k), found)
+        is_found = is_found | is_first
+        last = jnp.where(row[k] > 0, float(k), last)
     # Rounding may leave the sum of all rates below the level.
     return jnp.where(is_found, found, last)

@@ -15,8 +15,8 @@ from iblf_jax.world.plants._modes import (
     changed,
     check_times,
     fit_modes,
-    in_turn,
     member_of_inner,
+    piecewise_constant,
     switching_results,
 )
 
@@ -25,10 +25,10 @@ from iblf_jax.world.plants._modes import (
 class Switched:
     """x' = f_s(t, x, u) with s = k for t_k <= t < t_{k+1}: parameters that jump at times t_k.
 
-    The state does not jump.  A step of a run is divided at the times, and the trajectory has
-    derivatives by them.  The plant has all members of the inner plant, with its own parameters:
-    those of the modes hold for the simulated motion only (`at`).  The default model of a scenario
-    is the inner plant.
+    The state does not jump.  A step of a run is divided at the times, and the derivatives of a
+    trajectory with respect to them are exact.  All members of the inner plant are members of this
+    one and use the inner plant's parameters.  The values of the modes apply to the simulated motion
+    only (`at`).  The default model of a scenario is the inner plant.
 
     Args:
       plant: any of `iblf_jax.robots` or `iblf_jax.plants`.
@@ -63,7 +63,7 @@ class Switched:
         """The inner plant with its parameters at time t [s]."""
         plant = self.plant
         for part in self.parameters:
-            plant = changed(plant, part.path, in_turn(part.values, self.times, t))
+            plant = changed(plant, part.path, piecewise_constant(part.values, self.times, t))
         return as_at(plant, t)
 
     def jump_times(self) -> jax.Array:
@@ -75,5 +75,5 @@ class Switched:
         return switching_results(self.times, end)
 
     def has_complete_path(self, end: jax.Array) -> jax.Array:
-        """Whether all switches until `end` are known, () bool: always."""
+        """True, () bool: the plant states all of its switches."""
         return end >= 0

@@ -18,7 +18,7 @@ from iblf_jax.core.optional import OptionalMembers
 from iblf_jax.core.units import ByLevel, PlantUnit
 
 MOST_SUBSTEPS = 1024
-"""Largest number of increments in a step; they are written out in the compiled step."""
+"""Largest `substeps`; the compiled step contains the code of each increment."""
 
 
 class ProcessNoise(Protocol):
@@ -27,8 +27,9 @@ class ProcessNoise(Protocol):
     A member may have further attributes; `noise_member` holds their defaults.
 
     - `additive`: whether `diffusion` does not depend on x.  Methods of strong order 1 need it.
-    - `substeps`: the increment of a step is the sum of so many increments.  Runs whose time steps
-      are in the ratio of their `substeps` have the same Brownian path at their common instants.
+    - `substeps`: the increment of a step is the sum of this number of independent increments.  Runs
+      whose time steps are in the ratio of their `substeps` have the same Brownian path at their
+      common instants.
     """
 
     @property
@@ -37,7 +38,8 @@ class ProcessNoise(Protocol):
         ...
 
     def diffusion(self, t: jax.Array, x: jax.Array) -> jax.Array:
-        """Sigma of each level with noise, (m, n), in the unit of the level per sqrt(s).
+        """The intensity sigma of each level with noise, (m, n), in the unit of the level per
+        sqrt(s).
 
         Args:
           t: time, () [s].
@@ -51,8 +53,8 @@ noise_member = OptionalMembers(additive=False, substeps=1)
 
 
 def check_structure(noise: Any) -> None:
-    """Raises ValueError for levels that are not increasing whole numbers from 1 on, or a number of
-    substeps that is none.
+    """Raises ValueError for levels that are not increasing whole numbers >= 1, or `substeps` that
+    is not a whole number from 1 to `MOST_SUBSTEPS`.
     """
     name = type(noise).__name__
     levels = noise.levels
@@ -68,15 +70,17 @@ def check_structure(noise: Any) -> None:
 
 
 def intensity_unit(levels: tuple[int, ...], of_state: bool = True) -> ByLevel:
-    """The unit of an intensity of these levels: that of each level per sqrt(s), or 1/sqrt(s)."""
+    """The unit of the intensity on each level: that of the level per sqrt(s), or, of an intensity
+    relative to the state (`of_state` False), 1/sqrt(s).
+    """
     if not of_state:
         return ByLevel("1/s^0.5" for _ in levels)
     return ByLevel(PlantUnit("1/s^0.5", f"x{level}/s^0.5") for level in levels)
 
 
 def check_rows(name: str, value: Any, levels: tuple[int, ...]) -> None:
-    """Raises ValueError for a leaf that has neither one number nor one row for each level."""
+    """Raises ValueError for a leaf that is neither one number nor one row for each level."""
     if value.ndim and len(value) != len(levels):
-        expected = f"one number, or {len(levels)} rows, one a level of {tuple(levels)}"
+        expected = f"one number, or {len(levels)} rows, one for each of the levels {tuple(levels)}"
         remedy = "Such as intensity=[[0.3, 0.2]] for one level of two joints."
         raise checks.fail(name, value, expected, remedy)

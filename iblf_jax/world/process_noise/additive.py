@@ -20,7 +20,7 @@ class Additive:
         in the unit of the level per sqrt(s) [1/s^0.5], >= 0.
       levels: the levels with noise, counted from 1; the second, of a robot the acceleration, if not
         given.
-      substeps: increments in a step; 1 if not given.
+      substeps: number of Brownian increments whose sum is that of a step; 1 if not given.
 
     Source: P. E. Kloeden, E. Platen, Numerical Solution of Stochastic Differential Equations, 1992,
       section 10.2.
@@ -32,7 +32,9 @@ class Additive:
     additive: ClassVar[bool] = True
 
     def check(self) -> None:
-        """Raises ValueError for levels that are none, or rows that do not fit them."""
+        """Raises ValueError for `levels` or `substeps` that are not valid, or rows that do not fit
+        the levels.
+        """
         check_structure(self)
         check_rows("Additive.intensity", self.intensity, self.levels)
 

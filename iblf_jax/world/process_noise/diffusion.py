@@ -15,16 +15,16 @@ from iblf_jax.world.process_noise._base import check_structure
 class Diffusion:
     """sigma = diffusion(t, x): white noise whose intensity varies with the time or the state.
 
-    The function is structure: a new one compiles anew.  Noise whose numbers are to be swept or
-    tuned is a class with `levels` and the method `diffusion`, whose numbers are leaves
-    (`iblf_jax.component`).
+    The function is part of the structure: a run with another function is compiled again.  To sweep
+    or tune numbers of the noise, write a class with `levels` and the method `diffusion` whose
+    numbers are leaves (`iblf_jax.component`).
 
     Args:
       diffusion: function (t, x) -> sigma, (m, n), of the time [s] and the state (r, n), a row for
-        each of `levels`.
+        each of the m `levels` in the unit of the level per sqrt(s).
       levels: the levels with noise, counted from 1; the second if not given.
       additive: whether `diffusion` does not depend on x; False if not given.
-      substeps: increments in a step; 1 if not given.
+      substeps: number of Brownian increments whose sum is that of a step; 1 if not given.
 
     Source: P. E. Kloeden, E. Platen, Numerical Solution of Stochastic Differential Equations, 1992,
       section 4.8.
@@ -36,7 +36,9 @@ class Diffusion:
     substeps: int = static(default=1)
 
     def check(self) -> None:
-        """Raises ValueError for something that is no function, or levels that are none."""
+        """Raises ValueError for a `diffusion` that is not a function, or other fields that are not
+        valid.
+        """
         if not callable(self.diffusion):
             expected = "a function (t, x) -> an array"
             raise checks.fail("Diffusion.diffusion", self.diffusion, expected)
