@@ -39,7 +39,6 @@ def estimate_of_draws(z: np.ndarray, margins: np.ndarray, confidence: float) -> 
     made = ~np.isnan(margins)
     z, margins = z[made], margins[made]
     runs = len(margins)
-    samples = Samples(z, margins, np.ones(runs))
     failed = margins <= 0
     count = int(np.sum(failed))
     notes: tuple[str, ...] = ()
@@ -48,10 +47,9 @@ def estimate_of_draws(z: np.ndarray, margins: np.ndarray, confidence: float) -> 
     if not count:
         bound = upper_bound(runs, confidence) if runs else 1.0
         level = Level(0.0, 0.0, margins, np.inf, 1.0)
-        method = "no failure in independent draws"
         nothing = Samples.none(z.shape[1])
         return Estimate(
-            bound, 0.0, bound, np.inf, (level,), nothing, samples, 1.0, method, 0.0, notes
+            bound, 0.0, bound, np.inf, (level,), nothing, nothing, 1.0, "monte_carlo", 0.0, notes
         )
     p = count / runs
     variation = float(np.sqrt((1 - p) / count))
@@ -65,9 +63,9 @@ def estimate_of_draws(z: np.ndarray, margins: np.ndarray, confidence: float) -> 
         coefficient_of_variation=variation,
         levels=(level,),
         failures=failures,
-        nearby=samples,
-        nearby_probability=1.0,
-        interval_method="Clopper-Pearson",
+        nearby=failures,
+        nearby_probability=p,
+        method="monte_carlo",
         effective_samples=float(count),
         notes=notes,
     )

@@ -1,8 +1,10 @@
 """Design points: the failures nearest to the origin of standard normal coordinates, which are the
 most likely ones, by gradients.
 
-The margin of a run is the least of m pieces, one for each joint and side, each smooth in z.  For
-each piece y_j one search from each start solves
+The margin of a run is the least of m pieces, one for each joint, side and
+window of time, each smooth in z.  For
+each piece y_j a search from the origin, and from each known failure at which y_j is the
+least piece, solves
 
     minimise |z|^2 / 2    subject to    y_j(z) = 0
 
@@ -53,31 +55,32 @@ PiecesOf = Callable[[np.ndarray], Pieces]
 """Points z, (S, d) -> the pieces of their margins; NaN for points that cannot be run."""
 
 
-def design_points(pieces_of: PiecesOf, starts: np.ndarray) -> tuple[np.ndarray, int]:
+def design_points(pieces_of: PiecesOf, failures: np.ndarray) -> tuple[np.ndarray, int]:
     """The design points, nearest first, (K, d), and the number of evaluations.
 
     Args:
       pieces_of: pieces of the margins of points and their gradients.
-      starts: (S, d); each is the start of one search for each piece.
+      failures: known failures, (F, d); there may be none.  For each piece a search starts at the
+        origin, and one at each failure for the piece that is least there.
     """
+    starts = np.concatenate([np.zeros((1, failures.shape[1])), failures])
     first = pieces_of(starts)
     count = first.margins.shape[1]
-    z = np.repeat(starts, count, axis=0)
-    piece = np.tile(np.arange(count), len(starts))
-    search = _Search(z, piece, first.margins.reshape(-1), _flat(first.gradients))
+    known = 1 + np.flatnonzero(np.all(np.isfinite(first.margins[1:]), axis=1))
+    start = np.concatenate([np.zeros(count, int), known])
+    piece = np.concatenate([np.arange(count), np.argmin(first.margins[known], axis=1)])
+    search = _Search(
+        starts[start], piece, first.margins[start, piece], first.gradients[start, piece]
+    )
     evaluations = len(starts)
     for _ in range(ITERATIONS):
         if not np.any(search.active):
             break
-        trial = search.trial()
-        found = pieces_of(trial)
-        search.accept(trial, found)
+        active = np.flatnonzero(search.active)
+        trial = search.trial(active)
+        search.accept(active, trial, pieces_of(trial))
         evaluations += len(trial)
     return distinct_points(search.z[search.converged]), evaluations
-
-
-def _flat(gradients: np.ndarray) -> np.ndarray:
-    return gradients.reshape(-1, gradients.shape[-1])
 
 
 class _Search:
@@ -104,44 +107,41 @@ class _Search:
             distance = np.abs(self.margin) / size
         return np.isfinite(self.margin) & np.isfinite(distance) & (size > 0)
 
-    def _full_step(self) -> np.ndarray:
-        a = self.gradient
-        length = np.sum(a * a, axis=1)
+    def trial(self, rows: np.ndarray) -> np.ndarray:
+        """The next points of these searches, (k, d)."""
+        a, z = self.gradient[rows], self.z[rows]
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-            factor = (np.sum(a * self.z, axis=1) - self.margin) / length
+            factor = (np.sum(a * z, axis=1) - self.margin[rows]) / np.sum(a * a, axis=1)
             target = factor[:, None] * a
             radius = np.linalg.norm(target, axis=1)
             target *= np.minimum(1.0, LARGEST_RADIUS / radius)[:, None]
-        return np.where(np.isfinite(target), target, self.z) - self.z
+        step = np.where(np.isfinite(target), target, z) - z
+        return z + self.fraction[rows, None] * step
 
-    def trial(self) -> np.ndarray:
-        """The next points, (S, d); those of searches that have ended are where they ended."""
-        step = self.fraction[:, None] * self._full_step()
-        return np.where(self.active[:, None], self.z + step, self.z)
+    def accept(self, rows: np.ndarray, trial: np.ndarray, found: Pieces) -> None:
+        """Accepts trials of these searches that decrease the merit, halves the other steps.
 
-    def _merit(self, z: np.ndarray, margin: np.ndarray) -> np.ndarray:
-        """|z|^2 / 2 + c |y|, with c twice the least for which the step is one of descent."""
-        size = np.linalg.norm(self.gradient, axis=1)
-        reach = np.maximum(np.linalg.norm(self.z, axis=1), 1.0)
-        with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-            return 0.5 * np.sum(z * z, axis=1) + 2 * reach / size * np.abs(margin)
-
-    def accept(self, trial: np.ndarray, found: Pieces) -> None:
-        """Accepts trials that decrease the merit, halves the other steps."""
-        rows = np.arange(len(trial))
-        margin = found.margins[rows, self.piece]
-        gradient = found.gradients[rows, self.piece]
-        better = self.active & (self._merit(trial, margin) < self._merit(self.z, self.margin))
-        step = np.linalg.norm(trial - self.z, axis=1)
-        moved_little = step <= TOLERANCE * np.maximum(1.0, np.linalg.norm(trial, axis=1))
-        at_surface = np.abs(np.where(better, margin, self.margin)) <= self.tolerance
-        self.z = np.where(better[:, None], trial, self.z)
-        self.gradient = np.where(better[:, None], gradient, self.gradient)
-        self.margin = np.where(better, margin, self.margin)
-        self.fraction = np.where(better, 1.0, 0.5 * self.fraction)
-        has_ended = (moved_little & better) | (self.fraction < 0.5**HALVINGS) | moved_little
-        self.converged |= self.active & has_ended & at_surface
-        self.active &= ~has_ended & self._has_direction()
+        The merit is |z|^2 / 2 + c |y|, with c twice the least for which the step is one of descent.
+        """
+        own = np.arange(len(rows)), self.piece[rows]
+        margin, gradient = found.margins[own], found.gradients[own]
+        z = self.z[rows]
+        slope = np.linalg.norm(self.gradient[rows], axis=1)
+        c = 2 * np.maximum(np.linalg.norm(z, axis=1), 1.0) / slope
+        before = 0.5 * np.sum(z * z, axis=1) + c * np.abs(self.margin[rows])
+        after = 0.5 * np.sum(trial * trial, axis=1) + c * np.abs(margin)
+        better = after < before  # False for NaN
+        step = np.linalg.norm(trial - z, axis=1)
+        has_stopped = step <= TOLERANCE * np.maximum(1.0, np.linalg.norm(trial, axis=1))
+        taken = rows[better]
+        self.z[taken] = trial[better]
+        self.margin[taken] = margin[better]
+        self.gradient[taken] = gradient[better]
+        self.fraction[rows] = np.where(better, 1.0, 0.5 * self.fraction[rows])
+        has_ended = has_stopped | (self.fraction[rows] < 0.5**HALVINGS)
+        at_surface = np.abs(self.margin[rows]) <= self.tolerance
+        self.converged[rows] = has_ended & at_surface
+        self.active[rows] = ~has_ended & self._has_direction()[rows]
 
 
 def distinct_points(points: np.ndarray) -> np.ndarray:

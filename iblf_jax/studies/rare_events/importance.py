@@ -6,8 +6,9 @@ Samples come from a mixture of standard normal distributions around the K design
 
 with weights alpha_k proportional to Phi(-|z_k|), but at least `LEAST_SHARE` / K.  The estimate is
 unbiased whatever the points are.  How good it is follows from the weights of the failures: the
-effective number of samples is (sum w)^2 / sum w^2.  The shape k of a generalised Pareto distribution
-that is fitted to the largest weights shows whether their variance exists: for k > 1/2 it does not.
+effective number of samples is (sum w)^2 / sum w^2.  The shape k of a generalised Pareto
+distribution that is fitted to the largest weights shows whether their variance exists: for
+k > 1/2 it does not.
 An estimate with few effective samples, one dominating weight or k above 1/2 is flagged as
 degenerate; a failure region that bends towards the origin has such weights.
 
@@ -86,13 +87,12 @@ def importance_sampling(
     p = float(np.mean(contributions))
     made = ~np.isnan(margins)
     samples = Samples(z[failed], margins[failed], weights[failed])
-    nearby = Samples(z[made], margins[made], weights[made])
     if not np.any(failed):
         bound = upper_bound(float(np.sum(made)), confidence)
         level = Level(0.0, 0.0, margins[made], np.inf, 1.0)
         notes: tuple[str, ...] = (NONE_FAILED,)
         return Estimate(
-            bound, 0.0, bound, np.inf, (level,), samples, nearby, 1.0, "none failed", 0.0, notes
+            bound, 0.0, bound, np.inf, (level,), samples, samples, 1.0, "importance", 0.0, notes
         )
     effective = float(np.sum(contributions)) ** 2 / float(np.sum(contributions**2))
     largest = float(np.max(contributions) / np.sum(contributions))
@@ -109,9 +109,9 @@ def importance_sampling(
         coefficient_of_variation=variation,
         levels=(Level(0.0, p, margins[made], variation, 1.0),),
         failures=samples,
-        nearby=nearby,
-        nearby_probability=1.0,
-        interval_method="log-normal",
+        nearby=samples,
+        nearby_probability=p,
+        method="importance",
         effective_samples=effective,
         notes=notes,
     )

@@ -67,10 +67,12 @@ class Estimate(NamedTuple):
     failures: Samples
     """The samples that failed."""
     nearby: Samples
-    """Samples of the last level before failures, with which a changed limit state is assessed."""
+    """Samples with which a changed limit state is assessed: those of the last level of subset
+    simulation, or the failures."""
     nearby_probability: float
-    """Probability of that level."""
-    interval_method: str
+    """Estimated probability of the set that they are samples of."""
+    method: str
+    """"subset", "importance" or "monte_carlo"."""
     effective_samples: float
     """Number of equally weighted independent failures with the same information."""
     notes: tuple[str, ...] = ()
@@ -87,7 +89,7 @@ def log_normal_interval(
 ) -> tuple[float, float]:
     """The interval of an estimate whose logarithm is normal, from its coefficient of variation.
 
-        p exp(+-Phi^-1((1 + confidence) / 2) sqrt(log(1 + variation^2)))
+    p exp(+-Phi^-1((1 + confidence) / 2) sqrt(log(1 + variation^2)))
     """
     from scipy.special import ndtri
 
@@ -111,6 +113,6 @@ def binomial_interval(count: float, runs: float, confidence: float) -> tuple[flo
 def upper_bound(runs: float, confidence: float) -> float:
     """The largest probability with which no event in so many independent runs is plausible.
 
-        1 - (1 - confidence)^(1 / runs)
+    1 - (1 - confidence)^(1 / runs)
     """
     return float(-np.expm1(np.log1p(-confidence) / max(runs, 1.0)))
