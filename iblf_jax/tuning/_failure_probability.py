@@ -48,8 +48,8 @@ from iblf_jax.studies.rare_events.subset import subset_simulation
 from iblf_jax.studies.statistics import check_confidence
 from iblf_jax.studies.study_setup import prepare
 from iblf_jax.studies.summaries import initial_margins
-from iblf_jax.tuning.margins import MARGINS, pieces_of_margins
-from iblf_jax.tuning.quantities import DEFICITS, Peak
+from iblf_jax.tuning.margins import pieces_of_margins
+from iblf_jax.tuning.quantities import DEFICITS, SIGNAL_OF_MARGIN, Peak
 from iblf_jax.tuning.rollouts import WINDOWS
 from iblf_jax.tuning.runs import in_groups
 
@@ -94,6 +94,10 @@ MISSED = (
     "Subset simulation gave {subset:.3g} and missed failures near a design point, because its"
     " levels went towards other failures; importance sampling around the design points is"
     " reported instead."
+)
+NOT_REACHED = (
+    "Subset simulation reached no failure (upper bound {subset:.2g}); importance sampling around"
+    " the design points is reported instead."
 )
 
 
@@ -265,7 +269,7 @@ class PiecesOfMargin:
         one: Any = 1.0
         run = prepared.options
         windows: Any = np.arange(1, WINDOWS) / WINDOWS * run.duration
-        self.peak = astype(Peak(one, MARGINS[options.margin], windows=windows), self.dtype)
+        self.peak = astype(Peak(one, SIGNAL_OF_MARGIN[options.margin], windows=windows), self.dtype)
         self.request = RunRequest.of(
             prepared.scenario, steps=run.steps, method=run.method, backend=run.backend
         )
@@ -362,9 +366,11 @@ def _checked_by_importance(
     if not len(points) or len(estimate.levels) == 1:
         return estimate, points
     second = _around(space, options, points, CHECK_RUNS)
-    if second.is_upper_bound or second.low <= estimate.high:
+    if second.is_upper_bound or (not estimate.is_upper_bound and second.low <= estimate.high):
         return estimate, points
     note = MISSED.format(subset=estimate.probability)
+    if estimate.is_upper_bound:
+        note = NOT_REACHED.format(subset=estimate.probability)
     return second._replace(notes=(note, *second.notes)), points
 
 
@@ -402,7 +408,7 @@ def _result(
     space: NormalSpace, options: FailureOptions, found: _Found, settings: dict[str, Any]
 ) -> FailureProbability:
     estimate = found.estimate
-    unit = unit_text(space.prepared.scenario, DEFICITS[MARGINS[options.margin]])
+    unit = unit_text(space.prepared.scenario, DEFICITS[SIGNAL_OF_MARGIN[options.margin]])
     notes = list(estimate.notes)
     if found.nominal <= 0:
         notes.insert(0, NOMINAL_FAILS.format(margin=found.nominal, unit=unit))

@@ -43,9 +43,9 @@ from iblf_jax.simulation.scenario import Scenario, canonical, fitted_to_step
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.perturbation_cube import Cube, unit_cube
 from iblf_jax.tuning.evaluation import Derivatives, Value
-from iblf_jax.tuning.margins import MARGINS, pieces_of_margins
+from iblf_jax.tuning.margins import pieces_of_margins
 from iblf_jax.tuning.parameters import Box
-from iblf_jax.tuning.quantities import DEFICITS, Peak
+from iblf_jax.tuning.quantities import DEFICITS, SIGNAL_OF_MARGIN, Peak
 from iblf_jax.tuning.runs import NUMBERS_A_RUN
 from iblf_jax.tuning.solvers import SQP, SearchSpace
 
@@ -161,9 +161,9 @@ def falsify(
     seed = checks.seed(seed)
     cube = unit_cube(scenario, perturbations)
     checks.fits_memory("starts", starts, 8.0 * (1 + cube.size) * NUMBERS_A_RUN)
-    checks.one_of("margin", margin, MARGINS)
+    checks.one_of("margin", margin, SIGNAL_OF_MARGIN)
     one: Any = 1.0
-    peak = Peak(one, MARGINS[margin])
+    peak = Peak(one, SIGNAL_OF_MARGIN[margin])
     check_needs("margin", peak, scenario)
     evaluate = MarginEvaluator(cube, peak, dt, request, starts)
     with bar(progress, iterations + 1, unit="steps") as shown:

@@ -13,9 +13,6 @@ from iblf_jax.studies.perturbation_cube import Cube
 from iblf_jax.tuning.quantities import Peak, Quantities
 from iblf_jax.tuning.runs import tangents_of_runs
 
-MARGINS = {"positions": "deficit", "velocities": "velocity_deficit", "regions": "region_deficit"}
-"""What may be violated -> the deficit that is minus its margin."""
-
 
 @partial(jax.jit, static_argnames="request")
 def pieces_of_margins(

@@ -13,7 +13,8 @@ the point of the linearised surface that is nearest to the origin,
 
     z_full = a (a . z - y_j) / |a|^2,      a = dy_j/dz,
 
-and a step that does not decrease |z|^2 / 2 + c |y_j| is halved.  All searches advance together, in
+and a step that does not decrease |z|^2 / 2 + c |y_j| is halved; steps grow again after one that
+does.  All searches advance together, in
 one batch of runs with derivatives.
 
 Source: Y. Zhang, A. Der Kiureghian, Proc. 6th IFIP WG 7.5 (1995) 297-305 (the improved iteration).
@@ -32,9 +33,11 @@ HALVINGS = 6
 """How often a step is halved before its search ends."""
 LARGEST_RADIUS = 12.0
 """Distance beyond which no design point is searched: the probability is below 1e-32 there."""
-TOLERANCE = 1e-3
-"""Size of |y_j| in units of its value at the origin, and relative step, at which a search has
-converged."""
+STEP_TOLERANCE = 3e-3
+"""Relative step at which a search ends."""
+MARGIN_TOLERANCE = 1e-2
+"""Size of |y_j| in units of the median at the starts at which a point is on the surface; samples
+around a point need no more."""
 SAME_POINT = 0.5
 """Distance below which two design points count as one."""
 FARTHEST = 2.0
@@ -80,7 +83,7 @@ def design_points(pieces_of: PiecesOf, failures: np.ndarray) -> tuple[np.ndarray
         trial = search.trial(active)
         search.accept(active, trial, pieces_of(trial))
         evaluations += len(trial)
-    return distinct_points(search.z[search.converged]), evaluations
+    return distinct_points(search.z[search.on_surface]), evaluations
 
 
 class _Search:
@@ -97,8 +100,9 @@ class _Search:
         """Of the full step, which the next trial takes."""
         sizes = np.abs(margins)
         typical = np.median(sizes[np.isfinite(sizes)]) if np.any(np.isfinite(sizes)) else 1.0
-        self.tolerance = TOLERANCE * max(typical, np.finfo(float).tiny)
-        self.converged = np.zeros(len(z), bool)
+        self.tolerance = MARGIN_TOLERANCE * max(typical, np.finfo(float).tiny)
+        self.on_surface = np.zeros(len(z), bool)
+        """Whether the last point of each search is a failure point but for the tolerance."""
         self.active = self._has_direction()
 
     def _has_direction(self) -> np.ndarray:
@@ -132,15 +136,16 @@ class _Search:
         after = 0.5 * np.sum(trial * trial, axis=1) + c * np.abs(margin)
         better = after < before  # False for NaN
         step = np.linalg.norm(trial - z, axis=1)
-        has_stopped = step <= TOLERANCE * np.maximum(1.0, np.linalg.norm(trial, axis=1))
+        has_stopped = step <= STEP_TOLERANCE * np.maximum(1.0, np.linalg.norm(trial, axis=1))
         taken = rows[better]
         self.z[taken] = trial[better]
         self.margin[taken] = margin[better]
         self.gradient[taken] = gradient[better]
-        self.fraction[rows] = np.where(better, 1.0, 0.5 * self.fraction[rows])
+        self.fraction[rows] *= np.where(better, 2.0, 0.5)
+        self.fraction[rows] = np.minimum(1.0, self.fraction[rows])
         has_ended = has_stopped | (self.fraction[rows] < 0.5**HALVINGS)
         at_surface = np.abs(self.margin[rows]) <= self.tolerance
-        self.converged[rows] = has_ended & at_surface
+        self.on_surface[rows] = at_surface
         self.active[rows] = ~has_ended & self._has_direction()[rows]
 
 
