@@ -175,9 +175,9 @@ def failure_probability(
         runs=options.runs,
         seed=seed,
     ).checked()
+    check_varied(perturbations)
     check_needs("margin", FOLDS[margin], scenario)
     prepared = prepare(scenario, perturbations, run_options, (FOLDS[margin](),))
-    check_varied(prepared)
     if options.method == "importance" and is_discrete(prepared.perturbations):
         expected = "continuous distributions, as gradients are needed"
         remedy = "Use method='subset', which needs none."

@@ -15,6 +15,7 @@ import dataclasses
 import zlib
 from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -212,12 +213,12 @@ def run_numbers(z: np.ndarray) -> np.ndarray:
     return np.array([zlib.crc32(row.tobytes()) for row in rows], np.uint32)
 
 
-def check_varied(prepared: PreparedStudy) -> None:
-    """Raises ValueError for a study without perturbations."""
-    if not prepared.program.targets:
+def check_varied(perturbations: Any) -> None:
+    """Raises ValueError for no perturbations."""
+    if isinstance(perturbations, Mapping) and not perturbations:
         raise checks.fail(
             "perturbations",
-            {},
+            perturbations,
             "at least one perturbation",
             "Say what varies, such as {'plant.mass': ij.factor(ij.normal(1.0, 0.1))}.",
         )
