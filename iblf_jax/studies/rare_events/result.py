@@ -107,6 +107,8 @@ class FailureProbability:
     """The probability; an upper bound at the confidence of the interval if no run failed
     (`is_upper_bound`)."""
     interval: tuple[float, float]
+    """Log-normal, from the coefficient of variation; that of Clopper and Pearson for independent
+    draws."""
     confidence: float
     """Of the interval."""
     coefficient_of_variation: float
@@ -240,18 +242,15 @@ class FailureProbability:
 
     def _method_in_words(self) -> str:
         if self.method == "importance":
-            return (
-                f"Importance sampling with {self.effective_samples:.0f} effective failures; log-"
-                "normal interval."
-            )
+            return f"Importance sampling with {self.effective_samples:.0f} effective failures."
         if self.method == "subset":
             thresholds = ", ".join(f"{level.threshold:.3g}" for level in self.levels)
             return (
                 f"Subset simulation with {len(self.levels)} levels, at margins {thresholds}"
-                f" {self.unit}; log-normal interval."
+                f" {self.unit}."
             )
         count = len(self.failures)
-        return f"{count} failures among independent draws; Clopper-Pearson interval."
+        return f"{count} failures among independent draws."
 
     def _repr_html_(self) -> str:
         return present("card", self)
