@@ -6,8 +6,8 @@ A point of d standard normal numbers fails beyond one of m planes, which are at 
 the origin.  Each estimator repeats each case with other seeds: `mean` is the mean estimate divided
 by the exact probability, `variation` the standard deviation of the estimates divided by their mean,
 `reported` the mean of the coefficients of variation that the estimator gives, `covered` the share
-of its 95 % intervals that contain the exact probability.  OpenTURNS takes the same number of points a
-level in blocks of 500; it is left out where it is not installed.
+of its 95 % intervals that contain the exact probability.  OpenTURNS takes the same number of points
+a level in blocks of 500; it is left out where it is not installed.
 """
 
 from __future__ import annotations

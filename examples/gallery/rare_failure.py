@@ -1,5 +1,6 @@
 """Rare failures: the probability that an arm with random parameters leaves its bounds, which no
-study of 10,000 runs would show."""
+study of 10,000 runs would show.
+"""
 
 import iblf_jax as ij
 

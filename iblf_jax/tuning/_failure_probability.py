@@ -188,7 +188,7 @@ def failure_probability(
         checks.fits_memory("runs", options.runs, 8.0 * 4 * space.size)
         found = _found(space, options)
     space.warn()
-    settings: dict[str, Any] = {
+    arguments: dict[str, Any] = {
         "duration": run_options.duration,
         "dt": run_options.dt,
         "method": options.method,
@@ -200,7 +200,7 @@ def failure_probability(
         "integrator": integrator,
         "backend": backend,
     }
-    return _result(space, options, found, settings)
+    return _result(space, options, found, arguments)
 
 
 def _checked(method: Any, margin: Any, limit: Any, confidence: Any, runs: Any) -> FailureOptions:
@@ -312,7 +312,7 @@ def _by_importance(
         points, _ = design_points(pieces, _nearest(coarse.failures))
     if not len(points):
         points, notes = np.zeros((1, space.size)), (NO_DESIGN_POINT,)
-    estimate = _around(space, options, points, options.runs)
+    estimate = _importance_estimate(space, options, points, options.runs)
     if coarse is not None and not coarse.is_upper_bound and coarse.low > estimate.high:
         notes = (*notes, MISSED_BY_IMPORTANCE.format(low=coarse.low, high=coarse.high))
     return estimate._replace(notes=(*notes, *estimate.notes)), points
@@ -330,7 +330,9 @@ def _by_subset(space: NormalSpace, options: FailureOptions, runs: int) -> Estima
     )
 
 
-def _around(space: NormalSpace, options: FailureOptions, points: np.ndarray, runs: int) -> Estimate:
+def _importance_estimate(
+    space: NormalSpace, options: FailureOptions, points: np.ndarray, runs: int
+) -> Estimate:
     return importance_sampling(
         space,
         points,
@@ -365,7 +367,7 @@ def _checked_by_importance(
     points, _ = design_points(pieces, _nearest(estimate.failures))
     if not len(points) or len(estimate.levels) == 1:
         return estimate, points
-    second = _around(space, options, points, CHECK_RUNS)
+    second = _importance_estimate(space, options, points, CHECK_RUNS)
     if second.is_upper_bound or (not estimate.is_upper_bound and second.low <= estimate.high):
         return estimate, points
     note = MISSED.format(subset=estimate.probability)
@@ -405,7 +407,7 @@ def _most_likely(
 
 
 def _result(
-    space: NormalSpace, options: FailureOptions, found: _Found, settings: dict[str, Any]
+    space: NormalSpace, options: FailureOptions, found: _Found, arguments: dict[str, Any]
 ) -> FailureProbability:
     estimate = found.estimate
     unit = unit_text(space.prepared.scenario, DEFICITS[SIGNAL_OF_MARGIN[options.margin]])
@@ -435,7 +437,7 @@ def _result(
         notes=tuple(notes),
         method=estimate.method,
         unit=unit,
-        settings=settings,
+        arguments=arguments,
     )
 
 

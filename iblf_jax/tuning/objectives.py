@@ -788,7 +788,7 @@ def failure_probability_below(
     whose probability P(A) is known from the last estimate, and a share probability / P(A) of them
     may fail.  Failures outside A, which other gains may have, are not seen: estimate the
     probability anew for the tuned scenario, `ij.failure_probability(best.scenario, perturbations,
-    **found.settings)`.
+    **found.arguments)`.
 
     Args:
       probability: the limit.
@@ -806,8 +806,8 @@ def failure_probability_below(
     size = _number(function, "scale", scale, "positive")
     share = jnp.minimum(limit / found.nearby_probability, 1.0)
     return Requirement(
-        Peak(size, SIGNAL_OF_MARGIN[found.settings["margin"]]),
-        jnp.asarray(-found.settings["limit"], share.dtype),
+        Peak(size, SIGNAL_OF_MARGIN[found.arguments["margin"]]),
+        jnp.asarray(-found.arguments["limit"], share.dtype),
         size,
         share,
         name=f"failure probability < {probability:g} among rare draws",

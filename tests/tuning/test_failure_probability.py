@@ -105,7 +105,7 @@ def test_importance_sampling_and_monte_carlo_agree(scenario, rare):
     frequent, distance = start_perturbations(scenario, 2.0)
     crude = ij.failure_probability(scenario, frequent, method="monte_carlo", runs=2000, **RUN)
     assert crude.interval[0] < exact(distance, 2.0) < crude.interval[1]
-    again = ij.failure_probability(scenario, frequent, **crude.settings, progress=False)
+    again = ij.failure_probability(scenario, frequent, **crude.arguments, progress=False)
     assert again.estimate == crude.estimate
 
 

@@ -148,9 +148,9 @@ class FailureProbability:
     that of a probability so large that subset simulation needs no second level."""
     unit: str
     """Of the margins."""
-    settings: dict[str, Any]
-    """The options of the call: `ij.failure_probability(scenario, perturbations, **settings)` makes
-    the same estimate for another scenario."""
+    arguments: dict[str, Any]
+    """Keyword arguments of the call: `ij.failure_probability(scenario, perturbations,
+    **arguments)` makes the same estimate for another scenario."""
 
     @property
     def rare_draws(self) -> dict[str, Perturbation]:
