@@ -95,6 +95,10 @@ MISSED = (
     " levels went towards other failures; importance sampling around the design points is"
     " reported instead."
 )
+DISAGREE = (
+    "Importance sampling around the design points gave {other:.2g}, which is larger, but from"
+    " degenerate weights: one of the two misses failures. Take more runs."
+)
 NOT_REACHED = (
     "Subset simulation reached no failure (upper bound {subset:.2g}); importance sampling around"
     " the design points is reported instead."
@@ -373,6 +377,9 @@ def _checked_by_importance(
     note = MISSED.format(subset=estimate.probability)
     if estimate.is_upper_bound:
         note = NOT_REACHED.format(subset=estimate.probability)
+    elif second.notes:
+        note = DISAGREE.format(other=second.probability)
+        return estimate._replace(notes=(*estimate.notes, note)), points
     return second._replace(notes=(note, *second.notes)), points
 
 

@@ -153,6 +153,9 @@ def test_without_failures_the_estimate_is_a_bound(scenario):
     assert found.is_upper_bound
     assert found.most_likely_failure is None
     assert "none of which failed" in repr(found)
+    figure = found.plot()
+    assert "at most" in figure.get_suptitle()
+    assert [text.get_text() for text in figure.axes[1].texts] == ["no run failed"]
     crude = ij.failure_probability(scenario, perturbations, method="monte_carlo", runs=100, **RUN)
     assert crude.is_upper_bound
     with pytest.raises(ValueError, match="draws near failure"):
