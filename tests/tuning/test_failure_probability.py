@@ -289,17 +289,45 @@ def test_the_command(tmp_path, capsys, monkeypatch):
     assert "method" in capsys.readouterr().err
 
 
-@pytest.mark.release
-def test_fifty_estimates_of_a_few_in_a_thousand():
-    """Subset simulation on runs of an arm agrees with 200,000 independent runs: no bias beyond
-    three standard errors, and the 95 % interval covers in at least 90 % of the repetitions."""
+def arm(stiffness):
+    """An arm under a PD law that leaves its bounds with a heavy load, and its perturbations."""
     pd = ij.presets.zhang_yan_2024(law="pd")
-    scenario = ij.with_parameters(pd, {"controller.Kp": 35.0, "controller.Kd": 10.0})
+    scenario = ij.with_parameters(pd, {"controller.Kp": stiffness, "controller.Kd": 10.0})
     perturbations = {
         "plant.payload": ij.value(ij.uniform(0.0, 1.5)),
         "plant.mass": ij.factor(ij.normal(1.0, 0.08)),
     }
-    options = {"duration": 4.0, "dt": 2e-3, "progress": False}
+    return scenario, perturbations
+
+
+OF_ARM = {"duration": 4.0, "dt": 2e-3}
+
+
+@pytest.mark.release
+def test_tuned_gains_keep_a_probability():
+    """Draws near failure are used again; the probability that is estimated anew keeps the limit."""
+    scenario, perturbations = arm(36.0)
+    before = ij.failure_probability(scenario, perturbations, runs=1000, **OF_ARM)
+    limit = 1e-3 * before.estimate
+    best = ij.tune(
+        scenario,
+        ["controller.Kp", "controller.Kd"],
+        ij.objectives.effort() + ij.objectives.failure_probability_below(limit, before),
+        perturbations=before.rare_draws,
+        runs=32,
+        effort="quick",
+        **OF_ARM,
+    )
+    after = ij.failure_probability(best.scenario, perturbations, **before.arguments)
+    assert after.estimate < limit < before.estimate
+
+
+@pytest.mark.release
+def test_fifty_estimates_of_a_few_in_a_thousand():
+    """Subset simulation on runs of an arm agrees with 200,000 independent runs: no bias beyond
+    three standard errors, and the 95 % interval covers in at least 90 % of the repetitions."""
+    scenario, perturbations = arm(35.0)
+    options = OF_ARM | {"progress": False}
     crude = ij.failure_probability(
         scenario, perturbations, method="monte_carlo", runs=200_000, **options
     )

@@ -56,8 +56,8 @@ FIRST_SCALE = 0.6
 TARGET_ACCEPTANCE = 0.44
 """Share of accepted candidates for which the steps are adapted (Papaioannou et al., section 3)."""
 NO_FAILURE = (
-    "No run failed, so the estimate is an upper bound and no estimate of the size of the"
-    " probability."
+    "No run failed, so the estimate is an upper bound, for the failures that the levels lead to,"
+    " and no estimate of the size of the probability."
 )
 STALLED = (
     "The smallest margin of the samples stopped to decrease at {margin:.4g}: no level nearer to"
