@@ -56,6 +56,7 @@ PROMISED = [
         "testing",
     ),
     *("identify", "Identification", "excitation", "joint_normal"),
+    *("failure_probability", "FailureProbability", "joint_samples"),
     *(
         "distributed",
         "certificates",
