@@ -26,7 +26,12 @@ import numpy as np
 from iblf_jax.core import checks
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.studies.distributions import Perturbation, distribution_member
+from iblf_jax.studies.distributions import (
+    Distribution,
+    JointSamples,
+    Perturbation,
+    distribution_member,
+)
 
 _SIGNS = {"positive": "> 0", "nonnegative": ">= 0"}
 
@@ -123,7 +128,7 @@ def targets_of(
     Raises:
       ValueError: not a mapping of perturbations, an unknown or overlapping path, a distribution
         that does not fit the leaf or reaches inadmissible values (a factor from -1 to 1 on a
-        mass).
+        mass), or leaves that cannot share the draws of their group.
     """
     checks.mapping(what, perturbations, '{"plant.mass[1]": ij.factor(ij.uniform(0.7, 1.3))}')
     check_paths(scenario, perturbations, what)
@@ -143,7 +148,34 @@ def targets_of(
                 _check_sign(f"{what}[{source!r}]", target, perturbation, nominal)
             targets.append(target)
             by_path[path] = perturbation
+    _check_groups(what, by_path)
     return tuple(targets), by_path
+
+
+def _check_groups(what: str, perturbations: Mapping[str, Perturbation]) -> None:
+    """Raises ValueError for leaves that cannot share the draws of their group."""
+    first: dict[str, tuple[str, Distribution]] = {}
+    for path, perturbation in perturbations.items():
+        group, distribution = perturbation.group, perturbation.distribution
+        if not group:
+            continue
+        other_path, other = first.setdefault(group, (path, distribution))
+        if not _can_share_draws(other, distribution):
+            expected = "the same number of draws, and the same weights of samples"
+            remedy = "Give the leaves that do not vary together groups of other names."
+            raise checks.fail(f"{what}: group {group!r}", (other_path, path), expected, remedy)
+
+
+def _can_share_draws(a: Distribution, b: Distribution) -> bool:
+    """Whether the draws of a group serve both: d numbers, or one of a list of samples."""
+    if distribution_member(a, "draws") != distribution_member(b, "draws"):
+        return False
+    if not isinstance(a, JointSamples) or not isinstance(b, JointSamples):
+        return True
+    if a.weights.shape != b.weights.shape:
+        return False
+    both = (a.weights, b.weights)
+    return not checks.is_concrete(both) or np.array_equal(*map(np.asarray, both))
 
 
 def _remedy_for(given: Any) -> str:
