@@ -24,11 +24,12 @@ states have one ancestor; samples with a common ancestor one level before are on
     1 + gamma = sum over clusters c of S_c^2 / (N p (1 - p)),      S_c = sum in c of (I - p),
 
 with I = 1 where y <= b.  If no two chains had a common ancestor, this would be equation (29) of Au
-and Beck without its assumption of stationary covariances.  The estimates of successive levels are
+and Beck without its assumption of stationary covariances.  The estimates of different levels are
 correlated as well, because the samples below the threshold of one level are the first states of
-the next.  With clusters of samples that have one ancestor of the same generation,
+the next.  With clusters c of samples of both levels that have one ancestor, of the generation
+before the earlier level,
 
-    delta^2 = sum_l delta_l^2 + 2 sum_l max(0, sum_c S_lc S_{l+1,c} / (N_l p_l N_{l+1} p_{l+1})).
+    delta^2 = sum_l delta_l^2 + 2 sum_{l < m} max(0, sum_c S_lc S_mc / (N_l p_l N_m p_m)).
 
 Source: S. K. Au, J. L. Beck, Probabilistic Engineering Mechanics 16 (2001) 263-277; the chains: I.
   Papaioannou, W. Betz, K. Zwirglmaier, D. Straub, ibid. 41 (2015) 89-103.
@@ -56,11 +57,11 @@ FIRST_SCALE = 0.6
 TARGET_ACCEPTANCE = 0.44
 """Share of accepted candidates for which the steps are adapted (Papaioannou et al., section 3)."""
 NO_FAILURE = (
-    "No run failed, so the estimate is an upper bound, for the failures that the levels lead to,"
+    "No sample failed, so the estimate is an upper bound, for the failures that the levels lead to,"
     " and no estimate of the size of the probability."
 )
 STALLED = (
-    "The smallest margin of the samples stopped to decrease at {margin:.4g}: no level nearer to"
+    "The smallest margin of the samples stopped decreasing at {margin:.4g}: no level nearer to"
     " failure was reached."
 )
 OUT_OF_LEVELS = (
@@ -77,12 +78,11 @@ class Population(NamedTuple):
     """(N,)."""
     chain: np.ndarray
     """Number of the chain of each sample, (N,)."""
-    ancestor: np.ndarray
+    parent: np.ndarray
     """Number of the chain of the level before in which the first state of the sample's chain
     was, (N,)."""
-    elder: np.ndarray
-    """The same, two levels before, (N,)."""
     acceptance: float
+    """Share of the candidates that were accepted."""
 
 
 def subset_simulation(
@@ -108,9 +108,9 @@ def subset_simulation(
     """
     z = np.random.default_rng([seed, 0]).standard_normal((runs, dimension))
     margins = limit_state(z)
-    made = ~np.isnan(margins)
-    number = np.arange(int(np.sum(made)))
-    samples = Population(z[made], margins[made], number, number, number, 1.0)
+    can_run = ~np.isnan(margins)
+    number = np.arange(int(np.sum(can_run)))
+    samples = Population(z[can_run], margins[can_run], number, number, 1.0)
     if np.sum(samples.margins <= 0) >= share * len(number):
         return estimate_of_draws(z, margins, confidence)
     scale = FIRST_SCALE
@@ -148,7 +148,7 @@ def next_threshold(margins: np.ndarray, share: float) -> float:
 def _level(samples: Population, threshold: float) -> Level:
     p = float(np.mean(samples.margins <= threshold))
     deviations = relative_deviations(samples, threshold)
-    variation = float(np.sqrt(_sum_of_squares(np.bincount(samples.ancestor, deviations))))
+    variation = float(np.sqrt(_sum_of_squares(np.bincount(samples.parent, deviations))))
     return Level(threshold, p, samples.margins, variation, samples.acceptance)
 
 
@@ -167,7 +167,7 @@ def _next_level(
     states = [samples.z[first]]
     margins = [samples.margins[first]]
     spread = np.std(states[0], axis=0)
-    accepted_in_all = 0.0
+    acceptance = 0.0
     steps = max(1, round(1 / share) - 1)
     for step in range(1, steps + 1):
         size = np.minimum(scale * spread, 1.0)
@@ -178,16 +178,15 @@ def _next_level(
         states.append(np.where(accepted[:, None], candidates, states[-1]))
         margins.append(np.where(accepted, found, margins[-1]))
         rate = float(np.mean(accepted))
-        accepted_in_all += rate / steps
+        acceptance += rate / steps
         scale = float(scale * np.exp((rate - TARGET_ACCEPTANCE) / np.sqrt(step)))
     chain = np.tile(np.arange(chains), len(states))
     population = Population(
         z=np.concatenate(states),
         margins=np.concatenate(margins),
         chain=chain,
-        ancestor=np.tile(samples.chain[first], len(states)),
-        elder=np.tile(samples.ancestor[first], len(states)),
-        acceptance=accepted_in_all,
+        parent=np.tile(samples.chain[first], len(states)),
+        acceptance=acceptance,
     )
     return population, scale
 
@@ -204,7 +203,7 @@ def _estimate(
     before = float(np.prod([level.probability for level in levels[:-1]]))
     nearby = Samples(last.z, last.margins, np.ones(len(last.margins)))
     if not np.any(failed):
-        reached = _upper_bound_of(levels, last, before, confidence)
+        reached = _upper_bound_of(history, before, confidence)
         return Estimate(
             probability=reached,
             low=0.0,
@@ -240,15 +239,16 @@ def _estimate(
 
 
 def _upper_bound_of(
-    levels: list[Level], last: Population, before: float, confidence: float
+    history: list[tuple[Population, float]], before: float, confidence: float
 ) -> float:
-    """A bound of the probability from a last level without failures."""
-    independent = len(np.unique(last.ancestor))
-    spread = np.sqrt(sum(level.coefficient_of_variation**2 for level in levels[:-1]))
+    """A bound of the probability from a last level without failures: the upper end of the interval
+    of the level's own probability, times the bound of independent samples, one for each parent.
+    """
+    last, _ = history[-1]
     reached = before
     if before < 1:
-        _, reached = log_normal_interval(before, float(spread), confidence)
-    return reached * upper_bound(independent, confidence)
+        _, reached = log_normal_interval(before, variation_of(history[:-1]), confidence)
+    return reached * upper_bound(len(np.unique(last.parent)), confidence)
 
 
 def variation_of(history: list[tuple[Population, float]]) -> float:
@@ -258,16 +258,25 @@ def variation_of(history: list[tuple[Population, float]]) -> float:
       history: samples and threshold of each level.
     """
     total = 0.0
-    before: np.ndarray | None = None
-    for samples, threshold in history:
+    for number, (samples, threshold) in enumerate(history):
         deviations = relative_deviations(samples, threshold)
-        total += _sum_of_squares(np.bincount(samples.ancestor, deviations))
-        if before is not None:
-            size = max(len(before), np.max(samples.elder) + 1)
-            of_elders = np.bincount(samples.elder, deviations, size)
-            total += 2 * max(0.0, float(of_elders[: len(before)] @ before))
-        before = np.bincount(samples.ancestor, deviations)
+        total += _sum_of_squares(np.bincount(samples.parent, deviations))
+        ancestor = samples.parent
+        for earlier, its_threshold in reversed(history[:number]):
+            ancestor = _parents_of_chains(earlier)[ancestor]
+            its_deviations = relative_deviations(earlier, its_threshold)
+            count = max(np.max(ancestor), np.max(earlier.parent)) + 1
+            of_earlier = np.bincount(earlier.parent, its_deviations, count)
+            of_later = np.bincount(ancestor, deviations, count)
+            total += 2 * max(0.0, float(of_earlier @ of_later))
     return float(np.sqrt(total))
+
+
+def _parents_of_chains(samples: Population) -> np.ndarray:
+    """The parent of each chain of a level."""
+    parents = np.zeros(np.max(samples.chain) + 1, int)
+    parents[samples.chain] = samples.parent
+    return parents
 
 
 def relative_deviations(samples: Population, threshold: float) -> np.ndarray:
