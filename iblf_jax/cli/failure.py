@@ -14,8 +14,8 @@ DESCRIPTION = (
     " Monte-Carlo simulation; print the estimate with its interval, and the most likely failure."
 )
 EPILOG = (
-    "Exit codes: 0 done; 1 no run failed, so that the estimate is an upper bound; 2 bad arguments"
-    " or files; 3 not finished (worker lost); 130 interrupted."
+    "Exit codes: 0 done; 1 no sample failed, so that the estimate is an upper bound; 2 bad"
+    " arguments or files; 3 not finished (worker lost); 130 interrupted."
 )
 
 

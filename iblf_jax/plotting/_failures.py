@@ -49,10 +49,10 @@ def failure_probability(found: FailureProbability, *, numbers: int = MAX_NUMBERS
 def _heading(found: FailureProbability) -> str:
     if found.is_upper_bound:
         bound = f"{found.estimate:.2g}"
-        return f"Probability of failure: at most {bound}; none of {found.runs} runs failed"
+        return f"Probability of failure: at most {bound}; {found.runs} runs, and no sample failed"
     low, high = found.interval
     return (
-        f"Probability of failure {found.estimate:.3g}, {found.confidence:.0%} interval"
+        f"Probability of failure {found.estimate:.3g}, {100 * found.confidence:g}% interval"
         f" {low:.2g} to {high:.2g}; {found.runs} runs"
     ).replace("%", " %")
 
@@ -89,7 +89,7 @@ def _draw_levels(axes: Axes, found: FailureProbability) -> None:
     low, high = found.interval
     lower = max(low, found.estimate * 1e-3)
     errors = [[found.estimate - lower], [high - found.estimate]]
-    label = f"estimate with {found.confidence:.0%} interval".replace("%", " %")
+    label = f"estimate with {100 * found.confidence:g}% interval".replace("%", " %")
     if found.is_upper_bound:
         label = "upper bound"
     colour = _style.colour(1)
@@ -103,7 +103,7 @@ def _draw_levels(axes: Axes, found: FailureProbability) -> None:
 def _draw_likely(axes: Axes, likely: LikelyFailure | None, numbers: int) -> None:
     if likely is None:
         axes.set_axis_off()
-        axes.text(0.5, 0.5, "no run failed", ha="center", va="center", transform=axes.transAxes)
+        axes.text(0.5, 0.5, "no failure found", ha="center", va="center", transform=axes.transAxes)
         return
     order = np.argsort(-np.abs(likely.z), kind="stable")[:numbers][::-1]
     labels = [escaped(likely.names[i]) for i in order]

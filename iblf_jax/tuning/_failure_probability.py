@@ -4,7 +4,7 @@
 The perturbations are functions of d independent standard normal numbers z, and a run fails where
 its margin y(z) is not above a limit, or where it diverges.  Subset simulation and Monte-Carlo need
 margins only; importance sampling begins at the design points, which are found by the gradients of
-the margin of each joint and side (`margins.pieces_of_margins`).
+the margin of each joint, side and window of time (`margins.pieces_of_margins`).
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from iblf_jax.core.pytree import astype
 from iblf_jax.core.status import UNTRUSTED, Status, has_flag
 from iblf_jax.engine import RunRequest, differentiates_forward
 from iblf_jax.simulation.metrics import Margin, RegionMargin, VelocityMargin, check_needs
+from iblf_jax.simulation.noise import has_noise
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.units import unit_text
@@ -32,7 +33,12 @@ from iblf_jax.studies.options import RunOptions, ThisProcess, executor_of
 from iblf_jax.studies.rare_events.crude import crude_monte_carlo
 from iblf_jax.studies.rare_events.design_points import Pieces, design_points
 from iblf_jax.studies.rare_events.importance import importance_sampling
-from iblf_jax.studies.rare_events.limit_state import Estimate, Samples
+from iblf_jax.studies.rare_events.limit_state import (
+    NO_RUN,
+    Estimate,
+    Samples,
+    log_normal_interval,
+)
 from iblf_jax.studies.rare_events.normal_space import MARGINS as METRICS
 from iblf_jax.studies.rare_events.normal_space import (
     NormalSpace,
@@ -55,6 +61,9 @@ from iblf_jax.tuning.runs import in_groups
 
 RUNS = {"subset": 4000, "importance": 4096, "monte_carlo": 10_000}
 """Method -> default of `runs`."""
+LEAST_RUNS = {"subset": 100, "importance": 100, "monte_carlo": 1}
+"""Method -> least number of `runs`: 10 chains in each level of subset simulation, and enough
+weights for a fit of their tail."""
 FOLDS: dict[str, type[Any]] = {
     "positions": Margin,
     "velocities": VelocityMargin,
@@ -70,25 +79,39 @@ SEARCHES_TOGETHER = 16
 COARSE_RUNS = 500
 """Samples of a level of the subset simulation from whose failures searches for design points
 start."""
+COARSE_CONFIDENCE = 0.999
+"""Confidence of its interval in the check of importance sampling.  An interval of 95 % from so few
+samples is above the probability in 3 % of the calls."""
 CHECK_RUNS = 1024
 """Number of runs of importance sampling that check an estimate of subset simulation."""
 NEAREST = 8
 """Number of sampled failures, the nearest ones, at which searches for design points start."""
 RAYS = 4
 """Number of points of each kind along whose rays the most likely failure is searched."""
-FRACTIONS = np.linspace(0.3, 1.05, 51)
-"""Where on a ray, in units of its point."""
+FRACTIONS = np.linspace(0.25, 1.0625, 53)
+"""Where on a ray, in units of its point: steps of 1/64, so that one of them is 1, the sampled
+failure itself."""
 NOMINAL_FAILS = (
-    "The nominal run fails already (margin {margin:.3g} {unit} above the limit), so failures are no"
-    " rare events here."
+    "The run at the medians of all draws fails already (margin {margin:.3g} {unit} above the"
+    " limit), so failures are no rare events here."
 )
 NO_DESIGN_POINT = (
     "The search by gradients found no failure, so the samples are distributed around the nominal"
     " run, as in Monte-Carlo simulation."
 )
 MISSED_BY_IMPORTANCE = (
-    "A subset simulation with few samples gave the interval {low:.2g} to {high:.2g}: the design"
-    " points do not represent all failures, and the estimate is too small. Use method='subset'."
+    "A subset simulation with few samples gave {coarse:.2g}, and even the lower end of its interval"
+    " at {confidence:.1%} confidence, {low:.2g}, is larger: the design points probably do not"
+    " represent all failures. Use method='subset'."
+)
+NOT_REACHED_BY_IMPORTANCE = (
+    "No sample around the design points failed; the subset simulation with few samples from which"
+    " they were searched is reported instead. Use method='subset' or take more runs."
+)
+NOISE = (
+    "The random numbers of the noise are drawn anew for each point, which the Markov chains of"
+    " subset simulation cannot follow: where noise contributes to failures, the interval is too"
+    " narrow. Compare with method='monte_carlo' at a probability that it can show."
 )
 MISSED = (
     "Subset simulation gave {subset:.3g} and missed failures near a design point, because its"
@@ -144,10 +167,11 @@ def failure_probability(
       dt: time step [s].
       method: "subset", subset simulation, for any margin; "importance", importance sampling around
         the failures nearest to the nominal run, which are found by gradients: fewer runs where few
-        such points represent all failures, and flagged where it sees that they do not;
+        such points represent all failures; a note says where the samples show that they do not;
         "monte_carlo", independent draws.
-      runs: number of runs; for "subset" of each level, ten levels or so.  4000, 4096 and 10,000
-        if not given.
+      runs: number of runs; for "subset" of each level, of which there is one for each factor of
+        ten.  4000, 4096 and 10,000 if not given.  The search for design points, the check of the
+        estimate and the search for the most likely failure take some 2000 runs more.
       margin: which margin fails: of the "positions", the "velocities" or the "regions".
       limit: margin at which a run fails, in its unit.
       confidence: of the interval, in (0, 1).
@@ -159,8 +183,9 @@ def failure_probability(
 
     Returns:
       A `FailureProbability`: estimate, interval, coefficient of variation, levels, the most likely
-      failure.  If no run failed, the estimate is an upper bound.  Draws that cannot be run are
-      excluded and counted; runs that diverge are failures.
+      failure.  If no sample failed, the estimate is an upper bound.  Draws that cannot be run are
+      excluded and counted; runs that diverge are failures.  The probability includes the noise of a
+      scenario, which subset simulation represents less well than Monte-Carlo simulation.
 
     Raises:
       ValueError: bad arguments, or a discrete distribution with method="importance".
@@ -214,10 +239,7 @@ def _checked(method: Any, margin: Any, limit: Any, confidence: Any, runs: Any) -
     confidence = check_confidence(confidence)
     if runs is None:
         runs = RUNS[method]
-    least = 1
-    if method == "subset":
-        least = 10 * round(1 / LEVEL_PROBABILITY)
-    runs = checks.positive_integer("runs", runs, least=least, most=MAX_RUNS)
+    runs = checks.positive_integer("runs", runs, least=LEAST_RUNS[method], most=MAX_RUNS)
     return FailureOptions(method, margin, number, confidence, runs)
 
 
@@ -258,7 +280,8 @@ def _found(space: NormalSpace, options: FailureOptions) -> _Found:
 
 
 class PiecesOfMargin:
-    """The margins of the joints and sides of runs in windows of time, with gradients, at points z.
+    """The margins of the joints and sides of runs in windows of time, with gradients, at points z;
+    NaN for points that cannot be run.
 
     Args:
       space: the runs by standard normal numbers.
@@ -295,8 +318,8 @@ class PiecesOfMargin:
             return pieces_of_margins(cube, self.peak, step, points, request=self.request)
 
         margins, gradients, status = in_groups(of_rows, len(z), SEARCHES_TOGETHER)
-        untrusted = has_flag(status, UNTRUSTED)
-        margins = np.where(untrusted[:, None], np.nan, margins - self.limit)
+        is_valid = self.space.admissible(z) & ~has_flag(status, UNTRUSTED)
+        margins = np.where(is_valid[:, None], margins - self.limit, np.nan)
         return Pieces(margins.astype(float), gradients.astype(float))
 
 
@@ -311,15 +334,31 @@ def _by_importance(
     points = np.zeros((1, space.size))
     notes: tuple[str, ...] = ()
     coarse: Estimate | None = None
-    if nominal > 0:
+    if not nominal <= 0:  # also for NaN, a median draw that cannot be run
         coarse = _by_subset(space, options, COARSE_RUNS)
         points, _ = design_points(pieces, _nearest(coarse.failures))
     if not len(points):
         points, notes = np.zeros((1, space.size)), (NO_DESIGN_POINT,)
     estimate = _importance_estimate(space, options, points, options.runs)
-    if coarse is not None and not coarse.is_upper_bound and coarse.low > estimate.high:
-        notes = (*notes, MISSED_BY_IMPORTANCE.format(low=coarse.low, high=coarse.high))
+    if coarse is not None and not coarse.is_upper_bound:
+        if estimate.is_upper_bound and NO_RUN not in estimate.notes:
+            notes = (NOT_REACHED_BY_IMPORTANCE, *notes, *coarse.notes)
+            return coarse._replace(notes=notes), points
+        notes = (*notes, *_missed_by_importance(estimate, coarse))
     return estimate._replace(notes=(*notes, *estimate.notes)), points
+
+
+def _missed_by_importance(estimate: Estimate, coarse: Estimate) -> tuple[str, ...]:
+    """A note if a subset simulation with few samples shows that an estimate is too small."""
+    variation = coarse.coefficient_of_variation
+    low, _ = log_normal_interval(coarse.probability, variation, COARSE_CONFIDENCE)
+    if low <= estimate.high:
+        return ()
+    return (
+        MISSED_BY_IMPORTANCE.format(
+            coarse=coarse.probability, confidence=COARSE_CONFIDENCE, low=low
+        ),
+    )
 
 
 def _by_subset(space: NormalSpace, options: FailureOptions, runs: int) -> Estimate:
@@ -421,6 +460,8 @@ def _result(
     notes = list(estimate.notes)
     if found.nominal <= 0:
         notes.insert(0, NOMINAL_FAILS.format(margin=found.nominal, unit=unit))
+    if estimate.method == "subset" and has_noise(space.prepared.scenario):
+        notes.append(NOISE)
     status = np.concatenate(space.status)
     failures = _samples(space, estimate.failures)
     return FailureProbability(

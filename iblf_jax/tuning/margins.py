@@ -18,8 +18,8 @@ from iblf_jax.tuning.runs import tangents_of_runs
 def pieces_of_margins(
     cube: Cube, peak: Peak, dt: jax.Array, u: jax.Array, *, request: RunRequest
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """The margin of each joint and side over a run, (S, m), its gradient by u, (S, m, d), and the
-    status of each run, (S,).
+    """The margin of each joint, side and window of time of `peak`, (S, m), its gradient by u,
+    (S, m, d), and the status of each run, (S,).
 
     Args:
       cube: the perturbations.

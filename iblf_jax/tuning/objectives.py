@@ -785,14 +785,14 @@ def failure_probability_below(
         P(A) share(y <= limit) < probability,      A the set of the draws `found.rare_draws`
 
     Use it with `perturbations=found.rare_draws`: the runs of the tuning are draws from a set A
-    whose probability P(A) is known from the last estimate, and a share probability / P(A) of them
-    may fail.  Failures outside A, which other gains may have, are not seen: estimate the
-    probability anew for the tuned scenario, `ij.failure_probability(best.scenario, perturbations,
-    **found.arguments)`.
+    whose probability P(A) is estimated by `found`, and a share probability / P(A) of them may fail.
+    A share below 1 / runs means that none of them fails.  Neither the error of P(A) nor failures
+    outside A, which other gains may have, are considered: estimate the probability anew for the
+    tuned scenario, `ij.failure_probability(best.scenario, perturbations, **found.arguments)`.
 
     Args:
-      probability: the limit.
-      found: an estimate of `ij.failure_probability` in which runs failed.
+      probability: the limit [1].
+      found: an estimate of `ij.failure_probability` in which samples failed.
       scale: a relevant margin, in the margin's unit.
 
     Raises:

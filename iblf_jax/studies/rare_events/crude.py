@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from iblf_jax.studies.rare_events.limit_state import (
+    NO_RUN,
     Estimate,
     Level,
     LimitState,
@@ -12,8 +13,6 @@ from iblf_jax.studies.rare_events.limit_state import (
     binomial_interval,
     upper_bound,
 )
-
-NO_RUN = "No draw could be run, so nothing is known about the probability."
 
 
 def crude_monte_carlo(
@@ -36,8 +35,8 @@ def crude_monte_carlo(
 
 def estimate_of_draws(z: np.ndarray, margins: np.ndarray, confidence: float) -> Estimate:
     """The estimate from independent draws, (N, d), and their margins, (N,)."""
-    made = ~np.isnan(margins)
-    z, margins = z[made], margins[made]
+    can_run = ~np.isnan(margins)
+    z, margins = z[can_run], margins[can_run]
     runs = len(margins)
     failed = margins <= 0
     count = int(np.sum(failed))

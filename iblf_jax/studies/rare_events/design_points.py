@@ -1,10 +1,9 @@
 """Design points: the failures nearest to the origin of standard normal coordinates, which are the
 most likely ones, by gradients.
 
-The margin of a run is the least of m pieces, one for each joint, side and
-window of time, each smooth in z.  For
-each piece y_j a search from the origin, and from each known failure at which y_j is the
-least piece, solves
+The margin of a run is the least of m pieces, one for each joint, side and window of time, each
+smooth in z.  For each piece y_j a search from the origin, and from each known failure at which y_j
+is the least piece, solves
 
     minimise |z|^2 / 2    subject to    y_j(z) = 0
 
@@ -14,8 +13,7 @@ the point of the linearised surface that is nearest to the origin,
     z_full = a (a . z - y_j) / |a|^2,      a = dy_j/dz,
 
 and a step that does not decrease |z|^2 / 2 + c |y_j| is halved; steps grow again after one that
-does.  All searches advance together, in
-one batch of runs with derivatives.
+does.  All searches advance together, in one batch of runs with derivatives.
 
 Source: Y. Zhang, A. Der Kiureghian, Proc. 6th IFIP WG 7.5 (1995) 297-305 (the improved iteration).
 """

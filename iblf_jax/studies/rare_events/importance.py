@@ -12,6 +12,12 @@ k > 1/2 it does not.
 An estimate with few effective samples, one dominating weight or k above 1/2 is flagged as
 degenerate; a failure region that bends towards the origin has such weights.
 
+If none of N samples fails, q(failure) is at most b = 1 - (1 - confidence)^(1 / N) at the
+confidence.  This is no bound of p: a set of probability p has at least Phi(Phi^-1(p) - |z_k|) under
+N(z_k, I), which a half space behind the origin attains, so
+
+    p <= min_k Phi(Phi^-1(b / alpha_k) + |z_k|).
+
 Source: O. Ditlevsen, H. O. Madsen, Structural Reliability Methods, chapter 9; A. B. Owen, Y. Zhou,
   J. American Statistical Association 95 (2000) 135-143 (mixtures); A. Vehtari et al., J. Machine
   Learning Research 25 (2024), 72 (the shape k); the fit: J. Zhang, M. A. Stephens, Technometrics 51
@@ -24,6 +30,7 @@ import numpy as np
 
 from iblf_jax.studies.rare_events.limit_state import (
     MIN_PROBABILITY,
+    NO_RUN,
     Estimate,
     Level,
     LimitState,
@@ -44,12 +51,12 @@ FEWEST_IN_TAIL = 5
 """Smallest number of weights to which a tail is fitted."""
 DEGENERATE = (
     "The weights are degenerate: {effective:.1f} effective failures, {largest:.0%} of the weight"
-    " in one sample, shape of the tail {shape:.2f}. The interval is not reliable; use"
-    " method='subset'."
+    " in one sample, shape of the tail {shape:.2f}. The interval is not reliable; take more runs"
+    " or method='subset'."
 )
 NONE_FAILED = (
-    "No sample around the design points failed, so the estimate is an upper bound and no estimate"
-    " of the size of the probability."
+    "No sample around the design points failed, so the estimate is an upper bound, and a large one"
+    " where they are far from the origin."
 )
 
 
@@ -67,10 +74,11 @@ def importance_sampling(
     Args:
       limit_state: margins of points.
       points: design points, (K, d).
-      runs: number of samples.
+      runs: number of samples, at least 2.
       seed: of the samples.
       confidence: of the interval.
-      runnable: probability that a draw can be run, by which the estimate is divided.
+      runnable: probability that a draw can be run, by which the estimate is divided.  If it is 0,
+        the estimate is the upper bound 1.
     """
     from scipy.special import ndtr
 
@@ -81,33 +89,38 @@ def importance_sampling(
     index = rng.choice(len(points), size=runs, p=share)
     z = points[index] + rng.standard_normal((runs, points.shape[1]))
     margins = limit_state(z)
-    weights = np.exp(-log_mixture_ratio(z, points, share)) / runnable
+    weights = np.exp(-log_mixture_ratio(z, points, share))
     failed = margins <= 0  # False for NaN
+    can_run = ~np.isnan(margins)
+    if runnable == 0 or not np.any(failed):
+        bound, note = 1.0, NO_RUN
+        if runnable > 0:
+            bound, note = bound_without_failures(radius, share, runs, confidence), NONE_FAILED
+            bound = min(1.0, bound / runnable)
+        level = Level(0.0, 0.0, margins[can_run], np.inf, 1.0)
+        none = Samples.none(z.shape[1])
+        return Estimate(
+            bound, 0.0, bound, np.inf, (level,), none, none, 1.0, "importance", 0.0, (note,)
+        )
+    weights = weights / runnable
     contributions = np.where(failed, weights, 0.0)
     p = float(np.mean(contributions))
-    made = ~np.isnan(margins)
     samples = Samples(z[failed], margins[failed], weights[failed])
-    if not np.any(failed):
-        bound = upper_bound(float(np.sum(made)), confidence)
-        level = Level(0.0, 0.0, margins[made], np.inf, 1.0)
-        notes: tuple[str, ...] = (NONE_FAILED,)
-        return Estimate(
-            bound, 0.0, bound, np.inf, (level,), samples, samples, 1.0, "importance", 0.0, notes
-        )
     effective = float(np.sum(contributions)) ** 2 / float(np.sum(contributions**2))
     largest = float(np.max(contributions) / np.sum(contributions))
     variation = float(np.std(contributions, ddof=1)) / (p * np.sqrt(runs))
     low, high = log_normal_interval(p, variation, confidence)
-    notes = ()
+    notes: tuple[str, ...] = ()
     shape = tail_shape(samples.weights)
-    if effective < FEW_SAMPLES or largest > LARGE_WEIGHT or shape > LARGE_SHAPE:
+    # The comparison is negated because the fit of a tail may be NaN.
+    if effective < FEW_SAMPLES or largest > LARGE_WEIGHT or not shape <= LARGE_SHAPE:
         notes = (DEGENERATE.format(effective=effective, largest=largest, shape=shape),)
     return Estimate(
-        probability=max(p, MIN_PROBABILITY),
+        probability=min(max(p, MIN_PROBABILITY), 1.0),
         low=low,
         high=high,
         coefficient_of_variation=variation,
-        levels=(Level(0.0, p, margins[made], variation, 1.0),),
+        levels=(Level(0.0, p, margins[can_run], variation, 1.0),),
         failures=samples,
         nearby=samples,
         nearby_probability=p,
@@ -115,6 +128,23 @@ def importance_sampling(
         effective_samples=effective,
         notes=notes,
     )
+
+
+def bound_without_failures(
+    radius: np.ndarray, share: np.ndarray, runs: int, confidence: float
+) -> float:
+    """The largest probability of failure with which no failure among the samples is plausible.
+
+    Args:
+      radius: distances of the design points from the origin, (K,).
+      share: their shares of the samples, (K,).
+      runs: number of samples.
+      confidence: of the bound.
+    """
+    from scipy.special import ndtr, ndtri
+
+    within_each = np.minimum(1.0, upper_bound(runs, confidence) / share)
+    return float(np.min(ndtr(ndtri(within_each) + radius)))
 
 
 def log_mixture_ratio(z: np.ndarray, points: np.ndarray, share: np.ndarray) -> np.ndarray:

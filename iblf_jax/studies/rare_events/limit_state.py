@@ -20,6 +20,7 @@ LimitState = Callable[[np.ndarray], np.ndarray]
 
 MIN_PROBABILITY = 1e-300
 """Probability below which none is reported."""
+NO_RUN = "No draw could be run, so nothing is known about the probability."
 
 
 class Level(NamedTuple):
@@ -80,7 +81,7 @@ class Estimate(NamedTuple):
 
     @property
     def is_upper_bound(self) -> bool:
-        """Whether no failure was found."""
+        """Whether no sample failed."""
         return not len(self.failures.margins)
 
 

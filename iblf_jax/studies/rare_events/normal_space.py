@@ -145,7 +145,9 @@ class NormalSpace:
         """The margins of runs above the limit at points z, (k, d) -> (k,); NaN for points that
         cannot be run.
 
-        A run that diverged failed, whatever its margin was until then.
+        A run that diverged failed, whatever its margin was until then.  So did one that has no
+        margin (NaN, from a bound that is not defined at all times, for example): nothing shows
+        that it stayed within its bounds.
         """
         results = self._run(z)
         self.runs += len(z)
@@ -153,10 +155,11 @@ class NormalSpace:
         self._modes.append(results.fastest_mode)
         self._errors.append(results.metrics[RELATIVE])
         margins = statistics.worst_joint(results.metrics, self.metric).astype(float) - self.limit
+        margins = np.nan_to_num(margins, nan=0.0, posinf=np.inf, neginf=-np.inf)
         diverged = has_flag(results.status, Status.NOT_FINITE)
-        margins = np.where(diverged, np.minimum(np.nan_to_num(margins, nan=0.0), 0.0), margins)
-        not_made = has_flag(results.status, Status.INADMISSIBLE_DRAW)
-        return np.where(not_made, np.nan, margins)
+        margins = np.where(diverged, np.minimum(margins, 0.0), margins)
+        not_run = has_flag(results.status, Status.INADMISSIBLE_DRAW)
+        return np.where(not_run, np.nan, margins)
 
     def _run(self, z: np.ndarray) -> BlockResults:
         dtype = self.prepared.scenario.initial.q.dtype
@@ -179,18 +182,24 @@ class NormalSpace:
         if not self._may_be_inadmissible():
             return 1.0
         rng = np.random.default_rng([self.prepared.options.seed, 2])
-        z = rng.standard_normal((ADMISSIBILITY_DRAWS, self.size))
+        return float(
+            np.mean(self.admissible(rng.standard_normal((ADMISSIBILITY_DRAWS, self.size))))
+        )
+
+    def admissible(self, z: np.ndarray) -> np.ndarray:
+        """Whether the draws at points z, (k, d), can be run, (k,)."""
         dtype = self.prepared.scenario.initial.q.dtype
-        return float(np.mean(_admissible(self.cube, jnp.asarray(z, dtype))))
+        return np.asarray(_admissible(self.cube, jnp.asarray(z, dtype)))
 
     def _may_be_inadmissible(self) -> bool:
         cube = self.cube
-        lowest = {
-            target.path: cube.uncertain.perturbations[target.path].distribution.support()
+        supports = [
+            cube.uncertain.perturbations[target.path].distribution.support()
             for target in cube.targets
             if target.sign is not None
-        }
-        return any(not np.all(np.isfinite(x)) for ends in lowest.values() for x in ends)
+        ]
+        # `prepare` refuses bounded distributions that reach inadmissible values.
+        return any(not np.all(np.isfinite(end)) for support in supports for end in support)
 
     def noise(self, point: np.ndarray) -> jax.Array | None:
         """Key of the noise of the run at a point, (d,); None for a scenario without noise."""

@@ -104,7 +104,7 @@ class FailureProbability:
     """The probability that a run fails, with its interval; printed as sentences."""
 
     estimate: float
-    """The probability; an upper bound at the confidence of the interval if no run failed
+    """The probability; an upper bound at the confidence of the interval if no sample failed
     (`is_upper_bound`)."""
     interval: tuple[float, float]
     """Log-normal, from the coefficient of variation; that of Clopper and Pearson for independent
@@ -112,16 +112,16 @@ class FailureProbability:
     confidence: float
     """Of the interval."""
     coefficient_of_variation: float
-    """Estimated standard deviation of the estimate, divided by it; infinite if no run failed."""
+    """Estimated standard deviation of the estimate, divided by it; infinite if no sample failed."""
     is_upper_bound: bool
-    """Whether no run failed."""
+    """Whether no sample failed."""
     runs: int
     """Number of runs, those of the search for the most likely failure included."""
     levels: tuple[Level, ...]
     """Of subset simulation: threshold, conditional probability and margins of each level; one for
     the other methods."""
     most_likely_failure: LikelyFailure | None
-    """None if no run failed."""
+    """The search may find one also if no sample failed; None if none was found."""
     failures: FailureSamples
     """The draws that failed."""
     nearby: FailureSamples
@@ -158,7 +158,7 @@ class FailureProbability:
         `joint_samples`.
 
         Raises:
-          ValueError: there are none, because no run failed.
+          ValueError: there are none, because no sample failed.
         """
         if not len(self.nearby):
             remedy = "Take more runs, or method='subset'."
@@ -215,16 +215,17 @@ class FailureProbability:
 
     def __repr__(self) -> str:
         low, high = self.interval
-        sure = f"{self.confidence:.0%}"
+        confidence = f"{100 * self.confidence:g}%"
         if self.is_upper_bound:
             first = (
-                f"FailureProbability(at most {self.estimate:.2g} with {sure} confidence;"
-                f" {self.runs} runs, none of which failed)"
+                f"FailureProbability(at most {self.estimate:.2g} with {confidence} confidence;"
+                f" {self.runs} runs, and no sample failed)"
             )
         else:
             first = (
-                f"FailureProbability({self.estimate:.3g}, {sure} interval {low:.2g} to {high:.2g},"
-                f" coefficient of variation {self.coefficient_of_variation:.2f}; {self.runs} runs)"
+                f"FailureProbability({self.estimate:.3g}, {confidence} interval {low:.2g} to"
+                f" {high:.2g}, coefficient of variation {self.coefficient_of_variation:.2f};"
+                f" {self.runs} runs)"
             )
         lines = [first, f"  {self._method_in_words()}"]
         if self.most_likely_failure is not None:
