@@ -16,6 +16,7 @@ from iblf_jax.studies.rare_events.crude import crude_monte_carlo
 from iblf_jax.studies.rare_events.design_points import Pieces, design_points
 from iblf_jax.studies.rare_events.importance import importance_sampling, tail_shape
 from iblf_jax.studies.rare_events.limit_state import (
+    NO_RUN,
     binomial_interval,
     log_normal_interval,
     upper_bound,
@@ -203,7 +204,7 @@ def test_an_estimate_without_failures_is_an_upper_bound():
     assert found.probability == pytest.approx(1 - 0.05 ** (1 / 500))
     assert found.low == 0
     assert "upper bound" in found.notes[0]
-    assert "stopped to decrease" in found.notes[1]
+    assert "stopped decreasing" in found.notes[1]
 
     def floor(z):
         return np.maximum(1 - z[:, 0], 0.1)
@@ -217,6 +218,23 @@ def test_an_estimate_without_failures_is_an_upper_bound():
     around = importance_sampling(constant, np.ones((1, 3)), runs=100, seed=0, confidence=0.95)
     assert around.is_upper_bound
     assert around.notes
+
+
+def test_the_bound_of_samples_around_a_distant_point_holds():
+    """No failure far from the origin bounds the failures behind the origin by little; around the
+    origin itself the bound is that of independent draws."""
+
+    def behind(z):
+        return z[:, 0] + 2.0
+
+    far = importance_sampling(behind, np.array([[5.0, 0.0]]), runs=4096, seed=0, confidence=0.95)
+    assert far.is_upper_bound
+    assert stats.norm.sf(2.0) < far.probability == far.high <= 1
+    options = {"runs": 4096, "seed": 0, "confidence": 0.95}
+    here = importance_sampling(lambda z: np.ones(len(z)), np.zeros((1, 2)), **options)
+    assert here.probability == pytest.approx(upper_bound(4096, 0.95))
+    half = importance_sampling(lambda z: np.ones(len(z)), np.zeros((1, 2)), runnable=0.5, **options)
+    assert half.probability == pytest.approx(2 * upper_bound(4096, 0.95))
 
 
 def test_the_limit_of_levels_is_reported():
@@ -250,11 +268,18 @@ def test_draws_that_cannot_be_run_are_excluded():
     points = np.array([[3.5, 0.0]])
     around = importance_sampling(margin, points, runs=4000, seed=0, confidence=0.95, runnable=0.5)
     assert around.low < exact < around.high
-    nothing = crude_monte_carlo(
-        lambda z: np.full(len(z), np.nan), 2, runs=9, seed=0, confidence=0.9
-    )
-    assert nothing.probability == 1
-    assert "no" in nothing.notes[0].lower()
+    options = {"runs": 9, "seed": 0, "confidence": 0.9}
+
+    def never(z):
+        return np.full(len(z), np.nan)
+
+    for nothing in (
+        crude_monte_carlo(never, 2, **options),
+        importance_sampling(never, points, runnable=0.0, **options),
+    ):
+        assert nothing.probability == nothing.high == 1
+        assert nothing.is_upper_bound
+        assert nothing.notes == (NO_RUN,)
 
 
 def test_discrete_margins():

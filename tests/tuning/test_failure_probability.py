@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,9 @@ import study_cases as cases
 import iblf_jax as ij
 from iblf_jax.core.status import Status, has_flag
 from iblf_jax.studies.rare_events import normal_space
+from iblf_jax.studies.rare_events.design_points import Pieces
 from iblf_jax.studies.rare_events.result import FailureProbability
+from iblf_jax.tuning import _failure_probability
 
 RUN = {"duration": 0.02, "dt": 1e-3, "integrator": "euler", "progress": False}
 """So short that a run leaves its bounds only if it starts outside, where the probability is
@@ -69,6 +72,7 @@ def test_a_probability_of_runs_that_is_known(rare):
     z = dict(zip(likely.names, likely.z, strict=True))
     assert abs(z["initial.q[1]"]) == pytest.approx(4.8, rel=1e-2)
     assert found.names == ("initial.q[1]", "plant.mass[0]", "plant.mass[1]")
+    assert 1.0 in _failure_probability.FRACTIONS  # a sampled failure itself, with its own noise
 
 
 def test_the_most_likely_failure_fails_again(rare):
@@ -131,7 +135,7 @@ def test_a_nominal_run_that_fails_is_said(scenario):
     found = ij.failure_probability(scenario, moved, runs=200, **RUN)
     assert found.estimate > 0.9
     assert found.nominal_margin < 0
-    assert "nominal run fails" in found.notes[0]
+    assert "medians of all draws fails" in found.notes[0]
     assert found.most_likely_failure.distance == 0
 
 
@@ -152,10 +156,10 @@ def test_without_failures_the_estimate_is_a_bound(scenario):
     found = ij.failure_probability(scenario, perturbations, runs=100, **RUN)
     assert found.is_upper_bound
     assert found.most_likely_failure is None
-    assert "none of which failed" in repr(found)
+    assert "no sample failed" in repr(found)
     figure = found.plot()
     assert "at most" in figure.get_suptitle()
-    assert [text.get_text() for text in figure.axes[1].texts] == ["no run failed"]
+    assert [text.get_text() for text in figure.axes[1].texts] == ["no failure found"]
     crude = ij.failure_probability(scenario, perturbations, method="monte_carlo", runs=100, **RUN)
     assert crude.is_upper_bound
     with pytest.raises(ValueError, match="draws near failure"):
@@ -180,6 +184,7 @@ def test_bad_arguments(scenario):
         "method": {"method": "sorm"},
         "margin": {"margin": "torques"},
         "runs": {"runs": 3},
+        ">= 100|100": {"runs": 99, "method": "importance"},
         "confidence": {"confidence": 1.0},
         "limit": {"limit": np.nan},
         "region_margin|regions": {"margin": "regions"},
@@ -207,6 +212,187 @@ def test_tails_of_float32_draws():
     assert joint.group == "g"
     assert joint.draws == 3
     np.testing.assert_allclose(joint.quantile(z), 1.0)
+
+
+def test_rare_values_of_a_list_in_float32():
+    """u near 1 does not resolve a weight of 1e-8 in float32; z does.  Elsewhere both agree."""
+    import jax
+    import jax.numpy as jnp
+
+    values, weights = jnp.asarray([0.0, 1.0, 2.0], jnp.float32), [0.0, 1 - 1e-8, 1e-8]
+    limit = 5.612  # Phi(-5.612) = 1e-8
+    z = jnp.asarray([-9.0, 0.0, limit - 0.01, limit + 0.01], jnp.float32)
+    weights = jnp.asarray(weights, jnp.float32)
+    for_all = normal_space.NormalCoordinates(ij.choice(values, weights))
+    np.testing.assert_array_equal(for_all.quantile(z), [1.0, 1.0, 1.0, 2.0])
+    joint = normal_space.NormalCoordinates(ij.joint_samples(values, "g", weights))
+    np.testing.assert_array_equal(jax.vmap(joint.quantile)(z[:, None]), [1.0, 1.0, 1.0, 2.0])
+    drawn = ij.choice([3.0, 1.0, 2.0, 5.0], [0.1, 0.3, 0.0, 0.6])
+    u = np.linspace(0.005, 0.995, 100)
+    np.testing.assert_array_equal(
+        drawn.of_normal(jax.scipy.special.ndtri(u)), drawn.quantile(jnp.asarray(u))
+    )
+
+
+def test_a_run_without_a_margin_fails(scenario, monkeypatch):
+    """A margin that is NaN shows nothing; it is no draw that could not be run."""
+    compute = normal_space.run_all_cases
+
+    def without_margins(*args):
+        results = compute(*args)
+        nothing = np.full_like(results.metrics["margin"], np.nan)
+        return results._replace(metrics={**results.metrics, "margin": nothing})
+
+    monkeypatch.setattr(normal_space, "run_all_cases", without_margins)
+    perturbations, _ = start_perturbations(scenario, 4.0)
+    found = ij.failure_probability(scenario, perturbations, method="monte_carlo", runs=50, **RUN)
+    assert found.estimate == 1
+    assert not found.is_upper_bound
+    assert found.excluded == 0
+
+
+def test_gradients_of_draws_that_cannot_be_run(scenario, monkeypatch):
+    """A negative mass has no margin, and no search continues from it."""
+    pieces_at = {}
+
+    def record(pieces, failures):
+        pieces_at["z"] = pieces(np.array([[0.0, 0.0, 0.0], [0.0, -4.0, 0.0]]))
+        return np.zeros((0, failures.shape[1])), 0
+
+    monkeypatch.setattr(_failure_probability, "design_points", record)
+    perturbations, _ = start_perturbations(scenario, 4.8, ij.normal(1.0, 0.3))
+    ij.failure_probability(scenario, perturbations, runs=100, **RUN)
+    assert np.all(np.isfinite(pieces_at["z"].margins[0]))
+    assert np.all(np.isnan(pieces_at["z"].margins[1]))
+
+
+def test_importance_sampling_without_failures_reports_subset_simulation(
+    scenario, rare, monkeypatch
+):
+    _, perturbations, probability = rare
+    sample = _failure_probability.importance_sampling
+
+    def without_failures(limit_state, points, **options):
+        return sample(lambda z: np.ones(len(z)), points, **options)
+
+    monkeypatch.setattr(_failure_probability, "importance_sampling", without_failures)
+    found = ij.failure_probability(scenario, perturbations, method="importance", runs=100, **RUN)
+    assert found.method == "subset"
+    assert not found.is_upper_bound
+    assert 0.1 < found.estimate / probability < 10  # from 500 samples of a level
+    assert "reported instead" in found.notes[0]
+
+
+def test_a_few_samples_of_subset_simulation_refute_importance_sampling_only_by_far():
+    """500 samples of a level have a coefficient of variation above 0.5."""
+    estimate = SimpleNamespace(high=1.2e-6)
+    near = SimpleNamespace(probability=6e-6, coefficient_of_variation=0.6)
+    far = SimpleNamespace(probability=6e-5, coefficient_of_variation=0.6)
+    assert _failure_probability._missed_by_importance(estimate, near) == ()
+    (note,) = _failure_probability._missed_by_importance(estimate, far)
+    assert "probably do not represent all failures" in note
+
+
+class AnalyticSpace:
+    """A margin of several pieces in place of runs.
+
+    Args:
+      pieces: function of z, (S, d) -> margins, (S, m).
+      gradients: d of each piece by z, (m, d).
+    """
+
+    prepared = SimpleNamespace(options=SimpleNamespace(seed=0))
+
+    def __init__(self, pieces, gradients):
+        self.pieces = pieces
+        self.gradients = np.asarray(gradients, float)
+        self.size = self.gradients.shape[1]
+
+    def __call__(self, z):
+        return np.min(self.pieces(z), axis=1)
+
+    def runnable_share(self):
+        return 1.0
+
+    def of_pieces(self, z):
+        gradients = np.broadcast_to(self.gradients, (len(z), *self.gradients.shape))
+        return Pieces(self.pieces(z), gradients)
+
+
+class SearchedPieces:
+    """The pieces of an `AnalyticSpace`, as the check of an estimate takes them."""
+
+    is_available = True
+
+    def __init__(self, space):
+        self.space = space
+
+    def __call__(self, z):
+        return self.space.of_pieces(z)
+
+
+def checked_estimate(space):
+    """The estimate of subset simulation, and the one that its check reports."""
+    options = _failure_probability.FailureOptions("subset", "positions", 0.0, 0.95, 1000)
+    first = _failure_probability._by_subset(space, options, options.runs)
+    reported, _ = _failure_probability._checked_by_importance(
+        space, options, SearchedPieces(space), first, 1.0
+    )
+    return first, reported
+
+
+def test_failures_that_subset_simulation_misses_are_found_by_the_check():
+    """Its levels follow the piece that is small, z_0 > 5.2; most failures are at z_1 > 4."""
+    from scipy.stats import norm
+
+    def pieces(z):
+        return np.stack([0.1 * (5.2 - z[:, 0]), 10 * (4.0 - z[:, 1])], axis=1)
+
+    first, reported = checked_estimate(AnalyticSpace(pieces, [[-0.1, 0.0], [0.0, -10.0]]))
+    exact = norm.sf(5.2) + norm.sf(4.0)
+    assert first.method == "subset"
+    assert first.high < exact
+    assert reported.method == "importance"
+    assert reported.low < exact < reported.high
+    assert "missed failures" in reported.notes[0]
+
+
+def test_failures_that_subset_simulation_does_not_reach_are_found_by_the_check():
+    """The small piece has a floor above zero."""
+    from scipy.stats import norm
+
+    def pieces(z):
+        floor = 0.1 + np.maximum(0.0, 1.0 - z[:, 0])
+        return np.stack([floor, 10 * (4.5 - z[:, 1])], axis=1)
+
+    first, reported = checked_estimate(AnalyticSpace(pieces, [[0.0, 0.0], [0.0, -10.0]]))
+    assert first.is_upper_bound
+    assert reported.low < norm.sf(4.5) < reported.high
+    assert "reached no failure" in reported.notes[0]
+
+
+def test_the_check_keeps_an_estimate_that_it_confirms():
+    """Of fifty estimates of one half space, at most a few are replaced: the check does not
+    select the larger one of two estimates that agree."""
+    space = AnalyticSpace(lambda z: 4.75 - z[:, :1], [[-1.0, 0.0]])
+    replaced = 0
+    for seed in range(50):
+        space.prepared = SimpleNamespace(options=SimpleNamespace(seed=seed))
+        first, reported = checked_estimate(space)
+        replaced += reported.method != first.method
+    assert replaced <= 2
+
+
+@pytest.mark.slow
+def test_a_note_says_that_chains_cannot_follow_noise(scenario):
+    noisy = ij.with_parts(scenario, process_noise=ij.process_noise.Additive(0.2))
+    perturbations, distance = start_perturbations(noisy, 4.0)
+    options = RUN | {"integrator": "euler_maruyama"}
+    found = ij.failure_probability(noisy, perturbations, runs=300, **options)
+    assert "Markov chains" in found.notes[-1]
+    assert found.interval[0] < exact(distance, 4.0) < found.interval[1]
+    crude = ij.failure_probability(noisy, perturbations, runs=300, method="monte_carlo", **options)
+    assert not any("Markov chains" in note for note in crude.notes)
 
 
 def test_noise_is_a_function_of_the_point():
@@ -238,6 +424,30 @@ def test_joint_samples():
     np.testing.assert_array_equal(
         file.perturbations["initial.q"].distribution.values, [[0.1, 0.2], [0.3, 0.4]]
     )
+
+
+def test_leaves_of_a_group_have_the_same_draws(scenario):
+    """Other numbers of samples would pair them by chance; one draw for two numbers would make both
+    the same."""
+    mass = ij.joint_samples([[1.0, 1.0], [1.1, 1.1], [1.2, 1.2]], "g")
+    normal = ij.joint_normal([1.0, 1.0], 0.01 * np.eye(2), "g")
+    for other in (mass, normal):
+        perturbations = {
+            "plant.mass": ij.factor(other),
+            "plant.payload": ij.value(ij.joint_samples([0.1, 0.2], "g")),
+        }
+        with pytest.raises(ValueError, match=r"group 'g'.*plant\.mass.*plant\.payload"):
+            ij.monte_carlo(scenario, perturbations, runs=8, duration=0.01, dt=1e-3)
+    weights = {"weights": [1.0, 2.0, 3.0]}
+    payload = ij.value(ij.joint_samples([0.1, 0.2, 0.3], "g", **weights))
+    with pytest.raises(ValueError, match="weights of samples"):
+        ij.monte_carlo(
+            scenario,
+            {"plant.mass": ij.factor(mass), "plant.payload": payload},
+            runs=8,
+            duration=0.01,
+            dt=1e-3,
+        )
 
 
 def test_the_draws_near_failure_are_perturbations(scenario, rare):
