@@ -408,7 +408,7 @@ def _checked_by_importance(
     if nominal <= 0 or not pieces.is_available:
         return estimate, np.zeros((0, space.size))
     points, _ = design_points(pieces, _nearest(estimate.failures))
-    if not len(points) or len(estimate.levels) == 1:
+    if not len(points) or estimate.method != "subset":
         return estimate, points
     second = _importance_estimate(space, options, points, CHECK_RUNS)
     if second.is_upper_bound or (not estimate.is_upper_bound and second.low <= estimate.high):

@@ -371,6 +371,19 @@ def test_failures_that_subset_simulation_does_not_reach_are_found_by_the_check()
     assert "reached no failure" in reported.notes[0]
 
 
+def test_failures_behind_a_margin_that_all_draws_share_are_found_by_the_check():
+    """Subset simulation has one level, from which nothing leads on."""
+    from scipy.stats import norm
+
+    def pieces(z):
+        return np.stack([np.ones(len(z)), 10 * (4.5 - z[:, 1])], axis=1)
+
+    first, reported = checked_estimate(AnalyticSpace(pieces, [[0.0, 0.0], [0.0, -10.0]]))
+    assert first.is_upper_bound
+    assert len(first.levels) == 1
+    assert reported.low < norm.sf(4.5) < reported.high
+
+
 def test_the_check_keeps_an_estimate_that_it_confirms():
     """Of fifty estimates of one half space, at most a few are replaced: the check does not
     select the larger one of two estimates that agree."""

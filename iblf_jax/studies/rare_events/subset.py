@@ -4,9 +4,11 @@ With thresholds b_1 > b_2 > ... > b_L = 0 of the margin y,
 
     P(y <= 0) = P(y <= b_1) P(y <= b_2 | y <= b_1) ... P(y <= 0 | y <= b_{L-1}).
 
-Each b_l is the quantile of the margins of level l at which a share p0 of the samples lies below.
-These samples are the first states of Markov chains, which generate the samples of the next level,
-distributed as N(0, I) restricted to y <= b_l.  A chain proposes in each component
+Each b_l is the quantile of the margins of level l at which a share p0 of the samples lies below; if
+the largest margin is an atom of more than 1 - p0 (that of a start that all runs share), it is the
+largest margin below the atom.  The samples up to b_l are the first states of Markov chains, which
+generate the samples of the next level, distributed as N(0, I) restricted to y <= b_l.  A chain
+proposes in each component
 
     z'_j = sqrt(1 - s_j^2) z_j + s_j w_j,      w_j ~ N(0, 1),
 
@@ -54,6 +56,10 @@ from iblf_jax.studies.rare_events.limit_state import (
 
 FIRST_SCALE = 0.6
 """Step of the chains in units of the standard deviation of their first states, at the start."""
+FEWEST_CHAINS = 10
+"""Smallest number of samples below an atom of the margin from which a level is generated."""
+LONGEST_CHAIN = 100
+"""Largest number of states of a chain, of which each is a batch of runs."""
 TARGET_ACCEPTANCE = 0.44
 """Share of accepted candidates for which the steps are adapted (Papaioannou et al., section 3)."""
 NO_FAILURE = (
@@ -61,8 +67,8 @@ NO_FAILURE = (
     " and no estimate of the size of the probability."
 )
 STALLED = (
-    "The smallest margin of the samples stopped decreasing at {margin:.4g}: no level nearer to"
-    " failure was reached."
+    "Fewer than {chains} samples of the last level have a margin below {margin:.4g}, which all"
+    " others have: no level nearer to failure was generated."
 )
 OUT_OF_LEVELS = (
     "The limit of {levels} levels was reached before a share {share:g} of the samples failed."
@@ -125,7 +131,7 @@ def subset_simulation(
         if threshold <= 0:
             break
         if np.all(inside):
-            notes.append(STALLED.format(margin=np.min(samples.margins)))
+            notes.append(STALLED.format(chains=FEWEST_CHAINS, margin=threshold))
             break
         if len(found) == levels:
             notes.append(OUT_OF_LEVELS.format(levels=levels, share=share))
@@ -136,12 +142,18 @@ def subset_simulation(
 
 
 def next_threshold(margins: np.ndarray, share: float) -> float:
-    """The quantile of the margins below which a share of them lies, at least 0."""
+    """The quantile of the margins below which a share of them lies, at least 0.
+
+    If all margins are up to it, it is the largest of those that are smaller, if there are enough.
+    """
     count = max(1, round(share * len(margins)))
     ordered = np.sort(margins)
     quantile = 0.5 * (ordered[count - 1] + ordered[min(count, len(ordered) - 1)])
     if not np.isfinite(quantile):
         quantile = ordered[count - 1]
+    below = ordered[ordered < ordered[-1]]
+    if quantile == ordered[-1] and len(below) >= FEWEST_CHAINS:
+        quantile = below[-1]
     return float(max(quantile, 0.0))
 
 
@@ -168,7 +180,8 @@ def _next_level(
     margins = [samples.margins[first]]
     spread = np.std(states[0], axis=0)
     acceptance = 0.0
-    steps = max(1, round(1 / share) - 1)
+    states_of_chain = min(round(len(samples.margins) / chains), LONGEST_CHAIN)
+    steps = max(1, states_of_chain - 1)
     for step in range(1, steps + 1):
         size = np.minimum(scale * spread, 1.0)
         noise = rng.standard_normal(states[-1].shape)
