@@ -23,9 +23,9 @@ from iblf_jax.core.pytree import astype
 from iblf_jax.core.status import UNTRUSTED, Status, has_flag
 from iblf_jax.engine import RunRequest, differentiates_forward
 from iblf_jax.simulation.metrics import Margin, RegionMargin, VelocityMargin, check_needs
-from iblf_jax.simulation.noise import has_noise
+from iblf_jax.simulation.noise import check_method, has_noise
 from iblf_jax.simulation.paths import with_parameters
-from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.simulation.units import unit_text
 from iblf_jax.studies.designs import MAX_RUNS
 from iblf_jax.studies.distributions import Perturbation
@@ -176,7 +176,8 @@ def failure_probability(
       limit: margin at which a run fails, in its unit.
       confidence: of the interval, in (0, 1).
       seed: whole number that fixes all draws.
-      integrator: "rk4", "heun" or "euler"; as `method` of `simulate`.
+      integrator: "rk4", "heun" or "euler", "euler_maruyama" or "stochastic_heun" with process
+        noise; as `method` of `simulate`.
       backend: "auto", "native", "gpu" or "vmap".
       executor: where the runs are computed, as in `monte_carlo`.
       progress: a progress bar; by default it is shown on a terminal.
@@ -195,6 +196,8 @@ def failure_probability(
       of `iblf_jax.studies.rare_events`.
     """
     options = _checked(method, margin, limit, confidence, runs)
+    scenario = canonical(scenario)
+    _check_integrator(scenario, integrator)
     executor = executor_of(executor, {})
     run_options = RunOptions(
         duration=duration,
@@ -241,6 +244,17 @@ def _checked(method: Any, margin: Any, limit: Any, confidence: Any, runs: Any) -
         runs = RUNS[method]
     runs = checks.positive_integer("runs", runs, least=LEAST_RUNS[method], most=MAX_RUNS)
     return FailureOptions(method, margin, number, confidence, runs)
+
+
+def _check_integrator(scenario: Scenario, integrator: Any) -> None:
+    """Raises ValueError for an integrator that does not fit, under the name that it has here: the
+    `method` of a run is called `integrator`.
+    """
+    try:
+        check_method(scenario, integrator)
+    except ValueError as error:
+        text = str(error).replace("method: got", "integrator: got")
+        raise ValueError(text.replace("method=", "integrator=")) from error
 
 
 class _Found(NamedTuple):

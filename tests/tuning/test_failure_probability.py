@@ -187,6 +187,7 @@ def test_bad_arguments(scenario):
         ">= 100|100": {"runs": 99, "method": "importance"},
         "confidence": {"confidence": 1.0},
         "limit": {"limit": np.nan},
+        "integrator: got 'leapfrog'": {"integrator": "leapfrog"},
         "region_margin|regions": {"margin": "regions"},
     }.items():
         with pytest.raises(ValueError, match=words):
@@ -399,7 +400,9 @@ def test_the_check_keeps_an_estimate_that_it_confirms():
 @pytest.mark.slow
 def test_a_note_says_that_chains_cannot_follow_noise(scenario):
     noisy = ij.with_parts(scenario, process_noise=ij.process_noise.Additive(0.2))
-    perturbations, distance = start_perturbations(noisy, 4.0)
+    perturbations, distance = start_perturbations(scenario, 4.0)
+    with pytest.raises(ValueError, match=r"integrator: got 'rk4'.*integrator=.euler_maruyama"):
+        ij.failure_probability(noisy, perturbations, duration=0.02)
     options = RUN | {"integrator": "euler_maruyama"}
     found = ij.failure_probability(noisy, perturbations, runs=300, **options)
     assert "Markov chains" in found.notes[-1]
