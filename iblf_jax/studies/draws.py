@@ -174,8 +174,9 @@ def _can_share_draws(a: Distribution, b: Distribution) -> bool:
         return True
     if a.weights.shape != b.weights.shape:
         return False
-    both = (a.weights, b.weights)
-    return not checks.is_concrete(both) or np.array_equal(*map(np.asarray, both))
+    if not checks.is_concrete((a.weights, b.weights)):
+        return True
+    return np.array_equal(np.asarray(a.weights), np.asarray(b.weights))
 
 
 def _remedy_for(given: Any) -> str:
