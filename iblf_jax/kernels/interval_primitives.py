@@ -24,9 +24,23 @@ def _primitive(name: str) -> Primitive:
     def jvp(primals, tangents):
         return primitive.bind(*primals), tangents[0]
 
+    def batch(arguments, axes):
+        size = next(x.shape[a] for x, a in zip(arguments, axes, strict=True) if a is not None)
+        moved = [
+            _batch_axis_first(x, axis, size) for x, axis in zip(arguments, axes, strict=True)
+        ]
+        return primitive.bind(*moved), 0
+
     ad.primitive_jvps[primitive] = jvp
-    batching.defbroadcasting(primitive)
+    batching.primitive_batchers[primitive] = batch
     return primitive
+
+
+def _batch_axis_first(x: jax.Array, axis: int | None, size: int) -> jax.Array:
+    """An argument with the axis of the batch in front."""
+    if axis is None:
+        return jnp.broadcast_to(x, (size, *x.shape))
+    return jnp.moveaxis(x, axis, 0)
 
 
 _UPPER = _primitive("upper")
