@@ -38,7 +38,7 @@ FLAGS = ("-O2", "-frounding-math", "-ffp-contract=off")
 """Flags of the compiler, after those of all kernels."""
 FUNCTIONS = frozenset(
     "add sub neg abs max min div sqrt rsqrt sign sin cos tan exp expm1 log log1p atan sinh cosh tanh"
-    " logistic upper lower hull".split()
+    " logistic upper lower hull meet".split()
 )
 """Operations on intervals that `c/interval.h` has as `i_<name>`."""
 COMPARISONS = frozenset({"lt", "le", "gt", "ge", "eq", "ne"})
