@@ -88,18 +88,11 @@ class Kinematics(NamedTuple):
 
 
 class Course(NamedTuple):
-    """The reference and the tube at one time, (n,) each."""
+    """The reference and its distances from the bounds at one time, (n,) each [rad]."""
 
     q_d: jax.Array
-    """[rad]"""
     k_l: jax.Array
     k_u: jax.Array
-    ratio: jax.Array
-    """k_l / k_u."""
-    inverse_ratio: jax.Array
-    growth_l: jax.Array
-    """k_l' / k_l [1/s]."""
-    growth_u: jax.Array
 
 
 def course(parts: ArmParts, t: jax.Array) -> Course:
@@ -107,16 +100,12 @@ def course(parts: ArmParts, t: jax.Array) -> Course:
     derivatives.
     """
 
-    def at(t: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def at(t: jax.Array) -> Course:
         q_d = parts.reference.position(t)
         lower, upper = parts.bounds.lower.at(t, q_d), parts.bounds.upper.at(t, q_d)
-        return q_d, q_d - lower, upper - q_d
+        return Course(q_d, q_d - lower, upper - q_d)
 
-    def with_rates(t: jax.Array) -> Course:
-        (q_d, k_l, k_u), (_, dk_l, dk_u) = jax.jvp(at, (t,), (jnp.ones_like(t),))
-        return Course(q_d, k_l, k_u, k_l / k_u, k_u / k_l, dk_l / k_l, dk_u / k_u)
-
-    return enclosed(with_rates)(t)
+    return enclosed(at)(t)
 
 
 class Side(NamedTuple):
@@ -132,14 +121,15 @@ class Side(NamedTuple):
 
 def side_of(parts: ArmParts, t: jax.Array, xi: jax.Array) -> Side:
     """The tube on the sides on which errors with the sign of `xi` are."""
-    now = course(parts, t)
+    now, rate = jax.jvp(lambda t: course(parts, t), (t,), (jnp.ones_like(t),))
     above = xi > 0
-    one, zero = jnp.ones_like(now.q_d), jnp.zeros_like(now.q_d)
-    ratio = jnp.where(above, now.ratio, now.inverse_ratio)
+    k, dk = jnp.where(above, now.k_u, now.k_l), jnp.where(above, rate.k_u, rate.k_l)
+    other, dother = jnp.where(above, now.k_l, now.k_u), jnp.where(above, rate.k_l, rate.k_u)
+    one, zero = jnp.ones_like(k), jnp.zeros_like(k)
+    ratio, growth, other_growth = other / k, dk / k, dother / k
     k_l, k_u = jnp.where(above, ratio, one), jnp.where(above, one, ratio)
-    tube = Tube(zero, zero, -k_l, k_u, -k_l * now.growth_l, k_u * now.growth_u)
-    growth = jnp.where(above, now.growth_u, now.growth_l)
-    return Side(jnp.where(above, now.k_u, now.k_l), growth, tube)
+    dk_l, dk_u = jnp.where(above, other_growth, growth), jnp.where(above, growth, other_growth)
+    return Side(k, growth, Tube(zero, zero, -k_l, k_u, -dk_l, dk_u))
 
 
 def degree(barrier: Any) -> int:
