@@ -32,7 +32,7 @@ enum { FINISHED, UNDECIDED, REFUTED, OUT_OF_BOXES, STOPPED, OUT_OF_MEMORY };
 typedef struct { F value, lowest, outside, inside; } verdict;
 /* value < 0: the statement holds; outside < 0: no point is in the region; lowest <= 0: every alternative is at least 0; inside <= 0: all points
    are in the region. */
-SEPARATE verdict evaluated(const interval *table, const interval *x) {
+SEPARATE verdict evaluated(const shared_number *table, const interval *x) {
   interval out[OUTPUTS];
   evaluate(table, x, out);
   verdict v = {UNBOUNDED, -UNBOUNDED, UNBOUNDED, -UNBOUNDED};
@@ -59,7 +59,7 @@ INLINE real remaining(real after, real before) {
 }
 
 /* The weight of a coordinate: the part of the margin that a bisection along it removes, per width. */
-SEPARATE void measure(const interval *table, real *box, real value, real outside) {
+SEPARATE void measure(const shared_number *table, real *box, real value, real outside) {
   real low[2 * COORDINATES * COORDINATES], high[2 * COORDINATES * COORDINATES], left[2 * COORDINATES];
   for (int k = 0; k < 2 * COORDINATES; k++) {
     int i = k / 2;
@@ -96,7 +96,7 @@ INLINE int widest(const real *box, const real *smallest) {
 }
 
 /* Makes the worst of some boxes that are left the result's: the one with the largest bound at its centre. */
-SEPARATE void note_worst(const interval *table, const real *boxes, int64_t count, search_result *result) {
+SEPARATE void note_worst(const shared_number *table, const real *boxes, int64_t count, search_result *result) {
   for (int64_t first = 0; first < count; first += W) {
     const real *here = boxes + first * RECORD;
     int some = count - first < W ? (int)(count - first) : W;
@@ -114,7 +114,7 @@ SEPARATE void note_worst(const interval *table, const real *boxes, int64_t count
   }
 }
 
-SEPARATE void search(const interval *table, const real *low, const real *high, const search_options *options, search_result *result) {
+SEPARATE void search(const shared_number *table, const real *low, const real *high, const search_options *options, search_result *result) {
   int64_t capacity = 1024, count = 1;
   real *stack = (real *)malloc(capacity * RECORD * sizeof(real));
   search_result r = {};
@@ -179,7 +179,7 @@ VISIBLE int search_box(const real *shared, const real *low, const real *high, in
                        const real *smallest, const int *stop, search_result *result) {
   environment e;
   if (enter(&e)) return 1;
-  interval table[TABLE_SIZE];
+  shared_number table[TABLE_SIZE];
   shared_numbers(shared, table);
   search_options options = {max_boxes, max_undecided, renewal, smallest, stop};
   search(table, low, high, &options, result);
@@ -187,7 +187,7 @@ VISIBLE int search_box(const real *shared, const real *low, const real *high, in
   return 0;
 }
 
-SEPARATE void enclose_all(const interval *table, int64_t boxes, const real *low, const real *high, real *lower, real *upper) {
+SEPARATE void enclose_all(const shared_number *table, int64_t boxes, const real *low, const real *high, real *lower, real *upper) {
   for (int64_t first = 0; first < boxes; first += W) {
     int count = boxes - first < W ? (int)(boxes - first) : W;
     interval x[COORDINATES], out[OUTPUTS];
@@ -203,7 +203,7 @@ SEPARATE void enclose_all(const interval *table, int64_t boxes, const real *low,
 VISIBLE int enclose_boxes(const real *shared, int64_t boxes, const real *low, const real *high, real *lower, real *upper) {
   environment e;
   if (enter(&e)) return 1;
-  interval table[TABLE_SIZE];
+  shared_number table[TABLE_SIZE];
   shared_numbers(shared, table);
   enclose_all(table, boxes, low, high, lower, upper);
   leave(&e);
