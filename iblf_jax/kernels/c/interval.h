@@ -5,8 +5,10 @@
    `x < y ? x : y` is y where either is NaN; `largest` returns NaN or infinity where an argument is NaN.  -lower and upper are never -infinity.
 
    The polynomials are truncated Taylor series.  Their errors are proved for any rounding mode, in which an operation has a relative error of at
-   most u = 2^-52: a polynomial by Horner's rule with n operations errs by at most g(n) = n u / (1 - n u) times the sum of the absolute terms. */
+   most u = 2^-52: a polynomial by Horner's rule with n operations errs by at most g(n) = n u / (1 - n u) times the sum of the absolute terms.
+   UNDERFLOW exceeds the errors of denormal results, for which this is not so. */
 #include <fenv.h>
+#define UNDERFLOW 1e-300
 
 typedef struct { F n, u; } interval;
 typedef struct { I yes, no; } truth;  /* for all numbers of the arguments; neither where it is undecided */
@@ -200,7 +202,7 @@ SEPARATE interval i_exp(interval x) { interval r = {minus_exp_below(-x.n), exp_a
 INLINE interval expm1_at(F x) {
   exponential e = exponential_of(clamped(x, -700, 709));
   F one = all_lanes(1), a = e.scale * e.expm1, b = e.scale - 1.0, y = a + b;
-  F error = (larger(a, -a) + larger(b, -b)) * EXPM1_ERROR;
+  F error = (larger(a, -a) + larger(b, -b)) * EXPM1_ERROR + UNDERFLOW;
   interval r = {smaller(error - y, one), x > all_lanes(709) ? UNBOUNDED : error + y};
   return r;
 }
@@ -216,7 +218,7 @@ INLINE interval log_of_parts(F k, F f) {
   p = p * z + 2.0 / 19.0; p = p * z + 2.0 / 17.0; p = p * z + 2.0 / 15.0; p = p * z + 2.0 / 13.0; p = p * z + 2.0 / 11.0;
   p = p * z + 2.0 / 9.0; p = p * z + 2.0 / 7.0; p = p * z + 2.0 / 5.0; p = p * z + 2.0 / 3.0;
   F y = p * z * s + 2.0 * s, value = k * 0x1.62e42fefa2000p-1 + (y + k * 0x1.9ef35793c7673p-41);
-  F error = (larger(y, -y) + larger(k, -k)) * LOG_ERROR;
+  F error = (larger(y, -y) + larger(k, -k)) * LOG_ERROR + UNDERFLOW;
   interval r = {error - value, error + value};
   return r;
 }
@@ -289,7 +291,7 @@ INLINE interval from_ends(F at_low, F low_error, F at_high, F high_error, I has_
   interval r = {has_minimum ? one : n, has_maximum ? one : u};
   return r;
 }
-INLINE F sine_error(F x) { F one = all_lanes(1); return smaller(larger(x, -x) * 2.0, one) * SINE_ERROR; }
+INLINE F sine_error(F x) { F one = all_lanes(1); return smaller(larger(x, -x) * 2.0, one) * SINE_ERROR + UNDERFLOW; }
 typedef struct { interval sin, cos; } sine_and_cosine;
 SEPARATE sine_and_cosine i_sincos(interval x) {
   angle low = angle_of(-x.n), high = angle_of(x.u);
@@ -324,7 +326,7 @@ INLINE interval atan_at(F x) {
   p = p * z + 1.0 / 37.0; p = p * z - 1.0 / 35.0; p = p * z + 1.0 / 33.0; p = p * z - 1.0 / 31.0; p = p * z + 1.0 / 29.0; p = p * z - 1.0 / 27.0;
   p = p * z + 1.0 / 25.0; p = p * z - 1.0 / 23.0; p = p * z + 1.0 / 21.0; p = p * z - 1.0 / 19.0; p = p * z + 1.0 / 17.0; p = p * z - 1.0 / 15.0;
   p = p * z + 1.0 / 13.0; p = p * z - 1.0 / 11.0; p = p * z + 1.0 / 9.0; p = p * z - 1.0 / 7.0; p = p * z + 1.0 / 5.0; p = p * z - 1.0 / 3.0;
-  F y = p * z * w + w + offset, error = (far | middle) != 0 ? all_lanes(ATAN_ERROR) : a * ATAN_ERROR;
+  F y = p * z * w + w + offset, error = (far | middle) != 0 ? all_lanes(ATAN_ERROR) : a * ATAN_ERROR + UNDERFLOW;
   y = x < zero ? -y : y;
   interval r = {error - y, error + y};
   return r;
