@@ -34,8 +34,9 @@ from iblf_jax.kernels.program import (
 )
 from iblf_jax.kernels.toolchain import ToolchainError, built, loaded
 
-FLAGS = ("-O2", "-frounding-math", "-ffp-contract=off")
-"""Flags of the compiler, after those of all kernels."""
+FLAGS = ("-frounding-math",)
+"""Flags of the compiler, after those of all kernels. A product and a sum that become one operation
+are rounded once, which is upward, too."""
 FUNCTIONS = frozenset(
     "add sub neg abs max min div sqrt rsqrt sign sin cos tan exp expm1 log log1p atan sinh cosh tanh"
     " logistic upper lower hull meet".split()
@@ -51,6 +52,14 @@ LOGIC = {
     "eq": "t_same",
 }
 """Operations on truth values -> their C++ functions."""
+FORMS = {
+    "number": ("number", "{}"),
+    "flag": ("flag", "{}"),
+    "single": ("single", "factor_of({}.u)"),
+    "several": ("several", "factors_of({})"),
+    "reciprocal": ("several", "reciprocals_of({})"),
+}
+"""Form of what depends on constants only -> the member of `shared_number` and its value."""
 LARGEST_POWER = 64
 """Integer exponents up to which a power is computed by products."""
 
@@ -131,39 +140,76 @@ class _Emitter:
         self.nodes = program.nodes
         self.outputs = program.outputs
         self.place = {value.hex(): constants + k for k, value in enumerate(literals)}
-        classes = program.classes()
-        read = {a for i, node in enumerate(self.nodes) if classes[i] != SHARED for a in node.args}
-        self.table = sorted(
-            i for i in {*read, *self.outputs} if classes[i] == SHARED
-        )
-        """Nodes that depend on constants only and that the rest of the program reads."""
+        self.is_shared = [c == SHARED for c in program.classes()]
+        read = {
+            (self._form(i, a), a)
+            for i, node in enumerate(self.nodes)
+            if not self.is_shared[i]
+            for a in node.args
+            if self.is_shared[a]
+        }
+        read |= {("number", i) for i in self.outputs if self.is_shared[i]}
+        self.table = {entry: k for k, entry in enumerate(sorted(read))}
+        """Form and node of what depends on constants only -> its place in the table."""
+
+    def _form(self, user: int, i: int) -> str:
+        """The form in which a node that depends on the box reads one that does not (`FORMS`)."""
+        node = self.nodes[i]
+        users_op = self.nodes[user].op
+        if node.kind == "b":
+            return "flag"
+        if node.op == "const":
+            return "number"
+        if users_op == "mul" and node.op == "shared":
+            return "single"
+        if users_op == "mul":
+            return "several"
+        if users_op == "div" and self.nodes[user].args[1] == i:
+            return "reciprocal"
+        return "number"
 
     def shared_numbers(self) -> list[str]:
         """The statements that fill the table."""
-        names: dict[int, str] = {}
-        lines = []
-        for i in needed(self.nodes, self.table):
-            node = self.nodes[i]
-            if node.op == "shared":
-                lines.append(f"  interval v{i} = at(all_lanes(shared[{node.value}]));")
-                names[i] = f"v{i}"
-            elif node.op == "const" and node.kind == "f":
-                place = self.place[node.value.hex()]
-                lines.append(f"  interval v{i} = at(all_lanes(shared[{place}]));")
-                names[i] = f"v{i}"
-        lines += self.statements(names, self.table)
-        return lines + [f"  put(table + {k}, {names[i]});" for k, i in enumerate(self.table)]
+        inputs = {
+            i: self._place(node)
+            for i, node in enumerate(self.nodes)
+            if node.op == "shared" or (node.op == "const" and node.kind == "f")
+        }
+        lines = [f"  interval v{i} = at(all_lanes(shared[{k}]));" for i, k in inputs.items()]
+        names = {i: f"v{i}" for i in inputs}
+        lines += self.statements(names, sorted({i for _, i in self.table}))
+        for (form, i), k in self.table.items():
+            member, value = FORMS[form]
+            lines.append(f"  table[{k}].{member} = {value.format(names[i])};")
+        return lines
+
+    def _place(self, node: Node) -> int:
+        """The position of an input or a literal among the numbers that the kernel receives."""
+        if node.op == "shared":
+            return node.value
+        return self.place[node.value.hex()]
 
     def evaluation(self) -> list[str]:
         """The statements that evaluate the outputs."""
-        names = {i: f"v{i}" for i in self.table}
-        lines = [
-            f"  {_type(self.nodes[i])} v{i} = get_{_type(self.nodes[i])}(table + {k});"
-            for k, i in enumerate(self.table)
-        ]
+        names = {i: self._in_table("number", i) for i, known in enumerate(self.is_shared) if known}
         names |= {i: f"x[{n.value}]" for i, n in enumerate(self.nodes) if n.op == "carry"}
-        lines += self.statements(names, self.outputs)
+        lines = self.statements(names, self.outputs)
         return lines + [f"  out[{k}] = {names[i]};" for k, i in enumerate(self.outputs)]
+
+    def _in_table(self, form: str, i: int) -> str:
+        """The C++ of an entry of the table; empty if there is none."""
+        if (form, i) not in self.table:
+            return ""
+        return f"table[{self.table[form, i]}].{FORMS[form][0]}"
+
+    def _arguments(self, i: int, names: dict[int, str]) -> list[str]:
+        """The C++ of the arguments of a node."""
+        return [
+            self._in_table(self._form(i, a), a)
+            if self.is_shared[a] and not self.is_shared[i]
+            else names[a]
+            for a in self.nodes[i].args
+        ]
 
     def statements(self, names: dict[int, str], outputs: Sequence[int]) -> list[str]:
         """The statements of the outputs and of what they depend on; new names are added."""
@@ -178,7 +224,8 @@ class _Emitter:
                 names[i] = f"v{i}"
                 continue
             angle = node.args[0]
-            lines.append(f"  sine_and_cosine a{angle} = i_sincos({names[angle]});")
+            (text,) = self._arguments(i, names)
+            lines.append(f"  sine_and_cosine a{angle} = i_sincos({text});")
             for j in waiting:
                 if self.nodes[j].op in ("sin", "cos") and self.nodes[j].args == node.args:
                     names[j] = f"a{angle}.{self.nodes[j].op}"
@@ -188,7 +235,7 @@ class _Emitter:
         """The C++ of a node's operation."""
         node = self.nodes[i]
         nodes = [self.nodes[a] for a in node.args]
-        args = [names[a] for a in node.args]
+        args = self._arguments(i, names)
         listed = ", ".join(args)
         of_truths = bool(nodes) and nodes[0].kind == "b"
         if node.op == "const" and node.kind == "b":
@@ -200,7 +247,9 @@ class _Emitter:
         if of_truths and node.op in LOGIC:
             return f"{LOGIC[node.op]}({listed})"
         if node.op == "mul":
-            return self._product(node.args, args)
+            return self._product(i, args)
+        if node.op == "div" and self.is_shared[node.args[1]] and not self.is_shared[i]:
+            return f"i_multiple({listed})"
         if node.op == "pow" and nodes[1].op == "const":
             return self._power(args, nodes[1].value)
         if node.op == "with_sign":
@@ -211,16 +260,22 @@ class _Emitter:
             return f"i_{node.op}({listed})"
         raise UnsupportedError(f"the operation {node.op!r} is not available on intervals")
 
-    def _product(self, factors: Sequence[int], args: Sequence[str]) -> str:
-        """A product: a square, one with a literal, or any other."""
+    def _product(self, i: int, args: Sequence[str]) -> str:
+        """A product: a square, one with a literal or another shared number, or any other."""
+        factors = self.nodes[i].args
         if factors[0] == factors[1]:
             return f"i_square({args[0]})"
-        for k in (0, 1):
-            factor = self.nodes[factors[k]]
+        for one, other in ((0, 1), (1, 0)):
+            factor = self.nodes[factors[one]]
             if factor.op == "const" and factor.value > 0:
-                return f"i_scaled({args[1 - k]}, {args[k]}.u)"
+                return f"i_scaled({args[other]}, {args[one]}.u)"
             if factor.op == "const" and factor.value < 0:
-                return f"i_scaled(i_neg({args[1 - k]}), {args[k]}.n)"
+                return f"i_scaled(i_neg({args[other]}), {args[one]}.n)"
+            if self.is_shared[factors[one]] and not self.is_shared[i]:
+                function = {"single": "i_times", "several": "i_multiple"}[
+                    self._form(i, factors[one])
+                ]
+                return f"{function}({args[other]}, {args[one]})"
         return f"i_mul({', '.join(args)})"
 
     def _power(self, args: Sequence[str], exponent: float) -> str:
@@ -257,10 +312,10 @@ def _source(
         *(f"#define {name} {value}" for name, value in sizes.items()),
         header("vector.h"),
         header("interval.h"),
-        "SEPARATE void shared_numbers(const real *shared, interval *table) {",
+        "SEPARATE void shared_numbers(const real *shared, shared_number *table) {",
         *emitter.shared_numbers(),
         "}",
-        "INLINE void evaluate(const interval *table, const interval *x, interval *out) {",
+        "INLINE void evaluate(const shared_number *table, const interval *x, interval *out) {",
         *emitter.evaluation(),
         "}",
         header("boxes.h"),

@@ -19,12 +19,13 @@ SEPARATE void leave(environment *e) { fesetenv(&e->before); }
 
 typedef struct {
   int64_t max_boxes, max_undecided, renewal;
-  const real *smallest;          /* width below which a coordinate is not bisected */
+  const real *smallest;          /* width up to which a coordinate is not bisected */
   const volatile int *stop;
 } search_options;
 typedef struct {
   int64_t boxes, undecided, status;
-  real done, upper, value;       /* part of the volume; of the worst box: its upper bound, and the bound at its centre */
+  real done;                     /* part of the volume of the whole box on which the statement is proved */
+  real bound, value;             /* of the worst box that is left: its upper bound, and the one at its centre */
   real low[COORDINATES], high[COORDINATES];
 } search_result;
 enum { FINISHED, UNDECIDED, REFUTED, OUT_OF_BOXES, STOPPED, OUT_OF_MEMORY };
@@ -32,7 +33,7 @@ enum { FINISHED, UNDECIDED, REFUTED, OUT_OF_BOXES, STOPPED, OUT_OF_MEMORY };
 typedef struct { F value, lowest, outside, inside; } verdict;
 /* value < 0: the statement holds; outside < 0: no point is in the region; lowest <= 0: every alternative is at least 0; inside <= 0: all points
    are in the region. */
-SEPARATE verdict evaluated(const interval *table, const interval *x) {
+SEPARATE verdict evaluated(const shared_number *table, const interval *x) {
   interval out[OUTPUTS];
   evaluate(table, x, out);
   verdict v = {UNBOUNDED, -UNBOUNDED, UNBOUNDED, -UNBOUNDED};
@@ -59,7 +60,7 @@ INLINE real remaining(real after, real before) {
 }
 
 /* The weight of a coordinate: the part of the margin that a bisection along it removes, per width. */
-SEPARATE void measure(const interval *table, real *box, real value, real outside) {
+SEPARATE void measure(const shared_number *table, real *box, real value, real outside) {
   real low[2 * COORDINATES * COORDINATES], high[2 * COORDINATES * COORDINATES], left[2 * COORDINATES];
   for (int k = 0; k < 2 * COORDINATES; k++) {
     int i = k / 2;
@@ -96,7 +97,7 @@ INLINE int widest(const real *box, const real *smallest) {
 }
 
 /* Makes the worst of some boxes that are left the result's: the one with the largest bound at its centre. */
-SEPARATE void note_worst(const interval *table, const real *boxes, int64_t count, search_result *result) {
+SEPARATE void note_worst(const shared_number *table, const real *boxes, int64_t count, search_result *r) {
   for (int64_t first = 0; first < count; first += W) {
     const real *here = boxes + first * RECORD;
     int some = count - first < W ? (int)(count - first) : W;
@@ -105,89 +106,131 @@ SEPARATE void note_worst(const interval *table, const real *boxes, int64_t count
     for (int i = 0; i < COORDINATES; i++) centre[i] = at((x[i].u - x[i].n) * REAL(0.5));
     verdict box = evaluated(table, x), point = evaluated(table, centre);
     for (int l = 0; l < some; l++)
-      if (!(point.value[l] <= result->value)) {
-        result->value = point.value[l];
-        result->upper = box.value[l];
-        memcpy(result->low, here + l * RECORD, sizeof result->low);
-        memcpy(result->high, here + l * RECORD + COORDINATES, sizeof result->high);
+      if (point.value[l] > r->value) {
+        r->value = point.value[l];
+        r->bound = box.value[l];
+        memcpy(r->low, here + l * RECORD, sizeof r->low);
+        memcpy(r->high, here + l * RECORD + COORDINATES, sizeof r->high);
       }
   }
 }
 
-SEPARATE void search(const interval *table, const real *low, const real *high, const search_options *options, search_result *result) {
-  int64_t capacity = 1024, count = 1;
-  real *stack = (real *)malloc(capacity * RECORD * sizeof(real));
-  search_result r = {};
-  r.value = -INFINITY;
-  r.status = stack ? FINISHED : OUT_OF_MEMORY;
-  if (stack) {
-    memcpy(stack, low, COORDINATES * sizeof(real));
-    memcpy(stack + COORDINATES, high, COORDINATES * sizeof(real));
-    stack[DEPTH] = stack[AGE] = 0;
-  }
-  while (r.status == FINISHED && count > 0) {
-    if (r.boxes >= options->max_boxes) { r.status = OUT_OF_BOXES; break; }
-    if (*options->stop) { r.status = STOPPED; break; }
-    if (count + W > capacity) {
-      real *larger_stack = (real *)realloc(stack, 2 * capacity * RECORD * sizeof(real));
-      if (!larger_stack) { r.status = OUT_OF_MEMORY; break; }
-      stack = larger_stack;
-      capacity *= 2;
+/* Evaluates at most W boxes, which it may change, and writes the halves of those that are left to `children`; returns their number. */
+SEPARATE int64_t branch(const shared_number *table, real *boxes, int some, const search_options *options, real *children, search_result *r) {
+  int64_t count = 0;
+  interval x[COORDINATES];
+  gathered(boxes, boxes + COORDINATES, RECORD, some, x);
+  verdict v = evaluated(table, x);
+  r->boxes += some;
+  for (int l = 0; l < some; l++) {
+    real *box = boxes + l * RECORD;
+    if (v.value[l] < 0 || v.outside[l] < 0) {
+      r->done += ldexp(1.0, -(int)box[DEPTH]);
+      continue;
     }
+    if (v.lowest[l] <= 0 && v.inside[l] <= 0) {
+      note_worst(table, box, 1, r);
+      r->status = REFUTED;
+    }
+    if (box[AGE] == 0) {
+      measure(table, box, v.value[l], v.outside[l]);
+      r->boxes += 2 * COORDINATES;
+      box[AGE] = options->renewal;
+    }
+    int i = widest(box, options->smallest);
+    real middle = i < 0 ? 0 : box[i] + REAL(0.5) * (box[COORDINATES + i] - box[i]);
+    if (i < 0 || !(box[i] < middle && middle < box[COORDINATES + i])) {
+      note_worst(table, box, 1, r);
+      r->undecided++;
+      continue;
+    }
+    box[DEPTH] += 1;
+    box[AGE] -= 1;
+    real *child = children + count * RECORD;
+    memcpy(child, box, RECORD * sizeof(real));
+    memcpy(child + RECORD, box, RECORD * sizeof(real));
+    child[COORDINATES + i] = middle;
+    child[RECORD + i] = middle;
+    count += 2;
+  }
+  if (r->undecided >= options->max_undecided && r->status == FINISHED) r->status = UNDECIDED;
+  return count;
+}
+
+/* Depth-first: the stack grows by at most W boxes a time. */
+SEPARATE void search(const shared_number *table, const real *box, const search_options *options, search_result *r) {
+  int64_t capacity = 512, count = 1;
+  real *stack = (real *)malloc(capacity * RECORD * sizeof(real)), boxes[W * RECORD];
+  if (!stack) r->status = OUT_OF_MEMORY;
+  else memcpy(stack, box, RECORD * sizeof(real));
+  while (r->status == FINISHED && count > 0) {
+    if (r->boxes >= options->max_boxes) { r->status = OUT_OF_BOXES; break; }
+    if (*options->stop) { r->status = STOPPED; break; }
     int some = count < W ? (int)count : W;
-    real boxes[W * RECORD];
     count -= some;
     memcpy(boxes, stack + count * RECORD, some * RECORD * sizeof(real));
-    interval x[COORDINATES];
-    gathered(boxes, boxes + COORDINATES, RECORD, some, x);
-    verdict v = evaluated(table, x);
-    r.boxes += some;
-    for (int l = 0; l < some; l++) {
-      real *box = boxes + l * RECORD;
-      if (v.value[l] < 0 || v.outside[l] < 0) { r.done += ldexp(1.0, -(int)box[DEPTH]); continue; }
-      if (v.lowest[l] <= 0 && v.inside[l] <= 0) { note_worst(table, box, 1, &r); r.status = REFUTED; }
-      if (box[AGE] == 0) {
-        measure(table, box, v.value[l], v.outside[l]);
-        r.boxes += 2 * COORDINATES;
-        box[AGE] = options->renewal;
-      }
-      int i = widest(box, options->smallest);
-      real middle = i < 0 ? 0 : box[i] + REAL(0.5) * (box[COORDINATES + i] - box[i]);
-      if (i < 0 || !(box[i] < middle && middle < box[COORDINATES + i])) {
-        note_worst(table, box, 1, &r);
-        r.undecided++;
-        continue;
-      }
-      box[DEPTH] += 1;
-      box[AGE] -= 1;
-      real *child = stack + count++ * RECORD;
-      memcpy(child, box, RECORD * sizeof(real));
-      memcpy(child + RECORD, box, RECORD * sizeof(real));
-      child[i] = middle;
-      child[RECORD + COORDINATES + i] = middle;
-      count++;
-    }
-    if (r.undecided >= options->max_undecided) break;
+    count += branch(table, boxes, some, options, stack + count * RECORD, r);
+    if (count + W <= capacity) continue;
+    real *more = (real *)realloc(stack, 2 * capacity * RECORD * sizeof(real));
+    if (!more) { r->status = OUT_OF_MEMORY; break; }
+    stack = more;
+    capacity *= 2;
   }
-  if (r.status == FINISHED && r.undecided) r.status = UNDECIDED;
-  if (r.status == OUT_OF_BOXES) note_worst(table, stack, count, &r);
+  if (r->status == FINISHED && r->undecided) r->status = UNDECIDED;
+  if (r->status == OUT_OF_BOXES) note_worst(table, stack, count, r);
   free(stack);
-  *result = r;
 }
 
-VISIBLE int search_box(const real *shared, const real *low, const real *high, int64_t max_boxes, int64_t max_undecided, int64_t renewal,
-                       const real *smallest, const int *stop, search_result *result) {
-  environment e;
-  if (enter(&e)) return 1;
-  interval table[TABLE_SIZE];
+/* Breadth-first, until there are `target` boxes: in one generation after the other, each is replaced by what is left of it.  `boxes` has room for
+   2 target of them. */
+SEPARATE int64_t divide(const shared_number *table, real *boxes, int64_t target, const search_options *options, search_result *r) {
+  int64_t count = 1;
+  real batch[W * RECORD], *next = (real *)malloc(2 * target * RECORD * sizeof(real));
+  if (!next) r->status = OUT_OF_MEMORY;
+  while (r->status == FINISHED && count > 0 && count < target) {
+    int64_t children = 0;
+    for (int64_t first = 0; first < count; first += W) {
+      int some = count - first < W ? (int)(count - first) : W;
+      memcpy(batch, boxes + first * RECORD, some * RECORD * sizeof(real));
+      children += branch(table, batch, some, options, next + children * RECORD, r);
+    }
+    memcpy(boxes, next, children * RECORD * sizeof(real));
+    count = children;
+  }
+  free(next);
+  if (r->status == FINISHED && r->undecided) r->status = UNDECIDED;
+  return count;
+}
+
+#define BEGIN                                   \
+  environment e;                                \
+  if (enter(&e)) return -1;                     \
+  shared_number table[TABLE_SIZE];              \
   shared_numbers(shared, table);
-  search_options options = {max_boxes, max_undecided, renewal, smallest, stop};
-  search(table, low, high, &options, result);
+#define START_RESULT memset(result, 0, sizeof *result); result->value = -INFINITY;
+
+/* A box is a record: lower and upper corner, and zeros where it is the whole. */
+VISIBLE int record_size(void) { return RECORD; }
+VISIBLE int64_t divide_box(const real *shared, real *boxes, int64_t target, const search_options *options, search_result *result) {
+  BEGIN START_RESULT
+  int64_t count = divide(table, boxes, target, options, result);
+  leave(&e);
+  return count;
+}
+VISIBLE int search_box(const real *shared, const real *box, const search_options *options, search_result *result) {
+  BEGIN START_RESULT
+  search(table, box, options, result);
+  leave(&e);
+  return 0;
+}
+VISIBLE int worst_box(const real *shared, const real *boxes, int64_t count, search_result *result) {
+  BEGIN START_RESULT
+  note_worst(table, boxes, count, result);
   leave(&e);
   return 0;
 }
 
-SEPARATE void enclose_all(const interval *table, int64_t boxes, const real *low, const real *high, real *lower, real *upper) {
+SEPARATE void enclose_all(const shared_number *table, int64_t boxes, const real *low, const real *high, real *lower, real *upper) {
   for (int64_t first = 0; first < boxes; first += W) {
     int count = boxes - first < W ? (int)(boxes - first) : W;
     interval x[COORDINATES], out[OUTPUTS];
@@ -201,10 +244,7 @@ SEPARATE void enclose_all(const interval *table, int64_t boxes, const real *low,
   }
 }
 VISIBLE int enclose_boxes(const real *shared, int64_t boxes, const real *low, const real *high, real *lower, real *upper) {
-  environment e;
-  if (enter(&e)) return 1;
-  interval table[TABLE_SIZE];
-  shared_numbers(shared, table);
+  BEGIN
   enclose_all(table, boxes, low, high, lower, upper);
   leave(&e);
   return 0;

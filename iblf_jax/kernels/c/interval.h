@@ -5,14 +5,19 @@
    `x < y ? x : y` is y where either is NaN; `largest` returns NaN or infinity where an argument is NaN.  -lower and upper are never -infinity.
 
    The polynomials are truncated Taylor series.  Their errors are proved for any rounding mode, in which an operation has a relative error of at
-   most u = 2^-52: a polynomial by Horner's rule with n operations errs by at most g(n) = n u / (1 - n u) times the sum of the absolute terms. */
+   most u = 2^-52: a polynomial by Horner's rule with n operations errs by at most g(n) = n u / (1 - n u) times the sum of the absolute terms.
+   UNDERFLOW exceeds the errors of denormal results, for which this is not so. */
 #include <fenv.h>
+#define UNDERFLOW 1e-300
 
 typedef struct { F n, u; } interval;
 typedef struct { I yes, no; } truth;  /* for all numbers of the arguments; neither where it is undecided */
 
 INLINE F all_lanes(real x) { F y; for (int l = 0; l < W; l++) y[l] = x; return y; }
-#define UNBOUNDED all_lanes(INFINITY)
+/* In memory, and not a constant: `x < infinity` would become `x <= DBL_MAX`, for which there is no minimum in one instruction. */
+extern "C" __attribute__((visibility("default"))) real no_bound;
+real no_bound = INFINITY;
+#define UNBOUNDED all_lanes(no_bound)
 INLINE F smaller(F x, F y) { return x < y ? x : y; }
 INLINE F larger(F x, F y) { return x > y ? x : y; }
 INLINE F largest(F x, F y) { return larger(smaller(x, UNBOUNDED), y); }
@@ -23,10 +28,6 @@ INLINE interval unless(I undefined, interval x) {
 }
 INLINE interval at(F x) { interval r = {-x, x}; return r; }
 
-INLINE void put(interval *place, interval x) { *place = x; }
-INLINE void put(interval *place, truth x) { place->n = from_bits(x.yes); place->u = from_bits(x.no); }
-INLINE interval get_interval(const interval *place) { return *place; }
-INLINE truth get_truth(const interval *place) { truth r = {bits(place->n), bits(place->u)}; return r; }
 
 /* Arithmetic */
 
@@ -47,6 +48,40 @@ INLINE interval i_mul(interval x, interval y) {
 /* The product with a positive number. */
 INLINE interval i_scaled(interval x, F k) { interval r = {x.n * k, x.u * k}; return r; }
 
+INLINE interval i_div(interval x, interval y) {
+  F zero = {};
+  I negative = y.u < zero, positive = y.n < zero;
+  F n = negative ? x.u : x.n, u = negative ? x.n : x.u;
+  F nearest = negative ? -y.u : -y.n, farthest = negative ? y.n : y.u;
+  interval r = {n / (n >= zero ? nearest : farthest), u / (u >= zero ? nearest : farthest)};
+  return unless(~(negative | positive), r);
+}
+
+/* The product with a number that is the same for all boxes, of which `positive` and `negative` are the parts max(k, 0) and max(-k, 0). */
+typedef struct { F positive, negative; } factor;
+INLINE factor factor_of(F k) { F zero = {}; factor r = {larger(k, zero), larger(-k, zero)}; return r; }
+INLINE interval i_times(interval x, factor k) {
+  interval r = {x.n * k.positive + x.u * k.negative, x.u * k.positive + x.n * k.negative};
+  return r;
+}
+/* The product with an interval that is the same for all boxes.  The upper bound is the larger of two products of the upper bound of x, if y >= 0,
+   or of -lower, if y <= 0; of one of each, if y contains 0.  The other products are with 0. */
+typedef struct { F a, b, c, d; } factors;
+INLINE factors factors_of(interval y) {
+  F zero = {};
+  I positive = y.n <= zero, negative = ~positive & (y.u <= zero);
+  factors r = {negative ? zero : y.u, positive ? -y.n : zero, negative ? y.n : zero, positive ? zero : (negative ? -y.u : y.n)};
+  return r;
+}
+INLINE interval i_multiple(interval x, factors y) {
+  interval r = {larger(x.n * y.a + x.u * y.c, x.n * y.b + x.u * y.d), larger(x.u * y.a + x.n * y.c, x.u * y.b + x.n * y.d)};
+  return r;
+}
+
+INLINE factors reciprocals_of(interval y) { return factors_of(i_div(at(all_lanes(1)), y)); }
+/* What depends on constants only, in the form in which the rest of the program reads it. */
+typedef union { interval number; truth flag; factor single; factors several; } shared_number;
+
 INLINE interval i_abs(interval x) {
   F zero = {};
   interval r = {smaller(x.u, smaller(x.n, zero)), largest(x.n, x.u)};
@@ -63,15 +98,6 @@ INLINE interval i_power(interval x, int exponent) {
   interval r = {n, u};
   return r;
 }
-INLINE interval i_div(interval x, interval y) {
-  F zero = {};
-  I negative = y.u < zero, positive = y.n < zero;
-  F n = negative ? x.u : x.n, u = negative ? x.n : x.u;
-  F nearest = negative ? -y.u : -y.n, farthest = negative ? y.n : y.u;
-  interval r = {n / (n >= zero ? nearest : farthest), u / (u >= zero ? nearest : farthest)};
-  return unless(~(negative | positive), r);
-}
-
 INLINE interval i_max(interval x, interval y) { interval r = {smaller(x.n, y.n), largest(x.u, y.u)}; return r; }
 INLINE interval i_min(interval x, interval y) { interval r = {largest(x.n, y.n), smaller(x.u, y.u)}; return r; }
 INLINE interval i_hull(interval x, interval y) { interval r = {largest(x.n, y.n), largest(x.u, y.u)}; return r; }
@@ -123,7 +149,13 @@ INLINE truth t_select(truth c, truth x, truth y) {
 /* Square roots are correctly rounded upward; an ulp less is a lower bound.  The argument is not negative by construction, so its part below 0 does
    not occur. */
 #define ULP 0x1p-52
+#if VECTOR_BYTES == 64 && !defined(__clang__)
+INLINE F root(F x) { return __builtin_ia32_sqrtpd512_mask(x, x, -1, 4); }
+#elif VECTOR_BYTES == 32 && !defined(__clang__)
+INLINE F root(F x) { return __builtin_ia32_sqrtpd256(x); }
+#else
 INLINE F root(F x) { real a[W]; memcpy(a, &x, sizeof a); for (int l = 0; l < W; l++) a[l] = sqrt(a[l]); memcpy(&x, a, sizeof a); return x; }
+#endif
 INLINE interval i_sqrt(interval x) {
   F zero = {}, low = root(larger(-x.n, zero)), high = root(x.u < zero ? zero : x.u);
   interval r = {low * ULP - low, high};
@@ -174,7 +206,7 @@ SEPARATE interval i_exp(interval x) { interval r = {minus_exp_below(-x.n), exp_a
 INLINE interval expm1_at(F x) {
   exponential e = exponential_of(clamped(x, -700, 709));
   F one = all_lanes(1), a = e.scale * e.expm1, b = e.scale - 1.0, y = a + b;
-  F error = (larger(a, -a) + larger(b, -b)) * EXPM1_ERROR;
+  F error = (larger(a, -a) + larger(b, -b)) * EXPM1_ERROR + UNDERFLOW;
   interval r = {smaller(error - y, one), x > all_lanes(709) ? UNBOUNDED : error + y};
   return r;
 }
@@ -190,7 +222,7 @@ INLINE interval log_of_parts(F k, F f) {
   p = p * z + 2.0 / 19.0; p = p * z + 2.0 / 17.0; p = p * z + 2.0 / 15.0; p = p * z + 2.0 / 13.0; p = p * z + 2.0 / 11.0;
   p = p * z + 2.0 / 9.0; p = p * z + 2.0 / 7.0; p = p * z + 2.0 / 5.0; p = p * z + 2.0 / 3.0;
   F y = p * z * s + 2.0 * s, value = k * 0x1.62e42fefa2000p-1 + (y + k * 0x1.9ef35793c7673p-41);
-  F error = (larger(y, -y) + larger(k, -k)) * LOG_ERROR;
+  F error = (larger(y, -y) + larger(k, -k)) * LOG_ERROR + UNDERFLOW;
   interval r = {error - value, error + value};
   return r;
 }
@@ -263,7 +295,7 @@ INLINE interval from_ends(F at_low, F low_error, F at_high, F high_error, I has_
   interval r = {has_minimum ? one : n, has_maximum ? one : u};
   return r;
 }
-INLINE F sine_error(F x) { F one = all_lanes(1); return smaller(larger(x, -x) * 2.0, one) * SINE_ERROR; }
+INLINE F sine_error(F x) { F one = all_lanes(1); return smaller(larger(x, -x) * 2.0, one) * SINE_ERROR + UNDERFLOW; }
 typedef struct { interval sin, cos; } sine_and_cosine;
 SEPARATE sine_and_cosine i_sincos(interval x) {
   angle low = angle_of(-x.n), high = angle_of(x.u);
@@ -298,7 +330,7 @@ INLINE interval atan_at(F x) {
   p = p * z + 1.0 / 37.0; p = p * z - 1.0 / 35.0; p = p * z + 1.0 / 33.0; p = p * z - 1.0 / 31.0; p = p * z + 1.0 / 29.0; p = p * z - 1.0 / 27.0;
   p = p * z + 1.0 / 25.0; p = p * z - 1.0 / 23.0; p = p * z + 1.0 / 21.0; p = p * z - 1.0 / 19.0; p = p * z + 1.0 / 17.0; p = p * z - 1.0 / 15.0;
   p = p * z + 1.0 / 13.0; p = p * z - 1.0 / 11.0; p = p * z + 1.0 / 9.0; p = p * z - 1.0 / 7.0; p = p * z + 1.0 / 5.0; p = p * z - 1.0 / 3.0;
-  F y = p * z * w + w + offset, error = (far | middle) != 0 ? all_lanes(ATAN_ERROR) : a * ATAN_ERROR;
+  F y = p * z * w + w + offset, error = (far | middle) != 0 ? all_lanes(ATAN_ERROR) : a * ATAN_ERROR + UNDERFLOW;
   y = x < zero ? -y : y;
   interval r = {error - y, error + y};
   return r;
