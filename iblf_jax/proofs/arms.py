@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import functools
 import itertools
 import math
 from collections.abc import Mapping
@@ -175,26 +176,14 @@ class _Arm:
         share[::2] = np.round(share[::2])
         return np.concatenate([t, s, low + share * (high - low)], axis=1)
 
-    def _found(self, point: Any, constants: Any) -> tuple[ArmPoint, Constants]:
-        numbers = jax.tree.unflatten(self.function.structure, list(map(jnp.asarray, constants)))
-        places = self.function.places
-        return point_of(places, self.scenario.n, jnp.asarray(point, float), numbers), numbers
-
     def state_of(self, point: Any, constants: Any) -> LevelState:
         """A point in physical numbers."""
         with jax.enable_x64(True):
-            found, _ = self._found(point, constants)
-            parts, errors = found.parts, found.errors
-            now, _ = arm_motion.motion(parts, errors, found.f_tilde)
-            f_hat = arm_motion.mismatch_torque(parts, now) - found.f_tilde
-            eta = f_hat - parts.kf * matvec(parts.model.mass_matrix(now.q), now.v)
+            numbers = _physical(self.function, np.asarray(point, float), list(constants))
             z = np.asarray(point)[1 + 3 * self.scenario.n :]
-            return LevelState(
-                float(errors.t),
-                *map(np.asarray, (now.q, now.v, found.f_tilde, f_hat, eta)),
-                self.uncertain.values(z),
-                np.broadcast_to(np.asarray(found.rate), (self.function.places.rates,)),
-            )
+            t, *vectors, rate = map(np.asarray, numbers)
+            rates = np.broadcast_to(rate, (self.function.places.rates,))
+            return LevelState(float(t), *vectors, self.uncertain.values(z), rates)
 
     def scenario_at(self, point: Any, constants: Any) -> Scenario:
         """The scenario whose run starts at a point, with its parameters and moved in time.
@@ -240,6 +229,18 @@ class _Uncertain(NamedTuple):
                 base, slope = float(self.numbers.base[k][i]), float(self.numbers.slope[k][i])
                 found[name] = base + slope * float(z[k])
         return found
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _physical(function: ArmBound, point: jax.Array, constants: list[jax.Array]) -> tuple:
+    """Time, position, velocity, f_tilde, f_hat, eta and the further rate at a point."""
+    numbers = jax.tree.unflatten(function.structure, constants)
+    found = point_of(function.places, function.n, point, numbers)
+    parts, errors = found.parts, found.errors
+    now, _ = arm_motion.motion(parts, errors, found.f_tilde)
+    f_hat = arm_motion.mismatch_torque(parts, now) - found.f_tilde
+    eta = f_hat - parts.kf * matvec(parts.model.mass_matrix(now.q), now.v)
+    return errors.t, now.q, now.v, found.f_tilde, f_hat, eta, found.rate
 
 
 def arm_problem(
