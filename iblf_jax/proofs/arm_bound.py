@@ -305,7 +305,7 @@ def decay_bound(constants: Constants, point: LevelPoint) -> jax.Array:
 
 
 def arm_bound(places: Places, n: int, x: jax.Array, constants: Constants) -> jax.Array:
-    """Upper bounds of V_w' over the box x, (3,) [N m rad/s]."""
+    """Upper bounds of V_w' over the box x, (2,) [N m rad/s]."""
     at = coordinates(x, n, places.coordinates)
     point = level_point(constants, at)
     e2, b = point.errors.e2, point.b
@@ -314,7 +314,7 @@ def arm_bound(places: Places, n: int, x: jax.Array, constants: Constants) -> jax
     coupling = jnp.max(jnp.stack([term.coupling for term in terms]))
     direct = coupling - losses - inner(e2, constants.parts.law.K2 * e2)
     squares = _squares(constants, norm(e2), b, terms) - losses
-    return jnp.stack([direct, squares, centred(places, n, x, constants)])
+    return jnp.stack([direct, squares])
 
 
 def _squares(constants: Constants, a: jax.Array, b: jax.Array, terms: list[Corner]) -> jax.Array:
