@@ -237,7 +237,7 @@ def _physical(function: ArmBound, point: jax.Array, constants: list[jax.Array]) 
     numbers = jax.tree.unflatten(function.structure, constants)
     found = point_of(function.places, function.n, point, numbers)
     parts, errors = found.parts, found.errors
-    now, _ = arm_motion.motion(parts, errors, found.f_tilde)
+    now = arm_motion.motion(parts, errors, found.f_tilde).now
     f_hat = arm_motion.mismatch_torque(parts, now) - found.f_tilde
     eta = f_hat - parts.kf * matvec(parts.model.mass_matrix(now.q), now.v)
     return errors.t, now.q, now.v, found.f_tilde, f_hat, eta, found.rate
