@@ -34,6 +34,7 @@ COMMANDS = (
     "montecarlo",
     "sweep",
     "tune",
+    "prove",
     "identify",
     "export",
     "presets",

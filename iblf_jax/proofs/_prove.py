@@ -7,8 +7,8 @@ V_w = V with the weight w of the estimation error.  Three steps answer:
    statement.
 2. At the weight with the least largest V_w', or at a neighbour with which the search advances
    faster, branch and bound with outward rounding decides whether V_w' < 0 everywhere.
-3. Without a proof, runs start at the points with the largest V_w' and at points with much kinetic
-   energy: one that leaves the bounds refutes the statement.
+3. Without a proof, runs start at the points with the largest V_w': one that violates the bounds
+   refutes the statement.
 """
 
 from __future__ import annotations
@@ -124,7 +124,7 @@ def prove(
     options = _Options.of(weight, max_boxes, threads, progress, checkpoint, seed)
     problem = problem_of(scenario, parameters, duration, disturbance_rate)
     level = checks.positive_number("level", level, "the unit of V_w")
-    sampled = sample_weights(problem, level, _weights(scenario, weight), options.seed)
+    sampled = sample_weights(problem, level, weights_of(scenario, weight), options.seed)
     best = min(sampled, key=lambda found: found.largest)
     if best.largest > 0.0:
         result = None
@@ -146,10 +146,11 @@ def prove(
         boxes=0 if result is None else result.boxes,
         done=0.0 if result is None else result.done,
         seconds=time.monotonic() - start,
+        rates={found.weight: found.largest for found in sampled},
         growth_points=_growth_points(problem, level, sampled),
         worst_box=None if worst is None else _worst_box(problem, level, best.weight, worst),
         violation=violation,
-        assumptions=problem.assumptions,
+        problem=problem,
     )
 
 
@@ -189,17 +190,17 @@ def problem_of(
     Raises:
       ValueError: it is not supported; the message says why.
     """
-    return arm_problem(
-        scenario, parameters, duration=duration, disturbance_rate=disturbance_rate
-    )
+    return arm_problem(scenario, parameters, duration=duration, disturbance_rate=disturbance_rate)
 
 
-def _weights(scenario: Scenario, weight: float | None) -> list[float]:
+def weights_of(scenario: Scenario, weight: float | None) -> list[float]:
     """The weights that are tried."""
     if weight is not None:
         return [float(weight)]
-    least_gain = float(np.min(np.asarray(scenario.controller.K2)))
-    least_rate = float(np.min(np.asarray(scenario.observer.kf)))
+    law: Any = scenario.controller
+    observer: Any = scenario.observer
+    least_gain = float(np.min(np.asarray(law.K2)))
+    least_rate = float(np.min(np.asarray(observer.kf)))
     scale = 1.0 / (least_gain * least_rate)
     decades = math.log10(GREATEST_RATIO / LEAST_RATIO)
     count = 1 + math.ceil(decades * WEIGHTS_PER_DECADE)
@@ -258,7 +259,9 @@ def _best(points: np.ndarray, rates: np.ndarray) -> tuple[np.ndarray, np.ndarray
 def _growth_points(
     problem: LevelSetProblem, level: float, sampled: Sequence[_Sampled]
 ) -> tuple[GrowthPoint, ...]:
-    """The point with the largest V_w' for each weight, in physical numbers."""
+    """The point with the largest V_w' for each weight, in physical numbers; () unless all grow."""
+    if min(each.largest for each in sampled) <= 0.0:
+        return ()
     found = []
     for each in sampled:
         state = problem.state_of(each.points[0], problem.constants(each.weight, level))
@@ -350,8 +353,7 @@ def _is_uncertain(problem: LevelSetProblem, name: str) -> bool:
 def _refuted(problem: LevelSetProblem, level: float, sampled: _Sampled) -> Violation | None:
     """A run that starts in the set and violates the bounds; None if none was found.
 
-    Runs start at the points with the largest V_w' and at the points of a random sample with the
-    largest distance from the reference state, which are those of the largest V_w'.
+    Runs start at the points with the largest V_w' that were found.
     """
     constants = problem.constants(sampled.weight, level)
     steps = math.ceil(max(problem.duration, LEAST_DURATION) / DT)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import enum
+import math
 from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
@@ -18,6 +19,7 @@ from iblf_jax.core import checks, tables
 from iblf_jax.core.presentation import present
 from iblf_jax.core.pytree import astype
 from iblf_jax.engine.simulate import simulate
+from iblf_jax.proofs.problem import LevelSetProblem
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.distributions import Perturbation
@@ -149,14 +151,16 @@ class Proof:
     """Part of the volume on which V_w' < 0 is proved."""
     seconds: float
     """Time that the call took [s]."""
+    rates: dict[float, float]
+    """Weight w that was tried -> the largest V_w' that was found."""
     growth_points: tuple[GrowthPoint, ...]
-    """For each weight that was tried the point with the largest V_w' that was found."""
+    """For each weight a point with V_w' > 0, if every weight has one; () otherwise."""
     worst_box: WorstBox | None
     """Of a proof that is not complete; None otherwise."""
     violation: Violation | None
     """None unless the verdict is REFUTED."""
-    assumptions: tuple[str, ...]
-    """What the statement assumes, in sentences."""
+    problem: LevelSetProblem
+    """Coordinates, bounds and points of the level set."""
     history: tuple[Attempt, ...] = ()
     """The proofs of a bisection, in their order; () for a single one."""
 
@@ -166,10 +170,14 @@ class Proof:
         return self.verdict == Verdict.PROVED
 
     @property
+    def assumptions(self) -> tuple[str, ...]:
+        """What the statement assumes, in sentences."""
+        return self.problem.assumptions
+
+    @property
     def point(self) -> GrowthPoint | None:
         """The point with V_w' > 0 at the best weight; None if there is none."""
-        best = min(self.growth_points, key=lambda point: point.rate, default=None)
-        return best if best is not None and best.rate > 0.0 else None
+        return min(self.growth_points, key=lambda point: point.rate, default=None)
 
     @property
     def tube(self) -> GuaranteedTube:
@@ -196,6 +204,35 @@ class Proof:
             return simulate(
                 found.scenario, duration=found.duration, dt=found.dt, record_every=record_every
             )
+
+    def adversarial_runs(
+        self, count: int, *, duration: float | None = None, dt: float = 1e-3, seed: int = 0
+    ) -> list[Rollout]:
+        """Runs that start at t = 0 at points of V_w = level with parameters at the ends of their
+        intervals.
+
+        Args:
+          count: number of runs.
+          duration: length of each run [s]; the time interval of the proof if not given.
+          dt: time step [s].
+          seed: of the random points.
+        """
+        count = checks.positive_integer("count", count, least=0)
+        steps = math.ceil((duration or self.duration) / dt)
+        constants = self.problem.constants(self.weight, self.level)
+        points = self.problem.sample(seed, 2 * count)[::2]
+        points[:, 0] = 0.0
+        every = max(1, steps // INSTANTS)
+        with jax.enable_x64(True):
+            return [
+                simulate(
+                    self.problem.scenario_at(point, constants),
+                    duration=steps * dt,
+                    dt=dt,
+                    record_every=every,
+                )
+                for point in points
+            ]
 
     def plot(self, **options: Any) -> Figure:
         """The tube over the reference with the bounds; see `plotting.guaranteed_tube`."""
@@ -227,14 +264,13 @@ class Proof:
         if self.ranges:
             uncertain = "every plant of the box of parameters"
         return (
-            f"{self.verdict.upper()}: {{V_w <= {self.level:.4g}}} is {_STATEMENTS[self.verdict]} for"
-            f" {times} and {uncertain}."
+            f"{self.verdict.upper()}: {{V_w <= {self.level:.4g}}} is"
+            f" {_STATEMENTS[self.verdict]} for {times} and {uncertain}."
         )
 
     def details(self) -> list[str]:
         """What was found, as lines."""
-        rows = [("", path, f"{low:.6g} to {high:.6g}") for path, (low, high) in self.ranges.items()]
-        lines = tables.as_text(rows, left=(0, 1)) if rows else []
+        lines = _range_rows(self.ranges)
         if self.proved:
             lines.append(self._guarantee())
         if self.verdict == Verdict.NOT_PROVED:
@@ -266,7 +302,9 @@ class Proof:
 
     def _how_violated(self, found: Violation) -> str:
         entries = found.state._asdict().items()
-        start = ", ".join(f"{name} = {_numbers(value)}" for name, value in entries if np.size(value))
+        start = ", ".join(
+            f"{name} = {_numbers(value)}" for name, value in entries if np.size(value)
+        )
         return (
             f"The run of {found.duration:.4g} s from {start} violates the bounds by"
             f" {-found.margin:.3g}; replay() returns it."
@@ -278,7 +316,9 @@ class Proof:
         if box is None:
             return lines
         lines.append(f"Worst box: V_w' <= {box.bound:+.4g}, {box.value:+.4g} at its centre:")
-        rows = [("", name, f"{low:.6g} to {high:.6g}") for name, (low, high) in box.intervals.items()]
+        rows = [
+            ("", name, f"{low:.6g} to {high:.6g}") for name, (low, high) in box.intervals.items()
+        ]
         lines += tables.as_text(rows, left=(0, 1))
         if box.decisive is not None:
             lines.append(
@@ -294,6 +334,12 @@ _STATEMENTS = {
     Verdict.REFUTED: "not inside the bounds forever",
     Verdict.UNDECIDED: "neither proved nor refuted to be invariant",
 }
+
+
+def _range_rows(ranges: Mapping[str, tuple[float, float]]) -> list[str]:
+    """Intervals as aligned lines."""
+    rows = [("", name, f"{low:.6g} to {high:.6g}") for name, (low, high) in ranges.items()]
+    return list(tables.as_text(rows, left=(0, 1)))
 
 
 def _numbers(value: Any) -> str:
