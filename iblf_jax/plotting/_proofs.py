@@ -16,6 +16,8 @@ from iblf_jax.proofs.result import GuaranteedTube, Proof
 from iblf_jax.world import plants
 
 WIDTH = 7.6
+RANGES = 2
+"""Largest number of intervals that the heading lists."""
 RUNS = 6
 """Runs with adversarial parameters that the figure shows."""
 
@@ -62,10 +64,12 @@ def guaranteed_tube(found: Proof, *, runs: int = RUNS) -> Figure:
 
 
 def _heading(found: Proof) -> str:
-    level = f"V_w $\\leq$ {found.level:.4g}".replace("V_w", "$V_w$")
-    if not found.ranges:
-        return f"{level}: {found.verdict}"
-    return f"{level} with {len(found.ranges)} uncertain parameters: {found.verdict}"
+    level = f"$V_w \\leq$ {found.level:.4g}"
+    ranges = [f"{path} {low:.4g} to {high:.4g}" for path, (low, high) in found.ranges.items()]
+    if len(ranges) > RANGES:
+        ranges = [f"{len(ranges)} uncertain parameters"]
+    words = escaped(", ".join([*ranges, str(found.verdict)]))
+    return f"{level}: {words}"
 
 
 def _colour(found: Proof) -> str:

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 import time
+import warnings
 from collections.abc import Mapping, Sequence
 from os import PathLike
 from typing import Any, NamedTuple
@@ -23,12 +24,14 @@ import jax
 import numpy as np
 
 from iblf_jax.core import checks, notices
-from iblf_jax.engine.simulate import simulate
+from iblf_jax.core.status import Status
+from iblf_jax.engine.simulate import SimulationWarning, simulate
 from iblf_jax.kernels.enclosure import enclose
 from iblf_jax.proofs.arms import arm_problem
 from iblf_jax.proofs.problem import LevelSetProblem
 from iblf_jax.proofs.result import GrowthPoint, Proof, Verdict, Violation, WorstBox
 from iblf_jax.proofs.search import SearchResult, search
+from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.distributions import Perturbation
 
@@ -52,8 +55,10 @@ RUNS = 16
 """Runs that start at points of the level set."""
 LEAST_DURATION = 5.0
 """Length of these runs, at least [s]."""
-DT = 1e-3
-"""Their time step [s]."""
+TIME_STEPS = (1e-3, 1e-4, 1e-5)
+"""Their time steps [s]: the first one with which a run is accurate."""
+UNRELIABLE = Status.INACCURATE | Status.STEP_TOO_LARGE
+"""Flags of runs that refute nothing."""
 
 
 class _Sampled(NamedTuple):
@@ -120,10 +125,23 @@ def prove(
     Source: design of this package; branch and bound with interval arithmetic as in R. E. Moore,
       R. B. Kearfott, M. J. Cloud, Introduction to Interval Analysis, 2009.
     """
-    start = time.monotonic()
     options = _Options.of(weight, max_boxes, threads, progress, checkpoint, seed)
     problem = problem_of(scenario, parameters, duration, disturbance_rate)
     level = checks.positive_number("level", level, "the unit of V_w")
+    with jax.enable_x64(True):
+        return _decided(canonical(scenario), problem, dict(parameters), level, weight, options)
+
+
+def _decided(
+    scenario: Scenario,
+    problem: LevelSetProblem,
+    parameters: dict[str, Perturbation],
+    level: float,
+    weight: float | None,
+    options: _Options,
+) -> Proof:
+    """The three steps."""
+    start = time.monotonic()
     sampled = sample_weights(problem, level, weights_of(scenario, weight), options.seed)
     best = min(sampled, key=lambda found: found.largest)
     if best.largest > 0.0:
@@ -136,8 +154,8 @@ def prove(
     worst = None if result is None else result.worst
     return Proof(
         verdict=verdict,
-        scenario=canonical(scenario),
-        parameters=dict(parameters),
+        scenario=scenario,
+        parameters=parameters,
         ranges=dict(problem.scales),
         level=level,
         weight=best.weight,
@@ -353,26 +371,33 @@ def _is_uncertain(problem: LevelSetProblem, name: str) -> bool:
 def _refuted(problem: LevelSetProblem, level: float, sampled: _Sampled) -> Violation | None:
     """A run that starts in the set and violates the bounds; None if none was found.
 
-    Runs start at the points with the largest V_w' that were found.
+    Runs start at the points with the largest V_w' that were found.  The time step is reduced until
+    the run is accurate; a run that is not accurate with the smallest one refutes nothing.
     """
     constants = problem.constants(sampled.weight, level)
-    steps = math.ceil(max(problem.duration, LEAST_DURATION) / DT)
-    if not problem.is_period:
-        steps = math.floor(problem.duration / DT)
+    duration = problem.duration
+    if problem.is_period:
+        duration = max(duration, LEAST_DURATION)
     for point in sampled.points[:RUNS]:
         scenario = problem.scenario_at(point, constants)
-        margin = _margin(scenario, steps, DT)
-        if margin < 0.0 and _margin(scenario, 2 * steps, 0.5 * DT) < 0.0:
-            state = problem.state_of(point, constants)
-            return Violation(scenario, state, steps * DT, DT, margin)
+        for dt in TIME_STEPS:
+            run = _run(scenario, duration, dt)
+            if not int(run.status) & Status.INACCURATE:
+                break
+        if int(run.status) & UNRELIABLE or not int(run.status) & Status.BOUND_VIOLATED:
+            continue
+        margin = float(np.min(np.asarray(run.metrics["margin"])))
+        state = problem.state_of(point, constants)
+        return Violation(scenario, state, int(run.steps or 0) * dt, dt, margin)
     return None
 
 
-@jax.enable_x64(True)
-def _margin(scenario: Scenario, steps: int, dt: float) -> float:
-    """The least distance from the bounds in a run."""
-    run = simulate(scenario, duration=steps * dt, dt=dt, record_every=steps)
-    return float(np.min(np.asarray(run.metrics["margin"])))
+def _run(scenario: Scenario, duration: float, dt: float) -> Rollout:
+    """A run, whose violations are no surprise."""
+    steps = math.floor(duration / dt)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SimulationWarning)
+        return simulate(scenario, duration=steps * dt, dt=dt, record_every=steps)
 
 
 def _verdict(result: SearchResult | None, violation: Violation | None) -> Verdict:

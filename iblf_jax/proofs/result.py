@@ -315,6 +315,9 @@ class Proof:
         box = self.worst_box
         if box is None:
             return lines
+        if box.bound < 0.0:
+            lines.append("The boxes that are left need more of them: increase max_boxes.")
+            return lines
         lines.append(f"Worst box: V_w' <= {box.bound:+.4g}, {box.value:+.4g} at its centre:")
         rows = [
             ("", name, f"{low:.6g} to {high:.6g}") for name, (low, high) in box.intervals.items()
