@@ -31,6 +31,13 @@ PAGES: dict[str, tuple[str, str]] = {
         ),
     ),
     "certificates": ("Certificates", "certify Certificate Counterexample"),
+    "proofs": (
+        "Proofs",
+        (
+            "prove Proof largest_level largest_parameters gains_for_guarantee GuaranteedGains"
+            " proofs.Verdict proofs.GrowthPoint proofs.GuaranteedTube"
+        ),
+    ),
     "tuning": (
         "Tuning",
         (
