@@ -61,6 +61,13 @@ PLOTS = {
         "error [mrad]",
         "Laws at equal effort; the page on choosing a law has the details. Less is better.",
     ),
+    "rare_failures": Plot(
+        ("case", "estimator"),
+        "variation",
+        "Probabilities of rare failures that are known: mean of the estimates, relative to the"
+        " exact value, their coefficient of variation, the one that the estimator reports, and the"
+        " share of its 95 % intervals that contain the exact value.",
+    ),
     "tuning": Plot(
         ("search",),
         "rollouts to 0.5 %",

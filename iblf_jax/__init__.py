@@ -53,6 +53,7 @@ from iblf_jax.studies.distributions import choice as choice
 from iblf_jax.studies.distributions import factor as factor
 from iblf_jax.studies.distributions import interval as interval
 from iblf_jax.studies.distributions import joint_normal as joint_normal
+from iblf_jax.studies.distributions import joint_samples as joint_samples
 from iblf_jax.studies.distributions import log_uniform as log_uniform
 from iblf_jax.studies.distributions import normal as normal
 from iblf_jax.studies.distributions import offset as offset
@@ -133,6 +134,7 @@ if TYPE_CHECKING:
     from iblf_jax.studies.compare import compare as compare
     from iblf_jax.studies.comparison import Comparison as Comparison
     from iblf_jax.studies.monte_carlo import monte_carlo as monte_carlo
+    from iblf_jax.studies.rare_events.result import FailureProbability as FailureProbability
     from iblf_jax.studies.sensitivity import Sensitivity as Sensitivity
     from iblf_jax.studies.sensitivity import sensitivity as sensitivity
     from iblf_jax.studies.store import StoreError as StoreError
@@ -144,6 +146,7 @@ if TYPE_CHECKING:
     from iblf_jax.tuning import Front as Front
     from iblf_jax.tuning import TuneResult as TuneResult
     from iblf_jax.tuning import cvar as cvar
+    from iblf_jax.tuning import failure_probability as failure_probability
     from iblf_jax.tuning import falsify as falsify
     from iblf_jax.tuning import objectives as objectives
     from iblf_jax.tuning import pareto as pareto
@@ -164,6 +167,8 @@ _ON_FIRST_USE = {
     "explore": ("iblf_jax.deployment.live", "explore"),
     "export": ("iblf_jax.deployment.export", "export"),
     "Exported": ("iblf_jax.deployment.export", "Exported"),
+    "failure_probability": ("iblf_jax.tuning", "failure_probability"),
+    "FailureProbability": ("iblf_jax.studies.rare_events.result", "FailureProbability"),
     "falsify": ("iblf_jax.tuning", "falsify"),
     "Front": ("iblf_jax.tuning", "Front"),
     "excitation": ("iblf_jax.identification", "excitation"),

@@ -32,6 +32,7 @@ COMMANDS = (
     "simulate",
     "compare",
     "montecarlo",
+    "failure",
     "sweep",
     "tune",
     "prove",

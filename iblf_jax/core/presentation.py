@@ -13,6 +13,7 @@ from typing import Any
 PRESENTATIONS = {
     "certificate figure": ("iblf_jax.plotting.certificates", "certificate"),
     "comparison figure": ("iblf_jax.plotting", "comparison"),
+    "failure figure": ("iblf_jax.plotting", "failure_probability"),
     "first exit figure": ("iblf_jax.plotting", "first_exit"),
     "front figure": ("iblf_jax.plotting", "pareto"),
     "identification figure": ("iblf_jax.plotting", "identification"),

@@ -1,4 +1,4 @@
-"""Reads study files: a Monte-Carlo study or a sweep as validated TOML.
+"""Reads study files: a Monte-Carlo study, a sweep or a probability of failure as validated TOML.
 
 A study file is a scenario file (`files.scenario`) with more tables:
 
@@ -10,16 +10,19 @@ A study file is a scenario file (`files.scenario`) with more tables:
     "initial.q" = { offset = "normal", mean = 0.0, std = 0.02 }
     [study]                       # Monte-Carlo: runs, seed, sampler, replicates
     runs = 10000
+    [failure]                     # or a probability of failure: method, runs, seed, margin, limit,
+    method = "subset"             # confidence
     [sweep]                       # or a sweep: also design, points, unit
     runs = 256
     [grid]                        # path -> values, or a perturbation in a random design
     "controller.K2" = [10.0, 20.0, 40.0]
 
 A perturbation names its kind (factor, offset or value), its distribution (uniform, normal,
-log_uniform, choice or joint_normal), the numbers of the distribution, and `shared = true` if all
-entries of a vector leaf get the same draw.  Correlated leaves are joint_normal, each with its mean,
-its rows of the factor of the covariance, and the group = "name" of the joint draw.  Tuning files
-have the same table [perturbations].  Every error is a ValueError that names file and key.
+log_uniform, choice, joint_normal or joint_samples), the numbers of the distribution, and `shared =
+true` if all entries of a vector leaf get the same draw.  Correlated leaves are joint_normal, each
+with its mean, its rows of the factor of the covariance, and the group = "name" of the joint draw;
+or joint_samples, each with its values in a list of samples, and the group.  Tuning files have the
+same table [perturbations].  Every error is a ValueError that names file and key.
 """
 
 from __future__ import annotations
@@ -51,6 +54,14 @@ from iblf_jax.studies.distributions import KINDS, Perturbation
 OPTIONS: dict[str, dict[str, type]] = {
     "study": {"runs": int, "seed": int, "sampler": str, "replicates": int},
 }
+OPTIONS["failure"] = {
+    "method": str,
+    "runs": int,
+    "seed": int,
+    "margin": str,
+    "limit": float,
+    "confidence": float,
+}
 OPTIONS["sweep"] = OPTIONS["study"] | {"design": str, "points": int, "unit": int}
 """Table -> key -> type."""
 
@@ -58,13 +69,16 @@ EXAMPLE = 'Write, for example, { factor = "uniform", low = 0.9, high = 1.1 }.'
 
 
 class StudyFile(NamedTuple):
-    """The content of a study file, as the arguments of `monte_carlo` or `sweep`."""
+    """The content of a study file, as the arguments of `monte_carlo`, `sweep` or
+    `failure_probability`.
+    """
 
     scenario: Scenario
     perturbations: dict[str, Perturbation]
     grid: dict[str, Any]
     options: dict[str, Any]
-    """duration, dt, method, and the entries of [study] or [sweep]."""
+    """duration, dt, method, and the entries of [study], [sweep] or [failure]; `integrator` is the
+    method of [run] for a probability of failure."""
 
 
 def load_study_file(
@@ -74,7 +88,7 @@ def load_study_file(
 
     Args:
       path: the file.
-      kind: "study" or "sweep", the table that it must have.
+      kind: "study", "sweep" or "failure", the table that it must have.
       modules: modules that the file cannot describe, as `load_scenario` takes them.
 
     Raises:
@@ -95,7 +109,8 @@ def study_from_dict(
     modules: Mapping[str, Any] | None = None,
 ) -> StudyFile:
     """As `load_study_file`, from the tables of a file."""
-    own = {"study": ("study", "perturbations"), "sweep": ("sweep", "perturbations", "grid")}
+    own: dict[str, tuple[str, ...]] = {name: (name, "perturbations") for name in OPTIONS}
+    own["sweep"] = (*own["sweep"], "grid")
     file = from_dict(data, source, other_tables=own[kind], folder=folder, modules=modules)
     try:
         if "record_every" in file.run:
@@ -105,7 +120,10 @@ def study_from_dict(
         if "duration" not in file.run:
             remedy = "Add [run] with duration = ..."
             raise missing("run.duration", "the length of a run [s]", remedy)
-        options = file.run | _options(data.get(kind), kind)
+        run = dict(file.run)
+        if kind == "failure" and "method" in run:
+            run["integrator"] = run.pop("method")
+        options = run | _options(data.get(kind), kind)
         perturbations = perturbations_of(data)
         grid = {}
         if kind == "sweep":

@@ -10,6 +10,7 @@ matplotlib Figure, which a notebook shows if it is the value of a cell.  Runs ma
 select one run of a batch first.
 """
 
+from iblf_jax.plotting._failures import failure_probability as failure_probability
 from iblf_jax.plotting._figures import adaptation as adaptation
 from iblf_jax.plotting._figures import errors as errors
 from iblf_jax.plotting._figures import joint as joint

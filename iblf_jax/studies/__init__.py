@@ -9,6 +9,7 @@
     store        store_config, store: a sweep on disk that survives a kill
     results      comparison, study, dataset (the table of a sweep); statistics, summaries
     search       perturbation_cube: the cases as a box, for gradient-based search
+    rare events  rare_events: probabilities of rare failures, for `ij.failure_probability`
 
 The public functions are those of `iblf_jax`; `distributions` has those of parameters.  The names
 below are options and errors of the functions.

@@ -8,8 +8,10 @@ a draw:
     log_uniform   low (high / low)^u
     choice        the first value whose cumulative weight reaches u
     joint_normal  mean + sum_k rows_k Phi^-1(u_k)
+    joint_samples the sample of the group whose cumulative weight reaches u
 
-The leaves of a `joint_normal` group share u_1 ... u_d, so that they vary together.  Independent
+The leaves of a `joint_normal` or `joint_samples` group share their u, so that they vary together.
+Independent
 draws, Latin hypercubes and Sobol points differ in their u only.  A draw z changes a leaf that holds
 x0 to
 
@@ -22,7 +24,7 @@ numbers do not recompile a study.
 
 from __future__ import annotations
 
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -42,6 +44,9 @@ class Distribution(Protocol):
 
     A distribution of leaves that vary together has two more attributes: `group`, the name of the
     draws that they share, and `draws`, the number of uniform numbers that `quantile` takes.
+
+    A distribution may have a method `of_normal(z)` = F^-1(Phi(z)) that is accurate in both tails,
+    where Phi(z) rounds to 1; one whose draws are not continuous in u sets `is_discrete = True`.
     """
 
     def quantile(self, u: jax.Array) -> jax.Array:
@@ -53,8 +58,9 @@ class Distribution(Protocol):
         ...
 
 
-distribution_member = OptionalMembers(group="", draws=0)
-"""The optional members of a `Distribution`: those of leaves that vary together."""
+distribution_member = OptionalMembers(group="", draws=0, of_normal=None, is_discrete=False)
+"""The optional members of a `Distribution`: those of leaves that vary together, and those that
+probabilities of rare failures read."""
 
 
 @component
@@ -96,7 +102,11 @@ class Normal:
 
     def quantile(self, u: jax.Array) -> jax.Array:
         """F^-1(u) = mean + std Phi^-1(u)."""
-        return self.mean + self.std * jax.scipy.special.ndtri(u)
+        return self.of_normal(jax.scipy.special.ndtri(u))
+
+    def of_normal(self, z: jax.Array) -> jax.Array:
+        """F^-1(Phi(z)) = mean + std z."""
+        return self.mean + self.std * z
 
     def support(self) -> tuple[np.ndarray, np.ndarray]:
         """The whole line."""
@@ -140,6 +150,7 @@ class Choice:
 
     values: jax.Array = leaf("", shape="any")
     weights: jax.Array = leaf("", sign="nonnegative", shape="any")
+    is_discrete: ClassVar[bool] = True
 
     def check(self) -> None:
         """Raises ValueError unless there is one weight a value and one that is not zero."""
@@ -150,15 +161,11 @@ class Choice:
                 "a list of numbers",
                 "Give a vector leaf one choice for each entry's path.",
             )
-        checks.shape_is("choice: weights", self.weights, self.values.shape)
-        if checks.is_concrete(self.weights) and not np.sum(np.asarray(self.weights)) > 0:
-            raise checks.fail("choice: weights", self.weights, "at least one weight > 0")
+        _check_weights("choice: weights", self.weights, self.values.shape)
 
     def quantile(self, u: jax.Array) -> jax.Array:
         """The first value whose cumulative weight reaches u."""
-        edges = jnp.cumsum(self.weights) / jnp.sum(self.weights)
-        index = jnp.sum(u[..., None] > edges, axis=-1)
-        return self.values[jnp.minimum(index, self.values.size - 1)]
+        return self.values[_first_that_reaches(u, self.weights)]
 
     def support(self) -> tuple[np.ndarray, np.ndarray]:
         """The least and the greatest value of positive weight."""
@@ -200,7 +207,11 @@ class JointNormal:
 
     def quantile(self, u: jax.Array) -> jax.Array:
         """Mean + rows Phi^-1(u), for the u of the group, (d,)."""
-        return self.mean + jnp.sum(self.rows * jax.scipy.special.ndtri(u), axis=-1)
+        return self.of_normal(jax.scipy.special.ndtri(u))
+
+    def of_normal(self, z: jax.Array) -> jax.Array:
+        """Mean + rows z, for the standard normal numbers of the group, (d,)."""
+        return self.mean + jnp.sum(self.rows * z, axis=-1)
 
     def support(self) -> tuple[np.ndarray, np.ndarray]:
         """The whole line."""
@@ -235,6 +246,54 @@ def is_interval(perturbation: Any) -> bool:
     return isinstance(perturbation, Perturbation) and isinstance(
         perturbation.distribution, Interval
     )
+
+
+@component
+class JointSamples:
+    """One of a list of samples, of leaves that vary together.
+
+    Args:
+      values: the leaf in each of m samples, (m,) or (m, ...), in the leaf's unit.
+      weights: (m,) numbers >= 0, of any sum.
+      group: name of the draw that the leaves share.
+    """
+
+    values: jax.Array = leaf("", shape="any")
+    weights: jax.Array = leaf("", sign="nonnegative", shape="any")
+    group: str = static()
+    draws: ClassVar[int] = 1
+    is_discrete: ClassVar[bool] = True
+
+    def check(self) -> None:
+        """Raises ValueError for no sample, weights that do not fit, or a group without a name."""
+        if self.values.ndim == 0 or self.values.size == 0:
+            expected = "the leaf in each of the samples, at least one"
+            raise checks.fail("joint_samples: values", self.values, expected)
+        _check_weights("joint_samples: weights", self.weights, self.values.shape[:1])
+        if not isinstance(self.group, str) or not self.group:
+            raise checks.fail("joint_samples: group", self.group, "a name")
+
+    def quantile(self, u: jax.Array) -> jax.Array:
+        """The first sample whose cumulative weight reaches u, for the u of the group, (1,)."""
+        return self.values[_first_that_reaches(u[0], self.weights)]
+
+    def support(self) -> tuple[np.ndarray, np.ndarray]:
+        """The least and the greatest value of positive weight."""
+        values = np.asarray(self.values)[np.asarray(self.weights) > 0]
+        return values.min(axis=0), values.max(axis=0)
+
+
+def _check_weights(name: str, weights: jax.Array, shape: tuple[int, ...]) -> None:
+    checks.shape_is(name, weights, shape)
+    if checks.is_concrete(weights) and not np.sum(np.asarray(weights)) > 0:
+        raise checks.fail(name, weights, "at least one weight > 0")
+
+
+def _first_that_reaches(u: jax.Array, weights: jax.Array) -> jax.Array:
+    """The index of the first entry whose cumulative weight reaches u, elementwise."""
+    edges = jnp.cumsum(weights) / jnp.sum(weights)
+    index = jnp.sum(u[..., None] > edges, axis=-1)
+    return jnp.minimum(index, weights.size - 1)
 
 
 @component
@@ -392,6 +451,30 @@ def joint_normal(mean: Any, rows: Any, group: str) -> JointNormal:
     return JointNormal(mean, rows, group)
 
 
+def joint_samples(values: Any, group: str, weights: Any = None) -> JointSamples:
+    """One of a list of samples, of leaves that vary together.
+
+        z = values[min {j : w_0 + ... + w_j >= u sum w}],   u the same for all leaves of the group
+
+    Args:
+      values: (m, ...), the perturbed leaf in each of m samples.
+      group: name of the draw that the leaves share.
+      weights: (m,) numbers >= 0, not necessarily of sum 1; equal if not given.
+
+    Returns:
+      A distribution for `factor`, `offset` or `value`.
+
+    Raises:
+      ValueError: no sample, weights that do not fit, or no name.
+
+    Source: `FailureProbability.rare_draws` is made of them.
+    """
+    if weights is None:
+        count = checks.as_floats("joint_samples: values", values).shape[:1]
+        weights = jnp.ones(count)
+    return JointSamples(values, weights, group)
+
+
 def choice(values: Any, weights: Any = None) -> Choice:
     """One of a list of numbers.
 
@@ -493,5 +576,6 @@ MEMBERS = {
     "log_uniform": LogUniform,
     "choice": Choice,
     "joint_normal": JointNormal,
+    "joint_samples": JointSamples,
 }
 """Every distribution by the name that files give it."""

@@ -43,14 +43,18 @@ class Cube:
         """Number of coordinates d."""
         return sum(int(np.prod(shape, dtype=int)) for _, shape in self.shapes)
 
-    def values(self, u: jax.Array) -> dict[str, jax.Array]:
-        """Path -> value at a point u, (d,)."""
+    def numbers(self, u: jax.Array) -> dict[str, jax.Array]:
+        """Name of the draws -> the coordinates of points u, (..., d), that are theirs."""
         parts, at = {}, 0
         for path, shape in self.shapes:
             size = int(np.prod(shape, dtype=int))
-            parts[path] = u[at : at + size].reshape(shape)
+            parts[path] = u[..., at : at + size].reshape((*u.shape[:-1], *shape))
             at += size
-        return draw(self.uncertain, self.targets, jnp.uint32(0), {}, parts)[1]
+        return parts
+
+    def values(self, u: jax.Array) -> dict[str, jax.Array]:
+        """Path -> value at a point u, (d,)."""
+        return draw(self.uncertain, self.targets, jnp.uint32(0), {}, self.numbers(u))[1]
 
     def why_inadmissible(self, u: np.ndarray) -> str:
         """Why a point cannot be run; "" if it can."""

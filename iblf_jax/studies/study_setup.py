@@ -66,6 +66,8 @@ class PreparedStudy:
     """Path -> uniform numbers of every run, for samplers with a design."""
     points: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
     """Path -> value at every point of a sweep."""
+    numbers: np.ndarray | None = None
+    """Number of each run, which its noise depends on; its position if not given."""
 
     @property
     def cases(self) -> int:
@@ -96,7 +98,10 @@ class PreparedStudy:
     def inputs_of(self, cases: np.ndarray) -> CaseInputs:
         """The inputs of these cases; numbers beyond the last case repeat it."""
         cases = np.minimum(cases, self.cases - 1)
-        return case_inputs(cases, self.options.runs, self.points, self.designed)
+        inputs = case_inputs(cases, self.options.runs, self.points, self.designed)
+        if self.numbers is None:
+            return inputs
+        return inputs._replace(index=self.numbers[cases % self.options.runs])
 
 
 def drawn_leaves(

@@ -27,9 +27,11 @@ and validates the result on fresh runs.
 | `samples`, `failures`, `step_check` | runs for the report, why fresh runs failed, and dt / 2 |
 | `_tune` | `tune`, which calls these in this order |
 | `_pareto`, `_falsify` | fronts of two objectives, and attacks on a result |
+| `_failure_probability`, `margins` | probabilities of rare failures, gradients of margins |
 """
 
 from iblf_jax.tuning import objectives as objectives
+from iblf_jax.tuning._failure_probability import failure_probability as failure_probability
 from iblf_jax.tuning._falsify import Attack as Attack
 from iblf_jax.tuning._falsify import falsify as falsify
 from iblf_jax.tuning._pareto import Front as Front

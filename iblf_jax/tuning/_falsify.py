@@ -43,13 +43,12 @@ from iblf_jax.simulation.scenario import Scenario, canonical, fitted_to_step
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.perturbation_cube import Cube, unit_cube
 from iblf_jax.tuning.evaluation import Derivatives, Value
+from iblf_jax.tuning.margins import pieces_of_margins
 from iblf_jax.tuning.parameters import Box
-from iblf_jax.tuning.quantities import DEFICITS, Peak, Quantities
-from iblf_jax.tuning.runs import NUMBERS_A_RUN, tangents_of_runs
+from iblf_jax.tuning.quantities import DEFICITS, SIGNAL_OF_MARGIN, Peak
+from iblf_jax.tuning.runs import NUMBERS_A_RUN
 from iblf_jax.tuning.solvers import SQP, SearchSpace
 
-MARGINS = {"positions": "deficit", "velocities": "velocity_deficit", "regions": "region_deficit"}
-"""What may be attacked -> the deficit that is minus its margin."""
 SOLVER = SQP(tolerance=1e-4, radius=0.5)
 MAX_HALVINGS = 8
 """How often a step to a point that is not admissible is halved before the attack stays where it
@@ -162,9 +161,9 @@ def falsify(
     seed = checks.seed(seed)
     cube = unit_cube(scenario, perturbations)
     checks.fits_memory("starts", starts, 8.0 * (1 + cube.size) * NUMBERS_A_RUN)
-    checks.one_of("margin", margin, MARGINS)
+    checks.one_of("margin", margin, SIGNAL_OF_MARGIN)
     one: Any = 1.0
-    peak = Peak(one, MARGINS[margin])
+    peak = Peak(one, SIGNAL_OF_MARGIN[margin])
     check_needs("margin", peak, scenario)
     evaluate = MarginEvaluator(cube, peak, dt, request, starts)
     with bar(progress, iterations + 1, unit="steps") as shown:
@@ -278,13 +277,8 @@ def _margins(
     """Smallest margin (S,), minus the peak of a deficit, its gradient by u (S, d) and the status of
     each attack.
     """
-    varied = jax.vmap(cube.values)(u)
-    jacobians = jax.vmap(jax.jacfwd(cube.values))(u)
-    folds = (Quantities((peak,)),)
-    found = tangents_of_runs(cube.uncertain.scenario, varied, jacobians, folds, dt, request)
-    deficits = found.outcome.metrics["tuning_pieces"]
-    slopes = found.tangents["tuning_pieces"]
-    worst = jnp.argmax(deficits, axis=1)
-    margin = -jnp.take_along_axis(deficits, worst[:, None], axis=1)[:, 0]
-    gradient = -jnp.take_along_axis(slopes, worst[:, None, None], axis=2)[:, :, 0]
-    return margin, gradient, found.outcome.status
+    margins, gradients, status = pieces_of_margins(cube, peak, dt, u, request=request)
+    worst = jnp.argmin(margins, axis=1)
+    margin = jnp.take_along_axis(margins, worst[:, None], axis=1)[:, 0]
+    gradient = jnp.take_along_axis(gradients, worst[:, None, None], axis=1)[:, 0]
+    return margin, gradient, status

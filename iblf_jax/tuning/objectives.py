@@ -44,7 +44,9 @@ from iblf_jax.engine import Outer as Outer
 from iblf_jax.simulation.metrics import Fold, Settling, Tracking, check_needs
 from iblf_jax.simulation.scenario import Scenario, fit_joints
 from iblf_jax.simulation.units import unit_text
+from iblf_jax.studies.rare_events.result import FailureProbability
 from iblf_jax.tuning.quantities import (
+    SIGNAL_OF_MARGIN,
     TUNED_SIGNALS,
     MetricResult,
     Peak,
@@ -771,5 +773,43 @@ def violation_probability_below(probability: Any, *, scale: Any = 0.05) -> Requi
         _share(function, "probability", probability),
         event="violated",
         name=f"violation probability < {probability:g}",
+        function=function,
+    )
+
+
+def failure_probability_below(
+    probability: Any, found: FailureProbability, *, scale: Any = 0.05
+) -> Requirement:
+    """The probability of a rare failure is below a limit, assessed on draws near failure.
+
+        P(A) share(y <= limit) < probability,      A the set of the draws `found.rare_draws`
+
+    Use it with `perturbations=found.rare_draws`: the runs of the tuning are draws from a set A
+    whose probability P(A) is known from the last estimate, and a share probability / P(A) of them
+    may fail.  Failures outside A, which other gains may have, are not seen: estimate the
+    probability anew for the tuned scenario, `ij.failure_probability(best.scenario, perturbations,
+    **found.arguments)`.
+
+    Args:
+      probability: the limit.
+      found: an estimate of `ij.failure_probability` in which runs failed.
+      scale: a relevant margin, in the margin's unit.
+
+    Raises:
+      ValueError: not such an estimate, or one without failures.
+    """
+    function = "failure_probability_below"
+    if not isinstance(found, FailureProbability) or found.is_upper_bound:
+        expected = "an estimate of ij.failure_probability in which runs failed"
+        raise checks.fail(f"{function}: found", found, expected)
+    limit = _share(function, "probability", probability)
+    size = _number(function, "scale", scale, "positive")
+    share = jnp.minimum(limit / found.nearby_probability, 1.0)
+    return Requirement(
+        Peak(size, SIGNAL_OF_MARGIN[found.arguments["margin"]]),
+        jnp.asarray(-found.arguments["limit"], share.dtype),
+        size,
+        share,
+        name=f"failure probability < {probability:g} among rare draws",
         function=function,
     )

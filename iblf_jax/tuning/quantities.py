@@ -70,6 +70,12 @@ quantity without a signal is assumed to depend on the torque."""
 DEFICITS = {"deficit": POSITION, "velocity_deficit": VELOCITY, "region_deficit": "m"}
 """Signals of which the largest is minus a margin -> unit; their sign counts, not their absolute
 value."""
+SIGNAL_OF_MARGIN = {
+    "positions": "deficit",
+    "velocities": "velocity_deficit",
+    "regions": "region_deficit",
+}
+"""What may be violated -> the deficit that is minus its margin."""
 OF_LIMIT = "of the limit"
 """Unit of a peak that is measured in limits, one for each joint."""
 TUNED_SIGNALS = {

@@ -18,6 +18,7 @@ EXAMPLES = ROOT / "examples"
 COMMANDS = {
     "arm.toml": ["simulate", "--out", "out"],
     "study.toml": ["montecarlo", "--quiet"],
+    "failure.toml": ["failure", "--quiet"],
     "sweep.toml": ["sweep", "--store", "sweep.zarr", "--quiet"],
     "tune.toml": ["tune", "--quiet"],
     "identify.toml": ["identify"],
@@ -48,6 +49,7 @@ def test_examples_run(name, tmp_path, monkeypatch, capsys):
     words = {
         "arm.toml": "status: ok",
         "study.toml": "512 runs",
+        "failure.toml": "Subset simulation with",
         "sweep.toml": "768 runs",
         "tune.toml": "peak torque < 14 N m",
     }

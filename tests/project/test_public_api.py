@@ -58,6 +58,7 @@ PROMISED = [
     *("identify", "Identification", "excitation", "joint_normal"),
     *("prove", "Proof", "proofs", "largest_level", "largest_parameters"),
     *("gains_for_guarantee", "GuaranteedGains"),
+    *("failure_probability", "FailureProbability", "joint_samples"),
     *(
         "distributed",
         "certificates",

@@ -431,6 +431,22 @@ ENTRIES = {
             "progress": False,
         },
     ),
+    "failure_probability": (
+        ij.failure_probability,
+        {
+            "scenario": None,
+            "perturbations": WAYS,
+            "method": "subset",
+            "runs": 100,
+            "margin": "positions",
+            "limit": 0.0,
+            "confidence": 0.9,
+            "seed": 0,
+            "integrator": "rk4",
+            "executor": None,
+            "progress": False,
+        },
+    ),
     "certify": (ij.certify, {"scenario": None, "run": None, "worst": 3}),
     "explain": (ij.explain, {"scenario": None, "varied": (), "metrics": ()}),
     "load_scenario": (ij.load_scenario, {"path": "x.toml"}),
@@ -452,7 +468,10 @@ ENTRIES = {
     ),
 }
 """Entry points and arguments; None stands for what is made in the test, or for none."""
-TIMED = ("simulate", "compare", "monte_carlo", "sweep", "sensitivity", "tune", "pareto", "falsify")
+TIMED = (
+    *("simulate", "compare", "monte_carlo", "sweep", "sensitivity", "tune", "pareto", "falsify"),
+    "failure_probability",
+)
 
 
 @pytest.fixture
@@ -975,6 +994,7 @@ COMMANDS = {
     "simulate": ["zhang_yan_2024", "--duration", "0.01"],
     "compare": ["zhang_yan_2024", "--duration", "0.01"],
     "montecarlo": ["study.toml", "--quiet"],
+    "failure": ["failure.toml", "--quiet"],
     "sweep": ["sweep.toml", "--quiet"],
     "tune": ["tune.toml", "--quiet"],
     "presets": ["printed_gap"],
@@ -993,7 +1013,7 @@ def test_any_word_in_the_place_of_any_other_on_the_command_line(
     monkeypatch.setattr("jax.distributed.initialize", entered)
     monkeypatch.setitem(sys.modules, "distributed", types.SimpleNamespace(Client=entered))
     monkeypatch.setattr("iblf_jax.cli.prepare_jax", lambda: None)
-    for name in ("study", "sweep", "tune"):
+    for name in ("study", "failure", "sweep", "tune"):
         shutil.copy(ROOT / "examples" / f"{name}.toml", tmp_path)
     for name in ("folder.toml", "folder.nc"):
         (tmp_path / name).mkdir()

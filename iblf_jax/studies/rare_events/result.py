@@ -1,0 +1,256 @@
+"""The result of `ij.failure_probability`."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING, Any
+
+import jax
+import numpy as np
+
+from iblf_jax.core import checks, tables
+from iblf_jax.core.presentation import present
+from iblf_jax.core.status import describe
+from iblf_jax.engine import RunRequest, run_rollout
+from iblf_jax.simulation.metrics import as_folds
+from iblf_jax.simulation.results import Rollout
+from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.studies.distributions import Perturbation, joint_samples, value
+from iblf_jax.studies.rare_events.limit_state import Level
+
+if TYPE_CHECKING:
+    import xarray
+
+GROUP = "rare draws"
+"""Name of the draw that the leaves of `rare_draws` share."""
+NUMBERS_SHOWN = 8
+"""Numbers of the most likely failure that the text lists."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class LikelyFailure:
+    """The most likely draw that was found to fail: the failure nearest to the origin of standard
+    normal coordinates.
+    """
+
+    scenario: Scenario
+    """With the values in it."""
+    values: dict[str, np.ndarray]
+    """Path -> value, in the unit of the leaf."""
+    z: np.ndarray
+    """Standard normal numbers, (d,)."""
+    names: tuple[str, ...]
+    """What each of them belongs to, d paths."""
+    margin: float
+    """Of the run, above the limit; not positive, unless the run diverged before it failed."""
+    status: int
+    """Flags of `Status` of the run."""
+    request: RunRequest
+    """What is run."""
+    dt: jax.Array
+    """Time step, () [s]."""
+    noise: jax.Array | None
+    """Key of the noise of the run; None for a scenario without noise."""
+
+    @property
+    def distance(self) -> float:
+        """Distance |z| from the origin, beta; Phi(-beta) is the probability of a half space at this
+        distance.
+        """
+        return float(np.linalg.norm(self.z))
+
+    def replay(self, record_every: int = 1) -> Rollout:
+        """The run with its whole trajectory, with the same noise.
+
+        Args:
+          record_every: steps between two records.
+        """
+        every = checks.recorded_every(record_every, self.request.steps)
+        request = self.request._replace(record_every=every)
+        folds = as_folds(None, self.dt.dtype, self.scenario)
+        return run_rollout(self.scenario, folds, self.dt, request, self.noise)
+
+    def __repr__(self) -> str:
+        order = np.argsort(-np.abs(self.z))[:NUMBERS_SHOWN]
+        rows = [("", self.names[i], f"{self.z[i]:+.2f} standard deviations") for i in order]
+        left_out = len(self.z) - len(order)
+        more = [f"  and {left_out} numbers that deviate less"] if left_out else []
+        first = (
+            f"LikelyFailure(distance {self.distance:.3f}, margin {self.margin:.3g};"
+            f" {describe(self.status)})"
+        )
+        return "\n".join([first, *tables.as_text(rows, left=(0, 1)), *more])
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class FailureSamples:
+    """Draws with their margins and weights; k of them."""
+
+    z: np.ndarray
+    """Standard normal numbers, (k, d)."""
+    values: dict[str, np.ndarray]
+    """Path -> values, (k, ...), in the unit of the leaf."""
+    margins: np.ndarray
+    """Above the limit, (k,)."""
+    weights: np.ndarray
+    """What each counts, (k,); equal for subset simulation and Monte-Carlo."""
+
+    def __len__(self) -> int:
+        return len(self.margins)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class FailureProbability:
+    """The probability that a run fails, with its interval; printed as sentences."""
+
+    estimate: float
+    """The probability; an upper bound at the confidence of the interval if no run failed
+    (`is_upper_bound`)."""
+    interval: tuple[float, float]
+    """Log-normal, from the coefficient of variation; that of Clopper and Pearson for independent
+    draws."""
+    confidence: float
+    """Of the interval."""
+    coefficient_of_variation: float
+    """Estimated standard deviation of the estimate, divided by it; infinite if no run failed."""
+    is_upper_bound: bool
+    """Whether no run failed."""
+    runs: int
+    """Number of runs, those of the search for the most likely failure included."""
+    levels: tuple[Level, ...]
+    """Of subset simulation: threshold, conditional probability and margins of each level; one for
+    the other methods."""
+    most_likely_failure: LikelyFailure | None
+    """None if no run failed."""
+    failures: FailureSamples
+    """The draws that failed."""
+    nearby: FailureSamples
+    """Draws near failure, to be used again: the samples of the last level, or the failures."""
+    nearby_probability: float
+    """Estimated probability of the set that they are samples of."""
+    names: tuple[str, ...]
+    """What each of the d standard normal numbers belongs to, a path."""
+    nominal_margin: float
+    """Margin of the run at z = 0, the medians of all draws, above the limit."""
+    effective_samples: float
+    """Number of equally weighted independent failures with the same information."""
+    excluded: int
+    """Number of draws that could not be run (`Status.INADMISSIBLE_DRAW`); the probability is one
+    given that a draw can be run."""
+    diverged: int
+    """Number of runs that diverged, which count as failures."""
+    started_outside: int
+    """Number of failures that were drawn outside their bounds at t = 0, where no law can act."""
+    notes: tuple[str, ...]
+    """What limits the estimate, in sentences."""
+    method: str
+    """The method that gave the estimate: "subset", "importance", or "monte_carlo", which is also
+    that of a probability so large that subset simulation needs no second level."""
+    unit: str
+    """Of the margins."""
+    arguments: dict[str, Any]
+    """Keyword arguments of the call: `ij.failure_probability(scenario, perturbations,
+    **arguments)` makes the same estimate for another scenario."""
+
+    @property
+    def rare_draws(self) -> dict[str, Perturbation]:
+        """The draws near failure as perturbations, for `tune` or `monte_carlo`: path -> `value` of
+        `joint_samples`.
+
+        Raises:
+          ValueError: there are none, because no run failed.
+        """
+        if not len(self.nearby):
+            remedy = "Take more runs, or method='subset'."
+            raise checks.fail(
+                "rare_draws", "an estimate without them", "draws near failure", remedy
+            )
+        weights = self.nearby.weights
+        return {
+            path: value(joint_samples(x, GROUP, weights)) for path, x in self.nearby.values.items()
+        }
+
+    def plot(self, **options: Any) -> Any:
+        """Figure: the probability of each margin through the levels, and the most likely failure.
+        Options as `plotting.failure_probability`.
+        """
+        return present("failure figure", self, **options)
+
+    def to_xarray(self) -> xarray.Dataset:
+        """Levels along `level`, failures along `failure`: z, margins, weights, and the drawn
+        values.
+        """
+        import xarray
+
+        levels = {
+            "threshold": [x.threshold for x in self.levels],
+            "conditional_probability": [x.probability for x in self.levels],
+            "level_variation": [x.coefficient_of_variation for x in self.levels],
+            "acceptance": [x.acceptance for x in self.levels],
+        }
+        variables: dict[str, Any] = {name: ("level", x) for name, x in levels.items()}
+        variables["threshold"] = ("level", levels["threshold"], {"units": self.unit})
+        coordinates = {"number": list(self.names)}
+        failures = self.failures
+        variables["z"] = (("failure", "number"), failures.z)
+        variables["failure_margin"] = ("failure", failures.margins, {"units": self.unit})
+        variables["weight"] = ("failure", failures.weights)
+        for path, x in failures.values.items():
+            entries = [f"{path}_{k}" for k in range(x.ndim - 1)]
+            variables[path] = (("failure", *entries), x)
+        attributes = {
+            "method": self.method,
+            "estimate": self.estimate,
+            "interval": list(self.interval),
+            "confidence": self.confidence,
+            "coefficient_of_variation": self.coefficient_of_variation,
+            "is_upper_bound": int(self.is_upper_bound),
+            "runs": self.runs,
+            "excluded": self.excluded,
+            "diverged": self.diverged,
+            "started_outside": self.started_outside,
+            "notes": "\n".join(self.notes),
+        }
+        return xarray.Dataset(variables, coordinates, attributes)
+
+    def __repr__(self) -> str:
+        low, high = self.interval
+        sure = f"{self.confidence:.0%}"
+        if self.is_upper_bound:
+            first = (
+                f"FailureProbability(at most {self.estimate:.2g} with {sure} confidence;"
+                f" {self.runs} runs, none of which failed)"
+            )
+        else:
+            first = (
+                f"FailureProbability({self.estimate:.3g}, {sure} interval {low:.2g} to {high:.2g},"
+                f" coefficient of variation {self.coefficient_of_variation:.2f}; {self.runs} runs)"
+            )
+        lines = [first, f"  {self._method_in_words()}"]
+        if self.most_likely_failure is not None:
+            text = repr(self.most_likely_failure).splitlines()
+            head = text[0].removeprefix("LikelyFailure(").removesuffix(")")
+            lines.append(f"  The most likely failure found: {head}")
+            lines += [f"    {line.strip()}" for line in text[1:]]
+        counts = {
+            "draws could not be run and are excluded": self.excluded,
+            "runs diverged and count as failures": self.diverged,
+            "of the sampled failures started outside their bounds": self.started_outside,
+        }
+        lines += [f"  {count} {words}." for words, count in counts.items() if count]
+        return "\n".join([*lines, *(f"  {note}" for note in self.notes)])
+
+    def _method_in_words(self) -> str:
+        if self.method == "importance":
+            return f"Importance sampling with {self.effective_samples:.0f} effective failures."
+        if self.method == "subset":
+            thresholds = ", ".join(f"{level.threshold:.3g}" for level in self.levels)
+            return (
+                f"Subset simulation with {len(self.levels)} levels, at margins {thresholds}"
+                f" {self.unit}."
+            )
+        count = len(self.failures)
+        return f"{count} failures among independent draws."
+
+    def _repr_html_(self) -> str:
+        return present("card", self)

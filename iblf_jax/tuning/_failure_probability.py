@@ -1,0 +1,481 @@
+"""`failure_probability`: the probability that a run leaves its bounds, also where no study of
+10,000 runs shows a failure.
+
+The perturbations are functions of d independent standard normal numbers z, and a run fails where
+its margin y(z) is not above a limit, or where it diverges.  Subset simulation and Monte-Carlo need
+margins only; importance sampling begins at the design points, which are found by the gradients of
+the margin of each joint and side (`margins.pieces_of_margins`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from concurrent.futures import Executor
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax.core import checks, notices
+from iblf_jax.core.progress import bar
+from iblf_jax.core.pytree import astype
+from iblf_jax.core.status import UNTRUSTED, Status, has_flag
+from iblf_jax.engine import RunRequest, differentiates_forward
+from iblf_jax.simulation.metrics import Margin, RegionMargin, VelocityMargin, check_needs
+from iblf_jax.simulation.paths import with_parameters
+from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.simulation.units import unit_text
+from iblf_jax.studies.designs import MAX_RUNS
+from iblf_jax.studies.distributions import Perturbation
+from iblf_jax.studies.options import RunOptions, ThisProcess, executor_of
+from iblf_jax.studies.rare_events.crude import crude_monte_carlo
+from iblf_jax.studies.rare_events.design_points import Pieces, design_points
+from iblf_jax.studies.rare_events.importance import importance_sampling
+from iblf_jax.studies.rare_events.limit_state import Estimate, Samples
+from iblf_jax.studies.rare_events.normal_space import MARGINS as METRICS
+from iblf_jax.studies.rare_events.normal_space import (
+    NormalSpace,
+    check_varied,
+    is_discrete,
+)
+from iblf_jax.studies.rare_events.result import (
+    FailureProbability,
+    FailureSamples,
+    LikelyFailure,
+)
+from iblf_jax.studies.rare_events.subset import subset_simulation
+from iblf_jax.studies.statistics import check_confidence
+from iblf_jax.studies.study_setup import prepare
+from iblf_jax.studies.summaries import initial_margins
+from iblf_jax.tuning.margins import pieces_of_margins
+from iblf_jax.tuning.quantities import DEFICITS, SIGNAL_OF_MARGIN, Peak
+from iblf_jax.tuning.rollouts import WINDOWS
+from iblf_jax.tuning.runs import in_groups
+
+RUNS = {"subset": 4000, "importance": 4096, "monte_carlo": 10_000}
+"""Method -> default of `runs`."""
+FOLDS: dict[str, type[Any]] = {
+    "positions": Margin,
+    "velocities": VelocityMargin,
+    "regions": RegionMargin,
+}
+"""What may fail -> the fold that has its margin."""
+LEVEL_PROBABILITY = 0.1
+"""Conditional probability of the levels of subset simulation."""
+MAX_LEVELS = 20
+"""Largest number of levels: probabilities down to 1e-20."""
+SEARCHES_TOGETHER = 16
+"""Points whose gradients are computed in one batch."""
+COARSE_RUNS = 500
+"""Samples of a level of the subset simulation from whose failures searches for design points
+start."""
+CHECK_RUNS = 1024
+"""Number of runs of importance sampling that check an estimate of subset simulation."""
+NEAREST = 8
+"""Number of sampled failures, the nearest ones, at which searches for design points start."""
+RAYS = 4
+"""Number of points of each kind along whose rays the most likely failure is searched."""
+FRACTIONS = np.linspace(0.3, 1.05, 51)
+"""Where on a ray, in units of its point."""
+NOMINAL_FAILS = (
+    "The nominal run fails already (margin {margin:.3g} {unit} above the limit), so failures are no"
+    " rare events here."
+)
+NO_DESIGN_POINT = (
+    "The search by gradients found no failure, so the samples are distributed around the nominal"
+    " run, as in Monte-Carlo simulation."
+)
+MISSED_BY_IMPORTANCE = (
+    "A subset simulation with few samples gave the interval {low:.2g} to {high:.2g}: the design"
+    " points do not represent all failures, and the estimate is too small. Use method='subset'."
+)
+MISSED = (
+    "Subset simulation gave {subset:.3g} and missed failures near a design point, because its"
+    " levels went towards other failures; importance sampling around the design points is"
+    " reported instead."
+)
+DISAGREE = (
+    "Importance sampling around the design points gave {other:.2g}, which is larger, but from"
+    " degenerate weights: one of the two misses failures. Take more runs."
+)
+NOT_REACHED = (
+    "Subset simulation reached no failure (upper bound {subset:.2g}); importance sampling around"
+    " the design points is reported instead."
+)
+
+
+class FailureOptions(NamedTuple):
+    """The checked arguments of `failure_probability` that are not those of runs."""
+
+    method: str
+    margin: str
+    limit: float
+    confidence: float
+    runs: int
+
+
+@notices.each_warning_once
+def failure_probability(
+    scenario: Scenario,
+    perturbations: Mapping[str, Perturbation],
+    *,
+    duration: float,
+    dt: float = 1e-3,
+    method: str = "subset",
+    runs: int | None = None,
+    margin: str = "positions",
+    limit: float = 0.0,
+    confidence: float = 0.95,
+    seed: int = 0,
+    integrator: str = "rk4",
+    backend: str = "auto",
+    executor: ThisProcess | Executor | None = None,
+    progress: bool | None = None,
+) -> FailureProbability:
+    """The probability that a run with random parameters fails, down to 1e-8 and below.
+
+        p = P(min over t and joints of min(q - lower, upper - q) <= limit, or the run diverges)
+
+    Args:
+      scenario: what to run, of n joints.
+      perturbations: path -> `factor`, `offset` or `value` of a distribution.
+      duration: length of a run [s], a whole number of steps.
+      dt: time step [s].
+      method: "subset", subset simulation, for any margin; "importance", importance sampling around
+        the failures nearest to the nominal run, which are found by gradients: fewer runs where few
+        such points represent all failures, and flagged where it sees that they do not;
+        "monte_carlo", independent draws.
+      runs: number of runs; for "subset" of each level, ten levels or so.  4000, 4096 and 10,000
+        if not given.
+      margin: which margin fails: of the "positions", the "velocities" or the "regions".
+      limit: margin at which a run fails, in its unit.
+      confidence: of the interval, in (0, 1).
+      seed: whole number that fixes all draws.
+      integrator: "rk4", "heun" or "euler"; as `method` of `simulate`.
+      backend: "auto", "native", "gpu" or "vmap".
+      executor: where the runs are computed, as in `monte_carlo`.
+      progress: a progress bar; by default it is shown on a terminal.
+
+    Returns:
+      A `FailureProbability`: estimate, interval, coefficient of variation, levels, the most likely
+      failure.  If no run failed, the estimate is an upper bound.  Draws that cannot be run are
+      excluded and counted; runs that diverge are failures.
+
+    Raises:
+      ValueError: bad arguments, or a discrete distribution with method="importance".
+      ij.studies.WorkerError: as `monte_carlo`.
+
+    Source: S. K. Au, J. L. Beck, Probabilistic Engineering Mechanics 16 (2001) 263-277; the modules
+      of `iblf_jax.studies.rare_events`.
+    """
+    options = _checked(method, margin, limit, confidence, runs)
+    executor = executor_of(executor, {})
+    run_options = RunOptions(
+        duration=duration,
+        dt=dt,
+        method=integrator,
+        backend=backend,
+        runs=options.runs,
+        seed=seed,
+    ).checked()
+    check_varied(perturbations)
+    check_needs("margin", FOLDS[margin], scenario)
+    prepared = prepare(scenario, perturbations, run_options, (FOLDS[margin](),))
+    if options.method == "importance" and is_discrete(prepared.perturbations):
+        expected = "continuous distributions, as gradients are needed"
+        remedy = "Use method='subset', which needs none."
+        raise checks.fail("perturbations", "a discrete distribution", expected, remedy)
+    expected_runs = {"subset": 5 * options.runs}.get(options.method, options.runs)
+    with bar(progress, expected_runs) as shown:
+        space = NormalSpace(prepared, METRICS[margin], options.limit, executor, shown.update)
+        checks.fits_memory("runs", options.runs, 8.0 * 4 * space.size)
+        found = _found(space, options)
+    space.warn()
+    arguments: dict[str, Any] = {
+        "duration": run_options.duration,
+        "dt": run_options.dt,
+        "method": options.method,
+        "runs": options.runs,
+        "margin": options.margin,
+        "limit": options.limit,
+        "confidence": options.confidence,
+        "seed": run_options.seed,
+        "integrator": integrator,
+        "backend": backend,
+    }
+    return _result(space, options, found, arguments)
+
+
+def _checked(method: Any, margin: Any, limit: Any, confidence: Any, runs: Any) -> FailureOptions:
+    checks.one_of("method", method, tuple(RUNS))
+    checks.one_of("margin", margin, tuple(FOLDS))
+    number = float(checks.number_between("limit", limit, -1e9, 1e9, "the margin's unit"))
+    confidence = check_confidence(confidence)
+    if runs is None:
+        runs = RUNS[method]
+    least = 1
+    if method == "subset":
+        least = 10 * round(1 / LEVEL_PROBABILITY)
+    runs = checks.positive_integer("runs", runs, least=least, most=MAX_RUNS)
+    return FailureOptions(method, margin, number, confidence, runs)
+
+
+class _Found(NamedTuple):
+    """The estimate and what was found with it."""
+
+    estimate: Estimate
+    nominal: float
+    """Margin at z = 0."""
+    likely: np.ndarray | None
+    """The most likely failure, (d,)."""
+    likely_margin: float
+    likely_status: int
+    gradient_runs: int
+
+
+def _found(space: NormalSpace, options: FailureOptions) -> _Found:
+    """The estimate by the method, and the most likely failure."""
+    seed = space.prepared.options.seed
+    origin = np.zeros((1, space.size))
+    nominal = float(space(origin)[0])
+    pieces = PiecesOfMargin(space, options)
+    points = np.zeros((0, space.size))
+    if options.method == "importance":
+        estimate, points = _by_importance(space, options, pieces, nominal)
+    elif options.method == "subset":
+        estimate = _by_subset(space, options, options.runs)
+        estimate, points = _checked_by_importance(space, options, pieces, estimate, nominal)
+    else:
+        estimate = crude_monte_carlo(
+            space, space.size, runs=options.runs, seed=seed, confidence=options.confidence
+        )
+    if nominal <= 0:
+        likely, margin, status = origin[0], nominal, int(space.status[0][0])
+        return _Found(estimate, nominal, likely, margin, status, pieces.runs)
+    likely, margin, status = _most_likely(space, estimate.failures, points)
+    return _Found(estimate, nominal, likely, margin, status, pieces.runs)
+
+
+class PiecesOfMargin:
+    """The margins of the joints and sides of runs in windows of time, with gradients, at points z.
+
+    Args:
+      space: the runs by standard normal numbers.
+      options: which margin fails, and at which limit.
+    """
+
+    def __init__(self, space: NormalSpace, options: FailureOptions):
+        prepared = space.prepared
+        self.space = space
+        self.limit = options.limit
+        self.dtype = prepared.scenario.initial.q.dtype
+        one: Any = 1.0
+        run = prepared.options
+        windows: Any = np.arange(1, WINDOWS) / WINDOWS * run.duration
+        self.peak = astype(Peak(one, SIGNAL_OF_MARGIN[options.margin], windows=windows), self.dtype)
+        self.request = RunRequest.of(
+            prepared.scenario, steps=run.steps, method=run.method, backend=run.backend
+        )
+        self.runs = 0
+        """Runs with gradients until now."""
+
+    @property
+    def is_available(self) -> bool:
+        """Whether the margin has a gradient that is computed in forward mode."""
+        has_gradient = not is_discrete(self.space.prepared.perturbations)
+        return has_gradient and differentiates_forward(self.space.size)
+
+    def __call__(self, z: np.ndarray) -> Pieces:
+        self.runs += len(z)
+        cube, step = self.space.cube, self.space.prepared.shared.dt
+
+        def of_rows(rows: np.ndarray) -> Any:
+            points = jnp.asarray(z[rows], self.dtype)
+            return pieces_of_margins(cube, self.peak, step, points, request=self.request)
+
+        margins, gradients, status = in_groups(of_rows, len(z), SEARCHES_TOGETHER)
+        untrusted = has_flag(status, UNTRUSTED)
+        margins = np.where(untrusted[:, None], np.nan, margins - self.limit)
+        return Pieces(margins.astype(float), gradients.astype(float))
+
+
+def _by_importance(
+    space: NormalSpace, options: FailureOptions, pieces: PiecesOfMargin, nominal: float
+) -> tuple[Estimate, np.ndarray]:
+    """The estimate by importance sampling, and the design points.
+
+    The searches start at the origin and at the nearest failures of a subset simulation with few
+    samples: gradients at the origin alone miss failures where a margin saturates on the way.
+    """
+    points = np.zeros((1, space.size))
+    notes: tuple[str, ...] = ()
+    coarse: Estimate | None = None
+    if nominal > 0:
+        coarse = _by_subset(space, options, COARSE_RUNS)
+        points, _ = design_points(pieces, _nearest(coarse.failures))
+    if not len(points):
+        points, notes = np.zeros((1, space.size)), (NO_DESIGN_POINT,)
+    estimate = _importance_estimate(space, options, points, options.runs)
+    if coarse is not None and not coarse.is_upper_bound and coarse.low > estimate.high:
+        notes = (*notes, MISSED_BY_IMPORTANCE.format(low=coarse.low, high=coarse.high))
+    return estimate._replace(notes=(*notes, *estimate.notes)), points
+
+
+def _by_subset(space: NormalSpace, options: FailureOptions, runs: int) -> Estimate:
+    return subset_simulation(
+        space,
+        space.size,
+        runs=runs,
+        share=LEVEL_PROBABILITY,
+        levels=MAX_LEVELS,
+        seed=space.prepared.options.seed,
+        confidence=options.confidence,
+    )
+
+
+def _importance_estimate(
+    space: NormalSpace, options: FailureOptions, points: np.ndarray, runs: int
+) -> Estimate:
+    return importance_sampling(
+        space,
+        points,
+        runs=runs,
+        seed=space.prepared.options.seed,
+        confidence=options.confidence,
+        runnable=space.runnable_share(),
+    )
+
+
+def _nearest(failures: Samples) -> np.ndarray:
+    """The sampled failures nearest to the origin, (k, d)."""
+    order = np.argsort(np.linalg.norm(failures.z, axis=1), kind="stable")
+    return failures.z[order[:NEAREST]]
+
+
+def _checked_by_importance(
+    space: NormalSpace,
+    options: FailureOptions,
+    pieces: PiecesOfMargin,
+    estimate: Estimate,
+    nominal: float,
+) -> tuple[Estimate, np.ndarray]:
+    """The estimate of subset simulation, or one of importance sampling if that shows that failures
+    were missed; and the design points.
+
+    Samples of intermediate levels go where most margins are small, which need not be where most
+    failures are.  Nothing in the samples shows this; design points do.
+    """
+    if nominal <= 0 or not pieces.is_available:
+        return estimate, np.zeros((0, space.size))
+    points, _ = design_points(pieces, _nearest(estimate.failures))
+    if not len(points) or len(estimate.levels) == 1:
+        return estimate, points
+    second = _importance_estimate(space, options, points, CHECK_RUNS)
+    if second.is_upper_bound or (not estimate.is_upper_bound and second.low <= estimate.high):
+        return estimate, points
+    note = MISSED.format(subset=estimate.probability)
+    if estimate.is_upper_bound:
+        note = NOT_REACHED.format(subset=estimate.probability)
+    elif second.notes:
+        note = DISAGREE.format(other=second.probability)
+        return estimate._replace(notes=(*estimate.notes, note)), points
+    return second._replace(notes=(note, *second.notes)), points
+
+
+def _most_likely(
+    space: NormalSpace, failures: Samples, points: np.ndarray
+) -> tuple[np.ndarray | None, float, int]:
+    """The failure nearest to the origin, its margin and status, on the rays through design points
+    and the nearest sampled failures.
+    """
+    ends = np.concatenate([points[:RAYS], _nearest(failures)[:RAYS]])
+    fractions = FRACTIONS
+    best: np.ndarray | None = None
+    margin = np.nan
+    status = 0
+    for _ in range(2):
+        if not len(ends):
+            break
+        z = (fractions[:, None, None] * ends).reshape(-1, space.size)
+        margins = space(z)
+        flags = space.status[-1]
+        radius = np.where(margins <= 0, np.linalg.norm(z, axis=1), np.inf)
+        i = int(np.argmin(radius))
+        if not np.isfinite(radius[i]):
+            break
+        if best is None or radius[i] < np.linalg.norm(best):
+            best, margin, status = z[i], float(margins[i]), int(flags[i])
+        # The second pass is between the nearest failure and the last point before it.
+        spacing = fractions[1] - fractions[0]
+        first = 1 - spacing / fractions[i // len(ends)]
+        ends, fractions = best[None], np.linspace(first, 1.0, len(FRACTIONS))
+    return best, margin, status
+
+
+def _result(
+    space: NormalSpace, options: FailureOptions, found: _Found, arguments: dict[str, Any]
+) -> FailureProbability:
+    estimate = found.estimate
+    unit = unit_text(space.prepared.scenario, DEFICITS[SIGNAL_OF_MARGIN[options.margin]])
+    notes = list(estimate.notes)
+    if found.nominal <= 0:
+        notes.insert(0, NOMINAL_FAILS.format(margin=found.nominal, unit=unit))
+    status = np.concatenate(space.status)
+    failures = _samples(space, estimate.failures)
+    return FailureProbability(
+        estimate=estimate.probability,
+        interval=(estimate.low, estimate.high),
+        confidence=options.confidence,
+        coefficient_of_variation=estimate.coefficient_of_variation,
+        is_upper_bound=estimate.is_upper_bound,
+        runs=space.runs + found.gradient_runs,
+        levels=estimate.levels,
+        most_likely_failure=_likely(space, found),
+        failures=failures,
+        nearby=_samples(space, estimate.nearby),
+        nearby_probability=estimate.nearby_probability,
+        names=tuple(space.names()),
+        nominal_margin=found.nominal,
+        effective_samples=estimate.effective_samples,
+        excluded=int(np.sum(has_flag(status, Status.INADMISSIBLE_DRAW))),
+        diverged=int(np.sum(has_flag(status, Status.NOT_FINITE))),
+        started_outside=_started_outside(space, failures),
+        notes=tuple(notes),
+        method=estimate.method,
+        unit=unit,
+        arguments=arguments,
+    )
+
+
+def _samples(space: NormalSpace, samples: Samples) -> FailureSamples:
+    return FailureSamples(samples.z, space.values(samples.z), samples.margins, samples.weights)
+
+
+def _likely(space: NormalSpace, found: _Found) -> LikelyFailure | None:
+    if found.likely is None:
+        return None
+    values = {path: x[0] for path, x in space.values(found.likely[None]).items()}
+    prepared = space.prepared
+    scenario = with_parameters(prepared.scenario, values)
+    run = prepared.options
+    return LikelyFailure(
+        scenario=scenario,
+        values=values,
+        z=found.likely,
+        names=tuple(space.names()),
+        margin=found.likely_margin,
+        status=found.likely_status,
+        request=RunRequest.of(scenario, steps=run.steps, method=run.method, record_every=1),
+        dt=prepared.shared.dt,
+        noise=space.noise(found.likely),
+    )
+
+
+def _started_outside(space: NormalSpace, failures: FailureSamples) -> int:
+    """Number of failures that were drawn outside their bounds at t = 0."""
+    if not len(failures):
+        return 0
+    first = initial_margins(space.prepared.scenario, jax.tree.map(jnp.asarray, failures.values))
+    inside = [np.min(margins, axis=1) > 0 for margins in first.values()]
+    return int(np.sum(~np.all(inside, axis=0)))
