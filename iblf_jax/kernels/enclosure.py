@@ -13,7 +13,6 @@ import ctypes
 import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from fractions import Fraction
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -397,7 +396,7 @@ def library(source: str) -> ctypes.CDLL:
       ToolchainError: there is no compiler, it fails, or it does not honour the rounding mode.
     """
     path, _ = built(source, FLAGS)
-    found = loaded(path, "search_box", "enclose_boxes", "rounded_operations", "lanes")
+    found = loaded(path, "search_box", "enclose_boxes", "rounded_operations", "vector_size")
     check_rounding(found)
     return found
 
@@ -413,17 +412,17 @@ def check_rounding(kernel: ctypes.CDLL) -> None:
       ToolchainError: a bound is on the wrong side of the exact result, or the bounds are further
         apart than two neighbouring numbers.
     """
-    lanes = kernel.lanes()
+    width = kernel.vector_size()
     pairs = [(x, y) for x in ROUNDED for y in ROUNDED]
-    pairs += [pairs[-1]] * (-len(pairs) % lanes)
-    for first in range(0, len(pairs), lanes):
-        x, y = (np.array(column) for column in zip(*pairs[first : first + lanes], strict=True))
-        lower = np.empty((7, lanes))
-        upper = np.empty((7, lanes))
+    pairs += [pairs[-1]] * (-len(pairs) % width)
+    for first in range(0, len(pairs), width):
+        x, y = (np.array(column) for column in zip(*pairs[first : first + width], strict=True))
+        lower = np.empty((7, width))
+        upper = np.empty((7, width))
         failed = kernel.rounded_operations(*map(pointer, (x, y, lower, upper)))
-        for lane in range(lanes):
-            found = list(zip(lower[:, lane].tolist(), upper[:, lane].tolist(), strict=True))
-            if failed or not _are_rounded(x[lane].item(), y[lane].item(), found):
+        for k in range(width):
+            found = list(zip(lower[:, k].tolist(), upper[:, k].tolist(), strict=True))
+            if failed or not _are_rounded(x[k].item(), y[k].item(), found):
                 raise ToolchainError(
                     "the compiler does not honour the rounding mode, which enclosures need:"
                     " install GCC 10 or later, or set $CXX to it"
@@ -434,6 +433,8 @@ def _are_rounded(x: float, y: float, found: list[tuple[float, float]]) -> bool:
     """Whether bounds of x + y, x - y, x y and x / y are the nearest ones of the exact results, and
     those of sqrt(x), sin(x) and exp(x) are close to it.
     """
+    from fractions import Fraction  # takes several milliseconds
+
     a, b = Fraction(x), Fraction(y)
     exact = (a + b, a - b, a * b, a / b)
     for value, (low, high) in zip(exact, found[:4], strict=True):
@@ -454,10 +455,10 @@ def _is_close(bounds: tuple[float, float], value: float) -> bool:
     return value - margin <= low < high <= value + margin
 
 
-def _encloses(low: float, high: float, value: Fraction) -> bool:
-    """Whether the bounds are the nearest floating-point numbers on both sides of a number."""
+def _encloses(low: float, high: float, value: Any) -> bool:
+    """Whether the bounds are the nearest floating-point numbers on both sides of a fraction."""
     if high == math.inf:
-        return value > Fraction(sys.float_info.max)
+        return value > sys.float_info.max
     return low <= value <= high and high <= math.nextafter(low, math.inf)
 
 
@@ -486,7 +487,7 @@ def enclose(
       UnsupportedError: an operation is not available on intervals.
       ToolchainError: no compiler, or one that does not honour the rounding mode.
     """
-    kernel = kernel_of(function, np.shape(lower)[1], constants)
+    kernel = interval_kernel(function, np.shape(lower)[1], constants)
     low, high = (np.ascontiguousarray(x, np.float64) for x in (lower, upper))
     if low.shape != high.shape or not (low <= high).all():
         raise ValueError("lower, upper: got a lower bound above the upper one, or two shapes.")
@@ -508,7 +509,7 @@ def enclose(
     return below, above
 
 
-class Kernel(NamedTuple):
+class IntervalKernel(NamedTuple):
     """A kernel with its constants."""
 
     library: ctypes.CDLL
@@ -517,7 +518,7 @@ class Kernel(NamedTuple):
     compiled: Compiled
 
 
-def kernel_of(function: Callable, dimension: int, constants: Sequence[Any]) -> Kernel:
+def interval_kernel(function: Callable, dimension: int, constants: Sequence[Any]) -> IntervalKernel:
     """The kernel of a function.
 
     Args:
@@ -536,4 +537,4 @@ def kernel_of(function: Callable, dimension: int, constants: Sequence[Any]) -> K
             raise ValueError(f"constants[{k}]: got {array!r}, expected finite numbers.")
     found = compiled(function, dimension, tuple(a.shape for a in arrays))
     numbers = np.concatenate([*(a.ravel() for a in arrays), np.array(found.literals), [0.0]])
-    return Kernel(library(found.source), numbers, found)
+    return IntervalKernel(library(found.source), numbers, found)

@@ -25,7 +25,7 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.core.progress import bar
-from iblf_jax.kernels.enclosure import Kernel, kernel_of, pointer
+from iblf_jax.kernels import IntervalKernel, interval_kernel, pointer
 
 STATUSES = ("proved", "undecided", "refuted", "out of boxes", "stopped", "out of memory")
 """How the search of a unit ended, in the order of `kernels/c/boxes.h`."""
@@ -102,7 +102,7 @@ class _Problem:
       upper: upper corners, (p, d).
     """
 
-    def __init__(self, kernel: Kernel, lower: np.ndarray, upper: np.ndarray) -> None:
+    def __init__(self, kernel: IntervalKernel, lower: np.ndarray, upper: np.ndarray) -> None:
         self.kernel = kernel
         self.lower = lower
         self.upper = upper
@@ -300,7 +300,7 @@ def search(
     if threads is not None:
         threads = checks.positive_integer("threads", threads)
     low, high = _with_patterns(lower, upper, patterns)
-    problem = _Problem(kernel_of(function, low.shape[1], constants), low, high)
+    problem = _Problem(interval_kernel(function, low.shape[1], constants), low, high)
     units, division = problem.divided(max_boxes)
     results = _Results(checkpoint, problem.digest(), len(units))
     boxes = division.boxes

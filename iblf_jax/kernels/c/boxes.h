@@ -259,7 +259,7 @@ SEPARATE void rounded(const real *x, const real *y, real *lower, real *upper) {
   interval a = at(load(x)), b = at(load(y)), results[] = {i_add(a, b), i_sub(a, b), i_mul(a, b), i_div(a, b), i_sqrt(a), i_sin(a), i_exp(a)};
   for (int k = 0; k < 7; k++) { store(lower + k * W, -results[k].n); store(upper + k * W, results[k].u); }
 }
-VISIBLE int lanes(void) { return W; }
+VISIBLE int vector_size(void) { return W; }
 VISIBLE int rounded_operations(const real *x, const real *y, real *lower, real *upper) {
   environment e;
   if (enter(&e)) return 1;
