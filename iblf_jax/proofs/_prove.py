@@ -52,7 +52,7 @@ REFINEMENTS = (0.75, 1.33)
 TRIAL_BOXES = 1_000_000
 """Boxes of the search at each of these weights."""
 RUNS = 16
-"""Runs that start at points of the level set."""
+"""Runs that start at points of the level set, if the caller gives no number."""
 LEAST_DURATION = 5.0
 """Length of these runs, at least [s]."""
 TIME_STEPS = (1e-3, 1e-4, 1e-5)
@@ -89,6 +89,7 @@ def prove(
     threads: int | None = None,
     progress: bool | None = None,
     checkpoint: str | PathLike | None = None,
+    runs: int = RUNS,
     seed: int = 0,
 ) -> Proof:
     """Decides whether {V_w <= level} is invariant for all times and all parameters of a box.
@@ -113,6 +114,7 @@ def prove(
       threads: number of threads; one for each processor if not given.
       progress: whether a bar shows the progress; None for where a user sees it.
       checkpoint: file from which an interrupted search continues, and to which it is written.
+      runs: number of runs that try to refute the bounds where no proof is found; 0 for none.
       seed: of the random points.
 
     Returns:
@@ -125,7 +127,7 @@ def prove(
     Source: design of this package; branch and bound with interval arithmetic as in R. E. Moore,
       R. B. Kearfott, M. J. Cloud, Introduction to Interval Analysis, 2009.
     """
-    options = _Options.of(weight, max_boxes, threads, progress, checkpoint, seed)
+    options = _Options.of(weight, max_boxes, threads, progress, checkpoint, runs, seed)
     problem = problem_of(scenario, parameters, duration, disturbance_rate)
     level = checks.positive_number("level", level, "the unit of V_w")
     with jax.enable_x64(True):
@@ -149,7 +151,7 @@ def _decided(
     else:
         best, result = _searched(problem, level, sampled, best, options)
     proved = result is not None and result.proved
-    violation = None if proved else _refuted(problem, level, best)
+    violation = None if proved else _refuted(problem, level, best, options.runs)
     verdict = _verdict(result, violation)
     worst = None if result is None else result.worst
     return Proof(
@@ -179,11 +181,19 @@ class _Options(NamedTuple):
     threads: int | None
     progress: bool | None
     checkpoint: str | PathLike | None
+    runs: int
     seed: int
 
     @classmethod
     def of(
-        cls, weight: Any, max_boxes: Any, threads: Any, progress: Any, checkpoint: Any, seed: Any
+        cls,
+        weight: Any,
+        max_boxes: Any,
+        threads: Any,
+        progress: Any,
+        checkpoint: Any,
+        runs: Any,
+        seed: Any,
     ) -> _Options:
         """Raises ValueError for an option that is not admissible."""
         if weight is not None:
@@ -194,7 +204,8 @@ class _Options(NamedTuple):
         progress = checks.boolean("progress", progress, optional=True)
         if checkpoint is not None:
             checkpoint = checks.file_to_write("checkpoint", checkpoint)
-        return cls(max_boxes, threads, progress, checkpoint, checks.seed(seed))
+        runs = checks.positive_integer("runs", runs, least=0, most=PARENTS)
+        return cls(max_boxes, threads, progress, checkpoint, runs, checks.seed(seed))
 
 
 def problem_of(
@@ -368,7 +379,9 @@ def _is_uncertain(problem: LevelSetProblem, name: str) -> bool:
 # --- runs ----------------------------------------------------------------------------------------
 
 
-def _refuted(problem: LevelSetProblem, level: float, sampled: _Sampled) -> Violation | None:
+def _refuted(
+    problem: LevelSetProblem, level: float, sampled: _Sampled, runs: int
+) -> Violation | None:
     """A run that starts in the set and violates the bounds; None if none was found.
 
     Runs start at the points with the largest V_w' that were found.  The time step is reduced until
@@ -378,7 +391,7 @@ def _refuted(problem: LevelSetProblem, level: float, sampled: _Sampled) -> Viola
     duration = problem.duration
     if problem.is_period:
         duration = max(duration, LEAST_DURATION)
-    for point in sampled.points[:RUNS]:
+    for point in sampled.points[:runs]:
         scenario = problem.scenario_at(point, constants)
         for dt in TIME_STEPS:
             run = _run(scenario, duration, dt)

@@ -40,7 +40,7 @@ def largest_level(
       between: the least and the greatest level that are tried, in the unit of V_w.
       accuracy: ratio - 1 of the two levels at which the search ends [1].
       max_boxes: largest number of boxes of each proof.
-      options: of `prove`.
+      options: of `prove`; without `runs`, no attempt is made to refute the bounds.
 
     Returns:
       The `Proof` of the greatest level that was proved, with all attempts in `history`; that of the
@@ -51,9 +51,10 @@ def largest_level(
 
     Source: bisection.
     """
+    given = {"runs": 0} | options
 
     def proof_at(level: float) -> Proof:
-        return prove(scenario, level=level, parameters=parameters, max_boxes=max_boxes, **options)
+        return prove(scenario, level=level, parameters=parameters, max_boxes=max_boxes, **given)
 
     return _bisected(proof_at, "between", between, accuracy)
 
@@ -80,7 +81,7 @@ def largest_parameters(
       between: the least and the greatest s that are tried [1].
       accuracy: ratio - 1 of the two factors at which the search ends [1].
       max_boxes: largest number of boxes of each proof.
-      options: of `prove`.
+      options: of `prove`; without `runs`, no attempt is made to refute the bounds.
 
     Returns:
       The `Proof` of the largest box that was proved, with all attempts in `history`; that of the
@@ -95,13 +96,14 @@ def largest_parameters(
     if not parameters:
         remedy = "Without an uncertain parameter there is no box."
         raise checks.fail("parameters", parameters, "at least one interval", remedy)
+    given = {"runs": 0} | options
 
     def proof_at(factor: float) -> Proof:
         narrowed = {
             path: scaled(scenario, path, perturbation, factor)
             for path, perturbation in parameters.items()
         }
-        return prove(scenario, level=level, parameters=narrowed, max_boxes=max_boxes, **options)
+        return prove(scenario, level=level, parameters=narrowed, max_boxes=max_boxes, **given)
 
     return _bisected(proof_at, "between", between, accuracy)
 

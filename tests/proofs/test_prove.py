@@ -78,6 +78,7 @@ def test_nothing_contradicts_a_proof():
     assert contradictions(found, 4) == 0
 
 
+@pytest.mark.release  # a program of its own
 def test_the_nominal_plant_is_proved():
     found = proof(percent=0.0, level=0.5)
     assert found.proved and found.ranges == {}
