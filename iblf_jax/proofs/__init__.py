@@ -1,0 +1,1 @@
+"""Guarantees over sets: statements that are proved for all points of a box."""
