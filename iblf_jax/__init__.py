@@ -51,6 +51,7 @@ from iblf_jax.simulation.vector_field import VectorField as VectorField
 from iblf_jax.simulation.vector_field import vector_field as vector_field
 from iblf_jax.studies.distributions import choice as choice
 from iblf_jax.studies.distributions import factor as factor
+from iblf_jax.studies.distributions import interval as interval
 from iblf_jax.studies.distributions import joint_normal as joint_normal
 from iblf_jax.studies.distributions import log_uniform as log_uniform
 from iblf_jax.studies.distributions import normal as normal

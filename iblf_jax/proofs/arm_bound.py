@@ -1,0 +1,296 @@
+"""Upper bounds of V_w' of a rigid arm over boxes of the level set V_w = c.
+
+**Coordinates.**  x = (t, theta_1..theta_n, psi, phi_1..phi_{n-1}, z_1..z_m, sign_1..sign_n).  Angles
+divide the level among the barriers, the velocity error and f_tilde:
+
+    sqrt(w_i V1_i) = sqrt(c) sphere(theta)_i,   R = c sphere(theta)_{n+1}^2
+    U^T e2 = sqrt(2R) cos(psi) sphere(phi),   M0 = U U^T,   sqrt(w_f) |f_tilde| = sqrt(2R) sin(psi)
+
+so that every x lies on the level set.  sign_i is the side of the tube on which e1_i lies.
+
+**f_tilde.**  With f' = f0 + H f_tilde of (P.3), b = |f_tilde| and the best direction of f_tilde,
+
+    V_w' <= -decay - e2^T K2 e2 + b |e2 + w_f f0| - w_f lambda b^2,                           (B.1)
+    lambda = least eigenvalue of diag(kf) - (H + H^T)/2
+
+**Parameters.**  For fixed derivatives in (U.1), f0 and H are affine in the coordinates z,
+
+    f' = d0' - sum_k z_k (W_k + M_k M0^-1 F),   F = (I + dM M0^-1)^-1 (d0' - dW)
+
+where F, which differs from f' by terms that are small of second order, is enclosed.  (B.1) is
+convex in f0 and H, so that its maximum over z is that at the corners of the box of z: V_w' is
+bounded at each corner, and z need not be bisected.
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from iblf_jax.core.linalg import inner, matvec
+from iblf_jax.kernels.interval_primitives import lower, upper, with_sign
+from iblf_jax.proofs import uncertainty
+from iblf_jax.proofs.arm_motion import (
+    ArmParts,
+    Errors,
+    along,
+    decay,
+    external_torque,
+    motion,
+    position,
+    rate_along_motion,
+    relative_tube,
+    required_torque,
+)
+from iblf_jax.proofs.matrices import (
+    least_eigenvalue,
+    norm,
+    solve,
+    solve_general,
+    solve_transposed,
+    sphere,
+    upper_factor,
+)
+from iblf_jax.proofs.uncertainty import Numbers, Places
+
+
+class Constants(NamedTuple):
+    """The numbers of a problem; a pytree."""
+
+    parts: ArmParts
+    numbers: Numbers
+    weight: jax.Array
+    """w_f [1/(N m)^2 N m rad]."""
+    level: jax.Array
+    """c [N m rad]."""
+
+
+class Coordinates(NamedTuple):
+    """A point of the level set, or a box; see the head of this module."""
+
+    t: jax.Array
+    theta: list[jax.Array]
+    psi: jax.Array
+    phi: list[jax.Array]
+    z: jax.Array
+    sign: jax.Array
+
+
+def coordinates(x: jax.Array, n: int, m: int) -> Coordinates:
+    """The parts of a vector of coordinates, (2n + 1 + m + n,)."""
+    theta = [x[1 + i] for i in range(n)]
+    phi = [x[2 + n + i] for i in range(n - 1)]
+    start = 2 * n + 1
+    return Coordinates(x[0], theta, x[1 + n], phi, x[start : start + m], x[start + m :])
+
+
+class LevelPoint(NamedTuple):
+    """What coordinates mean physically."""
+
+    errors: Errors
+    energy: jax.Array
+    """w V1 of each joint, (n,) [N m rad]."""
+    b: jax.Array
+    """|f_tilde|, () [N m]."""
+
+
+def level_point(constants: Constants, at: Coordinates) -> LevelPoint:
+    """Errors and |f_tilde| at coordinates."""
+    parts, level = constants.parts, constants.level
+    *sides, rest = sphere(at.theta)
+    energy = level * jnp.stack(sides) ** 2
+    tube = relative_tube(parts, at.t)
+    e1 = parts.law.barrier.error_at(energy / parts.law.weight, tube, at.sign > 0)
+    e1 = with_sign(e1, at.sign)
+    radius = jnp.sqrt(2.0 * level) * rest
+    direction = jnp.stack(sphere(at.phi))
+    scaled = radius * jnp.cos(at.psi) * direction
+    errors = Errors(at.t, e1, scaled)
+    U = upper_factor(parts.model.mass_matrix(position(parts, errors)))
+    errors = errors._replace(e2=solve_transposed(U, scaled))
+    b = radius * jnp.sin(at.psi) / jnp.sqrt(constants.weight)
+    return LevelPoint(errors, energy, b)
+
+
+class Affine(NamedTuple):
+    """A vector that is affine in f_tilde."""
+
+    value: jax.Array
+    """At f_tilde = 0, (n,)."""
+    slope: jax.Array
+    """Its derivative, (n, n)."""
+
+
+def in_f_tilde(function: Any, n: int) -> Any:
+    """A pytree of vectors that are affine in f_tilde, each as an `Affine`."""
+    zero = jnp.zeros(n)
+    values = function(zero)
+    columns = [along(function, (zero,), (unit,)) for unit in jnp.eye(n)]
+    slopes = jax.tree.map(lambda *columns: jnp.stack(columns, axis=-1), *columns)
+    return jax.tree.map(Affine, values, slopes)
+
+
+def add(left: Affine, right: Affine) -> Affine:
+    """The sum."""
+    return Affine(left.value + right.value, left.slope + right.slope)
+
+
+def scaled(factor: jax.Array, vector: Affine) -> Affine:
+    """The product of a number and a vector."""
+    return Affine(factor * vector.value, factor * vector.slope)
+
+
+def on_columns(function: Any, vector: Affine) -> Affine:
+    """A linear function of a vector that is affine in f_tilde."""
+    n = vector.slope.shape[-1]
+    columns = [function(vector.slope[:, i]) for i in range(n)]
+    return Affine(function(vector.value), jnp.stack(columns, axis=-1))
+
+
+class Mismatch(NamedTuple):
+    """f' as a function of the parameters: constant + sum_k (z_k - r_k) columns_k."""
+
+    constant: Affine
+    columns: list[Affine]
+
+
+class MismatchRate(NamedTuple):
+    """The rates in (P.3), as functions of f_tilde."""
+
+    external: Any
+    """d0'."""
+    fixed: Any
+    """dW of the difference between the scenario's plant and its model; () if there is none."""
+    columns: list[Any]
+    """W_k."""
+
+
+def mismatch(constants: Constants, places: Places, at: Errors, z: jax.Array) -> Mismatch:
+    """f' over a box of parameters; see the head of this module."""
+    parts, numbers = constants.parts, constants.numbers
+    n = at.e1.shape[-1]
+    nominal = (parts.plant, parts.disturbance)
+    known = (parts.model, parts.disturbance)
+    inside = uncertainty.between(places, numbers, nominal, known, z)
+    fixed = uncertainty.fixed_difference(places, numbers, nominal, known)
+    directions = uncertainty.directions(places, numbers, known)
+    q = position(parts, at)
+    M0 = parts.model.mass_matrix(q)
+
+    def with_plant(plant_and_disturbance: Any) -> ArmParts:
+        plant, disturbance = plant_and_disturbance
+        return parts._replace(plant=plant, disturbance=disturbance)
+
+    def rates(f_tilde: jax.Array) -> MismatchRate:
+        now, jerk = motion(parts, at, f_tilde)
+
+        def torque_rate(p: Any) -> jax.Array:
+            return rate_along_motion(required_torque, with_plant(p), now, jerk)
+
+        external = rate_along_motion(external_torque, with_plant(known), now, jerk)
+        difference: Any = ()
+        if fixed is not None:
+            difference = along(torque_rate, (inside,), (fixed,))
+        columns = [along(torque_rate, (inside,), (direction,)) for direction in directions]
+        return MismatchRate(external, difference, columns)
+
+    def mass_along(direction: Any) -> jax.Array:
+        return along(lambda p: p[0].mass_matrix(q), (inside,), (direction,))
+
+    found = in_f_tilde(rates, n)
+    size = z - numbers.reference
+    right = found.external
+    total = jnp.eye(n)
+    masses = [mass_along(direction) for direction in directions]
+    # The rate of a further disturbance is a coordinate without entries.
+    free = [Affine(-unit, jnp.zeros((n, n))) for unit in jnp.eye(n)[: places.rates]]
+    moved = [*found.columns, *free]
+    masses += [jnp.zeros((n, n))] * places.rates
+    dM = sum((size[k] * mass for k, mass in enumerate(masses)), jnp.zeros((n, n)))
+    if fixed is not None:
+        fixed_mass = mass_along(fixed)
+        dM = dM + fixed_mass
+        right = add(right, scaled(jnp.asarray(-1.0), found.fixed))
+    for k, column in enumerate(moved):
+        right = add(right, scaled(-size[k], column))
+    # dM M0^-1, row by row, because both are symmetric
+    total = total + jnp.stack([solve(M0, row) for row in dM])
+    whole = on_columns(lambda column: solve_general(total, column), right)
+    inner_part = on_columns(lambda column: solve(M0, column), whole)
+
+    def minus_product(mass: jax.Array) -> Affine:
+        return on_columns(lambda column: -matvec(mass, column), inner_part)
+
+    constant = found.external
+    if fixed is not None:
+        constant = add(constant, scaled(jnp.asarray(-1.0), found.fixed))
+        constant = add(constant, minus_product(fixed_mass))
+    columns = [
+        add(scaled(jnp.asarray(-1.0), column), minus_product(mass))
+        for column, mass in zip(moved, masses, strict=True)
+    ]
+    return Mismatch(constant, columns)
+
+
+def corners(constants: Constants, found: Mismatch, z: jax.Array) -> list[Affine]:
+    """f' at each corner of the box of parameters."""
+    size = z - constants.numbers.reference
+    ends = [(lower(size[k]), upper(size[k])) for k in range(len(found.columns))]
+    vertices = []
+    for choice in itertools.product(*ends):
+        vertex = found.constant
+        for factor, column in zip(choice, found.columns, strict=True):
+            vertex = add(vertex, scaled(factor, column))
+        vertices.append(vertex)
+    return vertices
+
+
+def decay_bound(constants: Constants, point: LevelPoint) -> jax.Array:
+    """A lower bound of the decay of the barriers, ()."""
+    parts = constants.parts
+    exact = decay(parts, point.errors)
+    rate = parts.law.barrier.decay_rate(parts.law.k1)
+    return jnp.sum(jnp.maximum(exact, rate * point.energy))
+
+
+def arm_bound(places: Places, n: int, x: jax.Array, constants: Constants) -> jax.Array:
+    """Upper bounds of V_w' over the box x, (2,) [N m rad/s]."""
+    at = coordinates(x, n, places.coordinates)
+    point = level_point(constants, at)
+    parts, weight = constants.parts, constants.weight
+    e2, b = point.errors.e2, point.b
+    losses = decay_bound(constants, point)
+    found = mismatch(constants, places, point.errors, at.z)
+    kf = jnp.diag(jnp.broadcast_to(parts.kf, (n,)))
+    coupled = []
+    gains = []
+    for vertex in corners(constants, found, at.z):
+        symmetric = 0.5 * (vertex.slope + vertex.slope.T)
+        gain = least_eigenvalue(kf - symmetric)
+        drive = norm(e2 + weight * vertex.value)
+        coupled.append(b * drive - weight * gain * b**2)
+        gains.append((norm(vertex.value), gain))
+    direct = jnp.max(jnp.stack(coupled)) - losses - inner(e2, parts.law.K2 * e2)
+    squares = _squares(constants, norm(e2), b, gains) - losses
+    return jnp.stack([direct, squares])
+
+
+def _squares(
+    constants: Constants, a: jax.Array, b: jax.Array, gains: list[tuple[jax.Array, jax.Array]]
+) -> jax.Array:
+    """A bound of (B.1) without its decay from completed squares, ().
+
+        -K a^2 + a b + w_f |f0| b - w_f lambda b^2
+            = -K (a - b/(2K))^2 - mu (b - w_f |f0|/(2 mu))^2 + (w_f |f0|)^2/(4 mu),
+        mu = w_f lambda - 1/(4K),   K = min K2,   a = |e2|
+    """
+    K = jnp.min(constants.parts.law.K2)
+    bounds = []
+    for force, gain in gains:
+        mu = lower(constants.weight * gain) - 1.0 / (4.0 * K)
+        push = upper(constants.weight * force)
+        bounds.append(push**2 / (4.0 * mu) - mu * (b - push / (2.0 * mu)) ** 2)
+    return jnp.max(jnp.stack(bounds)) - K * (a - b / (2.0 * K)) ** 2
