@@ -39,7 +39,7 @@ FLAGS = ("-frounding-math",)
 are rounded once, which is upward, too."""
 FUNCTIONS = frozenset(
     "add sub neg abs max min div sqrt rsqrt sign sin cos tan exp expm1 log log1p atan sinh cosh tanh"
-    " logistic upper lower hull".split()
+    " logistic upper lower hull meet".split()
 )
 """Operations on intervals that `c/interval.h` has as `i_<name>`."""
 COMPARISONS = frozenset({"lt", "le", "gt", "ge", "eq", "ne"})

@@ -1,4 +1,4 @@
-"""Four JAX primitives that say how an interval is evaluated; on numbers, each is the identity.
+"""JAX primitives that say how an interval is evaluated; on numbers, each is the identity.
 
 A function that is enclosed over boxes (`enclosure`) may use them where the natural extension to
 intervals is too wide. Derivatives and batches pass through them to the first argument.
@@ -47,6 +47,7 @@ _UPPER = _primitive("upper")
 _LOWER = _primitive("lower")
 _HULL = _primitive("hull")
 _WITH_SIGN = _primitive("with_sign")
+_MEET = _primitive("meet")
 
 
 def _of_one_shape(*arrays: jax.Array | float) -> list[jax.Array]:
@@ -68,6 +69,11 @@ def lower(x: jax.Array | float) -> jax.Array:
 def hull(x: jax.Array | float, y: jax.Array | float) -> jax.Array:
     """x; on intervals the smallest interval that contains x and y."""
     return _HULL.bind(*_of_one_shape(x, y))
+
+
+def meet(x: jax.Array | float, y: jax.Array | float) -> jax.Array:
+    """x; on intervals the numbers that x and y have in common, of two enclosures of one number."""
+    return _MEET.bind(*_of_one_shape(x, y))
 
 
 def with_sign(x: jax.Array | float, sign: jax.Array | float) -> jax.Array:

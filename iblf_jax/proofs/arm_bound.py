@@ -38,11 +38,11 @@ from iblf_jax.proofs.arm_motion import (
     Errors,
     along,
     decay,
+    error_at,
     external_torque,
     motion,
     position,
     rate_along_motion,
-    relative_tube,
     required_torque,
 )
 from iblf_jax.proofs.matrices import (
@@ -102,13 +102,11 @@ def level_point(constants: Constants, at: Coordinates) -> LevelPoint:
     parts, level = constants.parts, constants.level
     *sides, rest = sphere(at.theta)
     energy = level * jnp.stack(sides) ** 2
-    tube = relative_tube(parts, at.t)
-    e1 = parts.law.barrier.error_at(energy / parts.law.weight, tube, at.sign > 0)
-    e1 = with_sign(e1, at.sign)
+    xi = with_sign(error_at(parts, at.t, energy, at.sign), at.sign)
     radius = jnp.sqrt(2.0 * level) * rest
     direction = jnp.stack(sphere(at.phi))
     scaled = radius * jnp.cos(at.psi) * direction
-    errors = Errors(at.t, e1, scaled)
+    errors = Errors(at.t, xi, scaled)
     U = upper_factor(parts.model.mass_matrix(position(parts, errors)))
     errors = errors._replace(e2=solve_transposed(U, scaled))
     b = radius * jnp.sin(at.psi) / jnp.sqrt(constants.weight)
@@ -171,7 +169,7 @@ class MismatchRate(NamedTuple):
 def mismatch(constants: Constants, places: Places, at: Errors, z: jax.Array) -> Mismatch:
     """f' over a box of parameters; see the head of this module."""
     parts, numbers = constants.parts, constants.numbers
-    n = at.e1.shape[-1]
+    n = at.xi.shape[-1]
     nominal = (parts.plant, parts.disturbance)
     known = (parts.model, parts.disturbance)
     inside = uncertainty.between(places, numbers, nominal, known, z)

@@ -22,8 +22,14 @@ j = j0 + M0^-1 f', with j0 that of f' = 0, and Z is affine in a.  With W = dZ/dt
 
 f' is affine in f_tilde, because q" and j0 are.
 
-Errors are written in the frame of the reference (`relative_tube`), so that e1' = alpha - q_d' + e2
-has no difference of nearly equal numbers.
+**Scaled errors.**  A barrier has no length of its own: its functions of e1 and of the tube are
+homogeneous in them.  They are evaluated at xi = e1/k in a tube whose width on the side of e1 is 1
+(`scaled_tube`), and
+
+    alpha - q_d' = k A,   s = k^(d-1) S,   V1 = k^d V,   d = 2 for a V1 in rad^2 and 0 for one in 1
+    e1' = k A + e2,   xi' = A - xi k'/k + e2/k
+
+Over a box, the width k of the tube then occurs once in each of them.
 """
 
 from __future__ import annotations
@@ -34,9 +40,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from iblf_jax.control.barriers._base import value_unit
 from iblf_jax.core.linalg import inner, matvec
+from iblf_jax.proofs.forms import enclosed
 from iblf_jax.proofs.matrices import solve
-from iblf_jax.world.bounds import Bounds, Tube, tube_at
+from iblf_jax.world.bounds import Bounds, Tube
 from iblf_jax.world.disturbances import Disturbance
 from iblf_jax.world.references import Reference
 from iblf_jax.world.robots import Robot
@@ -63,8 +71,8 @@ class Errors(NamedTuple):
 
     t: jax.Array
     """() [s]."""
-    e1: jax.Array
-    """q - q_d, (n,) [rad]."""
+    xi: jax.Array
+    """e1/k, with k the width of the tube on the side of e1, (n,) [1]."""
     e2: jax.Array
     """q' - alpha, (n,) [rad/s]."""
 
@@ -79,18 +87,85 @@ class Kinematics(NamedTuple):
     """Acceleration, (n,) [rad/s^2]."""
 
 
-def relative_tube(parts: ArmParts, t: jax.Array) -> Tube:
-    """The tube in the frame of the reference: q_d = 0, q_d' = 0, bounds -k_l and k_u."""
-    tube = tube_at(parts.reference, parts.bounds, t, acceleration=False)
-    zero = jnp.zeros_like(tube.q_d)
-    lower, upper = tube.lower - tube.q_d, tube.upper - tube.q_d
-    return Tube(zero, zero, lower, upper, tube.dlower - tube.dq_d, tube.dupper - tube.dq_d)
+class Course(NamedTuple):
+    """The reference and its distances from the bounds at one time, (n,) each [rad]."""
+
+    q_d: jax.Array
+    k_l: jax.Array
+    k_u: jax.Array
 
 
-def relative_alpha(parts: ArmParts, t: jax.Array, e1: jax.Array) -> jax.Array:
-    """Alpha - q_d', (n,) [rad/s]."""
+def course(parts: ArmParts, t: jax.Array) -> Course:
+    """Reference and tube, with narrow enclosures over intervals of time, also of their
+    derivatives.
+    """
+
+    def at(t: jax.Array) -> Course:
+        q_d = parts.reference.position(t)
+        lower, upper = parts.bounds.lower.at(t, q_d), parts.bounds.upper.at(t, q_d)
+        return Course(q_d, q_d - lower, upper - q_d)
+
+    return enclosed(at)(t)
+
+
+class Side(NamedTuple):
+    """The tube on the side of an error, (n,) each."""
+
+    k: jax.Array
+    """Its width [rad]."""
+    growth: jax.Array
+    """k'/k [1/s]."""
+    scaled: Tube
+    """The tube in the frame of the reference, divided by k."""
+
+
+def side_of(parts: ArmParts, t: jax.Array, xi: jax.Array) -> Side:
+    """The tube on the sides on which errors with the sign of `xi` are."""
+    now, rate = jax.jvp(lambda t: course(parts, t), (t,), (jnp.ones_like(t),))
+    above = xi > 0
+    k, dk = jnp.where(above, now.k_u, now.k_l), jnp.where(above, rate.k_u, rate.k_l)
+    other, dother = jnp.where(above, now.k_l, now.k_u), jnp.where(above, rate.k_l, rate.k_u)
+    one, zero = jnp.ones_like(k), jnp.zeros_like(k)
+    ratio, growth, other_growth = other / k, dk / k, dother / k
+    k_l, k_u = jnp.where(above, ratio, one), jnp.where(above, one, ratio)
+    dk_l, dk_u = jnp.where(above, other_growth, growth), jnp.where(above, growth, other_growth)
+    return Side(k, growth, Tube(zero, zero, -k_l, k_u, -dk_l, dk_u))
+
+
+def degree(barrier: Any) -> int:
+    """d: V1 is homogeneous of this degree in lengths."""
+    return 2 if value_unit(barrier) == "rad^2" else 0
+
+
+def scaled_alpha(parts: ArmParts, t: jax.Array, xi: jax.Array) -> jax.Array:
+    """A = (alpha - q_d')/k, (n,) [1/s]."""
     law = parts.law
-    return law.barrier.virtual_velocity(relative_tube(parts, t), e1, law.k1, law.o)
+    return law.barrier.virtual_velocity(side_of(parts, t, xi).scaled, xi, law.k1, law.o)
+
+
+def relative_alpha(parts: ArmParts, t: jax.Array, xi: jax.Array) -> jax.Array:
+    """Alpha - q_d', (n,) [rad/s]."""
+    return side_of(parts, t, xi).k * scaled_alpha(parts, t, xi)
+
+
+def slope(parts: ArmParts, t: jax.Array, xi: jax.Array) -> jax.Array:
+    """w s, (n,) [N m]."""
+    law, side = parts.law, side_of(parts, t, xi)
+    scaled = law.weight * law.barrier.slope(side.scaled, xi)
+    return scaled * side.k if degree(law.barrier) == 2 else scaled / side.k
+
+
+def energy(parts: ArmParts, t: jax.Array, xi: jax.Array) -> jax.Array:
+    """w V1, (n,) [N m rad]."""
+    law, side = parts.law, side_of(parts, t, xi)
+    return law.weight * law.barrier.value(side.scaled, xi) * side.k ** degree(law.barrier)
+
+
+def error_at(parts: ArmParts, t: jax.Array, energy: jax.Array, sign: jax.Array) -> jax.Array:
+    """The xi with the sign of `sign` at which w V1 = energy, (n,) [1]."""
+    law, side = parts.law, side_of(parts, t, sign)
+    scaled = energy / (law.weight * side.k ** degree(law.barrier))
+    return law.barrier.error_at(scaled, side.scaled, sign > 0)
 
 
 def along(function: Callable, point: tuple, rates: tuple) -> Any:
@@ -98,49 +173,54 @@ def along(function: Callable, point: tuple, rates: tuple) -> Any:
     return jax.jvp(function, point, rates)[1]
 
 
-def error_rate(parts: ArmParts, at: Errors) -> jax.Array:
-    """e1' = alpha - q_d' + e2, (n,) [rad/s]."""
-    return relative_alpha(parts, at.t, at.e1) + at.e2
+def xi_rate(parts: ArmParts, at: Errors) -> jax.Array:
+    """xi' = A - xi k'/k + e2/k, (n,) [1/s]."""
+    side = side_of(parts, at.t, at.xi)
+    return scaled_alpha(parts, at.t, at.xi) - side.growth * at.xi + at.e2 / side.k
 
 
 def velocity(parts: ArmParts, at: Errors) -> jax.Array:
     """q', (n,) [rad/s]."""
-    return reference_rate(parts, at.t) + error_rate(parts, at)
+    return reference_rate(parts, at.t) + (relative_alpha(parts, at.t, at.xi) + at.e2)
+
+
+def reference(parts: ArmParts, t: jax.Array) -> jax.Array:
+    """q_d, (n,) [rad]."""
+    return course(parts, t).q_d
 
 
 def reference_rate(parts: ArmParts, t: jax.Array) -> jax.Array:
     """q_d', (n,) [rad/s]."""
-    return along(parts.reference.position, (t,), (jnp.ones_like(t),))
+    return along(lambda t: reference(parts, t), (t,), (jnp.ones_like(t),))
 
 
 def position(parts: ArmParts, at: Errors) -> jax.Array:
     """q, (n,) [rad]."""
-    return parts.reference.position(at.t) + at.e1
+    return reference(parts, at.t) + side_of(parts, at.t, at.xi).k * at.xi
 
 
 def velocity_error_rate(parts: ArmParts, at: Errors, f_tilde: jax.Array) -> jax.Array:
     """e2' of (P.1), (n,) [rad/s^2]."""
     law, model = parts.law, parts.model
     q = position(parts, at)
-    slope = law.barrier.slope(relative_tube(parts, at.t), at.e1)
     coriolis = model.coriolis(q, velocity(parts, at), at.e2)
-    force = f_tilde - coriolis - law.K2 * at.e2 - law.weight * slope
+    force = f_tilde - coriolis - law.K2 * at.e2 - slope(parts, at.t, at.xi)
     return solve(model.mass_matrix(q), force)
 
 
 def acceleration(parts: ArmParts, at: Errors, f_tilde: jax.Array) -> jax.Array:
     """q" = q_d" + (alpha - q_d')' + e2', (n,) [rad/s^2]."""
     one = jnp.ones_like(at.t)
-    rates = (one, error_rate(parts, at))
-    alpha_rate = along(lambda t, e1: relative_alpha(parts, t, e1), (at.t, at.e1), rates)
-    reference = along(lambda t: reference_rate(parts, t), (at.t,), (one,))
-    return reference + alpha_rate + velocity_error_rate(parts, at, f_tilde)
+    rates = (one, xi_rate(parts, at))
+    alpha_rate = along(lambda t, xi: relative_alpha(parts, t, xi), (at.t, at.xi), rates)
+    reference_acceleration = along(lambda t: reference_rate(parts, t), (at.t,), (one,))
+    return reference_acceleration + alpha_rate + velocity_error_rate(parts, at, f_tilde)
 
 
 def rates_of_errors(parts: ArmParts, at: Errors, f_tilde: jax.Array) -> Errors:
-    """The rates of t, e1 and e2."""
+    """The rates of t, xi and e2."""
     e2_rate = velocity_error_rate(parts, at, f_tilde)
-    return Errors(jnp.ones_like(at.t), error_rate(parts, at), e2_rate)
+    return Errors(jnp.ones_like(at.t), xi_rate(parts, at), e2_rate)
 
 
 def motion(parts: ArmParts, at: Errors, f_tilde: jax.Array) -> tuple[Kinematics, jax.Array]:
@@ -176,13 +256,8 @@ def rate_along_motion(
 
 def decay(parts: ArmParts, at: Errors) -> jax.Array:
     """-(w V1)' of each joint at e2 = 0, (n,) [N m rad/s]."""
-    law = parts.law
-
-    def value(t, e1):
-        return law.weight * law.barrier.value(relative_tube(parts, t), e1)
-
-    rates = (jnp.ones_like(at.t), relative_alpha(parts, at.t, at.e1))
-    return -along(value, (at.t, at.e1), rates)
+    rates = (jnp.ones_like(at.t), xi_rate(parts, at._replace(e2=jnp.zeros_like(at.e2))))
+    return -along(lambda t, xi: energy(parts, t, xi), (at.t, at.xi), rates)
 
 
 def mismatch_torque(parts: ArmParts, now: Kinematics) -> jax.Array:

@@ -26,7 +26,7 @@ from iblf_jax.core.pytree import astype
 from iblf_jax.core.time import as_at
 from iblf_jax.proofs import arm_motion, uncertainty
 from iblf_jax.proofs.arm_bound import Constants, arm_bound
-from iblf_jax.proofs.arm_motion import ArmParts, Errors, position, relative_tube, velocity
+from iblf_jax.proofs.arm_motion import ArmParts, Errors, position
 from iblf_jax.proofs.matrices import solve_transposed, upper_factor
 from iblf_jax.proofs.periods import AperiodicError, period_of, shifted
 from iblf_jax.proofs.problem import LevelSetProblem, LevelState
@@ -101,9 +101,8 @@ def point_of(places: Places, n: int, point: jax.Array, constants: Constants) -> 
     t, s, z = point[0], point[1 : 1 + 3 * n], point[1 + 3 * n :]
     s = s / jnp.sqrt(jnp.sum(s**2))
     energy = level * s[:n] ** 2
-    tube = relative_tube(parts, t)
-    e1 = parts.law.barrier.error_at(energy / parts.law.weight, tube, s[:n] > 0)
-    errors = Errors(t, e1, jnp.zeros(n))
+    xi = arm_motion.error_at(parts, t, energy, s[:n])
+    errors = Errors(t, xi, jnp.zeros(n))
     U = upper_factor(parts.model.mass_matrix(position(parts, errors)))
     size = jnp.sqrt(2.0 * level)
     e2 = solve_transposed(U, size * s[n : 2 * n])

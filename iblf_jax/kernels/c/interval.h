@@ -101,6 +101,10 @@ INLINE interval i_power(interval x, int exponent) {
 INLINE interval i_max(interval x, interval y) { interval r = {smaller(x.n, y.n), largest(x.u, y.u)}; return r; }
 INLINE interval i_min(interval x, interval y) { interval r = {largest(x.n, y.n), smaller(x.u, y.u)}; return r; }
 INLINE interval i_hull(interval x, interval y) { interval r = {largest(x.n, y.n), largest(x.u, y.u)}; return r; }
+INLINE interval i_meet(interval x, interval y) {
+  interval r = {smaller(x.n, smaller(y.n, UNBOUNDED)), smaller(x.u, smaller(y.u, UNBOUNDED))};
+  return r;
+}
 /* The sum with 0 times the bound is NaN where there is no bound. */
 INLINE interval i_upper(interval x) { F zero = {}; interval r = {x.u * zero - x.u, x.u}; return r; }
 INLINE interval i_lower(interval x) { F zero = {}; interval r = {x.n, x.n * zero - x.n}; return r; }
