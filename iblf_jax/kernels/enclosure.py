@@ -112,7 +112,8 @@ def compiled(
     for output in program.outputs:
         if program.nodes[output].kind != "f":
             raise UnsupportedError("an output that is no floating-point number")
-    literals = tuple(dict.fromkeys(_literals(program)))
+    # By their digits: 0.0 and -0.0 are equal, and each has its place.
+    literals = tuple({value.hex(): value for value in _literals(program)}.values())
     return Compiled(
         program,
         tuple(ids.size for ids in results),

@@ -45,6 +45,7 @@ from iblf_jax.proofs.arm_motion import (
     rate_along_motion,
     required_torque,
 )
+from iblf_jax.proofs.forms import centre
 from iblf_jax.proofs.matrices import (
     least_eigenvalue,
     norm,
@@ -246,6 +247,55 @@ def corners(constants: Constants, found: Mismatch, z: jax.Array) -> list[Affine]
     return vertices
 
 
+class Corner(NamedTuple):
+    """The terms of (B.1) at a corner of the box of parameters."""
+
+    force: jax.Array
+    """|f0|, () [N m/s]."""
+    gain: jax.Array
+    """lambda, () [1/s]."""
+    coupling: jax.Array
+    """b |e2 + w_f f0| - w_f lambda b^2, () [N m rad/s]."""
+
+
+def corner_terms(
+    constants: Constants, places: Places, point: LevelPoint, z: jax.Array
+) -> list[Corner]:
+    """The terms of (B.1) at each corner of the box of parameters."""
+    parts, weight, b = constants.parts, constants.weight, point.b
+    e2 = point.errors.e2
+    kf = jnp.diag(parts.kf)
+    terms = []
+    for vertex in corners(constants, mismatch(constants, places, point.errors, z), z):
+        gain = least_eigenvalue(kf - 0.5 * (vertex.slope + vertex.slope.T))
+        drive = norm(e2 + weight * vertex.value)
+        terms.append(Corner(norm(vertex.value), gain, b * drive - weight * gain * b**2))
+    return terms
+
+
+def centred(places: Places, n: int, x: jax.Array, constants: Constants) -> jax.Array:
+    """The upper bound of (B.1) from its value at the centre of the box and from its derivatives
+    over the box, by the mean value theorem, ().
+    """
+    count = 2 * n + 1
+
+    def values(free: jax.Array) -> jax.Array:
+        at = coordinates(jnp.concatenate([free, x[count:]]), n, places.coordinates)
+        point = level_point(constants, at)
+        terms = corner_terms(constants, places, point, at.z)
+        e2 = point.errors.e2
+        losses = jnp.sum(decay(constants.parts, point.errors))
+        losses = losses + inner(e2, constants.parts.law.K2 * e2)
+        return jnp.stack([term.coupling - losses for term in terms])
+
+    free = x[:count]
+    middle = centre(free)
+    bound = values(middle)
+    for i, unit in enumerate(jnp.eye(count)):
+        bound = bound + along(values, (free,), (unit,)) * (free[i] - middle[i])
+    return jnp.max(bound)
+
+
 def decay_bound(constants: Constants, point: LevelPoint) -> jax.Array:
     """A lower bound of the decay of the barriers, ()."""
     parts = constants.parts
@@ -258,27 +308,16 @@ def arm_bound(places: Places, n: int, x: jax.Array, constants: Constants) -> jax
     """Upper bounds of V_w' over the box x, (2,) [N m rad/s]."""
     at = coordinates(x, n, places.coordinates)
     point = level_point(constants, at)
-    parts, weight = constants.parts, constants.weight
     e2, b = point.errors.e2, point.b
     losses = decay_bound(constants, point)
-    found = mismatch(constants, places, point.errors, at.z)
-    kf = jnp.diag(jnp.broadcast_to(parts.kf, (n,)))
-    coupled = []
-    gains = []
-    for vertex in corners(constants, found, at.z):
-        symmetric = 0.5 * (vertex.slope + vertex.slope.T)
-        gain = least_eigenvalue(kf - symmetric)
-        drive = norm(e2 + weight * vertex.value)
-        coupled.append(b * drive - weight * gain * b**2)
-        gains.append((norm(vertex.value), gain))
-    direct = jnp.max(jnp.stack(coupled)) - losses - inner(e2, parts.law.K2 * e2)
-    squares = _squares(constants, norm(e2), b, gains) - losses
+    terms = corner_terms(constants, places, point, at.z)
+    coupling = jnp.max(jnp.stack([term.coupling for term in terms]))
+    direct = coupling - losses - inner(e2, constants.parts.law.K2 * e2)
+    squares = _squares(constants, norm(e2), b, terms) - losses
     return jnp.stack([direct, squares])
 
 
-def _squares(
-    constants: Constants, a: jax.Array, b: jax.Array, gains: list[tuple[jax.Array, jax.Array]]
-) -> jax.Array:
+def _squares(constants: Constants, a: jax.Array, b: jax.Array, terms: list[Corner]) -> jax.Array:
     """A bound of (B.1) without its decay from completed squares, ().
 
         -K a^2 + a b + w_f |f0| b - w_f lambda b^2
@@ -287,8 +326,8 @@ def _squares(
     """
     K = jnp.min(constants.parts.law.K2)
     bounds = []
-    for force, gain in gains:
-        mu = lower(constants.weight * gain) - 1.0 / (4.0 * K)
-        push = upper(constants.weight * force)
+    for term in terms:
+        mu = lower(constants.weight * term.gain) - 1.0 / (4.0 * K)
+        push = upper(constants.weight * term.force)
         bounds.append(push**2 / (4.0 * mu) - mu * (b - push / (2.0 * mu)) ** 2)
     return jnp.max(jnp.stack(bounds)) - K * (a - b / (2.0 * K)) ** 2
