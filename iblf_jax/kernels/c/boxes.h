@@ -59,7 +59,8 @@ INLINE real remaining(real after, real before) {
   return part < 0 ? 0 : part < 1 ? part : 1;
 }
 
-/* The weight of a coordinate: the part of the margin that a bisection along it removes, per width. */
+/* The weight of a coordinate: what a bisection along it removes of the margin, per width.  The half that loses less counts three times: both halves
+   must be finished. */
 SEPARATE void measure(const shared_number *table, real *box, real value, real outside) {
   real low[2 * COORDINATES * COORDINATES], high[2 * COORDINATES * COORDINATES], left[2 * COORDINATES];
   for (int k = 0; k < 2 * COORDINATES; k++) {
@@ -80,7 +81,8 @@ SEPARATE void measure(const shared_number *table, real *box, real value, real ou
     }
   }
   for (int i = 0; i < COORDINATES; i++) {
-    real width = box[COORDINATES + i] - box[i], gain = 2 - left[2 * i] - left[2 * i + 1];
+    real width = box[COORDINATES + i] - box[i], one = left[2 * i], other = left[2 * i + 1];
+    real gain = 4 - one - other - 2 * (one > other ? one : other);
     box[2 * COORDINATES + i] = width > 0 ? (gain + REAL(1e-3)) / width : 0;
   }
 }
