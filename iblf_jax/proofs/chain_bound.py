@@ -27,7 +27,7 @@ from iblf_jax.control.barriers import Quadratic
 from iblf_jax.kernels.interval_primitives import hull, meet, with_sign
 from iblf_jax.proofs import chain_motion, uncertainty
 from iblf_jax.proofs.arm_motion import along
-from iblf_jax.proofs.chain_motion import ChainParts, ChainState, Column, LevelEquations, Motion
+from iblf_jax.proofs.chain_motion import ChainParts, ChainState, Column, LevelEquations, Motion, OpenTube
 from iblf_jax.proofs.matrices import sphere
 from iblf_jax.proofs.uncertainty import Numbers, Places
 from iblf_jax.world import plants
@@ -89,9 +89,12 @@ class TruePlant:
             wanted = plants.level_input(model, i + 1, t, x, rate)
             return wanted - self.above(self.true, i, t, x, rate)
         external = chain_motion.external_at(self.known[1], t, x, model, model)
-        zero = jnp.zeros(1)
-        of_level = plants.level_input(model, i + 1, t, x, external.rates[i])
-        of_level = of_level - plants.level_input(model, i + 1, t, x, zero)
+        # I0_i is affine in the rate; a difference of intervals would be too wide.
+        of_level = along(
+            lambda rate: plants.level_input(model, i + 1, t, x, rate),
+            (jnp.zeros(1),),
+            (external.rates[i],),
+        )
         if i == model.order - 1:
             of_level = of_level + external.input
         moved = along(lambda p: self.above(p, i, t, x, rate), (self.inside,), (self.difference,))
@@ -207,8 +210,11 @@ def _error(
     lower, upper = bounds_at(parts.bounds[i], around.t, middle)
     k_l, k_u = middle - lower, upper - middle
 
+    # Where the first iterations leave the bounds, only a tube of positive width leads back.
+    kind = OpenTube if true.is_box else Tube
+
     def next_error(e: jax.Array) -> jax.Array:
-        tube = Tube(zero, zero, -(k_l + slope * e), k_u - slope * e, zero, zero)
+        tube = kind(zero, zero, -(k_l + slope * e), k_u - slope * e, zero, zero)
         return barrier.error_at(value, tube, sign > 0)
 
     if i == 0 or not observed[i - 1]:
@@ -257,4 +263,5 @@ def chain_bound(
     signs = x[start + places.coordinates :]
     true = TruePlant(constants, places, z, is_box=True)
     point = level_point(constants, observed, true, x[0], shares, signs)
-    return level_rate(constants, observed, true, point).reshape(1)
+    rate = level_rate(constants, observed, true, point)
+    return jnp.where(true.equations.positive_widths(point.now.y), rate, jnp.inf)

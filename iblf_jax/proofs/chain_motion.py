@@ -53,7 +53,7 @@ from iblf_jax.control.barriers._base import barrier_member
 from iblf_jax.core import taylor
 from iblf_jax.proofs.arm_motion import along
 from iblf_jax.world import plants
-from iblf_jax.world.bounds import Bounds, Tube, bounds_at
+from iblf_jax.world.bounds import NARROWEST, Bounds, Tube, bounds_at
 from iblf_jax.world.disturbances import Disturbance, rates_of
 from iblf_jax.world.references import Reference
 
@@ -77,6 +77,22 @@ class ChainParts(NamedTuple):
     def order(self) -> int:
         """Number of levels."""
         return self.law.order  # type: ignore[no-any-return]
+
+
+class OpenTube(Tube):
+    """A tube whose widths are differences without a least value, whose derivative is undecided on
+    intervals.  `positive_widths` says where they are those of `Tube`.
+    """
+
+    @property
+    def k_l(self) -> jax.Array:
+        """k_l."""
+        return self.q_d - self.lower
+
+    @property
+    def k_u(self) -> jax.Array:
+        """k_u."""
+        return self.upper - self.q_d
 
 
 class ChainState(NamedTuple):
@@ -164,16 +180,24 @@ class LevelEquations:
         return self.column(tuple(self.centre(j, y) + y.e[j] for j in range(i)))
 
     @remembered(errors=1, estimates=0)
-    def relative_tube(self, i: int, y: ChainState) -> Tube:
+    def relative_tube(self, i: int, y: ChainState) -> OpenTube:
         """The tube of row i in the frame of its centre."""
         zero = jnp.zeros(1)
         bounds = self.parts.bounds[i]
         if bounds is None or isinstance(self.parts.law.barriers[i], Quadratic):
-            return Tube(zero, zero, zero - 1.0, zero + 1.0, zero, zero)
+            return OpenTube(zero, zero, zero - 1.0, zero + 1.0, zero, zero)
         middle, rate = self.centre(i, y), self.centre_rate(i, y)
         now, moved = taylor.in_time(lambda t: bounds_at(bounds, t, zero), y.t, 1)
         lower, upper = now[0] - middle, now[1] - middle
-        return Tube(zero, zero, lower, upper, moved[0] - rate, moved[1] - rate)
+        return OpenTube(zero, zero, lower, upper, moved[0] - rate, moved[1] - rate)
+
+    def positive_widths(self, y: ChainState) -> jax.Array:
+        """Whether all tubes are wider than the least width at which a law takes them as they are,
+        (1,) bool.
+        """
+        tubes = [self.relative_tube(i, y) for i in range(self.parts.order)]
+        widths = [width for tube in tubes for width in (tube.k_l, tube.k_u)]
+        return functools.reduce(jnp.logical_and, [width > NARROWEST for width in widths])
 
     @remembered(errors=1, estimates=0)
     def barrier_slope(self, i: int, y: ChainState) -> jax.Array:
@@ -224,7 +248,7 @@ class LevelEquations:
         barrier = self.parts.law.barriers[i]
         zero, one = jnp.zeros(1), jnp.ones(1)
         tube = self.relative_tube(i, y)
-        moved = Tube(zero, zero, -one, -one, zero, zero)
+        moved = OpenTube(zero, zero, -one, -one, zero, zero)
         return along(barrier.value, (tube, y.e[i]), (moved, -one))
 
     def weighted_decay(self, i: int, y: ChainState, energy: jax.Array) -> jax.Array:
@@ -250,7 +274,7 @@ class LevelEquations:
         gain_o = None if law.o is None else law.o[i]
         rate = barrier.virtual_velocity(tube, y.e[i], law.k[i], gain_o)
         zero = jnp.zeros(1)
-        moved = Tube(zero, zero, tube.dlower, tube.dupper, zero, zero)
+        moved = OpenTube(zero, zero, tube.dlower, tube.dupper, zero, zero)
         return -law.weights[i] * along(barrier.value, (tube, y.e[i]), (moved, rate))
 
 
