@@ -24,7 +24,7 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.control.barriers import Quadratic
-from iblf_jax.kernels.interval_primitives import hull, meet, with_sign
+from iblf_jax.kernels.interval_primitives import hull, meet, with_sign, lower as kl_, upper as ku_
 from iblf_jax.proofs import chain_motion, uncertainty
 from iblf_jax.proofs.arm_motion import along
 from iblf_jax.proofs.chain_motion import ChainParts, ChainState, Column, LevelEquations, Motion, OpenTube
@@ -217,6 +217,17 @@ def _error(
         tube = kind(zero, zero, -(k_l + slope * e), k_u - slope * e, zero, zero)
         return barrier.error_at(value, tube, sign > 0)
 
+    if i == 0 and true.is_box:
+        def at_time(t):
+            middle = parts.reference.position(t)
+            lower, upper = bounds_at(parts.bounds[0], t, middle)
+            tube = OpenTube(zero, zero, lower-middle, upper-middle, zero, zero)
+            return barrier.error_at(value, tube, sign > 0)
+        t = around.t
+        c = 0.5*(kl_(t)+ku_(t))
+        slope_t = along(at_time, (t,), (jnp.ones_like(t),))
+        e = meet(at_time(c) + slope_t*(t-c), next_error(zero))
+        return with_sign(e, sign)
     if i == 0 or not observed[i - 1]:
         return with_sign(next_error(zero), sign)
     if not true.is_box:
@@ -260,8 +271,8 @@ def chain_bound(
     shares = sphere([x[1 + k] for k in range(angles)])
     start = 1 + angles
     z = x[start : start + places.coordinates]
-    signs = x[start + places.coordinates :]
+    signs = x[start + places.coordinates : -1]
     true = TruePlant(constants, places, z, is_box=True)
-    point = level_point(constants, observed, true, x[0], shares, signs)
+    point = level_point(constants, observed, true, x[-1] + x[0], shares, signs)
     rate = level_rate(constants, observed, true, point)
     return jnp.where(true.equations.positive_widths(point.now.y), rate, jnp.inf)

@@ -46,6 +46,9 @@ from iblf_jax.world.bounds import Tube
 
 ORDERS = (2, 3)
 """Numbers of levels for which the bound is small enough to be of use."""
+PARTS_OF_TIME = 128
+"""Parts of the time interval, each of which is searched on its own: over a long part the tube of the
+first level has no positive width, so that no bisection would be better than another."""
 ASSUMPTIONS = (
     "The equations hold in real numbers: the loop is continuous, and its parameters are the stored"
     " double-precision numbers.",
@@ -274,7 +277,7 @@ def chain_problem(
         names=names,
         lower=lower,
         upper=upper,
-        patterns=np.array(list(itertools.product((-1.0, 1.0), repeat=order))),
+        patterns=_patterns(order, length),
         bound=ChainBound(structure, uncertain.places, observed),
         constants=chain.constants,
         point_rate=ChainRate(structure, uncertain.places, observed),
@@ -302,11 +305,20 @@ def _coordinates(
     if estimates > 1:
         upper[order:] = half
         lower[-1] = -half
-    names = ["t", *(f"theta[{i}]" for i in range(count)), *uncertain.names]
-    names += [f"side[{i}]" for i in range(order)]
+    names = ["time since start", *(f"theta[{i}]" for i in range(count)), *uncertain.names]
+    names += [*(f"side[{i}]" for i in range(order)), "start"]
+    # The parts of the time overlap by more than the rounding of their starts.
+    part = duration / PARTS_OF_TIME * (1.0 + 1e-9)
     lower = np.concatenate([[0.0], lower, uncertain.low])
-    upper = np.concatenate([[np.nextafter(duration, np.inf)], upper, uncertain.high])
+    upper = np.concatenate([[part], upper, uncertain.high])
     return tuple(names), lower, upper
+
+
+def _patterns(order: int, duration: float) -> np.ndarray:
+    """The signs of the errors and the start of each part of the time, (p, r + 1)."""
+    signs = itertools.product((-1.0, 1.0), repeat=order)
+    starts = np.arange(PARTS_OF_TIME) * (duration / PARTS_OF_TIME)
+    return np.array([[*sign, start] for sign in signs for start in starts])
 
 
 def _parts_of(scenario: Scenario) -> ChainParts:
