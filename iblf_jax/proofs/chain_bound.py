@@ -24,10 +24,11 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.control.barriers import Quadratic
-from iblf_jax.kernels.interval_primitives import hull, meet, with_sign, lower as kl_, upper as ku_
+from iblf_jax.kernels.interval_primitives import hull, meet, with_sign
 from iblf_jax.proofs import chain_motion, uncertainty
 from iblf_jax.proofs.arm_motion import along
 from iblf_jax.proofs.chain_motion import ChainParts, ChainState, Column, LevelEquations, Motion, OpenTube
+from iblf_jax.proofs.forms import centre, derivative
 from iblf_jax.proofs.matrices import sphere
 from iblf_jax.proofs.uncertainty import Numbers, Places
 from iblf_jax.world import plants
@@ -218,16 +219,8 @@ def _error(
         return barrier.error_at(value, tube, sign > 0)
 
     if i == 0 and true.is_box:
-        def at_time(t):
-            middle = parts.reference.position(t)
-            lower, upper = bounds_at(parts.bounds[0], t, middle)
-            tube = OpenTube(zero, zero, lower-middle, upper-middle, zero, zero)
-            return barrier.error_at(value, tube, sign > 0)
-        t = around.t
-        c = 0.5*(kl_(t)+ku_(t))
-        slope_t = along(at_time, (t,), (jnp.ones_like(t),))
-        e = meet(at_time(c) + slope_t*(t-c), next_error(zero))
-        return with_sign(e, sign)
+        # Both widths of the first tube depend on the time: a mean-value form keeps their relation.
+        return with_sign(meet(_first_error(parts, value, sign, around.t), next_error(zero)), sign)
     if i == 0 or not observed[i - 1]:
         return with_sign(next_error(zero), sign)
     if not true.is_box:
@@ -237,6 +230,24 @@ def _error(
     for _ in range(CONTRACTIONS):
         e = meet(next_error(e), e)
     return with_sign(e, sign)
+
+
+def _first_error(
+    parts: ChainParts, value: jax.Array, sign: jax.Array, t: jax.Array
+) -> jax.Array:
+    """e_1 at which V_1 has a value, by the mean-value form e(c) + e'(T) (t - c) in an interval T of
+    times with the centre c.
+    """
+
+    def error(t: jax.Array) -> jax.Array:
+        middle = parts.reference.position(t)
+        lower, upper = bounds_at(parts.bounds[0], t, middle)
+        zero = jnp.zeros(1)
+        tube = OpenTube(zero, zero, lower - middle, upper - middle, zero, zero)
+        return parts.law.barriers[0].error_at(value, tube, sign > 0)
+
+    c = centre(t)
+    return error(c) + derivative(error)(t) * (t - c)
 
 
 def level_rate(
@@ -275,4 +286,4 @@ def chain_bound(
     true = TruePlant(constants, places, z, is_box=True)
     point = level_point(constants, observed, true, x[-1] + x[0], shares, signs)
     rate = level_rate(constants, observed, true, point)
-    return jnp.where(true.equations.positive_widths(point.now.y), rate, jnp.inf)
+    return jnp.where(true.equations.inside_guards(point.now.y), rate, jnp.inf)

@@ -72,6 +72,8 @@ class ChainParts(NamedTuple):
     reference: Reference
     bounds: tuple[Bounds | None, ...]
     """Of each level."""
+    guards: jax.Array
+    """Guard of the law's barrier of each level, 0 of those without one, (r, 1)."""
 
     @property
     def order(self) -> int:
@@ -80,8 +82,8 @@ class ChainParts(NamedTuple):
 
 
 class OpenTube(Tube):
-    """A tube whose widths are differences without a least value, whose derivative is undecided on
-    intervals.  `positive_widths` says where they are those of `Tube`.
+    """A tube whose widths have no least value, because the derivative of a maximum is undecided on
+    intervals.  Inside the guards (`inside_guards`) they are those of `Tube`.
     """
 
     @property
@@ -191,13 +193,16 @@ class LevelEquations:
         lower, upper = now[0] - middle, now[1] - middle
         return OpenTube(zero, zero, lower, upper, moved[0] - rate, moved[1] - rate)
 
-    def positive_widths(self, y: ChainState) -> jax.Array:
-        """Whether all tubes are wider than the least width at which a law takes them as they are,
-        (1,) bool.
-        """
-        tubes = [self.relative_tube(i, y) for i in range(self.parts.order)]
-        widths = [width for tube in tubes for width in (tube.k_l, tube.k_u)]
-        return functools.reduce(jnp.logical_and, [width > NARROWEST for width in widths])
+    def inside_guards(self, y: ChainState) -> jax.Array:
+        """Whether all errors are inside the bounds and no guard is active, (1,) bool."""
+        inside = jnp.ones(1, bool)
+        for i, barrier in enumerate(self.parts.law.barriers):
+            if isinstance(barrier, Quadratic):
+                continue
+            tube, share = self.relative_tube(i, y), 1.0 - self.parts.guards[i]
+            inside &= (tube.k_l > NARROWEST) & (tube.k_u > NARROWEST)
+            inside &= (y.e[i] < share * tube.k_u) & (y.e[i] > -share * tube.k_l)
+        return inside
 
     @remembered(errors=1, estimates=0)
     def barrier_slope(self, i: int, y: ChainState) -> jax.Array:

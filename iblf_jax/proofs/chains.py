@@ -25,7 +25,7 @@ from iblf_jax.core import checks
 from iblf_jax.core.pytree import astype
 from iblf_jax.core.time import as_at, jump_times_of
 from iblf_jax.proofs import chain_motion
-from iblf_jax.proofs.arms import Uncertain, uncertain_coordinates
+from iblf_jax.proofs.arms import INSTANTS, Uncertain, uncertain_coordinates
 from iblf_jax.proofs.chain_bound import (
     Constants,
     LevelPoint,
@@ -42,7 +42,7 @@ from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Initial, Scenario, canonical
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.world import plants
-from iblf_jax.world.bounds import Tube
+from iblf_jax.world.bounds import Tube, tube_at
 
 ORDERS = (2, 3)
 """Numbers of levels for which the bound is small enough to be of use."""
@@ -143,10 +143,12 @@ class _Chain:
           level: c, in the unit of w_i V_i.
 
         Raises:
-          ValueError: a number that is not positive.
+          ValueError: a number that is not positive, or a level that reaches the guard of the first
+            barrier; the bound examines those of the other levels.
         """
         weight = checks.positive_number("weight", weight, "1")
         level = checks.positive_number("level", level, "energy")
+        self._check_level(level)
         with jax.enable_x64(True):
             weights = weight * self._scales_of_weights()
         numbers = Constants(
@@ -158,6 +160,26 @@ class _Chain:
             np.asarray(level),
         )
         return [np.asarray(x, float) for x in jax.tree.leaves(numbers)]
+
+    def _check_level(self, level: float) -> None:
+        """Raises ValueError if the level set reaches the guard of the first barrier."""
+        barrier = self.scenario.controller.barriers[0]
+        if isinstance(barrier, Quadratic):
+            return
+        with jax.enable_x64(True):
+            times = jnp.linspace(0.0, self.duration, INSTANTS)
+            value = level / self.parts.law.weights[0] * jnp.ones(1)
+
+            def reached(t: jax.Array) -> jax.Array:
+                tube = tube_at(self.parts.reference, self.scenario.bounds, t, acceleration=False)
+                return barrier.xi_bound(value, tube)
+
+            xi = float(jnp.max(jax.vmap(reached)(times)))
+        if xi < 1.0 - barrier.guard:
+            return
+        expected = f"a level inside the guard of the first barrier, |xi| < {1.0 - barrier.guard:g}"
+        remedy = f"It reaches |xi| = {xi:.6g}, where the law has another slope. Lower the level."
+        raise checks.fail("level", level, expected, remedy)
 
     def _scales_of_weights(self) -> np.ndarray:
         """w_i s_i'(0)/(k_i kappa_i) of each observed level at t = 0, 1 of the others, (r, 1)."""
@@ -339,7 +361,10 @@ def _parts_of(scenario: Scenario) -> ChainParts:
     context = scenario.context
     bounds = tuple(context.level_bounds(i + 1) for i in range(order))
     model = as_at(scenario.model, jnp.zeros(()))
-    return ChainParts(model, law, _rows(gain, order), scenario.reference, bounds)
+    guards = [[0.0 if isinstance(x, Quadratic) else x.guard] for x in scenario.controller.barriers]
+    return ChainParts(
+        model, law, _rows(gain, order), scenario.reference, bounds, jnp.asarray(guards)
+    )
 
 
 def _rows(value: jax.Array, order: int) -> jax.Array:
