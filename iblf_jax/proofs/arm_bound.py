@@ -30,7 +30,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.core.linalg import inner, matvec
+from iblf_jax.core.linalg import inner, matmul, matvec
 from iblf_jax.kernels.interval_primitives import lower, upper, with_sign
 from iblf_jax.proofs import uncertainty
 from iblf_jax.proofs.arm_motion import (
@@ -40,6 +40,7 @@ from iblf_jax.proofs.arm_motion import (
     decay,
     error_at,
     external_torque,
+    inverse_mass,
     motion,
     position,
     rate_along_motion,
@@ -49,7 +50,6 @@ from iblf_jax.proofs.forms import centre
 from iblf_jax.proofs.matrices import (
     least_eigenvalue,
     norm,
-    solve,
     solve_general,
     solve_transposed,
     sphere,
@@ -161,10 +161,11 @@ class MismatchRate(NamedTuple):
 
     external: Any
     """d0'."""
-    fixed: Any
-    """dW of the difference between the scenario's plant and its model; () if there is none."""
     columns: list[Any]
-    """W_k."""
+    """W_k without M_k M0^-1 (slow - K2 M0^-1 force)."""
+    slow: Any
+    force: Any
+    """Parts of `Motion`."""
 
 
 def mismatch(constants: Constants, places: Places, at: Errors, z: jax.Array) -> Mismatch:
@@ -176,62 +177,62 @@ def mismatch(constants: Constants, places: Places, at: Errors, z: jax.Array) -> 
     inside = uncertainty.between(places, numbers, nominal, known, z)
     fixed = uncertainty.fixed_difference(places, numbers, nominal, known)
     directions = uncertainty.directions(places, numbers, known)
-    q = position(parts, at)
-    M0 = parts.model.mass_matrix(q)
+    q, M0_inverse = position(parts, at), inverse_mass(parts, at)
+    if fixed is not None:
+        directions = [fixed, *directions]
 
     def with_plant(plant_and_disturbance: Any) -> ArmParts:
         plant, disturbance = plant_and_disturbance
         return parts._replace(plant=plant, disturbance=disturbance)
 
     def rates(f_tilde: jax.Array) -> MismatchRate:
-        now, jerk = motion(parts, at, f_tilde)
+        moved = motion(parts, at, f_tilde)
 
         def torque_rate(p: Any) -> jax.Array:
-            return rate_along_motion(required_torque, with_plant(p), now, jerk)
+            return rate_along_motion(required_torque, with_plant(p), moved.now, moved.alpha_jerk)
 
-        external = rate_along_motion(external_torque, with_plant(known), now, jerk)
-        difference: Any = ()
-        if fixed is not None:
-            difference = along(torque_rate, (inside,), (fixed,))
+        external = rate_along_motion(
+            external_torque, with_plant(known), moved.now, moved.alpha_jerk
+        )
         columns = [along(torque_rate, (inside,), (direction,)) for direction in directions]
-        return MismatchRate(external, difference, columns)
+        return MismatchRate(external, columns, moved.slow, moved.force)
 
     def mass_along(direction: Any) -> jax.Array:
         return along(lambda p: p[0].mass_matrix(q), (inside,), (direction,))
 
     found = in_f_tilde(rates, n)
     size = z - numbers.reference
-    right = found.external
-    total = jnp.eye(n)
-    masses = [mass_along(direction) for direction in directions]
-    # The rate of a further disturbance is a coordinate without entries.
-    free = [Affine(-unit, jnp.zeros((n, n))) for unit in jnp.eye(n)[: places.rates]]
-    moved = [*found.columns, *free]
-    masses += [jnp.zeros((n, n))] * places.rates
-    dM = sum((size[k] * mass for k, mass in enumerate(masses)), jnp.zeros((n, n)))
     if fixed is not None:
-        fixed_mass = mass_along(fixed)
-        dM = dM + fixed_mass
-        right = add(right, scaled(jnp.asarray(-1.0), found.fixed))
-    for k, column in enumerate(moved):
-        right = add(right, scaled(-size[k], column))
-    # dM M0^-1, row by row, because both are symmetric
-    total = total + jnp.stack([solve(M0, row) for row in dM])
-    whole = on_columns(lambda column: solve_general(total, column), right)
-    inner_part = on_columns(lambda column: solve(M0, column), whole)
+        size = jnp.concatenate([jnp.ones(1), size])
+    # M_k M0^-1, of which the inverse is a narrow interval where q is one
+    shares = [matmul(mass_along(direction), M0_inverse) for direction in directions]
 
-    def minus_product(mass: jax.Array) -> Affine:
-        return on_columns(lambda column: -matvec(mass, column), inner_part)
+    def torque_column(column: Affine, share: jax.Array) -> Affine:
+        fast = matmul(share * parts.law.K2, M0_inverse)
+        with_slow = add(column, on_columns(lambda slow: matvec(share, slow), found.slow))
+        return add(with_slow, on_columns(lambda force: -matvec(fast, force), found.force))
 
-    constant = found.external
-    if fixed is not None:
-        constant = add(constant, scaled(jnp.asarray(-1.0), found.fixed))
-        constant = add(constant, minus_product(fixed_mass))
     columns = [
-        add(scaled(jnp.asarray(-1.0), column), minus_product(mass))
-        for column, mass in zip(moved, masses, strict=True)
+        torque_column(column, share)
+        for column, share in zip(found.columns, shares, strict=True)
     ]
-    return Mismatch(constant, columns)
+    # The rate of a further disturbance is a coordinate without entries.
+    columns += [Affine(-unit, jnp.zeros((n, n))) for unit in jnp.eye(n)[: places.rates]]
+    shares += [jnp.zeros((n, n))] * places.rates
+    total, right = jnp.eye(n), found.external
+    for k, (column, share) in enumerate(zip(columns, shares, strict=True)):
+        total = total + size[k] * share
+        right = add(right, scaled(-size[k], column))
+    whole = on_columns(lambda column: solve_general(total, column), right)
+
+    def affine_column(column: Affine, share: jax.Array) -> Affine:
+        product = on_columns(lambda column: matvec(share, column), whole)
+        return scaled(jnp.asarray(-1.0), add(column, product))
+
+    affine = [affine_column(*pair) for pair in zip(columns, shares, strict=True)]
+    if fixed is not None:
+        return Mismatch(add(found.external, affine[0]), affine[1:])
+    return Mismatch(found.external, affine)
 
 
 def corners(constants: Constants, found: Mismatch, z: jax.Array) -> list[Affine]:
@@ -256,6 +257,12 @@ class Corner(NamedTuple):
     """lambda, () [1/s]."""
     coupling: jax.Array
     """b |e2 + w_f f0| - w_f lambda b^2, () [N m rad/s]."""
+    square: jax.Array
+    """The same from a completed square, for an upper bound: D b - m b^2 = D^2/(4m) - m (b -
+    D/(2m))^2 with D = |e2 + w_f f0| and m = w_f lambda."""
+    directed: jax.Array
+    """-K |e2|^2 + the same = -K (D - b/(2K))^2 - mu b^2 + K w_f f0 . (2 e2 + w_f f0), with K =
+    min K2 and mu = m - 1/(4K)."""
 
 
 def corner_terms(
@@ -264,12 +271,19 @@ def corner_terms(
     """The terms of (B.1) at each corner of the box of parameters."""
     parts, weight, b = constants.parts, constants.weight, point.b
     e2 = point.errors.e2
-    kf = jnp.diag(parts.kf)
+    kf, K = jnp.diag(parts.kf), jnp.min(parts.law.K2)
     terms = []
     for vertex in corners(constants, mismatch(constants, places, point.errors, z), z):
         gain = least_eigenvalue(kf - 0.5 * (vertex.slope + vertex.slope.T))
-        drive = norm(e2 + weight * vertex.value)
-        terms.append(Corner(norm(vertex.value), gain, b * drive - weight * gain * b**2))
+        push = weight * vertex.value
+        drive = norm(e2 + push)
+        m = weight * gain
+        largest, least = upper(drive), lower(m)
+        square = largest**2 / (4.0 * least) - least * (b - largest / (2.0 * least)) ** 2
+        mu = lower(m - 1.0 / (4.0 * K))
+        directed = inner(push, 2.0 * e2 + push) * K - K * (drive - b / (2.0 * K)) ** 2 - mu * b**2
+        force = norm(vertex.value)
+        terms.append(Corner(force, gain, b * drive - m * b**2, square, directed))
     return terms
 
 
@@ -305,16 +319,17 @@ def decay_bound(constants: Constants, point: LevelPoint) -> jax.Array:
 
 
 def arm_bound(places: Places, n: int, x: jax.Array, constants: Constants) -> jax.Array:
-    """Upper bounds of V_w' over the box x, (2,) [N m rad/s]."""
+    """Upper bounds of V_w' over the box x, (3,) [N m rad/s]."""
     at = coordinates(x, n, places.coordinates)
     point = level_point(constants, at)
     e2, b = point.errors.e2, point.b
     losses = decay_bound(constants, point)
     terms = corner_terms(constants, places, point, at.z)
-    coupling = jnp.max(jnp.stack([term.coupling for term in terms]))
+    coupling = jnp.max(jnp.stack([jnp.minimum(term.coupling, term.square) for term in terms]))
     direct = coupling - losses - inner(e2, constants.parts.law.K2 * e2)
+    directed = jnp.max(jnp.stack([term.directed for term in terms])) - losses
     squares = _squares(constants, norm(e2), b, terms) - losses
-    return jnp.stack([direct, squares])
+    return jnp.stack([direct, squares, directed])
 
 
 def _squares(constants: Constants, a: jax.Array, b: jax.Array, terms: list[Corner]) -> jax.Array:

@@ -43,7 +43,7 @@ import jax.numpy as jnp
 from iblf_jax.control.barriers._base import value_unit
 from iblf_jax.core.linalg import inner, matvec
 from iblf_jax.proofs.forms import enclosed
-from iblf_jax.proofs.matrices import solve
+from iblf_jax.proofs.matrices import inverse
 from iblf_jax.world.bounds import Bounds, Tube
 from iblf_jax.world.disturbances import Disturbance
 from iblf_jax.world.references import Reference
@@ -199,22 +199,37 @@ def position(parts: ArmParts, at: Errors) -> jax.Array:
     return reference(parts, at.t) + side_of(parts, at.t, at.xi).k * at.xi
 
 
+def coupling_force(parts: ArmParts, at: Errors) -> jax.Array:
+    """-C0 e2 - w s, (n,) [N m]."""
+    q, v = position(parts, at), velocity(parts, at)
+    return -parts.model.coriolis(q, v, at.e2) - slope(parts, at.t, at.xi)
+
+
+def error_force(parts: ArmParts, at: Errors, f_tilde: jax.Array) -> jax.Array:
+    """M0 e2' of (P.1), (n,) [N m]."""
+    return f_tilde + coupling_force(parts, at) - parts.law.K2 * at.e2
+
+
+def inverse_mass(parts: ArmParts, at: Errors) -> jax.Array:
+    """M0^-1, (n, n)."""
+    return inverse(parts.model.mass_matrix(position(parts, at)))
+
+
 def velocity_error_rate(parts: ArmParts, at: Errors, f_tilde: jax.Array) -> jax.Array:
     """e2' of (P.1), (n,) [rad/s^2]."""
-    law, model = parts.law, parts.model
-    q = position(parts, at)
-    coriolis = model.coriolis(q, velocity(parts, at), at.e2)
-    force = f_tilde - coriolis - law.K2 * at.e2 - slope(parts, at.t, at.xi)
-    return solve(model.mass_matrix(q), force)
+    return matvec(inverse_mass(parts, at), error_force(parts, at, f_tilde))
 
 
-def acceleration(parts: ArmParts, at: Errors, f_tilde: jax.Array) -> jax.Array:
-    """q" = q_d" + (alpha - q_d')' + e2', (n,) [rad/s^2]."""
-    one = jnp.ones_like(at.t)
-    rates = (one, xi_rate(parts, at))
-    alpha_rate = along(lambda t, xi: relative_alpha(parts, t, xi), (at.t, at.xi), rates)
-    reference_acceleration = along(lambda t: reference_rate(parts, t), (at.t,), (one,))
-    return reference_acceleration + alpha_rate + velocity_error_rate(parts, at, f_tilde)
+def relative_alpha_rate(parts: ArmParts, at: Errors) -> jax.Array:
+    """(alpha - q_d')', (n,) [rad/s^2]."""
+    rates = (jnp.ones_like(at.t), xi_rate(parts, at))
+    return along(lambda t, xi: relative_alpha(parts, t, xi), (at.t, at.xi), rates)
+
+
+def alpha_rate(parts: ArmParts, at: Errors) -> jax.Array:
+    """alpha', (n,) [rad/s^2]."""
+    second = along(lambda t: reference_rate(parts, t), (at.t,), (jnp.ones_like(at.t),))
+    return second + relative_alpha_rate(parts, at)
 
 
 def rates_of_errors(parts: ArmParts, at: Errors, f_tilde: jax.Array) -> Errors:
@@ -223,14 +238,37 @@ def rates_of_errors(parts: ArmParts, at: Errors, f_tilde: jax.Array) -> Errors:
     return Errors(jnp.ones_like(at.t), xi_rate(parts, at), e2_rate)
 
 
-def motion(parts: ArmParts, at: Errors, f_tilde: jax.Array) -> tuple[Kinematics, jax.Array]:
-    """The motion, and its jerk j0 for f' = 0, (n,) [rad/s^3]."""
+class Motion(NamedTuple):
+    """The motion of the joints, and its jerk j0 for f' = 0 in parts:
+
+        j0 = alpha" + M0^-1 (slow - K2 M0^-1 force)
+    """
+
+    now: Kinematics
+    alpha_jerk: jax.Array
+    """alpha", (n,) [rad/s^3]."""
+    slow: jax.Array
+    """(-C0 e2 - w s)' - M0' e2' - kf f_tilde, (n,) [N m/s]."""
+    force: jax.Array
+    """M0 e2', (n,) [N m]."""
+
+
+def motion(parts: ArmParts, at: Errors, f_tilde: jax.Array) -> Motion:
+    """The motion at time and errors."""
     rates = rates_of_errors(parts, at, f_tilde)
-    f_tilde_rate = -parts.kf * f_tilde
-    a, jerk = jax.jvp(
-        lambda at, f_tilde: acceleration(parts, at, f_tilde), (at, f_tilde), (rates, f_tilde_rate)
-    )
-    return Kinematics(at.t, position(parts, at), velocity(parts, at), a), jerk
+    first, second = jax.jvp(lambda at: alpha_rate(parts, at), (at,), (rates,))
+    now = Kinematics(at.t, position(parts, at), velocity(parts, at), first + rates.e2)
+    coupling = along(lambda at: coupling_force(parts, at), (at,), (rates,))
+    mass_rate = along(parts.model.mass_matrix, (now.q,), (now.v,))
+    slow = coupling - matvec(mass_rate, rates.e2) - parts.kf * f_tilde
+    return Motion(now, second, slow, error_force(parts, at, f_tilde))
+
+
+def jerk(parts: ArmParts, at: Errors, moved: Motion) -> jax.Array:
+    """j0, (n,) [rad/s^3]."""
+    inverse = inverse_mass(parts, at)
+    rest = moved.slow - parts.law.K2 * matvec(inverse, moved.force)
+    return moved.alpha_jerk + matvec(inverse, rest)
 
 
 def required_torque(parts: ArmParts, now: Kinematics) -> jax.Array:
@@ -278,11 +316,12 @@ def mismatch_rate(
       f_tilde: error of the observer's estimate, (n,) [N m].
       extra: rate of a further disturbance, (n,) [N m/s].
     """
-    now, jerk = motion(parts, at, f_tilde)
-    rate = rate_along_motion(mismatch_torque, parts, now, jerk) + extra
+    moved = motion(parts, at, f_tilde)
+    now = moved.now
+    rate = rate_along_motion(mismatch_torque, parts, now, jerk(parts, at, moved)) + extra
     M0, M = parts.model.mass_matrix(now.q), parts.plant.mass_matrix(now.q)
     # (I + dM M0^-1)^-1 = M0 M^-1
-    return matvec(M0, solve(M, rate))
+    return matvec(M0, matvec(inverse(M), rate))
 
 
 def level_rate(

@@ -185,7 +185,7 @@ class _Arm:
         with jax.enable_x64(True):
             found, _ = self._found(point, constants)
             parts, errors = found.parts, found.errors
-            now, _ = arm_motion.motion(parts, errors, found.f_tilde)
+            now = arm_motion.motion(parts, errors, found.f_tilde).now
             f_hat = arm_motion.mismatch_torque(parts, now) - found.f_tilde
             eta = f_hat - parts.kf * matvec(parts.model.mass_matrix(now.q), now.v)
             z = np.asarray(point)[1 + 3 * self.scenario.n :]

@@ -11,7 +11,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.core.linalg import matvec
+from iblf_jax.core.linalg import matmul
 
 
 Factor = dict[tuple[int, int], jax.Array]
@@ -55,26 +55,33 @@ def solve_upper(U: Factor, rhs: jax.Array) -> jax.Array:
 
 
 @jax.custom_jvp
-def solve(matrix: jax.Array, rhs: jax.Array) -> jax.Array:
-    """The solution x of matrix x = rhs, (n,), for a symmetric positive definite (n, n) matrix; its
-    derivative is that of the equation.
+def inverse(matrix: jax.Array) -> jax.Array:
+    """The inverse of a symmetric positive definite (n, n) matrix; its derivative is that of the
+    equation.
+
+    A product with the inverse is narrower over a box than elimination, in which the entries of the
+    right-hand side occur several times.
     """
-    n = len(rhs)
+    n = matrix.shape[-1]
     if n == 1:
-        return rhs / matrix[0]
+        return 1.0 / matrix
     if n == 2:
+        # The last pivot of a serial arm is constant.
         ratio = matrix[0, 1] / matrix[1, 1]
-        first = (rhs[0] - ratio * rhs[1]) / (matrix[0, 0] - ratio * matrix[0, 1])
-        return jnp.stack([first, (rhs[1] - matrix[0, 1] * first) / matrix[1, 1]])
+        first = 1.0 / (matrix[0, 0] - ratio * matrix[0, 1])
+        mixed = -ratio * first
+        last = 1.0 / matrix[1, 1] - ratio * mixed
+        return jnp.stack([jnp.stack([first, mixed]), jnp.stack([mixed, last])])
     U = upper_factor(matrix)
-    return solve_transposed(U, solve_upper(U, rhs))
+    columns = [solve_transposed(U, solve_upper(U, unit)) for unit in jnp.eye(n)]
+    return jnp.stack(columns, axis=-1)
 
 
-@solve.defjvp
-def _solve_jvp(primals: tuple, tangents: tuple) -> tuple:
-    (matrix, rhs), (matrix_dot, rhs_dot) = primals, tangents
-    x = solve(matrix, rhs)
-    return x, solve(matrix, rhs_dot - matvec(matrix_dot, x))
+@inverse.defjvp
+def _inverse_jvp(primals: tuple, tangents: tuple) -> tuple:
+    (matrix,), (matrix_dot,) = primals, tangents
+    found = inverse(matrix)
+    return found, -matmul(found, matmul(matrix_dot, found))
 
 
 def solve_general(matrix: jax.Array, rhs: jax.Array) -> jax.Array:
@@ -137,9 +144,9 @@ def sphere(angles: list[jax.Array]) -> list[jax.Array]:
 
 
 __all__ = [
+    "inverse",
     "least_eigenvalue",
     "norm",
-    "solve",
     "solve_general",
     "solve_transposed",
     "sphere",
