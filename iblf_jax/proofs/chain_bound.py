@@ -1,7 +1,7 @@
 """Points and bounds of V' on the level set V = c of a plant in strict-feedback form.
 
-**Coordinates.**  x = (t, theta_1..theta_{N-1}, z_1..z_m, sign_1..sign_r), N = r + number of observed
-levels.  Angles divide the level among its terms,
+**Coordinates.**  x = (t - t_0, theta_1..theta_{N-1}, z_1..z_m, sign_1..sign_r, t_0), where N is r
+and the number of observed levels.  Angles divide the level among its terms,
 
     (sqrt(w_i V_i/c) for each level, sqrt(v_i/(2c)) d_tilde_i for each observed one) = sphere(theta)
 
@@ -11,9 +11,9 @@ so that every x lies on the level set.  sign_i is the side of the tube on which 
 
     alpha_{i-1} = alpha_0 + rho e_i,   rho = G0_{i-1}/G_{i-1} - 1,
 
-because d_hat_{i-1} contains x_{i-1}', and rho = 0 where it is no estimate.  The error at which w_i
-V_i has its value is the fixed point of e = error_at(V_i; tube around alpha_0 + rho e).  On intervals
-the iteration begins with all errors inside the bounds, sign_i e_i in [0, k_0/(1 + rho)].
+because d_hat_{i-1} contains x_{i-1}', and rho = 0 where it is no estimate.  The error at which
+V_i has its value is the fixed point of e = error_at(V_i; tube around alpha_0 + rho e).  On
+intervals the iteration begins with all errors inside the bounds, sign_i e_i in [0, k_0/(1 + rho)].
 """
 
 from __future__ import annotations
@@ -27,7 +27,14 @@ from iblf_jax.control.barriers import Quadratic
 from iblf_jax.kernels.interval_primitives import hull, meet, with_sign
 from iblf_jax.proofs import chain_motion, uncertainty
 from iblf_jax.proofs.arm_motion import along
-from iblf_jax.proofs.chain_motion import ChainParts, ChainState, Column, LevelEquations, Motion, OpenTube
+from iblf_jax.proofs.chain_motion import (
+    ChainParts,
+    ChainState,
+    Column,
+    LevelEquations,
+    Motion,
+    OpenTube,
+)
 from iblf_jax.proofs.forms import centre, derivative
 from iblf_jax.proofs.matrices import sphere
 from iblf_jax.proofs.uncertainty import Numbers, Places
@@ -64,9 +71,7 @@ class TruePlant:
       is_box: whether differences are formed by the mean value theorem, for intervals.
     """
 
-    def __init__(
-        self, constants: Constants, places: Places, z: jax.Array, *, is_box: bool
-    ) -> None:
+    def __init__(self, constants: Constants, places: Places, z: jax.Array, *, is_box: bool) -> None:
         self.parts = constants.parts
         self.equations = LevelEquations(constants.parts)
         self.is_box = is_box
@@ -108,7 +113,7 @@ class TruePlant:
         return true / plants.gain_times(self.parts.model, i + 1, t, x, one)
 
     def slope_of_centre(self, i: int, t: jax.Array, x: jax.Array) -> jax.Array:
-        """rho of the centre of the row above row i, G0_i/G_i - 1."""
+        """Rho of the centre of the row above row i, G0_i/G_i - 1."""
         zero, one = jnp.zeros(1), jnp.ones(1)
         slope = along(lambda rate: self.mismatch(i, t, x, rate), (zero,), (one,))
         return -plants.gain_times(self.parts.model, i + 1, t, x, slope)
@@ -232,9 +237,7 @@ def _error(
     return with_sign(e, sign)
 
 
-def _first_error(
-    parts: ChainParts, value: jax.Array, sign: jax.Array, t: jax.Array
-) -> jax.Array:
+def _first_error(parts: ChainParts, value: jax.Array, sign: jax.Array, t: jax.Array) -> jax.Array:
     """e_1 at which V_1 has a value, by the mean-value form e(c) + e'(T) (t - c) in an interval T of
     times with the centre c.
     """

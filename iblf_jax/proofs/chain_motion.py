@@ -4,9 +4,10 @@ The law is `controllers.BarrierBackstepping` with exact derivatives, the observe
 none, one number per level.  Plant and model, with d_i the difference that the observer estimates:
 
     x_i' = f_i + G_i x_{i+1} + external_i = f0_i + G0_i x_{i+1} + d_i,   i = 1..r,   x_{r+1} = u
-    V = sum_i w_i V_i + sum_i (v_i/2) d_tilde_i^2,   d_tilde = d - d_hat,   d_hat_i' = kappa_i d_tilde_i
+    d_tilde = d - d_hat,   d_hat_i' = kappa_i d_tilde_i
+    V = sum_i w_i V_i + sum_i (v_i/2) d_tilde_i^2
 
-The second sum has the levels with kappa_i > 0; at the others d_hat_i = 0 and d_tilde_i = d_i.
+The last sum has the levels with kappa_i > 0; at the others d_hat_i = 0 and d_tilde_i = d_i.
 
 **Motion.**  With R_i, the rate that the law wants (`_levels`), alpha_i = I0_i(R_i - d_hat_i), where
 I0_i(rate) = (rate - f0_i)/G0_i, and
@@ -16,14 +17,18 @@ I0_i(rate) = (rate - f0_i)/G0_i, and
 
 alpha_{i-1}' differs from its rate beta_{i-1} in the model's flow, with d_hat held, by
 
-    delta_{i-1} = D alpha_{i-1} along (e_j' : d_tilde_j - delta_{j-1},  d_hat_j' : kappa_j d_tilde_j)
+    delta_{i-1} = the derivative of alpha_{i-1} along e_j' = d_tilde_j - delta_{j-1} and
+                  d_hat_j' = kappa_j d_tilde_j,   j < i,
 
 so that with the barriers' decay
 
     (sum w_i V_i)' = -sum w_i (decay_i + c_i s_i^2)
                      + sum w_i (s_i d_tilde_i + (dV_i/d alpha_{i-1}) delta_{i-1})             (C.2)
 
-**Parameters.**  At a given rate x_i', the level above is Z_i(p; x_i') = (x_i' - f_i - external_i)/G_i,
+**Parameters.**  At a given rate x_i', the level above is
+
+    Z_i(p; x_i') = (x_i' - f_i - external_i)/G_i,
+
 which is affine in the parameters of most plants.  With m_i(p; rate) = I0_i(rate) - Z_i(p; rate),
 
     d_i = G0_i m_i(p; x_i')   where d_hat_i is an estimate,
@@ -361,14 +366,10 @@ def motion(
         surplus.append(d_tilde[i] - delta)
         error_rates.append(equations.model_error_rate(i, y) + surplus[i])
         x_rates.append(equations.model_state_rate(i, y) + d_tilde[i])
-    return Motion(
-        y, tuple(x_rates), d, d_tilde, tuple(error_rates), tuple(deltas), estimates
-    )
+    return Motion(y, tuple(x_rates), d, d_tilde, tuple(error_rates), tuple(deltas), estimates)
 
 
-def mismatch_rate(
-    equations: LevelEquations, truth: Truth, i: int, now: Motion
-) -> jax.Array:
+def mismatch_rate(equations: LevelEquations, truth: Truth, i: int, now: Motion) -> jax.Array:
     """d_i' of (C.4) of an observed row."""
     y = now.y
     rates = ChainState(jnp.ones_like(y.t), now.error_rate[: i + 2], now.d_hat_rate[:i])

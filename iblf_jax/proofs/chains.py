@@ -47,8 +47,8 @@ from iblf_jax.world.bounds import Tube, tube_at
 ORDERS = (2, 3)
 """Numbers of levels for which the bound is small enough to be of use."""
 PARTS_OF_TIME = 128
-"""Parts of the time interval, each of which is searched on its own: over a long part the tube of the
-first level has no positive width, so that no bisection would be better than another."""
+"""Parts of the time interval, each of which is searched on its own: over a long part a tube may have
+no positive width, so that no bisection would be better than another."""
 ASSUMPTIONS = (
     "The equations hold in real numbers: the loop is continuous, and its parameters are the stored"
     " double-precision numbers.",
@@ -135,6 +135,7 @@ class _Chain:
         """Number of terms of V."""
         return len(self.observed) + sum(self.observed)
 
+    @jax.enable_x64(True)
     def constants(self, weight: float, level: float) -> list[np.ndarray]:
         """The constants of a weight and a level.
 
@@ -149,32 +150,31 @@ class _Chain:
         weight = checks.positive_number("weight", weight, "1")
         level = checks.positive_number("level", level, "energy")
         self._check_level(level)
-        with jax.enable_x64(True):
-            weights = weight * self._scales_of_weights()
+        weights = weight * self._scales_of_weights()
         numbers = Constants(
             self.parts,
             self.scenario.plant,
             self.scenario.disturbance,
             self.uncertain.numbers,
-            weights,
-            np.asarray(level),
+            jnp.asarray(weights),
+            jnp.asarray(level),
         )
         return [np.asarray(x, float) for x in jax.tree.leaves(numbers)]
 
     def _check_level(self, level: float) -> None:
         """Raises ValueError if the level set reaches the guard of the first barrier."""
-        barrier = self.scenario.controller.barriers[0]
+        law: Any = self.scenario.controller
+        barrier = law.barriers[0]
         if isinstance(barrier, Quadratic):
             return
-        with jax.enable_x64(True):
-            times = jnp.linspace(0.0, self.duration, INSTANTS)
-            value = level / self.parts.law.weights[0] * jnp.ones(1)
+        times = jnp.linspace(0.0, self.duration, INSTANTS)
+        value = level / self.parts.law.weights[0] * jnp.ones(1)
 
-            def reached(t: jax.Array) -> jax.Array:
-                tube = tube_at(self.parts.reference, self.scenario.bounds, t, acceleration=False)
-                return barrier.xi_bound(value, tube)
+        def reached(t: jax.Array) -> jax.Array:
+            tube = tube_at(self.parts.reference, self.scenario.bounds, t, acceleration=False)
+            return barrier.xi_bound(value, tube)  # type: ignore[no-any-return]
 
-            xi = float(jnp.max(jax.vmap(reached)(times)))
+        xi = float(jnp.max(jax.vmap(reached)(times)))
         if xi < 1.0 - barrier.guard:
             return
         expected = f"a level inside the guard of the first barrier, |xi| < {1.0 - barrier.guard:g}"
@@ -228,7 +228,7 @@ class _Chain:
         """The scenario whose run starts at a point, with its parameters and moved in time."""
         state = self.state_of(point, constants)
         scenario = paths.with_parameters(self.scenario, state.parameters)
-        bounds = [
+        bounds: list[Any] = [
             None
             if side is None
             else dataclasses.replace(
@@ -256,7 +256,7 @@ def _slope_at_centre(parts: ChainParts, i: int) -> jax.Array:
     tube = Tube(zero, zero, -one, one, zero, zero)
     bounds = parts.bounds[i]
     if bounds is not None:
-        lower, upper = bounds.lower.at(0.0, zero), bounds.upper.at(0.0, zero)
+        lower, upper = (side.at(jnp.zeros(()), zero) for side in (bounds.lower, bounds.upper))
         half = 0.5 * (upper - lower) * one
         tube = Tube(zero, zero, -half, half, zero, zero)
     return chain_motion.along(lambda e: parts.law.barriers[i].slope(tube, e), (zero,), (one,))
@@ -287,22 +287,25 @@ def chain_problem(
         length, is_period = _time_interval(scenario, duration)
         parts = _parts_of(scenario)
         uncertain = uncertain_coordinates(scenario, parameters, None)
+        zero = jnp.zeros(())
         numbers = Constants(
-            parts, scenario.plant, scenario.disturbance, uncertain.numbers, 0.0, 0.0
+            parts, scenario.plant, scenario.disturbance, uncertain.numbers, zero, zero
         )
         structure = jax.tree.structure(numbers)
     observed = tuple(bool(gain > 0.0) for gain in np.asarray(parts.kappa)[:, 0])
     chain = _Chain(scenario, parts, uncertain, observed, structure, length)
     names, lower, upper = _coordinates(observed, length, uncertain)
     order = len(observed)
+    function: Any = ChainBound(structure, uncertain.places, observed)
+    point_rate: Any = ChainRate(structure, uncertain.places, observed)
     return LevelSetProblem(
         names=names,
         lower=lower,
         upper=upper,
         patterns=_patterns(order, length),
-        bound=ChainBound(structure, uncertain.places, observed),
+        bound=function,
         constants=chain.constants,
-        point_rate=ChainRate(structure, uncertain.places, observed),
+        point_rate=point_rate,
         sample=chain.sample,
         state_of=chain.state_of,  # type: ignore[arg-type]
         scenario_at=chain.scenario_at,
@@ -345,7 +348,8 @@ def _patterns(order: int, duration: float) -> np.ndarray:
 
 def _parts_of(scenario: Scenario) -> ChainParts:
     """The parts of V', with barriers without a guard."""
-    law = copy.copy(scenario.controller)
+    law: Any = copy.copy(scenario.controller)
+    guards = [[0.0 if isinstance(x, Quadratic) else x.guard] for x in law.barriers]
     barriers = []
     for barrier in law.barriers:
         free = copy.copy(barrier)
@@ -361,7 +365,6 @@ def _parts_of(scenario: Scenario) -> ChainParts:
     context = scenario.context
     bounds = tuple(context.level_bounds(i + 1) for i in range(order))
     model = as_at(scenario.model, jnp.zeros(()))
-    guards = [[0.0 if isinstance(x, Quadratic) else x.guard] for x in scenario.controller.barriers]
     return ChainParts(
         model, law, _rows(gain, order), scenario.reference, bounds, jnp.asarray(guards)
     )
@@ -424,7 +427,8 @@ def _check_plant(scenario: Scenario) -> None:
         if plants.nominal_of(part) is not part or jnp.size(jump_times_of(name, part)):
             reason = "The plant changes during the run."
             raise _unsupported(name, kind, "a plant that does not change", reason)
-    if jax.tree.structure(scenario.plant) != jax.tree.structure(scenario.model):
+    structures = [jax.tree.structure(part) for part in (scenario.plant, scenario.model)]
+    if structures[0] != structures[1]:
         reason = "The difference of their parameters is what the proof is about."
         expected = f"a plant of the structure of {type(scenario.plant).__name__}"
         raise _unsupported("model", type(scenario.model).__name__, expected, reason)

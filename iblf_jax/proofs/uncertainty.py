@@ -135,12 +135,10 @@ def fixed_difference(places: Places, numbers: Numbers, nominal: Any, model: Any)
 
 
 def difference(places: Places, numbers: Numbers, nominal: Any, model: Any, z: jax.Array) -> Any:
-    """p - p0 of (U.1) at coordinates z, (m,), a pytree as the model's parameters."""
+    """P - p0 of (U.1) at coordinates z, (m,), a pytree as the model's parameters."""
     new: dict[Place, jax.Array] = {}
     for place in places.differing:
-        new[place] = _entry(jax.tree.leaves(nominal), place) - _entry(
-            jax.tree.leaves(model), place
-        )
+        new[place] = _entry(jax.tree.leaves(nominal), place) - _entry(jax.tree.leaves(model), place)
     at_reference = values_at(places, numbers, numbers.reference)
     for k, entries in enumerate(places.entries):
         away = z[k] - numbers.reference[k]

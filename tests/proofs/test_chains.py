@@ -14,13 +14,13 @@ import pytest
 
 import iblf_jax as ij
 from iblf_jax import barriers, controllers, disturbances, observers
-from iblf_jax.bounds import Bounds, Constant, Sinusoid
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.kernels.enclosure import enclose
 from iblf_jax.proofs.chains import chain_problem
 from iblf_jax.proofs.search import search
-from iblf_jax.references import Sinusoid as SinusoidalReference
 from iblf_jax.simulation import closed_loop, levels
+from iblf_jax.world.bounds import Bounds, Constant, Sinusoid
+from iblf_jax.world.references import Sinusoid as SinusoidalReference
 
 Mapping, Quadratic, Integral = barriers.Mapping, barriers.Quadratic, barriers.Integral
 
@@ -57,7 +57,9 @@ def lever(*law_barriers, kappa=(0.0, 40.0), **fields) -> ij.Scenario:
     scenario = ij.Scenario(
         plant=Lever(J=1.2, b=0.3, m=2.0),
         reference=SinusoidalReference(offset=0.1, amplitude=0.4, frequency=1.0),
-        bounds=Bounds(lower=Constant(-0.8), upper=Sinusoid(offset=0.9, amplitude=0.1, frequency=2.0)),
+        bounds=Bounds(
+            lower=Constant(-0.8), upper=Sinusoid(offset=0.9, amplitude=0.1, frequency=2.0)
+        ),
         state_bounds=(Bounds(lower=Constant(-2.0), upper=Constant(2.5)),),
         disturbance=disturbances.Levels((None, disturbances.Sinusoids(0.3, 2.0))),
         controller=law,
@@ -228,9 +230,7 @@ REFUSED = {
     "n": (ij.presets.vessel, "one number per level"),
     "a robot inside": (ij.presets.motor_driven_two_link, "without a robot inside"),
     "filters": (
-        lambda: lever(
-            controller=controllers.BarrierBackstepping(k=(2.0, 8.0), filter=0.01)
-        ),
+        lambda: lever(controller=controllers.BarrierBackstepping(k=(2.0, 8.0), filter=0.01)),
         "exact derivatives",
     ),
     "an observer of another kind": (

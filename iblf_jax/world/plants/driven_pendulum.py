@@ -45,9 +45,7 @@ class DrivenPendulum:
 
     def drift(self, t: jax.Array, x: jax.Array) -> jax.Array:
         """f, (3, 1): 0, -(B x2 + N sin x1)/D, -(H x3 + Km x2)/M."""
-        return jnp.stack(
-            [jnp.zeros_like(x[0]), -self._load(x) / self.D, -self._drop(x) / self.M]
-        )
+        return jnp.stack([jnp.zeros_like(x[0]), -self._load(x) / self.D, -self._drop(x) / self.M])
 
     def gain(self, t: jax.Array, x: jax.Array) -> jax.Array:
         """The diagonals of G, (3, 1): 1, 1/D, 1/M."""
