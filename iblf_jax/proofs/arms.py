@@ -122,7 +122,7 @@ class _Arm:
 
     scenario: Scenario
     parts: ArmParts
-    uncertain: _Uncertain
+    uncertain: Uncertain
     function: ArmBound
     point_rate: ArmRate
     duration: float
@@ -209,7 +209,7 @@ class _Arm:
         )
 
 
-class _Uncertain(NamedTuple):
+class Uncertain(NamedTuple):
     """The uncertain coordinates of a problem."""
 
     places: Places
@@ -229,6 +229,11 @@ class _Uncertain(NamedTuple):
                 base, slope = float(self.numbers.base[k][i]), float(self.numbers.slope[k][i])
                 found[name] = base + slope * float(z[k])
         return found
+
+    def scales(self) -> dict[str, tuple[float, float]]:
+        """Path of each uncertain entry -> its least and its greatest value."""
+        low, high = self.values(self.low), self.values(self.high)
+        return {name: tuple(sorted((low[name], high[name]))) for name in low}
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -289,20 +294,15 @@ def arm_problem(
         sample=arm.sample,
         state_of=arm.state_of,
         scenario_at=arm.scenario_at,
-        scales=_scales(uncertain),
+        scales=uncertain.scales(),
         duration=length,
         is_period=is_period,
         assumptions=ASSUMPTIONS,
     )
 
 
-def _scales(uncertain: _Uncertain) -> dict[str, tuple[float, float]]:
-    low, high = uncertain.values(uncertain.low), uncertain.values(uncertain.high)
-    return {name: tuple(sorted((low[name], high[name]))) for name in low}
-
-
 def _coordinates(
-    n: int, duration: float, uncertain: _Uncertain
+    n: int, duration: float, uncertain: Uncertain
 ) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
     """Names and ends of the coordinates; ends of angles are rounded outward."""
     right, full = np.nextafter(0.5 * math.pi, 2.0), np.nextafter(2.0 * math.pi, 7.0)
@@ -464,7 +464,7 @@ def _check_tube(scenario: Scenario, duration: float) -> None:
     )
 
 
-def _check_mass_matrices(parts: ArmParts, uncertain: _Uncertain) -> None:
+def _check_mass_matrices(parts: ArmParts, uncertain: Uncertain) -> None:
     """Raises ValueError if a mass matrix of the box of parameters is not positive definite."""
     n = parts.kf.shape[0]
     generator = np.random.default_rng(0)
@@ -486,7 +486,7 @@ def _check_mass_matrices(parts: ArmParts, uncertain: _Uncertain) -> None:
 
 def uncertain_coordinates(
     scenario: Scenario, parameters: Mapping[str, Perturbation], disturbance_rate: Any
-) -> _Uncertain:
+) -> Uncertain:
     """The coordinates of parameters that a user gives.
 
     Raises:
@@ -528,7 +528,7 @@ def uncertain_coordinates(
     labels += [f"disturbance_rate[{i}]" for i in range(len(rates))]
     numbers = Numbers(tuple(bases), tuple(slopes), jnp.asarray(references, float))
     places = Places(tuple(entries), _differing(scenario), len(rates))
-    return _Uncertain(
+    return Uncertain(
         places, numbers, np.array(low, float), np.array(high, float), tuple(labels), tuple(names)
     )
 

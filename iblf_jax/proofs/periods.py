@@ -75,6 +75,11 @@ def _frequencies(name: str, part: Any) -> Iterator[float]:
         for i, inner in enumerate(part.parts):
             yield from _frequencies(f"{name}.parts[{i}]", inner)
         return
+    if isinstance(part, disturbances.Levels):
+        for i, inner in enumerate(part.parts):
+            if inner is not None:
+                yield from _frequencies(f"{name}.parts[{i}]", inner)
+        return
     if isinstance(part, CONSTANT):
         return
     if type(part) not in FREQUENCIES:
@@ -90,6 +95,9 @@ def shifted(part: Any, t: jax.Array | float) -> Any:
     """A part of `period_of` as it is t [s] later: part at time s is the result at time s - t."""
     if isinstance(part, disturbances.Sum):
         return disturbances.Sum(tuple(shifted(inner, t) for inner in part.parts))
+    if isinstance(part, disturbances.Levels):
+        moved = [None if inner is None else shifted(inner, t) for inner in part.parts]
+        return disturbances.Levels(tuple(moved))
     if isinstance(part, CONSTANT):
         return part
     if type(part) not in FREQUENCIES:

@@ -132,3 +132,20 @@ def fixed_difference(places: Places, numbers: Numbers, nominal: Any, model: Any)
             end = _entry(jax.tree.leaves(nominal), place)
         new[place] = end - _entry(known, place)
     return _direction(model, new)
+
+
+def difference(places: Places, numbers: Numbers, nominal: Any, model: Any, z: jax.Array) -> Any:
+    """P - p0 of (U.1) at coordinates z, (m,), a pytree as the model's parameters."""
+    new: dict[Place, jax.Array] = {}
+    for place in places.differing:
+        new[place] = _entry(jax.tree.leaves(nominal), place) - _entry(jax.tree.leaves(model), place)
+    at_reference = values_at(places, numbers, numbers.reference)
+    for k, entries in enumerate(places.entries):
+        away = z[k] - numbers.reference[k]
+        for i, place in enumerate(entries):
+            new[place] = numbers.slope[k][i] * away
+            if place in places.differing:
+                new[place] = new[place] + (
+                    at_reference[place] - _entry(jax.tree.leaves(model), place)
+                )
+    return _direction(model, new)
