@@ -28,12 +28,14 @@ from iblf_jax.core.status import Status
 from iblf_jax.engine.simulate import SimulationWarning, simulate
 from iblf_jax.kernels.enclosure import enclose
 from iblf_jax.proofs.arms import arm_problem
+from iblf_jax.proofs.chains import chain_problem
 from iblf_jax.proofs.problem import LevelSetProblem
 from iblf_jax.proofs.result import GrowthPoint, Proof, Verdict, Violation, WorstBox
 from iblf_jax.proofs.search import SearchResult, search
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.distributions import Perturbation
+from iblf_jax.world import plants
 
 POINTS = 2048
 """Points of the level set at which V_w' is computed together."""
@@ -47,6 +49,8 @@ WEIGHTS_PER_DECADE = 4
 LEAST_RATIO, GREATEST_RATIO = 0.25, 1e3
 """Ends of the grid of weights, in parts of 1/(K2 kf). Below 1/(4 K2 kf), V_w' > 0 for an estimation
 error along e2 even without an error of the parameters."""
+LEAST_CHAIN_WEIGHT, GREATEST_CHAIN_WEIGHT = 1e-2, 1e2
+"""Ends of the grid for a plant in strict-feedback form, whose weight has no unit."""
 REFINEMENTS = (0.75, 1.33)
 """Factors of the best weight that are tried as well."""
 TRIAL_BOXES = 1_000_000
@@ -100,12 +104,15 @@ def prove(
     is rigorous for real-number equations: bounds are rounded outward.
 
     Args:
-      scenario: the loop, with the corrected backstepping law and the momentum observer.
+      scenario: the loop of a robot with the corrected backstepping law and the momentum observer,
+        or of a plant in strict-feedback form of order 2 or 3 with one number per level and the law
+        `BarrierBackstepping`.
       level: level c of V_w, in its unit, N m rad for robots.
       parameters: path -> `factor`, `offset` or `value` of an `interval`, such as
         {"plant.mass": ij.factor(ij.interval(0.97, 1.03))}; paths joined by commas vary together;
         {} for the plant as given.
-      weight: w [rad/(N m)]; searched if not given.
+      weight: w [rad/(N m)], without unit for a plant in strict-feedback form; searched if not
+        given.
       duration: length of the time interval from t = 0 on [s]; a period of the scenario if not
         given.
       disturbance_rate: bound of the rate of a further disturbance, () or (n,) [N m/s]; none if not
@@ -219,21 +226,32 @@ def problem_of(
     Raises:
       ValueError: it is not supported; the message says why.
     """
-    return arm_problem(scenario, parameters, duration=duration, disturbance_rate=disturbance_rate)
+    if not (isinstance(scenario, Scenario) and plants.is_chain(scenario.plant)):
+        return arm_problem(
+            scenario, parameters, duration=duration, disturbance_rate=disturbance_rate
+        )
+    if disturbance_rate is not None:
+        remedy = "Add a disturbance with an uncertain parameter to the scenario."
+        raise checks.fail("disturbance_rate", disturbance_rate, "None for such a plant", remedy)
+    return chain_problem(scenario, parameters, duration=duration)
 
 
 def weights_of(scenario: Scenario, weight: float | None) -> list[float]:
     """The weights that are tried."""
     if weight is not None:
         return [float(weight)]
+    if plants.is_chain(scenario.plant):
+        return _grid(LEAST_CHAIN_WEIGHT, GREATEST_CHAIN_WEIGHT)
     law: Any = scenario.controller
     observer: Any = scenario.observer
-    least_gain = float(np.min(np.asarray(law.K2)))
-    least_rate = float(np.min(np.asarray(observer.kf)))
-    scale = 1.0 / (least_gain * least_rate)
-    decades = math.log10(GREATEST_RATIO / LEAST_RATIO)
-    count = 1 + math.ceil(decades * WEIGHTS_PER_DECADE)
-    return list(scale * np.geomspace(LEAST_RATIO, GREATEST_RATIO, count))
+    scale = 1.0 / float(np.min(np.asarray(law.K2)) * np.min(np.asarray(observer.kf)))
+    return _grid(LEAST_RATIO * scale, GREATEST_RATIO * scale)
+
+
+def _grid(low: float, high: float) -> list[float]:
+    """Numbers between two ends, equally spaced on a logarithmic scale."""
+    count = 1 + math.ceil(math.log10(high / low) * WEIGHTS_PER_DECADE)
+    return np.geomspace(low, high, count).tolist()
 
 
 # --- points of the level set ---------------------------------------------------------------------

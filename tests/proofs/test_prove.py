@@ -8,6 +8,8 @@ import math
 import numpy as np
 import pytest
 from proof_cases import MASS, pendulum, within
+from test_chains import lever
+from test_chains import within as lever_within
 
 import iblf_jax as ij
 from iblf_jax.cli import main
@@ -240,12 +242,21 @@ def test_gains_for_a_guarantee_are_proved():
         {"controller.K2": (1.0, 40.0), "observer.kf": (10.0, 100.0)},
         level=LEVEL,
         parameters=within(20.0),
-        tries=20,
+        tries=60,
         progress=False,
     )
     assert found.rate_before > 0.0 > found.rate
     assert found.proof.proved
     assert set(found.gains) == {"controller.K2", "observer.kf"}
+
+
+def test_a_plant_in_strict_feedback_form_is_proved():
+    found = ij.prove(
+        lever(), level=0.1, parameters=lever_within(0.01, "J"), weight=0.5, progress=False
+    )
+    assert found.proved
+    assert largest_rate(found, 10_000) < 0.0
+    assert contradictions(found, 2) == 0
 
 
 @pytest.mark.release
