@@ -71,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
     names = ("weight", "duration", "disturbance_rate", "threads", "checkpoint", "seed")
     options: dict[str, Any] = given_options(args, *names)
     if args.max_boxes is not None:
-        options["max_boxes"] = _whole(args.max_boxes)
+        options["max_boxes"] = _integer(args.max_boxes)
     found = prove(
         scenario_of(args).scenario,
         level=args.level,
@@ -85,7 +85,7 @@ def run(args: argparse.Namespace) -> int:
     return int(not found.proved)
 
 
-def _whole(number: float) -> int:
+def _integer(number: float) -> int:
     from iblf_jax.core import checks
 
     if not number.is_integer():

@@ -37,6 +37,7 @@ from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.world import plants
 
+EXAMPLE = '{"plant.mass": ij.factor(ij.interval(0.97, 1.03))}'
 POINTS = 2048
 """Points of the level set at which V_w' is computed together."""
 PARENTS = 32
@@ -135,8 +136,9 @@ def prove(
       R. B. Kearfott, M. J. Cloud, Introduction to Interval Analysis, 2009.
     """
     options = _Options.of(weight, max_boxes, threads, progress, checkpoint, runs, seed)
-    problem = problem_of(scenario, parameters, duration, disturbance_rate)
     level = checks.positive_number("level", level, "the unit of V_w")
+    checks.mapping("parameters", parameters, EXAMPLE)
+    problem = problem_of(scenario, parameters, duration, disturbance_rate)
     with jax.enable_x64(True):
         return _decided(canonical(scenario), problem, dict(parameters), level, weight, options)
 

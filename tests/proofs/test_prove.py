@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 from proof_cases import MASS, pendulum, within
-from test_chains import lever
+from test_chains import LEVER, lever
 from test_chains import within as lever_within
 
 import iblf_jax as ij
@@ -252,7 +252,7 @@ def test_gains_for_a_guarantee_are_proved():
 
 def test_a_plant_in_strict_feedback_form_is_proved():
     found = ij.prove(
-        lever(), level=0.1, parameters=lever_within(0.01, "J"), weight=0.5, progress=False
+        lever(), level=0.3, parameters=lever_within(0.05, *LEVER), weight=0.56, progress=False
     )
     assert found.proved
     assert largest_rate(found, 10_000) < 0.0
