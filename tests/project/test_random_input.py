@@ -502,6 +502,7 @@ def no_runs(monkeypatch):
         "tuning._falsify._margins",
         "engine.explain.instructions",
         "certificates._certify._certificate_of",
+        "proofs._prove.problem_of",
     ):
         monkeypatch.setattr(f"iblf_jax.{place}", entered)
     by_scan = ExecutionPlan((), PLAIN_LAYOUT, PLAIN_LAYOUT, True)

@@ -250,6 +250,7 @@ def test_gains_for_a_guarantee_are_proved():
     assert set(found.gains) == {"controller.K2", "observer.kf"}
 
 
+@pytest.mark.release  # a program of its own
 def test_a_plant_in_strict_feedback_form_is_proved():
     found = ij.prove(
         lever(), level=0.3, parameters=lever_within(0.05, *LEVER), weight=0.56, progress=False
