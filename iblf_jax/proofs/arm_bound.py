@@ -169,7 +169,7 @@ class MismatchRate(NamedTuple):
 
 
 def mismatch(constants: Constants, places: Places, at: Errors, z: jax.Array) -> Mismatch:
-    """f' over a box of parameters; see the head of this module."""
+    """F' over a box of parameters; see the head of this module."""
     parts, numbers = constants.parts, constants.numbers
     n = at.xi.shape[-1]
     nominal = (parts.plant, parts.disturbance)
@@ -213,8 +213,7 @@ def mismatch(constants: Constants, places: Places, at: Errors, z: jax.Array) -> 
         return add(with_slow, on_columns(lambda force: -matvec(fast, force), found.force))
 
     columns = [
-        torque_column(column, share)
-        for column, share in zip(found.columns, shares, strict=True)
+        torque_column(column, share) for column, share in zip(found.columns, shares, strict=True)
     ]
     # The rate of a further disturbance is a coordinate without entries.
     columns += [Affine(-unit, jnp.zeros((n, n))) for unit in jnp.eye(n)[: places.rates]]
@@ -236,7 +235,7 @@ def mismatch(constants: Constants, places: Places, at: Errors, z: jax.Array) -> 
 
 
 def corners(constants: Constants, found: Mismatch, z: jax.Array) -> list[Affine]:
-    """f' at each corner of the box of parameters."""
+    """F' at each corner of the box of parameters."""
     size = z - constants.numbers.reference
     ends = [(lower(size[k]), upper(size[k])) for k in range(len(found.columns))]
     vertices = []
@@ -335,9 +334,9 @@ def arm_bound(places: Places, n: int, x: jax.Array, constants: Constants) -> jax
 def _squares(constants: Constants, a: jax.Array, b: jax.Array, terms: list[Corner]) -> jax.Array:
     """A bound of (B.1) without its decay from completed squares, ().
 
-        -K a^2 + a b + w_f |f0| b - w_f lambda b^2
-            = -K (a - b/(2K))^2 - mu (b - w_f |f0|/(2 mu))^2 + (w_f |f0|)^2/(4 mu),
-        mu = w_f lambda - 1/(4K),   K = min K2,   a = |e2|
+    -K a^2 + a b + w_f |f0| b - w_f lambda b^2
+        = -K (a - b/(2K))^2 - mu (b - w_f |f0|/(2 mu))^2 + (w_f |f0|)^2/(4 mu),
+    mu = w_f lambda - 1/(4K),   K = min K2,   a = |e2|
     """
     K = jnp.min(constants.parts.law.K2)
     bounds = []

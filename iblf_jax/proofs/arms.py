@@ -311,7 +311,7 @@ def _coordinates(
     if n > 1:
         phi[-1] = full
     psi = right if n > 1 else 2.0 * right
-    upper = [np.nextafter(duration, np.inf), *[right] * n, psi, *phi]
+    upper = [duration * (1.0 + 1e-12), *[right] * n, psi, *phi]
     names += [*uncertain.names, *(f"side[{i}]" for i in range(n))]
     return (
         tuple(names),
@@ -507,7 +507,7 @@ def uncertain_coordinates(
     for group, perturbation in parameters.items():
         for together in _entries_together(scenario, str(group), perturbation):
             values = [float(np.asarray(paths.get(scenario, path))) for path in together]
-            ends = _ends(perturbation, together[0], str(group), scenario)
+            ends = _ends(scenario, str(group), together[0], perturbation)
             base, slope, reference = _line(perturbation.kind, values)
             entries.append(tuple(index[path] for path in together))
             bases.append(jnp.asarray(base))
@@ -573,17 +573,13 @@ def _entries_together(
 
 
 def _ends(
-    perturbation: Perturbation, entry: str, group: str, scenario: Scenario
+    scenario: Scenario, group: str, entry: str, perturbation: Perturbation
 ) -> tuple[float, float]:
     """The ends of z for an entry of a path."""
     first = group.split(",")[0].strip()
     shape = np.shape(paths.get(scenario, first))
     k = _entries_of(scenario, first).index(entry)
     low, high = (np.broadcast_to(x, shape).ravel()[k] for x in perturbation.distribution.support())
-    if not (np.isfinite(low) and np.isfinite(high)):
-        raise checks.fail(
-            f"parameters[{group!r}]", (float(low), float(high)), "a bounded interval"
-        )
     return float(low), float(high)
 
 

@@ -13,7 +13,6 @@ import jax.numpy as jnp
 
 from iblf_jax.core.linalg import matmul
 
-
 Factor = dict[tuple[int, int], jax.Array]
 """U of M = U U^T: the entries (i, j) with i <= j."""
 
@@ -131,7 +130,7 @@ def norm(vector: jax.Array) -> jax.Array:
 def sphere(angles: list[jax.Array]) -> list[jax.Array]:
     """The point of the unit sphere with m spherical angles, m + 1 coordinates.
 
-        (cos a_1, sin a_1 cos a_2, ..., sin a_1 ... sin a_m)
+    (cos a_1, sin a_1 cos a_2, ..., sin a_1 ... sin a_m)
     """
     coordinates = []
     rest = None
@@ -152,5 +151,3 @@ __all__ = [
     "sphere",
     "upper_factor",
 ]
-
-
