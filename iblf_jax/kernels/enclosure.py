@@ -38,34 +38,8 @@ FLAGS = ("-frounding-math",)
 """Flags of the compiler, after those of all kernels. A product and a sum that become one operation
 are rounded once, which is upward, too."""
 FUNCTIONS = frozenset(
-    [
-        "add",
-        "sub",
-        "neg",
-        "abs",
-        "max",
-        "min",
-        "div",
-        "sqrt",
-        "rsqrt",
-        "sign",
-        "sin",
-        "cos",
-        "tan",
-        "exp",
-        "expm1",
-        "log",
-        "log1p",
-        "atan",
-        "sinh",
-        "cosh",
-        "tanh",
-        "logistic",
-        "upper",
-        "lower",
-        "hull",
-        "meet",
-    ]
+    "add sub neg abs max min div sqrt rsqrt sign sin cos tan exp expm1 log log1p atan sinh cosh tanh"
+    " logistic upper lower hull meet".split()
 )
 """Operations on intervals that `c/interval.h` has as `i_<name>`."""
 COMPARISONS = frozenset({"lt", "le", "gt", "ge", "eq", "ne"})
@@ -104,7 +78,9 @@ class Compiled(NamedTuple):
 
 
 @CACHES.function(maxsize=64)
-def compiled(function: Callable, dimension: int, shapes: tuple[tuple[int, ...], ...]) -> Compiled:
+def compiled(
+    function: Callable, dimension: int, shapes: tuple[tuple[int, ...], ...]
+) -> Compiled:
     """The program of a function on intervals, and its C++ source.
 
     Args:
@@ -118,9 +94,9 @@ def compiled(function: Callable, dimension: int, shapes: tuple[tuple[int, ...], 
     """
     structs = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in shapes]
     with jax.enable_x64(True):
-        jaxpr, out = jax.make_jaxpr(
-            lambda x, c: jax.tree.leaves(function(x, c)), return_shape=True
-        )(jax.ShapeDtypeStruct((dimension,), jnp.float64), structs)
+        jaxpr, out = jax.make_jaxpr(lambda x, c: jax.tree.leaves(function(x, c)), return_shape=True)(
+            jax.ShapeDtypeStruct((dimension,), jnp.float64), structs
+        )
     b = Builder(np.float64, sparse=True, exact=True)
     x = np.asarray([b.input("carry", i, "f") for i in range(dimension)], np.int64)
     operands = [x]
@@ -464,7 +440,9 @@ class Kernel(NamedTuple):
     compiled: Compiled
 
 
-def kernel_of(function: Callable, dimension: int, constants: Sequence[Any]) -> Kernel:
+def kernel_of(
+    function: Callable, dimension: int, constants: Sequence[Any]
+) -> Kernel:
     """The kernel of a function.
 
     Args:

@@ -1,7 +1,7 @@
 """Upper bounds of V_w' of a rigid arm over boxes of the level set V_w = c.
 
-**Coordinates.**  x = (t, theta_1..theta_n, psi, phi_1..phi_{n-1}, z_1..z_m, sign_1..sign_n).  Angles
-divide the level among the barriers, the velocity error and f_tilde:
+**Coordinates.**  x = (t, theta_1..theta_n, psi, phi_1..phi_{n-1}, z_1..z_m, sign_1..sign_n).
+Angles divide the level among the barriers, the velocity error and f_tilde:
 
     sqrt(w_i V1_i) = sqrt(c) sphere(theta)_i,   R = c sphere(theta)_{n+1}^2
     U^T e2 = sqrt(2R) cos(psi) sphere(phi),   M0 = U U^T,   sqrt(w_f) |f_tilde| = sqrt(2R) sin(psi)

@@ -10,7 +10,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +23,7 @@ from iblf_jax.control.decays._base import decay_member
 from iblf_jax.core import checks
 from iblf_jax.core.linalg import matvec
 from iblf_jax.core.pytree import astype
-from iblf_jax.core.time import as_at
+from iblf_jax.core.time import as_at, jump_times_of
 from iblf_jax.proofs import arm_motion, uncertainty
 from iblf_jax.proofs.arm_bound import Constants, arm_bound
 from iblf_jax.proofs.arm_motion import ArmParts, Errors, position
@@ -53,7 +53,8 @@ MOST_CORNERS = 6
 """Largest number of uncertain coordinates: a bound has 2^m corners."""
 
 
-class ArmBound(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class ArmBound:
     """The bound of arms of one structure, as a hashable function."""
 
     structure: Any
@@ -66,7 +67,8 @@ class ArmBound(NamedTuple):
         return arm_bound(self.places, self.n, x, numbers), jnp.zeros((0,))
 
 
-class ArmRate(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class ArmRate:
     """V_w' at a point of arms of one structure, as a hashable function."""
 
     structure: Any
@@ -189,11 +191,16 @@ class _Arm:
             f_hat = arm_motion.mismatch_torque(parts, now) - found.f_tilde
             eta = f_hat - parts.kf * matvec(parts.model.mass_matrix(now.q), now.v)
             z = np.asarray(point)[1 + 3 * self.scenario.n :]
+            rates = self.function.places.rates
             return LevelState(
-                float(errors.t),
-                *map(np.asarray, (now.q, now.v, found.f_tilde, f_hat, eta)),
-                self.uncertain.values(z),
-                np.broadcast_to(np.asarray(found.rate), (self.function.places.rates,)),
+                t=float(errors.t),
+                q=np.asarray(now.q),
+                dq=np.asarray(now.v),
+                f_tilde=np.asarray(found.f_tilde),
+                f_hat=np.asarray(f_hat),
+                eta=np.asarray(eta),
+                parameters=self.uncertain.values(z),
+                rate=np.broadcast_to(np.asarray(found.rate), (rates,)),
             )
 
     def scenario_at(self, point: Any, constants: Any) -> Scenario:
@@ -209,7 +216,8 @@ class _Arm:
             bounds, lower=shifted(bounds.lower, state.t), upper=shifted(bounds.upper, state.t)
         )
         initial = dataclasses.replace(scenario.initial, q=state.q, dq=state.dq)
-        observer = dataclasses.replace(scenario.observer, eta0=state.eta, start="zero")
+        observer: Any = scenario.observer
+        observer = dataclasses.replace(observer, eta0=state.eta, start="zero")
         return dataclasses.replace(
             scenario,
             initial=initial,
@@ -271,7 +279,8 @@ def arm_problem(
         uncertain = uncertain_coordinates(scenario, parameters, disturbance_rate)
         _check_tube(scenario, length)
         _check_mass_matrices(parts, uncertain)
-        structure = jax.tree.structure(Constants(parts, uncertain.numbers, 0.0, 0.0))
+        zero = jnp.zeros(())
+        structure = jax.tree.structure(Constants(parts, uncertain.numbers, zero, zero))
     n = scenario.n
     function = ArmBound(structure, uncertain.places, n)
     point_rate = ArmRate(structure, uncertain.places, n)
@@ -297,7 +306,7 @@ def arm_problem(
 
 def _scales(uncertain: _Uncertain) -> dict[str, tuple[float, float]]:
     low, high = uncertain.values(uncertain.low), uncertain.values(uncertain.high)
-    return {name: tuple(sorted((low[name], high[name]))) for name in low}
+    return {name: (min(low[name], high[name]), max(low[name], high[name])) for name in low}
 
 
 def _coordinates(
@@ -346,19 +355,14 @@ def _check_plant(scenario: Scenario) -> None:
         if plants.is_chain(part):
             reason = "This bound is that of rigid arms."
             raise _unsupported(name, type(part).__name__, "a robot", reason)
-        if jnp.size(_jumps(part)):
+        if jnp.size(jump_times_of(name, part)):
             reason = "A load that is picked up changes the plant during the run."
             raise _unsupported(name, type(part).__name__, "a robot that does not change", reason)
-    if jax.tree.structure(scenario.plant) != jax.tree.structure(scenario.model):
+    structures: list[Any] = [jax.tree.structure(x) for x in (scenario.plant, scenario.model)]
+    if structures[0] != structures[1]:
         reason = "The difference of their parameters is what the proof is about."
         expected = f"a robot of the structure of the plant, {type(scenario.plant).__name__}"
         raise _unsupported("model", type(scenario.model).__name__, expected, reason)
-
-
-def _jumps(part: Any) -> Any:
-    from iblf_jax.core.time import jump_times_of
-
-    return jump_times_of("plant", part)
 
 
 def _check_law(law: Any) -> None:
@@ -376,9 +380,13 @@ def _check_law(law: Any) -> None:
     zero, one = jnp.zeros(1), jnp.ones(1)
     tube = arm_motion.Tube(zero, zero, -one, one, zero, zero)
     known = barrier_member(barrier, "error_at")(zero, tube, zero > 0)
-    if known is None or barrier_member(barrier, "decay_rate")(one) is None:
+    claims = (
+        barrier_member(barrier, "decay_rate")(one),
+        barrier_member(barrier, "xi_bound")(one, tube),
+    )
+    if known is None or any(claim is None for claim in claims):
         reason = "The level set needs the error at which V1 has a value, in closed form."
-        expected = "a barrier with error_at and decay_rate"
+        expected = "a barrier with error_at, xi_bound and decay_rate"
         raise _unsupported("controller.barrier", type(barrier).__name__, expected, reason)
 
 
@@ -428,7 +436,8 @@ def _time_interval(scenario: Scenario, duration: float | None) -> tuple[float, b
 
 def _parts_of(scenario: Scenario) -> ArmParts:
     """The parts of V_w', with a barrier without a guard."""
-    law, barrier = copy.copy(scenario.controller), copy.copy(scenario.controller.barrier)
+    law: Any = copy.copy(scenario.controller)
+    barrier, observer = copy.copy(law.barrier), cast(Any, scenario.observer)
     # The constructor refuses such a guard: only inside the guard is the barrier evaluated.
     object.__setattr__(barrier, "guard", -math.inf)
     object.__setattr__(law, "barrier", barrier)
@@ -438,7 +447,7 @@ def _parts_of(scenario: Scenario) -> ArmParts:
         as_at(scenario.plant, zero),
         scenario.disturbance,
         law,
-        jnp.broadcast_to(scenario.observer.kf, (scenario.n,)),
+        jnp.broadcast_to(observer.kf, (scenario.n,)),
         scenario.reference,
         scenario.bounds,
     )

@@ -241,9 +241,7 @@ class _Results:
         try:
             with np.load(place) as file:
                 found = {name: file[name] for name in ("digest", "boxes", "done")}
-        except (
-            Exception
-        ) as error:  # incomplete, another kind of file, or one that begins like a zip
+        except Exception as error:  # incomplete, another kind of file, or one that begins like a zip
             remedy = (
                 f"It cannot be read ({type(error).__name__}: {error}): delete it or name another"
                 " file."
@@ -327,9 +325,7 @@ def _with_patterns(lower: Any, upper: Any, patterns: Any) -> tuple[np.ndarray, n
     rows = np.zeros((1, 0))
     if patterns is not None:
         rows = np.asarray(patterns, np.float64)
-    corners = [
-        np.broadcast_to(np.asarray(x, np.float64), (len(rows), len(x))) for x in (lower, upper)
-    ]
+    corners = [np.broadcast_to(np.asarray(x, np.float64), (len(rows), len(x))) for x in (lower, upper)]
     low, high = (np.concatenate([corner, rows], axis=1) for corner in corners)
     return low, high
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from fractions import Fraction
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +11,7 @@ import mpmath
 import numpy as np
 import pytest
 
+from iblf_jax.kernels import enclosure
 from iblf_jax.kernels.enclosure import enclose
 
 mpmath.mp.dps = 60
@@ -47,7 +49,7 @@ def intervals(rng, lowest: float, number: int) -> tuple[np.ndarray, np.ndarray]:
     centre = rng.choice([-1, 1], number) * 10.0 ** rng.uniform(-12, 2.5, number)
     if lowest > -math.inf:
         centre = lowest + np.abs(centre) + size
-    size[::7] = 0
+    size[:: 7] = 0
     special = np.array([0.0, -0.0, 1.0, np.pi, np.pi / 2, 3 * np.pi / 2, 1e5, 2.0**-1022, 1e-320])
     special = special[special > lowest]
     centre[: len(special)] = special

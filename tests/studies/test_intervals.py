@@ -24,7 +24,7 @@ def test_an_interval_has_ends_and_no_quantile():
 
 @pytest.mark.parametrize("ends", [(1.1, 0.9), (1.0, 1.0), (0.9, np.inf), (np.nan, 1.0)])
 def test_ends_that_are_no_interval_are_refused(ends):
-    with pytest.raises(ValueError, match="low < high|finite"):
+    with pytest.raises(ValueError, match=r"low < high|finite"):
         ij.interval(*ends)
 
 
