@@ -12,8 +12,8 @@ from __future__ import annotations
 import ctypes
 import math
 import sys
-from collections.abc import Callable, Sequence
-from fractions import Fraction
+from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import jax
@@ -38,8 +38,11 @@ FLAGS = ("-frounding-math",)
 """Flags of the compiler, after those of all kernels. A product and a sum that become one operation
 are rounded once, which is upward, too."""
 FUNCTIONS = frozenset(
-    "add sub neg abs max min div sqrt rsqrt sign sin cos tan exp expm1 log log1p atan sinh cosh tanh"
-    " logistic upper lower hull meet".split()
+    [
+        *("add", "sub", "neg", "abs", "max", "min", "div", "sqrt", "rsqrt", "sign"),
+        *("tan", "exp", "expm1", "log", "log1p", "atan", "sinh", "cosh", "tanh", "logistic"),
+        *("upper", "lower", "hull", "meet"),
+    ]
 )
 """Operations on intervals that `c/interval.h` has as `i_<name>`."""
 COMPARISONS = frozenset({"lt", "le", "gt", "ge", "eq", "ne"})
@@ -60,6 +63,11 @@ FORMS = {
     "reciprocal": ("several", "reciprocals_of({})"),
 }
 """Form of what depends on constants only -> the member of `shared_number` and its value."""
+SEEN = "const shared_number *table, const interval *x"
+"""What every function that evaluates boxes reads."""
+SEGMENT = 400
+"""Operations of a function; the time of a compiler grows faster than its length."""
+NOTHING: Mapping[int, str] = MappingProxyType({})
 LARGEST_POWER = 64
 """Integer exponents up to which a power is computed by products."""
 
@@ -78,9 +86,7 @@ class Compiled(NamedTuple):
 
 
 @CACHES.function(maxsize=64)
-def compiled(
-    function: Callable, dimension: int, shapes: tuple[tuple[int, ...], ...]
-) -> Compiled:
+def compiled(function: Callable, dimension: int, shapes: tuple[tuple[int, ...], ...]) -> Compiled:
     """The program of a function on intervals, and its C++ source.
 
     Args:
@@ -94,9 +100,9 @@ def compiled(
     """
     structs = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in shapes]
     with jax.enable_x64(True):
-        jaxpr, out = jax.make_jaxpr(lambda x, c: jax.tree.leaves(function(x, c)), return_shape=True)(
-            jax.ShapeDtypeStruct((dimension,), jnp.float64), structs
-        )
+        jaxpr, out = jax.make_jaxpr(
+            lambda x, c: jax.tree.leaves(function(x, c)), return_shape=True
+        )(jax.ShapeDtypeStruct((dimension,), jnp.float64), structs)
     b = Builder(np.float64, sparse=True, exact=True)
     x = np.asarray([b.input("carry", i, "f") for i in range(dimension)], np.int64)
     operands = [x]
@@ -169,8 +175,8 @@ class _Emitter:
             return "reciprocal"
         return "number"
 
-    def shared_numbers(self) -> list[str]:
-        """The statements that fill the table."""
+    def shared_numbers(self) -> str:
+        """The function that fills the table."""
         inputs = {
             i: self._place(node)
             for i, node in enumerate(self.nodes)
@@ -178,11 +184,11 @@ class _Emitter:
         }
         lines = [f"  interval v{i} = at(all_lanes(shared[{k}]));" for i, k in inputs.items()]
         names = {i: f"v{i}" for i in inputs}
-        lines += self.statements(names, sorted({i for _, i in self.table}))
+        lines += self.statements(names, needed(self.nodes, {i for _, i in self.table}, names))
         for (form, i), k in self.table.items():
             member, value = FORMS[form]
             lines.append(f"  table[{k}].{member} = {value.format(names[i])};")
-        return lines
+        return function("shared_numbers", "const real *shared, shared_number *table", lines)
 
     def _place(self, node: Node) -> int:
         """The position of an input or a literal among the numbers that the kernel receives."""
@@ -190,12 +196,23 @@ class _Emitter:
             return node.value
         return self.place[node.value.hex()]
 
-    def evaluation(self) -> list[str]:
-        """The statements that evaluate the outputs."""
+    def evaluation(self) -> str:
+        """The function `evaluate`, and those that it is divided into."""
         names = {i: self._in_table("number", i) for i, known in enumerate(self.is_shared) if known}
         names |= {i: f"x[{n.value}]" for i, n in enumerate(self.nodes) if n.op == "carry"}
-        lines = self.statements(names, self.outputs)
-        return lines + [f"  out[{k}] = {names[i]};" for k, i in enumerate(self.outputs)]
+        order = needed(self.nodes, self.outputs, names)
+        parts = [order[k : k + SEGMENT] for k in range(0, len(order), SEGMENT)]
+        memory = _Memory(self.nodes, self.outputs, parts)
+        functions = []
+        for k, part in enumerate(parts):
+            stored = memory.stored(part)
+            lines = self.statements(dict(names), part, stored)
+            functions.append(function(f"part_{k}", f"{SEEN}, shared_number *m", lines))
+            names |= stored
+        lines = [f"  shared_number m[{memory.size + 1}];"]
+        lines += [f"  part_{k}(table, x, m);" for k in range(len(parts))]
+        lines += [f"  out[{k}] = {names[i]};" for k, i in enumerate(self.outputs)]
+        return "\n".join([*functions, function("evaluate", f"{SEEN}, interval *out", lines)])
 
     def _in_table(self, form: str, i: int) -> str:
         """The C++ of an entry of the table; empty if there is none."""
@@ -212,25 +229,30 @@ class _Emitter:
             for a in self.nodes[i].args
         ]
 
-    def statements(self, names: dict[int, str], outputs: Sequence[int]) -> list[str]:
-        """The statements of the outputs and of what they depend on; new names are added."""
+    def statements(
+        self, names: dict[int, str], nodes: Sequence[int], stored: Mapping[int, str] = NOTHING
+    ) -> list[str]:
+        """The statements of nodes, of which some are stored at places; new names are added."""
         lines = []
-        waiting = needed(self.nodes, outputs, names)
-        for i in waiting:
+        for i in nodes:
             node = self.nodes[i]
-            if i in names:
-                continue
-            if node.op not in ("sin", "cos"):
+            if i not in names and node.op in ("sin", "cos"):
+                lines.append(self._sine_and_cosine(i, nodes, names))
+            if i not in names:
                 lines.append(f"  {_type(node)} v{i} = {self.expression(i, names)};")
                 names[i] = f"v{i}"
-                continue
-            angle = node.args[0]
-            (text,) = self._arguments(i, names)
-            lines.append(f"  sine_and_cosine a{angle} = i_sincos({text});")
-            for j in waiting:
-                if self.nodes[j].op in ("sin", "cos") and self.nodes[j].args == node.args:
-                    names[j] = f"a{angle}.{self.nodes[j].op}"
+            if i in stored:
+                lines.append(f"  {stored[i]} = {names[i]};")
         return lines
+
+    def _sine_and_cosine(self, i: int, nodes: Sequence[int], names: dict[int, str]) -> str:
+        """The statement of the sine and the cosine of one angle, of which some nodes need one."""
+        (angle,) = self.nodes[i].args
+        (text,) = self._arguments(i, names)
+        for j in nodes:
+            if self.nodes[j].op in ("sin", "cos") and self.nodes[j].args == (angle,):
+                names[j] = f"a{angle}.{self.nodes[j].op}"
+        return f"  sine_and_cosine a{angle} = i_sincos({text});"
 
     def expression(self, i: int, names: dict[int, str]) -> str:
         """The C++ of a node's operation."""
@@ -251,8 +273,10 @@ class _Emitter:
             return self._product(i, args)
         if node.op == "div" and self.is_shared[node.args[1]] and not self.is_shared[i]:
             return f"i_multiple({listed})"
-        if node.op == "pow" and nodes[1].op == "const":
-            return self._power(args, nodes[1].value)
+        if node.op == "pow" and self.is_shared[node.args[1]]:
+            return self._power(args, nodes[1])
+        if node.op == "is_finite":
+            return f"t_is_finite({listed})"
         if node.op == "with_sign":
             return args[0]
         if node.op in COMPARISONS and not of_truths:
@@ -279,11 +303,55 @@ class _Emitter:
                 return f"{function}({args[other]}, {args[one]})"
         return f"i_mul({', '.join(args)})"
 
-    def _power(self, args: Sequence[str], exponent: float) -> str:
-        """A power with a constant exponent."""
-        if exponent.is_integer() and 0 < exponent <= LARGEST_POWER:
-            return f"i_power({args[0]}, {int(exponent)})"
-        return f"i_pow({', '.join(args)})"
+    def _power(self, args: Sequence[str], exponent: Node) -> str:
+        """A power whose exponent does not depend on the box."""
+        if exponent.op != "const":
+            return f"i_power_of_positive({', '.join(args)})"
+        if not exponent.value.is_integer():
+            return f"i_pow({', '.join(args)})"
+        if not 0 < exponent.value <= LARGEST_POWER:
+            raise UnsupportedError(f"the power {exponent.value:g} is not available on intervals")
+        return f"i_power({args[0]}, {int(exponent.value)})"
+
+
+class _Memory:
+    """Places in memory of the numbers that one part of a program computes and another one reads.
+
+    Args:
+      nodes: all nodes.
+      outputs: nodes that are read after the last part.
+      parts: the nodes of each part.
+    """
+
+    def __init__(
+        self, nodes: Sequence[Node], outputs: Sequence[int], parts: Sequence[Sequence[int]]
+    ) -> None:
+        self.nodes = nodes
+        self.size = 0
+        part_of = {i: k for k, part in enumerate(parts) for i in part}
+        last = dict(part_of)
+        for i, k in part_of.items():
+            last |= {a: max(last[a], k) for a in nodes[i].args if a in last}
+        last |= {i: len(parts) for i in outputs if i in last}
+        self.places: dict[int, int] = {}
+        free: list[int] = []
+        for k, part in enumerate(parts):
+            for i in (i for i in part if last[i] > k):
+                self.places[i] = free.pop() if free else self.size
+                self.size = max(self.size, self.places[i] + 1)
+            free += [place for i, place in self.places.items() if last[i] == k]
+
+    def stored(self, part: Sequence[int]) -> dict[int, str]:
+        """Node -> C++ of its place, of those nodes of a part that are stored."""
+        member = {"f": "number", "b": "flag"}
+        return {
+            i: f"m[{self.places[i]}].{member[self.nodes[i].kind]}" for i in part if i in self.places
+        }
+
+
+def function(name: str, parameters: str, lines: Sequence[str]) -> str:
+    """A C++ function."""
+    return "\n".join([f"SEPARATE void {name}({parameters}) {{", *lines, "}"])
 
 
 def _type(node: Node) -> str:
@@ -313,12 +381,8 @@ def _source(
         *(f"#define {name} {value}" for name, value in sizes.items()),
         header("vector.h"),
         header("interval.h"),
-        "SEPARATE void shared_numbers(const real *shared, shared_number *table) {",
-        *emitter.shared_numbers(),
-        "}",
-        "INLINE void evaluate(const shared_number *table, const interval *x, interval *out) {",
-        *emitter.evaluation(),
-        "}",
+        emitter.shared_numbers(),
+        emitter.evaluation(),
         header("boxes.h"),
     ]
     return "\n".join(parts)
@@ -332,12 +396,12 @@ def library(source: str) -> ctypes.CDLL:
       ToolchainError: there is no compiler, it fails, or it does not honour the rounding mode.
     """
     path, _ = built(source, FLAGS)
-    found = loaded(path, "search_box", "enclose_boxes", "rounded_operations", "lanes")
+    found = loaded(path, "search_box", "enclose_boxes", "rounded_operations", "vector_size")
     check_rounding(found)
     return found
 
 
-ROUNDED = (1.0, 3.0, 0.1, 0.2, 2.0**-60, 2.0, -0.7, -3.3, 1e-310, 1e300, 1e-200, 7.0)
+ROUNDED = (1.0, 3.0, 0.1, 0.2, 2.0**-60, 2.0, -0.7, -3.3, 1e300, 1e-200, 7.0)
 """Numbers whose sums, differences, products and quotients are verified."""
 
 
@@ -348,17 +412,17 @@ def check_rounding(kernel: ctypes.CDLL) -> None:
       ToolchainError: a bound is on the wrong side of the exact result, or the bounds are further
         apart than two neighbouring numbers.
     """
-    lanes = kernel.lanes()
+    width = kernel.vector_size()
     pairs = [(x, y) for x in ROUNDED for y in ROUNDED]
-    pairs += [pairs[-1]] * (-len(pairs) % lanes)
-    for first in range(0, len(pairs), lanes):
-        x, y = (np.array(column) for column in zip(*pairs[first : first + lanes], strict=True))
-        lower = np.empty((5, lanes))
-        upper = np.empty((5, lanes))
+    pairs += [pairs[-1]] * (-len(pairs) % width)
+    for first in range(0, len(pairs), width):
+        x, y = (np.array(column) for column in zip(*pairs[first : first + width], strict=True))
+        lower = np.empty((7, width))
+        upper = np.empty((7, width))
         failed = kernel.rounded_operations(*map(pointer, (x, y, lower, upper)))
-        for lane in range(lanes):
-            found = list(zip(lower[:, lane].tolist(), upper[:, lane].tolist(), strict=True))
-            if failed or not _are_rounded(x[lane].item(), y[lane].item(), found):
+        for k in range(width):
+            found = list(zip(lower[:, k].tolist(), upper[:, k].tolist(), strict=True))
+            if failed or not _are_rounded(x[k].item(), y[k].item(), found):
                 raise ToolchainError(
                     "the compiler does not honour the rounding mode, which enclosures need:"
                     " install GCC 10 or later, or set $CXX to it"
@@ -366,24 +430,35 @@ def check_rounding(kernel: ctypes.CDLL) -> None:
 
 
 def _are_rounded(x: float, y: float, found: list[tuple[float, float]]) -> bool:
-    """Whether bounds of x + y, x - y, x y, x / y and sqrt(x) are the nearest ones of the exact
-    results.
+    """Whether bounds of x + y, x - y, x y and x / y are the nearest ones of the exact results, and
+    those of sqrt(x), sin(x) and exp(x) are close to it.
     """
+    from fractions import Fraction  # takes several milliseconds
+
     a, b = Fraction(x), Fraction(y)
     exact = (a + b, a - b, a * b, a / b)
-    for value, (low, high) in zip(exact, found[:-1], strict=True):
+    for value, (low, high) in zip(exact, found[:4], strict=True):
         if not _encloses(low, high, value):
             return False
-    low, high = found[-1]
+    root, sine, exponential = found[4:]
+    if abs(x) < 10 and not (_is_close(sine, math.sin(x)) and _is_close(exponential, math.exp(x))):
+        return False
     if x < 0:
-        return high == math.inf
-    return Fraction(low) ** 2 <= a <= Fraction(high) ** 2 and high - low <= 5e-16 * high
+        return root[1] == math.inf
+    return Fraction(root[0]) ** 2 <= a <= Fraction(root[1]) ** 2 and _is_close(root, math.sqrt(x))
 
 
-def _encloses(low: float, high: float, value: Fraction) -> bool:
-    """Whether the bounds are the nearest floating-point numbers on both sides of a number."""
+def _is_close(bounds: tuple[float, float], value: float) -> bool:
+    """Whether bounds contain a value of the C library, but for its error, and are close to it."""
+    low, high = bounds
+    margin = 1e-14 * max(1.0, abs(value))
+    return value - margin <= low < high <= value + margin
+
+
+def _encloses(low: float, high: float, value: Any) -> bool:
+    """Whether the bounds are the nearest floating-point numbers on both sides of a fraction."""
     if high == math.inf:
-        return value > Fraction(sys.float_info.max)
+        return value > sys.float_info.max
     return low <= value <= high and high <= math.nextafter(low, math.inf)
 
 
@@ -408,11 +483,14 @@ def enclose(
       Lower and upper bounds of the arrays that the function returns, each (k, *shape).
 
     Raises:
+      ValueError: a lower bound is above the upper one, or a constant is not finite.
       UnsupportedError: an operation is not available on intervals.
       ToolchainError: no compiler, or one that does not honour the rounding mode.
     """
-    kernel = kernel_of(function, np.shape(lower)[1], constants)
+    kernel = interval_kernel(function, np.shape(lower)[1], constants)
     low, high = (np.ascontiguousarray(x, np.float64) for x in (lower, upper))
+    if low.shape != high.shape or not (low <= high).all():
+        raise ValueError("lower, upper: got a lower bound above the upper one, or two shapes.")
     size = sum(kernel.compiled.sizes)
     bounds = np.empty((2, len(low), size))
     kernel.library.enclose_boxes(
@@ -431,7 +509,7 @@ def enclose(
     return below, above
 
 
-class Kernel(NamedTuple):
+class IntervalKernel(NamedTuple):
     """A kernel with its constants."""
 
     library: ctypes.CDLL
@@ -440,17 +518,23 @@ class Kernel(NamedTuple):
     compiled: Compiled
 
 
-def kernel_of(
-    function: Callable, dimension: int, constants: Sequence[Any]
-) -> Kernel:
+def interval_kernel(function: Callable, dimension: int, constants: Sequence[Any]) -> IntervalKernel:
     """The kernel of a function.
 
     Args:
       function: see `compiled`.
       dimension: number of coordinates.
-      constants: numbers and arrays.
+      constants: numbers and arrays, which must be finite.
+
+    Raises:
+      ValueError: a constant that is not finite.
+      UnsupportedError: an operation is not available on intervals.
+      ToolchainError: no compiler, or one that does not honour the rounding mode.
     """
     arrays = [np.asarray(c, np.float64) for c in constants]
+    for k, array in enumerate(arrays):
+        if not np.isfinite(array).all():
+            raise ValueError(f"constants[{k}]: got {array!r}, expected finite numbers.")
     found = compiled(function, dimension, tuple(a.shape for a in arrays))
     numbers = np.concatenate([*(a.ravel() for a in arrays), np.array(found.literals), [0.0]])
-    return Kernel(library(found.source), numbers, found)
+    return IntervalKernel(library(found.source), numbers, found)

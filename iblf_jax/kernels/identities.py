@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 import operator
-from fractions import Fraction
 from functools import reduce
 from typing import TYPE_CHECKING
 
@@ -59,6 +58,8 @@ def is_exact(op: str, values: list, kind: str) -> bool:
         return False
     if op == "div" and values[1] == 0:
         return False
+    from fractions import Fraction  # takes several milliseconds
+
     result = EXACT_ARITHMETIC[op](*map(Fraction, values))
     try:
         return Fraction(float(result)) == result

@@ -17,18 +17,14 @@ def _primitive(name: str) -> Primitive:
     primitive = Primitive(name)
     primitive.def_impl(lambda x, *others: x)
     primitive.def_abstract_eval(lambda x, *others: x)
-    mlir.register_lowering(
-        primitive, mlir.lower_fun(lambda x, *others: x, multiple_results=False)
-    )
+    mlir.register_lowering(primitive, mlir.lower_fun(lambda x, *others: x, multiple_results=False))
 
     def jvp(primals, tangents):
         return primitive.bind(*primals), tangents[0]
 
     def batch(arguments, axes):
         size = next(x.shape[a] for x, a in zip(arguments, axes, strict=True) if a is not None)
-        moved = [
-            _batch_axis_first(x, axis, size) for x, axis in zip(arguments, axes, strict=True)
-        ]
+        moved = [_batch_axis_first(x, axis, size) for x, axis in zip(arguments, axes, strict=True)]
         return primitive.bind(*moved), 0
 
     ad.primitive_jvps[primitive] = jvp

@@ -31,7 +31,7 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.core.linalg import inner, matmul, matvec
-from iblf_jax.kernels.interval_primitives import lower, upper, with_sign
+from iblf_jax.kernels import lower, upper, with_sign
 from iblf_jax.proofs import uncertainty
 from iblf_jax.proofs.arm_motion import (
     ArmParts,

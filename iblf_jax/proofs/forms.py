@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.kernels.interval_primitives import lower, meet, upper
+from iblf_jax.kernels import lower, meet, upper
 
 
 def centre(x: jax.Array) -> jax.Array:

@@ -25,14 +25,14 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.core.progress import bar
-from iblf_jax.kernels.enclosure import Kernel, kernel_of, pointer
+from iblf_jax.kernels import IntervalKernel, interval_kernel, pointer
 
 STATUSES = ("proved", "undecided", "refuted", "out of boxes", "stopped", "out of memory")
 """How the search of a unit ended, in the order of `kernels/c/boxes.h`."""
 PROVED, UNDECIDED, REFUTED, OUT_OF_BOXES, STOPPED, OUT_OF_MEMORY = range(6)
 UNITS = 4096
 """Units of work, at least, unless fewer boxes prove the statement."""
-RENEWAL = 8
+RENEWAL = 7
 """Bisections after which the weights of the coordinates are measured again."""
 NARROWEST = 2.0**-24
 """Width, in parts of the whole, up to which a coordinate is not bisected."""
@@ -102,7 +102,7 @@ class _Problem:
       upper: upper corners, (p, d).
     """
 
-    def __init__(self, kernel: Kernel, lower: np.ndarray, upper: np.ndarray) -> None:
+    def __init__(self, kernel: IntervalKernel, lower: np.ndarray, upper: np.ndarray) -> None:
         self.kernel = kernel
         self.lower = lower
         self.upper = upper
@@ -241,7 +241,9 @@ class _Results:
         try:
             with np.load(place) as file:
                 found = {name: file[name] for name in ("digest", "boxes", "done")}
-        except Exception as error:  # incomplete, another kind of file, or one that begins like a zip
+        except (
+            Exception
+        ) as error:  # incomplete, another kind of file, or one that begins like a zip
             remedy = (
                 f"It cannot be read ({type(error).__name__}: {error}): delete it or name another"
                 " file."
@@ -280,7 +282,8 @@ def search(
       constants: numbers and arrays of the function, which count as exact.
       patterns: values of the last d - b coordinates, which are not divided, (p, d - b): the
         statement is to be proved for each row. None if d = b.
-      max_boxes: number of boxes after which the search ends.
+      max_boxes: number of boxes after which the search ends, at the end of a generation of boxes
+        where it is reached during the division into units.
       threads: number of threads; None for the number of processors.
       progress: whether a bar shows the part of the volume that is done and an estimate of the
         remaining time; None for where a user sees it.
@@ -288,13 +291,16 @@ def search(
         proved are written; None for none.
 
     Raises:
-      ValueError: the checkpoint is one of another problem.
+      ValueError: a bad argument, or the checkpoint is one of another problem.
       UnsupportedError: an operation is not available on intervals.
       ToolchainError: no compiler, or one that does not honour the rounding mode.
     """
     start = time.monotonic()
+    max_boxes = checks.positive_integer("max_boxes", max_boxes)
+    if threads is not None:
+        threads = checks.positive_integer("threads", threads)
     low, high = _with_patterns(lower, upper, patterns)
-    problem = _Problem(kernel_of(function, low.shape[1], constants), low, high)
+    problem = _Problem(interval_kernel(function, low.shape[1], constants), low, high)
     units, division = problem.divided(max_boxes)
     results = _Results(checkpoint, problem.digest(), len(units))
     boxes = division.boxes
@@ -321,12 +327,22 @@ def search(
 
 
 def _with_patterns(lower: Any, upper: Any, patterns: Any) -> tuple[np.ndarray, np.ndarray]:
-    """The corners of the boxes of all patterns, each (p, d)."""
+    """The corners of the boxes of all patterns, each (p, d).
+
+    Raises:
+      ValueError: a lower end is not below or at the upper one, or numbers are missing.
+    """
+    low, high = (np.asarray(x, np.float64) for x in (lower, upper))
+    if low.shape != high.shape or low.ndim != 1 or not (low <= high).all():
+        remedy = f"The upper corner is {high.tolist()}."
+        raise checks.fail("lower", low.tolist(), "a corner below the upper one", remedy)
     rows = np.zeros((1, 0))
     if patterns is not None:
         rows = np.asarray(patterns, np.float64)
-    corners = [np.broadcast_to(np.asarray(x, np.float64), (len(rows), len(x))) for x in (lower, upper)]
-    low, high = (np.concatenate([corner, rows], axis=1) for corner in corners)
+    low, high = (
+        np.concatenate([np.broadcast_to(corner, (len(rows), len(corner))), rows], axis=1)
+        for corner in (low, high)
+    )
     return low, high
 
 

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.kernels.interval_primitives import hull
+from iblf_jax.kernels import hull
 
 Place = tuple[int, int]
 """An entry of a leaf: the number of the leaf, and that of the entry in it."""

@@ -59,7 +59,8 @@ INLINE real remaining(real after, real before) {
   return part < 0 ? 0 : part < 1 ? part : 1;
 }
 
-/* The weight of a coordinate: the part of the margin that a bisection along it removes, per width. */
+/* The weight of a coordinate: what a bisection along it removes of the margin, per width.  The half that loses less counts three times: both halves
+   must be finished. */
 SEPARATE void measure(const shared_number *table, real *box, real value, real outside) {
   real low[2 * COORDINATES * COORDINATES], high[2 * COORDINATES * COORDINATES], left[2 * COORDINATES];
   for (int k = 0; k < 2 * COORDINATES; k++) {
@@ -80,7 +81,8 @@ SEPARATE void measure(const shared_number *table, real *box, real value, real ou
     }
   }
   for (int i = 0; i < COORDINATES; i++) {
-    real width = box[COORDINATES + i] - box[i], gain = 2 - left[2 * i] - left[2 * i + 1];
+    real width = box[COORDINATES + i] - box[i], one = left[2 * i], other = left[2 * i + 1];
+    real gain = 4 - one - other - 2 * (one > other ? one : other);
     box[2 * COORDINATES + i] = width > 0 ? (gain + REAL(1e-3)) / width : 0;
   }
 }
@@ -188,6 +190,7 @@ SEPARATE int64_t divide(const shared_number *table, real *boxes, int64_t target,
   real batch[W * RECORD], *next = (real *)malloc(2 * target * RECORD * sizeof(real));
   if (!next) r->status = OUT_OF_MEMORY;
   while (r->status == FINISHED && count > 0 && count < target) {
+    if (r->boxes >= options->max_boxes) { r->status = OUT_OF_BOXES; break; }
     int64_t children = 0;
     for (int64_t first = 0; first < count; first += W) {
       int some = count - first < W ? (int)(count - first) : W;
@@ -250,12 +253,13 @@ VISIBLE int enclose_boxes(const real *shared, int64_t boxes, const real *low, co
   return 0;
 }
 
-/* The bounds of x + y, x - y, x y, x / y and sqrt(x), of W numbers each: what the compiler and the processor make of the rounding mode. */
+/* The bounds of x + y, x - y, x y, x / y, sqrt(x), sin(x) and exp(x), of W numbers each: what the compiler and the processor make of the rounding
+   mode. */
 SEPARATE void rounded(const real *x, const real *y, real *lower, real *upper) {
-  interval a = at(load(x)), b = at(load(y)), results[] = {i_add(a, b), i_sub(a, b), i_mul(a, b), i_div(a, b), i_sqrt(a)};
-  for (int k = 0; k < 5; k++) { store(lower + k * W, -results[k].n); store(upper + k * W, results[k].u); }
+  interval a = at(load(x)), b = at(load(y)), results[] = {i_add(a, b), i_sub(a, b), i_mul(a, b), i_div(a, b), i_sqrt(a), i_sin(a), i_exp(a)};
+  for (int k = 0; k < 7; k++) { store(lower + k * W, -results[k].n); store(upper + k * W, results[k].u); }
 }
-VISIBLE int lanes(void) { return W; }
+VISIBLE int vector_size(void) { return W; }
 VISIBLE int rounded_operations(const real *x, const real *y, real *lower, real *upper) {
   environment e;
   if (enter(&e)) return 1;

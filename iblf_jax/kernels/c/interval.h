@@ -67,8 +67,10 @@ INLINE interval i_times(interval x, factor k) {
 /* The product with an interval that is the same for all boxes.  The upper bound is the larger of two products of the upper bound of x, if y >= 0,
    or of -lower, if y <= 0; of one of each, if y contains 0.  The other products are with 0. */
 typedef struct { F a, b, c, d; } factors;
-INLINE factors factors_of(interval y) {
+INLINE factors factors_of(interval given) {
   F zero = {};
+  /* Infinity in place of NaN: `larger` would drop NaN. */
+  interval y = {smaller(given.n, UNBOUNDED), smaller(given.u, UNBOUNDED)};
   I positive = y.n <= zero, negative = ~positive & (y.u <= zero);
   factors r = {negative ? zero : y.u, positive ? -y.n : zero, negative ? y.n : zero, positive ? zero : (negative ? -y.u : y.n)};
   return r;
@@ -168,12 +170,24 @@ INLINE interval i_rsqrt(interval x) {
   return unless(~(x.u > zero), r);
 }
 
+/* A polynomial by Horner's rule, the highest power first.  Its coefficients are static: with the flags of the rounding mode, the compiler would
+   leave the divisions of other constants to the processor. */
+template <int N> INLINE F polynomial(F x, const real (&coefficients)[N]) {
+  F p = all_lanes(coefficients[0]);
+#pragma GCC unroll 24
+  for (int k = 1; k < N; k++) p = p * x + coefficients[k];
+  return p;
+}
+
 /* Exponential function: x = k ln 2 + r.  k LN2_HI and x - k LN2_HI are exact (40 bits and 12; multiples of 2^-54 below 1/2), so that r errs by at
    most 1.1 * 2^-54; in the rounding mode upward |r| <= ln 2 / 2 + 1e-12.  The terms of exp(r) from r^14 on are below 2e-17.
    expm1(r) = r + r^2 q errs by at most g(28) (exp|r| - 1 - |r|) + u |expm1 r| <= 2e-15 |expm1 r|, and exp(r) by 1e-15 <= 1.5e-15 exp(r). */
 #define MAGIC 0x1.8p52
 #define EXP_ERROR 3e-15
 #define EXPM1_ERROR 4e-15
+static constexpr real EXPM1_SERIES[] = {
+  1.0 / 6227020800.0, 1.0 / 479001600.0, 1.0 / 39916800.0, 1.0 / 3628800.0, 1.0 / 362880.0, 1.0 / 40320.0, 1.0 / 5040.0, 1.0 / 720.0, 1.0 / 120.0,
+  1.0 / 24.0, 1.0 / 6.0, 0.5};
 typedef struct { F scale, expm1; } exponential;
 INLINE F clamped(F x, real low, real high) {
   F a = all_lanes(low), b = all_lanes(high), y = x < a ? a : x;
@@ -184,10 +198,7 @@ INLINE exponential exponential_of(F x) {
   F t = (x * 1.4426950408889634 - 0.5) + MAGIC, k = t - MAGIC;
   F r = (x - k * 0x1.62e42fefa2000p-1) - k * 0x1.9ef35793c7673p-41;
   I n = bits(t) - bits(all_lanes(MAGIC));
-  F p = all_lanes(1.0 / 6227020800.0);
-  p = p * r + 1.0 / 479001600.0; p = p * r + 1.0 / 39916800.0; p = p * r + 1.0 / 3628800.0; p = p * r + 1.0 / 362880.0;
-  p = p * r + 1.0 / 40320.0; p = p * r + 1.0 / 5040.0; p = p * r + 1.0 / 720.0; p = p * r + 1.0 / 120.0; p = p * r + 1.0 / 24.0;
-  p = p * r + 1.0 / 6.0; p = p * r + 0.5;
+  F p = polynomial(r, EXPM1_SERIES);
   exponential e = {from_bits((n + 1023) << 52), p * (r * r) + r};
   return e;
 }
@@ -217,10 +228,10 @@ SEPARATE interval i_expm1(interval x) { return increasing(expm1_at(-x.n), expm1_
 /* Logarithm: 1 + x = 2^k (1 + f), s = f / (2 + f), log(1 + f) = 2 (s + s^3 / 3 + ...) with |s| <= 0.1716; the terms from s^23 on are below 3e-19.
    s has a relative error of 2 u, the sum one below 8 u in all; k times the upper part of ln 2 is exact. */
 #define LOG_ERROR 4e-15
+static constexpr real LOG_SERIES[] = {
+  2.0 / 21.0, 2.0 / 19.0, 2.0 / 17.0, 2.0 / 15.0, 2.0 / 13.0, 2.0 / 11.0, 2.0 / 9.0, 2.0 / 7.0, 2.0 / 5.0, 2.0 / 3.0};
 INLINE interval log_of_parts(F k, F f) {
-  F s = f / (f + 2.0), z = s * s, p = all_lanes(2.0 / 21.0);
-  p = p * z + 2.0 / 19.0; p = p * z + 2.0 / 17.0; p = p * z + 2.0 / 15.0; p = p * z + 2.0 / 13.0; p = p * z + 2.0 / 11.0;
-  p = p * z + 2.0 / 9.0; p = p * z + 2.0 / 7.0; p = p * z + 2.0 / 5.0; p = p * z + 2.0 / 3.0;
+  F s = f / (f + 2.0), z = s * s, p = polynomial(z, LOG_SERIES);
   F y = p * z * s + 2.0 * s, value = k * 0x1.62e42fefa2000p-1 + (y + k * 0x1.9ef35793c7673p-41);
   F error = (larger(y, -y) + larger(k, -k)) * LOG_ERROR + UNDERFLOW;
   interval r = {error - value, error + value};
@@ -263,15 +274,15 @@ SEPARATE interval i_log1p(interval x) {
    cosine by g(22) 0.34 + u + 2.5e-16 < 2.3e-15.  For |x| <= 1/2, where r = x, sine errs by 1e-15 |x|. */
 #define SINE_ERROR 2.5e-15
 #define LARGEST_ANGLE 1e5
+static constexpr real SINE_SERIES[] = {
+  -1.0 / 1307674368000.0, 1.0 / 6227020800.0, -1.0 / 39916800.0, 1.0 / 362880.0, -1.0 / 5040.0, 1.0 / 120.0, -1.0 / 6.0};
+static constexpr real COSINE_SERIES[] = {
+  1.0 / 20922789888000.0, -1.0 / 87178291200.0, 1.0 / 479001600.0, -1.0 / 3628800.0, 1.0 / 40320.0, -1.0 / 720.0, 1.0 / 24.0, -0.5};
 typedef struct { F s, c; I quadrant; } angle;
 INLINE angle angle_of(F x) {
   F t = (x * 0.63661977236758134 - 0.5) + MAGIC, k = t - MAGIC;
   F r = ((x - k * 0x1.921fb54440000p+0) - k * 0x1.68c234c4c0000p-39) - k * 0x1.98a2e03707345p-77;
-  F z = r * r, s = all_lanes(-1.0 / 1307674368000.0), c = all_lanes(1.0 / 20922789888000.0);
-  s = s * z + 1.0 / 6227020800.0; s = s * z - 1.0 / 39916800.0; s = s * z + 1.0 / 362880.0; s = s * z - 1.0 / 5040.0;
-  s = s * z + 1.0 / 120.0; s = s * z - 1.0 / 6.0;
-  c = c * z - 1.0 / 87178291200.0; c = c * z + 1.0 / 479001600.0; c = c * z - 1.0 / 3628800.0; c = c * z + 1.0 / 40320.0;
-  c = c * z - 1.0 / 720.0; c = c * z + 1.0 / 24.0; c = c * z - 0.5;
+  F z = r * r, s = polynomial(z, SINE_SERIES), c = polynomial(z, COSINE_SERIES);
   angle a = {s * z * r + r, c * z + 1.0, bits(t)};
   return a;
 }
@@ -321,15 +332,15 @@ SEPARATE interval i_tan(interval x) {
 /* Arctangent: of w = x, (|x| - 1) / (|x| + 1) or -1 / |x| with |w| <= 0.4143, which errs by 3 u |w|; the terms from w^41 on are below 1e-17.  The
    sum errs by g(40) 0.03 + u 0.45, with pi / 2 or pi / 4 by 1.2e-15 in all, and relative to |x| where w = x. */
 #define ATAN_ERROR 3e-15
+static constexpr real ATAN_SERIES[] = {
+  -1.0 / 39.0, 1.0 / 37.0, -1.0 / 35.0, 1.0 / 33.0, -1.0 / 31.0, 1.0 / 29.0, -1.0 / 27.0, 1.0 / 25.0, -1.0 / 23.0, 1.0 / 21.0, -1.0 / 19.0,
+  1.0 / 17.0, -1.0 / 15.0, 1.0 / 13.0, -1.0 / 11.0, 1.0 / 9.0, -1.0 / 7.0, 1.0 / 5.0, -1.0 / 3.0};
 INLINE interval atan_at(F x) {
   F a = larger(x, -x), one = all_lanes(1), zero = {};
   I far = a > all_lanes(2.414213562373095), middle = (a > all_lanes(0.41421356237309503)) & ~far;
   F w = (far ? -one : (middle ? a - 1.0 : a)) / (far ? a : (middle ? a + 1.0 : one)), z = w * w;
   F offset = far ? all_lanes(1.5707963267948966) : (middle ? all_lanes(0.78539816339744831) : zero);
-  F p = all_lanes(-1.0 / 39.0);
-  p = p * z + 1.0 / 37.0; p = p * z - 1.0 / 35.0; p = p * z + 1.0 / 33.0; p = p * z - 1.0 / 31.0; p = p * z + 1.0 / 29.0; p = p * z - 1.0 / 27.0;
-  p = p * z + 1.0 / 25.0; p = p * z - 1.0 / 23.0; p = p * z + 1.0 / 21.0; p = p * z - 1.0 / 19.0; p = p * z + 1.0 / 17.0; p = p * z - 1.0 / 15.0;
-  p = p * z + 1.0 / 13.0; p = p * z - 1.0 / 11.0; p = p * z + 1.0 / 9.0; p = p * z - 1.0 / 7.0; p = p * z + 1.0 / 5.0; p = p * z - 1.0 / 3.0;
+  F p = polynomial(z, ATAN_SERIES);
   F y = p * z * w + w + offset, error = (far | middle) != 0 ? all_lanes(ATAN_ERROR) : a * ATAN_ERROR + UNDERFLOW;
   y = x < zero ? -y : y;
   interval r = {error - y, error + y};
@@ -360,5 +371,10 @@ INLINE interval tanh_at(F x) {
 SEPARATE interval i_tanh(interval x) { return increasing(tanh_at(-x.n), tanh_at(x.u)); }
 
 INLINE interval i_logistic(interval x) { interval one = at(all_lanes(1)); return i_div(one, i_add(one, i_exp(i_neg(x)))); }
-/* x^y for x >= 0, which is positive by construction where y is negative or no whole number. */
+/* x^y for a y that is no whole number: x >= 0, by construction. */
 INLINE interval i_pow(interval x, interval y) { return i_exp(i_mul(y, i_log(x))); }
+/* x^y for any y; without bounds where x may be negative. */
+INLINE interval i_power_of_positive(interval x, interval y) {
+  F zero = {};
+  return unless(~(x.n <= zero), i_pow(x, y));
+}
