@@ -222,10 +222,10 @@ def mismatch(constants: Constants, places: Places, at: Errors, z: jax.Array) -> 
     for k, (column, share) in enumerate(zip(columns, shares, strict=True)):
         total = total + size[k] * share
         right = add(right, scaled(-size[k], column))
-    whole = on_columns(lambda column: solve_general(total, column), right)
+    total_rate = on_columns(lambda column: solve_general(total, column), right)
 
     def affine_column(column: Affine, share: jax.Array) -> Affine:
-        product = on_columns(lambda column: matvec(share, column), whole)
+        product = on_columns(lambda column: matvec(share, column), total_rate)
         return scaled(jnp.asarray(-1.0), add(column, product))
 
     affine = [affine_column(*pair) for pair in zip(columns, shares, strict=True)]

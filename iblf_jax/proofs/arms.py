@@ -138,14 +138,14 @@ class _Arm:
         weight = checks.positive_number("weight", weight, "1/(N m)^2 N m rad")
         level = checks.positive_number("level", level, "N m rad")
         self._check_level(level)
-        numbers = Constants(
-            self.parts, self.uncertain.numbers, np.asarray(weight), np.asarray(level)
-        )
-        return [np.asarray(x, float) for x in jax.tree.leaves(numbers)]
+        parts, numbers = self.parts, self.uncertain.numbers
+        leaves = [*jax.tree.leaves((parts, numbers)), weight, level]
+        return [np.asarray(x, float) for x in leaves]
 
     def _check_level(self, level: float) -> None:
         """Raises ValueError if the level set reaches the guard of the barrier."""
-        barrier = self.scenario.controller.barrier
+        law: Any = self.scenario.controller
+        barrier = law.barrier
         with jax.enable_x64(True):
             times = jnp.linspace(0.0, self.duration, INSTANTS)
             per_joint = level / self.parts.law.weight

@@ -1,9 +1,9 @@
 """Algebra of small symmetric matrices whose entries may be intervals.
 
 `core.linalg` tests pivots and replaces them by NaN; an interval of a pivot may contain zero
-although no pivot is zero.  The functions here have no branches.  The factor is the upper one, M = U U^T: the
-last diagonal entries of the mass matrix of a serial arm depend on the fewest joints, so that its
-first pivots are the narrowest intervals.
+although no pivot is zero.  The functions here have no branches.  The factor is the upper one,
+M = U U^T: the last diagonal entries of the mass matrix of a serial arm depend on the fewest joints,
+so that its first pivots are the narrowest intervals.
 """
 
 from __future__ import annotations
