@@ -27,7 +27,8 @@ PAGES: dict[str, tuple[str, str]] = {
         "Studies",
         (
             "monte_carlo Study sweep load_sweep StoreError sensitivity Sensitivity compare"
-            " Comparison factor offset value uniform normal log_uniform choice joint_normal interval"
+            " Comparison factor offset value uniform normal log_uniform choice joint_normal"
+            " interval"
         ),
     ),
     "certificates": ("Certificates", "certify Certificate Counterexample"),
