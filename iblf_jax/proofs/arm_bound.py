@@ -1,7 +1,7 @@
 """Upper bounds of V_w' of a rigid arm over boxes of the level set V_w = c.
 
-**Coordinates.**  x = (t, theta_1..theta_n, psi, phi_1..phi_{n-1}, z_1..z_m, sign_1..sign_n).  Angles
-divide the level among the barriers, the velocity error and f_tilde:
+**Coordinates.**  x = (t, theta_1..theta_n, psi, phi_1..phi_{n-1}, z_1..z_m, sign_1..sign_n).
+Angles divide the level among the barriers, the velocity error and f_tilde:
 
     sqrt(w_i V1_i) = sqrt(c) sphere(theta)_i,   R = c sphere(theta)_{n+1}^2
     U^T e2 = sqrt(2R) cos(psi) sphere(phi),   M0 = U U^T,   sqrt(w_f) |f_tilde| = sqrt(2R) sin(psi)
@@ -169,7 +169,7 @@ class MismatchRate(NamedTuple):
 
 
 def mismatch(constants: Constants, places: Places, at: Errors, z: jax.Array) -> Mismatch:
-    """f' over a box of parameters; see the head of this module."""
+    """F' over a box of parameters; see the head of this module."""
     parts, numbers = constants.parts, constants.numbers
     n = at.xi.shape[-1]
     nominal = (parts.plant, parts.disturbance)
@@ -213,8 +213,7 @@ def mismatch(constants: Constants, places: Places, at: Errors, z: jax.Array) -> 
         return add(with_slow, on_columns(lambda force: -matvec(fast, force), found.force))
 
     columns = [
-        torque_column(column, share)
-        for column, share in zip(found.columns, shares, strict=True)
+        torque_column(column, share) for column, share in zip(found.columns, shares, strict=True)
     ]
     # The rate of a further disturbance is a coordinate without entries.
     columns += [Affine(-unit, jnp.zeros((n, n))) for unit in jnp.eye(n)[: places.rates]]
@@ -223,10 +222,10 @@ def mismatch(constants: Constants, places: Places, at: Errors, z: jax.Array) -> 
     for k, (column, share) in enumerate(zip(columns, shares, strict=True)):
         total = total + size[k] * share
         right = add(right, scaled(-size[k], column))
-    whole = on_columns(lambda column: solve_general(total, column), right)
+    total_rate = on_columns(lambda column: solve_general(total, column), right)
 
     def affine_column(column: Affine, share: jax.Array) -> Affine:
-        product = on_columns(lambda column: matvec(share, column), whole)
+        product = on_columns(lambda column: matvec(share, column), total_rate)
         return scaled(jnp.asarray(-1.0), add(column, product))
 
     affine = [affine_column(*pair) for pair in zip(columns, shares, strict=True)]
@@ -236,7 +235,7 @@ def mismatch(constants: Constants, places: Places, at: Errors, z: jax.Array) -> 
 
 
 def corners(constants: Constants, found: Mismatch, z: jax.Array) -> list[Affine]:
-    """f' at each corner of the box of parameters."""
+    """F' at each corner of the box of parameters."""
     size = z - constants.numbers.reference
     ends = [(lower(size[k]), upper(size[k])) for k in range(len(found.columns))]
     vertices = []
@@ -335,9 +334,9 @@ def arm_bound(places: Places, n: int, x: jax.Array, constants: Constants) -> jax
 def _squares(constants: Constants, a: jax.Array, b: jax.Array, terms: list[Corner]) -> jax.Array:
     """A bound of (B.1) without its decay from completed squares, ().
 
-        -K a^2 + a b + w_f |f0| b - w_f lambda b^2
-            = -K (a - b/(2K))^2 - mu (b - w_f |f0|/(2 mu))^2 + (w_f |f0|)^2/(4 mu),
-        mu = w_f lambda - 1/(4K),   K = min K2,   a = |e2|
+    -K a^2 + a b + w_f |f0| b - w_f lambda b^2
+        = -K (a - b/(2K))^2 - mu (b - w_f |f0|/(2 mu))^2 + (w_f |f0|)^2/(4 mu),
+    mu = w_f lambda - 1/(4K),   K = min K2,   a = |e2|
     """
     K = jnp.min(constants.parts.law.K2)
     bounds = []

@@ -149,14 +149,14 @@ def relative_alpha(parts: ArmParts, t: jax.Array, xi: jax.Array) -> jax.Array:
 
 
 def slope(parts: ArmParts, t: jax.Array, xi: jax.Array) -> jax.Array:
-    """w s, (n,) [N m]."""
+    """W s, (n,) [N m]."""
     law, side = parts.law, side_of(parts, t, xi)
     scaled = law.weight * law.barrier.slope(side.scaled, xi)
     return scaled * side.k if degree(law.barrier) == 2 else scaled / side.k
 
 
 def energy(parts: ArmParts, t: jax.Array, xi: jax.Array) -> jax.Array:
-    """w V1, (n,) [N m rad]."""
+    """W V1, (n,) [N m rad]."""
     law, side = parts.law, side_of(parts, t, xi)
     return law.weight * law.barrier.value(side.scaled, xi) * side.k ** degree(law.barrier)
 
@@ -174,7 +174,7 @@ def along(function: Callable, point: tuple, rates: tuple) -> Any:
 
 
 def xi_rate(parts: ArmParts, at: Errors) -> jax.Array:
-    """xi' = A - xi k'/k + e2/k, (n,) [1/s]."""
+    """Xi' = A - xi k'/k + e2/k, (n,) [1/s]."""
     side = side_of(parts, at.t, at.xi)
     return scaled_alpha(parts, at.t, at.xi) - side.growth * at.xi + at.e2 / side.k
 
@@ -241,7 +241,7 @@ def rates_of_errors(parts: ArmParts, at: Errors, f_tilde: jax.Array) -> Errors:
 class Motion(NamedTuple):
     """The motion of the joints, and its jerk j0 for f' = 0 in parts:
 
-        j0 = alpha" + M0^-1 (slow - K2 M0^-1 force)
+    j0 = alpha" + M0^-1 (slow - K2 M0^-1 force)
     """
 
     now: Kinematics
@@ -299,7 +299,7 @@ def decay(parts: ArmParts, at: Errors) -> jax.Array:
 
 
 def mismatch_torque(parts: ArmParts, now: Kinematics) -> jax.Array:
-    """f = M0 q" + C0 q' + G0 - Z, (n,) [N m]."""
+    """F = M0 q" + C0 q' + G0 - Z, (n,) [N m]."""
     model = parts.model
     inertial = matvec(model.mass_matrix(now.q), now.a) + model.coriolis(now.q, now.v, now.v)
     return inertial + model.gravity(now.q) - required_torque(parts, now)
@@ -308,7 +308,7 @@ def mismatch_torque(parts: ArmParts, now: Kinematics) -> jax.Array:
 def mismatch_rate(
     parts: ArmParts, at: Errors, f_tilde: jax.Array, extra: jax.Array | float = 0.0
 ) -> jax.Array:
-    """f' of (P.3) by exact differences, for numbers, (n,) [N m/s].
+    """F' of (P.3) by exact differences, for numbers, (n,) [N m/s].
 
     Args:
       parts: with the true plant.

@@ -11,7 +11,7 @@ import functools
 import itertools
 import math
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +24,7 @@ from iblf_jax.control.decays._base import decay_member
 from iblf_jax.core import checks
 from iblf_jax.core.linalg import matvec
 from iblf_jax.core.pytree import astype
-from iblf_jax.core.time import as_at
+from iblf_jax.core.time import as_at, jump_times_of
 from iblf_jax.proofs import arm_motion, uncertainty
 from iblf_jax.proofs.arm_bound import Constants, arm_bound
 from iblf_jax.proofs.arm_motion import ArmParts, Errors, position
@@ -50,11 +50,14 @@ INSTANTS = 1024
 """Times at which the tube is examined before a proof."""
 SUPPORTED_PARTS = ("plant", "disturbance")
 """Parts of a scenario whose parameters may be uncertain."""
+VECTORS = ("q", "dq", "f_tilde", "f_hat", "eta")
+"""Vectors of a point in physical numbers, as in `LevelState`."""
 MOST_CORNERS = 6
 """Largest number of uncertain coordinates: a bound has 2^m corners."""
 
 
-class ArmBound(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class ArmBound:
     """The bound of arms of one structure, as a hashable function."""
 
     structure: Any
@@ -67,7 +70,8 @@ class ArmBound(NamedTuple):
         return arm_bound(self.places, self.n, x, numbers), jnp.zeros((0,))
 
 
-class ArmRate(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class ArmRate:
     """V_w' at a point of arms of one structure, as a hashable function."""
 
     structure: Any
@@ -137,14 +141,14 @@ class _Arm:
         weight = checks.positive_number("weight", weight, "1/(N m)^2 N m rad")
         level = checks.positive_number("level", level, "N m rad")
         self._check_level(level)
-        numbers = Constants(
-            self.parts, self.uncertain.numbers, np.asarray(weight), np.asarray(level)
-        )
-        return [np.asarray(x, float) for x in jax.tree.leaves(numbers)]
+        parts, numbers = self.parts, self.uncertain.numbers
+        leaves = [*jax.tree.leaves((parts, numbers)), weight, level]
+        return [np.asarray(x, float) for x in leaves]
 
     def _check_level(self, level: float) -> None:
         """Raises ValueError if the level set reaches the guard of the barrier."""
-        barrier = self.scenario.controller.barrier
+        law: Any = self.scenario.controller
+        barrier = law.barrier
         with jax.enable_x64(True):
             times = jnp.linspace(0.0, self.duration, INSTANTS)
             per_joint = level / self.parts.law.weight
@@ -181,9 +185,13 @@ class _Arm:
         with jax.enable_x64(True):
             numbers = _physical(self.function, np.asarray(point, float), list(constants))
             z = np.asarray(point)[1 + 3 * self.scenario.n :]
-            t, *vectors, rate = map(np.asarray, numbers)
-            rates = np.broadcast_to(rate, (self.function.places.rates,))
-            return LevelState(float(t), *vectors, self.uncertain.values(z), rates)
+            rates = self.function.places.rates
+            return LevelState(
+                t=float(numbers["t"]),
+                **{name: np.asarray(numbers[name]) for name in VECTORS},
+                parameters=self.uncertain.values(z),
+                rate=np.broadcast_to(np.asarray(numbers["rate"]), (rates,)),
+            )
 
     def scenario_at(self, point: Any, constants: Any) -> Scenario:
         """The scenario whose run starts at a point, with its parameters and moved in time.
@@ -198,7 +206,8 @@ class _Arm:
             bounds, lower=shifted(bounds.lower, state.t), upper=shifted(bounds.upper, state.t)
         )
         initial = dataclasses.replace(scenario.initial, q=state.q, dq=state.dq)
-        observer = dataclasses.replace(scenario.observer, eta0=state.eta, start="zero")
+        observer: Any = scenario.observer
+        observer = dataclasses.replace(observer, eta0=state.eta, start="zero")
         return dataclasses.replace(
             scenario,
             initial=initial,
@@ -233,11 +242,11 @@ class Uncertain(NamedTuple):
     def scales(self) -> dict[str, tuple[float, float]]:
         """Path of each uncertain entry -> its least and its greatest value."""
         low, high = self.values(self.low), self.values(self.high)
-        return {name: tuple(sorted((low[name], high[name]))) for name in low}
+        return {name: (min(low[name], high[name]), max(low[name], high[name])) for name in low}
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _physical(function: ArmBound, point: jax.Array, constants: list[jax.Array]) -> tuple:
+def _physical(function: ArmBound, point: jax.Array, constants: list[jax.Array]) -> dict[str, Any]:
     """Time, position, velocity, f_tilde, f_hat, eta and the further rate at a point."""
     numbers = jax.tree.unflatten(function.structure, constants)
     found = point_of(function.places, function.n, point, numbers)
@@ -245,7 +254,8 @@ def _physical(function: ArmBound, point: jax.Array, constants: list[jax.Array]) 
     now = arm_motion.motion(parts, errors, found.f_tilde).now
     f_hat = arm_motion.mismatch_torque(parts, now) - found.f_tilde
     eta = f_hat - parts.kf * matvec(parts.model.mass_matrix(now.q), now.v)
-    return errors.t, now.q, now.v, found.f_tilde, f_hat, eta, found.rate
+    vectors = dict(zip(VECTORS, (now.q, now.v, found.f_tilde, f_hat, eta), strict=True))
+    return {"t": errors.t, "rate": found.rate, **vectors}
 
 
 def arm_problem(
@@ -277,7 +287,8 @@ def arm_problem(
         uncertain = uncertain_coordinates(scenario, parameters, disturbance_rate)
         _check_tube(scenario, length)
         _check_mass_matrices(parts, uncertain)
-        structure = jax.tree.structure(Constants(parts, uncertain.numbers, 0.0, 0.0))
+        zero = jnp.zeros(())
+        structure = jax.tree.structure(Constants(parts, uncertain.numbers, zero, zero))
     n = scenario.n
     function = ArmBound(structure, uncertain.places, n)
     point_rate = ArmRate(structure, uncertain.places, n)
@@ -312,7 +323,7 @@ def _coordinates(
     if n > 1:
         phi[-1] = full
     psi = right if n > 1 else 2.0 * right
-    upper = [np.nextafter(duration, np.inf), *[right] * n, psi, *phi]
+    upper = [duration * (1.0 + 1e-12), *[right] * n, psi, *phi]
     names += [*uncertain.names, *(f"side[{i}]" for i in range(n))]
     return (
         tuple(names),
@@ -347,19 +358,14 @@ def _check_plant(scenario: Scenario) -> None:
         if plants.is_chain(part):
             reason = "This bound is that of rigid arms."
             raise _unsupported(name, type(part).__name__, "a robot", reason)
-        if jnp.size(_jumps(part)):
+        if jnp.size(jump_times_of(name, part)):
             reason = "A load that is picked up changes the plant during the run."
             raise _unsupported(name, type(part).__name__, "a robot that does not change", reason)
-    if jax.tree.structure(scenario.plant) != jax.tree.structure(scenario.model):
+    structures: list[Any] = [jax.tree.structure(x) for x in (scenario.plant, scenario.model)]
+    if structures[0] != structures[1]:
         reason = "The difference of their parameters is what the proof is about."
         expected = f"a robot of the structure of the plant, {type(scenario.plant).__name__}"
         raise _unsupported("model", type(scenario.model).__name__, expected, reason)
-
-
-def _jumps(part: Any) -> Any:
-    from iblf_jax.core.time import jump_times_of
-
-    return jump_times_of("plant", part)
 
 
 def _check_law(law: Any) -> None:
@@ -377,9 +383,13 @@ def _check_law(law: Any) -> None:
     zero, one = jnp.zeros(1), jnp.ones(1)
     tube = arm_motion.Tube(zero, zero, -one, one, zero, zero)
     known = barrier_member(barrier, "error_at")(zero, tube, zero > 0)
-    if known is None or barrier_member(barrier, "decay_rate")(one) is None:
+    claims = (
+        barrier_member(barrier, "decay_rate")(one),
+        barrier_member(barrier, "xi_bound")(one, tube),
+    )
+    if known is None or any(claim is None for claim in claims):
         reason = "The level set needs the error at which V1 has a value, in closed form."
-        expected = "a barrier with error_at and decay_rate"
+        expected = "a barrier with error_at, xi_bound and decay_rate"
         raise _unsupported("controller.barrier", type(barrier).__name__, expected, reason)
 
 
@@ -429,7 +439,8 @@ def _time_interval(scenario: Scenario, duration: float | None) -> tuple[float, b
 
 def _parts_of(scenario: Scenario) -> ArmParts:
     """The parts of V_w', with a barrier without a guard."""
-    law, barrier = copy.copy(scenario.controller), copy.copy(scenario.controller.barrier)
+    law: Any = copy.copy(scenario.controller)
+    barrier, observer = copy.copy(law.barrier), cast(Any, scenario.observer)
     # The constructor refuses such a guard: only inside the guard is the barrier evaluated.
     object.__setattr__(barrier, "guard", -math.inf)
     object.__setattr__(law, "barrier", barrier)
@@ -439,7 +450,7 @@ def _parts_of(scenario: Scenario) -> ArmParts:
         as_at(scenario.plant, zero),
         scenario.disturbance,
         law,
-        jnp.broadcast_to(scenario.observer.kf, (scenario.n,)),
+        jnp.broadcast_to(observer.kf, (scenario.n,)),
         scenario.reference,
         scenario.bounds,
     )
@@ -508,7 +519,7 @@ def uncertain_coordinates(
     for group, perturbation in parameters.items():
         for together in _entries_together(scenario, str(group), perturbation):
             values = [float(np.asarray(paths.get(scenario, path))) for path in together]
-            ends = _ends(perturbation, together[0], str(group), scenario)
+            ends = _ends(scenario, str(group), together[0], perturbation)
             base, slope, reference = _line(perturbation.kind, values)
             entries.append(tuple(index[path] for path in together))
             bases.append(jnp.asarray(base))
@@ -574,17 +585,13 @@ def _entries_together(
 
 
 def _ends(
-    perturbation: Perturbation, entry: str, group: str, scenario: Scenario
+    scenario: Scenario, group: str, entry: str, perturbation: Perturbation
 ) -> tuple[float, float]:
     """The ends of z for an entry of a path."""
     first = group.split(",")[0].strip()
     shape = np.shape(paths.get(scenario, first))
     k = _entries_of(scenario, first).index(entry)
     low, high = (np.broadcast_to(x, shape).ravel()[k] for x in perturbation.distribution.support())
-    if not (np.isfinite(low) and np.isfinite(high)):
-        raise checks.fail(
-            f"parameters[{group!r}]", (float(low), float(high)), "a bounded interval"
-        )
     return float(low), float(high)
 
 

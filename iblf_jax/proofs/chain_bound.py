@@ -92,8 +92,8 @@ class TruePlant:
         """m_i of (C.3) of row i."""
         model = self.parts.model
         if not self.is_box:
-            wanted = plants.level_input(model, i + 1, t, x, rate)
-            return wanted - self.above(self.true, i, t, x, rate)
+            desired = plants.level_input(model, i + 1, t, x, rate)
+            return desired - self.above(self.true, i, t, x, rate)
         external = chain_motion.external_at(self.known[1], t, x, model, model)
         # I0_i is affine in the rate; a difference of intervals would be too wide.
         of_level = along(
@@ -164,13 +164,13 @@ def level_point(
         return chain_motion.with_estimate(equations, observed, true, i, y, given[i])
 
     for i in range(order):
-        around = y
+        at_centre = y
         slope = jnp.zeros(1)
         if i > 0:
-            around, _, _ = estimated(y._replace(e=(*y.e, jnp.zeros(1))), i - 1)
+            at_centre, _, _ = estimated(y._replace(e=(*y.e, jnp.zeros(1))), i - 1)
             if observed[i - 1]:
                 slope = true.slope_of_centre(i - 1, t, equations.state(i, y))
-        e = _error(constants, observed, true, i, around, slope, energy[i], signs[i])
+        e = _error(constants, observed, true, i, at_centre, slope, energy[i], signs[i])
         y = y._replace(e=(*y.e, e))
         if i > 0:
             y, *found = estimated(y, i - 1)
@@ -181,8 +181,8 @@ def level_point(
     d_tilde.append(found[1])
     now = chain_motion.motion(equations, observed, y, tuple(d), tuple(d_tilde))
     x = equations.state(order, y)
-    wanted = equations.wanted_rate(order - 1, y) - y.d_hat[order - 1]
-    u = plants.level_input(constants.parts.model, order, t, x, wanted)
+    desired = equations.desired_rate(order - 1, y) - y.d_hat[order - 1]
+    u = plants.level_input(constants.parts.model, order, t, x, desired)
     return LevelPoint(now, energy, x, u)
 
 
@@ -191,7 +191,7 @@ def _error(
     observed: tuple[bool, ...],
     true: TruePlant,
     i: int,
-    around: ChainState,
+    at_centre: ChainState,
     slope: jax.Array,
     energy: jax.Array,
     sign: jax.Array,
@@ -201,7 +201,7 @@ def _error(
     Args:
       constants, observed, true: of the problem.
       i: row.
-      around: the state for e_i = 0.
+      at_centre: the state for e_i = 0.
       slope: rho.
       energy: w_i V_i.
       sign: side of the tube.
@@ -212,8 +212,9 @@ def _error(
     if isinstance(barrier, Quadratic):
         return with_sign(sign * jnp.sqrt(2.0 * value), sign)
     zero = jnp.zeros(1)
-    middle = true.equations.centre(i, around)
-    lower, upper = bounds_at(parts.bounds[i], around.t, middle)
+    middle = true.equations.centre(i, at_centre)
+    bounds: Any = parts.bounds[i]
+    lower, upper = bounds_at(bounds, at_centre.t, middle)
     k_l, k_u = middle - lower, upper - middle
 
     # Where the first iterations leave the bounds, only a tube of positive width leads back.
@@ -225,7 +226,9 @@ def _error(
 
     if i == 0 and true.is_box:
         # Both widths of the first tube depend on the time: a mean-value form keeps their relation.
-        return with_sign(meet(_first_error(parts, value, sign, around.t), next_error(zero)), sign)
+        return with_sign(
+            meet(_first_error(parts, value, sign, at_centre.t), next_error(zero)), sign
+        )
     if i == 0 or not observed[i - 1]:
         return with_sign(next_error(zero), sign)
     if not true.is_box:
@@ -241,10 +244,11 @@ def _first_error(parts: ChainParts, value: jax.Array, sign: jax.Array, t: jax.Ar
     """e_1 at which V_1 has a value, by the mean-value form e(c) + e'(T) (t - c) in an interval T of
     times with the centre c.
     """
+    bounds: Any = parts.bounds[0]
 
     def error(t: jax.Array) -> jax.Array:
         middle = parts.reference.position(t)
-        lower, upper = bounds_at(parts.bounds[0], t, middle)
+        lower, upper = bounds_at(bounds, t, middle)
         zero = jnp.zeros(1)
         tube = OpenTube(zero, zero, lower - middle, upper - middle, zero, zero)
         return parts.law.barriers[0].error_at(value, tube, sign > 0)

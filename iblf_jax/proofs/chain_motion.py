@@ -9,8 +9,8 @@ none, one number per level.  Plant and model, with d_i the difference that the o
 
 The last sum has the levels with kappa_i > 0; at the others d_hat_i = 0 and d_tilde_i = d_i.
 
-**Motion.**  With R_i, the rate that the law wants (`_levels`), alpha_i = I0_i(R_i - d_hat_i), where
-I0_i(rate) = (rate - f0_i)/G0_i, and
+**Motion.**  With R_i, the rate that the law desires (`controllers._levels`), and
+I0_i(rate) = (rate - f0_i)/G0_i, the law is alpha_i = I0_i(R_i - d_hat_i), and
 
     rho_i = R_i + G0_i e_{i+1}   is the rate of x_i in the model's flow,
     x_i' = rho_i + d_tilde_i,   e_i' = x_i' - alpha_{i-1}'                                    (C.1)
@@ -48,7 +48,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -168,8 +168,8 @@ class LevelEquations:
         """alpha_{i-1}, around which the tube of row i is."""
         if i == 0:
             return self.parts.reference.position(y.t)
-        wanted = self.wanted_rate(i - 1, y) - y.d_hat[i - 1]
-        return plants.level_input(self.parts.model, i, y.t, self.state(i, y), wanted)
+        desired = self.desired_rate(i - 1, y) - y.d_hat[i - 1]
+        return plants.level_input(self.parts.model, i, y.t, self.state(i, y), desired)
 
     @remembered(errors=1, estimates=0)
     def centre_rate(self, i: int, y: ChainState) -> jax.Array:
@@ -215,7 +215,7 @@ class LevelEquations:
         return self.parts.law.barriers[i].slope(self.relative_tube(i, y), y.e[i])
 
     @remembered(errors=1, estimates=0)
-    def relative_wanted_rate(self, i: int, y: ChainState) -> jax.Array:
+    def relative_desired_rate(self, i: int, y: ChainState) -> jax.Array:
         """R_i - beta_{i-1} of row i."""
         law = self.parts.law
         barrier = law.barriers[i]
@@ -230,9 +230,9 @@ class LevelEquations:
         coupling = plants.transposed_gain(self.parts.model, i, y.t, x, below) / law.weights[i]
         return rate - coupling * barrier.error_over_slope(tube, y.e[i])
 
-    def wanted_rate(self, i: int, y: ChainState) -> jax.Array:
+    def desired_rate(self, i: int, y: ChainState) -> jax.Array:
         """R_i of row i."""
-        return self.centre_rate(i, y) + self.relative_wanted_rate(i, y)
+        return self.centre_rate(i, y) + self.relative_desired_rate(i, y)
 
     def model_gain(self, i: int, y: ChainState, v: jax.Array) -> jax.Array:
         """G0_i v of row i."""
@@ -242,7 +242,7 @@ class LevelEquations:
     def model_error_rate(self, i: int, y: ChainState) -> jax.Array:
         """e_i' of row i in the model's flow, rho_i - beta_{i-1}."""
         pull = self.model_gain(i, y, error_above(y, i, self.parts.order))
-        return self.relative_wanted_rate(i, y) + pull
+        return self.relative_desired_rate(i, y) + pull
 
     def model_state_rate(self, i: int, y: ChainState) -> jax.Array:
         """rho_i of row i."""
@@ -302,22 +302,10 @@ class Motion(NamedTuple):
     d_hat_rate: Column
 
 
-class Truth(Protocol):
-    """What differs between the plant and its model."""
-
-    def mismatch(self, i: int, t: jax.Array, x: jax.Array, rate: jax.Array) -> jax.Array:
-        """m_i of (C.3) of row i, (1,)."""
-        ...
-
-    def ratio(self, i: int, t: jax.Array, x: jax.Array) -> jax.Array:
-        """G_i/G0_i of row i, (1,)."""
-        ...
-
-
 def with_estimate(
     equations: LevelEquations,
     observed: tuple[bool, ...],
-    truth: Truth,
+    truth: Any,
     i: int,
     y: ChainState,
     d_tilde: Any,
@@ -327,7 +315,7 @@ def with_estimate(
     Args:
       equations: of the law.
       observed: of each row, whether its kappa is positive.
-      truth: the plant's difference from the model.
+      truth: the plant's difference from the model, a `chain_bound.TruePlant`.
       i: row.
       y: with e_{i+1} of the row and d_hat of the rows below.
       d_tilde: of the row, where it is observed.
@@ -369,7 +357,7 @@ def motion(
     return Motion(y, tuple(x_rates), d, d_tilde, tuple(error_rates), tuple(deltas), estimates)
 
 
-def mismatch_rate(equations: LevelEquations, truth: Truth, i: int, now: Motion) -> jax.Array:
+def mismatch_rate(equations: LevelEquations, truth: Any, i: int, now: Motion) -> jax.Array:
     """d_i' of (C.4) of an observed row."""
     y = now.y
     rates = ChainState(jnp.ones_like(y.t), now.error_rate[: i + 2], now.d_hat_rate[:i])

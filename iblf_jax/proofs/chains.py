@@ -47,8 +47,8 @@ from iblf_jax.world.bounds import Tube, tube_at
 ORDERS = (2, 3)
 """Numbers of levels for which the bound is small enough to be of use."""
 PARTS_OF_TIME = 128
-"""Parts of the time interval, each of which is searched on its own: over a long part a tube may have
-no positive width, so that no bisection would be better than another."""
+"""Parts of the time interval, each of which is searched on its own: over a long part a tube may
+have no positive width, so that no bisection would be better than another."""
 ASSUMPTIONS = (
     "The equations hold in real numbers: the loop is continuous, and its parameters are the stored"
     " double-precision numbers.",
@@ -427,7 +427,7 @@ def _check_plant(scenario: Scenario) -> None:
         if plants.nominal_of(part) is not part or jnp.size(jump_times_of(name, part)):
             reason = "The plant changes during the run."
             raise _unsupported(name, kind, "a plant that does not change", reason)
-    structures = [jax.tree.structure(part) for part in (scenario.plant, scenario.model)]
+    structures: list[Any] = [jax.tree.structure(part) for part in (scenario.plant, scenario.model)]
     if structures[0] != structures[1]:
         reason = "The difference of their parameters is what the proof is about."
         expected = f"a plant of the structure of {type(scenario.plant).__name__}"

@@ -1,9 +1,9 @@
 """Algebra of small symmetric matrices whose entries may be intervals.
 
-`core.linalg` tests pivots and replaces them by NaN; an interval of a pivot may contain zero although
-no pivot is zero.  The functions here have no branches.  The factor is the upper one, M = U U^T: the
-last diagonal entries of the mass matrix of a serial arm depend on the fewest joints, so that its
-first pivots are the narrowest intervals.
+`core.linalg` tests pivots and replaces them by NaN; an interval of a pivot may contain zero
+although no pivot is zero.  The functions here have no branches.  The factor is the upper one,
+M = U U^T: the last diagonal entries of the mass matrix of a serial arm depend on the fewest joints,
+so that its first pivots are the narrowest intervals.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.core.linalg import matmul
-
 
 Factor = dict[tuple[int, int], jax.Array]
 """U of M = U U^T: the entries (i, j) with i <= j."""
@@ -131,7 +130,7 @@ def norm(vector: jax.Array) -> jax.Array:
 def sphere(angles: list[jax.Array]) -> list[jax.Array]:
     """The point of the unit sphere with m spherical angles, m + 1 coordinates.
 
-        (cos a_1, sin a_1 cos a_2, ..., sin a_1 ... sin a_m)
+    (cos a_1, sin a_1 cos a_2, ..., sin a_1 ... sin a_m)
     """
     coordinates = []
     rest = None
@@ -152,5 +151,3 @@ __all__ = [
     "sphere",
     "upper_factor",
 ]
-
-

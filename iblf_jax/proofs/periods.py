@@ -76,9 +76,9 @@ def _frequencies(name: str, part: Any) -> Iterator[float]:
             yield from _frequencies(f"{name}.parts[{i}]", inner)
         return
     if isinstance(part, disturbances.Levels):
-        for i, inner in enumerate(part.parts):
-            if inner is not None:
-                yield from _frequencies(f"{name}.parts[{i}]", inner)
+        for i, of_level in enumerate(part.parts):
+            if of_level is not None:
+                yield from _frequencies(f"{name}.parts[{i}]", of_level)
         return
     if isinstance(part, CONSTANT):
         return

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -77,15 +78,6 @@ class LevelSetProblem:
             return np.asarray(_rates(self.point_rate, np.asarray(points, float), list(constants)))
 
 
+@partial(jax.jit, static_argnums=0)
 def _rates(point_rate: Callable, points: Any, constants: Any) -> jax.Array:
-    return _compiled_rates(point_rate)(points, constants)
-
-
-_PROGRAMS: dict[Callable, Callable] = {}
-
-
-def _compiled_rates(point_rate: Callable) -> Callable:
-    found = _PROGRAMS.get(point_rate)
-    if found is None:
-        found = _PROGRAMS[point_rate] = jax.jit(jax.vmap(point_rate, (0, None)))
-    return found
+    return jax.vmap(point_rate, (0, None))(points, constants)

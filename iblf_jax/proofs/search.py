@@ -32,7 +32,7 @@ STATUSES = ("proved", "undecided", "refuted", "out of boxes", "stopped", "out of
 PROVED, UNDECIDED, REFUTED, OUT_OF_BOXES, STOPPED, OUT_OF_MEMORY = range(6)
 UNITS = 4096
 """Units of work, at least, unless fewer boxes prove the statement."""
-RENEWAL = 8
+RENEWAL = 7
 """Bisections after which the weights of the coordinates are measured again."""
 NARROWEST = 2.0**-24
 """Width, in parts of the whole, up to which a coordinate is not bisected."""

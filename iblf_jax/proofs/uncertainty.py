@@ -76,8 +76,8 @@ def values_at(places: Places, numbers: Numbers, z: jax.Array) -> dict[Place, jax
 
 def leaves_at(places: Places, numbers: Numbers, part: Any, z: jax.Array) -> Any:
     """A pytree with the entries at coordinates z, (m,)."""
-    leaves, structure = jax.tree.flatten(part)
-    return structure.unflatten(replaced(leaves, values_at(places, numbers, z)))
+    new = replaced(jax.tree.leaves(part), values_at(places, numbers, z))
+    return jax.tree.unflatten(jax.tree.structure(part), new)
 
 
 def _entry(leaves: list[jax.Array], place: Place) -> jax.Array:
@@ -93,18 +93,17 @@ def between(places: Places, numbers: Numbers, nominal: Any, model: Any, z: jax.A
       model: those of the model, p0, of the same structure.
       z: coordinates, (m,).
     """
-    known, structure = jax.tree.flatten(model)
+    known = jax.tree.leaves(model)
     ends = values_at(places, numbers, z)
     for place in places.differing:
         ends.setdefault(place, _entry(jax.tree.leaves(nominal), place))
     new = {place: hull(_entry(known, place), end) for place, end in ends.items()}
-    return structure.unflatten(replaced(known, new))
+    return jax.tree.unflatten(jax.tree.structure(model), replaced(known, new))
 
 
 def _direction(model: Any, entries: dict[Place, jax.Array]) -> Any:
-    leaves, structure = jax.tree.flatten(model)
-    zeros = [jnp.zeros(np.shape(x)) for x in leaves]
-    return structure.unflatten(replaced(zeros, entries))
+    zeros = [jnp.zeros(np.shape(x)) for x in jax.tree.leaves(model)]
+    return jax.tree.unflatten(jax.tree.structure(model), replaced(zeros, entries))
 
 
 def directions(places: Places, numbers: Numbers, model: Any) -> list[Any]:

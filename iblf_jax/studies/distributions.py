@@ -327,7 +327,8 @@ class Perturbation:
         """The perturbed leaf, from its nominal value and the uniform number(s) of this draw; the
         shape of `nominal`.
         """
-        draw = jnp.broadcast_to(self.distribution.quantile(u).astype(nominal.dtype), nominal.shape)
+        distribution: Any = self.distribution
+        draw = jnp.broadcast_to(distribution.quantile(u).astype(nominal.dtype), nominal.shape)
         if self.kind == "factor":
             return nominal * draw
         if self.kind == "offset":

@@ -278,12 +278,14 @@ def random_tree(rng, depth: int):
 
 
 def value_of(tree, leaves, which: int):
-    """The value of an expression, by JAX (0) or exact (1); ValueError where it is not defined."""
+    """The value of an expression, by JAX (0) or exact (1); ValueError where it is not defined, or
+    so large that mpmath would need gigabytes for its exponential.
+    """
     if isinstance(tree, int):
         return leaves[tree]
     value = CHOICES[tree[0]][which](*(value_of(t, leaves, which) for t in tree[1:]))
-    if which and (isinstance(value, mpmath.mpc) or not mpmath.isfinite(value)):
-        raise ValueError("not a real number")
+    if which and (isinstance(value, mpmath.mpc) or not abs(value) < 1e4):
+        raise ValueError("not a real number of moderate size")
     return value
 
 
@@ -316,13 +318,13 @@ def check_random_expressions(seed: int, expressions: int) -> int:
 
 
 def test_random_expressions():
-    assert check_random_expressions(0, 300) > 1500
+    assert check_random_expressions(0, 200) > 800
 
 
 @pytest.mark.release
-@pytest.mark.parametrize("seed", range(1, 11))
+@pytest.mark.parametrize("seed", range(1, 6))
 def test_more_random_expressions(seed):
-    assert check_random_expressions(seed, 500) > 2500
+    assert check_random_expressions(seed, 300) > 1200
 
 
 # --- refusals ----------------------------------------------------------------------------------

@@ -21,7 +21,7 @@ velocities (`controllers.FullState`).
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -269,8 +269,8 @@ def xi_bound_from_errors(barrier: Barrier, V: jax.Array, tube: Tube) -> jax.Arra
     """`xi_bound` of a barrier with `error_at`: the larger |xi| on the two sides at which V1 = V,
     (n,) [1].
     """
-    e_u = barrier.error_at(V, tube, jnp.asarray(True))
-    e_l = barrier.error_at(V, tube, jnp.asarray(False))
+    e_u: Any = barrier.error_at(V, tube, jnp.asarray(True))
+    e_l: Any = barrier.error_at(V, tube, jnp.asarray(False))
     return jnp.maximum(e_u / tube.k_u, -e_l / tube.k_l)
 
 
