@@ -12,7 +12,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize
 
 from iblf_jax.core import checks
 from iblf_jax.proofs._prove import problem_of, prove, sample_weights, weights_of
@@ -93,6 +92,8 @@ def gains_for_guarantee(
 
     Source: J. A. Nelder, R. Mead, The Computer Journal 7 (1965) 308-313.
     """
+    from scipy.optimize import minimize
+
     limits = _limits(gains)
     tries = checks.positive_integer("tries", tries, most=100_000)
     low, high = np.log(np.array(list(limits.values()))).T

@@ -375,7 +375,7 @@ def tube_of_level(scenario: Scenario, level: float, duration: float) -> Guarante
 
 def position_barrier(scenario: Scenario) -> tuple[Any, jax.Array]:
     """The barrier of the positions and the weight of its V1."""
-    law = scenario.controller
+    law: Any = scenario.controller
     if plants.is_chain(scenario.plant):
         return law.barriers[0], law.weights[0]
     return law.barrier, law.weight
