@@ -15,11 +15,11 @@ so that every x lies on the level set.  sign_i is the side of the tube on which 
 
 **Parameters.**  For fixed derivatives in (U.1), f0 and H are affine in the coordinates z,
 
-    f' = d0' - sum_k z_k (W_k + M_k M0^-1 F),   F = (I + dM M0^-1)^-1 (d0' - dW)
+    f'(z) = f'(c) - sum_k (z_k - c_k) (I + dM(c) M0^-1)^-1 (W_k + M_k M0^-1 F)
 
-where F, which differs from f' by terms that are small of second order, is enclosed.  (B.1) is
-convex in f0 and H, so that its maximum over z is that at the corners of the box of z: V_w' is
-bounded at each corner, and z need not be bisected.
+with the centre c of the box of z.  F is f'(z) once more and is enclosed over the box; its product
+with z - c is of second order in the size of the box.  (B.1) is convex in f0 and H, so that its
+maximum over z is that at the corners of the box of z: V_w' is bounded at each corner.
 """
 
 from __future__ import annotations
@@ -150,7 +150,7 @@ def on_columns(function: Any, vector: Affine) -> Affine:
 
 
 class Mismatch(NamedTuple):
-    """f' as a function of the parameters: constant + sum_k (z_k - r_k) columns_k."""
+    """f' as a function of the parameters: constant + sum_k (z_k - c_k) columns_k, c the centre."""
 
     constant: Affine
     columns: list[Affine]
@@ -201,9 +201,6 @@ def mismatch(constants: Constants, places: Places, at: Errors, z: jax.Array) -> 
         return along(lambda p: p[0].mass_matrix(q), (inside,), (direction,))
 
     found = in_f_tilde(rates, n)
-    size = z - numbers.reference
-    if fixed is not None:
-        size = jnp.concatenate([jnp.ones(1), size])
     # M_k M0^-1, of which the inverse is a narrow interval where q is one
     shares = [matmul(mass_along(direction), M0_inverse) for direction in directions]
 
@@ -218,25 +215,34 @@ def mismatch(constants: Constants, places: Places, at: Errors, z: jax.Array) -> 
     # The rate of a further disturbance is a coordinate without entries.
     columns += [Affine(-unit, jnp.zeros((n, n))) for unit in jnp.eye(n)[: places.rates]]
     shares += [jnp.zeros((n, n))] * places.rates
-    total, right = jnp.eye(n), found.external
-    for k, (column, share) in enumerate(zip(columns, shares, strict=True)):
-        total = total + size[k] * share
-        right = add(right, scaled(-size[k], column))
-    total_rate = on_columns(lambda column: solve_general(total, column), right)
+
+    def solution_at(z: jax.Array) -> tuple[jax.Array, Affine]:
+        """I + dM M0^-1 and f' at coordinates z."""
+        size = z - numbers.reference
+        if fixed is not None:
+            size = jnp.concatenate([jnp.ones(1), size])
+        total, right = jnp.eye(n), found.external
+        for k, (column, share) in enumerate(zip(columns, shares, strict=True)):
+            total = total + size[k] * share
+            right = add(right, scaled(-size[k], column))
+        return total, on_columns(lambda column: solve_general(total, column), right)
+
+    total, constant = solution_at(centre(z))
+    _, everywhere = solution_at(z)
 
     def affine_column(column: Affine, share: jax.Array) -> Affine:
-        product = on_columns(lambda column: matvec(share, column), total_rate)
-        return scaled(jnp.asarray(-1.0), add(column, product))
+        product = on_columns(lambda column: matvec(share, column), everywhere)
+        force = scaled(jnp.asarray(-1.0), add(column, product))
+        return on_columns(lambda column: solve_general(total, column), force)
 
-    affine = [affine_column(*pair) for pair in zip(columns, shares, strict=True)]
-    if fixed is not None:
-        return Mismatch(add(found.external, affine[0]), affine[1:])
-    return Mismatch(found.external, affine)
+    first = 0 if fixed is None else 1
+    pairs = zip(columns[first:], shares[first:], strict=True)
+    return Mismatch(constant, [affine_column(*pair) for pair in pairs])
 
 
-def corners(constants: Constants, found: Mismatch, z: jax.Array) -> list[Affine]:
+def corners(found: Mismatch, z: jax.Array) -> list[Affine]:
     """F' at each corner of the box of parameters."""
-    size = z - constants.numbers.reference
+    size = z - centre(z)
     ends = [(lower(size[k]), upper(size[k])) for k in range(len(found.columns))]
     vertices = []
     for choice in itertools.product(*ends):
@@ -272,7 +278,7 @@ def corner_terms(
     e2 = point.errors.e2
     kf, K = jnp.diag(parts.kf), jnp.min(parts.law.K2)
     terms = []
-    for vertex in corners(constants, mismatch(constants, places, point.errors, z), z):
+    for vertex in corners(mismatch(constants, places, point.errors, z), z):
         gain = least_eigenvalue(kf - 0.5 * (vertex.slope + vertex.slope.T))
         push = weight * vertex.value
         drive = norm(e2 + push)

@@ -166,10 +166,10 @@ def points_of(problem, x):
     return np.concatenate([t, shares, x[:, 1 + angles : start]], axis=1)
 
 
-@pytest.mark.parametrize("name", LEVERS)
-def test_bounds_are_above_the_points_of_their_boxes(name):
-    problem = chain_problem(LEVERS[name], within(0.1, *LEVER))
-    constants = problem.constants(1.0, 0.3)
+def check_bounds(scenario, parameters, level):
+    """Bounds of random boxes against a random point of each."""
+    problem = chain_problem(scenario, parameters)
+    constants = problem.constants(1.0, level)
     generator = np.random.default_rng(2)
     count = 2000
     size = problem.upper - problem.lower
@@ -188,6 +188,17 @@ def test_bounds_are_above_the_points_of_their_boxes(name):
     narrow = np.isfinite(bounds) & (width[:, 0] < 1e-5)
     assert narrow.sum() > 100
     assert np.median(bounds[narrow] - rates[narrow]) < 0.05
+
+
+@pytest.mark.parametrize("name", LEVERS)
+def test_bounds_are_above_the_points_of_their_boxes(name):
+    check_bounds(LEVERS[name], within(0.1, *LEVER), 0.3)
+
+
+@pytest.mark.release
+@pytest.mark.parametrize("upper", [Mapping(), Quadratic()], ids=["Mapping", "Quadratic"])
+def test_bounds_of_order_3(upper):
+    check_bounds(pendulum((Mapping(), upper, upper)), within(0.05, *PENDULUM), 0.5)
 
 
 def proved(problem, weight, level, max_boxes):
