@@ -408,10 +408,10 @@ def _refuted(
     the run is accurate; a run that is not accurate with the smallest one refutes nothing.
     """
     constants = problem.constants(sampled.weight, level)
-    duration = problem.duration
-    if problem.is_period:
-        duration = max(duration, LEAST_DURATION)
     for point in sampled.points[:runs]:
+        duration = max(problem.duration, LEAST_DURATION)
+        if not problem.is_period:
+            duration = max(problem.duration - point[0], TIME_STEPS[0])
         scenario = problem.scenario_at(point, constants)
         for dt in TIME_STEPS:
             run = _run(scenario, duration, dt)

@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 
 INSTANTS = 512
 """Times of a guaranteed tube."""
+AT_REST = 5.0
+"""Time that is shown if reference and bounds are constant, so that there is no period [s]."""
 
 
 class Verdict(enum.StrEnum):
@@ -218,7 +220,7 @@ class Proof:
           seed: of the random points.
         """
         count = checks.positive_integer("count", count, least=0)
-        steps = math.ceil((duration or self.duration) / dt)
+        steps = math.ceil((duration or self.duration or AT_REST) / dt)
         constants = self.problem.constants(self.weight, self.level)
         points = self.problem.sample(seed, 2 * count)[::2]
         points[:, 0] = 0.0
@@ -358,7 +360,7 @@ def tube_of_level(scenario: Scenario, level: float, duration: float) -> Guarante
     """Positions in {V_w <= level} over time."""
     scenario = canonical(astype(scenario, jnp.float64))
     barrier, weight = position_barrier(scenario)
-    times = jnp.linspace(0.0, duration, INSTANTS)
+    times = jnp.linspace(0.0, duration or AT_REST, INSTANTS)
 
     def ends(t):
         tube = scenario.context.tube(t)

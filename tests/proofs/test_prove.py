@@ -135,6 +135,24 @@ WIDE = 5.0
 """Percent: V_w' < 0 at all points that are sampled, and more boxes are needed than in the test."""
 
 
+def test_a_time_interval_that_is_no_period():
+    found = proof(weight=2e-3, duration=2.0)
+    assert found.proved and not found.is_period
+    assert "for 0 <= t <= 2 s" in repr(found)
+    assert found.tube.t[-1] == 2.0
+
+
+@pytest.mark.release  # a program of its own
+def test_constant_reference_and_bounds():
+    scenario = pendulum(
+        reference=ij.references.Sinusoid(offset=[0.5], amplitude=0.0, frequency=1.0),
+        bounds=ij.Bounds(lower=ij.bounds.Constant([0.1]), upper=ij.bounds.Constant([1.0])),
+    )
+    found = ij.prove(scenario, level=0.5, parameters=within(3.0), progress=False)
+    assert found.proved and found.is_period and found.duration == 0.0
+    assert contradictions(found, 4) == 0
+
+
 def test_a_given_weight_is_the_only_one():
     found = proof(weight=2e-3)
     assert found.proved and list(found.rates) == [2e-3]
@@ -273,7 +291,7 @@ def test_two_links_are_proved_and_nothing_contradicts(gains, percent, level):
     found = ij.prove(paper(**gains), level=level, parameters=within(percent), progress=False)
     assert found.proved
     assert max(largest_rate(found, 100_000, seed) for seed in range(10)) < 0.0
-    assert contradictions(found, 500) == 0
+    assert contradictions(found, 10_000, duration=2.0) == 0
 
 
 @pytest.mark.release
