@@ -28,10 +28,17 @@ PAGES: dict[str, tuple[str, str]] = {
         (
             "monte_carlo Study sweep load_sweep StoreError sensitivity Sensitivity compare"
             " Comparison failure_probability FailureProbability factor offset value"
-            " uniform normal log_uniform choice joint_normal joint_samples"
+            " uniform normal log_uniform choice joint_normal joint_samples interval"
         ),
     ),
     "certificates": ("Certificates", "certify Certificate Counterexample"),
+    "proofs": (
+        "Proofs",
+        (
+            "prove Proof largest_level largest_parameters gains_for_guarantee GuaranteedGains"
+            " proofs.Verdict proofs.GrowthPoint proofs.GuaranteedTube"
+        ),
+    ),
     "tuning": (
         "Tuning",
         (

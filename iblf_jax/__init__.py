@@ -51,6 +51,7 @@ from iblf_jax.simulation.vector_field import VectorField as VectorField
 from iblf_jax.simulation.vector_field import vector_field as vector_field
 from iblf_jax.studies.distributions import choice as choice
 from iblf_jax.studies.distributions import factor as factor
+from iblf_jax.studies.distributions import interval as interval
 from iblf_jax.studies.distributions import joint_normal as joint_normal
 from iblf_jax.studies.distributions import joint_samples as joint_samples
 from iblf_jax.studies.distributions import log_uniform as log_uniform
@@ -104,6 +105,7 @@ _keep_public_import_paths()
 if TYPE_CHECKING:
     from iblf_jax import certificates as certificates
     from iblf_jax import plotting as plotting
+    from iblf_jax import proofs as proofs
     from iblf_jax import studies as studies
     from iblf_jax import testing as testing
     from iblf_jax import tuning as tuning
@@ -121,6 +123,12 @@ if TYPE_CHECKING:
     from iblf_jax.identification import Identification as Identification
     from iblf_jax.identification import excitation as excitation
     from iblf_jax.identification import identify as identify
+    from iblf_jax.proofs import GuaranteedGains as GuaranteedGains
+    from iblf_jax.proofs import Proof as Proof
+    from iblf_jax.proofs import gains_for_guarantee as gains_for_guarantee
+    from iblf_jax.proofs import largest_level as largest_level
+    from iblf_jax.proofs import largest_parameters as largest_parameters
+    from iblf_jax.proofs import prove as prove
     from iblf_jax.reports import report as report
     from iblf_jax.studies import distributed as distributed
     from iblf_jax.studies.compare import compare as compare
@@ -164,14 +172,21 @@ _ON_FIRST_USE = {
     "falsify": ("iblf_jax.tuning", "falsify"),
     "Front": ("iblf_jax.tuning", "Front"),
     "excitation": ("iblf_jax.identification", "excitation"),
+    "gains_for_guarantee": ("iblf_jax.proofs", "gains_for_guarantee"),
+    "GuaranteedGains": ("iblf_jax.proofs", "GuaranteedGains"),
     "Identification": ("iblf_jax.identification", "Identification"),
     "identify": ("iblf_jax.identification", "identify"),
+    "largest_level": ("iblf_jax.proofs", "largest_level"),
+    "largest_parameters": ("iblf_jax.proofs", "largest_parameters"),
     "load_sweep": ("iblf_jax.studies.sweep", "load_sweep"),
     "load_tuning": ("iblf_jax.files.tuning", "load_tuning"),
     "monte_carlo": ("iblf_jax.studies.monte_carlo", "monte_carlo"),
     "objectives": ("iblf_jax.tuning.objectives", None),
     "pareto": ("iblf_jax.tuning", "pareto"),
     "plotting": ("iblf_jax.plotting", None),
+    "Proof": ("iblf_jax.proofs", "Proof"),
+    "proofs": ("iblf_jax.proofs", None),
+    "prove": ("iblf_jax.proofs", "prove"),
     "recommended_dt": ("iblf_jax.studies.time_step", "recommended_dt"),
     "recommended_period": ("iblf_jax.engine.period", "recommended_period"),
     "report": ("iblf_jax.reports", "report"),

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
     from iblf_jax.certificates import Certificate
     from iblf_jax.identification import Identification
+    from iblf_jax.proofs import Proof
     from iblf_jax.simulation.results import Rollout
     from iblf_jax.studies.comparison import Comparison
     from iblf_jax.studies.study import Study
@@ -237,6 +238,20 @@ def _identification(found: Identification) -> Shown:
     return Shown("Identification", found.words(), contents, figures, found.scenario, on_card=2)
 
 
+def _proof(found: Proof) -> Shown:
+    rows = [
+        (path, unit_at(found.scenario, path), f"{low:.6g}", f"{high:.6g}")
+        for path, (low, high) in found.ranges.items()
+    ]
+    contents = {}
+    if rows:
+        contents["Uncertain parameters"] = tables.as_html(("path", "unit", "from", "to"), rows)
+    points = [(f"{w:.4g}", f"{rate:+.4g}") for w, rate in found.rates.items()]
+    contents["Largest V_w' found, by weight"] = tables.as_html(("w", "V_w'"), points)
+    words = [found.sentence(), *found.details()]
+    return Shown(f"Proof: {found.verdict}", words, contents, {"Tube": found.plot}, found.scenario)
+
+
 KINDS: dict[str, Callable[[Any], Shown]] = {
     "Scenario": _scenario,
     "Rollout": _rollout,
@@ -245,6 +260,7 @@ KINDS: dict[str, Callable[[Any], Shown]] = {
     "Comparison": _comparison,
     "TuneResult": _tuning,
     "Identification": _identification,
+    "Proof": _proof,
 }
 """Name of a result's class -> the function that makes the content.  Names in place of classes avoid
 the import of modules that are not used."""
@@ -293,8 +309,8 @@ def report(result: Any, path: str | Path, *, title: str | None = None) -> Path:
     the versions.
 
     Args:
-      result: a Scenario, Rollout, Study, Certificate, Comparison, TuneResult, Identification, or
-        any other result of this package.
+      result: a Scenario, Rollout, Study, Certificate, Comparison, TuneResult, Identification,
+        Proof, or any other result of this package.
       path: the file, which must end in ".html"; its folder must exist.
       title: the heading; the kind of the result if not given.
 

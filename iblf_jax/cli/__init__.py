@@ -35,6 +35,7 @@ COMMANDS = (
     "failure",
     "sweep",
     "tune",
+    "prove",
     "identify",
     "export",
     "presets",

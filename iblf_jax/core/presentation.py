@@ -17,11 +17,13 @@ PRESENTATIONS = {
     "first exit figure": ("iblf_jax.plotting", "first_exit"),
     "front figure": ("iblf_jax.plotting", "pareto"),
     "identification figure": ("iblf_jax.plotting", "identification"),
+    "proof figure": ("iblf_jax.plotting", "guaranteed_tube"),
     "rollout figure": ("iblf_jax.plotting", "overview"),
     "study figure": ("iblf_jax.plotting", "study_overview"),
     "tuning figure": ("iblf_jax.plotting", "tuning"),
     "card": ("iblf_jax.reports", "card"),
     "report": ("iblf_jax.reports", "report"),
+    "proof dataset": ("iblf_jax.files.proofs", "proof_to_xarray"),
     "rollout dataset": ("iblf_jax.files.rollouts", "rollout_to_xarray"),
     "tuning file": ("iblf_jax.files.tuning", "save_tuning"),
 }

@@ -17,6 +17,7 @@ pipeline has three stages:
 
 `cpu` compiles the C with the system's C++ compiler or, where there is none, with Clang from the
 package `ziglang` (`toolchain`), and calls it from within jit. `cuda` does the same with NVRTC.
+`enclosure` evaluates a function over boxes, by interval arithmetic with outward rounding.
 
 The following step integrates x' = -k x by Euler's method with a step size of 0.1 s. The gain k is
 shared, and nothing differs between runs but the state:
@@ -70,9 +71,18 @@ from iblf_jax.kernels.cpu import c_source as c_source
 from iblf_jax.kernels.drafts import draft as draft
 from iblf_jax.kernels.emit_c import header as header
 from iblf_jax.kernels.emit_c import plain_function as plain_function
+from iblf_jax.kernels.enclosure import IntervalKernel as IntervalKernel
+from iblf_jax.kernels.enclosure import enclose as enclose
+from iblf_jax.kernels.enclosure import interval_kernel as interval_kernel
+from iblf_jax.kernels.enclosure import pointer as pointer
 from iblf_jax.kernels.folder import cpuinfo as cpuinfo
 from iblf_jax.kernels.folder import directory as directory
 from iblf_jax.kernels.folder import processor as processor
+from iblf_jax.kernels.interval_primitives import hull as hull
+from iblf_jax.kernels.interval_primitives import lower as lower
+from iblf_jax.kernels.interval_primitives import meet as meet
+from iblf_jax.kernels.interval_primitives import upper as upper
+from iblf_jax.kernels.interval_primitives import with_sign as with_sign
 from iblf_jax.kernels.messages import has_reader as has_reader
 from iblf_jax.kernels.operations import OPERATIONS as OPERATIONS
 from iblf_jax.kernels.packed import Packed as Packed

@@ -49,6 +49,7 @@ class Called(NamedTuple):
     dtype: Any
     sparse: bool
     limits: LoweringLimits
+    exact: bool
     read: Callable
     """Function (builder, jaxpr, operands) -> results."""
 
@@ -106,6 +107,7 @@ def apply(
         b.dtype,
         b.sparse,
         b.limits,
+        b.exact,
         read,
     )
     template = _template(called)
@@ -168,6 +170,7 @@ def _template(called: Called) -> Template:
         called.dtype,
         sparse=called.sparse,
         limits=called.limits._replace(written_out=math.inf, under_condition=math.inf),
+        exact=called.exact,
     )
 
     def node_of(kind, value, *known):

@@ -11,6 +11,7 @@ whether a sum with logarithms is finite (`_is_finite`), where the sum is so larg
 from __future__ import annotations
 
 import math
+import operator
 from functools import reduce
 from typing import TYPE_CHECKING
 
@@ -36,6 +37,34 @@ def fold(op: str, values: list, kinds: list[str], kind: str, dtype: np.dtype):
     types = {"f": dtype.type, "i": np.int64, "b": np.bool_}
     with np.errstate(all="ignore"):
         return function(*(types[k](v) for k, v in zip(kinds, values, strict=True))).item()
+
+
+EXACT = frozenset({"neg", "abs", "max", "min", "sign", "floor", "ceil", "round_even"})
+"""Operations on floating-point numbers whose results are not rounded."""
+EXACT_ARITHMETIC = {
+    "add": operator.add,
+    "sub": operator.sub,
+    "mul": operator.mul,
+    "div": operator.truediv,
+}
+"""Operations that may be exact for some numbers -> the same on fractions."""
+
+
+def is_exact(op: str, values: list, kind: str) -> bool:
+    """Whether the floating-point result of an operation on constants is exact."""
+    if kind != "f" or op in EXACT or op == "convert":
+        return True
+    if op not in EXACT_ARITHMETIC or not all(map(math.isfinite, values)):
+        return False
+    if op == "div" and values[1] == 0:
+        return False
+    from fractions import Fraction  # takes several milliseconds
+
+    result = EXACT_ARITHMETIC[op](*map(Fraction, values))
+    try:
+        return Fraction(float(result)) == result
+    except OverflowError:
+        return False
 
 
 def simplify(b: Builder, op: str, args: tuple[int, ...], kind: str) -> int | None:
@@ -268,6 +297,37 @@ def _extreme(b: Builder, args, kind):
     return None
 
 
+def _sign_of(b: Builder, node: int) -> int | None:
+    """The node of the sign of a number whose sign is given (`with_sign`); None for others."""
+    found = b.nodes[node]
+    if found.op == "with_sign":
+        return found.args[1]
+    if found.op == "neg":
+        sign = _sign_of(b, found.args[0])
+        if sign is not None:
+            return b.emit("neg", sign)
+    return None
+
+
+def _comparison(op: str):
+    """The rule of a comparison: with 0, a given sign decides."""
+
+    def rule(b: Builder, args, kind):
+        signs = [_sign_of(b, a) for a in args]
+        for one, other in ((0, 1), (1, 0)):
+            if signs[one] is not None and b.value(args[other]) == 0:
+                decided = list(args)
+                decided[one] = signs[one]
+                return b.emit(op, *decided, kind=kind)
+        return None
+
+    return rule
+
+
+def _sign(b: Builder, args, kind):
+    return _sign_of(b, args[0])
+
+
 _RULES = {
     "add": _add,
     "sub": _sub,
@@ -282,4 +342,6 @@ _RULES = {
     "is_finite": _is_finite,
     "max": _extreme,
     "min": _extreme,
+    "sign": _sign,
+    **{op: _comparison(op) for op in ("lt", "le", "gt", "ge", "eq", "ne")},
 }

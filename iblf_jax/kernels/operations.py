@@ -117,3 +117,6 @@ OPERATIONS: dict[str, Operation] = {
 }
 """The operations of a program, besides constants and inputs. The effect of "convert" depends on
 both kinds, and a "lookup" has a table."""
+ON_INTERVALS = ("upper", "lower", "hull", "meet", "with_sign")
+"""Operations that only programs on intervals have (`interval_primitives`)."""
+COMMUTING = frozenset(name for name, operation in OPERATIONS.items() if operation.commutes)

@@ -26,8 +26,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from iblf_jax.kernels.identities import fold, simplify, without_absent
-from iblf_jax.kernels.operations import OPERATIONS
+from iblf_jax.kernels.identities import fold, is_exact, simplify, without_absent
+from iblf_jax.kernels.operations import COMMUTING
 
 SHARED, PER_RUN, TIME = 0, 1, 2
 INPUTS = ("shared", "per_run", "carry", "index", "argument")
@@ -140,7 +140,14 @@ def extend_classes(
 class Builder:
     """Adds nodes to a list; equal nodes are one node."""
 
-    def __init__(self, dtype, *, sparse: bool = False, limits: LoweringLimits = NO_LIMITS) -> None:
+    def __init__(
+        self,
+        dtype,
+        *,
+        sparse: bool = False,
+        limits: LoweringLimits = NO_LIMITS,
+        exact: bool = False,
+    ) -> None:
         """Starts an empty list of nodes.
 
         Args:
@@ -148,8 +155,11 @@ class Builder:
           sparse: whether a product with a literal zero is zero. This holds for programs of
             derivatives, in which such a zero means "does not depend".
           limits: sizes above which a jaxpr is not compiled.
+          exact: whether the program must be equal to the jaxpr in real arithmetic, as one on
+            intervals must: constants are folded only where the result is not rounded.
         """
         self.dtype = np.dtype(dtype)
+        self.exact = exact
         self.sparse = sparse
         self.limits = limits
         self.nodes: list[Node] = []
@@ -183,18 +193,25 @@ class Builder:
                 return rest
         if all(self.nodes[a].op == "const" for a in args):
             nodes = [self.nodes[a] for a in args]
-            folded = fold(op, [n.value for n in nodes], [n.kind for n in nodes], kind, self.dtype)
+            folded = self._folded(op, nodes, kind)
             if folded is not None:
                 return self.constant(folded, kind)
         simpler = simplify(self, op, args, kind)
         if simpler is not None:
             return simpler
-        if OPERATIONS[op].commutes:
+        if op in COMMUTING:
             args = tuple(sorted(args))
         new = self._add(Node(op, tuple(args), kind), None)
         if kind == "f" and self.known_finite and all(map(self._is_finite, args)):
             self.known_finite.add(new)
         return new
+
+    def _folded(self, op: str, nodes: Sequence[Node], kind: str):
+        """The value of an operation on constants; None if it is not computed here."""
+        values = [node.value for node in nodes]
+        if self.exact and not is_exact(op, values, kind):
+            return None
+        return fold(op, values, [node.kind for node in nodes], kind, self.dtype)
 
     def lookup(self, table: tuple[float, ...], index: int) -> int:
         """The node of table[index], for an index that is unknown at compile time."""

@@ -11,7 +11,7 @@ from functools import reduce
 
 import numpy as np
 
-from iblf_jax.kernels.operations import OPERATIONS
+from iblf_jax.kernels.operations import ON_INTERVALS, OPERATIONS
 from iblf_jax.kernels.program import Builder, Ids, UnsupportedError, kind_of
 from iblf_jax.kernels.structure import STRUCTURE
 
@@ -33,7 +33,11 @@ def _integer_pow(b: Builder, eqn, x: Ids) -> Ids:
 
 
 def power(b: Builder, eqn, x: Ids, exponent: int) -> Ids:
-    """x^exponent by squaring, for an integer exponent."""
+    """x^exponent by squaring, for an integer exponent; on intervals, an odd power is one operation,
+    which does not lose that its factors are equal.
+    """
+    if b.exact and abs(exponent) > 2:
+        return _power_of_interval(b, eqn, x, exponent)
     result, square, left = None, x, abs(exponent)
     kind = kind_of(eqn.outvars[0].aval.dtype)
     while left:
@@ -47,6 +51,14 @@ def power(b: Builder, eqn, x: Ids, exponent: int) -> Ids:
         return one
     if exponent < 0:
         return each(b, "div", eqn, one, result)
+    return result
+
+
+def _power_of_interval(b: Builder, eqn, x: Ids, exponent: int) -> Ids:
+    """x^exponent for an integer exponent as the operation "pow", inverted if it is negative."""
+    result = each(b, "pow", eqn, x, np.full(x.shape, b.constant(abs(exponent), "f")))
+    if exponent < 0:
+        return each(b, "div", eqn, np.full(x.shape, b.constant(1, "f")), result)
     return result
 
 
@@ -202,14 +214,31 @@ def _square(b: Builder, eqn, x: Ids) -> Ids:
 
 
 def _one_minus_square(b: Builder, eqn, x: Ids) -> Ids:
-    """As (1 + x) (1 - x), which is exact where |x| is close to 1."""
+    """As (1 + x) (1 - x), which is exact where |x| is close to 1; on intervals as 1 - x^2, in which
+    x occurs once.
+    """
     one = np.full(x.shape, b.constant(1, "f"))
+    if b.exact:
+        return each(b, "sub", eqn, one, each(b, "mul", eqn, x, x))
     return each(b, "mul", eqn, each(b, "add", eqn, one, x), each(b, "sub", eqn, one, x))
 
 
 def _log2(b: Builder, eqn, x: Ids) -> Ids:
+    if b.exact:
+        raise UnsupportedError("the operation 'log2' is not available on intervals")
     log_of_2 = np.full(x.shape, b.constant(np.log(2.0), "f"))
     return each(b, "div", eqn, each(b, "log", eqn, x), log_of_2)
+
+
+def _of_intervals(op: str) -> Callable:
+    """The rule of a primitive of `interval_primitives`, the identity elsewhere."""
+
+    def rule(b: Builder, eqn, x: Ids, *others: Ids) -> Ids:
+        if b.exact:
+            return each(b, op, eqn, x, *others)
+        return x
+
+    return rule
 
 
 def _primitives_of(op: str) -> tuple[str, ...]:
@@ -248,4 +277,5 @@ RULES: dict[str, Callable] = {
     "cummax": _cumulative("max"),
     "cummin": _cumulative("min"),
     "dot_general": _dot_general,
+    **{op: _of_intervals(op) for op in ON_INTERVALS},
 }

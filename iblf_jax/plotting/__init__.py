@@ -28,6 +28,7 @@ from iblf_jax.plotting._figures import velocity_errors as velocity_errors
 from iblf_jax.plotting._figures import velocity_portrait as velocity_portrait
 from iblf_jax.plotting._identification import identification as identification
 from iblf_jax.plotting._overview import overview as overview
+from iblf_jax.plotting._proofs import guaranteed_tube as guaranteed_tube
 from iblf_jax.plotting._studies import bands as bands
 from iblf_jax.plotting._studies import first_exit as first_exit
 from iblf_jax.plotting._studies import histograms as histograms

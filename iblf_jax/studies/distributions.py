@@ -222,6 +222,36 @@ class JointNormal:
 
 
 @component
+class Interval:
+    """All numbers between `low` and `high`, without probabilities: a set for proofs.
+
+    It has no quantile: studies that draw, design or search runs refuse it.
+
+    Args:
+      low: the lower end, () or as the leaf, in its unit.
+      high: the upper end, () or as the leaf, in its unit.
+    """
+
+    low: jax.Array = leaf("", shape="any")
+    high: jax.Array = leaf("", shape="any")
+
+    def check(self) -> None:
+        """Raises ValueError unless low < high."""
+        _increasing("interval", self.low, self.high)
+
+    def support(self) -> tuple[np.ndarray, np.ndarray]:
+        """The two ends."""
+        return np.asarray(self.low), np.asarray(self.high)
+
+
+def is_interval(perturbation: Any) -> bool:
+    """Whether a perturbation states a set of values and no distribution."""
+    return isinstance(perturbation, Perturbation) and isinstance(
+        perturbation.distribution, Interval
+    )
+
+
+@component
 class JointSamples:
     """One of a list of samples, of leaves that vary together.
 
@@ -294,18 +324,19 @@ class Perturbation:
     """A distribution and how its draw acts on a leaf; made by `factor`, `offset` and `value`.
 
     Args:
-      distribution: of the draw, any `Distribution`; of a factor [1], else in the leaf's unit.
+      distribution: of the draw, any `Distribution`, or an `Interval`; of a factor [1], else in the
+        leaf's unit.
       kind: "factor", "offset" or "value"; "value" if not given.
       shared: whether all entries of a vector leaf get the same draw; False if not given.
     """
 
-    distribution: Distribution
+    distribution: Distribution | Interval
     kind: str = static(default="value")
     shared: bool = static(default=False)
 
     def check(self) -> None:
         """Raises ValueError for something that is not a distribution."""
-        if not isinstance(self.distribution, Distribution):
+        if not isinstance(self.distribution, Distribution | Interval):
             raise _no_distribution(self.kind, self.distribution)
         checks.one_of("Perturbation.kind", self.kind, KINDS)
         object.__setattr__(self, "shared", checks.boolean("Perturbation.shared", self.shared))
@@ -319,7 +350,8 @@ class Perturbation:
         """The perturbed leaf, from its nominal value and the uniform number(s) of this draw; the
         shape of `nominal`.
         """
-        draw = jnp.broadcast_to(self.distribution.quantile(u).astype(nominal.dtype), nominal.shape)
+        distribution: Any = self.distribution
+        draw = jnp.broadcast_to(distribution.quantile(u).astype(nominal.dtype), nominal.shape)
         if self.kind == "factor":
             return nominal * draw
         if self.kind == "offset":
@@ -364,6 +396,24 @@ def uniform(low: Any, high: Any) -> Uniform:
       ValueError: unless low < high.
     """
     return Uniform(low, high)
+
+
+def interval(low: Any, high: Any) -> Interval:
+    """All numbers between two ends, for proofs; it has no probabilities.
+
+        low <= z <= high
+
+    Args:
+      low, high: the ends, numbers or arrays that fit the leaf.
+
+    Returns:
+      A set for `factor`, `offset` or `value`, which proofs take; `uniform(low, high)` is the
+      distribution for studies.
+
+    Raises:
+      ValueError: unless low < high.
+    """
+    return Interval(low, high)
 
 
 def normal(mean: Any = 0.0, std: Any = 1.0) -> Normal:
@@ -471,7 +521,7 @@ def choice(values: Any, weights: Any = None) -> Choice:
 
 def _perturbation(kind: str, distribution: Any, shared: Any) -> Perturbation:
     """A perturbation; ValueError for an invalid distribution."""
-    if not isinstance(distribution, Distribution):
+    if not isinstance(distribution, Distribution | Interval):
         raise _no_distribution(kind, distribution)
     return Perturbation(distribution, kind, shared)
 
@@ -481,7 +531,7 @@ def _no_distribution(kind: str, given: Any) -> ValueError:
     return checks.fail(f"{kind}: distribution", given, "a distribution", remedy)
 
 
-def factor(distribution: Distribution, *, shared: bool = False) -> Perturbation:
+def factor(distribution: Distribution | Interval, *, shared: bool = False) -> Perturbation:
     """The leaf is its nominal value times a draw.
 
         x = x0 z
@@ -491,7 +541,8 @@ def factor(distribution: Distribution, *, shared: bool = False) -> Perturbation:
       shared: one draw for all entries of a vector leaf, rather than one each.
 
     Returns:
-      A perturbation for `monte_carlo`, `sweep`, `sensitivity` and `tune`.
+      A perturbation for `monte_carlo`, `sweep`, `sensitivity` and `tune`; of an `interval`, for
+      proofs.
 
     Raises:
       ValueError: not a distribution.
@@ -501,7 +552,7 @@ def factor(distribution: Distribution, *, shared: bool = False) -> Perturbation:
     return _perturbation("factor", distribution, shared)
 
 
-def offset(distribution: Distribution, *, shared: bool = False) -> Perturbation:
+def offset(distribution: Distribution | Interval, *, shared: bool = False) -> Perturbation:
     """The leaf is its nominal value plus a draw.
 
         x = x0 + z
@@ -511,7 +562,8 @@ def offset(distribution: Distribution, *, shared: bool = False) -> Perturbation:
       shared: one draw for all entries of a vector leaf, rather than one each.
 
     Returns:
-      A perturbation for `monte_carlo`, `sweep`, `sensitivity` and `tune`.
+      A perturbation for `monte_carlo`, `sweep`, `sensitivity` and `tune`; of an `interval`, for
+      proofs.
 
     Raises:
       ValueError: not a distribution.
@@ -521,7 +573,7 @@ def offset(distribution: Distribution, *, shared: bool = False) -> Perturbation:
     return _perturbation("offset", distribution, shared)
 
 
-def value(distribution: Distribution, *, shared: bool = False) -> Perturbation:
+def value(distribution: Distribution | Interval, *, shared: bool = False) -> Perturbation:
     """The leaf is a draw.
 
         x = z
@@ -531,7 +583,8 @@ def value(distribution: Distribution, *, shared: bool = False) -> Perturbation:
       shared: one draw for all entries of a vector leaf, rather than one each.
 
     Returns:
-      A perturbation for `monte_carlo`, `sweep`, `sensitivity` and `tune`.
+      A perturbation for `monte_carlo`, `sweep`, `sensitivity` and `tune`; of an `interval`, for
+      proofs.
 
     Raises:
       ValueError: not a distribution.

@@ -31,6 +31,7 @@ from iblf_jax.studies.distributions import (
     JointSamples,
     Perturbation,
     distribution_member,
+    is_interval,
 )
 
 _SIGNS = {"positive": "> 0", "nonnegative": ">= 0"}
@@ -115,7 +116,12 @@ def check_paths(scenario: Scenario, chosen: Iterable[str], what: str) -> None:
 
 
 def targets_of(
-    scenario: Scenario, perturbations: Any, what: str = "perturbations", *, signs: bool = True
+    scenario: Scenario,
+    perturbations: Any,
+    what: str = "perturbations",
+    *,
+    signs: bool = True,
+    intervals: bool = False,
 ) -> tuple[tuple[Target, ...], dict[str, Perturbation]]:
     """Checks a user's perturbations; returns the targets, and target path -> perturbation.
 
@@ -124,11 +130,14 @@ def targets_of(
       perturbations: path -> perturbation.
       what: their name in error messages.
       signs: whether to refuse bounded distributions that reach inadmissible values.
+      intervals: whether the perturbations are sets without probabilities (`ij.interval`) and not
+        distributions.
 
     Raises:
-      ValueError: not a mapping of perturbations, an unknown or overlapping path, a distribution
-        that does not fit the leaf or reaches inadmissible values (a factor from -1 to 1 on a
-        mass), or leaves that cannot share the draws of their group.
+      ValueError: not a mapping of perturbations, an unknown or overlapping path, an interval in
+        place of a distribution or the reverse, a distribution that does not fit the leaf or reaches
+        inadmissible values (a factor from -1 to 1 on a mass), or leaves that cannot share the draws
+        of their group.
     """
     checks.mapping(what, perturbations, '{"plant.mass[1]": ij.factor(ij.uniform(0.7, 1.3))}')
     check_paths(scenario, perturbations, what)
@@ -139,6 +148,7 @@ def targets_of(
             raise checks.fail(
                 f"{what}[{source!r}]", perturbation, expected, _remedy_for(perturbation)
             )
+        _check_kind(f"{what}[{source!r}]", perturbation, intervals)
         for path in _targets(scenario, source, perturbation):
             nominal = np.asarray(paths.get(scenario, path))
             sign = paths.sign_at(scenario, path)
@@ -191,6 +201,21 @@ def _remedy_for(given: Any) -> str:
             f" ij.value(ij.uniform({low}, {high}))."
         )
     return "Say how the draw acts on the leaf: ij.value(ij.uniform(low, high)), for example."
+
+
+def _check_kind(name: str, perturbation: Perturbation, intervals: bool) -> None:
+    """Raises ValueError for an interval where runs are drawn, or a distribution where all values
+    of a set are meant.
+    """
+    if is_interval(perturbation) == intervals:
+        return
+    if intervals:
+        expected = "an interval: a proof holds for all values of a set, without probabilities"
+        remedy = f"Write ij.{perturbation.kind}(ij.interval(low, high))."
+    else:
+        expected = "a distribution: an interval is a set of values without probabilities"
+        remedy = f"Write ij.{perturbation.kind}(ij.uniform(low, high)) for equal probabilities."
+    raise checks.fail(name, perturbation.distribution, expected, remedy)
 
 
 def _targets(scenario: Scenario, source: str, perturbation: Perturbation) -> list[str]:

@@ -169,6 +169,28 @@ def test_xi_bound_holds_and_is_reached_on_the_worse_side(name, bounds):
     np.testing.assert_allclose(jnp.min(bound, axis=1), np.broadcast_to(size, (8, 2)), rtol=1e-6)
 
 
+@pytest.mark.parametrize("bounds", BOUNDS)
+@pytest.mark.parametrize("name", sorted(set(BARRIERS) - {"quadratic", "state"}))
+def test_error_at_is_the_error_at_which_the_barrier_has_a_value(name, bounds):
+    barrier = BARRIERS[name]
+
+    def error(t, xi):
+        tube = tube_of(BOUNDS[bounds], t)
+        q = position(tube, jnp.full(2, xi))
+        return q - tube.q_d, barrier.error_at(barrier.value(tube, q), tube, jnp.asarray(xi > 0))
+
+    away = np.abs(POINTS[1]) > 1e-6  # V1 of a smaller error is below the rounding of 1 - xi^2
+    expected, found = jax.jit(jax.vmap(error))(*(column[away] for column in POINTS))
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+
+
+def test_a_barrier_without_a_guard_is_exact_up_to_the_bound():
+    tube = simple_tube(0.5, 0.8)
+    found = barriers.guarded_error(tube, jnp.array([0.79999, -0.49999]), -np.inf)
+    np.testing.assert_allclose(found.e, [0.79999, -0.49999])
+    np.testing.assert_allclose(found.beyond, 0.0)
+
+
 def test_no_claim_without_a_barrier():
     assert barriers.Quadratic().xi_bound(jnp.ones(()), simple_tube(1.0, 1.0)) is None
 

@@ -56,6 +56,8 @@ PROMISED = [
         "testing",
     ),
     *("identify", "Identification", "excitation", "joint_normal"),
+    *("prove", "Proof", "proofs", "largest_level", "largest_parameters"),
+    *("gains_for_guarantee", "GuaranteedGains"),
     *("failure_probability", "FailureProbability", "joint_samples"),
     *(
         "distributed",

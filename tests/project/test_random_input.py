@@ -447,6 +447,23 @@ ENTRIES = {
             "progress": False,
         },
     ),
+    "prove": (
+        ij.prove,
+        {
+            "scenario": None,
+            "level": 1.0,
+            "parameters": {"plant.mass": ij.factor(ij.interval(0.9, 1.1))},
+            "weight": None,
+            "duration": None,
+            "disturbance_rate": None,
+            "max_boxes": 1000,
+            "threads": 1,
+            "progress": False,
+            "checkpoint": None,
+            "runs": 0,
+            "seed": 0,
+        },
+    ),
     "certify": (ij.certify, {"scenario": None, "run": None, "worst": 3}),
     "explain": (ij.explain, {"scenario": None, "varied": (), "metrics": ()}),
     "load_scenario": (ij.load_scenario, {"path": "x.toml"}),
@@ -485,6 +502,7 @@ def no_runs(monkeypatch):
         "tuning._falsify._margins",
         "engine.explain.instructions",
         "certificates._certify._certificate_of",
+        "proofs._prove.problem_of",
     ):
         monkeypatch.setattr(f"iblf_jax.{place}", entered)
     by_scan = ExecutionPlan((), PLAIN_LAYOUT, PLAIN_LAYOUT, True)
@@ -997,6 +1015,7 @@ COMMANDS = {
     "failure": ["failure.toml", "--quiet"],
     "sweep": ["sweep.toml", "--quiet"],
     "tune": ["tune.toml", "--quiet"],
+    "prove": ["zhang_yan_2024", "--level", "1.0", "--quiet"],
     "presets": ["printed_gap"],
     "parameters": ["zhang_yan_2024"],
 }

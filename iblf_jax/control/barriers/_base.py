@@ -21,7 +21,7 @@ velocities (`controllers.FullState`).
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -35,9 +35,9 @@ from iblf_jax.world.bounds import Tube
 GUARD = 1e-3
 """Default distance from the bound, in xi, at which the guard takes over."""
 
-CLAIMS = ("decay_rate", "xi_bound", "error_over_slope", "value_unit")
-"""Members that a barrier may lack: it then makes no claim, cannot bound velocities, or has a V1
-without a unit."""
+CLAIMS = ("decay_rate", "xi_bound", "error_over_slope", "error_at", "value_unit")
+"""Members that a barrier may lack: it then makes no claim, cannot bound velocities, has a level set
+of V1 that is not known in closed form, or has a V1 without a unit."""
 
 
 class Barrier(Protocol):
@@ -107,6 +107,17 @@ class Barrier(Protocol):
         """
         ...
 
+    def error_at(self, V: jax.Array, tube: Tube, above: jax.Array) -> jax.Array | None:
+        """The error e1 at which V1 = V on one side of the tube, inside the bound whatever the guard
+        is, (n,) [rad]; None if it is not known in closed form.
+
+        Args:
+          V: value of V1, () or (n,), >= 0.
+          tube: the tube at that time.
+          above: whether the side is the upper one, e1 >= 0, () or (n,) bool.
+        """
+        ...
+
 
 barrier_member = OptionalMembers(
     uses_o=True,
@@ -117,6 +128,7 @@ barrier_member = OptionalMembers(
     decay_rate=lambda k1: None,
     xi_bound=lambda V, tube: None,
     error_over_slope=lambda tube, q: None,
+    error_at=lambda V, tube, above: None,
 )
 """Reads what a barrier may lack: without a claim, the answer is None."""
 
@@ -181,7 +193,7 @@ def guarded_error(tube: Tube, q: jax.Array, guard: float) -> GuardedError:
       tube: reference and bounds at this time, a `bounds.Tube`.
       q: positions, (n,) [rad].
       guard: distance from the bound in xi, a Python number in (0, 1) [1]; `guard` of the barriers,
-        1e-3 by default.
+        1e-3 by default.  With -infinity the error is not limited.
 
     Returns:
       `GuardedError`: e, beyond and k, (n,) [rad], and dk, the rate of k, (n,) [rad/s].
@@ -192,12 +204,15 @@ def guarded_error(tube: Tube, q: jax.Array, guard: float) -> GuardedError:
     Source: design of this package; the sides are Zhang & Yan 2024, (3.15).
     """
     q = _in_tube(tube, q)
-    if checks.is_concrete(guard):
+    unlimited = isinstance(guard, float) and guard == -np.inf
+    if checks.is_concrete(guard) and not unlimited:
         check_guard("guarded_error", guard)
     e1 = q - tube.q_d
     above = e1 > 0
     k = jnp.where(above, tube.k_u, tube.k_l)
     dk = jnp.where(above, tube.dk_u, tube.dk_l)
+    if unlimited:
+        return GuardedError(e1, jnp.zeros_like(e1), k, dk)
     edge = (1.0 - guard) * k
     e = jnp.where(jnp.abs(e1) <= edge, e1, jnp.where(above, edge, -edge))
     return GuardedError(e, e1 - e, k, dk)
@@ -243,6 +258,20 @@ def guard_is_active(tube: Tube, q: jax.Array, guard: float) -> jax.Array:
     if checks.is_concrete(guard) and not (isinstance(guard, float) and guard == -np.inf):
         check_guard("guard_is_active", guard)
     return jnp.abs(tube.xi(q)) > 1.0 - guard
+
+
+def side_width(tube: Tube, above: jax.Array) -> jax.Array:
+    """k_u where `above`, k_l elsewhere, (n,) [rad]."""
+    return jnp.where(above, tube.k_u, tube.k_l)
+
+
+def xi_bound_from_errors(barrier: Barrier, V: jax.Array, tube: Tube) -> jax.Array:
+    """`xi_bound` of a barrier with `error_at`: the larger |xi| on the two sides at which V1 = V,
+    (n,) [1].
+    """
+    e_u: Any = barrier.error_at(V, tube, jnp.asarray(True))
+    e_l: Any = barrier.error_at(V, tube, jnp.asarray(False))
+    return jnp.maximum(e_u / tube.k_u, -e_l / tube.k_l)
 
 
 def bound_motion_gain(tube: Tube, o: jax.Array) -> jax.Array:

@@ -12,6 +12,7 @@ from iblf_jax.control.barriers._base import (
     check_guard,
     guarded_error,
     paper_virtual_velocity,
+    side_width,
 )
 from iblf_jax.core.pytree import component, static
 from iblf_jax.world.bounds import Tube
@@ -73,3 +74,8 @@ class Integral:
     def xi_bound(self, V: jax.Array, tube: Tube) -> jax.Array:
         """|xi| <= sqrt(1 - exp(-V)), (n,) [1].    (3.22)"""
         return jnp.broadcast_to(jnp.sqrt(-jnp.expm1(-V)), tube.q_d.shape)
+
+    def error_at(self, V: jax.Array, tube: Tube, above: jax.Array) -> jax.Array:
+        """+-k sqrt(1 - exp(-V)), (n,) [rad]."""
+        size = side_width(tube, above) * jnp.sqrt(-jnp.expm1(-V))
+        return jnp.where(above, size, -size)

@@ -12,6 +12,7 @@ from iblf_jax.control.barriers._base import (
     check_guard,
     guarded_error,
     paper_virtual_velocity,
+    side_width,
 )
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import component, static
@@ -87,3 +88,10 @@ class Log:
         return jnp.broadcast_to(
             (-jnp.expm1(-2.0 * self.p * V)) ** (1.0 / (2 * self.p)), tube.q_d.shape
         )
+
+    def error_at(self, V: jax.Array, tube: Tube, above: jax.Array) -> jax.Array:
+        """+-k (1 - exp(-2 p V))^(1/(2p)), (n,) [rad]."""
+        power = -jnp.expm1(-2.0 * self.p * V)
+        xi = jnp.sqrt(power) if self.p == 1 else power ** (1.0 / (2 * self.p))
+        size = side_width(tube, above) * xi
+        return jnp.where(above, size, -size)

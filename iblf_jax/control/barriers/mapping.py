@@ -9,7 +9,12 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.barriers._base import GUARD, check_guard, guarded_error
+from iblf_jax.control.barriers._base import (
+    GUARD,
+    check_guard,
+    guarded_error,
+    xi_bound_from_errors,
+)
 from iblf_jax.core.pytree import component, static
 from iblf_jax.world.bounds import Tube
 
@@ -80,15 +85,16 @@ class Mapping:
 
     def xi_bound(self, V: jax.Array, tube: Tube) -> jax.Array:
         """The larger |xi| on the two sides at which |z| = sqrt(2V), (n,) [1]."""
-        Z = jnp.sqrt(2.0 * V)
+        return xi_bound_from_errors(self, V, tube)
 
-        def reached(k_l, k_u):
-            # Z k_u xi^2 + b xi - Z k_l = 0
-            b = k_u * k_l - Z * (k_u - k_l)
-            root = jnp.sqrt(b**2 + 4.0 * Z**2 * k_u * k_l)
-            return 2.0 * Z * k_l / (b + root)
-
-        return jnp.maximum(reached(tube.k_l, tube.k_u), reached(tube.k_u, tube.k_l))
+    def error_at(self, V: jax.Array, tube: Tube, above: jax.Array) -> jax.Array:
+        """The root e of z(e) = +-sqrt(2V) inside the bounds, (n,) [rad]."""
+        z = jnp.where(above, jnp.sqrt(2.0 * V), -jnp.sqrt(2.0 * V))
+        # z e^2 + b e - z k_l k_u = 0
+        product = tube.k_l * tube.k_u
+        b = product - z * (tube.k_u - tube.k_l)
+        root = jnp.sqrt(b**2 + 4.0 * z**2 * product)
+        return 2.0 * z * product / (b + root)
 
 
 def _mapped(e: jax.Array, tube: Tube) -> tuple[jax.Array, jax.Array]:

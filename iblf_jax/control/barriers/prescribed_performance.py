@@ -9,7 +9,13 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.barriers._base import GUARD, check_guard, guarded_error
+from iblf_jax.control.barriers._base import (
+    GUARD,
+    check_guard,
+    guarded_error,
+    side_width,
+    xi_bound_from_errors,
+)
 from iblf_jax.control.barriers._series import log_remainder
 from iblf_jax.core.pytree import component, static
 from iblf_jax.world.bounds import Tube
@@ -78,12 +84,18 @@ class PrescribedPerformance:
         return 2.0 * k1
 
     def xi_bound(self, V: jax.Array, tube: Tube) -> jax.Array:
-        """|xi| <= (1 - E) / (1 + r E), E = exp(-2 sqrt(2V)), r = narrower / wider side: the worst
-        side's bound, (n,) [1].
+        """The larger |xi| on the two sides at which |eps| = sqrt(2V), which is that of the side
+        with the narrower bound, (n,) [1].
         """
-        ratio = jnp.minimum(tube.k_l, tube.k_u) / jnp.maximum(tube.k_l, tube.k_u)
+        return xi_bound_from_errors(self, V, tube)
+
+    def error_at(self, V: jax.Array, tube: Tube, above: jax.Array) -> jax.Array:
+        """+-k (1 - E) / (1 + E k / k_other), E = exp(-2 sqrt(2V)), (n,) [rad]."""
+        k = side_width(tube, above)
+        ratio = k / side_width(tube, ~above)
         size = 2.0 * jnp.sqrt(2.0 * V)
-        return -jnp.expm1(-size) / (1.0 + ratio * jnp.exp(-size))
+        error = k * -jnp.expm1(-size) / (1.0 + ratio * jnp.exp(-size))
+        return jnp.where(above, error, -error)
 
 
 def _eps(e: jax.Array, tube: Tube) -> jax.Array:

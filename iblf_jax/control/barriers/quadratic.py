@@ -52,3 +52,8 @@ class Quadratic:
     def xi_bound(self, V: jax.Array, tube: Tube) -> None:
         """No claim: V1 does not see the bounds."""
         return None
+
+    def error_at(self, V: jax.Array, tube: Tube, above: jax.Array) -> jax.Array:
+        """+-sqrt(2 V), (n,) [rad]."""
+        size = jnp.broadcast_to(jnp.sqrt(2.0 * V), tube.q_d.shape)
+        return jnp.where(above, size, -size)

@@ -10,7 +10,7 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.control.barriers._base import GUARD, check_guard, guarded_error
+from iblf_jax.control.barriers._base import GUARD, check_guard, guarded_error, side_width
 from iblf_jax.control.barriers._series import sinc
 from iblf_jax.core.pytree import component, static
 from iblf_jax.world.bounds import Tube
@@ -83,6 +83,12 @@ class Tan:
         return jnp.sqrt(
             2.0 / math.pi * jnp.arctan(math.pi * V / jnp.minimum(tube.k_l, tube.k_u) ** 2)
         )
+
+    def error_at(self, V: jax.Array, tube: Tube, above: jax.Array) -> jax.Array:
+        """+-k sqrt(2/pi arctan(pi V / k^2)), (n,) [rad]."""
+        k = side_width(tube, above)
+        size = k * jnp.sqrt(2.0 / math.pi * jnp.arctan(math.pi * V / k**2))
+        return jnp.where(above, size, -size)
 
 
 def _cos_th(x: jax.Array) -> jax.Array:

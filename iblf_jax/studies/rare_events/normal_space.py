@@ -80,10 +80,11 @@ class NormalCoordinates:
 def in_normal_coordinates(prepared: PreparedStudy) -> PreparedStudy:
     """The study with distributions that take standard normal numbers instead of uniform ones."""
     uncertain = prepared.shared.uncertain
-    perturbations = {
-        path: dataclasses.replace(p, distribution=NormalCoordinates(p.distribution))
-        for path, p in uncertain.perturbations.items()
-    }
+    perturbations = {}
+    for path, p in uncertain.perturbations.items():
+        distribution: Any = p.distribution  # no interval: `prepare` refuses them
+        coordinates = NormalCoordinates(distribution)
+        perturbations[path] = dataclasses.replace(p, distribution=coordinates)
     shared = prepared.shared._replace(uncertain=uncertain._replace(perturbations=perturbations))
     return dataclasses.replace(prepared, shared=shared)
 

@@ -45,14 +45,32 @@ class DrivenPendulum:
 
     def drift(self, t: jax.Array, x: jax.Array) -> jax.Array:
         """f, (3, 1): 0, -(B x2 + N sin x1)/D, -(H x3 + Km x2)/M."""
-        load = self.B * x[1] + self.N * jnp.sin(x[0])
-        drop = self.H * x[2] + self.Km * x[1]
-        return jnp.stack([jnp.zeros_like(x[0]), -load / self.D, -drop / self.M])
+        return jnp.stack([jnp.zeros_like(x[0]), -self._load(x) / self.D, -self._drop(x) / self.M])
 
     def gain(self, t: jax.Array, x: jax.Array) -> jax.Array:
         """The diagonals of G, (3, 1): 1, 1/D, 1/M."""
         one = jnp.ones_like(x[0])
         return jnp.stack([one, one / self.D, one / self.M])
+
+    def level_input(
+        self, level: int, t: jax.Array, x: jax.Array, rate: jax.Array, torque: jax.Array | float
+    ) -> jax.Array:
+        """x_{i+1} for which x_i' is `rate`, (1,), linear in all parameters; there is no robot that
+        `torque` could act on.
+        """
+        if level == 1:
+            return rate
+        if level == 2:
+            return self.D * rate + self._load(x)
+        return self.M * rate + self._drop(x)
+
+    def _load(self, x: jax.Array) -> jax.Array:
+        """Torque of friction and gravity, (1,) [N m]."""
+        return self.B * x[1] + self.N * jnp.sin(x[0])
+
+    def _drop(self, x: jax.Array) -> jax.Array:
+        """Voltage of resistance and back-emf, (1,) [V]."""
+        return self.H * x[2] + self.Km * x[1]
 
     def steady_levels(self, q: jax.Array, dq: jax.Array) -> jax.Array:
         """The torque that holds gravity, (1, 1) [N m]."""

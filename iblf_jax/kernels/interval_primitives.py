@@ -1,0 +1,86 @@
+"""JAX primitives that say how an interval is evaluated; on numbers, each is the identity.
+
+A function that is enclosed over boxes (`enclosure`) may use them where the natural extension to
+intervals is too wide. Derivatives and batches pass through them to the first argument.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+
+
+def _primitive(name: str) -> Primitive:
+    """An elementwise primitive whose value is its first argument."""
+    primitive = Primitive(name)
+    primitive.def_impl(lambda x, *others: x)
+    primitive.def_abstract_eval(lambda x, *others: x)
+    mlir.register_lowering(primitive, mlir.lower_fun(lambda x, *others: x, multiple_results=False))
+
+    def jvp(primals, tangents):
+        return primitive.bind(*primals), tangents[0]
+
+    def batch(arguments, axes):
+        size = next(x.shape[a] for x, a in zip(arguments, axes, strict=True) if a is not None)
+        moved = [_batch_axis_first(x, axis, size) for x, axis in zip(arguments, axes, strict=True)]
+        return primitive.bind(*moved), 0
+
+    ad.primitive_jvps[primitive] = jvp
+    batching.primitive_batchers[primitive] = batch
+    return primitive
+
+
+def _batch_axis_first(x: jax.Array, axis: int | None, size: int) -> jax.Array:
+    """An argument with the axis of the batch in front."""
+    if axis is None:
+        return jnp.broadcast_to(x, (size, *x.shape))
+    return jnp.moveaxis(x, axis, 0)
+
+
+_UPPER = _primitive("upper")
+_LOWER = _primitive("lower")
+_HULL = _primitive("hull")
+_WITH_SIGN = _primitive("with_sign")
+_MEET = _primitive("meet")
+
+
+def _of_one_shape(*arrays: jax.Array | float) -> list[jax.Array]:
+    """The arrays with one shape and one floating-point type."""
+    dtype = jnp.result_type(float, *arrays)
+    return list(jnp.broadcast_arrays(*(jnp.asarray(x, dtype) for x in arrays)))
+
+
+def upper(x: jax.Array | float) -> jax.Array:
+    """x; on intervals [a, b] -> [b, b]."""
+    return _UPPER.bind(*_of_one_shape(x))
+
+
+def lower(x: jax.Array | float) -> jax.Array:
+    """x; on intervals [a, b] -> [a, a]."""
+    return _LOWER.bind(*_of_one_shape(x))
+
+
+def hull(x: jax.Array | float, y: jax.Array | float) -> jax.Array:
+    """x; on intervals the smallest interval that contains x and y."""
+    return _HULL.bind(*_of_one_shape(x, y))
+
+
+def meet(x: jax.Array | float, y: jax.Array | float) -> jax.Array:
+    """x; on intervals the numbers that x and y have in common, of two enclosures of one number."""
+    return _MEET.bind(*_of_one_shape(x, y))
+
+
+def with_sign(x: jax.Array | float, sign: jax.Array | float) -> jax.Array:
+    """x; on intervals, comparisons of the result with the literal 0 are decided by `sign`.
+
+    An interval that touches 0 would otherwise select both cases of `jnp.where(x > 0, ...)`. The
+    caller states that the side x >= 0 (`sign` 1) or x <= 0 (`sign` -1) is evaluated, with the value
+    at x = 0 by continuity.
+
+    Args:
+      x: a number.
+      sign: 1 or -1.
+    """
+    return _WITH_SIGN.bind(*_of_one_shape(x, sign))

@@ -1,0 +1,98 @@
+"""Figure of a level set that is proved, or not, to be invariant."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from iblf_jax.core import checks
+from iblf_jax.plotting import _style
+from iblf_jax.plotting._curves import check_class, escaped, thinned
+from iblf_jax.plotting._panels import quantity_of
+from iblf_jax.proofs.result import GuaranteedTube, Proof
+from iblf_jax.world import plants
+
+WIDTH = 7.6
+RANGES = 2
+"""Largest number of intervals that the heading lists."""
+RUNS = 6
+"""Runs with adversarial parameters that the figure shows."""
+
+
+@_style.styled()
+def guaranteed_tube(found: Proof, *, runs: int = RUNS) -> Figure:
+    """The positions of {V_w <= level} over time, with the bounds, the reference and runs.
+
+    The runs start at points of the level set with parameters at the ends of their intervals.  Of a
+    refuted statement, the run that violates the bounds is shown.
+
+    Args:
+      found: the result of `ij.prove`.
+      runs: number of runs.
+
+    Returns:
+      The figure, one row per joint.
+
+    Raises:
+      ValueError: not a Proof, or a number of runs that is not a whole number.
+    """
+    check_class("found", found, Proof, "ij.prove returns one.")
+    count = checks.positive_integer("runs", runs, least=0, most=1000)
+    tube = found.tube
+    names = plants.component_names(found.scenario.plant)
+    figure = _style.new_figure(WIDTH, 0.9 + 1.9 * len(names))
+    panels = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
+    shown = found.adversarial_runs(count) if count else []
+    for i, axes in enumerate(panels):
+        _draw_tube(axes, tube, i)
+        for number, run in enumerate(shown):
+            label = "runs from V = level" if number == 0 else "_"
+            t, q = thinned(np.asarray(run.t), np.asarray(run.q)[:, i])
+            axes.plot(t, q, color=_style.colour(0), linewidth=0.7, alpha=0.8, label=label)
+        if found.violation is not None:
+            _draw_violation(axes, found, i)
+        quantity = quantity_of(found.scenario, "q", i)
+        axes.set_ylabel(f"{escaped(names[i])}\n{_style.label(quantity.symbol, quantity.unit)}")
+        axes.margins(x=0)
+    panels[-1].set_xlabel(_style.label("$t$", "s"))
+    _style.set_heading(figure, [_heading(found)], color=_colour(found))
+    _style.legend_below(figure, 3, of=[panels[0]])
+    return figure
+
+
+def _heading(found: Proof) -> str:
+    level = f"$V_w \\leq$ {found.level:.4g}"
+    ranges = [f"{path} {low:.4g} to {high:.4g}" for path, (low, high) in found.ranges.items()]
+    if len(ranges) > RANGES:
+        ranges = [f"{len(ranges)} uncertain parameters"]
+    words = escaped(", ".join([*ranges, str(found.verdict)]))
+    return f"{level}: {words}"
+
+
+def _colour(found: Proof) -> str:
+    if found.violation is not None:
+        return _style.failure()
+    return _style.text_colour()
+
+
+def _draw_tube(axes: Axes, tube: GuaranteedTube, i: int) -> None:
+    """Bounds, the positions of the level set and the reference of one joint."""
+    lower, upper = tube.lower_bound[:, i], tube.upper_bound[:, i]
+    for side, text in ((lower, "bounds"), (upper, "_")):
+        axes.plot(tube.t, side, color=_style.bound(), linewidth=1.0, label=text)
+    style: dict[str, Any] = {"color": _style.tube(), "linewidth": 0, "zorder": 0}
+    axes.fill_between(tube.t, tube.lower[:, i], tube.upper[:, i], label="level set", **style)
+    axes.plot(tube.t, tube.reference[:, i], label="reference", **_style.reference())
+
+
+def _draw_violation(axes: Axes, found: Proof, i: int) -> None:
+    """The run that violates the bounds, at the times of its start."""
+    run = found.replay(10)
+    assert found.violation is not None
+    t = np.asarray(run.t) + found.violation.state.t
+    inside = t <= found.duration
+    style: dict[str, Any] = {"color": _style.failure(), "linewidth": 1.2}
+    axes.plot(t[inside], np.asarray(run.q)[inside, i], label="violates the bounds", **style)

@@ -1,0 +1,443 @@
+"""`prove`: is a level set of V_w invariant for all times and all parameters of a box?
+
+V_w = V with the weight w of the estimation error.  Three steps answer:
+
+1. Points of the level set are drawn for every weight of a grid, and V_w' is increased from the
+   largest ones by random steps.  If every weight has a point with V_w' > 0, no weight proves the
+   statement.
+2. At the weight with the least largest V_w', or at a neighbour with which the search advances
+   faster, branch and bound with outward rounding decides whether V_w' < 0 everywhere.
+3. Without a proof, runs start at the points with the largest V_w': one that violates the bounds
+   refutes the statement.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+import warnings
+from collections.abc import Mapping, Sequence
+from os import PathLike
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from iblf_jax.core import checks, notices
+from iblf_jax.core.status import Status
+from iblf_jax.engine.simulate import SimulationWarning, simulate
+from iblf_jax.kernels.enclosure import enclose
+from iblf_jax.proofs.arms import arm_problem
+from iblf_jax.proofs.chains import chain_problem
+from iblf_jax.proofs.problem import LevelSetProblem
+from iblf_jax.proofs.result import GrowthPoint, Proof, Verdict, Violation, WorstBox
+from iblf_jax.proofs.search import SearchResult, search
+from iblf_jax.simulation.results import Rollout
+from iblf_jax.simulation.scenario import Scenario, canonical
+from iblf_jax.studies.distributions import Perturbation
+from iblf_jax.world import plants
+
+EXAMPLE = '{"plant.mass": ij.factor(ij.interval(0.97, 1.03))}'
+POINTS = 2048
+"""Points of the level set at which V_w' is computed together."""
+PARENTS = 32
+"""Points from which V_w' is increased."""
+ROUNDS = 8
+"""Rounds of random steps from the best points."""
+SHRINKAGE = 0.6
+"""Factor of the size of the random steps after each round."""
+WEIGHTS_PER_DECADE = 4
+LEAST_RATIO, GREATEST_RATIO = 0.25, 1e3
+"""Ends of the grid of weights, in parts of 1/(K2 kf). Below 1/(4 K2 kf), V_w' > 0 for an estimation
+error along e2 even without an error of the parameters."""
+LEAST_CHAIN_WEIGHT, GREATEST_CHAIN_WEIGHT = 1e-2, 1e2
+"""Ends of the grid for a plant in strict-feedback form, whose weight has no unit."""
+REFINEMENTS = (0.75, 1.33)
+"""Factors of the best weight that are tried as well."""
+TRIAL_BOXES = 1_000_000
+"""Boxes of the search at each of these weights."""
+RUNS = 16
+"""Runs that start at points of the level set, if the caller gives no number."""
+LEAST_DURATION = 5.0
+"""Length of these runs, at least [s]."""
+TIME_STEPS = (1e-3, 1e-4, 1e-5)
+"""Their time steps [s]: the first one with which a run is accurate."""
+UNRELIABLE = Status.INACCURATE | Status.STEP_TOO_LARGE
+"""Flags of runs that refute nothing."""
+
+
+class _Sampled(NamedTuple):
+    """The largest V_w' that was found at a weight."""
+
+    weight: float
+    points: np.ndarray
+    """The points with the largest V_w', in descending order, (PARENTS, p)."""
+    rates: np.ndarray
+    """V_w' there, (PARENTS,)."""
+
+    @property
+    def largest(self) -> float:
+        """The largest V_w'."""
+        return float(self.rates[0])
+
+
+@notices.each_warning_once
+def prove(
+    scenario: Scenario,
+    *,
+    level: float,
+    parameters: Mapping[str, Perturbation],
+    weight: float | None = None,
+    duration: float | None = None,
+    disturbance_rate: Any = None,
+    max_boxes: int = 1_000_000_000,
+    threads: int | None = None,
+    progress: bool | None = None,
+    checkpoint: str | PathLike | None = None,
+    runs: int = RUNS,
+    seed: int = 0,
+) -> Proof:
+    """Decides whether {V_w <= level} is invariant for all times and all parameters of a box.
+
+        V_w' < 0 wherever V_w = level;   V_w = sum_i w_i V1_i + e2^T M0 e2 / 2 + w |f_tilde|^2 / 2
+
+    The plant has parameters p of the box, law and observer those of the scenario's model.  A proof
+    is rigorous for real-number equations: bounds are rounded outward.
+
+    Args:
+      scenario: the loop of a robot with the corrected backstepping law and the momentum observer,
+        or of a plant in strict-feedback form of order 2 or 3 with one number per level and the law
+        `BarrierBackstepping`.
+      level: level c of V_w, in its unit, N m rad for robots.
+      parameters: path -> `factor`, `offset` or `value` of an `interval`, such as
+        {"plant.mass": ij.factor(ij.interval(0.97, 1.03))}; paths joined by commas vary together;
+        {} for the plant as given.
+      weight: w [rad/(N m)], without unit for a plant in strict-feedback form; searched if not
+        given.
+      duration: length of the time interval from t = 0 on [s]; a period of the scenario if not
+        given.
+      disturbance_rate: bound of the rate of a further disturbance, () or (n,) [N m/s]; none if not
+        given.
+      max_boxes: largest number of boxes.
+      threads: number of threads; one for each processor if not given.
+      progress: whether a bar shows the progress; None for where a user sees it.
+      checkpoint: file from which an interrupted search continues, and to which it is written.
+      runs: number of runs that try to refute the bounds where no proof is found; 0 for none.
+      seed: of the random points.
+
+    Returns:
+      A `Proof` with the verdict PROVED, NOT PROVED, REFUTED or UNDECIDED.
+
+    Raises:
+      ValueError: a scenario, a parameter, a level or an option that is not supported; the message
+        says why.
+
+    Source: design of this package; branch and bound with interval arithmetic as in R. E. Moore,
+      R. B. Kearfott, M. J. Cloud, Introduction to Interval Analysis, 2009.
+    """
+    options = _Options.of(weight, max_boxes, threads, progress, checkpoint, runs, seed)
+    level = checks.positive_number("level", level, "the unit of V_w")
+    checks.mapping("parameters", parameters, EXAMPLE)
+    problem = problem_of(scenario, parameters, duration, disturbance_rate)
+    with jax.enable_x64(True):
+        return _decided(canonical(scenario), problem, dict(parameters), level, weight, options)
+
+
+def _decided(
+    scenario: Scenario,
+    problem: LevelSetProblem,
+    parameters: dict[str, Perturbation],
+    level: float,
+    weight: float | None,
+    options: _Options,
+) -> Proof:
+    """The three steps."""
+    start = time.monotonic()
+    sampled = sample_weights(problem, level, weights_of(scenario, weight), options.seed)
+    best = min(sampled, key=lambda found: found.largest)
+    if best.largest > 0.0:
+        result = None
+    else:
+        best, result = _searched(problem, level, sampled, best, options)
+    proved = result is not None and result.proved
+    violation = None if proved else _refuted(problem, level, best, options.runs)
+    verdict = _verdict(result, violation)
+    worst = None if result is None else result.worst
+    return Proof(
+        verdict=verdict,
+        scenario=scenario,
+        parameters=parameters,
+        ranges=dict(problem.scales),
+        level=level,
+        weight=best.weight,
+        duration=problem.duration,
+        is_period=problem.is_period,
+        boxes=0 if result is None else result.boxes,
+        done=0.0 if result is None else result.done,
+        seconds=time.monotonic() - start,
+        rates={found.weight: found.largest for found in sampled},
+        growth_points=_growth_points(problem, level, sampled),
+        worst_box=None if worst is None else _worst_box(problem, level, best.weight, worst),
+        violation=violation,
+        problem=problem,
+    )
+
+
+class _Options(NamedTuple):
+    """The options of a search, checked."""
+
+    max_boxes: int
+    threads: int | None
+    progress: bool | None
+    checkpoint: str | PathLike | None
+    runs: int
+    seed: int
+
+    @classmethod
+    def of(
+        cls,
+        weight: Any,
+        max_boxes: Any,
+        threads: Any,
+        progress: Any,
+        checkpoint: Any,
+        runs: Any,
+        seed: Any,
+    ) -> _Options:
+        """Raises ValueError for an option that is not admissible."""
+        if weight is not None:
+            checks.positive_number("weight", weight, "rad/(N m)")
+        max_boxes = checks.positive_integer("max_boxes", max_boxes, most=10**15)
+        if threads is not None:
+            threads = checks.positive_integer("threads", threads, most=1024)
+        progress = checks.boolean("progress", progress, optional=True)
+        if checkpoint is not None:
+            checkpoint = checks.file_to_write("checkpoint", checkpoint)
+        runs = checks.positive_integer("runs", runs, least=0, most=PARENTS)
+        return cls(max_boxes, threads, progress, checkpoint, runs, checks.seed(seed))
+
+
+def problem_of(
+    scenario: Scenario,
+    parameters: Mapping[str, Perturbation],
+    duration: float | None,
+    disturbance_rate: Any,
+) -> LevelSetProblem:
+    """The proof problem of a scenario.
+
+    Raises:
+      ValueError: it is not supported; the message says why.
+    """
+    if not (isinstance(scenario, Scenario) and plants.is_chain(scenario.plant)):
+        return arm_problem(
+            scenario, parameters, duration=duration, disturbance_rate=disturbance_rate
+        )
+    if disturbance_rate is not None:
+        remedy = "Add a disturbance with an uncertain parameter to the scenario."
+        raise checks.fail("disturbance_rate", disturbance_rate, "None for such a plant", remedy)
+    return chain_problem(scenario, parameters, duration=duration)
+
+
+def weights_of(scenario: Scenario, weight: float | None) -> list[float]:
+    """The weights that are tried."""
+    if weight is not None:
+        return [float(weight)]
+    if plants.is_chain(scenario.plant):
+        return _grid(LEAST_CHAIN_WEIGHT, GREATEST_CHAIN_WEIGHT)
+    law: Any = scenario.controller
+    observer: Any = scenario.observer
+    scale = 1.0 / float(np.min(np.asarray(law.K2)) * np.min(np.asarray(observer.kf)))
+    return _grid(LEAST_RATIO * scale, GREATEST_RATIO * scale)
+
+
+def _grid(low: float, high: float) -> list[float]:
+    """Numbers between two ends, equally spaced on a logarithmic scale."""
+    count = 1 + math.ceil(math.log10(high / low) * WEIGHTS_PER_DECADE)
+    return np.geomspace(low, high, count).tolist()
+
+
+# --- points of the level set ---------------------------------------------------------------------
+
+
+def sample_weights(
+    problem: LevelSetProblem, level: float, weights: Sequence[float], seed: int
+) -> list[_Sampled]:
+    """The largest V_w' that was found at each weight.
+
+    The points of one weight are among the first ones of the next, because a point is one of every
+    level set.
+    """
+    points = problem.sample(seed, POINTS)
+    found = []
+    for weight in weights:
+        sampled = _largest_rates(problem, problem.constants(weight, level), weight, points, seed)
+        points = np.concatenate([sampled.points, points[: POINTS - PARENTS]])
+        found.append(sampled)
+    return found
+
+
+def _largest_rates(
+    problem: LevelSetProblem, constants: Any, weight: float, points: np.ndarray, seed: int
+) -> _Sampled:
+    """Increases V_w' from the best of some points.
+
+    Each round moves coordinates of the best points a part of the way to those of random points,
+    with which times and parameters stay in their intervals.
+    """
+    best, rates = _best(points, problem.rate(points, constants))
+    generator = np.random.default_rng(seed)
+    part = 1.0
+    for number in range(ROUNDS):
+        part *= SHRINKAGE
+        random = problem.sample(seed + 1 + number, POINTS)
+        parents = np.repeat(best, POINTS // PARENTS, axis=0)
+        # Some steps change only a few coordinates: the largest rates are at corners of the others.
+        changed = generator.uniform(size=random.shape) < 0.5
+        candidates = parents + part * changed * (random - parents)
+        joined = np.concatenate([best, candidates])
+        best, rates = _best(joined, np.concatenate([rates, problem.rate(candidates, constants)]))
+    return _Sampled(weight, best, rates)
+
+
+def _best(points: np.ndarray, rates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The points with the largest rates."""
+    order = np.argsort(-np.nan_to_num(rates, nan=-np.inf), kind="stable")[:PARENTS]
+    return points[order], rates[order]
+
+
+def _growth_points(
+    problem: LevelSetProblem, level: float, sampled: Sequence[_Sampled]
+) -> tuple[GrowthPoint, ...]:
+    """The point with the largest V_w' for each weight, in physical numbers; () unless all grow."""
+    if min(each.largest for each in sampled) <= 0.0:
+        return ()
+    found = []
+    for each in sampled:
+        state = problem.state_of(each.points[0], problem.constants(each.weight, level))
+        found.append(GrowthPoint(each.weight, each.largest, state))
+    return tuple(found)
+
+
+# --- branch and bound ----------------------------------------------------------------------------
+
+
+def _searched(
+    problem: LevelSetProblem,
+    level: float,
+    sampled: Sequence[_Sampled],
+    best: _Sampled,
+    options: _Options,
+) -> tuple[_Sampled, SearchResult]:
+    """The search at the best weight, or at a neighbour with which it advances faster."""
+    candidates = [best]
+    if len(sampled) > 1:
+        neighbours = [factor * best.weight for factor in REFINEMENTS]
+        more = sample_weights(problem, level, neighbours, options.seed)
+        candidates += [found for found in more if found.largest < 0.0]
+    trials = min(TRIAL_BOXES, options.max_boxes)
+    found = []
+    for candidate in candidates:
+        result = _search(problem, level, candidate.weight, trials, options, checkpoint=None)
+        if result.proved:
+            return candidate, result
+        found.append((result.done, candidate, result))
+    _, candidate, result = max(found, key=lambda each: each[0])
+    if trials == options.max_boxes:
+        return candidate, result
+    return candidate, _search(
+        problem, level, candidate.weight, options.max_boxes, options, options.checkpoint
+    )
+
+
+def _search(
+    problem: LevelSetProblem,
+    level: float,
+    weight: float,
+    max_boxes: int,
+    options: _Options,
+    checkpoint: str | PathLike | None,
+) -> SearchResult:
+    """The search at a weight."""
+    return search(
+        problem.bound,
+        problem.lower,
+        problem.upper,
+        problem.constants(weight, level),
+        patterns=problem.patterns,
+        max_boxes=max_boxes,
+        threads=options.threads,
+        progress=options.progress,
+        checkpoint=checkpoint,
+    )
+
+
+def _worst_box(problem: LevelSetProblem, level: float, weight: float, found: Any) -> WorstBox:
+    """The worst box with the names of its coordinates, and its bounds with narrower intervals."""
+    intervals = {
+        name: (float(low), float(high))
+        for name, low, high in zip(problem.names, found.lower, found.upper, strict=True)
+    }
+    wide = [k for k, name in enumerate(problem.names) if _is_uncertain(problem, name)]
+    lower, upper = (np.tile(corner, (len(wide), 1)) for corner in (found.lower, found.upper))
+    for row, k in enumerate(wide):
+        lower[row, k] = upper[row, k] = 0.5 * (found.lower[k] + found.upper[k])
+    narrowed = {}
+    if wide:
+        constants = problem.constants(weight, level)
+        _, bounds = enclose(problem.bound, lower, upper, constants)
+        least = bounds[0].min(axis=1)
+        narrowed = {problem.names[k]: float(x) for k, x in zip(wide, least, strict=True)}
+    return WorstBox(intervals, float(found.bound), float(found.value), narrowed)
+
+
+def _is_uncertain(problem: LevelSetProblem, name: str) -> bool:
+    """Whether a coordinate is one of parameters."""
+    first = name.split(" and ")[0]
+    return first in problem.scales or first.startswith("disturbance_rate")
+
+
+# --- runs ----------------------------------------------------------------------------------------
+
+
+def _refuted(
+    problem: LevelSetProblem, level: float, sampled: _Sampled, runs: int
+) -> Violation | None:
+    """A run that starts in the set and violates the bounds; None if none was found.
+
+    Runs start at the points with the largest V_w' that were found.  The time step is reduced until
+    the run is accurate; a run that is not accurate with the smallest one refutes nothing.
+    """
+    constants = problem.constants(sampled.weight, level)
+    for point in sampled.points[:runs]:
+        duration = max(problem.duration, LEAST_DURATION)
+        if not problem.is_period:
+            duration = max(problem.duration - point[0], TIME_STEPS[0])
+        scenario = problem.scenario_at(point, constants)
+        for dt in TIME_STEPS:
+            run = _run(scenario, duration, dt)
+            if not int(run.status) & Status.INACCURATE:
+                break
+        if int(run.status) & UNRELIABLE or not int(run.status) & Status.BOUND_VIOLATED:
+            continue
+        margin = float(np.min(np.asarray(run.metrics["margin"])))
+        state = problem.state_of(point, constants)
+        return Violation(scenario, state, int(run.steps or 0) * dt, dt, margin)
+    return None
+
+
+def _run(scenario: Scenario, duration: float, dt: float) -> Rollout:
+    """A run, whose violations are no surprise."""
+    steps = math.floor(duration / dt)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SimulationWarning)
+        return simulate(scenario, duration=steps * dt, dt=dt, record_every=steps)
+
+
+def _verdict(result: SearchResult | None, violation: Violation | None) -> Verdict:
+    if violation is not None:
+        return Verdict.REFUTED
+    if result is None:
+        return Verdict.NOT_PROVED
+    if result.proved:
+        return Verdict.PROVED
+    return Verdict.UNDECIDED

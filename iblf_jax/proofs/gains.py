@@ -1,0 +1,156 @@
+"""Gains for which a level set is proved to be invariant.
+
+The largest V_w' that is found on a level set is a function of the gains that costs a few thousand
+evaluations of V_w'.  `gains_for_guarantee` minimises it over gains and weight, and proves the
+result.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from iblf_jax.core import checks
+from iblf_jax.proofs._prove import problem_of, prove, sample_weights, weights_of
+from iblf_jax.proofs.result import Proof
+from iblf_jax.simulation.paths import get, with_parameters
+from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.studies.distributions import Perturbation
+
+TRIES = 60
+"""Gains that are tried, if the caller gives no number."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class GuaranteedGains:
+    """Gains with the least largest V_w' on a level set, and the proof."""
+
+    scenario: Scenario
+    """With the gains in it."""
+    gains: dict[str, float]
+    """Path -> value."""
+    rate: float
+    """The largest V_w' that was found, in the unit of V_w per second."""
+    rate_before: float
+    """The same for the scenario that was given."""
+    tries: int
+    """Number of gains that were tried."""
+    proof: Proof
+
+    def __repr__(self) -> str:
+        gains = ", ".join(f"{path} = {value:.4g}" for path, value in self.gains.items())
+        return "\n".join(
+            [
+                f"Gains {gains}: largest V_w' found {self.rate:+.4g}, before"
+                f" {self.rate_before:+.4g} ({self.tries} tries).",
+                repr(self.proof),
+            ]
+        )
+
+
+def gains_for_guarantee(
+    scenario: Scenario,
+    gains: Mapping[str, tuple[float, float]],
+    *,
+    level: float,
+    parameters: Mapping[str, Perturbation],
+    tries: int = TRIES,
+    duration: float | None = None,
+    disturbance_rate: Any = None,
+    seed: int = 0,
+    **options: Any,
+) -> GuaranteedGains:
+    """Chooses gains for which {V_w <= level} decreases fastest where it decreases least, and proves
+    the result.
+
+        min over gains and w of  max V_w'  on V_w = level and the box of parameters
+
+    The maximum is that of random points which a search improves (`prove`, step 1), so that only the
+    proof at the end is a guarantee.  Gains are searched on a logarithmic scale by the method of
+    Nelder and Mead, from the given ones.
+
+    Args:
+      scenario: the loop with the gains from which the search starts.
+      gains: path -> its least and its greatest value, such as {"controller.K2": (1.0, 20.0)}; all
+        entries of a vector are equal.
+      level: c, in the unit of V_w.
+      parameters: path -> perturbation by an `interval`, as in `prove`.
+      tries: number of gains that are tried.
+      duration: as in `prove`.
+      disturbance_rate: as in `prove`.
+      seed: of the random points.
+      options: further options of `prove`.
+
+    Returns:
+      The gains and the proof.
+
+    Raises:
+      ValueError: bad arguments, as in `prove`.
+
+    Source: J. A. Nelder, R. Mead, The Computer Journal 7 (1965) 308-313.
+    """
+    from scipy.optimize import minimize
+
+    limits = _limits(gains)
+    tries = checks.positive_integer("tries", tries, most=100_000)
+    low, high = np.log(np.array(list(limits.values()))).T
+
+    def at(u: np.ndarray) -> tuple[Scenario, float]:
+        values = map(float, np.exp(low + u[:-1] * (high - low)))
+        candidate = with_parameters(scenario, dict(zip(limits, values, strict=True)))
+        weights = weights_of(candidate, None)
+        return candidate, float(weights[0] * (weights[-1] / weights[0]) ** u[-1])
+
+    def rate_of(candidate: Scenario, weight: float) -> float:
+        problem = problem_of(candidate, parameters, duration, disturbance_rate)
+        return sample_weights(problem, level, [weight], seed)[0].largest
+
+    problem = problem_of(scenario, parameters, duration, disturbance_rate)
+    sampled = sample_weights(problem, level, weights_of(scenario, None), seed)
+    rates = [found.largest for found in sampled]
+    start = [_place(scenario, path, ends) for path, ends in limits.items()]
+    start.append(float(np.clip(np.argmin(rates) / (len(rates) - 1), 0.05, 0.95)))
+    found = minimize(
+        lambda u: rate_of(*at(u)),
+        start,
+        method="Nelder-Mead",
+        bounds=[(0.0, 1.0)] * len(start),
+        options={"maxfev": tries, "xatol": 1e-3, "fatol": 1e-4 * level},
+    )
+    chosen, _ = at(found.x)
+    proof = prove(
+        chosen,
+        level=level,
+        parameters=parameters,
+        duration=duration,
+        disturbance_rate=disturbance_rate,
+        seed=seed,
+        **options,
+    )
+    values = {path: float(np.ravel(get(chosen, path))[0]) for path in limits}
+    return GuaranteedGains(chosen, values, float(found.fun), min(rates), int(found.nfev), proof)
+
+
+def _limits(gains: Any) -> dict[str, tuple[float, float]]:
+    """Path -> ends, checked."""
+    example = '{"controller.K2": (1.0, 20.0)}'
+    limits = {}
+    for path, ends in checks.mapping("gains", gains, example).items():
+        numbers = np.asarray(checks.as_floats(f"gains[{path!r}]", ends), float)
+        if numbers.shape != (2,) or not 0.0 < numbers[0] < numbers[1] < np.inf:
+            expected = "two positive numbers in ascending order"
+            raise checks.fail(f"gains[{path!r}]", ends, expected)
+        limits[path] = (float(numbers[0]), float(numbers[1]))
+    if not limits:
+        raise checks.fail("gains", gains, f"at least one gain, such as {example}")
+    return limits
+
+
+def _place(scenario: Scenario, path: str, ends: tuple[float, float]) -> float:
+    """The place of a gain between its ends on a logarithmic scale, away from them."""
+    value = float(np.mean(np.asarray(get(scenario, path))))
+    share = np.log(max(value, ends[0]) / ends[0]) / np.log(ends[1] / ends[0])
+    return float(np.clip(share, 0.05, 0.95))

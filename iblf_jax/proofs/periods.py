@@ -1,0 +1,111 @@
+"""The period of a scenario whose time-varying parts are constants and sinusoids."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator
+from fractions import Fraction
+from typing import Any
+
+import jax
+import numpy as np
+
+from iblf_jax.world import bounds, disturbances, references
+
+LARGEST_RATIO = 1000
+"""Largest quotient of a frequency by the common one for which a common period is used."""
+
+FREQUENCIES = {
+    references.Sinusoid: (("amplitude", "frequency"),),
+    bounds.Sinusoid: (("amplitude", "frequency"),),
+    disturbances.Sinusoids: (("amplitude", "frequency"),),
+    disturbances.TipForce: (("amplitude", "frequency"),),
+    disturbances.ModelShaped: (
+        ("acceleration_amplitude", "acceleration_frequency"),
+        ("velocity_amplitude", "velocity_frequency"),
+    ),
+}
+"""Periodic members -> their fields of amplitudes and frequencies."""
+CONSTANT = (bounds.Constant, disturbances.Nothing, disturbances.Friction)
+"""Members that do not depend on time."""
+
+
+class AperiodicError(ValueError):
+    """A part of a scenario has no period, or none in common with the others."""
+
+
+def period_of(parts: dict[str, Any]) -> float:
+    """The common period of parts of a scenario [s]; 0 if none depends on time.
+
+        2 pi / w,   w the greatest common divisor of all frequencies
+
+    Frequencies are compared as the exact numbers that they are.
+
+    Args:
+      parts: name -> reference, side of the bounds, or disturbance.
+
+    Raises:
+      AperiodicError: a part that is neither constant nor a sinusoid, or frequencies without a
+        common divisor; the message says which.
+    """
+    frequencies = {
+        Fraction(w) for name, part in parts.items() for w in _frequencies(name, part) if w
+    }
+    if not frequencies:
+        return 0.0
+    common = Fraction(
+        math.gcd(*_over_common_denominator(frequencies)),
+        math.lcm(*(w.denominator for w in frequencies)),
+    )
+    if max(frequencies) / common > LARGEST_RATIO:
+        listed = ", ".join(f"{float(w):g}" for w in sorted(frequencies))
+        raise AperiodicError(f"the frequencies {listed} rad/s have no common divisor")
+    return 2.0 * math.pi / float(common)
+
+
+def _over_common_denominator(numbers: set[Fraction]) -> list[int]:
+    denominator = math.lcm(*(w.denominator for w in numbers))
+    return [int(w * denominator) for w in numbers]
+
+
+def _frequencies(name: str, part: Any) -> Iterator[float]:
+    """The absolute frequencies of a part whose amplitude is not zero."""
+    if isinstance(part, disturbances.Sum):
+        for i, inner in enumerate(part.parts):
+            yield from _frequencies(f"{name}.parts[{i}]", inner)
+        return
+    if isinstance(part, disturbances.Levels):
+        for i, of_level in enumerate(part.parts):
+            if of_level is not None:
+                yield from _frequencies(f"{name}.parts[{i}]", of_level)
+        return
+    if isinstance(part, CONSTANT):
+        return
+    if type(part) not in FREQUENCIES:
+        raise AperiodicError(f"{name} is a {type(part).__name__}, whose period is not known")
+    for fields in FREQUENCIES[type(part)]:
+        amplitude, frequency = (np.asarray(getattr(part, field)) for field in fields)
+        for size, w in np.broadcast(amplitude, frequency):
+            if size:
+                yield abs(float(w))
+
+
+def shifted(part: Any, t: jax.Array | float) -> Any:
+    """A part of `period_of` as it is t [s] later: part at time s is the result at time s - t."""
+    if isinstance(part, disturbances.Sum):
+        return disturbances.Sum(tuple(shifted(inner, t) for inner in part.parts))
+    if isinstance(part, disturbances.Levels):
+        moved = [None if inner is None else shifted(inner, t) for inner in part.parts]
+        return disturbances.Levels(tuple(moved))
+    if isinstance(part, CONSTANT):
+        return part
+    if type(part) not in FREQUENCIES:
+        raise AperiodicError(f"a {type(part).__name__} cannot be moved in time")
+    phases = {
+        frequency.replace("frequency", "phase"): frequency
+        for _, frequency in FREQUENCIES[type(part)]
+    }
+    fields = vars(part)
+    new = {phase: fields[phase] + fields[frequency] * t for phase, frequency in phases.items()}
+    return dataclasses.replace(part, **new)

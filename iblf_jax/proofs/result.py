@@ -1,0 +1,383 @@
+"""The result of `ij.prove`."""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+import math
+from collections.abc import Mapping
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax.control.barriers._base import barrier_member
+from iblf_jax.core import checks, tables
+from iblf_jax.core.presentation import present
+from iblf_jax.core.pytree import astype
+from iblf_jax.engine.simulate import simulate
+from iblf_jax.proofs.problem import LevelSetProblem
+from iblf_jax.simulation.results import Rollout
+from iblf_jax.simulation.scenario import Scenario, canonical
+from iblf_jax.studies.distributions import Perturbation
+from iblf_jax.world import plants
+
+if TYPE_CHECKING:
+    import xarray
+    from matplotlib.figure import Figure
+
+INSTANTS = 512
+"""Times of a guaranteed tube."""
+AT_REST = 5.0
+"""Time that is shown if reference and bounds are constant, so that there is no period [s]."""
+
+
+class Verdict(enum.StrEnum):
+    """What `ij.prove` found."""
+
+    PROVED = "proved"
+    """V_w' < 0 at every point of V_w = level, for all times and parameters."""
+    NOT_PROVED = "not proved"
+    """Every weight that was tried has a point of the level set with V_w' > 0."""
+    REFUTED = "refuted"
+    """A run that starts in the set violates the bounds."""
+    UNDECIDED = "undecided"
+    """Neither a proof nor a counterexample was found with the given number of boxes."""
+
+
+class GrowthPoint(NamedTuple):
+    """A point of the level set, and V_w' there in floating-point numbers."""
+
+    weight: float
+    """w."""
+    rate: float
+    """V_w', in the unit of V_w per second."""
+    state: Any
+    """Time, state, estimation error and parameters in physical numbers."""
+
+    def __repr__(self) -> str:
+        entries = self.state._asdict().items()
+        parts = [f"{name} = {_numbers(value)}" for name, value in entries if np.size(value)]
+        return f"V_w' = {self.rate:+.4g} at w = {self.weight:.3g}: {', '.join(parts)}"
+
+
+class WorstBox(NamedTuple):
+    """The box on which the upper bound of V_w' is furthest from a proof."""
+
+    intervals: dict[str, tuple[float, float]]
+    """Coordinate -> its ends; coordinates without a unit are those of the level set."""
+    bound: float
+    """Upper bound of V_w' on the box."""
+    value: float
+    """Upper bound at the centre of the box."""
+    narrowed: dict[str, float]
+    """Uncertain number -> the bound if its interval is replaced by its centre."""
+
+    @property
+    def decisive(self) -> str | None:
+        """The uncertain number whose width raises the bound most; None if no width raises it."""
+        if not self.narrowed:
+            return None
+        name = min(self.narrowed, key=self.narrowed.__getitem__)
+        return name if self.narrowed[name] < self.bound else None
+
+
+class GuaranteedTube(NamedTuple):
+    """Positions in {V_w <= level}, and the bounds, over time."""
+
+    t: np.ndarray
+    """Times, (T,) [s]."""
+    reference: np.ndarray
+    """(T, n), in the unit of the position."""
+    lower: np.ndarray
+    """Least position in the set, (T, n)."""
+    upper: np.ndarray
+    """Greatest position in the set, (T, n)."""
+    lower_bound: np.ndarray
+    """Lower bound of the position, (T, n)."""
+    upper_bound: np.ndarray
+    """Upper bound of the position, (T, n)."""
+    xi: np.ndarray
+    """Bound of |xi|, (T, n) [1]."""
+
+
+class Attempt(NamedTuple):
+    """One proof of a bisection."""
+
+    value: float
+    """Level, or factor of the widths of the intervals."""
+    verdict: Verdict
+    boxes: int
+    seconds: float
+
+
+class Violation(NamedTuple):
+    """A run that starts in the level set and violates the bounds."""
+
+    scenario: Scenario
+    """With the start and the parameters in it; its time 0 is the time of the start."""
+    state: Any
+    """The start in physical numbers."""
+    duration: float
+    """[s]."""
+    dt: float
+    """[s]."""
+    margin: float
+    """Least distance from the bounds, in the unit of the position; negative outside."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Proof:
+    """Whether {V_w <= level} is invariant for all times and parameters; printed as sentences."""
+
+    verdict: Verdict
+    scenario: Scenario
+    parameters: Mapping[str, Perturbation]
+    """Path -> `factor`, `offset` or `value` of an interval."""
+    ranges: dict[str, tuple[float, float]]
+    """Path of each uncertain number -> its least and its greatest value."""
+    level: float
+    """c, in the unit of V_w."""
+    weight: float
+    """w of the proof; of the weights that were tried, the one with the least largest V_w'."""
+    duration: float
+    """Length of the time interval [s]."""
+    is_period: bool
+    """Whether the time interval is a period, so that the statement is about all times."""
+    boxes: int
+    """Number of boxes that were evaluated."""
+    done: float
+    """Part of the volume on which V_w' < 0 is proved."""
+    seconds: float
+    """Time that the call took [s]."""
+    rates: dict[float, float]
+    """Weight w that was tried -> the largest V_w' that was found."""
+    growth_points: tuple[GrowthPoint, ...]
+    """For each weight a point with V_w' > 0, if every weight has one; () otherwise."""
+    worst_box: WorstBox | None
+    """Of a proof that is not complete; None otherwise."""
+    violation: Violation | None
+    """None unless the verdict is REFUTED."""
+    problem: LevelSetProblem
+    """Coordinates, bounds and points of the level set."""
+    history: tuple[Attempt, ...] = ()
+    """The proofs of a bisection, in their order; () for a single one."""
+
+    @property
+    def proved(self) -> bool:
+        """Whether the set is proved to be invariant."""
+        return self.verdict == Verdict.PROVED
+
+    @property
+    def assumptions(self) -> tuple[str, ...]:
+        """What the statement assumes, in sentences."""
+        return self.problem.assumptions
+
+    @property
+    def point(self) -> GrowthPoint | None:
+        """The point with V_w' > 0 at the best weight; None if there is none."""
+        return min(self.growth_points, key=lambda point: point.rate, default=None)
+
+    @property
+    def tube(self) -> GuaranteedTube:
+        """Positions in {V_w <= level} over the time interval.
+
+        w_i V1_i <= V_w, so that e1_i is between the two errors at which V1_i = level/w_i.
+        """
+        return tube_of_level(self.scenario, self.level, self.duration)
+
+    def replay(self, record_every: int = 1) -> Rollout:
+        """The run that refutes the bounds.
+
+        Args:
+          record_every: steps between two records.
+
+        Raises:
+          ValueError: the verdict is not REFUTED.
+        """
+        if self.violation is None:
+            remedy = "Only a refuted statement has a run that violates the bounds."
+            raise checks.fail("verdict", str(self.verdict), str(Verdict.REFUTED), remedy)
+        found = self.violation
+        with jax.enable_x64(True):
+            return simulate(
+                found.scenario, duration=found.duration, dt=found.dt, record_every=record_every
+            )
+
+    def adversarial_runs(
+        self, count: int, *, duration: float | None = None, dt: float = 1e-3, seed: int = 0
+    ) -> list[Rollout]:
+        """Runs that start at t = 0 at points of V_w = level with parameters at the ends of their
+        intervals.
+
+        Args:
+          count: number of runs.
+          duration: length of each run [s]; the time interval of the proof if not given.
+          dt: time step [s].
+          seed: of the random points.
+        """
+        count = checks.positive_integer("count", count, least=0)
+        steps = math.ceil((duration or self.duration or AT_REST) / dt)
+        constants = self.problem.constants(self.weight, self.level)
+        points = self.problem.sample(seed, 2 * count)[::2]
+        points[:, 0] = 0.0
+        every = max(1, steps // INSTANTS)
+        with jax.enable_x64(True):
+            return [
+                simulate(
+                    self.problem.scenario_at(point, constants),
+                    duration=steps * dt,
+                    dt=dt,
+                    record_every=every,
+                )
+                for point in points
+            ]
+
+    def plot(self, **options: Any) -> Figure:
+        """The tube over the reference with the bounds; see `plotting.guaranteed_tube`."""
+        return present("proof figure", self, **options)
+
+    def to_xarray(self) -> xarray.Dataset:
+        """Tube, verdict and numbers as a dataset."""
+        return present("proof dataset", self)
+
+    def save(self, path: str | PathLike) -> Path:
+        """Writes the dataset as netCDF; returns the path."""
+        place = checks.file_to_write("path", path)
+        self.to_xarray().to_netcdf(place, engine="scipy")
+        return place
+
+    def _repr_html_(self) -> str:
+        """The card in a notebook."""
+        return present("card", self)
+
+    def __repr__(self) -> str:
+        return "\n".join([self.sentence(), *self.details()])
+
+    def sentence(self) -> str:
+        """The statement and its verdict as one sentence."""
+        times = f"0 <= t <= {self.duration:.4g} s"
+        if self.is_period:
+            times = "all t"
+        uncertain = "the plant as given"
+        if self.ranges:
+            uncertain = "every plant of the box of parameters"
+        return (
+            f"{self.verdict.upper()}: {{V_w <= {self.level:.4g}}} is"
+            f" {_STATEMENTS[self.verdict]} for {times} and {uncertain}."
+        )
+
+    def details(self) -> list[str]:
+        """What was found, as lines."""
+        lines = _range_rows(self.ranges)
+        if self.proved:
+            lines.append(self._guarantee())
+        if self.verdict == Verdict.NOT_PROVED:
+            lines += self._why_not_proved()
+        if self.violation is not None:
+            lines.append(self._how_violated(self.violation))
+        if self.verdict == Verdict.UNDECIDED:
+            lines += self._why_undecided()
+        evaluated = f"w = {self.weight:.3g}, {self.boxes:,} boxes, {self.seconds:.3g} s."
+        lines.append(evaluated)
+        if self.history:
+            tried = ", ".join(f"{x.value:.4g} {x.verdict}" for x in self.history)
+            lines.append(f"Tried: {tried}.")
+        lines += [f"Assumed: {sentence}" for sentence in self.assumptions if self.proved]
+        return lines
+
+    def _guarantee(self) -> str:
+        xi = ", ".join(f"{x:.4g}" for x in self.tube.xi.max(axis=0))
+        names = ", ".join(plants.component_names(self.scenario.plant))
+        return f"Guaranteed for every start in the set: |xi| <= {xi} ({names})."
+
+    def _why_not_proved(self) -> list[str]:
+        tried = len(self.growth_points)
+        lines = [f"For each of the {tried} weights tried, V_w' > 0 at a point of the level set."]
+        if self.point is not None:
+            lines.append(f"  {self.point!r}")
+        lines.append("This refutes the Lyapunov function, not the bounds.")
+        return lines
+
+    def _how_violated(self, found: Violation) -> str:
+        entries = found.state._asdict().items()
+        start = ", ".join(
+            f"{name} = {_numbers(value)}" for name, value in entries if np.size(value)
+        )
+        return (
+            f"The run of {found.duration:.4g} s from {start} violates the bounds by"
+            f" {-found.margin:.3g}; replay() returns it."
+        )
+
+    def _why_undecided(self) -> list[str]:
+        lines = [f"V_w' < 0 is proved on {100.0 * self.done:.3g} % of the volume."]
+        box = self.worst_box
+        if box is None:
+            return lines
+        if box.bound < 0.0:
+            lines.append("The boxes that are left need more of them: increase max_boxes.")
+            return lines
+        lines.append(f"Worst box: V_w' <= {box.bound:+.4g}, {box.value:+.4g} at its centre:")
+        rows = [
+            ("", name, f"{low:.6g} to {high:.6g}") for name, (low, high) in box.intervals.items()
+        ]
+        lines += tables.as_text(rows, left=(0, 1))
+        if box.decisive is not None:
+            lines.append(
+                f"The width of {box.decisive} raises the bound most: it is"
+                f" {box.narrowed[box.decisive]:+.4g} without it."
+            )
+        return lines
+
+
+_STATEMENTS = {
+    Verdict.PROVED: "invariant",
+    Verdict.NOT_PROVED: "not shown to be invariant by V_w",
+    Verdict.REFUTED: "not inside the bounds forever",
+    Verdict.UNDECIDED: "neither proved nor refuted to be invariant",
+}
+
+
+def _range_rows(ranges: Mapping[str, tuple[float, float]]) -> list[str]:
+    """Intervals as aligned lines."""
+    rows = [("", name, f"{low:.6g} to {high:.6g}") for name, (low, high) in ranges.items()]
+    return list(tables.as_text(rows, left=(0, 1)))
+
+
+def _numbers(value: Any) -> str:
+    """Numbers as text."""
+    if isinstance(value, Mapping):
+        return ", ".join(f"{path} {number:.5g}" for path, number in value.items())
+    texts = [f"{x:.5g}" for x in np.ravel(value)]
+    return texts[0] if np.ndim(value) == 0 else f"({', '.join(texts)})"
+
+
+@jax.enable_x64(True)
+def tube_of_level(scenario: Scenario, level: float, duration: float) -> GuaranteedTube:
+    """Positions in {V_w <= level} over time."""
+    scenario = canonical(astype(scenario, jnp.float64))
+    barrier, weight = position_barrier(scenario)
+    times = jnp.linspace(0.0, duration or AT_REST, INSTANTS)
+
+    def ends(t):
+        tube = scenario.context.tube(t)
+        values = jnp.broadcast_to(level / weight, tube.q_d.shape)
+        error_at = barrier_member(barrier, "error_at")
+        below = error_at(values, tube, jnp.zeros(values.shape, bool))
+        above = error_at(values, tube, jnp.ones(values.shape, bool))
+        xi = barrier_member(barrier, "xi_bound")(values, tube)
+        return tube.q_d, tube.q_d + below, tube.q_d + above, tube.lower, tube.upper, xi
+
+    found = jax.vmap(ends)(times)
+    return GuaranteedTube(np.asarray(times), *(np.asarray(x) for x in found))
+
+
+def position_barrier(scenario: Scenario) -> tuple[Any, jax.Array]:
+    """The barrier of the positions and the weight of its V1."""
+    law: Any = scenario.controller
+    if plants.is_chain(scenario.plant):
+        return law.barriers[0], law.weights[0]
+    return law.barrier, law.weight

@@ -1,0 +1,388 @@
+"""Branch and bound over boxes: proves that one of several functions is negative at every point.
+
+A box is finished if an alternative is negative on it, or if it is outside the region; otherwise it
+is bisected, along the coordinate that reduces the margin most (`kernels/c/boxes.h`). The whole box
+is first divided into some thousand boxes, the units of work. A compiled kernel searches each of
+them depth-first.
+
+The number of boxes does not depend on the number of threads: results count in the order of the
+units, up to the first one that is not proved.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import math
+import os
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from iblf_jax.core import checks
+from iblf_jax.core.progress import bar
+from iblf_jax.kernels import IntervalKernel, interval_kernel, pointer
+
+STATUSES = ("proved", "undecided", "refuted", "out of boxes", "stopped", "out of memory")
+"""How the search of a unit ended, in the order of `kernels/c/boxes.h`."""
+PROVED, UNDECIDED, REFUTED, OUT_OF_BOXES, STOPPED, OUT_OF_MEMORY = range(6)
+UNITS = 4096
+"""Units of work, at least, unless fewer boxes prove the statement."""
+RENEWAL = 7
+"""Bisections after which the weights of the coordinates are measured again."""
+NARROWEST = 2.0**-24
+"""Width, in parts of the whole, up to which a coordinate is not bisected."""
+MAX_UNDECIDED = 16
+"""Boxes of a unit that are too narrow to be bisected, after which its search ends."""
+SECONDS_BETWEEN_CHECKPOINTS = 10.0
+
+
+class WorstBox(NamedTuple):
+    """The box that has the largest bound at its centre, of those that are left."""
+
+    lower: np.ndarray
+    """Lower corner, (d,)."""
+    upper: np.ndarray
+    """Upper corner, (d,)."""
+    bound: float
+    """Upper bound of the smallest alternative on the box."""
+    value: float
+    """The same at its centre."""
+
+
+class SearchResult(NamedTuple):
+    """The result of a search."""
+
+    status: str
+    """ "proved", "refuted" (no alternative is negative on a box inside the region), "undecided" (a
+    box is too narrow to be bisected), "out of boxes" or "out of memory"."""
+    boxes: int
+    """Number of boxes that were evaluated."""
+    seconds: float
+    done: float
+    """Part of the volume on which the statement is proved."""
+    worst: WorstBox | None
+    """None if the statement is proved."""
+
+    @property
+    def proved(self) -> bool:
+        """Whether the statement is proved."""
+        return self.status == STATUSES[PROVED]
+
+
+class _Options(ctypes.Structure):
+    _fields_ = (
+        ("max_boxes", ctypes.c_int64),
+        ("max_undecided", ctypes.c_int64),
+        ("renewal", ctypes.c_int64),
+        ("smallest", ctypes.c_void_p),
+        ("stop", ctypes.c_void_p),
+    )
+
+
+class _Found(NamedTuple):
+    """What a kernel found."""
+
+    boxes: int
+    status: int
+    done: float
+    worst: WorstBox | None
+
+
+class _Problem:
+    """A statement on boxes of one kernel.
+
+    Args:
+      kernel: kernel of the function.
+      lower: lower corners of the boxes that are to be searched, (p, d).
+      upper: upper corners, (p, d).
+    """
+
+    def __init__(self, kernel: IntervalKernel, lower: np.ndarray, upper: np.ndarray) -> None:
+        self.kernel = kernel
+        self.lower = lower
+        self.upper = upper
+        self.smallest = (upper - lower)[0] * NARROWEST
+        self.stop = np.zeros(1, np.int32)
+        self.size = int(kernel.library.record_size())
+        self.dimension = lower.shape[1]
+
+    def digest(self) -> str:
+        """A hash of everything on which the results of the units depend."""
+        found = hashlib.sha256(self.kernel.compiled.source.encode())
+        for x in (self.kernel.numbers, self.lower, self.upper):
+            found.update(x.tobytes())
+        found.update(repr((UNITS, RENEWAL, NARROWEST, MAX_UNDECIDED)).encode())
+        return found.hexdigest()
+
+    def divided(self, max_boxes: int) -> tuple[np.ndarray, _Found]:
+        """The units of work, in an order without regularity, and what their division found."""
+        target = math.ceil(UNITS / len(self.lower))
+        records = []
+        parts = []
+        for low, high in zip(self.lower, self.upper, strict=True):
+            room = np.zeros((2 * target, self.size))
+            room[0, : 2 * self.dimension] = np.concatenate([low, high])
+            found, count = self._call("divide_box", max_boxes, room, ctypes.c_int64(target))
+            records.append(room[:count])
+            parts.append(found)
+        units = np.concatenate(records)
+        division = _Found(
+            sum(part.boxes for part in parts),
+            max(part.status for part in parts),
+            sum(part.done for part in parts) / len(parts),
+            max(
+                (part.worst for part in parts if part.worst is not None),
+                key=lambda box: box.value,
+                default=None,
+            ),
+        )
+        return units[np.random.default_rng(0).permutation(len(units))], division
+
+    def searched(self, unit: np.ndarray, max_boxes: int) -> _Found:
+        """The result of a unit."""
+        found, _ = self._call("search_box", max_boxes, unit)
+        return found._replace(done=found.done / len(self.lower))
+
+    def worst(self, units: np.ndarray) -> WorstBox | None:
+        """The worst of some units."""
+        found = self._result_type()()
+        self.kernel.library.worst_box(
+            pointer(self.kernel.numbers),
+            pointer(units),
+            ctypes.c_int64(len(units)),
+            ctypes.byref(found),
+        )
+        return self._worst_of(found)
+
+    def _call(self, name: str, max_boxes: int, boxes: np.ndarray, *more: Any) -> tuple[_Found, int]:
+        """Calls a function of the kernel."""
+        options = _Options(
+            max_boxes, MAX_UNDECIDED, RENEWAL, pointer(self.smallest), pointer(self.stop)
+        )
+        result = self._result_type()()
+        function = getattr(self.kernel.library, name)
+        function.restype = ctypes.c_int64
+        count = function(
+            pointer(self.kernel.numbers),
+            pointer(boxes),
+            *more,
+            ctypes.byref(options),
+            ctypes.byref(result),
+        )
+        return _Found(result.boxes, result.status, result.done, self._worst_of(result)), count
+
+    def _result_type(self) -> Any:
+        """`search_result` of the kernel."""
+        corner = ctypes.c_double * self.dimension
+        fields = [
+            *((name, ctypes.c_int64) for name in ("boxes", "undecided", "status")),
+            *((name, ctypes.c_double) for name in ("done", "bound", "value")),
+            ("low", corner),
+            ("high", corner),
+        ]
+        return type("Result", (ctypes.Structure,), {"_fields_": fields})
+
+    def _worst_of(self, found: Any) -> WorstBox | None:
+        """The worst box of a result; None if there is none."""
+        if found.value == -math.inf:
+            return None
+        return WorstBox(np.array(found.low), np.array(found.high), found.bound, found.value)
+
+
+class _Results:
+    """The results of the units that are proved, in memory and in a file.
+
+    Args:
+      path: of the file; None for none.
+      digest: of the problem.
+      units: number of units.
+    """
+
+    def __init__(self, path: str | os.PathLike | None, digest: str, units: int) -> None:
+        self.path = None if path is None else Path(path)
+        self.digest = digest
+        self.boxes = np.zeros(units, np.int64)
+        self.done = np.zeros(units)
+        self.saved = time.monotonic()
+        if self.path is not None and self.path.exists():
+            self._load(self.path)
+
+    def add(self, unit: int, found: _Found) -> None:
+        """Adds a unit that is proved."""
+        self.boxes[unit] = found.boxes
+        self.done[unit] = found.done
+        if time.monotonic() - self.saved > SECONDS_BETWEEN_CHECKPOINTS:
+            self.save()
+
+    def save(self) -> None:
+        """Writes the file under another name and renames it, so that it is complete."""
+        self.saved = time.monotonic()
+        if self.path is None:
+            return
+        temporary = self.path.with_name(f".{self.path.name}.{os.getpid()}.partial")
+        with open(temporary, "wb") as file:
+            np.savez(file, digest=np.asarray(self.digest), boxes=self.boxes, done=self.done)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, self.path)
+
+    def _load(self, path: Path) -> None:
+        """Reads the file.
+
+        Raises:
+          ValueError: it is no checkpoint, or one of another problem.
+        """
+        place = checks.file_to_read("checkpoint", path)
+        try:
+            with np.load(place) as file:
+                found = {name: file[name] for name in ("digest", "boxes", "done")}
+        except (
+            Exception
+        ) as error:  # incomplete, another kind of file, or one that begins like a zip
+            remedy = (
+                f"It cannot be read ({type(error).__name__}: {error}): delete it or name another"
+                " file."
+            )
+            raise checks.fail("checkpoint", str(path), "a checkpoint of a proof", remedy) from error
+        if str(found["digest"]) != self.digest or found["boxes"].shape != self.boxes.shape:
+            remedy = (
+                "Scenario, level, parameters or the package's version differ: delete it or name"
+                " another file."
+            )
+            raise checks.fail("checkpoint", str(path), "a checkpoint of this very proof", remedy)
+        self.boxes = found["boxes"]
+        self.done = found["done"]
+
+
+def search(
+    function: Callable,
+    lower: Any,
+    upper: Any,
+    constants: Sequence[Any] = (),
+    *,
+    patterns: Any = None,
+    max_boxes: int = 1_000_000_000,
+    threads: int | None = None,
+    progress: bool | None = None,
+    checkpoint: str | os.PathLike | None = None,
+) -> SearchResult:
+    """Tries to prove that at every point x of a box with region(x) <= 0, one of the alternatives is
+    negative.
+
+    Args:
+      function: function (x, constants) -> (alternatives (m,), region (r,)) of one point, (d,), and
+        of a list of constants. All points of the box are in the region if r = 0.
+      lower: lower corner of the box, (b,).
+      upper: upper corner, (b,).
+      constants: numbers and arrays of the function, which count as exact.
+      patterns: values of the last d - b coordinates, which are not divided, (p, d - b): the
+        statement is to be proved for each row. None if d = b.
+      max_boxes: number of boxes after which the search ends, at the end of a generation of boxes
+        where it is reached during the division into units.
+      threads: number of threads; None for the number of processors.
+      progress: whether a bar shows the part of the volume that is done and an estimate of the
+        remaining time; None for where a user sees it.
+      checkpoint: file from which the search continues if it exists, and to which the units that are
+        proved are written; None for none.
+
+    Raises:
+      ValueError: a bad argument, or the checkpoint is one of another problem.
+      UnsupportedError: an operation is not available on intervals.
+      ToolchainError: no compiler, or one that does not honour the rounding mode.
+    """
+    start = time.monotonic()
+    max_boxes = checks.positive_integer("max_boxes", max_boxes)
+    if threads is not None:
+        threads = checks.positive_integer("threads", threads)
+    low, high = _with_patterns(lower, upper, patterns)
+    problem = _Problem(interval_kernel(function, low.shape[1], constants), low, high)
+    units, division = problem.divided(max_boxes)
+    results = _Results(checkpoint, problem.digest(), len(units))
+    boxes = division.boxes
+    done = division.done
+    ended = division
+    proved = 0
+    with bar(progress, total=100, unit="% of the volume") as shown:
+        shown.update(100 * done)
+        if division.status == PROVED:
+            for found in _in_order(problem, units, results, max_boxes - boxes, threads):
+                ended = found
+                boxes += found.boxes
+                done += found.done
+                shown.update(100 * found.done)
+                shown.set_postfix_str(f"{boxes:.3g} boxes", refresh=False)
+                if found.status != PROVED:
+                    break
+                proved += 1
+    worst = ended.worst
+    if ended.status == OUT_OF_BOXES:
+        left = [box for box in (worst, problem.worst(units[proved:])) if box is not None]
+        worst = max(left, key=lambda box: box.value, default=None)
+    return SearchResult(STATUSES[ended.status], boxes, time.monotonic() - start, done, worst)
+
+
+def _with_patterns(lower: Any, upper: Any, patterns: Any) -> tuple[np.ndarray, np.ndarray]:
+    """The corners of the boxes of all patterns, each (p, d).
+
+    Raises:
+      ValueError: a lower end is not below or at the upper one, or numbers are missing.
+    """
+    low, high = (np.asarray(x, np.float64) for x in (lower, upper))
+    if low.shape != high.shape or low.ndim != 1 or not (low <= high).all():
+        remedy = f"The upper corner is {high.tolist()}."
+        raise checks.fail("lower", low.tolist(), "a corner below the upper one", remedy)
+    rows = np.zeros((1, 0))
+    if patterns is not None:
+        rows = np.asarray(patterns, np.float64)
+    low, high = (
+        np.concatenate([np.broadcast_to(corner, (len(rows), len(corner))), rows], axis=1)
+        for corner in (low, high)
+    )
+    return low, high
+
+
+def _in_order(
+    problem: _Problem, units: np.ndarray, results: _Results, max_boxes: int, threads: int | None
+) -> Iterator[_Found]:
+    """The results of the units in their order, computed by several threads, up to the first one
+    that is not proved.
+    """
+    waiting: dict[Future, int] = {}
+    found: dict[int, _Found] = {}
+    left = max_boxes
+    started = 0
+    number = threads or os.cpu_count() or 1
+    pool = ThreadPoolExecutor(number)
+    try:
+        for k, unit in enumerate(units):
+            while k not in found:
+                while started < len(units) and len(waiting) < 2 * number:
+                    if results.boxes[started] > 0:
+                        found[started] = _Found(
+                            int(results.boxes[started]), PROVED, float(results.done[started]), None
+                        )
+                    else:
+                        waiting[pool.submit(problem.searched, units[started], left)] = started
+                    started += 1
+                if k in found:
+                    break
+                for future in wait(waiting, return_when=FIRST_COMPLETED).done:
+                    place = waiting.pop(future)
+                    found[place] = future.result()
+                    if found[place].status == PROVED:
+                        results.add(place, found[place])
+            result = found.pop(k)
+            if result.boxes > left:
+                # The number of boxes that were left when it began depended on the other threads.
+                result = problem.searched(unit, left)
+            left -= result.boxes
+            yield result
+    finally:
+        problem.stop[0] = 1
+        pool.shutdown(cancel_futures=True)
+        results.save()

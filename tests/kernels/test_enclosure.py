@@ -1,0 +1,385 @@
+"""Enclosures over boxes contain the exact values, which mpmath computes with 60 digits."""
+
+from __future__ import annotations
+
+import math
+
+import jax
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+import pytest
+from test_lowering_backends import needs_compiler
+
+from iblf_jax.kernels import enclosure, toolchain
+from iblf_jax.kernels.enclosure import enclose
+from iblf_jax.kernels.interval_primitives import hull, lower, meet, upper, with_sign
+from iblf_jax.kernels.program import UnsupportedError
+from iblf_jax.kernels.toolchain import ToolchainError
+
+pytestmark = needs_compiler
+
+
+@pytest.fixture(autouse=True)
+def digits():
+    with mpmath.workdps(60):
+        yield
+
+
+UNARY = {
+    "neg": (lambda x: -x, lambda x: -x, -math.inf),
+    "abs": (jnp.abs, abs, -math.inf),
+    "square": (lambda x: x * x, lambda x: x * x, -math.inf),
+    "cube": (lambda x: x**3, lambda x: x**3, -math.inf),
+    "fourth": (lambda x: x**4, lambda x: x**4, -math.inf),
+    "sqrt": (jnp.sqrt, mpmath.sqrt, 0.0),
+    "rsqrt": (jax.lax.rsqrt, lambda x: 1 / mpmath.sqrt(x), 0.0),
+    "sin": (jnp.sin, mpmath.sin, -math.inf),
+    "cos": (jnp.cos, mpmath.cos, -math.inf),
+    "tan": (jnp.tan, mpmath.tan, -math.inf),
+    "exp": (jnp.exp, mpmath.exp, -math.inf),
+    "expm1": (jnp.expm1, mpmath.expm1, -math.inf),
+    "log": (jnp.log, mpmath.log, 0.0),
+    "log1p": (jnp.log1p, mpmath.log1p, -1.0),
+    "atan": (jnp.arctan, mpmath.atan, -math.inf),
+    "sinh": (jnp.sinh, mpmath.sinh, -math.inf),
+    "cosh": (jnp.cosh, mpmath.cosh, -math.inf),
+    "tanh": (jnp.tanh, mpmath.tanh, -math.inf),
+    "logistic": (jax.nn.sigmoid, lambda x: 1 / (1 + mpmath.exp(-x)), -math.inf),
+    "power": (lambda x: x**1.7, lambda x: x ** mpmath.mpf(1.7), 0.0),
+    "negative power": (lambda x: x**-2.5, lambda x: x ** mpmath.mpf(-2.5), 0.0),
+    "reciprocal": (lambda x: 1 / x, lambda x: 1 / x, -math.inf),
+}
+"""Operation -> JAX function, exact function, infimum of its domain."""
+
+
+def intervals(rng, lowest: float, number: int) -> tuple[np.ndarray, np.ndarray]:
+    """Intervals of all sizes and positions above a bound, some of them points."""
+    size = 10.0 ** rng.uniform(-12, 2.5, number)
+    centre = rng.choice([-1, 1], number) * 10.0 ** rng.uniform(-12, 2.5, number)
+    if lowest > -math.inf:
+        centre = lowest + np.abs(centre) + size
+    size[::7] = 0
+    special = np.array([0.0, -0.0, 1.0, np.pi, np.pi / 2, 3 * np.pi / 2, 1e5, 2.0**-1022, 1e-320])
+    special = special[special > lowest]
+    centre[: len(special)] = special
+    size[: len(special)] = 0
+    low = centre - size
+    return np.maximum(low, np.nextafter(lowest, math.inf)), centre + size
+
+
+def points(rng, low: float, high: float) -> list[float]:
+    """Ends and inner points of an interval."""
+    share = rng.uniform(size=4)
+    inner = (1 - share) * low + share * high
+    return [low, high, *np.clip(inner, low, high).tolist()]
+
+
+def contains(lower: float, upper: float, value) -> bool:
+    """Whether bounds contain an exact value; NaN is no bound."""
+    return not (lower > value) and not (upper < value)
+
+
+@pytest.mark.parametrize("name", UNARY)
+def test_functions_contain_exact_values(name):
+    function, exact, lowest = UNARY[name]
+    rng = np.random.default_rng(len(name))
+    low, high = intervals(rng, lowest, 300)
+    below, above = enclose(lambda x, c: function(x[0]), low[:, None], high[:, None])
+    for a, b, least, most in zip(low, high, below[0], above[0], strict=True):
+        for x in points(rng, a, b):
+            if name == "reciprocal" and x == 0:
+                continue
+            assert contains(least, most, exact(mpmath.mpf(x))), (name, a, b, x, least, most)
+
+
+EDGES = [0.0, -0.0, 5e-324, 2.0**-1022, 1e-160, 1.0, 1.0 + 2.0**-52, 3.0, 1e160, 1.7e308]
+EDGES += [-x for x in EDGES[2:]]
+
+
+def binary(x, c):
+    """Every operation of two numbers, with both of the box, and with one of a constant."""
+    k = jnp.stack([c[0], c[0] + 0.0 * c[0], 1.5 * c[0]])
+    pairs = [(x[0], x[1]), (x[0], k[0]), (k[0], x[1]), (x[0], k[2]), (k[2], x[1])]
+    return [
+        jnp.stack([a + b, a - b, a * b, a / b, jnp.maximum(a, b), jnp.minimum(a, b)])
+        for a, b in pairs
+    ]
+
+
+def exact_binary(a, b):
+    """The same in exact arithmetic; None for a quotient by 0."""
+    quotient = a / b if b else None
+    return [a + b, a - b, a * b, quotient, max(a, b), min(a, b)]
+
+
+@pytest.mark.parametrize("constant", [0.0, -0.7, 3.0, 1e-310, -1e308])
+def test_arithmetic_at_the_edges(constant):
+    """Denormal and huge numbers, overflow, divisors that contain zero, points and half-lines."""
+    rng = np.random.default_rng(0)
+    ends = np.sort(rng.choice(EDGES, (400, 2, 2)), axis=2)
+    below, above = enclose(binary, ends[:, :, 0], ends[:, :, 1], [constant])
+    c, d = mpmath.mpf(constant), mpmath.mpf(1.5) * mpmath.mpf(constant)
+    with mpmath.workdps(700):
+        for k, (one, other) in enumerate(ends):
+            for x, y in zip(points(rng, *one), points(rng, *other), strict=True):
+                x, y = mpmath.mpf(x), mpmath.mpf(y)
+                pairs = [(x, y), (x, c), (c, y), (x, d), (d, y)]
+                for pair, least, most in zip(pairs, below, above, strict=True):
+                    for value, a, b in zip(exact_binary(*pair), least[k], most[k], strict=True):
+                        assert value is None or contains(a, b, value), (pair, value, a, b)
+
+
+def test_bounds_are_tight():
+    """A bound is an ulp from the exact result of an operation, and exact where that is exact."""
+    below, above = enclose(
+        lambda x, c: [x[0] + x[1], x[0] * x[1], x[0] / x[1], x[0] * c[0], x[0] / c[0]],
+        [[1.0, 3.0], [-2.0, 4.0]],
+        [[1.0, 3.0], [5.0, 8.0]],
+        [3.0],
+    )
+    third = math.nextafter(1 / 3, 1)
+    assert [(a[0], b[0]) for a, b in zip(below, above, strict=True)] == [
+        (4.0, 4.0), (3.0, 3.0), (1 / 3, third), (3.0, 3.0), (1 / 3, third),
+    ]  # fmt: skip
+    assert (below[0][1], above[0][1]) == (2.0, 13.0)
+    assert (below[1][1], above[1][1]) == (-16.0, 40.0)
+    assert (below[2][1], above[2][1]) == (-0.5, 1.25)
+
+
+def test_unbounded_operands_stay_unbounded():
+    """A divisor that contains zero gives the whole line, which no operation turns into a bound."""
+
+    def function(x, c):
+        whole = 1 / x[0]
+        zero, shared_whole = x[1], 1 / (c[0] - c[0])
+        return jnp.stack(
+            [
+                whole * zero,
+                whole - whole,
+                whole * whole,
+                jnp.maximum(whole, -1.0) + whole,
+                jnp.sqrt(whole) * -1.0,
+                whole * c[0],
+                x[0] * shared_whole,
+                upper(whole),
+                jnp.sin(whole) + whole,
+                x[1] / x[0],
+            ]
+        )
+
+    (below,), (above,) = enclose(function, [[-1.0, 0.0]], [[1.0, 0.0]], [0.3])
+    assert not (np.delete(above[0], 4) < math.inf).any(), above
+    assert above[0, 4] == 0.0
+    assert not (np.delete(below[0], [2, 8]) > -math.inf).any(), below
+
+
+def test_comparisons_have_three_results():
+    def function(x, c):
+        a, b = x
+        results = [a < b, a <= b, a > b, a >= b, a == b, a != b, ~(a < b)]
+        results += [(a < b) & (a > 0), (a < b) | (a > 0), (a < b) ^ (a > 0), jnp.isfinite(a)]
+        return jnp.stack([jnp.where(r, 1.0, 0.0) for r in results] + [jnp.sign(a - b)])
+
+    lows = [[1, 2], [1, 1], [1, 3], [2, 1], [1, 1]]
+    highs = [[1, 2], [2, 3], [2, 4], [2, 1], [1, 1]]
+    (below,), (above,) = enclose(function, np.array(lows, float), np.array(highs, float))
+    both = (0, 1)
+    expected = [
+        [1, 1, 0, 0, 0, 1, 0, 1, 1, 0, 1, -1],
+        [both, both, both, both, both, both, both, both, 1, both, 1, (-2, 1)],
+        [1, 1, 0, 0, 0, 1, 0, 1, 1, 0, 1, -1],
+        [0, 0, 1, 1, 0, 1, 1, 0, 1, 1, 1, 1],
+        [0, 1, 0, 1, 1, 0, 1, 0, 1, 1, 1, 0],
+    ]
+    for row, a, b in zip(expected, below, above, strict=True):
+        for k, value in enumerate(row[:-1]):
+            assert (a[k], b[k]) == (value if isinstance(value, tuple) else (value, value)), k
+    assert below[:, -1].tolist() == [-1, -1, -1, 1, 0]
+    assert above[:, -1].tolist() == [-1, 1, -1, 1, 0]
+
+
+def test_undecided_selection_is_the_hull():
+    (below,), (above,) = enclose(
+        lambda x, c: jnp.where(x[0] > 0, 1.0 + x[0], -2.0 * x[0])[None], [[-1.0]], [[1.0]]
+    )
+    assert (below[0, 0], above[0, 0]) == (-2.0, 2.0)
+
+
+def test_primitives_of_intervals():
+    def function(x, c):
+        side = with_sign(x[0], x[2])
+        cases = [side > 0, side >= 0, -side > 0, side == 0]
+        return jnp.stack(
+            [upper(x[0]), lower(x[0]), hull(x[0], x[1]), meet(x[0], x[1])]
+            + [jnp.where(case, 1.0, 2.0) for case in cases]
+            + [jnp.sign(side)]
+        )
+
+    (below,), (above,) = enclose(function, [[-1, 0, 1], [-1, 0, -1]], [[1, 3, 1], [1, 3, -1]])
+    assert below.tolist() == [[1, -1, -1, 0, 1, 1, 2, 2, 1], [1, -1, -1, 0, 2, 2, 1, 2, -1]]
+    assert above.tolist() == [[1, -1, 3, 1, 1, 1, 2, 2, 1], [1, -1, 3, 1, 2, 2, 1, 2, -1]]
+
+
+def test_primitives_are_the_identity_on_numbers():
+    def function(x):
+        return upper(x) * lower(x[::-1]) + hull(x, 2.0 * x) + meet(x, 0.0) + with_sign(x, 1.0)
+
+    def plain(x):
+        return x * x[::-1] + 3 * x
+
+    x = jnp.array([0.3, -0.7])
+    np.testing.assert_allclose(function(x), plain(x))
+    np.testing.assert_allclose(jax.jit(function)(x), jax.jit(plain)(x))
+    np.testing.assert_allclose(jax.jacfwd(function)(x), jax.jacfwd(plain)(x))
+    np.testing.assert_allclose(jax.jacrev(function)(x), jax.jacrev(plain)(x))
+    batch = jnp.stack([x, 2 * x, -x])
+    np.testing.assert_allclose(jax.vmap(function)(batch), jax.vmap(plain)(batch))
+    mixed = jax.vmap(hull, (1, None))(batch, jnp.zeros(3))
+    np.testing.assert_allclose(mixed, batch.T)
+
+
+def test_literals_are_not_folded_inexactly():
+    """0.1 + 0.2 of literals is enclosed, not rounded."""
+
+    def function(x, c):
+        return ((jnp.asarray(0.1) + jnp.asarray(0.2)) - 0.3 + 0.0 * x[0])[None]
+
+    exact = mpmath.mpf(0.1) + mpmath.mpf(0.2) - mpmath.mpf(0.3)
+    (below,), (above,) = enclose(function, [[0.0]], [[1.0]])
+    assert contains(below[0, 0], above[0, 0], exact)
+    assert 0 < above[0, 0] - below[0, 0] < 1e-15
+
+
+# --- random expressions ------------------------------------------------------------------------
+
+LEAVES = 4
+CHOICES = {
+    "add": (jnp.add, lambda a, b: a + b),
+    "sub": (jnp.subtract, lambda a, b: a - b),
+    "mul": (jnp.multiply, lambda a, b: a * b),
+    "div": (jnp.divide, lambda a, b: a / b),
+    "max": (jnp.maximum, max),
+    "min": (jnp.minimum, min),
+    "where": (lambda a, b: jnp.where(a < b, a + 1, b * b), lambda a, b: a + 1 if a < b else b * b),
+    **{name: UNARY[name][:2] for name in ("abs", "sqrt", "sin", "cos", "exp", "log1p", "atan")},
+    **{name: UNARY[name][:2] for name in ("tanh", "square", "cube", "expm1", "neg")},
+}
+TWO = ("add", "sub", "mul", "div", "max", "min", "where")
+
+
+def random_tree(rng, depth: int):
+    """An expression: the number of a leaf, or (operation, expressions)."""
+    if depth == 0 or rng.uniform() < 0.1:
+        return int(rng.integers(LEAVES + 2))
+    name = str(rng.choice(list(CHOICES)))
+    arity = 2 if name in TWO else 1
+    return (name, *(random_tree(rng, depth - 1) for _ in range(arity)))
+
+
+def value_of(tree, leaves, which: int):
+    """The value of an expression, by JAX (0) or exact (1); ValueError where it is not defined, or
+    so large that mpmath would need gigabytes for its exponential.
+    """
+    if isinstance(tree, int):
+        return leaves[tree]
+    value = CHOICES[tree[0]][which](*(value_of(t, leaves, which) for t in tree[1:]))
+    if which and (isinstance(value, mpmath.mpc) or not abs(value) < 1e4):
+        raise ValueError("not a real number of moderate size")
+    return value
+
+
+def check_random_expressions(seed: int, expressions: int) -> int:
+    """The number of exact values that were compared with their enclosures."""
+    rng = np.random.default_rng(seed)
+    trees = [random_tree(rng, 5) for _ in range(expressions)]
+    constants = [0.37, -1.9]
+
+    def function(x, c):
+        leaves = [*x, *c]
+        return jnp.stack([value_of(tree, leaves, 0) + 0.0 * x[0] for tree in trees])
+
+    size = 10.0 ** rng.uniform(-9, 0.5, (8, LEAVES)) * rng.choice([0, 1, 1], (8, LEAVES))
+    centre = rng.normal(size=(8, LEAVES))
+    low, high = centre - size, centre + size
+    (below,), (above,) = enclose(function, low, high, constants)
+    compared = 0
+    for k in range(len(low)):
+        x = np.clip(low[k] + rng.uniform(size=LEAVES) * (high[k] - low[k]), low[k], high[k])
+        leaves = [*map(mpmath.mpf, x), *map(mpmath.mpf, constants)]
+        for tree, least, most in zip(trees, below[k], above[k], strict=True):
+            try:
+                value = value_of(tree, leaves, 1)
+            except (ZeroDivisionError, ValueError):
+                continue
+            compared += 1
+            assert contains(least, most, value), (tree, x.tolist(), least, most)
+    return compared
+
+
+def test_random_expressions():
+    assert check_random_expressions(0, 200) > 800
+
+
+@pytest.mark.release
+@pytest.mark.parametrize("seed", range(1, 6))
+def test_more_random_expressions(seed):
+    assert check_random_expressions(seed, 300) > 1200
+
+
+# --- refusals ----------------------------------------------------------------------------------
+
+
+def test_a_kernel_that_does_not_round_outward_is_refused(monkeypatch):
+    source = enclosure.compiled(jnp_square, 1, ()).source
+    assert source.count("FE_UPWARD") > 0
+    with pytest.raises(ToolchainError, match="rounding mode"):
+        enclosure.library(source.replace("fesetround(FE_UPWARD)", "fesetround(FE_TONEAREST)"))
+    # The flags of -ffast-math, which itself would change the rounding of the whole process.
+    flags = ("-O2", "-fno-rounding-math", "-fassociative-math", "-fno-signed-zeros")
+    monkeypatch.setattr(enclosure, "FLAGS", (*flags, "-freciprocal-math", "-ffinite-math-only"))
+    with pytest.raises(ToolchainError, match="rounding mode"):
+        enclosure.library(source + "\n// without the flags of the rounding mode")
+
+
+def jnp_square(x, c):
+    return x * x
+
+
+def test_the_rounding_mode_of_the_thread_is_restored():
+    enclose(jnp_square, [[0.1]], [[0.3]])
+    assert 1.0 + 2.0**-60 == 1.0
+    assert np.nextafter(0.0, 1.0) / 2 == 0.0
+
+
+@pytest.mark.parametrize(
+    ("function", "name"),
+    [
+        (lambda x, c: jnp.floor(x), "floor"),
+        (lambda x, c: jnp.fmod(x, 2.0), "rem"),
+        (lambda x, c: jnp.arcsin(x), "asin"),
+        (lambda x, c: x ** x[0], "pow"),
+        (lambda x, c: x.astype(int).astype(float), "convert"),
+    ],
+)
+def test_unsupported_operations_are_named(function, name):
+    with pytest.raises(UnsupportedError, match=name):
+        enclose(function, [[0.1]], [[0.3]])
+
+
+def test_bad_numbers_are_refused():
+    with pytest.raises(ValueError, match="constants\\[0\\]"):
+        enclose(lambda x, c: x * c[0], [[0.0]], [[1.0]], [math.nan])
+    with pytest.raises(ValueError, match="above the upper one"):
+        enclose(jnp_square, [[1.0]], [[0.0]])
+
+
+def test_new_numbers_need_no_compilation():
+    def function(x, c):
+        return x * c[0] + jnp.sin(c[0])
+
+    enclose(function, [[0.0]], [[1.0]], [2.0])
+    before = toolchain.CACHES.libraries.copy()
+    (below,), _ = enclose(function, [[1.0]], [[1.0]], [3.0])
+    assert toolchain.CACHES.libraries == before
+    assert abs(below[0, 0] - (3.0 + math.sin(3.0))) < 1e-13

@@ -1,0 +1,196 @@
+"""Branch and bound: what must be proved, what must not, and that nothing depends on threads."""
+
+from __future__ import annotations
+
+import threading
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_lowering_backends import needs_compiler
+
+from iblf_jax.proofs import search as module
+from iblf_jax.proofs.search import search
+
+pytestmark = needs_compiler
+
+LOW, HIGH = np.full(3, -2.0), np.full(3, 2.0)
+NOWHERE = jnp.zeros(0)
+"""The region of a statement about the whole box."""
+
+
+def bowl(x, c):
+    """Its maximum, 0 at the origin, plus the constant."""
+    return (c[0] - jnp.sum(x**2 / (1 + x**2)))[None], NOWHERE
+
+
+def waves(x, c):
+    """cos(a + b) - |x|^2/10 + c, in which variables occur several times; 1 + c at the origin."""
+    a, b = 2 * x[0] + x[1], x[1] * x[2] - x[0]
+    cosine = jnp.cos(a) * jnp.cos(b) - jnp.sin(a) * jnp.sin(b)
+    return (cosine - 0.1 * jnp.sum(x**2) + c[0])[None], NOWHERE
+
+
+def test_a_negative_function_is_proved():
+    found = search(waves, LOW, HIGH, [-1.01], progress=False)
+    assert found.proved and found.status == "proved"
+    assert found.done == pytest.approx(1.0, abs=1e-12)
+    assert found.worst is None
+    assert found.boxes > 1000
+
+
+def test_a_maximum_of_exactly_zero_is_not_proved():
+    found = search(bowl, LOW, HIGH, [0.0], progress=False)
+    assert found.status == "undecided"
+    assert np.all(found.worst.lower <= 0) and np.all(found.worst.upper >= 0)
+    assert found.worst.bound >= 0
+    assert np.all(found.worst.upper - found.worst.lower < 1e-5)
+
+
+def test_a_positive_value_is_refuted_with_a_box():
+    found = search(waves, LOW, HIGH, [-0.9], progress=False)
+    assert found.status == "refuted" and not found.proved
+    (value,), _ = waves(jnp.asarray((found.worst.lower + found.worst.upper) / 2), [-0.9])
+    assert value > 0
+    assert found.worst.value == pytest.approx(float(value), abs=1e-12)
+
+
+def test_rounding_to_nearest_would_prove_too_much():
+    """(x + 2^-60) - x is rounded to 0 for x = 1, and is positive."""
+
+    def function(x, c):
+        return ((x[0] + c[0]) - x[0])[None], NOWHERE
+
+    one = np.ones(1)
+    (nearest,), _ = function(jnp.asarray(one), [2.0**-60])
+    assert nearest == 0.0
+    assert not search(function, one, one, [2.0**-60], progress=False).proved
+
+    def negative(x, c):
+        return (function(x, c)[0] - 2.0**-62), NOWHERE
+
+    assert not search(negative, one, one, [2.0**-60], progress=False).proved
+
+
+def test_a_region_excludes_points():
+    """x1 + x2 + x3 < 3 inside the ball of radius 1.7 < sqrt(3), and not inside that of 1.8."""
+
+    def function(x, c):
+        return (jnp.sum(x) - 3.0)[None], (jnp.sum(x**2) - c[0] ** 2)[None]
+
+    assert search(function, LOW, HIGH, [1.7], progress=False).proved
+    found = search(function, LOW, HIGH, [1.8], progress=False)
+    assert found.status == "refuted"
+    assert np.sum(found.worst.lower**2) <= 1.8**2
+
+
+def test_one_alternative_suffices():
+    """Each of two bounds is negative on one half."""
+
+    def function(x, c):
+        return jnp.stack([x[0] - 0.1, -x[0] - 0.1]), NOWHERE
+
+    assert search(function, LOW, HIGH, progress=False).proved
+
+
+def test_a_pattern_is_proved_for_each_row():
+    def function(x, c):
+        return (x[3] * x[0] + c[0])[None], NOWHERE
+
+    low = np.array([0.5, -1.0, -1.0])
+    negative, both = [[-1.0]], [[-1.0], [1.0]]
+    assert search(function, low, HIGH, [0.4], patterns=negative, progress=False).proved
+    found = search(function, low, HIGH, [0.4], patterns=both, progress=False)
+    assert found.status == "refuted"
+    assert found.worst.lower[3] == found.worst.upper[3] == 1.0
+
+
+@pytest.mark.parametrize(("constant", "limit"), [(-1.01, 10**9), (-1.001, 40_000), (-0.9, 10**9)])
+def test_nothing_depends_on_the_number_of_threads(constant, limit):
+    results = [
+        search(waves, LOW, HIGH, [constant], max_boxes=limit, threads=n, progress=False)
+        for n in (1, 2, 3)
+    ]
+    for found in results[1:]:
+        assert found[:2] == results[0][:2]
+        assert found.done == results[0].done
+        assert (found.worst is None) == (results[0].worst is None)
+        if found.worst is not None:
+            np.testing.assert_array_equal(found.worst.lower, results[0].worst.lower)
+
+
+def test_the_number_of_boxes_is_limited():
+    found = search(waves, LOW, HIGH, [-1.0001], max_boxes=50_000, progress=False)
+    assert found.status == "out of boxes"
+    assert 50_000 <= found.boxes < 50_000 + 50
+    assert 0 < found.done < 1
+    assert found.worst.bound >= 0
+    few = search(waves, LOW, HIGH, [-1.0001], max_boxes=100, progress=False)
+    assert few.status == "out of boxes" and few.boxes < 1000
+
+
+def test_proved_statements_hold_at_random_points():
+    points = np.random.default_rng(0).uniform(LOW, HIGH, (10_000, 3))
+    for constant in (-1.2, -1.05, -1.01, -0.99, -0.95):
+        found = search(waves, LOW, HIGH, [constant], max_boxes=200_000, progress=False)
+        values = np.asarray(jax.vmap(lambda x, c=constant: waves(x, [c])[0])(points))
+        assert not (found.proved and values.max() >= 0)
+        assert found.proved == (constant < -1)
+
+
+def test_an_interrupted_proof_continues(tmp_path, monkeypatch):
+    """After an interruption the search needs no proved unit again, and gives the same count."""
+    path = tmp_path / "proof.npz"
+    whole = search(waves, LOW, HIGH, [-1.001], progress=False)
+    part = search(
+        waves, LOW, HIGH, [-1.001], max_boxes=whole.boxes // 2, progress=False, checkpoint=path
+    )
+    assert part.status == "out of boxes"
+    searched = []
+    original = module._Problem.searched
+
+    def counted(self, unit, max_boxes):
+        searched.append(threading.get_ident())
+        return original(self, unit, max_boxes)
+
+    monkeypatch.setattr(module._Problem, "searched", counted)
+    rest = search(waves, LOW, HIGH, [-1.001], progress=False, checkpoint=path)
+    assert rest[:2] == whole[:2]
+    assert rest.done == pytest.approx(whole.done, abs=1e-12)
+    resumed = len(searched)
+    searched.clear()
+    search(waves, LOW, HIGH, [-1.001], progress=False)
+    assert 0 < resumed < 0.8 * len(searched)
+
+
+def test_checkpoints_of_other_problems_are_refused(tmp_path):
+    path = tmp_path / "proof.npz"
+    search(waves, LOW, HIGH, [-1.2], progress=False, checkpoint=path)
+    with pytest.raises(ValueError, match="this very proof"):
+        search(waves, LOW, HIGH, [-1.3], progress=False, checkpoint=path)
+    path.write_bytes(b"no archive")
+    with pytest.raises(ValueError, match="cannot be read"):
+        search(waves, LOW, HIGH, [-1.2], progress=False, checkpoint=path)
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper", "options", "message"),
+    [
+        ([0.0, 1.0], [1.0, 0.0], {}, "lower"),
+        ([0.0, np.nan], [1.0, 1.0], {}, "lower"),
+        ([0.0], [1.0, 1.0], {}, "lower"),
+        ([0.0], [1.0], {"threads": 0}, "threads"),
+        ([0.0], [1.0], {"max_boxes": 0}, "max_boxes"),
+    ],
+)
+def test_bad_input_is_refused(lower, upper, options, message):
+    with pytest.raises(ValueError, match=message):
+        search(bowl, lower, upper, [0.0], **options)
+
+
+def test_a_bar_shows_the_volume(capsys):
+    search(waves, LOW, HIGH, [-1.01], progress=True)
+    shown = capsys.readouterr().err
+    assert "% of the volume" in shown and "boxes" in shown
+    assert "100/100" in shown
