@@ -408,12 +408,26 @@ def interval(low: Any, high: Any) -> Interval:
 
     Returns:
       A set for `factor`, `offset` or `value`, which proofs take; `uniform(low, high)` is the
-      distribution for studies.
+      distribution for studies.  Ends that have to be rounded, because JAX stores single-precision
+      numbers by default, are rounded outward.
 
     Raises:
       ValueError: unless low < high.
     """
-    return Interval(low, high)
+    stored = Interval(low, high)
+    return Interval(
+        _rounded_outward(low, stored.low, -np.inf), _rounded_outward(high, stored.high, np.inf)
+    )
+
+
+def _rounded_outward(end: Any, stored: jax.Array, outward: float) -> Any:
+    """The stored end, or its neighbour if the stored one lies inside the given end."""
+    if isinstance(end, jax.Array):
+        return end  # it has its own precision
+    exact = np.asarray(end, float)
+    numbers = np.asarray(stored)
+    is_inside = (numbers - exact) * np.sign(outward) < 0.0
+    return np.where(is_inside, np.nextafter(numbers, numbers.dtype.type(outward)), numbers)
 
 
 def normal(mean: Any = 0.0, std: Any = 1.0) -> Normal:

@@ -164,9 +164,10 @@ def targets_of(
 
 def _check_groups(what: str, perturbations: Mapping[str, Perturbation]) -> None:
     """Raises ValueError for leaves that cannot share the draws of their group."""
-    first: dict[str, tuple[str, Distribution]] = {}
+    first: dict[str, tuple[str, Any]] = {}
     for path, perturbation in perturbations.items():
-        group, distribution = perturbation.group, perturbation.distribution
+        group = perturbation.group
+        distribution: Any = perturbation.distribution
         if not group:
             continue
         other_path, other = first.setdefault(group, (path, distribution))

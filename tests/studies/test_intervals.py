@@ -1,5 +1,6 @@
 """Intervals: sets of values without probabilities, which studies refuse."""
 
+import jax
 import numpy as np
 import pytest
 
@@ -56,3 +57,12 @@ def test_a_proof_refuses_a_distribution_and_names_the_remedy():
         targets_of(SCENARIO, uniform, "parameters", intervals=True)
     assert "ij.factor(ij.interval(low, high))" in str(error.value)
     assert targets_of(SCENARIO, MASS, "parameters", intervals=True)[0]
+
+
+def test_ends_in_single_precision_are_rounded_outward():
+    with jax.enable_x64(False):
+        interval = ij.interval(0.97, [1.03, 2.0])
+    assert interval.low.dtype == np.float32
+    assert float(interval.low) < 0.97
+    np.testing.assert_array_less(1.03, float(interval.high[0]))
+    assert float(interval.high[1]) == 2.0
