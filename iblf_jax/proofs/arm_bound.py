@@ -1,7 +1,8 @@
 """Upper bounds of V_w' of a rigid arm over boxes of the level set V_w = c.
 
-**Coordinates.**  x = (t, theta_1..theta_n, psi, phi_1..phi_{n-1}, z_1..z_m, sign_1..sign_n).
-Angles divide the level among the barriers, the velocity error and f_tilde:
+**Coordinates.**  x = (t - t_0, theta_1..theta_n, psi, phi_1..phi_{n-1}, z_1..z_m, sign_1..sign_n,
+t_0), with the start t_0 of a part of the time interval.  Angles divide the level among the
+barriers, the velocity error and f_tilde:
 
     sqrt(w_i V1_i) = sqrt(c) sphere(theta)_i,   R = c sphere(theta)_{n+1}^2
     U^T e2 = sqrt(2R) cos(psi) sphere(phi),   M0 = U U^T,   sqrt(w_f) |f_tilde| = sqrt(2R) sin(psi)
@@ -81,11 +82,12 @@ class Coordinates(NamedTuple):
 
 
 def coordinates(x: jax.Array, n: int, m: int) -> Coordinates:
-    """The parts of a vector of coordinates, (2n + 1 + m + n,)."""
+    """The parts of a vector of coordinates, (2n + 1 + m + n + 1,)."""
     theta = [x[1 + i] for i in range(n)]
     phi = [x[2 + n + i] for i in range(n - 1)]
     start = 2 * n + 1
-    return Coordinates(x[0], theta, x[1 + n], phi, x[start : start + m], x[start + m :])
+    z, sign = x[start : start + m], x[start + m : -1]
+    return Coordinates(x[-1] + x[0], theta, x[1 + n], phi, z, sign)
 
 
 class LevelPoint(NamedTuple):

@@ -30,7 +30,7 @@ from iblf_jax.proofs.arm_bound import Constants, arm_bound
 from iblf_jax.proofs.arm_motion import ArmParts, Errors, position
 from iblf_jax.proofs.matrices import solve_transposed, upper_factor
 from iblf_jax.proofs.periods import AperiodicError, period_of, shifted
-from iblf_jax.proofs.problem import LevelSetProblem, LevelState
+from iblf_jax.proofs.problem import LevelSetProblem, LevelState, length_of_part, patterns_of
 from iblf_jax.proofs.uncertainty import Numbers, Places
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Scenario, canonical
@@ -298,7 +298,7 @@ def arm_problem(
         names=names,
         lower=lower,
         upper=upper,
-        patterns=np.array(list(itertools.product((-1.0, 1.0), repeat=n))),
+        patterns=patterns_of(n, length),
         bound=function,
         constants=arm.constants,
         point_rate=point_rate,
@@ -317,14 +317,15 @@ def _coordinates(
 ) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
     """Names and ends of the coordinates; ends of angles are rounded outward."""
     right, full = np.nextafter(0.5 * math.pi, 2.0), np.nextafter(2.0 * math.pi, 7.0)
-    names = ["t", *(f"theta[{i}]" for i in range(n)), "psi", *(f"phi[{i}]" for i in range(n - 1))]
+    names = ["time since start", *(f"theta[{i}]" for i in range(n)), "psi"]
+    names += [f"phi[{i}]" for i in range(n - 1)]
     lower = [0.0] * (2 * n + 1)
     phi = [2.0 * right] * (n - 1)
     if n > 1:
         phi[-1] = full
     psi = right if n > 1 else 2.0 * right
-    upper = [duration * (1.0 + 1e-12), *[right] * n, psi, *phi]
-    names += [*uncertain.names, *(f"side[{i}]" for i in range(n))]
+    upper = [length_of_part(duration), *[right] * n, psi, *phi]
+    names += [*uncertain.names, *(f"side[{i}]" for i in range(n)), "start"]
     return (
         tuple(names),
         np.concatenate([lower, uncertain.low]),

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import itertools
 import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -36,7 +35,7 @@ from iblf_jax.proofs.chain_bound import (
 )
 from iblf_jax.proofs.chain_motion import ChainParts
 from iblf_jax.proofs.periods import AperiodicError, period_of, shifted
-from iblf_jax.proofs.problem import LevelSetProblem
+from iblf_jax.proofs.problem import LevelSetProblem, length_of_part, patterns_of
 from iblf_jax.proofs.uncertainty import Places
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Initial, Scenario, canonical
@@ -46,9 +45,6 @@ from iblf_jax.world.bounds import Tube, tube_at
 
 ORDERS = (2, 3)
 """Numbers of levels for which the bound is small enough to be of use."""
-PARTS_OF_TIME = 128
-"""Parts of the time interval, each of which is searched on its own: over a long part a tube may
-have no positive width, so that no bisection would be better than another."""
 ASSUMPTIONS = (
     "The equations hold in real numbers: the loop is continuous, and its parameters are the stored"
     " double-precision numbers.",
@@ -302,7 +298,7 @@ def chain_problem(
         names=names,
         lower=lower,
         upper=upper,
-        patterns=_patterns(order, length),
+        patterns=patterns_of(order, length),
         bound=function,
         constants=chain.constants,
         point_rate=point_rate,
@@ -332,18 +328,10 @@ def _coordinates(
         lower[-1] = -half
     names = ["time since start", *(f"theta[{i}]" for i in range(count)), *uncertain.names]
     names += [*(f"side[{i}]" for i in range(order)), "start"]
-    # The parts of the time overlap by more than the rounding of their starts.
-    part = duration / PARTS_OF_TIME * (1.0 + 1e-9)
+    part = length_of_part(duration)
     lower = np.concatenate([[0.0], lower, uncertain.low])
     upper = np.concatenate([[part], upper, uncertain.high])
     return tuple(names), lower, upper
-
-
-def _patterns(order: int, duration: float) -> np.ndarray:
-    """The signs of the errors and the start of each part of the time, (p, r + 1)."""
-    signs = itertools.product((-1.0, 1.0), repeat=order)
-    starts = np.arange(PARTS_OF_TIME) * (duration / PARTS_OF_TIME)
-    return np.array([[*sign, start] for sign in signs for start in starts])
 
 
 def _parts_of(scenario: Scenario) -> ChainParts:

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+
+PARTS_OF_TIME = 32
+"""Parts of the time interval, each of which is searched on its own: over a long part a tube may
+have no positive width, so that no bisection would be better than another."""
 
 
 class LevelState(NamedTuple):
@@ -30,6 +35,20 @@ class LevelState(NamedTuple):
     """Path of each uncertain entry -> its value."""
     rate: np.ndarray
     """Rate of the further disturbance, (n,) [N m/s]; (0,) if there is none."""
+
+
+def length_of_part(duration: float) -> float:
+    """The length of each part of a time interval, () [s]: parts overlap by more than the rounding
+    of their starts.
+    """
+    return duration / PARTS_OF_TIME * (1.0 + 1e-9)
+
+
+def patterns_of(signs: int, duration: float) -> np.ndarray:
+    """The signs of the errors and the start of each part of the time interval, (p, signs + 1)."""
+    sides = itertools.product((-1.0, 1.0), repeat=signs)
+    starts = np.arange(PARTS_OF_TIME) * (duration / PARTS_OF_TIME)
+    return np.array([[*side, start] for side in sides for start in starts])
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

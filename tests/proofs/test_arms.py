@@ -109,7 +109,7 @@ def test_rate_is_that_of_the_closed_loop_from_the_scenario_of_a_point(name):
 
 
 def coordinates_of(point, n):
-    """The coordinates of a point of the level set, with its signs."""
+    """The coordinates of a point of the level set, with its signs and the start 0."""
     s = point[1 : 1 + 3 * n] / np.linalg.norm(point[1 : 1 + 3 * n])
     ends = [*np.abs(s[:n]), np.linalg.norm(s[n:])]
     theta = [np.arctan2(np.linalg.norm(ends[i + 1 :]), ends[i]) for i in range(n)]
@@ -120,7 +120,7 @@ def coordinates_of(point, n):
         psi = np.arctan2(b, np.linalg.norm(y))
         phi = [np.arctan2(np.linalg.norm(y[i + 1 :]), y[i]) for i in range(n - 2)]
         phi.append(np.arctan2(y[-1], y[-2]) % (2 * np.pi))
-    return np.array([point[0], *theta, psi, *phi, *point[1 + 3 * n :], *np.sign(s[:n])])
+    return np.array([point[0], *theta, psi, *phi, *point[1 + 3 * n :], *np.sign(s[:n]), 0.0])
 
 
 @pytest.mark.parametrize("name", each({"pendulum"}))
@@ -131,7 +131,7 @@ def test_bound_over_boxes_is_above_the_rate_of_their_points(name):
     constants = problem.constants(WEIGHT, LEVEL)
     points = problem.sample(2, 2000)
     x = np.array([coordinates_of(point, n) for point in points])
-    width = np.concatenate([problem.upper - problem.lower, np.zeros(n)])
+    width = np.concatenate([problem.upper - problem.lower, np.zeros(n + 1)])
     size = width * generator.choice([0.0, 1e-6, 1e-3, 1e-2, 0.1], (len(x), 1))
     below, above = generator.uniform(size=(2, *x.shape)) * size
     _, (bounds, _) = enclose(problem.bound, x - below - 1e-12 * width, x + above, constants)
@@ -165,7 +165,7 @@ def test_rate_of_a_further_disturbance_enters_at_its_corners():
     f_tilde = np.sqrt(2 * LEVEL / WEIGHT) * s[:, 2]
     expected = without + WEIGHT * f_tilde * points[:, -1]
     np.testing.assert_allclose(problem.rate(points, constants), expected, rtol=1e-9, atol=1e-9)
-    assert problem.names[-2:] == ("disturbance_rate[0]", "side[0]")
+    assert problem.names[-3:] == ("disturbance_rate[0]", "side[0]", "start")
 
 
 def with_parts(**parts):
