@@ -303,7 +303,9 @@ def decay_bound(constants: Constants, point: LevelPoint) -> jax.Array:
 
 
 def arm_bound(places: Places, n: int, x: jax.Array, constants: Constants) -> jax.Array:
-    """Upper bounds of V_w' over the box x, (3,) [N m rad/s]."""
+    """Upper bounds of V_w' over the box x, (3,) [N m rad/s]; infinite where the guard of the barrier
+    may be active.
+    """
     at = coordinates(x, n, places.coordinates)
     point = level_point(constants, at)
     e2, b = point.errors.e2, point.b
@@ -313,7 +315,8 @@ def arm_bound(places: Places, n: int, x: jax.Array, constants: Constants) -> jax
     direct = coupling - losses - inner(e2, constants.parts.law.K2 * e2)
     directed = jnp.max(jnp.stack([term.directed for term in terms])) - losses
     squares = _squares(constants, norm(e2), b, terms) - losses
-    return jnp.stack([direct, squares, directed])
+    inside = jnp.max(jnp.abs(point.errors.xi)) < 1.0 - constants.parts.guard
+    return jnp.where(inside, jnp.stack([direct, squares, directed]), jnp.inf)
 
 
 def _squares(constants: Constants, a: jax.Array, b: jax.Array, terms: list[Corner]) -> jax.Array:

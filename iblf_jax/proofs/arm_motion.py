@@ -64,6 +64,8 @@ class ArmParts(NamedTuple):
     """Gain of the observer, (n,) [1/s]."""
     reference: Reference
     bounds: Bounds
+    guard: jax.Array
+    """Guard of the law's barrier, () [1]."""
 
 
 class Errors(NamedTuple):

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.control import controllers, observers
+from iblf_jax.control import controllers, observers, sensors
 from iblf_jax.control.actuators import Ideal
 from iblf_jax.control.barriers._base import barrier_member
 from iblf_jax.control.decays._base import decay_member
@@ -28,6 +28,7 @@ from iblf_jax.core.time import as_at, jump_times_of
 from iblf_jax.proofs import arm_motion, uncertainty
 from iblf_jax.proofs.arm_bound import Constants, arm_bound
 from iblf_jax.proofs.arm_motion import ArmParts, Errors, position
+from iblf_jax.proofs.dependence import cases_of
 from iblf_jax.proofs.matrices import solve_transposed, upper_factor
 from iblf_jax.proofs.periods import AperiodicError, period_of, shifted
 from iblf_jax.proofs.problem import LevelSetProblem, LevelState, length_of_part, patterns_of
@@ -146,7 +147,9 @@ class _Arm:
         return [np.asarray(x, float) for x in leaves]
 
     def _check_level(self, level: float) -> None:
-        """Raises ValueError if the level set reaches the guard of the barrier."""
+        """Raises ValueError if the level set reaches the guard of the barrier at one of some
+        instants; the bound examines all times.
+        """
         law: Any = self.scenario.controller
         barrier = law.barrier
         with jax.enable_x64(True):
@@ -284,6 +287,7 @@ def arm_problem(
         scenario = canonical(astype(scenario, jnp.float64))
         length, is_period = _time_interval(scenario, duration)
         parts = _parts_of(scenario)
+        _check_continuous(parts, scenario.n)
         uncertain = uncertain_coordinates(scenario, parameters, disturbance_rate)
         _check_tube(scenario, length)
         _check_mass_matrices(parts, uncertain)
@@ -405,6 +409,9 @@ def _check_absent(scenario: Scenario) -> None:
         part = vars(scenario)[name]
         if part is not None:
             raise _unsupported(name, type(part).__name__, "None", reason)
+    if not isinstance(scenario.sensor, sensors.Ideal):
+        reason = "Law and observer must know position and velocity exactly."
+        raise _unsupported("sensor", type(scenario.sensor).__name__, "Ideal()", reason)
     if not isinstance(scenario.actuator, Ideal):
         reason = "The torque of the law must be applied as it is."
         raise _unsupported("actuator", type(scenario.actuator).__name__, "Ideal()", reason)
@@ -454,11 +461,31 @@ def _parts_of(scenario: Scenario) -> ArmParts:
         jnp.broadcast_to(observer.kf, (scenario.n,)),
         scenario.reference,
         scenario.bounds,
+        jnp.asarray(scenario.controller.barrier.guard),  # type: ignore[attr-defined]
     )
 
 
+def _check_continuous(parts: ArmParts, n: int) -> None:
+    """Raises ValueError for a plant or a disturbance with cases: f may jump, and V_w with it."""
+
+    def torque(x: jax.Array) -> jax.Array:
+        now = arm_motion.Kinematics(x[0], *jnp.split(x[1:], 3))
+        return arm_motion.required_torque(parts, now)
+
+    cases = cases_of(torque, 1 + 3 * n)
+    if not cases:
+        return
+    expected = "functions without cases (jnp.sign, or jnp.where of a comparison)"
+    remedy = "A jump of f is not in its derivative f'. Take a smooth function, such as tanh."
+    raise checks.fail("prove: scenario.plant and disturbance", ", ".join(cases), expected, remedy)
+
+
 def _check_tube(scenario: Scenario, duration: float) -> None:
-    """Raises ValueError if the reference is not inside the bounds."""
+    """Raises ValueError if the reference is not inside the bounds at one of some instants.
+
+    Between them it is inside, too, where a search succeeds: its bounds divide by the widths of the
+    tube, and so are infinite on a box of times in which a width is 0.
+    """
     times = jnp.linspace(0.0, duration, INSTANTS)
 
     def distances(t):
@@ -477,7 +504,12 @@ def _check_tube(scenario: Scenario, duration: float) -> None:
 
 
 def _check_mass_matrices(parts: ArmParts, uncertain: Uncertain) -> None:
-    """Raises ValueError if a mass matrix of the box of parameters is not positive definite."""
+    """Raises ValueError if a mass matrix at a corner of the box of parameters is not positive
+    definite at some positions.
+
+    Inside the box all are positive definite where a search succeeds: its bounds are infinite on a
+    box that has a singular mass matrix.
+    """
     n = parts.kf.shape[0]
     generator = np.random.default_rng(0)
     q = generator.uniform(-math.pi, math.pi, (64, n))
@@ -539,7 +571,8 @@ def uncertain_coordinates(
     labels = [" and ".join(x) for x in names]
     labels += [f"disturbance_rate[{i}]" for i in range(len(rates))]
     numbers = Numbers(tuple(bases), tuple(slopes), jnp.asarray(references, float))
-    places = Places(tuple(entries), _differing(scenario), len(rates))
+    at_reference = _values_at_reference(entries, numbers)
+    places = Places(tuple(entries), _differing(scenario, at_reference), len(rates))
     return Uncertain(
         places, numbers, np.array(low, float), np.array(high, float), tuple(labels), tuple(names)
     )
@@ -617,11 +650,32 @@ def _places_of_entries(scenario: Scenario) -> dict[str, uncertainty.Place]:
     return found
 
 
-def _differing(scenario: Scenario) -> tuple[uncertainty.Place, ...]:
-    """The entries in which the scenario's plant and its model differ."""
-    pairs = zip(jax.tree.leaves(scenario.plant), jax.tree.leaves(scenario.model), strict=True)
+def _values_at_reference(
+    entries: list[tuple[uncertainty.Place, ...]], numbers: Numbers
+) -> dict[uncertainty.Place, float]:
+    """The entries at the reference value of their coordinate."""
+    found = {}
+    for k, together in enumerate(entries):
+        values = numbers.base[k] + numbers.slope[k] * numbers.reference[k]
+        found |= dict(zip(together, np.asarray(values).tolist(), strict=True))
+    return found
+
+
+def _differing(
+    scenario: Scenario, at_reference: dict[uncertainty.Place, float]
+) -> tuple[uncertainty.Place, ...]:
+    """The entries that differ from those that the law knows.
+
+    An entry of a coordinate is compared at the coordinate's reference value: entries that a `value`
+    sets together have one value there, although their nominal values may differ.
+    """
+    actual = jax.tree.leaves((scenario.plant, scenario.disturbance))
+    known = jax.tree.leaves((scenario.model, scenario.disturbance))
     found = []
-    for leaf, (true, known) in enumerate(pairs):
-        unequal = np.flatnonzero(np.asarray(true).ravel() != np.asarray(known).ravel())
-        found += [(leaf, int(entry)) for entry in unequal]
+    for leaf, pair in enumerate(zip(actual, known, strict=True)):
+        values, expected = (np.ravel(np.asarray(x)).tolist() for x in pair)
+        for entry, value in enumerate(values):
+            place = (leaf, entry)
+            if at_reference.get(place, value) != expected[entry]:
+                found.append(place)
     return tuple(found)

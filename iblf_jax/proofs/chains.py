@@ -8,14 +8,14 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.control import controllers, observers
+from iblf_jax.control import controllers, observers, sensors
 from iblf_jax.control.actuators import Ideal
 from iblf_jax.control.barriers import Quadratic
 from iblf_jax.control.barriers._base import barrier_member, has_ratio
@@ -34,6 +34,7 @@ from iblf_jax.proofs.chain_bound import (
     level_rate,
 )
 from iblf_jax.proofs.chain_motion import ChainParts
+from iblf_jax.proofs.dependence import cases_of, depends_on
 from iblf_jax.proofs.periods import AperiodicError, period_of, shifted
 from iblf_jax.proofs.problem import LevelSetProblem, length_of_part, patterns_of
 from iblf_jax.proofs.uncertainty import Places
@@ -158,7 +159,9 @@ class _Chain:
         return [np.asarray(x, float) for x in jax.tree.leaves(numbers)]
 
     def _check_level(self, level: float) -> None:
-        """Raises ValueError if the level set reaches the guard of the first barrier."""
+        """Raises ValueError if the level set reaches the guard of the first barrier at one of some
+        instants; the bound examines all times.
+        """
         law: Any = self.scenario.controller
         barrier = law.barriers[0]
         if isinstance(barrier, Quadratic):
@@ -280,6 +283,7 @@ def chain_problem(
     check_supported(scenario)
     with jax.enable_x64(True):
         scenario = canonical(astype(scenario, jnp.float64))
+        _check_continuous(scenario)
         length, is_period = _time_interval(scenario, duration)
         parts = _parts_of(scenario)
         uncertain = uncertain_coordinates(scenario, parameters, None)
@@ -308,8 +312,23 @@ def chain_problem(
         scales=uncertain.scales(),
         duration=length,
         is_period=is_period,
-        assumptions=ASSUMPTIONS,
+        assumptions=(*ASSUMPTIONS, *_without_claim(scenario)),
     )
+
+
+def _without_claim(scenario: Scenario) -> list[str]:
+    """A sentence on the bounds about which a proof claims nothing; none where it claims all."""
+    law: Any = scenario.controller
+    bounds = (scenario.bounds, *scenario.state_bounds)
+    levels = [
+        f"x_{i + 1}"
+        for i, (barrier, side) in enumerate(zip(law.barriers, bounds, strict=False))
+        if isinstance(barrier, Quadratic) and side is not None
+    ]
+    if not levels:
+        return []
+    names = ", ".join(levels)
+    return [f"Nothing is claimed about the bounds of {names}: a Quadratic barrier has none."]
 
 
 def _coordinates(
@@ -415,11 +434,48 @@ def _check_plant(scenario: Scenario) -> None:
         if plants.nominal_of(part) is not part or jnp.size(jump_times_of(name, part)):
             reason = "The plant changes during the run."
             raise _unsupported(name, kind, "a plant that does not change", reason)
+        if depends_on(_rates_of(part), 1 + part.order, 0):
+            reason = "Its drift or its gain depends on the time, with a period that is not known."
+            raise _unsupported(name, kind, "a plant that does not depend on the time", reason)
     structures: list[Any] = [jax.tree.structure(part) for part in (scenario.plant, scenario.model)]
     if structures[0] != structures[1]:
         reason = "The difference of their parameters is what the proof is about."
         expected = f"a plant of the structure of {type(scenario.plant).__name__}"
         raise _unsupported("model", type(scenario.model).__name__, expected, reason)
+
+
+def _rates_of(plant: Any) -> Callable[[jax.Array], jax.Array]:
+    """What the law reads of a plant, as a function of (t, x), (1 + r,)."""
+
+    def rates(tx: jax.Array) -> jax.Array:
+        t, x, one = tx[0], tx[1:, None], jnp.ones(1)
+        found = []
+        for level in range(1, plant.order + 1):
+            found.append(plants.level_rate(plant, level, t, x, one))
+            found.append(plants.gain_times(plant, level, t, x, one))
+            found.append(plants.level_input(plant, level, t, x, one))
+        return jnp.concatenate(found)
+
+    return rates
+
+
+def _check_continuous(scenario: Scenario) -> None:
+    """Raises ValueError for a plant or a disturbance with cases: d may jump, and V with it."""
+    order = scenario.plant.order
+
+    def functions(tx: jax.Array) -> jax.Array:
+        t, x = tx[0], tx[1:, None]
+        plant, model = scenario.plant, scenario.model
+        external = chain_motion.external_at(scenario.disturbance, t, x, plant, model)
+        acting = [external.rates.reshape(-1), external.input]
+        return jnp.concatenate([_rates_of(plant)(tx), _rates_of(model)(tx), *acting])
+
+    cases = cases_of(functions, 1 + order)
+    if not cases:
+        return
+    expected = "functions without cases (jnp.sign, or jnp.where of a comparison)"
+    remedy = "A jump of d is not in its derivative d'. Take a smooth function, such as tanh."
+    raise checks.fail("prove: scenario.plant and disturbance", ", ".join(cases), expected, remedy)
 
 
 def _check_law(scenario: Scenario) -> None:
@@ -477,6 +533,9 @@ def _check_absent(scenario: Scenario) -> None:
         part = vars(scenario)[name]
         if part is not None:
             raise _unsupported(name, type(part).__name__, "None", reason)
+    if not isinstance(scenario.sensor, sensors.Ideal):
+        reason = "Law and observer must know all levels exactly."
+        raise _unsupported("sensor", type(scenario.sensor).__name__, "Ideal()", reason)
     if not isinstance(scenario.actuator, Ideal):
         reason = "The input of the law must be applied as it is."
         raise _unsupported("actuator", type(scenario.actuator).__name__, "Ideal()", reason)

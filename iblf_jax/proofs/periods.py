@@ -80,7 +80,7 @@ def _frequencies(name: str, part: Any) -> Iterator[float]:
             if of_level is not None:
                 yield from _frequencies(f"{name}.parts[{i}]", of_level)
         return
-    if isinstance(part, CONSTANT):
+    if type(part) in CONSTANT:
         return
     if type(part) not in FREQUENCIES:
         raise AperiodicError(f"{name} is a {type(part).__name__}, whose period is not known")
@@ -98,7 +98,7 @@ def shifted(part: Any, t: jax.Array | float) -> Any:
     if isinstance(part, disturbances.Levels):
         moved = [None if inner is None else shifted(inner, t) for inner in part.parts]
         return disturbances.Levels(tuple(moved))
-    if isinstance(part, CONSTANT):
+    if type(part) in CONSTANT:
         return part
     if type(part) not in FREQUENCIES:
         raise AperiodicError(f"a {type(part).__name__} cannot be moved in time")
