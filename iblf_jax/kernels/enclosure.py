@@ -165,15 +165,13 @@ class _Emitter:
         users_op = self.nodes[user].op
         if node.kind == "b":
             return "flag"
-        if node.op == "const":
-            return "number"
-        if users_op == "mul" and node.op == "shared":
-            return "single"
-        if users_op == "mul":
-            return "several"
         if users_op == "div" and self.nodes[user].args[1] == i:
             return "reciprocal"
-        return "number"
+        if node.op == "const" or users_op != "mul":
+            return "number"
+        if node.op == "shared":
+            return "single"
+        return "several"
 
     def shared_numbers(self) -> str:
         """The function that fills the table."""
@@ -296,7 +294,8 @@ class _Emitter:
                 return f"i_scaled({args[other]}, {args[one]}.u)"
             if factor.op == "const" and factor.value < 0:
                 return f"i_scaled(i_neg({args[other]}), {args[one]}.n)"
-            if self.is_shared[factors[one]] and not self.is_shared[i]:
+            is_literal = factor.op == "const"  # 0 or NaN here
+            if self.is_shared[factors[one]] and not self.is_shared[i] and not is_literal:
                 function = {"single": "i_times", "several": "i_multiple"}[
                     self._form(i, factors[one])
                 ]

@@ -44,9 +44,9 @@ from iblf_jax.control.barriers._base import value_unit
 from iblf_jax.core.linalg import inner, matvec
 from iblf_jax.proofs.forms import enclosed
 from iblf_jax.proofs.matrices import inverse
-from iblf_jax.world.bounds import Bounds, Tube
+from iblf_jax.world.bounds import Bounds, Tube, side_member
 from iblf_jax.world.disturbances import Disturbance
-from iblf_jax.world.references import Reference
+from iblf_jax.world.references import Reference, reference_member
 from iblf_jax.world.robots import Robot
 from iblf_jax.world.robots._base import friction_torque
 
@@ -107,7 +107,13 @@ def course(parts: ArmParts, t: jax.Array) -> Course:
         lower, upper = parts.bounds.lower.at(t, q_d), parts.bounds.upper.at(t, q_d)
         return Course(q_d, q_d - lower, upper - q_d)
 
-    return enclosed(at)(t)
+    return enclosed(at, smoothness(parts.reference, parts.bounds))(t)
+
+
+def smoothness(reference: Reference, bounds: Bounds) -> float:
+    """The number of continuous derivatives of reference and bounds in time."""
+    sides = [side_member(side, "continuous_derivatives") for side in (bounds.lower, bounds.upper)]
+    return float(min(reference_member(reference, "continuous_derivatives"), *sides))
 
 
 class Side(NamedTuple):

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.control import controllers, observers, sensors
+from iblf_jax.control import controllers, observers
 from iblf_jax.control.actuators import Ideal
 from iblf_jax.control.barriers._base import barrier_member
 from iblf_jax.control.decays._base import decay_member
@@ -28,7 +28,7 @@ from iblf_jax.core.time import as_at, jump_times_of
 from iblf_jax.proofs import arm_motion, uncertainty
 from iblf_jax.proofs.arm_bound import Constants, arm_bound
 from iblf_jax.proofs.arm_motion import ArmParts, Errors, position
-from iblf_jax.proofs.dependence import cases_of
+from iblf_jax.proofs.dependence import check_without_cases
 from iblf_jax.proofs.matrices import solve_transposed, upper_factor
 from iblf_jax.proofs.periods import AperiodicError, period_of, shifted
 from iblf_jax.proofs.problem import LevelSetProblem, LevelState, length_of_part, patterns_of
@@ -287,8 +287,8 @@ def arm_problem(
         scenario = canonical(astype(scenario, jnp.float64))
         length, is_period = _time_interval(scenario, duration)
         parts = _parts_of(scenario)
-        _check_continuous(parts, scenario.n)
         uncertain = uncertain_coordinates(scenario, parameters, disturbance_rate)
+        _check_continuous(parts, uncertain, scenario.n)
         _check_tube(scenario, length)
         _check_mass_matrices(parts, uncertain)
         zero = jnp.zeros(())
@@ -355,6 +355,11 @@ def check_supported(scenario: Any) -> None:
         reason = "The error of this observer does not obey f_tilde' = f' - kf f_tilde."
         raise _unsupported("observer", type(observer).__name__, "observers.Momentum", reason)
     _check_absent(scenario)
+    smooth = arm_motion.smoothness(scenario.reference, scenario.bounds)
+    if smooth < 2:
+        reason = "f contains alpha', and with it two derivatives of reference and bounds."
+        expected = "two continuous derivatives in time"
+        raise _unsupported("reference and bounds", f"{smooth:g}", expected, reason)
 
 
 def _check_plant(scenario: Scenario) -> None:
@@ -401,7 +406,7 @@ def _check_law(law: Any) -> None:
 def _check_absent(scenario: Scenario) -> None:
     """Raises ValueError for parts that the bound does not contain."""
     reasons = {
-        "sampling": "The proof is one of the continuous loop.",
+        "sampling": "The proof is one of the continuous loop, with an ideal sensor.",
         "velocity_bounds": "The level set bounds positions only.",
         "process_noise": "V_w' of a stochastic loop has further terms.",
     }
@@ -409,9 +414,6 @@ def _check_absent(scenario: Scenario) -> None:
         part = vars(scenario)[name]
         if part is not None:
             raise _unsupported(name, type(part).__name__, "None", reason)
-    if not isinstance(scenario.sensor, sensors.Ideal):
-        reason = "Law and observer must know position and velocity exactly."
-        raise _unsupported("sensor", type(scenario.sensor).__name__, "Ideal()", reason)
     if not isinstance(scenario.actuator, Ideal):
         reason = "The torque of the law must be applied as it is."
         raise _unsupported("actuator", type(scenario.actuator).__name__, "Ideal()", reason)
@@ -465,19 +467,19 @@ def _parts_of(scenario: Scenario) -> ArmParts:
     )
 
 
-def _check_continuous(parts: ArmParts, n: int) -> None:
+def _check_continuous(parts: ArmParts, uncertain: Uncertain, n: int) -> None:
     """Raises ValueError for a plant or a disturbance with cases: f may jump, and V_w with it."""
+    m = len(uncertain.paths)
 
     def torque(x: jax.Array) -> jax.Array:
-        now = arm_motion.Kinematics(x[0], *jnp.split(x[1:], 3))
-        return arm_motion.required_torque(parts, now)
+        t, motion, z = x[0], x[1 : 1 + 3 * n], x[1 + 3 * n :]
+        nominal = (parts.plant, parts.disturbance)
+        plant, disturbance = uncertainty.leaves_at(uncertain.places, uncertain.numbers, nominal, z)
+        true = parts._replace(plant=plant, disturbance=disturbance)
+        now = arm_motion.Kinematics(t, *jnp.split(motion, 3))
+        return arm_motion.required_torque(true, now)
 
-    cases = cases_of(torque, 1 + 3 * n)
-    if not cases:
-        return
-    expected = "functions without cases (jnp.sign, or jnp.where of a comparison)"
-    remedy = "A jump of f is not in its derivative f'. Take a smooth function, such as tanh."
-    raise checks.fail("prove: scenario.plant and disturbance", ", ".join(cases), expected, remedy)
+    check_without_cases(torque, 1 + 3 * n + m)
 
 
 def _check_tube(scenario: Scenario, duration: float) -> None:

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.control import controllers, observers, sensors
+from iblf_jax.control import controllers, observers
 from iblf_jax.control.actuators import Ideal
 from iblf_jax.control.barriers import Quadratic
 from iblf_jax.control.barriers._base import barrier_member, has_ratio
@@ -23,7 +23,7 @@ from iblf_jax.control.decays._base import decay_member
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import astype
 from iblf_jax.core.time import as_at, jump_times_of
-from iblf_jax.proofs import chain_motion
+from iblf_jax.proofs import chain_motion, uncertainty
 from iblf_jax.proofs.arms import INSTANTS, Uncertain, uncertain_coordinates
 from iblf_jax.proofs.chain_bound import (
     Constants,
@@ -34,7 +34,7 @@ from iblf_jax.proofs.chain_bound import (
     level_rate,
 )
 from iblf_jax.proofs.chain_motion import ChainParts
-from iblf_jax.proofs.dependence import cases_of, depends_on
+from iblf_jax.proofs.dependence import check_without_cases, depends_on
 from iblf_jax.proofs.periods import AperiodicError, period_of, shifted
 from iblf_jax.proofs.problem import LevelSetProblem, length_of_part, patterns_of
 from iblf_jax.proofs.uncertainty import Places
@@ -283,10 +283,10 @@ def chain_problem(
     check_supported(scenario)
     with jax.enable_x64(True):
         scenario = canonical(astype(scenario, jnp.float64))
-        _check_continuous(scenario)
         length, is_period = _time_interval(scenario, duration)
         parts = _parts_of(scenario)
         uncertain = uncertain_coordinates(scenario, parameters, None)
+        _check_continuous(scenario, uncertain)
         zero = jnp.zeros(())
         numbers = Constants(
             parts, scenario.plant, scenario.disturbance, uncertain.numbers, zero, zero
@@ -459,23 +459,19 @@ def _rates_of(plant: Any) -> Callable[[jax.Array], jax.Array]:
     return rates
 
 
-def _check_continuous(scenario: Scenario) -> None:
+def _check_continuous(scenario: Scenario, uncertain: Uncertain) -> None:
     """Raises ValueError for a plant or a disturbance with cases: d may jump, and V with it."""
     order = scenario.plant.order
+    nominal = (scenario.plant, scenario.disturbance)
 
-    def functions(tx: jax.Array) -> jax.Array:
-        t, x = tx[0], tx[1:, None]
-        plant, model = scenario.plant, scenario.model
-        external = chain_motion.external_at(scenario.disturbance, t, x, plant, model)
+    def functions(point: jax.Array) -> jax.Array:
+        tx, z = point[: 1 + order], point[1 + order :]
+        plant, disturbance = uncertainty.leaves_at(uncertain.places, uncertain.numbers, nominal, z)
+        external = chain_motion.external_at(disturbance, tx[0], tx[1:, None], plant, scenario.model)
         acting = [external.rates.reshape(-1), external.input]
-        return jnp.concatenate([_rates_of(plant)(tx), _rates_of(model)(tx), *acting])
+        return jnp.concatenate([_rates_of(plant)(tx), _rates_of(scenario.model)(tx), *acting])
 
-    cases = cases_of(functions, 1 + order)
-    if not cases:
-        return
-    expected = "functions without cases (jnp.sign, or jnp.where of a comparison)"
-    remedy = "A jump of d is not in its derivative d'. Take a smooth function, such as tanh."
-    raise checks.fail("prove: scenario.plant and disturbance", ", ".join(cases), expected, remedy)
+    check_without_cases(functions, 1 + order + len(uncertain.paths))
 
 
 def _check_law(scenario: Scenario) -> None:
@@ -526,16 +522,13 @@ def _check_observer(scenario: Scenario) -> None:
 def _check_absent(scenario: Scenario) -> None:
     """Raises ValueError for parts that the bound does not contain."""
     reasons = {
-        "sampling": "The proof is one of the continuous loop.",
+        "sampling": "The proof is one of the continuous loop, with an ideal sensor.",
         "process_noise": "V' of a stochastic loop has further terms.",
     }
     for name, reason in reasons.items():
         part = vars(scenario)[name]
         if part is not None:
             raise _unsupported(name, type(part).__name__, "None", reason)
-    if not isinstance(scenario.sensor, sensors.Ideal):
-        reason = "Law and observer must know all levels exactly."
-        raise _unsupported("sensor", type(scenario.sensor).__name__, "Ideal()", reason)
     if not isinstance(scenario.actuator, Ideal):
         reason = "The input of the law must be applied as it is."
         raise _unsupported("actuator", type(scenario.actuator).__name__, "Ideal()", reason)

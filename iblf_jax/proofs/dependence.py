@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import jax
 
+from iblf_jax.core import checks
 from iblf_jax.kernels.enclosure import compiled
 
 CASES = frozenset({"sign", "lt", "le", "gt", "ge", "lookup"})
@@ -19,7 +20,20 @@ def depends_on(function: Callable[[jax.Array], jax.Array], size: int, k: int) ->
     return any(node.op == "carry" and node.value == k for node in nodes)
 
 
-def cases_of(function: Callable[[jax.Array], jax.Array], size: int) -> list[str]:
-    """The operations of a function of (size,) that select a case by its argument."""
+def check_without_cases(function: Callable[[jax.Array], jax.Array], size: int) -> None:
+    """Raises ValueError if a function of (size,) selects a case by its argument.
+
+    Args:
+      function: what plant and disturbance add to f or d, of time, state and parameters.
+      size: of its argument.
+    """
     program = compiled(lambda x, constants: function(x), size, ()).program
-    return sorted({node.op for node in program.nodes if node.op in CASES})
+    found = sorted({node.op for node in program.nodes if node.op in CASES})
+    if not found:
+        return
+    raise checks.fail(
+        "prove: scenario.plant and disturbance",
+        f"operations that select a case ({', '.join(found)})",
+        "functions without cases, such as jnp.sign or jnp.where of a comparison",
+        "A derivative does not contain a jump. Take a smooth function, such as jnp.tanh.",
+    )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -25,17 +26,22 @@ def derivative(function: Callable) -> Callable:
     return rate
 
 
-def enclosed(function: Callable) -> Callable:
-    """A smooth function of one number t with a narrow enclosure, also of each derivative.
+def enclosed(function: Callable, continuous_derivatives: float = math.inf) -> Callable:
+    """A function of one number t with a narrow enclosure, also of its derivatives.
 
         g(t) in g(c) + (t - c) (g'(c) + 1/2 g"(T) (t - c)),   c the centre of the interval T of t
 
     and in the natural extension g(T), of which the common part is taken.  On numbers it is the
-    function itself.
+    function itself.  The form needs a continuous g'; the natural extension g" of a function with
+    cases contains the derivatives of all of them.  Derivatives that jump have the natural extension
+    alone.
 
     Args:
       function: t, () -> pytree of arrays.
+      continuous_derivatives: their number.
     """
+    if continuous_derivatives < 1:
+        return function
     rate = derivative(function)
 
     @jax.custom_jvp
@@ -51,7 +57,7 @@ def enclosed(function: Callable) -> Callable:
     @form.defjvp
     def form_jvp(primals: tuple, tangents: tuple) -> tuple:
         (t,), (dt,) = primals, tangents
-        slopes = enclosed(rate)(t)
+        slopes = enclosed(rate, continuous_derivatives - 1)(t)
         return form(t), jax.tree.map(lambda slope: slope * dt, slopes)
 
     return form

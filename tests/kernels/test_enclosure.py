@@ -251,6 +251,20 @@ def test_literals_are_not_folded_inexactly():
     assert 0 < above[0, 0] - below[0, 0] < 1e-15
 
 
+def test_quotients_and_products_of_literals():
+    """0.3 is no power of two, so that the quotient is no product; NaN is no bound."""
+
+    def function(x, c):
+        return jnp.stack([x[0] / 0.3, x[0] / -7.0, 2.0 / x[1], x[0] / 0.0, x[0] * jnp.nan])
+
+    (below,), (above,) = enclose(function, [[-1.0, 3.0]], [[2.0, 4.0]])
+    exact = [(-1 / mpmath.mpf(0.3), 2 / mpmath.mpf(0.3)), (-mpmath.mpf(2) / 7, mpmath.mpf(1) / 7)]
+    for k, (low, high) in enumerate([*exact, (mpmath.mpf(0.5), mpmath.mpf(2) / 3)]):
+        assert below[0, k] <= low and high <= above[0, k]
+        assert above[0, k] - below[0, k] < (high - low) * (1 + 1e-14)
+    assert not (below[0, 3:] > -math.inf).any() and not (above[0, 3:] < math.inf).any()
+
+
 # --- random expressions ------------------------------------------------------------------------
 
 LEAVES = 4

@@ -1,0 +1,191 @@
+"""Attacks on the proofs: cases in which a bound was, or might be, below V', and what is refused."""
+
+import dataclasses
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from proof_cases import pendulum
+from test_arms import chain_loop, coordinates_of
+from test_chains import LEVER, Lever, check_bounds, lever, within
+from test_chains import pendulum as pendulum_with_motor
+
+import iblf_jax as ij
+from iblf_jax.core.pytree import Leaf, component, leaf
+from iblf_jax.kernels.enclosure import enclose
+from iblf_jax.proofs.arms import arm_problem
+from iblf_jax.proofs.chains import chain_problem
+from iblf_jax.proofs.forms import enclosed
+from iblf_jax.proofs.search import search
+
+WEIGHT, LEVEL = 2e-3, 0.8
+Mapping, Quadratic = ij.barriers.Mapping, ij.barriers.Quadratic
+
+
+def test_entries_with_one_value_differ_from_the_model_at_the_reference_value():
+    """At the reference value, the mass of 2, the inertia of 0.06 becomes 2."""
+    together = {"plant.mass, plant.inertia": ij.value(ij.interval(1.99, 2.01))}
+    problem = arm_problem(pendulum(), together)
+    constants = problem.constants(WEIGHT, LEVEL)
+    points = problem.sample(2, 300)
+    x = np.array([coordinates_of(point, 1) for point in points])
+    _, (bounds, _) = enclose(problem.bound, x, x, constants)
+    rate = problem.rate(points, constants)
+    assert np.all(bounds >= rate[:, None] - 1e-9 * np.abs(rate[:, None]))
+
+
+def test_levels_of_a_disturbance_with_one_value_differ_from_what_is_known():
+    waves = ij.disturbances.Sinusoids(0.3, 2.0, 0.5, 0.1)
+    scenario = lever(disturbance=ij.disturbances.Levels((None, waves)))
+    path = "disturbance.parts[1]"
+    together = {f"{path}.amplitude, {path}.offset": ij.value(ij.interval(0.2, 0.4))}
+    check_bounds(scenario, together, 0.3)
+
+
+def narrow_between_samples():
+    """A loop whose tube is widest at every sampled instant of its time interval."""
+    side = {"phase": [0.5 * np.pi], "frequency": 1.0, "amplitude": [0.25]}
+    return chain_loop(
+        1,
+        reference=ij.references.Sinusoid(0.0, 0.0, 1.0),
+        bounds=ij.Bounds(
+            lower=ij.bounds.Constant([-0.7]), upper=ij.bounds.Sinusoid(offset=[0.45], **side)
+        ),
+        controller=ij.controllers.Backstepping(
+            k1=2.0, K2=3.0, reading="corrected", barrier=ij.barriers.Tan(guard=0.2)
+        ),
+    )
+
+
+def test_the_guard_is_examined_between_the_sampled_instants():
+    problem = arm_problem(narrow_between_samples(), {}, duration=1023 * 2 * np.pi)
+    constants = problem.constants(WEIGHT, 0.2)
+    # At theta = 0 the first error has the whole level.
+    wide, narrow = ([t, 0.0, 0.0, 1.0, 0.0] for t in (0.0, np.pi))
+    _, (bounds, _) = enclose(problem.bound, [wide, narrow], [wide, narrow], constants)
+    assert np.all(np.isfinite(bounds[0])) and np.all(np.isinf(bounds[1]))
+
+
+def test_a_derivative_that_jumps_is_enclosed_across_its_jump():
+    """max(t, 0)^3 has two continuous derivatives; the third one jumps from 0 to 6."""
+
+    def third(x, constants):
+        function = enclosed(lambda t: jnp.maximum(t, 0.0) ** 3, continuous_derivatives=2)
+        for _ in range(3):
+            function = (lambda f: lambda t: jax.jvp(f, (t,), (jnp.ones_like(t),))[1])(function)
+        return function(x[0])[None]
+
+    (below,), (above,) = enclose(third, [[-1.0], [-0.1]], [[0.5], [1.0]])
+    assert np.all(below <= 0.0) and np.all(above >= 6.0)
+
+
+@component
+class Aging(Lever):
+    """A lever whose load grows with the time, although everything else is periodic."""
+
+    rate: Leaf = leaf("1", default=0.01)
+    n: ClassVar[int] = 1
+    order: ClassVar[int] = 2
+
+    def drift(self, t, x):
+        return super().drift(t, x) * (1.0 + self.rate * t)
+
+    def level_input(self, level, t, x, rate, torque):
+        if level == 1:
+            return rate
+        return self.J * (rate - self.drift(t, x)[1])
+
+
+@component
+class Stiction(Lever):
+    """A lever with dry friction that jumps with the direction of motion."""
+
+    n: ClassVar[int] = 1
+    order: ClassVar[int] = 2
+
+    def drift(self, t, x):
+        load = self.b * jnp.sign(x[1]) + self.m * jnp.sin(x[0])
+        return jnp.stack([jnp.zeros_like(x[0]), -load / self.J])
+
+    def level_input(self, level, t, x, rate, torque):
+        if level == 1:
+            return rate
+        return self.J * (rate - self.drift(t, x)[1])
+
+
+@component
+class Threshold(Lever):
+    """A lever whose load has another sign where a parameter is below 1."""
+
+    n: ClassVar[int] = 1
+    order: ClassVar[int] = 2
+
+    def drift(self, t, x):
+        load = jnp.where(self.b > 0.3, 1.0, -1.0) * self.m * jnp.sin(x[0])
+        return jnp.stack([jnp.zeros_like(x[0]), -load / self.J])
+
+    def level_input(self, level, t, x, rate, torque):
+        if level == 1:
+            return rate
+        return self.J * (rate - self.drift(t, x)[1])
+
+
+@component
+class DryFriction:
+    """A torque of constant size against the motion of a joint."""
+
+    size: Leaf = leaf("N m")
+
+    def torque(self, t, q, dq, plant, model):
+        return -self.size * jnp.sign(dq)
+
+    def jump_times(self):
+        return jnp.zeros(0)
+
+
+@pytest.mark.parametrize(
+    ("plant", "words"),
+    [
+        (Aging(J=1.2, b=0.3, m=2.0), "does not depend on the time"),
+        (Stiction(J=1.2, b=0.3, m=2.0), "select a case"),
+        (Threshold(J=1.2, b=0.3, m=2.0), "select a case"),
+    ],
+)
+@pytest.mark.parametrize("duration", [None, 2.0])
+def test_plants_with_time_or_cases_are_refused(plant, words, duration):
+    with pytest.raises(ValueError, match=words):
+        chain_problem(lever(plant=plant, model=plant), within(0.1, "b"), duration=duration)
+
+
+def test_a_torque_that_jumps_is_refused():
+    scenario = pendulum(disturbance=DryFriction(0.1))
+    with pytest.raises(ValueError, match="select a case"):
+        arm_problem(scenario, {}, duration=2.0)
+
+
+def test_a_reference_whose_acceleration_jumps_is_refused():
+    reference = ij.references.WaypointSpline((0.0, 1.0, 2.0), [[0.5], [0.6], [0.5]], derivatives=1)
+    with pytest.raises(ValueError, match="two continuous derivatives"):
+        arm_problem(pendulum(reference=reference), {}, duration=2.0)
+
+
+def test_a_mass_matrix_that_is_singular_inside_the_box_is_not_proved():
+    """The mass of the model is far from zero, that of the box is zero at an inner point."""
+    problem = arm_problem(pendulum(), {"plant.mass": ij.factor(ij.interval(0.9, 1.1))})
+    low, high = problem.lower.copy(), problem.upper.copy()
+    k = problem.names.index("plant.mass[0]")
+    low[k], high[k] = -2.0, 1.1
+    constants = problem.constants(WEIGHT, LEVEL)
+    box = {"patterns": problem.patterns, "progress": False, "max_boxes": 20_000}
+    assert not search(problem.bound, low, high, constants, **box).proved
+
+
+def test_nothing_is_claimed_about_bounds_without_a_barrier():
+    claimed = chain_problem(lever(), within(0.1, *LEVER)).assumptions
+    assert not any("Nothing is claimed" in sentence for sentence in claimed)
+    mixed = pendulum_with_motor((Mapping(), Quadratic(), Quadratic()))
+    assert any("the bounds of x_2, x_3" in x for x in chain_problem(mixed, {}).assumptions)
+    free = dataclasses.replace(mixed, state_bounds=())
+    assert not any("Nothing" in x for x in chain_problem(free, {}).assumptions)
