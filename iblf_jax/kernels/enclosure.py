@@ -492,11 +492,13 @@ def enclose(
         raise ValueError("lower, upper: got a lower bound above the upper one, or two shapes.")
     size = sum(kernel.compiled.sizes)
     bounds = np.empty((2, len(low), size))
-    kernel.library.enclose_boxes(
+    failed = kernel.library.enclose_boxes(
         pointer(kernel.numbers),
         ctypes.c_int64(len(low)),
         *map(pointer, (low, high, bounds[0], bounds[1])),
     )
+    if failed:
+        raise ToolchainError("the processor refuses the rounding mode that enclosures need")
     ends = np.cumsum(kernel.compiled.sizes)[:-1]
     below, above = (
         [

@@ -303,8 +303,8 @@ def decay_bound(constants: Constants, point: LevelPoint) -> jax.Array:
 
 
 def arm_bound(places: Places, n: int, x: jax.Array, constants: Constants) -> jax.Array:
-    """Upper bounds of V_w' over the box x, (3,) [N m rad/s]; infinite where the guard of the barrier
-    may be active.
+    """Upper bounds of V_w' over the box x, (3,) [N m rad/s]; infinite where the barrier's guard may
+    be active.
     """
     at = coordinates(x, n, places.coordinates)
     point = level_point(constants, at)

@@ -10,7 +10,7 @@ import dataclasses
 import functools
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, cast
 
 import jax
@@ -19,6 +19,7 @@ import numpy as np
 
 from iblf_jax.control import controllers, observers
 from iblf_jax.control.actuators import Ideal
+from iblf_jax.control.barriers import MEMBERS
 from iblf_jax.control.barriers._base import barrier_member
 from iblf_jax.control.decays._base import decay_member
 from iblf_jax.core import checks
@@ -38,7 +39,7 @@ from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.draws import targets_of
 from iblf_jax.world import plants
-from iblf_jax.world.bounds import tube_at
+from iblf_jax.world.bounds import Tube, tube_at
 
 ASSUMPTIONS = (
     "The equations hold in real numbers: the loop is continuous, and its parameters are the stored"
@@ -285,9 +286,9 @@ def arm_problem(
     check_supported(scenario)
     with jax.enable_x64(True):
         scenario = canonical(astype(scenario, jnp.float64))
-        length, is_period = _time_interval(scenario, duration)
         parts = _parts_of(scenario)
         uncertain = uncertain_coordinates(scenario, parameters, disturbance_rate)
+        length, is_period = _time_interval(scenario, duration, uncertain)
         _check_continuous(parts, uncertain, scenario.n)
         _check_tube(scenario, length)
         _check_mass_matrices(parts, uncertain)
@@ -312,7 +313,7 @@ def arm_problem(
         scales=uncertain.scales(),
         duration=length,
         is_period=is_period,
-        assumptions=ASSUMPTIONS,
+        assumptions=(*ASSUMPTIONS, *claims_of([scenario.controller.barrier])),  # type: ignore[attr-defined]
     )
 
 
@@ -391,7 +392,7 @@ def _check_law(law: Any) -> None:
         raise _unsupported("controller.decays", names, "exponential decays", reason)
     barrier = law.barrier
     zero, one = jnp.zeros(1), jnp.ones(1)
-    tube = arm_motion.Tube(zero, zero, -one, one, zero, zero)
+    tube = Tube(zero, zero, -one, one, zero, zero)
     known = barrier_member(barrier, "error_at")(zero, tube, zero > 0)
     claims = (
         barrier_member(barrier, "decay_rate")(one),
@@ -401,6 +402,39 @@ def _check_law(law: Any) -> None:
         reason = "The level set needs the error at which V1 has a value, in closed form."
         expected = "a barrier with error_at, xi_bound and decay_rate"
         raise _unsupported("controller.barrier", type(barrier).__name__, expected, reason)
+    if type(barrier) not in MEMBERS.values() and not _is_homogeneous(barrier, law.o):
+        reason = "The bound divides all lengths by the width of the tube."
+        expected = "a barrier without a length of its own"
+        raise _unsupported("controller.barrier", type(barrier).__name__, expected, reason)
+
+
+def _is_homogeneous(barrier: Any, o: Any) -> bool:
+    """Whether V1, s and alpha of a barrier scale as powers of all lengths, at one point of each
+    side.
+    """
+    degree = arm_motion.degree(barrier)
+    o = None if o is None else jnp.max(o) * jnp.ones(2)
+
+    def scaled_back(size: float) -> jax.Array:
+        width = size * jnp.ones(2)
+        tube = Tube(0.0 * width, 0.0 * width, -0.7 * width, 1.3 * width, 0.2 * width, -0.1 * width)
+        e = width * jnp.array([-0.3, 0.4])
+        alpha = barrier.virtual_velocity(tube, e, jnp.ones(2), o) / size
+        slope = barrier.slope(tube, e) / size ** (degree - 1)
+        return jnp.stack([barrier.value(tube, e) / size**degree, slope, alpha])
+
+    return bool(jnp.allclose(scaled_back(1.0), scaled_back(3.0), rtol=1e-3))
+
+
+def claims_of(barriers: Sequence[Any]) -> list[str]:
+    """Sentences on the claims of barriers that are not members of the package."""
+    names = {
+        type(barrier).__name__ for barrier in barriers if type(barrier) not in MEMBERS.values()
+    }
+    return [
+        f"The claims of {name} hold: its error_at, xi_bound and decay_rate."
+        for name in sorted(names)
+    ]
 
 
 def _check_absent(scenario: Scenario) -> None:
@@ -430,7 +464,9 @@ def _check_absent(scenario: Scenario) -> None:
 # --- time, tube and mass matrix ------------------------------------------------------------------
 
 
-def _time_interval(scenario: Scenario, duration: float | None) -> tuple[float, bool]:
+def _time_interval(
+    scenario: Scenario, duration: float | None, uncertain: Uncertain
+) -> tuple[float, bool]:
     """The length of the time interval [s], and whether it is a period."""
     if duration is not None:
         return checks.positive_number("duration", duration, "s"), False
@@ -441,7 +477,7 @@ def _time_interval(scenario: Scenario, duration: float | None) -> tuple[float, b
         "disturbance": scenario.disturbance,
     }
     try:
-        return period_of(varying), True
+        return period_of(varying, [path for paths in uncertain.paths for path in paths]), True
     except AperiodicError as error:
         remedy = f"Give a duration [s]: {error}."
         raise checks.fail("duration", None, "a duration", remedy) from None
@@ -656,7 +692,7 @@ def _values_at_reference(
     entries: list[tuple[uncertainty.Place, ...]], numbers: Numbers
 ) -> dict[uncertainty.Place, float]:
     """The entries at the reference value of their coordinate."""
-    found = {}
+    found: dict[uncertainty.Place, float] = {}
     for k, together in enumerate(entries):
         values = numbers.base[k] + numbers.slope[k] * numbers.reference[k]
         found |= dict(zip(together, np.asarray(values).tolist(), strict=True))

@@ -24,7 +24,7 @@ from iblf_jax.core import checks
 from iblf_jax.core.pytree import astype
 from iblf_jax.core.time import as_at, jump_times_of
 from iblf_jax.proofs import chain_motion, uncertainty
-from iblf_jax.proofs.arms import INSTANTS, Uncertain, uncertain_coordinates
+from iblf_jax.proofs.arms import INSTANTS, Uncertain, claims_of, uncertain_coordinates
 from iblf_jax.proofs.chain_bound import (
     Constants,
     LevelPoint,
@@ -283,9 +283,9 @@ def chain_problem(
     check_supported(scenario)
     with jax.enable_x64(True):
         scenario = canonical(astype(scenario, jnp.float64))
-        length, is_period = _time_interval(scenario, duration)
         parts = _parts_of(scenario)
         uncertain = uncertain_coordinates(scenario, parameters, None)
+        length, is_period = _time_interval(scenario, duration, uncertain)
         _check_continuous(scenario, uncertain)
         zero = jnp.zeros(())
         numbers = Constants(
@@ -312,7 +312,7 @@ def chain_problem(
         scales=uncertain.scales(),
         duration=length,
         is_period=is_period,
-        assumptions=(*ASSUMPTIONS, *_without_claim(scenario)),
+        assumptions=(*ASSUMPTIONS, *claims_of(parts.law.barriers), *_without_claim(scenario)),
     )
 
 
@@ -382,7 +382,9 @@ def _rows(value: jax.Array, order: int) -> jax.Array:
     return jnp.broadcast_to(jnp.reshape(value, (-1, 1)), (order, 1))
 
 
-def _time_interval(scenario: Scenario, duration: float | None) -> tuple[float, bool]:
+def _time_interval(
+    scenario: Scenario, duration: float | None, uncertain: Uncertain
+) -> tuple[float, bool]:
     """The length of the time interval [s], and whether it is a period."""
     if duration is not None:
         return checks.positive_number("duration", duration, "s"), False
@@ -392,7 +394,7 @@ def _time_interval(scenario: Scenario, duration: float | None) -> tuple[float, b
         if bounds is not None:
             varying |= {f"{name}.lower": bounds.lower, f"{name}.upper": bounds.upper}
     try:
-        return period_of(varying), True
+        return period_of(varying, [path for paths in uncertain.paths for path in paths]), True
     except AperiodicError as error:
         remedy = f"Give a duration [s]: {error}."
         raise checks.fail("duration", None, "a duration", remedy) from None
@@ -461,7 +463,7 @@ def _rates_of(plant: Any) -> Callable[[jax.Array], jax.Array]:
 
 def _check_continuous(scenario: Scenario, uncertain: Uncertain) -> None:
     """Raises ValueError for a plant or a disturbance with cases: d may jump, and V with it."""
-    order = scenario.plant.order
+    order = plants.order_of(scenario.plant)
     nominal = (scenario.plant, scenario.disturbance)
 
     def functions(point: jax.Array) -> jax.Array:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from typing import Any
 
@@ -35,7 +35,7 @@ class AperiodicError(ValueError):
     """A part of a scenario has no period, or none in common with the others."""
 
 
-def period_of(parts: dict[str, Any]) -> float:
+def period_of(parts: dict[str, Any], uncertain: Sequence[str] = ()) -> float:
     """The common period of parts of a scenario [s]; 0 if none depends on time.
 
         2 pi / w,   w the greatest common divisor of all frequencies
@@ -44,13 +44,22 @@ def period_of(parts: dict[str, Any]) -> float:
 
     Args:
       parts: name -> reference, side of the bounds, or disturbance.
+      uncertain: paths of uncertain numbers.  All frequencies of a part with one of them count,
+        because its amplitudes may be uncertain.
 
     Raises:
-      AperiodicError: a part that is neither constant nor a sinusoid, or frequencies without a
-        common divisor; the message says which.
+      AperiodicError: a part that is neither constant nor a sinusoid, an uncertain frequency, or
+        frequencies without a common divisor; the message says which.
     """
+    for path in uncertain:
+        if "frequency" in path.rpartition(".")[2]:
+            raise AperiodicError(f"the frequency {path} is uncertain")
+    varied = {path.split(".")[0] for path in uncertain}
     frequencies = {
-        Fraction(w) for name, part in parts.items() for w in _frequencies(name, part) if w
+        Fraction(w)
+        for name, part in parts.items()
+        for w in _frequencies(name, part, all_count=name in varied)
+        if w
     }
     if not frequencies:
         return 0.0
@@ -69,16 +78,16 @@ def _over_common_denominator(numbers: set[Fraction]) -> list[int]:
     return [int(w * denominator) for w in numbers]
 
 
-def _frequencies(name: str, part: Any) -> Iterator[float]:
-    """The absolute frequencies of a part whose amplitude is not zero."""
+def _frequencies(name: str, part: Any, *, all_count: bool) -> Iterator[float]:
+    """The absolute frequencies of a part whose amplitude is not zero, or all of them."""
     if isinstance(part, disturbances.Sum):
         for i, inner in enumerate(part.parts):
-            yield from _frequencies(f"{name}.parts[{i}]", inner)
+            yield from _frequencies(f"{name}.parts[{i}]", inner, all_count=all_count)
         return
     if isinstance(part, disturbances.Levels):
         for i, of_level in enumerate(part.parts):
             if of_level is not None:
-                yield from _frequencies(f"{name}.parts[{i}]", of_level)
+                yield from _frequencies(f"{name}.parts[{i}]", of_level, all_count=all_count)
         return
     if type(part) in CONSTANT:
         return
@@ -87,7 +96,7 @@ def _frequencies(name: str, part: Any) -> Iterator[float]:
     for fields in FREQUENCIES[type(part)]:
         amplitude, frequency = (np.asarray(getattr(part, field)) for field in fields)
         for size, w in np.broadcast(amplitude, frequency):
-            if size:
+            if size or all_count:
                 yield abs(float(w))
 
 

@@ -26,6 +26,7 @@ import numpy as np
 from iblf_jax.core import checks
 from iblf_jax.core.progress import bar
 from iblf_jax.kernels import IntervalKernel, interval_kernel, pointer
+from iblf_jax.kernels.toolchain import ToolchainError
 
 STATUSES = ("proved", "undecided", "refuted", "out of boxes", "stopped", "out of memory")
 """How the search of a unit ended, in the order of `kernels/c/boxes.h`."""
@@ -39,6 +40,8 @@ NARROWEST = 2.0**-24
 MAX_UNDECIDED = 16
 """Boxes of a unit that are too narrow to be bisected, after which its search ends."""
 SECONDS_BETWEEN_CHECKPOINTS = 10.0
+RESULT_TYPES = {"divide_box": ctypes.c_int64, "search_box": ctypes.c_int}
+"""Function of a kernel -> the C type of its result, which is negative if it has not run."""
 
 
 class WorstBox(NamedTuple):
@@ -123,11 +126,13 @@ class _Problem:
         """The units of work, in an order without regularity, and what their division found."""
         target = math.ceil(UNITS / len(self.lower))
         records = []
-        parts = []
+        parts: list[_Found] = []
+        left = max_boxes
         for low, high in zip(self.lower, self.upper, strict=True):
             room = np.zeros((2 * target, self.size))
             room[0, : 2 * self.dimension] = np.concatenate([low, high])
-            found, count = self._call("divide_box", max_boxes, room, ctypes.c_int64(target))
+            found, count = self._call("divide_box", left, room, ctypes.c_int64(target))
+            left = max(left - found.boxes, 0)
             records.append(room[:count])
             parts.append(found)
         units = np.concatenate(records)
@@ -166,7 +171,7 @@ class _Problem:
         )
         result = self._result_type()()
         function = getattr(self.kernel.library, name)
-        function.restype = ctypes.c_int64
+        function.restype = RESULT_TYPES[name]
         count = function(
             pointer(self.kernel.numbers),
             pointer(boxes),
@@ -174,6 +179,8 @@ class _Problem:
             ctypes.byref(options),
             ctypes.byref(result),
         )
+        if count < 0:
+            raise ToolchainError("the processor refuses the rounding mode that enclosures need")
         return _Found(result.boxes, result.status, result.done, self._worst_of(result)), count
 
     def _result_type(self) -> Any:

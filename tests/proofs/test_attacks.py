@@ -189,3 +189,46 @@ def test_nothing_is_claimed_about_bounds_without_a_barrier():
     assert any("the bounds of x_2, x_3" in x for x in chain_problem(mixed, {}).assumptions)
     free = dataclasses.replace(mixed, state_bounds=())
     assert not any("Nothing" in x for x in chain_problem(free, {}).assumptions)
+
+
+@component
+class WithLength(ij.barriers.Mapping):
+    """A barrier whose V1 depends on a length of its own."""
+
+    def value(self, tube, q):
+        return super().value(tube, q) * (1.0 + (q - tube.q_d) ** 2)
+
+
+@component
+class Renamed(ij.barriers.Mapping):
+    """A barrier that the package does not know."""
+
+
+def with_barrier(barrier):
+    law = ij.controllers.Backstepping(k1=2.0, K2=[3.0], reading="corrected", barrier=barrier)
+    return pendulum(controller=law)
+
+
+def test_barriers_of_users_are_without_a_length_and_their_claims_are_assumed():
+    with pytest.raises(ValueError, match="without a length of its own"):
+        arm_problem(with_barrier(WithLength()), {})
+    claims = "The claims of Renamed hold"
+    assert any(claims in x for x in arm_problem(with_barrier(Renamed()), {}).assumptions)
+    assert any(claims in x for x in chain_problem(lever(Mapping(), Renamed()), {}).assumptions)
+    assert not any("claims of" in x for x in arm_problem(pendulum(), {}).assumptions)
+
+
+def test_an_uncertain_wave_does_not_end_with_the_period_of_the_others():
+    """An amplitude that is 0 in the scenario, and a frequency, may be any number of the box."""
+    rest = {
+        "reference": ij.references.Sinusoid(0.5, 0.0, 1.0),
+        "bounds": ij.Bounds(lower=ij.bounds.Constant([0.1]), upper=ij.bounds.Constant([1.0])),
+    }
+    silent = pendulum(disturbance=ij.disturbances.Sinusoids([0.0], [2.0]), **rest)
+    assert arm_problem(silent, {}).duration == 0.0
+    loud = {"disturbance.amplitude": ij.offset(ij.interval(-1.0, 1.0))}
+    assert arm_problem(silent, loud).duration == pytest.approx(np.pi)
+    faster = {"disturbance.parts[1].frequency": ij.factor(ij.interval(0.9, 1.1))}
+    with pytest.raises(ValueError, match="is uncertain"):
+        chain_problem(lever(), faster)
+    assert not chain_problem(lever(), faster, duration=2.0).is_period

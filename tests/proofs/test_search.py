@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import types
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +11,8 @@ import numpy as np
 import pytest
 from test_lowering_backends import needs_compiler
 
+from iblf_jax.kernels import interval_kernel
+from iblf_jax.kernels.toolchain import ToolchainError
 from iblf_jax.proofs import search as module
 from iblf_jax.proofs.search import search
 
@@ -38,6 +41,18 @@ def test_a_negative_function_is_proved():
     assert found.done == pytest.approx(1.0, abs=1e-12)
     assert found.worst is None
     assert found.boxes > 1000
+
+
+def test_a_kernel_that_has_not_run_proves_nothing():
+    kernel = interval_kernel(waves, 3, [-1.01])
+    refused = types.SimpleNamespace(
+        record_size=kernel.library.record_size, search_box=lambda *a: -1, divide_box=lambda *a: -1
+    )
+    problem = module._Problem(kernel._replace(library=refused), LOW[None], HIGH[None])
+    with pytest.raises(ToolchainError, match="rounding mode"):
+        problem.divided(100)
+    with pytest.raises(ToolchainError, match="rounding mode"):
+        problem.searched(np.zeros(problem.size), 100)
 
 
 def test_a_maximum_of_exactly_zero_is_not_proved():
