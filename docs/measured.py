@@ -68,13 +68,6 @@ PLOTS = {
         " exact value, their coefficient of variation, the one that the estimator reports, and the"
         " share of its 95 % intervals that contain the exact value.",
     ),
-    "proofs": Plot(
-        ("case", "K2", "kf", "level", "parameters"),
-        "boxes",
-        "Proofs of invariant level sets with outward rounding: boxes of the search, the share of the"
-        " volume that was proved, and the seconds of a call with a compiled kernel; less is"
-        " better.",
-    ),
     "tuning": Plot(
         ("search",),
         "rollouts to 0.5 %",
