@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from proof_cases import pendulum
-from test_arms import chain_loop, coordinates_of
+from test_arm_proofs import chain_loop, coordinates_of
 from test_chains import LEVER, Lever, check_bounds, lever, within
 from test_chains import pendulum as pendulum_with_motor
 
