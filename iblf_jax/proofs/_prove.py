@@ -29,6 +29,7 @@ from iblf_jax.engine.simulate import SimulationWarning, simulate
 from iblf_jax.kernels.enclosure import enclose
 from iblf_jax.proofs.arms import arm_problem
 from iblf_jax.proofs.chains import chain_problem
+from iblf_jax.proofs.periods import AperiodicError
 from iblf_jax.proofs.problem import LevelSetProblem
 from iblf_jax.proofs.result import GrowthPoint, Proof, Verdict, Violation, WorstBox
 from iblf_jax.proofs.search import SearchResult, search
@@ -97,12 +98,13 @@ def prove(
     runs: int = RUNS,
     seed: int = 0,
 ) -> Proof:
-    """Decides whether {V_w <= level} is invariant for all times and all parameters of a box.
+    """Decides whether {V_w <= level} is invariant for all parameters of a box.
 
         V_w' < 0 wherever V_w = level;   V_w = sum_i w_i V1_i + e2^T M0 e2 / 2 + w |f_tilde|^2 / 2
 
-    The plant has parameters p of the box, law and observer those of the scenario's model.  A proof
-    is rigorous for real-number equations: bounds are rounded outward.
+    The plant has parameters p of the box, law and observer those of the scenario's model.  The
+    statement holds at all times if the scenario has a period, otherwise for the given duration.  A
+    proof is rigorous for real-number equations: bounds are rounded outward.
 
     Args:
       scenario: the loop of a robot with the corrected backstepping law and the momentum observer,
@@ -412,7 +414,11 @@ def _refuted(
         duration = max(problem.duration, LEAST_DURATION)
         if not problem.is_period:
             duration = max(problem.duration - point[0], TIME_STEPS[0])
-        scenario = problem.scenario_at(point, constants)
+        try:
+            scenario = problem.scenario_at(point, constants)
+        except AperiodicError as error:
+            notices.warn(f"No run tried to refute the bounds: {error}.")
+            return None
         for dt in TIME_STEPS:
             run = _run(scenario, duration, dt)
             if not int(run.status) & Status.INACCURATE:

@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 
 INSTANTS = 512
 """Times of a guaranteed tube."""
+CONSTANT = 1e-9
+"""Relative variation of the bound of |xi| below which it does not depend on the time."""
 AT_REST = 5.0
 """Time that is shown if reference and bounds are constant, so that there is no period [s]."""
 
@@ -290,9 +292,13 @@ class Proof:
         return lines
 
     def _guarantee(self) -> str:
-        xi = ", ".join(f"{x:.4g}" for x in self.tube.xi.max(axis=0))
+        xi = self.tube.xi.max(axis=0)
+        texts = ", ".join(f"{math.ceil(x * 1e4) / 1e4:.4g}" for x in xi)
         names = ", ".join(plants.component_names(self.scenario.plant))
-        return f"Guaranteed for every start in the set: |xi| <= {xi} ({names})."
+        instants = ""
+        if np.any(np.ptp(self.tube.xi, axis=0) > CONSTANT * xi):
+            instants = f", the largest of {INSTANTS} instants"
+        return f"Guaranteed for every start in the set: |xi| <= {texts} ({names}{instants})."
 
     def _why_not_proved(self) -> list[str]:
         tried = len(self.growth_points)
@@ -368,7 +374,7 @@ def tube_of_level(scenario: Scenario, level: float, duration: float) -> Guarante
         error_at = barrier_member(barrier, "error_at")
         below = error_at(values, tube, jnp.zeros(values.shape, bool))
         above = error_at(values, tube, jnp.ones(values.shape, bool))
-        xi = barrier_member(barrier, "xi_bound")(values, tube)
+        xi = jnp.maximum(-below / tube.k_l, above / tube.k_u)
         return tube.q_d, tube.q_d + below, tube.q_d + above, tube.lower, tube.upper, xi
 
     found = jax.vmap(ends)(times)
