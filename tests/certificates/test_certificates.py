@@ -862,7 +862,7 @@ def test_an_own_claim_with_terms_of_its_own_and_a_memory(paper):
     assert "what the law states" in line.statement
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_where_an_own_claim_is_not_made(own):
     law = own.controller
     smooth = ij.controllers.Saturated(law=law, limit=[20.0, 9.0], edge="smooth")
@@ -1024,7 +1024,7 @@ def test_printed_breaks_its_claim_where_corrected_keeps_it():
     assert np.all(np.diff(corrected.traces.V[:200]) < 0)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_search_finds_the_gap_of_the_printed_law_only():
     perturbations = {
         "initial.q": between(0.4, 0.75),

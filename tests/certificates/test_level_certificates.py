@@ -431,7 +431,7 @@ def test_a_robot_is_certified_with_its_observer():
     check_torque_observer(LINK, 2)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_robot_with_drives_is_certified_with_the_observer_of_the_robot():
     drive = ij.plants.ElectricDrive(
         LINK, torque_constant=0.5, inductance=0.01, resistance=0.5, back_emf=0.1
@@ -459,7 +459,7 @@ def test_a_disturbance_of_q_has_no_torque_observer():
     assert certificate.holds
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_the_flexible_two_link_arm_is_certified():
     paper = ij.presets.zhang_yan_2024()
     flexible = ij.plants.FlexibleJoint(paper.plant, stiffness=300.0, motor_inertia=0.02)
@@ -489,6 +489,7 @@ def test_the_rigid_law_on_a_flexible_arm_has_the_flexibility_in_f():
 # --- many runs, other loops -----------------------------------------------------------------------
 
 
+@pytest.mark.release
 def test_many_runs_name_the_worst():
     scenario = pendulum(disturbance=DISTURBANCES)
     gains = {"controller.k": ij.factor(ij.uniform(0.8, 1.2))}
