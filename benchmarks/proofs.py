@@ -147,7 +147,7 @@ def row(case: Case, boxes: int) -> list[Any]:
         case.kf,
         case.level,
         case.parameters,
-        proof.verdict,
+        str(proof.verdict),
         proof.boxes,
         round(float(proof.done), 4),
         round(proof.seconds, 2),
