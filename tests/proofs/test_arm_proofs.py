@@ -16,6 +16,8 @@ from iblf_jax.simulation import closed_loop
 
 MASSES = {"plant.mass": ij.factor(ij.interval(0.97, 1.03))}
 WEIGHT, LEVEL = 2e-3, 0.8
+LEVELS = {"tan": 0.05}
+"""Levels of barriers whose guard is active at LEVEL."""
 
 
 def chain_loop(n, **parts):
@@ -100,11 +102,12 @@ def level_and_rate(scenario, weight):
 def test_rate_is_that_of_the_closed_loop_from_the_scenario_of_a_point(name):
     scenario, parameters = LOOPS[name]()
     problem = arm_problem(scenario, parameters)
-    constants = problem.constants(WEIGHT, LEVEL)
+    expected_level = LEVELS.get(name, LEVEL)
+    constants = problem.constants(WEIGHT, expected_level)
     points = problem.sample(0, 6)
     for point, expected in zip(points, problem.rate(points, constants), strict=True):
         level, rate = level_and_rate(problem.scenario_at(point, constants), WEIGHT)
-        np.testing.assert_allclose(level, LEVEL, rtol=1e-12)
+        np.testing.assert_allclose(level, expected_level, rtol=1e-12)
         np.testing.assert_allclose(rate, expected, rtol=1e-10, atol=1e-10)
 
 
@@ -128,7 +131,7 @@ def test_bound_over_boxes_is_above_the_rate_of_their_points(name):
     scenario, parameters = LOOPS[name]()
     problem = arm_problem(scenario, parameters)
     n, generator = scenario.n, np.random.default_rng(1)
-    constants = problem.constants(WEIGHT, LEVEL)
+    constants = problem.constants(WEIGHT, LEVELS.get(name, LEVEL))
     points = problem.sample(2, 2000)
     x = np.array([coordinates_of(point, n) for point in points])
     width = np.concatenate([problem.upper - problem.lower, np.zeros(n + 1)])
