@@ -74,6 +74,7 @@ from iblf_jax.kernels.emit_c import plain_function as plain_function
 from iblf_jax.kernels.enclosure import IntervalKernel as IntervalKernel
 from iblf_jax.kernels.enclosure import enclose as enclose
 from iblf_jax.kernels.enclosure import interval_kernel as interval_kernel
+from iblf_jax.kernels.enclosure import interval_program as interval_program
 from iblf_jax.kernels.enclosure import pointer as pointer
 from iblf_jax.kernels.folder import cpuinfo as cpuinfo
 from iblf_jax.kernels.folder import directory as directory

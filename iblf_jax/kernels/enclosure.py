@@ -86,7 +86,9 @@ class Compiled(NamedTuple):
 
 
 @CACHES.function(maxsize=64)
-def compiled(function: Callable, dimension: int, shapes: tuple[tuple[int, ...], ...]) -> Compiled:
+def interval_program(
+    function: Callable, dimension: int, shapes: tuple[tuple[int, ...], ...]
+) -> Compiled:
     """The program of a function on intervals, and its C++ source.
 
     Args:
@@ -523,7 +525,7 @@ def interval_kernel(function: Callable, dimension: int, constants: Sequence[Any]
     """The kernel of a function.
 
     Args:
-      function: see `compiled`.
+      function: see `interval_program`.
       dimension: number of coordinates.
       constants: numbers and arrays, which must be finite.
 
@@ -536,6 +538,6 @@ def interval_kernel(function: Callable, dimension: int, constants: Sequence[Any]
     for k, array in enumerate(arrays):
         if not np.isfinite(array).all():
             raise ValueError(f"constants[{k}]: got {array!r}, expected finite numbers.")
-    found = compiled(function, dimension, tuple(a.shape for a in arrays))
+    found = interval_program(function, dimension, tuple(a.shape for a in arrays))
     numbers = np.concatenate([*(a.ravel() for a in arrays), np.array(found.literals), [0.0]])
     return IntervalKernel(library(found.source), numbers, found)

@@ -26,7 +26,7 @@ import numpy as np
 from iblf_jax.core import checks, notices
 from iblf_jax.core.status import Status
 from iblf_jax.engine.simulate import SimulationWarning, simulate
-from iblf_jax.kernels.enclosure import enclose
+from iblf_jax.kernels import enclose
 from iblf_jax.proofs.arms import arm_problem
 from iblf_jax.proofs.chains import chain_problem
 from iblf_jax.proofs.periods import AperiodicError

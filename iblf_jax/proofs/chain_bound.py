@@ -24,7 +24,7 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.control.barriers import Quadratic
-from iblf_jax.kernels.interval_primitives import hull, meet, with_sign
+from iblf_jax.kernels import hull, meet, with_sign
 from iblf_jax.proofs import chain_motion, uncertainty
 from iblf_jax.proofs.arm_motion import along
 from iblf_jax.proofs.chain_motion import (

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import jax
 
 from iblf_jax.core import checks
-from iblf_jax.kernels.enclosure import compiled
+from iblf_jax.kernels import interval_program
 
 CASES = frozenset({"sign", "lt", "le", "gt", "ge", "lookup"})
 """Operations that select a case: with them, a function may jump, which its derivative does not
@@ -16,7 +16,7 @@ contain."""
 
 def depends_on(function: Callable[[jax.Array], jax.Array], size: int, k: int) -> bool:
     """Whether a function of (size,) depends on entry k of its argument."""
-    nodes = compiled(lambda x, constants: function(x), size, ()).program.nodes
+    nodes = interval_program(lambda x, constants: function(x), size, ()).program.nodes
     return any(node.op == "carry" and node.value == k for node in nodes)
 
 
@@ -27,7 +27,7 @@ def check_without_cases(function: Callable[[jax.Array], jax.Array], size: int) -
       function: what plant and disturbance add to f or d, of time, state and parameters.
       size: of its argument.
     """
-    program = compiled(lambda x, constants: function(x), size, ()).program
+    program = interval_program(lambda x, constants: function(x), size, ()).program
     found = sorted({node.op for node in program.nodes if node.op in CASES})
     if not found:
         return

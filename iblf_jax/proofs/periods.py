@@ -92,7 +92,7 @@ def _frequencies(name: str, part: Any, *, all_count: bool) -> Iterator[float]:
     if type(part) in CONSTANT:
         return
     if type(part) not in FREQUENCIES:
-        raise AperiodicError(f"{name} is a {type(part).__name__}, whose period is not known")
+        raise AperiodicError(f"the period of {name} ({type(part).__name__}) is not known")
     for fields in FREQUENCIES[type(part)]:
         amplitude, frequency = (np.asarray(getattr(part, field)) for field in fields)
         for size, w in np.broadcast(amplitude, frequency):
@@ -110,7 +110,7 @@ def shifted(part: Any, t: jax.Array | float) -> Any:
     if type(part) in CONSTANT:
         return part
     if type(part) not in FREQUENCIES:
-        raise AperiodicError(f"a {type(part).__name__} cannot be moved in time")
+        raise AperiodicError(f"{type(part).__name__} cannot be moved in time")
     phases = {
         frequency.replace("frequency", "phase"): frequency
         for _, frequency in FREQUENCIES[type(part)]

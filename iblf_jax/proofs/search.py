@@ -25,8 +25,7 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.core.progress import bar
-from iblf_jax.kernels import IntervalKernel, interval_kernel, pointer
-from iblf_jax.kernels.toolchain import ToolchainError
+from iblf_jax.kernels import IntervalKernel, ToolchainError, interval_kernel, pointer
 
 STATUSES = ("proved", "undecided", "refuted", "out of boxes", "stopped", "out of memory")
 """How the search of a unit ended, in the order of `kernels/c/boxes.h`."""
