@@ -85,20 +85,49 @@ class Compiled(NamedTuple):
     source: str
 
 
+class Lowered(NamedTuple):
+    """A function as a scalar program."""
+
+    program: Program
+    sizes: tuple[int, ...]
+    """Number of entries of each output array."""
+    shapes: tuple[tuple[int, ...], ...]
+    """Shape of each output array."""
+
+
 @CACHES.function(maxsize=64)
-def interval_program(
-    function: Callable, dimension: int, shapes: tuple[tuple[int, ...], ...]
-) -> Compiled:
+def compiled(function: Callable, dimension: int, shapes: tuple[tuple[int, ...], ...]) -> Compiled:
     """The program of a function on intervals, and its C++ source.
 
     Args:
-      function: function (x, constants) -> arrays, of one point, (dimension,), and of a list of
-        constants. The function object is the key of a cache.
+      function: as `interval_program`; the function object is the key of a cache.
       dimension: number of coordinates.
       shapes: shapes of the constants.
 
     Raises:
       UnsupportedError: an operation is not available on intervals.
+    """
+    lowered = interval_program(function, dimension, shapes)
+    constants = sum(map(math.prod, shapes))
+    # By their digits: 0.0 and -0.0 are equal, and each has its place.
+    literals = tuple({value.hex(): value for value in _literals(lowered.program)}.values())
+    source = _source(lowered.program, dimension, constants, literals, lowered.sizes[0])
+    return Compiled(*lowered, literals, source)
+
+
+def interval_program(
+    function: Callable, dimension: int, shapes: tuple[tuple[int, ...], ...] = ()
+) -> Lowered:
+    """The scalar program of a function on intervals.
+
+    Args:
+      function: function (x, constants) -> arrays, of one point, (dimension,), and of a list of
+        constants.
+      dimension: number of coordinates.
+      shapes: shapes of the constants.
+
+    Raises:
+      UnsupportedError: an operation cannot be expressed.
     """
     structs = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in shapes]
     with jax.enable_x64(True):
@@ -120,15 +149,7 @@ def interval_program(
     for output in program.outputs:
         if program.nodes[output].kind != "f":
             raise UnsupportedError("an output that is no floating-point number")
-    # By their digits: 0.0 and -0.0 are equal, and each has its place.
-    literals = tuple({value.hex(): value for value in _literals(program)}.values())
-    return Compiled(
-        program,
-        tuple(ids.size for ids in results),
-        tuple(x.shape for x in out),
-        literals,
-        _source(program, dimension, first, literals, results[0].size),
-    )
+    return Lowered(program, tuple(ids.size for ids in results), tuple(x.shape for x in out))
 
 
 def _literals(program: Program) -> list[float]:
@@ -525,7 +546,7 @@ def interval_kernel(function: Callable, dimension: int, constants: Sequence[Any]
     """The kernel of a function.
 
     Args:
-      function: see `interval_program`.
+      function: see `compiled`.
       dimension: number of coordinates.
       constants: numbers and arrays, which must be finite.
 
@@ -538,6 +559,6 @@ def interval_kernel(function: Callable, dimension: int, constants: Sequence[Any]
     for k, array in enumerate(arrays):
         if not np.isfinite(array).all():
             raise ValueError(f"constants[{k}]: got {array!r}, expected finite numbers.")
-    found = interval_program(function, dimension, tuple(a.shape for a in arrays))
+    found = compiled(function, dimension, tuple(a.shape for a in arrays))
     numbers = np.concatenate([*(a.ravel() for a in arrays), np.array(found.literals), [0.0]])
     return IntervalKernel(library(found.source), numbers, found)

@@ -171,7 +171,47 @@ class MismatchRate(NamedTuple):
 
 
 def mismatch(constants: Constants, places: Places, at: Errors, z: jax.Array) -> Mismatch:
-    """F' over a box of parameters; see the head of this module."""
+    """The rate f' over a box of parameters; see the head of this module."""
+    numbers, n = constants.numbers, at.xi.shape[-1]
+    found = torque_columns(constants, places, at, z)
+    columns, shares = found.columns, found.shares
+    # The first ones belong to the difference of the scenario's plant from its model.
+    fixed = len(columns) - places.coordinates
+
+    def solution_at(z: jax.Array) -> tuple[jax.Array, Affine]:
+        """I + dM M0^-1 and f' at coordinates z."""
+        size = jnp.concatenate([jnp.ones(fixed), z - numbers.reference])
+        total, right = jnp.eye(n), found.external
+        for k, (column, share) in enumerate(zip(columns, shares, strict=True)):
+            total = total + size[k] * share
+            right = add(right, scaled(-size[k], column))
+        return total, on_columns(lambda column: solve_general(total, column), right)
+
+    total, constant = solution_at(centre(z))
+    _, everywhere = solution_at(z)
+
+    def affine_column(column: Affine, share: jax.Array) -> Affine:
+        product = on_columns(lambda column: matvec(share, column), everywhere)
+        force = scaled(jnp.asarray(-1.0), add(column, product))
+        return on_columns(lambda column: solve_general(total, column), force)
+
+    pairs = zip(columns[fixed:], shares[fixed:], strict=True)
+    return Mismatch(constant, [affine_column(*pair) for pair in pairs])
+
+
+class TorqueColumns(NamedTuple):
+    """What f' consists of, by coordinate: (I + dM M0^-1) f' = external - sum_k size_k column_k."""
+
+    external: Affine
+    """d0'."""
+    columns: list[Affine]
+    """W_k with j0, of the fixed difference first, where there is one."""
+    shares: list[jax.Array]
+    """M_k M0^-1 of each."""
+
+
+def torque_columns(constants: Constants, places: Places, at: Errors, z: jax.Array) -> TorqueColumns:
+    """The columns of f' over a box of parameters."""
     parts, numbers = constants.parts, constants.numbers
     n = at.xi.shape[-1]
     nominal = (parts.plant, parts.disturbance)
@@ -217,33 +257,11 @@ def mismatch(constants: Constants, places: Places, at: Errors, z: jax.Array) -> 
     # The rate of a further disturbance is a coordinate without entries.
     columns += [Affine(-unit, jnp.zeros((n, n))) for unit in jnp.eye(n)[: places.rates]]
     shares += [jnp.zeros((n, n))] * places.rates
-
-    def solution_at(z: jax.Array) -> tuple[jax.Array, Affine]:
-        """I + dM M0^-1 and f' at coordinates z."""
-        size = z - numbers.reference
-        if fixed is not None:
-            size = jnp.concatenate([jnp.ones(1), size])
-        total, right = jnp.eye(n), found.external
-        for k, (column, share) in enumerate(zip(columns, shares, strict=True)):
-            total = total + size[k] * share
-            right = add(right, scaled(-size[k], column))
-        return total, on_columns(lambda column: solve_general(total, column), right)
-
-    total, constant = solution_at(centre(z))
-    _, everywhere = solution_at(z)
-
-    def affine_column(column: Affine, share: jax.Array) -> Affine:
-        product = on_columns(lambda column: matvec(share, column), everywhere)
-        force = scaled(jnp.asarray(-1.0), add(column, product))
-        return on_columns(lambda column: solve_general(total, column), force)
-
-    first = 0 if fixed is None else 1
-    pairs = zip(columns[first:], shares[first:], strict=True)
-    return Mismatch(constant, [affine_column(*pair) for pair in pairs])
+    return TorqueColumns(found.external, columns, shares)
 
 
 def corners(found: Mismatch, z: jax.Array) -> list[Affine]:
-    """F' at each corner of the box of parameters."""
+    """The rate f' at each corner of the box of parameters."""
     size = z - centre(z)
     ends = [(lower(size[k]), upper(size[k])) for k in range(len(found.columns))]
     vertices = []

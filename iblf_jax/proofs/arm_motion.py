@@ -316,7 +316,7 @@ def mismatch_torque(parts: ArmParts, now: Kinematics) -> jax.Array:
 def mismatch_rate(
     parts: ArmParts, at: Errors, f_tilde: jax.Array, extra: jax.Array | float = 0.0
 ) -> jax.Array:
-    """F' of (P.3) by exact differences, for numbers, (n,) [N m/s].
+    """The rate f' of (P.3) by exact differences, for numbers, (n,) [N m/s].
 
     Args:
       parts: with the true plant.

@@ -214,15 +214,22 @@ class LevelEquations:
         """s_i of row i."""
         return self.parts.law.barriers[i].slope(self.relative_tube(i, y), y.e[i])
 
+    def virtual_rate(self, i: int, y: ChainState) -> jax.Array:
+        """a_i - beta_{i-1} of row i, the virtual velocity of its barrier."""
+        law = self.parts.law
+        gain_o = None if law.o is None else law.o[i]
+        tube = self.relative_tube(i, y)
+        return law.barriers[i].virtual_velocity(  # type: ignore[no-any-return]
+            tube, y.e[i], law.k[i], gain_o
+        )
+
     @remembered(errors=1, estimates=0)
     def relative_desired_rate(self, i: int, y: ChainState) -> jax.Array:
         """R_i - beta_{i-1} of row i."""
         law = self.parts.law
         barrier = law.barriers[i]
         tube = self.relative_tube(i, y)
-        gain_o = None if law.o is None else law.o[i]
-        rate = barrier.virtual_velocity(tube, y.e[i], law.k[i], gain_o)
-        rate = rate - law.c[i] * barrier.slope(tube, y.e[i])
+        rate = self.virtual_rate(i, y) - law.c[i] * barrier.slope(tube, y.e[i])
         if i == 0:
             return rate
         below = law.weights[i - 1] * self.barrier_slope(i - 1, y)
@@ -279,13 +286,11 @@ class LevelEquations:
     def exact_decay(self, i: int, y: ChainState) -> jax.Array:
         """-w_i V_i' of row i for e_i' = a_i - beta_{i-1}."""
         law = self.parts.law
-        barrier = law.barriers[i]
         tube = self.relative_tube(i, y)
-        gain_o = None if law.o is None else law.o[i]
-        rate = barrier.virtual_velocity(tube, y.e[i], law.k[i], gain_o)
         zero = jnp.zeros(1)
         moved = OpenTube(zero, zero, tube.dlower, tube.dupper, zero, zero)
-        return -law.weights[i] * along(barrier.value, (tube, y.e[i]), (moved, rate))
+        rates = (moved, self.virtual_rate(i, y))
+        return -law.weights[i] * along(law.barriers[i].value, (tube, y.e[i]), rates)
 
 
 class Motion(NamedTuple):

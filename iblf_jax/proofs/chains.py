@@ -16,15 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.control import controllers, observers
-from iblf_jax.control.actuators import Ideal
 from iblf_jax.control.barriers import Quadratic
 from iblf_jax.control.barriers._base import barrier_member, has_ratio
-from iblf_jax.control.decays._base import decay_member
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import astype
 from iblf_jax.core.time import as_at, jump_times_of
 from iblf_jax.proofs import chain_motion, uncertainty
-from iblf_jax.proofs.arms import INSTANTS, Uncertain, claims_of, uncertain_coordinates
 from iblf_jax.proofs.chain_bound import (
     Constants,
     LevelPoint,
@@ -35,8 +32,25 @@ from iblf_jax.proofs.chain_bound import (
 )
 from iblf_jax.proofs.chain_motion import ChainParts
 from iblf_jax.proofs.dependence import check_without_cases, depends_on
-from iblf_jax.proofs.periods import AperiodicError, period_of, shifted
-from iblf_jax.proofs.problem import LevelSetProblem, length_of_part, patterns_of
+from iblf_jax.proofs.parameters import Uncertain, uncertain_coordinates
+from iblf_jax.proofs.periods import shifted
+from iblf_jax.proofs.problem import (
+    LevelSetProblem,
+    length_of_part,
+    patterns_of,
+    random_points,
+)
+from iblf_jax.proofs.support import (
+    CONTINUOUS,
+    REAL_NUMBERS,
+    check_absent,
+    check_exponential,
+    check_level,
+    check_same_structure,
+    claims_of,
+    time_interval,
+    unsupported,
+)
 from iblf_jax.proofs.uncertainty import Places
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Initial, Scenario, canonical
@@ -47,8 +61,7 @@ from iblf_jax.world.bounds import Tube, tube_at
 ORDERS = (2, 3)
 """Numbers of levels for which the bound is small enough to be of use."""
 ASSUMPTIONS = (
-    "The equations hold in real numbers: the loop is continuous, and its parameters are the stored"
-    " double-precision numbers.",
+    REAL_NUMBERS,
     "The input of the law is applied as it is: without sampling, delay or saturation.",
     "The errors of the observer and the state are exactly those of the level set; measurements have"
     " no noise.",
@@ -159,26 +172,18 @@ class _Chain:
         return [np.asarray(x, float) for x in jax.tree.leaves(numbers)]
 
     def _check_level(self, level: float) -> None:
-        """Raises ValueError if the level set reaches the guard of the first barrier at one of some
-        instants; the bound examines all times.
-        """
+        """Raises ValueError if the level set reaches the guard of the first barrier."""
         law: Any = self.scenario.controller
         barrier = law.barriers[0]
         if isinstance(barrier, Quadratic):
             return
-        times = jnp.linspace(0.0, self.duration, INSTANTS)
         value = level / self.parts.law.weights[0] * jnp.ones(1)
 
-        def reached(t: jax.Array) -> jax.Array:
+        def xi_bound(t: jax.Array) -> jax.Array:
             tube = tube_at(self.parts.reference, self.scenario.bounds, t, acceleration=False)
             return barrier.xi_bound(value, tube)  # type: ignore[no-any-return]
 
-        xi = float(jnp.max(jax.vmap(reached)(times)))
-        if xi < 1.0 - barrier.guard:
-            return
-        expected = f"a level inside the guard of the first barrier, |xi| < {1.0 - barrier.guard:g}"
-        remedy = f"It reaches |xi| = {xi:.6g}, where the law has another slope. Lower the level."
-        raise checks.fail("level", level, expected, remedy)
+        check_level(level, xi_bound, barrier.guard, self.duration, "first barrier")
 
     def _scales_of_weights(self) -> np.ndarray:
         """w_i s_i'(0)/(k_i kappa_i) of each observed level at t = 0, 1 of the others, (r, 1)."""
@@ -194,14 +199,8 @@ class _Chain:
 
     def sample(self, seed: int, count: int) -> np.ndarray:
         """Random points, (count, 1 + terms + m)."""
-        low, high = self.uncertain.low, self.uncertain.high
-        generator = np.random.default_rng(seed)
-        t = generator.uniform(0.0, self.duration, (count, 1))
-        s = generator.normal(size=(count, self.terms))
-        s /= np.linalg.norm(s, axis=1, keepdims=True)
-        share = generator.uniform(size=(count, len(low)))
-        share[::2] = np.round(share[::2])
-        return np.concatenate([t, s, low + share * (high - low)], axis=1)
+        ends = (self.uncertain.low, self.uncertain.high)
+        return random_points(seed, count, self.duration, self.terms, *ends)
 
     def state_of(self, point: Any, constants: Any) -> ChainLevelState:
         """A point in physical numbers."""
@@ -227,14 +226,6 @@ class _Chain:
         """The scenario whose run starts at a point, with its parameters and moved in time."""
         state = self.state_of(point, constants)
         scenario = paths.with_parameters(self.scenario, state.parameters)
-        bounds: list[Any] = [
-            None
-            if side is None
-            else dataclasses.replace(
-                side, lower=shifted(side.lower, state.t), upper=shifted(side.upper, state.t)
-            )
-            for side in (scenario.bounds, *scenario.state_bounds)
-        ]
         observer = scenario.observer
         if isinstance(observer, observers.LevelObserver):
             observer = dataclasses.replace(observer, eta0=state.eta, start="zero")
@@ -242,8 +233,8 @@ class _Chain:
             scenario,
             initial=Initial(x=state.x),
             observer=observer,
-            bounds=bounds[0],
-            state_bounds=tuple(bounds[1:]),
+            bounds=shifted(scenario.bounds, state.t),
+            state_bounds=tuple(shifted(side, state.t) for side in scenario.state_bounds),
             reference=shifted(scenario.reference, state.t),
             disturbance=shifted(scenario.disturbance, state.t),
         )
@@ -285,7 +276,7 @@ def chain_problem(
         scenario = canonical(astype(scenario, jnp.float64))
         parts = _parts_of(scenario)
         uncertain = uncertain_coordinates(scenario, parameters, None)
-        length, is_period = _time_interval(scenario, duration, uncertain)
+        length, is_period = time_interval(_varying(scenario), duration, uncertain)
         _check_continuous(scenario, uncertain)
         zero = jnp.zeros(())
         numbers = Constants(
@@ -382,29 +373,18 @@ def _rows(value: jax.Array, order: int) -> jax.Array:
     return jnp.broadcast_to(jnp.reshape(value, (-1, 1)), (order, 1))
 
 
-def _time_interval(
-    scenario: Scenario, duration: float | None, uncertain: Uncertain
-) -> tuple[float, bool]:
-    """The length of the time interval [s], and whether it is a period."""
-    if duration is not None:
-        return checks.positive_number("duration", duration, "s"), False
-    varying = {"reference": scenario.reference, "disturbance": scenario.disturbance}
-    names = ["bounds", *(f"state_bounds[{i}]" for i in range(len(scenario.state_bounds)))]
-    for name, bounds in zip(names, (scenario.bounds, *scenario.state_bounds), strict=True):
-        if bounds is not None:
-            varying |= {f"{name}.lower": bounds.lower, f"{name}.upper": bounds.upper}
-    try:
-        return period_of(varying, [path for paths in uncertain.paths for path in paths]), True
-    except AperiodicError as error:
-        remedy = f"Give a duration [s]: {error}."
-        raise checks.fail("duration", None, "a duration", remedy) from None
+def _varying(scenario: Scenario) -> dict[str, Any]:
+    """The parts that may depend on time, by name."""
+    sides = {f"state_bounds[{i}]": side for i, side in enumerate(scenario.state_bounds)}
+    return {
+        "reference": scenario.reference,
+        "disturbance": scenario.disturbance,
+        "bounds": scenario.bounds,
+        **sides,
+    }
 
 
 # --- what is supported -------------------------------------------------------------------------
-
-
-def _unsupported(field: str, given: Any, expected: str, reason: str) -> ValueError:
-    return checks.fail(f"prove: scenario.{field}", given, expected, reason)
 
 
 def check_supported(scenario: Any) -> None:
@@ -414,7 +394,11 @@ def check_supported(scenario: Any) -> None:
     _check_plant(scenario)
     _check_law(scenario)
     _check_observer(scenario)
-    _check_absent(scenario)
+    reasons = {
+        "sampling": CONTINUOUS,
+        "process_noise": "V' of a stochastic loop has further terms.",
+    }
+    check_absent(scenario, reasons, input="input", rate="d'")
 
 
 def _check_plant(scenario: Scenario) -> None:
@@ -423,27 +407,23 @@ def _check_plant(scenario: Scenario) -> None:
         kind = type(part).__name__
         if not plants.is_chain(part):
             reason = "This bound is that of plants with drift and gain."
-            raise _unsupported(name, kind, "a plant in strict-feedback form", reason)
+            raise unsupported(name, kind, "a plant in strict-feedback form", reason)
         if plants.robot_of(part) is not None:
             reason = "Its disturbances are torques on a robot, which this bound does not contain."
-            raise _unsupported(name, kind, "a plant without a robot inside", reason)
+            raise unsupported(name, kind, "a plant without a robot inside", reason)
         if part.n != 1:
             reason = "The signs of the errors and the level set of several numbers are not here."
-            raise _unsupported(f"{name}.n", part.n, "one number per level", reason)
+            raise unsupported(f"{name}.n", part.n, "one number per level", reason)
         if part.order not in ORDERS:
             reason = "The derivatives of the law grow with each level."
-            raise _unsupported(f"{name}.order", part.order, "order 2 or 3", reason)
+            raise unsupported(f"{name}.order", part.order, "order 2 or 3", reason)
         if plants.nominal_of(part) is not part or jnp.size(jump_times_of(name, part)):
             reason = "The plant changes during the run."
-            raise _unsupported(name, kind, "a plant that does not change", reason)
+            raise unsupported(name, kind, "a plant that does not change", reason)
         if depends_on(_rates_of(part), 1 + part.order, 0):
             reason = "Its drift or its gain depends on the time, with a period that is not known."
-            raise _unsupported(name, kind, "a plant that does not depend on the time", reason)
-    structures: list[Any] = [jax.tree.structure(part) for part in (scenario.plant, scenario.model)]
-    if structures[0] != structures[1]:
-        reason = "The difference of their parameters is what the proof is about."
-        expected = f"a plant of the structure of {type(scenario.plant).__name__}"
-        raise _unsupported("model", type(scenario.model).__name__, expected, reason)
+            raise unsupported(name, kind, "a plant that does not depend on the time", reason)
+    check_same_structure(scenario, f"a plant of the structure of {type(scenario.plant).__name__}")
 
 
 def _rates_of(plant: Any) -> Callable[[jax.Array], jax.Array]:
@@ -480,30 +460,27 @@ def _check_law(scenario: Scenario) -> None:
     law: Any = scenario.controller
     if not isinstance(law, controllers.BarrierBackstepping):
         reason = "V' is known for barrier backstepping with exact derivatives."
-        raise _unsupported(
+        raise unsupported(
             "controller", type(law).__name__, "controllers.BarrierBackstepping", reason
         )
     if law.filter is not None:
         reason = "With filters V' has the errors of the filters, which are not in V."
-        raise _unsupported("controller.filter", law.filter, "exact derivatives (None)", reason)
-    if not all(decay_member(decay, "constant") for decay in law.decays):
-        names = ", ".join(type(decay).__name__ for decay in law.decays)
-        reason = "V' with other decays is not known here."
-        raise _unsupported("controller.decays", names, "exponential decays", reason)
+        raise unsupported("controller.filter", law.filter, "exact derivatives (None)", reason)
+    check_exponential(law, "V'")
     one = jnp.ones(1)
     tube = Tube(0.0 * one, 0.0 * one, -one, one, 0.0 * one, 0.0 * one)
     for i, barrier in enumerate(law.barriers):
         name, kind = f"controller.barriers[{i}]", type(barrier).__name__
         if barrier_member(barrier, "decay_rate")(one) is None:
-            raise _unsupported(name, kind, "a barrier with decay_rate", "V' contains its decay.")
+            raise unsupported(name, kind, "a barrier with decay_rate", "V' contains its decay.")
         if i > 0 and not has_ratio(barrier):
             reason = "The law needs e/s above the first level."
-            raise _unsupported(name, kind, "a barrier with error_over_slope", reason)
+            raise unsupported(name, kind, "a barrier with error_over_slope", reason)
         if isinstance(barrier, Quadratic):
             continue
         if barrier_member(barrier, "error_at")(one, tube, one > 0) is None:
             reason = "The level set needs the error at which V_i has a value, in closed form."
-            raise _unsupported(name, kind, "a barrier with error_at", reason)
+            raise unsupported(name, kind, "a barrier with error_at", reason)
 
 
 def _check_observer(scenario: Scenario) -> None:
@@ -513,28 +490,9 @@ def _check_observer(scenario: Scenario) -> None:
     if not isinstance(observer, observers.LevelObserver):
         reason = "V contains d_tilde of observers with d_tilde' = d' - kappa d_tilde only."
         expected = "observers.LevelObserver or NoObserver"
-        raise _unsupported("observer", type(observer).__name__, expected, reason)
+        raise unsupported("observer", type(observer).__name__, expected, reason)
     order = scenario.plant.order
     gain, eta0 = (np.asarray(_rows(x, order)) for x in (observer.gain, observer.eta0))
     if np.any(eta0[gain == 0.0]):
         reason = "A level without a gain keeps this estimate, which is taken as 0."
-        raise _unsupported("observer.eta0", observer.eta0, "0 where the gain is 0", reason)
-
-
-def _check_absent(scenario: Scenario) -> None:
-    """Raises ValueError for parts that the bound does not contain."""
-    reasons = {
-        "sampling": "The proof is one of the continuous loop, with an ideal sensor.",
-        "process_noise": "V' of a stochastic loop has further terms.",
-    }
-    for name, reason in reasons.items():
-        part = vars(scenario)[name]
-        if part is not None:
-            raise _unsupported(name, type(part).__name__, "None", reason)
-    if not isinstance(scenario.actuator, Ideal):
-        reason = "The input of the law must be applied as it is."
-        raise _unsupported("actuator", type(scenario.actuator).__name__, "Ideal()", reason)
-    if jnp.size(scenario.jump_times()):
-        times = np.asarray(scenario.jump_times()).tolist()
-        reason = "d' is not defined at a jump."
-        raise _unsupported("jump_times()", times, "no jumps", reason)
+        raise unsupported("observer.eta0", observer.eta0, "0 where the gain is 0", reason)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 
@@ -16,8 +17,7 @@ contain."""
 
 def depends_on(function: Callable[[jax.Array], jax.Array], size: int, k: int) -> bool:
     """Whether a function of (size,) depends on entry k of its argument."""
-    nodes = interval_program(lambda x, constants: function(x), size, ()).program.nodes
-    return any(node.op == "carry" and node.value == k for node in nodes)
+    return any(node.op == "carry" and node.value == k for node in _nodes(function, size))
 
 
 def check_without_cases(function: Callable[[jax.Array], jax.Array], size: int) -> None:
@@ -27,8 +27,7 @@ def check_without_cases(function: Callable[[jax.Array], jax.Array], size: int) -
       function: what plant and disturbance add to f or d, of time, state and parameters.
       size: of its argument.
     """
-    program = interval_program(lambda x, constants: function(x), size, ()).program
-    found = sorted({node.op for node in program.nodes if node.op in CASES})
+    found = sorted({node.op for node in _nodes(function, size) if node.op in CASES})
     if not found:
         return
     raise checks.fail(
@@ -37,3 +36,8 @@ def check_without_cases(function: Callable[[jax.Array], jax.Array], size: int) -
         "functions without cases, such as jnp.sign or jnp.where of a comparison",
         "A derivative does not contain a jump. Take a smooth function, such as jnp.tanh.",
     )
+
+
+def _nodes(function: Callable[[jax.Array], jax.Array], size: int) -> tuple[Any, ...]:
+    """The operations of a function of (size,)."""
+    return interval_program(lambda x, constants: function(x), size).program.nodes

@@ -8,13 +8,14 @@ result.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.proofs._prove import problem_of, prove, sample_weights, weights_of
+from iblf_jax.proofs.largest import ends_of
 from iblf_jax.proofs.result import Proof
 from iblf_jax.simulation.paths import get, with_parameters
 from iblf_jax.simulation.scenario import Scenario
@@ -92,37 +93,12 @@ def gains_for_guarantee(
 
     Source: J. A. Nelder, R. Mead, The Computer Journal 7 (1965) 308-313.
     """
-    from scipy.optimize import minimize
-
     limits = _limits(gains)
     tries = checks.positive_integer("tries", tries, most=100_000)
-    low, high = np.log(np.array(list(limits.values()))).T
-
-    def at(u: np.ndarray) -> tuple[Scenario, float]:
-        values = map(float, np.exp(low + u[:-1] * (high - low)))
-        candidate = with_parameters(scenario, dict(zip(limits, values, strict=True)))
-        weights = weights_of(candidate, None)
-        return candidate, float(weights[0] * (weights[-1] / weights[0]) ** u[-1])
-
-    def rate_of(candidate: Scenario, weight: float) -> float:
-        problem = problem_of(candidate, parameters, duration, disturbance_rate)
-        return sample_weights(problem, level, [weight], seed)[0].largest
-
-    problem = problem_of(scenario, parameters, duration, disturbance_rate)
-    sampled = sample_weights(problem, level, weights_of(scenario, None), seed)
-    rates = [found.largest for found in sampled]
-    start = [_place(scenario, path, ends) for path, ends in limits.items()]
-    start.append(float(np.clip(np.argmin(rates) / (len(rates) - 1), 0.05, 0.95)))
-    found = minimize(
-        lambda u: rate_of(*at(u)),
-        start,
-        method="Nelder-Mead",
-        bounds=[(0.0, 1.0)] * len(start),
-        options={"maxfev": tries, "xatol": 1e-3, "fatol": 1e-4 * level},
-    )
-    chosen, _ = at(found.x)
+    uncertain = (parameters, duration, disturbance_rate)
+    found = _Search(scenario, limits, level, uncertain, seed).best(tries)
     proof = prove(
-        chosen,
+        found.scenario,
         level=level,
         parameters=parameters,
         duration=duration,
@@ -130,8 +106,66 @@ def gains_for_guarantee(
         seed=seed,
         **options,
     )
-    values = {path: float(np.ravel(get(chosen, path))[0]) for path in limits}
-    return GuaranteedGains(chosen, values, float(found.fun), min(rates), int(found.nfev), proof)
+    values = {path: float(np.ravel(get(found.scenario, path))[0]) for path in limits}
+    return GuaranteedGains(
+        found.scenario, values, found.rate, found.rate_before, found.tries, proof
+    )
+
+
+class _Found(NamedTuple):
+    """The result of a search."""
+
+    scenario: Scenario
+    rate: float
+    rate_before: float
+    tries: int
+
+
+class _Search(NamedTuple):
+    """The search over gains and weight, as numbers u in [0, 1] on a logarithmic scale."""
+
+    scenario: Scenario
+    limits: dict[str, tuple[float, float]]
+    level: float
+    uncertain: tuple[Mapping[str, Perturbation], float | None, Any]
+    """Parameters, duration and bound of the rate of a further disturbance, as `prove` takes
+    them."""
+    seed: int
+
+    def at(self, u: np.ndarray) -> tuple[Scenario, float]:
+        """The scenario and the weight."""
+        low, high = np.log(np.array(list(self.limits.values()))).T
+        values = map(float, np.exp(low + u[:-1] * (high - low)))
+        candidate = with_parameters(self.scenario, dict(zip(self.limits, values, strict=True)))
+        weights = weights_of(candidate, None)
+        return candidate, float(weights[0] * (weights[-1] / weights[0]) ** u[-1])
+
+    def rates(self, scenario: Scenario, weights: Sequence[float]) -> list[float]:
+        """The largest V_w' that is found at each weight."""
+        problem = problem_of(scenario, *self.uncertain)
+        return [x.largest for x in sample_weights(problem, self.level, weights, self.seed)]
+
+    def rate_at(self, u: np.ndarray) -> float:
+        """The largest V_w' that is found."""
+        candidate, weight = self.at(u)
+        return self.rates(candidate, [weight])[0]
+
+    def best(self, tries: int) -> _Found:
+        """The gains with the least rate, by the method of Nelder and Mead."""
+        from scipy.optimize import minimize
+
+        before = self.rates(self.scenario, weights_of(self.scenario, None))
+        start = [_place(self.scenario, path, ends) for path, ends in self.limits.items()]
+        start.append(float(np.clip(np.argmin(before) / (len(before) - 1), 0.05, 0.95)))
+        found = minimize(
+            self.rate_at,
+            start,
+            method="Nelder-Mead",
+            bounds=[(0.0, 1.0)] * len(start),
+            options={"maxfev": tries, "xatol": 1e-3, "fatol": 1e-4 * self.level},
+        )
+        scenario, _ = self.at(found.x)
+        return _Found(scenario, float(found.fun), min(before), int(found.nfev))
 
 
 def _limits(gains: Any) -> dict[str, tuple[float, float]]:
@@ -139,11 +173,7 @@ def _limits(gains: Any) -> dict[str, tuple[float, float]]:
     example = '{"controller.K2": (1.0, 20.0)}'
     limits = {}
     for path, ends in checks.mapping("gains", gains, example).items():
-        numbers = np.asarray(checks.as_floats(f"gains[{path!r}]", ends), float)
-        if numbers.shape != (2,) or not 0.0 < numbers[0] < numbers[1] < np.inf:
-            expected = "two positive numbers in ascending order"
-            raise checks.fail(f"gains[{path!r}]", ends, expected)
-        limits[path] = (float(numbers[0]), float(numbers[1]))
+        limits[path] = ends_of(f"gains[{path!r}]", ends)
     if not limits:
         raise checks.fail("gains", gains, f"at least one gain, such as {example}")
     return limits

@@ -56,7 +56,7 @@ def largest_level(
     def proof_at(level: float) -> Proof:
         return prove(scenario, level=level, parameters=parameters, max_boxes=max_boxes, **given)
 
-    return _bisected(proof_at, "between", between, accuracy)
+    return _bisected(proof_at, between, accuracy)
 
 
 def largest_parameters(
@@ -105,7 +105,7 @@ def largest_parameters(
         }
         return prove(scenario, level=level, parameters=narrowed, max_boxes=max_boxes, **given)
 
-    return _bisected(proof_at, "between", between, accuracy)
+    return _bisected(proof_at, between, accuracy)
 
 
 def scaled(
@@ -122,9 +122,9 @@ def scaled(
     return dataclasses.replace(perturbation, distribution=interval(low, high))
 
 
-def _bisected(proof_at: Callable[[float], Proof], field: str, between: Any, accuracy: Any) -> Proof:
+def _bisected(proof_at: Callable[[float], Proof], between: Any, accuracy: Any) -> Proof:
     """The proof at the greatest value, within the accuracy, by bisection of the logarithm."""
-    low, high = _ends(field, between)
+    low, high = ends_of("between", between)
     accuracy = checks.positive_number("accuracy", accuracy, "1")
     history = []
 
@@ -149,7 +149,8 @@ def _bisected(proof_at: Callable[[float], Proof], field: str, between: Any, accu
     return dataclasses.replace(best, history=tuple(history))
 
 
-def _ends(field: str, between: Any) -> tuple[float, float]:
+def ends_of(field: str, between: Any) -> tuple[float, float]:
+    """Two positive numbers in ascending order; ValueError for anything else."""
     ends = np.asarray(checks.as_floats(field, between), float)
     if ends.shape != (2,) or not 0.0 < ends[0] < ends[1] < math.inf:
         raise checks.fail(field, between, "two positive numbers in ascending order")

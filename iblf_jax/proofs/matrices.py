@@ -140,14 +140,3 @@ def sphere(angles: list[jax.Array]) -> list[jax.Array]:
         rest = sine if rest is None else rest * sine
     coordinates.append(jnp.ones(()) if rest is None else rest)
     return coordinates
-
-
-__all__ = [
-    "inverse",
-    "least_eigenvalue",
-    "norm",
-    "solve_general",
-    "solve_transposed",
-    "sphere",
-    "upper_factor",
-]

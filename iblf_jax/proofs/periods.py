@@ -27,8 +27,8 @@ FREQUENCIES = {
     ),
 }
 """Periodic members -> their fields of amplitudes and frequencies."""
-CONSTANT = (bounds.Constant, disturbances.Nothing, disturbances.Friction)
-"""Members that do not depend on time."""
+CONSTANT = (bounds.Constant, disturbances.Nothing, disturbances.Friction, type(None))
+"""Members that do not depend on time, and the type of a part that is missing."""
 
 
 class AperiodicError(ValueError):
@@ -43,7 +43,7 @@ def period_of(parts: dict[str, Any], uncertain: Sequence[str] = ()) -> float:
     Frequencies are compared as the exact numbers that they are.
 
     Args:
-      parts: name -> reference, side of the bounds, or disturbance.
+      parts: name -> reference, bounds, or disturbance.
       uncertain: paths of uncertain numbers.  All frequencies of a part with one of them count,
         because its amplitudes may be uncertain.
 
@@ -86,8 +86,11 @@ def _frequencies(name: str, part: Any, *, all_count: bool) -> Iterator[float]:
         return
     if isinstance(part, disturbances.Levels):
         for i, of_level in enumerate(part.parts):
-            if of_level is not None:
-                yield from _frequencies(f"{name}.parts[{i}]", of_level, all_count=all_count)
+            yield from _frequencies(f"{name}.parts[{i}]", of_level, all_count=all_count)
+        return
+    if isinstance(part, bounds.Bounds):
+        for side in ("lower", "upper"):
+            yield from _frequencies(f"{name}.{side}", vars(part)[side], all_count=all_count)
         return
     if type(part) in CONSTANT:
         return
@@ -105,8 +108,10 @@ def shifted(part: Any, t: jax.Array | float) -> Any:
     if isinstance(part, disturbances.Sum):
         return disturbances.Sum(tuple(shifted(inner, t) for inner in part.parts))
     if isinstance(part, disturbances.Levels):
-        moved = [None if inner is None else shifted(inner, t) for inner in part.parts]
-        return disturbances.Levels(tuple(moved))
+        return disturbances.Levels(tuple(shifted(inner, t) for inner in part.parts))
+    if isinstance(part, bounds.Bounds):
+        lower, upper = shifted(part.lower, t), shifted(part.upper, t)
+        return dataclasses.replace(part, lower=lower, upper=upper)
     if type(part) in CONSTANT:
         return part
     if type(part) not in FREQUENCIES:

@@ -51,6 +51,29 @@ def patterns_of(signs: int, duration: float) -> np.ndarray:
     return np.array([[*side, start] for side in sides for start in starts])
 
 
+def random_points(
+    seed: int, count: int, duration: float, terms: int, low: np.ndarray, high: np.ndarray
+) -> np.ndarray:
+    """Random points (t, s, z), (count, 1 + terms + m); every second one has its parameters at a
+    corner.
+
+    Args:
+      seed: of the points.
+      count: their number.
+      duration: length of the time interval [s].
+      terms: length of s.
+      low: least z, (m,).
+      high: greatest z, (m,).
+    """
+    generator = np.random.default_rng(seed)
+    t = generator.uniform(0.0, duration, (count, 1))
+    s = generator.normal(size=(count, terms))
+    s /= np.linalg.norm(s, axis=1, keepdims=True)
+    share = generator.uniform(size=(count, len(low)))
+    share[::2] = np.round(share[::2])
+    return np.concatenate([t, s, low + share * (high - low)], axis=1)
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class LevelSetProblem:
     """Is V_w' < 0 at every point of V_w = level, at every time and for all parameters of a box?

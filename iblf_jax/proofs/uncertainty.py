@@ -134,7 +134,7 @@ def fixed_difference(places: Places, numbers: Numbers, nominal: Any, model: Any)
 
 
 def difference(places: Places, numbers: Numbers, nominal: Any, model: Any, z: jax.Array) -> Any:
-    """P - p0 of (U.1) at coordinates z, (m,), a pytree as the model's parameters."""
+    """The difference p - p0 of (U.1) at coordinates z, (m,), a pytree as the model's parameters."""
     new: dict[Place, jax.Array] = {}
     for place in places.differing:
         new[place] = _entry(jax.tree.leaves(nominal), place) - _entry(jax.tree.leaves(model), place)

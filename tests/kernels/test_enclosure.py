@@ -345,7 +345,7 @@ def test_more_random_expressions(seed):
 
 
 def test_a_kernel_that_does_not_round_outward_is_refused(monkeypatch):
-    source = enclosure.interval_program(jnp_square, 1, ()).source
+    source = enclosure.compiled(jnp_square, 1, ()).source
     assert source.count("FE_UPWARD") > 0
     with pytest.raises(ToolchainError, match="rounding mode"):
         enclosure.library(source.replace("fesetround(FE_UPWARD)", "fesetround(FE_TONEAREST)"))

@@ -81,6 +81,13 @@ def test_a_derivative_that_jumps_is_enclosed_across_its_jump():
     assert np.all(below <= 0.0) and np.all(above >= 6.0)
 
 
+def level_input_of_drift(plant, level, t, x, rate, torque):
+    """`level_input` of a lever with another drift."""
+    if level == 1:
+        return rate
+    return plant.J * (rate - plant.drift(t, x)[1])
+
+
 @component
 class Aging(Lever):
     """A lever whose load grows with the time, although everything else is periodic."""
@@ -92,10 +99,7 @@ class Aging(Lever):
     def drift(self, t, x):
         return super().drift(t, x) * (1.0 + self.rate * t)
 
-    def level_input(self, level, t, x, rate, torque):
-        if level == 1:
-            return rate
-        return self.J * (rate - self.drift(t, x)[1])
+    level_input = level_input_of_drift
 
 
 @component
@@ -109,10 +113,7 @@ class Stiction(Lever):
         load = self.b * jnp.sign(x[1]) + self.m * jnp.sin(x[0])
         return jnp.stack([jnp.zeros_like(x[0]), -load / self.J])
 
-    def level_input(self, level, t, x, rate, torque):
-        if level == 1:
-            return rate
-        return self.J * (rate - self.drift(t, x)[1])
+    level_input = level_input_of_drift
 
 
 @component
@@ -126,10 +127,7 @@ class Threshold(Lever):
         load = jnp.where(self.b > 0.3, 1.0, -1.0) * self.m * jnp.sin(x[0])
         return jnp.stack([jnp.zeros_like(x[0]), -load / self.J])
 
-    def level_input(self, level, t, x, rate, torque):
-        if level == 1:
-            return rate
-        return self.J * (rate - self.drift(t, x)[1])
+    level_input = level_input_of_drift
 
 
 @component

@@ -92,16 +92,11 @@ def importance_sampling(
     weights = np.exp(-log_mixture_ratio(z, points, share))
     failed = margins <= 0  # False for NaN
     can_run = ~np.isnan(margins)
-    if runnable == 0 or not np.any(failed):
-        bound, note = 1.0, NO_RUN
-        if runnable > 0:
-            bound, note = bound_without_failures(radius, share, runs, confidence), NONE_FAILED
-            bound = min(1.0, bound / runnable)
-        level = Level(0.0, 0.0, margins[can_run], np.inf, 1.0)
-        none = Samples.none(z.shape[1])
-        return Estimate(
-            bound, 0.0, bound, np.inf, (level,), none, none, 1.0, "importance", 0.0, (note,)
-        )
+    if runnable == 0:
+        return _upper_bound(1.0, NO_RUN, margins[can_run], z.shape[1])
+    if not np.any(failed):
+        bound = bound_without_failures(radius, share, runs, confidence) / runnable
+        return _upper_bound(min(1.0, bound), NONE_FAILED, margins[can_run], z.shape[1])
     weights = weights / runnable
     contributions = np.where(failed, weights, 0.0)
     p = float(np.mean(contributions))
@@ -127,6 +122,24 @@ def importance_sampling(
         method="importance",
         effective_samples=effective,
         notes=notes,
+    )
+
+
+def _upper_bound(bound: float, note: str, margins: np.ndarray, dimension: int) -> Estimate:
+    """The estimate without a failure among samples with these margins."""
+    none = Samples.none(dimension)
+    return Estimate(
+        probability=bound,
+        low=0.0,
+        high=bound,
+        coefficient_of_variation=np.inf,
+        levels=(Level(0.0, 0.0, margins, np.inf, 1.0),),
+        failures=none,
+        nearby=none,
+        nearby_probability=1.0,
+        method="importance",
+        effective_samples=0.0,
+        notes=(note,),
     )
 
 

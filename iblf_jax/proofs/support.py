@@ -1,0 +1,126 @@
+"""Checks that the families of plants share: what a proof supports, its time interval and level."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax.control.actuators import Ideal
+from iblf_jax.control.barriers import MEMBERS
+from iblf_jax.control.decays._base import decay_member
+from iblf_jax.core import checks
+from iblf_jax.proofs.parameters import Uncertain
+from iblf_jax.proofs.periods import AperiodicError, period_of
+from iblf_jax.simulation.scenario import Scenario
+
+INSTANTS = 1024
+"""Times at which the tube is examined before a proof."""
+REAL_NUMBERS = (
+    "The equations hold in real numbers: the loop is continuous, and its parameters are the stored"
+    " double-precision numbers."
+)
+"""The assumption of every proof."""
+CONTINUOUS = "The proof is one of the continuous loop, with an ideal sensor."
+
+
+def unsupported(field: str, given: Any, expected: str, reason: str) -> ValueError:
+    """The error for a part of a scenario whose V_w' is not known."""
+    return checks.fail(f"prove: scenario.{field}", given, expected, reason)
+
+
+def check_same_structure(scenario: Scenario, expected: str) -> None:
+    """Raises ValueError unless plant and model have the same parameters."""
+    structures: list[Any] = [jax.tree.structure(part) for part in (scenario.plant, scenario.model)]
+    if structures[0] == structures[1]:
+        return
+    reason = "The difference of their parameters is what the proof is about."
+    raise unsupported("model", type(scenario.model).__name__, expected, reason)
+
+
+def check_exponential(law: Any, rate: str) -> None:
+    """Raises ValueError for a law with other than exponential decays; `rate` is V_w' or V'."""
+    if all(decay_member(decay, "constant") for decay in law.decays):
+        return
+    names = ", ".join(type(decay).__name__ for decay in law.decays)
+    reason = f"{rate} with other decays is not known here."
+    raise unsupported("controller.decays", names, "exponential decays", reason)
+
+
+def check_absent(scenario: Scenario, reasons: Mapping[str, str], *, input: str, rate: str) -> None:
+    """Raises ValueError for parts that a bound does not contain.
+
+    Args:
+      scenario: the loop.
+      reasons: field of the scenario that must be None -> why.
+      input: name of the input of the plant.
+      rate: rate that is not defined at a jump.
+    """
+    for name, reason in reasons.items():
+        part = vars(scenario)[name]
+        if part is not None:
+            raise unsupported(name, type(part).__name__, "None", reason)
+    if not isinstance(scenario.actuator, Ideal):
+        reason = f"The {input} of the law must be applied as it is."
+        raise unsupported("actuator", type(scenario.actuator).__name__, "Ideal()", reason)
+    if jnp.size(scenario.jump_times()):
+        times = np.asarray(scenario.jump_times()).tolist()
+        raise unsupported("jump_times()", times, "no jumps", f"{rate} is not defined at a jump.")
+
+
+def claims_of(barriers: Sequence[Any]) -> list[str]:
+    """Sentences on the claims of barriers that are not members of the package."""
+    names = {
+        type(barrier).__name__ for barrier in barriers if type(barrier) not in MEMBERS.values()
+    }
+    return [
+        f"The claims of {name} hold: its error_at, xi_bound and decay_rate."
+        for name in sorted(names)
+    ]
+
+
+def time_interval(
+    varying: dict[str, Any], duration: float | None, uncertain: Uncertain
+) -> tuple[float, bool]:
+    """The length of the time interval [s], and whether it is a period.
+
+    Args:
+      varying: name -> part of the scenario that may depend on time.
+      duration: length that the caller gives [s]; None for a period.
+      uncertain: parameters.
+
+    Raises:
+      ValueError: neither a duration nor a period.
+    """
+    if duration is not None:
+        return checks.positive_number("duration", duration, "s"), False
+    try:
+        return period_of(varying, uncertain.entries), True
+    except AperiodicError as error:
+        remedy = f"Give a duration [s]: {error}."
+        raise checks.fail("duration", None, "a duration", remedy) from None
+
+
+@jax.enable_x64(True)
+def check_level(
+    level: float, xi_bound: Callable[[jax.Array], jax.Array], guard: float, duration: float, of: str
+) -> None:
+    """Raises ValueError if a level set reaches the guard of a barrier at one of some instants; the
+    bound examines all times.
+
+    Args:
+      level: c.
+      xi_bound: bound of |xi| on the level set at a time.
+      guard: of the barrier.
+      duration: length of the time interval [s].
+      of: the barrier in words.
+    """
+    xi = float(jnp.max(jax.vmap(xi_bound)(jnp.linspace(0.0, duration, INSTANTS))))
+    if xi < 1.0 - guard:
+        return
+    expected = f"a level inside the guard of the {of}, |xi| < {1.0 - guard:g}"
+    remedy = f"It reaches |xi| = {xi:.6g}, where the law has another slope. Lower the level."
+    raise checks.fail("level", level, expected, remedy)
