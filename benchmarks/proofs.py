@@ -103,13 +103,17 @@ CASES = [
         (10.0, 200.0, 1.0, 1.0, 2e-3),
         (5.0, 60.0, 0.5, 1.0, 3e-3),
         (5.0, 60.0, 0.5, 2.0, 3e-3),
-        (20.0, 20.0, 0.5, 0.1, 1e-3),
-        (20.0, 20.0, 0.5, 0.2, 1e-3),
+        (20.0, 20.0, 0.5, 0.02, 2e-3),
+        (20.0, 20.0, 0.5, 0.05, 2e-3),
+        (20.0, 20.0, 0.5, 0.1, 2e-3),
     ),
-    Case(
-        "two links, the paper's disturbance", 10.0, 200.0, 1.0, "masses 1 %",
-        percent(MASSES, 1.0), 2e-3, disturbed,
-    ),
+    *[
+        Case(
+            "two links, the paper's disturbance", 10.0, 200.0, level, "masses 1 %",
+            percent(MASSES, 1.0), 2e-3, disturbed,
+        )
+        for level in (1.0, 2.28)
+    ],
     Case(
         "two links", 3.0, 100.0, 1.0, "masses 1 %, both centres of mass 1 %",
         percent(MASSES, 1.0) | percent("plant.centre", 1.0, shared=True), 2e-3, two_links,

@@ -61,6 +61,13 @@ PLOTS = {
         "error [mrad]",
         "Laws at equal effort; the page on choosing a law has the details. Less is better.",
     ),
+    "proofs": Plot(
+        ("case", "K2", "kf", "level", "parameters"),
+        "boxes",
+        "Proofs of invariant level sets with outward rounding: boxes of the search, the share of"
+        " the volume that was proved, and the seconds of a call with a compiled kernel; less is"
+        " better.",
+    ),
     "rare_failures": Plot(
         ("case", "estimator"),
         "variation",
