@@ -75,6 +75,12 @@ PLOTS = {
         " exact value, their coefficient of variation, the one that the estimator reports, and the"
         " share of its 95 % intervals that contain the exact value.",
     ),
+    "armour": Plot(
+        ("controller", "masses", "constants"),
+        "position [mrad]",
+        "Half-width of the tube of two controllers with uncertain masses; the page on guarantees"
+        " over sets explains the columns. A tube that is not proved is no guarantee.",
+    ),
     "tuning": Plot(
         ("search",),
         "rollouts to 0.5 %",
