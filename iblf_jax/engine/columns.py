@@ -110,12 +110,18 @@ class TangentStep:
         return WithTangent(after, tangent), record
 
 
+def begun(inputs: Inputs, method: str) -> Carry:
+    """The carry before the first step, whose accuracy is not read: the run without derivatives
+    estimates it.
+    """
+    size = error_estimate.watched_indices(initial_state(inputs.scenario)).size
+    return start(inputs, method, jnp.zeros((size, size), inputs.dt.dtype))
+
+
 def _begun(inputs: Inputs, method: str, places: Places) -> Carry | WithTangent:
-    """The carry before the first step."""
+    """The carry before the first step, with its tangents."""
     if not places:
-        size = error_estimate.watched_indices(initial_state(inputs.scenario)).size
-        # The accuracy is estimated by the run without tangents; this estimate is not read.
-        return start(inputs, method, jnp.zeros((size, size), inputs.dt.dtype))
+        return begun(inputs, method)
 
     def of(eps):
         carry = _begun(_moved(inputs, places, eps), method, places[:-1])
@@ -126,11 +132,16 @@ def _begun(inputs: Inputs, method: str, places: Places) -> Carry | WithTangent:
     return WithTangent(carry, tangent)
 
 
+def float_metrics(inputs: Inputs, carry: Carry) -> dict[str, jax.Array]:
+    """Every metric of a fold that is a float."""
+    results = finished(inputs.folds, carry.accumulators).items()
+    return {name: x for name, x in results if jnp.issubdtype(x.dtype, jnp.floating)}
+
+
 def _metrics(inputs: Inputs, carry: Carry | WithTangent, places: Places) -> dict[str, jax.Array]:
     """The derivative of every metric that is a float."""
     if not isinstance(carry, WithTangent):
-        results = finished(inputs.folds, carry.accumulators).items()
-        return {name: x for name, x in results if jnp.issubdtype(x.dtype, jnp.floating)}
+        return float_metrics(inputs, carry)
     floats, replaced = _floats(carry.carry)
     zero = jnp.zeros_like(inputs.dt)
 

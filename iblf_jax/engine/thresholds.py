@@ -6,6 +6,8 @@ This module imports nothing else of the engine, so that executors and the plan c
 
 from __future__ import annotations
 
+import math
+
 from iblf_jax.core import checks
 from iblf_jax.kernels import LoweringLimits
 
@@ -85,6 +87,8 @@ Equal nodes are merged later, so that about a third remain."""
 MAX_SEGMENTED_DERIVATIVE_NODES = 150_000
 """The same for executors that divide a step into functions, which compile for half a minute where
 the others compile for minutes."""
+ADJOINT_NODES = 3
+"""Nodes of the adjoint of a step for each node of the step, approximately."""
 MAX_NODES_PER_OPERATION = 12.0
 """Nodes of a step for each operation of the closed loop, up to which a kernel of a batch computes
 derivatives.  A scalar program writes out the products of arrays that XLA computes as one operation.
@@ -92,6 +96,8 @@ For 64 runs of 500 steps of the paper's loop with a network of two hidden layers
 weights, kernel and scan take: layers of 32 (6 nodes), 0.11 and 0.25 s (11 and 15 s of processor
 time with compilation); layers of 64 (19 nodes), 0.53 and 0.39 s (25 and 18 s).  Without a network
 there are 2 nodes."""
+SEGMENT_BYTES = 1 << 22
+"""Bytes of the carries of a segment of reverse mode, at least sqrt(steps) of them."""
 MAX_FORWARD_NUMBERS = 32
 """Numbers by which forward mode differentiates; reverse mode differentiates by more."""
 MAX_COLUMN_ORDER = 2
@@ -132,6 +138,26 @@ def native_build(nodes: int, short_vector: bool) -> tuple[int | None, tuple[str,
     if nodes > MAX_C_FUNCTION_NODES:
         segment = SEGMENT_NODES
     return segment, tuple(flags)
+
+
+def uses_short_vector(bytes_of_runs: int, steps: int) -> bool:
+    """Whether a kernel makes so many steps in short vectors.
+
+    Args:
+      bytes_of_runs: bytes of one number of each run.
+      steps: number of steps.
+    """
+    return bytes_of_runs <= SHORT_VECTOR_BYTES and steps > FEW_STEPS
+
+
+def segment_steps(steps: int, bytes_per_step: int) -> int:
+    """Steps of a segment of reverse mode by kernels.
+
+    Args:
+      steps: steps of the run.
+      bytes_per_step: bytes of the carries of all runs.
+    """
+    return min(steps, max(math.isqrt(steps - 1) + 1, SEGMENT_BYTES // bytes_per_step))
 
 
 def steps_per_call(nodes: int, steps: int, every: int | None) -> int:
