@@ -33,6 +33,7 @@ from iblf_jax.engine.batch import Batch, carry_shapes, finalize, initialize
 from iblf_jax.engine.carry import Carry, Inputs, StepOptions, keep_if
 from iblf_jax.engine.columns import begun, float_metrics, floats_of
 from iblf_jax.engine.derivatives import floats_of_carry
+from iblf_jax.engine.linearization import Linearization
 from iblf_jax.engine.loops import kernel_loop, program_of, rows_of_leaves
 from iblf_jax.engine.outcome import Outcome
 from iblf_jax.engine.registry import Executor
@@ -97,8 +98,8 @@ class Adjoint(NamedTuple):
 class AdjointStep:
     """The adjoint of a step of one run.  The first one is that of the last instant.
 
-    A run that diverges keeps its last valid state.  From then on its steps contribute nothing:
-    the derivatives of a step that is not made need not be finite.
+    A run that diverges keeps its last valid state.  The derivatives of a step that it does not make
+    need not be finite; such a step contributes nothing.
     """
 
     step: TimeStep
@@ -142,10 +143,12 @@ class AdjointStep:
         parameters = [leaves[place] for place in self.places]
         _, pullback, status = jax.vjp(made, parameters, floats, has_aux=True)
         by_leaves, cotangent = pullback((carry.cotangent, series[size:]))
-        is_valid = status & int(Status.NOT_FINITE) == 0
-        by_leaves = keep_if(is_valid, by_leaves, jax.tree.map(jnp.zeros_like, by_leaves))
+        is_made = status & int(Status.NOT_FINITE) == 0
+        total = sum(map(jnp.sum, [*cotangent, *by_leaves]), jnp.zeros_like(inputs.dt))
+        counts = is_made | jnp.isfinite(total)
+        by_leaves = keep_if(counts, by_leaves, jax.tree.map(jnp.zeros_like, by_leaves))
         gradient = jax.tree.map(jnp.add, carry.gradient, by_leaves)
-        return Adjoint(keep_if(is_valid, cotangent, carry.cotangent), gradient), ()
+        return Adjoint(keep_if(counts, cotangent, carry.cotangent), gradient), ()
 
 
 def with_leaves(inputs: Inputs, places: Sequence[int], values: Sequence[jax.Array]) -> Inputs:
@@ -180,10 +183,27 @@ class ReverseRun(NamedTuple):
         """Number of runs."""
         return self.batch.runs or 1
 
+    def is_supported(self) -> bool:
+        """Whether the executor differentiates the runs in reverse mode."""
+        if not self.executor.accepts_series:
+            return False
+        if self.request.backend != "auto":
+            return True
+        method = self.request.method
+        step = program_of(TimeStep(method), self.batch, carry_shapes(self.batch, method))
+        nodes = thresholds.ADJOINT_NODES * step.program.size
+        return thresholds.is_within(nodes, self.executor.limits.derivative_nodes)
+
     def forward(self) -> tuple[Outcome, Stored]:
         """The outcome, without records, and what the way back needs."""
-        plain = kernel_loop(self.executor)
-        before, at_start = initialize(plain, self.batch, self.request.method)
+        stored, at_start = self.stored()
+        loop = kernel_loop(self.executor)
+        return finalize(loop, self.batch, self.request, stored.carry, at_start), stored
+
+    def stored(self) -> tuple[Stored, Linearization]:
+        """What the way back needs, and the linearization at the start."""
+        loop = kernel_loop(self.executor)
+        before, at_start = initialize(loop, self.batch, self.request.method)
         form = Form.of(before)
         segment = self.segment(form)
         packed = self.executor.pack(
@@ -192,9 +212,7 @@ class ReverseRun(NamedTuple):
         program = self.recording_program(form)
         after, (carries,) = self.runner()(program, packed, self.request.instants, segment)
         leaves = self.executor.unpack(after, form.shapes, self.runs)
-        carry = jax.tree.unflatten(form.treedef, leaves)
-        outcome = finalize(plain, self.batch, self.request, carry, at_start)
-        return outcome, Stored(carry, carries)
+        return Stored(jax.tree.unflatten(form.treedef, leaves), carries), at_start
 
     def backward(self, stored: Stored, cotangents: Cotangents) -> list[jax.Array]:
         """The gradient of every run by each leaf, (runs, ...)."""

@@ -67,6 +67,8 @@ class DerivativeSizes(NamedTuple):
     """Counts the numbers of the derivative that are kept along the run, with one tangent per run.
     It traces a step, and is called only where the count decides."""
     order: int = 1
+    reverses: bool = False
+    """Whether the caller and its executor have reverse mode (`adjoint`)."""
     columns: int = 1
     """Numbers of a transformed run by which it is differentiated, the most of any order."""
     nodes_together: float = math.inf
@@ -80,17 +82,20 @@ class DerivativeSizes(NamedTuple):
 
 def choose_derivatives(sizes: DerivativeSizes) -> str:
     """How a derivative is computed where a kernel can be built: "together" (all tangents of a run
-    in one kernel), "one per run" or "scan".
+    in one kernel), "one per run", "reverse" or "scan".
     """
     if sizes.nodes_per_operation > thresholds.MAX_NODES_PER_OPERATION:
         return "scan"
     if thresholds.is_within(sizes.nodes_together, sizes.max_nodes):
         return "together"
-    if sizes.order > thresholds.MAX_COLUMN_ORDER or sizes.columns > thresholds.MAX_COLUMNS:
+    if sizes.order > thresholds.MAX_COLUMN_ORDER:
         return "scan"
-    if sizes.count_kept_numbers() > thresholds.MAX_KEPT_NUMBERS:
-        return "scan"
-    return "one per run"
+    has_few = sizes.columns <= thresholds.MAX_COLUMNS
+    if has_few and sizes.count_kept_numbers() <= thresholds.MAX_KEPT_NUMBERS:
+        return "one per run"
+    if sizes.reverses:
+        return "reverse"
+    return "scan"
 
 
 class Outer(NamedTuple):

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from iblf_jax.engine import registry, thresholds
+from iblf_jax.engine import registry
 from iblf_jax.engine.adjoint import Cotangents, ReverseRun
 from iblf_jax.engine.batch import Batch, StepLoop, carry_shapes, run_all, split
 from iblf_jax.engine.carry import Inputs
@@ -254,10 +254,10 @@ def run_batch_vjp(
 
     def attempt(executor: Executor) -> tuple[Outcome, Pullback]:
         batch = Batch.of(inputs, varied, execution.layout, request.constants)
-        if not _reverses(executor, batch, request):
-            return by_scan()
         places = tuple(np.flatnonzero(split(inputs, numbers).is_per_run).tolist())
         run = ReverseRun(executor, batch, places, request)
+        if not run.is_supported():
+            return by_scan()
         with compilers_stopped_on_error():
             run.start_build(metrics)
             outcome, stored = run.forward()
@@ -288,15 +288,6 @@ def run_batch_vjp(
         return outcome, lambda slopes: pullback(slopes)[0]
 
     return first_that_works(execution, attempt, by_scan)
-
-
-def _reverses(executor: Executor, batch: Batch, request: RunRequest) -> bool:
-    """Whether an executor differentiates a batch in reverse mode."""
-    if not executor.accepts_series:
-        return False
-    nodes = program_of(TimeStep(request.method), batch, carry_shapes(batch, request.method))
-    size = thresholds.ADJOINT_NODES * nodes.program.size
-    return request.backend != "auto" or thresholds.is_within(size, executor.limits.derivative_nodes)
 
 
 def step_states(

@@ -105,7 +105,7 @@ MAX_COLUMN_ORDER = 2
 in the caller's mode."""
 MAX_KEPT_NUMBERS = 1 << 27
 """Numbers of such a derivative of the records of one run: 1 GiB."""
-MAX_COLUMNS = 96
+MAX_COLUMNS = 32
 """Numbers by which a transformable run is differentiated column by column; the scan differentiates
 by more.  64 runs of 500 steps of the paper's loop with N weights take, by
 columns and by the scan in reverse mode: N = 8, 0.06 and 1.6 s; N = 32, 0.36 and 1.2 s; N = 96,
