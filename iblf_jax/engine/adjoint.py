@@ -32,6 +32,7 @@ from iblf_jax.engine import thresholds
 from iblf_jax.engine.batch import Batch, carry_shapes, finalize, initialize
 from iblf_jax.engine.carry import Carry, Inputs, StepOptions, keep_if
 from iblf_jax.engine.columns import begun, float_metrics, floats_of
+from iblf_jax.engine.compile import operations
 from iblf_jax.engine.derivatives import floats_of_carry
 from iblf_jax.engine.linearization import Linearization
 from iblf_jax.engine.loops import kernel_loop, program_of, rows_of_leaves
@@ -191,8 +192,11 @@ class ReverseRun(NamedTuple):
             return True
         method = self.request.method
         step = program_of(TimeStep(method), self.batch, carry_shapes(self.batch, method))
-        nodes = thresholds.ADJOINT_NODES * step.program.size
-        return thresholds.is_within(nodes, self.executor.limits.derivative_nodes)
+        nodes = step.program.size
+        if nodes > thresholds.MAX_NODES_PER_OPERATION * operations(self.batch.leaves.first):
+            return False
+        limit = self.executor.limits.derivative_nodes
+        return thresholds.is_within(thresholds.ADJOINT_NODES * nodes, limit)
 
     def forward(self) -> tuple[Outcome, Stored]:
         """The outcome, without records, and what the way back needs."""
@@ -340,7 +344,7 @@ class ReverseRun(NamedTuple):
     ) -> jax.Array:
         """The cotangents of what `count` steps record, (steps, numbers, runs)."""
         every = self.request.record_every or 1
-        index = first + jnp.arange(count)
+        index = first + jnp.arange(count, dtype=jnp.int32)
 
         def of_steps(x: jax.Array) -> jax.Array:
             rows = x[:, index // every].reshape(self.runs, count, -1).transpose(1, 2, 0)

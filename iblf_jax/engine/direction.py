@@ -236,7 +236,7 @@ def _gradient_by_kernel(
 ) -> list[jax.Array]:
     count = len(runs.is_per_run)
     leaves, cotangents = operands[:count], operands[count:]
-    records, metrics = _shapes(runs, shapes_of(leaves))
+    records, metrics = _shapes(runs, shapes_of(list(leaves)))
     names = sorted(metrics)
     of_metrics: dict[str, jax.Array] = {}
     of_records: dict[int, jax.Array] = {}
@@ -257,7 +257,7 @@ def _gradient_by_kernel(
 
 def _abstract(*operands: Any, runs: Runs, places: tuple[int, ...]) -> list:
     leaves, _ = _divided(runs, operands)
-    shapes = _shapes(runs, shapes_of(leaves))
+    shapes = _shapes(runs, shapes_of(list(leaves)))
     return [jax.core.ShapedArray(x.shape, x.dtype) for x in jax.tree.leaves(shapes)]
 
 

@@ -106,9 +106,9 @@ in the caller's mode."""
 MAX_KEPT_NUMBERS = 1 << 27
 """Numbers of such a derivative of the records of one run: 1 GiB."""
 MAX_COLUMNS = 32
-"""Numbers by which a transformable run is differentiated column by column; the scan differentiates
-by more.  64 runs of 500 steps of the paper's loop with N weights take, by
-columns and by the scan in reverse mode: N = 8, 0.06 and 1.6 s; N = 32, 0.36 and 1.2 s; N = 96,
+"""Numbers by which a transformable run is differentiated column by column; reverse mode (`adjoint`,
+or the scan) differentiates by more.  64 runs of 500 steps of the paper's loop with N weights take,
+by columns and by the scan in reverse mode: N = 8, 0.06 and 1.6 s; N = 32, 0.36 and 1.2 s; N = 96,
 4.2 and 3.5 s; N = 386, 9.7 and 2.2 s (two cores)."""
 STEP_SIZE_CHUNK = 1000
 """Steps between two assessments of the pair of runs that determines a step size."""

@@ -6,9 +6,11 @@ built,
     out' = J leaves',       J = d (records, metrics) / d leaves,
 
 where each column of J is a run with one tangent (`columns`).  JAX transposes the product, so both
-forward and reverse mode use J, and the derivative of J is computed in the same way.  The scan
-computes all other derivatives: those of third order, by the time step, by parameters of a metric,
-by many numbers, and of more records than are kept (`derivatives.choose_derivatives`).
+forward and reverse mode use J, and the derivative of J is computed in the same way.  For many
+numbers, and for more records than are kept, J is not computed: J leaves' is a primitive whose
+transpose is computed by kernels that go backwards in time (`direction`).  The scan computes all
+other derivatives: those of third order, by the time step and by parameters of a metric
+(`derivatives.choose_derivatives`).
 """
 
 from __future__ import annotations

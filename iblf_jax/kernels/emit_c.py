@@ -204,7 +204,7 @@ class _Emitter:
         return f"{head} {{\n{body}\n}}\n"
 
 
-def sizes(program: Program, shared_leaves: int, per_run_leaves: int, series: int) -> str:
+def sizes(program: Program, shared_leaves: int, per_run_leaves: int, series: int = 0) -> str:
     """The definitions of the sizes that the headers use.
 
     Args:
