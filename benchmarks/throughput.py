@@ -11,8 +11,10 @@ forward sensitivities, and the limit: a rollout written by hand in C++ (`limit/p
   which carries the state alone and is there for the paper's loop only.  The second
 loop is a planar chain of four joints; the third, a real arm of seven (`presets.iiwa14`), whose step
 is too long for XLA.  Last, `native` on 1e4, 1e5 and 1e6 runs, and on a law that is sampled beside
-one that is not.  `a core` is steps per second of processor time: on a shared machine it is the
-number to compare.  A row that needs a package which is not there is left out.
+one that is not; and gradients by the weights of a network in reverse mode, by kernels and by the
+scan, whose cost `in values` is that of so many runs without derivatives.  `a core` is steps per
+second of processor time: on a shared machine it is the number to compare.  A row that needs a
+package which is not there is left out.
 """
 
 from __future__ import annotations
@@ -28,7 +30,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -39,10 +41,11 @@ import iblf_jax as ij
 from iblf_jax import kernels
 from iblf_jax.core import devices
 from iblf_jax.engine import RunRequest
-from iblf_jax.engine.execute import run_batch, run_batch_jvp
-from iblf_jax.engine.structural_constants import robot_constants
+from iblf_jax.engine.execute import run_batch, run_batch_jvp, run_batch_vjp
+from iblf_jax.engine.structural_constants import constants_of, robot_constants
 from iblf_jax.kernels import toolchain
 from iblf_jax.simulation.metrics import standard
+from iblf_jax.simulation.paths import get
 from iblf_jax.simulation.scenario import canonical
 
 FOLDER = Path(__file__).parent
@@ -469,6 +472,88 @@ def sampled(quick: bool) -> list[list]:
     return result
 
 
+@ij.component
+class Network:
+    """Torque of a network of q, q' and the time."""
+
+    layers: Any
+
+    def torque(self, t, q, dq, plant, model):
+        """The output of the network."""
+        periodic = jnp.stack([jnp.sin(t), jnp.cos(t), jnp.sin(2 * t), jnp.cos(2 * t)])
+        x = jnp.concatenate([q, dq, periodic])
+        for weights, offsets in self.layers[:-1]:
+            x = jnp.tanh(weights @ x + offsets)
+        weights, offsets = self.layers[-1]
+        return weights @ x + offsets
+
+    def jump_times(self):
+        """None."""
+        return jnp.zeros(0)
+
+
+def with_network(width: int) -> ij.Scenario:
+    """The paper's scenario with a network of two hidden layers as its disturbance."""
+    rng = np.random.default_rng(0)
+    sizes = [(width, 8), (width, width), (2, width)]
+    layers = [(0.1 * rng.normal(size=size), 0.1 * rng.normal(size=size[0])) for size in sizes]
+    return canonical(ij.with_parts(ij.presets.zhang_yan_2024(), disturbance=Network(layers)))
+
+
+def gradients(quick: bool) -> list[list]:
+    """Runs and their gradients by all weights of a network, in turn."""
+    jax.config.update("jax_enable_x64", True)
+    sizes = [(2, 2, 20)] if quick else [(8, 1, 3000), (8, 64, 500), (16, 64, 500)]
+    dt, folds, method = jnp.asarray(1e-3), standard()[:1], method_for(quick)
+    result = []
+    for width, runs, steps in sizes:
+        scenario = with_network(width)
+        weights = {
+            name.path: jnp.asarray(get(scenario, name.path))
+            for name in ij.parameters(scenario)
+            if ".layers" in name.path
+        }
+        varied = {
+            path: jnp.broadcast_to(x, (runs, *x.shape)) for path, x in weights.items()
+        } | draws(scenario, runs, "float64")
+        request = RunRequest(steps, method, constants=constants_of(scenario))
+
+        def value(varied, scenario=scenario, request=request):
+            return run_batch(scenario, varied, folds, dt, request).metrics["rmse"]
+
+        def gradient(varied, backend, scenario=scenario, request=request, weights=weights):
+            outcome, pullback = run_batch_vjp(
+                scenario,
+                varied,
+                list(weights),
+                ["rmse"],
+                folds,
+                dt,
+                request._replace(backend=backend),
+            )
+            found = pullback({"rmse": jnp.ones_like(outcome.metrics["rmse"])})
+            return {path: jnp.sum(x, axis=0) for path, x in found.items()}
+
+        count = sum(x.size for x in weights.values())
+        functions = {
+            "native, with a network": value,
+            f"native, gradient by {count} weights": partial(gradient, backend="native"),
+            f"vmap, gradient by {count} weights": partial(gradient, backend="vmap"),
+        }
+        compiled = {name: compile_seconds(f, varied) for name, f in functions.items()}
+        calls = {name: partial(call, varied) for name, (_, call) in compiled.items()}
+        for call in calls.values():
+            jax.block_until_ready(call())
+        found = in_turn(calls, 1 if quick else 7)
+        least = found["native, with a network"][1]
+        for name, (wall, cpu) in found.items():
+            speeds = runs * steps / wall, runs * steps / cpu
+            row = ["paper", "float64", runs, name, steps, compiled[name][0], *speeds]
+            result.append([*row, math.nan, math.nan, cpu / least])
+            print(f"{runs} runs, {name}: {cpu / least:.1f} values", file=sys.stderr, flush=True)
+    return result
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -500,6 +585,7 @@ def main() -> None:
         for dtype in ["float32"] if options.quick else options.dtypes.split(","):
             rows += table(dtype, batches, loop, options.quick)
     rows += flat(options.quick) + sampled(options.quick)
+    rows = [[*row, math.nan] for row in rows] + gradients(options.quick)
     columns = [
         "loop",
         "type",
@@ -511,6 +597,7 @@ def main() -> None:
         "steps/s a core",
         "x textbook",
         "of limit",
+        "in values",
     ]
     report(f"Throughput, {method_for(options.quick)} at 1 ms", columns, rows, options.json)
 

@@ -21,7 +21,7 @@ from iblf_jax.engine.execute import CompiledBatch as CompiledBatch
 from iblf_jax.engine.execute import compile_batch as compile_batch
 from iblf_jax.engine.execute import run_batch as run_batch
 from iblf_jax.engine.execute import run_batch_jvp as run_batch_jvp
-from iblf_jax.engine.execute import run_for_reverse as run_for_reverse
+from iblf_jax.engine.execute import run_batch_vjp as run_batch_vjp
 from iblf_jax.engine.execute import step_states as step_states
 from iblf_jax.engine.metric_folds import folded as folded
 from iblf_jax.engine.outcome import Outcome as Outcome

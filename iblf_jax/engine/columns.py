@@ -110,12 +110,18 @@ class TangentStep:
         return WithTangent(after, tangent), record
 
 
+def begun(inputs: Inputs, method: str) -> Carry:
+    """The carry before the first step, whose accuracy is not read: the run without derivatives
+    estimates it.
+    """
+    size = error_estimate.watched_indices(initial_state(inputs.scenario)).size
+    return start(inputs, method, jnp.zeros((size, size), inputs.dt.dtype))
+
+
 def _begun(inputs: Inputs, method: str, places: Places) -> Carry | WithTangent:
-    """The carry before the first step."""
+    """The carry before the first step, with its tangents."""
     if not places:
-        size = error_estimate.watched_indices(initial_state(inputs.scenario)).size
-        # The accuracy is estimated by the run without tangents; this estimate is not read.
-        return start(inputs, method, jnp.zeros((size, size), inputs.dt.dtype))
+        return begun(inputs, method)
 
     def of(eps):
         carry = _begun(_moved(inputs, places, eps), method, places[:-1])
@@ -126,11 +132,16 @@ def _begun(inputs: Inputs, method: str, places: Places) -> Carry | WithTangent:
     return WithTangent(carry, tangent)
 
 
+def float_metrics(inputs: Inputs, carry: Carry) -> dict[str, jax.Array]:
+    """Every metric of a fold that is a float."""
+    results = finished(inputs.folds, carry.accumulators).items()
+    return {name: x for name, x in results if jnp.issubdtype(x.dtype, jnp.floating)}
+
+
 def _metrics(inputs: Inputs, carry: Carry | WithTangent, places: Places) -> dict[str, jax.Array]:
     """The derivative of every metric that is a float."""
     if not isinstance(carry, WithTangent):
-        results = finished(inputs.folds, carry.accumulators).items()
-        return {name: x for name, x in results if jnp.issubdtype(x.dtype, jnp.floating)}
+        return float_metrics(inputs, carry)
     floats, replaced = _floats(carry.carry)
     zero = jnp.zeros_like(inputs.dt)
 
@@ -140,7 +151,7 @@ def _metrics(inputs: Inputs, carry: Carry | WithTangent, places: Places) -> dict
     return jax.jvp(of, (zero, floats), (jnp.ones_like(zero), carry.tangent))[1]
 
 
-def _directed(batch: Batch, places: Places, directions: list[list[Any]]) -> tuple[Batch, list[int]]:
+def _directed(batch: Batch, directions: list[list[Any]]) -> tuple[Batch, list[int]]:
     """A run for every column of every run of a batch; and how many columns each derivative has.
 
     `directions`: for each derivative, of each of its leaves the tangents, (P, *shape of the leaf).
@@ -155,11 +166,19 @@ def _directed(batch: Batch, places: Places, directions: list[list[Any]]) -> tupl
         return jnp.tile(repeated, (runs * math.prod(sizes[:k]), *[1] * (column.ndim - 1)))
 
     added = [[beside_others(k, x) for x in level] for k, level in enumerate(directions)]
+    repeated = batch._replace(leaves=leaves._replace(per_run=per_run))
+    return _with_directions(repeated, added)._replace(runs=runs * math.prod(sizes)), sizes
+
+
+def _with_directions(batch: Batch, added: list[list[jax.Array]]) -> Batch:
+    """A batch with a direction of each derivative for each run, (R, *shape of the leaf)."""
+    leaves = batch.leaves
     inputs = leaves.unflatten(leaves.shared, leaves.per_run)._replace(direction=added)
-    is_per_run = (*leaves.is_per_run, *[True] * sum(map(len, places)))
-    structure, values = jax.tree.structure(inputs), per_run + jax.tree.leaves(added)
-    wide = Leaves(structure, is_per_run, leaves.shared, values)
-    return batch._replace(leaves=wide, runs=runs * math.prod(sizes)), sizes
+    values = jax.tree.leaves(added)
+    is_per_run = (*leaves.is_per_run, *[True] * len(values))
+    structure = jax.tree.structure(inputs)
+    wide = Leaves(structure, is_per_run, leaves.shared, leaves.per_run + values)
+    return batch._replace(leaves=wide)
 
 
 def _units(shapes: list[tuple[int, ...]], dtype) -> list[jax.Array]:
@@ -182,13 +201,22 @@ def _stepped(
     request: RunRequest,
 ) -> tuple[list[jax.Array], Any]:
     """The derivatives of what a step records and of the metrics, (R, P, ...)."""
-    wide, sizes = _directed(batch, step.places, directions)
+    wide, sizes = _directed(batch, directions)
+    return jax.tree.map(
+        lambda x: x.reshape(batch.runs or 1, *sizes, *x.shape[1:]), _made(loop, wide, step, request)
+    )
+
+
+def _made(
+    loop: StepLoop, wide: Batch, step: TangentStep, request: RunRequest
+) -> tuple[list[jax.Array], dict[str, jax.Array]]:
+    """The derivatives of what a step records and of the metrics, for each run and direction of a
+    batch that has its directions.
+    """
     before = wide.map_runs(lambda inputs: _begun(inputs, request.method, step.places))
     after, records = loop(step, wide, before, request.steps + 1, request.record_every)
     metrics = wide.map_runs(lambda inputs, carry: _metrics(inputs, carry, step.places), after)
-    return jax.tree.map(
-        lambda x: x.reshape(batch.runs or 1, *sizes, *x.shape[1:]), (list(records), metrics)
-    )
+    return list(records), metrics
 
 
 def columns(
@@ -211,6 +239,27 @@ def columns(
     shapes = _scenario_shapes(batch)
     directions = [_units([shapes[place] for place in level], batch.dtype) for level in places]
     return _stepped(loop, batch, TangentStep(TimeStep.of(request), places), directions, request)
+
+
+def along_direction(
+    loop: StepLoop,
+    batch: Batch,
+    places: tuple[int, ...],
+    moves: list[jax.Array],
+    request: RunRequest,
+) -> tuple[list[jax.Array], dict[str, jax.Array]]:
+    """The derivative of records and metrics of every run along a direction of its own.
+
+    Args:
+      loop, batch, request: as `columns`.
+      places: of the leaves that move.
+      moves: how far each of them moves in every run, (R, *shape of the leaf).
+
+    Returns:
+      As `columns`, without the axis of the columns.
+    """
+    step = TangentStep(TimeStep.of(request), (places,))
+    return _made(loop, _with_directions(batch, [moves]), step, request)
 
 
 def outer_vectors(folds: Any, found: Advanced) -> list[jax.Array]:

@@ -111,10 +111,14 @@ def plan_of_batch(
     return choose_plan(request, Sizes(operations(inputs), runs), machine)
 
 
+def nested_layout(inputs: Inputs) -> BatchLayout:
+    """The layout of a scan that callers may batch, differentiate or loop over."""
+    return plan.scan_layout(devices.platform(), operations(inputs), None, nested=True)
+
+
 def nested_batch(inputs: Inputs) -> Batch:
     """One run for the scan; callers may batch, differentiate or loop over it."""
-    layout = plan.scan_layout(devices.platform(), operations(inputs), None, nested=True)
-    return Batch.of(inputs, None, layout)
+    return Batch.of(inputs, None, nested_layout(inputs))
 
 
 def run_by_scan(

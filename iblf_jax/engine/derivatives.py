@@ -1,4 +1,4 @@
-"""Derivatives of runs, in two ways: tangents in a kernel, and the scan.
+"""Derivatives of runs, in three ways: tangents in a kernel, reverse mode in kernels, and the scan.
 
 **Tangents in a kernel.**  A step with tangents is a step as any other, and every executor makes it.
 Each direction u of the parameters has a tangent x_u of the state; a few tangents cost less than
@@ -11,9 +11,14 @@ reverse mode and need no memory along time.  A kernel carries the tangents in on
   them; records are differentiated as well, and a tangent of a tangent is a second derivative.
   `jax.grad`, `jacfwd`, `jacrev` and `hessian` of `simulate` use this layout (`transformable`).
 
+**Reverse mode in kernels** (`adjoint`).  The adjoint of a step is a step, too, and goes backwards
+over the stored states.  Its time hardly depends on how many numbers it is by: a gradient takes
+four to six times as long as the run.  `tune` by many numbers uses it, and `jax.grad` of `simulate`
+(`direction`).
+
 **The scan.**  JAX differentiates `loops.scan` or `loops.checkpointed` in forward or reverse mode.
-The time of reverse mode does not depend on how many numbers it is by, so this is the way for many
-numbers, for derivatives of third order, and where no kernel can be built.
+This is the way for derivatives of third order, for large networks, and where no kernel can be
+built.
 
 `choose_derivatives` chooses.  Each way is needed.  16 runs of 1000 steps by 9 gains of a chain of
 three joints take 0.025 s with all tangents in one kernel (8.6 s with compilation) and 0.064 s with
@@ -67,6 +72,8 @@ class DerivativeSizes(NamedTuple):
     """Counts the numbers of the derivative that are kept along the run, with one tangent per run.
     It traces a step, and is called only where the count decides."""
     order: int = 1
+    reverses: bool = False
+    """Whether the caller and its executor have reverse mode (`adjoint`)."""
     columns: int = 1
     """Numbers of a transformed run by which it is differentiated, the most of any order."""
     nodes_together: float = math.inf
@@ -80,17 +87,20 @@ class DerivativeSizes(NamedTuple):
 
 def choose_derivatives(sizes: DerivativeSizes) -> str:
     """How a derivative is computed where a kernel can be built: "together" (all tangents of a run
-    in one kernel), "one per run" or "scan".
+    in one kernel), "one per run", "reverse" or "scan".
     """
     if sizes.nodes_per_operation > thresholds.MAX_NODES_PER_OPERATION:
         return "scan"
     if thresholds.is_within(sizes.nodes_together, sizes.max_nodes):
         return "together"
-    if sizes.order > thresholds.MAX_COLUMN_ORDER or sizes.columns > thresholds.MAX_COLUMNS:
+    if sizes.order > thresholds.MAX_COLUMN_ORDER:
         return "scan"
-    if sizes.count_kept_numbers() > thresholds.MAX_KEPT_NUMBERS:
-        return "scan"
-    return "one per run"
+    has_few = sizes.columns <= thresholds.MAX_COLUMNS
+    if has_few and sizes.count_kept_numbers() <= thresholds.MAX_KEPT_NUMBERS:
+        return "one per run"
+    if sizes.reverses:
+        return "reverse"
+    return "scan"
 
 
 class Outer(NamedTuple):

@@ -7,21 +7,24 @@ is called any number of times.  `simulate` uses `single_run.run_one` instead.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
+import numpy as np
 
 from iblf_jax.engine import registry
-from iblf_jax.engine.batch import Batch, StepLoop, carry_shapes, run_all
+from iblf_jax.engine.adjoint import Cotangents, ReverseRun
+from iblf_jax.engine.batch import Batch, StepLoop, carry_shapes, run_all, split
 from iblf_jax.engine.carry import Inputs
 from iblf_jax.engine.columns import numbers_of, outer_vectors, run_by_columns
 from iblf_jax.engine.compile import (
     compiled_plan,
+    compilers_stopped_on_error,
     first_that_works,
     inputs_of,
-    nested_batch,
+    nested_layout,
     operations,
     plan_of_batch,
     run_by_executor,
@@ -216,26 +219,75 @@ def _derivative_sizes(
     )
 
 
-def run_for_reverse(
+Pullback = Callable[[dict[str, jax.Array]], dict[str, jax.Array]]
+"""From the derivatives of a loss by metrics, by name, to those by leaves, by path."""
+
+
+def run_batch_vjp(
     scenario: Scenario,
+    varied: Mapping[str, jax.Array],
+    by: Collection[str],
+    metrics: Collection[str],
     folds: Any,
     dt: jax.Array,
     request: RunRequest,
-    noise: jax.Array | None = None,
-) -> Outcome:
-    """One run without records, for reverse mode: only a few states are in memory at a time.
-
-    The stages of the integrator are a loop, because the derivative contains the step six times:
-    the gradient of 8 runs of 500 steps of the paper's loop by 226 weights of a network compiles
-    in 12 s instead of 22 s of processor time, and takes the same time afterwards.
+) -> tuple[Outcome, Pullback]:
+    """Runs a batch, and prepares its gradients in reverse mode by any number of leaves; call it
+    inside `jit`.
 
     Args:
-      scenario, folds, dt, request: as `run_batch`.
-      noise: key of the noise of a sensor.
+      scenario, varied, folds, dt: as `run_batch`.
+      by: the paths of `varied` by which the runs are differentiated.
+      metrics: names of the metrics that are differentiated.
+      request: the request, without records; static.
+
+    Returns:
+      The outcome, and a function from the derivatives of a loss by these metrics, name -> (batch,
+      ...), to its derivatives by the leaves at `by`, path -> (batch, ...).
+
+    Raises:
+      ValueError: an unknown backend or path.
     """
-    batch = nested_batch(inputs_of(scenario, folds, dt, request, noise))
-    batch = batch._replace(layout=batch.layout._replace(rolled=True))
-    return run_all(checkpointed, batch, request)
+    inputs = inputs_of(scenario, folds, dt, request)
+    execution = plan_of_batch(request, inputs, varied, registry.machine())
+    numbers = {path: varied[path] for path in by}
+
+    def attempt(executor: Executor) -> tuple[Outcome, Pullback]:
+        batch = Batch.of(inputs, varied, execution.layout, request.constants)
+        places = tuple(np.flatnonzero(split(inputs, numbers).is_per_run).tolist())
+        run = ReverseRun(executor, batch, places, request)
+        if not run.is_supported():
+            return by_scan()
+        with compilers_stopped_on_error():
+            run.start_build(metrics)
+            outcome, stored = run.forward()
+
+        def leaves_of(numbers: dict[str, jax.Array]) -> list[jax.Array]:
+            leaves = split(inputs, {**varied, **numbers})
+            merged = leaves.merge(leaves.shared, leaves.per_run)
+            return [merged[place] for place in places]
+
+        def pullback(slopes: dict[str, jax.Array]) -> dict[str, jax.Array]:
+            gradient = run.backward(stored, Cotangents(slopes))
+            return jax.vjp(leaves_of, numbers)[1](gradient)[0]
+
+        return outcome, pullback
+
+    def by_scan() -> tuple[Outcome, Pullback]:
+        # The derivative contains the step six times: with the stages of the integrator as a loop,
+        # the gradient of 8 runs of 500 steps of the paper's loop by 226 weights of a network
+        # compiles in 12 s instead of 22 s of processor time, and takes the same time afterwards.
+        layout = nested_layout(inputs)._replace(rolled=True)
+
+        def run(numbers: dict[str, jax.Array]) -> tuple[dict[str, jax.Array], Outcome]:
+            batch = Batch.of(inputs, {**varied, **numbers}, layout)
+            outcome = run_all(checkpointed, batch, request)
+            return {name: outcome.metrics[name] for name in metrics}, outcome
+
+        _, pullback, outcome = jax.vjp(run, numbers, has_aux=True)
+        return outcome, lambda slopes: pullback(slopes)[0]
+
+    return first_that_works(execution, attempt, by_scan)
 
 
 def step_states(

@@ -13,10 +13,12 @@ import numpy as np
 from iblf_jax.control.actuators._base import input_delay
 from iblf_jax.core import checks, notices
 from iblf_jax.core.devices import threads
+from iblf_jax.engine import thresholds
+from iblf_jax.engine.adjoint import ReverseRun
 from iblf_jax.engine.batch import Batch, carry_shapes
 from iblf_jax.engine.compile import inputs_of
 from iblf_jax.engine.loops import program_of
-from iblf_jax.engine.registry import default_backend
+from iblf_jax.engine.registry import EXECUTORS, Executor, default_backend
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.structural_constants import constants_of
 from iblf_jax.engine.time_step import TimeStep
@@ -117,16 +119,25 @@ def explain(
     slots = instructions(program, width)
     counts = {NAMES[c]: counter for c, counter in program.counts().items()}
     name, reason = default_backend()
-    columns = (
-        f"by numbers of the scenario on {name}, one run a number, first and second ones; others by"
-        " plain JAX"
-    )
-    backend, derivatives = name, columns
+    backend = name
     if reason:
         backend = f"{name}: {reason}"
         derivatives = f"by plain JAX: {reason}"
+    else:
+        derivatives = _derivatives(EXECUTORS[name], one)
     return Explanation(
         counts, slots, width, threads() * width * 2 * _clock() / slots, backend, derivatives
+    )
+
+
+def _derivatives(executor: Executor, one: Batch) -> str:
+    """What computes the derivatives of `simulate`, for a batch of one run."""
+    many = "more of them and others by plain JAX"
+    if ReverseRun(executor, one, (), RunRequest(1)).is_supported():
+        many = "first ones by more of them in reverse mode; others by plain JAX"
+    return (
+        f"by up to {thresholds.MAX_COLUMNS} numbers of the scenario on {executor.name}, one run a"
+        f" number, first and second ones; {many}"
     )
 
 

@@ -23,6 +23,7 @@ from iblf_jax.engine.linearization import LinearizationStep
 from iblf_jax.engine.machine_function import machine_function
 from iblf_jax.engine.registry import Executor
 from iblf_jax.kernels import (
+    EMPTY,
     CompiledStep,
     Shapes,
     compile_step,
@@ -112,20 +113,22 @@ def checkpointed(
 @CACHE.memoised(64)
 def _on_leaves(step: Any, treedef, is_per_run: tuple[bool, ...], carry_treedef) -> Callable:
     """The step as a function of lists of leaves.  `compile_step` caches by the function object, so
-    the same structure gives the same object.
+    the same structure gives the same object.  A step that reads a series has one more argument.
     """
 
-    def on_leaves(shared, per_run, carry, index):
+    def on_leaves(shared, per_run, *series_carry_and_index):
+        *series, carry, index = series_carry_and_index
         inputs = Leaves(treedef, is_per_run, [], []).unflatten(shared, per_run)
         before = jax.tree.unflatten(carry_treedef, carry)
-        after, records = step(inputs, before, index, StepOptions(scalar=True))
+        after, records = step(inputs, before, index, StepOptions(scalar=True), *series)
         return jax.tree.leaves(after), records
 
     return on_leaves
 
 
-def program_of(step: Any, batch: Batch, carry: Any) -> CompiledStep:
-    """The scalar program of a step, for a carry with a leading batch axis (arrays or their shapes).
+def program_of(step: Any, batch: Batch, carry: Any, series: Shapes = EMPTY) -> CompiledStep:
+    """The scalar program of a step, for a carry with a leading batch axis (arrays or their shapes);
+    `series` has the shapes of what each step of a run reads from a series.
 
     Raises:
       UnsupportedError: the step cannot be lowered.
@@ -142,7 +145,18 @@ def program_of(step: Any, batch: Batch, carry: Any) -> CompiledStep:
         limits=thresholds.LOWERING_LIMITS,
         is_derivative=step_member(step, "is_derivative"),
         known=batch.shared_constants,
+        series=series,
     )
+
+
+def rows_of_leaves(executor: Executor, batch: Batch) -> tuple[jax.Array, jax.Array]:
+    """The leaves of a batch as a kernel reads them: shared (S,), and per run (P, runs)."""
+    pack = partial(executor.pack, dtype=batch.dtype)
+    shared, per_run = batch.leaves.shared, batch.leaves.per_run
+    # Shared leaves are packed as those of a single run.
+    shared_rows = pack([x[None] for x in shared], Shapes.of(shared), runs=1).floats
+    per_run_rows = pack(per_run, Shapes.of(per_run, 1), runs=batch.runs or 1).floats
+    return shared_rows[:, 0], per_run_rows
 
 
 def kernel_loop(executor: Executor, **options: Any) -> StepLoop:
@@ -158,14 +172,9 @@ def kernel_loop(executor: Executor, **options: Any) -> StepLoop:
         runs = batch.runs or 1
         flat, treedef = jax.tree.flatten(carry)
         shapes = Shapes.of(flat, 1)
-        pack = partial(executor.pack, dtype=batch.dtype)
-        shared, per_run = batch.leaves.shared, batch.leaves.per_run
-        # Shared leaves are packed as those of a single run.
-        shared_rows = pack([x[None] for x in shared], Shapes.of(shared), runs=1).floats
-        per_run_rows = pack(per_run, Shapes.of(per_run, 1), runs=runs).floats
-        before = pack(flat, shapes, runs=runs)
+        before = executor.pack(flat, shapes, batch.dtype, runs)
         after, arrays = executor.run(
-            compiled.program, shared_rows[:, 0], per_run_rows, before, steps, every, **options
+            compiled.program, *rows_of_leaves(executor, batch), before, steps, every, **options
         )
         records = ()
         if every:

@@ -32,8 +32,7 @@ def _kernel_build(
         a short vector; `runs` and `steps` decide if None.
     """
     if short_vector is None:
-        is_small = runs * program.dtype.itemsize <= thresholds.SHORT_VECTOR_BYTES
-        short_vector = is_small and steps > thresholds.FEW_STEPS
+        short_vector = thresholds.uses_short_vector(runs * program.dtype.itemsize, steps)
     return Build(*thresholds.native_build(program.size, short_vector))
 
 
@@ -42,9 +41,11 @@ def build(program: Program, shared: int, per_run: int, runs: int, steps: int) ->
     cpu.kernel(program, shared, per_run, _kernel_build(program, runs, steps))
 
 
-def start_build(program: Program, shared: int, per_run: int, runs: int, steps: int) -> None:
-    """As `build`, in the background."""
-    cpu.start_build(program, shared, per_run, _kernel_build(program, runs, steps))
+def start_build(
+    program: Program, shared: int, per_run: int, runs: int, steps: int, series: int = 0
+) -> None:
+    """As `build`, in the background, of a program that may read a series."""
+    cpu.start_build(program, shared, per_run, _kernel_build(program, runs, steps), series)
 
 
 def run(
@@ -56,11 +57,12 @@ def run(
     every: int | None,
     first: jax.Array | int = 0,
     short_vector: bool | None = None,
+    series: jax.Array | None = None,
 ) -> tuple[Packed, list[jax.Array]]:
     """All steps of all runs.
 
     Args:
-      program, shared, per_run, carry, steps, every, first: as `kernels.cpu.run`.
+      program, shared, per_run, carry, steps, every, first, series: as `kernels.cpu.run`.
       short_vector: as `_kernel_build`.
 
     Returns:
@@ -69,5 +71,14 @@ def run(
     """
     kernel = _kernel_build(program, carry.floats.shape[1], steps, short_vector)
     return cpu.run(
-        program, shared, per_run, carry, steps, every, first=first, build=kernel, threads=threads()
+        program,
+        shared,
+        per_run,
+        carry,
+        steps,
+        every,
+        first=first,
+        series=series,
+        build=kernel,
+        threads=threads(),
     )

@@ -45,10 +45,14 @@ class Executor(NamedTuple):
     unpack: Callable = unpack
     """Converts rows of numbers to leaves."""
     start_build: Callable | None = None
-    """Starts to compile in the background; arguments as `build`."""
+    """Starts to compile in the background; arguments as `build`, and `series`, the count of numbers
+    of each step of a run in the series that the program reads."""
     accepts_first_step: bool = False
     """Whether `run` accepts `first`, the index of the first step, and `short_vector`.  Then a long
     single run can be divided into several calls."""
+    accepts_series: bool = False
+    """Whether `run` accepts `series`, a table of which each step reads a row, and `first`.  Then
+    the executor differentiates in reverse mode (`adjoint`)."""
     uses_host_compiler: bool = False
     """Whether results depend on the processor and the C++ compiler of the host in their last
     digits."""
@@ -65,6 +69,7 @@ NATIVE = Executor(
     unpack=native.unpack,
     start_build=native.start_build,
     accepts_first_step=True,
+    accepts_series=True,
     uses_host_compiler=True,
 )
 GPU = Executor(

@@ -6,6 +6,8 @@ This module imports nothing else of the engine, so that executors and the plan c
 
 from __future__ import annotations
 
+import math
+
 from iblf_jax.core import checks
 from iblf_jax.kernels import LoweringLimits
 
@@ -85,13 +87,18 @@ Equal nodes are merged later, so that about a third remain."""
 MAX_SEGMENTED_DERIVATIVE_NODES = 150_000
 """The same for executors that divide a step into functions, which compile for half a minute where
 the others compile for minutes."""
+ADJOINT_NODES = 3
+"""Nodes of the adjoint of a step for each node of the step, approximately."""
 MAX_NODES_PER_OPERATION = 12.0
 """Nodes of a step for each operation of the closed loop, up to which a kernel of a batch computes
-derivatives.  A scalar program writes out the products of arrays that XLA computes as one operation.
+derivatives, in forward and in reverse mode.  A scalar program writes out the products of arrays that XLA computes as one operation.
 For 64 runs of 500 steps of the paper's loop with a network of two hidden layers, by 2 of its
 weights, kernel and scan take: layers of 32 (6 nodes), 0.11 and 0.25 s (11 and 15 s of processor
-time with compilation); layers of 64 (19 nodes), 0.53 and 0.39 s (25 and 18 s).  Without a network
-there are 2 nodes."""
+time with compilation); layers of 64 (19 nodes), 0.53 and 0.39 s (25 and 18 s).  In reverse mode,
+by all weights and on a busy machine: layers of 32, 0.6 and 4.5 s (the first gradient 41 and 113 s);
+layers of 64, 2.7 and 7.2 s (184 and 40 s).  Without a network there are 2 nodes."""
+SEGMENT_BYTES = 1 << 22
+"""Bytes of the carries of a segment of reverse mode, at least sqrt(steps) of them."""
 MAX_FORWARD_NUMBERS = 32
 """Numbers by which forward mode differentiates; reverse mode differentiates by more."""
 MAX_COLUMN_ORDER = 2
@@ -99,10 +106,10 @@ MAX_COLUMN_ORDER = 2
 in the caller's mode."""
 MAX_KEPT_NUMBERS = 1 << 27
 """Numbers of such a derivative of the records of one run: 1 GiB."""
-MAX_COLUMNS = 96
-"""Numbers by which a transformable run is differentiated column by column; the scan differentiates
-by more.  64 runs of 500 steps of the paper's loop with N weights take, by
-columns and by the scan in reverse mode: N = 8, 0.06 and 1.6 s; N = 32, 0.36 and 1.2 s; N = 96,
+MAX_COLUMNS = 32
+"""Numbers by which a transformable run is differentiated column by column; reverse mode (`adjoint`,
+or the scan) differentiates by more.  64 runs of 500 steps of the paper's loop with N weights take,
+by columns and by the scan in reverse mode: N = 8, 0.06 and 1.6 s; N = 32, 0.36 and 1.2 s; N = 96,
 4.2 and 3.5 s; N = 386, 9.7 and 2.2 s (two cores)."""
 STEP_SIZE_CHUNK = 1000
 """Steps between two assessments of the pair of runs that determines a step size."""
@@ -132,6 +139,26 @@ def native_build(nodes: int, short_vector: bool) -> tuple[int | None, tuple[str,
     if nodes > MAX_C_FUNCTION_NODES:
         segment = SEGMENT_NODES
     return segment, tuple(flags)
+
+
+def uses_short_vector(bytes_of_runs: int, steps: int) -> bool:
+    """Whether a kernel makes so many steps in short vectors.
+
+    Args:
+      bytes_of_runs: bytes of one number of each run.
+      steps: number of steps.
+    """
+    return bytes_of_runs <= SHORT_VECTOR_BYTES and steps > FEW_STEPS
+
+
+def segment_steps(steps: int, bytes_per_step: int) -> int:
+    """Steps of a segment of reverse mode by kernels.
+
+    Args:
+      steps: steps of the run.
+      bytes_per_step: bytes of the carries of all runs.
+    """
+    return min(steps, max(math.isqrt(steps - 1) + 1, SEGMENT_BYTES // bytes_per_step))
 
 
 def steps_per_call(nodes: int, steps: int, every: int | None) -> int:

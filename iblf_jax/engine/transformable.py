@@ -6,9 +6,11 @@ built,
     out' = J leaves',       J = d (records, metrics) / d leaves,
 
 where each column of J is a run with one tangent (`columns`).  JAX transposes the product, so both
-forward and reverse mode use J, and the derivative of J is computed in the same way.  The scan
-computes all other derivatives: those of third order, by the time step, by parameters of a metric,
-by many numbers, and of more records than are kept (`derivatives.choose_derivatives`).
+forward and reverse mode use J, and the derivative of J is computed in the same way.  For many
+numbers, and for more records than are kept, J is not computed: J leaves' is a primitive whose
+transpose is computed by kernels that go backwards in time (`direction`).  The scan computes all
+other derivatives: those of third order, by the time step and by parameters of a metric
+(`derivatives.choose_derivatives`).
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +29,7 @@ from jax.custom_derivatives import SymbolicZero
 from iblf_jax.core import checks
 from iblf_jax.core.caches import CACHE
 from iblf_jax.engine import registry
-from iblf_jax.engine.batch import Batch, Leaves, run_all
+from iblf_jax.engine.batch import run_all
 from iblf_jax.engine.columns import ACCURACY, Places, columns, floats_of, numbers_of
 from iblf_jax.engine.compile import (
     first_that_works,
@@ -36,37 +38,14 @@ from iblf_jax.engine.compile import (
     run_by_executor,
 )
 from iblf_jax.engine.derivatives import DerivativeSizes, choose_derivatives
+from iblf_jax.engine.direction import Runs, derivative
 from iblf_jax.engine.loops import kernel_loop, scan
 from iblf_jax.engine.outcome import Outcome
-from iblf_jax.engine.plan import PLAIN_LAYOUT, ExecutionPlan
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.single_run import run_one
 from iblf_jax.engine.structural_constants import constants_of
 from iblf_jax.engine.time_step import recorded
 from iblf_jax.simulation.scenario import Scenario
-
-
-class Runs(NamedTuple):
-    """What is run on lists of leaves; static."""
-
-    treedef: Any
-    """Of the `Inputs`."""
-    request: RunRequest
-    backend: str
-    """Of the derivatives."""
-    is_per_run: tuple[bool, ...]
-    """Which leaves have a run axis."""
-    runs: int = 1
-
-    def batch(self, leaves: tuple) -> Batch:
-        """Of all runs."""
-        groups = Leaves.of(self.treedef, self.is_per_run, leaves)
-        return Batch(groups, self.runs, constants=self.request.constants)
-
-    @property
-    def plan(self) -> ExecutionPlan:
-        """One executor; no warning reports the scan, which gives the same derivatives."""
-        return ExecutionPlan((self.backend,), PLAIN_LAYOUT, PLAIN_LAYOUT, False)
 
 
 def run_transformable(
@@ -121,12 +100,19 @@ def _differentiable(runs: Runs, beside_derivative: bool = False) -> Callable:
                 moves,
             )
 
-        by_kernel = _by_kernel(runs, (places,), leaves)
-        if by_kernel is None:
+        if not _is_by_scenario(runs, (places,)):
+            return by_scan()
+        way = choose_derivatives(_derivative_sizes(runs, (places,), leaves))
+        by_kernel = None
+        if way == "one per run":
+            by_kernel = _by_kernel(runs, (places,), leaves)
+        if by_kernel is None and way != "reverse":
             return by_scan()
 
         def attempt(_):
             found = _differentiable(runs, True)(*leaves)
+            if way == "reverse":
+                return found, _in_form_of(found, *derivative(runs, places, leaves, moves))
             return found, _in_form_of(found, *_times(by_kernel, moves, 0))
 
         return first_that_works(runs.plan, attempt, by_scan)
@@ -162,14 +148,22 @@ def _run_by_kernel(runs: Runs, *leaves: jax.Array) -> Outcome:
     return jax.tree.map(lambda x: x[0], _over_runs(_values, runs)(*leaves))
 
 
+def _is_by_scenario(runs: Runs, places: Places) -> bool:
+    """Whether all leaves at these places belong to the scenario."""
+    scenario = jax.tree.unflatten(runs.treedef, runs.is_per_run).scenario
+    number_of_leaves = len(jax.tree.leaves(scenario))
+    return all(i < number_of_leaves for level in places for i in level)
+
+
 def _by_kernel(runs: Runs, places: Places, leaves: tuple) -> Any:
     """A derivative of records and metrics by the kernel, differentiable; None where there is
     none.
     """
-    scenario = jax.tree.unflatten(runs.treedef, runs.is_per_run).scenario
-    number_of_leaves = len(jax.tree.leaves(scenario))
-    by_scenario = all(i < number_of_leaves for level in places for i in level)
-    if not by_scenario or choose_derivatives(_derivative_sizes(runs, places, leaves)) == "scan":
+    is_by_scenario = _is_by_scenario(runs, places)
+    if (
+        not is_by_scenario
+        or choose_derivatives(_derivative_sizes(runs, places, leaves)) != "one per run"
+    ):
         return None
     kernel = jax.custom_jvp(
         lambda *leaves: jax.tree.map(lambda x: x[0], _over_runs(_columns, runs, places)(*leaves))
@@ -227,7 +221,10 @@ def _derivative_sizes(runs: Runs, places: Places, leaves: tuple) -> DerivativeSi
         inputs = jax.tree.unflatten(runs.treedef, leaves)
         return numbers_of(inputs, recorded) * samples * math.prod(columns)
 
-    return DerivativeSizes(count_kept_numbers, order=len(places), columns=max(columns))
+    reverses = len(places) == 1 and registry.EXECUTORS[runs.backend].accepts_series
+    return DerivativeSizes(
+        count_kept_numbers, order=len(places), reverses=reverses, columns=max(columns)
+    )
 
 
 def _over_runs(function: Callable, runs: Runs, *static: Any) -> Callable:
@@ -238,18 +235,7 @@ def _over_runs(function: Callable, runs: Runs, *static: Any) -> Callable:
 
     @batched.def_vmap
     def rule(size, is_batched, *leaves):
-        def widened(x, is_new, is_per_run):
-            if not (is_new or is_per_run):
-                return x
-            if not is_new:
-                x = jnp.broadcast_to(x, (size, *x.shape))
-            if is_per_run:
-                return x.reshape(-1, *x.shape[2:])
-            return jnp.repeat(x, runs.runs, axis=0)
-
-        wide = map(widened, leaves, is_batched, runs.is_per_run)
-        is_per_run = tuple(map(bool.__or__, is_batched, runs.is_per_run))
-        more = runs._replace(is_per_run=is_per_run, runs=size * runs.runs)
+        more, wide = runs.repeated(size, leaves, is_batched)
         found = _over_runs(function, more, *static)(*wide)
         found = jax.tree.map(lambda x: x.reshape(size, runs.runs, *x.shape[1:]), found)
         return found, jax.tree.map(lambda _: True, found)

@@ -86,6 +86,7 @@ from iblf_jax.kernels.interval_primitives import upper as upper
 from iblf_jax.kernels.interval_primitives import with_sign as with_sign
 from iblf_jax.kernels.messages import has_reader as has_reader
 from iblf_jax.kernels.operations import OPERATIONS as OPERATIONS
+from iblf_jax.kernels.packed import EMPTY as EMPTY
 from iblf_jax.kernels.packed import Packed as Packed
 from iblf_jax.kernels.packed import Shapes as Shapes
 from iblf_jax.kernels.packed import pack as pack

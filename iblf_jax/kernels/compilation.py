@@ -12,7 +12,7 @@ import numpy as np
 
 from iblf_jax.kernels.caches import CACHES
 from iblf_jax.kernels.from_jaxpr import closed
-from iblf_jax.kernels.packed import Shapes
+from iblf_jax.kernels.packed import EMPTY, Shapes
 from iblf_jax.kernels.passes import with_reciprocals
 from iblf_jax.kernels.program import (
     NO_LIMITS,
@@ -45,13 +45,15 @@ def compile_step(
     limits: LoweringLimits = NO_LIMITS,
     is_derivative: bool = False,
     known: tuple[Known | None, ...] = (),
+    series: Shapes = EMPTY,
 ) -> CompiledStep:
     """The scalar program of a step of one run.
 
     Args:
-      step: function (shared leaves, leaves of the run, carry leaves, index) -> (carry leaves,
-        records) of JAX; leaves are lists of arrays, `index` is the number of the step, () int32.
-        The function object is the key of a cache: pass the same one for the same step.
+      step: function (shared leaves, leaves of the run, series, carry leaves, index) -> (carry
+        leaves, records) of JAX; without `series`, the function has no such argument. Leaves are
+        lists of arrays, `index` is the number of the step, () int32. The function object is the
+        key of a cache: pass the same one for the same step.
       dtype: floating-point type of all numbers.
       shared: shapes of the leaves that all runs share.
       per_run: shapes of the leaves of one run that differ between runs.
@@ -60,22 +62,27 @@ def compile_step(
       is_derivative: whether the step computes tangents, in which a literal zero means "does not
         depend" (`program.Builder`).
       known: what is known beforehand of each shared number; empty for nothing.
+      series: shapes of what a step of one run reads from a table with one row per step.
 
     Raises:
       UnsupportedError: the step contains an operation that a scalar program cannot express, or
         exceeds a limit.
     """
     index = jax.ShapeDtypeStruct((), jnp.int32)
+    leaves = [shared.structs(), per_run.structs()]
+    if series.items:
+        leaves.append(series.structs())
     jaxpr, (after, records) = jax.make_jaxpr(step, return_shape=True)(
-        shared.structs(), per_run.structs(), carry.structs(), index
+        *leaves, carry.structs(), index
     )
     b = Builder(dtype, sparse=is_derivative, limits=limits)
     shared_ids = _inputs(b, shared, lambda i, kind: _shared(b, i, known))
     per_run_ids = _inputs(b, per_run, lambda i, kind: b.input("per_run", i, kind))
+    series_ids = _inputs(b, series, lambda i, kind: b.input("series", i, kind))
     carry_ids = _inputs(b, carry, lambda i, kind: b.input("carry", i, kind), of_carry=True)
     index_id = np.asarray(b.input("index", 0, "i"), np.int64)
     _mark_constant_carry(b, jaxpr.jaxpr, carry_ids)
-    out = closed(b, jaxpr, [*shared_ids, *per_run_ids, *carry_ids, index_id])
+    out = closed(b, jaxpr, [*shared_ids, *per_run_ids, *series_ids, *carry_ids, index_id])
     carry_out, recorded = out[: len(after)], out[len(after) :]
     if Shapes.of(after).kinds() != carry.kinds():
         raise UnsupportedError("the step changes the types of its carry")

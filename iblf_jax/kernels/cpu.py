@@ -31,7 +31,9 @@ class Build(NamedTuple):
 
 
 @CACHES.function(maxsize=8)
-def c_source(program: Program, shared: int, per_run: int, segment: int | None = None) -> str:
+def c_source(
+    program: Program, shared: int, per_run: int, segment: int | None = None, series: int = 0
+) -> str:
     """The C of a program's kernel.
 
     Args:
@@ -39,20 +41,25 @@ def c_source(program: Program, shared: int, per_run: int, segment: int | None = 
       shared: number of shared leaf entries that go in.
       per_run: number of leaf entries that go in for each run.
       segment: operations of a function, at most; None for one function.
+      series: numbers of each step of a run in the series that the program reads, if it reads one.
     """
-    return source(program, shared, per_run, segment=segment)
+    return source(program, shared, per_run, segment=segment, series=series)
 
 
 DEFAULT_BUILD = Build()
 
 
-def start_build(program: Program, shared: int, per_run: int, build: Build = DEFAULT_BUILD) -> None:
+def start_build(
+    program: Program, shared: int, per_run: int, build: Build = DEFAULT_BUILD, series: int = 0
+) -> None:
     """Starts to compile a kernel in the background; arguments as `kernel`."""
-    build_ahead(c_source(program, shared, per_run, build.segment), build.flags)
+    build_ahead(c_source(program, shared, per_run, build.segment, series), build.flags)
 
 
 @CACHES.function(maxsize=64)
-def kernel(program: Program, shared: int, per_run: int, build: Build = DEFAULT_BUILD) -> str:
+def kernel(
+    program: Program, shared: int, per_run: int, build: Build = DEFAULT_BUILD, series: int = 0
+) -> str:
     """The name by which XLA knows the kernel of a program; compiles the kernel if necessary.
 
     Args:
@@ -60,12 +67,13 @@ def kernel(program: Program, shared: int, per_run: int, build: Build = DEFAULT_B
       shared: number of shared leaf entries that go in.
       per_run: number of leaf entries that go in for each run.
       build: how the C is written and compiled.
+      series: numbers of each step of a run in the series that the program reads, if it reads one.
 
     Raises:
       ToolchainError: no compiler, or an error from it.
       UnsupportedError: an operation that C does not have.
     """
-    library, key = built(c_source(program, shared, per_run, build.segment), build.flags)
+    library, key = built(c_source(program, shared, per_run, build.segment, series), build.flags)
     return register(f"iblf_jax_{key}", library, "iblf_jax_kernel", "cpu")
 
 
@@ -116,6 +124,7 @@ def run(
     every: int | None = None,
     *,
     first: jax.Array | int = 0,
+    series: jax.Array | None = None,
     build: Build = DEFAULT_BUILD,
     threads: int = 1,
 ) -> tuple[Packed, list[jax.Array]]:
@@ -129,6 +138,8 @@ def run(
       steps: number of steps.
       every: interval of the recorded steps; None for no record.
       first: number of the first step, () int32, a multiple of `every`.
+      series: what the steps read, if they read a series: (steps, numbers, runs).  The first step
+        reads the last row.
       build: how the kernel is compiled.
       threads: number of threads.
 
@@ -140,13 +151,17 @@ def run(
       UnsupportedError: an operation that C does not have.
     """
     runs = carry.floats.shape[1]
-    name = kernel(program, shared.size, per_run.shape[0], build)
+    width = 0
+    if series is not None:
+        width = series.shape[1]
+    name = kernel(program, shared.size, per_run.shape[0], build, width)
     outputs = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in carry]
     outputs += record_shapes(program, runs, steps, every)
     attributes = jnp.asarray(np.asarray([[0, steps, every or 0, threads]], np.int32))
     if not isinstance(first, int) or first:
         attributes = attributes.at[0, 0].set(first)
-    floats, ints, *records = jax.ffi.ffi_call(name, outputs)(
-        shared.reshape(1, -1), per_run, *carry, attributes
-    )
+    operands = [shared.reshape(1, -1), per_run, *carry, attributes]
+    if series is not None:
+        operands.append(series.reshape(steps, -1))
+    floats, ints, *records = jax.ffi.ffi_call(name, outputs)(*operands)
     return Packed(floats, ints), [x.reshape(len(x), -1, runs) for x in records]

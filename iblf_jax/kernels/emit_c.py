@@ -33,7 +33,7 @@ from iblf_jax.kernels.program import (
     needed,
 )
 
-NATIVE = (("vector.h", "mathlib.h", "records.h"), ("frame.h", "driver.h"))
+NATIVE = (("vector.h", "mathlib.h", "records.h", "series.h"), ("frame.h", "driver.h"))
 CUDA = (("scalar.h", "mathlib.h", "records.h"), ("kernels.h",))
 """The headers before and after the generated functions, by target."""
 SINES = frozenset({"sin", "cos"})
@@ -76,6 +76,7 @@ SEEN_BY_ADVANCE = (
     "const F *floats",
     "const I *ints",
     "const word *row",
+    "const F *series",
     "const F *once",
     "F *r",
     "I *s",
@@ -203,13 +204,14 @@ class _Emitter:
         return f"{head} {{\n{body}\n}}\n"
 
 
-def sizes(program: Program, shared_leaves: int, per_run_leaves: int) -> str:
+def sizes(program: Program, shared_leaves: int, per_run_leaves: int, series: int = 0) -> str:
     """The definitions of the sizes that the headers use.
 
     Args:
       program: the program.
       shared_leaves: number of shared leaf entries.
       per_run_leaves: number of leaf entries of each run.
+      series: numbers of each step of a run in the series that the program reads.
     """
     constants, columns, floats, ints = map(len, Layout.of(program))
     values: dict[str, object] = {
@@ -219,6 +221,7 @@ def sizes(program: Program, shared_leaves: int, per_run_leaves: int) -> str:
         "INTS": ints,
         "CONSTANTS": constants,
         "COLUMNS": columns,
+        "SERIES": series,
         "DOUBLE": int(program.dtype == np.float64),
         "RECORDED": len(program.recorded),
         # C has no empty list of initial values.
@@ -233,6 +236,7 @@ def source(
     per_run_leaves: int,
     target: tuple[tuple[str, ...], ...] = NATIVE,
     segment: int | None = None,
+    series: int = 0,
 ) -> str:
     """The C source of a program's kernel.
 
@@ -242,6 +246,7 @@ def source(
       per_run_leaves: number of leaf entries of each run.
       target: NATIVE or CUDA.
       segment: operations of a function, at most; None for one function per step.
+      series: numbers of each step of a run in the series that the program reads, if it reads one.
     """
     if target is NATIVE and not segment:
         # The functions that the program calls keep their order: they have enough independent
@@ -256,7 +261,7 @@ def source(
     signals = _signals(e, layout.constants, layout.columns)
     before, after = target
     parts = [
-        sizes(program, shared_leaves, per_run_leaves),
+        sizes(program, shared_leaves, per_run_leaves, series),
         *map(header, before),
         *(f"TABLE {name}[] = {{{numbers}}};" for numbers, name in tables.items()),
         *functions,
@@ -381,7 +386,7 @@ def _signals(e: _Emitter, constants: list[int], columns: list[int]) -> str:
 HEAD_OF_ADVANCE = (
     "FUNCTION void advance(const word *constants, const F *leaves, F *floats, I *ints, const word"
     " *row, int count,\n                    int64_t first, int64_t every, record_arrays records,"
-    " int64_t runs, int64_t run)"
+    " const real *rows, int64_t runs, int64_t run)"
 )
 
 
@@ -396,6 +401,22 @@ def _names_of_inputs(e: _Emitter, layout: Layout) -> dict[int, str]:
     nodes = e.program.nodes
     names = {i: unpacked(nodes[i], f"constants[{k}]") for k, i in enumerate(layout.constants)}
     return names | {i: f"leaves[{n.value}]" for i, n in enumerate(nodes) if n.op == "per_run"}
+
+
+def _names_of_series(e: _Emitter) -> dict[int, str]:
+    """C expressions of the numbers that a step reads from the series."""
+    nodes = e.program.nodes
+    return {i: f"series[{n.value}]" for i, n in enumerate(nodes) if n.op == "series"}
+
+
+def _loop(program: Program) -> list[str]:
+    """The beginning of the loop over the steps; `rows` points to the row of the next step."""
+    if not any(node.op == "series" for node in program.nodes):
+        return ["  for (int step = 0; step < count; step++, row += COLUMNS) {"]
+    return [
+        "  for (int step = 0; step < count; step++, row += COLUMNS, rows -= SERIES * runs) {",
+        "  read_series(rows, series, runs, run);",
+    ]
 
 
 def _names_of_columns(e: _Emitter, layout: Layout) -> dict[int, str]:
@@ -435,6 +456,7 @@ def _advance(e: _Emitter, layout: Layout, segment: int | None) -> str:
     program = e.program
     names = _names_of_inputs(e, layout)
     places = _places_of_carry(layout)
+    e.lines.append("  F series[SERIES + 1];")
     for c, place in places.items():
         kind = _of_kind(program, c, "F", "I")
         e.lines.append(f"  {kind} c{c} = {_sign(program, c)}{place};")
@@ -445,8 +467,8 @@ def _advance(e: _Emitter, layout: Layout, segment: int | None) -> str:
     e.statements(names, frontier(program, e.classes, PER_RUN, lambda k: k == PER_RUN | TIME))
     if e.calls.functions:
         e.lines += [e.calls.declarations, *e.calls.once_statements(names)]
-    e.lines.append("  for (int step = 0; step < count; step++, row += COLUMNS) {")
-    names |= _names_of_columns(e, layout)
+    e.lines += _loop(program)
+    names |= _names_of_columns(e, layout) | _names_of_series(e)
     e.statements(names, [after for _, after in program.carry])
     if program.outputs:
         _record(e, names)
@@ -606,7 +628,7 @@ def _advance_in_segments(e: _Emitter, layout: Layout, segment: int) -> str:
     """
     program = e.program
     nodes = program.nodes
-    names = _names_of_inputs(e, layout) | _names_of_columns(e, layout)
+    names = _names_of_inputs(e, layout) | _names_of_columns(e, layout) | _names_of_series(e)
     places = _places_of_carry(layout)
     names |= {program.carry[c][0]: place for c, place in places.items() if program.carry[c][0] >= 0}
     segments = _Segments(e, names, segment, "segment", SEEN_BY_ADVANCE)
@@ -625,10 +647,9 @@ def _advance_in_segments(e: _Emitter, layout: Layout, segment: int) -> str:
         for c, (unchanged, after) in enumerate(program.carry)
         if unchanged != after
     ]
-    e.lines += [segments.declarations, e.calls.declarations, *signs]
+    e.lines += ["  F series[SERIES + 1];", segments.declarations, e.calls.declarations, *signs]
     e.lines += [*(f"  {call}" for call in before), *e.calls.once_statements(segments.names)]
-    e.lines.append("  for (int step = 0; step < count; step++, row += COLUMNS) {")
-    e.lines += [f"  {call}" for call in within]
+    e.lines += [*_loop(program), *(f"  {call}" for call in within)]
     if program.outputs:
         _record(e, segments.names)
     e.lines += _moves(program, moved, places.__getitem__)

@@ -37,6 +37,10 @@ class Shapes(NamedTuple):
         return sum(math.prod(shape) for shape, _ in self.items)
 
 
+EMPTY = Shapes(())
+"""The shapes of no arrays."""
+
+
 class Packed(NamedTuple):
     """Numbers of many runs, one row per number, one column per run."""
 

@@ -30,9 +30,10 @@ from iblf_jax.kernels.identities import fold, is_exact, simplify, without_absent
 from iblf_jax.kernels.operations import COMMUTING
 
 SHARED, PER_RUN, TIME = 0, 1, 2
-INPUTS = ("shared", "per_run", "carry", "index", "argument")
+INPUTS = ("shared", "per_run", "carry", "index", "series", "argument")
 """Operations that stand for an input: leaves that all runs share, leaves of one run, the carry, the
-number of the step, and the arguments of a function that a program calls."""
+number of the step, the numbers that a step of a run reads from a series, and the arguments of a
+function that a program calls."""
 
 
 Ids = np.ndarray

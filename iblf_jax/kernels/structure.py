@@ -81,6 +81,11 @@ def _iota(b: Builder, eqn, *_: Ids) -> Ids:
     return constants(b, np.broadcast_to(line, shape).astype(eqn.outvars[0].aval.dtype))
 
 
+def _empty(b: Builder, eqn, *_: Ids) -> Ids:
+    """An array that other primitives fill before it is read."""
+    return constants(b, np.zeros(eqn.outvars[0].aval.shape, eqn.outvars[0].aval.dtype))
+
+
 def _chosen(
     b: Builder, x: Ids, index: Ids, at: Callable, known: dict[int, int] | None = None
 ) -> Ids:
@@ -269,6 +274,7 @@ STRUCTURE: dict[str, Callable] = {
     "rev": _rev,
     "pad": _pad,
     "iota": _iota,
+    **dict.fromkeys(("empty", "empty2"), _empty),  # of the transpose of a scan
     "unstack": _unstack,  # since jax 0.11
     "gather": _gather,
     "dynamic_slice": _dynamic_slice,

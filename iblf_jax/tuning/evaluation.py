@@ -39,9 +39,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core.status import UNTRUSTED
-from iblf_jax.engine import run_for_reverse, starts_per_batch
+from iblf_jax.engine import run_batch_vjp, starts_per_batch
 from iblf_jax.simulation.noise import NOISE_NAME
-from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.studies.draws import paths_overlap
 from iblf_jax.tuning.objectives import Objective
 from iblf_jax.tuning.problem import NO_LEVEL, Candidate, TuningProblem, of_runs
@@ -278,25 +277,36 @@ def _overlaps(problem: TuningProblem, path: str, others: list[str]) -> bool:
 @jax.jit
 def reverse_derivatives(problem: TuningProblem, candidates: Candidate) -> Derivatives:
     """The problem with gradient (S, p), by reverse mode; its matrix is zero."""
+    tuned = [block.path for block in problem.blocks]
 
-    def one_run(z: jax.Array, index: jax.Array) -> Any:
-        values = problem.leaves(z, index)
-        noise = values.pop(NOISE_NAME, None)
-        scenario = with_parameters(problem.scenario, values)
-        request = problem.request._replace(constants=None)
-        outcome = run_for_reverse(scenario, _fold(problem), problem.dt, request, noise)
-        return outcome.metrics["tuning_smooth"], (outcome.metrics["tuning_exact"], outcome.status)
+    def leaves(z: jax.Array) -> tuple[dict[str, jax.Array], dict[str, jax.Array]]:
+        """The leaves that depend on the coordinates, and the others."""
+        values = problem.leaves_of_runs(candidates._replace(z=z))
+        depends = {
+            path: x
+            for path, x in values.items()
+            if path != NOISE_NAME and _overlaps(problem, path, tuned)
+        }
+        return depends, {path: x for path, x in values.items() if path not in depends}
 
-    def loss(z: jax.Array, candidate: Candidate) -> Any:
-        candidate = candidate._replace(z=z)
-        smooth, (exact, status) = jax.vmap(partial(one_run, z))(candidate.index)
-        value = value_of_start(problem, candidate, smooth, exact, status)
-        return _loss(problem, candidate, smooth), value
-
-    with_gradient = jax.vmap(jax.value_and_grad(loss, has_aux=True))
-    (_, found), gradients = with_gradient(candidates.z, candidates)
+    depends, to_coordinates, others = jax.vjp(leaves, candidates.z, has_aux=True)
+    outcome, to_leaves = run_batch_vjp(
+        problem.scenario,
+        depends | others,
+        list(depends),
+        ["tuning_smooth"],
+        _fold(problem),
+        problem.dt,
+        problem.request,
+    )
+    numbers = outcome.metrics["tuning_smooth"], outcome.metrics["tuning_exact"], outcome.status
+    smooth, exact, status = _by_start(numbers, candidates)
+    value = jax.vmap(partial(value_of_start, problem))(candidates, smooth, exact, status)
+    slopes = jax.vmap(jax.grad(partial(_loss, problem), argnums=1))(candidates, smooth)
+    slopes = slopes.reshape(-1, slopes.shape[-1])
+    (gradients,) = to_coordinates(to_leaves({"tuning_smooth": slopes}))
     size = gradients.shape[-1]
-    return Derivatives(found, gradients, jnp.zeros((*gradients.shape, size), gradients.dtype))
+    return Derivatives(value, gradients, jnp.zeros((*gradients.shape, size), gradients.dtype))
 
 
 DERIVATIVES = {"forward": forward_derivatives, "reverse": reverse_derivatives}

@@ -312,8 +312,8 @@ def test_second_derivatives_are_the_kernels(paper, monkeypatch):
 @needs_compiler
 @pytest.mark.slow
 def test_where_kernels_cannot_the_scan_differentiates(paper, monkeypatch):
-    """And says the same: by the step, where records would be too large, without a compiler, and
-    where a step does not lower."""
+    """And says the same: by the step, by higher orders, without a compiler, and where a step does
+    not lower."""
 
     def last(K2, dt):
         scenario = canonical(ij.with_parameters(paper, {"controller.K2": K2}))
@@ -339,8 +339,7 @@ def test_where_kernels_cannot_the_scan_differentiates(paper, monkeypatch):
         raise UnsupportedError("made up")
 
     for place, name, value in (
-        (thresholds, "MAX_KEPT_NUMBERS", 10),
-        (thresholds, "MAX_COLUMNS", 1),
+        (thresholds, "MAX_COLUMN_ORDER", 0),
         (registry, "default_backend", lambda: registry.Availability("vmap", "no compiler")),
         (transformable, "_columns", no_kernel),
     ):

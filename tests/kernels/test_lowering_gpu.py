@@ -343,7 +343,8 @@ def test_without_a_gpu_it_runs_on_vmap_with_one_warning(monkeypatch):
 def test_explain_says_what_a_batch_runs_on(paper, monkeypatch):
     told = repr(ij.explain(paper))
     assert "a batch runs on native\n" in told and told.endswith(
-        "on native, one run a number, first and second ones; others by plain JAX"
+        "on native, one run a number, first and second ones; first ones by more of them in reverse"
+        " mode; others by plain JAX"
     )
     gpu_for_this_platform(monkeypatch)
     told = repr(ij.explain(paper))

@@ -296,3 +296,19 @@ def test_a_kernel_that_writes_out_large_arrays_is_not_built_for_derivatives():
 
     limit = thresholds.MAX_NODES_PER_OPERATION
     assert (way(limit), way(1.01 * limit)) == ("together", "scan")
+
+
+@pytest.mark.parametrize(
+    ("columns", "kept", "order", "reverses", "expected"),
+    [
+        (thresholds.MAX_COLUMNS, 0, 1, True, "one per run"),
+        (thresholds.MAX_COLUMNS + 1, 0, 1, True, "reverse"),
+        (thresholds.MAX_COLUMNS + 1, 0, 1, False, "scan"),
+        (1, thresholds.MAX_KEPT_NUMBERS + 1, 1, True, "reverse"),
+        (1, thresholds.MAX_KEPT_NUMBERS + 1, 1, False, "scan"),
+        (1, 0, thresholds.MAX_COLUMN_ORDER + 1, True, "scan"),
+    ],
+)
+def test_many_numbers_are_differentiated_in_reverse_mode(columns, kept, order, reverses, expected):
+    sizes = DerivativeSizes(lambda: kept, order=order, columns=columns, reverses=reverses)
+    assert choose_derivatives(sizes) == expected

@@ -1,11 +1,11 @@
-/* Runs all blocks of W runs through all steps, on several threads.  The generated part gives CONSTANTS, LEAVES, FLOATS, INTS, COLUMNS
-   (sizes), record_arrays, shared_constants, shared_signals (a table of what only time decides) and advance (W runs over some steps).
+/* Runs all blocks of W runs through all steps, on several threads.  The generated part gives CONSTANTS, LEAVES, FLOATS, INTS, COLUMNS,
+   SERIES (sizes), record_arrays, shared_constants, shared_signals (a table of what only time decides) and advance (W runs over some steps).
 
    A group of blocks goes through all steps before the next one, a stretch of steps at a time: its states and the stretch's table stay
    in the cache; the caller says how many (STRETCH, GROUP).  A block that has fewer than W runs repeats its last one; the copies are not written back. */
 
 typedef struct {
-  const real *shared, *leaves, *floats_in;
+  const real *shared, *leaves, *floats_in, *series;
   const int32_t *ints_in;
   real *floats_out;
   record_arrays records;
@@ -22,15 +22,6 @@ typedef struct {
   F floats[GROUP][FLOATS + 1];
   I ints[GROUP][INTS + 1];
 } workspace;
-
-static inline int64_t at_most(int64_t a, int64_t b) { return a < b ? a : b; }
-
-static F gather_f(const real *row, int64_t run, int64_t runs) {
-  F x;
-  if (run + W <= runs) return load(row + run);
-  for (int l = 0; l < W; l++) x[l] = row[at_most(run + l, runs - 1)];
-  return x;
-}
 
 static void read_block(const job *j, workspace *w, int g, int64_t run) {
   for (int i = 0; i < LEAVES; i++) w->leaves[g][i] = gather_f(j->leaves + i * j->runs, run, j->runs);
@@ -56,7 +47,7 @@ static void run_group(const job *j, workspace *w, int64_t group) {
     for (int g = 0; g < blocks; g++) {
       int64_t run = (first_block + g) * W;
       advance(w->constants, w->leaves[g], w->floats[g], w->ints[g], w->table, count, j->first + done, j->every, j->records,
-              j->runs, run);
+              j->series + (j->steps - 1 - done) * SERIES * j->runs, j->runs, run);
     }
   }
   for (int g = 0; g < blocks; g++) write_block(j, w, g, (first_block + g) * W);
@@ -94,10 +85,10 @@ static void run_all(job *j, int64_t threads) {
 }
 
 /* Operands: shared (1, n), leaves (LEAVES, runs), floats (FLOATS, runs), ints (INTS, runs), settings (1, 4) = first step, steps, record
-   every, threads.  Results: floats, ints, and the recorded arrays (rows or more, numbers * runs). */
+   every, threads; if a step reads a series, its rows (steps or more, SERIES * runs).  Results: floats, ints, and the recorded arrays (rows or more, numbers * runs). */
 extern "C" __attribute__((visibility("default"))) XLA_FFI_Error *iblf_jax_kernel(XLA_FFI_CallFrame *frame) {
   if (is_question(frame)) return NULL;
-  if (frame->args.size != 5 || frame->rets.size != 2 + RECORDED) return failure(frame, "iblf_jax kernel: wrong number of operands");
+  if (frame->args.size != 5 + (SERIES > 0) || frame->rets.size != 2 + RECORDED) return failure(frame, "iblf_jax kernel: wrong number of operands");
   XLA_FFI_Buffer **in = (XLA_FFI_Buffer **)frame->args.args, **out = (XLA_FFI_Buffer **)frame->rets.rets;
   if (in[2]->rank != 2 || in[4]->rank != 2) return failure(frame, "iblf_jax kernel: wrong rank");
   int64_t runs = in[2]->dims[1];
@@ -108,8 +99,11 @@ extern "C" __attribute__((visibility("default"))) XLA_FFI_Error *iblf_jax_kernel
   int64_t rows = j.every > 0 ? (j.steps + j.every - 1) / j.every : 0;
   if (!has_shape(in[0], 1, SHARED_LEAVES) || !has_shape(in[1], LEAVES, runs) || !has_shape(in[2], FLOATS, runs) ||
       !has_shape(in[3], INTS, runs) || !has_shape(in[4], 1, 4) || !has_shape(out[0], FLOATS, runs) || !has_shape(out[1], INTS, runs) ||
-      !has_records(out + 2, rows, runs))
+      !has_records(out + 2, rows, runs) ||
+      (SERIES > 0 && (in[5]->rank != 2 || in[5]->dims[0] < j.steps || in[5]->dims[1] != SERIES * runs)))
     return failure(frame, "iblf_jax kernel: wrong shapes");
+  static const real nothing[1] = {0};
+  j.series = SERIES > 0 ? (const real *)in[SERIES > 0 ? 5 : 0]->data : nothing;
   j.shared = (const real *)in[0]->data; j.leaves = (const real *)in[1]->data; j.floats_in = (const real *)in[2]->data;
   j.ints_in = (const int32_t *)in[3]->data; j.floats_out = (real *)out[0]->data; j.ints_out = (int32_t *)out[1]->data;
   /* Samples are numbered from step 0 on; the arrays begin at the one of the first step. */

@@ -32,7 +32,7 @@ iblf_jax_advance(const word *__restrict__ constants, const word *__restrict__ ta
   for (int i = 0; i < FLOATS; i++) floats[i] = floats_in[i * runs + run];
 #pragma unroll
   for (int i = 0; i < INTS; i++) ints[i] = ints_in[i * runs + run];
-  advance(constants, leaves, floats, ints, table, (int)count, first, every, records, runs, run);
+  advance(constants, leaves, floats, ints, table, (int)count, first, every, records, 0, runs, run);
 #pragma unroll
   for (int i = 0; i < FLOATS; i++) floats_out[i * runs + run] = floats[i];
 #pragma unroll
