@@ -28,8 +28,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.core.devices import default_devices, user_default
+from iblf_jax.core.devices import default_devices
 from iblf_jax.core.status import Status, flag
+from iblf_jax.core.thread_options import with_options_of_caller
 from iblf_jax.engine import block_size, blocks_in_flight, wait_until_ready
 from iblf_jax.studies.dataset import DRAWN
 from iblf_jax.studies.draws import CaseInputs
@@ -135,7 +136,6 @@ def run_blocks(
     if not first_blocks:
         return
     devices = devices[: len(first_blocks)]
-    default_device = user_default()
     execute = partial(_execute, program=prepared.program, record_every=record_every)
     copies = [jax.device_put(prepared.shared, device) for device in devices]
     if len(devices) > 1:
@@ -146,8 +146,7 @@ def run_blocks(
         """The results of a block on the device of this number, and the bytes that it took."""
         cases = np.arange(block * block_size(), (block + 1) * block_size())
         inputs = jax.device_put(prepared.inputs_of(cases), devices[device])
-        with jax.default_device(default_device):  # JAX keeps it for each thread
-            out = execute(copies[device], inputs)
+        out = execute(copies[device], inputs)
         wait_until_ready(out)
         return jax.tree.map(np.asarray, out), sum(x.nbytes for x in jax.tree.leaves((inputs, out)))
 
@@ -157,11 +156,12 @@ def run_blocks(
     in_flight = blocks_in_flight(here.chunk, here.memory, bytes_taken, len(devices))
     # Each block in flight has a thread, which draws, starts or copies results while the block of
     # another thread is integrated.
+    compute_in_pool = with_options_of_caller(compute)
     pool = ThreadPoolExecutor(in_flight, "block")
     waiting = deque[tuple[int, Future]]()
     try:
         for k, block in enumerate(itertools.chain(first_blocks[1:], remaining), start=1):
-            waiting.append((block, pool.submit(compute, block, k % len(devices))))
+            waiting.append((block, pool.submit(compute_in_pool, block, k % len(devices))))
             if len(waiting) == in_flight:
                 block, future = waiting.popleft()
                 yield block, future.result()[0]
@@ -181,7 +181,7 @@ def _compile(execute: partial, copies: list[SharedInputs], inputs: list[CaseInpu
         program.lower(shared, inputs, **options).compile()
 
     with ThreadPoolExecutor(len(copies)) as pool:
-        list(pool.map(compile_on_device, copies, inputs))
+        list(pool.map(with_options_of_caller(compile_on_device), copies, inputs))
 
 
 def run_spans_here(

@@ -35,7 +35,7 @@ from typing import Any, NamedTuple
 
 import jax
 
-from iblf_jax.core import devices
+from iblf_jax.core import devices, thread_options
 from iblf_jax.core.caches import CACHE
 from iblf_jax.core.pytree import is_component_class, register_component
 from iblf_jax.engine import uses_host_compiler
@@ -70,6 +70,8 @@ class WorkerTask(NamedTuple):
 
     prepared: PreparedStudy
     store: SharedStore | None
+    jax_options: dict[str, Any]
+    """Options of JAX of the client's thread (`core.thread_options`)."""
 
 
 def initialize_worker(x64: bool = True, threads: int | None = 1) -> None:
@@ -202,7 +204,8 @@ def run_task(payload: bytes, first: int, last: int) -> BlockResults | None:
         unit = first // store.unit
         if store.marks()[unit] and store.read(unit) is not None:
             return None
-    ((_, results),) = run_spans_here(task.prepared, [slice(first, last)], ThisProcess())
+    with thread_options.applied(task.jax_options):
+        ((_, results),) = run_spans_here(task.prepared, [slice(first, last)], ThisProcess())
     if store is None:
         return results
     store.write(unit, named_arrays(results))
@@ -244,7 +247,7 @@ def run_on_workers(
       WorkerError: a worker was lost, or its environment differs from the client's.
       ValueError: the study cannot be sent to another process.
     """
-    payload = packed(WorkerTask(prepared, store))
+    payload = packed(WorkerTask(prepared, store, thread_options.of_any_process()))
     remaining, waiting = iter(spans), dict[Future, slice]()
     try:
         while True:

@@ -176,16 +176,18 @@ def test_time_is_scanned_in_one_place():
 def test_the_session_is_left_alone():
     """jax.config belongs to the user: the command line, a program of its own, sets it, and the
     cache of compiled programs its fields; `initialize_worker` sets it where a user calls it in a
-    worker's process; which device is the default is read."""
+    worker's process; the options of a thread are read."""
     users = {
         p.relative_to(PACKAGE): text for p, text in SOURCES.items() if calls(text, "jax.config")
     }
     assert {p for p in users if p.parts[0] != "cli"} == {
         Path("core/disk_cache.py"),
         Path("core/devices.py"),
+        Path("core/thread_options.py"),
         Path("studies/workers.py"),
     }
-    assert not calls(users[Path("core/devices.py")], "jax.config.update")
+    for reader in ("core/devices.py", "core/thread_options.py"):
+        assert not calls(users[Path(reader)], "jax.config.update")
 
 
 def test_no_prints_and_no_star_imports():
