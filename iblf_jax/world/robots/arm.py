@@ -32,6 +32,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.linalg import sums_from, sums_to, symmetric
 from iblf_jax.core.optional import attributes
 from iblf_jax.core.pytree import Leaf, component, leaf, static
 from iblf_jax.world.robots import spatial
@@ -290,7 +291,7 @@ class Arm:
         return spatial.Bodies(
             p + spatial.apply(R, self.centre),
             spatial.with_last(self.mass[:, None], load[3:, 3]),
-            spatial.symmetric(turned),
+            symmetric(turned),
             spatial.apply(R[-1], load[:3, 3]),
         )
 
@@ -340,12 +341,11 @@ class Arm:
     def mass_matrix(self, q: jax.Array) -> jax.Array:
         """M(q), (n, n) [kg m^2]."""
         frames = self._frames(q)
-        composite = spatial.Inertia(*map(_suffix_sums, spatial.inertia(self._bodies(frames))))
+        composite = spatial.Inertia(*map(sums_from, spatial.inertia(self._bodies(frames))))
         S = frames.motion_subspaces
         upper = jnp.sum(S[:, None] * spatial.momentum(composite, S), axis=(-1, -2))
-        above, diagonal = np.triu(np.ones((self.n, self.n), bool)), np.eye(self.n, dtype=bool)
-        return jnp.where(above, upper, upper.T) + jnp.where(
-            diagonal, self.armature, jnp.zeros_like(upper)
+        return symmetric(upper) + jnp.where(
+            np.eye(self.n, dtype=bool), self.armature, jnp.zeros_like(upper)
         )
 
     def coriolis(self, q: jax.Array, v: jax.Array, u: jax.Array) -> jax.Array:
@@ -380,7 +380,7 @@ class Arm:
         """G(q), (n,) [N m]: the weight of all links beyond each joint."""
         frames = self._frames(q)
         links = spatial.inertia(self._bodies(frames))
-        first, mass = _suffix_sums(links.first), _suffix_sums(links.mass)
+        first, mass = sums_from(links.first), sums_from(links.mass)
         weight = jnp.stack([spatial.cross(first, self.g), mass * self.g], axis=1)
         return -jnp.sum(frames.motion_subspaces * weight, axis=(-1, -2))
 
@@ -393,26 +393,11 @@ def _numbered(word: str, n: int) -> tuple[str, ...]:
     return tuple(f"{word}{i + 1}" for i in range(n))
 
 
-def _prefix_sums(rows: jax.Array) -> jax.Array:
-    """Row i: the sum of rows 0 to i, (n, ...), over the joints that move link i.
-
-    It is written for a scalar program, in which each sum continues the one before.
-    """
-    n = rows.shape[0]
-    chosen = np.tril(np.ones((n, n), bool)).reshape((n, n) + (1,) * (rows.ndim - 1))
-    return jnp.sum(jnp.where(chosen, rows, jnp.zeros_like(rows)), axis=1)
-
-
-def _suffix_sums(rows: jax.Array) -> jax.Array:
-    """Row i: the sum of rows i to n - 1, (n, ...), over the links that joint i moves."""
-    return jnp.flip(_prefix_sums(jnp.flip(rows, 0)), 0)
-
-
 def _velocities(S: jax.Array, speeds: jax.Array) -> jax.Array:
     """J_i u, the motion of every link when the joints move at `speeds`, (n, 2, 3)."""
-    return _prefix_sums(S * speeds[:, None, None])
+    return sums_to(S * speeds[:, None, None])
 
 
 def _joint_torques(S: jax.Array, forces: jax.Array) -> jax.Array:
     """sum_i J_i^T F_i, (n,): the joint torques that correspond to wrenches on the links."""
-    return jnp.sum(S * _suffix_sums(forces), axis=(-1, -2))
+    return jnp.sum(S * sums_from(forces), axis=(-1, -2))

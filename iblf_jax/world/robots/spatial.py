@@ -29,6 +29,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.core.linalg import symmetric
+
 
 class Inertia(NamedTuple):
     """Moments of m bodies in the world's frame."""
@@ -132,15 +134,6 @@ def chained(steps: jax.Array) -> jax.Array:
     for step in steps[1:]:
         placed.append(joined(placed[-1], step))
     return jnp.stack(placed)
-
-
-def symmetric(matrix: jax.Array) -> jax.Array:
-    """The matrix with its upper triangle in place of the lower one, (..., k, k).
-
-    A scalar program then computes the upper triangle only.
-    """
-    above = np.triu(np.ones(matrix.shape[-2:], bool))
-    return jnp.where(above, matrix, jnp.swapaxes(matrix, -1, -2))
 
 
 def rotational_inertia(second: jax.Array) -> jax.Array:
