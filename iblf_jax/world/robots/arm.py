@@ -350,15 +350,40 @@ class Arm:
 
     def coriolis(self, q: jax.Array, v: jax.Array, u: jax.Array) -> jax.Array:
         """C(q, v) u, (n,) [N m], with the C of the Christoffel symbols."""
+        return self._inertial_torque(q, v, u, None)
+
+    def inverse_dynamics(
+        self, q: jax.Array, v: jax.Array, u: jax.Array, acceleration: jax.Array
+    ) -> jax.Array:
+        """C(q, v) u + G + M acceleration, (n,) [N m], without M."""
+        return self._inertial_torque(q, v, u, acceleration) + self.gravity(q)
+
+    def _inertial_torque(
+        self, q: jax.Array, v: jax.Array, u: jax.Array, acceleration: jax.Array | None
+    ) -> jax.Array:
+        """C(q, v) u + M acceleration, (n,) [N m]; None for no acceleration."""
         frames = self._frames(q)
         S, bodies = frames.motion_subspaces, self._bodies(frames)
-        V = _velocities(S, v)
-        carried = _velocities(spatial.motion_cross(V, S), u)
-        if u is v:  # the usual case
-            return _joint_torques(S, spatial.inertial_forces(bodies, carried, [(V, V)]))
-        U = _velocities(S, u)
-        mean = carried - 0.5 * spatial.motion_cross(V, U)
-        return _joint_torques(S, spatial.inertial_forces(bodies, mean, [(V, U), (U, V)]))
+        V = U = _velocities(S, v)
+        rates = _velocities(spatial.motion_cross(V, S), u)
+        pairs = [(V, V)]
+        if u is not v:
+            U = _velocities(S, u)
+            rates = rates - 0.5 * spatial.motion_cross(V, U)
+            pairs = [(V, U), (U, V)]
+        torque = jnp.zeros_like(q)
+        if acceleration is not None:
+            rates = rates + _velocities(S, acceleration)
+            torque = self.armature * acceleration
+        return torque + _joint_torques(S, spatial.inertial_forces(bodies, rates, pairs))
+
+    @traced_once
+    def momentum(self, q: jax.Array, v: jax.Array) -> jax.Array:
+        """M(q) v, (n,) [N m s], without M."""
+        frames = self._frames(q)
+        S = frames.motion_subspaces
+        links = spatial.momenta(self._bodies(frames), _velocities(S, v))
+        return _joint_torques(S, links) + self.armature * v
 
     @traced_once
     def energy_gradient(self, q: jax.Array, v: jax.Array) -> jax.Array:

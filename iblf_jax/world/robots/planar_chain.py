@@ -12,8 +12,8 @@ and M = S^T H S with phi = S q.  An entry above the diagonal is a product of one
 link, so that sums along the chain give M v, C v and the inverse dynamics in O(n) operations, with
 w = S v as the angular velocities:
 
-    (H a + C)_i = d_i a_i + l_i E_i . sum_{j>i} b_j x_j + b_i E_i . sum_{j<i} l_j x_j,
-    x_j = E_j a_j - e_j w_j^2
+    (H a + C)_i = d_i a_i - l_i E_i . sum_{j>i} b_j x_j - b_i E_i . sum_{j<i} l_j x_j,
+    x_j = e_j w_j^2 - E_j a_j
 
     U = g sum_i b_i sin phi_i
 
@@ -63,7 +63,7 @@ class Lumped(NamedTuple):
 
 
 def _along_and_across(q: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """e and E of the links, (2, n) each."""
+    """The unit vectors e and E of the links, (2, n) each."""
     phi = sums_to(q)
     c, s = jnp.cos(phi), jnp.sin(phi)
     return jnp.stack([c, s]), jnp.stack([-s, c])
@@ -128,7 +128,7 @@ class PlanarChain:
         along, beyond = lumped.length * e, sums_from(lumped.first * e, axis=1)
         # Row i, column j: l_i e_i . W_j.
         products = jnp.sum(along[:, :, None] * beyond[:, None, :], axis=0)
-        differences = jnp.where(np.triu(np.ones((self.n, self.n)), 1), products, 0.0)
+        differences = jnp.where(np.triu(np.ones((self.n, self.n), bool), 1), products, 0.0)
         next_joint = jnp.sum(along[:, :-1] * beyond[:, 1:], axis=0)
         twice = jnp.concatenate([2.0 * next_joint, jnp.zeros((1,), q.dtype)])
         diagonal = sums_from(lumped.second + twice)
@@ -140,11 +140,21 @@ class PlanarChain:
         e, E = _along_and_across(q)
         return -sums_from(self._lumped().across(E, sums_to(v) * sums_to(u) * e))
 
+    def inverse_dynamics(
+        self, q: jax.Array, v: jax.Array, u: jax.Array, acceleration: jax.Array
+    ) -> jax.Array:
+        """C(q, v) u + G + M acceleration, (n,) [N m], without M."""
+        lumped, a = self._lumped(), sums_to(acceleration)
+        e, E = _along_and_across(q)
+        weight = self.g * lumped.first * e[0]
+        opposite = sums_to(v) * sums_to(u) * e - a * E
+        return sums_from(lumped.second * a - lumped.across(E, opposite) + weight)
+
     def momentum(self, q: jax.Array, v: jax.Array) -> jax.Array:
-        """M(q) v, (n,) [N m s]."""
+        """M(q) v, (n,) [N m s], without M."""
         lumped, w = self._lumped(), sums_to(v)
-        E = _along_and_across(q)[1]
-        return sums_from(lumped.second * w + lumped.across(E, w * E))
+        e = _along_and_across(q)[0]
+        return sums_from(lumped.second * w + lumped.across(e, w * e))
 
     def energy_gradient(self, q: jax.Array, v: jax.Array) -> jax.Array:
         """dT/dq with T = 1/2 v^T M v, (n,) [N m]."""
@@ -166,4 +176,3 @@ class PlanarChain:
     def skeleton(self, q: jax.Array) -> jax.Array:
         """Base, joints and tip, (n + 1, 2) [m]."""
         return planar_skeleton(self.length, q)
-
