@@ -12,6 +12,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 
 def matvec(matrix: jax.Array, vector: jax.Array) -> jax.Array:
@@ -43,6 +44,29 @@ def matmul_in_order(left: jax.Array, right: jax.Array) -> jax.Array:
 def inner(u: jax.Array, v: jax.Array) -> jax.Array:
     """u^T v, (), for two (n,) vectors."""
     return jnp.sum(u * v)
+
+
+def sums_to(rows: jax.Array, axis: int = 0) -> jax.Array:
+    """Entry i: the sum of the entries 0 to i along an axis, such as those of the joints that move
+    link i.
+    """
+    return jax.lax.cumsum(rows, axis)
+
+
+def sums_from(rows: jax.Array, axis: int = 0) -> jax.Array:
+    """Entry i: the sum of the entries from i on along an axis, such as those of the links that
+    joint i moves.
+    """
+    return jax.lax.cumsum(rows, axis, reverse=True)
+
+
+def symmetric(matrix: jax.Array) -> jax.Array:
+    """The matrix with its upper triangle in place of the lower one, (..., k, k).
+
+    A scalar program then computes the upper triangle only.
+    """
+    above = np.triu(np.ones(matrix.shape[-2:], bool))
+    return jnp.where(above, matrix, jnp.swapaxes(matrix, -1, -2))
 
 
 def _factors(matrix: jax.Array) -> tuple[list[list[jax.Array]], list[jax.Array]]:

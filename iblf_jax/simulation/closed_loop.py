@@ -33,7 +33,7 @@ from iblf_jax.control.controllers._base import law_member, state_of_levels
 from iblf_jax.control.observers._base import observer_member
 from iblf_jax.control.sensors import Measurement
 from iblf_jax.control.sensors._base import unrounded
-from iblf_jax.core.linalg import inner, matvec
+from iblf_jax.core.linalg import inner
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.time import as_at
 from iblf_jax.simulation.delays import initial_commands
@@ -61,6 +61,7 @@ from iblf_jax.simulation.signals import Sample
 from iblf_jax.world import plants
 from iblf_jax.world.bounds import bounds_at
 from iblf_jax.world.regions import margins
+from iblf_jax.world.robots import inverse_dynamics, momentum
 
 # --- the state ---------------------------------------------------------------------------------
 
@@ -421,19 +422,18 @@ def _robot_uncertain_signals(
 ) -> _UncertainSignals:
     """The signals of a model that is a robot: f of (2.1) and V2 of (3.12)."""
     model = scenario.model
-    M0, G0 = model.mass_matrix(q), model.gravity(q)
-    balance = G0
+    balance = model.gravity(q)
     if not isinstance(signals.torque, tuple):
         # The plant has another input than the torque of the law.
         tau, balance = signals.torque, steady_input(scenario, q)
-    f = matvec(M0, moved.ddq) + model.coriolis(q, dq, dq) + G0 - tau
+    f = inverse_dynamics(model, q, dq, dq, moved.ddq) - tau
     f_hat = estimate_as_torque(model, q, signals.f_hat)
     e2, f_tilde = dq - signals.alpha, f - f_hat
     V = jnp.sum(signals.V1)
     if law_member(unwrapped(scenario.controller), "includes_e2"):
         V = V + 0.5 * inner(f_tilde, f_tilde)
     else:
-        V = V + 0.5 * (inner(e2, matvec(M0, e2)) + inner(f_tilde, f_tilde))
+        V = V + 0.5 * (inner(e2, momentum(model, q, e2)) + inner(f_tilde, f_tilde))
     return _UncertainSignals(balance, f, f_hat, V)
 
 

@@ -17,12 +17,12 @@ from iblf_jax.control.observers import NoObserver
 from iblf_jax.control.observers._base import observer_member
 from iblf_jax.control.sensors._base import Measurement, sensor_member
 from iblf_jax.core import taylor
-from iblf_jax.core.linalg import matvec, solve_spd
+from iblf_jax.core.linalg import solve_spd
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.time import as_at
 from iblf_jax.world import plants
 from iblf_jax.world.disturbances import rates_of
-from iblf_jax.world.robots import at_time, friction_torque
+from iblf_jax.world.robots import at_time, friction_torque, inverse_dynamics, momentum
 
 # --- the start ------------------------------------------------------------------------------------
 
@@ -317,8 +317,7 @@ def torque_needed(
     plant = at_time(scenario.plant, t)
     external = scenario.disturbance.torque(t, q, dq, plant, scenario.model)
     passive = external + friction_torque(plant, dq)
-    inertial = matvec(plant.mass_matrix(q), ddq)
-    return inertial + plant.coriolis(q, dq, dq) + plant.gravity(q) - passive
+    return inverse_dynamics(plant, q, dq, dq, ddq) - passive
 
 
 # --- the uncertain term ---------------------------------------------------------------------------
@@ -351,4 +350,4 @@ def estimate_as_torque(model: Any, q: jax.Array, estimate: jax.Array) -> jax.Arr
     """An estimate as the torque f_hat, (n,) [N m], of a model that is a robot: M0 d_hat_2."""
     if estimate.ndim == 1:
         return estimate
-    return matvec(model.mass_matrix(q), estimate[1])
+    return momentum(model, q, estimate[1])

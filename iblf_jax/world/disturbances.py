@@ -26,7 +26,7 @@ from iblf_jax.core.optional import OptionalMembers
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.core.time import joined, jump_times_of, no_times
 from iblf_jax.core.units import TORQUE, VELOCITY, PlantUnit, Unit
-from iblf_jax.world.robots import Robot
+from iblf_jax.world.robots import Robot, momentum
 
 
 class Disturbance(Protocol):
@@ -126,7 +126,7 @@ class ModelShaped:
         b = self.velocity_amplitude * jnp.sin(
             self.velocity_frequency * t + self.velocity_phase + self.phase
         )
-        return matvec(model.mass_matrix(q), a) + model.coriolis(q, dq, b)
+        return momentum(model, q, a) + model.coriolis(q, dq, b)
 
     jump_times = _never
 

@@ -16,7 +16,6 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.control.decays import Decay, Exponential
-from iblf_jax.core.linalg import matvec
 from iblf_jax.core.optional import OptionalMembers
 from iblf_jax.core.pytree import layers
 from iblf_jax.world.bounds import Bounds, Tube, speed_limits_at, tube_at
@@ -300,14 +299,6 @@ def decay_of(law: Any, i: int) -> Decay:
     if not decays:
         return Exponential()
     return decays[i]  # type: ignore[no-any-return]
-
-
-def rigid_body_torque(
-    model: Robot, q: jax.Array, dq: jax.Array, v: jax.Array, acceleration: jax.Array
-) -> jax.Array:
-    """C0 v + G0 + M0 acceleration, (n,) [N m]."""
-    coriolis, gravity = model.coriolis(q, dq, v), model.gravity(q)
-    return coriolis + gravity + matvec(model.mass_matrix(q), acceleration)
 
 
 class LyapunovLaw(Protocol):

@@ -53,11 +53,12 @@ from iblf_jax.control.controllers._base import (
 from iblf_jax.control.decays._base import decay_member
 from iblf_jax.core import checks
 from iblf_jax.core.component_paths import member_of, replaced, resolve
-from iblf_jax.core.linalg import inner, matvec, solve_spd
+from iblf_jax.core.linalg import inner, solve_spd
 from iblf_jax.core.pytree import Leaf, component, leaf, static
 from iblf_jax.core.time import as_at
 from iblf_jax.core.units import PlantUnit, of_entry
 from iblf_jax.world import plants
+from iblf_jax.world.robots import inverse_dynamics
 
 SHARE_OF_BAND = 0.05
 """Width of the projection's band in that of the box, if none is given."""
@@ -371,8 +372,7 @@ class AdaptiveParameters:
         q, dq = measured
         driving = command.tau + disturbance
         ddq = _acceleration(context.model, q, dq, driving)
-        model = true.model
-        needed = matvec(model.mass_matrix(q), ddq) + model.coriolis(q, dq, dq) + model.gravity(q)
+        needed = inverse_dynamics(true.model, q, dq, dq, ddq)
         return inner(command.input_slope, needed - command.tau)
 
     def true_parameters(self, t: jax.Array, context: LawContext) -> jax.Array:

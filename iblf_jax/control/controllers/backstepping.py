@@ -43,7 +43,6 @@ from iblf_jax.control.controllers._base import (
     LawContext,
     decay_of,
     no_state,
-    rigid_body_torque,
 )
 from iblf_jax.control.decays import Decay
 from iblf_jax.control.decays._base import (
@@ -52,9 +51,10 @@ from iblf_jax.control.decays._base import (
     gain_at,
 )
 from iblf_jax.core import checks
-from iblf_jax.core.linalg import inner, matvec
+from iblf_jax.core.linalg import inner
 from iblf_jax.core.pytree import Leaf, component, leaf, static
 from iblf_jax.world.bounds import Tube
+from iblf_jax.world.robots import inverse_dynamics, momentum
 
 READINGS = ("printed", "corrected")
 
@@ -151,7 +151,7 @@ class Backstepping:
         alpha, dalpha = alpha_and_rate(self, t, q, dq, context)
         tube = context.tube(t)
         v = alpha if self.reading == "corrected" else dq
-        feedforward = rigid_body_torque(context.model, q, dq, v, dalpha)
+        feedforward = inverse_dynamics(context.model, q, dq, v, dalpha)
         tau = feedforward - f_hat - self.K2 * (dq - alpha)
         tau = tau - self.weight * self.barrier.slope(tube, q)
         tau = with_energy_decay(self, t, q, dq - alpha, context, tau)
@@ -162,7 +162,7 @@ class Backstepping:
         """V1 + 1/2 e2^T M0 e2, () [N m rad]."""
         e2 = dq - virtual_velocity(self, t, q, context)
         V1 = self.weight * self.barrier.value(context.tube(t), q)
-        return jnp.sum(V1) + 0.5 * inner(e2, matvec(context.model.mass_matrix(q), e2))
+        return jnp.sum(V1) + 0.5 * inner(e2, momentum(context.model, q, e2))
 
     def energy_decay(
         self, t: jax.Array, q: jax.Array, dq: jax.Array, context: LawContext
@@ -261,8 +261,8 @@ def with_energy_decay(
     decay = decay_of(law, 1)
     if decay_member(decay, "constant"):
         return tau
-    momentum = matvec(context.model.mass_matrix(q), e2)
-    return tau - energy_gain(decay, t, 0.5 * inner(e2, momentum), e2) * momentum
+    of_error = momentum(context.model, q, e2)
+    return tau - energy_gain(decay, t, 0.5 * inner(e2, of_error), e2) * of_error
 
 
 def virtual_velocity(law, t: jax.Array, q: jax.Array, context: LawContext) -> jax.Array:

@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.control.controllers._base import Command, LawContext, no_state
-from iblf_jax.core.linalg import matvec
 from iblf_jax.core.pytree import Leaf, component, leaf
+from iblf_jax.world.robots import inverse_dynamics
 
 
 @component
@@ -47,7 +47,7 @@ class ComputedTorque:
         """The torque and what belongs to it."""
         tube, model = context.tube(t), context.model
         e1, de1 = q - tube.q_d, dq - tube.dq_d
-        accelerate = matvec(model.mass_matrix(q), tube.ddq_d - self.Kd * de1 - self.Kp * e1)
-        tau = accelerate + model.coriolis(q, dq, dq) + model.gravity(q) - f_hat
+        acceleration = tube.ddq_d - self.Kd * de1 - self.Kp * e1
+        tau = inverse_dynamics(model, q, dq, dq, acceleration) - f_hat
         never = jnp.zeros(q.shape, bool)
         return Command(tau, tube.dq_d, 0.5 * self.Kp * e1**2, never, never), ()

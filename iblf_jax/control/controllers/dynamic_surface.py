@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.control.barriers import Barrier, Integral
-from iblf_jax.control.controllers._base import Command, LawContext, rigid_body_torque
+from iblf_jax.control.controllers._base import Command, LawContext
 from iblf_jax.control.controllers.backstepping import (
     barrier_command,
     check_barrier,
@@ -33,6 +33,7 @@ from iblf_jax.control.controllers.backstepping import (
 )
 from iblf_jax.control.decays import Decay
 from iblf_jax.core.pytree import Leaf, component, leaf
+from iblf_jax.world.robots import inverse_dynamics
 
 
 @component
@@ -94,7 +95,7 @@ class DynamicSurface:
         tube, beta = context.tube(t), state
         dbeta = (virtual_velocity(self, t, q, context) - beta) / self.filter
         centre, rate = context.shifted(beta, dbeta)
-        feedforward = rigid_body_torque(context.model, q, dq, centre, rate)
+        feedforward = inverse_dynamics(context.model, q, dq, centre, rate)
         tau = feedforward - f_hat - self.K2 * (dq - centre)
         tau = tau - self.weight * self.barrier.slope(tube, q)
         tau = with_energy_decay(self, t, q, dq - centre, context, tau)

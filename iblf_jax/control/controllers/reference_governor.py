@@ -30,8 +30,9 @@ from iblf_jax.control.controllers._base import Command, Controller, LawContext, 
 from iblf_jax.control.controllers.computed_torque import ComputedTorque
 from iblf_jax.control.controllers.pd_gravity import PDGravity
 from iblf_jax.core import checks
-from iblf_jax.core.linalg import inner, matvec
+from iblf_jax.core.linalg import inner
 from iblf_jax.core.pytree import Leaf, component, leaf
+from iblf_jax.world.robots import momentum
 
 
 class GovernorState(NamedTuple):
@@ -111,10 +112,10 @@ class ReferenceGovernor:
     def energy(self, q: jax.Array, dq: jax.Array, g: jax.Array, context: LawContext) -> jax.Array:
         """V, () [N m for PD, rad^2/s^2 for computed torque]."""
         law: Any = self.law
-        momentum = dq
+        weighted = dq
         if isinstance(law, PDGravity):
-            momentum = matvec(context.model.mass_matrix(q), dq)
-        return 0.5 * (inner(dq, momentum) + jnp.sum(law.Kp * (q - g) ** 2))
+            weighted = momentum(context.model, q, dq)
+        return 0.5 * (inner(dq, weighted) + jnp.sum(law.Kp * (q - g) ** 2))
 
     def level(self, t: jax.Array, g: jax.Array, context: LawContext) -> jax.Array:
         """Gamma, () in the unit of V; 0 for a g outside."""

@@ -37,11 +37,11 @@ from iblf_jax.control.controllers._base import (
     Command,
     LawContext,
     no_state,
-    rigid_body_torque,
 )
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.world.bounds import Tube
+from iblf_jax.world.robots import inverse_dynamics
 
 BEYOND_LAYER = 1e6
 """Width of the layer of `TerminalSlidingMode.unlimited`, relative to that of the law."""
@@ -108,7 +108,7 @@ class TerminalSlidingMode:
         sigma, slope = self._surface(tube, q, dq)
         along_surface = (dq - tube.dq_d) / slope
         acceleration = tube.ddq_d - self.K * self._saturated(sigma) - along_surface
-        tau = rigid_body_torque(context.model, q, dq, dq, acceleration) - f_hat
+        tau = inverse_dynamics(context.model, q, dq, dq, acceleration) - f_hat
         never = jnp.zeros(q.shape, bool)
         return Command(tau, tube.dq_d, 0.5 * sigma**2, never, never), ()
 

@@ -13,8 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.core.linalg import matvec
-from iblf_jax.world.robots import Robot
+from iblf_jax.world.robots import Robot, momentum
 
 STARTS = ("zero", "matched")
 
@@ -40,14 +39,14 @@ def initial_eta(observer: Any, q: jax.Array, dq: jax.Array, model: Robot) -> jax
     eta0 = jnp.broadcast_to(observer.eta0, q.shape)
     if observer.start == "zero":
         return eta0
-    return eta0 - observer.kf * matvec(model.mass_matrix(q), dq)
+    return eta0 - observer.kf * momentum(model, q, dq)
 
 
 def eta_and_momentum(
     observer: Any, t: jax.Array, q: jax.Array, dq: jax.Array, model: Robot, state: jax.Array
 ) -> jax.Array:
     """f_hat = eta + kf M0 q', (n,) [N m]."""
-    return state + observer.kf * matvec(model.mass_matrix(q), dq)
+    return state + observer.kf * momentum(model, q, dq)
 
 
 def advanced_eta(

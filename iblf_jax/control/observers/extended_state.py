@@ -14,9 +14,8 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.core import checks
-from iblf_jax.core.linalg import matvec
 from iblf_jax.core.pytree import Leaf, component, leaf
-from iblf_jax.world.robots import Robot, energy_gradient
+from iblf_jax.world.robots import Robot, energy_gradient, momentum
 
 
 class ExtendedStateValues(NamedTuple):
@@ -74,7 +73,7 @@ class ExtendedState:
 
     def init(self, q: jax.Array, dq: jax.Array, model: Robot) -> ExtendedStateValues:
         """The measured momentum, and no estimate yet."""
-        return ExtendedStateValues(matvec(model.mass_matrix(q), dq), jnp.zeros_like(q))
+        return ExtendedStateValues(momentum(model, q, dq), jnp.zeros_like(q))
 
     def estimate(
         self, t: jax.Array, q: jax.Array, dq: jax.Array, model: Robot, state: ExtendedStateValues
@@ -93,7 +92,7 @@ class ExtendedState:
     ) -> ExtendedStateValues:
         """p_hat' and f_hat'."""
         l1, l2 = self._gains
-        innovation = matvec(model.mass_matrix(q), dq) - state.p_hat
+        innovation = momentum(model, q, dq) - state.p_hat
         drift = energy_gradient(model, q, dq) - model.gravity(q)
         return ExtendedStateValues(tau + drift + state.f_hat + l1 * innovation, l2 * innovation)
 

@@ -17,9 +17,8 @@ from iblf_jax.world.plants.rigid import (
     diagonal_inertia,
     inverse_mass_matrix,
     robot_acceleration,
-    torque_of,
 )
-from iblf_jax.world.robots import Robot
+from iblf_jax.world.robots import Robot, inverse_dynamics
 
 
 @component
@@ -89,7 +88,7 @@ class ElectricDrive:
         if level == 1:
             return rate
         if level == 2:
-            needed = torque_of(self.robot, x[0], x[1], rate) - torque
+            needed = inverse_dynamics(self.robot, x[0], x[1], x[1], rate) - torque
             return needed / self.torque_constant
         return self.inductance * rate + self.voltage(x[2], x[1])
 

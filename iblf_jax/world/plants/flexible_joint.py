@@ -17,9 +17,8 @@ from iblf_jax.world.plants.rigid import (
     diagonal_inertia,
     inverse_mass_matrix,
     robot_acceleration,
-    torque_of,
 )
-from iblf_jax.world.robots import Robot, WithMotors
+from iblf_jax.world.robots import Robot, WithMotors, inverse_dynamics
 
 
 @component
@@ -108,7 +107,7 @@ class FlexibleJoint:
         if level in (1, 3):
             return rate
         if level == 2:
-            needed = torque_of(self.robot, x[0], x[1], rate) - torque
+            needed = inverse_dynamics(self.robot, x[0], x[1], x[1], rate) - torque
             return x[0] + needed / self.stiffness
         return self.motor_inertia * rate + self._motor_load(x)
 

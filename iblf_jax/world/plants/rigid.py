@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.core import checks
-from iblf_jax.core.linalg import matvec, solve_spd
+from iblf_jax.core.linalg import solve_spd
 from iblf_jax.core.pytree import component
 from iblf_jax.core.time import as_at, jump_times_of
-from iblf_jax.world.robots import Robot
+from iblf_jax.world.robots import Robot, inverse_dynamics
 
 
 @component
@@ -67,7 +67,7 @@ class Rigid:
         """The velocity, or the torque, (n,), for which x_i' is `rate`."""
         if level == 1:
             return rate
-        return torque_of(self.robot, x[0], x[1], rate) - torque
+        return inverse_dynamics(self.robot, x[0], x[1], x[1], rate) - torque
 
     def transposed_gain(self, level: int, t: jax.Array, x: jax.Array, s: jax.Array) -> jax.Array:
         """G_i^T s, (n,)."""
@@ -100,12 +100,6 @@ def robot_acceleration(robot: Robot, q: jax.Array, dq: jax.Array, torque: jax.Ar
     """M^-1 (torque - C q' - G), (n,) [rad/s^2]."""
     rest = torque - robot.coriolis(q, dq, dq) - robot.gravity(q)
     return solve_spd(robot.mass_matrix(q), rest)
-
-
-def torque_of(robot: Robot, q: jax.Array, dq: jax.Array, acceleration: jax.Array) -> jax.Array:
-    """C q' + G + M acceleration, (n,) [N m]."""
-    coriolis, gravity = robot.coriolis(q, dq, dq), robot.gravity(q)
-    return coriolis + gravity + matvec(robot.mass_matrix(q), acceleration)
 
 
 def inverse_mass_matrix(robot: Robot, q: jax.Array) -> jax.Array:

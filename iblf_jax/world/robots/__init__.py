@@ -8,8 +8,10 @@ from iblf_jax.world.robots._base import coriolis_from_mass_matrix as coriolis_fr
 from iblf_jax.world.robots._base import energy_gradient as energy_gradient
 from iblf_jax.world.robots._base import friction_torque as friction_torque
 from iblf_jax.world.robots._base import from_energy as from_energy
+from iblf_jax.world.robots._base import inverse_dynamics as inverse_dynamics
 from iblf_jax.world.robots._base import joint_names as joint_names
 from iblf_jax.world.robots._base import mass_matrix_rate as mass_matrix_rate
+from iblf_jax.world.robots._base import momentum as momentum
 from iblf_jax.world.robots.arm import Arm as Arm
 from iblf_jax.world.robots.arm import Limits as Limits
 from iblf_jax.world.robots.arm import Pose as Pose
@@ -37,7 +39,9 @@ __all__ = [
     "energy_gradient",
     "friction_torque",
     "from_energy",
+    "inverse_dynamics",
     "joint_names",
     "load",
     "mass_matrix_rate",
+    "momentum",
 ]

@@ -42,9 +42,10 @@ class Robot(Protocol):
     robot as it is at time t [s], for one that changes during a run; `jump_times()`, (m,) [s], are
     the times at which it jumps, where steps of a run are divided.  `friction_torque(dq)`, (n,)
     [N m], is the friction of its joints.  These belong to the plant only: law and observer do not
-    know them, and (2.1) has them in f.  `energy_gradient(q, v)` replaces the general formula of the
-    function of this name where a member has a shorter one.  A class may name its `geometry_fields`,
-    a tuple of fields whose zeros, ones and equal numbers may be compiled in
+    know them, and (2.1) has them in f.  `energy_gradient(q, v)`, `momentum(q, v)` and
+    `inverse_dynamics(q, v, u, acceleration)` replace the general formulas of the functions of
+    these names where a member has shorter ones, such as sums along a chain.  A class may name its
+    `geometry_fields`, a tuple of fields whose zeros, ones and equal numbers may be compiled in
     (`engine.structural_constants`).
     """
 
@@ -94,6 +95,8 @@ robot_member = OptionalMembers(
     geometry_fields=(),
     friction_torque=jnp.zeros_like,
     energy_gradient=None,
+    momentum=None,
+    inverse_dynamics=None,
 )
 """Reads optional members of a robot: those that `Robot` describes, and the names, kinds and limits
 of joints that a robot from a file has."""
@@ -188,6 +191,25 @@ def energy_gradient(robot: Robot, q: jax.Array, v: jax.Array) -> jax.Array:
     if own_method is not None:
         return own_method(q, v)  # type: ignore[no-any-return]
     return matvec(mass_matrix_rate(robot, q, v), v) - robot.coriolis(q, v, v)
+
+
+def momentum(robot: Robot, q: jax.Array, v: jax.Array) -> jax.Array:
+    """M(q) v, (n,) [N m s], by the robot's own method if it has one."""
+    own_method = robot_member(robot, "momentum")
+    if own_method is not None:
+        return own_method(q, v)  # type: ignore[no-any-return]
+    return matvec(robot.mass_matrix(q), v)
+
+
+def inverse_dynamics(
+    robot: Robot, q: jax.Array, v: jax.Array, u: jax.Array, acceleration: jax.Array
+) -> jax.Array:
+    """C(q, v) u + G + M acceleration, (n,) [N m], by the robot's own method if it has one."""
+    own_method = robot_member(robot, "inverse_dynamics")
+    if own_method is not None:
+        return own_method(q, v, u, acceleration)  # type: ignore[no-any-return]
+    coriolis, gravity = robot.coriolis(q, v, u), robot.gravity(q)
+    return coriolis + gravity + matvec(robot.mass_matrix(q), acceleration)
 
 
 def from_energy(cls: type[T]) -> type[T]:

@@ -24,7 +24,6 @@ is part of f in (2.1).
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
 from functools import partial
 from typing import ClassVar, NamedTuple
 
@@ -33,6 +32,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.linalg import sums_from, sums_to, symmetric
 from iblf_jax.core.optional import attributes
 from iblf_jax.core.pytree import Leaf, component, leaf, static
 from iblf_jax.world.robots import spatial
@@ -279,16 +279,32 @@ class Arm:
         return Frames(H, jnp.stack([w, v], axis=1))
 
     @traced_once
-    def _bodies(self, frames: Frames) -> tuple[jax.Array, jax.Array]:
-        """Upper rows of the links' pseudo-inertias in the world, (n, 3, 4), and masses, (n, 1); the
-        last with the load at the tip.
+    def _bodies(self, frames: Frames) -> spatial.Bodies:
+        """The links in the world, each about its centre; the last with the load at the tip."""
+        R, p = frames.placement[..., :3], frames.placement[..., 3]
+        load = self._load()
+        own = spatial.pseudo_inertia(jnp.zeros_like(self.mass), self.centre, self.inertia)
+        second = spatial.with_last(own[:, :3, :3], load[:3, :3])
+        turned = spatial.product(
+            spatial.product(R, spatial.rotational_inertia(second)), jnp.swapaxes(R, -1, -2)
+        )
+        return spatial.Bodies(
+            p + spatial.apply(R, self.centre),
+            spatial.with_last(self.mass[:, None], load[3:, 3]),
+            symmetric(turned),
+            spatial.apply(R[-1], load[:3, 3]),
+        )
+
+    def _load(self) -> jax.Array:
+        """Pseudo-inertia of the load at the tip, (4, 4), about the centre of the last link, along
+        this link's axes.
         """
-        P = spatial.pseudo_inertia(self.mass, self.centre, self.inertia)
-        tip = jnp.concatenate([self._tip_placement(), jnp.asarray([[0.0, 0.0, 0.0, 1.0]], P.dtype)])
+        P = self.carried.moments()
         corner = jnp.asarray(np.diag([0.0, 0.0, 0.0, 1.0]), P.dtype) * self.payload
-        at_tip = spatial.product(spatial.product(tip, self.carried.moments() + corner), tip.T)
-        P = jnp.concatenate([P[:-1], P[-1:] + at_tip])
-        return spatial.moved(frames.placement, P), P[:, 3, 3:]
+        tip = self._tip_placement()
+        tip = spatial.placement(tip[:, :3], tip[:, 3] - self.centre[-1])
+        tip = jnp.concatenate([tip, jnp.asarray([[0.0, 0.0, 0.0, 1.0]], P.dtype)])
+        return spatial.product(spatial.product(tip, P + corner), tip.T)
 
     @traced_once
     def _tip_placement(self) -> jax.Array:
@@ -325,31 +341,49 @@ class Arm:
     def mass_matrix(self, q: jax.Array) -> jax.Array:
         """M(q), (n, n) [kg m^2]."""
         frames = self._frames(q)
-        composite = spatial.inertia(*map(_suffix_sums, self._bodies(frames)))
+        composite = spatial.Inertia(*map(sums_from, spatial.inertia(self._bodies(frames))))
         S = frames.motion_subspaces
         upper = jnp.sum(S[:, None] * spatial.momentum(composite, S), axis=(-1, -2))
-        above, diagonal = np.triu(np.ones((self.n, self.n), bool)), np.eye(self.n, dtype=bool)
-        return jnp.where(above, upper, upper.T) + jnp.where(
-            diagonal, self.armature, jnp.zeros_like(upper)
+        return symmetric(upper) + jnp.where(
+            np.eye(self.n, dtype=bool), self.armature, jnp.zeros_like(upper)
         )
 
     def coriolis(self, q: jax.Array, v: jax.Array, u: jax.Array) -> jax.Array:
         """C(q, v) u, (n,) [N m], with the C of the Christoffel symbols."""
+        return self._inertial_torque(q, v, u, None)
+
+    def inverse_dynamics(
+        self, q: jax.Array, v: jax.Array, u: jax.Array, acceleration: jax.Array
+    ) -> jax.Array:
+        """C(q, v) u + G + M acceleration, (n,) [N m], without M."""
+        return self._inertial_torque(q, v, u, acceleration) + self.gravity(q)
+
+    def _inertial_torque(
+        self, q: jax.Array, v: jax.Array, u: jax.Array, acceleration: jax.Array | None
+    ) -> jax.Array:
+        """C(q, v) u + M acceleration, (n,) [N m]; None for no acceleration."""
         frames = self._frames(q)
-        S, bodies = frames.motion_subspaces, spatial.inertia(*self._bodies(frames))
-        V = _velocities(S, v)
-        carried = _velocities(spatial.motion_cross(V, S), u)
-        if u is v:  # the usual case: V x V = 0
-            forces = spatial.momentum(bodies, carried) + spatial.wrench_cross(
-                V, spatial.momentum(bodies, V)
-            )
-        else:
+        S, bodies = frames.motion_subspaces, self._bodies(frames)
+        V = U = _velocities(S, v)
+        rates = _velocities(spatial.motion_cross(V, S), u)
+        pairs = [(V, V)]
+        if u is not v:
             U = _velocities(S, u)
-            L = spatial.momentum(
-                bodies, jnp.stack([carried - 0.5 * spatial.motion_cross(V, U), U, V])
-            )
-            forces = L[0] + 0.5 * jnp.sum(spatial.wrench_cross(jnp.stack([V, U]), L[1:]), axis=0)
-        return _joint_torques(S, forces)
+            rates = rates - 0.5 * spatial.motion_cross(V, U)
+            pairs = [(V, U), (U, V)]
+        torque = jnp.zeros_like(q)
+        if acceleration is not None:
+            rates = rates + _velocities(S, acceleration)
+            torque = self.armature * acceleration
+        return torque + _joint_torques(S, spatial.inertial_forces(bodies, rates, pairs))
+
+    @traced_once
+    def momentum(self, q: jax.Array, v: jax.Array) -> jax.Array:
+        """M(q) v, (n,) [N m s], without M."""
+        frames = self._frames(q)
+        S = frames.motion_subspaces
+        links = spatial.momenta(self._bodies(frames), _velocities(S, v))
+        return _joint_torques(S, links) + self.armature * v
 
     @traced_once
     def energy_gradient(self, q: jax.Array, v: jax.Array) -> jax.Array:
@@ -357,22 +391,23 @@ class Arm:
         the momentum of all links beyond it.
         """
         frames = self._frames(q)
-        S, bodies = frames.motion_subspaces, spatial.inertia(*self._bodies(frames))
+        S, bodies = frames.motion_subspaces, self._bodies(frames)
         V = _velocities(S, v)
-        return _joint_torques(spatial.motion_cross(V, S), spatial.momentum(bodies, V))
+        return _joint_torques(spatial.motion_cross(V, S), spatial.momenta(bodies, V))
 
     @traced_once
     def potential(self, q: jax.Array) -> jax.Array:
         """U(q) = - g . sum_i m_i c_i, () [J]; zero with all mass at the base's origin."""
-        return -jnp.sum(self.g * self._bodies(self._frames(q))[0][:, :, 3])
+        return -jnp.sum(self.g * spatial.inertia(self._bodies(self._frames(q))).first)
 
     @traced_once
     def gravity(self, q: jax.Array) -> jax.Array:
-        """G(q), (n,) [N m]."""
+        """G(q), (n,) [N m]: the weight of all links beyond each joint."""
         frames = self._frames(q)
-        upper, mass = self._bodies(frames)
-        weight = jnp.stack([spatial.cross(upper[:, :, 3], self.g), mass * self.g], axis=1)
-        return -_joint_torques(frames.motion_subspaces, weight)
+        links = spatial.inertia(self._bodies(frames))
+        first, mass = sums_from(links.first), sums_from(links.mass)
+        weight = jnp.stack([spatial.cross(first, self.g), mass * self.g], axis=1)
+        return -jnp.sum(frames.motion_subspaces * weight, axis=(-1, -2))
 
     def friction_torque(self, dq: jax.Array) -> jax.Array:
         """Joint friction, -(damping q' + friction tanh(q' / friction_width)), (n,) [N m]."""
@@ -383,27 +418,11 @@ def _numbered(word: str, n: int) -> tuple[str, ...]:
     return tuple(f"{word}{i + 1}" for i in range(n))
 
 
-def _prefix_sums(rows: jax.Array) -> jax.Array:
-    """Row i: the sum of rows 0 to i, (n, ...), over the joints that move link i."""
-    return _summed(rows, np.tril)
-
-
-def _suffix_sums(rows: jax.Array) -> jax.Array:
-    """Row i: the sum of rows i to n - 1, (n, ...), over the links that joint i moves."""
-    return _summed(rows, np.triu)
-
-
-def _summed(rows: jax.Array, triangle: Callable) -> jax.Array:
-    n = rows.shape[0]
-    chosen = triangle(np.ones((n, n), bool)).reshape((n, n) + (1,) * (rows.ndim - 1))
-    return jnp.sum(jnp.where(chosen, rows, jnp.zeros_like(rows)), axis=1)
-
-
 def _velocities(S: jax.Array, speeds: jax.Array) -> jax.Array:
     """J_i u, the motion of every link when the joints move at `speeds`, (n, 2, 3)."""
-    return _prefix_sums(S * speeds[:, None, None])
+    return sums_to(S * speeds[:, None, None])
 
 
 def _joint_torques(S: jax.Array, forces: jax.Array) -> jax.Array:
     """sum_i J_i^T F_i, (n,): the joint torques that correspond to wrenches on the links."""
-    return jnp.sum(S * _suffix_sums(forces), axis=(-1, -2))
+    return jnp.sum(S * sums_from(forces), axis=(-1, -2))

@@ -1,27 +1,72 @@
-"""A planar chain of n revolute links, from its energies alone.
+"""A planar chain of n revolute links.
 
-In absolute link angles theta_i = q_1 + ... + q_i the mass matrix is H_ij = A_ij cos(theta_i -
-theta_j) + I_i delta_ij, where A collects the masses: link k moves with every link before it, at its
-full length l_i, and with itself at lc_k,
+With the absolute link angles phi_i = q_1 + ... + q_i, the unit vectors e_i = (cos phi_i, sin phi_i)
+along the links and E_i = (-sin phi_i, cos phi_i) across them, the mass matrix of these angles is
 
-    A_ij = sum_k m_k a_ki a_kj,    a_ki = l_i for i < k, lc_k for i = k, 0 beyond,
+    H_ij = l_i b_j E_i . E_j  for i < j,    H_ii = d_i
 
-and M = S^T H S with theta = S q.  U = g sum_k m_k sum_i a_ki sin theta_i.  C and G come by
-automatic differentiation. For n = 2 this is the closed form of `TwoLink`, which the tests hold it
-to.
+    b_i = m_i lc_i + l_i (m_{i+1} + ... + m_n + payload)
+    d_i = m_i lc_i^2 + l_i^2 (m_{i+1} + ... + m_n + payload) + I_i
+
+and M = S^T H S with phi = S q.  An entry above the diagonal is a product of one factor of each
+link, so that sums along the chain give M v, C v and the inverse dynamics in O(n) operations, with
+w = S v as the angular velocities:
+
+    (H a + C)_i = d_i a_i - l_i E_i . sum_{j>i} b_j x_j - b_i E_i . sum_{j<i} l_j x_j,
+    x_j = e_j w_j^2 - E_j a_j
+
+    U = g sum_i b_i sin phi_i
+
+M itself takes O(n^2): with W_j = b_j e_j + ... + b_n e_n, M_ij - M_{i+1,j} = l_i e_i . W_j for
+i < j, and M_jj - M_{j+1,j+1} = d_j + 2 l_j e_j . W_{j+1}.  For n = 2 this is the closed form of
+`TwoLink`.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.core.linalg import inner, matmul, matvec
+from iblf_jax.core.linalg import inner, sums_from, sums_to, symmetric
 from iblf_jax.core.optional import attributes
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.world.robots._base import broadcast_fields, from_energy, planar_skeleton
+
+
+class Lumped(NamedTuple):
+    """The numbers of a chain on which its motion depends (head of this module), (n,) each."""
+
+    length: jax.Array
+    """l [m]."""
+    first: jax.Array
+    """b [kg m]."""
+    second: jax.Array
+    """d [kg m^2]."""
+
+    def across(self, direction: jax.Array, x: jax.Array) -> jax.Array:
+        """l_i y_i . sum_{j>i} b_j x_j + b_i y_i . sum_{j<i} l_j x_j, (n,), of vectors (2, n).
+
+        Args:
+          direction: y.
+          x: the vectors in the sums.
+        """
+        beyond = sums_from((self.first * x)[:, 1:], axis=1)
+        before = sums_to((self.length * x)[:, :-1], axis=1)
+        outer = self.length[:-1] * jnp.sum(direction[:, :-1] * beyond, axis=0)
+        inner = self.first[1:] * jnp.sum(direction[:, 1:] * before, axis=0)
+        none = jnp.zeros((1,), x.dtype)
+        return jnp.concatenate([outer, none]) + jnp.concatenate([none, inner])
+
+
+def _along_and_across(q: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The unit vectors e and E of the links, (2, n) each."""
+    phi = sums_to(q)
+    c, s = jnp.cos(phi), jnp.sin(phi)
+    return jnp.stack([c, s]), jnp.stack([-s, c])
 
 
 @component
@@ -69,33 +114,60 @@ class PlanarChain:
         """Number of joints."""
         return self.mass.shape[-1]
 
-    def _lever_arms(self) -> tuple[jax.Array, jax.Array]:
-        """Masses (n + 1,) and lever arms a_ki (n + 1, n): the links, then the payload as a mass at
-        the tip.
-        """
-        before = np.tril(np.ones((self.n + 1, self.n)), -1)
-        own = np.eye(self.n + 1, self.n)
-        arms = (
-            jnp.asarray(before, self.length.dtype) * self.length
-            + jnp.asarray(own, self.length.dtype) * self.centre
-        )
-        masses = jnp.concatenate([self.mass, jnp.atleast_1d(self.payload)])
-        return masses, arms
+    def _lumped(self) -> Lumped:
+        """l, b and d of the links."""
+        masses = jnp.concatenate([self.mass[1:], jnp.atleast_1d(self.payload)])
+        beyond = sums_from(masses)
+        first = self.mass * self.centre
+        second = first * self.centre + self.inertia + self.length**2 * beyond
+        return Lumped(self.length, first + self.length * beyond, second)
 
     def mass_matrix(self, q: jax.Array) -> jax.Array:
         """M(q), (n, n) [kg m^2]."""
-        masses, arms = self._lever_arms()
-        A = matmul(arms.T, masses[:, None] * arms)
-        theta = jnp.cumsum(q)
-        c, s = jnp.cos(theta), jnp.sin(theta)
-        H = A * (c[:, None] * c[None, :] + s[:, None] * s[None, :]) + jnp.diag(self.inertia)
-        S = jnp.asarray(np.tril(np.ones((self.n, self.n))), H.dtype)
-        return matmul(S.T, matmul(H, S))
+        lumped, (e, _) = self._lumped(), _along_and_across(q)
+        along, beyond = lumped.length * e, sums_from(lumped.first * e, axis=1)
+        # Row i, column j: l_i e_i . W_j.
+        products = jnp.sum(along[:, :, None] * beyond[:, None, :], axis=0)
+        differences = jnp.where(np.triu(np.ones((self.n, self.n), bool), 1), products, 0.0)
+        next_joint = jnp.sum(along[:, :-1] * beyond[:, 1:], axis=0)
+        twice = jnp.concatenate([2.0 * next_joint, jnp.zeros((1,), q.dtype)])
+        diagonal = sums_from(lumped.second + twice)
+        on_diagonal = np.eye(self.n, dtype=bool)
+        return symmetric(sums_from(jnp.where(on_diagonal, diagonal, differences)))
+
+    def coriolis(self, q: jax.Array, v: jax.Array, u: jax.Array) -> jax.Array:
+        """C(q, v) u, (n,) [N m], with the C of the Christoffel symbols."""
+        e, E = _along_and_across(q)
+        return -sums_from(self._lumped().across(E, sums_to(v) * sums_to(u) * e))
+
+    def inverse_dynamics(
+        self, q: jax.Array, v: jax.Array, u: jax.Array, acceleration: jax.Array
+    ) -> jax.Array:
+        """C(q, v) u + G + M acceleration, (n,) [N m], without M."""
+        lumped, a = self._lumped(), sums_to(acceleration)
+        e, E = _along_and_across(q)
+        weight = self.g * lumped.first * e[0]
+        opposite = sums_to(v) * sums_to(u) * e - a * E
+        return sums_from(lumped.second * a - lumped.across(E, opposite) + weight)
+
+    def momentum(self, q: jax.Array, v: jax.Array) -> jax.Array:
+        """M(q) v, (n,) [N m s], without M."""
+        lumped, w = self._lumped(), sums_to(v)
+        e = _along_and_across(q)[0]
+        return sums_from(lumped.second * w + lumped.across(e, w * e))
+
+    def energy_gradient(self, q: jax.Array, v: jax.Array) -> jax.Array:
+        """dT/dq with T = 1/2 v^T M v, (n,) [N m]."""
+        w, (e, E) = sums_to(v), _along_and_across(q)
+        return sums_from(w * self._lumped().across(E, w * e))
+
+    def gravity(self, q: jax.Array) -> jax.Array:
+        """G(q), (n,) [N m]."""
+        return sums_from(self.g * self._lumped().first * jnp.cos(sums_to(q)))
 
     def potential(self, q: jax.Array) -> jax.Array:
         """U(q), () [J]."""
-        masses, arms = self._lever_arms()
-        return self.g * inner(matvec(arms.T, masses), jnp.sin(jnp.cumsum(q)))
+        return self.g * inner(self._lumped().first, jnp.sin(sums_to(q)))
 
     def tip(self, q: jax.Array) -> jax.Array:
         """Position of the tip, (2,) [m]."""

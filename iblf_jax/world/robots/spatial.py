@@ -22,11 +22,14 @@ drops it.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+from iblf_jax.core.linalg import symmetric
 
 
 class Inertia(NamedTuple):
@@ -38,6 +41,22 @@ class Inertia(NamedTuple):
     """h, (m, 3) [kg m]."""
     mass: jax.Array
     """(m, 1) [kg]."""
+
+
+class Bodies(NamedTuple):
+    """Bodies in the world's frame, each described about a point that moves with it.
+
+    Point and rotational inertia of a link do not depend on masses: model and plant share them.
+    """
+
+    point: jax.Array
+    """Position x of the point, (m, 3) [m]; of all bodies but the last it is the centre of mass."""
+    mass: jax.Array
+    """(m, 1) [kg]."""
+    rotational: jax.Array
+    """J about the point, (m, 3, 3) [kg m^2]."""
+    offset: jax.Array
+    """First moment s of the last body about its point, (3,) [kg m]."""
 
 
 def apply(matrix: jax.Array, vector: jax.Array) -> jax.Array:
@@ -106,31 +125,36 @@ def joined(outer: jax.Array, inner: jax.Array) -> jax.Array:
 
 
 def chained(steps: jax.Array) -> jax.Array:
-    """Row i: the composition of steps 0 to i, (n, 3, 4), by a parallel scan of log2 n rounds."""
-    reach = 1
-    while reach < steps.shape[0]:
-        steps = jnp.concatenate([steps[:reach], joined(steps[:-reach], steps[reach:])])
-        reach *= 2
-    return steps
+    """Row i: the composition of steps 0 to i, (n, 3, 4).
 
-
-def moved(H: jax.Array, P: jax.Array) -> jax.Array:
-    """Upper rows of the pseudo-inertia H P H^T, (..., 3, 4), of bodies whose frames are at H, (...,
-    3, 4).
+    One step after the other: a step has few numbers that are neither 0 nor 1, so that its product
+    with a dense placement needs half the operations of a product of two dense ones.
     """
-    HP = product(H, P)
-    return placement(product(HP, jnp.swapaxes(H, -1, -2)), HP[..., 3])
+    placed = [steps[0]]
+    for step in steps[1:]:
+        placed.append(joined(placed[-1], step))
+    return jnp.stack(placed)
 
 
-def inertia(upper: jax.Array, mass: jax.Array) -> Inertia:
-    """Spatial inertias from the upper rows of pseudo-inertias, (m, 3, 4), and masses, (m, 1)."""
-    second, diagonal = upper[..., :3], np.eye(3, dtype=bool)
-    trace = jnp.sum(jnp.where(diagonal, second, jnp.zeros_like(second)), axis=(-1, -2))
-    return Inertia(
-        jnp.where(diagonal, trace[..., None, None], jnp.zeros_like(second)) - second,
-        upper[..., 3],
-        mass,
-    )
+def rotational_inertia(second: jax.Array) -> jax.Array:
+    """J = tr(Sigma) 1 - Sigma, (..., 3, 3), from second moments Sigma."""
+    diagonal, zero = np.eye(3, dtype=bool), jnp.zeros_like(second)
+    trace = jnp.sum(jnp.where(diagonal, second, zero), axis=(-1, -2))
+    return jnp.where(diagonal, trace[..., None, None], zero) - second
+
+
+def with_last(rows: jax.Array, added: jax.Array) -> jax.Array:
+    """The rows, (n, ...), with `added`, (...), added to the last one."""
+    return jnp.concatenate([rows[:-1], rows[-1:] + added])
+
+
+def inertia(bodies: Bodies) -> Inertia:
+    """The moments of bodies about the world's origin."""
+    x, offset = bodies.point, bodies.offset
+    first = with_last(bodies.mass * x, offset)
+    second = first[:, :, None] * x[:, None, :]
+    second = symmetric(with_last(second, x[-1, :, None] * offset))
+    return Inertia(bodies.rotational + rotational_inertia(second), first, bodies.mass)
 
 
 def momentum(body: Inertia, motion: jax.Array) -> jax.Array:
@@ -150,11 +174,42 @@ def motion_cross(motion: jax.Array, other: jax.Array) -> jax.Array:
     )
 
 
-def wrench_cross(motion: jax.Array, wrench: jax.Array) -> jax.Array:
-    """Cross product of a motion and a wrench, (w x n + v x f, w x f): the rate of a wrench that
-    moves with `motion`.
+def momenta(bodies: Bodies, motion: jax.Array) -> jax.Array:
+    """Momenta of bodies, (m, 2, 3), each with its own motion, (m, 2, 3): about the point x, which
+    moves with c = v + w x x, they are f = m c + w x s and J w + s x c.
     """
-    lever = cross(motion[..., 1:, :], wrench[..., 1:, :])
-    return cross(motion[..., :1, :], wrench) + jnp.concatenate(
-        [lever, jnp.zeros_like(lever)], axis=-2
-    )
+    w, v = motion[:, 0], motion[:, 1]
+    velocity = v + cross(w, bodies.point)
+    linear = with_last(bodies.mass * velocity, cross(w[-1], bodies.offset))
+    angular = with_last(apply(bodies.rotational, w), cross(bodies.offset, velocity[-1]))
+    return jnp.stack([angular + cross(bodies.point, linear), linear], axis=1)
+
+
+def inertial_forces(
+    bodies: Bodies, acceleration: jax.Array, motions: Sequence[tuple[jax.Array, jax.Array]]
+) -> jax.Array:
+    """Rates of the momenta of bodies, (m, 2, 3): about the point x, whose acceleration is
+    a = v' + w' x x + w x c, they are f = m a + w' x s + w x (w x s) and J w' + w x J w + s x a.
+
+    Args:
+      bodies: m of them.
+      acceleration: rates of their motions, (w', v'), (m, 2, 3).
+      motions: pairs of motions, (m, 2, 3) each. The products of two motions are the means over the
+        pairs: [(V, V)] for the force at the motion V, [(V, U), (U, V)] for the symmetric bilinear
+        form of these forces.
+    """
+    x, s = bodies.point, bodies.offset
+    turning, linear = acceleration[:, 0], acceleration[:, 1]
+
+    def mean(product_of: Callable) -> jax.Array:
+        values = [product_of(one[:, 0], other[:, 0], other[:, 1]) for one, other in motions]
+        if len(values) == 1:
+            return values[0]
+        return 0.5 * (values[0] + values[1])
+
+    a = linear + cross(turning, x) + mean(lambda w, u, v: cross(w, v + cross(u, x)))
+    gyroscopic = mean(lambda w, u, v: cross(w, apply(bodies.rotational, u)))
+    of_offset = mean(lambda w, u, v: cross(w[-1], cross(u[-1], s))) + cross(turning[-1], s)
+    force = with_last(bodies.mass * a, of_offset)
+    moment = with_last(apply(bodies.rotational, turning) + gyroscopic, cross(s, a[-1]))
+    return jnp.stack([moment + cross(x, force), force], axis=1)

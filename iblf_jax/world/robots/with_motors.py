@@ -11,7 +11,14 @@ import jax.numpy as jnp
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.core.time import as_at, jump_times_of
-from iblf_jax.world.robots._base import Robot, energy_gradient, friction_torque, robot_member
+from iblf_jax.world.robots._base import (
+    Robot,
+    energy_gradient,
+    friction_torque,
+    inverse_dynamics,
+    momentum,
+    robot_member,
+)
 
 
 @component
@@ -89,6 +96,17 @@ class WithMotors:
     def energy_gradient(self, q: jax.Array, v: jax.Array) -> jax.Array:
         """dT/dq of the robot, (n,) [N m]; the inertia of the motors does not depend on q."""
         return energy_gradient(self.robot, q, v)
+
+    def momentum(self, q: jax.Array, v: jax.Array) -> jax.Array:
+        """M(q) v + J v, (n,) [N m s]."""
+        return momentum(self.robot, q, v) + self.inertia * v
+
+    def inverse_dynamics(
+        self, q: jax.Array, v: jax.Array, u: jax.Array, acceleration: jax.Array
+    ) -> jax.Array:
+        """The torque on the robot, and J acceleration, (n,) [N m]."""
+        torque = inverse_dynamics(self.robot, q, v, u, acceleration)
+        return torque + self.inertia * acceleration
 
     def gravity(self, q: jax.Array) -> jax.Array:
         """G(q) of the robot, (n,) [N m]."""
