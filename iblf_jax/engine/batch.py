@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from iblf_jax.engine.carry import Carry, Inputs, start
 from iblf_jax.engine.linearization import (
     Linearization,
+    LinearizationCarry,
     LinearizationStep,
     linearization_at,
     linearization_steps,
@@ -161,11 +162,14 @@ The first step and every `every`-th one after it are recorded; None records noth
 have a leading run axis, which the time axis of the records follows."""
 
 
-def _linearized(loop: StepLoop, batch: Batch, carry: Linearization) -> Linearization:
-    """The carry after the `LinearizationStep`s of every run."""
+def _linearized(loop: StepLoop, batch: Batch, carry: LinearizationCarry) -> Linearization:
+    """What the `LinearizationStep`s of every run find."""
     batch = _linearized_batch(batch)
     steps = linearization_steps(batch.leaves.first.scenario)
-    return loop(LinearizationStep(), batch, carry, steps, None)[0]
+    after, columns = loop(LinearizationStep(), batch, carry, steps, 1)
+    if batch.runs is None:
+        return after.found(columns)
+    return jax.vmap(LinearizationCarry.found)(after, columns)
 
 
 def _linearized_batch(batch: Batch) -> Batch:
@@ -181,7 +185,7 @@ def _linearized_batch(batch: Batch) -> Batch:
     return batch._replace(leaves=Leaves.of(treedef, is_per_run, constants))
 
 
-def _initial_linearization(batch: Batch, method: str) -> Linearization:
+def _initial_linearization(batch: Batch, method: str) -> LinearizationCarry:
     """The carry of a `LinearizationStep` at the start of every run."""
 
     def of_run(inputs):
@@ -197,7 +201,7 @@ def _initial_linearization(batch: Batch, method: str) -> Linearization:
     return batch.map_runs(of_run)
 
 
-def linearization_batch(batch: Batch, method: str) -> tuple[Batch, Linearization]:
+def linearization_batch(batch: Batch, method: str) -> tuple[Batch, LinearizationCarry]:
     """The batch and the shapes of the carry of the `LinearizationStep`s of a batch."""
     return _linearized_batch(batch), jax.eval_shape(lambda: _initial_linearization(batch, method))
 
