@@ -2,7 +2,8 @@
 
 The spectral radius of the map from one period to the next decides.  It is computed at the start and
 along the reference, and the largest value grows past 1 at some period.  The period is an input of
-the compiled map, so the search compiles again only where more commands are in transit.
+the compiled map, which has room for the commands in transit at the shortest period, so the search
+compiles once.
 """
 
 from __future__ import annotations
@@ -46,24 +47,25 @@ def radius_at(scenario: Scenario, period: float, times: np.ndarray) -> float:
     (`stability.growth_by_sampling`).
 
     Args:
-      scenario: canonical, with a sampling.
+      scenario: canonical, with a sampling.  Periods that need no more commands in transit than its
+        queue holds share one compiled map.
       period: that it has instead of its own [s].
       times: along the reference [s].
     """
     sampling: Any = scenario.sampling
     dtype = scenario.initial.q.dtype
-    changed = dataclasses.replace(
-        sampling,
-        period=jnp.asarray(period, dtype),
-        queue=commands_in_transit(float(sampling.delay), period),
-    )
+    in_transit = commands_in_transit(float(sampling.delay), period)
+    queue = max(sampling.queue, in_transit)
+    changed = dataclasses.replace(sampling, period=jnp.asarray(period, dtype), queue=queue)
     changed_scenario = dataclasses.replace(scenario, sampling=changed)
     maps, continuous = (
         np.asarray(each, float) for each in _maps(changed_scenario, jnp.asarray(times, dtype))
     )
+    # The last rows and columns belong to commands that are never in transit.
+    size = maps.shape[-1] - (queue - in_transit) * scenario.n
     return max(
         float(growth_by_sampling(largest_eigenvalue(one), largest_eigenvalue(other), period))
-        for one, other in zip(maps, continuous, strict=True)
+        for one, other in zip(maps[:, :size, :size], continuous, strict=True)
     )
 
 
@@ -147,7 +149,15 @@ def _limit(scenario: Scenario, times: np.ndarray, radius: float) -> float | None
     are.
     """
     sampling: Any = scenario.sampling
-    low, high = None, max(SHORTEST_PERIOD, float(sampling.delay) / MAX_COMMANDS_IN_TRANSIT)
+    delay = float(sampling.delay)
+    low, high = None, max(SHORTEST_PERIOD, delay / MAX_COMMANDS_IN_TRANSIT)
+    # One map is compiled for all periods: the shortest has the most commands in transit.
+    first = dataclasses.replace(
+        sampling,
+        period=jnp.asarray(high, scenario.initial.q.dtype),
+        queue=commands_in_transit(delay, high),
+    )
+    scenario = dataclasses.replace(scenario, sampling=first)
     while high <= LONGEST_PERIOD and radius_at(scenario, high, times) < radius:
         low, high = high, high * PERIOD_RATIO
     if low is None or high > LONGEST_PERIOD:
