@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import gc
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -11,7 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.kernels.caches import CACHES
-from iblf_jax.kernels.from_jaxpr import closed
+from iblf_jax.kernels.from_jaxpr import PARAMETERS, closed
+from iblf_jax.kernels.kept_programs import kept_program
 from iblf_jax.kernels.packed import Shapes
 from iblf_jax.kernels.passes import with_reciprocals
 from iblf_jax.kernels.program import (
@@ -65,10 +68,64 @@ def compile_step(
       UnsupportedError: the step contains an operation that a scalar program cannot express, or
         exceeds a limit.
     """
+    with _without_garbage_collection():
+        return _compiled(step, dtype, shared, per_run, carry, limits, is_derivative, known)
+
+
+@contextlib.contextmanager
+def _without_garbage_collection() -> Iterator[None]:
+    """Context manager in which Python does not look for garbage.
+
+    A trace and a program are many small objects that stay.  Python looks through all of them again
+    and again, which takes a tenth of the time of a compilation.
+    """
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()
+
+
+def _compiled(
+    step: Callable,
+    dtype: np.dtype,
+    shared: Shapes,
+    per_run: Shapes,
+    carry: Shapes,
+    limits: LoweringLimits,
+    is_derivative: bool,
+    known: tuple[Known | None, ...],
+) -> CompiledStep:
+    """As `compile_step`."""
     index = jax.ShapeDtypeStruct((), jnp.int32)
     jaxpr, (after, records) = jax.make_jaxpr(step, return_shape=True)(
         shared.structs(), per_run.structs(), carry.structs(), index
     )
+    arguments = (dtype.str, shared, per_run, carry, limits, is_derivative, known)
+
+    def lower() -> Program:
+        return _lowered(jaxpr, len(after), *arguments[1:], dtype=dtype)
+
+    return CompiledStep(kept_program(jaxpr, PARAMETERS, arguments, lower), records)
+
+
+def _lowered(
+    jaxpr: Any,
+    carried: int,
+    shared: Shapes,
+    per_run: Shapes,
+    carry: Shapes,
+    limits: LoweringLimits,
+    is_derivative: bool,
+    known: tuple[Known | None, ...],
+    *,
+    dtype: np.dtype,
+) -> Program:
+    """The program of the jaxpr of a step, whose first `carried` outputs are the carry; other
+    arguments as `compile_step`.
+    """
     b = Builder(dtype, sparse=is_derivative, limits=limits)
     shared_ids = _inputs(b, shared, lambda i, kind: _shared(b, i, known))
     per_run_ids = _inputs(b, per_run, lambda i, kind: b.input("per_run", i, kind))
@@ -76,8 +133,8 @@ def compile_step(
     index_id = np.asarray(b.input("index", 0, "i"), np.int64)
     _mark_constant_carry(b, jaxpr.jaxpr, carry_ids)
     out = closed(b, jaxpr, [*shared_ids, *per_run_ids, *carry_ids, index_id])
-    carry_out, recorded = out[: len(after)], out[len(after) :]
-    if Shapes.of(after).kinds() != carry.kinds():
+    carry_out, recorded = out[:carried], out[carried:]
+    if Shapes.of(jaxpr.out_avals[:carried]).kinds() != carry.kinds():
         raise UnsupportedError("the step changes the types of its carry")
     program = finished(
         b,
@@ -86,7 +143,7 @@ def compile_step(
         [_as_float(b, i) for i in _numbers(recorded)],
         tuple(ids.size for ids in recorded),
     )
-    return CompiledStep(with_reciprocals(program), records)
+    return with_reciprocals(program)
 
 
 def _numbers(arrays: Sequence[Ids]) -> list[int]:
