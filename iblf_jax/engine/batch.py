@@ -162,8 +162,8 @@ The first step and every `every`-th one after it are recorded; None records noth
 have a leading run axis, which the time axis of the records follows."""
 
 
-def _linearized(loop: StepLoop, batch: Batch, carry: LinearizationCarry) -> Linearization:
-    """What the `LinearizationStep`s of every run find."""
+def linearized(loop: StepLoop, batch: Batch, carry: LinearizationCarry) -> Linearization:
+    """What the `LinearizationStep`s of every run find, from the carry at the state of each."""
     batch = _linearized_batch(batch)
     steps = linearization_steps(batch.leaves.first.scenario)
     after, columns = loop(LinearizationStep(), batch, carry, steps, 1)
@@ -208,7 +208,7 @@ def linearization_batch(batch: Batch, method: str) -> tuple[Batch, Linearization
 
 def initialize(loop: StepLoop, batch: Batch, method: str) -> tuple[Carry, Linearization]:
     """The carry before the first step, and the linearization at the start."""
-    at_start = _linearized(loop, batch, _initial_linearization(batch, method))
+    at_start = linearized(loop, batch, _initial_linearization(batch, method))
 
     def of_run(inputs, at_start):
         is_sampled = inputs.scenario.sampling is not None
@@ -253,10 +253,10 @@ def finalize(
     doubled = batch._replace(leaves=leaves, runs=2 * (batch.runs or 1))
     pairs = batch.map_runs(at_nearest_and_end, carry)
     if batch.runs is None:
-        pairs = _linearized(loop, doubled, pairs)
+        pairs = linearized(loop, doubled, pairs)
     else:
         flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), pairs)
-        flat = _linearized(loop, doubled, flat)
+        flat = linearized(loop, doubled, flat)
         pairs = jax.tree.map(lambda x: x.reshape(-1, 2, *x.shape[1:]), flat)
     return batch.map_runs(outcome, carry, at_start, pairs)
 

@@ -17,6 +17,7 @@ from jax.flatten_util import ravel_pytree
 from iblf_jax.engine.carry import Inputs, StepOptions, keep_if
 from iblf_jax.simulation import error_estimate, stability
 from iblf_jax.simulation.closed_loop import (
+    LoopState,
     initial_state,
     integrated_part,
     perturbed_rate,
@@ -133,6 +134,15 @@ class LinearizationStep:
             carry.unresolved,
         )
         return LinearizationCarry(carry.time, x, growth, lengths, unresolved), column
+
+
+def jacobian_carry(
+    scenario: Scenario, time: jax.Array, state: LoopState
+) -> LinearizationCarry:
+    """The carry of a `LinearizationStep` of which only the Jacobian at a state is of interest."""
+    watched = error_estimate.watched_indices(state).size
+    no_estimate = error_estimate.UnresolvedSignals(*[jnp.zeros_like(state.q)] * 3)
+    return linearization_at(time, perturbed_state(state), watched, no_estimate)
 
 
 def linearization_steps(scenario: Scenario) -> int:

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks, notices
+from iblf_jax.engine.execute import sampled_jacobians
 from iblf_jax.engine.step_size import MODE_INSTANTS, largest_eigenvalue, round_down, start_and_along
 from iblf_jax.simulation.closed_loop import LoopState, run_sampled_law
 from iblf_jax.simulation.sampling import Sampling, commands_in_transit
@@ -24,7 +25,6 @@ from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.simulation.stability import (
     continuous_map,
     growth_by_sampling,
-    jacobian,
     period_map,
 )
 
@@ -58,8 +58,11 @@ def radius_at(scenario: Scenario, period: float, times: np.ndarray) -> float:
     queue = max(sampling.queue, in_transit)
     changed = dataclasses.replace(sampling, period=jnp.asarray(period, dtype), queue=queue)
     changed_scenario = dataclasses.replace(scenario, sampling=changed)
+    instants = jnp.asarray(np.concatenate([[0.0], times]), dtype)
+    states = _sampled_states(changed_scenario, instants)
+    derivatives = sampled_jacobians(changed_scenario, instants, states)
     maps, continuous = (
-        np.asarray(each, float) for each in _maps(changed_scenario, jnp.asarray(times, dtype))
+        np.asarray(each, float) for each in _maps(changed_scenario, states, derivatives)
     )
     # The last rows and columns belong to commands that are never in transit.
     size = maps.shape[-1] - (queue - in_transit) * scenario.n
@@ -70,24 +73,33 @@ def radius_at(scenario: Scenario, period: float, times: np.ndarray) -> float:
 
 
 @jax.jit
-def _maps(scenario: Scenario, times: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The derivatives of the period maps, (T + 1, m, m), and the maps of the same loops in
-    continuous time, (T + 1, k, k).
+def _sampled_states(scenario: Scenario, instants: jax.Array) -> LoopState:
+    """The states at the start and along the reference after the law has run, (T, ...): the torque
+    of an instant is the one that the law commands there.
     """
-    zero = jnp.zeros_like(scenario.initial.q[0])
 
-    def at(t: jax.Array, state: LoopState) -> tuple[jax.Array, jax.Array]:
-        # The torque of the instant is the one that the law commands there.
-        state = run_sampled_law(
-            scenario, t, state, jnp.zeros((scenario.sensor.draws, scenario.n), zero.dtype)
-        )
-        derivative = jacobian(scenario, t, state)
+    def sampled(t: jax.Array, state: LoopState) -> LoopState:
+        no_noise = jnp.zeros((scenario.sensor.draws, scenario.n), t.dtype)
+        return run_sampled_law(scenario, t, state, no_noise)
+
+    return jax.vmap(sampled)(instants, start_and_along(scenario, instants[1:]))
+
+
+@jax.jit
+def _maps(
+    scenario: Scenario, states: LoopState, derivatives: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """The derivatives of the period maps, (T, m, m), and the maps of the same loops in continuous
+    time, (T, k, k).
+    """
+
+    def at(state: LoopState, derivative: jax.Array) -> tuple[jax.Array, jax.Array]:
         return (
             period_map(scenario, state, derivative),
             continuous_map(scenario, state, derivative),
         )
 
-    return jax.vmap(at)(jnp.concatenate([zero[None], times]), start_and_along(scenario, times))
+    return jax.vmap(at)(states, derivatives)
 
 
 @notices.each_warning_once
