@@ -136,9 +136,7 @@ class LinearizationStep:
         return LinearizationCarry(carry.time, x, growth, lengths, unresolved), column
 
 
-def jacobian_carry(
-    scenario: Scenario, time: jax.Array, state: LoopState
-) -> LinearizationCarry:
+def jacobian_carry(scenario: Scenario, time: jax.Array, state: LoopState) -> LinearizationCarry:
     """The carry of a `LinearizationStep` of which only the Jacobian at a state is of interest."""
     watched = error_estimate.watched_indices(state).size
     no_estimate = error_estimate.UnresolvedSignals(*[jnp.zeros_like(state.q)] * 3)
@@ -177,7 +175,5 @@ def linearization_at(
     if watched < x.size:
         lengths = jnp.zeros((3, watched), x.dtype)
     return jax.lax.stop_gradient(
-        LinearizationCarry(
-            time, x, stability.power_iteration_start(x), lengths, unresolved
-        )
+        LinearizationCarry(time, x, stability.power_iteration_start(x), lengths, unresolved)
     )

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks, notices
+from iblf_jax.core.progress import announced
 from iblf_jax.engine.execute import sampled_jacobians
 from iblf_jax.engine.step_size import MODE_INSTANTS, largest_eigenvalue, round_down, start_and_along
 from iblf_jax.simulation.closed_loop import LoopState, run_sampled_law
@@ -103,6 +104,7 @@ def _maps(
 
 
 @notices.each_warning_once
+@announced("searching for the longest stable sampling period")
 def recommended_period(
     scenario: Scenario, *, duration: float = 20.0, radius: float = 1.0, margin: float = 2.0
 ) -> float:

@@ -11,10 +11,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend import core
 
 from iblf_jax.kernels.caches import CACHES
 from iblf_jax.kernels.from_jaxpr import PARAMETERS, closed
 from iblf_jax.kernels.kept_programs import kept_program
+from iblf_jax.kernels.messages import announce_if_slow
 from iblf_jax.kernels.packed import Shapes
 from iblf_jax.kernels.passes import with_reciprocals
 from iblf_jax.kernels.program import (
@@ -108,7 +110,22 @@ def _compiled(
     def lower() -> Program:
         return _lowered(jaxpr, len(after), *arguments[1:], dtype=dtype)
 
-    return CompiledStep(kept_program(jaxpr, PARAMETERS, arguments, lower), records)
+    with announce_if_slow(f"compiling a step of {_count_operations(jaxpr.jaxpr):,} operations"):
+        program = kept_program(jaxpr, PARAMETERS, arguments, lower)
+    return CompiledStep(program, records)
+
+
+def _count_operations(jaxpr: Any) -> int:
+    """The number of operations of a jaxpr and of its inner jaxprs, each counted once."""
+    pending = [jaxpr]
+    found: dict[int, Any] = {}
+    while pending:
+        inner = pending.pop()
+        if id(inner) not in found:
+            found[id(inner)] = inner
+            for equation in inner.eqns:
+                pending += core.jaxprs_in_params(equation.params)
+    return sum(len(inner.eqns) for inner in found.values())
 
 
 def _lowered(
