@@ -217,14 +217,19 @@ def initialize(loop: StepLoop, batch: Batch, method: str) -> tuple[Carry, Linear
     return batch.map_runs(of_run, at_start), at_start
 
 
-def carry_shapes(batch: Batch, method: str) -> Carry:
-    """Shapes and types of the carry of a `TimeStep`."""
+def carry_without_linearization(batch: Batch, method: str) -> Carry:
+    """The carry before the first step, with an error estimate that has no meaning."""
 
     def of_run(inputs):
         size = error_estimate.watched_indices(initial_state(inputs.scenario)).size
         return start(inputs, method, jnp.zeros((size, size), inputs.dt.dtype))
 
-    return jax.eval_shape(lambda: batch.map_runs(of_run))
+    return batch.map_runs(of_run)
+
+
+def carry_shapes(batch: Batch, method: str) -> Carry:
+    """Shapes and types of the carry of a `TimeStep`."""
+    return jax.eval_shape(lambda: carry_without_linearization(batch, method))
 
 
 def finalize(

@@ -16,11 +16,19 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.engine import registry
-from iblf_jax.engine.batch import Batch, StepLoop, carry_shapes, linearized, run_all
+from iblf_jax.engine.batch import (
+    Batch,
+    StepLoop,
+    carry_shapes,
+    carry_without_linearization,
+    linearized,
+    run_all,
+)
 from iblf_jax.engine.carry import Inputs
 from iblf_jax.engine.columns import numbers_of, outer_vectors, run_by_columns
 from iblf_jax.engine.compile import (
     compiled_plan,
+    compilers_stopped_on_error,
     first_that_works,
     inputs_of,
     nested_batch,
@@ -50,7 +58,7 @@ from iblf_jax.engine.plan import (
 from iblf_jax.engine.registry import Executor
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.structural_constants import constants_of
-from iblf_jax.engine.time_step import TimeStep
+from iblf_jax.engine.time_step import TimeStep, positions
 from iblf_jax.simulation.closed_loop import LoopState
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.stability import resolved_jacobian
@@ -115,23 +123,48 @@ class CompiledBatch(NamedTuple):
         return self.execution.backend
 
     def __call__(
-        self,
-        scenario: Scenario,
-        varied: Mapping[str, jax.Array],
-        folds: Any,
-        dt: jax.Array,
-        *,
-        record_every: int | None = None,
+        self, scenario: Scenario, varied: Mapping[str, jax.Array], folds: Any, dt: jax.Array
     ) -> Outcome:
         """Runs a scenario once for every entry of `varied`, as `run_batch` does.
 
         Args:
           scenario, varied, folds, dt: as `run_batch`.
-          record_every: interval of the recorded instants; None for metrics only.
         """
-        request = self.request._replace(record_every=record_every)
+        request = self.request._replace(record_every=None)
         inputs = inputs_of(scenario, folds, dt, request)
         return _run_planned(self.execution, inputs, varied, request)
+
+    def positions(
+        self,
+        scenario: Scenario,
+        varied: Mapping[str, jax.Array],
+        dt: jax.Array,
+        record_every: int,
+    ) -> dict[str, jax.Array]:
+        """The positions, errors and bounds of the same runs (`time_step.positions`), (runs, T, ...)
+        each.  Without metrics, status and assessment of the step, less is compiled.
+
+        Args:
+          scenario, varied, dt: as `run_batch`.
+          record_every: interval of the recorded instants.
+        """
+        request = self.request._replace(record_every=record_every)
+        inputs = inputs_of(scenario, (), dt, request)
+        step = TimeStep(request.method, positions)
+
+        def run(loop: StepLoop, batch: Batch) -> dict[str, jax.Array]:
+            carry = carry_without_linearization(batch, request.method)
+            return loop(step, batch, carry, request.instants, record_every)[1]
+
+        def attempt(executor: Executor) -> dict[str, jax.Array]:
+            batch = Batch.of(inputs, varied, self.execution.layout, request.constants)
+            with compilers_stopped_on_error():
+                return run(kernel_loop(executor), batch)
+
+        def by_scan() -> dict[str, jax.Array]:
+            return run_by_scan(self.execution.scan_layout, inputs, varied, partial(run, scan))
+
+        return first_that_works(self.execution, attempt, by_scan)
 
 
 def compile_batch(
