@@ -22,6 +22,7 @@ import numpy as np
 
 from iblf_jax.core import checks, notices, tables
 from iblf_jax.core.optional import has_members
+from iblf_jax.core.progress import announced
 from iblf_jax.core.pytree import wrapped_field
 from iblf_jax.core.units import as_text
 from iblf_jax.simulation.paths import get, parameters, unit_at
@@ -304,6 +305,7 @@ def card(result: Any) -> str:
 
 
 @notices.each_warning_once
+@announced("writing a report; the bands of a study simulate its runs again")
 def report(result: Any, path: str | Path, *, title: str | None = None) -> Path:
     """Writes a result as one self-contained HTML file with text, tables, figures, the scenario and
     the versions.

@@ -41,6 +41,7 @@ from iblf_jax.control.controllers import EventCompensated
 from iblf_jax.control.controllers.event_compensated import excess
 from iblf_jax.core import checks, notices
 from iblf_jax.core.optional import has_members
+from iblf_jax.core.progress import announced
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.engine.simulate import SimulationWarning, simulate
 from iblf_jax.simulation.results import Rollout
@@ -75,6 +76,7 @@ AT_CHECKS = "measured; it holds at the instants at which the condition of the tr
 
 
 @notices.each_warning_once
+@announced("checking the conditions of the theorem along a run")
 def certify(
     scenario: Scenario,
     run: Any = None,

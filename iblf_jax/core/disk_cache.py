@@ -33,7 +33,7 @@ MAX_BYTES = 2 * 2**30
 """Largest size of all entries together."""
 JAX_SUFFIX = "-cache"
 """Suffix of the names of JAX's entries."""
-SUFFIXES = (JAX_SUFFIX, "-atime", ".so", ".cubin")
+SUFFIXES = (JAX_SUFFIX, "-atime", ".so", ".cubin", ".program")
 """Suffixes of the names of entries that may be removed: JAX's and ours."""
 DIGEST_SIZE = 32
 """Bytes of a digest."""

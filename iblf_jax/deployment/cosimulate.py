@@ -22,6 +22,7 @@ from iblf_jax.control.actuators import Ideal
 from iblf_jax.control.actuators.delay import WHOLE_TOLERANCE
 from iblf_jax.core import checks, notices
 from iblf_jax.core.optional import attributes
+from iblf_jax.core.progress import announced
 from iblf_jax.core.status import VELOCITY_LIMIT, Status
 from iblf_jax.core.time import as_at
 from iblf_jax.deployment.mujoco_plant import INTEGRATORS, MujocoPlant, Stages
@@ -48,6 +49,7 @@ from iblf_jax.world.robots._base import robot_member
 
 
 @notices.each_warning_once
+@announced("simulating the plant and the law side by side")
 def cosimulate(
     scenario: Scenario,
     plant: Any,

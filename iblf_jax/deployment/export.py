@@ -17,6 +17,7 @@ import numpy as np
 from iblf_jax.control.actuators import Ideal
 from iblf_jax.control.actuators._base import input_delay
 from iblf_jax.core import checks, notices, taylor
+from iblf_jax.core.progress import announced
 from iblf_jax.core.pytree import astype
 from iblf_jax.core.status import FAILED, Status, describe, has_flag
 from iblf_jax.deployment.build import write_files
@@ -94,6 +95,7 @@ class Exported:
 
 
 @notices.each_warning_once
+@announced("exporting; the self-test contains a simulated run")
 def export(
     scenario: Scenario,
     folder: str | Path,

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from iblf_jax.engine.carry import Carry, Inputs, start
 from iblf_jax.engine.linearization import (
     Linearization,
+    LinearizationCarry,
     LinearizationStep,
     linearization_at,
     linearization_steps,
@@ -161,11 +162,14 @@ The first step and every `every`-th one after it are recorded; None records noth
 have a leading run axis, which the time axis of the records follows."""
 
 
-def _linearized(loop: StepLoop, batch: Batch, carry: Linearization) -> Linearization:
-    """The carry after the `LinearizationStep`s of every run."""
+def linearized(loop: StepLoop, batch: Batch, carry: LinearizationCarry) -> Linearization:
+    """What the `LinearizationStep`s of every run find, from the carry at the state of each."""
     batch = _linearized_batch(batch)
     steps = linearization_steps(batch.leaves.first.scenario)
-    return loop(LinearizationStep(), batch, carry, steps, None)[0]
+    after, columns = loop(LinearizationStep(), batch, carry, steps, 1)
+    if batch.runs is None:
+        return after.found(columns)
+    return jax.vmap(LinearizationCarry.found)(after, columns)
 
 
 def _linearized_batch(batch: Batch) -> Batch:
@@ -181,7 +185,7 @@ def _linearized_batch(batch: Batch) -> Batch:
     return batch._replace(leaves=Leaves.of(treedef, is_per_run, constants))
 
 
-def _initial_linearization(batch: Batch, method: str) -> Linearization:
+def _initial_linearization(batch: Batch, method: str) -> LinearizationCarry:
     """The carry of a `LinearizationStep` at the start of every run."""
 
     def of_run(inputs):
@@ -197,14 +201,14 @@ def _initial_linearization(batch: Batch, method: str) -> Linearization:
     return batch.map_runs(of_run)
 
 
-def linearization_batch(batch: Batch, method: str) -> tuple[Batch, Linearization]:
+def linearization_batch(batch: Batch, method: str) -> tuple[Batch, LinearizationCarry]:
     """The batch and the shapes of the carry of the `LinearizationStep`s of a batch."""
     return _linearized_batch(batch), jax.eval_shape(lambda: _initial_linearization(batch, method))
 
 
 def initialize(loop: StepLoop, batch: Batch, method: str) -> tuple[Carry, Linearization]:
     """The carry before the first step, and the linearization at the start."""
-    at_start = _linearized(loop, batch, _initial_linearization(batch, method))
+    at_start = linearized(loop, batch, _initial_linearization(batch, method))
 
     def of_run(inputs, at_start):
         is_sampled = inputs.scenario.sampling is not None
@@ -213,14 +217,19 @@ def initialize(loop: StepLoop, batch: Batch, method: str) -> tuple[Carry, Linear
     return batch.map_runs(of_run, at_start), at_start
 
 
-def carry_shapes(batch: Batch, method: str) -> Carry:
-    """Shapes and types of the carry of a `TimeStep`."""
+def carry_without_linearization(batch: Batch, method: str) -> Carry:
+    """The carry before the first step, with an error estimate that has no meaning."""
 
     def of_run(inputs):
         size = error_estimate.watched_indices(initial_state(inputs.scenario)).size
         return start(inputs, method, jnp.zeros((size, size), inputs.dt.dtype))
 
-    return jax.eval_shape(lambda: batch.map_runs(of_run))
+    return batch.map_runs(of_run)
+
+
+def carry_shapes(batch: Batch, method: str) -> Carry:
+    """Shapes and types of the carry of a `TimeStep`."""
+    return jax.eval_shape(lambda: carry_without_linearization(batch, method))
 
 
 def finalize(
@@ -249,10 +258,10 @@ def finalize(
     doubled = batch._replace(leaves=leaves, runs=2 * (batch.runs or 1))
     pairs = batch.map_runs(at_nearest_and_end, carry)
     if batch.runs is None:
-        pairs = _linearized(loop, doubled, pairs)
+        pairs = linearized(loop, doubled, pairs)
     else:
         flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), pairs)
-        flat = _linearized(loop, doubled, flat)
+        flat = linearized(loop, doubled, flat)
         pairs = jax.tree.map(lambda x: x.reshape(-1, 2, *x.shape[1:]), flat)
     return batch.map_runs(outcome, carry, at_start, pairs)
 

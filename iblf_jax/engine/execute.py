@@ -7,16 +7,26 @@ is called any number of times.  `simulate` uses `single_run.run_one` instead.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.engine import registry
 from iblf_jax.engine.adjoint import Cotangents, ReverseRun
-from iblf_jax.engine.batch import Batch, StepLoop, carry_shapes, run_all, split
+from iblf_jax.engine.batch import (
+    Batch,
+    StepLoop,
+    carry_shapes,
+    carry_without_linearization,
+    linearized,
+    run_all,
+    split,
+)
 from iblf_jax.engine.carry import Inputs
 from iblf_jax.engine.columns import numbers_of, outer_vectors, run_by_columns
 from iblf_jax.engine.compile import (
@@ -39,14 +49,22 @@ from iblf_jax.engine.derivatives import (
     choose_derivatives,
     run_with_tangents,
 )
+from iblf_jax.engine.linearization import jacobian_carry
 from iblf_jax.engine.loops import checkpointed, kernel_loop, program_of, scan
 from iblf_jax.engine.outcome import Outcome
-from iblf_jax.engine.plan import STATES_LAYOUT, ExecutionPlan, plan_of_states
+from iblf_jax.engine.plan import (
+    STATES_LAYOUT,
+    ExecutionPlan,
+    plan_of_jacobians,
+    plan_of_states,
+)
 from iblf_jax.engine.registry import Executor
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.structural_constants import constants_of
-from iblf_jax.engine.time_step import TimeStep
+from iblf_jax.engine.time_step import TimeStep, positions
+from iblf_jax.simulation.closed_loop import LoopState
 from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.simulation.stability import resolved_jacobian
 
 
 def run_batch(
@@ -108,23 +126,48 @@ class CompiledBatch(NamedTuple):
         return self.execution.backend
 
     def __call__(
-        self,
-        scenario: Scenario,
-        varied: Mapping[str, jax.Array],
-        folds: Any,
-        dt: jax.Array,
-        *,
-        record_every: int | None = None,
+        self, scenario: Scenario, varied: Mapping[str, jax.Array], folds: Any, dt: jax.Array
     ) -> Outcome:
         """Runs a scenario once for every entry of `varied`, as `run_batch` does.
 
         Args:
           scenario, varied, folds, dt: as `run_batch`.
-          record_every: interval of the recorded instants; None for metrics only.
         """
-        request = self.request._replace(record_every=record_every)
+        request = self.request._replace(record_every=None)
         inputs = inputs_of(scenario, folds, dt, request)
         return _run_planned(self.execution, inputs, varied, request)
+
+    def positions(
+        self,
+        scenario: Scenario,
+        varied: Mapping[str, jax.Array],
+        dt: jax.Array,
+        record_every: int,
+    ) -> dict[str, jax.Array]:
+        """The positions, errors and bounds of the same runs (`time_step.positions`), (runs, T, ...)
+        each.  Without metrics, status and assessment of the step, less is compiled.
+
+        Args:
+          scenario, varied, dt: as `run_batch`.
+          record_every: interval of the recorded instants.
+        """
+        request = self.request._replace(record_every=record_every)
+        inputs = inputs_of(scenario, (), dt, request)
+        step = TimeStep(request.method, positions)
+
+        def run(loop: StepLoop, batch: Batch) -> dict[str, jax.Array]:
+            carry = carry_without_linearization(batch, request.method)
+            return loop(step, batch, carry, request.instants, record_every)[1]
+
+        def attempt(executor: Executor) -> dict[str, jax.Array]:
+            batch = Batch.of(inputs, varied, self.execution.layout, request.constants)
+            with compilers_stopped_on_error():
+                return run(kernel_loop(executor), batch)
+
+        def by_scan() -> dict[str, jax.Array]:
+            return run_by_scan(self.execution.scan_layout, inputs, varied, partial(run, scan))
+
+        return first_that_works(self.execution, attempt, by_scan)
 
 
 def compile_batch(
@@ -322,6 +365,47 @@ def _step_states(
 
     def by(loop: StepLoop) -> tuple[Any, Any]:
         return loop(step, batch, carry, request.steps, 1)
+
+    return first_that_works(
+        execution, lambda executor: by(kernel_loop(executor)), partial(by, scan)
+    )
+
+
+def sampled_jacobians(scenario: Scenario, times: jax.Array, states: LoopState) -> jax.Array:
+    """The derivatives of `closed_loop.perturbed_rate` of a sampled loop at many states, by the
+    kernel that linearizes runs: `simulate` and studies build the same one.
+
+    Args:
+      scenario: canonical, with a sampling.
+      times: of the states, (R,) [s].
+      states: (R, ...).
+
+    Returns:
+      (R, m, m), as `stability.jacobian`.
+    """
+    request = RunRequest(0)
+    if registry.default_backend().reason is None:
+        request = request._replace(constants=constants_of(scenario))
+    return _sampled_jacobians(scenario, times, states, request=request)
+
+
+@partial(jax.jit, static_argnames="request")
+def _sampled_jacobians(
+    scenario: Scenario, times: jax.Array, states: LoopState, *, request: RunRequest
+) -> jax.Array:
+    # Commands in transit have no influence, and their number would make another kernel.
+    sampling: Any = scenario.sampling
+    sampling = dataclasses.replace(sampling, queue=min(sampling.queue, 1))
+    scenario = dataclasses.replace(scenario, sampling=sampling)
+    inputs = inputs_of(scenario, (), times[0], request)
+    starts = {"initial.q": jnp.repeat(scenario.initial.q[None], len(times), axis=0)}
+    batch = Batch.of(inputs, starts, STATES_LAYOUT, request.constants)
+    carry = jax.vmap(partial(jacobian_carry, scenario))(times, states)
+    execution = plan_of_jacobians(operations(inputs), registry.default_backend())
+
+    def by(loop: StepLoop) -> jax.Array:
+        found = linearized(loop, batch, carry)
+        return jax.vmap(partial(resolved_jacobian, sampled=True))(found.jacobian)
 
     return first_that_works(
         execution, lambda executor: by(kernel_loop(executor)), partial(by, scan)

@@ -13,6 +13,7 @@ import numpy as np
 from iblf_jax.control.actuators._base import input_delay
 from iblf_jax.core import checks, notices
 from iblf_jax.core.devices import threads
+from iblf_jax.core.progress import announced
 from iblf_jax.engine import thresholds
 from iblf_jax.engine.adjoint import ReverseRun
 from iblf_jax.engine.batch import Batch, carry_shapes
@@ -74,6 +75,7 @@ class Explanation:
 
 
 @notices.each_warning_once
+@announced("compiling a time step to explain it")
 def explain(
     scenario: Scenario, *, varied: Sequence[str] = (), method: str = "rk4", metrics=None
 ) -> Explanation:

@@ -17,6 +17,7 @@ from jax.flatten_util import ravel_pytree
 from iblf_jax.engine.carry import Inputs, StepOptions, keep_if
 from iblf_jax.simulation import error_estimate, stability
 from iblf_jax.simulation.closed_loop import (
+    LoopState,
     initial_state,
     integrated_part,
     perturbed_rate,
@@ -26,14 +27,10 @@ from iblf_jax.simulation.scenario import Scenario
 
 
 class Linearization(NamedTuple):
-    """The carry of a `LinearizationStep`: a state around which the closed loop is linearized.
+    """What the `LinearizationStep`s find at a state."""
 
-    The state does not change, so what it decides is computed once.
-    """
-
-    time: jax.Array
     state: jax.Array
-    """(m,)."""
+    """The state, (m,)."""
     growth: stability.PowerIteration
     """Of the power iteration."""
     jacobian: jax.Array
@@ -42,6 +39,33 @@ class Linearization(NamedTuple):
     unresolved: error_estimate.UnresolvedSignals
     """Of the run; its torque is turned into what it accelerates, as that takes the robot's mass
     matrix."""
+
+
+class LinearizationCarry(NamedTuple):
+    """The carry of a `LinearizationStep`: a state around which the closed loop is linearized.
+
+    The state does not change, so what it decides is computed once.  The columns of the Jacobian are
+    records of the steps: every carried number is a statement that the compiler reads, and the
+    Jacobians of an arm of six joints with sensors and drives have 5,292 numbers.
+    """
+
+    time: jax.Array
+    state: jax.Array
+    """(m,)."""
+    growth: stability.PowerIteration
+    """Of the power iteration."""
+    lengths: Any
+    """Sums of the absolute values of the columns of the Jacobian so far, (3, m') [1/s]; `()` where
+    no power iteration follows, which is all that reads them."""
+    unresolved: error_estimate.UnresolvedSignals
+    """As in `Linearization`."""
+
+    def found(self, columns: jax.Array) -> Linearization:
+        """The linearization, from the carry after the last step and the records (steps, m')."""
+        watched = columns.shape[-1]
+        by_column = columns[: 3 * watched].reshape(3, watched, watched)
+        jacobian = jnp.swapaxes(by_column, 1, 2)
+        return Linearization(self.state, self.growth, jacobian, self.unresolved)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,9 +78,9 @@ class LinearizationStep:
     """
 
     def __call__(
-        self, inputs: Inputs, carry: Linearization, index: jax.Array, options: StepOptions
-    ):
-        """The carry after the step; nothing is recorded."""
+        self, inputs: Inputs, carry: LinearizationCarry, index: jax.Array, options: StepOptions
+    ) -> tuple[LinearizationCarry, jax.Array]:
+        """The carry after the step, and the derivatives of the watched numbers, (m',) [1/s]."""
         start = initial_state(inputs.scenario)
         watched, x = error_estimate.watched_indices(start), carry.state
         as_state = ravel_pytree(perturbed_state(start))[1]
@@ -87,27 +111,36 @@ class LinearizationStep:
             len(watched) < x.size
         ):  # a power iteration follows, across infinite slopes by the widest differences
             widest |= (iteration >= 0) & jnp.any(
-                stability.has_infinite_derivative(
-                    carry.jacobian, inputs.scenario.sampling is not None
+                stability.are_lengths_of_infinite_derivatives(
+                    carry.lengths, inputs.scenario.sampling is not None
                 )
             )
         size = jnp.where(
             widest, sizes[2], jnp.where((level == 1) & (iteration < 0), sizes[1], sizes[0])
         )
-        w, growth = stability.directional_derivative(rate_at, x, direction, size), carry.growth
+        w = stability.directional_derivative(rate_at, x, direction, size)
+        column = jnp.stack([w[i] for i in watched])
+        growth, lengths = carry.growth, carry.lengths
         if len(watched) < x.size:
             growth = keep_if(
                 iteration < 0, growth, stability.power_iteration_step(growth, w, iteration)
             )
-        columns = jnp.arange(watched.size, dtype=index.dtype) == number
-        chosen = (jnp.arange(3, dtype=index.dtype) == level)[:, None, None] & columns
-        jacobian = jnp.where(chosen, jnp.stack([w[i] for i in watched])[:, None], carry.jacobian)
+            columns = jnp.arange(watched.size, dtype=index.dtype) == number
+            chosen = (jnp.arange(3, dtype=index.dtype) == level)[:, None] & columns
+            lengths = jnp.where(chosen, jnp.sum(jnp.abs(column)), lengths)
         unresolved = keep_if(
             index == 0,
             error_estimate.with_acceleration(inputs.scenario, carry.unresolved),
             carry.unresolved,
         )
-        return Linearization(carry.time, x, growth, jacobian, unresolved), ()
+        return LinearizationCarry(carry.time, x, growth, lengths, unresolved), column
+
+
+def jacobian_carry(scenario: Scenario, time: jax.Array, state: LoopState) -> LinearizationCarry:
+    """The carry of a `LinearizationStep` of which only the Jacobian at a state is of interest."""
+    watched = error_estimate.watched_indices(state).size
+    no_estimate = error_estimate.UnresolvedSignals(*[jnp.zeros_like(state.q)] * 3)
+    return linearization_at(time, perturbed_state(state), watched, no_estimate)
 
 
 def linearization_steps(scenario: Scenario) -> int:
@@ -133,17 +166,14 @@ def fastest_mode(scenario: Scenario, found: Linearization) -> jax.Array:
 
 def linearization_at(
     time: jax.Array, state: Any, watched: int, unresolved: error_estimate.UnresolvedSignals
-) -> Linearization:
+) -> LinearizationCarry:
     """The carry of a `LinearizationStep` at a state, as `perturbed_state` gives it, of which
     `accuracy` watches so many numbers.
     """
     x = ravel_pytree(state)[0]
+    lengths: Any = ()
+    if watched < x.size:
+        lengths = jnp.zeros((3, watched), x.dtype)
     return jax.lax.stop_gradient(
-        Linearization(
-            time,
-            x,
-            stability.power_iteration_start(x),
-            jnp.zeros((3, watched, watched), x.dtype),
-            unresolved,
-        )
+        LinearizationCarry(time, x, stability.power_iteration_start(x), lengths, unresolved)
     )

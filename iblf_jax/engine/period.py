@@ -2,7 +2,8 @@
 
 The spectral radius of the map from one period to the next decides.  It is computed at the start and
 along the reference, and the largest value grows past 1 at some period.  The period is an input of
-the compiled map, so the search compiles again only where more commands are in transit.
+the compiled map, which has room for the commands in transit at the shortest period, so the search
+compiles once.
 """
 
 from __future__ import annotations
@@ -16,6 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks, notices
+from iblf_jax.core.progress import announced
+from iblf_jax.engine.execute import sampled_jacobians
 from iblf_jax.engine.step_size import MODE_INSTANTS, largest_eigenvalue, round_down, start_and_along
 from iblf_jax.simulation.closed_loop import LoopState, run_sampled_law
 from iblf_jax.simulation.sampling import Sampling, commands_in_transit
@@ -23,7 +26,6 @@ from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.simulation.stability import (
     continuous_map,
     growth_by_sampling,
-    jacobian,
     period_map,
 )
 
@@ -46,49 +48,63 @@ def radius_at(scenario: Scenario, period: float, times: np.ndarray) -> float:
     (`stability.growth_by_sampling`).
 
     Args:
-      scenario: canonical, with a sampling.
+      scenario: canonical, with a sampling.  Periods that need no more commands in transit than its
+        queue holds share one compiled map.
       period: that it has instead of its own [s].
       times: along the reference [s].
     """
     sampling: Any = scenario.sampling
     dtype = scenario.initial.q.dtype
-    changed = dataclasses.replace(
-        sampling,
-        period=jnp.asarray(period, dtype),
-        queue=commands_in_transit(float(sampling.delay), period),
-    )
+    in_transit = commands_in_transit(float(sampling.delay), period)
+    queue = max(sampling.queue, in_transit)
+    changed = dataclasses.replace(sampling, period=jnp.asarray(period, dtype), queue=queue)
     changed_scenario = dataclasses.replace(scenario, sampling=changed)
+    instants = jnp.asarray(np.concatenate([[0.0], times]), dtype)
+    states = _sampled_states(changed_scenario, instants)
+    derivatives = sampled_jacobians(changed_scenario, instants, states)
     maps, continuous = (
-        np.asarray(each, float) for each in _maps(changed_scenario, jnp.asarray(times, dtype))
+        np.asarray(each, float) for each in _maps(changed_scenario, states, derivatives)
     )
+    # The last rows and columns belong to commands that are never in transit.
+    size = maps.shape[-1] - (queue - in_transit) * scenario.n
     return max(
         float(growth_by_sampling(largest_eigenvalue(one), largest_eigenvalue(other), period))
-        for one, other in zip(maps, continuous, strict=True)
+        for one, other in zip(maps[:, :size, :size], continuous, strict=True)
     )
 
 
 @jax.jit
-def _maps(scenario: Scenario, times: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The derivatives of the period maps, (T + 1, m, m), and the maps of the same loops in
-    continuous time, (T + 1, k, k).
+def _sampled_states(scenario: Scenario, instants: jax.Array) -> LoopState:
+    """The states at the start and along the reference after the law has run, (T, ...): the torque
+    of an instant is the one that the law commands there.
     """
-    zero = jnp.zeros_like(scenario.initial.q[0])
 
-    def at(t: jax.Array, state: LoopState) -> tuple[jax.Array, jax.Array]:
-        # The torque of the instant is the one that the law commands there.
-        state = run_sampled_law(
-            scenario, t, state, jnp.zeros((scenario.sensor.draws, scenario.n), zero.dtype)
-        )
-        derivative = jacobian(scenario, t, state)
+    def sampled(t: jax.Array, state: LoopState) -> LoopState:
+        no_noise = jnp.zeros((scenario.sensor.draws, scenario.n), t.dtype)
+        return run_sampled_law(scenario, t, state, no_noise)
+
+    return jax.vmap(sampled)(instants, start_and_along(scenario, instants[1:]))
+
+
+@jax.jit
+def _maps(
+    scenario: Scenario, states: LoopState, derivatives: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """The derivatives of the period maps, (T, m, m), and the maps of the same loops in continuous
+    time, (T, k, k).
+    """
+
+    def at(state: LoopState, derivative: jax.Array) -> tuple[jax.Array, jax.Array]:
         return (
             period_map(scenario, state, derivative),
             continuous_map(scenario, state, derivative),
         )
 
-    return jax.vmap(at)(jnp.concatenate([zero[None], times]), start_and_along(scenario, times))
+    return jax.vmap(at)(states, derivatives)
 
 
 @notices.each_warning_once
+@announced("searching for the longest stable sampling period")
 def recommended_period(
     scenario: Scenario, *, duration: float = 20.0, radius: float = 1.0, margin: float = 2.0
 ) -> float:
@@ -147,7 +163,15 @@ def _limit(scenario: Scenario, times: np.ndarray, radius: float) -> float | None
     are.
     """
     sampling: Any = scenario.sampling
-    low, high = None, max(SHORTEST_PERIOD, float(sampling.delay) / MAX_COMMANDS_IN_TRANSIT)
+    delay = float(sampling.delay)
+    low, high = None, max(SHORTEST_PERIOD, delay / MAX_COMMANDS_IN_TRANSIT)
+    # One map is compiled for all periods: the shortest has the most commands in transit.
+    first = dataclasses.replace(
+        sampling,
+        period=jnp.asarray(high, scenario.initial.q.dtype),
+        queue=commands_in_transit(delay, high),
+    )
+    scenario = dataclasses.replace(scenario, sampling=first)
     while high <= LONGEST_PERIOD and radius_at(scenario, high, times) < radius:
         low, high = high, high * PERIOD_RATIO
     if low is None or high > LONGEST_PERIOD:

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from iblf_jax.core import checks, notices
+from iblf_jax.core.progress import announced
 from iblf_jax.engine.diagnosis import SimulationError as SimulationError
 from iblf_jax.engine.diagnosis import SimulationWarning as SimulationWarning
 from iblf_jax.engine.diagnosis import report
@@ -31,6 +32,7 @@ memory.  For two joints they take about 5 GB."""
 
 
 @notices.each_warning_once
+@announced("simulating; the first run of a structure compiles its programs")
 def simulate(
     scenario: Scenario,
     *,

@@ -244,6 +244,15 @@ def recorded(folds: Any, found: Advanced):
     return attributes(found.sample, SIGNALS), *states
 
 
+POSITIONS = ("t", "q", "e1", "lower", "upper", "q_d")
+"""Signals of `positions`."""
+
+
+def positions(folds: Any, found: Advanced) -> dict[str, jax.Array]:
+    """The time, and the positions of an instant with their errors, bounds and reference."""
+    return attributes(found.sample, POSITIONS)
+
+
 def samples_of_step(scenario: Scenario) -> int:
     """How many samples the folds see of a step at most: `Advanced.metric_samples`."""
     arrives = scenario.sampling is not None and scenario.sampling.queue > 0

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks, notices
+from iblf_jax.core.progress import announced
 from iblf_jax.core.pytree import astype
 from iblf_jax.identification.coordinates import Coordinates, coordinates, drive_limit, scales
 from iblf_jax.identification.replay import LeafSlice, inverse_dynamics
@@ -66,6 +67,7 @@ class DriveLimits(NamedTuple):
 
 
 @notices.each_warning_once
+@announced("searching for a trajectory that makes the parameters identifiable")
 def excitation(
     scenario: Scenario,
     paths: list[str],

@@ -11,6 +11,7 @@ import jax
 import numpy as np
 
 from iblf_jax.core import checks, notices
+from iblf_jax.core.progress import announced
 from iblf_jax.core.pytree import astype
 from iblf_jax.identification.assessment import assessed
 from iblf_jax.identification.coordinates import (
@@ -47,6 +48,7 @@ TORQUES = ("held", "interpolated")
 
 
 @notices.each_warning_once
+@announced("identifying parameters from a log")
 def identify(
     scenario: Scenario,
     log: Any,

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
+import gc
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend import core
 
 from iblf_jax.kernels.caches import CACHES
-from iblf_jax.kernels.from_jaxpr import closed
+from iblf_jax.kernels.from_jaxpr import PARAMETERS, closed
+from iblf_jax.kernels.kept_programs import kept_program
+from iblf_jax.kernels.messages import announce_if_slow
 from iblf_jax.kernels.packed import EMPTY, Shapes
 from iblf_jax.kernels.passes import with_reciprocals
 from iblf_jax.kernels.program import (
@@ -68,6 +73,38 @@ def compile_step(
       UnsupportedError: the step contains an operation that a scalar program cannot express, or
         exceeds a limit.
     """
+    with _without_garbage_collection():
+        return _compiled(step, dtype, shared, per_run, carry, limits, is_derivative, known, series)
+
+
+@contextlib.contextmanager
+def _without_garbage_collection() -> Iterator[None]:
+    """Context manager in which Python does not look for garbage.
+
+    A trace and a program are many small objects that stay.  Python looks through all of them again
+    and again, which takes a tenth of the time of a compilation.
+    """
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()
+
+
+def _compiled(
+    step: Callable,
+    dtype: np.dtype,
+    shared: Shapes,
+    per_run: Shapes,
+    carry: Shapes,
+    limits: LoweringLimits,
+    is_derivative: bool,
+    known: tuple[Known | None, ...],
+    series: Shapes,
+) -> CompiledStep:
+    """As `compile_step`."""
     index = jax.ShapeDtypeStruct((), jnp.int32)
     leaves = [shared.structs(), per_run.structs()]
     if series.items:
@@ -75,6 +112,45 @@ def compile_step(
     jaxpr, (after, records) = jax.make_jaxpr(step, return_shape=True)(
         *leaves, carry.structs(), index
     )
+    arguments = (dtype.str, shared, per_run, carry, limits, is_derivative, known, series)
+
+    def lower() -> Program:
+        return _lowered(jaxpr, len(after), *arguments[1:], dtype=dtype)
+
+    with announce_if_slow(f"compiling a step of {_count_operations(jaxpr.jaxpr):,} operations"):
+        program = kept_program(jaxpr, PARAMETERS, arguments, lower)
+    return CompiledStep(program, records)
+
+
+def _count_operations(jaxpr: Any) -> int:
+    """The number of operations of a jaxpr and of its inner jaxprs, each counted once."""
+    pending = [jaxpr]
+    found: dict[int, Any] = {}
+    while pending:
+        inner = pending.pop()
+        if id(inner) not in found:
+            found[id(inner)] = inner
+            for equation in inner.eqns:
+                pending += core.jaxprs_in_params(equation.params)
+    return sum(len(inner.eqns) for inner in found.values())
+
+
+def _lowered(
+    jaxpr: Any,
+    carried: int,
+    shared: Shapes,
+    per_run: Shapes,
+    carry: Shapes,
+    limits: LoweringLimits,
+    is_derivative: bool,
+    known: tuple[Known | None, ...],
+    series: Shapes,
+    *,
+    dtype: np.dtype,
+) -> Program:
+    """The program of the jaxpr of a step, whose first `carried` outputs are the carry; other
+    arguments as `compile_step`.
+    """
     b = Builder(dtype, sparse=is_derivative, limits=limits)
     shared_ids = _inputs(b, shared, lambda i, kind: _shared(b, i, known))
     per_run_ids = _inputs(b, per_run, lambda i, kind: b.input("per_run", i, kind))
@@ -83,8 +159,8 @@ def compile_step(
     index_id = np.asarray(b.input("index", 0, "i"), np.int64)
     _mark_constant_carry(b, jaxpr.jaxpr, carry_ids)
     out = closed(b, jaxpr, [*shared_ids, *per_run_ids, *series_ids, *carry_ids, index_id])
-    carry_out, recorded = out[: len(after)], out[len(after) :]
-    if Shapes.of(after).kinds() != carry.kinds():
+    carry_out, recorded = out[:carried], out[carried:]
+    if Shapes.of(jaxpr.out_avals[:carried]).kinds() != carry.kinds():
         raise UnsupportedError("the step changes the types of its carry")
     program = finished(
         b,
@@ -93,7 +169,7 @@ def compile_step(
         [_as_float(b, i) for i in _numbers(recorded)],
         tuple(ids.size for ids in recorded),
     )
-    return CompiledStep(with_reciprocals(program), records)
+    return with_reciprocals(program)
 
 
 def _numbers(arrays: Sequence[Ids]) -> list[int]:

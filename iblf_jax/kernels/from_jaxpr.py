@@ -7,7 +7,7 @@ scans are unrolled. A primitive without a rule raises `UnsupportedError`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -206,3 +206,16 @@ def choose(b: Builder, condition: int, yes: Ids, no: Ids | None) -> Ids | None:
 
 
 CONTROL = {"scan": _scan, "cond": _cond, "while": _while}
+
+PARAMETERS: dict[str, Callable[[dict[str, Any]], tuple]] = {
+    "scan": lambda params: (
+        params["length"],
+        params["reverse"],
+        params["jaxpr"],
+        _parts(params),
+    ),
+    "cond": lambda params: (params["branches"],),
+    "while": lambda params: (),
+    **{name: lambda params, inner=inner: (params[inner],) for name, inner in INLINED.items()},
+}
+"""Primitive with inner functions -> function (parameters) -> those that are read here."""

@@ -21,13 +21,18 @@ def has_reader() -> bool:
 
 
 @contextlib.contextmanager
-def announce_if_slow(text: str) -> Iterator[None]:
-    """Print a line once the body has taken `SLOW` seconds, in a terminal or a notebook."""
+def announce_if_slow(text: str, shown: bool | None = None) -> Iterator[threading.Timer]:
+    """Print a line once the body has taken `SLOW` seconds, unless the body cancels it.
+
+    Args:
+      text: of the line.
+      shown: whether it is printed; None for a line in a terminal or a notebook only.
+    """
     line = threading.Timer(SLOW, lambda: sys.stderr.write(f"iblf_jax: {text}\n"))
     line.daemon = True
-    if has_reader():
+    if has_reader() if shown is None else shown:
         line.start()
     try:
-        yield
+        yield line
     finally:
         line.cancel()

@@ -343,15 +343,21 @@ def cached_file(
     Raises:
       ToolchainError: the file cannot be made, or there is no safe place or no space for it.
     """
+    path = cache_path(content, suffix)
+    with _made_once(path.stem):
+        _make_if_missing(path.parent, path, make)
+    return path, path.stem
+
+
+def cache_path(content: Iterable[str], suffix: str) -> Path:
+    """The path of a file of the cache, which need not exist; arguments and errors as
+    `cached_file`.
+    """
     key = hashlib.sha256("\0".join(content).encode()).hexdigest()[:32]
     try:
-        folder = directory()
+        return directory() / f"{key}{suffix}"
     except OSError as error:
         raise ToolchainError(str(error)) from None
-    path = folder / f"{key}{suffix}"
-    with _made_once(key):
-        _make_if_missing(folder, path, make)
-    return path, key
 
 
 @contextlib.contextmanager

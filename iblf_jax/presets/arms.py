@@ -45,6 +45,7 @@ from iblf_jax.control.controllers.systems import observer_of
 from iblf_jax.control.observers import Momentum, Printed
 from iblf_jax.core import checks
 from iblf_jax.core.disk_cache import keep_programs
+from iblf_jax.core.progress import announced
 from iblf_jax.simulation.scenario import Initial, Scenario, fit_joints
 from iblf_jax.world import disturbances, references
 from iblf_jax.world.bounds import Bounds, from_limits, tube_at
@@ -138,9 +139,10 @@ def _coupled_gain(robot: Robot, reference: Reference) -> jax.Array:
     positions = _positions_of(reference, jnp.asarray(TIMES, jnp.result_type(float)))
     if positions.ndim == 1:
         positions = jnp.repeat(positions[:, None], robot.n, axis=1)
-    matrices = jnp.stack(
-        [mass_matrix_at(robot, q) for q in positions.astype(jnp.result_type(float))]
-    )
+    # The matrices are computed one by one, and collected by NumPy: XLA would compile programs that
+    # divide and join them.
+    separate = np.asarray(positions.astype(jnp.result_type(float)))
+    matrices = jnp.asarray(np.stack([np.asarray(mass_matrix_at(robot, q)) for q in separate]))
     inertia = jnp.diagonal(matrices[0])
     size = jnp.sqrt(inertia)
     coupling = jnp.sum(jnp.abs(matrices[0]), axis=1) / inertia
@@ -211,6 +213,7 @@ def _stiffness(
     return jnp.max(jax.vmap(at)(times), axis=0)
 
 
+@announced("computing the gains of an arm")
 def arm_scenario(
     robot: Robot,
     reference: Reference,

@@ -24,6 +24,7 @@ import jax
 import numpy as np
 
 from iblf_jax.core import checks, notices
+from iblf_jax.core.progress import announced
 from iblf_jax.core.status import Status
 from iblf_jax.engine.simulate import SimulationWarning, simulate
 from iblf_jax.kernels import enclose
@@ -83,6 +84,7 @@ class _Sampled(NamedTuple):
 
 
 @notices.each_warning_once
+@announced("preparing a proof")
 def prove(
     scenario: Scenario,
     *,

@@ -91,12 +91,9 @@ def _record_block(
 ):
     """The recorded positions of a block of runs: signal -> (B, T, n); and the times, (B, T)."""
     varied, _, _ = drawn_leaves(program.targets, shared, inputs)
-    outcome = program.batch(
-        shared.uncertain.scenario, varied, shared.folds, shared.dt, record_every=record_every
-    )
-    arrays = outcome.records[0]
-    recorded = {name: arrays[name] for name in ("q", "e1", "lower", "upper", "q_d")}
-    return recorded, arrays["t"]
+    recorded = program.batch.positions(shared.uncertain.scenario, varied, shared.dt, record_every)
+    times = recorded.pop("t")
+    return recorded, times
 
 
 @partial(jax.jit, static_argnames=("program", "record_every"))

@@ -34,6 +34,7 @@ from iblf_jax.control.controllers.systems import observer_of
 from iblf_jax.control.observers import NoObserver
 from iblf_jax.core import checks, notices
 from iblf_jax.core.optional import attributes
+from iblf_jax.core.progress import announced
 from iblf_jax.core.pytree import field_values, layers, unwrapped
 from iblf_jax.core.status import Status
 from iblf_jax.core.units import INPUT
@@ -56,6 +57,7 @@ Laws = Sequence[str | Controller] | Mapping[str, str | Controller]
 
 
 @notices.each_warning_once
+@announced("comparing laws")
 def compare(
     scenario: Scenario,
     laws: Laws = LAWS,

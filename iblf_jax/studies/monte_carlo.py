@@ -11,7 +11,7 @@ from concurrent.futures import Executor
 from typing import Any
 
 from iblf_jax.core import checks, notices
-from iblf_jax.core.progress import bar
+from iblf_jax.core.progress import announced, bar
 from iblf_jax.simulation.error_estimate import RELATIVE
 from iblf_jax.simulation.metrics import Fold
 from iblf_jax.simulation.noise import has_noise
@@ -26,6 +26,7 @@ from iblf_jax.studies.time_step import warn_of_step
 
 
 @notices.each_warning_once
+@announced("compiling the program of a study")
 def monte_carlo(
     scenario: Scenario,
     perturbations: Mapping[str, Perturbation],

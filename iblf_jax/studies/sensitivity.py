@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from iblf_jax.core import checks, notices, tables
-from iblf_jax.core.progress import bar
+from iblf_jax.core.progress import announced, bar
 from iblf_jax.core.pytree import field_values
 from iblf_jax.core.status import FAILED, has_flag
 from iblf_jax.simulation.metrics import Fold, metric_units
@@ -103,6 +103,7 @@ class Sensitivity:
 
 
 @notices.each_warning_once
+@announced("compiling the program of a sensitivity analysis")
 def sensitivity(
     scenario: Scenario,
     perturbations: Mapping[str, Perturbation],

@@ -23,6 +23,7 @@ import numpy as np
 
 from iblf_jax.core import checks, notices
 from iblf_jax.core.presentation import present
+from iblf_jax.core.progress import announced
 from iblf_jax.core.status import FAILED, Status, describe, has_flag
 from iblf_jax.core.status import VIOLATED as CONSTRAINT_VIOLATED
 from iblf_jax.engine import RunRequest, block_size, run_rollout
@@ -374,6 +375,7 @@ class Study:
         return present("study figure", self, **options)
 
     @notices.each_warning_once
+    @announced("simulating a run of a study again")
     def replay(self, index: int, *, record_every: int = 1) -> Rollout:
         """Computes one run again, with its whole trajectory.
 

@@ -19,7 +19,7 @@ import jax
 import numpy as np
 
 from iblf_jax.core import checks, notices
-from iblf_jax.core.progress import bar
+from iblf_jax.core.progress import announced, bar
 from iblf_jax.engine import cases_per_unit, whole_blocks
 from iblf_jax.simulation.error_estimate import RELATIVE
 from iblf_jax.simulation.metrics import Fold, metric_units
@@ -52,6 +52,7 @@ if TYPE_CHECKING:
 
 
 @notices.each_warning_once
+@announced("compiling the program of a sweep")
 def sweep(
     scenario: Scenario,
     grid: Mapping[str, Any],

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from iblf_jax.core import checks, notices
+from iblf_jax.core.progress import announced
 from iblf_jax.core.status import Status, has_flag
 from iblf_jax.engine import block_size, step_size
 from iblf_jax.simulation.error_estimate import RELATIVE, TOLERANCE
@@ -24,6 +25,7 @@ MAX_TRIES = 8
 
 
 @notices.each_warning_once
+@announced("searching for the largest accurate time step")
 def recommended_dt(
     scenario: Scenario,
     *,

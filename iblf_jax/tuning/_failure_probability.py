@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks, notices
-from iblf_jax.core.progress import bar
+from iblf_jax.core.progress import announced, bar
 from iblf_jax.core.pytree import astype
 from iblf_jax.core.status import UNTRUSTED, Status, has_flag
 from iblf_jax.engine import RunRequest, differentiates_forward
@@ -139,6 +139,7 @@ class FailureOptions(NamedTuple):
 
 
 @notices.each_warning_once
+@announced("compiling the programs of an estimate of a failure probability")
 def failure_probability(
     scenario: Scenario,
     perturbations: Mapping[str, Perturbation],

@@ -31,7 +31,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks, notices
-from iblf_jax.core.progress import bar
+from iblf_jax.core.progress import announced, bar
 from iblf_jax.core.pytree import astype
 from iblf_jax.core.status import VIOLATED, Status, describe, has_flag
 from iblf_jax.engine import RunRequest
@@ -106,6 +106,7 @@ class Attack:
 
 @notices.each_warning_once
 @checks.renamed(sets="perturbations")
+@announced("compiling the programs of a search for a failure")
 def falsify(
     scenario: Scenario,
     perturbations: Mapping[str, Perturbation],

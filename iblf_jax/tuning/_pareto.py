@@ -37,7 +37,7 @@ import numpy as np
 
 from iblf_jax.core import checks, notices
 from iblf_jax.core.presentation import present
-from iblf_jax.core.progress import bar
+from iblf_jax.core.progress import announced, bar
 from iblf_jax.engine import MAX_FORWARD_NUMBERS, differentiates_forward
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.scenario import Scenario
@@ -120,6 +120,7 @@ def non_dominated(points: np.ndarray) -> np.ndarray:
 
 
 @notices.each_warning_once
+@announced("compiling the programs of a search for a Pareto front")
 def pareto(
     scenario: Scenario,
     parameters: Sequence[str | Tunable],

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks, notices
-from iblf_jax.core.progress import bar
+from iblf_jax.core.progress import announced, bar
 from iblf_jax.core.units import POSITION
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.scenario import Scenario
@@ -58,6 +58,7 @@ POLISH_STEPS = 15
 
 
 @notices.each_warning_once
+@announced("compiling the programs of a search for gains")
 def tune(
     scenario: Scenario,
     parameters: Sequence[str | Tunable],

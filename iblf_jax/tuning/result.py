@@ -14,6 +14,7 @@ import numpy as np
 
 from iblf_jax.core import checks, notices
 from iblf_jax.core.presentation import present
+from iblf_jax.core.progress import announced
 from iblf_jax.core.status import UNTRUSTED
 from iblf_jax.engine import RunRequest, points_per_batch, run_batch, run_rollout
 from iblf_jax.simulation import paths
@@ -291,6 +292,7 @@ class TuneResult:
         return self.check()
 
     @notices.each_warning_once
+    @announced("checking tuned gains in runs that the search did not use")
     def check(self, runs: int | None = None, seed: int | None = None) -> TuningReport:
         """Makes the report with another number of fresh runs, or another seed.
 
