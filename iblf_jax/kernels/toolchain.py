@@ -471,18 +471,23 @@ def loaded(library: Path, *names: str) -> ctypes.CDLL:
 
 
 def _load(image: bytes) -> ctypes.CDLL:
-    """A library from its bytes."""
-    file = None
-    try:
-        file = os.memfd_create("iblf_jax")
-        with open(file, "wb", closefd=False) as out:
-            out.write(image)
-        # The file stays open: the loader would take another library of this name for this one.
-        return ctypes.CDLL(f"/proc/self/fd/{file}")
-    except (OSError, AttributeError):  # this system has no such files, or they are not executable
-        if file is not None:
-            os.close(file)
+    """A library from its bytes; it takes five memory maps, and no file stays open."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "kernel.so"
+        try:
+            file = os.memfd_create("iblf_jax")
+        except (OSError, AttributeError):  # this system has no files in memory
+            path.write_bytes(image)
+            return ctypes.CDLL(str(path))
+        with open(file, "wb") as out:
+            out.write(image)
+            out.flush()
+            try:
+                # By a name of its own: the loader would take another library of the name
+                # /proc/self/fd/... for this one.
+                path.symlink_to(f"/proc/self/fd/{file}")
+                return ctypes.CDLL(str(path))
+            except OSError:  # files in memory are not executable here
+                path.unlink(missing_ok=True)
         path.write_bytes(image)
         return ctypes.CDLL(str(path))
