@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import jax
 
+from iblf_jax.core import programs
 from iblf_jax.engine import registry
 from iblf_jax.engine.batch import Batch, StepLoop, carry_shapes, run_all
 from iblf_jax.engine.carry import Inputs
@@ -259,7 +260,7 @@ def step_states(
     return _step_states(scenario, dt, carry, step=step, request=request)
 
 
-@partial(jax.jit, static_argnames=("step", "request"))
+@programs.jit(static_argnames=("step", "request"))
 def _step_states(
     scenario: Scenario, dt: jax.Array, carry: Any, *, step: Any, request: RunRequest
 ) -> tuple[Any, Any]:

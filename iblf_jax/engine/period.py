@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.core import checks, notices
+from iblf_jax.core import checks, notices, programs
 from iblf_jax.engine.step_size import MODE_INSTANTS, largest_eigenvalue, round_down, start_and_along
 from iblf_jax.simulation.closed_loop import LoopState, run_sampled_law
 from iblf_jax.simulation.sampling import Sampling, commands_in_transit
@@ -67,7 +67,7 @@ def radius_at(scenario: Scenario, period: float, times: np.ndarray) -> float:
     )
 
 
-@jax.jit
+@programs.jit
 def _maps(scenario: Scenario, times: jax.Array) -> tuple[jax.Array, jax.Array]:
     """The derivatives of the period maps, (T + 1, m, m), and the maps of the same loops in
     continuous time, (T + 1, k, k).
