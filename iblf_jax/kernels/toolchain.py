@@ -54,7 +54,16 @@ NaN and infinities keep their meaning: there is no -ffast-math and no -ffinite-m
 angle would lose digits. `-nostdinc++` selects the headers of C: the `math.h` of C++ takes a tenth
 of a second longer to read."""
 FLAGS_OF_KIND = {
-    "gcc": ("-fexpensive-optimizations", "-fcaller-saves", "-ftree-loop-vectorize"),
+    "gcc": (
+        "-fexpensive-optimizations",
+        "-fcaller-saves",
+        "-ftree-loop-vectorize",
+        "-fno-dse",
+        "-fno-tree-dse",
+        "-fno-forward-propagate",
+        "-fno-tree-sink",
+        "-fno-guess-branch-probability",
+    ),
     "clang": ("-fvectorize", "-fslp-vectorize", "-fno-sanitize=undefined", "-nostdlib++"),
     "other": (),
 }
@@ -64,7 +73,9 @@ GCC: the optimisations of -O3 from which the generated text gains. The paper's l
 with -O3 (within 1 %, a single run 3 % slower) and is compiled in 0.6 s instead of 2.7 s. The first
 flag is necessary for products and sums to become one operation. With the second, numbers stay in
 registers across rare calls (a step of seven joints takes 5 to 25 % longer without it). The third
-makes the square roots of many runs one instruction.
+makes the square roots of many runs one instruction. The others switch off passes from which the
+generated text gains nothing: a step with 21 tangents of seven joints compiles in 13.6 s instead of
+18.4 s, the paper's loop in 0.45 s instead of 0.52 s, and both run as fast as with them.
 
 Clang: the first two flags make the square roots of many runs one instruction. `ziglang` adds checks
 of undefined behaviour to code that is not optimised, and its own C++ library, of which a kernel
