@@ -41,7 +41,6 @@ V, its decay W and the disturbance terms T, with V' <= -W + T.
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -59,7 +58,7 @@ from iblf_jax.control.controllers import (
 )
 from iblf_jax.control.controllers._base import law_member
 from iblf_jax.control.observers import Momentum, Printed
-from iblf_jax.core import checks
+from iblf_jax.core import checks, programs
 from iblf_jax.core.pytree import layers, unwrapped
 from iblf_jax.simulation.scenario import Scenario
 
@@ -222,7 +221,7 @@ def constants_of(scenario: Scenario) -> Claim | FullClaim:
     return Claim(decay, law.K2, observer.kf)
 
 
-@partial(jax.jit, static_argnames="case")
+@programs.jit(static_argnames="case")
 def rho_terms(
     constants: Claim | FullClaim,
     lambda_max: jax.typing.ArrayLike,

@@ -28,6 +28,7 @@ from iblf_jax.certificates.run_summary import (
     Segment,
     weighted_lyapunov,
 )
+from iblf_jax.core import programs
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.simulation.scenario import Scenario
 
@@ -212,7 +213,7 @@ def _why_no_bound(segment: Segment, name: str, bounds: dict[str, np.ndarray]) ->
     return ""
 
 
-@jax.jit
+@programs.jit
 def xi_bound(scenario: Scenario, t: jax.Array, V: jax.Array) -> jax.Array | None:
     """The barrier's own bound on |xi_i| where w_i V1_i <= V, (T, n), or None if it states none."""
     law: Any = unwrapped(scenario.controller)
@@ -232,7 +233,7 @@ def _along(segment: Segment, bound: Any, V: np.ndarray, *signals: np.ndarray) ->
     return np.asarray(found)[: V.size]
 
 
-@jax.jit
+@programs.jit
 def _xi2_bound(
     scenario: Scenario, t: jax.Array, q: jax.Array, dq: jax.Array, V: jax.Array
 ) -> jax.Array | None:

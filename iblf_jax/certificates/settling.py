@@ -40,7 +40,7 @@ from iblf_jax.control.actuators import Ideal
 from iblf_jax.control.controllers import Backstepping, BarrierBackstepping, FullState
 from iblf_jax.control.controllers._base import decay_of
 from iblf_jax.control.decays._base import decay_member, energy_gain
-from iblf_jax.core import checks
+from iblf_jax.core import checks, programs
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.simulation.scenario import Scenario
 
@@ -173,10 +173,10 @@ def predicted(
     return np.linspace(0.0, end, count + 1), np.exp(np.asarray(found, float))
 
 
-_least_decay = jax.jit(least_decay)
+_least_decay = programs.jit(least_decay)
 
 
-@jax.jit
+@programs.jit
 def _step(
     law: Any, mu: jax.Array, rho2: jax.Array, h: jax.Array, i: jax.Array, logarithm: jax.Array
 ) -> jax.Array:

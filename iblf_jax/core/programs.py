@@ -1,18 +1,29 @@
-"""Bounds the number of memory maps that compiled programs use.
+"""Bounds what compiled programs use: memory, and memory maps.
 
-The code of a program that JAX has compiled for a CPU uses some hundred memory maps, and Linux
-allows a process 65,530.  JAX keeps every program for the life of the process: after a few hundred
-programs (a few dozen arms, each with programs of its own) the compiler cannot allocate memory, and
-the process ends.  This module therefore clears JAX's programs when the number of maps comes close
-to the limit; programs that are needed again are compiled again, or read from the disk
-(`core.disk_cache`).
+JAX keeps every program for the life of the process.  The programs of one scenario take some 20 to
+40 MB, and a program uses 10 to 250 memory maps, of which Linux allows a process 65,530.  After some
+hundred programs the compiler cannot allocate memory, and the process ends.
+
+`PROGRAMS` therefore keeps the programs that were used last.  `programs.jit` takes the place of
+`jax.jit` for a function that is compiled once for each structure, such as that of a scenario.  JAX
+keeps a program only as long as the function that it was compiled for exists, so each structure has
+a copy of the function of its own: without the copy, JAX releases the program.
+
+Programs of other functions, of operations of `jnp` outside a compiled function among them, are
+released all together when the number of maps comes close to the limit (`ProgramBound`).
+
+What is needed again is compiled again, or read from the disk (`core.disk_cache`).
 """
 
 from __future__ import annotations
 
 import gc
 import threading
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Sequence
+from functools import update_wrapper, wraps
 from pathlib import Path
+from typing import Any
 
 import jax
 
@@ -24,6 +35,10 @@ MAX_MAP_FRACTION = 0.6
 some, too."""
 MAPS_OF_A_PROGRAM = 300
 """Approximate largest number of maps of a program: a step of an arm's closed loop has 250."""
+
+
+MAX_PROGRAMS = 512
+"""Programs that are kept.  `simulate` uses five for a scenario, a study two, `certify` twelve."""
 
 
 def count_maps() -> int:
@@ -42,9 +57,156 @@ def most_maps() -> int | None:
         return None
 
 
+class Programs:
+    """Functions that JAX has compiled, each for one structure of its arguments; those that were not
+    used for longest leave.
+
+    Args:
+      size: how many are kept.
+    """
+
+    def __init__(self, size: int) -> None:
+        self.size = size
+        self._kept: OrderedDict[Hashable, Any] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    def get(self, key: Hashable, compiled: Callable[[], Any]) -> Any:
+        """The function of a key; `compiled()` returns it if it is not kept."""
+        with self._lock:
+            found = self._kept.get(key)
+            if found is None:
+                found = self._kept[key] = compiled()
+            self._kept.move_to_end(key)
+            while len(self._kept) > self.size:
+                self._kept.popitem(last=False)
+        return found
+
+    def release(self, number: int) -> None:
+        """Releases the functions that were not used for longest; programs that run stay until their
+        end.
+
+        Args:
+          number: how many.
+        """
+        with self._lock:
+            for _ in range(min(number, len(self._kept))):
+                self._kept.popitem(last=False)
+
+    def of(self, function: Callable) -> list[Any]:
+        """What is kept of a function."""
+        with self._lock:
+            return [kept for key, kept in self._kept.items() if key[0] is function]  # type: ignore[index]
+
+
+class StructuredFunction:
+    """A function that JAX compiles once for each structure of its arguments (`jit`).
+
+    It has the methods of a function of `jax.jit` that this package uses.
+    """
+
+    def __init__(
+        self,
+        function: Callable,
+        programs: Programs,
+        static_argnums: tuple[int, ...] = (),
+        static_argnames: tuple[str, ...] = (),
+    ) -> None:
+        self._function = function
+        self._programs = programs
+        self._static_argnums = static_argnums
+        self._static_argnames = static_argnames
+        update_wrapper(self, function)
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """The value of the function."""
+        return self._program(args, kwargs)(*args, **kwargs)
+
+    def trace(self, *args: Any, **kwargs: Any) -> Any:
+        """As `trace` of `jax.jit`."""
+        return self._program(args, kwargs).trace(*args, **kwargs)
+
+    def lower(self, *args: Any, **kwargs: Any) -> Any:
+        """As `lower` of `jax.jit`."""
+        return self._program(args, kwargs).lower(*args, **kwargs)
+
+    def clear_cache(self) -> None:
+        """As `clear_cache` of `jax.jit`."""
+        for program in self._programs.of(self._function):
+            program.clear_cache()
+
+    def _cache_size(self) -> int:
+        """How many programs JAX has compiled."""
+        return sum(program._cache_size() for program in self._programs.of(self._function))
+
+    def _program(self, args: tuple, kwargs: dict[str, Any]) -> Any:
+        """The copy of the function for the structure of these arguments."""
+        key = (self._function, *self._structure_of(args, kwargs))
+        return self._programs.get(key, self._copy)
+
+    def _structure_of(self, args: tuple, kwargs: dict[str, Any]) -> tuple:
+        """What a copy is made for: the static arguments, and structure and shapes of the others.
+
+        JAX distinguishes their types itself.
+        """
+        static = [args[i] for i in self._static_argnums]
+        static += [kwargs.get(name) for name in self._static_argnames]
+        others = [x for i, x in enumerate(args) if i not in self._static_argnums]
+        named = {name: x for name, x in kwargs.items() if name not in self._static_argnames}
+        leaves, structure = jax.tree.flatten((others, named))
+        return tuple(static), structure, tuple([getattr(x, "shape", ()) for x in leaves])
+
+    def _copy(self) -> Any:
+        """A copy of the function, to be compiled by JAX for one structure."""
+        function = self._function
+
+        @wraps(function)
+        def copy(*args: Any, **kwargs: Any) -> Any:
+            return function(*args, **kwargs)
+
+        # JAX finds the positions of static arguments by their names if only the names are given.
+        return jax.jit(
+            copy,
+            static_argnums=self._static_argnums or None,
+            static_argnames=self._static_argnames or None,
+        )
+
+
+PROGRAMS = Programs(MAX_PROGRAMS)
+"""The programs of this process."""
+
+
+def jit(
+    function: Callable | None = None,
+    *,
+    static_argnums: int | Sequence[int] = (),
+    static_argnames: str | Sequence[str] = (),
+) -> Any:
+    """As `jax.jit`, for a function of many structures (head of this module); also a decorator with
+    options.
+
+    Args:
+      function: the function.
+      static_argnums: positions of arguments that are compiled in; they are hashable.
+      static_argnames: names of keyword arguments that are compiled in.
+    """
+    numbers = (static_argnums,) if isinstance(static_argnums, int) else tuple(static_argnums)
+    names = (static_argnames,) if isinstance(static_argnames, str) else tuple(static_argnames)
+
+    def decorated(function: Callable) -> StructuredFunction:
+        return StructuredFunction(function, PROGRAMS, numbers, names)
+
+    if function is None:
+        return decorated
+    return decorated(function)
+
+
 class ProgramBound:
-    """Makes JAX release all programs when the process has more than `bound` memory maps, of the
-    `limit` that the system allows.
+    """Releases programs when the process has more than `bound` memory maps, of the `limit` that the
+    system allows: the half of `PROGRAMS` that was not used for longest and, where that is not
+    enough, all programs of JAX.
     """
 
     def __init__(self, limit: int, bound: int) -> None:
@@ -72,6 +234,9 @@ class ProgramBound:
     def check(self) -> None:
         """Counts the maps, and releases programs if there are too many."""
         maps = count_maps()
+        if maps > self.bound:
+            PROGRAMS.release(len(PROGRAMS) // 2)
+            maps = count_maps()
         if maps > self.bound:
             release_programs()
             self.released += 1

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.core import programs
 from iblf_jax.engine import registry
 from iblf_jax.engine.adjoint import Cotangents, ReverseRun
 from iblf_jax.engine.batch import (
@@ -354,7 +355,7 @@ def step_states(
     return _step_states(scenario, dt, carry, step=step, request=request)
 
 
-@partial(jax.jit, static_argnames=("step", "request"))
+@programs.jit(static_argnames=("step", "request"))
 def _step_states(
     scenario: Scenario, dt: jax.Array, carry: Any, *, step: Any, request: RunRequest
 ) -> tuple[Any, Any]:

@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.control.controllers._base import law_member
+from iblf_jax.core import programs
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.engine.step_size import largest_eigenvalue, start_and_along
 from iblf_jax.simulation.closed_loop import LoopState, initial_state, run_sampled_law
@@ -157,7 +158,7 @@ def _relative_to_limit(
     return radius
 
 
-@jax.jit
+@programs.jit
 def _period_maps(scenario: Scenario, times: jax.Array, states: LoopState) -> jax.Array:
     """The derivatives of the maps from one period to the next, (INSTANTS, m, m)."""
 
@@ -169,7 +170,7 @@ def _period_maps(scenario: Scenario, times: jax.Array, states: LoopState) -> jax
     return jax.vmap(at)(times, states)
 
 
-@jax.jit
+@programs.jit
 def _jacobians(scenario: Scenario, times: jax.Array, states: LoopState) -> jax.Array:
     """The closed loop's Jacobians, (INSTANTS, m, m) [1/s]."""
     return jax.vmap(lambda t, state: jacobian(scenario, t, state))(times, states)
@@ -196,7 +197,7 @@ def _instants(scenario: Scenario, run: Any) -> Iterator[tuple[jax.Array, LoopSta
     yield jnp.asarray(recorded[nearest], dtype), _states_at(scenario, x)
 
 
-@jax.jit
+@programs.jit
 def _states_at(scenario: Scenario, x: jax.Array) -> LoopState:
     """Initial states of a loop at these states of the plant, (INSTANTS, r, n)."""
     return jax.vmap(lambda x: initial_state(dataclasses.replace(scenario, initial=Initial(x=x))))(x)

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.core import checks, notices
+from iblf_jax.core import checks, notices, programs
 from iblf_jax.core.progress import announced
 from iblf_jax.engine.execute import sampled_jacobians
 from iblf_jax.engine.step_size import MODE_INSTANTS, largest_eigenvalue, round_down, start_and_along
@@ -73,7 +73,7 @@ def radius_at(scenario: Scenario, period: float, times: np.ndarray) -> float:
     )
 
 
-@jax.jit
+@programs.jit
 def _sampled_states(scenario: Scenario, instants: jax.Array) -> LoopState:
     """The states at the start and along the reference after the law has run, (T, ...): the torque
     of an instant is the one that the law commands there.
@@ -86,7 +86,7 @@ def _sampled_states(scenario: Scenario, instants: jax.Array) -> LoopState:
     return jax.vmap(sampled)(instants, start_and_along(scenario, instants[1:]))
 
 
-@jax.jit
+@programs.jit
 def _maps(
     scenario: Scenario, states: LoopState, derivatives: jax.Array
 ) -> tuple[jax.Array, jax.Array]:

@@ -11,13 +11,13 @@ results are the same.
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.core import programs
 from iblf_jax.core.caches import CACHE
 from iblf_jax.engine import registry, thresholds
 from iblf_jax.engine.batch import Batch, StepLoop, finalize, initialize, run_all
@@ -136,12 +136,12 @@ def _steps_per_call(executor: Executor, nodes: int, request: RunRequest) -> int:
     return thresholds.steps_per_call(nodes, request.instants, request.record_every)
 
 
-@partial(jax.jit, static_argnums=(0, 1))
+@programs.jit(static_argnums=(0, 1))
 def _initialize(parts: Parts, request: RunRequest, leaves: list) -> tuple[Carry, Linearization]:
     return initialize(parts.loop, parts.batch(leaves, request), request.method)
 
 
-@partial(jax.jit, static_argnums=(0, 1))
+@programs.jit(static_argnums=(0, 1))
 def _all_steps(parts: Parts, request: RunRequest, leaves: list, carry: Carry) -> tuple[Carry, Any]:
     return _steps(parts.loop, parts.batch(leaves, request), request, carry, request.instants)
 
@@ -162,7 +162,7 @@ def _steps_in_calls(
     return carry, jax.tree.map(lambda *x: jnp.asarray(np.concatenate(x)), *recorded)
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2))
+@programs.jit(static_argnums=(0, 1, 2))
 def _steps_from(
     parts: Parts, request: RunRequest, count: int, leaves: list, carry: Carry, first: jax.Array
 ) -> tuple[Carry, Any]:
@@ -181,7 +181,7 @@ def _steps(
     return carry, jax.tree.map(lambda x: x[0], records)
 
 
-@partial(jax.jit, static_argnums=(0, 1))
+@programs.jit(static_argnums=(0, 1))
 def _finalize(
     parts: Parts, request: RunRequest, leaves: list, carry: Carry, at_start: Linearization
 ) -> Outcome:
@@ -189,7 +189,7 @@ def _finalize(
     return jax.tree.map(lambda x: x[0], outcome)
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2))
+@programs.jit(static_argnums=(0, 1, 2))
 def _run_by_scan(structure: Any, layout: BatchLayout, request: RunRequest, leaves: list) -> Outcome:
     inputs = jax.tree.unflatten(structure, leaves)
     return run_by_scan(layout, inputs, None, lambda batch: run_all(scan, batch, request))

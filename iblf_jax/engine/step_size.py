@@ -20,7 +20,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from iblf_jax.control.actuators._base import input_delay
-from iblf_jax.core import checks, notices
+from iblf_jax.core import checks, notices, programs
 from iblf_jax.core.status import Status, has_flag
 from iblf_jax.engine.machine_function import machine_function
 from iblf_jax.engine.request import RunRequest
@@ -91,7 +91,7 @@ def side_by_side(scenario: Scenario, dt: float, steps: int, *, method: str) -> P
     return pair
 
 
-@partial(jax.jit, static_argnames="method")
+@programs.jit(static_argnames="method")
 def _start(scenario: Scenario, dt: jax.Array, steps: jax.Array, *, method: str) -> Pair:
     start, zero = initial_state(scenario), jnp.zeros_like(dt)
     x = ravel_pytree(start)[0]
@@ -108,7 +108,7 @@ def _start(scenario: Scenario, dt: jax.Array, steps: jax.Array, *, method: str) 
     return Pair(jnp.int32(0), x, x, estimate, zero, (zero - 1.0, zero, x), jnp.bool_(True))
 
 
-@partial(jax.jit, static_argnames="method")
+@programs.jit(static_argnames="method")
 def _advanced(
     scenario: Scenario, dt: jax.Array, steps: jax.Array, pair: Pair, *, method: str
 ) -> Pair:
@@ -185,7 +185,7 @@ def _one_step(scenario: Scenario, times: jax.Array, dt: jax.Array, pair: Pair, m
     return Pair(pair.step + 1, coarse, fine, estimate, difference, nearest, going)
 
 
-@jax.jit
+@programs.jit
 def start_and_along(scenario: Scenario, times: jax.Array) -> LoopState:
     """The state at the start, and those of a loop that follows its reference exactly; time axis
     first, (1 + T, ...).

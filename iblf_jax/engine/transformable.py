@@ -26,7 +26,7 @@ import numpy as np
 from jax.custom_batching import custom_vmap
 from jax.custom_derivatives import SymbolicZero
 
-from iblf_jax.core import checks
+from iblf_jax.core import checks, programs
 from iblf_jax.core.caches import CACHE
 from iblf_jax.engine import registry
 from iblf_jax.engine.batch import run_all
@@ -68,7 +68,7 @@ def run_transformable(
     return _run_by_scan(runs, *leaves)
 
 
-@partial(jax.jit, static_argnums=0)
+@programs.jit(static_argnums=0)
 def _run_by_scan(runs: Runs, *leaves: jax.Array) -> Outcome:
     """The run by the scan."""
     inputs = jax.tree.unflatten(runs.treedef, leaves)
@@ -243,7 +243,7 @@ def _over_runs(function: Callable, runs: Runs, *static: Any) -> Callable:
     return batched
 
 
-@partial(jax.jit, static_argnums=0)
+@programs.jit(static_argnums=0)
 def _values(runs: Runs, leaves: tuple) -> Outcome:
     def run(loop, batch):
         return run_all(loop, batch, runs.request)
@@ -252,7 +252,7 @@ def _values(runs: Runs, leaves: tuple) -> Outcome:
     return run_by_executor(executor, runs.batch(leaves), runs.request, run)
 
 
-@partial(jax.jit, static_argnums=(0, 1))
+@programs.jit(static_argnums=(0, 1))
 def _columns(runs: Runs, places: Places, leaves: tuple) -> Any:
     loop = kernel_loop(registry.EXECUTORS[runs.backend])
     return columns(loop, runs.batch(leaves), places, runs.request)

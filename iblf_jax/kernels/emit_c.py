@@ -13,7 +13,7 @@ name a number of C99, and `plain_function` writes one function.
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib.resources import files
 from types import MappingProxyType
@@ -552,6 +552,10 @@ class _Segments:
         computed = [i for i in needed if nodes[i].op not in ("const", "result")]
         part = {i: k // self.size for k, i in enumerate(computed)}
         last = self._last_reading_part(part, outputs)
+        read_last = defaultdict[int, list[int]](list)
+        for i in computed:
+            if nodes[i].op != "call":
+                read_last[last[i]].append(i)
         calls = []
         for first in range(0, len(computed), self.size):
             number = first // self.size
@@ -559,20 +563,18 @@ class _Segments:
             outlive = [i for i in here if last[i] > number and nodes[i].op != "call"]
             calls.append(self._one(here, outlive, own))
             if not kept:
-                self._free_places(
-                    [i for i in computed if last[i] == number and nodes[i].op != "call"]
-                )
+                self._free_places(read_last[number])
         self.names |= {i: self.e.calls.results[i] for i in needed if nodes[i].op == "result"}
         return calls
 
     def _last_reading_part(self, part: dict[int, int], outputs: list[int]) -> dict[int, int]:
         """Node -> the last function that reads it, of the nodes of `part`, node -> function."""
-        last = dict.fromkeys(part, -1) | dict.fromkeys(outputs, len(part))
+        last = dict.fromkeys(part, -1)
         for i, number in part.items():
             for a in self.e.program.nodes[i].args:
-                if a in part and a not in outputs:
-                    last[a] = max(last[a], number)
-        return last
+                if a in part:
+                    last[a] = number  # the parts are in order
+        return last | dict.fromkeys(outputs, len(part))
 
     def _free_places(self, nodes: list[int]) -> None:
         """Makes the places of nodes free for others."""

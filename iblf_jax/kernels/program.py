@@ -18,10 +18,8 @@ each node as rarely as its class permits:
 from __future__ import annotations
 
 import math
-import operator
 from collections import Counter
 from collections.abc import Callable, Container, Iterable, Sequence
-from functools import reduce
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -131,7 +129,10 @@ def extend_classes(
     for i in range(len(classes), len(nodes)):
         node = nodes[i]
         if node.args:
-            classes.append(reduce(operator.or_, (classes[a] for a in node.args)))
+            union = 0
+            for a in node.args:
+                union |= classes[a]
+            classes.append(union)
         elif i in constant_carry:
             classes.append(PER_RUN)
         else:
@@ -167,6 +168,8 @@ class Builder:
         self.constant_carry: set[int] = set()
         """Nodes of carried numbers that a step returns unchanged."""
         self._known: dict[tuple, int] = {}
+        self._emitted: dict[tuple, int] = {}
+        """Operation, arguments and kind of each call of `emit` -> its node."""
         self._classes: list[int] = []
         self.known_finite: set[int] = set()
         """Inputs that are known to be finite (`Known`), and nodes that depend only on these."""
@@ -187,7 +190,29 @@ class Builder:
         return self._add(Node(op, (), kind, index), index)
 
     def emit(self, op: str, *args: int, kind: str = "f") -> int:
-        """The node of op(*args): folded, simplified, or new."""
+        """The node of op(*args): folded, simplified, or new.
+
+        The tangents of a step repeat most operations, many of them on constants.
+        """
+        call = (op, args, kind)
+        node = self._emitted.get(call)
+        if node is None:
+            node = self._emitted[call] = self._emit(op, args, kind)
+        return node
+
+    def emit_each(self, op: str, calls: Iterable[tuple[int, ...]], kind: str) -> list[int]:
+        """The node of op(*args) for each tuple of arguments."""
+        emitted = self._emitted
+        found = []
+        for args in calls:
+            node = emitted.get((op, args, kind))
+            if node is None:
+                node = self.emit(op, *args, kind=kind)
+            found.append(node)
+        return found
+
+    def _emit(self, op: str, args: tuple[int, ...], kind: str) -> int:
+        """As `emit`, for arguments that it has not had yet."""
         if self.absent in args and kind == "f":
             rest = without_absent(self, op, args)
             if rest is not None:
@@ -387,13 +412,14 @@ def finished(
             place[node] = len(order)
             order.append(node)
             stack.pop()
-    nodes = tuple(
-        builder.nodes[i]._replace(args=tuple(place[a] for a in builder.nodes[i].args))
-        for i in order
-    )
+    nodes = []
+    for i in order:
+        op, args, kind, value = builder.nodes[i]
+        nodes.append(Node(op, tuple([place[a] for a in args]), kind, value))
     carry = tuple((place.get(a, -1), place[b]) for a, b in zip(carry_in, carry_out, strict=True))
     kinds = tuple(builder.nodes[b].kind for b in carry_out)
-    return Program(builder.dtype, nodes, carry, tuple(place[i] for i in outputs), kinds, recorded)
+    results = tuple(place[i] for i in outputs)
+    return Program(builder.dtype, tuple(nodes), carry, results, kinds, recorded)
 
 
 def frontier(

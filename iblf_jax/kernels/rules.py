@@ -21,7 +21,7 @@ def each(b: Builder, op: str, eqn, *operands: Ids, kind: str | None = None) -> I
     kind = kind or kind_of(eqn.outvars[0].aval.dtype)
     shape = np.broadcast_shapes(*(x.shape for x in operands))
     flat = zip(*(np.broadcast_to(x, shape).ravel().tolist() for x in operands), strict=True)
-    return np.asarray([b.emit(op, *args, kind=kind) for args in flat], np.int64).reshape(shape)
+    return np.asarray(b.emit_each(op, flat, kind), np.int64).reshape(shape)
 
 
 def _elementwise(op: str) -> Callable:

@@ -28,7 +28,7 @@ from iblf_jax.control.observers._base import observer_member
 from iblf_jax.control.sensors import Ideal as IdealSensor
 from iblf_jax.control.sensors import Sensor
 from iblf_jax.control.sensors._base import sensor_member
-from iblf_jax.core import checks, modules, notices
+from iblf_jax.core import checks, modules, notices, programs
 from iblf_jax.core.disk_cache import keep_programs
 from iblf_jax.core.modules import NUMBERS
 from iblf_jax.core.presentation import present
@@ -843,7 +843,7 @@ class _InitialValues(NamedTuple):
     region_margins: Any
 
 
-@jax.jit
+@programs.jit
 def _initial_values(scenario: Scenario) -> _InitialValues:
     """The values at the start. Their shapes are checked while this is traced, once per
     structure.
@@ -977,7 +977,7 @@ def _check_levels_at_start(scenario: Scenario) -> None:
                 plants.check_dependence(name, _dependence_near(plant, t, levels))
 
 
-@jax.jit
+@programs.jit
 def _dependence_near(plant: Plant, t: jax.Array, x: jax.Array) -> Any:
     """The dependence of drift and gain on the levels at the start and at a state near it, where
     even functions of a level that starts at 0 have a slope.

@@ -33,6 +33,7 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
+from iblf_jax.core import programs
 from iblf_jax.core.linalg import matmul_in_order
 from iblf_jax.simulation.closed_loop import (
     LoopState,
@@ -199,7 +200,7 @@ def resolved_jacobian(jacobians: jax.Array, sampled: bool) -> jax.Array:
     return jnp.where(steep, jacobians[..., 2, :, :], jacobians[..., 0, :, :])
 
 
-@jax.jit
+@programs.jit
 def jacobian(scenario: Scenario, t: jax.Array, state: LoopState) -> jax.Array:
     """The derivative of `closed_loop.perturbed_rate` at (t, state), (m, m): the Jacobian of the
     closed loop [1/s] where the law is not sampled.

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.control.actuators._base import input_delay
-from iblf_jax.core import checks
+from iblf_jax.core import checks, programs
 from iblf_jax.core.pytree import component
 from iblf_jax.simulation.closed_loop import LoopState, evaluate, initial_state
 from iblf_jax.simulation.scenario import Scenario, canonical
@@ -240,16 +240,16 @@ def _at(scenario: Scenario, t: jax.Array, x: jax.Array) -> tuple[jax.Array, Loop
     return t.astype(dtype), _unpack(scenario, x.astype(dtype))
 
 
-@jax.jit
+@programs.jit
 def _start(scenario: Scenario) -> jax.Array:
     return _pack(scenario, initial_state(scenario))
 
 
-@jax.jit
+@programs.jit
 def _rate(scenario: Scenario, t: jax.Array, x: jax.Array) -> jax.Array:
     return _pack(scenario, evaluate(scenario, *_at(scenario, t, x))[0])
 
 
-@jax.jit
+@programs.jit
 def _sample(scenario: Scenario, t: jax.Array, x: jax.Array) -> Sample:
     return evaluate(scenario, *_at(scenario, t, x))[1]

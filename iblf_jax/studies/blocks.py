@@ -27,7 +27,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.core import checks
+from iblf_jax.core import checks, programs
 from iblf_jax.core.devices import default_devices
 from iblf_jax.core.status import Status, flag
 from iblf_jax.core.thread_options import with_options_of_caller
@@ -96,7 +96,7 @@ def _record_block(
     return recorded, times
 
 
-@partial(jax.jit, static_argnames=("program", "record_every"))
+@programs.jit(static_argnames=("program", "record_every"))
 def _execute(
     shared: SharedInputs,
     inputs: CaseInputs,

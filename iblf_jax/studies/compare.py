@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from typing import Any
 
 import jax
@@ -32,7 +31,7 @@ from iblf_jax.control.controllers import (
 from iblf_jax.control.controllers._base import law_member
 from iblf_jax.control.controllers.systems import observer_of
 from iblf_jax.control.observers import NoObserver
-from iblf_jax.core import checks, notices
+from iblf_jax.core import checks, notices, programs
 from iblf_jax.core.optional import attributes
 from iblf_jax.core.progress import announced
 from iblf_jax.core.pytree import field_values, layers, unwrapped
@@ -295,7 +294,7 @@ def _trials_of(
     return trials
 
 
-@partial(jax.jit, static_argnames="request")
+@programs.jit(static_argnames="request")
 def _batch(
     scenario: Scenario,
     varied: dict[str, jax.Array],

@@ -30,7 +30,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.core import checks, notices
+from iblf_jax.core import checks, notices, programs
 from iblf_jax.core.progress import announced, bar
 from iblf_jax.core.pytree import astype
 from iblf_jax.core.status import VIOLATED, Status, describe, has_flag
@@ -271,7 +271,7 @@ def _admissible(
     return accepted.copy()
 
 
-@partial(jax.jit, static_argnames="request")
+@programs.jit(static_argnames="request")
 def _margins(
     cube: Cube, peak: Peak, dt: jax.Array, u: jax.Array, *, request: RunRequest
 ) -> tuple[jax.Array, jax.Array, jax.Array]:

@@ -38,6 +38,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.core import programs
 from iblf_jax.core.status import UNTRUSTED
 from iblf_jax.engine import run_batch_vjp, starts_per_batch
 from iblf_jax.simulation.noise import NOISE_NAME
@@ -228,13 +229,13 @@ def values(problem: TuningProblem, z: np.ndarray) -> Value:
     return in_groups(lambda rows: value(problem, problem.candidates(z[rows])), len(z), group)
 
 
-@jax.jit
+@programs.jit
 def _values(problem: TuningProblem, candidates: Candidate, found: Rollouts) -> Value:
     by_start = _by_start((found.smooth, found.exact, found.status), candidates)
     return jax.vmap(partial(value_of_start, problem))(candidates, *by_start)
 
 
-@jax.jit
+@programs.jit
 def forward_derivatives(problem: TuningProblem, candidates: Candidate) -> Derivatives:
     """The problem with gradient (S, p), Gauss-Newton matrix (S, p, p) and the pieces of the
     requirements, by forward mode.
@@ -274,7 +275,7 @@ def _overlaps(problem: TuningProblem, path: str, others: list[str]) -> bool:
     return any(paths_overlap(problem.scenario, path, other) for other in others)
 
 
-@jax.jit
+@programs.jit
 def reverse_derivatives(problem: TuningProblem, candidates: Candidate) -> Derivatives:
     """The problem with gradient (S, p), by reverse mode; its matrix is zero."""
     tuned = [block.path for block in problem.blocks]

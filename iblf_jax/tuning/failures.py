@@ -21,12 +21,12 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
+from iblf_jax.core import programs
 from iblf_jax.simulation.paths import unit_at
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.draws import Target, UncertainScenario, draw
@@ -279,7 +279,7 @@ def _distinct_draws(x: np.ndarray) -> list[int]:
     return distinct
 
 
-@partial(jax.jit, static_argnames="targets")
+@programs.jit(static_argnames="targets")
 def drawn_leaves(
     cases: UncertainScenario, point: Any, index: jax.Array, *, targets: tuple[Target, ...]
 ) -> dict[str, jax.Array]:

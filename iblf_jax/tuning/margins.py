@@ -4,17 +4,16 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import jax
 
+from iblf_jax.core import programs
 from iblf_jax.engine import RunRequest
 from iblf_jax.studies.perturbation_cube import Cube
 from iblf_jax.tuning.quantities import Peak, Quantities
 from iblf_jax.tuning.runs import tangents_of_runs
 
 
-@partial(jax.jit, static_argnames="request")
+@programs.jit(static_argnames="request")
 def pieces_of_margins(
     cube: Cube, peak: Peak, dt: jax.Array, u: jax.Array, *, request: RunRequest
 ) -> tuple[jax.Array, jax.Array, jax.Array]:

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.core import checks
+from iblf_jax.core import checks, programs
 from iblf_jax.core.units import POSITION
 from iblf_jax.engine import RunRequest, points_per_batch
 from iblf_jax.simulation.noise import has_noise
@@ -289,7 +289,7 @@ class TuningProblem:
         )
 
 
-_leaves_of_runs = jax.jit(TuningProblem.leaves_of_runs)
+_leaves_of_runs = programs.jit(TuningProblem.leaves_of_runs)
 
 
 def of_runs(function: Any, candidates: Candidate) -> Any:

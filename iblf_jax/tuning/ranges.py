@@ -53,7 +53,7 @@ import numpy as np
 
 from iblf_jax.control.actuators._base import actuator_member
 from iblf_jax.control.sensors._base import sensor_member, unrounded
-from iblf_jax.core import checks
+from iblf_jax.core import checks, programs
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.engine.period import radius_at
 from iblf_jax.engine.step_size import fastest_along, start_and_along
@@ -410,7 +410,7 @@ def drive_exceeded(scenario: Scenario) -> str:
     return ""
 
 
-@jax.jit
+@programs.jit
 def _command_steps(scenario: Scenario, times: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Steps of the command by one count of each joint, or of each level and component of a sensor
     of levels (T + 1, m, n), and the standard deviation by the noise (T + 1, n), [N m].

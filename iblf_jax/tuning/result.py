@@ -5,14 +5,14 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.core import checks, notices
+from iblf_jax.core import checks, notices, programs
 from iblf_jax.core.presentation import present
 from iblf_jax.core.progress import announced
 from iblf_jax.core.status import UNTRUSTED
@@ -65,7 +65,7 @@ class AtLimit(NamedTuple):
         return f"{text} ({self.reason})" if self.reason else text
 
 
-@partial(jax.jit, static_argnames="request")
+@programs.jit(static_argnames="request")
 def _slice(
     scenario: Scenario, changes: Any, folds: Any, dt: jax.Array, *, request: RunRequest
 ) -> Any:

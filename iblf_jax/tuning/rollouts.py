@@ -5,13 +5,13 @@ search and for the report on its result.
 from __future__ import annotations
 
 import dataclasses
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.core import programs
 from iblf_jax.engine import RunRequest, run_batch
 from iblf_jax.simulation.closed_loop import evaluate, initial_state
 from iblf_jax.simulation.error_estimate import RELATIVE
@@ -79,7 +79,7 @@ def draw_run(
     return replaced_leaves(cases.scenario, point, drawn) | noise, admissible
 
 
-@partial(jax.jit, static_argnames=("targets", "nominal"))
+@programs.jit(static_argnames=("targets", "nominal"))
 def draw_runs(
     cases: UncertainScenario,
     points: dict[str, jax.Array],
@@ -108,7 +108,7 @@ class Rollouts(NamedTuple):
     fastest_mode: Any
 
 
-@partial(jax.jit, static_argnames="request")
+@programs.jit(static_argnames="request")
 def rollouts(
     scenario: Scenario,
     varied: dict[str, jax.Array],

@@ -1,0 +1,147 @@
+"""Compiled programs: those of many structures share a bounded number of places."""
+
+from __future__ import annotations
+
+import itertools
+import os
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from many_scenarios import CompileCounter, scenarios
+
+import iblf_jax as ij
+from iblf_jax.core import programs
+from iblf_jax.simulation.scenario import canonical
+
+needs_maps = pytest.mark.skipif(
+    programs.count_maps() == 0, reason="this system does not count memory maps"
+)
+
+
+def counted(size: int, **static):
+    """A function of arrays of any length, and the lengths for which it was traced."""
+    traced: list[int] = []
+
+    def total(x, factor=1):
+        traced.append(len(x))
+        return factor * jnp.sum(jnp.sin(x) ** 2)
+
+    return programs.StructuredFunction(total, programs.Programs(size), **static), traced
+
+
+def test_the_program_that_was_not_used_for_longest_leaves():
+    total, traced = counted(2)
+    for length in (1, 2, 1, 3, 1, 2):
+        assert total(np.ones(length)) == pytest.approx(length * np.sin(1.0) ** 2)
+    assert traced == [1, 2, 3, 2]
+
+
+def test_static_arguments_have_programs_of_their_own():
+    total, traced = counted(8, static_argnames=("factor",))
+    assert total(np.ones(2), factor=3) == 3 * total(np.ones(2), factor=1)
+    assert total(np.ones(2), factor=3) == 3 * total(np.ones(2), factor=1)
+    assert traced == [2, 2]
+    assert total(np.ones(2), 3) == 3 * total(np.ones(2), factor=1)
+    assert total._cache_size() == 3
+    total.clear_cache()
+    total(np.ones(2), factor=3)
+    assert len(traced) == 4
+
+
+def test_it_may_be_transformed_and_called_in_another_program():
+    total, _ = counted(8)
+    x = np.linspace(0.0, 1.0, 6).reshape(2, 3)
+    by_rows = jax.jit(jax.vmap(jax.grad(total)))(x)
+    np.testing.assert_allclose(by_rows, np.sin(2.0 * x))
+
+
+def maps_of_programs(number: int, size: int) -> int:
+    """Memory maps that so many programs take, of which so many are kept."""
+
+    def iterated(x):
+        A = jnp.outer(x, jnp.cos(x))
+        return jax.lax.fori_loop(0, 9, lambda i, y: jnp.tanh(A @ y + jnp.sin(y) * i), x)
+
+    function = programs.StructuredFunction(iterated, programs.Programs(size))
+    before = programs.count_maps()
+    for length in range(5, 5 + number):
+        function(np.ones(length))
+    return programs.count_maps() - before
+
+
+@needs_maps
+def test_the_number_of_memory_maps_stops_growing():
+    maps_of_programs(4, 4)
+    assert 3 * maps_of_programs(24, 4) < maps_of_programs(24, 24)
+
+
+@needs_maps
+def test_a_few_dozen_scenarios_take_the_memory_maps_of_a_few(monkeypatch):
+    monkeypatch.setattr(programs.PROGRAMS, "size", 6)
+    programs.PROGRAMS.release(len(programs.PROGRAMS))
+    some = iter(list(itertools.islice(scenarios(), 48)))
+    for scenario in itertools.islice(some, 12):
+        canonical(scenario)
+    before = programs.count_maps()
+    with CompileCounter() as compiled:
+        for scenario in some:
+            canonical(scenario)
+    assert compiled.count >= 36
+    assert len(programs.PROGRAMS) == 6
+    assert programs.count_maps() < before + 3 * 36
+
+
+def open_files() -> int:
+    """Files that this process has open."""
+    return len(os.listdir("/proc/self/fd"))
+
+
+@pytest.mark.release
+@needs_maps
+def test_five_hundred_scenarios_in_one_process():
+    """Simulated all, some of them certified and batched; twenty that are used again and again are
+    compiled once.
+    """
+    options = {"duration": 0.005, "dt": 1e-3}
+    mass = {"plant.mass[0]": ij.factor(ij.uniform(0.9, 1.1))}
+    made = itertools.islice(scenarios(), 500)
+    hot = list(itertools.islice(made, 20))
+
+    def simulate(scenario):
+        run = ij.simulate(scenario, method="euler", metrics=(), **options)
+        assert np.all(np.isfinite(run.q))
+
+    for scenario in hot:
+        simulate(scenario)
+    files, maps = open_files(), []
+    for number, scenario in enumerate(made):
+        simulate(scenario)
+        if number % 20 == 0:
+            ij.certify(scenario, **options)
+            ij.monte_carlo(scenario, mass, runs=4, **options)
+            with CompileCounter() as compiled:
+                for again in hot:
+                    simulate(again)
+            assert compiled.count == 0
+        maps.append(programs.count_maps())
+    assert max(maps) < programs.MAX_MAP_FRACTION * programs.most_maps()
+    # From half of them on, only the kernels remain, each a library of five maps.
+    assert maps[-1] - maps[len(maps) // 2] < 15 * len(maps)
+    assert open_files() < files + 10
+
+
+def test_functions_of_scenarios_are_compiled_with_the_bound():
+    """`jax.jit` keeps the programs of every structure for the life of the process."""
+    package = Path(ij.__file__).parent
+    for folder in ("engine", "studies", "tuning"):
+        for path in (package / folder).glob("*.py"):
+            lines = path.read_text().splitlines()
+            found = [x for x in lines if x.startswith(("@jax.jit", "@partial(jax.jit"))]
+            assert len(found) == UNBOUNDED.get(path.name, 0), f"{path}: {found}"
+
+
+UNBOUNDED = {"summaries.py": 1}
+"""Functions of arrays alone, by file."""
