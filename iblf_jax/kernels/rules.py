@@ -118,7 +118,8 @@ def _reduce(op: str) -> Callable:
     def rule(b: Builder, eqn, x: Ids) -> Ids:
         axes = eqn.params["axes"]
         kept = [a for a in range(x.ndim) if a not in axes]
-        rows = np.transpose(x, [*axes, *kept]).reshape(-1, *(x.shape[a] for a in kept))
+        count = math.prod(x.shape[a] for a in axes)
+        rows = np.transpose(x, [*axes, *kept]).reshape(count, *(x.shape[a] for a in kept))
         if len(rows) == 0:
             kind = kind_of(eqn.outvars[0].aval.dtype)
             return np.full(rows.shape[1:], b.constant(_neutral(op, kind), kind))

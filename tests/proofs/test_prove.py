@@ -159,7 +159,7 @@ def test_a_given_weight_is_the_only_one():
 
 
 def test_the_largest_level_and_box_are_proved_next_to_what_is_not():
-    common = {"accuracy": 0.5, "max_boxes": 20_000, "progress": False, "weight": 2e-3}
+    common = {"accuracy": 0.5, "max_boxes": 30_000, "progress": False, "weight": 2e-3}
     found = ij.largest_level(
         pendulum(K2=20.0, kf=20.0), parameters=within(3.0), between=(0.2, 6.0), **common
     )
