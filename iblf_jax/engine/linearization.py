@@ -121,13 +121,6 @@ class LinearizationStep:
         return Linearization(carry.time, x, growth, lengths, unresolved), column
 
 
-def jacobian_carry(scenario: Scenario, time: jax.Array, state: LoopState) -> Linearization:
-    """The carry of a `LinearizationStep` of which only the Jacobian at a state is of interest."""
-    watched = error_estimate.watched_indices(state).size
-    no_estimate = error_estimate.UnresolvedSignals(*[jnp.zeros_like(state.q)] * 3)
-    return linearization_at(time, perturbed_state(state), watched, no_estimate)
-
-
 def linearization_steps(scenario: Scenario) -> int:
     """Steps of a `LinearizationStep`."""
     state = initial_state(scenario)
@@ -135,6 +128,13 @@ def linearization_steps(scenario: Scenario) -> int:
     if watched == ravel_pytree(perturbed_state(state))[0].size:
         return 3 * watched
     return 3 * watched + stability.POWER_ITERATIONS
+
+
+def jacobian_carry(scenario: Scenario, time: jax.Array, state: LoopState) -> Linearization:
+    """The carry of a `LinearizationStep` of which only the Jacobian at a state is of interest."""
+    watched = error_estimate.watched_indices(state).size
+    no_estimate = error_estimate.UnresolvedSignals(*[jnp.zeros_like(state.q)] * 3)
+    return linearization_at(time, perturbed_state(state), watched, no_estimate)
 
 
 def fastest_mode(scenario: Scenario, found: Linearization) -> jax.Array:
