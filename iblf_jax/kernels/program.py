@@ -18,10 +18,8 @@ each node as rarely as its class permits:
 from __future__ import annotations
 
 import math
-import operator
 from collections import Counter
 from collections.abc import Callable, Container, Iterable, Sequence
-from functools import reduce
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -130,7 +128,10 @@ def extend_classes(
     for i in range(len(classes), len(nodes)):
         node = nodes[i]
         if node.args:
-            classes.append(reduce(operator.or_, (classes[a] for a in node.args)))
+            found = 0
+            for a in node.args:
+                found |= classes[a]
+            classes.append(found)
         elif i in constant_carry:
             classes.append(PER_RUN)
         else:
@@ -191,8 +192,9 @@ class Builder:
             rest = without_absent(self, op, args)
             if rest is not None:
                 return rest
-        if all(self.nodes[a].op == "const" for a in args):
-            nodes = [self.nodes[a] for a in args]
+        nodes = [self.nodes[a] for a in args]
+        # The first argument decides most cases, without a generator.
+        if nodes[0].op == "const" and all(node.op == "const" for node in nodes):
             folded = self._folded(op, nodes, kind)
             if folded is not None:
                 return self.constant(folded, kind)
@@ -387,8 +389,10 @@ def finished(
             order.append(node)
             stack.pop()
     nodes = tuple(
-        builder.nodes[i]._replace(args=tuple(place[a] for a in builder.nodes[i].args))
-        for i in order
+        [
+            Node(op, tuple([place[a] for a in args]), kind, value)
+            for op, args, kind, value in map(builder.nodes.__getitem__, order)
+        ]
     )
     carry = tuple((place.get(a, -1), place[b]) for a, b in zip(carry_in, carry_out, strict=True))
     kinds = tuple(builder.nodes[b].kind for b in carry_out)
