@@ -136,3 +136,14 @@ def test_steps_of_this_package_are_kept(folder):
     kernels.CACHES.clear()
     ij.explain(scenario)
     assert len(list(folder.glob("*.program"))) == 1
+
+
+def test_a_step_that_cannot_be_written_as_text_is_refused_as_before(folder):
+    """Keys of random numbers are neither text nor lowered."""
+    key = jax.random.PRNGKey(0)
+
+    def step(shared, per_run, carry, index):
+        return [carry[0] + jax.random.normal(jax.random.fold_in(key, index))], []
+
+    with pytest.raises(kernels.UnsupportedError):
+        compiled(step)
