@@ -1,18 +1,23 @@
 """Latency of one run: the paper's 20 s at 1 ms (20,000 RK4 steps, float64) against SciPy's LSODA on
 the same closed loop.
 
-    python benchmarks/latency.py [--quick] [--json FILE]
+    python benchmarks/latency.py [--quick] [--first] [--json FILE]
 
 Rows: LSODA at rtol 1e-6 on the loop in NumPy, LSODA on this package's own compiled vector field,
   and `simulate` on its two backends.
 `import` is the time of `import iblf_jax` above `import jax`, each in a fresh process.
+With `--first`, the rows are the first results of an arm of six joints with a sampled law, encoders
+  and motors instead: processor seconds of a call in a fresh process, those of the compilers it
+  starts included, with an empty cache and in a second process.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import subprocess
 import sys
+import tempfile
 import time
 from functools import partial
 
@@ -67,6 +72,59 @@ def numpy_loop(t: float, x: np.ndarray) -> np.ndarray:
     return np.concatenate([dq, ddq, -20.0 * (f_hat + tau - C @ dq - G)])
 
 
+FIRST_RESULTS = {
+    "simulate": "ij.simulate(arm, **timing)",
+    "recommended_period": "ij.recommended_period(arm, duration=1.5)",
+    "export": "ij.export(arm, folder)",
+    "monte_carlo": "study()",
+    "report of a study": "ij.report(found, folder + '/report.html')",
+}
+"""Call -> its text in FIRST_RESULT."""
+FIRST_RESULT = """
+import resource, sys, tempfile
+import jax
+jax.config.update("jax_enable_x64", True)
+import iblf_jax as ij
+sensor = ij.sensors.Encoder(counts=2.0**16, velocity=ij.sensors.FilteredDifference(cutoff=300.0))
+arm = ij.with_parts(
+    ij.presets.ur5(),
+    sampling=ij.Sampling(period=2e-3, delay=1e-3),
+    sensor=sensor,
+    actuator=ij.actuators.Motor(bandwidth=200.0),
+)
+timing = {"duration": 1.5, "dt": 1e-3}
+def study():
+    unknown = {"plant.payload": ij.value(ij.uniform(1.0, 2.0))}
+    return ij.monte_carlo(arm, unknown, runs=64, **timing)
+def used():
+    whose = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+    return sum(sum(resource.getrusage(each)[:2]) for each in whose)
+if "found" in sys.argv[1]:
+    found = study()
+with tempfile.TemporaryDirectory() as folder:
+    start = used()
+    eval(sys.argv[1])
+    print(used() - start)
+"""
+
+
+def first_results(calls: list[str]) -> list[list]:
+    """Rows of the first results: call, seconds with an empty cache and in a second process."""
+    rows = []
+    for name in calls:
+        command = [sys.executable, "-c", FIRST_RESULT, FIRST_RESULTS[name]]
+        with tempfile.TemporaryDirectory() as cache:
+            environment = os.environ | {"XDG_CACHE_HOME": cache}
+            seconds = [
+                subprocess.run(
+                    command, check=True, capture_output=True, text=True, env=environment
+                ).stdout.split()[-1]
+                for _ in range(2)
+            ]
+        rows.append([name, *map(float, seconds)])
+    return rows
+
+
 def import_seconds(repeats: int) -> float:
     """Seconds of `import iblf_jax` after `import jax`, in a fresh process; the smallest of some."""
     code = (
@@ -86,8 +144,14 @@ def main() -> None:
     parser.add_argument(
         "--quick", action="store_true", help="half a second of motion by Euler's method, one repeat"
     )
+    parser.add_argument("--first", action="store_true", help="first results of an arm instead")
     parser.add_argument("--json", help="also write the table to this file")
     args = parser.parse_args()
+    if args.first:
+        columns = ["call", "empty cache, s", "second process, s"]
+        calls = list(FIRST_RESULTS)[:1] if args.quick else list(FIRST_RESULTS)
+        report("First results, processor time", columns, first_results(calls), args.json)
+        return
     duration, method, repeats = (0.5, "euler", 1) if args.quick else (20.0, "rk4", 5)
     steps = round(duration / 1e-3)
 

@@ -1,4 +1,5 @@
-"""The folder of compiled programs, of XLA and of our own kernels, which later processes reuse.
+"""The folder of compiled programs, which later processes reuse: those of XLA, our own kernels, and
+the scalar programs of long steps.
 
 It is $XDG_CACHE_HOME/iblf_jax, or ~/.cache/iblf_jax; the programs of XLA have a folder in it for
 each kind of processor. The first run of a process enables JAX's cache there, unless the user

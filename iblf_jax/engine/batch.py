@@ -15,7 +15,6 @@ import jax.numpy as jnp
 from iblf_jax.engine.carry import Carry, Inputs, start
 from iblf_jax.engine.linearization import (
     Linearization,
-    LinearizationCarry,
     LinearizationStep,
     linearization_at,
     linearization_steps,
@@ -162,14 +161,12 @@ The first step and every `every`-th one after it are recorded; None records noth
 have a leading run axis, which the time axis of the records follows."""
 
 
-def linearized(loop: StepLoop, batch: Batch, carry: LinearizationCarry) -> Linearization:
-    """What the `LinearizationStep`s of every run find, from the carry at the state of each."""
+def _linearized(loop: StepLoop, batch: Batch, carry: Linearization) -> Linearization:
+    """The linearization of every run, after all `LinearizationStep`s."""
     batch = _linearized_batch(batch)
     steps = linearization_steps(batch.leaves.first.scenario)
-    after, columns = loop(LinearizationStep(), batch, carry, steps, 1)
-    if batch.runs is None:
-        return after.found(columns)
-    return jax.vmap(LinearizationCarry.found)(after, columns)
+    carry, columns = loop(LinearizationStep(), batch, carry, steps, 1)
+    return carry.with_columns(columns)
 
 
 def _linearized_batch(batch: Batch) -> Batch:
@@ -185,7 +182,7 @@ def _linearized_batch(batch: Batch) -> Batch:
     return batch._replace(leaves=Leaves.of(treedef, is_per_run, constants))
 
 
-def _initial_linearization(batch: Batch, method: str) -> LinearizationCarry:
+def _initial_linearization(batch: Batch, method: str) -> Linearization:
     """The carry of a `LinearizationStep` at the start of every run."""
 
     def of_run(inputs):
@@ -201,14 +198,14 @@ def _initial_linearization(batch: Batch, method: str) -> LinearizationCarry:
     return batch.map_runs(of_run)
 
 
-def linearization_batch(batch: Batch, method: str) -> tuple[Batch, LinearizationCarry]:
+def linearization_batch(batch: Batch, method: str) -> tuple[Batch, Linearization]:
     """The batch and the shapes of the carry of the `LinearizationStep`s of a batch."""
     return _linearized_batch(batch), jax.eval_shape(lambda: _initial_linearization(batch, method))
 
 
 def initialize(loop: StepLoop, batch: Batch, method: str) -> tuple[Carry, Linearization]:
     """The carry before the first step, and the linearization at the start."""
-    at_start = linearized(loop, batch, _initial_linearization(batch, method))
+    at_start = _linearized(loop, batch, _initial_linearization(batch, method))
 
     def of_run(inputs, at_start):
         is_sampled = inputs.scenario.sampling is not None
@@ -258,10 +255,10 @@ def finalize(
     doubled = batch._replace(leaves=leaves, runs=2 * (batch.runs or 1))
     pairs = batch.map_runs(at_nearest_and_end, carry)
     if batch.runs is None:
-        pairs = linearized(loop, doubled, pairs)
+        pairs = _linearized(loop, doubled, pairs)
     else:
         flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), pairs)
-        flat = linearized(loop, doubled, flat)
+        flat = _linearized(loop, doubled, flat)
         pairs = jax.tree.map(lambda x: x.reshape(-1, 2, *x.shape[1:]), flat)
     return batch.map_runs(outcome, carry, at_start, pairs)
 
@@ -281,3 +278,11 @@ def run_step(
     carry, at_start = initialize(loop, batch, request.method)
     carry, records = loop(step, batch, carry, request.instants, request.record_every)
     return finalize(loop, batch, request, carry, at_start), records
+
+
+def jacobians(loop: StepLoop, batch: Batch, carry: Linearization) -> jax.Array:
+    """The Jacobian of every run at the state of its carry (`linearization.jacobian_carry`),
+    (B, m', m') [1/s].
+    """
+    is_sampled = batch.leaves.first.scenario.sampling is not None
+    return resolved_jacobian(_linearized(loop, batch, carry).jacobian, is_sampled)

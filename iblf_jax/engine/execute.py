@@ -24,7 +24,7 @@ from iblf_jax.engine.batch import (
     StepLoop,
     carry_shapes,
     carry_without_linearization,
-    linearized,
+    jacobians,
     run_all,
     split,
 )
@@ -65,7 +65,6 @@ from iblf_jax.engine.structural_constants import constants_of
 from iblf_jax.engine.time_step import TimeStep, positions
 from iblf_jax.simulation.closed_loop import LoopState
 from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.simulation.stability import resolved_jacobian
 
 
 def run_batch(
@@ -374,7 +373,7 @@ def _step_states(
 
 def sampled_jacobians(scenario: Scenario, times: jax.Array, states: LoopState) -> jax.Array:
     """The derivatives of `closed_loop.perturbed_rate` of a sampled loop at many states, by the
-    kernel that linearizes runs: `simulate` and studies build the same one.
+    kernel that linearizes runs; studies build the same one.
 
     Args:
       scenario: canonical, with a sampling.
@@ -405,8 +404,7 @@ def _sampled_jacobians(
     execution = plan_of_jacobians(operations(inputs), registry.default_backend())
 
     def by(loop: StepLoop) -> jax.Array:
-        found = linearized(loop, batch, carry)
-        return jax.vmap(partial(resolved_jacobian, sampled=True))(found.jacobian)
+        return jacobians(loop, batch, carry)
 
     return first_that_works(
         execution, lambda executor: by(kernel_loop(executor)), partial(by, scan)

@@ -27,26 +27,9 @@ from iblf_jax.simulation.scenario import Scenario
 
 
 class Linearization(NamedTuple):
-    """What the `LinearizationStep`s find at a state."""
-
-    state: jax.Array
-    """The state, (m,)."""
-    growth: stability.PowerIteration
-    """Of the power iteration."""
-    jacobian: jax.Array
-    """By the numbers that `accuracy` watches, by differences of three sizes, (3, m', m') [1/s];
-    `stability.resolved_jacobian` makes one of them."""
-    unresolved: error_estimate.UnresolvedSignals
-    """Of the run; its torque is turned into what it accelerates, as that takes the robot's mass
-    matrix."""
-
-
-class LinearizationCarry(NamedTuple):
     """The carry of a `LinearizationStep`: a state around which the closed loop is linearized.
 
-    The state does not change, so what it decides is computed once.  The columns of the Jacobian are
-    records of the steps: every carried number is a statement that the compiler reads, and the
-    Jacobians of an arm of six joints with sensors and drives have 5,292 numbers.
+    The state does not change, so what it decides is computed once.
     """
 
     time: jax.Array
@@ -55,17 +38,21 @@ class LinearizationCarry(NamedTuple):
     growth: stability.PowerIteration
     """Of the power iteration."""
     lengths: Any
-    """Sums of the absolute values of the columns of the Jacobian so far, (3, m') [1/s]; `()` where
-    no power iteration follows, which is all that reads them."""
+    """Lengths of the columns of `jacobian` that are found, (3, m') [1/s], where a power iteration
+    reads them; `()` elsewhere."""
     unresolved: error_estimate.UnresolvedSignals
-    """As in `Linearization`."""
+    """Of the run; its torque is turned into what it accelerates, as that takes the robot's mass
+    matrix."""
+    jacobian: Any = ()
+    """By the numbers that `accuracy` watches, by differences of three sizes, (3, m', m') [1/s];
+    `stability.resolved_jacobian` makes one of them.  `()` until all steps are made, because each
+    records its column: carried from step to step, the m'^2 numbers would be most of the program."""
 
-    def found(self, columns: jax.Array) -> Linearization:
-        """The linearization, from the carry after the last step and the records (steps, m')."""
-        watched = columns.shape[-1]
-        by_column = columns[: 3 * watched].reshape(3, watched, watched)
-        jacobian = jnp.swapaxes(by_column, 1, 2)
-        return Linearization(self.state, self.growth, jacobian, self.unresolved)
+    def with_columns(self, columns: jax.Array) -> Linearization:
+        """The linearization after its steps, which recorded these columns, (..., steps, m')."""
+        size = columns.shape[-1]
+        by_size = columns[..., : 3 * size, :].reshape(*columns.shape[:-2], 3, size, size)
+        return self._replace(jacobian=jnp.swapaxes(by_size, -1, -2))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,9 +65,9 @@ class LinearizationStep:
     """
 
     def __call__(
-        self, inputs: Inputs, carry: LinearizationCarry, index: jax.Array, options: StepOptions
-    ) -> tuple[LinearizationCarry, jax.Array]:
-        """The carry after the step, and the derivatives of the watched numbers, (m',) [1/s]."""
+        self, inputs: Inputs, carry: Linearization, index: jax.Array, options: StepOptions
+    ):
+        """The carry after the step, and its column of the Jacobian, (m',)."""
         start = initial_state(inputs.scenario)
         watched, x = error_estimate.watched_indices(start), carry.state
         as_state = ravel_pytree(perturbed_state(start))[1]
@@ -111,9 +98,7 @@ class LinearizationStep:
             len(watched) < x.size
         ):  # a power iteration follows, across infinite slopes by the widest differences
             widest |= (iteration >= 0) & jnp.any(
-                stability.are_lengths_of_infinite_derivatives(
-                    carry.lengths, inputs.scenario.sampling is not None
-                )
+                stability.is_infinite(carry.lengths, inputs.scenario.sampling is not None)
             )
         size = jnp.where(
             widest, sizes[2], jnp.where((level == 1) & (iteration < 0), sizes[1], sizes[0])
@@ -133,14 +118,7 @@ class LinearizationStep:
             error_estimate.with_acceleration(inputs.scenario, carry.unresolved),
             carry.unresolved,
         )
-        return LinearizationCarry(carry.time, x, growth, lengths, unresolved), column
-
-
-def jacobian_carry(scenario: Scenario, time: jax.Array, state: LoopState) -> LinearizationCarry:
-    """The carry of a `LinearizationStep` of which only the Jacobian at a state is of interest."""
-    watched = error_estimate.watched_indices(state).size
-    no_estimate = error_estimate.UnresolvedSignals(*[jnp.zeros_like(state.q)] * 3)
-    return linearization_at(time, perturbed_state(state), watched, no_estimate)
+        return Linearization(carry.time, x, growth, lengths, unresolved), column
 
 
 def linearization_steps(scenario: Scenario) -> int:
@@ -150,6 +128,13 @@ def linearization_steps(scenario: Scenario) -> int:
     if watched == ravel_pytree(perturbed_state(state))[0].size:
         return 3 * watched
     return 3 * watched + stability.POWER_ITERATIONS
+
+
+def jacobian_carry(scenario: Scenario, time: jax.Array, state: LoopState) -> Linearization:
+    """The carry of a `LinearizationStep` of which only the Jacobian at a state is of interest."""
+    watched = error_estimate.watched_indices(state).size
+    no_estimate = error_estimate.UnresolvedSignals(*[jnp.zeros_like(state.q)] * 3)
+    return linearization_at(time, perturbed_state(state), watched, no_estimate)
 
 
 def fastest_mode(scenario: Scenario, found: Linearization) -> jax.Array:
@@ -166,7 +151,7 @@ def fastest_mode(scenario: Scenario, found: Linearization) -> jax.Array:
 
 def linearization_at(
     time: jax.Array, state: Any, watched: int, unresolved: error_estimate.UnresolvedSignals
-) -> LinearizationCarry:
+) -> Linearization:
     """The carry of a `LinearizationStep` at a state, as `perturbed_state` gives it, of which
     `accuracy` watches so many numbers.
     """
@@ -175,5 +160,11 @@ def linearization_at(
     if watched < x.size:
         lengths = jnp.zeros((3, watched), x.dtype)
     return jax.lax.stop_gradient(
-        LinearizationCarry(time, x, stability.power_iteration_start(x), lengths, unresolved)
+        Linearization(
+            time,
+            x,
+            stability.power_iteration_start(x),
+            lengths,
+            unresolved,
+        )
     )

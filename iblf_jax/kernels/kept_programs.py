@@ -111,6 +111,8 @@ class _Writer:
         if isinstance(value, core.Jaxpr | core.ClosedJaxpr):
             self._write_once(value)
         elif isinstance(value, np.ndarray | np.generic | jax.Array):
+            if jax.dtypes.issubdtype(value.dtype, jax.dtypes.extended):
+                raise _UnknownError  # a key of random numbers
             array = np.asarray(value)
             self.lines.append(f"{array.dtype} {array.shape} {array.tobytes().hex()}")
         elif isinstance(value, tuple | list):
@@ -151,6 +153,8 @@ def _declared(variables: Any, names: dict[Any, str]) -> str:
     """New variables as text; `names` receives them."""
     texts = []
     for variable in variables:
+        if not isinstance(variable.aval, jax.core.ShapedArray):
+            raise _UnknownError
         names[variable] = f"v{len(names)}"
         texts.append(f"{names[variable]}:{variable.aval.dtype}{variable.aval.shape}")
     return " ".join(texts)

@@ -217,8 +217,9 @@ class Builder:
             rest = without_absent(self, op, args)
             if rest is not None:
                 return rest
-        if all(self.nodes[a].op == "const" for a in args):
-            nodes = [self.nodes[a] for a in args]
+        nodes = [self.nodes[a] for a in args]
+        # The first argument decides most cases, without a generator.
+        if nodes[0].op == "const" and all(node.op == "const" for node in nodes):
             folded = self._folded(op, nodes, kind)
             if folded is not None:
                 return self.constant(folded, kind)

@@ -177,13 +177,11 @@ def has_infinite_derivative(jacobians: jax.Array, sampled: bool) -> jax.Array:
       sampled: whether they are of a sampled loop.  There the large one is not used: a position
         that moves so far between two samples means a velocity at which the torque saturates.
     """
-    return are_lengths_of_infinite_derivatives(jnp.sum(jnp.abs(jacobians), axis=-2), sampled)
+    return is_infinite(jnp.sum(jnp.abs(jacobians), axis=-2), sampled)
 
 
-def are_lengths_of_infinite_derivatives(lengths: jax.Array, sampled: bool) -> jax.Array:
-    """`has_infinite_derivative` from the sums of the absolute values of each column of the
-    Jacobians, (..., 3, m).
-    """
+def is_infinite(lengths: jax.Array, sampled: bool) -> jax.Array:
+    """As `has_infinite_derivative`, from the lengths of the columns, (..., 3, m)."""
     larger = lengths[..., 1, :]
     if not sampled:
         larger = jnp.minimum(larger, lengths[..., 2, :])

@@ -17,13 +17,14 @@ from scipy.integrate import solve_ivp
 import iblf_jax as ij
 from iblf_jax.core.status import Status
 from iblf_jax.engine import RunRequest, native
-from iblf_jax.engine.execute import run_batch, run_batch_jvp
+from iblf_jax.engine.execute import run_batch, run_batch_jvp, sampled_jacobians
 from iblf_jax.engine.period import radius_at
 from iblf_jax.engine.step_size import start_and_along
 from iblf_jax.simulation.closed_loop import run_sampled_law
 from iblf_jax.simulation.metrics import standard
 from iblf_jax.simulation.noise import noise_key, normals
 from iblf_jax.simulation.scenario import canonical
+from iblf_jax.simulation.stability import jacobian
 from iblf_jax.tuning.parameters import layout
 from iblf_jax.tuning.ranges import BY_COUNT, BY_PERIOD, TIMES, TOGETHER
 from iblf_jax.tuning.result import AtLimit
@@ -391,6 +392,27 @@ def test_the_radius_is_that_of_the_map():
     J = np.array([(after(z + e) - after(z - e)) / 2e-6 for e in step]).T
     found = radius_at(scenario, 2e-3, np.zeros(0))
     assert np.isclose(found, np.max(np.abs(np.linalg.eigvals(J))), rtol=1e-4)
+
+
+def test_jacobians_at_many_states_are_those_at_each():
+    """The kernel that linearizes runs gives those of `stability.jacobian`."""
+    sensor = ij.sensors.Encoder(counts=65536, velocity=VELOCITIES[0])
+    scenario = canonical(ij.with_parts(SLOW, sampling=ij.Sampling(1e-3, delay=3e-3), sensor=sensor))
+    times = jnp.asarray([0.0, 0.3, 0.7])
+    states = start_and_along(scenario, times[1:])
+    found = sampled_jacobians(scenario, times, states)
+    for k, t in enumerate(times):
+        state = jax.tree.map(lambda x, k=k: x[k], states)
+        one = jacobian(scenario, t, state)
+        np.testing.assert_allclose(found[k], one, rtol=1e-6, atol=1e-6 * np.max(np.abs(one)))
+
+
+@pytest.mark.parametrize("queue", [2, 7])
+def test_a_longer_queue_does_not_change_the_radius(queue):
+    scenario = ij.with_parts(PAPER, sampling=ij.Sampling(2e-3, delay=1e-3))
+    longer = ij.with_parts(PAPER, sampling=ij.Sampling(2e-3, delay=1e-3, queue=queue))
+    times = np.array([0.0, 0.4])
+    assert radius_at(canonical(scenario), 2e-3, times) == radius_at(canonical(longer), 2e-3, times)
 
 
 def test_what_is_sampled_too_slowly_says_so():

@@ -106,3 +106,55 @@ def test_a_slow_operation_is_announced_in_a_terminal(monkeypatch, capsys, watche
         time.sleep(seconds)
     time.sleep(0.2)
     assert capsys.readouterr().err == line
+
+
+@pytest.mark.parametrize(
+    ("options", "shown"), [({}, True), ({"progress": None}, True), ({"progress": False}, False)]
+)
+def test_a_slow_call_prints_one_line(monkeypatch, capsys, options, shown):
+    """The functions that it calls print none."""
+    monkeypatch.setattr(messages, "SLOW", 0.1)
+    monkeypatch.setattr(messages, "has_reader", lambda: True)
+
+    @progress.announced("counting")
+    def inner():
+        time.sleep(0.3)
+
+    @progress.announced("adding up")
+    def outer(progress=None):
+        inner()
+        return "sum"
+
+    assert outer(**options) == "sum"
+    assert capsys.readouterr().err == ("iblf_jax: adding up\n" if shown else "")
+
+
+def test_a_bar_takes_the_place_of_the_line(monkeypatch, capsys):
+    monkeypatch.setattr(messages, "SLOW", 0.2)
+    monkeypatch.setattr(messages, "has_reader", lambda: True)
+
+    @progress.announced("adding up")
+    def outer():
+        with progress.bar(False, 3) as shown:
+            time.sleep(0.4)
+            shown.update(3)
+
+    outer()
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: ij.simulate(ij.presets.zhang_yan_2024(), duration=0.01, dt=1e-3),
+        lambda: cases.study(3),
+    ],
+)
+def test_calls_that_compile_have_a_line(monkeypatch, capsys, call):
+    monkeypatch.setattr(messages, "SLOW", 0.0)
+    monkeypatch.setattr(messages, "has_reader", lambda: True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        call()
+    first = capsys.readouterr().err.splitlines()[0]
+    assert first.startswith(("iblf_jax: simulating", "iblf_jax: compiling the program of a study"))
