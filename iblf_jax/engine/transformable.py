@@ -102,16 +102,16 @@ def _differentiable(runs: Runs, beside_derivative: bool = False) -> Callable:
 
         if not _is_by_scenario(runs, (places,)):
             return by_scan()
-        way = choose_derivatives(_derivative_sizes(runs, (places,), leaves))
+        method = choose_derivatives(_derivative_sizes(runs, (places,), leaves))
         by_kernel = None
-        if way == "one per run":
+        if method == "one per run":
             by_kernel = _by_kernel(runs, (places,), leaves)
-        if by_kernel is None and way != "reverse":
+        if by_kernel is None and method != "reverse":
             return by_scan()
 
         def attempt(_):
             found = _differentiable(runs, True)(*leaves)
-            if way == "reverse":
+            if method == "reverse":
                 return found, _in_form_of(found, *derivative(runs, places, leaves, moves))
             return found, _in_form_of(found, *_times(by_kernel, moves, 0))
 

@@ -157,7 +157,8 @@ def test_in_float32(whole):
     "scenario",
     [
         lambda: dataclasses.replace(
-            ij.presets.zhang_yan_2024(), sampling=ij.Sampling(period=5e-3, delay=2e-3)
+            ij.with_parameters(ij.presets.zhang_yan_2024(), {"observer.kf": 4.0}),
+            sampling=ij.Sampling(period=5e-3, delay=2e-3),
         ),
         lambda: ij.presets.zhang_yan_2024_saturated(),
         lambda: ij.presets.zhang_yan_2024(law="mapping"),
@@ -165,7 +166,7 @@ def test_in_float32(whole):
     ids=("sampled", "saturated", "mapping"),
 )
 def test_other_loops(scenario):
-    problem = Problem(scenario(), method="heun")
+    problem = Problem(scenario(), gains=0.2 * GAINS, method="heun")
     assert_close(problem.gradient()[1], problem.gradient("vmap")[1], 1e-10)
 
 
