@@ -2,11 +2,13 @@
 machine's processor, side by side.
 
     python benchmarks/gpu.py [--quick] [--json FILE] [--dtype float32|float64] [--batches
-    4096,65536,1048576] [--chain]
+    4096,65536,1048576] [--chain] [--arm] [--all]
 
 On a GPU it first holds the kernel to the reference (largest difference, statuses), then prints the
 rows of the GPU (`gpu`, `vmap`, textbook `jit(vmap(scan))`) and, from a process of its own, those of
-the processor.  `of peak` counts the instructions of the scalar program (`ij.explain`) against what
+the processor.  `--chain` adds a chain of four joints, and `--arm` the `iiwa14` with a joint
+controller beside the same arm and controller in MJX and in MuJoCo Warp (`peers/servo_arm.py`), if
+they are installed.  `--all` measures all of it in float32 and float64.  `of peak` counts the instructions of the scalar program (`ij.explain`) against what
 the multiprocessors can issue at their highest clock.  Without a GPU there are the processor's rows
 only.
 """
@@ -21,6 +23,7 @@ import os
 import subprocess
 import sys
 import tempfile
+import time
 from functools import partial
 from pathlib import Path
 
@@ -28,11 +31,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from _timing import compile_seconds, interleaved, report
+from peers import servo_arm
 from throughput import GAINS, chain, draws, method_for, textbook
 
 import iblf_jax as ij
 from iblf_jax.engine import RunRequest
 from iblf_jax.engine.execute import run_batch, run_batch_jvp
+from iblf_jax.engine.structural_constants import robot_constants
 from iblf_jax.simulation.metrics import standard
 from iblf_jax.simulation.scenario import canonical
 
@@ -59,6 +64,9 @@ RATES = {"textbook": 1e6, "vmap": 1e6, "gpu + 6 tangents": 1e9, "gpu": 5e9, "gpu
 LAUNCHED = {"textbook": 200, "vmap": 200}
 """Steps of the rows in which XLA launches the kernels of each step one after the other: those take
 as long for one run as for many."""
+SERVO_RUNS = 65_536
+SERVO_STEPS = 100
+"""Runs and steps of the arm with a joint controller."""
 QUICK = ("textbook", "native", "gpu", "gpu + 6 tangents")
 """The rows of the quick size: each compiles for seconds, and `throughput` has the processor's
 others."""
@@ -95,7 +103,7 @@ def candidates(scenario, dtype: str, is_paper: bool, method: str) -> dict:
         request = RunRequest(steps, method, backend=compiled)
         return run_batch_jvp(scenario, v, GAINS, folds[:1], dt, request)
 
-    compiled = "gpu" if on_a_gpu() else "native"
+    compiled = compiled_backend()
     rows = {"textbook": lambda v, dt, steps: textbook(v, dt, steps=steps)} if is_paper else {}
     rows |= {
         "vmap": on("vmap"),
@@ -169,6 +177,69 @@ def table(which: str, dtype: str, batches, quick: bool) -> list[list]:
     return rows
 
 
+def servo_rows(runs: int, quick: bool) -> list[list]:
+    """The arm with a joint controller, by this package and by the peers, in float32."""
+    device = jax.local_devices()[0].device_kind
+    steps = 20 if quick else SERVO_STEPS
+    compiled = {}
+    seconds = {}
+    for name, build in servo_candidates(quick).items():
+        start = time.perf_counter()
+        try:
+            compiled[name] = build(runs, steps)
+        except ImportError as error:
+            print(f"iiwa14: no row of {name}: {error}")
+            continue
+        seconds[name] = time.perf_counter() - start
+    positions = {name: np.asarray(call()) for name, call in compiled.items()}
+    best = interleaved(compiled, 1 if quick else 3)
+    ours = next(iter(positions.values()))
+    for name, found in positions.items():
+        difference = float(np.max(np.abs(found - ours)))
+        print(f"iiwa14, {name}: positions after {steps} steps differ by {difference:.2g} rad")
+    return [
+        ["iiwa14", device, "float32", runs, name, steps, s, runs * steps / best[name], "", ""]
+        for name, s in seconds.items()
+    ]
+
+
+def servo_candidates(quick: bool) -> dict:
+    """Name -> function of (runs, steps) that compiles a call, which returns the final positions."""
+
+    def ours(folds, runs, steps):
+        scenario = servo_arm.servo_scenario("float32")
+        request = RunRequest(
+            steps,
+            method_for(quick),
+            record_every=steps,
+            constants=robot_constants(scenario),
+            backend=compiled_backend(),
+        )
+        values = {"initial.q": jnp.asarray(servo_arm.starts(scenario, runs), "float32")}
+        dt = jnp.asarray(servo_arm.DT, "float32")
+
+        def final(v):
+            outcome = run_batch(scenario, v, folds, dt, request)
+            signals, *_ = outcome.records
+            return signals["q"][:, -1], outcome.metrics
+
+        call = jax.jit(final).lower(values).compile()
+        return lambda: call(values)[0]
+
+    folds = jax.tree.map(lambda x: jnp.asarray(x, "float32"), standard())
+    rows = {compiled_backend(): partial(ours, folds)}
+    if quick:
+        return rows
+    return rows | {"MJX": servo_arm.with_mjx, "MuJoCo Warp": servo_arm.with_mujoco_warp}
+
+
+def compiled_backend() -> str:
+    """The executor of this process's device."""
+    if on_a_gpu():
+        return "gpu"
+    return "native"
+
+
 def rows_of_the_processor(arguments: list[str]) -> list[list]:
     """The rows of this machine's processor, from a process that has no GPU."""
     with tempfile.TemporaryDirectory() as folder:
@@ -192,21 +263,22 @@ def main() -> None:
     parser.add_argument("--dtype", default="float32", choices=["float32", "float64"])
     parser.add_argument("--batches", default="4096,65536,1048576")
     parser.add_argument("--chain", action="store_true", help="a planar chain of four joints, too")
+    parser.add_argument("--arm", action="store_true", help="the iiwa14 beside its peers, too")
+    parser.add_argument("--all", action="store_true", help="all of it, in both types")
     options = parser.parse_args()
-    jax.config.update("jax_enable_x64", options.dtype == "float64")
+    dtypes = ["float32", "float64"] if options.all else [options.dtype]
+    jax.config.update("jax_enable_x64", "float64" in dtypes)
     batches = [2] if options.quick else [int(x) for x in options.batches.split(",")]
+    loops = ["paper", "chain of 4"] if options.chain or options.all else ["paper"]
     rows = []
-    for which in ["paper", "chain of 4"] if options.chain else ["paper"]:
-        rows += table(which, options.dtype, batches, options.quick)
-    if on_a_gpu():
-        same = [
-            "--dtype",
-            options.dtype,
-            "--batches",
-            "4096",
-            *(["--quick"] if options.quick else []),
-        ]
-        rows += rows_of_the_processor(same)
+    for dtype in dtypes:
+        for which in loops:
+            rows += table(which, dtype, batches, options.quick)
+        if on_a_gpu():
+            same = ["--dtype", dtype, "--batches", "4096"]
+            rows += rows_of_the_processor([*same, *(["--quick"] if options.quick else [])])
+    if options.arm or options.all:
+        rows += servo_rows(SERVO_RUNS if not options.quick else 2, options.quick)
     report(
         f"One kernel a rollout, {method_for(options.quick)} at 1 ms", COLUMNS, rows, options.json
     )

@@ -5,21 +5,37 @@
    so that neighbouring threads read neighbouring words; of the table of signals all threads read the same word. */
 #define MOST_THREADS 128
 
+#ifndef BLOCKS
+#define BLOCKS 1
+#endif
+/* The same words for `advance`: a number in constant memory is an operand of an instruction, and takes neither a register nor a load. */
+__constant__ word iblf_jax_bank[CONSTANTS + 1];
+
 /* CONSTANTS words, by one thread. */
 extern "C" __global__ void iblf_jax_constants(const real *shared, word *constants) {
-  if (blockIdx.x == 0 && threadIdx.x == 0) shared_constants(shared, constants);
+  if (blockIdx.x == 0 && threadIdx.x == 0) rollout<true>().shared_constants(shared, constants);
 }
 
 /* `count` rows of COLUMNS words, for the steps from `first` on, one thread a row. */
 extern "C" __global__ void iblf_jax_signals(const word *constants, int64_t first, int64_t count, word *table) {
   int64_t row = (int64_t)blockIdx.x * blockDim.x + threadIdx.x;
-  if (row < count) shared_signals(constants, (integer)(first + row), table + row * COLUMNS);
+  if (row < count) rollout<true>().shared_signals(constants, (integer)(first + row), table + row * COLUMNS);
+}
+
+#ifndef ATTEMPT
+#define ATTEMPT 1
+#endif
+INLINE void load_state(const real *floats_in, const int32_t *ints_in, F *floats, I *ints, int64_t runs, int64_t run) {
+#pragma unroll
+  for (int i = 0; i < FLOATS; i++) floats[i] = floats_in[i * runs + run];
+#pragma unroll
+  for (int i = 0; i < INTS; i++) ints[i] = ints_in[i * runs + run];
 }
 
 /* `runs` runs over `count` steps; floats_in may be floats_out, ints_in may be ints_out.  The 1 asks for all registers that a thread can have:
    without it ptxas gives a step that needs more than those 32, and keeps the rest in memory. */
-extern "C" __global__ void __launch_bounds__(MOST_THREADS, 1)
-iblf_jax_advance(const word *__restrict__ constants, const word *__restrict__ table, const real *__restrict__ leaves_in,
+extern "C" __global__ void __launch_bounds__(MOST_THREADS, BLOCKS)
+iblf_jax_advance(const word *__restrict__ table, const real *__restrict__ leaves_in,
                  const real *floats_in, const int32_t *ints_in, real *floats_out, int32_t *ints_out, record_arrays records, int64_t runs,
                  int64_t first, int64_t count, int64_t every) {
   int64_t run = (int64_t)blockIdx.x * blockDim.x + threadIdx.x;
@@ -28,11 +44,17 @@ iblf_jax_advance(const word *__restrict__ constants, const word *__restrict__ ta
   if (run >= runs) return;
 #pragma unroll
   for (int i = 0; i < LEAVES; i++) leaves[i] = leaves_in[i * runs + run];
-#pragma unroll
-  for (int i = 0; i < FLOATS; i++) floats[i] = floats_in[i * runs + run];
-#pragma unroll
-  for (int i = 0; i < INTS; i++) ints[i] = ints_in[i * runs + run];
-  advance(constants, leaves, floats, ints, table, (int)count, first, every, records, runs, run);
+  load_state(floats_in, ints_in, floats, ints, runs, run);
+#if ATTEMPT
+  rollout<false> attempt;
+  attempt.advance(iblf_jax_bank, leaves, floats, ints, table, (int)count, first, every, records, runs, run);
+  if (attempt.far) {
+    load_state(floats_in, ints_in, floats, ints, runs, run);
+    rollout<true>().advance(iblf_jax_bank, leaves, floats, ints, table, (int)count, first, every, records, runs, run);
+  }
+#else
+  rollout<true>().advance(iblf_jax_bank, leaves, floats, ints, table, (int)count, first, every, records, runs, run);
+#endif
 #pragma unroll
   for (int i = 0; i < FLOATS; i++) floats_out[i * runs + run] = floats[i];
 #pragma unroll
