@@ -188,7 +188,7 @@ def limit(dtype):
     """The rollout written by hand as a function of (values, steps), or None without a compiler."""
     try:
         text = (FOLDER / "limit" / "paper_loop.cc").read_text()
-        for name in ("vector.h", "format.h", "simple.h", "mathlib.h"):
+        for name in ("vector.h", "mathlib.h"):
             text = text.replace(
                 f'#include "{name}"', (Path(kernels.__file__).parent / "c" / name).read_text()
             )

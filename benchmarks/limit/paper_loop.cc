@@ -3,8 +3,6 @@
    addition theorem, the 2x2 solve and both barrier slopes with one division each, signals of time in a table.  It carries the state
    and nothing else: no metrics, no status, no guard, no records. */
 #include "vector.h"
-#include "format.h"
-#include "simple.h"
 #include "mathlib.h"
 
 #define CHUNK 128

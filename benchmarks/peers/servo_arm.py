@@ -20,7 +20,8 @@ from iblf_jax.simulation.scenario import canonical
 
 DT = 1e-3
 RATE = 20.0
-"""Damping of a joint divided by its inertia [1/s]; the stiffness is RATE^2 / 4 times the inertia."""
+"""Damping of a joint divided by its inertia [1/s]; the stiffness is RATE^2 / 4 times the
+inertia."""
 REACH = 0.3
 """Distance of the reference from the start, on every joint [rad]."""
 
@@ -75,9 +76,7 @@ def mjcf(scenario) -> str:
         )
     bodies += "</body>" * robot.n
     option = f'<option integrator="RK4" timestep="{DT}" gravity="{numbers(robot.g)}"/>'
-    return (
-        f"<mujoco>{option}<worldbody>{bodies}</worldbody><actuator>{servos}</actuator></mujoco>"
-    )
+    return f"<mujoco>{option}<worldbody>{bodies}</worldbody><actuator>{servos}</actuator></mujoco>"
 
 
 def with_mjx(runs: int, steps: int) -> Callable:

@@ -35,7 +35,6 @@ from iblf_jax.kernels.program import (
 )
 
 
-
 class Target(NamedTuple):
     """What the generated text means, and where it differs from that of other targets."""
 
@@ -43,8 +42,10 @@ class Target(NamedTuple):
     """The headers before the generated functions."""
     after: tuple[str, ...]
     """The headers after them."""
-    around: tuple[str, ...] = ()
-    """What stands before and after the generated functions."""
+    opening: str = ""
+    """A line before the generated functions."""
+    closing: str = ""
+    """A line after them."""
     in_c: Mapping[str, str] = MappingProxyType({})
     """Operation on floats -> its C, where the target has its own."""
     signal: str = "row[{}]"
@@ -58,12 +59,21 @@ class Target(NamedTuple):
         return -(-columns // words) * words
 
 
-NATIVE = Target(("vector.h", "format.h", "simple.h", "mathlib.h", "records.h"), ("frame.h", "driver.h"))
+NATIVE = Target(("vector.h", "mathlib.h", "records.h"), ("frame.h", "driver.h"))
 CUDA = Target(
-    ("scalar.h", "format.h", "simple_cuda.h", "mathlib.h", "records.h", "rollout.h"),
+    ("scalar.h", "mathlib.h", "records.h", "device.h"),
     ("kernels.h",),
-    around=("template <bool careful> struct rollout : angles<careful> {", "};"),
-    in_c=MappingProxyType({"div": "f_div({}, {})"}),
+    opening="template <bool careful> struct rollout : angles<careful> {",
+    closing="};",
+    in_c=MappingProxyType(
+        {
+            "div": "f_div({}, {})",
+            "max": "larger({}, {})",
+            "min": "smaller({}, {})",
+            "abs": "FN(fabs)({})",
+            "is_finite": "MASK(FN(fabs)({}) < (F)INFINITY)",
+        }
+    ),
     signal="signal(row, {})",
     row_bytes=16,
 )
@@ -272,6 +282,8 @@ def sizes(
         # C has no empty list of initial values.
         "RECORDED_SIZES": f"{{{', '.join(map(str, [*program.recorded, 0]))}}}",
     }
+    if target is CUDA:
+        values["CALLS"] = int(any(node.op == "call" for node in program.nodes))
     return "".join(f"#define {name} {value}\n" for name, value in values.items())
 
 
@@ -306,15 +318,15 @@ def source(
         sizes(program, shared_leaves, per_run_leaves, target),
         *map(header, target.before),
         *(f"TABLE {name}[] = {{{numbers}}};" for numbers, name in tables.items()),
-        *target.around[:1],
+        target.opening,
         *functions,
         constants,
         signals,
         _advance(e, layout, segment),
-        *target.around[1:],
+        target.closing,
         *map(header, target.after),
     ]
-    return "\n".join(parts)
+    return "\n".join(filter(None, parts))
 
 
 def plain_function(

@@ -31,26 +31,6 @@ EXPORTED int cuGetErrorString(int code, const char **text) {
   return FINE;
 }
 
-EXPORTED int cuLibraryGetGlobal(uint64_t *address, size_t *bytes, void *library, const char *name) {
-  if (library != &loads || strcmp(name, "iblf_jax_bank")) return NOT_FOUND;
-  *address = (uint64_t)iblf_jax_bank;
-  *bytes = sizeof iblf_jax_bank;
-  return FINE;
-}
-
-EXPORTED int cuMemcpyDtoDAsync_v2(uint64_t to, uint64_t from, size_t bytes, void *stream) {
-  if (stream != STREAM) return INVALID_VALUE;
-  memcpy((void *)to, (void *)from, bytes);
-  return FINE;
-}
-
-EXPORTED int cuStreamGetCtx(void *stream, void **context) { *context = &launches; return stream == STREAM ? FINE : INVALID_VALUE; }
-EXPORTED int cuCtxPushCurrent_v2(void *context) { return context == &launches ? FINE : INVALID_VALUE; }
-EXPORTED int cuCtxPopCurrent_v2(void **context) { *context = &launches; return FINE; }
-EXPORTED int cuEventCreate(void **event, unsigned flags) { *event = &loads; return FINE; }
-EXPORTED int cuEventRecord(void *event, void *stream) { return event == &loads && stream == STREAM ? FINE : INVALID_VALUE; }
-EXPORTED int cuStreamWaitEvent(void *stream, void *event, unsigned flags) { return event == &loads && stream == STREAM ? FINE : INVALID_VALUE; }
-
 template <typename T> static T at(void **arguments, int i) { return *(T *)arguments[i]; }
 
 EXPORTED int cuLaunchKernel(void *kernel, unsigned blocks, unsigned by, unsigned bz, unsigned threads, unsigned ty, unsigned tz,
@@ -66,9 +46,9 @@ EXPORTED int cuLaunchKernel(void *kernel, unsigned blocks, unsigned by, unsigned
       else if (!strcmp(name, "iblf_jax_signals"))
         iblf_jax_signals(at<const word *>(a, 0), at<int64_t>(a, 1), at<int64_t>(a, 2), at<word *>(a, 3));
       else
-        iblf_jax_advance(at<const word *>(a, 0), at<const real *>(a, 1), at<const real *>(a, 2), at<const int32_t *>(a, 3), at<real *>(a, 4),
-                         at<int32_t *>(a, 5), at<record_arrays>(a, 6), at<int64_t>(a, 7), at<int64_t>(a, 8), at<int64_t>(a, 9),
-                         at<int64_t>(a, 10));
+        iblf_jax_advance(at<const word *>(a, 0), at<const word *>(a, 1), at<const real *>(a, 2), at<const real *>(a, 3),
+                         at<const int32_t *>(a, 4), at<real *>(a, 5), at<int32_t *>(a, 6), at<record_arrays>(a, 7), at<int64_t>(a, 8),
+                         at<int64_t>(a, 9), at<int64_t>(a, 10), at<int64_t>(a, 11));
     }
   return FINE;
 }

@@ -61,8 +61,6 @@ def kernel(dtype, flags=()):
     source = (
         f"#define DOUBLE {int(dtype == np.float64)}\n"
         + emit_c.header("vector.h")
-        + emit_c.header("format.h")
-        + emit_c.header("simple.h")
         + emit_c.header("mathlib.h")
         + entries
     )

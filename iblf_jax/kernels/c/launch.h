@@ -17,27 +17,11 @@ typedef int (*find_type)(void **kernel, void *library, const char *name);
 typedef int (*launch_type)(void *kernel, unsigned, unsigned, unsigned, unsigned, unsigned, unsigned, unsigned shared_bytes, void *stream,
                            void **arguments, void **extra);
 typedef int (*describe_type)(int code, const char **text);
-typedef int (*global_type)(uint64_t *address, size_t *bytes, void *library, const char *name);
-typedef int (*copy_type)(uint64_t to, uint64_t from, size_t bytes, void *stream);
-typedef int (*context_type)(void *stream, void **context);
-typedef int (*push_type)(void *context);
-typedef int (*pop_type)(void **context);
-typedef int (*event_type)(void **event, unsigned flags);
-typedef int (*record_type)(void *event, void *stream);
-typedef int (*wait_type)(void *stream, void *event, unsigned flags);
 
 static pthread_once_t once = PTHREAD_ONCE_INIT;
 static launch_type cu_launch;
 static describe_type cu_describe;
-static global_type cu_global;
-static copy_type cu_copy;
-static context_type cu_context;
-static push_type cu_push;
-static pop_type cu_pop;
-static event_type cu_event;
-static record_type cu_record;
-static wait_type cu_wait;
-static void *loaded, *constants_kernel, *signals_kernel, *advance_kernel;
+static void *constants_kernel, *signals_kernel, *advance_kernel;
 static char trouble[512];
 
 static int succeeded(const char *what, int code, char *text, size_t size) {
@@ -56,7 +40,7 @@ static void *entry(void *driver, const char *name) {
 
 /* Leaves a message in `trouble` if it fails. */
 static void prepare(void) {
-  void *driver = dlopen(DRIVER, RTLD_NOW | RTLD_LOCAL);
+  void *driver = dlopen(DRIVER, RTLD_NOW | RTLD_LOCAL), *library = NULL;
   if (!driver) {
     snprintf(trouble, sizeof trouble, "iblf_jax kernel: the CUDA driver does not load: %s", dlerror());
     return;
@@ -65,20 +49,12 @@ static void prepare(void) {
   find_type cu_find = (find_type)entry(driver, "cuLibraryGetKernel");
   cu_describe = (describe_type)entry(driver, "cuGetErrorString");
   cu_launch = (launch_type)entry(driver, "cuLaunchKernel");
-  cu_global = (global_type)entry(driver, "cuLibraryGetGlobal");
-  cu_copy = (copy_type)entry(driver, "cuMemcpyDtoDAsync_v2");
-  cu_context = (context_type)entry(driver, "cuStreamGetCtx");
-  cu_push = (push_type)entry(driver, "cuCtxPushCurrent_v2");
-  cu_pop = (pop_type)entry(driver, "cuCtxPopCurrent_v2");
-  cu_event = (event_type)entry(driver, "cuEventCreate");
-  cu_record = (record_type)entry(driver, "cuEventRecord");
-  cu_wait = (wait_type)entry(driver, "cuStreamWaitEvent");
   if (trouble[0]) return;
-  if (!succeeded("loading", cu_load(&loaded, image, NULL, NULL, 0, NULL, NULL, 0), trouble, sizeof trouble)) return;
+  if (!succeeded("loading", cu_load(&library, image, NULL, NULL, 0, NULL, NULL, 0), trouble, sizeof trouble)) return;
   const char *names[] = {"iblf_jax_constants", "iblf_jax_signals", "iblf_jax_advance"};
   void **kernels[] = {&constants_kernel, &signals_kernel, &advance_kernel};
   for (int i = 0; i < 3; i++)
-    if (!succeeded(names[i], cu_find(kernels[i], loaded, names[i]), trouble, sizeof trouble)) return;
+    if (!succeeded(names[i], cu_find(kernels[i], library, names[i]), trouble, sizeof trouble)) return;
 }
 
 /* The whole number of a name, or -1. */
@@ -100,52 +76,6 @@ static int launched(void *kernel, int64_t count, int64_t threads, void *stream, 
     return 0;
   }
   return succeeded("launch", cu_launch(kernel, (unsigned)blocks, 1, 1, (unsigned)threads, 1, 1, 0, stream, arguments, NULL), text, size);
-}
-
-/* The bank of constants of a device, which all launches on it share: a call waits until the call before it, on whatever stream, is done. */
-typedef struct { void *context, *event; uint64_t address; } bank;
-#define MOST_DEVICES 64
-static pthread_mutex_t in_call = PTHREAD_MUTEX_INITIALIZER;
-static bank banks[MOST_DEVICES];
-
-/* The bank of the current context; NULL and a message if there is none. */
-static bank *bank_of(void *context, char *text, size_t size) {
-  size_t bytes;
-  for (int i = 0; i < MOST_DEVICES; i++) {
-    bank *found = &banks[i];
-    if (found->context == context) return found;
-    if (found->context) continue;
-    if (!succeeded("constants", cu_global(&found->address, &bytes, loaded, "iblf_jax_bank"), text, size)) return NULL;
-    if (!succeeded("event", cu_event(&found->event, 2 /* without times */), text, size)) return NULL;
-    found->context = context;
-    return found;
-  }
-  snprintf(text, size, "iblf_jax kernel: more than %d devices", MOST_DEVICES);
-  return NULL;
-}
-
-typedef struct { int64_t runs, steps, every, threads, stretch; void *shared, *leaves, *constants, *table, *floats_in, *ints_in, *floats, *ints; } job;
-typedef struct { void *at[RECORDED + 1]; } places;
-
-/* All launches of a call, with the stream's context current. */
-static int launch_all(job *j, places *records, bank *b, void *stream, char *text, size_t size) {
-  void *for_constants[] = {&j->shared, &j->constants};
-  if (!succeeded("wait", cu_wait(stream, b->event, 0), text, size)) return 0;
-  if (!launched(constants_kernel, 1, 1, stream, for_constants, text, size)) return 0;
-  if (CONSTANTS && !succeeded("copy", cu_copy(b->address, (uint64_t)j->constants, CONSTANTS * (DOUBLE ? 8 : 4), stream), text, size)) return 0;
-  int64_t first = 0;
-  do {
-    int64_t count = j->steps - first < j->stretch ? j->steps - first : j->stretch;
-    void *for_signals[] = {&j->constants, &first, &count, &j->table};
-    void *for_advance[] = {&j->table,  &j->leaves, &j->floats_in, &j->ints_in, &j->floats, &j->ints,
-                           records,    &j->runs,   &first,        &count,      &j->every};
-    if (count > 0 && !launched(signals_kernel, count, 64, stream, for_signals, text, size)) return 0;
-    if (!launched(advance_kernel, j->runs, j->threads, stream, for_advance, text, size)) return 0;
-    j->floats_in = j->floats;
-    j->ints_in = j->ints;
-    first += count;
-  } while (first < j->steps);
-  return succeeded("record", cu_record(b->event, stream), text, size);
 }
 
 /* Operands: shared (1, SHARED_LEAVES), leaves (LEAVES, runs), floats (FLOATS, runs), ints (INTS, runs).  Results: floats, ints, room for
@@ -177,17 +107,22 @@ extern "C" __attribute__((visibility("default"))) XLA_FFI_Error *iblf_jax_kernel
   if (error) return error;
 
   char text[512];
-  void *stream = asked.stream, *context, *before;
-  job j = {runs, steps, every, threads, stretch, in[0]->data, in[1]->data, out[2]->data, out[3]->data, in[2]->data, in[3]->data, out[0]->data,
-           out[1]->data};
-  places records;
+  void *stream = asked.stream, *shared = in[0]->data, *leaves = in[1]->data, *constants = out[2]->data;
+  void *table = out[3]->data, *floats_in = in[2]->data, *ints_in = in[3]->data, *floats = out[0]->data, *ints = out[1]->data;
+  struct { void *at[RECORDED + 1]; } records;
   for (int i = 0; i < RECORDED; i++) records.at[i] = out[4 + i]->data;
-  if (!succeeded("context", cu_context(stream, &context), text, sizeof text)) return failure(frame, text);
-  if (!succeeded("context", cu_push(context), text, sizeof text)) return failure(frame, text);
-  pthread_mutex_lock(&in_call);
-  bank *b = bank_of(context, text, sizeof text);
-  int done = b && launch_all(&j, &records, b, stream, text, sizeof text);
-  pthread_mutex_unlock(&in_call);
-  cu_pop(&before);
-  return done ? NULL : failure(frame, text);
+  void *for_constants[] = {&shared, &constants};
+  if (!launched(constants_kernel, 1, 1, stream, for_constants, text, sizeof text)) return failure(frame, text);
+  int64_t first = 0;
+  do {
+    int64_t count = steps - first < stretch ? steps - first : stretch;
+    void *for_signals[] = {&constants, &first, &count, &table};
+    void *for_advance[] = {&constants, &table, &leaves, &floats_in, &ints_in, &floats, &ints, &records, &runs, &first, &count, &every};
+    if (count > 0 && !launched(signals_kernel, count, 64, stream, for_signals, text, sizeof text)) return failure(frame, text);
+    if (!launched(advance_kernel, runs, threads, stream, for_advance, text, sizeof text)) return failure(frame, text);
+    floats_in = floats;
+    ints_in = ints;
+    first += count;
+  } while (first < steps);
+  return NULL;
 }

@@ -51,24 +51,3 @@ template <typename count> INLINE void store_some(real *p, F x, count) { *p = x; 
 #define LANEWISE(name, call) INLINE F name(F x) { return FN(call)(x); }
 #define LANEWISE2(name, call) INLINE F name(F x, F y) { return FN(call)(x, y); }
 #define LANEWISE_WHERE(name, call) static __device__ __attribute__((noinline)) F name(I which, F x, F y) { return which ? FN(call)(x) : y; }
-
-/* A number of a row of the table of signals.  All threads read the same word; 16 bytes are read at once. */
-#ifdef __CUDA_ARCH__
-#if DOUBLE
-INLINE word signal(const word *row, int k) {
-  double2 some = __ldg((const double2 *)row + k / 2);
-  word found;
-  found.f = k % 2 == 0 ? some.x : some.y;
-  return found;
-}
-#else
-INLINE word signal(const word *row, int k) {
-  float4 some = __ldg((const float4 *)row + k / 4);
-  word found;
-  found.f = k % 4 == 0 ? some.x : k % 4 == 1 ? some.y : k % 4 == 2 ? some.z : some.w;
-  return found;
-}
-#endif
-#else
-INLINE word signal(const word *row, int k) { return row[k]; }
-#endif
