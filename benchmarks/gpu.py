@@ -232,13 +232,13 @@ def timed(slots: int, dtype: str, runs: int, quick: bool, functions, found) -> l
             calls[name] = partial(found[runs, name][1], *arguments)
             jax.block_until_ready(calls[name]())
     best = interleaved(calls, 1 if quick else 3)
-    progress(f"{runs} runs measured")
     steps = {name: steps_of(name, runs, quick) for name in calls}
     speed = {name: runs * steps[name] / best[name] for name in calls}
     rows = []
     for name, s in speed.items():
         share = s * slots / peak(dtype) if name == "gpu" else ""
         ratio = s / speed["textbook"] if "textbook" in speed else ""
+        progress(f"{runs} runs, {name}: {s:.3e} steps/s")
         rows.append([runs, name, steps[name], found[runs, name][0], s, ratio, share])
     return rows
 
@@ -253,18 +253,18 @@ def servo_rows(runs: int, quick: bool) -> list[list]:
         start = time.perf_counter()
         try:
             compiled[name] = build(runs, steps)
-        except ImportError as error:
+        except (ImportError, RuntimeError) as error:  # absent, or without its binaries
             print(f"iiwa14: no row of {name}: {error}")
             continue
         seconds[name] = time.perf_counter() - start
         progress(f"iiwa14, {name}: compiled")
     positions = {name: np.asarray(call()) for name, call in compiled.items()}
     best = interleaved(compiled, 1 if quick else 2)
-    progress("iiwa14 measured")
     ours = next(iter(positions.values()))
     for name, found in positions.items():
         difference = float(np.max(np.abs(found - ours)))
         print(f"iiwa14, {name}: positions after {steps} steps differ by {difference:.2g} rad")
+        progress(f"iiwa14, {name}: {runs * steps / best[name]:.3e} steps/s")
     return [
         ["iiwa14", device, "float32", runs, name, steps, s, runs * steps / best[name], "", ""]
         for name, s in seconds.items()
