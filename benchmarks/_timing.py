@@ -12,6 +12,8 @@ import shlex
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -48,9 +50,31 @@ def compile_seconds(function: Callable, *args: Any) -> tuple[float, Callable]:
     """Seconds to trace and compile `jax.jit(function)` for these arguments, and the compiled
     function.
     """
-    start = time.perf_counter()
-    compiled = jax.jit(function).lower(*args).compile()
-    return time.perf_counter() - start, compiled
+    return compiled_side_by_side({"": (function, args)}, threads=1)[""]
+
+
+def compiled_side_by_side(
+    functions: Mapping[Any, tuple[Callable, Sequence[Any]]], threads: int
+) -> dict[Any, tuple[float, Callable]]:
+    """The same for many functions: name -> `compile_seconds`.
+
+    They are traced one after the other; XLA compiles so many at the same time.
+    """
+
+    def timed(call):
+        start = time.perf_counter()
+        return call(), time.perf_counter() - start
+
+    def compiled(lowered, tracing):
+        found, compiling = timed(lowered.compile)
+        return tracing + compiling, found
+
+    with ThreadPoolExecutor(threads) as pool:
+        started = {}
+        for name, (function, args) in functions.items():
+            lowered, tracing = timed(partial(jax.jit(function).lower, *args))
+            started[name] = pool.submit(compiled, lowered, tracing)
+        return {name: future.result() for name, future in started.items()}
 
 
 def machine() -> dict[str, str]:

@@ -34,7 +34,7 @@ def launcher(program: Program, shared: int, per_run: int, image: bytes) -> str:
     padded = image + bytes(-len(image) % 8)
     words = ",".join(map(hex, np.frombuffer(padded, "<u8").tolist()))
     array = f"static const unsigned long long image[] = {{{words}}};\n"
-    definitions = sizes(program, shared, per_run)
+    definitions = sizes(program, shared, per_run, CUDA)
     return "\n".join([definitions, array, header("frame.h"), header("launch.h")])
 
 
@@ -80,11 +80,12 @@ def call(
     """
     layout = Layout.of(program)
     runs = carry.floats.shape[1]
+    columns = CUDA.columns(program, len(layout.columns))
     table_rows = max(min(steps, table), 1)
     outputs = [
         *(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in carry),
         jax.ShapeDtypeStruct((1, len(layout.constants)), program.dtype),
-        jax.ShapeDtypeStruct((table_rows, len(layout.columns)), program.dtype),
+        jax.ShapeDtypeStruct((table_rows, columns), program.dtype),
         *record_shapes(program, runs, steps, every),
     ]
     floats, ints, _, _, *records = jax.ffi.ffi_call(name, outputs)(

@@ -17,6 +17,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib.resources import files
 from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 
@@ -33,9 +34,49 @@ from iblf_jax.kernels.program import (
     needed,
 )
 
-NATIVE = (("vector.h", "mathlib.h", "records.h", "series.h"), ("frame.h", "driver.h"))
-CUDA = (("scalar.h", "mathlib.h", "records.h"), ("kernels.h",))
-"""The headers before and after the generated functions, by target."""
+
+class Target(NamedTuple):
+    """What the generated text means, and where it differs from that of other targets."""
+
+    before: tuple[str, ...]
+    """The headers before the generated functions."""
+    after: tuple[str, ...]
+    """The headers after them."""
+    opening: str = ""
+    """A line before the generated functions."""
+    closing: str = ""
+    """A line after them."""
+    in_c: Mapping[str, str] = MappingProxyType({})
+    """Operation on floats -> its C, where the target has its own."""
+    signal: str = "row[{}]"
+    """The C expression of a number of the table of signals."""
+    row_bytes: int = 1
+    """A row of the table of signals is a multiple of so many bytes."""
+
+    def columns(self, program: Program, columns: int) -> int:
+        """The number of words of a row of the table of signals."""
+        words = max(self.row_bytes // program.dtype.itemsize, 1)
+        return -(-columns // words) * words
+
+
+NATIVE = Target(("vector.h", "mathlib.h", "records.h", "series.h"), ("frame.h", "driver.h"))
+CUDA = Target(
+    ("scalar.h", "mathlib.h", "records.h", "device.h"),
+    ("kernels.h",),
+    opening="template <bool careful> struct rollout : angles<careful> {",
+    closing="};",
+    in_c=MappingProxyType(
+        {
+            "div": "f_div({}, {})",
+            "max": "larger({}, {})",
+            "min": "smaller({}, {})",
+            "abs": "FN(fabs)({})",
+            "is_finite": "MASK(FN(fabs)({}) < (F)INFINITY)",
+        }
+    ),
+    signal="signal(row, {})",
+    row_bytes=16,
+)
 SINES = frozenset({"sin", "cos"})
 """Operations that `mathlib.h` divides into a polynomial and its replacement for large angles."""
 
@@ -95,7 +136,13 @@ class _Emitter:
     `names`, an argument of many methods, has the C expressions of nodes that are computed already.
     """
 
-    def __init__(self, program: Program, tables: dict[str, str], calls: FunctionCalls) -> None:
+    def __init__(
+        self,
+        program: Program,
+        tables: dict[str, str],
+        calls: FunctionCalls,
+        target: Target = NATIVE,
+    ) -> None:
         self.program = program
         self.with_shared_test = SINES
         """Operations of which several share one test (`_sines`)."""
@@ -107,6 +154,7 @@ class _Emitter:
             if node.op == "lookup"
         }
         self.calls = calls
+        self.target = target
         self.in_place: dict[int, int] = {}
         """Selections that overwrite a carried number in its place -> the node of the number before
         the step."""
@@ -166,9 +214,16 @@ class _Emitter:
         if node.op == "lookup":
             text = f"f_lookup({self.tables[i]}, {len(node.value)}, {args[0]})"
         else:
-            text = expression(node, args, [self.program.nodes[a].kind for a in node.args])
+            kinds = [self.program.nodes[a].kind for a in node.args]
+            text = self._expression(node, args, kinds)
         self.lines.append(f"  {c_type(node)} v{i} = {text};")
         return f"v{i}"
+
+    def _expression(self, node: Node, args: list[str], kinds: list[str]) -> str:
+        """The C of one operation, the target's own where it has one."""
+        if node.op in self.target.in_c and kinds[0] == "f":
+            return self.target.in_c[node.op].format(*args)
+        return expression(node, args, kinds)
 
     def _overwritten(self, i: int, args: list[str]) -> str:
         """Adds a statement that overwrites a carried number where a selection takes another one;
@@ -204,13 +259,20 @@ class _Emitter:
         return f"{head} {{\n{body}\n}}\n"
 
 
-def sizes(program: Program, shared_leaves: int, per_run_leaves: int, series: int = 0) -> str:
+def sizes(
+    program: Program,
+    shared_leaves: int,
+    per_run_leaves: int,
+    target: Target = NATIVE,
+    series: int = 0,
+) -> str:
     """The definitions of the sizes that the headers use.
 
     Args:
       program: the program.
       shared_leaves: number of shared leaf entries.
       per_run_leaves: number of leaf entries of each run.
+      target: NATIVE or CUDA.
       series: numbers of each step of a run in the series that the program reads.
     """
     constants, columns, floats, ints = map(len, Layout.of(program))
@@ -220,13 +282,15 @@ def sizes(program: Program, shared_leaves: int, per_run_leaves: int, series: int
         "FLOATS": floats,
         "INTS": ints,
         "CONSTANTS": constants,
-        "COLUMNS": columns,
+        "COLUMNS": target.columns(program, columns),
         "SERIES": series,
         "DOUBLE": int(program.dtype == np.float64),
         "RECORDED": len(program.recorded),
         # C has no empty list of initial values.
         "RECORDED_SIZES": f"{{{', '.join(map(str, [*program.recorded, 0]))}}}",
     }
+    if target is CUDA:
+        values["CALLS"] = int(any(node.op == "call" for node in program.nodes))
     return "".join(f"#define {name} {value}\n" for name, value in values.items())
 
 
@@ -234,7 +298,7 @@ def source(
     program: Program,
     shared_leaves: int,
     per_run_leaves: int,
-    target: tuple[tuple[str, ...], ...] = NATIVE,
+    target: Target = NATIVE,
     segment: int | None = None,
     series: int = 0,
 ) -> str:
@@ -255,22 +319,23 @@ def source(
     layout = Layout.of(program)
     tables: dict[str, str] = {}
     calls = FunctionCalls(program, layout)
-    e = _Emitter(program, tables, calls)
-    functions = _functions(calls, tables, segment)
+    e = _Emitter(program, tables, calls, target)
+    functions = _functions(calls, tables, segment, target)
     constants = _constants(e, layout.constants)
     signals = _signals(e, layout.constants, layout.columns)
-    before, after = target
     parts = [
-        sizes(program, shared_leaves, per_run_leaves, series),
-        *map(header, before),
+        sizes(program, shared_leaves, per_run_leaves, target, series),
+        *map(header, target.before),
         *(f"TABLE {name}[] = {{{numbers}}};" for numbers, name in tables.items()),
+        target.opening,
         *functions,
         constants,
         signals,
         _advance(e, layout, segment),
-        *map(header, after),
+        target.closing,
+        *map(header, target.after),
     ]
-    return "\n".join(parts)
+    return "\n".join(filter(None, parts))
 
 
 def plain_function(
@@ -330,11 +395,13 @@ def header(name: str) -> str:
     return (files("iblf_jax.kernels") / "c" / name).read_text()
 
 
-def _functions(calls: FunctionCalls, tables: dict[str, str], segment: int | None) -> list[str]:
+def _functions(
+    calls: FunctionCalls, tables: dict[str, str], segment: int | None, target: Target
+) -> list[str]:
     """The C of the functions that a program calls, divided as in `source`."""
     texts = []
     for k, (function, arguments, _) in enumerate(calls.functions):
-        e = _Emitter(function, tables, calls)
+        e = _Emitter(function, tables, calls, target)
         names = {
             i: arguments[node.value]
             for i, node in enumerate(function.nodes)
@@ -421,7 +488,8 @@ def _loop(program: Program) -> list[str]:
 
 def _names_of_columns(e: _Emitter, layout: Layout) -> dict[int, str]:
     """C expressions of the numbers of a time step that are the same for all runs."""
-    return {i: unpacked(e.program.nodes[i], f"row[{k}]") for k, i in enumerate(layout.columns)}
+    nodes = e.program.nodes
+    return {i: unpacked(nodes[i], e.target.signal.format(k)) for k, i in enumerate(layout.columns)}
 
 
 def _of_kind(program: Program, c: int, of_float: str, of_other: str) -> str:

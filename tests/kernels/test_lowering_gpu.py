@@ -34,8 +34,9 @@ from iblf_jax.engine.time_step import TimeStep
 from iblf_jax.kernels import nvrtc
 from iblf_jax.kernels.emit_c import CUDA, source
 from iblf_jax.kernels.layout import Layout
-from iblf_jax.kernels.packed import Shapes, pack
+from iblf_jax.kernels.packed import Packed, Shapes, pack
 from iblf_jax.kernels.passes import written_out
+from iblf_jax.kernels.program import Builder, finished
 from iblf_jax.kernels.toolchain import ToolchainError
 from iblf_jax.simulation.metrics import standard
 from iblf_jax.simulation.paths import get
@@ -268,6 +269,66 @@ def test_forward_sensitivities(paper):
         assert_same(jax.tree.map(np.asarray, x), jax.tree.map(np.asarray, y), 1e-10)
 
 
+def results_of(operation, dtype, x, y):
+    """An operation on floats, for each pair of numbers, by the kernel."""
+    builder = Builder(dtype)
+    inputs = [builder.input("carry", i, "f") for i in range(2)]
+    result = builder.emit(operation, *inputs, kind="f")
+    program = finished(builder, [*inputs, -1], [*inputs, result], [])
+    floats = jnp.asarray(np.stack([x, y, np.zeros_like(x)]), dtype)
+    carry = Packed(floats, jnp.zeros((0, len(x)), jnp.int32))
+    shared, per_run = jnp.zeros(1, dtype), jnp.zeros((1, len(x)), dtype)
+    (found, _), _ = run_program(program, shared, per_run, carry, 1, None)
+    return np.asarray(found[2])
+
+
+@needs_compiler
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_quotients_are_within_one_unit_of_the_last_place(dtype):
+    rng = np.random.default_rng(0)
+    sign = rng.choice([-1.0, 1.0], (2, 20_000))
+    x, y = (sign * 2.0 ** rng.uniform(-60, 60, sign.shape)).astype(dtype)
+    found = results_of("div", dtype, x, y)
+    exact = x.astype(np.longdouble) / y
+    worst = np.max(np.abs(found - exact) / np.spacing(np.abs(exact.astype(dtype))))
+    assert worst <= 1.0, f"{worst} units of the last place"
+
+
+@needs_compiler
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize(
+    ("operation", "expected"), [("div", np.divide), ("max", np.maximum), ("min", np.minimum)]
+)
+def test_special_numbers_are_those_of_ieee_754(operation, expected, dtype):
+    numbers = np.asarray([0.0, -0.0, 1.0, -3.0, 1e30, 1e-30, np.inf, -np.inf, np.nan], dtype)
+    x, y = (a.ravel() for a in np.meshgrid(numbers, numbers))
+    with np.errstate(all="ignore"):
+        exact = expected(x, y)
+    normal = ~((np.abs(exact) > 0) & (np.abs(exact) < np.finfo(dtype).tiny))
+    found = results_of(operation, dtype, x, y)
+    np.testing.assert_allclose(found[normal], exact[normal], rtol=2 * np.finfo(dtype).eps)
+
+
+@needs_compiler
+def test_angles_that_become_far_within_a_later_launch(runs_here, monkeypatch):
+    """A run whose angle grows beyond the limit of the polynomials, and one whose angle does not."""
+    monkeypatch.setattr(thresholds, "MAX_STEPS_PER_LAUNCH", 4)
+    builder = Builder("float64")
+    angle, factor, total = (builder.input("carry", i, "f") for i in range(3))
+    after = [
+        builder.emit("mul", angle, factor, kind="f"),
+        factor,
+        builder.emit("add", total, builder.emit("sin", angle, kind="f"), kind="f"),
+    ]
+    program = finished(builder, [angle, factor, total], after, [])
+    start = np.asarray([[0.7, 0.7], [64.0, 1.0], [0.0, 0.0]])
+    carry = Packed(jnp.asarray(start), jnp.zeros((0, 2), jnp.int32))
+    (found, _), _ = run_program(program, jnp.zeros(1), jnp.zeros((1, 2)), carry, 11, None)
+    angles = start[0] * start[1] ** np.arange(11)[:, None]
+    assert np.max(angles) > 1e14
+    np.testing.assert_allclose(found[2], np.sum(np.sin(angles), axis=0), rtol=1e-13)
+
+
 @needs_a_cpu
 @needs_compiler
 def test_the_image_is_loaded_once_and_launched_for_some_steps_at_a_time(paper, monkeypatch):
@@ -456,10 +517,7 @@ def test_the_paper_s_step_stays_in_registers(paper, tmp_path):
     )
     assert found, report
     assert int(found[1]) == 0
-    assert int(found[2]) <= 200, (
-        "two blocks of 128 threads fit a multiprocessor; the estimate of the error takes 25"
-        " registers"
-    )
+    assert int(found[2]) <= 256, "two blocks of 128 threads fit a multiprocessor"
 
 
 @needs_nvrtc
