@@ -640,7 +640,7 @@ def _advance_in_segments(e: _Emitter, layout: Layout, segment: int) -> str:
     names = _names_of_inputs(e, layout) | _names_of_columns(e, layout) | _names_of_series(e)
     places = _places_of_carry(layout)
     names |= {program.carry[c][0]: place for c, place in places.items() if program.carry[c][0] >= 0}
-    seen = SEEN_BY_ADVANCE
+    seen: tuple[str, ...] = SEEN_BY_ADVANCE
     declarations = list[str]()
     if _reads_series(program):
         seen = (*seen, SERIES)
