@@ -116,7 +116,8 @@ MAX_COLUMNS = 32
 """Numbers by which a transformable run is differentiated column by column; reverse mode (`adjoint`,
 or the scan) differentiates by more.  64 runs of 500 steps of the paper's loop with N weights take,
 by columns and by the scan in reverse mode: N = 8, 0.06 and 1.6 s; N = 32, 0.36 and 1.2 s; N = 96,
-4.2 and 3.5 s; N = 386, 9.7 and 2.2 s (two cores)."""
+4.2 and 3.5 s; N = 386, 9.7 and 2.2 s (two cores).  Reverse mode by kernels takes 0.1 s for N = 162
+and 0.2 s for N = 374 on a busy machine."""
 STEP_SIZE_CHUNK = 1000
 """Steps between two assessments of the pair of runs that determines a step size."""
 

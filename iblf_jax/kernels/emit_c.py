@@ -117,7 +117,6 @@ SEEN_BY_ADVANCE = (
     "const F *floats",
     "const I *ints",
     "const word *row",
-    "const F *series",
     "const F *once",
     "F *r",
     "I *s",
@@ -476,9 +475,18 @@ def _names_of_series(e: _Emitter) -> dict[int, str]:
     return {i: f"series[{n.value}]" for i, n in enumerate(nodes) if n.op == "series"}
 
 
+SERIES = "const F *series"
+"""Parameter of the generated functions for what a step reads from the series."""
+
+
+def _reads_series(program: Program) -> bool:
+    """Whether a step reads a series."""
+    return any(node.op == "series" for node in program.nodes)
+
+
 def _loop(program: Program) -> list[str]:
     """The beginning of the loop over the steps; `rows` points to the row of the next step."""
-    if not any(node.op == "series" for node in program.nodes):
+    if not _reads_series(program):
         return ["  for (int step = 0; step < count; step++, row += COLUMNS) {"]
     return [
         "  for (int step = 0; step < count; step++, row += COLUMNS, rows -= SERIES * runs) {",
@@ -524,7 +532,8 @@ def _advance(e: _Emitter, layout: Layout, segment: int | None) -> str:
     program = e.program
     names = _names_of_inputs(e, layout)
     places = _places_of_carry(layout)
-    e.lines.append("  F series[SERIES + 1];")
+    if _reads_series(program):
+        e.lines.append("  F series[SERIES];")
     for c, place in places.items():
         kind = _of_kind(program, c, "F", "I")
         e.lines.append(f"  {kind} c{c} = {_sign(program, c)}{place};")
@@ -701,7 +710,12 @@ def _advance_in_segments(e: _Emitter, layout: Layout, segment: int) -> str:
     names = _names_of_inputs(e, layout) | _names_of_columns(e, layout) | _names_of_series(e)
     places = _places_of_carry(layout)
     names |= {program.carry[c][0]: place for c, place in places.items() if program.carry[c][0] >= 0}
-    segments = _Segments(e, names, segment, "segment", SEEN_BY_ADVANCE)
+    seen: tuple[str, ...] = SEEN_BY_ADVANCE
+    declarations = list[str]()
+    if _reads_series(program):
+        seen = (*seen, SERIES)
+        declarations.append("  F series[SERIES];")
+    segments = _Segments(e, names, segment, "segment", seen)
     once = frontier(program, e.classes, PER_RUN, lambda k: k == PER_RUN | TIME)
     before = segments.add(once, kept=True)
     carried = sorted({after for _, after in program.carry})
@@ -717,7 +731,8 @@ def _advance_in_segments(e: _Emitter, layout: Layout, segment: int) -> str:
         for c, (unchanged, after) in enumerate(program.carry)
         if unchanged != after
     ]
-    e.lines += ["  F series[SERIES + 1];", segments.declarations, e.calls.declarations, *signs]
+    declarations += [segments.declarations, e.calls.declarations]
+    e.lines += [*declarations, *signs]
     e.lines += [*(f"  {call}" for call in before), *e.calls.once_statements(segments.names)]
     e.lines += [*_loop(program), *(f"  {call}" for call in within)]
     if program.outputs:

@@ -235,8 +235,10 @@ def test_a_step_whose_adjoint_does_not_lower_is_differentiated_by_the_scan(probl
 
 
 def test_a_long_step_is_differentiated_by_the_scan_on_auto(problem, monkeypatch):
-    monkeypatch.setattr(thresholds, "ADJOINT_NODES", 10**9)
     monkeypatch.setattr(execute, "Cotangents", None)
+    with pytest.raises(TypeError):
+        problem.traced("auto")
+    monkeypatch.setattr(thresholds, "ADJOINT_NODES", 10**9)
     problem.traced("auto")
     with pytest.raises(TypeError):
         problem.traced("native")
