@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.linalg import inner, matvec
 from iblf_jax.testing._contract import (
     Findings,
     call_has_shape,
@@ -17,7 +18,14 @@ from iblf_jax.testing._contract import (
     in_dtype,
     shape_of,
 )
-from iblf_jax.world.robots import Robot, coriolis_from_mass_matrix, mass_matrix_rate
+from iblf_jax.world.robots import (
+    Robot,
+    coriolis_from_mass_matrix,
+    energy_gradient,
+    inverse_dynamics,
+    mass_matrix_rate,
+    momentum,
+)
 
 TOLERANCE = 1e-9
 """Relative, float64: closed forms and automatic differentiation agree to rounding."""
@@ -28,6 +36,8 @@ def check_robot(robot: Any, *, q: Any = None) -> None:
     J = d tip/dq.
 
         M = M^T > 0,   x^T (M' - 2 C) x = 0,   C(q, v) v = M' v - 1/2 d/dq (v^T M v),   G = dU/dq
+
+    The robot's own `momentum`, `inverse_dynamics` and `energy_gradient` are compared with M, C, G.
 
     Args:
       robot: an instance.
@@ -115,6 +125,13 @@ def _identities(robot: Any, q: jax.Array, v: jax.Array, u: jax.Array) -> dict[st
         ),
         "gravity": robot.gravity(q) - jax.grad(robot.potential)(q),
         "gravity_scale": jnp.max(jnp.abs(robot.gravity(q))),
+        "momentum": momentum(robot, q, u) - M @ u,
+        "inverse_dynamics": inverse_dynamics(robot, q, v, u, u)
+        - (C @ u + robot.gravity(q) + M @ u),
+        "energy_gradient": (
+            energy_gradient(robot, q, v)
+            - 0.5 * jax.grad(lambda x: inner(v, matvec(robot.mass_matrix(x), v)))(q)
+        ),
         "jacobian": robot.jacobian(q) - jax.jacfwd(robot.tip)(q),
         "tip": robot.skeleton(q)[-1] - robot.tip(q),
     }
@@ -157,5 +174,13 @@ def _physics(findings: Findings, got: dict[str, np.ndarray]) -> None:
         "gravity(q) is not dU/dq of potential(q)",
         "Look at signs and heights",
     )
+    small("momentum", scale, "momentum(q, v) is not M(q) v", "Leave it out")
+    small(
+        "inverse_dynamics",
+        max(motion, np.max(got["gravity_scale"])),
+        "inverse_dynamics(q, v, u, a) is not C(q, v) u + G + M a",
+        "Leave it out",
+    )
+    small("energy_gradient", motion, "energy_gradient(q, v) is not dT/dq", "Leave it out")
     small("jacobian", 1.0, "jacobian(q) is not d tip/dq", "Use iblf_jax.robots.from_energy")
     small("tip", 1.0, "the last row of skeleton(q) is not tip(q)", "skeleton is base, joints, tip")

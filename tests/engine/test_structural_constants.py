@@ -210,6 +210,35 @@ def test_derivatives_by_the_geometry(monkeypatch):
     assert counts.tolist() == [True, False, True], "a height on the vertical axis is no lever"
 
 
+def test_another_mechanism_in_the_same_process_is_another_program():
+    """The zeros are in the key of the compiled program: the arm that comes second is not run with
+    those of the first."""
+    first = square_arm()
+    moved = {
+        f"{robot}.position": jnp.asarray([[0.1, 0.0, 0.3], [0.4, 0.0, 0.2]])
+        for robot in ("plant", "model")
+    }
+    second = with_parameters(first, moved)
+
+    def metrics(scenario, backend):
+        request = RunRequest(5, "euler", constants=robot_constants(scenario), backend=backend)
+        return metrics_of(scenario, run=request)
+
+    by_kernel = [metrics(scenario, "native") for scenario in (first, second, first)]
+    by_scan = [metrics(scenario, "vmap") for scenario in (first, second, first)]
+    for found, expected in zip(by_kernel, by_scan, strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-12)
+    assert np.max(np.abs(by_kernel[0] - by_kernel[1])) > 1e-6
+    np.testing.assert_array_equal(by_kernel[0], by_kernel[2])
+
+
+@partial(jax.jit, static_argnames="run")
+def metrics_of(scenario, *, run):
+    start = {"initial.q": scenario.initial.q[None]}
+    found = execute.run_batch(scenario, start, STANDARD, jnp.asarray(DT), run).metrics
+    return jnp.concatenate([jnp.ravel(x).astype(float) for _, x in sorted(found.items())])
+
+
 def test_robots_without_a_geometry_and_tracers_have_none():
     assert robot_constants(canonical(PRESET)) is None
     jax.jit(

@@ -569,6 +569,22 @@ PARTS = {
         {"robot": members.TWO_LINK, "q": [0.1, 0.2], "v": [0.1, 0.2]},
         ("robot", "q", "v"),
     ),
+    "momentum": (
+        robots.momentum,
+        {"robot": members.TWO_LINK, "q": [0.1, 0.2], "v": [0.1, 0.2]},
+        ("robot", "q", "v"),
+    ),
+    "inverse_dynamics": (
+        robots.inverse_dynamics,
+        {
+            "robot": members.TWO_LINK,
+            "q": [0.1, 0.2],
+            "v": [0.1, 0.2],
+            "u": [0.1, 0.2],
+            "acceleration": [0.1, 0.2],
+        },
+        ("robot", "q", "v", "u", "acceleration"),
+    ),
     "from_energy": (robots.from_energy, {"cls": None}, ("cls",)),
     "joint_names": (robots.joint_names, {"robot": members.TWO_LINK, "n": 2}, ("n",)),
     "tube_at": (

@@ -163,6 +163,12 @@ def test_a_check_in_post_init_is_found():
             {"jacobian": lambda self, q: TWO_LINK.jacobian(self, q).T},
             ("jacobian(q) is not d tip/dq",),
         ),
+        ({"momentum": lambda self, q, v: v}, ("momentum(q, v) is not M(q) v",)),
+        (
+            {"inverse_dynamics": lambda self, q, v, u, a: TWO_LINK.mass_matrix(self, q) @ a},
+            ("inverse_dynamics(q, v, u, a) is not",),
+        ),
+        ({"energy_gradient": lambda self, q, v: v}, ("energy_gradient(q, v) is not dT/dq",)),
         ({"potential": lambda self, q: float(q[0])}, ("potential(q) raised", "use jax.numpy")),
         (
             {
@@ -184,6 +190,9 @@ def test_a_check_in_post_init_is_found():
         "not-linear",
         "not-skew",
         "transposed",
+        "momentum",
+        "inverse-dynamics",
+        "energy-gradient",
         "python-float",
         "stopped",
         "float64",

@@ -140,6 +140,30 @@ def test_c_is_the_one_of_the_christoffel_symbols(seed):
     np.testing.assert_allclose(arm.energy_gradient(q, v), rate, rtol=1e-10, atol=1e-12)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_momentum_and_inverse_dynamics_are_the_products_of_the_matrices(seed):
+    load = ij.robots.Payload(
+        mass=0.7, centre=[0.1, -0.2, 0.3], inertia=[0.1, 0.2, 0.2, 0.0, 0.0, 0.1]
+    )
+    arm = dataclasses.replace(random_arm(4, seed), payload=0.4, carried=load, armature=0.1)
+    q, v, u, a = jnp.asarray(np.random.default_rng(seed).normal(size=(4, 4)))
+
+    @jax.jit
+    def differences(arm):
+        M, rest = arm.mass_matrix(q), arm.gravity(q) + arm.mass_matrix(q) @ a
+        return (
+            arm.momentum(q, v) - M @ v,
+            arm.inverse_dynamics(q, v, u, a) - arm.coriolis(q, v, u) - rest,
+            arm.inverse_dynamics(q, v, v, a) - arm.coriolis(q, v, v) - rest,
+            # The form for one velocity and that for two.
+            arm.coriolis(q, v, v) - arm.coriolis(q, v, 1.0 * v),
+            arm.gravity(q) - jax.grad(arm.potential)(q),
+        )
+
+    for difference in differences(arm):
+        np.testing.assert_allclose(difference, 0.0, atol=1e-12 * float(jnp.max(arm.mass_matrix(q))))
+
+
 def two_link_in_space(**fields) -> Arm:
     """The paper's arm as an Arm: both axes along y, gravity down."""
     p = TWO_LINK

@@ -195,6 +195,8 @@ def energy_gradient(robot: Robot, q: jax.Array, v: jax.Array) -> jax.Array:
 
 def momentum(robot: Robot, q: jax.Array, v: jax.Array) -> jax.Array:
     """M(q) v, (n,) [N m s], by the robot's own method if it has one."""
+    _is_robot(robot)
+    q, v = checks.vectors(robot.n, q=q, v=v)
     own_method = robot_member(robot, "momentum")
     if own_method is not None:
         return own_method(q, v)  # type: ignore[no-any-return]
@@ -205,6 +207,11 @@ def inverse_dynamics(
     robot: Robot, q: jax.Array, v: jax.Array, u: jax.Array, acceleration: jax.Array
 ) -> jax.Array:
     """C(q, v) u + G + M acceleration, (n,) [N m], by the robot's own method if it has one."""
+    _is_robot(robot)
+    is_velocity = u is v
+    q, v, u, acceleration = checks.vectors(robot.n, q=q, v=v, u=u, acceleration=acceleration)
+    if is_velocity:  # a robot may have a shorter form for one object
+        u = v
     own_method = robot_member(robot, "inverse_dynamics")
     if own_method is not None:
         return own_method(q, v, u, acceleration)  # type: ignore[no-any-return]
