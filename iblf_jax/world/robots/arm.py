@@ -15,7 +15,9 @@ and I_i the inertia of link i about the world's origin:
 x and x* are the cross products of a motion with a motion and with a wrench (`spatial`).  Since
 B + B^T = I', M' - 2 C is skew-symmetric; C is the one of the Christoffel symbols (Echeandia &
 Wensing 2021).  All links are computed at once; only the positions of the frames go from link to
-link.
+link.  The momentum and the force of a link are those about its centre, moved to the origin
+(`spatial.momenta`, `spatial.inertial_forces`): there, a plant and a model whose masses differ have
+the same rotational inertias and accelerations, and a scalar program computes these once.
 
 Friction in the joints acts on the plant (`friction_torque`); the law's M0, C0, G0 hold none, so it
 is part of f in (2.1).

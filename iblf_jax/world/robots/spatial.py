@@ -10,8 +10,7 @@ A *pseudo-inertia* is the symmetric 4 x 4 matrix of a body's moments about the o
     P = [[Sigma, h], [h^T, m]],   Sigma = int r r^T dm,   h = m c,
     rotational inertia J = tr(Sigma) 1 - Sigma.
 
-It adds up over bodies, and moves to another frame as H P H^T with H = [[R, p], [0, 1]]: no
-parallel-axis rules.
+It adds up over bodies, and moves to another frame as H P H^T with H = [[R, p], [0, 1]].
 
 Products are written as sums: a call into a matrix library costs more than the arithmetic
 (`core.linalg`), and a step that is compiled as one function must not contain such a call.  Few
