@@ -320,7 +320,9 @@ def _with_equal_rows(name: str, value: Any) -> Any:
     except ValueError:
         got = [row.shape for row in rows]
         raise fail(name, got, "rows of one number, or of one a joint each") from None
-    return jnp.stack([jnp.broadcast_to(row, shape) for row in rows])
+    # A user may have set the strict promotion of JAX, which refuses rows of different types.
+    with jax.numpy_dtype_promotion("standard"):
+        return jnp.stack([jnp.broadcast_to(row, shape) for row in rows])
 
 
 def as_floats(name: str, value: Any) -> jax.Array:
