@@ -389,7 +389,7 @@ def sampled_jacobians(scenario: Scenario, times: jax.Array, states: LoopState) -
     return _sampled_jacobians(scenario, times, states, request=request)
 
 
-@partial(jax.jit, static_argnames="request")
+@programs.jit(static_argnames="request")
 def _sampled_jacobians(
     scenario: Scenario, times: jax.Array, states: LoopState, *, request: RunRequest
 ) -> jax.Array:
