@@ -18,6 +18,7 @@ from jax.custom_batching import custom_vmap
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
+from iblf_jax.core import programs
 from iblf_jax.core.caches import CACHE
 from iblf_jax.engine import registry
 from iblf_jax.engine.adjoint import Cotangents, ReverseRun
@@ -230,7 +231,7 @@ def _batched_gradient(runs: Runs, places: tuple[int, ...], which: tuple[int, ...
     return gradient
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2))
+@programs.jit(static_argnums=(0, 1, 2))
 def _gradient_by_kernel(
     runs: Runs, places: tuple[int, ...], which: tuple[int, ...], operands: Sequence[jax.Array]
 ) -> list[jax.Array]:
@@ -299,7 +300,7 @@ def _batch(operands, axes, *, runs, places):
 
 _primitive = Primitive("iblf_jax_derivative_of_runs")
 _primitive.multiple_results = True
-_primitive.def_impl(jax.jit(_along, static_argnames=("runs", "places")))
+_primitive.def_impl(programs.jit(_along, static_argnames=("runs", "places")))
 _primitive.def_abstract_eval(_abstract)
 mlir.register_lowering(_primitive, mlir.lower_fun(_along, multiple_results=True))
 ad.primitive_jvps[_primitive] = _jvp
