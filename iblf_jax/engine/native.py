@@ -38,7 +38,8 @@ def _kernel_build(
 
 def build(program: Program, shared: int, per_run: int, runs: int, steps: int) -> None:
     """Compiles the kernel with which `run` makes so many steps of so many runs."""
-    cpu.kernel(program, shared, per_run, _kernel_build(program, runs, steps))
+    # With every argument that `cpu.run` passes, so that it finds this kernel in the cache.
+    cpu.kernel(program, shared, per_run, _kernel_build(program, runs, steps), 0)
 
 
 def start_build(

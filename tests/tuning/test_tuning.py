@@ -121,12 +121,12 @@ def test_the_gauss_newton_matrix_is_that_of_the_signals(paper, nominal):
 
 @pytest.mark.slow
 def test_reverse_mode_remembers_few_states(paper):
-    """Temporary memory of the gradient grows like the cube root of the number of steps, and stays
-    below 2 sqrt(T) states."""
+    """Temporary memory of the gradient by the scan grows like the cube root of the number of steps,
+    and stays below 2 sqrt(T) states.  (That of kernels: `tests/engine/test_adjoint.py`.)"""
     sizes = {}
     for steps in (500, 4000):
         built = TuningProblem.build(
-            paper, GAINS, objective(), **{**SHORT, "duration": steps * 1e-3}
+            paper, GAINS, objective(), **{**SHORT, "duration": steps * 1e-3}, backend="vmap"
         )
         compiled = evaluation.reverse_derivatives.lower(
             built, built.candidates(built.box.z[None])
