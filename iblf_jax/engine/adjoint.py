@@ -30,8 +30,14 @@ from iblf_jax.core import checks
 from iblf_jax.core.status import Status
 from iblf_jax.engine import thresholds
 from iblf_jax.engine.batch import Batch, carry_shapes, finalize, initialize
-from iblf_jax.engine.carry import Carry, Inputs, StepOptions, keep_if
-from iblf_jax.engine.columns import begun, float_metrics, floats_of
+from iblf_jax.engine.carry import (
+    Carry,
+    Inputs,
+    StepOptions,
+    keep_if,
+    start_without_accuracy,
+)
+from iblf_jax.engine.columns import float_metrics, floats_of
 from iblf_jax.engine.compile import operations
 from iblf_jax.engine.derivatives import floats_of_carry
 from iblf_jax.engine.linearization import Linearization
@@ -305,7 +311,7 @@ class ReverseRun(NamedTuple):
 
         def floats_at_start(parameters):
             moved = with_leaves(inputs, self.places, parameters)
-            return floats_of_carry(begun(moved, self.request.method))[0]
+            return floats_of_carry(start_without_accuracy(moved, self.request.method))[0]
 
         _, pullback = jax.vjp(floats_at_start, self._parameters(inputs))
         (by_start,) = pullback(adjoint.cotangent)

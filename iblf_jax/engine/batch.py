@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from iblf_jax.engine.carry import Carry, Inputs, start
+from iblf_jax.engine.carry import Carry, Inputs, start, start_without_accuracy
 from iblf_jax.engine.linearization import (
     Linearization,
     LinearizationStep,
@@ -216,12 +216,7 @@ def initialize(loop: StepLoop, batch: Batch, method: str) -> tuple[Carry, Linear
 
 def carry_without_linearization(batch: Batch, method: str) -> Carry:
     """The carry before the first step, with an error estimate that has no meaning."""
-
-    def of_run(inputs):
-        size = error_estimate.watched_indices(initial_state(inputs.scenario)).size
-        return start(inputs, method, jnp.zeros((size, size), inputs.dt.dtype))
-
-    return batch.map_runs(of_run)
+    return batch.map_runs(lambda inputs: start_without_accuracy(inputs, method))
 
 
 def carry_shapes(batch: Batch, method: str) -> Carry:

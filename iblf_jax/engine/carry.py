@@ -109,6 +109,12 @@ def start(inputs: Inputs, method: str, jacobian: jax.Array) -> Carry:
     )
 
 
+def start_without_accuracy(inputs: Inputs, method: str) -> Carry:
+    """As `start`, without a linearization: its estimate of the accuracy has no meaning."""
+    size = error_estimate.watched_indices(initial_state(inputs.scenario)).size
+    return start(inputs, method, jnp.zeros((size, size), inputs.dt.dtype))
+
+
 def _blank_sample(inputs: Inputs, state: LoopState) -> Sample:
     """A sample of zeros."""
     shapes = jax.eval_shape(evaluate, inputs.scenario, inputs.dt, state, inputs.dt)[1]

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.engine.batch import Batch, Leaves, StepLoop, run_step
-from iblf_jax.engine.carry import Carry, Inputs, StepOptions, start
+from iblf_jax.engine.carry import Carry, Inputs, StepOptions, start_without_accuracy
 from iblf_jax.engine.derivatives import (
     Directions,
     Tangents,
@@ -110,18 +110,11 @@ class TangentStep:
         return WithTangent(after, tangent), record
 
 
-def begun(inputs: Inputs, method: str) -> Carry:
-    """The carry before the first step, whose accuracy is not read: the run without derivatives
-    estimates it.
-    """
-    size = error_estimate.watched_indices(initial_state(inputs.scenario)).size
-    return start(inputs, method, jnp.zeros((size, size), inputs.dt.dtype))
-
-
 def _begun(inputs: Inputs, method: str, places: Places) -> Carry | WithTangent:
     """The carry before the first step, with its tangents."""
     if not places:
-        return begun(inputs, method)
+        # The accuracy is estimated by the run without tangents; this estimate is not read.
+        return start_without_accuracy(inputs, method)
 
     def of(eps):
         carry = _begun(_moved(inputs, places, eps), method, places[:-1])

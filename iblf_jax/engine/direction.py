@@ -55,21 +55,30 @@ class Runs(NamedTuple):
         return ExecutionPlan((self.backend,), PLAIN_LAYOUT, PLAIN_LAYOUT, False)
 
     def repeated(
-        self, size: int, leaves: Sequence[jax.Array], is_batched: Sequence[bool]
+        self, size: int, operands: Sequence[jax.Array], is_batched: Sequence[bool]
     ) -> tuple[Runs, list[jax.Array]]:
         """All runs for every entry of a batch axis.
 
         Args:
           size: entries of the axis.
-          leaves: of the runs, with this axis first where `is_batched`.
-          is_batched: which leaves have the axis.
+          operands: leaves, and after them arrays with a run axis; each with the batch axis first
+            where `is_batched`.
+          is_batched: which operands have the batch axis.
         """
+        others = len(operands) - len(self.is_per_run)
         wide = [
             with_more_runs(x, size, self.runs, is_new, is_per_run)
-            for x, is_new, is_per_run in zip(leaves, is_batched, self.is_per_run, strict=True)
+            for x, is_new, is_per_run in zip(
+                operands, is_batched, self.is_per_run + (True,) * others, strict=True
+            )
         ]
+        # The operands after the leaves are not leaves of the runs.
         is_per_run = tuple(map(bool.__or__, map(bool, is_batched), self.is_per_run))
         return self._replace(is_per_run=is_per_run, runs=size * self.runs), wide
+
+    def with_batch_axis(self, outputs: Sequence[jax.Array], size: int) -> list[jax.Array]:
+        """What `repeated` runs return, with the batch axis before the run axis."""
+        return [x.reshape(size, self.runs, *x.shape[1:]) for x in outputs]
 
 
 def with_more_runs(
@@ -211,7 +220,6 @@ def _batched_gradient(runs: Runs, places: tuple[int, ...], which: tuple[int, ...
     """The gradient by kernels as a function of leaves and cotangents, for one batch axis more where
     JAX batches it.
     """
-    count = len(runs.is_per_run)
 
     @custom_vmap
     def gradient(*operands: jax.Array) -> list[jax.Array]:
@@ -219,13 +227,8 @@ def _batched_gradient(runs: Runs, places: tuple[int, ...], which: tuple[int, ...
 
     @gradient.def_vmap
     def rule(size, is_batched, *operands):
-        more, wide = runs.repeated(size, operands[:count], is_batched[:count])
-        wide += [
-            with_more_runs(x, size, runs.runs, is_new, True)
-            for x, is_new in zip(operands[count:], is_batched[count:], strict=True)
-        ]
-        found = _batched_gradient(more, places, which)(*wide)
-        found = [x.reshape(size, runs.runs, *x.shape[1:]) for x in found]
+        more, wide = runs.repeated(size, operands, is_batched)
+        found = runs.with_batch_axis(_batched_gradient(more, places, which)(*wide), size)
         return found, [True] * len(found)
 
     return gradient
@@ -235,9 +238,8 @@ def _batched_gradient(runs: Runs, places: tuple[int, ...], which: tuple[int, ...
 def _gradient_by_kernel(
     runs: Runs, places: tuple[int, ...], which: tuple[int, ...], operands: Sequence[jax.Array]
 ) -> list[jax.Array]:
-    count = len(runs.is_per_run)
-    leaves, cotangents = operands[:count], operands[count:]
-    records, metrics = _shapes(runs, shapes_of(list(leaves)))
+    leaves, cotangents = _divided(runs, operands)
+    records, metrics = _shapes(runs, shapes_of(leaves))
     names = sorted(metrics)
     of_metrics: dict[str, jax.Array] = {}
     of_records: dict[int, jax.Array] = {}
@@ -258,12 +260,12 @@ def _gradient_by_kernel(
 
 def _abstract(*operands: Any, runs: Runs, places: tuple[int, ...]) -> list:
     leaves, _ = _divided(runs, operands)
-    shapes = _shapes(runs, shapes_of(list(leaves)))
+    shapes = _shapes(runs, shapes_of(leaves))
     return [jax.core.ShapedArray(x.shape, x.dtype) for x in jax.tree.leaves(shapes)]
 
 
 def _jvp(primals, tangents, *, runs, places):
-    leaves = primals[: len(runs.is_per_run)]
+    leaves, _ = _divided(runs, primals)
     of_leaves, of_moves = _divided(runs, tangents)
     value = _primitive.bind(*primals, runs=runs, places=places)
     instantiated = [ad.instantiate_zeros(x) for x in of_moves]
@@ -288,14 +290,9 @@ def _batch(operands, axes, *, runs, places):
         for x, axis, is_new in zip(operands, axes, is_batched, strict=True)
     ]
     size = next(len(x) for x, is_new in zip(first, is_batched, strict=True) if is_new)
-    leaves, moves = _divided(runs, first)
-    more, wide = runs.repeated(size, leaves, is_batched[: len(leaves)])
-    wide += [
-        with_more_runs(x, size, runs.runs, is_new, True)
-        for x, is_new in zip(moves, is_batched[len(leaves) :], strict=True)
-    ]
-    found = _primitive.bind(*wide, runs=more, places=places)
-    return [x.reshape(size, runs.runs, *x.shape[1:]) for x in found], [0] * len(found)
+    more, wide = runs.repeated(size, first, is_batched)
+    found = runs.with_batch_axis(_primitive.bind(*wide, runs=more, places=places), size)
+    return found, [0] * len(found)
 
 
 _primitive = Primitive("iblf_jax_derivative_of_runs")

@@ -40,7 +40,24 @@ class CompiledStep(NamedTuple):
     """Shapes and types of the records of one step of one run, a pytree."""
 
 
+@contextlib.contextmanager
+def _without_garbage_collection() -> Iterator[None]:
+    """Context manager, also a decorator, in which Python does not look for garbage.
+
+    A trace and a program are many small objects that stay.  Python looks through all of them again
+    and again, which takes a tenth of the time of a compilation.
+    """
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()
+
+
 @CACHES.function(maxsize=64)
+@_without_garbage_collection()
 def compile_step(
     step: Callable,
     dtype: np.dtype,
@@ -73,38 +90,6 @@ def compile_step(
       UnsupportedError: the step contains an operation that a scalar program cannot express, or
         exceeds a limit.
     """
-    with _without_garbage_collection():
-        return _compiled(step, dtype, shared, per_run, carry, limits, is_derivative, known, series)
-
-
-@contextlib.contextmanager
-def _without_garbage_collection() -> Iterator[None]:
-    """Context manager in which Python does not look for garbage.
-
-    A trace and a program are many small objects that stay.  Python looks through all of them again
-    and again, which takes a tenth of the time of a compilation.
-    """
-    was_enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if was_enabled:
-            gc.enable()
-
-
-def _compiled(
-    step: Callable,
-    dtype: np.dtype,
-    shared: Shapes,
-    per_run: Shapes,
-    carry: Shapes,
-    limits: LoweringLimits,
-    is_derivative: bool,
-    known: tuple[Known | None, ...],
-    series: Shapes,
-) -> CompiledStep:
-    """As `compile_step`."""
     index = jax.ShapeDtypeStruct((), jnp.int32)
     leaves = [shared.structs(), per_run.structs()]
     if series.items:
