@@ -8,10 +8,14 @@ missing or older than the source. Warnings of Sphinx and dead links (`links.py`)
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -49,6 +53,39 @@ def is_executed(notebook: Path) -> bool:
     ) == digest(notebook)
 
 
+def missing() -> list[Callable[[], object]]:
+    """The notebooks, scripts and examples of flags whose output is missing or older than they."""
+    import flags
+    import gallery
+
+    work = SITE / "work"
+    work.mkdir(parents=True, exist_ok=True)
+    return [
+        *(partial(execute, notebook, work) for notebook in NOTEBOOKS if not is_executed(notebook)),
+        *(partial(gallery.page, script) for script in gallery.PAGES if not gallery.is_made(script)),
+        *(partial(flags.section, name) for name in flags.CASES if not flags.is_made(name)),
+    ]
+
+
+def execute_missing() -> None:
+    """Executes them, each processor one at a time."""
+    tasks = missing()
+    if not tasks:
+        return
+    # JAX hangs in processes that are forked from one that has used it.
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(mp_context=context, initializer=enable_x64) as pool:
+        for done in [pool.submit(task) for task in tasks]:
+            done.result()
+
+
+def enable_x64() -> None:
+    """Scripts and examples are computed in float64."""
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+
+
 def assemble() -> None:
     """Puts all pages together."""
     import barriers
@@ -65,11 +102,7 @@ def assemble() -> None:
     shutil.copy(ROOT / "docs" / "conf.py", SOURCE)
 
     (SOURCE / "tutorials").mkdir()
-    work = SITE / "work"
-    work.mkdir(exist_ok=True)
     for notebook in NOTEBOOKS:
-        if not is_executed(notebook):
-            execute(notebook, work)
         shutil.copy(EXECUTED / notebook.name, SOURCE / "tutorials")
     listed = "\n".join(notebook.stem for notebook in NOTEBOOKS)
     words = "The notebooks of the repository with their output."
@@ -77,9 +110,6 @@ def assemble() -> None:
         f"# Tutorials\n\n{words}\n\n```{{toctree}}\n:maxdepth: 1\n\n{listed}\n```\n"
     )
 
-    for script in gallery.PAGES:
-        if not gallery.is_made(script):
-            gallery.page(script)
     shutil.copytree(gallery.MADE, SOURCE / "gallery")
     (SOURCE / "gallery" / "index.md").write_text(gallery.index())
 
@@ -100,10 +130,10 @@ def assemble() -> None:
 
 def main() -> int:
     """Assembles and builds; Sphinx's exit code."""
-    import jax
     import links
 
-    jax.config.update("jax_enable_x64", True)
+    execute_missing()
+    enable_x64()
     assemble()
     command = [
         sys.executable,

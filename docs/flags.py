@@ -324,6 +324,11 @@ def _kept(name: str) -> Path:
     return MADE / f"{name.lower()}.md"
 
 
+def is_made(name: str) -> bool:
+    """Whether the section of a flag, as this file has it now, is there."""
+    return gallery.is_of(_kept(name), Path(__file__))
+
+
 def write(folder: Path) -> None:
     """Write the page.
 
@@ -342,10 +347,7 @@ def write(folder: Path) -> None:
         ),
     ]
     lines += ["", "```python", "run.ok, ij.Status(int(run.status))", "```", ""]
-    lines += [
-        _kept(name).read_text() if gallery.is_of(_kept(name), Path(__file__)) else section(name)
-        for name in CASES
-    ]
+    lines += [_kept(name).read_text() if is_made(name) else section(name) for name in CASES]
     for picture in MADE.glob("*.png"):
         shutil.copy(picture, folder)
     (folder / "why_did_my_run_fail.md").write_text("\n".join(lines))

@@ -10,6 +10,7 @@ import runpy
 import shutil
 import signal
 import sys
+import zlib
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -119,6 +120,28 @@ def pytest_configure(config):
         jax.config.update("jax_numpy_dtype_promotion", "strict")
 
 
+def slow_part(test: str, parts: int) -> int:
+    """Which part of the slow tests a test belongs to, from 0; all cases of a test are in one part,
+    since they share what is compiled."""
+    return zlib.crc32(test.split("[")[0].encode()) % parts
+
+
+def pytest_collection_modifyitems(config, items):
+    """Leaves the slow tests out that are of another part than TEST_PART names: "2/8" is the third
+    of eight parts."""
+    if not (chosen := os.environ.get("TEST_PART")):
+        return
+    part, parts = (int(word) for word in chosen.split("/"))
+    other = [
+        item
+        for item in items
+        if item.get_closest_marker("slow") and slow_part(item.nodeid, parts) != part
+    ]
+    config.hook.pytest_deselected(items=other)
+    left_out = set(other)
+    items[:] = [item for item in items if item not in left_out]
+
+
 @pytest.fixture(autouse=True)
 def bounded_memory(memory):
     """Compiled programs of hundreds of tests would take 10 GB a process.
@@ -133,6 +156,14 @@ def bounded_memory(memory):
         gc.collect()
         ctypes.CDLL(None).malloc_trim(0)
         memory["most"] = max(MEMORY, resident() + MEMORY // 4)
+
+
+@pytest.fixture
+def optimised_kernels(monkeypatch) -> None:
+    """Kernels as users compile them, here and in processes that the test starts: what a page, a
+    notebook or a script of the gallery computes takes longer than its compilation."""
+    if compiler := os.environ["TESTER_CXX"]:
+        monkeypatch.setenv("CXX", compiler)
 
 
 @pytest.fixture(scope="session")

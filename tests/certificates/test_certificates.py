@@ -135,6 +135,7 @@ def test_inequality_is_an_equality_where_the_proof_leaves_nothing():
     assert abs(left) <= rounding("float64") * float(seen.dV_size) < 1e-11
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [x if x == "integral" else pytest.param(x, marks=pytest.mark.slow) for x in BARRIERS]
 )
@@ -348,6 +349,7 @@ def test_gains_below_the_conditions_are_named(corrected_run):
 LIGHT = {"controller.K2": [0.3, 0.1], "observer.kf": [0.4, 0.9], "controller.weight": [0.5, 0.05]}
 
 
+@pytest.mark.slow
 def test_a_law_with_weights_has_a_claim_below_the_conditions_of_theorem_2(corrected_run):
     """Its own lines fail, and say what is lost; those with weights hold, and bound xi, e2 and
     f_tilde."""
@@ -496,6 +498,7 @@ def test_decimated_run_is_judged_at_every_step(shaken, monkeypatch):
     assert_alike(certify(run.scenario, decimated(shaken, 501)), whole)
 
 
+@pytest.mark.slow
 def test_certificate_never_contradicts_the_status(corrected_run):
     run = pushed(corrected_run.scenario, 3000.0, 0.5)
     assert int(run.status) & int(ij.Status.BOUND_VIOLATED)
@@ -643,6 +646,7 @@ def test_one_arm_with_friction_or_a_load_is_case_2(changes):
 # --- no claim -------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["PDGravity", pytest.param("NoObserver", marks=pytest.mark.slow)])
 def test_no_claim_is_not_applicable(paper, name):
     law = ij.controllers.PDGravity(Kp=60.0, Kd=20.0) if name == "PDGravity" else paper.controller
@@ -718,6 +722,7 @@ def own(paper):
     return ij.with_parameters(scenario, {"plant.payload": 0.4})
 
 
+@pytest.mark.slow
 def test_a_law_that_states_its_own_claim_is_held_against_it(own):
     certificate = certify(own, **OWN)
     assert certificate.holds
@@ -947,6 +952,7 @@ def batch(corrected_run):
     return jax.tree.map(lambda *x: jnp.stack(x), *runs)
 
 
+@pytest.mark.slow
 def test_batch_reports_the_worst_run(corrected_run, batch, corrected_certificate):
     certificate = certify(corrected_run.scenario, batch)
     assert certificate.runs == (0, 1, 2)
@@ -977,6 +983,7 @@ class Study:
         return self.runs[index]
 
 
+@pytest.mark.slow
 def test_study_is_judged_at_its_worst_runs(corrected_run, batch):
     study = Study(batch)
     nearest = int(np.argmin(np.min(np.asarray(batch.metrics.xi_margin), axis=1)))
@@ -986,6 +993,7 @@ def test_study_is_judged_at_its_worst_runs(corrected_run, batch):
     assert certify(corrected_run.scenario, Study(batch), worst=None).runs == (0, 1, 2)
 
 
+@pytest.mark.slow
 def test_study_of_another_scenario_is_refused(corrected_run):
     scenario = corrected_run.scenario
     perturbed = {"plant.mass": ij.factor(ij.uniform(0.9, 1.1))}
@@ -1006,6 +1014,7 @@ def gap_certificate(reading):
     return certify(scenario, ij.simulate(scenario, **PAPER))
 
 
+@pytest.mark.slow
 def test_printed_breaks_its_claim_where_corrected_keeps_it():
     printed, corrected = (gap_certificate(reading) for reading in ("printed", "corrected"))
     for certificate in (printed, corrected):  # inside the paper's own conditions
@@ -1103,6 +1112,7 @@ def test_old_names_and_tuples_are_told_the_new_ones(paper, search, old):
 # --- what a user sees -----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_certificate_shows_itself(paper_certificate):
     text = repr(paper_certificate)
     assert text.startswith("Certificate: holds")
@@ -1125,6 +1135,7 @@ def test_certificate_shows_itself(paper_certificate):
         paper_certificate["envelopes"]
 
 
+@pytest.mark.slow
 def test_certificate_draws_itself(paper_certificate):
     figure = paper_certificate.plot(until=5.0)
     assert figure._repr_png_().startswith(b"\x89PNG")

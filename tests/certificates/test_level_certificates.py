@@ -107,6 +107,7 @@ def both_sides(scenario, seed):
     return left, right, terms
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("design", [pytest.param(x, marks=MARKS.get(x, RELEASE)) for x in DESIGNS])
 def test_both_sides_of_the_claim_are_equal(design):
     order, barrier = DESIGNS[design]
@@ -130,6 +131,7 @@ def test_both_sides_of_the_claim_are_equal(design):
     )
 
 
+@pytest.mark.slow
 def test_an_integral_barrier_gives_an_inequality():
     scenario = random_scenario(2, (ij.barriers.Integral(), MAPPING), seed=5)
     left, right, _ = both_sides(scenario, 5)
@@ -220,6 +222,7 @@ def undisturbed():
     return certify(pendulum(), duration=2.0, dt=2e-3)
 
 
+@pytest.mark.slow
 def test_without_disturbance_V_decays_at_its_rate(undisturbed):
     assert undisturbed.holds
     assert undisturbed.numbers["rho"] == 4.0
@@ -238,6 +241,7 @@ def test_without_disturbance_V_decays_at_its_rate(undisturbed):
     assert "of the claim (S.3) does not apply" in text
 
 
+@pytest.mark.slow
 def test_a_disturbed_run_has_the_true_terms():
     scenario = pendulum(disturbance=DISTURBANCES)
     run = ij.simulate(scenario, duration=2.0, dt=2e-3)
@@ -253,6 +257,7 @@ def test_a_disturbed_run_has_the_true_terms():
     assert certificate["envelope"].verdict == "holds"
 
 
+@pytest.mark.slow
 def test_an_observer_states_kappa_and_a_wrong_one_fails():
     observer = ij.observers.LevelObserver(gain=(20.0, 20.0, 20.0))
     certificate = certify(pendulum(disturbance=DISTURBANCES, observer=observer), duration=1.0)
@@ -304,6 +309,7 @@ class WithWrongFeedback(WithoutExchange):
         return 2.0 * self.c[-1] * levels[-1].slope / self.weights[-1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", [WithoutExchange, WithWrongFeedback])
 def test_a_wrong_law_fails(law):
     certificate = certify(pendulum(law(**GAINS)), duration=0.5, dt=2e-3)
@@ -313,6 +319,7 @@ def test_a_wrong_law_fails(law):
     assert certificate.verdict == "fails"
 
 
+@pytest.mark.slow
 def test_a_dynamic_surface_claims_ultimate_boundedness():
     law = ij.controllers.BarrierBackstepping(filter=0.01, **GAINS)
     certificate = certify(pendulum(law, disturbance=DISTURBANCES), duration=1.0)
@@ -376,6 +383,7 @@ def double_integrator(law, **parts):
     return ij.Scenario(**(chosen | parts))
 
 
+@pytest.mark.slow
 def test_a_users_law_on_levels_states_its_own_claim():
     certificate = certify(double_integrator(WithClaim()), duration=1.0, dt=5e-3)
     assert certificate.holds
@@ -386,6 +394,7 @@ def test_a_users_law_on_levels_states_its_own_claim():
     assert wrong["inequality, own V"].verdict == "fails"
 
 
+@pytest.mark.slow
 def test_a_law_without_a_claim_is_not_applicable():
     certificate = certify(double_integrator(TwoLevels()), duration=0.5, dt=5e-3)
     assert certificate.verdict == "not applicable"
@@ -427,6 +436,7 @@ def check_torque_observer(plant, order):
     assert certificate[f"e, level {order}"].margin > 0
 
 
+@pytest.mark.slow
 def test_a_robot_is_certified_with_its_observer():
     check_torque_observer(LINK, 2)
 
@@ -439,6 +449,7 @@ def test_a_robot_with_drives_is_certified_with_the_observer_of_the_robot():
     check_torque_observer(drive, 3)
 
 
+@pytest.mark.slow
 def test_levels_of_a_robot_are_observed():
     rates = ij.disturbances.Levels((ij.disturbances.Sinusoids(0.1, 2.0),))
     observer = ij.observers.LevelObserver(gain=20.0)
@@ -450,6 +461,7 @@ def test_levels_of_a_robot_are_observed():
     assert certificate["equality"].verdict == "holds"
 
 
+@pytest.mark.slow
 def test_a_disturbance_of_q_has_no_torque_observer():
     rates = ij.disturbances.Levels((ij.disturbances.Sinusoids(0.1, 2.0),))
     certificate = certify(robot_scenario(LINK, 2, disturbance=rates), duration=0.3)
@@ -474,6 +486,7 @@ def test_the_flexible_two_link_arm_is_certified():
     assert certificate.levels[2].name == "motor position"
 
 
+@pytest.mark.slow
 def test_the_rigid_law_on_a_flexible_arm_has_the_flexibility_in_f():
     flexible = ij.plants.FlexibleJoint(LINK, stiffness=300.0, motor_inertia=0.01)
     law = ij.controllers.Backstepping(k1=2.0, K2=5.0, barrier=ij.barriers.Integral())
@@ -503,6 +516,7 @@ def test_many_runs_name_the_worst():
     certificate.plot()
 
 
+@pytest.mark.slow
 def test_limits_of_the_input_and_the_guard_are_excluded():
     law = ij.controllers.BarrierBackstepping(**GAINS)
     limited = pendulum(ij.controllers.Saturated(law, limit=5.0))
@@ -516,6 +530,7 @@ def test_limits_of_the_input_and_the_guard_are_excluded():
     assert certificate.verdict == "not applicable"
 
 
+@pytest.mark.slow
 def test_alpha_outside_the_bounds_of_its_level_fails():
     law = ij.controllers.BarrierBackstepping(k=(2.0, 5.0), barriers=(MAPPING, MAPPING))
     scenario = double_integrator(

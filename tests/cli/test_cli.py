@@ -83,6 +83,7 @@ def test_reproduce(command, tmp_path):
     assert data["integral BLF"].sizes["time"] == 20_001
 
 
+@pytest.mark.slow
 def test_reproduce_states_that_the_arm_is_assumed(command, tmp_path, monkeypatch, short_run):
     made = {"integral BLF": short_run, "log-BLF": short_run}, {"first": 1.0, "again": 0.5}
     monkeypatch.setattr("iblf_jax.cli.reproduce._simulate_both", lambda args: made)
@@ -123,6 +124,7 @@ def test_claims_can_fail(paper, short_run):
 # ----------------------------------------------------------------------------------------- simulate
 
 
+@pytest.mark.slow
 def test_simulate_a_file(command, paper, tmp_path):
     ij.save_scenario(paper, tmp_path / "mine.toml", run={"duration": 0.05, "method": "heun"})
     code, out, err = command(
@@ -155,6 +157,7 @@ def test_simulate_a_file(command, paper, tmp_path):
     np.testing.assert_array_equal(ij.load_rollouts(tmp_path / "out" / "rollout.nc")["run"].q, run.q)
 
 
+@pytest.mark.slow
 def test_a_seed_fixes_the_noise(command, paper, tmp_path):
     noisy = ij.with_parts(
         paper,
@@ -170,6 +173,7 @@ def test_a_seed_fixes_the_noise(command, paper, tmp_path):
     assert a["metrics"]["rmse"] != c["metrics"]["rmse"]
 
 
+@pytest.mark.slow
 def test_simulate_a_preset(command):
     code, out, _ = command(
         "simulate",

@@ -96,6 +96,7 @@ def test_vector_field_of_a_chain_at_random_states(rng):
 # --- trajectories ---------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_fault_between_two_instants_against_scipy():
     time = 0.0503
     scenario = with_actuator(ij.actuators.Fault(RHO, BIAS, time))
@@ -121,6 +122,7 @@ def test_fault_between_two_instants_against_scipy():
     np.testing.assert_allclose(run.disturbance_estimate[-1], expected["f_hat"], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_dead_zone_and_play_against_scipy():
     parts = ij.actuators.DeadZone(LOWER, UPPER, SLOPE), ij.actuators.Backlash(GAP, BANDWIDTH)
     run = ij.simulate(with_actuator(*parts), duration=DURATION, dt=2e-5, record_every=5000)
@@ -139,6 +141,7 @@ def test_dead_zone_and_play_against_scipy():
     assert np.any(held) and not np.all(held)
 
 
+@pytest.mark.slow
 def test_levels_in_a_sampled_loop_against_scipy():
     step, period, samples = np.array([0.5, 0.2]), 5e-3, 20
     law = ij.controllers.PDGravity(Kp=20.0, Kd=2.0)
@@ -203,6 +206,7 @@ def command(pieces, t):
     return LOOP.evaluate(t, at(t))[1]["tau"]
 
 
+@pytest.mark.slow
 def test_delay_of_whole_steps_has_the_order_of_the_integrator():
     expected = delayed_end(4e-3)
 
@@ -228,6 +232,7 @@ def test_delay_of_other_lengths_is_of_second_order():
     assert errors[0] / errors[1] > 3.0
 
 
+@pytest.mark.slow
 def test_delay_and_fault_against_scipy():
     scenario = with_actuator(ij.actuators.Delay(4e-3), ij.actuators.Fault(RHO, BIAS, 0.05))
     run = ij.simulate(scenario, duration=DURATION, dt=5e-4)
@@ -239,6 +244,7 @@ def test_delay_and_fault_against_scipy():
     np.testing.assert_allclose(run.tau[0], LOOP.arm(np.array(LOOP.q0))[2], atol=1e-14)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("product", [0.9, 1.1])
 def test_growth_under_a_delay_is_that_of_the_characteristic_root(product):
     """M v' = -Kd v(t - h) has v ~ exp(s t), s = W(-k h)/h with k = Kd/M; stable for k h < pi/2."""
@@ -263,6 +269,7 @@ def test_growth_under_a_delay_is_that_of_the_characteristic_root(product):
     assert (found < 0) == (product < 1.0)
 
 
+@pytest.mark.slow
 def test_derivative_by_the_delay_and_by_the_time_of_a_fault():
     def end(values):
         scenario = with_actuator(
@@ -285,6 +292,7 @@ def test_derivative_by_the_delay_and_by_the_time_of_a_fault():
     np.testing.assert_allclose(slopes[:, 0], by_delay, rtol=2e-2)
 
 
+@pytest.mark.slow
 def test_derivative_by_a_delay_of_one_step():
     """The first command arrives at the end of the step in which the law computed it."""
 
@@ -309,6 +317,7 @@ def test_a_long_run_in_float32_has_the_delay_of_a_short_one():
 # --- studies --------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_monte_carlo_over_delays_repeats_single_runs():
     scenario = with_actuator(ij.actuators.Delay(3e-3, history=6))
     study = ij.monte_carlo(
@@ -341,6 +350,7 @@ def test_delays_beyond_the_history_or_below_a_step_are_flagged(delays):
     assert np.all(np.asarray(study.status) & int(Status.NOT_FINITE))
 
 
+@pytest.mark.slow
 def test_falsify_finds_a_loss_of_effectiveness_that_leaves_the_bounds():
     scenario = with_actuator(ij.actuators.Fault(effectiveness=1.0, time=0.1))
     attack = ij.falsify(
@@ -421,6 +431,7 @@ def test_refusals_name_the_field_and_the_remedy(call, words):
         call()
 
 
+@pytest.mark.slow
 def test_certificate_of_a_delayed_run_claims_nothing(tmp_path):
     scenario = with_actuator(ij.actuators.Delay(2e-3))
     ij.save_scenario(scenario, tmp_path / "delayed.toml")

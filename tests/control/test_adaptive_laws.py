@@ -157,6 +157,7 @@ def flat(state, i=None):
     return np.concatenate([np.ravel(x) for x in taken])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_the_vector_field_is_that_of_an_independent_program(name, rng):
     scenario, program, paths = CASES[name]
@@ -210,6 +211,7 @@ def own_terms_of_chain(scenario, t, state):
     return level_terms_at(scenario, t, state).own
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scenario", "paths", "own_terms"),
     [
@@ -245,6 +247,7 @@ def test_the_rate_of_the_lyapunov_function_is_what_is_claimed(scenario, paths, o
 # ------------------------------------------------------------------------- limits of the rates
 
 
+@pytest.mark.slow
 def test_without_an_error_the_law_is_the_wrapped_one_and_nothing_adapts():
     scenario = ARM
     law, context, q = scenario.controller, scenario.context, scenario.initial.q
@@ -443,6 +446,7 @@ def test_a_certificate_checks_the_claim_with_the_parameters_of_the_plant():
     assert "AdaptiveParameters changes it" in theorem.note
 
 
+@pytest.mark.slow
 def test_a_figure_shows_the_parameters_with_their_names_and_units():
     loaded = ij.with_parameters(ARM, {"plant.payload": 0.4})
     law = controllers.Saturated(loaded.controller, limit=15.0, auxiliary=5.0)

@@ -102,6 +102,7 @@ def random_points(case, rng, count):
         yield t, x, aux
 
 
+@pytest.mark.slow
 def test_the_input_of_a_chain_is_that_of_the_independent_program(coupled, rng):
     case = chains.CASES["coupled"]
     field = jax.jit(evaluate)
@@ -130,6 +131,7 @@ def _arrays(state):
 # --- the Lyapunov rate ----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_rate_of_V2_of_an_arm(rng):
     """(A.3), with equality for a barrier that decays exactly, while the torque is limited."""
     law = controllers.Backstepping(
@@ -154,6 +156,7 @@ def test_the_rate_of_V2_of_an_arm(rng):
         np.testing.assert_allclose(proof.auxiliary.growth, slope @ aux, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_rate_of_V_of_a_chain_with_bounds_of_every_level(coupled, rng):
     terms = jax.jit(level_terms_at)
     case = chains.CASES["coupled"]
@@ -166,6 +169,7 @@ def test_the_rate_of_V_of_a_chain_with_bounds_of_every_level(coupled, rng):
         np.testing.assert_allclose(left, 0.0, atol=1e-12 * claim.size)
 
 
+@pytest.mark.slow
 def test_a_certificate_covers_the_limited_torque():
     scenario = ij.with_parts(LIMITED, observer=ij.observers.Momentum(kf=20.0))
     run = ij.simulate(scenario, duration=1.5, dt=1e-3)
@@ -234,6 +238,7 @@ def test_the_command_of_a_network_with_an_auxiliary_state_needs_no_model(name):
     np.testing.assert_array_equal(commands[0].input_slope, dq - commands[0].alpha)
 
 
+@pytest.mark.slow
 def test_the_rate_that_gives_the_limit_alone():
     """One joint without Coriolis torques: for k M0 = K2 the torque is that of the limit alone,
     and a large k does not tend to it."""

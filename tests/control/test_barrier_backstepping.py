@@ -43,6 +43,7 @@ def test_input_and_virtual_controls_at_random_states(name):
             np.testing.assert_allclose(alphas, points["alpha"][i][:-1], rtol=1e-10, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_torque_estimate_is_held_and_not_the_acceleration_that_it_causes():
     """The estimate of a robot's observer is f_hat; d_hat_2 = M^-1(q) f_hat moves with q."""
     scenario = chain_cases.scenario("flexible")
@@ -84,6 +85,7 @@ PAIRS = {
 QUICK_PAIR = "mapping and prescribed performance"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "pair", [x if x == QUICK_PAIR else pytest.param(x, marks=pytest.mark.slow) for x in PAIRS]
 )
@@ -187,12 +189,14 @@ ALLOWED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ALLOWED)
 def test_allowed(what):
     run = ij.simulate(third_order(controller=ALLOWED[what]), duration=0.3, dt=1e-3)
     assert run.ok, run
 
 
+@pytest.mark.slow
 def test_a_symmetric_tube_needs_no_smooth_barrier():
     """Integral has no kink where both sides are at the same distance."""
     tube = ij.Bounds(lower=bounds.Funnel(-0.6, -0.6, 0.0), upper=bounds.Funnel(0.6, 0.6, 0.0))
@@ -208,6 +212,7 @@ def test_a_symmetric_tube_needs_no_smooth_barrier():
     assert run.ok, run
 
 
+@pytest.mark.slow
 def test_a_gain_that_becomes_singular_is_flagged():
     """The gain of the last level, cos(t), is zero at t = pi/2."""
 
@@ -221,6 +226,7 @@ def test_a_gain_that_becomes_singular_is_flagged():
     assert int(run.status) & ij.Status.SINGULAR_GAIN
 
 
+@pytest.mark.slow
 def test_a_virtual_control_outside_the_bounds_of_its_level_is_flagged():
     narrow = ij.Bounds(lower=bounds.Constant(-0.3), upper=bounds.Constant(0.3))
     wide = ij.Bounds(lower=bounds.Constant(-50.0), upper=bounds.Constant(50.0))
@@ -232,6 +238,7 @@ def test_a_virtual_control_outside_the_bounds_of_its_level_is_flagged():
     assert int(run.status) & ij.Status.ALPHA_INFEASIBLE
 
 
+@pytest.mark.slow
 def test_the_input_jumps_where_the_last_error_is_zero():
     """The error contains the estimates of the observer, as the command does."""
     scenario = third_order(

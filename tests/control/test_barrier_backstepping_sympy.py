@@ -15,6 +15,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 import sympy as sp
 
 import iblf_jax as ij
@@ -135,6 +136,7 @@ def scenario():
     )
 
 
+@pytest.mark.slow
 def test_a_derivation_by_sympy_gives_the_same_input():
     case, rng = scenario(), np.random.default_rng(3)
     command = jax.jit(lambda t, x: case.controller.command(t, x, 0.0 * x, case.context, ())[0])

@@ -49,6 +49,7 @@ xi_of = compiled(lambda tube, q: tube.xi(q))
 kappa_of = compiled(bound_motion_gain)
 
 
+@pytest.mark.slow
 @given(xi=INSIDE, k_l=WIDTH, k_u=WIDTH)
 def test_integral_barrier_is_the_integral(xi, k_l, k_u):
     """(2.6): V1 = int_0^xi 2 s / (1 - s^2) ds, by quadrature."""

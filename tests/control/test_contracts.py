@@ -47,6 +47,7 @@ def test_member_fits_its_contract(check, member):
     check(member)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LONG)
 def test_a_long_robot_has_the_shapes_and_the_physics_of_its_contract(name, rng):
     robot, findings = ROBOTS[name], Findings(ROBOTS[name], "Robot")

@@ -83,6 +83,7 @@ def test_torque_of_an_arm_at_random_states(name, rng):
         np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12 * max(abs(expected)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [x if x == "mixed" else pytest.param(x, marks=pytest.mark.release) for x in PAIRS]
 )
@@ -121,6 +122,7 @@ def commanded(scenario, t, x, d_hat, beta, filtered):
     return scenario.controller.command(t, x, d_hat, scenario.context, state)[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CHAINS)
 def test_input_of_a_chain_at_random_states(name):
     case, scenario = chain_with(name, CHAINS[name])
@@ -164,6 +166,7 @@ def free_pendulum(levels):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "levels",
     [PRESCRIBED_CHAIN, pytest.param((FINITE, FIXED, FINITE), marks=pytest.mark.release)],
@@ -181,6 +184,7 @@ def test_trajectory_of_order_three_and_its_settling_time(levels):
     assert certificate.holds
 
 
+@pytest.mark.slow
 def test_settling_time_of_an_arm_and_the_case_in_which_it_is_broken():
     scenario = arm_scenario(PAIRS["fixed"])
     certificate = ij.certify(scenario, duration=0.6, dt=1e-3)
@@ -213,6 +217,7 @@ def test_settling_time_of_a_law_with_bounds_on_velocities():
     assert certificate["settling time"].verdict == "holds"
 
 
+@pytest.mark.slow
 def test_the_least_decay_of_a_sum_is_that_of_the_worst_distribution(rng):
     """D(t, E) against random distributions of E over the parts, and against their best."""
     law = canonical(arm_scenario(PAIRS["fixed"])).controller
@@ -322,6 +327,7 @@ def test_v_decays_at_the_rate_of_the_gain_of_the_instant(barrier, rng):
 # --- in the package -------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_law_with_exponential_decays_is_the_law_without():
     plain = arm_scenario(())
     constant = ij.with_parts(
@@ -340,6 +346,7 @@ def test_operations_are_at_most_half_more_than_those_of_the_law(name):
     assert operations(PAIRS[name]) < 1.5 * operations(())
 
 
+@pytest.mark.slow
 def test_files_units_batches_and_gradients(tmp_path):
     scenario = arm_scenario(PAIRS["mixed"])
     ij.save_scenario(scenario, tmp_path / "arm.toml")
@@ -366,6 +373,7 @@ def test_files_units_batches_and_gradients(tmp_path):
     np.testing.assert_allclose(slope, difference, rtol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the simulated run")
 def test_the_c_of_a_law_with_decays_gives_the_torques_of_simulate(tmp_path, monkeypatch):
     monkeypatch.setattr("iblf_jax.deployment.export.VECTORS_DURATION", 0.2)
@@ -375,6 +383,7 @@ def test_the_c_of_a_law_with_decays_gives_the_torques_of_simulate(tmp_path, monk
     subprocess.run(["./selftest"], cwd=tmp_path, check=True)
 
 
+@pytest.mark.slow
 def test_units_of_the_levels_of_a_plant():
     law = controllers.BarrierBackstepping(
         k=(2.0, 20.0, 60.0),
@@ -450,6 +459,7 @@ def test_ranges_of_the_powers_end_at_one():
     assert "power" in lows.reason
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "decay",
     [decays.FiniteTime(k_a=1.0), decays.PrescribedTime(T=1.0, gain=3.0, cap=40.0)],

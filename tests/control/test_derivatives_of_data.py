@@ -58,6 +58,7 @@ def test_a_reference_with_too_few_derivatives_is_refused(reference, has):
         ij.simulate(with_reference(reference), **SHORT)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "reference",
     [
@@ -73,6 +74,7 @@ def test_a_reference_with_enough_derivatives_gives_a_continuous_input(reference)
     assert jumps.max() < 0.1  # of 4 V
 
 
+@pytest.mark.slow
 def test_a_dynamic_surface_takes_any_reference():
     chain = ij.plants.StrictFeedback(
         drift=lambda t, x: -x, gain=lambda t, x: jnp.ones_like(x), n=1, order=3
@@ -104,11 +106,13 @@ def test_bounds_with_too_few_derivatives_are_refused(level, name, needed):
         ij.simulate(with_bounds(level, barriers), **SHORT)
 
 
+@pytest.mark.slow
 def test_bounds_of_the_last_level_need_one_derivative():
     scenario = with_bounds(3, (Mapping(), Quadratic(), Mapping()))
     assert int(ij.simulate(scenario, **SHORT).status) == 0
 
 
+@pytest.mark.slow
 def test_bounds_of_a_level_without_a_barrier_need_none():
     scenario = with_bounds(2, (Mapping(), Quadratic(), Quadratic()))
     assert int(ij.simulate(scenario, **SHORT).status) == 0

@@ -40,6 +40,7 @@ class FilteredLoop(Loop):
         return np.concatenate([v, np.linalg.solve(M, tau + f - C(v) @ v - G), deta, dbeta])
 
 
+@pytest.mark.slow
 def test_the_run_is_that_of_an_independent_program_at_random_gains_and_bounds(rng):
     for _ in range(2):
         draws = {
@@ -83,6 +84,7 @@ def test_the_run_is_that_of_an_independent_program_at_random_gains_and_bounds(rn
         np.testing.assert_allclose(run.alpha, found.y[6:].T, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_it_tends_to_the_backstepping_law_at_the_first_order_of_its_filter():
     paper = ij.presets.zhang_yan_2024(reading="corrected")
     exact = ij.simulate(paper, duration=2.0, dt=1e-4, record_every=100)
@@ -111,6 +113,7 @@ def test_it_costs_less_than_what_differentiates():
     assert counts[1] < counts[0]
 
 
+@pytest.mark.slow
 def test_it_starts_on_alpha_and_is_sampled_too():
     scenario = ij.presets.zhang_yan_2024(law="dynamic_surface")
     run = ij.simulate(scenario, duration=0.1, dt=1e-3)
@@ -128,6 +131,7 @@ def test_it_starts_on_alpha_and_is_sampled_too():
     np.testing.assert_allclose(held.q, continuous.q, atol=2e-3)
 
 
+@pytest.mark.slow
 def test_theorem_2_claims_nothing_of_it():
     certificate = ij.certify(
         ij.presets.zhang_yan_2024(law="dynamic_surface"), duration=0.1, dt=1e-3
@@ -137,6 +141,7 @@ def test_theorem_2_claims_nothing_of_it():
     } == {"not applicable"}
 
 
+@pytest.mark.slow
 def test_a_gradient_by_the_filter_is_the_difference():
     def loss(mu):
         scenario = ij.with_parameters(

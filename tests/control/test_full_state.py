@@ -147,6 +147,7 @@ def random_states(scenario, count=64, seed=0):
     return jnp.asarray(t[keep]), jax.tree.map(lambda x: x[keep], states)
 
 
+@pytest.mark.slow
 def test_the_torque_is_the_independent_one_at_random_gains_bounds_and_states(rng):
     for _ in range(5):
         loop = FullLoop.random(rng)
@@ -204,6 +205,7 @@ def test_the_run_is_that_of_an_independent_program():
 FAMILY = {name: cls() for name, cls in barriers.MEMBERS.items()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("second", [name for name in FAMILY if name != "quadratic"])
 @pytest.mark.parametrize("first", ["integral", "tan"])
 def test_any_two_barriers_keep_their_inequality_at_every_state(first, second):
@@ -224,6 +226,7 @@ def test_any_two_barriers_keep_their_inequality_at_every_state(first, second):
     assert np.median(allowed / np.abs(proof.dV)) < 1e-10  # small beside what it judges
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("first", "second"), [("integral", "integral"), ("tan", "mapping")])
 def test_weights_of_the_first_barrier_keep_the_inequality_at_every_state(first, second):
     """(F.2) with V1 = sum w_i V1_i."""
@@ -248,6 +251,7 @@ def test_weights_of_the_first_barrier_keep_the_inequality_at_every_state(first, 
     np.testing.assert_allclose(proof.V, expected, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_without_its_own_terms_the_inequality_breaks():
     """What the test above would see of a law without its cross term, or of a smaller rate."""
     law = controllers.FullState(k1=2.0, K2=20.0, c=1.0)
@@ -270,6 +274,7 @@ class _WithoutCrossTerm(controllers.FullState):
         return command._replace(tau=command.tau + context.model.mass_matrix(q) @ crossed), rate
 
 
+@pytest.mark.slow
 def test_symmetric_bounds_and_logarithms_are_the_published_barriers():
     """V = 1/2 sum ln(k^2/(k^2 - z^2)) with slope z/(k^2 - z^2) on both errors; He, Chen, Yin
     2016."""
@@ -314,6 +319,7 @@ def certificate():
     return ij.certify(ij.presets.zhang_yan_2024_full_state(), duration=3.0, dt=5e-4)
 
 
+@pytest.mark.slow
 def test_the_certificate_holds_line_by_line(certificate):
     lines = {line.name: line for line in certificate.lines}
     assert certificate.verdict == "holds"
@@ -400,6 +406,7 @@ def test_no_velocity_bound_is_violated_from_random_feasible_starts(starts):
     assert np.min(np.asarray(study.metrics["velocity_margin"])[feasible]) > 0
 
 
+@pytest.mark.slow
 def test_a_gradient_is_the_difference():
     smooth = controllers.FullState(
         k1=2.0, K2=20.0, c=8.0, o=0.1, velocity_barrier=barriers.Mapping()
@@ -538,6 +545,7 @@ def outcome_by(duration, dt, factor=2.0, backend="auto"):
     return outcome
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [2.0, pytest.param(1.0, marks=pytest.mark.slow)])
 def test_derivatives_across_the_jumps_are_those_of_runs_in_pieces(factor):
     assert (
@@ -599,12 +607,14 @@ def test_every_mode_and_executor_has_the_same_derivative_across_the_jumps():
     np.testing.assert_allclose(reverse, native, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_derivative_of_the_torque_s_square_contains_its_jump():
     true = slopes_in_pieces(0.12)[1]
     found = jax.jacfwd(outcome_by(0.12, 1e-4))(jnp.array([*GAINS.values()]))[1]
     np.testing.assert_allclose(found, true, rtol=0.05)
 
 
+@pytest.mark.slow
 def test_where_e2_slides_along_0_derivatives_are_those_of_the_sliding_motion():
     assert pieces(0.25, kf=20.0).passed == [(0, True), (1, None), (1, True)]
     true = slopes_in_pieces(0.25, kf=20.0)
@@ -671,6 +681,7 @@ def test_it_needs_bounds_to_keep():
         )
 
 
+@pytest.mark.slow
 def test_it_stands_beside_other_laws_with_the_margin_of_the_velocities():
     scenario = ij.presets.zhang_yan_2024_full_state()
     plain = controllers.Backstepping(k1=2.0, K2=20.0, o=0.1, reading="corrected")

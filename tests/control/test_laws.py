@@ -229,6 +229,7 @@ def test_centres_fill_the_box(nodes, dimensions):
 # ------------------------------------------------------------------------------------ saturation
 
 
+@pytest.mark.slow
 def test_under_the_preset_limit_bounds_tracking_and_estimate_still_hold(saturated_runs):
     run, free = saturated_runs["preset"], saturated_runs["free"]
     limit = run.scenario.controller.limit
@@ -270,6 +271,7 @@ def inequality_excess(run):
     return jax.jit(jax.vmap(at))(run.t, states)
 
 
+@pytest.mark.slow
 def test_the_inequality_of_theorem_2_fails_only_while_the_torque_is_cut(saturated_runs):
     run = saturated_runs["preset"]
     assert float(jnp.max(inequality_excess(saturated_runs["free"]))) < 1e-9
@@ -644,6 +646,7 @@ def test_a_weight_of_one_costs_no_operation_and_another_one_a_joint():
     assert 0 < products[1] - products[0] <= 2 * 8
 
 
+@pytest.mark.slow
 def test_a_run_of_other_weights_is_the_same_in_a_batch():
     paper = ij.presets.zhang_yan_2024()
     varied = {"controller.weight": ij.factor(ij.uniform(0.2, 3.0))}
@@ -656,6 +659,7 @@ def test_a_run_of_other_weights_is_the_same_in_a_batch():
     assert np.max(np.abs(single.q - ij.simulate(paper, duration=0.1, dt=1e-3).q)) > 1e-5
 
 
+@pytest.mark.slow
 def test_the_derivative_by_the_weight_is_that_of_differences_also_at_one():
     paper = ij.presets.zhang_yan_2024()
 
@@ -669,6 +673,7 @@ def test_the_derivative_by_the_weight_is_that_of_differences_also_at_one():
         np.testing.assert_allclose(jax.grad(margin)(w), difference, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_weights_are_tuned():
     goal = ij.objectives.tracking() + 0.1 * ij.objectives.effort()
     found = ij.tune(

@@ -67,6 +67,7 @@ def random_state(scenario, rng):
     return LoopState(x[0], x[1], state.controller, memory, higher=higher)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [2, 3, 4])
 def test_each_level_of_a_level_observer_obeys_its_equation(order, rng):
     """d_hat_j' = kappa_j d_tilde_j, with the true d along the run: then d_tilde_j' = d_j' - kappa_j
@@ -79,6 +80,7 @@ def test_each_level_of_a_level_observer_obeys_its_equation(order, rng):
         assert np.max(np.abs(d[1])) > 1e-2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [3, 4])
 @pytest.mark.parametrize(
     "observer",
@@ -172,6 +174,7 @@ def test_a_period_of_a_level_observer_is_exact():
     np.testing.assert_allclose(step + shift, after, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_law_of_robots_receives_the_torque():
     """M0 d_hat_2 of a LevelObserver is the f_hat of a Momentum observer in the continuous loop,
     where M is constant only; here the loops agree in their estimates of a slow disturbance."""

@@ -62,6 +62,7 @@ def independent_rate(name, governor, goal, x):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(LAWS))
 def test_the_run_is_that_of_an_independent_program(name):
     governor = controllers.ReferenceGovernor(law=LAWS[name])
@@ -81,6 +82,7 @@ def test_the_run_is_that_of_an_independent_program(name):
     np.testing.assert_allclose(run.controller_state.g, found.y[4:].T, atol=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(LAWS))
 def test_it_keeps_what_the_law_alone_breaks_from_random_starts(name):
     governor = controllers.ReferenceGovernor(law=LAWS[name])
@@ -122,6 +124,7 @@ def test_V_stays_below_Gamma():
     assert float(jnp.max(jnp.abs(run.e1[-1]))) < 0.02  # and it gets there
 
 
+@pytest.mark.slow
 def test_it_lags_behind_a_reference_that_moves():
     paper = ij.presets.zhang_yan_2024(law="computed_torque", reading="corrected")
     governed = ij.with_parts(paper, controller=controllers.ReferenceGovernor(law=paper.controller))
@@ -130,6 +133,7 @@ def test_it_lags_behind_a_reference_that_moves():
     assert late[1] > 10 * late[0]
 
 
+@pytest.mark.slow
 def test_files_paths_and_gradients(tmp_path):
     scenario = scenario_of(controllers.ReferenceGovernor(law=LAWS["pd"]))
     ij.save_scenario(scenario, tmp_path / "s.toml")
@@ -151,6 +155,7 @@ def test_files_paths_and_gradients(tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_its_speed_is_tuned():
     scenario = scenario_of(controllers.ReferenceGovernor(law=LAWS["pd"], eta=2.0))
     result = ij.tune(

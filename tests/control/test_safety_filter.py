@@ -69,6 +69,7 @@ def alone():
         return ij.simulate(falling(), **RUN)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [
@@ -160,6 +161,7 @@ def test_the_torque_is_the_nearest_by_a_general_solver(options, rng):
     assert lost < 5 + np.sum(np.max(slack, axis=1) > 0)
 
 
+@pytest.mark.slow
 def test_the_law_is_passed_on_where_it_is_safe():
     scenario = filtered(falling())
     tau, bare, slack = commands(
@@ -169,6 +171,7 @@ def test_the_law_is_passed_on_where_it_is_safe():
     np.testing.assert_array_equal(slack, 0.0)
 
 
+@pytest.mark.slow
 def test_velocity_bounds_are_kept_too():
     speeds = bounds.Bounds(lower=bounds.Constant(-0.8), upper=bounds.Sinusoid(0.6, 0.05, 2.0))
     scenario = falling(velocity_bounds=speeds)
@@ -182,6 +185,7 @@ def test_velocity_bounds_are_kept_too():
     assert float(jnp.min(run.metrics.velocity_margin)) > 0
 
 
+@pytest.mark.slow
 def test_an_empty_box_is_flagged_with_its_slack():
     narrow = bounds.Bounds(lower=bounds.Constant(-0.5), upper=bounds.Constant(0.5))
     scenario = filtered(
@@ -227,6 +231,7 @@ def test_backends_agree_and_a_run_alone_is_that_of_a_batch():
     np.testing.assert_array_equal(again.metrics.ise, native.metrics["ise"][again_at])
 
 
+@pytest.mark.slow
 def test_a_study_tells_the_largest_slack():
     narrow = bounds.Bounds(lower=bounds.Constant(-0.5), upper=bounds.Constant(0.5))
     scenario = filtered(
@@ -248,6 +253,7 @@ def test_a_study_tells_the_largest_slack():
         ij.simulate(falling(), **RUN, metrics=(ij.metrics.Slack(),))
 
 
+@pytest.mark.slow
 def test_it_is_sampled_and_saved(tmp_path):
     scenario = ij.with_parts(
         filtered(falling(), nearest="acceleration"), sampling=ij.Sampling(period=2e-3, delay=1e-3)
@@ -261,6 +267,7 @@ def test_it_is_sampled_and_saved(tmp_path):
     assert "controller.a1" in {p.path for p in ij.parameters(again)}
 
 
+@pytest.mark.slow
 def test_a_gradient_is_the_difference():
     start = initial_state(filtered(falling()))
 
@@ -275,6 +282,7 @@ def test_a_gradient_is_the_difference():
     assert float(found) == pytest.approx(float(difference), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_theorem_2_claims_nothing_while_it_works():
     """The certificate of a barrier law within a filter leaves out the samples at which the torque
     was changed."""
@@ -331,6 +339,7 @@ def test_shapes_have_names():
         controllers.SafetyFilter(law=controllers.PDGravity(Kp=1.0, Kd=1.0), margin=-1.0)
 
 
+@pytest.mark.slow
 def test_the_reference_of_a_filter_may_leave_the_bounds_and_that_of_no_other_law():
     parts = {"reference": ij.references.Quintic(start=[0.5, 0.5], end=[1.2, 0.5], duration=0.1)}
     run = ij.simulate(filtered(falling(**parts), nearest="acceleration"), duration=0.3, dt=1e-3)

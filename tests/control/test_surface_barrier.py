@@ -49,6 +49,7 @@ def test_its_torque_is_the_published_one():
     np.testing.assert_allclose(dq - command.alpha, sigma, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_funnel_of_the_surface_is_one_of_the_error():
     run = ij.simulate(scenario(), duration=4.0, dt=1e-3)
     assert int(run.status) == 0

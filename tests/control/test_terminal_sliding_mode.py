@@ -177,6 +177,7 @@ def test_an_exponent_without_a_law_is_refused():
             ij.controllers.TerminalSlidingMode(beta=1.0, K=20.0, layer=0.1, p=p)
 
 
+@pytest.mark.slow
 def test_a_sampled_loop_is_assessed_with_the_slope_of_the_layer():
     """Outside the layer the torque does not depend on the position, which says nothing about the
     period.  A layer that is too thin for the period is reported."""

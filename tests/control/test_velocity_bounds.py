@@ -40,6 +40,7 @@ def violated():
         return ij.simulate(paper(velocity_bounds=speeds((-0.5, -0.3), (0.6, 0.5))), **SHORT)
 
 
+@pytest.mark.slow
 def test_what_is_watched_is_what_the_samples_say(watched):
     run, t = watched, np.asarray(watched.t)
     low = np.stack([-1.6 - 0.1 * np.sin(t), np.full_like(t, -1.4)], axis=1)
@@ -55,6 +56,7 @@ def test_what_is_watched_is_what_the_samples_say(watched):
     assert int(run.metrics.first_velocity_violation_joint) == -1
 
 
+@pytest.mark.slow
 def test_the_law_and_the_loop_do_not_know(watched):
     free = ij.simulate(paper(velocity_bounds=None), **SHORT)
     for name in ("q", "dq", "tau", "V"):
@@ -76,6 +78,7 @@ def test_a_violation_is_flagged_with_time_and_joint(violated):
         ij.simulate(run.scenario, **SHORT, throw=True)
 
 
+@pytest.mark.slow
 def test_backends_agree():
     scenario = paper(velocity_bounds=speeds((-0.5, -0.3), (0.6, 0.5)))
     options = {"runs": 4, "duration": 0.3, "dt": 1e-3, "progress": False}
@@ -91,6 +94,7 @@ def test_backends_agree():
     np.testing.assert_array_equal(studies[0].status, studies[1].status)
 
 
+@pytest.mark.slow
 def test_a_funnel_of_velocities_follows_the_reference():
     funnel = bounds.Bounds(lower=bounds.Funnel(-1.0, -0.2, 2.0), upper=bounds.Funnel(1.5, 0.2, 2.0))
     run = ij.simulate(
@@ -103,6 +107,7 @@ def test_a_funnel_of_velocities_follows_the_reference():
     np.testing.assert_allclose(run.dq_lower, run.dq_d - 0.8 * r - 0.2, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_margin_has_a_derivative():
     def margin(low):
         scenario = ij.with_parameters(
@@ -138,6 +143,7 @@ def test_a_dataset_has_them(watched):
     np.testing.assert_array_equal(data.dq_upper, watched.dq_upper)
 
 
+@pytest.mark.slow
 def test_requirements_on_velocities():
     scenario = paper(velocity_bounds=speeds((-0.6, -0.6)))
     objective = ij.objectives.tracking() + ij.objectives.velocity_margin_above(0.02)

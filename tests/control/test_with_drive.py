@@ -59,6 +59,7 @@ def test_paths_reach_the_law_and_the_drive():
     np.testing.assert_array_equal(changed.controller.drive.resistance, [2.0, 2.0])
 
 
+@pytest.mark.slow
 def test_an_observer_receives_the_torque():
     """Momentum under WithDrive estimates the torque that the current lacks, Kt i - tau, besides the
     disturbance; a run shows that it is finite and that tau is recorded as the voltage."""
@@ -104,6 +105,7 @@ def test_a_rigid_model_has_the_motors_or_the_links_alone():
     np.testing.assert_allclose(ij.robots.friction_torque(rigid, v), [-0.15, -0.04], rtol=1e-15)
 
 
+@pytest.mark.slow
 def test_a_robot_with_motors_keeps_the_members_of_its_robot():
     arm = ij.presets.iiwa14().plant
     motors = ij.robots.WithMotors(arm, inertia=0.1)
@@ -112,6 +114,7 @@ def test_a_robot_with_motors_keeps_the_members_of_its_robot():
     np.testing.assert_array_equal(motors.limits.upper, arm.limits.upper)
 
 
+@pytest.mark.slow
 def test_a_robot_with_the_inertia_of_the_motors_in_another_form_is_accepted():
     """Such as the armature of an Arm, which is one robot less its motors here."""
     links = ij.robots.PlanarChain(mass=[1.3], length=[0.4], centre=[0.2], inertia=[0.02])

@@ -151,6 +151,7 @@ def numpy_torque(net, x):
     return np.asarray(net.layers[1].weight) @ hidden + np.asarray(net.layers[1].bias)
 
 
+@pytest.mark.slow
 def test_the_torque_of_a_run_is_that_of_numpy(scenario):
     run = ij.simulate(scenario, **SHORT)
     for k in (0, 7, len(run.t) - 1):
@@ -159,6 +160,7 @@ def test_the_torque_of_a_run_is_that_of_numpy(scenario):
         assert np.allclose(run.disturbance[k], expected, rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_compiled_batch_over_weights_is_its_single_runs(paper):
     deep = ij.with_parts(paper, disturbance=Plain(weights_of(1, jnp.tanh)))
     spread = {"disturbance.net[layers][0][0]": ij.factor(ij.uniform(0.5, 1.5))}
@@ -170,6 +172,7 @@ def test_a_compiled_batch_over_weights_is_its_single_runs(paper):
     assert not np.array_equal(*first)
 
 
+@pytest.mark.slow
 def test_gradient_by_a_weight_and_single_precision(scenario):
     path = "disturbance.net.layers[1].bias"
     start = scenario.disturbance.net.layers[1].bias

@@ -46,6 +46,7 @@ def test_one_part_is_exchanged_and_no_other(paper, name, part):
     assert same(paper, ij.presets.zhang_yan_2024())
 
 
+@pytest.mark.slow
 def test_the_result_runs_whatever_the_scenario_came_from(paper, short_run, tmp_path):
     ij.save_scenario(paper, tmp_path / "paper.toml")
     parts = {

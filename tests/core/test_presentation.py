@@ -22,6 +22,7 @@ def test_an_unknown_presentation_is_an_error():
         present("no such figure", None)
 
 
+@pytest.mark.slow
 def test_studies_and_results_load_no_figures():
     code = (
         "import sys, iblf_jax as ij; ij.monte_carlo, ij.Rollout, ij.certify, ij.tune\n"

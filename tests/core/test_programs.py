@@ -72,12 +72,14 @@ def maps_of_programs(number: int, size: int) -> int:
     return programs.count_maps() - before
 
 
+@pytest.mark.slow
 @needs_maps
 def test_the_number_of_memory_maps_stops_growing():
     maps_of_programs(4, 4)
     assert 3 * maps_of_programs(24, 4) < maps_of_programs(24, 24)
 
 
+@pytest.mark.slow
 @needs_maps
 def test_a_few_dozen_scenarios_take_the_memory_maps_of_a_few(monkeypatch):
     monkeypatch.setattr(programs.PROGRAMS, "size", 6)

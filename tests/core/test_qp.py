@@ -120,6 +120,7 @@ def test_many_without_a_solution_meet_the_conditions_of_the_least(n, rows, rng):
     assert lost > 100
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_the_solution(rng):
     H, G, h = (jnp.asarray(x[0]) for x in random_programs(rng, 1, 3, 8))
     soft = jnp.ones(8)

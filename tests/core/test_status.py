@@ -57,6 +57,7 @@ def test_a_good_run_is_ok(short_run):
     assert describe(int(short_run.status)) == "ok"
 
 
+@pytest.mark.slow
 def test_violation_with_joint_and_time(thrown):
     run = quiet(thrown)
     assert int(run.status) & Status.BOUND_VIOLATED
@@ -74,6 +75,7 @@ def test_violation_with_joint_and_time(thrown):
         ij.simulate(thrown, **SHORT, throw=True)
 
 
+@pytest.mark.slow
 def test_the_guard_alone_is_not_a_failure(paper):
     wide = ij.with_parts(
         paper,
@@ -90,6 +92,7 @@ def test_the_guard_alone_is_not_a_failure(paper):
     assert all_finite(run)
 
 
+@pytest.mark.slow
 def test_a_step_too_large_is_found_and_a_step_that_works_is_named(paper):
     stiff = ij.with_parameters(paper, {"controller.K2": 200.0})
     run = quiet(stiff)
@@ -115,6 +118,7 @@ def test_recommended_dt_and_the_measured_mode(paper, short_run):
     assert 800 < float(short_run.fastest_mode) < 1100
 
 
+@pytest.mark.slow
 def test_the_fastest_mode_is_the_largest_spectral_radius(paper, short_run):
     """Of the closed loop's exact Jacobian at the start, where the run was nearest to a bound and at
     the end."""

@@ -62,6 +62,7 @@ def test_a_function_without_a_rule_is_differentiated_by_nested_jvp():
         np.testing.assert_allclose(x, y, rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [solve_spd, solve_gain])
 def test_solutions_of_equations(solver):
     """Functions with a derivative rule of first order (`jax.custom_jvp`) are written out."""
@@ -76,6 +77,7 @@ def test_solutions_of_equations(solver):
         np.testing.assert_allclose(x, y, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_dynamics_of_an_arm():
     robot = ij.presets.iiwa14().plant
     rng = np.random.default_rng(3)

@@ -245,6 +245,7 @@ def everything(scenario, **options):
     return floats, start
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_derivatives_are_the_kernels_and_equal_those_of_plain_jax(paper, monkeypatch):
     """Of all that is recorded and measured, by leaves of every kind, in both modes, in a batch and
@@ -285,6 +286,7 @@ def test_derivatives_are_the_kernels_and_equal_those_of_plain_jax(paper, monkeyp
     assert calls == []
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_second_derivatives_are_the_kernels(paper, monkeypatch):
     monkeypatch.setattr(
@@ -392,6 +394,7 @@ def test_a_new_structure_does_recompile(paper, monkeypatch):
     assert traces == [1]
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_another_length_compiles_the_steps_alone(paper):
     def compiled():
@@ -408,6 +411,7 @@ def test_another_length_compiles_the_steps_alone(paper):
     np.testing.assert_array_equal(longer.q[:150], again.q[:450:3])
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(native.unavailable() is not None, reason="no C++ compiler")
 def test_a_run_alone_falls_back_where_its_kernel_cannot_be_built(paper, tmp_path, monkeypatch):
     """With one warning if it was asked for, without one if it was not; another length is not tried
@@ -441,6 +445,7 @@ def test_a_run_alone_falls_back_where_its_kernel_cannot_be_built(paper, tmp_path
     np.testing.assert_array_equal(ij.simulate(paper, **short, backend="native").q, expected.q)
 
 
+@pytest.mark.slow
 def test_the_same_run_twice_is_bit_identical(paper, short_run):
     again = ij.simulate(paper, **SHORT)
     for name in ("q", "tau", "V"):

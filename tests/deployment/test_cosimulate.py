@@ -68,6 +68,7 @@ CHAINED = ij.with_parts(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "scenario",
     [ij.with_parts(PAPER, sampling=ij.Sampling(2e-3)), DRIVEN, CHAINED],
@@ -99,6 +100,7 @@ def test_a_real_arm_from_its_file():
     assert largest_difference(run.q, other.q) < 1e-10
 
 
+@pytest.mark.slow
 def test_a_payload_that_the_law_does_not_know():
     load = (
         '<body pos="{} 0 0"><inertial pos="0 0 0" mass="0.3" diaginertia="1e-12 1e-12'
@@ -113,6 +115,7 @@ def test_a_payload_that_the_law_does_not_know():
     assert largest_difference(found.q, ij.simulate(scenario, **TIMING).q) > 1e-3
 
 
+@pytest.mark.slow
 def test_a_joint_that_touches_its_stop():
     scenario = ij.with_parts(PAPER, sampling=ij.Sampling(1e-3))
     free = ij.cosimulate(scenario, spec_of(PAPER.plant), **TIMING)
@@ -153,6 +156,7 @@ def test_what_else_moves_on_the_arm_is_locked_and_what_stands_apart_is_free():
     assert largest_difference(found.q, expected.q) > 1e-5
 
 
+@pytest.mark.slow
 def test_a_locked_joint_in_a_frame_is_held_where_it_is():
     inner = (
         '<frame pos="0 0.02 0" euler="0 0 0.4"><body name="palm" pos="0.03 0 0" euler="0 0'
@@ -190,6 +194,7 @@ DRIVES = """<tendon><fixed name="wire"><joint joint="elbow" coef="1"/></fixed></
   <general site="hand" gear="0 1 0 0 0 0" biastype="affine" biasprm="5 0 0"/> <motor joint="turntable"/></actuator>"""
 
 
+@pytest.mark.slow
 def test_a_models_own_drives_are_off():
     aside = (
         '<body name="table" pos="3 0 0"><joint name="turntable" axis="0 0 1"/><geom'
@@ -215,6 +220,7 @@ AROUND = """<tendon><fixed name="split"><joint joint="l" coef="0.5"/><joint join
   <sensor><jointpos joint="l"/></sensor><keyframe><key name="home" qpos="0 0 0.01 0.01"/></keyframe>"""
 
 
+@pytest.mark.slow
 def test_a_gripper_goes_with_all_that_moves_it():
     text = two_link(PAPER.plant, inside=GRIPPER).replace("</worldbody>", f"</worldbody>{AROUND}")
     arm = ij.robots.load(_written("gripper.xml", text), tip="fore", locked={"l": 0.02, "r": 0.02})
@@ -227,6 +233,7 @@ def test_a_gripper_goes_with_all_that_moves_it():
         ij.cosimulate(scenario, _written("tied.xml", tied), duration=0.1)
 
 
+@pytest.mark.slow
 def test_models_stay_as_they_are_and_other_integrators_come_near():
     model = spec_of(PAPER.plant).compile()
     # 0.8 ms do not divide 1 ms: the step is the next shorter one that does.
@@ -242,6 +249,7 @@ def test_models_stay_as_they_are_and_other_integrators_come_near():
     assert errors[1] == pytest.approx(0.5 * errors[0], rel=0.1)
 
 
+@pytest.mark.slow
 def test_callbacks_of_others_are_kept():
     seen, model = [], spec_of(PAPER.plant).compile()
     mujoco.set_mjcb_control(lambda model, data: seen.append(data.time))
@@ -264,6 +272,7 @@ def test_a_run_that_flies_away_is_told():
         ij.cosimulate(wild, spec_of(PAPER.plant), period=5e-3, throw=True, **TIMING)
 
 
+@pytest.mark.slow
 def test_records_and_films(tmp_path):
     from PIL import Image
 
@@ -293,6 +302,7 @@ def test_an_arm_without_shapes_is_drawn_as_its_skeleton():
     assert not has_shapes(shapes.compile()), "a table does not move, and other groups are not drawn"
 
 
+@pytest.mark.slow
 def test_films_may_follow_each_other(tmp_path):
     """Without a display MuJoCo's renderer fails once, and ends the process at the second try."""
     for ending in ("gif", "html"):
@@ -307,6 +317,7 @@ def test_films_may_follow_each_other(tmp_path):
         assert (tmp_path / f"arm.{ending}").stat().st_size > 1000
 
 
+@pytest.mark.slow
 def test_a_shorter_period_finds_room_for_its_commands():
     slow = ij.with_parts(PAPER, sampling=ij.Sampling(4e-3, delay=4e-3))
     run = ij.cosimulate(slow, spec_of(PAPER.plant), period=1e-3, duration=0.02, dt=1e-3)
@@ -350,6 +361,7 @@ def test_what_is_no_model_or_no_single_scenario_is_named():
         ij.cosimulate(many, spec_of(PAPER.plant), duration=0.1, period=1e-3)
 
 
+@pytest.mark.slow
 def test_a_urdf_whose_meshes_are_not_there_touches_nothing():
     shape = (
         "<collision><geometry><mesh"

@@ -104,6 +104,7 @@ def against_jax(folder, scenario, *, external_reference=False, dtype="float64"):
     return generated
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("law", "observer"), CASES)
 def test_every_law_and_observer_gives_in_c_what_it_gives_in_jax(base, tmp_path, law, observer):
     against_jax(
@@ -112,6 +113,7 @@ def test_every_law_and_observer_gives_in_c_what_it_gives_in_jax(base, tmp_path, 
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("velocity", members.VELOCITIES)
 @pytest.mark.parametrize("external_reference", [False, True])
 def test_velocities_follow_by_the_filter_of_the_scenario(
@@ -125,6 +127,7 @@ def test_velocities_follow_by_the_filter_of_the_scenario(
     assert ("NULL, " in (tmp_path / "selftest.c").read_text()) == (velocity != "measured")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", ["euler", "poles"])
 def test_floats_and_every_step_of_an_observer(base, tmp_path, step):
     lab = ij.with_parts(
@@ -140,6 +143,7 @@ HOSTILE = (
 )
 
 
+@pytest.mark.slow
 def test_names_from_files_stay_in_comments(tmp_path):
     n = len(HOSTILE)
     scenario = ij.Scenario(
@@ -157,6 +161,7 @@ def test_names_from_files_stay_in_comments(tmp_path):
     assert text.isascii() and "int main" in text and "??" not in text
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the simulated run")
 def test_what_cannot_be_written_says_why(base, tmp_path):
     @ij.component
@@ -293,6 +298,7 @@ int main(void) {
 """
 
 
+@pytest.mark.slow
 def test_a_folder_is_complete_and_its_parameters_are_those_of_the_paths(tmp_path):
     scenario = ij.presets.zhang_yan_2024()
     generated = ij.export(scenario, tmp_path / "first", period=2e-3, name="arm_law")
@@ -349,6 +355,7 @@ def test_a_folder_is_complete_and_its_parameters_are_those_of_the_paths(tmp_path
     np.testing.assert_allclose(tau, outputs.tau, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_law_that_does_not_hold_is_told(tmp_path):
     with pytest.warns(UserWarning, match="recommended_period"):
         ij.export(ij.presets.zhang_yan_2024(), tmp_path, period=0.05)
@@ -371,6 +378,7 @@ def lab():
     return ij.with_parts(gains, **{name: make() for name, make in LAB.items()})
 
 
+@pytest.mark.slow
 def test_a_closed_loop_as_an_fmu_is_simulate(lab, tmp_path):
     ij.export(lab, tmp_path, target="fmu-loop", dt=1e-3, seed=4)
     file = str(tmp_path / "iblf_loop.fmu")
@@ -401,6 +409,7 @@ def test_a_closed_loop_as_an_fmu_is_simulate(lab, tmp_path):
         fmpy.simulate_fmu(file, stop_time=0.01, step_size=1e-3, output_interval=1.5e-3)
 
 
+@pytest.mark.slow
 def test_a_sampled_loop_without_noise_as_an_fmu_is_simulate(tmp_path):
     lab = ij.with_parts(ij.presets.zhang_yan_2024(), sampling=ij.Sampling(1e-3))
     ij.export(lab, tmp_path, target="fmu-loop")
@@ -416,6 +425,7 @@ def test_a_sampled_loop_without_noise_as_an_fmu_is_simulate(tmp_path):
         np.testing.assert_allclose(found[name], getattr(run, name), atol=1e-10, err_msg=name)
 
 
+@pytest.mark.slow
 def test_a_law_as_an_fmu_gives_the_torque_of_simulate(lab, tmp_path):
     lab = ij.with_parts(lab, sampling=ij.Sampling(2e-3), actuator=ij.actuators.Ideal())
     with warnings.catch_warnings():
@@ -517,6 +527,7 @@ def test_the_former_name_of_a_given_reference_still_works(tmp_path):
         ij.export(ij.presets.zhang_yan_2024(), tmp_path, target="wasm", reference="told")
 
 
+@pytest.mark.slow
 def test_the_command_line_exports(tmp_path, capsys):
     from iblf_jax.cli import main
 

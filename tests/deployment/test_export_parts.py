@@ -100,6 +100,7 @@ def short_run(monkeypatch):
     monkeypatch.setattr("iblf_jax.deployment.export.VECTORS_DURATION", DURATION)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", release(OBSERVED, "robot"))
 @pytest.mark.filterwarnings("ignore:the simulated run")
 def test_a_law_that_estimates_levels_reads_the_measured_ones(tmp_path, case):
@@ -113,6 +114,7 @@ def test_a_law_that_estimates_levels_reads_the_measured_ones(tmp_path, case):
     np.testing.assert_allclose(torques, run.tau[:-1:10], rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", release(LAWS, "trigger"))
 @pytest.mark.filterwarnings("ignore:the simulated run")
 def test_the_c_of_a_law_with_a_state_of_its_own_passes_its_self_test(tmp_path, case):

@@ -34,6 +34,7 @@ def self_test(folder):
 QUICK = ("user class", "electric drive")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reference", ["inside", "given"])
 @pytest.mark.parametrize(
     "case", [x if x in QUICK else pytest.param(x, marks=pytest.mark.slow) for x in CASES]
@@ -54,6 +55,7 @@ def test_a_law_of_a_rigid_model_has_no_parameters_of_the_plant(tmp_path):
     assert not [path for path in exported.parameters if path.startswith("plant")]
 
 
+@pytest.mark.slow
 def test_a_given_reference_has_the_derivatives_that_it_is_given():
     derivatives = [0.3, -0.2, 0.5, 0.7, -1.1]
     numbers = [jnp.asarray([x]) for x in derivatives]
@@ -64,6 +66,7 @@ def test_a_given_reference_has_the_derivatives_that_it_is_given():
         function = jax.jacfwd(function)
 
 
+@pytest.mark.slow
 def test_a_law_as_an_fmu_receives_all_levels(tmp_path):
     fmpy = pytest.importorskip("fmpy")
     pytest.importorskip("fmpy.validation")
@@ -92,6 +95,7 @@ def test_a_law_as_an_fmu_receives_all_levels(tmp_path):
     assert units == {"x_3": "A", "tau": "V", "alpha": "rad/s", "d_hat_3": "A/s"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "case", [pytest.param("flexible joint", marks=pytest.mark.slow), "user functions"]
 )

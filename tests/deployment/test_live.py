@@ -80,6 +80,7 @@ def simulated(law: str, **changed: float):
     return np.asarray(ij.simulate(scenario, duration=0.25, dt=5e-4).q).T
 
 
+@pytest.mark.slow
 def test_sliders_and_curves_agree_after_a_switch_of_the_law(two_laws, tmp_path):
     actions = [
         {},
@@ -104,6 +105,7 @@ def test_sliders_and_curves_agree_after_a_switch_of_the_law(two_laws, tmp_path):
     assert np.abs(np.subtract(found[2]["q"], found[0]["q"])).max() > 1e-2
 
 
+@pytest.mark.slow
 def test_numbers_of_the_address_are_those_of_sliders_and_curves(two_laws, tmp_path):
     address = "?law=log&controller.K2=130&initial.q[0]=0.55&observer.kf=many&initial.q[1]="
     begin, other, back = in_node(
@@ -158,6 +160,7 @@ NAMES = [
 ]
 
 
+@pytest.mark.slow
 def test_names_cannot_end_or_change_the_script_of_a_page(two_laws, tmp_path):
     scenario = ij.presets.zhang_yan_2024()
     page = ij.explore(dict.fromkeys(NAMES, scenario), duration=0.02, dt=2e-3)

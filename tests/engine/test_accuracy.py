@@ -111,6 +111,7 @@ def test_a_good_run_says_how_good(short_run):
     assert "of the tube" in repr(short_run)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frequency", [6283.0, 4e3 * np.pi])
 def test_a_signal_that_the_stages_cannot_see_is_flagged_with_a_step_that_will_do(shaken, frequency):
     """4000 pi rad/s goes through whole periods between the stages of a step of 1 ms: every stage
@@ -139,6 +140,7 @@ def test_a_reference_between_the_stages_is_flagged(paper):
         assert int(ij.simulate(fast, **SHORT).status) & Status.INACCURATE
 
 
+@pytest.mark.slow
 def test_the_guard_beyond_the_first_instant_is_told(paper):
     wide = dataclasses.replace(paper.controller, barrier=ij.barriers.Integral(guard=0.1))
     near = ij.with_parameters(
@@ -239,6 +241,7 @@ def test_solve(rng, size):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["rk4", "heun"])
 @pytest.mark.parametrize(
     "actuator", [ij.actuators.Ideal(), ij.actuators.Motor(bandwidth=600.0)], ids=["ideal", "lag"]
@@ -286,6 +289,7 @@ class PowerOfE2:
         return ij.controllers.Command(tau, alpha, (q - tube.q_d) ** 2, none, none), ()
 
 
+@pytest.mark.slow
 def test_an_infinite_slope_at_one_instant_is_no_fast_mode(paper):
     scenario = ij.with_parts(
         paper, controller=PowerOfE2(K2=5.0, c=2.0), observer=ij.observers.NoObserver()
@@ -345,6 +349,7 @@ def split(steps, **fields):
     return loop.end(0.4)
 
 
+@pytest.mark.slow
 def test_a_step_is_divided_where_a_disturbance_jumps():
     """Two jumps within one step of 4 or 10 ms: the error is that of a smooth loop, and the estimate
     is not below it."""
@@ -407,6 +412,7 @@ def test_a_recommended_step_is_divided_at_every_jump():
     assert not int(ij.simulate(scenario, duration=0.04, dt=dt).status) & Status.INACCURATE
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "time", [LATE, pytest.param(0.2, marks=pytest.mark.slow)], ids=["within a step", "at its end"]
 )
@@ -475,6 +481,7 @@ def test_tangents_beside_a_batch_and_reverse_mode_go_through_a_jump(sampling):
         np.testing.assert_allclose(slope[0], np.sum(expected), rtol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "backend",
     [
@@ -584,6 +591,7 @@ PARTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "part", [x if x == "actuator" else pytest.param(x, marks=pytest.mark.slow) for x in PARTS]
 )

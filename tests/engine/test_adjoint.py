@@ -94,6 +94,7 @@ def whole(problem):
     return problem.gradient()
 
 
+@pytest.mark.slow
 def test_the_gradient_is_that_of_the_scan_and_of_tangents(problem, whole):
     outcome, gradient = whole
     by_scan, expected = problem.gradient("vmap")
@@ -118,6 +119,7 @@ def test_the_gradient_is_that_of_the_scan_and_of_tangents(problem, whole):
     assert_close(found, summed, 1e-10)
 
 
+@pytest.mark.slow
 def test_segments_other_runs_and_threads_change_no_bit(problem, whole, monkeypatch):
     _, gradient = whole
     for threads, runs in ((1, slice(0, 5)), (2, slice(0, 5)), (2, slice(1, 3))):
@@ -234,6 +236,7 @@ def test_a_step_whose_adjoint_does_not_lower_is_differentiated_by_the_scan(probl
         problem.traced("native")
 
 
+@pytest.mark.slow
 def test_a_long_step_is_differentiated_by_the_scan_on_auto(problem, monkeypatch):
     monkeypatch.setattr(execute, "Cotangents", None)
     with pytest.raises(TypeError):
@@ -285,6 +288,7 @@ LIGHT = ij.with_parts(
 """Its derivatives compile sooner than those of the paper's loop."""
 
 
+@pytest.mark.slow
 def test_jax_differentiates_simulate_in_both_modes(in_reverse):
     loss, by_scan = simulated(LIGHT), simulated(LIGHT, "vmap")
     values = {"controller.Kp": jnp.asarray([60.0, 50.0]), "plant.mass": jnp.asarray([1.5, 1.2])}

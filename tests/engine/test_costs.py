@@ -100,6 +100,7 @@ def test_operations_of_a_step(name):
     )
 
 
+@pytest.mark.slow
 def test_operations_of_a_planar_chain_grow_no_faster_than_the_square_of_the_joints():
     slots = {n: ij.explain(planar_chain(n), varied=["plant.mass[1]"]).slots for n in (2, 4, 8, 12)}
     assert slots[4] < 4 * slots[2] and slots[8] < 4 * slots[4] and slots[12] < 2.25 * slots[8]
@@ -171,6 +172,7 @@ def in_a_fresh_process(call: str) -> dict[str, int]:
     return json.loads(done.stdout.splitlines()[-1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "call", [x if x == "simulate" else pytest.param(x, marks=pytest.mark.slow) for x in CALLS]
 )

@@ -251,6 +251,7 @@ print(before, most, low.released, float(value))
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(programs.most_maps() is None, reason="this system has no limit of memory maps")
 @pytest.mark.parametrize(
     ("structures", "room"), [(9, 20), pytest.param(52, 100, marks=pytest.mark.slow)]

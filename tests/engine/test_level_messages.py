@@ -23,6 +23,7 @@ def message_of(scenario, duration=0.5, dt=1e-3) -> str:
     return text
 
 
+@pytest.mark.slow
 def test_a_violated_level_is_named_with_time_margin_unit_and_remedy():
     plain = law(Mapping(), Quadratic(), Quadratic())
     text = message_of(pendulum(controller=plain, state_bounds=(None, symmetric(2.0))))
@@ -31,6 +32,7 @@ def test_a_violated_level_is_named_with_time_margin_unit_and_remedy():
     assert "give it barriers.Mapping() there" in text
 
 
+@pytest.mark.slow
 def test_a_violated_second_level_has_the_unit_of_the_level():
     plain = law(Mapping(), Quadratic(), Quadratic())
     text = message_of(pendulum(controller=plain, state_bounds=(symmetric(0.1),)))
@@ -40,6 +42,7 @@ def test_a_violated_second_level_has_the_unit_of_the_level():
     assert "velocity bounds" not in text
 
 
+@pytest.mark.slow
 def test_a_virtual_control_outside_its_level_is_reported_like_assumption_2():
     plain = law(Mapping(), Quadratic(), Quadratic())
     scenario = pendulum(controller=plain, state_bounds=(symmetric(3.0), symmetric(2.0)))
@@ -56,6 +59,7 @@ def test_a_virtual_control_outside_its_level_is_reported_like_assumption_2():
     assert "widen state_bounds or lower controller.k" in text
 
 
+@pytest.mark.slow
 def test_a_law_of_robots_is_told_who_keeps_the_bounds_of_levels():
     rigid = ij.presets.zhang_yan_2024()
     plant = ij.plants.FlexibleJoint(rigid.plant, stiffness=3e3, motor_inertia=0.02)
@@ -73,6 +77,7 @@ def test_a_law_of_robots_is_told_who_keeps_the_bounds_of_levels():
     assert "controllers.BarrierBackstepping keeps them" in text
 
 
+@pytest.mark.slow
 def test_a_gain_that_becomes_singular_is_named():
     def gain(t, x):
         one = jnp.ones_like(x[0])
@@ -96,6 +101,7 @@ def test_a_gain_that_becomes_singular_is_named():
     assert "bound the levels so that they stay away" in text
 
 
+@pytest.mark.slow
 def test_an_inaccurate_run_names_the_unit_of_the_worst_component():
     text = message_of(body(), duration=10.0, dt=0.5)
     assert "the components of the first level are inaccurate" in text
@@ -114,6 +120,7 @@ def test_errors_before_a_run_name_components():
         ij.simulate(body(initial=ij.Initial(q=[0.5, 1.0, 0.2], dq=1e13)), duration=1.0, dt=1e-2)
 
 
+@pytest.mark.slow
 def test_a_run_that_starts_outside_a_level_is_named_in_a_study():
     draws = {"initial.x[2]": ij.offset(ij.uniform(24.0, 25.0))}
     study = ij.monte_carlo(pendulum(), draws, runs=2, duration=0.01, dt=1e-4)
@@ -122,6 +129,7 @@ def test_a_run_that_starts_outside_a_level_is_named_in_a_study():
         study.replay(0)
 
 
+@pytest.mark.slow
 def test_a_robot_keeps_its_words():
     bounds = symmetric(0.1)
     robot = ij.with_parts(ij.presets.zhang_yan_2024(), velocity_bounds=bounds)

@@ -18,6 +18,7 @@ SHORT = {"duration": 0.3, "dt": 1e-3}
 CASES = loops_of_plants.CASES
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ["user class", "electric drive"])
 def test_names_and_a_solution_of_scipy(case):
     scenario = CASES[case]()
@@ -38,6 +39,7 @@ LEAVES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "case",
     [x if x == "user class" else pytest.param(x, marks=pytest.mark.slow) for x in LEAVES],
@@ -60,6 +62,7 @@ def test_derivatives_by_leaves_are_differences(case):
         np.testing.assert_allclose(forward, difference, rtol=1e-3, atol=1e-6, err_msg=path)
 
 
+@pytest.mark.slow
 def test_float32_follows_float64():
     scenario = CASES["user class"]()
     exact = ij.simulate(scenario, **SHORT)
@@ -68,6 +71,7 @@ def test_float32_follows_float64():
     np.testing.assert_allclose(coarse.x, exact.x, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_batch_is_its_runs():
     scenario = CASES["user class"]()
     starts = jnp.asarray([[[0.2], [0.0], [0.0]], [[0.1], [0.1], [-0.2]]])
@@ -79,6 +83,7 @@ def test_a_batch_is_its_runs():
     np.testing.assert_allclose(batch[1], run(starts[1]), atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "case", ["user class", pytest.param("flexible joint", marks=pytest.mark.slow)]
 )
@@ -93,6 +98,7 @@ def test_a_step_and_a_period_are_found(case):
     assert int(run.status) == 0
 
 
+@pytest.mark.slow
 def test_the_error_of_a_sampled_loop_includes_all_levels():
     sampled = CASES["electric drive"](
         sampling=ij.Sampling(2e-3), actuator=ij.actuators.Motor(bandwidth=300.0, limit=60.0)
@@ -102,6 +108,7 @@ def test_the_error_of_a_sampled_loop_includes_all_levels():
     assert 0.1 * error < float(jnp.max(run.metrics.numerical_error)) < 1e-3
 
 
+@pytest.mark.slow
 def test_the_geometry_of_the_robot_inside_a_plant_is_compiled_in():
     axis = [[0.0, 0.0, 1.0], [0.0, 0.0, 1.0]]
     arm = ij.robots.Arm(

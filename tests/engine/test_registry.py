@@ -58,6 +58,7 @@ def added(monkeypatch):
     return calls
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize("backend", ["mine", "auto"])
 def test_an_added_executor_runs_a_single_run(scenario, added, backend):
@@ -68,6 +69,7 @@ def test_an_added_executor_runs_a_single_run(scenario, added, backend):
     assert added == ["run"] * 3, "the start, the steps, the end"
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_an_added_executor_runs_a_batch(scenario, added):
     perturbed = {"controller.Kp": ij.factor(ij.uniform(0.9, 1.1))}
@@ -111,6 +113,7 @@ def test_a_removed_backend_is_vmap(scenario):
     assert request.backend == "vmap"
 
 
+@pytest.mark.slow
 def test_where_no_kernel_can_be_compiled_auto_runs_by_the_scan(scenario, monkeypatch):
     """One warning names the remedy, for a run and for a batch."""
     reason = 'there is no C++ compiler; `pip install "iblf_jax[export]"` contains one'

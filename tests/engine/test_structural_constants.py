@@ -88,6 +88,7 @@ def moving(program) -> int:
     return sum(program.counts()[PER_RUN | TIME].values())
 
 
+@pytest.mark.slow
 def test_a_mechanism_of_right_angles_saves_a_fifth_of_the_operations_of_two_joints():
     scenario = square_arm()
     assert moving(lowered(scenario)[2]) < 0.8 * moving(lowered(scenario, (), False)[2])
@@ -210,6 +211,7 @@ def test_derivatives_by_the_geometry(monkeypatch):
     assert counts.tolist() == [True, False, True], "a height on the vertical axis is no lever"
 
 
+@pytest.mark.slow
 def test_another_mechanism_in_the_same_process_is_another_program():
     """The zeros are in the key of the compiled program: the arm that comes second is not run with
     those of the first."""
@@ -258,6 +260,7 @@ def status_of(scenario, *, run):
     ).status[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "path", ["initial.q", "initial.dq", "plant.mass", "plant.position", "model.g", "controller.K2"]
 )

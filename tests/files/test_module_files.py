@@ -148,6 +148,7 @@ def test_files_of_studies_receive_modules(kind, tmp_path):
     assert same(loaded, scenario)
 
 
+@pytest.mark.slow
 def test_a_saved_tuning_receives_modules(tmp_path):
     scenario = with_net(Opaque(0.1 * jnp.ones((2, 4))))
     ij.save_scenario(scenario, tmp_path / "a.toml", run={"duration": 0.05, "dt": 1e-3})
@@ -163,6 +164,7 @@ def test_a_saved_tuning_receives_modules(tmp_path):
     assert same(again.scenario, result.scenario)
 
 
+@pytest.mark.slow
 def test_a_law_with_a_module_on_a_robot_of_a_file(monkeypatch, tmp_path):
     pytest.importorskip("mujoco")  # reads the robot
     monkeypatch.setitem(ij.controllers.MEMBERS, "network_law", NetworkLaw)
@@ -237,6 +239,7 @@ def test_a_broken_description_is_refused_with_its_key(case):
         from_dict(tables)
 
 
+@pytest.mark.slow
 def test_a_network_is_part_of_an_exported_law(tmp_path):
     observer = NetworkObserver(ij.observers.Momentum(kf=20.0), mlp(size=2))
     scenario = ij.with_parts(

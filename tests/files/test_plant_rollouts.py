@@ -52,6 +52,7 @@ def test_a_study_has_dimensions_and_units_of_levels():
     assert np.all(np.asarray(study.metrics.level_margin)[:, 0] <= 20.0 - drawn + 1e-12)
 
 
+@pytest.mark.slow
 def test_a_robot_keeps_its_dimensions():
     data = ij.simulate(ij.presets.zhang_yan_2024(), duration=0.02, dt=1e-3).to_xarray()
     assert set(data.dims) == {"time", "joint"}

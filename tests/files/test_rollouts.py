@@ -217,6 +217,7 @@ def _damage(content, rng, kind):
     return bytes(damaged)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 @pytest.mark.parametrize("kind", ["bit", "byte", "block", "five"])
 def test_a_damaged_netcdf_file_is_refused_or_loads_as_it_was(kind, stored, rng, tmp_path):
@@ -274,6 +275,7 @@ def test_a_digest_knows_values_that_are_written_in_several_ways(short_run, tmp_p
     assert bool(ij.load_rollouts(tmp_path / "a.nc")["run"]["is_so"])
 
 
+@pytest.mark.slow
 def test_the_package_imports_no_labels_and_no_figures():
     code = (
         "import iblf_jax, sys; assert not {'xarray', 'matplotlib', 'optax', 'pandas', 'tomli_w'} &"

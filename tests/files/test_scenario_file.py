@@ -88,6 +88,7 @@ def scenarios(draw) -> ij.Scenario:
     return changed
 
 
+@pytest.mark.slow
 @hypothesis.settings(max_examples=100)
 @hypothesis.given(scenarios())
 def test_a_saved_scenario_comes_back_equal(scenario):
@@ -384,6 +385,7 @@ def paper_file() -> str:
     return scenario_file.scenario_to_toml(ij.presets.zhang_yan_2024())
 
 
+@pytest.mark.slow
 @hypothesis.settings(max_examples=300)
 @hypothesis.given(data=st.data())
 def test_malformed_files_are_value_errors_only(data):
@@ -400,6 +402,7 @@ def test_malformed_files_are_value_errors_only(data):
     assert error is None or error.startswith("file.toml: ")
 
 
+@pytest.mark.slow
 @hypothesis.settings(max_examples=300)
 @hypothesis.given(place=st.integers(0, 10_000), cut=st.integers(0, 20), insert=st.text(max_size=6))
 def test_damaged_texts_are_value_errors_only(place, cut, insert, tmp_path_factory):

@@ -171,6 +171,7 @@ def z_scores(known, truth):
 TRUTH = {"robot.mass": MASS, "disturbance.viscous": VISCOUS, "disturbance.coulomb": COULOMB}
 
 
+@pytest.mark.slow
 def test_true_values_are_within_their_errors_and_masses_within_a_percent(known):
     assert np.max(np.abs(z_scores(known, TRUTH))) < 4.0
     assert np.max(np.abs(known.values["robot.mass"] / MASS - 1.0)) < 1e-3
@@ -189,6 +190,7 @@ def test_the_fit_is_as_good_as_the_encoder_also_on_what_was_held_back(known):
     assert 0 < np.sum(~known.kept) < np.sum(known.kept)
 
 
+@pytest.mark.slow
 def test_friction_that_sticks_is_left_to_the_log(scenario):
     """A bristle's friction is no tanh: about standstill torques are free, what the rest tells is
     not spoilt, and the report says so."""
@@ -221,6 +223,7 @@ def test_the_scenario_has_the_new_numbers_in_plant_and_model(known, scenario):
     np.testing.assert_array_equal(known.scenario.controller.K2, scenario.controller.K2)
 
 
+@pytest.mark.slow
 def test_what_a_log_leaves_open_is_drawn_together(known):
     """The draws of a study have the covariance of the identification, also between leaves."""
     assert set(known.perturbations) == {"plant.mass", "disturbance.viscous", "disturbance.coulomb"}
@@ -239,6 +242,7 @@ def test_what_a_log_leaves_open_is_drawn_together(known):
     )
 
 
+@pytest.mark.slow
 def test_what_a_log_cannot_tell_is_not_the_start_as_an_answer(scenario, log):
     """m1, lc1 and I1 enter as two numbers, p1 and p4: these are right in the scenario, and the
     three are not told."""
@@ -258,6 +262,7 @@ def test_what_a_log_cannot_tell_is_not_the_start_as_an_answer(scenario, log):
     np.testing.assert_allclose(m * lc**2 + J, MASS[0] * CENTRE[0] ** 2 + INERTIA[0], rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_delay_between_torque_and_position_is_found(scenario, log):
     late = log | {
         "t": log["t"][:-2],
@@ -269,6 +274,7 @@ def test_a_delay_between_torque_and_position_is_found(scenario, log):
     assert np.max(np.abs(z_scores(known, TRUTH))) < 5.0
 
 
+@pytest.mark.slow
 def test_irregular_times_and_a_gap(scenario, run, rng):
     """Rows left out at random, and a third of a second at once; the torque of a continuous loop is
     interpolated."""
@@ -281,12 +287,14 @@ def test_irregular_times_and_a_gap(scenario, run, rng):
     assert all(np.isnan(one.held_back) for one in known.fit)
 
 
+@pytest.mark.slow
 def test_a_run_is_a_log(scenario, run):
     """A Rollout of a continuous loop: without noise, the numbers come back."""
     known = ij.identify(scenario, run, ["robot.mass"])
     np.testing.assert_allclose(known.values["robot.mass"], MASS, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_several_logs_and_one_that_is_held_back(scenario, log):
     first, second = (
         {name: x[part] for name, x in log.items()} for part in (slice(0, 700), slice(760, None))
@@ -310,6 +318,7 @@ def test_the_torque_of_a_step_is_its_mean(log):
     )
 
 
+@pytest.mark.slow
 def test_a_delay_of_the_command_is_a_leaf(scenario, log):
     commanded = {
         name: (np.roll(x, -1, axis=0) if name == "tau" else x)[:-1] for name, x in log.items()
@@ -320,6 +329,7 @@ def test_a_delay_of_the_command_is_a_leaf(scenario, log):
     assert set(known.values) == set(PATHS)
 
 
+@pytest.mark.slow
 def test_outliers_are_borne_by_huber(scenario, log):
     rng, q = np.random.default_rng(2), log["q"].copy()
     hit = rng.choice(q.size, 40, replace=False)
@@ -328,6 +338,7 @@ def test_outliers_are_borne_by_huber(scenario, log):
     assert np.max(np.abs(known.values["robot.mass"] / MASS - 1.0)) < 2e-3
 
 
+@pytest.mark.slow
 def test_priors_and_limits(scenario, log):
     """What was known before is believed for what it is worth; what is at a limit is said to be."""
     fixed = ij.identify(scenario, log, PATHS, widths=False, priors={"robot.mass": (MASS, 1e-7)})
@@ -381,6 +392,7 @@ def other_logs():
     return [independent_log(duration=5.0, seed=seed) for seed in (11, 12)]
 
 
+@pytest.mark.slow
 def test_coulomb_friction_that_was_left_out_is_found_and_what_makes_up_for_it_is_marked(
     scenario, other_logs
 ):
@@ -407,6 +419,7 @@ def test_coulomb_friction_that_was_left_out_is_found_and_what_makes_up_for_it_is
     assert json.dumps(known.to_dict(), allow_nan=False)
 
 
+@pytest.mark.slow
 def test_a_fit_that_lacks_nothing_has_no_finding(known, scenario, other_logs):
     assert not any("The residual torque of" in note or "biased" in note for note in known.notes)
     assert all(number.bias is None for number in known.numbers)
@@ -603,6 +616,7 @@ def test_the_report_is_words_json_and_a_page(known, tmp_path):
         known.save(tmp_path / "known.txt")
 
 
+@pytest.mark.slow
 def test_inertias_stay_those_of_bodies(rng):
     """Any z is a body, and z, x and their derivative belong together."""
     scenario = ij.presets.iiwa14()
@@ -675,6 +689,7 @@ def test_whiteness_tells_noise_from_what_a_model_lacks(rng):
     )
 
 
+@pytest.mark.slow
 def test_an_excitation_is_inside_its_bounds_and_tells_more(scenario, heavier, run):
     best = ij.excitation(scenario, PATHS, duration=6.0, iterations=15)
     rich = ij.simulate(ij.with_parts(heavier, reference=best), duration=6.0, dt=1e-3)
@@ -703,6 +718,7 @@ def _narrow(scenario):
     )
 
 
+@pytest.mark.slow
 def test_joint_draws_in_a_file_and_in_a_design(tmp_path):
     """The same table as any perturbation; a group without a name, or rows that do not fit, are
     refused."""
@@ -737,6 +753,7 @@ def test_joint_draws_in_a_file_and_in_a_design(tmp_path):
         ij.joint_normal([1.0, 2.0], [1.0, 2.0], "g")
 
 
+@pytest.mark.slow
 def test_the_command_line_identifies_and_writes_what_it_found(tmp_path, capsys):
     out = tmp_path / "known"
     assert (
@@ -846,6 +863,7 @@ def test_friction_is_free_where_a_joint_turns_round_and_nowhere_else(scenario, l
     )
 
 
+@pytest.mark.slow
 def test_one_joint_of_seven_that_is_mounted_the_other_way_is_named():
     """The last joint of an arm has a small part of the torques: its sign is told all the same."""
     scenario = ij.with_parts(ij.presets.iiwa14(payload=0.0), disturbance=ij.disturbances.Nothing())

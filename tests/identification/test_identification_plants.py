@@ -8,6 +8,7 @@ import pytest
 import iblf_jax as ij
 
 
+@pytest.mark.slow
 def test_a_plant_that_is_no_robot_is_refused_with_the_remedy():
     scenario = loops_of_plants.flexible_joint()
     with pytest.raises(ValueError, match=r"scenario\.plant: got 'FlexibleJoint'.*plant\.robot"):

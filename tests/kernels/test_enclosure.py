@@ -221,6 +221,7 @@ def test_primitives_of_intervals():
     assert above.tolist() == [[1, -1, 3, 1, 1, 1, 2, 2, 1], [1, -1, 3, 1, 2, 2, 1, 2, -1]]
 
 
+@pytest.mark.slow
 def test_primitives_are_the_identity_on_numbers():
     def function(x):
         return upper(x) * lower(x[::-1]) + hull(x, 2.0 * x) + meet(x, 0.0) + with_sign(x, 1.0)
@@ -331,6 +332,7 @@ def check_random_expressions(seed: int, expressions: int) -> int:
     return compared
 
 
+@pytest.mark.slow
 def test_random_expressions():
     assert check_random_expressions(0, 200) > 800
 

@@ -122,6 +122,7 @@ def test_a_small_program_is_not_kept(folder, monkeypatch):
     assert list(folder.glob("*.program")) == []
 
 
+@pytest.mark.slow
 def test_steps_of_this_package_are_kept(folder):
     """Every parameter of their primitives that the lowering reads has a text."""
     sensor = ij.sensors.Encoder(

@@ -186,6 +186,7 @@ def numbers(leaves) -> list:
     return [x for leaf in leaves for x in np.asarray(leaf).ravel()]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("family", "name"), MEMBERS, ids=[f"{f}-{n}" for f, n in MEMBERS])
 def test_every_member_lowers_and_its_program_is_its_step(family, name, monkeypatch):
     scenario = canonical(with_member(family, name, getattr(ij, family).MEMBERS[name]))
@@ -505,6 +506,7 @@ class _Odd(ij.observers.NoObserver):
         return jnp.sort(q) * 0
 
 
+@pytest.mark.slow
 def test_a_step_that_does_not_lower_runs_on_vmap_and_says_so():
     scenario = canonical(dataclasses.replace(PRESET, observer=_Odd()))
     varied = {"plant.mass[1]": jnp.asarray([0.8, 0.9])}

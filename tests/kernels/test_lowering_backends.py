@@ -74,6 +74,7 @@ def assert_same(found, expected, tolerance):
         np.testing.assert_allclose(x, y, rtol=0, atol=tolerance * scale)
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
 def test_native_agrees_with_the_reference(dtype):
@@ -100,6 +101,7 @@ def recorded_steps():
     return steps, values, jax.jit(partial(steps, loops.scan))(values)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("family", ["g++", "clang++", "ziglang"])
 def test_every_compiler_gives_the_same_numbers(tmp_path, monkeypatch, recorded_steps, family):
     """Flags and pragmas suit GCC and Clang; the compilers optimise here, as a user's do."""
@@ -242,6 +244,7 @@ def test_one_run_and_threads():
     )
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize("runs", [1, 3, 64, 65, 200])
 @pytest.mark.parametrize("dtype", ["float32", "float64"])

@@ -150,6 +150,7 @@ def test_a_batch_agrees_with_the_reference(dtype, runs_here):
     np.testing.assert_array_equal(found.status, expected.status)
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_runs_that_fail_have_the_reference_s_status_and_touch_no_other(runs_here):
     values = spoiled(37)
@@ -226,6 +227,7 @@ def test_every_run_has_its_own_jump(runs_here, paper, dtype):
         np.testing.assert_allclose(found[name], expected[name], rtol=rtol, err_msg=name)
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize(
     "case", ["user class", pytest.param("flexible joint", marks=pytest.mark.slow)]
@@ -329,6 +331,7 @@ def test_angles_that_become_far_within_a_later_launch(runs_here, monkeypatch):
     np.testing.assert_allclose(found[2], np.sum(np.sin(angles), axis=0), rtol=1e-13)
 
 
+@pytest.mark.slow
 @needs_a_cpu
 @needs_compiler
 def test_the_image_is_loaded_once_and_launched_for_some_steps_at_a_time(paper, monkeypatch):
@@ -435,6 +438,7 @@ def test_auto_on_a_gpu_without_nvrtc_runs_on_vmap(monkeypatch):
     assert registry.default_backend() == ("gpu", None)
 
 
+@pytest.mark.slow
 @needs_a_cpu
 @needs_compiler
 def test_the_default_device_decides_on_a_machine_with_a_gpu(paper, monkeypatch):
@@ -492,6 +496,7 @@ def test_nvrtc_compiles_the_kernel(architecture, dtype, paper):
     assert nvrtc.compiled(text, architecture) == image
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("nvcc") is None, reason="no nvcc")
 def test_the_paper_s_step_stays_in_registers(paper, tmp_path):
     program, shared, lane, _ = step_of(paper, draws(2), method="rk4", dtype="float32")

@@ -746,6 +746,7 @@ BUILD = (
 )
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_two_processes_build_at_once_and_one_is_killed(cache, tmp_path, monkeypatch):
     """Both get the kernel; of a third that is killed while it compiles nothing stays."""

@@ -143,6 +143,7 @@ def test_runs_of_different_length_and_record_share_one_time_axis():
     assert lines_of(axes, "reference $q_d$")[0].get_xdata()[-1] == pytest.approx(6.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [1, 4, 7])
 def test_every_figure_scales_to_n_joints(n):
     run = made_up(chain(n))
@@ -170,6 +171,7 @@ def test_the_overview_names_units_and_status(runs):
     assert runs["k1=2"].plot(title="mine").get_suptitle().startswith("mine")
 
 
+@pytest.mark.slow
 def test_a_failed_run_is_named_cut_and_does_not_flatten_the_others():
     good, bad = made_up(chain(2)), runaway(chain(2))
     runs = {"good": good, "bad": bad}
@@ -193,6 +195,7 @@ def test_a_failed_run_is_named_cut_and_does_not_flatten_the_others():
     assert np.ptp(only) < 1e3
 
 
+@pytest.mark.slow
 def test_a_run_without_one_finite_number_still_gives_a_figure():
     run = made_up(chain(2), status=int(ij.Status.NOT_FINITE))
     run = jax.tree.map(lambda x: x * jnp.nan if x.ndim == 2 else x, run)
@@ -200,6 +203,7 @@ def test_a_run_without_one_finite_number_still_gives_a_figure():
     drawn(plotting.joint(run))
 
 
+@pytest.mark.slow
 def test_a_run_of_one_sample_is_drawn():
     run = jax.tree.map(lambda x: x[:1] if jnp.ndim(x) else x, made_up(chain(2)))
     plotting.paper_figures(run)
@@ -267,6 +271,7 @@ def colours_of(figure):
     return {to_hex(text.get_color()) for text in texts}
 
 
+@pytest.mark.slow
 def test_figures_follow_the_user_s_style(runs):
     with matplotlib.rc_context(
         matplotlib.style.library["dark_background"] | {"font.size": 16.0, "lines.linewidth": 3.0}
@@ -293,6 +298,7 @@ def test_figures_follow_the_user_s_style(runs):
     assert to_hex(lines_of(axes, "k1=4")[0].get_color()) == _style.COLOURS[1].lower()
 
 
+@pytest.mark.slow
 def test_joints_have_the_names_of_the_robot_s_file(tmp_path):
     plant = Arm3D(3)
     plant.joints = ("base_yaw", "_hidden", "cost$5$")
@@ -321,6 +327,7 @@ def test_a_spike_is_cut_and_named():
         assert np.ptp(axes.get_ylim()) < 60
 
 
+@pytest.mark.slow
 def test_no_row_has_a_panel_alone_and_no_labels_meet():
     assert [_style.row_sizes(n, 4) for n in (1, 4, 5, 9, 13)] == [
         [1],
@@ -361,6 +368,7 @@ def test_a_wrapped_label_keeps_its_words_and_formulas(words):
     assert all(len(line) <= 9 or "$" in line for line in lines)
 
 
+@pytest.mark.slow
 def test_the_package_loads_no_matplotlib_until_something_is_drawn():
     code = "import sys, iblf_jax; assert 'matplotlib' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -43,6 +43,7 @@ def line_of(axes, label):
     return next(line for line in axes.get_lines() if line.get_label() == label)
 
 
+@pytest.mark.slow
 def test_the_overview_has_a_row_for_every_level(run):
     labels = labels_of(run.plot())
     assert labels[:3] == ["angle $x_1$ [rad]", "speed $x_2$ [rad/s]", "current $x_{3}$ [A]"]
@@ -63,6 +64,7 @@ def test_a_level_is_drawn_with_its_bounds_and_virtual_control(run):
     assert high > 20.0
 
 
+@pytest.mark.slow
 def test_regions_are_named_by_the_robot_inside_a_plant(flexible_run):
     scenario = flexible_run.scenario
     wall = ij.regions.HalfSpace(normal=[1.0, 0.0], offset=-0.1)
@@ -76,6 +78,7 @@ def test_regions_are_named_by_the_robot_inside_a_plant(flexible_run):
     assert any("the tip" in label for label in labels), labels
 
 
+@pytest.mark.slow
 def test_a_level_without_bounds_shows_none_and_keeps_its_virtual_control_in_view():
     law = ij.controllers.BarrierBackstepping(k=(3.0, 10.0, 30.0))
     only_third = pendulum(controller=law, state_bounds=(None, symmetric(20.0)))
@@ -87,6 +90,7 @@ def test_a_level_without_bounds_shows_none_and_keeps_its_virtual_control_in_view
     assert high > np.max(guide)
 
 
+@pytest.mark.slow
 def test_components_of_different_units_have_labels_of_their_own(body_run):
     labels = labels_of(body_run.plot())
     assert labels[:3] == ["pose $x_1$ [m]", "pose $x_1$ [m]", "pose $x_1$ [rad]"]
@@ -112,6 +116,7 @@ def test_figures_have_the_names_and_units_of_the_plant(run, body_run):
     assert labels_of(plotting.tube(body()))[2] == "heading\n$x_1$ [rad]"
 
 
+@pytest.mark.slow
 def test_levels_of_plants_of_different_orders_are_refused(run, body_run):
     one = pendulum(plant=ij.plants.StrictFeedback(_rows, _ones, n=1, order=2), **_ORDER_2)
     other = ij.simulate(one, duration=0.1, dt=1e-3)
@@ -157,6 +162,7 @@ def test_a_plant_with_an_outline_is_animated_and_drawn_along_its_path(body_run, 
     assert np.allclose(triangles[0].get_xydata()[:3], start, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_flexible_arm_is_animated_with_its_motors(flexible_run, tmp_path):
     from iblf_jax.plotting._arm import Scene, motions_of
 
@@ -176,6 +182,7 @@ def test_a_plant_without_a_shape_is_refused(run, tmp_path):
             draw(run)
 
 
+@pytest.mark.slow
 def test_reports_show_levels_with_their_units(run, tmp_path):
     text = ij.report(run, tmp_path / "run.html").read_text()
     assert "rad/s; rad/s^2; A/s" in text
@@ -185,6 +192,7 @@ def test_reports_show_levels_with_their_units(run, tmp_path):
     assert "1 components: pendulum" in scenario
 
 
+@pytest.mark.slow
 def test_a_sweep_reduces_a_metric_of_levels_to_the_worst_one():
     points = {"controller.k[2]": [20.0, 30.0], "initial.x[2][0]": [0.0, 10.0]}
     data = ij.sweep(pendulum(), points, duration=0.1, dt=1e-3)

@@ -28,6 +28,7 @@ def drawn(figure):
     return figure
 
 
+@pytest.mark.slow
 def test_study_at_a_glance(study):
     figure = drawn(study.plot(runs=256))
     assert len(figure.axes) == 2 + 1 + 3
@@ -44,6 +45,7 @@ def test_bands_are_the_quantiles(study):
     assert "5 to 95 %" in [text.get_text() for text in figure.legends[0].get_texts()]
 
 
+@pytest.mark.slow
 def test_histograms_count_every_run(study):
     figure = drawn(plotting.histograms(study, ["margin", "first_violation_time"]))
     counted = sum(patch.get_height() for patch in figure.axes[0].patches)
@@ -60,6 +62,7 @@ def test_scatter_shows_the_correlation(study):
     assert figure.axes[0].get_title() == f"rank correlation {rho:.2f}"
 
 
+@pytest.mark.slow
 def test_heat_maps_stand_side_by_side(table):
     figure = drawn(plotting.heat_map(table, ["violated", "margin"]))
     shares, margins = (

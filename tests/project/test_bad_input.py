@@ -810,6 +810,7 @@ def test_a_second_call_warns_again_and_what_is_muted_does_not_count(monkeypatch)
     assert len(caught) == 1
 
 
+@pytest.mark.slow
 def test_a_warning_shows_no_line_of_the_package(tmp_path):
     """In a process of its own, as a user sees it: the text is there once, with the user's line
     below."""
@@ -872,6 +873,7 @@ def test_the_article_of_a_noun(noun, expected):
     assert checks.with_article(noun) == expected
 
 
+@pytest.mark.slow
 def test_no_message_has_a_fixed_article_before_a_name_that_varies():
     """An f-string with "a " or "an " right before a value, unless the value is one of those words
     that are known."""

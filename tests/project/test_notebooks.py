@@ -14,7 +14,8 @@ import build
 FOLDER = ROOT / "notebooks"
 
 
-@pytest.mark.slow
+@pytest.mark.site
+@pytest.mark.usefixtures("optimised_kernels")
 @pytest.mark.parametrize("name", sorted(path.name for path in FOLDER.glob("*.ipynb")))
 def test_notebook_runs(name, tmp_path):
     notebook = build.execute(FOLDER / name, tmp_path)

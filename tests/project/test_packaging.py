@@ -92,6 +92,7 @@ def test_the_tests_run_on_every_python_with_and_without_extras():
     assert all_extras <= set(PROJECT["optional-dependencies"])
 
 
+@pytest.mark.slow
 def test_every_import_is_declared():
     sources = [path.read_text(encoding="utf-8") for path in (ROOT / "iblf_jax").rglob("*.py")]
     distributions = {

@@ -316,6 +316,7 @@ def test_version_is_the_packages():
     assert ij.__version__ == version("iblf_jax")
 
 
+@pytest.mark.slow
 def test_import_is_light_and_leaves_the_session_alone():
     """In a process of its own: nothing heavy beyond what jax loads, no array made, x64 and the
     cache as they were."""

@@ -114,6 +114,7 @@ def finite(tree) -> bool:
     return all(np.all(np.isfinite(x)) for x in jax.tree.leaves(tree))
 
 
+@pytest.mark.slow
 @many
 @given(member=st.sampled_from(MEMBERS), data=st.data(), value=ANYTHING)
 def test_constructors(member, data, value):
@@ -130,6 +131,7 @@ def test_constructors(member, data, value):
             assert np.issubdtype(getattr(made, field.name).dtype, np.floating)
 
 
+@pytest.mark.slow
 @many
 @given(
     name=st.sampled_from([f.name for f in dataclasses.fields(ij.Scenario)]),
@@ -201,6 +203,7 @@ def test_parse_and_get(paper, path):
     assert value is None or np.all(np.isfinite(value))
 
 
+@pytest.mark.slow
 @many
 @given(path=PATHLIKE.filter(lambda p: isinstance(p, str)), value=ANYTHING)
 def test_with_parameters(paper, path, value):
@@ -227,6 +230,7 @@ def entered(*args, **options):
     raise Entered
 
 
+@pytest.mark.slow
 @many
 @given(data=st.data(), value=ANYTHING)
 def test_arguments_of_simulate(paper, data, value):

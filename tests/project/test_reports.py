@@ -44,6 +44,7 @@ SAYS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", SAYS)
 def test_a_card_has_words_a_table_and_a_picture(results, kind):
     result = results[kind]
@@ -55,6 +56,7 @@ def test_a_card_has_words_a_table_and_a_picture(results, kind):
         assert words in text, words
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", SAYS)
 def test_a_page_needs_nothing_else(results, kind, tmp_path):
     result = results[kind]
@@ -152,6 +154,7 @@ def test_the_page_of_a_tuning_begins_with_its_report(results):
     assert "TuneResult(" not in rest[-1]
 
 
+@pytest.mark.slow
 def test_names_from_files_are_escaped(tmp_path):
     names = ("<script>alert(1)</script>", '"><img src=x>')
     robot = arm_cases.random_arm(2, seed=3, prismatic=0.0, joints=names)

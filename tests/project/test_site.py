@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import run_page
@@ -34,9 +35,18 @@ PAGES = [
 """Every page with Python: README, CONTRIBUTING and what is beside them, and the documentation."""
 ELSEWHERE = {"other_solvers"}
 """`test_vector_field` runs the page about other solvers, which needs a library of theirs."""
+FIRST = {"README", "start"}
+"""Every run of CI has these pages."""
 LONG = {"guide", "tune_my_robot"}
 """They take more than a minute of a processor each and run before a release. The other pages are
 the short forms of the guide; a notebook goes from the paper to a tuned robot."""
+
+
+def mark_of(page: Path) -> pytest.MarkDecorator:
+    """The mark of the test that runs a page."""
+    if page.stem in LONG:
+        return pytest.mark.release
+    return pytest.mark.site if page.stem in FIRST else pytest.mark.slow
 
 
 def test_there_are_examples():
@@ -44,7 +54,8 @@ def test_there_are_examples():
     assert len(gallery.REPRODUCTIONS) >= 5
 
 
-@pytest.mark.slow
+@pytest.mark.site
+@pytest.mark.usefixtures("optimised_kernels")
 @pytest.mark.parametrize("script", gallery.PAGES, ids=lambda script: script.stem)
 def test_a_script_of_the_gallery_makes_its_page(script):
     pictures = gallery.page(script)
@@ -70,13 +81,10 @@ def test_every_name_on_a_page_exists(page):
     assert not unknown, f"{page.name} names {unknown}, which iblf_jax does not have"
 
 
+@pytest.mark.usefixtures("optimised_kernels")
 @pytest.mark.parametrize(
     "page",
-    [
-        pytest.param(page, marks=pytest.mark.release if page.stem in LONG else pytest.mark.slow)
-        for page in PAGES
-        if page.stem not in ELSEWHERE
-    ],
+    [pytest.param(page, marks=mark_of(page)) for page in PAGES if page.stem not in ELSEWHERE],
     ids=lambda page: page.stem,
 )
 def test_every_block_of_a_page_runs_in_a_process_of_its_own(page, tmp_path):
@@ -129,7 +137,7 @@ def test_every_flag_has_a_section():
     assert {flag.name for flag in ij.Status if flag} == set(flags.CASES)
 
 
-@pytest.mark.slow
+@pytest.mark.site
 @pytest.mark.parametrize("name", flags.CASES)
 def test_a_run_raises_its_flag(name):
     assert f"## {name}" in flags.section(name)

@@ -54,6 +54,7 @@ def test_the_testers_own_flags_come_last():
 )
 def test_the_same_as_users_compile(what):
     plain = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
+    plain.pop("TEST_PART", None)
     names = [str(ROOT / "tests" / name) for name in (SETTINGS, *AGAIN[what])]
     command = [
         sys.executable,
@@ -77,3 +78,25 @@ def test_the_same_as_users_compile(what):
     )
     assert done.returncode == 0, done.stdout[-3000:]
     assert f"{len(names)} passed" in done.stdout
+
+
+def slow_tests(part: str) -> set[str]:
+    """The slow tests of a file that a run with this TEST_PART has."""
+    command = [sys.executable, "-m", "pytest", "--collect-only", "-n", "0", "-m", "slow"]
+    env = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
+    done = subprocess.run(
+        [*command, str(ROOT / "tests" / "control" / "test_laws.py")],
+        cwd=ROOT,
+        env=env | {"TEST_PART": part},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return {line for line in done.stdout.splitlines() if "::" in line}
+
+
+@pytest.mark.slow
+def test_the_parts_of_the_slow_tests_are_disjoint_and_complete():
+    every, first, second = slow_tests(""), slow_tests("0/2"), slow_tests("1/2")
+    assert first and second and not first & second
+    assert first | second == every

@@ -98,6 +98,7 @@ def level_and_rate(scenario, weight):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", each({"integral"}))
 def test_rate_is_that_of_the_closed_loop_from_the_scenario_of_a_point(name):
     scenario, parameters = LOOPS[name]()
@@ -126,6 +127,7 @@ def coordinates_of(point, n):
     return np.array([point[0], *theta, psi, *phi, *point[1 + 3 * n :], *np.sign(s[:n]), 0.0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", each({"pendulum"}))
 def test_bound_over_boxes_is_above_the_rate_of_their_points(name):
     scenario, parameters = LOOPS[name]()
@@ -145,6 +147,7 @@ def test_bound_over_boxes_is_above_the_rate_of_their_points(name):
     assert np.nanmin((bounds.min(1) - rate) / np.abs(rate)) < 0.1
 
 
+@pytest.mark.slow
 def test_search_proves_a_pendulum_and_not_one_whose_observer_is_slow():
     problem = arm_problem(chain_loop(1), {"plant.mass": ij.factor(ij.interval(0.95, 1.05))})
     box = {"patterns": problem.patterns, "progress": False, "threads": 1}
@@ -158,6 +161,7 @@ def test_search_proves_a_pendulum_and_not_one_whose_observer_is_slow():
     assert problem.rate(problem.sample(0, 2000), weak).max() > 0
 
 
+@pytest.mark.slow
 def test_rate_of_a_further_disturbance_enters_at_its_corners():
     scenario = chain_loop(1)
     problem = arm_problem(scenario, {}, disturbance_rate=2.0)

@@ -24,6 +24,7 @@ WEIGHT, LEVEL = 2e-3, 0.8
 Mapping, Quadratic = ij.barriers.Mapping, ij.barriers.Quadratic
 
 
+@pytest.mark.slow
 def test_entries_with_one_value_differ_from_the_model_at_the_reference_value():
     """At the reference value, the mass of 2, the inertia of 0.06 becomes 2."""
     together = {"plant.mass, plant.inertia": ij.value(ij.interval(1.99, 2.01))}
@@ -36,6 +37,7 @@ def test_entries_with_one_value_differ_from_the_model_at_the_reference_value():
     assert np.all(bounds >= rate[:, None] - 1e-9 * np.abs(rate[:, None]))
 
 
+@pytest.mark.slow
 def test_levels_of_a_disturbance_with_one_value_differ_from_what_is_known():
     waves = ij.disturbances.Sinusoids(0.3, 2.0, 0.5, 0.1)
     scenario = lever(disturbance=ij.disturbances.Levels((None, waves)))
@@ -59,6 +61,7 @@ def narrow_between_samples():
     )
 
 
+@pytest.mark.slow
 def test_the_guard_is_examined_between_the_sampled_instants():
     problem = arm_problem(narrow_between_samples(), {}, duration=1023 * 2 * np.pi)
     constants = problem.constants(WEIGHT, 0.2)
@@ -180,6 +183,7 @@ def test_a_mass_matrix_that_is_singular_inside_the_box_is_not_proved():
     assert not search(problem.bound, low, high, constants, **box).proved
 
 
+@pytest.mark.slow
 def test_nothing_is_claimed_about_bounds_without_a_barrier():
     claimed = chain_problem(lever(), within(0.1, *LEVER)).assumptions
     assert not any("Nothing is claimed" in sentence for sentence in claimed)

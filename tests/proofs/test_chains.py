@@ -131,6 +131,7 @@ LEVERS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LEVERS)
 def test_rate_of_v_is_that_of_the_closed_loop(name):
     check_points(LEVERS[name], within(0.2, *LEVER), 0.3)
@@ -190,6 +191,7 @@ def check_bounds(scenario, parameters, level):
     assert np.median(bounds[narrow] - rates[narrow]) < 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LEVERS)
 def test_bounds_are_above_the_points_of_their_boxes(name):
     check_bounds(LEVERS[name], within(0.1, *LEVER), 0.3)
@@ -215,6 +217,7 @@ def proved(problem, weight, level, max_boxes):
     return found, problem.rate(problem.sample(3, 20_000), constants).max()
 
 
+@pytest.mark.slow
 def test_lever_with_uncertain_parameters_is_proved():
     found, largest = proved(chain_problem(lever(), within(0.05, *LEVER)), 1.0, 0.3, 3_000_000)
     assert found.proved

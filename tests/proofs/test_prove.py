@@ -56,6 +56,7 @@ def contradictions(found, count, duration=None):
     return int(np.sum(failed))
 
 
+@pytest.mark.slow
 def test_a_proof_says_what_it_proves():
     found = proof()
     assert found.verdict == Verdict.PROVED and found.proved
@@ -74,6 +75,7 @@ def test_the_tube_is_where_the_barrier_has_the_level():
     assert np.all(found.tube.upper < found.tube.upper_bound)
 
 
+@pytest.mark.slow
 def test_nothing_contradicts_a_proof():
     found = proof()
     assert largest_rate(found, 10_000) < 0.0
@@ -93,6 +95,7 @@ def test_a_proof_is_repeatable():
     assert (a.weight, a.boxes, a.rates) == (b.weight, b.boxes, b.rates)
 
 
+@pytest.mark.slow
 def test_every_weight_has_a_point_that_refutes_the_lyapunov_function():
     found = proof(K2=20.0, kf=20.0, percent=20.0)
     assert found.verdict == Verdict.NOT_PROVED and found.seconds < 60.0
@@ -103,6 +106,7 @@ def test_every_weight_has_a_point_that_refutes_the_lyapunov_function():
         found.replay()
 
 
+@pytest.mark.slow
 def test_a_run_that_leaves_the_bounds_refutes_them():
     found = ij.prove(
         pendulum(K2=20.0, kf=20.0),
@@ -120,6 +124,7 @@ def test_a_run_that_leaves_the_bounds_refutes_them():
     assert "replay() returns it" in repr(found)
 
 
+@pytest.mark.slow
 def test_a_small_budget_leaves_it_undecided():
     found = proof(K2=20.0, kf=20.0, percent=WIDE, max_boxes=2_000)
     assert found.verdict == Verdict.UNDECIDED
@@ -158,6 +163,7 @@ def test_a_given_weight_is_the_only_one():
     assert found.proved and list(found.rates) == [2e-3]
 
 
+@pytest.mark.slow
 def test_the_largest_level_and_box_are_proved_next_to_what_is_not():
     common = {"accuracy": 0.5, "max_boxes": 30_000, "progress": False, "weight": 2e-3}
     found = ij.largest_level(
@@ -254,6 +260,7 @@ def test_the_parameters_of_the_command():
             perturbations([word])
 
 
+@pytest.mark.slow
 def test_gains_for_a_guarantee_are_proved():
     found = ij.gains_for_guarantee(
         pendulum(K2=20.0, kf=20.0),

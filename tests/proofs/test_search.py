@@ -35,6 +35,7 @@ def waves(x, c):
     return (cosine - 0.1 * jnp.sum(x**2) + c[0])[None], NOWHERE
 
 
+@pytest.mark.slow
 def test_a_negative_function_is_proved():
     found = search(waves, LOW, HIGH, [-1.01], progress=False)
     assert found.proved and found.status == "proved"
@@ -145,6 +146,7 @@ def test_the_number_of_boxes_is_limited():
     assert few.status == "out of boxes" and few.boxes < 1000
 
 
+@pytest.mark.slow
 def test_proved_statements_hold_at_random_points():
     points = np.random.default_rng(0).uniform(LOW, HIGH, (10_000, 3))
     for constant in (-1.2, -1.05, -1.01, -0.99, -0.95):
@@ -154,6 +156,7 @@ def test_proved_statements_hold_at_random_points():
         assert found.proved == (constant < -1)
 
 
+@pytest.mark.slow
 def test_an_interrupted_proof_continues(tmp_path, monkeypatch):
     """After an interruption the search needs no proved unit again, and gives the same count."""
     path = tmp_path / "proof.npz"

@@ -106,6 +106,7 @@ def test_other_numbers_against_scipy(seed, law, reading):
         ), name
 
 
+@pytest.mark.slow
 def test_the_independent_program_reproduces_the_reference_data(reference_data):
     """So that the two second opinions are one."""
     times = reference_data["t"][:51]

@@ -66,6 +66,7 @@ def against_the_independent_program(scenario, expected):
     return run
 
 
+@pytest.mark.slow
 def test_a_chain_of_order_three_is_that_of_the_independent_program():
     case = free_case()
     expected = other.triggered_chain(case, PERIOD, 0.01, 0.002, count=250)
@@ -123,6 +124,7 @@ def test_the_compensation_bounds_what_a_held_command_adds(rng):
     assert np.max(grows / epsilon) > TANH_GAP
 
 
+@pytest.mark.slow
 def test_a_threshold_of_zero_sends_every_command_that_changes():
     always = ij.with_parts(PAPER, sampling=ij.Sampling(1e-3, trigger=ij.EventTrigger()))
     run = ij.simulate(always, duration=0.2, dt=1e-3)
@@ -131,6 +133,7 @@ def test_a_threshold_of_zero_sends_every_command_that_changes():
     assert float(run.metrics.event_count) == 201
 
 
+@pytest.mark.slow
 def test_a_command_that_is_not_finite_is_not_held():
     """A run whose law computes NaN stops with a trigger as it does without one."""
 
@@ -177,6 +180,7 @@ def test_commands_are_held_within_the_threshold():
         assert np.all(np.abs(wanted - tau[k]) <= threshold)
 
 
+@pytest.mark.slow
 def test_a_run_of_a_batch_is_the_run_alone():
     perturbations = {"plant.mass": ij.factor(ij.uniform(0.9, 1.1))}
     study = ij.monte_carlo(TRIGGERED, perturbations, runs=4, duration=0.2, dt=1e-3, progress=False)
@@ -185,6 +189,7 @@ def test_a_run_of_a_batch_is_the_run_alone():
     assert len(set(np.asarray(study.metrics["event_count"]).tolist())) > 1
 
 
+@pytest.mark.slow
 def test_the_derivative_of_a_held_command():
     """Between the instants of events a run is smooth in a gain."""
 
@@ -224,6 +229,7 @@ def test_a_law_without_a_lyapunov_function_has_no_compensation():
         ij.simulate(ij.with_parts(PAPER, controller=law), duration=0.1, dt=1e-3)
 
 
+@pytest.mark.slow
 def test_a_certificate_says_that_the_compensation_changes_the_input():
     law = controllers.EventCompensated(
         TRIGGERED.controller, relative=0.1, absolute=0.4, epsilon=0.5

@@ -52,6 +52,7 @@ def simulated(scenario, duration=0.5):
 # --- sensors of levels ----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_current_sensor_in_the_loop():
     """Its readings differ from the current by the noise alone, and q comes in counts."""
     law = ij.controllers.WithDrive(ij.controllers.PDGravity(Kp=9.0, Kd=1.0), drive=DRIVE)
@@ -221,6 +222,7 @@ def test_the_reported_noise_is_that_of_the_estimate():
     assert 0.8 < jitter < 1.2
 
 
+@pytest.mark.slow
 def test_a_count_of_a_level_moves_the_command():
     """`tuning.ranges`: the step of the command by a count of the encoder and by a step of the
     current sensor, against differences."""

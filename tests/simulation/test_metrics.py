@@ -67,6 +67,7 @@ def test_every_metric_has_a_unit(short_run):
     assert set(short_run.metrics.units) == set(short_run.metrics)
 
 
+@pytest.mark.slow
 def test_settling_and_overshoot(paper_run, short_run):
     """On a run that settles, and on one that ends outside."""
     metrics = ij.simulate(paper_run.scenario, duration=20.0, dt=1e-3, record_every=10).metrics
@@ -195,6 +196,7 @@ INTEGRALS = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "loop", [x if x in QUICK else pytest.param(x, marks=pytest.mark.slow) for x in LOOPS]
 )
@@ -225,6 +227,7 @@ def test_integrals_are_of_second_order(loop):
         assert errors[1] < 1e-7 or np.log2(errors[0] / errors[1]) / 2 > 1.9, (name, errors)
 
 
+@pytest.mark.slow
 def test_one_definition_serves_runs_batches_and_losses():
     """A disturbance that jumps within a step, under a sampled law: the numbers of a run, a batch
     and a loss are the same."""

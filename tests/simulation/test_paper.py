@@ -55,6 +55,7 @@ def test_torque_at_half_a_millisecond(reference_data, law, reading):
     assert largest(run.q, ref["q"]) <= 1e-8
 
 
+@pytest.mark.slow
 @both
 def test_float32(reference_data, law, reading):
     scenario = ij.astype(ij.presets.zhang_yan_2024(law=law, reading=reading), "float32")

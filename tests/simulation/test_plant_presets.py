@@ -30,6 +30,7 @@ LARGEST_INPUT = {
 """[V], [V], [N m], [N, N, N m], and the torque limits of the iiwa 14 [N m]."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [pytest.param(x, marks=pytest.mark.release) if "iiwa" in x else x for x in RUNS]
 )

@@ -102,6 +102,7 @@ def test_a_robot_has_no_stacked_levels():
     assert not [path for path in paths if path.startswith("initial.x")]
 
 
+@pytest.mark.slow
 def test_metrics_have_the_units_of_the_plant(pendulum_run, body_run):
     units = pendulum_run.metrics.units
     assert units["ise"] == "rad^2 s"
@@ -142,6 +143,7 @@ def test_margins_of_all_levels(pendulum_run):
     assert metrics.first_level_violation_level == -1
 
 
+@pytest.mark.slow
 def test_the_violated_level_and_its_first_time():
     plain = ij.controllers.BarrierBackstepping(k=(3.0, 10.0, 30.0))
     bounds = ij.Bounds(lower=ij.bounds.Constant(-2.0), upper=ij.bounds.Constant(2.0))
@@ -157,6 +159,7 @@ def test_the_violated_level_and_its_first_time():
     assert run.metrics.level_margin[0, 0] == pytest.approx(2.0 - np.max(np.abs(current)))
 
 
+@pytest.mark.slow
 def test_a_law_of_robots_has_no_margin_of_higher_virtual_controls():
     robot = two_link()
     plant = ij.plants.FlexibleJoint(robot, stiffness=3e3, motor_inertia=0.02)
@@ -179,6 +182,7 @@ def test_a_law_of_robots_has_no_margin_of_higher_virtual_controls():
     assert np.all(np.isinf(run.metrics.level_margin[1]))  # level 4 has no bounds
 
 
+@pytest.mark.slow
 def test_the_input_above_gravity_is_that_of_the_plant():
     robot = two_link()
     motor = {"torque_constant": 0.5, "inductance": 0.01, "resistance": 0.5, "back_emf": 0.1}

@@ -74,6 +74,7 @@ CASES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", CASES)
 def test_trajectories_against_an_independent_program(method):
     noise, sigma = CASES[method]
@@ -144,6 +145,7 @@ def proportional_end(dW):
     return SPEED * np.exp(-RATE - 0.5 * 0.6**2 + 0.6 * dW.sum(axis=1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "noise", "exact", "order"),
     [
@@ -251,6 +253,7 @@ class EndState:
         return {"end_q": acc[0], "end_dq": acc[1]}
 
 
+@pytest.mark.slow
 def test_moments_of_an_ornstein_uhlenbeck_process(study):
     a, b, sigma = 0.5 / INERTIA, 0.6 / INERTIA, INTENSITY
     exact = np.array([sigma**2 / (2 * a * b), sigma**2 / (2 * a)])
@@ -267,6 +270,7 @@ def test_runs_do_not_depend_on_chunks_or_the_number_of_runs(study):
     assert np.unique(study.metrics["end_q"]).size == len(study)
 
 
+@pytest.mark.slow
 def test_first_exit(study):
     found = study.first_exit(joint=0, instants=9)
     times = np.asarray(study.metrics["first_exit_time"])[:, 0]
@@ -317,6 +321,7 @@ def test_first_exit_names_the_missing_metric(study, joint, metric):
 # --- derivatives, files, certificates, refusals ---------------------------------------------------
 
 
+@pytest.mark.slow
 def test_pathwise_derivative_by_the_intensity():
     scenario = link(process_noise.Additive([[0.7]]))
 
@@ -339,6 +344,7 @@ def test_a_file_gives_the_noise_back():
     assert (noise.levels, noise.substeps) == ((1,), 2)
 
 
+@pytest.mark.slow
 def test_a_certificate_claims_nothing_under_noise():
     scenario = ij.with_parts(ij.presets.zhang_yan_2024(), process_noise=process_noise.Additive(0.2))
     certificate = ij.certify(scenario, duration=0.05, dt=1e-3, method="stochastic_heun")

@@ -173,6 +173,7 @@ def test_a_disturbance_that_jumps_between_samples_is_that_of_an_independent_prog
     assert run.ok
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay", [0.0, 1e-3, 2e-3])
 def test_a_sampled_loop_is_that_of_an_independent_program(delay):
     agree(
@@ -184,6 +185,7 @@ def test_a_sampled_loop_is_that_of_an_independent_program(delay):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay", [7e-4, 2.7e-3])
 def test_a_delay_may_be_of_any_length(delay):
     agree(
@@ -194,6 +196,7 @@ def test_a_delay_may_be_of_any_length(delay):
     )
 
 
+@pytest.mark.slow
 def test_an_encoder_and_a_lag_are_those_of_an_independent_program():
     actuator = ij.actuators.Motor(bandwidth=600.0)
     scenario = ij.with_parts(
@@ -204,6 +207,7 @@ def test_an_encoder_and_a_lag_are_those_of_an_independent_program():
     assert np.any(run.measured.q != run.q)
 
 
+@pytest.mark.slow
 def test_a_drive_with_limits_is_that_of_an_independent_program():
     """A limit that sets in within a step costs some accuracy."""
     run = agree(
@@ -234,6 +238,7 @@ VELOCITIES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("velocity", VELOCITIES)
 def test_batches_are_single_runs_and_backends_agree(velocity):
     sensor = ij.sensors.Encoder(counts=65536, noise=1e-5, velocity=velocity)
@@ -263,6 +268,7 @@ def test_batches_are_single_runs_and_backends_agree(velocity):
     assert np.allclose(by_scan.q, first.q, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_noise_is_white_and_normal():
     keys = jax.vmap(lambda i: noise_key(jax.random.PRNGKey(3), i))(jnp.arange(100))
     draw = jax.jit(
@@ -277,6 +283,7 @@ def test_noise_is_white_and_normal():
         assert abs(np.mean(a * b)) < far and abs(np.mean((a**2 - 1) * (b**2 - 1))) < 3 * far
 
 
+@pytest.mark.slow
 def test_derivatives_are_differences():
     sensor = ij.sensors.Encoder(noise=1e-5, velocity=ij.sensors.FilteredDifference(cutoff=700.0))
     scenario = ij.with_parts(
@@ -306,6 +313,7 @@ def test_derivatives_are_differences():
         assert np.isclose(slope, (ends[0] - ends[1]) / (2 * step), rtol=2e-4), path
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(native.unavailable() is not None, reason="no C++ compiler")
 def test_derivatives_beside_a_batch_are_those_of_every_backend():
     sensor = ij.sensors.Encoder(counts=65536, velocity=ij.sensors.FilteredDifference(cutoff=700.0))
@@ -367,6 +375,7 @@ def test_rounding_is_left_out_of_derivatives():
     assert np.array_equal(slope, [1.0, 1.0])
 
 
+@pytest.mark.slow
 def test_the_radius_is_that_of_the_map():
     """Against differences of whole periods, by an independent program of the same loop."""
     scenario = canonical(ij.with_parts(PAPER, sampling=ij.Sampling(period=2e-3, delay=1e-3)))
@@ -394,6 +403,7 @@ def test_the_radius_is_that_of_the_map():
     assert np.isclose(found, np.max(np.abs(np.linalg.eigvals(J))), rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_jacobians_at_many_states_are_those_at_each():
     """The kernel that linearizes runs gives those of `stability.jacobian`."""
     sensor = ij.sensors.Encoder(counts=65536, velocity=VELOCITIES[0])
@@ -407,6 +417,7 @@ def test_jacobians_at_many_states_are_those_at_each():
         np.testing.assert_allclose(found[k], one, rtol=1e-6, atol=1e-6 * np.max(np.abs(one)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("queue", [2, 7])
 def test_a_longer_queue_does_not_change_the_radius(queue):
     scenario = ij.with_parts(PAPER, sampling=ij.Sampling(2e-3, delay=1e-3))
@@ -415,6 +426,7 @@ def test_a_longer_queue_does_not_change_the_radius(queue):
     assert radius_at(canonical(scenario), 2e-3, times) == radius_at(canonical(longer), 2e-3, times)
 
 
+@pytest.mark.slow
 def test_what_is_sampled_too_slowly_says_so():
     fine, late, slow = (
         ij.with_parts(PAPER, sampling=ij.Sampling(period=period, delay=delay))
@@ -455,6 +467,7 @@ QUICK = ("controller.weight",)
 LAGS = ("sensor.velocity.cutoff", "actuator.bandwidth")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "limiting", [x if x in QUICK else pytest.param(x, marks=pytest.mark.slow) for x in LIMITED]
 )
@@ -485,6 +498,7 @@ def test_the_warning_names_the_one_term_that_limits_the_loop(limiting):
         assert other == limiting or radius(other, 1.5 * share) > 1, other
 
 
+@pytest.mark.slow
 def test_nothing_is_claimed_of_a_sampled_loop():
     scenario = ij.with_parts(PAPER, sampling=ij.Sampling(period=1e-3))
     certificate = ij.certify(scenario, duration=0.2, dt=1e-3)
@@ -499,6 +513,7 @@ def test_nothing_is_claimed_of_a_sampled_loop():
     assert -0.01 < certificate["margin, sampled less continuous"].value < 0.01
 
 
+@pytest.mark.slow
 def test_parts_go_through_files(tmp_path):
     scenario = ij.with_parts(
         SLOW, sampling=ij.Sampling(period=1e-3, delay=2.5e-3), sensor=ENCODER, actuator=MOTOR
@@ -542,6 +557,7 @@ def test_bad_parts_are_refused(make, words):
         make()
 
 
+@pytest.mark.slow
 def test_a_study_may_not_lengthen_the_delay_beyond_the_queue():
     scenario = ij.with_parts(SLOW, sampling=ij.Sampling(period=1e-3, delay=1e-3))
     study = ij.monte_carlo(
@@ -563,6 +579,7 @@ def test_a_study_may_not_lengthen_the_delay_beyond_the_queue():
     assert not np.any(np.asarray(study.status) & int(Status.NOT_FINITE))
 
 
+@pytest.mark.slow
 def test_tuning_hears_the_noise():
     sensor = ij.sensors.Encoder(
         counts=65536, noise=1e-5, velocity=ij.sensors.FilteredDifference(cutoff=700.0)
@@ -599,6 +616,7 @@ def test_tuning_hears_the_noise():
     )
 
 
+@pytest.mark.slow
 def test_ranges_end_where_a_count_is_more_than_the_drive_gives():
     sensor = ij.sensors.Encoder(counts=65536, velocity=ij.sensors.FilteredDifference(cutoff=700.0))
     scenario = ij.with_parts(
@@ -638,6 +656,7 @@ def test_ranges_end_where_a_count_is_more_than_the_drive_gives():
     assert layout(canonical(hopeless), gains, 1e-3, "rk4")[1].reasons[0][1] == BY_PERIOD + TOGETHER
 
 
+@pytest.mark.slow
 def test_held_torque_is_drawn_as_steps_and_measurements_beside_the_truth():
     scenario = ij.with_parts(SLOW, sampling=ij.Sampling(period=2e-3), sensor=ENCODER)
     run, driven = (
@@ -658,6 +677,7 @@ def test_held_torque_is_drawn_as_steps_and_measurements_beside_the_truth():
     )
 
 
+@pytest.mark.slow
 def test_tuning_finds_its_way_out_of_a_loop_that_is_sampled_too_slowly():
     """Where the loop grows from sample to sample its gradient points nowhere: the search begins at
     gains with which it does not."""
@@ -678,6 +698,7 @@ def test_tuning_finds_its_way_out_of_a_loop_that_is_sampled_too_slowly():
     assert not int(run.status) & int(Status.SAMPLING_TOO_SLOW)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "observer",
     [
@@ -712,6 +733,7 @@ def test_a_step_with_the_poles_forgets_as_the_observer_does_and_has_no_bias(obse
     assert poles < 1.2 * euler
 
 
+@pytest.mark.slow
 def test_a_sampled_step_is_explained():
     sensor = ij.sensors.Encoder(noise=1e-4, velocity=ij.sensors.Tracking(bandwidth=100.0))
     counts = [

@@ -20,6 +20,7 @@ def closed_loop(name: str) -> ij.Scenario:
     return chain_cases.scenario(name, observer=ij.observers.LevelObserver(other.CASES[name].kappa))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", other.CASES)
 def test_equal_to_the_independent_program(name):
     """Every fifth instant of its run: states, input, estimates and sum w_i V_i."""
@@ -45,6 +46,7 @@ def test_errors_and_uncertain_terms_of_the_levels():
     np.testing.assert_allclose(run.disturbance, d, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_a_flexible_joint_starts_at_the_equilibrium_of_its_springs():
     scenario = chain_cases.scenario(
         "flexible", initial=ij.Initial(q=other.ARM_START, dq=[0.1, 0.0])
@@ -65,6 +67,7 @@ def test_a_robot_keeps_its_bounds_of_velocities_by_either_name():
         ij.with_parts(preset, state_bounds=(limits,))
 
 
+@pytest.mark.slow
 def test_a_disturbance_of_the_first_level_of_a_robot():
     """q' = x_2 + d_1, which no torque can compensate at once."""
     drift = ij.disturbances.Levels((ij.disturbances.Sinusoids(amplitude=0.05, frequency=2.0),))
@@ -83,6 +86,7 @@ def stiff_arm(robot):
     return plants.FlexibleJoint(robot, stiffness=3000.0, motor_inertia=0.001, motor_damping=2.0)
 
 
+@pytest.mark.slow
 def test_a_rigid_law_controls_a_flexible_arm():
     """Plant and model are separate objects: the model may be the robot inside the plant."""
     preset = ij.presets.zhang_yan_2024()
@@ -97,6 +101,7 @@ def test_a_rigid_law_controls_a_flexible_arm():
     np.testing.assert_allclose(run.q[::500], expected.q, atol=0.01)
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_run_by_its_leaves():
     """By the gains, the stiffness, a weight, a bound and the start, against differences."""
     scenario = chain_cases.scenario("flexible", initial=ij.Initial(q=other.ARM_START))
@@ -116,6 +121,7 @@ def test_derivatives_of_a_run_by_its_leaves():
         np.testing.assert_allclose(found[i], expected, rtol=2e-4, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_bounds_of_a_level_are_recorded_under_every_law():
     preset = ij.presets.zhang_yan_2024()
     plant = stiff_arm(preset.plant)
@@ -130,6 +136,7 @@ def test_bounds_of_a_level_are_recorded_under_every_law():
     assert np.all(np.isinf(run.higher_upper[:, 0]))
 
 
+@pytest.mark.slow
 def test_a_law_of_order_two_is_a_law_of_robots():
     preset = ij.presets.zhang_yan_2024()
     law = controllers.BarrierBackstepping(k=(2.0, 20.0))

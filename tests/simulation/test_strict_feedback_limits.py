@@ -4,6 +4,7 @@ and fast filters.  Each is measured as an order of convergence, over runs of one
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 import iblf_jax as ij
 
@@ -49,6 +50,7 @@ def orders(errors):
     return np.log2(np.asarray(errors[:-1]) / np.asarray(errors[1:]))
 
 
+@pytest.mark.slow
 def test_a_rigid_law_on_a_drive_tends_to_the_rigid_loop_for_a_small_inductance():
     """First order in L: the current lags by L/R."""
     law = ij.controllers.Backstepping(k1=2.0, K2=5.0, o=0.1, reading="corrected")
@@ -64,6 +66,7 @@ def test_a_rigid_law_on_a_drive_tends_to_the_rigid_loop_for_a_small_inductance()
     assert np.all(np.abs(orders(errors) - 1.0) < 0.15), errors
 
 
+@pytest.mark.slow
 def test_a_rigid_law_on_stiff_joints_tends_to_the_robot_with_motors():
     """First order in 1/K, with the inertia of the motors in the model."""
     law = ij.controllers.Backstepping(k1=2.0, K2=[4.0, 0.6], o=0.1, reading="corrected")
@@ -77,6 +80,7 @@ def test_a_rigid_law_on_stiff_joints_tends_to_the_robot_with_motors():
     assert errors[-1] < 5e-4
 
 
+@pytest.mark.slow
 def test_the_loop_of_the_law_of_order_3_does_not_depend_on_the_inductance():
     law = ij.controllers.BarrierBackstepping(k=(2.0, 10.0, 40.0))
     runs = [ij.simulate(on(drive(L), law), **SHORT) for L in (0.02, 0.2)]
@@ -84,6 +88,7 @@ def test_the_loop_of_the_law_of_order_3_does_not_depend_on_the_inductance():
     assert np.max(np.abs(runs[0].tau - runs[1].tau)) > 0.1
 
 
+@pytest.mark.slow
 def test_the_law_of_order_3_tends_to_that_of_order_2_for_a_fast_current():
     """First order in 1/k3."""
     weights = np.ones((2, 2)) * [[2.0], [0.3]]
@@ -99,6 +104,7 @@ def test_the_law_of_order_3_tends_to_that_of_order_2_for_a_fast_current():
     assert errors[-1] < 5e-3
 
 
+@pytest.mark.slow
 def test_a_dynamic_surface_tends_to_the_exact_law_for_fast_filters():
     """First order in mu, without a disturbance: a filter follows the true rate of alpha, and the
     exact law computes that of its model."""

@@ -91,6 +91,7 @@ def test_scipy_agrees_with_an_independent_program(paper, reference_data):
     np.testing.assert_allclose(tau, reference_data["iblf_printed.tau"][:6], rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_rate_is_the_loops_own_with_memory_in_law_and_observer(paper):
     scenario = ij.with_parts(paper, **LAW_WITH_MEMORY)
     field = ij.vector_field(scenario)

@@ -107,6 +107,7 @@ def test_at_equal_gains_the_integral_form_works_harder_than_the_logarithmic_one(
     assert comparison.factors["log"] > 1.0
 
 
+@pytest.mark.slow
 def test_failed_runs_are_named():
     scenario = ij.presets.zhang_yan_2024()
     laws = {"good": "integral", "weak": controllers.PDGravity(Kp=0.01, Kd=0.01)}
@@ -166,6 +167,7 @@ def test_a_filter_by_name_is_around_the_unconstrained_law():
     )  # a filter is a law's own, unlike a torque limit
 
 
+@pytest.mark.slow
 def test_a_law_without_a_factor_is_said_so():
     # A limit far below what the integral form does: no gain makes this one work as hard.
     capped = controllers.Saturated(law=controllers.PDGravity(Kp=60.0, Kd=20.0), limit=[8.0, 1.0])
@@ -334,6 +336,7 @@ def wavy():
     )
 
 
+@pytest.mark.slow
 def test_the_factor_nearest_one_is_found_beyond_trials_that_fail(wavy):
     """The effort is the target's at 0.045 and at 1.28; the trials between 1.17 and 1.23 and from
     1.4 to 1.6 fail."""
@@ -350,6 +353,7 @@ def test_the_factor_nearest_one_is_found_beyond_trials_that_fail(wavy):
     )
 
 
+@pytest.mark.slow
 def test_failed_trials_are_in_the_text_and_in_the_dictionary(wavy):
     text, found = repr(wavy), wavy.searches["at 1"]
     assert "of which 1.28 is the nearest to 1" in text

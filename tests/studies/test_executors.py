@@ -49,14 +49,17 @@ class LosesWorkers(concurrent.futures.Executor):
         return future
 
 
+@pytest.mark.slow
 def test_a_study_is_bit_identical(threads):
     assert cases.same(cases.named(cases.study()), cases.named(cases.study(executor=threads)))
 
 
+@pytest.mark.slow
 def test_a_sweep_is_bit_identical(threads, table):
     assert cases.table(executor=threads).identical(table)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("writer", ["client", "worker"])
 def test_a_store_is_bit_identical_whoever_writes_it(threads, table, writer, tmp_path):
     options = ij.studies.StoreOptions(tmp_path / "sweep.zarr", cases.UNIT, writer=writer)
@@ -64,6 +67,7 @@ def test_a_store_is_bit_identical_whoever_writes_it(threads, table, writer, tmp_
     assert cases.table(store=options.path).identical(table)
 
 
+@pytest.mark.slow
 def test_sensitivity_is_bit_identical(threads):
     options = {"points": 4} | cases.options()
     here = ij.sensitivity(SCENARIO, cases.perturbations(), **options)
@@ -78,6 +82,7 @@ class KilledWorkerError(Exception):
     __module__ = "distributed.scheduler"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "error",
     [
@@ -100,6 +105,7 @@ def test_errors_of_a_task_are_the_users(threads):
         cases.study(executor=LosesWorkers(0, ValueError("from the task")))
 
 
+@pytest.mark.slow
 def test_ctrl_c_stops_after_a_unit(threads, table, tmp_path, monkeypatch):
     path, write = tmp_path / "sweep.zarr", store.Store.write
 
@@ -152,6 +158,7 @@ def test_what_is_no_executor_is_refused(wrong):
         cases.study(executor=wrong)
 
 
+@pytest.mark.slow
 def test_keyword_arguments_of_earlier_versions_still_work(table, tmp_path):
     with pytest.warns(DeprecationWarning, match=r"unit of ij.sweep.*StoreOptions"):
         old = ij.sweep(
@@ -200,6 +207,7 @@ def test_jobs_of_jax_distributed_are_deprecated(monkeypatch):
     assert issubclass(distributed.ProcessLostError, RuntimeError)
 
 
+@pytest.mark.slow
 def test_units_that_another_process_writes_are_skipped(table, tmp_path, monkeypatch):
     """A second process works on the same store while this one computes."""
     path, write, seen = tmp_path / "sweep.zarr", store.Store.write, []
@@ -246,6 +254,7 @@ def test_dask_and_a_process_pool(tmp_path):
     assert done.stdout.splitlines() == ["own law", "killed worker", "Ctrl-C", "process pool"]
 
 
+@pytest.mark.slow
 def test_importing_the_package_starts_no_device(compiled):
     """Else neither `jax.distributed.initialize` nor the number of CPU devices could come after the
     import."""

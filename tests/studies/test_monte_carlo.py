@@ -529,6 +529,7 @@ else:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["left", pytest.param("caught", marks=pytest.mark.slow)])
 def test_an_interrupted_study_ends_without_a_crash(what):
     """XLA compiles in threads of its own, which go on after Ctrl-C: the end of the interpreter

@@ -16,6 +16,7 @@ UNKNOWN = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "case", [x if x == "user class" else pytest.param(x, marks=pytest.mark.slow) for x in UNKNOWN]
 )
@@ -30,6 +31,7 @@ def test_executors_give_the_same_numbers(case):
         np.testing.assert_allclose(first, second, rtol=1e-7, atol=1e-9, err_msg=name)
 
 
+@pytest.mark.slow
 def test_a_sweep_over_a_gain_of_a_level_is_stored(tmp_path):
     pytest.importorskip("zarr")
     options = {"store": str(tmp_path / "sweep.zarr"), "progress": False, **SHORT}
@@ -40,6 +42,7 @@ def test_a_sweep_over_a_gain_of_a_level_is_stored(tmp_path):
     assert first.sizes["controller.k[2]"] == 2
 
 
+@pytest.mark.slow
 def test_a_rigid_law_is_compared_with_one_of_all_levels():
     rigid = loops_of_plants.rigid_law()
     scenario = loops_of_plants.flexible_joint(plant=rigid.plant)

@@ -103,6 +103,7 @@ def test_designs_and_vectors():
         np.testing.assert_array_equal(found["observer.kf"][:, 0], found["observer.kf"][:, 1])
 
 
+@pytest.mark.slow
 def test_vectors_in_a_grid_and_a_point_that_cannot_work():
     found = once(grid={"controller.K2": [[10.0, 20.0], [30.0, 40.0]], "initial.q": [0.8, 2.0]})
     assert found["controller.K2_values"].values.tolist() == [[10, 20], [30, 40]]
@@ -193,6 +194,7 @@ def test_another_scenario_law_or_backend_is_refused(finished):
     ), "what it ran on, not what was asked for"
 
 
+@pytest.mark.slow
 def test_a_store_of_a_backend_that_was_removed_loads(tmp_path, monkeypatch):
     """As it is; to continue it is to compute other digits, and is refused."""
     with monkeypatch.context() as patch:
@@ -528,6 +530,7 @@ def test_a_store_that_is_changed_meanwhile_is_not_written_on(tmp_path, finished,
         cases.table(store=path)
 
 
+@pytest.mark.slow
 def test_the_draft_of_a_killed_creation_is_removed_by_the_next(tmp_path, table):
     """At once, not after an hour; the store's name may hold what a pattern would mean something
     else by."""

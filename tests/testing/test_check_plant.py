@@ -43,6 +43,7 @@ def altered(**members):
     return ij.component(cls)(**values)
 
 
+@pytest.mark.slow
 def test_an_altered_copy_fits_where_nothing_is_altered():
     check_plant(altered())
 

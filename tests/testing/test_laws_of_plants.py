@@ -10,6 +10,7 @@ from iblf_jax.controllers import Command
 import iblf_jax as ij
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "case", [pytest.param("electric drive", marks=pytest.mark.release), "user functions"]
 )
@@ -18,6 +19,7 @@ def test_laws_of_plants_pass_in_their_scenario(case):
     assert ij.testing.check_law(scenario.controller, scenario=scenario) == ()
 
 
+@pytest.mark.slow
 def test_a_law_of_order_two_passes_on_a_robot():
     assert ij.testing.check_law(ij.controllers.BarrierBackstepping(k=(2.0, 20.0))) == ()
 

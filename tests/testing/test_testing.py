@@ -228,6 +228,7 @@ def test_an_undeclared_jump_is_found():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("methods", "words"),
     [
@@ -277,6 +278,7 @@ def test_broken_barriers(methods, words):
     )
 
 
+@pytest.mark.slow
 def test_broken_observer():
     wrong = changed(
         ij.observers.Momentum, derivative=lambda self, t, q, dq, tau, model, state: (state,)
@@ -286,6 +288,7 @@ def test_broken_observer():
     rejects(ij.testing.check_observer, wide(kf=20.0), "estimate is float64 for float32")
 
 
+@pytest.mark.slow
 def test_broken_law():
     no_pair = changed(PlainLaw, command=lambda self, *args: PlainLaw.command(self, *args)[0])
     rejects(ij.testing.check_law, no_pair(3.0), "pair (Command, rate of the state)")
@@ -341,18 +344,21 @@ def published(power=1.0, delta=0.0):
     return changed(PlainLaw, command=command, needs_velocity_bounds=True)(3.0)
 
 
+@pytest.mark.slow
 def test_a_law_that_is_undefined_beyond_its_bounds_fits_with_a_remark():
     (remark,) = ij.testing.check_law(unguarded(1.0))
     assert "undefined beyond the bound" in remark
     assert "-40, -1, 1, 40" in remark
 
 
+@pytest.mark.slow
 def test_so_does_one_that_is_undefined_beyond_velocity_bounds():
     position, velocity = ij.testing.check_law(published())
     assert "undefined beyond the bound" in position
     assert "undefined beyond the velocity bound" in velocity
 
 
+@pytest.mark.slow
 def test_an_infinite_derivative_in_e2_is_named():
     with pytest.raises(ContractError) as caught:
         ij.testing.check_law(published(power=0.6))
@@ -405,12 +411,14 @@ def test_broken_claims_of_a_law():
         claims_of(terms(3.0))
 
 
+@pytest.mark.slow
 def test_claims_of_a_law_are_nonnegative():
     assert claims_of(changed(Stating)(3.0)) == []
     growing = changed(Stating, decay=lambda self, t, q, dq, *args: 3.0 * (dq - 0.2) * dq)
     assert any("decay is -" in problem for problem in claims_of(growing(3.0)))
 
 
+@pytest.mark.slow
 def test_broken_fold():
     class Root:
         units: ClassVar[dict[str, str]] = {"rms": "rad"}

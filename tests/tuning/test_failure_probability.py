@@ -58,6 +58,7 @@ def rare(scenario):
     return found, perturbations, exact(distance, 4.8)
 
 
+@pytest.mark.slow
 def test_a_probability_of_runs_that_is_known(rare):
     found, _, probability = rare
     low, high = found.interval
@@ -75,6 +76,7 @@ def test_a_probability_of_runs_that_is_known(rare):
     assert 1.0 in _failure_probability.FRACTIONS  # a sampled failure itself, with its own noise
 
 
+@pytest.mark.slow
 def test_the_most_likely_failure_fails_again(rare):
     found, _, _ = rare
     run = found.most_likely_failure.replay(record_every=5)
@@ -101,6 +103,7 @@ def test_the_words_of_a_result(rare):
     assert "<img" in found._repr_html_()
 
 
+@pytest.mark.slow
 def test_importance_sampling_and_monte_carlo_agree(scenario, rare):
     _, perturbations, probability = rare
     found = ij.failure_probability(scenario, perturbations, method="importance", runs=600, **RUN)
@@ -121,6 +124,7 @@ def test_the_same_bits_for_a_seed_whatever_the_chunks(scenario, rare):
     np.testing.assert_array_equal(again.failures.margins, found.failures.margins)
 
 
+@pytest.mark.slow
 def test_draws_that_cannot_be_run_are_counted(scenario):
     perturbations, distance = start_perturbations(scenario, 3.2, ij.normal(1.0, 0.6))
     found = ij.failure_probability(scenario, perturbations, runs=1000, **RUN)
@@ -139,6 +143,7 @@ def test_a_nominal_run_that_fails_is_said(scenario):
     assert found.most_likely_failure.distance == 0
 
 
+@pytest.mark.slow
 def test_a_limit_above_zero(scenario):
     """The share of the runs of a study whose margin is at most the limit."""
     perturbations, distance = start_perturbations(scenario, 4.0)
@@ -151,6 +156,7 @@ def test_a_limit_above_zero(scenario):
     assert len(found.levels) == 3
 
 
+@pytest.mark.slow
 def test_without_failures_the_estimate_is_a_bound(scenario):
     perturbations = perturbed(ij.uniform(-1e-3, 1e-3), ij.uniform(0.999, 1.001))
     found = ij.failure_probability(scenario, perturbations, runs=100, **RUN)
@@ -168,6 +174,7 @@ def test_without_failures_the_estimate_is_a_bound(scenario):
         ij.objectives.failure_probability_below(1e-3, crude)
 
 
+@pytest.mark.slow
 def test_discrete_distributions(scenario):
     distance = distances(scenario)[1, 1]
     start = ij.choice([0.0, 1.1 * distance], [0.999, 0.001])
@@ -215,6 +222,7 @@ def test_tails_of_float32_draws():
     np.testing.assert_allclose(joint.quantile(z), 1.0)
 
 
+@pytest.mark.slow
 def test_rare_values_of_a_list_in_float32():
     """u near 1 does not resolve a weight of 1e-8 in float32; z does.  Elsewhere both agree."""
     import jax

@@ -61,6 +61,7 @@ def goal():
     return objectives.tracking() + 0.1 * objectives.effort()
 
 
+@pytest.mark.slow
 def test_the_gradient_by_208_numbers_is_that_of_central_differences(scheduled):
     problem = TuningProblem.build(scheduled, PATHS, goal(), **RUN).for_solver(LBFGS())
     rng = np.random.default_rng(0)
@@ -101,6 +102,7 @@ def test_both_modes_have_the_same_gradient_of_a_sampled_loop_with_noise_and_a_re
     np.testing.assert_allclose(reverse.value.loss, forward.value.loss, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_208_numbers_are_tuned_with_the_same_report(scheduled):
     best = ij.tune(
         scheduled,
@@ -169,6 +171,7 @@ def test_an_epoch_goes_through_the_runs_without_replacement():
     assert all(len(runs_of_step(10, 4, 5, number)) == 4 for number in range(9))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [Adam(0.2, batch=4), Optax(optax.sgd(0.05), batch=4)])
 def test_a_mini_batch_finds_the_optimum_of_all_runs_and_values_compare_all_of_them(solver):
     evaluate = Bowls(iterations=150)

@@ -359,6 +359,7 @@ def test_joints_selects_joints_everywhere(joints, expected, three_joints):
     np.testing.assert_allclose(found[:3], separate, rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_limits_of_single_joints_and_weights(three_joints):
     """A requirement with a limit for each joint is broken by the joint that is nearest to its own,
     or beyond."""
@@ -486,6 +487,7 @@ def test_the_name_of_a_requirement_calls_a_slice_joints():
     assert "of joint 1 <" in below(0.1, joints=1).name
 
 
+@pytest.mark.slow
 def test_names_of_joints_become_indices():
     scenario = ij.presets.ur5()
     names = scenario.plant.joints

@@ -66,6 +66,7 @@ def reference(arm, goal):
     return ij.tune(arm, GAINS, goal, solver=SQP(starts=1), **RUN)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*DERIVATIVES, *POPULATIONS])
 def test_it_reaches_the_optimum_and_keeps_the_requirements(arm, before, goal, reference, name):
     needs_its_package(name)
@@ -102,6 +103,7 @@ def of_worst_runs(before):
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["pieces", "worst runs"])
 def test_its_gradients_are_those_of_its_values(arm, before, goal, kind):
     study = {"objective": goal} if kind == "pieces" else of_worst_runs(before)
@@ -138,6 +140,7 @@ def test_one_point_costs_one_evaluation(arm, goal):
     assert programme.evaluate.evaluations == before + 1
 
 
+@pytest.mark.slow
 def test_a_piece_that_no_gain_changes_is_no_constraint(arm, before):
     """The margin at t = 0 may be at its limit, and cannot be moved inside."""
     at_start = objectives.tracking() + objectives.margin_above(float(np.min(before.margin)))
@@ -170,6 +173,7 @@ def test_an_invalid_run_gives_finite_numbers(arm, goal):
     assert programme.best[1].tolist() == programme.z.tolist()
 
 
+@pytest.mark.slow
 def test_several_starts_end_at_the_best_of_their_ends(arm, goal, reference):
     best = ij.tune(arm, GAINS, goal, solver=SLSQP(starts=3), **RUN)
     assert best.history["z"].shape[1] == 3

@@ -155,6 +155,7 @@ def goal_of(paper, limit: float, allowed: float = 0.25):
     return complete(goal + objectives.margin_above(0.05), [1.0])
 
 
+@pytest.mark.slow
 def test_the_step_check_of_a_nominal_run_agrees_with_simulate(paper):
     goal = goal_of(paper, 12.0)
     gains = {"controller.K2": np.array([10.0, 15.0])}

@@ -70,6 +70,7 @@ def test_a_limit_that_is_infinite_cannot_be_tuned():
         layout(arm, ["plant.effort"], DT, "rk4")
 
 
+@pytest.mark.slow
 def test_theorem_2_limits_gains_from_below_where_it_holds(lab):
     paper = canonical(ij.presets.zhang_yan_2024())
     for path in ("controller.k1", "controller.K2", "observer.kf"):
@@ -113,6 +114,7 @@ def test_a_cutoff_above_the_nyquist_frequency_starts_at_the_upper_end(lab):
     np.testing.assert_allclose(high, [np.pi / 2e-3, 2020.0])
 
 
+@pytest.mark.slow
 def test_a_time_constant_has_a_lower_end_and_a_gain_an_upper_one(lab):
     law = lab.controller
     surface = ij.controllers.DynamicSurface(k1=law.k1, K2=law.K2, filter=0.01, weight=law.weight)
@@ -149,6 +151,7 @@ def test_a_delay_needs_a_queue_that_holds_its_commands(lab):
         layout(canonical(at_once), ["sampling.delay"], DT, "rk4")
 
 
+@pytest.mark.slow
 def test_gains_of_all_levels_reach_what_the_step_follows():
     drive = canonical(loops_of_plants.electric_drive())
     low, high, (below, above) = ends(drive, "controller.k")
@@ -162,6 +165,7 @@ def test_gains_of_all_levels_reach_what_the_step_follows():
     assert np.all(alone > gains[0])
 
 
+@pytest.mark.slow
 def test_numbers_of_a_plant_keep_the_loop_within_the_step():
     flexible = canonical(loops_of_plants.flexible_joint())
     stiffness, inertia = "model.stiffness", "plant.motor_inertia"
@@ -177,6 +181,7 @@ def test_numbers_of_a_plant_keep_the_loop_within_the_step():
     assert ends(flexible, "plant.robot.mass")[2] == (ranges.BY_SIGN, ranges.UNLIMITED)
 
 
+@pytest.mark.slow
 def test_bounds_of_levels_contain_the_start():
     drive = canonical(loops_of_plants.electric_drive())
     current = start_levels(drive)[2][0]

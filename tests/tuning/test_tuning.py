@@ -697,6 +697,7 @@ class Cliff:
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "solver", [SQP(1e-6), Adam(learning_rate=0.5)], ids=lambda solver: solver.name
 )
@@ -1025,6 +1026,7 @@ def test_signature_of_tune_is_short_and_solvers_fit_their_protocol():
         assert [member for member in members if not hasattr(solver, member)] == []
 
 
+@pytest.mark.slow
 def test_keyword_arguments_of_earlier_versions_warn_and_mean_the_same(paper):
     calls = []
     with pytest.warns(DeprecationWarning, match="deprecated") as caught:
@@ -1186,6 +1188,7 @@ def test_a_killed_tuning_goes_on_bit_identically(tmp_path, monkeypatch):
             assert resumed[name].tobytes() == complete[name].tobytes(), name
 
 
+@pytest.mark.slow
 def test_a_checkpoint_of_another_problem_is_refused(paper, tmp_path):
     file = tmp_path / "c.npz"
     ij.tune(
@@ -1202,6 +1205,7 @@ def test_a_checkpoint_of_another_problem_is_refused(paper, tmp_path):
         )
 
 
+@pytest.mark.slow
 def test_more_peaks_than_the_memory_holds_are_refused(paper, monkeypatch):
     """A requirement on a peak has a matrix for each piece of it in each run."""
     monkeypatch.setattr(checks, "memory", lambda: 1_400_000)

@@ -59,6 +59,7 @@ def scenario(distributed: bool = False, **parts) -> ij.Scenario:
     return ij.Scenario(**(given | parts))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("distributed", [False, True])
 def test_vector_field_and_trajectory_of_the_independent_program(distributed, rng):
     one = scenario(distributed)
@@ -96,6 +97,7 @@ def test_the_filtered_law_tends_to_neighbours_velocities_with_mu():
     np.testing.assert_allclose(ratios, 2.0, rtol=0.15)
 
 
+@pytest.mark.slow
 def test_one_agent_that_measures_the_leader_is_the_single_plant(rng):
     single = plants.Rigid(pendulum(0))
     stack = plants.Agents(agents=(single,), adjacency=((0.0,),), leader=(1.0,))
@@ -110,6 +112,7 @@ def test_one_agent_that_measures_the_leader_is_the_single_plant(rng):
         np.testing.assert_allclose(agent(t, x), alone(t, x), rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_agents_of_order_four_and_two_joints_follow_the_leader():
     """Flexible joints: the start with given positions is the springs' equilibrium of each agent."""
     arm = ij.presets.customary_two_link()
@@ -134,6 +137,7 @@ def test_agents_of_order_four_and_two_joints_follow_the_leader():
     assert stack.units == ("rad", "rad/s", "rad", "rad/s", "N m")
 
 
+@pytest.mark.slow
 def test_friction_of_the_agents_robots_acts_on_the_plant(rng):
     """The friction of each agent enters its own acceleration, which no law knows."""
     damping = [0.3, 0.5]
@@ -156,6 +160,7 @@ def test_friction_of_the_agents_robots_acts_on_the_plant(rng):
     np.testing.assert_allclose(difference, expected, rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_studies_and_files(tmp_path):
     one = scenario()
     file = tmp_path / "agents.toml"
@@ -185,6 +190,7 @@ def test_the_certificate_of_the_levels_holds(distributed):
         assert any("ultimate boundedness" in note for note in repr(found).splitlines())
 
 
+@pytest.mark.slow
 def test_more_agents_cost_in_proportion_to_their_number():
     """A chain and an undirected path: the operations of a law grow as N, not as N^2."""
 
@@ -266,6 +272,7 @@ def test_refused_with_a_remedy(what):
         ij.simulate(make(), duration=0.1, dt=1e-2)
 
 
+@pytest.mark.slow
 def test_bounds_of_the_agents_velocities_are_kept():
     limits = ij.Bounds(lower=bounds.Constant(-1.5), upper=bounds.Constant(1.5))
     one = scenario(

@@ -71,6 +71,7 @@ def test_real_arms_have_the_dynamics_that_mujoco_gives(name):
         assert relative(ours[2][i], G) < 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", REAL)
 def test_motion_is_mujocos(name):
     arm, model = real(name)
@@ -94,6 +95,7 @@ def test_motion_is_mujocos(name):
     np.testing.assert_allclose(x[0], data.qpos, rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_armature_is_on_the_diagonal():
     arm, model = real("ur5")
     armature = np.linspace(0.1, 2.0, arm.n)
@@ -140,6 +142,7 @@ def test_c_is_the_one_of_the_christoffel_symbols(seed):
     np.testing.assert_allclose(arm.energy_gradient(q, v), rate, rtol=1e-10, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_momentum_and_inverse_dynamics_are_the_products_of_the_matrices(seed):
     load = ij.robots.Payload(

@@ -239,6 +239,7 @@ def light_wrist(joints=6, width=0.12):
     return arms.arm_scenario(arm, reference, bounds=narrow(width))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("joints", [2, pytest.param(6, marks=pytest.mark.release)])
 def test_a_light_wrist_keeps_narrow_bounds_at_500_hz_and_did_not_with_the_papers_weight(joints):
     scenario = ij.with_parts(light_wrist(joints), **LAB)

@@ -166,6 +166,7 @@ MJCF = """<mujoco><compiler angle="degree"/>
 <actuator><motor joint="j1" gear="10" ctrlrange="-3 2"/><position joint="j1b" gear="2" forcerange="-7 7"/></actuator></mujoco>"""
 
 
+@pytest.mark.slow
 def test_mjcf_with_classes_references_and_two_hinges_in_a_body(file):
     arm = ij.robots.load(file(MJCF.format(finger='<joint name="jf" axis="1 0 0"/>')), tip="ee")
     assert arm.links == ("b1:j1", "b1", "b2")
@@ -231,6 +232,7 @@ def meshed(file, tmp_path):
     return file(MESHED)
 
 
+@pytest.mark.slow
 def test_meshes_weigh_what_they_weigh_in_mujoco(meshed):
     arm = ij.robots.load(meshed, tip="c")
     spec = mujoco.MjSpec.from_file(str(meshed))

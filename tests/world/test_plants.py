@@ -74,6 +74,7 @@ def test_a_vessel_refuses_added_masses_of_the_wrong_sign():
 # ------------------------------------------------------------ driven pendulum
 
 
+@pytest.mark.slow
 def test_the_driven_pendulum_is_an_electric_drive_on_a_pendulum(rng):
     """With M = L/Kt, H = R/Kt and the motor's torque Kt i as the third level."""
     link = ij.robots.PlanarChain(mass=[0.9], length=[0.4], centre=[0.3], inertia=[0.02], g=9.81)
@@ -132,6 +133,7 @@ def scenario_of(plant, **parts):
     )
 
 
+@pytest.mark.slow
 def test_a_users_class_fits_the_contract_and_runs():
     plant = Pendulum(**NUMBERS)
     ij.testing.check_plant(plant)
@@ -142,6 +144,7 @@ def test_a_users_class_fits_the_contract_and_runs():
     assert float(run.metrics.relative_numerical_error) < 1e-5
 
 
+@pytest.mark.slow
 def test_a_users_leaves_are_parameters_with_units_and_gradients():
     scenario = scenario_of(Pendulum(**NUMBERS), model=Pendulum(**NUMBERS))
     units = {p.path: p.unit for p in ij.parameters(scenario)}
@@ -194,6 +197,7 @@ def test_a_gain_that_depends_on_later_levels_is_refused():
         ij.simulate(scenario_of(plant), duration=0.1, dt=1e-2)
 
 
+@pytest.mark.slow
 def test_a_drift_of_strict_feedback_form_is_accepted():
     plant = with_drift(lambda t, x: jnp.stack([jnp.cos(x[0]), x[0] * x[1], x[0] * x[1] * x[2]]))
     dependence = plants.dependence_on_levels(plant, jnp.zeros(()), jnp.asarray([[0.3], [1.0], [2]]))

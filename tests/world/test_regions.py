@@ -131,6 +131,7 @@ def filtered_torque(q, v, a1=10.0, a2=10.0, b1=10.0, b2=10.0):
     return asked, asked + least_change(rows, np.concatenate([high - planned, planned - low, room]))
 
 
+@pytest.mark.slow
 def test_the_torque_is_that_of_every_set_of_active_rows(rng):
     scenario, changed = filtered(stepping()), 0
     q, v = rng.uniform([0.8, 0.9], [1.2, 1.6], (60, 2)), rng.uniform(-1.5, 1.5, (60, 2))
@@ -168,6 +169,7 @@ def test_a_run_is_that_of_an_independent_program():
 # ------------------------------------------------------------------------------- what is watched
 
 
+@pytest.mark.slow
 def test_margins_are_those_by_hand_and_what_the_status_says(alone):
     np.testing.assert_allclose(
         alone.region_margin, [distances(q) for q in np.asarray(alone.q)], atol=1e-12
@@ -183,6 +185,7 @@ def test_margins_are_those_by_hand_and_what_the_status_says(alone):
     assert np.sum(np.asarray(alone.metrics.region_margin) < -0.01) >= 2
 
 
+@pytest.mark.slow
 def test_the_loop_does_not_know(alone):
     free = ij.simulate(stepping(regions=()), **RUN)
     for name in ("q", "tau", "V"):
@@ -192,6 +195,7 @@ def test_the_loop_does_not_know(alone):
     assert free.region_margin == () and "region_margin" not in free.metrics
 
 
+@pytest.mark.slow
 def test_the_filter_keeps_what_the_law_breaks(kept):
     assert not int(kept.status) & int(ij.status.FAILED | ij.Status.FILTER_INFEASIBLE)
     margin = np.asarray(kept.metrics.region_margin)
@@ -200,6 +204,7 @@ def test_the_filter_keeps_what_the_law_breaks(kept):
     np.testing.assert_array_equal(kept.metrics.largest_region_slack, 0.0)
 
 
+@pytest.mark.slow
 def test_too_little_torque_breaks_them_and_says_by_how_much():
     scenario = filtered(stepping(initial=ij.Initial([1.0, 1.3], [-3.0, -1.0])), limit=[3.0, 1.0])
     with pytest.warns(ij.SimulationWarning, match=r"m/s\^2 \(run\.region_slack\).*b1 and b2"):
@@ -220,6 +225,7 @@ def test_too_little_torque_breaks_them_and_says_by_how_much():
     )
 
 
+@pytest.mark.slow
 def test_points_of_an_arm_are_mujocos_and_move_as_their_rates_say(rng, tmp_path):
     mujoco = pytest.importorskip("mujoco")
     (tmp_path / "arm.xml").write_text(MODEL)
@@ -285,6 +291,7 @@ def test_a_run_in_space_by_the_kernels():
 # ------------------------------------------------------------------------ what is done with them
 
 
+@pytest.mark.slow
 def test_derivatives_by_the_region_and_the_rates():
     def worst(offset, b1):
         scenario = ij.with_parameters(
@@ -310,6 +317,7 @@ def test_derivatives_by_the_region_and_the_rates():
     assert float(found) == pytest.approx(float(difference), rel=1e-4)
 
 
+@pytest.mark.slow
 def test_a_requirement_on_regions_and_an_attack_on_them():
     scenario, short = (
         stepping(goal=(0.5, 0.9), regions=(BALL, WALL)),
@@ -342,6 +350,7 @@ def test_a_requirement_on_regions_and_an_attack_on_them():
         ij.tune(stepping(regions=()), ["controller.Kd"], objective, **short)
 
 
+@pytest.mark.slow
 def test_starts_beyond_a_wall_are_told_from_violations():
     scenario = stepping(goal=(1.0, 1.3), regions=(regions.HalfSpace([1.0, 0.0], -0.1),))
     study = ij.monte_carlo(
@@ -382,6 +391,7 @@ def test_files_and_datasets_hold_them(tmp_path, alone):
     assert data.region_margin.dims == ("time", "region") and data.region_margin.units == "m"
 
 
+@pytest.mark.slow
 def test_figures(alone, kept):
     figure = plotting.region_margins({"alone": alone, "filtered": kept})
     assert len(figure.axes) == 6

@@ -46,6 +46,7 @@ def written(folder, text):
     return path
 
 
+@pytest.mark.slow
 def test_what_the_file_leaves_out_follows_from_the_arm(folder):
     scenario = ij.load_scenario(written(folder, ROBOT + REFERENCE))
     arm = ij.robots.load(folder / "ur5.urdf", tip="tool0")
@@ -75,6 +76,7 @@ def test_what_it_says_counts(folder):
     assert (float(scenario.plant.mass[2]), float(scenario.model.mass[2])) == (3.0, 2.275)
 
 
+@pytest.mark.slow
 def test_plant_and_model_from_two_files_and_a_locked_joint(folder):
     (folder / "believed.urdf").write_text(
         (folder / "ur5.urdf").read_text().replace('<mass value="2.275" />', '<mass value="2.0" />')
@@ -180,6 +182,7 @@ def test_without_the_extra_it_says_so(folder, monkeypatch):
         scenario_file.load_scenario(written(folder, ROBOT + REFERENCE))
 
 
+@pytest.mark.slow
 def test_repair(folder):
     text = (folder / "ur5.urdf").read_text()
     (folder / "ur5.urdf").write_text(text.replace('ixx="0.049443313556"', 'ixx="9"'))

@@ -103,6 +103,7 @@ def test_kinetic_and_potential_energy_from_positions(n, rng):
     np.testing.assert_allclose(robot.tip(q), [centres(q)[-1].real, centres(q)[-1].imag], atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [1, 2, 5, 12])
 def test_sums_along_a_chain_are_the_products_of_its_matrices(n, rng):
     """H_ij = A_ij cos(phi_i - phi_j) of the absolute angles, with the lever arms of all masses."""
@@ -166,6 +167,7 @@ def test_energy_of_a_falling_arm_is_kept_and_friction_takes_it(rng):
     assert float(lost) > 0.1
 
 
+@pytest.mark.slow
 def test_payload_hangs_at_the_tip(rng):
     """A payload m adds J^T m J to M and -J^T (0, -m g) to G."""
     links = random_links(3, rng) | {"payload": 0.0}

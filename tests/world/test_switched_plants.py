@@ -69,6 +69,7 @@ def test_vector_field_against_an_independent_program():
         )
 
 
+@pytest.mark.slow
 def test_trajectory_and_order_with_switches_between_the_instants():
     exact = independent_end(1.0)
     errors = []
@@ -126,6 +127,7 @@ def test_a_file_gives_plants_with_modes_back():
 # --- a Markov chain -------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_distribution_of_the_path():
     scenario = canonical(
         scenario_of(plants.MarkovSwitched(LINK, {"mass[0]": MASSES}, rates=Q, switches=3))
@@ -146,6 +148,7 @@ def test_distribution_of_the_path():
             assert np.mean(modes[here] == j) == pytest.approx(share, abs=2.5 / np.sqrt(count))
 
 
+@pytest.mark.slow
 def test_a_rate_that_is_varied_alone_changes_the_dwell_time():
     """A study varies q_ij without q_ii: the mean time in mode i is 1/sum_{j != i} q_ij."""
     one = scenario_of(plants.MarkovSwitched(LINK, {"mass[0]": MASSES}, rates=Q, switches=1))

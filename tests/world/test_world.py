@@ -152,6 +152,7 @@ def test_the_heading_on_an_ellipse_is_along_its_tangent():
     assert grown == pytest.approx(2.0 * np.pi)
 
 
+@pytest.mark.slow
 def test_spline_is_differentiable_by_its_waypoints():
     gradient = jax.jacobian(lambda w: references.WaypointSpline(TIMES, w).position(1.7)[0])(
         jnp.asarray(POINTS)
