@@ -32,6 +32,8 @@ from iblf_jax.world.robots._base import mass_matrix_at, robot_member
 if TYPE_CHECKING:
     from iblf_jax.tuning.parameters import Tunable
 
+NODE = "iblf_jax.deployment.ros2.node"
+"""The modules of a node; in a package, its own name replaces this one."""
 NODE_MODULES = ("c_law.py", "monitor.py", "supervisor.py", "law_node.py")
 """The modules of `node/` that a package contains."""
 POLICIES = ("hold", "zero")
@@ -187,8 +189,8 @@ def _gain(scenario: Scenario, item: Tunable, low: np.ndarray, high: np.ndarray) 
         if not np.all(np.isfinite(end)):
             remedy = f'Give both: ij.tunable("{item.path}", low, high).'
             raise checks.fail(f"gains: {item.path}: {name}", end, "finite limits", remedy)
-        whole = np.broadcast_to(end, value.shape) if item.tied else end.reshape(value.shape)
-        reason = paths.why_inadmissible(scenario, {item.path: jnp.asarray(whole)})
+        complete = np.broadcast_to(end, value.shape) if item.tied else end.reshape(value.shape)
+        reason = paths.why_inadmissible(scenario, {item.path: jnp.asarray(complete)})
         if reason:
             raise checks.fail(f"gains: {item.path}: {name}", end, "an admissible value", reason)
     return Gain(item.path, paths.unit_at(scenario, item.path), value, low, high, item.tied)
@@ -334,9 +336,10 @@ def ros_files(law: Law, generated: GeneratedLaw, options: RosOptions) -> dict[st
         f"{name}/law.json": f"{json.dumps(description, indent=1)}\n",
         f"c/{name}_library.c": _template("library.c", values),
     }
-    node = files("iblf_jax.deployment.ros2.node")
+    node = files(NODE)
     for module in NODE_MODULES:
-        texts[f"{name}/{module}"] = (node / module).read_text(encoding="utf-8")
+        text = (node / module).read_text(encoding="utf-8")
+        texts[f"{name}/{module}"] = text.replace(NODE, name)
     for file, text in generated.files.items():
         texts[f"c/{file}"] = text
     return texts

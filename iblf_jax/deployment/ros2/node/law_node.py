@@ -33,9 +33,15 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 
-from .c_law import FLAGS, CLaw, Gain, load_law, why_refused
-from .monitor import LoopMonitor
-from .supervisor import NANOSECONDS, Command, Mode, Settings, Supervisor
+from iblf_jax.deployment.ros2.node.c_law import FLAGS, CLaw, Gain, load_law, why_refused
+from iblf_jax.deployment.ros2.node.monitor import LoopMonitor
+from iblf_jax.deployment.ros2.node.supervisor import (
+    NANOSECONDS,
+    Command,
+    Configuration,
+    Mode,
+    Supervisor,
+)
 
 DIAGNOSTICS_PERIOD = 0.1
 """[s]."""
@@ -74,19 +80,19 @@ class LawNode(Node):  # type: ignore[misc]
         super().__init__(law.description.name, **options)
         self.law = law
         self.gains = {gain.path: gain for gain in law.description.gains}
-        settings = self._settings()
+        configuration = self._configuration()
         origin = self._declared("time_origin", math.nan, "stamp that is t = 0 [s], NaN for start")
-        self.supervisor = Supervisor(law, settings, _origin(origin))
+        self.supervisor = Supervisor(law, configuration, _origin(origin))
         self._declare_gains()
         self.monitor = LoopMonitor()
         self._answered: int | None = None
         """Arrival of the last state that a command has answered [ns]."""
         self._missed_before = 0
         self._tick: int | None = None
-        self._period = round(settings.period * NANOSECONDS)
-        self._efforts = Float64MultiArray(data=array("d", [0.0] * len(settings.joints)))
+        self._period = round(configuration.period * NANOSECONDS)
+        self._efforts = Float64MultiArray(data=array("d", [0.0] * len(configuration.joints)))
         self._publisher = self.create_publisher(Float64MultiArray, "efforts", QUEUE_DEPTH)
-        self._create_diagnostics(settings.joints)
+        self._create_diagnostics(configuration.joints)
         for name, action in (("start", self._start), ("stop", self._stop), ("hold", self._hold)):
             self.create_service(Trigger, f"~/{name}", _service(action))
         self.add_on_set_parameters_callback(self._refuse_parameters)
@@ -102,7 +108,7 @@ class LawNode(Node):  # type: ignore[misc]
             expected = f"a value such as {default}"
             raise refused(name, error, expected, DECIMAL_POINT) from None
 
-    def _settings(self) -> Settings:
+    def _configuration(self) -> Configuration:
         """The constants of the supervisor from the parameters."""
         known = self.law.description
         joints = self._joints()
@@ -124,7 +130,7 @@ class LawNode(Node):  # type: ignore[misc]
         arrival_timeout = stamp_timeout
         if self.trigger == "state":
             arrival_timeout = self._timeout("watchdog", WATCHDOG)
-        return Settings(
+        return Configuration(
             joints=joints,
             period=known.period,
             reads_velocity=known.reads_velocity,
@@ -214,7 +220,7 @@ class LawNode(Node):  # type: ignore[misc]
             self._states = self.create_subscription(
                 JointState, "joint_states", self._answer_state, quality
             )
-            period = self.supervisor.settings.arrival_timeout / 2
+            period = self.supervisor.configuration.arrival_timeout / 2
             if math.isfinite(period):
                 self.create_timer(period, self._watch, clock=steady)
         else:
@@ -223,7 +229,7 @@ class LawNode(Node):  # type: ignore[misc]
             self._states = self.create_subscription(
                 JointState, "joint_states", self._receive, quality
             )
-            period = self.supervisor.settings.period
+            period = self.supervisor.configuration.period
             self._timer = self.create_timer(period, self._sample, clock=steady)
         self.create_timer(DIAGNOSTICS_PERIOD, self._publish_diagnostics, clock=steady)
 
@@ -362,9 +368,10 @@ class LawNode(Node):  # type: ignore[misc]
         for value, text in zip(self._values, texts, strict=True):
             value.value = text
         self._status.level = self._level()
-        self._status.message = supervisor.mode.value
-        if supervisor.note:
-            self._status.message += f": {supervisor.note}"
+        reason = supervisor.note
+        if supervisor.mode is Mode.FAULT and fault is not None:
+            reason = fault.reason
+        self._status.message = f"{supervisor.mode.value}: {reason}".removesuffix(": ")
         self._diagnostics.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics_publisher.publish(self._diagnostics)
         supervisor.reset_extremes()

@@ -17,15 +17,15 @@ from __future__ import annotations
 import enum
 import math
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
+
+from iblf_jax.deployment.ros2.node.c_law import NOT_FINITE, CLaw
 
 NANOSECONDS = 1_000_000_000
 NEW_SAMPLE = 0.75
 """Shortest distance of the stamps of two samples, in periods."""
 STAMP_TOLERANCE = 0.01
 """Tolerance of the distance of two stamps, in periods."""
-NOT_FINITE = 1
-"""Bit of the law's status for a result that is not finite."""
 
 
 class Mode(enum.Enum):
@@ -80,7 +80,7 @@ class Command(NamedTuple):
     """Whether a torque was clipped to its limit."""
 
 
-class Settings(NamedTuple):
+class Configuration(NamedTuple):
     """Constants of a supervisor."""
 
     joints: tuple[str, ...]
@@ -101,28 +101,6 @@ class Settings(NamedTuple):
     """Age by its stamp beyond which a state is stale [s]."""
     arrival_timeout: float
     """Time since the arrival beyond which a state is stale [s]."""
-
-
-class Law(Protocol):
-    """The law as the supervisor calls it; see `c_law.CLaw`."""
-
-    def init(self, q: Sequence[float], dq: Sequence[float] | None) -> bool:
-        """Starts the law at positions [rad] and velocities [rad/s]; whether that succeeded."""
-        ...
-
-    def step(
-        self, t: float, q: Sequence[float], dq: Sequence[float] | None
-    ) -> tuple[list[float], int]:
-        """The torques [N m] and the status of one sample at time t [s]."""
-        ...
-
-    def balance(self, q: Sequence[float]) -> list[float]:
-        """The torques that balance gravity at positions [rad], (n,) [N m]."""
-        ...
-
-    def bounds(self, t: float) -> tuple[list[float], list[float]]:
-        """The lower and the upper bounds on the positions at time t [s], (n,) each [rad]."""
-        ...
 
 
 class JointReader:
@@ -209,14 +187,16 @@ class Supervisor:
 
     Args:
       law: the law; its state belongs to the supervisor.
-      settings: the constants.
+      configuration: the constants.
       time_origin: stamp at which reference and bounds begin [ns]; None for the stamp of the state
         with which the law starts.
     """
 
-    def __init__(self, law: Law, settings: Settings, time_origin: int | None = None) -> None:
+    def __init__(
+        self, law: CLaw, configuration: Configuration, time_origin: int | None = None
+    ) -> None:
         self.law = law
-        self.settings = settings
+        self.configuration = configuration
         self.time_origin = time_origin
         self.mode = Mode.WAITING
         self.last_fault: Fault | None = None
@@ -226,13 +206,13 @@ class Supervisor:
         """Stamp that is t = 0 of the running law [ns]."""
         self.missed = 0
         """Samples without a state of their own, counted by the stamps."""
-        self.margin = [math.inf] * len(settings.joints)
+        self.margin = [math.inf] * len(configuration.joints)
         """Smallest distances to the bounds since `reset_extremes` [rad]."""
         self.status = 0
         """Flags of the law since `reset_extremes`."""
         self.limited = False
         """Whether a torque was clipped since `reset_extremes`."""
-        self._reader = JointReader(settings.joints, settings.reads_velocity)
+        self._reader = JointReader(configuration.joints, configuration.reads_velocity)
         self._sample: JointSample | None = None
         self._previous: JointSample | None = None
         self._last_stamp: int | None = None
@@ -240,10 +220,10 @@ class Supervisor:
         self._held: tuple[float, ...] = ()
         self._without_torque = False
         """Whether `stop` replaced the torques of the mode fault by zeros."""
-        self._period = round(settings.period * NANOSECONDS)
-        self._stamp_timeout = _nanoseconds(settings.stamp_timeout)
-        self._arrival_timeout = _nanoseconds(settings.arrival_timeout)
-        self._zero = [0.0] * len(settings.joints)
+        self._period = round(configuration.period * NANOSECONDS)
+        self._stamp_timeout = _nanoseconds(configuration.stamp_timeout)
+        self._arrival_timeout = _nanoseconds(configuration.arrival_timeout)
+        self._zero = [0.0] * len(configuration.joints)
 
     def receive(
         self,
@@ -264,7 +244,7 @@ class Supervisor:
         """
         found = self._reader.read(names, position, velocity, stamp, received)
         if found is None:
-            self.note = f"a state has none of the joints {', '.join(self.settings.joints)}"
+            self.note = f"a state has none of the joints {', '.join(self.configuration.joints)}"
             return False
         if isinstance(found, JointSample):
             fault = self._clock_fault(stamp)
@@ -348,7 +328,7 @@ class Supervisor:
             return False
         self.mode = Mode.STOPPED
         self.note = ""
-        if self.settings.start_automatically:
+        if self.configuration.start_automatically:
             started, reason = self.start(now, clock)
             if not started:
                 self.note = reason
@@ -389,7 +369,7 @@ class Supervisor:
 
     def _torque_without_law(self, is_fresh: bool) -> list[float]:
         """The torques of the modes without the law."""
-        holds_on_fault = self.settings.on_fault == "hold" and not self._without_torque
+        holds_on_fault = self.configuration.on_fault == "hold" and not self._without_torque
         if self.mode is Mode.HOLDING or (self.mode is Mode.FAULT and holds_on_fault):
             return self._hold_torque(is_fresh)
         return list(self._zero)
@@ -404,8 +384,8 @@ class Supervisor:
             return torque
         velocity = self._velocity(sample)
         for i, q in enumerate(sample.position):
-            torque[i] += self.settings.hold_stiffness[i] * (self._held[i] - q)
-            torque[i] -= self.settings.hold_damping[i] * velocity[i]
+            torque[i] += self.configuration.hold_stiffness[i] * (self._held[i] - q)
+            torque[i] -= self.configuration.hold_damping[i] * velocity[i]
         return torque
 
     def _velocity(self, sample: JointSample) -> Sequence[float]:
@@ -420,9 +400,9 @@ class Supervisor:
         return [(x - y) / duration for x, y in pairs]
 
     def _limited(self, torque: list[float], status: int) -> Command:
-        """The command with every torque within its limits; a torque that is no number becomes 0."""
+        """The command with every torque within its limits; NaN becomes 0."""
         limited = False
-        for i, limit in enumerate(self.settings.torque_limits):
+        for i, limit in enumerate(self.configuration.torque_limits):
             x = torque[i]
             if -limit <= x <= limit:
                 continue
@@ -467,7 +447,7 @@ class Supervisor:
         """What a user learns about a start: the time, and joints outside of their bounds."""
         text = f"The law runs from t = {t:g} s."
         lower, upper = self.law.bounds(t)
-        rows = zip(self.settings.joints, lower, sample.position, upper, strict=True)
+        rows = zip(self.configuration.joints, lower, sample.position, upper, strict=True)
         outside = [name for name, low, q, high in rows if not low < q < high]
         if outside:
             text += f" Outside of their bounds at the start: {', '.join(outside)}."
@@ -522,7 +502,7 @@ class Supervisor:
 
     def reset_extremes(self) -> None:
         """Begins a new interval of `margin`, `status` and `limited`."""
-        self.margin = [math.inf] * len(self.settings.joints)
+        self.margin = [math.inf] * len(self.configuration.joints)
         self.status = 0
         self.limited = False
 
