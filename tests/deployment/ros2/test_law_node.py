@@ -4,9 +4,11 @@ law of a simulated run in lock-step, faults, limits, gains that change, and rest
 from __future__ import annotations
 
 import array
+import json
 import math
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -481,6 +483,19 @@ REFUSED = {
     "a gain": ({"controller.K2": "[9.0, 2.0]"}, "controller.K2: got 9, expected a number from 1"),
     "a scalar gain": ({"controller.k1": 9.0}, "controller.k1: got"),
 }
+
+
+def test_joints_of_a_named_model_keep_their_names(nodes, package, tmp_path):
+    """The driver's names have to be those of the exported law, in its order."""
+    shutil.copytree(package.modules / NAME, tmp_path / NAME)
+    description = json.loads((tmp_path / NAME / "law.json").read_text())
+    (tmp_path / NAME / "law.json").write_text(json.dumps(description | {"has_joint_names": True}))
+    nodes.environment["PYTHONPATH"] = str(tmp_path)
+    for joints in ("[joint_2, joint_1]", "[shoulder, elbow]"):
+        process = nodes.begin(joints=joints)
+        _, errors = process.communicate(timeout=TIMEOUT)
+        assert process.returncode == 2
+        assert "expected the joints of the exported law, ['joint_1', 'joint_2']" in errors
 
 
 @pytest.mark.parametrize("name", REFUSED)
