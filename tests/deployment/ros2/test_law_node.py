@@ -200,9 +200,8 @@ class Nodes:
         self.file = package.prefix / "share" / NAME / "config" / f"{NAME}.yaml"
         self.processes: list[subprocess.Popen] = []
 
-    def begin(self, **parameters) -> subprocess.Popen:
-        command = [sys.executable, "-m", f"{NAME}.law_node", "--ros-args"]
-        command += ["--params-file", str(self.file)]
+    def begin(self, program=("-m", f"{NAME}.law_node"), **parameters) -> subprocess.Popen:
+        command = [sys.executable, *program, "--ros-args", "--params-file", str(self.file)]
         for name, value in ({"state_timeout": 0.5} | parameters).items():
             command += ["-p", f"{name}:={value}"]
         process = subprocess.Popen(command, env=self.environment, stderr=subprocess.PIPE, text=True)
@@ -240,6 +239,19 @@ def test_in_lock_step_the_efforts_are_those_of_the_simulation(client, nodes, pac
     assert client.mode == "running"
     assert client.diagnostics["missed_periods"] == "0"
     assert client.diagnostics["samples"] == str(len(run.t) - 1)
+
+
+def test_without_the_executor_in_cpp_the_node_uses_that_in_python(client, nodes):
+    """As with rclpy before ROS 2 Kilted."""
+    hidden = "import sys; sys.modules['rclpy.experimental'] = None; "
+    program = f"{hidden}from {NAME}.law_node import main; sys.exit(main())"
+    process = nodes.begin(program=["-c", program], start_automatically="true")
+    client.connect()
+    client.reach("running")
+    assert client.call("stop").success
+    client.reach("stopped")
+    process.terminate()
+    assert process.wait(TIMEOUT) == 0
 
 
 def test_nothing_is_published_before_a_complete_state(client, nodes):
