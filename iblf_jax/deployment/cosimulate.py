@@ -136,7 +136,7 @@ def cosimulate(
     folds = as_folds(metrics, scenario.initial.q.dtype, scenario)
     motion = _Run(scenario, robot, dt, seed).motion(steps)
     rows = motion.rows
-    result = _rollout(scenario, folds, motion, dt, record_every, f"MuJoCo {integrator or 'own'}")
+    result = rollout_of(scenario, folds, motion, dt, record_every, f"MuJoCo {integrator or 'own'}")
     report(result, steps, throw)
     if film is not None:
         film_run(result, robot, rows.model_positions[rows.instant], dt, Path(film))
@@ -203,7 +203,7 @@ def with_period(scenario: Scenario, period: float | None) -> Scenario:
     return dataclasses.replace(scenario, sampling=sampling)
 
 
-class _Rows(NamedTuple):
+class Rows(NamedTuple):
     """One row of the recorded motion, or R rows stacked.
 
     Each time step has a row at its start.  Where torque or law signals jump, there is one row
@@ -226,10 +226,10 @@ class _Rows(NamedTuple):
     """Positions of all joints of MuJoCo's model."""
 
 
-class _Motion(NamedTuple):
+class RecordedMotion(NamedTuple):
     """The recorded motion of a run."""
 
-    rows: _Rows
+    rows: Rows
     states: LoopState
     """The state after each sample of the law."""
     diverged: bool
@@ -280,9 +280,9 @@ class _Run:
         """Whether the robot receives the command unchanged."""
         self.stages = Stages(self.torque_and_rate, jax.tree.map(np.asarray, self.state.actuator))
         self.states: list[LoopState] = []
-        self.rows: list[_Rows] = []
+        self.rows: list[Rows] = []
 
-    def motion(self, steps: int) -> _Motion:
+    def motion(self, steps: int) -> RecordedMotion:
         """Runs this number of steps and returns the recorded motion."""
         diverged = False
         self.robot.place(np.asarray(self.state.q), np.asarray(self.state.dq))
@@ -296,7 +296,7 @@ class _Run:
                 self.begin_step(index, t)
                 if index < steps:
                     self.integrate(t, t + self.dt)
-        return _Motion(_stacked(self.rows), _stacked(self.states), diverged)
+        return RecordedMotion(_stacked(self.rows), _stacked(self.states), diverged)
 
     def has_diverged(self) -> bool:
         """Whether the state is not finite or too fast."""
@@ -360,7 +360,7 @@ class _Run:
         model_positions = self.robot.data.qpos.copy()
         sample = len(self.commands) - 1
         self.rows.append(
-            _Rows(t, instant, q, dq, ddq, tau, limited, actuator, sample, model_positions)
+            Rows(t, instant, q, dq, ddq, tau, limited, actuator, sample, model_positions)
         )
 
     # Commands in transit, and jumps of the scenario
@@ -409,11 +409,11 @@ def _stacked(trees: Sequence[Any]) -> Any:
 
 
 @jax.jit
-def _observed(scenario: Scenario, folds, dt, motion: _Motion):
+def _observed(scenario: Scenario, folds, dt, motion: RecordedMotion, is_gap):
     """Samples, metrics and flags of a motion."""
     rows = motion.rows
     t = rows.t.astype(dt.dtype)
-    half, zero = 0.5 * jnp.diff(t), jnp.zeros((1,), dt.dtype)
+    half, zero = jnp.where(is_gap, 0.0, 0.5 * jnp.diff(t)), jnp.zeros((1,), dt.dtype)
     weight = jnp.concatenate([zero, half]) + jnp.concatenate([half, zero])
     step = jnp.where(rows.instant & (t > 0), dt, 0.0)
     signals = jax.tree.map(lambda x: x[rows.sample], motion.states.sampled.signals)
@@ -426,12 +426,31 @@ def _observed(scenario: Scenario, folds, dt, motion: _Motion):
     return samples, folded(folds, samples), raised
 
 
-def _rollout(
-    scenario: Scenario, folds: Any, motion: _Motion, dt: float, record_every: int, method: str
+def rollout_of(
+    scenario: Scenario,
+    folds: Any,
+    motion: RecordedMotion,
+    dt: float,
+    record_every: int,
+    method: str,
+    is_gap: np.ndarray | None = None,
 ) -> Rollout:
-    """The result of a motion."""
+    """The result of a motion.
+
+    Args:
+      scenario: sampled and canonical.
+      folds: the metrics.
+      motion: R rows.
+      dt: time step [s].
+      record_every: record every so-many-th step.
+      method: name of the integrator.
+      is_gap: whether the time between two rows is not part of integrals over time, (R - 1,) bool;
+        none of it if not given.
+    """
     step_size = jnp.asarray(dt, scenario.initial.q.dtype)
-    samples, results, raised = _observed(scenario, folds, step_size, motion)
+    if is_gap is None:
+        is_gap = np.zeros(len(motion.rows.t) - 1, bool)
+    samples, results, raised = _observed(scenario, folds, step_size, motion, is_gap)
     status = np.bitwise_or.reduce(np.asarray(raised))
     if motion.diverged:
         status |= int(Status.NOT_FINITE)
