@@ -406,7 +406,12 @@ class _StateReader:
         return [key.index(name) for name in self.names]
 
     def _names_of_message(self, key: tuple[str, ...]) -> tuple[str, ...]:
-        """The names of the joints of a robot without names: those of the first message."""
+        """The names of the joints of a robot without names: those of an exported node if they are
+        in the first message, else all names of this message.
+        """
+        exported = tuple(f"joint_{i + 1}" for i in range(self.n))
+        if set(exported) <= set(key):
+            return exported
         if len(key) != self.n:
             came = f"the joints {', '.join(key)}"
             expected = f"{self.n} joints, as the scenario's robot has no names"

@@ -64,8 +64,8 @@ def bag_log(
     Args:
       path: the folder of the recording, or a `.db3` or `.mcap` file.
       scenario: on a robot of n joints; its joint names order the joint states, in which further
-        joints may occur.  A robot without names is read in the order of the first message, with a
-        warning.
+        joints may occur.  A robot without names has joint_1, joint_2, ..., as in an exported node,
+        or is read in the order of the first message, with a warning.
       joint_states: topic of the `sensor_msgs/JointState`s; a relative name may be the end of one
         topic.
       efforts: topic of the `std_msgs/Float64MultiArray`s, in the order of the scenario's joints;

@@ -102,6 +102,12 @@ def test_a_robot_without_names_is_read_in_the_order_of_the_messages(scenario, mo
         (log,) = read(folder, 2)
     np.testing.assert_array_equal(log.q, q)
     assert log.dq is None
+    # The names that an exported node has for such a robot.
+    names = ("joint_2", "joint_1")
+    folder = write_bag(tmp_path / "numbered", messages_of(t, names, q, tau))
+    (numbered,) = read(folder, 2)
+    np.testing.assert_array_equal(numbered.q, q[:, ::-1])
+    folder = tmp_path / "bag"
     (swapped,) = read(folder, 2, joints=("elbow", "shoulder"))
     np.testing.assert_array_equal(swapped.q, q[:, ::-1])
 
