@@ -302,6 +302,22 @@ def test_a_recording_identifies_what_the_same_csv_file_identifies(logged, tmp_pa
         np.testing.assert_allclose(one.error, two.error, rtol=1e-4)
 
 
+def test_the_latency_of_the_efforts_is_estimated(tmp_path):
+    """The robot receives each effort 2 ms after the stamp of the joint state, as the recorder."""
+    scenario = bag_files.example_scenario()
+    late = ij.with_parts(scenario, sampling=ij.Sampling(4e-3, delay=2e-3))
+    late = ij.with_parameters(late, bag_files.EXAMPLE)
+    run = ij.simulate(late, duration=3.0, dt=1e-3)
+    t, q, tau = (np.asarray(x) for x in (run.t, run.q, run.tau))
+    commands = [*tau[2::4], tau[-1]]
+    messages = messages_of(t[::4], NAMES, q[::4], commands, latency=2_000_000)
+    log = read_log(write_bag(tmp_path / "bag", messages), scenario)
+    known = ij.identify(scenario, log, ["robot.mass", "disturbance.viscous"], widths=False)
+    np.testing.assert_allclose(known.delay, 2e-3, atol=5e-5)
+    true = np.concatenate([*bag_files.EXAMPLE.values()])
+    np.testing.assert_allclose([x.value for x in known.wanted], true, rtol=1e-3)
+
+
 @pytest.mark.parametrize("as_option", [False, True])
 def test_the_command_line_reads_a_recording(as_option, logged, tmp_path, capsys):
     t, q, tau = logged
