@@ -73,6 +73,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NM,NM,...",
         help="limits of the torques [N m] (default: the model's, else 3 times what a run needs)",
     )
+    demo.add_argument(
+        "--state-timeout",
+        type=float,
+        metavar="S",
+        help="age beyond which the law takes a state for stale [s] (default: two periods)",
+    )
+    demo.add_argument(
+        "--priority",
+        type=int,
+        metavar="N",
+        help="real-time priority of both processes, 1 to 99, by `chrt` (default: none)",
+    )
     demo.set_defaults(run_ros=run_demo)
 
 
@@ -142,7 +154,7 @@ def run_robot(args: argparse.Namespace) -> int:
             motion = node.run(
                 periods * options["period"],
                 patience=ENDLESS,
-                on_release=lambda: print("the robot is in motion", flush=True),
+                on_release=lambda: print(f"in motion, t = 0 at {node.origin} ns", flush=True),
             )
     except TimeoutError as error:
         complain(str(error))
@@ -175,6 +187,8 @@ def run_demo(args: argparse.Namespace) -> int:
             joints=args.joints,
             duration=args.duration,
             torque_limits=limits,
+            state_timeout=args.state_timeout,
+            priority=args.priority,
             **options,
         )
     except (ToolchainError, TimeoutError, ChildProcessError) as error:

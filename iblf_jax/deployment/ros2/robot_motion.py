@@ -46,6 +46,8 @@ class RobotMotion:
     """Time step of MuJoCo [s]."""
     origin: float
     """Stamp of the state at t = 0 [s]."""
+    ended: float
+    """Clock of the computer at the end [s]."""
     t: np.ndarray
     """Times of the rows, (R,) [s]."""
     instant: np.ndarray
@@ -163,7 +165,7 @@ class RobotMotion:
         names = fields.pop("count_names").tolist()
         fields["counts"] = dict(zip(names, fields.pop("count_values").tolist(), strict=True))
         fields["joints"] = tuple(fields["joints"].tolist())
-        for name in ("period", "dt", "origin", "diverged"):
+        for name in ("period", "dt", "origin", "ended", "diverged"):
             fields[name] = fields[name].item()
         return RobotMotion(**fields)
 

@@ -156,7 +156,7 @@ class RobotSimulation:
         for step in range(first, first + self.steps_per_period):
             self.begin_step(step * self.dt)
             self.integrate(step * self.dt, (step + 1) * self.dt)
-            self.diverged = self.diverged or self.has_diverged()
+        self.diverged = self.has_diverged()
         self.index += 1
 
     def has_diverged(self) -> bool:

@@ -281,10 +281,11 @@ class SimulatedRobot:
         finally:
             if was_enabled:
                 gc.enable()
+        ended = time.time()
         simulation.finish()
-        return self._motion()
+        return self._motion(ended)
 
-    def _motion(self) -> RobotMotion:
+    def _motion(self, ended: float) -> RobotMotion:
         simulation = self.simulation
         self.counts["timeouts of the hold time"] = simulation.timeouts
         return recorded(
@@ -295,6 +296,7 @@ class SimulatedRobot:
             period=simulation.period,
             dt=simulation.dt,
             origin=self.origin / NANOSECONDS,
+            ended=ended,
             published=np.array(self.published),
             latency=np.array(self.latency),
             lateness=np.array(self.lateness),

@@ -60,6 +60,7 @@ def motion_of(simulation: RobotSimulation) -> RobotMotion:
         period=PERIOD,
         dt=DT,
         origin=0.0,
+        ended=0.0,
         published=np.ones(samples, bool),
         latency=np.zeros(samples),
         lateness=np.zeros(samples),

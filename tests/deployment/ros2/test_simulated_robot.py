@@ -193,7 +193,7 @@ def test_the_command_ends_cleanly_on_a_signal(number, tmp_path):
     with pd_law():
         process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         line = process.stdout.readline()
-        assert "in motion" in line, line
+        assert line.startswith("in motion, t = 0 at "), line
         time.sleep(0.5)
         process.send_signal(number)
         output, _ = process.communicate(timeout=30)
