@@ -7,8 +7,10 @@ import json
 import signal
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -231,6 +233,26 @@ def priority_command(priority: int | None) -> list[str]:
     return ["chrt", "-f", str(priority)]
 
 
+@contextmanager
+def interrupts_raised() -> Iterator[None]:
+    """Context in which SIGINT and SIGTERM raise KeyboardInterrupt, so that the contexts inside it
+    stop their processes.
+    """
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {x: signal.signal(x, interrupt) for x in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
 def run_nodes(
     law: Sequence[str], robot: Sequence[str], folder: Path, longest: float
 ) -> tuple[RobotMotion, dict[str, str]]:
@@ -250,6 +272,7 @@ def run_nodes(
       TimeoutError: the robot is still running after this time.
     """
     with (
+        interrupts_raised(),
         ProcessOfNode(robot, folder / "robot.log") as robot_process,
         ProcessOfNode(law, folder / "law.log") as law_process,
         DiagnosticsListener() as listener,

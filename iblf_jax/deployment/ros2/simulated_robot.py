@@ -22,6 +22,9 @@ from iblf_jax.world.robots.payload import Payload
 REPUBLISH_INTERVAL = 0.1
 """In lock-step, time after which a state that no effort has answered is published again [s]: a law
 node that has started meanwhile has not received it."""
+DISCOVERY_TIME = 0.3
+"""Time from the discovery of a publisher of efforts to the first state [s], in which the law node
+discovers this node: an effort that it publishes before is lost."""
 NANOSECONDS = 1_000_000_000
 
 
@@ -254,8 +257,8 @@ class SimulatedRobot:
 
         Args:
           duration: of the motion [s], a whole number of periods.
-          patience: longest wall-clock time that a lock-step waits for the effort which answers a
-            state, and that the brake waits for the first effort [s].
+          patience: longest time of the computer that a lock-step waits for the effort which answers
+            a state, and that the brake waits for the first effort [s].
           on_release: called when the first effort has arrived.
 
         Returns:
@@ -274,6 +277,7 @@ class SimulatedRobot:
         gc.collect()
         gc.disable()  # A collection takes longer than a period.
         try:
+            self._wait_for_law(patience)
             if self.real_time:
                 self._run_in_real_time(periods, patience, on_release)
             else:
@@ -282,6 +286,9 @@ class SimulatedRobot:
             if was_enabled:
                 gc.enable()
         ended = time.time()
+        if not self.published:  # It was stopped before a law was found.
+            self._replace_first_state()
+            simulation.measure()
         simulation.finish()
         return self._motion(ended)
 
@@ -303,6 +310,18 @@ class SimulatedRobot:
             counts=dict(self.counts),
             diverged=simulation.diverged,
         )
+
+    def _wait_for_law(self, patience: float) -> None:
+        """Waits until a node publishes efforts, and has discovered this one."""
+        end = time.perf_counter() + patience
+        while not self._stops and self.node.count_publishers("efforts") == 0:
+            self._spin(time.perf_counter() + REPUBLISH_INTERVAL)
+            if time.perf_counter() > end:
+                raise TimeoutError(self._no_effort(patience))
+        settled = time.perf_counter() + DISCOVERY_TIME
+        while not self._stops and time.perf_counter() < settled:
+            self._spin(settled)
+        self.arrivals.clear()
 
     # Lock-step
 
