@@ -1,14 +1,17 @@
-"""`export`: writes the law or the closed loop of a scenario as C99, an FMU or WebAssembly."""
+"""`export`: writes the law or the closed loop of a scenario as C99, an FMU, WebAssembly or a ROS 2
+package.
+"""
 
 from __future__ import annotations
 
 import argparse
+from typing import Any
 
 from iblf_jax.cli._common import add_scenario_arguments, output_folder, scenario_of
 
-HELP = "write a law as C99 or an FMU, or a closed loop for a browser"
+HELP = "write a law as C99, an FMU or a ROS 2 package, or a closed loop for a browser"
 DESCRIPTION = (
-    "Write the law of a scenario as C99 or an FMU, or its closed loop as an FMU or"
+    "Write the law of a scenario as C99, an FMU or a ROS 2 package, or its closed loop as an FMU or"
     " WebAssembly; print files, operations and sizes."
 )
 EPILOG = "Exit code 2 also if a compiler is missing or fails."
@@ -19,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_scenario_arguments(parser)
     parser.add_argument("--out", required=True, metavar="DIR", help="the folder to write into")
     parser.add_argument(
-        "--target", default="c", metavar="NAME", help="c, fmu, fmu-loop or wasm (default: c)"
+        "--target", default="c", metavar="NAME", help="c, fmu, fmu-loop, wasm or ros2 (default: c)"
     )
     parser.add_argument(
         "--period",
@@ -39,8 +42,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--name",
         metavar="NAME",
-        help="prefix of every name in the code (default: iblf_law or iblf_loop)",
+        help="prefix of every name in the code, and name of a ROS 2 package (default: iblf_law or"
+        " iblf_loop)",
     )
+    _add_ros_arguments(parser)
     parser.add_argument(
         "--dt",
         type=float,
@@ -60,6 +65,57 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _add_ros_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--gain",
+        dest="gains",
+        action="append",
+        metavar="PATH[=LOW:HIGH]",
+        help="ros2: a gain that can be changed while the node runs (default range: that of tune);"
+        " may be repeated",
+    )
+    parser.add_argument(
+        "--torque-limits",
+        type=float,
+        nargs="+",
+        metavar="TAU",
+        help="ros2: largest torque of every joint, or one for all [N m] (default: the model's)",
+    )
+    parser.add_argument(
+        "--on-fault",
+        metavar="POLICY",
+        help="ros2: torques of a fault, hold or zero (default: hold)",
+    )
+
+
+def _tunable(text: str) -> Any:
+    """A gain as `export` takes it, from PATH or PATH=LOW:HIGH."""
+    from iblf_jax.core import checks
+    from iblf_jax.tuning import tunable
+
+    path, equals, limits = text.partition("=")
+    if not equals:
+        return path
+    try:
+        low, high = map(float, limits.split(":"))
+    except ValueError:
+        remedy = "Such as --gain controller.K2=5:50."
+        raise checks.fail("--gain", text, "PATH or PATH=LOW:HIGH", remedy) from None
+    return tunable(path, low, high)
+
+
+def _ros_options(args: argparse.Namespace) -> dict[str, Any]:
+    """The options of a ROS 2 package that have a value."""
+    from iblf_jax.cli._common import given_options
+
+    options = given_options(args, "torque_limits", "on_fault")
+    if len(options.get("torque_limits", ())) == 1:
+        options["torque_limits"] = options["torque_limits"][0]
+    if args.gains is not None:
+        options["gains"] = [_tunable(text) for text in args.gains]
+    return options
+
+
 def run(args: argparse.Namespace) -> int:
     """Runs the command."""
     from iblf_jax.cli import complain
@@ -68,9 +124,14 @@ def run(args: argparse.Namespace) -> int:
     from iblf_jax.kernels import ToolchainError
 
     file = scenario_of(args)
-    options = run_options(args, file)
     names = ("target", "period", "dtype", "reference", "name", "seed")
-    chosen = given_options(args, *names) | {key: options[key] for key in ("dt", "method")}
+    chosen = given_options(args, *names) | _ros_options(args)
+    if args.target == "ros2":
+        # A law has no time step: only what the user gave is checked, not what the file has.
+        chosen |= given_options(args, "dt", "method")
+    else:
+        options = run_options(args, file)
+        chosen |= {key: options[key] for key in ("dt", "method")}
     try:
         print(export(file.scenario, output_folder(args.out), **chosen))
     except ToolchainError as error:

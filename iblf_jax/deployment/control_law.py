@@ -178,6 +178,12 @@ def sample(scenario: Scenario, inputs: SampleInputs, state: LawState) -> tuple[L
     return LawState(update.controller, update.observer, filtered, update.sent), outputs
 
 
+def bounds_at(scenario: Scenario, inputs: SampleInputs) -> tuple[jax.Array, jax.Array]:
+    """The lower and the upper bounds of the positions at the time of a sample, (n,) each [rad]."""
+    tube = _with_reference(scenario, inputs).context.tube(inputs.t)
+    return tube.lower, tube.upper
+
+
 def _measurement(
     scenario: Scenario, inputs: SampleInputs, states: tuple[Any, ...]
 ) -> tuple[Measurement, tuple[Any, ...]]:
@@ -244,6 +250,8 @@ class ControlLaw(NamedTuple):
     """The levels, counted from 1, that a sample does not read; only the start does."""
     estimate_size: int
     """Numbers of the observer's estimate."""
+    bounds: Program
+    """The program of `bounds_at`; its results are the lower and the upper bounds."""
 
 
 def control_law(scenario: Scenario, external_reference: bool) -> ControlLaw:
@@ -275,15 +283,20 @@ def control_law(scenario: Scenario, external_reference: bool) -> ControlLaw:
         state, outputs = sample(scenario, inputs, of_floats(carry, like))
         return as_floats(state, dtype), outputs
 
+    def bounds_step(scenario, inputs, carry, index):
+        return (), bounds_at(scenario, inputs)
+
     start_program = program_of(start_step, scenario, inputs, ())
     sample_program = program_of(sample_step, scenario, inputs, state)
+    bounds_program = program_of(bounds_step, scenario, inputs, ())
     # The levels follow the time, n numbers each.
     levels = {
         (node.value - 1) // scenario.n + 1 for node in sample_program.nodes if node.op == "per_run"
     }
     unread = tuple(i for i in range(2, plants.order_of(scenario.model) + 1) if i not in levels)
     estimate = jax.eval_shape(sample, scenario, inputs, like)[1].f_hat
-    return ControlLaw(start_program, sample_program, number_names(state), unread, estimate.size)
+    names = number_names(state)
+    return ControlLaw(start_program, sample_program, names, unread, estimate.size, bounds_program)
 
 
 def as_floats(state: Any, dtype: Any) -> Any:

@@ -1,4 +1,6 @@
-"""`export`: a scenario's law or its complete closed loop as C99, an FMU or WebAssembly."""
+"""`export`: a scenario's law or its complete closed loop as C99, an FMU, WebAssembly or a ROS 2
+package.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +8,7 @@ import dataclasses
 import math
 import re
 from collections import Counter
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -33,6 +36,12 @@ from iblf_jax.deployment.cosimulate import check_single, with_period
 from iblf_jax.deployment.finite import check_finite
 from iblf_jax.deployment.fmu import law_fmu, loop_fmu
 from iblf_jax.deployment.loop_program import loop_program
+from iblf_jax.deployment.ros2.package import (
+    RosOptions,
+    check_ros_name,
+    ros_options,
+    write_package,
+)
 from iblf_jax.deployment.write_c import (
     CHECK_INTERVAL,
     Law,
@@ -53,8 +62,10 @@ from iblf_jax.simulation.scenario import Scenario, canonical, fitted_to_step
 from iblf_jax.world import plants
 from iblf_jax.world.robots._base import robot_member
 
-LAW_TARGETS = ("c", "fmu")
+LAW_TARGETS = ("c", "fmu", "ros2")
 LOOP_TARGETS = ("fmu-loop", "wasm")
+LOOP_DEFAULTS = {"dt": 1e-3, "method": "rk4", "seed": 0}
+"""The defaults of the arguments that only a closed loop has."""
 TYPES = {"double": "float64", "float": "float32"}
 VECTORS_DURATION = 20.0
 """Length of the simulated run whose torques the self-test compares [s]."""
@@ -108,8 +119,11 @@ def export(
     dt: float = 1e-3,
     method: str = "rk4",
     seed: int = 0,
+    gains: Sequence[Any] | None = None,
+    torque_limits: Any = None,
+    on_fault: str = "hold",
 ) -> Exported:
-    """Writes a scenario's law, or its complete closed loop, as code that runs without Python.
+    """Writes a scenario's law, or its complete closed loop, as code that runs without JAX.
 
         (tau_k, z_(k+1)) = law(t_k, y_k, z_k)
 
@@ -119,6 +133,8 @@ def export(
     run; build files.  "fmu": the same law as `name.fmu`, FMI 3.0 for co-simulation, with the binary
     of this platform. "fmu-loop": the complete closed loop as an FMU.  "wasm": the complete closed
     loop as `name.wasm` for a browser, and `name.json`, the table of its parameters and records.
+    "ros2": a package of type ament_python with the C law and a node that reads `joint_states` and
+    publishes `efforts`, within torque limits and with a policy for faults.
 
     Args:
       scenario: the scenario.  An exported law does not contain the effects of the sensors
@@ -126,15 +142,21 @@ def export(
         part of the simulated run only.  The process noise of the plant is left out.  Levels that
         the sensor does not measure are inputs of the start only.
       folder: output folder; it is created if it does not exist, and existing files are replaced.
-      target: "c", "fmu", "fmu-loop" or "wasm".
+      target: "c", "fmu", "fmu-loop", "wasm" or "ros2".
       period: of the law [s]; the scenario's `sampling.period` if not given.  A closed loop need not
         be sampled.
-      dtype: floating-point type of the code, "double" or "float"; an FMU has doubles.
+      dtype: floating-point type of the code, "double" or "float"; an FMU and a ROS 2 package have
+        doubles.
       reference: "inside" for a law that computes its reference as a function of time; "given" for
         a law whose inputs are q_d, q_d' and q_d".
-      name: prefix of all names in the code, a C identifier; "iblf_law" or "iblf_loop" if not
-        given.
+      name: prefix of all names in the code, a C identifier, and the name of a ROS 2 package;
+        "iblf_law" or "iblf_loop" if not given.
       dt, method, seed: of a closed loop, as in `simulate`.
+      gains: of a ROS 2 package, the gains that can be changed while the node runs: paths, or
+        `ij.tunable(path, low, high)` with a range; without one, the range is that of `tune`.
+      torque_limits: of a ROS 2 package, the largest torques, () or (n,) [N m], at most the model's
+        `effort`, which they are if not given.
+      on_fault: of a ROS 2 package, "hold" (the torques that hold the position) or "zero".
 
     Returns:
       An `Exported`: files, sizes and operations of a call; prints as a table.
@@ -151,9 +173,14 @@ def export(
     is_loop = target in LOOP_TARGETS
     reference = _current_name(reference)
     _check_options(target, dtype, reference, is_loop)
+    loop_options = {"dt": dt, "method": method, "seed": seed}
+    ros_only = {"gains": gains, "torque_limits": torque_limits, "on_fault": on_fault}
+    _check_target_options(target, loop_options, ros_only)
     tableau(method)
     dt, seed = checks.time_span("dt", dt), checks.seed(seed)
     name = checked_name(name, "iblf_loop" if is_loop else "iblf_law")
+    if target == "ros2":
+        check_ros_name(name)
     check_single(scenario)
     if not is_loop:
         scenario = _without_parts_of_the_plant(scenario)
@@ -162,12 +189,15 @@ def export(
     scenario = canonical(astype(scenario, _available(dtype)))
     if not is_loop:
         _check_period(float(scenario.sampling.period))  # type: ignore[union-attr]
+    ros = None
+    if target == "ros2":
+        ros = ros_options(scenario, gains, torque_limits, on_fault)
     folder = checks.folder_to_write("folder", folder)
     external_reference = reference == "given"
     try:
         if is_loop:
             return _export_loop(scenario, folder, target, name, dt, method, seed)
-        return _export_law(scenario, folder, target, name, external_reference)
+        return _export_law(scenario, folder, target, name, external_reference, ros)
     except UnsupportedError as error:
         came = f"what has no C ({error})"
         raise checks.fail("scenario", came, "a scenario whose operations are lowered") from None
@@ -199,14 +229,43 @@ def _check_options(target: str, dtype: str, reference: str, is_loop: bool) -> No
     checks.one_of("reference", reference, ("inside", "given"))
     if target.startswith("fmu") and dtype != "double":
         raise checks.fail("dtype", dtype, '"double" for an FMU', "FMI's own numbers are.")
+    if target == "ros2" and dtype != "double":
+        expected = '"double" for a ROS 2 package'
+        raise checks.fail("dtype", dtype, expected, "The messages have doubles.")
+    if target == "ros2" and reference == "given":
+        expected = '"inside" for a ROS 2 package'
+        remedy = "The node has no topic for a reference: give the scenario a reference."
+        raise checks.fail("reference", reference, expected, remedy)
     if is_loop and reference == "given":
         expected = '"inside" for a closed loop'
         remedy = "Only a law alone receives its reference as an input."
         raise checks.fail("reference", reference, expected, remedy)
 
 
+def _check_target_options(
+    target: str, loop_options: dict[str, Any], ros_only: dict[str, Any]
+) -> None:
+    """Raises ValueError for options of another target."""
+    if target == "ros2":
+        for name, value in loop_options.items():
+            if value != LOOP_DEFAULTS[name]:
+                expected = f"{LOOP_DEFAULTS[name]!r}, the default, for a ROS 2 package"
+                raise checks.fail(name, value, expected, "Only a closed loop has this option.")
+        return
+    for name, value in ros_only.items():
+        if value is None or (name == "on_fault" and value == "hold"):
+            continue
+        expected = f"the default for the target {target!r}"
+        raise checks.fail(name, value, expected, 'Only target="ros2" has this option.')
+
+
 def _export_law(
-    scenario: Scenario, folder: Path, target: str, name: str, external_reference: bool
+    scenario: Scenario,
+    folder: Path,
+    target: str,
+    name: str,
+    external_reference: bool,
+    ros: RosOptions | None,
 ) -> Exported:
     law = Law(
         scenario=scenario,
@@ -221,6 +280,8 @@ def _export_law(
     if target == "c":
         write_files(folder, generated.files)
         files = tuple(generated.files)
+    elif ros is not None:
+        files = write_package(law, generated, ros, folder)
     else:
         law_fmu(law, generated, folder / f"{name}.fmu")
         files = (f"{name}.fmu",)

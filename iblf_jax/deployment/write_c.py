@@ -159,6 +159,11 @@ class Law(NamedTuple):
         return tuple(x.name for x in inputs)
 
     @property
+    def reference_inputs(self) -> tuple[str, ...]:
+        """Names of the inputs that are the reference and its derivatives."""
+        return tuple(x for x in self.further_inputs if x not in self.levels)
+
+    @property
     def levels(self) -> tuple[str, ...]:
         """Names of the inputs that are levels of the model."""
         return ("q", "dq", *(x.name for x in law_inputs(self.scenario.model, False)))
@@ -188,17 +193,18 @@ class GeneratedLaw(NamedTuple):
 def generate(law: Law) -> GeneratedLaw:
     """Generates the files of a law and counts its operations and the bytes of its data."""
     programs, name, n = law.programs, law.name, law.scenario.n
-    parameters = Parameters.of(law.scenario, (programs.start, programs.sample))
+    parameters = Parameters.of(law.scenario, (programs.start, programs.sample, programs.bounds))
     size = len(programs.state_names)
     real_bytes = np.dtype(programs.sample.dtype).itemsize
-    start, sample = _functions(law, parameters)
+    start, sample, bounds = _functions(law, parameters)
     operations = operations_of(programs.sample)
     state_bytes = real_bytes * (max(size, 1) + 2 * n + programs.estimate_size)
     parameter_bytes = real_bytes * max(1, parameters.size)
     result_bytes = real_bytes * (size + len(programs.sample.outputs))
     stack_bytes = max(stack_bytes_of(text, real_bytes) for text in (start, sample)) + result_bytes
+    functions = f"{sample}\n{bounds}"
     values = shared_values(
-        law.scenario, name, programs.sample.dtype, parameters, law.joints, start, sample
+        law.scenario, name, programs.sample.dtype, parameters, law.joints, start, functions
     )
     values |= _law_values(law, operations)
     texts = {
@@ -209,8 +215,8 @@ def generate(law: Law) -> GeneratedLaw:
     return GeneratedLaw(texts, operations, state_bytes, parameter_bytes, stack_bytes, parameters)
 
 
-def _functions(law: Law, parameters: Parameters) -> tuple[str, str]:
-    """The C functions that compute the start and a sample."""
+def _functions(law: Law, parameters: Parameters) -> tuple[str, str, str]:
+    """The C functions that compute the start, a sample and the bounds at a time."""
     programs, name = law.programs, law.name
     size = len(programs.state_names)
     arrays = ("q", "dq", *law.further_inputs)
@@ -226,10 +232,14 @@ def _functions(law: Law, parameters: Parameters) -> tuple[str, str]:
     sample_arguments = [parameter_argument, "const F *m", *arguments]
     results = [f"r[{k}]" for k in range(size + len(programs.sample.outputs))]
     at_start = results[: len(programs.start.outputs)]
+    both_bounds = results[: len(programs.bounds.outputs)]
     return (
         plain_function(programs.start, f"{name}_start", start_arguments, inputs, at_start, SEGMENT),
         plain_function(
             programs.sample, f"{name}_sample", sample_arguments, inputs, results, SEGMENT
+        ),
+        plain_function(
+            programs.bounds, f"{name}_tube", start_arguments, inputs, both_bounds, SEGMENT
         ),
     )
 
@@ -338,6 +348,13 @@ def _input_values(law: Law) -> dict[str, str]:
         "first_further": ", first_{}",
     }
     texts = {key: "".join(map(form.format, law.further_inputs)) for key, form in forms.items()}
+    reference = law.reference_inputs
+    unread = dict.fromkeys(law.levels, "zero")
+    texts |= {
+        "bounds_declarations": "".join(map(forms["further_declarations"].format, reference)),
+        "bounds_parameters": "".join(map(forms["further_parameters"].format, reference)),
+        "bounds_values": "".join(f", {unread.get(x, x)}" for x in law.further_inputs),
+    }
     for key, index in (("arguments", ""), ("arguments_of_k", "[k]"), ("arguments_of_0", "[0]")):
         arguments = {name: name + index for name in ("dq", *law.further_inputs)}
         texts[key] = ", ".join((arguments | dict.fromkeys(law.unread_levels, "NULL")).values())

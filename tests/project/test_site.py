@@ -32,8 +32,9 @@ PAGES = [
     if run_page.blocks(page.read_text(encoding="utf-8"))
 ]
 """Every page with Python: README, CONTRIBUTING and what is beside them, and the documentation."""
-ELSEWHERE = {"other_solvers"}
-"""`test_vector_field` runs the page about other solvers, which needs a library of theirs."""
+ELSEWHERE = {"other_solvers", "ros2_demo"}
+"""`test_vector_field` runs the page about other solvers, which needs a library of theirs, and
+`test_demo` the one about a robot under ROS 2, which needs a law node."""
 LONG = {"guide", "tune_my_robot"}
 """They take more than a minute of a processor each and run before a release. The other pages are
 the short forms of the guide; a notebook goes from the paper to a tuned robot."""

@@ -39,3 +39,11 @@ int ${name}_step(const ${name}_parameters *p, ${name}_state *s, real t, const re
   memcpy(tau, s->tau, sizeof s->tau);
   return status;
 }
+
+void ${name}_bounds(const ${name}_parameters *p, real t${bounds_parameters}, real *lower, real *upper) {
+  static const real zero[${joints}] = {0};
+  real result[2 * ${joints}];
+  ${name}_tube(p, &t, zero, zero${bounds_values}, result);
+  memcpy(lower, result, ${joints} * sizeof *lower);
+  memcpy(upper, result + ${joints}, ${joints} * sizeof *upper);
+}

@@ -51,6 +51,9 @@ int ${name}_init(const ${name}_parameters *p, ${name}_state *s, const ${name}_re
 int ${name}_step(const ${name}_parameters *p, ${name}_state *s, ${name}_real t, const ${name}_real *q, const ${name}_real *dq${further_declarations},
     ${name}_real *tau);
 
+/* The lower and the upper bounds on the positions at time t [rad]. */
+void ${name}_bounds(const ${name}_parameters *p, ${name}_real t${bounds_declarations}, ${name}_real *lower, ${name}_real *upper);
+
 #ifdef __cplusplus
 }
 #endif

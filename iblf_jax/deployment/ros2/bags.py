@@ -8,15 +8,13 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Sequence
-from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from iblf_jax.control import sensors
-from iblf_jax.control.sensors._base import sensor_member
+from iblf_jax.control.actuators import Ideal
 from iblf_jax.core import checks, notices
 from iblf_jax.deployment.cosimulate import (
     RecordedMotion,
@@ -25,12 +23,13 @@ from iblf_jax.deployment.cosimulate import (
     rollout_of,
     with_period,
 )
+from iblf_jax.deployment.ros2.law_replay import replay_law
 from iblf_jax.identification.bag import BagOptions, is_bag, joints_of, read_bag_log
 from iblf_jax.identification.log import Log
-from iblf_jax.simulation.closed_loop import LoopState, initial_state, run_sampled_law
+from iblf_jax.simulation.closed_loop import LoopState
 from iblf_jax.simulation.metrics import Fold, as_folds
 from iblf_jax.simulation.results import Rollout
-from iblf_jax.simulation.scenario import Initial, Scenario, canonical
+from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.world import plants
 
 SHORTEST_INTERVAL = 0.75
@@ -125,8 +124,8 @@ def read_bag(
         that of the first joint state with an effort if not given.
 
     Returns:
-      A `Rollout` of the given scenario, whose `initial` is not used.  `dt` is the median time
-      between joint states; `fastest_mode` is NaN, and there is no `numerical_error`.
+      A `Rollout` of the given scenario, whose `initial` and `actuator` are not used.  `dt` is the
+      median time between joint states; `fastest_mode` is NaN, and there is no `numerical_error`.
 
     Raises:
       ValueError: as `bag_log`, or a plant in strict-feedback form.
@@ -146,9 +145,10 @@ def read_bag(
     dq = log.dq
     if dq is None:
         dq = _derivative(log, log.q)
+    # The recorded torques are those after the actuator.
+    scenario = dataclasses.replace(scenario, actuator=Ideal())
     rows = _rows(log, dq)
-    states = _replayed(scenario, log, dq)
-    motion = RecordedMotion(rows, jax.tree.map(np.asarray, states), diverged=False)
+    motion = RecordedMotion(rows, _replayed(scenario, log, dq), diverged=False)
     folds = as_folds(metrics, scenario.initial.q.dtype, scenario)
     is_gap = rows.instant[:-1] & rows.instant[1:]
     dt = float(np.median(np.diff(log.t)))
@@ -213,38 +213,13 @@ def _rows(log: Log, dq: np.ndarray) -> Rows:
     )
 
 
-def _without_effects(sensor: Any) -> Any:
-    """The sensor for recorded readings: its velocity filter, without counts, offset and noise."""
-    velocity = sensor_member(sensor, "velocity")
-    if velocity is None:
-        return sensors.Ideal()
-    return sensors.Encoder(velocity)
-
-
 def _replayed(scenario: Scenario, log: Log, dq: np.ndarray) -> LoopState:
-    """The states of law and observer after each row, which run on the recorded readings."""
-    scenario = dataclasses.replace(scenario, sensor=_without_effects(scenario.sensor))
+    """The states of law and observer after each joint state."""
     is_due = _samples(log.t, float(scenario.sampling.period))  # type: ignore[union-attr]
     dtype = scenario.initial.q.dtype
-    rows = [jnp.asarray(x, dtype) for x in (log.t, log.q, dq)]
-    return _replay(scenario, *rows, jnp.asarray(is_due))
-
-
-@jax.jit
-def _replay(scenario: Scenario, t: jax.Array, q: jax.Array, dq: jax.Array, is_due: jax.Array):
-    """The state of the loop after each row, stacked."""
-    # The start is not checked against the bounds: values that JAX is tracing have no number.
-    scenario = dataclasses.replace(scenario, initial=Initial(q=q[0], dq=dq[0]))
-    normal = jnp.zeros((scenario.sensor.draws, scenario.n), q.dtype)
-
-    def one(state: LoopState, row: Any) -> tuple[LoopState, LoopState]:
-        t, q, dq, due = row
-        state = state._replace(q=q, dq=dq)
-        run = partial(run_sampled_law, scenario, t, normal=normal)
-        state = jax.lax.cond(due, run, lambda state: state, state)
-        return state, state
-
-    return jax.lax.scan(one, initial_state(scenario), (t, q, dq, is_due))[1]
+    t, q, dq_read = (jnp.asarray(x, dtype) for x in (log.t, log.q, dq))
+    states = replay_law(scenario, t, q, dq_read, jnp.asarray(is_due))
+    return jax.tree.map(np.asarray, states)
 
 
 def _samples(t: np.ndarray, period: float) -> np.ndarray:

@@ -5,7 +5,6 @@ exported C law.
 from __future__ import annotations
 
 import json
-import math
 import string
 from collections.abc import Iterable, Mapping, Sequence
 from importlib.resources import files
@@ -15,6 +14,7 @@ from xml.sax.saxutils import escape
 
 from iblf_jax import __version__
 from iblf_jax.core import notices
+from iblf_jax.deployment.ros2.yaml_text import yaml_numbers
 from iblf_jax.deployment.write_c import GeneratedLaw, Law, title_of
 
 RATE_TOLERANCE = 1e-9
@@ -111,7 +111,7 @@ def _values(
         "gain_names": _gain_names(gains),
     }
     for name in ("torque_limits", "hold_stiffness", "hold_damping"):
-        values[name] = _yaml_numbers(description[name])
+        values[name] = yaml_numbers(description[name])
         values[f"cpp_{name}"] = _cpp_numbers(description[name])
     return values
 
@@ -155,26 +155,7 @@ def _gain_lines(generated: GeneratedLaw, gains: Sequence[Mapping[str, Any]]) -> 
     numbers = [x for field in generated.parameters.fields for x in field.value.reshape(-1).tolist()]
     lines = []
     for gain in gains:
-        values = _yaml_numbers(numbers[places[0]] for places in gain["offsets"])
-        limits = f"{_yaml_numbers(gain['low'])} to {_yaml_numbers(gain['high'])}"
+        values = yaml_numbers(numbers[places[0]] for places in gain["offsets"])
+        limits = f"{yaml_numbers(gain['low'])} to {yaml_numbers(gain['high'])}"
         lines.append(f"    {json.dumps(gain['path'])}: {values}  # [{gain['unit']}], from {limits}")
     return "\n".join(lines) or "    # The law was exported without gains that can be changed."
-
-
-def _yaml_numbers(numbers: Iterable[float]) -> str:
-    """A list of floating-point numbers in YAML."""
-    return f"[{', '.join(map(_yaml_number, numbers))}]"
-
-
-def _yaml_number(x: float) -> str:
-    """A floating-point number in YAML 1.1, whose exponents need a decimal point and a sign."""
-    if not math.isfinite(x):
-        return {"inf": ".inf", "-inf": "-.inf"}.get(repr(float(x)), ".nan")
-    mantissa, mark, exponent = repr(float(x)).partition("e")
-    if not mark:
-        return mantissa
-    if "." not in mantissa:
-        mantissa += ".0"
-    if exponent[0] not in "+-":
-        exponent = f"+{exponent}"
-    return f"{mantissa}e{exponent}"

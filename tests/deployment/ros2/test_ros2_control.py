@@ -413,6 +413,23 @@ def test_the_files_of_the_package_fit_together(built):
     assert own["torque_limits"] == [500.0, 400.0] and own["joints"] == list(JOINTS)
 
 
+def test_an_export_contains_the_controller(scenario, tmp_path):
+    """With the limits, gains and joints of the package around it."""
+    K2 = ij.tunable("controller.K2", 5.0, 20.0)
+    made = ij.export(scenario, tmp_path, target="ros2", gains=[K2], torque_limits=[50.0, 20.0])
+    inside = [name for name in made.files if name.startswith("iblf_law_controller/")]
+    assert len(inside) == 9 and all((tmp_path / name).is_file() for name in inside)
+    package = tmp_path / "iblf_law_controller"
+    source = (package / "src" / "law_controller.cpp").read_text()
+    assert "kTorqueLimits = {50.0, 20.0};" in source and 'kNames = {"joint_1", "joint_2"}' in source
+    include = package / "include"
+    own = ("-I", include, "-I", include / "iblf_law_controller", "-isystem", HERE / "stubs")
+    run(["c++", "-std=c++17", *FLAGS, *own, "-fsyntax-only", package / "src/law_controller.cpp"])
+    assert (package / "src" / "iblf_law.c").read_text() == (tmp_path / "c/iblf_law.c").read_text()
+    parameters = (package / "config" / "controllers.yaml").read_text()
+    assert "torque_limits: [50.0, 20.0]" in parameters and "controller.K2" in parameters
+
+
 def test_a_period_without_a_whole_rate_has_no_controller(scenario, built):
     scenario = canonical(ij.with_parts(scenario, sampling=ij.Sampling(3e-3)))
     law = Law(scenario, control_law(scenario, False), "iblf_law", False, built.vectors, (), None)

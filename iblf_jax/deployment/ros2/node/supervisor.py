@@ -1,0 +1,512 @@
+"""The safety state machine around the law, without ROS.
+
+    waiting -> stopped -> running <-> holding,    running, holding -> fault -> running
+
+    waiting: no complete state yet, no command       stopped: zero torques
+    running: the law's torques                       holding: the hold torques
+    fault: zero torques or the hold torques, as the user chose; only `start` leaves it
+
+    hold torques: g(q) + K (q_h - q) - D q'    while the states are fresh, with q_h at the hold
+                  g(q)                         at the last valid position q otherwise
+
+Every command passes `Supervisor._limited`, which clips it to the torque limits.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from iblf_jax.deployment.ros2.node.c_law import NOT_FINITE, CLaw
+
+NANOSECONDS = 1_000_000_000
+NEW_SAMPLE = 0.75
+"""Shortest distance of the stamps of two samples, in periods."""
+STAMP_TOLERANCE = 0.01
+"""Tolerance of the distance of two stamps, in periods."""
+
+
+class Mode(enum.Enum):
+    """The modes of the node."""
+
+    WAITING = "waiting"
+    STOPPED = "stopped"
+    RUNNING = "running"
+    HOLDING = "holding"
+    FAULT = "fault"
+
+
+class FaultKind(enum.Enum):
+    """Why a state, or a torque of the law, is not used."""
+
+    STALE = "stale state"
+    NOT_FINITE = "state that is not finite"
+    JOINTS = "joints that do not match"
+    CLOCK = "clock that jumped"
+    TORQUE = "torque that is not finite"
+
+
+class Fault(NamedTuple):
+    """A fault and its reason in words."""
+
+    kind: FaultKind
+    reason: str
+
+
+class JointSample(NamedTuple):
+    """A complete and valid state of the joints, in the order of the law."""
+
+    stamp: int
+    """Stamp of the message [ns]."""
+    received: int
+    """Arrival by the steady clock [ns]."""
+    position: tuple[float, ...]
+    """[rad]."""
+    velocity: tuple[float, ...] | None
+    """[rad/s]; None if it is not measured."""
+
+
+class Command(NamedTuple):
+    """What the node publishes."""
+
+    torque: list[float]
+    """In the order of the law's joints, within the limits [N m]."""
+    mode: Mode
+    status: int
+    """Status of the law; 0 if it did not run."""
+    limited: bool
+    """Whether a torque was clipped to its limit."""
+
+
+class Configuration(NamedTuple):
+    """Constants of a supervisor."""
+
+    joints: tuple[str, ...]
+    period: float
+    """Sampling period of the law [s]."""
+    reads_velocity: bool
+    """Whether a state without velocities is incomplete."""
+    torque_limits: tuple[float, ...]
+    """[N m]."""
+    on_fault: str
+    """"hold" or "zero"."""
+    hold_stiffness: tuple[float, ...]
+    """[N m/rad]."""
+    hold_damping: tuple[float, ...]
+    """[N m s/rad]."""
+    start_automatically: bool
+    stamp_timeout: float
+    """Age by its stamp beyond which a state is stale [s]."""
+    arrival_timeout: float
+    """Time since the arrival beyond which a state is stale [s]."""
+
+
+class JointReader:
+    """Reads messages with joints in any order, and further joints.
+
+    Args:
+      joints: names of the law's joints, in its order.
+      reads_velocity: whether a message without velocities is incomplete.
+    """
+
+    def __init__(self, joints: Sequence[str], reads_velocity: bool) -> None:
+        self.joints = tuple(joints)
+        self.reads_velocity = reads_velocity
+        self._names: list[str] = []
+        self._places: tuple[int, ...] = ()
+        """Places of the joints in a message with these names."""
+
+    def read(
+        self,
+        names: list[str],
+        position: Sequence[float],
+        velocity: Sequence[float],
+        stamp: int,
+        received: int,
+    ) -> JointSample | Fault | None:
+        """The state in a message, the reason why it is not valid, or None for other joints.
+
+        Args:
+          names: names of the joints in the message.
+          position: their positions [rad].
+          velocity: their velocities [rad/s]; empty if they are not measured.
+          stamp: stamp of the message [ns].
+          received: arrival by the steady clock [ns].
+        """
+        if names != self._names:
+            fault = self._find(names)
+            if fault is not None:
+                return fault
+        if not self._places:
+            return None
+        fault = self._wrong_lengths(len(names), len(position), len(velocity))
+        if fault is not None:
+            return fault
+        q = tuple([position[i] for i in self._places])
+        dq = None
+        if len(velocity):
+            dq = tuple([velocity[i] for i in self._places])
+        for name, numbers in (("position", q), ("velocity", dq or ())):
+            for joint, x in zip(self.joints, numbers, strict=False):
+                if not math.isfinite(x):
+                    reason = f"the {name} of {joint} is {x}"
+                    return Fault(FaultKind.NOT_FINITE, reason)
+        return JointSample(stamp, received, q, dq)
+
+    def _find(self, names: list[str]) -> Fault | None:
+        """Finds the joints in a message with other names than the last one."""
+        self._names, self._places = [], ()
+        known = set(self.joints).intersection(names)
+        if known:
+            missing = [name for name in self.joints if name not in known]
+            if missing:
+                reason = f"the state has no joints {', '.join(missing)}"
+                return Fault(FaultKind.JOINTS, reason)
+            repeated = [name for name in self.joints if names.count(name) > 1]
+            if repeated:
+                reason = f"the state has several joints {', '.join(repeated)}"
+                return Fault(FaultKind.JOINTS, reason)
+            self._places = tuple(names.index(name) for name in self.joints)
+        self._names = list(names)
+        return None
+
+    def _wrong_lengths(self, names: int, positions: int, velocities: int) -> Fault | None:
+        if positions != names:
+            reason = f"the state has {names} names and {positions} positions"
+            return Fault(FaultKind.JOINTS, reason)
+        if velocities == names or (velocities == 0 and not self.reads_velocity):
+            return None
+        reason = f"the state has {names} names and {velocities} velocities"
+        return Fault(FaultKind.JOINTS, reason)
+
+
+class Supervisor:
+    """Decides from the states, the services and the clocks which torque is published.
+
+    Args:
+      law: the law; its state belongs to the supervisor.
+      configuration: the constants.
+      time_origin: stamp at which reference and bounds begin [ns]; None for the stamp of the state
+        with which the law starts.
+    """
+
+    def __init__(
+        self, law: CLaw, configuration: Configuration, time_origin: int | None = None
+    ) -> None:
+        self.law = law
+        self.configuration = configuration
+        self.time_origin = time_origin
+        self.mode = Mode.WAITING
+        self.last_fault: Fault | None = None
+        self.note = "no joint state has arrived"
+        """What the node waits for, or the last message that it did not use."""
+        self.started_at: int | None = None
+        """Stamp that is t = 0 of the running law [ns]."""
+        self.missed = 0
+        """Samples without a state of their own, counted by the stamps."""
+        self.margin = [math.inf] * len(configuration.joints)
+        """Smallest distances to the bounds since `reset_extremes` [rad]."""
+        self.status = 0
+        """Flags of the law since `reset_extremes`."""
+        self.limited = False
+        """Whether a torque was clipped since `reset_extremes`."""
+        self._reader = JointReader(configuration.joints, configuration.reads_velocity)
+        self._sample: JointSample | None = None
+        self._previous: JointSample | None = None
+        self._last_stamp: int | None = None
+        self._due_stamp: int | None = None
+        self._held: tuple[float, ...] = ()
+        self._without_torque = False
+        """Whether `stop` replaced the torques of the mode fault by zeros."""
+        self._period = round(configuration.period * NANOSECONDS)
+        self._stamp_timeout = _nanoseconds(configuration.stamp_timeout)
+        self._arrival_timeout = _nanoseconds(configuration.arrival_timeout)
+        self._zero = [0.0] * len(configuration.joints)
+
+    def receive(
+        self,
+        names: list[str],
+        position: Sequence[float],
+        velocity: Sequence[float],
+        stamp: int,
+        received: int,
+    ) -> bool:
+        """Takes a joint state.
+
+        Args:
+          names, position, velocity, stamp, received: as `JointReader.read`.
+
+        Returns:
+          Whether a law that samples with the states has to answer: the stamp is that of a new
+          sample, or the state is not valid.
+        """
+        found = self._reader.read(names, position, velocity, stamp, received)
+        if found is None:
+            self.note = f"a state has none of the joints {', '.join(self.configuration.joints)}"
+            return False
+        if isinstance(found, JointSample):
+            fault = self._clock_fault(stamp)
+            if fault is None:
+                return self._accept(found)
+            found = fault
+        self._report(found)
+        return True
+
+    def _clock_fault(self, stamp: int) -> Fault | None:
+        """A fault for a stamp before the last one; the later states are compared with this one."""
+        last = self._last_stamp
+        if last is None or stamp >= last:
+            return None
+        self._last_stamp = self._due_stamp = stamp
+        backward = (last - stamp) / NANOSECONDS
+        return Fault(FaultKind.CLOCK, f"the stamps jumped back by {backward:g} s")
+
+    def _accept(self, sample: JointSample) -> bool:
+        """Keeps a valid state; whether it is a new sample."""
+        last = self._last_stamp
+        if last is not None and sample.stamp == last and self._sample is not None:
+            return False
+        self._previous, self._sample = self._sample, sample
+        self._last_stamp = sample.stamp
+        if last is not None:
+            self._check_gap(sample.stamp - last)
+        due = self._due_stamp
+        if due is not None and sample.stamp - due < NEW_SAMPLE * self._period:
+            return False
+        if due is not None:
+            self.missed += max(round((sample.stamp - due) / self._period) - 1, 0)
+        self._due_stamp = sample.stamp
+        return True
+
+    def _check_gap(self, gap: int) -> None:
+        """A fault for states that are further apart than the longest age."""
+        if gap > self._stamp_timeout + STAMP_TOLERANCE * self._period:
+            reason = f"the stamps of two states are {gap / NANOSECONDS:g} s apart"
+            self._report(Fault(FaultKind.STALE, reason))
+
+    def _report(self, fault: Fault) -> None:
+        """A fault of a state; it changes the mode only while torques depend on the states."""
+        self.note = fault.reason
+        if self.mode in (Mode.RUNNING, Mode.HOLDING):
+            self._enter_fault(fault)
+
+    def _enter_fault(self, fault: Fault) -> None:
+        self.mode = Mode.FAULT
+        self.last_fault = fault
+        self.note = fault.reason
+        self._without_torque = False
+        if self._sample is not None:
+            self._held = self._sample.position
+
+    def command(self, now: int, clock: int | None = None) -> Command | None:
+        """The command of this instant, one for each sample of the law; None before the first
+        complete state.
+
+        Args:
+          now: the steady clock [ns].
+          clock: the clock of the stamps [ns]; None if the stamps are not compared with a clock.
+        """
+        problem = self._staleness(now, clock)
+        if self.mode is Mode.WAITING and not self._leave_waiting(problem, now, clock):
+            return None
+        if problem is not None and self.mode in (Mode.RUNNING, Mode.HOLDING):
+            self._enter_fault(Fault(FaultKind.STALE, problem))
+        if self.mode is Mode.RUNNING and self._sample is not None:
+            torque, status = self._law_torque(self._sample)
+            # The law may have failed, which changes the mode.
+            if self.mode is Mode.RUNNING:
+                return self._limited(torque, status)
+        return self._limited(self._torque_without_law(problem is None), 0)
+
+    def _leave_waiting(self, problem: str | None, now: int, clock: int | None) -> bool:
+        """Leaves the mode waiting with the first complete and fresh state."""
+        if self._sample is None or problem is not None:
+            if problem is not None:
+                self.note = problem
+            return False
+        self.mode = Mode.STOPPED
+        self.note = ""
+        if self.configuration.start_automatically:
+            started, reason = self.start(now, clock)
+            if not started:
+                self.note = reason
+        return True
+
+    def _staleness(self, now: int, clock: int | None) -> str | None:
+        """Why the last state is stale; None if it is fresh, or if there is none."""
+        sample = self._sample
+        if sample is None:
+            return None
+        age = now - sample.received
+        if age > self._arrival_timeout:
+            return f"no valid state has arrived for {age / NANOSECONDS:.4g} s"
+        if clock is None:
+            return None
+        age = clock - sample.stamp
+        if age > self._stamp_timeout:
+            return f"the last state is {age / NANOSECONDS:.4g} s old by its stamp"
+        if -age > self._stamp_timeout:
+            return f"the stamp of the last state is {-age / NANOSECONDS:.4g} s in the future"
+        return None
+
+    def _law_torque(self, sample: JointSample) -> tuple[list[float], int]:
+        """The torques of one sample of the law, and its status."""
+        t = (sample.stamp - (self.started_at or 0)) / NANOSECONDS
+        torque, status = self.law.step(t, sample.position, sample.velocity)
+        if status & NOT_FINITE:
+            self._enter_fault(
+                Fault(FaultKind.TORQUE, f"the law has no finite torque at t = {t:g} s")
+            )
+            return torque, status
+        self.status |= status
+        lower, upper = self.law.bounds(t)
+        margin = self.margin
+        for i, x in enumerate(sample.position):
+            margin[i] = min(margin[i], x - lower[i], upper[i] - x)
+        return torque, status
+
+    def _torque_without_law(self, is_fresh: bool) -> list[float]:
+        """The torques of the modes without the law."""
+        holds_on_fault = self.configuration.on_fault == "hold" and not self._without_torque
+        if self.mode is Mode.HOLDING or (self.mode is Mode.FAULT and holds_on_fault):
+            return self._hold_torque(is_fresh)
+        return list(self._zero)
+
+    def _hold_torque(self, is_fresh: bool) -> list[float]:
+        """The torques that hold the position of the hold."""
+        sample = self._sample
+        if sample is None:
+            return list(self._zero)
+        torque = self.law.balance(sample.position)
+        if not is_fresh:
+            return torque
+        velocity = self._velocity(sample)
+        for i, q in enumerate(sample.position):
+            torque[i] += self.configuration.hold_stiffness[i] * (self._held[i] - q)
+            torque[i] -= self.configuration.hold_damping[i] * velocity[i]
+        return torque
+
+    def _velocity(self, sample: JointSample) -> Sequence[float]:
+        """The measured velocities, or the difference quotient of the last two states [rad/s]."""
+        if sample.velocity is not None:
+            return sample.velocity
+        before = self._previous
+        if before is None or sample.stamp <= before.stamp:
+            return self._zero
+        duration = (sample.stamp - before.stamp) / NANOSECONDS
+        pairs = zip(sample.position, before.position, strict=True)
+        return [(x - y) / duration for x, y in pairs]
+
+    def _limited(self, torque: list[float], status: int) -> Command:
+        """The command with every torque within its limits; NaN becomes 0."""
+        limited = False
+        for i, limit in enumerate(self.configuration.torque_limits):
+            x = torque[i]
+            if -limit <= x <= limit:
+                continue
+            limited = True
+            torque[i] = 0.0
+            if not math.isnan(x):
+                torque[i] = math.copysign(limit, x)
+        self.limited |= limited
+        return Command(torque, self.mode, status, limited)
+
+    def start(self, now: int, clock: int | None = None) -> tuple[bool, str]:
+        """Starts the law with the last state.
+
+        Args:
+          now, clock: as `command`.
+
+        Returns:
+          Whether the law runs, and the reason in words.
+        """
+        if self.mode is Mode.RUNNING:
+            return True, "The law is running already."
+        sample, problem = self._sample, self._staleness(now, clock)
+        if sample is None:
+            return False, f"Refused: {self.note}. A complete joint state is needed."
+        if problem is not None:
+            return False, f"Refused: {problem}. Fresh joint states are needed."
+        origin = sample.stamp
+        if self.time_origin is not None:
+            origin = self.time_origin
+        if sample.stamp < origin:
+            ahead = (origin - sample.stamp) / NANOSECONDS
+            reason = f"time_origin is {ahead:g} s after the stamp of the last state"
+            return False, f"Refused: {reason}. Set it to the start of an earlier run, or to NaN."
+        if not self.law.init(sample.position, sample.velocity):
+            return False, "Refused: the law has no finite state at these positions and velocities."
+        self.started_at = origin
+        self.mode = Mode.RUNNING
+        self.note = ""
+        return True, self._start_message(sample, (sample.stamp - origin) / NANOSECONDS)
+
+    def _start_message(self, sample: JointSample, t: float) -> str:
+        """What a user learns about a start: the time, and joints outside of their bounds."""
+        text = f"The law runs from t = {t:g} s."
+        lower, upper = self.law.bounds(t)
+        rows = zip(self.configuration.joints, lower, sample.position, upper, strict=True)
+        outside = [name for name, low, q, high in rows if not low < q < high]
+        if outside:
+            text += f" Outside of their bounds at the start: {', '.join(outside)}."
+        return text
+
+    def stop(self) -> tuple[bool, str]:
+        """Zero torques; the mode fault stays until `start`."""
+        if self.mode is Mode.WAITING:
+            return True, "No command has been sent yet."
+        if self.mode is Mode.FAULT:
+            self._without_torque = True
+            return True, "The torques are zero. The fault stays until the law is started."
+        self.mode = Mode.STOPPED
+        return True, "The torques are zero."
+
+    def hold(self, now: int, clock: int | None = None) -> tuple[bool, str]:
+        """Holds the present position.
+
+        Args:
+          now, clock: as `command`.
+
+        Returns:
+          Whether the position is held, and the reason in words.
+        """
+        sample, problem = self._sample, self._staleness(now, clock)
+        if self.mode is Mode.WAITING or sample is None:
+            return False, f"Refused: {self.note}. A complete joint state is needed."
+        if self.mode is Mode.FAULT:
+            return False, f"Refused: {self.note}. Only start leaves a fault."
+        if problem is not None:
+            return False, f"Refused: {problem}. Fresh joint states are needed."
+        self.mode = Mode.HOLDING
+        self._held = sample.position
+        return True, "The position is held."
+
+    def is_stale(self, now: int, clock: int | None = None) -> bool:
+        """Whether the last state is stale; arguments as `command`."""
+        return self._staleness(now, clock) is not None
+
+    @property
+    def sample_received(self) -> int | None:
+        """Arrival of the last valid state by the steady clock [ns]."""
+        return None if self._sample is None else self._sample.received
+
+    def final_command(self) -> Command | None:
+        """The last command before the node ends: the torques of a fault by the user's policy."""
+        if self.mode is Mode.WAITING:
+            return None
+        if self.mode in (Mode.RUNNING, Mode.HOLDING):
+            self._enter_fault(Fault(FaultKind.STALE, "the node ends"))
+        return self._limited(self._torque_without_law(False), 0)
+
+    def reset_extremes(self) -> None:
+        """Begins a new interval of `margin`, `status` and `limited`."""
+        self.margin = [math.inf] * len(self.configuration.joints)
+        self.status = 0
+        self.limited = False
+
+
+def _nanoseconds(seconds: float) -> float:
+    """Seconds, possibly infinite, in nanoseconds."""
+    return seconds * NANOSECONDS

@@ -1,0 +1,351 @@
+"""Writes a law as a ROS 2 package of type ament_python: the C law, a node around it in Python, a
+launch file and a file of parameters.
+"""
+
+from __future__ import annotations
+
+import json
+import keyword
+import math
+import re
+import sys
+from collections.abc import Mapping
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from iblf_jax import __version__
+from iblf_jax.core import checks
+from iblf_jax.deployment.build import write_files
+from iblf_jax.deployment.c_names import Parameters
+from iblf_jax.deployment.ros2.ros2_control import controller_package, ros2_control_files
+from iblf_jax.deployment.ros2.yaml_text import yaml_number, yaml_numbers
+from iblf_jax.deployment.write_c import GeneratedLaw, Law, title_of
+from iblf_jax.simulation import paths
+from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.studies.draws import check_paths
+from iblf_jax.world import plants
+from iblf_jax.world.robots._base import mass_matrix_at, robot_member
+
+if TYPE_CHECKING:
+    from iblf_jax.tuning.parameters import Tunable
+
+NODE = "iblf_jax.deployment.ros2.node"
+"""The modules of a node; in a package, its own name replaces this one."""
+NODE_MODULES = ("c_law.py", "monitor.py", "supervisor.py", "law_node.py")
+"""The modules of `node/` that a package contains."""
+POLICIES = ("hold", "zero")
+"""Torques of a fault: those that hold the position, or zero."""
+HOLD_BANDWIDTH = 5.0
+"""Bandwidth of the hold for a joint alone [rad/s]."""
+HOLD_BANDWIDTH_TIMES_PERIOD = 0.02
+"""Largest product of this bandwidth and the period: the inertia of a joint in an arm may be ten
+times smaller than that of the joint alone."""
+PACKAGE_NAME = r"[a-z](?:_?[a-z0-9])+"
+"""Names of ROS packages: lower case, digits and single underscores (REP 144)."""
+PERIOD = "sampling.period"
+
+
+class Gain(NamedTuple):
+    """A gain of the node: a leaf, or entries of one, with its range."""
+
+    path: str
+    unit: str
+    value: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    tied: bool
+    """Whether one number sets all entries."""
+
+
+class RosOptions(NamedTuple):
+    """The validated options of a package."""
+
+    gains: tuple[Gain, ...]
+    torque_limits: np.ndarray
+    """(n,) [N m]."""
+    on_fault: str
+
+
+def check_ros_name(name: str) -> None:
+    """Raises ValueError for a name that no ROS package or no Python module can have."""
+    is_module = name in sys.stdlib_module_names or keyword.iskeyword(name)
+    if re.fullmatch(PACKAGE_NAME, name) and not is_module:
+        return
+    expected = "lower case, digits and single underscores, and no module of Python"
+    raise checks.fail("name", name, expected, 'It names the ROS package: name="arm_law".')
+
+
+def ros_options(scenario: Scenario, gains: Any, torque_limits: Any, on_fault: str) -> RosOptions:
+    """The options of a package.
+
+    Args:
+      scenario: canonical, sampled.
+      gains: paths and `Tunable`s of the gains that can be changed while the node runs; None for
+        none.
+      torque_limits: largest torques, () or (n,) [N m]; None for those of the model.
+      on_fault: "hold" or "zero".
+
+    Raises:
+      ValueError: an invalid option, or a model with levels that no joint state has.
+    """
+    checks.one_of("on_fault", on_fault, POLICIES)
+    if plants.is_chain(scenario.model):
+        expected = "a robot, whose state is q and q'"
+        remedy = "sensor_msgs/JointState has no further levels; export to C instead."
+        raise checks.fail("scenario.model", type(scenario.model).__name__, expected, remedy)
+    limits = _torque_limits(scenario, torque_limits)
+    return RosOptions(_gains(scenario, gains), limits, on_fault)
+
+
+def _torque_limits(scenario: Scenario, given: Any) -> np.ndarray:
+    """The largest torques, (n,) [N m]: the given ones, at most those of the model."""
+    n = scenario.n
+    effort = robot_member(scenario.model, "effort")
+    largest = np.full(n, math.inf)
+    if effort is not None:
+        largest = np.broadcast_to(np.asarray(effort, float), (n,))
+    if given is None:
+        if np.all(np.isfinite(largest)):
+            return largest
+        expected = "the largest torque of every joint [N m]"
+        remedy = "The model has no finite `effort`: give torque_limits=[50.0, 20.0]."
+        raise checks.fail("torque_limits", None, expected, remedy)
+    limits = np.asarray(checks.as_floats("torque_limits", given), float)
+    if limits.shape not in ((), (n,)):
+        raise checks.fail("torque_limits", given, f"one number, or {n} numbers [N m]")
+    limits = np.broadcast_to(limits, (n,))
+    if np.all((limits > 0) & np.isfinite(limits) & (limits <= largest)):
+        return limits
+    expected = "finite numbers > 0"
+    if np.any(np.isfinite(largest)):
+        expected += f", at most the model's efforts {largest.tolist()} N m"
+    raise checks.fail("torque_limits", given, expected, "Give the limits of the drives.")
+
+
+def _gains(scenario: Scenario, given: Any) -> tuple[Gain, ...]:
+    """The gains with their ranges, those of `tune` where none are given."""
+    if given is None:
+        return ()
+    # Importing `tuning` takes half a second, which other targets do not need.
+    from iblf_jax.tuning.parameters import in_units, layout
+
+    example = '[ij.tunable("controller.K2", 5.0, 50.0)]'
+    entries = checks.nonempty_list("gains", given, example)
+    tunables = [_as_tunable(place, entry) for place, entry in enumerate(entries)]
+    check_paths(scenario, [x.path for x in tunables], "gains")
+    if any(x.path == PERIOD for x in tunables):
+        expected = "leaves of law, observer or model"
+        remedy = "The period of a node is fixed: export once for each period."
+        raise checks.fail("gains", PERIOD, expected, remedy)
+    for item in tunables:
+        _check_tied(scenario, item)
+    period = float(scenario.sampling.period)  # type: ignore[union-attr]
+    blocks, box = layout(scenario, tunables, period, "rk4")
+    low, high = in_units(blocks, box.low), in_units(blocks, box.high)
+    found = []
+    for item, block in zip(tunables, blocks, strict=True):
+        part = slice(block.start, block.start + block.size)
+        least, most = _range_end(item.low, low[part]), _range_end(item.high, high[part])
+        found.append(_gain(scenario, item, least, most))
+    return tuple(found)
+
+
+def _as_tunable(place: int, given: Any) -> Tunable:
+    """An entry of the list of gains."""
+    from iblf_jax.tuning.parameters import Tunable
+
+    if isinstance(given, str):
+        return Tunable(given)
+    if isinstance(given, Tunable):
+        return given
+    expected = "the path of a leaf, or ij.tunable(path, low, high)"
+    remedy = 'Such as ij.tunable("controller.K2", 5.0, 50.0).'
+    raise checks.fail(f"gains[{place}]", given, expected, remedy)
+
+
+def _check_tied(scenario: Scenario, item: Tunable) -> None:
+    """Raises ValueError for one number that would replace different ones."""
+    value = np.asarray(paths.get(scenario, item.path), float)
+    if not item.tied or np.all(value == value.flat[0]):
+        return
+    remedy = f'Such as ij.with_parameters(scenario, {{"{item.path}": {value.flat[0]:g}}}).'
+    raise checks.fail(f"gains: {item.path}", value, "equal numbers for a tied gain", remedy)
+
+
+def _range_end(given: Any, numbers: np.ndarray) -> np.ndarray:
+    """An end of a range: the given one, as that of `tune` has passed through a logarithm."""
+    if given is None or np.size(given) not in (1, numbers.size):
+        return numbers
+    return np.broadcast_to(np.asarray(given, float).reshape(-1), numbers.shape)
+
+
+def _gain(scenario: Scenario, item: Tunable, low: np.ndarray, high: np.ndarray) -> Gain:
+    """A gain whose range is admissible."""
+    value = np.asarray(paths.get(scenario, item.path), float)
+    for name, end in (("low", low), ("high", high)):
+        if not np.all(np.isfinite(end)):
+            remedy = f'Give both: ij.tunable("{item.path}", low, high).'
+            raise checks.fail(f"gains: {item.path}: {name}", end, "finite limits", remedy)
+        complete = np.broadcast_to(end, value.shape) if item.tied else end.reshape(value.shape)
+        reason = paths.why_inadmissible(scenario, {item.path: jnp.asarray(complete)})
+        if reason:
+            raise checks.fail(f"gains: {item.path}: {name}", end, "an admissible value", reason)
+    return Gain(item.path, paths.unit_at(scenario, item.path), value, low, high, item.tied)
+
+
+def _offsets(scenario: Scenario, parameters: Parameters, path: str) -> np.ndarray:
+    """Indices of the numbers at a path in the struct of parameters, in the shape of the value.
+
+    Raises:
+      ValueError: the law does not read the leaf.
+    """
+    starts, offset = {}, 0
+    for field in parameters.fields:
+        starts[field.path] = (offset, field.shape)
+        offset += math.prod(field.shape)
+    rows = zip(paths.leaves(scenario, path), paths.places(scenario, path), strict=True)
+    for leaf, tokens in rows:
+        if leaf in starts:
+            start, shape = starts[leaf]
+            index = tuple(int(token) for token in tokens[len(paths.parse(leaf)) :])
+            return np.asarray(start + np.arange(math.prod(shape)).reshape(shape)[index])
+    remedy = checks.did_you_mean(path, [field.path for field in parameters.fields])
+    raise checks.fail("gains", path, "a parameter that the law reads", remedy)
+
+
+def _description(law: Law, generated: GeneratedLaw, options: RosOptions) -> dict[str, Any]:
+    """The content of `law.json`."""
+    scenario = law.scenario
+    stiffness, damping = _hold_gains(scenario)
+    return {
+        "name": law.name,
+        "version": __version__,
+        "joints": list(_joints(law)),
+        "has_joint_names": bool(law.joints),
+        "period": float(scenario.sampling.period),  # type: ignore[union-attr]
+        "reads_velocity": "dq" not in law.unread_levels,
+        "torque_limits": options.torque_limits.tolist(),
+        "on_fault": options.on_fault,
+        "hold_stiffness": stiffness,
+        "hold_damping": damping,
+        "gains": [_gain_row(scenario, generated.parameters, gain) for gain in options.gains],
+    }
+
+
+def _joints(law: Law) -> tuple[str, ...]:
+    """The names of the joints; numbered ones for a model without names."""
+    return law.joints or tuple(f"joint_{i + 1}" for i in range(law.scenario.n))
+
+
+def _gain_row(scenario: Scenario, parameters: Parameters, gain: Gain) -> dict[str, Any]:
+    """A gain in `law.json`."""
+    numbers = _offsets(scenario, parameters, gain.path).reshape(-1)
+    offsets = [[int(x)] for x in numbers]
+    if gain.tied:
+        offsets = [[int(x) for x in numbers]]
+    return {
+        "path": gain.path,
+        "unit": gain.unit,
+        "is_scalar": gain.tied or gain.value.ndim == 0,
+        "low": gain.low.reshape(-1).tolist(),
+        "high": gain.high.reshape(-1).tolist(),
+        "offsets": offsets,
+    }
+
+
+def _hold_gains(scenario: Scenario) -> tuple[list[float], list[float]]:
+    """Stiffness [N m/rad] and damping [N m s/rad] of the hold: critical damping of each joint
+    alone at the start, two digits.
+    """
+    period = float(scenario.sampling.period)  # type: ignore[union-attr]
+    bandwidth = min(HOLD_BANDWIDTH, HOLD_BANDWIDTH_TIMES_PERIOD / period)
+    inertia = np.diag(np.asarray(mass_matrix_at(scenario.model, scenario.initial.q)))
+    stiffness, damping = bandwidth**2 * inertia, 2 * bandwidth * inertia
+    return [float(f"{x:.2g}") for x in stiffness], [float(f"{x:.2g}") for x in damping]
+
+
+def _gain_lines(options: RosOptions) -> str:
+    """The gains in the file of parameters."""
+    lines = []
+    for gain in options.gains:
+        numbers = gain.value.reshape(-1).tolist()
+        text = yaml_numbers(numbers)
+        if gain.tied or gain.value.ndim == 0:
+            text = yaml_number(numbers[0])
+        low, high = gain.low.reshape(-1).tolist(), gain.high.reshape(-1).tolist()
+        limits = f"{yaml_numbers(low)} to {yaml_numbers(high)}"
+        lines.append(f"    {json.dumps(gain.path)}: {text}  # [{gain.unit}], from {limits}")
+    return "\n".join(lines) or "    # This law was exported without gains that can be changed."
+
+
+def _template(name: str, values: Mapping[str, Any]) -> str:
+    """The text of a template with its placeholders filled in."""
+    text = (files("iblf_jax.deployment.ros2") / "templates" / name).read_text(encoding="utf-8")
+    return Template(text).substitute(values)
+
+
+def ros_files(law: Law, generated: GeneratedLaw, options: RosOptions) -> dict[str, str]:
+    """The files of the package, and in a folder of it those of the package of a controller of
+    ros2_control: path -> text.
+    """
+    name = law.name
+    description = _description(law, generated, options)
+    values = {
+        "name": name,
+        "title": title_of(law.scenario),
+        "version": __version__,
+        "joints": json.dumps(description["joints"]),
+        "period": yaml_number(description["period"]),
+        "torque_limits": yaml_numbers(description["torque_limits"]),
+        "on_fault": description["on_fault"],
+        "hold_stiffness": yaml_numbers(description["hold_stiffness"]),
+        "hold_damping": yaml_numbers(description["hold_damping"]),
+        "gains": _gain_lines(options),
+        "n": law.scenario.n,
+        "velocity": _velocity_note(description["reads_velocity"]),
+    }
+    texts = {
+        "package.xml": _template("package.xml", values),
+        "setup.py": _template("setup.py.txt", values),
+        "setup.cfg": _template("setup.cfg", values),
+        "README.md": _template("README.md", values),
+        f"resource/{name}": "",
+        f"launch/{name}.launch.py": _template("launch.py.txt", values),
+        f"config/{name}.yaml": _template("parameters.yaml", values),
+        "test/test_law.py": _template("test_law.py.txt", values),
+        f"{name}/__init__.py": f'"""{values["title"]}."""\n',
+        f"{name}/law.json": f"{json.dumps(description, indent=1)}\n",
+        f"c/{name}_library.c": _template("library.c", values),
+    }
+    node = files(NODE)
+    for module in NODE_MODULES:
+        text = (node / module).read_text(encoding="utf-8")
+        texts[f"{name}/{module}"] = text.replace(NODE, name)
+    for file, text in generated.files.items():
+        texts[f"c/{file}"] = text
+    controller = controller_package(name)
+    for file, text in ros2_control_files(law, generated, description).items():
+        texts[f"{controller}/{file}"] = text
+    return texts
+
+
+def _velocity_note(reads_velocity: bool) -> str:
+    if reads_velocity:
+        return "positions and velocities"
+    return "positions (the law filters velocities from them)"
+
+
+def write_package(
+    law: Law, generated: GeneratedLaw, options: RosOptions, folder: Path
+) -> tuple[str, ...]:
+    """Writes the package into a folder; returns the names of its files."""
+    texts = ros_files(law, generated, options)
+    for name in {str(Path(name).parent) for name in texts}:
+        (folder / name).mkdir(parents=True, exist_ok=True)
+    write_files(folder, texts)
+    return tuple(texts)

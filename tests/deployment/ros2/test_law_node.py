@@ -1,0 +1,471 @@
+"""The node of a generated package as a process of its own, and a client of rclpy in this one: the
+law of a simulated run in lock-step, faults, limits, gains that change, and restarts."""
+
+from __future__ import annotations
+
+import array
+import math
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import ros_package
+
+import iblf_jax as ij
+from iblf_jax.deployment.ros2.node.c_law import load_law
+
+REASON = "rclpy is not installed: pip install '.[ros]' has wheels for Python 3.11 on Linux x86-64"
+rclpy = pytest.importorskip("rclpy", reason=REASON)
+from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParameters
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+from std_srvs.srv import Trigger
+
+NAME, PERIOD = ros_package.NAME, ros_package.PERIOD
+LIMITS = (40.0, 15.0)
+JOINTS = ("joint_1", "joint_2")
+INSIDE = (0.55, 0.45)
+"""Positions inside of the bounds at t = 0."""
+TIMEOUT = 20.0
+"""Longest wait for something that must happen [s]."""
+
+
+@pytest.fixture(scope="module")
+def package(tmp_path_factory):
+    return ros_package.made_package(tmp_path_factory.mktemp("ros2"))
+
+
+@pytest.fixture(scope="module")
+def context():
+    """A domain of its own, so that tests beside each other do not hear each other."""
+    os.environ["ROS_DOMAIN_ID"] = str(random.SystemRandom().randrange(1, 100))
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    rclpy.init()
+    yield
+    rclpy.shutdown()
+
+
+class Client:
+    """What a robot's driver and its user do: states, efforts, services and parameters."""
+
+    def __init__(self):
+        self.node = rclpy.create_node("robot")
+        self.states = self.node.create_publisher(JointState, "joint_states", 10)
+        self.efforts: list[list[float]] = []
+        self.diagnostics: dict[str, str] = {}
+        self.level = b"\0"
+        self.node.create_subscription(Float64MultiArray, "efforts", self._effort, 10)
+        self.node.create_subscription(DiagnosticArray, "diagnostics", self._diagnostic, 10)
+
+    def _effort(self, message):
+        effort = list(message.data)
+        assert all(-limit <= x <= limit for x, limit in zip(effort, LIMITS, strict=True))
+        self.efforts.append(effort)
+
+    def _diagnostic(self, message):
+        status = message.status[0]
+        self.level = status.level
+        self.diagnostics = {value.key: value.value for value in status.values}
+
+    def spin(self, duration: float) -> None:
+        """Receives for a duration."""
+        end = time.monotonic() + duration
+        while time.monotonic() < end:
+            rclpy.spin_once(self.node, timeout_sec=0.005)
+
+    def wait(self, condition: Callable[[], object], what: str) -> None:
+        """Receives until a condition holds."""
+        end = time.monotonic() + TIMEOUT
+        while not condition():
+            assert time.monotonic() < end, f"{what}; {self.diagnostics}"
+            rclpy.spin_once(self.node, timeout_sec=0.005)
+
+    def connect(self) -> None:
+        """Waits until the node reports a message of this client, with other joints than its own.
+
+        The endpoints of a killed process are known for 20 s, so that counts of them say nothing.
+        """
+        other = {"names": ("gripper",), "q": (0.0,), "dq": (0.0,)}
+        self.diagnostics = {}
+        self.drive(lambda: "none of" in self.diagnostics.get("note", ""), "no node", **other)
+
+    def state(self, q=INSIDE, dq=(0.0, 0.0), names=JOINTS, stamp=None) -> None:
+        """Publishes a state, with the present time as its stamp unless one is given [s]."""
+        message = JointState(name=list(names), position=list(q), velocity=list(dq))
+        message.header.stamp = self.node.get_clock().now().to_msg()
+        if stamp is not None:
+            nanoseconds = round(stamp * 1e9)
+            message.header.stamp.sec = nanoseconds // 10**9
+            message.header.stamp.nanosec = nanoseconds % 10**9
+        self.states.publish(message)
+
+    def drive(self, until: Callable[[], object], what: str, **state) -> None:
+        """Publishes a state every period until a condition holds."""
+        end = time.monotonic() + TIMEOUT
+        while not until():
+            assert time.monotonic() < end, f"{what}; {self.diagnostics}"
+            self.state(**state)
+            self.spin(PERIOD)
+
+    def drive_for(self, duration: float, **state) -> None:
+        """Publishes a state every period for a duration."""
+        end = time.monotonic() + duration
+        self.drive(lambda: time.monotonic() > end, "time", **state)
+
+    def _called(self, kind, name, request, drives=True):
+        client = self.node.create_client(kind, name)
+        assert client.wait_for_service(TIMEOUT)
+        future = client.call_async(request)
+        if drives:
+            self.drive(future.done, name)
+        else:
+            self.wait(future.done, name)
+        return future.result()
+
+    def call(self, service: str, drives=True):
+        """Calls a service of the node, while states go on."""
+        return self._called(Trigger, f"/{NAME}/{service}", Trigger.Request(), drives)
+
+    def set(self, name: str, value, drives=True) -> tuple[bool, str]:
+        """Sets a parameter of the node; whether that succeeded, and the reason."""
+        number = ParameterValue(type=ParameterType.PARAMETER_DOUBLE)
+        if isinstance(value, float):
+            number.double_value = value
+        else:
+            number.type = ParameterType.PARAMETER_DOUBLE_ARRAY
+            number.double_array_value = array.array("d", value)
+        request = SetParameters.Request(parameters=[Parameter(name=name, value=number)])
+        service = f"/{NAME}/set_parameters"
+        result = self._called(SetParameters, service, request, drives).results[0]
+        return result.successful, result.reason
+
+    def get(self, name: str) -> list[float]:
+        """The numbers of a parameter."""
+        request = GetParameters.Request(names=[name])
+        value = self._called(GetParameters, f"/{NAME}/get_parameters", request).values[0]
+        return list(value.double_array_value) or [value.double_value]
+
+    @property
+    def mode(self) -> str:
+        return self.diagnostics.get("mode", "")
+
+    def reach(self, mode: str, **state) -> None:
+        """Publishes states until the node reports a mode."""
+        self.drive(lambda: self.mode == mode, f"not {mode}", **state)
+
+
+@pytest.fixture
+def client(context):
+    made = Client()
+    yield made
+    made.node.destroy_node()
+
+
+class Nodes:
+    """Processes of the node, with a timeout of states that a busy machine does not exceed."""
+
+    def __init__(self, package):
+        self.environment = dict(os.environ)
+        paths = [str(package.modules), os.environ.get("PYTHONPATH", "")]
+        self.environment["PYTHONPATH"] = os.pathsep.join(paths)
+        self.file = package.prefix / "share" / NAME / "config" / f"{NAME}.yaml"
+        self.processes: list[subprocess.Popen] = []
+
+    def begin(self, **parameters) -> subprocess.Popen:
+        command = [sys.executable, "-m", f"{NAME}.law_node", "--ros-args"]
+        command += ["--params-file", str(self.file)]
+        for name, value in ({"state_timeout": 0.5} | parameters).items():
+            command += ["-p", f"{name}:={value}"]
+        process = subprocess.Popen(command, env=self.environment, stderr=subprocess.PIPE, text=True)
+        self.processes.append(process)
+        return process
+
+
+@pytest.fixture
+def nodes(package, context):
+    made = Nodes(package)
+    yield made
+    for process in made.processes:
+        process.kill()
+        process.communicate()
+
+
+def shuffled(q, dq):
+    """The joints among others in another order."""
+    names = ["gripper", "joint_2", "camera", "joint_1"]
+    return {"names": names, "q": (9.0, q[1], 8.0, q[0]), "dq": (7.0, dq[1], 6.0, dq[0])}
+
+
+def test_in_lock_step_the_efforts_are_those_of_the_simulation(client, nodes, package):
+    """The states of a simulated run with joints in another order: the node repeats its torques."""
+    run = ij.simulate(package.scenario, duration=3.0, dt=1e-3, record_every=10)
+    nodes.begin(trigger="state", start_automatically="true")
+    client.connect()
+    for k in range(len(run.t) - 1):
+        q, dq = run.measured.q[k].tolist(), run.measured.dq[k].tolist()
+        client.state(stamp=1000.0 + k * PERIOD, **shuffled(q, dq))
+        client.wait(lambda: len(client.efforts) == k + 1, f"no answer {k}")  # noqa: B023
+    np.testing.assert_allclose(client.efforts, run.tau[:-1], rtol=0, atol=1e-6)
+    client.spin(0.3)
+    assert client.mode == "running"
+    assert client.diagnostics["missed_periods"] == "0"
+    assert client.diagnostics["samples"] == str(len(run.t) - 1)
+
+
+def test_nothing_is_published_before_a_complete_state(client, nodes):
+    nodes.begin()
+    client.connect()
+    client.spin(0.3)
+    client.drive_for(0.3, names=("joint_1",), q=(0.5,), dq=(0.0,))
+    client.drive_for(0.3, q=(0.5, math.nan))
+    client.drive_for(0.3, names=("gripper", "camera"))
+    client.drive_for(0.3, stamp=1.0)
+    client.state(dq=())
+    client.spin(0.3)
+    assert client.efforts == []
+    assert client.mode == "waiting"
+    assert not client.call("hold", drives=False).success
+    assert not client.call("start", drives=False).success
+    assert client.efforts == []
+    client.reach("stopped")
+    assert client.efforts
+    assert set(map(tuple, client.efforts)) == {(0.0, 0.0)}
+
+
+def test_start_hold_and_stop(client, nodes):
+    nodes.begin(hold_stiffness="[10.0, 5.0]", hold_damping="[0.0, 0.0]")
+    client.connect()
+    client.reach("stopped")
+    response = client.call("start")
+    assert response.success and "runs from t = 0 s" in response.message
+    client.reach("running")
+    client.drive_for(0.2)
+    assert client.efforts[-1] != [0.0, 0.0]
+    assert client.call("hold").success
+    client.reach("holding")
+    client.drive_for(0.2)
+    held = client.efforts[-1]
+    client.drive_for(0.2, q=(INSIDE[0] + 0.01, INSIDE[1] + 0.02))
+    change = np.subtract(client.efforts[-1], held)
+    # The stiffness, and the small change of gravity.
+    assert np.all(np.abs(change - [-0.1, -0.1]) < [0.5, 0.2])
+    assert client.call("stop").success
+    client.reach("stopped")
+    client.drive_for(0.2)
+    assert client.efforts[-1] == [0.0, 0.0]
+
+
+FAULTS = {
+    "a NaN": {"q": (math.nan, 0.5)},
+    "an infinite velocity": {"dq": (0.0, math.inf)},
+    "a missing joint": {"names": ("joint_1",), "q": (0.5,), "dq": (0.0,)},
+    "a joint that is misspelt": {"names": ("joint_1", "joint2")},
+    "too few positions": {"q": (0.5,)},
+    "no velocities": {"dq": ()},
+    "an old stamp": {"stamp": 1.0},
+}
+
+
+@pytest.mark.parametrize("policy", ["zero", "hold"])
+@pytest.mark.parametrize("name", FAULTS)
+def test_one_bad_state_is_a_fault_until_start(client, nodes, name, policy):
+    nodes.begin(on_fault=policy, start_automatically="true")
+    client.connect()
+    client.reach("running")
+    client.state(**FAULTS[name])
+    client.reach("fault")
+    assert client.level == b"\2"
+    assert client.diagnostics["last_fault"] != "none"
+    client.drive_for(0.2)
+    assert (client.efforts[-1] == [0.0, 0.0]) == (policy == "zero")
+    assert not client.call("hold").success
+    client.drive_for(0.3)
+    assert client.mode == "fault"
+    assert client.call("start").success
+    client.reach("running")
+
+
+@pytest.mark.parametrize("trigger", ["timer", "state"])
+@pytest.mark.parametrize("policy", ["zero", "hold"])
+def test_without_states_the_policy_takes_over(client, nodes, trigger, policy):
+    nodes.begin(on_fault=policy, start_automatically="true", trigger=trigger)
+    client.connect()
+    client.reach("running")
+    client.wait(lambda: client.mode == "fault", "no fault")
+    count = len(client.efforts)
+    client.wait(lambda: len(client.efforts) > count, "no torques of the policy")
+    assert (client.efforts[-1] == [0.0, 0.0]) == (policy == "zero")
+    assert "stale" in client.diagnostics["last_fault"]
+
+
+def test_states_older_than_two_periods_are_stale(client, nodes):
+    """With the default timeout: stamps that are three periods old when they arrive."""
+    nodes.begin(start_automatically="true", state_timeout=2 * PERIOD)
+    client.connect()
+    for _ in range(50):
+        client.state(stamp=client.node.get_clock().now().nanoseconds * 1e-9 - 3 * PERIOD)
+        client.spin(PERIOD)
+    assert client.efforts == []
+    assert client.mode == "waiting"
+
+
+def test_bursts_neither_stop_the_law_nor_exceed_limits(client, nodes):
+    nodes.begin(start_automatically="true")
+    client.connect()
+    client.reach("running")
+    before = int(client.diagnostics["samples"])
+    for _ in range(20):
+        for _ in range(50):
+            client.state(q=(INSIDE[0] + 0.2 * random.random(), INSIDE[1]))
+        client.spin(2 * PERIOD)
+    client.drive_for(0.3)
+    assert client.mode == "running"
+    assert int(client.diagnostics["samples"]) > before
+
+
+def test_torques_are_never_beyond_their_limits(client, nodes):
+    """Every effort is compared in `Client`; states at and outside of the bounds use all torque."""
+    nodes.begin(start_automatically="true", torque_limits="[5.0, 3.0]")
+    client.connect()
+    client.reach("running")
+    rng = np.random.default_rng(0)
+    for _ in range(100):
+        q, dq = rng.normal(0.5, 1.0, 2), rng.normal(0.0, 20.0, 2)
+        client.state(q=q.tolist(), dq=dq.tolist())
+        client.spin(PERIOD)
+    efforts = np.abs(client.efforts)
+    np.testing.assert_array_equal(efforts.max(axis=0), [5.0, 3.0])
+    assert client.diagnostics["limited"] == "true"
+
+
+def test_a_gain_changes_while_the_law_runs_and_is_refused_outside_of_its_range(client, nodes):
+    nodes.begin(start_automatically="true", time_origin=0.0)
+    client.connect()
+    moving = {"dq": (0.3, -0.4)}
+    client.reach("running", **moving)
+    succeeded, reason = client.set("controller.K2", [4.5, 2.0])
+    assert not succeeded
+    assert "got 4.5, expected a number from 1 to 4" in reason
+    assert client.get("controller.K2") == [2.0, 2.0]
+    assert not client.set("controller.K2", [2.0])[0]
+    assert not client.set("controller.K2", [math.nan, 2.0])[0]
+    assert not client.set("controller.k1", 4.1)[0]
+    assert not client.set("torque_limits", [1.0, 1.0])[0], "read-only"
+    assert not client.set("period", 0.02)[0], "read-only"
+    assert client.set("controller.K2", [4.0, 3.5]) == (True, "")
+    assert client.set("controller.k1", 2.0) == (True, "")
+    assert client.get("controller.K2") == [4.0, 3.5]
+    client.drive_for(0.2, **moving)
+    assert client.mode == "running"
+
+
+def test_a_gain_takes_effect_between_two_samples(client, nodes, package):
+    """The law's library in this process with the same change at the same sample."""
+    law, unchanged = (load_law(package.modules / NAME) for _ in range(2))
+    rng = np.random.default_rng(1)
+    positions = np.asarray(INSIDE) + 0.001 * np.cumsum(rng.normal(size=(30, 2)), axis=0)
+    velocities = rng.normal(0.0, 0.5, (30, 2))
+    nodes.begin(trigger="state", start_automatically="true")
+    client.connect()
+    differences = []
+    for k, (q, dq) in enumerate(zip(positions.tolist(), velocities.tolist(), strict=True)):
+        if k == 0:
+            assert law.init(q, dq)
+            assert unchanged.init(q, dq)
+        if k == 15:
+            assert client.set("controller.K2", [4.0, 3.5], drives=False) == (True, "")
+            law.set_gain("controller.K2", [4.0, 3.5])
+        expected, _ = law.step(k * PERIOD, q, dq)
+        client.state(stamp=1000.0 + k * PERIOD, q=q, dq=dq)
+        client.wait(lambda: len(client.efforts) == k + 1, f"no answer {k}")  # noqa: B023
+        np.testing.assert_allclose(client.efforts[-1], expected, rtol=0, atol=1e-6)
+        differences.append(np.abs(np.subtract(expected, unchanged.step(k * PERIOD, q, dq)[0])))
+    assert np.max(differences[:15]) == 0
+    assert np.min(np.max(differences[15:], axis=1)) > 1e-3
+
+
+def test_ranges_are_in_the_descriptors(client, nodes):
+    nodes.begin()
+    client.connect()
+    request = DescribeParameters.Request(names=["controller.K2", "controller.k1"])
+    name = f"/{NAME}/describe_parameters"
+    found = client._called(DescribeParameters, name, request).descriptors
+    spans = [
+        (x.floating_point_range[0].from_value, x.floating_point_range[0].to_value) for x in found
+    ]
+    assert spans == [(1.0, 4.0), (0.5, 4.0)]
+    assert "N m s/rad" in found[0].description
+
+
+def test_a_killed_node_goes_on_with_the_reference(client, nodes, package):
+    """The second process runs from the middle of the run, with the origin of the first."""
+    run = ij.simulate(package.scenario, duration=2.0, dt=1e-3, record_every=10)
+    begin = {"trigger": "state", "start_automatically": "true", "time_origin": 1000.0}
+
+    def replay(rows):
+        client.connect()
+        client.efforts.clear()
+        for count, k in enumerate(rows, start=1):
+            q, dq = run.measured.q[k].tolist(), run.measured.dq[k].tolist()
+            client.state(stamp=1000.0 + k * PERIOD, q=q, dq=dq)
+            client.wait(lambda: len(client.efforts) == count, f"no answer {k}")  # noqa: B023
+        return np.asarray(client.efforts)
+
+    first = nodes.begin(**begin)
+    np.testing.assert_allclose(replay(range(100)), run.tau[:100], atol=1e-6)
+    first.kill()
+    first.wait()
+    nodes.begin(**begin)
+    after = replay(range(120, 200))
+    # The observer starts again; the reference does not.
+    assert np.abs(after[-40:] - run.tau[160:200]).max() < 0.2
+    assert client.diagnostics["time_origin [s]"] == "1000.000000000"
+
+
+@pytest.mark.parametrize("policy", ["zero", "hold"])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_node_that_ends_sends_the_torques_of_its_policy(client, nodes, policy, number):
+    process = nodes.begin(on_fault=policy, start_automatically="true", trigger="state")
+    client.connect()
+    client.reach("running")
+    count = len(client.efforts)
+    process.send_signal(number)
+    client.wait(lambda: len(client.efforts) > count, "no last torques")
+    assert process.wait(TIMEOUT) == 0
+    assert (client.efforts[-1] == [0.0, 0.0]) == (policy == "zero")
+
+
+REFUSED = {
+    "another period": ({"period": 0.02}, "period: got 0.02, expected the exported period 0.01 s"),
+    "too few joints": ({"joints": "[joint_1]"}, "joints: got ['joint_1'], expected 2 different"),
+    "a joint twice": ({"joints": "[a, a]"}, "joints: got ['a', 'a'], expected 2 different"),
+    "one limit": ({"torque_limits": "[10.0]"}, "torque_limits: got [10.0], expected 2 numbers"),
+    "a limit that is no number": ({"torque_limits": "[.nan, 1.0]"}, "torque_limits: got [nan"),
+    "an infinite limit": ({"torque_limits": "[.inf, 1.0]"}, "torque_limits: got [inf"),
+    "a limit above the export": ({"torque_limits": "[41.0, 1.0]"}, "at most [40.0, 15.0] N m"),
+    "a limit of zero": ({"torque_limits": "[0.0, 1.0]"}, "torque_limits: got [0.0"),
+    "integers": ({"torque_limits": "[10, 1]"}, "decimal point"),
+    "a policy": ({"on_fault": "brake"}, "on_fault: got brake, expected one of ['hold', 'zero']"),
+    "a trigger": ({"trigger": "clock"}, "trigger: got clock"),
+    "a negative stiffness": ({"hold_stiffness": "[-1.0, 1.0]"}, "hold_stiffness: got [-1.0"),
+    "a timeout of zero": ({"state_timeout": 0.0}, "state_timeout: got 0.0"),
+    "a gain": ({"controller.K2": "[9.0, 2.0]"}, "controller.K2: got 9, expected a number from 1"),
+    "a scalar gain": ({"controller.k1": 9.0}, "controller.k1: got"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_node_with_bad_parameters_does_not_start(nodes, name):
+    parameters, words = REFUSED[name]
+    process = nodes.begin(**parameters)
+    _, errors = process.communicate(timeout=TIMEOUT)
+    assert process.returncode == 2
+    assert words in errors

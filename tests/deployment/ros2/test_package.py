@@ -1,0 +1,366 @@
+"""The generated ROS 2 package without ROS: its files, the law in its library, and what the export
+refuses."""
+
+from __future__ import annotations
+
+import ast
+import json
+import shutil
+import subprocess
+import sys
+import types
+import xml.etree.ElementTree
+
+import jax
+import members
+import numpy as np
+import pytest
+import ros_package
+import yaml
+from conftest import ROOT
+
+import iblf_jax as ij
+from iblf_jax.deployment.control_law import bounds_at, inputs_at_start
+from iblf_jax.deployment.ros2.node.c_law import (
+    FLAGS,
+    NOT_FINITE,
+    CLaw,
+    load_law,
+    read_description,
+)
+from iblf_jax.deployment.ros2.package import ros_options
+from iblf_jax.simulation.scenario import canonical
+
+NAME = ros_package.NAME
+
+
+@pytest.fixture(scope="module")
+def package(tmp_path_factory):
+    return ros_package.made_package(tmp_path_factory.mktemp("ros2"))
+
+
+@pytest.fixture
+def law(package) -> CLaw:
+    return load_law(package.modules / NAME)
+
+
+@pytest.fixture(scope="module")
+def run(package) -> ij.Rollout:
+    return ij.simulate(package.scenario, duration=2.0, dt=1e-3, record_every=10)
+
+
+def test_the_library_is_the_law_of_the_simulation(law, run):
+    assert law.init(run.measured.q[0].tolist(), run.measured.dq[0].tolist())
+    for k in range(len(run.t) - 1):
+        q, dq = run.measured.q[k].tolist(), run.measured.dq[k].tolist()
+        torque, status = law.step(float(run.t[k]), q, dq)
+        assert status == 0
+        np.testing.assert_allclose(torque, run.tau[k], rtol=1e-9, atol=1e-7)
+
+
+def test_the_bounds_are_those_of_the_scenario(law, package):
+    scenario = canonical(package.scenario)
+    inputs = inputs_at_start(scenario)
+    for t in (0.0, 0.37, 12.5):
+        lower, upper = law.bounds(t)
+        expected = bounds_at(scenario, inputs._replace(t=jax.numpy.asarray(t)))
+        np.testing.assert_allclose([lower, upper], expected, rtol=1e-12)
+
+
+def test_balance_is_gravity_and_leaves_the_state(law, package, run):
+    q = [0.4, 0.9]
+    law.init(run.measured.q[0].tolist(), run.measured.dq[0].tolist())
+    first, _ = law.step(0.0, q, [0.1, 0.2])
+    law.init(run.measured.q[0].tolist(), run.measured.dq[0].tolist())
+    balance = law.balance([0.4, 0.9])
+    gravity = package.scenario.model.gravity(jax.numpy.asarray(q))
+    np.testing.assert_allclose(balance, gravity, rtol=1e-12)
+    assert law.step(0.0, q, [0.1, 0.2])[0] == first
+
+
+def test_a_state_that_is_not_finite_is_reported(law):
+    assert law.init([0.5, 0.5], [0.0, 0.0])
+    assert law.step(0.0, [float("nan"), 0.5], [0.0, 0.0])[1] == NOT_FINITE
+    assert law.step(0.0, [0.5, 0.5], [0.0, float("inf")])[1] == NOT_FINITE
+    assert law.init([float("inf"), 0.5], [0.0, 0.0]) is False
+    assert law.balance([float("nan"), 0.5]) == [0.0, 0.0]
+
+
+def test_a_position_outside_of_the_bounds_is_reported(law):
+    lower, _ = law.bounds(0.0)
+    q = [lower[0] - 0.1, 0.5]
+    law.init(q, [0.0, 0.0])
+    assert law.step(0.0, q, [0.0, 0.0])[1] & FLAGS["outside"]
+
+
+def test_gains_are_set_by_their_paths(law, package):
+    scenario = package.scenario
+    assert law.gain("controller.K2") == [2.0, 2.0]
+    assert law.gain("controller.k1") == [1.0]
+    assert law.gain("observer.kf[1]") == [3.0]
+    law.set_gain("controller.K2", [3.0, 2.5])
+    law.set_gain("controller.k1", [2.0])
+    law.set_gain("observer.kf[1]", [8.0])
+    changed = {"controller.K2": [3.0, 2.5], "controller.k1": 2.0, "observer.kf[1]": 8.0}
+    run = ij.simulate(ij.with_parameters(scenario, changed), duration=0.1, dt=1e-3, record_every=10)
+    law.init(run.measured.q[0].tolist(), run.measured.dq[0].tolist())
+    for k in range(10):
+        q, dq = run.measured.q[k].tolist(), run.measured.dq[k].tolist()
+        torque, _ = law.step(float(run.t[k]), q, dq)
+        np.testing.assert_allclose(torque, run.tau[k], rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ([2.0], "got 1 numbers, expected 2"),
+        ([0.9, 2.0], "got 0.9, expected a number from 1 to 4"),
+        ([2.0, 3.6], "got 3.6, expected a number from 1.5 to 3.5"),
+        ([float("nan"), 2.0], "got nan"),
+    ],
+)
+def test_gains_outside_of_their_range_are_refused(law, values, words):
+    with pytest.raises(ValueError, match=words):
+        law.set_gain("controller.K2", values)
+    assert law.gain("controller.K2") == [2.0, 2.0]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"name": "other_law"}, "got no law 'other_law'"),
+        ({"joints": ["a", "b", "c"]}, "got 2 joints, expected 3"),
+        ({"period": 0.02}, "got the period 0.01 s, expected 0.02 s"),
+        ({"gains": None}, "got no \\['gains'\\]"),
+    ],
+)
+def test_a_library_of_another_law_is_refused(package, tmp_path, change, words):
+    folder = tmp_path / NAME
+    shutil.copytree(package.modules / NAME, folder)
+    content = json.loads((folder / "law.json").read_text()) | change
+    content = {name: value for name, value in content.items() if value is not None}
+    (folder / "law.json").write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=words):
+        load_law(folder)
+
+
+def test_a_package_that_is_not_built_says_so(package):
+    with pytest.raises(ValueError, match="got no shared library of the law"):
+        load_law(package.source / NAME)
+
+
+def test_the_package_is_a_complete_ament_python_package(package):
+    root = xml.etree.ElementTree.parse(package.source / "package.xml").getroot()
+    assert root.findtext("name") == NAME
+    assert root.findtext("export/build_type") == "ament_python"
+    assert (package.source / "resource" / NAME).read_text() == ""
+    installed = package.prefix
+    assert (installed / "share/ament_index/resource_index/packages" / NAME).is_file()
+    for file in ("package.xml", f"launch/{NAME}.launch.py", f"config/{NAME}.yaml"):
+        assert (installed / "share" / NAME / file).is_file()
+    assert (installed / "lib" / NAME / "law_node").is_file()
+
+
+def test_the_modules_need_neither_this_package_nor_jax(package):
+    for path in (package.modules / NAME).glob("*.py"):
+        assert "iblf_jax" not in path.read_text().replace("generated by iblf_jax", ""), path
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom):
+                assert str(node.module).split(".")[0] not in {"jax", "numpy"}
+
+
+def test_the_own_test_of_the_package_passes(package):
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "test"]
+    environment = {"PYTHONPATH": str(package.modules), "PATH": "/usr/bin:/bin"}
+    done = subprocess.run(
+        command, cwd=package.source, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "4 passed" in done.stdout
+
+
+def test_the_self_test_of_the_c_law_passes(package, tmp_path):
+    sources = [str(package.source / "c" / f"{name}.c") for name in (NAME, "selftest")]
+    program = tmp_path / "selftest"
+    flags = ["-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-O2"]
+    subprocess.run(["cc", *flags, *sources, "-lm", "-o", str(program)], check=True)
+    done = subprocess.run([str(program)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
+
+
+def test_the_parameter_file_has_the_exported_values(package):
+    text = (package.source / "config" / f"{NAME}.yaml").read_text()
+    values = yaml.safe_load(text)[NAME]["ros__parameters"]
+    assert values["period"] == 0.01
+    assert values["torque_limits"] == [40.0, 15.0]
+    assert values["joints"] == ["joint_1", "joint_2"]
+    assert values["controller.K2"] == [2.0, 2.0]
+    assert values["controller.k1"] == 1.0
+    assert values["observer.kf[1]"] == 3.0
+    assert values["time_origin"] != values["time_origin"]
+    assert values["start_automatically"] is False
+    assert all(isinstance(x, float) for x in values["hold_stiffness"] + values["hold_damping"])
+
+
+def test_the_launch_file_starts_the_node(package, monkeypatch):
+    """There is no wheel of `launch`: its classes are replaced by records of their arguments."""
+
+    def record(name):
+        return lambda *args, **options: (name, args, options)
+
+    def module(name, **members):
+        found = types.ModuleType(name)
+        vars(found).update(members)
+        monkeypatch.setitem(sys.modules, name, found)
+
+    share = package.prefix / "share" / NAME
+    module("ament_index_python.packages", get_package_share_directory=lambda name: str(share))
+    module("launch", LaunchDescription=lambda actions: actions)
+    module("launch.actions", DeclareLaunchArgument=record("argument"))
+    module("launch.substitutions", LaunchConfiguration=record("configuration"))
+    module("launch_ros.actions", Node=record("node"))
+    namespace: dict = {}
+    path = share / "launch" / f"{NAME}.launch.py"
+    exec(compile(path.read_text(), str(path), "exec"), namespace)
+    argument, node = namespace["generate_launch_description"]()
+    assert argument[1] == ("parameters",)
+    assert argument[2]["default_value"] == str(share / "config" / f"{NAME}.yaml")
+    assert (share / "config" / f"{NAME}.yaml").is_file()
+    assert (node[2]["package"], node[2]["executable"]) == (NAME, "law_node")
+    assert node[2]["parameters"] == [("configuration", ("parameters",), {})]
+
+
+def test_the_description_is_read_as_it_was_written(package):
+    found = read_description(package.modules / NAME / "law.json")
+    assert found.joints == ("joint_1", "joint_2")
+    assert found.has_joint_names is False
+    assert found.reads_velocity is True
+    assert [gain.path for gain in found.gains] == [
+        "controller.K2",
+        "controller.k1",
+        "observer.kf[1]",
+    ]
+    assert [len(gain.offsets) for gain in found.gains] == [2, 1, 1]
+    assert len(found.gains[1].offsets[0]) == 2
+    assert found.gains[0].high == (4.0, 3.5)
+
+
+def plain() -> ij.Scenario:
+    return ij.presets.zhang_yan_2024()
+
+
+ROS = {"target": "ros2", "period": 0.01, "torque_limits": 100.0}
+REFUSED = {
+    "no limits": ({"torque_limits": None}, "torque_limits: got None.*`effort`"),
+    "limits of another number of joints": ({"torque_limits": [1.0] * 3}, "torque_limits: got"),
+    "an infinite limit": ({"torque_limits": float("inf")}, "torque_limits: got inf"),
+    "a negative limit": ({"torque_limits": -1.0}, "torque_limits: got -1"),
+    "a limit of zero": ({"torque_limits": [1.0, 0.0]}, "torque_limits: got"),
+    "no period": ({"period": None}, "period: got None"),
+    "another policy": ({"on_fault": "brake"}, "on_fault: got 'brake'"),
+    "a path of no leaf": ({"gains": ["controller.K3"]}, "controller.K3.*Did you mean"),
+    "a leaf of the plant": ({"gains": [ij.tunable("plant.mass", 0.1, 9.0)]}, "gains: got"),
+    "the period as a gain": ({"gains": ["sampling.period"]}, "gains: got 'sampling.period'"),
+    "a gain outside of its range": (
+        {"gains": [ij.tunable("controller.K2", 50.0, 60.0)]},
+        r"tunable\('controller.K2'\): got",
+    ),
+    "a range that the leaf does not have": (
+        {"gains": [ij.tunable("controller.K2", -5.0, 60.0, scale="linear")]},
+        "controller.K2",
+    ),
+    "gains that overlap": (
+        {"gains": ["controller.K2", "controller.K2[0]"]},
+        "gains: got.*overlap",
+    ),
+    "no list": ({"gains": "controller.K2"}, "gains: got 'controller.K2'"),
+    "a number as gain": ({"gains": [1.0]}, r"gains\[0\]: got 1.0"),
+    "floats": ({"dtype": "float"}, "dtype: got 'float'"),
+    "a reference from outside": ({"reference": "given"}, "reference: got 'given'"),
+    "a step of a loop": ({"dt": 2e-3}, "dt: got 0.002"),
+    "a method of a loop": ({"method": "euler"}, "method: got 'euler'"),
+    "a seed of a loop": ({"seed": 1}, "seed: got 1"),
+    "upper case": ({"name": "ArmLaw"}, "name: got 'ArmLaw'"),
+    "two underscores": ({"name": "arm__law"}, "name: got 'arm__law'"),
+    "a module of Python": ({"name": "json"}, "name: got 'json'"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_the_export_refuses(case, tmp_path):
+    options, words = REFUSED[case]
+    with pytest.raises(ValueError, match=words):
+        ij.export(plain(), tmp_path / "arm", **(ROS | options))
+    assert not (tmp_path / "arm").exists()
+
+
+@pytest.mark.parametrize(
+    "options", [{"gains": ["controller.K2"]}, {"torque_limits": 5.0}, {"on_fault": "zero"}]
+)
+@pytest.mark.parametrize("target", ["c", "fmu", "fmu-loop", "wasm"])
+def test_other_targets_refuse_options_of_a_node(target, options, tmp_path):
+    with pytest.raises(ValueError, match='Only target="ros2" has this option'):
+        ij.export(plain(), tmp_path, target=target, period=0.01, **options)
+
+
+def test_a_tied_gain_with_different_numbers_is_refused(tmp_path):
+    scenario = ij.with_parameters(plain(), {"controller.K2": [20.0, 30.0]})
+    gains = [ij.tunable("controller.K2", 5.0, 60.0, tied=True)]
+    with pytest.raises(ValueError, match="equal numbers for a tied gain"):
+        ij.export(scenario, tmp_path / "arm", gains=gains, **ROS)
+
+
+def test_levels_beyond_q_and_dq_are_refused(tmp_path):
+    scenario = ij.presets.motor_driven_two_link()
+    with pytest.raises(ValueError, match=r"scenario.model: got .*a robot, whose state is q and q'"):
+        ij.export(scenario, tmp_path / "arm", **ROS)
+
+
+def test_limits_are_those_of_the_model_and_not_above(tmp_path):
+    scenario = ij.with_parts(ij.presets.iiwa14(), sampling=ij.Sampling(2e-3))
+    scenario = canonical(scenario)
+    effort = np.asarray(scenario.model.effort)
+    options = ros_options(scenario, None, None, "hold")
+    np.testing.assert_allclose(options.torque_limits, effort)
+    with pytest.raises(ValueError, match="at most the model's efforts"):
+        ros_options(scenario, None, 1.01 * effort, "hold")
+
+
+def test_ranges_without_limits_are_those_of_tune(package, tmp_path):
+    options = ros_options(canonical(package.scenario), ["controller.K2"], 100.0, "zero")
+    gain = options.gains[0]
+    assert np.all(gain.low < gain.value) and np.all(gain.value < gain.high)
+    assert np.all(np.isfinite(gain.high))
+
+
+@pytest.mark.slow
+def test_a_law_that_filters_velocities_needs_none(tmp_path):
+    encoder = ij.sensors.Encoder(counts=4096, velocity=members.VELOCITIES["filtered_difference"])
+    scenario = ij.with_parts(plain(), sensor=encoder, sampling=ij.Sampling(0.01))
+    ij.export(scenario, tmp_path / "src", target="ros2", name="encoder_law", torque_limits=100.0)
+    ros_package.install(tmp_path / "src", tmp_path / "install")
+    law = load_law(ros_package.site_packages(tmp_path / "install") / "encoder_law")
+    assert law.description.reads_velocity is False
+    assert law.init([0.5, 0.5], None)
+    torque, status = law.step(0.0, [0.5, 0.5], None)
+    assert status == 0 and np.all(np.isfinite(torque))
+
+
+@pytest.mark.slow
+def test_the_command_line_exports_a_node(tmp_path):
+    command = [sys.executable, "-m", "iblf_jax", "export", "zhang_yan_2024", "--target", "ros2"]
+    command += ["--period", "0.01", "--out", str(tmp_path / "arm"), "--name", "cli_law"]
+    options = ["--gain", "controller.K2=5:50", "--torque-limits", "400", "90", "--on-fault", "zero"]
+    done = subprocess.run(
+        [*command, *options], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    found = json.loads((tmp_path / "arm" / "cli_law" / "law.json").read_text())
+    assert found["torque_limits"] == [400.0, 90.0]
+    assert found["on_fault"] == "zero"
+    assert found["gains"][0]["high"] == [50.0, 50.0]
+    done = subprocess.run(
+        [*command, "--gain", "controller.K2=5"], cwd=ROOT, capture_output=True, text=True
+    )
+    assert done.returncode == 2
+    assert "PATH or PATH=LOW:HIGH" in done.stderr

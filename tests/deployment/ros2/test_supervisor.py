@@ -1,0 +1,524 @@
+"""The safety state machine of the generated node, without ROS: faults, policies, clocks and limits,
+with a law whose torques a test chooses."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from array import array
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from iblf_jax.deployment.ros2.node.c_law import NOT_FINITE
+from iblf_jax.deployment.ros2.node.monitor import LoopMonitor
+from iblf_jax.deployment.ros2.node.supervisor import (
+    NANOSECONDS,
+    Configuration,
+    FaultKind,
+    JointReader,
+    JointSample,
+    Mode,
+    Supervisor,
+)
+
+JOINTS = ("shoulder", "elbow", "wrist")
+PERIOD = 0.01
+T = round(PERIOD * NANOSECONDS)
+EPOCH = 1_700_000_000 * NANOSECONDS
+"""A stamp as wall clocks have them."""
+LIMITS = (10.0, 5.0, 2.0)
+
+
+class ChosenLaw:
+    """A law whose torques, gravity and status a test sets; it records its calls."""
+
+    def __init__(self):
+        self.torque = [1.0, 2.0, 1.5]
+        self.gravity = [3.0, 2.0, 1.0]
+        self.status = 0
+        self.starts = True
+        self.calls = []
+        self.inits = []
+
+    def init(self, q, dq):
+        self.inits.append((q, dq))
+        return self.starts
+
+    def step(self, t, q, dq):
+        self.calls.append((t, q, dq))
+        return list(self.torque), self.status
+
+    def balance(self, q):
+        return [g * math.cos(x) for g, x in zip(self.gravity, q, strict=True)]
+
+    def bounds(self, t):
+        return [-1.0] * 3, [1.0] * 3
+
+
+def configuration(**changes):
+    values = {
+        "joints": JOINTS,
+        "period": PERIOD,
+        "reads_velocity": True,
+        "torque_limits": LIMITS,
+        "on_fault": "zero",
+        "hold_stiffness": (4.0, 3.0, 2.0),
+        "hold_damping": (0.4, 0.3, 0.2),
+        "start_automatically": False,
+        "stamp_timeout": 2 * PERIOD,
+        "arrival_timeout": 2 * PERIOD,
+    }
+    return Configuration(**(values | changes))
+
+
+class Bench:
+    """A supervisor with a clock: states arrive with the stamp of their arrival unless a test says
+    otherwise."""
+
+    def __init__(self, law=None, time_origin=None, **changes):
+        self.law = law or ChosenLaw()
+        self.supervisor = Supervisor(self.law, configuration(**changes), time_origin)
+        self.now = 0
+
+    @property
+    def clock(self):
+        return EPOCH + self.now
+
+    @property
+    def mode(self):
+        return self.supervisor.mode
+
+    def state(self, q=(0.1, 0.2, 0.3), dq=(0.0, 0.0, 0.0), names=JOINTS, stamp=None):
+        stamp = self.clock if stamp is None else stamp
+        return self.supervisor.receive(list(names), q, dq, stamp, self.now)
+
+    def command(self):
+        return self.supervisor.command(self.now, self.clock)
+
+    def period(self, **state):
+        """One period: a state, and the command that follows."""
+        self.now += T
+        self.state(**state)
+        return self.command()
+
+    def start(self):
+        started, message = self.supervisor.start(self.now, self.clock)
+        assert started, message
+        return message
+
+    def running(self):
+        self.period()
+        self.start()
+        assert self.period().mode is Mode.RUNNING
+        return self
+
+
+def test_nothing_is_published_before_the_first_complete_state():
+    bench = Bench()
+    for state in (
+        None,
+        {"names": ("gripper",), "q": (0.0,), "dq": (0.0,)},
+        {"names": ("shoulder", "elbow"), "q": (0.0, 0.0), "dq": (0.0, 0.0)},
+        {"q": (0.0, math.nan, 0.0)},
+        {"dq": ()},
+        {"q": (0.0, 0.0)},
+    ):
+        bench.now += T
+        if state is not None:
+            bench.state(**state)
+        assert bench.command() is None
+        assert bench.mode is Mode.WAITING
+        assert bench.supervisor.start(bench.now, bench.clock)[0] is False
+        assert bench.supervisor.hold(bench.now, bench.clock)[0] is False
+        assert bench.supervisor.stop()[0] is True
+        assert bench.command() is None
+        assert bench.supervisor.final_command() is None
+    assert bench.supervisor.note
+    command = bench.period()
+    assert command.mode is Mode.STOPPED
+    assert command.torque == [0.0, 0.0, 0.0]
+
+
+def test_a_first_state_that_is_stale_is_no_state():
+    bench = Bench()
+    bench.now += T
+    bench.state(stamp=bench.clock - 3 * T)
+    assert bench.command() is None
+    assert "old by its stamp" in bench.supervisor.note
+    assert bench.period().mode is Mode.STOPPED
+
+
+@given(order=st.permutations((*JOINTS, "gripper", "camera")))
+def test_joints_are_found_by_name_in_any_order(order):
+    numbers = {name: (0.1 * i, 1.0 * i) for i, name in enumerate((*JOINTS, "gripper", "camera"))}
+    reader = JointReader(JOINTS, True)
+    q = array("d", [numbers[name][0] for name in order])
+    dq = array("d", [numbers[name][1] for name in order])
+    for _ in range(2):  # the second message has the names of the first
+        sample = reader.read(list(order), q, dq, 5, 7)
+        assert sample == JointSample(5, 7, (0.0, 0.1, 0.2), (0.0, 1.0, 2.0))
+
+
+def test_the_order_may_change_from_message_to_message():
+    reader = JointReader(("a", "b"), True)
+    first = reader.read(["a", "b"], (1.0, 2.0), (3.0, 4.0), 0, 0)
+    second = reader.read(["b", "a"], (2.0, 1.0), (4.0, 3.0), 1, 1)
+    assert first[2:] == second[2:] == ((1.0, 2.0), (3.0, 4.0))
+
+
+BAD_STATES = {
+    "NaN in a position": ({"q": (0.1, math.nan, 0.3)}, FaultKind.NOT_FINITE, "elbow"),
+    "infinity in a velocity": ({"dq": (0.0, 0.0, math.inf)}, FaultKind.NOT_FINITE, "wrist"),
+    "a missing joint": (
+        {"names": ("shoulder", "wrist"), "q": (0.1, 0.3), "dq": (0.0, 0.0)},
+        FaultKind.JOINTS,
+        "elbow",
+    ),
+    "an unknown name in place of a joint": (
+        {"names": ("shoulder", "elbo", "wrist")},
+        FaultKind.JOINTS,
+        "elbow",
+    ),
+    "a joint that occurs twice": (
+        {"names": (*JOINTS, "elbow"), "q": (0.1, 0.2, 0.3, 0.4), "dq": (0.0,) * 4},
+        FaultKind.JOINTS,
+        "elbow",
+    ),
+    "too few positions": ({"q": (0.1, 0.2)}, FaultKind.JOINTS, "2 positions"),
+    "too many positions": ({"q": (0.1, 0.2, 0.3, 0.4)}, FaultKind.JOINTS, "4 positions"),
+    "no velocities": ({"dq": ()}, FaultKind.JOINTS, "0 velocities"),
+    "too few velocities": ({"dq": (0.0,)}, FaultKind.JOINTS, "1 velocities"),
+    "a stamp before the last one": ({"stamp": EPOCH}, FaultKind.CLOCK, "jumped back"),
+    "a stamp far after the last one": (
+        {"stamp": EPOCH + 100 * T},
+        FaultKind.STALE,
+        "apart",
+    ),
+}
+
+
+@pytest.mark.parametrize("policy", ["zero", "hold"])
+@pytest.mark.parametrize("mode", [Mode.RUNNING, Mode.HOLDING])
+@pytest.mark.parametrize("name", BAD_STATES)
+def test_a_bad_state_is_a_fault_that_only_start_leaves(name, mode, policy):
+    state, kind, words = BAD_STATES[name]
+    bench = Bench(on_fault=policy).running()
+    if mode is Mode.HOLDING:
+        assert bench.supervisor.hold(bench.now, bench.clock)[0]
+    calls = len(bench.law.calls)
+    command = bench.period(**state)
+    assert command.mode is Mode.FAULT
+    assert bench.supervisor.last_fault.kind is kind
+    assert words in bench.supervisor.last_fault.reason
+    is_zero = command.torque == [0.0, 0.0, 0.0]
+    assert is_zero == (policy == "zero")
+    for _ in range(5):
+        assert bench.period().mode is Mode.FAULT
+    assert bench.supervisor.hold(bench.now, bench.clock)[0] is False
+    assert bench.supervisor.stop()[0] is True
+    assert bench.period().torque == [0.0, 0.0, 0.0]
+    assert bench.mode is Mode.FAULT
+    assert len(bench.law.calls) == calls, "the law rests in a fault"
+    bench.start()
+    assert bench.period().torque == bench.law.torque
+
+
+@pytest.mark.parametrize("name", BAD_STATES)
+def test_a_bad_state_while_stopped_changes_nothing_but_the_note(name):
+    bench = Bench()
+    bench.period()
+    if name == "a stamp far after the last one":
+        return
+    command = bench.period(**BAD_STATES[name][0])
+    assert command.mode is Mode.STOPPED
+    assert BAD_STATES[name][2] in bench.supervisor.note
+
+
+def test_states_of_other_joints_are_ignored_until_the_own_ones_are_stale():
+    bench = Bench().running()
+    other = {"names": ("gripper",), "q": (math.nan,), "dq": (0.0,)}
+    assert bench.period(**other).mode is Mode.RUNNING
+    assert bench.period(**other).mode is Mode.RUNNING
+    assert bench.period(**other).mode is Mode.FAULT
+    assert bench.supervisor.last_fault.kind is FaultKind.STALE
+
+
+def test_a_state_is_stale_after_two_periods_and_not_before():
+    bench = Bench().running()
+    bench.now += 2 * T
+    assert bench.command().mode is Mode.RUNNING
+    bench.now += 1
+    assert bench.command().mode is Mode.FAULT
+    assert bench.supervisor.last_fault.kind is FaultKind.STALE
+
+
+@pytest.mark.parametrize("age", [-3, 3])
+def test_a_stamp_that_the_clock_contradicts_is_stale(age):
+    bench = Bench(stamp_timeout=2 * PERIOD).running()
+    for k in range(1, 6):  # the stamps drift away from the clock, each within two periods
+        bench.now += T
+        bench.state(stamp=bench.clock - round(age * T * k / 5))
+        command = bench.command()
+    assert command.mode is Mode.FAULT
+    words = "old by its stamp" if age > 0 else "in the future"
+    assert words in bench.supervisor.last_fault.reason
+
+
+def test_a_law_that_samples_with_the_states_has_no_clock_but_gaps_of_stamps():
+    bench = Bench(arrival_timeout=0.5).running()
+    stamp = bench.clock
+    for gap, mode in ((T, Mode.RUNNING), (2 * T, Mode.RUNNING), (3 * T, Mode.FAULT)):
+        stamp += gap
+        bench.now += 20 * T  # as slow as a simulator may be
+        assert bench.state(stamp=stamp)
+        assert bench.supervisor.command(bench.now).mode is mode
+    assert bench.supervisor.missed == 3
+
+
+def test_a_law_that_samples_with_the_states_notices_that_none_arrive():
+    bench = Bench(arrival_timeout=0.5).running()
+    bench.now += round(0.5 * NANOSECONDS)
+    assert not bench.supervisor.is_stale(bench.now)
+    bench.now += 1
+    assert bench.supervisor.is_stale(bench.now)
+    assert bench.supervisor.command(bench.now).mode is Mode.FAULT
+
+
+def test_a_burst_gives_one_sample_a_period():
+    """States that waited in a queue arrive together, and some twice."""
+    bench = Bench().running()
+    new = []
+    for stamp in (1.0, 1.0, 1.3, 1.6, 2.0, 2.0, 3.0):
+        new.append(bench.state(stamp=bench.clock + round(stamp * T)))
+    assert new == [True, False, False, False, True, False, True]
+    assert bench.mode is Mode.RUNNING
+    assert bench.supervisor.missed == 0
+
+
+def test_faster_states_than_samples_are_not_missed_samples():
+    bench = Bench(arrival_timeout=0.5)
+    answered = sum(bench.state(stamp=EPOCH + k * T // 2) for k in range(20))
+    assert answered == 10
+    assert bench.supervisor.missed == 0
+
+
+def test_times_of_the_law_are_those_of_the_stamps():
+    bench = Bench().running()
+    for _ in range(3):
+        bench.period()
+    assert [t for t, _, _ in bench.law.calls] == pytest.approx([PERIOD * k for k in (1, 2, 3, 4)])
+
+
+def test_a_restarted_node_goes_on_with_the_reference():
+    first = Bench().running()
+    origin = first.supervisor.started_at
+    second = Bench(time_origin=origin)
+    second.now = 700 * T
+    second.period()
+    assert second.start() == f"The law runs from t = {700 * PERIOD:g} s."
+    second.period()
+    assert second.law.calls[0][0] == pytest.approx(701 * PERIOD)
+
+
+def test_a_reference_that_has_not_begun_is_refused():
+    bench = Bench(time_origin=EPOCH + 1000 * T)
+    bench.period()
+    started, message = bench.supervisor.start(bench.now, bench.clock)
+    assert not started and "time_origin is 9.99 s after" in message
+    assert bench.mode is Mode.STOPPED
+
+
+def test_the_start_names_joints_outside_of_their_bounds():
+    bench = Bench()
+    bench.period(q=(0.0, 1.5, -1.0))
+    assert "Outside of their bounds at the start: elbow, wrist." in bench.start()
+
+
+def test_a_law_that_does_not_start_leaves_the_mode():
+    bench = Bench()
+    bench.law.starts = False
+    bench.period()
+    assert bench.supervisor.start(bench.now, bench.clock)[0] is False
+    assert bench.period().mode is Mode.STOPPED
+
+
+def test_start_again_does_not_reset_a_running_law():
+    bench = Bench().running()
+    assert "already" in bench.start()
+    assert len(bench.law.inits) == 1
+
+
+def test_start_needs_a_fresh_state():
+    bench = Bench()
+    bench.period()
+    bench.now += 3 * T
+    assert bench.supervisor.start(bench.now, bench.clock)[0] is False
+    assert bench.supervisor.hold(bench.now, bench.clock)[0] is False
+
+
+def test_an_automatic_start_needs_no_service_and_does_not_leave_a_fault():
+    bench = Bench(start_automatically=True)
+    assert bench.period().mode is Mode.RUNNING
+    assert bench.period(q=(math.nan,) * 3).mode is Mode.FAULT
+    for _ in range(5):
+        assert bench.period().mode is Mode.FAULT
+
+
+def test_an_automatic_start_that_is_refused_is_reported():
+    bench = Bench(start_automatically=True, time_origin=EPOCH + 1000 * T)
+    assert bench.period().mode is Mode.STOPPED
+    assert "time_origin" in bench.supervisor.note
+
+
+def test_a_torque_that_is_not_finite_is_a_fault():
+    bench = Bench(on_fault="zero").running()
+    bench.law.status = NOT_FINITE
+    command = bench.period()
+    assert command.mode is Mode.FAULT
+    assert command.torque == [0.0, 0.0, 0.0]
+    assert bench.supervisor.last_fault.kind is FaultKind.TORQUE
+
+
+def test_hold_is_gravity_with_stiffness_and_damping_about_the_position():
+    bench = Bench().running()
+    assert bench.supervisor.hold(bench.now, bench.clock)[0]
+    q, dq = (0.2, 0.1, 0.5), (1.0, -1.0, 0.5)
+    command = bench.period(q=q, dq=dq)
+    held = (0.1, 0.2, 0.3)
+    rows = zip(bench.law.balance(q), held, q, dq, (4.0, 3.0, 2.0), (0.4, 0.3, 0.2), strict=True)
+    expected = [g + k * (h - x) - d * v for g, h, x, v, k, d in rows]
+    assert command.mode is Mode.HOLDING
+    assert command.torque == pytest.approx(expected)
+
+
+def test_without_fresh_states_hold_is_gravity_alone():
+    bench = Bench(on_fault="hold").running()
+    bench.now += 3 * T
+    command = bench.command()
+    assert command.mode is Mode.FAULT
+    assert command.torque == pytest.approx(bench.law.balance((0.1, 0.2, 0.3)))
+    fresh = bench.period(q=(0.3, 0.2, 0.3))
+    gravity = bench.law.balance((0.3, 0.2, 0.3))
+    assert fresh.torque == pytest.approx([gravity[0] - 4.0 * 0.2, *gravity[1:]])
+
+
+def test_hold_without_measured_velocities_damps_the_difference_quotient():
+    bench = Bench(reads_velocity=False)
+    bench.period(dq=())
+    bench.start()
+    assert bench.period(dq=()).mode is Mode.RUNNING
+    assert bench.law.calls[0][2] is None
+    bench.supervisor.hold(bench.now, bench.clock)
+    command = bench.period(q=(0.11, 0.2, 0.3), dq=())
+    gravity = bench.law.balance((0.11, 0.2, 0.3))
+    assert command.torque[0] == pytest.approx(gravity[0] - 4.0 * 0.01 - 0.4 * 0.01 / PERIOD)
+
+
+def test_stop_is_zero_torque():
+    bench = Bench().running()
+    assert bench.supervisor.stop()[0]
+    command = bench.period()
+    assert command.mode is Mode.STOPPED
+    assert command.torque == [0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize(("policy", "torque"), [("zero", 0.0), ("hold", None)])
+def test_the_last_command_is_that_of_the_policy(policy, torque):
+    bench = Bench(on_fault=policy).running()
+    expected = [torque] * 3 if torque is not None else bench.law.balance((0.1, 0.2, 0.3))
+    assert bench.supervisor.final_command().torque == pytest.approx(expected)
+
+
+def test_margins_and_flags_are_the_worst_of_an_interval():
+    bench = Bench().running()
+    bench.law.status = 4
+    bench.period(q=(0.9, 0.0, -0.95))
+    bench.law.status = 2
+    bench.period(q=(0.0, 0.0, 0.0))
+    assert bench.supervisor.margin == pytest.approx([0.1, 0.8, 0.05])
+    assert bench.supervisor.status == 6
+    bench.supervisor.reset_extremes()
+    bench.law.status = 0
+    bench.period(q=(0.5, 0.5, 0.5))
+    assert bench.supervisor.margin == pytest.approx([0.5, 0.5, 0.5])
+    assert bench.supervisor.status == 0
+
+
+TORQUE = st.floats(allow_nan=True, allow_infinity=True)
+STATE = st.fixed_dictionaries(
+    {},
+    optional={
+        "q": st.lists(TORQUE, min_size=2, max_size=4),
+        "dq": st.lists(TORQUE, min_size=0, max_size=4),
+        "names": st.permutations((*JOINTS, "gripper")),
+    },
+)
+ACTION = st.sampled_from(["state", "state", "state", "none", "start", "stop", "hold", "late"])
+
+
+@given(
+    events=st.lists(st.tuples(ACTION, STATE, st.tuples(TORQUE, TORQUE, TORQUE)), max_size=30),
+    gravity=st.tuples(TORQUE, TORQUE, TORQUE),
+    policy=st.sampled_from(["hold", "zero"]),
+    automatic=st.booleans(),
+)
+def test_no_torque_is_ever_beyond_its_limit(events, gravity, policy, automatic):
+    """Whatever law, states, services and clocks do."""
+    bench = Bench(on_fault=policy, start_automatically=automatic)
+    bench.law.gravity = list(gravity)
+    bench.law.balance = lambda q: list(gravity)
+    bench.period()
+    for action, state, torque in events:
+        bench.law.torque = list(torque)
+        bench.now += {"late": 4, "none": 1}.get(action, 1) * T
+        if action == "state":
+            bench.state(**state)
+        if action == "start":
+            bench.supervisor.start(bench.now, bench.clock)
+        if action == "stop":
+            bench.supervisor.stop()
+        if action == "hold":
+            bench.supervisor.hold(bench.now, bench.clock)
+        command = bench.command()
+        for x, limit in zip(command.torque, LIMITS, strict=True):
+            assert -limit <= x <= limit
+    for x, limit in zip(bench.supervisor.final_command().torque, LIMITS, strict=True):
+        assert -limit <= x <= limit
+
+
+@pytest.mark.parametrize(
+    ("torque", "expected"),
+    [
+        ([11.0, -6.0, 1.0], [10.0, -5.0, 1.0]),
+        ([math.inf, -math.inf, math.nan], [10.0, -5.0, 0.0]),
+        ([10.0, -5.0, 2.0], [10.0, -5.0, 2.0]),
+    ],
+)
+def test_torques_are_clipped(torque, expected):
+    bench = Bench().running()
+    bench.law.torque = torque
+    command = bench.period()
+    assert command.torque == expected
+    assert command.limited == (torque != expected)
+    assert bench.supervisor.limited == (torque != expected)
+
+
+def test_missed_periods_are_a_share_of_all():
+    monitor = LoopMonitor()
+    assert monitor.missed_share == 0.0
+    for missed in (0, 0, 1, 0):
+        monitor.count_sample(missed)
+    assert (monitor.samples, monitor.missed, monitor.missed_share) == (4, 1, 0.2)
+
+
+def test_latencies_have_a_longest_one_and_quantiles():
+    monitor = LoopMonitor()
+    assert monitor.latency_quantile(0.99) == 0.0
+    for latency in itertools.chain([3_000_000_000], [105_000] * 98, [405_000]):
+        monitor.add_latency(latency)
+    assert monitor.longest_latency == 3_000_000_000
+    assert monitor.latency_quantile(0.5) == pytest.approx(110e-6)
+    assert monitor.latency_quantile(0.99) == pytest.approx(410e-6)
+    assert monitor.latency_quantile(1.0) == pytest.approx(3.0)
