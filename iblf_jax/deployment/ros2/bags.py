@@ -36,6 +36,9 @@ SHORTEST_INTERVAL = 0.75
 """Shortest time between two samples of the law in a replay [periods]: joint states that arrive
 faster than the law runs are not samples of it."""
 MIN_ROWS = 2
+REPRODUCED = 0.1
+"""Largest median distance between recorded and computed torques, relative to the largest recorded
+one, for which no warning is given."""
 
 
 @notices.each_warning_once
@@ -110,9 +113,11 @@ def read_bag(
 
     Positions, velocities and torques are those of the recording.  The signals of the law (virtual
     velocity, estimate, Lyapunov function) are computed: the scenario's law and observer run on the
-    recorded joint states with the gains of the scenario, and start at the first row.  Accelerations
-    are differences of the velocities to the next row, and so are velocities that are not recorded.
-    Gaps are not part of integrals over time.
+    recorded joint states and torques with the gains of the scenario, and start at the first row.
+    Accelerations are differences of the velocities to the next row, and so are velocities that are
+    not recorded.  Gaps are not part of integrals over time.  A warning says if the law has other
+    torques on these states than the recorded ones: the recording began after the law, or another
+    law ran.
 
     Args:
       path: the folder of the recording, or a `.db3` or `.mcap` file.
@@ -148,7 +153,9 @@ def read_bag(
     # The recorded torques are those after the actuator.
     scenario = dataclasses.replace(scenario, actuator=Ideal())
     rows = _rows(log, dq)
-    motion = RecordedMotion(rows, _replayed(scenario, log, dq), diverged=False)
+    states = _replayed(scenario, log, dq)
+    _compare_torques(log, states)
+    motion = RecordedMotion(rows, states, diverged=False)
     folds = as_folds(metrics, scenario.initial.q.dtype, scenario)
     is_gap = rows.instant[:-1] & rows.instant[1:]
     dt = float(np.median(np.diff(log.t)))
@@ -217,9 +224,23 @@ def _replayed(scenario: Scenario, log: Log, dq: np.ndarray) -> LoopState:
     """The states of law and observer after each joint state."""
     is_due = _samples(log.t, float(scenario.sampling.period))  # type: ignore[union-attr]
     dtype = scenario.initial.q.dtype
-    t, q, dq_read = (jnp.asarray(x, dtype) for x in (log.t, log.q, dq))
-    states = replay_law(scenario, t, q, dq_read, jnp.asarray(is_due))
+    t, q, dq_read, tau = (jnp.asarray(x, dtype) for x in (log.t, log.q, dq, log.tau))
+    states = replay_law(scenario, t, q, dq_read, jnp.asarray(is_due), tau)
     return jax.tree.map(np.asarray, states)
+
+
+def _compare_torques(log: Log, states: LoopState) -> None:
+    """Warns if the torques of the law on the recorded states are not the recorded ones."""
+    computed = np.asarray(states.sampled.commands[:, 0])
+    largest = np.max(np.abs(log.tau))
+    distance = np.median(np.max(np.abs(computed - log.tau), axis=1))
+    if distance <= REPRODUCED * largest:
+        return
+    notices.warn(
+        f"{log.name}: the law of the scenario has other torques on the recorded states than those"
+        f" recorded, by {distance:.3g} N m (median) of at most {largest:.3g} N m. Give time_origin"
+        " if the recording began after the law, or the scenario whose law ran."
+    )
 
 
 def _samples(t: np.ndarray, period: float) -> np.ndarray:

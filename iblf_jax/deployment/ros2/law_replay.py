@@ -26,7 +26,12 @@ def without_effects(sensor: Any) -> Any:
 
 
 def replay_law(
-    scenario: Scenario, t: jax.Array, q: jax.Array, dq: jax.Array, is_due: jax.Array
+    scenario: Scenario,
+    t: jax.Array,
+    q: jax.Array,
+    dq: jax.Array,
+    is_due: jax.Array,
+    tau: jax.Array | None = None,
 ) -> LoopState:
     """The state of law and observer after each of K measured states, stacked.
 
@@ -35,25 +40,31 @@ def replay_law(
       t: times of the states, (K,) [s].
       q, dq: measured positions [rad] and velocities [rad/s], (K, n).
       is_due: whether the law runs at a state, (K,) bool.
+      tau: torques that acted from each state on, (K, n) [N m], which the observer receives, so that
+        it forgets a wrong start; those of the law if not given.
     """
-    return _replay(
-        dataclasses.replace(scenario, sensor=without_effects(scenario.sensor)), t, q, dq, is_due
-    )
+    scenario = dataclasses.replace(scenario, sensor=without_effects(scenario.sensor))
+    return _replay(scenario, t, q, dq, is_due, tau)
 
 
 @jax.jit
 def _replay(
-    scenario: Scenario, t: jax.Array, q: jax.Array, dq: jax.Array, is_due: jax.Array
+    scenario: Scenario,
+    t: jax.Array,
+    q: jax.Array,
+    dq: jax.Array,
+    is_due: jax.Array,
+    tau: jax.Array | None,
 ) -> LoopState:
     # The start is not checked against the bounds: values that JAX is tracing have no number.
     scenario = dataclasses.replace(scenario, initial=Initial(q=q[0], dq=dq[0]))
     normal = jnp.zeros((scenario.sensor.draws, scenario.n), q.dtype)
 
     def one(state: LoopState, now: Any) -> tuple[LoopState, LoopState]:
-        t, q, dq, due = now
+        t, q, dq, due, applied = now
         state = state._replace(q=q, dq=dq)
-        run = partial(run_sampled_law, scenario, t, normal=normal)
+        run = partial(run_sampled_law, scenario, t, normal=normal, applied=applied)
         state = jax.lax.cond(due, run, lambda state: state, state)
         return state, state
 
-    return jax.lax.scan(one, initial_state(scenario), (t, q, dq, is_due))[1]
+    return jax.lax.scan(one, initial_state(scenario), (t, q, dq, is_due, tau))[1]

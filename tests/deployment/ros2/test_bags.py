@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 import sqlite3
 import sys
+import warnings
 
 import bag_files
 import numpy as np
@@ -386,6 +387,25 @@ def test_the_law_of_a_recorded_run_has_its_own_period(scenario, tmp_path):
     found = ij.deployment.read_bag(write_bag(tmp_path / "bag", messages), scenario, joints=NAMES)
     np.testing.assert_allclose(found.alpha, run.alpha, atol=1e-9)
     np.testing.assert_allclose(found.dt, 1e-3)
+
+
+def test_another_law_or_origin_of_time_is_reported(scenario, tmp_path):
+    """The law of a recording that began 0.5 s after it has its own time.  The observer, which
+    starts with the recording, forgets its start."""
+    scenario = ij.with_parts(scenario, observer=ij.observers.Momentum(kf=20.0))
+    run = ij.simulate(scenario, duration=1.5, dt=PERIOD)
+    t, q, dq, tau = (np.asarray(x)[250:] for x in (run.t, run.q, run.dq, run.tau))
+    folder = write_bag(tmp_path / "bag", messages_of(t, NAMES, q, tau, dq, origin=10**9))
+    with pytest.warns(UserWarning, match="other torques .* Give time_origin"):
+        ij.deployment.read_bag(folder, scenario, joints=NAMES)
+    other = ij.with_parameters(scenario, {"reference.amplitude": 0.02})
+    with pytest.warns(UserWarning, match="other torques"):
+        ij.deployment.read_bag(folder, other, joints=NAMES, time_origin=1.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = ij.deployment.read_bag(folder, scenario, joints=NAMES, time_origin=1.0)
+    np.testing.assert_allclose(found.q_d, run.q_d[250:], atol=1e-9)
+    np.testing.assert_allclose(found.alpha, run.alpha[250:], atol=1e-9)
 
 
 def test_gaps_are_not_integrated(scenario, tmp_path):
