@@ -10,9 +10,10 @@ Efforts (`std_msgs/Float64MultiArray`) have no stamps, so they are assigned to j
 receive times of the recording.  A loop that answers each joint state within a period therefore has
 the answer to the joint state in its row, from where on the torque is constant until the next row
 (zero-order hold).  The latency between joint state and effort is a delay of the logged torque,
-which `identify` estimates.  The torque is unknown before the first effort, after the last one, and
-within an interval between efforts that is a gap by the rule of `Log.gap`; the joint states in such
-intervals are no rows, so that the log has a gap there as well.
+which `identify` estimates.  Messages that a recorder received at about the same time, in the
+wrong order, are assigned by their number.  The torque is unknown before the first effort, after
+the last one, and within an interval between efforts that is a gap by the rule of `Log.gap`; the
+joint states in such intervals are no rows, so that the log has a gap there as well.
 """
 
 from __future__ import annotations
@@ -35,6 +36,10 @@ gap."""
 STATE_TYPE, EFFORT_TYPE = "sensor_msgs/msg/JointState", "std_msgs/msg/Float64MultiArray"
 STORAGE_ENDINGS = (".db3", ".mcap")
 """Endings of the files of a recording."""
+EXCHANGED = 0.25
+"""Largest distance of messages that a recorder may have exchanged [intervals of joint states]."""
+LONGEST_EXCHANGE = 10
+"""Largest number of joint states between one with two efforts and one without."""
 TIMES = ("stamp", "receive")
 NANOSECONDS = 10**9
 """In a second."""
@@ -143,18 +148,97 @@ def held_efforts(received: np.ndarray, efforts: np.ndarray) -> tuple[np.ndarray,
     """
     if not len(efforts) or not len(received):
         return np.zeros(len(received), int), np.zeros(len(received), bool)
+    answer = _answers(received, efforts)
+    is_answered = answer >= 0
+    index = np.maximum.accumulate(answer)
+    # Efforts before the first joint state are those of rows until the first answer.
+    before = np.searchsorted(efforts, received[0], side="left") - 1
+    index = np.maximum(index, before)
     intervals = np.diff(efforts)
     limit = np.inf
     if len(intervals):
         limit = GAP_RATIO * float(np.quantile(intervals, GAP_QUANTILE))
     is_before_gap = np.append(intervals > limit, True)
-    end = np.inf
-    if len(received) > 1:
-        end = received[-1] + np.median(np.diff(received))
-    index = np.searchsorted(efforts, np.append(received[1:], end), side="left") - 1
-    is_answered = efforts[index] >= received
     is_known = (index >= 0) & (is_answered | ~is_before_gap[index])
     return np.maximum(index, 0), is_known
+
+
+def _answers(received: np.ndarray, efforts: np.ndarray) -> np.ndarray:
+    """The effort that answers each joint state, (N,) int; -1 without one.
+
+    It is the last one that was received from the joint state on until the next one.
+    """
+    end, tolerance = np.inf, 0.0
+    if len(received) > 1:
+        interval = float(np.median(np.diff(received)))
+        end, tolerance = received[-1] + interval, EXCHANGED * interval
+    first = np.searchsorted(efforts, received, side="left")
+    last = np.searchsorted(efforts, np.append(received[1:], end), side="left") - 1
+    order = _Order(received, efforts, tolerance, first, last)
+    several = np.flatnonzero(last > first)
+    if 2 * len(several) > len(received):
+        several = several[:0]  # the loop has several efforts for each joint state
+    for k in several.tolist():
+        while order.last[k] > order.first[k] and order.repair(k):
+            pass
+    return np.where(order.last >= order.first, order.last, -1)
+
+
+class _Order(NamedTuple):
+    """The efforts of each joint state, from which messages are moved that a recorder exchanged.
+
+    A recorder may exchange a joint state and an effort that arrive at about the same time.  Then
+    one joint state has two efforts, and another one near it has none.  The efforts between the two
+    are moved by one joint state if all of them were received close to their new ones.
+    """
+
+    received: np.ndarray
+    efforts: np.ndarray
+    tolerance: float
+    """Largest distance of messages that were exchanged [ns]."""
+    first: np.ndarray
+    """Index of the first effort of each joint state, (N,)."""
+    last: np.ndarray
+    """Index of the last effort, before the first one where there is none, (N,)."""
+
+    def repair(self, k: int) -> bool:
+        """Moves an effort of the joint state k, which has several; whether this was possible."""
+        backward, forward = self._backward(k), self._forward(k)
+        if backward and (not forward or backward <= forward):
+            self.first[k] += 1
+            self.first[k - backward : k] += 1
+            self.last[k - backward : k] += 1
+            self.first[k - backward] = self.last[k - backward] = self.first[k] - backward
+            return True
+        if forward:
+            self.last[k] -= 1
+            self.first[k + 1 : k + forward + 1] -= 1
+            self.last[k + 1 : k + forward + 1] -= 1
+            self.first[k + forward] = self.last[k + forward] = self.last[k] + forward
+            return True
+        return False
+
+    def _backward(self, k: int) -> int:
+        """The distance of the joint state before k that has no effort; 0 if there is none."""
+        for distance in range(1, min(LONGEST_EXCHANGE, k) + 1):
+            row = k - distance
+            if self.efforts[self.first[row + 1]] - self.received[row + 1] > self.tolerance:
+                return 0
+            count = self.last[row] - self.first[row] + 1
+            if count != 1:
+                return 0 if count else distance
+        return 0
+
+    def _forward(self, k: int) -> int:
+        """The distance of the joint state after k that has no effort; 0 if there is none."""
+        for distance in range(1, min(LONGEST_EXCHANGE, len(self.received) - 1 - k) + 1):
+            row = k + distance
+            if self.received[row] - self.efforts[self.last[row - 1]] > self.tolerance:
+                return 0
+            count = self.last[row] - self.first[row] + 1
+            if count != 1:
+                return 0 if count else distance
+        return 0
 
 
 def _selected(t: np.ndarray, start: float, duration: float | None, path: Path) -> slice:

@@ -1,6 +1,9 @@
-"""Records `joint_states` and `efforts` as rosbag2 does: `python bag_recorder.py FOLDER`, until SIGTERM.
+"""Records `joint_states` and `efforts` as rosbag2 does, until SIGTERM.
 
-The messages are stored as ROS serialised them, with the times at which the middleware received them.
+    python bag_recorder.py FOLDER
+
+The messages are stored as ROS serialised them, with the times at which the middleware received
+them.
 It prints "ready" once it is subscribed.
 """
 

@@ -138,6 +138,32 @@ def test_an_effort_belongs_to_the_joint_state_that_it_answers():
         assert found == expected, (states, efforts)
 
 
+def test_messages_that_a_recorder_exchanged_are_assigned_by_their_number():
+    """A busy recorder stores messages later than they arrived, and those of one topic together."""
+    rng = np.random.default_rng(1)
+    count = 2000
+    states = 1000.0 * np.arange(count) + rng.uniform(-50, 50, count)
+    efforts = states + rng.uniform(200, 400, count)
+    for k in np.flatnonzero(rng.random(count) < 0.2):
+        # The answer is stored just before its joint state.
+        states[k] = efforts[k] + rng.uniform(1, 30)
+    index, is_known = held_efforts(np.sort(states).astype(int), np.sort(efforts).astype(int))
+    np.testing.assert_array_equal(index, np.arange(count))
+    assert is_known.all()
+    # Five joint states, and then their answers; and the other way round.
+    states, efforts = 1000 * np.arange(40), 1000 * np.arange(40) + 300
+    late = 14_350 + np.arange(5)
+    for a, b in ((late, late + 10), (late + 10, late)):
+        states[10:15], efforts[10:15] = a, b
+        index, is_known = held_efforts(states, efforts)
+        np.testing.assert_array_equal(index, np.arange(40))
+    # Two efforts a joint state, and one that is missing, are no exchange.
+    states, efforts = 1000 * np.arange(40), 500 * np.arange(80) + 100
+    index, _ = held_efforts(states, np.delete(efforts, [20, 21]))
+    np.testing.assert_array_equal(index[:10], 2 * np.arange(10) + 1)
+    assert index[10] == 19 and index[11] == 21
+
+
 def test_gaps_of_either_topic_are_gaps_of_the_log(scenario, motion, tmp_path):
     t, q, _, tau = motion
     messages = messages_of(t, NAMES, q, tau)
