@@ -32,6 +32,7 @@ ROBOT_OPTIONS = (
     "state_dropout",
     "effort_dropout",
     "hold_time",
+    "brake",
     "seed",
 )
 """Options of `robot_node` that have the same name on the command line."""
@@ -124,6 +125,12 @@ def _add_robot_arguments(parser: argparse.ArgumentParser, default: str | None = 
     )
     parser.add_argument(
         "--hold-time", type=float, metavar="S", help="of the last effort [s] (default: 0.1)"
+    )
+    parser.add_argument(
+        "--brake",
+        metavar="WHEN",
+        help="start (until the first torque), always (also after the hold time) or never (default:"
+        " start)",
     )
     parser.add_argument("--seed", type=int, metavar="N", help="of noise and dropouts (default: 0)")
 

@@ -94,11 +94,13 @@ class RobotMotion:
 
         `latency`: from the publication of a state to the next effort; `lateness`: from the nominal
         instant of a state to its publication; `jitter`: distance of the interval between the
-        efforts of two successive states from the period.
+        efforts of two successive states from the period; `gap`: the longest interval between two
+        efforts.
         """
         arrivals = self.state_t + self.lateness + self.latency
         jitter = np.abs(np.diff(arrivals) - self.period)
-        found = {"missed": self.missed}
+        gaps = np.diff(arrivals[np.isfinite(arrivals)])
+        found = {"missed": self.missed, "gap": float(np.max(gaps, initial=0.0))}
         series = {"latency": self.latency, "lateness": self.lateness, "jitter": jitter}
         for name, values in series.items():
             finite = values[np.isfinite(values)]

@@ -43,7 +43,7 @@ def robot(q=(0.8, 0.8), *, payload=None, **options) -> RobotSimulation:
         "sensor": ij.sensors.Ideal(),
         "delay": 0.0,
         "hold_time": 0.1,
-        "brake": True,
+        "brake": "start",
         "seed": 0,
     }
     return RobotSimulation(plant, np.array(q), np.zeros(2), **(settings | options))
@@ -133,7 +133,7 @@ def free_fall(duration: float, q=(0.8, 0.8)) -> np.ndarray:
 
 
 def test_without_efforts_the_brake_holds_and_without_brake_the_torque_is_zero():
-    held, free = robot(brake=True), robot(brake=False)
+    held, free = robot(brake="start"), robot(brake="never")
     for _ in range(10):
         held.measure()
         held.advance()
@@ -155,6 +155,23 @@ def test_an_effort_acts_for_the_hold_time_and_then_the_torque_is_zero():
     assert motion.t[acts][-1] == pytest.approx(0.0137, abs=1e-9)
     np.testing.assert_array_equal(motion.tau[motion.t > 0.0137 + 1e-9], 0.0)
     assert motion.counts["timeouts of the hold time"] == 1
+
+
+def test_a_brake_stops_the_robot_after_the_hold_time_until_the_next_effort():
+    simulation = robot(hold_time=0.01, brake="always")
+    simulation.measure()
+    simulation.receive(0.0, np.array([20.0, 5.0]))
+    simulation.receive(0.03, np.array([20.0, 5.0]))
+    for _ in range(20):
+        simulation.advance()
+    motion = motion_of(simulation)
+    stopped = (motion.t > 0.01 + 1e-9) & (motion.t < 0.03 - 1e-9)
+    assert stopped.sum() > 30
+    np.testing.assert_array_equal(np.ptp(motion.q[stopped], axis=0), 0.0)
+    np.testing.assert_array_equal(motion.dq[stopped], 0.0)
+    np.testing.assert_array_equal(motion.ddq[stopped], 0.0)
+    assert np.all(motion.q[stopped][0] != 0.8)
+    assert np.max(np.abs(motion.dq[motion.t > 0.031])) > 1e-3
 
 
 def test_an_effort_within_a_period_acts_from_its_arrival_on():
