@@ -13,9 +13,8 @@ same model, integrator (RK4), step (0.5 ms) and period, over all steps.  `second
 the second half of the motion.  `with delay`: from `cosimulate` with the median delay of the row,
 from the nominal instant of a state to its torque.  `missed`: share of the periods without a torque.
 `latency`: from the publication of a state to the next torque.  `jitter`: distance of the interval
-between two torques from the period.  `gap`: longest interval between two torques, of simulation
-time.  `torque`: largest torque, relative to its limit.  `load`: runnable processes of the machine
-before the row.
+between two torques from the period.  `gap`: longest interval between two torques.  `torque`:
+largest torque, relative to its limit.  `load`: runnable processes of the machine before the row.
 """
 
 from __future__ import annotations
@@ -148,7 +147,7 @@ class Bench:
             1e3 * timing["latency, 99 %"],
             1e3 * timing["latency, longest"],
             1e3 * timing["jitter, 99 %"] if case.real_time else "",
-            1e3 * timing["gap"],
+            1e3 * timing["gap"] if case.real_time else "",
             distance(motion, expected, 0.0),
             distance(motion, expected, 0.5 * self.duration),
             delayed,

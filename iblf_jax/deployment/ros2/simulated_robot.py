@@ -310,6 +310,7 @@ class SimulatedRobot:
             published=np.array(self.published),
             latency=np.array(self.latency),
             lateness=np.array(self.lateness),
+            effort_t=np.array(simulation.efforts.times) - simulation.efforts.delay,
             counts=dict(self.counts),
             diverged=simulation.diverged,
         )

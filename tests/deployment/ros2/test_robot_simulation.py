@@ -3,6 +3,8 @@ does without efforts."""
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -64,6 +66,7 @@ def motion_of(simulation: RobotSimulation) -> RobotMotion:
         published=np.ones(samples, bool),
         latency=np.zeros(samples),
         lateness=np.zeros(samples),
+        effort_t=np.array(simulation.efforts.times) - simulation.efforts.delay,
         counts={"timeouts of the hold time": simulation.timeouts},
         diverged=simulation.diverged,
     )
@@ -119,6 +122,22 @@ def test_a_motion_survives_its_file(tmp_path):
     assert loaded.counts == motion.counts
     assert loaded.timing() == pytest.approx(motion.timing(), nan_ok=True)
     np.testing.assert_array_equal(loaded.rollout(PAPER).V, motion.rollout(PAPER).V)
+
+
+def test_the_timing_of_a_motion_is_that_of_its_messages():
+    motion = closed_with_law(robot(), PAPER, periods=5)
+    latency = np.array([0.5, 0.7, np.nan, 0.5, 0.9, np.nan]) * 1e-3
+    lateness = np.array([0.0, 0.1, 0.0, 0.0, 0.3, 0.0]) * 1e-3
+    # Five periods from the first to the last effort, one of them without an effort.
+    arrivals = np.array([0.5, 2.8, 6.5, 9.2, 10.6]) * 1e-3
+    timing = dataclasses.replace(
+        motion, latency=latency, lateness=lateness, effort_t=arrivals
+    ).timing()
+    assert timing["missed"] == pytest.approx(0.2)
+    assert timing["gap"] == pytest.approx(3.7e-3)
+    assert timing["latency, longest"] == pytest.approx(0.9e-3)
+    assert timing["lateness, longest"] == pytest.approx(0.3e-3)
+    assert timing["jitter, median"] == pytest.approx(0.65e-3)
 
 
 def free_fall(duration: float, q=(0.8, 0.8)) -> np.ndarray:
