@@ -24,6 +24,8 @@ EPILOG = "Both commands need the extras `ros` and `robots`."
 
 ENDLESS = 1e6
 """Length of a motion that only a signal ends [s]."""
+DEMO_PERIOD = 2e-3
+"""Period of the law in a demonstration of a scenario that has none [s]."""
 ROBOT_OPTIONS = (
     "period",
     "dt",
@@ -68,7 +70,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help="length of the motion [s] (default: 10)",
     )
-    demo.add_argument("--out", required=True, metavar="DIR", help="folder for package and results")
+    demo.add_argument(
+        "--out",
+        default="ros_demo",
+        metavar="DIR",
+        help="folder for package and results (default: ros_demo)",
+    )
     demo.add_argument(
         "--torque-limits",
         metavar="NM,NM,...",
@@ -100,7 +107,10 @@ def _add_robot_arguments(parser: argparse.ArgumentParser, default: str | None = 
         "--joints", nargs="+", metavar="NAME", help="joints in FILE (default: the scenario's)"
     )
     parser.add_argument(
-        "--period", type=float, metavar="S", help="of the states [s] (default: the scenario's)"
+        "--period",
+        type=float,
+        metavar="S",
+        help="of the states [s] (default: the scenario's; in a demonstration else 0.002)",
     )
     parser.add_argument(
         "--real-time",
@@ -182,7 +192,7 @@ def run_demo(args: argparse.Namespace) -> int:
     from iblf_jax.simulation.scenario import canonical
 
     scenario = canonical(scenario_of(args).scenario)
-    options = _robot_options(args, scenario)
+    options = _robot_options(args, scenario, DEMO_PERIOD)
     limits = None
     if args.torque_limits:
         limits = _numbers("--torque-limits", args.torque_limits)
@@ -206,19 +216,24 @@ def run_demo(args: argparse.Namespace) -> int:
     return int(not found.ok)
 
 
-def _robot_options(args: argparse.Namespace, scenario: Scenario) -> dict[str, Any]:
-    """The arguments of `robot_node` for a scenario and the command line."""
+def _robot_options(
+    args: argparse.Namespace, scenario: Scenario, period: float | None = None
+) -> dict[str, Any]:
+    """The arguments of `robot_node` for a scenario and the command line; `period` is that of the
+    law where neither has one.
+    """
     from iblf_jax.core import checks
     from iblf_jax.world.robots.payload import Payload
 
     options = given_options(args, *ROBOT_OPTIONS)
     options["initial"], options["sensor"] = scenario.initial, scenario.sensor
     options["real_time"] = args.real_time
-    if "period" not in options:
-        if scenario.sampling is None:
-            remedy = "Give one: --period 0.002."
-            raise checks.fail("--period", None, "the period of the law [s]", remedy)
-        options["period"] = float(scenario.sampling.period)
+    if scenario.sampling is not None:
+        period = float(scenario.sampling.period)
+    options.setdefault("period", period)
+    if options["period"] is None:
+        remedy = "Give one: --period 0.002."
+        raise checks.fail("--period", None, "the period of the law [s]", remedy)
     if args.payload:
         numbers = _numbers("--payload", args.payload)
         if len(numbers) not in (1, 4, 10):

@@ -23,7 +23,7 @@ REPUBLISH_INTERVAL = 0.1
 """In lock-step, time after which a state that no effort has answered is published again [s]: a law
 node that has started meanwhile has not received it."""
 BRAKES = ("start", "always", "never")
-DISCOVERY_TIME = 0.3
+DISCOVERY_TIME = 1.0
 """Time from the discovery of a publisher of efforts to the first state [s], in which the law node
 discovers this node: an effort that it publishes before is lost."""
 NANOSECONDS = 1_000_000_000
