@@ -23,6 +23,7 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock, ClockType
+from rclpy.duration import Duration
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -51,6 +52,8 @@ WATCHDOG = 0.5
 """Default time without a state after which a law that samples with the states is in fault [s]."""
 PERIOD_TOLERANCE = 1e-9
 """Relative difference of the period from the exported one."""
+FINAL_TIMEOUT = Duration(seconds=0.5)
+"""Longest wait for the arrival of the last command."""
 QUEUE_DEPTH = 10
 """Messages that a topic stores."""
 DECIMAL_POINT = "Numbers have a decimal point in YAML: 50.0."
@@ -267,12 +270,8 @@ class LawNode(Node):  # type: ignore[misc]
     def _sample(self) -> None:
         """One sample of the law a period."""
         missed = self._missed_periods()
-        clock = self._clock_of_stamps()
-        if self.supervisor.is_stale(monotonic_ns(), clock):
-            # This process may have been suspended: newer states may wait in the queue.
-            self._take_waiting_states()
-            clock = self._clock_of_stamps()
-        command = self.supervisor.command(monotonic_ns(), clock)
+        self._catch_up()
+        command = self.supervisor.command(monotonic_ns(), self._clock_of_stamps())
         if command is not None:
             self._publish(command, missed)
 
@@ -286,8 +285,14 @@ class LawNode(Node):  # type: ignore[misc]
             return 0
         return max(round((place - before) / self._period) - 1, 0)
 
-    def _take_waiting_states(self) -> None:
-        """Takes the states that wait in the queue of the subscription."""
+    def _catch_up(self) -> None:
+        """Takes the states that wait in the queue, if the last one is stale: this process may have
+        been suspended.  A law that samples with the states answers each of them instead.
+        """
+        if self.trigger == "state":
+            return
+        if not self.supervisor.is_stale(monotonic_ns(), self._clock_of_stamps()):
+            return
         for _ in range(QUEUE_DEPTH):
             with self._states.handle:
                 taken = self._states.handle.take_message(JointState, False)
@@ -319,8 +324,11 @@ class LawNode(Node):  # type: ignore[misc]
         command = self.supervisor.final_command()
         if command is not None:
             self._send(command)
+            # The process ends after this; without waiting, the message may be lost.
+            self._publisher.wait_for_all_acked(FINAL_TIMEOUT)
 
     def _start(self) -> tuple[bool, str]:
+        self._catch_up()
         started, message = self.supervisor.start(monotonic_ns(), self._clock_of_stamps())
         if started:
             self.get_logger().info(f"{message} time_origin is {self._origin_text()} s.")
@@ -330,6 +338,7 @@ class LawNode(Node):  # type: ignore[misc]
         return self.supervisor.stop()
 
     def _hold(self) -> tuple[bool, str]:
+        self._catch_up()
         return self.supervisor.hold(monotonic_ns(), self._clock_of_stamps())
 
     def _origin_text(self) -> str:
