@@ -78,7 +78,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     demo.add_argument(
         "--torque-limits",
-        metavar="NM,NM,...",
+        type=float,
+        nargs="+",
+        metavar="NM",
         help="limits of the torques [N m] (default: the model's, else 3 times what a run needs)",
     )
     demo.add_argument(
@@ -193,9 +195,6 @@ def run_demo(args: argparse.Namespace) -> int:
 
     scenario = canonical(scenario_of(args).scenario)
     options = _robot_options(args, scenario, DEMO_PERIOD)
-    limits = None
-    if args.torque_limits:
-        limits = _numbers("--torque-limits", args.torque_limits)
     try:
         found = demonstrate(
             scenario,
@@ -203,7 +202,7 @@ def run_demo(args: argparse.Namespace) -> int:
             plant=args.plant,
             joints=args.joints,
             duration=args.duration,
-            torque_limits=limits,
+            torque_limits=args.torque_limits,
             state_timeout=args.state_timeout,
             priority=args.priority,
             **options,

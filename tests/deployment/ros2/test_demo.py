@@ -121,7 +121,7 @@ def test_the_command_prints_accuracy_missed_periods_and_latency(tmp_path, capsys
     [
         (["ros", "robot", "zhang_yan_2024"], "--period: got None"),
         (["ros", "demo", "--period", "0.002", "--payload", "1,2"], "--payload: got '1,2'"),
-        (["ros", "demo", "--period", "0.002", "--torque-limits", "a"], "--torque-limits: got 'a'"),
+        (["ros", "demo", "--torque-limits", "60"], "torque_limits"),
         (["ros", "robot", "ur5", "--period", "0.002"], "plant: got 'Arm'"),
         (["ros"], "required"),
     ],
