@@ -129,6 +129,8 @@ class RobotSimulation:
         self.samples: list[Reading] = []
         self.rows: list[Row] = []
         self.diverged = False
+        self.is_recording = True
+        """Whether `rows` and `samples` have the complete motion, and not only its last instant."""
 
     @property
     def t(self) -> float:
@@ -143,6 +145,8 @@ class RobotSimulation:
             self.samples.pop()
         elif self.rows:  # The signals of the law jump with every reading.
             self.record(reading.t, instant=False)
+        if not self.is_recording:
+            self.samples.clear()
         self.samples.append(reading)
         return reading
 
@@ -211,6 +215,8 @@ class RobotSimulation:
         """Appends the row of a time."""
         sample = max(len(self.samples) - 1, 0)
         row = Row(t, instant, self.robot.state, self.torque, sample, self.is_braked)
+        if not self.is_recording:
+            self.rows.clear()
         self.rows.append(row)
 
     def finish(self) -> None:

@@ -254,6 +254,7 @@ class SimulatedRobot:
         duration: float,
         *,
         patience: float = 30.0,
+        record: bool = True,
         on_release: Callable[[], object] = lambda: None,
     ) -> RobotMotion:
         """Runs the robot.
@@ -262,6 +263,8 @@ class SimulatedRobot:
           duration: of the motion [s], a whole number of periods.
           patience: longest time of the computer that a lock-step waits for the effort which answers
             a state, and that the brake waits for the first effort [s].
+          record: whether the motion is recorded, which takes about 3 GB an hour; without it, the
+            result has the last instant only, and the timing.
           on_release: called when the first effort has arrived.
 
         Returns:
@@ -276,6 +279,7 @@ class SimulatedRobot:
             raise checks.fail("robot", "one that has run", "one that has not", "Make a new one.")
         periods = checks.whole_steps(duration, simulation.period, dt_is_free=False)
         patience = checks.time_span("patience", patience)
+        simulation.is_recording = checks.boolean("record", record)
         was_enabled = gc.isenabled()
         gc.collect()
         gc.disable()  # A collection takes longer than a period.

@@ -140,6 +140,14 @@ def test_the_timing_of_a_motion_is_that_of_its_messages():
     assert timing["jitter, median"] == pytest.approx(0.65e-3)
 
 
+def test_without_a_recording_the_last_instant_is_kept():
+    recording, other = robot(), robot()
+    other.is_recording = False
+    complete, last = closed_with_law(recording, PAPER, 5), closed_with_law(other, PAPER, 5)
+    np.testing.assert_array_equal(last.q, complete.q[-1:])
+    assert len(other.rows) == len(other.samples) == 1
+
+
 def free_fall(duration: float, q=(0.8, 0.8)) -> np.ndarray:
     """Positions of the arm without torque, by MuJoCo alone."""
     model = mujoco.MjModel.from_xml_path(str(ARM))
