@@ -394,6 +394,7 @@ def test_a_gain_changes_while_the_law_runs_and_is_refused_outside_of_its_range(c
     assert not client.set("controller.k1", 4.1)[0]
     assert not client.set("torque_limits", [1.0, 1.0])[0], "read-only"
     assert not client.set("period", 0.02)[0], "read-only"
+    assert not client.set("time_origin", math.inf)[0]
     assert client.set("controller.K2", [4.0, 3.5]) == (True, "")
     assert client.set("controller.k1", 2.0) == (True, "")
     assert client.get("controller.K2") == [4.0, 3.5]
@@ -491,6 +492,7 @@ REFUSED = {
     "a policy": ({"on_fault": "brake"}, "on_fault: got brake, expected one of ['hold', 'zero']"),
     "a trigger": ({"trigger": "clock"}, "trigger: got clock"),
     "a negative stiffness": ({"hold_stiffness": "[-1.0, 1.0]"}, "hold_stiffness: got [-1.0"),
+    "an infinite time": ({"time_origin": ".inf"}, "time_origin: got inf"),
     "a timeout of zero": ({"state_timeout": 0.0}, "state_timeout: got 0.0"),
     "a gain": ({"controller.K2": "[9.0, 2.0]"}, "controller.K2: got 9, expected a number from 1"),
     "a scalar gain": ({"controller.k1": 9.0}, "controller.k1: got"),

@@ -85,12 +85,15 @@ class LawNode(Node):  # type: ignore[misc]
         self.gains = {gain.path: gain for gain in law.description.gains}
         configuration = self._configuration()
         origin = self._declared("time_origin", math.nan, "stamp that is t = 0 [s], NaN for start")
+        if math.isinf(origin):
+            raise refused("time_origin", origin, "a stamp [s] or NaN", "NaN is that of the start.")
         self.supervisor = Supervisor(law, configuration, _origin(origin))
         self._declare_gains()
         self.monitor = LoopMonitor()
         self._answered: int | None = None
         """Arrival of the last state that a command has answered [ns]."""
         self._missed_before = 0
+        self._logged_mode = Mode.WAITING
         self._tick: int | None = None
         self._period = round(configuration.period * NANOSECONDS)
         self._efforts = Float64MultiArray(data=array("d", [0.0] * len(configuration.joints)))
@@ -197,12 +200,14 @@ class LawNode(Node):  # type: ignore[misc]
             self.law.set_gain(gain.path, numbers)
 
     def _refuse_parameters(self, parameters: Sequence[Parameter]) -> SetParametersResult:
-        """Refuses values of gains outside of their ranges."""
+        """Refuses values of gains outside of their ranges, and a time that is infinite."""
         for parameter in parameters:
+            reason = ""
             gain = self.gains.get(parameter.name)
-            if gain is None:
-                continue
-            reason = why_refused(gain, _numbers(parameter.value))
+            if gain is not None:
+                reason = why_refused(gain, _numbers(parameter.value))
+            if parameter.name == "time_origin" and math.isinf(parameter.value):
+                reason = f"time_origin: got {parameter.value}, expected a stamp [s] or NaN."
             if reason:
                 return SetParametersResult(successful=False, reason=reason)
         return SetParametersResult(successful=True)
@@ -318,6 +323,18 @@ class LawNode(Node):  # type: ignore[misc]
     def _send(self, command: Command) -> None:
         self._efforts.data[:] = array("d", command.torque)
         self._publisher.publish(self._efforts)
+        if command.mode is not self._logged_mode:
+            self._log_mode(command.mode)
+
+    def _log_mode(self, mode: Mode) -> None:
+        """Logs a changed mode; a fault with its reason."""
+        self._logged_mode = mode
+        fault = self.supervisor.last_fault
+        if mode is Mode.FAULT and fault is not None:
+            policy = self.supervisor.configuration.on_fault
+            self.get_logger().error(f"{_fault_text(fault)}; torques by the policy {policy!r}.")
+        else:
+            self.get_logger().info(f"The mode is {mode.value}.")
 
     def send_final_command(self) -> None:
         """Publishes the torques of the fault policy before the node ends."""
@@ -482,9 +499,11 @@ def main(args: Sequence[str] | None = None) -> int:
     # Objects of the start are not searched for garbage again.
     gc.collect()
     gc.freeze()
-    _spin(executor)
-    node.send_final_command()
-    rclpy.try_shutdown()
+    try:
+        _spin(executor)
+    finally:
+        node.send_final_command()
+        rclpy.try_shutdown()
     return 0
 
 
