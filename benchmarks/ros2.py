@@ -13,8 +13,8 @@ same model, integrator (RK4), step (0.5 ms) and period, over all steps.  `second
 the second half of the motion.  `with delay`: from `cosimulate` with the median delay of the row,
 from the nominal instant of a state to its torque.  `missed`: share of the periods without a torque.
 `latency`: from the publication of a state to the next torque.  `jitter`: distance of the interval
-between two torques from the period.  `torque`: largest torque, relative to its limit.  `load`:
-runnable processes of the machine before the row.
+between two torques from the period.  `gap`: longest interval between two torques.  `torque`:
+largest torque, relative to its limit.  `load`: runnable processes of the machine before the row.
 """
 
 from __future__ import annotations
@@ -69,6 +69,7 @@ COLUMNS = (
     "latency 99 % [ms]",
     "longest [ms]",
     "jitter 99 % [ms]",
+    "gap [ms]",
     "distance [rad]",
     "second half [rad]",
     "with delay [rad]",
@@ -146,6 +147,7 @@ class Bench:
             1e3 * timing["latency, 99 %"],
             1e3 * timing["latency, longest"],
             1e3 * timing["jitter, 99 %"] if case.real_time else "",
+            1e3 * timing["gap"] if case.real_time else "",
             distance(motion, expected, 0.0),
             distance(motion, expected, 0.5 * self.duration),
             delayed,
@@ -214,8 +216,8 @@ def cases(priority: int) -> list[Case]:
     rows.append(Case("restart in lock-step", restarts=True))
     timer = {"trigger": "timer", "state_timeout": repr(LATENESS * 2e-3)}
     rows.append(Case("restart in real time", 2e-3, True, priority, timer, restarts=True))
-    held = {"hold_time": 10.0}
-    name = "restart in real time, torque held"
+    held = {"brake": "always"}
+    name = "restart in real time, with brake"
     rows.append(Case(name, 2e-3, True, priority, timer, held, restarts=True))
     return rows
 

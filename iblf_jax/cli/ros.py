@@ -24,6 +24,8 @@ EPILOG = "Both commands need the extras `ros` and `robots`."
 
 ENDLESS = 1e6
 """Length of a motion that only a signal ends [s]."""
+DEMO_PERIOD = 2e-3
+"""Period of the law in a demonstration of a scenario that has none [s]."""
 ROBOT_OPTIONS = (
     "period",
     "dt",
@@ -32,6 +34,7 @@ ROBOT_OPTIONS = (
     "state_dropout",
     "effort_dropout",
     "hold_time",
+    "brake",
     "seed",
 )
 """Options of `robot_node` that have the same name on the command line."""
@@ -67,10 +70,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help="length of the motion [s] (default: 10)",
     )
-    demo.add_argument("--out", required=True, metavar="DIR", help="folder for package and results")
+    demo.add_argument(
+        "--out",
+        default="ros_demo",
+        metavar="DIR",
+        help="folder for package and results (default: ros_demo)",
+    )
     demo.add_argument(
         "--torque-limits",
-        metavar="NM,NM,...",
+        type=float,
+        nargs="+",
+        metavar="NM",
         help="limits of the torques [N m] (default: the model's, else 3 times what a run needs)",
     )
     demo.add_argument(
@@ -99,7 +109,10 @@ def _add_robot_arguments(parser: argparse.ArgumentParser, default: str | None = 
         "--joints", nargs="+", metavar="NAME", help="joints in FILE (default: the scenario's)"
     )
     parser.add_argument(
-        "--period", type=float, metavar="S", help="of the states [s] (default: the scenario's)"
+        "--period",
+        type=float,
+        metavar="S",
+        help="of the states [s] (default: the scenario's; in a demonstration else 0.002)",
     )
     parser.add_argument(
         "--real-time",
@@ -124,6 +137,12 @@ def _add_robot_arguments(parser: argparse.ArgumentParser, default: str | None = 
     )
     parser.add_argument(
         "--hold-time", type=float, metavar="S", help="of the last effort [s] (default: 0.1)"
+    )
+    parser.add_argument(
+        "--brake",
+        metavar="WHEN",
+        help="start (until the first torque), always (also after the hold time) or never (default:"
+        " start)",
     )
     parser.add_argument("--seed", type=int, metavar="N", help="of noise and dropouts (default: 0)")
 
@@ -154,13 +173,12 @@ def run_robot(args: argparse.Namespace) -> int:
             motion = node.run(
                 periods * options["period"],
                 patience=ENDLESS,
+                record=folder is not None,
                 on_release=lambda: print(f"in motion, t = 0 at {node.origin} ns", flush=True),
             )
     except TimeoutError as error:
         complain(str(error))
         return 1
-    if not motion.instant.any():
-        return 0
     print(_report_of(motion))
     if folder is not None:
         motion.save(folder / "motion.npz")
@@ -175,10 +193,7 @@ def run_demo(args: argparse.Namespace) -> int:
     from iblf_jax.simulation.scenario import canonical
 
     scenario = canonical(scenario_of(args).scenario)
-    options = _robot_options(args, scenario)
-    limits = None
-    if args.torque_limits:
-        limits = _numbers("--torque-limits", args.torque_limits)
+    options = _robot_options(args, scenario, DEMO_PERIOD)
     try:
         found = demonstrate(
             scenario,
@@ -186,7 +201,7 @@ def run_demo(args: argparse.Namespace) -> int:
             plant=args.plant,
             joints=args.joints,
             duration=args.duration,
-            torque_limits=limits,
+            torque_limits=args.torque_limits,
             state_timeout=args.state_timeout,
             priority=args.priority,
             **options,
@@ -199,19 +214,24 @@ def run_demo(args: argparse.Namespace) -> int:
     return int(not found.ok)
 
 
-def _robot_options(args: argparse.Namespace, scenario: Scenario) -> dict[str, Any]:
-    """The arguments of `robot_node` for a scenario and the command line."""
+def _robot_options(
+    args: argparse.Namespace, scenario: Scenario, period: float | None = None
+) -> dict[str, Any]:
+    """The arguments of `robot_node` for a scenario and the command line; `period` is that of the
+    law where neither has one.
+    """
     from iblf_jax.core import checks
     from iblf_jax.world.robots.payload import Payload
 
     options = given_options(args, *ROBOT_OPTIONS)
     options["initial"], options["sensor"] = scenario.initial, scenario.sensor
     options["real_time"] = args.real_time
-    if "period" not in options:
-        if scenario.sampling is None:
-            remedy = "Give one: --period 0.002."
-            raise checks.fail("--period", None, "the period of the law [s]", remedy)
-        options["period"] = float(scenario.sampling.period)
+    if scenario.sampling is not None:
+        period = float(scenario.sampling.period)
+    options.setdefault("period", period)
+    if options["period"] is None:
+        remedy = "Give one: --period 0.002."
+        raise checks.fail("--period", None, "the period of the law [s]", remedy)
     if args.payload:
         numbers = _numbers("--payload", args.payload)
         if len(numbers) not in (1, 4, 10):

@@ -33,7 +33,17 @@ CLASSIFIED = [
     if (match := re.fullmatch(r"Programming Language :: Python :: (3\.\d+)", text))
 ]
 """The Pythons of the classifiers, as (3, minor)."""
-DISTRIBUTION = {"PIL": "pillow", "mpl_toolkits": "matplotlib", "tomli_w": "tomli-w"}
+DISTRIBUTION = {"PIL": "pillow", "mpl_toolkits": "matplotlib", "tomli_w": "tomli-w"} | {
+    name: f"ros-{name.replace('_', '-')}"
+    for name in (
+        "rclpy",
+        "rcl_interfaces",
+        "sensor_msgs",
+        "std_msgs",
+        "std_srvs",
+        "diagnostic_msgs",
+    )
+}
 """Name of an import -> its distribution, where they differ."""
 COMES_WITH = {"jaxlib": "jax", "pandas": "xarray", "pillow": "matplotlib"}
 """What the package imports without a declaration of its own -> the dependency that always brings

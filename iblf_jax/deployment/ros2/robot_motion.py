@@ -75,6 +75,8 @@ class RobotMotion:
     the next publication."""
     lateness: np.ndarray
     """From the nominal instant of a state to its publication in real time, (K,) [s]."""
+    effort_t: np.ndarray
+    """Times at which efforts arrived, without those that were lost or refused, (M,) [s]."""
     counts: dict[str, int]
     """Numbers of events: `dropped efforts`, `refused efforts`, `timeouts of the hold time`,
     `skipped states` of a robot that was late by more than a period."""
@@ -83,22 +85,22 @@ class RobotMotion:
 
     @property
     def missed(self) -> float:
-        """Share of the published states to which no effort came within the period."""
-        answered = np.isfinite(self.latency[self.published][:-1])
-        if answered.size == 0:
+        """Share of the periods in which no effort arrived [1]."""
+        intervals = np.round(np.diff(self.effort_t) / self.period)
+        if intervals.size == 0:
             return math.nan
-        return float(1.0 - np.mean(answered))
+        return float(np.sum(np.maximum(intervals - 1.0, 0.0)) / max(np.sum(intervals), 1.0))
 
     def timing(self) -> dict[str, float]:
         """Latency, lateness and jitter [s], and the share of missed periods [1].
 
         `latency`: from the publication of a state to the next effort; `lateness`: from the nominal
-        instant of a state to its publication; `jitter`: distance of the interval between the
-        efforts of two successive states from the period.
+        instant of a state to its publication; `jitter`: distance of the interval between two
+        efforts from the period; `gap`: the longest such interval.
         """
-        arrivals = self.state_t + self.lateness + self.latency
-        jitter = np.abs(np.diff(arrivals) - self.period)
-        found = {"missed": self.missed}
+        intervals = np.diff(self.effort_t)
+        found = {"missed": self.missed, "gap": float(np.max(intervals, initial=0.0))}
+        jitter = np.abs(intervals - self.period)
         series = {"latency": self.latency, "lateness": self.lateness, "jitter": jitter}
         for name, values in series.items():
             finite = values[np.isfinite(values)]

@@ -89,7 +89,8 @@ class RobotSimulation:
 
     The torque is zero before the first effort.  An effort acts from its arrival on until the next
     one arrives, and at most for `hold_time`, after which the torque is zero.  While the brake is
-    engaged, the robot keeps its initial state; the first effort that acts releases it.
+    engaged, the robot keeps its position; the next effort that acts releases it.  It is engaged at
+    the start unless it is "never", and after the hold time if it is "always".
     """
 
     def __init__(
@@ -103,7 +104,7 @@ class RobotSimulation:
         sensor: Any,
         delay: float,
         hold_time: float,
-        brake: bool,
+        brake: str,
         seed: int,
     ) -> None:
         """The arguments of `robot_node`; q and dq are the initial state, (n,) each."""
@@ -113,7 +114,8 @@ class RobotSimulation:
         self.steps_per_period = round(period / dt)
         self.tolerance = WHOLE_TOLERANCE * dt
         self.hold_time = hold_time
-        self.is_braked = brake
+        self.brakes_after_hold = brake == "always"
+        self.is_braked = brake != "never"
         robot.place(q, dq)
         self.readings = SensorReadings(sensor, q, dq, period, seed)
         self.efforts = CommandsInTransit(delay)
@@ -127,6 +129,8 @@ class RobotSimulation:
         self.samples: list[Reading] = []
         self.rows: list[Row] = []
         self.diverged = False
+        self.is_recording = True
+        """Whether `rows` and `samples` have the complete motion, and not only its last instant."""
 
     @property
     def t(self) -> float:
@@ -141,6 +145,8 @@ class RobotSimulation:
             self.samples.pop()
         elif self.rows:  # The signals of the law jump with every reading.
             self.record(reading.t, instant=False)
+        if not self.is_recording:
+            self.samples.clear()
         self.samples.append(reading)
         return reading
 
@@ -201,11 +207,16 @@ class RobotSimulation:
             self.torque = np.zeros_like(self.torque)
             self.zero_torque_from = math.inf
             self.timeouts += 1
+            if self.brakes_after_hold:
+                self.is_braked = True
+                self.robot.place(self.robot.q, np.zeros_like(self.torque))
 
     def record(self, t: float, instant: bool) -> None:
         """Appends the row of a time."""
         sample = max(len(self.samples) - 1, 0)
         row = Row(t, instant, self.robot.state, self.torque, sample, self.is_braked)
+        if not self.is_recording:
+            self.rows.clear()
         self.rows.append(row)
 
     def finish(self) -> None:

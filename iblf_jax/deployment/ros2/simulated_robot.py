@@ -22,7 +22,8 @@ from iblf_jax.world.robots.payload import Payload
 REPUBLISH_INTERVAL = 0.1
 """In lock-step, time after which a state that no effort has answered is published again [s]: a law
 node that has started meanwhile has not received it."""
-DISCOVERY_TIME = 0.3
+BRAKES = ("start", "always", "never")
+DISCOVERY_TIME = 1.0
 """Time from the discovery of a publisher of efforts to the first state [s], in which the law node
 discovers this node: an effort that it publishes before is lost."""
 NANOSECONDS = 1_000_000_000
@@ -60,7 +61,7 @@ def robot_node(
     effort_dropout: float = 0.0,
     payload: Payload | None = None,
     hold_time: float = 0.1,
-    brake: bool = True,
+    brake: str = "start",
     seed: int = 0,
     ros_args: Sequence[str] = (),
 ) -> SimulatedRobot:
@@ -91,8 +92,9 @@ def robot_node(
       effort_dropout: probability that an effort is lost [1]; the first one never is.
       payload: a body that is fixed to the body which the last joint moves, in its frame.
       hold_time: longest time that an effort acts [s].
-      brake: whether the robot keeps its initial state until the first effort that is not zero.
-        Time of the motion counts from the state which that effort answers.
+      brake: "start": the robot keeps its initial state until the first effort that is not zero,
+        and time of the motion counts from the state which that effort answers; "always": a brake
+        also stops it at the end of the hold time, until the next such effort; "never": no brake.
       seed: fixes the dropouts, and the noise of the sensor as in `cosimulate`.
       ros_args: arguments of ROS, such as ["--ros-args", "-r", "joint_states:=/arm/joint_states"].
 
@@ -111,6 +113,7 @@ def robot_node(
     )
     if integrator is not None:
         checks.one_of("integrator", integrator, INTEGRATORS)
+    checks.one_of("brake", brake, BRAKES)
     period = checks.time_span("period", period)
     robot = MujocoPlant(plant, names, len(names), {}, integrator, payload)
     if dt is None:
@@ -130,7 +133,7 @@ def robot_node(
         sensor=Ideal() if sensor is None else sensor,
         delay=checks.time_span("delay", delay, zero=True),
         hold_time=checks.time_span("hold_time", hold_time),
-        brake=checks.boolean("brake", brake),
+        brake=brake,
         seed=checks.seed(seed),
     )
     dropouts = Dropouts(
@@ -251,6 +254,7 @@ class SimulatedRobot:
         duration: float,
         *,
         patience: float = 30.0,
+        record: bool = True,
         on_release: Callable[[], object] = lambda: None,
     ) -> RobotMotion:
         """Runs the robot.
@@ -259,6 +263,8 @@ class SimulatedRobot:
           duration: of the motion [s], a whole number of periods.
           patience: longest time of the computer that a lock-step waits for the effort which answers
             a state, and that the brake waits for the first effort [s].
+          record: whether the motion is recorded, which takes about 3 GB an hour; without it, the
+            result has the last instant only, and the timing.
           on_release: called when the first effort has arrived.
 
         Returns:
@@ -273,6 +279,7 @@ class SimulatedRobot:
             raise checks.fail("robot", "one that has run", "one that has not", "Make a new one.")
         periods = checks.whole_steps(duration, simulation.period, dt_is_free=False)
         patience = checks.time_span("patience", patience)
+        simulation.is_recording = checks.boolean("record", record)
         was_enabled = gc.isenabled()
         gc.collect()
         gc.disable()  # A collection takes longer than a period.
@@ -307,6 +314,7 @@ class SimulatedRobot:
             published=np.array(self.published),
             latency=np.array(self.latency),
             lateness=np.array(self.lateness),
+            effort_t=np.array(simulation.efforts.times) - simulation.efforts.delay,
             counts=dict(self.counts),
             diverged=simulation.diverged,
         )
@@ -314,7 +322,7 @@ class SimulatedRobot:
     def _wait_for_law(self, patience: float) -> None:
         """Waits until a node publishes efforts, and has discovered this one."""
         end = time.perf_counter() + patience
-        while not self._stops and self.node.count_publishers("efforts") == 0:
+        while not self._stops and self.node.count_publishers(self._subscription.topic_name) == 0:
             self._spin(time.perf_counter() + REPUBLISH_INTERVAL)
             if time.perf_counter() > end:
                 raise TimeoutError(self._no_effort(patience))
@@ -469,8 +477,7 @@ class SimulatedRobot:
         if arrival.effort is None:
             return
         self._has_received = True
-        is_first = not self.simulation.efforts.commands
-        if is_first and self.simulation.is_braked and not np.any(arrival.effort):
+        if self.simulation.is_braked and not np.any(arrival.effort):
             return
         self.simulation.receive(t, arrival.effort)
 

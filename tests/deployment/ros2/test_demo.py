@@ -102,7 +102,7 @@ def test_diagnostics_are_those_before_the_end():
 
 
 def test_the_command_prints_accuracy_missed_periods_and_latency(tmp_path, capsys):
-    words = ["ros", "demo", "--period", "0.002", "--duration", "0.2", "--effort-dropout", "0.1"]
+    words = ["ros", "demo", "--duration", "0.2", "--effort-dropout", "0.1"]
     assert cli.main([*words, "--out", str(tmp_path)]) == 0
     output = capsys.readouterr().out
     for part in (
@@ -119,9 +119,9 @@ def test_the_command_prints_accuracy_missed_periods_and_latency(tmp_path, capsys
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        (["ros", "demo"], "--period: got None"),
+        (["ros", "robot", "zhang_yan_2024"], "--period: got None"),
         (["ros", "demo", "--period", "0.002", "--payload", "1,2"], "--payload: got '1,2'"),
-        (["ros", "demo", "--period", "0.002", "--torque-limits", "a"], "--torque-limits: got 'a'"),
+        (["ros", "demo", "--torque-limits", "60"], "torque_limits"),
         (["ros", "robot", "ur5", "--period", "0.002"], "plant: got 'Arm'"),
         (["ros"], "required"),
     ],

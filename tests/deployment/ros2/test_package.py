@@ -31,6 +31,8 @@ from iblf_jax.deployment.ros2.node.c_law import (
 from iblf_jax.deployment.ros2.package import ros_options
 from iblf_jax.simulation.scenario import canonical
 
+setuptools = pytest.importorskip("setuptools", reason="setuptools builds a package")
+
 NAME = ros_package.NAME
 
 
@@ -159,6 +161,20 @@ def test_the_package_is_a_complete_ament_python_package(package):
     for file in ("package.xml", f"launch/{NAME}.launch.py", f"config/{NAME}.yaml"):
         assert (installed / "share" / NAME / file).is_file()
     assert (installed / "lib" / NAME / "law_node").is_file()
+
+
+def test_plain_pip_builds_and_installs_the_package(package, tmp_path):
+    if tuple(map(int, setuptools.__version__.split(".")[:2])) < (70, 1):
+        pytest.skip("setuptools before 70.1 builds wheels only with the package wheel")
+    source = tmp_path / "source"
+    shutil.copytree(package.source, source)
+    command = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps"]
+    command += ["--no-build-isolation", "--target", str(tmp_path / "target"), str(source)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    law = load_law(tmp_path / "target" / NAME)
+    assert law.balance([0.4, 0.9])[0] != 0
+    assert (tmp_path / "target" / "bin" / "law_node").is_file()
 
 
 def test_the_modules_need_neither_this_package_nor_jax(package):

@@ -3,6 +3,8 @@ does without efforts."""
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -43,7 +45,7 @@ def robot(q=(0.8, 0.8), *, payload=None, **options) -> RobotSimulation:
         "sensor": ij.sensors.Ideal(),
         "delay": 0.0,
         "hold_time": 0.1,
-        "brake": True,
+        "brake": "start",
         "seed": 0,
     }
     return RobotSimulation(plant, np.array(q), np.zeros(2), **(settings | options))
@@ -64,6 +66,7 @@ def motion_of(simulation: RobotSimulation) -> RobotMotion:
         published=np.ones(samples, bool),
         latency=np.zeros(samples),
         lateness=np.zeros(samples),
+        effort_t=np.array(simulation.efforts.times) - simulation.efforts.delay,
         counts={"timeouts of the hold time": simulation.timeouts},
         diverged=simulation.diverged,
     )
@@ -121,6 +124,30 @@ def test_a_motion_survives_its_file(tmp_path):
     np.testing.assert_array_equal(loaded.rollout(PAPER).V, motion.rollout(PAPER).V)
 
 
+def test_the_timing_of_a_motion_is_that_of_its_messages():
+    motion = closed_with_law(robot(), PAPER, periods=5)
+    latency = np.array([0.5, 0.7, np.nan, 0.5, 0.9, np.nan]) * 1e-3
+    lateness = np.array([0.0, 0.1, 0.0, 0.0, 0.3, 0.0]) * 1e-3
+    # Five periods from the first to the last effort, one of them without an effort.
+    arrivals = np.array([0.5, 2.8, 6.5, 9.2, 10.6]) * 1e-3
+    timing = dataclasses.replace(
+        motion, latency=latency, lateness=lateness, effort_t=arrivals
+    ).timing()
+    assert timing["missed"] == pytest.approx(0.2)
+    assert timing["gap"] == pytest.approx(3.7e-3)
+    assert timing["latency, longest"] == pytest.approx(0.9e-3)
+    assert timing["lateness, longest"] == pytest.approx(0.3e-3)
+    assert timing["jitter, median"] == pytest.approx(0.65e-3)
+
+
+def test_without_a_recording_the_last_instant_is_kept():
+    recording, other = robot(), robot()
+    other.is_recording = False
+    complete, last = closed_with_law(recording, PAPER, 5), closed_with_law(other, PAPER, 5)
+    np.testing.assert_array_equal(last.q, complete.q[-1:])
+    assert len(other.rows) == len(other.samples) == 1
+
+
 def free_fall(duration: float, q=(0.8, 0.8)) -> np.ndarray:
     """Positions of the arm without torque, by MuJoCo alone."""
     model = mujoco.MjModel.from_xml_path(str(ARM))
@@ -133,7 +160,7 @@ def free_fall(duration: float, q=(0.8, 0.8)) -> np.ndarray:
 
 
 def test_without_efforts_the_brake_holds_and_without_brake_the_torque_is_zero():
-    held, free = robot(brake=True), robot(brake=False)
+    held, free = robot(brake="start"), robot(brake="never")
     for _ in range(10):
         held.measure()
         held.advance()
@@ -155,6 +182,23 @@ def test_an_effort_acts_for_the_hold_time_and_then_the_torque_is_zero():
     assert motion.t[acts][-1] == pytest.approx(0.0137, abs=1e-9)
     np.testing.assert_array_equal(motion.tau[motion.t > 0.0137 + 1e-9], 0.0)
     assert motion.counts["timeouts of the hold time"] == 1
+
+
+def test_a_brake_stops_the_robot_after_the_hold_time_until_the_next_effort():
+    simulation = robot(hold_time=0.01, brake="always")
+    simulation.measure()
+    simulation.receive(0.0, np.array([20.0, 5.0]))
+    simulation.receive(0.03, np.array([20.0, 5.0]))
+    for _ in range(20):
+        simulation.advance()
+    motion = motion_of(simulation)
+    stopped = (motion.t > 0.01 + 1e-9) & (motion.t < 0.03 - 1e-9)
+    assert stopped.sum() > 30
+    np.testing.assert_array_equal(np.ptp(motion.q[stopped], axis=0), 0.0)
+    np.testing.assert_array_equal(motion.dq[stopped], 0.0)
+    np.testing.assert_array_equal(motion.ddq[stopped], 0.0)
+    assert np.all(motion.q[stopped][0] != 0.8)
+    assert np.max(np.abs(motion.dq[motion.t > 0.031])) > 1e-3
 
 
 def test_an_effort_within_a_period_acts_from_its_arrival_on():

@@ -173,6 +173,7 @@ def test_a_robot_runs_once():
         ({"integrator": "rk4"}, "integrator"),
         ({"hold_time": 0.0}, "hold_time: got 0.0"),
         ({"payload": 1.0}, "payload: got 1.0"),
+        ({"brake": True}, "brake: got True, expected"),
     ],
 )
 def test_bad_arguments_name_the_field(options, words):

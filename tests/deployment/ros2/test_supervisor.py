@@ -395,6 +395,7 @@ def test_hold_is_gravity_with_stiffness_and_damping_about_the_position():
 
 def test_without_fresh_states_hold_is_gravity_alone():
     bench = Bench(on_fault="hold").running()
+    bench.period(dq=(1.0, 1.0, 1.0))
     bench.now += 3 * T
     command = bench.command()
     assert command.mode is Mode.FAULT
@@ -402,6 +403,16 @@ def test_without_fresh_states_hold_is_gravity_alone():
     fresh = bench.period(q=(0.3, 0.2, 0.3))
     gravity = bench.law.balance((0.3, 0.2, 0.3))
     assert fresh.torque == pytest.approx([gravity[0] - 4.0 * 0.2, *gravity[1:]])
+
+
+def test_stop_counts_for_one_fault_only():
+    bench = Bench(on_fault="hold").running()
+    bench.period(q=(math.nan,) * 3)
+    bench.supervisor.stop()
+    assert bench.period().torque == [0.0, 0.0, 0.0]
+    bench.start()
+    bench.period()
+    assert bench.period(q=(math.nan,) * 3).torque != [0.0, 0.0, 0.0]
 
 
 def test_hold_without_measured_velocities_damps_the_difference_quotient():

@@ -23,6 +23,7 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock, ClockType
+from rclpy.duration import Duration
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -51,6 +52,8 @@ WATCHDOG = 0.5
 """Default time without a state after which a law that samples with the states is in fault [s]."""
 PERIOD_TOLERANCE = 1e-9
 """Relative difference of the period from the exported one."""
+FINAL_TIMEOUT = Duration(seconds=0.5)
+"""Longest wait for the arrival of the last command."""
 QUEUE_DEPTH = 10
 """Messages that a topic stores."""
 DECIMAL_POINT = "Numbers have a decimal point in YAML: 50.0."
@@ -82,12 +85,15 @@ class LawNode(Node):  # type: ignore[misc]
         self.gains = {gain.path: gain for gain in law.description.gains}
         configuration = self._configuration()
         origin = self._declared("time_origin", math.nan, "stamp that is t = 0 [s], NaN for start")
+        if math.isinf(origin):
+            raise refused("time_origin", origin, "a stamp [s] or NaN", "NaN is that of the start.")
         self.supervisor = Supervisor(law, configuration, _origin(origin))
         self._declare_gains()
         self.monitor = LoopMonitor()
         self._answered: int | None = None
         """Arrival of the last state that a command has answered [ns]."""
         self._missed_before = 0
+        self._logged_mode = Mode.WAITING
         self._tick: int | None = None
         self._period = round(configuration.period * NANOSECONDS)
         self._efforts = Float64MultiArray(data=array("d", [0.0] * len(configuration.joints)))
@@ -194,12 +200,14 @@ class LawNode(Node):  # type: ignore[misc]
             self.law.set_gain(gain.path, numbers)
 
     def _refuse_parameters(self, parameters: Sequence[Parameter]) -> SetParametersResult:
-        """Refuses values of gains outside of their ranges."""
+        """Refuses values of gains outside of their ranges, and a time that is infinite."""
         for parameter in parameters:
+            reason = ""
             gain = self.gains.get(parameter.name)
-            if gain is None:
-                continue
-            reason = why_refused(gain, _numbers(parameter.value))
+            if gain is not None:
+                reason = why_refused(gain, _numbers(parameter.value))
+            if parameter.name == "time_origin" and math.isinf(parameter.value):
+                reason = f"time_origin: got {parameter.value}, expected a stamp [s] or NaN."
             if reason:
                 return SetParametersResult(successful=False, reason=reason)
         return SetParametersResult(successful=True)
@@ -267,12 +275,8 @@ class LawNode(Node):  # type: ignore[misc]
     def _sample(self) -> None:
         """One sample of the law a period."""
         missed = self._missed_periods()
-        clock = self._clock_of_stamps()
-        if self.supervisor.is_stale(monotonic_ns(), clock):
-            # This process may have been suspended: newer states may wait in the queue.
-            self._take_waiting_states()
-            clock = self._clock_of_stamps()
-        command = self.supervisor.command(monotonic_ns(), clock)
+        self._catch_up()
+        command = self.supervisor.command(monotonic_ns(), self._clock_of_stamps())
         if command is not None:
             self._publish(command, missed)
 
@@ -286,8 +290,14 @@ class LawNode(Node):  # type: ignore[misc]
             return 0
         return max(round((place - before) / self._period) - 1, 0)
 
-    def _take_waiting_states(self) -> None:
-        """Takes the states that wait in the queue of the subscription."""
+    def _catch_up(self) -> None:
+        """Takes the states that wait in the queue, if the last one is stale: this process may have
+        been suspended.  A law that samples with the states answers each of them instead.
+        """
+        if self.trigger == "state":
+            return
+        if not self.supervisor.is_stale(monotonic_ns(), self._clock_of_stamps()):
+            return
         for _ in range(QUEUE_DEPTH):
             with self._states.handle:
                 taken = self._states.handle.take_message(JointState, False)
@@ -313,14 +323,29 @@ class LawNode(Node):  # type: ignore[misc]
     def _send(self, command: Command) -> None:
         self._efforts.data[:] = array("d", command.torque)
         self._publisher.publish(self._efforts)
+        if command.mode is not self._logged_mode:
+            self._log_mode(command.mode)
+
+    def _log_mode(self, mode: Mode) -> None:
+        """Logs a changed mode; a fault with its reason."""
+        self._logged_mode = mode
+        fault = self.supervisor.last_fault
+        if mode is Mode.FAULT and fault is not None:
+            policy = self.supervisor.configuration.on_fault
+            self.get_logger().error(f"{_fault_text(fault)}; torques by the policy {policy!r}.")
+        else:
+            self.get_logger().info(f"The mode is {mode.value}.")
 
     def send_final_command(self) -> None:
         """Publishes the torques of the fault policy before the node ends."""
         command = self.supervisor.final_command()
         if command is not None:
             self._send(command)
+            # The process ends after this; without waiting, the message may be lost.
+            self._publisher.wait_for_all_acked(FINAL_TIMEOUT)
 
     def _start(self) -> tuple[bool, str]:
+        self._catch_up()
         started, message = self.supervisor.start(monotonic_ns(), self._clock_of_stamps())
         if started:
             self.get_logger().info(f"{message} time_origin is {self._origin_text()} s.")
@@ -330,6 +355,7 @@ class LawNode(Node):  # type: ignore[misc]
         return self.supervisor.stop()
 
     def _hold(self) -> tuple[bool, str]:
+        self._catch_up()
         return self.supervisor.hold(monotonic_ns(), self._clock_of_stamps())
 
     def _origin_text(self) -> str:
@@ -473,9 +499,11 @@ def main(args: Sequence[str] | None = None) -> int:
     # Objects of the start are not searched for garbage again.
     gc.collect()
     gc.freeze()
-    _spin(executor)
-    node.send_final_command()
-    rclpy.try_shutdown()
+    try:
+        _spin(executor)
+    finally:
+        node.send_final_command()
+        rclpy.try_shutdown()
     return 0
 
 
