@@ -33,7 +33,7 @@ ROBOT_OPTIONS = (
     "delay",
     "state_dropout",
     "effort_dropout",
-    "hold_time",
+    "effort_timeout",
     "brake",
     "seed",
 )
@@ -136,12 +136,15 @@ def _add_robot_arguments(parser: argparse.ArgumentParser, default: str | None = 
         help="mass on the last body [kg], and its centre in the frame of this body [m]",
     )
     parser.add_argument(
-        "--hold-time", type=float, metavar="S", help="of the last effort [s] (default: 0.1)"
+        "--effort-timeout",
+        type=float,
+        metavar="S",
+        help="longest time that an effort acts [s] (default: 0.1)",
     )
     parser.add_argument(
         "--brake",
         metavar="WHEN",
-        help="start (until the first torque), always (also after the hold time) or never (default:"
+        help="start (until the first torque), always (also after the time-out) or never (default:"
         " start)",
     )
     parser.add_argument("--seed", type=int, metavar="N", help="of noise and dropouts (default: 0)")

@@ -120,9 +120,7 @@ def read_bag_log(
         remedy = "Record both topics while the law runs: ros2 bag record joint_states efforts."
         raise checks.fail(str(path), came, "efforts among the joint states", remedy)
     stamp = recording.stamp[is_known]
-    origin = int(stamp[0])
-    if options.time_origin is not None:
-        origin = round(options.time_origin * NANOSECONDS)
+    origin = _origin(stamp, options.time_origin)
     found = {
         "t": (stamp - origin) / NANOSECONDS,
         "q": recording.q[is_known],
@@ -134,6 +132,16 @@ def read_bag_log(
     found = {name: x[rows] for name, x in found.items()}
     _check_finite(found, path)
     return found
+
+
+def _origin(stamp: np.ndarray, given: float | None) -> int:
+    """The stamp that is t = 0 [ns]: the first one, or the given one."""
+    if given is None:
+        return int(stamp[0])
+    origin = round(given * NANOSECONDS)
+    nearest = int(stamp[np.argmin(np.abs(stamp - origin))])
+    # As a float of seconds, a stamp of today is rounded to 240 ns.
+    return nearest if nearest / NANOSECONDS == given else origin
 
 
 def held_efforts(received: np.ndarray, efforts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

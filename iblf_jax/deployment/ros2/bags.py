@@ -126,7 +126,8 @@ def read_bag(
       metrics: the folds to run; None for `iblf_jax.metrics.standard()`.
       joint_states, efforts, joints, times, start, duration: as in `bag_log`.
       time_origin: stamp at which the law started [s], from which on its reference and bounds run;
-        that of the first joint state with an effort if not given.
+        that of the first joint state with an effort if not given.  An exported node publishes
+        zeros before its start, and reports the stamp in its diagnostics.
 
     Returns:
       A `Rollout` of the given scenario, whose `initial` and `actuator` are not used.  `dt` is the
@@ -157,6 +158,7 @@ def read_bag(
     _compare_torques(log, states)
     motion = RecordedMotion(rows, states, diverged=False)
     folds = as_folds(metrics, scenario.initial.q.dtype, scenario)
+    # Two adjacent rows of joint states have no torque that was constant between them.
     is_gap = rows.instant[:-1] & rows.instant[1:]
     dt = float(np.median(np.diff(log.t)))
     return rollout_of(scenario, folds, motion, dt, 1, "recorded", is_gap)
@@ -203,20 +205,21 @@ def _rows(log: Log, dq: np.ndarray) -> Rows:
     """
     count = len(log.t)
     has_row_before = np.append(False, np.diff(log.t) <= log.gap)
-    place = np.repeat(np.arange(count), 1 + has_row_before)
-    instant = np.append(place[1:] != place[:-1], True)
-    sample = place - ~instant
+    state = np.repeat(np.arange(count), 1 + has_row_before)
+    instant = np.append(state[1:] != state[:-1], True)
+    # The torque in the row before a joint state is that of the joint state before.
+    sample = np.where(instant, state, state - 1)
     return Rows(
-        t=log.t[place],
+        t=log.t[state],
         instant=instant,
-        q=log.q[place],
-        dq=dq[place],
+        q=log.q[state],
+        dq=dq[state],
         ddq=_derivative(log, dq)[sample],
         tau=log.tau[sample],
-        limited=np.zeros((len(place), log.q.shape[1]), bool),
+        limited=np.zeros((len(state), log.q.shape[1]), bool),
         actuator=(),
         sample=sample,
-        model_positions=log.q[place],
+        model_positions=log.q[state],
     )
 
 

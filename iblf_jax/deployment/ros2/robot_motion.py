@@ -78,13 +78,13 @@ class RobotMotion:
     effort_t: np.ndarray
     """Times at which efforts arrived, without those that were lost or refused, (M,) [s]."""
     counts: dict[str, int]
-    """Numbers of events: `dropped efforts`, `refused efforts`, `timeouts of the hold time`,
+    """Numbers of events: `dropped efforts`, `refused efforts`, `expired efforts`,
     `skipped states` of a robot that was late by more than a period."""
     diverged: bool
     """Whether the state was not finite or too fast; the motion ends there."""
 
     @property
-    def missed(self) -> float:
+    def missed_share(self) -> float:
         """Share of the periods in which no effort arrived [1]."""
         intervals = np.round(np.diff(self.effort_t) / self.period)
         if intervals.size == 0:
@@ -99,7 +99,7 @@ class RobotMotion:
         efforts from the period; `gap`: the longest such interval.
         """
         intervals = np.diff(self.effort_t)
-        found = {"missed": self.missed, "gap": float(np.max(intervals, initial=0.0))}
+        found = {"missed": self.missed_share, "gap": float(np.max(intervals, initial=0.0))}
         jitter = np.abs(intervals - self.period)
         series = {"latency": self.latency, "lateness": self.lateness, "jitter": jitter}
         for name, values in series.items():

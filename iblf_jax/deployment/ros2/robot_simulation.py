@@ -88,9 +88,9 @@ class RobotSimulation:
     """A robot in motion.
 
     The torque is zero before the first effort.  An effort acts from its arrival on until the next
-    one arrives, and at most for `hold_time`, after which the torque is zero.  While the brake is
-    engaged, the robot keeps its position; the next effort that acts releases it.  It is engaged at
-    the start unless it is "never", and after the hold time if it is "always".
+    one arrives, and at most for `effort_timeout`, after which the torque is zero.  While the brake
+    is engaged, the robot keeps its position; the next effort that acts releases it.  It is engaged
+    at the start unless it is "never", and after the effort time-out if it is "always".
     """
 
     def __init__(
@@ -103,7 +103,7 @@ class RobotSimulation:
         dt: float,
         sensor: Any,
         delay: float,
-        hold_time: float,
+        effort_timeout: float,
         brake: str,
         seed: int,
     ) -> None:
@@ -113,8 +113,8 @@ class RobotSimulation:
         self.dt = dt
         self.steps_per_period = round(period / dt)
         self.tolerance = WHOLE_TOLERANCE * dt
-        self.hold_time = hold_time
-        self.brakes_after_hold = brake == "always"
+        self.effort_timeout = effort_timeout
+        self.brakes_after_timeout = brake == "always"
         self.is_braked = brake != "never"
         robot.place(q, dq)
         self.readings = SensorReadings(sensor, q, dq, period, seed)
@@ -123,7 +123,7 @@ class RobotSimulation:
         self.zero_torque_from = math.inf
         """Time at which the last effort stops to act [s]."""
         self.timeouts = 0
-        """Number of efforts that acted for the hold time."""
+        """Number of efforts that acted until their time-out."""
         self.index = 0
         """Number of periods that have passed."""
         self.samples: list[Reading] = []
@@ -136,6 +136,11 @@ class RobotSimulation:
     def t(self) -> float:
         """Time since the start of the motion [s]."""
         return self.index * self.steps_per_period * self.dt
+
+    @property
+    def is_released(self) -> bool:
+        """Whether no brake holds the robot, or an effort that releases it is on its way."""
+        return not self.is_braked or bool(self.efforts.commands)
 
     def measure(self) -> Reading:
         """Reads the sensor; a second reading at the same time replaces the first."""
@@ -192,7 +197,7 @@ class RobotSimulation:
         return min(self.efforts.next_arrival(otherwise), self.zero_torque_from)
 
     def change_torque(self, t: float) -> None:
-        """Applies the newest effort that has arrived by t, or zero torque after the hold time."""
+        """Applies the newest effort that has arrived by t, or zero torque after its time-out."""
         until = t + self.tolerance
         if self.next_change(math.inf) > until:
             return
@@ -201,13 +206,13 @@ class RobotSimulation:
         effort = self.efforts.received(until)
         if effort is not None:
             self.torque = effort
-            self.zero_torque_from = t + self.hold_time
+            self.zero_torque_from = t + self.effort_timeout
             self.is_braked = False
         if self.zero_torque_from <= until:
             self.torque = np.zeros_like(self.torque)
             self.zero_torque_from = math.inf
             self.timeouts += 1
-            if self.brakes_after_hold:
+            if self.brakes_after_timeout:
                 self.is_braked = True
                 self.robot.place(self.robot.q, np.zeros_like(self.torque))
 

@@ -60,7 +60,7 @@ def robot_node(
     state_dropout: float = 0.0,
     effort_dropout: float = 0.0,
     payload: Payload | None = None,
-    hold_time: float = 0.1,
+    effort_timeout: float = 0.1,
     brake: str = "start",
     seed: int = 0,
     ros_args: Sequence[str] = (),
@@ -70,8 +70,8 @@ def robot_node(
     It publishes `joint_states` (sensor_msgs/JointState: stamp, names, positions, velocities and the
     torques that act) once a period, and applies `efforts` (std_msgs/Float64MultiArray, in the order
     of `joints`).  Its torque is zero before the first effort.  An effort acts until the next one,
-    and at most for `hold_time`; then the torque is zero.  Efforts of a wrong length, or that are
-    not finite, are refused with a message in the log.
+    and at most for `effort_timeout`; then the torque is zero.  Efforts of a wrong length, or that
+    are not finite, are refused with a message in the log.
 
     In lock-step the stamps are simulation time, and every state waits for the effort that answers
     it, so that the result does not depend on the speed of the computer.  In real time the stamps
@@ -91,10 +91,10 @@ def robot_node(
       state_dropout: probability that a state is not published [1]; the first one always is.
       effort_dropout: probability that an effort is lost [1]; the first one never is.
       payload: a body that is fixed to the body which the last joint moves, in its frame.
-      hold_time: longest time that an effort acts [s].
+      effort_timeout: longest time that an effort acts [s].
       brake: "start": the robot keeps its initial state until the first effort that is not zero,
         and time of the motion counts from the state which that effort answers; "always": a brake
-        also stops it at the end of the hold time, until the next such effort; "never": no brake.
+        also stops it at the time-out of an effort, until the next such effort; "never": no brake.
       seed: fixes the dropouts, and the noise of the sensor as in `cosimulate`.
       ros_args: arguments of ROS, such as ["--ros-args", "-r", "joint_states:=/arm/joint_states"].
 
@@ -132,7 +132,7 @@ def robot_node(
         dt=period / steps,
         sensor=Ideal() if sensor is None else sensor,
         delay=checks.time_span("delay", delay, zero=True),
-        hold_time=checks.time_span("hold_time", hold_time),
+        effort_timeout=checks.time_span("effort_timeout", effort_timeout),
         brake=brake,
         seed=checks.seed(seed),
     )
@@ -208,7 +208,7 @@ class SimulatedRobot:
         self.real_time = real_time
         self.arrivals: list[Arrival] = []
         self.counts = dict.fromkeys(
-            ("dropped efforts", "refused efforts", "timeouts of the hold time", "skipped states"),
+            ("dropped efforts", "refused efforts", "expired efforts", "skipped states"),
             0,
         )
         self.origin = 0
@@ -301,7 +301,7 @@ class SimulatedRobot:
 
     def _motion(self, ended: float) -> RobotMotion:
         simulation = self.simulation
-        self.counts["timeouts of the hold time"] = simulation.timeouts
+        self.counts["expired efforts"] = simulation.timeouts
         return recorded(
             simulation.robot,
             simulation.rows,
@@ -354,7 +354,7 @@ class SimulatedRobot:
         while not self._stops:
             self._replace_first_state()
             self._exchange(simulation.measure(), patience)
-            if not simulation.is_braked or simulation.efforts.commands:
+            if simulation.is_released:
                 return
             self.origin += round(simulation.period * NANOSECONDS)
             if time.perf_counter() > end:
@@ -415,7 +415,7 @@ class SimulatedRobot:
             while time.perf_counter() < due and not simulation.efforts.commands:
                 self._spin(due)
                 self._take_arrivals_of_clock(start)
-            if self._stops or not simulation.is_braked or simulation.efforts.commands:
+            if self._stops or simulation.is_released:
                 return start
             if time.perf_counter() > end:
                 raise TimeoutError(self._no_release(patience))

@@ -195,6 +195,9 @@ def test_times_and_a_part_are_selected(scenario, motion, tmp_path):
     seconds = ORIGIN * 1e-9 - 5.0
     later = read_log(folder, scenario, time_origin=seconds)
     np.testing.assert_allclose(later["t"], t + 5.0, atol=1e-6)
+    # The float of the first stamp is another instant, after which the first row would be lost.
+    same = read_log(folder, scenario, time_origin=ORIGIN / 10**9)
+    np.testing.assert_array_equal(same["t"], read_log(folder, scenario)["t"])
     # stamps that do not advance: the driver did not set them
     broken = [
         (topic, received, state_message(0, NAMES, q[k // 2]) if k % 2 == 0 else message)

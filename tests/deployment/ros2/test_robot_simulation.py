@@ -44,7 +44,7 @@ def robot(q=(0.8, 0.8), *, payload=None, **options) -> RobotSimulation:
         "dt": DT,
         "sensor": ij.sensors.Ideal(),
         "delay": 0.0,
-        "hold_time": 0.1,
+        "effort_timeout": 0.1,
         "brake": "start",
         "seed": 0,
     }
@@ -67,7 +67,7 @@ def motion_of(simulation: RobotSimulation) -> RobotMotion:
         latency=np.zeros(samples),
         lateness=np.zeros(samples),
         effort_t=np.array(simulation.efforts.times) - simulation.efforts.delay,
-        counts={"timeouts of the hold time": simulation.timeouts},
+        counts={"expired efforts": simulation.timeouts},
         diverged=simulation.diverged,
     )
 
@@ -171,8 +171,8 @@ def test_without_efforts_the_brake_holds_and_without_brake_the_torque_is_zero():
     np.testing.assert_array_equal(motion_of(held).ddq, 0.0)
 
 
-def test_an_effort_acts_for_the_hold_time_and_then_the_torque_is_zero():
-    simulation = robot(hold_time=0.0137)
+def test_an_effort_acts_for_the_effort_timeout_and_then_the_torque_is_zero():
+    simulation = robot(effort_timeout=0.0137)
     simulation.measure()
     simulation.receive(0.0, np.array([20.0, 5.0]))
     for _ in range(10):
@@ -181,11 +181,11 @@ def test_an_effort_acts_for_the_hold_time_and_then_the_torque_is_zero():
     acts = motion.tau[:, 0] != 0
     assert motion.t[acts][-1] == pytest.approx(0.0137, abs=1e-9)
     np.testing.assert_array_equal(motion.tau[motion.t > 0.0137 + 1e-9], 0.0)
-    assert motion.counts["timeouts of the hold time"] == 1
+    assert motion.counts["expired efforts"] == 1
 
 
-def test_a_brake_stops_the_robot_after_the_hold_time_until_the_next_effort():
-    simulation = robot(hold_time=0.01, brake="always")
+def test_a_brake_stops_the_robot_after_the_effort_timeout_until_the_next_effort():
+    simulation = robot(effort_timeout=0.01, brake="always")
     simulation.measure()
     simulation.receive(0.0, np.array([20.0, 5.0]))
     simulation.receive(0.03, np.array([20.0, 5.0]))

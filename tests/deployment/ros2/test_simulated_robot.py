@@ -66,7 +66,7 @@ def test_in_lock_step_the_motion_is_that_of_mujoco_with_the_law():
         motion = node.run(0.5)
     np.testing.assert_allclose(motion.q[motion.instant], expected(250), atol=1e-9)
     assert motion.origin == 0.0
-    assert motion.missed == 0.0
+    assert motion.missed_share == 0.0
     assert len(motion.state_t) == 251
 
 
@@ -171,7 +171,7 @@ def test_a_robot_runs_once():
         ({"initial": [0.1, 0.2]}, "initial: got .* expected an ij.Initial"),
         ({"initial": ij.Initial(q=[0.1, 0.2, 0.3])}, r"initial.q: got .*\(3,\)"),
         ({"integrator": "rk4"}, "integrator"),
-        ({"hold_time": 0.0}, "hold_time: got 0.0"),
+        ({"effort_timeout": 0.0}, "effort_timeout: got 0.0"),
         ({"payload": 1.0}, "payload: got 1.0"),
         ({"brake": True}, "brake: got True, expected"),
     ],
