@@ -50,6 +50,12 @@ PLOTS = {
         "cycles",
         "One call of a law in C, as `ij.export` writes it; less is better.",
     ),
+    "ros2": Plot(
+        ("case", "period [ms]", "priority"),
+        "distance [rad]",
+        "A law and a robot as two processes under ROS 2: the largest distance from the same run by"
+        " `cosimulate`; the how-to page explains the rows. Less is better.",
+    ),
     "constraints": Plot(
         ("law",),
         "us a step",

@@ -53,7 +53,7 @@ PAGES: dict[str, tuple[str, str]] = {
         "Export, files and reports",
         (
             "export Exported explore cosimulate report load_scenario save_scenario load_rollouts"
-            " save_rollouts"
+            " save_rollouts deployment.bag_log deployment.read_bag"
         ),
     ),
     "testing": (

@@ -104,6 +104,7 @@ _keep_public_import_paths()
 
 if TYPE_CHECKING:
     from iblf_jax import certificates as certificates
+    from iblf_jax import deployment as deployment
     from iblf_jax import plotting as plotting
     from iblf_jax import proofs as proofs
     from iblf_jax import studies as studies
@@ -163,6 +164,7 @@ _ON_FIRST_USE = {
     "cosimulate": ("iblf_jax.deployment.cosimulate", "cosimulate"),
     "Counterexample": ("iblf_jax.certificates", "Counterexample"),
     "cvar": ("iblf_jax.tuning", "cvar"),
+    "deployment": ("iblf_jax.deployment", None),
     "distributed": ("iblf_jax.studies.distributed", None),
     "explore": ("iblf_jax.deployment.live", "explore"),
     "export": ("iblf_jax.deployment.export", "export"),

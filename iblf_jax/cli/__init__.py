@@ -38,6 +38,7 @@ COMMANDS = (
     "prove",
     "identify",
     "export",
+    "ros",
     "presets",
     "parameters",
 )

@@ -23,7 +23,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--log",
         action="append",
         metavar="FILE",
-        help="use this log, .csv or .nc, instead of the file's; may be repeated",
+        help=(
+            "use this log, .csv, .nc or the folder of a rosbag2 recording, instead of the file's;"
+            " may be repeated"
+        ),
     )
     parser.add_argument(
         "--out",

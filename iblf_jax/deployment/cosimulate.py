@@ -26,6 +26,7 @@ from iblf_jax.core.progress import announced
 from iblf_jax.core.status import VELOCITY_LIMIT, Status
 from iblf_jax.core.time import as_at
 from iblf_jax.deployment.mujoco_plant import INTEGRATORS, MujocoPlant, Stages
+from iblf_jax.deployment.transit import CommandsInTransit
 from iblf_jax.engine import folded, sample_status
 from iblf_jax.engine.simulate import report
 from iblf_jax.simulation.closed_loop import (
@@ -122,7 +123,7 @@ def cosimulate(
     checks.mapping("locked", locked, '{"gripper_joint": 0.02}')
     robot = MujocoPlant(plant, names, scenario.n, locked, integrator)
     if dt is None:
-        dt = _own_step(scenario, robot)
+        dt = own_step(float(scenario.sampling.period), robot)  # type: ignore[union-attr]
     dt = checks.time_span("dt", dt)
     check_step(scenario, dt)
     steps = checks.whole_steps(duration, dt, dt_is_free=False)
@@ -136,7 +137,7 @@ def cosimulate(
     folds = as_folds(metrics, scenario.initial.q.dtype, scenario)
     motion = _Run(scenario, robot, dt, seed).motion(steps)
     rows = motion.rows
-    result = _rollout(scenario, folds, motion, dt, record_every, f"MuJoCo {integrator or 'own'}")
+    result = rollout_of(scenario, folds, motion, dt, record_every, f"MuJoCo {integrator or 'own'}")
     report(result, steps, throw)
     if film is not None:
         film_run(result, robot, rows.model_positions[rows.instant], dt, Path(film))
@@ -167,9 +168,8 @@ def _check_no_process_noise(scenario: Scenario) -> None:
     raise checks.fail("scenario.process_noise", type(noise).__name__, expected, remedy)
 
 
-def _own_step(scenario: Scenario, robot: MujocoPlant) -> float:
+def own_step(period: float, robot: MujocoPlant) -> float:
     """The model's own step, or the next shorter one that divides the period of the law [s]."""
-    period = float(scenario.sampling.period)  # type: ignore[union-attr]
     return period / max(1, math.ceil(period / robot.timestep - WHOLE_TOLERANCE))
 
 
@@ -203,7 +203,7 @@ def with_period(scenario: Scenario, period: float | None) -> Scenario:
     return dataclasses.replace(scenario, sampling=sampling)
 
 
-class _Rows(NamedTuple):
+class Rows(NamedTuple):
     """One row of the recorded motion, or R rows stacked.
 
     Each time step has a row at its start.  Where torque or law signals jump, there is one row
@@ -226,10 +226,10 @@ class _Rows(NamedTuple):
     """Positions of all joints of MuJoCo's model."""
 
 
-class _Motion(NamedTuple):
+class RecordedMotion(NamedTuple):
     """The recorded motion of a run."""
 
-    rows: _Rows
+    rows: Rows
     states: LoopState
     """The state after each sample of the law."""
     diverged: bool
@@ -260,16 +260,13 @@ class _Run:
         self.robot = robot
         self.dt = dt
         self.period = float(sampling.period)
-        self.delay = float(sampling.delay)
         self.steps_per_period = round(self.period / dt)
         self.noise = jnp.zeros(4, jnp.float32)
         if has_noise(scenario):
             self.noise = noise_key(jax.random.PRNGKey(seed))
         self.state = initial_state(scenario)
         self.command = np.asarray(scenario.model.gravity(scenario.initial.q))
-        self.commands: list[np.ndarray] = []
-        self.arrived = 0
-        """Number of commands that have arrived."""
+        self.commands = CommandsInTransit(float(sampling.delay))
         self.jump_times = np.sort(np.asarray(scenario.jump_times(), float))
         eps = np.finfo(scenario.initial.q.dtype).eps
         self.jump_widths = JUMP_SEPARATION * eps * np.abs(self.jump_times)
@@ -280,9 +277,9 @@ class _Run:
         """Whether the robot receives the command unchanged."""
         self.stages = Stages(self.torque_and_rate, jax.tree.map(np.asarray, self.state.actuator))
         self.states: list[LoopState] = []
-        self.rows: list[_Rows] = []
+        self.rows: list[Rows] = []
 
-    def motion(self, steps: int) -> _Motion:
+    def motion(self, steps: int) -> RecordedMotion:
         """Runs this number of steps and returns the recorded motion."""
         diverged = False
         self.robot.place(np.asarray(self.state.q), np.asarray(self.state.dq))
@@ -296,7 +293,7 @@ class _Run:
                 self.begin_step(index, t)
                 if index < steps:
                     self.integrate(t, t + self.dt)
-        return _Motion(_stacked(self.rows), _stacked(self.states), diverged)
+        return RecordedMotion(stacked(self.rows), stacked(self.states), diverged)
 
     def has_diverged(self) -> bool:
         """Whether the state is not finite or too fast."""
@@ -321,7 +318,7 @@ class _Run:
         """
         tolerance = WHOLE_TOLERANCE * self.dt
         while t < end - tolerance:
-            h = min(self.next_arrival(end), self.next_jump(end), end) - t
+            h = min(self.commands.next_arrival(end), self.next_jump(end), end) - t
             self.stages.begin(t)
             self.robot.step(t, h)
             self.stages.finish(h)
@@ -336,7 +333,8 @@ class _Run:
         state = self.state._replace(q=jnp.asarray(self.robot.q), dq=jnp.asarray(self.robot.dq))
         self.state = _law(self.scenario, t, state, len(self.commands), self.noise)
         self.states.append(self.state)
-        self.commands.append(np.asarray(self.state.sampled.commands[0]))
+        command = np.asarray(self.state.sampled.commands[0])
+        self.commands.send(len(self.commands) * self.period, command)
 
     def torque_and_rate(self, t, q, dq, actuator) -> tuple[np.ndarray, Any]:
         """The torque on the joints, and the rate of the actuator's state."""
@@ -360,16 +358,10 @@ class _Run:
         model_positions = self.robot.data.qpos.copy()
         sample = len(self.commands) - 1
         self.rows.append(
-            _Rows(t, instant, q, dq, ddq, tau, limited, actuator, sample, model_positions)
+            Rows(t, instant, q, dq, ddq, tau, limited, actuator, sample, model_positions)
         )
 
     # Commands in transit, and jumps of the scenario
-
-    def next_arrival(self, otherwise: float) -> float:
-        """Time at which the next command arrives [s]; `otherwise` if none is in transit."""
-        if self.arrived < len(self.commands):
-            return self.arrived * self.period + self.delay
-        return otherwise
 
     def next_jump(self, otherwise: float) -> float:
         """Time of the next jump of the scenario [s]; `otherwise` if there is none."""
@@ -379,7 +371,7 @@ class _Run:
 
     def command_arrives(self, until: float) -> bool:
         """Whether the next command arrives by then."""
-        return self.next_arrival(math.inf) <= until
+        return self.commands.next_arrival(math.inf) <= until
 
     def jumps(self, until: float) -> bool:
         """Whether the scenario jumps by then."""
@@ -387,9 +379,9 @@ class _Run:
 
     def apply_changes(self, until: float) -> None:
         """Applies the commands that arrive, and the jumps that occur, by then."""
-        while self.command_arrives(until):
-            self.command = self.commands[self.arrived]
-            self.arrived += 1
+        command = self.commands.received(until)
+        if command is not None:
+            self.command = command
         while self.jumps(until):
             self.jumped += 1
 
@@ -403,17 +395,17 @@ class _Run:
         return t
 
 
-def _stacked(trees: Sequence[Any]) -> Any:
+def stacked(trees: Sequence[Any]) -> Any:
     """One pytree whose arrays stack those of the given pytrees along a new first axis."""
     return jax.tree.map(lambda *x: np.stack(x), *trees)
 
 
 @jax.jit
-def _observed(scenario: Scenario, folds, dt, motion: _Motion):
+def _observed(scenario: Scenario, folds, dt, motion: RecordedMotion, is_gap):
     """Samples, metrics and flags of a motion."""
     rows = motion.rows
     t = rows.t.astype(dt.dtype)
-    half, zero = 0.5 * jnp.diff(t), jnp.zeros((1,), dt.dtype)
+    half, zero = jnp.where(is_gap, 0.0, 0.5 * jnp.diff(t)), jnp.zeros((1,), dt.dtype)
     weight = jnp.concatenate([zero, half]) + jnp.concatenate([half, zero])
     step = jnp.where(rows.instant & (t > 0), dt, 0.0)
     signals = jax.tree.map(lambda x: x[rows.sample], motion.states.sampled.signals)
@@ -426,12 +418,31 @@ def _observed(scenario: Scenario, folds, dt, motion: _Motion):
     return samples, folded(folds, samples), raised
 
 
-def _rollout(
-    scenario: Scenario, folds: Any, motion: _Motion, dt: float, record_every: int, method: str
+def rollout_of(
+    scenario: Scenario,
+    folds: Any,
+    motion: RecordedMotion,
+    dt: float,
+    record_every: int,
+    method: str,
+    is_gap: np.ndarray | None = None,
 ) -> Rollout:
-    """The result of a motion."""
+    """The result of a motion.
+
+    Args:
+      scenario: sampled and canonical.
+      folds: the metrics.
+      motion: R rows.
+      dt: time step [s].
+      record_every: record every so-many-th step.
+      method: name of the integrator.
+      is_gap: whether the time between two rows is not part of integrals over time, (R - 1,) bool;
+        none of it if not given.
+    """
     step_size = jnp.asarray(dt, scenario.initial.q.dtype)
-    samples, results, raised = _observed(scenario, folds, step_size, motion)
+    if is_gap is None:
+        is_gap = np.zeros(len(motion.rows.t) - 1, bool)
+    samples, results, raised = _observed(scenario, folds, step_size, motion, is_gap)
     status = np.bitwise_or.reduce(np.asarray(raised))
     if motion.diverged:
         status |= int(Status.NOT_FINITE)

@@ -20,6 +20,7 @@ import numpy as np
 from iblf_jax.core import checks, notices
 from iblf_jax.world.robots.description import Shown, read
 from iblf_jax.world.robots.load import locked_position
+from iblf_jax.world.robots.payload import Payload
 from iblf_jax.world.robots.tree import HINGE, SLIDE, Tree, mujoco_package, unknown
 
 INTEGRATORS = ("RK4", "Euler", "implicit", "implicitfast")
@@ -38,6 +39,7 @@ class MujocoPlant:
         n: int,
         locked: Mapping[str, float],
         integrator: str | None,
+        payload: Payload | None = None,
     ) -> None:
         """The arguments of `cosimulate`.
 
@@ -48,12 +50,17 @@ class MujocoPlant:
           n: number of driven joints.
           locked: joint -> position [rad or m].
           integrator: MuJoCo's; None for the model's own.
+          payload: a body fixed to the body that the last driven joint moves, in whose frame centre
+            and inertia are; none if not given.
 
         Raises:
-          ValueError: missing joints, or a model that MuJoCo does not accept.
+          ValueError: missing joints, a model that MuJoCo does not accept, or a payload for an
+            `MjModel` or with a start.
           ImportError: the extra `robots` is not installed.
         """
         self.mujoco = mujoco = mujoco_package()
+        if payload is not None:
+            plant = with_payload(plant, names, payload)
         if isinstance(plant, mujoco.MjModel):
             model = copy.copy(plant)
             joints, locked_positions = _joints(Tree(model, mujoco, "world", {}), names, n, locked)
@@ -65,6 +72,7 @@ class MujocoPlant:
             spec = _specification(mujoco, plant)
             model, joints = _with_locked_joints(mujoco, spec, plant, names, n, locked)
         self.model = model
+        self.joint_names = tuple(Tree(model, mujoco, "world", {}).joint_names[j] for j in joints)
         self.positions, self.speeds = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
         arm = {int(model.body_rootid[model.jnt_bodyid[j]]) for j in joints}
         for a in range(model.nu):  # the law replaces the model's own actuators
@@ -94,6 +102,20 @@ class MujocoPlant:
     def place(self, q: np.ndarray, dq: np.ndarray) -> None:
         """Sets the state of the driven joints."""
         self.data.qpos[self.positions], self.data.qvel[self.speeds] = q, dq
+
+    @property
+    def state(self) -> np.ndarray:
+        """Positions and velocities of all joints of the model, as `restore` takes them."""
+        return np.concatenate([self.data.qpos, self.data.qvel])
+
+    def restore(self, state: np.ndarray) -> None:
+        """Sets positions and velocities of all joints of the model."""
+        self.data.qpos[:] = state[: self.model.nq]
+        self.data.qvel[:] = state[self.model.nq :]
+
+    def apply(self, torque: np.ndarray) -> None:
+        """Sets a torque of the driven joints, (n,) [N m], that stays until the next one."""
+        self.data.qfrc_applied[self.speeds] = torque
 
     @contextmanager
     def driven(self, torque: TorqueCallback) -> Iterator[None]:
@@ -233,6 +255,50 @@ def _without_missing_meshes(spec: Any, path: Path) -> None:
     for mesh in list(spec.meshes):
         if mesh.name in missing:
             spec.delete(mesh)
+
+
+LEAST_INERTIA = 1e-12
+"""Moment of inertia of a payload that has none [kg m^2]; MuJoCo accepts no smaller one."""
+
+
+def with_payload(plant: Any, names: tuple[str, ...], payload: Payload) -> Any:
+    """MuJoCo's specification of a robot with a payload, a body that is fixed to the one which the
+    last driven joint moves.
+
+    Args:
+      plant, names, payload: as in `MujocoPlant`.
+
+    Raises:
+      ValueError: as `MujocoPlant`.
+    """
+    mujoco = mujoco_package()
+    if isinstance(plant, mujoco.MjModel):
+        remedy = "Give the file or an MjSpec, to which a body can be added."
+        raise checks.fail("payload", payload, "None for a compiled model", remedy)
+    if not isinstance(payload, Payload):
+        remedy = "Such as ij.robots.Payload(mass=0.3, centre=[0.3, 0.0, 0.0])."
+        raise checks.fail("payload", payload, "an iblf_jax.robots.Payload, or None", remedy)
+    if payload.start is not None:
+        remedy = "Take a payload without a start."
+        raise checks.fail("payload.start", payload.start, "None, as MuJoCo's mass is fixed", remedy)
+    spec = _specification(mujoco, plant)
+    mass = checks.positive_number("payload.mass", payload.mass, "kg", zero=True)
+    if mass == 0:
+        return spec
+    tree = Tree(_compiled(spec, plant), mujoco, "world", {})
+    last = names[-1:] or tree.joint_names[-1:]
+    for name in last:
+        if name not in tree.joint_names:
+            raise unknown("plant", name, "a model that has the scenario's joints", tree.joint_names)
+    joint = tree.joint_names.index(last[0])
+    body = spec.bodies[int(tree.model.jnt_bodyid[joint])].add_body(name="payload of the robot")
+    body.mass, body.explicitinertial = mass, True
+    body.ipos = np.asarray(payload.centre, float)
+    inertia = np.asarray(payload.inertia, float)
+    if not np.any(inertia):
+        inertia = np.array([LEAST_INERTIA] * 3 + [0.0] * 3)
+    body.fullinertia = inertia
+    return spec
 
 
 def _joints(

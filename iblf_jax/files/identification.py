@@ -4,7 +4,7 @@ An identification file is a scenario file (`files.scenario`) with up to three mo
 
     preset = "zhang_yan_2024"        # or the complete scenario: the start of the search
     [identify]                       # arguments of `identify`: held_out, window, torque, delay, ...
-    log = "log.csv"                  # relative to this file; or a list of files
+    log = "log.csv"                  # relative to this file; a recording; or a list
     parameters = ["robot.mass", "disturbance.viscous"]
     [limits]                         # path -> [low, high]
     "robot.mass" = [0.1, 5.0]
@@ -25,6 +25,7 @@ from iblf_jax.core import checks
 from iblf_jax.files.scenario import from_dict, numbers_by_path, read_toml
 from iblf_jax.files.values import Words, as_table, known_keys
 from iblf_jax.identification import Identification, identify
+from iblf_jax.identification.log import LOG_FILE
 
 TABLES = ("identify", "limits", "priors")
 ARGUMENTS = ("window", "torque", "delay", "loss", "widths", "iterations")
@@ -80,7 +81,7 @@ def _logs(given: Any, key: str, folder: Path) -> list[Path]:
     found = []
     for name in names:
         text = None if isinstance(name, Words) else name
-        found.append(folder / checks.string(key, text, "the path of a .csv or .nc file"))
+        found.append(folder / checks.string(key, text, f"the path of {LOG_FILE}"))
     return found
 
 

@@ -6,6 +6,7 @@
 `_identify`             the public function: options, problem, search, result
 `problem`               what is identified, from which data
 `log`                   logs, read and checked
+`bag`                   logs from rosbag2 recordings
 `coordinates`           parameters, and coordinates in which all points are rigid bodies
 `smoothing`             velocities and accelerations from positions
 `regression`            the initial estimate

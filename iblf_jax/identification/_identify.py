@@ -14,6 +14,7 @@ from iblf_jax.core import checks, notices
 from iblf_jax.core.progress import announced
 from iblf_jax.core.pytree import astype
 from iblf_jax.identification.assessment import assessed
+from iblf_jax.identification.bag import joints_of
 from iblf_jax.identification.coordinates import (
     DELAY_PATH,
     DELAY_SCALE,
@@ -75,7 +76,8 @@ def identify(
       scenario: on a robot of n joints; the search starts from its plant's parameters.
       log: t (N,) [s], q (N, n) [rad], tau (N, n) [N m], dq (N, n) [rad/s] if there is one: an
         xarray Dataset, a mapping, a `Rollout`, a CSV file with the heading t, q[0], ..., tau[0],
-        ..., a netCDF file, or a list of these.  Times may be irregular and have gaps.
+        ..., a netCDF file, the folder of a rosbag2 recording with the topics `joint_states` and
+        `efforts` (extra `ros`), or a list of these.  Times may be irregular and have gaps.
       paths: of leaves of robot (plant and model), plant, model, disturbance, or "sampling.delay".
       held_out: the share of each log, at its end, that is held back for validation; or logs for it.
       window: length of the windows [s]; long ones contain more information and more model error.
@@ -169,7 +171,7 @@ def _problem(
     hold = options.torque == "held"
     all_paths = with_widths(start, paths) if options.widths else paths
     simulated, c = coordinates(start, all_paths, options.limits)
-    logs, held_back = _logs(log, held_out, start.n)
+    logs, held_back = _logs(log, held_out, start)
     fitted_windows = windows(logs, options.window, held_back, hold)
     _check_size(fitted_windows, len(c.x), logs, options.window)
     fronts = [_front(one, 1.0 - share) for one, share in zip(logs, held_back, strict=True)]
@@ -284,14 +286,15 @@ class _Search(NamedTuple):
         return chosen._replace(steps=free_fit.steps + law_fit.steps), ratio
 
 
-def _logs(log: Any, held_out: Any, n: int) -> tuple[list[Log], list[float]]:
+def _logs(log: Any, held_out: Any, start: Scenario) -> tuple[list[Log], list[float]]:
     """The logs, and the share of each that is held back."""
-    logs = read(log, n)
+    joints = joints_of(start)
+    logs = read(log, start.n, joints=joints)
     if isinstance(held_out, int | float) and not isinstance(held_out, bool):
         if not 0.0 <= held_out <= 0.9:
             raise checks.fail("held_out", held_out, "a share from 0 to 0.9, or a log")
         return logs, [float(held_out)] * len(logs)
-    others = read(held_out, n, "held_out")
+    others = read(held_out, start.n, "held_out", joints)
     return logs + others, [0.0] * len(logs) + [1.0] * len(others)
 
 

@@ -3,9 +3,10 @@
     t [s], q (N, n) [rad], tau (N, n) [N m], and, where it was logged, q' (N, n) [rad/s]
 
 A log is a Dataset or a mapping with these names (what `Rollout.to_xarray` gives), a Rollout, a CSV
-file whose heading is t, q[0], ..., dq[0], ..., tau[0], ..., or a netCDF file.  Time stamps may be
-irregular; a long time without samples is a gap, which divides the log into two segments.  Logged
-velocities are mostly filtered differences of the positions and serve as a check only.
+file whose heading is t, q[0], ..., dq[0], ..., tau[0], ..., a netCDF file, or a rosbag2 recording
+(`identification.bag`).  Time stamps may be irregular; a long time without samples is a gap, which
+divides the log into two segments.  Logged velocities are mostly filtered differences of the
+positions and serve as a check only.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import csv
 import os
 import re
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,11 +23,17 @@ import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.core.optional import has_members
+from iblf_jax.identification.bag import (
+    GAP_QUANTILE,
+    GAP_RATIO,
+    BagOptions,
+    is_bag,
+    read_bag_log,
+)
 from iblf_jax.simulation.results import Rollout
 
-GAP_RATIO, GAP_QUANTILE = 3.0, 0.95
-"""A time between samples of more than GAP_RATIO times the quantile GAP_QUANTILE of these times is a
-gap."""
+LOG_FILE = "a .csv or .nc file or of a rosbag2 recording"
+"""What a log on the disk is, in messages about paths."""
 MIN_SAMPLES = 50
 """Samples that a log must have."""
 UNITS = {
@@ -67,13 +74,14 @@ class Log(NamedTuple):
         ]
 
 
-def read(log: Any, n: int, what: str = "log") -> list[Log]:
+def read(log: Any, n: int, what: str = "log", joints: Sequence[str] = ()) -> list[Log]:
     """The logs that a user gave, checked.
 
     Args:
       log: one, or a list of them.
       n: number of joints.
       what: the user's word for it.
+      joints: names of the joints, by which the joint states of a recording are ordered.
 
     Raises:
       ValueError: something that is no log, or one with missing columns, rows without numbers, times
@@ -83,16 +91,20 @@ def read(log: Any, n: int, what: str = "log") -> list[Log]:
     if isinstance(log, list | tuple):
         if not log:
             raise checks.fail(what, log, "at least one log")
-        return [one for i, x in enumerate(log) for one in read(x, n, f"{what}[{i}]")]
+        return [one for i, x in enumerate(log) for one in read(x, n, f"{what}[{i}]", joints)]
     if isinstance(log, str | os.PathLike):
-        path = checks.file_to_read(what, log, "a log, .csv or .nc")
+        path = checks.file_path(what, log, LOG_FILE)
+        if is_bag(path) and path.exists():
+            found = read_bag_log(path, n, joints, BagOptions())
+            return [_checked(found, n, str(path))]
+        path = checks.file_to_read(what, log, LOG_FILE)
         return [_checked(_of_file(path), n, str(path))]
     if isinstance(log, Rollout):
         return [_checked(_of_rollout(log, what), n, what)]
     if isinstance(log, Mapping) or has_members(log, "data_vars"):
         return [_checked(_of_mapping(log, what), n, what)]
     raise checks.fail(
-        what, log, "a Dataset, a Rollout, the path of a .csv or .nc file, or a list of these"
+        what, log, f"a Dataset, a Rollout, the path of {LOG_FILE}, or a list of these"
     )
 
 
@@ -109,7 +121,7 @@ def _of_file(path: Path) -> dict[str, np.ndarray]:
         return _of_mapping(data, str(path))
     if ending == ".csv":
         return _of_columns(*_columns(path), str(path))
-    raise checks.fail("log", str(path), "a file that ends in .csv or .nc")
+    raise checks.fail("log", str(path), f"the path of {LOG_FILE}")
 
 
 def _columns(path: Path) -> tuple[list[str], np.ndarray]:

@@ -531,6 +531,7 @@ def law_update(
     controller: Any,
     observer: Any,
     sent: Any = (),
+    applied: jax.Array | None = None,
 ) -> LawUpdate:
     """Command and next states of law and observer for one measurement: the program that runs on
     the robot's computer.
@@ -541,6 +542,8 @@ def law_update(
       measured: measurement at t.
       controller, observer: their states at t.
       sent: the `SentCommand` before t of a loop with an event trigger.
+      applied: torque of the period that the observer receives, (n,) [N m]; that of the command if
+        not given.
     """
     sampling: Any = scenario.sampling
     running = discrete_observer(scenario)
@@ -555,7 +558,10 @@ def law_update(
     if sampling.trigger is not None:
         sent = sampling.trigger.sent(plant_input(command), command.tau, sent)
         command = _with_sent_input(command, sent)
-    arguments = observer_arguments(scenario, running, t, q, dq, higher, command.tau, observer)
+    torque = command.tau
+    if applied is not None:
+        torque = applied
+    arguments = observer_arguments(scenario, running, t, q, dq, higher, torque, observer)
     next_observer = _next_observer_state(sampling, running, arguments)
     next_controller = _euler(controller, controller_rate, sampling.period)
     return LawUpdate(measured, command, f_hat, next_controller, next_observer, reading, sent)
@@ -583,7 +589,11 @@ def _euler(state: Any, rate: Any, period: jax.Array) -> Any:
 
 @jax.jit
 def run_sampled_law(
-    scenario: Scenario, t: jax.Array, state: LoopState, normal: jax.Array
+    scenario: Scenario,
+    t: jax.Array,
+    state: LoopState,
+    normal: jax.Array,
+    applied: jax.Array | None = None,
 ) -> LoopState:
     """The state after one run of sensor, law and observer.
 
@@ -592,6 +602,7 @@ def run_sampled_law(
       t: start of the period, () [s].
       state: at t.
       normal: standard normal numbers for the sensor, (draws, n).
+      applied: as in `law_update`.
     """
     before, sampling = state.sampled, scenario.sampling
     assert sampling is not None
@@ -604,7 +615,8 @@ def run_sampled_law(
     )
     if isinstance(measured.higher, tuple):
         measured = measured._replace(higher=state.higher)
-    update = law_update(scenario, t, measured, state.controller, state.observer, before.sent)
+    parts = (state.controller, state.observer, before.sent)
+    update = law_update(scenario, t, measured, *parts, applied)
     commands = jnp.concatenate([plant_input(update.command)[None], before.commands[:-1]])
     estimated = estimated_levels(
         scenario,

@@ -17,6 +17,9 @@ another start."""
 BEFORE_A_RELEASE = {"armour.py", "constraints.py", "tuning.py"}
 """Their quick sizes compile for a quarter of a minute."""
 
+NEEDED = {"ros2.py": ("mujoco", "rclpy")}
+"""Benchmark -> libraries that not every environment has."""
+
 
 def benchmarks():
     """Every benchmark, with its mark."""
@@ -27,6 +30,8 @@ def benchmarks():
 
 @pytest.mark.parametrize("name", benchmarks())
 def test_quick_benchmark(name, tmp_path, monkeypatch):
+    for library in NEEDED.get(name, ()):
+        pytest.importorskip(library, reason=f"{name} needs {library}")
     output = tmp_path / "table.json"
     words = [str(FOLDER / name), "--quick", "--json", str(output)]
     if name in OF_THEIR_OWN:

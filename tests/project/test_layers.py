@@ -33,6 +33,7 @@ ONLY_IN = {
     "unopy": ("tuning",),
     "argparse": ("cli",),
     "mujoco": ("world", "deployment"),
+    "rosbags": ("identification",),
     "xarray": ("files", "studies", "identification", "cli", "plotting"),
 }
 """Library -> the modules that may use it, inside functions too."""
@@ -155,12 +156,13 @@ def calls(source: str, name: str) -> list[int]:
 
 def test_time_is_scanned_in_one_place():
     """lax.scan is a loop over time, which is the engine's; stages of an integrator, iterations, the
-    samples that an exported law is tested with, the plant under torques of a log, the switches of a
-    Markov chain and checkers' loops are no runs."""
+    samples that an exported law is tested with, a law on recorded states, the plant under torques
+    of a log, the switches of a Markov chain and checkers' loops are no runs."""
     allowed = {
         "core/linalg.py",
         "core/qp.py",
         "deployment/export.py",
+        "deployment/ros2/law_replay.py",
         "identification/replay.py",
         "simulation/integrators.py",
         "world/plants/markov_switched.py",

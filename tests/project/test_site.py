@@ -33,8 +33,9 @@ PAGES = [
     if run_page.blocks(page.read_text(encoding="utf-8"))
 ]
 """Every page with Python: README, CONTRIBUTING and what is beside them, and the documentation."""
-ELSEWHERE = {"other_solvers"}
-"""`test_vector_field` runs the page about other solvers, which needs a library of theirs."""
+ELSEWHERE = {"other_solvers", "ros2_demo"}
+"""`test_vector_field` runs the page about other solvers, which needs a library of theirs, and
+`test_demo` the one about a robot under ROS 2, which needs a law node."""
 FIRST = {"README", "start"}
 """Every run of CI has these pages."""
 LONG = {"guide", "tune_my_robot"}

@@ -9,7 +9,7 @@ import keyword
 import math
 import re
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
 from string import Template
@@ -23,6 +23,8 @@ from iblf_jax.core import checks
 from iblf_jax.deployment.build import write_files
 from iblf_jax.deployment.c_names import Parameters
 from iblf_jax.deployment.ros2.node.supervisor import ARRIVAL_TIMEOUT, STALE_PERIODS
+from iblf_jax.deployment.ros2.ros2_control import controller_package, ros2_control_files
+from iblf_jax.deployment.ros2.yaml_text import yaml_number, yaml_numbers
 from iblf_jax.deployment.write_c import GeneratedLaw, Law, title_of
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Scenario
@@ -268,34 +270,16 @@ def _hold_gains(scenario: Scenario) -> tuple[list[float], list[float]]:
     return [float(f"{x:.2g}") for x in stiffness], [float(f"{x:.2g}") for x in damping]
 
 
-def _yaml_numbers(numbers: Sequence[float]) -> str:
-    """A list of floating-point numbers in YAML, each with a decimal point."""
-    return f"[{', '.join(map(_yaml_number, numbers))}]"
-
-
-def _yaml_number(x: float) -> str:
-    """A floating-point number in YAML 1.1, whose exponents need a decimal point and a sign."""
-    text = repr(float(x))
-    if "e" not in text:
-        return text
-    mantissa, exponent = text.split("e")
-    if "." not in mantissa:
-        mantissa += ".0"
-    if exponent[0] not in "+-":
-        exponent = f"+{exponent}"
-    return f"{mantissa}e{exponent}"
-
-
 def _gain_lines(options: RosOptions) -> str:
     """The gains in the file of parameters."""
     lines = []
     for gain in options.gains:
         numbers = gain.value.reshape(-1).tolist()
-        text = _yaml_numbers(numbers)
+        text = yaml_numbers(numbers)
         if gain.tied or gain.value.ndim == 0:
-            text = _yaml_number(numbers[0])
+            text = yaml_number(numbers[0])
         low, high = gain.low.reshape(-1).tolist(), gain.high.reshape(-1).tolist()
-        limits = f"{_yaml_numbers(low)} to {_yaml_numbers(high)}"
+        limits = f"{yaml_numbers(low)} to {yaml_numbers(high)}"
         lines.append(f"    {json.dumps(gain.path)}: {text}  # [{gain.unit}], from {limits}")
     return "\n".join(lines) or "    # This law was exported without gains that can be changed."
 
@@ -307,7 +291,9 @@ def _template(name: str, values: Mapping[str, Any]) -> str:
 
 
 def ros_files(law: Law, generated: GeneratedLaw, options: RosOptions) -> dict[str, str]:
-    """The files of the package: path in its folder -> text."""
+    """The files of the package, and in a folder of it those of the package of a controller of
+    ros2_control: path -> text.
+    """
     name = law.name
     description = _description(law, generated, options)
     values = {
@@ -315,13 +301,13 @@ def ros_files(law: Law, generated: GeneratedLaw, options: RosOptions) -> dict[st
         "title": title_of(law.scenario),
         "version": __version__,
         "joints": json.dumps(description["joints"]),
-        "period": _yaml_number(description["period"]),
-        "state_timeout": _yaml_number(STALE_PERIODS * description["period"]),
-        "arrival_timeout": _yaml_number(ARRIVAL_TIMEOUT),
-        "torque_limits": _yaml_numbers(description["torque_limits"]),
+        "period": yaml_number(description["period"]),
+        "state_timeout": yaml_number(STALE_PERIODS * description["period"]),
+        "arrival_timeout": yaml_number(ARRIVAL_TIMEOUT),
+        "torque_limits": yaml_numbers(description["torque_limits"]),
         "on_fault": description["on_fault"],
-        "hold_stiffness": _yaml_numbers(description["hold_stiffness"]),
-        "hold_damping": _yaml_numbers(description["hold_damping"]),
+        "hold_stiffness": yaml_numbers(description["hold_stiffness"]),
+        "hold_damping": yaml_numbers(description["hold_damping"]),
         "gains": _gain_lines(options),
         "n": law.scenario.n,
         "velocity": _velocity_note(description["reads_velocity"]),
@@ -345,6 +331,9 @@ def ros_files(law: Law, generated: GeneratedLaw, options: RosOptions) -> dict[st
         texts[f"{name}/{module}"] = text.replace(NODE, name)
     for file, text in generated.files.items():
         texts[f"c/{file}"] = text
+    controller = controller_package(name)
+    for file, text in ros2_control_files(law, generated, description).items():
+        texts[f"{controller}/{file}"] = text
     return texts
 
 

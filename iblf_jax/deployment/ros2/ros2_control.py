@@ -1,0 +1,161 @@
+"""Writes a law as a controller plugin of ros2_control: a package of type ament_cmake around the
+exported C law.
+"""
+
+from __future__ import annotations
+
+import json
+import string
+from collections.abc import Iterable, Mapping, Sequence
+from importlib.resources import files
+from string import Template
+from typing import Any
+from xml.sax.saxutils import escape
+
+from iblf_jax import __version__
+from iblf_jax.core import notices
+from iblf_jax.deployment.ros2.yaml_text import yaml_numbers
+from iblf_jax.deployment.write_c import GeneratedLaw, Law, title_of
+
+RATE_TOLERANCE = 1e-9
+"""Relative distance of a rate from a whole number of Hz."""
+TEMPLATES = {
+    "package.xml": "package.xml",
+    "CMakeLists.txt": "CMakeLists.txt",
+    "law_controller.xml": "law_controller.xml",
+    "README.md": "README.md",
+    "config/controllers.yaml": "controllers.yaml",
+    "include/{package}/law_controller.hpp": "law_controller.hpp",
+    "src/law_controller.cpp": "law_controller.cpp",
+}
+"""Path in the package -> its template."""
+PLAIN_CHARACTERS = frozenset(
+    string.ascii_letters + string.digits + " !#$%&'()*+,-./:;<=>@[]^_`{|}~"
+)
+"""Characters that a C++ string contains as they are: no quote, backslash or question mark."""
+
+
+def controller_package(name: str) -> str:
+    """The name of the package of a law's controller."""
+    return f"{name}_controller"
+
+
+def ros2_control_files(
+    law: Law, generated: GeneratedLaw, description: Mapping[str, Any]
+) -> dict[str, str]:
+    """The files of the package: path in its folder -> text.
+
+    There are none, with a warning, for a period whose rate is not a whole number of Hz, as
+    ros2_control has no such rates.
+
+    Args:
+      law: the law, of a robot, with its reference inside.
+      generated: its C code, of double precision.
+      description: "joints" (n names), "has_joint_names" (whether they are those of the robot's
+        file), "reads_velocity", "torque_limits", "hold_stiffness", "hold_damping" (n numbers each),
+        "on_fault" and "gains": for each gain "path", "unit", "low" and "high" (its range) and
+        "offsets" (for each of its numbers the places in the struct of parameters).
+    """
+    period = float(law.scenario.sampling.period)  # type: ignore[union-attr]
+    rate = round(1.0 / period)
+    if rate < 1 or abs(rate * period - 1.0) > RATE_TOLERANCE:
+        notices.warn(
+            f"period = {period:g} s is not the period of a whole number of Hz, so no controller for"
+            " ros2_control is written. Export with period=1e-3, 2e-3 or another such period."
+        )
+        return {}
+    package = controller_package(law.name)
+    values = _values(law, generated, description, rate) | {"package": package}
+    texts = {
+        path.format(package=package): _template(name, values) for path, name in TEMPLATES.items()
+    }
+    texts[f"include/{package}/{law.name}.h"] = generated.files[f"{law.name}.h"]
+    texts[f"src/{law.name}.c"] = generated.files[f"{law.name}.c"]
+    return texts
+
+
+def _template(name: str, values: Mapping[str, Any]) -> str:
+    """The text of a template with its placeholders filled in."""
+    folder = files("iblf_jax.deployment.ros2") / "templates" / "ros2_control"
+    return Template((folder / name).read_text(encoding="utf-8")).substitute(values)
+
+
+def _values(
+    law: Law, generated: GeneratedLaw, description: Mapping[str, Any], rate: int
+) -> dict[str, Any]:
+    """The values for the placeholders of the templates."""
+    period = float(law.scenario.sampling.period)  # type: ignore[union-attr]
+    joints, gains = description["joints"], description["gains"]
+    states = ["`position`"]
+    if description["reads_velocity"]:
+        states.append("`velocity`")
+    values = {
+        "name": law.name,
+        "upper": law.name.upper(),
+        "guard": f"{controller_package(law.name).upper()}__LAW_CONTROLLER_HPP_",
+        "version": __version__,
+        "title": escape(title_of(law.scenario)),
+        "n": law.scenario.n,
+        "period": repr(period),
+        "period_ns": round(period * 1e9),
+        "rate": rate,
+        "joints": json.dumps(list(joints)),
+        "joint_list": ", ".join(f"`{json.dumps(x)[1:-1]}`" for x in joints),
+        "state_interfaces": " and ".join(states),
+        "on_fault": description["on_fault"],
+        "reads_velocity": _cpp_bool(description["reads_velocity"]),
+        "has_joint_names": _cpp_bool(description["has_joint_names"]),
+        "cpp_names": ", ".join(map(cpp_string, joints)),
+        "cpp_gains": _cpp_gains(gains),
+        "gains": _gain_lines(generated, gains),
+        "gain_names": _gain_names(gains),
+    }
+    for name in ("torque_limits", "hold_stiffness", "hold_damping"):
+        values[name] = yaml_numbers(description[name])
+        values[f"cpp_{name}"] = _cpp_numbers(description[name])
+    return values
+
+
+def cpp_string(text: str) -> str:
+    """A literal of C++ of any text in UTF-8: ASCII without trigraphs."""
+    encoded = (
+        chr(byte) if chr(byte) in PLAIN_CHARACTERS else f"\\{byte:03o}" for byte in text.encode()
+    )
+    return f'"{"".join(encoded)}"'
+
+
+def _cpp_bool(value: bool) -> str:
+    return "true" if value else "false"
+
+
+def _cpp_numbers(numbers: Iterable[float]) -> str:
+    return ", ".join(repr(float(x)) for x in numbers)
+
+
+def _cpp_gains(gains: Sequence[Mapping[str, Any]]) -> str:
+    """The rows of the table of gains."""
+    rows = []
+    for gain in gains:
+        places = ", ".join(f"{{{', '.join(map(str, entry))}}}" for entry in gain["offsets"])
+        low, high = _cpp_numbers(gain["low"]), _cpp_numbers(gain["high"])
+        rows.append(f"\n    {{{cpp_string(gain['path'])}, {{{low}}}, {{{high}}}, {{{places}}}}}")
+    return ",".join(rows)
+
+
+def _gain_names(gains: Sequence[Mapping[str, Any]]) -> str:
+    """The sentence of the README about the gains."""
+    if not gains:
+        return "the law was exported without gains that can be changed."
+    names = ", ".join(f"`{gain['path']}`" for gain in gains)
+    return f"the gains {names} within the exported ranges."
+
+
+def _gain_lines(generated: GeneratedLaw, gains: Sequence[Mapping[str, Any]]) -> str:
+    """The gains in the file of parameters."""
+    numbers = [x for field in generated.parameters.fields for x in field.value.reshape(-1).tolist()]
+    lines = []
+    for gain in gains:
+        values = yaml_numbers(numbers[places[0]] for places in gain["offsets"])
+        limits = f"{yaml_numbers(gain['low'])} to {yaml_numbers(gain['high'])}"
+        lines.append(f"    {json.dumps(gain['path'])}: {values}  # [{gain['unit']}], from {limits}")
+    return "\n".join(lines) or "    # The law was exported without gains that can be changed."

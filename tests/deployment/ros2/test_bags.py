@@ -1,0 +1,610 @@
+"""Recordings of a robot under ROS 2: what a log and a run of them hold, and recordings that are
+wrong.
+
+The recordings are written by the writer of `rosbags`; two messages were serialised by rclpy.
+"""
+
+from __future__ import annotations
+
+import re
+import sqlite3
+import sys
+import warnings
+
+import bag_files
+import numpy as np
+import pytest
+from bag_files import effort_message, messages_of, state_message, string_message, write_bag
+from conftest import ROOT
+
+import iblf_jax as ij
+from iblf_jax import cli
+from iblf_jax.identification.bag import held_efforts
+from iblf_jax.identification.log import read
+
+ORIGIN = 1_700_000_000_123_456_789
+NAMES = ("shoulder", "elbow")
+PERIOD = 2e-3
+FROM_RCLPY = {
+    "state": (
+        "0001000000f1536515cd5b07050000006261736500766434030000000200000062005a630800000067726970706572"
+        "00020000006100660603000000000000000000d03f0000000000002240000000000000f8bf03000000647b65510000"
+        "00000000e03f0000000000000000000000000000004003000000654919000000000000000840000000000000000000"
+        "000000000010c0"
+    ),
+    "effort": "0001000000000000000000000200000064735f3a000000000000f43f00000000000004c0",
+}
+"""A joint state of the joints b, gripper and a, and an effort, serialised by rclpy 9.1."""
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    """The paper's arm, whose law runs every 2 ms with an encoder."""
+    return ij.with_parts(
+        ij.presets.zhang_yan_2024(),
+        controller=ij.controllers.Backstepping(k1=2.0, K2=10.0, o=0.1),
+        sampling=ij.Sampling(PERIOD),
+    )
+
+
+@pytest.fixture(scope="module")
+def motion():
+    """t, q, dq and tau of 0.4 s at 500 Hz; any numbers."""
+    t = PERIOD * np.arange(200)
+    rng = np.random.default_rng(0)
+    return t, *rng.normal(size=(3, 200, 2))
+
+
+def read_log(folder, scenario, **options):
+    return ij.deployment.bag_log(folder, scenario, **({"joints": NAMES} | options))
+
+
+@pytest.mark.parametrize("storage", bag_files.STORAGES)
+@pytest.mark.parametrize("as_file", [False, True])
+def test_a_recording_is_a_log(storage, as_file, scenario, motion, tmp_path):
+    t, q, dq, tau = motion
+    messages = messages_of(t, NAMES, q, tau, dq, origin=ORIGIN)
+    messages.append(("/rosout", ORIGIN, string_message("a topic that is not read")))
+    folder = write_bag(tmp_path / "bag", messages, storage)
+    if as_file:
+        (folder,) = (path for path in folder.iterdir() if path.suffix != ".yaml")
+    log = read_log(folder, scenario)
+    assert set(log) == {"t", "q", "dq", "tau"}
+    np.testing.assert_allclose(log["t"], t, atol=1e-9)
+    for name, values in (("q", q), ("dq", dq), ("tau", tau)):
+        np.testing.assert_array_equal(log[name], values)
+
+
+def test_joints_are_found_by_their_names(scenario, motion, tmp_path):
+    """The order differs between the messages, other joints are in them, and another robot publishes
+    on the same topic."""
+    t, q, dq, tau = motion
+    messages = []
+    for k, (topic, received, message) in enumerate(messages_of(t, NAMES, q, tau, dq)):
+        if topic == "/joint_states":
+            order = [("elbow", "gripper", "shoulder"), NAMES][k % 4 // 2]
+            row = {"gripper": 9.0} | dict(zip(NAMES, q[k // 2], strict=True))
+            rate = {"gripper": 9.0} | dict(zip(NAMES, dq[k // 2], strict=True))
+            stamp = round(t[k // 2] * 1e9)
+            values = ([x[name] for name in order] for x in (row, rate))
+            message = state_message(stamp, order, *values)
+            other = state_message(stamp, ("wheel",), [1.0])
+            messages.append((topic, received + 1, other))
+        messages.append((topic, received, message))
+    log = read_log(write_bag(tmp_path / "bag", messages), scenario)
+    for name, values in (("q", q), ("dq", dq), ("tau", tau)):
+        np.testing.assert_array_equal(log[name], values)
+
+
+def test_a_robot_without_names_is_read_in_the_order_of_the_messages(scenario, motion, tmp_path):
+    t, q, _, tau = motion
+    folder = write_bag(tmp_path / "bag", messages_of(t, NAMES, q, tau))
+    with pytest.warns(UserWarning, match="order of the first message: shoulder, elbow"):
+        (log,) = read(folder, 2)
+    np.testing.assert_array_equal(log.q, q)
+    assert log.dq is None
+    # The names that an exported node has for such a robot.
+    names = ("joint_2", "joint_1")
+    folder = write_bag(tmp_path / "numbered", messages_of(t, names, q, tau))
+    (numbered,) = read(folder, 2)
+    np.testing.assert_array_equal(numbered.q, q[:, ::-1])
+    folder = tmp_path / "bag"
+    (swapped,) = read(folder, 2, joints=("elbow", "shoulder"))
+    np.testing.assert_array_equal(swapped.q, q[:, ::-1])
+
+
+def test_an_effort_belongs_to_the_joint_state_that_it_answers():
+    """Receive times in units of the period; None where the effort is unknown."""
+    cases = [
+        # a latency of 0.3 periods, and one of 1.3 periods
+        ([0, 1, 2, 3], [0.3, 1.3, 2.3, 3.3], [0, 1, 2, 3]),
+        ([0, 1, 2, 3], [1.3, 2.3, 3.3], [None, 0, 1, 2]),
+        # joint states twice as often as efforts: the torque is constant in between
+        ([0, 0.5, 1, 1.5, 2, 2.5], [0.1, 1.1, 2.1], [0, 0, 1, 1, 2, None]),
+        # no effort for 5 periods, and none after 37
+        (
+            [*range(40)],
+            [k + 0.3 for k in range(38) if not 20 <= k < 24],
+            [*range(20), *[None] * 4, *range(20, 34), None, None],
+        ),
+        # one effort is missing: the torque before it goes on
+        ([*range(5)], [0.3, 1.3, 3.3, 4.3], [0, 1, 1, 2, 3]),
+        ([0, 1], [], [None, None]),
+        ([0, 1], [0.3], [0, None]),
+    ]
+    for states, efforts, expected in cases:
+        index, is_known = held_efforts(1000 * np.array(states), 1000 * np.array(efforts))
+        found = [int(k) if known else None for k, known in zip(index, is_known, strict=True)]
+        assert found == expected, (states, efforts)
+
+
+def test_messages_that_a_recorder_exchanged_are_assigned_by_their_number():
+    """A busy recorder stores messages later than they arrived, and those of one topic together."""
+    rng = np.random.default_rng(1)
+    count = 2000
+    states = 1000.0 * np.arange(count) + rng.uniform(-50, 50, count)
+    efforts = states + rng.uniform(200, 400, count)
+    for k in np.flatnonzero(rng.random(count) < 0.2):
+        # The answer is stored just before its joint state.
+        states[k] = efforts[k] + rng.uniform(1, 30)
+    index, is_known = held_efforts(np.sort(states).astype(int), np.sort(efforts).astype(int))
+    np.testing.assert_array_equal(index, np.arange(count))
+    assert is_known.all()
+    # Five joint states, and then their answers; and the other way round.
+    states, efforts = 1000 * np.arange(40), 1000 * np.arange(40) + 300
+    late = 14_350 + np.arange(5)
+    for a, b in ((late, late + 10), (late + 10, late)):
+        states[10:15], efforts[10:15] = a, b
+        index, is_known = held_efforts(states, efforts)
+        np.testing.assert_array_equal(index, np.arange(40))
+    # Two efforts a joint state, and one that is missing, are no exchange.
+    states, efforts = 1000 * np.arange(40), 500 * np.arange(80) + 100
+    index, _ = held_efforts(states, np.delete(efforts, [20, 21]))
+    np.testing.assert_array_equal(index[:10], 2 * np.arange(10) + 1)
+    assert index[10] == 19 and index[11] == 21
+
+
+def test_gaps_of_either_topic_are_gaps_of_the_log(scenario, motion, tmp_path):
+    t, q, _, tau = motion
+    messages = messages_of(t, NAMES, q, tau)
+    kept = []
+    for topic, received, message in messages:
+        k = round((received * 1e-9) // PERIOD)
+        lost_state = topic == "/joint_states" and 50 <= k < 60
+        lost_effort = topic == "/efforts" and 120 <= k < 140
+        if not lost_state and not lost_effort:
+            kept.append((topic, received, message))
+    folder = write_bag(tmp_path / "bag", kept)
+    (log,) = read(folder, 2, joints=NAMES)
+    ends = [
+        (round(log.t[s.start] / PERIOD), round(log.t[s.stop - 1] / PERIOD)) for s in log.segments
+    ]
+    assert ends == [(0, 49), (60, 119), (140, 199)]
+    rows = np.round(log.t / PERIOD).astype(int)
+    np.testing.assert_array_equal(
+        log.tau[:-1][np.diff(rows) == 1], tau[rows[:-1]][np.diff(rows) == 1]
+    )
+
+
+def test_times_and_a_part_are_selected(scenario, motion, tmp_path):
+    t, q, _, tau = motion
+    folder = write_bag(tmp_path / "bag", messages_of(t, NAMES, q, tau, origin=ORIGIN))
+    part = read_log(folder, scenario, start=0.1, duration=0.2)
+    np.testing.assert_array_equal(part["q"], q[50:150])
+    np.testing.assert_allclose(part["t"], t[50:150], atol=1e-9)
+    seconds = ORIGIN * 1e-9 - 5.0
+    later = read_log(folder, scenario, time_origin=seconds)
+    np.testing.assert_allclose(later["t"], t + 5.0, atol=1e-6)
+    # The float of the first stamp is another instant, after which the first row would be lost.
+    same = read_log(folder, scenario, time_origin=ORIGIN / 10**9)
+    np.testing.assert_array_equal(same["t"], read_log(folder, scenario)["t"])
+    # stamps that do not advance: the driver did not set them
+    broken = [
+        (topic, received, state_message(0, NAMES, q[k // 2]) if k % 2 == 0 else message)
+        for k, (topic, received, message) in enumerate(messages_of(t, NAMES, q, tau))
+    ]
+    folder = write_bag(tmp_path / "zero", broken)
+    with pytest.raises(ValueError, match=r'stamps: got 0 s and then 0 s.*times="receive"'):
+        read_log(folder, scenario)
+    np.testing.assert_allclose(read_log(folder, scenario, times="receive")["t"], t, atol=1e-9)
+
+
+def test_a_clock_that_jumps_back_divides_a_recording(scenario, motion, tmp_path):
+    t, q, _, tau = motion
+    messages = messages_of(t, NAMES, q, tau, origin=10**9)
+    again = messages_of(t, NAMES, q, tau, origin=0)
+    second = [(topic, received + 2 * 10**9, message) for topic, received, message in again]
+    folder = write_bag(tmp_path / "bag", messages + second)
+    with pytest.raises(ValueError, match=r"0.398 s and then -1 s.*duration=0.398 selects") as error:
+        read_log(folder, scenario)
+    duration = float(re.search(r"duration=([\d.]+)", str(error.value))[1])
+    np.testing.assert_array_equal(read_log(folder, scenario, duration=duration)["q"], q[:199])
+
+
+def test_a_state_that_is_published_twice_is_one_row(scenario, motion, tmp_path):
+    t, q, _, tau = motion
+    messages = messages_of(t, NAMES, q, tau)
+    messages += [(topic, at + 9, x) for topic, at, x in messages if topic == "/joint_states"]
+    log = read_log(write_bag(tmp_path / "bag", messages), scenario)
+    np.testing.assert_array_equal(log["q"], q)
+    np.testing.assert_array_equal(log["tau"], tau)
+
+
+def test_efforts_may_be_those_of_the_joint_states(scenario, motion, tmp_path):
+    t, q, dq, tau = motion
+    messages = [
+        ("/joint_states", k, state_message(round(t[k] * 1e9), NAMES, q[k], dq[k], tau[k]))
+        for k in range(len(t))
+    ]
+    folder = write_bag(tmp_path / "bag", messages)
+    log = read_log(folder, scenario, efforts=None)
+    np.testing.assert_array_equal(log["tau"], tau)
+    with pytest.raises(
+        ValueError, match=r"efforts: got no topics .*topics: /joint_states.*efforts=None"
+    ):
+        read_log(folder, scenario)
+
+
+def test_topics_with_a_namespace(scenario, motion, tmp_path):
+    t, q, _, tau = motion
+    messages = [(f"/left{topic}", at, x) for topic, at, x in messages_of(t, NAMES, q, tau)]
+    log = read_log(write_bag(tmp_path / "one", messages), scenario)
+    np.testing.assert_array_equal(log["q"], q)
+    messages += [(f"/right{topic}", at, x) for topic, at, x in messages_of(t, NAMES, -q, tau)]
+    folder = write_bag(tmp_path / "two", messages)
+    with pytest.raises(
+        ValueError, match=r"got 2 topics .*/left/joint_states .*/right/joint_states"
+    ):
+        read_log(folder, scenario)
+    log = read_log(folder, scenario, joint_states="right/joint_states", efforts="/right/efforts")
+    np.testing.assert_array_equal(log["q"], -q)
+
+
+# --- messages of ROS -----------------------------------------------------------------------------
+
+
+def raw_bag(folder, state, effort):
+    """A recording of 100 times the same two serialised messages."""
+    from rosbags.rosbag2 import Writer
+
+    with Writer(folder, version=9, storage_plugin=bag_files.STORAGES["mcap"]) as writer:
+        kinds = {"/joint_states": bag_files.JOINT_STATE, "/efforts": bag_files.ARRAY}
+        topics = [writer.add_connection(x, y, typestore=bag_files.STORE) for x, y in kinds.items()]
+        for k in range(100):
+            writer.write(topics[0], 10 * k, state)
+            writer.write(topics[1], 10 * k + 1, effort)
+    return folder
+
+
+def check_raw_bag(folder, scenario):
+    log = ij.deployment.bag_log(folder, scenario, joints=("a", "b"), times="receive", duration=9e-7)
+    np.testing.assert_array_equal(log["q"][0], [-1.5, 0.25])
+    np.testing.assert_array_equal(log["dq"][0], [2.0, 0.5])
+    np.testing.assert_array_equal(log["tau"][0], [1.25, -2.5])
+    stamped = {"joints": ("a", "b"), "efforts": None, "time_origin": 1_700_000_000.0}
+    log = ij.deployment.bag_log(folder, scenario, **stamped)
+    np.testing.assert_array_equal(log["tau"], [[-4.0, 3.0]])  # the same stamp is the same state
+    np.testing.assert_allclose(log["t"], [0.123456789], atol=1e-9)
+
+
+def test_messages_that_rclpy_serialised_are_read(scenario, tmp_path):
+    raw = {name: bytes.fromhex(text) for name, text in FROM_RCLPY.items()}
+    check_raw_bag(raw_bag(tmp_path / "bag", **raw), scenario)
+
+
+def test_messages_that_rclpy_serialises_now_are_read(scenario, tmp_path):
+    reason = "rclpy of the extra `ros` is not installed"
+    serialization = pytest.importorskip("rclpy.serialization", reason=reason)
+    sensor_msgs = pytest.importorskip("sensor_msgs.msg", reason=reason)
+    std_msgs = pytest.importorskip("std_msgs.msg", reason=reason)
+    state = sensor_msgs.JointState()
+    state.header.stamp.sec, state.header.stamp.nanosec = 1_700_000_000, 123_456_789
+    state.name = ["b", "gripper", "a"]
+    state.position, state.velocity = [0.25, 9.0, -1.5], [0.5, 0.0, 2.0]
+    state.effort = [3.0, 0.0, -4.0]
+    effort = std_msgs.Float64MultiArray(data=[1.25, -2.5])
+    raw = [serialization.serialize_message(x) for x in (state, effort)]
+    check_raw_bag(raw_bag(tmp_path / "bag", *raw), scenario)
+
+
+# --- identification ------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def logged():
+    """The log of the examples: t, q, tau."""
+    rows = np.loadtxt(ROOT / "examples" / "log.csv", delimiter=",", skiprows=1)
+    return rows[:, 0], rows[:, 1:3], rows[:, 3:5]
+
+
+def test_a_recording_identifies_what_the_same_csv_file_identifies(logged, tmp_path, capsys):
+    t, q, tau = logged
+    folder = write_bag(tmp_path / "run_bag", messages_of(t, NAMES, q, tau, origin=ORIGIN), "mcap")
+    friction = ij.disturbances.Friction(viscous=0.05, coulomb=0.05)
+    scenario = ij.with_parts(ij.presets.zhang_yan_2024(), disturbance=friction)
+    paths = ["robot.mass", "disturbance.viscous", "disturbance.coulomb"]
+    of_csv = ij.identify(scenario, ROOT / "examples" / "log.csv", paths, widths=False)
+    with pytest.warns(UserWarning, match="no joint names"):
+        of_bag = ij.identify(scenario, f"{folder}/", paths, widths=False)
+    for one, two in zip(of_bag.wanted, of_csv.wanted, strict=True):
+        assert one.name == two.name
+        np.testing.assert_allclose(one.value, two.value, rtol=1e-6)
+        np.testing.assert_allclose(one.error, two.error, rtol=1e-4)
+
+
+def test_the_latency_of_the_efforts_is_estimated(tmp_path):
+    """The robot receives each effort 2 ms after the stamp of the joint state, as the recorder."""
+    scenario = bag_files.example_scenario()
+    late = ij.with_parts(scenario, sampling=ij.Sampling(4e-3, delay=2e-3))
+    late = ij.with_parameters(late, bag_files.EXAMPLE)
+    run = ij.simulate(late, duration=3.0, dt=1e-3)
+    t, q, tau = (np.asarray(x) for x in (run.t, run.q, run.tau))
+    commands = [*tau[2::4], tau[-1]]
+    messages = messages_of(t[::4], NAMES, q[::4], commands, latency=2_000_000)
+    log = read_log(write_bag(tmp_path / "bag", messages), scenario)
+    known = ij.identify(scenario, log, ["robot.mass", "disturbance.viscous"], widths=False)
+    np.testing.assert_allclose(known.delay, 2e-3, atol=5e-5)
+    true = np.concatenate([*bag_files.EXAMPLE.values()])
+    np.testing.assert_allclose([x.value for x in known.wanted], true, rtol=1e-3)
+
+
+@pytest.mark.parametrize("as_option", [False, True])
+def test_the_command_line_reads_a_recording(as_option, logged, tmp_path, capsys):
+    t, q, tau = logged
+    write_bag(tmp_path / "run_bag", messages_of(t, NAMES, q, tau, origin=ORIGIN))
+    text = (ROOT / "examples" / "identify.toml").read_text()
+    options = ["--log", str(tmp_path / "run_bag")]
+    if not as_option:
+        options = []
+        text = text.replace('"log.csv"', '"run_bag"')
+    (tmp_path / "identify.toml").write_text(text)
+    assert cli.main(["identify", str(tmp_path / "identify.toml"), *options]) == 0
+    shown = capsys.readouterr()
+    assert "6 of 6 numbers" in shown.out and "no joint names" in shown.err
+
+
+def test_the_recording_of_the_examples_is_a_run_of_its_arm(tmp_path):
+    scenario = bag_files.example_scenario()
+    place = ROOT / "examples" / "run_bag"
+    log = read_log(place, scenario)
+    again = read_log(write_bag(tmp_path / "bag", bag_files.example_messages()), scenario)
+    for name in ("t", "q", "dq", "tau"):
+        np.testing.assert_allclose(log[name], again[name], atol=2e-3)
+    paths = ["robot.mass", "disturbance.viscous"]
+    known = ij.identify(scenario, log, paths, widths=False)
+    true = np.concatenate([*bag_files.EXAMPLE.values()])
+    np.testing.assert_allclose([x.value for x in known.wanted], true, rtol=0.03)
+
+
+# --- runs ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("sensor", [None, "encoder"])
+def test_a_recorded_run_is_the_simulated_run(sensor, scenario, tmp_path):
+    """Law and observer run on the recorded readings as they ran on the robot."""
+    if sensor is not None:
+        velocity = ij.sensors.FilteredDifference(cutoff=200.0)
+        encoder = ij.sensors.Encoder(counts=65536, velocity=velocity)
+        scenario = ij.with_parts(scenario, sensor=encoder)
+    run = ij.simulate(scenario, duration=1.0, dt=PERIOD)
+    signals = [np.asarray(x) for x in (run.t, run.measured.q, run.tau, run.measured.dq)]
+    t, q, tau, dq = signals
+    messages = messages_of(t, NAMES, q, tau, dq, origin=ORIGIN)
+    folder = write_bag(tmp_path / "bag", messages, "mcap")
+    found = ij.deployment.read_bag(folder, scenario, joints=NAMES)
+    assert found.method == "recorded" and found.steps == run.steps
+    assert int(found.status) == int(run.status)
+    np.testing.assert_array_equal(found.q, q)
+    np.testing.assert_array_equal(found.tau, tau)
+    for name in ("alpha", "disturbance_estimate"):
+        np.testing.assert_allclose(getattr(found, name), getattr(run, name), atol=1e-9)
+    np.testing.assert_allclose(found.lower, run.lower, atol=1e-9)
+    replayed = np.asarray(found.tau)
+    assert replayed.shape == (501, 2)
+    if sensor is None:
+        for name in ("rmse", "margin", "xi_margin", "iae", "peak_torque", "torque_rms", "effort"):
+            np.testing.assert_allclose(found.metrics[name], run.metrics[name], rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose(found.metrics.estimate_rmse, run.metrics.estimate_rmse, rtol=0.1)
+    assert found.plot() is not None
+
+
+def test_the_law_of_a_recorded_run_has_its_own_period(scenario, tmp_path):
+    """Joint states at 1 kHz, the law at 500 Hz: the signals change at every second row only."""
+    run = ij.simulate(scenario, duration=0.2, dt=1e-3)
+    t, q, dq, tau = (np.asarray(x) for x in (run.t, run.q, run.dq, run.tau))
+    messages = messages_of(t, NAMES, q, tau, dq)
+    found = ij.deployment.read_bag(write_bag(tmp_path / "bag", messages), scenario, joints=NAMES)
+    np.testing.assert_allclose(found.alpha, run.alpha, atol=1e-9)
+    np.testing.assert_allclose(found.dt, 1e-3)
+
+
+def test_another_law_or_origin_of_time_is_reported(scenario, tmp_path):
+    """The law of a recording that began 0.5 s after it has its own time.  The observer, which
+    starts with the recording, forgets its start."""
+    scenario = ij.with_parts(scenario, observer=ij.observers.Momentum(kf=20.0))
+    run = ij.simulate(scenario, duration=1.5, dt=PERIOD)
+    t, q, dq, tau = (np.asarray(x)[250:] for x in (run.t, run.q, run.dq, run.tau))
+    folder = write_bag(tmp_path / "bag", messages_of(t, NAMES, q, tau, dq, origin=10**9))
+    with pytest.warns(UserWarning, match="other torques .* Give time_origin"):
+        ij.deployment.read_bag(folder, scenario, joints=NAMES)
+    other = ij.with_parameters(scenario, {"reference.amplitude": 0.02})
+    with pytest.warns(UserWarning, match="other torques"):
+        ij.deployment.read_bag(folder, other, joints=NAMES, time_origin=1.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = ij.deployment.read_bag(folder, scenario, joints=NAMES, time_origin=1.0)
+    np.testing.assert_allclose(found.q_d, run.q_d[250:], atol=1e-9)
+    np.testing.assert_allclose(found.alpha, run.alpha[250:], atol=1e-9)
+
+
+def test_gaps_are_not_integrated(scenario, tmp_path):
+    run = ij.simulate(scenario, duration=0.4, dt=PERIOD)
+    t, q, dq, tau = (np.asarray(x) for x in (run.t, run.q, run.dq, run.tau))
+    messages = messages_of(t, NAMES, q, tau, dq)
+    kept = [x for x in messages if not 0.1e9 <= x[1] < 0.3e9]
+    whole = ij.deployment.read_bag(write_bag(tmp_path / "whole", messages), scenario, joints=NAMES)
+    found = ij.deployment.read_bag(write_bag(tmp_path / "bag", kept), scenario, joints=NAMES)
+    e1 = np.abs(np.asarray(whole.e1))
+    inside = e1[:50], e1[150:]
+    expected = sum(PERIOD * np.sum((x[1:] + x[:-1]) / 2, axis=0) for x in inside)
+    np.testing.assert_allclose(found.metrics.iae, expected, rtol=1e-6)
+
+
+# --- what is wrong -------------------------------------------------------------------------------
+
+
+def truncated(folder, share):
+    """Cuts the end off the file of a recording."""
+    (path,) = (path for path in folder.iterdir() if path.suffix != ".yaml")
+    data = path.read_bytes()
+    path.write_bytes(data[: int(share * len(data))])
+
+
+@pytest.mark.parametrize("storage", bag_files.STORAGES)
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.9, 0.999])
+def test_a_truncated_recording_is_refused(storage, share, scenario, motion, tmp_path):
+    t, q, _, tau = motion
+    folder = write_bag(tmp_path / "bag", messages_of(t, NAMES, q, tau), storage)
+    truncated(folder, share)
+    with pytest.raises(
+        ValueError, match=r"expected a complete rosbag2 recording.*ros2 bag reindex"
+    ):
+        read_log(folder, scenario)
+
+
+def test_a_recording_with_less_messages_than_its_metadata_count_is_refused(
+    scenario, motion, tmp_path
+):
+    t, q, _, tau = motion
+    folder = write_bag(tmp_path / "bag", messages_of(t, NAMES, q, tau))
+    with sqlite3.connect(folder / "bag.db3") as database:
+        database.execute("DELETE FROM messages WHERE id > 350")
+    with pytest.raises(ValueError, match=r"got 50 messages less than its metadata count"):
+        read_log(folder, scenario)
+
+
+def test_a_folder_without_metadata_is_refused(scenario, motion, tmp_path):
+    t, q, _, tau = motion
+    with pytest.raises(ValueError, match=r"without metadata.yaml.*\.csv or \.nc"):
+        read(tmp_path, 2)
+    folder = write_bag(tmp_path / "bag", messages_of(t, NAMES, q, tau))
+    (folder / "metadata.yaml").unlink()
+    with pytest.raises(ValueError, match=r"ros2 bag reindex .*, or read the file bag.db3"):
+        read_log(folder, scenario)
+    np.testing.assert_array_equal(read_log(folder / "bag.db3", scenario)["q"], q)
+
+
+def one_state(names=NAMES, q=(0.0, 0.0), dq=(), stamp=0):
+    return [("/joint_states", 0, state_message(stamp, names, q, dq))]
+
+
+EFFORT = [("/efforts", 1, effort_message([0.0, 0.0]))]
+WRONG = {
+    "no joint states": (
+        EFFORT,
+        {},
+        r"joint_states: got no topics joint_states, expected .*: /efforts \(",
+    ),
+    "a topic of another type": (
+        [("/joint_states", 0, string_message("x")), *EFFORT],
+        {},
+        r"/joint_states with messages std_msgs/msg/String, expected sensor_msgs/msg/JointState",
+    ),
+    "other joints": (
+        one_state(("a", "b")) + EFFORT,
+        {},
+        r"joints: got joint states of a, b, expected joint states of shoulder, elbow",
+    ),
+    "one joint is missing": (
+        one_state(("elbow", "wrist")) + EFFORT,
+        {},
+        r"got the joints elbow, wrist, expected all of shoulder, elbow",
+    ),
+    "a name twice": (one_state(("elbow", "elbow")) + EFFORT, {}, r"different names"),
+    "too few positions": (one_state(q=(0.0,)) + EFFORT, {}, r"got 1 numbers as position"),
+    "too few velocities": (one_state(dq=(0.0,)) + EFFORT, {}, r"got 1 numbers as velocity"),
+    "another number of efforts": (
+        [*one_state(), ("/efforts", 1, effort_message([0.0, 0.0, 0.0]))],
+        {},
+        r"effort 0: got 3 numbers, expected 2, one for each joint",
+    ),
+    "efforts before all joint states": (
+        [("/efforts", 0, effort_message([0.0, 0.0])), ("/joint_states", 9, one_state()[0][2])],
+        {},
+        r"no joint state with an effort",
+    ),
+    "a part that is empty": (
+        one_state() + EFFORT,
+        {"start": 5.0},
+        r"no joint state in all from 5 s",
+    ),
+    "one name": (
+        EFFORT,
+        {"joints": "ab"},
+        r"joints: got 'ab', expected a list of 2 different names",
+    ),
+    "three names": (EFFORT, {"joints": ("a", "b", "c")}, r"joints: got .*2 different names"),
+    "an origin of time before 1970": (EFFORT, {"time_origin": -1.0}, r"time_origin: got -1"),
+    "a wrong clock": (EFFORT, {"times": "sent"}, r"times: got 'sent'"),
+    "a negative start": (EFFORT, {"start": -1.0}, r"start: got -1"),
+    "a topic that is no name": (EFFORT, {"efforts": 3}, r"efforts: got 3"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_what_is_wrong_is_refused(case, scenario, tmp_path):
+    messages, options, words = WRONG[case]
+    folder = write_bag(tmp_path / "bag", messages)
+    with pytest.raises(ValueError, match=words):
+        read_log(folder, scenario, **options)
+
+
+def test_a_topic_without_messages_is_refused(scenario, tmp_path):
+    from rosbags.rosbag2 import Writer
+
+    with Writer(tmp_path / "bag", version=9) as writer:
+        for topic, kind in (
+            ("/joint_states", bag_files.JOINT_STATE),
+            ("/efforts", bag_files.ARRAY),
+        ):
+            connection = writer.add_connection(topic, kind, typestore=bag_files.STORE)
+            if topic == "/joint_states":
+                kind, message = state_message(0, NAMES, (0.0, 0.0))
+                writer.write(connection, 0, bag_files.STORE.serialize_cdr(message, kind))
+    with pytest.raises(ValueError, match=r"no joint state with an effort.*ros2 bag record"):
+        read_log(tmp_path / "bag", scenario)
+
+
+def test_numbers_that_are_not_finite_are_refused(scenario, motion, tmp_path):
+    t, q, _, tau = motion
+    q = q.copy()
+    q[7, 1] = np.nan
+    folder = write_bag(tmp_path / "bag", messages_of(t, NAMES, q, tau))
+    with pytest.raises(
+        ValueError, match=r"q that is not finite: got 1 of 200 rows, .* t = 0.014 s"
+    ):
+        read(folder, 2, joints=NAMES)
+    with pytest.raises(ValueError, match=r"q that is not finite"):
+        ij.deployment.read_bag(folder, scenario, joints=NAMES)
+
+
+def test_paths_that_are_no_recordings(scenario, tmp_path):
+    with pytest.raises(ValueError, match="Nothing is there"):
+        read_log(tmp_path / "none", scenario)
+    (tmp_path / "log.csv").write_text("t\n")
+    with pytest.raises(ValueError, match=r"path: got .*log.csv.*\.db3 or \.mcap"):
+        read_log(tmp_path / "log.csv", scenario)
+
+
+def test_a_plant_in_strict_feedback_form_has_no_recorded_run(motion, tmp_path):
+    t, q, _, tau = motion
+    folder = write_bag(tmp_path / "bag", messages_of(t, NAMES, q, tau))
+    chain = ij.presets.flexible_joint_two_link()
+    with pytest.raises(ValueError, match=r"scenario.plant: got .*bag_log"):
+        ij.deployment.read_bag(folder, chain)
+
+
+def test_without_the_package_the_extra_is_named(scenario, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rosbags", None)
+    with pytest.raises(ImportError, match=r"rosbags.*\.\[ros\]"):
+        read_log(tmp_path, scenario)

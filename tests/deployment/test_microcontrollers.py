@@ -1,0 +1,226 @@
+"""What the page on Simulink and micro-controllers says of the C law: its blocks of C are compiled
+and run, and the law needs no C library but `memcpy`, `memset` and functions of `math.h`."""
+
+from __future__ import annotations
+
+import platform
+import re
+import shutil
+import subprocess
+import sys
+from importlib.resources import files
+
+import members
+import pytest
+from conftest import ROOT
+
+import iblf_jax as ij
+from iblf_jax.deployment.control_law import control_law
+from iblf_jax.deployment.export import vectors
+from iblf_jax.deployment.write_c import Law, generate
+from iblf_jax.simulation.scenario import canonical
+
+PAGE = (ROOT / "docs" / "how_to" / "simulink_and_microcontrollers.md").read_text(encoding="utf-8")
+STUBS = ROOT / "tests" / "deployment" / "stubs"
+STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-O1")
+CORTEX = ("-target", "thumb-linux-musleabihf", "-mcpu=cortex_m4+vfp4d16sp")
+BARE = ("-std=c99", "-ffreestanding", "-fno-unwind-tables", "-fno-asynchronous-unwind-tables")
+MEMORY = {"memcpy", "memset"}
+MATH = set(re.findall(r"FN\((\w+)\)", (files("iblf_jax.kernels") / "c" / "plain.h").read_text()))
+OWN = {"sin", "cos", "sqrt", "expm1", "fabs"}
+"""Functions of `math.h` that the law of the page needs."""
+
+pytestmark = [
+    pytest.mark.skipif(not shutil.which("cc"), reason="there is no C compiler"),
+    pytest.mark.skipif(platform.system() != "Linux", reason="objects are read by nm of Linux"),
+]
+
+
+def run(command, folder):
+    done = subprocess.run([str(x) for x in command], cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def undefined(path):
+    """The names that an object needs from elsewhere."""
+    return set(re.findall(r" U (\w+)", run(["nm", "-u", path], path.parent)))
+
+
+def writable(path):
+    """The names of writable data in an object."""
+    return re.findall(r" [bBdDcC] (\w+)", run(["nm", path], path.parent))
+
+
+def block_of(name):
+    """The block of C on the page whose comment begins with a file name."""
+    (text,) = re.findall(rf"```c\n(/\* {name}: .*?)```", PAGE, re.DOTALL)
+    return text
+
+
+def folder_of(scenario, folder):
+    """Writes the law of a scenario as `arm_law`; its self-test has the vectors of a run of 20 s."""
+    scenario = canonical(scenario)
+    found = vectors(scenario, False)
+    law = Law(scenario, control_law(scenario, False), "arm_law", False, found, (), None)
+    folder.mkdir(exist_ok=True)
+    for name, text in generate(law).files.items():
+        (folder / name).write_text(text)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def sampled():
+    return ij.with_parts(ij.presets.zhang_yan_2024(), sampling=ij.Sampling(1e-3))
+
+
+@pytest.fixture(scope="module")
+def law(sampled, tmp_path_factory):
+    return folder_of(sampled, tmp_path_factory.mktemp("law"))
+
+
+@pytest.fixture(scope="module")
+def small_law(sampled, tmp_path_factory):
+    return folder_of(ij.astype(sampled, "float32"), tmp_path_factory.mktemp("small_law"))
+
+
+BLOCK_TEST = """
+#include <math.h>
+#include <stdio.h>
+#include "arm_law.h"
+#include "vectors.h"
+
+void arm_law_block_reset(void);
+void arm_law_block(double t, const double q[2], const double dq[2], double tau[2]);
+
+int main(void) {
+  double tau[2], worst = 0.0, largest = 1.0;
+  int k, i, round;
+  for (round = 0; round < 2; round++) {
+    arm_law_block_reset();
+    for (k = 0; k < SAMPLES; k++) {
+      arm_law_block(k * 1e-3, q[k], dq[k], tau);
+      for (i = 0; i < 2 && k % CHECKED == 0; i++) {
+        largest = fmax(largest, fabs(torque[k / CHECKED][i]));
+        worst = fmax(worst, fabs(tau[i] - torque[k / CHECKED][i]));
+      }
+    }
+  }
+  (void)first_q, (void)first_dq;
+  printf("%.3g\\n", worst / largest);
+  return 0;
+}
+"""
+
+
+def test_the_c_caller_block_of_the_page_returns_the_torques_of_the_self_test(law):
+    """A second run after a reset is the first one again."""
+    (law / "arm_law_block.c").write_text(block_of("arm_law_block.c"))
+    (law / "block_test.c").write_text(BLOCK_TEST)
+    sources = ("block_test.c", "arm_law_block.c", "arm_law.c")
+    run(["cc", *STRICT, *sources, "-lm", "-o", "block_test"], law)
+    # The start of the run of the self-test is not rounded, and its samples are.
+    assert float(run(["./block_test"], law)) < 1e-6
+
+
+def test_the_s_function_of_the_page_returns_the_torques_of_the_self_test(law):
+    (law / "arm_law_sfun.c").write_text(block_of("arm_law_sfun.c"))
+    includes = ("-I", STUBS, "-I", law)
+    sources = ("arm_law_sfun.c", "arm_law.c")
+    run(["cc", *STRICT, *includes, *sources, "-lm", "-o", "sfun_test"], law)
+    worst, status = map(float, run(["./sfun_test"], law).split())
+    assert worst < 1e-6 and status == 0.0
+
+
+@pytest.mark.parametrize("suffix", ["", "f"])
+def test_the_law_of_the_page_needs_the_functions_that_it_lists(suffix, law, small_law):
+    folder = small_law if suffix else law
+    run(["cc", *BARE, "-O2", "-fno-stack-protector", "-c", "arm_law.c", "-o", "law.o"], folder)
+    needed = undefined(folder / "law.o") - {"_GLOBAL_OFFSET_TABLE_"}
+    assert needed == MEMORY | {f"{name}{suffix}" for name in OWN}
+    assert writable(folder / "law.o") == []
+    others = re.search(r"The others that can occur are (.*?)\. newlib", PAGE, re.DOTALL)[1]
+    assert set(re.findall(r"`(\w+)`", others)) == MATH - OWN
+
+
+TINY_LIBRARY = """
+#include <stddef.h>
+void *memcpy(void *restrict to, const void *restrict from, size_t n) {
+  unsigned char *a = to; const unsigned char *b = from;
+  while (n--) *a++ = *b++;
+  return to;
+}
+void *memset(void *to, int x, size_t n) {
+  unsigned char *a = to;
+  while (n--) *a++ = (unsigned char)x;
+  return to;
+}
+"""
+
+
+def test_a_law_links_without_a_c_library(law):
+    """Against `memcpy`, `memset` and the mathematical library alone."""
+    (law / "tiny.c").write_text(TINY_LIBRARY)
+    bare = (*BARE, "-O2", "-fPIC", "-fno-stack-protector", "-fno-tree-loop-distribute-patterns")
+    run(["cc", *bare, "-c", "arm_law.c", "tiny.c"], law)
+    link = ["cc", "-shared", "-nostdlib", "-nodefaultlibs", "-Wl,--no-undefined"]
+    run([*link, "arm_law.o", "tiny.o", "-lm", "-o", "bare.so"], law)
+    needed = re.findall(r"NEEDED\s+(\S+)", run(["objdump", "-p", "bare.so"], law))
+    assert len(needed) == 1 and needed[0].startswith("libm")
+    missing = subprocess.run(
+        [*link, "arm_law.o", "-lm", "-o", "none.so"], cwd=law, capture_output=True, text=True
+    )
+    assert missing.returncode != 0 and "memcpy" in missing.stderr
+
+
+@pytest.mark.parametrize("name", members.LAWS)
+def test_every_law_needs_only_memory_and_mathematics(name, sampled, tmp_path):
+    scenario = ij.with_parts(
+        sampled,
+        controller=members.LAWS[name],
+        velocity_bounds=ij.Bounds(ij.bounds.Constant(-2.0), ij.bounds.Constant(2.5)),
+    )
+    scenario = canonical(scenario)
+    none = vectors_of_nothing(scenario)
+    law = Law(scenario, control_law(scenario, False), "arm_law", False, none, (), None)
+    for file, text in generate(law).files.items():
+        (tmp_path / file).write_text(text)
+    run(["cc", *BARE, "-O0", "-fno-stack-protector", "-c", "arm_law.c", "-o", "law.o"], tmp_path)
+    needed = undefined(tmp_path / "law.o") - {"_GLOBAL_OFFSET_TABLE_"}
+    assert needed <= MEMORY | MATH and needed >= MEMORY
+    assert writable(tmp_path / "law.o") == []
+
+
+def vectors_of_nothing(scenario):
+    """Self-test vectors of two samples at the start; the self-test is not compiled."""
+    from iblf_jax.deployment.control_law import inputs_at_start
+    from iblf_jax.deployment.write_c import Vectors
+
+    first = inputs_at_start(scenario)
+    rows = [[x, x] for x in (first.q, first.dq)]
+    return Vectors((first.q, first.dq), *rows, (), rows[0])
+
+
+def test_the_law_compiles_for_a_cortex_m4(small_law):
+    pytest.importorskip("ziglang", reason="ziglang of the extra `export` is not installed")
+    assert " ".join(CORTEX) in PAGE
+    compiler = [sys.executable, "-m", "ziglang", "cc", *CORTEX, *BARE, "-Os"]
+    run([*compiler, "-c", "arm_law.c", "-o", "m4.o"], small_law)
+    data = (small_law / "m4.o").read_bytes()
+    assert data[:5] == b"\x7fELF\x01" and int.from_bytes(data[18:20], "little") == 40  # 32-bit Arm
+    assert undefined(small_law / "m4.o") == MEMORY | {f"{name}f" for name in OWN}
+    assert writable(small_law / "m4.o") == []
+    size = int(run(["size", "m4.o"], small_law).splitlines()[1].split()[0])
+    assert "The code has 4 kB in single precision" in PAGE and 3000 < size < 5500
+
+
+def test_operation_counts_of_the_page_are_those_of_the_export(law):
+    text = (law / "README.md").read_text()
+    sums, divisions, roots, others = (
+        int(x)
+        for x in re.search(
+            r"(\d+) sums.*?(\d+) divisions, (\d+) square roots, (\d+) elementary", text, re.DOTALL
+        ).groups()
+    )
+    words = f"({sums} sums and products, {divisions + roots} divisions and\nsquare roots, {others}"
+    assert words in PAGE
