@@ -27,6 +27,7 @@ rclpy = pytest.importorskip("rclpy", reason=REASON)
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParameters
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
@@ -200,9 +201,7 @@ class Nodes:
         self.file = package.prefix / "share" / NAME / "config" / f"{NAME}.yaml"
         self.processes: list[subprocess.Popen] = []
 
-    def begin(
-        self, program=("-m", f"{NAME}.law_node"), remap=(), **parameters
-    ) -> subprocess.Popen:
+    def begin(self, program=("-m", f"{NAME}.law_node"), remap=(), **parameters) -> subprocess.Popen:
         command = [sys.executable, *program, "--ros-args", "--params-file", str(self.file)]
         for rule in remap:
             command += ["-r", rule]
@@ -345,6 +344,22 @@ def test_a_tick_without_a_new_state_repeats_the_torques(client, nodes):
     assert int(client.diagnostics["periods_without_new_state"]) > 20
     assert len(client.efforts) > 60
     assert len(set(map(tuple, client.efforts))) <= 41
+
+
+@pytest.mark.parametrize("trigger", ["timer", "state"])
+def test_a_best_effort_driver_reaches_the_trigger_timer_only(client, nodes, trigger):
+    quality = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+    driver = client.node.create_publisher(JointState, "joint_states", quality)
+    nodes.begin(trigger=trigger)
+    client.connect()
+    reliable, client.states = client.states, driver
+    try:
+        if trigger == "timer":
+            client.reach("stopped")
+        client.drive_for(0.5)
+    finally:
+        client.states = reliable
+    assert client.mode == ("stopped" if trigger == "timer" else "waiting")
 
 
 def test_the_parameter_file_holds_in_a_namespace_and_under_another_name(client, nodes, tmp_path):

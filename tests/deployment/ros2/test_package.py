@@ -250,12 +250,15 @@ def test_the_launch_file_starts_the_node(package, monkeypatch):
     namespace: dict = {}
     path = share / "launch" / f"{NAME}.launch.py"
     exec(compile(path.read_text(), str(path), "exec"), namespace)
-    argument, node = namespace["generate_launch_description"]()
+    argument, *topics, node = namespace["generate_launch_description"]()
     assert argument[1] == ("parameters",)
     assert argument[2]["default_value"] == str(share / "config" / f"{NAME}.yaml")
     assert (share / "config" / f"{NAME}.yaml").is_file()
     assert (node[2]["package"], node[2]["executable"]) == (NAME, "law_node")
     assert node[2]["parameters"] == [("configuration", ("parameters",), {})]
+    names = ["joint_states", "efforts", "diagnostics"]
+    assert [(x[1][0], x[2]["default_value"]) for x in topics] == [(x, x) for x in names]
+    assert node[2]["remappings"] == [(x, ("configuration", (x,), {})) for x in names]
 
 
 def test_the_description_is_read_as_it_was_written(package):

@@ -26,8 +26,8 @@ from iblf_jax.deployment.ros2.node.c_law import NOT_FINITE, CLaw
 NANOSECONDS = 1_000_000_000
 MIN_STAMP_SPACING = 0.75
 """Shortest distance of the stamps of two samples of a law that samples with the states, in periods.
-A state that follows sooner, from a driver that is faster than the law, is kept for diagnostics and
-holds, but the law does not answer it."""
+A state that follows sooner, from a driver that is faster than the law, becomes the last state, but
+the law does not answer it."""
 STAMP_TOLERANCE = 0.01
 """Tolerance of the distance of two stamps, in periods."""
 STALE_PERIODS = 2.0
@@ -293,8 +293,6 @@ class Supervisor:
         self._previous, self._state = before, state
         self._last_stamp = state.stamp
         self._why_invalid = None
-        if before is not None and state.received - before.received > self._arrival_timeout:
-            self._hold_position = None
         if last is not None:
             self._check_gap(state.stamp - last)
         due = self._due_stamp
