@@ -293,10 +293,13 @@ class Supervisor:
         self._previous, self._state = before, state
         self._last_stamp = state.stamp
         self._why_invalid = None
+        spacing = MIN_STAMP_SPACING * self._period
         if last is not None:
             self._check_gap(state.stamp - last)
+            # Of the states of a faster driver, the one closest to a whole period is answered.
+            spacing = max(spacing, self._period - (state.stamp - last) / 2)
         due = self._due_stamp
-        if due is not None and state.stamp - due < MIN_STAMP_SPACING * self._period:
+        if due is not None and state.stamp - due < spacing:
             return False
         if due is not None:
             self.missed += max(round((state.stamp - due) / self._period) - 1, 0)
