@@ -32,6 +32,7 @@ def bounds_of_c(folder, size, t, *reference):
     return lower, upper
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["zhang_yan_2024_funnel", "motor_driven_pendulum"])
 def test_bounds_are_a_function_of_time(name, tmp_path):
     scenario = ij.with_parts(getattr(ij.presets, name)(), sampling=ij.Sampling(PERIOD))

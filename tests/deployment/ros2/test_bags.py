@@ -317,6 +317,7 @@ def logged():
     return rows[:, 0], rows[:, 1:3], rows[:, 3:5]
 
 
+@pytest.mark.slow
 def test_a_recording_identifies_what_the_same_csv_file_identifies(logged, tmp_path, capsys):
     t, q, tau = logged
     folder = write_bag(tmp_path / "run_bag", messages_of(t, NAMES, q, tau, origin=ORIGIN), "mcap")
@@ -332,6 +333,7 @@ def test_a_recording_identifies_what_the_same_csv_file_identifies(logged, tmp_pa
         np.testing.assert_allclose(one.error, two.error, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_the_latency_of_the_efforts_is_estimated(tmp_path):
     """The robot receives each effort 2 ms after the stamp of the joint state, as the recorder."""
     scenario = bag_files.example_scenario()
@@ -348,6 +350,7 @@ def test_the_latency_of_the_efforts_is_estimated(tmp_path):
     np.testing.assert_allclose([x.value for x in known.wanted], true, rtol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("as_option", [False, True])
 def test_the_command_line_reads_a_recording(as_option, logged, tmp_path, capsys):
     t, q, tau = logged
@@ -363,6 +366,7 @@ def test_the_command_line_reads_a_recording(as_option, logged, tmp_path, capsys)
     assert "6 of 6 numbers" in shown.out and "no joint names" in shown.err
 
 
+@pytest.mark.slow
 def test_the_recording_of_the_examples_is_a_run_of_its_arm(tmp_path):
     scenario = bag_files.example_scenario()
     place = ROOT / "examples" / "run_bag"
@@ -379,6 +383,7 @@ def test_the_recording_of_the_examples_is_a_run_of_its_arm(tmp_path):
 # --- runs ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sensor", [None, "encoder"])
 def test_a_recorded_run_is_the_simulated_run(sensor, scenario, tmp_path):
     """Law and observer run on the recorded readings as they ran on the robot."""
@@ -418,6 +423,7 @@ def test_the_law_of_a_recorded_run_has_its_own_period(scenario, tmp_path):
     np.testing.assert_allclose(found.dt, 1e-3)
 
 
+@pytest.mark.slow
 def test_another_law_or_origin_of_time_is_reported(scenario, tmp_path):
     """The law of a recording that began 0.5 s after it has its own time.  The observer, which
     starts with the recording, forgets its start."""

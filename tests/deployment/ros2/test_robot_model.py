@@ -20,6 +20,7 @@ CHAIN = ij.with_parts(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scenario", [PAPER, CHAIN], ids=["two links", "chain"])
 @pytest.mark.parametrize("payload", [0.0, 0.4])
 def test_a_planar_arm_moves_in_mujoco_as_in_simulate(scenario, payload):

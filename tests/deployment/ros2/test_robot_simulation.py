@@ -90,6 +90,7 @@ def closed_with_law(simulation: RobotSimulation, scenario, periods: int) -> Robo
     return motion_of(simulation)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scenario", [PAPER, NOISY], ids=["exact", "noise and delay"])
 def test_a_robot_answered_at_once_moves_as_in_cosimulate(scenario):
     simulation = robot(sensor=scenario.sensor, delay=float(scenario.sampling.delay), seed=3)
@@ -213,6 +214,7 @@ def test_an_effort_within_a_period_acts_from_its_arrival_on():
     np.testing.assert_array_equal(motion.tau[after], [[-3.0, 1.0]] * after.sum())
 
 
+@pytest.mark.slow
 def test_a_payload_changes_the_motion_as_that_of_the_plant_does():
     length = float(PAPER.plant.length[1])
     loaded = robot(payload=ij.robots.Payload(mass=0.3, centre=[length, 0.0, 0.0]))

@@ -28,9 +28,12 @@ JOINTS = ("joint_1", "joint_2")
 UNTOUCHED = 123.5
 """What an effort of the harness is before the first command."""
 
-pytestmark = pytest.mark.skipif(
-    not (shutil.which("c++") and shutil.which("cc")), reason="there is no compiler of C and C++"
-)
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(
+        not (shutil.which("c++") and shutil.which("cc")), reason="there is no compiler of C and C++"
+    ),
+]
 
 
 def places_of(generated, path):
