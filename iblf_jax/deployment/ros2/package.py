@@ -22,6 +22,7 @@ from iblf_jax import __version__
 from iblf_jax.core import checks
 from iblf_jax.deployment.build import write_files
 from iblf_jax.deployment.c_names import Parameters
+from iblf_jax.deployment.ros2.node.supervisor import ARRIVAL_TIMEOUT, STALE_PERIODS
 from iblf_jax.deployment.ros2.ros2_control import controller_package, ros2_control_files
 from iblf_jax.deployment.ros2.yaml_text import yaml_number, yaml_numbers
 from iblf_jax.deployment.write_c import GeneratedLaw, Law, title_of
@@ -50,7 +51,7 @@ PACKAGE_NAME = r"[a-z](?:_?[a-z0-9])+"
 PERIOD = "sampling.period"
 
 
-class Gain(NamedTuple):
+class GainOption(NamedTuple):
     """A gain of the node: a leaf, or entries of one, with its range."""
 
     path: str
@@ -65,7 +66,7 @@ class Gain(NamedTuple):
 class RosOptions(NamedTuple):
     """The validated options of a package."""
 
-    gains: tuple[Gain, ...]
+    gains: tuple[GainOption, ...]
     torque_limits: np.ndarray
     """(n,) [N m]."""
     on_fault: str
@@ -127,7 +128,7 @@ def _torque_limits(scenario: Scenario, given: Any) -> np.ndarray:
     raise checks.fail("torque_limits", given, expected, "Give the limits of the drives.")
 
 
-def _gains(scenario: Scenario, given: Any) -> tuple[Gain, ...]:
+def _gains(scenario: Scenario, given: Any) -> tuple[GainOption, ...]:
     """The gains with their ranges, those of `tune` where none are given."""
     if given is None:
         return ()
@@ -184,7 +185,7 @@ def _range_end(given: Any, numbers: np.ndarray) -> np.ndarray:
     return np.broadcast_to(np.asarray(given, float).reshape(-1), numbers.shape)
 
 
-def _gain(scenario: Scenario, item: Tunable, low: np.ndarray, high: np.ndarray) -> Gain:
+def _gain(scenario: Scenario, item: Tunable, low: np.ndarray, high: np.ndarray) -> GainOption:
     """A gain whose range is admissible."""
     value = np.asarray(paths.get(scenario, item.path), float)
     for name, end in (("low", low), ("high", high)):
@@ -195,7 +196,7 @@ def _gain(scenario: Scenario, item: Tunable, low: np.ndarray, high: np.ndarray) 
         reason = paths.why_inadmissible(scenario, {item.path: jnp.asarray(complete)})
         if reason:
             raise checks.fail(f"gains: {item.path}: {name}", end, "an admissible value", reason)
-    return Gain(item.path, paths.unit_at(scenario, item.path), value, low, high, item.tied)
+    return GainOption(item.path, paths.unit_at(scenario, item.path), value, low, high, item.tied)
 
 
 def _offsets(scenario: Scenario, parameters: Parameters, path: str) -> np.ndarray:
@@ -242,7 +243,7 @@ def _joints(law: Law) -> tuple[str, ...]:
     return law.joints or tuple(f"joint_{i + 1}" for i in range(law.scenario.n))
 
 
-def _gain_row(scenario: Scenario, parameters: Parameters, gain: Gain) -> dict[str, Any]:
+def _gain_row(scenario: Scenario, parameters: Parameters, gain: GainOption) -> dict[str, Any]:
     """A gain in `law.json`."""
     numbers = _offsets(scenario, parameters, gain.path).reshape(-1)
     offsets = [[int(x)] for x in numbers]
@@ -301,6 +302,8 @@ def ros_files(law: Law, generated: GeneratedLaw, options: RosOptions) -> dict[st
         "version": __version__,
         "joints": json.dumps(description["joints"]),
         "period": yaml_number(description["period"]),
+        "state_timeout": yaml_number(STALE_PERIODS * description["period"]),
+        "arrival_timeout": yaml_number(ARRIVAL_TIMEOUT),
         "torque_limits": yaml_numbers(description["torque_limits"]),
         "on_fault": description["on_fault"],
         "hold_stiffness": yaml_numbers(description["hold_stiffness"]),

@@ -27,6 +27,7 @@ rclpy = pytest.importorskip("rclpy", reason=REASON)
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParameters
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
@@ -200,8 +201,10 @@ class Nodes:
         self.file = package.prefix / "share" / NAME / "config" / f"{NAME}.yaml"
         self.processes: list[subprocess.Popen] = []
 
-    def begin(self, program=("-m", f"{NAME}.law_node"), **parameters) -> subprocess.Popen:
+    def begin(self, program=("-m", f"{NAME}.law_node"), remap=(), **parameters) -> subprocess.Popen:
         command = [sys.executable, *program, "--ros-args", "--params-file", str(self.file)]
+        for rule in remap:
+            command += ["-r", rule]
         for name, value in ({"state_timeout": 0.5} | parameters).items():
             command += ["-p", f"{name}:={value}"]
         process = subprocess.Popen(command, env=self.environment, stderr=subprocess.PIPE, text=True)
@@ -295,6 +298,87 @@ def test_start_hold_and_stop(client, nodes):
     client.reach("stopped")
     client.drive_for(0.2)
     assert client.efforts[-1] == [0.0, 0.0]
+
+
+def test_stop_while_waiting_cancels_the_automatic_start(client, nodes):
+    nodes.begin(start_automatically="true")
+    client.connect()
+    assert "automatic start is cancelled" in client.call("stop", drives=False).message
+    client.reach("stopped")
+    client.drive_for(0.3)
+    assert client.mode == "stopped"
+    assert set(map(tuple, client.efforts)) == {(0.0, 0.0)}
+    assert client.diagnostics["time_origin [s]"] == "not set"
+
+
+def test_a_start_outside_of_the_bounds_is_refused(client, nodes):
+    outside = {"q": (5.0, INSIDE[1])}
+    nodes.begin(state_timeout=TIMEOUT)
+    client.connect()
+    client.reach("stopped", **outside)
+    response = client.call("start", drives=False)
+    assert not response.success
+    assert "joint_1 at 5 rad, bounds " in response.message
+    assert "joint_2" not in response.message
+    assert "start_outside_bounds: true" in response.message
+    client.drive_for(0.2, **outside)
+    assert client.mode == "stopped"
+
+
+def test_a_start_outside_of_the_bounds_can_be_allowed(client, nodes):
+    nodes.begin(start_outside_bounds="true", start_automatically="true")
+    client.connect()
+    client.reach("running", q=(5.0, INSIDE[1]))
+
+
+def test_a_tick_without_a_new_state_repeats_the_torques(client, nodes):
+    """States every three periods: the law computes new torques for each of them, and once."""
+    nodes.begin(start_automatically="true")
+    client.connect()
+    client.reach("running")
+    client.efforts.clear()
+    for _ in range(40):
+        client.state(dq=tuple(np.random.default_rng().normal(0.0, 0.1, 2)))
+        client.spin(3 * PERIOD)
+    assert client.mode == "running"
+    assert int(client.diagnostics["periods_without_new_state"]) > 20
+    assert len(client.efforts) > 60
+    assert len(set(map(tuple, client.efforts))) <= 41
+
+
+@pytest.mark.parametrize("trigger", ["timer", "state"])
+def test_a_best_effort_driver_reaches_the_trigger_timer_only(client, nodes, trigger):
+    quality = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+    driver = client.node.create_publisher(JointState, "joint_states", quality)
+    nodes.begin(trigger=trigger)
+    client.connect()
+    reliable, client.states = client.states, driver
+    try:
+        if trigger == "timer":
+            client.reach("stopped")
+        client.drive_for(0.5)
+    finally:
+        client.states = reliable
+    assert client.mode == ("stopped" if trigger == "timer" else "waiting")
+
+
+def test_the_parameter_file_holds_in_a_namespace_and_under_another_name(client, nodes, tmp_path):
+    """Lowered limits of torques are not ignored there."""
+    text = nodes.file.read_text()
+    assert "torque_limits: [40.0, 15.0]" in text
+    nodes.file = tmp_path / "lowered.yaml"
+    nodes.file.write_text(text.replace("[40.0, 15.0]", "[5.0, 3.0]"))
+    topics = [f"{topic}:=/{topic}" for topic in ("joint_states", "efforts", "diagnostics")]
+    names = ["__ns:=/left", "__node:=other_law"]
+    nodes.begin(remap=[*names, *topics], start_automatically="true")
+    client.connect()
+    client.reach("running")
+    rng = np.random.default_rng(0)
+    for _ in range(100):
+        q, dq = rng.normal(0.5, 1.0, 2), rng.normal(0.0, 20.0, 2)
+        client.state(q=q.tolist(), dq=dq.tolist())
+        client.spin(PERIOD)
+    np.testing.assert_array_equal(np.abs(client.efforts).max(axis=0), [5.0, 3.0])
 
 
 FAULTS = {
@@ -394,7 +478,13 @@ def test_a_gain_changes_while_the_law_runs_and_is_refused_outside_of_its_range(c
     assert not client.set("controller.k1", 4.1)[0]
     assert not client.set("torque_limits", [1.0, 1.0])[0], "read-only"
     assert not client.set("period", 0.02)[0], "read-only"
-    assert not client.set("time_origin", math.inf)[0]
+    for value in (math.inf, -math.inf, 1e300):
+        succeeded, reason = client.set("time_origin", value)
+        assert not succeeded
+        assert f"time_origin: got {value}, expected a stamp" in reason
+        assert "NaN is the stamp at the start" in reason
+    assert not client.set("state_timeout", math.inf)[0], "read-only"
+    assert not client.set("arrival_timeout", math.inf)[0], "read-only"
     assert client.set("controller.K2", [4.0, 3.5]) == (True, "")
     assert client.set("controller.k1", 2.0) == (True, "")
     assert client.get("controller.K2") == [4.0, 3.5]
@@ -479,6 +569,35 @@ def test_a_node_that_ends_sends_the_torques_of_its_policy(client, nodes, policy,
     assert (client.efforts[-1] == [0.0, 0.0]) == (policy == "zero")
 
 
+@pytest.mark.parametrize("policy", ["zero", "hold"])
+def test_a_node_whose_callback_fails_sends_the_torques_of_its_policy(
+    client, nodes, package, policy
+):
+    """The law's function raises an error at its thirtieth call."""
+    program = (
+        f"import sys; from {NAME} import c_law; from {NAME}.law_node import main\n"
+        "step, calls = c_law.CLaw.step, []\n"
+        "def failing(self, *args):\n"
+        "    calls.append(1)\n"
+        "    if len(calls) == 30: raise ZeroDivisionError('an error of the test')\n"
+        "    return step(self, *args)\n"
+        "c_law.CLaw.step = failing\n"
+        "sys.exit(main())"
+    )
+    process = nodes.begin(program=["-c", program], on_fault=policy, start_automatically="true")
+    client.connect()
+    client.drive(lambda: process.poll() is not None, "the process goes on")
+    assert process.returncode == 1
+    assert "an error of the test" in process.stderr.read()
+    client.spin(0.2)
+    balance = [0.0, 0.0]
+    if policy == "hold":
+        balance = load_law(package.modules / NAME).balance(INSIDE)
+    np.testing.assert_allclose(client.efforts[-1], balance)
+    assert len(client.efforts) >= 30
+    assert np.abs(client.efforts[-2]).max() > 0
+
+
 REFUSED = {
     "another period": ({"period": 0.02}, "period: got 0.02, expected the exported period 0.01 s"),
     "too few joints": ({"joints": "[joint_1]"}, "joints: got ['joint_1'], expected 2 different"),
@@ -493,6 +612,14 @@ REFUSED = {
     "a trigger": ({"trigger": "clock"}, "trigger: got clock"),
     "a negative stiffness": ({"hold_stiffness": "[-1.0, 1.0]"}, "hold_stiffness: got [-1.0"),
     "an infinite time": ({"time_origin": ".inf"}, "time_origin: got inf"),
+    "a time beyond all stamps": ({"time_origin": 1e300}, "time_origin: got 1e+300"),
+    "an infinite age": ({"state_timeout": ".inf"}, "state_timeout: got inf, expected a time > 0"),
+    "an age that is no number": ({"state_timeout": ".nan"}, "state_timeout: got nan"),
+    "an infinite wait": ({"arrival_timeout": ".inf"}, "arrival_timeout: got inf"),
+    "an infinite wait with the trigger state": (
+        {"arrival_timeout": ".inf", "trigger": "state"},
+        "arrival_timeout: got inf, expected a time > 0 and at most 3600 s. The default is 0.5 s.",
+    ),
     "a timeout of zero": ({"state_timeout": 0.0}, "state_timeout: got 0.0"),
     "a gain": ({"controller.K2": "[9.0, 2.0]"}, "controller.K2: got 9, expected a number from 1"),
     "a scalar gain": ({"controller.k1": 9.0}, "controller.k1: got"),

@@ -206,7 +206,9 @@ def test_the_self_test_of_the_c_law_passes(package, tmp_path):
 
 def test_the_parameter_file_has_the_exported_values(package):
     text = (package.source / "config" / f"{NAME}.yaml").read_text()
-    values = yaml.safe_load(text)[NAME]["ros__parameters"]
+    content = yaml.safe_load(text)
+    assert list(content) == ["/**"], "the file holds for a node in a namespace too"
+    values = content["/**"]["ros__parameters"]
     assert values["period"] == 0.01
     assert values["torque_limits"] == [40.0, 15.0]
     assert values["joints"] == ["joint_1", "joint_2"]
@@ -215,7 +217,17 @@ def test_the_parameter_file_has_the_exported_values(package):
     assert values["observer.kf[1]"] == 3.0
     assert values["time_origin"] != values["time_origin"]
     assert values["start_automatically"] is False
+    assert values["start_outside_bounds"] is False
+    assert values["state_timeout"] == 2 * values["period"]
+    assert values["arrival_timeout"] == 0.5
     assert all(isinstance(x, float) for x in values["hold_stiffness"] + values["hold_damping"])
+
+
+def test_the_readme_of_the_package_says_what_a_robot_needs(package):
+    text = (package.source / "README.md").read_text()
+    for word in ("brakes", "state_timeout", "arrival_timeout", "best-effort", "falls", "/commands"):
+        assert word in text
+    assert "$" not in text
 
 
 def test_the_launch_file_starts_the_node(package, monkeypatch):
@@ -238,12 +250,15 @@ def test_the_launch_file_starts_the_node(package, monkeypatch):
     namespace: dict = {}
     path = share / "launch" / f"{NAME}.launch.py"
     exec(compile(path.read_text(), str(path), "exec"), namespace)
-    argument, node = namespace["generate_launch_description"]()
+    argument, *topics, node = namespace["generate_launch_description"]()
     assert argument[1] == ("parameters",)
     assert argument[2]["default_value"] == str(share / "config" / f"{NAME}.yaml")
     assert (share / "config" / f"{NAME}.yaml").is_file()
     assert (node[2]["package"], node[2]["executable"]) == (NAME, "law_node")
     assert node[2]["parameters"] == [("configuration", ("parameters",), {})]
+    names = ["joint_states", "efforts", "diagnostics"]
+    assert [(x[1][0], x[2]["default_value"]) for x in topics] == [(x, x) for x in names]
+    assert node[2]["remappings"] == [(x, ("configuration", (x,), {})) for x in names]
 
 
 def test_the_description_is_read_as_it_was_written(package):

@@ -67,6 +67,7 @@ def configuration(**changes):
         "hold_stiffness": (4.0, 3.0, 2.0),
         "hold_damping": (0.4, 0.3, 0.2),
         "start_automatically": False,
+        "start_outside_bounds": False,
         "stamp_timeout": 2 * PERIOD,
         "arrival_timeout": 2 * PERIOD,
     }
@@ -297,10 +298,12 @@ def test_a_burst_gives_one_sample_a_period():
     assert bench.supervisor.missed == 0
 
 
-def test_faster_states_than_samples_are_not_missed_samples():
+@pytest.mark.parametrize("factor", [1, 2, 3, 4, 5, 10])
+def test_of_faster_states_than_samples_one_a_period_is_answered(factor):
     bench = Bench(arrival_timeout=0.5)
-    answered = sum(bench.state(stamp=EPOCH + k * T // 2) for k in range(20))
-    assert answered == 10
+    stamps = [EPOCH + k * T // factor for k in range(10 * factor)]
+    answered = [stamp for stamp in stamps if bench.state(stamp=stamp)]
+    assert answered == [EPOCH + k * T for k in range(10)]
     assert bench.supervisor.missed == 0
 
 
@@ -330,10 +333,82 @@ def test_a_reference_that_has_not_begun_is_refused():
     assert bench.mode is Mode.STOPPED
 
 
-def test_the_start_names_joints_outside_of_their_bounds():
+OUTSIDE = "elbow at 1.5 rad, bounds -1 to 1 rad; wrist at -1 rad, bounds -1 to 1 rad."
+
+
+def test_a_start_outside_of_the_bounds_is_refused():
     bench = Bench()
     bench.period(q=(0.0, 1.5, -1.0))
-    assert "Outside of their bounds at the start: elbow, wrist." in bench.start()
+    started, message = bench.supervisor.start(bench.now, bench.clock)
+    assert not started
+    assert OUTSIDE in message and "Move the robot, or" in message
+    assert bench.law.inits == []
+    assert bench.period().mode is Mode.STOPPED
+    bench.start()
+    assert bench.period(q=(0.0, 1.5, 0.0)).mode is Mode.RUNNING, "only the start is refused"
+
+
+def test_a_start_outside_of_the_bounds_can_be_allowed():
+    bench = Bench(start_outside_bounds=True)
+    bench.period(q=(0.0, 1.5, -1.0))
+    assert OUTSIDE in bench.start()
+    assert bench.period(q=(0.0, 1.5, -1.0)).mode is Mode.RUNNING
+
+
+def test_an_automatic_start_outside_of_the_bounds_is_refused():
+    bench = Bench(start_automatically=True)
+    assert bench.period(q=(0.0, 1.5, -1.0)).mode is Mode.STOPPED
+    assert OUTSIDE in bench.supervisor.note
+    assert bench.period().mode is Mode.STOPPED
+
+
+def test_stop_while_waiting_cancels_the_automatic_start():
+    bench = Bench(start_automatically=True)
+    assert bench.command() is None
+    assert "automatic start is cancelled" in bench.supervisor.stop()[1]
+    for _ in range(3):
+        assert bench.period().mode is Mode.STOPPED
+    assert bench.law.inits == []
+    bench.start()
+    assert bench.period().mode is Mode.RUNNING
+
+
+def test_a_period_without_a_new_state_repeats_the_torques():
+    bench = Bench().running()
+    bench.law.status = 4
+    first = bench.period()
+    calls = len(bench.law.calls)
+    bench.law.torque = [0.1, 0.2, 0.3]
+    stamp = bench.clock
+    bench.now += T // 2
+    assert bench.command() == first
+    bench.state(q=(0.4, 0.4, 0.4), stamp=stamp)  # the same stamp once more is no new state
+    bench.now += T // 2
+    assert bench.command() == first
+    assert len(bench.law.calls) == calls
+    assert bench.supervisor.repeated == 2
+    assert bench.period().torque == [0.1, 0.2, 0.3]
+    assert len(bench.law.calls) == calls + 1
+    assert bench.supervisor.repeated == 2
+
+
+def test_repeated_torques_keep_their_limits():
+    bench = Bench().running()
+    bench.law.torque = [11.0, -6.0, 1.0]
+    bench.period()
+    bench.now += T
+    assert bench.command().torque == [10.0, -5.0, 1.0]
+    assert bench.supervisor.repeated == 1
+
+
+def test_a_new_start_does_not_repeat_torques_of_the_earlier_run():
+    bench = Bench().running()
+    bench.supervisor.stop()
+    bench.start()
+    calls = len(bench.law.calls)
+    bench.command()
+    assert len(bench.law.calls) == calls + 1
+    assert bench.supervisor.repeated == 0
 
 
 def test_a_law_that_does_not_start_leaves_the_mode():
@@ -400,9 +475,87 @@ def test_without_fresh_states_hold_is_gravity_alone():
     command = bench.command()
     assert command.mode is Mode.FAULT
     assert command.torque == pytest.approx(bench.law.balance((0.1, 0.2, 0.3)))
-    fresh = bench.period(q=(0.3, 0.2, 0.3))
+
+
+@pytest.mark.parametrize("policy", ["hold", "holding"])
+def test_states_that_return_after_an_outage_make_no_step_of_the_torques(policy):
+    """The first of them is the position that is held from then on."""
+    bench = Bench(on_fault="hold").running()
+    if policy == "holding":
+        bench.supervisor.hold(bench.now, bench.clock)
+    bench.now += 3 * T
+    assert bench.command().mode is Mode.FAULT
+    first = (0.3, 0.2, 0.3)
+    assert bench.period(q=first).torque == pytest.approx(bench.law.balance(first))
+    gravity = bench.law.balance((0.4, 0.2, 0.3))
+    later = bench.period(q=(0.4, 0.2, 0.3))
+    assert later.torque == pytest.approx([gravity[0] - 4.0 * 0.1, *gravity[1:]])
+
+
+def test_an_outage_between_two_commands_counts_too():
+    """With the trigger "state" no command may fall into the outage."""
+    bench = Bench(on_fault="hold", arrival_timeout=0.5).running()
+    bench.period(q=(math.nan,) * 3)
+    bench.period()
+    bench.now += 4 * T
+    bench.state(q=(0.3, 0.2, 0.3))
+    command = bench.supervisor.command(bench.now)
+    assert command.mode is Mode.FAULT
+    assert command.torque == pytest.approx(bench.law.balance((0.3, 0.2, 0.3)))
+
+
+def test_a_late_command_does_not_move_the_position_of_the_hold():
+    """States that wait while the process is suspended are no interruption: a position that moved
+    at each of them would let a loaded arm sink step by step."""
+    bench = Bench().running()
+    bench.supervisor.hold(bench.now, bench.clock)
+    stamps = [bench.clock + k * T for k in (1, 2, 3)]
+    bench.now += 3 * T
+    for stamp in stamps:
+        bench.state(q=(0.3, 0.2, 0.3), stamp=stamp)
+    command = bench.command()
+    assert command.mode is Mode.HOLDING
     gravity = bench.law.balance((0.3, 0.2, 0.3))
-    assert fresh.torque == pytest.approx([gravity[0] - 4.0 * 0.2, *gravity[1:]])
+    assert command.torque == pytest.approx([gravity[0] - 4.0 * 0.2, *gravity[1:]])
+
+
+def test_invalid_messages_leave_gravity_alone_while_the_last_state_is_fresh():
+    """With the trigger "state" the last valid state is fresh for `arrival_timeout`."""
+    bench = Bench(on_fault="hold", arrival_timeout=0.5).running()
+    moved = (0.15, 0.25, 0.35)
+    bench.period(q=moved, dq=(1.0, 1.0, 1.0))
+    gravity = bench.law.balance(moved)
+    for _ in range(5):
+        bench.now += 4 * T
+        bench.state(q=(math.nan,) * 3)
+        command = bench.supervisor.command(bench.now)
+        assert command.mode is Mode.FAULT
+        assert command.torque == pytest.approx(gravity)
+    first, second = (0.3, 0.2, 0.3), (0.3, 0.3, 0.3)
+    assert bench.period(q=first).torque == pytest.approx(bench.law.balance(first))
+    gravity = bench.law.balance(second)
+    expected = [gravity[0], gravity[1] - 3.0 * 0.1, gravity[2]]
+    assert bench.period(q=second).torque == pytest.approx(expected)
+
+
+def test_one_invalid_message_is_an_interruption_too():
+    """States before and after it are two periods apart, as after one lost message."""
+    bench = Bench(on_fault="hold").running()
+    bench.period(q=(math.nan,) * 3)
+    first = (0.3, 0.2, 0.3)
+    assert bench.period(q=first).torque == pytest.approx(bench.law.balance(first))
+
+
+def test_start_and_hold_need_a_valid_last_message():
+    bench = Bench(arrival_timeout=0.5)
+    bench.period()
+    bench.now += T
+    bench.state(q=(math.nan, 0.0, 0.0))
+    for action in (bench.supervisor.start, bench.supervisor.hold):
+        done, message = action(bench.now)
+        assert not done and "the position of shoulder is nan" in message
+    assert bench.period().mode is Mode.STOPPED
+    bench.start()
 
 
 def test_stop_counts_for_one_fault_only():

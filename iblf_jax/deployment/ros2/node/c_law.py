@@ -21,7 +21,7 @@ LIBRARY = "_law"
 DESCRIPTION = "law.json"
 
 
-class Gain(NamedTuple):
+class GainEntry(NamedTuple):
     """A gain that may change while the law runs."""
 
     path: str
@@ -53,7 +53,7 @@ class LawDescription(NamedTuple):
     """[N m/rad]."""
     hold_damping: tuple[float, ...]
     """[N m s/rad]."""
-    gains: tuple[Gain, ...]
+    gains: tuple[GainEntry, ...]
 
 
 def read_description(path: Path) -> LawDescription:
@@ -69,8 +69,8 @@ def read_description(path: Path) -> LawDescription:
     return LawDescription(**fields)
 
 
-def _gain(content: dict[str, Any]) -> Gain:
-    return Gain(
+def _gain(content: dict[str, Any]) -> GainEntry:
+    return GainEntry(
         content["path"],
         content["unit"],
         content["is_scalar"],
@@ -190,7 +190,7 @@ class CLaw:
                 self._parameters[place] = value
 
 
-def why_refused(gain: Gain, values: Sequence[float]) -> str:
+def why_refused(gain: GainEntry, values: Sequence[float]) -> str:
     """Why values of a gain are refused; empty if they are valid."""
     if len(values) != len(gain.offsets):
         return f"{gain.path}: got {len(values)} numbers, expected {len(gain.offsets)}."

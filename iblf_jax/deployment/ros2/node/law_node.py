@@ -2,9 +2,9 @@
 
     joint_states (sensor_msgs/JointState) -> law -> efforts (std_msgs/Float64MultiArray)
 
-The efforts are in the order of the parameter `joints`.  `~/start`, `~/stop` and `~/hold`
-(std_srvs/Trigger) change the mode, and `diagnostics` (diagnostic_msgs/DiagnosticArray) reports it
-ten times a second.
+The torques in `efforts` are in the order of the parameter `joints`.  `~/start`, `~/stop` and
+`~/hold` (std_srvs/Trigger) change the mode, and `diagnostics` (diagnostic_msgs/DiagnosticArray)
+reports it ten times a second.
 """
 
 from __future__ import annotations
@@ -34,10 +34,12 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 
-from iblf_jax.deployment.ros2.node.c_law import FLAGS, CLaw, Gain, load_law, why_refused
+from iblf_jax.deployment.ros2.node.c_law import FLAGS, CLaw, GainEntry, load_law, why_refused
 from iblf_jax.deployment.ros2.node.monitor import LoopMonitor
 from iblf_jax.deployment.ros2.node.supervisor import (
+    ARRIVAL_TIMEOUT,
     NANOSECONDS,
+    STALE_PERIODS,
     Command,
     Configuration,
     Mode,
@@ -46,10 +48,10 @@ from iblf_jax.deployment.ros2.node.supervisor import (
 
 DIAGNOSTICS_PERIOD = 0.1
 """[s]."""
-STALE_PERIODS = 2.0
-"""Default age beyond which a state is stale, in periods."""
-WATCHDOG = 0.5
-"""Default time without a state after which a law that samples with the states is in fault [s]."""
+LONGEST_TIMEOUT = 3600.0
+"""Largest value of a timeout [s]."""
+LARGEST_STAMP = 2.0**31
+"""Stamps have 32 bits for the seconds [s]."""
 PERIOD_TOLERANCE = 1e-9
 """Relative difference of the period from the exported one."""
 FINAL_TIMEOUT = Duration(seconds=0.5)
@@ -63,9 +65,9 @@ class RefusedError(ValueError):
     """A parameter with which the node does not start."""
 
 
-def refused(field: str, came: Any, expected: str, remedy: str) -> RefusedError:
+def refused(field: str, value: Any, expected: str, remedy: str) -> RefusedError:
     """An error that names the parameter, its value, the expected value and the remedy."""
-    return RefusedError(f"{field}: got {came}, expected {expected}. {remedy}")
+    return RefusedError(f"{field}: got {value}, expected {expected}. {remedy}")
 
 
 class LawNode(Node):  # type: ignore[misc]
@@ -85,8 +87,9 @@ class LawNode(Node):  # type: ignore[misc]
         self.gains = {gain.path: gain for gain in law.description.gains}
         configuration = self._configuration()
         origin = self._declared("time_origin", math.nan, "stamp that is t = 0 [s], NaN for start")
-        if math.isinf(origin):
-            raise refused("time_origin", origin, "a stamp [s] or NaN", "NaN is that of the start.")
+        reason = _why_refused_origin(origin)
+        if reason:
+            raise RefusedError(reason)
         self.supervisor = Supervisor(law, configuration, _origin(origin))
         self._declare_gains()
         self.monitor = LoopMonitor()
@@ -132,10 +135,15 @@ class LawNode(Node):  # type: ignore[misc]
         stiffness = self._declared("hold_stiffness", list(known.hold_stiffness), "[N m/rad]", True)
         damping = self._declared("hold_damping", list(known.hold_damping), "[N m s/rad]", True)
         automatic = self._declared("start_automatically", False, "start with the first state", True)
-        stamp_timeout = self._timeout("state_timeout", STALE_PERIODS * known.period)
-        arrival_timeout = stamp_timeout
-        if self.trigger == "state":
-            arrival_timeout = self._timeout("watchdog", WATCHDOG)
+        outside = self._declared(
+            "start_outside_bounds", False, "start while a joint is outside of its bounds", True
+        )
+        meaning = "longest age of a state, or distance of two stamps with the trigger state [s]"
+        stamp_timeout = self._timeout("state_timeout", STALE_PERIODS * known.period, meaning)
+        meaning = "longest time without a state with the trigger state [s]"
+        arrival_timeout = self._timeout("arrival_timeout", ARRIVAL_TIMEOUT, meaning)
+        if self.trigger == "timer":
+            arrival_timeout = stamp_timeout
         return Configuration(
             joints=joints,
             period=known.period,
@@ -145,6 +153,7 @@ class LawNode(Node):  # type: ignore[misc]
             hold_stiffness=_nonnegative("hold_stiffness", stiffness, n),
             hold_damping=_nonnegative("hold_damping", damping, n),
             start_automatically=automatic,
+            start_outside_bounds=outside,
             stamp_timeout=stamp_timeout,
             arrival_timeout=arrival_timeout,
         )
@@ -176,12 +185,14 @@ class LawNode(Node):  # type: ignore[misc]
                 raise refused("torque_limits", list(limits), expected, remedy)
         return tuple(limits)
 
-    def _timeout(self, name: str, default: float) -> float:
-        """A time after which a state is stale [s]."""
-        value = self._declared(name, default, "age beyond which a state is stale [s]", True)
-        if value > 0:
+    def _timeout(self, name: str, default: float, description: str) -> float:
+        """A time after which states are stale [s]."""
+        value = self._declared(name, default, description, True)
+        # NaN is not between the limits either.
+        if 0 < value <= LONGEST_TIMEOUT:
             return value
-        raise refused(name, value, "a time > 0 s", f"The default is {default:g} s.")
+        expected = f"a time > 0 and at most {LONGEST_TIMEOUT:g} s"
+        raise refused(name, value, expected, f"The default is {default:g} s.")
 
     def _declare_gains(self) -> None:
         """Declares the gains with their ranges; their defaults are those of the law."""
@@ -200,14 +211,14 @@ class LawNode(Node):  # type: ignore[misc]
             self.law.set_gain(gain.path, numbers)
 
     def _refuse_parameters(self, parameters: Sequence[Parameter]) -> SetParametersResult:
-        """Refuses values of gains outside of their ranges, and a time that is infinite."""
+        """Refuses values of gains outside of their ranges, and a time that is no stamp."""
         for parameter in parameters:
             reason = ""
             gain = self.gains.get(parameter.name)
             if gain is not None:
                 reason = why_refused(gain, _numbers(parameter.value))
-            if parameter.name == "time_origin" and math.isinf(parameter.value):
-                reason = f"time_origin: got {parameter.value}, expected a stamp [s] or NaN."
+            if parameter.name == "time_origin":
+                reason = _why_refused_origin(parameter.value)
             if reason:
                 return SetParametersResult(successful=False, reason=reason)
         return SetParametersResult(successful=True)
@@ -225,12 +236,12 @@ class LawNode(Node):  # type: ignore[misc]
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         quality = QoSProfile(depth=QUEUE_DEPTH)
         if self.trigger == "state":
+            # A lost state would stop a simulator in lock-step: this one is reliable.
             self._states = self.create_subscription(
-                JointState, "joint_states", self._answer_state, quality
+                JointState, "joint_states", self._on_state, quality
             )
             period = self.supervisor.configuration.arrival_timeout / 2
-            if math.isfinite(period):
-                self.create_timer(period, self._watch, clock=steady)
+            self.create_timer(period, self._on_watchdog, clock=steady)
         else:
             # Drivers publish with either reliability; this one receives from both.
             quality.reliability = ReliabilityPolicy.BEST_EFFORT
@@ -238,7 +249,7 @@ class LawNode(Node):  # type: ignore[misc]
                 JointState, "joint_states", self._receive, quality
             )
             period = self.supervisor.configuration.period
-            self._timer = self.create_timer(period, self._sample, clock=steady)
+            self._timer = self.create_timer(period, self._on_timer, clock=steady)
         self.create_timer(DIAGNOSTICS_PERIOD, self._publish_diagnostics, clock=steady)
 
     def _receive(self, message: JointState) -> bool:
@@ -252,7 +263,7 @@ class LawNode(Node):  # type: ignore[misc]
             monotonic_ns(),
         )
 
-    def _answer_state(self, message: JointState) -> None:
+    def _on_state(self, message: JointState) -> None:
         """One sample of the law for each state that is a new sample."""
         if not self._receive(message):
             return
@@ -263,7 +274,7 @@ class LawNode(Node):  # type: ignore[misc]
         self._missed_before = self.supervisor.missed
         self._publish(command, missed)
 
-    def _watch(self) -> None:
+    def _on_watchdog(self) -> None:
         """Publishes the torques of the fault while no states arrive."""
         now = monotonic_ns()
         if not self.supervisor.is_stale(now):
@@ -272,8 +283,8 @@ class LawNode(Node):  # type: ignore[misc]
         if command is not None:
             self._send(command)
 
-    def _sample(self) -> None:
-        """One sample of the law a period."""
+    def _on_timer(self) -> None:
+        """A command a period; the law computes new torques if a new state has arrived."""
         missed = self._missed_periods()
         self._catch_up()
         command = self.supervisor.command(monotonic_ns(), self._clock_of_stamps())
@@ -315,7 +326,7 @@ class LawNode(Node):  # type: ignore[misc]
         """Publishes a command of the loop and counts it."""
         self._send(command)
         self.monitor.count_sample(missed)
-        received = self.supervisor.sample_received
+        received = self.supervisor.state_received
         if received is not None and received != self._answered:
             self._answered = received
             self.monitor.add_latency(monotonic_ns() - received)
@@ -369,7 +380,7 @@ class LawNode(Node):  # type: ignore[misc]
         """The message of diagnostics, of which only the values change."""
         names = ["mode", "last_fault", "note", *FLAGS, "limited"]
         names += [f"margin.{joint} [rad]" for joint in joints]
-        names += ["samples", "missed_periods", "missed_share"]
+        names += ["samples", "missed_periods", "missed_share", "periods_without_new_state"]
         names += ["longest_latency [s]", "latency_99 [s]", "time_origin [s]"]
         self._values = [KeyValue(key=name) for name in names]
         self._status = DiagnosticStatus(
@@ -389,6 +400,7 @@ class LawNode(Node):  # type: ignore[misc]
         texts.append(_boolean(supervisor.limited))
         texts += [f"{x:.6g}" for x in supervisor.margin]
         texts += [str(monitor.samples), str(monitor.missed), f"{monitor.missed_share:.3g}"]
+        texts.append(str(supervisor.repeated))
         texts.append(f"{monitor.longest_latency * 1e-9:.6f}")
         texts += [f"{monitor.latency_quantile(0.99):.6f}", self._origin_text()]
         for value, text in zip(self._values, texts, strict=True):
@@ -438,12 +450,20 @@ def _numbers(value: Any) -> list[float]:
     return []
 
 
+def _why_refused_origin(value: Any) -> str:
+    """Why a value of `time_origin` is refused; empty if it is valid."""
+    if isinstance(value, float) and (math.isnan(value) or abs(value) < LARGEST_STAMP):
+        return ""
+    expected = f"a stamp below {LARGEST_STAMP:.0f} s, or NaN"
+    return f"time_origin: got {value}, expected {expected}. NaN is the stamp at the start."
+
+
 def _origin(seconds: float) -> int | None:
     """A stamp [ns] from seconds; None for NaN."""
     return None if math.isnan(seconds) else round(seconds * NANOSECONDS)
 
 
-def _descriptor(gain: Gain) -> ParameterDescriptor:
+def _descriptor(gain: GainEntry) -> ParameterDescriptor:
     """The descriptor of a gain; an array has one range that contains those of its numbers."""
     span = FloatingPointRange(from_value=min(gain.low), to_value=max(gain.high))
     text = f"[{gain.unit}], from {list(gain.low)} to {list(gain.high)}"

@@ -6,8 +6,10 @@
     running: the law's torques                       holding: the hold torques
     fault: zero torques or the hold torques, as the user chose; only `start` leaves it
 
-    hold torques: g(q) + K (q_h - q) - D q'    while the states are fresh, with q_h at the hold
+    hold torques: g(q) + K (q_h - q) - D q'    while the states are valid and fresh
                   g(q)                         at the last valid position q otherwise
+    q_h: the position at the hold or the fault; after an interruption of the states, the position
+         of the first valid and fresh state, so that its return makes no step of the torques
 
 Every command passes `Supervisor._limited`, which clips it to the torque limits.
 """
@@ -22,10 +24,16 @@ from typing import NamedTuple
 from iblf_jax.deployment.ros2.node.c_law import NOT_FINITE, CLaw
 
 NANOSECONDS = 1_000_000_000
-NEW_SAMPLE = 0.75
-"""Shortest distance of the stamps of two samples, in periods."""
+MIN_STAMP_SPACING = 0.75
+"""Shortest distance of the stamps of two samples of a law that samples with the states, in periods.
+A state that follows sooner, from a driver that is faster than the law, becomes the last state, but
+the law does not answer it."""
 STAMP_TOLERANCE = 0.01
 """Tolerance of the distance of two stamps, in periods."""
+STALE_PERIODS = 2.0
+"""Default of the parameter `state_timeout`, in periods."""
+ARRIVAL_TIMEOUT = 0.5
+"""Default of the parameter `arrival_timeout` [s]."""
 
 
 class Mode(enum.Enum):
@@ -97,6 +105,8 @@ class Configuration(NamedTuple):
     hold_damping: tuple[float, ...]
     """[N m s/rad]."""
     start_automatically: bool
+    start_outside_bounds: bool
+    """Whether the law may start while a joint is outside of its bounds."""
     stamp_timeout: float
     """Age by its stamp beyond which a state is stale [s]."""
     arrival_timeout: float
@@ -212,13 +222,24 @@ class Supervisor:
         """Flags of the law since `reset_extremes`."""
         self.limited = False
         """Whether a torque was clipped since `reset_extremes`."""
+        self.repeated = 0
+        """Periods without a new state, in which the law's last torques were published again."""
         self._reader = JointReader(configuration.joints, configuration.reads_velocity)
-        self._sample: JointSample | None = None
+        self._state: JointSample | None = None
+        """The last valid state."""
         self._previous: JointSample | None = None
         self._last_stamp: int | None = None
         self._due_stamp: int | None = None
-        self._held: tuple[float, ...] = ()
-        self._without_torque = False
+        self._why_invalid: str | None = None
+        """Why the last message with the joints is not valid; None if it is."""
+        self._law_stamp: int | None = None
+        """Stamp of the state of the running law's last step [ns]."""
+        self._law_result: tuple[list[float], int] = ([], 0)
+        """Torques and status of this step."""
+        self._starts_automatically = configuration.start_automatically
+        self._hold_position: tuple[float, ...] | None = None
+        """None if the next valid and fresh state is to be held."""
+        self._zero_in_fault = False
         """Whether `stop` replaced the torques of the mode fault by zeros."""
         self._period = round(configuration.period * NANOSECONDS)
         self._stamp_timeout = _nanoseconds(configuration.stamp_timeout)
@@ -251,6 +272,7 @@ class Supervisor:
             if fault is None:
                 return self._accept(found)
             found = fault
+        self._why_invalid = found.reason
         self._report(found)
         return True
 
@@ -263,26 +285,31 @@ class Supervisor:
         backward = (last - stamp) / NANOSECONDS
         return Fault(FaultKind.CLOCK, f"the stamps jumped back by {backward:g} s")
 
-    def _accept(self, sample: JointSample) -> bool:
+    def _accept(self, state: JointSample) -> bool:
         """Keeps a valid state; whether it is a new sample."""
-        last = self._last_stamp
-        if last is not None and sample.stamp == last and self._sample is not None:
+        last, before = self._last_stamp, self._state
+        if state.stamp == last and before is not None:
             return False
-        self._previous, self._sample = self._sample, sample
-        self._last_stamp = sample.stamp
+        self._previous, self._state = before, state
+        self._last_stamp = state.stamp
+        self._why_invalid = None
+        spacing = MIN_STAMP_SPACING * self._period
         if last is not None:
-            self._check_gap(sample.stamp - last)
+            self._check_gap(state.stamp - last)
+            # Of the states of a faster driver, the one closest to a whole period is answered.
+            spacing = max(spacing, self._period - (state.stamp - last) / 2)
         due = self._due_stamp
-        if due is not None and sample.stamp - due < NEW_SAMPLE * self._period:
+        if due is not None and state.stamp - due < spacing:
             return False
         if due is not None:
-            self.missed += max(round((sample.stamp - due) / self._period) - 1, 0)
-        self._due_stamp = sample.stamp
+            self.missed += max(round((state.stamp - due) / self._period) - 1, 0)
+        self._due_stamp = state.stamp
         return True
 
     def _check_gap(self, gap: int) -> None:
         """A fault for states that are further apart than the longest age."""
         if gap > self._stamp_timeout + STAMP_TOLERANCE * self._period:
+            self._hold_position = None
             reason = f"the stamps of two states are {gap / NANOSECONDS:g} s apart"
             self._report(Fault(FaultKind.STALE, reason))
 
@@ -296,9 +323,9 @@ class Supervisor:
         self.mode = Mode.FAULT
         self.last_fault = fault
         self.note = fault.reason
-        self._without_torque = False
-        if self._sample is not None:
-            self._held = self._sample.position
+        self._zero_in_fault = False
+        if self._state is not None:
+            self._hold_position = self._state.position
 
     def command(self, now: int, clock: int | None = None) -> Command | None:
         """The command of this instant, one for each sample of the law; None before the first
@@ -308,95 +335,125 @@ class Supervisor:
           now: the steady clock [ns].
           clock: the clock of the stamps [ns]; None if the stamps are not compared with a clock.
         """
-        problem = self._staleness(now, clock)
-        if self.mode is Mode.WAITING and not self._leave_waiting(problem, now, clock):
+        if self.mode is Mode.WAITING and not self._leave_waiting(now, clock):
             return None
+        problem = self._staleness(now, clock)
         if problem is not None and self.mode in (Mode.RUNNING, Mode.HOLDING):
             self._enter_fault(Fault(FaultKind.STALE, problem))
-        if self.mode is Mode.RUNNING and self._sample is not None:
-            torque, status = self._law_torque(self._sample)
+        if self.mode is Mode.RUNNING and self._state is not None:
+            torque, status = self._law_torque(self._state)
             # The law may have failed, which changes the mode.
             if self.mode is Mode.RUNNING:
                 return self._limited(torque, status)
-        return self._limited(self._torque_without_law(problem is None), 0)
+        is_current = problem is None and self._why_invalid is None
+        return self._limited(self._torque_without_law(is_current), 0)
 
-    def _leave_waiting(self, problem: str | None, now: int, clock: int | None) -> bool:
+    def _leave_waiting(self, now: int, clock: int | None) -> bool:
         """Leaves the mode waiting with the first complete and fresh state."""
-        if self._sample is None or problem is not None:
-            if problem is not None:
-                self.note = problem
+        if self._state is None:
+            return False
+        problem = self._why_not_current(now, clock)
+        if problem is not None:
+            self.note = problem
             return False
         self.mode = Mode.STOPPED
         self.note = ""
-        if self.configuration.start_automatically:
+        if self._starts_automatically:
             started, reason = self.start(now, clock)
             if not started:
                 self.note = reason
         return True
 
+    def _why_not_current(self, now: int, clock: int | None) -> str | None:
+        """Why the last valid state is not the present one; None if it is, or if there is none."""
+        return self._why_invalid or self._staleness(now, clock)
+
     def _staleness(self, now: int, clock: int | None) -> str | None:
         """Why the last state is stale; None if it is fresh, or if there is none."""
-        sample = self._sample
-        if sample is None:
+        state = self._state
+        if state is None:
             return None
-        age = now - sample.received
+        age = now - state.received
         if age > self._arrival_timeout:
             return f"no valid state has arrived for {age / NANOSECONDS:.4g} s"
         if clock is None:
             return None
-        age = clock - sample.stamp
+        age = clock - state.stamp
         if age > self._stamp_timeout:
             return f"the last state is {age / NANOSECONDS:.4g} s old by its stamp"
         if -age > self._stamp_timeout:
             return f"the stamp of the last state is {-age / NANOSECONDS:.4g} s in the future"
         return None
 
-    def _law_torque(self, sample: JointSample) -> tuple[list[float], int]:
-        """The torques of one sample of the law, and its status."""
-        t = (sample.stamp - (self.started_at or 0)) / NANOSECONDS
-        torque, status = self.law.step(t, sample.position, sample.velocity)
+    def _law_torque(self, state: JointSample) -> tuple[list[float], int]:
+        """The torques of the law for a state, and its status.
+
+        A state that the law has used already gives the torques of that step again: another step
+        with the same measurement would distort the velocity filter and the observer.
+        """
+        if state.stamp == self._law_stamp:
+            self.repeated += 1
+            torque, status = self._law_result
+            return list(torque), status
+        t = self._time_of_law(state)
+        torque, status = self.law.step(t, state.position, state.velocity)
         if status & NOT_FINITE:
             self._enter_fault(
                 Fault(FaultKind.TORQUE, f"the law has no finite torque at t = {t:g} s")
             )
             return torque, status
+        self._law_stamp = state.stamp
+        self._law_result = (list(torque), status)
         self.status |= status
         lower, upper = self.law.bounds(t)
         margin = self.margin
-        for i, x in enumerate(sample.position):
+        for i, x in enumerate(state.position):
             margin[i] = min(margin[i], x - lower[i], upper[i] - x)
         return torque, status
 
-    def _torque_without_law(self, is_fresh: bool) -> list[float]:
-        """The torques of the modes without the law."""
-        holds_on_fault = self.configuration.on_fault == "hold" and not self._without_torque
+    def _time_of_law(self, state: JointSample) -> float:
+        """The time of a state since the start of reference and bounds [s]."""
+        if self.started_at is None:
+            raise RuntimeError("started_at: got None, expected a stamp while the law runs.")
+        return (state.stamp - self.started_at) / NANOSECONDS
+
+    def _torque_without_law(self, is_current: bool) -> list[float]:
+        """The torques of the modes without the law.
+
+        Args:
+          is_current: whether the last valid state is the present one.
+        """
+        holds_on_fault = self.configuration.on_fault == "hold" and not self._zero_in_fault
         if self.mode is Mode.HOLDING or (self.mode is Mode.FAULT and holds_on_fault):
-            return self._hold_torque(is_fresh)
+            return self._hold_torque(is_current)
         return list(self._zero)
 
-    def _hold_torque(self, is_fresh: bool) -> list[float]:
+    def _hold_torque(self, is_current: bool) -> list[float]:
         """The torques that hold the position of the hold."""
-        sample = self._sample
-        if sample is None:
+        state = self._state
+        if state is None:
             return list(self._zero)
-        torque = self.law.balance(sample.position)
-        if not is_fresh:
+        torque = self.law.balance(state.position)
+        if not is_current:
+            self._hold_position = None
             return torque
-        velocity = self._velocity(sample)
-        for i, q in enumerate(sample.position):
-            torque[i] += self.configuration.hold_stiffness[i] * (self._held[i] - q)
+        if self._hold_position is None:
+            self._hold_position = state.position
+        velocity = self._velocity(state)
+        for i, q in enumerate(state.position):
+            torque[i] += self.configuration.hold_stiffness[i] * (self._hold_position[i] - q)
             torque[i] -= self.configuration.hold_damping[i] * velocity[i]
         return torque
 
-    def _velocity(self, sample: JointSample) -> Sequence[float]:
+    def _velocity(self, state: JointSample) -> Sequence[float]:
         """The measured velocities, or the difference quotient of the last two states [rad/s]."""
-        if sample.velocity is not None:
-            return sample.velocity
+        if state.velocity is not None:
+            return state.velocity
         before = self._previous
-        if before is None or sample.stamp <= before.stamp:
+        if before is None or state.stamp <= before.stamp:
             return self._zero
-        duration = (sample.stamp - before.stamp) / NANOSECONDS
-        pairs = zip(sample.position, before.position, strict=True)
+        duration = (state.stamp - before.stamp) / NANOSECONDS
+        pairs = zip(state.position, before.position, strict=True)
         return [(x - y) / duration for x, y in pairs]
 
     def _limited(self, torque: list[float], status: int) -> Command:
@@ -424,41 +481,58 @@ class Supervisor:
         """
         if self.mode is Mode.RUNNING:
             return True, "The law is running already."
-        sample, problem = self._sample, self._staleness(now, clock)
-        if sample is None:
+        state, problem = self._state, self._why_not_current(now, clock)
+        if state is None:
             return False, f"Refused: {self.note}. A complete joint state is needed."
         if problem is not None:
-            return False, f"Refused: {problem}. Fresh joint states are needed."
-        origin = sample.stamp
+            return False, f"Refused: {problem}. Valid and fresh joint states are needed."
+        origin = state.stamp
         if self.time_origin is not None:
             origin = self.time_origin
-        if sample.stamp < origin:
-            ahead = (origin - sample.stamp) / NANOSECONDS
+        if state.stamp < origin:
+            ahead = (origin - state.stamp) / NANOSECONDS
             reason = f"time_origin is {ahead:g} s after the stamp of the last state"
             return False, f"Refused: {reason}. Set it to the start of an earlier run, or to NaN."
-        if not self.law.init(sample.position, sample.velocity):
+        t = (state.stamp - origin) / NANOSECONDS
+        outside = self._outside(state, t)
+        if outside and not self.configuration.start_outside_bounds:
+            remedy = "Move the robot, or restart the node with start_outside_bounds: true."
+            return False, f"Refused: outside of its bounds: {outside}. {remedy}"
+        if not self.law.init(state.position, state.velocity):
             return False, "Refused: the law has no finite state at these positions and velocities."
         self.started_at = origin
         self.mode = Mode.RUNNING
         self.note = ""
-        return True, self._start_message(sample, (sample.stamp - origin) / NANOSECONDS)
-
-    def _start_message(self, sample: JointSample, t: float) -> str:
-        """What a user learns about a start: the time, and joints outside of their bounds."""
-        text = f"The law runs from t = {t:g} s."
-        lower, upper = self.law.bounds(t)
-        rows = zip(self.configuration.joints, lower, sample.position, upper, strict=True)
-        outside = [name for name, low, q, high in rows if not low < q < high]
+        self._law_stamp = None
+        message = f"The law runs from t = {t:g} s."
         if outside:
-            text += f" Outside of their bounds at the start: {', '.join(outside)}."
-        return text
+            message += f" Outside of its bounds: {outside}."
+        return True, message
+
+    def _outside(self, state: JointSample, t: float) -> str:
+        """The joints outside of their bounds, with positions and bounds; empty if there are none.
+
+        Args:
+          state: the positions.
+          t: time since the start of reference and bounds [s].
+        """
+        lower, upper = self.law.bounds(t)
+        rows = zip(self.configuration.joints, lower, state.position, upper, strict=True)
+        return "; ".join(
+            f"{name} at {q:.6g} rad, bounds {low:.6g} to {high:.6g} rad"
+            for name, low, q, high in rows
+            if not low < q < high
+        )
 
     def stop(self) -> tuple[bool, str]:
-        """Zero torques; the mode fault stays until `start`."""
+        """Zero torques, and no automatic start; the mode fault stays until `start`."""
+        if self.mode is Mode.WAITING and self._starts_automatically:
+            self._starts_automatically = False
+            return True, "No command has been sent yet. The automatic start is cancelled."
         if self.mode is Mode.WAITING:
             return True, "No command has been sent yet."
         if self.mode is Mode.FAULT:
-            self._without_torque = True
+            self._zero_in_fault = True
             return True, "The torques are zero. The fault stays until the law is started."
         self.mode = Mode.STOPPED
         return True, "The torques are zero."
@@ -472,15 +546,15 @@ class Supervisor:
         Returns:
           Whether the position is held, and the reason in words.
         """
-        sample, problem = self._sample, self._staleness(now, clock)
-        if self.mode is Mode.WAITING or sample is None:
+        state, problem = self._state, self._why_not_current(now, clock)
+        if self.mode is Mode.WAITING or state is None:
             return False, f"Refused: {self.note}. A complete joint state is needed."
         if self.mode is Mode.FAULT:
             return False, f"Refused: {self.note}. Only start leaves a fault."
         if problem is not None:
-            return False, f"Refused: {problem}. Fresh joint states are needed."
+            return False, f"Refused: {problem}. Valid and fresh joint states are needed."
         self.mode = Mode.HOLDING
-        self._held = sample.position
+        self._hold_position = state.position
         return True, "The position is held."
 
     def is_stale(self, now: int, clock: int | None = None) -> bool:
@@ -488,9 +562,9 @@ class Supervisor:
         return self._staleness(now, clock) is not None
 
     @property
-    def sample_received(self) -> int | None:
+    def state_received(self) -> int | None:
         """Arrival of the last valid state by the steady clock [ns]."""
-        return None if self._sample is None else self._sample.received
+        return None if self._state is None else self._state.received
 
     def final_command(self) -> Command | None:
         """The last command before the node ends: the torques of a fault by the user's policy."""
