@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import random
 import subprocess
 import sys
 from pathlib import Path
@@ -11,6 +13,17 @@ import iblf_jax as ij
 
 NAME = "arm_law"
 PERIOD = 0.01
+
+
+def take_domain() -> None:
+    """A domain of this process alone, so that tests beside each other do not hear each other.
+
+    Two workers of one run differ in the last digit.  The ports of domains above 100 are those that
+    Linux gives to clients.
+    """
+    worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0")[2:])
+    os.environ["ROS_DOMAIN_ID"] = str(10 * random.SystemRandom().randrange(1, 10) + worker % 10)
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 
 
 class Package(NamedTuple):

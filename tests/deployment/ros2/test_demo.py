@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
@@ -12,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import ROOT
+from ros_package import take_domain
 
 import iblf_jax as ij
 from iblf_jax import cli
@@ -26,7 +26,7 @@ from iblf_jax.deployment.ros2.demo import (
     law_command,
 )
 
-os.environ["ROS_DOMAIN_ID"] = str(1 + int.from_bytes(os.urandom(2), "big") % 200)
+take_domain()
 
 PAPER = ij.with_parts(ij.presets.zhang_yan_2024(), sampling=ij.Sampling(2e-3))
 

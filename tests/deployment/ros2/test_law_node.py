@@ -48,9 +48,7 @@ def package(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def context():
-    """A domain of its own, so that tests beside each other do not hear each other."""
-    os.environ["ROS_DOMAIN_ID"] = str(random.SystemRandom().randrange(1, 100))
-    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    ros_package.take_domain()
     rclpy.init()
     yield
     rclpy.shutdown()

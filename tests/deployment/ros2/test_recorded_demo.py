@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from ros_package import take_domain
 
 import iblf_jax as ij
 
@@ -17,7 +17,7 @@ pytest.importorskip("rclpy", reason='needs the extra "ros" (Python 3.11)')
 pytest.importorskip("rosbags", reason='needs the extra "ros"')
 from iblf_jax.deployment.ros2.demo import demonstrate
 
-os.environ["ROS_DOMAIN_ID"] = str(1 + int.from_bytes(os.urandom(2), "big") % 200)
+take_domain()
 HERE = Path(__file__).parent
 PERIOD = 2e-3
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
@@ -13,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import ROOT
+from ros_package import take_domain
 
 import iblf_jax as ij
 
@@ -20,7 +20,7 @@ mujoco = pytest.importorskip("mujoco", reason='needs the extra "robots"')
 rclpy = pytest.importorskip("rclpy", reason='needs the extra "ros" (Python 3.11)')
 from pd_law import torque
 
-os.environ["ROS_DOMAIN_ID"] = str(1 + int.from_bytes(os.urandom(2), "big") % 200)
+take_domain()
 
 ARM = ROOT / "examples" / "two_link.xml"
 LAW = Path(__file__).with_name("pd_law.py")
