@@ -516,6 +516,8 @@ def main(args: Sequence[str] | None = None) -> int:
         return 2
     executor = _executor()
     executor.add_node(node)
+    # The first message of a log takes 8 ms, in which a running law would miss periods.
+    node.get_logger().info(f"The mode is {node.supervisor.mode.value}.")
     # Objects of the start are not searched for garbage again.
     gc.collect()
     gc.freeze()
