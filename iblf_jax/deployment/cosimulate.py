@@ -23,7 +23,7 @@ from iblf_jax.control.actuators.delay import WHOLE_TOLERANCE
 from iblf_jax.core import checks, notices
 from iblf_jax.core.optional import attributes
 from iblf_jax.core.progress import announced
-from iblf_jax.core.status import VELOCITY_LIMIT, Status
+from iblf_jax.core.status import Status
 from iblf_jax.core.time import as_at
 from iblf_jax.deployment.mujoco_plant import INTEGRATORS, MujocoPlant, Stages
 from iblf_jax.deployment.transit import CommandsInTransit
@@ -286,7 +286,7 @@ class _Run:
         with self.robot.driven(self.stages):
             for index in range(steps + 1):
                 t = index * self.dt
-                diverged = diverged or self.has_diverged()
+                diverged = diverged or self.robot.has_diverged()
                 if diverged:
                     self.rows.append(self.rows[-1]._replace(t=t, instant=True))
                     continue
@@ -294,11 +294,6 @@ class _Run:
                 if index < steps:
                     self.integrate(t, t + self.dt)
         return RecordedMotion(stacked(self.rows), stacked(self.states), diverged)
-
-    def has_diverged(self) -> bool:
-        """Whether the state is not finite or too fast."""
-        is_finite = np.all(np.isfinite(self.robot.q))
-        return not (is_finite and np.all(np.abs(self.robot.dq) < VELOCITY_LIMIT))
 
     def begin_step(self, index: int, t: float) -> None:
         """Samples the law if it is due, applies what changes at t, and records the instant."""

@@ -60,7 +60,6 @@ from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.noise import check_method, has_noise, noise_key, realised
 from iblf_jax.simulation.scenario import Scenario, canonical, fitted_to_step
 from iblf_jax.world import plants
-from iblf_jax.world.robots._base import robot_member
 
 LAW_TARGETS = ("c", "fmu", "ros2")
 LOOP_TARGETS = ("fmu-loop", "wasm")
@@ -273,7 +272,7 @@ def _export_law(
         name=name,
         external_reference=external_reference,
         vectors=vectors(scenario, external_reference),
-        joints=_joint_names(scenario.model),
+        joints=plants.declared_joints(scenario.model),
         scenario_toml=_scenario_toml(scenario),
     )
     generated = generate(law)
@@ -303,7 +302,7 @@ def _export_loop(
     key = np.asarray(noise_key(jax.random.key(seed)), float)
     scenario = realised(scenario, jnp.asarray(key, scenario.initial.q.dtype))
     loop = loop_program(scenario, method)
-    joints = _joint_names(scenario.plant)
+    joints = plants.declared_joints(scenario.plant)
     generated = loop_files(scenario, loop, name, method, joints)
     run_settings = [dt]
     if has_noise(scenario):
@@ -317,12 +316,6 @@ def _export_loop(
     sizes = {"state": width * loop.carry_size + 8, "parameters": width * generated.parameters.size}
     paths = tuple(field.path for field in generated.parameters.fields)
     return Exported(folder, target, files, operations_of(loop.step), sizes, paths)
-
-
-def _joint_names(part: Any) -> tuple[str, ...]:
-    """The names of the joints of a robot, or of the robot inside a plant; () without names."""
-    robot = plants.robot_of(part)
-    return () if robot is None else tuple(robot_member(robot, "joints"))
 
 
 def checked_name(name: Any, default: str) -> str:

@@ -18,6 +18,7 @@ import jax
 import numpy as np
 
 from iblf_jax.core import checks, notices
+from iblf_jax.core.status import VELOCITY_LIMIT
 from iblf_jax.world.robots.description import Shown, read
 from iblf_jax.world.robots.load import locked_position
 from iblf_jax.world.robots.payload import Payload
@@ -112,6 +113,11 @@ class MujocoPlant:
         """Sets positions and velocities of all joints of the model."""
         self.data.qpos[:] = state[: self.model.nq]
         self.data.qvel[:] = state[self.model.nq :]
+
+    def has_diverged(self) -> bool:
+        """Whether the state of the driven joints is not finite or too fast."""
+        is_finite = np.all(np.isfinite(self.q))
+        return not (is_finite and np.all(np.abs(self.dq) < VELOCITY_LIMIT))
 
     def apply(self, torque: np.ndarray) -> None:
         """Sets a torque of the driven joints, (n,) [N m], that stays until the next one."""

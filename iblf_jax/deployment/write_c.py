@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from string import Template
 from typing import Any, NamedTuple
@@ -44,9 +44,10 @@ C_TYPES = {
 """Placeholders that depend on whether the numbers are floats."""
 
 
-def fill_template(template: str, values: dict[str, Any]) -> str:
-    """The text of a template in `c/` with its placeholders filled in."""
-    return Template((files("iblf_jax.deployment") / "c" / template).read_text()).substitute(values)
+def fill_template(template: str, values: Mapping[str, Any], folder: str = "c") -> str:
+    """The text of a template in a folder of this package with its placeholders filled in."""
+    path = files("iblf_jax.deployment") / folder / template
+    return Template(path.read_text(encoding="utf-8")).substitute(values)
 
 
 def operations_of(program: Program) -> Counter[str]:

@@ -14,7 +14,6 @@ from iblf_jax.core import checks, notices
 from iblf_jax.core.progress import announced
 from iblf_jax.core.pytree import astype
 from iblf_jax.identification.assessment import assessed
-from iblf_jax.identification.bag import joints_of
 from iblf_jax.identification.coordinates import (
     DELAY_PATH,
     DELAY_SCALE,
@@ -43,6 +42,7 @@ from iblf_jax.identification.standstill import (
 )
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical
+from iblf_jax.world import plants
 
 LOSSES = ("squares", "huber")
 TORQUES = ("held", "interpolated")
@@ -288,7 +288,7 @@ class _Search(NamedTuple):
 
 def _logs(log: Any, held_out: Any, start: Scenario) -> tuple[list[Log], list[float]]:
     """The logs, and the share of each that is held back."""
-    joints = joints_of(start)
+    joints = plants.declared_joints(start.plant)
     logs = read(log, start.n, joints=joints)
     if isinstance(held_out, int | float) and not isinstance(held_out, bool):
         if not 0.0 <= held_out <= 0.9:

@@ -26,9 +26,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from iblf_jax.core import checks, notices
-from iblf_jax.simulation.scenario import Scenario
-from iblf_jax.world import plants
-from iblf_jax.world.robots._base import robot_member
 
 GAP_RATIO, GAP_QUANTILE = 3.0, 0.95
 """A time between samples of more than GAP_RATIO times the quantile GAP_QUANTILE of these times is a
@@ -88,12 +85,6 @@ def is_bag(path: Path) -> bool:
     return path.is_dir() or path.suffix.lower() in STORAGE_ENDINGS
 
 
-def joints_of(scenario: Scenario) -> tuple[str, ...]:
-    """The names of the joints of a scenario's robot; () without names."""
-    robot = plants.robot_of(scenario.plant)
-    return () if robot is None else tuple(robot_member(robot, "joints"))
-
-
 def read_bag_log(
     path: Path, n: int, joints: Sequence[str], options: BagOptions
 ) -> dict[str, np.ndarray]:
@@ -144,6 +135,13 @@ def _origin(stamp: np.ndarray, given: float | None) -> int:
     return nearest if nearest / NANOSECONDS == given else origin
 
 
+def longest_interval(times: np.ndarray) -> float:
+    """The longest time between two samples that is not a gap, in the unit of the times."""
+    if len(times) < 2:
+        return float("inf")
+    return GAP_RATIO * float(np.quantile(np.diff(times), GAP_QUANTILE))
+
+
 def held_efforts(received: np.ndarray, efforts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The effort of each joint state, and whether it is known (head of this module).
 
@@ -162,11 +160,7 @@ def held_efforts(received: np.ndarray, efforts: np.ndarray) -> tuple[np.ndarray,
     # Efforts before the first joint state are those of rows until the first answer.
     before = np.searchsorted(efforts, received[0], side="left") - 1
     index = np.maximum(index, before)
-    intervals = np.diff(efforts)
-    limit = np.inf
-    if len(intervals):
-        limit = GAP_RATIO * float(np.quantile(intervals, GAP_QUANTILE))
-    is_before_gap = np.append(intervals > limit, True)
+    is_before_gap = np.append(np.diff(efforts) > longest_interval(efforts), True)
     is_known = (index >= 0) & (is_answered | ~is_before_gap[index])
     return np.maximum(index, 0), is_known
 

@@ -24,10 +24,9 @@ import numpy as np
 from iblf_jax.core import checks
 from iblf_jax.core.optional import has_members
 from iblf_jax.identification.bag import (
-    GAP_QUANTILE,
-    GAP_RATIO,
     BagOptions,
     is_bag,
+    longest_interval,
     read_bag_log,
 )
 from iblf_jax.simulation.results import Rollout
@@ -57,7 +56,7 @@ class Log(NamedTuple):
     @property
     def gap(self) -> float:
         """Time between samples above which there is a gap [s]."""
-        return GAP_RATIO * float(np.quantile(np.diff(self.t), GAP_QUANTILE))
+        return longest_interval(self.t)
 
     @property
     def step(self) -> float:

@@ -133,15 +133,15 @@ def tunable(
     return Tunable(path, low, high, checks.boolean("tunable: tied", tied), scale)
 
 
-def _as_tunable(place: int, given: Any) -> Tunable:
-    """An entry of a user's list of parameters."""
+def as_tunable(name: str, given: Any) -> Tunable:
+    """An entry of a user's list of parameters; `name` is that of the entry in messages."""
     if isinstance(given, str):
         return Tunable(given)
     if isinstance(given, Tunable):
         return given
     remedy = 'Such as "controller.K2" or ij.tunable("controller.K2", 5.0, 50.0).'
     expected = "the path of a leaf, or ij.tunable(path, low, high)"
-    raise checks.fail(f"parameters[{place}]", given, expected, remedy)
+    raise checks.fail(name, given, expected, remedy)
 
 
 def layout(
@@ -159,7 +159,7 @@ def layout(
         the start or are not admissible.
     """
     given = checks.nonempty_list("parameters", parameters, '["controller.k1", "controller.K2"]')
-    tunables = [_as_tunable(i, x) for i, x in enumerate(given)]
+    tunables = [as_tunable(f"parameters[{i}]", x) for i, x in enumerate(given)]
     check_paths(scenario, [x.path for x in tunables], "parameters")
     starts = {item.path: _start_of(scenario, item) for item in tunables}
     lows = _starts_without(starts, [x.path for x in tunables if x.low is None])

@@ -36,6 +36,11 @@ AGAIN = {
 SETTINGS = "project/test_users_settings.py::test_the_testers_own_flags_come_last"
 
 
+def plain_environment() -> dict[str, str]:
+    """The environment without what this run of the tests has put into it."""
+    return {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
+
+
 def test_the_testers_own_flags_come_last():
     flags, own = os.environ["XLA_FLAGS"], os.environ["TESTER_XLA_FLAGS"]
     as_users = bool(os.environ.get("TEST_AS_USERS"))
@@ -53,8 +58,7 @@ def test_the_testers_own_flags_come_last():
     ],
 )
 def test_the_same_as_users_compile(what):
-    plain = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
-    plain.pop("TEST_PART", None)
+    plain = plain_environment()
     names = [str(ROOT / "tests" / name) for name in (SETTINGS, *AGAIN[what])]
     command = [
         sys.executable,
@@ -71,7 +75,7 @@ def test_the_same_as_users_compile(what):
     done = subprocess.run(
         command,
         cwd=ROOT,
-        env=plain | {"TEST_AS_USERS": "1"},
+        env=plain | {"TEST_AS_USERS": "1", "TEST_PART": ""},
         capture_output=True,
         text=True,
         timeout=300,
@@ -83,11 +87,10 @@ def test_the_same_as_users_compile(what):
 def slow_tests(part: str) -> set[str]:
     """The slow tests of a file that a run with this TEST_PART has."""
     command = [sys.executable, "-m", "pytest", "--collect-only", "-n", "0", "-m", "slow"]
-    env = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
     done = subprocess.run(
         [*command, str(ROOT / "tests" / "control" / "test_laws.py")],
         cwd=ROOT,
-        env=env | {"TEST_PART": part},
+        env=plain_environment() | {"TEST_PART": part},
         capture_output=True,
         text=True,
         check=True,

@@ -24,7 +24,7 @@ from iblf_jax.deployment.cosimulate import (
     with_period,
 )
 from iblf_jax.deployment.ros2.law_replay import replay_law
-from iblf_jax.identification.bag import BagOptions, is_bag, joints_of, read_bag_log
+from iblf_jax.identification.bag import BagOptions, is_bag, read_bag_log
 from iblf_jax.identification.log import Log
 from iblf_jax.simulation.closed_loop import LoopState
 from iblf_jax.simulation.metrics import Fold, as_folds
@@ -173,7 +173,7 @@ def _log(path: Any, scenario: Scenario, options: BagOptions) -> dict[str, np.nda
     if not is_bag(place):
         raise checks.fail("path", str(place), "a folder, or a file that ends in .db3 or .mcap")
     check_single(scenario)
-    return read_bag_log(place, scenario.n, joints_of(scenario), options)
+    return read_bag_log(place, scenario.n, plants.declared_joints(scenario.plant), options)
 
 
 def _check_robots(scenario: Scenario) -> None:

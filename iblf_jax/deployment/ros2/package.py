@@ -9,10 +9,8 @@ import keyword
 import math
 import re
 import sys
-from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
-from string import Template
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax.numpy as jnp
@@ -25,7 +23,7 @@ from iblf_jax.deployment.c_names import Parameters
 from iblf_jax.deployment.ros2.node.supervisor import ARRIVAL_TIMEOUT, STALE_PERIODS
 from iblf_jax.deployment.ros2.ros2_control import controller_package, ros2_control_files
 from iblf_jax.deployment.ros2.yaml_text import yaml_number, yaml_numbers
-from iblf_jax.deployment.write_c import GeneratedLaw, Law, title_of
+from iblf_jax.deployment.write_c import GeneratedLaw, Law, fill_template, title_of
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.draws import check_paths
@@ -39,6 +37,8 @@ NODE = "iblf_jax.deployment.ros2.node"
 """The modules of a node; in a package, its own name replaces this one."""
 NODE_MODULES = ("c_law.py", "monitor.py", "supervisor.py", "law_node.py")
 """The modules of `node/` that a package contains."""
+TEMPLATES = "ros2/templates"
+"""Folder of the templates."""
 POLICIES = ("hold", "zero")
 """Torques of a fault: those that hold the position, or zero."""
 HOLD_BANDWIDTH = 5.0
@@ -133,11 +133,11 @@ def _gains(scenario: Scenario, given: Any) -> tuple[GainOption, ...]:
     if given is None:
         return ()
     # Importing `tuning` takes half a second, which other targets do not need.
-    from iblf_jax.tuning.parameters import in_units, layout
+    from iblf_jax.tuning.parameters import as_tunable, in_units, layout
 
     example = '[ij.tunable("controller.K2", 5.0, 50.0)]'
     entries = checks.nonempty_list("gains", given, example)
-    tunables = [_as_tunable(place, entry) for place, entry in enumerate(entries)]
+    tunables = [as_tunable(f"gains[{i}]", entry) for i, entry in enumerate(entries)]
     check_paths(scenario, [x.path for x in tunables], "gains")
     if any(x.path == PERIOD for x in tunables):
         expected = "leaves of law, observer or model"
@@ -154,19 +154,6 @@ def _gains(scenario: Scenario, given: Any) -> tuple[GainOption, ...]:
         least, most = _range_end(item.low, low[part]), _range_end(item.high, high[part])
         found.append(_gain(scenario, item, least, most))
     return tuple(found)
-
-
-def _as_tunable(place: int, given: Any) -> Tunable:
-    """An entry of the list of gains."""
-    from iblf_jax.tuning.parameters import Tunable
-
-    if isinstance(given, str):
-        return Tunable(given)
-    if isinstance(given, Tunable):
-        return given
-    expected = "the path of a leaf, or ij.tunable(path, low, high)"
-    remedy = 'Such as ij.tunable("controller.K2", 5.0, 50.0).'
-    raise checks.fail(f"gains[{place}]", given, expected, remedy)
 
 
 def _check_tied(scenario: Scenario, item: Tunable) -> None:
@@ -284,12 +271,6 @@ def _gain_lines(options: RosOptions) -> str:
     return "\n".join(lines) or "    # This law was exported without gains that can be changed."
 
 
-def _template(name: str, values: Mapping[str, Any]) -> str:
-    """The text of a template with its placeholders filled in."""
-    text = (files("iblf_jax.deployment.ros2") / "templates" / name).read_text(encoding="utf-8")
-    return Template(text).substitute(values)
-
-
 def ros_files(law: Law, generated: GeneratedLaw, options: RosOptions) -> dict[str, str]:
     """The files of the package, and in a folder of it those of the package of a controller of
     ros2_control: path -> text.
@@ -313,17 +294,17 @@ def ros_files(law: Law, generated: GeneratedLaw, options: RosOptions) -> dict[st
         "velocity": _velocity_note(description["reads_velocity"]),
     }
     texts = {
-        "package.xml": _template("package.xml", values),
-        "setup.py": _template("setup.py.txt", values),
-        "setup.cfg": _template("setup.cfg", values),
-        "README.md": _template("README.md", values),
+        "package.xml": fill_template("package.xml", values, TEMPLATES),
+        "setup.py": fill_template("setup.py.txt", values, TEMPLATES),
+        "setup.cfg": fill_template("setup.cfg", values, TEMPLATES),
+        "README.md": fill_template("README.md", values, TEMPLATES),
         f"resource/{name}": "",
-        f"launch/{name}.launch.py": _template("launch.py.txt", values),
-        f"config/{name}.yaml": _template("parameters.yaml", values),
-        "test/test_law.py": _template("test_law.py.txt", values),
+        f"launch/{name}.launch.py": fill_template("launch.py.txt", values, TEMPLATES),
+        f"config/{name}.yaml": fill_template("parameters.yaml", values, TEMPLATES),
+        "test/test_law.py": fill_template("test_law.py.txt", values, TEMPLATES),
         f"{name}/__init__.py": f'"""{values["title"]}."""\n',
         f"{name}/law.json": f"{json.dumps(description, indent=1)}\n",
-        f"c/{name}_library.c": _template("library.c", values),
+        f"c/{name}_library.c": fill_template("library.c", values, TEMPLATES),
     }
     node = files(NODE)
     for module in NODE_MODULES:

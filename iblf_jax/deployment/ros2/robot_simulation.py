@@ -13,7 +13,6 @@ import numpy as np
 
 from iblf_jax.control.actuators.delay import WHOLE_TOLERANCE
 from iblf_jax.control.sensors import Ideal
-from iblf_jax.core.status import VELOCITY_LIMIT
 from iblf_jax.deployment.mujoco_plant import MujocoPlant
 from iblf_jax.deployment.transit import CommandsInTransit
 from iblf_jax.simulation.noise import noise_key, normals
@@ -167,13 +166,8 @@ class RobotSimulation:
         for step in range(first, first + self.steps_per_period):
             self.begin_step(step * self.dt)
             self.integrate(step * self.dt, (step + 1) * self.dt)
-        self.diverged = self.has_diverged()
+        self.diverged = self.robot.has_diverged()
         self.index += 1
-
-    def has_diverged(self) -> bool:
-        """Whether the state is not finite or too fast."""
-        is_finite = np.all(np.isfinite(self.robot.q))
-        return not (is_finite and np.all(np.abs(self.robot.dq) < VELOCITY_LIMIT))
 
     def begin_step(self, t: float) -> None:
         """Applies the efforts that arrive at t, and records the instant."""

@@ -7,18 +7,18 @@ from __future__ import annotations
 import json
 import string
 from collections.abc import Iterable, Mapping, Sequence
-from importlib.resources import files
-from string import Template
 from typing import Any
 from xml.sax.saxutils import escape
 
 from iblf_jax import __version__
 from iblf_jax.core import notices
 from iblf_jax.deployment.ros2.yaml_text import yaml_numbers
-from iblf_jax.deployment.write_c import GeneratedLaw, Law, title_of
+from iblf_jax.deployment.write_c import GeneratedLaw, Law, fill_template, title_of
 
 RATE_TOLERANCE = 1e-9
 """Relative distance of a rate from a whole number of Hz."""
+FOLDER = "ros2/templates/ros2_control"
+"""Of the templates."""
 TEMPLATES = {
     "package.xml": "package.xml",
     "CMakeLists.txt": "CMakeLists.txt",
@@ -67,17 +67,12 @@ def ros2_control_files(
     package = controller_package(law.name)
     values = _values(law, generated, description, rate) | {"package": package}
     texts = {
-        path.format(package=package): _template(name, values) for path, name in TEMPLATES.items()
+        path.format(package=package): fill_template(name, values, FOLDER)
+        for path, name in TEMPLATES.items()
     }
     texts[f"include/{package}/{law.name}.h"] = generated.files[f"{law.name}.h"]
     texts[f"src/{law.name}.c"] = generated.files[f"{law.name}.c"]
     return texts
-
-
-def _template(name: str, values: Mapping[str, Any]) -> str:
-    """The text of a template with its placeholders filled in."""
-    folder = files("iblf_jax.deployment.ros2") / "templates" / "ros2_control"
-    return Template((folder / name).read_text(encoding="utf-8")).substitute(values)
 
 
 def _values(

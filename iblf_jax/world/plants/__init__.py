@@ -8,6 +8,7 @@ from iblf_jax.world.plants._base import check_dependence as check_dependence
 from iblf_jax.world.plants._base import check_dimensions as check_dimensions
 from iblf_jax.world.plants._base import component_names as component_names
 from iblf_jax.world.plants._base import component_noun as component_noun
+from iblf_jax.world.plants._base import declared_joints as declared_joints
 from iblf_jax.world.plants._base import dependence_on_levels as dependence_on_levels
 from iblf_jax.world.plants._base import flow as flow
 from iblf_jax.world.plants._base import gain_times as gain_times

@@ -25,6 +25,7 @@ from iblf_jax.core.optional import OptionalMembers, has_members
 from iblf_jax.core.status import VELOCITY_LIMIT
 from iblf_jax.core.units import ByLevel, Unit, per_second, product
 from iblf_jax.world.robots import joint_names
+from iblf_jax.world.robots._base import robot_member
 
 Units = str | tuple[str, ...]
 """The unit of a level: one for all its components, or one for each."""
@@ -154,6 +155,12 @@ def robot_of(part: Any) -> Any:
     if is_chain(part):
         return plant_member(part, "robot")
     return part
+
+
+def declared_joints(part: Any) -> tuple[str, ...]:
+    """The names that a robot, or the robot inside a plant, gives its joints; () without names."""
+    robot = robot_of(part)
+    return () if robot is None else tuple(robot_member(robot, "joints"))
 
 
 def level_rate(

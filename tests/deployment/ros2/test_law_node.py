@@ -226,6 +226,15 @@ def shuffled(q, dq):
     return {"names": names, "q": (9.0, q[1], 8.0, q[0]), "dq": (7.0, dq[1], 6.0, dq[0])}
 
 
+def send_random_states(client):
+    """States at and outside of the bounds, for which the law uses all torque."""
+    rng = np.random.default_rng(0)
+    for _ in range(100):
+        q, dq = rng.normal(0.5, 1.0, 2), rng.normal(0.0, 20.0, 2)
+        client.state(q=q.tolist(), dq=dq.tolist())
+        client.spin(PERIOD)
+
+
 def test_in_lock_step_the_efforts_are_those_of_the_simulation(client, nodes, package):
     """The states of a simulated run with joints in another order: the node repeats its torques."""
     run = ij.simulate(package.scenario, duration=3.0, dt=1e-3, record_every=10)
@@ -371,11 +380,7 @@ def test_the_parameter_file_holds_in_a_namespace_and_under_another_name(client, 
     nodes.begin(remap=[*names, *topics], start_automatically="true")
     client.connect()
     client.reach("running")
-    rng = np.random.default_rng(0)
-    for _ in range(100):
-        q, dq = rng.normal(0.5, 1.0, 2), rng.normal(0.0, 20.0, 2)
-        client.state(q=q.tolist(), dq=dq.tolist())
-        client.spin(PERIOD)
+    send_random_states(client)
     np.testing.assert_array_equal(np.abs(client.efforts).max(axis=0), [5.0, 3.0])
 
 
@@ -452,11 +457,7 @@ def test_torques_are_never_beyond_their_limits(client, nodes):
     nodes.begin(start_automatically="true", torque_limits="[5.0, 3.0]")
     client.connect()
     client.reach("running")
-    rng = np.random.default_rng(0)
-    for _ in range(100):
-        q, dq = rng.normal(0.5, 1.0, 2), rng.normal(0.0, 20.0, 2)
-        client.state(q=q.tolist(), dq=dq.tolist())
-        client.spin(PERIOD)
+    send_random_states(client)
     efforts = np.abs(client.efforts)
     np.testing.assert_array_equal(efforts.max(axis=0), [5.0, 3.0])
     assert client.diagnostics["limited"] == "true"
