@@ -30,6 +30,7 @@ nb_render_text_lexer = "none"
 exclude_patterns = ["README.md"]
 smartquotes = False  # q' is a velocity
 add_module_names = False
+toc_object_entries = False  # each object has a heading
 python_maximum_signature_line_length = 80
 python_use_unqualified_type_names = True
 extlinks = {"repository": (f"{URLS['Repository']}/%s", "%s")}
@@ -38,6 +39,7 @@ mathjax3_config = {"chtml": {"scale": 0.95}}
 copybutton_prompt_text = "$ "
 html_theme = "sphinx_book_theme"
 html_title = "iblf_jax"
+html_context = {"default_mode": "auto"}
 html_favicon = "_static/favicon.svg"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
@@ -56,9 +58,8 @@ html_theme_options = {
     "show_toc_level": 2,
     "home_page_in_toc": True,
     "use_download_button": False,
-    "repository_url": URLS["Repository"],
-    "use_repository_button": True,
-    "use_issues_button": True,
+    "navbar_persistent": [],  # the sidebar has the search
+    "secondary_sidebar_items": {"**": ["page-toc.html"], "members": []},  # its tables are wide
     "icon_links": [
         {"name": "Repository", "url": URLS["Repository"], "icon": "fa-brands fa-github"},
         {"name": "Paper", "url": URLS["Paper"], "icon": "fa-solid fa-file-lines"},

@@ -41,9 +41,11 @@ def types_of(module: ModuleType) -> dict[str, Any]:
 
 
 def _belongs_to(thing: Any, name: str, module: ModuleType) -> bool:
-    """Whether a name of a family's module is one of its own: listed, defined there, or what its
-    members see.
+    """Whether a public name of a family's module is one of its own: listed, defined there, or what
+    its members see.
     """
+    if name.startswith("_"):
+        return False
     listed = getattr(module, "__all__", None)
     if listed is not None:
         return name in listed

@@ -127,6 +127,7 @@ def _signature(thing: Any) -> str:
     text = re.sub(r": '([^']*)'", r": \1", re.sub(r"iblf_jax(\.\w+)+\.(\w+)", r"\2", text)).replace(
         " -> None", ""
     )
+    text = re.sub(r"Annotated\[(\w+), (\w+)\]", r"\1 | \2", text)
     return re.sub(r"-> '([^']*)'", r"-> \1", re.sub(r"<[^>]*>", "...", text)).replace("'", '"')
 
 
