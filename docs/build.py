@@ -1,5 +1,8 @@
 """Builds the site: `python docs/build.py`; the result is out/site/html/index.html.
 
+`--version NAME` says which version the pages belong to; they are in out/site/html/NAME. The front
+page leads to the last release there, or to "main", and `switcher.json` lists all of them.
+
 The script assembles the pages in out/site/source: the pages of this folder, the notebooks and the
 gallery as the tests executed them, and pages that are generated from docstrings, status flags,
 barriers, CONTRIBUTING and benchmark results. It executes notebooks and scripts whose output is
@@ -8,8 +11,12 @@ missing or older than the source. Warnings of Sphinx and dead links (`links.py`)
 
 from __future__ import annotations
 
+import argparse
+import importlib.metadata
+import json
 import multiprocessing
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -24,11 +31,24 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 
 import nbformat
 from gallery import digest
+from packaging.version import InvalidVersion, Version
+from PIL import Image
 
 SITE = ROOT / "out" / "site"
 SOURCE = SITE / "source"
+HTML = SITE / "html"
 EXECUTED = SITE / "notebooks"
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+KERNEL = ROOT / "docs" / "notebook_kernel.py"
+DEVELOPMENT = "main"
+"""Name of the version that is not a release."""
+THUMBNAIL = 480
+"""Width of a picture on the page of the gallery [pixels]."""
+
+
+def digest_of(notebook: Path) -> str:
+    """What the outputs of a notebook depend on: itself, and what its kernel runs before it."""
+    return digest(notebook) + digest(KERNEL)
 
 
 def execute(notebook: Path, folder: Path) -> nbformat.NotebookNode:
@@ -37,9 +57,13 @@ def execute(notebook: Path, folder: Path) -> nbformat.NotebookNode:
 
     found = nbformat.read(notebook, as_version=4)
     NotebookClient(
-        found, timeout=300, kernel_name="python3", resources={"metadata": {"path": str(folder)}}
+        found,
+        timeout=300,
+        kernel_name="python3",
+        resources={"metadata": {"path": str(folder)}},
+        extra_arguments=[f"--IPKernelApp.exec_files=['{KERNEL}']"],
     ).execute()
-    found.metadata["source_digest"] = digest(notebook)
+    found.metadata["source_digest"] = digest_of(notebook)
     EXECUTED.mkdir(parents=True, exist_ok=True)
     nbformat.write(found, EXECUTED / notebook.name)
     return found
@@ -50,7 +74,7 @@ def is_executed(notebook: Path) -> bool:
     path = EXECUTED / notebook.name
     return path.exists() and nbformat.read(path, as_version=4).metadata.get(
         "source_digest"
-    ) == digest(notebook)
+    ) == digest_of(notebook)
 
 
 def missing() -> list[Callable[[], object]]:
@@ -59,7 +83,8 @@ def missing() -> list[Callable[[], object]]:
     import gallery
 
     work = SITE / "work"
-    work.mkdir(parents=True, exist_ok=True)
+    shutil.rmtree(work, ignore_errors=True)  # a store of another version cannot be continued
+    work.mkdir(parents=True)
     return [
         *(partial(execute, notebook, work) for notebook in NOTEBOOKS if not is_executed(notebook)),
         *(partial(gallery.page, script) for script in gallery.PAGES if not gallery.is_made(script)),
@@ -86,6 +111,43 @@ def enable_x64() -> None:
     jax.config.update("jax_enable_x64", True)
 
 
+def tutorial(notebook: Path) -> nbformat.NotebookNode:
+    """An executed notebook, whose pictures have the texts of its figures."""
+    found = nbformat.read(EXECUTED / notebook.name, as_version=4)
+    for cell in found.cells:
+        shown = [output.get("data", {}) for output in cell.get("outputs", ())]
+        texts = [data["text/plain"] for data in shown if "image/png" in data]
+        if texts:
+            cell.metadata["mystnb"] = {"image": {"alt": " Next figure: ".join(texts)}}
+    return found
+
+
+def with_thumbnails(index: str, folder: Path) -> str:
+    """The page of the gallery with small pictures, which have the titles of their pages as text."""
+
+    def small(card: re.Match[str]) -> str:
+        title, options, name = card.groups()
+        thumbnail = f"small_{Path(name).stem}.png"
+        with Image.open(folder / name) as picture:
+            reduced = picture.convert("RGB")
+            reduced.thumbnail((THUMBNAIL, 4 * THUMBNAIL))
+            reduced.quantize(128).save(folder / thumbnail, optimize=True)
+        return f"{{grid-item-card}} {title}\n{options}:img-top: {thumbnail}\n:img-alt: {title}\n"
+
+    card = r"\{grid-item-card\} (.*)\n((?::link.*\n)*):img-top: (.*)\n"
+    return re.sub(card, small, index)
+
+
+def copy_mathjax(folder: Path) -> None:
+    """MathJax as a package of the extra `docs` has it: with it, no page loads anything from other
+    hosts. Of the files that each contain all of MathJax the pages load one.
+    """
+    package = importlib.metadata.distribution("sphinx-mathjax-offline")
+    found = Path(str(package.locate_file("sphinx-mathjax-offline/static/mathjax")))
+    complete = {path.name for path in found.glob("*-*.js")} - {"tex-chtml.js"}
+    shutil.copytree(found, folder, ignore=shutil.ignore_patterns("asciimath.js", *complete))
+
+
 def assemble() -> None:
     """Puts all pages together."""
     import barriers
@@ -100,10 +162,11 @@ def assemble() -> None:
     shutil.rmtree(SOURCE, ignore_errors=True)
     shutil.copytree(ROOT / "docs", SOURCE, ignore=shutil.ignore_patterns("*.py", "__pycache__"))
     shutil.copy(ROOT / "docs" / "conf.py", SOURCE)
+    copy_mathjax(SOURCE / "_static" / "mathjax")
 
     (SOURCE / "tutorials").mkdir()
     for notebook in NOTEBOOKS:
-        shutil.copy(EXECUTED / notebook.name, SOURCE / "tutorials")
+        nbformat.write(tutorial(notebook), SOURCE / "tutorials" / notebook.name)
     listed = "\n".join(notebook.stem for notebook in NOTEBOOKS)
     words = "The notebooks of the repository with their output."
     (SOURCE / "tutorials" / "index.md").write_text(
@@ -111,7 +174,8 @@ def assemble() -> None:
     )
 
     shutil.copytree(gallery.MADE, SOURCE / "gallery")
-    (SOURCE / "gallery" / "index.md").write_text(gallery.index())
+    index = with_thumbnails(gallery.index(), SOURCE / "gallery")
+    (SOURCE / "gallery" / "index.md").write_text(index)
 
     (SOURCE / "extra").mkdir()
     laws = {
@@ -126,15 +190,53 @@ def assemble() -> None:
     measured.write(SOURCE / "benchmarks.md")
     shutil.copy(ROOT / "benchmarks" / "README.md", SOURCE / "lab_notes.md")
     shutil.copy(ROOT / "CONTRIBUTING.md", SOURCE / "contributing.md")
+    changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    changes = changes.replace("(benchmarks/README.md)", "(lab_notes.md)")
+    (SOURCE / "changelog.md").write_text(changes, encoding="utf-8")
+    shutil.copy(ROOT / "CITATION.cff", SOURCE)
+
+
+def release_of(name: str) -> Version | None:
+    """The version that a folder of pages is named after; None for a version in development."""
+    try:
+        return Version(name)
+    except InvalidVersion:
+        return None
+
+
+def write_versions(folder: Path) -> None:
+    """Lists the versions that were built in a folder, and leads its front page to the last release,
+    or to the version in development where there is none.
+    """
+    built = [path.parent.name for path in folder.glob("*/index.html")]
+    releases = sorted((name for name in built if release_of(name)), key=Version, reverse=True)
+    others = sorted(name for name in built if name not in releases)
+    preferred = (releases + others)[0]
+    rows = []
+    for name in [*others, *releases]:
+        label = f"{name} (last release)" if name in releases[:1] else name
+        row = {"name": label, "version": name, "url": f"{name}/", "preferred": name == preferred}
+        rows.append(row)
+    (folder / "switcher.json").write_text(json.dumps(rows, indent=1), encoding="utf-8")
+    (folder / "index.html").write_text(
+        f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>iblf_jax</title>\n'
+        f'<meta http-equiv="refresh" content="0; url={preferred}/index.html"></head>\n'
+        f'<body><a href="{preferred}/index.html">Documentation of iblf_jax</a></body></html>\n',
+        encoding="utf-8",
+    )
 
 
 def main() -> int:
     """Assembles and builds; Sphinx's exit code."""
     import links
 
+    parser = argparse.ArgumentParser(description="Builds the documentation site.")
+    parser.add_argument("--version", default=DEVELOPMENT, help="which version the pages are of")
+    name = parser.parse_args().version
     execute_missing()
     enable_x64()
     assemble()
+    shutil.rmtree(HTML / name, ignore_errors=True)
     command = [
         sys.executable,
         "-m",
@@ -146,19 +248,22 @@ def main() -> int:
         "--keep-going",
         "-b",
         "html",
+        "-d",
+        str(SITE / "doctrees" / name),
+        "-A",
+        f"built_version={name}",
         str(SOURCE),
-        str(SITE / "html"),
+        str(HTML / name),
     ]
     code = subprocess.run(command, check=False).returncode
-    wrong = links.faults(SITE / "html")
+    wrong = links.faults(HTML / name)
     print("\n".join(wrong))
-    code = code or int(bool(wrong))
-    print(
-        f"written to {SITE.relative_to(ROOT) / 'html' / 'index.html'}"
-        if code == 0
-        else "the site was not built"
-    )
-    return code
+    if code or wrong:
+        print("the site was not built")
+        return code or 1
+    write_versions(HTML)
+    print(f"written to {(HTML / 'index.html').relative_to(ROOT)}")
+    return 0
 
 
 if __name__ == "__main__":

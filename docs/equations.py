@@ -27,7 +27,7 @@ TAG = re.compile(r"\(\d\.\d+\)(?:[-,]\s*\(\d\.\d+\))*")
 TOKENS = re.compile(
     rf"(?P<tag>{TAG.pattern})|(?P<gap>\s{{3,}})|"
     r"(?P<space>\s+)|(?P<sign><=|>=|->|!=|\.\.\.|\+-|-\+)"
-    r"|(?P<name>[A-Za-z]+)(?P<index>\d*)(?P<sub>(?:_(?:~?\w+|\([^)]*\)|\{[^}]*\}))?)(?P<prime>['\"]*)"
+    r"|(?P<name>[A-Za-z]+)(?P<index>\d*)(?P<sub>(?:_(?:\w+_\+|~?\w+|\([^)]*\)|\{[^}]*\}))?)(?P<prime>['\"]*)"
     r"|(?P<power>\^(?:-?\d|[A-Za-z]+\d*|\((?:[^()]|\([^()]*\))*\)))|(?P<other>.)"
 )
 
@@ -100,8 +100,10 @@ def _name(
         return "word", name
     if len(name) == 1 or name in SYMBOLS:
         symbol = SYMBOLS.get(name, name)
-        if sub in ACCENTS:
-            return "name", f"{ACCENTS[sub]}{{{symbol.strip()}}}{_lower(index)}{prime}"
+        accent, _, below = sub.partition("_")
+        if accent in ACCENTS:
+            lower = _lower(",".join(part for part in (index, _subscript(below)) if part))
+            return "name", f"{ACCENTS[accent]}{{{symbol.strip()}}}{lower}{prime}"
         return (
             "name",
             f"{symbol}{_lower(','.join(part for part in (index, _subscript(sub)) if part))}{prime}",

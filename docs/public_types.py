@@ -41,9 +41,11 @@ def types_of(module: ModuleType) -> dict[str, Any]:
 
 
 def _belongs_to(thing: Any, name: str, module: ModuleType) -> bool:
-    """Whether a name of a family's module is one of its own: listed, defined there, or what its
-    members see.
+    """Whether a public name of a family's module is one of its own: listed, defined there, or what
+    its members see.
     """
+    if name.startswith("_"):
+        return False
     listed = getattr(module, "__all__", None)
     if listed is not None:
         return name in listed
@@ -81,9 +83,14 @@ def fields_of(record: type) -> dict[str, str]:
     return texts | texts_of_fields(definition.body)
 
 
-def page(thing: Any, name: str, level: int, body: Callable[[str], str]) -> str:
-    """A protocol or a record in Markdown; `body` writes a docstring."""
-    lines = [f"{'#' * level} {name}", "", body(inspect.getdoc(thing) or ""), ""]
+def page(
+    thing: Any, name: str, level: int, body: Callable[[str], str], defined: Callable[..., str]
+) -> str:
+    """A protocol or a record in Markdown; `body` writes a docstring, `defined` a definition."""
+    family, _, short = name.rpartition(".")
+    module = f"iblf_jax.{family}".rstrip(".")
+    definition = defined("class", module, short)
+    lines = [f"{'#' * level} {name}", "", definition, body(inspect.getdoc(thing) or ""), ""]
     if is_record(thing):
         for field, text in fields_of(thing).items():
             lines.append(f"- **{field}**: {' '.join(text.split())}" if text else f"- **{field}**")
@@ -93,12 +100,8 @@ def page(thing: Any, name: str, level: int, body: Callable[[str], str]) -> str:
             continue
         lines += [f"{'#' * (level + 1)} {name}.{member}", ""]
         if isinstance(value, FunctionType):
-            lines += [
-                "```python",
-                f"{member}({', '.join(list(inspect.signature(value).parameters)[1:])})",
-                "```",
-                "",
-            ]
+            arguments = ", ".join(list(inspect.signature(value).parameters)[1:])
+            lines += [defined("method", module, f"{short}.{member}", f"({arguments})")]
         lines += [body(inspect.getdoc(value) or ""), ""]
     for attribute, text in ({} if is_record(thing) else _attributes(thing)).items():
         lines += [f"- **{attribute}**: {' '.join(text.split())}", ""]

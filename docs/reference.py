@@ -88,20 +88,35 @@ OWN_TYPES = "Protocols and types for user-written classes"
 """Heading of the protocols and records of a family."""
 
 
-def page_of(thing: Any, name: str, level: int = 2) -> str:
-    """One public object in Markdown."""
+def page_of(thing: Any, name: str, level: int = 2, module: str = "iblf_jax") -> str:
+    """One public object in Markdown; `name` is its name in a module."""
     if public_types.is_protocol(thing) or public_types.is_record(thing):
-        return public_types.page(thing, name, level, body)
+        return public_types.page(thing, name, level, body, defined)
     documented_in = public_types.ALIASES.get(name)
     if documented_in is not None:
-        return "\n".join(
-            [f"{'#' * level} {name}", "", body(public_types.alias_text(documented_in, name)), ""]
-        )
-    doc = inspect.getdoc(thing) or ""
-    lines = [f"{'#' * level} {name}", ""]
-    if callable(thing):
-        lines += ["```python", f"{name}{_signature(thing)}", "```", ""]
-    return "\n".join([*lines, body(doc), ""])
+        text = body(public_types.alias_text(documented_in, name))
+        kind, signature = "data", ""
+    else:
+        text = body(inspect.getdoc(thing) or "")
+        kind, signature = _kind(thing), _signature(thing) if callable(thing) else ""
+    return "\n".join(
+        [f"{'#' * level} {name}", "", defined(kind, module, name, signature), text, ""]
+    )
+
+
+def _kind(thing: Any) -> str:
+    """What Sphinx calls such an object."""
+    if inspect.isclass(thing):
+        return "class"
+    return "function" if callable(thing) else "data"
+
+
+def defined(kind: str, module: str, name: str, signature: str = "") -> str:
+    """The definition of an object, which the general index lists under its name; its signature is
+    shown if there is one.
+    """
+    options = [f":module: {module}"] if signature else [f":module: {module}", ":no-typesetting:"]
+    return "\n".join([f"```{{py:{kind}}} {name}{signature}", *options, "```", ""])
 
 
 def _signature(thing: Any) -> str:
@@ -112,12 +127,8 @@ def _signature(thing: Any) -> str:
     text = re.sub(r": '([^']*)'", r": \1", re.sub(r"iblf_jax(\.\w+)+\.(\w+)", r"\2", text)).replace(
         " -> None", ""
     )
-    text = re.sub(r"-> '([^']*)'", r"-> \1", re.sub(r"<[^>]*>", "...", text)).replace("'", '"')
-    return (
-        text
-        if len(text) < 90
-        else text.replace("(", "(\n    ", 1).replace(", ", ",\n    ").replace(") ->", "\n) ->")
-    )
+    text = re.sub(r"Annotated\[(\w+), (\w+)\]", r"\1 | \2", text)
+    return re.sub(r"-> '([^']*)'", r"-> \1", re.sub(r"<[^>]*>", "...", text)).replace("'", '"')
 
 
 def body(doc: str) -> str:
@@ -166,7 +177,7 @@ def write(folder: Path) -> None:
     for family in FAMILIES:
         module = getattr(ij, family)
         members = {cls.__name__: cls for cls in module.MEMBERS.values()}
-        texts = [page_of(cls, name) for name, cls in members.items()]
+        texts = [page_of(cls, name, 2, f"iblf_jax.{family}") for name, cls in members.items()]
         texts += [f"## {OWN_TYPES}\n"]
         texts += [
             page_of(thing, f"{family}.{name}", 3)

@@ -1,6 +1,7 @@
 // Runs the script of a live page with the least of a document that it needs.
 // Called as: node live_page.js PAGE.html ACTIONS.json; prints one line of JSON for each action.
-// An action is {"law": name}, which chooses a law, or {"move": path, "to": number}, which moves a slider; {} does nothing.
+// An action is {"law": name}, which chooses a law, or {"move": path, "to": number}, which moves a slider, or
+// {"reset": true}, which presses the button; {} does nothing.
 "use strict";
 const fs = require("fs");
 const text = fs.readFileSync(process.argv[2], "utf8"), actions = JSON.parse(fs.readFileSync(process.argv[3], "utf8"));
@@ -26,6 +27,7 @@ class Range extends Element {  // as a browser does, it keeps its value within i
 const made = {};
 globalThis.document = {
   body: new Element("body"),
+  documentElement: new Element("html"),
   getElementById: id => made[id] ??= new Element(id),
   createElement: tag => tag === "input" ? new Range(tag) : new Element(tag),
 };
@@ -35,6 +37,9 @@ globalThis.Option = class extends Element {
 globalThis.location = {search: process.argv[4] || ""};
 globalThis.devicePixelRatio = 1;
 globalThis.addEventListener = () => undefined;
+globalThis.frameElement = null;
+globalThis.matchMedia = () => ({addEventListener: () => undefined});
+globalThis.getComputedStyle = () => ({getPropertyValue: () => ""});
 (0, eval)(script);
 
 const sliders = made.sliders;
@@ -49,9 +54,11 @@ for (const action of actions) {
     input.value = action.to;
     input.listeners.input();
   }
-  const shown = sliders.all("label").map(label => [label.all("input")[0].name, label.all("span")[0].textContent]);
+  if ("reset" in action) sliders.all("button")[0].listeners.click();
+  const shown = sliders.all("label").filter(label => label.all("input").length).map(label => [label.all("input")[0].name, label.all("span")[0].textContent]);
   const places = sliders.all("input").map(input => [input.name, Number(input.value)]);
+  const menu = sliders.all("label").filter(label => label.htmlFor === "law").map(label => label.textContent);
   const laws = sliders.all("option").map(option => option.value);
   console.log(JSON.stringify({...JSON.parse(document.body.dataset.run), shown: Object.fromEntries(shown),
-    places: Object.fromEntries(places), laws}));
+    places: Object.fromEntries(places), laws, menu}));
 }

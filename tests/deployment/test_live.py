@@ -90,9 +90,12 @@ def test_sliders_and_curves_agree_after_a_switch_of_the_law(two_laws, tmp_path):
         {"move": "initial.q[0]", "to": 0.5},
         {"law": "integral"},
         {"law": "log"},
+        {"reset": True},
     ]
     found = in_node(two_laws, tmp_path, actions)
-    assert [one["law"] for one in found] == ["integral"] * 3 + ["log"] * 2 + ["integral", "log"]
+    laws = ["integral"] * 3 + ["log"] * 2 + ["integral", "log", "log"]
+    assert [one["law"] for one in found] == laws
+    assert all(one["menu"] == ["Control law"] for one in found)
     for one in found:
         K2, start = np.exp(one["places"]["controller.K2"]), one["places"]["initial.q[0]"]
         assert one["shown"]["controller.K2"].startswith(f"{K2:.3g}"[:4].rstrip("."))
@@ -102,6 +105,7 @@ def test_sliders_and_curves_agree_after_a_switch_of_the_law(two_laws, tmp_path):
         np.testing.assert_allclose(one["q"], expected, atol=1e-3)
     np.testing.assert_array_equal(found[5]["q"], found[2]["q"])  # a law keeps its own numbers
     np.testing.assert_array_equal(found[6]["q"], found[4]["q"])
+    np.testing.assert_array_equal(found[7]["q"], found[3]["q"])  # as before its slider was moved
     assert np.abs(np.subtract(found[2]["q"], found[0]["q"])).max() > 1e-2
 
 

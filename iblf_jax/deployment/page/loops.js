@@ -72,6 +72,11 @@ class Loops {
     for (const k of places) parameters[k] = value;
   }
 
+  // Gives a loop the numbers again that it had when the page was opened.
+  reset(name) {
+    this.modules.delete(name);
+  }
+
   // Runs a loop with its parameters as they are: columns by name, a number for each record.
   run(name, steps, every) {
     const {loop, table, Reals} = this.opened(name);
