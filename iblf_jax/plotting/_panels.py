@@ -25,6 +25,7 @@ from iblf_jax.plotting._curves import (
     Peak,
     distinct,
     escaped,
+    peak_of,
     rounding_error,
     thinned,
 )
@@ -403,6 +404,25 @@ def peak_in_words(curve: Curve, peak: Peak, quantity: PanelQuantity) -> str:
     if quantity.field not in WITHOUT_JOINT:
         parts.append(curve.joint_label(peak.joint))
     return ", ".join([*parts, f"t = {peak.t:.4g} s"])
+
+
+PEAKS = ("e1", "e2", "tau")
+"""The signals of which tables list the peaks."""
+
+
+def peak_rows(curve: Curve) -> list[tuple[str, str, str, str, str]]:
+    """The peaks of errors and torque of every joint, for a table: signal, unit, joint, value with
+    its sign, and time [s].
+    """
+    rows = []
+    for field in PEAKS:
+        for joint in range(curve.run.n):
+            peak = peak_of(curve, field, [joint])
+            unit = quantity_of(curve.run.scenario, field, joint).unit
+            if peak is not None:
+                numbers = (f"{peak.value:.4g}", f"{peak.t:.4g}")
+                rows.append((field, unit, curve.joint_label(joint), *numbers))
+    return rows
 
 
 def signed(value: float, digits: int = 5) -> str:

@@ -15,6 +15,9 @@ from iblf_jax.plotting._curves import ROUNDING
 GAIN = 2.0
 """An axis is logarithmic if the middle half of the values then takes more than this many times the
 share of the axis that it takes on a linear one."""
+CORNER = 0.1
+"""An axis is also logarithmic if the median of the values is then not within this share of the axis
+from an end, and is so on a linear one."""
 ROOM = 0.05
 """Room beyond the outermost values, as a share of the axis."""
 
@@ -66,7 +69,7 @@ def _finite(x: Any) -> np.ndarray:
 
 def scale_of(x: Any) -> Scale:
     """The scale of an axis with these values: linear, unless a logarithmic one spreads their middle
-    half over more than `GAIN` times the share of the axis.
+    half (`GAIN`), or moves their median away from an end (`CORNER`).
     """
     values = _finite(x).astype(float)
     if not varies(values):
@@ -79,6 +82,8 @@ def scale_of(x: Any) -> Scale:
         other = _logarithmic_on_both_sides(usual)
     if _middle_share(other, values) > GAIN * _middle_share(LINEAR, values):
         return other
+    if _is_in_corner(LINEAR, values) and not _is_in_corner(other, values):
+        return other
     return LINEAR
 
 
@@ -86,6 +91,13 @@ def _middle_share(scale: Scale, values: np.ndarray) -> float:
     """The share of an axis that the middle half of the values takes."""
     low, first, third, high = scale.forward(np.quantile(values, [0.0, 0.25, 0.75, 1.0]))
     return float((third - first) / (high - low))
+
+
+def _is_in_corner(scale: Scale, values: np.ndarray) -> bool:
+    """Whether the median of the values is near an end of the axis."""
+    low, middle, high = scale.forward(np.quantile(values, [0.0, 0.5, 1.0]))
+    place = (middle - low) / (high - low)
+    return bool(min(place, 1.0 - place) < CORNER)
 
 
 def follow(axes: Axes, direction: str, x: Any) -> None:
