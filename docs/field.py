@@ -113,10 +113,11 @@ def benchmark_page(found: list[Part]) -> str:
         " their ratio states how fast.",
         "## Comparison on each task",
         "The published law sets the effort: the RMS input above the one that balances gravity. For"
-        " a plant in strict-feedback form it is the RMS of all inputs above the steady input of the"
-        " plant, which is zero where the plant states none. One factor scales the gains of every"
-        " other law to this effort. Before that, the laws have the rates of the published law, and"
-        " boxes and limits at the scales of the published run (`benchmarks/field/measure.py`). Laws"
+        " a plant in strict-feedback form it is the RMS of all inputs, each in its unit, above the"
+        " steady input of the plant, which is zero where the plant states none. One factor scales"
+        " the gains of every other law to this effort. Before that, the laws have the rates of the"
+        " published law, and boxes and limits at the scales of the published run"
+        " (`benchmarks/field/measure.py`). Laws"
         " with several gains, or with a choice of the published gains for another purpose, could be"
         " tuned further; the tables compare laws at one ratio of their gains.",
         markdown_table(
