@@ -1,6 +1,5 @@
-"""Prescribed time inside bounds on all states (TiSSaT 2026): a chain of three integrators shall
-reach its reference before a prescribed time. The published motion depends on the time step of the
-program.
+"""Prescribed time inside bounds on all states (TiSSaT 2026): three integrators shall reach their
+reference before a prescribed time. The published motion depends on the program's time step.
 """
 
 import jax
