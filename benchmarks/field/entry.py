@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import io
 import re
 import runpy
@@ -259,8 +260,9 @@ def _value(kind: Any, value: Any, field: dataclasses.Field, place: str, faults: 
     return value
 
 
+@functools.cache
 def execute(folder: Path) -> Reproduction:
-    """Runs the `example.py` of a folder.
+    """Runs the `example.py` of a folder, once a process.
 
     Raises:
       EntryError: a name is missing.
