@@ -163,7 +163,10 @@ def test_every_public_name_is_in_the_reference():
             "V1 = int_0^xi 2 s ds    (2.6), (3.1)",
             r"V_{1} = \int _{0}^{\xi } 2 s\,\mathrm{d} s\quad\text{(2.6), (3.1)}",
         ),
-        ("x_hat' = f + G x_hat_+ + d_hat_s", r"\hat{x}' = f + G\,\hat{x}_{+} + \hat{\mathrm{d}}_{s}"),
+        (
+            "x_hat' = f + G x_hat_+ + d_hat_s",
+            r"\hat{x}' = f + G\,\hat{x}_{+} + \hat{\mathrm{d}}_{s}",
+        ),
         (
             "k = k_u if e1 > 0,   z_(k+1) <= 1",
             "k = k_{u}\\ \\text{if}\\ e_{1} > 0, \\\\\nz_{k+1} \\le  1",
