@@ -1,10 +1,10 @@
-"""The gallery: runs every script of examples/gallery and examples/reproductions and writes its
-page.
+"""The gallery: runs every script of examples/gallery and every entry of benchmarks/field and writes
+its page.
 
 A page has the text, the figures and the printed output of its script. The docstring of a script is
 the introduction, "Title: text". A block begins with "# %%" and a text, which may continue in the
-comment lines below. A reproduction has a scenario file of the same name, and may have published
-numbers in a CSV file of the same name.
+comment lines below. The page of an entry also has the tables of its `entry.toml`, and its scenario
+file; the numbers that the entry reached are written to a JSON file of the same name.
 
 The tests run the scripts by `page`, which writes to `out/site/gallery`. `docs/build.py` reads the
 pages there, and runs the scripts whose page is missing or older.
@@ -18,29 +18,42 @@ import hashlib
 import io
 import itertools
 import os
+import sys
 import warnings
 from pathlib import Path
 from typing import Any
 
+import entry_tables
 from matplotlib import pyplot
 from matplotlib.figure import Figure
 
+sys.path.append(str(Path(__file__).resolve().parents[1] / "benchmarks" / "field"))
+
+import entry
+
 ROOT = Path(__file__).resolve().parents[1]
 SCRIPTS = sorted((ROOT / "examples" / "gallery").glob("*.py"))
-REPRODUCTIONS = sorted((ROOT / "examples" / "reproductions").glob("*.py"))
-PAGES = [*SCRIPTS, *REPRODUCTIONS]
+ENTRIES = [folder / "example.py" for folder in entry.folders()]
+PAGES = [*SCRIPTS, *ENTRIES]
 MADE = ROOT / "out" / "site" / "gallery"
 DPI = 110
 
 
+def page_name(script: Path) -> str:
+    """The name of the page of a script: that of the script, or of the folder of an entry."""
+    return script.parent.name if script.name == "example.py" else script.stem
+
+
 def digest(source: Path) -> str:
-    """What a page says of the script, or of the notebook, that it was made from, and of what lies
-    beside it under the same name.
+    """What a page states of the script, or of the notebook, that it was made from; for an entry, of
+    its folder.
     """
-    files = [source, *(source.with_suffix(suffix) for suffix in (".toml", ".csv"))]
-    return hashlib.sha256(
-        b"".join(file.read_bytes() for file in files if file.exists())
-    ).hexdigest()[:16]
+    files = [source]
+    if source.name == "example.py":
+        files += sorted(
+            path for path in source.parent.iterdir() if path.suffix in (".toml", ".csv")
+        )
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:16]
 
 
 def is_of(page: Path, source: Path) -> bool:
@@ -50,17 +63,37 @@ def is_of(page: Path, source: Path) -> bool:
 
 def is_made(script: Path) -> bool:
     """Whether the page of this script, as it is now, is there."""
-    return is_of(MADE / f"{script.stem}.md", script)
+    return is_of(MADE / f"{page_name(script)}.md", script)
 
 
 def page(script: Path) -> list[Path]:
     """Runs a script and writes its page; the pictures that it made."""
     MADE.mkdir(parents=True, exist_ok=True)
-    text = script.read_text()
-    title, _, rest = ast.get_docstring(ast.parse(text)).partition(": ")
-    code = text.split('"""', 2)[2].strip()
-    blocks = [block.strip() for block in f"\n{code}".split("\n# %%")]
+    name = page_name(script)
+    title, _, rest = ast.get_docstring(ast.parse(script.read_text())).partition(": ")
     lines = [f"<!-- {digest(script)} -->", f"# {title}", "", f"{rest[0].upper()}{rest[1:]}", ""]
+    shown, pictures, defined = _executed(script, name, title)
+    if script.name == "example.py":
+        contents = entry.load(script.parent)
+        made = entry.reproduction(defined)
+        (MADE / f"{name}.json").write_text(entry_tables.computed(made), encoding="utf-8")
+        before = entry_tables.before_the_script(contents, made)
+        after = entry_tables.after_the_script(contents) + _scenario_file(script.parent)
+        shown = [*_as_lines(before), *shown, *_as_lines(after)]
+    (MADE / f"{name}.md").write_text("\n".join(lines + shown), encoding="utf-8")
+    return pictures
+
+
+def _as_lines(parts: list[str]) -> list[str]:
+    """Parts of a page, with an empty line after each."""
+    return [line for part in parts for line in (part, "")]
+
+
+def _executed(script: Path, name: str, title: str) -> tuple[list[str], list[Path], dict[str, Any]]:
+    """The blocks of a script with their output, its pictures, and the names that it defines."""
+    code = script.read_text().split('"""', 2)[2].strip()
+    blocks = [block.strip() for block in f"\n{code}".split("\n# %%")]
+    lines: list[str] = []
     names: dict[str, Any] = {"__name__": "__main__", "__file__": str(script)}
     pictures: list[Path] = []
     before = Path.cwd()
@@ -74,27 +107,25 @@ def page(script: Path) -> list[Path]:
                 exec(compile(source, str(script), "exec", dont_inherit=True), names)
             lines += [words.strip(), ""] if words else []
             lines += ["```python", source.strip(), "```", ""] if source.strip() else []
-            for name, value in list(names.items()):
-                if id(value) not in seen and (found := _picture(value, f"{script.stem}_{name}")):
+            for variable, value in list(names.items()):
+                if id(value) not in seen and (found := _picture(value, f"{name}_{variable}")):
                     pictures.append(found)
-                    lines += [f"![{title}: {name}]({found.name})", ""]
+                    lines += [f"![{title}: {variable}]({found.name})", ""]
             if printed.getvalue().strip():
                 lines += ["```text", printed.getvalue().rstrip(), "```", ""]
     finally:
         pyplot.close("all")
         os.chdir(before)
-    beside = script.with_suffix(".toml")
-    if beside.exists():
-        lines += [
-            f"The scenario file, `{beside.relative_to(ROOT).as_posix()}`:",
-            "",
-            "```toml",
-            beside.read_text().rstrip(),
-            "```",
-            "",
-        ]
-    (MADE / f"{script.stem}.md").write_text("\n".join(lines), encoding="utf-8")
-    return pictures
+    return lines, pictures, names
+
+
+def _scenario_file(folder: Path) -> list[str]:
+    """The scenario file of an entry, where there is one."""
+    path = folder / "scenario.toml"
+    if not path.exists():
+        return []
+    place = path.relative_to(ROOT).as_posix()
+    return ["## Scenario file", f"`{place}`:", f"```toml\n{path.read_text().rstrip()}\n```"]
 
 
 def _words(block: str) -> tuple[str, str]:
@@ -121,18 +152,19 @@ def index() -> str:
     """The page that shows all of them, by their first picture."""
     words = "Each figure has a script in `examples/gallery`, which the tests run."
     others = (
-        "Published examples of other authors, in `examples/reproductions`: as scenario files, or as"
-        " scripts where the plant is a function of the example. Each page lists the printed and the"
-        " missing parameters, the results of this package, and what could not be reproduced."
+        "Published examples of other authors, in `benchmarks/field/entries`. Each page lists the"
+        " printed, corrected and missing parameters, the published numbers beside those that this"
+        " package reached, and what was not reproduced. The"
+        " [benchmark of the field](../field.md) compares the laws of the package on all of them."
     )
-    toctree = "```{toctree}\n:hidden:\n\n" + "\n".join(script.stem for script in PAGES) + "\n```"
+    toctree = "```{toctree}\n:hidden:\n\n" + "\n".join(map(page_name, PAGES)) + "\n```"
     parts = [
         "# Gallery",
         words,
         _cards(SCRIPTS),
-        "(reproductions)=\n## Reproductions",
+        "(reproductions)=\n## Published examples",
         others,
-        _cards(REPRODUCTIONS),
+        _cards(ENTRIES),
         toctree,
     ]
     return "\n\n".join(parts) + "\n"
@@ -142,13 +174,14 @@ def _cards(scripts: list[Path]) -> str:
     """A grid of pages."""
     cards = []
     for script in scripts:
-        text = (MADE / f"{script.stem}.md").read_text()
+        name = page_name(script)
+        text = (MADE / f"{name}.md").read_text()
         title, picture = (
             text.split("\n# ", 1)[1].split("\n", 1)[0],
             text.split("![", 1)[1].split("](", 1)[1].split(")", 1)[0],
         )
         cards.append(
-            f":::{{grid-item-card}} {title}\n:link: {script.stem}\n:link-type: doc\n:img-top:"
+            f":::{{grid-item-card}} {title}\n:link: {name}\n:link-type: doc\n:img-top:"
             f" {picture}\n:::"
         )
     return "::::{grid} 1 2 3 3\n:gutter: 2\n\n" + "\n".join(cards) + "\n\n::::"

@@ -170,7 +170,17 @@ def _rollout(run: Rollout) -> Shown:
         f"{plants.input_name(plant).capitalize()}s": lambda: plotting.torques(run),
         "Uncertain terms": lambda: plotting.uncertain_terms(run),
     }
-    return Shown("Run", _described(run), {"Metrics": table}, figures, run.scenario)
+    contents = {"Metrics": table, "Peaks with their signs": _peaks(run)}
+    return Shown("Run", _described(run), contents, figures, run.scenario)
+
+
+def _peaks(run: Rollout) -> str:
+    """The recorded peaks of a run, as a table."""
+    from iblf_jax.plotting._curves import curves_of
+    from iblf_jax.plotting._panels import peak_rows
+
+    (curve,) = curves_of(run)
+    return tables.as_html(("peak of", "unit", "joint", "value", "at [s]"), peak_rows(curve))
 
 
 def _perturbation(drawn: Any) -> str:
@@ -184,6 +194,7 @@ def _perturbation(drawn: Any) -> str:
 
 def _study(study: Study) -> Shown:
     from iblf_jax import plotting
+    from iblf_jax.plotting._studies import start_notes
     from iblf_jax.studies.statistics import SMALLER_IS_WORSE
 
     if not checks.is_concrete(study):
@@ -208,7 +219,8 @@ def _study(study: Study) -> Shown:
     if first == "margin":
         figures["Overview"] = lambda: plotting.study_overview(study)
     figures["Every metric"] = lambda: plotting.histograms(study)
-    return Shown("Monte-Carlo study", _described(study), content, figures, study.scenario)
+    words = [*_described(study), *start_notes(study, list(study.metrics))]
+    return Shown("Monte-Carlo study", words, content, figures, study.scenario)
 
 
 def _certificate(found: Certificate) -> Shown:

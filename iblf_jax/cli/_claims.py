@@ -284,6 +284,16 @@ def assumed(runs: Pair) -> str:
     )
 
 
+def assumed_briefly(runs: Pair) -> str:
+    """The assumed masses and lengths in a sentence, for the title of a figure."""
+    arm: Any = next(iter(runs.values())).scenario.plant
+    masses, lengths = _all_digits(arm.mass), _all_digits(arm.length)
+    return (
+        "The arm's masses and lengths are assumed (the paper prints none):"
+        f" {masses} kg, {lengths} m"
+    )
+
+
 def _all_digits(values: Any) -> str:
     """One number per joint as text, in six significant digits."""
     return " / ".join(f"{x:.6g}" for x in np.ravel(np.asarray(values, float)))

@@ -22,9 +22,9 @@ NAMES = {"integral": "integral BLF", "log": "log-BLF"}
 HELP = "reproduce the paper's simulation and its six figures"
 DESCRIPTION = (
     "Run the paper's law (integral barrier) and its comparison (log barrier), write the six"
-    " figures, an animation of the arm, the data and the metrics, and report which of the"
-    " paper's claims hold. The paper prints no masses and lengths of its arm; the runs"
-    " assume values, and the output lists them."
+    " figures, an animation of the arm, a report, the data and the metrics, and report which of"
+    " the paper's claims hold. The paper prints no masses and lengths of its arm; the runs"
+    " assume values, and the output, the report and the figures state them."
 )
 EPILOG = "Source: T. Zhang, P. Yan, AIMS Mathematics 9(1) (2024) 319-339."
 
@@ -57,7 +57,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Runs the command."""
-    from iblf_jax.cli._claims import assumed, paper_claims, remark
+    from iblf_jax.cli._claims import assumed, assumed_briefly, paper_claims, remark
+    from iblf_jax.cli._paper_figures import as_markdown, peaks, peaks_table
     from iblf_jax.core.status import FAILED, describe, has_flag
 
     begin = time.perf_counter()
@@ -73,17 +74,24 @@ def run(args: argparse.Namespace) -> int:
     print(metrics_table(runs) + "\n")
     claims = paper_claims(runs)
     note = remark(runs)
+    peaks_text = peaks_table(runs)
+    print(
+        "Peaks with their signs; the metrics peak_error and peak_torque are absolute values\n"
+        f"{peaks_text}\n"
+    )
     _print_claims(claims, note)
-    findings = {"assumed": assumption, "claims": claims, "remark": note}
+    findings = {"assumed": assumption, "peaks": peaks(runs), "claims": claims, "remark": note}
     _write_data(folder, args, runs, findings, seconds)
-    _draw(folder, runs)
+    report = as_markdown(claims, peaks_text, assumption, note)
+    (folder / "report.md").write_text(report, encoding="utf-8")
+    _draw(folder, runs, assumed_briefly(runs))
     print(
         f"\nsimulations: {seconds['first']:.2f} s with compilation, {seconds['again']:.2f} s"
         f" without compilation; the whole command: {time.perf_counter() - begin:.1f} s"
     )
     print(
-        f"written to {folder}: figure_1 ... figure_6 (.png, .pdf), arm.gif, rollouts.nc,"
-        " metrics.json"
+        f"written to {folder}: report.md, figure_1 ... figure_6 (.png, .pdf), arm.gif,"
+        " rollouts.nc, metrics.json"
     )
     return int(any(has_flag(int(one.status), FAILED) for one in runs.values()))
 
@@ -143,6 +151,13 @@ def _write_data(
         "versions": {"iblf_jax": iblf_jax.__version__, "jax": jax.__version__},
         "runs": {name: status_and_metrics(one) for name, one in runs.items()},
         "assumed": findings["assumed"],
+        "peaks": {
+            run: {
+                signal: [peak and peak._asdict() for peak in peaks]
+                for signal, peaks in signals.items()
+            }
+            for run, signals in findings["peaks"].items()
+        },
         "claims": [dict(zip(keys, claim, strict=True)) for claim in findings["claims"]],
         "remark": findings["remark"],
         "seconds": {"with compilation": seconds["first"], "the two runs alone": seconds["again"]},
@@ -150,8 +165,8 @@ def _write_data(
     write_json(folder / "metrics.json", report)
 
 
-def _draw(folder: Path, runs: dict[str, Rollout]) -> None:
+def _draw(folder: Path, runs: dict[str, Rollout], note: str) -> None:
     from iblf_jax import plotting
 
-    plotting.save(plotting.paper_figures(runs), folder, formats=("png", "pdf"))
-    plotting.animate(runs, folder / "arm.gif")
+    plotting.save(plotting.paper_figures(runs, note=note), folder, formats=("png", "pdf"))
+    plotting.animate(runs, folder / "arm.gif", note=note)

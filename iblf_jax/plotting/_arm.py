@@ -118,7 +118,11 @@ class Scene:
     """The figure of an animation; `move_to(frame)` moves its parts to their places."""
 
     def __init__(
-        self, curves: Sequence[Curve], target: ReferenceMotion, motions: Sequence[Motion]
+        self,
+        curves: Sequence[Curve],
+        target: ReferenceMotion,
+        motions: Sequence[Motion],
+        note: str = "",
     ) -> None:
         self.target = target
         self.motions = motions
@@ -143,7 +147,8 @@ class Scene:
         title = "The arm within its joint limits"
         if has_outline(scenario.plant):
             title = "The plant and its reference"
-        _style.set_title(self.figure, title, curves)
+        notes = [note] if note else []
+        _style.set_title(self.figure, title, curves, notes=notes)
         _style.legend_below(self.figure, 4)
 
     def _animated(self, artist: Any) -> Any:

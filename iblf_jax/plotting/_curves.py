@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -158,6 +158,14 @@ SAME_SIGNAL = 0.03
 """Signals that differ by less than this fraction of their range are drawn once for all runs."""
 
 
+BOUNDS_OF = {"q": ("lower", "upper"), "dq": ("dq_lower", "dq_upper")}
+"""Signal -> its bounds; those of "level_3" are "level_3_lower" and "level_3_upper"."""
+SAME_BOUNDS = {"e1": "q", "xi": "q"}
+"""Signal -> the signal with whose bounds its own change."""
+WITHOUT_JOINT = ("region_margin", "theta")
+"""Signals whose entries are not joints."""
+
+
 @dataclass(frozen=True, eq=False)
 class Curve:
     """One run to draw: `curve["q"]` is an array (T, n), shorter than `curve.t` if the run was
@@ -240,6 +248,11 @@ class Curve:
         return bool(int(self.run.status) & FAILED)
 
     @property
+    def diverged(self) -> bool:
+        """Whether the state diverged and was frozen."""
+        return bool(int(self.run.status) & Status.NOT_FINITE)
+
+    @property
     def status(self) -> str:
         """The run's status flags in words."""
         return describe(int(self.run.status), status_words(self.run.scenario))
@@ -252,35 +265,141 @@ class Curve:
         if not plants.is_chain(scenario.model):
             return []
         found = []
-        steps = np.diff(self.t[: self.samples])
         for level in range(1, plants.order_of(scenario.model) + 1):
             sizes = [self[f"level_{level}_{part}"] for part in ("d", "estimate")]
-            rates = np.diff(self[f"level_{level}"], axis=0) / steps[:, None]
-            if np.nanmax(np.abs(sizes)) > NEGLIGIBLE * np.nanmax(np.abs(rates), initial=0.0):
+            if np.nanmax(np.abs(sizes)) > NEGLIGIBLE * self.largest_rate(level):
                 found.append(level)
         return found
+
+    def largest_rate(self, level: int) -> float:
+        """The largest rate of a level, counted from 1, over time and components, in its unit per
+        second.
+        """
+        steps = np.diff(self.t[: self.samples])
+        rates = np.diff(self[f"level_{level}"], axis=0) / steps[:, None]
+        return float(np.nanmax(np.abs(rates), initial=0.0))
 
     def joint_label(self, joint: int) -> str:
         """The label of a joint in a figure."""
         return joint_labels(self.run.scenario.plant, self.run.n)[joint]
 
-    def break_index(self) -> int | None:
-        """The first sample outside the bounds or regions, else the last sample of a run that
-        diverged, else None.
+    def exit_index(self, field: str, entry: int) -> int | None:
+        """The first sample at which the joint of a panel left the bounds that concern the panel;
+        None if it stayed inside.
+
+        The bounds are those of the panel's own quantity, or of every level of the joint for a
+        quantity without bounds, such as the torque.  Of a run that diverged without leaving a bound
+        it is the last sample, in every panel.
+
+        Args:
+          field: the signal of the panel.
+          entry: the joint, or the region, of the panel.
         """
-        lower, upper = self["lower"][: self.samples], self["upper"][: self.samples]
-        inside = ((lower < self["q"]) & (self["q"] < upper)).all(axis=1)
-        for level in range(3, plants.order_of(self.run.scenario.plant) + 1):
-            x, low, high = (self[f"level_{level}{part}"] for part in ("", "_lower", "_upper"))
-            inside &= ~((x <= low) | (x >= high)).any(axis=1)
-        if self.has_regions:
-            inside &= (self["region_margin"] > 0).all(axis=1)
-        outside = np.flatnonzero(~inside)
-        if outside.size:
-            return int(outside[0])
-        if int(self.run.status) & Status.NOT_FINITE:
+        exits = []
+        for name in self._bounded_by(field):
+            outside = np.flatnonzero(self._outside(name)[:, entry])
+            exits += outside[:1].tolist()
+        if exits:
+            return min(exits)
+        if self.diverged and not self._has_exit():
             return self.samples - 1
         return None
+
+    def _bounded_signals(self) -> list[str]:
+        """The signals of the run that have bounds: levels, and distances to regions."""
+        names = ["q"]
+        if self.has_speed_limits:
+            names.append("dq")
+        order = plants.order_of(self.run.scenario.plant)
+        names += [f"level_{level}" for level in range(3, order + 1)]
+        if self.has_regions:
+            names.append("region_margin")
+        return names
+
+    def _bounded_by(self, field: str) -> list[str]:
+        """The bounded signals that concern the panel of a signal."""
+        own = SAME_BOUNDS.get(field, field)
+        bounded = self._bounded_signals()
+        if own in bounded:
+            return [own]
+        if own in WITHOUT_JOINT:
+            return []
+        return [name for name in bounded if name not in WITHOUT_JOINT]
+
+    def _outside(self, field: str) -> np.ndarray:
+        """Whether a bounded signal touches or leaves its bounds, (T, n) bool."""
+        values = self[field]
+        if field == "region_margin":
+            return values <= 0.0
+        low_field, high_field = BOUNDS_OF.get(field, (f"{field}_lower", f"{field}_upper"))
+        low, high = self[low_field][: self.samples], self[high_field][: self.samples]
+        return (values <= low) | (values >= high)
+
+    def _has_exit(self) -> bool:
+        return any(self._outside(name).any() for name in self._bounded_signals())
+
+    def largest(self, field: str) -> float:
+        """The largest finite size of a signal over time and joints; 0 if there is none."""
+        sizes = np.abs(self[field])
+        return float(np.max(sizes, where=np.isfinite(sizes), initial=0.0))
+
+
+ROUNDING = 256.0
+"""Values below this many units in the last place of the largest value from which a signal is
+computed are rounding errors."""
+
+COMPUTED_FROM: dict[str, tuple[str, ...]] = {
+    "q": ("q", "q_d"),
+    "e1": ("q", "q_d"),
+    "dq": ("dq", "dq_d"),
+    "e2": ("dq", "alpha"),
+    "disturbance_estimate": ("tau", "disturbance"),
+}
+"""Signal -> the signals from whose size its rounding errors follow; of the others, that is the
+signal itself, over all joints."""
+
+
+def rounding_error(curves: Sequence[Curve], field: str) -> float:
+    """The size below which a signal of these runs is a rounding error, in its unit.
+
+    Args:
+      curves: the runs.
+      field: the signal; "xi" is relative to the bounds, so that its scale is 1.
+    """
+    errors = []
+    for curve in curves:
+        unit_in_last_place = float(np.finfo(curve[field].dtype).eps)
+        errors.append(ROUNDING * unit_in_last_place * _scale_of(curve, field))
+    return max(errors)
+
+
+def _scale_of(curve: Curve, field: str) -> float:
+    """The size of the numbers from which a signal is computed."""
+    if field == "xi":
+        return 1.0
+    level = LEVEL_SIGNAL.fullmatch(field)
+    if level is not None and level[2] == "estimate":
+        return curve.largest_rate(int(level[1]))
+    return max(curve.largest(name) for name in COMPUTED_FROM.get(field, (field,)))
+
+
+class Peak(NamedTuple):
+    """The value of a signal that is farthest from zero, with its sign, joint and time."""
+
+    value: float
+    joint: int
+    t: float
+    """s."""
+
+
+def peak_of(curve: Curve, field: str, joints: Sequence[int]) -> Peak | None:
+    """The peak of a signal over some joints of a run; None without a finite value."""
+    values = curve[field][:, list(joints)]
+    sizes = np.where(np.isfinite(values), np.abs(values), -1.0)
+    sample, column = divmod(int(np.argmax(sizes)), sizes.shape[1])
+    if sizes[sample, column] < 0.0:
+        return None
+    return Peak(float(values[sample, column]), joints[column], float(curve.t[sample]))
 
 
 def joint_labels(robot: Any, n: int) -> list[str]:

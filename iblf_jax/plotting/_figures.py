@@ -1,7 +1,8 @@
 """The six figures of the paper and related ones, for a run or a dict of runs by name.
 
 A figure against time has one row per panel; a second column magnifies the start of the run, so
-that the magnification covers no curve.
+that the magnification covers no curve.  Its titles state why it ends where it does, and the range
+of the signal after it.
 
 Source: Zhang & Yan 2024, figures 1 to 6.
 """
@@ -9,6 +10,7 @@ Source: Zhang & Yan 2024, figures 1 to 6.
 from __future__ import annotations
 
 import dataclasses
+import string
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -38,6 +40,7 @@ from iblf_jax.plotting._panels import (
     disturbance_quantity,
     level_quantity,
     quantity_of,
+    range_after,
     run_style,
     show,
     transient_end,
@@ -51,8 +54,15 @@ Runs = Rollout | Mapping[str, Rollout]
 
 ZOOM_SHARE = 0.1
 """Share of the time that the zoom shows by default for runs without a transient."""
+MIN_ZOOMED = 0.01
 MAX_ZOOMED = 0.3
-"""Largest share of the time that the zoom shows by default."""
+"""Smallest and largest share of the time that the zoom shows by default."""
+TRANSIENTS = 2.5
+"""Length of the zoom in transients, by default."""
+COLUMNS = (2.1, 1.0)
+"""Widths of the columns of the full time and of the zoom."""
+TITLE_HEIGHT = 0.15
+"""Height of the title of a zoom [in]."""
 
 
 class PanelRow(NamedTuple):
@@ -64,49 +74,89 @@ class PanelRow(NamedTuple):
 
 
 def windows(
-    curves: Sequence[Curve], rows: Sequence[PanelRow], zoom: float | None
+    curves: Sequence[Curve],
+    rows: Sequence[PanelRow],
+    zoom: float | None,
+    transients: float = TRANSIENTS,
 ) -> tuple[Window, Window]:
     """The windows of the full time and of the zoom.
 
     Args:
       curves: the runs.
       rows: the quantities whose transients the zoom shows.
-      zoom: end of the zoom [s]; if not given, a round number near 2.5 transients.
+      zoom: end of the zoom [s]; if not given, a round number near the end of the transient times
+        `transients`.
+      transients: see `zoom`.
 
     Raises:
       ValueError: the zoom is not a positive number.
     """
     end = max(float(np.asarray(curve.run.t)[-1]) for curve in curves) or 1e-3
     if zoom is None:
-        zoom = _default_zoom(curves, rows, end)
+        zoom = _default_zoom(curves, rows, end, transients)
     return (0.0, end), (0.0, min(checks.positive_number("zoom", zoom, "s"), end))
 
 
-def _default_zoom(curves: Sequence[Curve], rows: Sequence[PanelRow], end: float) -> float:
-    transient = max(transient_end(curves, row.quantity, row.joint) for row in rows)
+def _transient_of(curves: Sequence[Curve], rows: Sequence[PanelRow]) -> float:
+    """The end of the longest transient of some rows [s]."""
+    return max(transient_end(curves, row.quantity, row.joint) for row in rows)
+
+
+def _default_zoom(
+    curves: Sequence[Curve], rows: Sequence[PanelRow], end: float, transients: float
+) -> float:
+    transient = _transient_of(curves, rows)
     if transient == 0:
         return ZOOM_SHARE * end
-    return float(f"{min(max(2.5 * transient, 0.01 * end), MAX_ZOOMED * end):.0e}")
+    zoom = max(transients * transient, MIN_ZOOMED * end)
+    return float(f"{min(zoom, MAX_ZOOMED * end):.0e}")
+
+
+def zoom_reason(curves: Sequence[Curve], rows: Sequence[PanelRow], zoom: float) -> str:
+    """The reason for which a window that ends at `zoom` [s] shows the start of some runs."""
+    window = f"first {zoom:.3g} s"
+    if all(curve.failed for curve in curves):
+        return f"{window}: the start (every run failed)"
+    of_runs = ""
+    if any(curve.failed for curve in curves):
+        of_runs = " of the runs without failure"
+    transient = _transient_of(curves, rows)
+    if transient == 0.0:
+        return f"{window}: the start; no transient{of_runs}"
+    if transient > zoom:
+        return f"{window} of the transient{of_runs}, which takes {transient:.3g} s"
+    return f"{window}: the transient{of_runs}"
 
 
 @_style.styled()
 def _rows_with_zoom(
-    title: str, curves: Sequence[Curve], rows: Sequence[PanelRow], zoom: float | None, height: float
+    title: str,
+    curves: Sequence[Curve],
+    rows: Sequence[PanelRow],
+    zoom: float | None,
+    height: float,
+    *,
+    transients: float = TRANSIENTS,
+    columns: tuple[float, float] = COLUMNS,
+    notes: Sequence[str] = (),
 ) -> Figure:
     """A figure of rows against time, with the start magnified in a second column."""
-    full, start = windows(curves, rows, zoom)
-    figure = _style.new_figure(_style.WIDTH, 1.0 + height * len(rows))
-    table = figure.subplots(len(rows), 2, sharex="col", squeeze=False, width_ratios=(2.1, 1))
+    full, start = windows(curves, rows, zoom, transients)
+    figure = _style.new_figure(_style.WIDTH, 1.0 + (height + TITLE_HEIGHT) * len(rows))
+    table = figure.subplots(len(rows), 2, sharex="col", squeeze=False, width_ratios=columns)
     for (main, inset), row in zip(table, rows, strict=True):
         show(main, curves, row.quantity, row.joint, full)
         show(inset, curves, row.quantity, row.joint, start, tight=True)
         main.set_ylabel(row.label)
         _outline(main, inset)
+        lines = [range_after(curves, row.quantity, row.joint, start[1])]
+        if inset is table[0, 1]:
+            lines.insert(0, zoom_reason(curves, rows, start[1]))
+        inset.set_title("\n".join(filter(None, lines)), fontsize=_style.size(8.0))
     for axes in table[-1]:
         _style.time_axis(axes)
-    table[0, 1].set_title(f"the first {start[1]:.3g} s, magnified")
     figure.align_ylabels(table[:, 0])
-    _style.set_title(figure, title, curves)
+    _style.set_title(figure, title, curves, notes=notes)
     _style.legend_below(figure)
     return figure
 
@@ -463,7 +513,6 @@ def draw_phase_portrait(axes: Axes, curves: Sequence[Curve], joints: tuple[int, 
     axes.set_aspect("equal")
 
 
-@_style.styled()
 def phase_portrait(runs: Runs, joints: tuple[int | str, int | str] = (0, 1)) -> Figure:
     """Position of one joint against another's, with the reference: the paper's figure 6.
 
@@ -484,13 +533,36 @@ def phase_portrait(runs: Runs, joints: tuple[int | str, int | str] = (0, 1)) -> 
     first, second = (check_joint(curves, joint, "joints") for joint in joints)
     if first == second:
         raise checks.fail("joints", joints, expected)
-    figure = _style.new_figure(4.6, 4.9)
-    draw_phase_portrait(figure.subplots(), curves, (first, second))
     title = "Phase portrait of the positions"
     plant = curves[0].run.scenario.plant
     if plants.is_chain(plant):
         title = f"Phase portrait: {plants.level_names(plant)[0]}"
-    _style.set_title(figure, title, curves)
+    return _portrait(curves, (first, second), title)
+
+
+@_style.styled()
+def _portrait(
+    curves: Sequence[Curve],
+    joints: tuple[int, int],
+    title: str,
+    names: tuple[str, str] | None = None,
+    notes: Sequence[str] = (),
+) -> Figure:
+    """The figure of a phase portrait; `names` are those of the axes, if they are not those of the
+    joints.
+    """
+    if curves[0].run.n < 2:
+        expected = "runs of at least two joints"
+        raise checks.fail("runs", "runs of one joint", expected, "A phase portrait has two axes.")
+    figure = _style.new_figure(4.6, 4.9)
+    axes = figure.subplots()
+    draw_phase_portrait(axes, curves, joints)
+    if names is not None:
+        units = [quantity_of(curves[0].run.scenario, "q", joint).unit for joint in joints]
+        axes.set_xlabel(_style.label(names[0], units[0]))
+        axes.set_ylabel(_style.label(names[1], units[1]))
+        axes.get_lines()[0].set_label("reference $x_d$")
+    _style.set_title(figure, title, curves, notes=notes)
     _style.legend_below(figure, 4)
     return figure
 
@@ -522,8 +594,10 @@ def velocity_portrait(runs: Runs, joint: int = 0) -> Figure:
     for curve in distinct(curves, ["q_d", "dq_d"], [joint]):
         path = (curve["q_d"][:, joint], curve["dq_d"][:, joint])
         axes.plot(*path, **_style.reference(), label="reference")
-    for i, curve in enumerate(curves):
-        style = run_style(curves, i)
+    for i in sorted(range(len(curves)), key=lambda i: curves[i].diverged):
+        curve, style = curves[i], run_style(curves, i)
+        if curve.diverged and not curves[0].diverged:
+            axes.axis(axes.axis())  # A run that diverged does not set the limits of the others.
         q, dq = curve["q"][:, joint], curve["dq"][:, joint]
         axes.plot(q, dq, label=curve.name or "run", **style)
         axes.plot(q[0], dq[0], marker="o", color=style["color"], linestyle="none", label="_")
@@ -561,12 +635,16 @@ def _draw_box(axes: Axes, curve: Curve, joint: int) -> None:
             axes.axvline(x1, **style)
 
 
-def paper_figures(runs: Runs, *, zoom: float | None = None) -> dict[str, Figure]:
+def paper_figures(runs: Runs, *, zoom: float | None = None, note: str = "") -> dict[str, Figure]:
     """The figures of the paper by name, "figure_1" to "figure_6", for runs of two joints or more.
+
+    Titles and panels have the paper's names: x_11 is the position of the first joint, e_21 its
+    velocity error.
 
     Args:
       runs: one run, or a dict of runs by name.
       zoom: length of the magnified start [s]; each figure's transient if not given.
+      note: a sentence for the title of every figure.
 
     Returns:
       The figures, ready for `save`.
@@ -574,14 +652,80 @@ def paper_figures(runs: Runs, *, zoom: float | None = None) -> dict[str, Figure]
     Raises:
       ValueError: no run, a batch, or a robot of one joint, which has no phase portrait.
     """
-    return {
-        "figure_1": joint(runs, 0, zoom=zoom),
-        "figure_2": joint(runs, 1, zoom=zoom),
-        "figure_3": velocity_errors(runs, zoom=zoom),
-        "figure_4": uncertain_terms(runs, zoom=zoom),
-        "figure_5": torques(runs, zoom=zoom),
-        "figure_6": phase_portrait(runs),
+    curves = curves_of(runs)
+    n = curves[0].run.n
+    e2 = " and ".join(f"$e_{{2{joint + 1}}}$" for joint in range(n))
+    notes = [note] if note else []
+    found = {}
+    for joint in range(min(n, 2)):
+        number = joint + 1
+        caption = f"The trajectories of $x_{{1{number}}}$ and $e_{{1{number}}}$"
+        fields = [("q", joint), ("e1", joint)]
+        found[number] = _paper_figure(number, caption, curves, fields, zoom, notes)
+    for number, caption, field in (
+        (3, f"The trajectories of {e2}", "e2"),
+        (4, "The uncertain terms", "disturbance_estimate"),
+        (5, "The control inputs", "tau"),
+    ):
+        fields = [(field, joint) for joint in range(n)]
+        found[number] = _paper_figure(number, caption, curves, fields, zoom, notes)
+    title = "Figure 6. The phase portrait of $x_{11}$ and $x_{12}$"
+    found[6] = _portrait(curves, (0, 1), title, ("$x_{11}$", "$x_{12}$"), notes)
+    return {f"figure_{number}": figure for number, figure in found.items()}
+
+
+MAGNIFIED = (3, 5)
+"""Numbers of the paper's figures whose transient is a small part of the run: the zoom shows no more
+than the transient, in a column as wide as that of the full time."""
+
+
+def _paper_figure(
+    number: int,
+    caption: str,
+    curves: Sequence[Curve],
+    fields: Sequence[tuple[str, int]],
+    zoom: float | None,
+    notes: Sequence[str],
+) -> Figure:
+    """A figure of the paper against time: one lettered panel per signal and joint."""
+    rows = []
+    for letter, (field, joint) in zip(string.ascii_lowercase, fields, strict=False):
+        quantity = _paper_quantity(curves[0].run.scenario, field, joint)
+        symbol = PAPER_SYMBOLS[field].format(joint + 1)
+        rows.append(PanelRow(quantity, joint, _style.label(f"({letter}) {symbol}", quantity.unit)))
+    options: dict[str, Any] = {}
+    if number in MAGNIFIED:
+        options = {"transients": 1.0, "columns": (1.0, 1.0)}
+    title = f"Figure {number}. {caption}"
+    return _rows_with_zoom(title, curves, rows, zoom, 1.9, notes=notes, **options)
+
+
+PAPER_SYMBOLS = {
+    "q": "$x_{{1{}}}$",
+    "e1": "$e_{{1{}}}$",
+    "e2": "$e_{{2{}}}$",
+    "disturbance_estimate": r"$f_{{s\_un,{}}}$",
+    "tau": r"$\tau_{{{}}}$",
+}
+"""Signal -> its symbol in the paper, for a joint that is counted from 1."""
+
+
+def _paper_quantity(scenario: Scenario, field: str, joint: int) -> PanelQuantity:
+    """The panel of a signal with the symbols of the paper."""
+    number = joint + 1
+    symbols: dict[str, dict[str, Any]] = {
+        "q": {
+            "bounds_label": f"$k_{{lc{number}}}$, $k_{{uc{number}}}$",
+            "guide_label": f"reference $x_{{d{number}}}$",
+            "transient_symbol": PAPER_SYMBOLS["e1"].format(number),
+        },
+        "e1": {"bounds_label": rf"$-k_{{l\_q{number}}}$, $k_{{u\_q{number}}}$"},
+        "e2": {},
+        "disturbance_estimate": {"symbol": r"$f_{s\_un}$"},
+        "tau": {},
     }
+    changed: dict[str, Any] = {"symbol": PAPER_SYMBOLS[field].format(number)} | symbols[field]
+    return dataclasses.replace(quantity_of(scenario, field, joint), **changed)
 
 
 def save(

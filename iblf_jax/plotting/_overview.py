@@ -25,6 +25,7 @@ from iblf_jax.plotting._panels import (
     draw_bounds,
     level_quantity,
     quantity_of,
+    say_zero,
     set_limits,
     show,
 )
@@ -155,16 +156,20 @@ def _joints(axes: Axes, curve: Curve, quantity: PanelQuantity, window: Window) -
     bounds = []
     if quantity.field == "xi":  # The bounds of e1 differ between joints; those of xi do not.
         bounds = draw_bounds(axes, curve, quantity, 0, window, label="_")
-    drawn = []
+    drawn: list[np.ndarray] = []
+    joints: list[int] = []
     for joint in range(curve.run.n):
         style = _style.series(joint)
         if quantity.truth:
             broad: dict[str, Any] = {"color": style["color"], "linewidth": 4.0, "alpha": 0.3}
             drawn.append(draw(axes, curve, quantity.truth, joint, window, label="_", **broad))
+            joints.append(joint)
         style["label"] = curve.joint_label(joint)
         drawn.append(draw(axes, curve, quantity.field, joint, window, **style))
-    set_limits(axes, [curve] * len(drawn), drawn, bounds, spikes=quantity.has_spikes)
-    annotate_clipped_peak(axes, [curve] * len(drawn), drawn, quantity.unit)
+        joints.append(joint)
+    curves = [curve] * len(drawn)
+    set_limits(axes, curves, drawn, bounds, quantity, spikes=quantity.has_spikes)
+    annotate_clipped_peak(axes, curves, drawn, quantity, joints)
     axes.set_ylabel(quantity.label)
     if quantity.truth:
         symbols = f"{quantity.symbol} (broad), {quantity.estimate_symbol}"
@@ -196,8 +201,10 @@ def _lyapunov(axes: Axes, curve: Curve, window: Window) -> None:
     V = curve["V"]
     positive = np.where(np.isfinite(V) & (V > 0), V, np.nan)
     axes.plot(*thinned(curve.t[: len(V)], positive), color=_style.blend(0.733))
+    symbol = r"$\sum w_i V_i$" if plants.is_chain(curve.run.scenario.model) else "$V_2$"
     if np.isfinite(positive).any():
         axes.set_yscale("log")
-    symbol = r"$\sum w_i V_i$" if plants.is_chain(curve.run.scenario.model) else "$V_2$"
+    elif np.isfinite(V).any():
+        say_zero(axes, 0.0, symbol, "1")
     axes.set_ylabel(f"Lyapunov function {symbol}")
     _style.time_axis(axes, window)

@@ -9,6 +9,7 @@ limits clip a signal states the signal's peak.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -18,7 +19,16 @@ from matplotlib.axes import Axes
 
 from iblf_jax.core.units import per_second
 from iblf_jax.plotting import _style
-from iblf_jax.plotting._curves import Curve, distinct, thinned
+from iblf_jax.plotting._curves import (
+    WITHOUT_JOINT,
+    Curve,
+    Peak,
+    distinct,
+    escaped,
+    peak_of,
+    rounding_error,
+    thinned,
+)
 from iblf_jax.plotting._style import FAINT, label, series
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import has
@@ -63,7 +73,9 @@ class PanelQuantity:
     measured: str = ""
     """The signal that is a measurement or an estimate of the quantity, which the law received."""
     transient: str = ""
-    """The signal whose transient a zoom shows; that of the quantity itself if empty."""
+    """The signal whose transient a zoom shows, an error; that of the quantity itself if empty."""
+    transient_symbol: str = ""
+    """The symbol of this signal."""
     has_spikes: bool = False
     """Whether an axis that shows all joints clips short peaks."""
     farthest_bound: float = FARTHEST_BOUND
@@ -93,6 +105,7 @@ QUANTITIES = {
             guide_label="reference $q_d$",
             measured="measured_q",
             transient="e1",
+            transient_symbol="$e_1$",
         ),
         PanelQuantity("e1", "error", "$e_1$", "rad", bounds=("error_lower", "error_upper")),
         PanelQuantity(
@@ -134,6 +147,7 @@ QUANTITIES = {
             "N m",
             truth="disturbance",
             transient="estimate_error",
+            transient_symbol=r"$f - \hat f$",
             has_spikes=True,
         ),
     )
@@ -209,6 +223,7 @@ def disturbance_quantity(scenario: Scenario, level: int, joint: int | None = Non
         unit_text(scenario, per_second(plants.units_of(scenario.plant)[level - 1]), joint),
         truth=f"level_{level}_d",
         transient=f"level_{level}_estimate_error",
+        transient_symbol=rf"$d_{{{level}}} - \hat d_{{{level}}}$",
         has_spikes=True,
     )
 
@@ -285,22 +300,24 @@ def set_limits(
     curves: Sequence[Curve],
     drawn: Sequence[np.ndarray],
     always_shown: Sequence[np.ndarray],
+    quantity: PanelQuantity,
     *,
     spikes: bool = False,
-    farthest_bound: float = FARTHEST_BOUND,
 ) -> None:
     """Sets the limits of the vertical axis.
 
     The axis shows the bounds and the reference, or the successful runs where there are none, and
-    the remaining signals up to 40 % beyond.
+    the remaining signals up to 40 % beyond.  A panel that would show only rounding errors says that
+    the quantity is zero.
 
     Args:
       axes: the panel.
       curves: the runs, in the order of `drawn`.
       drawn: the drawn samples of each run.
       always_shown: bounds and reference; empty if there are none.
+      quantity: the quantity of the panel; bounds farther from the runs than its `farthest_bound` do
+        not set the limits.
       spikes: clip short peaks.
-      farthest_bound: bounds farther from the runs than this do not set the limits.
     """
     successful, failed = [], []
     for curve, y in zip(curves, drawn, strict=True):
@@ -311,45 +328,116 @@ def set_limits(
         else:
             successful.append(y)
     low, high = _span([*successful, *failed]) or (-1.0, 1.0)
-    near = [y[(y > low - farthest_bound) & (y < high + farthest_bound)] for y in always_shown]
+    farthest = quantity.farthest_bound
+    near = [y[(y > low - farthest) & (y < high + farthest)] for y in always_shown]
     base = _span(near) or _span(successful)
     if base:
         room = 0.4 * (base[1] - base[0])
         low = min(base[0], max(low, base[0] - room))
         high = max(base[1], min(high, base[1] + room))
-    margin = 0.06 * (high - low) or max(0.1 * abs(high), 1e-3)
+    rounding = rounding_error(curves, quantity.field)
+    if max(abs(low), abs(high)) <= rounding:
+        say_zero(axes, max(abs(low), abs(high)), quantity.symbol, quantity.unit)
+        return
+    margin = 0.06 * (high - low)
+    if high - low <= rounding:
+        margin = 0.1 * abs(high)
     axes.set_ylim(low - margin, high + margin)
 
 
+def say_zero(axes: Axes, largest: float, symbol: str, unit: str) -> None:
+    """Writes into a panel that its quantity is zero, on an axis that does not magnify rounding
+    errors.
+
+    Args:
+      axes: the panel.
+      largest: the largest size of the quantity, which is a rounding error.
+      symbol, unit: of the quantity.
+    """
+    axes.set_yscale("linear")
+    axes.set_ylim(-1.0, 1.0)
+    axes.set_yticks([0.0])
+    words = "zero"
+    if largest > 0.0:
+        words = f"zero: {at_most(symbol, rounded_away(largest))} {unit} is rounding"
+    centred: dict[str, Any] = {"transform": axes.transAxes, "ha": "center", "va": "center"}
+    axes.text(0.5, 0.75, words, fontsize=_style.size(8.0), **centred)
+
+
 def annotate_clipped_peak(
-    axes: Axes, curves: Sequence[Curve], drawn: Sequence[np.ndarray], unit: str
+    axes: Axes,
+    curves: Sequence[Curve],
+    drawn: Sequence[np.ndarray],
+    quantity: PanelQuantity,
+    joints: Sequence[int],
 ) -> None:
-    """Writes the largest clipped value and its time into a panel.
+    """Writes the largest clipped value, with its sign, joint and time, into a panel.
 
     Args:
       axes: the panel, with its limits.
       curves: the runs, in the order of `drawn`.
       drawn: the drawn samples of each run, from the first one on.
-      unit: unit of the values.
+      quantity: the quantity of the panel.
+      joints: the joint of each of `drawn`.
     """
     low, high = axes.get_ylim()
     found = []
-    for curve, y in zip(curves, drawn, strict=True):
+    for curve, y, joint in zip(curves, drawn, joints, strict=True):
         outside = np.flatnonzero(np.isfinite(y) & ((y < low) | (y > high)))
         if outside.size:
             i = outside[np.argmax(np.abs(y[outside]))]
-            found.append((abs(float(y[i])), float(curve.t[i])))
+            found.append((Peak(float(y[i]), joint, float(curve.t[i])), curve))
     if found:
-        value, t = max(found)
+        peak, curve = max(found, key=lambda one: abs(one[0].value))
         back = {"facecolor": _style.background(), "edgecolor": "none", "alpha": 0.85, "pad": 1.0}
         where: dict[str, Any] = {"transform": axes.transAxes, "ha": "right", "va": "top"}
         where |= {"fontsize": _style.size(7.5), "zorder": 6}
-        axes.text(0.98, 0.97, f"peak {value:.5g} {unit} at t = {t:.4g} s", bbox=back, **where)
+        words = peak_in_words(curve, peak, quantity)
+        axes.text(0.98, 0.97, words, bbox=back, **where)
 
 
-def _mark_break(axes: Axes, curve: Curve, y: np.ndarray, window: Window) -> None:
-    """Marks with a cross where a run failed, at the edge of the panel if the sample is outside."""
-    index = curve.break_index()
+def peak_in_words(curve: Curve, peak: Peak, quantity: PanelQuantity) -> str:
+    """A peak with its sign, its joint, its time and the name of its run, for a figure."""
+    parts = [f"peak {signed(peak.value)} {quantity.unit}"]
+    if curve.name:
+        parts.append(escaped(curve.name))
+    if quantity.field not in WITHOUT_JOINT:
+        parts.append(curve.joint_label(peak.joint))
+    return ", ".join([*parts, f"t = {peak.t:.4g} s"])
+
+
+PEAKS = ("e1", "e2", "tau")
+"""The signals of which tables list the peaks."""
+
+
+def peak_rows(curve: Curve) -> list[tuple[str, str, str, str, str]]:
+    """The peaks of errors and torque of every joint, for a table: signal, unit, joint, value with
+    its sign, and time [s].
+    """
+    rows = []
+    for field in PEAKS:
+        for joint in range(curve.run.n):
+            peak = peak_of(curve, field, [joint])
+            unit = quantity_of(curve.run.scenario, field, joint).unit
+            if peak is not None:
+                numbers = (f"{peak.value:.4g}", f"{peak.t:.4g}")
+                rows.append((field, unit, curve.joint_label(joint), *numbers))
+    return rows
+
+
+def signed(value: float, digits: int = 5) -> str:
+    """A number with a typographic minus sign."""
+    return f"{value:.{digits}g}".replace("-", "\N{MINUS SIGN}")
+
+
+def _mark_exit(
+    axes: Axes, curve: Curve, quantity: PanelQuantity, joint: int, window: Window
+) -> None:
+    """Marks with a cross where the joint of a panel left its bounds, at the edge of the panel if
+    the sample is outside.
+    """
+    index = curve.exit_index(quantity.field, joint)
+    y = curve[quantity.field][:, joint]
     if index is not None and window[0] <= curve.t[index] <= window[1] and np.isfinite(y[index]):
         style: dict[str, Any] = {"marker": "x", "markersize": 7, "markeredgewidth": 2}
         style |= {"linestyle": "none", "zorder": 5, "clip_on": False}
@@ -467,12 +555,12 @@ def show(
         always_shown = guides + kept
     elif bounds:
         always_shown = guides + bounds
-    set_limits(axes, owners, samples, always_shown, farthest_bound=quantity.farthest_bound)
+    set_limits(axes, owners, samples, always_shown, quantity)
     if not tight:
-        annotate_clipped_peak(axes, owners, samples, quantity.unit)
+        annotate_clipped_peak(axes, owners, samples, quantity, [joint] * len(samples))
     for curve in curves:
         if curve.failed:
-            _mark_break(axes, curve, curve[quantity.field][:, joint], window)
+            _mark_exit(axes, curve, quantity, joint, window)
 
 
 def run_style(curves: Sequence[Curve], index: int) -> dict[str, Any]:
@@ -504,3 +592,44 @@ def transient_end(curves: Sequence[Curve], quantity: PanelQuantity, joint: int) 
         if outside.size:
             ends.append(float(curve.t[outside[-1]]))
     return max(ends)
+
+
+ERRORS = ("e1", "e2", "xi")
+"""Quantities that should be zero."""
+
+
+def range_after(curves: Sequence[Curve], quantity: PanelQuantity, joint: int, time: float) -> str:
+    """The range of a quantity, or of the error whose transient its zoom shows, after a time, in
+    words; empty if no successful run continues after it.
+    """
+    field = quantity.transient or quantity.field
+    values = []
+    for curve in curves:
+        y = curve[field][:, joint]
+        later = y[curve.t[: len(y)] > time]
+        if not curve.failed:
+            values.append(later)
+    span = _span(values)
+    if span is None:
+        return ""
+    low, high = span
+    if quantity.transient or field in ERRORS:
+        symbol = quantity.transient_symbol or quantity.symbol
+        largest = rounded_away(max(abs(low), abs(high)))
+        return f"then {at_most(symbol, largest)} {quantity.unit}"
+    ends = f"{signed(low, 3)} to {signed(high, 3)}"
+    return f"then {ends} {quantity.unit}"
+
+
+def at_most(symbol: str, size: str) -> str:
+    """The statement that a quantity is at most of a size, as one formula."""
+    inside = symbol.strip("$").strip("|")
+    return rf"$|{inside}| \leq$ {size}"
+
+
+def rounded_away(value: float) -> str:
+    """A size in two digits that is not below it."""
+    if value == 0.0:
+        return "0"
+    place = math.floor(math.log10(value)) - 1
+    return f"{math.ceil(value / 10.0**place - 1e-9) * 10.0**place:.2g}"

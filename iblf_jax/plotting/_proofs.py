@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from iblf_jax.core import checks
 from iblf_jax.plotting import _style
-from iblf_jax.plotting._curves import check_class, escaped, thinned
+from iblf_jax.plotting._curves import check_class, curves_of, escaped, thinned
 from iblf_jax.plotting._panels import quantity_of
 from iblf_jax.proofs.result import GuaranteedTube, Proof
 from iblf_jax.world import plants
@@ -59,7 +59,7 @@ def guaranteed_tube(found: Proof, *, runs: int = RUNS) -> Figure:
         axes.margins(x=0)
     panels[-1].set_xlabel(_style.label("$t$", "s"))
     _style.set_heading(figure, [_heading(found)], color=_colour(found))
-    _style.legend_below(figure, 3, of=[panels[0]])
+    _style.legend_below(figure, 3)
     return figure
 
 
@@ -89,10 +89,15 @@ def _draw_tube(axes: Axes, tube: GuaranteedTube, i: int) -> None:
 
 
 def _draw_violation(axes: Axes, found: Proof, i: int) -> None:
-    """The run that violates the bounds, at the times of its start."""
-    run = found.replay(10)
+    """The run that violates the bounds, at the times of its start; in red for the joint that leaves
+    them.
+    """
+    (curve,) = curves_of(found.replay())
     assert found.violation is not None
-    t = np.asarray(run.t) + found.violation.state.t
-    inside = t <= found.duration
-    style: dict[str, Any] = {"color": _style.failure(), "linewidth": 1.2}
-    axes.plot(t[inside], np.asarray(run.q)[inside, i], label="violates the bounds", **style)
+    t = curve.t[: curve.samples] + found.violation.state.t
+    shown = t <= found.duration
+    style: dict[str, Any] = {"color": _style.blend(0.733), "linewidth": 1.2}
+    style["label"] = "run that violates a bound"
+    if curve.exit_index("q", i) is not None:
+        style |= {"color": _style.failure(), "label": "joint that violates its bounds"}
+    axes.plot(t[shown], curve["q"][shown, i], **style)

@@ -12,12 +12,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from iblf_jax.core import checks
-from iblf_jax.plotting import _style
-from iblf_jax.plotting._curves import check_class, escaped, joint_labels
+from iblf_jax.plotting import _scales, _style
+from iblf_jax.plotting._curves import ROUNDING, check_class, escaped, joint_labels
 from iblf_jax.plotting._panels import quantity_of
 from iblf_jax.studies import statistics
 from iblf_jax.studies.first_exit import FirstExit
 from iblf_jax.studies.study import Study
+from iblf_jax.studies.summaries import LEVELS, REGIONS, initial_margins
 
 if TYPE_CHECKING:
     import xarray
@@ -154,35 +155,93 @@ def histograms(study: Study, metrics: Sequence[str] | None = None, *, bins: int 
         names = checks.nonempty_list("metrics", metrics, '["margin", "rmse"]')
     values = {name: statistics.worst_joint(study.metrics, name) for name in names}
     if metrics is None:
-        values = {name: x for name, x in values.items() if _varies(x)}
+        values = {name: x for name, x in values.items() if _scales.varies(x)}
     if not values:
         raise checks.fail("metrics", names, "at least one metric with values that differ")
     figure, panels = _grid(len(values), 2.0)
     for axes, (name, x) in zip(panels, values.items(), strict=True):
         _draw_histogram(axes, study, name, x, checks.positive_integer("bins", bins, most=10_000))
-    _style.set_heading(figure, [_failure_summary(study)])
+    _style.set_heading(figure, [_failure_summary(study), *start_notes(study, list(values))])
     _style.legend_below(figure)
     return figure
-
-
-def _varies(x: np.ndarray) -> bool:
-    finite = x[np.isfinite(x)]
-    return bool(finite.size and np.ptp(finite) > 0)
 
 
 def _draw_histogram(axes: Axes, study: Study, name: str, x: np.ndarray, bins: int) -> None:
     failed = _is_failed(study)
     finite = np.isfinite(x)
-    if finite.any():
-        edges = np.histogram_bin_edges(x[finite].astype(float), bins).tolist()
-        axes.hist(x[finite & ~failed], edges, label="not failed", alpha=0.8, color=_style.colour(0))
-        style: dict[str, Any] = {"alpha": 0.8, "color": _style.colour(1), "linewidth": 0}
-        style |= {"hatch": "////", "edgecolor": _style.background()}
-        axes.hist(x[finite & failed], edges, label="failed", **style)
+    unit = study.metrics.units.get(name, "1")
+    if _scales.varies(x):
+        _draw_bars(axes, x[finite & ~failed], x[finite & failed], bins)
+    elif finite.any():
+        centred: dict[str, Any] = {"transform": axes.transAxes, "ha": "center", "va": "center"}
+        axes.text(0.5, 0.5, f"{x[finite][0]:.5g} {unit} in every run", **centred)
+        axes.set_xticks([])
+        axes.set_yticks([])
+    notes = []
     if not finite.all():
-        axes.set_title(f"{int((~finite).sum())} runs without a value")
-    axes.set_xlabel(_style.label(name.replace("_", " "), study.metrics.units.get(name, "1")))
+        notes.append(f"{int((~finite).sum())} runs without a value")
+    if set_by_start(study, name):
+        notes.append("that of the start (t = 0) in every run")
+    axes.set_title("\n".join(notes))
+    axes.set_xlabel(_metric_label(study, name))
     axes.set_ylabel("runs")
+
+
+def _draw_bars(axes: Axes, good: np.ndarray, bad: np.ndarray, bins: int) -> None:
+    """The bars of a histogram, on the scale that its values need."""
+    both = np.concatenate([good, bad]).astype(float)
+    scale = _scales.scale_of(both)
+    edges = scale.spread(float(both.min()), float(both.max()), bins + 1)
+    # The inverse of a scale rounds; the outermost values belong to the first and the last bar.
+    edges[0], edges[-1] = both.min(), both.max()
+    axes.hist(good, edges.tolist(), label="not failed", alpha=0.8, color=_style.colour(0))
+    style: dict[str, Any] = {"alpha": 0.8, "color": _style.colour(1), "linewidth": 0}
+    style |= {"hatch": "////", "edgecolor": _style.background()}
+    axes.hist(bad, edges.tolist(), label="failed", **style)
+    axes.set_xscale(scale.name, **scale.options)
+
+
+def _metric_label(study: Study, name: str) -> str:
+    """The label of a metric of the worst joint; a peak of a study is a size without sign."""
+    words = name.replace("_", " ")
+    if name.startswith("peak_"):
+        words += " (absolute value)"
+    return _style.label(words, study.metrics.units.get(name, "1"))
+
+
+MARGINS = {
+    "margin": LEVELS[0],
+    "velocity_margin": LEVELS[1],
+    "region_margin": REGIONS,
+}
+"""Metric -> the margin at the start in `initial_margins` of which it is the smallest value."""
+
+
+def set_by_start(study: Study, metric: str) -> bool:
+    """Whether the least margin of every run is its margin at t = 0, so that the distribution of the
+    metric is that of the starts and says nothing about the law.
+    """
+    if metric not in MARGINS:
+        return False
+    at_start = initial_margins(study.scenario, study.samples).get(MARGINS[metric])
+    least = statistics.worst_joint(study.metrics, metric)[study.made]
+    if at_start is None or not least.size or not np.all(np.isfinite(least)):
+        return False
+    start = np.broadcast_to(np.min(at_start, axis=1), study.made.shape)[study.made]
+    # A margin is the difference of numbers of the size of the bounds, about 1 in SI units.
+    rounding = ROUNDING * np.finfo(least.dtype).eps * max(1.0, float(np.max(np.abs(start))))
+    return bool(np.all(np.abs(least - start) <= rounding))
+
+
+def start_notes(study: Study, metrics: Sequence[str]) -> list[str]:
+    """A sentence for the margins among some metrics that the start sets in every run."""
+    names = [name.replace("_", " ") for name in metrics if set_by_start(study, name)]
+    if not names:
+        return []
+    return [
+        f"The least {' and '.join(names)} of every run is that of its start (t = 0): its"
+        " distribution is that of the starts and says nothing about the law."
+    ]
 
 
 @_style.styled()
@@ -205,7 +264,7 @@ def scatter(study: Study, metric: str = "margin") -> Figure:
     figure, panels = _grid(len(drawn), 2.2)
     for axes, (path, x) in zip(panels, drawn.items(), strict=True):
         _draw_scatter(axes, study, metric, path, x)
-    _style.set_heading(figure, [_failure_summary(study)])
+    _style.set_heading(figure, [_failure_summary(study), *start_notes(study, [metric])])
     _style.legend_below(figure)
     return figure
 
@@ -221,15 +280,17 @@ def _draw_scatter(axes: Axes, study: Study, metric: str, path: str, x: np.ndarra
     crosses: dict[str, Any] = {"s": 9, "marker": "x", "linewidths": 0.8, "color": _style.colour(1)}
     axes.scatter(x[good], y[good], label="not failed", **dots)
     axes.scatter(x[bad], y[bad], label="failed", **crosses)
-    if metric in ("margin", "xi_margin"):
+    _scales.follow(axes, "x", x[known])
+    _scales.follow(axes, "y", y[known])
+    if metric in ("margin", "xi_margin") and np.any(y[known] <= 0.0):
         axes.axhline(0.0, color=_style.bound(), linewidth=1.0)
     rho, _ = statistics.rank_correlation(x[known], y[known])
     if not np.isnan(rho):
         axes.set_title(f"rank correlation {rho:.2f}")
-    axes.locator_params(axis="x", nbins=4)
+    if axes.get_xscale() == "linear":
+        axes.locator_params(axis="x", nbins=4)
     axes.set_xlabel(_style.label(escaped(path), study.parameter_unit(path)))
-    unit = study.metrics.units.get(metric, "1")
-    axes.set_ylabel(_style.label(f"worst {metric.replace('_', ' ')}", unit))
+    axes.set_ylabel(f"worst {_metric_label(study, metric)}")
 
 
 @_style.styled()
@@ -258,7 +319,8 @@ def study_overview(study: Study, *, runs: int = 512) -> Figure:
     _draw_histogram(panels[n], study, "margin", margins, 40)
     for axes, (path, x) in zip(panels[n + 1 :], drawn.items(), strict=True):
         _draw_scatter(axes, study, "margin", path, x)
-    _style.set_heading(figure, [_failure_summary(study), f"bands: {_bands_title(data).lower()}"])
+    lines = [_failure_summary(study), f"bands: {_bands_title(data).lower()}"]
+    _style.set_heading(figure, [*lines, *start_notes(study, ["margin"])])
     _style.legend_below(figure, 6)
     return figure
 

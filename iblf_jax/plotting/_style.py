@@ -321,7 +321,14 @@ def wrapped(label: str, room: int) -> str:
     return "\n".join(line.strip() for line in lines)
 
 
-def set_title(figure: Figure, title: str, curves: Sequence[Curve], *, always: bool = False) -> None:
+def set_title(
+    figure: Figure,
+    title: str,
+    curves: Sequence[Curve],
+    *,
+    always: bool = False,
+    notes: Sequence[str] = (),
+) -> None:
     """Sets the title of a figure, with the status of the runs that have a flag.
 
     Args:
@@ -329,12 +336,14 @@ def set_title(figure: Figure, title: str, curves: Sequence[Curve], *, always: bo
       title: the first line.
       curves: the runs; those with the same status share a line.
       always: state the status of the other runs too.
+      notes: further lines.
     """
     named: dict[str, list[str]] = {}
     for curve in curves:
         if always or not curve.run.ok:
             named.setdefault(curve.status, []).append(curve.name or "status")
     lines = [title, *(f"{', '.join(names)}: {status}" for status, names in named.items())]
+    lines += notes
     colour = text_colour()
     if any(curve.failed for curve in curves):
         colour = failure()

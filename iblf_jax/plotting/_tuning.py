@@ -12,8 +12,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from iblf_jax.core import checks
-from iblf_jax.plotting import _style
-from iblf_jax.plotting._curves import Curve, curves_of, escaped
+from iblf_jax.plotting import _scales, _style
+from iblf_jax.plotting._curves import ROUNDING, Curve, curves_of, escaped, peak_of
 from iblf_jax.plotting._panels import (
     Window,
     annotate_clipped_peak,
@@ -21,7 +21,9 @@ from iblf_jax.plotting._panels import (
     quantity_of,
     set_limits,
     show,
+    signed,
 )
+from iblf_jax.studies.summaries import LEVELS, initial_margins
 
 if TYPE_CHECKING:
     from iblf_jax.tuning import Front, TuneResult
@@ -91,23 +93,29 @@ def tuning(
 
 
 def _peaks(axes: Axes, curves: list[Curve]) -> None:
-    """The largest torque of every joint, before and after."""
-    n, margin = curves[0].run.n, 0.15
-    above: dict[str, Any] = {"xytext": (0, 2), "textcoords": "offset points"}
-    above |= {"ha": "center", "va": "bottom", "fontsize": _style.size(6.5)}
+    """The torque of every joint that is farthest from zero, with its sign, before and after."""
+    n = curves[0].run.n
+    style: dict[str, Any] = {"textcoords": "offset points", "ha": "center"}
+    style["fontsize"] = _style.size(6.5)
+    margin = 0.15
     if n > 3:
-        margin, above["rotation"] = 0.35, 90
-    peaks = []
+        margin, style["rotation"] = 0.35, 90
+    values = []
     for i, curve in enumerate(curves):
-        magnitude = np.abs(curve["tau"])
-        peak = np.where(np.isfinite(magnitude), magnitude, 0.0).max(axis=0)
+        found = [peak_of(curve, "tau", [joint]) for joint in range(n)]
+        peaks = [0.0 if peak is None else peak.value for peak in found]
         places = np.arange(n) + 0.4 * (i - 0.5)
-        axes.bar(places, peak, width=0.36, color=_style.colour(i))
-        for x, y in zip(places, peak, strict=True):
-            axes.annotate(f"{y:.5g}", (x, y), **above)
-        peaks.append(peak)
-    if _spans_decades(np.concatenate(peaks)):
-        axes.set_yscale("log")
+        axes.bar(places, peaks, width=0.36, color=_style.colour(i))
+        for x, y in zip(places, peaks, strict=True):
+            beyond: dict[str, Any] = {"xytext": (0, 2), "va": "bottom"}
+            if y < 0.0:
+                beyond = {"xytext": (0, -2), "va": "top"}
+            axes.annotate(signed(y), (x, y), **style, **beyond)
+        values += peaks
+    sizes = np.abs(values)
+    if _spans_decades(sizes):
+        axes.set_yscale("symlog", linthresh=float(sizes.min()))
+    axes.axhline(0.0, color=_style.bound(), linewidth=0.8)
     axes.margins(y=margin)
     _style.name_ticks(axes, [curves[0].joint_label(i) for i in range(n)], 30)
     axes.grid(axis="x", visible=False)
@@ -121,9 +129,9 @@ def _torque(axes: Axes, curves: list[Curve], window: Window) -> None:
     drawn = []
     for i, curve in enumerate(curves):
         drawn.append(draw(axes, curve, "tau", joint, window, **_style.series(i)))
-    set_limits(axes, curves, drawn, [], spikes=True)
     quantity = quantity_of(curves[0].run.scenario, "tau", joint)
-    annotate_clipped_peak(axes, curves, drawn, quantity.unit)
+    set_limits(axes, curves, drawn, [], quantity, spikes=True)
+    annotate_clipped_peak(axes, curves, drawn, quantity, [joint] * len(drawn))
     name = f"{quantity.name} of {curves[0].joint_label(joint)}"
     axes.set_ylabel(_style.label(name, quantity.unit))
     _style.time_axis(axes, window)
@@ -151,8 +159,7 @@ def _progress(axes: Axes, result: TuneResult) -> None:
     axes.plot(steps, trials, linestyle="none", marker=".", markersize=3, color=_style.bound())
     best = history["objective"][_accepted(result), result.best_start]
     axes.step(_accepted(result) + 1, best, where="post", marker=".", **_style.series(0))
-    low, high = float(np.min(best)), float(np.max(best))
-    axes.set_ylim(low - 0.1 * (high - low) - 1e-12, high + 0.2 * (high - low) + 1e-12)
+    _scales.follow(axes, "y", trials)
     axes.set_xlabel("step")
     axes.set_ylabel("objective")
 
@@ -164,6 +171,10 @@ def _margin(axes: Axes, result: TuneResult) -> None:
     axes.set_xlabel("step")
     unit = quantity_of(result.scenario, "q").unit
     axes.set_ylabel(_style.label("smallest margin", unit))
+    start = float(np.min(initial_margins(result.scenario, {})[LEVELS[0]]))
+    rounding = ROUNDING * np.finfo(margin.dtype).eps
+    if np.all(np.abs(margin - start) <= rounding):
+        axes.set_title("that of the start (t = 0) at every step")
 
 
 def _gains(axes: Axes, result: TuneResult) -> None:
@@ -325,14 +336,9 @@ def pareto(front: Front) -> Figure:
     axes.plot(*front.tried.T, color=_style.bound(), label="trials", **dots)
     axes.plot(*front.objectives.T, marker="o", markersize=4, label="front", **_style.series(0))
     axes.plot(*front.first, linestyle="none", marker="s", color=_style.colour(1), label="start")
-    for axis, x in zip("xy", np.concatenate([front.objectives, front.first[None]]).T, strict=True):
-        low, high = float(x.min()), float(x.max())
-        if _spans_decades(x):
-            room = (high / low) ** 0.1
-            axes.set(**{f"{axis}scale": "log", f"{axis}lim": (low / room, high * room)})
-        else:
-            room = 0.1 * (high - low) or 0.1 * abs(high) or 1.0
-            axes.set(**{f"{axis}lim": (low - room, high + room)})
+    points = np.concatenate([front.objectives, front.first[None], front.tried])
+    for direction, x in zip("xy", points.T, strict=True):
+        _scales.follow(axes, direction, x)
     axes.set_xlabel(front.labels[0])
     axes.set_ylabel(front.labels[1])
     axes.legend()

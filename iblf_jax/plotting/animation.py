@@ -32,7 +32,14 @@ LONGEST_FILM = 10.0
 DPI = 90
 
 
-def animate(runs: Runs, path: str | Path, fps: float = 25.0, *, speed: float | None = None) -> Path:
+def animate(
+    runs: Runs,
+    path: str | Path,
+    fps: float = 25.0,
+    *,
+    speed: float | None = None,
+    note: str = "",
+) -> Path:
     """Writes the motion of the arm, with its joint limits, as a GIF or an HTML page.
 
     Each run is one arm; limits and reference are those of the first run.
@@ -42,6 +49,7 @@ def animate(runs: Runs, path: str | Path, fps: float = 25.0, *, speed: float | N
       path: the file; its ending, ".gif" or ".html", determines the format.
       fps: frames per second of the animation, up to 50.
       speed: speed relative to the run; if not given 1, or more for runs longer than 10 s.
+      note: a sentence for the title.
 
     Returns:
       The path of the file.
@@ -57,7 +65,7 @@ def animate(runs: Runs, path: str | Path, fps: float = 25.0, *, speed: float | N
         raise checks.fail("fps", fps, f"at most {MAX_FPS:g} frames a second")
     t = frame_times(max(float(np.asarray(curve.run.t)[-1]) for curve in curves), fps, speed)
     with _style.styled():
-        return write_film(list(_pictures(Scene(curves, *motions_of(curves, t)))), path, fps)
+        return write_film(list(_pictures(Scene(curves, *motions_of(curves, t), note))), path, fps)
 
 
 def film_path(path: str | Path, field: str = "path") -> Path:

@@ -16,7 +16,8 @@ from iblf_jax.certificates.lines import Line
 from iblf_jax.certificates.result import LevelTraces
 from iblf_jax.core import checks
 from iblf_jax.plotting import _style
-from iblf_jax.plotting._curves import check_class, escaped, thinned
+from iblf_jax.plotting._curves import ROUNDING, check_class, escaped, thinned
+from iblf_jax.plotting._panels import say_zero
 
 WIDTH = 10.0
 HEIGHT = 5.4
@@ -52,7 +53,7 @@ def certificate(
     traces = _until(shown.traces, until)
     if isinstance(traces, LevelTraces):
         figure = _level_panels(shown, traces)
-        _title(figure, shown, title, _level_subject(shown))
+        _title(figure, shown, traces, title, _level_subject(shown))
         return figure
     subject, V = "Theorem 2", Bounded("Lyapunov function", "$V_2$", "1")
     if shown.is_of_own_claim:
@@ -68,17 +69,26 @@ def certificate(
     _draw_bounded(panels[1, 1], traces.t, traces.f_tilde, traces.f_tilde_bound, f_tilde)
     _verdicts(panels[1, 2], shown)
     _mark_excluded(panels.flat[:5], traces)
-    _title(figure, shown, title, subject)
+    _title(figure, shown, traces, title, subject)
     return figure
 
 
-def _title(figure: Figure, shown: Certificate, title: str | None, subject: str) -> None:
+def _title(
+    figure: Figure,
+    shown: Certificate,
+    traces: Traces | LevelTraces,
+    title: str | None,
+    subject: str,
+) -> None:
     """The heading with the verdict."""
     if title is None:
         title = f"{subject} along the run"
     if shown.worst_run is not None:
         title += f", worst run {shown.worst_run}"
     lines = [f"{title}: {shown.verdict}", shown.heading]
+    end, last = float(shown.traces.t[-1]), float(traces.t[-1])
+    if last < end:
+        lines.append(f"until {last:.4g} s, as requested; the verdict is that of all {end:.4g} s")
     _style.set_heading(figure, lines, color=_verdict_colour(shown.verdict))
 
 
@@ -104,6 +114,12 @@ def _level_panels(shown: Certificate, traces: LevelTraces) -> Figure:
     _draw_inequality(panels[1], t, traces.left, traces.disturbance_terms, "disturbance terms")
     for i, level in enumerate(levels):
         axes, name = panels[2 + i], f"{level.name} error"
+        error = Bounded(name, f"$e_{i + 1}$", level.unit)
+        if not level.is_bounded and _is_zero(
+            axes, traces.error[:, i], traces.error_bound[:, i], error
+        ):
+            _set_axes(axes, t, f"{name} {error.symbol}", level.unit)
+            continue
         _draw_errors(axes, t, traces.error[:, i], traces.error_bound[:, i], shown.joints)
         if level.is_bounded:
             _finish_relative_error(axes, t, shown.joints, rf"{name} $\xi_{i + 1}$")
@@ -127,10 +143,12 @@ def _disturbances(axes: Axes, traces: LevelTraces) -> None:
         size = np.where(traces.d_tilde[:, i] > 0, traces.d_tilde[:, i], np.nan)
         label = rf"$|\tilde d_{i + 1}|$"
         axes.plot(*thinned(traces.t, size), label=label, **_style.series(i))
-    axes.set_yscale("log")
     _set_axes(axes, traces.t, r"error of the estimate $|\tilde d_i|$", "unit of the level/s")
-    if axes.get_lines():
-        axes.legend(loc="best", **LEGEND)
+    if not axes.get_lines():
+        say_zero(axes, 0.0, r"$\tilde d_i$", "")
+        return
+    axes.set_yscale("log")
+    axes.legend(loc="best", **LEGEND)
 
 
 class Bounded(NamedTuple):
@@ -165,13 +183,27 @@ def _draw_bounded(
     axes: Axes, t: np.ndarray, values: np.ndarray, bound: np.ndarray, signal: Bounded
 ) -> None:
     """A nonnegative signal and its bound on a logarithmic axis."""
+    _set_axes(axes, t, f"{signal.name} {signal.symbol}", signal.unit)
+    if _is_zero(axes, values, bound, signal):
+        return
     if np.isfinite(bound).any():
         axes.plot(*thinned(t, bound), label="bound", **_bound_style())
     positive = np.where(values > 0, values, np.nan)
     axes.plot(*thinned(t, positive), label=signal.symbol, **_style.series(0))
     axes.set_yscale("log")
-    _set_axes(axes, t, f"{signal.name} {signal.symbol}", signal.unit)
     axes.legend(loc="best", **LEGEND)
+
+
+def _is_zero(axes: Axes, values: np.ndarray, bound: np.ndarray, signal: Bounded) -> bool:
+    """Whether a signal consists of rounding errors of its bound; if so, the panel says it."""
+    largest, scale = (
+        float(np.max(np.abs(x), where=np.isfinite(x), initial=0.0)) for x in (values, bound)
+    )
+    rounding = ROUNDING * float(np.finfo(values.dtype).eps) * scale
+    if largest > rounding or not np.isfinite(values).any():
+        return False
+    say_zero(axes, largest, signal.symbol, signal.unit)
+    return True
 
 
 def _inequality(axes: Axes, traces: Traces) -> None:

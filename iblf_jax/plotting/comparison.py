@@ -2,8 +2,9 @@
 at equal effort, side by side.
 
 The error has a logarithmic axis, on which an exponential decay is a straight line whose slope is
-its rate.  The torque is shown for a tenth of that time, because its transient, 1/K2 against 1/k1,
-is much shorter.
+its rate.  The torque is shown for a tenth of that time if the laws differ most there, because its
+transient, 1/K2 against 1/k1, is much shorter.  The titles of the panels state why a window shows
+the start, and the range of the signal after it.
 """
 
 from __future__ import annotations
@@ -15,9 +16,15 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from iblf_jax.plotting import _style
-from iblf_jax.plotting._curves import Curve, check_class, check_joint, curves_of, thinned
-from iblf_jax.plotting._figures import PanelRow, windows
-from iblf_jax.plotting._panels import Window, draw, quantity_of, set_limits
+from iblf_jax.plotting._curves import (
+    Curve,
+    check_class,
+    check_joint,
+    curves_of,
+    thinned,
+)
+from iblf_jax.plotting._figures import PanelRow, windows, zoom_reason
+from iblf_jax.plotting._panels import Window, draw, quantity_of, range_after, set_limits
 from iblf_jax.simulation.metrics import Settling
 from iblf_jax.studies.comparison import Comparison
 from iblf_jax.world import plants
@@ -27,7 +34,8 @@ SMALLEST = 1e-5
 axis."""
 
 TORQUE_SHARE = 0.1
-"""Time that the torque panel shows, as a share of the time of the error panel."""
+"""Time that the torque panel shows, as a share of the time of the error panel, if the torques
+differ most there."""
 
 
 @_style.styled()
@@ -60,7 +68,9 @@ def comparison(result: Comparison, joint: int = 0, *, zoom: float | None = None)
     if result.factors:
         name = plants.input_name(scenario.plant)
         columns[f"equal effort (RMS {name} above gravity)"] = curves_of(result.equal_effort)
-    figure = _style.new_figure(_style.WIDTH, 6.6)
+    torque = PanelRow(quantity_of(scenario, "tau", joint), joint, "")
+    shown = [curve for curves in columns.values() for curve in curves]
+    figure = _style.new_figure(_style.WIDTH, 7.0)
     table = figure.subplots(
         3, len(columns), squeeze=False, sharey="row", height_ratios=(1.5, 1.5, 1.0)
     )
@@ -68,7 +78,14 @@ def comparison(result: Comparison, joint: int = 0, *, zoom: float | None = None)
     for column, (title, curves) in zip(table.T, columns.items(), strict=True):
         column[0].set_title(title)
         _errors(column[0], curves, order, joint, (start, end))
-        _torques(column[1], curves, order, joint, (start, TORQUE_SHARE * end))
+        _name_window(column[0], curves, error, end, zoom_reason(curves, [error], end))
+        reason = zoom_reason(curves, [torque], end)
+        torque_end = end
+        if _differ_most_before(shown, joint, TORQUE_SHARE * end):
+            torque_end = TORQUE_SHARE * end
+            reason = f"first {torque_end:.3g} s: the laws differ most"
+        _torques(column[1], curves, order, torque, (start, torque_end))
+        _name_window(column[1], curves, torque, torque_end, reason)
         _settling(column[2], curves, order)
     table[0, 0].set_ylabel(_style.label("error $|e_1|$", quantity.unit))
     table[1, 0].set_ylabel(quantity_of(scenario, "tau", joint).label)
@@ -84,6 +101,24 @@ def _law_style(curve: Curve, order: list[str]) -> dict[str, Any]:
     if curve.failed:
         style |= _style.FAINT
     return style
+
+
+def _differ_most_before(curves: list[Curve], joint: int, end: float) -> bool:
+    """Whether the torques of the laws without failure differ most before a time [s]."""
+    successful = [curve for curve in curves if not curve.failed]
+    if not successful:
+        return True
+    t = successful[0].t
+    torques = [curve.at("tau", t)[:, joint] for curve in successful]
+    return bool(t[np.argmax(np.ptp(torques, axis=0))] <= end)
+
+
+def _name_window(axes: Axes, curves: list[Curve], row: PanelRow, end: float, reason: str) -> None:
+    """Adds the reason for the window of a panel, and the range of its quantity after the window, to
+    its title.
+    """
+    words = ", ".join(filter(None, [reason, range_after(curves, row.quantity, row.joint, end)]))
+    axes.set_title("\n".join(filter(None, [axes.get_title(), words])))
 
 
 def _errors(axes: Axes, curves: list[Curve], order: list[str], joint: int, window: Window) -> None:
@@ -102,12 +137,14 @@ def _errors(axes: Axes, curves: list[Curve], order: list[str], joint: int, windo
     _style.time_axis(axes, window)
 
 
-def _torques(axes: Axes, curves: list[Curve], order: list[str], joint: int, window: Window) -> None:
+def _torques(
+    axes: Axes, curves: list[Curve], order: list[str], row: PanelRow, window: Window
+) -> None:
     drawn = []
     for curve in curves:
-        drawn.append(draw(axes, curve, "tau", joint, window, **_law_style(curve, order)))
+        drawn.append(draw(axes, curve, "tau", row.joint, window, **_law_style(curve, order)))
     _style.time_axis(axes, window)
-    set_limits(axes, curves, drawn, [])
+    set_limits(axes, curves, drawn, [], row.quantity)
 
 
 def _settling(axes: Axes, curves: list[Curve], order: list[str]) -> None:

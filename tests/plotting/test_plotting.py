@@ -58,18 +58,17 @@ def test_the_paper_s_figures_have_their_panels_and_units(runs):
         name: [axes.get_ylabel() for axes in figure.axes if axes.get_ylabel()]
         for name, figure in figures.items()
     }
-    assert labels["figure_1"] == labels["figure_2"] == ["position $q$ [rad]", "error $e_1$ [rad]"]
-    assert labels["figure_3"] == ["joint 0\n$e_2$ [rad/s]", "joint 1\n$e_2$ [rad/s]"]
-    assert labels["figure_4"] == ["joint 0\n$f$ [N m]", "joint 1\n$f$ [N m]"]
-    assert labels["figure_5"] == [
-        r"joint 0" + "\n" + r"$\tau$ [N m]",
-        "joint 1\n" + r"$\tau$ [N m]",
-    ]
-    assert labels["figure_6"] == ["position of joint 1 [rad]"]
+    assert labels["figure_1"] == ["(a) $x_{11}$ [rad]", "(b) $e_{11}$ [rad]"]
+    assert labels["figure_2"] == ["(a) $x_{12}$ [rad]", "(b) $e_{12}$ [rad]"]
+    assert labels["figure_3"] == ["(a) $e_{21}$ [rad/s]", "(b) $e_{22}$ [rad/s]"]
+    assert labels["figure_4"] == [r"(a) $f_{s\_un,1}$ [N m]", r"(b) $f_{s\_un,2}$ [N m]"]
+    assert labels["figure_5"] == [r"(a) $\tau_{1}$ [N m]", r"(b) $\tau_{2}$ [N m]"]
+    assert labels["figure_6"] == ["$x_{12}$ [rad]"]
     for name, figure in figures.items():
         assert len(figure.axes) == (1 if name == "figure_6" else 4), name
         assert set(runs) <= {text.split(" ")[0] for text in texts_of(figure)}, name
-        assert figure.axes[-1].get_xlabel() in ("time $t$ [s]", "position of joint 0 [rad]")
+        assert figure.axes[-1].get_xlabel() in ("time $t$ [s]", "$x_{11}$ [rad]")
+        assert figure.get_suptitle().startswith(f"Figure {name[-1]}. ")
         assert "failed" not in figure.get_suptitle()
 
 
@@ -321,7 +320,7 @@ def test_joints_have_the_names_of_the_robot_s_file(tmp_path):
 def test_a_spike_is_cut_and_named():
     calm = made_up(chain(2))
     spiky = dataclasses.replace(calm, tau=calm.tau.at[3, 1].set(-4321.5))
-    for run, said in ((calm, []), (spiky, ["peak 4321.5 N m at t = 0.03 s"])):
+    for run, said in ((calm, []), (spiky, ["peak \N{MINUS SIGN}4321.5 N m, joint 1, t = 0.03 s"])):
         (axes,) = [axes for axes in run.plot().axes if "torque" in axes.get_ylabel()]
         assert [text.get_text() for text in axes.texts] == said
         assert np.ptp(axes.get_ylim()) < 60
@@ -389,8 +388,8 @@ def test_thinning_keeps_every_peak_and_both_ends():
 
 def test_the_break_of_a_run_is_where_it_left_its_bounds():
     (good,), (bad,) = curves_of(made_up(chain(2))), curves_of(runaway(chain(2), at=150))
-    assert good.break_index() is None
-    assert 130 <= bad.break_index() < bad.samples == 151
+    assert good.exit_index("q", 0) is None
+    assert 130 <= bad.exit_index("q", 0) < bad.samples == 151
 
 
 @pytest.mark.parametrize("plant", [chain(2), chain(4), Arm3D(3)], ids=["two", "four", "space"])
@@ -433,3 +432,22 @@ def test_joint_limits_are_drawn_where_the_robot_would_be_at_them():
             there = np.asarray(plant.skeleton(jnp.asarray(q).at[joint].set(bound)))
             expected = there[joint] + FAN_RADIUS * (there[joint + 1] - there[joint])
             np.testing.assert_allclose(world.fans[0, joint, corner], expected, atol=1e-6)
+
+
+def test_the_paper_s_figures_3_and_5_magnify_the_transient_in_half_of_their_width():
+    runs = made_up(chain(2), duration=20.0)
+    figures = plotting.paper_figures(runs, note="the arm is assumed")
+    for name in ("figure_3", "figure_5"):
+        figure = drawn_figure(figures[name])
+        main, inset = (axes.get_position().width for axes in figure.axes[:2])
+        assert inset == pytest.approx(main, rel=0.05), name
+        assert "the transient" in figure.axes[1].get_title()
+        end = figure.axes[1].get_xlim()[1]
+        assert end < plotting.velocity_errors(runs).axes[1].get_xlim()[1]
+    assert all("the arm is assumed" in figure.get_suptitle() for figure in figures.values())
+
+
+def drawn_figure(figure):
+    """The figure with its final layout."""
+    figure.draw_without_rendering()
+    return figure

@@ -149,7 +149,8 @@ def test_bounds_of_levels_mark_where_a_run_failed():
         run = ij.simulate(scenario, duration=0.3, dt=1e-3)
     (curve,) = curves_of(run)
     first = int(np.argmax(np.abs(np.asarray(run.higher)[:, 0, 0]) >= 2.0))
-    assert curve.break_index() == first
+    assert curve.exit_index("level_3", 0) == curve.exit_index("tau", 0) == first
+    assert curve.exit_index("q", 0) is None
 
 
 def test_a_plant_with_an_outline_is_animated_and_drawn_along_its_path(body_run, tmp_path):

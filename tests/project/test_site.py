@@ -52,12 +52,12 @@ def mark_of(page: Path) -> pytest.MarkDecorator:
 
 def test_there_are_examples():
     assert len(gallery.SCRIPTS) >= 15
-    assert len(gallery.REPRODUCTIONS) >= 5
+    assert len(gallery.ENTRIES) >= 5
 
 
 @pytest.mark.site
 @pytest.mark.usefixtures("optimised_kernels")
-@pytest.mark.parametrize("script", gallery.PAGES, ids=lambda script: script.stem)
+@pytest.mark.parametrize("script", gallery.PAGES, ids=gallery.page_name)
 def test_a_script_of_the_gallery_makes_its_page(script):
     pictures = gallery.page(script)
     assert pictures and all(path.stat().st_size > 1000 for path in pictures)

@@ -1,0 +1,233 @@
+"""The table "How it compares" of the README and of the article, made of `benchmarks/results`.
+
+    python benchmarks/comparison.py            prints the table
+    python benchmarks/comparison.py --write    puts it into README.md and paper/paper.md
+    python benchmarks/comparison.py --check    fails if one of them has another table
+
+Every number comes from the file of the program that its row names; nothing is measured here.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import sys
+from pathlib import Path
+from typing import Any, NamedTuple
+
+ROOT = Path(__file__).resolve().parents[1]
+RESULTS = ROOT / "benchmarks" / "results"
+FILES = (ROOT / "README.md", ROOT / "paper" / "paper.md")
+BEGIN, END = "<!-- comparison -->\n", "<!-- end of comparison -->"
+
+Conditions = dict[str, Any]
+"""Column of a result -> the value that chooses a row."""
+
+
+class Comparison(NamedTuple):
+    """A row: one task, one number of iblf_jax and those of other software."""
+
+    task: str
+    benchmark: str
+    """Name of the program and of the file of its results."""
+    column: str
+    """The column with the number."""
+    unit: str
+    better: str
+    """ "more" or "less"."""
+    ours: Conditions
+    others: dict[str, Conditions]
+    """Other software -> the conditions that choose its row."""
+    beside: dict[str, str] = {}  # noqa: RUF012 - a constant
+    """Column -> words for its value, which the row states as well, because the number alone would
+    mislead."""
+
+
+LOOP = {"loop": "paper", "type": "float64", "runs": 4096}
+ON_GPU = {"loop": "paper", "type": "float32", "runs": 65536}
+ARM_ON_GPU = {"loop": "iiwa14", "type": "float32", "runs": 65536}
+ARM_ON_CPU = {"type": "float64"}
+RARE = {"case": "1e-6, 50 numbers"}
+COMPARISONS = (
+    Comparison(
+        "4096 closed loops of the paper's arm, CPU",
+        "throughput",
+        "steps/s a core",
+        "steps/s a core",
+        "more",
+        LOOP | {"row": "native"},
+        {
+            "the same loop in plain JAX": LOOP | {"row": "textbook"},
+            "diffrax": LOOP | {"row": "diffrax"},
+        },
+    ),
+    Comparison(
+        "one run of 20 s, called from Python",
+        "latency",
+        "ms",
+        "ms",
+        "less",
+        {"row": "native, user's call"},
+        {"SciPy LSODA": {"row": "LSODA, NumPy loop"}},
+    ),
+    Comparison(
+        "65,536 closed loops of the paper's arm, H200",
+        "gpu",
+        "steps/s",
+        "steps/s",
+        "more",
+        ON_GPU | {"row": "gpu"},
+        {"the same loop in plain JAX": ON_GPU | {"row": "textbook"}},
+    ),
+    Comparison(
+        "iiwa 14 with law and observer; MuJoCo simulates the plant alone, CPU",
+        "arm",
+        "steps/s a core",
+        "steps/s a core",
+        "more",
+        ARM_ON_CPU | {"row": "native, standard metrics"},
+        {"MuJoCo `rollout`": ARM_ON_CPU | {"row": "MuJoCo rollout, plant alone"}},
+    ),
+    Comparison(
+        "iiwa 14 with law and observer; the others simulate the plant alone, H200",
+        "gpu",
+        "steps/s",
+        "steps/s",
+        "more",
+        ARM_ON_GPU | {"row": "gpu"},
+        {
+            "MJX": ARM_ON_GPU | {"row": "MJX"},
+            "MuJoCo Warp": ARM_ON_GPU | {"row": "MuJoCo Warp"},
+        },
+    ),
+    Comparison(
+        "one step of a safety filter and of MPC: bounds on positions, velocities and the tip",
+        "constraints",
+        "us a step",
+        "us",
+        "less",
+        {"law": "safety_filter"},
+        {"MPC by CasADi, IPOPT": {"law": "MPC (CasADi)"}},
+        {
+            "rmse [rad]": "RMS error {:.2g} rad",
+            "least wall [m]": "least distance from an obstacle {:.1g} m",
+        },
+    ),
+    Comparison(
+        "tuning of two gains under limits, to 0.5 % above the best",
+        "tuning",
+        "rollouts to 0.5 %",
+        "rollouts",
+        "less",
+        {"search": "iblf_jax tune"},
+        {
+            "SLSQP with exact derivatives": {"search": "SLSQP, exact slopes"},
+            "CMA-ES": {"search": "CMA-ES"},
+        },
+    ),
+    Comparison(
+        "failure probability of 1e-6, 50 variables: runs",
+        "rare_failures",
+        "points",
+        "runs",
+        "less",
+        RARE | {"estimator": "importance"},
+        {"OpenTURNS, subset simulation": RARE | {"estimator": "OpenTURNS, subset"}},
+    ),
+)
+
+
+def value_of(comparison: Comparison, conditions: Conditions, column: str = "") -> float:
+    """The number of the only row of a result that meets the conditions, in the compared column or
+    in another one.
+    """
+    rows = json.loads((RESULTS / f"{comparison.benchmark}.json").read_text())["rows"]
+    found = [row for row in rows if all(row[key] == value for key, value in conditions.items())]
+    if len(found) != 1:
+        raise LookupError(f"{comparison.benchmark}.json has {len(found)} rows with {conditions}")
+    return float(found[0][column or comparison.column])
+
+
+def words(value: float) -> str:
+    """A number with two digits."""
+    rounded = float(f"{value:.2g}")
+    if rounded < 1e4:
+        return f"{rounded:,.10g}"
+    mantissa, exponent = f"{rounded:.1e}".split("e")
+    return f"{mantissa}e{int(exponent)}"
+
+
+def beside(comparison: Comparison, conditions: Conditions) -> str:
+    """The further values of a row, in words."""
+    values = [
+        text.format(value_of(comparison, conditions, column))
+        for column, text in comparison.beside.items()
+    ]
+    return "".join(f", {value}" for value in values)
+
+
+def row(comparison: Comparison) -> str:
+    """A row of the table."""
+    ours = value_of(comparison, comparison.ours)
+    others = []
+    for name, conditions in comparison.others.items():
+        other = value_of(comparison, conditions)
+        ratio = ours / other
+        if comparison.better == "less":
+            ratio = other / ours
+        others.append(f"{name}: {words(other)} ({words(ratio)}){beside(comparison, conditions)}")
+    cells = [
+        comparison.task,
+        f"{words(ours)} {comparison.unit}{beside(comparison, comparison.ours)}",
+        "; ".join(others),
+        f"`benchmarks/{comparison.benchmark}.py`",
+    ]
+    return "| " + " | ".join(cells) + " |"
+
+
+def table() -> str:
+    """The table as Markdown."""
+    head = [
+        "| task | iblf_jax | other software (times better) | measured by |",
+        "|---|---|---|---|",
+    ]
+    return "\n".join([*head, *map(row, COMPARISONS)]) + "\n"
+
+
+def replaced(text: str) -> str:
+    """A text with the table between its marks."""
+    pattern = re.escape(BEGIN) + ".*?" + re.escape(END)
+    if not re.search(pattern, text, re.DOTALL):
+        raise LookupError(f"the text has no place for the table, from {BEGIN!r} to {END!r}")
+    new = f"{BEGIN}{table()}{END}"
+    return re.sub(pattern, lambda _: new, text, flags=re.DOTALL)
+
+
+def outdated() -> list[Path]:
+    """The files whose table is not that of the results."""
+    return [path for path in FILES if replaced(path.read_text()) != path.read_text()]
+
+
+def main() -> int:
+    """Prints, writes or checks the table."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    action = parser.add_mutually_exclusive_group()
+    action.add_argument("--write", action="store_true")
+    action.add_argument("--check", action="store_true")
+    options = parser.parse_args()
+    if options.write:
+        for path in FILES:
+            path.write_text(replaced(path.read_text(encoding="utf-8")), encoding="utf-8")
+        return 0
+    if options.check:
+        names = [str(path.relative_to(ROOT)) for path in outdated()]
+        if names:
+            print(f"{', '.join(names)}: run python benchmarks/comparison.py --write")
+        return int(bool(names))
+    print(table())
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

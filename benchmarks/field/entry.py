@@ -1,0 +1,298 @@
+"""Entries of the benchmark of the field: `entry.toml` as dataclasses, and the run of `example.py`.
+
+An entry is a folder of `entries/`. README.md in this folder describes its files.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import io
+import re
+import runpy
+import tomllib
+import typing
+import warnings
+from pathlib import Path
+from typing import Any, NamedTuple
+
+FOLDER = Path(__file__).resolve().parent
+ROOT = FOLDER.parents[1]
+ENTRIES = FOLDER / "entries"
+RESULTS = FOLDER / "results"
+
+FAMILIES = ("robot", "flexible joint", "drive", "vessel", "vehicle", "strict feedback")
+METHODS = ("barrier", "prescribed performance", "constrained")
+READ = {
+    "article": "the article",
+    "program": "the authors' program",
+    "thesis": "a thesis",
+    "secondary": "a public program that follows the publication",
+}
+"""Value of `source.read` -> what was read, in words."""
+KINDS = {
+    "formula": "Terms and signs of formulas",
+    "number": "Printed numbers that do not give the published result",
+    "program": "Programs that differ from their text or from their plant",
+    "condition": "Conditions and claims that do not hold",
+    "figure": "Figures that show something else",
+    "other": "Others",
+}
+"""Value of `kind` of a correction -> heading of its group on the page of all corrections."""
+
+
+class EntryError(ValueError):
+    """An entry that cannot be used; `faults` has one sentence for each repair."""
+
+    def __init__(self, faults: list[str]) -> None:
+        super().__init__("\n".join(faults))
+        self.faults = faults
+
+
+def _one_of(values: typing.Iterable[str], **options: Any) -> Any:
+    """A field whose value is one of a list."""
+    return dataclasses.field(metadata={"one_of": tuple(values)}, **options)
+
+
+@dataclasses.dataclass(frozen=True)
+class Source:
+    """The publication."""
+
+    authors: str
+    title: str
+    where: str
+    year: int
+    read: str = _one_of(READ)
+    doi: str = ""
+    url: str = ""
+    code: str = ""
+
+    @property
+    def link(self) -> str:
+        """The address of the publication."""
+        return f"https://doi.org/{self.doi}" if self.doi else self.url
+
+
+@dataclasses.dataclass(frozen=True)
+class Printed:
+    """A number of the source."""
+
+    quantity: str
+    value: str
+    where: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Correction:
+    """What had to be corrected to reproduce the result."""
+
+    printed: str
+    corrected: str
+    evidence: str
+    kind: str = _one_of(KINDS, default="other")
+
+
+@dataclasses.dataclass(frozen=True)
+class Missing:
+    """What the source does not state."""
+
+    quantity: str
+    assumed: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Published:
+    """A published number that the example must reach."""
+
+    quantity: str
+    value: float
+    tolerance: float
+    where: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Claim:
+    """A published statement without a number."""
+
+    statement: str
+    where: str
+
+
+@dataclasses.dataclass(frozen=True)
+class NotReproduced:
+    """What the example does not show."""
+
+    text: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """Duration and time step."""
+
+    duration: float
+    dt: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Entry:
+    """The contents of an `entry.toml`."""
+
+    title: str
+    plant: str
+    source: Source
+    run: Run
+    not_reproduced: NotReproduced
+    family: str = _one_of(FAMILIES)
+    method: str = _one_of(METHODS)
+    printed: tuple[Printed, ...] = ()
+    corrected: tuple[Correction, ...] = ()
+    missing: tuple[Missing, ...] = ()
+    published: tuple[Published, ...] = ()
+    claims: tuple[Claim, ...] = ()
+
+
+class Reproduction(NamedTuple):
+    """What an `example.py` defines."""
+
+    scenario: Any
+    runs: dict[str, Any]
+    figure: Any
+    reached: dict[str, float]
+    holds: dict[str, bool]
+    evidence: dict[str, float]
+    """Numbers that the texts of the corrections refer to, by their name in braces."""
+    not_applicable: dict[str, str]
+    """Law -> why `measure.py` leaves it out."""
+    uncertain: tuple[str, ...] | None
+    """Paths of the plant parameters that `measure.py` varies."""
+
+
+REQUIRED_NAMES = ("scenario", "runs", "figure")
+DEFAULTS: dict[str, Any] = {
+    "reached": {},
+    "holds": {},
+    "evidence": {},
+    "not_applicable": {},
+    "uncertain": None,
+}
+"""Names that an `example.py` may leave out -> their value."""
+
+
+TYPES = {str: "a text", float: "a number", int: "a whole number"}
+"""Type of a value -> its name in a message."""
+
+
+def folders() -> list[Path]:
+    """The folders of all entries."""
+    return sorted(path.parent for path in ENTRIES.glob("*/entry.toml"))
+
+
+def load(folder: Path) -> Entry:
+    """The contents of the `entry.toml` of a folder.
+
+    Raises:
+      EntryError: a key is missing or unknown, or has a value of the wrong kind.
+    """
+    path = folder / "entry.toml"
+    if not path.exists():
+        raise EntryError(["there is no entry.toml; copy the one of benchmarks/field/template"])
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except tomllib.TOMLDecodeError as error:
+        raise EntryError([f"entry.toml is not valid TOML: {error}"]) from None
+    faults: list[str] = []
+    entry = _record(Entry, table, "the head of the file", faults)
+    if faults:
+        raise EntryError([f"entry.toml: {fault}" for fault in faults])
+    return entry
+
+
+def _record(kind: Any, table: Any, place: str, faults: list[str]) -> Any:
+    """A dataclass from a table; None, and further faults, where that is not possible."""
+    if not isinstance(table, dict):
+        faults.append(f"{place} must be a table")
+        return None
+    count = len(faults)
+    fields = {field.name: field for field in dataclasses.fields(kind)}
+    for name in sorted(set(table) - set(fields)):
+        faults.append(f"{place} has the unknown key {name!r}; known are {', '.join(fields)}")
+    hints = typing.get_type_hints(kind)
+    values = {}
+    for name, field in fields.items():
+        if name in table:
+            values[name] = _value(hints[name], table[name], field, place, faults)
+        elif field.default is dataclasses.MISSING:
+            faults.append(f"{place} lacks {_in_words(name, hints[name])}")
+    if len(faults) > count:
+        return None
+    return kind(**values)
+
+
+def _in_words(name: str, kind: Any) -> str:
+    """A key or a table, as a message names it."""
+    return f"the table [{name}]" if dataclasses.is_dataclass(kind) else f"the key {name!r}"
+
+
+def _value(kind: Any, value: Any, field: dataclasses.Field, place: str, faults: list[str]) -> Any:
+    """A value of the declared type; further faults where it is none."""
+    name = field.name
+    if typing.get_origin(kind) is tuple:
+        if not isinstance(value, list):
+            faults.append(f"{name} must be a list of tables, each with the heading [[{name}]]")
+            return ()
+        item = typing.get_args(kind)[0]
+        places = (f"[[{name}]] number {i}" for i in range(1, len(value) + 1))
+        return tuple(
+            _record(item, part, where, faults) for where, part in zip(places, value, strict=True)
+        )
+    if dataclasses.is_dataclass(kind):
+        return _record(kind, value, f"[{name}]", faults)
+    if kind is float and type(value) is int:
+        value = float(value)
+    if type(value) is not kind:
+        faults.append(f"{place}: {name} = {value!r} must be {TYPES[kind]}")
+    allowed = field.metadata.get("one_of")
+    if allowed and value not in allowed:
+        faults.append(f"{place}: {name} = {value!r} must be one of {', '.join(allowed)}")
+    if kind is str and value == "" and field.default is dataclasses.MISSING:
+        faults.append(f"{place}: {name} is empty")
+    return value
+
+
+@functools.cache
+def execute(folder: Path) -> Reproduction:
+    """Runs the `example.py` of a folder, once a process.
+
+    Raises:
+      EntryError: a name is missing.
+    """
+    with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+        warnings.simplefilter("ignore")  # runs that leave their bounds are part of some examples
+        return reproduction(runpy.run_path(str(folder / "example.py")))
+
+
+def reproduction(names: dict[str, Any]) -> Reproduction:
+    """What a script has defined."""
+    lacking = [name for name in REQUIRED_NAMES if name not in names]
+    if lacking:
+        raise EntryError([f"example.py does not define {name!r}" for name in lacking])
+    defined = {name: names[name] for name in Reproduction._fields if name in names}
+    return Reproduction(**(DEFAULTS | defined))
+
+
+def filled(text: str, numbers: dict[str, float]) -> str:
+    """A text in which {name} and {name:format} are replaced by computed numbers."""
+
+    def number(match: re.Match[str]) -> str:
+        name, spec = match[1], match[2]
+        if name not in numbers:
+            return match[0]
+        return format(numbers[name], spec or ".4g")
+
+    return re.sub(r"\{(\w+)(?::([^{}]*))?\}", number, text)
+
+
+def is_reached(published: Published, value: float) -> bool:
+    """Whether a value is the published one within its tolerance."""
+    return abs(value - published.value) <= published.tolerance * (1 + 1e-9)

@@ -1,0 +1,121 @@
+"""Tables of the pages of the benchmark of the field: an `entry.toml` as Markdown."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / "benchmarks" / "field"))
+
+from entry import READ, Entry, Reproduction, filled
+
+CODE_AND_FORMULAS = re.compile(r"(`[^`]*`|\$[^$]*\$)")
+"""Parts of a text that Markdown does not interpret."""
+
+
+def escaped(text: str) -> str:
+    """A text in which stars, underscores and angle brackets are characters, outside of code and
+    formulas.
+    """
+    parts = CODE_AND_FORMULAS.split(" ".join(text.split()))
+    for i in range(0, len(parts), 2):
+        parts[i] = re.sub(r"([*_<\[\]~])", r"\\\1", parts[i])
+    return "".join(parts)
+
+
+def markdown_table(headings: list[str], rows: list[list[str]]) -> str:
+    """A table; cells are Markdown."""
+    lines = [headings, ["---"] * len(headings), *rows]
+    return "\n".join("| " + " | ".join(_cell(cell) for cell in line) + " |" for line in lines)
+
+
+def _cell(text: str) -> str:
+    return re.sub(r"(?<!\\)\|", r"\\|", text)
+
+
+def _records(items: tuple[Any, ...], headings: list[str]) -> str:
+    """A table of dataclasses, a column a field."""
+    rows = [[escaped(str(x)) for x in dataclasses.astuple(item)] for item in items]
+    return markdown_table(headings, rows)
+
+
+def source_in_words(entry: Entry) -> str:
+    """The publication, its address, and what was read."""
+    source = entry.source
+    text = (
+        f"{escaped(source.authors)}, {escaped(source.title)}, {escaped(source.where)}"
+        f" ([{source.doi or 'link'}]({source.link}))."
+    )
+    if source.code:
+        text += f" Public program: <{source.code}>."
+    return f"{text} The numbers of this page were read from {READ[source.read]}."
+
+
+def before_the_script(entry: Entry, made: Reproduction) -> list[str]:
+    """What was published, and what had to be corrected and assumed."""
+    parts = [source_in_words(entry), "## Printed"]
+    parts.append(_records(entry.printed, ["quantity", "value", "where"]))
+    if entry.corrected:
+        parts += ["## Corrected", corrections(entry, made.evidence)]
+    if entry.missing:
+        parts += ["## Missing in the source", _records(entry.missing, ["quantity", "assumed here"])]
+    if entry.published:
+        parts += ["## Published and reached", published(entry, made.reached)]
+    if entry.claims:
+        parts += ["## Published statements", claims(entry, made.holds)]
+    parts.append("## Script")
+    return parts
+
+
+def after_the_script(entry: Entry) -> list[str]:
+    """What was not reproduced."""
+    return ["## Not reproduced", escaped(entry.not_reproduced.text)]
+
+
+def corrections(entry: Entry, evidence: dict[str, float]) -> str:
+    """The corrections, with the computed numbers of their evidence."""
+    rows = [
+        [escaped(x.printed), escaped(x.corrected), escaped(filled(x.evidence, evidence))]
+        for x in entry.corrected
+    ]
+    return markdown_table(["printed", "corrected", "evidence"], rows)
+
+
+def published(entry: Entry, reached: dict[str, float]) -> str:
+    """The published numbers beside those of the run."""
+    rows = [
+        [
+            escaped(x.quantity),
+            f"{x.value:g}",
+            f"{float(reached[x.quantity]):.5g}",
+            f"{x.tolerance:g}",
+            escaped(x.where),
+        ]
+        for x in entry.published
+    ]
+    return markdown_table(["quantity", "published", "reached", "tolerance", "where"], rows)
+
+
+def claims(entry: Entry, holds: dict[str, bool]) -> str:
+    """The published statements, and whether they hold in the run."""
+    rows = []
+    for claim in entry.claims:
+        answer = "yes" if holds[claim.statement] else "no"
+        rows.append([escaped(claim.statement), answer, escaped(claim.where)])
+    return markdown_table(["statement", "holds", "where"], rows)
+
+
+def computed(made: Reproduction) -> str:
+    """The numbers of a run as JSON, for the pages that list all entries."""
+    return json.dumps(
+        {
+            "reached": {name: float(x) for name, x in made.reached.items()},
+            "holds": {name: bool(x) for name, x in made.holds.items()},
+            "evidence": {name: float(x) for name, x in made.evidence.items()},
+        },
+        indent=1,
+    )

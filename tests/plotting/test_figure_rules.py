@@ -1,0 +1,377 @@
+"""What every figure must state: peaks with their sign and joint, the reason for a zoom, where a
+joint left its bounds, that a quantity is zero, that a margin is that of the start.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import types
+import warnings
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import study_cases as cases
+from made_up_runs import chain, made_up, runaway
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
+
+import iblf_jax as ij
+from iblf_jax import Status, plotting
+from iblf_jax.plotting import _scales, _studies, _style, _tuning, certificates
+from iblf_jax.plotting._curves import curves_of, rounding_error
+from iblf_jax.studies.summaries import LEVELS, initial_margins
+
+
+def texts_of(axes):
+    return [text.get_text() for text in axes.texts]
+
+
+def drawn(figure):
+    """Draws the figure; any warning of matplotlib's is an error."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        figure._repr_png_()
+    return figure
+
+
+def changed(run, joint, sample, value, field="q", flag=Status.BOUND_VIOLATED):
+    """The run with one sample of one joint changed, and a flag."""
+    values = getattr(run, field).at[sample, joint].set(value)
+    return dataclasses.replace(run, **{field: values}, status=jnp.int32(int(flag)))
+
+
+# ---- peaks keep their sign and their joint
+
+
+def test_a_clipped_peak_has_its_sign_its_run_and_its_joint():
+    calm = made_up(chain(2))
+    dipped = changed(calm, 1, 50, -9.0)
+    figure = plotting.positions({"calm": calm, "dipped": dipped})
+    first, _, second, _ = figure.axes
+    assert texts_of(first) == []
+    assert texts_of(second) == ["peak \N{MINUS SIGN}9 rad, dipped, joint 1, t = 0.5 s"]
+
+
+def test_a_peak_of_a_region_names_no_joint():
+    run = made_up(chain(1))
+    margin = jnp.asarray(0.1 + 0.01 * np.sin(np.asarray(run.t)))[:, None]
+    run = dataclasses.replace(run, region_margin=jnp.tile(margin, 3).at[50, 2].set(-9.0))
+    pair = {"a": run, "b": dataclasses.replace(run, status=jnp.int32(Status.REGION_VIOLATED))}
+    regions = [ij.regions.HalfSpace(normal=[1.0, 0.0], offset=1.0)] * 3
+    for one in pair.values():
+        object.__setattr__(one.scenario, "regions", regions)
+    figure = plotting.region_margins(pair)
+    assert "joint" not in "".join(text for axes in figure.axes for text in texts_of(axes))
+
+
+def test_the_bars_of_a_tuning_have_the_signs_of_the_torques():
+    run = made_up(chain(2))
+    (axes,) = [Figure().subplots()]
+    _tuning._peaks(axes, curves_of({"before": run, "tuned": run}))
+    heights = [bar.get_height() for bar in axes.patches]
+    tau = np.asarray(run.tau)
+    expected = [column[np.argmax(np.abs(column))] for column in tau.T]
+    assert np.all(np.sign(expected) == -1.0)
+    np.testing.assert_allclose(heights, expected * 2)
+    assert texts_of(axes) == [f"{x:.5g}".replace("-", "\N{MINUS SIGN}") for x in expected] * 2
+
+
+def test_bars_of_torques_over_decades_keep_their_signs():
+    run = made_up(chain(2))
+    run = dataclasses.replace(run, tau=run.tau * jnp.asarray([1e3, 1.0]))
+    axes = Figure().subplots()
+    _tuning._peaks(axes, curves_of({"before": run, "tuned": run}))
+    assert axes.get_yscale() == "symlog"
+    assert min(bar.get_height() for bar in axes.patches) < -4e3
+
+
+def test_a_report_lists_the_peaks_with_their_signs():
+    from iblf_jax.reports import shown
+
+    tables = shown(made_up(chain(2))).tables
+    cells = re.findall(r"<td[^>]*>([^<]*)</td>", tables["Peaks with their signs"])
+    rows = [cells[i : i + 5] for i in range(0, len(cells), 5)]
+    assert ["tau", "N m", "joint 0", "-5", "0"] in rows
+    assert ["tau", "N m", "joint 1", "-4", "0"] in rows
+
+
+# ---- a zoom states its reason
+
+
+def zoom_titles(figure):
+    return [axes.get_title().replace("\n", " ") for axes in figure.axes[1::2]]
+
+
+def test_a_zoom_of_the_transient_says_so_and_bounds_what_follows():
+    run = made_up(chain(2), duration=20.0)
+    figure = plotting.velocity_errors(run)
+    end = figure.axes[1].get_xlim()[1]
+    later = np.abs(np.asarray(run.e2))[np.asarray(run.t) > end].max(axis=0)
+    titles = zoom_titles(figure)
+    assert titles[0].startswith(f"first {end:.3g} s: the transient then $|e_2| \\leq$ ")
+    assert titles[1].startswith("then $|e_2| \\leq$ ")
+    for title, largest in zip(titles, later, strict=True):
+        stated = float(title.split("\\leq$ ")[1].removesuffix(" rad/s"))
+        assert largest <= stated <= 1.1 * largest
+
+
+def test_the_range_after_a_zoom_of_a_torque_is_that_of_the_run():
+    run = made_up(chain(2), duration=20.0)
+    figure = plotting.torques(run)
+    end = figure.axes[1].get_xlim()[1]
+    later = np.asarray(run.tau)[np.asarray(run.t) > end]
+    for joint, title in enumerate(zoom_titles(figure)):
+        low, high = later[:, joint].min(), later[:, joint].max()
+        assert title.endswith(f"then {low:.3g} to {high:.3g} N m")
+
+
+def test_other_zooms_have_other_reasons():
+    run = made_up(chain(2), duration=20.0)
+    assert "of the transient, which takes" in zoom_titles(plotting.errors(run, zoom=0.1))[0]
+    still = dataclasses.replace(run, e1=0.0 * run.e1, xi=0.0 * run.xi)
+    assert "no transient" in zoom_titles(plotting.errors(still))[0]
+    bad = runaway(chain(2))
+    assert "every run failed" in zoom_titles(plotting.positions(bad))[0]
+    both = plotting.positions({"good": run, "bad": bad})
+    assert "the transient of the runs without failure" in zoom_titles(both)[0]
+
+
+@pytest.mark.parametrize(("value", "text"), [(0.0385, "0.039"), (0.5, "0.5"), (0.0, "0")])
+def test_a_stated_bound_is_not_below_the_value(value, text):
+    from iblf_jax.plotting._panels import rounded_away
+
+    assert rounded_away(value) == text
+
+
+@pytest.mark.slow
+def test_a_comparison_states_the_reason_for_each_window(paper):
+    found = ij.compare(paper, ["integral", "log"], duration=2.0, dt=2e-3)
+    error, torque = found.plot().axes[:4:2]
+    assert error.get_title().startswith("gains as given\nfirst ")
+    assert "the transient" in error.get_title()
+    assert torque.get_title().startswith(f"first {torque.get_xlim()[1]:.3g} s: the laws differ")
+
+
+@pytest.mark.slow
+def test_a_certificate_until_a_time_says_so(paper, short_run):
+    certificate = ij.certify(paper, short_run)
+    title = certificate.plot(until=0.2).get_suptitle()
+    assert "until 0.2 s, as requested; the verdict is that of all 0.5 s" in title
+    assert "as requested" not in certificate.plot().get_suptitle()
+
+
+# ---- scatter axes follow the data
+
+
+def middle_share(scale, x):
+    low, first, third, high = scale.forward(np.quantile(x, [0.0, 0.25, 0.75, 1.0]))
+    return (third - first) / (high - low)
+
+
+@pytest.mark.parametrize(
+    ("x", "name"),
+    [
+        (np.linspace(0.001, 0.5, 200), "linear"),
+        (np.linspace(-1.0, 3.0, 200), "linear"),
+        (np.geomspace(1e-3, 1e3, 200), "log"),
+        (np.concatenate([np.linspace(0.01, 0.1, 195), np.geomspace(-1e4, -1.0, 5)]), "symlog"),
+        (np.full(7, 0.1), "linear"),
+        (np.zeros(3), "linear"),
+    ],
+)
+def test_an_axis_shows_all_values_and_squeezes_none(x, name):
+    axes = Figure().subplots()
+    _scales.follow(axes, "x", np.append(x, np.nan))
+    assert axes.get_xscale() == name
+    low, high = axes.get_xlim()
+    assert low < x.min()
+    assert high > x.max()
+    if name != "linear":
+        scale = _scales.scale_of(x)
+        assert middle_share(scale, x) > 2.0 * middle_share(_scales.LINEAR, x)
+        np.testing.assert_allclose(scale.inverse(scale.forward(x)), x, rtol=1e-9)
+
+
+def test_values_that_differ_by_rounding_do_not_vary():
+    assert not _scales.varies(0.1 + 1e-17 * np.arange(9))
+    assert _scales.varies(0.1 + 1e-9 * np.arange(9))
+    assert not _scales.varies(np.array([np.nan]))
+
+
+def test_a_front_shows_every_trial():
+    tried = np.array([[0.5, 40.0], [0.9, 1.0], [3.0, 0.8]])
+    front = types.SimpleNamespace(
+        tried=tried,
+        objectives=np.array([[0.8, 1.0], [0.85, 0.9]]),
+        first=np.array([1.0, 1.0]),
+        labels=("tracking", "effort"),
+    )
+    (axes,) = plotting.pareto(front).axes
+    for limits, x in zip((axes.get_xlim(), axes.get_ylim()), tried.T, strict=True):
+        assert limits[0] < x.min()
+        assert limits[1] > x.max()
+
+
+@pytest.fixture(scope="module")
+def study():
+    return cases.study(64)
+
+
+def test_a_scatter_shows_every_run(study):
+    margins = np.asarray(study.metrics["margin"]).copy()
+    margins[3] = -1e4
+    far = dataclasses.replace(
+        study, metrics=ij.Metrics({"margin": margins}, study.metrics.unit_pairs)
+    )
+    figure = drawn(plotting.scatter(far))
+    worst = margins.min(axis=1)
+    for axes, x in zip(figure.axes, (v for v in _flat(study)), strict=True):
+        assert axes.get_yscale() == "symlog"
+        assert axes.get_ylim()[0] < worst.min()
+        assert axes.get_ylim()[1] > worst.max()
+        assert axes.get_xlim()[0] < x.min()
+        assert axes.get_xlim()[1] > x.max()
+
+
+def _flat(study):
+    """The drawn numbers of a study, one array a number."""
+    from iblf_jax.studies.statistics import scalar_samples
+
+    return scalar_samples(study.samples).values()
+
+
+def test_a_run_that_diverged_does_not_squeeze_the_velocity_portrait():
+    good = made_up(chain(2))
+    alone = plotting.velocity_portrait(good).axes[0].get_ylim()
+    both = plotting.velocity_portrait({"good": good, "bad": runaway(chain(2))}).axes[0].get_ylim()
+    assert both == alone
+
+
+# ---- the mark of a violation
+
+
+def crosses_of(axes):
+    """The marks of violations in a panel, by their times."""
+    red = to_hex(_style.failure())
+    lines = [line for line in axes.get_lines() if line.get_marker() == "x"]
+    return [float(line.get_xdata()[0]) for line in lines if to_hex(line.get_color()) == red]
+
+
+def test_only_the_joint_that_left_its_bounds_is_marked():
+    run = changed(made_up(chain(3)), 1, 20, 9.0)
+    for make in (plotting.positions, plotting.errors, plotting.torques, plotting.velocities):
+        marks = [crosses_of(axes) for axes in make(run).axes]
+        assert marks == [[], [], [0.2], [0.2], [], []], make.__name__
+    assert [crosses_of(axes) for axes in run.plot().axes[:3]] == [[], [0.2], []]
+
+
+def test_each_joint_is_marked_at_its_own_time():
+    run = changed(changed(made_up(chain(2)), 1, 20, 9.0), 0, 40, -9.0)
+    assert [crosses_of(axes) for axes in plotting.positions(run).axes[::2]] == [[0.4], [0.2]]
+
+
+def test_a_velocity_that_left_its_bounds_is_not_marked_among_the_positions():
+    run = made_up(chain(2))
+    wide = jnp.full_like(run.dq, 3.0)
+    run = dataclasses.replace(run, dq_lower=-wide, dq_upper=wide)
+    run = changed(run, 0, 30, 5.0, "dq", Status.VELOCITY_VIOLATED)
+    assert [crosses_of(axes) for axes in plotting.velocities(run).axes[::2]] == [[0.3], []]
+    assert not any(crosses_of(axes) for axes in plotting.positions(run).axes)
+
+
+def test_a_run_that_diverged_inside_its_bounds_is_marked_in_every_panel():
+    run = made_up(chain(2), status=int(Status.NOT_FINITE))
+    stopped = {
+        name: getattr(run, name).at[100:].set(getattr(run, name)[100]) for name in ("q", "dq")
+    }
+    run = dataclasses.replace(run, **stopped)
+    assert [crosses_of(axes) for axes in plotting.torques(run).axes[::2]] == [[1.0], [1.0]]
+
+
+# ---- rounding errors are zero
+
+
+def noise(run, size=1e-17):
+    values = size * np.random.default_rng(0).standard_normal(run.q.shape)
+    return jnp.asarray(values)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-17, 1e-6])
+def test_a_panel_of_rounding_errors_says_zero(size):
+    run = made_up(chain(2))
+    run = dataclasses.replace(run, disturbance=0.0 * run.q, disturbance_estimate=noise(run, size))
+    for axes in plotting.uncertain_terms(run).axes:
+        says_zero = [text for text in texts_of(axes) if text.startswith("zero")]
+        largest = np.abs(np.asarray(run.disturbance_estimate)).max()
+        is_rounding = largest <= rounding_error(curves_of(run), "disturbance_estimate")
+        assert is_rounding == (size < 1e-6)
+        assert bool(says_zero) == is_rounding
+        if is_rounding:
+            assert axes.get_yticks().tolist() == [0.0]
+            assert np.ptp(axes.get_ylim()) > 1e6 * largest
+            assert ("rounding" in says_zero[0]) == (size > 0.0)
+
+
+def test_the_overview_says_zero():
+    run = made_up(chain(2))
+    still = dataclasses.replace(run, disturbance=0.0 * run.q, disturbance_estimate=noise(run))
+    (axes,) = [axes for axes in drawn(still.plot()).axes if "broad" in axes.get_ylabel()]
+    assert texts_of(axes)[0].startswith(r"zero: $|f| \leq$ ")
+    assert not any("zero" in text for axes in run.plot().axes for text in texts_of(axes))
+
+
+def test_a_constant_has_no_axis_that_magnifies_rounding_errors():
+    run = made_up(chain(2))
+    run = dataclasses.replace(run, tau=5.0 + noise(run, 1e-15))
+    for axes in drawn(plotting.torques(run)).axes:
+        assert axes.yaxis.get_offset_text().get_text() == ""
+        assert np.ptp(axes.get_ylim()) > 0.1
+
+
+@pytest.mark.parametrize(("values", "is_zero"), [(0.0, True), (1e-17, True), (1e-3, False)])
+def test_a_certificate_says_zero(values, is_zero):
+    t = np.linspace(0.0, 1.0, 50)
+    axes = Figure().subplots()
+    signal = certificates.Bounded("estimation error", r"$|\tilde f|$", "N m")
+    certificates._draw_bounded(axes, t, np.full(50, values), np.full(50, 2.0), signal)
+    assert any(text.startswith("zero") for text in texts_of(axes)) == is_zero
+    assert axes.get_yscale() == ("linear" if is_zero else "log")
+
+
+# ---- margins of the start
+
+
+def with_margins(study, margins):
+    metrics = ij.Metrics({"margin": margins}, study.metrics.unit_pairs)
+    return dataclasses.replace(study, metrics=metrics)
+
+
+def test_a_study_says_when_the_start_sets_every_margin(study):
+    starts = initial_margins(study.scenario, study.samples)[LEVELS[0]]
+    of_start = with_margins(study, starts)
+    assert _studies.set_by_start(of_start, "margin")
+    figure = drawn(plotting.histograms(of_start, ["margin"]))
+    assert "says nothing about the law" in figure.get_suptitle().replace("\n", " ")
+    assert "that of the start" in figure.axes[0].get_title()
+    scatter = plotting.scatter(of_start).get_suptitle().replace("\n", " ")
+    assert "The least margin of every run is that of its start (t = 0)" in scatter
+    lower = starts.copy()
+    lower[5] -= 1e-6
+    other = with_margins(study, lower)
+    assert not _studies.set_by_start(other, "margin")
+    assert "law" not in plotting.histograms(other, ["margin"]).get_suptitle()
+
+
+def test_one_margin_for_all_runs_is_stated_not_drawn(study):
+    figure = drawn(plotting.histograms(with_margins(study, np.full((64, 2), 0.1)), ["margin"]))
+    assert texts_of(figure.axes[0]) == ["0.1 rad in every run"]
+    assert not figure.axes[0].patches
+
+
+def test_a_peak_of_a_study_is_labelled_as_a_size(study):
+    peaks = np.linspace(1.0, 2.0, 128).reshape(64, 2)
+    metrics = ij.Metrics({"peak_torque": peaks}, (("peak_torque", "N m"),))
+    figure = plotting.histograms(dataclasses.replace(study, metrics=metrics))
+    assert figure.axes[0].get_xlabel() == "peak torque (absolute value) [N m]"

@@ -1,0 +1,95 @@
+"""The files of a release agree, and the release script finds it where they do not."""
+
+from __future__ import annotations
+
+import importlib.machinery
+import importlib.util
+import shutil
+import sys
+
+import pytest
+from conftest import ROOT
+
+
+def module_of(path, name):
+    """A program of the repository as a module; it may have no suffix."""
+    loader = importlib.machinery.SourceFileLoader(name, str(path))
+    spec = importlib.util.spec_from_loader(name, loader)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    loader.exec_module(module)
+    return module
+
+
+release = module_of(ROOT / "tools" / "release", "release")
+comparison = module_of(ROOT / "benchmarks" / "comparison.py", "comparison")
+
+
+def copied(folder):
+    for name in ("pyproject.toml", "CITATION.cff", "CHANGELOG.md"):
+        shutil.copy(ROOT / name, folder)
+    return folder
+
+
+def test_all_files_name_the_same_version():
+    assert release.check_versions() == release.project()["version"]
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "message"),
+    [
+        ("CITATION.cff", "\nversion: ", "\nversion: 9", "CITATION.cff must have the line"),
+        ("CITATION.cff", "date-released: 2", "date-released: 1", "'date-released: 2"),
+        ("pyproject.toml", '\nversion = "', '\nversion = "9.', "CITATION.cff must have"),
+        ("CHANGELOG.md", "\n## {version} - ", "\n## 0.0.1 - ", "no heading '## "),
+        ("CHANGELOG.md", "\n## {version} - 2", "\n## {version} - soon 2", "has no heading"),
+    ],
+)
+def test_a_file_with_another_version_is_found(file, old, new, message, tmp_path):
+    folder = copied(tmp_path)
+    version = release.project()["version"]
+    text = (folder / file).read_text(encoding="utf-8")
+    changed = text.replace(old.format(version=version), new.format(version=version), 1)
+    assert changed != text
+    (folder / file).write_text(changed, encoding="utf-8")
+    with pytest.raises(release.ReleaseError, match=message):
+        release.check_versions(folder)
+
+
+def test_notes_are_those_of_the_version_alone():
+    changelog = "# Changelog\n\n## 2.0 - 2030-01-02\n\nNew.\n\n## 1.0 - 2029-01-02\n\nOld.\n"
+    assert release.section_of(changelog, "2.0") == ("2030-01-02", "New.")
+    assert release.section_of(changelog, "1.0") == ("2029-01-02", "Old.")
+
+
+def test_a_file_that_a_distribution_lacks_is_named():
+    release.lacking("wheel", set())
+    with pytest.raises(release.ReleaseError, match=r"The wheel lacks 1 files: a\.py"):
+        release.lacking("wheel", {"a.py"})
+
+
+def test_the_environment_of_the_check_has_no_compiler(tmp_path):
+    environment = release.without_compiler(tmp_path / "bin", tmp_path / "home")
+    for compiler in ("cc", "gcc", "g++", "c++", "clang"):
+        assert shutil.which(compiler, path=environment["PATH"]) is None
+
+
+def test_readme_and_article_have_the_measured_numbers():
+    assert comparison.outdated() == []
+
+
+def test_another_number_in_the_table_is_found():
+    text = comparison.FILES[0].read_text(encoding="utf-8")
+    assert comparison.replaced(text.replace("12 ms", "11 ms", 1)) == text
+    with pytest.raises(LookupError, match="has no place for the table"):
+        comparison.replaced("nothing")
+    wrong = comparison.COMPARISONS[0]._replace(ours={"row": "native"})
+    with pytest.raises(LookupError, match="rows with"):
+        comparison.row(wrong)
+
+
+def test_the_article_shows_the_figures_that_its_program_makes():
+    figures = module_of(ROOT / "paper" / "figures.py", "article_figures")
+    assert figures.faults() == []
+    for name in figures.FIGURES:
+        assert (ROOT / "paper" / name).exists()

@@ -1,0 +1,67 @@
+"""The page on stability names every public name once, and every deprecated argument."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+from conftest import ROOT
+
+import iblf_jax as ij
+from iblf_jax.studies.options import REPLACED as STUDY_ARGUMENTS
+from iblf_jax.tuning.options import REPLACED as TUNE_ARGUMENTS
+
+PAGE = (ROOT / "docs" / "stability.md").read_text(encoding="utf-8")
+LISTS = ("stable", "provisional", "internal")
+NO_PROMISE = {"TYPE_CHECKING", "__version__"}
+
+
+def table(page: str, mark: str) -> str:
+    """The table after a mark."""
+    return page.split(f"<!-- {mark} -->\n", 1)[1].split("\n\n", 1)[0]
+
+
+def names_in(page: str, mark: str) -> set[str]:
+    """The names in code of a table's first columns; the last one says something about them."""
+    rows = table(page, mark).splitlines()
+    cells = [row.split("|")[1:-1] for row in rows]
+    columns = slice(1, None) if mark == "stable" else slice(0, 1)
+    return {name for row in cells for cell in row[columns] for name in re.findall(r"`(\w+)`", cell)}
+
+
+def wrong(page: str, public: set[str]) -> dict[str, set[str]]:
+    """Public names that no list has, listed names that do not exist, and names of two lists."""
+    listed = {mark: names_in(page, mark) for mark in LISTS}
+    together = set.union(*listed.values())
+    twice = {name for name in together if sum(name in names for names in listed.values()) > 1}
+    return {"missing": public - together, "unknown": together - public, "twice": twice}
+
+
+def test_every_public_name_is_in_one_list():
+    assert wrong(PAGE, set(dir(ij)) - NO_PROMISE) == {
+        "missing": set(),
+        "unknown": set(),
+        "twice": set(),
+    }
+
+
+def test_every_deprecated_argument_is_listed():
+    deprecated = table(PAGE, "deprecated")
+    for name in (*TUNE_ARGUMENTS, *STUDY_ARGUMENTS):
+        assert f"{name}=" in deprecated, name
+
+
+@pytest.mark.parametrize("call", [ij.sweep, ij.monte_carlo, ij.sensitivity, ij.tune])
+def test_deprecated_arguments_are_accepted_until_the_next_major_version(call):
+    import inspect
+
+    parameters = inspect.signature(call).parameters.values()
+    assert any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters)
+
+
+def test_these_tests_can_fail():
+    page = PAGE.replace("`simulate` ", "").replace("`tune` `TuneResult`", "`tuen` `TuneResult`")
+    found = wrong(page.replace("| `explain` |", "| `certify` |"), set(dir(ij)) - NO_PROMISE)
+    assert found["missing"] == {"simulate", "tune", "explain"}
+    assert found["unknown"] == {"tuen"}
+    assert found["twice"] == {"certify"}
