@@ -8,7 +8,7 @@ import sys
 import pytest
 from conftest import ROOT
 
-sys.path.append(str(ROOT / "docs"))
+sys.path.insert(0, str(ROOT / "docs"))  # before another package of the name `build`
 import build
 
 FOLDER = ROOT / "notebooks"
