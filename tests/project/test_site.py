@@ -213,10 +213,13 @@ def test_dead_links_and_pages_out_of_reach_are_named(tmp_path):
         )
     (tmp_path / "a.html").write_text(
         '<a href="deep/b.html#here">y</a><img src="gone.png"><a href="#here">z</a>'
+        '<img src="a.html" alt="a plot"><pre>/tmp/x.py:1: a warning</pre>'
     )
     assert set(links.faults(tmp_path)) == {
         "a.html: #here has no such place",
         "a.html: there is no gone.png",
+        "a.html: the image gone.png has no text",
+        "a.html: the path /tmp/x.py:1: is shown",
         "d.html: #nowhere has no such place",
         "d.html is more than 3 clicks away",
     }
@@ -313,8 +316,8 @@ def test_the_check_in_a_browser_names_what_is_wrong(tmp_path):
     assert done.returncode == 1, done.stderr
     for fault in (
         "there is no gone.png",
-        "no text for the image",
-        "fails",
+        "the image gone.png has no text",
+        "gone.png fails",
         "requests http://127.0.0.1:9/x.js",
         "a failure",
         "1280 pixels, dark: cut code: pre",
