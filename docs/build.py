@@ -173,7 +173,9 @@ def assemble() -> None:
         f"# Tutorials\n\n{words}\n\n```{{toctree}}\n:maxdepth: 1\n\n{listed}\n```\n"
     )
 
-    shutil.copytree(gallery.MADE, SOURCE / "gallery")
+    shutil.copytree(gallery.MADE, SOURCE / "gallery", ignore=shutil.ignore_patterns("*.md"))
+    for script in gallery.PAGES:  # and no page of a script that is there no longer
+        shutil.copy(gallery.MADE / f"{gallery.page_name(script)}.md", SOURCE / "gallery")
     index = with_thumbnails(gallery.index(), SOURCE / "gallery")
     (SOURCE / "gallery" / "index.md").write_text(index)
 
