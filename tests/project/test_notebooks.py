@@ -8,7 +8,7 @@ import sys
 import pytest
 from conftest import ROOT
 
-sys.path.insert(0, str(ROOT / "docs"))  # before another package of the name `build`
+sys.path.append(str(ROOT / "docs"))
 import build
 
 FOLDER = ROOT / "notebooks"
