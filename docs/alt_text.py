@@ -3,38 +3,49 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 LONGEST = 400
-"""Largest number of characters of a text; what a screen reader reads without a pause."""
+"""Largest number of characters of a text, which a screen reader reads in one piece."""
 
 
 def describe(figure: Figure) -> str:
-    """What a figure shows: the quantities of its panels, and the names of its curves."""
-    panels = [axes for axes in figure.axes if axes.get_visible() and not _is_colour_bar(axes)]
-    heading = _words(figure.get_suptitle())
-    texts = list(dict.fromkeys(text for axes in panels if (text := _panel(axes))))
-    names = list(dict.fromkeys(name for axes in panels for name in _legend(axes)))
+    """What a figure shows: the quantities of its panels, the names of its curves, and what its
+    colours mean.
+    """
+    bars = [axes for axes in figure.axes if axes.get_label() == "<colorbar>"]
+    panels = [axes for axes in figure.axes if axes.get_visible() and axes not in bars]
+    texts = _different(_panel(axes) for axes in panels)
+    names = _different(name for axes in panels for name in _legend(axes))
+    colours = _different(_words(axes.get_ylabel() or axes.get_xlabel()) for axes in bars)
     noun = "Plot" if len(panels) == 1 else f"{len(panels)} plots"
-    parts = [f"{noun} of {'; '.join(texts)}" if texts else noun]
-    if heading:
-        parts.insert(0, heading)
-    if names:
-        parts.append(f"Legend: {', '.join(names)}")
-    return _shortened(". ".join(parts))
+    parts = [_words(figure.get_suptitle()), f"{noun} of {'; '.join(texts)}" if texts else noun]
+    parts += [f"Legend: {', '.join(names)}"] if names else []
+    parts += [f"Colours: {', '.join(colours)}"] if colours else []
+    return _shortened(". ".join(part for part in parts if part))
 
 
-def _is_colour_bar(axes: Axes) -> bool:
-    return axes.get_label() == "<colorbar>"
+def _different(texts: Iterable[str]) -> list[str]:
+    """The texts that are not empty, each once."""
+    return list(dict.fromkeys(text for text in texts if text))
 
 
 def _panel(axes: Axes) -> str:
     """The title of a panel, and its quantities: the vertical one over the horizontal one."""
-    title, y, x = (_words(text) for text in (axes.get_title(), axes.get_ylabel(), axes.get_xlabel()))
-    quantities = f"{y} over {x}" if x and y else y or x
-    return f"{title} ({quantities})" if title and quantities else title or quantities
+    title, x, y = map(_words, (axes.get_title(), axes.get_xlabel(), axes.get_ylabel()))
+    quantities = f"{y} over {x}" if x and y else y
+    if title and quantities:
+        return f"{title} ({quantities})"
+    return title or quantities or _categories(axes)
+
+
+def _categories(axes: Axes) -> str:
+    """The names at the ticks of a panel without titles, "" if these are numbers."""
+    names = [_words(tick.get_text()) for tick in axes.get_xticklabels()]
+    return ", ".join(name for name in names if re.search("[A-Za-z]{2}", name))
 
 
 def _legend(axes: Axes) -> list[str]:
@@ -43,9 +54,13 @@ def _legend(axes: Axes) -> list[str]:
 
 
 def _words(text: str) -> str:
-    """A label without the marks of mathematical text, on one line."""
-    text = re.sub(r"\\(?:mathrm|text|dot|ddot|hat|tilde|bar|partial)\b\s*", "", text)
-    return " ".join(re.sub(r"[$\\{}\[\]|`*<>]", " ", text.replace("[", "(").replace("]", ")")).split())
+    """A label on one line, without the marks of mathematical text and of Markdown."""
+    text = re.sub(r"\\(hat|tilde|bar)\{?(\w)\}?", r"\2_\1", text)
+    text = re.sub(r"\\dot\{?(\w)\}?", r"\1'", text)
+    text = re.sub(r"\\ddot\{?(\w)\}?", r"\1''", text)
+    text = re.sub(r"\\(?:mathrm|text|partial)\b\s*", "", text).strip().replace("\n", ", ")
+    text = text.replace("[", "(").replace("]", ")")
+    return " ".join(re.sub(r"[$\\{}|`*<>]", " ", text).split())
 
 
 def _shortened(text: str) -> str:

@@ -8,6 +8,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+from alt_text import describe
 from reference import body
 
 import iblf_jax as ij
@@ -22,8 +23,10 @@ def tube() -> ij.bounds.Tube:
     return ij.bounds.Tube(0 * one, 0 * one, LOWER * one, UPPER * one, 0 * one, -0.1 * one)
 
 
-def draw(barrier, path: Path) -> None:
-    """V1, dV1/dq and alpha of one barrier, inside the bounds and a little beyond."""
+def draw(barrier, path: Path) -> str:
+    """Draws V1, dV1/dq and alpha of one barrier, inside the bounds and a little beyond; a text for
+    readers who do not see the figure.
+    """
     from iblf_jax.plotting._style import bound, label, new_figure, styled
 
     e1 = np.linspace(1.1 * LOWER, 1.1 * UPPER, 600)
@@ -47,16 +50,17 @@ def draw(barrier, path: Path) -> None:
             axes.set_xlabel(label("$e_1$", "rad"))
             axes.set_ylabel(label(f"${symbol}$", unit))
         figure.savefig(path, dpi=110)
+        return describe(figure)
 
 
 def write(folder: Path) -> None:
     """Write a page for each barrier, and the list of pages."""
     names = []
     for name, cls in ij.barriers.MEMBERS.items():
-        draw(cls(), folder / f"barrier_{name}.png")
+        shown = draw(cls(), folder / f"barrier_{name}.png")
         text = (
-            f"# {cls.__name__}\n\n{body(inspect.getdoc(cls) or '')}\n\n![V1, slope and"
-            f" alpha](barrier_{name}.png)\n\n"
+            f"# {cls.__name__}\n\n{body(inspect.getdoc(cls) or '')}\n\n"
+            f"![{cls.__name__}. {shown}](barrier_{name}.png)\n\n"
         )
         conditions = (
             f"The plot has bounds at {LOWER:g} and {UPPER:g} rad; the upper one decreases by 0.1"

@@ -48,7 +48,7 @@ THUMBNAIL = 480
 
 def digest_of(notebook: Path) -> str:
     """What the outputs of a notebook depend on: itself, and what its kernel runs before it."""
-    return digest(notebook) + digest(KERNEL)
+    return "".join(digest(source) for source in (notebook, KERNEL, ROOT / "docs" / "alt_text.py"))
 
 
 def execute(notebook: Path, folder: Path) -> nbformat.NotebookNode:
@@ -174,7 +174,9 @@ def assemble() -> None:
         f"# Tutorials\n\n{words}\n\n```{{toctree}}\n:maxdepth: 1\n\n{listed}\n```\n"
     )
 
-    shutil.copytree(gallery.MADE, SOURCE / "gallery")
+    shutil.copytree(gallery.MADE, SOURCE / "gallery", ignore=shutil.ignore_patterns("*.md"))
+    for script in gallery.PAGES:  # and no page of a script that is there no longer
+        shutil.copy(gallery.MADE / f"{gallery.page_name(script)}.md", SOURCE / "gallery")
     index = with_thumbnails(gallery.index(), SOURCE / "gallery")
     (SOURCE / "gallery" / "index.md").write_text(index)
 
@@ -210,7 +212,7 @@ def write_versions(folder: Path) -> None:
     """Lists the versions that were built in a folder, and leads its front page to the last release,
     or to the version in development where there is none.
     """
-    built = [path.parent.name for path in folder.glob("*/index.html")]
+    built = [path.parent.name for path in folder.glob("*/objects.inv")]
     releases = sorted((name for name in built if release_of(name)), key=Version, reverse=True)
     others = sorted(name for name in built if name not in releases)
     preferred = (releases + others)[0]

@@ -141,10 +141,11 @@ def page(result: dict[str, Any]) -> str:
         [
             "# Choosing a law",
             "",
-            "The gains of every law are scaled by one factor to the same effort, the RMS torque"
-            " above gravity of the first law, on the paper's arm with K2 = 2 N m s/rad. A law that"
-            " reaches this effort with no factor runs at its own gains ('own'); compare its torques"
-            " as well as its errors. Errors are the largest ones in the second half of a run."
+            "The gains of every law are scaled by one factor to the same {term}`effort`, the RMS"
+            " torque above gravity of the first law, on the paper's arm with K2 = 2 N m s/rad. A"
+            " law that reaches this effort with no factor runs at its own gains ('own'); compare"
+            " its torques as well as its errors. Errors are the largest ones in the second half of"
+            " a run."
             " 'left' is a run that leaves the bounds or diverges. The program that measures the"
             " table describes every column:"
             f" `{result['command']}`.",

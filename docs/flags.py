@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import gallery
 import jax.numpy as jnp
+from alt_text import describe
 
 import iblf_jax as ij
 from iblf_jax import plotting
@@ -313,8 +314,9 @@ def section(name: str) -> str:
     if run is not None:
         if isinstance(run, ij.Rollout) and not int(run.status) & int(ij.Status[name]):
             raise ValueError(f"the run of {name} has {ij.Status(int(run.status))!r}")
-        case.draw(run).savefig(MADE / f"flag_{name.lower()}.png", dpi=100)
-        lines += [f"![{name}](flag_{name.lower()}.png)", ""]
+        figure = case.draw(run)
+        figure.savefig(MADE / f"flag_{name.lower()}.png", dpi=100)
+        lines += [f"![{describe(figure)}](flag_{name.lower()}.png)", ""]
     text = "\n".join(lines)
     _kept(name).write_text(text)
     return text

@@ -1,9 +1,12 @@
-"""Links of the built site: none is dead, and every page is three clicks from the front page at
-most.
+"""What can be found in the pages of the built site without a browser: dead links, pages that are
+more than three clicks from the front page, images without a text, and paths of temporary files.
+
+`tools/check_site.py` opens the pages in a browser.
 """
 
 from __future__ import annotations
 
+import re
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote, urldefrag, urlparse
@@ -11,14 +14,15 @@ from urllib.parse import unquote, urldefrag, urlparse
 CLICKS = 3
 SPHINX = ("search.html", "genindex.html")
 """Pages of Sphinx's own, which its search box leads to."""
+TEMPORARY = re.compile(r"/tmp/\S*|ipykernel_\S*")
 
 
 class _Page(HTMLParser):
-    """Where a page leads, and the anchors that it has."""
+    """Where a page leads, the anchors that it has, and what is wrong in itself."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
-        self.anchors, self.links = {""}, list[str]()
+        self.anchors, self.links, self.wrong = {""}, list[str](), list[str]()
         self.feed(text)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
@@ -27,10 +31,17 @@ class _Page(HTMLParser):
         for address in (found.get("href"), found.get("src")):
             if address and not urlparse(address).scheme and not address.startswith("//"):
                 self.links.append(address)
+        text = found.get("alt") or ""
+        # Without a text, the name of the file takes its place.
+        if tag == "img" and (not text.strip() or "_images/" in text):
+            self.wrong.append(f"the image {(found.get('src') or '')[:80]} has no text")
+
+    def handle_data(self, data: str) -> None:
+        self.wrong += [f"the path {path} is shown" for path in TEMPORARY.findall(data)]
 
 
 def faults(folder: Path) -> list[str]:
-    """What is wrong with the links of the pages in a folder, a line each."""
+    """What is wrong with the pages in a folder, a line each."""
     folder = folder.resolve()
     pages = {
         path: _Page(path.read_text(encoding="utf-8"))
@@ -40,6 +51,7 @@ def faults(folder: Path) -> list[str]:
     wrong, leads = list[str](), dict[Path, set[Path]]()
     for path, page in pages.items():
         leads[path] = set()
+        wrong += [f"{path.relative_to(folder)}: {fault}" for fault in page.wrong]
         for address in page.links:
             place, anchor = urldefrag(unquote(address))
             target = (path.parent / place.split("?")[0]).resolve() if place else path

@@ -114,7 +114,8 @@ def write(page: Path) -> None:
         )
         parts.append(
             f"## {result['title']}\n\n{plot.words} `{result['command']}`; {where}.\n\n"
-            f"![{result['title']}](benchmark_{name}.png)\n\n{table(result['rows'])}\n"
+            f"![{result['title']}: {plot.values} of the rows of the table](benchmark_{name}.png)"
+            f"\n\n{table(result['rows'])}\n"
         )
     page.write_text("\n".join(parts))
 

@@ -8,14 +8,13 @@ def _prepare() -> None:
     import warnings
     from pathlib import Path
 
-    from IPython import get_ipython
     from matplotlib.figure import Figure
 
     sys.path.append(str(Path(__file__).parent))
     from alt_text import describe
 
-    plain = get_ipython().display_formatter.formatters["text/plain"]
-    plain.for_type(Figure, lambda figure, printer, _: printer.text(describe(figure)))
+    # A formatter of IPython would be removed by `%matplotlib inline`.
+    Figure.__repr__ = describe
 
     def without_path(message, category, filename, lineno, line=None) -> str:
         return f"{category.__name__}: {message}\n"

@@ -2,9 +2,9 @@
 prints what is wrong: `python tools/check_site.py`.
 
 It finds errors of the browser's console, requests to other hosts, pages and elements wider than the
-screen, lines of code that are cut, images without text or that fail, equations that MathJax does
-not read, dead links inside the site, and pages that are too large. It needs Chromium with its
-driver, and the extra `browser`. Addresses outside the site are not opened.
+screen, lines of code that are cut, images that fail, equations that MathJax does not read, pages
+that are too large, and what `docs/links.py` finds. It needs Chromium with its driver, and the extra
+`browser`. Addresses outside the site are not opened.
 """
 
 from __future__ import annotations
@@ -47,31 +47,38 @@ CONTENT = """
 const found = [];
 for (const image of document.images) {
   const name = image.src.slice(0, 100);
-  if (!image.alt.trim() || image.alt.includes("_images/")) found.push(`no text for the image ${name}`);
   if (!image.naturalWidth) found.push(`the image ${name} fails`);
 }
 for (const error of document.querySelectorAll("mjx-merror, [data-mjx-error]"))
   found.push(`MathJax: ${error.title || error.dataset.mjxError || error.textContent}`);
 const loaded = performance.getEntriesByType("resource");
-for (const {name} of loaded)
-  if (!name.startsWith(location.origin) && !name.startsWith("data:")) found.push(`requests ${name}`);
+for (const {name} of loaded) {
+  const isInside = name.startsWith(location.origin) || name.startsWith("data:");
+  if (!isInside) found.push(`requests ${name}`);
+}
 const images = loaded.filter(each => each.initiatorType === "img");
 const bytes = images.reduce((sum, each) => sum + each.encodedBodySize, 0);
 return [found, bytes];
 """
 """What is wrong with the content of a page, and the size of its images."""
 LAYOUT = """
-const found = [], width = innerWidth, named = element =>
-  `${element.tagName.toLowerCase()} "${element.textContent.trim().replace(/\\s+/g, " ").slice(0, 50)}"`;
-if (document.scrollingElement.scrollWidth > width + 1) found.push("the page is wider than the screen");
+const found = [], width = innerWidth;
+function named(element) {
+  const words = element.textContent.trim().replace(/\\s+/g, " ").slice(0, 50);
+  return `${element.tagName.toLowerCase()} "${words}"`;
+}
+if (document.scrollingElement.scrollWidth > width + 1)
+  found.push("the page is wider than the screen");
 function scrolls(element) {
   for (let each = element.parentElement; each && each !== document.body; each = each.parentElement)
     if (["auto", "scroll"].includes(getComputedStyle(each).overflowX)) return true;
   return false;
 }
-for (const element of document.querySelectorAll("main pre, main table, main img, mjx-container, main p, main dt, canvas, main iframe")) {
+const checked = "main :is(pre, table, img, p, dt, iframe), mjx-container, canvas";
+for (const element of document.querySelectorAll(checked)) {
   const {right, width: own} = element.getBoundingClientRect();
-  if (own && right > width + 1 && !scrolls(element)) found.push(`off the screen: ${named(element)}`);
+  const isOff = own && right > width + 1 && !scrolls(element);
+  if (isOff) found.push(`off the screen: ${named(element)}`);
 }
 const isWide = width > 768;
 for (const block of document.querySelectorAll("pre")) {
@@ -158,6 +165,8 @@ def faults(folder: Path, pattern: str = "") -> list[str]:
         for path in sorted(folder.rglob("*.html"))
         if "_static" not in path.parts and pattern in str(path.relative_to(folder))
     ]
+    if not pages:
+        raise SystemExit(f"there are no such pages in {folder}; `python docs/build.py` builds them")
     wrong = [] if pattern else links.faults(folder)
     # The list of versions is beside the folder of a version.
     with served(folder.parent) as address, opened_browser() as browser:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import importlib.util
+import json
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -10,8 +13,12 @@ from pathlib import Path
 import pytest
 import run_page
 from conftest import ROOT
+from matplotlib.figure import Figure
+from PIL import Image
 
-sys.path.append(str(ROOT / "docs"))
+sys.path.insert(0, str(ROOT / "docs"))  # before another package of the name `build`
+import alt_text
+import build
 import equations
 import flags
 import gallery
@@ -163,7 +170,10 @@ def test_every_public_name_is_in_the_reference():
             "V1 = int_0^xi 2 s ds    (2.6), (3.1)",
             r"V_{1} = \int _{0}^{\xi } 2 s\,\mathrm{d} s\quad\text{(2.6), (3.1)}",
         ),
-        ("x_hat' = f + G x_hat_+ + d_hat_s", r"\hat{x}' = f + G\,\hat{x}_{+} + \hat{\mathrm{d}}_{s}"),
+        (
+            "x_hat' = f + G x_hat_+ + d_hat_s",
+            r"\hat{x}' = f + G\,\hat{x}_{+} + \hat{\mathrm{d}}_{s}",
+        ),
         (
             "k = k_u if e1 > 0,   z_(k+1) <= 1",
             "k = k_{u}\\ \\text{if}\\ e_{1} > 0, \\\\\nz_{k+1} \\le  1",
@@ -203,10 +213,116 @@ def test_dead_links_and_pages_out_of_reach_are_named(tmp_path):
         )
     (tmp_path / "a.html").write_text(
         '<a href="deep/b.html#here">y</a><img src="gone.png"><a href="#here">z</a>'
+        '<img src="a.html" alt="a plot"><pre>/tmp/x.py:1: a warning</pre>'
     )
     assert set(links.faults(tmp_path)) == {
         "a.html: #here has no such place",
         "a.html: there is no gone.png",
+        "a.html: the image gone.png has no text",
+        "a.html: the path /tmp/x.py:1: is shown",
         "d.html: #nowhere has no such place",
         "d.html is more than 3 clicks away",
     }
+
+
+def test_members_do_not_address_authors():
+    shown = re.sub("<!--.*?-->", "", (ROOT / "docs" / "members.md").read_text(), flags=re.DOTALL)
+    assert "edit" not in shown.split("##", 1)[0]
+
+
+@pytest.mark.parametrize(
+    ("path", "expected"),
+    [
+        ("simulate", "```{py:function} simulate(scenario: Scenario,"),
+        ("Scenario", "```{py:class} Scenario(plant: Robot | Plant,"),
+        ("proofs.Verdict", "```{py:class} proofs.Verdict("),
+    ],
+)
+def test_an_object_of_the_reference_is_defined_for_the_general_index(path, expected):
+    text = reference.page_of(reference.named(path), path)
+    assert expected in text
+    assert ":module: iblf_jax\n" in text
+
+
+def test_a_protocol_and_its_methods_are_defined_for_the_general_index():
+    text = reference.page_of(ij.observers.Observer, "observers.Observer", 3)
+    assert "```{py:class} Observer\n:module: iblf_jax.observers\n:no-typesetting:" in text
+    assert "```{py:method} Observer.estimate(" in text
+
+
+def test_private_types_are_not_in_the_reference():
+    names = reference.public_types.types_of(ij.metrics)
+    assert names
+    assert not [name for name in names if name.startswith("_")]
+
+
+def test_the_text_of_a_figure_names_quantities_curves_and_colours():
+    figure = Figure()
+    left, right = figure.subplots(1, 2)
+    figure.suptitle("Two runs\nstatus: ok")
+    left.plot([0, 1], [0, 1], label=r"$\hat{f}$")
+    left.legend()
+    left.set(title="joint 0", xlabel="time $t$ [s]", ylabel=r"velocity $\dot{q}$ [rad/s]")
+    image = right.imshow([[0, 1], [2, 3]])
+    right.set(xlabel="$k_1$ [1/s]", ylabel="$K_2$")
+    figure.colorbar(image, label="margin [rad]")
+    assert alt_text.describe(figure) == (
+        "Two runs, status: ok. 2 plots of joint 0 (velocity q' (rad/s) over time t (s));"
+        " K_2 over k_1 (1/s). Legend: f_hat. Colours: margin (rad)"
+    )
+    assert alt_text.describe(Figure()) == "0 plots"
+
+
+def test_the_gallery_shows_small_pictures_with_the_titles_as_texts(tmp_path):
+    Image.new("RGB", (2000, 1000)).save(tmp_path / "run_figure.png")
+    card = ":::{grid-item-card} A run\n:link: run\n:link-type: doc\n:img-top: run_figure.png\n:::\n"
+    changed = build.with_thumbnails(card, tmp_path)
+    assert ":link-type: doc\n:img-top: small_run_figure.png\n:img-alt: A run\n:::" in changed
+    with Image.open(tmp_path / "small_run_figure.png") as picture:
+        assert picture.size == (build.THUMBNAIL, build.THUMBNAIL // 2)
+
+
+@pytest.mark.parametrize(
+    ("built", "preferred"),
+    [(["main"], "main"), (["main", "1.2.0", "1.10.0", "1.10.0rc1"], "1.10.0")],
+)
+def test_the_front_page_leads_to_the_last_release(built, preferred, tmp_path):
+    for name in [*built, "not_a_version"]:
+        (tmp_path / name).mkdir()
+    for name in built:
+        (tmp_path / name / "objects.inv").touch()
+    build.write_versions(tmp_path)
+    rows = json.loads((tmp_path / "switcher.json").read_text())
+    assert {row["version"] for row in rows} == set(built)
+    assert [row["version"] for row in rows if row["preferred"]] == [preferred]
+    assert f"url={preferred}/index.html" in (tmp_path / "index.html").read_text()
+
+
+FAULTY = """<!DOCTYPE html><html><head><link rel="icon" href="data:,"></head><body><main>
+<pre style="overflow: auto">{line}</pre><img src="gone.png"><table><tr><td>{line}</td></tr></table>
+<script>console.error("a failure")</script><script src="http://127.0.0.1:9/x.js"></script>
+</main></body></html>"""
+
+
+@pytest.mark.site
+@pytest.mark.skipif(
+    not importlib.util.find_spec("selenium") or not shutil.which("chromedriver"),
+    reason="the extra `browser` and Chromium with its driver",
+)
+def test_the_check_in_a_browser_names_what_is_wrong(tmp_path):
+    (tmp_path / "index.html").write_text(FAULTY.format(line="x" * 300))
+    command = [sys.executable, str(ROOT / "tools" / "check_site.py"), str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 1, done.stderr
+    for fault in (
+        "there is no gone.png",
+        "the image gone.png has no text",
+        "gone.png fails",
+        "requests http://127.0.0.1:9/x.js",
+        "a failure",
+        "1280 pixels, dark: cut code: pre",
+        "390 pixels, light: the page is wider than the screen",
+        "390 pixels, light: off the screen: table",
+    ):
+        assert fault in done.stdout, fault
+    assert "390 pixels, light: cut code" not in done.stdout
