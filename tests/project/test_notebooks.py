@@ -17,7 +17,8 @@ import nbformat
 import pytest
 from conftest import ROOT
 
-sys.path.append(str(ROOT / "docs"))
+# First, because a package index has a `build` too.
+sys.path.insert(0, str(ROOT / "docs"))
 import build
 
 FOLDER = ROOT / "notebooks"
