@@ -185,6 +185,7 @@ class Plant:
 
     n: ClassVar[int] = 1
     order: ClassVar[int] = 2
+    units: ClassVar[tuple[ij.plants.Units, ...]] = ("m", "m/s", "N")
 
     def drift(self, t: jax.Array, x: jax.Array) -> jax.Array:
         """f."""
