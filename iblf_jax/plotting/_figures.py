@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -117,15 +118,15 @@ def zoom_reason(curves: Sequence[Curve], rows: Sequence[PanelRow], zoom: float) 
     window = f"first {zoom:.3g} s"
     if all(curve.failed for curve in curves):
         return f"{window}: the start (every run failed)"
-    of_runs = ""
+    others = ""
     if any(curve.failed for curve in curves):
-        of_runs = " of the runs without failure"
+        others = " (failed runs aside)"
     transient = _transient_of(curves, rows)
     if transient == 0.0:
-        return f"{window}: the start; no transient{of_runs}"
+        return f"{window}: the start; no transient{others}"
     if transient > zoom:
-        return f"{window} of the transient{of_runs}, which takes {transient:.3g} s"
-    return f"{window}: the transient{of_runs}"
+        return f"{window} of a transient of {transient:.3g} s{others}"
+    return f"{window}: the transient{others}"
 
 
 @_style.styled()
@@ -152,13 +153,23 @@ def _rows_with_zoom(
         lines = [range_after(curves, row.quantity, row.joint, start[1])]
         if inset is table[0, 1]:
             lines.insert(0, zoom_reason(curves, rows, start[1]))
-        inset.set_title("\n".join(filter(None, lines)), fontsize=_style.size(8.0))
+        _name_zoom(inset, lines)
     for axes in table[-1]:
         _style.time_axis(axes)
     figure.align_ylabels(table[:, 0])
     _style.set_title(figure, title, curves, notes=notes)
     _style.legend_below(figure)
     return figure
+
+
+def _name_zoom(inset: Axes, lines: Sequence[str]) -> None:
+    """Sets the title of a zoom, above the power of ten of its vertical axis if it has one."""
+    low, high = np.abs(inset.get_ylim())
+    smallest, largest = matplotlib.rcParams["axes.formatter.limits"]
+    pad = matplotlib.rcParams["axes.titlepad"]
+    if not 10.0**smallest <= max(low, high) < 10.0**largest:
+        pad += _style.size(10.0)
+    inset.set_title("\n".join(filter(None, lines)), fontsize=_style.size(8.0), pad=pad)
 
 
 def _outline(main: Axes, inset: Axes) -> None:

@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 
 import iblf_jax as ij
 from iblf_jax import Status, plotting
-from iblf_jax.plotting import _scales, _studies, _style, _tuning, certificates
+from iblf_jax.plotting import _proofs, _scales, _studies, _style, _tuning, certificates
 from iblf_jax.plotting._curves import curves_of, rounding_error
 from iblf_jax.studies.summaries import LEVELS, initial_margins
 
@@ -129,13 +129,13 @@ def test_the_range_after_a_zoom_of_a_torque_is_that_of_the_run():
 
 def test_other_zooms_have_other_reasons():
     run = made_up(chain(2), duration=20.0)
-    assert "of the transient, which takes" in zoom_titles(plotting.errors(run, zoom=0.1))[0]
+    assert "first 0.1 s of a transient of " in zoom_titles(plotting.errors(run, zoom=0.1))[0]
     still = dataclasses.replace(run, e1=0.0 * run.e1, xi=0.0 * run.xi)
     assert "no transient" in zoom_titles(plotting.errors(still))[0]
     bad = runaway(chain(2))
     assert "every run failed" in zoom_titles(plotting.positions(bad))[0]
     both = plotting.positions({"good": run, "bad": bad})
-    assert "the transient of the runs without failure" in zoom_titles(both)[0]
+    assert "the transient (failed runs aside)" in zoom_titles(both)[0]
 
 
 @pytest.mark.parametrize(("value", "text"), [(0.0385, "0.039"), (0.5, "0.5"), (0.0, "0")])
@@ -290,6 +290,20 @@ def test_a_run_that_diverged_inside_its_bounds_is_marked_in_every_panel():
     assert [crosses_of(axes) for axes in plotting.torques(run).axes[::2]] == [[1.0], [1.0]]
 
 
+def test_a_refutation_is_red_for_the_joint_that_leaves_its_bounds():
+    run = changed(made_up(chain(2)), 1, 20, 9.0)
+    state = types.SimpleNamespace(t=0.0)
+    found = types.SimpleNamespace(
+        replay=lambda: run, violation=types.SimpleNamespace(state=state), duration=4.0
+    )
+    red = []
+    for joint in range(2):
+        axes = Figure().subplots()
+        _proofs._draw_violation(axes, found, joint)
+        red.append(to_hex(axes.get_lines()[0].get_color()) == to_hex(_style.failure()))
+    assert red == [False, True]
+
+
 # ---- rounding errors are zero
 
 
@@ -375,3 +389,25 @@ def test_a_peak_of_a_study_is_labelled_as_a_size(study):
     metrics = ij.Metrics({"peak_torque": peaks}, (("peak_torque", "N m"),))
     figure = plotting.histograms(dataclasses.replace(study, metrics=metrics))
     assert figure.axes[0].get_xlabel() == "peak torque (absolute value) [N m]"
+
+
+def test_a_tuning_says_when_the_start_sets_its_margin(paper):
+    start = float(initial_margins(paper, {})[LEVELS[0]].min())
+    for margins, is_start in (([start, np.nan, start], True), ([start, start - 1e-6], False)):
+        history = {"margin": np.array(margins)[:, None]}
+        result = types.SimpleNamespace(history=history, best_start=0, scenario=paper)
+        axes = Figure().subplots()
+        _tuning._margin(axes, result)
+        assert ("that of the start" in axes.get_title()) == is_start
+
+
+def test_the_title_of_a_zoom_is_above_the_power_of_ten_of_its_axis():
+    run = made_up(chain(2))
+    small = dataclasses.replace(run, disturbance=1e-5 * run.q, disturbance_estimate=2e-5 * run.q)
+    figure = plotting.uncertain_terms(small)
+    figure.draw_without_rendering()
+    for axes in figure.axes[1::2]:
+        title = axes.title.get_window_extent()
+        power = axes.yaxis.get_offset_text()
+        assert power.get_text()
+        assert not title.overlaps(power.get_window_extent())
