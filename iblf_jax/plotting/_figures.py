@@ -17,7 +17,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -153,23 +152,13 @@ def _rows_with_zoom(
         lines = [range_after(curves, row.quantity, row.joint, start[1])]
         if inset is table[0, 1]:
             lines.insert(0, zoom_reason(curves, rows, start[1]))
-        _name_zoom(inset, lines)
+        inset.set_title("\n".join(filter(None, lines)), fontsize=_style.size(8.0))
     for axes in table[-1]:
         _style.time_axis(axes)
     figure.align_ylabels(table[:, 0])
     _style.set_title(figure, title, curves, notes=notes)
     _style.legend_below(figure)
     return figure
-
-
-def _name_zoom(inset: Axes, lines: Sequence[str]) -> None:
-    """Sets the title of a zoom, above the power of ten of its vertical axis if it has one."""
-    low, high = np.abs(inset.get_ylim())
-    smallest, largest = matplotlib.rcParams["axes.formatter.limits"]
-    pad = matplotlib.rcParams["axes.titlepad"]
-    if not 10.0**smallest <= max(low, high) < 10.0**largest:
-        pad += _style.size(10.0)
-    inset.set_title("\n".join(filter(None, lines)), fontsize=_style.size(8.0), pad=pad)
 
 
 def _outline(main: Axes, inset: Axes) -> None:

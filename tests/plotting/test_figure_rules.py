@@ -399,15 +399,3 @@ def test_a_tuning_says_when_the_start_sets_its_margin(paper):
         axes = Figure().subplots()
         _tuning._margin(axes, result)
         assert ("that of the start" in axes.get_title()) == is_start
-
-
-def test_the_title_of_a_zoom_is_above_the_power_of_ten_of_its_axis():
-    run = made_up(chain(2))
-    small = dataclasses.replace(run, disturbance=1e-5 * run.q, disturbance_estimate=2e-5 * run.q)
-    figure = plotting.uncertain_terms(small)
-    figure.draw_without_rendering()
-    for axes in figure.axes[1::2]:
-        title = axes.title.get_window_extent()
-        power = axes.yaxis.get_offset_text()
-        assert power.get_text()
-        assert not title.overlaps(power.get_window_extent())
