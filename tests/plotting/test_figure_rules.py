@@ -332,7 +332,7 @@ def test_the_overview_says_zero():
     run = made_up(chain(2))
     still = dataclasses.replace(run, disturbance=0.0 * run.q, disturbance_estimate=noise(run))
     (axes,) = [axes for axes in drawn(still.plot()).axes if "broad" in axes.get_ylabel()]
-    assert texts_of(axes)[0].startswith(r"zero: $|f| \leq$ ")
+    assert texts_of(axes)[0].startswith("zero\n($|f| \\leq$ ")
     assert not any("zero" in text for axes in run.plot().axes for text in texts_of(axes))
 
 
@@ -352,6 +352,36 @@ def test_a_certificate_says_zero(values, is_zero):
     certificates._draw_bounded(axes, t, np.full(50, values), np.full(50, 2.0), signal)
     assert any(text.startswith("zero") for text in texts_of(axes)) == is_zero
     assert axes.get_yscale() == ("linear" if is_zero else "log")
+
+
+def test_a_zoom_of_rounding_errors_has_no_transient():
+    run = made_up(chain(2))
+    decaying = 1e-15 * np.exp(-5.0 * np.asarray(run.t))[:, None] * np.ones(2)
+    run = dataclasses.replace(
+        run, disturbance=0.0 * run.q, disturbance_estimate=jnp.asarray(decaying)
+    )
+    titles = zoom_titles(plotting.uncertain_terms(run))
+    assert "no transient then zero" in titles[0]
+    assert titles[1] == "then zero"
+
+
+@pytest.mark.parametrize("size", [1e-16, 1e-3])
+def test_an_inequality_of_rounding_errors_is_zero(size):
+    t = np.linspace(0.0, 1.0, 50)
+    traces = types.SimpleNamespace(t=t, left=np.full(50, -size), V=np.exp(-t))
+    axes = Figure().subplots()
+    certificates._draw_inequality(axes, traces, 0.0 * t, "terms")
+    assert any(text.startswith("zero") for text in texts_of(axes)) == (size < 1e-3)
+
+
+@pytest.mark.parametrize("size", [1e-16, 1e-3])
+def test_errors_of_an_estimate_that_are_rounding_are_zero(size):
+    t = np.linspace(0.0, 1.0, 50)
+    columns = np.stack([np.exp(-t), np.exp(-2.0 * t)], axis=1)[:, :, None]
+    traces = types.SimpleNamespace(t=t, d_tilde=np.full((50, 2), size), error=columns)
+    axes = Figure().subplots()
+    certificates._disturbances(axes, traces)
+    assert any(text.startswith("zero") for text in texts_of(axes)) == (size < 1e-3)
 
 
 # ---- margins of the start
