@@ -96,9 +96,9 @@ def test_reproduce_states_that_the_arm_is_assumed(command, tmp_path, monkeypatch
     )
     code, out, err = command("reproduce", "--out", "out")
     assert code == 0, err
-    assert len(notes) == 1
-    assert "masses and lengths are assumed (the paper prints none)" in notes[0]
-    assert "2 / 0.85 kg, 0.35 / 0.31 m" in notes[0]
+    assert notes == [
+        "Masses 2 / 0.85 kg and lengths 0.35 / 0.31 m are assumed: the paper prints none."
+    ]
     text_report = (tmp_path / "out" / "report.md").read_text()
     assert text_report.count("The masses and lengths of the arm are assumed.") == 6
     report = strict_json(tmp_path / "out" / "metrics.json")

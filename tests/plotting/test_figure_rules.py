@@ -110,7 +110,7 @@ def test_a_zoom_of_the_transient_says_so_and_bounds_what_follows():
     end = figure.axes[1].get_xlim()[1]
     later = np.abs(np.asarray(run.e2))[np.asarray(run.t) > end].max(axis=0)
     titles = zoom_titles(figure)
-    assert titles[0].startswith(f"first {end:.3g} s: the transient then $|e_2| \\leq$ ")
+    assert titles[0].startswith(f"first {end:.3g} s: the transient, then $|e_2| \\leq$ ")
     assert titles[1].startswith("then $|e_2| \\leq$ ")
     for title, largest in zip(titles, later, strict=True):
         stated = float(title.split("\\leq$ ")[1].removesuffix(" rad/s"))
@@ -361,7 +361,7 @@ def test_a_zoom_of_rounding_errors_has_no_transient():
         run, disturbance=0.0 * run.q, disturbance_estimate=jnp.asarray(decaying)
     )
     titles = zoom_titles(plotting.uncertain_terms(run))
-    assert "no transient then zero" in titles[0]
+    assert "no transient, then zero" in titles[0]
     assert titles[1] == "then zero"
 
 
