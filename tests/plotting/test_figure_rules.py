@@ -127,6 +127,11 @@ def test_the_range_after_a_zoom_of_a_torque_is_that_of_the_run():
         assert title.endswith(f"then {low:.3g} to {high:.3g} N m")
 
 
+def test_a_relative_error_has_no_unit_in_words():
+    titles = zoom_titles(plotting.errors(made_up(chain(1), duration=20.0)))
+    assert re.fullmatch(r".*then \$\|\\xi\| \\leq\$ [\d.e-]+", titles[0]), titles
+
+
 def test_other_zooms_have_other_reasons():
     run = made_up(chain(2), duration=20.0)
     assert "first 0.1 s of a transient of " in zoom_titles(plotting.errors(run, zoom=0.1))[0]
