@@ -152,7 +152,7 @@ def test_a_stated_bound_is_not_below_the_value(value, text):
 
 @pytest.mark.slow
 def test_a_comparison_states_the_reason_for_each_window(paper):
-    found = ij.compare(paper, ["integral", "log"], duration=2.0, dt=2e-3)
+    found = ij.compare(paper, ["integral", "log"], duration=8.0, dt=1e-3)
     error, torque = found.plot().axes[:4:2]
     assert error.get_title().startswith("gains as given\nfirst ")
     assert "the transient" in error.get_title()
