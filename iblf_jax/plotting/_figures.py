@@ -110,7 +110,7 @@ def _default_zoom(
         return ZOOM_SHARE * end
     zoom = min(max(transients * transient, MIN_ZOOMED * end), MAX_ZOOMED * end)
     rounded = float(f"{zoom:.0e}")
-    if rounded < transient:
+    if rounded < transient <= zoom:
         return float(f"{zoom:.1e}")
     return rounded
 

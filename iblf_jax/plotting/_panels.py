@@ -614,13 +614,14 @@ def range_after(curves: Sequence[Curve], quantity: PanelQuantity, joint: int, ti
         return ""
     low, high = span
     largest = max(abs(low), abs(high))
+    unit = quantity.unit.removeprefix("1")
     if largest <= rounding_error(curves, quantity.field):
         return "then zero"
     if quantity.transient or field in ERRORS:
         symbol = quantity.transient_symbol or quantity.symbol
-        return f"then {at_most(symbol, rounded_away(largest))} {quantity.unit}"
+        return f"then {at_most(symbol, rounded_away(largest))} {unit}".rstrip()
     ends = f"{signed(low, 3)} to {signed(high, 3)}"
-    return f"then {ends} {quantity.unit}"
+    return f"then {ends} {unit}".rstrip()
 
 
 def at_most(symbol: str, size: str) -> str:

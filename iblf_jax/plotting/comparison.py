@@ -117,7 +117,7 @@ def _name_window(axes: Axes, curves: list[Curve], row: PanelRow, end: float, rea
     """Adds the reason for the window of a panel, and the range of its quantity after the window, to
     its title.
     """
-    words = ", ".join(filter(None, [reason, range_after(curves, row.quantity, row.joint, end)]))
+    words = ",\n".join(filter(None, [reason, range_after(curves, row.quantity, row.joint, end)]))
     axes.set_title("\n".join(filter(None, [axes.get_title(), words])))
 
 
