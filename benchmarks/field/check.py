@@ -167,8 +167,10 @@ def _faults_of_options(made: Reproduction) -> list[str]:
     found = []
     if not isinstance(made.not_applicable, dict):
         found.append("example.py: not_applicable must be a dict, law -> reason")
-    known = ij.parameters(made.scenario) if isinstance(made.scenario, ij.Scenario) else {}
-    for path in made.uncertain or ():
+    if made.uncertain is None or not isinstance(made.scenario, ij.Scenario):
+        return found
+    known = {parameter.path for parameter in ij.parameters(made.scenario)}
+    for path in made.uncertain:
         if path not in known:
             found.append(f"example.py: uncertain has {path!r}, which is no path of the scenario")
     return found

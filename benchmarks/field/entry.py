@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import io
 import re
 import runpy
@@ -24,10 +25,10 @@ RESULTS = FOLDER / "results"
 FAMILIES = ("robot", "flexible joint", "drive", "vessel", "vehicle", "strict feedback")
 METHODS = ("barrier", "prescribed performance", "constrained")
 READ = {
-    "article": "the article",
-    "program": "the authors' program",
-    "thesis": "a thesis",
-    "secondary": "a public program that follows the publication",
+    "article": "article",
+    "program": "program of the authors",
+    "thesis": "thesis",
+    "secondary": "program of others",
 }
 """Value of `source.read` -> what was read, in words."""
 KINDS = {
@@ -45,8 +46,11 @@ class EntryError(ValueError):
     """An entry that cannot be used; `faults` has one sentence for each repair."""
 
     def __init__(self, faults: list[str]) -> None:
-        super().__init__("\n".join(faults))
+        super().__init__(faults)
         self.faults = faults
+
+    def __str__(self) -> str:
+        return "; ".join(self.faults)
 
 
 def _one_of(values: typing.Iterable[str], **options: Any) -> Any:
@@ -259,8 +263,9 @@ def _value(kind: Any, value: Any, field: dataclasses.Field, place: str, faults: 
     return value
 
 
+@functools.cache
 def execute(folder: Path) -> Reproduction:
-    """Runs the `example.py` of a folder.
+    """Runs the `example.py` of a folder, once a process.
 
     Raises:
       EntryError: a name is missing.

@@ -1,29 +1,7 @@
-"""A bound on the output, logarithmic barrier (Liu): a servo drive follows a sine within 0.51 of it, with the textbook's law and with the package's.
-
-Program chap10_2 of the MATLAB programs of J. Liu's textbook Intelligent Control (in Chinese), as a
-public repository has it (github.com/468301239/Control_Confidential, files chap10_2ctrl.m,
-chap10_2plant.m, chap10_2plot.m). The text of the book was not accessible.
-
-| printed | value | where |
-| --- | --- | --- |
-| plant | x1' = x2, x2' = -25 x2 + 133 u | chap10_2plant.m |
-| reference | y_d = sin t | chap10_2ctrl.m |
-| bound of the error | k_b = 0.51, so that -1.51 < x1 < 1.51 | kb1 in chap10_2ctrl.m |
-| start | (0.5, 0) | x0 in chap10_2plant.m |
-| gains | k1 = k2 = 10 | chap10_2ctrl.m |
-| law | alpha_1 = y_d' - (k_b^2 - z1^2) k1 z1 | alfa in chap10_2ctrl.m |
-
-**Published result**, according to the plotting script: x1 and y_d within the bounds, the error within
-k_b. There are no numbers.
-
-**The published law differs from that of the package** in alpha_1 only: V_1 and its slope are those
-of `barriers.Log`, whose alpha_1 = y_d' - (k1 + kappa) z1 has a gain in 1/s that does not depend on
-the bound. The published gain of z1, (k_b^2 - z1^2) k1, decreases to 0 at the bound, so that V' =
--k1 z1^2 - k2 z2^2 where the package has V_1' <= -2 k1 V_1 at z2 = 0. A barrier with the published
-alpha_1 is a class of this page.
-
-**Not printed:** what happens at the bound; the guard of `barriers.Log` limits the slope from
-0.999 k_b on. Nothing had to be corrected.
+"""A bound on the output, logarithmic barrier (Liu 2018): a servo drive follows a sine within 0.51
+of it, with the law of the textbook and with that of the package. They differ in alpha_1 only: the
+gain (k_b^2 - z1^2) k1 of the textbook decreases to 0 at the bound, so that V' = -k1 z1^2 - k2 z2^2,
+where `barriers.Log` has V_1' <= -2 k1 V_1 at z2 = 0.
 """
 
 import jax
@@ -63,23 +41,29 @@ class TextbookLog:
         return tube.dq_d - k1 * (self.error_over_slope(tube, q) * e + beyond)
 
 
-def drift(t, x):
-    """f_1 and f_2."""
-    return jnp.stack([jnp.zeros_like(x[0]), -25.0 * x[1]])
+@ij.component
+class Drive:
+    """x1' = x2, x2' = -friction x2 + input_gain u."""
+
+    friction: ij.Leaf = ij.leaf("1/s", shape="scalar")
+    input_gain: ij.Leaf = ij.leaf("rad/(V s^2)", sign="positive", shape="scalar")
+    n, order, units = 1, 2, ("rad", "rad/s", "V")
+
+    def drift(self, t, x):
+        """f_1 and f_2."""
+        return jnp.stack([jnp.zeros_like(x[0]), -self.friction * x[1]])
+
+    def gain(self, t, x):
+        """G_1 and G_2."""
+        one = jnp.ones_like(x[0])
+        return jnp.stack([one, self.input_gain * one])
 
 
-def gain(t, x):
-    """G_1 and G_2."""
-    return jnp.stack([jnp.ones_like(x[0]), jnp.full_like(x[0], 133.0)])
-
-
-def scenario(barrier):
+def task(barrier):
     """The published task with a barrier on the output."""
     side = ij.bounds.Funnel
     return ij.Scenario(
-        plant=ij.plants.StrictFeedback(
-            drift, gain, n=1, order=2, units=("rad", "rad/s", "V"), level_names=("angle", "speed")
-        ),
+        plant=Drive(friction=25.0, input_gain=133.0),
         reference=ij.references.Sinusoid(offset=0.0, amplitude=1.0),
         bounds=ij.Bounds(lower=side(-K_B, -K_B, 0.0), upper=side(K_B, K_B, 0.0)),
         controller=ij.controllers.BarrierBackstepping(
@@ -89,8 +73,10 @@ def scenario(barrier):
     )
 
 
-members = {"published alpha": TextbookLog(), "Log of the package": LOG}
-runs = {name: ij.simulate(scenario(b), duration=10.0, dt=1e-3) for name, b in members.items()}
+scenario = task(TextbookLog())
+uncertain = ("plant.friction", "plant.input_gain")
+cases = {"published alpha": scenario, "Log of the package": task(LOG)}
+runs = {name: ij.simulate(case, duration=10.0, dt=1e-3) for name, case in cases.items()}
 figure, axes = plt.subplots(1, 3, figsize=(11, 3.2), layout="constrained")
 for name, run in runs.items():
     for panel, curve in zip(axes, (run.x[:, 0], run.e1, run.tau), strict=True):
@@ -98,7 +84,7 @@ for name, run in runs.items():
 for panel, limit in zip(axes, (1.51, K_B), strict=False):
     panel.axhline(limit, color="k", linestyle=":", linewidth=0.8)
     panel.axhline(-limit, color="k", linestyle=":", linewidth=0.8)
-for panel, label in zip(axes, ("$x_1$", "error $z_1$", "input $u$"), strict=True):
+for panel, label in zip(axes, ("$x_1$ [rad]", "error $z_1$ [rad]", "input $u$ [V]"), strict=True):
     panel.set(xlabel="time $t$ [s]", ylabel=label)
 axes[2].set(xlim=(0.0, 2.0))
 axes[0].legend(fontsize="x-small")
@@ -115,5 +101,8 @@ for name, run in runs.items():
     print(f"u(0) = {u[0]:.6f}, largest |u| {np.abs(u).max():.4f}")
     print(f"   x1 in {ranges[0]}, x2 in {ranges[1]}, largest |z1| {np.abs(z).max():.4f}")
     print(f"   z1 at 1, 2 and 5 s: {at}; |z1| < 0.01 after {small:.3f} s")
-
-# %% **Not reproduced:** the curves of the book, which are not available as numbers.
+published = runs["published alpha"]
+holds = {
+    "the error stays within k_b = 0.51": bool(np.all(np.abs(published.e1) < K_B)),
+    "the output stays within 1.51": bool(np.all(np.abs(published.x[:, 0]) < 1.51)),
+}

@@ -1,0 +1,612 @@
+"""All applicable laws of the package on the task of each entry, at equal effort.
+
+    python benchmarks/field/measure.py [NAME ...] [--quick] [--processes N] [--out FOLDER]
+
+The published law, the one of the entry's `scenario`, sets the effort: the RMS input above the one
+that balances gravity.  For a plant in strict-feedback form it is the RMS of all its inputs above
+the plant's own steady input, which is zero where the plant states none.  The gains of every other
+law are scaled by one factor to this effort (`ij.compare`).  Columns:
+
+- `factor`: of the gains; "own" for a law that has no factor in [1/32, 32] with this effort, and
+  runs at the gains of `laws_of`.
+- `effort`: as a share of that of the published law.
+- `RMS error`, `error`: RMS and largest |e1| of all components in the second half of the run.
+- `peak input`: largest input of the entire run.
+- `margin`: least distance to any bound of the scenario over the entire run, as a share of half the
+  distance of these bounds; bounds of the first level at every step, others at the recorded samples.
+- `error, parameters`, `margin, parameters`: the worse of two plants whose uncertain parameters are
+  0.8 and 1.2 times those of the entry; the model is the one of the entry.
+- `error, 500 Hz`, `margin, 500 Hz`: law and observer run once in 2 ms and read exact sensors.
+- `error, noise`, `margin, noise`: the same with white noise on every level, whose standard
+  deviation is `NOISE` times half the least distance of the bounds, and of the further levels
+  `NOISE` times their largest value in the published run.
+
+"left" is a run that leaves its bounds or diverges, and "step" one for which the entry's time step
+is too large.  The results go to results/NAME.json, after each law.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import functools
+import json
+import multiprocessing
+import os
+import shlex
+import sys
+import warnings
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+from typing import Any, NamedTuple
+
+HERE = Path(__file__).resolve().parent
+sys.path[:0] = [str(HERE), str(HERE.parent)]
+
+import jax
+
+jax.config.update("jax_enable_x64", True)
+
+import entry
+import laws
+import matplotlib
+import numpy as np
+from _timing import machine
+
+import iblf_jax as ij
+from iblf_jax import barriers, bounds, controllers, sensors
+from iblf_jax.control.controllers import law_by_name
+from iblf_jax.core.pytree import layers, unwrapped
+from iblf_jax.simulation.metrics import AboveGravity, optional_folds, standard
+from iblf_jax.simulation.units import unit_text
+from iblf_jax.world import plants
+
+PERIOD = 2e-3
+"""s."""
+NOISE = 1e-3
+SHARES = (0.8, 1.2)
+"""Factors of the uncertain parameters."""
+UNCERTAIN = ("mass", "payload", "inertia")
+"""Beginnings of the names of uncertain parameters, where an entry does not name them."""
+RECORDS = 4000
+"""Recorded samples of a run, about."""
+PUBLISHED = "published law"
+OF_ROBOTS = "laws of robots"
+LEFT, OWN, STEP = "left", "own", "step"
+QUICK_DURATION = 0.1
+"""s."""
+QUICK_LAWS = 2
+
+BARRIERS = {
+    "Integral": barriers.Integral(),
+    "Log": barriers.Log(),
+    "Tan": barriers.Tan(),
+    "State": barriers.State(),
+    "PrescribedPerformance": barriers.PrescribedPerformance(),
+    "Mapping": barriers.Mapping(),
+    "no bounds": barriers.Quadratic(),
+}
+"""Name in the table -> barrier of every level that has bounds."""
+
+
+class Task(NamedTuple):
+    """The task of an entry, and the scales of its published run."""
+
+    scenario: ij.Scenario
+    duration: float
+    dt: float
+    rate: float
+    """Gain of the first level of the published law, or 2 [1/s]."""
+    half_width: np.ndarray
+    """Half the least distance of the bounds over the published run, (n,)."""
+    levels: np.ndarray
+    """Largest absolute value of each level in the published run, (r, n)."""
+    center: np.ndarray
+    """Middle of the range of the first level in the published run, (n,)."""
+    inputs: np.ndarray
+    """Largest input of the published run, (n,)."""
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Time and records of a run."""
+        steps = round(self.duration / self.dt)
+        every = max(1, steps // RECORDS)
+        while steps % every:
+            every -= 1
+        return {"duration": self.duration, "dt": self.dt, "record_every": every}
+
+
+def task_of(folder: Path, duration: float) -> tuple[Task, entry.Reproduction]:
+    """The task of an entry."""
+    made = entry.execute(folder)
+    unknown = np.zeros(0)  # until the published run
+    dt = entry.load(folder).run.dt
+    found = Task(made.scenario, duration, dt, 2.0, unknown, unknown, unknown, unknown)
+    published = simulated(found.scenario, found)
+    x = np.abs(np.asarray(published.x))
+    positions = np.asarray(published.q)
+    width = np.asarray(published.upper - published.lower)
+    scales = {
+        "rate": rate_of(found.scenario.controller),
+        "half_width": 0.5 * width.min(axis=0),
+        "levels": np.maximum(x.max(axis=0), 1e-9),
+        "center": 0.5 * (positions.max(axis=0) + positions.min(axis=0)),
+        "inputs": np.maximum(np.abs(np.asarray(published.tau)).max(axis=0), 1e-9),
+    }
+    return found._replace(**scales), made
+
+
+def rate_of(law: Any) -> float:
+    """The gain of a law's first level [1/s]."""
+    inner = unwrapped(law)
+    for name in ("k1", "k", "a"):
+        if hasattr(inner, name):
+            return float(np.ravel(getattr(inner, name))[0])
+    if hasattr(inner, "Kp") and isinstance(inner, controllers.ComputedTorque):
+        return float(np.sqrt(np.ravel(inner.Kp)[0]))
+    return 2.0
+
+
+# ---------------------------------------------------------------------------- laws
+
+
+def laws_of(task: Task, uncertain: tuple[str, ...]) -> dict[str, laws.Choice | str]:
+    """Name -> law and the further parts of the scenario that it needs, or why it does not apply.
+
+    The list for robots is that of `benchmarks/laws.py`, with gains and boxes at the scales of the
+    task.  Plants of other families have `BarrierBackstepping` with each barrier, with exact
+    derivatives and with filters.
+    """
+    plant = task.scenario.plant
+    robot = plant
+    chosen: dict[str, laws.Choice | str] = {}
+    if plants.is_chain(plant):
+        chosen = level_laws(task)
+        robot = plants.robot_of(plant)
+    if robot is None:
+        return chosen | {OF_ROBOTS: "the plant is none"}
+    for name, choice in laws.CHOICES.items():
+        if name in chosen:
+            continue
+        try:
+            chosen[name] = robot_law(name, choice, task, robot, uncertain)
+        except ValueError as error:
+            chosen[name] = first_sentence(error)
+    return chosen
+
+
+def level_laws(task: Task) -> dict[str, laws.Choice | str]:
+    """`BarrierBackstepping` with each barrier on every level that has bounds."""
+    found: dict[str, laws.Choice | str] = {}
+    order = plants.order_of(task.scenario.plant)
+    bounded = [True, *(part is not None for part in task.scenario.state_bounds)]
+    bounded += [False] * (order - len(bounded))
+    own = unwrapped(task.scenario.controller)
+    gains: dict[str, Any] = {"k": geometric_gains(task.rate, order)}
+    if isinstance(own, controllers.BarrierBackstepping):
+        gains = {"k": own.k, "c": own.c, "weights": own.weights}
+    filters = 0.1 / np.asarray(gains["k"])[: order - 1]
+    for name, barrier in BARRIERS.items():
+        chosen = tuple(barrier if has_bounds else barriers.Quadratic() for has_bounds in bounded)
+        for words, filter_times in (("", None), (", filters", filters)):
+            title = f"BarrierBackstepping({name}){words}"
+            try:
+                law = controllers.BarrierBackstepping(barriers=chosen, filter=filter_times, **gains)
+                found[title] = laws.Choice(law)
+            except ValueError as error:
+                found[title] = first_sentence(error)
+    return found
+
+
+def geometric_gains(rate: float, order: int) -> tuple[float, ...]:
+    """Gains from the rate of the first level to ten times it [1/s]."""
+    return tuple(rate * 10.0 ** (i / (order - 1)) for i in range(order))
+
+
+def robot_law(
+    name: str, choice: laws.Choice, task: Task, robot: Any, uncertain: tuple[str, ...]
+) -> laws.Choice | str:
+    """A law of `benchmarks/laws.py` at the scales of a task."""
+    law = choice.law
+    if isinstance(law, str):
+        law = law_by_name(law, reading="corrected")
+    parts = dict(choice.parts)
+    if "velocity_bounds" in parts:
+        parts["velocity_bounds"] = box(3.0 * task.levels[1])
+        if task.scenario.velocity_bounds is not None:
+            del parts["velocity_bounds"]
+    q = task.scenario.initial.q
+    inertia = np.diag(np.asarray(robot.mass_matrix(np.broadcast_to(q, (robot.n,)))))
+    if any(isinstance(part, controllers.AdaptiveParameters) for part in layers(law)):
+        if not uncertain:
+            return "no parameter of the plant is uncertain"
+        if plants.is_chain(task.scenario.plant):
+            return "the parameters of the robot inside a plant are not paths of its own model"
+    scaled = scaled_law(law, task, inertia, uncertain)
+    if isinstance(task.scenario.plant, plants.ElectricDrive):
+        scaled = controllers.WithDrive(scaled, task.scenario.plant)
+    return laws.Choice(scaled, parts)
+
+
+def box(size: np.ndarray) -> ij.Bounds:
+    """Constant bounds -size and size."""
+    return ij.Bounds(lower=bounds.Constant(-size), upper=bounds.Constant(size))
+
+
+def scaled_law(law: Any, task: Task, inertia: np.ndarray, uncertain: tuple[str, ...]) -> Any:
+    """A law, and those that it wraps, with the numbers of `numbers_of`."""
+    values = numbers_of(law, task, inertia, uncertain)
+    wrapped = getattr(type(law), "wraps", None)
+    if wrapped:
+        values[wrapped] = scaled_law(getattr(law, wrapped), task, inertia, uncertain)
+    return dataclasses.replace(law, **values)
+
+
+def numbers_of(
+    law: Any, task: Task, inertia: np.ndarray, uncertain: tuple[str, ...]
+) -> dict[str, Any]:
+    """Gains and boxes of a law of robots at the scales of a task, field by field.
+
+    Rates are those of the published law, and ten times as fast for the second level.  Torques per
+    speed are rates times the diagonal of the mass matrix at the start.  A barrier has the weight
+    with which its torque near e1 = 0 is K2 k1 e1.
+    """
+    rate, length, speed = task.rate, task.half_width, task.levels[1]
+    damping = 10.0 * rate * inertia
+    surface = 3.0 * (speed + rate * length)
+    levels: dict[str, Any] = {"k1": rate, "K2": damping}
+    if hasattr(law, "barrier") and hasattr(law, "weight"):
+        has_unit = barriers_unit(law.barrier) != "1"
+        levels["weight"] = damping * rate * (1.0 if has_unit else length**2)
+    numbers = {
+        controllers.Backstepping: levels,
+        controllers.DynamicSurface: levels | {"filter": 0.01 / rate},
+        controllers.AdaptiveRBF: levels
+        | {
+            "middle": task.center,
+            "span_q": length,
+            "span_dq": speed,
+            "span_ddq": 3.0 * rate * speed,
+        },
+        controllers.BarrierBackstepping: {"k": geometric_gains(rate, 2)},
+        controllers.FullState: {"k1": rate, "K2": 10.0 * rate},
+        controllers.SurfaceBarrier: {
+            "a": rate,
+            "K": damping * surface**2,
+            "surface": box(surface),
+        },
+        controllers.TerminalSlidingMode: {
+            "beta": rate,
+            "K": 10.0 * rate * speed,
+            "layer": 0.1 * length,
+        },
+        controllers.ComputedTorque: {"Kp": 10.0 * rate**2, "Kd": 11.0 * rate},
+        controllers.PDGravity: {"Kp": damping * rate, "Kd": 1.1 * damping},
+        controllers.SafetyFilter: {"a1": 5.0 * rate, "a2": 5.0 * rate},
+        controllers.Saturated: {"limit": 1.2 * task.inputs, "auxiliary": 5.0 * rate},
+    }
+    if isinstance(law, controllers.AdaptiveParameters):
+        return adaptation(task, uncertain)
+    return dict(numbers.get(type(law), {}))
+
+
+def barriers_unit(barrier: Any) -> str:
+    """The unit of a barrier's value."""
+    return getattr(barrier, "value_unit", "1")
+
+
+def adaptation(task: Task, uncertain: tuple[str, ...]) -> dict[str, Any]:
+    """Rates and boxes of the uncertain parameters that are not zero."""
+    names, values = [], []
+    known = {parameter.path: parameter.value for parameter in ij.parameters(task.scenario)}
+    for path in uncertain:
+        name = path.removeprefix("plant.")
+        for i, value in enumerate(np.ravel(known[path])):
+            if value != 0.0:
+                names.append(f"{name}[{i}]" if np.ndim(known[path]) else name)
+                values.append(float(value))
+    theta = np.array(values)
+    energy = float(np.max(task.inputs * task.half_width))
+    Gamma = theta**2 / energy
+    return {
+        "parameters": tuple(names),
+        "Gamma": Gamma,
+        "lower": 0.5 * theta,
+        "upper": 2.0 * theta,
+        "sigma": 0.01 * task.rate / Gamma,
+        "band": None,
+    }
+
+
+def first_sentence(error: Exception) -> str:
+    """The first sentence of a message, on one line."""
+    text = " ".join(str(error).split())
+    return text.split(". ")[0].rstrip(".")
+
+
+# ---------------------------------------------------------------------------- runs
+
+
+def simulated(scenario: ij.Scenario, task: Task) -> ij.Rollout:
+    """A run with the metrics of `ij.compare`, so that both share one program."""
+    folds = (*standard(), *optional_folds(scenario), AboveGravity())
+    return ij.simulate(scenario, metrics=folds, **task.options)
+
+
+class Row(NamedTuple):
+    """The numbers of a law, and why no factor of its gains gives the effort of the first one."""
+
+    values: list[Any]
+    reason: str
+
+
+def row(name: str, choice: laws.Choice, task: Task, uncertain: tuple[str, ...]) -> Row:
+    """Measures a law."""
+    base = ij.with_parts(task.scenario, **choice.parts)
+    compared = ij.compare(base, {PUBLISHED: base.controller, name: choice.law}, **task.options)
+    run = compared.equal_effort.get(name, compared.rollouts[name])
+    factor: Any = OWN
+    if name in compared.equal_effort:
+        factor = float(compared.factors[name])
+    one = run.scenario
+    perturbed = [
+        simulated(ij.with_parameters(one, scaled_parameters(one, uncertain, share)), task)
+        for share in SHARES
+        if uncertain
+    ]
+    exact, noisy = sampled_runs(one, task)
+    own = float(compared.rollouts[PUBLISHED].metrics.effort_above_gravity)
+    effort = float(run.metrics.effort_above_gravity) / own
+    values = [name, factor, effort if np.isfinite(effort) else LEFT, *accuracy(run, task)]
+    values += worst([of_run(x, task) for x in perturbed])
+    return Row(
+        [*values, *of_run(exact, task), *of_run(noisy, task)], compared.reasons.get(name, "")
+    )
+
+
+def scaled_parameters(
+    scenario: ij.Scenario, uncertain: tuple[str, ...], share: float
+) -> dict[str, Any]:
+    """Path -> value times a factor; of the plant only, so that the model remains."""
+    known = {parameter.path: parameter.value for parameter in ij.parameters(scenario)}
+    return {path: share * np.asarray(known[path]) for path in uncertain}
+
+
+def sampled_runs(scenario: ij.Scenario, task: Task) -> tuple[ij.Rollout, ij.Rollout]:
+    """Runs at 500 Hz without and with noise; both have one structure."""
+    period = period_of(task)
+    sigma = np.concatenate([task.half_width[None], task.levels[1:]]) * NOISE
+    return tuple(
+        simulated(
+            ij.with_parts(
+                scenario, sensor=sensor_of(scenario, sigma * share), sampling=ij.Sampling(period)
+            ),
+            task,
+        )
+        for share in (0.0, 1.0)
+    )
+
+
+def sensor_of(scenario: ij.Scenario, sigma: np.ndarray) -> Any:
+    """Sensors of all levels with white noise."""
+    if plants.is_chain(scenario.plant):
+        return sensors.Levels(tuple(sensors.Direct(noise=row) for row in sigma))
+    return sensors.Encoder(velocity=sensors.Measured(noise=sigma[1]), noise=sigma[0])
+
+
+def state_of(run: ij.Rollout, task: Task) -> str:
+    """Whether a run has left the bounds of the task, or its step is too large; "" if neither."""
+    flags = ij.Status.BOUND_VIOLATED | ij.Status.NOT_FINITE | ij.Status.SINGULAR_GAIN
+    if task.scenario.velocity_bounds is not None or task.scenario.state_bounds:
+        flags |= ij.Status.VELOCITY_VIOLATED | ij.Status.STATE_BOUND_VIOLATED
+    if task.scenario.regions:
+        flags |= ij.Status.REGION_VIOLATED
+    status = int(run.status)
+    if status & int(flags):
+        return LEFT
+    return STEP if status & int(ij.Status.STEP_TOO_LARGE) else ""
+
+
+def accuracy(run: ij.Rollout, task: Task) -> list[Any]:
+    """RMS and largest error, peak input and margin."""
+    state = state_of(run, task)
+    peak = float(np.max(np.asarray(run.metrics.peak_torque)))
+    if state:
+        return [state, state, peak if np.isfinite(peak) else state, state]
+    e1 = np.asarray(run.e1)[len(run.t) // 2 :]
+    return [float(np.sqrt(np.mean(e1**2))), float(np.abs(e1).max()), peak, margin(run, task)]
+
+
+def of_run(run: ij.Rollout, task: Task) -> list[Any]:
+    """Largest error and margin."""
+    _, error, _, least = accuracy(run, task)
+    return [error, least]
+
+
+def margin(run: ij.Rollout, task: Task) -> float:
+    """The least distance to a bound of the task, as a share of half the distance of the bounds."""
+    found = [float(np.min(np.asarray(run.metrics.xi_margin)))]
+    if task.scenario.velocity_bounds is not None or task.scenario.state_bounds:
+        for x, lower, upper in (
+            (run.dq, run.dq_lower, run.dq_upper),
+            (run.higher, run.higher_lower, run.higher_upper),
+        ):
+            if np.size(lower):
+                share = np.minimum(x - lower, upper - x) / (0.5 * (upper - lower))
+                found.append(float(np.nanmin(share)))
+    return min(found)
+
+
+def worst(values: list[list[Any]]) -> list[Any]:
+    """The larger error and the smaller margin of several runs; "left" if one of them left."""
+    if not values:
+        return ["-", "-"]
+    for state in (LEFT, STEP):
+        if any(state in pair for pair in values):
+            return [state, state]
+    errors, margins = zip(*values, strict=True)
+    return [max(errors), min(margins)]
+
+
+# ---------------------------------------------------------------------------- entries
+
+
+def columns(scenario: ij.Scenario) -> list[str]:
+    """The headings of the table."""
+    from iblf_jax.core.units import INPUT, POSITION
+
+    length, force = unit_text(scenario, POSITION), unit_text(scenario, INPUT)
+    return [
+        "law",
+        "factor",
+        "effort",
+        f"RMS error [{length}]",
+        f"error [{length}]",
+        f"peak input [{force}]",
+        "margin",
+        f"error, parameters [{length}]",
+        "margin, parameters",
+        f"error, 500 Hz [{length}]",
+        "margin, 500 Hz",
+        f"error, noise [{length}]",
+        "margin, noise",
+    ]
+
+
+def uncertain_of(made: entry.Reproduction) -> tuple[str, ...]:
+    """The uncertain parameters of an entry, without those that are zero."""
+    known = {parameter.path: parameter.value for parameter in ij.parameters(made.scenario)}
+    paths = made.uncertain
+    if paths is None:
+        paths = tuple(path for path in known if is_uncertain(path))
+    return tuple(path for path in paths if np.any(np.asarray(known[path]) != 0.0))
+
+
+def is_uncertain(path: str) -> bool:
+    """Whether a path is that of a mass, a payload or an inertia of the plant."""
+    return path.startswith("plant.") and path.rsplit(".", 1)[-1].startswith(UNCERTAIN)
+
+
+def measure(
+    folder: Path,
+    save: Callable[[dict[str, Any]], None],
+    *,
+    quick: bool = False,
+    only: list[str] | None = None,
+) -> None:
+    """Measures an entry, and saves its results after each law."""
+    matplotlib.use("Agg")
+    contents = entry.load(folder)
+    dt = contents.run.dt
+    duration = dt * round(QUICK_DURATION / dt) if quick else contents.run.duration
+    task, made = task_of(folder, duration)
+    uncertain = uncertain_of(made)
+    chosen = {PUBLISHED: laws.Choice(task.scenario.controller)} | laws_of(task, uncertain)
+    reasons = {name: words for name, words in chosen.items() if isinstance(words, str)}
+    reasons |= made.not_applicable
+    applicable = [name for name in chosen if name not in reasons]
+    if quick:
+        applicable = applicable[:QUICK_LAWS]
+    headings = columns(task.scenario)
+    result = {
+        "title": contents.title,
+        "machine": machine(),
+        "duration": task.duration,
+        "dt": task.dt,
+        "period": period_of(task),
+        "noise": NOISE,
+        "uncertain": list(uncertain),
+        "input": plants.input_name(task.scenario.plant) if is_chain(task) else "torque",
+        "rows": [],
+        "no_factor": {},
+        "not_applicable": reasons,
+    }
+    for name in only or applicable:
+        try:
+            found = row(name, chosen[name], task, uncertain)
+        except ValueError as error:
+            reasons[name] = first_sentence(error)
+        except Exception as error:  # a law that fails must not stop the others
+            reasons[name] = f"its run failed: {type(error).__name__}: {first_sentence(error)}"
+        else:
+            result["rows"].append(dict(zip(headings, found.values, strict=True)))
+            if found.reason:
+                result["no_factor"][name] = found.reason
+        print(f"{folder.name}: {name}: {reasons.get(name, 'measured')}", flush=True)
+        save(result)
+
+
+def period_of(task: Task) -> float:
+    """The period of the sampled runs [s], a whole number of steps."""
+    return task.dt * max(1, round(PERIOD / task.dt))
+
+
+def is_chain(task: Task) -> bool:
+    """Whether the plant is one in strict-feedback form."""
+    return plants.is_chain(task.scenario.plant)
+
+
+def write(folder: Path, out: Path, command: str, **options: Any) -> None:
+    """Measures an entry and writes its file."""
+    out.mkdir(parents=True, exist_ok=True)
+
+    def save(result: dict[str, Any]) -> None:
+        text = json.dumps({"command": command, **result}, indent=1)
+        (out / f"{folder.name}.json").write_text(text + "\n", encoding="utf-8")
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the table reports runs that leave the bounds
+        measure(folder, save, **options)
+
+
+def main() -> int:
+    """Measures the named entries; the exit code is the number of those that failed."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("names", nargs="*", metavar="NAME", help="entries; all if none is given")
+    parser.add_argument("--quick", action="store_true", help="0.1 s of motion, two laws")
+    parser.add_argument("--processes", type=int, default=1, help="entries at the same time")
+    parser.add_argument("--out", type=Path, default=entry.RESULTS, help="folder of the results")
+    parser.add_argument("--only", nargs="+", metavar="LAW", help="these rows")
+    args = parser.parse_args()
+    chosen = [entry.ENTRIES / name for name in args.names] or entry.folders()
+    words = [*args.names, *(["--quick"] if args.quick else [])]
+    command = shlex.join(["python", "benchmarks/field/measure.py", *words])
+    options = {"quick": args.quick, "only": args.only}
+    failed = 0
+    for name, error in outcomes(chosen, args.processes, args.out, command, options):
+        failed += error is not None
+        print(f"{name}: {'measured' if error is None else f'failed: {error}'}", flush=True)
+    print(f"{len(chosen) - failed} of {len(chosen)} entries measured")
+    return failed
+
+
+def outcomes(chosen, processes, out, command, options):
+    """Measures entries; the name of each with None, or with the reason why it failed."""
+    call = functools.partial(write, out=out, command=command, **options)
+    if processes == 1:
+        for folder in chosen:
+            yield folder.name, reason_of(lambda folder=folder: call(folder))
+        return
+    # One thread of a kernel for each process; JAX hangs in processes that are forked.
+    os.environ.setdefault("IBLF_JAX_THREADS", str(max(1, (os.cpu_count() or 1) // processes)))
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(processes, mp_context=context, max_tasks_per_child=1) as pool:
+        started = {pool.submit(call, folder): folder.name for folder in chosen}
+        for future in as_completed(started):
+            yield started[future], reason_of(future.result)
+
+
+def reason_of(call) -> str | None:
+    """Runs a call; why it failed, or None."""
+    try:
+        call()
+    except Exception as error:  # one entry must not stop the others
+        return f"{type(error).__name__}: {error}"
+    return None
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,523 @@
+"""The benchmark of the field: the format of its entries, what their pages state, the checker, and
+the programs that are written without the package."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from types import SimpleNamespace
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from conftest import ROOT
+
+import iblf_jax as ij
+from iblf_jax import cli
+from iblf_jax.files.scenario import load_scenario_file
+
+FIELD = ROOT / "benchmarks" / "field"
+sys.path += [str(FIELD), str(ROOT / "docs")]
+import check
+import entry
+import entry_tables
+import field
+import measure
+
+NAMES = [folder.name for folder in entry.folders()]
+TEMPLATE = FIELD / "template"
+FEWEST = 9
+
+
+def test_there_are_entries_of_each_method():
+    assert len(NAMES) >= FEWEST
+    assert {entry.load(entry.ENTRIES / name).method for name in NAMES} == set(entry.METHODS)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_format_of_an_entry(name):
+    folder = entry.ENTRIES / name
+    contents = entry.load(folder)
+    assert not check._faults_of_name(folder)
+    assert not check._faults_of_text(contents)
+    assert not check._faults_of_script(folder / "example.py")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
+def test_an_entry_is_correct(name):
+    """Among others: every published number is reached, every claim holds, and the program that is
+    written without the package gives the same motion."""
+    assert check.faults_of(entry.ENTRIES / name) == []
+
+
+def test_scenario_files_name_their_command():
+    files = sorted(entry.ENTRIES.glob("*/scenario.toml"))
+    assert len(files) >= 6
+    for path in files:
+        assert not check._faults_of_scenario(path.parent, entry.load(path.parent))
+        assert set(load_scenario_file(path).run) >= {"duration", "dt"}
+
+
+@pytest.mark.slow
+def test_the_command_of_a_scenario_file_runs(capsys):
+    path = entry.ENTRIES / "mahmud_2021" / "scenario.toml"
+    assert cli.main(["simulate", str(path), "--duration", "0.1"]) == 0
+    assert "status: ok" in capsys.readouterr().out
+
+
+def test_independent_programs_exist():
+    assert len(sorted(entry.ENTRIES.glob("*/independent.py"))) >= 7
+
+
+# ---------------------------------------------------------------------------- further statements
+
+
+def runs_of(name):
+    return entry.execute(entry.ENTRIES / name).runs
+
+
+def dimanidis(runs):
+    for run in runs.values():
+        assert run.status == 0
+    evidence = entry.execute(entry.ENTRIES / "dimanidis_2018").evidence
+    assert evidence["best"] < 0.003
+    assert evidence["gain"] > 0.1
+    np.testing.assert_allclose(evidence["torque"], -0.287, atol=1e-3)
+    np.testing.assert_allclose(evidence["sigma"], 7.295, atol=1e-3)
+    assert abs(evidence["printed_sigma"] - 7.295) > 0.5
+
+
+def shaw_cortez(runs):
+    run = runs["filtered"]
+    # The law requests more than the filter gives.
+    assert int(run.status) == int(ij.Status.TORQUE_SATURATED)
+    assert np.min(run.metrics.margin) > 0
+    # The reference leaves the bounds, and is no fault of a filter's run.
+    assert np.any(run.q_d > run.scenario.bounds.upper.value)
+    evidence = entry.execute(entry.ENTRIES / "shaw_cortez_2022").evidence
+    assert evidence["without_term"] > 3 * evidence["with_term"]
+
+
+def zhang(runs):
+    run = runs["published law"]
+    assert run.status == 0
+    late = np.flatnonzero(run.t < 6.99)[-1]
+    M = np.asarray(run.scenario.plant.mass_matrix(run.q[late]))
+    np.testing.assert_allclose(
+        run.e1[late], np.linalg.solve(M, [0.15, 0.18, 0.12]) / 1500, rtol=0.03
+    )
+    assert np.abs(run.e1[run.t < 6.0]).max() < 1e-8
+
+
+def mahmud(runs):
+    (run,) = runs.values()
+    assert run.status == 0
+    # The least distance is that of the start, in a corner of the bounds.
+    np.testing.assert_allclose(run.metrics.margin, 2.0, atol=1e-9)
+    np.testing.assert_allclose(run.metrics.velocity_margin, 2.0, atol=1e-9)
+    np.testing.assert_allclose(
+        run.scenario.plant.mass_matrix(np.zeros(2)), [[3.957, 0.438], [0.438, 0.196]], rtol=1e-9
+    )
+
+
+def cruz_ancona(runs):
+    for run in runs.values():
+        assert run.status == 0
+        w = 1.4195117 * np.linalg.norm(run.dq - run.alpha, axis=1)
+        assert w[0] > 1 > 0.05 > w[run.t > 8.0].max()
+
+
+def tee_ge(runs):
+    assert all(run.status == 0 for run in runs.values())
+    for name in ("exact derivatives", "filter of the package"):
+        assert 2.4 < np.abs(runs[name].alpha).max() < 2.5
+    evidence = entry.execute(entry.ENTRIES / "tee_ge_2012").evidence
+    np.testing.assert_allclose(evidence["corrected"], evidence["limit"], rtol=1e-6)
+    assert evidence["branch"] > 5 * evidence["limit"]
+
+
+def tangent(runs):
+    for name in ("published barrier", "Log"):
+        assert runs[name].status == 0
+        assert np.abs(runs[name].e1).max() < 0.06
+        assert np.diff(runs[name].V).max() < 1e-10
+    unbounded = runs["Quadratic, no barrier"]
+    assert unbounded.status == int(ij.Status.BOUND_VIOLATED)
+    assert unbounded.x[:, 0].max() > 0.56
+    evidence = entry.execute(entry.ENTRIES / "tangent_barrier_2013").evidence
+    assert evidence["wrong_V"] > 10 * evidence["wrong_least"]
+    assert abs(evidence["hand"] - evidence["exact"]) > 0.1 * abs(evidence["exact"])
+
+
+def liu(runs):
+    for run in runs.values():
+        assert run.status == 0
+        assert np.abs(run.e1).max() < 0.51
+        assert np.diff(run.V).max() < 1e-10
+
+
+def zhang_yan(runs):
+    assert all(run.status == 0 for run in runs.values())
+    evidence = entry.execute(entry.ENTRIES / "zhang_yan_2024").evidence
+    assert evidence["printed"] > 1.02 * evidence["start"]
+    assert evidence["corrected"] <= evidence["start"]
+    assert evidence["with_term"] < 1e-6 < 1e-3 < evidence["without_term"]
+    assert evidence["equal_gains"] > evidence["equal_effort"] > 1.0
+
+
+FURTHER = {
+    "cruz_ancona_2022": cruz_ancona,
+    "dimanidis_2018": dimanidis,
+    "liu_2018": liu,
+    "mahmud_2021": mahmud,
+    "shaw_cortez_2022": shaw_cortez,
+    "tangent_barrier_2013": tangent,
+    "tee_ge_2012": tee_ge,
+    "zhang_2022": zhang,
+    "zhang_yan_2024": zhang_yan,
+}
+"""Entry -> what its page states beyond the published numbers and claims."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FURTHER)
+def test_an_entry_does_what_its_page_states(name):
+    FURTHER[name](runs_of(name))
+
+
+# ---------------------------------------------------------------------------- the checker
+
+
+QUICK = """
+import matplotlib.pyplot as plt
+import numpy as np
+
+import iblf_jax as ij
+
+scenario = ij.presets.zhang_yan_2024()
+runs = {"first": ij.simulate(scenario, duration=0.01, dt=1e-3)}
+figure, axes = plt.subplots()
+axes.plot(runs["first"].t, runs["first"].e1)
+axes.set(xlabel="time [s]", ylabel="error [rad]")
+reached = {"largest error [rad]": float(np.abs(runs["first"].e1).max())}
+holds = {"the output stays inside its bounds": True}
+evidence = {"printed": 0.1}
+"""
+SCRIPT = f'"""A title: one sentence."""\n{QUICK}'
+
+
+@pytest.fixture
+def faults(tmp_path):
+    """Writes an entry with replaced words; the function returns what the checker finds."""
+
+    def found(text=(), script=(), files=(), name="author_2020"):
+        folder = tmp_path / name
+        folder.mkdir()
+        contents = (TEMPLATE / "entry.toml").read_text(encoding="utf-8")
+        contents = contents.replace("duration = 2.0", "duration = 0.01")
+        contents = contents.replace("value = 0.5\n", "value = 0.3\n")
+        (folder / "entry.toml").write_text(replaced(contents, text), encoding="utf-8")
+        (folder / "example.py").write_text(replaced(SCRIPT, script), encoding="utf-8")
+        for file, words in dict(files).items():
+            (folder / file).write_text(words, encoding="utf-8")
+        return check.faults_of(folder)
+
+    return found
+
+
+def replaced(text, pairs):
+    for old, new in dict(pairs).items():
+        assert old in text
+        text = text.replace(old, new)
+    return text
+
+
+IN_TEXT = {
+    "unknown key": ({'plant = "servo': 'plant_ = "servo'}, "has the unknown key 'plant_'"),
+    "missing key": ({'plant = "servo': 'plant_ = "servo'}, "lacks the key 'plant'"),
+    "missing table": ({"[run]": "[runs]"}, "lacks the table [run]"),
+    "missing key of a list": (
+        {'where = "equation (40)"': ""},
+        "[[printed]] number 1 lacks the key",
+    ),
+    "unknown family": ({'"drive"': '"car"'}, "family = 'car' must be one of robot, flexible joint"),
+    "unknown method": ({'"barrier"': '"wall"'}, "method = 'wall' must be one of barrier"),
+    "what was read": ({'read = "article"': 'read = "web"'}, "read = 'web' must be one of article"),
+    "a text for a number": (
+        {"year = 2020": 'year = "2020"'},
+        "year = '2020' must be a whole number",
+    ),
+    "no list": ({"[[claims]]": "[claims]"}, "claims must be a list of tables"),
+    "no TOML": ({"year = 2020": "year ="}, "entry.toml is not valid TOML: Invalid value (at line"),
+    "no link": ({'doi = "10.1000/182"': ""}, '[source] needs doi = "10...." or url'),
+    "address as DOI": ({'"10.1000/182"': '"https://doi.org/10.1000/182"'}, "must begin with 10."),
+    "tolerance": ({"tolerance = 0.005": "tolerance = 0"}, "must be positive"),
+    "time step": ({"dt = 1e-3": "dt = 0.0"}, "[run] needs 0 < dt < duration"),
+    "number not reached": (
+        {"value = 0.3\n": "value = 0.513\n"},
+        "'largest error [rad]' is not reached: published 0.513, here 0.3",
+    ),
+    "number not computed": (
+        {'"largest error [rad]"': '"peak [rad]"'},
+        "reached lacks 'peak [rad]'",
+    ),
+    "unused evidence": ({"{printed}": "0.1"}, "no evidence of [[corrected]] contains {printed}"),
+    "duration": ({"duration = 0.01": "duration = 3.0"}, "ends at 0.01 s, and entry.toml"),
+}
+IN_SCRIPT = {
+    "claim is false": ('bounds": True', 'bounds": False', "does not hold"),
+    "claim not decided": ("holds = {", "answers = {", "holds lacks"),
+    "no figure": ("figure, axes", "picture, axes", "does not define 'figure'"),
+    "no curves": ('axes.plot(runs["first"].t, runs["first"].e1)', "", "the figure has no curves"),
+    "no label": ('xlabel="time [s]", ', "", "panel 1 of the figure has no label of its x axis"),
+    "error": ("ij.presets.zhang", "ij.preset.zhang", "example.py does not run: line 8: Attribute"),
+    "syntax": ("scenario = ij", "scenario = = ij", "example.py does not run: SyntaxError"),
+    "docstring": ("A title: one", "A title, one", "must begin with a docstring"),
+    "array": ("float(np.abs(", "(lambda x: np.ones(2))(np.abs(", "must be one number"),
+    "too long": ("evidence =", "\n" * check.MOST_LINES + "evidence =", "shorten it to 150"),
+    "time step": ("dt=1e-3", "dt=1e-4", "has the step 0.0001 s"),
+    "no rollout": ('{"first": ij', '{"second": 1, "first": ij', "must be the Rollout"),
+    "unknown path": ("holds =", "uncertain = ('plant.m',)\nholds =", "uncertain has 'plant.m'"),
+}
+
+
+def test_a_correct_entry_has_no_faults(faults):
+    assert faults() == []
+
+
+@pytest.mark.parametrize("fault", IN_TEXT)
+def test_the_checker_reports_a_fault_of_the_text(fault, faults):
+    replacement, words = IN_TEXT[fault]
+    assert any(words in line for line in faults(text=replacement))
+
+
+@pytest.mark.parametrize("fault", IN_SCRIPT)
+def test_the_checker_reports_a_fault_of_the_script(fault, faults):
+    old, new, words = IN_SCRIPT[fault]
+    assert any(words in line for line in faults(script={old: new}))
+
+
+def test_the_checker_reports_faults_of_the_folder(faults, tmp_path):
+    assert any("named after the first author" in line for line in faults(name="author"))
+    (tmp_path / "empty_2020").mkdir()
+    assert check.faults_of(tmp_path / "empty_2020") == [
+        "there is no entry.toml; copy the one of benchmarks/field/template"
+    ]
+    shutil.copy(TEMPLATE / "entry.toml", tmp_path / "empty_2020")
+    assert check.faults_of(tmp_path / "empty_2020") == [
+        "there is no example.py; copy the one of benchmarks/field/template"
+    ]
+
+
+FURTHER_FILES = {
+    "scenario without its command": (
+        {"scenario.toml": '# x\npreset = "zhang_yan_2024"\n[run]\nduration = 0.01\ndt = 1e-3\n'},
+        "the first line must be a comment that ends in: python -m iblf_jax simulate",
+    ),
+    "scenario of another duration": (
+        {"scenario.toml": 'preset = "zhang_yan_2024"\n[run]\nduration = 1.0\ndt = 1e-3\n'},
+        "[run] must have the duration and dt of entry.toml",
+    ),
+    "invalid scenario": ({"scenario.toml": 'preset = "none"\n'}, "scenario.toml: "),
+    "another motion": (
+        {"independent.py": "def compare():\n    return 0.1\n"},
+        "compare() gives 0.1, where 0.0001 is allowed",
+    ),
+    "no comparison": ({"independent.py": "x = 1\n"}, "must define compare() -> float"),
+    "failed comparison": (
+        {"independent.py": "def compare():\n    return 1 / 0\n"},
+        "independent.py does not run: line 2: ZeroDivisionError",
+    ),
+}
+
+
+@pytest.mark.parametrize("fault", FURTHER_FILES)
+def test_the_checker_reports_a_fault_of_a_further_file(fault, faults):
+    files, words = FURTHER_FILES[fault]
+    assert any(words in line for line in faults(files=files))
+
+
+@pytest.mark.slow
+def test_the_template_is_correct(tmp_path):
+    folder = tmp_path / "author_2020"
+    shutil.copytree(TEMPLATE, folder)
+    assert check.faults_of(folder) == []
+
+
+# ---------------------------------------------------------------------------- the measurement
+
+
+@pytest.mark.slow
+def test_the_quick_measurement(tmp_path, monkeypatch, capsys):
+    words = ["measure.py", "no_entry_2000", "liu_2018", "--quick", "--out", str(tmp_path)]
+    monkeypatch.setattr(sys, "argv", words)
+    assert measure.main() == 1
+    printed = capsys.readouterr().out
+    assert "no_entry_2000: failed: EntryError: there is no entry.toml" in printed
+    assert "liu_2018: measured" in printed
+    result = json.loads((tmp_path / "liu_2018.json").read_text())
+    published, other = result["rows"]
+    assert published["law"] == measure.PUBLISHED
+    assert published["factor"] == published["effort"] == 1.0
+    assert set(other) == set(published)
+    assert other["law"] == "BarrierBackstepping(Integral)"
+    assert result["machine"]["jax"]
+    assert result["command"].endswith("benchmarks/field/measure.py no_entry_2000 liu_2018 --quick")
+    assert result["uncertain"] == ["plant.friction", "plant.input_gain"]
+    for row in result["rows"]:
+        assert not {measure.LEFT, measure.STEP} & {x for x in row.values() if isinstance(x, str)}
+        assert row["margin"] <= 1.0
+
+
+@pytest.mark.slow
+def test_processes_report_entries_that_failed(tmp_path, monkeypatch, capsys):
+    words = ["measure.py", "no_entry_2000", "no_entry_2001", "--processes", "2"]
+    monkeypatch.setattr(sys, "argv", [*words, "--out", str(tmp_path)])
+    assert measure.main() == 2
+    printed = capsys.readouterr().out
+    for name in ("no_entry_2000", "no_entry_2001"):
+        assert f"{name}: failed: EntryError: there is no entry.toml" in printed
+    assert "0 of 2 entries measured" in printed
+
+
+def test_the_laws_of_a_robot_are_those_of_the_table_of_laws():
+    task = task_of_preset(ij.presets.zhang_yan_2024())
+    found = measure.laws_of(task, ("plant.mass",))
+    assert list(found) == list(measure.laws.CHOICES)
+    assert not [name for name, choice in found.items() if isinstance(choice, str)]
+    adaptive = found["AdaptiveParameters(masses)"].law
+    assert adaptive.parameters == ("mass[0]", "mass[1]")
+    assert isinstance(measure.laws_of(task, ())["AdaptiveParameters(masses)"], str)
+
+
+def test_the_laws_of_a_plant_have_each_barrier_with_and_without_filters():
+    scenario = ij.presets.motor_driven_pendulum()
+    found = measure.laws_of(task_of_preset(scenario), ())
+    assert found[measure.OF_ROBOTS] == "the plant is none"
+    for name in measure.BARRIERS:
+        exact = found[f"BarrierBackstepping({name})"]
+        filtered = found[f"BarrierBackstepping({name}), filters"]
+        assert isinstance(exact, str) == isinstance(filtered, str)
+        if not isinstance(exact, str):
+            assert exact.law.filter is None
+            assert filtered.law.filter is not None
+
+
+def task_of_preset(scenario):
+    n, r = scenario.plant.n, measure.plants.order_of(scenario.plant)
+    return measure.Task(
+        scenario, 1.0, 1e-3, 2.0, np.ones(n), np.ones((r, n)), np.zeros(n), np.ones(n)
+    )
+
+
+class ARun(NamedTuple):
+    """What `measure.accuracy` reads of a run."""
+
+    status: int
+    t: np.ndarray
+    e1: np.ndarray
+    metrics: SimpleNamespace
+
+
+def a_run(status=0):
+    e1 = np.concatenate([np.full(50, 9.0), [-2.0], np.zeros(49)])[:, None]
+    metrics = SimpleNamespace(peak_torque=np.array([4.0]), xi_margin=np.array([0.25]))
+    return ARun(status, np.arange(100.0), e1, metrics)
+
+
+def test_errors_are_those_of_the_second_half():
+    task = task_of_preset(ij.presets.zhang_yan_2024())
+    rms, error, peak, margin = measure.accuracy(a_run(), task)
+    np.testing.assert_allclose([rms, error, peak, margin], [2 / np.sqrt(50), 2.0, 4.0, 0.25])
+    left = measure.accuracy(a_run(int(ij.Status.BOUND_VIOLATED)), task)
+    assert left == ["left", "left", 4.0, "left"]
+    assert measure.accuracy(a_run(int(ij.Status.STEP_TOO_LARGE)), task)[0] == "step"
+    # Velocities have no bounds in this task, and the bounds that a law was given do not count.
+    assert measure.state_of(a_run(int(ij.Status.VELOCITY_VIOLATED)), task) == ""
+    assert measure.worst([[1.0, 0.5], [2.0, 0.7]]) == [2.0, 0.5]
+    assert measure.worst([[1.0, 0.5], ["left", "left"]]) == ["left", "left"]
+    assert measure.worst([]) == ["-", "-"]
+
+
+def test_uncertain_parameters_are_those_of_the_plant_that_are_not_zero():
+    scenario = ij.presets.zhang_yan_2024()
+    made = entry.reproduction({"scenario": scenario, "runs": {}, "figure": None})
+    assert measure.uncertain_of(made) == ("plant.mass", "plant.inertia")
+    named = made._replace(uncertain=("plant.g", "plant.payload"))
+    assert measure.uncertain_of(named) == ("plant.g",)
+    changed = measure.scaled_parameters(scenario, ("plant.mass",), 0.8)
+    np.testing.assert_allclose(changed["plant.mass"], [1.6, 0.68], rtol=1e-6)
+
+
+# ---------------------------------------------------------------------------- the pages
+
+
+RESULT = {
+    "command": "python benchmarks/field/measure.py NAME",
+    "machine": {"processor": "P", "cores": "2", "python": "3", "jax": "0", "date": "2026-01-01"},
+    "duration": 1.0,
+    "dt": 1e-3,
+    "noise": 1e-3,
+    "uncertain": ["plant.mass"],
+    "input": "torque",
+    "rows": [
+        {"law": "published law", "factor": 1.0, "error [rad]": 0.1, "error, noise [rad]": 0.2},
+        {"law": "A", "factor": 2.0, "error [rad]": 0.05, "error, noise [rad]": 0.1},
+        {"law": "B", "factor": "own", "error [rad]": 0.01, "error, noise [rad]": 0.01},
+        {"law": "C", "factor": 0.5, "error [rad]": "left", "error, noise [rad]": "left"},
+    ],
+    "not_applicable": {"D": "it has |none|"},
+}
+
+
+@pytest.fixture
+def parts(tmp_path):
+    """All entries, with small results for one of them."""
+    for name in NAMES:
+        contents = entry.load(entry.ENTRIES / name)
+        computed = {
+            "reached": {number.quantity: number.value for number in contents.published},
+            "holds": {claim.statement: True for claim in contents.claims},
+            "evidence": {"gain": 0.51234},
+            "levels": 2,
+        }
+        (tmp_path / f"{name}.json").write_text(json.dumps(computed))
+    results = tmp_path / "results"
+    results.mkdir()
+    (results / "zhang_yan_2024.json").write_text(json.dumps(RESULT))
+    return field.parts(results, tmp_path)
+
+
+def test_the_page_of_the_benchmark(parts):
+    page = field.benchmark_page(parts)
+    numbers = sum(len(part.contents.published) for part in parts)
+    assert f"{len(NAMES)} published examples" in page
+    assert f"{numbers} of {numbers} published numbers" in page
+    rows = [line for line in page.splitlines() if line.startswith("| [")]
+    assert len(rows) == len(NAMES)
+    measured = next(row for row in rows if "zhang_yan_2024" in row)
+    assert measured.endswith("| A | 0.5 | 0.5 |")
+    assert sum(row.endswith("| not measured |  |  |") for row in rows) == len(NAMES) - 1
+    assert "| published law | 1 | 0.1 | 0.2 |" in page
+    assert "| C | 0.5 | left | left |" in page
+    assert "Not in the table: D: it has" in page
+    for name in NAMES:
+        assert f"(gallery/{name}.md)" in page
+
+
+def test_the_page_of_the_corrections_has_all_of_them(parts):
+    page = field.corrections_page(parts)
+    count = sum(len(part.contents.corrected) for part in parts)
+    assert page.startswith("# What the literature printed, and what is correct")
+    assert f"{count} corrections" in page
+    assert sum(line.startswith("| [") for line in page.splitlines()) == count
+    assert "and with k = 1 by 0.51 rad" in page
+    assert "theory/printed_and_corrected.md" in page
+
+
+def test_tables_of_a_page_escape_what_markdown_interprets():
+    assert entry_tables.escaped("a*b_c <d> [e] `x_1` $y_2$") == (r"a\*b\_c \<d> \[e\] `x_1` $y_2$")
+    assert entry_tables.markdown_table(["h"], [["|w|"]]).splitlines()[-1] == r"| \|w\| |"
+    assert entry.filled("{a} {a:.1f} {b} {c", {"a": 1.25}) == "1.25 1.2 {b} {c"
