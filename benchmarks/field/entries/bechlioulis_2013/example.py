@@ -34,7 +34,7 @@ class VanDerPol:
 
 # %% The law. Where the estimate of sigma is outside its funnel the logarithm is complex, and the
 # limited input is -5 or 5. `by_modulus` has the input of the program there, which is always 5:
-# MATLAB's `min` and `max` compare complex numbers by their modulus.
+# `min` and `max` compare complex numbers by modulus in MATLAB and in GNU Octave (run: 5).
 @ij.component
 class PublishedLaw:
     """u = -k ln((1 + xi)/(1 - xi)), xi = sigma/rho, sigma = 6 x1 + x2 of the state, or of the
