@@ -152,6 +152,7 @@ def assemble() -> None:
     """Puts all pages together."""
     import barriers
     import choosing
+    import field
     import flags
     import gallery
     import measured
@@ -189,6 +190,7 @@ def assemble() -> None:
     flags.write(SOURCE / "how_to")
     barriers.write(SOURCE / "theory")
     choosing.write(SOURCE / "how_to")
+    field.write(SOURCE)
     measured.write(SOURCE / "benchmarks.md")
     shutil.copy(ROOT / "benchmarks" / "README.md", SOURCE / "lab_notes.md")
     shutil.copy(ROOT / "CONTRIBUTING.md", SOURCE / "contributing.md")

@@ -13,6 +13,8 @@ sys.path.append(str(Path(__file__).resolve().parents[1] / "benchmarks" / "field"
 
 from entry import READ, Entry, Reproduction, filled
 
+from iblf_jax.world import plants
+
 CODE_AND_FORMULAS = re.compile(r"(`[^`]*`|\$[^$]*\$)")
 """Parts of a text that Markdown does not interpret."""
 
@@ -116,6 +118,7 @@ def computed(made: Reproduction) -> str:
             "reached": {name: float(x) for name, x in made.reached.items()},
             "holds": {name: bool(x) for name, x in made.holds.items()},
             "evidence": {name: float(x) for name, x in made.evidence.items()},
+            "levels": plants.order_of(made.scenario.plant),
         },
         indent=1,
     )

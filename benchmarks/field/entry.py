@@ -28,7 +28,7 @@ READ = {
     "article": "the article",
     "program": "the authors' program",
     "thesis": "a thesis",
-    "secondary": "a public program that follows the publication",
+    "secondary": "a program of others",
 }
 """Value of `source.read` -> what was read, in words."""
 KINDS = {
@@ -46,8 +46,11 @@ class EntryError(ValueError):
     """An entry that cannot be used; `faults` has one sentence for each repair."""
 
     def __init__(self, faults: list[str]) -> None:
-        super().__init__("\n".join(faults))
+        super().__init__(faults)
         self.faults = faults
+
+    def __str__(self) -> str:
+        return "; ".join(self.faults)
 
 
 def _one_of(values: typing.Iterable[str], **options: Any) -> Any:

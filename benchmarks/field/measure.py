@@ -9,6 +9,7 @@ law are scaled by one factor to this effort (`ij.compare`).  Columns:
 
 - `factor`: of the gains; "own" for a law that has no factor in [1/32, 32] with this effort, and
   runs at the gains of `laws_of`.
+- `effort`: as a share of that of the published law.
 - `RMS error`, `error`: RMS and largest |e1| of all components in the second half of the run.
 - `peak input`: largest input of the entire run.
 - `margin`: least distance to any bound of the scenario over the entire run, as a share of half the
@@ -21,7 +22,7 @@ law are scaled by one factor to this effort (`ij.compare`).  Columns:
   `NOISE` times their largest value in the published run.
 
 "left" is a run that leaves its bounds or diverges, and "step" one for which the entry's time step
-is too large.  The results go to results/NAME.json.
+is too large.  The results go to results/NAME.json, after each law.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ import os
 import shlex
 import sys
 import warnings
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -115,11 +117,12 @@ class Task(NamedTuple):
         return {"duration": self.duration, "dt": self.dt, "record_every": every}
 
 
-def task_of(folder: Path, duration: float | None = None) -> tuple[Task, entry.Reproduction]:
+def task_of(folder: Path, duration: float) -> tuple[Task, entry.Reproduction]:
     """The task of an entry."""
-    run = entry.load(folder).run
     made = entry.execute(folder)
-    found = Task(made.scenario, duration or run.duration, run.dt, 2.0, *[np.zeros(0)] * 4)
+    unknown = np.zeros(0)  # until the published run
+    dt = entry.load(folder).run.dt
+    found = Task(made.scenario, duration, dt, 2.0, unknown, unknown, unknown, unknown)
     published = simulated(found.scenario, found)
     x = np.abs(np.asarray(published.x))
     positions = np.asarray(published.q)
@@ -331,8 +334,15 @@ def simulated(scenario: ij.Scenario, task: Task) -> ij.Rollout:
     return ij.simulate(scenario, metrics=folds, **task.options)
 
 
-def row(name: str, choice: laws.Choice, task: Task, uncertain: tuple[str, ...]) -> list[Any]:
-    """The numbers of a law."""
+class Row(NamedTuple):
+    """The numbers of a law, and why no factor of its gains gives the effort of the first one."""
+
+    values: list[Any]
+    reason: str
+
+
+def row(name: str, choice: laws.Choice, task: Task, uncertain: tuple[str, ...]) -> Row:
+    """Measures a law."""
     base = ij.with_parts(task.scenario, **choice.parts)
     compared = ij.compare(base, {PUBLISHED: base.controller, name: choice.law}, **task.options)
     run = compared.equal_effort.get(name, compared.rollouts[name])
@@ -346,8 +356,13 @@ def row(name: str, choice: laws.Choice, task: Task, uncertain: tuple[str, ...]) 
         if uncertain
     ]
     exact, noisy = sampled_runs(one, task)
-    values = [name, factor, *accuracy(run, task), *worst([of_run(x, task) for x in perturbed])]
-    return [*values, *of_run(exact, task), *of_run(noisy, task)]
+    own = float(compared.rollouts[PUBLISHED].metrics.effort_above_gravity)
+    effort = float(run.metrics.effort_above_gravity) / own
+    values = [name, factor, effort if np.isfinite(effort) else LEFT, *accuracy(run, task)]
+    values += worst([of_run(x, task) for x in perturbed])
+    return Row(
+        [*values, *of_run(exact, task), *of_run(noisy, task)], compared.reasons.get(name, "")
+    )
 
 
 def scaled_parameters(
@@ -360,7 +375,7 @@ def scaled_parameters(
 
 def sampled_runs(scenario: ij.Scenario, task: Task) -> tuple[ij.Rollout, ij.Rollout]:
     """Runs at 500 Hz without and with noise; both have one structure."""
-    period = task.dt * max(1, round(PERIOD / task.dt))
+    period = period_of(task)
     sigma = np.concatenate([task.half_width[None], task.levels[1:]]) * NOISE
     return tuple(
         simulated(
@@ -445,6 +460,7 @@ def columns(scenario: ij.Scenario) -> list[str]:
     return [
         "law",
         "factor",
+        "effort",
         f"RMS error [{length}]",
         f"error [{length}]",
         f"peak input [{force}]",
@@ -472,41 +488,58 @@ def is_uncertain(path: str) -> bool:
     return path.startswith("plant.") and path.rsplit(".", 1)[-1].startswith(UNCERTAIN)
 
 
-def measure(folder: Path, *, quick: bool = False, only: list[str] | None = None) -> dict[str, Any]:
-    """The results of an entry."""
+def measure(
+    folder: Path,
+    save: Callable[[dict[str, Any]], None],
+    *,
+    quick: bool = False,
+    only: list[str] | None = None,
+) -> None:
+    """Measures an entry, and saves its results after each law."""
     matplotlib.use("Agg")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the table reports runs that leave the bounds
-        dt = entry.load(folder).run.dt
-        duration = dt * round(QUICK_DURATION / dt) if quick else None
-        task, made = task_of(folder, duration)
-        uncertain = uncertain_of(made)
-        chosen = {PUBLISHED: laws.Choice(task.scenario.controller)} | laws_of(task, uncertain)
-        reasons = {name: words for name, words in chosen.items() if isinstance(words, str)}
-        reasons |= made.not_applicable
-        applicable = [name for name in chosen if name not in reasons]
-        if quick:
-            applicable = applicable[:QUICK_LAWS]
-        rows = []
-        for name in only or applicable:
-            try:
-                rows.append(row(name, chosen[name], task, uncertain))
-            except ValueError as error:
-                reasons[name] = first_sentence(error)
-            print(f"{folder.name}: {name}", flush=True)
+    contents = entry.load(folder)
+    dt = contents.run.dt
+    duration = dt * round(QUICK_DURATION / dt) if quick else contents.run.duration
+    task, made = task_of(folder, duration)
+    uncertain = uncertain_of(made)
+    chosen = {PUBLISHED: laws.Choice(task.scenario.controller)} | laws_of(task, uncertain)
+    reasons = {name: words for name, words in chosen.items() if isinstance(words, str)}
+    reasons |= made.not_applicable
+    applicable = [name for name in chosen if name not in reasons]
+    if quick:
+        applicable = applicable[:QUICK_LAWS]
     headings = columns(task.scenario)
-    return {
-        "title": entry.load(folder).title,
+    result = {
+        "title": contents.title,
         "machine": machine(),
         "duration": task.duration,
         "dt": task.dt,
-        "period": task.dt * max(1, round(PERIOD / task.dt)),
+        "period": period_of(task),
         "noise": NOISE,
         "uncertain": list(uncertain),
         "input": plants.input_name(task.scenario.plant) if is_chain(task) else "torque",
-        "rows": [dict(zip(headings, values, strict=True)) for values in rows],
+        "rows": [],
+        "no_factor": {},
         "not_applicable": reasons,
     }
+    for name in only or applicable:
+        try:
+            found = row(name, chosen[name], task, uncertain)
+        except ValueError as error:
+            reasons[name] = first_sentence(error)
+        except Exception as error:  # a law that fails must not stop the others
+            reasons[name] = f"its run failed: {type(error).__name__}: {first_sentence(error)}"
+        else:
+            result["rows"].append(dict(zip(headings, found.values, strict=True)))
+            if found.reason:
+                result["no_factor"][name] = found.reason
+        print(f"{folder.name}: {name}: {reasons.get(name, 'measured')}", flush=True)
+        save(result)
+
+
+def period_of(task: Task) -> float:
+    """The period of the sampled runs [s], a whole number of steps."""
+    return task.dt * max(1, round(PERIOD / task.dt))
 
 
 def is_chain(task: Task) -> bool:
@@ -514,13 +547,17 @@ def is_chain(task: Task) -> bool:
     return plants.is_chain(task.scenario.plant)
 
 
-def write(folder: Path, out: Path, command: str, **options: Any) -> str:
-    """Measures an entry and writes its file; the name of the entry."""
-    result = measure(folder, **options)
+def write(folder: Path, out: Path, command: str, **options: Any) -> None:
+    """Measures an entry and writes its file."""
     out.mkdir(parents=True, exist_ok=True)
-    text = json.dumps({"command": command, **result}, indent=1)
-    (out / f"{folder.name}.json").write_text(text + "\n", encoding="utf-8")
-    return folder.name
+
+    def save(result: dict[str, Any]) -> None:
+        text = json.dumps({"command": command, **result}, indent=1)
+        (out / f"{folder.name}.json").write_text(text + "\n", encoding="utf-8")
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the table reports runs that leave the bounds
+        measure(folder, save, **options)
 
 
 def main() -> int:

@@ -71,8 +71,12 @@ for name, run in {"unlimited": unlimited, "limited to 15 rad/s²": limited}.item
     estimate.plot(run.t[start], run.disturbance_estimate[start, 0], label=name)
 torque.set_ylabel("torque of joint 1 [N m]")
 estimate.set_ylabel("estimate of f that the law receives [N m]")
-for axes in (torque, estimate):
+for axes, signal in ((torque, "tau"), (estimate, "disturbance_estimate")):
+    late = [getattr(run, signal)[run.t >= 0.15, 0] for run in (unlimited, limited)]
+    axes.set_title(f"first 0.15 s: the peak, then {np.min(late):.2g} to {np.max(late):.2g} N m")
     axes.set_xlabel("time [s]")
 torque.legend()
-print("peak torque [N m]:", unlimited.metrics.peak_torque, limited.metrics.peak_torque)
+for name, run in {"unlimited": unlimited, "limited": limited}.items():
+    peaks = [column[np.argmax(np.abs(column))] for column in np.asarray(run.tau).T]
+    print(f"{name}: peak torque {peaks[0]:.2f} N m of joint 1, {peaks[1]:.2f} N m of joint 2")
 print("time of the limit [s]:", limited.metrics.limited_time)

@@ -29,6 +29,9 @@ torque.set_ylabel("torque of joint 1 [N m]")
 for axes in (error, torque):
     axes.set_xlabel("time [s]")
 error.legend()
+late = [run.tau[run.t >= 0.5, 0] for run in found.equal_effort.values()]
+low, high = np.min(late), np.max(late)
+torque.set_title(f"first 0.5 s: the transient, then {low:.3g} to {high:.3g} N m")
 print(found)
 
 # %% The same laws from a start near the upper bound of joint 1, with a velocity towards it.

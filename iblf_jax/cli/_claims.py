@@ -288,10 +288,7 @@ def assumed_briefly(runs: Pair) -> str:
     """The assumed masses and lengths in a sentence, for the title of a figure."""
     arm: Any = next(iter(runs.values())).scenario.plant
     masses, lengths = _all_digits(arm.mass), _all_digits(arm.length)
-    return (
-        "The arm's masses and lengths are assumed (the paper prints none):"
-        f" {masses} kg, {lengths} m"
-    )
+    return f"Masses {masses} kg and lengths {lengths} m are assumed: the paper prints none."
 
 
 def _all_digits(values: Any) -> str:

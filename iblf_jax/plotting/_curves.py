@@ -504,7 +504,7 @@ def _differ(a: Curve, b: Curve, fields: Sequence[str], joints: Sequence[int]) ->
     for field in fields:
         for joint in joints:
             one, two = (c.at(field, t)[:, joint] for c in (a, b))
-            tolerance = SAME_SIGNAL * np.ptp(one) + 1e-9
+            tolerance = SAME_SIGNAL * np.nan_to_num(np.ptp(one)) + 1e-9
             if not np.allclose(one, two, rtol=0.0, atol=tolerance, equal_nan=True):
                 return True
     return False

@@ -108,8 +108,11 @@ def _default_zoom(
     transient = _transient_of(curves, rows)
     if transient == 0:
         return ZOOM_SHARE * end
-    zoom = max(transients * transient, MIN_ZOOMED * end)
-    return float(f"{min(zoom, MAX_ZOOMED * end):.0e}")
+    zoom = min(max(transients * transient, MIN_ZOOMED * end), MAX_ZOOMED * end)
+    rounded = float(f"{zoom:.0e}")
+    if rounded < transient:
+        return float(f"{zoom:.1e}")
+    return rounded
 
 
 def zoom_reason(curves: Sequence[Curve], rows: Sequence[PanelRow], zoom: float) -> str:
@@ -117,15 +120,15 @@ def zoom_reason(curves: Sequence[Curve], rows: Sequence[PanelRow], zoom: float) 
     window = f"first {zoom:.3g} s"
     if all(curve.failed for curve in curves):
         return f"{window}: the start (every run failed)"
-    of_runs = ""
+    others = ""
     if any(curve.failed for curve in curves):
-        of_runs = " of the runs without failure"
+        others = " (failed runs aside)"
     transient = _transient_of(curves, rows)
     if transient == 0.0:
-        return f"{window}: the start; no transient{of_runs}"
+        return f"{window}: the start; no transient{others}"
     if transient > zoom:
-        return f"{window} of the transient{of_runs}, which takes {transient:.3g} s"
-    return f"{window}: the transient{of_runs}"
+        return f"{window} of a transient of {transient:.3g} s{others}"
+    return f"{window}: the transient{others}"
 
 
 @_style.styled()
@@ -152,7 +155,7 @@ def _rows_with_zoom(
         lines = [range_after(curves, row.quantity, row.joint, start[1])]
         if inset is table[0, 1]:
             lines.insert(0, zoom_reason(curves, rows, start[1]))
-        inset.set_title("\n".join(filter(None, lines)), fontsize=_style.size(8.0))
+        inset.set_title(",\n".join(filter(None, lines)), fontsize=_style.size(8.0))
     for axes in table[-1]:
         _style.time_axis(axes)
     figure.align_ylabels(table[:, 0])
@@ -675,8 +678,8 @@ def paper_figures(runs: Runs, *, zoom: float | None = None, note: str = "") -> d
 
 
 MAGNIFIED = (3, 5)
-"""Numbers of the paper's figures whose transient is a small part of the run: the zoom shows no more
-than the transient, in a column as wide as that of the full time."""
+"""Numbers of the paper's figures whose transient is a small part of the run: the zoom shows little
+more than the transient, in a column as wide as that of the full time."""
 
 
 def _paper_figure(
@@ -695,7 +698,7 @@ def _paper_figure(
         rows.append(PanelRow(quantity, joint, _style.label(f"({letter}) {symbol}", quantity.unit)))
     options: dict[str, Any] = {}
     if number in MAGNIFIED:
-        options = {"transients": 1.0, "columns": (1.0, 1.0)}
+        options = {"transients": 1.1, "columns": (1.0, 1.0)}
     title = f"Figure {number}. {caption}"
     return _rows_with_zoom(title, curves, rows, zoom, 1.9, notes=notes, **options)
 
@@ -721,7 +724,10 @@ def _paper_quantity(scenario: Scenario, field: str, joint: int) -> PanelQuantity
         },
         "e1": {"bounds_label": rf"$-k_{{l\_q{number}}}$, $k_{{u\_q{number}}}$"},
         "e2": {},
-        "disturbance_estimate": {"symbol": r"$f_{s\_un}$"},
+        "disturbance_estimate": {
+            "symbol": r"$f_{s\_un}$",
+            "transient_symbol": r"$f_{s\_un} - \hat f_{s\_un}$",
+        },
         "tau": {},
     }
     changed: dict[str, Any] = {"symbol": PAPER_SYMBOLS[field].format(number)} | symbols[field]

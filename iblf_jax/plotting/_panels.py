@@ -359,9 +359,9 @@ def say_zero(axes: Axes, largest: float, symbol: str, unit: str) -> None:
     axes.set_yticks([0.0])
     words = "zero"
     if largest > 0.0:
-        words = f"zero: {at_most(symbol, rounded_away(largest))} {unit} is rounding"
+        words += f"\n({at_most(symbol, rounded_away(largest))} {unit} is rounding)"
     centred: dict[str, Any] = {"transform": axes.transAxes, "ha": "center", "va": "center"}
-    axes.text(0.5, 0.75, words, fontsize=_style.size(8.0), **centred)
+    axes.text(0.5, 0.75, words, fontsize=_style.size(7.5), **centred)
 
 
 def annotate_clipped_peak(
@@ -578,7 +578,7 @@ def _run_label(curve: Curve, quantity: PanelQuantity) -> str:
 
 def transient_end(curves: Sequence[Curve], quantity: PanelQuantity, joint: int) -> float:
     """Time [s] after which all successful runs stay within 5 % of the range of their second half;
-    0 if they start in it.
+    0 if they start in it, or differ from it by rounding errors.
     """
     ends = [0.0]
     for curve in curves:
@@ -586,7 +586,7 @@ def transient_end(curves: Sequence[Curve], quantity: PanelQuantity, joint: int) 
         half = len(y) // 2
         if curve.failed or half < 2 or not np.isfinite(y).all():
             continue
-        room = 0.05 * np.ptp(y)
+        room = max(0.05 * np.ptp(y), rounding_error([curve], quantity.field))
         low, high = y[half:].min() - room, y[half:].max() + room
         outside = np.flatnonzero((y[:half] < low) | (y[:half] > high))
         if outside.size:
@@ -613,10 +613,12 @@ def range_after(curves: Sequence[Curve], quantity: PanelQuantity, joint: int, ti
     if span is None:
         return ""
     low, high = span
+    largest = max(abs(low), abs(high))
+    if largest <= rounding_error(curves, quantity.field):
+        return "then zero"
     if quantity.transient or field in ERRORS:
         symbol = quantity.transient_symbol or quantity.symbol
-        largest = rounded_away(max(abs(low), abs(high)))
-        return f"then {at_most(symbol, largest)} {quantity.unit}"
+        return f"then {at_most(symbol, rounded_away(largest))} {quantity.unit}"
     ends = f"{signed(low, 3)} to {signed(high, 3)}"
     return f"then {ends} {quantity.unit}"
 

@@ -173,7 +173,8 @@ def _margin(axes: Axes, result: TuneResult) -> None:
     axes.set_ylabel(_style.label("smallest margin", unit))
     start = float(np.min(initial_margins(result.scenario, {})[LEVELS[0]]))
     rounding = ROUNDING * np.finfo(margin.dtype).eps
-    if np.all(np.abs(margin - start) <= rounding):
+    validated = margin[np.isfinite(margin)]
+    if validated.size and np.all(np.abs(validated - start) <= rounding):
         axes.set_title("that of the start (t = 0) at every step")
 
 

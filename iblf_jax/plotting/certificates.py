@@ -111,7 +111,7 @@ def _level_panels(shown: Certificate, traces: LevelTraces) -> Figure:
     panels = list(figure.subplots(rows, COLUMNS).flat)
     V = Bounded("Lyapunov function", "$V$", "1")
     _draw_bounded(panels[0], t, traces.V, traces.envelope, V)
-    _draw_inequality(panels[1], t, traces.left, traces.disturbance_terms, "disturbance terms")
+    _draw_inequality(panels[1], traces, traces.disturbance_terms, "disturbance terms")
     for i, level in enumerate(levels):
         axes, name = panels[2 + i], f"{level.name} error"
         error = Bounded(name, f"$e_{i + 1}$", level.unit)
@@ -138,14 +138,14 @@ def _level_panels(shown: Certificate, traces: LevelTraces) -> Figure:
 def _disturbances(axes: Axes, traces: LevelTraces) -> None:
     """The size of d_tilde of every level that has one, on a logarithmic axis."""
     for i in range(traces.d_tilde.shape[1]):
-        if not np.any(traces.d_tilde[:, i] > 0):
+        if _is_rounding(traces.d_tilde[:, i], _rate(traces.t, traces.error[:, i])):
             continue
         size = np.where(traces.d_tilde[:, i] > 0, traces.d_tilde[:, i], np.nan)
         label = rf"$|\tilde d_{i + 1}|$"
         axes.plot(*thinned(traces.t, size), label=label, **_style.series(i))
     _set_axes(axes, traces.t, r"error of the estimate $|\tilde d_i|$", "unit of the level/s")
     if not axes.get_lines():
-        say_zero(axes, 0.0, r"$\tilde d_i$", "")
+        say_zero(axes, _largest(traces.d_tilde), r"$\tilde d_i$", "")
         return
     axes.set_yscale("log")
     axes.legend(loc="best", **LEGEND)
@@ -196,28 +196,45 @@ def _draw_bounded(
 
 def _is_zero(axes: Axes, values: np.ndarray, bound: np.ndarray, signal: Bounded) -> bool:
     """Whether a signal consists of rounding errors of its bound; if so, the panel says it."""
-    largest, scale = (
-        float(np.max(np.abs(x), where=np.isfinite(x), initial=0.0)) for x in (values, bound)
-    )
-    rounding = ROUNDING * float(np.finfo(values.dtype).eps) * scale
-    if largest > rounding or not np.isfinite(values).any():
+    if not _is_rounding(values, bound):
         return False
-    say_zero(axes, largest, signal.symbol, signal.unit)
+    say_zero(axes, _largest(values), signal.symbol, signal.unit)
     return True
+
+
+def _is_rounding(values: np.ndarray, scale: np.ndarray) -> bool:
+    """Whether a signal consists of rounding errors of numbers of the size of another one."""
+    rounding = ROUNDING * float(np.finfo(values.dtype).eps) * _largest(scale)
+    return bool(np.isfinite(values).any()) and _largest(values) <= rounding
+
+
+def _largest(values: np.ndarray) -> float:
+    """The largest finite size of a signal; 0 if there is none."""
+    return float(np.max(np.abs(values), where=np.isfinite(values), initial=0.0))
+
+
+def _rate(t: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """The rate of a signal between its samples."""
+    steps = np.diff(t).reshape(-1, *[1] * (values.ndim - 1))
+    return np.diff(values, axis=0) / steps
 
 
 def _inequality(axes: Axes, traces: Traces) -> None:
     """The left side of the inequality of Theorem 2, and the terms that the printed proof drops."""
-    _draw_inequality(axes, traces.t, traces.left, traces.dropped, "dropped terms")
+    _draw_inequality(axes, traces, traces.dropped, "dropped terms")
 
 
 def _draw_inequality(
-    axes: Axes, t: np.ndarray, left: np.ndarray, terms: np.ndarray, name: str
+    axes: Axes, traces: Traces | LevelTraces, terms: np.ndarray, name: str
 ) -> None:
     """The left side of the inequality, on an axis that is logarithmic on both sides of zero."""
+    t, left = traces.t, traces.left
     _set_axes(axes, t, "left side of the inequality", "1/s")
     if not np.isfinite(left).any():
         axes.text(0.5, 0.5, "no claim applies", transform=axes.transAxes, ha="center", va="center")
+        return
+    both = Bounded("", r"$\mathrm{left\ side}$", "1/s")
+    if _is_zero(axes, np.concatenate([left, terms]), _rate(t, traces.V), both):
         return
     sizes = np.abs(left[np.isfinite(left) & (left != 0)])
     smallest = 1.0

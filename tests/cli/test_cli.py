@@ -18,7 +18,7 @@ from conftest import ROOT
 
 import iblf_jax as ij
 from iblf_jax import _start, cli
-from iblf_jax.cli import _claims, _common
+from iblf_jax.cli import _claims, _common, _paper_figures
 from iblf_jax.core import tables
 from iblf_jax.core.disk_cache import keep_programs
 from iblf_jax.files import scenario as scenario_file
@@ -55,7 +55,7 @@ def test_reproduce(command, tmp_path):
     assert code == 0, err
     figures = [f"figure_{i}.{ending}" for i in range(1, 7) for ending in ("pdf", "png")]
     written = sorted(path.name for path in (tmp_path / "out").iterdir())
-    assert written == sorted([*figures, "arm.gif", "metrics.json", "rollouts.nc"])
+    assert written == sorted([*figures, "arm.gif", "metrics.json", "report.md", "rollouts.nc"])
     assert all((tmp_path / "out" / name).stat().st_size > 1000 for name in written)
     for word in (
         "settling_time",
@@ -76,6 +76,9 @@ def test_reproduce(command, tmp_path):
     assert [claim["held"] for claim in report["claims"]] == [True] * 8
     assert report["runs"]["integral BLF"]["metrics"]["first_violation_time"]["value"] is None
     assert "masses 2 / 0.85 kg, lengths 0.35 / 0.31 m" in report["assumed"]
+    torques = report["peaks"]["integral BLF"]["tau"]
+    assert [peak["joint"] for peak in torques] == [0, 1]
+    np.testing.assert_allclose([peak["value"] for peak in torques], [-13.81, -16.28], atol=0.01)
     settling = report["runs"]["log-BLF"]["metrics"]["settling_time"]
     np.testing.assert_allclose(settling["value"], [1.077, 0.837], atol=2e-3)
     assert settling["unit"] == "s"
@@ -86,12 +89,20 @@ def test_reproduce(command, tmp_path):
 @pytest.mark.slow
 def test_reproduce_states_that_the_arm_is_assumed(command, tmp_path, monkeypatch, short_run):
     made = {"integral BLF": short_run, "log-BLF": short_run}, {"first": 1.0, "again": 0.5}
+    notes = []
     monkeypatch.setattr("iblf_jax.cli.reproduce._simulate_both", lambda args: made)
-    monkeypatch.setattr("iblf_jax.cli.reproduce._draw", lambda folder, runs: None)
+    monkeypatch.setattr(
+        "iblf_jax.cli.reproduce._draw", lambda folder, runs, note: notes.append(note)
+    )
     code, out, err = command("reproduce", "--out", "out")
     assert code == 0, err
+    assert notes == [
+        "Masses 2 / 0.85 kg and lengths 0.35 / 0.31 m are assumed: the paper prints none."
+    ]
+    text_report = (tmp_path / "out" / "report.md").read_text()
+    assert text_report.count("The masses and lengths of the arm are assumed.") == 6
     report = strict_json(tmp_path / "out" / "metrics.json")
-    for text in (" ".join(out.split()), report["assumed"]):
+    for text in (" ".join(out.split()), text_report, report["assumed"]):
         assert "the paper prints no masses, lengths" in text and "ASSUME" in text
         assert "masses 2 / 0.85 kg, lengths 0.35 / 0.31 m" in text and "g = 9.81 m/s^2" in text
 
@@ -100,6 +111,29 @@ def test_the_assumed_numbers_are_those_of_the_runs(paper):
     heavier = ij.with_parameters(paper, {"robot.mass": [2.5, 0.75]})
     run = ij.simulate(heavier, duration=0.01, dt=1e-3)
     assert "masses 2.5 / 0.75 kg, lengths 0.35 / 0.31 m" in _claims.assumed({"a": run})
+
+
+def test_the_report_compares_every_figure_with_the_paper(short_run):
+    runs = {"integral BLF": short_run, "log-BLF": short_run}
+    claims = _claims.paper_claims(runs)
+    peaks = _paper_figures.peaks_table(runs)
+    text = _paper_figures.as_markdown(claims, peaks, "assumed", "a remark")
+    for number in range(1, 7):
+        assert f"### Figure {number}. " in text
+        assert f"](figure_{number}.png)" in text
+    assert text.count("- What differs: ") == 6
+    for one in _paper_figures.COMPARISONS:
+        assert all(1 <= number <= len(claims) for number in one.claims)
+    did_not_hold = sum(not claim.confirmed for claim in claims)
+    assert text.count("**did not hold**") == did_not_hold > 0
+    tau = np.asarray(short_run.tau)
+    for joint in range(2):
+        value = tau[np.argmax(np.abs(tau[:, joint])), joint]
+        assert value < 0.0
+        assert ["tau", "integral", "BLF", "joint", str(joint), f"{value:.4g}"] in [
+            [word for word in line.split() if word not in ("N", "m")][:6]
+            for line in peaks.splitlines()
+        ]
 
 
 def test_claims_can_fail(paper, short_run):

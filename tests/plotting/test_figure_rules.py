@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 
 import iblf_jax as ij
 from iblf_jax import Status, plotting
-from iblf_jax.plotting import _scales, _studies, _style, _tuning, certificates
+from iblf_jax.plotting import _proofs, _scales, _studies, _style, _tuning, certificates
 from iblf_jax.plotting._curves import curves_of, rounding_error
 from iblf_jax.studies.summaries import LEVELS, initial_margins
 
@@ -110,7 +110,7 @@ def test_a_zoom_of_the_transient_says_so_and_bounds_what_follows():
     end = figure.axes[1].get_xlim()[1]
     later = np.abs(np.asarray(run.e2))[np.asarray(run.t) > end].max(axis=0)
     titles = zoom_titles(figure)
-    assert titles[0].startswith(f"first {end:.3g} s: the transient then $|e_2| \\leq$ ")
+    assert titles[0].startswith(f"first {end:.3g} s: the transient, then $|e_2| \\leq$ ")
     assert titles[1].startswith("then $|e_2| \\leq$ ")
     for title, largest in zip(titles, later, strict=True):
         stated = float(title.split("\\leq$ ")[1].removesuffix(" rad/s"))
@@ -129,13 +129,13 @@ def test_the_range_after_a_zoom_of_a_torque_is_that_of_the_run():
 
 def test_other_zooms_have_other_reasons():
     run = made_up(chain(2), duration=20.0)
-    assert "of the transient, which takes" in zoom_titles(plotting.errors(run, zoom=0.1))[0]
+    assert "first 0.1 s of a transient of " in zoom_titles(plotting.errors(run, zoom=0.1))[0]
     still = dataclasses.replace(run, e1=0.0 * run.e1, xi=0.0 * run.xi)
     assert "no transient" in zoom_titles(plotting.errors(still))[0]
     bad = runaway(chain(2))
     assert "every run failed" in zoom_titles(plotting.positions(bad))[0]
     both = plotting.positions({"good": run, "bad": bad})
-    assert "the transient of the runs without failure" in zoom_titles(both)[0]
+    assert "the transient (failed runs aside)" in zoom_titles(both)[0]
 
 
 @pytest.mark.parametrize(("value", "text"), [(0.0385, "0.039"), (0.5, "0.5"), (0.0, "0")])
@@ -290,6 +290,20 @@ def test_a_run_that_diverged_inside_its_bounds_is_marked_in_every_panel():
     assert [crosses_of(axes) for axes in plotting.torques(run).axes[::2]] == [[1.0], [1.0]]
 
 
+def test_a_refutation_is_red_for_the_joint_that_leaves_its_bounds():
+    run = changed(made_up(chain(2)), 1, 20, 9.0)
+    state = types.SimpleNamespace(t=0.0)
+    found = types.SimpleNamespace(
+        replay=lambda: run, violation=types.SimpleNamespace(state=state), duration=4.0
+    )
+    red = []
+    for joint in range(2):
+        axes = Figure().subplots()
+        _proofs._draw_violation(axes, found, joint)
+        red.append(to_hex(axes.get_lines()[0].get_color()) == to_hex(_style.failure()))
+    assert red == [False, True]
+
+
 # ---- rounding errors are zero
 
 
@@ -318,7 +332,7 @@ def test_the_overview_says_zero():
     run = made_up(chain(2))
     still = dataclasses.replace(run, disturbance=0.0 * run.q, disturbance_estimate=noise(run))
     (axes,) = [axes for axes in drawn(still.plot()).axes if "broad" in axes.get_ylabel()]
-    assert texts_of(axes)[0].startswith(r"zero: $|f| \leq$ ")
+    assert texts_of(axes)[0].startswith("zero\n($|f| \\leq$ ")
     assert not any("zero" in text for axes in run.plot().axes for text in texts_of(axes))
 
 
@@ -338,6 +352,36 @@ def test_a_certificate_says_zero(values, is_zero):
     certificates._draw_bounded(axes, t, np.full(50, values), np.full(50, 2.0), signal)
     assert any(text.startswith("zero") for text in texts_of(axes)) == is_zero
     assert axes.get_yscale() == ("linear" if is_zero else "log")
+
+
+def test_a_zoom_of_rounding_errors_has_no_transient():
+    run = made_up(chain(2))
+    decaying = 1e-15 * np.exp(-5.0 * np.asarray(run.t))[:, None] * np.ones(2)
+    run = dataclasses.replace(
+        run, disturbance=0.0 * run.q, disturbance_estimate=jnp.asarray(decaying)
+    )
+    titles = zoom_titles(plotting.uncertain_terms(run))
+    assert "no transient, then zero" in titles[0]
+    assert titles[1] == "then zero"
+
+
+@pytest.mark.parametrize("size", [1e-16, 1e-3])
+def test_an_inequality_of_rounding_errors_is_zero(size):
+    t = np.linspace(0.0, 1.0, 50)
+    traces = types.SimpleNamespace(t=t, left=np.full(50, -size), V=np.exp(-t))
+    axes = Figure().subplots()
+    certificates._draw_inequality(axes, traces, 0.0 * t, "terms")
+    assert any(text.startswith("zero") for text in texts_of(axes)) == (size < 1e-3)
+
+
+@pytest.mark.parametrize("size", [1e-16, 1e-3])
+def test_errors_of_an_estimate_that_are_rounding_are_zero(size):
+    t = np.linspace(0.0, 1.0, 50)
+    columns = np.stack([np.exp(-t), np.exp(-2.0 * t)], axis=1)[:, :, None]
+    traces = types.SimpleNamespace(t=t, d_tilde=np.full((50, 2), size), error=columns)
+    axes = Figure().subplots()
+    certificates._disturbances(axes, traces)
+    assert any(text.startswith("zero") for text in texts_of(axes)) == (size < 1e-3)
 
 
 # ---- margins of the start
@@ -375,3 +419,13 @@ def test_a_peak_of_a_study_is_labelled_as_a_size(study):
     metrics = ij.Metrics({"peak_torque": peaks}, (("peak_torque", "N m"),))
     figure = plotting.histograms(dataclasses.replace(study, metrics=metrics))
     assert figure.axes[0].get_xlabel() == "peak torque (absolute value) [N m]"
+
+
+def test_a_tuning_says_when_the_start_sets_its_margin(paper):
+    start = float(initial_margins(paper, {})[LEVELS[0]].min())
+    for margins, is_start in (([start, np.nan, start], True), ([start, start - 1e-6], False)):
+        history = {"margin": np.array(margins)[:, None]}
+        result = types.SimpleNamespace(history=history, best_start=0, scenario=paper)
+        axes = Figure().subplots()
+        _tuning._margin(axes, result)
+        assert ("that of the start" in axes.get_title()) == is_start

@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -79,3 +81,30 @@ def test_files_that_the_documentation_names_are_there():
     assert not [
         text for text in texts if re.search(r"STUDY\.toml|SWEEP\.toml|TUNE\.toml|iblf_jax\[", text)
     ]
+
+
+MATLAB_PAGE = (ROOT / "docs" / "how_to" / "from_matlab.md").read_text(encoding="utf-8")
+
+
+def block_of(language: str) -> str:
+    """The first block of a language on the page for users of MATLAB."""
+    return re.findall(rf"```{language}\n(.*?)```", MATLAB_PAGE, re.DOTALL)[0]
+
+
+def numbers_in(text: str) -> list[float]:
+    """The numbers with decimals of a text."""
+    return [float(number) for number in re.findall(r"\d+\.\d{4,}", text)]
+
+
+def test_the_page_compares_with_what_its_matlab_script_prints():
+    compared = re.search(r"printed = \{(.*?)\n\}", MATLAB_PAGE, re.DOTALL)
+    assert numbers_in(compared[1]) == numbers_in(block_of("text"))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not shutil.which("octave"), reason="needs GNU Octave")
+def test_the_matlab_script_prints_what_its_page_states(tmp_path):
+    (tmp_path / "two_link_barrier.m").write_text(block_of("matlab"))
+    command = ["octave", "--no-gui", "--quiet", "--eval", "two_link_barrier"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+    np.testing.assert_allclose(numbers_in(done.stdout), numbers_in(block_of("text")), atol=2e-8)

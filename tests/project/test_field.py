@@ -3,8 +3,11 @@ the programs that are written without the package."""
 
 from __future__ import annotations
 
+import json
 import shutil
 import sys
+from types import SimpleNamespace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -15,9 +18,12 @@ from iblf_jax import cli
 from iblf_jax.files.scenario import load_scenario_file
 
 FIELD = ROOT / "benchmarks" / "field"
-sys.path.append(str(FIELD))
+sys.path += [str(FIELD), str(ROOT / "docs")]
 import check
 import entry
+import entry_tables
+import field
+import measure
 
 NAMES = [folder.name for folder in entry.folders()]
 TEMPLATE = FIELD / "template"
@@ -338,3 +344,180 @@ def test_the_template_is_correct(tmp_path):
     folder = tmp_path / "author_2020"
     shutil.copytree(TEMPLATE, folder)
     assert check.faults_of(folder) == []
+
+
+# ---------------------------------------------------------------------------- the measurement
+
+
+@pytest.mark.slow
+def test_the_quick_measurement(tmp_path, monkeypatch, capsys):
+    words = ["measure.py", "no_entry_2000", "liu_2018", "--quick", "--out", str(tmp_path)]
+    monkeypatch.setattr(sys, "argv", words)
+    assert measure.main() == 1
+    printed = capsys.readouterr().out
+    assert "no_entry_2000: failed: EntryError: there is no entry.toml" in printed
+    assert "liu_2018: measured" in printed
+    result = json.loads((tmp_path / "liu_2018.json").read_text())
+    published, other = result["rows"]
+    assert published["law"] == measure.PUBLISHED
+    assert published["factor"] == published["effort"] == 1.0
+    assert set(other) == set(published)
+    assert other["law"] == "BarrierBackstepping(Integral)"
+    assert result["machine"]["jax"]
+    assert result["command"].endswith("benchmarks/field/measure.py no_entry_2000 liu_2018 --quick")
+    assert result["uncertain"] == ["plant.friction", "plant.input_gain"]
+    for row in result["rows"]:
+        assert not {measure.LEFT, measure.STEP} & {x for x in row.values() if isinstance(x, str)}
+        assert row["margin"] <= 1.0
+
+
+@pytest.mark.slow
+def test_processes_report_entries_that_failed(tmp_path, monkeypatch, capsys):
+    words = ["measure.py", "no_entry_2000", "no_entry_2001", "--processes", "2"]
+    monkeypatch.setattr(sys, "argv", [*words, "--out", str(tmp_path)])
+    assert measure.main() == 2
+    printed = capsys.readouterr().out
+    for name in ("no_entry_2000", "no_entry_2001"):
+        assert f"{name}: failed: EntryError: there is no entry.toml" in printed
+    assert "0 of 2 entries measured" in printed
+
+
+def test_the_laws_of_a_robot_are_those_of_the_table_of_laws():
+    task = task_of_preset(ij.presets.zhang_yan_2024())
+    found = measure.laws_of(task, ("plant.mass",))
+    assert list(found) == list(measure.laws.CHOICES)
+    assert not [name for name, choice in found.items() if isinstance(choice, str)]
+    adaptive = found["AdaptiveParameters(masses)"].law
+    assert adaptive.parameters == ("mass[0]", "mass[1]")
+    assert isinstance(measure.laws_of(task, ())["AdaptiveParameters(masses)"], str)
+
+
+def test_the_laws_of_a_plant_have_each_barrier_with_and_without_filters():
+    scenario = ij.presets.motor_driven_pendulum()
+    found = measure.laws_of(task_of_preset(scenario), ())
+    assert found[measure.OF_ROBOTS] == "the plant is none"
+    for name in measure.BARRIERS:
+        exact = found[f"BarrierBackstepping({name})"]
+        filtered = found[f"BarrierBackstepping({name}), filters"]
+        assert isinstance(exact, str) == isinstance(filtered, str)
+        if not isinstance(exact, str):
+            assert exact.law.filter is None
+            assert filtered.law.filter is not None
+
+
+def task_of_preset(scenario):
+    n, r = scenario.plant.n, measure.plants.order_of(scenario.plant)
+    return measure.Task(
+        scenario, 1.0, 1e-3, 2.0, np.ones(n), np.ones((r, n)), np.zeros(n), np.ones(n)
+    )
+
+
+class ARun(NamedTuple):
+    """What `measure.accuracy` reads of a run."""
+
+    status: int
+    t: np.ndarray
+    e1: np.ndarray
+    metrics: SimpleNamespace
+
+
+def a_run(status=0):
+    e1 = np.concatenate([np.full(50, 9.0), [-2.0], np.zeros(49)])[:, None]
+    metrics = SimpleNamespace(peak_torque=np.array([4.0]), xi_margin=np.array([0.25]))
+    return ARun(status, np.arange(100.0), e1, metrics)
+
+
+def test_errors_are_those_of_the_second_half():
+    task = task_of_preset(ij.presets.zhang_yan_2024())
+    rms, error, peak, margin = measure.accuracy(a_run(), task)
+    np.testing.assert_allclose([rms, error, peak, margin], [2 / np.sqrt(50), 2.0, 4.0, 0.25])
+    left = measure.accuracy(a_run(int(ij.Status.BOUND_VIOLATED)), task)
+    assert left == ["left", "left", 4.0, "left"]
+    assert measure.accuracy(a_run(int(ij.Status.STEP_TOO_LARGE)), task)[0] == "step"
+    # Velocities have no bounds in this task, and the bounds that a law was given do not count.
+    assert measure.state_of(a_run(int(ij.Status.VELOCITY_VIOLATED)), task) == ""
+    assert measure.worst([[1.0, 0.5], [2.0, 0.7]]) == [2.0, 0.5]
+    assert measure.worst([[1.0, 0.5], ["left", "left"]]) == ["left", "left"]
+    assert measure.worst([]) == ["-", "-"]
+
+
+def test_uncertain_parameters_are_those_of_the_plant_that_are_not_zero():
+    scenario = ij.presets.zhang_yan_2024()
+    made = entry.reproduction({"scenario": scenario, "runs": {}, "figure": None})
+    assert measure.uncertain_of(made) == ("plant.mass", "plant.inertia")
+    named = made._replace(uncertain=("plant.g", "plant.payload"))
+    assert measure.uncertain_of(named) == ("plant.g",)
+    changed = measure.scaled_parameters(scenario, ("plant.mass",), 0.8)
+    np.testing.assert_allclose(changed["plant.mass"], [1.6, 0.68], rtol=1e-6)
+
+
+# ---------------------------------------------------------------------------- the pages
+
+
+RESULT = {
+    "command": "python benchmarks/field/measure.py NAME",
+    "machine": {"processor": "P", "cores": "2", "python": "3", "jax": "0", "date": "2026-01-01"},
+    "duration": 1.0,
+    "dt": 1e-3,
+    "noise": 1e-3,
+    "uncertain": ["plant.mass"],
+    "input": "torque",
+    "rows": [
+        {"law": "published law", "factor": 1.0, "error [rad]": 0.1, "error, noise [rad]": 0.2},
+        {"law": "A", "factor": 2.0, "error [rad]": 0.05, "error, noise [rad]": 0.1},
+        {"law": "B", "factor": "own", "error [rad]": 0.01, "error, noise [rad]": 0.01},
+        {"law": "C", "factor": 0.5, "error [rad]": "left", "error, noise [rad]": "left"},
+    ],
+    "not_applicable": {"D": "it has |none|"},
+}
+
+
+@pytest.fixture
+def parts(tmp_path):
+    """All entries, with small results for one of them."""
+    for name in NAMES:
+        contents = entry.load(entry.ENTRIES / name)
+        computed = {
+            "reached": {number.quantity: number.value for number in contents.published},
+            "holds": {claim.statement: True for claim in contents.claims},
+            "evidence": {"gain": 0.51234},
+            "levels": 2,
+        }
+        (tmp_path / f"{name}.json").write_text(json.dumps(computed))
+    results = tmp_path / "results"
+    results.mkdir()
+    (results / "zhang_yan_2024.json").write_text(json.dumps(RESULT))
+    return field.parts(results, tmp_path)
+
+
+def test_the_page_of_the_benchmark(parts):
+    page = field.benchmark_page(parts)
+    numbers = sum(len(part.contents.published) for part in parts)
+    assert f"{len(NAMES)} published examples" in page
+    assert f"{numbers} of {numbers} published numbers" in page
+    rows = [line for line in page.splitlines() if line.startswith("| [")]
+    assert len(rows) == len(NAMES)
+    measured = next(row for row in rows if "zhang_yan_2024" in row)
+    assert measured.endswith("| A | 0.5 | 0.5 |")
+    assert sum(row.endswith("| not measured |  |  |") for row in rows) == len(NAMES) - 1
+    assert "| published law | 1 | 0.1 | 0.2 |" in page
+    assert "| C | 0.5 | left | left |" in page
+    assert "Not in the table: D: it has" in page
+    for name in NAMES:
+        assert f"(gallery/{name}.md)" in page
+
+
+def test_the_page_of_the_corrections_has_all_of_them(parts):
+    page = field.corrections_page(parts)
+    count = sum(len(part.contents.corrected) for part in parts)
+    assert page.startswith("# What the literature printed, and what is correct")
+    assert f"{count} corrections" in page
+    assert sum(line.startswith("| [") for line in page.splitlines()) == count
+    assert "and with k = 1 by 0.51 rad" in page
+    assert "theory/printed_and_corrected.md" in page
+
+
+def test_tables_of_a_page_escape_what_markdown_interprets():
+    assert entry_tables.escaped("a*b_c <d> [e] `x_1` $y_2$") == (r"a\*b\_c \<d> \[e\] `x_1` $y_2$")
+    assert entry_tables.markdown_table(["h"], [["|w|"]]).splitlines()[-1] == r"| \|w\| |"
+    assert entry.filled("{a} {a:.1f} {b} {c", {"a": 1.25}) == "1.25 1.2 {b} {c"

@@ -1,22 +1,37 @@
 """The notebooks run from top to bottom, as a reader would run them; the site shows what they
-gave."""
+gave.
+
+Each of them begins with goals and prerequisites, and ends with exercises, whose solutions run with
+it, and with a link to the next one.
+"""
 
 from __future__ import annotations
 
+import copy
+import itertools
+import re
 import sys
+from pathlib import Path
 
+import nbformat
 import pytest
 from conftest import ROOT
 
-sys.path.append(str(ROOT / "docs"))
+# First, because a package index has a `build` too.
+sys.path.insert(0, str(ROOT / "docs"))
 import build
 
 FOLDER = ROOT / "notebooks"
+NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
+GOALS = ("## Goals", "After this notebook you can")
+PREREQUISITES = ("Notebooks:", "Knowledge:", "Extras:", "Time:")
+EXERCISES = range(2, 5)
+"""Numbers of exercises that a notebook may have."""
 
 
 @pytest.mark.site
 @pytest.mark.usefixtures("optimised_kernels")
-@pytest.mark.parametrize("name", sorted(path.name for path in FOLDER.glob("*.ipynb")))
+@pytest.mark.parametrize("name", [path.name for path in NOTEBOOKS])
 def test_notebook_runs(name, tmp_path):
     notebook = build.execute(FOLDER / name, tmp_path)
     shown = [
@@ -26,4 +41,52 @@ def test_notebook_runs(name, tmp_path):
 
 
 def test_there_are_notebooks():
-    assert "01_reproduce_the_paper.ipynb" in {path.name for path in FOLDER.glob("*.ipynb")}
+    assert "01_reproduce_the_paper.ipynb" in {path.name for path in NOTEBOOKS}
+
+
+def target_of_next(cells: list) -> Path:
+    """The file that the last cell of a notebook links to."""
+    link = re.search(r"\]\(([^)]+)\)", cells[-1].source)
+    if link is None:
+        return FOLDER / "no link"
+    if link[1].endswith(".ipynb"):
+        return FOLDER / link[1]
+    return (ROOT / "docs" / "tutorials" / link[1]).resolve()
+
+
+def missing_parts(cells: list) -> list[str]:
+    """What a notebook lacks for a reader who learns with it."""
+    missing = [text for text in (*GOALS, *PREREQUISITES) if text not in cells[1].source]
+    exercises = [i for i, cell in enumerate(cells) if cell.source.startswith("### Exercise")]
+    if len(exercises) not in EXERCISES:
+        missing.append(f"two to four exercises, not {len(exercises)}")
+    for i in exercises:
+        solution = cells[i + 1]
+        is_collapsed = "hide-cell" in solution.metadata.get("tags", [])
+        if solution.cell_type != "code" or not is_collapsed or "assert" not in solution.source:
+            missing.append(f"a collapsed solution with an assertion of {cells[i].source[:15]!r}")
+    if not cells[-1].source.startswith("## Next") or not target_of_next(cells).exists():
+        missing.append("a link to what is next")
+    return missing
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_has_goals_prerequisites_exercises_and_a_link(path):
+    cells = nbformat.read(path, as_version=4).cells
+    assert not missing_parts(cells)
+
+
+def test_each_notebook_leads_to_the_next():
+    for path, following in itertools.pairwise(NOTEBOOKS):
+        assert target_of_next(nbformat.read(path, as_version=4).cells) == following
+
+
+def test_a_notebook_without_these_parts_is_refused():
+    cells = nbformat.read(NOTEBOOKS[0], as_version=4).cells
+    assert "## Goals" in missing_parts(cells[:1] + cells[2:])
+    assert "two to four exercises, not 0" in missing_parts(cells[:4] + cells[-1:])
+    assert "a link to what is next" in missing_parts(cells[:-1])
+    unchecked = copy.deepcopy(cells)
+    for cell in unchecked:
+        cell.source = cell.source.replace("assert", "print")
+    assert len(missing_parts(unchecked)) == 3

@@ -239,10 +239,9 @@ def test_the_command_line_tunes_and_a_saved_result_reproduces_its_report(tmp_pat
 def _check_torque_and_ends(paper, best, figure):
     """Report, repr and figure show both, although the objective contains neither; the legend
     covers no curve."""
-    peaks = [
-        np.asarray(ij.simulate(scenario, **SHORT).metrics.peak_torque)
-        for scenario in (paper, best.scenario)
-    ]
+    runs = [ij.simulate(scenario, **SHORT) for scenario in (paper, best.scenario)]
+    peaks = [np.asarray(run.metrics.peak_torque) for run in runs]
+    signed = [tau[np.argmax(np.abs(tau))] for run in runs for tau in np.asarray(run.tau).T]
     assert best.at_limits["controller.k1[0]"] == (best.tuned[0], "upper", 2.5, "as given")
     for text in (repr(best), str(best.report)):
         assert "controller.k1[0] = 2.5 is at the upper end of its range, 2.5" in text
@@ -256,7 +255,7 @@ def _check_torque_and_ends(paper, best, figure):
     assert "at the end of their range: controller.k1[0]" in figure.get_suptitle().replace("\n", " ")
     panels = {axes.get_ylabel(): axes for axes in figure.axes}
     assert [text.get_text() for text in panels["peak torque [N m]"].texts] == [
-        f"{x:.5g}" for x in np.concatenate(peaks)
+        f"{x:.5g}".replace("-", "\N{MINUS SIGN}") for x in signed
     ]
     gains = panels["gain, relative to start"]
     assert not gains.get_legend().get_window_extent().overlaps(gains.get_window_extent())

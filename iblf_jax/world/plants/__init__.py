@@ -4,6 +4,7 @@ from typing import Any
 
 from iblf_jax.world.plants._base import MAX_ORDER as MAX_ORDER
 from iblf_jax.world.plants._base import Plant as Plant
+from iblf_jax.world.plants._base import Units as Units
 from iblf_jax.world.plants._base import check_dependence as check_dependence
 from iblf_jax.world.plants._base import check_dimensions as check_dimensions
 from iblf_jax.world.plants._base import component_names as component_names
@@ -76,6 +77,7 @@ __all__ = [
     "Rigid",
     "StrictFeedback",
     "Switched",
+    "Units",
     "Vessel",
     "as_plant",
     "component_names",

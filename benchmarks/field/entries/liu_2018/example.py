@@ -41,23 +41,29 @@ class TextbookLog:
         return tube.dq_d - k1 * (self.error_over_slope(tube, q) * e + beyond)
 
 
-def drift(t, x):
-    """f_1 and f_2."""
-    return jnp.stack([jnp.zeros_like(x[0]), -25.0 * x[1]])
+@ij.component
+class Drive:
+    """x1' = x2, x2' = -friction x2 + input_gain u."""
 
+    friction: ij.Leaf = ij.leaf("1/s", shape="scalar")
+    input_gain: ij.Leaf = ij.leaf("rad/(V s^2)", sign="positive", shape="scalar")
+    n, order, units = 1, 2, ("rad", "rad/s", "V")
 
-def gain(t, x):
-    """G_1 and G_2."""
-    return jnp.stack([jnp.ones_like(x[0]), jnp.full_like(x[0], 133.0)])
+    def drift(self, t, x):
+        """f_1 and f_2."""
+        return jnp.stack([jnp.zeros_like(x[0]), -self.friction * x[1]])
+
+    def gain(self, t, x):
+        """G_1 and G_2."""
+        one = jnp.ones_like(x[0])
+        return jnp.stack([one, self.input_gain * one])
 
 
 def task(barrier):
     """The published task with a barrier on the output."""
     side = ij.bounds.Funnel
     return ij.Scenario(
-        plant=ij.plants.StrictFeedback(
-            drift, gain, n=1, order=2, units=("rad", "rad/s", "V"), level_names=("angle", "speed")
-        ),
+        plant=Drive(friction=25.0, input_gain=133.0),
         reference=ij.references.Sinusoid(offset=0.0, amplitude=1.0),
         bounds=ij.Bounds(lower=side(-K_B, -K_B, 0.0), upper=side(K_B, K_B, 0.0)),
         controller=ij.controllers.BarrierBackstepping(
@@ -68,6 +74,7 @@ def task(barrier):
 
 
 scenario = task(TextbookLog())
+uncertain = ("plant.friction", "plant.input_gain")
 cases = {"published alpha": scenario, "Log of the package": task(LOG)}
 runs = {name: ij.simulate(case, duration=10.0, dt=1e-3) for name, case in cases.items()}
 figure, axes = plt.subplots(1, 3, figsize=(11, 3.2), layout="constrained")

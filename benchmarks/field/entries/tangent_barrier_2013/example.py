@@ -48,14 +48,22 @@ class TangentSquared:
         return tube.dq_d - k1 * (e * self.error_over_slope(tube, q) + beyond)
 
 
-def drift(t, x):
-    """f_1 and f_2."""
-    return jnp.stack([0.1 * x[0] ** 2, 0.1 * x[0] * x[1] - 0.2 * x[0]])
+@ij.component
+class Plant:
+    """x1' = a x1^2 + x2, x2' = b x1 x2 + c x1 + (1 + x1^2) u."""
 
+    a: ij.Leaf = ij.leaf("1", shape="scalar", default=0.1)
+    b: ij.Leaf = ij.leaf("1", shape="scalar", default=0.1)
+    c: ij.Leaf = ij.leaf("1", shape="scalar", default=-0.2)
+    n, order, units = 1, 2, ("1", "1", "1")
 
-def gain(t, x):
-    """G_1 and G_2."""
-    return jnp.stack([jnp.ones_like(x[0]), 1.0 + x[0] ** 2])
+    def drift(self, t, x):
+        """f_1 and f_2."""
+        return jnp.stack([self.a * x[0] ** 2, self.b * x[0] * x[1] + self.c * x[0]])
+
+    def gain(self, t, x):
+        """G_1 and G_2."""
+        return jnp.stack([jnp.ones_like(x[0]), 1.0 + x[0] ** 2])
 
 
 def drift_of_the_law(t, x):
@@ -67,7 +75,7 @@ def task(barrier):
     """The published task with a barrier on the output."""
     side = ij.bounds.Funnel
     return ij.Scenario(
-        plant=ij.plants.StrictFeedback(drift, gain, n=1, order=2),
+        plant=Plant(),
         reference=ij.references.Sinusoid(offset=0.2, amplitude=0.3),
         bounds=ij.Bounds(lower=side(-K_B, -K_B, 0.0), upper=side(K_B, K_B, 0.0)),
         controller=ij.controllers.BarrierBackstepping(
@@ -78,7 +86,8 @@ def task(barrier):
 
 
 scenario = task(TangentSquared())
-wrong = ij.plants.StrictFeedback(drift_of_the_law, gain, n=1, order=2)
+uncertain = ("plant.a", "plant.b", "plant.c")
+wrong = ij.plants.StrictFeedback(drift_of_the_law, Plant().gain, n=1, order=2)
 cases = {
     "published barrier": scenario,
     "Log": task(ij.barriers.Log()),

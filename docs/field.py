@@ -1,0 +1,294 @@
+"""The pages "Benchmark of the field" and "What the literature printed, and what is correct".
+
+The first one has the entries of `benchmarks/field/entries` and the results of
+`benchmarks/field/measure.py`; the second one has the corrections of all entries. The numbers are
+those of `benchmarks/field/results` and those that the gallery computed when it made the page of an
+entry (`gallery.page`).
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gallery
+from entry import (
+    KINDS,
+    READ,
+    RESULTS,
+    Correction,
+    Entry,
+    Published,
+    filled,
+    folders,
+    is_reached,
+    load,
+)
+from entry_tables import escaped, markdown_table
+
+PUBLISHED = "published law"
+"""The row of the law that sets the effort."""
+ERROR, NOISE = "error [", "error, noise ["
+"""Beginnings of the columns of the largest error, and of that with noise."""
+COLUMNS = {
+    "factor": "of the gains of the law, so that its effort is that of the published law; 'own'"
+    " where no factor from 1/32 to 32 gives this effort, and the law runs at its own gains",
+    "effort": "of the law, as a share of the effort of the published law",
+    "RMS error, error": "RMS and largest absolute value of $e_1$ over all components, in the second"
+    " half of the run",
+    "peak input": "largest input of the entire run",
+    "margin": "least distance to any bound of the task over the entire run, as a share of half the"
+    " distance between these bounds; many runs have their least distance at the start",
+    "..., parameters": "the worse of two plants whose uncertain parameters are 0.8 and 1.2 times"
+    " those of the entry; the model of the law is the one of the entry",
+    "..., 500 Hz": "law and observer run once in 2 ms and read exact sensors",
+    "..., noise": "the same with white noise on every level; its standard deviation is {noise:g}"
+    " times half the least distance between the bounds, and on the further levels {noise:g} times"
+    " their largest value in the published run",
+}
+"""Column of the tables -> its meaning."""
+
+
+class Part(NamedTuple):
+    """An entry with what was computed for it."""
+
+    name: str
+    contents: Entry
+    computed: dict[str, Any]
+    """Of `gallery.page`."""
+    result: dict[str, Any] | None
+    """Of `measure.py`; None before the entry is measured."""
+
+    @property
+    def link(self) -> str:
+        """The entry's title, as a link to its page."""
+        return f"[{escaped(self.contents.title)}](gallery/{self.name}.md)"
+
+
+def parts(results: Path = RESULTS, made: Path = gallery.MADE) -> list[Part]:
+    """All entries."""
+    found = []
+    for folder in folders():
+        computed = json.loads((made / f"{folder.name}.json").read_text(encoding="utf-8"))
+        file = results / f"{folder.name}.json"
+        result = json.loads(file.read_text(encoding="utf-8")) if file.exists() else None
+        found.append(Part(folder.name, load(folder), computed, result))
+    return found
+
+
+def write(folder: Path) -> None:
+    """Writes both pages."""
+    found = parts()
+    (folder / "field.md").write_text(benchmark_page(found), encoding="utf-8")
+    (folder / "literature_corrected.md").write_text(corrections_page(found), encoding="utf-8")
+
+
+# ---------------------------------------------------------------------------- the benchmark
+
+
+def benchmark_page(found: list[Part]) -> str:
+    """The table of all entries, and the results of each."""
+    numbers = [is_reached(x, part.computed["reached"][x.quantity]) for part, x in published(found)]
+    holds = [value for part in found for value in part.computed["holds"].values()]
+    corrected = sum(len(part.contents.corrected) for part in found)
+    measured = [part for part in found if part.result]
+    noise = measured[0].result["noise"] if measured else 0.0
+    sections = [
+        "# Benchmark of the field",
+        f"{len(found)} published examples of barrier, prescribed-performance and constrained"
+        " control, reproduced with the plants and laws of this package. Each entry has a page with"
+        " the printed and the missing parameters, the script, and the published numbers beside"
+        f" those that the script reaches: {sum(numbers)} of {len(numbers)} published numbers are"
+        " reached within the accuracy to which they can be read, and"
+        f" {sum(holds)} of {len(holds)} published statements hold. {corrected} corrections were"
+        " necessary, which [a page of its own](literature_corrected.md) lists."
+        " `benchmarks/field/README.md` in the repository describes how to add an entry.",
+        "## Entries",
+        summary(found),
+        "The last three columns name the law of the package that has the smallest error at the"
+        " effort of the published law, sampled at 500 Hz with noise, and its errors with and"
+        " without noise as shares of those of the published law. Without noise many of these tasks"
+        " have an exact model and no disturbance, so that errors tend to zero under every law and"
+        " their ratio states how fast.",
+        "## Comparison on each task",
+        "The published law sets the effort: the RMS input above the one that balances gravity. For"
+        " a plant in strict-feedback form it is the RMS of all inputs, each in its unit, above the"
+        " steady input of the plant, which is zero where the plant states none. One factor scales"
+        " the gains of every other law to this effort. Before that, the laws have the rates of the"
+        " published law, and boxes and limits at the scales of the published run"
+        " (`benchmarks/field/measure.py`). Laws"
+        " with several gains, or with a choice of the published gains for another purpose, could be"
+        " tuned further; the tables compare laws at one ratio of their gains.",
+        markdown_table(
+            ["column", "meaning"],
+            [[name, meaning.format(noise=noise)] for name, meaning in COLUMNS.items()],
+        ),
+        '"left" is a run that leaves its bounds or diverges, and "step" one for which the time step'
+        " of the entry is too large.",
+        *(section(part) for part in found),
+    ]
+    return "\n\n".join(sections) + "\n"
+
+
+def published(found: list[Part]) -> list[tuple[Part, Published]]:
+    """The published numbers of all entries."""
+    return [(part, number) for part in found for number in part.contents.published]
+
+
+def summary(found: list[Part]) -> str:
+    """One row for each entry."""
+    headings = [
+        "entry",
+        "year",
+        "plant",
+        "method",
+        "levels",
+        "read",
+        "published",
+        "reached",
+        "best law",
+        "error, noise",
+        "error",
+    ]
+    rows = []
+    for part in sorted(found, key=lambda part: (part.contents.source.year, part.name)):
+        contents = part.contents
+        first_author = contents.source.authors.split(",")[0]
+        rows.append(
+            [
+                f"[{escaped(first_author)}](gallery/{part.name}.md): {escaped(contents.title)}",
+                str(contents.source.year),
+                contents.plant,
+                contents.method,
+                str(part.computed["levels"]),
+                READ[contents.source.read],
+                *published_and_reached(part),
+                *best_law(part),
+            ]
+        )
+    return markdown_table(headings, rows)
+
+
+def published_and_reached(part: Part) -> tuple[str, str]:
+    """The first published number and the reached one, or the number of statements that hold."""
+    numbers = part.contents.published
+    if not numbers:
+        holds = part.computed["holds"].values()
+        return f"{len(holds)} of its statements", f"{sum(holds)} hold"
+    first = numbers[0]
+    further = f" and {len(numbers) - 1} more" if len(numbers) > 1 else ""
+    value = part.computed["reached"][first.quantity]
+    return f"{escaped(first.quantity)}: {first.value:g}{further}", f"{value:.4g}"
+
+
+def best_law(part: Part) -> tuple[str, str, str]:
+    """The law with the smallest error at equal effort and with noise, and its errors with and
+    without noise as shares of those of the published law.
+    """
+    if part.result is None:
+        return "not measured", "", ""
+    rows = {row["law"]: row for row in part.result["rows"]}
+    with_noise, without = (column(part.result, start) for start in (NOISE, ERROR))
+    inside = {
+        name: row[with_noise]
+        for name, row in rows.items()
+        if name != PUBLISHED and isinstance(row[with_noise], float) and row["factor"] != "own"
+    }
+    if not inside:
+        return "none at equal effort", "", ""
+    best = min(inside, key=lambda name: inside[name])
+    own = rows[PUBLISHED]
+    shares = [_share(rows[best][name], own[name]) for name in (with_noise, without)]
+    return best, *shares
+
+
+def _share(value: Any, own: Any) -> str:
+    """An error as a share of that of the published law."""
+    if not isinstance(own, float):
+        return f"the published law {own}"
+    if not isinstance(value, float):
+        return str(value)
+    return f"{value / own:.2g}"
+
+
+def column(result: dict[str, Any], start: str) -> str:
+    """The column whose name begins so."""
+    return next(name for name in result["rows"][0] if name.startswith(start))
+
+
+def section(part: Part) -> str:
+    """The table of an entry."""
+    heading = f"### {part.contents.title}"
+    if part.result is None:
+        return (
+            f"{heading}\n\n{part.link} is not measured yet:"
+            f" `python benchmarks/field/measure.py {part.name}`."
+        )
+    result = part.result
+    columns = list(result["rows"][0])
+    rows = [[_cell(row[name]) for name in columns] for row in result["rows"]]
+    words = [
+        f"{part.link}; {result['duration']:g} s with a step of {result['dt']:g} s; the effort is"
+        f" that of the {result['input']}.",
+        _uncertain(result),
+    ]
+    reasons = [f"{name}: {escaped(why)}" for name, why in result["not_applicable"].items()]
+    if reasons:
+        words.append("Not in the table: " + "; ".join(reasons) + ".")
+    machine = result["machine"]
+    where = (
+        f"`{result['command']}`; {machine['processor']}, {machine['cores']} cores, Python"
+        f" {machine['python']}, jax {machine['jax']}, {machine['date']}."
+    )
+    return "\n\n".join([heading, " ".join(words), markdown_table(columns, rows), where])
+
+
+def _uncertain(result: dict[str, Any]) -> str:
+    """Which parameters are uncertain, in a sentence."""
+    if not result["uncertain"]:
+        return "No parameter of the plant is uncertain."
+    return "Uncertain parameters: " + ", ".join(f"`{path}`" for path in result["uncertain"]) + "."
+
+
+def _cell(value: Any) -> str:
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
+
+
+# ---------------------------------------------------------------------------- the corrections
+
+
+def corrections_page(found: list[Part]) -> str:
+    """All corrections, grouped by what was wrong."""
+    grouped: dict[str, list[tuple[Part, Correction]]] = {kind: [] for kind in KINDS}
+    for part in found:
+        for correction in part.contents.corrected:
+            grouped[correction.kind].append((part, correction))
+    count = sum(len(group) for group in grouped.values())
+    concerned = sum(bool(part.contents.corrected) for part in found)
+    sections = [
+        "# What the literature printed, and what is correct",
+        f"{count} corrections that were necessary to reproduce {concerned} of the {len(found)}"
+        " published examples of the [benchmark of the field](field.md). Each has its evidence; the"
+        " numbers in it were computed by the script of the entry when this page was made. Some"
+        " entries were read from a public program that follows a publication; their corrections"
+        " concern this program, and the column *read* states it. The page"
+        " [Printed and corrected](theory/printed_and_corrected.md) derives the two corrections of"
+        " the paper that this package is built on.",
+    ]
+    for kind, group in grouped.items():
+        if group:
+            sections += [f"## {KINDS[kind]}", corrections_table(group)]
+    return "\n\n".join(sections) + "\n"
+
+
+def corrections_table(group: list[tuple[Part, Correction]]) -> str:
+    """The corrections of a group."""
+    rows = []
+    for part, correction in group:
+        source = part.contents.source
+        name = f"[{escaped(source.authors.split(',')[0])} {source.year}](gallery/{part.name}.md)"
+        evidence = filled(correction.evidence, part.computed["evidence"])
+        texts = [escaped(x) for x in (correction.printed, correction.corrected, evidence)]
+        rows.append([name, READ[source.read], *texts])
+    return markdown_table(["entry", "read", "printed", "corrected", "evidence"], rows)
