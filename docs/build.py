@@ -212,12 +212,13 @@ def write_versions(folder: Path) -> None:
     """Lists the versions that were built in a folder, and leads its front page to the last release,
     or to the version in development where there is none.
     """
-    built = [path.parent.name for path in folder.glob("*/objects.inv")]
-    releases = sorted((name for name in built if release_of(name)), key=Version, reverse=True)
-    others = sorted(name for name in built if name not in releases)
-    preferred = (releases + others)[0]
+    built = sorted(path.parent.name for path in folder.glob("*/objects.inv"))
+    numbered = sorted(filter(release_of, built), key=Version, reverse=True)
+    releases = [name for name in numbered if not Version(name).is_prerelease]
+    development = [name for name in built if name not in numbered]
+    preferred = (releases + development + numbered)[0]
     rows = []
-    for name in [*others, *releases]:
+    for name in [*development, *numbered]:
         label = f"{name} (last release)" if name in releases[:1] else name
         row = {"name": label, "version": name, "url": f"{name}/", "preferred": name == preferred}
         rows.append(row)

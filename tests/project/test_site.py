@@ -284,7 +284,11 @@ def test_the_gallery_shows_small_pictures_with_the_titles_as_texts(tmp_path):
 
 @pytest.mark.parametrize(
     ("built", "preferred"),
-    [(["main"], "main"), (["main", "1.2.0", "1.10.0", "1.10.0rc1"], "1.10.0")],
+    [
+        (["main"], "main"),
+        (["main", "1.0.0rc1"], "main"),
+        (["main", "1.2.0", "1.10.0", "1.11.0rc1"], "1.10.0"),
+    ],
 )
 def test_the_front_page_leads_to_the_last_release(built, preferred, tmp_path):
     for name in [*built, "not_a_version"]:
@@ -295,6 +299,8 @@ def test_the_front_page_leads_to_the_last_release(built, preferred, tmp_path):
     rows = json.loads((tmp_path / "switcher.json").read_text())
     assert {row["version"] for row in rows} == set(built)
     assert [row["version"] for row in rows if row["preferred"]] == [preferred]
+    last = [row["version"] for row in rows if row["name"].endswith("(last release)")]
+    assert last == [name for name in [preferred] if name != "main"]
     assert f"url={preferred}/index.html" in (tmp_path / "index.html").read_text()
 
 
