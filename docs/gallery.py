@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import entry_tables
+from alt_text import describe
 from matplotlib import pyplot
 from matplotlib.figure import Figure
 
@@ -110,7 +111,8 @@ def _executed(script: Path, name: str, title: str) -> tuple[list[str], list[Path
             for variable, value in list(names.items()):
                 if id(value) not in seen and (found := _picture(value, f"{name}_{variable}")):
                     pictures.append(found)
-                    lines += [f"![{title}: {variable}]({found.name})", ""]
+                    shown = describe(value) if isinstance(value, Figure) else "animation"
+                    lines += [f"![{title}: {shown}]({found.name})", ""]
             if printed.getvalue().strip():
                 lines += ["```text", printed.getvalue().rstrip(), "```", ""]
     finally:
