@@ -1,4 +1,4 @@
-"""The printed law and observer in NumPy and SciPy, with the derivative of alpha by a complex step."""
+"""The printed law and observer in NumPy and SciPy; the derivative of alpha by a complex step."""
 
 from pathlib import Path
 
