@@ -50,11 +50,11 @@ def source_in_words(entry: Entry) -> str:
     source = entry.source
     text = (
         f"{escaped(source.authors)}, {escaped(source.title)}, {escaped(source.where)}"
-        f" ([{source.doi or 'link'}]({source.link}))."
+        f" ([{source.link.removeprefix('https://')}]({source.link}))."
     )
     if source.code:
         text += f" Public program: <{source.code}>."
-    return f"{text} The numbers of this page were read from {READ[source.read]}."
+    return f"{text} Source of the numbers: {READ[source.read]}."
 
 
 def before_the_script(entry: Entry, made: Reproduction) -> list[str]:

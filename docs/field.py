@@ -65,6 +65,13 @@ class Part(NamedTuple):
         """The entry's title, as a link to its page."""
         return f"[{escaped(self.contents.title)}](gallery/{self.name}.md)"
 
+    @property
+    def short_link(self) -> str:
+        """The first author and the year, as a link to the entry's page."""
+        source = self.contents.source
+        author = escaped(source.authors.split(",")[0])
+        return f"[{author} {source.year}](gallery/{self.name}.md)"
+
 
 def parts(results: Path = RESULTS, made: Path = gallery.MADE) -> list[Part]:
     """All entries."""
@@ -140,13 +147,11 @@ def summary(found: list[Part]) -> str:
     """One row for each entry."""
     headings = [
         "entry",
-        "year",
         "plant",
         "method",
         "levels",
         "read",
-        "published",
-        "reached",
+        "published and reached",
         "best law",
         "error, noise",
         "error",
@@ -154,32 +159,37 @@ def summary(found: list[Part]) -> str:
     rows = []
     for part in sorted(found, key=lambda part: (part.contents.source.year, part.name)):
         contents = part.contents
-        first_author = contents.source.authors.split(",")[0]
         rows.append(
             [
-                f"[{escaped(first_author)}](gallery/{part.name}.md): {escaped(contents.title)}",
-                str(contents.source.year),
+                part.short_link,
                 contents.plant,
                 contents.method,
                 str(part.computed["levels"]),
                 READ[contents.source.read],
-                *published_and_reached(part),
+                published_and_reached(part),
                 *best_law(part),
             ]
         )
     return markdown_table(headings, rows)
 
 
-def published_and_reached(part: Part) -> tuple[str, str]:
-    """The first published number and the reached one, or the number of statements that hold."""
+def published_and_reached(part: Part) -> str:
+    """The first published number and the reached one, and how many numbers and statements there
+    are.
+    """
     numbers = part.contents.published
-    if not numbers:
-        holds = part.computed["holds"].values()
-        return f"{len(holds)} of its statements", f"{sum(holds)} hold"
-    first = numbers[0]
-    further = f" and {len(numbers) - 1} more" if len(numbers) > 1 else ""
-    value = part.computed["reached"][first.quantity]
-    return f"{escaped(first.quantity)}: {first.value:g}{further}", f"{value:.4g}"
+    holds = part.computed["holds"].values()
+    texts = []
+    if numbers:
+        first = numbers[0]
+        value = part.computed["reached"][first.quantity]
+        texts.append(f"{escaped(first.quantity)}: {first.value:g}, reached {value:.4g}")
+    if len(numbers) > 1:
+        reached = [is_reached(x, part.computed["reached"][x.quantity]) for x in numbers]
+        texts.append(f"{sum(reached)} of {len(numbers)} numbers")
+    if holds:
+        texts.append(f"{sum(holds)} of {len(holds)} statements hold")
+    return "; ".join(texts)
 
 
 def best_law(part: Part) -> tuple[str, str, str]:
@@ -286,9 +296,7 @@ def corrections_table(group: list[tuple[Part, Correction]]) -> str:
     """The corrections of a group."""
     rows = []
     for part, correction in group:
-        source = part.contents.source
-        name = f"[{escaped(source.authors.split(',')[0])} {source.year}](gallery/{part.name}.md)"
         evidence = filled(correction.evidence, part.computed["evidence"])
         texts = [escaped(x) for x in (correction.printed, correction.corrected, evidence)]
-        rows.append([name, READ[source.read], *texts])
+        rows.append([part.short_link, READ[part.contents.source.read], *texts])
     return markdown_table(["entry", "read", "printed", "corrected", "evidence"], rows)

@@ -25,10 +25,10 @@ RESULTS = FOLDER / "results"
 FAMILIES = ("robot", "flexible joint", "drive", "vessel", "vehicle", "strict feedback")
 METHODS = ("barrier", "prescribed performance", "constrained")
 READ = {
-    "article": "the article",
-    "program": "the authors' program",
-    "thesis": "a thesis",
-    "secondary": "a program of others",
+    "article": "article",
+    "program": "program of the authors",
+    "thesis": "thesis",
+    "secondary": "program of others",
 }
 """Value of `source.read` -> what was read, in words."""
 KINDS = {

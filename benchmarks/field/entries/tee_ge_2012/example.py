@@ -79,8 +79,8 @@ class ModelFilter:
         first = context.tube(t)
         alpha = barrier.virtual_velocity(first, x[0], k, None) - f[0]
         rate = (alpha - state) / self.mu
-        side, still = jnp.full_like(alpha, 2.5), jnp.zeros_like(alpha)
-        second = ij.bounds.Tube(alpha, rate, -side, side, still, still)
+        side, zero = jnp.full_like(alpha, 2.5), jnp.zeros_like(alpha)
+        second = ij.bounds.Tube(alpha, rate, -side, side, zero, zero)
         exchange = barrier.error_over_slope(second, x[1]) * barrier.slope(first, x[0])
         u = (barrier.virtual_velocity(second, x[1], k, None) - exchange - f[1]) / G[1]
         V = barrier.value(first, x[0]) + barrier.value(second, x[1])
