@@ -590,8 +590,9 @@ def outcomes(chosen, processes, out, command, options):
         for folder in chosen:
             yield folder.name, reason_of(lambda folder=folder: call(folder))
         return
-    # One thread of a kernel for each process; JAX hangs in processes that are forked.
-    os.environ.setdefault("IBLF_JAX_THREADS", str(max(1, (os.cpu_count() or 1) // processes)))
+    # A few threads of a kernel for each process; the last entries use what the others leave.
+    os.environ.setdefault("IBLF_JAX_THREADS", str(max(2, (os.cpu_count() or 1) // processes)))
+    # JAX hangs in processes that are forked.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(processes, mp_context=context, max_tasks_per_child=1) as pool:
         started = {pool.submit(call, folder): folder.name for folder in chosen}
