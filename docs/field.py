@@ -42,7 +42,8 @@ COLUMNS = {
     " distance between these bounds; many runs have their least distance at the start",
     "..., parameters": "the worse of two plants whose uncertain parameters are 0.8 and 1.2 times"
     " those of the entry; the model of the law is the one of the entry",
-    "..., 500 Hz": "law and observer run once in 2 ms and read exact sensors",
+    "..., 500 Hz": "law and observer run once in 2 ms, or in the nearest whole number of steps, and"
+    " read exact sensors",
     "..., noise": "the same with white noise on every level; its standard deviation is {noise:g}"
     " times half the least distance between the bounds, and on the further levels {noise:g} times"
     " their largest value in the published run",

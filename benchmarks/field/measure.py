@@ -16,7 +16,8 @@ law are scaled by one factor to this effort (`ij.compare`).  Columns:
   distance of these bounds; bounds of the first level at every step, others at the recorded samples.
 - `error, parameters`, `margin, parameters`: the worse of two plants whose uncertain parameters are
   0.8 and 1.2 times those of the entry; the model is the one of the entry.
-- `error, 500 Hz`, `margin, 500 Hz`: law and observer run once in 2 ms and read exact sensors.
+- `error, 500 Hz`, `margin, 500 Hz`: law and observer run once in 2 ms, or in the nearest whole
+  number of steps, and read exact sensors.
 - `error, noise`, `margin, noise`: the same with white noise on every level, whose standard
   deviation is `NOISE` times half the least distance of the bounds, and of the further levels
   `NOISE` times their largest value in the published run.
