@@ -74,7 +74,7 @@ cases = {
     "without k1": ij.with_parameters(scenario, {"controller.k1": 0.0}),
     "without the dead zone": ij.with_parts(scenario, actuator=ij.actuators.Ideal()),
 }
-runs = {name: ij.simulate(case, duration=20.0, dt=1e-4) for name, case in cases.items()}
+runs = {name: ij.simulate(case, duration=20.0, dt=2e-4) for name, case in cases.items()}
 data = np.loadtxt(Path(__file__).with_name("data.csv"), delimiter=",", skiprows=1)
 t = data[:, 0]
 run = runs["published"]
