@@ -129,6 +129,7 @@ evidence = {
     "integrator": np.abs(run.controller_state[:, 0]).max(),
     "sampled": 1e3 * np.abs(sampled("published, gains 50")[:, 0]).max(),
     "continuous": 1e3 * largest["published, gains 50"][0],
+    "last_crossing": np.asarray(run.t)[(np.asarray(run.tau) <= 0.0).any(axis=1)].max(),
     "least_command": np.asarray(run.tau)[late].min() + UPPER,
     "offset": 1e6 * UPPER * BOUND**2,
     "late": 1e6 * np.abs(run.e1[late]).max(),
