@@ -74,7 +74,7 @@ cases = {
     "without k1": ij.with_parameters(scenario, {"controller.k1": 0.0}),
     "without the dead zone": ij.with_parts(scenario, actuator=ij.actuators.Ideal()),
 }
-runs = {name: ij.simulate(case, duration=20.0, dt=1e-4) for name, case in cases.items()}
+runs = {name: ij.simulate(case, duration=20.0, dt=2e-4) for name, case in cases.items()}
 data = np.loadtxt(Path(__file__).with_name("data.csv"), delimiter=",", skiprows=1)
 t = data[:, 0]
 run = runs["published"]
@@ -129,6 +129,7 @@ evidence = {
     "integrator": np.abs(run.controller_state[:, 0]).max(),
     "sampled": 1e3 * np.abs(sampled("published, gains 50")[:, 0]).max(),
     "continuous": 1e3 * largest["published, gains 50"][0],
+    "last_crossing": np.asarray(run.t)[(np.asarray(run.tau) <= 0.0).any(axis=1)].max(),
     "least_command": np.asarray(run.tau)[late].min() + UPPER,
     "offset": 1e6 * UPPER * BOUND**2,
     "late": 1e6 * np.abs(run.e1[late]).max(),
