@@ -261,6 +261,8 @@ def main() -> int:
         str(HTML / name),
     ]
     code = subprocess.run(command, check=False).returncode
+    # MyST-NB stores its pictures beside the output folder; Sphinx has copied them into it.
+    shutil.rmtree(HTML / "jupyter_execute", ignore_errors=True)
     wrong = links.faults(HTML / name)
     print("\n".join(wrong))
     if code or wrong:
