@@ -114,7 +114,10 @@ def _faults_of_script(script: Path) -> list[str]:
     found = []
     count = len(text.splitlines())
     if count > MOST_LINES:
-        found.append(f"example.py has {count} lines; shorten it to {MOST_LINES}")
+        found.append(
+            f"example.py has {count} lines; shorten it to {MOST_LINES}: numbers can stand in"
+            " scenario.toml or in a csv file, and checks of formulas in independent.py"
+        )
     try:
         words = ast.get_docstring(ast.parse(text)) or ""
     except SyntaxError:
@@ -277,6 +280,13 @@ def _faults_of_independent(folder: Path) -> list[str]:
     return [f"independent.py: compare() gives {difference:.3g}, where {allowed:g} is allowed"]
 
 
+def computed_numbers(folder: Path) -> list[str]:
+    """What the scripts of a correct entry computed, one line each."""
+    made = execute(folder)
+    numbers = {**made.reached, **made.evidence}
+    return [f"{name} = {float(value):.6g}" for name, value in numbers.items()]
+
+
 def main() -> int:
     """Checks the named entries."""
     parser = argparse.ArgumentParser(
@@ -294,8 +304,8 @@ def main() -> int:
         found = faults_of(folder)
         faulty += bool(found)
         print(f"{folder.name}: {'correct' if not found else f'{len(found)} to repair'}", flush=True)
-        for fault in found:
-            print(f"  - {fault}")
+        for line in found or computed_numbers(folder):
+            print(f"  - {line}")
     print(f"{len(chosen) - faulty} of {len(chosen)} entries are correct")
     return faulty
 

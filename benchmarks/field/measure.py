@@ -23,7 +23,8 @@ law are scaled by one factor to this effort (`ij.compare`).  Columns:
   `NOISE` times their largest value in the published run.
 
 "left" is a run that leaves its bounds or diverges, and "step" one for which the entry's time step
-is too large.  The results go to results/NAME.json, after each law.
+is too large.  With `--quick` or `--only` the results go to a temporary folder unless `--out` names
+one.  The results go to results/NAME.json, after each law.
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ import multiprocessing
 import os
 import shlex
 import sys
+import tempfile
 import warnings
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -507,8 +509,6 @@ def measure(
     reasons = {name: words for name, words in chosen.items() if isinstance(words, str)}
     reasons |= made.not_applicable
     applicable = [name for name in chosen if name not in reasons]
-    if quick:
-        applicable = applicable[:QUICK_LAWS]
     headings = columns(task.scenario)
     result = {
         "title": contents.title,
@@ -524,6 +524,8 @@ def measure(
         "not_applicable": reasons,
     }
     for name in only or applicable:
+        if quick and len(result["rows"]) == QUICK_LAWS:
+            break
         try:
             found = row(name, chosen[name], task, uncertain)
         except ValueError as error:
@@ -569,15 +571,20 @@ def main() -> int:
     parser.add_argument("names", nargs="*", metavar="NAME", help="entries; all if none is given")
     parser.add_argument("--quick", action="store_true", help="0.1 s of motion, two laws")
     parser.add_argument("--processes", type=int, default=1, help="entries at the same time")
-    parser.add_argument("--out", type=Path, default=entry.RESULTS, help="folder of the results")
+    parser.add_argument("--out", type=Path, help="folder of the results")
     parser.add_argument("--only", nargs="+", metavar="LAW", help="these rows")
     args = parser.parse_args()
     chosen = [entry.ENTRIES / name for name in args.names] or entry.folders()
     words = [*args.names, *(["--quick"] if args.quick else [])]
     command = shlex.join(["python", "benchmarks/field/measure.py", *words])
     options = {"quick": args.quick, "only": args.only}
+    out = args.out or entry.RESULTS
+    if args.out is None and (args.quick or args.only):
+        # A part of a measurement must not take the place of an entire one.
+        out = Path(tempfile.mkdtemp())
+        print(f"parts of a measurement are written to {out}")
     failed = 0
-    for name, error in outcomes(chosen, args.processes, args.out, command, options):
+    for name, error in outcomes(chosen, args.processes, out, command, options):
         failed += error is not None
         print(f"{name}: {'measured' if error is None else f'failed: {error}'}", flush=True)
     print(f"{len(chosen) - failed} of {len(chosen)} entries measured")

@@ -463,5 +463,6 @@ def _infeasible(result: Rollout, steps: int) -> ValueError:
         f"a value inside the bounds ({float(lower[sample, joint]):.6g},"
         f" {float(upper[sample, joint]):.6g}) at {where}",
         "The reference must stay strictly inside the bounds (Assumption 2): move it, widen the"
-        " bounds or shorten the run.",
+        " bounds or shorten the run. A law that keeps the bounds whatever the reference is has"
+        " filters = True, and its Command a slack.",
     )
