@@ -17,6 +17,8 @@ import warnings
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from matplotlib import pyplot
+
 FOLDER = Path(__file__).resolve().parent
 ROOT = FOLDER.parents[1]
 ENTRIES = FOLDER / "entries"
@@ -270,9 +272,17 @@ def execute(folder: Path) -> Reproduction:
     Raises:
       EntryError: a name is missing.
     """
-    with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
-        warnings.simplefilter("ignore")  # runs that leave their bounds are part of some examples
-        return reproduction(runpy.run_path(str(folder / "example.py")))
+    before = set(pyplot.get_fignums())
+    try:
+        with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+            warnings.simplefilter(
+                "ignore"
+            )  # runs that leave their bounds are part of some examples
+            return reproduction(runpy.run_path(str(folder / "example.py")))
+    finally:
+        # A figure that is closed can still be saved and drawn.
+        for number in set(pyplot.get_fignums()) - before:
+            pyplot.close(number)
 
 
 def reproduction(names: dict[str, Any]) -> Reproduction:

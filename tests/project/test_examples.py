@@ -78,9 +78,9 @@ def test_files_that_the_documentation_names_are_there():
     named = {name for text in texts for name in re.findall(r"examples/[\w.]+\w", text)}
     assert {f"examples/{name}" for name in (*COMMANDS, "arm.urdf")} - named <= {"examples/arm.toml"}
     assert all((ROOT / name).exists() for name in named)
-    assert not [
-        text for text in texts if re.search(r"STUDY\.toml|SWEEP\.toml|TUNE\.toml|iblf_jax\[", text)
-    ]
+    lines = [line for text in texts for line in text.splitlines() if "Warning: " not in line]
+    forbidden = r"STUDY\.toml|SWEEP\.toml|TUNE\.toml|iblf_jax\["
+    assert not [line for line in lines if re.search(forbidden, line)]
 
 
 MATLAB_PAGE = (ROOT / "docs" / "how_to" / "from_matlab.md").read_text(encoding="utf-8")
