@@ -59,6 +59,9 @@ def _words(text: str) -> str:
     text = re.sub(r"\\dot\{?(\w)\}?", r"\1'", text)
     text = re.sub(r"\\ddot\{?(\w)\}?", r"\1''", text)
     text = re.sub(r"\\(?:mathrm|text|partial)\b\s*", "", text).strip().replace("\n", ", ")
+    text = re.sub(r"\\(?:leq|le)\b|<=", " at most ", text)
+    text = re.sub(r"\\(?:geq|ge)\b|>=", " at least ", text)
+    text = re.sub(r"\|([^|\s][^|]*)\|", r"abs(\1)", text)
     text = text.replace("[", "(").replace("]", ")")
     return " ".join(re.sub(r"[$\\{}|`*<>]", " ", text).split())
 

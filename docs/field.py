@@ -29,6 +29,8 @@ from entry_tables import escaped, markdown_table
 
 PUBLISHED = "published law"
 """The row of the law that sets the effort."""
+MANY = 100
+"""A published law whose error grows by this factor with noise is named below the table."""
 ERROR, NOISE = "error [", "error, noise ["
 """Beginnings of the columns of the largest error, and of that with noise."""
 COLUMNS = {
@@ -118,7 +120,7 @@ def benchmark_page(found: list[Part]) -> str:
         " effort of the published law, sampled at 500 Hz with noise, and its errors with and"
         " without noise as shares of those of the published law. Without noise many of these tasks"
         " have an exact model and no disturbance, so that errors tend to zero under every law and"
-        " their ratio states how fast.",
+        " their ratio states how fast." + noisy_laws(measured),
         "## Comparison on each task",
         "The published law sets the effort: the RMS input above the one that balances gravity. For"
         " a plant in strict-feedback form it is the RMS of all inputs, each in its unit, above the"
@@ -214,6 +216,29 @@ def best_law(part: Part) -> tuple[str, str, str]:
     return best, *shares
 
 
+def noisy_laws(measured: list[Part]) -> str:
+    """The published laws whose error is many times larger with noise, in a sentence; "" if there
+    are none. Their rows have a small share with noise beside a large one without.
+    """
+    listed = []
+    for part in measured:
+        own = next(row for row in part.result["rows"] if row["law"] == PUBLISHED)
+        noise, error = column(part.result, NOISE), column(part.result, ERROR)
+        values = own[noise], own[error]
+        if not all(isinstance(value, float) for value in values):
+            continue
+        if values[0] > MANY * values[1]:
+            unit = error.removeprefix(ERROR).rstrip("]")
+            listed.append(f"{part.short_link} {values[0]:.3g} {unit} instead of {values[1]:.2g}")
+    if not listed:
+        return ""
+    return (
+        " A share with noise that is far below the one without noise means that the published law"
+        f" loses its accuracy at 500 Hz with noise. Its error grows by more than {MANY} times in"
+        f" these entries: {'; '.join(listed)}."
+    )
+
+
 def _share(value: Any, own: Any) -> str:
     """An error as a share of that of the published law."""
     if not isinstance(own, float):
@@ -284,8 +309,8 @@ def corrections_page(found: list[Part]) -> str:
         " numbers in it were computed by the script of the entry when this page was made. Some"
         " entries were read from a public program that follows a publication; their corrections"
         " concern this program, and the column *read* states it. The page"
-        " [Printed and corrected](theory/printed_and_corrected.md) derives the two corrections of"
-        " the paper that this package is built on.",
+        " [Printed and corrected](theory/printed_and_corrected.md) derives the corrections of the"
+        " law and of the observer of the paper that this package is built on.",
     ]
     for kind, group in grouped.items():
         if group:
