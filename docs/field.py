@@ -30,7 +30,8 @@ from entry_tables import escaped, markdown_table
 PUBLISHED = "published law"
 """The row of the law that sets the effort."""
 MANY = 100
-"""A published law whose error grows by this factor with noise is named below the table."""
+"""A published law is named below the table where the share of the best law with noise is smaller
+than that without by this factor."""
 ERROR, NOISE = "error [", "error, noise ["
 """Beginnings of the columns of the largest error, and of that with noise."""
 COLUMNS = {
@@ -201,41 +202,59 @@ def best_law(part: Part) -> tuple[str, str, str]:
     """
     if part.result is None:
         return "not measured", "", ""
-    rows = {row["law"]: row for row in part.result["rows"]}
-    with_noise, without = (column(part.result, start) for start in (NOISE, ERROR))
-    inside = {
-        name: row[with_noise]
-        for name, row in rows.items()
-        if name != PUBLISHED and isinstance(row[with_noise], float) and row["factor"] != "own"
-    }
-    if not inside:
+    best = _name_of_best(part.result)
+    if best is None:
         return "none at equal effort", "", ""
-    best = min(inside, key=lambda name: inside[name])
-    own = rows[PUBLISHED]
-    shares = [_share(rows[best][name], own[name]) for name in (with_noise, without)]
+    rows = {row["law"]: row for row in part.result["rows"]}
+    columns = [column(part.result, start) for start in (NOISE, ERROR)]
+    shares = [_share(rows[best][name], rows[PUBLISHED][name]) for name in columns]
     return best, *shares
 
 
+def _name_of_best(result: dict[str, Any]) -> str | None:
+    """The law with the smallest error at equal effort and with noise; None if there is none."""
+    with_noise = column(result, NOISE)
+    inside = {
+        row["law"]: row[with_noise]
+        for row in result["rows"]
+        if row["law"] != PUBLISHED and isinstance(row[with_noise], float) and row["factor"] != "own"
+    }
+    if not inside:
+        return None
+    return min(inside, key=lambda name: inside[name])
+
+
 def noisy_laws(measured: list[Part]) -> str:
-    """The published laws whose error is many times larger with noise, in a sentence; "" if there
-    are none. Their rows have a small share with noise beside a large one without.
+    """The rows whose share with noise is many times smaller than that without, and the errors of
+    the published law that cause it, in a sentence; "" if there are none.
     """
-    listed = []
-    for part in measured:
-        own = next(row for row in part.result["rows"] if row["law"] == PUBLISHED)
-        noise, error = column(part.result, NOISE), column(part.result, ERROR)
-        values = own[noise], own[error]
-        if not all(isinstance(value, float) for value in values):
-            continue
-        if values[0] > MANY * values[1]:
-            unit = error.removeprefix(ERROR).rstrip("]")
-            listed.append(f"{part.short_link} {values[0]:.3g} {unit} instead of {values[1]:.2g}")
+    listed = [text for part in measured if (text := _loss_with_noise(part))]
     if not listed:
         return ""
     return (
-        " A share with noise that is far below the one without noise means that the published law"
-        f" loses its accuracy at 500 Hz with noise. Its error grows by more than {MANY} times in"
-        f" these entries: {'; '.join(listed)}."
+        f" A share with noise that is more than {MANY} times smaller than that without means that"
+        " the published law loses its accuracy at 500 Hz with noise, and the best law does not:"
+        f" {'; '.join(listed)}."
+    )
+
+
+def _loss_with_noise(part: Part) -> str:
+    """The errors of a published law that loses its accuracy with noise, "" for other laws."""
+    best = _name_of_best(part.result)
+    rows = {row["law"]: row for row in part.result["rows"]}
+    if best is None:
+        return ""
+    noise, error = (column(part.result, start) for start in (NOISE, ERROR))
+    values = [rows[law][name] for law in (PUBLISHED, best) for name in (noise, error)]
+    if not all(isinstance(value, float) for value in values):
+        return ""
+    own_noise, own_error, best_noise, best_error = values
+    if MANY * best_noise * own_error >= best_error * own_noise:
+        return ""
+    unit = error.removeprefix(ERROR).rstrip("]")
+    return (
+        f"the published law of {part.short_link} has an error of {own_noise:.3g} {unit} with noise"
+        f" and {own_error:.2g} {unit} without"
     )
 
 

@@ -279,6 +279,10 @@ def test_the_text_of_a_figure_names_quantities_curves_and_colours():
         (r"then $|e_1| \leq 0.0004$ rad", "then abs(e_1) at most 0.0004 rad"),
         ("|xi| <= 1, |e| >= 0", "abs(xi) at most 1, abs(e) at least 0"),
         ("a | b | c", "a b c"),
+        (
+            "first 2 s: the transient,\nthen $|f - \\hat f|$",
+            "first 2 s: the transient, then abs(f - f_hat)",
+        ),
         (r"$k_{l} \left| x \right.$", "k_ l left x right."),
     ],
 )
