@@ -55,10 +55,14 @@ def _legend(axes: Axes) -> list[str]:
 
 def _words(text: str) -> str:
     """A label on one line, without the marks of mathematical text and of Markdown."""
-    text = re.sub(r"\\(hat|tilde|bar)\{?(\w)\}?", r"\2_\1", text)
+    text = re.sub(r"\\(hat|tilde|bar)\s*\{?(\w)\}?", r"\2_\1", text)
     text = re.sub(r"\\dot\{?(\w)\}?", r"\1'", text)
     text = re.sub(r"\\ddot\{?(\w)\}?", r"\1''", text)
-    text = re.sub(r"\\(?:mathrm|text|partial)\b\s*", "", text).strip().replace("\n", ", ")
+    text = re.sub(r"\\(?:mathrm|text|partial)\b\s*", "", text).strip()
+    text = re.sub(r",?\n", ", ", text)
+    text = re.sub(r"\\(?:leq|le)\b|<=", " at most ", text)
+    text = re.sub(r"\\(?:geq|ge)\b|>=", " at least ", text)
+    text = re.sub(r"\|([^|\s][^|]*)\|", r"abs(\1)", text)
     text = text.replace("[", "(").replace("]", ")")
     return " ".join(re.sub(r"[$\\{}|`*<>]", " ", text).split())
 

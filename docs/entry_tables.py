@@ -68,7 +68,7 @@ def before_the_script(entry: Entry, made: Reproduction) -> list[str]:
     if entry.published:
         parts += ["## Published and reached", published(entry, made.reached)]
     if entry.claims:
-        parts += ["## Published statements", claims(entry, made.holds)]
+        parts += ["## Published statements", claims(entry, made)]
     parts.append("## Script")
     return parts
 
@@ -102,13 +102,20 @@ def published(entry: Entry, reached: dict[str, float]) -> str:
     return markdown_table(["quantity", "published", "reached", "tolerance", "where"], rows)
 
 
-def claims(entry: Entry, holds: dict[str, bool]) -> str:
-    """The published statements, and whether they hold in the run."""
+def claims(entry: Entry, made: Reproduction) -> str:
+    """The published statements, whether they hold in the run, and, where the script gives them, the
+    numbers that decide it.
+    """
     rows = []
     for claim in entry.claims:
-        answer = "yes" if holds[claim.statement] else "no"
-        rows.append([escaped(claim.statement), answer, escaped(claim.where)])
-    return markdown_table(["statement", "holds", "where"], rows)
+        answer = "yes" if made.holds[claim.statement] else "no"
+        detail = made.details.get(claim.statement, "")
+        rows.append([escaped(x) for x in (claim.statement, answer, detail, claim.where)])
+    headings = ["statement", "holds", "numbers and criterion", "where"]
+    if made.details:
+        return markdown_table(headings, rows)
+    without_details = [[*row[:2], row[3]] for row in rows]
+    return markdown_table([*headings[:2], headings[3]], without_details)
 
 
 def computed(made: Reproduction) -> str:

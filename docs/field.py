@@ -29,6 +29,9 @@ from entry_tables import escaped, markdown_table
 
 PUBLISHED = "published law"
 """The row of the law that sets the effort."""
+MANY = 100
+"""A published law is named below the table where the share of the best law with noise is smaller
+than that without by this factor."""
 ERROR, NOISE = "error [", "error, noise ["
 """Beginnings of the columns of the largest error, and of that with noise."""
 COLUMNS = {
@@ -118,7 +121,7 @@ def benchmark_page(found: list[Part]) -> str:
         " effort of the published law, sampled at 500 Hz with noise, and its errors with and"
         " without noise as shares of those of the published law. Without noise many of these tasks"
         " have an exact model and no disturbance, so that errors tend to zero under every law and"
-        " their ratio states how fast.",
+        " their ratio states how fast." + noisy_laws(measured),
         "## Comparison on each task",
         "The published law sets the effort: the RMS input above the one that balances gravity. For"
         " a plant in strict-feedback form it is the RMS of all inputs, each in its unit, above the"
@@ -199,19 +202,60 @@ def best_law(part: Part) -> tuple[str, str, str]:
     """
     if part.result is None:
         return "not measured", "", ""
+    best = _name_of_best(part.result)
+    if best is None:
+        return "none at equal effort", "", ""
     rows = {row["law"]: row for row in part.result["rows"]}
-    with_noise, without = (column(part.result, start) for start in (NOISE, ERROR))
+    columns = [column(part.result, start) for start in (NOISE, ERROR)]
+    shares = [_share(rows[best][name], rows[PUBLISHED][name]) for name in columns]
+    return best, *shares
+
+
+def _name_of_best(result: dict[str, Any]) -> str | None:
+    """The law with the smallest error at equal effort and with noise; None if there is none."""
+    with_noise = column(result, NOISE)
     inside = {
-        name: row[with_noise]
-        for name, row in rows.items()
-        if name != PUBLISHED and isinstance(row[with_noise], float) and row["factor"] != "own"
+        row["law"]: row[with_noise]
+        for row in result["rows"]
+        if row["law"] != PUBLISHED and isinstance(row[with_noise], float) and row["factor"] != "own"
     }
     if not inside:
-        return "none at equal effort", "", ""
-    best = min(inside, key=lambda name: inside[name])
-    own = rows[PUBLISHED]
-    shares = [_share(rows[best][name], own[name]) for name in (with_noise, without)]
-    return best, *shares
+        return None
+    return min(inside, key=lambda name: inside[name])
+
+
+def noisy_laws(measured: list[Part]) -> str:
+    """The rows whose share with noise is many times smaller than that without, and the errors of
+    the published law that cause it, in a sentence; "" if there are none.
+    """
+    listed = [text for part in measured if (text := _loss_with_noise(part))]
+    if not listed:
+        return ""
+    return (
+        f" A share with noise that is more than {MANY} times smaller than that without means that"
+        " the published law loses its accuracy at 500 Hz with noise, and the best law does not:"
+        f" {'; '.join(listed)}."
+    )
+
+
+def _loss_with_noise(part: Part) -> str:
+    """The errors of a published law that loses its accuracy with noise, "" for other laws."""
+    best = _name_of_best(part.result)
+    rows = {row["law"]: row for row in part.result["rows"]}
+    if best is None:
+        return ""
+    noise, error = (column(part.result, start) for start in (NOISE, ERROR))
+    values = [rows[law][name] for law in (PUBLISHED, best) for name in (noise, error)]
+    if not all(isinstance(value, float) for value in values):
+        return ""
+    own_noise, own_error, best_noise, best_error = values
+    if MANY * best_noise * own_error >= best_error * own_noise:
+        return ""
+    unit = error.removeprefix(ERROR).rstrip("]")
+    return (
+        f"the published law of {part.short_link} has an error of {own_noise:.3g} {unit} with noise"
+        f" and {own_error:.2g} {unit} without"
+    )
 
 
 def _share(value: Any, own: Any) -> str:
@@ -284,8 +328,8 @@ def corrections_page(found: list[Part]) -> str:
         " numbers in it were computed by the script of the entry when this page was made. Some"
         " entries were read from a public program that follows a publication; their corrections"
         " concern this program, and the column *read* states it. The page"
-        " [Printed and corrected](theory/printed_and_corrected.md) derives the two corrections of"
-        " the paper that this package is built on.",
+        " [Printed and corrected](theory/printed_and_corrected.md) derives the corrections of the"
+        " law and of the observer of the paper that this package is built on.",
     ]
     for kind, group in grouped.items():
         if group:

@@ -23,8 +23,8 @@ import warnings
 from pathlib import Path
 from typing import Any
 
+import alt_text
 import entry_tables
-from alt_text import describe
 from matplotlib import pyplot
 from matplotlib.figure import Figure
 
@@ -38,6 +38,12 @@ ENTRIES = [folder / "example.py" for folder in entry.folders()]
 PAGES = [*SCRIPTS, *ENTRIES]
 MADE = ROOT / "out" / "site" / "gallery"
 DPI = 110
+GENERATORS = [Path(__file__), *(Path(module.__file__) for module in (alt_text, entry_tables))]
+"""Modules on which the text of every page depends."""
+PRECISION = (
+    "The output was computed in float64: to obtain the same numbers, put"
+    ' `import jax; jax.config.update("jax_enable_x64", True)` before the script.'
+)
 
 
 def page_name(script: Path) -> str:
@@ -47,9 +53,11 @@ def page_name(script: Path) -> str:
 
 def digest(source: Path) -> str:
     """What a page states of the script, or of the notebook, that it was made from; for an entry, of
-    its folder.
+    its folder, and for every script of the gallery also of the modules that make its page.
     """
     files = [source]
+    if source in PAGES:
+        files += GENERATORS
     if source.name == "example.py":
         files += sorted(
             path for path in source.parent.iterdir() if path.suffix in (".toml", ".csv")
@@ -73,7 +81,10 @@ def page(script: Path) -> list[Path]:
     name = page_name(script)
     title, _, rest = ast.get_docstring(ast.parse(script.read_text())).partition(": ")
     lines = [f"<!-- {digest(script)} -->", f"# {title}", "", f"{rest[0].upper()}{rest[1:]}", ""]
-    shown, pictures, defined = _executed(script, name, title)
+    executed, pictures, defined = _executed(script, name, title)
+    shown = executed
+    if "jax_enable_x64" not in script.read_text():
+        shown = [PRECISION, "", *executed]
     if script.name == "example.py":
         contents = entry.load(script.parent)
         made = entry.reproduction(defined)
@@ -111,7 +122,7 @@ def _executed(script: Path, name: str, title: str) -> tuple[list[str], list[Path
             for variable, value in list(names.items()):
                 if id(value) not in seen and (found := _picture(value, f"{name}_{variable}")):
                     pictures.append(found)
-                    shown = describe(value) if isinstance(value, Figure) else "animation"
+                    shown = alt_text.describe(value) if isinstance(value, Figure) else "animation"
                     lines += [f"![{title}: {shown}]({found.name})", ""]
             if printed.getvalue().strip():
                 lines += ["```text", printed.getvalue().rstrip(), "```", ""]

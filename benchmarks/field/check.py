@@ -236,8 +236,10 @@ def _faults_of_claims(entry: Entry, made: Reproduction) -> list[str]:
                 f"the claim {claim.statement!r} does not hold; if the publication is wrong, move it"
                 " to [[corrected]]"
             )
-    for key in sorted(set(made.holds) - {claim.statement for claim in entry.claims}):
-        found.append(f"entry.toml: no [[claims]] has the statement {key!r} of holds")
+    statements = {claim.statement for claim in entry.claims}
+    for name, found_in in (("holds", made.holds), ("details", made.details)):
+        for key in sorted(set(found_in) - statements):
+            found.append(f"entry.toml: no [[claims]] has the statement {key!r} of {name}")
     return found
 
 

@@ -167,6 +167,8 @@ class Reproduction(NamedTuple):
     holds: dict[str, bool]
     evidence: dict[str, float]
     """Numbers that the texts of the corrections refer to, by their name in braces."""
+    details: dict[str, str]
+    """Statement of a claim -> the numbers and the criterion that decide it."""
     not_applicable: dict[str, str]
     """Law -> why `measure.py` leaves it out."""
     uncertain: tuple[str, ...] | None
@@ -178,6 +180,7 @@ DEFAULTS: dict[str, Any] = {
     "reached": {},
     "holds": {},
     "evidence": {},
+    "details": {},
     "not_applicable": {},
     "uncertain": None,
 }

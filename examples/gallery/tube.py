@@ -1,4 +1,8 @@
-"""The paper's example: two joints between time-varying bounds, under the proposed law."""
+"""The paper's example: two joints between time-varying bounds, under the proposed law.
+
+[Time-varying asymmetric bounds](zhang_yan_2024.md) compares this run with a logarithmic barrier and
+checks the statements of the paper.
+"""
 
 import iblf_jax as ij
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from iblf_jax.cli._common import metrics_table, output_folder, status_and_metrics, write_json
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
     from iblf_jax.cli._claims import PaperClaim
@@ -57,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Runs the command."""
-    from iblf_jax.cli._claims import assumed, assumed_briefly, paper_claims, remark
+    from iblf_jax.cli._claims import assumed, assumed_briefly, remark
     from iblf_jax.cli._paper_figures import as_markdown, peaks, peaks_table
     from iblf_jax.core.status import FAILED, describe, has_flag
 
@@ -72,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
     assumption = assumed(runs)
     print(textwrap.fill(f"Assumed: {assumption}", 118) + "\n")
     print(metrics_table(runs) + "\n")
-    claims = paper_claims(runs)
+    claims = check_claims(runs)
     note = remark(runs)
     peaks_text = peaks_table(runs)
     print(
@@ -119,6 +120,17 @@ def _simulate_both(args: argparse.Namespace) -> tuple[dict[str, Rollout], dict[s
 
     runs, first = both()
     return runs, {"first": first, "again": both()[1]}
+
+
+def check_claims(runs: Mapping[str, Rollout]) -> list[PaperClaim]:
+    """The claims of the paper, each with the verdict and the numbers of two runs.
+
+    Args:
+      runs: two runs by name, of the integral and the logarithmic law, in this order.
+    """
+    from iblf_jax.cli._claims import paper_claims
+
+    return paper_claims(runs)
 
 
 def _print_claims(claims: list[PaperClaim], note: str) -> None:

@@ -165,6 +165,9 @@ def zhang_yan(runs):
     assert evidence["corrected"] <= evidence["start"]
     assert evidence["with_term"] < 1e-6 < 1e-3 < evidence["without_term"]
     assert evidence["equal_gains"] > evidence["equal_effort"] > 1.0
+    assert evidence["weight_two"] < 1e-12
+    assert evidence["K2"] > 0.5
+    assert evidence["kf"] > 1.0
 
 
 FURTHER = {
@@ -268,6 +271,11 @@ IN_TEXT = {
 }
 IN_SCRIPT = {
     "claim is false": ('bounds": True', 'bounds": False', "does not hold"),
+    "numbers of no claim": (
+        "holds =",
+        "details = {'x': '1 rad'}\nholds =",
+        "no [[claims]] has the statement 'x' of details",
+    ),
     "claim not decided": ("holds = {", "answers = {", "holds lacks"),
     "no figure": ("figure, axes", "picture, axes", "does not define 'figure'"),
     "no curves": ('axes.plot(runs["first"].t, runs["first"].e1)', "", "the figure has no curves"),
@@ -515,6 +523,31 @@ def test_the_page_of_the_corrections_has_all_of_them(parts):
     assert sum(line.startswith("| [") for line in page.splitlines()) == count
     assert "and with k = 1 by 0.51 rad" in page
     assert "theory/printed_and_corrected.md" in page
+
+
+def test_laws_that_lose_their_accuracy_with_noise_are_named_below_the_table(parts):
+    (measured,) = (part for part in parts if part.result)
+    assert field.noisy_laws([measured]) == ""
+    published, best, *others = RESULT["rows"]
+    published = published | {"error, noise [rad]": 250.0}
+    noisy = measured._replace(result=RESULT | {"rows": [published, best, *others]})
+    words = f"{measured.short_link} has an error of 250 rad with noise and 0.1 rad without."
+    assert words in field.noisy_laws([noisy])
+    assert words in field.benchmark_page([noisy])
+    published["error, noise [rad]"] = "left"
+    assert field.noisy_laws([noisy]) == ""
+
+
+def test_the_page_of_an_entry_has_the_numbers_that_decide_its_claims():
+    contents = entry.load(TEMPLATE)
+    (claim,) = contents.claims
+    names = {"scenario": None, "runs": {}, "figure": None, "holds": {claim.statement: True}}
+    without = entry_tables.claims(contents, entry.reproduction(names))
+    assert without.startswith("| statement | holds | where |\n")
+    names["details"] = {claim.statement: "margin |e| 0.1 rad"}
+    table = entry_tables.claims(contents, entry.reproduction(names))
+    assert table.startswith("| statement | holds | numbers and criterion | where |\n")
+    assert f"| yes | margin \\|e\\| 0.1 rad | {claim.where} |" in table
 
 
 def test_tables_of_a_page_escape_what_markdown_interprets():

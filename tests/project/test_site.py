@@ -273,6 +273,57 @@ def test_the_text_of_a_figure_names_quantities_curves_and_colours():
     assert alt_text.describe(Figure()) == "0 plots"
 
 
+@pytest.mark.parametrize(
+    ("label", "expected"),
+    [
+        (r"then $|e_1| \leq 0.0004$ rad", "then abs(e_1) at most 0.0004 rad"),
+        ("|xi| <= 1, |e| >= 0", "abs(xi) at most 1, abs(e) at least 0"),
+        ("a | b | c", "a b c"),
+        (
+            "first 2 s: the transient,\nthen $|f - \\hat f|$",
+            "first 2 s: the transient, then abs(f - f_hat)",
+        ),
+        (r"$k_{l} \left| x \right.$", "k_ l left x right."),
+    ],
+)
+def test_the_text_of_a_figure_keeps_magnitudes_and_inequalities(label, expected):
+    assert alt_text._words(label) == expected
+
+
+def test_a_page_of_the_gallery_states_its_precision(tmp_path, monkeypatch):
+    monkeypatch.setattr(gallery, "MADE", tmp_path)
+    script = tmp_path / "short.py"
+    script.write_text('"""A title: a sentence."""\n\nprint(1)\n', encoding="utf-8")
+    gallery.page(script)
+    text = (tmp_path / "short.md").read_text(encoding="utf-8")
+    assert f"A sentence.\n\n{gallery.PRECISION}\n\n```python\nprint(1)\n```" in text
+    script.write_text('"""A title: a."""\n# jax_enable_x64\nprint(1)\n', encoding="utf-8")
+    gallery.page(script)
+    assert gallery.PRECISION not in (tmp_path / "short.md").read_text(encoding="utf-8")
+
+
+def test_a_page_of_the_gallery_depends_on_the_modules_that_make_it(tmp_path, monkeypatch):
+    module = tmp_path / "module.py"
+    module.write_text("1")
+    monkeypatch.setattr(gallery, "GENERATORS", [module])
+    script = gallery.SCRIPTS[0]
+    before = gallery.digest(script)
+    module.write_text("2")
+    assert gallery.digest(script) != before
+
+
+def test_the_citation_of_the_package_is_that_of_its_citation_file():
+    page = (ROOT / "docs" / "citation.md").read_text(encoding="utf-8")
+    first = page.split("```bibtex\n")[1].split("```")[0]
+    assert first.startswith("@software{iblf_jax,")
+    cited = (ROOT / "CITATION.cff").read_text(encoding="utf-8").split("\nreferences:")[0]
+    for name, key in (("title", "title"), ("version", "version"), ("url", "repository-code")):
+        (value,) = re.findall(rf'^{key}: "?(.*?)"?$', cited, re.MULTILINE)
+        assert re.search(rf"^  {name} += \{{{re.escape(value)}\}},$", first, re.MULTILINE)
+    (year,) = re.findall(r"^date-released: (\d{4})-", cited, re.MULTILINE)
+    assert f"{{{year}}}" in first
+
+
 def test_the_gallery_shows_small_pictures_with_the_titles_as_texts(tmp_path):
     Image.new("RGB", (2000, 1000)).save(tmp_path / "run_figure.png")
     card = ":::{grid-item-card} A run\n:link: run\n:link-type: doc\n:img-top: run_figure.png\n:::\n"
