@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax import __version__
-from iblf_jax.core import checks
+from iblf_jax.core import checks, notices
 from iblf_jax.deployment.build import write_files
 from iblf_jax.deployment.c_names import Parameters
 from iblf_jax.deployment.ros2.node.supervisor import ARRIVAL_TIMEOUT, STALE_PERIODS
@@ -153,7 +153,20 @@ def _gains(scenario: Scenario, given: Any) -> tuple[GainOption, ...]:
         part = slice(block.start, block.start + block.size)
         least, most = _range_end(item.low, low[part]), _range_end(item.high, high[part])
         found.append(_gain(scenario, item, least, most))
+        if item.low is None or item.high is None:
+            _warn_of_default_range(found[-1])
     return tuple(found)
+
+
+def _warn_of_default_range(gain: GainOption) -> None:
+    """Warns that a range in which an operator may change a gain was not simulated."""
+    low, high = (np.array2string(x, precision=4) for x in (gain.low, gain.high))
+    notices.warn(
+        f"gains: {gain.path}: the range {low} to {high} has a default end, from a linear analysis"
+        " near the reference that changes one gain at a time. The loop may be unstable within it,"
+        " elsewhere or with other gains. Give limits that you have simulated:"
+        f' ij.tunable("{gain.path}", low, high).'
+    )
 
 
 def _check_tied(scenario: Scenario, item: Tunable) -> None:
