@@ -274,14 +274,19 @@ def _gain_lines(options: RosOptions) -> str:
     """The gains in the file of parameters."""
     lines = []
     for gain in options.gains:
-        numbers = gain.value.reshape(-1).tolist()
-        text = yaml_numbers(numbers)
-        if gain.tied or gain.value.ndim == 0:
-            text = yaml_number(numbers[0])
+        text = _yaml_value(gain)
         low, high = gain.low.reshape(-1).tolist(), gain.high.reshape(-1).tolist()
         limits = f"{yaml_numbers(low)} to {yaml_numbers(high)}"
         lines.append(f"    {json.dumps(gain.path)}: {text}  # [{gain.unit}], from {limits}")
     return "\n".join(lines) or "    # This law was exported without gains that can be changed."
+
+
+def _yaml_value(gain: GainOption) -> str:
+    """The value of a gain as YAML: one number, or one for each joint."""
+    numbers = gain.value.reshape(-1).tolist()
+    if gain.tied or gain.value.ndim == 0:
+        return yaml_number(numbers[0])
+    return yaml_numbers(numbers)
 
 
 def ros_files(law: Law, generated: GeneratedLaw, options: RosOptions) -> dict[str, str]:
@@ -303,6 +308,7 @@ def ros_files(law: Law, generated: GeneratedLaw, options: RosOptions) -> dict[st
         "hold_stiffness": yaml_numbers(description["hold_stiffness"]),
         "hold_damping": yaml_numbers(description["hold_damping"]),
         "gains": _gain_lines(options),
+        "set_gain": _set_gain_note(name, options),
         "n": law.scenario.n,
         "velocity": _velocity_note(description["reads_velocity"]),
     }
@@ -329,6 +335,17 @@ def ros_files(law: Law, generated: GeneratedLaw, options: RosOptions) -> dict[st
     for file, text in ros2_control_files(law, generated, description).items():
         texts[f"{controller}/{file}"] = text
     return texts
+
+
+def _set_gain_note(name: str, options: RosOptions) -> str:
+    """How a gain is changed while the node runs, in the README."""
+    if not options.gains:
+        return "This law was exported without gains that can be changed while the node runs."
+    gain = options.gains[0]
+    return (
+        "The gains among them can be changed while the node runs, within their ranges there:\n\n"
+        f"    ros2 param set /{name} {gain.path} {json.dumps(_yaml_value(gain))}"
+    )
 
 
 def _velocity_note(reads_velocity: bool) -> str:
