@@ -45,7 +45,7 @@ class Page:
 
     def save(self, path: str | Path) -> Path:
         """Writes the page, one HTML file that needs nothing else; a double click opens it.  Without
-        `ziglang`, of the extra `export`, the file says so and shows the scenario's table and figure.
+        `ziglang`, of the extra `export`, the file says so and shows the scenario's table.
         """
         path = checks.file_to_write("path", path)
         path.write_text(self.fallback or self.text, encoding="utf-8")

@@ -95,10 +95,14 @@ BY_SMALL_FACTOR = f"{1 / MAX_FACTOR:g} times its start"
 BY_STEP = "beyond it the step dt is too long for the loop"
 BY_PERIOD = "beyond it the loop is unstable at its sampling period"
 AT_START = {
-    BY_STEP: "the step dt is too long for the loop already at the start, so this end is close to it;"
-    " take a smaller dt, or give a range",
-    BY_PERIOD: "the sampled loop is unstable already at the start, so this end is close to it; start"
-    " at gains of a stable loop, or give a range",
+    BY_STEP: (
+        "the step dt is too long for the loop already at the start, so this end is close to it;"
+        " take a smaller dt, or give a range"
+    ),
+    BY_PERIOD: (
+        "the sampled loop is unstable already at the start, so this end is close to it; start at"
+        " gains of a stable loop, or give a range"
+    ),
 }
 """The reason of an end where already the start violates a condition."""
 BY_COUNT = (

@@ -133,7 +133,8 @@ def test_numbers_of_the_address_are_those_of_sliders_and_curves(two_laws, tmp_pa
 def test_values_of_the_address_that_are_not_used_are_named(tmp_path):
     page = ij.explore(ij.presets.zhang_yan_2024(), duration=0.1, dt=2e-3)
     plain, good = (
-        in_node(page, tmp_path, [{}], address)[0] for address in ("", "?controller.K2=30&initial.q[1]=0.7")
+        in_node(page, tmp_path, [{}], address)[0]
+        for address in ("", "?controller.K2=30&initial.q[1]=0.7")
     )
     assert plain["unused"] == good["unused"] == ""
     given = ["controller.K2=8,1", "controller.k1[0]=8", "observer.kf=-1", "nonsense=3", "law=none"]
@@ -222,7 +223,9 @@ def test_gains_starts_and_bounds_have_sliders(page):
     assert not re.search(r'(?:src|href)="(?!data:)', page.text)
 
 
-def test_a_notebook_shows_it_in_a_frame_and_without_a_compiler_its_figure(page, monkeypatch, tmp_path):
+def test_a_notebook_shows_it_in_a_frame_and_without_a_compiler_its_figure(
+    page, monkeypatch, tmp_path
+):
     assert page._repr_html_().startswith("<iframe srcdoc=")
 
     def missing(*_, **__):
