@@ -151,8 +151,14 @@ def _add_robot_arguments(parser: argparse.ArgumentParser, default: str | None = 
 
 
 def run(args: argparse.Namespace) -> int:
-    """Runs the command."""
-    return args.run_ros(args)  # type: ignore[no-any-return]
+    """Runs the command; 2 where a package of the extras is missing."""
+    from iblf_jax.cli import complain
+
+    try:
+        return args.run_ros(args)  # type: ignore[no-any-return]
+    except ImportError as error:
+        complain(str(error))
+        return 2
 
 
 def run_robot(args: argparse.Namespace) -> int:

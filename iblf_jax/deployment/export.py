@@ -152,7 +152,8 @@ def export(
         "iblf_law" or "iblf_loop" if not given.
       dt, method, seed: of a closed loop, as in `simulate`.
       gains: of a ROS 2 package, the gains that can be changed while the node runs: paths, or
-        `ij.tunable(path, low, high)` with a range; without one, the range is that of `tune`.
+        `ij.tunable(path, low, high)` with a range that was simulated; without one, the range is the
+        default of `tune`, which may contain unstable loops, and a warning says so.
       torque_limits: of a ROS 2 package, the largest torques, () or (n,) [N m], at most the model's
         `effort`, which they are if not given.
       on_fault: of a ROS 2 package, "hold" (the torques that hold the position) or "zero".

@@ -44,9 +44,11 @@ class Page:
         self.text, self.fallback = text, fallback
 
     def save(self, path: str | Path) -> Path:
-        """Writes the page, one HTML file that needs nothing else."""
+        """Writes the page, one HTML file that needs nothing else; a double click opens it.  Without
+        `ziglang`, of the extra `export`, the file says so and shows the scenario's table.
+        """
         path = checks.file_to_write("path", path)
-        path.write_text(self.text, encoding="utf-8")
+        path.write_text(self.fallback or self.text, encoding="utf-8")
         return path
 
     def _repr_html_(self) -> str:

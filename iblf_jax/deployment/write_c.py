@@ -433,6 +433,9 @@ def _vectors(law: Law, arrays: dict[str, np.ndarray]) -> str:
         return "{" + ", ".join(number(float(y), law.is_float) for y in x) + "}"
 
     lines = ["/* Samples of a simulated run, for selftest.c; the torque of every CHECKED-th. */"]
+    lines.append(
+        "/* first_*: the state of the simulated plant at t = 0. A robot gives its first readings */"
+    )
     lines.append(f"enum {{ SAMPLES = {len(v.q)}, CHECKED = {CHECK_INTERVAL} }};")
     names = ("q", "dq", *law.further_inputs)
     lines += [

@@ -112,8 +112,9 @@ class Rollout(Signals):
     actuator_state: Any = ()
     """State of the actuator, time axis first; `()` if it has none."""
     measured: Any = ()
-    """The last measurement, `measured.q` [rad] and `measured.dq` [rad/s], (T, n); `()` where the
-    law is not sampled."""
+    """What the law received at the last sample, `measured.q` [rad] and `measured.dq` [rad/s],
+    (T, n); `()` where the law is not sampled.  Samples are the rows at whole multiples of the
+    period; the rows between them repeat the last one."""
 
     @property
     def ok(self) -> bool:

@@ -700,7 +700,7 @@ def canonical(scenario: Scenario) -> Scenario:
     _check_start(scenario)
     for law in layers(scenario.controller):
         law_member(law, "check_start")(scenario.context)
-    for text in _advice(scenario):
+    for text in advice_of(scenario):
         notices.warn(text)
     return scenario
 
@@ -716,7 +716,7 @@ def _with_sufficient_queue(scenario: Scenario) -> Scenario:
     return dataclasses.replace(scenario, sampling=sampling)
 
 
-def _advice(scenario: Scenario) -> list[str]:
+def advice_of(scenario: Scenario) -> list[str]:
     """The warnings of the parts about their parameter values."""
     advice = law_member(scenario.controller, "advice")()
     advice = advice + observer_member(scenario.observer, "advice")()

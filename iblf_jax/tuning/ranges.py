@@ -94,6 +94,17 @@ BY_FACTOR = f"{MAX_FACTOR:g} times its start"
 BY_SMALL_FACTOR = f"{1 / MAX_FACTOR:g} times its start"
 BY_STEP = "beyond it the step dt is too long for the loop"
 BY_PERIOD = "beyond it the loop is unstable at its sampling period"
+AT_START = {
+    BY_STEP: (
+        "the step dt is too long for the loop already at the start, so this end is close to it;"
+        " take a smaller dt, or give a range"
+    ),
+    BY_PERIOD: (
+        "the sampled loop is unstable already at the start, so this end is close to it; start at"
+        " gains of a stable loop, or give a range"
+    ),
+}
+"""The reason of an end where already the start violates a condition."""
 BY_COUNT = (
     "beyond it one count of the encoder commands more torque, or a higher rate of it, than the"
     " drive can deliver"
@@ -363,7 +374,7 @@ class Reach(NamedTuple):
     share: float
     """The largest share up to 1 for which no condition is violated, 0 if there is none."""
     reason: str
-    """The condition that is violated beyond it; empty where none is."""
+    """The condition that is violated beyond it, or at the start; empty where none is."""
 
 
 def _reach(violated: Callable[[float], str]) -> Reach:
@@ -373,7 +384,7 @@ def _reach(violated: Callable[[float], str]) -> Reach:
         return Reach(1.0, "")
     at_start = violated(0.0)
     if at_start:
-        return Reach(0.0, at_start)
+        return Reach(0.0, AT_START.get(at_start, at_start))
     low = 0.0
     high = 1.0
     for _ in range(BISECTION_STEPS):

@@ -20,7 +20,7 @@ from iblf_jax.engine import RunRequest, points_per_batch, run_batch, run_rollout
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.metrics import as_folds
 from iblf_jax.simulation.results import Rollout
-from iblf_jax.simulation.scenario import Scenario, canonical
+from iblf_jax.simulation.scenario import Scenario, advice_of, canonical
 from iblf_jax.tuning.objectives import Objective, depends_on_torque
 from iblf_jax.tuning.options import Report, TuningRunOptions
 from iblf_jax.tuning.quantities import Quantities
@@ -229,6 +229,7 @@ class TuneResult:
                 ' the time step is too long; take effort="thorough" or a smaller dt'
             )
         lines += self._distant_gains()
+        lines += [f"WARNING: {text}" for text in advice_of(self.scenario)]
         if not depends_on_torque(objective):
             lines.append(
                 "WARNING: this objective has no price on torque: add effort(), torque_rate() or"

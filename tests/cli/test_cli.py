@@ -464,3 +464,14 @@ def test_numbers_as_text():
         "c": "x y",
         "d": "q",
     }
+
+
+def test_a_missing_extra_of_ros_is_named_without_a_traceback(monkeypatch, tmp_path, capsys):
+    def missing(*_, **__):
+        raise ImportError("This needs rclpy")
+
+    monkeypatch.setattr("iblf_jax.deployment.ros2.demo.ros_packages", missing)
+    assert cli.main(["ros", "demo", "--out", str(tmp_path)]) == 2
+    err = capsys.readouterr().err
+    assert "This needs rclpy" in err
+    assert "Traceback" not in err

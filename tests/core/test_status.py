@@ -184,7 +184,10 @@ def test_words_for_every_flag():
 def test_gains_below_the_theorem_are_advised_against(paper):
     for path, name in (("controller.K2", "K2"), ("observer.kf", "kf")):
         weak = ij.with_parameters(paper, {path: [20.0, 0.4]})
-        with pytest.warns(UserWarning, match=rf"{path} = .*Theorem 2 needs {name} > 1/2"):
+        with pytest.warns(
+            UserWarning,
+            match=rf"{path} = .*Theorem 2 needs {name} > 1/2.*of the paper.*reading=\"corrected\"",
+        ):
             ij.simulate(weak, **SHORT)
         part = weak.controller if name == "K2" else weak.observer
         assert (

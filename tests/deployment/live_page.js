@@ -60,5 +60,5 @@ for (const action of actions) {
   const menu = sliders.all("label").filter(label => label.htmlFor === "law").map(label => label.textContent);
   const laws = sliders.all("option").map(option => option.value);
   console.log(JSON.stringify({...JSON.parse(document.body.dataset.run), shown: Object.fromEntries(shown),
-    places: Object.fromEntries(places), laws, menu}));
+    places: Object.fromEntries(places), laws, menu, unused: made.unused.hidden ? "" : made.unused.textContent}));
 }

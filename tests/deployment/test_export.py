@@ -305,6 +305,8 @@ def test_a_folder_is_complete_and_its_parameters_are_those_of_the_paths(tmp_path
     shutil.move(generated.folder, tmp_path / "moved")
     folder = tmp_path / "moved"
     assert sorted(x.name for x in folder.iterdir()) == sorted(generated.files)
+    assert "A robot gives its first readings" in (folder / "vectors.h").read_text()
+    assert "`arm_law_init` with the first readings" in (folder / "README.md").read_text()
     assert "ok: torque within" in built_and_run(folder, "-O2", name="arm_law")
     assert "ok: torque within" in built_and_run(
         folder, "-O2", name="arm_law", compiler=(sys.executable, "-m", "ziglang", "cc")

@@ -130,6 +130,19 @@ def test_numbers_of_the_address_are_those_of_sliders_and_curves(two_laws, tmp_pa
     assert in_node(two_laws, tmp_path, [{}], "?law=constructor")[0]["law"] == "integral"
 
 
+def test_values_of_the_address_that_are_not_used_are_named(tmp_path):
+    page = ij.explore(ij.presets.zhang_yan_2024(), duration=0.1, dt=2e-3)
+    plain, good = (
+        in_node(page, tmp_path, [{}], address)[0]
+        for address in ("", "?controller.K2=30&initial.q[1]=0.7")
+    )
+    assert plain["unused"] == good["unused"] == ""
+    given = ["controller.K2=8,1", "controller.k1[0]=8", "observer.kf=-1", "nonsense=3", "law=none"]
+    bad = in_node(page, tmp_path, [{}], "?" + "&".join([*given, "controller.o=0.2"]))[0]
+    assert f"address: {', '.join(given)}." in bad["unused"]
+    assert bad["q"] != good["q"]
+
+
 def test_gains_that_differ_between_joints_are_all_shown_until_the_slider_is_moved(tmp_path):
     scenario = ij.with_parameters(ij.presets.zhang_yan_2024(), {"controller.K2": [20.0, 33.0]})
     page = ij.explore(scenario, duration=0.1, dt=2e-3)
@@ -210,15 +223,19 @@ def test_gains_starts_and_bounds_have_sliders(page):
     assert not re.search(r'(?:src|href)="(?!data:)', page.text)
 
 
-def test_a_notebook_shows_it_in_a_frame_and_without_a_compiler_its_figure(page, monkeypatch):
+def test_a_notebook_shows_it_in_a_frame_and_without_a_compiler_its_figure(
+    page, monkeypatch, tmp_path
+):
     assert page._repr_html_().startswith("<iframe srcdoc=")
 
     def missing(*_, **__):
         raise ToolchainError("ziglang is not installed")
 
     monkeypatch.setattr(live, "export", missing)
-    shown = ij.explore(ij.presets.zhang_yan_2024())._repr_html_()
-    assert "ziglang is not installed" in shown and "data:image/png" in shown
+    without = ij.explore(ij.presets.zhang_yan_2024())
+    saved = without.save(tmp_path / "live.html").read_text(encoding="utf-8")
+    for shown in (without._repr_html_(), saved):
+        assert "ziglang is not installed" in shown and "data:image/png" in shown
 
 
 @pytest.mark.slow

@@ -127,6 +127,19 @@ def test_a_time_constant_has_a_lower_end_and_a_gain_an_upper_one(lab):
     assert ranges.sampled_too_slowly(below_it)
 
 
+def test_the_range_of_an_unstable_start_ends_close_to_it_and_says_so(lab):
+    unstable = ij.with_parameters(lab, {"controller.K2": 20.0})
+    assert ranges.sampled_too_slowly(unstable)
+    _, high, (_, above) = ends(unstable, "controller.k1")
+    np.testing.assert_allclose(high, 1.01 * np.asarray(get(unstable, "controller.k1")))
+    assert above == ranges.AT_START[ranges.BY_PERIOD]
+    assert "unstable already at the start" in above
+    assert ends(lab, "controller.k1")[2][1] == ranges.BY_PERIOD
+    coarse = canonical(ij.presets.zhang_yan_2024())
+    _, box = layout(coarse, ["controller.k1"], 0.1, "rk4")
+    assert box.reasons[0][1] == ranges.AT_START[ranges.BY_STEP]
+
+
 @pytest.mark.filterwarnings("ignore:sampling.period is a whole number")
 def test_the_period_is_a_multiple_of_the_step_within_what_loop_and_queue_allow(lab):
     low, high, (below, above) = ends(lab, "sampling.period")

@@ -915,6 +915,14 @@ def robust(paper):
 
 
 @pytest.mark.slow
+def test_the_report_repeats_the_warnings_about_the_tuned_gains(robust):
+    assert not any("Theorem 2" in note for note in robust.notes)
+    weak = ij.with_parameters(robust.scenario, {"observer.kf": 0.4})
+    notes = dataclasses.replace(robust, scenario=weak).notes
+    assert any(note.startswith("WARNING: observer.kf = [0.4 0.4]: Theorem 2") for note in notes)
+
+
+@pytest.mark.slow
 def test_the_report_is_on_fresh_runs_and_gives_intervals(robust):
     report = robust.report
     assert report.runs == 256

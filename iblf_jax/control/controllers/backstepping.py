@@ -131,12 +131,13 @@ class Backstepping:
         is_papers = np.asarray(self.weight) == 1.0
         if not np.any(is_papers & (np.asarray(self.K2) <= 0.5)):
             return []
-        need = "Theorem 2 needs K2 > 1/2 on every joint (3.17) for the paper's envelope of V2"
+        need = "Theorem 2 needs K2 > 1/2 on every joint, condition (3.17) of the paper"
+        lost = "Below it the paper's bound on V2 is not proven"
         rest = (
-            "the corrected law with a momentum observer has the weighted claim of ij.certify for"
-            " every K2 > 0"
+            'with reading="corrected" and observers.Momentum, ij.certify computes another bound,'
+            ' its claim "weighted", which holds for every K2 > 0'
         )
-        return [f"controller.K2 = {self.K2}: {need}. Below it that envelope is lost: {rest}."]
+        return [f"controller.K2 = {self.K2}: {need}. {lost}; {rest}."]
 
     def command(
         self,

@@ -23,15 +23,16 @@ def kf_advice(observer: Any) -> list[str]:
     kf = observer.kf
     if not checks.is_concrete(kf) or bool(np.all(np.asarray(kf) > 0.5)):
         return []
-    need = "Theorem 2 needs kf > 1/2 on every joint (3.17), and kf > 1 where f changes (3.25)"
-    rest = (
-        "the corrected law with a momentum observer has the weighted claim of ij.certify for every"
-        " kf > 0"
+    need = (
+        "Theorem 2 needs kf > 1/2 on every joint, and kf > 1 where the disturbance changes:"
+        " conditions (3.17) and (3.25) of the paper"
     )
-    return [
-        f"observer.kf = {kf}: {need}, for the paper's envelope of V2. Below it that envelope is"
-        f" lost: {rest}."
-    ]
+    lost = "Below it the paper's bound on V2 is not proven"
+    rest = (
+        'with reading="corrected" and observers.Momentum, ij.certify computes another bound, its'
+        ' claim "weighted", which holds for every kf > 0'
+    )
+    return [f"observer.kf = {kf}: {need}. {lost}; {rest}."]
 
 
 def initial_eta(observer: Any, q: jax.Array, dq: jax.Array, model: Robot) -> jax.Array:

@@ -32,12 +32,23 @@ class Loops {
     new Reals(loop.memory.buffer, loop.settings(), table.settings.length).set(table.settings);
     const parameters = new Reals(loop.memory.buffer, loop.parameters(), table.count);
     for (const each of this.controlled(table)) {
-      const text = this.requested(each.words), value = Number(text);
-      const isNumber = text !== null && text.trim() !== "" && Number.isFinite(value);
-      const isAllowed = isNumber && (!each.positive || value > 0);
-      if (isAllowed) for (const k of each.places) parameters[k] = value;
+      const text = this.requested(each.words);
+      if (this.isUsed(each, text)) for (const k of each.places) parameters[k] = Number(text);
     }
     return {loop, table, Reals, parameters};
+  }
+
+  // Whether the text of the address is a number that a slider may have.
+  isUsed(each, text) {
+    const value = Number(text);
+    const isNumber = text !== null && text.trim() !== "" && Number.isFinite(value);
+    return isNumber && (!each.positive || value > 0);
+  }
+
+  // Of some names of the address, those that set nothing in a loop.
+  unused(name, names) {
+    const sliders = new Map(this.controlled(this.opened(name).table).map(each => [each.words, each]));
+    return names.filter(each => !sliders.has(each) || !this.isUsed(sliders.get(each), this.requested(each)));
   }
 
   // What has a slider: its name, the places of its numbers among the parameters, its range.

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax import __version__
-from iblf_jax.core import checks
+from iblf_jax.core import checks, notices
 from iblf_jax.deployment.build import write_files
 from iblf_jax.deployment.c_names import Parameters
 from iblf_jax.deployment.ros2.node.supervisor import ARRIVAL_TIMEOUT, STALE_PERIODS
@@ -153,7 +153,20 @@ def _gains(scenario: Scenario, given: Any) -> tuple[GainOption, ...]:
         part = slice(block.start, block.start + block.size)
         least, most = _range_end(item.low, low[part]), _range_end(item.high, high[part])
         found.append(_gain(scenario, item, least, most))
+        if item.low is None or item.high is None:
+            _warn_of_default_range(found[-1])
     return tuple(found)
+
+
+def _warn_of_default_range(gain: GainOption) -> None:
+    """Warns that a range in which an operator may change a gain was not simulated."""
+    low, high = (np.array2string(x, precision=4) for x in (gain.low, gain.high))
+    notices.warn(
+        f"gains: {gain.path}: the range {low} to {high} has a default end, from a linear analysis"
+        " near the reference that changes one gain at a time. The loop may be unstable within it,"
+        " elsewhere or with other gains. Give limits that you have simulated:"
+        f' ij.tunable("{gain.path}", low, high).'
+    )
 
 
 def _check_tied(scenario: Scenario, item: Tunable) -> None:
@@ -261,14 +274,19 @@ def _gain_lines(options: RosOptions) -> str:
     """The gains in the file of parameters."""
     lines = []
     for gain in options.gains:
-        numbers = gain.value.reshape(-1).tolist()
-        text = yaml_numbers(numbers)
-        if gain.tied or gain.value.ndim == 0:
-            text = yaml_number(numbers[0])
+        text = _yaml_value(gain)
         low, high = gain.low.reshape(-1).tolist(), gain.high.reshape(-1).tolist()
         limits = f"{yaml_numbers(low)} to {yaml_numbers(high)}"
         lines.append(f"    {json.dumps(gain.path)}: {text}  # [{gain.unit}], from {limits}")
     return "\n".join(lines) or "    # This law was exported without gains that can be changed."
+
+
+def _yaml_value(gain: GainOption) -> str:
+    """The value of a gain as YAML: one number, or one for each joint."""
+    numbers = gain.value.reshape(-1).tolist()
+    if gain.tied or gain.value.ndim == 0:
+        return yaml_number(numbers[0])
+    return yaml_numbers(numbers)
 
 
 def ros_files(law: Law, generated: GeneratedLaw, options: RosOptions) -> dict[str, str]:
@@ -290,6 +308,7 @@ def ros_files(law: Law, generated: GeneratedLaw, options: RosOptions) -> dict[st
         "hold_stiffness": yaml_numbers(description["hold_stiffness"]),
         "hold_damping": yaml_numbers(description["hold_damping"]),
         "gains": _gain_lines(options),
+        "set_gain": _set_gain_note(name, options),
         "n": law.scenario.n,
         "velocity": _velocity_note(description["reads_velocity"]),
     }
@@ -316,6 +335,17 @@ def ros_files(law: Law, generated: GeneratedLaw, options: RosOptions) -> dict[st
     for file, text in ros2_control_files(law, generated, description).items():
         texts[f"{controller}/{file}"] = text
     return texts
+
+
+def _set_gain_note(name: str, options: RosOptions) -> str:
+    """How a gain is changed while the node runs, in the README."""
+    if not options.gains:
+        return "This law was exported without gains that can be changed while the node runs."
+    gain = options.gains[0]
+    return (
+        "The gains among them can be changed while the node runs, within their ranges there:\n\n"
+        f"    ros2 param set /{name} {gain.path} {json.dumps(_yaml_value(gain))}"
+    )
 
 
 def _velocity_note(reads_velocity: bool) -> str:

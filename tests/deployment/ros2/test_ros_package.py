@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 import types
+import warnings
 import xml.etree.ElementTree
 
 import jax
@@ -228,6 +229,8 @@ def test_the_readme_of_the_package_says_what_a_robot_needs(package):
     for word in ("brakes", "state_timeout", "arrival_timeout", "best-effort", "falls", "/commands"):
         assert word in text
     assert "$" not in text
+    K2 = package.scenario.controller.K2.tolist()
+    assert f'ros2 param set /arm_law controller.K2 "{K2}"' in text
 
 
 def test_the_launch_file_starts_the_node(package, monkeypatch):
@@ -357,11 +360,17 @@ def test_limits_are_those_of_the_model_and_not_above(tmp_path):
         ros_options(scenario, None, 1.01 * effort, "hold")
 
 
-def test_ranges_without_limits_are_those_of_tune(package, tmp_path):
-    options = ros_options(canonical(package.scenario), ["controller.K2"], 100.0, "zero")
+def test_ranges_without_limits_are_those_of_tune_and_not_simulated(package):
+    with pytest.warns(UserWarning, match=r"controller.K2: the range .* default end.*simulated"):
+        options = ros_options(canonical(package.scenario), ["controller.K2"], 100.0, "zero")
     gain = options.gains[0]
     assert np.all(gain.low < gain.value) and np.all(gain.value < gain.high)
     assert np.all(np.isfinite(gain.high))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        ros_options(
+            canonical(package.scenario), [ij.tunable("controller.K2", 1.0, 4.0)], 100.0, "zero"
+        )
 
 
 @pytest.mark.slow

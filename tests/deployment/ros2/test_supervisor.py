@@ -255,6 +255,31 @@ def test_a_state_is_stale_after_two_periods_and_not_before():
     assert bench.supervisor.last_fault.kind is FaultKind.STALE
 
 
+@pytest.mark.parametrize(
+    ("phase", "periods", "mode"),
+    [(0.5, 2, Mode.RUNNING), (0.95, 2, Mode.FAULT), (0.95, 3, Mode.RUNNING)],
+)
+def test_one_lost_state_is_a_fault_where_ticks_come_just_before_arrivals(phase, periods, mode):
+    """The age of a state at a tick of the timer is that of transport and phase."""
+    transport = round(0.1 * T)
+    bench = Bench(stamp_timeout=periods * PERIOD, arrival_timeout=periods * PERIOD)
+
+    def arrives_and_ticks(is_lost=False):
+        bench.now += T - round(phase * T)
+        if not is_lost:
+            bench.state(stamp=bench.clock - transport)
+        bench.now += round(phase * T)
+        return bench.command()
+
+    arrives_and_ticks()
+    bench.start()
+    assert arrives_and_ticks().mode is Mode.RUNNING
+    assert arrives_and_ticks(is_lost=True).mode is mode
+    assert arrives_and_ticks().mode is mode
+    if mode is Mode.FAULT:
+        assert bench.start() == "The law runs from t = 0 s."
+
+
 @pytest.mark.parametrize("age", [-3, 3])
 def test_a_stamp_that_the_clock_contradicts_is_stale(age):
     bench = Bench(stamp_timeout=2 * PERIOD).running()
