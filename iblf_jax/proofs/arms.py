@@ -336,6 +336,8 @@ def _check_plant(scenario: Scenario) -> None:
 def _check_law(law: Any) -> None:
     if not isinstance(law, controllers.Backstepping):
         reason = "V_w' is known for the paper's law with one of its barriers."
+        if isinstance(law, controllers.Saturated):
+            reason += " Without its limit: with_parts(s, controller=s.controller.law)."
         raise unsupported("controller", type(law).__name__, "controllers.Backstepping", reason)
     if law.reading != "corrected":
         reason = "The printed law leaves 1/2 e2^T M0' e2 in V_w', and its proof fails."
