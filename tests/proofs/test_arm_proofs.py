@@ -225,6 +225,10 @@ REFUSED = {
         MASSES,
     ),
     "duration": (with_parts(reference=ij.references.Quintic(0.4, 0.6, 2.0)), MASSES),
+    "WaypointSpline": (
+        with_parts(reference=ij.references.WaypointSpline((0.0, 1.0), [[0.5, 0.5], [0.6, 0.6]])),
+        MASSES,
+    ),
     "bounds": (with_parts(reference=ij.references.Sinusoid(0.5, 0.9)), MASSES),
     "a parameter of the plant": (paper_loop, {"model.mass": ij.factor(ij.interval(0.9, 1.1))}),
     "an interval": (paper_loop, {"plant.mass": ij.factor(ij.uniform(0.9, 1.1))}),
