@@ -443,7 +443,8 @@ def _compared(run: Rollout, continuous: Rollout, kind: str) -> tuple[Line, Line]
         "smallest distance to a bound, less that of the continuous run",
         "rad",
     )
-    V_line = not_applicable(by_V, measured, counts=False)
+    scale = f"{measured}; the largest V2 of the continuous run is {np.max(continuous.V):.4g}"
+    V_line = not_applicable(by_V, scale, counts=False)
     margin_line = not_applicable(by_margin, measured, counts=False)
     return (
         dataclasses.replace(V_line, value=float(V_excess[at]), time=float(run.t[at])),
