@@ -225,7 +225,7 @@ REFUSED = {
         MASSES,
     ),
     "duration": (with_parts(reference=ij.references.Quintic(0.4, 0.6, 2.0)), MASSES),
-    "WaypointSpline": (
+    "a reference without pieces": (
         with_parts(reference=ij.references.WaypointSpline((0.0, 1.0), [[0.5, 0.5], [0.6, 0.6]])),
         MASSES,
     ),
