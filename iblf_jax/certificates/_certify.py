@@ -130,6 +130,9 @@ def certify(
     Source: Zhang & Yan 2024, Theorem 2 and its proof, (3.16)-(3.31); (S.3) as at the head of
       `iblf_jax.certificates.level_terms`, (D.2) at that of `iblf_jax.certificates.settling`.
     """
+    if isinstance(scenario, Rollout) or _is_study(scenario):
+        remedy = "Pass certify(scenario, run) or certify(scenario, study)."
+        raise checks.fail("scenario", type(scenario).__name__, "a Scenario", remedy)
     scenario = _with_history_of(canonical(scenario), run, dt)
     if not checks.is_concrete(scenario):
         remedy = "certify works on the host: call it outside jit, vmap and grad."
@@ -165,7 +168,7 @@ def _runs_of_study(
     scenario: Scenario, study: Any, worst: int | None
 ) -> Iterator[tuple[int, Rollout]]:
     """The runs of a study to check; ValueError for a study of another scenario."""
-    if not has_members(study, "replay", "metrics", "__len__"):
+    if not _is_study(study):
         remedy = "Pass what ij.simulate or ij.monte_carlo returned."
         raise checks.fail("run", study, "a Rollout, a study or None", remedy)
     nominal = optional_member(study, "scenario")
@@ -173,6 +176,10 @@ def _runs_of_study(
         _check_same(scenario, canonical(nominal), numbers=True)
     for index in _nearest_to_bounds(study, worst):
         yield index, _replayed(study, index)
+
+
+def _is_study(candidate: Any) -> bool:
+    return has_members(candidate, "replay", "metrics", "__len__")
 
 
 def _on_host(run: Rollout) -> Rollout:
@@ -436,7 +443,8 @@ def _compared(run: Rollout, continuous: Rollout, kind: str) -> tuple[Line, Line]
         "smallest distance to a bound, less that of the continuous run",
         "rad",
     )
-    V_line = not_applicable(by_V, measured, counts=False)
+    scale = f"{measured}; the largest V2 of the continuous run is {np.max(continuous.V):.4g}"
+    V_line = not_applicable(by_V, scale, counts=False)
     margin_line = not_applicable(by_margin, measured, counts=False)
     return (
         dataclasses.replace(V_line, value=float(V_excess[at]), time=float(run.t[at])),

@@ -56,6 +56,7 @@ from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.world import plants
 from iblf_jax.world.bounds import Tube, tube_at
+from iblf_jax.world.references import WaypointSpline
 
 ASSUMPTIONS = (
     REAL_NUMBERS,
@@ -313,6 +314,10 @@ def check_supported(scenario: Any) -> None:
         reason = "The error of this observer does not obey f_tilde' = f' - kf f_tilde."
         raise unsupported("observer", type(observer).__name__, "observers.Momentum", reason)
     _check_absent(scenario)
+    if isinstance(scenario.reference, WaypointSpline):
+        reason = "The piece of a spline depends on the time, which is an interval here."
+        expected = "a reference without pieces, such as references.Quintic"
+        raise unsupported("reference", "WaypointSpline", expected, reason)
     smooth = arm_motion.smoothness(scenario.reference, scenario.bounds)
     if smooth < 2:
         reason = "f contains alpha', and with it two derivatives of reference and bounds."
@@ -336,6 +341,8 @@ def _check_plant(scenario: Scenario) -> None:
 def _check_law(law: Any) -> None:
     if not isinstance(law, controllers.Backstepping):
         reason = "V_w' is known for the paper's law with one of its barriers."
+        if isinstance(law, controllers.Saturated):
+            reason += " Without its limit: with_parts(s, controller=s.controller.law)."
         raise unsupported("controller", type(law).__name__, "controllers.Backstepping", reason)
     if law.reading != "corrected":
         reason = "The printed law leaves 1/2 e2^T M0' e2 in V_w', and its proof fails."

@@ -125,10 +125,12 @@ def _check_part(path: str) -> None:
 
 
 def _entries_of(scenario: Scenario, path: str) -> list[str]:
-    """The paths of the numbers at a path."""
+    """The paths of the numbers at a path, with the number of a row in place of its name."""
     shape = np.shape(paths.get(scenario, path))
     indices = itertools.product(*map(range, shape))
-    return [path + "".join(f"[{i}]" for i in index) for index in indices]
+    (tokens,) = paths.places(scenario, path)
+    numbered = "".join(map(paths.written, tokens)).removeprefix(".")
+    return [numbered + "".join(f"[{i}]" for i in index) for index in indices]
 
 
 def _entries_together(

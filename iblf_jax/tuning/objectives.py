@@ -591,6 +591,9 @@ def effort(*, joints: Any = None, weights: Any = None, scale: Any = None) -> Obj
 def torque_rate(*, joints: Any = None, weights: Any = None, scale: Any = None) -> Objective:
     """Integral of the squared rate of the torque, int sum_i (w_i tau_i')^2 dt / scale; arguments as
     `tracking`, scale in N^2 m^2/s.
+
+    A sampled loop needs an actuator whose torque is continuous, such as `actuators.Motor`: a held
+    torque jumps at each sample, and the integral of a jump grows as 1/dt.
     """
     return _integral("torque_rate", "torque_rate", joints, weights, scale)
 

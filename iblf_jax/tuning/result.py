@@ -224,10 +224,7 @@ class TuneResult:
                 " ij.tuning.Effort(iterations=...)"
             )
         if self.stopped == STUCK:
-            lines.append(
-                "WARNING: no optimum: the slope of the objective or of a requirement jumps here, or"
-                ' the time step is too long; take effort="thorough" or a smaller dt'
-            )
+            lines.append(self._no_optimum_in_words())
         lines += self._distant_gains()
         lines += [f"WARNING: {text}" for text in advice_of(self.scenario)]
         if not depends_on_torque(objective):
@@ -236,6 +233,14 @@ class TuneResult:
                 " peak_torque_below(limit)"
             )
         return tuple(lines)
+
+    def _no_optimum_in_words(self) -> str:
+        """Names the time step only if the runs at half of it differ."""
+        text = "WARNING: no optimum: the slope of the objective or of a requirement jumps here"
+        check = self.step_check
+        if not check.depends_on_step:
+            return f'{text}; take effort="thorough"'
+        return f'{text}, or the time step is too long; {check.remedy}, or take effort="thorough"'
 
     def _distant_gains(self) -> list[str]:
         """A warning for each gain that has changed by more than the factor LARGE_CHANGE."""

@@ -17,12 +17,14 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.control.actuators import Ideal, Motor
 from iblf_jax.core.units import INPUT, POSITION
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.units import unit_text
 from iblf_jax.tuning.objectives import Objective
 from iblf_jax.tuning.options import TuningRunOptions
+from iblf_jax.tuning.quantities import quantity_member
 from iblf_jax.tuning.robust import combine, worst_count, worst_share
 from iblf_jax.tuning.samples import Sample, SampleRequest, is_random, sample_runs
 from iblf_jax.world import plants
@@ -148,6 +150,18 @@ class StepCheck:
     """Number of runs that diverge or are integrated unstably."""
     quantities: ReportedQuantities = ReportedQuantities()
     """Names and units."""
+    torque_jumps: bool = False
+    """Whether the objective has the rate of a torque that jumps at each sample."""
+
+    @property
+    def remedy(self) -> str:
+        """What to do about an objective that depends on the step."""
+        if self.torque_jumps:
+            return (
+                "the squared rate of a held torque grows as 1/dt, so a smaller dt does not help:"
+                " take an actuator with a lag, or an objective without torque_rate()"
+            )
+        return "take a smaller dt"
 
     @property
     def worst(self) -> WorstExcess:
@@ -225,12 +239,25 @@ class StepCheck:
             )
         if not self.depends_on_step:
             return text
-        return f"WARNING: {text}; more than {LARGEST_DIFFERENCE:.0%} apart: take a smaller dt"
+        return f"WARNING: {text}; more than {LARGEST_DIFFERENCE:.0%} apart: {self.remedy}"
 
     def __str__(self) -> str:
         """Bounds, then requirements, then the numbers."""
         requirements = [f"requirement {r}" for r in self.requirements]
         return "\n".join([self.bounds_in_words(), *requirements, self.numbers_in_words()])
+
+
+def has_rate_of_held_torque(scenario: Scenario, objective: Objective) -> bool:
+    """Whether an objective contains the rate of a torque that a sampled loop applies without a
+    lag.
+    """
+    has_rate = any(quantity_member(q, "signal") == "torque_rate" for q in objective.quantities)
+    if scenario.sampling is None or not has_rate:
+        return False
+    actuator = scenario.actuator
+    return isinstance(actuator, Ideal) or (
+        isinstance(actuator, Motor) and actuator.bandwidth is None
+    )
 
 
 def worst_of(excesses: list[tuple[float, str]], violated: int) -> WorstExcess:
@@ -278,6 +305,7 @@ def check_step_size(
         quantities=ReportedQuantities.of(scenario),
         violated=pair(lambda x: int(np.sum(x.left_bounds()))),
         untrusted=pair(lambda x: int(np.sum(x.is_untrusted()))),
+        torque_jumps=has_rate_of_held_torque(scenario, objective),
     )
 
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from functools import partial
+from types import SimpleNamespace
 from typing import ClassVar
 
 import jax
@@ -1004,6 +1005,12 @@ def test_study_of_another_scenario_is_refused(corrected_run):
         certify(stiffer, study)
     with pytest.raises(ValueError, match="a run of another kind of scenario"):
         certify(ij.presets.zhang_yan_2024(law="log"), study)
+
+
+def test_a_study_in_place_of_the_scenario_is_refused_with_the_right_call():
+    no_runs = SimpleNamespace(metrics={}, status=())
+    with pytest.raises(ValueError, match=r"got 'Study'.*certify\(scenario, study\)"):
+        certify(Study(no_runs))
 
 
 # --- the gap --------------------------------------------------------------------------------------

@@ -7,10 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from arm_cases import random_arm
 
 import iblf_jax as ij
 from iblf_jax.kernels.enclosure import enclose
 from iblf_jax.proofs.arms import arm_problem
+from iblf_jax.proofs.parameters import uncertain_coordinates
 from iblf_jax.proofs.search import search
 from iblf_jax.simulation import closed_loop
 
@@ -184,6 +186,10 @@ ARM = paper_loop()
 REFUSED = {
     "controller.reading": (lambda: ij.presets.zhang_yan_2024(), MASSES),
     "controller": (with_parts(controller=ij.controllers.PDGravity(Kp=1.0, Kd=1.0)), MASSES),
+    "with_parts(s, controller=s.controller.law)": (
+        with_parts(controller=ij.controllers.Saturated(paper_loop().controller, limit=50.0)),
+        MASSES,
+    ),
     "controller.decays": (
         lambda: ij.with_parts(
             ARM,
@@ -219,6 +225,10 @@ REFUSED = {
         MASSES,
     ),
     "duration": (with_parts(reference=ij.references.Quintic(0.4, 0.6, 2.0)), MASSES),
+    "a reference without pieces": (
+        with_parts(reference=ij.references.WaypointSpline((0.0, 1.0), [[0.5, 0.5], [0.6, 0.6]])),
+        MASSES,
+    ),
     "bounds": (with_parts(reference=ij.references.Sinusoid(0.5, 0.9)), MASSES),
     "a parameter of the plant": (paper_loop, {"model.mass": ij.factor(ij.interval(0.9, 1.1))}),
     "an interval": (paper_loop, {"plant.mass": ij.factor(ij.uniform(0.9, 1.1))}),
@@ -245,6 +255,24 @@ def test_what_the_bound_does_not_know_is_refused_with_the_reason(text):
     scenario, parameters = REFUSED[text]
     with pytest.raises(ValueError, match=re.escape(text)):
         arm_problem(scenario(), parameters)
+
+
+def test_a_link_of_a_box_can_be_named():
+    """`ij.parameters` lists a row by its name and by its number."""
+    arm = dataclasses.replace(random_arm(2, 0, prismatic=0.0), links=("upper", "fore arm"))
+    scenario = dataclasses.replace(paper_loop(), plant=arm, model=arm)
+    width = ij.factor(ij.interval(0.8, 1.2))
+
+    def of(path):
+        return uncertain_coordinates(scenario, {path: width}, None)
+
+    for named, numbered in {
+        "plant.link[upper].mass": "plant.mass[0]",
+        'plant.link["fore arm"].centre': "plant.centre[1]",
+        "plant.link[upper].mass, plant.link[fore arm].mass": "plant.mass[0], plant.mass[1]",
+    }.items():
+        assert of(named).places == of(numbered).places
+        assert of(named).names == of(numbered).names
 
 
 def test_a_level_at_the_guard_is_refused():

@@ -220,6 +220,21 @@ def test_an_estimate_without_failures_is_an_upper_bound():
     assert around.notes
 
 
+def test_margins_of_bounded_draws_that_approach_a_limit_are_noted():
+    """A load below 1 has margins above 0.1; the same load without its limit can fail."""
+
+    def bounded(z):
+        return 0.2 - 0.1 * stats.norm.cdf(z[:, 0])
+
+    def note_of(margin):
+        found = subset_simulation(margin, 2, runs=500, seed=0, **OPTIONS)
+        assert found.is_upper_bound
+        return " ".join(found.notes)
+
+    assert "approach 0.1 and not 0" in note_of(bounded)
+    assert "approach" not in note_of(lambda z: 20.0 - z[:, 0])
+
+
 def test_a_margin_that_most_draws_share():
     """Runs with one start have its margin unless they come nearer to a bound later: 1 % here."""
 

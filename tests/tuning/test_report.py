@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -30,6 +31,7 @@ from iblf_jax.tuning.step_check import (
     StepCheck,
     check_step_size,
     excess_at_half_step,
+    has_rate_of_held_torque,
 )
 
 BRIEF = {"duration": 0.2, "dt": 2e-3, "method": "euler"}
@@ -240,6 +242,35 @@ def test_an_objective_that_depends_on_the_step_is_warned_of():
     assert "WARNING" not in str(made_up_check(objective=(1.0, 1.009)))
     for half in (1.011, np.nan):
         assert "more than 1% apart: take a smaller dt" in str(made_up_check(objective=(1.0, half)))
+
+
+def test_a_smaller_step_is_not_the_remedy_for_the_rate_of_a_held_torque():
+    jumping = dataclasses.replace(made_up_check(objective=(1.0, 2.0)), torque_jumps=True)
+    assert "an actuator with a lag" in str(jumping)
+    assert "take a smaller dt" not in str(jumping)
+
+
+def test_a_held_torque_is_one_of_a_sampled_loop_without_a_lag():
+    continuous = ij.presets.zhang_yan_2024()
+    sampled = ij.with_parts(continuous, sampling=ij.Sampling(period=2e-3))
+    rate = objectives.tracking() + objectives.torque_rate()
+
+    def with_motor(**limits):
+        return ij.with_parts(sampled, actuator=ij.actuators.Motor(**limits))
+
+    assert has_rate_of_held_torque(sampled, rate)
+    assert has_rate_of_held_torque(with_motor(limit=50.0), rate)
+    assert not has_rate_of_held_torque(with_motor(bandwidth=200.0), rate)
+    assert not has_rate_of_held_torque(sampled, objectives.tracking() + objectives.effort())
+    assert not has_rate_of_held_torque(continuous, rate)
+
+
+def test_a_search_that_is_stuck_names_the_step_only_if_half_of_it_differs():
+    def words(**check):
+        return TuneResult._no_optimum_in_words(SimpleNamespace(step_check=made_up_check(**check)))
+
+    assert "dt" not in words()
+    assert "the time step is too long; take a smaller dt" in words(objective=(1.0, 1.02))
 
 
 # ---------------------------------------------------------------------------------------- the order

@@ -70,6 +70,12 @@ STALLED = (
     "Fewer than {chains} samples of the last level have a margin below {margin:.4g}, which all"
     " others have: no level nearer to failure was generated."
 )
+CONVERGED = (
+    "The margins approach {margin:.4g} and not 0: the last {count} of {levels} levels came nearer"
+    " to failure by less than 1 %. No failure was reached. If the distributions are bounded, the"
+    " probability may be 0: ij.falsify searches for a draw that fails, and ij.prove for a proof"
+    " that none does."
+)
 OUT_OF_LEVELS = (
     "The limit of {levels} levels was reached before a share {share:g} of the samples failed."
 )
@@ -228,7 +234,7 @@ def _estimate(
             nearby_probability=before,
             method="subset",
             effective_samples=0.0,
-            notes=(NO_FAILURE, *notes),
+            notes=(NO_FAILURE, *_note_of_convergence(levels), *notes),
         )
     levels = [*levels[:-1], _level(last, 0.0)]
     history = [*history[:-1], (last, 0.0)]
@@ -249,6 +255,16 @@ def _estimate(
         effective_samples=1 / max(variation, 1e-8) ** 2,
         notes=tuple(notes),
     )
+
+
+def _note_of_convergence(levels: list[Level]) -> tuple[str, ...]:
+    """A note if the second half of the thresholds differs by less than 1 %, of at least 4."""
+    half = len(levels) // 2
+    last = levels[-1].threshold
+    if half < 2 or levels[half].threshold - last >= 0.01 * last:
+        return ()
+    count = len(levels) - half
+    return (CONVERGED.format(margin=last, count=count, levels=len(levels)),)
 
 
 def _upper_bound_of(
