@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from types import SimpleNamespace
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
