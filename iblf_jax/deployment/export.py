@@ -142,6 +142,8 @@ def export(
         (counts, offset, noise), the actuator and the delay, which are the robot's own; they are
         part of the simulated run only.  The process noise of the plant is left out.  Levels that
         the sensor does not measure are inputs of the start only.
+        The observer is part of the code, also for a law that does not use its estimate, unless it
+        is `NoObserver()`.
       folder: output folder; it is created if it does not exist, and existing files are replaced.
       target: "c", "fmu", "fmu-loop", "wasm" or "ros2".
       period: of the law [s]; the scenario's `sampling.period` if not given.  A closed loop need not
