@@ -45,7 +45,20 @@ PAGES: dict[str, tuple[str, str]] = {
             "tune TuneResult tunable pareto Front falsify Attack cvar tune_file save_tuning"
             " load_tuning tuning.SQP tuning.LBFGS tuning.Adam tuning.Optax tuning.SLSQP"
             " tuning.TrustConstr tuning.DifferentialEvolution tuning.CMAES tuning.Optuna tuning.Uno"
-            " tuning.Report tuning.Solver objectives.Quantity objectives.Outer"
+            " tuning.Report tuning.Solver"
+        ),
+    ),
+    "objectives": (
+        "Objectives and requirements",
+        (
+            "objectives.tracking objectives.effort objectives.torque_rate objectives.settle"
+            " objectives.peak_torque objectives.margin objectives.velocity_margin"
+            " objectives.region_margin objectives.metric objectives.error_below"
+            " objectives.peak_torque_below objectives.margin_above"
+            " objectives.velocity_margin_above objectives.region_margin_above"
+            " objectives.violation_probability_below objectives.failure_probability_below"
+            " objectives.Objective objectives.Requirement objectives.Term"
+            " objectives.Quantity objectives.Outer"
         ),
     ),
     "identification": ("Identification", "identify Identification excitation"),

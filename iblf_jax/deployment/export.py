@@ -94,6 +94,8 @@ class Exported:
     """Bytes of state, parameters and stack."""
     parameters: tuple[str, ...]
     """Paths of the leaves that can be set in the exported code."""
+    notes: tuple[str, ...] = ()
+    """What was left out, and why."""
 
     def __repr__(self) -> str:
         lines = [
@@ -101,7 +103,7 @@ class Exported:
             f"a call: {describe_counts(self.operations)}",
         ]
         lines += [f"{name}: {size} bytes" for name, size in self.sizes.items()]
-        return "\n".join([*lines, f"parameters: {', '.join(self.parameters)}"])
+        return "\n".join([*lines, f"parameters: {', '.join(self.parameters)}", *self.notes])
 
 
 @notices.each_warning_once
@@ -140,6 +142,8 @@ def export(
         (counts, offset, noise), the actuator and the delay, which are the robot's own; they are
         part of the simulated run only.  The process noise of the plant is left out.  Levels that
         the sensor does not measure are inputs of the start only.
+        The observer is part of the code, also for a law that does not use its estimate, unless it
+        is `NoObserver()`.
       folder: output folder; it is created if it does not exist, and existing files are replaced.
       target: "c", "fmu", "fmu-loop", "wasm" or "ros2".
       period: of the law [s]; the scenario's `sampling.period` if not given.  A closed loop need not
@@ -267,6 +271,7 @@ def _export_law(
     external_reference: bool,
     ros: RosOptions | None,
 ) -> Exported:
+    scenario_toml, notes = _scenario_toml(scenario)
     law = Law(
         scenario=scenario,
         programs=control_law(scenario, external_reference),
@@ -274,7 +279,7 @@ def _export_law(
         external_reference=external_reference,
         vectors=vectors(scenario, external_reference),
         joints=plants.declared_joints(scenario.model),
-        scenario_toml=_scenario_toml(scenario),
+        scenario_toml=scenario_toml,
     )
     generated = generate(law)
     if target == "c":
@@ -291,7 +296,7 @@ def _export_law(
         "stack, without optimisation": generated.stack_bytes,
     }
     paths = tuple(field.path for field in generated.parameters.fields)
-    return Exported(folder, target, files, generated.operations, sizes, paths)
+    return Exported(folder, target, files, generated.operations, sizes, paths, notes)
 
 
 def _export_loop(
@@ -351,12 +356,12 @@ def _available(dtype: str) -> str:
     return jax_type
 
 
-def _scenario_toml(scenario: Scenario) -> str | None:
-    """The scenario as TOML; None if it has parts that cannot be stored in a file."""
+def _scenario_toml(scenario: Scenario) -> tuple[str | None, tuple[str, ...]]:
+    """The scenario as TOML, or None and the reason if a file cannot hold it."""
     try:
-        return scenario_to_toml(scenario)
-    except ValueError:
-        return None
+        return scenario_to_toml(scenario), ()
+    except ValueError as error:
+        return None, (f"scenario.toml left out: {error}",)
 
 
 def vectors(scenario: Scenario, external_reference: bool) -> Vectors:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -13,6 +14,8 @@ import jax
 import numpy as np
 
 from iblf_jax import __version__
+from iblf_jax.core.modules import is_module
+from iblf_jax.core.pytree import field_values
 from iblf_jax.deployment.c_names import Parameters, comment, number
 from iblf_jax.deployment.control_law import FLAGS, ControlLaw, SampleInputs, velocity_filters
 from iblf_jax.deployment.signal_units import one_unit, per_time
@@ -410,7 +413,27 @@ def _scenario_row(law: Law) -> str:
         f"python -m iblf_jax export scenario.toml --out . --name {law.name} --dtype {dtype}"
         f" --reference {reference}"
     )
-    return f"\n| `scenario.toml` | the exported scenario: `{command}` repeats the export |"
+    repeats = f"`{command}` repeats the export"
+    classes = sorted(_users_classes(law.scenario))
+    if classes:
+        call = (
+            f'ij.export(ij.load_scenario("scenario.toml"), ".", name="{law.name}",'
+            f' dtype="{dtype}", reference="{reference}")'
+        )
+        repeats = f"`{call}` repeats it, in a program that first registers {', '.join(classes)}"
+    return f"\n| `scenario.toml` | the exported scenario: {repeats} |"
+
+
+def _users_classes(part: Any) -> set[str]:
+    """The names of the classes of a scenario's parts that are defined outside this package."""
+    if isinstance(part, tuple | list):
+        return set().union(*map(_users_classes, part))
+    if not dataclasses.is_dataclass(part) or isinstance(part, type) or is_module(part):
+        return set()
+    found = set().union(*map(_users_classes, field_values(part).values()))
+    if type(part).__module__.partition(".")[0] != "iblf_jax":
+        found.add(type(part).__name__)
+    return found
 
 
 def _contents(law: Law) -> str:

@@ -129,12 +129,15 @@ def encode(part: Any, hint: Any, path: str) -> Any:
     if name is None:
         cls = type(part).__name__
         expected = f"a member of {words} that a file can name ({', '.join(members)})"
-        remedy = (
-            "Name your class before saving and loading:"
-            f' iblf_jax.{_module_of(part, family)}.MEMBERS["my_name"] = {cls}.'
-        )
+        entry = _registration(_module_of(part, family), "my_name", cls)
+        remedy = f"Name your class before saving and loading: {entry}."
         raise checks.fail(path, Words(f"an object of class {cls}"), expected, remedy)
     return {"kind": name, **encode_fields(part, path)}
+
+
+def _registration(module: str, name: str, cls: str) -> str:
+    """The statement that gives a class a name in files."""
+    return f'iblf_jax.{module}.MEMBERS["{name}"] = {cls}'
 
 
 def _module_of(part: Any, hint: Any) -> str:
@@ -208,7 +211,13 @@ def _decode_member(table: dict[str, Any], hint: Any, path: str) -> Any:
         remedy = f'Write kind = "{next(iter(members))}".'
         raise missing(f"{path}.kind", f"{expected}: {', '.join(members)}", remedy)
     if not isinstance(kind, str) or kind not in members:
-        raise checks.fail(f"{path}.kind", kind, expected, did_you_mean(kind, members))
+        named = families_of(hint)
+        module = FAMILIES[named[0]][0] if named else "<family>"
+        remedy = (
+            f"{did_you_mean(kind, members)} If it is your own class, register it first:"
+            f" {_registration(module, checks.one_line(str(kind)), 'TheClass')}."
+        )
+        raise checks.fail(f"{path}.kind", kind, expected, remedy.strip())
     return decode_fields(members[kind], {key: x for key, x in table.items() if key != "kind"}, path)
 
 

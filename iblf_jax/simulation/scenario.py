@@ -719,7 +719,8 @@ def _with_sufficient_queue(scenario: Scenario) -> Scenario:
 def advice_of(scenario: Scenario) -> list[str]:
     """The warnings of the parts about their parameter values."""
     advice = law_member(scenario.controller, "advice")()
-    advice = advice + observer_member(scenario.observer, "advice")()
+    if all(law_member(part, "uses_observer") for part in layers(scenario.controller)):
+        advice = advice + observer_member(scenario.observer, "advice")()
     advice = advice + motors_advice(scenario)
     if scenario.sampling is not None:
         advice = advice + sensor_member(scenario.sensor, "advice")(scenario.sampling.period)

@@ -70,7 +70,8 @@ def compare(
     """Runs several laws on one scenario, at their gains and at equal effort.
 
         factor_i = the c of [1/32, 32] nearest to 1, by |ln c|, with
-                   rms|tau - G0(q)| of law i at gains c k1, c K2  =  that of the first law
+                   rms|tau - G0(q)| of law i, every leaf in its `gains` times c
+                   =  that of the first law
 
     Args:
       scenario: plant, reference, bounds, disturbance, observer and start, shared by all laws; a law
@@ -85,8 +86,8 @@ def compare(
 
     Returns:
       A `Comparison`: prints as two tables and states what is equal in each; `rollouts`,
-      `equal_effort`, `factors`, `searches` (which factors were tried, and which failed), `plot()`,
-      `to_pandas()`.
+      `equal_effort` (`equal_effort[name].scenario` has the law with the scaled gains), `factors`,
+      `searches` (which factors were tried, and which failed), `plot()`, `to_pandas()`.
 
     Raises:
       ValueError: an unknown law, no law, or bad arguments of `simulate`.

@@ -31,6 +31,10 @@ FACTOR_TWO = (
     "Equal gains favour the integral form: V_integral = 2 V_log (p = 1) identically, so its barrier"
     " term is twice the logarithmic one's at the same k1 and K2. Compare at equal effort."
 )
+MARGINS_OF_START = (
+    "The margins to the bounds and 1-max|xi| are those of the start (at t = 0) in every run: they"
+    " do not compare the laws."
+)
 OWN_GAINS = "Laws whose gains differ are comparable at equal effort only."
 
 
@@ -123,6 +127,14 @@ def row_of(law: str, factor: float, run: Rollout) -> Row:
     )
 
 
+def _is_closest_at_start(run: Rollout) -> bool:
+    """Whether the smallest margins of a run, in position and in xi, are those of its start."""
+    q, lower, upper, xi = (np.asarray(x[0]) for x in (run.q, run.lower, run.upper, run.xi))
+    margin = np.min(np.minimum(q - lower, upper - q))
+    found = np.min(run.metrics.margin), np.min(run.metrics.xi_margin)
+    return np.allclose(found, (margin, 1.0 - np.max(np.abs(xi))), rtol=1e-6, atol=0.0)
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Comparison:
     """Several laws on one scenario.  Prints as two tables, each with what is equal in it."""
@@ -130,7 +142,8 @@ class Comparison:
     rollouts: dict[str, Rollout]
     """Law -> run at the gains it has."""
     equal_effort: dict[str, Rollout]
-    """Law -> run at the first law's effort; without the laws for which there is no factor."""
+    """Law -> run at the first law's effort; without the laws for which there is no factor.  The
+    `scenario` of the run has the law with the scaled gains."""
     factors: dict[str, float]
     """Law -> the factor of its gains at equal effort; NaN where none was found."""
     reasons: dict[str, str]
@@ -206,6 +219,9 @@ class Comparison:
                 " from 1/32 to 32 that do it, the one nearest to 1 (by |ln factor|)."
             )
             notes["effort"] = [f"{equal} {scaled}", *self._searches_in_words()]
+        for kind, runs in (("gains", self.rollouts), ("effort", self.equal_effort)):
+            if kind in notes and runs and all(map(_is_closest_at_start, runs.values())):
+                notes[kind].append(MARGINS_OF_START)
         return notes
 
     @property

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.control.controllers import Command, Controller, WithDrive
 from iblf_jax.control.controllers._base import law_member
 from iblf_jax.core import notices
-from iblf_jax.core.pytree import unwrapped
+from iblf_jax.core.pytree import field_values, unwrapped
 from iblf_jax.core.status import VIOLATED, Status
 from iblf_jax.engine.simulate import simulate
 from iblf_jax.simulation.levels import (
@@ -48,7 +50,7 @@ def check_law(
     law: Any, *, scenario: Scenario | None = None, n: int | None = None
 ) -> tuple[str, ...]:
     """Checks a tracking law: shapes, the state's structure, derivatives, float32, finite values
-    inside the bounds, and a short closed loop.
+    inside the bounds, the class attributes `gains` and `uses_observer`, and a short closed loop.
 
     A law inside a `WithDrive` runs on the plant that this contains.
 
@@ -96,12 +98,46 @@ def check_law(
             found = {"tau": command.tau, "alpha": command.alpha, "V1": command.V1}
             return found | leaves_by_name("input", command.input) | rates
 
-        check_function(findings, outputs, base.controller, (t, measured, f_hat, base.context))
+        arguments = (t, measured, f_hat, base.context)
+        check_function(findings, outputs, base.controller, arguments)
+        _declarations(findings, outputs, base.controller, arguments)
         check_claims(findings, base)
         is_defined_beyond = check_at_the_bounds(findings, base)
         findings.stop_if_any()
         _closed_loop(findings, in_dtype(base, "float32"), is_defined_beyond)
     return tuple(findings.remarks)
+
+
+def _declarations(
+    findings: Findings,
+    outputs: Callable[..., dict[str, jax.Array]],
+    law: Any,
+    arguments: tuple[Any, ...],
+) -> None:
+    """Requires that the class attributes `gains` and `uses_observer` fit the fields and the
+    command.
+    """
+    inner = unwrapped(law)
+    gains = law_member(inner, "gains")
+    if gains is not law_member.defaults["gains"]:
+        names = tuple(field_values(inner))
+        unknown = [name for name in gains if name not in names]
+        findings.require(
+            not unknown,
+            f"gains = {gains!r} has names that are no field: {', '.join(map(repr, unknown))}",
+            f"Its fields are {', '.join(names)}",
+        )
+    if law_member(law, "uses_observer"):
+        return
+    t, measured, f_hat, context = arguments
+    with_estimate = outputs(law, t, measured, f_hat, context)
+    without = outputs(law, t, measured, jnp.zeros_like(f_hat), context)
+    changed = [name for name, x in with_estimate.items() if not jnp.array_equal(x, without[name])]
+    findings.require(
+        not changed,
+        f"uses_observer is False, but {', '.join(changed)} depends on f_hat",
+        "Remove the attribute; `compare` runs such a law without an observer",
+    )
 
 
 def _structure(findings: Findings, scenario: Scenario) -> None:

@@ -313,9 +313,12 @@ def _tried(search: Search) -> tuple[str, ...]:
     starts = search.strategy.starts
     lines = []
     if starts > 1:
+        noun = "valley"
+        if valleys != 1:
+            noun = "valleys"
         lines.append(
             f"searches from {starts} of {len(search.strategy.screening.points)} points: they were"
-            f" in {valleys} valleys when they ended or were dropped, {reached} in the best one"
+            f" in {valleys} {noun} when they ended or were dropped, {reached} in the best one"
         )
     phase = int(search.state["phase"])
     if phase == REPAIR or search.state["repair_ended"]:

@@ -584,6 +584,9 @@ def tracking(
 def effort(*, joints: Any = None, weights: Any = None, scale: Any = None) -> Objective:
     """Integral of the squared torque, int sum_i (w_i tau_i)^2 dt / scale; arguments as `tracking`,
     scale in N^2 m^2 s.
+
+    The torque includes gravity.  The effort of `iblf_jax.compare` is the torque above gravity:
+    `metric(iblf_jax.metrics.AboveGravity(), "effort_above_gravity")`.
     """
     return _integral("effort", "torque", joints, weights, scale)
 

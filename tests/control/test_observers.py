@@ -4,6 +4,7 @@ run."""
 from __future__ import annotations
 
 import dataclasses
+import warnings
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +15,7 @@ from iblf_jax.robots import mass_matrix_rate
 
 import iblf_jax as ij
 from iblf_jax.simulation.closed_loop import LoopState, evaluate
+from iblf_jax.simulation.scenario import canonical
 
 
 @pytest.fixture(scope="module")
@@ -92,3 +94,14 @@ def test_no_observer_estimates_nothing():
     q = jnp.ones(2)
     assert np.all(np.asarray(NoObserver().estimate(0.0, q, q, None, ())) == 0)
     assert jax.tree.leaves(NoObserver().init(q, q, None)) == []
+
+
+def test_a_law_without_an_observer_is_not_advised_about_kf(paper):
+    """Theorem 2 is about laws that use f_hat."""
+    low = dataclasses.replace(paper, observer=ij.observers.Momentum(kf=0.4))
+    with pytest.warns(UserWarning, match="Theorem 2 needs kf"):
+        canonical(low)
+    law = ij.controllers.AdaptiveRBF(k1=2.0, K2=20.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        canonical(dataclasses.replace(low, controller=law))

@@ -254,6 +254,45 @@ def test_a_users_law_goes_out_without_a_name_in_files(base, tmp_path):
     assert "controller.gain" in [field.path for field in generated.parameters.fields]
 
 
+@ij.component
+class Damped:
+    """tau = G0 - gain (q - q_d) - q'."""
+
+    gain: ij.Leaf = ij.leaf("N m/rad")
+    uses_observer = False
+
+    def init(self, q, dq, context):
+        return ()
+
+    def command(self, t, q, dq, f_hat, context, state):
+        tube, no = context.tube(t), jnp.zeros(q.shape, bool)
+        tau = context.model.gravity(q) - self.gain * (q - tube.q_d) - dq
+        return ij.controllers.Command(tau, tube.dq_d, 0.0 * q, no, no), ()
+
+
+def test_a_users_law_in_files_is_registered_before_the_export_is_repeated(tmp_path, monkeypatch):
+    monkeypatch.setattr("iblf_jax.deployment.export.VECTORS_DURATION", 0.02)
+    scenario = ij.with_parts(ij.presets.zhang_yan_2024(), controller=Damped([30.0, 20.0]))
+    without = ij.export(scenario, tmp_path / "without", period=2e-3)
+    assert "scenario.toml" not in without.files
+    assert "scenario.toml left out: controller: got an object of class Damped" in repr(without)
+
+    monkeypatch.setitem(ij.controllers.MEMBERS, "damped", Damped)
+    named = ij.export(scenario, tmp_path / "named", period=2e-3)
+    assert "left out" not in repr(named)
+    readme = (named.folder / "README.md").read_text()
+    assert "in a program that first registers Damped" in readme
+    assert "python -m iblf_jax export scenario.toml" not in readme
+    (call,) = re.findall(r"`(ij\.export\(.*?)` repeats", readme)
+    first = (named.folder / "iblf_law.c").read_text()
+    monkeypatch.chdir(named.folder)
+    eval(call, {"ij": ij})
+    assert (named.folder / "iblf_law.c").read_text() == first
+
+    own = ij.export(ij.presets.zhang_yan_2024(), tmp_path / "own", period=2e-3)
+    assert "`python -m iblf_jax export scenario.toml" in (own.folder / "README.md").read_text()
+
+
 def test_memories_may_hold_whole_numbers_and_flags(base, tmp_path):
     @ij.component
     class Counting:

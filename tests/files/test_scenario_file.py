@@ -177,6 +177,13 @@ def test_users_classes_are_refused_until_they_have_a_name(paper, monkeypatch):
     text = scenario_file.scenario_to_toml(mine)
     assert "[controller.inner.barrier]" in text
     assert_equal(scenario_file.from_dict(tomllib.loads(text)).scenario, mine)
+    monkeypatch.delitem(ij.controllers.MEMBERS, "doubled")
+    remedy = (
+        r"controller\.kind.*If it is your own class, register it first:"
+        r" iblf_jax\.controllers\.MEMBERS\[.doubled.\] = TheClass"
+    )
+    with pytest.raises(ValueError, match=remedy):
+        scenario_file.from_dict(tomllib.loads(text))
 
 
 def test_none_where_the_default_is_something_else(paper, monkeypatch):

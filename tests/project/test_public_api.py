@@ -252,6 +252,22 @@ def test_what_users_return_is_documented_on_the_reference_pages(name, tmp_path, 
     )
 
 
+def test_every_objective_is_on_its_reference_page(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    import reference
+
+    made = {
+        f"objectives.{name}"
+        for name, function in vars(ij.objectives).items()
+        if inspect.isfunction(function)
+        and inspect.signature(function).return_annotation in ("Objective", "Requirement")
+        and not name.startswith("_")
+        and "objective" not in inspect.signature(function).parameters
+    }
+    assert {"objectives.tracking", "objectives.margin_above"} <= made
+    assert made <= set(reference.PAGES["objectives"][1].split())
+
+
 @pytest.mark.parametrize("name", PROMISED)
 def test_promised_names_are_there(name):
     assert hasattr(ij, name)

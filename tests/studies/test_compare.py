@@ -89,6 +89,21 @@ def test_the_text_says_what_was_held_equal(comparison):
     assert "integral form" not in repr(without)
 
 
+def test_margins_of_the_start_are_said_to_be_those(comparison):
+    words = "those of the start (at t = 0) in every run"
+    assert repr(comparison).count(words) == 2
+    log = comparison.rollouts["log"]
+    smaller = dataclasses.replace(
+        log.metrics,
+        values_by_name=log.metrics.values_by_name | {"margin": 0.5 * log.metrics.margin},
+    )
+    closer = dataclasses.replace(
+        comparison,
+        rollouts={**comparison.rollouts, "log": dataclasses.replace(log, metrics=smaller)},
+    )
+    assert words not in " ".join(closer.notes["gains"])
+
+
 def test_the_table_is_the_metrics_of_the_runs(comparison):
     row, run = comparison.table["gains"][1], comparison.rollouts["log"]
     assert row.law == "log"

@@ -309,6 +309,22 @@ def test_broken_law():
     )
 
 
+def test_class_attributes_that_do_not_fit_the_law_are_found():
+    """`gains` names fields, and a law that reads f_hat uses the observer."""
+
+    def command(self, t, q, dq, f_hat, context, state):
+        command, rate = PlainLaw.command(self, t, q, dq, f_hat, context, state)
+        return command._replace(tau=command.tau - f_hat), rate
+
+    other_gains = changed(PlainLaw, command=command, gains=("gain", "KX"), uses_observer=False)
+    rejects(
+        ij.testing.check_law,
+        other_gains(3.0),
+        "gains = ('gain', 'KX') has names that are no field: 'KX'",
+        "uses_observer is False, but tau depends on f_hat",
+    )
+
+
 def unguarded(reach):
     """A law with a root that has no real value for |xi| > reach."""
 

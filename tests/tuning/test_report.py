@@ -13,6 +13,7 @@ import iblf_jax as ij
 from iblf_jax import objectives, reports
 from iblf_jax.cli.tune import _has_failed
 from iblf_jax.studies.statistics import probability
+from iblf_jax.tuning._tune import _tried
 from iblf_jax.tuning.failures import (
     FailedRuns,
     FreshRuns,
@@ -509,3 +510,11 @@ def test_runs_that_differ_in_noise_only_are_fresh_too(paper):
     assert "no perturbation differs between the runs" in str(report)
     with pytest.raises(ValueError, match="fresh"):
         result.check(seed=0)
+
+
+@pytest.mark.parametrize(("valleys", "words"), [(1, "in 1 valley when"), (3, "in 3 valleys when")])
+def test_the_number_of_valleys_is_a_grammatical_phrase(valleys, words):
+    strategy = SimpleNamespace(starts=6, screening=SimpleNamespace(points=range(385)))
+    state = {"valleys": np.asarray([valleys, 2]), "phase": 0, "repair_ended": False}
+    (line,) = _tried(SimpleNamespace(strategy=strategy, state=state))
+    assert words in line
