@@ -155,7 +155,8 @@ CASES: dict[str, Case] = {
         " weight of the arm, so that no law can satisfy the bounds.",
         "Inspect the first violation (`run.metrics.first_violation_time`), and check whether the"
         " torque was saturated or the start was outside the bounds. Otherwise the gains are too"
-        " small for the uncertain term: increase `K2`, or tune the gains.",
+        " small for the uncertain term: increase `K2`, or `k` and `weights` of"
+        " `BarrierBackstepping` and the gain of its `LevelObserver`, or tune the gains.",
     ),
     "NOT_FINITE": Case(
         lambda: _run(_sampled(4e-3, 4e-3), dt=4e-3),

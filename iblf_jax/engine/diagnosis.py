@@ -43,6 +43,11 @@ REPORTED = (
 """The flags that a warning reports although the run did not fail."""
 
 
+CONSEQUENCES = Status.INACCURATE | Status.GUARD_STAYED | Status.INFINITE_SLOPE
+"""The flags that a message leaves out of a run that diverged: they follow from it, and the causes
+stand out without them."""
+
+
 class SimulationError(RuntimeError):
     """A run that failed, raised by `simulate(..., throw=True)`."""
 
@@ -56,6 +61,8 @@ def report(result: Rollout, steps: int, throw: bool) -> None:
     status = Status(int(result.status))
     if status & Status.INFEASIBLE_REFERENCE:
         raise _infeasible(result, steps)
+    if status & Status.NOT_FINITE:
+        status &= ~CONSEQUENCES
     failed = status & FAILED
     reported = failed | status & REPORTED
     law = unwrapped(result.scenario.controller)
@@ -82,7 +89,9 @@ def report(result: Rollout, steps: int, throw: bool) -> None:
 
 def _explanations(result: Rollout, status: Status, steps: int) -> list[str]:
     """The explanations of the flags of a status that have one."""
-    texts = [text(result) for flag, text in BOUND_EXPLANATIONS.items() if status & flag]
+    violated = [flag for flag in BOUND_EXPLANATIONS if status & flag]
+    violated.sort(key=lambda flag: float(result.metrics.get(VIOLATION_TIMES[flag], np.inf)))
+    texts = [BOUND_EXPLANATIONS[flag](result) for flag in violated]
     singular = ""
     if status & (Status.SINGULAR_GAIN | Status.NOT_FINITE):
         singular = _singular_gain(result)
@@ -252,12 +261,12 @@ def _unstable_step(result: Rollout) -> str:
 def _infinite_slope(result: Rollout) -> str:
     return (
         "At an isolated instant the derivative of the closed loop with respect to a state is"
-        " infinite or nearly so, as that of |e2|^a sign(e2) with a < 1 is with respect to e2 ="
-        " q' - alpha where e2 = 0, or that of sharp dry friction at a reversal. That is no"
+        " infinite or nearly so, as that of a power |e2|^a sign(e2) with a < 1 with respect to e2"
+        " at e2 = 0, of a square root at 0, or of sharp dry friction at a reversal. That is no"
         f" fast mode, so the time step is assessed by differences of {THIRD_SIZE:g}"
         f" {_unit_of_differences(result.scenario)} there."
-        " Derivatives of the run are not reliable; replace such a power by e2 (e2^2 +"
-        " delta^2)^((a - 1)/2) with a small delta."
+        " Derivatives of the run are not reliable. If the law has such a power, replace it by"
+        " e2 (e2^2 + delta^2)^((a - 1)/2) with a small delta."
     )
 
 
@@ -382,6 +391,13 @@ BOUND_EXPLANATIONS: dict[Status, Callable[[Rollout], str]] = {
     Status.REGION_VIOLATED: _region_violation,
 }
 """The explanation of each flag of a violated bound."""
+VIOLATION_TIMES = {
+    Status.BOUND_VIOLATED: "first_violation_time",
+    Status.VELOCITY_VIOLATED: "first_velocity_violation_time",
+    Status.STATE_BOUND_VIOLATED: "first_level_violation_time",
+    Status.REGION_VIOLATED: "first_region_violation_time",
+}
+"""The metric with the time at which each of these bounds was violated first."""
 LOOP_EXPLANATIONS: dict[Status, Callable[[Rollout], str]] = {
     Status.INFINITE_SLOPE: _infinite_slope,
     Status.SAMPLING_TOO_SLOW: _sampling_too_slow,
@@ -408,14 +424,22 @@ def _inaccurate(result: Rollout, status: Status, steps: int) -> str:
             f"{estimate}: a loop whose deviation grows from one period to the next magnifies every"
             " error, whatever dt is."
         )
+    step = _smaller_step(result, steps)
+    if not step:
+        return (
+            f"{estimate}. Trial runs recommend no smaller step: compare this run with one at a"
+            " tenth of dt. If they differ, the loop magnifies every error, whatever dt is."
+        )
     return (
         f"{estimate}: dt = {float(result.dt):g} s is too large for the signals that drive this"
-        f" loop. Take {_smaller_step(result, steps)}."
+        f" loop. Take {step}."
     )
 
 
 def _smaller_step(result: Rollout, steps: int) -> str:
-    """A time step that makes this run accurate, in words."""
+    """A time step that makes this run accurate, in words; empty if trial runs find none that is
+    smaller.
+    """
     if not checks.is_concrete(result.scenario):
         return "a smaller one"
     if input_delay(result.scenario.actuator) is not None:
@@ -423,9 +447,12 @@ def _smaller_step(result: Rollout, steps: int) -> str:
         return "a smaller one, a whole part of actuator.delay"
     duration = steps * float(result.dt)
     try:
-        return f"dt={find_dt(result.scenario, duration=duration, method=result.method):g}"
+        dt = find_dt(result.scenario, duration=duration, method=result.method)
     except ValueError:  # the run is too long for trial runs
         return "a smaller one"
+    if dt >= float(result.dt):
+        return ""
+    return f"dt={dt:g}"
 
 
 def _alternative_remedy(result: Rollout) -> str:

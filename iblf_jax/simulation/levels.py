@@ -84,15 +84,22 @@ def steady_input(scenario: Any, q: jax.Array) -> jax.Array:
     A law of robots on another plant has a model without the plant's input: the input is then the
     one that balances the gravity of the plant.
     """
-    model = scenario.model
-    if not plants.is_chain(model):
-        model = scenario.plant
-    if not plants.is_chain(model):
+    if not plants.is_chain(scenario.model) and not plants.is_chain(scenario.plant):
         return scenario.model.gravity(q)  # type: ignore[no-any-return]
-    own = plants.plant_member(model, "steady_input")
+    own = stated_steady_input(scenario)
     if own is None:
         return jnp.zeros_like(q)
     return own(q)  # type: ignore[no-any-return]
+
+
+def stated_steady_input(scenario: Any) -> Any:
+    """The function `steady_input` of the model, or of the plant where the model is a robot; None
+    for a plant that states none.
+    """
+    model = scenario.model
+    if not plants.is_chain(model):
+        model = scenario.plant
+    return plants.plant_member(model, "steady_input")
 
 
 # --- law and sensor -----------------------------------------------------------------------------

@@ -73,6 +73,10 @@ def compare(
                    rms|tau - G0(q)| of law i, every leaf in its `gains` times c
                    =  that of the first law
 
+    Laws with barriers of different units, such as `Mapping` and `PrescribedPerformance`, are
+    different designs at equal weights: scale the weights before you compare them, see
+    `BarrierBackstepping`.
+
     Args:
       scenario: plant, reference, bounds, disturbance, observer and start, shared by all laws; a law
         of robots takes the rigid limit of a plant in strict-feedback form as its model, that of a
@@ -80,7 +84,8 @@ def compare(
         o and reading of its own law are those of the laws that are given by name, and a torque
         limit around its law is put around them too.
       laws: names (`iblf_jax.controllers.LAWS` or `KEEPERS`) or laws, or a dict of either by the
-        name to show.  The first one sets the effort.
+        name to show.  The first one sets the effort.  Names are laws of robots; for a plant
+        without a robot give laws, such as {"mapping": BarrierBackstepping(...)}.
       duration, dt, method, record_every: as `simulate`.
       equal_effort: whether to look for the factors; a few batches of 89 further runs a law.
 
@@ -177,7 +182,17 @@ def _with_law(scenario: Scenario, law: str | Controller) -> Scenario:
         if not all(law_member(part, "uses_observer") for part in layers(law)):
             observer = NoObserver()
     model = _model_for(controller, scenario)
+    receives_x = law_member(unwrapped(controller), "receives_x")
+    if isinstance(law, str) and plants.is_chain(model) and not receives_x:
+        raise _no_robot(law, model)
     return dataclasses.replace(scenario, controller=controller, observer=observer, model=model)
+
+
+def _no_robot(name: str, model: Any) -> ValueError:
+    """The error for a law by name on a plant without a robot."""
+    expected = f"a law, as names are laws of robots and {type(model).__name__} contains none"
+    remedy = f"Give {{{name!r}: controllers.BarrierBackstepping(...)}}, with a barrier a level."
+    return checks.fail("laws", name, expected, remedy)
 
 
 def _model_for(law: Controller, scenario: Scenario) -> Any:
@@ -333,4 +348,4 @@ def _shown(value: Any) -> str:
     values = np.unique(np.asarray(value))
     if values.size == 1:
         return f"{values[0]:g}"
-    return np.array2string(np.asarray(value), precision=4)
+    return np.array2string(np.squeeze(np.asarray(value)), precision=4)

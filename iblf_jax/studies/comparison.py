@@ -19,6 +19,8 @@ from iblf_jax.core.presentation import present
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import FAILED, describe
 from iblf_jax.core.units import INPUT, POSITION, VELOCITY
+from iblf_jax.simulation.levels import stated_steady_input
+from iblf_jax.simulation.metrics import Settling
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.units import status_words, unit_text
@@ -45,7 +47,8 @@ class Row(NamedTuple):
     factor: float
     """What the law's gains were multiplied by."""
     settling_time: float
-    """Until |e1| < 0.01 rad for good [s]."""
+    """Until |e1| < 0.01 for good, in the unit of the first level [s]; NaN where the bounds are
+    closer than that, so that every run that keeps them has settled from the start."""
     rmse: float
     """[rad]."""
     margin: float
@@ -101,6 +104,14 @@ def _verdict(run: Rollout) -> str:
     return f"FAILED: {text}" if status & FAILED else text
 
 
+def _is_settled_by_bounds(run: Rollout) -> bool:
+    """Whether the bounds of every component are closer to the reference than the error at which
+    it counts as settled, so that its settling time says nothing about the law.
+    """
+    widest = np.maximum(run.upper - run.q_d, run.q_d - run.lower)
+    return bool(np.all(widest <= Settling().tolerance))
+
+
 def row_of(law: str, factor: float, run: Rollout) -> Row:
     """The line of one run."""
     m = run.metrics
@@ -113,7 +124,7 @@ def row_of(law: str, factor: float, run: Rollout) -> Row:
     return Row(
         law,
         factor,
-        worst("settling_time"),
+        math.nan if _is_settled_by_bounds(run) else worst("settling_time"),
         worst("rmse"),
         worst("margin", np.min),
         worst("xi_margin", np.min),
@@ -202,6 +213,8 @@ class Comparison:
             notes["gains"].append(OWN_GAINS)
         if any(isinstance(barrier, Integral) for barrier in barriers):
             notes["gains"].append(FACTOR_TWO)
+        if any(_is_settled_by_bounds(run) for run in self.rollouts.values()):
+            notes["gains"].append(self._settling_in_words)
         notes["gains"] += [f"{name} FAILED: {why}." for name, why in self.failed.items()]
         if self.factors:
             if int(self.rollouts[first].status) & NO_EFFORT:
@@ -230,13 +243,24 @@ class Comparison:
         return next(iter(self.rollouts.values())).scenario
 
     @property
+    def _settling_in_words(self) -> str:
+        """Why the table has no settling times."""
+        size = f"{float(Settling().tolerance):g} {unit_text(self.scenario, POSITION)}"
+        return (
+            f"Settling is the time until |e1| < {size} for good. It is not shown, because the"
+            " bounds are closer to the reference than that."
+        )
+
+    @property
     def _input_in_words(self) -> str:
         """The input that is held equal at equal effort, with its formula."""
         plant = self.scenario.plant
         if not plants.is_chain(plant):
             return "torque above gravity, sqrt(mean |tau - G0(q)|^2)"
         name = plants.input_name(plant)
-        return f"{name} above the one that balances gravity, sqrt(mean |u - u_0(x)|^2)"
+        if stated_steady_input(self.scenario) is None:
+            return f"{name}, sqrt(mean |u - u_0|^2) with u_0 = 0 (the plant has no steady_input),"
+        return f"{name} above its steady_input u_0(q), sqrt(mean |u - u_0(q)|^2)"
 
     def _searches_in_words(self) -> list[str]:
         """Why a law has no factor, and for the others what was searched where that says more than

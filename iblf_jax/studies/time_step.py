@@ -21,6 +21,8 @@ from iblf_jax.studies.study_setup import prepare
 
 STEP_FLAGS = Status.STEP_TOO_LARGE | Status.INACCURATE
 """Flags of a run whose time step was too large."""
+LOST = Status.BOUND_VIOLATED | Status.NOT_FINITE
+"""Flags of a run that left its bounds or diverged, perhaps not because of its step."""
 MAX_TRIES = 8
 
 
@@ -48,7 +50,8 @@ def recommended_dt(
     variances are inaccurate.
 
     With perturbations the step is so small that no run of a first block of the study (256 runs on
-    CPU) is flagged STEP_TOO_LARGE or INACCURATE.
+    CPU) is flagged STEP_TOO_LARGE or INACCURATE.  Runs that leave their bounds or diverge at
+    every step are an exception.
 
     Args:
       scenario: what is to run.
@@ -59,7 +62,8 @@ def recommended_dt(
 
     Returns:
       The step [s].  If no step is accurate (for example of a loop that amplifies every error), the
-      step of the eigenvalue criterion alone, with a warning.
+      step of the eigenvalue criterion alone, with a warning.  If runs of a study leave their bounds
+      or diverge at a step and at a smaller one, the smaller one, with a warning.
 
     Raises:
       ValueError: bad scenario, duration, method, perturbations or seed, or a method that does not
@@ -78,6 +82,7 @@ def recommended_dt(
     dt = step_size.find_dt(scenario, duration=duration, method=method)
     if not perturbations:
         return dt
+    lost_before = None
     for _ in range(MAX_TRIES):
         options = RunOptions(
             duration=max(round(duration / dt), 1) * dt,
@@ -90,11 +95,37 @@ def recommended_dt(
         prepared = prepare(scenario, perturbations, options.checked(), metrics=())
         ((_, results),) = run_blocks(prepared, [0])
         errors = results.metrics[RELATIVE]
-        needed = needed_dt(results.status, results.fastest_mode, errors, dt, method)
+        needed = _dt_to_try(results.status, results.fastest_mode, errors, dt, method)
         if needed is None:
             return dt
-        dt = needed
+        flagged = has_flag(results.status, STEP_FLAGS)
+        lost = np.sum(flagged & has_flag(results.status, LOST))
+        fails_at_any_step = lost == np.sum(flagged) and lost == lost_before
+        if fails_at_any_step or duration / needed > step_size.MAX_TRIED:
+            notices.warn(
+                f"At dt = {dt:g} s, {np.sum(flagged)} of {flagged.size} runs are unstable or"
+                f" inaccurate, of which {lost} left their bounds or diverged. A smaller step was"
+                " not tried, or did not help: inspect them, by study.worst() of a study at this"
+                " step."
+            )
+            return dt
+        dt, lost_before = needed, lost
     return dt
+
+
+def _dt_to_try(
+    status: np.ndarray, modes: np.ndarray, errors: np.ndarray, dt: float, method: str
+) -> float | None:
+    """`needed_dt`, where runs that left their bounds or diverged reduce the step at most ten times
+    at once: near a bound the guard makes the loop fast, so that the fastest mode of such a run
+    measures no step.
+    """
+    kept = ~has_flag(status, LOST)
+    of_kept = needed_dt(status[kept], modes[kept], errors[kept], dt, method)
+    of_lost = needed_dt(status[~kept], modes[~kept], errors[~kept], dt, method)
+    if of_lost is not None:
+        of_lost = max(of_lost, step_size.round_down(dt / 10.0))
+    return min((step for step in (of_kept, of_lost) if step is not None), default=None)
 
 
 def needed_dt(
@@ -125,11 +156,19 @@ def warn_of_step(
     """Warns if runs of a study were flagged because of their step, and names a smaller one;
     arguments as `needed_dt`.
     """
-    needed = needed_dt(status, modes, errors, dt, method)
-    if needed is not None:
-        count = np.sum(has_flag(status, STEP_FLAGS))
-        notices.warn(
-            f"The time step dt = {dt:g} s is too large for {count} of {status.size} runs, which are"
-            f" unstable or inaccurate. Take dt={needed:g}; ij.recommended_dt(scenario,"
-            " perturbations=..., duration=...) finds one beforehand."
+    needed = _dt_to_try(status, modes, errors, dt, method)
+    if needed is None:
+        return
+    flagged = has_flag(status, STEP_FLAGS)
+    lost = np.sum(flagged & has_flag(status, LOST))
+    text = (
+        f"The time step dt = {dt:g} s is too large for {np.sum(flagged)} of {status.size} runs,"
+        f" which are unstable or inaccurate. Take dt={needed:g}; ij.recommended_dt(scenario,"
+        " perturbations=..., duration=...) finds one beforehand."
+    )
+    if lost:
+        text += (
+            f" {lost} of them left their bounds or diverged: those that still do so at that step do"
+            " probably not fail because of the step; study.worst() finds them."
         )
+    notices.warn(text)

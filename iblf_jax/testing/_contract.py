@@ -22,6 +22,13 @@ STEP = 1e-6
 """Relative step of the central differences, whose error is about 1e-9 in float64."""
 
 
+STACKED = (
+    "All rows of jnp.stack must have one shape: write 0.0 * x[0], or jnp.zeros_like(x[0]), for a"
+    " row of zeros, and add a constant to it"
+)
+"""The remedy for rows of different shapes."""
+
+
 class ContractError(AssertionError):
     """A component violates the contract of its family; the message lists the problems with their
     remedies.
@@ -149,7 +156,7 @@ def is_float(x: Any) -> bool:
 def first_line(error: Exception) -> str:
     """The class of an exception and the first line of its text."""
     text = str(error).strip().partition("\n")[0]
-    return f"{type(error).__name__}: {text}"
+    return f"{type(error).__name__}: {text.rstrip('.')}"
 
 
 def _has_members(
@@ -180,6 +187,8 @@ def shape_of(findings: Findings, label: str, call: Callable, *args: Any) -> Any:
         remedy = ""
         if isinstance(error, jax.errors.JAXTypeError):
             remedy = "It is called with tracers: use jax.numpy, and `jnp.where` in place of `if`"
+        elif "stack" in str(error):
+            remedy = STACKED
         findings.stop(f"{label}{findings.kind} raised {first_line(error)}", remedy)
 
 

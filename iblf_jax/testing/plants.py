@@ -28,6 +28,11 @@ TOLERANCE = 1e-9
 """Relative, float64: two formulas of one quantity agree to rounding."""
 SMALLEST_RATIO = 1e-12
 """Least ratio of the singular values of a gain that counts as invertible."""
+PART = (
+    "For a plant that is defined in a part of the space only, give states there:"
+    " check_plant(plant, x=...), shape (m, order, n)"
+)
+"""The remedy for a plant that has no value at a random state."""
 Numbers = dict[str, Any]
 
 
@@ -125,7 +130,7 @@ def _dependence(findings: Findings, plant: Any, t: jax.Array, points: jax.Array)
     """Requires rows of drift and gain that depend on no later level."""
     of_points = jax.vmap(lambda x: plants.dependence_on_levels(plant, t, x))
     try:
-        plants.check_dependence("the plant", jax.jit(of_points)(points))
+        plants.check_dependence(type(plant).__name__, jax.jit(of_points)(points))
     except ValueError as error:
         findings.stop(str(error).removesuffix("."))
 
@@ -137,9 +142,7 @@ def _structure(findings: Findings, plant: Any, t: jax.Array, points: jax.Array) 
     if not plant_member(plant, "needs_filters"):
         _dependence(findings, plant, t, points)
     gains = np.asarray(jax.vmap(lambda x: plant.gain(t, x))(points))
-    finite = np.isfinite(gains).all()
-    findings.require(finite, "gain(t, x) is not finite", "Give states by x=..., or look at poles")
-    findings.stop_if_any()
+    _finite_gains(findings, gains, points)
     for i in range(plant.order):
         matrices = gains[:, i]
         if gains.ndim == 3:
@@ -151,8 +154,19 @@ def _structure(findings: Findings, plant: Any, t: jax.Array, points: jax.Array) 
     findings.stop_if_any()
     slopes = jax.jit(jax.vmap(lambda x: _derivatives_along(plant, t, x)))(points)
     problem = f"a derivative of order up to {plant.order - 1} of drift or gain is not finite"
-    remedy = "Laws differentiate them that often: look at roots, norms and divisions"
+    remedy = f"Laws differentiate them that often: look at roots, norms and divisions. {PART}"
     findings.require(np.isfinite(np.asarray(slopes)).all(), problem, remedy)
+
+
+def _finite_gains(findings: Findings, gains: np.ndarray, points: jax.Array) -> None:
+    """Stops the check at the first row of a gain that is not finite, with its state."""
+    finite = np.isfinite(gains).reshape(*gains.shape[:2], -1).all(axis=-1)
+    if finite.all():
+        return
+    point, row = np.argwhere(~finite)[0]
+    state = np.array2string(np.asarray(points[point]).ravel(), precision=4, threshold=8)
+    problem = f"row {row} of gain(t, x) is not finite at x = {state}"
+    findings.stop(problem, f"Look at roots and divisions. {PART}")
 
 
 def _derivatives_along(plant: Any, t: jax.Array, x: jax.Array) -> jax.Array:

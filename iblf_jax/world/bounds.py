@@ -1,5 +1,8 @@
 """Bounds on joint positions, k_lc(t) < q < k_uc(t), and the tube that they form around the
-reference; bounds on joint velocities have the same form.
+reference.  Bounds on joint velocities, and on the levels of a plant in strict-feedback form, have
+the same form: `Scenario.bounds` are those of q or of the first level x_1, and `state_bounds` those
+of x_2 ... x_r.  The units rad and rad/s are those of a robot; the bounds of another plant have the
+unit of their level.
 
 Each side is a component: constant, sinusoidal, or a funnel that shrinks onto the reference.  The
 law uses the bounds of the error
@@ -95,7 +98,8 @@ class Funnel:
     """A bound at a distance r(t) = (initial - final) exp(-rate t) + final from the reference.
 
     `initial` and `final` are signed: positive for an upper side (bound = q_d + r), negative for a
-      lower one.
+    lower one.  A constant bound d on the error has the sides Funnel(-d, -d, 0.0) and
+    Funnel(d, d, 0.0).
 
     Args:
       initial: distance from the reference at t = 0, () or (n,) [rad].
@@ -119,7 +123,8 @@ class Bounds:
     """A lower and an upper side, each of any kind: `Bounds(lower=Constant(0.1), upper=Sinusoid(0.9,
     0.14))`.
 
-    On positions in rad; on velocities (`Scenario.velocity_bounds`) in rad/s.
+    On positions in rad; on velocities (`Scenario.velocity_bounds`) in rad/s; on a level of another
+    plant (`Scenario.state_bounds`) in the unit of the level.
 
     Args:
       lower: the lower side, any `Side`.

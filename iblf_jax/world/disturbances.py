@@ -9,6 +9,10 @@ The observer estimates the lumped uncertain term of (2.1),
 evaluated along the run with the *model*.  It equals the disturbance here when the plant is the
 model; if the plant has other masses, a payload or friction, f holds those as well.  f must be
 differentiable (Assumption 1), so a discontinuous disturbance declares its `jump_times`.
+
+On a plant in strict-feedback form, `Levels` has a disturbance for each level, in the unit of the
+level per second.  A disturbance that is not inside `Levels` is a torque on the robot inside the
+plant; on a plant without a robot it is added to the input u, in the unit of u.
 """
 
 from __future__ import annotations
@@ -134,6 +138,9 @@ class ModelShaped:
 @component
 class Sinusoids:
     """Joint torques offset + amplitude sin(frequency t + phase).
+
+    On a plant without a robot it is added to the input, and inside `Levels` to the rate of a level,
+    in their units.
 
     Args:
       amplitude: amplitude of the torque, () or (n,) [N m].

@@ -139,6 +139,10 @@ REFUSED = {
         {"controller": law(barriers=(MAPPING, barriers.Integral(), MAPPING))},
         r"barriers\[1\].*Integral.*Mapping\(\)",
     ),
+    "the logarithmic form on a level in the middle": (
+        {"controller": law(barriers=(MAPPING, barriers.Log(), MAPPING))},
+        r"barriers\[1\].*Log.* e/s does not jump at e = 0.*level 2, about alpha_1.*filter=",
+    ),
     "a barrier without a ratio": (
         {"controller": law(barriers=(MAPPING, MAPPING, barriers.Log(p=2)))},
         r"barriers\[2\].*error_over_slope",

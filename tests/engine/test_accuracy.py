@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import warnings
 from functools import partial
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +24,7 @@ from iblf_jax.simulation.error_estimate import RELATIVE, TOLERANCE
 from iblf_jax.simulation.integrators import TABLEAUS
 from iblf_jax.simulation.metrics import as_folds
 from iblf_jax.simulation.scenario import canonical
+from iblf_jax.studies import time_step
 from iblf_jax.tuning.quantities import Quantities
 
 RUNS = 48
@@ -208,6 +210,44 @@ def test_a_study_names_the_step_that_its_runs_need(paper):
         study = ij.monte_carlo(paper, perturbations, runs=256, duration=0.1, dt=dt)
     assert study.metrics[RELATIVE].shape == (256,)
     assert study.status_counts["STEP_TOO_LARGE"] == 0
+
+
+KEPT, FAILED = Status.STEP_TOO_LARGE, Status.STEP_TOO_LARGE | Status.BOUND_VIOLATED
+
+
+def studied(*runs):
+    """The arrays of a study: flags, fastest mode and error of each run."""
+    status, modes = zip(*runs, strict=True)
+    return np.array([int(x) for x in status]), np.array(modes), np.zeros(len(runs))
+
+
+@pytest.mark.parametrize(
+    ("runs", "dt"),
+    [(((KEPT, 5e4), (FAILED, 1e12)), "2e-05"), (((FAILED, 1e12), (Status(0), 1.0)), "0.0001")],
+)
+def test_failed_runs_reduce_the_step_at_most_ten_times(runs, dt):
+    with pytest.warns(UserWarning, match=rf"Take dt={dt};.* 1 of them left their bounds"):
+        time_step.warn_of_step(*studied(*runs), 1e-3, "rk4")
+
+
+def test_a_study_without_failed_runs_mentions_none():
+    with pytest.warns(UserWarning, match="1 of 1 runs") as found:
+        time_step.warn_of_step(*studied((KEPT, 5e3)), 1e-3, "rk4")
+    assert "left their bounds" not in str(found[0].message)
+
+
+def test_runs_that_fail_at_every_step_do_not_reduce_the_recommended_one(paper, monkeypatch):
+    """Runs that leave their bounds at any step have a mode of 1e15 1/s beside the bound."""
+
+    class Results:
+        status, fastest_mode, errors = studied((FAILED, 1e15), (Status(0), 1.0))
+        metrics: ClassVar = {RELATIVE: errors}
+
+    monkeypatch.setattr(time_step, "run_blocks", lambda *_: [(0, Results)])
+    draws = {"controller.K2": ij.factor(ij.uniform(0.9, 1.1))}
+    with pytest.warns(UserWarning, match=r"1 of 2 runs .* of which 1 left .*worst"):
+        dt = ij.recommended_dt(paper, duration=0.1, perturbations=draws)
+    assert dt == pytest.approx(ij.recommended_dt(paper, duration=0.1) / 10.0)
 
 
 def test_folds_may_not_take_its_names(paper):

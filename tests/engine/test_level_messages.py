@@ -1,11 +1,14 @@
 """Messages about the levels of a plant in strict-feedback form: which one, when, and what to do."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import pytest
 from plant_cases import body, pendulum, symmetric
 
 import iblf_jax as ij
 from iblf_jax.core.status import Status
+from iblf_jax.engine import diagnosis
 from iblf_jax.engine.diagnosis import SimulationWarning
 
 Mapping, Quadratic = ij.barriers.Mapping, ij.barriers.Quadratic
@@ -137,3 +140,57 @@ def test_a_robot_keeps_its_words():
     assert "a velocity bound was violated. Joint 1 left its velocity bounds first" in text
     assert "2 joints" in repr(ij.simulate(ij.presets.zhang_yan_2024(), duration=0.02, dt=1e-3))
     assert "1 components" in repr(ij.simulate(pendulum(), duration=0.02, dt=1e-3))
+
+
+@pytest.fixture(scope="module")
+def run():
+    """A run of 20 ms, with the metrics of violated bounds."""
+    return ij.simulate(pendulum(), duration=0.02, dt=1e-3)
+
+
+def message_for(run, status, **metrics) -> str:
+    """The warning about a run with these flags and metrics."""
+    values = run.metrics.values_by_name | {name: jnp.asarray(x) for name, x in metrics.items()}
+    changed = dataclasses.replace(
+        run,
+        status=jnp.asarray(int(status)),
+        metrics=dataclasses.replace(run.metrics, values_by_name=values),
+    )
+    with pytest.warns(SimulationWarning) as found:
+        diagnosis.report(changed, 20, throw=False)
+    return str(found[0].message)
+
+
+CONSEQUENCES = Status.INACCURATE | Status.GUARD_STAYED | Status.INFINITE_SLOPE
+
+
+def test_the_consequences_of_a_divergence_are_left_out_of_its_message(run):
+    text = message_for(run, Status.BOUND_VIOLATED | Status.NOT_FINITE | CONSEQUENCES)
+    assert "a bound was violated" in text
+    for consequence in ("inaccurate", "guard", "derivative"):
+        assert consequence not in text
+    assert "guard stayed active" in message_for(run, Status.BOUND_VIOLATED | Status.GUARD_STAYED)
+
+
+def test_the_first_violation_is_named_first(run):
+    both = Status.BOUND_VIOLATED | Status.VELOCITY_VIOLATED
+    times = {"first_violation_time": 0.01, "first_velocity_violation_time": 0.004}
+    text = message_for(run, both, **times)
+    assert text.index("Level 2 (speed)") < text.index("Level 1 (angle)")
+    text = message_for(run, both, **(times | {"first_violation_time": 0.001}))
+    assert text.index("Level 1 (angle)") < text.index("Level 2 (speed)")
+
+
+def test_a_larger_step_is_no_remedy_for_an_inaccurate_run(run, monkeypatch):
+    monkeypatch.setattr(diagnosis, "find_dt", lambda *_, **__: 5e-3)
+    text = message_for(run, Status.INACCURATE)
+    assert "Take dt" not in text
+    assert "compare this run with one at a tenth of dt" in text
+    monkeypatch.setattr(diagnosis, "find_dt", lambda *_, **__: 2e-4)
+    assert "Take dt=0.0002" in message_for(run, Status.INACCURATE)
+
+
+def test_an_infinite_slope_has_a_remedy_only_if_the_law_has_the_power(run):
+    text = message_for(run, Status.INFINITE_SLOPE)
+    assert "a square root at 0" in text
+    assert "If the law has such a power, replace it" in text

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import loops_of_plants
 import numpy as np
+import plant_cases
 import pytest
 
 import iblf_jax as ij
@@ -69,3 +70,36 @@ def test_a_rigid_law_and_one_of_all_levels_at_equal_effort():
     assert list(found.equal_effort) == ["rigid", "all levels"]
     np.testing.assert_allclose(efforts[1], efforts[0], rtol=1e-4)
     assert "k = " in str(found)
+
+
+def test_a_law_by_name_is_refused_on_a_plant_without_a_robot():
+    with pytest.raises(ValueError, match=r"laws: got 'log'.*Give \{'log': .*BarrierBackstepping"):
+        ij.compare(plant_cases.pendulum(), ["log"], **SHORT)
+
+
+def errors_below(size):
+    return ij.Bounds(
+        lower=ij.bounds.Funnel(-size, -size, 0.0), upper=ij.bounds.Funnel(size, size, 0.0)
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("size", "shown"), [(0.005, False), (0.02, True)])
+def test_a_settling_time_is_shown_where_the_bounds_do_not_settle_the_run(size, shown):
+    scenario = plant_cases.pendulum(bounds=errors_below(size), initial=ij.Initial(x=[[0.0]] * 3))
+    laws = {"mapping": scenario.controller}
+    found = ij.compare(scenario, laws, duration=0.01, dt=1e-3, equal_effort=False)
+    assert np.isfinite(found.table["gains"][0].settling_time) == shown
+    assert ("|e1| < 0.01 rad for good. It is not shown" in str(found)) != shown
+    assert "k = [ 3. 10. 30.]" in str(found)
+
+
+@pytest.mark.slow
+def test_the_effort_is_named_by_what_the_plant_states():
+    short = {"duration": 0.01, "dt": 1e-3}
+    scenario = plant_cases.pendulum()
+    found = ij.compare(scenario, {"mapping": scenario.controller}, **short)
+    assert "u_0 = 0 (the plant has no steady_input)" in str(found)
+    preset = ij.presets.motor_driven_pendulum()
+    found = ij.compare(preset, {"mapping": preset.controller}, **short)
+    assert "above its steady_input u_0(q)" in str(found)

@@ -51,7 +51,15 @@ def test_an_altered_copy_fits_where_nothing_is_altered():
 BROKEN = {
     "later-level": (
         lambda: plant_of(drift=lambda t, x: jnp.stack([x[1], x[0]])),
-        ["row 0 that depends on x[1]", "row 0 of the gain"],
+        ["StrictFeedback.drift(t, x): got row 0 that depends on x[1]", "row 0 of the gain"],
+    ),
+    "gain-without-value": (
+        lambda: plant_of(gain=lambda t, x: jnp.stack([x[0] ** 0, jnp.sqrt(x[1] - 1.0)])),
+        ["row 1 of gain(t, x) is not finite at x = [", "give states there: check_plant(plant, x="],
+    ),
+    "rows-of-different-shapes": (
+        lambda: plant_of(drift=lambda t, x: jnp.stack([0.0, x[1]])),
+        ["(1,). All rows of jnp.stack must have one shape: write 0.0 * x[0]"],
     ),
     "singular": (
         lambda: plant_of(gain=lambda t, x: jnp.stack([x[0] ** 0, 0.0 * x[0]])),

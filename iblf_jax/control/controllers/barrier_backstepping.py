@@ -73,7 +73,13 @@ from iblf_jax.world.references import reference_member
 
 @component
 class BarrierBackstepping:
-    """u = alpha_r of (S.2), for a plant of any order r (head of this module).
+    """Backstepping with a barrier on every level, u = alpha_r, for a plant of any order r.
+
+        alpha_i = G_i^-1 [ a_i - c_i s_i - (e_i/(w_i s_i)) G_{i-1}^T (w_{i-1} s_{i-1})
+                           - f_i - d_hat_i ],   e_i = x_i - alpha_{i-1},   u = alpha_r      (S.2)
+
+    V_i, s_i and a_i are the value, the slope and the virtual velocity of the barrier of level i.
+    The page "Plants in strict-feedback form" has the claim and the choice of the weights.
 
     The law receives the state x, (r, n), of any plant in strict-feedback form, robots included.
     It keeps the bounds of every level that has a barrier, as long as alpha_{i-1} is inside the
@@ -87,7 +93,10 @@ class BarrierBackstepping:
         numbers or (r, n) [1], >= 0; 0 if not given.
       weights: w_i of each level's V_i, r numbers or (r, n) [1], > 0; those of the model's energy if
         not given, with which w_i V_i is about half the scale of the level times e_i^2 near e_i = 0;
-        1 for a model that states none.
+        1 for a model that states none.  The unit 1 of c and of the weights is that of a plant
+        without units; `iblf_jax.parameters` shows the others, in which all w_i V_i have one unit.
+        They depend on the barrier: in a tube of half-width k, w/k^2 with `Mapping` equals w with
+        `PrescribedPerformance` near e_i = 0.
       o: margin under the root of kappa, one number, r numbers or (r, n) [1/s^2], > 0, for barriers
         that have it and for no others; 0.1 for these, if not given.
       filter: mu_i of the filters of a dynamic surface, r - 1 numbers or (r - 1, n) [s], > 0; exact
@@ -97,7 +106,7 @@ class BarrierBackstepping:
 
     Source: M. Krstic, I. Kanellakopoulos, P. Kokotovic, Nonlinear and Adaptive Control Design,
       1995 (backstepping); K. P. Tee, S. S. Ge, Automatica 47 (2011) 2511-2516 (barriers); weights
-      and full-state bounds as at the head of this module.
+      and full-state bounds of this package.
     """
 
     k: Leaf = leaf("1/s", sign="positive", shape="level")
@@ -280,12 +289,17 @@ class BarrierBackstepping:
         # Row i is level i + 1, whose slope u contains with r - (i + 1) - 1 derivatives.
         needed = self.order - i - 2
         smooth = barrier_member(barrier, "slope_derivatives")
-        if smooth >= needed and not (i > 0 and ratio_jumps(barrier)):
+        if i > 0 and ratio_jumps(barrier):
+            expected = "a barrier whose e/s does not jump at e = 0"
+        elif smooth < needed:
+            expected = f"a barrier whose slope has {needed} continuous derivatives at e = 0"
+        else:
             return
-        expected = f"a barrier whose slope has {max(needed, 0)} continuous derivatives at e = 0"
-        if i > 0:
-            expected += " and whose e/s does not jump there"
-        remedy = f"{_smooth_alternatives(i, self.order)} The tube of this level is asymmetric."
+        remedy = (
+            f"The tube of level {i + 1}{_centre_in_words(i)} is asymmetric, and the level is not"
+            f" the last. {_smooth_alternatives(i, self.order)} Or filter the virtual controls:"
+            " BarrierBackstepping(filter=...)."
+        )
         raise checks.fail(name, kind, expected, remedy)
 
     def _check_decay(self, i: int) -> None:
@@ -454,6 +468,11 @@ def _are_opposite(lower: Funnel, upper: Funnel) -> bool:
         and np.allclose(lower.final, -np.asarray(upper.final))
         and np.allclose(lower.rate, upper.rate)
     )
+
+
+def _centre_in_words(i: int) -> str:
+    """The centre of the tube of level i + 1, in words; nothing for the first level."""
+    return f", about alpha_{i}," if i > 0 else ""
 
 
 def _smooth_alternatives(i: int, order: int) -> str:

@@ -1,4 +1,9 @@
-"""Plants in strict-feedback form.  The contract is `Plant` in `_base.py`; robots are of order 2."""
+"""Plants in strict-feedback form.  Robots are of order 2.
+
+    x_i' = f_i(t, x_1..x_i) + G_i(t, x_1..x_i) x_{i+1} + d_i,   i = 1..r,   x_{r+1} = u      (S.1)
+
+A class of your own has the methods of the protocol `Plant`, which is on this page.
+"""
 
 from typing import Any
 

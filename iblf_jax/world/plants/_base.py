@@ -320,7 +320,7 @@ def check_dependence(name: str, dependence: Dependence) -> None:
         if not np.any(later > ROUNDING * np.max(known)):
             continue
         i, j = np.unravel_index(np.argmax(later), later.shape)
-        got = f"a row {i} that depends on x[{j}]"
+        got = f"row {i} that depends on x[{j}]"
         expected = f"row {i} to depend on x[0] ... x[{i}] only (strict-feedback form)"
         if i == 0:
             expected = "row 0 to depend on x[0] only (strict-feedback form)"
