@@ -23,6 +23,21 @@ PAGES: dict[str, tuple[str, str]] = {
             " recommended_period vector_field VectorField explain component leaf Leaf static astype"
         ),
     ),
+    "presets": (
+        "Presets, and robots from files",
+        (
+            "robots.load robots.from_energy presets.arm_scenario presets.zhang_yan_2024"
+            " presets.zhang_yan_2024_full_state presets.zhang_yan_2024_funnel"
+            " presets.zhang_yan_2024_saturated presets.printed_gap presets.customary_two_link"
+            " presets.ur5 presets.iiwa14 presets.flexible_joint_two_link"
+            " presets.flexible_joint_iiwa14 presets.motor_driven_two_link"
+            " presets.motor_driven_pendulum presets.cybership_ii"
+        ),
+    ),
+    "velocities": (
+        "Velocities of an encoder",
+        "sensors.Measured sensors.FilteredDifference sensors.Tracking",
+    ),
     "studies": (
         "Studies",
         (
@@ -203,6 +218,6 @@ def write(folder: Path) -> None:
         names.append(family)
     listed = "\n".join(names)
     (folder / "index.md").write_text(
-        "# Reference\n\nThe reference documents every public name. [All members in one"
+        "# Reference\n\nThe reference documents the public functions and classes; `help()` shows the same texts. [All members in one"
         f" table](../members.md).\n\n```{{toctree}}\n:maxdepth: 2\n\n{listed}\n```\n"
     )
