@@ -218,7 +218,7 @@ def write(folder: Path) -> None:
         names.append(family)
     listed = "\n".join(names)
     (folder / "index.md").write_text(
-        "# Reference\n\nThe reference documents the public functions and classes; `help()` shows the"
-        " same texts. [All members in one"
+        "# Reference\n\nThe reference documents the public functions and classes; `help()` shows"
+        " the same texts. [All members in one"
         f" table](../members.md).\n\n```{{toctree}}\n:maxdepth: 2\n\n{listed}\n```\n"
     )
