@@ -166,9 +166,24 @@ def test_a_torque_that_jumps_is_refused():
         arm_problem(scenario, {}, duration=2.0)
 
 
+@component
+class Ramp:
+    """A position whose acceleration jumps at 1 s."""
+
+    continuous_derivatives: ClassVar[int] = 1
+
+    def position(self, t):
+        return 0.5 + 0.05 * jnp.maximum(t - 1.0, 0.0)[None] ** 2
+
+
 def test_a_reference_whose_acceleration_jumps_is_refused():
-    reference = ij.references.WaypointSpline((0.0, 1.0, 2.0), [[0.5], [0.6], [0.5]], derivatives=1)
     with pytest.raises(ValueError, match="two continuous derivatives"):
+        arm_problem(pendulum(reference=Ramp()), {}, duration=2.0)
+
+
+def test_a_spline_is_refused_because_of_its_pieces():
+    reference = ij.references.WaypointSpline((0.0, 1.0, 2.0), [[0.5], [0.6], [0.5]])
+    with pytest.raises(ValueError, match="a reference without pieces"):
         arm_problem(pendulum(reference=reference), {}, duration=2.0)
 
 

@@ -185,7 +185,7 @@ def with_drift(drift):
     ids=["complete-equation", "square-at-a-start-of-0", "two-levels-up"],
 )
 def test_a_drift_that_depends_on_later_levels_is_refused(drift, words):
-    with pytest.raises(ValueError, match=rf"plant.drift\(t, x\): got a {words}"):
+    with pytest.raises(ValueError, match=rf"plant.drift\(t, x\): got {words}"):
         ij.simulate(scenario_of(with_drift(drift)), duration=0.1, dt=1e-2)
 
 
@@ -193,7 +193,7 @@ def test_a_gain_that_depends_on_later_levels_is_refused():
     plant = plants.StrictFeedback(
         drift=lambda t, x: -x, gain=lambda t, x: 1.0 + x[::-1] ** 2, n=1, order=3
     )
-    with pytest.raises(ValueError, match=r"plant.gain\(t, x\): got a row 0 that depends on x\[2\]"):
+    with pytest.raises(ValueError, match=r"plant.gain\(t, x\): got row 0 that depends on x\[2\]"):
         ij.simulate(scenario_of(plant), duration=0.1, dt=1e-2)
 
 
