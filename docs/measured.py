@@ -9,6 +9,7 @@ import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from entry_tables import markdown_table
 from gallery import ROOT
 
 RESULTS = ROOT / "benchmarks" / "results"
@@ -122,12 +123,8 @@ def write(page: Path) -> None:
 
 def table(rows: list[dict[str, Any]]) -> str:
     """Rows as Markdown."""
-    lines = [
-        list(rows[0]),
-        ["---"] * len(rows[0]),
-        *([f"{x:.3g}" if isinstance(x, float) else str(x) for x in row.values()] for row in rows),
-    ]
-    return "\n".join("| " + " | ".join(cells) + " |" for cells in lines)
+    cells = [[f"{x:.3g}" if isinstance(x, float) else str(x) for x in row.values()] for row in rows]
+    return markdown_table(list(rows[0]), cells)
 
 
 def draw(plot: Plot, rows: list[dict[str, Any]], path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -84,16 +85,7 @@ def recommended_dt(
         return dt
     lost_before = None
     for _ in range(MAX_TRIES):
-        options = RunOptions(
-            duration=max(round(duration / dt), 1) * dt,
-            dt=dt,
-            method=method,
-            backend="auto",
-            runs=block_size(),
-            seed=seed,
-        )
-        prepared = prepare(scenario, perturbations, options.checked(), metrics=())
-        ((_, results),) = run_blocks(prepared, [0])
+        results = _first_block(scenario, perturbations, duration, dt, method, seed)
         errors = results.metrics[RELATIVE]
         needed = _dt_to_try(results.status, results.fastest_mode, errors, dt, method)
         if needed is None:
@@ -111,6 +103,28 @@ def recommended_dt(
             return dt
         dt, lost_before = needed, lost
     return dt
+
+
+def _first_block(
+    scenario: Scenario,
+    perturbations: Mapping[str, Perturbation],
+    duration: float,
+    dt: float,
+    method: str,
+    seed: int,
+) -> Any:
+    """The results of the first block of a study at a step."""
+    options = RunOptions(
+        duration=max(round(duration / dt), 1) * dt,
+        dt=dt,
+        method=method,
+        backend="auto",
+        runs=block_size(),
+        seed=seed,
+    )
+    prepared = prepare(scenario, perturbations, options.checked(), metrics=())
+    ((_, results),) = run_blocks(prepared, [0])
+    return results
 
 
 def _dt_to_try(
