@@ -9,15 +9,19 @@ import contextlib
 import dataclasses
 import functools
 import io
+import math
 import re
 import runpy
 import tomllib
 import typing
 import warnings
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 from matplotlib import pyplot
+from scipy.integrate import solve_ivp
 
 FOLDER = Path(__file__).resolve().parent
 ROOT = FOLDER.parents[1]
@@ -312,3 +316,42 @@ def filled(text: str, numbers: dict[str, float]) -> str:
 def is_reached(published: Published, value: float) -> bool:
     """Whether a value is the published one within its tolerance."""
     return abs(value - published.value) <= published.tolerance * (1 + 1e-9)
+
+
+def largest_difference(
+    run: Any,
+    rate: Callable[[float, np.ndarray], Any],
+    *,
+    x0: Sequence[float] | None = None,
+    start: float = 0.0,
+    end: float = math.inf,
+    every: int = 1,
+    components: int | None = None,
+    method: str = "DOP853",
+    rtol: float = 1e-9,
+    atol: float = 1e-11,
+    **options: Any,
+) -> float:
+    """The largest difference of a run's states from those that SciPy integrates.
+
+    Args:
+      run: a `Rollout`.
+      rate: (t, x) -> x'; x has the states of the run, level after level, and then further ones,
+        such as those of filters and observers.
+      x0: x at `start`; the run's own states if not given.
+      start, end: what is compared [s].
+      every: compares one of so many recorded samples.
+      components: how many of the states are compared; None for all states of the run.
+      method, rtol, atol, options: as `scipy.integrate.solve_ivp`.
+    """
+    t = np.asarray(run.t)[::every]
+    own = np.asarray(run.x)[::every].reshape(len(t), -1)
+    # Half a step of the grid: decimal times are not exact.
+    compared = (t > start - 0.5 * run.dt) & (t < end + 0.5 * run.dt)
+    t, own = t[compared], own[compared]
+    first = own[0] if x0 is None else x0
+    found = solve_ivp(
+        rate, (t[0], t[-1]), first, method, t_eval=t, rtol=rtol, atol=atol, **options
+    ).y.T
+    count = own.shape[1] if components is None else components
+    return float(np.abs(found[:, :count] - own[:, :count]).max())

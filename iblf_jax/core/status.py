@@ -94,6 +94,9 @@ FAILED = (
 )
 """The flags of a failed run."""
 
+LOST = Status.BOUND_VIOLATED | Status.NOT_FINITE
+"""The flags of a run that left its bounds or diverged, perhaps not because of its step."""
+
 UNTRUSTED = Status.NOT_FINITE | Status.STEP_TOO_LARGE
 """The flags of a run whose results are meaningless: no loss and no certificate uses them."""
 

@@ -17,10 +17,10 @@ from iblf_jax.control.barriers import Quadratic
 from iblf_jax.control.controllers._base import law_member
 from iblf_jax.core import checks, notices
 from iblf_jax.core.pytree import unwrapped
-from iblf_jax.core.status import FAILED, Status, describe
+from iblf_jax.core.status import FAILED, LOST, Status, describe
 from iblf_jax.core.units import POSITION, VELOCITY
 from iblf_jax.engine.limiting_term import limiting_term
-from iblf_jax.engine.step_size import comfortable_dt, find_dt
+from iblf_jax.engine.step_size import comfortable_dt, find_dt, limited
 from iblf_jax.simulation.error_estimate import ERROR, RELATIVE, TOLERANCE
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.results import Rollout
@@ -251,10 +251,20 @@ def _first_violation(what: str, time: jax.Array, margin: jax.Array, unit: str) -
 def _unstable_step(result: Rollout) -> str:
     mode = float(result.fastest_mode)
     limit = tableau(result.method).stability / mode
+    needed = comfortable_dt(mode, result.method)
+    if int(result.status) & LOST:
+        to_try = limited(needed, float(result.dt))
+        if to_try > needed:
+            return (
+                f"The closed loop's fastest mode is {mode:.4g} 1/s, but the run left its bounds or"
+                f" diverged, and the mode may be that of the failure. Take dt={to_try:g}: if the"
+                " run fails at that step too, the step is not the cause. Then look at the gains,"
+                " the start and the disturbance."
+            )
     return (
         f"The closed loop's fastest mode is {mode:.4g} 1/s, so {result.method} is stable up to"
         f" dt = {limit:.3g} s only; dt = {float(result.dt):g} s was requested. Take"
-        f" dt={comfortable_dt(mode, result.method):g}{_alternative_remedy(result)}."
+        f" dt={needed:g}{_alternative_remedy(result)}."
     )
 
 

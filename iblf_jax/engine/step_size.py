@@ -237,6 +237,14 @@ def comfortable_dt(mode: float, method: str) -> float:
     return round_down(phase / max(mode, SLOWEST_RATE))
 
 
+def limited(needed: float, dt: float) -> float:
+    """The step to try after a run of step dt that left its bounds or diverged: at most ten times
+    smaller [s].  Near a bound the guard makes the loop fast, so that `needed`, the step for the
+    fastest mode of such a run, says little.
+    """
+    return max(needed, round_down(dt / 10.0))
+
+
 def smaller(dt: float, excess: float, order: int) -> float:
     """The round step to try after dt, whose error is `excess` times what it may be: one to ten
     times smaller.

@@ -25,7 +25,6 @@ from iblf_jax.plotting._curves import (
 )
 from iblf_jax.plotting._figures import PanelRow, windows, zoom_reason
 from iblf_jax.plotting._panels import Window, draw, quantity_of, range_after, set_limits
-from iblf_jax.simulation.metrics import Settling
 from iblf_jax.studies.comparison import Comparison
 from iblf_jax.world import plants
 
@@ -78,6 +77,7 @@ def comparison(result: Comparison, joint: int = 0, *, zoom: float | None = None)
     for column, (title, curves) in zip(table.T, columns.items(), strict=True):
         column[0].set_title(title)
         _errors(column[0], curves, order, joint, (start, end))
+        _mark_tolerance(column[0], result, joint)
         _name_window(column[0], curves, error, end, zoom_reason(curves, [error], end))
         reason = zoom_reason(curves, [torque], end)
         torque_end = end
@@ -122,7 +122,7 @@ def _name_window(axes: Axes, curves: list[Curve], row: PanelRow, end: float, rea
 
 
 def _errors(axes: Axes, curves: list[Curve], order: list[str], joint: int, window: Window) -> None:
-    """The error |e1| of every law, and the tolerance of the settling time."""
+    """The error |e1| of every law."""
     start = 0.0
     for curve in curves:
         error = np.abs(curve["e1"][:, joint])
@@ -131,10 +131,14 @@ def _errors(axes: Axes, curves: list[Curve], order: list[str], joint: int, windo
         points = thinned(t[shown], np.maximum(error[shown], SMALLEST))
         axes.semilogy(*points, **_law_style(curve, order))
         start = max(start, error[0])
-    tolerance = float(Settling().tolerance)
-    axes.axhline(tolerance, color=_style.bound(), linewidth=0.8, zorder=1, label="settled")
     axes.set_ylim(SMALLEST, 3.0 * max(start, 10.0 * SMALLEST))
     _style.time_axis(axes, window)
+
+
+def _mark_tolerance(axes: Axes, result: Comparison, joint: int) -> None:
+    """A line at the error of one joint below which a law has settled."""
+    tolerance = np.broadcast_to(result.settling.tolerance, result.scenario.n)[joint]
+    axes.axhline(tolerance, color=_style.bound(), linewidth=0.8, zorder=1, label="settled")
 
 
 def _torques(

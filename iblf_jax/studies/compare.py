@@ -40,7 +40,14 @@ from iblf_jax.core.units import INPUT
 from iblf_jax.engine import Outcome, RunRequest, run_batch
 from iblf_jax.engine.simulate import simulate
 from iblf_jax.simulation.error_estimate import RELATIVE
-from iblf_jax.simulation.metrics import AboveGravity, as_folds, optional_folds, standard
+from iblf_jax.simulation.metrics import (
+    AboveGravity,
+    Fold,
+    Settling,
+    as_folds,
+    optional_folds,
+    standard,
+)
 from iblf_jax.simulation.noise import noise_values
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.results import Rollout
@@ -65,6 +72,7 @@ def compare(
     dt: float = 1e-3,
     method: str = "rk4",
     record_every: int = 1,
+    metrics: Sequence[Fold] = (),
     equal_effort: bool = True,
 ) -> Comparison:
     """Runs several laws on one scenario, at their gains and at equal effort.
@@ -87,6 +95,8 @@ def compare(
         name to show.  The first one sets the effort.  Names are laws of robots; for a plant
         without a robot give laws, such as {"mapping": BarrierBackstepping(...)}.
       duration, dt, method, record_every: as `simulate`.
+      metrics: folds besides the standard ones.  A fold replaces the standard one of its class:
+        `ij.metrics.Settling(tolerance=0.001)` sets the error at which a law has settled.
       equal_effort: whether to look for the factors; a few batches of 89 further runs a law.
 
     Returns:
@@ -107,11 +117,13 @@ def compare(
         "dt": dt,
         "method": method,
         "record_every": record_every,
+        "metrics": _folds(scenario, metrics),
     }
+    settling = next(fold for fold in options["metrics"] if isinstance(fold, Settling))
     rollouts = {name: _run(one, options) for name, one in scenarios.items()}
     gains = {name: _gains_in_words(one.controller) for name, one in scenarios.items()}
     if not equal_effort:
-        return Comparison(rollouts, {}, {}, {}, gains)
+        return Comparison(rollouts, {}, {}, {}, gains, settling=settling)
     first = next(iter(rollouts))
     others = {name: one for name, one in scenarios.items() if name != first}
     equal = {first: _EqualEffort(1.0, rollouts[first])}
@@ -124,6 +136,7 @@ def compare(
         {name: one.reason for name, one in equal.items() if one.reason},
         gains,
         {name: one.search for name, one in equal.items() if one.search is not None},
+        settling,
     )
 
 
@@ -207,6 +220,16 @@ def _model_for(law: Controller, scenario: Scenario) -> Any:
     return model if robot is None else robot
 
 
+def _folds(scenario: Scenario, further: Sequence[Fold]) -> tuple[Fold, ...]:
+    """The folds of every run: those of `further`, and the standard ones of other classes."""
+    if not isinstance(further, tuple | list):
+        remedy = "Put one fold into brackets, metrics=(fold,)."
+        raise checks.fail("metrics", further, "a tuple of folds", remedy)
+    replaced = tuple(type(fold) for fold in further)
+    usual = (*standard(), *optional_folds(scenario), AboveGravity())
+    return (*(fold for fold in usual if not isinstance(fold, replaced)), *further)
+
+
 def _limited_as(controller: Controller, law: Controller) -> Controller:
     """A law with the torque limits of another one."""
     if not isinstance(controller, Saturated):
@@ -217,9 +240,7 @@ def _limited_as(controller: Controller, law: Controller) -> Controller:
 def _run(scenario: Scenario, options: Mapping[str, Any]) -> Rollout:
     """One run; the table reports its failure, so there is no warning."""
     with notices.muted(UserWarning):
-        return simulate(
-            scenario, metrics=(*standard(), *optional_folds(scenario), AboveGravity()), **options
-        )
+        return simulate(scenario, **options)
 
 
 def gain_names(law: Controller) -> tuple[str, ...]:

@@ -47,8 +47,8 @@ class Row(NamedTuple):
     factor: float
     """What the law's gains were multiplied by."""
     settling_time: float
-    """Until |e1| < 0.01 for good, in the unit of the first level [s]; NaN where the bounds are
-    closer than that, so that every run that keeps them has settled from the start."""
+    """Until |e1| is below the tolerance of `Comparison.settling` for good [s]; NaN where the bounds
+    are closer than that, so that every run that keeps them has settled from the start."""
     rmse: float
     """[rad]."""
     margin: float
@@ -104,16 +104,16 @@ def _verdict(run: Rollout) -> str:
     return f"FAILED: {text}" if status & FAILED else text
 
 
-def _is_settled_by_bounds(run: Rollout) -> bool:
+def _is_settled_by_bounds(run: Rollout, settling: Settling) -> bool:
     """Whether the bounds of every component are closer to the reference than the error at which
     it counts as settled, so that its settling time says nothing about the law.
     """
     widest = np.maximum(run.upper - run.q_d, run.q_d - run.lower)
-    return bool(np.all(widest <= Settling().tolerance))
+    return bool(np.all(widest <= settling.tolerance))
 
 
-def row_of(law: str, factor: float, run: Rollout) -> Row:
-    """The line of one run."""
+def row_of(law: str, factor: float, run: Rollout, settling: Settling) -> Row:
+    """The line of one run, whose settling time is that of `settling`."""
     m = run.metrics
 
     def worst(name: str, reduce: Any = np.max) -> float:
@@ -124,7 +124,7 @@ def row_of(law: str, factor: float, run: Rollout) -> Row:
     return Row(
         law,
         factor,
-        math.nan if _is_settled_by_bounds(run) else worst("settling_time"),
+        math.nan if _is_settled_by_bounds(run, settling) else worst("settling_time"),
         worst("rmse"),
         worst("margin", np.min),
         worst("xi_margin", np.min),
@@ -164,6 +164,8 @@ class Comparison:
     searches: dict[str, EffortSearch] = dataclasses.field(default_factory=dict)
     """Law -> the search for its factor: all trials, with those that failed; without the first
     law."""
+    settling: Settling = dataclasses.field(default_factory=Settling)
+    """The metric of the settling times, with their tolerance."""
 
     @property
     def nearest(self) -> dict[str, tuple[float, float]]:
@@ -179,9 +181,12 @@ class Comparison:
     @property
     def table(self) -> dict[str, tuple[Row, ...]]:
         """The lines of both tables: "gains" and "effort"."""
-        as_given = tuple(row_of(name, 1.0, run) for name, run in self.rollouts.items())
+        as_given = tuple(
+            row_of(name, 1.0, run, self.settling) for name, run in self.rollouts.items()
+        )
         effort = tuple(
-            row_of(name, self.factors[name], run) for name, run in self.equal_effort.items()
+            row_of(name, self.factors[name], run, self.settling)
+            for name, run in self.equal_effort.items()
         )
         if not self.factors:
             return {"gains": as_given}
@@ -213,7 +218,7 @@ class Comparison:
             notes["gains"].append(OWN_GAINS)
         if any(isinstance(barrier, Integral) for barrier in barriers):
             notes["gains"].append(FACTOR_TWO)
-        if any(_is_settled_by_bounds(run) for run in self.rollouts.values()):
+        if any(_is_settled_by_bounds(run, self.settling) for run in self.rollouts.values()):
             notes["gains"].append(self._settling_in_words)
         notes["gains"] += [f"{name} FAILED: {why}." for name, why in self.failed.items()]
         if self.factors:
@@ -245,10 +250,11 @@ class Comparison:
     @property
     def _settling_in_words(self) -> str:
         """Why the table has no settling times."""
-        size = f"{float(Settling().tolerance):g} {unit_text(self.scenario, POSITION)}"
+        size = f"{float(np.max(self.settling.tolerance)):g} {unit_text(self.scenario, POSITION)}"
         return (
             f"Settling is the time until |e1| < {size} for good. It is not shown, because the"
-            " bounds are closer to the reference than that."
+            " bounds are closer to the reference than that: give a smaller tolerance,"
+            " metrics=(ij.metrics.Settling(tolerance=...),)."
         )
 
     @property

@@ -9,7 +9,7 @@ import numpy as np
 
 from iblf_jax.core import checks, notices
 from iblf_jax.core.progress import announced
-from iblf_jax.core.status import Status, has_flag
+from iblf_jax.core.status import LOST, Status, has_flag
 from iblf_jax.engine import block_size, step_size
 from iblf_jax.simulation.error_estimate import RELATIVE, TOLERANCE
 from iblf_jax.simulation.integrators import tableau
@@ -22,8 +22,6 @@ from iblf_jax.studies.study_setup import prepare
 
 STEP_FLAGS = Status.STEP_TOO_LARGE | Status.INACCURATE
 """Flags of a run whose time step was too large."""
-LOST = Status.BOUND_VIOLATED | Status.NOT_FINITE
-"""Flags of a run that left its bounds or diverged, perhaps not because of its step."""
 MAX_TRIES = 8
 
 
@@ -131,14 +129,13 @@ def _dt_to_try(
     status: np.ndarray, modes: np.ndarray, errors: np.ndarray, dt: float, method: str
 ) -> float | None:
     """`needed_dt`, where runs that left their bounds or diverged reduce the step at most ten times
-    at once: near a bound the guard makes the loop fast, so that the fastest mode of such a run
-    measures no step.
+    at once.
     """
     kept = ~has_flag(status, LOST)
     of_kept = needed_dt(status[kept], modes[kept], errors[kept], dt, method)
     of_lost = needed_dt(status[~kept], modes[~kept], errors[~kept], dt, method)
     if of_lost is not None:
-        of_lost = max(of_lost, step_size.round_down(dt / 10.0))
+        of_lost = step_size.limited(of_lost, dt)
     return min((step for step in (of_kept, of_lost) if step is not None), default=None)
 
 

@@ -111,6 +111,16 @@ def test_a_step_too_large_is_found_and_a_step_that_works_is_named(paper):
     assert ij.simulate(stiff, duration=500 * dt, dt=dt).ok
 
 
+@pytest.mark.slow
+def test_the_mode_of_a_run_that_left_its_bounds_recommends_at_most_a_tenth_of_the_step(paper):
+    stiff = ij.with_parameters(paper, {"controller.K2": 3e4})
+    with pytest.warns(
+        ij.SimulationWarning,
+        match=r"the mode may be that of the failure\. Take dt=0\.0001: if the run fails",
+    ):
+        ij.simulate(stiff, **SHORT)
+
+
 def test_recommended_dt_and_the_measured_mode(paper, short_run):
     """About K2 / lambda_min(M0): 850 to 1010 1/s on the paper's run."""
     assert ij.recommended_dt(paper) == 1e-3

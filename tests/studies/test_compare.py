@@ -115,6 +115,23 @@ def test_the_table_is_the_metrics_of_the_runs(comparison):
     assert frame.shape == (6, 10)
 
 
+def test_a_metric_replaces_the_standard_one_of_its_class(comparison):
+    folds = (ij.metrics.Settling(tolerance=[0.02, 0.04]), ij.metrics.LyapunovValue())
+    options = RUN | {"record_every": 1}
+    found = ij.compare(comparison.scenario, ["log"], metrics=folds, equal_effort=False, **options)
+    run = found.rollouts["log"]
+    inside = np.abs(run.e1) < np.array([0.02, 0.04])
+    settled = [np.flatnonzero(~inside[:, i])[-1] + 1 for i in range(2)]
+    np.testing.assert_allclose(run.metrics.settling_time, run.t[np.array(settled)])
+    assert set(ij.metrics.LyapunovValue.units) <= set(run.metrics)
+    assert found.table["gains"][0].settling_time < comparison.table["gains"][1].settling_time
+
+
+def test_metrics_are_a_sequence(comparison):
+    with pytest.raises(ValueError, match=r"metrics.*Put one fold into brackets"):
+        ij.compare(comparison.scenario, ["log"], metrics=ij.metrics.Settling(), **RUN)
+
+
 def test_at_equal_gains_the_integral_form_works_harder_than_the_logarithmic_one(comparison):
     integral, log = comparison.table["gains"][:2]
     assert integral.settling_time < log.settling_time

@@ -1,10 +1,9 @@
 """The loop of `example.py` with NumPy and SciPy only."""
 
-import runpy
 from pathlib import Path
 
 import numpy as np
-from scipy.integrate import solve_ivp
+from entry import execute, largest_difference
 
 TOLERANCE = 1e-3  # of velocities of up to 0.2 rad/s, which oscillate at 17 Hz
 
@@ -27,14 +26,7 @@ def rates(t, x):
     return np.concatenate([v, np.linalg.solve(M, tau - C @ v - G - d)])
 
 
-def compare():
+def compare() -> float:
     """The largest difference of the states."""
-    names = runpy.run_path(str(Path(__file__).with_name("example.py")))
-    run = names["runs"]["published"]
-    t = np.asarray(run.t)
-    found = solve_ivp(rates, (0.0, t[-1]), np.zeros(4), t_eval=t, rtol=1e-9, atol=1e-12).y.T
-    return float(np.abs(found - np.concatenate([run.q, run.dq], axis=1)).max())
-
-
-if __name__ == "__main__":
-    print(compare())
+    run = execute(Path(__file__).parent).runs["published"]
+    return largest_difference(run, rates, x0=np.zeros(4), method="RK45", atol=1e-12)

@@ -3,8 +3,7 @@
 from pathlib import Path
 
 import numpy as np
-from entry import execute
-from scipy.integrate import solve_ivp
+from entry import execute, largest_difference
 
 TOLERANCE = 1e-6
 
@@ -16,9 +15,7 @@ def rate(t, x):
     return [x[1], -2 * (x[0] ** 2 - 1) * x[1] - x[0] + 1 + (2 + np.sin(x[0] * x[1])) * u]
 
 
-def compare():
+def compare() -> float:
     """The largest difference of the states."""
     run = next(iter(execute(Path(__file__).parent).runs.values()))
-    t, x = np.asarray(run.t)[::100], np.asarray(run.x)[::100, :, 0]
-    found = solve_ivp(rate, (0.0, t[-1]), x[0], "LSODA", t_eval=t, rtol=1e-11, atol=1e-13).y.T
-    return float(np.abs(found - x).max())
+    return largest_difference(run, rate, every=100, method="LSODA", rtol=1e-11, atol=1e-13)

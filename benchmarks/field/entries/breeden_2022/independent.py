@@ -1,11 +1,10 @@
 """The start of this entry with the published rows of the programme, without the package."""
 
 import itertools
-import runpy
 from pathlib import Path
 
 import numpy as np
-from scipy.integrate import solve_ivp
+from entry import execute, largest_difference
 
 n = np.sqrt(398600e9 / 6778e3**3)
 A0 = np.array([[0, 0, 1, 0], [0, 0, 0, 1], [3 * n**2, 0, 0, 2 * n], [0, 0, -2 * n, 0]])
@@ -58,9 +57,7 @@ def rate(t, x):
 
 def compare() -> float:
     """The largest difference of positions [m] and speeds [m/s] in the first 60 s."""
-    run = next(iter(runpy.run_path(str(Path(__file__).with_name("example.py")))["runs"].values()))
-    early = np.asarray(run.t) <= 60.0
-    own = np.asarray(run.x)[early].reshape(-1, 4)
-    t = np.asarray(run.t)[early]
-    found = solve_ivp(rate, (0.0, 60.0), own[0], "RK45", t, max_step=0.1, rtol=1e-8, atol=1e-9)
-    return float(np.abs(own - found.y.T).max())
+    run = next(iter(execute(Path(__file__).parent).runs.values()))
+    return largest_difference(
+        run, rate, end=60.0, method="RK45", max_step=0.1, rtol=1e-8, atol=1e-9
+    )

@@ -1,10 +1,9 @@
 """The corrected loop of `example.py` with NumPy and SciPy only."""
 
-import runpy
 from pathlib import Path
 
 import numpy as np
-from scipy.integrate import solve_ivp
+from entry import execute, largest_difference
 
 CENTRES = 5.0 * (2.0 * np.random.RandomState(5489).random_sample((1000, 8)) - 1.0)
 TOLERANCE = 1e-3  # of the velocities, in the steep first millisecond of the filter
@@ -44,17 +43,9 @@ def rates(t, x):
     return np.concatenate([v, acceleration, (alpha - filtered) / 1e-3, [growth]])
 
 
-def compare():
+def compare() -> float:
     """The largest difference of the states."""
-    names = runpy.run_path(str(Path(__file__).with_name("example.py")))
-    run = names["runs"]["corrected"]
-    t = np.asarray(run.t)
-    start = [0.15, 0.4, 0.0, 0.0, 0.0, 0.0, 0.0]
-    found = solve_ivp(
-        rates, (0.0, t[-1]), start, t_eval=t, method="Radau", rtol=1e-7, atol=1e-9
-    ).y.T
-    return float(np.abs(found[:, :4] - np.concatenate([run.q, run.dq], axis=1)).max())
-
-
-if __name__ == "__main__":
-    print(compare())
+    run = execute(Path(__file__).parent).runs["corrected"]
+    return largest_difference(
+        run, rates, x0=[0.15, 0.4, 0, 0, 0, 0, 0], method="Radau", rtol=1e-7, atol=1e-9
+    )

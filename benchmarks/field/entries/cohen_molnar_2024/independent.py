@@ -1,10 +1,9 @@
 """The corrected loop of `example.py` with NumPy and SciPy only."""
 
-import runpy
 from pathlib import Path
 
 import numpy as np
-from scipy.integrate import solve_ivp
+from entry import execute, largest_difference
 
 TOLERANCE = 1e-3  # of the angles up to 4 s; the gradient of the barrier is by differences here
 
@@ -39,16 +38,9 @@ def rates(t, x):
     return np.concatenate([x[2:], np.linalg.solve(M, u - bias)])
 
 
-def compare():
+def compare() -> float:
     """The largest difference of the states up to 4 s."""
-    names = runpy.run_path(str(Path(__file__).with_name("example.py")))
-    run = names["runs"]["corrected"]
-    t = np.asarray(run.t)[np.asarray(run.t) <= 4.0]
-    start = [np.pi / 2 + 0.1, 0.0, 0.0, 0.0]
-    found = solve_ivp(rates, (0.0, 4.0), start, t_eval=t, rtol=1e-9, atol=1e-10).y.T
-    states = np.concatenate([run.q, run.dq], axis=1)[: len(t)]
-    return float(np.abs(found - states).max())
-
-
-if __name__ == "__main__":
-    print(compare())
+    run = execute(Path(__file__).parent).runs["corrected"]
+    return largest_difference(
+        run, rates, x0=[np.pi / 2 + 0.1, 0, 0, 0], end=4.0, method="RK45", atol=1e-10
+    )

@@ -3,8 +3,7 @@
 from pathlib import Path
 
 import numpy as np
-from entry import execute
-from scipy.integrate import solve_ivp
+from entry import execute, largest_difference
 
 END = 4.0
 TOLERANCE = 1e-7
@@ -31,11 +30,7 @@ def rate(t, x):
     return np.concatenate([v, np.linalg.solve(M, tau + 2 * np.sin(4 * t) - C - G)])
 
 
-def compare():
+def compare() -> float:
     """The largest difference of the positions [rad]."""
     run = next(iter(execute(Path(__file__).parent).runs.values()))
-    t = np.asarray(run.t)
-    t = t[t < END]
-    x = np.concatenate([run.q, run.dq], axis=1)[: len(t)]
-    found = solve_ivp(rate, (0.0, END), x[0], "DOP853", t_eval=t, rtol=1e-9, atol=1e-11).y.T
-    return float(np.abs(found - x)[:, :2].max())
+    return largest_difference(run, rate, end=END, components=2)

@@ -1,10 +1,9 @@
 """The motion of this entry from the printed normal form and law, without the package."""
 
-import runpy
 from pathlib import Path
 
 import numpy as np
-from scipy.integrate import solve_ivp
+from entry import execute, largest_difference
 
 
 def force(t, y, dy):
@@ -24,7 +23,5 @@ def rate(t, x):
 
 def compare() -> float:
     """The largest difference of y [m] and y' [m/s]."""
-    run = next(iter(runpy.run_path(str(Path(__file__).with_name("example.py")))["runs"].values()))
-    found = solve_ivp(rate, (0.0, 10.0), np.zeros(4), "LSODA", run.t, rtol=1e-10, atol=1e-11)
-    own = np.stack([np.asarray(run.q[:, 0]), np.asarray(run.dq[:, 0])])
-    return float(np.abs(own - found.y[:2]).max())
+    run = next(iter(execute(Path(__file__).parent).runs.values()))
+    return largest_difference(run, rate, x0=np.zeros(4), method="LSODA", rtol=1e-10, atol=1e-11)

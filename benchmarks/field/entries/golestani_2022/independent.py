@@ -1,10 +1,9 @@
 """The loop of `example.py` with the gains of the figures, with NumPy and SciPy only."""
 
-import runpy
 from pathlib import Path
 
 import numpy as np
-from scipy.integrate import solve_ivp
+from entry import execute, largest_difference
 
 J = np.array([[20.0, 1.2, 0.9], [1.2, 17.0, 1.4], [0.9, 1.4, 15.0]])
 
@@ -31,17 +30,16 @@ def rates(t, x):
     return np.concatenate([turning, acceleration, [growth]])
 
 
-def compare():
+def compare() -> float:
     """The largest difference of the states up to 10 s."""
-    names = runpy.run_path(str(Path(__file__).with_name("example.py")))
-    run = names["runs"]["15 s"]
-    t = np.asarray(run.t)[np.asarray(run.t) <= 10.0]
-    start = [0.2, -0.15, -0.25, 0.0, 0.0, 0.0, 0.0]
-    found = solve_ivp(
-        rates, (0.0, t[-1]), start, t_eval=t, rtol=1e-8, atol=1e-10, max_step=0.02
-    ).y.T
-    return float(np.abs(found[:, :6] - np.asarray(run.x)[: len(t)].reshape(-1, 6)).max())
-
-
-if __name__ == "__main__":
-    print(compare())
+    run = execute(Path(__file__).parent).runs["15 s"]
+    return largest_difference(
+        run,
+        rates,
+        x0=[0.2, -0.15, -0.25, 0, 0, 0, 0],
+        end=10.0,
+        method="RK45",
+        rtol=1e-8,
+        atol=1e-10,
+        max_step=0.02,
+    )

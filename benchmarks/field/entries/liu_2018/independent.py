@@ -3,8 +3,7 @@
 from pathlib import Path
 
 import numpy as np
-from entry import execute
-from scipy.integrate import solve_ivp
+from entry import execute, largest_difference
 
 END = 5.0
 TOLERANCE = 1e-6
@@ -21,11 +20,7 @@ def rate(t, x):
     return [x2, -25 * x2 + 133 * u]
 
 
-def compare():
+def compare() -> float:
     """The largest difference of the states."""
     run = next(iter(execute(Path(__file__).parent).runs.values()))
-    t = np.asarray(run.t)[::50]
-    t = t[t < END]
-    x = np.asarray(run.x)[::50, :, 0][: len(t)]
-    found = solve_ivp(rate, (0.0, END), x[0], "DOP853", t_eval=t, rtol=1e-10, atol=1e-12).y.T
-    return float(np.abs(found - x).max())
+    return largest_difference(run, rate, end=END, every=50, rtol=1e-10, atol=1e-12)

@@ -3,8 +3,7 @@
 from pathlib import Path
 
 import numpy as np
-from entry import execute
-from scipy.integrate import solve_ivp
+from entry import execute, largest_difference
 
 TOLERANCE = 1e-6
 
@@ -23,9 +22,7 @@ def rate(t, x):
     return [dx1, alpha_rate - 10 * (x2 - top / g1) - g1 * z1 / room]
 
 
-def compare():
+def compare() -> float:
     """The largest difference of the states."""
     run = next(iter(execute(Path(__file__).parent).runs.values()))
-    t, x = np.asarray(run.t)[::50], np.asarray(run.x)[::50, :, 0]
-    found = solve_ivp(rate, (0.0, t[-1]), x[0], "DOP853", t_eval=t, rtol=1e-11, atol=1e-13).y.T
-    return float(np.abs(found - x).max())
+    return largest_difference(run, rate, every=50, rtol=1e-11, atol=1e-13)

@@ -1,10 +1,9 @@
 """The corrected loop of `example.py` with NumPy and SciPy only."""
 
-import runpy
 from pathlib import Path
 
 import numpy as np
-from scipy.integrate import solve_ivp
+from entry import execute, largest_difference
 
 TOLERANCE = 1e-3  # of the velocities, where they come within 0.002 rad/s of a limit
 Q = np.array([[-np.pi / 4, -np.pi / 2], [np.pi / 2, np.pi / 2]])
@@ -49,16 +48,7 @@ def rates(t, x):
     return np.concatenate([v, np.linalg.solve(true, known @ u + bias - true_bias)])
 
 
-def compare():
+def compare() -> float:
     """The largest difference of the states."""
-    names = runpy.run_path(str(Path(__file__).with_name("example.py")))
-    run = names["runs"]["corrected"]
-    t = np.asarray(run.t)
-    found = solve_ivp(
-        rates, (0.0, t[-1]), np.zeros(4), method="Radau", t_eval=t, rtol=1e-8, atol=1e-10
-    ).y.T
-    return float(np.abs(found - np.concatenate([run.q, run.dq], axis=1)).max())
-
-
-if __name__ == "__main__":
-    print(compare())
+    run = execute(Path(__file__).parent).runs["corrected"]
+    return largest_difference(run, rates, x0=np.zeros(4), method="Radau", rtol=1e-8, atol=1e-10)

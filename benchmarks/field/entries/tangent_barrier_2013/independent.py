@@ -3,8 +3,7 @@
 from pathlib import Path
 
 import numpy as np
-from entry import execute
-from scipy.integrate import solve_ivp
+from entry import execute, largest_difference
 
 END = 3.0
 TOLERANCE = 1e-6
@@ -31,11 +30,7 @@ def rate(t, x):
     return [dx1, 0.1 * x1 * x2 - 0.2 * x1 + (1 + x1**2) * u]
 
 
-def compare():
+def compare() -> float:
     """The largest difference of the states."""
     run = next(iter(execute(Path(__file__).parent).runs.values()))
-    t = np.asarray(run.t)[::50]
-    t = t[t < END]
-    x = np.asarray(run.x)[::50, :, 0][: len(t)]
-    found = solve_ivp(rate, (0.0, END), x[0], "DOP853", t_eval=t, rtol=1e-10, atol=1e-12).y.T
-    return float(np.abs(found - x).max())
+    return largest_difference(run, rate, end=END, every=50, rtol=1e-10, atol=1e-12)

@@ -3,8 +3,7 @@
 from pathlib import Path
 
 import numpy as np
-from entry import execute
-from scipy.integrate import solve_ivp
+from entry import execute, largest_difference
 
 TOLERANCE = 1e-6
 
@@ -49,24 +48,17 @@ def with_filter(t, x):
 
 
 LOOPS = {
-    "exact derivatives": (with_exact_derivatives, [], 1.5),
-    "filter of the model": (with_filter, [0.0], 0.9),
+    "exact derivatives": (with_exact_derivatives, [0.5, 2.0], 1.5),
+    "filter of the model": (with_filter, [0.5, 2.0, 0.0], 0.9),
 }
-"""Run -> derivative, start of further states, and end: the published rho divides by z, which passes
-0."""
+"""Run -> derivative, start, and end: the published rho divides by z, which passes 0."""
 
 
-def difference(run, rate, further, end):
-    """The largest difference of the states."""
-    t = np.asarray(run.t)[::50]
-    t = t[t < end]
-    x = np.asarray(run.x)[::50, :, 0][: len(t)]
-    start = [*x[0], *further]
-    found = solve_ivp(rate, (0.0, end), start, "DOP853", t_eval=t, rtol=1e-10, atol=1e-12).y.T
-    return float(np.abs(found[:, :2] - x).max())
-
-
-def compare():
+def compare() -> float:
     """The largest difference of the states, of both laws."""
     runs = execute(Path(__file__).parent).runs
-    return max(difference(runs[name], *loop) for name, loop in LOOPS.items())
+    tolerances = {"rtol": 1e-10, "atol": 1e-12}
+    return max(
+        largest_difference(runs[name], rate, x0=x0, end=end, every=50, **tolerances)
+        for name, (rate, x0, end) in LOOPS.items()
+    )

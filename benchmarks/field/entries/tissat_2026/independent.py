@@ -3,8 +3,7 @@
 from pathlib import Path
 
 import numpy as np
-from entry import execute
-from scipy.integrate import solve_ivp
+from entry import execute, largest_difference
 
 TOLERANCE = 1e-4
 BOUNDS = ((20.0, 30.0), (150.0, 180.0))
@@ -41,13 +40,12 @@ def rate(t, y):
     return [x2, x3, u, (alpha1 - beta1) / 0.3, (alpha2 - beta2) / 0.3]
 
 
-def compare():
+def compare() -> float:
     """The largest difference of the states."""
     run = next(iter(execute(Path(__file__).parent).runs.values()))
-    t, x = np.asarray(run.t)[::200], np.asarray(run.x)[::200, :, 0]
-    beta = np.zeros(2)
+    x, beta = np.ravel(run.x[0]), np.zeros(2)
     for _ in range(2):  # the second filter begins at alpha_2, which depends on the first
-        beta = beta + 0.3 * np.array(rate(0.0, [*x[0], *beta])[3:])
-    start = [*x[0], *beta]
-    found = solve_ivp(rate, (0.0, t[-1]), start, "LSODA", t_eval=t, rtol=1e-11, atol=1e-12).y.T
-    return float(np.abs(found[:, :3] - x).max())
+        beta = beta + 0.3 * np.array(rate(0.0, [*x, *beta])[3:])
+    x0 = [*x, *beta]
+    tolerances = {"rtol": 1e-11, "atol": 1e-12}
+    return largest_difference(run, rate, x0=x0, every=200, method="LSODA", **tolerances)

@@ -3,8 +3,7 @@
 from pathlib import Path
 
 import numpy as np
-from entry import execute
-from scipy.integrate import solve_ivp
+from entry import execute, largest_difference
 
 START, END = 6.0, 6.9
 TOLERANCE = 1e-7
@@ -36,12 +35,7 @@ def rate(t, x):
     return np.concatenate([v, np.linalg.solve(M, tau + np.array([0.15, 0.18, 0.12]) - N)])
 
 
-def compare():
+def compare() -> float:
     """The largest difference of the positions [rad]."""
     run = next(iter(execute(Path(__file__).parent).runs.values()))
-    t = np.asarray(run.t)
-    inside = (t >= START - 1e-9) & (t < END)
-    t = t[inside]
-    x = np.concatenate([run.q, run.dq], axis=1)[inside]
-    found = solve_ivp(rate, (t[0], END), x[0], "DOP853", t_eval=t, rtol=1e-9, atol=1e-11).y.T
-    return float(np.abs(found - x)[:, :3].max())
+    return largest_difference(run, rate, start=START, end=END, components=3)

@@ -3,8 +3,7 @@
 from pathlib import Path
 
 import numpy as np
-from entry import execute
-from scipy.integrate import solve_ivp
+from entry import execute, largest_difference
 
 END = 5.0
 TOLERANCE = 1e-7
@@ -65,12 +64,7 @@ def rate(t, x):
     return np.concatenate([v, np.linalg.solve(M, tau + f - C @ v - G), eta_rate])
 
 
-def compare():
+def compare() -> float:
     """The largest difference of the positions [rad]."""
     run = next(iter(execute(Path(__file__).parent).runs.values()))
-    t = np.asarray(run.t)[::20]
-    t = t[t < END]
-    q = np.asarray(run.q)[::20][: len(t)]
-    start = np.array([0.8, 0.8, 0.0, 0.0, 0.0, 0.0])
-    found = solve_ivp(rate, (0.0, END), start, "DOP853", t_eval=t, rtol=1e-9, atol=1e-11).y.T
-    return float(np.abs(found[:, :2] - q).max())
+    return largest_difference(run, rate, x0=[0.8, 0.8, 0, 0, 0, 0], end=END, every=20, components=2)
