@@ -16,6 +16,7 @@ from iblf_jax.core import checks
 from iblf_jax.core.status import FAILED, VIOLATED
 from iblf_jax.plotting import _style
 from iblf_jax.plotting._curves import escaped
+from iblf_jax.plotting._studies import MARGINS
 from iblf_jax.studies.statistics import SMALLER_IS_WORSE
 
 if TYPE_CHECKING:
@@ -145,8 +146,19 @@ def _draw_heat_map(
     axes.set_xlabel(_axis_label(data, x))
     axes.set_ylabel(_axis_label(data, y))
     figure.colorbar(image, ax=axes, label=label)
+    axes.set_title(_equality(metric, picture))
     if picture.size <= 150:
         _write_numbers(axes, picture, image)
+
+
+def _equality(metric: str, picture: np.ndarray) -> str:
+    """A title where all points have one value, which then says nothing about what was swept."""
+    values = picture[np.isfinite(picture)]
+    if metric in SHARES or values.size < 2 or not np.allclose(values, values[0], 1e-6, 0.0):
+        return ""
+    if metric in MARGINS:
+        return "equal at all points, as margins of the start (t = 0) are"
+    return "equal at all points"
 
 
 def _ticks(axis: Any, values: np.ndarray) -> None:

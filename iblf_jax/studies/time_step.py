@@ -81,6 +81,18 @@ def recommended_dt(
     dt = step_size.find_dt(scenario, duration=duration, method=method)
     if not perturbations:
         return dt
+    return _dt_for_all(scenario, perturbations, duration, dt, method, seed)
+
+
+def _dt_for_all(
+    scenario: Scenario,
+    perturbations: Mapping[str, Perturbation],
+    duration: float,
+    dt: float,
+    method: str,
+    seed: int,
+) -> float:
+    """The step, at most dt, at which no run of a first block is flagged because of its step."""
     lost_before = None
     for _ in range(MAX_TRIES):
         results = _first_block(scenario, perturbations, duration, dt, method, seed)

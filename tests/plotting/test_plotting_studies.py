@@ -73,6 +73,18 @@ def test_heat_maps_stand_side_by_side(table):
     np.testing.assert_array_equal(margins, table.margin.min("joint").median("run").T)
 
 
+def test_a_heat_map_of_equal_values_says_so(table):
+    def title(**values):
+        metric = next(iter(values))
+        return drawn(plotting.heat_map(table.assign(values), metric)).axes[0].get_title()
+
+    dim = next(iter(table.margin.dims))
+    growing = table.margin + table[dim]
+    assert title(margin=growing) == ""
+    assert title(margin=0.0 * growing + 0.25).endswith("as margins of the start (t = 0) are")
+    assert title(fastest_mode=0.0 * growing.min("joint") + 0.25) == "equal at all points"
+
+
 def test_heat_map_shows_the_medians(table):
     figure = drawn(plotting.heat_map(table, "margin"))
     expected = table.margin.min("joint").median("run").transpose("observer.kf", "controller.K2")

@@ -8,12 +8,12 @@ import pytest
 
 from iblf_jax import barriers, controllers, decays, observers
 
-PAGE = runpy.run_path(str(Path(__file__).resolve().parents[2] / "docs" / "members.py"))
+PAGE = runpy.run_path(str(Path(__file__).resolve().parents[2] / "docs" / "members_page.py"))
 
 
 def test_the_page_is_not_stale():
     assert PAGE["TARGET"].read_text(encoding="utf-8") == PAGE["text"](), (
-        "run `python docs/members.py`"
+        "run `python docs/members_page.py`"
     )
 
 

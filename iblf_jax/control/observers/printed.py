@@ -31,7 +31,7 @@ class Printed:
       start: "zero": eta(0) = eta0, as printed; "matched": eta(0) = eta0 - kf M0 q'(0), so that
         f_hat(0) = eta0; "zero" if not given.
 
-    Source: Zhang & Yan 2024, (3.11), signs restored.
+    Source: Zhang & Yan 2024, (3.11), with the signs of its derivation.
     """
 
     kf: Leaf = leaf("1/s", sign="positive")

@@ -218,8 +218,8 @@ class FailureProbability:
         confidence = f"{100 * self.confidence:g}%"
         if self.is_upper_bound:
             first = (
-                f"FailureProbability(at most {self.estimate:.2g} with {confidence} confidence;"
-                f" {self.runs} runs, and no sample failed)"
+                f"FailureProbability(no sample failed in {self.runs} runs; at most"
+                f" {self.estimate:.2g} with {confidence} confidence)"
             )
         else:
             first = (
@@ -228,6 +228,10 @@ class FailureProbability:
                 f" {self.runs} runs)"
             )
         lines = [first, f"  {self._method_in_words()}"]
+        notes = [f"  {note}" for note in self.notes]
+        if self.is_upper_bound:  # the notes say what the bound is about
+            lines[1:1] = notes
+            notes = []
         if self.most_likely_failure is not None:
             text = repr(self.most_likely_failure).splitlines()
             head = text[0].removeprefix("LikelyFailure(").removesuffix(")")
@@ -239,7 +243,7 @@ class FailureProbability:
             "of the sampled failures started outside their bounds": self.started_outside,
         }
         lines += [f"  {count} {words}." for words, count in counts.items() if count]
-        return "\n".join([*lines, *(f"  {note}" for note in self.notes)])
+        return "\n".join([*lines, *notes])
 
     def _method_in_words(self) -> str:
         if self.method == "importance":

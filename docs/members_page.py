@@ -1,5 +1,5 @@
 """Writes docs/members.md from the docstrings of the package's own members: `python
-docs/members.py`.
+docs/members_page.py`.
 
 A test compares the file with the output of this script.
 """
@@ -119,7 +119,7 @@ def text() -> str:
     lines = [
         "# Members",
         "",
-        "<!-- `python docs/members.py` writes this file. -->",
+        "<!-- `python docs/members_page.py` writes this file. -->",
         "",
         "The page lists all members of all families; the [reference](reference/index.md) documents"
         " their arguments.",
