@@ -193,10 +193,12 @@ def assemble() -> None:
     field.write(SOURCE)
     measured.write(SOURCE / "benchmarks.md")
     shutil.copy(ROOT / "benchmarks" / "README.md", SOURCE / "lab_notes.md")
-    shutil.copy(ROOT / "CONTRIBUTING.md", SOURCE / "contributing.md")
-    changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
-    changes = changes.replace("(benchmarks/README.md)", "(lab_notes.md)")
-    (SOURCE / "changelog.md").write_text(changes, encoding="utf-8")
+    shutil.copy(ROOT / "benchmarks" / "field" / "README.md", SOURCE / "add_an_entry.md")
+    for name, page in (("CONTRIBUTING", "contributing"), ("CHANGELOG", "changelog")):
+        text = (ROOT / f"{name}.md").read_text(encoding="utf-8")
+        text = text.replace("(benchmarks/field/README.md)", "(add_an_entry.md)")
+        text = text.replace("(benchmarks/README.md)", "(lab_notes.md)")
+        (SOURCE / f"{page}.md").write_text(text, encoding="utf-8")
     shutil.copy(ROOT / "CITATION.cff", SOURCE)
 
 

@@ -114,7 +114,7 @@ def benchmark_page(found: list[Part]) -> str:
         " reached within the accuracy to which they can be read, and"
         f" {sum(holds)} of {len(holds)} published statements hold. {corrected} corrections were"
         " necessary, which [a page of its own](literature_corrected.md) lists."
-        " `benchmarks/field/README.md` in the repository describes how to add an entry.",
+        " [Adding an entry](add_an_entry.md) describes the steps.",
         "## Entries",
         summary(found),
         "The last three columns name the law of the package that has the smallest error at the"

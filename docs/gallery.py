@@ -7,7 +7,8 @@ comment lines below. The page of an entry also has the tables of its `entry.toml
 file; the numbers that the entry reached are written to a JSON file of the same name.
 
 The tests run the scripts by `page`, which writes to `out/site/gallery`. `docs/build.py` reads the
-pages there, and runs the scripts whose page is missing or older.
+pages there, and runs the scripts whose page is missing or older.  `python docs/gallery.py NAME`
+writes one page, to look at it before the site is built.
 """
 
 from __future__ import annotations
@@ -198,3 +199,22 @@ def _cards(scripts: list[Path]) -> str:
             f" {picture}\n:::"
         )
     return "::::{grid} 1 2 3 3\n:gutter: 2\n\n" + "\n".join(cards) + "\n\n::::"
+
+
+def main() -> None:
+    """Writes the pages whose names are given."""
+    import jax
+    import matplotlib
+
+    jax.config.update("jax_enable_x64", True)
+    matplotlib.use("Agg")
+    scripts = {page_name(script): script for script in PAGES}
+    for name in sys.argv[1:]:
+        if name not in scripts:
+            sys.exit(f"There is no page {name}; there are {', '.join(scripts)}.")
+        page(scripts[name])
+        print(MADE / f"{name}.md")
+
+
+if __name__ == "__main__":
+    main()

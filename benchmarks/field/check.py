@@ -24,6 +24,8 @@ import matplotlib
 import numpy as np
 from entry import (
     ENTRIES,
+    PLACEHOLDER,
+    TEMPLATE,
     Entry,
     EntryError,
     Reproduction,
@@ -48,12 +50,14 @@ INDEPENDENT = 1e-4
 
 def faults_of(folder: Path) -> list[str]:
     """What has to be repaired, a sentence each; empty for a correct entry."""
+    if not folder.is_dir():
+        return [f"{folder} does not exist; `check.py` without a name checks all entries"]
     found = _faults_of_name(folder)
     try:
         entry = load(folder)
     except EntryError as error:
         return found + error.faults
-    found += _faults_of_text(entry)
+    found += _faults_of_text(entry) + _faults_of_year(folder, entry) + _words_of_template(entry)
     script = folder / "example.py"
     if not script.exists():
         return [*found, "there is no example.py; copy the one of benchmarks/field/template"]
@@ -64,9 +68,12 @@ def faults_of(folder: Path) -> list[str]:
         return found + error.faults
     except Exception as error:  # whatever the script raises is reported to its author
         return [*found, f"example.py does not run: {_last_line(error, script)}"]
-    found += _faults_of_runs(entry, made) + _faults_of_options(made)
-    found += _faults_of_figure(made.figure)
-    found += _faults_of_numbers(entry, made) + _faults_of_claims(entry, made)
+    found += _faults_of_runs(entry, made) + _faults_of_figure(made.figure)
+    options = _faults_of_options(made)
+    if options:
+        return found + options
+    found += _faults_of_numbers(entry, made) + _faults_of_evidence(entry, made)
+    found += _faults_of_claims(entry, made)
     return found + _faults_of_scenario(folder, entry) + _faults_of_independent(folder)
 
 
@@ -77,6 +84,30 @@ def _faults_of_name(folder: Path) -> list[str]:
         f"the folder {folder.name!r} must be named after the first author and the year,"
         " such as tee_ge_2012"
     ]
+
+
+def _faults_of_year(folder: Path, entry: Entry) -> list[str]:
+    if folder.name.endswith(f"_{entry.source.year}"):
+        return []
+    return [
+        f"the folder {folder.name!r} must end in the year of entry.toml, [source] year ="
+        f" {entry.source.year}"
+    ]
+
+
+def _words_of_template(entry: Entry) -> list[str]:
+    """What the author has not replaced yet."""
+    template = load(TEMPLATE)
+    found = []
+    if entry.title == template.title:
+        found.append("entry.toml: title is that of the template")
+    for name in ("authors", "title", "where", "doi"):
+        value = vars(entry.source)[name]
+        if value and value == vars(template.source)[name]:
+            found.append(f"entry.toml: [source] {name} is that of the template")
+    if set(entry.corrected) & set(template.corrected):
+        found.append("entry.toml: [[corrected]] has the example of the template")
+    return found
 
 
 def _faults_of_text(entry: Entry) -> list[str]:
@@ -168,8 +199,9 @@ def _faults_of_runs(entry: Entry, made: Reproduction) -> list[str]:
 def _faults_of_options(made: Reproduction) -> list[str]:
     """The names that an example may define in addition."""
     found = []
-    if not isinstance(made.not_applicable, dict):
-        found.append("example.py: not_applicable must be a dict, law -> reason")
+    for name in ("reached", "holds", "evidence", "details", "not_applicable"):
+        if not isinstance(getattr(made, name), dict):
+            found.append(f"example.py: {name} must be a dict")
     if made.uncertain is None or not isinstance(made.scenario, ij.Scenario):
         return found
     known = {parameter.path for parameter in ij.parameters(made.scenario)}
@@ -199,7 +231,7 @@ def _faults_of_figure(figure: object) -> list[str]:
 
 
 def _faults_of_numbers(entry: Entry, made: Reproduction) -> list[str]:
-    """Every published number is reached, and every number of `evidence` is used."""
+    """Every published number is reached."""
     found = []
     for number in entry.published:
         if number.quantity not in made.reached:
@@ -218,10 +250,27 @@ def _faults_of_numbers(entry: Entry, made: Reproduction) -> list[str]:
             )
     for key in sorted(set(made.reached) - {number.quantity for number in entry.published}):
         found.append(f"entry.toml: no [[published]] has the quantity {key!r} of reached")
+    return found
+
+
+def _faults_of_evidence(entry: Entry, made: Reproduction) -> list[str]:
+    """Every number of `evidence` is one, and is used; every {name} of the texts is one of them."""
+    found = []
+    for key, value in made.evidence.items():
+        if isinstance(value, str) or np.ndim(value) != 0:
+            found.append(f"example.py: evidence[{key!r}] must be one number")
+    if found:
+        return found
     texts = "\n".join(correction.evidence for correction in entry.corrected)
-    for key in made.evidence:
-        if filled(texts, {key: 0.0}) == texts:
-            found.append(f"entry.toml: no evidence of [[corrected]] contains {{{key}}}")
+    try:
+        filled(texts, made.evidence)
+    except EntryError as error:
+        return error.faults
+    used = {match[1] for match in PLACEHOLDER.finditer(texts)}
+    for key in sorted(set(made.evidence) - used):
+        found.append(f"entry.toml: no evidence of [[corrected]] contains {{{key}}}")
+    for key in sorted(used - set(made.evidence)):
+        found.append(f"example.py: evidence lacks {key!r}, which a [[corrected]] contains")
     return found
 
 

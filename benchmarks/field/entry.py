@@ -27,6 +27,7 @@ FOLDER = Path(__file__).resolve().parent
 ROOT = FOLDER.parents[1]
 ENTRIES = FOLDER / "entries"
 RESULTS = FOLDER / "results"
+TEMPLATE = FOLDER / "template"
 
 FAMILIES = ("robot", "flexible joint", "drive", "vessel", "vehicle", "strict feedback")
 METHODS = ("barrier", "prescribed performance", "constrained")
@@ -301,16 +302,30 @@ def reproduction(names: dict[str, Any]) -> Reproduction:
     return Reproduction(**(DEFAULTS | defined))
 
 
+PLACEHOLDER = re.compile(r"\{(\w+)(?::([^{}]*))?\}")
+"""{name} or {name:format} in the text of a correction, for a number of `evidence`."""
+
+
 def filled(text: str, numbers: dict[str, float]) -> str:
-    """A text in which {name} and {name:format} are replaced by computed numbers."""
+    """A text in which {name} and {name:format} are replaced by computed numbers.
+
+    Raises:
+      EntryError: no number can be written in a format.
+    """
 
     def number(match: re.Match[str]) -> str:
         name, spec = match[1], match[2]
         if name not in numbers:
             return match[0]
-        return format(numbers[name], spec or ".4g")
+        try:
+            return format(float(numbers[name]), spec or ".4g")
+        except ValueError:
+            fault = (
+                f"entry.toml: {match[0]} must have the format of a number, such as {{{name}:.3g}}"
+            )
+            raise EntryError([fault]) from None
 
-    return re.sub(r"\{(\w+)(?::([^{}]*))?\}", number, text)
+    return PLACEHOLDER.sub(number, text)
 
 
 def is_reached(published: Published, value: float) -> bool:

@@ -506,6 +506,10 @@ def measure(
     task, made = task_of(folder, duration)
     uncertain = uncertain_of(made)
     chosen = {PUBLISHED: laws.Choice(task.scenario.controller)} | laws_of(task, uncertain)
+    unknown = sorted(set(made.not_applicable) - set(chosen))
+    if unknown:
+        fault = f"example.py: not_applicable has {unknown}, of which `measure.py` knows no law"
+        raise entry.EntryError([fault])
     reasons = {name: words for name, words in chosen.items() if isinstance(words, str)}
     reasons |= made.not_applicable
     applicable = [name for name in chosen if name not in reasons]

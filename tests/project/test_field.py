@@ -211,6 +211,17 @@ evidence = {"printed": 0.1}
 SCRIPT = f'"""A title: one sentence."""\n{QUICK}'
 
 
+OF_AN_AUTHOR = {
+    "A bound on the output of a servo drive": "Bounds of a drive",
+    "A. Author, B. Author": "C. Author",
+    "Title of the publication": "Bounds",
+    "Journal 1(2) (2020) 3-4, section 5": "Journal 2 (2020) 5-6",
+    "10.1000/182": "10.1000/183",
+    'printed = "k1 = 1"': 'printed = "k1 = 2"',
+}
+"""Words of the template that an author replaces."""
+
+
 @pytest.fixture
 def faults(tmp_path):
     """Writes an entry with replaced words; the function returns what the checker finds."""
@@ -221,6 +232,8 @@ def faults(tmp_path):
         contents = (TEMPLATE / "entry.toml").read_text(encoding="utf-8")
         contents = contents.replace("duration = 2.0", "duration = 0.01")
         contents = contents.replace("value = 0.5\n", "value = 0.3\n")
+        for old, new in OF_AN_AUTHOR.items():
+            contents = contents.replace(old, new)
         (folder / "entry.toml").write_text(replaced(contents, text), encoding="utf-8")
         (folder / "example.py").write_text(replaced(SCRIPT, script), encoding="utf-8")
         for file, words in dict(files).items():
@@ -254,8 +267,8 @@ IN_TEXT = {
     ),
     "no list": ({"[[claims]]": "[claims]"}, "claims must be a list of tables"),
     "no TOML": ({"year = 2020": "year ="}, "entry.toml is not valid TOML: Invalid value (at line"),
-    "no link": ({'doi = "10.1000/182"': ""}, '[source] needs doi = "10...." or url'),
-    "address as DOI": ({'"10.1000/182"': '"https://doi.org/10.1000/182"'}, "must begin with 10."),
+    "no link": ({'doi = "10.1000/183"': ""}, '[source] needs doi = "10...." or url'),
+    "address as DOI": ({'"10.1000/183"': '"https://doi.org/10.1000/182"'}, "must begin with 10."),
     "tolerance": ({"tolerance = 0.005": "tolerance = 0"}, "must be positive"),
     "time step": ({"dt = 1e-3": "dt = 0.0"}, "[run] needs 0 < dt < duration"),
     "number not reached": (
@@ -267,6 +280,21 @@ IN_TEXT = {
         "reached lacks 'peak [rad]'",
     ),
     "unused evidence": ({"{printed}": "0.1"}, "no evidence of [[corrected]] contains {printed}"),
+    "evidence not computed": ({"{printed}": "{printed} {other:.3g}"}, "evidence lacks 'other'"),
+    "format": ({"{printed}": "{printed:.3q}"}, "{printed:.3q} must have the format of a number"),
+    "another year": ({"year = 2020": "year = 2021"}, "must end in the year of entry.toml"),
+    "title of the template": (
+        {'"Bounds of a drive"': '"A bound on the output of a servo drive"'},
+        "title is that of the template",
+    ),
+    "author of the template": (
+        {'"C. Author"': '"A. Author, B. Author"'},
+        "[source] authors is that of the template",
+    ),
+    "correction of the template": (
+        {'printed = "k1 = 2"': 'printed = "k1 = 1"'},
+        "[[corrected]] has the example of the template",
+    ),
     "duration": ({"duration = 0.01": "duration = 3.0"}, "ends at 0.01 s, and entry.toml"),
 }
 IN_SCRIPT = {
@@ -287,6 +315,8 @@ IN_SCRIPT = {
     "too long": ("evidence =", "\n" * check.MOST_LINES + "evidence =", "shorten it to 150"),
     "time step": ("dt=1e-3", "dt=1e-4", "has the step 0.0001 s"),
     "no rollout": ('{"first": ij', '{"second": 1, "first": ij', "must be the Rollout"),
+    "evidence in words": ('"printed": 0.1', '"printed": "0.1"', "evidence['printed'] must be one"),
+    "details as a list": ("holds =", "details = ['x']\nholds =", "details must be a dict"),
     "unknown path": ("holds =", "uncertain = ('plant.m',)\nholds =", "uncertain has 'plant.m'"),
 }
 
@@ -309,14 +339,15 @@ def test_the_checker_reports_a_fault_of_the_script(fault, faults):
 
 def test_the_checker_reports_faults_of_the_folder(faults, tmp_path):
     assert any("named after the first author" in line for line in faults(name="author"))
+    assert any("must end in the year" in line for line in faults(name="author_1999"))
+    assert "does not exist" in check.faults_of(tmp_path / "other_2020")[0]
     (tmp_path / "empty_2020").mkdir()
     assert check.faults_of(tmp_path / "empty_2020") == [
         "there is no entry.toml; copy the one of benchmarks/field/template"
     ]
     shutil.copy(TEMPLATE / "entry.toml", tmp_path / "empty_2020")
-    assert check.faults_of(tmp_path / "empty_2020") == [
-        "there is no example.py; copy the one of benchmarks/field/template"
-    ]
+    found = check.faults_of(tmp_path / "empty_2020")
+    assert found[-1] == "there is no example.py; copy the one of benchmarks/field/template"
 
 
 FURTHER_FILES = {
@@ -351,7 +382,9 @@ def test_the_checker_reports_a_fault_of_a_further_file(fault, faults):
 def test_the_template_is_correct(tmp_path):
     folder = tmp_path / "author_2020"
     shutil.copytree(TEMPLATE, folder)
-    assert check.faults_of(folder) == []
+    found = check.faults_of(folder)
+    assert len(found) == 6
+    assert all("of the template" in fault for fault in found)
 
 
 # ---------------------------------------------------------------------------- the measurement

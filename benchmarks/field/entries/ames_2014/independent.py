@@ -1,9 +1,9 @@
 """The distance and the speed of this entry with a numerical minimum, without the package."""
 
-import runpy
 from pathlib import Path
 
 import numpy as np
+from entry import execute
 from scipy.integrate import solve_ivp
 from scipy.optimize import minimize_scalar
 
@@ -31,7 +31,7 @@ def acceleration(x):
 
 def compare() -> float:
     """The largest difference of z [m] and v [m/s]."""
-    run = next(iter(runpy.run_path(str(Path(__file__).with_name("example.py")))["runs"].values()))
+    run = next(iter(execute(Path(__file__).parent).runs.values()))
     t, x = np.asarray(run.t), np.asarray(run.x[..., 0])
     options = {"max_step": 0.02, "rtol": 1e-8, "atol": 1e-9}
     found = solve_ivp(

@@ -1,9 +1,9 @@
 """The rotation matrix of this entry, by SciPy, without angles and without the package."""
 
-import runpy
 from pathlib import Path
 
 import numpy as np
+from entry import execute
 from scipy.integrate import solve_ivp
 
 INERTIA = np.array(
@@ -47,7 +47,7 @@ def rate(t, z):
 
 def compare() -> float:
     """The largest difference of the entries of R [1] and of the angular velocity [rad/s]."""
-    run = next(iter(runpy.run_path(str(Path(__file__).with_name("example.py")))["runs"].values()))
+    run = next(iter(execute(Path(__file__).parent).runs.values()))
     t, x = np.asarray(run.t), np.asarray(run.x)
     c, s = np.cos(np.radians(225.0)), np.sin(np.radians(225.0))
     start = np.concatenate([[c, -s, 0.0, s, c, 0.0, 0.0, 0.0, 1.0], np.zeros(6)])

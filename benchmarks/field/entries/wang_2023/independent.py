@@ -1,9 +1,9 @@
 """The vehicle of this entry with all nine neurons of the program, without the package."""
 
-import runpy
 from pathlib import Path
 
 import numpy as np
+from entry import execute
 from scipy.integrate import solve_ivp
 
 M = np.array([50.5, 84.36, 17.21])
@@ -70,7 +70,7 @@ def rate(t, z):
 
 def compare() -> float:
     """The largest difference of positions [m, rad] and speeds [m/s, rad/s] in the first 20 s."""
-    run = next(iter(runpy.run_path(str(Path(__file__).with_name("example.py")))["runs"].values()))
+    run = next(iter(execute(Path(__file__).parent).runs.values()))
     early = np.asarray(run.t) <= 20.0
     t, own = np.asarray(run.t)[early], np.asarray(run.x)[early]
     x = np.array([0.1, 0.1, 0.1, 10.0, 0.0, -np.pi / 6])
