@@ -24,6 +24,7 @@ import entry
 import entry_tables
 import field
 import measure
+import task_laws
 
 NAMES = [folder.name for folder in entry.folders()]
 TEMPLATE = FIELD / "template"
@@ -425,19 +426,19 @@ def test_processes_report_entries_that_failed(tmp_path, monkeypatch, capsys):
 
 def test_the_laws_of_a_robot_are_those_of_the_table_of_laws():
     task = task_of_preset(ij.presets.zhang_yan_2024())
-    found = measure.laws_of(task, ("plant.mass",))
-    assert list(found) == list(measure.laws.CHOICES)
+    found = task_laws.laws_of(task, ("plant.mass",))
+    assert list(found) == list(task_laws.laws.CHOICES)
     assert not [name for name, choice in found.items() if isinstance(choice, str)]
     adaptive = found["AdaptiveParameters(masses)"].law
     assert adaptive.parameters == ("mass[0]", "mass[1]")
-    assert isinstance(measure.laws_of(task, ())["AdaptiveParameters(masses)"], str)
+    assert isinstance(task_laws.laws_of(task, ())["AdaptiveParameters(masses)"], str)
 
 
 def test_the_laws_of_a_plant_have_each_barrier_with_and_without_filters():
     scenario = ij.presets.motor_driven_pendulum()
-    found = measure.laws_of(task_of_preset(scenario), ())
-    assert found[measure.OF_ROBOTS] == "the plant is none"
-    for name in measure.BARRIERS:
+    found = task_laws.laws_of(task_of_preset(scenario), ())
+    assert found[task_laws.OF_ROBOTS] == "the plant is none"
+    for name in task_laws.BARRIERS:
         exact = found[f"BarrierBackstepping({name})"]
         filtered = found[f"BarrierBackstepping({name}), filters"]
         assert isinstance(exact, str) == isinstance(filtered, str)
@@ -447,8 +448,8 @@ def test_the_laws_of_a_plant_have_each_barrier_with_and_without_filters():
 
 
 def task_of_preset(scenario):
-    n, r = scenario.plant.n, measure.plants.order_of(scenario.plant)
-    return measure.Task(
+    n, r = scenario.plant.n, task_laws.plants.order_of(scenario.plant)
+    return task_laws.Task(
         scenario, 1.0, 1e-3, 2.0, np.ones(n), np.ones((r, n)), np.zeros(n), np.ones(n)
     )
 
