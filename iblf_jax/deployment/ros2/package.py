@@ -13,6 +13,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -23,7 +24,13 @@ from iblf_jax.deployment.c_names import Parameters
 from iblf_jax.deployment.ros2.node.supervisor import ARRIVAL_TIMEOUT, STALE_PERIODS
 from iblf_jax.deployment.ros2.ros2_control import controller_package, ros2_control_files
 from iblf_jax.deployment.ros2.yaml_text import yaml_number, yaml_numbers
-from iblf_jax.deployment.write_c import GeneratedLaw, Law, fill_template, title_of
+from iblf_jax.deployment.write_c import (
+    CHECK_INTERVAL,
+    GeneratedLaw,
+    Law,
+    fill_template,
+    title_of,
+)
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.draws import check_paths
@@ -354,10 +361,25 @@ def _velocity_note(reads_velocity: bool) -> str:
     return "positions (the law filters velocities from them)"
 
 
+def _warn_of_gravity(law: Law, limits: np.ndarray) -> None:
+    """Warns of limits below the torques that carry gravity in the run of the self-test."""
+    positions = jnp.asarray(law.vectors.q[::CHECK_INTERVAL])
+    gravity = np.abs(jax.vmap(law.scenario.model.gravity)(positions)).max(axis=0)
+    if np.all(gravity <= limits):
+        return
+    needed, given = (np.array2string(x, precision=4) for x in (gravity, limits))
+    notices.warn(
+        f"torque_limits: gravity takes up to {needed} N m in the simulated run, but the node clips"
+        f" at {given} N m: the drives can neither hold nor move the robot there. Give the limits of"
+        " the drives, or a scenario that they can carry."
+    )
+
+
 def write_package(
     law: Law, generated: GeneratedLaw, options: RosOptions, folder: Path
 ) -> tuple[str, ...]:
     """Writes the package into a folder; returns the names of its files."""
+    _warn_of_gravity(law, options.torque_limits)
     texts = ros_files(law, generated, options)
     for name in {str(Path(name).parent) for name in texts}:
         (folder / name).mkdir(parents=True, exist_ok=True)

@@ -360,6 +360,14 @@ def test_limits_are_those_of_the_model_and_not_above(tmp_path):
         ros_options(scenario, None, 1.01 * effort, "hold")
 
 
+def test_limits_below_gravity_are_reported(tmp_path):
+    scenario = ros_package.law_scenario()
+    gravity = np.abs(scenario.model.gravity(scenario.initial.q))
+    assert gravity[0] > 1.0
+    with pytest.warns(UserWarning, match=r"gravity takes up to .* clips at \[ 1. 15.\]"):
+        ij.export(scenario, tmp_path, target="ros2", torque_limits=[1.0, 15.0])
+
+
 def test_ranges_without_limits_are_those_of_tune_and_not_simulated(package):
     with pytest.warns(UserWarning, match=r"controller.K2: the range .* default end.*simulated"):
         options = ros_options(canonical(package.scenario), ["controller.K2"], 100.0, "zero")
