@@ -9,6 +9,7 @@ import keyword
 import math
 import re
 import sys
+from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -21,6 +22,7 @@ from iblf_jax import __version__
 from iblf_jax.core import checks, notices
 from iblf_jax.deployment.build import write_files
 from iblf_jax.deployment.c_names import Parameters
+from iblf_jax.deployment.control_law import bounds_at, inputs_at_start
 from iblf_jax.deployment.ros2.node.supervisor import ARRIVAL_TIMEOUT, STALE_PERIODS
 from iblf_jax.deployment.ros2.ros2_control import controller_package, ros2_control_files
 from iblf_jax.deployment.ros2.yaml_text import yaml_number, yaml_numbers
@@ -317,7 +319,10 @@ def ros_files(law: Law, generated: GeneratedLaw, options: RosOptions) -> dict[st
         "gains": _gain_lines(options),
         "set_gain": _set_gain_note(name, options),
         "n": law.scenario.n,
+        "rate": f"{1.0 / description['period']:.6g}",
         "velocity": _velocity_note(description["reads_velocity"]),
+        "lost_state": _lost_state_note(description["reads_velocity"]),
+        "start_table": _start_table(law, description["joints"]),
     }
     texts = {
         "package.xml": fill_template("package.xml", values, TEMPLATES),
@@ -350,7 +355,8 @@ def _set_gain_note(name: str, options: RosOptions) -> str:
         return "This law was exported without gains that can be changed while the node runs."
     gain = options.gains[0]
     return (
-        "The gains among them can be changed while the node runs, within their ranges there:\n\n"
+        "The gains among them can be changed while the node runs, within their ranges there; the"
+        " torque makes a step. Simulate the ends of the ranges with the delay of your loop.\n\n"
         f"    ros2 param set /{name} {gain.path} {json.dumps(_yaml_value(gain))}"
     )
 
@@ -359,6 +365,27 @@ def _velocity_note(reads_velocity: bool) -> str:
     if reads_velocity:
         return "positions and velocities"
     return "positions (the law filters velocities from them)"
+
+
+def _lost_state_note(reads_velocity: bool) -> str:
+    """What a lost state does, in the README."""
+    if reads_velocity:
+        return "the torques of the state before act for one more period."
+    return (
+        "the velocity filter divides by the period, so that one lost state doubles the difference"
+        " of the next, and the torques have an error for some periods."
+    )
+
+
+def _start_table(law: Law, joints: Sequence[str]) -> str:
+    """Reference and bounds of every joint at t = 0, in the README."""
+    scenario = law.scenario
+    inputs = inputs_at_start(scenario)
+    lower, upper = bounds_at(scenario, inputs)
+    rows = zip(joints, scenario.reference.position(inputs.t), lower, upper, strict=True)
+    lines = ["| joint | reference [rad] | bounds [rad] |", "|---|---|---|"]
+    lines += [f"| `{name}` | {q:.4g} | {low:.4g} to {high:.4g} |" for name, q, low, high in rows]
+    return "\n".join(f"  {line}" for line in lines)
 
 
 def _warn_of_gravity(law: Law, limits: np.ndarray) -> None:

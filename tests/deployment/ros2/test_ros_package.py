@@ -229,6 +229,12 @@ def test_the_readme_of_the_package_says_what_a_robot_needs(package):
     for word in ("brakes", "state_timeout", "arrival_timeout", "best-effort", "falls", "/commands"):
         assert word in text
     assert "$" not in text
+    assert text.index("## Before the law moves a robot") < text.index("/arm_law/start std_srvs")
+    scenario = canonical(package.scenario)
+    lower, upper = bounds_at(scenario, inputs_at_start(scenario))
+    for i, q in enumerate(scenario.reference.position(0.0)):
+        row = f"| `joint_{i + 1}` | {q:.4g} | {lower[i]:.4g} to {upper[i]:.4g} |"
+        assert row in text
     K2 = package.scenario.controller.K2.tolist()
     assert f'ros2 param set /arm_law controller.K2 "{K2}"' in text
 
