@@ -146,7 +146,8 @@ int arm_law_begin(const arm_law_real *q, const arm_law_real *dq);
 int arm_law_tick(arm_law_real t, const arm_law_real *q, const arm_law_real *dq, arm_law_real *tau);
 
 int main(void) {
-  const arm_law_real rest[2] = {0, 0}, inside[2] = {(arm_law_real)0.5, (arm_law_real)0.5}, far[2] = {5, 5};
+  const arm_law_real rest[2] = {0, 0}, far[2] = {5, 5};
+  const arm_law_real inside[2] = {(arm_law_real)0.5, (arm_law_real)0.5};
   arm_law_real tau[2];
   int refused = arm_law_begin(far, rest), started = arm_law_begin(inside, rest), first, later;
   first = arm_law_tick(0, inside, rest, tau);
@@ -164,9 +165,7 @@ def test_the_timer_of_the_page_checks_the_bounds_and_clips_the_torque(precision,
     (folder / "timer_test.c").write_text(TIMER_TEST)
     sources = ("timer_test.c", "arm_law_timer.c", "arm_law.c")
     run(["cc", *STRICT, *sources, "-lm", "-o", "timer_test"], folder)
-    refused, started, first, later, *torques = map(
-        float, run(["./timer_test"], folder).split()
-    )
+    refused, started, first, later, *torques = map(float, run(["./timer_test"], folder).split())
     assert (refused, started, first, later) == (2, 0, 0, 2)
     assert [abs(x) for x in torques] == [20.0, 20.0]
 
@@ -190,7 +189,9 @@ def test_the_law_of_the_page_needs_the_functions_that_it_lists(suffix, law, smal
     needed = undefined(folder / "law.o") - {"_GLOBAL_OFFSET_TABLE_"}
     assert needed == MEMORY | {f"{name}{suffix}" for name in OWN}
     assert writable(folder / "law.o") == []
-    others = re.search(r"The others that can occur in other laws are (.*?)\. newlib", PAGE, re.DOTALL)[1]
+    others = re.search(
+        r"The others that can occur in other laws are (.*?)\. newlib", PAGE, re.DOTALL
+    )[1]
     assert set(re.findall(r"`(\w+)`", others)) == MATH - OWN
 
 
