@@ -266,6 +266,11 @@ def test_the_law_compiles_for_a_cortex_m4(small_law):
     assert "The code has 4 kB in single precision" in PAGE and 3000 < size < 5500
 
 
+def test_the_readme_has_the_period_without_the_rounding_of_a_float(law, small_law):
+    for folder in (law, small_law):
+        assert "**Every period of 0.001 s**" in (folder / "README.md").read_text()
+
+
 def test_operation_counts_of_the_page_are_those_of_the_export(law):
     text = (law / "README.md").read_text()
     sums, divisions, roots, others = (
