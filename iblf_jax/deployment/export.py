@@ -159,7 +159,7 @@ def export(
         `ij.tunable(path, low, high)` with a range that was simulated; without one, the range is the
         default of `tune`, which may contain unstable loops, and a warning says so.
       torque_limits: of a ROS 2 package, the largest torques, () or (n,) [N m], at most the model's
-        `effort`, which they are if not given.
+        `effort`, which they are if not given; a warning says if gravity takes more.
       on_fault: of a ROS 2 package, "hold" (the torques that hold the position) or "zero".
 
     Returns:

@@ -291,7 +291,7 @@ def loop_fmu(
     name, step = generated.values["name"], run_settings[0]
     setting_values = ", ".join(map(repr, run_settings))
     values = {"name": name, "step": repr(step), "setting_values": setting_values}
-    title = f"the closed loop of {generated.values['title']}"
+    title = f"the closed loop: {generated.values['title']}"
     variables = loop_variables(scenario, generated.parameters)
     _package(path, name, title, step, variables, "fmu_loop.c", values, generated.files)
 

@@ -380,6 +380,7 @@ def _supporting_files(
         "parameter_bytes": sizes[1],
         "stack_bytes": sizes[2],
         "period": repr(period),
+        "period_text": f"{period:g}",
         "contents": _contents(law),
         "scenario_row": "",
         "time_note": "",
@@ -387,7 +388,8 @@ def _supporting_files(
     if law.is_float:
         values["tolerance"] = "1e-4"
         values["time_note"] = (
-            "Time as a float loses a millisecond after four hours: start again before.  "
+            "Time as a float loses a millisecond after four hours: start again before, at rest and"
+            " with t = 0, at which reference and bounds begin again.  "
         )
     arrays = {"q": v.q, "torque": v.tau}
     rows = dict(zip(("dq", *law.further_inputs), (v.dq, *v.further), strict=True))

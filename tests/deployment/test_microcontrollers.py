@@ -3,6 +3,7 @@ and run, and the law needs no C library but `memcpy`, `memset` and functions of 
 
 from __future__ import annotations
 
+import json
 import platform
 import re
 import shutil
@@ -11,6 +12,7 @@ import sys
 from importlib.resources import files
 
 import members
+import numpy as np
 import pytest
 from conftest import ROOT
 
@@ -53,8 +55,8 @@ def writable(path):
 
 
 def block_of(name):
-    """The block of C on the page whose comment begins with a file name."""
-    (text,) = re.findall(rf"```c\n(/\* {name}: .*?)```", PAGE, re.DOTALL)
+    """The block of C or JavaScript on the page whose comment begins with a file name."""
+    (text,) = re.findall(rf"```(?:c|js)\n(/\* {name}: .*?)```", PAGE, re.DOTALL)
     return text
 
 
@@ -71,7 +73,11 @@ def folder_of(scenario, folder):
 
 @pytest.fixture(scope="module")
 def sampled():
-    return ij.with_parts(ij.presets.zhang_yan_2024(), sampling=ij.Sampling(1e-3))
+    scenario = ij.with_parameters(
+        ij.presets.zhang_yan_2024(reading="corrected"),
+        {"controller.K2": 4.0, "observer.kf": 4.0},
+    )
+    return ij.with_parts(scenario, sampling=ij.Sampling(1e-3, delay=1e-3))
 
 
 @pytest.fixture(scope="module")
@@ -132,6 +138,50 @@ def test_the_s_function_of_the_page_returns_the_torques_of_the_self_test(law):
     assert worst < 1e-6 and status == 0.0
 
 
+TIMER_TEST = """
+#include <stdio.h>
+#include "arm_law.h"
+
+int arm_law_begin(const arm_law_real *q, const arm_law_real *dq);
+int arm_law_tick(arm_law_real t, const arm_law_real *q, const arm_law_real *dq, arm_law_real *tau);
+
+int main(void) {
+  const arm_law_real rest[2] = {0, 0}, far[2] = {5, 5};
+  const arm_law_real inside[2] = {(arm_law_real)0.5, (arm_law_real)0.5};
+  arm_law_real tau[2];
+  int refused = arm_law_begin(far, rest), started = arm_law_begin(inside, rest), first, later;
+  first = arm_law_tick(0, inside, rest, tau);
+  later = arm_law_tick((arm_law_real)1e-3, far, rest, tau);
+  printf("%d %d %d %d %g %g\\n", refused, started, first, later, (double)tau[0], (double)tau[1]);
+  return 0;
+}
+"""
+
+
+@pytest.mark.parametrize("precision", ["double", "float"])
+def test_the_timer_of_the_page_checks_the_bounds_and_clips_the_torque(precision, law, small_law):
+    folder = small_law if precision == "float" else law
+    (folder / "arm_law_timer.c").write_text(block_of("arm_law_timer.c"))
+    (folder / "timer_test.c").write_text(TIMER_TEST)
+    sources = ("timer_test.c", "arm_law_timer.c", "arm_law.c")
+    run(["cc", *STRICT, *sources, "-lm", "-o", "timer_test"], folder)
+    refused, started, first, later, *torques = map(float, run(["./timer_test"], folder).split())
+    assert (refused, started, first, later) == (2, 0, 0, 2)
+    assert [abs(x) for x in torques] == [20.0, 20.0]
+
+
+def test_the_check_of_the_page_prints_the_end_of_the_run(sampled, tmp_path):
+    pytest.importorskip("ziglang", reason="ziglang of the extra `export` is not installed")
+    node = shutil.which("node")
+    if node is None:
+        pytest.skip("there is no node")
+    ij.export(sampled, tmp_path / "arm_loop", target="wasm", name="arm_loop")
+    (tmp_path / "check.mjs").write_text(block_of("check.mjs"))
+    expected = ij.simulate(sampled, duration=1.0, dt=1e-3, seed=0).q[-1]
+    found = json.loads(run([node, "check.mjs"], tmp_path))
+    np.testing.assert_allclose(found, expected, atol=1e-10)
+
+
 @pytest.mark.parametrize("suffix", ["", "f"])
 def test_the_law_of_the_page_needs_the_functions_that_it_lists(suffix, law, small_law):
     folder = small_law if suffix else law
@@ -139,7 +189,9 @@ def test_the_law_of_the_page_needs_the_functions_that_it_lists(suffix, law, smal
     needed = undefined(folder / "law.o") - {"_GLOBAL_OFFSET_TABLE_"}
     assert needed == MEMORY | {f"{name}{suffix}" for name in OWN}
     assert writable(folder / "law.o") == []
-    others = re.search(r"The others that can occur are (.*?)\. newlib", PAGE, re.DOTALL)[1]
+    others = re.search(
+        r"The others that can occur in other laws are (.*?)\. newlib", PAGE, re.DOTALL
+    )[1]
     assert set(re.findall(r"`(\w+)`", others)) == MATH - OWN
 
 
@@ -212,6 +264,11 @@ def test_the_law_compiles_for_a_cortex_m4(small_law):
     assert writable(small_law / "m4.o") == []
     size = int(run(["size", "m4.o"], small_law).splitlines()[1].split()[0])
     assert "The code has 4 kB in single precision" in PAGE and 3000 < size < 5500
+
+
+def test_the_readme_has_the_period_without_the_rounding_of_a_float(law, small_law):
+    for folder in (law, small_law):
+        assert "**Every period of 0.001 s**" in (folder / "README.md").read_text()
 
 
 def test_operation_counts_of_the_page_are_those_of_the_export(law):

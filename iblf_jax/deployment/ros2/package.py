@@ -9,10 +9,12 @@ import keyword
 import math
 import re
 import sys
+from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -20,10 +22,17 @@ from iblf_jax import __version__
 from iblf_jax.core import checks, notices
 from iblf_jax.deployment.build import write_files
 from iblf_jax.deployment.c_names import Parameters
+from iblf_jax.deployment.control_law import bounds_at, inputs_at_start
 from iblf_jax.deployment.ros2.node.supervisor import ARRIVAL_TIMEOUT, STALE_PERIODS
 from iblf_jax.deployment.ros2.ros2_control import controller_package, ros2_control_files
 from iblf_jax.deployment.ros2.yaml_text import yaml_number, yaml_numbers
-from iblf_jax.deployment.write_c import GeneratedLaw, Law, fill_template, title_of
+from iblf_jax.deployment.write_c import (
+    CHECK_INTERVAL,
+    GeneratedLaw,
+    Law,
+    fill_template,
+    title_of,
+)
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.studies.draws import check_paths
@@ -310,7 +319,10 @@ def ros_files(law: Law, generated: GeneratedLaw, options: RosOptions) -> dict[st
         "gains": _gain_lines(options),
         "set_gain": _set_gain_note(name, options),
         "n": law.scenario.n,
+        "rate": f"{1.0 / description['period']:.6g}",
         "velocity": _velocity_note(description["reads_velocity"]),
+        "lost_state": _lost_state_note(description["reads_velocity"]),
+        "start_table": _start_table(law, description["joints"]),
     }
     texts = {
         "package.xml": fill_template("package.xml", values, TEMPLATES),
@@ -343,7 +355,8 @@ def _set_gain_note(name: str, options: RosOptions) -> str:
         return "This law was exported without gains that can be changed while the node runs."
     gain = options.gains[0]
     return (
-        "The gains among them can be changed while the node runs, within their ranges there:\n\n"
+        "The gains among them can be changed while the node runs, within their ranges there; the"
+        " torque makes a step. Simulate the ends of the ranges with the delay of your loop.\n\n"
         f"    ros2 param set /{name} {gain.path} {json.dumps(_yaml_value(gain))}"
     )
 
@@ -354,10 +367,46 @@ def _velocity_note(reads_velocity: bool) -> str:
     return "positions (the law filters velocities from them)"
 
 
+def _lost_state_note(reads_velocity: bool) -> str:
+    """What a lost state does, in the README."""
+    if reads_velocity:
+        return "the torques of the state before act for one more period."
+    return (
+        "the velocity filter divides by the period, so that one lost state doubles the difference"
+        " of the next, and the torques have an error for some periods."
+    )
+
+
+def _start_table(law: Law, joints: Sequence[str]) -> str:
+    """Reference and bounds of every joint at t = 0, in the README."""
+    scenario = law.scenario
+    inputs = inputs_at_start(scenario)
+    lower, upper = bounds_at(scenario, inputs)
+    rows = zip(joints, scenario.reference.position(inputs.t), lower, upper, strict=True)
+    lines = ["| joint | reference [rad] | bounds [rad] |", "|---|---|---|"]
+    lines += [f"| `{name}` | {q:.4g} | {low:.4g} to {high:.4g} |" for name, q, low, high in rows]
+    return "\n".join(f"  {line}" for line in lines)
+
+
+def _warn_of_gravity(law: Law, limits: np.ndarray) -> None:
+    """Warns of limits below the torques that carry gravity in the run of the self-test."""
+    positions = jnp.asarray(law.vectors.q[::CHECK_INTERVAL])
+    gravity = np.abs(jax.vmap(law.scenario.model.gravity)(positions)).max(axis=0)
+    if np.all(gravity <= limits):
+        return
+    needed, given = (np.array2string(x, precision=4) for x in (gravity, limits))
+    notices.warn(
+        f"torque_limits: gravity takes up to {needed} N m in the simulated run, but the node clips"
+        f" at {given} N m: the drives can neither hold nor move the robot there. Give the limits of"
+        " the drives, or a scenario that they can carry."
+    )
+
+
 def write_package(
     law: Law, generated: GeneratedLaw, options: RosOptions, folder: Path
 ) -> tuple[str, ...]:
     """Writes the package into a folder; returns the names of its files."""
+    _warn_of_gravity(law, options.torque_limits)
     texts = ros_files(law, generated, options)
     for name in {str(Path(name).parent) for name in texts}:
         (folder / name).mkdir(parents=True, exist_ok=True)

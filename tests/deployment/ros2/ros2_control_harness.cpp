@@ -4,7 +4,9 @@
 //   text NAME VALUE              a parameter, before `init`
 //   texts NAME VALUES...
 //   numbers NAME VALUES...
-//   init | configure | deactivate | timer
+//   flag NAME                    a parameter that is true
+//   change NAME VALUES...        a parameter, as `ros2 param set` does; prints the answer
+//   init | configure | deactivate | cleanup | timer
 //   names                        prints the interfaces that the controller claims
 //   activate NAMES...            with these interfaces, such as a/position, in this order
 //   set NAME VALUE               a value of a claimed interface, without an update
@@ -92,6 +94,13 @@ int main()
         rclcpp::Parameter(std::vector<std::string>(words.begin() + 1, words.end()));
     } else if (command == "numbers") {
       node.parameters[words[0]] = rclcpp::Parameter(numbers_of(words, 1));
+    } else if (command == "flag") {
+      node.parameters[words[0]] = rclcpp::Parameter(true);
+    } else if (command == "change") {
+      const auto answer = node.set(rclcpp::Parameter(words[0], numbers_of(words, 1)));
+      std::cout << "change " << (answer.successful ? "SUCCESS" : "ERROR " + answer.reason) << "\n";
+    } else if (command == "cleanup") {
+      print("cleanup", controller->on_cleanup(state));
     } else if (command == "init") {
       print("init", controller->on_init());
     } else if (command == "configure") {

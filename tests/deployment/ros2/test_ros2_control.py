@@ -310,6 +310,27 @@ def test_a_torque_that_is_not_finite_is_a_fault(built, updates):
     assert np.all(np.isfinite(held)) and np.all(np.abs(held) <= [500.0, 400.0])
 
 
+@pytest.mark.parametrize("policy", ["hold", "zero"])
+def test_a_start_outside_of_the_bounds_is_a_fault(policy, built, updates):
+    """The first sample is outside by 1 rad, the later ones are inside."""
+    samples = [(t, np.asarray(q), np.asarray(dq)) for t, q, dq in updates[:6]]
+    samples[0] = (samples[0][0], samples[0][1] + [0.0, 1.0], samples[0][2])
+    steps = [f"update {t} {built.states(q, dq)}" for t, q, dq in samples]
+    lines = built.answers([*built.activated(f"text on_fault {policy}"), *steps, "timer"])
+    (message,) = logged(lines)
+    assert message.startswith("fault: a joint is outside of its bounds at the start. Move")
+    expected = np.zeros((6, 2))
+    if policy == "hold":
+        held = samples[0][1]
+        expected = [hold_torque(built, q, held, dq, True) for _, q, dq in samples]
+    np.testing.assert_allclose(efforts_of(lines), expected, atol=1e-12)
+    commands = built.activated("flag start_outside_bounds")
+    lines = built.answers([*commands, *steps, "timer"])
+    assert not logged(lines)
+    torques = np.clip(built.law_torques(samples), [-500.0, -400.0], [500.0, 400.0])
+    np.testing.assert_allclose(efforts_of(lines), torques, rtol=1e-9, atol=1e-9)
+
+
 def test_only_a_new_activation_leaves_a_fault(built, updates):
     samples = [list(x) for x in updates[:6]]
     samples[3][1] = np.array([np.nan, 0.5])
@@ -350,6 +371,26 @@ def test_gains_are_read_when_the_controller_is_configured(built, updates):
     rows = [np.array(x) for x in zip(*updates[:50], strict=True)]
     expected = reference_torques(scenario, updates[0][1], updates[0][2], rows)
     np.testing.assert_allclose(changed, expected, atol=1e-11 * np.abs(expected).max())
+
+
+def test_a_parameter_of_a_configured_controller_cannot_be_changed(built, updates):
+    """It would have no effect: parameters are read in `on_configure`."""
+    commands = built.activated()
+    change = "change controller.K2 6.0 15.0"
+    limits, other = "change torque_limits 1.0 1.0", "change use_sim_time 1.0"
+    lines = built.answers([*commands, change, limits, other, "deactivate", change])
+    changes = [line for line in lines if line.startswith("change")]
+    reason = ": it is read when the controller is configured. Deactivate it and clean it up first."
+    refused = f"change ERROR controller.K2{reason}"
+    assert changes == [refused, f"change ERROR torque_limits{reason}", "change SUCCESS", refused]
+    steps = [f"update {t} {built.states(q, dq)}" for t, q, dq in updates[:10]]
+    again = ["deactivate", "cleanup", change, "configure", commands[-1]]
+    lines = built.answers([*commands, *again, *steps])
+    assert "change SUCCESS" in lines
+    found = efforts_of(lines)
+    np.testing.assert_array_equal(
+        found, built.efforts(updates[:10], "numbers controller.K2 6.0 15.0")
+    )
 
 
 REFUSED = {

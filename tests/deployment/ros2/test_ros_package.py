@@ -229,6 +229,12 @@ def test_the_readme_of_the_package_says_what_a_robot_needs(package):
     for word in ("brakes", "state_timeout", "arrival_timeout", "best-effort", "falls", "/commands"):
         assert word in text
     assert "$" not in text
+    assert text.index("## Before the law moves a robot") < text.index("/arm_law/start std_srvs")
+    scenario = canonical(package.scenario)
+    lower, upper = bounds_at(scenario, inputs_at_start(scenario))
+    for i, q in enumerate(scenario.reference.position(0.0)):
+        row = f"| `joint_{i + 1}` | {q:.4g} | {lower[i]:.4g} to {upper[i]:.4g} |"
+        assert row in text
     K2 = package.scenario.controller.K2.tolist()
     assert f'ros2 param set /arm_law controller.K2 "{K2}"' in text
 
@@ -358,6 +364,14 @@ def test_limits_are_those_of_the_model_and_not_above(tmp_path):
     np.testing.assert_allclose(options.torque_limits, effort)
     with pytest.raises(ValueError, match="at most the model's efforts"):
         ros_options(scenario, None, 1.01 * effort, "hold")
+
+
+def test_limits_below_gravity_are_reported(tmp_path):
+    scenario = ros_package.law_scenario()
+    gravity = np.abs(scenario.model.gravity(scenario.initial.q))
+    assert gravity[0] > 1.0
+    with pytest.warns(UserWarning, match=r"gravity takes up to .* clips at \[ 1. 15.\]"):
+        ij.export(scenario, tmp_path, target="ros2", torque_limits=[1.0, 15.0])
 
 
 def test_ranges_without_limits_are_those_of_tune_and_not_simulated(package):

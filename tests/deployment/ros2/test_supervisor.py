@@ -217,7 +217,10 @@ def test_a_bad_state_is_a_fault_that_only_start_leaves(name, mode, policy):
     assert is_zero == (policy == "zero")
     for _ in range(5):
         assert bench.period().mode is Mode.FAULT
-    assert bench.supervisor.hold(bench.now, bench.clock)[0] is False
+    is_held, message = bench.supervisor.hold(bench.now, bench.clock)
+    assert is_held is False
+    assert message.startswith("Refused: in fault (") and words in message
+    assert message.endswith("; the states are valid now. Only start leaves it.")
     assert bench.supervisor.stop()[0] is True
     assert bench.period().torque == [0.0, 0.0, 0.0]
     assert bench.mode is Mode.FAULT
@@ -464,6 +467,9 @@ def test_an_automatic_start_needs_no_service_and_does_not_leave_a_fault():
     assert bench.period(q=(math.nan,) * 3).mode is Mode.FAULT
     for _ in range(5):
         assert bench.period().mode is Mode.FAULT
+    bench.now += 3 * T
+    _, message = bench.supervisor.hold(bench.now, bench.clock)
+    assert "in fault (the position of shoulder is nan); no valid state has arrived for" in message
 
 
 def test_an_automatic_start_that_is_refused_is_reported():

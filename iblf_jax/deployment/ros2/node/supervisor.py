@@ -549,8 +549,10 @@ class Supervisor:
         state, problem = self._state, self._why_not_current(now, clock)
         if self.mode is Mode.WAITING or state is None:
             return False, f"Refused: {self.note}. A complete joint state is needed."
-        if self.mode is Mode.FAULT:
-            return False, f"Refused: {self.note}. Only start leaves a fault."
+        fault = self.last_fault
+        if self.mode is Mode.FAULT and fault is not None:
+            present = problem or "the states are valid now"
+            return False, f"Refused: in fault ({fault.reason}); {present}. Only start leaves it."
         if problem is not None:
             return False, f"Refused: {problem}. Valid and fresh joint states are needed."
         self.mode = Mode.HOLDING

@@ -27,6 +27,8 @@ const std::array<const char *, kJoints> kNames = {${cpp_names}};
 const Vector kTorqueLimits = {${cpp_torque_limits}};     // of the export [N m]
 const Vector kHoldStiffness = {${cpp_hold_stiffness}};   // [N m/rad]
 const Vector kHoldDamping = {${cpp_hold_damping}};       // [N m s/rad]
+const std::array<const char *, 6> kParameters = {
+  "joints", "torque_limits", "on_fault", "hold_stiffness", "hold_damping", "start_outside_bounds"};
 constexpr double kNanosecond = 1e-9;                     // [s]
 
 struct Gain
@@ -99,6 +101,9 @@ const char * description_of(Fault fault)
     case Fault::kStale: return "more than two periods passed between two updates";
     case Fault::kClock: return "the time jumped back";
     case Fault::kTorque: return "the law has no finite torque";
+    case Fault::kOutside:
+      return "a joint is outside of its bounds at the start. Move the robot, or set "
+             "start_outside_bounds: true";
     default: return "none";
   }
 }
@@ -114,6 +119,7 @@ controller_interface::CallbackReturn LawController::on_init()
   auto_declare<std::string>("on_fault", "${on_fault}");
   auto_declare<std::vector<double>>("hold_stiffness", as_list(kHoldStiffness));
   auto_declare<std::vector<double>>("hold_damping", as_list(kHoldDamping));
+  auto_declare<bool>("start_outside_bounds", false);
   const double * defaults = numbers_of(parameters_);
   for (const auto & gain : gains()) {
     std::vector<double> values;
@@ -153,6 +159,7 @@ controller_interface::CallbackReturn LawController::on_configure(const rclcpp_li
   if (!read_parameters()) {
     return controller_interface::CallbackReturn::ERROR;
   }
+  refuse_changes();
   timer_ = get_node()->create_wall_timer(std::chrono::milliseconds(100), [this]() {log_fault();});
   return controller_interface::CallbackReturn::SUCCESS;
 }
@@ -177,6 +184,12 @@ controller_interface::CallbackReturn LawController::on_deactivate(const rclcpp_l
   mode_ = Mode::kWaiting;
   torque_.fill(0.0);
   write_torque();
+  return controller_interface::CallbackReturn::SUCCESS;
+}
+
+controller_interface::CallbackReturn LawController::on_cleanup(const rclcpp_lifecycle::State &)
+{
+  refusal_.reset();
   return controller_interface::CallbackReturn::SUCCESS;
 }
 
@@ -243,7 +256,23 @@ void LawController::start(std::int64_t now)
   mode_ = Mode::kRunning;
   if (status != 0) {
     enter_fault(Fault::kTorque);
+  } else if (!start_outside_bounds_ && !is_inside()) {
+    enter_fault(Fault::kOutside);
   }
+}
+
+// Whether all joints are between their bounds at the start.
+bool LawController::is_inside() const
+{
+  Vector lower{}, upper{};
+  ${name}_bounds(&parameters_, 0.0, lower.data(), upper.data());
+  for (std::size_t i = 0; i < kJoints; i++) {
+    // NaN is not between the bounds either.
+    if (!(lower[i] < q_[i] && q_[i] < upper[i])) {
+      return false;
+    }
+  }
+  return true;
 }
 
 void LawController::check(std::int64_t now, bool is_finite)
@@ -337,6 +366,7 @@ bool LawController::read_parameters()
     return refuse("on_fault", on_fault, "hold or zero.");
   }
   holds_on_fault_ = on_fault == "hold";
+  start_outside_bounds_ = get_node()->get_parameter("start_outside_bounds").as_bool();
   return read_joints() && read_limits() && read_hold() && read_gains();
 }
 
@@ -424,6 +454,33 @@ bool LawController::read_gains()
     }
   }
   return true;
+}
+
+// Whether `read_parameters` reads a parameter.
+bool LawController::is_own(const std::string & name) const
+{
+  const auto is_gain = [&](const Gain & gain) {return name == gain.path;};
+  return std::find(kParameters.begin(), kParameters.end(), name) != kParameters.end() ||
+         std::any_of(gains().begin(), gains().end(), is_gain);
+}
+
+// The parameters are read in `on_configure`: a later change would have no effect, so it is refused
+// until `on_cleanup`.
+void LawController::refuse_changes()
+{
+  refusal_ = get_node()->add_on_set_parameters_callback(
+    [this](const std::vector<rclcpp::Parameter> & changed) {
+      rcl_interfaces::msg::SetParametersResult result;
+      result.successful = true;
+      for (const auto & parameter : changed) {
+        if (is_own(parameter.get_name())) {
+          result.successful = false;
+          result.reason = parameter.get_name() +
+            ": it is read when the controller is configured. Deactivate it and clean it up first.";
+        }
+      }
+      return result;
+    });
 }
 
 // Finds the interfaces of the joints; the order in which they were claimed does not matter.

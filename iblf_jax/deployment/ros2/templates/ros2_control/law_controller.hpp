@@ -35,7 +35,8 @@ enum class Fault : int
   kState,   // a position or a velocity is not finite
   kStale,   // more than two periods between two updates
   kClock,   // the time jumped back
-  kTorque   // the law has no finite torque
+  kTorque,  // the law has no finite torque
+  kOutside  // a joint is outside of its bounds at the start
 };
 
 class LawController : public controller_interface::ControllerInterface
@@ -48,6 +49,7 @@ public:
   controller_interface::CallbackReturn on_activate(const rclcpp_lifecycle::State & state) override;
   controller_interface::CallbackReturn on_deactivate(
     const rclcpp_lifecycle::State & state) override;
+  controller_interface::CallbackReturn on_cleanup(const rclcpp_lifecycle::State & state) override;
   controller_interface::return_type update(
     const rclcpp::Time & time, const rclcpp::Duration & period) override;
 
@@ -62,6 +64,8 @@ private:
   bool read_limits();
   bool read_hold();
   bool read_gains();
+  bool is_own(const std::string & name) const;
+  void refuse_changes();
   bool read_vector(const std::string & name, bool must_be_positive, Vector & values);
   bool refuse(const std::string & field, const std::string & came, const std::string & expected);
   template<typename Interfaces>
@@ -69,6 +73,7 @@ private:
 
   bool read_state();
   void start(std::int64_t now);
+  bool is_inside() const;
   void check(std::int64_t now, bool is_finite);
   void enter_fault(Fault reason);
   void hold_torque(bool is_finite);
@@ -81,6 +86,7 @@ private:
   Vector hold_stiffness_{};
   Vector hold_damping_{};
   bool holds_on_fault_ = true;
+  bool start_outside_bounds_ = false;
   ${name}_parameters parameters_{};
 
   // Places of the joints among the claimed interfaces.
@@ -102,6 +108,7 @@ private:
   Vector hold_q_{};              // positions at the fault [rad]
   Vector torque_{};              // [N m]
   rclcpp::TimerBase::SharedPtr timer_;
+  rclcpp::node_interfaces::OnSetParametersCallbackHandle::SharedPtr refusal_;
 };
 
 }  // namespace ${package}

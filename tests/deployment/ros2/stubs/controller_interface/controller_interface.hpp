@@ -34,6 +34,7 @@ public:
   virtual CallbackReturn on_configure(const rclcpp_lifecycle::State &) = 0;
   virtual CallbackReturn on_activate(const rclcpp_lifecycle::State &) = 0;
   virtual CallbackReturn on_deactivate(const rclcpp_lifecycle::State &) = 0;
+  virtual CallbackReturn on_cleanup(const rclcpp_lifecycle::State &) = 0;
   virtual return_type update(const rclcpp::Time &, const rclcpp::Duration &) = 0;
 
   std::shared_ptr<rclcpp_lifecycle::LifecycleNode> get_node() {return node_;}

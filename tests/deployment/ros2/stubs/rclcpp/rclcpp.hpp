@@ -9,6 +9,17 @@
 #include <string>
 #include <vector>
 
+namespace rcl_interfaces::msg
+{
+
+struct SetParametersResult
+{
+  bool successful = false;
+  std::string reason;
+};
+
+}  // namespace rcl_interfaces::msg
+
 namespace rclcpp
 {
 
@@ -56,6 +67,12 @@ public:
   : texts(value) {}
   explicit Parameter(const std::vector<double> & value)
   : numbers(value) {}
+  explicit Parameter(bool value)
+  : flag(value) {}
+  Parameter(const std::string & name, const std::vector<double> & value)
+  : numbers(value), name(name) {}
+  const std::string & get_name() const {return name;}
+  bool as_bool() const {return flag;}
   std::string as_string() const {return text;}
   std::vector<std::string> as_string_array() const {return texts;}
   std::vector<double> as_double_array() const {return numbers;}
@@ -64,7 +81,20 @@ private:
   std::string text;
   std::vector<std::string> texts;
   std::vector<double> numbers;
+  bool flag = false;
+  std::string name;
 };
+
+namespace node_interfaces
+{
+
+struct OnSetParametersCallbackHandle
+{
+  using SharedPtr = std::shared_ptr<OnSetParametersCallbackHandle>;
+  std::function<rcl_interfaces::msg::SetParametersResult(const std::vector<Parameter> &)> callback;
+};
+
+}  // namespace node_interfaces
 
 // What the harness reads in the place of a log.
 inline std::vector<std::string> & log()

@@ -24,10 +24,35 @@ public:
     timer = std::make_shared<rclcpp::TimerBase>(callback);
     return timer;
   }
+  template<typename Callback>
+  rclcpp::node_interfaces::OnSetParametersCallbackHandle::SharedPtr
+  add_on_set_parameters_callback(Callback callback)
+  {
+    using Handle = rclcpp::node_interfaces::OnSetParametersCallbackHandle;
+    const auto handle = std::make_shared<Handle>(Handle{callback});
+    on_set_ = handle;
+    return handle;
+  }
 
   // Of the harness.
+  rcl_interfaces::msg::SetParametersResult set(const rclcpp::Parameter & parameter)
+  {
+    rcl_interfaces::msg::SetParametersResult answer;
+    answer.successful = true;
+    if (const auto handle = on_set_.lock()) {
+      answer = handle->callback({parameter});
+    }
+    if (answer.successful) {
+      parameters[parameter.get_name()] = parameter;
+    }
+    return answer;
+  }
   std::map<std::string, rclcpp::Parameter> parameters;
   rclcpp::TimerBase::SharedPtr timer;
+
+private:
+  // As in rclcpp, the callback ends with the last owner of its handle.
+  std::weak_ptr<rclcpp::node_interfaces::OnSetParametersCallbackHandle> on_set_;
 };
 
 namespace node_interfaces
