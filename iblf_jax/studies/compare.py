@@ -24,6 +24,7 @@ import numpy as np
 from iblf_jax.control.controllers import (
     KEEPERS,
     LAWS,
+    BarrierBackstepping,
     Controller,
     Saturated,
     law_by_name,
@@ -52,7 +53,7 @@ from iblf_jax.simulation.noise import noise_values
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical
-from iblf_jax.simulation.units import unit_text
+from iblf_jax.simulation.units import status_words, unit_text
 from iblf_jax.studies.comparison import Comparison
 from iblf_jax.studies.equal_effort import NO_EFFORT, EffortSearch, Trials, grid, search
 from iblf_jax.studies.time_step import needed_dt
@@ -60,6 +61,10 @@ from iblf_jax.world import plants
 
 NAMES = (*LAWS, *KEEPERS)
 Laws = Sequence[str | Controller] | Mapping[str, str | Controller]
+ONLY_K = (
+    "the factor scales k and not the weights: if the barriers of the laws have different units,"
+    " choose the weights first (BarrierBackstepping, weights)"
+)
 
 
 @notices.each_warning_once
@@ -281,13 +286,17 @@ def _at_effort_of(
         return needed_dt(trials.status, trials.mode, trials.error, dt, method)
 
     inaccurate = bool((int(reference.status) | int(own.status)) & Status.INACCURATE)
-    unit = unit_text(scenario, INPUT)
-    found = search(_trials_of(scenario, names, options), target, dt_for, inaccurate, unit)
+    trials_of = _trials_of(scenario, names, options)
+    unit, texts = unit_text(scenario, INPUT), status_words(scenario)
+    found = search(trials_of, target, dt_for, inaccurate, unit, texts)
     for factor in found.crossings:
         run = _run(with_parameters(scenario, _scaled(scenario, names, factor)), options)
         if not int(run.status) & NO_EFFORT:
             return _EqualEffort(factor, run, search=found)
-    return _EqualEffort(float("nan"), reason=found.in_words(), search=found)
+    reason = found.in_words()
+    if isinstance(unwrapped(scenario.controller), BarrierBackstepping):
+        reason += f"; {ONLY_K}"
+    return _EqualEffort(float("nan"), reason=reason, search=found)
 
 
 def _scaled(scenario: Scenario, names: Sequence[str], factor: Any) -> dict[str, Any]:
