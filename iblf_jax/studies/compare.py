@@ -122,9 +122,9 @@ def compare(
         "dt": dt,
         "method": method,
         "record_every": record_every,
-        "metrics": _folds(scenario, metrics),
+        "metrics": metrics,
     }
-    settling = next(fold for fold in options["metrics"] if isinstance(fold, Settling))
+    settling = next(fold for fold in _folds(scenario, metrics) if isinstance(fold, Settling))
     rollouts = {name: _run(one, options) for name, one in scenarios.items()}
     gains = {name: _gains_in_words(one.controller) for name, one in scenarios.items()}
     if not equal_effort:
@@ -226,7 +226,9 @@ def _model_for(law: Controller, scenario: Scenario) -> Any:
 
 
 def _folds(scenario: Scenario, further: Sequence[Fold]) -> tuple[Fold, ...]:
-    """The folds of every run: those of `further`, and the standard ones of other classes."""
+    """The folds of a run: those of `further`, and of other classes the standard ones and those of
+    the signals that runs with its law have.
+    """
     if not isinstance(further, tuple | list):
         remedy = "Put one fold into brackets, metrics=(fold,)."
         raise checks.fail("metrics", further, "a tuple of folds", remedy)
@@ -245,7 +247,7 @@ def _limited_as(controller: Controller, law: Controller) -> Controller:
 def _run(scenario: Scenario, options: Mapping[str, Any]) -> Rollout:
     """One run; the table reports its failure, so there is no warning."""
     with notices.muted(UserWarning):
-        return simulate(scenario, **options)
+        return simulate(scenario, **options | {"metrics": _folds(scenario, options["metrics"])})
 
 
 def gain_names(law: Controller) -> tuple[str, ...]:
