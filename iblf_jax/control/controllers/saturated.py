@@ -84,9 +84,10 @@ class AuxiliaryState(NamedTuple):
 
 @component
 class Saturated:
-    """tau = clip(tau_law, lower_limit, limit) (hard), or c + (tau_law - c) / (1 + |(tau_law -
-    c)/h|^8)^(1/8) with the centre c of the limits and half their distance h (smooth, for
-    gradients).
+    """tau = clip(tau_law, lower_limit, limit).
+
+    The smooth limit, for gradients, is c + h x/(1 + |x|^8)^(1/8) with x = (tau_law - c)/h, the
+    centre c of both limits and half their distance h.
 
     With `auxiliary` the law has the auxiliary state lambda,
 
