@@ -247,7 +247,8 @@ def _limited_as(controller: Controller, law: Controller) -> Controller:
 def _run(scenario: Scenario, options: Mapping[str, Any]) -> Rollout:
     """One run; the table reports its failure, so there is no warning."""
     with notices.muted(UserWarning):
-        return simulate(scenario, **options | {"metrics": _folds(scenario, options["metrics"])})
+        folds = _folds(scenario, options["metrics"])
+        return simulate(scenario, **{**options, "metrics": folds})
 
 
 def gain_names(law: Controller) -> tuple[str, ...]:
