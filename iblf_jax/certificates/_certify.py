@@ -150,8 +150,7 @@ def certify(
         _check_same(scenario, run.scenario, numbers=not run.is_batch)
         run = _on_host(run)
         if not run.is_batch:
-            inaccurate = int(has_flag(int(run.status), Status.INACCURATE))
-            return dataclasses.replace(_certificate_of(run), inaccurate=inaccurate)
+            return _certificate_of(run)
         return _over_runs((i, run[i]) for i in range(len(run)))
     return _over_runs(_runs_of_study(scenario, run, worst))
 
@@ -246,6 +245,12 @@ def _replayed(study: Any, index: int) -> Rollout:
 
 def _certificate_of(run: Rollout) -> Certificate:
     """The certificate of one run, its arrays on the host."""
+    inaccurate = int(has_flag(int(run.status), Status.INACCURATE))
+    return dataclasses.replace(_checked_claims(run), inaccurate=inaccurate)
+
+
+def _checked_claims(run: Rollout) -> Certificate:
+    """The certificate of one run, without its flags."""
     if run.scenario.process_noise is not None:
         return _certificate_by_comparison(run, "noisy", NOISY)
     if run.scenario.sampling is not None:
@@ -500,7 +505,7 @@ def _over_runs(runs: Iterable[tuple[int, Rollout]]) -> Certificate:
     for index, run in runs:
         certificate = _certificate_of(run)
         indices.append(index)
-        inaccurate += int(has_flag(int(run.status), Status.INACCURATE))
+        inaccurate += certificate.inaccurate
         if not is_valid(run):
             invalid.append(index)
         for line in certificate.lines:
