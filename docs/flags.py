@@ -184,8 +184,8 @@ CASES: dict[str, Case] = {
     ),
     "TORQUE_SATURATED": Case(
         lambda: _run(_weak([9.0, 4.0])),
-        "The commanded torque exceeded its limit. This flag is a remark and not a failure: in this"
-        " example the bounds are satisfied.",
+        "The commanded torque exceeded its limit. This flag is a remark and not a failure, but"
+        " `run.ok` is false: in this example the bounds are satisfied.",
         "No action is needed if the bounds are satisfied and no certificate is required. Otherwise"
         " reduce the gains, or tune them with `peak_torque_below`.",
         plotting.torques,
@@ -346,10 +346,13 @@ def write(folder: Path) -> None:
         "",
         (
             "Runs, batches and studies have status flags, `ij.Status`. Each section shows a run"
-            " that has the flag."
+            " that has the flag. `run.ok` is true if no flag is set; a run has failed if it has a"
+            " flag of `ij.status.FAILED`. The other flags are remarks, or limit what the numbers of"
+            " a run mean."
         ),
     ]
-    lines += ["", "```python", "run.ok, ij.Status(int(run.status))", "```", ""]
+    lines += ["", "```python", "flags = ij.Status(int(run.status))"]
+    lines += ["run.ok, flags, bool(flags & ij.status.FAILED)", "```", ""]
     lines += [_kept(name).read_text() for name in CASES]
     for picture in MADE.glob("*.png"):
         shutil.copy(picture, folder)

@@ -125,11 +125,21 @@ def page_of(thing: Any, name: str, level: int = 2, module: str = "iblf_jax") -> 
         text = body(public_types.alias_text(documented_in, name))
         kind, signature = "data", ""
     else:
-        text = body(inspect.getdoc(thing) or "")
+        text = _with_notes(body(inspect.getdoc(thing) or ""), thing)
         kind, signature = _kind(thing), _signature(thing) if callable(thing) else ""
     return "\n".join(
         [f"{'#' * level} {name}", "", defined(kind, module, name, signature), text, ""]
     )
+
+
+def _with_notes(text: str, thing: Any) -> str:
+    """The text about an object, followed by the head of its module if the text refers to it."""
+    text, at_head = re.subn(r"at the head\s+of\s+this\s+module", "in the notes below", text)
+    text, other = re.subn(r"head\s+of\s+this\s+module", "notes below", text)
+    if not at_head + other:
+        return text
+    head = inspect.getdoc(inspect.getmodule(thing)) or ""
+    return f"{text}\n\n**Notes**\n\n{body(head)}"
 
 
 def _kind(thing: Any) -> str:

@@ -227,6 +227,7 @@ ACTUATORS = {
     "ideal": actuators.Ideal(),
     "motor_bare": actuators.Motor(),
     "motor_lag": actuators.Motor(bandwidth=[300.0, 400.0]),
+    "motor_two_limits": actuators.Motor(limit=[40.0, 20.0], lower_limit=[-30.0, -5.0]),
     "chain": actuators.Chain(
         (
             actuators.Motor(bandwidth=900.0, limit=[40.0, 20.0]),

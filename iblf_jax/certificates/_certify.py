@@ -43,10 +43,11 @@ from iblf_jax.core import checks, notices
 from iblf_jax.core.optional import has_members
 from iblf_jax.core.progress import announced
 from iblf_jax.core.pytree import unwrapped
+from iblf_jax.core.status import Status, has_flag
 from iblf_jax.engine.simulate import SimulationWarning, simulate
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical, with_history, with_parts
-from iblf_jax.world.robots import joint_names
+from iblf_jax.world import plants
 
 MAX_RECORDED = 20_000
 """Largest number of recorded samples of a run that `certify` makes; the other steps are
@@ -121,6 +122,8 @@ def certify(
     Returns:
       A `Certificate`; over many runs each line is that of the run with the smallest margin.  It
       prints the lines that apply, and why the others do not in one sentence; its `lines` has all.
+      Its first lines say how many of the runs have the flag INACCURATE, whose numbers are not
+      reliable.
 
     Raises:
       ValueError: a law that states half of a claim; a run of another scenario, one that its own
@@ -242,6 +245,12 @@ def _replayed(study: Any, index: int) -> Rollout:
 
 def _certificate_of(run: Rollout) -> Certificate:
     """The certificate of one run, its arrays on the host."""
+    inaccurate = int(has_flag(int(run.status), Status.INACCURATE))
+    return dataclasses.replace(_checked_claims(run), inaccurate=inaccurate)
+
+
+def _checked_claims(run: Rollout) -> Certificate:
+    """The certificate of one run, without its flags."""
     if run.scenario.process_noise is not None:
         return _certificate_by_comparison(run, "noisy", NOISY)
     if run.scenario.sampling is not None:
@@ -289,7 +298,7 @@ def _certificate_of(run: Rollout) -> Certificate:
         all_lines,
         _numbers(summary),
         Traces(*map(np.concatenate, zip(*traces, strict=True))),
-        joints=joint_names(run.scenario.plant, run.n),
+        joints=plants.component_names(run.scenario.plant),
     )
 
 
@@ -491,10 +500,12 @@ def _over_runs(runs: Iterable[tuple[int, Rollout]]) -> Certificate:
     by_name: dict[str, list[Line]] = {}
     indices: list[int] = []
     invalid: list[int] = []
+    inaccurate = 0
     worst: tuple[tuple[float, float], int, Certificate] | None = None
     for index, run in runs:
         certificate = _certificate_of(run)
         indices.append(index)
+        inaccurate += certificate.inaccurate
         if not is_valid(run):
             invalid.append(index)
         for line in certificate.lines:
@@ -510,6 +521,7 @@ def _over_runs(runs: Iterable[tuple[int, Rollout]]) -> Certificate:
         lines=tuple(lines.over_runs(same, invalid) for same in by_name.values()),
         runs=tuple(indices),
         worst_run=worst_index,
+        inaccurate=inaccurate,
     )
 
 

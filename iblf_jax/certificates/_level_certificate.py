@@ -23,7 +23,6 @@ from iblf_jax.core.units import as_text
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.world import plants
-from iblf_jax.world.robots import joint_names
 
 CLAIM = "the claim (S.3)"
 
@@ -71,7 +70,7 @@ def level_certificate(run: Rollout) -> Certificate:
         ),
         _numbers(summary),
         LevelTraces(*map(np.concatenate, zip(*traces, strict=True))),
-        joints=joint_names(plants.robot_of(run.scenario.plant), run.n),
+        joints=plants.component_names(run.scenario.plant),
         claim=CLAIM,
         levels=_labels(run.scenario),
     )

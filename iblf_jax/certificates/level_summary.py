@@ -30,6 +30,7 @@ from iblf_jax.core import checks
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import UNTRUSTED, describe
 from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.simulation.units import status_words
 from iblf_jax.world import plants
 
 LEVELS = ("levels", 0)
@@ -207,7 +208,8 @@ def level_summary(run: Any, grid: TimeGrid, all_steps: Iterable[Steps]) -> Level
     if is_valid(run):
         check_status(run, float(extrema.bound_distance))
     else:
-        why_invalid = f"the run is not valid: {describe(int(run.status) & int(UNTRUSTED))}"
+        flags = describe(int(run.status) & int(UNTRUSTED), status_words(scenario))
+        why_invalid = f"the run is not valid: {flags}"
     jumps = np.sort(np.ravel(np.asarray(scenario.jump_times())))
     return LevelSummary(
         run=run,

@@ -8,6 +8,7 @@ was broken. `check_positive` and `check_margins` make lines from numbers.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -59,15 +60,18 @@ class Line:
         """
         return self.verdict != NOT_APPLICABLE or (self.value is not None and not self.counts)
 
-    def where(self) -> str:
+    def where(self, joints: Sequence[str] = ()) -> str:
         """Run, joint and time of the smallest margin, and when the line was first broken, in
-        words.
+        words; `joints` are the names of the joints, "joint 0", "joint 1", ... if not given.
         """
         if self.margin is None and self.value is None:
             return ""
+        joint: Any = None
+        if self.joint is not None:
+            joint = joints[self.joint] if joints else f"joint {self.joint}"
         parts = (
             ("run {}", self.run),
-            ("joint {}", self.joint),
+            ("{}", joint),
             ("t = {:.4g} s", self.time),
             ("first broken at t = {:.4g} s", self.first),
         )

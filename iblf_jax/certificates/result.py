@@ -113,6 +113,8 @@ class Certificate:
     """The claim that the lines are about, besides one that the law states about itself."""
     levels: tuple[LevelLabel, ...] = ()
     """The levels of a plant in strict-feedback form, of which `traces` are `LevelTraces` then."""
+    inaccurate: int = 0
+    """The number of checked runs with the flag INACCURATE."""
 
     @property
     def verdict(self) -> str:
@@ -152,7 +154,10 @@ class Certificate:
             ("", "equation", "verdict", "margin", "value", "where the margin is smallest"),
             *self._rows(),
         ]
-        shown = [f"Certificate: {self.verdict}  ({self.subject})", *tables.as_text(rows)]
+        shown = [f"Certificate: {self.verdict}  ({self.subject})"]
+        if self.inaccurate:
+            shown.append(self.accuracy_note)
+        shown += tables.as_text(rows)
         notes = [f"  {'; '.join(names)}: {note}" for note, names in self._notes().items()]
         if notes:
             shown += ["notes", *notes]
@@ -174,9 +179,24 @@ class Certificate:
         ]
         failing = [i for i, line in enumerate(self.applicable) if line.verdict == FAILS]
         table = tables.as_html(heading, rows, failing)
+        if self.inaccurate:
+            table = f"<p>{html.escape(self.accuracy_note)}</p>{table}"
         if not self.omitted:
             return table
         return f"{table}<p>{html.escape(self.omitted)}</p>"
+
+    @property
+    def accuracy_note(self) -> str:
+        """How many of the checked runs have the flag INACCURATE, in words; "" if none has."""
+        if not self.inaccurate:
+            return ""
+        runs = "The run is"
+        if self.runs:
+            runs = f"{self.inaccurate} of {len(self.runs)} runs are"
+        return (
+            f"{runs} flagged INACCURATE, so the numbers of this certificate are not reliable:"
+            " simulate with a smaller dt."
+        )
 
     @property
     def applicable(self) -> tuple[Line, ...]:
@@ -224,7 +244,7 @@ class Certificate:
                 line.verdict,
                 _number(line.margin, line.unit),
                 _number(line.value, line.unit),
-                line.where(),
+                line.where(self.joints),
             )
             for line in self.applicable
         ]
@@ -238,6 +258,7 @@ class Certificate:
             "verdict": self.verdict,
             "runs": list(self.runs),
             "worst_run": self.worst_run,
+            "inaccurate_runs": self.inaccurate,
             "numbers": self.numbers,
             "lines": [dataclasses.asdict(line) for line in self.lines],
         })  # fmt: skip

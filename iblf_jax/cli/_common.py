@@ -202,10 +202,11 @@ def write_json(path: Path, value: Any) -> None:
 def status_and_metrics(run: Rollout) -> dict[str, Any]:
     """The status and the metrics of one run, for JSON."""
     from iblf_jax.core.status import Status, describe
+    from iblf_jax.simulation.units import status_words
 
     status = Status(int(run.status))
     return {
-        "status": describe(status),
+        "status": describe(status, status_words(run.scenario)),
         "flags": [flag.name for flag in Status if flag and flag in status],
         "fastest_mode": {"value": run.fastest_mode, "unit": "1/s"},
         "metrics": {

@@ -46,6 +46,7 @@ def run(args: argparse.Namespace) -> int:
     """Runs the command."""
     from iblf_jax.core.status import FAILED, describe, has_flag
     from iblf_jax.engine.simulate import simulate
+    from iblf_jax.simulation.units import status_words
 
     file = scenario_of(args)
     options = run_options(args, file)
@@ -55,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
     print(
         f"{args.scenario}: {options['duration']:g} s, dt = {options['dt']:g} s, {options['method']}"
     )
-    print(f"status: {describe(int(result.status))}")
+    print(f"status: {describe(int(result.status), status_words(result.scenario))}")
     print("\n" + metrics_table({"": result}))
     if folder is not None:
         _write(folder, args.scenario, result, options, args.seed)

@@ -287,6 +287,8 @@ def as_leaf(owner: str, field: dataclasses.Field, value: Any) -> Any:
     if value is None:
         if field.default is None:
             return None
+        if isinstance(field.default, tuple):
+            raise fail(name, value, "a tuple, () for none")
         raise fail(name, value, expected if declared else "a component")
     if not declared and isinstance(value, tuple | list) and not value:
         return tuple(value)

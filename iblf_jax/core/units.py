@@ -20,9 +20,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from fractions import Fraction
 from typing import Any, TypeAlias
 
-Exponents: TypeAlias = dict[str, int]
+Exponents: TypeAlias = dict[str, Fraction]
 """Name of a factor of a unit -> its exponent."""
 
 
@@ -100,8 +101,8 @@ def resolved(unit: Unit, units: Mapping[str, Unit]) -> Unit:
     return found
 
 
-def power(unit: Unit, exponent: int) -> Unit:
-    """A unit to an integer power."""
+def power(unit: Unit, exponent: int | Fraction) -> Unit:
+    """A unit to a power."""
     if isinstance(unit, tuple):
         return type(unit)(power(entry, exponent) for entry in unit)
     return written({name: exponent * k for name, k in exponents(unit).items()})
@@ -118,7 +119,7 @@ def product(first: Unit, second: Unit) -> Unit:
             return kind(product(a, b) for a, b in rows)
     total = exponents(str(first))
     for name, exponent in exponents(str(second)).items():
-        total[name] = total.get(name, 0) + exponent
+        total[name] = total.get(name, Fraction(0)) + exponent
     return written(total)
 
 
@@ -135,19 +136,16 @@ def per_second(unit: Unit) -> Unit:
 
 
 def exponents(unit: str) -> Exponents:
-    """The factors of a unit such as "N m s/rad", with their exponents.
-
-    A factor that this notation does not cover, such as "m^0.5", counts as a name.
-    """
+    """The factors of a unit such as "N m s/rad" or "m^0.5", with their exponents."""
     found: Exponents = {}
     numerator, _, denominator = unit.partition("/")
     for sign, factors in ((1, numerator), (-1, denominator)):
         for factor in re.split(r"[\s()/]+", factors):
             name, caret, exponent = factor.rpartition("^")
-            if not caret or not exponent.isdecimal():
+            if not caret or not re.fullmatch(r"\d+(\.\d+)?", exponent):
                 name, exponent = factor, "1"
             if name not in ("", "1"):
-                found[name] = found.get(name, 0) + sign * int(exponent)
+                found[name] = found.get(name, Fraction(0)) + sign * Fraction(exponent)
     return found
 
 
@@ -163,11 +161,11 @@ def written(factors: Exponents) -> str:
     return f"{above or '1'}/{denominator}"
 
 
-def _factor(name: str, exponent: int) -> str:
-    """A factor with its exponent, such as "s^2"."""
+def _factor(name: str, exponent: Fraction) -> str:
+    """A factor with its exponent, such as "s^2" or "m^0.5"."""
     if exponent == 1:
         return name
-    return f"{name}^{exponent}"
+    return f"{name}^{float(exponent):g}"
 
 
 def as_text(unit: Unit) -> str:

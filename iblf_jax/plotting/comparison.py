@@ -65,8 +65,10 @@ def comparison(result: Comparison, joint: int = 0, *, zoom: float | None = None)
     start, end = windows(given, [error], zoom)[1]
     columns = {"gains as given": given}
     if result.factors:
-        name = plants.input_name(scenario.plant)
-        columns[f"equal effort (RMS {name} above gravity)"] = curves_of(result.equal_effort)
+        effort = "torque above gravity"
+        if plants.is_chain(scenario.plant):
+            effort = f"{plants.input_name(scenario.plant)} above $u_0$"
+        columns[f"equal effort (RMS {effort})"] = curves_of(result.equal_effort)
     torque = PanelRow(quantity_of(scenario, "tau", joint), joint, "")
     shown = [curve for curves in columns.values() for curve in curves]
     figure = _style.new_figure(_style.WIDTH, 7.0)

@@ -118,7 +118,9 @@ class Rollout(Signals):
 
     @property
     def ok(self) -> bool:
-        """Whether no flag is set (for one run)."""
+        """Whether no flag is set (for one run), including the flags that are no failure; a run has
+        failed if it has a flag of `status.FAILED`.
+        """
         return int(self.status) == int(Status.OK)
 
     @property
@@ -148,6 +150,11 @@ class Rollout(Signals):
     def is_batch(self) -> bool:
         """Whether this holds many runs."""
         return np.ndim(self.status) > 0
+
+    def __bool__(self) -> bool:
+        if not self.is_batch:
+            raise TypeError("a run has no truth value; run.ok is whether no flag is set")
+        return len(self) > 0
 
     def __len__(self) -> int:
         if not self.is_batch:

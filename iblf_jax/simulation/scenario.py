@@ -966,16 +966,22 @@ def _check_levels_at_start(scenario: Scenario) -> None:
         noun = plants.component_noun(scenario.plant)
         _check_order(f"state_bounds[{i}] of {noun}", lower, upper)
         remedy = "Move the start or widen the bounds."
+        if i == 0 and not np.any(x[1]):
+            remedy = f"{remedy} {WITHOUT_DQ}"
         level = f"initial.x[{i + 1}][{{}}]"
         _check_inside(level, f"bounds of level {i + 2}", np.asarray(x[i + 1]), lower, upper, remedy)
     parts: dict[str, Any] = {"plant": scenario.plant, "model": scenario.model}
     for name, plant in parts.items():
         if plants.is_chain(plant):
             levels = x[: plant.order]
-            _check_gains(name, np.asarray(plant.gain(t, levels)))
+            _check_gains(name, np.asarray(plant.gain(t, levels)), np.asarray(levels))
             filtered = name == "model" and plants.plant_member(plant, "needs_filters")
             if not filtered and not isinstance(plant, plants.OF_KNOWN_STRUCTURE):
                 plants.check_dependence(name, _dependence_near(plant, t, levels))
+
+
+WITHOUT_DQ = "x_2 is 0 if Initial has no dq: Initial(x=...) takes all levels."
+"""The remedy for a start of a plant whose second level may have been left out."""
 
 
 @programs.jit
@@ -988,11 +994,13 @@ def _dependence_near(plant: Plant, t: jax.Array, x: jax.Array) -> Any:
     return jax.vmap(partial(plants.dependence_on_levels, plant, t))(points)
 
 
-def _check_gains(name: str, gains: np.ndarray) -> None:
-    """Raises ValueError for a gain of a level that is singular or not finite."""
+def _check_gains(name: str, gains: np.ndarray, x: np.ndarray) -> None:
+    """Raises ValueError for a gain of a level that is singular or not finite at the start x."""
+    remedy = f"The start is x = {x.tolist()}, and every level must act on the level below it there."
+    if not x[1].any():
+        remedy += f" {WITHOUT_DQ}"
     for i, gain in enumerate(gains):
         matrix = np.diag(gain) if gain.ndim == 1 else gain
-        remedy = "Every level must act on the level below it."
         expected = f"an invertible gain of level {i + 1} at the start"
         if not np.all(np.isfinite(matrix)) or np.linalg.matrix_rank(matrix) < len(matrix):
             raise checks.fail(f"{name}.gain(t, x)[{i}]", matrix, expected, remedy)

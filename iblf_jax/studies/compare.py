@@ -24,6 +24,7 @@ import numpy as np
 from iblf_jax.control.controllers import (
     KEEPERS,
     LAWS,
+    BarrierBackstepping,
     Controller,
     Saturated,
     law_by_name,
@@ -52,7 +53,7 @@ from iblf_jax.simulation.noise import noise_values
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical
-from iblf_jax.simulation.units import unit_text
+from iblf_jax.simulation.units import status_words, unit_text
 from iblf_jax.studies.comparison import Comparison
 from iblf_jax.studies.equal_effort import NO_EFFORT, EffortSearch, Trials, grid, search
 from iblf_jax.studies.time_step import needed_dt
@@ -60,6 +61,10 @@ from iblf_jax.world import plants
 
 NAMES = (*LAWS, *KEEPERS)
 Laws = Sequence[str | Controller] | Mapping[str, str | Controller]
+ONLY_K = (
+    "the factor scales k and not the weights: if the barriers of the laws have different units,"
+    " choose the weights first (BarrierBackstepping, weights)"
+)
 
 
 @notices.each_warning_once
@@ -117,9 +122,9 @@ def compare(
         "dt": dt,
         "method": method,
         "record_every": record_every,
-        "metrics": _folds(scenario, metrics),
+        "metrics": metrics,
     }
-    settling = next(fold for fold in options["metrics"] if isinstance(fold, Settling))
+    settling = next(fold for fold in _folds(scenario, metrics) if isinstance(fold, Settling))
     rollouts = {name: _run(one, options) for name, one in scenarios.items()}
     gains = {name: _gains_in_words(one.controller) for name, one in scenarios.items()}
     if not equal_effort:
@@ -221,7 +226,9 @@ def _model_for(law: Controller, scenario: Scenario) -> Any:
 
 
 def _folds(scenario: Scenario, further: Sequence[Fold]) -> tuple[Fold, ...]:
-    """The folds of every run: those of `further`, and the standard ones of other classes."""
+    """The folds of a run: those of `further`, and of other classes the standard ones and those of
+    the signals that runs with its law have.
+    """
     if not isinstance(further, tuple | list):
         remedy = "Put one fold into brackets, metrics=(fold,)."
         raise checks.fail("metrics", further, "a tuple of folds", remedy)
@@ -240,7 +247,8 @@ def _limited_as(controller: Controller, law: Controller) -> Controller:
 def _run(scenario: Scenario, options: Mapping[str, Any]) -> Rollout:
     """One run; the table reports its failure, so there is no warning."""
     with notices.muted(UserWarning):
-        return simulate(scenario, **options)
+        folds = _folds(scenario, options["metrics"])
+        return simulate(scenario, **{**options, "metrics": folds})
 
 
 def gain_names(law: Controller) -> tuple[str, ...]:
@@ -281,13 +289,17 @@ def _at_effort_of(
         return needed_dt(trials.status, trials.mode, trials.error, dt, method)
 
     inaccurate = bool((int(reference.status) | int(own.status)) & Status.INACCURATE)
-    unit = unit_text(scenario, INPUT)
-    found = search(_trials_of(scenario, names, options), target, dt_for, inaccurate, unit)
+    trials_of = _trials_of(scenario, names, options)
+    unit, texts = unit_text(scenario, INPUT), status_words(scenario)
+    found = search(trials_of, target, dt_for, inaccurate, unit, texts)
     for factor in found.crossings:
         run = _run(with_parameters(scenario, _scaled(scenario, names, factor)), options)
         if not int(run.status) & NO_EFFORT:
             return _EqualEffort(factor, run, search=found)
-    return _EqualEffort(float("nan"), reason=found.in_words(), search=found)
+    reason = found.in_words()
+    if isinstance(unwrapped(scenario.controller), BarrierBackstepping):
+        reason += f"; {ONLY_K}"
+    return _EqualEffort(float("nan"), reason=reason, search=found)
 
 
 def _scaled(scenario: Scenario, names: Sequence[str], factor: Any) -> dict[str, Any]:

@@ -40,6 +40,10 @@ MARGINS_OF_START = (
 OWN_GAINS = "Laws whose gains differ are comparable at equal effort only."
 
 
+ROUNDING = 4.0
+"""Error of a distance of two positions in units of the last place of the larger one."""
+
+
 class Row(NamedTuple):
     """The line of one law: values of its worst joint, but efforts and chatter of all joints."""
 
@@ -48,7 +52,7 @@ class Row(NamedTuple):
     """What the law's gains were multiplied by."""
     settling_time: float
     """Until |e1| is below the tolerance of `Comparison.settling` for good [s]; NaN where the bounds
-    are closer than that, so that every run that keeps them has settled from the start."""
+    are not farther than that, so that every run that keeps them has settled from the start."""
     rmse: float
     """[rad]."""
     margin: float
@@ -64,7 +68,8 @@ class Row(NamedTuple):
     torque_rms: float
     """sqrt(mean |tau|^2) [N m]."""
     effort_above_gravity: float
-    """sqrt(mean |tau - G0(q)|^2) [N m]."""
+    """sqrt(mean |tau - G0(q)|^2) [N m]; for a plant in strict-feedback form sqrt(mean |u - u_0|^2),
+    u_0 its `steady_input`."""
     chatter: float
     """sum |tau_k+1 - tau_k| [N m]."""
     status: str
@@ -78,9 +83,10 @@ def headings(scenario: Scenario) -> tuple[str, ...]:
     """The heading of each column of `Row`, with the units of the plant."""
     plant = scenario.plant
     first, second, of_input = (unit_text(scenario, unit) for unit in (POSITION, VELOCITY, INPUT))
-    torque, speed = "tau", "velocity"
+    torque, speed, above = "tau", "velocity", "above gravity"
     if plants.is_chain(plant):
         torque, speed = plants.input_name(plant), plants.level_names(plant)[1]
+        above = f"{torque} above u_0"
     return (
         "law",
         "factor",
@@ -92,7 +98,7 @@ def headings(scenario: Scenario) -> tuple[str, ...]:
         "region margin [m]",
         f"peak {torque} [{of_input}]",
         f"rms {torque} [{of_input}]",
-        "above gravity",
+        f"{above} [{of_input}]",
         f"chatter [{of_input}]",
         "status",
     )
@@ -105,11 +111,15 @@ def _verdict(run: Rollout) -> str:
 
 
 def _is_settled_by_bounds(run: Rollout, settling: Settling) -> bool:
-    """Whether the bounds of every component are closer to the reference than the error at which
-    it counts as settled, so that its settling time says nothing about the law.
+    """Whether the bounds of every component are no farther from the reference than the error at
+    which it counts as settled, so that its settling time says nothing about the law.
     """
-    widest = np.maximum(run.upper - run.q_d, run.q_d - run.lower)
-    return bool(np.all(widest <= settling.tolerance))
+    q_d, lower, upper = (np.asarray(x) for x in (run.q_d, run.lower, run.upper))
+    widest = np.maximum(upper - q_d, q_d - lower)
+    # The difference of two rounded positions may exceed a tolerance equal to the bounds' distance.
+    size = np.maximum(np.abs(q_d), np.maximum(np.abs(lower), np.abs(upper)))
+    rounding = ROUNDING * np.finfo(widest.dtype).eps * size
+    return bool(np.all(widest <= np.asarray(settling.tolerance) + rounding))
 
 
 def row_of(law: str, factor: float, run: Rollout, settling: Settling) -> Row:
@@ -253,7 +263,7 @@ class Comparison:
         size = f"{float(np.max(self.settling.tolerance)):g} {unit_text(self.scenario, POSITION)}"
         return (
             f"Settling is the time until |e1| < {size} for good. It is not shown, because the"
-            " bounds are closer to the reference than that: give a smaller tolerance,"
+            " bounds are no farther from the reference than that: give a smaller tolerance,"
             " metrics=(ij.metrics.Settling(tolerance=...),)."
         )
 

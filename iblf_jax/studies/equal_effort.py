@@ -21,7 +21,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -87,6 +87,8 @@ class EffortSearch:
     to blame; None without such."""
     unit: str = "N m"
     """Of the efforts."""
+    texts: Mapping[Status, str] = dataclasses.field(default_factory=lambda: WORDS)
+    """Of each status flag."""
 
     @property
     def factor(self) -> float:
@@ -114,7 +116,7 @@ class EffortSearch:
         """Factor -> why its run is not valid, in words."""
         why = invalid_flags(self.accepts_inaccurate)
         bad = zip(self.factors[~self.valid], self.status[~self.valid], strict=True)
-        return {float(factor): describe(int(status) & why) for factor, status in bad}
+        return {float(factor): describe(int(status) & why, self.texts) for factor, status in bad}
 
     def in_words(self) -> str:
         """What was searched, what failed and what was found, in one line."""
@@ -156,7 +158,9 @@ class EffortSearch:
         nearest = sorted(
             self.failed_groups(), key=lambda group: min(abs(math.log(x)) for x in group[0])
         )
-        groups = [f"{_range(factors)} ({_reasons(status)})" for factors, status in nearest]
+        groups = [
+            f"{_range(factors)} ({_reasons(status, self.texts)})" for factors, status in nearest
+        ]
         words = [f"{len(self.failed)} of them fail: {_few(groups)}"]
         if self.smaller_dt is not None:
             words.append(
@@ -233,6 +237,7 @@ def search(
     needed_dt: Callable[[Trials], float | None] = lambda trials: None,
     inaccurate: bool = False,
     unit: str = "N m",
+    texts: Mapping[Status, str] = WORDS,
 ) -> EffortSearch:
     """Finds the factors at which the effort is the target.
 
@@ -242,6 +247,7 @@ def search(
       needed_dt: trials with too large a time step -> one that is small enough [s].
       inaccurate: whether trials flagged INACCURATE are valid.
       unit: of the efforts.
+      texts: of each status flag.
     """
     powers = grid()
     trials = run(2.0**powers)
@@ -253,7 +259,7 @@ def search(
     if np.any(hidden):
         dt = needed_dt(Trials(*(x[hidden] for x in trials)))
     return EffortSearch(
-        target, 2.0**powers, trials.effort, trials.status, ordered, inaccurate, dt, unit
+        target, 2.0**powers, trials.effort, trials.status, ordered, inaccurate, dt, unit, texts
     )
 
 
@@ -385,12 +391,12 @@ def _range(factors: Sequence[float]) -> str:
     return f"{len(factors)} from {factors[0]:.4g} to {factors[-1]:.4g}"
 
 
-def _reasons(status: Sequence[int]) -> str:
+def _reasons(status: Sequence[int], texts: Mapping[Status, str]) -> str:
     """Why some trials failed, each reason with the number of trials if not all of them failed for
     it.
     """
     words = []
-    for flag, text in WORDS.items():
+    for flag, text in texts.items():
         count = sum(bool(x & flag) for x in status)
         if count == len(status):
             words.append(text)

@@ -15,6 +15,7 @@ from iblf_jax.control.actuators import Actuator, Delivered
 from iblf_jax.control.actuators._base import smooth
 from iblf_jax.control.sensors import Measurement, Sensor
 from iblf_jax.control.sensors._base import sensor_member, unrounded
+from iblf_jax.core import checks
 from iblf_jax.core.optional import has_members
 from iblf_jax.testing._contract import (
     Findings,
@@ -93,7 +94,9 @@ def _measures(findings: Findings, sensor, given, normal, period) -> None:
     same_structure(findings, label + ", state", after, state)
 
 
-def check_actuator(actuator: Any, *, n: int | None = None) -> None:
+def check_actuator(
+    actuator: Any, *, n: int | None = None, torques: tuple[Any, Any] | None = None
+) -> None:
     """Checks an actuator: shapes, the state's structure, derivatives, float32, and the initial
     torque.
 
@@ -104,13 +107,20 @@ def check_actuator(actuator: Any, *, n: int | None = None) -> None:
     Args:
       actuator: an instance.
       n: number of joints; that of its leaves if not given, 2 if these are scalars.
+      torques: the smallest and the largest torque that it delivers at a standstill, two numbers or
+        two (n,), such as (0.0, 5.0) for one that delivers positive torques only; a small range
+        around 0 if not given.
 
     Raises:
       ContractError: lists what does not hold, with the remedy.
-      ValueError: `n` is not a number of joints, or not that of the leaves.
+      ValueError: `n` is not a number of joints, or not that of the leaves, or `torques` is not an
+        increasing pair.
     """
+    low, high = _range_of(torques)
     with examine_joints(actuator, Actuator, n, "actuator") as (findings, fitted, joints):
-        command, dq = jnp.asarray(np.random.default_rng(3).uniform(-0.1, 0.1, (2, joints)))
+        shares, dq = np.random.default_rng(3).uniform(-0.1, 0.1, (2, joints))
+        # The shares of the range are between 0.1 and 0.9.
+        command, dq = jnp.asarray(low + (0.5 + 4.0 * shares) * (high - low)), jnp.asarray(dq)
         in_both_types(findings, _delivers, fitted, command, dq)
 
         def outputs(actuator, command, dq):
@@ -119,7 +129,23 @@ def check_actuator(actuator: Any, *, n: int | None = None) -> None:
             return {"tau": delivered.tau} | leaves_by_name("rate", delivered.rate)
 
         check_function(findings, outputs, fitted, (command, dq))
-        _starts_at_its_torque(findings, smooth(fitted), command / jnp.max(jnp.abs(command)))
+        tested = [command]
+        if torques is None:
+            tested = [size * command / jnp.max(jnp.abs(command)) for size in SMALL_TORQUES]
+        _starts_at_its_torque(findings, smooth(fitted), tested)
+
+
+def _range_of(torques: Any) -> tuple[np.ndarray, np.ndarray]:
+    """The smallest and the largest tested torque; ValueError unless they are an increasing pair."""
+    if torques is None:
+        torques = (-SMALL_TORQUES[0], SMALL_TORQUES[0])
+    expected = "a pair (smallest, largest) of numbers"
+    if not isinstance(torques, tuple | list) or len(torques) != 2:
+        raise checks.fail("torques", torques, expected)
+    low, high = (np.asarray(checks.as_floats("torques", side), float) for side in torques)
+    if not np.all(low < high):
+        raise checks.fail("torques", torques, expected)
+    return low, high
 
 
 def _delivers(findings: Findings, actuator, command, dq) -> None:
@@ -133,12 +159,11 @@ def _delivers(findings: Findings, actuator, command, dq) -> None:
     same_structure(findings, label + ", rate", found.rate, state)
 
 
-def _starts_at_its_torque(findings: Findings, actuator: Any, direction: jax.Array) -> None:
-    """Requires that in the state `init(tau)` some input delivers tau at a standstill, and that the
-    state is stable at this input.
+def _starts_at_its_torque(findings: Findings, actuator: Any, torques: list[jax.Array]) -> None:
+    """Requires that in the state `init(tau)` some input delivers tau at a standstill, for one of
+    some torques, and that the state is stable at this input.
     """
-    for size in SMALL_TORQUES:
-        torque = size * direction
+    for torque in torques:
         state = actuator.init(torque)
         found = _input_that_delivers(actuator, torque, state)
         if found is not None:
@@ -150,8 +175,10 @@ def _starts_at_its_torque(findings: Findings, actuator: Any, direction: jax.Arra
     delivered = np.asarray(actuator.deliver(torque, jnp.zeros_like(torque), state).tau)
     findings.add(
         f"from init({np.asarray(torque)}) at a standstill no input makes it deliver that torque;"
-        f" commanded to, it gives {delivered} N m",
-        "`init` must return the state in which the actuator delivers the torque",
+        f" commanded to, it gives {delivered}",
+        "`init` must return the state in which the actuator delivers the torque; for an actuator"
+        " that cannot deliver this one, give the range, check_actuator(actuator, torques=(low,"
+        " high))",
     )
 
 

@@ -40,6 +40,7 @@ from iblf_jax.simulation.metrics import check_needs
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical, fitted_to_step
+from iblf_jax.simulation.units import status_words
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.perturbation_cube import Cube, unit_cube
 from iblf_jax.tuning.evaluation import Derivatives, Value
@@ -97,7 +98,7 @@ class Attack:
         lines = [
             f"Attack({word}: smallest margin {self.margin:.4g} {self.unit}, {self.first_margin:.4g}"
             f" at random; {self.runs} runs)",
-            f"  status: {describe(self.status)}",
+            f"  status: {describe(self.status, status_words(self.scenario))}",
         ]
         for path, x in self.values.items():
             lines.append(f"  {path}: {np.array2string(np.asarray(x), precision=5)}")

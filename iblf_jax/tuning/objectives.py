@@ -339,12 +339,20 @@ def for_scenario(objective: Objective, scenario: Scenario) -> Objective:
 
 
 def _in_units_of(scenario: Scenario, requirement: Requirement) -> Requirement:
-    """A requirement whose name has the unit of the plant in the place of that of a robot."""
+    """A requirement whose name has the unit of the plant, and the names of its input and of its
+    second level, in the place of those of a robot.
+    """
     _, unit = requirement.measure
-    text = unit_text(scenario, unit)
-    if text == unit:
-        return requirement
-    return dataclasses.replace(requirement, name=requirement.name.replace(f" {unit}", f" {text}"))
+    name = requirement.name.replace(f" {unit}", f" {unit_text(scenario, unit)}")
+    plant, quantity = scenario.plant, requirement.quantity
+    if plants.is_chain(plant) and isinstance(quantity, Peak):
+        own = {
+            "torque": f"peak {plants.input_name(plant)}",
+            "velocity_deficit": f"{plants.level_names(plant)[1]} margin",
+        }
+        words = IN_WORDS[quantity.signal]
+        name = name.replace(words, own.get(quantity.signal, words), 1)
+    return dataclasses.replace(requirement, name=name)
 
 
 def _part_of(part: Any, function: str, names: tuple[str, ...]) -> Any:

@@ -53,6 +53,9 @@ from iblf_jax.tuning.samples import (
 )
 from iblf_jax.tuning.step_check import ReportedQuantities, StepCheck
 
+LARGEST_PERCENTAGE = 100.0
+"""Ratio of two values from which a report shows the factor and no percentage."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Change:
@@ -75,13 +78,20 @@ class Change:
     def __str__(self) -> str:
         text = f"{self.name}: {self.before:.5g} -> {self.after:.5g}"
         if self.before:
-            text += f" ({(self.after / self.before - 1) * 100:+.1f} %)"
+            text += f" ({_change_in_words(self.after / self.before)})"
         if self.low is None:
             return text
         verdict = "NOT significant: the interval contains zero"
         if self.significant:
             verdict = "significant"
         return f"{text}; change {self.low:.3g} to {self.high:.3g}; {verdict}"
+
+
+def _change_in_words(ratio: float) -> str:
+    """A ratio of two values as a percentage, or as a factor where it is large."""
+    if abs(ratio) >= LARGEST_PERCENTAGE:
+        return f"a factor of {ratio:.3g}"
+    return f"{(ratio - 1) * 100:+.1f} %"
 
 
 @dataclasses.dataclass(frozen=True)

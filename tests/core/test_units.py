@@ -63,7 +63,11 @@ def test_products_powers_and_rates():
     assert per_second(("m", "rad")) == ("m/s", "rad/s")
     by_level = ByLevel(("m", ("m/s", "rad/s")))
     assert product(by_level, ("s", "A")) == ByLevel((("m s", "m A"), ("m", "rad A/s")))
-    assert per_second("m^0.5") == "m^0.5/s"  # not an integer power: it counts as a name
+    assert per_second("m^0.5") == "m^0.5/s"
+    assert power("m^0.5", 2) == "m"
+    assert power("m^0.5", -2) == "1/m"
+    assert product("m^0.5", "m^0.5/s") == "m/s"
+    assert power("m^1.5", 3) == "m^4.5"
 
 
 def test_components_and_levels_are_resolved_and_shown():

@@ -42,6 +42,12 @@ DRAWS = {
 }
 
 
+def test_a_large_change_is_shown_as_a_factor():
+    assert str(Change("objective", 1.0, 1.5, None, None)).endswith("1 -> 1.5 (+50.0 %)")
+    diverged = str(Change("objective", 1.08, 1.6251e24, None, None))
+    assert diverged == "objective: 1.08 -> 1.6251e+24 (a factor of 1.5e+24)"
+
+
 # ---------------------------------------------------------------- the most influential perturbation
 
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 
 from iblf_jax.control.actuators._base import Delivered
 from iblf_jax.core import checks
+from iblf_jax.core.input_limits import check_lower_limit, lower_or_opposite
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.core.units import INPUT, VELOCITY, PlantUnit
 
@@ -18,7 +19,7 @@ from iblf_jax.core.units import INPUT, VELOCITY, PlantUnit
 class Motor:
     """A first-order lag with limits of torque and rate, and a torque-speed line.
 
-        v = clip(u, +-limit),   y' = clip(bandwidth (v - y), +-rate_limit),
+        v = clip(u, lower_limit, limit),   y' = clip(bandwidth (v - y), +-rate_limit),
         tau = clip(y, +-stall max(1 - |q'|/no_load_speed, 0))
 
     A limit or a lag that is not given is left out; without a bandwidth y = v.  Beyond the no-load
@@ -36,6 +37,8 @@ class Motor:
       stall: torque at a standstill, () or (n,) [N m], > 0; none if not given.  It needs a
         no_load_speed.
       no_load_speed: speed at which the torque is 0, () or (n,) [rad/s], > 0; none if not given.
+      lower_limit: smallest torque, () or (n,) [N m], below the limit, such as 0 for a pump;
+        -limit if not given.  It needs a limit.
 
     Source: R. Krishnan, Electric Motor Drives, 2001, chapter 2: the torque-speed line of a DC
       motor.
@@ -46,10 +49,11 @@ class Motor:
     rate_limit: Leaf = leaf(PlantUnit("N m/s", "u/s"), sign="positive", default=None)
     stall: Leaf = leaf(INPUT, sign="positive", default=None)
     no_load_speed: Leaf = leaf(VELOCITY, sign="positive", default=None)
+    lower_limit: Leaf = leaf(INPUT, default=None)
 
     def check(self) -> None:
-        """Raises ValueError for one of stall and no_load_speed without the other, or a rate_limit
-        without a bandwidth.
+        """Raises ValueError for one of stall and no_load_speed without the other, a rate_limit
+        without a bandwidth, or a lower_limit without a larger limit.
         """
         if (self.stall is None) != (self.no_load_speed is None):
             name = "no_load_speed" if self.no_load_speed is None else "stall"
@@ -61,12 +65,13 @@ class Motor:
                 "a bandwidth, as there is a rate_limit",
                 "Such as bandwidth=1000.0.",
             )
+        check_lower_limit("Motor", self.lower_limit, self.limit)
 
     @property
     def unlimited(self) -> Motor:
         """The same drive without limits."""
         return dataclasses.replace(
-            self, limit=None, rate_limit=None, stall=None, no_load_speed=None
+            self, limit=None, rate_limit=None, stall=None, no_load_speed=None, lower_limit=None
         )
 
     def init(self, tau: jax.Array) -> Any:
@@ -79,8 +84,9 @@ class Motor:
         v: jax.Array = command
         rate: Any = ()
         if self.limit is not None:
-            limited |= jnp.abs(command) > self.limit
-            v = jnp.clip(command, -self.limit, self.limit)
+            lower = lower_or_opposite(self.lower_limit, self.limit)
+            limited |= (command < lower) | (command > self.limit)
+            v = jnp.clip(command, lower, self.limit)
         if self.bandwidth is not None:
             rate = self.bandwidth * (v - state)
             if self.rate_limit is not None:

@@ -96,7 +96,8 @@ class BarrierBackstepping:
         1 for a model that states none.  The unit 1 of c and of the weights is that of a plant
         without units; `iblf_jax.parameters` shows the others, in which all w_i V_i have one unit.
         They depend on the barrier: in a tube of half-width k, w/k^2 with `Mapping` equals w with
-        `PrescribedPerformance` near e_i = 0.
+        `PrescribedPerformance` and `Log` near e_i = 0, so that a weight of 1 of these is large in
+        a narrow tube.
       o: margin under the root of kappa, one number, r numbers or (r, n) [1/s^2], > 0, for barriers
         that have it and for no others; 0.1 for these, if not given.
       filter: mu_i of the filters of a dynamic surface, r - 1 numbers or (r - 1, n) [s], > 0; exact

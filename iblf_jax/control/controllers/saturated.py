@@ -61,6 +61,7 @@ from iblf_jax.control.controllers._base import (
     wrapped_advice,
 )
 from iblf_jax.core import checks
+from iblf_jax.core.input_limits import check_lower_limit, lower_or_opposite
 from iblf_jax.core.pytree import Leaf, component, leaf, static, unwrapped
 from iblf_jax.core.units import INPUT
 from iblf_jax.world import plants
@@ -83,11 +84,17 @@ class AuxiliaryState(NamedTuple):
 
 @component
 class Saturated:
-    """tau = clip(tau_law, -limit, limit) (hard), or tau_law / (1 + |tau_law/limit|^8)^(1/8)
-    (smooth, for gradients).
+    """tau = clip(tau_law, lower_limit, limit).
 
-    With `auxiliary` the law has the auxiliary state lambda of (A.1), and e2 is q' - alpha - lambda
-    (head of this module).  Paths reach through: "controller.K2" is the wrapped law's K2.
+    The smooth limit, for gradients, is c + h x/(1 + |x|^8)^(1/8) with x = (tau_law - c)/h, the
+    centre c of both limits and half their distance h.
+
+    With `auxiliary` the law has the auxiliary state lambda,
+
+        lambda' = -auxiliary lambda + G_r (sat(u) - u),   lambda(0) = 0,                      (A.1)
+
+    G_r = M0^-1 for a robot, and follows alpha + lambda in the place of alpha, so that e2 is
+    q' - alpha - lambda.  Paths reach through: "controller.K2" is the wrapped law's K2.
 
     Args:
       law: the law whose torque is limited, any `Controller`.
@@ -95,6 +102,8 @@ class Saturated:
       edge: "hard" or "smooth"; "hard" if not given.
       auxiliary: rate k of the auxiliary state, () or (n,) [1/s], > 0; no auxiliary state if not
         given.  A sampled law needs one below 2 divided by its period.
+      lower_limit: smallest torque of each joint, () or (n,) [N m], below the limit, such as 0 for
+        a pump; -limit if not given.
 
     Source: the limit is a common construction; the auxiliary state as in M. Chen, S. S. Ge, B. Ren,
       Automatica 47 (2011) 452-465, with a linear filter; (A.1)-(A.4) as derived at the head of this
@@ -105,13 +114,17 @@ class Saturated:
     limit: Leaf = leaf(INPUT, sign="positive")
     edge: str = static(default="hard")
     auxiliary: Leaf = leaf("1/s", sign="positive", default=None)
+    lower_limit: Leaf = leaf(INPUT, default=None)
     wraps: ClassVar[str] = "law"
     advice = wrapped_advice
 
     def check(self) -> None:
-        """Raises ValueError for something that is not a law, or an unknown edge."""
+        """Raises ValueError for something that is not a law, an unknown edge, or a lower limit that
+        is not below the limit.
+        """
         checks.conforms("Saturated.law", self.law, Controller, "iblf_jax.controllers has them.")
         checks.one_of("Saturated.edge", self.edge, EDGES)
+        check_lower_limit("Saturated", self.lower_limit, self.limit)
 
     @property
     def has_auxiliary(self) -> bool:
@@ -157,11 +170,16 @@ class Saturated:
 
     def _limited(self, command: Command) -> Command:
         """A command with its torque limited."""
-        saturated = command.saturated | (jnp.abs(command.tau) > self.limit)
+        lower = lower_or_opposite(self.lower_limit, self.limit)
+        beyond = (command.tau < lower) | (command.tau > self.limit)
+        saturated = command.saturated | beyond
         if self.edge == "hard":
-            tau = jnp.clip(command.tau, -self.limit, self.limit)
-        else:
+            tau = jnp.clip(command.tau, lower, self.limit)
+        elif self.lower_limit is None:
             tau = self.limit * _smooth_clip(command.tau / self.limit)
+        else:
+            centre, half = (self.limit + lower) / 2.0, (self.limit - lower) / 2.0
+            tau = centre + half * _smooth_clip((command.tau - centre) / half)
         return command._replace(tau=tau, saturated=saturated)
 
     def shift(self, state: AuxiliaryState) -> Shift:

@@ -15,6 +15,7 @@ from iblf_jax.engine import RunRequest, run_rollout
 from iblf_jax.simulation.metrics import as_folds
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.simulation.units import status_words
 from iblf_jax.studies.distributions import Perturbation, joint_samples, value
 from iblf_jax.studies.rare_events.limit_state import Level
 
@@ -75,10 +76,8 @@ class LikelyFailure:
         rows = [("", self.names[i], f"{self.z[i]:+.2f} standard deviations") for i in order]
         left_out = len(self.z) - len(order)
         more = [f"  and {left_out} numbers that deviate less"] if left_out else []
-        first = (
-            f"LikelyFailure(distance {self.distance:.3f}, margin {self.margin:.3g};"
-            f" {describe(self.status)})"
-        )
+        flags = describe(self.status, status_words(self.scenario))
+        first = f"LikelyFailure(distance {self.distance:.3f}, margin {self.margin:.3g}; {flags})"
         return "\n".join([first, *tables.as_text(rows, left=(0, 1)), *more])
 
 

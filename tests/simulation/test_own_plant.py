@@ -1,0 +1,169 @@
+"""A plant of order 2 whose second level is not the rate of the first: two water tanks."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import iblf_jax as ij
+from iblf_jax.core.status import Status
+from iblf_jax.tuning.objectives import fitted
+
+ROOT_OF_2G = 4.429  # [m^0.5/s]
+LIMITS = {"limit": 9e-5, "lower_limit": 6e-5}
+SHORT = {"duration": 40.0, "dt": 0.2}
+
+
+@ij.component
+class Tanks:
+    """The level x1 of the lower tank, and the root x2 of the level of the upper one."""
+
+    a1: ij.Leaf = ij.leaf("m^2", sign="positive", shape="scalar")
+    a2: ij.Leaf = ij.leaf("m^2", sign="positive", shape="scalar")
+    n: ClassVar[int] = 1
+    order: ClassVar[int] = 2
+    units: ClassVar[tuple[str, ...]] = ("m", "m^0.5", "m^3/s")
+    level_names: ClassVar[tuple[str, ...]] = ("lower level", "root of the upper level")
+    input_name: ClassVar[str] = "pump flow"
+    area: ClassVar[float] = 0.0154
+
+    def drift(self, t: jax.Array, x: jax.Array) -> jax.Array:
+        lower = -self.a1 * ROOT_OF_2G * jnp.sqrt(x[0]) / self.area
+        upper = -self.a2 * ROOT_OF_2G / (2.0 * self.area) + 0.0 * x[1]
+        return jnp.stack([lower, upper])
+
+    def gain(self, t: jax.Array, x: jax.Array) -> jax.Array:
+        flow = self.a2 * ROOT_OF_2G / self.area + 0.0 * x[0]
+        return jnp.stack([flow, 1.0 / (2.0 * self.area * x[1])])
+
+
+def tanks(**parts: Any) -> ij.Scenario:
+    tube = ij.Bounds(
+        lower=ij.bounds.Funnel(-0.01, -0.01, 0.0), upper=ij.bounds.Funnel(0.01, 0.01, 0.0)
+    )
+    root = ij.Bounds(lower=ij.bounds.Constant(0.1), upper=ij.bounds.Constant(0.6))
+    own: dict[str, Any] = {
+        "plant": Tanks(a1=5e-5, a2=7e-5),
+        "reference": ij.references.Sinusoid(offset=0.12, amplitude=0.02, frequency=0.02),
+        "bounds": tube,
+        "state_bounds": (root,),
+        "controller": ij.controllers.BarrierBackstepping(
+            k=(0.03, 0.1), barriers=(ij.barriers.Mapping(),) * 2, weights=(1e4, 400.0)
+        ),
+        "initial": ij.Initial(x=[[0.125], [0.247]]),
+    }
+    return ij.Scenario(**own | parts)
+
+
+@pytest.mark.parametrize("bounded", [True, False])
+def test_a_start_without_the_second_level_is_named(bounded):
+    parts: dict[str, Any] = {"initial": ij.Initial(q=0.125)}
+    if not bounded:
+        parts["state_bounds"] = ()
+    with pytest.raises(ValueError, match=r"x_2 is 0 if Initial has no dq: Initial\(x=\.\.\.\)"):
+        ij.simulate(tanks(**parts), **SHORT)
+
+
+def test_a_start_at_a_singular_gain_is_shown_with_its_levels():
+    scenario = tanks(plant=Tanks(a1=5e-5, a2=0.0 + 1e-320), initial=ij.Initial(x=[[0.125], [0.2]]))
+    with pytest.raises(ValueError, match=r"The start is x = \[\[0.125\], \[0.2\]\]") as caught:
+        ij.simulate(scenario, **SHORT)
+    assert "dq" not in str(caught.value)
+
+
+def test_no_bounds_of_the_levels_are_an_empty_tuple():
+    with pytest.raises(
+        ValueError, match=r"state_bounds: got None, expected a tuple, \(\) for none"
+    ):
+        tanks(state_bounds=None)
+
+
+def test_weights_of_a_root_have_the_unit_of_its_square():
+    assert "1/m^2; 1/m " in repr(ij.parameters(tanks()))
+
+
+@pytest.mark.slow
+def test_a_run_has_no_truth_value():
+    run = ij.simulate(tanks(), **SHORT)
+    with pytest.raises(TypeError, match=r"run\.ok"):
+        bool(run)
+
+
+def limited(kind: str) -> ij.Scenario:
+    scenario = tanks()
+    if kind == "motor":
+        return ij.with_parts(scenario, actuator=ij.actuators.Motor(**LIMITS))
+    edge = "smooth" if kind == "smooth" else "hard"
+    law = ij.controllers.Saturated(scenario.controller, **LIMITS, edge=edge)
+    return ij.with_parts(scenario, controller=law)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["motor", "hard", "smooth"])
+def test_an_input_has_a_lower_limit_of_its_own(kind):
+    scenario = limited(kind)
+    command = np.asarray(ij.simulate(tanks(), **SHORT).tau)
+    assert command.min() < LIMITS["lower_limit"]
+    assert command.max() > LIMITS["limit"]
+    run = ij.simulate(scenario, **SHORT)
+    assert run.tau.min() >= LIMITS["lower_limit"]
+    assert run.tau.max() <= LIMITS["limit"]
+    assert run.tau.min() < 1.02 * LIMITS["lower_limit"]
+    assert run.tau.max() > 0.98 * LIMITS["limit"]
+    assert Status(int(run.status)) & Status.TORQUE_SATURATED
+    study = ij.monte_carlo(
+        scenario, {"plant.a2": ij.factor(ij.uniform(1.0, 1.0001))}, runs=2, progress=False, **SHORT
+    )
+    np.testing.assert_allclose(study.metrics["rmse"][0], run.metrics.rmse, rtol=1e-2)
+    np.testing.assert_allclose(study.metrics["peak_torque"][0], np.max(run.tau), rtol=1e-3)
+
+
+def test_limits_of_an_input_are_checked():
+    law = tanks().controller
+    for make in (ij.actuators.Motor, lambda **limits: ij.controllers.Saturated(law, **limits)):
+        with pytest.raises(ValueError, match=r"lower_limit: got 2., expected less than the limit"):
+            make(limit=1.0, lower_limit=2.0)
+    with pytest.raises(ValueError, match=r"Motor.lower_limit: got 0., expected a limit, too"):
+        ij.actuators.Motor(lower_limit=0.0)
+
+
+def test_an_actuator_of_one_direction_is_checked_in_its_range():
+    pump = ij.actuators.Motor(limit=1e-4, lower_limit=0.0)
+    with pytest.raises(ij.testing.ContractError, match=r"torques=\(low, high\)"):
+        ij.testing.check_actuator(pump)
+    ij.testing.check_actuator(pump, torques=(0.0, 1e-4))
+    with pytest.raises(ValueError, match="torques: got"):
+        ij.testing.check_actuator(pump, torques=(1e-4, 0.0))
+
+
+def test_requirements_have_the_names_of_the_plant():
+    objectives = ij.objectives
+    goal = objectives.tracking() + objectives.peak_torque_below(1e-4)
+    goal = fitted(goal + objectives.velocity_margin_above(0.05), tanks())
+    names = [requirement.name for requirement in goal.requirements]
+    assert names == ["peak pump flow < 0.0001 m^3/s", "root of the upper level margin > 0.05 m^0.5"]
+
+
+@pytest.mark.slow
+def test_a_certificate_counts_inaccurate_runs():
+    perturbed = {"plant.a2": ij.factor(ij.uniform(0.999, 1.001))}
+    coarse = {"duration": 50.0, "dt": 2.5}
+    with pytest.warns(UserWarning, match="too large for 3 of 3 runs"):
+        study = ij.monte_carlo(tanks(), perturbed, runs=3, progress=False, **coarse)
+    assert np.all(study.status & int(Status.INACCURATE))
+    assert not np.any(study.status & int(Status.STEP_TOO_LARGE))
+    certificate = ij.certify(tanks(), study, worst=2)
+    assert certificate.inaccurate == 2
+    for text in (str(certificate), certificate.table_html()):
+        assert "2 of 2 runs are flagged INACCURATE, so the numbers" in text
+    single = ij.certify(study.replay(0).scenario, study.replay(0))
+    assert "The run is flagged INACCURATE, so the numbers" in str(single)
+    assert "component 0, t = " in str(single)
+    accurate = ij.certify(tanks(), **SHORT)
+    assert accurate.inaccurate == 0
+    assert "INACCURATE" not in str(accurate) + accurate.table_html()
+    assert accurate.accuracy_note == ""
