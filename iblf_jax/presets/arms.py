@@ -19,10 +19,11 @@ M_ii, and a loop that is sampled at 500 Hz allows no faster modes.
 
 The slope of the barrier acts as a spring of stiffness w ds/de1, independently of K2.  With
 
-    w_i = min(1, M_ii (rate/2)^2 / max_t ds_i/de1(e1 = 0))
+    w_i = min(1, M_ii (rate/2)^2 / max_t ds_i/de1(e1 = 0)),
 
-this spring and a damper rate M_ii are at most critically damped at the reference, so that light
-joints can be sampled.  The paper's weight is 1.
+where ds/de1 is that of the side with the nearer bound, this spring and a damper rate M_ii are at
+least critically damped at the reference, so that light joints can be sampled.  The paper's weight
+is 1.
 """
 
 from __future__ import annotations
@@ -69,7 +70,10 @@ MIN_K2 = 0.6
 """Smallest gain [N m s/rad]; above the 1/2 of Theorem 2 (3.17), for claims with the paper's
 weights."""
 TIMES = np.linspace(0.0, 20.0, 81)
-"""Times at which the narrowest bounds and the fastest modes are sought [s]."""
+"""Times at which the fastest modes are sought [s]."""
+FINE_TIMES = np.linspace(0.0, 20.0, 2001)
+"""Times at which the nearest bound is sought [s].  A reference at 1 rad/s moves 0.01 rad between
+them; the slope of a barrier at a bound 0.1 rad away then differs by at most a tenth."""
 OBSERVERS: dict[str, Any] = {"printed": Printed, "corrected": Momentum}
 """Reading of the paper -> its observer."""
 
@@ -159,8 +163,9 @@ def inertial_weight(
 
         w_i = min(1, M_ii(q) (rate/2)^2 / max_t ds_i/de1),   at e1 = 0 and q = q_d(0)
 
-    The slope acts as a spring of stiffness w ds/de1.  With K2 = rate M_ii the spring is at most
-    critically damped at the reference, for joints of any inertia and bounds of any width.
+    The slope acts as a spring of stiffness w ds/de1, which is taken on the side of the tube where
+    it is larger.  With K2 = rate M_ii the spring is at least critically damped at the reference,
+    for joints of any inertia and bounds of any width.
 
     Args:
       robot: the robot of n joints that provides the inertia.
@@ -191,7 +196,7 @@ def inertial_weight(
     reference = fit_joints(reference, robot.n, "reference")
     bounds = fit_joints(bounds, robot.n, "bounds")
     inertia = jnp.diagonal(mass_matrix_at(robot, _start_of(reference)))
-    stiffness = _stiffness(barrier, reference, bounds, jnp.asarray(TIMES, inertia.dtype))
+    stiffness = _stiffness(barrier, reference, bounds, jnp.asarray(FINE_TIMES, inertia.dtype))
     return jnp.minimum(inertia * (0.5 * rate) ** 2 / stiffness, 1.0)
 
 
@@ -199,15 +204,24 @@ def inertial_weight(
 def _stiffness(
     barrier: Barrier, reference: Reference, bounds: Bounds, times: jax.Array
 ) -> jax.Array:
-    """The largest ds/de1 of each joint at e1 = 0 and these times, (n,), while lower and upper bound
-    leave room for the reference.
+    """The largest ds/de1 of each joint at e1 = 0, on both sides and at these times, (n,), while
+    lower and upper bound leave room for the reference.
     """
+
+    def on_one_side(tube):
+        unit = jnp.ones_like(tube.q_d)
+        return jax.jvp(lambda q: barrier.slope(tube, q), (tube.q_d,), (unit,))[1]
 
     def at(t):
         tube = tube_at(reference, bounds, t, acceleration=False)
-        stiffness = jax.jvp(
-            lambda q: barrier.slope(tube, q), (tube.q_d,), (jnp.ones_like(tube.q_d),)
-        )[1]
+        # At e1 = 0 the derivative is that of one side; the other side is that of the mirrored tube.
+        mirrored = tube._replace(
+            lower=tube.q_d - tube.k_u,
+            upper=tube.q_d + tube.k_l,
+            dlower=tube.dq_d - tube.dk_u,
+            dupper=tube.dq_d + tube.dk_l,
+        )
+        stiffness = jnp.maximum(on_one_side(tube), on_one_side(mirrored))
         return jnp.where((tube.k_l > 0) & (tube.k_u > 0), stiffness, 0.0)
 
     return jnp.max(jax.vmap(at)(times), axis=0)

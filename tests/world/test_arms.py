@@ -318,6 +318,56 @@ def test_the_weight_makes_every_barrier_as_stiff_at_the_reference():
         )
 
 
+def test_the_weight_is_that_of_the_nearer_bound_whichever_side_it_is_on():
+    """The slope of the integral barrier at e1 = 0 has two derivatives, 2/k_l^2 and 2/k_u^2."""
+    arm, k = arms.arm("ur5"), 0.15
+    hold = references.Quintic(start=MIDDLE, end=MIDDLE, duration=1.0)
+    inertia = jnp.diagonal(arm.mass_matrix(hold.position(jnp.zeros(()))))
+    expected = np.minimum(1.0, inertia * 12.5**2 * k**2 / 2)
+    assert float(np.min(expected)) < 0.5
+    for below, above in ((k, 1.0), (1.0, k)):
+        tube = bounds.Bounds(
+            lower=bounds.Constant(np.asarray(MIDDLE) - below),
+            upper=bounds.Constant(np.asarray(MIDDLE) + above),
+        )
+        scenario = arms.arm_scenario(arm, hold, bounds=tube)
+        np.testing.assert_allclose(get(scenario, "controller.weight"), expected, rtol=1e-9)
+
+
+def test_the_weight_is_that_of_the_nearest_bound_of_a_short_motion():
+    """A motion of 0.2 s comes nearest to its bounds at 0.1 s."""
+    arm, k = arms.arm("ur5"), 0.15
+    there = np.asarray(MIDDLE) + 0.5
+    spline = references.WaypointSpline(
+        times=(0.0, 0.1, 0.2), waypoints=np.array([MIDDLE, there, MIDDLE])
+    )
+    tube = bounds.Bounds(
+        lower=bounds.Constant(np.asarray(MIDDLE) - 1.0), upper=bounds.Constant(there + k)
+    )
+    scenario = arms.arm_scenario(arm, spline, bounds=tube)
+    inertia = jnp.diagonal(arm.mass_matrix(spline.position(jnp.zeros(()))))
+    np.testing.assert_allclose(
+        get(scenario, "controller.weight"),
+        np.minimum(1.0, inertia * 12.5**2 * k**2 / 2),
+        rtol=1e-6,
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_a_light_wrist_near_either_end_of_its_range_is_stable_at_500_hz(side):
+    pytest.importorskip("mujoco")
+    arm = ij.robots.load(ROOT / "tests" / "data" / "arms" / "light_wrist.urdf", tip="hand")
+    pose = np.array([0.3, -0.6, 1.0, 0.2, 1.8 * side, 2.65 * side])
+    hold = references.Quintic(start=pose, end=pose, duration=1.0)
+    scenario = ij.with_parts(arms.arm_scenario(arm, hold), **LAB)
+    for offset in (-0.02, 0.02):
+        moved = ij.Initial(q=pose + offset * np.array([0, 0, 0, 0, 1, 1]))
+        run = ij.simulate(ij.with_parts(scenario, initial=moved), duration=0.1, dt=1e-3)
+        assert int(run.status) == 0
+        assert float(run.metrics.sampling_radius) < 0.996
+
+
 @pytest.mark.parametrize("name", ["ur5", "iiwa14"])
 def test_joints_that_move_against_each_other_get_no_fast_mode(name):
     """Axes of an arm are nearly parallel in some positions: with gains up to 100 M_ii, M^-1 K2 of
