@@ -225,7 +225,7 @@ def _study(study: Study) -> Shown:
 
 def _certificate(found: Certificate) -> Shown:
     table, figure = {"Line by line": found.table_html()}, {"Along the run": found.plot}
-    return Shown(f"Certificate: {found.verdict}", [found.subject], table, figure)
+    return Shown(f"Certificate: {found.headline}", [found.subject], table, figure)
 
 
 def _comparison(found: Comparison) -> Shown:

@@ -21,6 +21,8 @@ from iblf_jax.certificates.lines import (
 from iblf_jax.core import checks, tables
 from iblf_jax.core.presentation import present
 
+WEIGHTED_LINES = "weighted"
+"""Beginning of the names of the lines of the claim with weights."""
 MAX_LISTED = 3
 """Lines that do not apply are listed by name up to this number."""
 
@@ -128,6 +130,20 @@ class Certificate:
         return HOLDS if checked else NOT_APPLICABLE
 
     @property
+    def headline(self) -> str:
+        """The verdict; if it is "fails", the lines that fail, and the claim with weights if it
+        holds.
+        """
+        if self.verdict != FAILS:
+            return self.verdict
+        failing = [f'"{x.name}"' for x in self.lines if x.counts and x.verdict == FAILS]
+        weighted = [x for x in self.lines if x.name.startswith(WEIGHTED_LINES) and x.counts]
+        verdicts = {x.verdict for x in weighted}
+        if HOLDS in verdicts and FAILS not in verdicts:
+            return f"{self.claim} fails in {_listed(failing)}; the claim with weights holds"
+        return f"fails in {_listed(failing)}"
+
+    @property
     def holds(self) -> bool:
         """Whether every claim that applies was checked and holds."""
         return self.verdict == HOLDS
@@ -154,7 +170,7 @@ class Certificate:
             ("", "equation", "verdict", "margin", "value", "where the margin is smallest"),
             *self._rows(),
         ]
-        shown = [f"Certificate: {self.verdict}  ({self.subject})"]
+        shown = [f"Certificate: {self.headline}  ({self.subject})"]
         if self.inaccurate:
             shown.append(self.accuracy_note)
         shown += tables.as_text(rows)

@@ -45,7 +45,8 @@ class Status(enum.IntFlag):
 
     SAMPLING_TOO_SLOW = 512
     """Deviations of the loop grow from one period to the next (spectral radius above 1) at one of
-    the assessed instants, and not in continuous time: sample faster."""
+    the assessed states of this run, and not in continuous time: sample faster.  Another start may
+    visit states where they do not."""
 
     VELOCITY_VIOLATED = 1024
     """A joint's velocity touched or left its bound."""

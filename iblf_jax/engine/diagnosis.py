@@ -30,6 +30,7 @@ from iblf_jax.simulation.stability import RADIUS, THIRD_SIZE
 from iblf_jax.simulation.units import status_words, unit_text
 from iblf_jax.world import plants
 from iblf_jax.world.bounds import NARROWEST, tube_at
+from iblf_jax.world.references import WaypointSpline
 from iblf_jax.world.regions import in_words
 
 REPORTED = (
@@ -290,8 +291,9 @@ def _unit_of_differences(scenario: Scenario) -> str:
 def _sampling_too_slow(result: Rollout) -> str:
     return (
         "The deviation of the loop grows from one period to the next, by"
-        f" {float(result.metrics[RADIUS]):.4g} at the worst of the assessed instants. Sample faster"
-        f" (ij.recommended_period says how fast){_alternative_remedy(result)}."
+        f" {float(result.metrics[RADIUS]):.4g} at the worst of the assessed states of this run"
+        " (another start visits others). Sample faster (ij.recommended_period says how fast)"
+        f"{_alternative_remedy(result)}."
     )
 
 
@@ -494,12 +496,18 @@ def _infeasible(result: Rollout, steps: int) -> ValueError:
     q_d, lower, upper = (np.asarray(x) for x in (tube.q_d, tube.lower, tube.upper))
     sample, joint = np.unravel_index(np.argmin(np.minimum(q_d - lower, upper - q_d)), q_d.shape)
     where = f"t = {float(times[sample]):.4g} s"
+    remedy = "The reference must stay strictly inside the bounds (Assumption 2): move it, widen the"
+    remedy += " bounds or shorten the run."
+    if isinstance(result.scenario.reference, WaypointSpline):
+        remedy += (
+            " A WaypointSpline may pass beyond its waypoints: move those near the bound further"
+            " inside, or add some there."
+        )
     return checks.fail(
         f"reference of {plants.component_names(result.scenario.plant)[joint]}",
         float(q_d[sample, joint]),
         f"a value inside the bounds ({float(lower[sample, joint]):.6g},"
         f" {float(upper[sample, joint]):.6g}) at {where}",
-        "The reference must stay strictly inside the bounds (Assumption 2): move it, widen the"
-        " bounds or shorten the run. A law that keeps the bounds whatever the reference is has"
-        " filters = True, and its Command a slack.",
+        f"{remedy} A law that keeps the bounds whatever the reference is has filters = True, and"
+        " its Command a slack.",
     )

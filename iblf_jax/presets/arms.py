@@ -243,8 +243,9 @@ def arm_scenario(
 
     The gains are k1 = 2; K2_i = 25 min(sum_j |M_ij|, 4 M_ii) with M at the start, reduced if joints
     that move against each other would have modes of M^-1 K2 above 200 1/s along the reference; and
-    kf = 20.  The weight of the barrier is `inertial_weight`.  The torque is limited to the arm's
-    `effort`.
+    kf = 20.  The weight of the barrier is w_i = min(1, M_ii 12.5^2 / s_i') with the largest slope
+    s_i' of the barrier at the reference, which is that at the nearest bound.  The torque is limited
+    to the arm's `effort`; its `speed` is not checked (`velocity_bounds` of `Scenario`).
 
     Args:
       robot: the plant, with `limits` and `effort`, as `iblf_jax.robots.load` returns it.

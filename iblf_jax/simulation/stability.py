@@ -52,7 +52,8 @@ to rounding for |A| t up to 30."""
 SQUARINGS = 20
 """Number of times a map is squared to compute its spectral radius."""
 RADIUS = "sampling_radius"
-"""Name of the spectral radius among the metrics of a sampled run."""
+"""Name of the spectral radius among the metrics of a sampled run: the largest at the assessed
+states of that run.  Below 1 small deviations from these states decay."""
 SECOND_SIZE, THIRD_SIZE = 10.0, 1e-2
 """The second size of a difference, relative to the first, and the third [rad/s, or the unit of the
 state]. An oscillation of 0.01 rad/s with a period of a few steps moves the positions by only 1e-5

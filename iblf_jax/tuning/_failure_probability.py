@@ -171,8 +171,9 @@ def failure_probability(
         such points represent all failures; a note says where the samples show that they do not;
         "monte_carlo", independent draws.
       runs: number of runs; for "subset" of each level, of which there is one for each factor of
-        ten.  4000, 4096 and 10,000 if not given.  The search for design points, the check of the
-        estimate and the search for the most likely failure take some 2000 runs more.
+        ten; at least 100, for "monte_carlo" 1.  4000, 4096 and 10,000 if not given.  The search
+        for design points, the check of the estimate and the search for the most likely failure take
+        some 2000 runs more.
       margin: which margin fails: of the "positions", the "velocities" or the "regions".
       limit: margin at which a run fails, in its unit.
       confidence: of the interval, in (0, 1).

@@ -94,7 +94,11 @@ class Attack:
         return simulate(self.scenario, record_every=record_every, **self.timing)
 
     def __repr__(self) -> str:
-        word = "FALSIFIED" if self.violated else "not falsified"
+        word = "not falsified"
+        if self.violated:
+            word = "FALSIFIED"
+        elif has_flag(self.status, Status.SAMPLING_TOO_SLOW):
+            word = "bounds kept, but the sampled loop is unstable at this draw"
         lines = [
             f"Attack({word}: smallest margin {self.margin:.4g} {self.unit}, {self.first_margin:.4g}"
             f" at random; {self.runs} runs)",

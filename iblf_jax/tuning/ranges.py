@@ -5,8 +5,8 @@ The lower end of a gain of a continuous law is k1 > 0, K2 > 1/2 (for a barrier o
 kf > 1 where all its entries start there, otherwise its sign decides.  Theorem 2 does not hold for
 sampled laws, and a light joint needs a smaller K2: there these gains may fall to x0 / MAX_FACTOR.
 
-The upper end of a gain x is f x0 with the largest f <= MAX_FACTOR for which the loop at the start
-and along its reference satisfies
+The upper end of a gain x is f x0 with the largest f <= MAX_FACTOR for which the loop without
+perturbations, at the start and along its reference, satisfies
 
     dt |lambda|_max <= STABILITY_FRACTION R                     for a continuous law,
     rho(map from a period to the next) < 1                      for a sampled law,
@@ -93,7 +93,7 @@ UNLIMITED = "none"
 BY_FACTOR = f"{MAX_FACTOR:g} times its start"
 BY_SMALL_FACTOR = f"{1 / MAX_FACTOR:g} times its start"
 BY_STEP = "beyond it the step dt is too long for the loop"
-BY_PERIOD = "beyond it the loop is unstable at its sampling period"
+BY_PERIOD = "beyond it the unperturbed loop is unstable at its sampling period"
 AT_START = {
     BY_STEP: (
         "the step dt is too long for the loop already at the start, so this end is close to it;"

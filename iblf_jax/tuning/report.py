@@ -184,6 +184,10 @@ class TuningReport:
     """The smallest margin of all runs, before and after [rad]."""
     peak_torque: tuple[tuple[float, ...], tuple[float, ...]] = ((), ())
     """The largest torque of all runs, joint by joint, before and after [N m]."""
+    sampling_radius: tuple[float, float] | None = None
+    """The largest `sampling_radius` of all runs, before and after; None for a continuous law."""
+    unstable: tuple[int, int] = (0, 0)
+    """Number of runs whose sampled loop is unstable, before and after."""
     at_limits: tuple[str, ...] | None = None
     """The tuned numbers at an end of their range, in words; None where the ranges are not known."""
     step_check: StepCheck | None = None
@@ -237,7 +241,10 @@ class TuningReport:
     @property
     def headline(self) -> str:
         """Bounds and requirements in a few words, what failed first."""
-        return "; ".join([*self._bounds_in_few_words(), *self._requirements_in_few_words()])
+        words = [*self._bounds_in_few_words(), *self._requirements_in_few_words()]
+        if self.unstable[1]:
+            words.append(f"the sampled loop is UNSTABLE in {self._unstable_in_words()}")
+        return "; ".join(words)
 
     def _bounds_in_few_words(self) -> list[str]:
         """Whether bounds are kept."""
@@ -308,7 +315,26 @@ class TuningReport:
         if check is not None and (any(check.violated) or any(check.untrusted)):
             rows.append(check.bounds_in_words())
         margins = f"{self.margin[0]:.4g} -> {self.margin[1]:.4g} {self.quantities.margin_unit}"
-        return [*rows, f"smallest margin: {margins}"]
+        return [*rows, f"smallest margin: {margins}", *self._stability_in_words()]
+
+    def _stability_in_words(self) -> list[str]:
+        """The largest spectral radius of a sampled loop, and how many runs are unstable."""
+        if self.sampling_radius is None:
+            return []
+        before, after = self.sampling_radius
+        row = f"largest sampling_radius: {before:.4g} -> {after:.4g}; stable below 1"
+        if self.unstable[1]:
+            row += (
+                "; WARNING: with the tuned gains the sampled loop is unstable in"
+                f" {self._unstable_in_words()}"
+            )
+        return [row]
+
+    def _unstable_in_words(self) -> str:
+        """The number of runs whose sampled loop is unstable with the tuned gains."""
+        if self.seed is None:
+            return "the nominal run"
+        return f"{self.unstable[1]} of {self.runs} runs"
 
     def _requirements_in_words(self) -> list[str]:
         """The requirements, the failed first, with the explanation of the runs that broke them;
@@ -398,12 +424,19 @@ def make_report(request: ReportRequest) -> TuningReport:
         violation=each(lambda x: _probability(x.left_bounds(), x, confidence)),
         margin=each(lambda x: float(x.margin[x.admissible].min())),
         peak_torque=each(lambda x: tuple(x.torque[x.admissible].max(axis=0).tolist())),
+        sampling_radius=each(_largest_radius) if request.after.sampling is not None else None,
+        unstable=each(lambda x: int(np.sum(x.is_sampled_too_slowly()))),
         quantities=ReportedQuantities.of(request.before),
         at_limits=request.at_limits,
         step_check=request.step_check,
         notes=request.notes,
         failures=_failures(request, draws, after) if fresh else (),
     )
+
+
+def _largest_radius(sample: Sample) -> float:
+    """The largest spectral radius of the one-period map of all runs."""
+    return float(sample.sampling_radius[sample.admissible].max())
 
 
 def _failures(

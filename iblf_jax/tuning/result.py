@@ -235,8 +235,16 @@ class TuneResult:
         return tuple(lines)
 
     def _no_optimum_in_words(self) -> str:
-        """Names the time step only if the runs at half of it differ."""
-        text = "WARNING: no optimum: the slope of the objective or of a requirement jumps here"
+        """Whether the gains can be used; names the time step only if the runs at half of it
+        differ.
+        """
+        text = "WARNING: better gains may exist"
+        if self.setup.objective.requirements:
+            text = (
+                "WARNING: these gains keep the requirements in the runs of the tuning, but better"
+                " ones may exist"
+            )
+        text += ": the slope of the objective or of a requirement jumps here"
         check = self.step_check
         if not check.depends_on_step:
             return f'{text}; take effort="thorough"'

@@ -19,6 +19,7 @@ from iblf_jax.simulation.metrics import Torque
 from iblf_jax.simulation.noise import noise_values
 from iblf_jax.simulation.paths import get, with_parameters
 from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.simulation.stability import RADIUS
 from iblf_jax.studies.draws import Target, UncertainScenario, draw, replaced_leaves
 from iblf_jax.tuning.objectives import Objective
 from iblf_jax.tuning.quantities import Peak, Quantities
@@ -106,6 +107,8 @@ class Rollouts(NamedTuple):
     """Estimated error of each run by the time step, relative to its tube."""
     status: Any
     fastest_mode: Any
+    sampling_radius: Any
+    """Spectral radius of the one-period map, (R,); NaN for a continuous law."""
 
 
 @programs.jit(static_argnames="request")
@@ -128,4 +131,5 @@ def rollouts(
     smooth, exact, peak_torque, error = (
         outcome.metrics[name] for name in ("tuning_smooth", "tuning_exact", "peak_torque", RELATIVE)
     )
-    return Rollouts(smooth, exact, peak_torque, error, outcome.status, outcome.fastest_mode)
+    radius = outcome.metrics.get(RADIUS, jnp.full_like(error, jnp.nan))
+    return Rollouts(smooth, exact, peak_torque, error, outcome.status, outcome.fastest_mode, radius)

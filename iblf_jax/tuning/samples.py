@@ -53,6 +53,8 @@ class Sample(NamedTuple):
     torque: np.ndarray
     """The largest of each joint, (N, n)."""
     status: np.ndarray
+    sampling_radius: np.ndarray
+    """Spectral radius of the one-period map of each run, (N,); NaN for a continuous law."""
     admissible: np.ndarray
     """Whether the draws of the run were admissible; the others do not count, (N,)."""
 
@@ -68,6 +70,10 @@ class Sample(NamedTuple):
     def is_untrusted(self) -> np.ndarray:
         """Whether each run diverged or was integrated unstably, (N,)."""
         return has_flag(self.status, UNTRUSTED)
+
+    def is_sampled_too_slowly(self) -> np.ndarray:
+        """Whether the sampled loop of each run is unstable, (N,)."""
+        return has_flag(self.status, Status.SAMPLING_TOO_SLOW) & self.admissible
 
     def losses(self, objective: Objective) -> np.ndarray:
         """The value of each term in each run, (N, n_terms)."""
@@ -128,7 +134,7 @@ def sample_runs(request: SampleRequest, scenarios: Sequence[Scenario]) -> list[S
     found, admissible = in_groups(run, len(owner), batch)
     if len(scenarios) > 1:
         warn_of_step(found.status, found.fastest_mode, found.relative_error, request.dt, method)
-    sample = Sample(found.exact, found.peak_torque, found.status, admissible)
+    sample = Sample(found.exact, found.peak_torque, found.status, found.sampling_radius, admissible)
     return [Sample(*(x[owner == s] for x in sample)) for s in range(len(scenarios))]
 
 

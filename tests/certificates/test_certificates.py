@@ -378,6 +378,11 @@ def test_with_the_papers_weights_its_own_conditions_decide(corrected_run):
     assert certificate.verdict == "fails"
     assert certificate["K2"].counts
     assert certificate["weighted inequality, case 2"].verdict == "holds"
+    assert repr(certificate).startswith(
+        "Certificate: the paper's theorem fails in 5 lines; the claim with weights holds  (Backst"
+    )
+    alone = dataclasses.replace(certificate, lines=(certificate["K2"],))
+    assert alone.headline == 'fails in "K2"'
 
 
 def test_the_claim_with_weights_is_about_the_corrected_law_with_a_momentum_observer(
@@ -398,6 +403,7 @@ def test_a_broken_claim_with_weights_is_seen(corrected_run, monkeypatch):
     certificate = certify(scenario, ij.simulate(scenario, **SHORT))
     assert certificate["weighted inequality, case 2"].verdict == "fails"
     assert certificate.verdict == "fails"
+    assert "the claim with weights holds" not in certificate.headline
 
 
 @pytest.mark.parametrize("weight", [[0.3, 2.5], [40.0, 7.0]])

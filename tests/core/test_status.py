@@ -178,6 +178,20 @@ def test_an_infeasible_reference_is_an_error_with_joint_and_time(paper):
 
 
 @pytest.mark.slow
+def test_a_spline_beyond_its_bounds_is_an_error_that_names_the_waypoints(paper):
+    waypoints = np.array([[0.5, 0.5], [0.8, 0.8], [0.8, 0.8]])
+    wide = ij.Bounds(lower=ij.bounds.Constant(0.0), upper=ij.bounds.Constant(0.81))
+    scenario = ij.with_parts(
+        paper,
+        reference=ij.references.WaypointSpline(times=(0.0, 0.2, 0.5), waypoints=waypoints),
+        bounds=wide,
+        initial=ij.Initial(q=[0.5, 0.5]),
+    )
+    with pytest.raises(ValueError, match="Assumption 2.*beyond its waypoints: move those"):
+        quiet(scenario, duration=0.5, dt=1e-3)
+
+
+@pytest.mark.slow
 def test_nothing_raises_inside_jit_and_flags_come_back(thrown):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -189,6 +203,12 @@ def test_words_for_every_flag():
     for flag in Status:
         assert describe(int(flag)) != ""
     assert describe(int(Status.BOUND_VIOLATED | Status.NOT_FINITE)).count(";") == 1
+
+
+def test_a_corrected_law_is_not_advised_about_K2():
+    """Its claim with weights holds for every K2 > 0; a light joint cannot have K2 > 1/2."""
+    corrected = ij.presets.zhang_yan_2024(reading="corrected")
+    assert ij.with_parameters(corrected, {"controller.K2": 0.1}).controller.advice() == []
 
 
 def test_gains_below_the_theorem_are_advised_against(paper):

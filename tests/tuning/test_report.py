@@ -374,6 +374,40 @@ def test_bounds_and_requirements_decide_headline_and_exit_code(report, headline,
     assert report.failed is failed and _has_failed(report) is failed
 
 
+def test_a_sampled_loop_that_is_unstable_in_some_runs_is_in_headline_and_text():
+    stable = dataclasses.replace(made_up_report(0, {}), sampling_radius=(0.998, 0.995))
+    assert "largest sampling_radius: 0.998 -> 0.995; stable below 1\n" in str(stable)
+    assert stable.headline == "bounds kept"
+    unstable = dataclasses.replace(stable, sampling_radius=(0.998, 1.005), unstable=(0, 3))
+    assert (
+        "largest sampling_radius: 0.998 -> 1.005; stable below 1; WARNING: with the tuned gains the"
+        " sampled loop is unstable in 3 of 100 runs" in str(unstable)
+    )
+    assert unstable.headline == "bounds kept; the sampled loop is UNSTABLE in 3 of 100 runs"
+    assert "sampling_radius" not in str(made_up_report(0, {}))
+
+
+@pytest.mark.slow
+def test_the_largest_radius_of_the_fresh_runs_is_that_of_a_study_with_the_same_seed(paper):
+    """K2 of the first gains is stable at 2 ms, and that of the tuned ones is not."""
+    slow = ij.with_parameters(
+        ij.with_parts(paper, sampling=ij.Sampling(2e-3)), {"controller.K2": 5.0}
+    )
+    gains = {"controller.K2": np.array([40.0, 40.0])}
+    draws = {"plant.mass": ij.factor(ij.uniform(0.8, 1.2))}
+    with pytest.warns(UserWarning):
+        report = result_of(slow, gains, goal_of(paper, 50.0), perturbations=draws, runs=4).report
+        studies = [
+            ij.monte_carlo(s, draws, runs=200, seed=7, progress=False, **BRIEF)
+            for s in (slow, ij.with_parameters(slow, gains))
+        ]
+    radii = [np.asarray(study.metrics.sampling_radius) for study in studies]
+    np.testing.assert_allclose(report.sampling_radius, [x.max() for x in radii], rtol=1e-6)
+    flagged = [np.asarray(s.status) & int(ij.Status.SAMPLING_TOO_SLOW) != 0 for s in studies]
+    assert report.unstable == tuple(int(x.sum()) for x in flagged)
+    assert report.unstable[0] == 0 and report.unstable[1] > 0
+
+
 def test_violations_within_a_requirement_on_their_probability_are_no_failure():
     report = made_up_report(1, {"violation probability < 0.05": "pass"})
     assert report.failed

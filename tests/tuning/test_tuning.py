@@ -661,7 +661,7 @@ def test_requirements_that_cannot_be_kept_are_named_with_how_much(paper):
         'not converged after 2 steps: take effort="thorough"' in line for line in priceless.notes
     )
     assert any(
-        "WARNING: no optimum: the slope of the objective" in line
+        "WARNING: better gains may exist: the slope of the objective" in line
         for line in dataclasses.replace(priceless, stopped=STUCK).notes
     )
     far = dataclasses.replace(priceless, values={"controller.k1": np.array([2.0, 210.0])})

@@ -32,6 +32,18 @@ def paper():
     return ij.presets.zhang_yan_2024()
 
 
+def test_an_attack_whose_loop_is_unstable_says_so_although_its_bounds_are_kept(paper):
+    timing = {"duration": 0.01, "dt": 1e-3, "method": "rk4"}
+    attack = ij.Attack(paper, {}, 0.1, 0.1, 0, np.ones((2, 2)), 4, timing)
+    assert repr(attack).startswith("Attack(not falsified: smallest margin 0.1 rad")
+    unstable = dataclasses.replace(attack, status=int(ij.Status.SAMPLING_TOO_SLOW))
+    assert repr(unstable).startswith(
+        "Attack(bounds kept, but the sampled loop is unstable at this draw: smallest margin 0.1 rad"
+    )
+    flags = ij.Status.SAMPLING_TOO_SLOW | ij.Status.BOUND_VIOLATED
+    assert repr(dataclasses.replace(attack, status=int(flags))).startswith("Attack(FALSIFIED")
+
+
 @pytest.mark.slow
 def test_falsify_finds_worse_than_random_runs_of_the_same_cost(paper):
     attack = ij.falsify(paper, SETS, starts=4, iterations=8, **SHORT)

@@ -123,10 +123,11 @@ class Backstepping:
         fit_decays(self, 2)
 
     def advice(self) -> list[str]:
-        """What is lost of Theorem 2 where the paper's law, whose weight is 1, has a gain outside
-        its conditions.
+        """What is lost of Theorem 2 where the printed law, whose weight is 1, has a gain outside
+        its conditions.  For the corrected law the claim with weights, which holds for every K2 > 0,
+        takes its place.
         """
-        if not checks.is_concrete((self.K2, self.weight)):
+        if self.reading == "corrected" or not checks.is_concrete((self.K2, self.weight)):
             return []
         is_papers = np.asarray(self.weight) == 1.0
         if not np.any(is_papers & (np.asarray(self.K2) <= 0.5)):

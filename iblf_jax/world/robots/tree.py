@@ -351,6 +351,7 @@ class Tree:
 
 def unknown(what: str, name: Any, expected: str, known: list[str]) -> ValueError:
     """An error that lists similar names, or the first names if none is similar."""
+    known = list(dict.fromkeys(known))  # the root and a body of the file may have the same name
     near = difflib.get_close_matches(str(name), known, n=3) or known[:12]
     names = ", ".join(map(repr, near))
     if len(known) > 12:
