@@ -326,7 +326,7 @@ class TuningReport:
         if self.unstable[1]:
             row += (
                 "; WARNING: with the tuned gains the sampled loop is unstable in"
-                f" {self._unstable_in_words()}"
+                f" {self._unstable_in_words()}: narrow the ranges of its gains"
             )
         return [row]
 

@@ -187,7 +187,7 @@ def test_a_spline_beyond_its_bounds_is_an_error_that_names_the_waypoints(paper):
         bounds=wide,
         initial=ij.Initial(q=[0.5, 0.5]),
     )
-    with pytest.raises(ValueError, match="Assumption 2.*beyond its waypoints: move those"):
+    with pytest.raises(ValueError, match=r"Assumption 2.*beyond its waypoints: move those"):
         quiet(scenario, duration=0.5, dt=1e-3)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import warnings
 from types import SimpleNamespace
 
 import numpy as np
@@ -273,10 +274,14 @@ def test_a_held_torque_is_one_of_a_sampled_loop_without_a_lag():
 
 
 def test_a_search_that_is_stuck_names_the_step_only_if_half_of_it_differs():
-    def words(**check):
-        return TuneResult._no_optimum_in_words(SimpleNamespace(step_check=made_up_check(**check)))
+    def words(requirements=(), **check):
+        setup = SimpleNamespace(objective=SimpleNamespace(requirements=requirements))
+        result = SimpleNamespace(step_check=made_up_check(**check), setup=setup)
+        return TuneResult._no_optimum_in_words(result)
 
     assert "dt" not in words()
+    assert words().startswith("WARNING: better gains may exist: the slope")
+    assert words(requirements=("a",)).startswith("WARNING: these gains keep the requirements in")
     assert "the time step is too long; take a smaller dt" in words(objective=(1.0, 1.02))
 
 
@@ -381,7 +386,7 @@ def test_a_sampled_loop_that_is_unstable_in_some_runs_is_in_headline_and_text():
     unstable = dataclasses.replace(stable, sampling_radius=(0.998, 1.005), unstable=(0, 3))
     assert (
         "largest sampling_radius: 0.998 -> 1.005; stable below 1; WARNING: with the tuned gains the"
-        " sampled loop is unstable in 3 of 100 runs" in str(unstable)
+        " sampled loop is unstable in 3 of 100 runs: narrow the ranges of its gains" in str(unstable)
     )
     assert unstable.headline == "bounds kept; the sampled loop is UNSTABLE in 3 of 100 runs"
     assert "sampling_radius" not in str(made_up_report(0, {}))
@@ -395,7 +400,8 @@ def test_the_largest_radius_of_the_fresh_runs_is_that_of_a_study_with_the_same_s
     )
     gains = {"controller.K2": np.array([40.0, 40.0])}
     draws = {"plant.mass": ij.factor(ij.uniform(0.8, 1.2))}
-    with pytest.warns(UserWarning):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of the unstable runs
         report = result_of(slow, gains, goal_of(paper, 50.0), perturbations=draws, runs=4).report
         studies = [
             ij.monte_carlo(s, draws, runs=200, seed=7, progress=False, **BRIEF)

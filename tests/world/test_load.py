@@ -542,6 +542,7 @@ def test_every_refusal_of_a_field_names_the_file(file):
     ("arguments", "message"),
     [
         ({"base": "bases"}, "base: got 'bases'.*'base'"),
+        ({"base": "foo"}, "There are 'base', 'upper'"),
         ({"tip": "tol"}, "tip: got 'tol'.*'tool'"),
         ({"tip": "base"}, "expected a chain with a joint that moves"),
         ({"base": "left", "tip": "upper"}, "expected a link beyond the base 'left'"),
