@@ -222,8 +222,8 @@ CASES: dict[str, Case] = {
     "SAMPLING_TOO_SLOW": Case(
         lambda: _run(_sampled(4e-3), dt=1e-3),
         "The one-period map of the sampled loop is unstable: its spectral radius,"
-        " `run.metrics.sampling_radius`, is above 1 at a state that this run visits. Slow growth that the loop shows in continuous"
-        " time as well does not raise the flag.",
+        " `run.metrics.sampling_radius`, is above 1 at a state that this run visits. Slow growth"
+        " that the loop shows in continuous time as well does not raise the flag.",
         "Use a shorter period; `ij.recommended_period(scenario, duration=...)` returns one. Or"
         " change the term that limits the loop, which the warning names: the slope of the barrier"
         " (`weight`), `K2`, `kf`, a filter, a lag or the delay.",
