@@ -184,10 +184,6 @@ class TuningReport:
     """The smallest margin of all runs, before and after [rad]."""
     peak_torque: tuple[tuple[float, ...], tuple[float, ...]] = ((), ())
     """The largest torque of all runs, joint by joint, before and after [N m]."""
-    sampling_radius: tuple[float, float] | None = None
-    """The largest `sampling_radius` of all runs, before and after; None for a continuous law."""
-    unstable: tuple[int, int] = (0, 0)
-    """Number of runs whose sampled loop is unstable, before and after."""
     at_limits: tuple[str, ...] | None = None
     """The tuned numbers at an end of their range, in words; None where the ranges are not known."""
     step_check: StepCheck | None = None
@@ -199,6 +195,10 @@ class TuningReport:
     failures: tuple[FailedRuns, ...] = ()
     """Fresh runs that failed with the tuned gains: those that left their bounds or diverged, then
     those that broke each requirement, with the most influential perturbation."""
+    sampling_radius: tuple[float, float] | None = None
+    """The largest `sampling_radius` of all runs, before and after; None for a continuous law."""
+    unstable: tuple[int, int] = (0, 0)
+    """Number of runs whose sampled loop is unstable, before and after."""
 
     @property
     def passed(self) -> bool:
