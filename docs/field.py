@@ -30,8 +30,8 @@ from entry_tables import escaped, markdown_table
 PUBLISHED = "published law"
 """The row of the law that sets the effort."""
 MANY = 100
-"""A published law is named below the table where the share of the best law with noise is smaller
-than that without by this factor."""
+"""The page names a published law as losing its accuracy with noise if the share of the best law
+with noise is so many times smaller than that without."""
 ERROR, NOISE = "error [", "error, noise ["
 """Beginnings of the columns of the largest error, and of that with noise."""
 COLUMNS = {
@@ -45,8 +45,9 @@ COLUMNS = {
     " distance between these bounds; many runs have their least distance at the start",
     "..., parameters": "the worse of two plants whose uncertain parameters are 0.8 and 1.2 times"
     " those of the entry; the model of the law is the one of the entry",
-    "..., 500 Hz": "law and observer run once in 2 ms, or in the nearest whole number of steps, and"
-    " read exact sensors",
+    "..., sampled": "law and observer run once in 2 ms, or in the nearest whole number of steps,"
+    " and read exact sensors; also where the task has a period of its own, which the other columns"
+    " keep. The period is stated above each table",
     "..., noise": "the same with white noise on every level; its standard deviation is {noise:g}"
     " times half the least distance between the bounds, and on the further levels {noise:g} times"
     " their largest value in the published run",
@@ -118,7 +119,7 @@ def benchmark_page(found: list[Part]) -> str:
         "## Entries",
         summary(found),
         "The last three columns name the law of the package that has the smallest error at the"
-        " effort of the published law, sampled at 500 Hz with noise, and its errors with and"
+        " effort of the published law, sampled at about 500 Hz with noise, and its errors with and"
         " without noise as shares of those of the published law. Without noise many of these tasks"
         " have an exact model and no disturbance, so that errors tend to zero under every law and"
         " their ratio states how fast." + noisy_laws(measured),
@@ -232,8 +233,9 @@ def noisy_laws(measured: list[Part]) -> str:
     if not listed:
         return ""
     return (
-        f" A share with noise that is more than {MANY} times smaller than that without means that"
-        " the published law loses its accuracy at 500 Hz with noise, and the best law does not:"
+        f" If the share with noise is more than {MANY} times smaller than that without, the"
+        " published law is accurate only without sampling and noise, and the best law also with"
+        " them:"
         f" {'; '.join(listed)}."
     )
 
@@ -275,6 +277,8 @@ def column(result: dict[str, Any], start: str) -> str:
 def section(part: Part) -> str:
     """The table of an entry."""
     heading = f"### {part.contents.title}"
+    if part.contents.not_measured:
+        return f"{heading}\n\n{part.link} is not measured: {part.contents.not_measured}"
     if part.result is None:
         return (
             f"{heading}\n\n{part.link} is not measured yet:"
@@ -285,7 +289,8 @@ def section(part: Part) -> str:
     rows = [[_cell(row[name]) for name in columns] for row in result["rows"]]
     words = [
         f"{part.link}; {result['duration']:g} s with a step of {result['dt']:g} s; the effort is"
-        f" that of the {result['input']}.",
+        f" that of the {result['input']}. The sampled runs have a period of"
+        f" {1e3 * result['period']:.4g} ms.",
         _uncertain(result),
     ]
     reasons = [f"{name}: {escaped(why)}" for name, why in result["not_applicable"].items()]

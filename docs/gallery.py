@@ -39,7 +39,10 @@ ENTRIES = [folder / "example.py" for folder in entry.folders()]
 PAGES = [*SCRIPTS, *ENTRIES]
 MADE = ROOT / "out" / "site" / "gallery"
 DPI = 110
-GENERATORS = [Path(__file__), *(Path(module.__file__) for module in (alt_text, entry_tables))]
+GENERATORS = [
+    Path(__file__),
+    *(Path(module.__file__) for module in (alt_text, entry_tables, entry)),
+]
 """Modules on which the text of every page depends."""
 PRECISION = (
     "The output was computed in float64: to obtain the same numbers, put"
@@ -114,14 +117,16 @@ def _executed(script: Path, name: str, title: str) -> tuple[list[str], list[Path
     try:
         for k, block in enumerate(blocks):
             words, source = _words(block) if k else ("", block)
-            printed, seen = io.StringIO(), {id(x) for x in names.values()}
+            printed, known = io.StringIO(), list(names.values())
             with contextlib.redirect_stdout(printed), warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 exec(compile(source, str(script), "exec", dont_inherit=True), names)
             lines += [words.strip(), ""] if words else []
             lines += ["```python", source.strip(), "```", ""] if source.strip() else []
             for variable, value in list(names.items()):
-                if id(value) not in seen and (found := _picture(value, f"{name}_{variable}")):
+                if any(value is other for other in known):
+                    continue
+                if found := _picture(value, f"{name}_{variable}"):
                     pictures.append(found)
                     shown = alt_text.describe(value) if isinstance(value, Figure) else "animation"
                     lines += [f"![{title}: {shown}]({found.name})", ""]

@@ -206,8 +206,8 @@ def _faults_of_options(made: Reproduction) -> list[str]:
         return found
     known = {parameter.path for parameter in ij.parameters(made.scenario)}
     for path in made.uncertain:
-        if path not in known:
-            found.append(f"example.py: uncertain has {path!r}, which is no path of the scenario")
+        if path not in known or not path.startswith("plant."):
+            found.append(f"example.py: uncertain has {path!r}, which is no parameter of the plant")
     return found
 
 
@@ -230,6 +230,11 @@ def _faults_of_figure(figure: object) -> list[str]:
     return found
 
 
+def _is_number(value: object) -> bool:
+    """Whether a value is one number, of Python, NumPy or JAX."""
+    return not isinstance(value, str) and np.ndim(value) == 0 and value is not None
+
+
 def _faults_of_numbers(entry: Entry, made: Reproduction) -> list[str]:
     """Every published number is reached."""
     found = []
@@ -238,7 +243,7 @@ def _faults_of_numbers(entry: Entry, made: Reproduction) -> list[str]:
             found.append(f"example.py: reached lacks {number.quantity!r}, which is [[published]]")
             continue
         value = made.reached[number.quantity]
-        if np.ndim(value) != 0:
+        if not _is_number(value):
             found.append(f"example.py: reached[{number.quantity!r}] must be one number")
             continue
         value = float(value)
@@ -257,7 +262,7 @@ def _faults_of_evidence(entry: Entry, made: Reproduction) -> list[str]:
     """Every number of `evidence` is one, and is used; every {name} of the texts is one of them."""
     found = []
     for key, value in made.evidence.items():
-        if isinstance(value, str) or np.ndim(value) != 0:
+        if not _is_number(value):
             found.append(f"example.py: evidence[{key!r}] must be one number")
     if found:
         return found
@@ -280,7 +285,11 @@ def _faults_of_claims(entry: Entry, made: Reproduction) -> list[str]:
     for claim in entry.claims:
         if claim.statement not in made.holds:
             found.append(f"example.py: holds lacks {claim.statement!r}, which is in [[claims]]")
-        elif not bool(made.holds[claim.statement]):
+        elif not isinstance(made.holds[claim.statement], bool | np.bool_):
+            found.append(
+                f"example.py: holds[{claim.statement!r}] must be True or False; use bool(np.all())"
+            )
+        elif not made.holds[claim.statement]:
             found.append(
                 f"the claim {claim.statement!r} does not hold; if the publication is wrong, move it"
                 " to [[corrected]]"
@@ -335,7 +344,10 @@ def computed_numbers(folder: Path) -> list[str]:
     """What the scripts of a correct entry computed, one line each."""
     made = execute(folder)
     numbers = {**made.reached, **made.evidence}
-    return [f"{name} = {float(value):.6g}" for name, value in numbers.items()]
+    return [
+        *(f"{name} = {float(value):.6g}" for name, value in numbers.items()),
+        *(f"{statement}: {text}" for statement, text in made.details.items()),
+    ]
 
 
 def main() -> int:

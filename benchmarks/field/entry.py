@@ -160,6 +160,8 @@ class Entry:
     missing: tuple[Missing, ...] = ()
     published: tuple[Published, ...] = ()
     claims: tuple[Claim, ...] = ()
+    not_measured: str = ""
+    """Why `measure.py` has no results of this entry, if that is intended."""
 
 
 class Reproduction(NamedTuple):
@@ -283,9 +285,8 @@ def execute(folder: Path) -> Reproduction:
     before = set(pyplot.get_fignums())
     try:
         with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
-            warnings.simplefilter(
-                "ignore"
-            )  # runs that leave their bounds are part of some examples
+            # Runs that leave their bounds are part of some examples.
+            warnings.simplefilter("ignore")
             return reproduction(runpy.run_path(str(folder / "example.py")))
     finally:
         # A figure that is closed can still be saved and drawn.
@@ -365,8 +366,11 @@ def largest_difference(
     compared = (t > start - 0.5 * run.dt) & (t < end + 0.5 * run.dt)
     t, own = t[compared], own[compared]
     first = own[0] if x0 is None else x0
-    found = solve_ivp(
+    solution = solve_ivp(
         rate, (t[0], t[-1]), first, method, t_eval=t, rtol=rtol, atol=atol, **options
-    ).y.T
+    )
+    if not solution.success:
+        raise ValueError(f"the integration by SciPy failed: {solution.message}")
+    found = solution.y.T
     count = own.shape[1] if components is None else components
     return float(np.abs(found[:, :count] - own[:, :count]).max())

@@ -16,15 +16,16 @@ law are scaled by one factor to this effort (`ij.compare`).  Columns:
   distance of these bounds; bounds of the first level at every step, others at the recorded samples.
 - `error, parameters`, `margin, parameters`: the worse of two plants whose uncertain parameters are
   0.8 and 1.2 times those of the entry; the model is the one of the entry.
-- `error, 500 Hz`, `margin, 500 Hz`: law and observer run once in 2 ms, or in the nearest whole
-  number of steps, and read exact sensors.
+- `error, sampled`, `margin, sampled`: law and observer run once in `PERIOD`, or in the nearest
+  whole number of steps, and read exact sensors; also where the task has a period of its own, which
+  the other columns keep.
 - `error, noise`, `margin, noise`: the same with white noise on every level, whose standard
   deviation is `NOISE` times half the least distance of the bounds, and of the further levels
   `NOISE` times their largest value in the published run.
 
 "left" is a run that leaves its bounds or diverges, and "step" one for which the entry's time step
-is too large.  With `--quick` or `--only` the results go to a temporary folder unless `--out` names
-one.  The results go to results/NAME.json, after each law.
+is too large.  The results go to results/NAME.json when all laws are measured, and to NAME.json.part
+after each law.  With `--quick` or `--only` they go to a temporary folder unless `--out` names one.
 """
 
 from __future__ import annotations
@@ -119,7 +120,7 @@ def scaled_parameters(
 
 
 def sampled_runs(scenario: ij.Scenario, task: Task) -> tuple[ij.Rollout, ij.Rollout]:
-    """Runs at 500 Hz without and with noise; both have one structure."""
+    """Sampled runs without and with noise; both have one structure."""
     period = period_of(task)
     sigma = np.concatenate([task.half_width[None], task.levels[1:]]) * NOISE
     return tuple(
@@ -210,8 +211,8 @@ def columns(scenario: ij.Scenario) -> list[str]:
         "margin",
         f"error, parameters [{length}]",
         "margin, parameters",
-        f"error, 500 Hz [{length}]",
-        "margin, 500 Hz",
+        f"error, sampled [{length}]",
+        "margin, sampled",
         f"error, noise [{length}]",
         "margin, noise",
     ]
@@ -253,6 +254,9 @@ def measure(
     reasons = {name: words for name, words in chosen.items() if isinstance(words, str)}
     reasons |= made.not_applicable
     applicable = [name for name in chosen if name not in reasons]
+    unknown = sorted(set(only or ()) - set(applicable))
+    if unknown:
+        raise entry.EntryError([f"--only: {unknown} do not apply; choose from {applicable}"])
     headings = columns(task.scenario)
     result = {
         "title": contents.title,
@@ -266,6 +270,7 @@ def measure(
         "rows": [],
         "no_factor": {},
         "not_applicable": reasons,
+        "failed": {},
     }
     for name in only or applicable:
         if quick and len(result["rows"]) == QUICK_LAWS:
@@ -275,13 +280,18 @@ def measure(
         except ValueError as error:
             reasons[name] = first_sentence(error)
         except Exception as error:  # a law that fails must not stop the others
-            reasons[name] = f"its run failed: {type(error).__name__}: {first_sentence(error)}"
+            result["failed"][name] = f"{type(error).__name__}: {first_sentence(error)}"
         else:
             result["rows"].append(dict(zip(headings, found.values, strict=True)))
             if found.reason:
                 result["no_factor"][name] = found.reason
-        print(f"{folder.name}: {name}: {reasons.get(name, 'measured')}", flush=True)
+        outcome = {**reasons, **result["failed"]}.get(name, "measured")
+        print(f"{folder.name}: {name}: {outcome}", flush=True)
         save(result)
+    if PUBLISHED in result["failed"] | reasons:
+        raise entry.EntryError(["the published law could not be measured"])
+    if result["failed"]:
+        raise entry.EntryError([f"the runs of {sorted(result['failed'])} failed"])
 
 
 def period_of(task: Task) -> float:
@@ -294,17 +304,20 @@ def is_chain(task: Task) -> bool:
     return plants.is_chain(task.scenario.plant)
 
 
-def write(folder: Path, out: Path, command: str, **options: Any) -> None:
-    """Measures an entry and writes its file."""
+def write(folder: Path, out: Path, flags: list[str], **options: Any) -> None:
+    """Measures an entry and writes its file; a measurement that stops leaves the former file."""
     out.mkdir(parents=True, exist_ok=True)
+    part = out / f"{folder.name}.json.part"
+    command = shlex.join(["python", "benchmarks/field/measure.py", folder.name, *flags])
 
     def save(result: dict[str, Any]) -> None:
         text = json.dumps({"command": command, **result}, indent=1)
-        (out / f"{folder.name}.json").write_text(text + "\n", encoding="utf-8")
+        part.write_text(text + "\n", encoding="utf-8")
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the table reports runs that leave the bounds
         measure(folder, save, **options)
+    part.replace(out / f"{folder.name}.json")
 
 
 def main() -> int:
@@ -319,8 +332,9 @@ def main() -> int:
     parser.add_argument("--only", nargs="+", metavar="LAW", help="these rows")
     args = parser.parse_args()
     chosen = [entry.ENTRIES / name for name in args.names] or entry.folders()
-    words = [*args.names, *(["--quick"] if args.quick else [])]
-    command = shlex.join(["python", "benchmarks/field/measure.py", *words])
+    flags = ["--quick"] if args.quick else []
+    if args.only:
+        flags += ["--only", *args.only]
     options = {"quick": args.quick, "only": args.only}
     out = args.out or entry.RESULTS
     if args.out is None and (args.quick or args.only):
@@ -328,16 +342,16 @@ def main() -> int:
         out = Path(tempfile.mkdtemp())
         print(f"parts of a measurement are written to {out}")
     failed = 0
-    for name, error in outcomes(chosen, args.processes, out, command, options):
+    for name, error in outcomes(chosen, args.processes, out, flags, options):
         failed += error is not None
         print(f"{name}: {'measured' if error is None else f'failed: {error}'}", flush=True)
     print(f"{len(chosen) - failed} of {len(chosen)} entries measured")
     return failed
 
 
-def outcomes(chosen, processes, out, command, options):
+def outcomes(chosen, processes, out, flags, options):
     """Measures entries; the name of each with None, or with the reason why it failed."""
-    call = functools.partial(write, out=out, command=command, **options)
+    call = functools.partial(write, out=out, flags=flags, **options)
     if processes == 1:
         for folder in chosen:
             yield folder.name, reason_of(lambda folder=folder: call(folder))

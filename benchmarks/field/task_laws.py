@@ -118,7 +118,7 @@ def laws_of(task: Task, uncertain: tuple[str, ...]) -> dict[str, laws.Choice | s
         chosen = level_laws(task)
         robot = plants.robot_of(plant)
     if robot is None:
-        return chosen | {OF_ROBOTS: "the plant is none"}
+        return chosen | {OF_ROBOTS: "the plant is no robot"}
     for name, choice in laws.CHOICES.items():
         if name in chosen:
             continue

@@ -319,6 +319,12 @@ IN_SCRIPT = {
     "evidence in words": ('"printed": 0.1', '"printed": "0.1"', "evidence['printed'] must be one"),
     "details as a list": ("holds =", "details = ['x']\nholds =", "details must be a dict"),
     "unknown path": ("holds =", "uncertain = ('plant.m',)\nholds =", "uncertain has 'plant.m'"),
+    "path of a law": (
+        "holds =",
+        "uncertain = ('controller.k1',)\nholds =",
+        "'controller.k1', which is no parameter of the plant",
+    ),
+    "claim of an array": ('bounds": True', 'bounds": np.ones(2) > 0', "must be True or False"),
 }
 
 
@@ -406,11 +412,41 @@ def test_the_quick_measurement(tmp_path, monkeypatch, capsys):
     assert set(other) == set(published)
     assert other["law"] == "BarrierBackstepping(Integral)"
     assert result["machine"]["jax"]
-    assert result["command"].endswith("benchmarks/field/measure.py no_entry_2000 liu_2018 --quick")
+    assert result["command"].endswith("benchmarks/field/measure.py liu_2018 --quick")
+    assert result["failed"] == {}
+    assert [path.name for path in tmp_path.iterdir()] == ["liu_2018.json"]
     assert result["uncertain"] == ["plant.friction", "plant.input_gain"]
     for row in result["rows"]:
         assert not {measure.LEFT, measure.STEP} & {x for x in row.values() if isinstance(x, str)}
         assert row["margin"] <= 1.0
+
+
+def test_a_law_that_does_not_apply_is_refused(tmp_path, monkeypatch, capsys):
+    words = ["measure.py", "liu_2018", "--quick", "--only", "no law", "--out", str(tmp_path)]
+    monkeypatch.setattr(sys, "argv", words)
+    assert measure.main() == 1
+    assert "--only: ['no law'] do not apply" in capsys.readouterr().out
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_published_law_that_fails_leaves_the_former_results(tmp_path, monkeypatch):
+    def fails(*arguments):
+        raise RuntimeError("no run")
+
+    monkeypatch.setattr(measure, "row", fails)
+    (tmp_path / "liu_2018.json").write_text("{}")
+    with pytest.raises(entry.EntryError, match="published law could not be measured"):
+        measure.write(
+            entry.ENTRIES / "liu_2018", tmp_path, [], quick=True, only=[measure.PUBLISHED]
+        )
+    assert (tmp_path / "liu_2018.json").read_text() == "{}"
+
+
+def test_an_independent_integration_that_stops_is_an_error():
+    run = SimpleNamespace(t=np.linspace(0.0, 2.0, 21), x=np.ones((21, 1, 1)), dt=0.1)
+    assert entry.largest_difference(run, lambda t, x: 0.0 * x, end=0.5) == 0.0
+    with pytest.raises(ValueError, match="the integration by SciPy failed"):
+        entry.largest_difference(run, lambda t, x: x**2)
 
 
 @pytest.mark.slow
@@ -437,7 +473,7 @@ def test_the_laws_of_a_robot_are_those_of_the_table_of_laws():
 def test_the_laws_of_a_plant_have_each_barrier_with_and_without_filters():
     scenario = ij.presets.motor_driven_pendulum()
     found = task_laws.laws_of(task_of_preset(scenario), ())
-    assert found[task_laws.OF_ROBOTS] == "the plant is none"
+    assert found[task_laws.OF_ROBOTS] == "the plant is no robot"
     for name in task_laws.BARRIERS:
         exact = found[f"BarrierBackstepping({name})"]
         filtered = found[f"BarrierBackstepping({name}), filters"]
@@ -501,6 +537,7 @@ RESULT = {
     "machine": {"processor": "P", "cores": "2", "python": "3", "jax": "0", "date": "2026-01-01"},
     "duration": 1.0,
     "dt": 1e-3,
+    "period": 2e-3,
     "noise": 1e-3,
     "uncertain": ["plant.mass"],
     "input": "torque",
