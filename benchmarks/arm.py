@@ -281,7 +281,7 @@ def main() -> None:
         "steps",
         "compile s",
         "steps/s",
-        "steps/s a core",
+        "steps/s per core",
         "of the limit",
         "q differs [rad]",
     ]

@@ -465,7 +465,7 @@ def sampled(quick: bool) -> list[list]:
                 ]
             )
             print(
-                f"{loop} {dtype} {runs} {name}: {speeds[1]:.3g} steps/s a core",
+                f"{loop} {dtype} {runs} {name}: {speeds[1]:.3g} steps/s per core",
                 file=sys.stderr,
                 flush=True,
             )
@@ -594,7 +594,7 @@ def main() -> None:
         "steps",
         "compile s",
         "steps/s",
-        "steps/s a core",
+        "steps/s per core",
         "x textbook",
         "of limit",
         "in values",

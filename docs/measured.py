@@ -32,7 +32,7 @@ PLOTS = {
     "latency": Plot(("row",), "ms", "A single run, as in a notebook; less is better."),
     "throughput": Plot(
         ("row", "type"),
-        "steps/s a core",
+        "steps/s per core",
         "Many runs of the paper's loop at once; more is better.",
         {"loop": "paper", "runs": 4096},
     ),
@@ -43,7 +43,7 @@ PLOTS = {
     ),
     "arm": Plot(
         ("row", "type"),
-        "steps/s a core",
+        "steps/s per core",
         "Seven joints, compared with other software; more is better.",
     ),
     "export": Plot(
