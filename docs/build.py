@@ -77,14 +77,21 @@ def is_executed(notebook: Path) -> bool:
     ) == digest_of(notebook)
 
 
-def missing() -> list[Callable[[], object]]:
+def new_work_folder() -> Path:
+    """An empty folder in which the notebooks run: a store of another version of the package cannot
+    be continued.
+    """
+    work = SITE / "work"
+    shutil.rmtree(work, ignore_errors=True)
+    work.mkdir(parents=True)
+    return work
+
+
+def outdated(work: Path) -> list[Callable[[], object]]:
     """The notebooks, scripts and examples of flags whose output is missing or older than they."""
     import flags
     import gallery
 
-    work = SITE / "work"
-    shutil.rmtree(work, ignore_errors=True)  # a store of another version cannot be continued
-    work.mkdir(parents=True)
     return [
         *(partial(execute, notebook, work) for notebook in NOTEBOOKS if not is_executed(notebook)),
         *(partial(gallery.page, script) for script in gallery.PAGES if not gallery.is_made(script)),
@@ -92,9 +99,9 @@ def missing() -> list[Callable[[], object]]:
     ]
 
 
-def execute_missing() -> None:
-    """Executes them, each processor one at a time."""
-    tasks = missing()
+def execute_outdated() -> None:
+    """Executes what is outdated, each processor one at a time."""
+    tasks = outdated(new_work_folder())
     if not tasks:
         return
     # JAX hangs in processes that are forked from one that has used it.
@@ -240,7 +247,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="Builds the documentation site.")
     parser.add_argument("--version", default=DEVELOPMENT, help="which version the pages are of")
     name = parser.parse_args().version
-    execute_missing()
+    execute_outdated()
     enable_x64()
     assemble()
     shutil.rmtree(HTML / name, ignore_errors=True)

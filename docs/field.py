@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import gallery
 from entry import (
     KINDS,
+    PUBLISHED,
     READ,
     RESULTS,
     Correction,
@@ -27,8 +28,6 @@ from entry import (
 )
 from entry_tables import escaped, markdown_table
 
-PUBLISHED = "published law"
-"""The row of the law that sets the effort."""
 MANY = 100
 """The page names a published law as losing its accuracy with noise if the share of the best law
 with noise is so many times smaller than that without."""

@@ -29,6 +29,8 @@ ENTRIES = FOLDER / "entries"
 RESULTS = FOLDER / "results"
 TEMPLATE = FOLDER / "template"
 
+PUBLISHED = "published law"
+"""The row of the law that sets the effort, in the results of `measure.py`."""
 FAMILIES = ("robot", "flexible joint", "drive", "vessel", "vehicle", "strict feedback")
 METHODS = ("barrier", "prescribed performance", "constrained")
 READ = {

@@ -56,7 +56,8 @@ import laws
 import matplotlib
 import numpy as np
 from _timing import machine
-from task_laws import Task, first_sentence, laws_of, simulated, task_of
+from entry import PUBLISHED
+from task_laws import Task, first_sentence, laws_of, task_of, with_standard_metrics
 
 import iblf_jax as ij
 from iblf_jax import sensors
@@ -71,7 +72,6 @@ SHARES = (0.8, 1.2)
 """Factors of the uncertain parameters."""
 UNCERTAIN = ("mass", "payload", "inertia")
 """Beginnings of the names of uncertain parameters, where an entry does not name them."""
-PUBLISHED = "published law"
 LEFT, OWN, STEP = "left", "own", "step"
 QUICK_DURATION = 0.1
 """s."""
@@ -97,17 +97,19 @@ def row(name: str, choice: laws.Choice, task: Task, uncertain: tuple[str, ...]) 
         factor = float(compared.factors[name])
     one = run.scenario
     perturbed = [
-        simulated(ij.with_parameters(one, scaled_parameters(one, uncertain, share)), task)
-        for share in SHARES
-        if uncertain
+        with_standard_metrics(
+            ij.with_parameters(one, scaled_parameters(one, uncertain, share)), task.options
+        )
+        for share in (SHARES if uncertain else ())
     ]
     exact, noisy = sampled_runs(one, task)
     own = float(compared.rollouts[PUBLISHED].metrics.effort_above_gravity)
     effort = float(run.metrics.effort_above_gravity) / own
     values = [name, factor, effort if np.isfinite(effort) else LEFT, *accuracy(run, task)]
-    values += worst([of_run(x, task) for x in perturbed])
+    values += worst([error_and_margin(x, task) for x in perturbed])
     return Row(
-        [*values, *of_run(exact, task), *of_run(noisy, task)], compared.reasons.get(name, "")
+        [*values, *error_and_margin(exact, task), *error_and_margin(noisy, task)],
+        compared.reasons.get(name, ""),
     )
 
 
@@ -124,11 +126,11 @@ def sampled_runs(scenario: ij.Scenario, task: Task) -> tuple[ij.Rollout, ij.Roll
     period = period_of(task)
     sigma = np.concatenate([task.half_width[None], task.levels[1:]]) * NOISE
     return tuple(
-        simulated(
+        with_standard_metrics(
             ij.with_parts(
                 scenario, sensor=sensor_of(scenario, sigma * share), sampling=ij.Sampling(period)
             ),
-            task,
+            task.options,
         )
         for share in (0.0, 1.0)
     )
@@ -141,7 +143,7 @@ def sensor_of(scenario: ij.Scenario, sigma: np.ndarray) -> Any:
     return sensors.Encoder(velocity=sensors.Measured(noise=sigma[1]), noise=sigma[0])
 
 
-def state_of(run: ij.Rollout, task: Task) -> str:
+def failure_of(run: ij.Rollout, task: Task) -> str:
     """Whether a run has left the bounds of the task, or its step is too large; "" if neither."""
     flags = ij.Status.BOUND_VIOLATED | ij.Status.NOT_FINITE | ij.Status.SINGULAR_GAIN
     if task.scenario.velocity_bounds is not None or task.scenario.state_bounds:
@@ -156,15 +158,15 @@ def state_of(run: ij.Rollout, task: Task) -> str:
 
 def accuracy(run: ij.Rollout, task: Task) -> list[Any]:
     """RMS and largest error, peak input and margin."""
-    state = state_of(run, task)
+    failure = failure_of(run, task)
     peak = float(np.max(np.asarray(run.metrics.peak_torque)))
-    if state:
-        return [state, state, peak if np.isfinite(peak) else state, state]
+    if failure:
+        return [failure, failure, peak if np.isfinite(peak) else failure, failure]
     e1 = np.asarray(run.e1)[len(run.t) // 2 :]
     return [float(np.sqrt(np.mean(e1**2))), float(np.abs(e1).max()), peak, margin(run, task)]
 
 
-def of_run(run: ij.Rollout, task: Task) -> list[Any]:
+def error_and_margin(run: ij.Rollout, task: Task) -> list[Any]:
     """Largest error and margin."""
     _, error, _, least = accuracy(run, task)
     return [error, least]

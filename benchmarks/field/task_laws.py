@@ -56,32 +56,38 @@ class Task(NamedTuple):
 
     @property
     def options(self) -> dict[str, Any]:
-        """Time and records of a run."""
-        steps = round(self.duration / self.dt)
-        every = max(1, steps // RECORDS)
-        while steps % every:
-            every -= 1
-        return {"duration": self.duration, "dt": self.dt, "record_every": every}
+        """Arguments of `ij.simulate`."""
+        return options_of(self.duration, self.dt)
+
+
+def options_of(duration: float, dt: float) -> dict[str, Any]:
+    """Arguments of `ij.simulate`, for about `RECORDS` recorded samples."""
+    steps = round(duration / dt)
+    every = max(1, steps // RECORDS)
+    while steps % every:
+        every -= 1
+    return {"duration": duration, "dt": dt, "record_every": every}
 
 
 def task_of(folder: Path, duration: float) -> tuple[Task, entry.Reproduction]:
     """The task of an entry."""
     made = entry.execute(folder)
-    unknown = np.zeros(0)  # until the published run
     dt = entry.load(folder).run.dt
-    found = Task(made.scenario, duration, dt, 2.0, unknown, unknown, unknown, unknown)
-    published = simulated(found.scenario, found)
+    published = with_standard_metrics(made.scenario, options_of(duration, dt))
     x = np.abs(np.asarray(published.x))
     positions = np.asarray(published.q)
     width = np.asarray(published.upper - published.lower)
-    scales = {
-        "rate": rate_of(found.scenario.controller),
-        "half_width": 0.5 * width.min(axis=0),
-        "levels": np.maximum(x.max(axis=0), 1e-9),
-        "center": 0.5 * (positions.max(axis=0) + positions.min(axis=0)),
-        "inputs": np.maximum(np.abs(np.asarray(published.tau)).max(axis=0), 1e-9),
-    }
-    return found._replace(**scales), made
+    task = Task(
+        scenario=made.scenario,
+        duration=duration,
+        dt=dt,
+        rate=rate_of(made.scenario.controller),
+        half_width=0.5 * width.min(axis=0),
+        levels=np.maximum(x.max(axis=0), 1e-9),
+        center=0.5 * (positions.max(axis=0) + positions.min(axis=0)),
+        inputs=np.maximum(np.abs(np.asarray(published.tau)).max(axis=0), 1e-9),
+    )
+    return task, made
 
 
 def rate_of(law: Any) -> float:
@@ -95,10 +101,10 @@ def rate_of(law: Any) -> float:
     return 2.0
 
 
-def simulated(scenario: ij.Scenario, task: Task) -> ij.Rollout:
+def with_standard_metrics(scenario: ij.Scenario, options: dict[str, Any]) -> ij.Rollout:
     """A run with the metrics of `ij.compare`, so that both share one program."""
     folds = (*standard(), *optional_folds(scenario), AboveGravity())
-    return ij.simulate(scenario, metrics=folds, **task.options)
+    return ij.simulate(scenario, metrics=folds, **options)
 
 
 # ---------------------------------------------------------------------------- laws
@@ -238,10 +244,11 @@ def numbers_of(
         controllers.PDGravity: {"Kp": damping * rate, "Kd": 1.1 * damping},
         controllers.SafetyFilter: {"a1": 5.0 * rate, "a2": 5.0 * rate},
         controllers.Saturated: {"limit": 1.2 * task.inputs, "auxiliary": 5.0 * rate},
+        controllers.ReferenceGovernor: {},  # it has the numbers of the law that it wraps
     }
     if isinstance(law, controllers.AdaptiveParameters):
         return adaptation(task, uncertain)
-    return dict(numbers.get(type(law), {}))
+    return dict(numbers[type(law)])
 
 
 def barriers_unit(barrier: Any) -> str:

@@ -513,7 +513,7 @@ def test_errors_are_those_of_the_second_half():
     assert left == ["left", "left", 4.0, "left"]
     assert measure.accuracy(a_run(int(ij.Status.STEP_TOO_LARGE)), task)[0] == "step"
     # Velocities have no bounds in this task, and the bounds that a law was given do not count.
-    assert measure.state_of(a_run(int(ij.Status.VELOCITY_VIOLATED)), task) == ""
+    assert measure.failure_of(a_run(int(ij.Status.VELOCITY_VIOLATED)), task) == ""
     assert measure.worst([[1.0, 0.5], [2.0, 0.7]]) == [2.0, 0.5]
     assert measure.worst([[1.0, 0.5], ["left", "left"]]) == ["left", "left"]
     assert measure.worst([]) == ["-", "-"]

@@ -6,6 +6,7 @@ import numpy as np
 from entry import execute, largest_difference
 
 END = 5.0
+"""s, compared of the 10 s of the run."""
 TOLERANCE = 1e-6
 
 
