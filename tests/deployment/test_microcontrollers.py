@@ -1,4 +1,4 @@
-"""What the page on Simulink and micro-controllers says of the C law: its blocks of C are compiled
+"""What the page on Simulink and microcontrollers says of the C law: its blocks of C are compiled
 and run, and the law needs no C library but `memcpy`, `memset` and functions of `math.h`."""
 
 from __future__ import annotations
