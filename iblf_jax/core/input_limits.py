@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
@@ -25,3 +27,10 @@ def lower_or_opposite(lower: Any, upper: Any) -> Any:
     if lower is None:
         return -upper
     return lower
+
+
+def is_beyond(x: jax.Array, lower: Any, upper: Any) -> jax.Array:
+    """Whether an input is outside its limits; symmetric limits need one comparison only."""
+    if lower is None:
+        return jnp.abs(x) > upper
+    return (x < lower) | (x > upper)

@@ -17,13 +17,15 @@ another start."""
 BEFORE_A_RELEASE = {"armour.py", "constraints.py", "tuning.py"}
 """Their quick sizes compile for a quarter of a minute."""
 
+NO_BENCHMARK = "comparison.py"
+"""It compares the results of the others, and `test_release.py` tests it."""
 NEEDED = {"ros2.py": ("mujoco", "rclpy")}
 """Benchmark -> libraries that not every environment has."""
 
 
 def benchmarks():
     """Every benchmark, with its mark."""
-    for path in sorted(FOLDER.glob("[a-z]*.py")):
+    for path in sorted(set(FOLDER.glob("[a-z]*.py")) - {FOLDER / NO_BENCHMARK}):
         mark = pytest.mark.release if path.name in BEFORE_A_RELEASE else pytest.mark.slow
         yield pytest.param(path.name, marks=mark)
 

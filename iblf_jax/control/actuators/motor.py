@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from iblf_jax.control.actuators._base import Delivered
 from iblf_jax.core import checks
-from iblf_jax.core.input_limits import check_lower_limit, lower_or_opposite
+from iblf_jax.core.input_limits import check_lower_limit, is_beyond, lower_or_opposite
 from iblf_jax.core.pytree import Leaf, component, leaf
 from iblf_jax.core.units import INPUT, VELOCITY, PlantUnit
 
@@ -85,7 +85,7 @@ class Motor:
         rate: Any = ()
         if self.limit is not None:
             lower = lower_or_opposite(self.lower_limit, self.limit)
-            limited |= (command < lower) | (command > self.limit)
+            limited |= is_beyond(command, self.lower_limit, self.limit)
             v = jnp.clip(command, lower, self.limit)
         if self.bandwidth is not None:
             rate = self.bandwidth * (v - state)

@@ -131,7 +131,8 @@ class AdaptiveParameters:
         checks.conforms("AdaptiveParameters.law", self.law, Controller, LAWS)
         self._check_law()
         names = self.parameters
-        if not names or not all(isinstance(name, str) for name in names):
+        are_paths = isinstance(names, tuple | list) and all(isinstance(x, str) for x in names)
+        if not names or not are_paths:
             expected = 'a tuple of paths, such as ("mass[0]", "payload")'
             raise checks.fail("AdaptiveParameters.parameters", names, expected)
         if len(set(names)) < len(names):

@@ -61,7 +61,7 @@ from iblf_jax.control.controllers._base import (
     wrapped_advice,
 )
 from iblf_jax.core import checks
-from iblf_jax.core.input_limits import check_lower_limit, lower_or_opposite
+from iblf_jax.core.input_limits import check_lower_limit, is_beyond, lower_or_opposite
 from iblf_jax.core.pytree import Leaf, component, leaf, static, unwrapped
 from iblf_jax.core.units import INPUT
 from iblf_jax.world import plants
@@ -171,7 +171,7 @@ class Saturated:
     def _limited(self, command: Command) -> Command:
         """A command with its torque limited."""
         lower = lower_or_opposite(self.lower_limit, self.limit)
-        beyond = (command.tau < lower) | (command.tau > self.limit)
+        beyond = is_beyond(command.tau, self.lower_limit, self.limit)
         saturated = command.saturated | beyond
         if self.edge == "hard":
             tau = jnp.clip(command.tau, lower, self.limit)
