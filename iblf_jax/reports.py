@@ -124,8 +124,8 @@ def _scenario(scenario: Scenario) -> Shown:
     rows = [(p.path, p.unit, _short(p.value)) for p in parameters(scenario, named=False)]
     leaves = tables.as_html(("path", "unit", "value"), rows)
     plant = scenario.plant
-    noun = plants.component_noun(plant)
-    words = [f"{scenario.n} {noun}s: {', '.join(plants.component_names(plant))}"]
+    names = ", ".join(plants.component_names(plant))
+    words = [f"{plants.counted_components(plant, scenario.n)}: {names}"]
     if plants.is_chain(plant):
         words.append(_levels_in_words(plant))
     content = {"Parts": _parts_of(scenario), "Parameters": leaves}

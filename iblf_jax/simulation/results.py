@@ -172,9 +172,9 @@ class Rollout(Signals):
     def __repr__(self) -> str:
         if not checks.is_concrete(self):
             return "Rollout(being traced)"
-        noun = plants.component_noun(self.scenario.plant)
+        components = plants.counted_components(self.scenario.plant, self.n)
         shape = (
-            f"{self.q.shape[-2]} samples, {self.n} {noun}s, dt = {float(np.ravel(self.dt)[0]):g} s,"
+            f"{self.q.shape[-2]} samples, {components}, dt = {float(np.ravel(self.dt)[0]):g} s,"
             f" {self.method}"
         )
         if self.is_batch:

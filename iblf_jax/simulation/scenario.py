@@ -291,8 +291,8 @@ class Scenario:
     def _check_combination(self) -> None:
         """Raises ValueError for parts that do not fit together."""
         if self.model.n != self.plant.n:
-            noun = plants.component_noun(self.plant)
-            got, expected = f"{self.model.n} {noun}s", f"{self.plant.n} {noun}s, as the plant has"
+            got = plants.counted_components(self.plant, self.model.n)
+            expected = f"{plants.counted_components(self.plant, self.plant.n)}, as the plant has"
             raise checks.fail("Scenario.model", got, expected)
         law = unwrapped(self.controller)
         if self.context.level_bounds(2) is None and law_member(law, "needs_velocity_bounds"):

@@ -190,7 +190,7 @@ def test_reports_show_levels_with_their_units(run, tmp_path):
     assert "<th>pendulum</th>" in text
     scenario = ij.report(pendulum(), tmp_path / "scenario.html").read_text()
     assert "3 levels: angle [rad], speed [rad/s], current [A]; input: input [V]" in scenario
-    assert "1 components: pendulum" in scenario
+    assert "1 component: pendulum" in scenario
 
 
 @pytest.mark.slow

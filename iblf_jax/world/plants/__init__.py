@@ -14,6 +14,7 @@ from iblf_jax.world.plants._base import check_dependence as check_dependence
 from iblf_jax.world.plants._base import check_dimensions as check_dimensions
 from iblf_jax.world.plants._base import component_names as component_names
 from iblf_jax.world.plants._base import component_noun as component_noun
+from iblf_jax.world.plants._base import counted_components as counted_components
 from iblf_jax.world.plants._base import declared_joints as declared_joints
 from iblf_jax.world.plants._base import dependence_on_levels as dependence_on_levels
 from iblf_jax.world.plants._base import flow as flow
@@ -87,6 +88,7 @@ __all__ = [
     "as_plant",
     "component_names",
     "component_noun",
+    "counted_components",
     "flow",
     "gain_times",
     "input_name",

@@ -403,6 +403,13 @@ def component_noun(part: Any) -> str:
     return "joint"
 
 
+def counted_components(part: Any, n: int) -> str:
+    """The number n of components of a level in words, such as "1 component" or "2 joints"."""
+    if n == 1:
+        return f"1 {component_noun(part)}"
+    return f"{n} {component_noun(part)}s"
+
+
 def speed_limit(part: Any) -> float:
     """The size of the second level above which a run counts as diverged: of a robot
     `status.VELOCITY_LIMIT`; other plants may have any units.
