@@ -30,7 +30,7 @@ def benchmarks():
         yield pytest.param(path.name, marks=mark)
 
 
-@pytest.mark.parametrize("name", benchmarks())
+@pytest.mark.parametrize("name", list(benchmarks()))
 def test_quick_benchmark(name, tmp_path, monkeypatch):
     for library in NEEDED.get(name, ()):
         pytest.importorskip(library, reason=f"{name} needs {library}")
