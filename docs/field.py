@@ -208,7 +208,8 @@ def best_law(part: Part) -> tuple[str, str, str]:
     rows = {row["law"]: row for row in part.result["rows"]}
     columns = [column(part.result, start) for start in (NOISE, ERROR)]
     shares = [_share(rows[best][name], rows[PUBLISHED][name]) for name in columns]
-    return best, *shares
+    # The place at which a narrow column may break the name.
+    return best.replace("(", "\u200b("), *shares
 
 
 def _name_of_best(result: dict[str, Any]) -> str | None:

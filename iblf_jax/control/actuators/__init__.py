@@ -1,4 +1,6 @@
-"""Actuators map the command of a law to the delivered torque.  `_base.py` has their contract."""
+"""Actuators map the command of a law to the delivered torque.  The contract is the
+protocol `Actuator`.
+"""
 
 from iblf_jax.control.actuators._base import Actuator as Actuator
 from iblf_jax.control.actuators._base import Delivered as Delivered

@@ -1,5 +1,5 @@
-"""Tracking laws.  The contract is `Controller` in `_base.py`; `systems.py` has the paper's systems
-by name.
+"""Tracking laws.  The contract is the protocol `Controller`; `law_by_name` makes the paper's
+systems.
 """
 
 from iblf_jax.control.controllers._base import Command as Command

@@ -1,4 +1,4 @@
-"""Disturbance observers.  The contract is `Observer` in `_base.py`."""
+"""Disturbance observers.  The contract is the protocol `Observer`."""
 
 from iblf_jax.control.observers._base import Observer as Observer
 from iblf_jax.control.observers._base import State as State

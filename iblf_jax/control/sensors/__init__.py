@@ -1,5 +1,5 @@
 """Sensors: the measurements of q and q', or of all levels of a plant, for a sampled law.  The
-contracts are `Sensor`, `LevelSensor` and `Velocity` in `_base.py`.
+contracts are the protocols `Sensor`, `LevelSensor` and `Velocity`.
 """
 
 from iblf_jax.control.sensors._base import LevelSensor as LevelSensor

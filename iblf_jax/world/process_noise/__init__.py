@@ -1,5 +1,5 @@
-"""Process noise: white noise on levels of the plant.  The contract is `ProcessNoise` in
-`_base.py`.
+"""Process noise: white noise on levels of the plant.  The contract is the
+protocol `ProcessNoise`.
 """
 
 from iblf_jax.world.process_noise._base import ProcessNoise as ProcessNoise

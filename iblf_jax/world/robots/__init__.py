@@ -1,5 +1,5 @@
-"""Robots: the plant that moves and the model that the law knows.  The contract is `Robot` in
-`_base.py`.
+"""Robots: the plant that moves and the model that the law knows.  The contract is the
+protocol `Robot`.
 """
 
 from iblf_jax.world.robots._base import Robot as Robot
