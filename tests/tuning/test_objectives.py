@@ -152,8 +152,11 @@ def test_tuning_by_a_metric_is_tuning_by_the_objective_that_it_equals(paper, tmp
     by_name = ij.tune(
         paper, gains, ij.objectives.tracking() + 0.1 * ij.objectives.effort(), **TUNING
     )
+    # Starts of nearly equal merit may be numbered in another order.
+    order, other_order = (np.argsort(best.history["loss"][0]) for best in (by_metric, by_name))
     for name in ("loss", "gradient_norm"):
-        np.testing.assert_allclose(by_metric.history[name][0], by_name.history[name][0], rtol=1e-8)
+        first, second = by_metric.history[name][0][order], by_name.history[name][0][other_order]
+        np.testing.assert_allclose(first, second, rtol=1e-8)
     by_metric.save(tmp_path / "tuned.json")
     assert ij.load_tuning(tmp_path / "tuned.json").values.keys() == by_metric.values.keys()
 
