@@ -23,6 +23,7 @@ from iblf_jax.engine.limiting_term import limiting_term
 from iblf_jax.engine.step_size import comfortable_dt, find_dt, limited
 from iblf_jax.simulation.error_estimate import ERROR, RELATIVE, TOLERANCE
 from iblf_jax.simulation.integrators import tableau
+from iblf_jax.simulation.metrics import VIOLATION_TIMES
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import has
@@ -403,13 +404,6 @@ BOUND_EXPLANATIONS: dict[Status, Callable[[Rollout], str]] = {
     Status.REGION_VIOLATED: _region_violation,
 }
 """The explanation of each flag of a violated bound."""
-VIOLATION_TIMES = {
-    Status.BOUND_VIOLATED: "first_violation_time",
-    Status.VELOCITY_VIOLATED: "first_velocity_violation_time",
-    Status.STATE_BOUND_VIOLATED: "first_level_violation_time",
-    Status.REGION_VIOLATED: "first_region_violation_time",
-}
-"""The metric with the time at which each of these bounds was violated first."""
 LOOP_EXPLANATIONS: dict[Status, Callable[[Rollout], str]] = {
     Status.INFINITE_SLOPE: _infinite_slope,
     Status.SAMPLING_TOO_SLOW: _sampling_too_slow,

@@ -30,6 +30,7 @@ from iblf_jax.control.observers._base import observer_member
 from iblf_jax.core import checks
 from iblf_jax.core.optional import OptionalMembers
 from iblf_jax.core.pytree import Leaf, component, layers, leaf
+from iblf_jax.core.status import Status
 from iblf_jax.core.units import (
     HIGHER,
     INPUT,
@@ -832,6 +833,14 @@ def standard() -> tuple[Fold, ...]:
     """
     return (Tracking(), Settling(), Margin(), Torque(), Estimation())
 
+
+VIOLATION_TIMES = {
+    Status.BOUND_VIOLATED: "first_violation_time",
+    Status.VELOCITY_VIOLATED: "first_velocity_violation_time",
+    Status.STATE_BOUND_VIOLATED: "first_level_violation_time",
+    Status.REGION_VIOLATED: "first_region_violation_time",
+}
+"""Flag of a violated constraint -> metric with the time at which it was violated first."""
 
 OPTIONAL: tuple[type[Any], ...] = (
     VelocityMargin,

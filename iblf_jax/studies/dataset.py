@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from iblf_jax.core.status import Status, has_flag
+from iblf_jax.simulation.metrics import VIOLATION_TIMES
 from iblf_jax.simulation.signals import dimension_names
 
 if TYPE_CHECKING:
@@ -19,13 +20,6 @@ if TYPE_CHECKING:
 RUN = "run"
 DRAWN = "drawn_"
 """Prefix of the names of drawn parameters in flat data."""
-FIRST_TIMES = {
-    "first_violation_time": Status.BOUND_VIOLATED,
-    "first_velocity_violation_time": Status.VELOCITY_VIOLATED,
-    "first_level_violation_time": Status.STATE_BOUND_VIOLATED,
-    "first_region_violation_time": Status.REGION_VIOLATED,
-}
-"""Metric with the time of the first violation of a constraint -> the flag of its violation."""
 
 
 def to_dataset(
@@ -98,7 +92,7 @@ def _started_outside(flat: Mapping[str, np.ndarray]) -> np.ndarray:
     status = flat["status"]
     at_start = [
         (status >= 0) & has_flag(status, flag) & (np.asarray(flat[name]) <= 0)
-        for name, flag in FIRST_TIMES.items()
+        for flag, name in VIOLATION_TIMES.items()
         if name in flat
     ]
     return np.any(at_start, axis=0)

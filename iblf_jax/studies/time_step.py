@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -81,21 +82,19 @@ def recommended_dt(
     dt = step_size.find_dt(scenario, duration=duration, method=method)
     if not perturbations:
         return dt
-    return _dt_for_all(scenario, perturbations, duration, dt, method, seed)
+    first_block = partial(_first_block, scenario, perturbations, duration, method, seed)
+    return _dt_for_all(first_block, duration, dt, method)
 
 
 def _dt_for_all(
-    scenario: Scenario,
-    perturbations: Mapping[str, Perturbation],
-    duration: float,
-    dt: float,
-    method: str,
-    seed: int,
+    first_block: Callable[[float], Any], duration: float, dt: float, method: str
 ) -> float:
-    """The step, at most dt, at which no run of a first block is flagged because of its step."""
+    """The step, at most dt, at which no run of a first block is flagged because of its step;
+    `first_block` returns the results at a step.
+    """
     lost_before = None
     for _ in range(MAX_TRIES):
-        results = _first_block(scenario, perturbations, duration, dt, method, seed)
+        results = first_block(dt)
         errors = results.metrics[RELATIVE]
         needed = _dt_to_try(results.status, results.fastest_mode, errors, dt, method)
         if needed is None:
@@ -119,9 +118,9 @@ def _first_block(
     scenario: Scenario,
     perturbations: Mapping[str, Perturbation],
     duration: float,
-    dt: float,
     method: str,
     seed: int,
+    dt: float,
 ) -> Any:
     """The results of the first block of a study at a step."""
     options = RunOptions(
