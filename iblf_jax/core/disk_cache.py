@@ -1,5 +1,4 @@
-"""The folder of compiled programs, which later processes reuse: those of XLA, our own kernels, and
-the scalar programs of long steps.
+"""The folder of compiled programs, which later processes reuse: those of XLA and our own kernels.
 
 It is $XDG_CACHE_HOME/iblf_jax, or ~/.cache/iblf_jax; the programs of XLA have a folder in it for
 each kind of processor. The first run of a process enables JAX's cache there, unless the user
@@ -35,7 +34,8 @@ MAX_BYTES = 2 * 2**30
 JAX_SUFFIX = "-cache"
 """Suffix of the names of JAX's entries."""
 SUFFIXES = (JAX_SUFFIX, "-atime", ".so", ".cubin", ".program")
-"""Suffixes of the names of entries that may be removed: JAX's and ours."""
+"""Suffixes of the names of entries that may be removed: JAX's and ours.  Release candidates kept
+scalar programs in ".program" files, which nothing reads any more."""
 DIGEST_SIZE = 32
 """Bytes of a digest."""
 IN_USE = 3600.0

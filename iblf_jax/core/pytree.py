@@ -23,11 +23,12 @@ import functools
 import operator
 from collections.abc import Callable
 from types import MappingProxyType
-from typing import Any, NamedTuple, TypeAlias, TypeVar, dataclass_transform
+from typing import Any, TypeAlias, TypeVar, dataclass_transform
 
 import jax
 
 from iblf_jax.core import checks, modules
+from iblf_jax.core.exact_keys import behaviour_of, exact_key, is_settled
 from iblf_jax.core.optional import OptionalMembers, has_members
 
 T = TypeVar("T")
@@ -112,6 +113,7 @@ def component(cls: type[T]) -> type[T]:
         if has_members(self, "check"):
             self.check()
         _note_modules(self)
+        _note_structure(self)
 
     cls.__init__ = checked_init  # type: ignore[method-assign]
 
@@ -140,6 +142,14 @@ def _note_modules(part: Any) -> None:
         object.__setattr__(part, _DIVISIONS, divisions)
 
 
+def _note_structure(part: Any) -> None:
+    """Stores the exact key of the static fields, if it cannot change."""
+    values = field_values(part)
+    fixed = tuple([values[f.name] for f in dataclasses.fields(part) if f.metadata.get("static")])
+    if fixed and is_settled(fixed):
+        object.__setattr__(part, _SETTLED_KEY, exact_key(fixed))
+
+
 def register_component(cls: type[T]) -> type[T]:
     """Registers a component's class as a pytree, and returns it.
 
@@ -147,56 +157,83 @@ def register_component(cls: type[T]) -> type[T]:
     (`studies.workers`), because decorators do not run there.
     """
     fields = dataclasses.fields(cls)  # type: ignore[arg-type]
+    # JAX compares the structures of two components by `==`.  Beside the static fields, a structure
+    # therefore holds their exact keys, and of a user's class the key of its methods.
     children = tuple(f.name for f in fields if not f.metadata.get("static"))
     structure = tuple(f.name for f in fields if f.metadata.get("static"))
     # Every call of a compiled function flattens its arguments by these getters.
     children_of, structure_of = _getter(children), _getter(structure)
     keys = tuple(map(jax.tree_util.GetAttrKey, children))
 
+    behaviour = behaviour_of(cls)
+    has_key = bool(structure) or behaviour is not None
+
     def flatten_with_keys(obj):
         values, aux = flatten(obj)
         return tuple(zip(keys, values, strict=True)), aux
 
     def flatten(obj):
+        values = children_of(obj)
         divisions = obj._divisions
-        if not divisions:
-            return children_of(obj), structure_of(obj)
-        values = dict(zip(children, children_of(obj), strict=True))
-        for name, division in divisions:
-            values[name] = division.with_nodes(values[name])
-        return tuple(values.values()), _WithModules(structure_of(obj), divisions)
+        if divisions:
+            by_name = dict(zip(children, values, strict=True))
+            for name, division in divisions:
+                by_name[name] = division.with_nodes(by_name[name])
+            values = tuple(by_name.values())
+        if not has_key and not divisions:
+            return values, ()
+        fixed = structure_of(obj)
+        settled = obj.__settled_key__
+        return values, (fixed, divisions, settled, settled or exact_key(fixed), cls.__behaviour__)
 
     def unflatten(aux, values):
         obj = object.__new__(cls)
-        if type(aux) is _WithModules:
-            object.__setattr__(obj, _DIVISIONS, aux.divisions)
-            by_name = dict(zip(children, values, strict=True))
-            for name, division in aux.divisions:
-                by_name[name] = division.without_nodes(by_name[name])
-            values, aux = by_name.values(), aux.structure
-        for name, value in zip(children, values, strict=True):
-            object.__setattr__(obj, name, value)
-        for name, value in zip(structure, aux, strict=True):
-            object.__setattr__(obj, name, value)
+        attributes = obj.__dict__
+        attributes.update(zip(children, values, strict=True))
+        if not aux:
+            return obj
+        fixed, divisions, settled = aux[:3]
+        attributes.update(zip(structure, fixed, strict=True))
+        if settled:
+            attributes[_SETTLED_KEY] = settled
+        if divisions:
+            attributes[_DIVISIONS] = divisions
+            for name, division in divisions:
+                attributes[name] = division.without_nodes(attributes[name])
         return obj
 
     jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
     setattr(cls, _REGISTERED, True)
     setattr(cls, _DIVISIONS, ())
+    setattr(cls, _SETTLED_KEY, None)
+    setattr(cls, _BEHAVIOUR, behaviour)
     return cls
 
 
-class _WithModules(NamedTuple):
-    """The structure of a component with modules that hold functions: its static fields, and the
-    divisions of these modules by the names of their fields.
-    """
+def note_code(tree: Any) -> None:
+    """Notes the methods of the users' classes in a pytree as they are now.
 
-    structure: tuple
-    divisions: tuple[tuple[str, modules.Division], ...]
+    A program is compiled again if a method has been replaced, or what it captures has changed.
+    Every entry point calls this once: to describe a class takes longer than to flatten its objects.
+    """
+    jax.tree.map(lambda x: None, tree, is_leaf=_noted)
+
+
+def _noted(part: Any) -> bool:
+    """False, so that JAX goes on to the parts of this one."""
+    cls = type(part)
+    if vars(cls).get(_BEHAVIOUR) is not None:
+        setattr(cls, _BEHAVIOUR, behaviour_of(cls))
+    return False
 
 
 _DIVISIONS = "_divisions"
 """Attribute with the divisions of those modules of a component that hold functions."""
+_SETTLED_KEY = "__settled_key__"
+"""Attribute with the exact key of an object's static fields, if this key cannot change."""
+_BEHAVIOUR = "__behaviour__"
+"""Attribute of a class with the key of its methods, as `note_code` found them; None for a class of
+the package."""
 _REGISTERED = "_registered_component"
 """Attribute of a class that `register_component` has registered."""
 

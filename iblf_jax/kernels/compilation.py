@@ -14,8 +14,7 @@ import numpy as np
 from jax.extend import core
 
 from iblf_jax.kernels.caches import CACHES
-from iblf_jax.kernels.from_jaxpr import PARAMETERS, closed
-from iblf_jax.kernels.kept_programs import kept_program
+from iblf_jax.kernels.from_jaxpr import closed
 from iblf_jax.kernels.messages import announce_if_slow
 from iblf_jax.kernels.packed import EMPTY, Shapes
 from iblf_jax.kernels.passes import with_reciprocals
@@ -97,13 +96,9 @@ def compile_step(
     jaxpr, (after, records) = jax.make_jaxpr(step, return_shape=True)(
         *leaves, carry.structs(), index
     )
-    arguments = (dtype.str, shared, per_run, carry, limits, is_derivative, known, series)
-
-    def lower() -> Program:
-        return _lowered(jaxpr, len(after), *arguments[1:], dtype=dtype)
-
+    arguments = (shared, per_run, carry, limits, is_derivative, known, series)
     with announce_if_slow(f"compiling a step of {_count_operations(jaxpr.jaxpr):,} operations"):
-        program = kept_program(jaxpr, PARAMETERS, arguments, lower)
+        program = _lowered(jaxpr, len(after), *arguments, dtype=dtype)
     return CompiledStep(program, records)
 
 

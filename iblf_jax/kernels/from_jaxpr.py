@@ -7,7 +7,7 @@ scans are unrolled. A primitive without a rule raises `UnsupportedError`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -206,20 +206,3 @@ def choose(b: Builder, condition: int, yes: Ids, no: Ids | None) -> Ids | None:
 
 
 CONTROL = {"scan": _scan, "cond": _cond, "while": _while}
-
-
-def _read_of_scan(params: dict[str, Any]) -> tuple:
-    return params["length"], params["reverse"], params["jaxpr"], _parts(params)
-
-
-def _read_of_inlined(name: str) -> Callable[[dict[str, Any]], tuple]:
-    return lambda params: (params[INLINED[name]],)
-
-
-PARAMETERS: dict[str, Callable[[dict[str, Any]], tuple]] = {
-    "scan": _read_of_scan,
-    "cond": lambda params: (params["branches"],),
-    "while": lambda params: (),
-    **{name: _read_of_inlined(name) for name in INLINED},
-}
-"""Primitive with inner functions -> function (parameters) -> those that are read here."""

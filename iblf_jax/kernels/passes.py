@@ -10,6 +10,7 @@ of a selection among shared denominators is the selection among their reciprocal
 
 from __future__ import annotations
 
+import dataclasses
 import heapq
 from collections import Counter
 from collections.abc import Sequence
@@ -129,7 +130,8 @@ def scheduled(program: Program) -> Program:
     in_time = set(needed(nodes, [after for _, after in program.carry])) | set(first)
     order.sort(key=lambda i: i not in in_time)
     place = {i: k for k, i in enumerate(order)}
-    return program._replace(
+    return dataclasses.replace(
+        program,
         nodes=tuple(nodes[i]._replace(args=tuple(place[a] for a in nodes[i].args)) for i in order),
         carry=tuple((place.get(before, -1), place[after]) for before, after in program.carry),
         outputs=tuple(place[output] for output in program.outputs),

@@ -17,6 +17,7 @@ each node as rarely as its class permits:
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections import Counter
 from collections.abc import Callable, Container, Iterable, Sequence
@@ -314,8 +315,12 @@ def constants(b: Builder, array) -> Ids:
     return np.asarray(flat, np.int64).reshape(array.shape)
 
 
-class Program(NamedTuple):
+@dataclasses.dataclass(frozen=True, eq=False)
+class Program:
     """One step as a list of nodes.
+
+    Programs are compared by identity.  They are keys of the caches of their C and of their kernels,
+    and equality of their numbers would give 0.0 and -0.0 one kernel.
 
     Args:
       dtype: floating-point type of every "f".

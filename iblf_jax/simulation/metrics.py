@@ -29,7 +29,7 @@ from iblf_jax.control.controllers._base import law_member
 from iblf_jax.control.observers._base import observer_member
 from iblf_jax.core import checks
 from iblf_jax.core.optional import OptionalMembers
-from iblf_jax.core.pytree import Leaf, component, layers, leaf
+from iblf_jax.core.pytree import Leaf, component, layers, leaf, note_code
 from iblf_jax.core.status import Status
 from iblf_jax.core.units import (
     HIGHER,
@@ -802,6 +802,7 @@ def as_folds(
                 remedy = f"{owner[name]} returns {name!r} too."
                 raise checks.fail(field, fold, "names that no other fold returns", remedy)
             owner[name] = field
+    note_code(metrics)
     return tuple(_in_type(f"metrics[{i}]", fold, dtype) for i, fold in enumerate(metrics))
 
 

@@ -41,6 +41,7 @@ from iblf_jax.core.pytree import (
     is_leaf_field,
     layers,
     leaf,
+    note_code,
     rewrapped,
     unwrapped,
 )
@@ -692,6 +693,7 @@ def canonical(scenario: Scenario) -> Scenario:
         raise checks.fail("scenario", scenario, "a Scenario", HOW_TO_MAKE)
     keep_programs()
     check_leaves(scenario)
+    note_code(scenario)
     scenario = _with_sufficient_queue(scenario)
     dtype = _shared_dtype(scenario)
     scenario = jax.tree.map(lambda x: _typed(x, dtype), scenario)

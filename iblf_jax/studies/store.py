@@ -363,8 +363,10 @@ def open_store(
     found = differences(store.config, config)
     # Any other difference changes the program as well, and explains more than its digest.
     explained = [text for text in found if not text.startswith("program:")]
-    code_changed = " (the code of a law, a robot or a metric has changed)"
-    found = explained or [text + code_changed for text in found]
+    why = "the code of a law, a robot or a metric has changed"
+    if "calls Python" in str(config.get("program")):
+        why = "what functions of Python compute while a program runs cannot be compared"
+    found = explained or [f"{text} ({why})" for text in found]
     if not any_unit:
         found += differences({"unit": store.unit}, {"unit": unit})
     if found:

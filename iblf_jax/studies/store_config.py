@@ -5,14 +5,14 @@ store is continued.
 from __future__ import annotations
 
 import dataclasses
-import hashlib
-import re
+import secrets
 from typing import Any
 
 import jax
 import numpy as np
 
 from iblf_jax.core import devices, modules
+from iblf_jax.core.program_digest import CallsPythonError, program_digest
 from iblf_jax.core.pytree import field_values, is_leaf_field
 from iblf_jax.engine import block_size, uses_host_compiler
 from iblf_jax.kernels import built_for
@@ -56,11 +56,21 @@ def structure(part: Any) -> Any:
     for field in dataclasses.fields(part):
         inner = values[field.name]
         if field.metadata.get("static"):
-            is_simple = isinstance(inner, str | bool | int | float)
-            found[field.name] = inner if is_simple else repr(inner)
+            found[field.name] = _static(inner)
         elif not is_leaf_field(field) and not isinstance(inner, jax.Array | np.ndarray):
             found[field.name] = structure(inner)
     return found
+
+
+def _static(value: Any) -> Any:
+    """A static field; of a function its name, as its code is in the digest of the program."""
+    if isinstance(value, str | bool | int | float):
+        return value
+    if isinstance(value, tuple):
+        return [_static(x) for x in value]
+    if callable(value):
+        return modules.name_of(value)
+    return repr(value)
 
 
 def values_of(scenario: Scenario) -> dict[str, Any]:
@@ -68,12 +78,16 @@ def values_of(scenario: Scenario) -> dict[str, Any]:
     return {p.path: np.asarray(p.value).tolist() for p in parameters(scenario, named=False)}
 
 
-def program_digest(prepared: PreparedStudy) -> str:
-    """A digest of the traced program, which changes with the code of a law, a robot or a metric."""
+def _digest(prepared: PreparedStudy) -> str:
+    """The digest of the program of a block, which changes with the code of a law, a robot or a
+    metric; of a program that cannot be described, a text that no other store has.
+    """
     inputs = prepared.inputs_of(np.arange(block_size()))
     traced = _execute.trace(prepared.shared, inputs, program=prepared.program)
-    text = re.sub(r"0x[0-9a-f]+", "", str(traced.jaxpr))
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
+    try:
+        return program_digest(traced)
+    except CallsPythonError as error:
+        return f"calls Python by {error}, {secrets.token_hex(8)}"
 
 
 def describe(prepared: PreparedStudy, points: Points, design: str) -> dict[str, Any]:
@@ -124,5 +138,5 @@ def describe(prepared: PreparedStudy, points: Points, design: str) -> dict[str, 
             "jax": jax.__version__,
             "jaxlib": jaxlib.__version__,
         },
-        "program": program_digest(prepared),
+        "program": _digest(prepared),
     }

@@ -219,9 +219,11 @@ def _run(
     search: Search, mode: str, iterations: int, checkpoint: Path | None, options: SearchOptions
 ) -> str:
     """Runs a search, from its checkpoint if there is one; returns why it ended."""
-    mark = fingerprint(search.evaluate.problem, search.solver, mode, iterations)
-    if checkpoint is not None and checkpoint.exists():
-        load_checkpoint(checkpoint, search, mark)
+    mark = ""
+    if checkpoint is not None:
+        mark = fingerprint(search.evaluate, search.solver, mode, iterations)
+        if checkpoint.exists():
+            load_checkpoint(checkpoint, search, mark)
     with bar(options.show, iterations, int(search.state["iteration"]), unit="steps") as shown:
         unit = unit_text(search.evaluate.problem.scenario, POSITION)
 

@@ -20,8 +20,10 @@ import optax
 
 from iblf_jax.core import checks
 from iblf_jax.core.optional import has_members
+from iblf_jax.core.program_digest import CallsPythonError, program_digest
 from iblf_jax.core.pytree import field_values
-from iblf_jax.tuning.problem import TuningProblem
+from iblf_jax.studies.store_config import structure
+from iblf_jax.tuning.evaluation import Evaluator
 from iblf_jax.tuning.search import Search
 from iblf_jax.tuning.solvers import Solver
 
@@ -29,8 +31,44 @@ NOT_PART_OF_THE_PROBLEM = ("patience",)
 """Options with which a search may be continued that began with others."""
 
 
-def fingerprint(problem: TuningProblem, solver: Solver, mode: str, iterations: int) -> str:
-    """A hash of everything that a checkpoint must agree with."""
+def fingerprint(evaluate: Evaluator, solver: Solver, mode: str, iterations: int) -> str:
+    """A hash of everything that a checkpoint must agree with.
+
+    Args:
+      evaluate: the problem. Its numbers and its program are part of the hash: names of classes
+        would not tell that the code of a user has changed.
+      solver: its class and its options are part of the hash.
+      mode: of differentiation.
+      iterations: of the search, which a schedule depends on.
+
+    Raises:
+      ValueError: the program calls functions of Python while it runs.
+    """
+    parts = [
+        described_solver(solver, iterations),
+        mode,
+        structure(evaluate.problem),
+        _program_of_problem(evaluate),
+    ]
+    digest = hashlib.sha256(repr(parts).encode())
+    for x in jax.tree.leaves((evaluate.problem, evaluate.candidates)):
+        digest.update(f"{np.shape(x)} ".encode() + np.asarray(x).tobytes())
+    return digest.hexdigest()
+
+
+def _program_of_problem(evaluate: Evaluator) -> str:
+    """The digest of the program that computes value and derivatives."""
+    try:
+        return program_digest(evaluate.traced())
+    except CallsPythonError as error:
+        remedy = f"It has a {error}: what that computes cannot be compared. Leave checkpoint out."
+        raise checks.fail(
+            "checkpoint", checks.Words("a program that calls Python"), "a compiled program", remedy
+        ) from error
+
+
+def described_solver(solver: Solver, iterations: int) -> tuple[str, dict[str, Any]]:
+    """The name of a solver and its options."""
     options: dict[str, Any] = {}
     if dataclasses.is_dataclass(solver):
         options = field_values(solver)
@@ -41,11 +79,7 @@ def fingerprint(problem: TuningProblem, solver: Solver, mode: str, iterations: i
             options[name] = _program_of(value)
     if "schedule" in options:
         options["iterations"] = iterations  # a schedule ends with the last step
-    leaves, structure = jax.tree.flatten(problem)
-    digest = hashlib.sha256(repr((structure, solver.name, mode, options)).encode())
-    for x in leaves:
-        digest.update(np.asarray(x).tobytes() + str(np.shape(x)).encode())
-    return digest.hexdigest()
+    return solver.name, options
 
 
 def _program_of(optimiser: Any) -> str:
@@ -55,8 +89,7 @@ def _program_of(optimiser: Any) -> str:
     w = jnp.zeros(1)
     update = optax.with_extra_args_support(optimiser).update
     with jax.numpy_dtype_promotion("standard"):  # optax mixes integers of several types
-        program = jax.make_jaxpr(update)(w, optimiser.init(w), w, value=w[0])
-    return f"{program} {program.consts}"
+        return program_digest(jax.jit(update).trace(w, optimiser.init(w), w, value=w[0]))
 
 
 def _named_leaves(state: Any) -> dict[str, np.ndarray]:

@@ -363,6 +363,11 @@ class Evaluator:
             return found
         return _scattered(found, active, len(z))
 
+    def traced(self) -> Any:
+        """The program of value and derivatives of a group of starts, traced."""
+        group = jax.tree.map(lambda x: np.asarray(x)[: self.group], self.candidates)
+        return self.derivatives.trace(self.problem, group)
+
     def values(self, z: np.ndarray) -> Value:
         """Value at any number of points z, (N, p), on the problem's own runs, without
         derivatives.

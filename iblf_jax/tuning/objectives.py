@@ -39,7 +39,7 @@ import numpy as np
 
 from iblf_jax.core import checks, notices
 from iblf_jax.core.joints import Selection, holds_weights, indices, selection
-from iblf_jax.core.pytree import component, leaf, static
+from iblf_jax.core.pytree import component, leaf, note_code, static
 from iblf_jax.engine import Outer as Outer
 from iblf_jax.simulation.metrics import Fold, Settling, Tracking, check_needs
 from iblf_jax.simulation.scenario import Scenario, fit_joints
@@ -209,6 +209,7 @@ def checked(objective: Any) -> Objective:
     if isinstance(objective, Requirement):
         objective = Objective((), (objective,))
     if isinstance(objective, Objective) and objective.terms:
+        note_code(objective)
         return objective
     remedy = "Such as ij.objectives.tracking() + 0.1 * ij.objectives.effort()."
     if isinstance(objective, str):

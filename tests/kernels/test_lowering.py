@@ -235,8 +235,10 @@ def lowered_function(f, *arrays):
         )
         values += x.ravel().tolist()
     (out,) = closed(b, jaxpr, operands)
-    p = program.finished(b, [], [], [])._replace(
-        nodes=tuple(b.nodes), carry=tuple((-1, int(i)) for i in out.ravel())
+    p = dataclasses.replace(
+        program.finished(b, [], [], []),
+        nodes=tuple(b.nodes),
+        carry=tuple((-1, int(i)) for i in out.ravel()),
     )
     return np.asarray(evaluate(p, [], [], [np.asarray(v) for v in values], 0)).reshape(out.shape)
 

@@ -14,7 +14,7 @@ from iblf_jax import objectives
 from iblf_jax.engine import thresholds
 from iblf_jax.engine.derivatives import DerivativeSizes, choose_derivatives
 from iblf_jax.tuning import LBFGS, Adam, Optax, SearchSpace, TuningProblem, evaluation
-from iblf_jax.tuning.checkpoints import fingerprint
+from iblf_jax.tuning.checkpoints import described_solver
 from iblf_jax.tuning.evaluation import Derivatives, Value
 from iblf_jax.tuning.parameters import Box
 from iblf_jax.tuning.problem import Candidate
@@ -265,7 +265,7 @@ def test_options_that_do_not_fit_are_refused(solver, words):
 
 def test_a_checkpoint_knows_the_numbers_of_an_optimiser():
     marks = [
-        fingerprint(None, Optax(optax.chain(optax.clip(1.0), optax.lion(rate))), "reverse", 60)
+        described_solver(Optax(optax.chain(optax.clip(1.0), optax.lion(rate))), 60)
         for rate in (1e-3, 1e-3, 2e-3)
     ]
     assert marks[0] == marks[1] != marks[2]

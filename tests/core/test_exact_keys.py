@@ -1,0 +1,184 @@
+"""Keys of structures: two values that can make two programs have two keys."""
+
+from __future__ import annotations
+
+import functools
+import pickle
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import iblf_jax as ij
+from iblf_jax.core.exact_keys import exact_key
+
+FACTOR = 2.0
+TABLE = np.array([0.0, 1.0])
+
+
+def from_a_global(x):
+    return FACTOR * x
+
+
+def from_a_table(x):
+    return TABLE[0] * x
+
+
+def of_another_function(x):
+    return from_a_global(x)
+
+
+def capturing(value):
+    return lambda x: value * x
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        (1, 1.0),
+        (1, True),
+        (0.0, -0.0),
+        (1.0, np.float64(1.0)),
+        (np.float32(1.0), np.float64(1.0)),
+        ((1, (2, 0.0)), (1, (2, -0.0))),
+        ("1", 1),
+        ((), None),
+        (functools.partial(max, 1), functools.partial(max, 1.0)),
+    ],
+)
+def test_equal_values_of_two_kinds_have_two_keys(one, other):
+    assert exact_key(one) != exact_key(other)
+
+
+@pytest.mark.parametrize("value", [1, 0.0, "a", (1, (2.0, "b")), None, float, np.dtype("int32")])
+def test_a_value_has_one_key(value):
+    copy = pickle.loads(pickle.dumps(value))
+    assert exact_key(value) == exact_key(copy)
+    assert hash(exact_key(value)) == hash(exact_key(copy))
+
+
+@pytest.mark.parametrize("function", [from_a_global, of_another_function])
+def test_a_global_variable_of_a_function_is_part_of_its_key(function, monkeypatch):
+    before = exact_key(function)
+    assert exact_key(function) == before
+    monkeypatch.setitem(globals(), "FACTOR", 3.0)
+    assert exact_key(function) != before
+
+
+def test_an_array_that_changes_in_place_changes_the_key(monkeypatch):
+    monkeypatch.setitem(globals(), "TABLE", np.array([0.0, 1.0]))
+    captured = np.ones(3)
+    functions = from_a_table, capturing(captured)
+    before = [exact_key(f) for f in functions]
+    TABLE[0] = 5.0
+    captured[1] = 5.0
+    assert not any(exact_key(f) == key for f, key in zip(functions, before, strict=True))
+
+
+def test_what_a_closure_captures_is_part_of_its_key():
+    value = 1.0
+
+    def scaled(x):
+        return value * x
+
+    before = exact_key(scaled)
+    value = 2.0
+    assert exact_key(scaled) != before
+
+
+def test_a_second_rule_of_differentiation_changes_the_key():
+    @jax.custom_jvp
+    def square(x):
+        return x * x
+
+    @square.defjvp
+    def first(primals, tangents):
+        return square(*primals), 2.0 * primals[0] * tangents[0]
+
+    def user(x):
+        return square(x)
+
+    before = exact_key(user)
+
+    @square.defjvp
+    def second(primals, tangents):
+        return square(*primals), 3.0 * primals[0] * tangents[0]
+
+    assert exact_key(user) != before
+
+
+def test_functions_that_call_each_other_have_a_key():
+    def even(n):
+        return n == 0 or odd(n - 1)
+
+    def odd(n):
+        return n != 0 and even(n - 1)
+
+    assert exact_key(even) == exact_key(even)
+    assert exact_key(even) != exact_key(odd)
+
+
+# --- components ---
+
+
+@ij.component
+class Push:
+    """A constant torque, by a factor that is structure."""
+
+    factor: object = ij.static(default=1.0)
+
+    def torque(self, t, q, dq, plant, model):
+        if isinstance(self.factor, bool):
+            return jnp.full_like(q, 7.0)
+        if isinstance(self.factor, int):
+            return jnp.full_like(q, 5.0)
+        return jnp.full_like(q, float(np.copysign(3.0, self.factor)))
+
+    def jump_times(self):
+        return jnp.zeros(0)
+
+
+def disturbance_of(paper, part):
+    """The disturbance of a short run."""
+    scenario = ij.with_parts(paper, disturbance=part)
+    return ij.simulate(scenario, duration=2e-3, dt=1e-3, backend="vmap").disturbance[0, 0]
+
+
+def test_each_value_of_a_static_field_has_its_own_program(paper):
+    runs = {value: [] for value in ("1.0", "1", "True", "0.0", "-0.0")}
+    for value in (*runs, *reversed(runs)):
+        runs[value].append(disturbance_of(paper, Push(factor=eval(value))))
+    first = {value: float(found[0]) for value, found in runs.items()}
+    base = first["1.0"] - 3.0
+    expected = {"1.0": 3.0, "1": 5.0, "True": 7.0, "0.0": 3.0, "-0.0": -3.0}
+    assert first == pytest.approx({value: base + x for value, x in expected.items()})
+    assert all(one == other for one, other in runs.values())
+
+
+def test_a_replaced_method_or_attribute_is_compiled(paper, monkeypatch):
+    class Own(Push):
+        size = 1.0
+
+        def torque(self, t, q, dq, plant, model):
+            return jnp.full_like(q, self.size * FACTOR)
+
+    part = ij.component(Own)()
+    first = disturbance_of(paper, part)
+    monkeypatch.setattr(Own, "size", 2.0)
+    assert disturbance_of(paper, part) - first == pytest.approx(2.0)
+    monkeypatch.setitem(globals(), "FACTOR", 5.0)
+    assert disturbance_of(paper, part) - first == pytest.approx(8.0)
+    monkeypatch.setattr(
+        Own, "torque", lambda self, t, q, dq, plant, model: jnp.full_like(q, self.size)
+    )
+    assert disturbance_of(paper, part) - first == pytest.approx(0.0)
+
+
+def test_a_component_with_functions_is_pickled():
+    plant = ij.plants.StrictFeedback(drift=from_a_global, gain=from_a_table, n=1, order=2)
+    copy = pickle.loads(pickle.dumps(plant))
+    assert jax.tree.structure(copy) == jax.tree.structure(plant)
+    push = pickle.loads(pickle.dumps(Push(factor=2)))
+    assert jax.tree.structure(push) == jax.tree.structure(Push(factor=2))
+    assert jax.tree.structure(push) != jax.tree.structure(Push(factor=2.0))

@@ -1,0 +1,107 @@
+"""Digests of programs: equal ones compute the same."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from iblf_jax.core.program_digest import CallsPythonError, program_digest
+
+TABLE = np.linspace(0.0, 1.0, 2000)
+
+
+def looked_up(table):
+    """A function whose only difference is an entry in the middle of a long table."""
+    return lambda x: jnp.interp(x, jnp.arange(2000.0), table)
+
+
+def scaled(factor):
+    return lambda x: jax.lax.fori_loop(0, 3, lambda i, y: y * factor, x)
+
+
+def with_rule(factor):
+    """A function with a rule of its own, which the derivative reads."""
+
+    @jax.custom_jvp
+    def square(x):
+        return x * x
+
+    square.defjvp(lambda primals, tangents: (square(*primals), factor * tangents[0]))
+    return jax.grad(square)
+
+
+def changed(table):
+    table = table.copy()
+    table[1000] += 1e-12
+    return table
+
+
+CASES = {
+    "a table": (looked_up(TABLE), looked_up(changed(TABLE))),
+    "a number in a loop": (scaled(2.0), scaled(2.0 + 1e-15)),
+    "the sign of a zero": (lambda x: jnp.arctan2(0.0, x), lambda x: jnp.arctan2(-0.0, x)),
+    "a rule of differentiation": (with_rule(2.0), with_rule(3.0)),
+    "a captured array of JAX": (
+        lambda x: x + jnp.asarray(TABLE)[3:5],
+        lambda x: x + jnp.asarray(TABLE)[4:6],
+    ),
+}
+
+
+def digest(function, x=1.0):
+    return program_digest(jax.jit(function).trace(x))
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_programs_that_differ_have_two_digests(case):
+    one, other = CASES[case]
+    assert digest(one) != digest(other)
+    assert digest(one) == digest(one)
+
+
+@pytest.mark.parametrize("call", ["pure_callback", "debug_callback"])
+def test_a_program_that_calls_python_has_no_digest(call):
+    def f(x):
+        if call == "debug_callback":
+            jax.debug.callback(print, x)
+            return x
+        return jax.pure_callback(np.sin, x, x)
+
+    with pytest.raises(CallsPythonError, match="callback"):
+        digest(lambda x: jax.lax.cond(x > 0, f, lambda x: x, x), jnp.ones(()))
+
+
+SCRIPT = """
+import jax
+import iblf_jax as ij
+from iblf_jax.core.program_digest import program_digest
+
+jax.config.update("jax_enable_x64", True)
+scenario = ij.presets.zhang_yan_2024()
+run = lambda k1: ij.simulate(
+    ij.with_parameters(scenario, {"controller.k1": k1}), duration=0.02, dt=1e-3
+).tau
+print(program_digest(jax.jit(run).trace(1.0)))
+"""
+
+
+@pytest.mark.slow
+def test_two_processes_agree():
+    found = [
+        subprocess.run(
+            [sys.executable, "-c", SCRIPT],
+            env={**os.environ, "PYTHONHASHSEED": seed},
+            check=True,
+            capture_output=True,
+            text=True,
+        ).stdout
+        for seed in ("1", "2")
+    ]
+    assert found[0] == found[1]
+    assert len(found[0].strip()) == 64
