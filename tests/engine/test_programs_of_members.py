@@ -1,0 +1,72 @@
+"""Every member gets its own program: in one process with all others, whatever their order, and in a
+process of its own with what all others have left on the disk.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scenarios_of_members import scenarios
+
+from iblf_jax.engine import native
+
+TESTS = Path(__file__).parents[1]
+ALIKE = [f"barrier {x}" for x in ("tan", "mapping", "prescribed_performance", "state", "log_p3")]
+"""Members whose programs differ in nothing but their operations."""
+
+pytestmark = pytest.mark.skipif(native.unavailable() is not None, reason="no C++ compiler")
+
+
+def answers(lines: list[str], folder: Path, *options: str) -> dict[tuple[str, str], list]:
+    """(member, backend) -> what `member_runs.py` answers, with `folder` as the cache."""
+    environment = os.environ | {
+        "PYTHONPATH": os.pathsep.join([str(TESTS), str(TESTS.parent)]),
+        "XDG_CACHE_HOME": str(folder),
+        "JAX_ENABLE_COMPILATION_CACHE": "1",
+        "PYTHONWARNINGS": "ignore",
+    }
+    done = subprocess.run(
+        [sys.executable, str(TESTS / "member_runs.py"), *options],
+        input="\n".join(lines),
+        env=environment,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    found = [json.loads(line) for line in done.stdout.splitlines()]
+    return {(x["name"], x["backend"]): x["end"] for x in found}
+
+
+def check(names: list[str], folder: Path) -> None:
+    """Compares the compiled run with plain JAX, in one process and in one process a member."""
+    order = [f"{backend} {name}" for name in names for backend in ("auto", "vmap")]
+    random.Random(0 if os.environ.get("CI") else None).shuffle(order)
+    together = answers(order, folder)
+    assert len(together) == len(order)
+    for name in names:
+        one, other = (np.concatenate(together[name, x], axis=None) for x in ("auto", "vmap"))
+        scale = max(1.0, np.abs(other).max())
+        np.testing.assert_allclose(one, other, rtol=0, atol=1e-9 * scale, err_msg=name)
+    apart = answers([f"auto {name}" for name in names], folder, "--apart")
+    assert apart == {key: end for key, end in together.items() if key[1] == "auto"}
+
+
+def test_laws_that_are_alike_have_their_own_programs(tmp_path):
+    check(ALIKE, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("part", range(4))
+def test_every_member_has_its_own_program(tmp_path_factory, part):
+    """In four parts, with one folder in common if one process runs them."""
+    folder = tmp_path_factory.getbasetemp() / "cache of members"
+    names = sorted(scenarios())
+    random.Random(1).shuffle(names)
+    check(names[part::4], folder)

@@ -1,0 +1,48 @@
+"""Runs of the scenarios of members, in processes that are told apart.
+
+Each line of the input names a backend and a member.  The answer is a line of JSON with position,
+velocity and torque at the end of a short run.  With `--apart`, each line gets a process of its own;
+it starts with the package imported, and with nothing computed or compiled.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import warnings
+
+import jax
+
+import iblf_jax as ij
+
+RUN = {"duration": 0.02, "dt": 2e-3}
+
+
+def answer(line: str) -> None:
+    """Runs the scenario that a line names and prints where it ends."""
+    from scenarios_of_members import scenarios  # it computes, which a process that forks must not
+
+    backend, name = line.strip().split(" ", 1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        run = ij.simulate(scenarios()[name](), backend=backend, **RUN)
+    end = [getattr(run, x)[-1].tolist() for x in ("q", "dq", "tau")]
+    print(json.dumps({"name": name, "backend": backend, "end": end}), flush=True)
+
+
+def serve(apart: bool) -> None:
+    """Answers the lines of the input."""
+    for line in sys.stdin:
+        if not apart:
+            answer(line)
+        elif os.fork() == 0:
+            answer(line)
+            os._exit(0)
+        else:
+            os.wait()
+
+
+if __name__ == "__main__":
+    jax.config.update("jax_enable_x64", True)
+    serve("--apart" in sys.argv)

@@ -1,0 +1,121 @@
+"""A scenario for every member of every family: the member in a loop into which it fits."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax.numpy as jnp
+import members
+
+import iblf_jax as ij
+
+PAPER = ij.presets.zhang_yan_2024(reading="corrected")
+CHAIN = ij.presets.motor_driven_two_link()
+FLEXIBLE = ij.presets.flexible_joint_two_link()
+VESSEL = ij.presets.vessel()
+SAMPLING = ij.Sampling(period=2e-3)
+WIDE = ij.Bounds(lower=ij.bounds.Constant(-4.0), upper=ij.bounds.Constant(4.0))
+FAR = ij.Bounds(lower=ij.bounds.Constant(-20.0), upper=ij.bounds.Constant(20.0))
+
+
+def with_velocity_bounds(law: Any) -> ij.Scenario:
+    return ij.with_parts(PAPER, controller=law, velocity_bounds=WIDE)
+
+
+def of_robot(robot: Any) -> ij.Scenario:
+    n = robot.n
+    return ij.Scenario(
+        plant=robot,
+        reference=ij.references.Sinusoid(offset=0.5, amplitude=0.1, frequency=1.0, phase=0.0),
+        bounds=ij.Bounds(lower=ij.bounds.Constant(0.0), upper=ij.bounds.Constant(1.0)),
+        controller=ij.controllers.Backstepping(k1=2.0, K2=20.0),
+        initial=ij.Initial(q=jnp.full(n, 0.45), dq=jnp.zeros(n)),
+    )
+
+
+def of_plant(plant: Any) -> ij.Scenario:
+    n, order = plant.n, plant.order
+    x = jnp.zeros((order, n)).at[0].set(0.45)
+    return ij.Scenario(
+        plant=plant,
+        reference=ij.references.Sinusoid(offset=0.5, amplitude=0.1, frequency=1.0, phase=0.0),
+        bounds=ij.Bounds(lower=ij.bounds.Constant(0.0), upper=ij.bounds.Constant(1.0)),
+        controller=ij.controllers.BarrierBackstepping(k=tuple([2.0] * order)),
+        initial=ij.Initial(x=x),
+    )
+
+
+FITTING: dict[str, Callable[[Any], ij.Scenario]] = {
+    "robot": of_robot,
+    "plant": of_plant,
+    "reference": lambda part: ij.with_parts(PAPER, reference=part, bounds=WIDE),
+    "side": lambda part: ij.with_parts(
+        of_robot(members.TWO_LINK), bounds=ij.Bounds(lower=ij.bounds.Constant(0.0), upper=part)
+    ),
+    "region": lambda part: ij.with_parts(PAPER, regions=(part,)),
+    "disturbance": lambda part: ij.with_parts(PAPER, disturbance=part),
+    "process_noise": lambda part: ij.with_parts(CHAIN, process_noise=part),
+    "barrier": lambda part: ij.with_parts(
+        PAPER, controller=ij.controllers.Backstepping(k1=2.0, K2=20.0, barrier=part)
+    ),
+    "decay": lambda part: ij.with_parts(
+        PAPER,
+        controller=ij.controllers.Backstepping(
+            k1=2.0, K2=20.0, barrier=ij.barriers.Mapping(), decays=(part, part)
+        ),
+    ),
+    "observer": lambda part: ij.with_parts(PAPER, observer=part),
+    "sensor": lambda part: ij.with_parts(PAPER, sensor=part, sampling=SAMPLING),
+    "actuator": lambda part: ij.with_parts(PAPER, actuator=part),
+    "law": lambda part: ij.with_parts(PAPER, controller=part),
+}
+
+
+def sampled(scenario: ij.Scenario, **parts: Any) -> ij.Scenario:
+    return ij.with_parts(scenario, sampling=SAMPLING, **parts)
+
+
+def estimated(part: Any) -> ij.Scenario:
+    """A robot whose velocity is not measured."""
+    observer = ij.observers.StateObserver(bandwidth=40.0, measured=(1,))
+    law = ij.controllers.BarrierBackstepping(k=(2.0, 20.0))
+    return sampled(PAPER, sensor=part, observer=observer, controller=law)
+
+
+SPECIAL: dict[str, Callable[[Any], ij.Scenario]] = {
+    "plant neighbour_model": lambda part: ij.with_parts(
+        of_plant(members.PAIR),
+        model=part,
+        controller=ij.controllers.BarrierBackstepping(k=(2.0, 2.0), filter=0.01),
+    ),
+    "reference ellipse": lambda part: ij.with_parts(VESSEL, reference=part, bounds=FAR),
+    "region half_space_of_the_elbow": lambda part: ij.with_parts(
+        of_robot(members.ROBOTS["arm"]), regions=(dataclasses.replace(part, offset=-2.0),)
+    ),
+    "region sphere_inside": lambda part: ij.with_parts(
+        of_robot(members.ROBOTS["arm"]), regions=(part,)
+    ),
+    "observer level": lambda part: ij.with_parts(CHAIN, observer=part),
+    "observer state_observer": lambda part: ij.with_parts(FLEXIBLE, observer=part),
+    "observer state_observer_two_encoders": lambda part: ij.with_parts(FLEXIBLE, observer=part),
+    "sensor levels": lambda part: sampled(CHAIN, sensor=part),
+    "sensor levels_encoders": lambda part: sampled(FLEXIBLE, sensor=part),
+    "sensor levels_unmeasured": estimated,
+    "law full_state": with_velocity_bounds,
+    "law full_state_mixed": with_velocity_bounds,
+    "law with_drive": lambda part: ij.with_parts(CHAIN, controller=part, model=part.drive.robot),
+}
+"""Members that fit into a loop of their own."""
+
+
+def scenarios() -> dict[str, Callable[[], ij.Scenario]]:
+    """Name of a member -> function that makes its scenario."""
+    found = {}
+    for family, make in FITTING.items():
+        for name, part in members.FAMILIES[family][0].items():
+            fitting = SPECIAL.get(f"{family} {name}", make)
+            found[f"{family} {name}"] = partial(fitting, part)
+    return found
