@@ -11,6 +11,7 @@ results are the same.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -27,7 +28,6 @@ from iblf_jax.engine.compile import (
     first_that_works,
     inputs_of,
     plan_of_single_run,
-    run_by_scan,
     shapes_of,
     single_batch,
     structural_part,
@@ -35,7 +35,6 @@ from iblf_jax.engine.compile import (
 from iblf_jax.engine.linearization import Linearization
 from iblf_jax.engine.loops import kernel_loop, scan
 from iblf_jax.engine.outcome import Outcome
-from iblf_jax.engine.plan import BatchLayout
 from iblf_jax.engine.registry import Executor
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.time_step import TimeStep
@@ -69,7 +68,7 @@ def run_one(
     request = request._replace(backend="auto")
 
     def attempt(executor: Executor) -> Outcome:
-        parts = Parts(executor.name, structure, execution.layout)
+        parts = Parts(executor.name, structure)
         try:
             with compilers_stopped_on_error():
                 return _run_by_executor(parts, nodes, request, leaves)
@@ -79,7 +78,7 @@ def run_one(
             raise
 
     def by_scan() -> Outcome:
-        return _run_by_scan(structure, execution.scan_layout, request, leaves)
+        return _run_by_scan(structure, execution.rolled, request, leaves)
 
     backends = tuple(
         name
@@ -98,11 +97,10 @@ class Parts(NamedTuple):
     """Name of the executor."""
     structure: Any
     """Tree structure of the `Inputs`."""
-    layout: BatchLayout
 
     def batch(self, leaves: list, request: RunRequest) -> Batch:
         """The batch of one run."""
-        return single_batch(jax.tree.unflatten(self.structure, leaves), request, self.layout)
+        return single_batch(jax.tree.unflatten(self.structure, leaves), request)
 
     @property
     def executor(self) -> Executor:
@@ -190,6 +188,6 @@ def _finalize(
 
 
 @programs.jit(static_argnums=(0, 1, 2))
-def _run_by_scan(structure: Any, layout: BatchLayout, request: RunRequest, leaves: list) -> Outcome:
-    inputs = jax.tree.unflatten(structure, leaves)
-    return run_by_scan(layout, inputs, None, lambda batch: run_all(scan, batch, request))
+def _run_by_scan(structure: Any, rolled: bool, request: RunRequest, leaves: list) -> Outcome:
+    batch = Batch.of(jax.tree.unflatten(structure, leaves), None)
+    return run_all(partial(scan, rolled=rolled), batch, request)

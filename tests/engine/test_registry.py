@@ -146,7 +146,7 @@ def test_where_no_kernel_can_be_compiled_auto_runs_by_the_scan(scenario, monkeyp
 def test_one_place_falls_back(monkeypatch, failures, tried, result):
     """To the next executor where one is not available, to the scan where a step does not lower."""
     monkeypatch.setattr(registry, "EXECUTORS", {"one": "one", "two": "two"})
-    execution = plan.ExecutionPlan(("one", "two"), plan.PLAIN_LAYOUT, plan.PLAIN_LAYOUT, False)
+    execution = plan.ExecutionPlan(("one", "two"), reports_unsupported=False)
     calls = []
 
     def attempt(name):
