@@ -52,6 +52,10 @@ WARNINGS = "backend warnings"
 """Topic of `CACHE` for the warnings that this process has shown."""
 
 
+OUT_OF_MEMORY = "RESOURCE_EXHAUSTED"
+"""XLA's word for a lack of memory, which another executor does not mend."""
+
+
 def _warn_once(text: str) -> None:
     if CACHE.mark(WARNINGS, text):
         notices.warn(text, BackendWarning)
@@ -64,8 +68,9 @@ def first_that_works(
 
     Args:
       execution: the plan.
-      attempt: function of an executor; it raises ToolchainError if the executor is not available,
-        and UnsupportedError if the executor cannot express the step.
+      attempt: function of an executor; it raises ToolchainError if the executor is not available
+        or a compiled program cannot be loaded (`building`), and UnsupportedError if the executor
+        cannot express the step.
       by_scan: function without arguments.
     """
     for text in execution.warnings:
@@ -124,12 +129,17 @@ def plan_of_batch(
 
 
 @contextlib.contextmanager
-def compilers_stopped_on_error() -> Iterator[None]:
-    """Context manager that stops the compilers in the background if its body raises."""
+def building() -> Iterator[None]:
+    """Context manager of an attempt to run by an executor.  If its body raises, the compilers in
+    the background stop.  A ToolchainError replaces an error of XLA, which could not compile or load
+    a program; a lack of memory remains one.
+    """
     try:
         yield
-    except BaseException:
+    except BaseException as error:
         stop_compilers()
+        if isinstance(error, jax.errors.JaxRuntimeError) and OUT_OF_MEMORY not in str(error):
+            raise ToolchainError(f"XLA failed: {str(error).splitlines()[0][:200]}") from error
         raise
 
 
@@ -185,7 +195,7 @@ def run_by_executor(
     """
     if executor.start_build:
         start_build(executor, time_step_program(batch, request))
-    with compilers_stopped_on_error():
+    with building():
         return run(kernel_loop(executor), batch)
 
 
@@ -258,7 +268,7 @@ def compiled_plan(
     def build(executor: Executor) -> tuple[str, ...]:
         linearization, step = on_shapes(programs, arguments)
         start_build(executor, step)
-        with compilers_stopped_on_error():
+        with building():
             executor.build(*linearization)
             executor.build(*step)
         return (executor.name,)

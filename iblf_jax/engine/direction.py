@@ -24,7 +24,7 @@ from iblf_jax.engine import registry
 from iblf_jax.engine.adjoint import Cotangents, ReverseRun
 from iblf_jax.engine.batch import Batch, Leaves, run_all
 from iblf_jax.engine.columns import ACCURACY, along_direction, floats_of
-from iblf_jax.engine.compile import compilers_stopped_on_error, first_that_works, shapes_of
+from iblf_jax.engine.compile import building, first_that_works, shapes_of
 from iblf_jax.engine.loops import kernel_loop, scan
 from iblf_jax.engine.plan import ExecutionPlan
 from iblf_jax.engine.registry import Executor
@@ -251,7 +251,7 @@ def _gradient_by_kernel(
     run = ReverseRun(registry.EXECUTORS[runs.backend], runs.batch(leaves), places, runs.request)
     if not run.is_supported():
         raise UnsupportedError("its step is too long to compile the adjoint")
-    with compilers_stopped_on_error():
+    with building():
         return run.backward(run.stored()[0], Cotangents(of_metrics, of_records))
 
 

@@ -31,8 +31,8 @@ from iblf_jax.engine.batch import (
 from iblf_jax.engine.carry import Inputs
 from iblf_jax.engine.columns import numbers_of, outer_vectors, run_by_columns
 from iblf_jax.engine.compile import (
+    building,
     compiled_plan,
-    compilers_stopped_on_error,
     first_that_works,
     inputs_of,
     operations,
@@ -154,7 +154,7 @@ class CompiledBatch(NamedTuple):
 
         def attempt(executor: Executor) -> dict[str, jax.Array]:
             batch = Batch.of(inputs, varied, request.constants)
-            with compilers_stopped_on_error():
+            with building():
                 return run(kernel_loop(executor), batch)
 
         def by_scan() -> dict[str, jax.Array]:
@@ -292,7 +292,7 @@ def run_batch_vjp(
         run = ReverseRun(executor, batch, places, request)
         if not run.is_supported():
             return by_scan()
-        with compilers_stopped_on_error():
+        with building():
             run.start_build(metrics)
             outcome, stored = run.forward()
 

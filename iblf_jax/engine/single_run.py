@@ -24,7 +24,7 @@ from iblf_jax.engine import registry, thresholds
 from iblf_jax.engine.batch import Batch, StepLoop, finalize, initialize, run_all
 from iblf_jax.engine.carry import Carry
 from iblf_jax.engine.compile import (
-    compilers_stopped_on_error,
+    building,
     first_that_works,
     inputs_of,
     plan_of_single_run,
@@ -70,7 +70,7 @@ def run_one(
     def attempt(executor: Executor) -> Outcome:
         parts = Parts(executor.name, structure)
         try:
-            with compilers_stopped_on_error():
+            with building():
                 return _run_by_executor(parts, nodes, request, leaves)
         except ToolchainError as error:
             if not isinstance(error, StoppedError):

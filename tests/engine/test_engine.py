@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import warnings
 from functools import partial
 
 import jax
@@ -127,6 +128,26 @@ def test_a_state_frozen_at_the_last_step_is_no_flag(paper):
         outcome(fast._replace(steps=jnp.asarray(40.0)), RunRequest(40, "euler")).status
         & Status.NOT_FINITE
     )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("throw", [False, True])
+def test_a_failed_run_is_not_reported_inside_a_transformation(short_loop, throw):
+    """Its status is a number under `jacfwd`, and its metrics are traced."""
+    failing = {"duration": 0.02, "dt": 1e-3, "method": "euler", "throw": throw, "backend": "vmap"}
+    fast = ij.with_parameters(short_loop, {"initial.dq": [30.0, 0.0]})
+
+    def margin(Kp):
+        return ij.simulate(
+            ij.with_parameters(fast, {"controller.Kp": Kp}), **failing
+        ).metrics.margin
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        slope = jax.jacfwd(margin)(jnp.asarray([60.0, 60.0]))
+    assert np.all(np.isfinite(slope)) and slope.shape == (2, 2)
+    with pytest.raises(ij.SimulationError, match="left its bounds"):
+        ij.simulate(fast, **{**failing, "throw": True})
 
 
 @pytest.mark.slow
