@@ -169,8 +169,7 @@ def solve(matrix: jax.Array, rhs: jax.Array) -> jax.Array:
     """The solution X of matrix X = rhs, (m, k), for any (m, m) matrix, by Gauss-Jordan elimination
     with pivoting.
 
-    It is for operations that occur once per run: a loop over the columns compiles quickly, and a
-    library call would prevent the run from being compiled as one machine function.
+    It is for operations that occur once per run: a loop over the columns compiles quickly.
     """
     rows = jnp.arange(len(matrix))
 

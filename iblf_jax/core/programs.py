@@ -27,6 +27,8 @@ from typing import Any
 
 import jax
 
+from iblf_jax.core import devices
+
 MAPS, MAX_MAPS = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
 COMPILE_EVENT = "/jax/core/compile/backend_compile_duration"
 """JAX's event of a program that is compiled, or read from the disk."""
@@ -37,6 +39,8 @@ MAPS_OF_A_PROGRAM = 300
 """Approximate largest number of maps of a program: a step of an arm's closed loop has 250."""
 
 
+UNOPTIMISED = {"xla_backend_optimization_level": 0}
+"""Compiler options of a program that is not optimised."""
 MAX_PROGRAMS = 512
 """Programs that are kept.  `simulate` uses five for a scenario, a study two, `certify` twelve."""
 
@@ -113,11 +117,13 @@ class StructuredFunction:
         programs: Programs,
         static_argnums: tuple[int, ...] = (),
         static_argnames: tuple[str, ...] = (),
+        optimised: bool = True,
     ) -> None:
         self._function = function
         self._programs = programs
         self._static_argnums = static_argnums
         self._static_argnames = static_argnames
+        self._optimised = optimised
         update_wrapper(self, function)
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
@@ -166,11 +172,15 @@ class StructuredFunction:
         def copy(*args: Any, **kwargs: Any) -> Any:
             return function(*args, **kwargs)
 
+        options = None
+        if not self._optimised and devices.platform() == "cpu":
+            options = UNOPTIMISED
         # JAX finds the positions of static arguments by their names if only the names are given.
         return jax.jit(
             copy,
             static_argnums=self._static_argnums or None,
             static_argnames=self._static_argnames or None,
+            compiler_options=options,
         )
 
 
@@ -183,6 +193,7 @@ def jit(
     *,
     static_argnums: int | Sequence[int] = (),
     static_argnames: str | Sequence[str] = (),
+    optimised: bool = True,
 ) -> Any:
     """As `jax.jit`, for a function of many structures (head of this module); also a decorator with
     options.
@@ -191,12 +202,14 @@ def jit(
       function: the function.
       static_argnums: positions of arguments that are compiled in; they are hashable.
       static_argnames: names of keyword arguments that are compiled in.
+      optimised: whether XLA optimises the program on a CPU; one that runs for less time than it
+        compiles compiles sooner without.
     """
     numbers = (static_argnums,) if isinstance(static_argnums, int) else tuple(static_argnums)
     names = (static_argnames,) if isinstance(static_argnames, str) else tuple(static_argnames)
 
     def decorated(function: Callable) -> StructuredFunction:
-        return StructuredFunction(function, PROGRAMS, numbers, names)
+        return StructuredFunction(function, PROGRAMS, numbers, names, optimised)
 
     if function is None:
         return decorated

@@ -19,9 +19,7 @@ from iblf_jax.engine.linearization import (
     linearization_at,
     linearization_steps,
 )
-from iblf_jax.engine.machine_function import machine_function
 from iblf_jax.engine.outcome import Outcome, outcome_of
-from iblf_jax.engine.plan import PLAIN_LAYOUT, BatchLayout
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.structural_constants import StructuralConstants
 from iblf_jax.engine.time_step import TimeStep
@@ -103,8 +101,6 @@ class Batch(NamedTuple):
     """The leaves of the `Inputs` of all runs."""
     runs: int | None
     """Number of runs; None for a single run, whose arrays have no run axis."""
-    layout: BatchLayout = PLAIN_LAYOUT
-    """How its parts are compiled."""
     constants: StructuralConstants | None = None
     """The numbers of the scenario that are compiled in."""
 
@@ -112,14 +108,13 @@ class Batch(NamedTuple):
     def of(
         inputs: Inputs,
         varied: Mapping[str, jax.Array] | None,
-        layout: BatchLayout = PLAIN_LAYOUT,
         constants: StructuralConstants | None = None,
     ) -> Batch:
         """A run for every entry of `varied` (path -> values, batch axis first), or one run."""
         if not varied:
-            return Batch(split(inputs, {}), None, layout, constants)
+            return Batch(split(inputs, {}), None, constants)
         runs = jax.tree.leaves(dict(varied))[0].shape[0]
-        return Batch(split(inputs, varied), runs, layout, constants)
+        return Batch(split(inputs, varied), runs, constants)
 
     @property
     def shared_constants(self) -> tuple:
@@ -145,12 +140,7 @@ class Batch(NamedTuple):
 
         if self.runs is None:
             return one([], *args)
-        if self.layout.mapping == "map":
-            return jax.lax.map(lambda each: one(*each), (self.leaves.per_run, *args))
-        all_runs = jax.vmap(one, axis_size=self.runs)
-        if self.layout.machine_functions == "parts":
-            all_runs = machine_function(all_runs)
-        return all_runs(self.leaves.per_run, *args)
+        return jax.vmap(one, axis_size=self.runs)(self.leaves.per_run, *args)
 
 
 StepLoop = Callable[[Any, Batch, Any, int, int | None], tuple[Any, Any]]

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -59,17 +58,11 @@ class Carry(NamedTuple):
     accuracy: error_estimate.Accuracy
 
 
-def _unchanged(function: Callable) -> Callable:
-    return function
-
-
 class StepOptions(NamedTuple):
     """How the code of a step is generated for an executor; the numbers do not depend on it."""
 
     rolled: bool = False
     """Whether the stages of the integrator are a loop."""
-    piece: Callable = _unchanged
-    """Applied to every part of the step that is compiled as a function of its own."""
     scalar: bool = False
     """Whether the step becomes a scalar program, in which equal numbers are computed once."""
 

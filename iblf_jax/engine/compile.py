@@ -23,16 +23,16 @@ from typing import Any, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import Jaxpr, jaxprs_in_params
 
-from iblf_jax.core import devices, notices
+from iblf_jax.core import notices
 from iblf_jax.core.caches import CACHE
 from iblf_jax.engine import plan, registry, thresholds
 from iblf_jax.engine.batch import Batch, StepLoop, carry_shapes, linearization_batch
 from iblf_jax.engine.carry import Inputs
 from iblf_jax.engine.linearization import LinearizationStep, linearization_steps
 from iblf_jax.engine.loops import kernel_loop, program_of
-from iblf_jax.engine.machine_function import count_operations, machine_function
-from iblf_jax.engine.plan import BatchLayout, ExecutionPlan, Sizes, choose_plan
+from iblf_jax.engine.plan import ExecutionPlan, Sizes, choose_plan
 from iblf_jax.engine.registry import Executor, Machine
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.time_step import TimeStep
@@ -52,6 +52,10 @@ WARNINGS = "backend warnings"
 """Topic of `CACHE` for the warnings that this process has shown."""
 
 
+OUT_OF_MEMORY = "RESOURCE_EXHAUSTED"
+"""XLA's word for a lack of memory, which another executor does not mend."""
+
+
 def _warn_once(text: str) -> None:
     if CACHE.mark(WARNINGS, text):
         notices.warn(text, BackendWarning)
@@ -64,8 +68,9 @@ def first_that_works(
 
     Args:
       execution: the plan.
-      attempt: function of an executor; it raises ToolchainError if the executor is not available,
-        and UnsupportedError if the executor cannot express the step.
+      attempt: function of an executor; it raises ToolchainError if the executor is not available
+        or a compiled program cannot be loaded (`building`), and UnsupportedError if the executor
+        cannot express the step.
       by_scan: function without arguments.
     """
     for text in execution.warnings:
@@ -100,7 +105,19 @@ def inputs_of(
 def operations(inputs: Inputs) -> int:
     """Operations of one evaluation of the closed loop."""
     zero = jnp.zeros_like(inputs.dt)
-    return count_operations(evaluate, inputs.scenario, zero, initial_state(inputs.scenario), zero)
+    arguments = (inputs.scenario, zero, initial_state(inputs.scenario), zero)
+    return count_operations(jax.make_jaxpr(evaluate)(*arguments).jaxpr)
+
+
+def count_operations(jaxpr: Jaxpr) -> int:
+    """Number of operations of a jaxpr, including those of its inner functions."""
+    number = 0
+    for operation in jaxpr.eqns:
+        bodies = list(jaxprs_in_params(operation.params))
+        number += sum(map(count_operations, bodies))
+        if not bodies:
+            number += 1
+    return number
 
 
 def plan_of_batch(
@@ -111,36 +128,18 @@ def plan_of_batch(
     return choose_plan(request, Sizes(operations(inputs), runs), machine)
 
 
-def nested_layout(inputs: Inputs) -> BatchLayout:
-    """The layout of a scan that callers may batch, differentiate or loop over."""
-    return plan.scan_layout(devices.platform(), operations(inputs), None, nested=True)
-
-
-def nested_batch(inputs: Inputs) -> Batch:
-    """One run for the scan; callers may batch, differentiate or loop over it."""
-    return Batch.of(inputs, None, nested_layout(inputs))
-
-
-def run_by_scan(
-    layout: BatchLayout, inputs: Inputs, varied: Mapping[str, jax.Array] | None, run: Callable
-) -> Any:
-    """`run(batch)` for the batch of these inputs, in a layout of the scan."""
-
-    def complete(inputs: Inputs, varied: dict[str, jax.Array]) -> Any:
-        return run(Batch.of(inputs, varied, layout))
-
-    if layout.machine_functions == "loop":
-        complete = machine_function(complete)
-    return complete(inputs, dict(varied or {}))
-
-
 @contextlib.contextmanager
-def compilers_stopped_on_error() -> Iterator[None]:
-    """Context manager that stops the compilers in the background if its body raises."""
+def building() -> Iterator[None]:
+    """Context manager of an attempt to run by an executor.  If its body raises, the compilers in
+    the background stop.  A ToolchainError replaces an error of XLA, which could not compile or load
+    a program; a lack of memory remains one.
+    """
     try:
         yield
-    except BaseException:
+    except BaseException as error:
         stop_compilers()
+        if isinstance(error, jax.errors.JaxRuntimeError) and OUT_OF_MEMORY not in str(error):
+            raise ToolchainError(f"XLA failed: {str(error).splitlines()[0][:200]}") from error
         raise
 
 
@@ -196,7 +195,7 @@ def run_by_executor(
     """
     if executor.start_build:
         start_build(executor, time_step_program(batch, request))
-    with compilers_stopped_on_error():
+    with building():
         return run(kernel_loop(executor), batch)
 
 
@@ -263,13 +262,13 @@ def compiled_plan(
     def programs(arguments: Any) -> tuple[StepProgram, StepProgram]:
         scenario, varied, folds, dt = arguments
         inputs = inputs_of(scenario, folds, dt, request)
-        batch = Batch.of(inputs, varied, execution.layout, request.constants)
+        batch = Batch.of(inputs, varied, request.constants)
         return _linearization_program(batch, request), time_step_program(batch, request)
 
     def build(executor: Executor) -> tuple[str, ...]:
         linearization, step = on_shapes(programs, arguments)
         start_build(executor, step)
-        with compilers_stopped_on_error():
+        with building():
             executor.build(*linearization)
             executor.build(*step)
         return (executor.name,)
@@ -289,10 +288,10 @@ class SingleRunPlan(NamedTuple):
     """Nodes of the scalar program of a step; 0 if it is not lowered."""
 
 
-def single_batch(inputs: Inputs, request: RunRequest, layout: BatchLayout) -> Batch:
+def single_batch(inputs: Inputs, request: RunRequest) -> Batch:
     """A batch of one run: executors need a run axis, so the start is its per-run leaf."""
     start = {"initial.q": inputs.scenario.initial.q[None]}
-    return Batch.of(inputs, start, layout, request.constants)
+    return Batch.of(inputs, start, request.constants)
 
 
 @CACHE.memoised(256)
@@ -313,7 +312,7 @@ def plan_of_single_run(
         return SingleRunPlan(execution, 0)
 
     def program(inputs: Inputs) -> StepProgram:
-        return time_step_program(single_batch(inputs, request, execution.layout), request)
+        return time_step_program(single_batch(inputs, request), request)
 
     try:
         step = on_shapes(program, inputs)

@@ -24,9 +24,9 @@ from iblf_jax.engine import registry
 from iblf_jax.engine.adjoint import Cotangents, ReverseRun
 from iblf_jax.engine.batch import Batch, Leaves, run_all
 from iblf_jax.engine.columns import ACCURACY, along_direction, floats_of
-from iblf_jax.engine.compile import compilers_stopped_on_error, first_that_works, shapes_of
+from iblf_jax.engine.compile import building, first_that_works, shapes_of
 from iblf_jax.engine.loops import kernel_loop, scan
-from iblf_jax.engine.plan import PLAIN_LAYOUT, ExecutionPlan
+from iblf_jax.engine.plan import ExecutionPlan
 from iblf_jax.engine.registry import Executor
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.kernels import UnsupportedError
@@ -52,7 +52,7 @@ class Runs(NamedTuple):
     @property
     def plan(self) -> ExecutionPlan:
         """One executor; no warning reports the scan, which gives the same derivatives."""
-        return ExecutionPlan((self.backend,), PLAIN_LAYOUT, PLAIN_LAYOUT, False)
+        return ExecutionPlan((self.backend,), reports_unsupported=False)
 
     def repeated(
         self, size: int, operands: Sequence[jax.Array], is_batched: Sequence[bool]
@@ -251,7 +251,7 @@ def _gradient_by_kernel(
     run = ReverseRun(registry.EXECUTORS[runs.backend], runs.batch(leaves), places, runs.request)
     if not run.is_supported():
         raise UnsupportedError("its step is too long to compile the adjoint")
-    with compilers_stopped_on_error():
+    with building():
         return run.backward(run.stored()[0], Cotangents(of_metrics, of_records))
 
 

@@ -31,15 +31,13 @@ from iblf_jax.engine.batch import (
 from iblf_jax.engine.carry import Inputs
 from iblf_jax.engine.columns import numbers_of, outer_vectors, run_by_columns
 from iblf_jax.engine.compile import (
+    building,
     compiled_plan,
-    compilers_stopped_on_error,
     first_that_works,
     inputs_of,
-    nested_layout,
     operations,
     plan_of_batch,
     run_by_executor,
-    run_by_scan,
     shapes_of,
     structural_part,
 )
@@ -53,12 +51,7 @@ from iblf_jax.engine.derivatives import (
 from iblf_jax.engine.linearization import jacobian_carry
 from iblf_jax.engine.loops import checkpointed, kernel_loop, program_of, scan
 from iblf_jax.engine.outcome import Outcome
-from iblf_jax.engine.plan import (
-    STATES_LAYOUT,
-    ExecutionPlan,
-    plan_of_jacobians,
-    plan_of_states,
-)
+from iblf_jax.engine.plan import ExecutionPlan, plan_of_jacobians, plan_of_states
 from iblf_jax.engine.registry import Executor
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.structural_constants import constants_of
@@ -104,11 +97,11 @@ def _run_planned(
         return run_all(loop, batch, request)
 
     def attempt(executor: Executor) -> Outcome:
-        batch = Batch.of(inputs, varied, execution.layout, request.constants)
+        batch = Batch.of(inputs, varied, request.constants)
         return run_by_executor(executor, batch, request, run)
 
     def by_scan() -> Outcome:
-        return run_by_scan(execution.scan_layout, inputs, varied, partial(run, scan))
+        return run(partial(scan, rolled=execution.rolled), Batch.of(inputs, varied))
 
     return first_that_works(execution, attempt, by_scan)
 
@@ -160,12 +153,12 @@ class CompiledBatch(NamedTuple):
             return loop(step, batch, carry, request.instants, record_every)[1]
 
         def attempt(executor: Executor) -> dict[str, jax.Array]:
-            batch = Batch.of(inputs, varied, self.execution.layout, request.constants)
-            with compilers_stopped_on_error():
+            batch = Batch.of(inputs, varied, request.constants)
+            with building():
                 return run(kernel_loop(executor), batch)
 
         def by_scan() -> dict[str, jax.Array]:
-            return run_by_scan(self.execution.scan_layout, inputs, varied, partial(run, scan))
+            return run(partial(scan, rolled=self.execution.rolled), Batch.of(inputs, varied))
 
         return first_that_works(self.execution, attempt, by_scan)
 
@@ -224,7 +217,7 @@ def run_batch_jvp(
     execution = plan_of_batch(request, inputs, varied, registry.machine())
 
     def attempt(executor: Executor) -> Tangents:
-        batch = Batch.of(inputs, varied, execution.layout, request.constants)
+        batch = Batch.of(inputs, varied, request.constants)
         method = "together"
         if request.backend == "auto":
             method = choose_derivatives(_derivative_sizes(executor, batch, along, request))
@@ -235,10 +228,8 @@ def run_batch_jvp(
         return run_with_tangents(kernel_loop(executor), batch, along, request)
 
     def by_scan() -> Tangents:
-        def run(batch: Batch) -> Tangents:
-            return run_with_tangents(scan, batch, along, request)
-
-        return run_by_scan(execution.scan_layout, inputs, varied, run)
+        loop = partial(scan, rolled=execution.rolled)
+        return run_with_tangents(loop, Batch.of(inputs, varied), along, request)
 
     return first_that_works(execution, attempt, by_scan)
 
@@ -296,12 +287,12 @@ def run_batch_vjp(
     numbers = {path: varied[path] for path in by}
 
     def attempt(executor: Executor) -> tuple[Outcome, Pullback]:
-        batch = Batch.of(inputs, varied, execution.layout, request.constants)
+        batch = Batch.of(inputs, varied, request.constants)
         places = tuple(np.flatnonzero(split(inputs, numbers).is_per_run).tolist())
         run = ReverseRun(executor, batch, places, request)
         if not run.is_supported():
             return by_scan()
-        with compilers_stopped_on_error():
+        with building():
             run.start_build(metrics)
             outcome, stored = run.forward()
 
@@ -320,11 +311,10 @@ def run_batch_vjp(
         # The derivative contains the step six times: with the stages of the integrator as a loop,
         # the gradient of 8 runs of 500 steps of the paper's loop by 226 weights of a network
         # compiles in 12 s instead of 22 s of processor time, and takes the same time afterwards.
-        layout = nested_layout(inputs)._replace(rolled=True)
+        loop = partial(checkpointed, rolled=True)
 
         def run(numbers: dict[str, jax.Array]) -> tuple[dict[str, jax.Array], Outcome]:
-            batch = Batch.of(inputs, {**varied, **numbers}, layout)
-            outcome = run_all(checkpointed, batch, request)
+            outcome = run_all(loop, Batch.of(inputs, {**varied, **numbers}), request)
             return {name: outcome.metrics[name] for name in metrics}, outcome
 
         _, pullback, outcome = jax.vjp(run, numbers, has_aux=True)
@@ -360,15 +350,14 @@ def _step_states(
 ) -> tuple[Any, Any]:
     inputs = inputs_of(scenario, (), dt, request)
     runs = jax.tree.leaves(carry)[0].shape[0]
-    batch = Batch.of(inputs, None, STATES_LAYOUT, request.constants)._replace(runs=runs)
+    batch = Batch.of(inputs, None, request.constants)._replace(runs=runs)
     execution = plan_of_states(operations(inputs), registry.default_backend())
 
     def by(loop: StepLoop) -> tuple[Any, Any]:
         return loop(step, batch, carry, request.steps, 1)
 
-    return first_that_works(
-        execution, lambda executor: by(kernel_loop(executor)), partial(by, scan)
-    )
+    by_scan = partial(by, partial(scan, rolled=execution.rolled))
+    return first_that_works(execution, lambda executor: by(kernel_loop(executor)), by_scan)
 
 
 def sampled_jacobians(scenario: Scenario, times: jax.Array, states: LoopState) -> jax.Array:
@@ -399,13 +388,12 @@ def _sampled_jacobians(
     scenario = dataclasses.replace(scenario, sampling=sampling)
     inputs = inputs_of(scenario, (), times[0], request)
     starts = {"initial.q": jnp.repeat(scenario.initial.q[None], len(times), axis=0)}
-    batch = Batch.of(inputs, starts, STATES_LAYOUT, request.constants)
+    batch = Batch.of(inputs, starts, request.constants)
     carry = jax.vmap(partial(jacobian_carry, scenario))(times, states)
     execution = plan_of_jacobians(operations(inputs), registry.default_backend())
 
     def by(loop: StepLoop) -> jax.Array:
         return jacobians(loop, batch, carry)
 
-    return first_that_works(
-        execution, lambda executor: by(kernel_loop(executor)), partial(by, scan)
-    )
+    by_scan = partial(by, partial(scan, rolled=execution.rolled))
+    return first_that_works(execution, lambda executor: by(kernel_loop(executor)), by_scan)

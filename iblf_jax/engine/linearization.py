@@ -82,7 +82,7 @@ class LinearizationStep:
 
         def rate_at(y):
             return ravel_pytree(
-                perturbed_rate(inputs.scenario, carry.time, as_state(y), inputs.dt, options.piece)
+                perturbed_rate(inputs.scenario, carry.time, as_state(y), inputs.dt)
             )[0]
 
         plant = as_state(x)

@@ -20,7 +20,6 @@ from iblf_jax.engine import thresholds
 from iblf_jax.engine.batch import Batch, Leaves, StepLoop
 from iblf_jax.engine.carry import StepOptions, keep_if, step_member
 from iblf_jax.engine.linearization import LinearizationStep
-from iblf_jax.engine.machine_function import machine_function
 from iblf_jax.engine.registry import Executor
 from iblf_jax.kernels import (
     EMPTY,
@@ -31,13 +30,13 @@ from iblf_jax.kernels import (
 )
 
 
-def scan(step: Any, batch: Batch, carry: Any, steps: int, every: int | None) -> tuple[Any, Any]:
+def scan(
+    step: Any, batch: Batch, carry: Any, steps: int, every: int | None, *, rolled: bool = False
+) -> tuple[Any, Any]:
     """All steps of all runs by `jax.lax.scan`, for any scenario and device; differentiable in
-    forward and reverse mode.
+    forward and reverse mode.  `rolled`: whether the stages of the integrator are a loop.
     """
-    options = StepOptions(batch.layout.rolled)
-    if batch.layout.machine_functions == "parts":
-        options = options._replace(piece=machine_function)
+    options = StepOptions(rolled)
 
     def one(inputs, carry):
         def of_run(carry, index):
@@ -80,16 +79,16 @@ def _scan_run(step: Callable, carry: Any, steps: int, every: int | None) -> tupl
 
 
 def checkpointed(
-    step: Any, batch: Batch, carry: Any, steps: int, every: int | None
+    step: Any, batch: Batch, carry: Any, steps: int, every: int | None, *, rolled: bool = False
 ) -> tuple[Any, Any]:
     """As `scan` without records, for reverse mode: about 3 T^(1/3) states are in memory at a time.
 
     Three nested loops keep only every T^(2/3)-th state and compute the others again.
     """
     if every is not None or isinstance(step, LinearizationStep):
-        return scan(step, batch, carry, steps, every)
+        return scan(step, batch, carry, steps, every, rolled=rolled)
     inner, blocks = thresholds.checkpoint_edge(steps)
-    options = StepOptions(batch.layout.rolled)
+    options = StepOptions(rolled)
 
     def one(inputs, carry):
         @jax.checkpoint

@@ -27,8 +27,6 @@ class RunRequest(NamedTuple):
     """The numbers of the scenario that are compiled in; None for none."""
     backend: str = "auto"
     """"auto", "vmap" (the scan) or the name of an executor."""
-    nested: bool = False
-    """Whether the caller runs the program inside a loop or a branch of JAX."""
 
     @property
     def instants(self) -> int:

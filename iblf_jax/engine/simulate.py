@@ -63,7 +63,8 @@ def simulate(
         additive, "stochastic_heun".
       record_every: interval of the recorded samples in steps; metrics and status cover every step.
       metrics: the folds to run; None for `iblf_jax.metrics.standard()`.
-      throw: whether to raise instead of warn if the run failed.
+      throw: whether to raise instead of warn if the run failed; inside a transformation of JAX it
+        does neither.
       backend: "native", C code that is built once for a structure and kept on disk; "gpu", the same
         on an NVIDIA GPU; "vmap", JAX without kernels; or "auto", the first of these that JAX's
         default device supports.  Under `jit` or `vmap` of the caller, a run uses JAX without
@@ -93,7 +94,8 @@ def simulate(
     folds = as_folds(metrics, step.dtype, scenario)
     noise = noise_key(jax.random.PRNGKey(seed)) if has_noise(scenario) else None
     result = run_rollout(scenario, folds, step, request, noise)
-    if checks.is_concrete(result.status) and result.status.ndim == 0:
+    # Inside a transformation the status may be a number, while the metrics are traced.
+    if checks.is_concrete(result) and result.status.ndim == 0:
         report(result, steps, throw)
     return result
 

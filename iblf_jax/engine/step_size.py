@@ -22,7 +22,6 @@ from jax.flatten_util import ravel_pytree
 from iblf_jax.control.actuators._base import input_delay
 from iblf_jax.core import checks, notices, programs
 from iblf_jax.core.status import Status, has_flag
-from iblf_jax.engine.machine_function import machine_function
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.engine.single_run import run_one
 from iblf_jax.engine.thresholds import STEP_SIZE_CHUNK
@@ -112,23 +111,15 @@ def _start(scenario: Scenario, dt: jax.Array, steps: jax.Array, *, method: str) 
 def _advanced(
     scenario: Scenario, dt: jax.Array, steps: jax.Array, pair: Pair, *, method: str
 ) -> Pair:
-    """The pair after the next `STEP_SIZE_CHUNK` steps, or after the last one.
+    """The pair after the next `STEP_SIZE_CHUNK` steps, or after the last one."""
+    times = scenario.jump_times()
 
-    It is one machine function, because an iteration of a loop of XLA takes longer than the step of
-    a small arm.
-    """
+    def one(pair, _):
+        after = _one_step(scenario, times, dt, pair, method)
+        goes_on = pair.going & (pair.step < steps)
+        return jax.tree.map(partial(jnp.where, goes_on), after, pair), None
 
-    def chunk(scenario, dt, steps, pair):
-        times = scenario.jump_times()
-
-        def one(pair, _):
-            after = _one_step(scenario, times, dt, pair, method)
-            goes_on = pair.going & (pair.step < steps)
-            return jax.tree.map(partial(jnp.where, goes_on), after, pair), None
-
-        return jax.lax.scan(one, pair, None, STEP_SIZE_CHUNK)[0]
-
-    return machine_function(chunk)(scenario, dt, steps, pair)
+    return jax.lax.scan(one, pair, None, STEP_SIZE_CHUNK)[0]
 
 
 def _one_step(scenario: Scenario, times: jax.Array, dt: jax.Array, pair: Pair, method: str) -> Pair:

@@ -11,23 +11,10 @@ import math
 from iblf_jax.core import checks
 from iblf_jax.kernels import LoweringLimits
 
-# Machine functions (`machine_function`) on a CPU.  Operations are those of a jaxpr.
-SMALL_BATCH = 64
-"""Largest number of runs of a batch that is compiled as one machine function.  From 128 runs on XLA
-refuses some fusions in it."""
-LARGEST_ARRAY = 1 << 13
-"""Entries of the largest array that a machine function computes.  XLA divides larger arrays among
-threads, which it cannot do in a machine function."""
-LARGEST_REDUCED = (1 << 12) - 1
-"""Entries of the largest array that a machine function sums or searches.  XLA refuses 4,096 and
-more, in float32 and in float64."""
+# The scan.  Operations are those of a jaxpr.
 LONG_EVALUATION = 2500
-"""Operations of the longest evaluation of the closed loop that is compiled together with the time
-loop.  A longer one is a machine function that XLA's loop calls, because the compilation time of
-LLVM grows faster than the length of a function.  Two joints take about 700 operations, three 1,500
-and an arm of seven 10,000."""
-MAX_FUNCTION_OPERATIONS = 60_000
-"""Operations of the longest machine function.  LLVM compiles longer ones for minutes."""
+"""Operations of the longest evaluation of the closed loop that the scan writes out once for each
+stage of the integrator."""
 
 # Scalar programs.  Their operations are called nodes.
 MAX_SINGLE_RUN_NODES = 60_000
@@ -127,9 +114,11 @@ def is_within(size: float, limit: float | None) -> bool:
     return limit is None or size <= limit
 
 
-def has_machine_functions(platform: str) -> bool:
-    """Whether XLA compiles machine functions for a platform."""
-    return platform == "cpu"
+def rolls_stages(operations: int) -> bool:
+    """Whether the stages of the integrator are a loop in the scan, for so many operations of the
+    closed loop.
+    """
+    return operations > LONG_EVALUATION
 
 
 def native_build(nodes: int, short_vector: bool) -> tuple[int | None, tuple[str, ...]]:

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -111,7 +110,7 @@ def advance(
     begin = continuous_start
     if inputs.scenario.sampling is not None:
         begin = sampled_start
-    start = begin(inputs, carry, index, method, options.piece(loop))
+    start = begin(inputs, carry, index, method, loop)
     along, times = start.along, start.times
     state = along.state
     first = times.division.pieces[0]
@@ -122,7 +121,7 @@ def advance(
     ahead = jnp.where(times.span.in_run, first.length, jnp.zeros_like(inputs.dt))
     step = jnp.where(index > 0, inputs.dt, jnp.zeros_like(inputs.dt))
     sample = weighed(stepped.aux, times.span.start, 0.5 * (times.behind + ahead), step)
-    begun, accumulators = options.piece(_observed)(inputs, index, start.accumulators, sample)
+    begun, accumulators = _observed(inputs, index, start.accumulators, sample)
     if along.jumps_with_law:
         stepped, accumulators = across_jumps(
             along, first, state, method, stepped, begun, accumulators
@@ -134,7 +133,8 @@ def advance(
         state_after, parts = _with_commands(
             along, method, times.division.pieces, state_after, parts
         )
-    after, status, nearest, estimate = options.piece(partial(_concluded, method))(
+    after, status, nearest, estimate = _concluded(
+        method,
         inputs,
         carry,
         index,

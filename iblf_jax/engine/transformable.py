@@ -28,13 +28,13 @@ from jax.custom_derivatives import SymbolicZero
 
 from iblf_jax.core import checks, programs
 from iblf_jax.core.caches import CACHE
-from iblf_jax.engine import registry
-from iblf_jax.engine.batch import run_all
+from iblf_jax.engine import registry, thresholds
+from iblf_jax.engine.batch import Batch, run_all
 from iblf_jax.engine.columns import ACCURACY, Places, columns, floats_of, numbers_of
 from iblf_jax.engine.compile import (
     first_that_works,
     inputs_of,
-    nested_batch,
+    operations,
     run_by_executor,
 )
 from iblf_jax.engine.derivatives import DerivativeSizes, choose_derivatives
@@ -72,7 +72,8 @@ def run_transformable(
 def _run_by_scan(runs: Runs, *leaves: jax.Array) -> Outcome:
     """The run by the scan."""
     inputs = jax.tree.unflatten(runs.treedef, leaves)
-    return run_all(scan, nested_batch(inputs), runs.request)
+    loop = partial(scan, rolled=thresholds.rolls_stages(operations(inputs)))
+    return run_all(loop, Batch.of(inputs, None), runs.request)
 
 
 @CACHE.memoised(64)

@@ -18,7 +18,6 @@ the signals of the law (alpha, V1, f_hat) keep the values of its last run.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -677,7 +676,6 @@ def perturbed_rate(
     t: jax.Array,
     perturbed: Any,
     dt: jax.Array | None = None,
-    compiled: Callable = lambda function: function,
 ) -> Any:
     """The function whose derivative linearises the loop.
 
@@ -694,7 +692,6 @@ def perturbed_rate(
       perturbed: a `perturbed_state` at t.
       dt: of the step, () [s]. The result does not depend on it; a caller that passes the same
         arguments to `evaluate` elsewhere shares the traced function.
-      compiled: wrapper of functions that are compiled on their own.
     """
     if not isinstance(perturbed, PerturbedState):
         actuator = actuators.smooth(scenario.actuator)
@@ -703,7 +700,7 @@ def perturbed_rate(
         arguments = [scenario, t, perturbed]
         if dt is not None:
             arguments.append(dt)
-        return compiled(evaluate)(*arguments)[0]
+        return evaluate(*arguments)[0]
     sampling: Any = scenario.sampling
     scenario = dataclasses.replace(
         scenario,
@@ -718,8 +715,8 @@ def perturbed_rate(
         controller=controller, observer=observer, sampled=state.sampled._replace(sensor=sensor)
     )
     normal = jnp.zeros((scenario.sensor.draws, scenario.n), t.dtype)
-    after = compiled(run_sampled_law)(scenario, t, state, normal)
+    after = run_sampled_law(scenario, t, state, normal)
     weight = 0.0 if dt is None else dt
-    plant_rate = compiled(evaluate)(scenario, t, state, weight, perturbed.torque)[0]
+    plant_rate = evaluate(scenario, t, state, weight, perturbed.torque)[0]
     memory = (after.controller, after.observer, after.sampled.sensor)
     return PerturbedState(plant_rate, after.sampled.commands[0], memory)

@@ -1,10 +1,11 @@
-"""One time loop for all: the executors and shapes of XLA's loop give the same run, and the plan
-decides between them."""
+"""One time loop for all: the executors and the loops of JAX give the same run, and the plan decides
+between them."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
+import warnings
 from functools import partial
 
 import jax
@@ -15,7 +16,7 @@ import pytest
 import iblf_jax as ij
 from iblf_jax.core import programs
 from iblf_jax.core.status import Status
-from iblf_jax.engine import compile, machine_function, native, plan, registry, thresholds
+from iblf_jax.engine import compile, native, plan, registry, thresholds
 from iblf_jax.engine.batch import Batch, run_all
 from iblf_jax.engine.carry import Inputs
 from iblf_jax.engine.loops import checkpointed, kernel_loop, scan
@@ -44,13 +45,17 @@ def inputs_of(scenario, steps=50, dt=1e-3):
     return Inputs(scenario, as_folds(None, step.dtype), step, jnp.asarray(float(steps)))
 
 
-@partial(jax.jit, static_argnames=("run", "shape", "loop"))
-def all_run(inputs, varied, run, shape, loop):
-    return run_all(loop, Batch.of(inputs, varied, *([shape] if shape else [])), run)
+ROLLED = partial(scan, rolled=True)
+"""The scan with the stages of the integrator as a loop."""
 
 
-def outcome(inputs, run, shape=None, varied=None, loop=scan):
-    return jax.tree.map(np.asarray, all_run(inputs, varied, run, shape, loop))
+@partial(jax.jit, static_argnames=("run", "loop"))
+def all_run(inputs, varied, run, loop):
+    return run_all(loop, Batch.of(inputs, varied), run)
+
+
+def outcome(inputs, run, varied=None, loop=scan):
+    return jax.tree.map(np.asarray, all_run(inputs, varied, run, loop))
 
 
 def assert_same(one, other):
@@ -65,12 +70,8 @@ def assert_same(one, other):
     [RunRequest(50, "heun", 7), RunRequest(50, "euler", 1), RunRequest(50, "euler")],
     ids=lambda run: f"{run.method}-{run.record_every}",
 )
-def test_every_shape_is_the_same_run(short_loop, run):
-    """Runs together and in turn, as one machine function, in parts and left to XLA; alone and in a
-    batch.
-
-    Where every step is recorded, which XLA's own loop does, one of these shapes is looked at.
-    """
+def test_every_loop_makes_the_same_run(short_loop, run):
+    """Alone and in a batch, with the stages of the integrator written out and as a loop."""
     inputs = inputs_of(ij.with_parameters(short_loop, {"initial.dq": [0.3, -0.2]}))
     alone = outcome(inputs, run)
     together = outcome(inputs, run, varied=DRAWS)
@@ -83,22 +84,8 @@ def test_every_shape_is_the_same_run(short_loop, run):
         run,
     )
     assert_same(jax.tree.map(lambda x: x[0], together), first)
-    shapes = (
-        plan.BatchLayout("map", "parts", True),
-        plan.BatchLayout("vmap", "parts", False),
-        plan.BatchLayout("vmap", "none", True),
-    )
-    for shape in shapes[:1] if run.record_every == 1 else shapes:
-        assert_same(outcome(inputs, run, shape, DRAWS), together)
-    whole = jax.jit(
-        lambda inputs: compile.run_by_scan(
-            plan.BatchLayout("vmap", "loop", True),
-            inputs,
-            None,
-            lambda batch: run_all(scan, batch, run),
-        )
-    )(inputs)
-    assert_same(jax.tree.map(np.asarray, whole), alone)
+    assert_same(outcome(inputs, run, DRAWS, ROLLED), together)
+    assert_same(outcome(inputs, run, loop=ROLLED), alone)
     if run.record_every is None:
         assert_same(outcome(inputs, run, loop=checkpointed), alone)
 
@@ -118,10 +105,8 @@ def test_any_explicit_method_is_a_row_of_the_table(short_loop, monkeypatch):
     )
     monkeypatch.setitem(TABLEAUS, "kutta", kutta)
     inputs, run = inputs_of(short_loop), RunRequest(50, "kutta", 10)
-    written_out, rolled = (
-        outcome(inputs, run, plan.BatchLayout("vmap", "none", rolled)) for rolled in (False, True)
-    )
-    assert_same(written_out, rolled)
+    written_out = outcome(inputs, run)
+    assert_same(written_out, outcome(inputs, run, loop=ROLLED))
     if native.unavailable() is None:
         start = {"initial.q": inputs.scenario.initial.q[None]}
         lowered = outcome(inputs, run, varied=start, loop=kernel_loop(registry.NATIVE))
@@ -146,9 +131,29 @@ def test_a_state_frozen_at_the_last_step_is_no_flag(paper):
 
 
 @pytest.mark.slow
-def test_long_loops_are_machine_functions_in_parts(paper, monkeypatch):
-    """By their length alone; a batch from outside and derivatives work as ever."""
-    before = ij.simulate(paper, duration=0.011, dt=1e-3)
+@pytest.mark.parametrize("throw", [False, True])
+def test_a_failed_run_is_not_reported_inside_a_transformation(short_loop, throw):
+    """Its status is a number under `jacfwd`, and its metrics are traced."""
+    failing = {"duration": 0.02, "dt": 1e-3, "method": "euler", "throw": throw, "backend": "vmap"}
+    fast = ij.with_parameters(short_loop, {"initial.dq": [30.0, 0.0]})
+
+    def margin(Kp):
+        return ij.simulate(
+            ij.with_parameters(fast, {"controller.Kp": Kp}), **failing
+        ).metrics.margin
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        slope = jax.jacfwd(margin)(jnp.asarray([60.0, 60.0]))
+    assert np.all(np.isfinite(slope)) and slope.shape == (2, 2)
+    with pytest.raises(ij.SimulationError, match="left its bounds"):
+        ij.simulate(fast, **{**failing, "throw": True})
+
+
+@pytest.mark.slow
+def test_the_stages_of_a_long_loop_are_rolled(paper, monkeypatch):
+    """By its length alone; a batch from outside and derivatives work as ever."""
+    before = ij.simulate(paper, duration=0.011, dt=1e-3, backend="vmap")
     monkeypatch.setattr(thresholds, "LONG_EVALUATION", 0)
     compile.plan_of_single_run.cache_clear()
     try:
@@ -161,7 +166,7 @@ def test_long_loops_are_machine_functions_in_parts(paper, monkeypatch):
                 backend="vmap",
             ).metrics.ise.sum()
 
-        compact = ij.simulate(paper, duration=0.011, dt=1e-3)
+        compact = ij.simulate(paper, duration=0.011, dt=1e-3, backend="vmap")
         K2 = jnp.array([20.0, 30.0])
         slope = jax.grad(ise)(K2)
         values = jax.vmap(ise)(K2[:, None] * jnp.ones(2))
@@ -186,13 +191,13 @@ def test_checkpoints_cover_the_run_with_few_steps_too_many(steps):
 
 
 def test_what_the_plan_says():
-    """A short loop alone is one machine function, a long one goes in parts and in turn, and a
-    caller's own batch is XLA's."""
-    assert plan.scan_layout("cpu", 700, None, False) == ("vmap", "loop", True)
-    assert plan.scan_layout("cpu", 700, 1000, False) == ("vmap", "none", False)
-    assert plan.scan_layout("cpu", 10_000, 1000, False) == ("map", "parts", True)
-    assert plan.scan_layout("cpu", 700, None, True) == ("vmap", "none", False)
-    assert plan.scan_layout("gpu", 10_000, None, False) == ("vmap", "none", True)
+    """The stages of a long loop are a loop in the scan, and "auto" takes what the platform has."""
+    machine = registry.Machine("cpu", ())
+    rolled = [
+        plan.choose_plan(RunRequest(100), plan.Sizes(operations, None), machine).rolled
+        for operations in (700, 10_000)
+    ]
+    assert rolled == [False, True]
     cpu = executors_of("cpu")
     assert cpu("auto") == cpu("native") == ("native",)
     assert executors_of("gpu")("auto") == ("gpu",)
@@ -214,16 +219,15 @@ def executors_of(platform):
 def test_the_length_of_a_function_is_that_of_its_inner_ones():
     inner = jax.jit(lambda x: jnp.sin(x) + jnp.cos(x))
     closed = jax.make_jaxpr(lambda x: inner(x) * inner(2.0 * x))(1.0)
-    assert sum(1 for _ in machine_function._operations(closed.jaxpr)) == 8
-    assert machine_function.count_operations(inner, 1.0) == 3
+    assert compile.count_operations(closed.jaxpr) == 8
+    assert compile.count_operations(jax.make_jaxpr(inner)(1.0).jaxpr) == 3
 
 
-@pytest.mark.parametrize("size", [40, 63, 64, 72])
-def test_large_sums_are_left_to_loops_of_xla(size):
-    """The map of a sampled loop of six joints has 72 rows: XLA refuses to search as many numbers
-    within a machine function."""
+@pytest.mark.parametrize("size", [2, 72])
+def test_the_spectral_radius_is_that_of_the_largest_eigenvalue(size):
+    """The map of a sampled loop of six joints has 72 rows."""
     A = np.random.default_rng(size).standard_normal((size, size))
-    found = jax.jit(machine_function.machine_function(stability.spectral_radius))(A)
+    found = jax.jit(stability.spectral_radius)(A)
     assert float(found) == pytest.approx(np.abs(np.linalg.eigvals(A)).max(), rel=1e-3)
 
 

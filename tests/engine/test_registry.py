@@ -146,7 +146,7 @@ def test_where_no_kernel_can_be_compiled_auto_runs_by_the_scan(scenario, monkeyp
 def test_one_place_falls_back(monkeypatch, failures, tried, result):
     """To the next executor where one is not available, to the scan where a step does not lower."""
     monkeypatch.setattr(registry, "EXECUTORS", {"one": "one", "two": "two"})
-    execution = plan.ExecutionPlan(("one", "two"), plan.PLAIN_LAYOUT, plan.PLAIN_LAYOUT, False)
+    execution = plan.ExecutionPlan(("one", "two"), reports_unsupported=False)
     calls = []
 
     def attempt(name):
@@ -162,6 +162,60 @@ def test_one_place_falls_back(monkeypatch, failures, tried, result):
     assert calls == tried
     missing = [str(x) for x in failures.values() if isinstance(x, ToolchainError)]
     assert len(given) == len(missing), "a step that does not lower is not reported here"
+
+
+def calls_what_xla_does_not_know(program, shared, per_run, carry, *others):
+    """As `native.run`, in a program that XLA cannot load."""
+    shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in carry]
+    carry = type(carry)(*jax.ffi.ffi_call("iblf_jax_unknown", shapes)(*carry))
+    return native.run(program, shared, per_run, carry, *others)
+
+
+def runs_without_its_function(*arguments):
+    """As `native.run`, with a kernel whose function has another name than is looked for."""
+    renamed = (None, ("-DSTRETCH=128", "-DGROUP=32", "-Diblf_jax_kernel=iblf_jax_other"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(native.thresholds, "native_build", lambda *_: renamed)
+        return native.run(*arguments)
+
+
+@pytest.mark.slow
+@needs_compiler
+@pytest.mark.parametrize(
+    ("run", "reason"),
+    [
+        (calls_what_xla_does_not_know, "XLA failed: .*iblf_jax_unknown"),
+        (runs_without_its_function, "a kernel does not load: .*iblf_jax_kernel"),
+    ],
+)
+def test_what_cannot_be_loaded_runs_by_the_scan(scenario, monkeypatch, run, reason):
+    """With one warning, and one attempt in a process."""
+    calls = []
+
+    def counted(*arguments):
+        calls.append("run")
+        return run(*arguments)
+
+    broken = registry.Executor(
+        run.__name__, (devices.platform(),), counted, lambda: None, native.build
+    )
+    monkeypatch.setattr(registry, "EXECUTORS", {broken.name: broken})
+    with pytest.warns(compile.BackendWarning, match=rf"{reason}.*running on vmap") as given:
+        found = ij.simulate(scenario, **SHORT)
+    assert [x.category for x in given] == [compile.BackendWarning]
+    assert calls
+    calls.clear()
+    again = ij.simulate(scenario, **SHORT)
+    assert calls == []
+    expected = ij.simulate(scenario, **SHORT, backend="vmap")
+    np.testing.assert_array_equal(found.q, expected.q)
+    np.testing.assert_array_equal(again.q, expected.q)
+
+
+def test_a_lack_of_memory_is_reported_as_such():
+    """Another executor needs as much."""
+    with pytest.raises(jax.errors.JaxRuntimeError, match="RESOURCE_EXHAUSTED"), compile.building():
+        raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 1 TiB.")
 
 
 def test_a_value_of_shapes_holds_no_arrays():

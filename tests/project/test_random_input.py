@@ -35,7 +35,7 @@ from iblf_jax.core import checks
 from iblf_jax.core.pytree import is_leaf_field
 from iblf_jax.core.status import Status
 from iblf_jax.engine import CompiledBatch, simulate
-from iblf_jax.engine.plan import PLAIN_LAYOUT, ExecutionPlan
+from iblf_jax.engine.plan import ExecutionPlan
 from iblf_jax.files.components import decode_fields
 from iblf_jax.simulation import metrics, paths
 from iblf_jax.simulation.results import Metrics
@@ -509,7 +509,7 @@ def no_runs(monkeypatch):
         "proofs._prove.problem_of",
     ):
         monkeypatch.setattr(f"iblf_jax.{place}", entered)
-    by_scan = ExecutionPlan((), PLAIN_LAYOUT, PLAIN_LAYOUT, True)
+    by_scan = ExecutionPlan((), reports_unsupported=True)
     monkeypatch.setattr(
         "iblf_jax.studies.study_setup.compile_batch",
         lambda request, *_: CompiledBatch(request, by_scan),

@@ -17,7 +17,6 @@ from typing import Any, NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend import core as jax_core
 
 from iblf_jax.core import checks
 from iblf_jax.core.linalg import matvec, solve_gain, solve_spd
@@ -184,8 +183,8 @@ def level_rate(
     own = plant_member(plant, "level_rate")
     if own is not None:
         return own(level, t, x, above, torque)  # type: ignore[no-any-return]
-    gain = _row(plant.gain, t, x, level)
-    return _row(plant.drift, t, x, level) + _times(gain, above)
+    gain = plant.gain(t, x)[level - 1]
+    return plant.drift(t, x)[level - 1] + _times(gain, above)
 
 
 def level_input(
@@ -202,8 +201,8 @@ def level_input(
     own = plant_member(plant, "level_input")
     if own is not None:
         return own(level, t, x, rate, torque)  # type: ignore[no-any-return]
-    gain = _row(plant.gain, t, x, level)
-    rest = rate - _row(plant.drift, t, x, level)
+    gain = plant.gain(t, x)[level - 1]
+    rest = rate - plant.drift(t, x)[level - 1]
     if gain.ndim == 2:
         return solve_gain(gain, rest)
     # NaN, as `solve_gain` gives; a division by 0 would give an infinite input.
@@ -226,28 +225,7 @@ def transposed_gain(
     own = plant_member(plant, "transposed_gain")
     if own is not None:
         return own(level, t, x, s)  # type: ignore[no-any-return]
-    return _times(_row(plant.gain, t, x, level).T, s)
-
-
-def _row(
-    function: Callable[[jax.Array, jax.Array], jax.Array], t: jax.Array, x: jax.Array, level: int
-) -> jax.Array:
-    """One row of drift or gain, without the computation of the others.
-
-    Most plants stack their rows.  The row is then taken before it is stacked, which keeps the
-    program small, and keeps XLA's compiler from simplifying functions whose inputs become unused,
-    at which it aborts (`engine.machine_function`).
-    """
-    traced = jax.make_jaxpr(function)(t, x)
-    jaxpr = traced.jaxpr
-    if not jaxpr.eqns or jaxpr.eqns[-1].outvars != jaxpr.outvars:
-        return function(t, x)[level - 1]
-    last = jaxpr.eqns[-1]
-    if last.primitive.name != "stack" or last.params["axis"] != 0:
-        return function(t, x)[level - 1]
-    one_row = jaxpr.replace(eqns=jaxpr.eqns[:-1], outvars=[last.invars[level - 1]])
-    (row,) = jax_core.jaxpr_as_fun(traced.replace(jaxpr=one_row))(t, x)
-    return row
+    return _times(plant.gain(t, x)[level - 1].T, s)
 
 
 def _times(gain: jax.Array, v: jax.Array) -> jax.Array:

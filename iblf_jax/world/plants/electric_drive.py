@@ -88,7 +88,9 @@ class ElectricDrive:
         if level == 1:
             return rate
         if level == 2:
-            needed = inverse_dynamics(self.robot, x[0], x[1], x[1], rate) - torque
+            # One array for both velocities: robots then compute their products once.
+            q, dq = x[0], x[1]
+            needed = inverse_dynamics(self.robot, q, dq, dq, rate) - torque
             return needed / self.torque_constant
         return self.inductance * rate + self.voltage(x[2], x[1])
 

@@ -107,8 +107,10 @@ class FlexibleJoint:
         if level in (1, 3):
             return rate
         if level == 2:
-            needed = inverse_dynamics(self.robot, x[0], x[1], x[1], rate) - torque
-            return x[0] + needed / self.stiffness
+            # One array for both velocities: robots then compute their products once.
+            q, dq = x[0], x[1]
+            needed = inverse_dynamics(self.robot, q, dq, dq, rate) - torque
+            return q + needed / self.stiffness
         return self.motor_inertia * rate + self._motor_load(x)
 
     def transposed_gain(self, level: int, t: jax.Array, x: jax.Array, s: jax.Array) -> jax.Array:

@@ -67,7 +67,9 @@ class Rigid:
         """The velocity, or the torque, (n,), for which x_i' is `rate`."""
         if level == 1:
             return rate
-        return inverse_dynamics(self.robot, x[0], x[1], x[1], rate) - torque
+        # One array for both velocities: robots then compute their products once.
+        q, dq = x[0], x[1]
+        return inverse_dynamics(self.robot, q, dq, dq, rate) - torque
 
     def transposed_gain(self, level: int, t: jax.Array, x: jax.Array, s: jax.Array) -> jax.Array:
         """G_i^T s, (n,)."""
