@@ -18,6 +18,7 @@ sys.path.append(str(Path(__file__).resolve().parents[1] / "benchmarks"))
 import gallery
 import withdrawn
 from entry import (
+    CHECKS,
     KINDS,
     PUBLISHED,
     READ,
@@ -123,7 +124,7 @@ def benchmark_page(found: list[Part]) -> str:
         " reached within the accuracy to which they can be read, and"
         f" {sum(holds)} of {len(holds)} published statements hold. {corrected} corrections were"
         " necessary, which [a page of its own](literature_corrected.md) lists."
-        " [Adding an entry](add_an_entry.md) describes the steps.",
+        " [Adding an entry](add_an_entry.md) describes the steps." + checked(),
         "## Entries",
         summary(found),
         "The last three columns name the law of the package that has the smallest error at the"
@@ -151,6 +152,20 @@ def benchmark_page(found: list[Part]) -> str:
         *without_table(found),
     ]
     return "\n\n".join(sections) + "\n"
+
+
+def checked() -> str:
+    """What `check.py` found with each version, in sentences; "" if it was not noted."""
+    sentences = []
+    for path in sorted(CHECKS.glob("*.json")):
+        result = json.loads(path.read_text(encoding="utf-8"))
+        entries, machine = result["entries"], result["machine"]
+        correct = sum(not found["to repair"] for found in entries.values())
+        sentences.append(
+            f" With Python {machine['python']} and JAX {machine['jax']} ({machine['date']}),"
+            f" `benchmarks/field/check.py` found {correct} of {len(entries)} entries correct."
+        )
+    return "".join(sentences)
 
 
 def published(found: list[Part]) -> list[tuple[Part, Published]]:

@@ -27,6 +27,7 @@ FOLDER = Path(__file__).resolve().parent
 ROOT = FOLDER.parents[1]
 ENTRIES = FOLDER / "entries"
 RESULTS = FOLDER / "results"
+CHECKS = FOLDER / "checks"
 TEMPLATE = FOLDER / "template"
 
 PUBLISHED = "published law"

@@ -70,6 +70,18 @@ def test_the_command_of_a_scenario_file_runs(capsys):
     assert "status: ok" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("path", sorted(entry.CHECKS.glob("*.json")), ids=lambda path: path.stem)
+def test_the_noted_checks_found_nothing_to_repair(path):
+    entries = json.loads(path.read_text(encoding="utf-8"))["entries"]
+    assert len(entries) >= FEWEST
+    assert not [name for name, found in entries.items() if found["to repair"]]
+    for name, found in entries.items():
+        contents = entry.load(entry.ENTRIES / name)
+        assert set(found["holds"]) == {claim.statement for claim in contents.claims}
+        for number in contents.published:
+            assert entry.is_reached(number, found["reached"][number.quantity])
+
+
 def test_independent_programs_exist():
     assert len(sorted(entry.ENTRIES.glob("*/independent.py"))) >= 20
 
