@@ -114,7 +114,9 @@ def commit() -> str:
     try:
         head = _git("rev-parse", "HEAD")
         # Results that were measured before do not change what is measured.
-        changed = _git("status", "--porcelain", "--", "iblf_jax", "benchmarks", ":!*/results/*")
+        changed = _git(
+            "status", "--porcelain", "--", "iblf_jax", "benchmarks", ":!*/results/*", ":!*/checks/*"
+        )
     except (OSError, subprocess.CalledProcessError) as error:
         return f"unknown: {error}"
     return f"{head} with uncommitted changes" if changed else head
