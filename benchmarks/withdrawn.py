@@ -7,7 +7,7 @@ from __future__ import annotations
 
 REASON = (
     "measured with JAX 0.11.2, with which the package could silently run the program of another"
-    " structure than the one that was asked for"
+    " structure than the requested one"
 )
 BENCHMARKS = ("gpu",)
 """Names in `benchmarks/results`."""
