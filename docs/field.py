@@ -317,6 +317,8 @@ def section(part: Part) -> str:
     reasons = [f"{name}: {escaped(why)}" for name, why in result["not_applicable"].items()]
     if reasons:
         words.append("Not in the table: " + "; ".join(reasons) + ".")
+    for pair in part.contents.equal_rows:
+        words.append(f"{pair.law} and {pair.other} agree. {escaped(pair.reason)}")
     machine = result["machine"]
     where = (
         f"`{result['command']}`; {machine['processor']}, {machine['cores']} cores, Python"

@@ -3,6 +3,7 @@ the programs that are written without the package."""
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shutil
 import sys
@@ -696,6 +697,15 @@ def test_laws_that_lose_their_accuracy_with_noise_are_named_below_the_table(part
     assert words in field.benchmark_page([noisy])
     published["error, noise [rad]"] = "left"
     assert field.noisy_laws([noisy]) == ""
+
+
+def test_the_reason_why_rows_agree_is_above_the_table(parts):
+    (measured,) = (part for part in parts if part.result)
+    pair = entry.EqualRows("A", "B", "The limit is not reached.")
+    agreeing = dataclasses.replace(measured.contents, equal_rows=(pair,))
+    assert "A and B agree." not in field.section(measured)
+    page = field.section(measured._replace(contents=agreeing))
+    assert page.index("A and B agree. The limit is not reached.") < page.index("| law |")
 
 
 def test_the_page_of_an_entry_has_the_numbers_that_decide_its_claims():
