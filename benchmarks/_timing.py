@@ -7,8 +7,10 @@ is repeated in turn (`interleaved`) and the smallest time of each is kept.
 from __future__ import annotations
 
 import json
+import os
 import platform
 import shlex
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -19,6 +21,13 @@ from types import MappingProxyType
 from typing import Any
 
 import jax
+import jaxlib
+import numpy as np
+
+import iblf_jax as ij
+from iblf_jax.kernels import processor
+
+ROOT = Path(__file__).resolve().parents[1]
 
 
 def once(call: Callable[[], Any]) -> float:
@@ -79,10 +88,6 @@ def compiled_side_by_side(
 
 def machine() -> dict[str, str]:
     """What the numbers were measured with (no host names)."""
-    import os
-
-    from iblf_jax.kernels import processor
-
     models = {
         line.partition(":")[2].strip()
         for line in processor().splitlines()
@@ -94,8 +99,33 @@ def machine() -> dict[str, str]:
         "cores": str(os.cpu_count()),
         "python": platform.python_version(),
         "jax": jax.__version__,
+        "jaxlib": jaxlib.__version__,
+        "numpy": np.__version__,
+        "iblf_jax": ij.__version__,
+        "commit": commit(),
         "backend": jax.default_backend(),
     }
+
+
+def commit() -> str:
+    """The commit of the package and of the benchmarks, and whether they were changed since."""
+    if Path(ij.__file__).resolve().parents[1] != ROOT:
+        return "unknown: iblf_jax was imported from another folder than that of the benchmarks"
+    try:
+        head = _git("rev-parse", "HEAD")
+        # Results that were measured before do not change what is measured.
+        changed = _git(
+            "status", "--porcelain", "--", "iblf_jax", "benchmarks", ":!*/results/*", ":!*/checks/*"
+        )
+    except (OSError, subprocess.CalledProcessError) as error:
+        return f"unknown: {error}"
+    return f"{head} with uncommitted changes" if changed else head
+
+
+def _git(*words: str) -> str:
+    """What git prints in the folder of the repository."""
+    call = subprocess.run(["git", *words], cwd=ROOT, check=True, capture_output=True, text=True)
+    return call.stdout.strip()
 
 
 def report(

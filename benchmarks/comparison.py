@@ -17,6 +17,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
+sys.path.append(str(ROOT / "benchmarks"))
+
+import withdrawn
+
 RESULTS = ROOT / "benchmarks" / "results"
 FILES = (ROOT / "README.md", ROOT / "paper" / "paper.md")
 BEGIN, END = "<!-- comparison -->\n", "<!-- end of comparison -->"
@@ -188,12 +192,19 @@ def row(comparison: Comparison) -> str:
 
 
 def table() -> str:
-    """The table as Markdown."""
+    """The table as Markdown, and which rows are withdrawn."""
+    shown = [x for x in COMPARISONS if x.benchmark not in withdrawn.BENCHMARKS]
+    removed = [x.task for x in COMPARISONS if x.benchmark in withdrawn.BENCHMARKS]
     head = [
         "| task | iblf_jax | other software (times better) | measured by |",
         "|---|---|---|---|",
     ]
-    return "\n".join([*head, *map(row, COMPARISONS)]) + "\n"
+    lines = [*head, *map(row, shown)]
+    if removed:
+        names = " and ".join(f'"{task}"' for task in removed)
+        reason = f"because they were {withdrawn.REASON}; they will be measured again."
+        lines += ["", f"The rows {names} are withdrawn, {reason}"]
+    return "\n".join(lines) + "\n"
 
 
 def replaced(text: str) -> str:

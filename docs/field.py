@@ -9,11 +9,16 @@ entry (`gallery.page`).
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import Any, NamedTuple
 
+sys.path.append(str(Path(__file__).resolve().parents[1] / "benchmarks"))
+
 import gallery
+import withdrawn
 from entry import (
+    CHECKS,
     KINDS,
     PUBLISHED,
     READ,
@@ -62,7 +67,12 @@ class Part(NamedTuple):
     computed: dict[str, Any]
     """Of `gallery.page`."""
     result: dict[str, Any] | None
-    """Of `measure.py`; None before the entry is measured."""
+    """Of `measure.py`; None where there is no table."""
+
+    @property
+    def is_withdrawn(self) -> bool:
+        """Whether the table of the entry was removed, and it is not measured again yet."""
+        return self.result is None and self.name in withdrawn.FIELD
 
     @property
     def link(self) -> str:
@@ -114,7 +124,7 @@ def benchmark_page(found: list[Part]) -> str:
         " reached within the accuracy to which they can be read, and"
         f" {sum(holds)} of {len(holds)} published statements hold. {corrected} corrections were"
         " necessary, which [a page of its own](literature_corrected.md) lists."
-        " [Adding an entry](add_an_entry.md) describes the steps.",
+        " [Adding an entry](add_an_entry.md) describes the steps." + checked(),
         "## Entries",
         summary(found),
         "The last three columns name the law of the package that has the smallest error at the"
@@ -123,7 +133,8 @@ def benchmark_page(found: list[Part]) -> str:
         " have an exact model and no disturbance, so that errors tend to zero under every law and"
         " their ratio states how fast." + noisy_laws(measured),
         "## Comparison on each task",
-        "The published law sets the effort: the RMS input above the one that balances gravity. For"
+        f"{len(measured)} of {len(found)} entries have a table. The published law sets the effort:"
+        " the RMS input above the one that balances gravity. For"
         " a plant in strict-feedback form it is the RMS of all inputs, each in its unit, above the"
         " steady input of the plant, which is zero where the plant states none. One factor scales"
         " the gains of every other law to this effort. Before that, the laws have the rates of the"
@@ -137,9 +148,24 @@ def benchmark_page(found: list[Part]) -> str:
         ),
         '"left" is a run that leaves its bounds or diverges, and "step" one for which the time step'
         " of the entry is too large.",
-        *(section(part) for part in found),
+        *(section(part) for part in measured),
+        *without_table(found),
     ]
     return "\n\n".join(sections) + "\n"
+
+
+def checked() -> str:
+    """What `check.py` found with each version, in sentences; "" if it was not noted."""
+    sentences = []
+    for path in sorted(CHECKS.glob("*.json")):
+        result = json.loads(path.read_text(encoding="utf-8"))
+        entries, machine = result["entries"], result["machine"]
+        correct = sum(not found["to repair"] for found in entries.values())
+        sentences.append(
+            f" With Python {machine['python']} and JAX {machine['jax']} ({machine['date']}),"
+            f" `benchmarks/field/check.py` found {correct} of {len(entries)} entries correct."
+        )
+    return "".join(sentences)
 
 
 def published(found: list[Part]) -> list[tuple[Part, Published]]:
@@ -200,6 +226,8 @@ def best_law(part: Part) -> tuple[str, str, str]:
     """The law with the smallest error at equal effort and with noise, and its errors with and
     without noise as shares of those of the published law.
     """
+    if part.is_withdrawn:
+        return "withdrawn", "", ""
     if part.result is None:
         return "not measured", "", ""
     best = _name_of_best(part.result)
@@ -275,15 +303,8 @@ def column(result: dict[str, Any], start: str) -> str:
 
 
 def section(part: Part) -> str:
-    """The table of an entry."""
+    """The table of an entry that is measured."""
     heading = f"### {part.contents.title}"
-    if part.contents.not_measured:
-        return f"{heading}\n\n{part.link} is not measured: {part.contents.not_measured}"
-    if part.result is None:
-        return (
-            f"{heading}\n\n{part.link} is not measured yet:"
-            f" `python benchmarks/field/measure.py {part.name}`."
-        )
     result = part.result
     columns = list(result["rows"][0])
     rows = [[_cell(row[name]) for name in columns] for row in result["rows"]]
@@ -296,12 +317,32 @@ def section(part: Part) -> str:
     reasons = [f"{name}: {escaped(why)}" for name, why in result["not_applicable"].items()]
     if reasons:
         words.append("Not in the table: " + "; ".join(reasons) + ".")
+    for pair in part.contents.equal_rows:
+        words.append(f"{pair.law} and {pair.other} agree. {escaped(pair.reason)}")
     machine = result["machine"]
     where = (
         f"`{result['command']}`; {machine['processor']}, {machine['cores']} cores, Python"
         f" {machine['python']}, jax {machine['jax']}, {machine['date']}."
     )
     return "\n\n".join([heading, " ".join(words), markdown_table(columns, rows), where])
+
+
+def without_table(found: list[Part]) -> list[str]:
+    """Which entries have no table, and why; empty if all have one."""
+    lines = []
+    removed = [part.link for part in found if part.is_withdrawn]
+    if removed:
+        lines.append(
+            f"- The tables of {len(removed)} entries are withdrawn, because they were"
+            f" {withdrawn.REASON}; they will be measured again: {'; '.join(removed)}."
+        )
+    for part in found:
+        if part.result or part.is_withdrawn:
+            continue
+        reason = part.contents.not_measured
+        words = f" is not measured: {reason}" if reason else " is not measured yet."
+        lines.append(f"- {part.link}{words}")
+    return ["### Entries without a table", "\n".join(lines)] if lines else []
 
 
 def _uncertain(result: dict[str, Any]) -> str:

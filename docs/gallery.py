@@ -174,7 +174,8 @@ def index() -> str:
         "Published examples of other authors, in `benchmarks/field/entries`. Each page lists the"
         " printed, corrected and missing parameters, the published numbers beside those that this"
         " package reached, and what was not reproduced. The"
-        " [benchmark of the field](../field.md) compares the laws of the package on all of them."
+        " [benchmark of the field](../field.md) compares the laws of the package on those that are"
+        " measured."
     )
     toctree = "```{toctree}\n:hidden:\n\n" + "\n".join(map(page_name, PAGES)) + "\n```"
     parts = [

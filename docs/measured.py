@@ -6,9 +6,13 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import Any, NamedTuple
 
+sys.path.append(str(Path(__file__).resolve().parents[1] / "benchmarks"))
+
+import withdrawn
 from entry_tables import markdown_table
 from gallery import ROOT
 
@@ -106,6 +110,12 @@ def write(page: Path) -> None:
         " [lab notes](lab_notes.md) describe the experiments.\n"
     ]
     for name, plot in PLOTS.items():
+        if name in withdrawn.BENCHMARKS:
+            parts.append(
+                f"## `benchmarks/{name}.py`\n\n{plot.words} The table is withdrawn, because it was"
+                f" {withdrawn.REASON}; it will be measured again.\n"
+            )
+            continue
         result = json.loads((RESULTS / f"{name}.json").read_text())
         draw(plot, result["rows"], page.with_name(f"benchmark_{name}.png"))
         machine = result["machine"]

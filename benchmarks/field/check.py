@@ -3,25 +3,31 @@
 For each entry: the format of `entry.toml`, the links, whether `example.py` runs, whether every
 published number is reached within its tolerance, whether every claim holds, the figure and the
 labels of its axes, `scenario.toml` and `independent.py` where they exist. Without names all entries
-are checked. The exit code is the number of entries that need a repair.
+are checked. The exit code is the number of entries that need a repair. `--json FILE` writes what
+was found and computed, with the versions and the commit; `benchmarks/field/checks` has such files.
 """
 
 from __future__ import annotations
 
 import argparse
 import ast
+import functools
+import json
 import math
 import re
 import runpy
+import shlex
 import sys
 import traceback
 import warnings
 from pathlib import Path
+from typing import Any, NamedTuple
 
-sys.path.append(str(Path(__file__).resolve().parent))
+sys.path += [str(Path(__file__).resolve().parent), str(Path(__file__).resolve().parents[1])]
 
 import matplotlib
 import numpy as np
+from _timing import machine
 from entry import (
     ENTRIES,
     PLACEHOLDER,
@@ -133,6 +139,9 @@ def _faults_of_text(entry: Entry) -> list[str]:
     for number in entry.published:
         if not number.tolerance > 0.0:
             found.append(f"entry.toml: the tolerance of {number.quantity!r} must be positive")
+    for pair in entry.equal_rows:
+        if pair.law == pair.other:
+            found.append(f"entry.toml: [[equal_rows]] needs two laws, not {pair.law!r} twice")
     keys = [x.quantity for x in entry.published] + [x.statement for x in entry.claims]
     for key in sorted({key for key in keys if keys.count(key) > 1}):
         found.append(f"entry.toml: {key!r} is there twice")
@@ -320,24 +329,47 @@ def _faults_of_scenario(folder: Path, entry: Entry) -> list[str]:
     return found
 
 
-def _faults_of_independent(folder: Path) -> list[str]:
-    """The program without the package, where there is one."""
+class Independent(NamedTuple):
+    """What the program without the package found."""
+
+    difference: float
+    """Of the states from those of `example.py`."""
+    allowed: float
+
+
+@functools.cache
+def independent(folder: Path) -> Independent | None:
+    """Runs the `independent.py` of a folder, once a process; None where there is none.
+
+    Raises:
+      EntryError: it does not define `compare`.
+    """
     path = folder / "independent.py"
     if not path.exists():
-        return []
+        return None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        names = runpy.run_path(str(path))
+        if "compare" not in names:
+            raise EntryError(["independent.py must define compare() -> float"])
+        difference = float(names["compare"]())
+    return Independent(difference, names.get("TOLERANCE", INDEPENDENT))
+
+
+def _faults_of_independent(folder: Path) -> list[str]:
+    """The program without the package, where there is one."""
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            names = runpy.run_path(str(path))
-            if "compare" not in names:
-                return ["independent.py must define compare() -> float"]
-            difference = float(names["compare"]())
+        found = independent(folder)
+    except EntryError as error:
+        return error.faults
     except Exception as error:  # whatever the script raises is reported to its author
-        return [f"independent.py does not run: {_last_line(error, path)}"]
-    allowed = names.get("TOLERANCE", INDEPENDENT)
-    if difference <= allowed:
+        return [f"independent.py does not run: {_last_line(error, folder / 'independent.py')}"]
+    if found is None or found.difference <= found.allowed:
         return []
-    return [f"independent.py: compare() gives {difference:.3g}, where {allowed:g} is allowed"]
+    return [
+        f"independent.py: compare() gives {found.difference:.3g}, where {found.allowed:g} is"
+        " allowed"
+    ]
 
 
 def computed_numbers(folder: Path) -> list[str]:
@@ -350,18 +382,38 @@ def computed_numbers(folder: Path) -> list[str]:
     ]
 
 
+def result_of(folder: Path, found: list[str]) -> dict[str, Any]:
+    """What `--json` writes of an entry; only what has to be repaired if that is anything."""
+    if found:
+        return {"to repair": found}
+    made = execute(folder)
+    result = {
+        "to repair": [],
+        "reached": {name: float(value) for name, value in made.reached.items()},
+        "holds": {statement: bool(value) for statement, value in made.holds.items()},
+        "evidence": {name: float(value) for name, value in made.evidence.items()},
+    }
+    compared = independent(folder)
+    if compared:
+        result["independent"] = compared._asdict()
+    return result
+
+
 def main() -> int:
     """Checks the named entries."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("names", nargs="*", metavar="NAME", help="entries; all if none is given")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="where the results go")
     args = parser.parse_args()
     import jax
 
     jax.config.update("jax_enable_x64", True)
     matplotlib.use("Agg")
     chosen = [ENTRIES / name for name in args.names] or folders()
+    command = shlex.join(["python", "benchmarks/field/check.py", *args.names])
+    results: dict[str, Any] = {"command": command, "machine": machine(), "entries": {}}
     faulty = 0
     for folder in chosen:
         found = faults_of(folder)
@@ -369,6 +421,10 @@ def main() -> int:
         print(f"{folder.name}: {'correct' if not found else f'{len(found)} to repair'}", flush=True)
         for line in found or computed_numbers(folder):
             print(f"  - {line}")
+        results["entries"][folder.name] = result_of(folder, found)
+        if args.json:
+            # After each entry, so that a check that stops has not been for nothing.
+            args.json.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
     print(f"{len(chosen) - faulty} of {len(chosen)} entries are correct")
     return faulty
 

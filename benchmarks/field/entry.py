@@ -27,6 +27,7 @@ FOLDER = Path(__file__).resolve().parent
 ROOT = FOLDER.parents[1]
 ENTRIES = FOLDER / "entries"
 RESULTS = FOLDER / "results"
+CHECKS = FOLDER / "checks"
 TEMPLATE = FOLDER / "template"
 
 PUBLISHED = "published law"
@@ -139,6 +140,15 @@ class NotReproduced:
 
 
 @dataclasses.dataclass(frozen=True)
+class EqualRows:
+    """Two laws whose rows in the results agree, and the reason."""
+
+    law: str
+    other: str
+    reason: str
+
+
+@dataclasses.dataclass(frozen=True)
 class Run:
     """Duration and time step."""
 
@@ -164,6 +174,8 @@ class Entry:
     claims: tuple[Claim, ...] = ()
     not_measured: str = ""
     """Why `measure.py` has no results of this entry, if that is intended."""
+    equal_rows: tuple[EqualRows, ...] = ()
+    """Pairs of laws whose rows may agree; `measure.py` refuses others that do."""
 
 
 class Reproduction(NamedTuple):

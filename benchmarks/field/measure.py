@@ -24,22 +24,28 @@ law are scaled by one factor to this effort (`ij.compare`).  Columns:
   `NOISE` times their largest value in the published run.
 
 "left" is a run that leaves its bounds or diverges, and "step" one for which the entry's time step
-is too large.  The results go to results/NAME.json when all laws are measured, and to NAME.json.part
-after each law.  With `--quick` or `--only` they go to a temporary folder unless `--out` names one.
+is too large.  A table is refused if two laws have an error that agrees to `DIGITS` digits and no
+[[equal_rows]] of `entry.toml` gives the reason, or if a law with a factor has an effort outside
+1 +- `EFFORT`, because its runs may be those of another law.
+
+The results go to results/NAME.json when all laws are measured, and to NAME.json.part after each
+law.  With `--quick` or `--only` they go to a temporary folder unless `--out` names one.
 """
 
 from __future__ import annotations
 
 import argparse
 import functools
+import itertools
 import json
+import math
 import multiprocessing
 import os
 import shlex
 import sys
 import tempfile
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -73,6 +79,10 @@ SHARES = (0.8, 1.2)
 UNCERTAIN = ("mass", "payload", "inertia")
 """Beginnings of the names of uncertain parameters, where an entry does not name them."""
 LEFT, OWN, STEP = "left", "own", "step"
+DIGITS = 12
+"""To which the errors of two laws may not agree."""
+EFFORT = 0.01
+"""Largest difference of an effort from that of the published law, of laws with a factor."""
 QUICK_DURATION = 0.1
 """s."""
 QUICK_LAWS = 2
@@ -197,6 +207,47 @@ def worst(values: list[list[Any]]) -> list[Any]:
     return [max(errors), min(margins)]
 
 
+# ---------------------------------------------------------------------------- refused tables
+
+
+def faults_of_rows(rows: list[dict[str, Any]], allowed: Sequence[entry.EqualRows]) -> list[str]:
+    """Why a table cannot be right, a sentence for each row or pair of rows; empty if it can be."""
+    reasons = {frozenset((pair.law, pair.other)) for pair in allowed}
+    found = []
+    for row in rows:
+        if row["factor"] != OWN and not _is_equal_effort(row["effort"]):
+            found.append(
+                f"{row['law']!r} has the factor {row['factor']:.6g} and the effort"
+                f" {row['effort']}, where 1 +- {EFFORT:g} is expected"
+            )
+    for one, other in itertools.combinations(rows, 2):
+        names = [name for name in one if "error" in name and _agree(one[name], other[name])]
+        is_allowed = frozenset((one["law"], other["law"])) in reasons
+        if names and not is_allowed:
+            found.append(
+                f"{one['law']!r} and {other['law']!r} agree to {DIGITS} digits in"
+                f" {', '.join(names)}; if both laws do the same, state the reason in an"
+                " [[equal_rows]] of entry.toml"
+            )
+        if is_allowed and not names:
+            found.append(
+                f"{one['law']!r} and {other['law']!r} differ, although an [[equal_rows]] of"
+                " entry.toml gives a reason why they agree; remove it"
+            )
+    return found
+
+
+def _is_equal_effort(effort: Any) -> bool:
+    return isinstance(effort, float) and abs(effort - 1.0) <= EFFORT
+
+
+def _agree(one: Any, other: Any) -> bool:
+    """Whether two cells are the same number."""
+    if not isinstance(one, float) or not isinstance(other, float):
+        return False
+    return math.isclose(one, other, rel_tol=10.0**-DIGITS)
+
+
 # ---------------------------------------------------------------------------- entries
 
 
@@ -249,10 +300,14 @@ def measure(
     task, made = task_of(folder, duration)
     uncertain = uncertain_of(made)
     chosen = {PUBLISHED: laws.Choice(task.scenario.controller)} | laws_of(task, uncertain)
-    unknown = sorted(set(made.not_applicable) - set(chosen))
-    if unknown:
-        fault = f"example.py: not_applicable has {unknown}, of which `measure.py` knows no law"
-        raise entry.EntryError([fault])
+    equal = [name for pair in contents.equal_rows for name in (pair.law, pair.other)]
+    for place, names in (
+        ("example.py: not_applicable", list(made.not_applicable)),
+        ("entry.toml: [[equal_rows]]", equal),
+    ):
+        unknown = sorted(set(names) - set(chosen))
+        if unknown:
+            raise entry.EntryError([f"{place} has {unknown}, of which `measure.py` knows no law"])
     reasons = {name: words for name, words in chosen.items() if isinstance(words, str)}
     reasons |= made.not_applicable
     applicable = [name for name in chosen if name not in reasons]
@@ -294,6 +349,8 @@ def measure(
         raise entry.EntryError(["the published law could not be measured"])
     if result["failed"]:
         raise entry.EntryError([f"the runs of {sorted(result['failed'])} failed"])
+    if faults := faults_of_rows(result["rows"], contents.equal_rows):
+        raise entry.EntryError(faults)
 
 
 def period_of(task: Task) -> float:

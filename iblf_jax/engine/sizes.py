@@ -10,9 +10,8 @@ from iblf_jax.core import checks, devices
 RUNS_PER_BLOCK = {"cpu": 256}
 """Runs in a block of a study, by platform."""
 DEFAULT_RUNS_PER_BLOCK = 32_768
-"""The same on all other platforms.  On an H100 100,000 runs of 20 s of the paper's loop take 0.48 s
-in float64, in blocks of 16,384 0.70 s and of 65,536 0.52 s; 1,000 runs, with which a block is
-padded, take 0.16 s, 0.13 s and 0.28 s."""
+"""The same on all other platforms: many runs fill a GPU, and few runs, which are padded to a block,
+take longer in a larger one.  The measurement of this size is withdrawn (`benchmarks/README.md`)."""
 STUDY_MEMORY = 256 * 2**20
 """Default limit of the memory that runs in flight take [bytes]."""
 MAX_IN_FLIGHT = 4

@@ -21,9 +21,7 @@ MAX_SINGLE_RUN_NODES = 60_000
 """Nodes of the longest step of a single run that is lowered on "auto".  For a longer step the
 kernel saves less time than its compilation takes.  A run of `presets.ur5`, 18,000 nodes, takes
 0.04 s on native and 0.24 s on vmap.  Its first result on a busy processor takes 11 s on native, 30
-if the kernel has to be built, and 24 on vmap.  On an H100 1000 steps of it take 0.13 s on gpu and
-0.9 on vmap, the first result 28 s and 13; 20,000 steps of the paper's loop take 0.11 s and 3, the
-first result 5 s and 9."""
+if the kernel has to be built, and 24 on vmap.  On gpu this is to be measured."""
 LOWERING_LIMITS = LoweringLimits(
     choices=64, table=4096, tables=50_000, scan=64, written_out=1000, under_condition=64, power=64
 )

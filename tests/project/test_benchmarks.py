@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import importlib
 import json
+import re
 import runpy
 import subprocess
 import sys
 from pathlib import Path
 
+import jax
 import pytest
 
 FOLDER = Path(__file__).parents[2] / "benchmarks"
@@ -21,6 +24,17 @@ NO_BENCHMARK = "comparison.py"
 """It compares the results of the others, and `test_release.py` tests it."""
 NEEDED = {"ros2.py": ("mujoco", "rclpy")}
 """Benchmark -> libraries that not every environment has."""
+
+
+NOTED = {"date", "python", "jax", "jaxlib", "numpy", "iblf_jax", "commit"}
+"""What every result names."""
+COMMIT = re.compile("[0-9a-f]{40}( with uncommitted changes|, which added this table; .*)?")
+CHECKS = FOLDER / "field" / "checks"
+RESULTS = sorted(
+    path
+    for folder in (FOLDER / "results", FOLDER / "field" / "results", CHECKS)
+    for path in folder.glob("*.json")
+)
 
 
 def benchmarks():
@@ -44,4 +58,38 @@ def test_quick_benchmark(name, tmp_path, monkeypatch):
         runpy.run_path(words[0], run_name="__main__")
     table = json.loads(output.read_text())
     assert table["rows"]
-    assert table["machine"]["jax"]
+    assert set(table["machine"]) >= NOTED
+    assert table["machine"]["jax"] == jax.__version__
+
+
+@pytest.mark.parametrize("path", RESULTS, ids=lambda path: f"{path.parent.parent.name}-{path.stem}")
+def test_a_result_names_its_versions_and_its_commit(path):
+    machine = json.loads(path.read_text(encoding="utf-8"))["machine"]
+    assert set(machine) >= NOTED
+    assert COMMIT.fullmatch(machine["commit"])
+    # Tables of these versions were wrong before measurements noted their commit.
+    if version(machine["jax"]) >= (0, 11):
+        assert "which added this table" not in machine["commit"]
+
+
+def version(text):
+    return tuple(int(part) for part in text.split(".")[:2])
+
+
+def test_results_that_are_withdrawn_are_not_there(monkeypatch):
+    monkeypatch.syspath_prepend(FOLDER)
+    withdrawn = importlib.import_module("withdrawn")
+    for folder, names in (
+        (FOLDER / "results", withdrawn.BENCHMARKS),
+        (FOLDER / "field" / "results", withdrawn.FIELD),
+    ):
+        assert names
+        assert not [name for name in names if (folder / f"{name}.json").exists()]
+
+
+def test_a_commit_that_is_not_known_has_its_reason(monkeypatch, tmp_path):
+    monkeypatch.syspath_prepend(FOLDER)
+    timing = importlib.import_module("_timing")
+    assert timing.commit() == timing.machine()["commit"]
+    monkeypatch.setattr(timing.ij, "__file__", str(tmp_path / "iblf_jax" / "__init__.py"))
+    assert timing.commit().startswith("unknown: iblf_jax was imported from another folder")

@@ -3,6 +3,7 @@ the programs that are written without the package."""
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shutil
 import sys
@@ -19,12 +20,14 @@ from iblf_jax.files.scenario import load_scenario_file
 
 FIELD = ROOT / "benchmarks" / "field"
 sys.path[:0] = [str(FIELD), str(ROOT / "docs")]
+sys.path.append(str(ROOT / "benchmarks"))
 import check
 import entry
 import entry_tables
 import field
 import measure
 import task_laws
+import withdrawn
 
 NAMES = [folder.name for folder in entry.folders()]
 TEMPLATE = FIELD / "template"
@@ -66,6 +69,18 @@ def test_the_command_of_a_scenario_file_runs(capsys):
     path = entry.ENTRIES / "mahmud_2021" / "scenario.toml"
     assert cli.main(["simulate", str(path), "--duration", "0.1"]) == 0
     assert "status: ok" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("path", sorted(entry.CHECKS.glob("*.json")), ids=lambda path: path.stem)
+def test_the_noted_checks_found_nothing_to_repair(path):
+    entries = json.loads(path.read_text(encoding="utf-8"))["entries"]
+    assert len(entries) >= FEWEST
+    assert not [name for name, found in entries.items() if found["to repair"]]
+    for name, found in entries.items():
+        contents = entry.load(entry.ENTRIES / name)
+        assert set(found["holds"]) == {claim.statement for claim in contents.claims}
+        for number in contents.published:
+            assert entry.is_reached(number, found["reached"][number.quantity])
 
 
 def test_independent_programs_exist():
@@ -296,6 +311,10 @@ IN_TEXT = {
         {'printed = "k1 = 2"': 'printed = "k1 = 1"'},
         "[[corrected]] has the example of the template",
     ),
+    "equal rows of one law": (
+        {"[run]": '[[equal_rows]]\nlaw = "A"\nother = "A"\nreason = "R"\n[run]'},
+        "[[equal_rows]] needs two laws, not 'A' twice",
+    ),
     "duration": ({"duration = 0.01": "duration = 3.0"}, "ends at 0.01 s, and entry.toml"),
 }
 IN_SCRIPT = {
@@ -442,6 +461,71 @@ def test_a_published_law_that_fails_leaves_the_former_results(tmp_path, monkeypa
     assert (tmp_path / "liu_2018.json").read_text() == "{}"
 
 
+def a_row(law, error, factor=1.0, effort=1.0):
+    return {"law": law, "factor": factor, "effort": effort, "error [rad]": error, "margin": 0.5}
+
+
+def test_rows_that_agree_are_refused():
+    rows = [a_row("published law", 0.3), a_row("A", 0.1, 2.0), a_row("B", 0.1 * (1 + 1e-13), 3.0)]
+    (fault,) = measure.faults_of_rows(rows, ())
+    assert "'A' and 'B' agree to 12 digits in error [rad]" in fault
+    rows[2]["error [rad]"] = 0.1 * (1 + 1e-11)
+    assert measure.faults_of_rows(rows, ()) == []
+    # Margins of the start agree under every law, and words are no numbers.
+    rows[1]["error [rad]"] = rows[2]["error [rad]"] = measure.LEFT
+    assert measure.faults_of_rows(rows, ()) == []
+
+
+def test_rows_may_agree_for_a_reason_that_the_entry_states():
+    rows = [a_row("published law", 0.3), a_row("A", 0.1), a_row("B", 0.1)]
+    pair = entry.EqualRows("B", "A", "the filter never acts")
+    assert measure.faults_of_rows(rows, (pair,)) == []
+    rows.append(a_row("C", 0.1))
+    assert len(measure.faults_of_rows(rows, (pair,))) == 2
+    rows[2]["error [rad]"] = 0.2
+    faults = measure.faults_of_rows(rows[:3], (pair,))
+    assert faults == [
+        "'A' and 'B' differ, although an [[equal_rows]] of entry.toml gives a reason why they"
+        " agree; remove it"
+    ]
+
+
+@pytest.mark.parametrize("effort", [0.989, 1.011, float("nan"), measure.LEFT])
+def test_a_factor_without_equal_effort_is_refused(effort):
+    rows = [a_row("published law", 0.3), a_row("A", 0.1, 2.0, effort)]
+    (fault,) = measure.faults_of_rows(rows, ())
+    assert f"'A' has the factor 2 and the effort {effort}, where 1 +- 0.01 is expected" in fault
+    rows[1]["factor"] = measure.OWN
+    assert measure.faults_of_rows(rows, ()) == []
+
+
+def test_a_table_of_wrong_programs_is_not_written(tmp_path, monkeypatch, capsys):
+    law = "BarrierBackstepping(Integral)"
+
+    def one_program(name, choice, task, uncertain):
+        effort = 1.02 if name == law else 1.0
+        columns = measure.columns(task.scenario)
+        return measure.Row([name, 1.0, effort, *([0.25] * (len(columns) - 3))], "")
+
+    monkeypatch.setattr(measure, "row", one_program)
+    words = ["measure.py", "liu_2018", "--quick", "--out", str(tmp_path)]
+    monkeypatch.setattr(sys, "argv", words)
+    (tmp_path / "liu_2018.json").write_text("{}")
+    assert measure.main() == 1
+    printed = capsys.readouterr().out
+    assert f"'published law' and '{law}' agree to 12 digits in RMS error" in printed
+    assert f"'{law}' has the factor 1 and the effort 1.02" in printed
+    assert "0 of 1 entries measured" in printed
+    assert (tmp_path / "liu_2018.json").read_text() == "{}"
+
+
+@pytest.mark.parametrize("path", sorted(entry.RESULTS.glob("*.json")), ids=lambda path: path.stem)
+def test_the_tables_of_the_repository_are_not_refused(path):
+    contents = entry.load(entry.ENTRIES / path.stem)
+    rows = json.loads(path.read_text(encoding="utf-8"))["rows"]
+    assert measure.faults_of_rows(rows, contents.equal_rows) == []
+
+
 def test_an_independent_integration_that_stops_is_an_error():
     run = SimpleNamespace(t=np.linspace(0.0, 2.0, 21), x=np.ones((21, 1, 1)), dt=0.1)
     assert entry.largest_difference(run, lambda t, x: 0.0 * x, end=0.5) == 0.0
@@ -578,7 +662,13 @@ def test_the_page_of_the_benchmark(parts):
     assert len(rows) == len(NAMES)
     measured = next(row for row in rows if "zhang_yan_2024" in row)
     assert measured.endswith("| A | 0.5 | 0.5 |")
-    assert sum(row.endswith("| not measured |  |  |") for row in rows) == len(NAMES) - 1
+    removed = len(withdrawn.FIELD) - 1
+    assert sum(row.endswith("| withdrawn |  |  |") for row in rows) == removed
+    assert sum(row.endswith("| not measured |  |  |") for row in rows) == len(NAMES) - 1 - removed
+    assert f"1 of {len(NAMES)} entries have a table." in page
+    assert f"- The tables of {removed} entries are withdrawn, because they were measured" in page
+    assert page.count("### ") == 2
+    assert "is not measured: the force is held for 0.1 s" in page
     assert "| published law | 1 | 0.1 | 0.2 |" in page
     assert "| C | 0.5 | left | left |" in page
     assert "Not in the table: D: it has" in page
@@ -607,6 +697,15 @@ def test_laws_that_lose_their_accuracy_with_noise_are_named_below_the_table(part
     assert words in field.benchmark_page([noisy])
     published["error, noise [rad]"] = "left"
     assert field.noisy_laws([noisy]) == ""
+
+
+def test_the_reason_why_rows_agree_is_above_the_table(parts):
+    (measured,) = (part for part in parts if part.result)
+    pair = entry.EqualRows("A", "B", "The limit is not reached.")
+    agreeing = dataclasses.replace(measured.contents, equal_rows=(pair,))
+    assert "A and B agree." not in field.section(measured)
+    page = field.section(measured._replace(contents=agreeing))
+    assert page.index("A and B agree. The limit is not reached.") < page.index("| law |")
 
 
 def test_the_page_of_an_entry_has_the_numbers_that_decide_its_claims():

@@ -133,7 +133,8 @@ for name in ("15 s", "10 s"):
     reached[f"largest rate of axis 3, {name} [rad/s]"] = w[name][:, 2].max()
 reached["largest rate of axis 2, 15 s [rad/s]"] = w["15 s"][:, 1].max()
 shares = {name: share(run) for name, run in runs.items()}
-holds = {"attitude and rates stay inside their bounds": max(x.max() for x in shares.values()) < 1.0}
+largest = max(float(x.max()) for x in shares.values())
+holds = {"attitude and rates stay inside their bounds": largest < 1.0}
 evidence = {
     "rate_printed": w["as printed"][:, 0].min(),
     "torque_printed": float(runs["as printed"].tau[:, 0].max()),
