@@ -532,9 +532,7 @@ GOOD = {
     "AdaptiveRBF": lambda **x: controllers.AdaptiveRBF(**({"k1": 2.0, "K2": 20.0} | x)),
     "AdaptiveNetwork": lambda **x: controllers.AdaptiveNetwork(**({"k1": 2.0, "K2": 20.0} | x)),
     "Log": lambda **x: barriers.Log(**x),
-    "Leader": lambda **x: references.Leader(
-        **({"motion": WEAK.reference, "weights": (1.0,)} | x)
-    ),
+    "Leader": lambda **x: references.Leader(**({"motion": WEAK.reference, "weights": (1.0,)} | x)),
     "save_scenario": lambda **x: ij.save_scenario(**({"scenario": WEAK, "path": "never.toml"} | x)),
 }
 """Function -> a call of it that is fine, but for what a case replaces."""
