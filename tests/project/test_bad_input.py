@@ -241,6 +241,23 @@ SCENARIOS = {
         "lower < upper",
         "Exchange",
     ),
+    "lower-funnel-of-the-upper-sign": (
+        with_part(bounds=bounds.Bounds(bounds.Funnel(0.3, 0.1, 1.0), bounds.Funnel(0.3, 0.1, 1.0))),
+        "bounds of joint 0",
+        "as a lower side it takes negative numbers",
+    ),
+    "lower-funnel-below-the-upper-one": (
+        with_part(bounds=bounds.Bounds(bounds.Funnel(0.2, 0.1, 1.0), bounds.Funnel(0.3, 0.1, 1.0))),
+        "reference of joint 0",
+        "as a lower side it takes negative numbers",
+    ),
+    "upper-funnel-of-the-lower-sign": (
+        with_part(
+            bounds=bounds.Bounds(bounds.Funnel(-0.3, -0.1, 1.0), bounds.Funnel(-0.2, -0.1, 1.0))
+        ),
+        "reference of joint 0",
+        "as an upper side it takes positive numbers",
+    ),
     "bounds-wrong-n": (
         with_part(bounds=bounds.Bounds(bounds.Constant([0.1] * 3), TUBE.upper)),
         "bounds.lower.value",
