@@ -198,8 +198,8 @@ class Study:
     ) -> FirstExit:
         """The distribution of the time at which a run first leaves its bounds.
 
-        Bounds are compared at the instants of the steps: an excursion between two of them is not
-        seen.
+        Bounds are compared at the instants of the steps, so an excursion between two of them is not
+        seen, unless process noise acts on the positions themselves (`metrics.Margin`).
 
         Args:
           joint: of this joint, from `metrics.FirstExit`; of any joint if None, from
