@@ -358,7 +358,7 @@ class _Reader:
     def constant(self, content: Any, dtype: Any) -> np.ndarray:
         """An array that is no leaf, from its entries and the text of its type."""
         try:
-            kind = np.dtype(checks.string(self.key, dtype, "a dtype")).kind
+            kind: str = np.dtype(checks.string(self.key, dtype, "a dtype")).kind
         except (TypeError, ValueError, SyntaxError):
             kind = ""
         if kind not in CONSTANT_KINDS:

@@ -345,7 +345,7 @@ def with_extremes(
         found = least_distances(first, last, variance[level], jnp.stack(numbers, axis=1))
         return jnp.where(instant > 0, found, last)
 
-    sides = {}
+    sides: dict[str, Any] = {}
     for level, name in ((1, "q_sides"), (2, "dq_sides")):
         if name in now:
             sides[name] = least(level, before[name], now[name])
