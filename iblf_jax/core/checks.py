@@ -51,6 +51,12 @@ File systems allow 255, and the names of temporary files are longer than those t
 MAX_JOINTS = 10_000
 """More than any robot has."""
 
+MAX_ENTRIES = 1_000_000
+"""More rows than any array of a component has: commands in transit, past samples, nodes."""
+
+MAX_POINTS = 100_000
+"""More instants or points than a figure shows."""
+
 MAX_DEPTH = 32
 """Largest depth of nested lists that can be an array."""
 

@@ -19,6 +19,7 @@ from iblf_jax.simulation.closed_loop import (
     initial_state,
     perturbed_state,
 )
+from iblf_jax.simulation.noise import distances
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import Sample
 
@@ -56,6 +57,8 @@ class Carry(NamedTuple):
     status: jax.Array
     nearest: Nearest
     accuracy: error_estimate.Accuracy
+    distances: Any
+    """To the bounds at the last instant, `noise.distances`; empty without process noise."""
 
 
 class StepOptions(NamedTuple):
@@ -86,7 +89,8 @@ def start(inputs: Inputs, method: str, jacobian: jax.Array) -> Carry:
       jacobian: what a `LinearizationStep` has found at the start.
     """
     state, zero = initial_state(inputs.scenario), jnp.zeros_like(inputs.dt)
-    blank = begun(inputs.folds, _blank_sample(inputs, state))
+    sample = _blank_sample(inputs, state)
+    blank = begun(inputs.folds, sample)
     constant, jacobian = jax.lax.stop_gradient((state, jacobian))
     if inputs.scenario.sampling is not None:
         jacobian = stability.period_map_as_rate(
@@ -99,6 +103,7 @@ def start(inputs: Inputs, method: str, jacobian: jax.Array) -> Carry:
         jnp.int32(0),
         Nearest(-jnp.ones_like(zero), zero, perturbed_state(constant)),
         estimate,
+        distances(inputs.scenario, sample),
     )
 
 

@@ -27,7 +27,7 @@ from iblf_jax.simulation.metrics import VIOLATION_TIMES
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import has
-from iblf_jax.simulation.stability import RADIUS, THIRD_SIZE
+from iblf_jax.simulation.stability import RADIUS, THIRD_SIZE, growth_in_words
 from iblf_jax.simulation.units import status_words, unit_text
 from iblf_jax.world import plants
 from iblf_jax.world.bounds import NARROWEST, tube_at
@@ -68,7 +68,8 @@ def report(result: Rollout, steps: int, throw: bool) -> None:
     failed = status & FAILED
     reported = failed | status & REPORTED
     law = unwrapped(result.scenario.controller)
-    if law_member(law, "needs_velocity_bounds") or law_member(law, "receives_x"):
+    knows_bounds = law_member(law, "needs_velocity_bounds") or law_member(law, "receives_x")
+    if knows_bounds or _fast_reference(result):
         reported |= status & Status.ALPHA_INFEASIBLE
     if not reported:
         return
@@ -80,7 +81,7 @@ def report(result: Rollout, steps: int, throw: bool) -> None:
         explained &= ~Status.ALPHA_INFEASIBLE
     text = " ".join(
         [
-            f"{heading}: {describe(reported, status_words(result.scenario))}.",
+            f"{heading}: {describe(status, status_words(result.scenario))}.",
             *_explanations(result, explained, steps),
         ]
     )
@@ -108,6 +109,8 @@ def _explanations(result: Rollout, status: Status, steps: int) -> list[str]:
         )
     elif status & Status.INACCURATE:
         texts.append(_inaccurate(result, status, steps))
+    if status & (Status.VELOCITY_VIOLATED | Status.ALPHA_INFEASIBLE):
+        texts.append(_fast_reference(result))
     texts += [text(result) for flag, text in LOOP_EXPLANATIONS.items() if status & flag]
     return [text for text in texts if text]
 
@@ -292,9 +295,9 @@ def _unit_of_differences(scenario: Scenario) -> str:
 def _sampling_too_slow(result: Rollout) -> str:
     return (
         "The deviation of the loop grows from one period to the next, by"
-        f" {float(result.metrics[RADIUS]):.4g} at the worst of the assessed states of this run"
-        " (another start visits others). Sample faster (ij.recommended_period says how fast)"
-        f"{_alternative_remedy(result)}."
+        f" {growth_in_words(float(result.metrics[RADIUS]))} at the worst of the assessed states of"
+        " this run (another start visits others). Sample faster (ij.recommended_period says how"
+        f" fast){_alternative_remedy(result)}."
     )
 
 
@@ -327,6 +330,48 @@ def _alpha_infeasible(result: Rollout) -> str:
         f"The virtual velocity alpha left the velocity bounds {worst}: nothing is claimed"
         " there. Start nearer to the reference, slow it down, widen the velocity bounds or"
         " lower controller.k1."
+    )
+
+
+def _fast_reference(result: Rollout) -> str:
+    """Which joint's reference touches or leaves its velocity bounds, in words; empty if none does.
+
+    Only the second level of a robot is the derivative of the first one.
+    """
+    if plants.is_chain(result.scenario.plant) or not has(result, "dq_lower"):
+        return ""
+    if not checks.is_concrete(result):
+        return ""
+    dq_d, lower, upper = (np.asarray(x) for x in (result.dq_d, result.dq_lower, result.dq_upper))
+    margin = np.minimum(dq_d - lower, upper - dq_d)
+    sample, joint = np.unravel_index(np.argmin(margin), margin.shape)
+    if margin[sample, joint] > NARROWEST:
+        return ""
+    reached, limit = dq_d[sample, joint], upper[sample, joint]
+    if reached < lower[sample, joint] + NARROWEST:
+        limit = lower[sample, joint]
+    unit = unit_text(result.scenario, VELOCITY, int(joint))
+    return (
+        f"The reference of {plants.component_names(result.scenario.plant)[joint]} reaches"
+        f" {reached:.4g} {unit} at t = {float(result.t[sample]):.4g} s, its limit is"
+        f" {limit:.4g} {unit}: no law can follow it inside the velocity bounds. Slow it down, or"
+        " widen scenario.velocity_bounds."
+    )
+
+
+def _torque_saturated(result: Rollout) -> str:
+    """How long the actuator cut the input of a run that failed or is doubtful."""
+    if "saturated_share" not in result.metrics or not checks.is_concrete(result):
+        return ""
+    share = np.asarray(result.metrics["saturated_share"])
+    names = plants.component_names(result.scenario.plant)
+    shares = [
+        f"{100 * x:.2g} % of the time in {name}"
+        for name, x in zip(names, share, strict=True)
+        if x > 0
+    ]
+    return (
+        f"The actuator's limit cut the input, {', '.join(shares)}: no claim of the law holds there."
     )
 
 
@@ -409,6 +454,7 @@ LOOP_EXPLANATIONS: dict[Status, Callable[[Rollout], str]] = {
     Status.SAMPLING_TOO_SLOW: _sampling_too_slow,
     Status.FILTER_INFEASIBLE: _filter_infeasible,
     Status.ALPHA_INFEASIBLE: _alpha_infeasible,
+    Status.TORQUE_SATURATED: _torque_saturated,
     Status.GUARD_STAYED: _guard_stayed,
     Status.MODES_EXHAUSTED: _modes_exhausted,
 }

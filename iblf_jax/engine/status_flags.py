@@ -10,15 +10,22 @@ from iblf_jax.simulation.closed_loop import (
     LoopState,
     integrated_part,
 )
-from iblf_jax.simulation.signals import Sample, has, level_margin, speed_margin
+from iblf_jax.simulation.signals import (
+    Sample,
+    has,
+    least_level_margin,
+    least_position_margin,
+    least_speed_margin,
+    level_margin,
+    speed_margin,
+)
 from iblf_jax.world.bounds import NARROWEST
 
 
 def sample_status(sample: Sample) -> jax.Array:
     """The flags that one sample raises, () int32."""
-    margin = jnp.minimum(sample.q - sample.lower, sample.upper - sample.q)
     found = (
-        flag(jnp.any(~(margin > 0)), Status.BOUND_VIOLATED)
+        flag(jnp.any(~(least_position_margin(sample) > 0)), Status.BOUND_VIOLATED)
         | flag(jnp.any(sample.guard_active), Status.GUARD_ACTIVE)
         | flag(jnp.any(sample.guard_active) & (sample.t > 0), Status.GUARD_STAYED)
         | flag(jnp.any(sample.saturated), Status.TORQUE_SATURATED)
@@ -36,7 +43,7 @@ def sample_status(sample: Sample) -> jax.Array:
         found |= flag(jnp.any(~(sample.region_margin > 0)), Status.REGION_VIOLATED)
     if not has(sample, "dq_lower"):
         return found
-    found |= flag(jnp.any(~(speed_margin(sample, sample.dq) > 0)), Status.VELOCITY_VIOLATED)
+    found |= flag(jnp.any(~(least_speed_margin(sample) > 0)), Status.VELOCITY_VIOLATED)
     return found | flag(
         jnp.any(~(speed_margin(sample, sample.alpha) > NARROWEST)), Status.ALPHA_INFEASIBLE
     )
@@ -47,7 +54,7 @@ def _level_flags(sample: Sample) -> jax.Array:
     found = flag(jnp.any(~jnp.isfinite(sample.tau)), Status.SINGULAR_GAIN)
     if not has(sample, "higher_lower"):
         return found
-    violated = ~(level_margin(sample, sample.higher) > 0)
+    violated = ~(least_level_margin(sample) > 0)
     found |= flag(jnp.any(violated), Status.STATE_BOUND_VIOLATED)
     if not has(sample, "e_higher"):
         return found

@@ -45,6 +45,7 @@ from iblf_jax.simulation.closed_loop import (
     perturbed_state,
     with_integrated_part,
 )
+from iblf_jax.simulation.noise import distances, with_extremes
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import SIGNALS, Sample
 from iblf_jax.world import plants
@@ -121,6 +122,10 @@ def advance(
     ahead = jnp.where(times.span.in_run, first.length, jnp.zeros_like(inputs.dt))
     step = jnp.where(index > 0, inputs.dt, jnp.zeros_like(inputs.dt))
     sample = weighed(stepped.aux, times.span.start, 0.5 * (times.behind + ahead), step)
+    walls = distances(inputs.scenario, sample)
+    sample = with_extremes(
+        inputs.scenario, inputs.noise, index, inputs.dt, sample, state.x, carry.distances, walls
+    )
     begun, accumulators = _observed(inputs, index, start.accumulators, sample)
     if along.jumps_with_law:
         stepped, accumulators = across_jumps(
@@ -152,7 +157,7 @@ def advance(
         *later.metric_samples,
     )
     return Advanced(
-        Carry(after, later.accumulators, status, nearest, estimate), metric_samples, state
+        Carry(after, later.accumulators, status, nearest, estimate, walls), metric_samples, state
     )
 
 

@@ -345,7 +345,7 @@ class _Reader:
         if kind == "value" and isinstance(content, bool | int | float | str | None):
             return content
         if kind == "constant":
-            return np.asarray(content, np.dtype(str(node.get("dtype"))))
+            return self.constant(content, node.get("dtype"))
         if kind == "import":
             return _imported(content, self.key)
         if kind == "class":
@@ -354,6 +354,21 @@ class _Reader:
         if kind == "opaque":
             raise self.needs_a_module(content)
         return self.container(kind, content, inside)
+
+    def constant(self, content: Any, dtype: Any) -> np.ndarray:
+        """An array that is no leaf, from its entries and the text of its type."""
+        try:
+            kind: str = np.dtype(checks.string(self.key, dtype, "a dtype")).kind
+        except (TypeError, ValueError, SyntaxError):
+            kind = ""
+        if kind not in CONSTANT_KINDS:
+            expected = "a NumPy dtype of numbers, truth values or text, such as '<i8'"
+            raise checks.fail(f"{self.key}: dtype of a constant", dtype, expected)
+        try:
+            return np.asarray(content, dtype)
+        except (TypeError, ValueError, OverflowError):
+            expected = f"a rectangular array with entries of the dtype {dtype}"
+            raise checks.fail(f"{self.key}: constant", content, expected) from None
 
     def container(self, kind: str, content: Any, inside: str) -> Any:
         """A dict, list or tuple."""
@@ -389,6 +404,8 @@ class _Reader:
 
 SEQUENCES: dict[str, Callable[[Iterable[Any]], Any]] = {"list": list, "tuple": tuple}
 """Name in a description -> the container."""
+CONSTANT_KINDS = ("b", "i", "u", "f", "U")
+"""Kinds of the dtypes that a constant may have."""
 EXPECTED_NODE = "the description of an entry of a module"
 
 

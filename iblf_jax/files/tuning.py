@@ -350,6 +350,8 @@ SETUP = tuple(
 
 def save_tuning(result: TuneResult, path: str | os.PathLike) -> None:
     """Writes a result to a JSON file that `load_tuning` reads; errors as `TuneResult.save`."""
+    if not isinstance(result, TuneResult):
+        raise checks.fail("result", result, "a TuneResult", "ij.tune returns one.")
     target = checks.file_to_write("path", path)
     setup = result.setup
     options = field_values(setup)

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from iblf_jax.identification.result import NOT_IDENTIFIABLE
+from iblf_jax.identification.result import NOT_IDENTIFIABLE, Identification
 from iblf_jax.plotting import _style
-from iblf_jax.plotting._curves import escaped
-
-if TYPE_CHECKING:
-    from iblf_jax.identification import Identification
+from iblf_jax.plotting._curves import check_class, escaped
 
 MAX_ROWS = 40
 """Largest number of identified numbers in the figure."""
@@ -32,6 +29,7 @@ def identification(known: Identification) -> Figure:
 
     Source: design of this package.
     """
+    check_class("known", known, Identification, "ij.identify returns one.")
     rows = min(len(known.numbers), MAX_ROWS)
     heights = [max(1.8, 0.45 + 0.17 * rows), 2.1, 2.1]
     figure = _style.new_figure(_style.WIDTH, 0.6 + sum(heights))

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from iblf_jax.core import checks
 from iblf_jax.plotting import _scales, _style
-from iblf_jax.plotting._curves import ROUNDING, Curve, curves_of, escaped, peak_of
+from iblf_jax.plotting._curves import ROUNDING, Curve, check_class, curves_of, escaped, peak_of
 from iblf_jax.plotting._panels import (
     Window,
     annotate_clipped_peak,
@@ -53,6 +53,7 @@ def tuning(
 
     Source: design of this package.
     """
+    _check_tuned(result)
     if landscape is not None and (not isinstance(landscape, tuple | list) or len(landscape) != 2):
         remedy = f"They are {', '.join(result.names)}."
         raise checks.fail("landscape", landscape, "the names of two tuned numbers", remedy)
@@ -256,8 +257,9 @@ def paths(
 
     Source: design of this package.
     """
+    _check_tuned(result)
     names = _two_gains(result, gains)
-    points = checks.positive_integer("points", points, least=2)
+    points = checks.positive_integer("points", points, least=2, most=checks.MAX_POINTS)
     pair = [result.names.index(name) for name in names]
     iterates = {"tune": result.history["x"][:, result.best_start][:, pair]}
     for name, x in (others or {}).items():
@@ -281,6 +283,13 @@ def paths(
         axes.set(xscale="log", yscale="log")
     _style.legend_below(figure, of=[axes])
     return figure
+
+
+def _check_tuned(result: Any) -> None:
+    """Raises ValueError for something that is no result of `tune`."""
+    from iblf_jax.tuning import TuneResult  # a result exists only where its package is loaded
+
+    check_class("result", result, TuneResult, "ij.tune returns one.")
 
 
 def _two_gains(result: TuneResult, gains: Any) -> tuple[str, str]:
@@ -331,6 +340,9 @@ def pareto(front: Front) -> Figure:
 
     Source: design of this package.
     """
+    from iblf_jax.tuning import Front  # a result exists only where its package is loaded
+
+    check_class("front", front, Front, "ij.pareto returns one.")
     figure = _style.new_figure(0.7 * _style.WIDTH, 3.6)
     axes = figure.subplots()
     dots: dict[str, Any] = {"linestyle": "none", "marker": ".", "markersize": 3}

@@ -88,8 +88,8 @@ class _Sampled(NamedTuple):
 def prove(
     scenario: Scenario,
     *,
-    level: float,
-    parameters: Mapping[str, Perturbation],
+    level: float | None = None,
+    parameters: Mapping[str, Perturbation] | None = None,
     weight: float | None = None,
     duration: float | None = None,
     disturbance_rate: Any = None,
@@ -112,8 +112,9 @@ def prove(
       scenario: the loop of a robot with the corrected backstepping law and the momentum observer,
         or of a plant in strict-feedback form of order 2 or 3 with one number per level and the law
         `BarrierBackstepping`.
-      level: level c of V_w, in its unit, N m rad for robots.
-      parameters: path -> `factor`, `offset` or `value` of an `interval`, such as
+      level: level c of V_w, in its unit, N m rad for robots; required. V_w of a start that the set
+        must contain is at least V[0] of its run; `largest_level` searches the greatest level.
+      parameters: required; path -> `factor`, `offset` or `value` of an `interval`, such as
         {"plant.mass": ij.factor(ij.interval(0.97, 1.03))}; paths joined by commas vary together;
         {} for the plant as given.
       weight: w [rad/(N m)], without unit for a plant in strict-feedback form; searched if not
@@ -140,11 +141,30 @@ def prove(
       R. B. Kearfott, M. J. Cloud, Introduction to Interval Analysis, 2009.
     """
     options = _Options.of(weight, max_boxes, threads, progress, checkpoint, runs, seed)
-    level = checks.positive_number("level", level, "the unit of V_w")
-    checks.mapping("parameters", parameters, EXAMPLE)
+    level, parameters = _chosen(level, parameters)
     problem = problem_of(scenario, parameters, duration, disturbance_rate)
     with jax.enable_x64(True):
         return _decided(canonical(scenario), problem, dict(parameters), level, weight, options)
+
+
+def _chosen(level: Any, parameters: Any) -> tuple[float, Mapping[str, Perturbation]]:
+    """Level and parameters; the error says how to choose what is missing."""
+    if level is None:
+        expected = "a level of V_w, such as level=0.5 [the unit of V_w]"
+        remedy = (
+            "V_w of a start that the set must contain is at least V[0] of its run"
+            " (ij.simulate(scenario, ...).V); ij.largest_level(scenario, parameters=...,"
+            " between=(0.01, 10.0)) searches the greatest level that can be proved."
+        )
+        raise checks.fail("level", None, expected, remedy)
+    if parameters is None:
+        remedy = (
+            "Name what is uncertain, with its interval: ij.parameters(scenario) lists the paths,"
+            " and {} stands for the plant as given."
+        )
+        raise checks.fail("parameters", None, f"a mapping such as {EXAMPLE}", remedy)
+    checks.mapping("parameters", parameters, EXAMPLE)
+    return checks.positive_number("level", level, "the unit of V_w"), parameters
 
 
 def _decided(

@@ -18,7 +18,7 @@ from iblf_jax.proofs._prove import problem_of, prove, sample_weights, weights_of
 from iblf_jax.proofs.largest import ends_of
 from iblf_jax.proofs.result import Proof
 from iblf_jax.simulation.paths import get, with_parameters
-from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.simulation.scenario import HOW_TO_MAKE, Scenario
 from iblf_jax.studies.distributions import Perturbation
 
 TRIES = 60
@@ -93,6 +93,8 @@ def gains_for_guarantee(
 
     Source: J. A. Nelder, R. Mead, The Computer Journal 7 (1965) 308-313.
     """
+    if not isinstance(scenario, Scenario):
+        raise checks.fail("scenario", scenario, "a Scenario", HOW_TO_MAKE)
     limits = _limits(gains)
     tries = checks.positive_integer("tries", tries, most=100_000)
     uncertain = (parameters, duration, disturbance_rate)

@@ -44,7 +44,15 @@ from iblf_jax.core.units import (
 from iblf_jax.simulation.error_estimate import ACCURACY_UNITS
 from iblf_jax.simulation.scenario import Scenario, fit_joints
 from iblf_jax.simulation.signals import Sample as Sample
-from iblf_jax.simulation.signals import has, level_margin, speed_margin
+from iblf_jax.simulation.signals import (
+    has,
+    least_level_margin,
+    least_position_margin,
+    least_speed_margin,
+    least_xi_margin,
+    level_margin,
+    speed_margin,
+)
 from iblf_jax.simulation.units import unit_text
 from iblf_jax.world import plants
 
@@ -212,6 +220,9 @@ class Margin:
 
     margin = min(q - lower, upper - q), continuous through zero; xi_margin = 1 - max |xi|;
     first_violation_time is infinite and first_violation_joint -1 on a run that keeps its bounds.
+    The margins are those at the instants of the steps; where process noise acts on the first level
+    they contain the excursions between two instants (`noise.least_distances`), and an exit counts
+    at the end of its step.
     """
 
     units: ClassVar[dict[str, str]] = {
@@ -227,8 +238,8 @@ class Margin:
 
     def update(self, acc: _MarginState, sample: Sample) -> _MarginState:
         """Adds one sample."""
-        margin = jnp.minimum(sample.q - sample.lower, sample.upper - sample.q)
-        return _with_margins(acc, sample.t, margin, 1.0 - jnp.abs(sample.xi))
+        margin, xi_margin = least_position_margin(sample), least_xi_margin(sample)
+        return _with_margins(acc, sample.t, margin, xi_margin)
 
     def finish(self, acc: _MarginState) -> dict[str, jax.Array]:
         """The margins, each (n,); first_violation_time and first_violation_joint, ()."""
@@ -245,7 +256,8 @@ class FirstExit:
     """Time at which each joint first reaches or leaves its bounds: first_exit_time.
 
     It is infinite for a joint that keeps its bounds.  Bounds are compared at the instants of the
-    steps, so an excursion between two instants is not seen.
+    steps, so an excursion between two instants is not seen; where process noise acts on the first
+    level it is, as in `Margin`.
     """
 
     units: ClassVar[dict[str, str]] = {"first_exit_time": "s"}
@@ -256,7 +268,7 @@ class FirstExit:
 
     def update(self, acc: jax.Array, sample: Sample) -> jax.Array:
         """Adds one sample."""
-        margin = jnp.minimum(sample.q - sample.lower, sample.upper - sample.q)
+        margin = least_position_margin(sample)
         return jnp.where(margin > 0, acc, jnp.minimum(acc, sample.t))
 
     def finish(self, acc: jax.Array) -> dict[str, jax.Array]:
@@ -324,7 +336,7 @@ class VelocityMargin:
     def update(self, acc: _MarginState, sample: Sample) -> _MarginState:
         """Adds one sample."""
         of_alpha = speed_margin(sample, sample.alpha)
-        return _with_margins(acc, sample.t, speed_margin(sample, sample.dq), of_alpha)
+        return _with_margins(acc, sample.t, least_speed_margin(sample), of_alpha)
 
     def finish(self, acc: _MarginState) -> dict[str, jax.Array]:
         """velocity_margin and alpha_margin, each (n,); first_velocity_violation_time and
@@ -387,7 +399,7 @@ def _level_margins(sample: Sample) -> list[jax.Array]:
     """The margins of the levels from the third on, and of the virtual controls for them, (r - 2, n)
     each; the latter only under a law that has them.
     """
-    found = [level_margin(sample, sample.higher)]
+    found = [least_level_margin(sample)]
     if has(sample, "e_higher"):
         found.append(level_margin(sample, sample.higher - sample.e_higher))
     return found
@@ -596,8 +608,9 @@ class _LevelErrorState(NamedTuple):
 class LevelEstimation:
     """Error of the levels that the law receives from an observer, and the time of their limits.
 
-    peak_level_error = max |x_hat - x| of each level, at the instants at which the law runs; of a
-    measured level it is the error of the sensor.  limited_time is the time for which a limit of the
+    peak_level_error = max |x_hat - x| of each level, at the instants at which the law runs, with
+    the x_hat that it receives, within the limits of the observer; of a measured level it is the
+    error of the sensor.  limited_time is the time for which a limit of the
     estimates was active, with its ends interpolated linearly between samples.  Only for scenarios
     whose observer estimates levels (`observers.StateObserver`), whose runs carry it by default.
     """

@@ -8,6 +8,7 @@ streams of their own, which are independent.
 from __future__ import annotations
 
 import copy
+import dataclasses
 from typing import Any
 
 import jax
@@ -19,6 +20,7 @@ from iblf_jax.core import checks
 from iblf_jax.simulation.discontinuities import Piece
 from iblf_jax.simulation.integrators import STOCHASTIC, TABLEAUS, tableau
 from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.simulation.signals import Sample, has
 from iblf_jax.world import plants
 from iblf_jax.world.process_noise import noise_member
 
@@ -30,6 +32,8 @@ PROCESS_STREAM = 0x7072
 """Distinguishes the increments of process noise from the noise of the sensor."""
 BRIDGE_STREAM = 0x6272
 """And those that divide the increment of a step."""
+EXTREME_STREAM = 0x6578
+"""And those from which the extremes between two instants follow."""
 MODES_STREAM = 0x6D6F
 """And the numbers from which switching times follow."""
 ROUNDS = 10
@@ -253,6 +257,103 @@ def _split(
 def _per_time(increment: jax.Array, length: jax.Array) -> jax.Array:
     """An increment as a rate; 0 for a piece without length."""
     return jnp.where(length > 0, increment / jnp.where(length > 0, length, 1.0), 0.0)
+
+
+def least_distances(
+    before: jax.Array, now: jax.Array, variance: jax.Array, uniform: jax.Array
+) -> jax.Array:
+    """The smallest distance to a wall between two instants, drawn from its distribution.
+
+        P(min < y) = exp(-2 (d_0 - y)(d_1 - y) / (sigma^2 dt)),   y < min(d_0, d_1)
+        min = (d_0 + d_1 - sqrt((d_0 - d_1)^2 - 2 sigma^2 dt ln U)) / 2,   U uniform
+
+    Between its values at two instants the level is a Brownian bridge, up to a drift of order dt.
+    With the distances at the instants alone, a probability of exit is that of walls that are
+    0.58 sigma sqrt(dt) farther away.
+
+    Args:
+      before, now: distances d_0 and d_1 at both instants; a wall at infinity stays there.
+      variance: sigma^2 dt, >= 0.
+      uniform: U in (0, 1].
+
+    Source: P. Baldi, Annals of Probability 23 (1995) 1644-1670, for the use of the law of the
+      bridge's extreme; M. Broadie, P. Glasserman, S. Kou, Mathematical Finance 7 (1997) 325-349,
+      for the shift of the walls.
+    """
+    is_wall = jnp.isfinite(before) & jnp.isfinite(now)
+    first, last = (jnp.where(is_wall, x, 1.0) for x in (before, now))
+    square = (first - last) ** 2 - 2.0 * variance * jnp.log(uniform)
+    root = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+    return jnp.where(is_wall, 0.5 * (first + last - root), now)
+
+
+def distances(scenario: Scenario, sample: Sample) -> dict[str, jax.Array]:
+    """Of each level with process noise and bounds, the distances to the lower and the upper ones:
+    field of `Sample` -> (2, n), or (2, r - 2, n) for the levels from the third on; empty without
+    process noise.
+    """
+    noise = scenario.process_noise
+    if noise is None:
+        return {}
+    found = {}
+    if 1 in noise.levels:
+        found["q_sides"] = jnp.stack([sample.q - sample.lower, sample.upper - sample.q])
+    if 2 in noise.levels and has(sample, "dq_lower"):
+        found["dq_sides"] = jnp.stack([sample.dq - sample.dq_lower, sample.dq_upper - sample.dq])
+    if max(noise.levels) > 2 and has(sample, "higher_lower"):
+        below, above = sample.higher - sample.higher_lower, sample.higher_upper - sample.higher
+        found["higher_sides"] = jnp.stack([below, above])
+    return found
+
+
+def with_extremes(
+    scenario: Scenario,
+    key: jax.Array,
+    instant: jax.Array,
+    dt: jax.Array,
+    sample: Sample,
+    x: jax.Array,
+    before: dict[str, jax.Array],
+    now: dict[str, jax.Array],
+) -> Sample:
+    """A sample with the smallest distances since the instant before, on levels with process noise.
+
+    The uniform numbers depend on key, instant, level, component and side only.
+
+    Args:
+      scenario, key: of the run.
+      instant: its number, () int; the first one has none before it.
+      dt: step, () [s].
+      sample: at the instant.
+      x: state of the plant there, (r, n), at which the intensity of the noise is taken.
+      before, now: `distances` at the instant before and at this one.
+    """
+    if not now:
+        return sample
+    noise: Any = scenario.process_noise
+    n = scenario.n
+    words = _words(key, EXTREME_STREAM)
+    instant = instant.astype(jnp.int32)
+    rows = noise.diffusion(sample.t, x) ** 2 * dt
+    variance = dict(zip(noise.levels, rows, strict=True))
+
+    def least(level: int, first: jax.Array, last: jax.Array) -> jax.Array:
+        if level not in variance:
+            return last
+        pairs = range((level - 1) * n, level * n)
+        numbers = [jnp.stack(_uniforms(words, instant, pair, dt.dtype)) for pair in pairs]
+        found = least_distances(first, last, variance[level], jnp.stack(numbers, axis=1))
+        return jnp.where(instant > 0, found, last)
+
+    sides: dict[str, Any] = {}
+    for level, name in ((1, "q_sides"), (2, "dq_sides")):
+        if name in now:
+            sides[name] = least(level, before[name], now[name])
+    if "higher_sides" in now:
+        first, last = before["higher_sides"], now["higher_sides"]
+        found = [least(3 + i, first[:, i], last[:, i]) for i in range(last.shape[1])]
+        sides["higher_sides"] = jnp.stack(found, axis=1)
+    return dataclasses.replace(sample, **sides)
 
 
 # --- switching times ------------------------------------------------------------------------------

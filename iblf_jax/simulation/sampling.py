@@ -140,12 +140,15 @@ class Sampling:
             checks.time_span("Sampling.period", self.period)
             checks.time_span("Sampling.delay", self.delay, zero=True)
             least = self.needed
+            if least > checks.MAX_ENTRIES:
+                expected = f"at most {checks.MAX_ENTRIES} periods of {float(self.period):g} s"
+                raise checks.fail("Sampling.delay", self.delay, expected)
             if queue is None:
                 queue = least
         if queue is None:
             expected = "a whole number, where period or delay is traced"
             raise checks.fail(name, None, expected, "Such as queue=1.")
-        queue = checks.positive_integer(name, queue, least=0)
+        queue = checks.positive_integer(name, queue, least=0, most=checks.MAX_ENTRIES)
         if queue < least:
             expected = f"at least {least}, for a delay of {float(self.delay):g} s"
             raise checks.fail(name, queue, expected)

@@ -918,8 +918,9 @@ def _check_start(scenario: Scenario) -> None:
         if not np.all(np.isfinite(values)):
             raise checks.fail(name, values, "finite values at t = 0")
     noun = plants.component_noun(scenario.plant)
-    _check_order(f"bounds of {noun}", start.lower, start.upper)
-    remedy = "Move the reference or widen the bounds (Assumption 2)."
+    _check_order(f"bounds of {noun}", start.lower, start.upper, scenario.bounds)
+    remedy = _funnel_remedy(scenario.bounds)
+    remedy = remedy or "Move the reference or widen the bounds (Assumption 2)."
     _check_inside(
         f"reference of {noun} {{}}", "bounds", start.q_d, start.lower, start.upper, remedy
     )
@@ -927,7 +928,7 @@ def _check_start(scenario: Scenario) -> None:
     _check_inside("initial.q[{}]", "bounds", q, start.lower, start.upper, remedy)
     if start.speed_limits is not None:
         slowest, fastest = start.speed_limits
-        _check_order("velocity_bounds of joint", slowest, fastest)
+        _check_order("velocity_bounds of joint", slowest, fastest, scenario.velocity_bounds)
         _check_inside("initial.dq[{}]", "velocity bounds", dq, slowest, fastest, remedy)
     for region, margin in zip(scenario.regions, start.region_margins, strict=True):
         if not margin > 0:
@@ -966,7 +967,7 @@ def _check_levels_at_start(scenario: Scenario) -> None:
         if isinstance(bounds.lower, Funnel) or isinstance(bounds.upper, Funnel):
             continue  # around alpha, which the law computes
         noun = plants.component_noun(scenario.plant)
-        _check_order(f"state_bounds[{i}] of {noun}", lower, upper)
+        _check_order(f"state_bounds[{i}] of {noun}", lower, upper, bounds)
         remedy = "Move the start or widen the bounds."
         if i == 0 and not np.any(x[1]):
             remedy = f"{remedy} {WITHOUT_DQ}"
@@ -1008,11 +1009,28 @@ def _check_gains(name: str, gains: np.ndarray, x: np.ndarray) -> None:
             raise checks.fail(f"{name}.gain(t, x)[{i}]", matrix, expected, remedy)
 
 
-def _check_order(name: str, lower: np.ndarray, upper: np.ndarray) -> None:
+def _funnel_remedy(bounds: Any) -> str:
+    """The remedy for a Funnel with the sign of the other side; empty if none has it."""
+    lower, upper = bounds.lower, bounds.upper
+    if isinstance(lower, Funnel) and np.any(np.asarray(lower.initial) > 0):
+        return (
+            "A Funnel is a signed distance from the reference: as a lower side it takes negative"
+            " numbers, such as Funnel(-0.3, -0.1, 1.0)."
+        )
+    if isinstance(upper, Funnel) and np.any(np.asarray(upper.initial) < 0):
+        return (
+            "A Funnel is a signed distance from the reference: as an upper side it takes positive"
+            " numbers, such as Funnel(0.3, 0.1, 1.0)."
+        )
+    return ""
+
+
+def _check_order(name: str, lower: np.ndarray, upper: np.ndarray, bounds: Any) -> None:
     """Raises ValueError where a lower bound is not below its upper bound at t = 0."""
+    remedy = _funnel_remedy(bounds) or "Exchange or widen them."
     for i, (low, high) in enumerate(zip(lower, upper, strict=True)):
         if not low < high:
-            expected, remedy = "finite lower < upper at t = 0", "Exchange or widen them."
+            expected = "finite lower < upper at t = 0"
             raise checks.fail(f"{name} {i}", (low, high), expected, remedy)
 
 

@@ -108,6 +108,14 @@ class Sample(Signals):
     """`x_hat` less the levels at the instant at which the law ran, (r, n); `()` without it."""
     limit_excess: Any = dataclasses.field(default=(), kw_only=True)
     """Positive where a limit of an observer's estimates is active, () [1]; `()` without limits."""
+    q_sides: Any = dataclasses.field(default=(), kw_only=True)
+    """Smallest distances of q to its lower and its upper bound since the instant before, (2, n),
+    where process noise acts on the first level (`noise.least_distances`); `()` elsewhere, as in the
+    two fields below."""
+    dq_sides: Any = dataclasses.field(default=(), kw_only=True)
+    """The same of dq, (2, n)."""
+    higher_sides: Any = dataclasses.field(default=(), kw_only=True)
+    """The same of the levels from the third on, (2, r - 2, n)."""
 
 
 def has(sample: Signals, signal: str) -> bool:
@@ -115,6 +123,37 @@ def has(sample: Signals, signal: str) -> bool:
     of regions.
     """
     return not isinstance(getattr(sample, signal), tuple)
+
+
+def least_position_margin(sample: Sample) -> Array:
+    """Smallest distance of the positions to the nearer of their bounds since the instant before,
+    (n,): that at the instant where no noise acts on them.
+    """
+    if has(sample, "q_sides"):
+        return jnp.minimum(sample.q_sides[0], sample.q_sides[1])
+    return jnp.minimum(sample.q - sample.lower, sample.upper - sample.q)
+
+
+def least_xi_margin(sample: Sample) -> Array:
+    """The same distance relative to that of the reference to the bound, 1 - |xi|, (n,) [1]."""
+    if has(sample, "q_sides"):
+        below, above = sample.q_d - sample.lower, sample.upper - sample.q_d
+        return jnp.minimum(sample.q_sides[0] / below, sample.q_sides[1] / above)
+    return 1.0 - jnp.abs(sample.xi)
+
+
+def least_speed_margin(sample: Sample) -> Array:
+    """As `least_position_margin`, of the velocities."""
+    if has(sample, "dq_sides"):
+        return jnp.minimum(sample.dq_sides[0], sample.dq_sides[1])
+    return speed_margin(sample, sample.dq)
+
+
+def least_level_margin(sample: Sample) -> Array:
+    """As `least_position_margin`, of the levels from the third on, (r - 2, n)."""
+    if has(sample, "higher_sides"):
+        return jnp.minimum(sample.higher_sides[0], sample.higher_sides[1])
+    return level_margin(sample, sample.higher)
 
 
 def level_margin(sample: Sample, levels: Array) -> Array:

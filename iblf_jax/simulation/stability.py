@@ -359,6 +359,13 @@ def growth_by_sampling(radius: Any, continuous_radius: Any, period: Any) -> Any:
     return radius / jnp.minimum(own, jnp.exp(TRANSIENT_GROWTH * period))
 
 
+def growth_in_words(radius: float) -> str:
+    """How much a deviation grows over one period at a spectral radius above 1, such as "0.02 %"."""
+    if radius < 2.0:
+        return f"{100.0 * (radius - 1.0):.2g} %"
+    return f"a factor of {radius:.3g}"
+
+
 def period_map_as_rate(scenario: Scenario, state: LoopState, derivative: jax.Array) -> jax.Array:
     """The one-period map as a rate, (m, m) [1/s]: the rate at which errors of a sampled loop grow
     or decay.

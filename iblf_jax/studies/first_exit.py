@@ -63,7 +63,7 @@ class FirstExit:
 
 def first_exit_of(study: Study, joint: int | None, instants: int, confidence: float) -> FirstExit:
     """The distribution of the first exit; arguments as `Study.first_exit`."""
-    instants = checks.positive_integer("instants", instants, least=2)
+    instants = checks.positive_integer("instants", instants, least=2, most=checks.MAX_POINTS)
     recorded = _recorded_times(study, joint)
     is_diverged = has_flag(study.status, Status.NOT_FINITE) & ~np.isfinite(recorded)
     times = np.where(is_diverged, study.duration, recorded.astype(float))

@@ -16,13 +16,14 @@ from iblf_jax.simulation.error_estimate import RELATIVE
 from iblf_jax.simulation.metrics import Fold
 from iblf_jax.simulation.noise import has_noise
 from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.simulation.stability import RADIUS
 from iblf_jax.studies.blocks import case_bytes
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.execution import run_all_cases
 from iblf_jax.studies.options import RunOptions, ThisProcess, check_deprecated, executor_of
 from iblf_jax.studies.study import Study
 from iblf_jax.studies.study_setup import prepare
-from iblf_jax.studies.time_step import warn_of_step
+from iblf_jax.studies.time_step import warn_of_sampling, warn_of_step
 
 
 @notices.each_warning_once
@@ -102,6 +103,7 @@ def monte_carlo(
         results = run_all_cases(prepared, executor, shown.update)
     errors = results.metrics[RELATIVE]
     warn_of_step(results.status, results.fastest_mode, errors, options.dt, method)
+    warn_of_sampling(results.status, results.metrics.get(RADIUS))
     return Study.of(prepared, results)
 
 

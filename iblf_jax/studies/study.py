@@ -33,6 +33,7 @@ from iblf_jax.simulation.metrics import metric_units
 from iblf_jax.simulation.noise import NOISE_NAME, noise_values
 from iblf_jax.simulation.results import Metrics, Rollout
 from iblf_jax.simulation.scenario import Scenario
+from iblf_jax.simulation.stability import RADIUS, growth_in_words
 from iblf_jax.simulation.units import status_words, unit_text
 from iblf_jax.studies import statistics, summaries
 from iblf_jax.studies.blocks import BlockResults, run_blocks
@@ -49,6 +50,12 @@ if TYPE_CHECKING:
 VIOLATED = CONSTRAINT_VIOLATED | Status.NOT_FINITE
 """The flags that `violation_probability` counts: a bound or region was violated, or the run
 diverged, so that it is unknown whether its bounds would have held."""
+
+REMARKABLE_RATIO = 10.0
+"""Largest tracking error over the runs, relative to the median, above which a study says so."""
+ROUNDING = 1e-4
+"""Largest excess of a spectral radius over 1 that is a rounding error: a state of the law that
+integrates has the radius 1."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -191,8 +198,8 @@ class Study:
     ) -> FirstExit:
         """The distribution of the time at which a run first leaves its bounds.
 
-        Bounds are compared at the instants of the steps: an excursion between two of them is not
-        seen.
+        Bounds are compared at the instants of the steps, so an excursion between two of them is not
+        seen, unless process noise acts on the positions themselves (`metrics.Margin`).
 
         Args:
           joint: of this joint, from `metrics.FirstExit`; of any joint if None, from
@@ -483,7 +490,31 @@ class Study:
         ]
         if flags:
             lines.append(f"  flags, of which a run may have several: {'; '.join(flags)}")
-        return "\n".join([*lines, f"  {self.included}"])
+        return "\n".join([*lines, *self._remarks(), f"  {self.included}"])
+
+    def _remarks(self) -> list[str]:
+        """What is remarkable although no flag says it, in words."""
+        lines = []
+        if RADIUS in self.metrics:
+            worst = self.worst(1, RADIUS)
+            radius = float(np.max(self.metrics[RADIUS][worst], initial=0.0))
+            if radius > 1.0 + ROUNDING:
+                lines.append(
+                    f"  largest sampling_radius: {radius:.6g} (run {worst[0]}): at one of its"
+                    " assessed states a deviation grows from one period to the next, by"
+                    f" {growth_in_words(radius)}"
+                )
+        if "rmse" in self.metrics:
+            errors = statistics.worst_joint(self.metrics, "rmse")
+            median = float(np.median(errors[self.made])) if self.made.any() else np.nan
+            worst = self.worst(1, "rmse")
+            ratio = float(np.max(errors[worst], initial=0.0)) / median if median > 0 else 0.0
+            if np.isfinite(ratio) and ratio > REMARKABLE_RATIO:
+                lines.append(
+                    f"  the largest rmse is {ratio:.3g} times the median (run {worst[0]}):"
+                    " study.correlations() says with which parameters it grows"
+                )
+        return lines
 
     def _repr_html_(self) -> str:
         return present("card", self)

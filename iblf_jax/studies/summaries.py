@@ -185,7 +185,7 @@ def bands(
 
     levels = check_quantiles(quantiles)
     count = min(checks.positive_integer("runs", runs), prepared.options.runs)
-    samples = checks.positive_integer("samples", samples)
+    samples = checks.positive_integer("samples", samples, most=checks.MAX_STEPS)
     record_every = max(1, prepared.options.steps // samples)
     used = used[:count]
     if not used.any():

@@ -25,6 +25,7 @@ from iblf_jax.simulation.error_estimate import RELATIVE
 from iblf_jax.simulation.metrics import Fold, metric_units
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.simulation.signals import dimension_names
+from iblf_jax.simulation.stability import RADIUS
 from iblf_jax.studies import store_config
 from iblf_jax.studies.blocks import case_bytes, named_arrays, result_shapes
 from iblf_jax.studies.dataset import DRAWN, to_dataset
@@ -45,7 +46,7 @@ from iblf_jax.studies.options import (
 from iblf_jax.studies.store import Store, StoreError, Variable, load_store, open_store
 from iblf_jax.studies.study_setup import PreparedStudy, prepare
 from iblf_jax.studies.sweep_points import make_points
-from iblf_jax.studies.time_step import warn_of_step
+from iblf_jax.studies.time_step import warn_of_sampling, warn_of_step
 
 if TYPE_CHECKING:
     import xarray
@@ -154,6 +155,8 @@ def sweep(
         np.ravel(result[name]) for name in ("status", "fastest_mode", RELATIVE)
     )
     warn_of_step(status, modes, errors, options.dt, method)
+    radii = np.ravel(result[RADIUS]) if RADIUS in result else None
+    warn_of_sampling(status, radii)
     return result
 
 

@@ -15,6 +15,7 @@ from iblf_jax.engine import block_size, step_size
 from iblf_jax.simulation.error_estimate import RELATIVE, TOLERANCE
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.scenario import Scenario, canonical
+from iblf_jax.simulation.stability import growth_in_words
 from iblf_jax.studies.blocks import run_blocks
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.draws import targets_of
@@ -194,3 +195,22 @@ def warn_of_step(
             " probably not fail because of the step; study.worst() finds them."
         )
     notices.warn(text)
+
+
+def warn_of_sampling(status: np.ndarray, radii: np.ndarray | None) -> None:
+    """Warns if deviations of sampled runs of a study grow because of the sampling.
+
+    Args:
+      status: of each run, (N,).
+      radii: `sampling_radius` of each run, (N,) [1]; None for a continuous law.
+    """
+    slow = has_flag(status, Status.SAMPLING_TOO_SLOW)
+    if radii is None or not slow.any():
+        return
+    worst = int(np.argmax(np.where(slow, radii, -np.inf)))
+    notices.warn(
+        f"The law is sampled too slowly in {slow.sum()} of {status.size} runs: the deviation of the"
+        f" loop grows from one period to the next, by {growth_in_words(float(radii[worst]))} at"
+        f" the worst of the assessed states (run {worst}). Sample faster:"
+        " ij.recommended_period(study.replay(i).scenario) says how fast for run i."
+    )

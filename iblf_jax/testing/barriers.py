@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any
 
@@ -93,6 +94,7 @@ def check_barrier(barrier: Any, *, n: int | None = None) -> None:
             numbers = _numbers(barrier, context, jnp.asarray(t), k1, o, jnp.asarray(XI))
             _at_every_xi(findings, numbers, barrier.guard)
             _claims(findings, barrier, tube, k1, numbers)
+            _grows_without_bound(findings, barrier, context, jnp.asarray(t), k1, o)
 
 
 def _functions(
@@ -195,6 +197,44 @@ def _at_every_xi(findings: Findings, numbers: dict[str, jax.Array], guard: float
         f"V1 grows at rate {growth:.3g} along q' = alpha",
         "alpha must make slope . alpha + dV1/dt negative",
     )
+
+
+def _grows_without_bound(
+    findings: Findings, barrier: Any, context: Any, t: jax.Array, k1: jax.Array, o: Any
+) -> None:
+    """Requires that V1 of a barrier with a guard has no limit at the bound.
+
+    V1 is evaluated at three distances from the bound, each a tenth of the one before. Where it has
+    a limit, its increments fall with the distance or a power of it; those of a logarithm are equal.
+    """
+    sharp = _with_guard(barrier, SMALL_GUARD)
+    nearest = 2.0 * max(sharp.guard, SMALL_GUARD)
+    if sharp.guard == -math.inf or 100.0 * nearest >= 1.0:
+        return
+    inside = 1.0 - nearest * np.array([100.0, 10.0, 1.0])
+    xi = jnp.asarray([*inside, *-inside])
+    V1 = np.asarray(_numbers(sharp, context, t, k1, o, xi)["value"]).reshape(2, 3, -1)
+    before, last = np.diff(V1, axis=1).swapaxes(0, 1)
+    findings.require(
+        np.all(last > LEAST_INCREMENT * before),
+        f"V1 is finite at the bound: it is {V1[:, -1].max():.4g} at |xi| = {inside[-1]:.9g}",
+        "A barrier grows without bound as |xi| -> 1, or a disturbance carries the joint across; a"
+        " V1 that does not states guard = -math.inf",
+    )
+
+
+def _with_guard(barrier: Any, guard: float) -> Any:
+    """The barrier with another guard, or itself if its class does not take one."""
+    try:
+        return dataclasses.replace(barrier, guard=guard)
+    except (TypeError, ValueError):
+        return barrier
+
+
+SMALL_GUARD = 1e-7
+LEAST_INCREMENT = 0.6
+"""Least ratio of two increments of V1, each over a tenth of the distance from the bound of the one
+before: 1 for a logarithm, 0.32 for a square root, 0.1 for a function with a slope at the bound."""
 
 
 def _claims(

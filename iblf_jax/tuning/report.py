@@ -322,7 +322,7 @@ class TuningReport:
         if self.sampling_radius is None:
             return []
         before, after = self.sampling_radius
-        row = f"largest sampling_radius: {before:.4g} -> {after:.4g}; stable below 1"
+        row = f"largest sampling_radius: {before:.6g} -> {after:.6g}; stable below 1"
         if self.unstable[1]:
             row += (
                 "; WARNING: with the tuned gains the sampled loop is unstable in"

@@ -274,7 +274,7 @@ class Leader:
         not valid.
         """
         checks.conforms("Leader.motion", self.motion, Reference, "iblf_jax.references has them.")
-        checks.positive_integer("Leader.components", self.components)
+        checks.positive_integer("Leader.components", self.components, most=checks.MAX_JOINTS)
         is_tuple = isinstance(self.weights, tuple) and len(self.weights) > 0
         if not is_tuple or not all(map(_is_weight, self.weights)):
             expected = "a tuple of finite numbers >= 0, one for each agent"

@@ -4,6 +4,7 @@ finite."""
 from __future__ import annotations
 
 import dataclasses
+import re
 import warnings
 
 import jax
@@ -13,7 +14,8 @@ from conftest import PAPER, SHORT
 from jax.flatten_util import ravel_pytree
 
 import iblf_jax as ij
-from iblf_jax.core.status import FAILED, Status, describe
+from iblf_jax.core.status import FAILED, WORDS, WORDS_OF_LEVELS, Status, describe
+from iblf_jax.engine import diagnosis
 from iblf_jax.simulation.closed_loop import initial_state, rate
 
 
@@ -199,9 +201,19 @@ def test_nothing_raises_inside_jit_and_flags_come_back(thrown):
     assert int(status) & Status.BOUND_VIOLATED
 
 
-def test_words_for_every_flag():
-    for flag in Status:
-        assert describe(int(flag)) != ""
+@pytest.mark.parametrize("flag", list(Status), ids=lambda flag: flag.name)
+def test_every_flag_that_is_set_is_put_into_words(flag, short_run, monkeypatch):
+    for words in (WORDS, WORDS_OF_LEVELS):
+        assert describe(int(flag), words) == words[flag]
+    if flag == Status.INFEASIBLE_REFERENCE:  # an error of its own, for the whole run
+        return
+    monkeypatch.setattr(diagnosis, "_explanations", lambda *_: [])
+    status = np.int32(int(flag | Status.BOUND_VIOLATED))
+    with pytest.warns(ij.SimulationWarning, match=re.escape(WORDS[flag])):
+        diagnosis.report(dataclasses.replace(short_run, status=status), 1, throw=False)
+
+
+def test_two_flags_are_two_texts():
     assert describe(int(Status.BOUND_VIOLATED | Status.NOT_FINITE)).count(";") == 1
 
 
@@ -223,3 +235,29 @@ def test_gains_below_the_theorem_are_advised_against(paper):
         assert (
             jax.jit(lambda p: len(p.advice()))(part) == 0
         )  # nothing to say about a number that is not known yet
+
+
+def test_a_reference_that_is_too_fast_is_named_with_its_limit(paper):
+    slow = ij.bounds.Constant([0.1, 9.0])
+    velocity_bounds = ij.Bounds(lower=ij.bounds.Constant(-9.0), upper=slow)
+    start = ij.Initial(q=paper.reference.position(0.0), dq=[0.0, 0.0])
+    scenario = ij.with_parts(paper, velocity_bounds=velocity_bounds, initial=start)
+    with pytest.warns(ij.SimulationWarning) as caught:
+        run = ij.simulate(scenario, **SHORT)
+    fastest = float(run.dq_d[:, 0].max())
+    words = f"The reference of joint 0 reaches {fastest:.4g} rad/s at t = "
+    (text,) = [str(w.message) for w in caught]
+    assert words in text
+    assert ", its limit is 0.1 rad/s" in text
+    assert "joint 1 reaches" not in text
+
+
+def test_a_torque_that_was_cut_is_named_where_a_run_failed(short_run):
+    metrics = dict(short_run.metrics.values_by_name) | {"saturated_share": np.array([0.0, 0.25])}
+    run = dataclasses.replace(
+        short_run,
+        metrics=ij.Metrics(metrics, short_run.metrics.unit_pairs),
+        status=np.int32(int(Status.TORQUE_SATURATED | Status.STATE_BOUND_VIOLATED)),
+    )
+    with pytest.warns(ij.SimulationWarning, match=r"cut the input, 25 % of the time in joint 1:"):
+        diagnosis.report(run, 1, throw=False)

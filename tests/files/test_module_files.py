@@ -225,6 +225,12 @@ BROKEN = {
     "too few arrays": '{"dict": {}}',
     "no dataclass": '{"class": "jax.nn:relu", "fields": {}}',
     "other fields": '{"class": "equinox.nn:Linear", "fields": {"weight": "array"}}',
+    "a constant without a dtype": '{"dict": {"w": "array", "c": {"constant": [1]}}}',
+    "a constant of objects": '{"constant": [1], "dtype": "O"}',
+    "a constant of no dtype": '{"constant": [1], "dtype": "<i3"}',
+    "a ragged constant": '{"constant": [[1], [1, 2]], "dtype": "<i8"}',
+    "a constant out of range": '{"constant": [300], "dtype": "|i1"}',
+    "a constant of words": '{"constant": ["x"], "dtype": "<i8"}',
     "nested": "[" * 60 + "]" * 60,
 }
 

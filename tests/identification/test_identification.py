@@ -589,6 +589,15 @@ def test_files(tmp_path, log):
         (found,) = read(tmp_path / name, 2)
         for key in ("t", "q", "tau"):
             np.testing.assert_array_equal(getattr(found, key), log[key])
+    (tmp_path / "utf16.csv").write_text("\n".join(lines), encoding="utf-16")
+    with pytest.raises(ValueError, match=r"utf16\.csv: got .*, expected a text in UTF-8"):
+        read(tmp_path / "utf16.csv", 2)
+    (tmp_path / "latin.csv").write_text("\n".join([*lines, "\xb5"]), encoding="latin-1")
+    with pytest.raises(ValueError, match=r"latin\.csv: got .*, expected a text in UTF-8"):
+        read(tmp_path / "latin.csv", 2)
+    (tmp_path / "wide.csv").write_text("t" * 200_000)
+    with pytest.raises(ValueError, match=r"wide\.csv: got field larger"):
+        read(tmp_path / "wide.csv", 2)
     (tmp_path / "bad.csv").write_text("t, q[0], q[2], tau[0]\n" + "0, 1, 2, 3\n" * 60)
     with pytest.raises(ValueError, match=r"expected a column q\[1\]"):
         read(tmp_path / "bad.csv", 2)

@@ -207,11 +207,17 @@ def test_values_that_differ_by_rounding_do_not_vary():
 
 def test_a_front_shows_every_trial():
     tried = np.array([[0.5, 40.0], [0.9, 1.0], [3.0, 0.8]])
-    front = types.SimpleNamespace(
-        tried=tried,
-        objectives=np.array([[0.8, 1.0], [0.85, 0.9]]),
-        first=np.array([1.0, 1.0]),
+    front = ij.Front(
         labels=("tracking", "effort"),
+        objectives=np.array([[0.8, 1.0], [0.85, 0.9]]),
+        x=np.ones((2, 1)),
+        names=("controller.K2",),
+        tried=tried,
+        first=np.array([1.0, 1.0]),
+        start=ij.presets.zhang_yan_2024(),
+        blocks=(),
+        z=np.zeros((2, 1)),
+        seconds=1.0,
     )
     (axes,) = plotting.pareto(front).axes
     for limits, x in zip((axes.get_xlim(), axes.get_ylim()), tried.T, strict=True):

@@ -241,6 +241,23 @@ SCENARIOS = {
         "lower < upper",
         "Exchange",
     ),
+    "lower-funnel-of-the-upper-sign": (
+        with_part(bounds=bounds.Bounds(bounds.Funnel(0.3, 0.1, 1.0), bounds.Funnel(0.3, 0.1, 1.0))),
+        "bounds of joint 0",
+        "as a lower side it takes negative numbers",
+    ),
+    "lower-funnel-below-the-upper-one": (
+        with_part(bounds=bounds.Bounds(bounds.Funnel(0.2, 0.1, 1.0), bounds.Funnel(0.3, 0.1, 1.0))),
+        "reference of joint 0",
+        "as a lower side it takes negative numbers",
+    ),
+    "upper-funnel-of-the-lower-sign": (
+        with_part(
+            bounds=bounds.Bounds(bounds.Funnel(-0.3, -0.1, 1.0), bounds.Funnel(-0.2, -0.1, 1.0))
+        ),
+        "reference of joint 0",
+        "as an upper side it takes positive numbers",
+    ),
     "bounds-wrong-n": (
         with_part(bounds=bounds.Bounds(bounds.Constant([0.1] * 3), TUBE.upper)),
         "bounds.lower.value",
@@ -447,6 +464,8 @@ def test_every_parameter_can_be_written_back_by_its_path(paper):
 WEAK = ij.presets.zhang_yan_2024()
 DRAWN = {"plant.mass": ij.factor(ij.uniform(0.9, 1.1))}
 TRACKING = ij.objectives.tracking()
+INTERVAL = {"plant.mass": ij.factor(ij.interval(0.9, 1.1))}
+GAINS = {"controller.K2": (1.0, 20.0)}
 NO_FOLDER = "/proc" if Path("/proc/self").exists() else "/dev/null"
 """A folder in which nobody can make a file."""
 
@@ -507,6 +526,30 @@ GOOD = {
     "tunable": lambda **x: ij.tunable(**({"path": "controller.K2", "low": 1.0, "high": 2.0} | x)),
     "factor": lambda **x: ij.factor(**({"distribution": ij.uniform(0.9, 1.1)} | x)),
     "with_parts": lambda **x: ij.with_parts(WEAK, **x),
+    "prove": lambda **x: ij.prove(**({"scenario": WEAK, "level": 0.1, "parameters": {}} | x)),
+    "largest_level": lambda **x: ij.largest_level(
+        **({"scenario": WEAK, "parameters": {}, "between": (1.0, 2.0)} | x)
+    ),
+    "largest_parameters": lambda **x: ij.largest_parameters(
+        **({"scenario": WEAK, "level": 0.1, "parameters": INTERVAL, "between": (0.5, 1.0)} | x)
+    ),
+    "gains_for_guarantee": lambda **x: ij.gains_for_guarantee(
+        **({"scenario": WEAK, "level": 0.1, "parameters": {}, "gains": GAINS} | x)
+    ),
+    "failure_probability": lambda **x: ij.failure_probability(
+        **({"scenario": WEAK, "perturbations": DRAWN, **SHORT} | x)
+    ),
+    "tune_file": lambda **x: ij.tune_file(**x),
+    "save_tuning": lambda **x: ij.save_tuning(**({"path": "never.json"} | x)),
+    "plotting.identification": lambda **x: ij.plotting.identification(**x),
+    "plotting.tuning": lambda **x: ij.plotting.tuning(**x),
+    "plotting.paths": lambda **x: ij.plotting.paths(**x),
+    "plotting.pareto": lambda **x: ij.plotting.pareto(**x),
+    "Delay": lambda **x: ij.actuators.Delay(**({"delay": 1e-3} | x)),
+    "AdaptiveRBF": lambda **x: controllers.AdaptiveRBF(**({"k1": 2.0, "K2": 20.0} | x)),
+    "AdaptiveNetwork": lambda **x: controllers.AdaptiveNetwork(**({"k1": 2.0, "K2": 20.0} | x)),
+    "Log": lambda **x: barriers.Log(**x),
+    "Leader": lambda **x: references.Leader(**({"motion": WEAK.reference, "weights": (1.0,)} | x)),
     "save_scenario": lambda **x: ij.save_scenario(**({"scenario": WEAK, "path": "never.toml"} | x)),
 }
 """Function -> a call of it that is fine, but for what a case replaces."""
@@ -531,12 +574,36 @@ NO_TIMES = (
 )
 NO_SEEDS = (None, "x", [], True, -1, 1.5, float("nan"), 2**32, 10**30, np.ones(2))
 NO_COUNTS = (None, "x", [], True, 0, -3, 1.5, float("nan"), np.inf, 10**30, 7 * 10**29, np.ones(2))
+NO_SCENARIOS = (None, 3, [], {}, "paper", np.ones(2), ij.Scenario, robots.TwoLink)
+NO_SIZES = (0, -3, 1.5, True, "x", 10**30)
 NO_FLAGS = ("yes", 1, 0.0, [], np.ones(2))
 NO_PATHS = (3, "a\0b", b"x", [], {}, 1.5, True, "n" * 300, f"new/{'m' * 270}/x", "/dev/null/x")
 LONG_NAME = "a" * 300
 
 REFUSED = {
     # function and argument: values, words of the message besides the argument's name
+    **{
+        f"{function} scenario": (NO_SCENARIOS, ["a Scenario", "ij.presets"])
+        for function in (
+            *("simulate", "compare", "certify", "monte_carlo", "sweep", "sensitivity", "tune"),
+            *("falsify", "failure_probability", "pareto", "identify", "excitation", "export"),
+            *("cosimulate", "explain", "recommended_dt", "recommended_period"),
+            *("prove", "largest_level", "largest_parameters", "gains_for_guarantee"),
+            "save_scenario",
+        )
+    },
+    "explore scenario": (NO_SCENARIOS, []),
+    "save_tuning result": ((None, 3, "x", WEAK), ["ij.tune"]),
+    "plotting.identification known": ((None, 3, WEAK), ["ij.identify"]),
+    "plotting.tuning result": ((None, 3, WEAK), ["ij.tune"]),
+    "plotting.paths result": ((None, 3, WEAK), ["ij.tune"]),
+    "plotting.pareto front": ((None, 3, WEAK), ["ij.pareto"]),
+    "Sampling queue": ((-1, 1.5, "x", True, 2_000_000, 10**30), ["whole number"]),
+    "Delay history": (NO_SIZES, ["whole number"]),
+    "AdaptiveRBF nodes": (NO_SIZES, ["whole number"]),
+    "AdaptiveNetwork nodes": (NO_SIZES, ["whole number"]),
+    "Log p": ((*NO_SIZES, 101), ["<= 100"]),
+    "Leader components": (NO_SIZES, ["whole number"]),
     "simulate backend": (NO_WORDS, ["'auto'"]),
     "simulate method": (NO_WORDS, ["'rk4'"]),
     "simulate record_every": (NO_COUNTS, ["whole number"]),
@@ -620,7 +687,7 @@ REFUSED = {
     "load path": ((None, 3, [], "a\0b", LONG_NAME), []),
     "load repair": (NO_FLAGS, ["True or False"]),
     "Sampling period": ((1e300, 5e-324, 0.0, -1.0, "x", None), []),
-    "Sampling delay": ((1e300, 5e-324, -1.0, "x"), []),
+    "Sampling delay": ((1e300, 5e-324, -1.0, "x", 1e6), []),
     "tunable low": (([], float("nan"), "x"), []),
     "tunable high": (([], float("nan"), "x"), []),
     "factor shared": (NO_FLAGS, []),

@@ -209,6 +209,13 @@ def test_bad_input_is_named(options, words):
         ij.prove(pendulum(), **given)
 
 
+def test_a_call_without_level_or_parameters_says_how_to_choose_them():
+    with pytest.raises(ValueError, match=r"level: got None.*V\[0\].*ij\.largest_level"):
+        ij.prove(pendulum())
+    with pytest.raises(ValueError, match=r"parameters: got None.*ij\.interval.*{}"):
+        ij.prove(pendulum(), level=LEVEL)
+
+
 @pytest.mark.parametrize(
     "parts",
     [

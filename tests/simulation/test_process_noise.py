@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import linalg
 
 import iblf_jax as ij
 from iblf_jax import bounds, controllers, process_noise, references
@@ -17,7 +18,12 @@ from iblf_jax.engine.step_size import NOISY_PHASES
 from iblf_jax.simulation import integrators
 from iblf_jax.simulation.closed_loop import evaluate, initial_state, with_process_noise
 from iblf_jax.simulation.discontinuities import Span, divide_step
-from iblf_jax.simulation.noise import brownian_increment, noise_key, with_noise_rates
+from iblf_jax.simulation.noise import (
+    brownian_increment,
+    least_distances,
+    noise_key,
+    with_noise_rates,
+)
 from iblf_jax.simulation.scenario import canonical
 
 INERTIA = 0.05 + 0.8 * 0.3**2
@@ -380,3 +386,88 @@ def test_methods_that_do_not_fit_are_refused(noise, method, words):
 def test_noise_that_does_not_fit_is_refused(make, words):
     with pytest.raises(ValueError, match=words):
         make()
+
+
+# --- the first exit against exact probabilities ---------------------------------------------------
+
+WALL, EXIT_SIGMA, EXIT_RATE, EXIT_RUNS = 0.1, 0.1, 2.0, 20_000
+
+
+def probability_of_exit(rate: float, duration: float, size: int = 400) -> float:
+    """That dx = -rate x dt + sigma dW from 0 leaves (-WALL, WALL) before the duration: one minus
+    the solution of the backward equation u_t = sigma^2/2 u_xx - rate x u_x, u = 0 at the walls.
+    """
+    x, h = np.linspace(-WALL, WALL, size + 1)[1:-1], 2 * WALL / size
+    diffusion, drift = 0.5 * EXIT_SIGMA**2 / h**2, 0.5 * rate * x / h
+    generator = (
+        np.diag(np.full(size - 1, -2 * diffusion))
+        + np.diag(diffusion - drift[:-1], 1)
+        + np.diag(diffusion + drift[1:], -1)
+    )
+    return 1.0 - (linalg.expm(duration * generator) @ np.ones(size - 1))[size // 2 - 1]
+
+
+def exits(rate: float, dt: float, level: int, **options) -> ij.Study:
+    """Runs of a link whose position (level 1) is Brownian, or whose velocity (level 2) is an
+    Ornstein-Uhlenbeck process."""
+    scenario = link(
+        process_noise.Additive(EXIT_SIGMA, levels=(level,)), stiffness=1e-9, damping=rate * INERTIA
+    )
+    far, near = (
+        bounds.Bounds(lower=bounds.Constant(-x), upper=bounds.Constant(x)) for x in (5.0, WALL)
+    )
+    walls = {"bounds": near, "velocity_bounds": None}
+    if level == 2:
+        walls = {"bounds": far, "velocity_bounds": near}
+    scenario = ij.with_parts(scenario, initial=ij.Initial(q=[0.0], dq=[0.0]), **walls)
+    given = {"runs": EXIT_RUNS, "duration": 1.0, "dt": dt, "method": "stochastic_heun"}
+    return ij.monte_carlo(scenario, {}, progress=False, **(given | options))
+
+
+def test_the_independent_probability_is_that_of_the_series():
+    k = np.arange(50)
+    terms = 4 / np.pi * (-1.0) ** k / (2 * k + 1)
+    series = 1 - np.sum(terms * np.exp(-(((2 * k + 1) * np.pi * EXIT_SIGMA / WALL) ** 2) / 8))
+    assert probability_of_exit(0.0, 1.0) == pytest.approx(series, abs=1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dt", [4e-3, 1e-3])
+@pytest.mark.parametrize(("level", "rate"), [(1, 0.0), (2, EXIT_RATE)], ids=["Brownian", "OU"])
+def test_exits_between_two_instants_count(level, rate, dt):
+    exact = probability_of_exit(rate, 1.0)
+    # Without a rate a small damping lets the velocity stay 0.
+    study = exits(rate or 1.0, dt, level)
+    found = np.asarray(study.violation_probability.estimate)
+    deviation = np.sqrt(exact * (1 - exact) / EXIT_RUNS)
+    assert 0.2 < exact < 0.8
+    assert abs(found - exact) < 3.5 * deviation
+    name = {1: "margin", 2: "velocity_margin"}[level]
+    margins = np.asarray(study.metrics[name])[:, 0]
+    np.testing.assert_array_equal(margins <= 0, np.asarray(study.status) & 1025 != 0)
+    # The instants alone miss exits: the walls seem to be 0.58 sigma sqrt(dt) farther away.
+    if level == 1:
+        reached = np.asarray(study.metrics["peak_error"])[:, 0]
+        missed = exact - np.mean(reached >= WALL)
+        assert missed > 4 * deviation
+
+
+def test_extremes_between_two_instants_do_not_depend_on_the_executor():
+    native, vmap = (exits(1.0, 4e-3, 1, runs=64, backend=name) for name in ("native", "vmap"))
+    for name in ("margin", "xi_margin", "first_violation_time"):
+        np.testing.assert_allclose(native.metrics[name], vmap.metrics[name], rtol=2e-5, atol=2e-7)
+    np.testing.assert_array_equal(native.status, vmap.status)
+
+
+def test_the_smallest_distance_has_the_distribution_of_the_bridge():
+    before, now, variance = 0.3, 0.5, 0.04
+    uniform = jnp.asarray((np.arange(4000) + 0.5) / 4000)
+    least = np.asarray(least_distances(jnp.asarray(before), jnp.asarray(now), variance, uniform))
+    assert np.all(least <= before + 1e-6)
+    for y in (-0.1, 0.0, 0.2):
+        exact = np.exp(-2 * (before - y) * (now - y) / variance)
+        assert np.mean(least < y) == pytest.approx(exact, abs=1e-3)
+    none = least_distances(
+        jnp.asarray([0.3, jnp.inf]), jnp.asarray([0.5, jnp.inf]), 0.0, uniform[:2]
+    )
+    np.testing.assert_allclose(none, [0.3, np.inf], rtol=1e-6)

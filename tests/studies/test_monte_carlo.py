@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+import warnings
 import zlib
 
 import jax
@@ -22,7 +23,7 @@ from scipy import stats
 import iblf_jax as ij
 from iblf_jax.core.status import FAILED, Status
 from iblf_jax.engine import execute, sizes
-from iblf_jax.studies import blocks, statistics
+from iblf_jax.studies import blocks, statistics, time_step
 
 SCENARIO = ij.presets.zhang_yan_2024()
 
@@ -550,3 +551,30 @@ def test_an_interrupted_study_ends_without_a_crash(what):
     assert "KeyboardInterrupt" in err if what == "left" else out == "caught\n"
     if what == "left":
         assert time.monotonic() - begin < 30
+
+
+def test_growth_and_large_errors_of_single_runs_are_remarked(paper):
+    sampled = dataclasses.replace(paper, sampling=ij.Sampling(period=1e-3))
+    options = {"runs": 4, "duration": 0.01, "dt": 1e-3}
+    study = ij.monte_carlo(sampled, {"plant.mass": ij.factor(ij.uniform(0.9, 1.1))}, **options)
+    assert "rmse is" not in repr(study)
+    assert "sampling_radius" not in repr(study)
+    radii = np.array([0.99, 1.0039, 0.98, 1.0])
+    rmse = np.array([[1.0, 1.0], [1.0, 1.0], [1.0, 30.0], [1.0, 1.0]])
+    values = study.metrics.values_by_name | {"sampling_radius": radii, "rmse": rmse}
+    metrics = ij.Metrics(values, study.metrics.unit_pairs)
+    text = repr(dataclasses.replace(study, metrics=metrics))
+    assert "largest sampling_radius: 1.0039 (run 1)" in text
+    assert "by 0.39 %" in text
+    assert "the largest rmse is 30 times the median (run 2)" in text
+
+
+def test_a_study_of_runs_that_are_sampled_too_slowly_warns():
+    status = np.array([0, int(ij.Status.SAMPLING_TOO_SLOW), 0])
+    radii = np.array([1.1, 1.0002, 0.9])
+    with pytest.warns(UserWarning, match=r"in 1 of 3 runs.* by 0\.02 % .*\(run 1\)"):
+        time_step.warn_of_sampling(status, radii)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        time_step.warn_of_sampling(status, None)
+        time_step.warn_of_sampling(0 * status, radii)

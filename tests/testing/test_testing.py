@@ -692,3 +692,31 @@ def test_a_number_of_joints_beside_a_robot_must_be_its_own(check, paper):
     )
     with pytest.raises(ValueError, match=r"n: got 3, expected 2"):
         check(member, n=3, **beside)
+
+
+@ij.component
+class FiniteBarrier:
+    """V1 = xi^2 / 2, which a disturbance carries across the bound."""
+
+    guard: float = ij.static(default=1e-3)
+    uses_o = False
+
+    def value(self, tube, q):
+        """V1."""
+        error = ij.barriers.guarded_error(tube, q, self.guard)
+        return 0.5 * (error.e / error.k) ** 2 + error.e / error.k**2 * error.beyond
+
+    def slope(self, tube, q):
+        """s."""
+        error = ij.barriers.guarded_error(tube, q, self.guard)
+        return error.e / error.k**2
+
+    def virtual_velocity(self, tube, q, k1, o):
+        """alpha."""
+        error = ij.barriers.guarded_error(tube, q, self.guard)
+        return tube.dq_d - (k1 - error.dk / error.k) * (q - tube.q_d)
+
+
+def test_a_barrier_that_is_finite_at_its_bound_is_refused():
+    with pytest.raises(ij.testing.ContractError, match=r"V1 is finite at the bound: it is 0\.5 "):
+        ij.testing.check_barrier(FiniteBarrier())

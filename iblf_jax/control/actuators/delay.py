@@ -53,7 +53,7 @@ class Delay:
         if checks.is_concrete(self.delay):
             checks.time_span("Delay.delay", self.delay)
         if self.history is not None:
-            checks.positive_integer("Delay.history", self.history)
+            checks.positive_integer("Delay.history", self.history, most=checks.MAX_ENTRIES)
 
     @property
     def input_delay(self) -> Delay:

@@ -18,6 +18,9 @@ from iblf_jax.core import checks
 from iblf_jax.core.pytree import component, static
 from iblf_jax.world.bounds import Tube
 
+MAX_P = 100
+"""Largest exponent; with a larger one xi^(2p) is 0 in most of the tube."""
+
 
 @component
 class Log:
@@ -29,7 +32,7 @@ class Log:
     what the kink adds.
 
     Args:
-      p: exponent, a whole number >= 1; 1 if not given.
+      p: exponent, a whole number from 1 to 100; 1 if not given.
       guard: distance from the bound in xi at which the guard begins, a number in (0, 1) [1];
         0.001 if not given.
 
@@ -47,9 +50,9 @@ class Log:
         return 2 * self.p - 2
 
     def check(self) -> None:
-        """Raises ValueError unless p is a whole number >= 1 and the guard in (0, 1)."""
+        """Raises ValueError unless p is a whole number from 1 to MAX_P and the guard in (0, 1)."""
         check_guard("Log", self.guard)
-        checks.positive_integer("Log.p", self.p)
+        checks.positive_integer("Log.p", self.p, most=MAX_P)
 
     def value(self, tube: Tube, q: jax.Array) -> jax.Array:
         """V1, (n,) [1]."""

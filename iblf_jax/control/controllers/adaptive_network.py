@@ -121,7 +121,7 @@ class AdaptiveNetwork:
 
     def check(self) -> None:
         """Raises ValueError for a bad barrier or number of nodes; completes `o` and `weight`."""
-        checks.positive_integer("AdaptiveNetwork.nodes", self.nodes)
+        checks.positive_integer("AdaptiveNetwork.nodes", self.nodes, most=checks.MAX_ENTRIES)
         check_barrier(self, "barrier", self.barrier, "Log")
         fit_o(self, self.barrier)
         fit_weight(self)

@@ -112,7 +112,7 @@ class AdaptiveRBF:
 
     def check(self) -> None:
         """Raises ValueError for a bad barrier or number of nodes; completes `o` and `weight`."""
-        checks.positive_integer("AdaptiveRBF.nodes", self.nodes)
+        checks.positive_integer("AdaptiveRBF.nodes", self.nodes, most=checks.MAX_ENTRIES)
         check_barrier(self, "barrier", self.barrier, "Log")
         fit_o(self, self.barrier)
         fit_weight(self)

@@ -58,7 +58,10 @@ class LawDescription(NamedTuple):
 
 def read_description(path: Path) -> LawDescription:
     """The description in a file; raises ValueError for a file with other fields."""
-    content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    try:
+        content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:  # UnicodeDecodeError and JSONDecodeError are ValueErrors
+        raise ValueError(f"{path.name}: {error}. Export the package again.") from error
     missing = [name for name in LawDescription._fields if name not in content]
     if missing:
         raise ValueError(f"{path.name}: got no {missing}. Export the package again.")
