@@ -85,9 +85,13 @@ from iblf_jax.tuning.robust import KINDS, Risk, cvar
 from iblf_jax.tuning.solvers import SOLVERS
 from iblf_jax.world.robots import joint_names
 
-components.FAMILIES.setdefault(quantities.Quantity, ("quantities", quantities.MEMBERS))
-components.FAMILIES.setdefault(metrics.Fold, ("metrics", metrics.MEMBERS))
-components.FAMILIES.setdefault(Distribution, ("distributions", distributions.MEMBERS))
+components.FAMILIES.setdefault(
+    quantities.Quantity, components.family("tuning.quantities", quantities.MEMBERS)
+)
+components.FAMILIES.setdefault(metrics.Fold, components.family("metrics", metrics.MEMBERS))
+components.FAMILIES.setdefault(
+    Distribution, components.family("studies.distributions", distributions.MEMBERS)
+)
 
 OBJECTIVES = (
     "tracking",
