@@ -39,6 +39,7 @@ from iblf_jax.files.values import (
 )
 from iblf_jax.world import bounds, disturbances, plants, process_noise, references, regions, robots
 
+
 class Family(NamedTuple):
     """The classes that a field of one protocol may hold."""
 

@@ -31,6 +31,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks, notices, programs
+from iblf_jax.core.presentation import Result
 from iblf_jax.core.progress import announced, bar
 from iblf_jax.core.pytree import astype
 from iblf_jax.core.status import VIOLATED, Status, describe, has_flag
@@ -60,7 +61,7 @@ too large."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Attack:
+class Attack(Result):
     """The worst run that `falsify` found."""
 
     scenario: Scenario
