@@ -57,7 +57,7 @@ from iblf_jax.core.pytree import field_values
 from iblf_jax.engine import RunRequest
 from iblf_jax.files import components, tuning
 from iblf_jax.files.modules import tables_of_modules
-from iblf_jax.files.rollouts import holds_rollouts, load_rollouts
+from iblf_jax.files.rollouts import ARRAY_OF_ATTRIBUTES, load_rollouts
 from iblf_jax.files.scenario import from_dict, load_scenario, scenario_to_dict
 from iblf_jax.files.values import Words, as_table, dotted, known_keys, missing
 from iblf_jax.simulation.closed_loop import initial_state
@@ -196,14 +196,17 @@ def load(path: str | os.PathLike, *, modules: Mapping[str, Any] | None = None) -
         return load_scenario(place, modules=modules)
     with place.open("rb") as file:
         start = file.read(3)
-    if start == b"CDF" or (start[:2] == b"PK" and holds_rollouts(place)):
+    if start == b"CDF":
         return load_rollouts(place, modules=modules)
     if start[:1] == b"{":
         return tuning.load_tuning(place, modules=modules)
     try:
-        return _loaded(place, modules)
+        with _opened(place) as archive:
+            if ARRAY_OF_ATTRIBUTES not in archive.namelist():
+                return _loaded(archive, modules)
     except ValueError as error:
         raise checks.with_location(place, error) from error
+    return load_rollouts(place, modules=modules)
 
 
 # --- to nodes
@@ -356,28 +359,32 @@ SEQUENCES: dict[str, Any] = {"tuple": tuple, "list": list}
 # --- from nodes
 
 
-def _loaded(place: Path, modules: Mapping[str, Any] | None) -> Any:
-    """The result in a file."""
+def _opened(place: Path) -> zipfile.ZipFile:
+    """The archive in a file."""
     try:
-        archive = zipfile.ZipFile(place)
-    except zipfile.BadZipFile as error:
-        raise checks.fail("file", Words("no such archive"), EXPECTED, str(error)) from error
-    with archive:
-        if DESCRIPTION not in archive.namelist():
-            raise checks.fail(DESCRIPTION, Words("nothing"), EXPECTED)
-        description = _described(archive)
-        reader = _Reader(archive, dict(modules or {}))
-        result = reader.value(description["result"], "result")
-        reader.check_modules()
+        return zipfile.ZipFile(place)
+    except Exception as error:  # A damaged directory raises errors of many kinds.
+        found = f"{type(error).__name__}: {error}"
+        raise checks.fail("file", Words("no archive"), EXPECTED, found) from error
+
+
+def _loaded(archive: zipfile.ZipFile, modules: Mapping[str, Any] | None) -> Any:
+    """The result in an archive."""
+    description = _described(archive)
+    reader = _Reader(archive, dict(modules or {}))
+    result = reader.value(description["result"], "result")
+    reader.check_modules()
     return result
 
 
 def _described(archive: zipfile.ZipFile) -> dict[str, Any]:
     """The description of an archive, whose format and version are known."""
+    if DESCRIPTION not in archive.namelist():
+        raise missing(DESCRIPTION, EXPECTED)
     try:
         description = json.loads(archive.read(DESCRIPTION))
-    except (ValueError, RecursionError, zipfile.BadZipFile, NotImplementedError) as error:
-        found = checks.one_line(str(error))
+    except Exception as error:  # zipfile and json raise errors of many kinds.
+        found = f"{type(error).__name__}: {error}"
         raise checks.fail(DESCRIPTION, Words("damaged text"), EXPECTED, found) from error
     as_table(description, DESCRIPTION)
     if description.get("format") != FORMAT:

@@ -21,7 +21,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import zipfile
 from collections.abc import Mapping
 from functools import partial
 from importlib.metadata import version
@@ -65,6 +64,8 @@ ENDINGS = (".nc", ".npz")
 ONE_RUN = "run"
 """The name of a run that is saved without one."""
 _ATTRIBUTES = "attributes"
+ARRAY_OF_ATTRIBUTES = f"{_ATTRIBUTES}.npy"
+"""File in the archive of ".npz" that only `save_rollouts` writes."""
 DIGEST = "digest"
 """Attribute of a netCDF file that holds the digests of its content."""
 MAX_NAMED = 4
@@ -167,11 +168,6 @@ def load_rollouts(path: str | os.PathLike, *, modules: Mapping[str, Any] | None 
     except ValueError as error:
         raise checks.with_location(path, error) from error
     return runs[ONE_RUN] if list(runs) == [ONE_RUN] else runs
-
-
-def holds_rollouts(path: str | os.PathLike) -> bool:
-    """Whether a zip archive is one that `save_rollouts` wrote."""
-    return zipfile.is_zipfile(path) and f"{_ATTRIBUTES}.npy" in zipfile.ZipFile(path).namelist()
 
 
 def load_datasets(path: str | os.PathLike) -> dict[str, xarray.Dataset]:
