@@ -332,9 +332,10 @@ def _fields_of(value: Any) -> dict[str, Any]:
 
 
 def _computed_names(cls: type) -> list[str]:
-    """The properties of a class that are computed once and kept."""
+    """The properties of a class that are computed once and kept, without those of MADE_AGAIN."""
     owners = reversed(cls.__mro__)
-    return [name for owner in owners for name, x in vars(owner).items() if _is_cached(x)]
+    names = [name for owner in owners for name, x in vars(owner).items() if _is_cached(x)]
+    return [name for name in names if (cls.__name__, name) not in MADE_AGAIN]
 
 
 def _is_cached(member: Any) -> bool:
@@ -352,6 +353,8 @@ def _name_of_member(cls: type) -> str | None:
     return None
 
 
+MADE_AGAIN = {("Proof", "problem")}
+"""Class and name of the properties that hold functions, which no file can."""
 MAPPINGS: dict[str, Any] = {"dict": dict, "counter": Counter}
 SEQUENCES: dict[str, Any] = {"tuple": tuple, "list": list}
 

@@ -290,6 +290,7 @@ def test_a_loaded_result_replays_its_runs(tmp_path):
 @pytest.mark.slow
 def test_a_loaded_proof_finds_its_problem(tmp_path):
     proof = _proof(disturbance_rate=0.1)
+    assert proof.problem.names  # Now the proof keeps the problem, which no file can hold.
     proof.save(tmp_path / "proof")
     again = ij.load(tmp_path / "proof")
     (run,), (expected,) = again.adversarial_runs(1, dt=0.01), proof.adversarial_runs(1, dt=0.01)
