@@ -169,7 +169,7 @@ class Bench:
             if case.restarts:
                 law_process = stack.enter_context(self.restarted(law, law_process, log))
             listener.listen(robot_process, law_process, LONGEST)
-        motion = RobotMotion.load(self.folder / "motion.npz")
+        motion = ij.load(self.folder / "motion.npz")
         return motion, listener.last_before(motion.ended)
 
     def restarted(self, law: Sequence[str], process: ProcessOfNode, log: Path) -> ProcessOfNode:

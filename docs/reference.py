@@ -57,8 +57,8 @@ PAGES: dict[str, tuple[str, str]] = {
     "tuning": (
         "Tuning",
         (
-            "tune TuneResult tunable pareto Front falsify Attack cvar tune_file save_tuning"
-            " load_tuning tuning.SQP tuning.LBFGS tuning.Adam tuning.Optax tuning.SLSQP"
+            "tune TuneResult tunable pareto Front falsify Attack cvar tune_file"
+            " tuning.SQP tuning.LBFGS tuning.Adam tuning.Optax tuning.SLSQP"
             " tuning.TrustConstr tuning.DifferentialEvolution tuning.CMAES tuning.Optuna tuning.Uno"
             " tuning.Report tuning.Solver"
         ),
@@ -80,7 +80,7 @@ PAGES: dict[str, tuple[str, str]] = {
     "out": (
         "Export, files and reports",
         (
-            "export Exported explore cosimulate report load_scenario save_scenario load_rollouts"
+            "export Exported explore cosimulate report load_scenario save_scenario load"
             " save_rollouts deployment.bag_log deployment.read_bag"
         ),
     ),

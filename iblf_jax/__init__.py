@@ -32,7 +32,6 @@ from iblf_jax.engine.explain import explain as explain
 from iblf_jax.engine.simulate import SimulationError as SimulationError
 from iblf_jax.engine.simulate import SimulationWarning as SimulationWarning
 from iblf_jax.engine.simulate import simulate as simulate
-from iblf_jax.files.rollouts import load_rollouts as load_rollouts
 from iblf_jax.files.rollouts import save_rollouts as save_rollouts
 from iblf_jax.files.scenario import load_scenario as load_scenario
 from iblf_jax.files.scenario import save_scenario as save_scenario
@@ -118,8 +117,7 @@ if TYPE_CHECKING:
     from iblf_jax.deployment.export import export as export
     from iblf_jax.deployment.live import explore as explore
     from iblf_jax.engine.period import recommended_period as recommended_period
-    from iblf_jax.files.tuning import load_tuning as load_tuning
-    from iblf_jax.files.tuning import save_tuning as save_tuning
+    from iblf_jax.files.results import load as load
     from iblf_jax.files.tuning import tune_file as tune_file
     from iblf_jax.identification import Identification as Identification
     from iblf_jax.identification import excitation as excitation
@@ -180,8 +178,8 @@ _ON_FIRST_USE = {
     "identify": ("iblf_jax.identification", "identify"),
     "largest_level": ("iblf_jax.proofs", "largest_level"),
     "largest_parameters": ("iblf_jax.proofs", "largest_parameters"),
+    "load": ("iblf_jax.files.results", "load"),
     "load_sweep": ("iblf_jax.studies.sweep", "load_sweep"),
-    "load_tuning": ("iblf_jax.files.tuning", "load_tuning"),
     "monte_carlo": ("iblf_jax.studies.monte_carlo", "monte_carlo"),
     "objectives": ("iblf_jax.tuning.objectives", None),
     "pareto": ("iblf_jax.tuning", "pareto"),
@@ -192,7 +190,6 @@ _ON_FIRST_USE = {
     "recommended_dt": ("iblf_jax.studies.time_step", "recommended_dt"),
     "recommended_period": ("iblf_jax.engine.period", "recommended_period"),
     "report": ("iblf_jax.reports", "report"),
-    "save_tuning": ("iblf_jax.files.tuning", "save_tuning"),
     "Sensitivity": ("iblf_jax.studies.sensitivity", "Sensitivity"),
     "sensitivity": ("iblf_jax.studies.sensitivity", "sensitivity"),
     "StoreError": ("iblf_jax.studies.store", "StoreError"),

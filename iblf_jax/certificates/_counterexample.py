@@ -39,6 +39,7 @@ from iblf_jax.certificates.level_terms import is_about_levels, level_terms_at
 from iblf_jax.certificates.proof_terms import terms_at
 from iblf_jax.control.controllers import Backstepping
 from iblf_jax.core import checks
+from iblf_jax.core.presentation import Result
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.simulation.closed_loop import initial_state
 from iblf_jax.simulation.paths import with_parameters
@@ -58,6 +59,8 @@ class Counterexample(NamedTuple):
     growth: float
     """The largest g that was found; at most -1 where the proof is exact, positive where V2 grows
     against the claim."""
+
+    save = Result.save
 
 
 def _growth(scenario: Scenario) -> tuple[jax.Array, jax.Array]:

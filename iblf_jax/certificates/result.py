@@ -19,7 +19,7 @@ from iblf_jax.certificates.lines import (
     Line,
 )
 from iblf_jax.core import checks, tables
-from iblf_jax.core.presentation import present
+from iblf_jax.core.presentation import Result, present
 
 WEIGHTED_LINES = "weighted"
 """Beginning of the names of the lines of the claim with weights."""
@@ -92,7 +92,7 @@ class LevelLabel(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Certificate:
+class Certificate(Result):
     """Theorem 2, or (S.3), inequality by inequality, for one run or for many.  `holds`, `lines`,
     `cert["inequality, case 2"]`, `plot()`.
     """

@@ -6,6 +6,7 @@ It writes the scenario with the estimates, a report and a figure.
 from __future__ import annotations
 
 import argparse
+import json
 
 HELP = "estimate parameters of a robot from its log"
 DESCRIPTION = (
@@ -32,8 +33,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--out",
         metavar="DIR",
         help=(
-            "write scenario.toml, identification.json, identification.html and .png into this"
-            " folder"
+            "write scenario.toml, identification.npz, identification.json, identification.html and"
+            " .png into this folder"
         ),
     )
 
@@ -49,13 +50,16 @@ def run(args: argparse.Namespace) -> int:
     if folder is not None:
         from iblf_jax import plotting
         from iblf_jax.files.scenario import save_scenario
+        from iblf_jax.reports import report
 
         save_scenario(result.scenario, folder / "scenario.toml")
-        result.save(folder / "identification.json")
-        result.save(folder / "identification.html")
+        result.save(folder / "identification.npz")
+        text = json.dumps(result.to_dict(), indent=1, allow_nan=False)
+        (folder / "identification.json").write_text(text, encoding="utf-8")
+        report(result, folder / "identification.html")
         plotting.save({"identification": result.plot()}, folder, formats=("png",))
         print(
-            f"\nwritten to {folder}: scenario.toml, identification.json, identification.html,"
-            " identification.png"
+            f"\nwritten to {folder}: scenario.toml, identification.npz, identification.json,"
+            " identification.html, identification.png"
         )
     return int(any(number.value is None for number in result.wanted))

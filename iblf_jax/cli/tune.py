@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out",
         metavar="DIR",
-        help="write scenario.toml, tuning.json, report.txt and tuning.png into this folder",
+        help="write scenario.toml, tuning.npz, report.txt and tuning.png into this folder",
     )
     parser.add_argument(
         "--checkpoint",
@@ -74,10 +74,10 @@ def run(args: argparse.Namespace) -> int:
             "method": result.setup.method,
         }
         save_scenario(result.scenario, folder / "scenario.toml", run=timing)
-        result.save(folder / "tuning.json")
+        result.save(folder / "tuning.npz")
         (folder / "report.txt").write_text(f"{result.report}\n{result}\n", encoding="utf-8")
         plotting.save({"tuning": result.plot()}, folder, formats=("png",))
-        print(f"\nwritten to {folder}: scenario.toml, tuning.json, report.txt, tuning.png")
+        print(f"\nwritten to {folder}: scenario.toml, tuning.npz, report.txt, tuning.png")
     return int(_has_failed(result.report))
 
 

@@ -8,6 +8,8 @@ imports the module at the first call. A new presentation is one entry of the tab
 from __future__ import annotations
 
 import importlib
+import os
+from pathlib import Path
 from typing import Any
 
 PRESENTATIONS = {
@@ -24,8 +26,8 @@ PRESENTATIONS = {
     "card": ("iblf_jax.reports", "card"),
     "report": ("iblf_jax.reports", "report"),
     "proof dataset": ("iblf_jax.files.proofs", "proof_to_xarray"),
+    "result file": ("iblf_jax.files.results", "save"),
     "rollout dataset": ("iblf_jax.files.rollouts", "rollout_to_xarray"),
-    "tuning file": ("iblf_jax.files.tuning", "save_tuning"),
 }
 """Name of a presentation -> the module and the function that makes it."""
 
@@ -43,3 +45,27 @@ def present(name: str, result: Any, *args: Any, **options: Any) -> Any:
     """
     module, function = PRESENTATIONS[name]
     return getattr(importlib.import_module(module), function)(result, *args, **options)
+
+
+class Result:
+    """What a study, a search or a proof finds: it can be saved."""
+
+    __slots__ = ()
+
+    def save(self, path: str | os.PathLike) -> Path:
+        """Writes everything to one file, from which `ij.load` returns an equal result.
+
+        Args:
+          path: the file; its folder must exist.  Its name may have any ending.
+
+        Returns:
+          The path.
+
+        Raises:
+          ValueError: the result holds a class that no file can name; the message says how to
+            register it.
+          OSError: the file cannot be written.
+
+        Source: `iblf_jax.files.results`.
+        """
+        return present("result file", self, path)

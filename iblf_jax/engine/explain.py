@@ -13,6 +13,7 @@ import numpy as np
 from iblf_jax.control.actuators._base import input_delay
 from iblf_jax.core import checks, notices
 from iblf_jax.core.devices import threads
+from iblf_jax.core.presentation import Result
 from iblf_jax.core.progress import announced
 from iblf_jax.engine import thresholds
 from iblf_jax.engine.adjoint import ReverseRun
@@ -42,7 +43,7 @@ NAMES = {
 
 
 @dataclasses.dataclass(frozen=True)
-class Explanation:
+class Explanation(Result):
     """Operations of one step, by how often they are executed; prints as a table."""
 
     counts: dict[str, Counter]

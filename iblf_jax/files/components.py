@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import typing
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -39,24 +39,51 @@ from iblf_jax.files.values import (
 )
 from iblf_jax.world import bounds, disturbances, plants, process_noise, references, regions, robots
 
-FAMILIES: dict[Any, tuple[str, dict[str, Any]]] = {
-    robots.Robot: ("robots", robots.MEMBERS),
-    plants.Plant: ("plants", plants.MEMBERS),
-    references.Reference: ("references", references.MEMBERS),
-    bounds.Side: ("bounds", bounds.MEMBERS),
-    regions.Region: ("regions", regions.MEMBERS),
-    disturbances.Disturbance: ("disturbances", disturbances.MEMBERS),
-    controllers.Controller: ("controllers", controllers.MEMBERS),
-    barriers.Barrier: ("barriers", barriers.MEMBERS),
-    decays.Decay: ("decays", decays.MEMBERS),
-    observers.Observer: ("observers", observers.MEMBERS),
-    sensors.Sensor: ("sensors", sensors.MEMBERS),
-    sensors.Part: ("sensors", sensors.MEMBERS | sensors.LEVELS),
-    sensors.Velocity: ("sensors", sensors.VELOCITIES),
-    process_noise.ProcessNoise: ("process_noise", process_noise.MEMBERS),
-    actuators.Actuator: ("actuators", actuators.MEMBERS),
+
+class Family(NamedTuple):
+    """The classes that a field of one protocol may hold."""
+
+    module: str
+    """The public module of the family."""
+    tables: dict[str, dict[str, Any]]
+    """Name of a table of this module -> the table itself, and no copy: users add their classes to
+    it.  A class of a user belongs into the last one."""
+
+    @property
+    def members(self) -> dict[str, Any]:
+        """Name -> class, those of users included."""
+        return {name: cls for table in self.tables.values() for name, cls in table.items()}
+
+    def registration(self, name: str, cls: str) -> str:
+        """The statement that gives a class a name in files."""
+        return f'iblf_jax.{self.module}.{next(reversed(self.tables))}["{name}"] = {cls}'
+
+
+def family(module: str, members: dict[str, Any]) -> Family:
+    """The family whose members are those of one table."""
+    return Family(module, {"MEMBERS": members})
+
+
+_PARTS_OF_SENSORS = {"MEMBERS": sensors.MEMBERS, "LEVELS": sensors.LEVELS}
+
+FAMILIES: dict[Any, Family] = {
+    robots.Robot: family("robots", robots.MEMBERS),
+    plants.Plant: family("plants", plants.MEMBERS),
+    references.Reference: family("references", references.MEMBERS),
+    bounds.Side: family("bounds", bounds.MEMBERS),
+    regions.Region: family("regions", regions.MEMBERS),
+    disturbances.Disturbance: family("disturbances", disturbances.MEMBERS),
+    controllers.Controller: family("controllers", controllers.MEMBERS),
+    barriers.Barrier: family("barriers", barriers.MEMBERS),
+    decays.Decay: family("decays", decays.MEMBERS),
+    observers.Observer: family("observers", observers.MEMBERS),
+    sensors.Sensor: family("sensors", sensors.MEMBERS),
+    sensors.Part: Family("sensors", _PARTS_OF_SENSORS),
+    sensors.Velocity: Family("sensors", {"VELOCITIES": sensors.VELOCITIES}),
+    process_noise.ProcessNoise: family("process_noise", process_noise.MEMBERS),
+    actuators.Actuator: family("actuators", actuators.MEMBERS),
 }
-"""Protocol -> the module of the family, and the family's members by name."""
+"""Protocol -> its family; modules above this one add theirs."""
 
 
 def field_hints(cls: Any) -> dict[str, Any]:
@@ -87,11 +114,12 @@ def members_of(hint: Any) -> tuple[str, dict[str, Any]]:
     """
     named = families_of(hint)
     if named:
-        words = " or ".join(FAMILIES[family][0] for family in named)
-        return words, {name: x for family in named for name, x in FAMILIES[family][1].items()}
+        families = [FAMILIES[protocol] for protocol in named]
+        words = " or ".join(one.module for one in families)
+        return words, {name: x for one in families for name, x in one.members.items()}
     seen: dict[str, list[Any]] = {}
-    for _, members in FAMILIES.values():
-        for name, cls in members.items():
+    for one in FAMILIES.values():
+        for name, cls in one.members.items():
             seen.setdefault(name, []).append(cls)
     return "any family", {name: found[0] for name, found in seen.items() if len(found) == 1}
 
@@ -129,23 +157,25 @@ def encode(part: Any, hint: Any, path: str) -> Any:
     if name is None:
         cls = type(part).__name__
         expected = f"a member of {words} that a file can name ({', '.join(members)})"
-        entry = _registration(_module_of(part, family), "my_name", cls)
+        entry = _registration(family, "my_name", cls, is_chain=plants.is_chain(part))
         remedy = f"Name your class before saving and loading: {entry}."
         raise checks.fail(path, Words(f"an object of class {cls}"), expected, remedy)
     return {"kind": name, **encode_fields(part, path)}
 
 
-def _registration(module: str, name: str, cls: str) -> str:
-    """The statement that gives a class a name in files."""
-    return f'iblf_jax.{module}.MEMBERS["{name}"] = {cls}'
+def _registration(hint: Any, name: str, cls: str, *, is_chain: bool = False) -> str:
+    """The statement that gives a class a name in files.
 
-
-def _module_of(part: Any, hint: Any) -> str:
-    """The module of the family to which an object of an unknown class belongs, in words."""
+    Args:
+      hint: annotation of the field that holds an object of the class.
+      name, cls: the name and the class.
+      is_chain: whether the object is a plant in strict-feedback form.
+    """
     named = families_of(hint)
-    if plants.is_chain(part) and plants.Plant in named:
-        return "plants"
-    return FAMILIES[named[0]][0] if named else "<family>"
+    if not named:
+        return f'iblf_jax.<family>.MEMBERS["{name}"] = {cls}'
+    protocol = plants.Plant if is_chain and plants.Plant in named else named[0]
+    return FAMILIES[protocol].registration(name, cls)
 
 
 def encode_fields(part: Any, path: str) -> dict[str, Any]:
@@ -211,11 +241,9 @@ def _decode_member(table: dict[str, Any], hint: Any, path: str) -> Any:
         remedy = f'Write kind = "{next(iter(members))}".'
         raise missing(f"{path}.kind", f"{expected}: {', '.join(members)}", remedy)
     if not isinstance(kind, str) or kind not in members:
-        named = families_of(hint)
-        module = FAMILIES[named[0]][0] if named else "<family>"
+        entry = _registration(hint, checks.one_line(str(kind)), "TheClass")
         remedy = (
-            f"{did_you_mean(kind, members)} If it is your own class, register it first:"
-            f" {_registration(module, checks.one_line(str(kind)), 'TheClass')}."
+            f"{did_you_mean(kind, members)} If it is your own class, register it first: {entry}."
         )
         raise checks.fail(f"{path}.kind", kind, expected, remedy.strip())
     return decode_fields(members[kind], {key: x for key, x in table.items() if key != "kind"}, path)

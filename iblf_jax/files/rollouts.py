@@ -2,15 +2,16 @@
 
 A Dataset has the dimensions `time` and `joint`, preceded by `run` for a batch.  Every variable has
 a unit and a description.  Metrics are variables too.  The attributes contain what is needed to
-repeat the run: the scenario as TOML (if a file can hold it), its parameters as JSON, and the
-versions.  In a batch, a parameter that differs between runs is a variable named by its path.
+repeat the run: the scenario as TOML (if a file can hold it; in a batch that of the first run), its
+parameters as JSON, and the versions.  In a batch, a parameter that differs between runs is a
+variable named by its path.
 
 One file holds several named runs, which may differ in length, joints and states.  Every variable
-and dimension is therefore stored as `<name>.<variable>`, and `load_rollouts` returns one Dataset
-per name.  netCDF is version 3, written by SciPy.
+and dimension is therefore stored as `<name>.<variable>`.  netCDF is version 3, written by SciPy.
+`load_datasets` returns one Dataset per name, and `load_rollouts` makes the runs of them again.
 
 netCDF 3 has no checksum.  The attribute `digest` of the file holds a digest of each variable
-(`files.digest`), which `load_rollouts` compares with the data that it reads.  The Datasets that it
+(`files.digest`), which `load_datasets` compares with the data that it reads.  The Datasets that it
 returns do not have the attribute, which would become stale in them.  NumPy's format has its own
 checksum.
 """
@@ -21,21 +22,26 @@ import json
 import os
 import re
 from collections.abc import Mapping
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
 from iblf_jax.core.optional import attributes
+from iblf_jax.core.pytree import astype
 from iblf_jax.core.status import Status, describe
 from iblf_jax.files import digest
-from iblf_jax.files.scenario import scenario_to_toml
-from iblf_jax.files.values import Words
-from iblf_jax.simulation.paths import parameters
-from iblf_jax.simulation.results import Rollout
+from iblf_jax.files.scenario import from_dict, scenario_to_toml
+from iblf_jax.files.values import Words, toml_tables
+from iblf_jax.simulation.closed_loop import initial_state
+from iblf_jax.simulation.paths import parameters, with_parameters
+from iblf_jax.simulation.results import Metrics, Rollout
+from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.signals import SIGNALS, dimension_names
 from iblf_jax.simulation.units import signal_meanings, signal_unit, status_words
 from iblf_jax.world import plants
@@ -51,8 +57,15 @@ STATES = {
 }
 """Field of a recorded state -> description."""
 
+METRIC = "metric "
+"""Beginning of the description of a metric."""
+
 ENDINGS = (".nc", ".npz")
+ONE_RUN = "run"
+"""The name of a run that is saved without one."""
 _ATTRIBUTES = "attributes"
+ARRAY_OF_ATTRIBUTES = f"{_ATTRIBUTES}.npy"
+"""File in the archive of ".npz" that only `save_rollouts` writes."""
 DIGEST = "digest"
 """Attribute of a netCDF file that holds the digests of its content."""
 MAX_NAMED = 4
@@ -88,7 +101,7 @@ def rollout_to_xarray(run: Rollout) -> xarray.Dataset:
         dims = (*batch, *dimension_names(name, np.shape(value)[len(batch) :], run.n))
         label = f"metric_{name}" if name in variables else name
         unit = run.metrics.units.get(name, "1")
-        attrs = _attrs(unit, f"metric {name.replace('_', ' ')}")
+        attrs = _attrs(unit, f"{METRIC}{name.replace('_', ' ')}")
         variables[label] = (dims, np.asarray(value), attrs)
     variables |= _status_variables(run, batch)
     varying, attrs = _parameters(run, batch)
@@ -115,7 +128,7 @@ def save_rollouts(runs: Mapping[str, Rollout] | Rollout, path: str | os.PathLike
         remedy = "The order is save_rollouts(runs, path)."
         raise checks.fail("path", Words(type(path).__name__), "a path, after the runs", remedy)
     ending = _ending(checks.file_to_write("path", path, "a file that ends in .nc or .npz"))
-    runs = {"run": runs} if isinstance(runs, Rollout) else runs
+    runs = {ONE_RUN: runs} if isinstance(runs, Rollout) else runs
     if not isinstance(runs, Mapping) or not runs:
         raise checks.fail("runs", runs, "a Rollout, or a dict of at least one Rollout by name")
     for name in runs:
@@ -134,7 +147,30 @@ def _is_name(name: Any) -> bool:
     return re.fullmatch(r"[A-Za-z0-9_][\w -]*", name, re.ASCII) is not None
 
 
-def load_rollouts(path: str | os.PathLike) -> dict[str, xarray.Dataset]:
+def load_rollouts(path: str | os.PathLike, *, modules: Mapping[str, Any] | None = None) -> Any:
+    """The runs of a file that `save_rollouts` wrote.
+
+    Args:
+      path: a ".nc" or ".npz" file.
+      modules: modules that the file cannot describe, as `load_scenario` takes them.
+
+    Returns:
+      The Rollout if one was saved, otherwise a dict of Rollouts by name.  A run whose file has no
+      scenario, because no file can hold it or because an earlier version saved many runs, is an
+      `xarray.Dataset` in place of the Rollout.
+
+    Raises:
+      ValueError, OSError: as `load_datasets`.
+    """
+    found = load_datasets(path)
+    try:
+        runs = {name: _rollout_of(data, name, modules) for name, data in found.items()}
+    except ValueError as error:
+        raise checks.with_location(path, error) from error
+    return runs[ONE_RUN] if list(runs) == [ONE_RUN] else runs
+
+
+def load_datasets(path: str | os.PathLike) -> dict[str, xarray.Dataset]:
     """The runs of a file that `save_rollouts` wrote, as Datasets by name.
 
     Args:
@@ -161,6 +197,97 @@ def load_rollouts(path: str | os.PathLike) -> dict[str, xarray.Dataset]:
 
 class DamagedFileError(ValueError):
     """The content of a file differs from its digest."""
+
+
+# --- from the Dataset
+
+
+@jax.enable_x64(True)
+def _rollout_of(
+    data: xarray.Dataset, name: str, modules: Mapping[str, Any] | None
+) -> Rollout | xarray.Dataset:
+    """The run of a Dataset; the Dataset itself where it has no scenario."""
+    if "scenario" not in data.attrs:
+        return data
+    batch = tuple(str(dim) for dim in data["status"].dims)
+    try:
+        scenario = _scenario_of(data, batch, modules)
+        start = jax.eval_shape(initial_state, _first(scenario, data["status"].shape))
+        states = {
+            "controller_state": start.controller,
+            "observer_state": start.observer,
+            "actuator_state": start.actuator,
+            "measured": start.sampled.measured if scenario.sampling is not None else (),
+        }
+        signals = {
+            signal: jnp.asarray(data[signal].values)
+            for signal in SIGNALS
+            if signal in data and signal != "t"
+        }
+        times = data["t" if "t" in data.data_vars else "time"].values
+        return Rollout(
+            **signals,
+            t=jnp.asarray(np.broadcast_to(times, (*data["status"].shape, times.shape[-1]))),
+            **{state: _state_of(data, state, tree) for state, tree in states.items()},
+            scenario=scenario,
+            metrics=_metrics_of(data),
+            **{key: jnp.asarray(data[key].values) for key in ("status", "fastest_mode", "dt")},
+            method=str(data.attrs["method"]),
+            steps=int(data.attrs["steps"]) if "steps" in data.attrs else None,
+        )
+    except Exception as error:  # A missing or wrong entry raises errors of many kinds.
+        found = f"{type(error).__name__}: {error}"
+        raise checks.fail(name, Words("data that give no run"), "a run", found) from error
+
+
+def _first(scenario: Scenario, batch: tuple[int, ...]) -> Scenario:
+    """The scenario of the first run."""
+    if np.ndim(scenario.initial.q) == 1:
+        return scenario
+    return jax.tree.map(lambda x: x[(0,) * len(batch)], scenario)
+
+
+def _scenario_of(
+    data: xarray.Dataset, batch: tuple[str, ...], modules: Mapping[str, Any] | None
+) -> Scenario:
+    """The scenario of a run; of many, with the leaves that differ between them."""
+    tables = toml_tables(str(data.attrs["scenario"]))
+    scenario = astype(from_dict(tables, modules=modules).scenario, data["q"].dtype)
+    if not batch:
+        return scenario
+    paths = [p.path for p in parameters(scenario, named=False) if p.path in data]
+    if not paths:
+        return scenario
+    given = {path: jnp.asarray(data[path].values) for path in paths}
+    make = partial(with_parameters, scenario)
+    for _ in batch:
+        make = jax.vmap(make)
+    return make(given)
+
+
+def _state_of(data: xarray.Dataset, state: str, tree: Any) -> Any:
+    """A recorded state with the structure of `tree`; `()` where none was recorded."""
+    names = [_state_name(state, keys) for keys, _ in jax.tree_util.tree_leaves_with_path(tree)]
+    if not names or names[0] not in data:
+        return ()
+    arrays = [jnp.asarray(data[name].values) for name in names]
+    return jax.tree.unflatten(jax.tree.structure(tree), arrays)
+
+
+def _metrics_of(data: xarray.Dataset) -> Metrics:
+    """The variables that are metrics."""
+    found, units = {}, {}
+    for label, variable in data.data_vars.items():
+        text = str(variable.attrs.get("description", ""))
+        if text.startswith(METRIC):
+            name = str(label).removeprefix("metric_")
+            found[name] = jnp.asarray(variable.values)
+            units[name] = str(variable.attrs["units"])
+    if "metrics" not in data.attrs:  # Earlier versions did not store the order.
+        return Metrics(found, tuple(units.items()))
+    order = json.loads(str(data.attrs["metrics"]))
+    pairs = tuple((name, units.get(name, unit)) for name, unit in order["units"])
+    return Metrics({name: found[name] for name in order["names"]}, pairs)
 
 
 # --- the Dataset
@@ -214,9 +341,13 @@ def _trajectories(run: Rollout, batch: tuple[str, ...]) -> dict[str, Any]:
             add(name, value, signal_unit(run.scenario, name), meanings[name])
     for state, tree in attributes(run, STATES).items():
         for keys, value in jax.tree_util.tree_leaves_with_path(tree):
-            name = re.sub(r"\W+", "_", state + jax.tree_util.keystr(keys)).strip("_")
-            add(name, value, "1", STATES[state])
+            add(_state_name(state, keys), value, "1", STATES[state])
     return variables
+
+
+def _state_name(state: str, keys: tuple[Any, ...]) -> str:
+    """The variable of one array of a recorded state."""
+    return re.sub(r"\W+", "_", state + jax.tree_util.keystr(keys)).strip("_")
 
 
 def _status_variables(run: Rollout, batch: tuple[str, ...]) -> dict[str, Any]:
@@ -267,15 +398,18 @@ def _parameters(run: Rollout, batch: tuple[str, ...]) -> tuple[dict[str, Any], d
     attrs = {
         "parameters": json.dumps(fixed),
         "method": run.method,
+        "metrics": json.dumps({"names": list(run.metrics), "units": run.metrics.unit_pairs}),
         "iblf_jax_version": version("iblf_jax"),
         "jax_version": jax.__version__,
     }
+    if run.steps is not None:
+        attrs["steps"] = run.steps
     if not batch:
         attrs["status"] = describe(int(run.status), status_words(run.scenario))
-        try:
-            attrs["scenario"] = scenario_to_toml(run.scenario)
-        except ValueError as error:
-            attrs["scenario_not_saved"] = str(error)
+    try:
+        attrs["scenario"] = scenario_to_toml(_first(run.scenario, np.shape(run.status)))
+    except ValueError as error:
+        attrs["scenario_not_saved"] = str(error)
     return varying, attrs
 
 

@@ -1,4 +1,4 @@
-"""Reads tuning files, which describe a tuning as validated TOML, and saves and loads its results.
+"""Reads tuning files, which describe a tuning as validated TOML, and results of earlier versions.
 
 A tuning file is a scenario file (`files.scenario`) with four more tables, of which [perturbations]
 is that of a study file (`files.study`):
@@ -39,8 +39,8 @@ Files of earlier versions are read with a DeprecationWarning.  They have the opt
 report in [tune] itself, and `joints` is the list of weights that is called `weights` now: a list of
 floating-point numbers, or of whole numbers that do not select joints, is read as weights.
 
-Every value is checked, and each error is a ValueError that names the dotted key.  A saved result is
-JSON with all its numbers in full precision; its report can be computed again.
+Every value is checked, and each error is a ValueError that names the dotted key.  Earlier versions
+wrote the result of a tuning as JSON with all its numbers in full precision; `ij.load` reads it.
 """
 
 from __future__ import annotations
@@ -57,10 +57,8 @@ import numpy as np
 
 from iblf_jax.core import checks, notices
 from iblf_jax.core.joints import holds_weights
-from iblf_jax.core.optional import attributes
-from iblf_jax.core.pytree import field_values
 from iblf_jax.files import components
-from iblf_jax.files.scenario import from_dict, read_toml, scenario_to_dict
+from iblf_jax.files.scenario import from_dict, read_toml
 from iblf_jax.files.study import perturbations_of
 from iblf_jax.files.values import Words, as_table, did_you_mean, known_keys, missing, numbers
 from iblf_jax.simulation import metrics
@@ -85,9 +83,13 @@ from iblf_jax.tuning.robust import KINDS, Risk, cvar
 from iblf_jax.tuning.solvers import SOLVERS
 from iblf_jax.world.robots import joint_names
 
-components.FAMILIES.setdefault(quantities.Quantity, ("quantities", quantities.MEMBERS))
-components.FAMILIES.setdefault(metrics.Fold, ("metrics", metrics.MEMBERS))
-components.FAMILIES.setdefault(Distribution, ("distributions", distributions.MEMBERS))
+components.FAMILIES.setdefault(
+    quantities.Quantity, components.family("tuning.quantities", quantities.MEMBERS)
+)
+components.FAMILIES.setdefault(metrics.Fold, components.family("metrics", metrics.MEMBERS))
+components.FAMILIES.setdefault(
+    Distribution, components.family("studies.distributions", distributions.MEMBERS)
+)
 
 OBJECTIVES = (
     "tracking",
@@ -324,70 +326,15 @@ def _objective(data: dict[str, Any], names: tuple[str, ...]) -> Objective:
     return total
 
 
-# --------------------------------------------------------------------------------- saved results
-
-
-RESULT = (
-    "names",
-    "best_start",
-    "stopped",
-    "optimiser",
-    "mode",
-    "seconds",
-    "multipliers",
-    "residuals",
-    "probes",
-    "tried",
-)
-"""Fields of a result that are words and numbers."""
-SETUP = tuple(
-    field.name
-    for field in dataclasses.fields(TuneSetup)
-    if field.name not in ("objective", "perturbations", "risk", "report")
-)
-"""Fields of its setup that are words and numbers."""
-
-
-def save_tuning(result: TuneResult, path: str | os.PathLike) -> None:
-    """Writes a result to a JSON file that `load_tuning` reads; errors as `TuneResult.save`."""
-    if not isinstance(result, TuneResult):
-        raise checks.fail("result", result, "a TuneResult", "ij.tune returns one.")
-    target = checks.file_to_write("path", path)
-    setup = result.setup
-    options = field_values(setup)
-    for name in ("objective", "perturbations", "risk"):
-        del options[name]
-    history = {
-        name: {"dtype": str(x.dtype), "shape": x.shape, "values": x.ravel().tolist()}
-        for name, x in result.history.items()
-    }
-    report = field_values(setup.report)
-    of_report = {name: report[field] for name, field in OF_REPORT.items()}
-    data = {
-        "what": "iblf_jax tuning result",
-        "start": scenario_to_dict(result.start),
-        "values": {key: np.asarray(x).tolist() for key, x in result.values.items()},
-        "history": history,
-        "setup": attributes(setup, SETUP) | of_report,
-        "risk": list(setup.risk),
-        "objective": components.encode_fields(setup.objective, "objective"),
-        "tuned_objective": result.objective,
-        "perturbations": {
-            key: components.encode_fields(x, key) for key, x in setup.perturbations.items()
-        },
-        **attributes(result, RESULT),
-        "report": result.report.to_dict(),
-    }
-    temporary = target.with_name(f".{target.name}.partial")
-    temporary.write_text(json.dumps(data, indent=1), encoding="utf-8")
-    os.replace(temporary, target)
+# ------------------------------------------------------------- saved results of earlier versions
 
 
 def load_tuning(path: str | os.PathLike, *, modules: Mapping[str, Any] | None = None) -> TuneResult:
-    """A saved result; its `report` is made again, on the same fresh draws.
+    """A result in the JSON of earlier versions; its `report` is made again, on the same fresh
+    draws.
 
     Args:
-      path: a file that `TuneResult.save` wrote.
+      path: a file that `TuneResult.save` wrote in these versions.
       modules: modules that the file cannot describe, as `load_scenario` takes them.
 
     Raises:
@@ -474,7 +421,7 @@ def _tuned_objective(data: dict[str, Any], history: dict[str, np.ndarray]) -> fl
 
 
 def _decoded(data: dict[str, Any], modules: Mapping[str, Any] | None) -> TuneResult:
-    """The result that `save_tuning` encoded."""
+    """The result that a file describes."""
     start = from_dict(data["start"], modules=modules).scenario
     values = {key: np.asarray(numbers(x, key)) for key, x in data["values"].items()}
     setup = _decoded_setup(data)

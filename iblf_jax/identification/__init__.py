@@ -1,7 +1,7 @@
 """Parameters of a robot from its log, with their uncertainty.
 
     known = ij.identify(scenario, "log.csv", ["robot.mass", "robot.damping"])
-    known.scenario, known.perturbations, known.plot(), known.save("report.html")
+    known.scenario, known.perturbations, known.plot(), known.save("known.npz")
 
 `_identify`             the public function: options, problem, search, result
 `problem`               what is identified, from which data

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
-import os
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from iblf_jax.core import checks, tables
-from iblf_jax.core.presentation import present
+from iblf_jax.core import tables
+from iblf_jax.core.presentation import Result, present
 from iblf_jax.identification.coordinates import plant_path
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Scenario
@@ -112,7 +110,7 @@ class Fit(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Identification:
+class Identification(Result):
     """Parameters from a log: values, standard errors, and what the log does not identify."""
 
     scenario: Scenario
@@ -327,24 +325,6 @@ class Identification:
             "steps": self.steps,
             "seconds": self.seconds,
         })  # fmt: skip
-
-    def save(self, path: str | os.PathLike) -> None:
-        """Writes the report: numbers as JSON, or numbers and figure as one page of HTML; the
-        ending, ".json" or ".html", decides.
-
-        Raises:
-          ValueError: another ending.
-          OSError: the file cannot be written.
-        """
-        target = checks.file_to_write("path", path, "a file that ends in .json or .html")
-        ending = target.suffix.lower()
-        if ending not in (".json", ".html"):
-            raise checks.fail("path", str(target), "a file that ends in .json or .html")
-        if ending == ".html":
-            present("report", self, target)
-            return
-        text = json.dumps(self.to_dict(), indent=1, allow_nan=False)
-        target.write_text(text, encoding="utf-8")
 
     def plot(self, **options):
         """Figure: values with standard errors, combinations, and residuals.  Options as

@@ -13,6 +13,7 @@ V_w = V with the weight w of the estimation error.  Three steps answer:
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import time
 import warnings
@@ -144,7 +145,8 @@ def prove(
     level, parameters = _chosen(level, parameters)
     problem = problem_of(scenario, parameters, duration, disturbance_rate)
     with jax.enable_x64(True):
-        return _decided(canonical(scenario), problem, dict(parameters), level, weight, options)
+        proof = _decided(canonical(scenario), problem, dict(parameters), level, weight, options)
+    return dataclasses.replace(proof, disturbance_rate=disturbance_rate)
 
 
 def _chosen(level: Any, parameters: Any) -> tuple[float, Mapping[str, Perturbation]]:
@@ -203,7 +205,7 @@ def _decided(
         growth_points=_growth_points(problem, level, sampled),
         worst_box=None if worst is None else _worst_box(problem, level, best.weight, worst),
         violation=violation,
-        problem=problem,
+        assumptions=problem.assumptions,
     )
 
 

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.presentation import Result
 from iblf_jax.proofs._prove import problem_of, prove, sample_weights, weights_of
 from iblf_jax.proofs.largest import ends_of
 from iblf_jax.proofs.result import Proof
@@ -26,7 +27,7 @@ TRIES = 60
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class GuaranteedGains:
+class GuaranteedGains(Result):
     """Gains with the least largest V_w' on a level set, and the proof."""
 
     scenario: Scenario

@@ -6,8 +6,7 @@ import dataclasses
 import enum
 import math
 from collections.abc import Mapping
-from os import PathLike
-from pathlib import Path
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -16,7 +15,7 @@ import numpy as np
 
 from iblf_jax.control.barriers._base import barrier_member
 from iblf_jax.core import checks, tables
-from iblf_jax.core.presentation import present
+from iblf_jax.core.presentation import Result, present
 from iblf_jax.core.pytree import astype
 from iblf_jax.engine.simulate import simulate
 from iblf_jax.proofs.problem import LevelSetProblem
@@ -132,7 +131,7 @@ class Violation(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Proof:
+class Proof(Result):
     """Whether {V_w <= level} is invariant for all times and parameters; printed as sentences."""
 
     verdict: Verdict
@@ -163,8 +162,10 @@ class Proof:
     """Of a proof that is not complete; None otherwise."""
     violation: Violation | None
     """None unless the verdict is REFUTED."""
-    problem: LevelSetProblem
-    """Coordinates, bounds and points of the level set."""
+    assumptions: tuple[str, ...]
+    """What the statement assumes, in sentences."""
+    disturbance_rate: Any = None
+    """Bound of the rate of a further disturbance, () or (n,) [N m/s]; None without one."""
     history: tuple[Attempt, ...] = ()
     """The proofs of a bisection, in their order; () for a single one."""
 
@@ -173,10 +174,13 @@ class Proof:
         """Whether the set is proved to be invariant."""
         return self.verdict == Verdict.PROVED
 
-    @property
-    def assumptions(self) -> tuple[str, ...]:
-        """What the statement assumes, in sentences."""
-        return self.problem.assumptions
+    @cached_property
+    def problem(self) -> LevelSetProblem:
+        """Coordinates, bounds and points of the level set."""
+        from iblf_jax.proofs._prove import problem_of
+
+        duration = None if self.is_period else self.duration
+        return problem_of(self.scenario, self.parameters, duration, self.disturbance_rate)
 
     @property
     def point(self) -> GrowthPoint | None:
@@ -245,12 +249,6 @@ class Proof:
     def to_xarray(self) -> xarray.Dataset:
         """Tube, verdict and numbers as a dataset."""
         return present("proof dataset", self)
-
-    def save(self, path: str | PathLike) -> Path:
-        """Writes the dataset as netCDF; returns the path."""
-        place = checks.file_to_write("path", path)
-        self.to_xarray().to_netcdf(place, engine="scipy")
-        return place
 
     def _repr_html_(self) -> str:
         """The card in a notebook."""

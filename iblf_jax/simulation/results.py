@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.core.presentation import present
+from iblf_jax.core.presentation import Result, present
 from iblf_jax.core.status import Status, describe
 from iblf_jax.simulation.error_estimate import RELATIVE
 from iblf_jax.simulation.scenario import Scenario
@@ -77,7 +77,7 @@ class Metrics(Mapping):
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, eq=False)
-class Rollout(Signals):
+class Rollout(Result, Signals):
     """One run of a scenario, or many: every array below has a leading run axis then.
 
     Its signals, `run.t`, `run.q`, `run.tau` ..., are those of `simulation.signals`, (T,) or (T, n)

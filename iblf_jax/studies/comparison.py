@@ -15,7 +15,7 @@ import numpy as np
 from iblf_jax.control.barriers import Integral
 from iblf_jax.control.controllers._base import law_member
 from iblf_jax.core import tables
-from iblf_jax.core.presentation import present
+from iblf_jax.core.presentation import Result, present
 from iblf_jax.core.pytree import unwrapped
 from iblf_jax.core.status import FAILED, describe
 from iblf_jax.core.units import INPUT, POSITION, VELOCITY
@@ -157,7 +157,7 @@ def _is_closest_at_start(run: Rollout) -> bool:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Comparison:
+class Comparison(Result):
     """Several laws on one scenario.  Prints as two tables, each with what is equal in it."""
 
     rollouts: dict[str, Rollout]

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from iblf_jax.core import checks
-from iblf_jax.core.presentation import present
+from iblf_jax.core.presentation import Result, present
 from iblf_jax.core.status import Status, has_flag
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ ROUNDING_STEPS = 4.0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class FirstExit:
+class FirstExit(Result):
     """The distribution of the first exit from the bounds, over the runs of a study."""
 
     times: np.ndarray

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from iblf_jax.core import checks, notices, tables
+from iblf_jax.core.presentation import Result
 from iblf_jax.core.progress import announced, bar
 from iblf_jax.core.pytree import field_values
 from iblf_jax.core.status import FAILED, has_flag
@@ -46,7 +47,7 @@ TAILS = (0.025, 0.975)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Sensitivity:
+class Sensitivity(Result):
     """Sobol indices, one for each number that is perturbed."""
 
     parameters: tuple[str, ...]

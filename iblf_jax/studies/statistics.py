@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from iblf_jax.core import checks
+from iblf_jax.core.presentation import Result
 
 SMALLER_IS_WORSE = (
     "margin",
@@ -35,7 +36,7 @@ SMALLER_IS_WORSE = (
 
 
 @dataclasses.dataclass(frozen=True)
-class Probability:
+class Probability(Result):
     """The estimated probability of an event, with its confidence interval."""
 
     estimate: float

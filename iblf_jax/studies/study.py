@@ -22,7 +22,7 @@ import jax
 import numpy as np
 
 from iblf_jax.core import checks, notices
-from iblf_jax.core.presentation import present
+from iblf_jax.core.presentation import Result, present
 from iblf_jax.core.progress import announced
 from iblf_jax.core.status import FAILED, Status, describe, has_flag
 from iblf_jax.core.status import VIOLATED as CONSTRAINT_VIOLATED
@@ -59,7 +59,7 @@ integrates has the radius 1."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class OneRun:
+class OneRun(Result):
     """One run of a study."""
 
     index: int
@@ -70,7 +70,7 @@ class OneRun:
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, eq=False)
-class Study:
+class Study(Result):
     """Many runs of one scenario with drawn parameters; arrays have N runs first.  `study[i]` is one
     run.
     """

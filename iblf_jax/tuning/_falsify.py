@@ -31,6 +31,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks, notices, programs
+from iblf_jax.core.presentation import Result
 from iblf_jax.core.progress import announced, bar
 from iblf_jax.core.pytree import astype
 from iblf_jax.core.status import VIOLATED, Status, describe, has_flag
@@ -40,7 +41,7 @@ from iblf_jax.simulation.metrics import check_needs
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario, canonical, fitted_to_step
-from iblf_jax.simulation.units import status_words
+from iblf_jax.simulation.units import status_words, unit_text
 from iblf_jax.studies.distributions import Perturbation
 from iblf_jax.studies.perturbation_cube import Cube, unit_cube
 from iblf_jax.tuning.evaluation import Derivatives, Value
@@ -60,7 +61,7 @@ too large."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Attack:
+class Attack(Result):
     """The worst run that `falsify` found."""
 
     scenario: Scenario
@@ -244,7 +245,7 @@ class MarginEvaluator:
         self.dtype = cube.uncertain.scenario.initial.q.dtype
         step = jnp.asarray(dt, self.dtype)
         self.margins = partial(_margins, cube, astype(peak, self.dtype), step, request=request)
-        self.unit = DEFICITS[peak.signal]
+        self.unit = unit_text(cube.uncertain.scenario, DEFICITS[peak.signal])
         size = cube.size
         self.space = SearchSpace(Box(np.full(size, 0.5), np.zeros(size), np.ones(size)))
         self.active = np.ones(starts, bool)

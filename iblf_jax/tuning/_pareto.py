@@ -36,7 +36,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks, notices
-from iblf_jax.core.presentation import present
+from iblf_jax.core.presentation import Result, present
 from iblf_jax.core.progress import announced, bar
 from iblf_jax.engine import MAX_FORWARD_NUMBERS, differentiates_forward
 from iblf_jax.simulation.paths import with_parameters
@@ -64,7 +64,7 @@ POINTS_BETWEEN = 8
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Front:
+class Front(Result):
     """Gains of which none is dominated by another in both objectives, from low a to low b."""
 
     labels: tuple[str, str]

@@ -28,6 +28,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from iblf_jax.core.presentation import Result
 from iblf_jax.core.status import Status, has_flag
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Scenario
@@ -168,7 +169,7 @@ WORST_FIRST = ("fail", "undecided", "pass")
 
 
 @dataclasses.dataclass(frozen=True)
-class TuningReport:
+class TuningReport(Result):
     """Changes and verdicts, on fresh runs or on the nominal one; prints as text."""
 
     runs: int

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import os
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -13,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.core import checks, notices, programs
-from iblf_jax.core.presentation import present
+from iblf_jax.core.presentation import Result, present
 from iblf_jax.core.progress import announced
 from iblf_jax.core.status import UNTRUSTED
 from iblf_jax.engine import RunRequest, points_per_batch, run_batch, run_rollout
@@ -88,7 +87,7 @@ class TuneSetup(TuningRunOptions):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class TuneResult:
+class TuneResult(Result):
     """A tuned scenario, the history of its search, and its report.
 
     With perturbations the report is on runs that the tuning did not use.
@@ -411,17 +410,6 @@ class TuneResult:
         `plotting.tuning`.
         """
         return present("tuning figure", self, **options)
-
-    def save(self, path: str | os.PathLike) -> None:
-        """Writes everything to one file, from which `load_tuning` restores the result with the
-        same report.
-
-        Raises:
-          ValueError: the scenario, the objective or a perturbation holds a class that no file can
-            name.
-          OSError: the file cannot be written.
-        """
-        present("tuning file", self, path)
 
     def __repr__(self) -> str:
         probes = f", {self.probes} probes" if self.probes else ""

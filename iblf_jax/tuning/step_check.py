@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.control.actuators import Ideal, Motor
+from iblf_jax.core.presentation import Result
 from iblf_jax.core.units import INPUT, POSITION
 from iblf_jax.simulation.paths import with_parameters
 from iblf_jax.simulation.scenario import Scenario
@@ -126,7 +127,7 @@ class WorstExcess(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class StepCheck:
+class StepCheck(Result):
     """The runs of a tuning with the tuned gains, at dt and at dt / 2; prints as text.
 
     Each pair of numbers is in this order.

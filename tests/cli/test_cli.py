@@ -22,6 +22,7 @@ from iblf_jax.cli import _claims, _common, _paper_figures
 from iblf_jax.core import tables
 from iblf_jax.core.disk_cache import keep_programs
 from iblf_jax.files import scenario as scenario_file
+from iblf_jax.files.rollouts import load_datasets
 
 SHORT = ["--duration", "0.05", "--dt", "0.001", "--method", "heun"]
 
@@ -82,7 +83,7 @@ def test_reproduce(command, tmp_path):
     settling = report["runs"]["log-BLF"]["metrics"]["settling_time"]
     np.testing.assert_allclose(settling["value"], [1.077, 0.837], atol=2e-3)
     assert settling["unit"] == "s"
-    data = ij.load_rollouts(tmp_path / "out" / "rollouts.nc")
+    data = load_datasets(tmp_path / "out" / "rollouts.nc")
     assert data["integral BLF"].sizes["time"] == 20_001
 
 
@@ -188,7 +189,7 @@ def test_simulate_a_file(command, paper, tmp_path):
     report = strict_json(tmp_path / "out" / "metrics.json")
     assert report["status"] == "ok"
     assert report["metrics"]["rmse"]["value"] == np.asarray(run.metrics.rmse).tolist()
-    np.testing.assert_array_equal(ij.load_rollouts(tmp_path / "out" / "rollout.nc")["run"].q, run.q)
+    np.testing.assert_array_equal(load_datasets(tmp_path / "out" / "rollout.nc")["run"].q, run.q)
 
 
 @pytest.mark.slow

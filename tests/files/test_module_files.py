@@ -157,10 +157,10 @@ def test_a_saved_tuning_receives_modules(tmp_path):
     given = {"disturbance.net": Opaque(jnp.zeros((2, 4)))}
     effort = ij.tuning.Effort(iterations=1, starts=1)
     result = ij.tune_file(tmp_path / "a.toml", modules=given, effort=effort, progress=False)
-    result.save(tmp_path / "tuning.json")
+    result.save(tmp_path / "tuning")
     with pytest.raises(ValueError, match=r'modules=\{"disturbance.net": module\}'):
-        ij.load_tuning(tmp_path / "tuning.json")
-    again = ij.load_tuning(tmp_path / "tuning.json", modules=given)
+        ij.load(tmp_path / "tuning")
+    again = ij.load(tmp_path / "tuning", modules=given)
     assert same(again.scenario, result.scenario)
 
 

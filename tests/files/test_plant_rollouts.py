@@ -5,6 +5,7 @@ import pytest
 from plant_cases import body, pendulum
 
 import iblf_jax as ij
+from iblf_jax.files.rollouts import load_datasets
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +31,7 @@ def test_signals_of_levels_have_dimensions_and_units(run):
 @pytest.mark.parametrize("ending", [".nc", ".npz"])
 def test_a_file_keeps_levels_and_units(run, tmp_path, ending):
     ij.save_rollouts(run, tmp_path / f"run{ending}")
-    (data,) = ij.load_rollouts(tmp_path / f"run{ending}").values()
+    (data,) = load_datasets(tmp_path / f"run{ending}").values()
     assert data.identical(run.to_xarray())
 
 

@@ -19,6 +19,7 @@ from made_up_runs import ALWAYS
 import iblf_jax as ij
 from iblf_jax.files import rollouts
 from iblf_jax.files import scenario as scenario_file
+from iblf_jax.files.rollouts import load_datasets
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +97,7 @@ def test_batches_of_batches_and_of_different_steps(paper):
 def test_files_give_the_same_datasets_back(ending, short_run, batch, tmp_path):
     runs = {"integral BLF": short_run, "b-2": batch}
     ij.save_rollouts(runs, tmp_path / f"runs{ending}")
-    found = ij.load_rollouts(tmp_path / f"runs{ending}")
+    found = load_datasets(tmp_path / f"runs{ending}")
     assert list(found) == list(runs)
     for name, run in runs.items():
         xarray.testing.assert_identical(found[name], run.to_xarray())
@@ -104,7 +105,7 @@ def test_files_give_the_same_datasets_back(ending, short_run, batch, tmp_path):
 
 def test_a_single_run_is_called_run(short_run, tmp_path):
     ij.save_rollouts(short_run, tmp_path / "a.nc")
-    assert list(ij.load_rollouts(str(tmp_path / "a.nc"))) == ["run"]
+    assert list(load_datasets(str(tmp_path / "a.nc"))) == ["run"]
 
 
 def test_states_of_any_structure(short_run, tmp_path):
@@ -116,7 +117,7 @@ def test_states_of_any_structure(short_run, tmp_path):
     assert data.controller_state_rest_0.dims == ("time", "joint")
     assert data.controller_state_rest_1.dims == ("time",)
     ij.save_rollouts(run, tmp_path / "a.nc")
-    xarray.testing.assert_identical(ij.load_rollouts(tmp_path / "a.nc")["run"], data)
+    xarray.testing.assert_identical(load_datasets(tmp_path / "a.nc")["run"], data)
 
 
 def test_metrics_with_the_name_of_a_field(short_run):
@@ -152,7 +153,7 @@ def test_bad_arguments(short_run, tmp_path):
     with pytest.raises(ValueError, match=r"ends in \.nc"):
         ij.save_rollouts(short_run, tmp_path / "a.csv")
     with pytest.raises(ValueError, match=r"ends in \.nc"):
-        ij.load_rollouts(tmp_path / "a")
+        load_datasets(tmp_path / "a")
     for runs in ({}, [short_run], None):
         with pytest.raises(ValueError, match="dict of at least one Rollout"):
             ij.save_rollouts(runs, tmp_path / "a.nc")  # type: ignore[arg-type]
@@ -175,11 +176,11 @@ def test_bad_arguments(short_run, tmp_path):
 def test_bad_files(ending, tmp_path):
     path = tmp_path / f"a.{ending}"
     with pytest.raises(FileNotFoundError):
-        ij.load_rollouts(path)
+        load_datasets(path)
     for content in (b"", b"hello", b"CDF\x01" + bytes(40), b"PK\x03\x04"):
         path.write_bytes(content)
         with pytest.raises(ValueError, match="expected a file written by save_rollouts"):
-            ij.load_rollouts(path)
+            load_datasets(path)
 
 
 @pytest.fixture(scope="module")
@@ -188,7 +189,7 @@ def stored(short_run, tmp_path_factory):
     path = tmp_path_factory.mktemp("stored") / "runs.nc"
     batch = jax.tree.map(lambda x: jnp.stack([x, x]), short_run)
     ij.save_rollouts({"one": short_run, "two runs": batch}, path)
-    return path, ij.load_rollouts(path)
+    return path, load_datasets(path)
 
 
 def _is_same(found, expected):
@@ -226,7 +227,7 @@ def test_a_damaged_netcdf_file_is_refused_or_loads_as_it_was(kind, stored, rng, 
     for _ in range(60):
         (tmp_path / "damaged.nc").write_bytes(_damage(content, rng, kind))
         try:
-            found = ij.load_rollouts(tmp_path / "damaged.nc")
+            found = load_datasets(tmp_path / "damaged.nc")
         except ValueError:
             refused += 1
             continue
@@ -240,11 +241,11 @@ def test_the_error_for_a_damaged_file_names_variable_and_remedy(stored, tmp_path
     data["one.q"][3, 1] += 1e-9
     data.to_netcdf(tmp_path / "edited.nc", engine="scipy")
     with pytest.raises(ValueError, match=r"edited.nc.*variable q of run 'one'.*'digest'") as caught:
-        ij.load_rollouts(tmp_path / "edited.nc")
+        load_datasets(tmp_path / "edited.nc")
     assert "variable dq" not in str(caught.value)
     del data.attrs["digest"]
     data.to_netcdf(tmp_path / "edited.nc", engine="scipy")
-    found = ij.load_rollouts(tmp_path / "edited.nc")
+    found = load_datasets(tmp_path / "edited.nc")
     np.testing.assert_array_equal(found["one"].q, data["one.q"])
 
 
@@ -256,7 +257,7 @@ def test_files_without_a_digest_load_and_datasets_carry_none(stored, tmp_path):
     assert "digest" in older.attrs
     del older.attrs["digest"]
     older.to_netcdf(tmp_path / "older.nc", engine="scipy")
-    assert _is_same(ij.load_rollouts(tmp_path / "older.nc"), expected)
+    assert _is_same(load_datasets(tmp_path / "older.nc"), expected)
     assert not any("digest" in one.attrs for one in expected.values())
 
 
@@ -272,7 +273,7 @@ def test_a_digest_knows_values_that_are_written_in_several_ways(short_run, tmp_p
         short_run, metrics=dataclasses.replace(short_run.metrics, values_by_name=values)
     )
     ij.save_rollouts(run, tmp_path / "a.nc")
-    assert bool(ij.load_rollouts(tmp_path / "a.nc")["run"]["is_so"])
+    assert bool(load_datasets(tmp_path / "a.nc")["run"]["is_so"])
 
 
 @pytest.mark.slow

@@ -733,7 +733,7 @@ def test_a_file_or_folder_that_does_not_exist_is_named_with_its_argument(tmp_pat
         match=r"checkpoint: got .*The folder .*none does not exist: create it first\.$",
     ):
         ij.tune(WEAK, gains, ij.objectives.tracking(), duration=0.01, dt=1e-3, checkpoint=place)
-    refuses(lambda: ij.load_rollouts(tmp_path / "none.nc"), "path", "Nothing is there.")
+    refuses(lambda: ij.load(tmp_path / "none.nc"), "path", "Nothing is there.")
     with pytest.raises(ValueError, match=r"Nothing is there\.$"):
         ij.robots.load(tmp_path / "none.urdf")
 

@@ -244,7 +244,7 @@ def test_figure_file_and_report(tmp_path):
     found = proof()
     figure = found.plot(runs=2)
     assert "proved" in figure.get_suptitle()
-    assert found.save(tmp_path / "proof.nc").exists()
+    assert ij.load(found.save(tmp_path / "proof")).sentence() == found.sentence()
     data = found.to_xarray()
     assert data.attrs["verdict"] == "proved" and data["range"].shape == (1, 2)
     assert "PROVED" in ij.report(found, tmp_path / "proof.html").read_text()

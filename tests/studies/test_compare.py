@@ -323,7 +323,7 @@ def test_command_line(tmp_path, capsys, monkeypatch):
     report = json.loads((tmp_path / "out" / "comparison.json").read_text())
     assert report["factors"]["integral"] == 1.0
     assert report["factors"]["log"] == pytest.approx(1.1, abs=0.1)
-    assert set(ij.load_rollouts(tmp_path / "out" / "rollouts.nc")) == {"integral", "log"}
+    assert set(ij.load(tmp_path / "out" / "rollouts.nc")) == {"integral", "log"}
 
 
 def test_command_line_refuses_an_unknown_law(capsys):

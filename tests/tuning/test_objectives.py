@@ -137,7 +137,7 @@ def test_a_metric_is_tuned_for_and_its_result_saved(paper, tmp_path):
     assert np.min(losses) < losses[0].min()
     assert "swing" in str(best.report)
     with pytest.raises(ValueError, match="Swing"):
-        best.save(tmp_path / "mine.json")
+        best.save(tmp_path / "mine")
 
 
 @pytest.mark.release
@@ -157,8 +157,8 @@ def test_tuning_by_a_metric_is_tuning_by_the_objective_that_it_equals(paper, tmp
     for name in ("loss", "gradient_norm"):
         first, second = by_metric.history[name][0][order], by_name.history[name][0][other_order]
         np.testing.assert_allclose(first, second, rtol=1e-8)
-    by_metric.save(tmp_path / "tuned.json")
-    assert ij.load_tuning(tmp_path / "tuned.json").values.keys() == by_metric.values.keys()
+    by_metric.save(tmp_path / "tuned")
+    assert ij.load(tmp_path / "tuned").values.keys() == by_metric.values.keys()
 
 
 def rejects(objective, *words, **options):
@@ -535,7 +535,7 @@ def test_a_tuning_file_selects_joints_by_name_index_and_slice(tmp_path):
 def test_a_result_that_was_saved_with_weights_as_joints_means_what_it_meant():
     """A file of the version before `weights`: tracking, peak_torque, a metric, and two
     requirements."""
-    found = ij.load_tuning(
+    found = ij.load(
         Path(__file__).parents[1] / "data" / "tuning_before_weights.json"
     ).setup.objective
     weights = [np.asarray(quantity.weights).tolist() for quantity in found.quantities]
@@ -563,8 +563,8 @@ def test_tuning_and_a_front_under_limits_of_single_joints(paper, tmp_path):
     peaks = np.asarray(ij.simulate(best.scenario, duration=0.5, dt=1e-3).metrics.peak_torque)
     assert np.all(peaks < np.array(limits) * 1.001)
     assert "peak torque < [16, 14] N m" in str(best.report) and "% of its limit" in str(best.report)
-    best.save(tmp_path / "tuned.json")
-    again = ij.load_tuning(tmp_path / "tuned.json")
+    best.save(tmp_path / "tuned")
+    again = ij.load(tmp_path / "tuned")
     assert jax.tree.structure(again.setup.objective) == jax.tree.structure(best.setup.objective)
     assert again.report.verdicts == best.report.verdicts
     pair = (o.tracking(joints=[0]), o.effort() + o.peak_torque_below(limits))

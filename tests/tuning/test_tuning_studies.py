@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import warnings
+from pathlib import Path
 from types import SimpleNamespace
 
 import jax
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 import iblf_jax as ij
+from iblf_jax.files.tuning import load_tuning
 from iblf_jax.simulation.paths import get
 from iblf_jax.tuning import _pareto, evaluation
 from iblf_jax.tuning._pareto import Front, non_dominated
@@ -231,11 +233,11 @@ def test_the_command_line_tunes_and_a_saved_result_reproduces_its_report(tmp_pat
     assert "fresh runs" in text
     assert {p.name for p in (tmp_path / "out").iterdir()} == {
         "scenario.toml",
-        "tuning.json",
+        "tuning.npz",
         "report.txt",
         "tuning.png",
     }
-    loaded = ij.load_tuning(tmp_path / "out" / "tuning.json")
+    loaded = ij.load(tmp_path / "out" / "tuning.npz")
     assert str(loaded.report) in text
     tuned = ij.load_scenario(tmp_path / "out" / "scenario.toml")
     np.testing.assert_array_equal(tuned.controller.K2, loaded.scenario.controller.K2)
@@ -368,17 +370,17 @@ def test_the_path_of_a_tuning_across_what_is_allowed(paper):
 def tuned(paper, tmp_path_factory):
     """A tuning, its checkpoint and its file."""
     folder = tmp_path_factory.mktemp("tuned")
-    best = ij.tune(
+    ij.tune(
         paper,
         ["controller.k1"],
         ij.objectives.tracking(scale=1.0),
         checkpoint=folder / "state.npz",
         **BRIEF,
     )
-    best.save(folder / "best.json")
     return folder
 
 
+EARLIER = Path(__file__).parents[1] / "data" / "tuning_before_weights.json"
 BRIEF = {
     "duration": 0.01,
     "iterations": 1,
@@ -389,10 +391,10 @@ BRIEF = {
 
 @pytest.mark.slow
 def test_files_that_are_torn_or_others(paper, tuned, tmp_path):
-    """Checkpoints and saved results: cut anywhere, of another kind, with keys that are missing or
-    of another type."""
+    """Checkpoints and results of earlier versions: cut anywhere, of another kind, with keys that
+    are missing or of another type."""
     np.save(tmp_path / "array.npy", np.ones(3))
-    state, saved = (tuned / "state.npz").read_bytes(), (tuned / "best.json").read_text()
+    state, saved = (tuned / "state.npz").read_bytes(), EARLIER.read_text()
     for data in (
         b"",
         state[:10],
@@ -410,8 +412,8 @@ def test_files_that_are_torn_or_others(paper, tuned, tmp_path):
                 checkpoint=tmp_path / "bad.npz",
                 **BRIEF,
             )
-        with pytest.raises(ValueError, match="save_rollouts"):
-            ij.load_rollouts(tmp_path / "bad.npz")
+        with pytest.raises(ValueError, match=r"bad.npz: "):
+            ij.load(tmp_path / "bad.npz")
     complete = json.loads(saved)
     bad = [
         {key: x for key, x in complete.items() if key != left_out}
@@ -427,5 +429,5 @@ def test_files_that_are_torn_or_others(paper, tuned, tmp_path):
     for data in (*map(json.dumps, bad), saved[:200], "[]", "[" * 100_000):
         (tmp_path / "bad.json").write_text(data)
         with pytest.raises(ValueError, match=r"path: got .*TuneResult\.save"):
-            ij.load_tuning(tmp_path / "bad.json")
-    assert ij.load_tuning(tuned / "best.json").names == ("controller.k1[0]", "controller.k1[1]")
+            load_tuning(tmp_path / "bad.json")
+    assert load_tuning(EARLIER).names == ("controller.k1[0]", "controller.k1[1]")

@@ -25,6 +25,7 @@ from iblf_jax.deployment.mujoco_plant import with_payload
 from iblf_jax.deployment.ros2.robot_model import planar_mjcf, plant_of
 from iblf_jax.deployment.ros2.robot_motion import RobotMotion
 from iblf_jax.deployment.ros2.simulated_robot import ros_packages
+from iblf_jax.files.results import load
 from iblf_jax.files.scenario import save_scenario
 from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.sampling import commands_in_transit
@@ -278,7 +279,7 @@ def run_nodes(
         DiagnosticsListener() as listener,
     ):
         listener.listen(robot_process, law_process, longest)
-    motion = RobotMotion.load(folder / "motion.npz")
+    motion = load(folder / "motion.npz")
     return motion, listener.last_before(motion.ended)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -14,6 +13,7 @@ import numpy as np
 
 from iblf_jax.control.actuators import Ideal
 from iblf_jax.core import checks
+from iblf_jax.core.presentation import Result
 from iblf_jax.deployment.cosimulate import (
     RecordedMotion,
     Rows,
@@ -32,7 +32,7 @@ from iblf_jax.simulation.scenario import Scenario, canonical
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class RobotMotion:
+class RobotMotion(Result):
     """The true motion of a simulated robot, what it published, and the efforts that it received.
 
     There are K states, one a period, and R rows, one a time step of MuJoCo and two at a change of
@@ -150,26 +150,6 @@ class RobotMotion:
         t, q, dq = (jnp.asarray(x, dtype) for x in columns)
         states = replay_law(scenario, t, q, dq, jnp.asarray(self.published))
         return jax.tree.map(np.asarray, states)
-
-    def save(self, path: str | Path) -> None:
-        """Writes the motion to a file of NumPy, `.npz`."""
-        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        counts = fields.pop("counts")
-        fields["count_names"] = np.array(list(counts))
-        fields["count_values"] = np.array(list(counts.values()), int)
-        np.savez(checks.file_to_write("path", path), **fields)
-
-    @staticmethod
-    def load(path: str | Path) -> RobotMotion:
-        """The motion in a file that `save` has written."""
-        with np.load(checks.file_to_read("path", path)) as file:
-            fields: dict[str, Any] = dict(file)
-        names = fields.pop("count_names").tolist()
-        fields["counts"] = dict(zip(names, fields.pop("count_values").tolist(), strict=True))
-        fields["joints"] = tuple(fields["joints"].tolist())
-        for name in ("period", "dt", "origin", "ended", "diverged"):
-            fields[name] = fields[name].item()
-        return RobotMotion(**fields)
 
 
 def recorded(

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from iblf_jax.core import checks, tables
-from iblf_jax.core.presentation import present
+from iblf_jax.core.presentation import Result, present
 from iblf_jax.core.status import describe
 from iblf_jax.engine import RunRequest, run_rollout
 from iblf_jax.simulation.metrics import as_folds
@@ -29,7 +29,7 @@ NUMBERS_SHOWN = 8
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class LikelyFailure:
+class LikelyFailure(Result):
     """The most likely draw that was found to fail: the failure nearest to the origin of standard
     normal coordinates.
     """
@@ -99,7 +99,7 @@ class FailureSamples:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class FailureProbability:
+class FailureProbability(Result):
     """The probability that a run fails, with its interval; printed as sentences."""
 
     estimate: float

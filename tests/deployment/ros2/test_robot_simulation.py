@@ -118,7 +118,7 @@ def test_a_robot_answered_at_once_moves_as_in_cosimulate(scenario):
 def test_a_motion_survives_its_file(tmp_path):
     motion = closed_with_law(robot(), PAPER, periods=5)
     motion.save(tmp_path / "motion.npz")
-    loaded = RobotMotion.load(tmp_path / "motion.npz")
+    loaded = ij.load(tmp_path / "motion.npz")
     assert loaded.joints == JOINTS
     assert loaded.counts == motion.counts
     assert loaded.timing() == pytest.approx(motion.timing(), nan_ok=True)

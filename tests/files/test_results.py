@@ -1,0 +1,536 @@
+"""Every result of a public function has `save`, and `ij.load` returns an equal result."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import importlib
+import inspect
+import io
+import json
+import typing
+import zipfile
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+
+import iblf_jax as ij
+from iblf_jax.core.presentation import Result
+from iblf_jax.core.pytree import field_values
+from iblf_jax.files.results import RECORDS
+from iblf_jax.identification import excitation
+
+MODULES = ("certificates", "deployment", "proofs", "studies", "tuning")
+NOT_RESULTS = {
+    "Line": "a part of a Certificate",
+    "Scenario": "has a file of its own, save_scenario",
+    "ParameterTable": "a view of a scenario",
+    "VectorField": "a function of a scenario",
+    "Tunable": "an argument of tune",
+    "Risk": "an argument of tune",
+    "Exported": "is about files that were written",
+    "Page": "has a file of its own, HTML",
+    "SimulatedRobot": "runs a simulation",
+}
+"""Class that a public function returns -> why it is no result."""
+
+MASS = {"plant.mass": ij.factor(ij.uniform(0.8, 1.2))}
+TIMES = {"duration": 0.1, "dt": 2e-3}
+QUIET = {"progress": False}
+PAPER = ij.presets.zhang_yan_2024()
+
+
+# --- which classes are results
+
+
+def _public_functions() -> Iterator[Callable]:
+    for module in (ij, *(importlib.import_module(f"iblf_jax.{name}") for name in MODULES)):
+        for name in dir(module):
+            member = getattr(module, name)
+            if inspect.isfunction(member) and not name.startswith("_"):
+                yield member
+
+
+def _returned(function: Callable) -> Iterator[type]:
+    """The classes of the package in the annotation of what a function returns."""
+    try:
+        hint = typing.get_type_hints(function).get("return")
+    except NameError:  # of a class that only type checkers import
+        return
+    for option in typing.get_args(hint) or (hint,):
+        if isinstance(option, type) and option.__module__.startswith("iblf_jax"):
+            yield option
+
+
+def _result_classes() -> list[type]:
+    """The classes that public functions return, and the methods of these classes."""
+    found: dict[str, type] = {}
+    functions = list(_public_functions())
+    while functions:
+        for cls in _returned(functions.pop()):
+            is_component = "_registered_component" in vars(cls)
+            if cls.__name__ in found or cls.__name__ in NOT_RESULTS or is_component:
+                continue
+            found[cls.__name__] = cls
+            functions += [
+                member
+                for name, member in inspect.getmembers(cls, inspect.isfunction)
+                if not name.startswith("_") or name == "__getitem__"
+            ]
+    return [found[name] for name in sorted(found)]
+
+
+CLASSES = _result_classes()
+
+
+@pytest.mark.parametrize("cls", CLASSES, ids=lambda cls: cls.__name__)
+def test_every_result_has_save_and_a_name_in_files(cls):
+    assert cls.save is Result.save
+    assert (cls.__module__.removeprefix("iblf_jax."), cls.__qualname__) in RECORDS.values()
+
+
+def test_the_classes_of_all_analyses_are_found():
+    names = {cls.__name__ for cls in CLASSES}
+    assert names >= {"Rollout", "Study", "FirstExit", "Proof", "Certificate", "TuningReport"}
+
+
+def test_every_name_in_files_leads_to_a_class_of_its_own():
+    places = list(RECORDS.values())
+    assert len(set(places)) == len(places)
+    for module, name in places:
+        assert isinstance(getattr(importlib.import_module(f"iblf_jax.{module}"), name), type)
+
+
+# --- an example of each
+
+
+@functools.cache
+def _study() -> Any:
+    perturbations = MASS | {"initial.q": ij.offset(ij.normal(0.0, 0.05))}
+    metrics = (*ij.metrics.standard(), ij.metrics.FirstExit())
+    return ij.monte_carlo(PAPER, perturbations, runs=16, metrics=metrics, **TIMES, **QUIET)
+
+
+@functools.cache
+def _tuned() -> Any:
+    goal = ij.objectives.tracking() + ij.objectives.peak_torque_below(60.0)
+    return ij.tune(
+        PAPER,
+        ["controller.K2"],
+        goal,
+        perturbations=MASS,
+        runs=2,
+        solver=ij.tuning.SQP(),
+        effort=ij.tuning.Effort(values=0, starts=1, iterations=2),
+        report=ij.tuning.Report(runs=4),
+        **TIMES,
+        **QUIET,
+    )
+
+
+@functools.cache
+def _failure() -> Any:
+    law = ij.with_parameters(PAPER, {"initial.q": 0.88})
+    start = {"initial.q": ij.offset(ij.normal(0.0, 0.03))}
+    return ij.failure_probability(law, start, method="monte_carlo", runs=400, **TIMES, **QUIET)
+
+
+def _pendulum() -> tuple[ij.Scenario, dict[str, Any]]:
+    arm = ij.robots.PlanarChain(mass=[2.0], length=[0.5], centre=[0.25], inertia=[0.05])
+    scenario = ij.Scenario(
+        plant=arm,
+        reference=ij.references.Sinusoid(0.0, 0.2),
+        bounds=ij.bounds.Bounds(ij.bounds.Constant(-0.8), ij.bounds.Constant(0.8)),
+        controller=ij.controllers.Backstepping(2.0, 3.0, reading="corrected"),
+        observer=ij.observers.Momentum(100.0),
+        initial=ij.Initial(0.0),
+    )
+    return scenario, {"plant.mass": ij.factor(ij.interval(0.99, 1.01))}
+
+
+def _proof(**options: Any) -> Any:
+    scenario, masses = _pendulum()
+    return ij.prove(
+        scenario, level=0.5, parameters=masses, weight=0.01, max_boxes=2000, **options, **QUIET
+    )
+
+
+def _gains() -> Any:
+    scenario, masses = _pendulum()
+    ranges = {"controller.K2": (1.0, 10.0)}
+    options = {"parameters": masses, "tries": 2, "max_boxes": 2000}
+    return ij.gains_for_guarantee(scenario, ranges, level=0.5, **options, **QUIET)
+
+
+def _certificate(scenario: ij.Scenario) -> Any:
+    return ij.certify(scenario, ij.simulate(scenario, **TIMES))
+
+
+def _identification() -> Any:
+    motion = excitation(PAPER, ["robot.mass"], duration=2.0)
+    scenario = ij.with_parts(PAPER, reference=motion)
+    run = ij.simulate(scenario, duration=2.0, dt=2e-3, record_every=5)
+    log = {name: np.asarray(getattr(run, name)) for name in ("t", "q", "tau")}
+    return ij.identify(scenario, log, ["robot.mass"])
+
+
+def _sampled() -> ij.Rollout:
+    scenario = ij.with_parts(
+        ij.presets.flexible_joint_two_link(),
+        observer=ij.observers.StateObserver(bandwidth=60.0, measured=(1, 3)),
+        sampling=ij.Sampling(period=2e-3),
+        sensor=ij.sensors.Levels((ij.sensors.Direct(), None, ij.sensors.Direct(), None)),
+    )
+    return ij.simulate(scenario, throw=False, **TIMES)
+
+
+def _many() -> ij.Rollout:
+    def run(gain: jax.Array) -> ij.Rollout:
+        return ij.simulate(ij.with_parameters(PAPER, {"controller.K2": gain}), **TIMES)
+
+    return jax.vmap(run)(jnp.array([[10.0, 12.0], [20.0, 24.0]]))
+
+
+EXAMPLES: dict[str, tuple[Callable[[], Any], ...]] = {
+    "Attack": (lambda: ij.falsify(PAPER, MASS, starts=2, iterations=2, **TIMES, **QUIET),),
+    "Certificate": (
+        lambda: _certificate(PAPER),
+        lambda: _certificate(ij.presets.flexible_joint_two_link()),
+    ),
+    "Comparison": (lambda: ij.compare(PAPER, laws=("integral", "log"), **TIMES),),
+    "Counterexample": (
+        lambda: ij.certificates.counterexample(
+            ij.presets.printed_gap(), {"initial.q": ij.offset(ij.uniform(-0.01, 0.01))}, starts=2
+        ),
+    ),
+    "Explanation": (lambda: ij.explain(PAPER),),
+    "FailureProbability": (_failure,),
+    "FirstExit": (lambda: _study().first_exit(),),
+    "Front": (
+        lambda: ij.pareto(
+            PAPER,
+            ["controller.k1", "controller.K2"],
+            (ij.objectives.tracking(), ij.objectives.effort()),
+            points=3,
+            iterations=2,
+            **TIMES,
+            **QUIET,
+        ),
+    ),
+    "GuaranteedGains": (_gains,),
+    "Identification": (_identification,),
+    "OneRun": (lambda: _study()[3],),
+    "Probability": (lambda: _study().violation_probability,),
+    "Proof": (_proof, functools.partial(_proof, disturbance_rate=0.1)),
+    "Rollout": (lambda: ij.simulate(PAPER, **TIMES), _many, _sampled),
+    "Sensitivity": (
+        lambda: ij.sensitivity(PAPER, MASS, output="rmse", points=8, **TIMES, **QUIET),
+    ),
+    "Study": (_study,),
+    "TuneResult": (_tuned,),
+    "TuningReport": (lambda: _tuned().report,),
+}
+"""Name of a class -> what makes examples of it."""
+
+
+def assert_equal(a: Any, b: Any, key: str) -> None:
+    """Raises where two results differ in a class, a type of number or a bit."""
+    assert type(a) is type(b) or isinstance(a, jax.Array), f"{key}: {type(a)}, {type(b)}"
+    if isinstance(a, np.ndarray | np.generic | jax.Array):
+        x, y = np.asarray(a), np.asarray(b)
+        assert (x.dtype, x.shape, x.tobytes()) == (y.dtype, y.shape, y.tobytes()), key
+    elif isinstance(a, float):
+        assert np.float64(a).tobytes() == np.float64(b).tobytes(), key
+    elif isinstance(a, Mapping) and not isinstance(a, ij.Metrics):
+        assert list(a) == list(b), key
+        for name in a:
+            assert_equal(a[name], b[name], f"{key}[{name}]")
+    elif isinstance(a, tuple | list):
+        assert len(a) == len(b), key
+        for i, (x, y) in enumerate(zip(a, b, strict=True)):
+            assert_equal(x, y, f"{key}[{i}]")
+    elif dataclasses.is_dataclass(a):
+        before, after = field_values(a), field_values(b)
+        for name in before:
+            assert_equal(before[name], after[name], f"{key}.{name}")
+    else:
+        assert a == b, key
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cls", CLASSES, ids=lambda cls: cls.__name__)
+def test_a_saved_result_comes_back(cls, tmp_path):
+    for i, make in enumerate(EXAMPLES[cls.__name__]):
+        result = make()
+        text = repr(result), str(result)
+        assert result.save(tmp_path / f"{i}") == tmp_path / f"{i}"
+        again = ij.load(tmp_path / f"{i}")
+        assert type(again) is cls
+        assert_equal(result, again, cls.__name__)
+        assert (repr(again), str(again)) == text
+        if hasattr(cls, "plot") and not getattr(again, "is_batch", False):
+            again.plot()
+            plt.close("all")
+
+
+@pytest.mark.slow
+def test_a_loaded_result_replays_its_runs(tmp_path):
+    for result, arguments in ((_study(), (3,)), (_failure().most_likely_failure, ())):
+        result.save(tmp_path / "result")
+        expected, run = result.replay(*arguments), ij.load(tmp_path / "result").replay(*arguments)
+        assert_equal(expected, run, "replay")
+
+
+@pytest.mark.slow
+def test_a_loaded_proof_finds_its_problem(tmp_path):
+    proof = _proof(disturbance_rate=0.1)
+    assert proof.problem.names  # Now the proof keeps the problem, which no file can hold.
+    proof.save(tmp_path / "proof")
+    again = ij.load(tmp_path / "proof")
+    (run,), (expected,) = again.adversarial_runs(1, dt=0.01), proof.adversarial_runs(1, dt=0.01)
+    assert_equal(expected, run, "run")
+    assert again.problem.assumptions == proof.assumptions
+
+
+@pytest.mark.slow
+def test_what_was_computed_is_not_computed_again(tmp_path):
+    """The text of a tuning states its report, which takes many runs."""
+    result = _tuned()
+    assert "fresh runs" in repr(result) and result.report
+    result.save(tmp_path / "tuned")
+    again = ij.load(tmp_path / "tuned")
+    assert {"report", "step_check"} <= vars(again).keys()
+    assert str(again.report) == str(result.report)
+
+
+# --- runs
+
+
+@pytest.fixture(scope="module")
+def run() -> ij.Rollout:
+    return ij.simulate(PAPER, **TIMES)
+
+
+@pytest.mark.parametrize("ending", [".nc", ".npz"])
+def test_runs_of_save_rollouts_come_back_as_rollouts(run, ending, tmp_path):
+    many = _many()
+    path = tmp_path / f"runs{ending}"
+    ij.save_rollouts(run, path)
+    assert_equal(run, ij.load(path), "run")
+    ij.save_rollouts({"one": run, "many runs": many}, path)
+    again = ij.load(path)
+    assert list(again) == ["one", "many runs"]
+    assert_equal(run, again["one"], "one")
+    assert_equal(many, again["many runs"], "many runs")
+
+
+@pytest.mark.slow
+def test_a_sampled_run_of_levels_comes_back_from_netcdf(tmp_path):
+    run = _sampled()
+    ij.save_rollouts(run, tmp_path / "run.nc")
+    assert_equal(run, ij.load(tmp_path / "run.nc"), "run")
+
+
+@pytest.mark.parametrize("enabled", [False, True])
+def test_numbers_keep_their_precision_in_both_modes_of_jax(enabled, tmp_path):
+    with jax.enable_x64(True):
+        run = ij.simulate(ij.astype(PAPER, jnp.float64), **TIMES)
+    with jax.enable_x64(False):
+        single = ij.simulate(ij.astype(PAPER, jnp.float32), **TIMES)
+    for name, result in (("double", run), ("single", single)):
+        with jax.enable_x64(not enabled):
+            result.save(tmp_path / name)
+        with jax.enable_x64(enabled):
+            again = ij.load(tmp_path / name)
+        assert_equal(result, again, name)
+
+
+# --- classes of users
+
+
+@ij.component
+class Push:
+    """A constant torque."""
+
+    size: ij.Leaf = ij.leaf("N m")
+
+    def torque(self, t, q, dq, plant, model):
+        return jnp.broadcast_to(self.size, q.shape)
+
+    def jump_times(self):
+        return jnp.zeros(0)
+
+
+def test_a_class_of_a_user_needs_a_name(run, tmp_path, monkeypatch):
+    mine = dataclasses.replace(run, scenario=ij.with_parts(PAPER, disturbance=Push(0.5)))
+    with pytest.raises(ValueError, match=r'scenario: disturbance: .*disturbances.MEMBERS\["my_'):
+        mine.save(tmp_path / "mine")
+    assert not (tmp_path / "mine").exists()
+    monkeypatch.setitem(ij.disturbances.MEMBERS, "push", Push)
+    mine.save(tmp_path / "mine")
+    assert_equal(mine, ij.load(tmp_path / "mine"), "mine")
+    monkeypatch.delitem(ij.disturbances.MEMBERS, "push")
+    with pytest.raises(ValueError, match=r'mine: result.scenario: .*MEMBERS\["push"\] = TheClass'):
+        ij.load(tmp_path / "mine")
+
+
+def test_an_unknown_class_in_a_result_is_refused(run, tmp_path):
+    for value in (object(), lambda: 0, np.array([None])):
+        odd = dataclasses.replace(run, measured=value)
+        with pytest.raises(ValueError, match=r"Rollout.measured"):
+            odd.save(tmp_path / "odd")
+    with pytest.raises(ValueError, match="traced"):
+        jax.jit(lambda x: dataclasses.replace(run, q=x).save(tmp_path / "odd"))(run.q)
+    assert not list(tmp_path.iterdir())
+
+
+# --- files that are not what was saved
+
+
+def _changed(path: Path, change: Callable[[dict[str, Any], dict[str, bytes]], None]) -> Path:
+    """A copy of a file with another description or other arrays."""
+    with zipfile.ZipFile(path) as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    description = json.loads(files.pop("result.json"))
+    change(description, files)
+    other = path.with_name("changed")
+    with zipfile.ZipFile(other, "w") as archive:
+        archive.writestr("result.json", json.dumps(description))
+        for name, content in files.items():
+            archive.writestr(name, content)
+    return other
+
+
+def _npy(array: np.ndarray) -> bytes:
+    content = io.BytesIO()
+    np.save(content, array, allow_pickle=True)
+    return content.getvalue()
+
+
+def _fields(description: dict[str, Any]) -> dict[str, Any]:
+    return description["result"]["fields"]
+
+
+def _set(**changes: Any) -> Callable:
+    return lambda description, files: _fields(description).update(changes)
+
+
+def _nested(description: dict[str, Any], files: dict[str, bytes]) -> None:
+    node: Any = 1
+    for _ in range(100):
+        node = {"list": [node]}
+    _fields(description)["steps"] = node
+
+
+CHANGES: dict[str, tuple[Callable, str]] = {
+    "an unknown field": (_set(speed=1.0), "result.speed: got an unknown key"),
+    "a missing field": (lambda d, f: _fields(d).pop("status"), "result.status: got nothing"),
+    "a text for a number": (_set(steps="many"), "result.steps: .*expected one of type int"),
+    "an unknown class": (lambda d, f: d["result"].update(record="Popen"), "result: got 'Popen'"),
+    "a class that is none": (lambda d, f: d["result"].update(record=3), "result: got 3"),
+    "an unknown node": (_set(steps={"call": "os.system"}), "result.steps: got .*a node"),
+    "deep nodes": (_nested, r"result.steps.*nodes inside each other"),
+    "an unknown member": (
+        _set(steps={"member": "barriers.none", "fields": {}}),
+        r'result.steps: got .barriers.none.*barriers.MEMBERS\["none"\]',
+    ),
+    "no array": (_set(q={"jax": 999, "type": "float64", "shape": [1]}), "result.q: .*999.npy"),
+    "another type": (
+        lambda d, f: _fields(d)["q"].update(type="int32"),
+        "result.q: got an array of type float.*expected type int32",
+    ),
+    "another shape": (lambda d, f: _fields(d)["q"].update(shape=[3]), "result.q: .*shape"),
+    "objects": (
+        lambda d, f: f.update({f"{_fields(d)['q']['jax']}.npy": _npy(np.array([print], object))}),
+        "result.q: got no array that can be read",
+    ),
+    "another version": (lambda d, f: d.update(version=2), "version: got 2, expected 1"),
+    "another format": (lambda d, f: d.update(format="MATLAB"), "format: got 'MATLAB'"),
+    "no result": (lambda d, f: d.pop("result"), "result: got nothing"),
+    "a scenario without leaves": (
+        lambda d, f: _fields(d)["scenario"].pop("leaves"),
+        "result.scenario: got None, expected a list",
+    ),
+    "fewer leaves": (
+        lambda d, f: _fields(d)["scenario"]["leaves"].pop(),
+        "result.scenario.leaves: got .*arrays",
+    ),
+    "another key of the scenario": (
+        lambda d, f: _fields(d)["scenario"]["scenario"]["robot"].update(speed=1.0),
+        "result.scenario: robot.speed: got an unknown key",
+    ),
+    "an unknown entry of an enumeration": (
+        _set(steps={"enum": "ProofVerdict", "value": "maybe"}),
+        "result.steps: got 'maybe', expected a Verdict",
+    ),
+    "no number": (_set(steps={"float": "1"}), "result.steps: got '1'"),
+    "a pair that is none": (_set(steps={"dict": [[1]]}), "result.steps: got .*a pair"),
+    "two kinds": (_set(steps={"list": [], "tuple": []}), "result.steps: got .*a node"),
+}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_a_changed_file_is_refused_with_its_key(run, name, tmp_path):
+    change, message = CHANGES[name]
+    path = _changed(run.save(tmp_path / "run"), change)
+    with pytest.raises(ValueError, match=f"changed: {message}"):
+        ij.load(path)
+
+
+def test_damaged_and_foreign_files_are_refused_with_their_name(run, tmp_path):
+    path = run.save(tmp_path / "run")
+    content = path.read_bytes()
+    place = tmp_path / "damaged"
+    for size in (0, 1, 10, len(content) // 2, len(content) - 1):
+        place.write_bytes(content[:size])
+        with pytest.raises(ValueError, match="damaged: "):
+            ij.load(place)
+    for text in (b"PK", b"CDF", b"{", b"hello", np.random.default_rng(0).bytes(1000)):
+        place.write_bytes(text)
+        with pytest.raises(ValueError, match="damaged"):
+            ij.load(place)
+    with zipfile.ZipFile(place, "w") as archive:
+        archive.writestr("other.txt", "text")
+    with pytest.raises(ValueError, match=r"damaged: result\.json: got nothing"):
+        ij.load(place)
+    with pytest.raises(FileNotFoundError, match="Nothing is there"):
+        ij.load(tmp_path / "none")
+
+
+def test_no_flipped_byte_passes_unnoticed(run, tmp_path):
+    content = bytearray(run.save(tmp_path / "run").read_bytes())
+    generator = np.random.default_rng(0)
+    place = tmp_path / "flipped"
+    for position in generator.integers(0, len(content), 60):
+        changed = bytearray(content)
+        changed[position] ^= 1 << int(generator.integers(8))
+        place.write_bytes(changed)
+        message = ""
+        try:
+            again = ij.load(place)
+        except ValueError as error:
+            message = str(error)
+        if not message:  # The bit was one of a date, for example.
+            assert_equal(run, again, "run")
+        else:
+            assert "flipped" in message
+
+
+def test_the_archive_can_be_read_by_numpy(run, tmp_path):
+    with np.load(run.save(tmp_path / "run.npz"), allow_pickle=False) as archive:
+        description = json.loads(archive["result.json"])
+        number = _fields(description)["q"]["jax"]
+        np.testing.assert_array_equal(archive[str(number)], run.q)
+
+
+def test_scenarios_and_earlier_tunings_are_loaded_too(tmp_path):
+    ij.save_scenario(PAPER, tmp_path / "paper.toml")
+    assert isinstance(ij.load(tmp_path / "paper.toml"), ij.Scenario)
+    earlier = Path(__file__).parents[1] / "data" / "tuning_before_weights.json"
+    assert ij.load(earlier).names == ("controller.k1[0]", "controller.k1[1]")
