@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend import core
 
+from iblf_jax.kernels import jaxprs
 from iblf_jax.kernels.caches import CACHES
 from iblf_jax.kernels.from_jaxpr import PARAMETERS, closed
 from iblf_jax.kernels.kept_programs import kept_program
@@ -102,22 +102,10 @@ def compile_step(
     def lower() -> Program:
         return _lowered(jaxpr, len(after), *arguments[1:], dtype=dtype)
 
-    with announce_if_slow(f"compiling a step of {_count_operations(jaxpr.jaxpr):,} operations"):
+    operations = jaxprs.count_operations(jaxpr)
+    with announce_if_slow(f"compiling a step of {operations:,} operations"):
         program = kept_program(jaxpr, PARAMETERS, arguments, lower)
     return CompiledStep(program, records)
-
-
-def _count_operations(jaxpr: Any) -> int:
-    """The number of operations of a jaxpr and of its inner jaxprs, each counted once."""
-    pending = [jaxpr]
-    found: dict[int, Any] = {}
-    while pending:
-        inner = pending.pop()
-        if id(inner) not in found:
-            found[id(inner)] = inner
-            for equation in inner.eqns:
-                pending += core.jaxprs_in_params(equation.params)
-    return sum(len(inner.eqns) for inner in found.values())
 
 
 def _lowered(
@@ -142,7 +130,7 @@ def _lowered(
     series_ids = _inputs(b, series, lambda i, kind: b.input("series", i, kind))
     carry_ids = _inputs(b, carry, lambda i, kind: b.input("carry", i, kind), of_carry=True)
     index_id = np.asarray(b.input("index", 0, "i"), np.int64)
-    _mark_constant_carry(b, jaxpr.jaxpr, carry_ids)
+    _mark_constant_carry(b, jaxprs.opened(jaxpr)[0], carry_ids)
     out = closed(b, jaxpr, [*shared_ids, *per_run_ids, *series_ids, *carry_ids, index_id])
     carry_out, recorded = out[:carried], out[carried:]
     if Shapes.of(jaxpr.out_avals[:carried]).kinds() != carry.kinds():

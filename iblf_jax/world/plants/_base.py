@@ -17,13 +17,13 @@ from typing import Any, NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend import core as jax_core
 
 from iblf_jax.core import checks
 from iblf_jax.core.linalg import matvec, solve_gain, solve_spd
 from iblf_jax.core.optional import OptionalMembers, has_members
 from iblf_jax.core.status import VELOCITY_LIMIT
 from iblf_jax.core.units import ByLevel, Unit, per_second, product
+from iblf_jax.kernels import jaxprs
 from iblf_jax.world.robots import joint_names
 from iblf_jax.world.robots._base import robot_member
 
@@ -238,16 +238,10 @@ def _row(
     program small, and keeps XLA's compiler from simplifying functions whose inputs become unused,
     at which it aborts (`engine.machine_function`).
     """
-    traced = jax.make_jaxpr(function)(t, x)
-    jaxpr = traced.jaxpr
-    if not jaxpr.eqns or jaxpr.eqns[-1].outvars != jaxpr.outvars:
+    row = jaxprs.entry_of_stack(jax.make_jaxpr(function)(t, x), level - 1)
+    if row is None:
         return function(t, x)[level - 1]
-    last = jaxpr.eqns[-1]
-    if last.primitive.name != "stack" or last.params["axis"] != 0:
-        return function(t, x)[level - 1]
-    one_row = jaxpr.replace(eqns=jaxpr.eqns[:-1], outvars=[last.invars[level - 1]])
-    (row,) = jax_core.jaxpr_as_fun(traced.replace(jaxpr=one_row))(t, x)
-    return row
+    return row(t, x)  # type: ignore[no-any-return]
 
 
 def _times(gain: jax.Array, v: jax.Array) -> jax.Array:
