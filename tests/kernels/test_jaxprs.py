@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+
 from iblf_jax.kernels import jaxprs
 from iblf_jax.kernels.primitives import is_zero, new_primitive, without_symbol
 
@@ -66,7 +67,9 @@ def test_variables_and_literals_are_told_apart():
 def test_sizes_of_a_scan():
     def looped(a, b, start, rows):
         return jax.lax.scan(
-            lambda c, row: ((c[0] * a + row, c[1] + b, c[2] + c[0]), row), (start, start, start), rows
+            lambda c, row: ((c[0] * a + row, c[1] + b, c[2] + c[0]), row),
+            (start, start, start),
+            rows,
         )
 
     traced = jax.make_jaxpr(looped)(1.0, 2.0, 0.5, jnp.ones(4))
