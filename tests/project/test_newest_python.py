@@ -118,14 +118,18 @@ def test_options_that_do_not_decide_what_is_installed_do_not_matter():
 
 def test_the_configuration_of_pip_is_passed_on(tmp_path, monkeypatch):
     wheels, own = tmp_path / "wheels", tmp_path / "pip.conf"
+    index = tmp_path / "index" / "simple"  # its links lead to a folder beside it
     wheels.mkdir()
+    index.mkdir(parents=True)
     own.write_text(
         f"[global]\nfind-links = {wheels}\n  file://{wheels}\n  /no/such/folder\n"
-        "index-url = https://user:a%20b@example.org/simple\n[install]\nno-binary = a\n"
+        "index-url = https://user:a%20b@example.org/simple\n"
+        f"extra-index-url = file://{index}\n[install]\nno-binary = a\n"
     )
     monkeypatch.setenv("PIP_CONFIG_FILE", str(own))
     found = tool.PipConfiguration.of_machine()
-    assert wheels in found.paths
+    assert {wheels, index.parent} <= set(found.paths)
+    assert index not in found.paths
     found.write(tmp_path / "written.conf")
     parser = configparser.RawConfigParser()
     parser.read(tmp_path / "written.conf")
