@@ -1,12 +1,15 @@
-"""Checks an installed iblf_jax: `python tools/check_installation.py BACKEND`.
+"""Checks an installed iblf_jax: `python tools/check_installation.py BACKEND [--reversed]`.
 
 `tools/release` runs it in a new environment, in a folder outside of the repository.  BACKEND is the
 executor that is expected of `monte_carlo`: "vmap" where there is no compiler, "native" where there
-is one.
+is one.  Where there is one, it is compared with "vmap" for scenarios of many structures, in one
+process.  A second call with --reversed finds the compiled programs of the first one on the disk,
+and uses them in another order.
 """
 
 from __future__ import annotations
 
+import argparse
 import subprocess
 import sys
 import tempfile
@@ -54,6 +57,71 @@ def check_run(backend: str) -> None:
     assert f"a batch runs on {backend}" in explained, explained
 
 
+def structures() -> dict[str, ij.Scenario]:
+    """Scenarios of different structure: barriers, laws, observers, sensors, actuators, plants."""
+    paper = ij.presets.zhang_yan_2024(reading="corrected")
+    paper = ij.with_parameters(paper, {"controller.K2": 4.0, "observer.kf": 4.0})
+    found = {}
+    for barrier in (
+        ij.barriers.Integral(),
+        ij.barriers.Log(),
+        ij.barriers.Tan(),
+        ij.barriers.State(),
+        ij.barriers.PrescribedPerformance(),
+        ij.barriers.Mapping(),
+        ij.barriers.Quadratic(),
+    ):
+        law = ij.controllers.Backstepping(k1=2.0, K2=4.0, barrier=barrier, reading="corrected")
+        found[type(barrier).__name__] = ij.with_parts(paper, controller=law)
+    computed = ij.controllers.ComputedTorque(Kp=25.0, Kd=10.0)
+    found["ComputedTorque"] = ij.with_parts(paper, controller=computed)
+    limited = ij.controllers.Saturated(law=paper.controller, limit=[30.0, 10.0])
+    found["Saturated"] = ij.with_parts(paper, controller=limited)
+    found["Momentum"] = ij.with_parts(paper, observer=ij.observers.Momentum(kf=4.0))
+    found["Motor"] = ij.with_parts(paper, actuator=ij.actuators.Motor(bandwidth=300.0))
+    found["Sampling"] = ij.with_parts(paper, sampling=ij.Sampling(period=2e-3))
+    encoder = ij.sensors.Encoder(
+        counts=65536.0, velocity=ij.sensors.FilteredDifference(cutoff=200.0)
+    )
+    found["Encoder"] = ij.with_parts(found["Sampling"], sensor=encoder)
+    presets = ("zhang_yan_2024_full_state", "motor_driven_pendulum", "flexible_joint_two_link")
+    for name in presets:
+        found[name] = ij.presets.PRESETS[name]()
+    return found
+
+
+def check_structures(in_reverse: bool) -> None:
+    """The executors agree on every structure, whichever were compiled before."""
+    scenarios = list(structures().items())
+    if in_reverse:
+        scenarios.reverse()
+    efforts: dict[bytes, str] = {}
+    for name, scenario in scenarios:
+        found = numbers_of(scenario, "auto")
+        expected = numbers_of(scenario, "vmap")
+        for key, value in expected.items():
+            tolerance = {"rtol": 1e-9, "atol": 1e-9, "err_msg": f"{name}: {key}, auto and vmap"}
+            np.testing.assert_allclose(found[key], value, **tolerance)
+        other = efforts.setdefault(expected["effort"].tobytes(), name)
+        assert other == name, f"{name} and {other} have the same effort"
+
+
+def numbers_of(scenario: ij.Scenario, backend: str) -> dict[str, np.ndarray]:
+    """The metrics of a small study of a scenario."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # about gains that were chosen for another law
+        study = ij.monte_carlo(
+            scenario,
+            {"initial.q": ij.offset(ij.uniform(-0.01, 0.01))},
+            runs=4,
+            duration=0.05,
+            dt=1e-3,
+            backend=backend,
+            progress=False,
+        )
+    return {name: np.asarray(value) for name, value in study.metrics.items()}
+
+
 def check_command_line() -> None:
     """The command writes a run and its figures."""
     with tempfile.TemporaryDirectory() as folder:
@@ -73,11 +141,18 @@ def check_export() -> None:
 
 def main() -> None:
     """Runs all checks."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("backend", choices=["vmap", "native"])
+    parser.add_argument("--reversed", action="store_true", help="structures in another order")
+    options = parser.parse_args()
     check_package()
-    check_run(sys.argv[1])
+    check_run(options.backend)
+    if options.backend != "vmap":
+        check_structures(options.reversed)
     check_command_line()
     check_export()
-    print(f"iblf_jax {ij.__version__} on Python {sys.version.split()[0]}: ok ({sys.argv[1]})")
+    versions = f"Python {sys.version.split()[0]}, JAX {jax.__version__}"
+    print(f"iblf_jax {ij.__version__} on {versions}: ok ({options.backend})")
 
 
 if __name__ == "__main__":

@@ -11,12 +11,12 @@ what these functions compute.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
 from typing import Any
 
 import jax
 import numpy as np
-from jax.extend import core
+
+from iblf_jax.kernels import jaxprs
 
 
 class CallsPythonError(ValueError):
@@ -32,31 +32,15 @@ def program_digest(traced: Any) -> str:
     Raises:
       CallsPythonError: the program contains a callback.
     """
+    callbacks = sorted(name for name in jaxprs.primitives(traced.jaxpr) if "callback" in name)
+    if callbacks:
+        raise CallsPythonError(callbacks[0])
     found = hashlib.sha256()
-    for jaxpr in _jaxprs(traced.jaxpr):
-        for equation in jaxpr.eqns:
-            if "callback" in equation.primitive.name:
-                raise CallsPythonError(equation.primitive.name)
-        for array in _arrays(jaxpr):
-            found.update(f"{array.dtype} {array.shape} ".encode() + array.tobytes())
+    for constant in jaxprs.constants(traced.jaxpr):
+        array = _numbers(constant)
+        found.update(f"{array.dtype} {array.shape} ".encode() + array.tobytes())
     found.update(traced.lower().as_text().encode())
     return found.hexdigest()
-
-
-def _jaxprs(jaxpr: Any) -> Iterator[Any]:
-    """A jaxpr and all jaxprs inside it, each time that one occurs."""
-    yield jaxpr
-    # Before JAX 0.11, a closed jaxpr holds an open one; from 0.11 on, they are one class.
-    for equation in getattr(jaxpr, "jaxpr", jaxpr).eqns:
-        for inner in core.jaxprs_in_params(equation.params):
-            yield from _jaxprs(inner)
-
-
-def _arrays(jaxpr: Any) -> Iterator[np.ndarray]:
-    """The constants and the literals of a jaxpr."""
-    yield from map(_numbers, getattr(jaxpr, "consts", ()))
-    for equation in jaxpr.eqns:
-        yield from (_numbers(x.val) for x in equation.invars if isinstance(x, core.Literal))
 
 
 def _numbers(constant: Any) -> np.ndarray:

@@ -25,7 +25,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.experimental import jet
-from jax.extend import core
+
+from iblf_jax.kernels import jaxprs
 
 Coefficients = list[Any]
 """Taylor coefficients of one array; None for a coefficient that is zero."""
@@ -108,7 +109,7 @@ def _by_taylor_arithmetic(function: Callable, curve: Sequence[tuple]) -> list[An
     traced, shape = jax.make_jaxpr(function, return_shape=True)(*curve[0])
     rows = [jax.tree.leaves(_divided(x, math.factorial(m))) for m, x in enumerate(curve)]
     inputs = [list(coefficients) for coefficients in zip(*rows, strict=True)]
-    outputs = _evaluated(traced.jaxpr, traced.consts, inputs, len(curve) - 1)
+    outputs = _evaluated(traced, inputs, len(curve) - 1)
     structure = jax.tree.structure(shape)
     dense = [_with_zeros(coefficients) for coefficients in outputs]
     found = []
@@ -139,17 +140,18 @@ def _is_constant(coefficients: Coefficients) -> bool:
     return all(x is None for x in coefficients[1:])
 
 
-def _evaluated(jaxpr: Any, consts: Sequence, inputs: list[Coefficients], order: int) -> list:
-    """The coefficients of the outputs of a jaxpr.
+def _evaluated(function: Any, inputs: list[Coefficients], order: int) -> list:
+    """The coefficients of the outputs of a traced function.
 
     Calls are evaluated in place: the rules of functions with derivatives of their own
     (`jax.custom_jvp`) are of first order only.
     """
+    jaxpr, consts = jaxprs.opened(function)
     known: dict[Any, Coefficients] = {}
     constant = [None] * order
 
     def read(atom) -> Coefficients:
-        if isinstance(atom, core.Literal):
+        if not jaxprs.is_variable(atom):
             return [jnp.asarray(atom.val, atom.val.dtype), *constant]
         return known[atom]
 
@@ -162,19 +164,6 @@ def _evaluated(jaxpr: Any, consts: Sequence, inputs: list[Coefficients], order: 
     return [read(x) for x in jaxpr.outvars]
 
 
-CALLED_JAXPR = {
-    "jit": "jaxpr",
-    "pjit": "jaxpr",
-    "closed_call": "call_jaxpr",
-    "core_call": "call_jaxpr",
-    "remat2": "jaxpr",
-    "checkpoint": "jaxpr",
-    "custom_jvp_call": "call_jaxpr",
-    "custom_vjp_call": "call_jaxpr",
-}
-"""Primitive that calls a function -> the parameter that holds its jaxpr."""
-
-
 def _evaluated_equation(equation: Any, inputs: list[Coefficients], order: int) -> list:
     """The coefficients of the outputs of one equation."""
     primitive, params = equation.primitive, equation.params
@@ -183,9 +172,9 @@ def _evaluated_equation(equation: Any, inputs: list[Coefficients], order: int) -
         if not primitive.multiple_results:
             values = [values]
         return [[x, *[None] * order] for x in values]
-    if primitive.name in CALLED_JAXPR:
-        called = params[CALLED_JAXPR[primitive.name]]
-        return _evaluated(called.jaxpr, called.consts, inputs, order)
+    function = jaxprs.called(equation)
+    if function is not None:
+        return _evaluated(function, inputs, order)
     if primitive.name == "scan":
         return _evaluated_scan(params, inputs, order)
     if primitive in RULES:
@@ -210,18 +199,17 @@ def _evaluated_equation(equation: Any, inputs: list[Coefficients], order: int) -
 
 def _evaluated_scan(params: dict, inputs: list[Coefficients], order: int) -> list:
     """The coefficients of the outputs of a loop of fixed length, written out."""
-    consts_count, carry_count = params["num_consts"], params["num_carry"]
+    consts_count, carry_count = jaxprs.scan_sizes(params)
     consts = inputs[:consts_count]
     carry = inputs[consts_count : consts_count + carry_count]
     sequences = inputs[consts_count + carry_count :]
     steps = list(range(params["length"]))
     if params["reverse"]:
         steps.reverse()
-    body = params["jaxpr"]
     collected: list[list] = []
     for i in steps:
         entries = [[None if x is None else x[i] for x in sequence] for sequence in sequences]
-        found = _evaluated(body.jaxpr, body.consts, [*consts, *carry, *entries], order)
+        found = _evaluated(params["jaxpr"], [*consts, *carry, *entries], order)
         carry = found[:carry_count]
         collected.append(found[carry_count:])
     if params["reverse"]:

@@ -15,8 +15,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
-from jax.extend.core import Primitive
-from jax.interpreters import ad, batching, mlir
 
 from iblf_jax.core import programs
 from iblf_jax.core.caches import CACHE
@@ -30,6 +28,7 @@ from iblf_jax.engine.plan import ExecutionPlan
 from iblf_jax.engine.registry import Executor
 from iblf_jax.engine.request import RunRequest
 from iblf_jax.kernels import UnsupportedError
+from iblf_jax.kernels.primitives import is_zero, new_primitive, without_symbol
 
 
 class Runs(NamedTuple):
@@ -268,17 +267,17 @@ def _jvp(primals, tangents, *, runs, places):
     leaves, _ = _divided(runs, primals)
     of_leaves, of_moves = _divided(runs, tangents)
     value = _primitive.bind(*primals, runs=runs, places=places)
-    instantiated = [ad.instantiate_zeros(x) for x in of_moves]
-    if all(isinstance(x, ad.Zero) for x in of_leaves):
+    instantiated = [without_symbol(x) for x in of_moves]
+    if all(map(is_zero, of_leaves)):
         return value, _primitive.bind(*leaves, *instantiated, runs=runs, places=places)
     by_scan = partial(_along_by_scan, runs=runs, places=places)
-    all_tangents = [*map(ad.instantiate_zeros, of_leaves), *instantiated]
+    all_tangents = [*map(without_symbol, of_leaves), *instantiated]
     return value, jax.jvp(by_scan, primals, all_tangents)[1]
 
 
 def _transpose(cotangents, *operands, runs, places):
     leaves, _ = _divided(runs, operands)
-    which = tuple(i for i, x in enumerate(cotangents) if not isinstance(x, ad.Zero))
+    which = tuple(i for i, x in enumerate(cotangents) if not is_zero(x))
     gradient = _gradient(runs, places, which, leaves, [cotangents[i] for i in which])
     return [None] * len(leaves) + gradient
 
@@ -295,11 +294,13 @@ def _batch(operands, axes, *, runs, places):
     return found, [0] * len(found)
 
 
-_primitive = Primitive("iblf_jax_derivative_of_runs")
-_primitive.multiple_results = True
-_primitive.def_impl(programs.jit(_along, static_argnames=("runs", "places")))
-_primitive.def_abstract_eval(_abstract)
-mlir.register_lowering(_primitive, mlir.lower_fun(_along, multiple_results=True))
-ad.primitive_jvps[_primitive] = _jvp
-ad.primitive_transposes[_primitive] = _transpose
-batching.primitive_batchers[_primitive] = _batch
+_primitive = new_primitive(
+    "iblf_jax_derivative_of_runs",
+    _along,
+    shapes=_abstract,
+    jvp=_jvp,
+    batch=_batch,
+    transpose=_transpose,
+    called=programs.jit(_along, static_argnames=("runs", "places")),
+    several_results=True,
+)

@@ -12,8 +12,8 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.extend.core import Var
 
+from iblf_jax.kernels import jaxprs
 from iblf_jax.simulation.signals import Sample
 
 
@@ -27,15 +27,9 @@ def begun_at(index: jax.Array, folds: Any, sample: Sample, accumulators: tuple) 
 
     What does not depend on the sample was begun by `start`, and costs no choice in every step.
     """
-    closed, shapes = jax.make_jaxpr(begun, return_shape=True)(folds, sample)
-    depends = set(closed.jaxpr.invars[-len(jax.tree.leaves(sample)) :])
-    for equation in closed.jaxpr.eqns:
-        if not depends.isdisjoint(x for x in equation.invars if isinstance(x, Var)):
-            depends.update(equation.outvars)
-    chosen = jax.tree.unflatten(
-        jax.tree.structure(shapes),
-        [isinstance(x, Var) and x in depends for x in closed.jaxpr.outvars],
-    )
+    traced, shapes = jax.make_jaxpr(begun, return_shape=True)(folds, sample)
+    depends = jaxprs.depend_on_last(traced, len(jax.tree.leaves(sample)))
+    chosen = jax.tree.unflatten(jax.tree.structure(shapes), depends)
 
     def of_first(depends_on_sample, new, old):
         if not depends_on_sample:

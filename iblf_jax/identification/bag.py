@@ -335,6 +335,7 @@ def _messages(path: Path, options: BagOptions) -> Iterator[tuple[bool, int, Any]
     """Whether a message is a joint state, its receive time [ns], and the message, in order."""
     library, typesys = _library()
     _check_is_bag(path)
+    _check_lengths(path)
     store = typesys.get_typestore(typesys.Stores.LATEST)
     with contextlib.ExitStack() as stack:
         with _damage_reported(path):
@@ -375,6 +376,28 @@ def _check_is_bag(path: Path) -> None:
     if stored:
         remedy = f"Run ros2 bag reindex {path}, or read the file {stored[0]} in it."
     raise checks.fail(str(path), came, "the folder of a rosbag2 recording", remedy)
+
+
+def _check_lengths(path: Path) -> None:
+    """Raises ValueError for a database that is shorter than its own header says.
+
+    SQLite reads what is missing of the last page as zeros, and depending on its version and on what
+    was there, no message looks damaged.
+    """
+    files = sorted(path.glob("*.db3")) if path.is_dir() else [path]
+    for file in files:
+        with file.open("rb") as opened:
+            header = opened.read(100)
+        # The number of pages is valid if the counters at 24 and 92 are equal.
+        if not header.startswith(b"SQLite format 3\0") or header[24:28] != header[92:96]:
+            continue
+        page_size = int.from_bytes(header[16:18], "big")
+        if page_size == 1:
+            page_size = 65536
+        expected = page_size * int.from_bytes(header[28:32], "big")
+        size = file.stat().st_size
+        if size < expected:
+            raise _damaged(path, f"{size} bytes of {file.name}, which had {expected}")
 
 
 @contextlib.contextmanager

@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend import core
 
+from iblf_jax.kernels import jaxprs
 from iblf_jax.kernels.caches import CACHES
 from iblf_jax.kernels.from_jaxpr import closed
 from iblf_jax.kernels.messages import announce_if_slow
@@ -97,22 +97,10 @@ def compile_step(
         *leaves, carry.structs(), index
     )
     arguments = (shared, per_run, carry, limits, is_derivative, known, series)
-    with announce_if_slow(f"compiling a step of {_count_operations(jaxpr.jaxpr):,} operations"):
+    operations = jaxprs.count_operations(jaxpr)
+    with announce_if_slow(f"compiling a step of {operations:,} operations"):
         program = _lowered(jaxpr, len(after), *arguments, dtype=dtype)
     return CompiledStep(program, records)
-
-
-def _count_operations(jaxpr: Any) -> int:
-    """The number of operations of a jaxpr and of its inner jaxprs, each counted once."""
-    pending = [jaxpr]
-    found: dict[int, Any] = {}
-    while pending:
-        inner = pending.pop()
-        if id(inner) not in found:
-            found[id(inner)] = inner
-            for equation in inner.eqns:
-                pending += core.jaxprs_in_params(equation.params)
-    return sum(len(inner.eqns) for inner in found.values())
 
 
 def _lowered(
@@ -137,7 +125,7 @@ def _lowered(
     series_ids = _inputs(b, series, lambda i, kind: b.input("series", i, kind))
     carry_ids = _inputs(b, carry, lambda i, kind: b.input("carry", i, kind), of_carry=True)
     index_id = np.asarray(b.input("index", 0, "i"), np.int64)
-    _mark_constant_carry(b, jaxpr.jaxpr, carry_ids)
+    _mark_constant_carry(b, jaxprs.opened(jaxpr)[0], carry_ids)
     out = closed(b, jaxpr, [*shared_ids, *per_run_ids, *series_ids, *carry_ids, index_id])
     carry_out, recorded = out[:carried], out[carried:]
     if Shapes.of(jaxpr.out_avals[:carried]).kinds() != carry.kinds():

@@ -11,25 +11,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from jax.extend import core
 
+from iblf_jax.kernels import jaxprs
 from iblf_jax.kernels.functions import apply
 from iblf_jax.kernels.program import Builder, Ids, UnsupportedError, constants
 from iblf_jax.kernels.rules import RULES
 
-INLINED = {
-    "jit": "jaxpr",
-    "pjit": "jaxpr",
-    "closed_call": "call_jaxpr",
-    "core_call": "call_jaxpr",
-    "custom_jvp_call": "call_jaxpr",
-    "custom_vjp_call": "call_jaxpr",
-    "custom_vjp_call_jaxpr": "fun_jaxpr",
-    "checkpoint": "jaxpr",
-    "remat": "jaxpr",
-    "remat2": "jaxpr",
-}
-"""Primitive that calls an inner function -> the parameter that holds it."""
 MAX_REINTERPRETED = 50
 """Equations up to which an inner function is interpreted at each call: a cache would not be
 faster."""
@@ -42,34 +29,28 @@ def interpret(b: Builder, jaxpr: Any, consts: Sequence[Ids], inputs: Sequence[Id
     )
 
     def read(atom):
-        if isinstance(atom, core.Literal):
+        if not jaxprs.is_variable(atom):
             return constants(b, atom.val)
         return known[atom]
 
-    live = _live(jaxpr)
+    live = jaxprs.needed(jaxpr)
     uses = {id(eqn): tuple(v in live for v in eqn.outvars) for eqn in jaxpr.eqns}
     calls: dict[int, list] = {}
     for eqn in jaxpr.eqns:
         if eqn.primitive.name == "jit":
-            calls.setdefault(id(eqn.params["jaxpr"]), []).append(uses[id(eqn)])
+            calls.setdefault(id(jaxprs.called(eqn)), []).append(uses[id(eqn)])
 
     for eqn in jaxpr.eqns:
         if not any(uses[id(eqn)]):
             continue
         name = eqn.primitive.name
+        function = jaxprs.called(eqn)
         operands = [read(v) for v in eqn.invars]
         results: Sequence[Ids | None]
-        if name == "jit" and len(eqn.params["jaxpr"].eqns) > MAX_REINTERPRETED:
-            results = apply(
-                b,
-                eqn.params["jaxpr"],
-                operands,
-                uses[id(eqn)],
-                calls[id(eqn.params["jaxpr"])],
-                closed,
-            )
-        elif name in INLINED:
-            results = closed(b, eqn.params[INLINED[name]], operands)
+        if name == "jit" and len(function.eqns) > MAX_REINTERPRETED:
+            results = apply(b, function, operands, uses[id(eqn)], calls[id(function)], closed)
+        elif function is not None:
+            results = closed(b, function, operands)
         elif name in CONTROL:
             results = CONTROL[name](b, eqn, operands, uses[id(eqn)])
         elif name in RULES:
@@ -96,15 +77,6 @@ def _several(found: Any) -> list[Ids | None]:
     return [found]
 
 
-def _live(jaxpr: Any) -> set:
-    """The variables that the outputs depend on."""
-    live = {v for v in jaxpr.outvars if isinstance(v, core.Var)}
-    for eqn in reversed(jaxpr.eqns):
-        if any(v in live for v in eqn.outvars):
-            live.update(v for v in eqn.invars if isinstance(v, core.Var))
-    return live
-
-
 def _check_float(b: Builder, dtype, eqn) -> None:
     """Refuses floats of another type than the program's, except constants, which are rounded."""
     if np.issubdtype(dtype, np.floating) and dtype != b.dtype and eqn.invars:
@@ -112,24 +84,15 @@ def _check_float(b: Builder, dtype, eqn) -> None:
 
 
 def closed(b: Builder, function: Any, operands: Sequence[Ids]) -> list[Ids]:
-    """The outputs of an inner jaxpr, closed or not."""
-    inner = getattr(function, "jaxpr", function)
-    consts = [constants(b, c) for c in getattr(function, "consts", ())]
-    return interpret(b, inner, consts, operands)
-
-
-def _parts(params: dict[str, Any]) -> tuple[int, int]:
-    """The numbers of constants and of carried arrays among the operands of a scan."""
-    if "num_consts" in params:  # before jax 0.11
-        return params["num_consts"], params["num_carry"]
-    consts, carry, _ = params["ft_in"].unpack()
-    return len(consts), len(carry)
+    """The outputs of a function, given its operands as node numbers."""
+    jaxpr, values = jaxprs.opened(function)
+    return interpret(b, jaxpr, [constants(b, value) for value in values], operands)
 
 
 def _scan(b: Builder, eqn, operands, used):
     params = eqn.params
     length = params["length"]
-    n_const, n_carry = _parts(params)
+    n_const, n_carry = jaxprs.scan_sizes(params)
     if length > b.limits.scan:
         raise UnsupportedError(
             f"an inner loop of {length} steps is too long to unroll (at most {b.limits.scan})"

@@ -6,18 +6,19 @@ intervals is too wide. Derivatives and batches pass through them to the first ar
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
-from jax.extend.core import Primitive
-from jax.interpreters import ad, batching, mlir
+
+from iblf_jax.kernels.primitives import new_primitive
 
 
-def _primitive(name: str) -> Primitive:
+def _primitive(name: str) -> Any:
     """An elementwise primitive whose value is its first argument."""
-    primitive = Primitive(name)
-    primitive.def_impl(lambda x, *others: x)
-    primitive.def_abstract_eval(lambda x, *others: x)
-    mlir.register_lowering(primitive, mlir.lower_fun(lambda x, *others: x, multiple_results=False))
+
+    def first(x, *others):
+        return x
 
     def jvp(primals, tangents):
         return primitive.bind(*primals), tangents[0]
@@ -27,8 +28,7 @@ def _primitive(name: str) -> Primitive:
         moved = [_batch_axis_first(x, axis, size) for x, axis in zip(arguments, axes, strict=True)]
         return primitive.bind(*moved), 0
 
-    ad.primitive_jvps[primitive] = jvp
-    batching.primitive_batchers[primitive] = batch
+    primitive = new_primitive(name, first, shapes=first, jvp=jvp, batch=batch)
     return primitive
 
 

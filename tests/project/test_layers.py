@@ -38,6 +38,17 @@ ONLY_IN = {
 }
 """Library -> the modules that may use it, inside functions too."""
 
+INTERNAL = ("jax._src", "jax.extend", "jax.interpreters", "jax.experimental")
+"""Modules of JAX that may change in any version."""
+
+INTERNALS = {
+    "core/disk_cache.py": "the cache of compiled programs",
+    "core/taylor.py": "rules of Taylor coefficients",
+    "kernels/jaxprs.py": "how a jaxpr stores equations, constants and inner functions",
+    "kernels/primitives.py": "primitives and their rules",
+}
+"""File -> the part of JAX's internals that it alone knows."""
+
 FILES = sorted(PACKAGE.rglob("*.py"))
 SOURCES = {path: path.read_text() for path in FILES}
 
@@ -143,6 +154,27 @@ def test_libraries_stay_in_their_place(library):
     assert users <= set(ONLY_IN[library]), (
         f"{library} belongs to {ONLY_IN[library]}, not to {users - set(ONLY_IN[library])}"
     )
+
+
+def test_internals_of_jax_stay_in_their_modules():
+    users = {
+        str(path.relative_to(PACKAGE))
+        for path, text in SOURCES.items()
+        if any(x.startswith(INTERNAL) for x in imports(text, at_the_top=False))
+        or any(calls(text, name) for name in INTERNAL)
+    }
+    assert users <= set(INTERNALS)
+
+
+def test_equations_of_jaxprs_are_read_by_interpreters_only():
+    """The others ask `kernels.jaxprs`."""
+    interpreters = {"core/taylor.py", "kernels/from_jaxpr.py"}
+    users = {
+        str(path.relative_to(PACKAGE))
+        for path, text in SOURCES.items()
+        if re.search(r"\.(eqns|constvars|call_jaxpr)\b", text)
+    }
+    assert users <= set(INTERNALS) | interpreters
 
 
 def calls(source: str, name: str) -> list[int]:

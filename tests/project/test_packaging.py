@@ -94,11 +94,14 @@ def test_workflows_use_a_python_of_the_classifiers():
 
 def test_the_tests_run_on_every_python_with_and_without_extras():
     workflow = (ROOT / ".github" / "workflows" / "tests.yml").read_text()
-    lists = re.findall(r"^ +(python|extras): (\[.*\])$", workflow, re.MULTILINE)
-    matrix = {name: json.loads(values) for name, values in lists}
-    assert [tuple(map(int, version.split("."))) for version in matrix["python"]] == CLASSIFIED
+    environments = re.findall(r'- \{python: "(3\.\d+)", pins: "(.*)"\}', workflow)
+    assert [tuple(map(int, python.split("."))) for python, _ in environments] == CLASSIFIED
+    # The oldest versions on the oldest Python, and what pip takes on the newer ones.
+    pins = [pin for _, pin in environments]
+    assert pins == ["-c constraints.txt"] + [""] * (len(CLASSIFIED) - 1)
+    extras = json.loads(re.findall(r"^ +extras: (\[.*\])$", workflow, re.MULTILINE)[0])
     all_extras = {"test", "sweep", "robots", "tuning", "export", "docs", "bench"}
-    assert [set(extras.split(",")) for extras in matrix["extras"]] == [{"test"}, all_extras]
+    assert [set(words.split(",")) for words in extras] == [{"test"}, all_extras]
     assert all_extras <= set(PROJECT["optional-dependencies"])
 
 
@@ -130,6 +133,22 @@ def test_every_dependency_is_pinned_at_a_version_that_is_allowed():
     for requirement in OPTIONAL:
         pin = PINS.get(canonicalize_name(requirement.name))
         assert pin is None or requirement.specifier.contains(pin), (requirement, pin)
+
+
+def test_jax_is_limited_to_the_versions_that_were_tested():
+    """The lower limit is the pinned version, and the upper one a minor version."""
+    (jax_,) = [x for x in REQUIRED if x.name == "jax"]
+    lower = PINS["jax"]
+    match = re.fullmatch(rf">={re.escape(lower)},<0\.(\d+)", sorted_specifier(jax_))
+    assert match is not None, jax_
+    newest = f"0.{int(match[1]) - 1}"
+    page = (ROOT / "docs" / "stability.md").read_text(encoding="utf-8")
+    assert f"from {lower} to {newest}." in page
+    assert jax_.specifier.contains(importlib.metadata.version("jax"))
+
+
+def sorted_specifier(requirement):
+    return ",".join(sorted(map(str, requirement.specifier), reverse=True))
 
 
 def test_the_pinned_versions_install_on_the_oldest_python():

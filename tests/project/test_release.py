@@ -21,6 +21,7 @@ def module_of(path, name):
     return module
 
 
+sys.path.insert(0, str(ROOT / "tools"))  # as when Python runs a program there
 release = module_of(ROOT / "tools" / "release", "release")
 comparison = module_of(ROOT / "benchmarks" / "comparison.py", "comparison")
 

@@ -478,6 +478,17 @@ def test_a_truncated_recording_is_refused(storage, share, scenario, motion, tmp_
         read_log(folder, scenario)
 
 
+def test_a_single_byte_that_is_missing_at_the_end_is_found(scenario, motion, tmp_path):
+    t, q, _, tau = motion
+    folder = write_bag(tmp_path / "bag", messages_of(t, NAMES, q, tau))
+    data = (folder / "bag.db3").read_bytes()
+    (folder / "bag.db3").write_bytes(data[:-1])
+    words = rf"got {len(data) - 1} bytes of bag\.db3, which had {len(data)}"
+    for path in (folder, folder / "bag.db3"):
+        with pytest.raises(ValueError, match=words):
+            read_log(path, scenario)
+
+
 def test_a_recording_with_less_messages_than_its_metadata_count_is_refused(
     scenario, motion, tmp_path
 ):

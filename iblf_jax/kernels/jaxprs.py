@@ -1,0 +1,110 @@
+"""What a jaxpr is in each version of JAX: the only module that knows how its equations are stored.
+
+Before JAX 0.11 a function is a `ClosedJaxpr`, which has the values of its constants and a `Jaxpr`.
+From 0.11 on both are one class, in which `jaxpr.jaxpr is jaxpr`.  Functions here take either.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from jax.extend import core
+
+CALLED = {
+    "jit": "jaxpr",
+    "pjit": "jaxpr",
+    "closed_call": "call_jaxpr",
+    "core_call": "call_jaxpr",
+    "custom_jvp_call": "call_jaxpr",
+    "custom_vjp_call": "call_jaxpr",
+    "custom_vjp_call_jaxpr": "fun_jaxpr",
+    "checkpoint": "jaxpr",
+    "remat": "jaxpr",
+    "remat2": "jaxpr",
+}
+"""Primitive that calls an inner function once -> the parameter that holds its jaxpr."""
+
+
+def called(equation: Any) -> Any:
+    """The function that an equation calls; None for an equation that calls none, or by rules of its
+    own (a loop, a branch).
+    """
+    name = equation.primitive.name
+    if name not in CALLED:
+        return None
+    return equation.params[CALLED[name]]
+
+
+def opened(function: Any) -> tuple[Any, Sequence[Any]]:
+    """The equations of a function, with their variables, and the values of its constants."""
+    return getattr(function, "jaxpr", function), getattr(function, "consts", ())
+
+
+def is_variable(atom: Any) -> bool:
+    """Whether an operand or an output is a variable; otherwise it is a literal with its `val`."""
+    return isinstance(atom, core.Var)
+
+
+def scan_sizes(params: dict[str, Any]) -> tuple[int, int]:
+    """The numbers of constants and of carried arrays among the operands of a scan."""
+    if "num_consts" in params:  # before JAX 0.11
+        return params["num_consts"], params["num_carry"]
+    consts, carry, _ = params["ft_in"].unpack()
+    return len(consts), len(carry)
+
+
+def count_operations(function: Any) -> int:
+    """The number of operations of a function and of its inner functions, each counted once."""
+    pending = [opened(function)[0]]
+    # The functions themselves are the values, so that no other one gets the `id` of one of them.
+    found: dict[int, Any] = {}
+    while pending:
+        inner = pending.pop()
+        if id(inner) not in found:
+            found[id(inner)] = inner
+            for equation in inner.eqns:
+                pending += core.jaxprs_in_params(equation.params)
+    return sum(len(inner.eqns) for inner in found.values())
+
+
+def needed(function: Any) -> set[Any]:
+    """The variables that the outputs depend on."""
+    jaxpr, _ = opened(function)
+    found = {x for x in jaxpr.outvars if is_variable(x)}
+    for equation in reversed(jaxpr.eqns):
+        if not found.isdisjoint(equation.outvars):
+            found.update(x for x in equation.invars if is_variable(x))
+    return found
+
+
+def depend_on_last(function: Any, count: int) -> list[bool]:
+    """Which outputs depend on the last `count` inputs."""
+    jaxpr, _ = opened(function)
+    found = set(jaxpr.invars[len(jaxpr.invars) - count :])
+    for equation in jaxpr.eqns:
+        if any(is_variable(x) and x in found for x in equation.invars):
+            found.update(equation.outvars)
+    return [is_variable(x) and x in found for x in jaxpr.outvars]
+
+
+def nested(function: Any) -> Iterator[tuple[Any, Sequence[Any]]]:
+    """A function and all functions inside it, as `opened`, each time that one occurs."""
+    jaxpr, constants = opened(function)
+    yield jaxpr, constants
+    for equation in jaxpr.eqns:
+        for inner in core.jaxprs_in_params(equation.params):
+            yield from nested(inner)
+
+
+def primitives(function: Any) -> set[str]:
+    """The names of all primitives of a function."""
+    return {equation.primitive.name for jaxpr, _ in nested(function) for equation in jaxpr.eqns}
+
+
+def constants(function: Any) -> Iterator[Any]:
+    """The values of all constants and literals of a function."""
+    for jaxpr, values in nested(function):
+        yield from values
+        for equation in jaxpr.eqns:
+            yield from (x.val for x in equation.invars if not is_variable(x))

@@ -1,0 +1,57 @@
+"""Primitives of our own: the only module that knows how JAX registers one and its rules."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+
+
+def new_primitive(
+    name: str,
+    evaluate: Callable,
+    *,
+    shapes: Callable,
+    jvp: Callable,
+    batch: Callable,
+    transpose: Callable | None = None,
+    called: Callable | None = None,
+    several_results: bool = False,
+) -> Primitive:
+    """A primitive with its rules, which receive its parameters by name.
+
+    Args:
+      name: its name in a jaxpr.
+      evaluate: function (operands) -> result, as JAX traces it.
+      shapes: function (operands) -> the shape and type of the result, or a list of them.
+      jvp: function (primals, tangents) -> (result, its tangent).
+      batch: function (operands, axes) -> (result, its axis).
+      transpose: function (cotangents, operands) -> the cotangent of each operand; None for a
+        primitive that is not linear.
+      called: `evaluate` as it runs outside of a trace, if that is another function.
+      several_results: whether results, tangents and axes are lists.
+    """
+    primitive = Primitive(name)
+    primitive.multiple_results = several_results
+    primitive.def_impl(called or evaluate)
+    primitive.def_abstract_eval(shapes)
+    lowering = mlir.lower_fun(evaluate, multiple_results=several_results)
+    mlir.register_lowering(primitive, lowering)
+    ad.primitive_jvps[primitive] = jvp
+    batching.primitive_batchers[primitive] = batch
+    if transpose is not None:
+        ad.primitive_transposes[primitive] = transpose
+    return primitive
+
+
+def is_zero(tangent: Any) -> bool:
+    """Whether a tangent or a cotangent is the symbol of zeros."""
+    return isinstance(tangent, ad.Zero)
+
+
+def without_symbol(tangent: Any) -> jax.Array:
+    """A tangent as an array."""
+    return ad.instantiate_zeros(tangent)  # type: ignore[no-any-return]

@@ -1,0 +1,166 @@
+"""What the package knows of JAX's internals holds for the version that is installed."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from iblf_jax.kernels import jaxprs
+from iblf_jax.kernels.primitives import is_zero, new_primitive, without_symbol
+
+TABLE = jnp.asarray([1.0, 2.0, 4.0])
+
+
+@jax.custom_jvp
+def with_a_rule(x):
+    return jnp.sin(x)
+
+
+with_a_rule.defjvp(lambda primals, tangents: (jnp.sin(primals[0]), tangents[0]))
+
+
+@jax.custom_vjp
+def with_a_reverse_rule(x):
+    return jnp.sin(x)
+
+
+with_a_reverse_rule.defvjp(lambda x: (jnp.sin(x), x), lambda x, g: (g,))
+
+CALLS = {
+    "jit": jax.jit(jnp.sin),
+    "custom_jvp": with_a_rule,
+    "custom_vjp": with_a_reverse_rule,
+    "checkpoint": jax.checkpoint(jnp.sin),
+}
+
+
+def names(function):
+    return [equation.primitive.name for equation in jaxprs.opened(function)[0].eqns]
+
+
+@pytest.mark.parametrize("kind", CALLS)
+def test_the_function_that_an_equation_calls_is_found(kind):
+    traced = jax.make_jaxpr(CALLS[kind])(1.0)
+    (equation,) = jaxprs.opened(traced)[0].eqns
+    inner = jaxprs.called(equation)
+    assert names(inner) == ["sin"]
+    (innermost,) = jaxprs.opened(inner)[0].eqns
+    assert jaxprs.called(innermost) is None
+    assert jaxprs.count_operations(traced) == 2
+
+
+def test_constants_belong_to_their_variables():
+    jaxpr, values = jaxprs.opened(jax.make_jaxpr(lambda x: x + TABLE)(1.0))
+    assert len(jaxpr.constvars) == len(values) == 1
+    np.testing.assert_array_equal(values[0], TABLE)
+    assert jaxprs.opened(jaxpr)[0] is jaxpr
+
+
+def test_variables_and_literals_are_told_apart():
+    (equation,) = jaxprs.opened(jax.make_jaxpr(lambda x: x * 3.0)(1.0))[0].eqns
+    assert [jaxprs.is_variable(x) for x in equation.invars] == [True, False]
+    assert equation.invars[1].val == 3.0
+
+
+def test_sizes_of_a_scan():
+    def looped(a, b, start, rows):
+        return jax.lax.scan(
+            lambda c, row: ((c[0] * a + row, c[1] + b, c[2] + c[0]), row),
+            (start, start, start),
+            rows,
+        )
+
+    traced = jax.make_jaxpr(looped)(1.0, 2.0, 0.5, jnp.ones(4))
+    scan = next(x for x in jaxprs.opened(traced)[0].eqns if x.primitive.name == "scan")
+    assert jaxprs.scan_sizes(scan.params) == (2, 3)
+    assert len(scan.invars) == 2 + 3 + 1
+    assert names(scan.params["jaxpr"])
+    assert scan.params["length"] == 4
+
+
+def test_a_shared_function_is_counted_once():
+    shared = jax.jit(lambda x: jnp.sin(x) + jnp.cos(x))
+    once = jaxprs.count_operations(jax.make_jaxpr(shared)(1.0))
+    twice = jaxprs.count_operations(jax.make_jaxpr(lambda x: shared(shared(x)))(1.0))
+    assert (once, twice) == (4, 5)
+
+
+def test_operations_of_branches_are_counted():
+    def chosen(x):
+        return jax.lax.cond(x > 0, lambda y: jnp.sin(y), lambda y: jnp.cos(y) * 2.0, x)
+
+    plain = jaxprs.count_operations(jax.make_jaxpr(lambda x: x > 0)(1.0))
+    assert jaxprs.count_operations(jax.make_jaxpr(chosen)(1.0)) >= plain + 4
+
+
+def test_dependences():
+    traced = jax.make_jaxpr(lambda x, y, z: (x + 1.0, jnp.sin(x) * z, z, 2.0))(1.0, 2.0, 3.0)
+    assert jaxprs.depend_on_last(traced, 1) == [False, True, True, False]
+    assert jaxprs.depend_on_last(traced, 3) == [True, True, True, False]
+    assert jaxprs.depend_on_last(traced, 0) == [False] * 4
+    jaxpr, _ = jaxprs.opened(traced)
+    x, y, z = jaxpr.invars
+    found = jaxprs.needed(traced)
+    assert {x, z} <= found
+    assert y not in found
+
+
+def test_constants_and_primitives_of_inner_functions():
+    def branches(x):
+        return jax.lax.cond(x[0] > 0.5, lambda x: jnp.sum(jnp.sin(x)) * 7.5, dotted, x)
+
+    def dotted(x):
+        return x @ jnp.asarray(TABLE)
+
+    traced = jax.make_jaxpr(branches)(jnp.asarray(TABLE))
+    assert {"cond", "sin", "dot_general", "reduce_sum"} <= jaxprs.primitives(traced)
+    found = [np.asarray(x) for x in jaxprs.constants(traced)]
+    assert any(np.array_equal(x, TABLE) for x in found)
+    assert any(np.array_equal(x, 7.5) for x in found)
+
+
+def shape_of_first(x, y):
+    return x
+
+
+double_sum = new_primitive(
+    "double_sum_of_the_tests",
+    lambda x, y: 2.0 * x + 2.0 * y,
+    shapes=shape_of_first,
+    jvp=lambda primals, tangents: (
+        double_sum.bind(*primals),
+        double_sum.bind(*map(without_symbol, tangents)),
+    ),
+    batch=lambda operands, axes: (double_sum.bind(*operands), axes[0]),
+    transpose=lambda g, x, y: [2.0 * without_symbol(g)] * 2,
+)
+
+
+def test_a_primitive_of_our_own():
+    x, y = jnp.asarray([1.0, 2.0]), jnp.asarray([3.0, 5.0])
+    np.testing.assert_array_equal(double_sum.bind(x, y), [8.0, 14.0])
+    np.testing.assert_array_equal(jax.jit(double_sum.bind)(x, y), [8.0, 14.0])
+    np.testing.assert_array_equal(jax.vmap(double_sum.bind)(x, y), [8.0, 14.0])
+    assert names(jax.make_jaxpr(double_sum.bind)(x, y)) == ["double_sum_of_the_tests"]
+
+
+def test_derivatives_of_a_primitive_of_our_own():
+    seen = []
+
+    def jvp(primals, tangents):
+        seen.append([is_zero(x) for x in tangents])
+        return primals[0], without_symbol(tangents[0])
+
+    first = new_primitive(
+        "first_of_the_tests",
+        lambda x, y: x,
+        shapes=shape_of_first,
+        jvp=jvp,
+        batch=lambda operands, axes: (operands[0], axes[0]),
+    )
+    assert jax.jvp(lambda x: first.bind(x, jnp.asarray(2.0)), (1.0,), (4.0,))[1] == 4.0
+    assert seen == [[False, True]]
+    assert jax.jvp(lambda x: double_sum.bind(x, 3.0 * x), (1.0,), (1.0,))[1] == 8.0
+    assert jax.linear_transpose(double_sum.bind, 1.0, 1.0)(1.0) == (2.0, 2.0)

@@ -1,0 +1,259 @@
+"""The program that runs a command with the newest Python and JAX keeps environments apart, passes
+the configuration of pip on, and says clearly when it cannot make an environment.
+"""
+
+from __future__ import annotations
+
+import configparser
+import os
+import re
+import subprocess
+import sys
+import threading
+import tomllib
+
+import pytest
+from conftest import ROOT
+from test_release import module_of
+
+tool = module_of(ROOT / "tools" / "newest_python", "newest_python")
+NO_OPTIONS = tool.PipConfiguration({}, [])
+
+
+@pytest.fixture
+def machine(tmp_path):
+    return tool.Machine(tmp_path, sys.executable)
+
+
+def call(*words, **variables):
+    command = [sys.executable, str(ROOT / "tools" / "newest_python"), *words]
+    return subprocess.run(
+        command, env=os.environ | variables, capture_output=True, text=True, check=False
+    )
+
+
+def test_the_extras_are_those_of_the_test_command_of_the_readme():
+    extras = tool.extras_of_the_tests()
+    assert f'-e ".[{extras}]"' in (ROOT / "README.md").read_text()
+    assert "test" in extras.split(",")
+
+
+def test_requirements_are_those_of_pyproject():
+    content = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    found = tool.requirements("test,sweep", False)
+    optional = content["optional-dependencies"]
+    for text in [*content["dependencies"], *optional["test"], *optional["sweep"]]:
+        assert text in found
+    assert set(optional["export"]).isdisjoint(found)
+    with pytest.raises(tool.UnavailableError, match="extra 'no_such_extra'; pyproject"):
+        tool.requirements("test,no_such_extra", False)
+
+
+def test_pre_releases_are_taken_of_jax_alone_and_above_its_limit():
+    usual, early = (set(tool.requirements("test", pre)) for pre in (False, True))
+    (limited,) = usual - early
+    assert re.match(r"jax>=.*<", limited)
+    assert early - usual == {"jax>=0.dev0", "jaxlib>=0.dev0"}
+    assert any(text.startswith("equinox") for text in early)
+
+
+def test_pythons_are_newer_than_the_oldest():
+    assert tool.minors() == sorted(tool.minors(), reverse=True)
+    assert min(tool.minors()) == 12
+
+
+# --- keys ----------------------------------------------------------------------------------------
+
+
+def test_different_environments_have_different_keys(tmp_path, monkeypatch):
+    wheels = tmp_path / "wheels"
+    wheels.mkdir()
+    options = {"global.find-links": str(wheels)}
+
+    def description(needed=("jax", "numpy"), python="3.13.1", options=options):
+        paths = [path for value in options.values() for path in tool.paths_in(value)]
+        return tool.description(list(needed), python, tool.PipConfiguration(options, paths))
+
+    contents = [
+        description(),
+        description(needed=["jax, numpy"]),
+        description(needed=["jax", "numpy", "scipy"]),
+        description(python="3.13.2"),
+        description(options={}),
+        description(options={**options, "global.index-url": "file:///nowhere"}),
+        description(options={**options, ":env:.index-url": "file:///nowhere"}),
+    ]
+    (wheels / "jax.whl").write_bytes(b"a")
+    contents.append(description())
+    monkeypatch.setattr(tool, "__file__", str(tmp_path / "other"))
+    (tmp_path / "other").write_text("another way to make it")
+    contents.append(description())
+    keys = [tool.key_of(content) for content in contents]
+    assert len(set(keys)) == len(keys)
+    assert tool.key_of(description()) == keys[-1]
+
+
+def test_the_newest_packages_are_looked_for_again_every_week(monkeypatch):
+    class Later(tool.datetime.date):
+        @classmethod
+        def today(cls):
+            return tool.datetime.date.fromordinal(now.toordinal() + 7)
+
+    now = tool.datetime.date.today()
+    before = tool.key_of(tool.description([], "", NO_OPTIONS))
+    monkeypatch.setattr(tool.datetime, "date", Later)
+    assert tool.key_of(tool.description([], "", NO_OPTIONS)) != before
+
+
+def test_options_that_do_not_decide_what_is_installed_do_not_matter():
+    same = [
+        tool.PipConfiguration(options, [])
+        for options in ({}, {":env:.compile": "0"}, {"global.default-timeout": "60"})
+    ]
+    assert len({tool.key_of(tool.description(["jax"], "3.13", pip)) for pip in same}) == 1
+
+
+# --- the configuration of pip --------------------------------------------------------------------
+
+
+def test_the_configuration_of_pip_is_passed_on(tmp_path, monkeypatch):
+    wheels, own = tmp_path / "wheels", tmp_path / "pip.conf"
+    index = tmp_path / "index" / "simple"  # its links lead to a folder beside it
+    wheels.mkdir()
+    index.mkdir(parents=True)
+    own.write_text(
+        f"[global]\nfind-links = {wheels}\n  file://{wheels}\n  /no/such/folder\n"
+        "index-url = https://user:a%20b@example.org/simple\n"
+        f"extra-index-url = file://{index}\n[install]\nno-binary = a\n"
+    )
+    monkeypatch.setenv("PIP_CONFIG_FILE", str(own))
+    found = tool.PipConfiguration.of_machine()
+    assert {wheels, index.parent} <= set(found.paths)
+    assert index not in found.paths
+    found.write(tmp_path / "written.conf")
+    parser = configparser.RawConfigParser()
+    parser.read(tmp_path / "written.conf")
+    assert parser["global"]["index-url"] == "https://user:a%20b@example.org/simple"
+    assert parser["global"]["find-links"].split()[:2] == [str(wheels), f"file://{wheels}"]
+    assert parser["install"]["no-binary"] == "a"
+
+
+# --- the copy ------------------------------------------------------------------------------------
+
+
+def test_the_copy_has_tracked_and_new_files_only(machine, tmp_path):
+    tool.copy_tree(["pyproject.toml", "tools/newest_python"], tmp_path / "tree")
+    copied = tmp_path / "tree" / "tools" / "newest_python"
+    assert copied.read_bytes() == (ROOT / "tools" / "newest_python").read_bytes()
+    assert os.access(copied, os.X_OK)
+
+
+def test_the_command_has_the_environment_of_the_copy(machine, tmp_path, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", "/foreign")
+    (tmp_path / "copy" / "tree").mkdir(parents=True)
+    code = "import os, pathlib; pathlib.Path('seen').write_text(repr(dict(os.environ)))"
+    command = [sys.executable, "-c", f"{code}; raise SystemExit(7)"]
+    packages, copy = tmp_path / "packages", tmp_path / "copy"
+    assert tool.run_command(machine, packages, copy, command) == 7
+    seen = eval((copy / "tree" / "seen").read_text())
+    assert "PYTHONPATH" not in seen
+    first = [str(x / "venv" / "bin") for x in (copy, packages)]
+    assert seen["PATH"].split(os.pathsep)[:2] == first
+
+
+# --- calls at the same time, and calls that were interrupted -------------------------------------
+
+
+def test_only_what_no_call_uses_is_removed(machine, tmp_path):
+    folders = [tmp_path / "copies" / name for name in ("used", "left")]
+    folders += [tmp_path / "packages" / name for name in ("old", "old_in_use", "new")]
+    for folder in folders:
+        folder.mkdir(parents=True)
+        tool.lock_of(folder).touch()
+        if folder.name.startswith("old"):
+            os.utime(tool.lock_of(folder), (0, 0))
+    used = [tool.lock_of(folders[0]), tool.lock_of(folders[3])]
+    with tool.locked(used[0]), tool.locked(used[1], shared=True):
+        tool.remove_unused(machine)
+    assert [x.name for x in folders if x.exists()] == ["used", "old_in_use", "new"]
+    tool.remove_unused(machine)
+    assert [x.name for x in folders if x.exists()] == ["new"]
+    assert sorted(x.name for x in tmp_path.rglob("*.lock")) == ["new.lock"]
+
+
+def test_an_environment_is_made_once_and_again_after_an_interruption(
+    machine, tmp_path, monkeypatch
+):
+    content = {"python": "3.13", "requirements": ["jax"]}
+    packages = tmp_path / "packages" / "key"
+    steps = []
+
+    def step(what, words, folder):
+        steps.append(what)
+        if len(steps) == 3:
+            raise tool.UnavailableError("no network")
+        return ""
+
+    monkeypatch.setattr(machine, "run", step)
+    with pytest.raises(tool.UnavailableError):
+        tool.make_packages(machine, packages, content)
+    (packages / "half").touch()
+    tool.make_packages(machine, packages, content)
+    assert not (packages / "half").exists()
+    assert len(steps) == 6
+    tool.make_packages(machine, packages, content)
+    assert len(steps) == 6
+
+
+def test_a_lock_is_awaited(tmp_path):
+    order = []
+
+    def second():
+        with tool.locked(tmp_path / "making.lock"):
+            order.append("second")
+
+    with tool.locked(tmp_path / "making.lock"):
+        thread = threading.Thread(target=second)
+        thread.start()
+        thread.join(0.2)
+        order.append("first")
+    thread.join(10.0)
+    assert order == ["first", "second"]
+
+
+# --- where it cannot be made ---------------------------------------------------------------------
+
+
+def test_a_python_that_cannot_be_used_is_named(tmp_path):
+    done = call("true", NEWEST_PYTHON="/no/such/python", NEWEST_PYTHON_FOLDER=str(tmp_path))
+    assert done.returncode == tool.UNAVAILABLE
+    assert "the environment cannot be made: /no/such/python" in done.stderr
+    assert "it must be a Python 3.13, 3.12" in done.stderr
+
+
+def test_without_any_python_and_root_it_says_what_to_do(tmp_path, monkeypatch):
+    monkeypatch.setattr(tool.os, "geteuid", lambda: 1000)
+    with pytest.raises(tool.UnavailableError, match=r"no python3\.13 .* name it by --python PATH"):
+        tool.debian(tmp_path, NO_OPTIONS)
+
+
+def test_apt_without_an_archive_of_debian_is_refused(monkeypatch):
+    monkeypatch.setattr(tool, "run", lambda what, words: "http://archive.ubuntu.com/ubuntu/")
+    with pytest.raises(tool.UnavailableError, match=r"names no archive of Debian: http://arch"):
+        tool._archive()
+
+
+def test_a_step_that_fails_is_shown_with_its_output():
+    code = "print('first'); raise SystemExit('the reason')"
+    with pytest.raises(tool.UnavailableError, match=r"a step failed:\nfirst\nthe reason"):
+        tool.run("a step", [sys.executable, "-uc", code])
+    with pytest.raises(tool.UnavailableError, match="a step did not start"):
+        tool.run("a step", ["/no/such/program"])
+
+
+def test_ci_runs_the_tests_in_both_environments_and_fails_without_the_second():
+    text = (ROOT / ".ci" / "run").read_text()
+    assert "set -euo pipefail" in text
+    waits = text.index('wait "$newest" || {')
+    assert "exit 1" in text[waits : text.index("\n", waits)]
+    assert text.index("tools/newest_python python -m pytest") > waits
