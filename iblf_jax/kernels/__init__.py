@@ -79,6 +79,7 @@ from iblf_jax.kernels.enclosure import pointer as pointer
 from iblf_jax.kernels.folder import cpuinfo as cpuinfo
 from iblf_jax.kernels.folder import directory as directory
 from iblf_jax.kernels.folder import processor as processor
+from iblf_jax.kernels.from_jaxpr import parts_of_scan as parts_of_scan
 from iblf_jax.kernels.interval_primitives import hull as hull
 from iblf_jax.kernels.interval_primitives import lower as lower
 from iblf_jax.kernels.interval_primitives import meet as meet

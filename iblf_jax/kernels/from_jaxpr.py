@@ -118,7 +118,7 @@ def closed(b: Builder, function: Any, operands: Sequence[Ids]) -> list[Ids]:
     return interpret(b, inner, consts, operands)
 
 
-def _parts(params: dict[str, Any]) -> tuple[int, int]:
+def parts_of_scan(params: dict[str, Any]) -> tuple[int, int]:
     """The numbers of constants and of carried arrays among the operands of a scan."""
     if "num_consts" in params:  # before jax 0.11
         return params["num_consts"], params["num_carry"]
@@ -129,7 +129,7 @@ def _parts(params: dict[str, Any]) -> tuple[int, int]:
 def _scan(b: Builder, eqn, operands, used):
     params = eqn.params
     length = params["length"]
-    n_const, n_carry = _parts(params)
+    n_const, n_carry = parts_of_scan(params)
     if length > b.limits.scan:
         raise UnsupportedError(
             f"an inner loop of {length} steps is too long to unroll (at most {b.limits.scan})"
@@ -209,7 +209,7 @@ CONTROL = {"scan": _scan, "cond": _cond, "while": _while}
 
 
 def _read_of_scan(params: dict[str, Any]) -> tuple:
-    return params["length"], params["reverse"], params["jaxpr"], _parts(params)
+    return params["length"], params["reverse"], params["jaxpr"], parts_of_scan(params)
 
 
 def _read_of_inlined(name: str) -> Callable[[dict[str, Any]], tuple]:
