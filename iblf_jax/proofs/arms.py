@@ -26,7 +26,7 @@ from iblf_jax.core.time import as_at, jump_times_of
 from iblf_jax.proofs import arm_motion, uncertainty
 from iblf_jax.proofs.arm_bound import Constants, arm_bound
 from iblf_jax.proofs.arm_motion import ArmParts, Errors, position
-from iblf_jax.proofs.examination import check_operations
+from iblf_jax.proofs.examination import Examined, Operations, check_operations
 from iblf_jax.proofs.matrices import solve_transposed, upper_factor
 from iblf_jax.proofs.parameters import Uncertain, uncertain_coordinates
 from iblf_jax.proofs.periods import shifted
@@ -82,6 +82,8 @@ class ArmBound:
     structure: Any
     places: Places
     n: int
+    digests: tuple[str, ...]
+    """Of the functions that users wrote, so that a changed one has a program of its own."""
 
     def __call__(self, x: jax.Array, constants: list[jax.Array]) -> tuple[jax.Array, jax.Array]:
         """Upper bounds of V_w' over a box, and no region."""
@@ -96,6 +98,8 @@ class ArmRate:
     structure: Any
     places: Places
     n: int
+    digests: tuple[str, ...]
+    """Of the functions that users wrote, so that a changed one has a program of its own."""
 
     def __call__(self, point: jax.Array, constants: list[jax.Array]) -> jax.Array:
         """V_w', () [N m rad/s]; infinite where the torque is not defined, such as log(-1)."""
@@ -260,21 +264,14 @@ def arm_problem(
             "disturbance": scenario.disturbance,
         }
         length, is_period = time_interval(varying, duration, uncertain)
-        _check_operations(parts, uncertain, scenario.n)
-        sides = {f"bounds.{name}": vars(scenario.bounds)[name] for name in ("lower", "upper")}
-        assumed = check_time_functions(scenario.reference, sides, scenario.n)
-        if type(parts.law.barrier) not in BARRIERS:
-            check_barrier(
-                "scenario.controller.barrier", parts.law.barrier, parts.law.o, homogeneous=True
-            )
-        assumed += agreement_of_robot(scenario.plant)
+        examined = _examined(scenario, parts, uncertain)
         _check_tube(scenario, length)
         _check_mass_matrices(parts, uncertain)
         zero = jnp.zeros(())
         structure = jax.tree.structure(Constants(parts, uncertain.numbers, zero, zero))
     n = scenario.n
-    function = ArmBound(structure, uncertain.places, n)
-    point_rate = ArmRate(structure, uncertain.places, n)
+    function = ArmBound(structure, uncertain.places, n, tuple(examined.digests))
+    point_rate = ArmRate(structure, uncertain.places, n, tuple(examined.digests))
     arm = _Arm(scenario, parts, uncertain, function, point_rate, length)
     names, lower, upper = _coordinates(n, length, uncertain)
     return LevelSetProblem(
@@ -291,7 +288,7 @@ def arm_problem(
         scales=uncertain.scales(),
         duration=length,
         is_period=is_period,
-        assumptions=(*ASSUMPTIONS, *claims_of([parts.law.barrier]), *assumed),
+        assumptions=(*ASSUMPTIONS, *claims_of([parts.law.barrier]), *examined.assumed),
     )
 
 
@@ -416,8 +413,24 @@ def _parts_of(scenario: Scenario) -> ArmParts:
     )
 
 
-def _check_operations(parts: ArmParts, uncertain: Uncertain, n: int) -> None:
-    """Raises ValueError for a plant or a disturbance with which f may jump, and V_w with it."""
+def _examined(scenario: Scenario, parts: ArmParts, uncertain: Uncertain) -> Examined:
+    """What is assumed of the parts of a scenario.
+
+    Raises:
+      ValueError: a part that may jump, or one that contradicts its contract.
+    """
+    digests = [_check_operations(parts, uncertain, scenario.n).digest]
+    sides = {f"bounds.{name}": vars(scenario.bounds)[name] for name in ("lower", "upper")}
+    in_time = check_time_functions(scenario.reference, sides, scenario.n)
+    if type(parts.law.barrier) not in BARRIERS:
+        name = "scenario.controller.barrier"
+        digests += check_barrier(name, parts.law.barrier, parts.law.o, homogeneous=True)
+    assumed = [*in_time.assumed, *agreement_of_robot(scenario.plant)]
+    return Examined(assumed, [*digests, *in_time.digests])
+
+
+def _check_operations(parts: ArmParts, uncertain: Uncertain, n: int) -> Operations:
+    """The operations of plant and disturbance, with which f must not jump, and V_w with it."""
     places = uncertain.places
     known = (parts.plant, parts.disturbance, parts.model)
     leaves = jax.tree.leaves(known)
@@ -432,7 +445,7 @@ def _check_operations(parts: ArmParts, uncertain: Uncertain, n: int) -> None:
     inputs = [jnp.zeros(()), vector, vector, vector]
     varying = [*range(4), *(4 + leaf for leaf in places.varying_leaves)]
     name = "scenario.plant and disturbance"
-    check_operations(name, torque, [*inputs, *leaves], varying, kinks=True)
+    return check_operations(name, torque, [*inputs, *leaves], varying, kinks=True)
 
 
 def _check_tube(scenario: Scenario, duration: float) -> None:

@@ -31,7 +31,7 @@ from iblf_jax.proofs.chain_bound import (
     level_rate,
 )
 from iblf_jax.proofs.chain_motion import ChainParts
-from iblf_jax.proofs.examination import check_operations, operations
+from iblf_jax.proofs.examination import Examined, check_operations, operations
 from iblf_jax.proofs.parameters import Uncertain, uncertain_coordinates
 from iblf_jax.proofs.periods import shifted
 from iblf_jax.proofs.problem import (
@@ -82,6 +82,8 @@ class ChainBound(NamedTuple):
     structure: Any
     places: Places
     observed: tuple[bool, ...]
+    digests: tuple[str, ...]
+    """Of the functions that users wrote, so that a changed one has a program of its own."""
 
     def __call__(self, x: jax.Array, constants: list[jax.Array]) -> tuple[jax.Array, jax.Array]:
         """Upper bounds of V' over a box, and no region."""
@@ -95,6 +97,8 @@ class ChainRate(NamedTuple):
     structure: Any
     places: Places
     observed: tuple[bool, ...]
+    digests: tuple[str, ...]
+    """Of the functions that users wrote, so that a changed one has a program of its own."""
 
     def __call__(self, point: jax.Array, constants: list[jax.Array]) -> jax.Array:
         """V', (); infinite where d is not defined."""
@@ -286,14 +290,7 @@ def chain_problem(
         parts = _parts_of(scenario)
         uncertain = uncertain_coordinates(scenario, parameters, None)
         length, is_period = time_interval(_varying(scenario), duration, uncertain)
-        _check_operations(scenario, uncertain)
-        assumed = check_time_functions(scenario.reference, _sides_of(scenario), 1)
-        for i, barrier in enumerate(parts.law.barriers):
-            if type(barrier) not in BARRIERS:
-                name = f"scenario.controller.barriers[{i}]"
-                o = None if parts.law.o is None else parts.law.o[i]
-                check_barrier(name, barrier, o, homogeneous=False)
-        assumed += agreement_of_plant(scenario.plant)
+        examined = _examined(scenario, parts, uncertain)
         zero = jnp.zeros(())
         numbers = Constants(
             parts, scenario.plant, scenario.disturbance, uncertain.numbers, zero, zero
@@ -303,8 +300,9 @@ def chain_problem(
     chain = _Chain(scenario, parts, uncertain, observed, structure, length)
     names, lower, upper = _coordinates(observed, length, uncertain)
     order = len(observed)
-    function: Any = ChainBound(structure, uncertain.places, observed)
-    point_rate: Any = ChainRate(structure, uncertain.places, observed)
+    digests = tuple(examined.digests)
+    function: Any = ChainBound(structure, uncertain.places, observed, digests)
+    point_rate: Any = ChainRate(structure, uncertain.places, observed, digests)
     return LevelSetProblem(
         names=names,
         lower=lower,
@@ -323,7 +321,7 @@ def chain_problem(
             *ASSUMPTIONS,
             *claims_of(parts.law.barriers),
             *_without_claim(scenario),
-            *assumed,
+            *examined.assumed,
         ),
     )
 
@@ -480,8 +478,25 @@ def _functions_of(plant: Any) -> dict[str, Callable]:
     return {f"{member} of level {i}": at_level(member, i) for member in members for i in levels}
 
 
-def _check_operations(scenario: Scenario, uncertain: Uncertain) -> None:
-    """Raises ValueError for a plant or a disturbance with which d may jump, and V with it.
+def _examined(scenario: Scenario, parts: ChainParts, uncertain: Uncertain) -> Examined:
+    """What is assumed of the parts of a scenario.
+
+    Raises:
+      ValueError: a part that may jump, or one that contradicts its contract.
+    """
+    digests = _check_operations(scenario, uncertain)
+    in_time = check_time_functions(scenario.reference, _sides_of(scenario), 1)
+    for i, barrier in enumerate(parts.law.barriers):
+        if type(barrier) not in BARRIERS:
+            name = f"scenario.controller.barriers[{i}]"
+            o = None if parts.law.o is None else parts.law.o[i]
+            digests += check_barrier(name, barrier, o, homogeneous=False)
+    assumed = [*in_time.assumed, *agreement_of_plant(scenario.plant)]
+    return Examined(assumed, [*digests, *in_time.digests])
+
+
+def _check_operations(scenario: Scenario, uncertain: Uncertain) -> list[str]:
+    """The digests of plant and disturbance, with which d must not jump, and V with it.
 
     The law differentiates what it reads of the levels below the last one.
     """
@@ -496,7 +511,7 @@ def _check_operations(scenario: Scenario, uncertain: Uncertain) -> None:
         plant, disturbance, model = jax.tree.unflatten(structure, numbers)
         return chain_motion.external_at(disturbance, t, x, plant, model)
 
-    check_operations(name, external, inputs, varying, kinks=True)
+    digests = [check_operations(name, external, inputs, varying, kinks=True).digest]
     for method in _functions_of(scenario.plant):
 
         def function(t: jax.Array, x: jax.Array, *numbers: jax.Array, method=method) -> Any:
@@ -504,7 +519,9 @@ def _check_operations(scenario: Scenario, uncertain: Uncertain) -> None:
             return _functions_of(plant)[method](t, x)
 
         is_last = method.endswith(f"level {order}")
-        check_operations(name, function, inputs, varying, kinks=is_last)
+        found = check_operations(name, function, inputs, varying, kinks=is_last)
+        digests.append(found.digest)
+    return digests
 
 
 def _check_law(scenario: Scenario) -> None:

@@ -10,11 +10,13 @@ Only operations count that depend on what varies, and on which an output depends
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.extend import core
 from jax.extend.core import primitives
 
@@ -87,11 +89,23 @@ class Operations(NamedTuple):
     """Those that are in no list."""
     inputs: frozenset[int]
     """Positions of the inputs on which an output depends."""
+    digest: str
+    """Of the jaxpr and its constants. Programs of a function are kept under its class; the digest
+    distinguishes those before and after a change of a number that it reads from elsewhere."""
 
     @property
     def are_smooth(self) -> bool:
         """Whether all are smooth."""
         return not self.kinks and not self.cases and not self.unknown
+
+
+class Examined(NamedTuple):
+    """What an examination of parts found."""
+
+    assumed: list[str]
+    """Sentences on what is assumed of them."""
+    digests: list[str]
+    """Of their functions, as `Operations.digest`."""
 
 
 Value = Any
@@ -169,19 +183,27 @@ def operations(
     def rule(eqn: Any, operands: list[frozenset]) -> list[frozenset]:
         seen: frozenset = frozenset().union(*operands)
         if eqn.primitive is primitives.scan_p and seen:
-            return _of_scan(eqn, operands, rule)
+            return _of_scan(eqn, operands, rule, constant)
         if eqn.primitive is primitives.cond_p and not operands[0]:
-            return _of_branches(eqn, operands, rule)
+            return _of_branches(eqn, operands, rule, constant)
         kind = _kind(eqn, operands) if seen else None
         if kind is not None:
             found[kind].add(eqn.primitive.name)
         return [seen] * len(eqn.outvars)
 
+    def constant(value: Any) -> frozenset:
+        array = np.asarray(value)
+        digest.update(f"{array.dtype} {array.shape}".encode())
+        digest.update(array.tobytes())
+        return frozenset()
+
+    jaxpr = traced(name, function, inputs)
+    digest = hashlib.sha256(str(jaxpr).encode())
     numbers = set(range(len(inputs)) if varying is None else varying)
     values = [frozenset({i} & numbers) for i in range(len(inputs))]
-    outputs = interpreted(traced(name, function, inputs), values, rule, lambda x: frozenset())
+    outputs = interpreted(jaxpr, values, rule, constant)
     sets = {kind: frozenset(names) for kind, names in found.items()}
-    return Operations(**sets, inputs=frozenset().union(*outputs))
+    return Operations(**sets, inputs=frozenset().union(*outputs), digest=digest.hexdigest())
 
 
 def _kind(eqn: Any, operands: list[frozenset]) -> str | None:
@@ -203,7 +225,9 @@ def _kind(eqn: Any, operands: list[frozenset]) -> str | None:
     return "cases" if primitive in CASES else "unknown"
 
 
-def _of_scan(eqn: Any, operands: list[frozenset], rule: Callable) -> list[frozenset]:
+def _of_scan(
+    eqn: Any, operands: list[frozenset], rule: Callable, constant: Callable
+) -> list[frozenset]:
     """The inputs on which the results of a loop of fixed length depend: its body is interpreted
     until what is carried no longer changes.
     """
@@ -211,19 +235,18 @@ def _of_scan(eqn: Any, operands: list[frozenset], rule: Callable) -> list[frozen
     values = list(operands)
     carry = slice(constants, constants + carried)
     while True:
-        results = interpreted(eqn.params["jaxpr"], values, rule, lambda x: frozenset())
+        results = interpreted(eqn.params["jaxpr"], values, rule, constant)
         merged = [x | y for x, y in zip(values[carry], results[:carried], strict=True)]
         if merged == values[carry]:
             return [*merged, *results[carried:]]
         values[carry] = merged
 
 
-def _of_branches(eqn: Any, operands: list[frozenset], rule: Callable) -> list[frozenset]:
+def _of_branches(
+    eqn: Any, operands: list[frozenset], rule: Callable, constant: Callable
+) -> list[frozenset]:
     """The inputs on which a result of one of the branches depends; what chooses does not vary."""
-    found = [
-        interpreted(branch, operands[1:], rule, lambda x: frozenset())
-        for branch in eqn.params["branches"]
-    ]
+    found = [interpreted(branch, operands[1:], rule, constant) for branch in eqn.params["branches"]]
     return [frozenset().union(*results) for results in zip(*found, strict=True)]
 
 
@@ -240,13 +263,16 @@ def check_operations(
     varying: Iterable[int] | None = None,
     *,
     kinks: bool,
-) -> None:
-    """Raises ValueError for a function that may jump, or whose derivative may be wrong.
+) -> Operations:
+    """The operations of a function that may not jump, and whose derivative is that of JAX.
 
     Args:
       name: of the part, for the message.
       function, inputs, varying: as `operations`.
       kinks: whether the derivative may jump.
+
+    Raises:
+      ValueError: an operation that is not admitted.
     """
     found = operations(name, function, inputs, varying)
     refuse_unknown(name, found)
@@ -257,6 +283,7 @@ def check_operations(
     if found.kinks and not kinks:
         got = f"operations whose derivative jumps ({', '.join(sorted(found.kinks))})"
         raise checks.fail(f"prove: {name}", checks.Words(got), "a smooth function", ADVICE)
+    return found
 
 
 def refuse_unknown(name: str, found: Operations) -> None:

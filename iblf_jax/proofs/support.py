@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.control.actuators import Ideal
-from iblf_jax.control.decays._base import decay_member
+from iblf_jax.control.decays import Exponential
 from iblf_jax.core import checks
 from iblf_jax.proofs.parameters import Uncertain
 from iblf_jax.proofs.periods import AperiodicError, period_of
@@ -43,7 +43,7 @@ def check_same_structure(scenario: Scenario, expected: str) -> None:
 
 def check_exponential(law: Any, rate: str) -> None:
     """Raises ValueError for a law with other than exponential decays; `rate` is V_w' or V'."""
-    if all(decay_member(decay, "constant") for decay in law.decays):
+    if all(type(decay) is Exponential for decay in law.decays):
         return
     names = ", ".join(type(decay).__name__ for decay in law.decays)
     reason = f"{rate} with other decays is not known here."

@@ -23,7 +23,7 @@ from iblf_jax.control.barriers._base import barrier_member
 from iblf_jax.core import checks
 from iblf_jax.proofs.arm_motion import degree
 from iblf_jax.proofs.chain_motion import OpenTube
-from iblf_jax.proofs.examination import REARRANGING, SMOOTH, interpreted, traced
+from iblf_jax.proofs.examination import REARRANGING, SMOOTH, interpreted, operations, traced
 from iblf_jax.proofs.users_parts import check_agreement
 
 SAMPLES = 256
@@ -60,17 +60,22 @@ class _Quantity(NamedTuple):
 ZERO, NUMBER = _Quantity(), _Quantity(0)
 
 
-def check_barrier(name: str, barrier: Any, o: Any, *, homogeneous: bool) -> None:
-    """Raises ValueError for a user's barrier with a case besides the sign of e1, or, if it is to be
-    homogeneous, with a length of its own, and for methods that contradict each other.
+def check_barrier(name: str, barrier: Any, o: Any, *, homogeneous: bool) -> list[str]:
+    """The digests of the methods of a user's barrier (`Operations.digest`).
 
     Args:
       name: of the barrier, for the message.
       barrier: without its guard.
       o: gain of the law, or None.
       homogeneous: whether a length of its own is refused.
+
+    Raises:
+      ValueError: a case besides the sign of e1, a length of its own, or methods that contradict
+        each other.
     """
+    digests = []
     for method, function, inputs, expected in _methods(barrier, o):
+        digests.append(operations(name, function, [jnp.ones(2) for _ in inputs]).digest)
         jaxpr = traced(f"{name}.{method}", function, [jnp.ones(2) for _ in inputs])
         rule = _homogeneous if homogeneous else _on_each_side
         try:
@@ -83,6 +88,7 @@ def check_barrier(name: str, barrier: Any, o: Any, *, homogeneous: bool) -> None
             reason = "The bound divides all lengths by the width of the tube."
             raise checks.fail(f"prove: {name}", got, words, reason) from None
     _check_samples(name, barrier, o)
+    return digests
 
 
 def _tube(lower: Any, upper: Any, dlower: Any, dupper: Any) -> OpenTube:

@@ -17,7 +17,7 @@ from iblf_jax.control import barriers
 from iblf_jax.core import checks
 from iblf_jax.core.optional import has_members
 from iblf_jax.core.time import as_at
-from iblf_jax.proofs.examination import Operations, operations, refuse_unknown
+from iblf_jax.proofs.examination import Examined, Operations, operations, refuse_unknown
 from iblf_jax.world import bounds, plants, references, robots
 from iblf_jax.world.robots._base import robot_member
 
@@ -68,8 +68,8 @@ def check_constant(name: str, part: Any) -> None:
 # --- references and bounds ------------------------------------------------------------------------
 
 
-def check_time_functions(reference: Any, sides: dict[str, Any], n: int) -> list[str]:
-    """Sentences on what is assumed of the reference and the sides of bounds.
+def check_time_functions(reference: Any, sides: dict[str, Any], n: int) -> Examined:
+    """What is assumed of the reference and the sides of bounds.
 
     Args:
       reference: any.
@@ -81,7 +81,7 @@ def check_time_functions(reference: Any, sides: dict[str, Any], n: int) -> list[
         derivatives.
     """
     t, q_d = jnp.zeros(()), jnp.zeros(n)
-    assumed = []
+    assumed, digests = [], []
     for name, part in {"reference": reference, **sides}.items():
         if type(part) in SMOOTH_IN_TIME:
             continue
@@ -89,9 +89,10 @@ def check_time_functions(reference: Any, sides: dict[str, Any], n: int) -> list[
             found = operations(name, part.position, [t])
         else:
             found = operations(name, part.at, [t, q_d])
+        digests.append(found.digest)
         if not found.are_smooth:
             assumed.append(_declared(name, part, found))
-    return assumed
+    return Examined(assumed, digests)
 
 
 def _declared(name: str, part: Any, found: Operations) -> str:
@@ -185,14 +186,13 @@ def check_agreement(name: str, given: Any, expected: Any, accuracy: float = ACCU
 
 
 def agreement_of_plant(plant: Any) -> list[str]:
-    """A sentence on the methods of a user's plant in strict-feedback form, which are compared with
-    its drift and gain at random points.
+    """A sentence on a user's plant in strict-feedback form: its methods are compared with drift and
+    gain, and row i with itself at other levels above i, at random points.
 
     Raises:
       ValueError: they disagree.
     """
-    own = ("level_rate", "level_input", "transposed_gain")
-    if type(plant) in PLANTS or all(plants.plant_member(plant, name) is None for name in own):
+    if type(plant) in PLANTS:
         return []
     generator = np.random.default_rng(0)
     x = generator.normal(size=(POINTS, plant.order, plant.n))
@@ -200,7 +200,10 @@ def agreement_of_plant(plant: Any) -> list[str]:
     for name, pair in jax.vmap(lambda *y: dict(_plant_pairs(plant, *y)))(x, above).items():
         check_agreement(f"scenario.plant.{name}", *pair)
     kind = type(plant).__name__
-    return [f"The methods of {kind} agree with its drift and gain: compared at {POINTS} points."]
+    return [
+        f"The methods of {kind} agree with its drift and gain, of which row i depends on"
+        f" x_1 ... x_i only: compared at {POINTS} points."
+    ]
 
 
 def _plant_pairs(
@@ -220,3 +223,6 @@ def _plant_pairs(
         yield f"level_input of level {level}", (found, above)
         found = plants.transposed_gain(plant, level, t, x, above)
         yield f"transposed_gain of level {level}", (found, transposed)
+        known = jnp.where(jnp.arange(plant.order)[:, None] < level, x, 0.0)
+        alone = plants.level_rate(plant, level, t, known, above)
+        yield f"drift and gain of level {level} without the levels above", (alone, rate)

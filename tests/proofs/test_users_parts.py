@@ -128,8 +128,33 @@ def test_disturbances_that_jump_or_have_own_derivatives_are_refused(name):
         arm_problem(scenario, {}, duration=2.0)
 
 
+TABLE = {"gain": 1.0, "array": np.array([1.0, 2.0])}
+"""Numbers that a function reads from elsewhere."""
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda v: TABLE["gain"] * v,
+        lambda v: jnp.sum(jnp.asarray(TABLE["array"])) * v,
+        jax.jit(lambda v: jnp.outer(jnp.asarray(TABLE["array"]), v)[1]),
+        lambda v: jax.lax.fori_loop(0, 2, lambda i, x: x * jnp.asarray(TABLE["array"])[1], v),
+    ],
+)
+def test_a_function_whose_numbers_changed_has_another_program(function, monkeypatch):
+    def bound():
+        jax.clear_caches()
+        return arm_problem(pendulum(disturbance=Torque(function)), {}, duration=2.0).bound
+
+    before = bound()
+    assert bound() == before
+    monkeypatch.setitem(TABLE, "gain", 5.0)
+    monkeypatch.setitem(TABLE, "array", np.array([1.0, 3.0]))
+    assert bound() != before
+
+
 SMOOTH = {
-    "a polynomial": lambda v: jnp.polyval(jnp.array([1.0, 2.0, 3.0]), v),
+    "a polynomial": lambda v: 3.0 + v * (2.0 + v * (1.0 + v**3)),
     "a loop": lambda v: jax.lax.fori_loop(0, 3, lambda i, x: x * v, v),
     "a table with known places": lambda v: jnp.concatenate([v, 2.0 * v])[jnp.array([1])],
     "remat": jax.checkpoint(jnp.sin),
@@ -287,6 +312,27 @@ def test_a_plant_with_a_wrong_inverse_is_refused():
         chain_problem(lever(plant=plant, model=plant), {})
 
 
+@component
+class Upward:
+    """A plant whose first level depends on the second one in a way that scenarios do not see."""
+
+    n: ClassVar[int] = 1
+    order: ClassVar[int] = 2
+
+    def drift(self, t, x):
+        far = 1.0 + jnp.tanh(50.0 * (jnp.sum(x**2, axis=0) - 1.0))
+        return jnp.stack([far * x[1], jnp.zeros(1)])
+
+    def gain(self, t, x):
+        return jnp.ones_like(x)
+
+
+def test_a_plant_without_strict_feedback_form_is_refused():
+    plant = Upward()
+    with pytest.raises(ValueError, match=r"levels above|strict-feedback form"):
+        chain_problem(lever(plant=plant, model=plant), {})
+
+
 # --- reference and bounds -------------------------------------------------------------------------
 
 
@@ -374,6 +420,16 @@ class OtherActuator(ij.actuators.Ideal):
 
 
 @component
+class OtherDecay:
+    """A decay that declares a constant gain."""
+
+    constant: ClassVar[bool] = True
+
+    def effective_gain(self, t, k, V):
+        return k
+
+
+@component
 class OtherSum(ij.disturbances.Sum):
     """A sum whose torque is another one."""
 
@@ -387,6 +443,11 @@ class OtherSum(ij.disturbances.Sum):
         {"controller": OtherLaw(k1=2.0, K2=[3.0], reading="corrected")},
         {"observer": OtherObserver(kf=[100.0])},
         {"actuator": OtherActuator()},
+        {
+            "controller": ij.controllers.Backstepping(
+                k1=2.0, K2=[3.0], reading="corrected", decays=OtherDecay()
+            )
+        },
     ],
 )
 def test_classes_that_inherit_from_known_ones_are_refused(parts):
