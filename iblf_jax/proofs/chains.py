@@ -405,7 +405,7 @@ def _varying(scenario: Scenario) -> dict[str, Any]:
 
 def _sides_of(scenario: Scenario) -> dict[str, Any]:
     """The sides of all bounds, by name."""
-    given = {"bounds": scenario.bounds}
+    given: dict[str, Any] = {"bounds": scenario.bounds}
     given |= {f"state_bounds[{i}]": bounds for i, bounds in enumerate(scenario.state_bounds)}
     return {
         f"{name}.{side}": vars(bounds)[side]

@@ -38,7 +38,7 @@ LOGIC = frozenset([primitives.and_p, primitives.or_p, primitives.xor_p, primitiv
 SUMS = frozenset([primitives.add_p, primitives.add_jaxvals_p, primitives.sub_p])
 PRODUCTS = frozenset([primitives.mul_p, primitives.dot_general_p])
 OF_ONE_UNIT = frozenset([primitives.neg_p, primitives.reduce_sum_p, primitives.cumsum_p])
-POWERS = {primitives.square_p: 2, primitives.sqrt_p: Fraction(1, 2)}
+POWERS: dict[Any, Any] = {primitives.square_p: 2, primitives.sqrt_p: Fraction(1, 2)}
 POWERS |= {primitives.rsqrt_p: Fraction(-1, 2)}
 
 

@@ -54,8 +54,10 @@ def check_constant(name: str, part: Any) -> None:
         return jax.tree.leaves(as_at(part, t))
 
     now = as_at(part, jnp.zeros(()))
-    is_same = jax.tree.structure(now) == jax.tree.structure(part) and all(
-        np.array_equal(x, y) for x, y in zip(leaves(0.0), jax.tree.leaves(part), strict=True)
+    structures: list[Any] = [jax.tree.structure(x) for x in (now, part)]
+    is_same = structures[0] == structures[1] and all(
+        np.array_equal(x, y)
+        for x, y in zip(jax.tree.leaves(now), jax.tree.leaves(part), strict=True)
     )
     found = operations(f"{name}.at(t)", leaves, [jnp.zeros(())])
     if is_same and not found.inputs and not found.unknown:
