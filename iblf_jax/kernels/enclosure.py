@@ -327,9 +327,7 @@ class _Emitter:
 
     def _power(self, args: Sequence[str], exponent: Node) -> str:
         """A power whose exponent does not depend on the box."""
-        if exponent.op != "const":
-            return f"i_power_of_positive({', '.join(args)})"
-        if not exponent.value.is_integer():
+        if exponent.op != "const" or not exponent.value.is_integer():
             return f"i_pow({', '.join(args)})"
         if not 0 < exponent.value <= LARGEST_POWER:
             raise UnsupportedError(f"the power {exponent.value:g} is not available on intervals")

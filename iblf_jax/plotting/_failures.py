@@ -47,6 +47,9 @@ def failure_probability(found: FailureProbability, *, numbers: int = MAX_NUMBERS
 
 
 def _heading(found: FailureProbability) -> str:
+    if found.margins_stagnate:
+        margin = f"{found.levels[-1].threshold:.3g} {found.unit}"
+        return f"No failure reachable was found in {found.runs} runs; margins stagnate at {margin}"
     if found.is_upper_bound:
         bound = f"{found.estimate:.2g}"
         return f"Probability of failure: at most {bound}; {found.runs} runs, and no sample failed"
@@ -86,6 +89,13 @@ def _draw_levels(axes: Axes, found: FailureProbability) -> None:
         for number, level in enumerate(found.levels):
             label = "threshold of a level" if number == 0 else "_nolegend_"
             axes.axvline(level.threshold, color=_style.blend(0.4), **_style.FAINT, label=label)
+    if not found.margins_stagnate:
+        _draw_estimate(axes, found)
+    axes.set_xlabel(_style.label("margin x above the limit", found.unit))
+    axes.set_ylabel("probability [1]")
+
+
+def _draw_estimate(axes: Axes, found: FailureProbability) -> None:
     low, high = found.interval
     lower = max(low, found.estimate * 1e-3)
     errors = [[found.estimate - lower], [high - found.estimate]]
@@ -96,8 +106,6 @@ def _draw_levels(axes: Axes, found: FailureProbability) -> None:
     axes.errorbar(
         [0.0], [found.estimate], yerr=errors, fmt="o", color=colour, capsize=4, label=label
     )
-    axes.set_xlabel(_style.label("margin x above the limit", found.unit))
-    axes.set_ylabel("probability [1]")
 
 
 def _draw_likely(axes: Axes, likely: LikelyFailure | None, numbers: int) -> None:

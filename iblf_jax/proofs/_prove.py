@@ -28,7 +28,7 @@ from iblf_jax.core import checks, notices
 from iblf_jax.core.progress import announced
 from iblf_jax.core.status import Status
 from iblf_jax.engine.simulate import SimulationWarning, simulate
-from iblf_jax.kernels import enclose
+from iblf_jax.kernels import UnsupportedError, enclose
 from iblf_jax.proofs.arms import arm_problem
 from iblf_jax.proofs.chains import chain_problem
 from iblf_jax.proofs.periods import AperiodicError
@@ -145,7 +145,11 @@ def prove(
     level, parameters = _chosen(level, parameters)
     problem = problem_of(scenario, parameters, duration, disturbance_rate)
     with jax.enable_x64(True):
-        proof = _decided(canonical(scenario), problem, dict(parameters), level, weight, options)
+        try:
+            proof = _decided(canonical(scenario), problem, dict(parameters), level, weight, options)
+        except UnsupportedError as error:
+            expected = "operations of the list in docs/how_to/prove.md"
+            raise checks.fail("prove: scenario", checks.Words(str(error)), expected) from error
     return dataclasses.replace(proof, disturbance_rate=disturbance_rate)
 
 

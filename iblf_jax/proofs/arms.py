@@ -18,7 +18,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from iblf_jax.control import controllers, observers
-from iblf_jax.control.barriers import MEMBERS
 from iblf_jax.control.barriers._base import barrier_member
 from iblf_jax.core import checks
 from iblf_jax.core.linalg import matvec
@@ -27,7 +26,7 @@ from iblf_jax.core.time import as_at, jump_times_of
 from iblf_jax.proofs import arm_motion, uncertainty
 from iblf_jax.proofs.arm_bound import Constants, arm_bound
 from iblf_jax.proofs.arm_motion import ArmParts, Errors, position
-from iblf_jax.proofs.dependence import check_without_cases
+from iblf_jax.proofs.examination import Examined, Operations, check_operations
 from iblf_jax.proofs.matrices import solve_transposed, upper_factor
 from iblf_jax.proofs.parameters import Uncertain, uncertain_coordinates
 from iblf_jax.proofs.periods import shifted
@@ -47,10 +46,18 @@ from iblf_jax.proofs.support import (
     check_level,
     check_same_structure,
     claims_of,
+    infinite_unless_defined,
     time_interval,
     unsupported,
 )
 from iblf_jax.proofs.uncertainty import Places
+from iblf_jax.proofs.users_barriers import check_barrier
+from iblf_jax.proofs.users_parts import (
+    BARRIERS,
+    agreement_of_robot,
+    check_constant,
+    check_time_functions,
+)
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.distributions import Perturbation
@@ -75,6 +82,8 @@ class ArmBound:
     structure: Any
     places: Places
     n: int
+    digests: tuple[str, ...]
+    """Of the functions that users wrote, so that a changed one has a program of its own."""
 
     def __call__(self, x: jax.Array, constants: list[jax.Array]) -> tuple[jax.Array, jax.Array]:
         """Upper bounds of V_w' over a box, and no region."""
@@ -89,14 +98,18 @@ class ArmRate:
     structure: Any
     places: Places
     n: int
+    digests: tuple[str, ...]
+    """Of the functions that users wrote, so that a changed one has a program of its own."""
 
     def __call__(self, point: jax.Array, constants: list[jax.Array]) -> jax.Array:
-        """V_w', () [N m rad/s]."""
+        """V_w', () [N m rad/s]; infinite where the torque is not defined, such as log(-1)."""
         numbers = jax.tree.unflatten(self.structure, constants)
         found = point_of(self.places, self.n, jnp.asarray(point), numbers)
-        return arm_motion.level_rate(
+        rate = arm_motion.level_rate(
             found.parts, numbers.weight, found.errors, found.f_tilde, found.rate
         )
+        now = arm_motion.motion(found.parts, found.errors, found.f_tilde).now
+        return infinite_unless_defined(rate, arm_motion.required_torque(found.parts, now))
 
 
 class ArmPoint(NamedTuple):
@@ -251,14 +264,14 @@ def arm_problem(
             "disturbance": scenario.disturbance,
         }
         length, is_period = time_interval(varying, duration, uncertain)
-        _check_continuous(parts, uncertain, scenario.n)
+        examined = _examined(scenario, parts, uncertain)
         _check_tube(scenario, length)
         _check_mass_matrices(parts, uncertain)
         zero = jnp.zeros(())
         structure = jax.tree.structure(Constants(parts, uncertain.numbers, zero, zero))
     n = scenario.n
-    function = ArmBound(structure, uncertain.places, n)
-    point_rate = ArmRate(structure, uncertain.places, n)
+    function = ArmBound(structure, uncertain.places, n, tuple(examined.digests))
+    point_rate = ArmRate(structure, uncertain.places, n, tuple(examined.digests))
     arm = _Arm(scenario, parts, uncertain, function, point_rate, length)
     names, lower, upper = _coordinates(n, length, uncertain)
     return LevelSetProblem(
@@ -275,7 +288,7 @@ def arm_problem(
         scales=uncertain.scales(),
         duration=length,
         is_period=is_period,
-        assumptions=(*ASSUMPTIONS, *claims_of([parts.law.barrier])),
+        assumptions=(*ASSUMPTIONS, *claims_of([parts.law.barrier]), *examined.assumed),
     )
 
 
@@ -310,7 +323,7 @@ def check_supported(scenario: Any) -> None:
     _check_plant(scenario)
     _check_law(scenario.controller)
     observer = scenario.observer
-    if not isinstance(observer, observers.Momentum):
+    if type(observer) is not observers.Momentum:
         reason = "The error of this observer does not obey f_tilde' = f' - kf f_tilde."
         raise unsupported("observer", type(observer).__name__, "observers.Momentum", reason)
     _check_absent(scenario)
@@ -334,12 +347,13 @@ def _check_plant(scenario: Scenario) -> None:
         if jnp.size(jump_times_of(name, part)):
             reason = "A load that is picked up changes the plant during the run."
             raise unsupported(name, type(part).__name__, "a robot that does not change", reason)
+        check_constant(f"scenario.{name}", part)
     expected = f"a robot of the structure of the plant, {type(scenario.plant).__name__}"
     check_same_structure(scenario, expected)
 
 
 def _check_law(law: Any) -> None:
-    if not isinstance(law, controllers.Backstepping):
+    if type(law) is not controllers.Backstepping:
         reason = "V_w' is known for the paper's law with one of its barriers."
         if isinstance(law, controllers.Saturated):
             reason += " Without its limit: with_parts(s, controller=s.controller.law)."
@@ -360,28 +374,6 @@ def _check_law(law: Any) -> None:
         reason = "The level set needs the error at which V1 has a value, in closed form."
         expected = "a barrier with error_at, xi_bound and decay_rate"
         raise unsupported("controller.barrier", type(barrier).__name__, expected, reason)
-    if type(barrier) not in MEMBERS.values() and not _is_homogeneous(barrier, law.o):
-        reason = "The bound divides all lengths by the width of the tube."
-        expected = "a barrier without a length of its own"
-        raise unsupported("controller.barrier", type(barrier).__name__, expected, reason)
-
-
-def _is_homogeneous(barrier: Any, o: Any) -> bool:
-    """Whether V1, s and alpha of a barrier scale as powers of all lengths, at one point of each
-    side.
-    """
-    degree = arm_motion.degree(barrier)
-    o = None if o is None else jnp.max(o) * jnp.ones(2)
-
-    def scaled_back(size: float) -> jax.Array:
-        width = size * jnp.ones(2)
-        tube = Tube(0.0 * width, 0.0 * width, -0.7 * width, 1.3 * width, 0.2 * width, -0.1 * width)
-        e = width * jnp.array([-0.3, 0.4])
-        alpha = barrier.virtual_velocity(tube, e, jnp.ones(2), o) / size
-        slope = barrier.slope(tube, e) / size ** (degree - 1)
-        return jnp.stack([barrier.value(tube, e) / size**degree, slope, alpha])
-
-    return bool(jnp.allclose(scaled_back(1.0), scaled_back(3.0), rtol=1e-3))
 
 
 def _check_absent(scenario: Scenario) -> None:
@@ -421,19 +413,39 @@ def _parts_of(scenario: Scenario) -> ArmParts:
     )
 
 
-def _check_continuous(parts: ArmParts, uncertain: Uncertain, n: int) -> None:
-    """Raises ValueError for a plant or a disturbance with cases: f may jump, and V_w with it."""
-    m = len(uncertain.paths)
+def _examined(scenario: Scenario, parts: ArmParts, uncertain: Uncertain) -> Examined:
+    """What is assumed of the parts of a scenario.
 
-    def torque(x: jax.Array) -> jax.Array:
-        t, motion, z = x[0], x[1 : 1 + 3 * n], x[1 + 3 * n :]
-        nominal = (parts.plant, parts.disturbance)
-        plant, disturbance = uncertainty.leaves_at(uncertain.places, uncertain.numbers, nominal, z)
-        true = parts._replace(plant=plant, disturbance=disturbance)
-        now = arm_motion.Kinematics(t, *jnp.split(motion, 3))
-        return arm_motion.required_torque(true, now)
+    Raises:
+      ValueError: a part that may jump, or one that contradicts its contract.
+    """
+    digests = [_check_operations(parts, uncertain, scenario.n).digest]
+    sides = {f"bounds.{name}": vars(scenario.bounds)[name] for name in ("lower", "upper")}
+    in_time = check_time_functions(scenario.reference, sides, scenario.n)
+    if type(parts.law.barrier) not in BARRIERS:
+        name = "scenario.controller.barrier"
+        digests += check_barrier(name, parts.law.barrier, parts.law.o, homogeneous=True)
+    assumed = [*in_time.assumed, *agreement_of_robot(scenario.plant)]
+    return Examined(assumed, [*digests, *in_time.digests])
 
-    check_without_cases(torque, 1 + 3 * n + m)
+
+def _check_operations(parts: ArmParts, uncertain: Uncertain, n: int) -> Operations:
+    """The operations of plant and disturbance, with which f must not jump, and V_w with it."""
+    places = uncertain.places
+    known = (parts.plant, parts.disturbance, parts.model)
+    leaves = jax.tree.leaves(known)
+    structure = jax.tree.structure(known)
+
+    def torque(t: jax.Array, q: jax.Array, v: jax.Array, a: jax.Array, *x: jax.Array) -> jax.Array:
+        plant, disturbance, model = jax.tree.unflatten(structure, x)
+        true = parts._replace(plant=plant, disturbance=disturbance, model=model)
+        return arm_motion.required_torque(true, arm_motion.Kinematics(t, q, v, a))
+
+    vector = jnp.zeros(n)
+    inputs = [jnp.zeros(()), vector, vector, vector]
+    varying = [*range(4), *(4 + leaf for leaf in places.varying_leaves)]
+    name = "scenario.plant and disturbance"
+    return check_operations(name, torque, [*inputs, *leaves], varying, kinks=True)
 
 
 def _check_tube(scenario: Scenario, duration: float) -> None:

@@ -21,7 +21,7 @@ from iblf_jax.control.barriers._base import barrier_member, has_ratio
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import astype
 from iblf_jax.core.time import as_at, jump_times_of
-from iblf_jax.proofs import chain_motion, uncertainty
+from iblf_jax.proofs import chain_motion
 from iblf_jax.proofs.chain_bound import (
     Constants,
     LevelPoint,
@@ -31,7 +31,7 @@ from iblf_jax.proofs.chain_bound import (
     level_rate,
 )
 from iblf_jax.proofs.chain_motion import ChainParts
-from iblf_jax.proofs.dependence import check_without_cases, depends_on
+from iblf_jax.proofs.examination import Examined, check_operations, operations
 from iblf_jax.proofs.parameters import Uncertain, uncertain_coordinates
 from iblf_jax.proofs.periods import shifted
 from iblf_jax.proofs.problem import (
@@ -48,10 +48,18 @@ from iblf_jax.proofs.support import (
     check_level,
     check_same_structure,
     claims_of,
+    infinite_unless_defined,
     time_interval,
     unsupported,
 )
 from iblf_jax.proofs.uncertainty import Places
+from iblf_jax.proofs.users_barriers import check_barrier
+from iblf_jax.proofs.users_parts import (
+    BARRIERS,
+    agreement_of_plant,
+    check_constant,
+    check_time_functions,
+)
 from iblf_jax.simulation import paths
 from iblf_jax.simulation.scenario import Initial, Scenario, canonical
 from iblf_jax.studies.distributions import Perturbation
@@ -74,6 +82,8 @@ class ChainBound(NamedTuple):
     structure: Any
     places: Places
     observed: tuple[bool, ...]
+    digests: tuple[str, ...]
+    """Of the functions that users wrote, so that a changed one has a program of its own."""
 
     def __call__(self, x: jax.Array, constants: list[jax.Array]) -> tuple[jax.Array, jax.Array]:
         """Upper bounds of V' over a box, and no region."""
@@ -87,12 +97,15 @@ class ChainRate(NamedTuple):
     structure: Any
     places: Places
     observed: tuple[bool, ...]
+    digests: tuple[str, ...]
+    """Of the functions that users wrote, so that a changed one has a program of its own."""
 
     def __call__(self, point: jax.Array, constants: list[jax.Array]) -> jax.Array:
-        """V', ()."""
+        """V', (); infinite where d is not defined."""
         numbers = jax.tree.unflatten(self.structure, constants)
         true, found = point_of(self.places, self.observed, jnp.asarray(point), numbers)
-        return level_rate(numbers, self.observed, true, found)
+        rate = level_rate(numbers, self.observed, true, found)
+        return infinite_unless_defined(rate, jnp.stack(found.now.d))
 
 
 def point_of(
@@ -277,7 +290,7 @@ def chain_problem(
         parts = _parts_of(scenario)
         uncertain = uncertain_coordinates(scenario, parameters, None)
         length, is_period = time_interval(_varying(scenario), duration, uncertain)
-        _check_continuous(scenario, uncertain)
+        examined = _examined(scenario, parts, uncertain)
         zero = jnp.zeros(())
         numbers = Constants(
             parts, scenario.plant, scenario.disturbance, uncertain.numbers, zero, zero
@@ -287,8 +300,9 @@ def chain_problem(
     chain = _Chain(scenario, parts, uncertain, observed, structure, length)
     names, lower, upper = _coordinates(observed, length, uncertain)
     order = len(observed)
-    function: Any = ChainBound(structure, uncertain.places, observed)
-    point_rate: Any = ChainRate(structure, uncertain.places, observed)
+    digests = tuple(examined.digests)
+    function: Any = ChainBound(structure, uncertain.places, observed, digests)
+    point_rate: Any = ChainRate(structure, uncertain.places, observed, digests)
     return LevelSetProblem(
         names=names,
         lower=lower,
@@ -303,7 +317,12 @@ def chain_problem(
         scales=uncertain.scales(),
         duration=length,
         is_period=is_period,
-        assumptions=(*ASSUMPTIONS, *claims_of(parts.law.barriers), *_without_claim(scenario)),
+        assumptions=(
+            *ASSUMPTIONS,
+            *claims_of(parts.law.barriers),
+            *_without_claim(scenario),
+            *examined.assumed,
+        ),
     )
 
 
@@ -384,6 +403,18 @@ def _varying(scenario: Scenario) -> dict[str, Any]:
     }
 
 
+def _sides_of(scenario: Scenario) -> dict[str, Any]:
+    """The sides of all bounds, by name."""
+    given: dict[str, Any] = {"bounds": scenario.bounds}
+    given |= {f"state_bounds[{i}]": bounds for i, bounds in enumerate(scenario.state_bounds)}
+    return {
+        f"{name}.{side}": vars(bounds)[side]
+        for name, bounds in given.items()
+        if bounds is not None
+        for side in ("lower", "upper")
+    }
+
+
 # --- what is supported -------------------------------------------------------------------------
 
 
@@ -420,45 +451,82 @@ def _check_plant(scenario: Scenario) -> None:
         if plants.nominal_of(part) is not part or jnp.size(jump_times_of(name, part)):
             reason = "The plant changes during the run."
             raise unsupported(name, kind, "a plant that does not change", reason)
-        if depends_on(_rates_of(part), 1 + part.order, 0):
+        check_constant(f"scenario.{name}", part)
+        functions = _functions_of(part)
+        inputs = [jnp.zeros(()), jnp.zeros((part.order, 1))]
+        if any(0 in operations(name, function, inputs).inputs for function in functions.values()):
             reason = "Its drift or its gain depends on the time, with a period that is not known."
             raise unsupported(name, kind, "a plant that does not depend on the time", reason)
     check_same_structure(scenario, f"a plant of the structure of {type(scenario.plant).__name__}")
 
 
-def _rates_of(plant: Any) -> Callable[[jax.Array], jax.Array]:
-    """What the law reads of a plant, as a function of (t, x), (1 + r,)."""
+def _functions_of(plant: Any) -> dict[str, Callable]:
+    """Name and level -> what the law reads of a plant there, as a function of (t, x)."""
+    one = jnp.ones(1)
+    members = ["level_rate", "transposed_gain", "level_input"]
+    if plants.plant_member(plant, "level_input") is None:
+        # That of the package is a function of drift and gain, which are in level_rate.
+        members.remove("level_input")
 
-    def rates(tx: jax.Array) -> jax.Array:
-        t, x, one = tx[0], tx[1:, None], jnp.ones(1)
-        found = []
-        for level in range(1, plant.order + 1):
-            found.append(plants.level_rate(plant, level, t, x, one))
-            found.append(plants.gain_times(plant, level, t, x, one))
-            found.append(plants.level_input(plant, level, t, x, one))
-        return jnp.concatenate(found)
+    def at_level(member: str, level: int) -> Callable:
+        def function(t: jax.Array, x: jax.Array) -> jax.Array:
+            return vars(plants)[member](plant, level, t, x, one)  # type: ignore[no-any-return]
 
-    return rates
+        return function
+
+    levels = range(1, plant.order + 1)
+    return {f"{member} of level {i}": at_level(member, i) for member in members for i in levels}
 
 
-def _check_continuous(scenario: Scenario, uncertain: Uncertain) -> None:
-    """Raises ValueError for a plant or a disturbance with cases: d may jump, and V with it."""
+def _examined(scenario: Scenario, parts: ChainParts, uncertain: Uncertain) -> Examined:
+    """What is assumed of the parts of a scenario.
+
+    Raises:
+      ValueError: a part that may jump, or one that contradicts its contract.
+    """
+    digests = _check_operations(scenario, uncertain)
+    in_time = check_time_functions(scenario.reference, _sides_of(scenario), 1)
+    for i, barrier in enumerate(parts.law.barriers):
+        if type(barrier) not in BARRIERS:
+            name = f"scenario.controller.barriers[{i}]"
+            o = None if parts.law.o is None else parts.law.o[i]
+            digests += check_barrier(name, barrier, o, homogeneous=False)
+    assumed = [*in_time.assumed, *agreement_of_plant(scenario.plant)]
+    return Examined(assumed, [*digests, *in_time.digests])
+
+
+def _check_operations(scenario: Scenario, uncertain: Uncertain) -> list[str]:
+    """The digests of plant and disturbance, with which d must not jump, and V with it.
+
+    The law differentiates what it reads of the levels below the last one.
+    """
     order = plants.order_of(scenario.plant)
-    nominal = (scenario.plant, scenario.disturbance)
+    known = (scenario.plant, scenario.disturbance, scenario.model)
+    leaves, structure = jax.tree.leaves(known), jax.tree.structure(known)
+    inputs = [jnp.zeros(()), jnp.zeros((order, 1)), *leaves]
+    varying = [0, 1, *(2 + leaf for leaf in uncertain.places.varying_leaves)]
+    name = "scenario.plant and disturbance"
 
-    def functions(point: jax.Array) -> jax.Array:
-        tx, z = point[: 1 + order], point[1 + order :]
-        plant, disturbance = uncertainty.leaves_at(uncertain.places, uncertain.numbers, nominal, z)
-        external = chain_motion.external_at(disturbance, tx[0], tx[1:, None], plant, scenario.model)
-        acting = [external.rates.reshape(-1), external.input]
-        return jnp.concatenate([_rates_of(plant)(tx), _rates_of(scenario.model)(tx), *acting])
+    def external(t: jax.Array, x: jax.Array, *numbers: jax.Array) -> Any:
+        plant, disturbance, model = jax.tree.unflatten(structure, numbers)
+        return chain_motion.external_at(disturbance, t, x, plant, model)
 
-    check_without_cases(functions, 1 + order + len(uncertain.paths))
+    digests = [check_operations(name, external, inputs, varying, kinks=True).digest]
+    for method in _functions_of(scenario.plant):
+
+        def function(t: jax.Array, x: jax.Array, *numbers: jax.Array, method=method) -> Any:
+            plant, _, _ = jax.tree.unflatten(structure, numbers)
+            return _functions_of(plant)[method](t, x)
+
+        is_last = method.endswith(f"level {order}")
+        found = check_operations(name, function, inputs, varying, kinks=is_last)
+        digests.append(found.digest)
+    return digests
 
 
 def _check_law(scenario: Scenario) -> None:
     law: Any = scenario.controller
-    if not isinstance(law, controllers.BarrierBackstepping):
+    if type(law) is not controllers.BarrierBackstepping:
         reason = "V' is known for barrier backstepping with exact derivatives."
         raise unsupported(
             "controller", type(law).__name__, "controllers.BarrierBackstepping", reason
@@ -485,9 +553,9 @@ def _check_law(scenario: Scenario) -> None:
 
 def _check_observer(scenario: Scenario) -> None:
     observer = scenario.observer
-    if isinstance(observer, observers.NoObserver):
+    if type(observer) is observers.NoObserver:
         return
-    if not isinstance(observer, observers.LevelObserver):
+    if type(observer) is not observers.LevelObserver:
         reason = "V contains d_tilde of observers with d_tilde' = d' - kappa d_tilde only."
         expected = "observers.LevelObserver or NoObserver"
         raise unsupported("observer", type(observer).__name__, expected, reason)

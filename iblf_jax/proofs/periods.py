@@ -80,15 +80,15 @@ def _over_common_denominator(numbers: set[Fraction]) -> list[int]:
 
 def _frequencies(name: str, part: Any, *, all_count: bool) -> Iterator[float]:
     """The absolute frequencies of a part whose amplitude is not zero, or all of them."""
-    if isinstance(part, disturbances.Sum):
+    if type(part) is disturbances.Sum:
         for i, inner in enumerate(part.parts):
             yield from _frequencies(f"{name}.parts[{i}]", inner, all_count=all_count)
         return
-    if isinstance(part, disturbances.Levels):
+    if type(part) is disturbances.Levels:
         for i, of_level in enumerate(part.parts):
             yield from _frequencies(f"{name}.parts[{i}]", of_level, all_count=all_count)
         return
-    if isinstance(part, bounds.Bounds):
+    if type(part) is bounds.Bounds:
         for side in ("lower", "upper"):
             yield from _frequencies(f"{name}.{side}", vars(part)[side], all_count=all_count)
         return
@@ -105,11 +105,11 @@ def _frequencies(name: str, part: Any, *, all_count: bool) -> Iterator[float]:
 
 def shifted(part: Any, t: jax.Array | float) -> Any:
     """A part of `period_of` as it is t [s] later: part at time s is the result at time s - t."""
-    if isinstance(part, disturbances.Sum):
+    if type(part) is disturbances.Sum:
         return disturbances.Sum(tuple(shifted(inner, t) for inner in part.parts))
-    if isinstance(part, disturbances.Levels):
+    if type(part) is disturbances.Levels:
         return disturbances.Levels(tuple(shifted(inner, t) for inner in part.parts))
-    if isinstance(part, bounds.Bounds):
+    if type(part) is bounds.Bounds:
         lower, upper = shifted(part.lower, t), shifted(part.upper, t)
         return dataclasses.replace(part, lower=lower, upper=upper)
     if type(part) in CONSTANT:

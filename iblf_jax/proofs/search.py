@@ -26,6 +26,7 @@ import numpy as np
 from iblf_jax.core import checks
 from iblf_jax.core.progress import bar
 from iblf_jax.kernels import IntervalKernel, ToolchainError, interval_kernel, pointer
+from iblf_jax.kernels.enclosure import FLAGS
 
 STATUSES = ("proved", "undecided", "refuted", "out of boxes", "stopped", "out of memory")
 """How the search of a unit ended, in the order of `kernels/c/boxes.h`."""
@@ -39,6 +40,8 @@ NARROWEST = 2.0**-24
 MAX_UNDECIDED = 16
 """Boxes of a unit that are too narrow to be bisected, after which its search ends."""
 SECONDS_BETWEEN_CHECKPOINTS = 10.0
+FORMAT = "checkpoint 2"
+"""Name of the form of a checkpoint."""
 RESULT_TYPES = {"divide_box": ctypes.c_int64, "search_box": ctypes.c_int}
 """Function of a kernel -> the C type of its result, which is negative if it has not run."""
 
@@ -113,12 +116,20 @@ class _Problem:
         self.size = int(kernel.library.record_size())
         self.dimension = lower.shape[1]
 
-    def digest(self) -> str:
-        """A hash of everything on which the results of the units depend."""
-        found = hashlib.sha256(self.kernel.compiled.source.encode())
-        for x in (self.kernel.numbers, self.lower, self.upper):
-            found.update(x.tobytes())
-        found.update(repr((UNITS, RENEWAL, NARROWEST, MAX_UNDECIDED)).encode())
+    def digest(self, units: np.ndarray) -> str:
+        """A hash of everything on which the results of the units depend, and of the units
+        themselves: their division depends on the processor and its compiler.
+
+        Each part has its length in front of it, so that no two problems have the same bytes.
+        """
+        options = (FORMAT, UNITS, RENEWAL, NARROWEST, MAX_UNDECIDED, FLAGS, np.shape(units))
+        arrays = (self.kernel.numbers, self.lower, self.upper, self.smallest, units)
+        parts = [repr(options).encode(), self.kernel.compiled.source.encode()]
+        parts += [np.ascontiguousarray(x).tobytes() for x in arrays]
+        found = hashlib.sha256()
+        for part in parts:
+            found.update(len(part).to_bytes(8, "little"))
+            found.update(part)
         return found.hexdigest()
 
     def divided(self, max_boxes: int) -> tuple[np.ndarray, _Found]:
@@ -308,7 +319,7 @@ def search(
     low, high = _with_patterns(lower, upper, patterns)
     problem = _Problem(interval_kernel(function, low.shape[1], constants), low, high)
     units, division = problem.divided(max_boxes)
-    results = _Results(checkpoint, problem.digest(), len(units))
+    results = _Results(checkpoint, problem.digest(units), len(units))
     boxes = division.boxes
     done = division.done
     ended = division

@@ -50,6 +50,12 @@ class Places(NamedTuple):
         """Number of coordinates, those of rates included."""
         return len(self.entries) + self.rates
 
+    @property
+    def varying_leaves(self) -> list[int]:
+        """The leaves with an entry that is uncertain or differs from the model's."""
+        entries = [place for together in self.entries for place in together]
+        return sorted({leaf for leaf, _ in [*entries, *self.differing]})
+
 
 def replaced(leaves: list[jax.Array], new: dict[Place, jax.Array]) -> list[jax.Array]:
     """Leaves with some of their entries replaced."""

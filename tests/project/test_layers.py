@@ -46,6 +46,8 @@ INTERNALS = {
     "core/taylor.py": "rules of Taylor coefficients",
     "kernels/jaxprs.py": "how a jaxpr stores equations, constants and inner functions",
     "kernels/primitives.py": "primitives and their rules",
+    "proofs/examination.py": "the operations that proofs admit",
+    "proofs/users_barriers.py": "what an operation does to a physical dimension",
 }
 """File -> the part of JAX's internals that it alone knows."""
 

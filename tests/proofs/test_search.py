@@ -192,6 +192,39 @@ def test_checkpoints_of_other_problems_are_refused(tmp_path):
         search(waves, LOW, HIGH, [-1.2], progress=False, checkpoint=path)
 
 
+def test_a_checkpoint_belongs_to_its_units(tmp_path, monkeypatch):
+    """Units of other places do not count as proved, although their number is the same."""
+    path = tmp_path / "proof.npz"
+    search(waves, LOW, HIGH, [-1.02], progress=False, checkpoint=path)
+    divided = module._Problem.divided
+
+    def in_another_order(self, max_boxes):
+        units, division = divided(self, max_boxes)
+        return units[::-1].copy(), division
+
+    monkeypatch.setattr(module._Problem, "divided", in_another_order)
+    with pytest.raises(ValueError, match="this very proof"):
+        search(waves, LOW, HIGH, [-1.02], progress=False, checkpoint=path)
+
+
+def test_no_two_problems_have_the_bytes_of_a_digest_in_common():
+    """Numbers that move from one part of a problem to the next one give another digest."""
+    kernel = interval_kernel(waves, 3, [-1.2])
+    units = np.arange(44.0).reshape(4, 11)
+
+    def digest(lower, upper, units):
+        return module._Problem(kernel, lower, upper).digest(units)
+
+    digests = [
+        digest(LOW[None], HIGH[None], units),
+        digest(LOW[None], HIGH[None], units.reshape(2, 22)),
+        digest(LOW[None], HIGH[None], units[:3]),
+        digest(np.stack([LOW, HIGH]), np.stack([HIGH, HIGH]), units),
+        digest(LOW[None], np.nextafter(HIGH, 3.0)[None], units),
+    ]
+    assert len(set(digests)) == len(digests)
+
+
 @pytest.mark.parametrize(
     ("lower", "upper", "options", "message"),
     [

@@ -17,8 +17,10 @@ from iblf_jax.studies.rare_events.design_points import Pieces, design_points
 from iblf_jax.studies.rare_events.importance import importance_sampling, tail_shape
 from iblf_jax.studies.rare_events.limit_state import (
     NO_RUN,
+    Level,
     binomial_interval,
     log_normal_interval,
+    stagnate,
     upper_bound,
 )
 from iblf_jax.studies.rare_events.subset import subset_simulation
@@ -362,3 +364,18 @@ def test_statistics_of_two_hundred_repetitions(name, method):
     assert covered >= 0.89
     largest = 0.3 if case.probability > 5e-7 else 0.4
     assert method is by_importance or spread < largest
+
+
+def test_levels_that_end_above_the_limit_stagnate():
+    """Thresholds that converge, a last level that none is below, and a search with too few
+    levels.
+    """
+
+    def levels(*thresholds, last=0.1):
+        shares = [0.1] * (len(thresholds) - 1) + [last]
+        return [Level(x, p, np.zeros(1), 0.1, 0.5) for x, p in zip(thresholds, shares, strict=True)]
+
+    assert stagnate(levels(1.0, 0.5, 0.1001, 0.1000))
+    assert stagnate(levels(1.0, 0.5, last=1.0))
+    assert not stagnate(levels(1.0, 0.8, 0.6, 0.4))
+    assert not stagnate(levels(1.0, 0.0))

@@ -162,12 +162,15 @@ def test_without_failures_the_estimate_is_a_bound(scenario):
     found = ij.failure_probability(scenario, perturbations, runs=100, **RUN)
     assert found.is_upper_bound
     assert found.most_likely_failure is None
-    assert "no sample failed" in repr(found)
+    assert found.margins_stagnate
+    assert "no failure reachable was found" in repr(found).splitlines()[0]
+    assert "at most" not in repr(found)
     figure = found.plot()
-    assert "at most" in figure.get_suptitle()
+    assert "No failure reachable was found" in figure.get_suptitle()
     assert [text.get_text() for text in figure.axes[1].texts] == ["no failure found"]
     crude = ij.failure_probability(scenario, perturbations, method="monte_carlo", runs=100, **RUN)
-    assert crude.is_upper_bound
+    assert crude.is_upper_bound and not crude.margins_stagnate
+    assert "no sample failed in 100 runs; at most" in repr(crude)
     with pytest.raises(ValueError, match="draws near failure"):
         _ = crude.rare_draws
     with pytest.raises(ValueError, match="in which runs failed"):

@@ -371,10 +371,8 @@ INLINE interval tanh_at(F x) {
 SEPARATE interval i_tanh(interval x) { return increasing(tanh_at(-x.n), tanh_at(x.u)); }
 
 INLINE interval i_logistic(interval x) { interval one = at(all_lanes(1)); return i_div(one, i_add(one, i_exp(i_neg(x)))); }
-/* x^y for a y that is no whole number: x >= 0, by construction. */
-INLINE interval i_pow(interval x, interval y) { return i_exp(i_mul(y, i_log(x))); }
-/* x^y for any y; without bounds where x may be negative. */
-INLINE interval i_power_of_positive(interval x, interval y) {
+/* x^y for a y that may be no whole number: without bounds where x may be negative, where it is not defined. */
+INLINE interval i_pow(interval x, interval y) {
   F zero = {};
-  return unless(~(x.n <= zero), i_pow(x, y));
+  return unless(~(x.n <= zero), i_exp(i_mul(y, i_log(x))));
 }

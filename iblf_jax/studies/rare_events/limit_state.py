@@ -10,7 +10,7 @@ exclude these draws, so p is a probability given that a draw can be run.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -37,6 +37,20 @@ class Level(NamedTuple):
     acceptance: float
     """Share of the candidates of the Markov chains that were accepted; 1 for independent
     samples."""
+
+
+def converge(levels: Sequence[Level]) -> bool:
+    """Whether the second half of the thresholds differs by less than 1 %, of at least 4."""
+    half, last = len(levels) // 2, levels[-1].threshold
+    return half >= 2 and levels[half].threshold - last < 0.01 * last
+
+
+def stagnate(levels: Sequence[Level]) -> bool:
+    """Whether the thresholds of levels no longer come nearer to 0: they converge to another margin,
+    or no sample is below the last one.
+    """
+    last = levels[-1]
+    return converge(levels) or (last.threshold > 0 and last.probability == 1)
 
 
 class Samples(NamedTuple):

@@ -17,7 +17,7 @@ from iblf_jax.simulation.results import Rollout
 from iblf_jax.simulation.scenario import Scenario
 from iblf_jax.simulation.units import status_words
 from iblf_jax.studies.distributions import Perturbation, joint_samples, value
-from iblf_jax.studies.rare_events.limit_state import Level
+from iblf_jax.studies.rare_events.limit_state import Level, stagnate
 
 if TYPE_CHECKING:
     import xarray
@@ -152,6 +152,13 @@ class FailureProbability(Result):
     **arguments)` makes the same estimate for another scenario."""
 
     @property
+    def margins_stagnate(self) -> bool:
+        """Whether the levels of subset simulation ended at a margin above the limit without a
+        failure. `estimate` then only counts levels, and the probability may be 0.
+        """
+        return self.is_upper_bound and self.method == "subset" and stagnate(self.levels)
+
+    @property
     def rare_draws(self) -> dict[str, Perturbation]:
         """The draws near failure as perturbations, for `tune` or `monte_carlo`: path -> `value` of
         `joint_samples`.
@@ -204,6 +211,7 @@ class FailureProbability(Result):
             "confidence": self.confidence,
             "coefficient_of_variation": self.coefficient_of_variation,
             "is_upper_bound": int(self.is_upper_bound),
+            "margins_stagnate": int(self.margins_stagnate),
             "runs": self.runs,
             "excluded": self.excluded,
             "diverged": self.diverged,
@@ -215,7 +223,12 @@ class FailureProbability(Result):
     def __repr__(self) -> str:
         low, high = self.interval
         confidence = f"{100 * self.confidence:g}%"
-        if self.is_upper_bound:
+        if self.margins_stagnate:
+            first = (
+                f"FailureProbability(no failure reachable was found in {self.runs} runs; the"
+                f" margins stagnate at {self.levels[-1].threshold:.4g} {self.unit})"
+            )
+        elif self.is_upper_bound:
             first = (
                 f"FailureProbability(no sample failed in {self.runs} runs; at most"
                 f" {self.estimate:.2g} with {confidence} confidence)"

@@ -50,6 +50,7 @@ from iblf_jax.studies.rare_events.limit_state import (
     Level,
     LimitState,
     Samples,
+    converge,
     log_normal_interval,
     upper_bound,
 )
@@ -258,12 +259,11 @@ def _estimate(
 
 
 def _note_of_convergence(levels: list[Level]) -> tuple[str, ...]:
-    """A note if the second half of the thresholds differs by less than 1 %, of at least 4."""
-    half = len(levels) // 2
-    last = levels[-1].threshold
-    if half < 2 or levels[half].threshold - last >= 0.01 * last:
+    """A note if the thresholds converge to a margin that is not 0."""
+    if not converge(levels):
         return ()
-    count = len(levels) - half
+    count = len(levels) - len(levels) // 2
+    last = levels[-1].threshold
     return (CONVERGED.format(margin=last, count=count, levels=len(levels)),)
 
 

@@ -23,7 +23,6 @@ from iblf_jax.core.linalg import matvec, solve_gain, solve_spd
 from iblf_jax.core.optional import OptionalMembers, has_members
 from iblf_jax.core.status import VELOCITY_LIMIT
 from iblf_jax.core.units import ByLevel, Unit, per_second, product
-from iblf_jax.kernels import jaxprs
 from iblf_jax.world.robots import joint_names
 from iblf_jax.world.robots._base import robot_member
 

@@ -1,0 +1,269 @@
+"""What a proof requires of barriers that users write.
+
+A barrier of the class must be smooth on each side of e1 = 0: it may select by the sign of e1, and
+by nothing else.  The bound of arms divides all lengths by the width of the tube (`arm_motion`), so
+that V1, slope and virtual velocity must be homogeneous in lengths.  Both are read from the jaxprs:
+each number has a degree d, its unit is rad^d, and an operation on numbers of different degrees,
+such as 1 + e1, shows a length that the barrier has of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from fractions import Fraction
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend import core
+from jax.extend.core import primitives
+
+from iblf_jax.control.barriers._base import barrier_member
+from iblf_jax.core import checks
+from iblf_jax.proofs.arm_motion import degree
+from iblf_jax.proofs.chain_motion import OpenTube
+from iblf_jax.proofs.examination import REARRANGING, SMOOTH, interpreted, operations, traced
+from iblf_jax.proofs.users_parts import check_agreement
+
+SAMPLES = 256
+"""Tubes and errors at which methods of a barrier are compared."""
+NEAR_ZERO = 1e-7
+"""Share of the width at which the two sides of e1 = 0 are compared."""
+JUMP = 1e-4
+"""Difference of the two sides that counts as a jump."""
+
+COMPARISONS = frozenset([primitives.lt_p, primitives.le_p, primitives.gt_p, primitives.ge_p])
+LOGIC = frozenset([primitives.and_p, primitives.or_p, primitives.xor_p, primitives.not_p])
+SUMS = frozenset([primitives.add_p, primitives.add_jaxvals_p, primitives.sub_p])
+PRODUCTS = frozenset([primitives.mul_p, primitives.dot_general_p])
+OF_ONE_UNIT = frozenset([primitives.neg_p, primitives.reduce_sum_p, primitives.cumsum_p])
+POWERS: dict[Any, Any] = {primitives.square_p: 2, primitives.sqrt_p: Fraction(1, 2)}
+POWERS |= {primitives.rsqrt_p: Fraction(-1, 2)}
+
+
+class _UnitError(Exception):
+    """An operation with a length of its own, or one that selects a case; a line for the user."""
+
+
+class _Quantity(NamedTuple):
+    """What is known of an array."""
+
+    degree: Fraction | int | None = None
+    """Its unit is rad^degree; None for zeros, which have every unit."""
+    is_error: bool = False
+    """Whether it is e1 or -e1."""
+    is_side: bool = False
+    """Whether it is a truth value that the sign of e1 decides, or one that does not vary."""
+
+
+ZERO, NUMBER = _Quantity(), _Quantity(0)
+
+
+def check_barrier(name: str, barrier: Any, o: Any, *, homogeneous: bool) -> list[str]:
+    """The digests of the methods of a user's barrier (`Operations.digest`).
+
+    Args:
+      name: of the barrier, for the message.
+      barrier: without its guard.
+      o: gain of the law, or None.
+      homogeneous: whether a length of its own is refused.
+
+    Raises:
+      ValueError: a case besides the sign of e1, a length of its own, or methods that contradict
+        each other.
+    """
+    digests = []
+    for method, function, inputs, expected in _methods(barrier, o):
+        digests.append(operations(name, function, [jnp.ones(2) for _ in inputs]).digest)
+        jaxpr = traced(f"{name}.{method}", function, [jnp.ones(2) for _ in inputs])
+        rule = _homogeneous if homogeneous else _on_each_side
+        try:
+            outputs = interpreted(jaxpr, inputs, rule, _of_constant)
+            if homogeneous:
+                _unit_of([*outputs, _Quantity(expected)])
+        except _UnitError as error:
+            got = checks.Words(f"{type(barrier).__name__}.{method} with {error}")
+            words = "a barrier without a length of its own, smooth on each side of e1 = 0"
+            reason = "The bound divides all lengths by the width of the tube."
+            raise checks.fail(f"prove: {name}", got, words, reason) from None
+    _check_samples(name, barrier, o)
+    return digests
+
+
+def _tube(lower: Any, upper: Any, dlower: Any, dupper: Any) -> OpenTube:
+    """A tube in the frame of the reference."""
+    zero = jnp.zeros_like(lower)
+    return OpenTube(zero, zero, lower, upper, dlower, dupper)
+
+
+def _methods(barrier: Any, o: Any) -> Iterator[tuple[str, Callable, list[_Quantity], int]]:
+    """Name, function, inputs and degree of the result of each method of a barrier."""
+    d = degree(barrier)
+    length, of_tube = _Quantity(1), [_Quantity(1)] * 4
+    error, gain = length._replace(is_error=True), NUMBER
+    gain_o = None if o is None else jnp.max(o)
+    at_error = [*of_tube, error]
+    yield "value", lambda *x: barrier.value(_tube(*x[:4]), x[4]), at_error, d
+    yield "slope", lambda *x: barrier.slope(_tube(*x[:4]), x[4]), at_error, d - 1
+
+    def virtual_velocity(*x: Any) -> Any:
+        own = None if gain_o is None else gain_o * x[6]
+        return barrier.virtual_velocity(_tube(*x[:4]), x[4], x[5], own)
+
+    yield "virtual_velocity", virtual_velocity, [*at_error, gain, gain], 1
+    for above in (True, False):
+
+        def error_at(*x: Any, above: bool = above) -> Any:
+            return barrier_member(barrier, "error_at")(x[4], _tube(*x[:4]), jnp.full(2, above))
+
+        yield "error_at", error_at, [*of_tube, _Quantity(d)], 1
+
+
+def _of_constant(value: Any) -> _Quantity:
+    """A constant: zeros have every unit, and a truth value does not vary."""
+    is_truth = np.asarray(value).dtype == bool
+    if not is_truth and not np.any(np.asarray(value)):
+        return ZERO
+    return _Quantity(0, is_side=is_truth)
+
+
+def _unit_of(quantities: list[_Quantity]) -> Any:
+    """The degree of quantities of one unit."""
+    found = {x.degree for x in quantities if x.degree is not None}
+    if len(found) > 1:
+        raise _UnitError("a length of its own")
+    return found.pop() if found else None
+
+
+def _homogeneous(eqn: Any, operands: list[_Quantity]) -> list[_Quantity]:
+    """The results of an operation on quantities of given units."""
+    return [_result(eqn, operands)] * len(eqn.outvars)
+
+
+def _on_each_side(eqn: Any, operands: list[_Quantity]) -> list[_Quantity]:
+    """The results of an operation where lengths do not matter: all units are equal."""
+    without = [x if x.degree is None else x._replace(degree=0) for x in operands]
+    return [_result(eqn, without)] * len(eqn.outvars)
+
+
+def _result(eqn: Any, operands: list[_Quantity]) -> _Quantity:
+    """The result of an operation."""
+    primitive, first = eqn.primitive, operands[0] if operands else NUMBER
+    if primitive in COMPARISONS and _is_with_zero(operands):
+        return _Quantity(0, is_side=True)
+    if primitive in LOGIC and all(x.is_side for x in operands):
+        return _Quantity(0, is_side=True)
+    if primitive is primitives.select_n_p and first.is_side:
+        return _Quantity(_unit_of(operands[1:]))
+    if primitive is primitives.abs_p and first.is_error:
+        return _Quantity(first.degree)
+    if primitive is primitives.sign_p and first.is_error:
+        return NUMBER
+    if primitive in REARRANGING:
+        return _moved(eqn, operands)
+    if primitive is primitives.convert_element_type_p and _is_exact(eqn):
+        return first
+    if primitive in SUMS:
+        is_error = any(x.is_error for x in operands) and any(x.degree is None for x in operands)
+        return _Quantity(_unit_of(operands), is_error)
+    if primitive in OF_ONE_UNIT:
+        return first._replace(is_error=first.is_error and primitive is primitives.neg_p)
+    if primitive not in SMOOTH:
+        raise _UnitError(f"{primitive.name}, which is no case of the sign of e1")
+    return _Quantity(_degree(eqn, operands))
+
+
+def _is_exact(eqn: Any) -> bool:
+    """Whether a conversion rounds nothing; integers do not vary, because no admitted operation
+    gives one that does.
+    """
+    before, after = (v.aval.dtype for v in (eqn.invars[0], eqn.outvars[0]))
+    return before == after or jnp.issubdtype(before, jnp.integer)
+
+
+def _is_with_zero(operands: list[_Quantity]) -> bool:
+    """Whether a comparison is one of e1 with 0."""
+    one, other = operands
+    return (one.is_error and other.degree is None) or (other.is_error and one.degree is None)
+
+
+def _moved(eqn: Any, operands: list[_Quantity]) -> _Quantity:
+    """The result of an operation that moves numbers."""
+    floats = [
+        x
+        for x, v in zip(operands, eqn.invars, strict=True)
+        if not jnp.issubdtype(v.aval.dtype, jnp.integer)
+    ]
+    if not floats:
+        return NUMBER
+    is_same = all(x == floats[0] for x in floats)
+    return floats[0] if is_same else _Quantity(_unit_of(floats))
+
+
+def _degree(eqn: Any, operands: list[_Quantity]) -> Any:
+    """The degree of the result of a product, a power or a function."""
+    primitive, degrees = eqn.primitive, [x.degree for x in operands]
+    if primitive is primitives.div_p and degrees[1] is not None:
+        return None if degrees[0] is None else degrees[0] - degrees[1]
+    if primitive in PRODUCTS:
+        return None if None in degrees else sum(degrees)
+    if primitive in POWERS:
+        return None if degrees[0] is None else degrees[0] * POWERS[primitive]
+    if primitive is primitives.integer_pow_p and eqn.params["y"] > 0:
+        return None if degrees[0] is None else degrees[0] * eqn.params["y"]
+    if primitive is primitives.integer_pow_p and degrees[0] is not None:
+        return degrees[0] * eqn.params["y"]
+    if primitive is primitives.pow_p and isinstance(eqn.invars[1], core.Literal):
+        exponent = Fraction(float(eqn.invars[1].val))
+        return 0 if degrees[0] is None else degrees[0] * exponent
+    if any(degrees):
+        raise _UnitError("a length of its own")
+    return 0
+
+
+# --- at random points -----------------------------------------------------------------------------
+
+
+@jax.enable_x64(True)
+def _check_samples(name: str, barrier: Any, o: Any) -> None:
+    """Raises ValueError for methods that contradict each other at a random point."""
+    generator = np.random.default_rng(0)
+    k_l, k_u = np.exp(generator.normal(size=(2, SAMPLES)))
+    dlower, dupper = generator.normal(size=(2, SAMPLES))
+    share = generator.uniform(-0.9, 0.9, SAMPLES)
+    e = np.where(share > 0.0, share * k_u, share * k_l)
+    gain_o = None if o is None else jnp.max(o) * jnp.ones(1)
+
+    def tube_of(x: tuple) -> OpenTube:
+        return _tube(*(y[None] for y in x))
+
+    def pairs(lower: Any, upper: Any, dlower: Any, dupper: Any, e: Any) -> dict[str, tuple]:
+        tube = tube_of((lower, upper, dlower, dupper))
+        V = barrier.value(tube, e[None])
+        slope = jax.jvp(lambda q: barrier.value(tube, q), (e[None],), (jnp.ones(1),))[1]
+        found = {"slope": (barrier.slope(tube, e[None]), slope)}
+        back = barrier_member(barrier, "error_at")(V, tube, e[None] > 0)
+        if back is not None:
+            found["error_at"] = (back, e[None])
+        ratio = barrier_member(barrier, "error_over_slope")(tube, e[None])
+        if ratio is not None:
+            found["error_over_slope"] = (ratio * slope, e[None])
+        return found
+
+    def at_zero(lower: Any, upper: Any, dlower: Any, dupper: Any, e: Any) -> tuple:
+        tube = tube_of((lower, upper, dlower, dupper))
+
+        def functions(q: jax.Array) -> jax.Array:
+            alpha = barrier.virtual_velocity(tube, q, jnp.ones(1), gain_o)
+            return jnp.stack([barrier.value(tube, q), barrier.slope(tube, q), alpha])
+
+        values, rates = jax.jvp(functions, (e[None],), (jnp.ones(1),))
+        return values, rates[2]
+
+    x = (-k_l, k_u, dlower, dupper)
+    for method, pair in jax.vmap(pairs)(*x, e).items():
+        check_agreement(f"{name}.{method}", *pair)
+    sides = [jax.vmap(at_zero)(*x, sign * NEAR_ZERO * np.minimum(k_l, k_u)) for sign in (-1.0, 1.0)]
+    for one, other in zip(*sides, strict=True):
+        check_agreement(f"{name} at e1 = 0", one, other, JUMP)

@@ -1,0 +1,573 @@
+"""Parts that users write: what a proof refuses, and what it states as an assumption."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from proof_cases import pendulum, within
+from test_chains import lever
+
+import iblf_jax as ij
+from iblf_jax.core.pytree import Leaf, component, leaf, static
+from iblf_jax.proofs.arms import arm_problem
+from iblf_jax.proofs.chains import chain_problem
+
+
+@jax.custom_jvp
+def without_slope(x):
+    return 5.0 * x
+
+
+without_slope.defjvp(lambda primals, tangents: (without_slope(*primals), 0.0 * tangents[0]))
+
+
+@jax.custom_vjp
+def with_rule(x):
+    return jnp.sin(x)
+
+
+with_rule.defvjp(lambda x: (jnp.sin(x), x), lambda x, g: (0.0 * g,))
+FALSE_SINE = jax.extend.core.Primitive("sin")
+FALSE_SINE.def_impl(lambda x: 100.0 * x)
+FALSE_SINE.def_abstract_eval(lambda x: x)
+jax.interpreters.ad.primitive_jvps[FALSE_SINE] = lambda primals, tangents: (
+    FALSE_SINE.bind(*primals),
+    jnp.zeros_like(tangents[0]),
+)
+
+
+def counted(x):
+    """A loop whose length depends on x."""
+    return jax.lax.while_loop(lambda c: c[0] < x[0], lambda c: (c[0] + 1.0, c[1] + x), (0.0, x))[1]
+
+
+def called_back(x):
+    return jax.pure_callback(np.floor, jax.ShapeDtypeStruct(x.shape, x.dtype), x)
+
+
+def by_root(x):
+    """The root of y - x, whose derivative is that of the equation, which may be another one."""
+    return jax.lax.custom_root(lambda y: y - x, x, lambda f, y: jnp.floor(x), lambda g, y: y)
+
+
+def by_solver(x):
+    return jax.lax.custom_linear_solve(lambda y: y, x, lambda f, y: jnp.floor(y), symmetric=True)
+
+
+JUMPS = {
+    "floor": lambda v: 100.0 * jnp.floor(10.0 * v),
+    "ceil": jnp.ceil,
+    "round": jnp.round,
+    "trunc": jnp.trunc,
+    "sign": jnp.sign,
+    "mod": lambda v: v % 0.1,
+    "remainder": lambda v: jnp.fmod(v, 0.1),
+    "atan2": lambda v: jnp.arctan2(v, -1.0),
+    "where ne": lambda v: jnp.where(v != 0.0, 1.0, 2.0),
+    "where lt": lambda v: jnp.where(v < 0.1, 1.0, 2.0),
+    "where isfinite": lambda v: jnp.where(jnp.isfinite(1.0 / v), 1.0, 2.0),
+    "a truth value": lambda v: (v > 0.1).astype(float),
+    "chain of comparisons": lambda v: (v > 0.1).astype(float) - (v < -0.1).astype(float),
+    "heaviside": lambda v: jnp.heaviside(v, 0.5),
+    "an integer": lambda v: v.astype(int).astype(float),
+    "fewer digits": lambda v: v.astype(jnp.float32).astype(float),
+    "reduce_precision": lambda v: jax.lax.reduce_precision(v, 5, 10),
+    "bits": lambda v: jax.lax.bitcast_convert_type(
+        jax.lax.bitcast_convert_type(v, jnp.int64) & ~0xFFFFFFFF, jnp.float64
+    ),
+    "nextafter": lambda v: jnp.nextafter(v, v + 1.0),
+    "argmax": lambda v: jnp.argmax(jnp.stack([v, -v]), axis=0).astype(float),
+    "sort": lambda v: jnp.sort(jnp.concatenate([v, -v]))[:1],
+    "an index": lambda v: jnp.array([1.0, 2.0, 3.0])[(10.0 * v).astype(int)],
+    "interp": lambda v: jnp.interp(v, jnp.array([0.0, 1.0]), jnp.array([0.0, 1.0])),
+    "cond": lambda v: jax.lax.cond(v[0] > 0.0, jnp.sin, jnp.cos, v),
+    "switch": lambda v: jax.lax.switch(v[0].astype(int), [jnp.sin, jnp.cos], v),
+    "while": counted,
+    "callback": called_back,
+    "random": lambda v: jax.random.normal(jax.random.key(v[0].astype(int)), v.shape),
+    "stop_gradient": lambda v: 5.0 * jax.lax.stop_gradient(v),
+    "custom_jvp": without_slope,
+    "custom_vjp": with_rule,
+    "custom_jvp inside jit": jax.jit(without_slope),
+    "custom_jvp inside remat": jax.checkpoint(without_slope),
+    "custom_jvp inside a loop": lambda v: jax.lax.fori_loop(0, 3, lambda i, x: without_slope(x), v),
+    "custom_root": by_root,
+    "custom_linear_solve": by_solver,
+    "a primitive of the name sin": FALSE_SINE.bind,
+    "relu": jax.nn.relu,
+    "sinc": jnp.sinc,
+    "erf_inv": jax.scipy.special.erfinv,
+    "a branch in Python": lambda v: v if v[0] > 0 else -v,
+}
+"""Functions of a velocity that jump, whose derivative is not theirs, or that cannot be examined."""
+
+
+@component
+class Torque:
+    """A torque that is a function of the velocity."""
+
+    function: Any = static()
+
+    def torque(self, t, q, dq, plant, model):
+        return -0.1 * self.function(dq)
+
+    def jump_times(self):
+        return jnp.zeros(0)
+
+
+@pytest.mark.parametrize("name", JUMPS)
+def test_disturbances_that_jump_or_have_own_derivatives_are_refused(name):
+    scenario = pendulum(disturbance=Torque(JUMPS[name]))
+    words = "select a case|does not know|cannot be traced|TracerBoolConversionError"
+    with pytest.raises(ValueError, match=words):
+        arm_problem(scenario, {}, duration=2.0)
+
+
+TABLE = {"gain": 1.0, "array": np.array([1.0, 2.0])}
+"""Numbers that a function reads from elsewhere."""
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda v: TABLE["gain"] * v,
+        lambda v: jnp.sum(jnp.asarray(TABLE["array"])) * v,
+        jax.jit(lambda v: jnp.outer(jnp.asarray(TABLE["array"]), v)[1]),
+        lambda v: jax.lax.fori_loop(0, 2, lambda i, x: x * jnp.asarray(TABLE["array"])[1], v),
+    ],
+)
+def test_a_function_whose_numbers_changed_has_another_program(function, monkeypatch):
+    def bound():
+        jax.clear_caches()
+        return arm_problem(pendulum(disturbance=Torque(function)), {}, duration=2.0).bound
+
+    before = bound()
+    assert bound() == before
+    monkeypatch.setitem(TABLE, "gain", 5.0)
+    monkeypatch.setitem(TABLE, "array", np.array([1.0, 3.0]))
+    assert bound() != before
+
+
+SMOOTH = {
+    "a polynomial": lambda v: 3.0 + v * (2.0 + v * (1.0 + v**3)),
+    "a loop": lambda v: jax.lax.fori_loop(0, 3, lambda i, x: x * v, v),
+    "a table with known places": lambda v: jnp.concatenate([v, 2.0 * v])[jnp.array([1])],
+    "remat": jax.checkpoint(jnp.sin),
+    "silu": jax.nn.silu,
+    "drag": lambda v: v * jnp.abs(v),
+    "a limit": lambda v: jnp.clip(v, -1.0, 1.0),
+    "a norm": lambda v: jnp.sqrt(v**2 + 1.0),
+    "a case that is known": lambda v: jnp.where(jnp.arange(1) > 2, 1.0, jnp.tanh(v)),
+    "a power": lambda v: (1.0 + v**2) ** 1.5,
+}
+
+
+@pytest.mark.parametrize("name", SMOOTH)
+def test_continuous_disturbances_are_admitted(name):
+    arm_problem(pendulum(disturbance=Torque(SMOOTH[name])), {}, duration=2.0)
+
+
+@component
+class Drift:
+    """x1' = x2, x2' = u + function(x[row])."""
+
+    function: Any = static()
+    row: int = static()
+    n: ClassVar[int] = 1
+    order: ClassVar[int] = 2
+
+    def drift(self, t, x):
+        rows = [jnp.zeros(1), jnp.zeros(1)]
+        rows[self.row] = self.function(x[self.row])
+        return jnp.stack(rows)
+
+    def gain(self, t, x):
+        return jnp.ones_like(x)
+
+
+def with_drift(function, row):
+    plant = Drift(function, row)
+    return lever(plant=plant, model=plant)
+
+
+@pytest.mark.parametrize("name", ["floor", "where ne", "stop_gradient", "custom_jvp", "atan2"])
+def test_plants_that_jump_are_refused(name):
+    with pytest.raises(ValueError, match=r"select a case|does not know"):
+        chain_problem(with_drift(lambda x: -JUMPS[name](x), 1), {})
+
+
+def test_a_kink_is_admitted_in_the_last_level_only():
+    """The law contains the derivative of the drift of the first level."""
+    chain_problem(with_drift(lambda x: -x * jnp.abs(x), 1), {})
+    with pytest.raises(ValueError, match="derivative jumps"):
+        chain_problem(with_drift(lambda x: -x * jnp.abs(x), 0), {})
+
+
+class Link:
+    """What the pendulums below share."""
+
+    def mass_matrix(self, q):
+        return jnp.broadcast_to(0.2, (1, 1))
+
+    def coriolis(self, q, v, u):
+        return jnp.zeros_like(q)
+
+    def gravity(self, q):
+        return self.mass * jnp.sin(q)
+
+    def potential(self, q):
+        return self.mass * jnp.sum(1.0 - jnp.cos(q))
+
+    def tip(self, q):
+        return jnp.stack([jnp.sin(q[0]), -jnp.cos(q[0])])
+
+    def jacobian(self, q):
+        return jnp.stack([jnp.cos(q), jnp.sin(q)])
+
+    def skeleton(self, q):
+        return jnp.stack([jnp.zeros(2), self.tip(q)])
+
+
+@component
+class Stepped(Link):
+    """A pendulum whose load is a step function of a parameter."""
+
+    mass: Leaf = leaf("kg")
+    n: ClassVar[int] = 1
+
+    def gravity(self, q):
+        return jnp.floor(self.mass) * jnp.sin(q)
+
+
+@component
+class Carrying(Link):
+    """A pendulum that picks up a load and does not say when."""
+
+    mass: Leaf = leaf("kg")
+    n: ClassVar[int] = 1
+
+    def at(self, t):
+        return dataclasses.replace(self, mass=self.mass * (1.0 + t))
+
+
+@component
+class Unbalanced(Link):
+    """A pendulum whose matrix C does not follow from M."""
+
+    mass: Leaf = leaf("kg")
+    n: ClassVar[int] = 1
+
+    def coriolis(self, q, v, u):
+        return -3.0 * u
+
+
+def test_a_step_function_of_a_parameter_is_refused_where_the_parameter_varies():
+    plant = Stepped(1.2)
+    same = pendulum(plant=plant, model=plant)
+    arm_problem(same, {})
+    with pytest.raises(ValueError, match="does not know"):
+        arm_problem(same, within(5.0))
+    with pytest.raises(ValueError, match="does not know"):
+        arm_problem(pendulum(plant=plant, model=Stepped(0.9)), {})
+
+
+def test_a_robot_that_changes_with_time_is_refused():
+    plant = Carrying(1.2)
+    with pytest.raises(ValueError, match="depends on the time"):
+        arm_problem(pendulum(plant=plant, model=plant), {})
+
+
+def test_a_robot_whose_matrices_contradict_each_other_is_refused():
+    plant = Unbalanced(1.2)
+    with pytest.raises(ValueError, match="coriolis"):
+        arm_problem(pendulum(plant=plant, model=plant), {})
+
+
+def test_methods_of_a_robot_of_a_user_are_an_assumption():
+    plant = Stepped(1.2)
+    sentences = arm_problem(pendulum(plant=plant, model=plant), {}).assumptions
+    assert any("M' - 2 C of Stepped is skew-symmetric" in x for x in sentences)
+    assert not any("skew-symmetric" in x for x in arm_problem(pendulum(), {}).assumptions)
+
+
+@component
+class WrongInput(Drift):
+    """A plant with a wrong inverse of its second level."""
+
+    n: ClassVar[int] = 1
+    order: ClassVar[int] = 2
+
+    def level_input(self, level, t, x, rate, torque):
+        return rate
+
+
+def test_a_plant_with_a_wrong_inverse_is_refused():
+    plant = WrongInput(lambda x: -3.0 * x, 1)
+    with pytest.raises(ValueError, match="level_input of level 2"):
+        chain_problem(lever(plant=plant, model=plant), {})
+
+
+@component
+class Upward:
+    """A plant whose first level depends on the second one in a way that scenarios do not see."""
+
+    n: ClassVar[int] = 1
+    order: ClassVar[int] = 2
+
+    def drift(self, t, x):
+        far = 1.0 + jnp.tanh(50.0 * (jnp.sum(x**2, axis=0) - 1.0))
+        return jnp.stack([far * x[1], jnp.zeros(1)])
+
+    def gain(self, t, x):
+        return jnp.ones_like(x)
+
+
+def test_a_plant_without_strict_feedback_form_is_refused():
+    plant = Upward()
+    with pytest.raises(ValueError, match=r"levels above|strict-feedback form"):
+        chain_problem(lever(plant=plant, model=plant), {})
+
+
+# --- reference and bounds -------------------------------------------------------------------------
+
+
+@component
+class Path:
+    """A position that is a function of time."""
+
+    function: Any = static()
+
+    def position(self, t):
+        return self.function(t)[None]
+
+
+@component
+class Declared(Path):
+    """The same with a number of continuous derivatives."""
+
+    continuous_derivatives: ClassVar[int] = 3
+
+
+@component
+class SideOfPath:
+    """A bound that is a function of time."""
+
+    function: Any = static()
+
+    def at(self, t, q_d):
+        return jnp.broadcast_to(self.function(t), q_d.shape)
+
+
+STEPS = {
+    "floor": lambda t: 0.5 + 0.01 * jnp.floor(t),
+    "where": lambda t: jnp.where(t < 1.0, 0.5, 0.51),
+    "max": lambda t: 0.5 + 0.01 * jnp.maximum(t - 1.0, 0.0),
+    "clip": lambda t: 0.5 + 0.01 * jnp.clip(t, 0.0, 1.0),
+    "custom_jvp": lambda t: 0.5 + 0.001 * without_slope(t),
+    "mod": lambda t: 0.5 + 0.01 * (t % 1.0),
+}
+
+
+@pytest.mark.parametrize("name", STEPS)
+def test_references_and_bounds_that_jump_and_declare_nothing_are_refused(name):
+    words = "select a case or have a kink|does not know"
+    with pytest.raises(ValueError, match=words):
+        arm_problem(pendulum(reference=Path(STEPS[name])), {}, duration=2.0)
+
+    def side(t):
+        return STEPS[name](t) + 0.5
+
+    upper = ij.Bounds(lower=ij.bounds.Constant([0.1]), upper=SideOfPath(side))
+    with pytest.raises(ValueError, match=words):
+        arm_problem(pendulum(bounds=upper), {}, duration=2.0)
+    with pytest.raises(ValueError, match=words):
+        chain_problem(lever(reference=Path(lambda t: STEPS[name](t) - 0.4)), {}, duration=2.0)
+
+
+def test_declared_derivatives_are_an_assumption():
+    cubic = Declared(lambda t: 0.5 + 0.01 * jnp.maximum(t - 1.0, 0.0) ** 4)
+    found = arm_problem(pendulum(reference=cubic), {}, duration=2.0)
+    sentence = "The reference Declared has 3 continuous derivatives, as it declares."
+    assert sentence in found.assumptions
+    smooth = Path(lambda t: 0.5 + 0.1 * jnp.tanh(t))
+    found = arm_problem(pendulum(reference=smooth), {}, duration=2.0)
+    assert not any("as it declares" in x for x in found.assumptions)
+    with pytest.raises(ValueError, match="does not know"):
+        arm_problem(pendulum(reference=Declared(STEPS["floor"])), {}, duration=2.0)
+
+
+# --- law, observer, actuator ----------------------------------------------------------------------
+
+
+@component
+class OtherLaw(ij.controllers.Backstepping):
+    """A law that inherits from the known one."""
+
+
+@component
+class OtherObserver(ij.observers.Momentum):
+    """An observer that inherits from the known one."""
+
+
+@component
+class OtherActuator(ij.actuators.Ideal):
+    """An actuator that inherits from the ideal one."""
+
+
+@component
+class OtherDecay:
+    """A decay that declares a constant gain."""
+
+    constant: ClassVar[bool] = True
+
+    def effective_gain(self, t, k, V):
+        return k
+
+
+@component
+class OtherSum(ij.disturbances.Sum):
+    """A sum whose torque is another one."""
+
+    def torque(self, t, q, dq, plant, model):
+        return 0.1 * jnp.tanh(t) * jnp.ones_like(q)
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        {"controller": OtherLaw(k1=2.0, K2=[3.0], reading="corrected")},
+        {"observer": OtherObserver(kf=[100.0])},
+        {"actuator": OtherActuator()},
+        {
+            "controller": ij.controllers.Backstepping(
+                k1=2.0, K2=[3.0], reading="corrected", decays=OtherDecay()
+            )
+        },
+    ],
+)
+def test_classes_that_inherit_from_known_ones_are_refused(parts):
+    with pytest.raises(ValueError, match=f"scenario.{next(iter(parts))}"):
+        arm_problem(pendulum(**parts), {})
+
+
+def test_a_disturbance_that_inherits_from_a_periodic_one_has_no_period():
+    with pytest.raises(ValueError, match="period of disturbance"):
+        arm_problem(pendulum(disturbance=OtherSum(())), {})
+
+
+# --- barriers -------------------------------------------------------------------------------------
+
+
+@component
+class Altered(ij.barriers.Mapping):
+    """A barrier whose methods are multiplied by functions of (tube, e1)."""
+
+    of_value: Any = static(default=None)
+    of_slope: Any = static(default=None)
+    of_alpha: Any = static(default=None)
+
+    def value(self, tube, q):
+        return super().value(tube, q) * (self.of_value or one)(tube, q)
+
+    def slope(self, tube, q):
+        return super().slope(tube, q) * (self.of_slope or one)(tube, q)
+
+    def virtual_velocity(self, tube, q, k1, o):
+        return super().virtual_velocity(tube, q, k1, o) * (self.of_alpha or one)(tube, q)
+
+
+def one(tube, q):
+    return jnp.ones_like(q)
+
+
+BARRIERS = {
+    "a length in V1": ({"of_value": lambda tube, q: 1.0 + 1e-9 * q**2}, "length of its own"),
+    "a length far away": (
+        {"of_alpha": lambda tube, q: 1.0 + jax.nn.sigmoid(1e3 * (tube.upper - tube.lower - 10.0))},
+        "length of its own",
+    ),
+    "a length in a comparison": (
+        {"of_alpha": lambda tube, q: jnp.where(q > 0.2, 1.0, 2.0)},
+        "no case of the sign",
+    ),
+    "a share in a comparison": (
+        {"of_alpha": lambda tube, q: jnp.where(q / tube.k_u > 0.2, 1.0, 2.0)},
+        "no case of the sign",
+    ),
+    "a jump at 0": (
+        {"of_alpha": lambda tube, q: jnp.where(q > 0.0, 1.0, 2.0)},
+        "at e1 = 0",
+    ),
+    "a slope that is none of V1": ({"of_slope": lambda tube, q: 2.0 * one(tube, q)}, "slope"),
+    "a floor": ({"of_alpha": lambda tube, q: jnp.floor(q / tube.k_u)}, "no case of the sign"),
+    "fewer digits": (
+        {"of_slope": lambda tube, q: (q / tube.k_u).astype(jnp.float32).astype(float)},
+        "no case of the sign",
+    ),
+    "its own rule": ({"of_slope": lambda tube, q: without_slope(q / tube.k_u)}, "no case of"),
+    "stop_gradient": (
+        {"of_alpha": lambda tube, q: jax.lax.stop_gradient(q / tube.k_u)},
+        "no case of the sign",
+    ),
+}
+
+
+def with_barrier(barrier):
+    law = ij.controllers.Backstepping(k1=2.0, K2=[3.0], reading="corrected", barrier=barrier)
+    return pendulum(controller=law)
+
+
+@pytest.mark.parametrize("name", BARRIERS)
+def test_barriers_with_lengths_jumps_or_wrong_slopes_are_refused(name):
+    fields, words = BARRIERS[name]
+    with pytest.raises(ValueError, match=words):
+        arm_problem(with_barrier(Altered(**fields)), {})
+
+
+def test_a_registered_barrier_is_not_one_of_the_package(monkeypatch):
+    monkeypatch.setitem(ij.barriers.MEMBERS, "altered", Altered)
+    assumed = arm_problem(with_barrier(Altered()), {}).assumptions
+    assert any("The claims of Altered hold" in x for x in assumed)
+    length = BARRIERS["a length in V1"][0]
+    with pytest.raises(ValueError, match="length of its own"):
+        arm_problem(with_barrier(Altered(**length)), {})
+
+
+def test_the_barriers_of_the_package_satisfy_what_is_required_of_others():
+    from iblf_jax.proofs.users_barriers import check_barrier
+
+    for barrier in (ij.barriers.Integral(), ij.barriers.Log(), ij.barriers.Mapping()):
+        object.__setattr__(barrier, "guard", -np.inf)
+        check_barrier("barrier", barrier, jnp.asarray(0.1), homogeneous=True)
+
+
+# --- domains of functions -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda v: 1e-3 * jnp.log(v - 100.0),
+        lambda v: 1e-3 * jnp.arctanh(v + 100.0),
+        lambda v: 1e-3 * v**1.5,
+    ],
+)
+@pytest.mark.slow
+def test_functions_that_are_not_defined_are_not_proved(function):
+    """Their derivatives are numbers, and the functions are not."""
+    found = ij.prove(
+        pendulum(disturbance=Torque(function)),
+        level=0.1,
+        parameters={},
+        weight=2e-3,
+        duration=0.1,
+        max_boxes=50_000,
+        runs=0,
+        progress=False,
+    )
+    assert not found.proved
