@@ -8,6 +8,7 @@ import json
 import math
 import os
 import random
+import re
 import shutil
 import signal
 import subprocess
@@ -39,6 +40,8 @@ INSIDE = (0.55, 0.45)
 """Positions inside of the bounds at t = 0."""
 TIMEOUT = 20.0
 """Longest wait for something that must happen [s]."""
+DEFAULT = object()
+"""Leaves a parameter as the exported file has it."""
 
 
 @pytest.fixture(scope="module")
@@ -63,6 +66,7 @@ class Client:
         self.efforts: list[list[float]] = []
         self.diagnostics: dict[str, str] = {}
         self.level = b"\0"
+        self.message = ""
         self.clients = {}
         self.node.create_subscription(Float64MultiArray, "efforts", self._effort, 10)
         self.node.create_subscription(DiagnosticArray, "diagnostics", self._diagnostic, 10)
@@ -81,6 +85,7 @@ class Client:
     def _diagnostic(self, message):
         status = message.status[0]
         self.level = status.level
+        self.message = status.message
         self.diagnostics = {value.key: value.value for value in status.values}
 
     def spin(self, duration: float) -> None:
@@ -204,7 +209,8 @@ class Nodes:
         for rule in remap:
             command += ["-r", rule]
         for name, value in ({"state_timeout": 0.5} | parameters).items():
-            command += ["-p", f"{name}:={value}"]
+            if value is not DEFAULT:
+                command += ["-p", f"{name}:={value}"]
         process = subprocess.Popen(command, env=self.environment, stderr=subprocess.PIPE, text=True)
         self.processes.append(process)
         return process
@@ -427,6 +433,55 @@ def test_without_states_the_policy_takes_over(client, nodes, trigger, policy):
     assert "stale" in client.diagnostics["last_fault"]
 
 
+def test_the_trigger_state_with_default_timeouts_compares_stamps_and_then_arrivals(client, nodes):
+    """Gaps of two periods between stamps are tolerated, three are not; nor is half a second without
+    a state.  The torques of the policy are zero, and the law starts again after each fault.
+    """
+    nodes.begin(trigger="state", on_fault="zero", start_automatically="true", state_timeout=DEFAULT)
+    client.connect()
+    stamp = 1000.0
+
+    def step(periods):
+        nonlocal stamp
+        stamp += periods * PERIOD
+        count = len(client.efforts)
+        client.state(stamp=stamp)
+        client.wait(lambda: len(client.efforts) > count, "no answer")
+        return client.efforts[-1]
+
+    for periods in (1, 1, 2, 1, 2):
+        assert step(periods) != [0.0, 0.0]
+    assert step(3) == [0.0, 0.0]
+    client.wait(lambda: client.mode == "fault", "no fault")
+    assert "the stamps of two states are 0.03 s apart" in client.diagnostics["last_fault"]
+    assert step(1) == [0.0, 0.0]
+    assert client.call("start", drives=False).success
+    assert step(1) != [0.0, 0.0]
+    last, count = time.monotonic(), len(client.efforts)
+    client.wait(lambda: len(client.efforts) > count, "no torques of the policy")
+    assert time.monotonic() - last > 0.49
+    assert client.efforts[-1] == [0.0, 0.0]
+    client.wait(lambda: client.mode == "fault", "no fault")
+    assert "no valid state has arrived for 0." in client.diagnostics["last_fault"]
+
+
+def test_the_trigger_timer_with_default_timeouts_tolerates_two_periods(client, nodes):
+    nodes.begin(on_fault="zero", state_timeout=DEFAULT)
+    client.connect()
+    end = time.monotonic() + TIMEOUT
+    while client.mode != "running":
+        # A busy machine may exceed the timeout in between.
+        assert time.monotonic() < end
+        client.call("start")
+        client.drive_for(0.15)
+    client.wait(lambda: client.mode == "fault", "no fault")
+    fault = client.diagnostics["last_fault"]
+    age = float(re.search(r"([\d.]+) s( old by its stamp|$)", fault)[1])
+    assert 2 * PERIOD < age < 1.0
+    client.spin(0.2)
+    assert client.efforts[-1] == [0.0, 0.0]
+
+
 def test_states_older_than_two_periods_are_stale(client, nodes):
     """With the default timeout: stamps that are three periods old when they arrive."""
     nodes.begin(start_automatically="true", state_timeout=2 * PERIOD)
@@ -436,6 +491,103 @@ def test_states_older_than_two_periods_are_stale(client, nodes):
         client.spin(PERIOD)
     assert client.efforts == []
     assert client.mode == "waiting"
+
+
+ELSEWHERE = (INSIDE[0] + 0.15, INSIDE[1] - 0.15)
+"""Positions of a second publisher, also inside of the bounds."""
+HIDES_EXECUTOR = "sys.modules['rclpy.experimental'] = None"
+HIDES_IDENTITY = "law_node._sender = lambda x: Sender(None, x['publication_sequence_number'])"
+HIDES_SENDER = "law_node._sender = lambda x: Sender()"
+
+
+def node_with(change: str) -> list[str]:
+    """A program of the node with a change of its modules before the start."""
+    start = f"from {NAME} import law_node; from {NAME}.supervisor import Sender"
+    first = [change, start] if change is HIDES_EXECUTOR else [start, change]
+    return ["-c", "; ".join(["import sys", *first, "sys.exit(law_node.main())"])]
+
+
+@pytest.mark.parametrize(
+    ("trigger", "policy", "change"),
+    [
+        pytest.param("timer", "zero", "pass", id="timer"),
+        pytest.param("state", "hold", "pass", id="state"),
+        pytest.param("timer", "hold", HIDES_EXECUTOR, id="executor in Python"),
+        pytest.param("state", "zero", HIDES_IDENTITY, id="numbers only"),
+    ],
+)
+def test_a_second_publisher_of_joint_states_is_a_fault(
+    client, nodes, package, trigger, policy, change
+):
+    program = node_with(change)
+    process = nodes.begin(
+        program=program, trigger=trigger, on_fault=policy, start_automatically="true"
+    )
+    client.connect()
+    client.reach("running")
+    client.drive_for(0.2)
+    node = rclpy.create_node("second_driver")
+    second, first = node.create_publisher(JointState, "joint_states", 10), client.states
+    before = len(client.efforts)
+
+    def both_send(until):
+        while not until():
+            client.states = second
+            client.state(q=ELSEWHERE)
+            client.states = first
+            client.state()
+            client.spin(PERIOD)
+
+    try:
+        end = time.monotonic() + TIMEOUT
+        both_send(lambda: client.mode == "fault" or time.monotonic() > end)
+        assert client.diagnostics["last_fault"].startswith("states of several publishers: a second")
+        assert int(client.diagnostics["publishers"]) >= 2
+        count = len(client.efforts)
+        end = time.monotonic() + 0.5
+        both_send(lambda: time.monotonic() > end)
+        # Both send on: the torques of the fault are constant.
+        balance = [0.0, 0.0]
+        if policy == "hold":
+            balance = load_law(package.modules / NAME).balance(INSIDE)
+        np.testing.assert_allclose(client.efforts[count:], [balance] * len(client.efforts[count:]))
+        if change is not HIDES_IDENTITY:
+            # No torque of the law answers a state of the second publisher.
+            law = load_law(package.modules / NAME)
+            assert law.init(INSIDE, (0.0, 0.0))
+            right, wrong = (law.step(0.0, q, (0.0, 0.0))[0] for q in (INSIDE, ELSEWHERE))
+            running = [x for x in client.efforts[before - 10 : count] if x != client.efforts[count]]
+            assert len(running) >= 10
+            steps = np.abs(np.diff(running, axis=0)).max()
+            assert steps < 0.1 * np.abs(np.subtract(right, wrong)).max()
+        refused = client.call("start", drives=False)
+        assert not refused.success and "second publisher" in refused.message
+    finally:
+        node.destroy_node()
+    client.drive_for(1.2)
+    assert client.call("start").success
+    client.reach("running")
+    process.terminate()
+    _, log = process.communicate(timeout=TIMEOUT)
+    # The name of a node may arrive later than its messages.
+    assert re.search("publishers of joint_states: .*, ", log)
+
+
+def test_publishers_that_the_middleware_does_not_tell_apart_are_counted(client, nodes):
+    nodes.begin(program=node_with(HIDES_SENDER), start_automatically="true")
+    client.connect()
+    client.reach("running")
+    assert client.level == b"\0" or "does not tell apart" in client.message
+    node = rclpy.create_node("second_driver")
+    publisher = node.create_publisher(JointState, "joint_states", 10)
+    try:
+        client.drive(lambda: int(client.diagnostics["publishers"]) >= 2, "one publisher")
+        client.drive(lambda: client.level == b"\1", "no warning")
+        assert "publishers, which the middleware does not tell apart" in client.message
+        assert client.mode == "running"
+    finally:
+        node.destroy_publisher(publisher)
+        node.destroy_node()
 
 
 def test_bursts_neither_stop_the_law_nor_exceed_limits(client, nodes):
@@ -566,6 +718,21 @@ def test_a_node_that_ends_sends_the_torques_of_its_policy(client, nodes, policy,
     client.wait(lambda: len(client.efforts) > count, "no last torques")
     assert process.wait(TIMEOUT) == 0
     assert (client.efforts[-1] == [0.0, 0.0]) == (policy == "zero")
+
+
+def test_a_second_signal_ends_the_node_at_once(client, nodes):
+    """While it waits for the arrival of its last command, here for a minute."""
+    change = "import time; law_node.LawNode.wait_for_efforts = lambda self: time.sleep(60)"
+    process = nodes.begin(program=node_with(change), state_timeout=TIMEOUT)
+    client.connect()
+    client.reach("stopped")
+    process.send_signal(signal.SIGTERM)
+    client.spin(1.0)
+    assert process.poll() is None
+    before = time.monotonic()
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(TIMEOUT) == -signal.SIGTERM
+    assert time.monotonic() - before < 1.0
 
 
 @pytest.mark.parametrize("policy", ["zero", "hold"])

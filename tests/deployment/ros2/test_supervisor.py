@@ -15,11 +15,14 @@ from iblf_jax.deployment.ros2.node.c_law import NOT_FINITE
 from iblf_jax.deployment.ros2.node.monitor import LoopMonitor
 from iblf_jax.deployment.ros2.node.supervisor import (
     NANOSECONDS,
+    PUBLISHER_TIMEOUT,
+    UNKNOWN,
     Configuration,
     FaultKind,
     JointReader,
     JointSample,
     Mode,
+    Sender,
     Supervisor,
 )
 
@@ -91,9 +94,11 @@ class Bench:
     def mode(self):
         return self.supervisor.mode
 
-    def state(self, q=(0.1, 0.2, 0.3), dq=(0.0, 0.0, 0.0), names=JOINTS, stamp=None):
+    def state(
+        self, q=(0.1, 0.2, 0.3), dq=(0.0, 0.0, 0.0), names=JOINTS, stamp=None, sender=UNKNOWN
+    ):
         stamp = self.clock if stamp is None else stamp
-        return self.supervisor.receive(list(names), q, dq, stamp, self.now)
+        return self.supervisor.receive(list(names), q, dq, stamp, self.now, sender)
 
     def command(self):
         return self.supervisor.command(self.now, self.clock)
@@ -247,6 +252,95 @@ def test_states_of_other_joints_are_ignored_until_the_own_ones_are_stale():
     assert bench.period(**other).mode is Mode.RUNNING
     assert bench.period(**other).mode is Mode.FAULT
     assert bench.supervisor.last_fault.kind is FaultKind.STALE
+
+
+SENDERS = {
+    "identities": (b"driver", b"other", itertools.repeat(None), itertools.repeat(None)),
+    "identities and numbers": (b"driver", b"other", itertools.count(1), itertools.count(10**6)),
+    "numbers of publishers that began together": (None, None, itertools.count(1)),
+    "numbers of publishers that began one after the other": (
+        *(None, None),
+        itertools.count(1000),
+        itertools.count(1),
+    ),
+}
+"""What the middleware reports about two publishers: identities, and numbers of their messages."""
+
+
+def both_senders(case):
+    """A function for each of two publishers that makes the sender of its next message."""
+    first, second, *numbers = SENDERS[case]
+    if len(numbers) == 1:
+        numbers = itertools.tee(numbers[0])
+    driver, other = numbers
+    return lambda: Sender(first, next(driver)), lambda: Sender(second, next(other))
+
+
+@pytest.mark.parametrize("policy", ["zero", "hold"])
+@pytest.mark.parametrize("mode", [Mode.RUNNING, Mode.HOLDING])
+@pytest.mark.parametrize("case", SENDERS)
+def test_a_second_publisher_is_a_fault_and_its_states_are_not_used(case, mode, policy):
+    driver, other = both_senders(case)
+    bench = Bench(on_fault=policy)
+    bench.period(sender=driver())
+    bench.start()
+    if mode is Mode.HOLDING:
+        assert bench.supervisor.hold(bench.now, bench.clock)[0]
+    assert bench.period(sender=driver()).mode is mode
+    far = {"q": (0.9, -0.9, 0.9)}
+    command = bench.period(sender=other(), **far)
+    assert command.mode is Mode.FAULT
+    assert bench.supervisor.last_fault.kind is FaultKind.PUBLISHER
+    assert "a second publisher sends states" in bench.supervisor.last_fault.reason
+    balance = [0.0] * 3 if policy == "zero" else bench.law.balance((0.1, 0.2, 0.3))
+    assert command.torque == balance
+    for _ in range(200):  # two seconds, in which both send
+        assert bench.period(sender=driver()).torque == balance
+        assert bench.period(sender=other(), **far).torque == balance
+    started, message = bench.supervisor.start(bench.now, bench.clock)
+    assert not started and "a second publisher" in message
+    assert all(q == (0.1, 0.2, 0.3) for _, q, _ in bench.law.calls)
+    for _ in range(round(PUBLISHER_TIMEOUT / PERIOD) + 1):
+        bench.period(sender=driver())
+    bench.start()
+    assert bench.period(sender=driver()).mode is Mode.RUNNING
+
+
+def test_a_higher_number_alone_is_a_second_publisher_with_the_next_state_of_the_first():
+    """Messages may have been lost, so that the higher number is no contradiction yet."""
+    bench = Bench().running()
+    assert bench.period(sender=Sender(None, 1)).mode is Mode.RUNNING
+    assert bench.period(sender=Sender(None, 1000)).mode is Mode.RUNNING
+    assert bench.period(sender=Sender(None, 2)).mode is Mode.FAULT
+    assert bench.supervisor.last_fault.kind is FaultKind.PUBLISHER
+
+
+def test_a_publisher_that_is_restarted_while_the_law_is_stopped_is_used_after_a_second():
+    bench = Bench()
+    for k in range(5):
+        bench.period(sender=Sender(b"first", 100 + k))
+    bench.now += 50 * T
+    for k in range(round(PUBLISHER_TIMEOUT / PERIOD) + 1):
+        assert not bench.supervisor.start(bench.now, bench.clock)[0]
+        assert bench.period(sender=Sender(b"second", 1 + k)).mode is Mode.STOPPED
+    bench.start()
+
+
+def test_publishers_of_other_joints_and_lost_messages_are_no_fault():
+    bench = Bench().running()
+    for number in (1, 2, 5, 6, 100):
+        gripper = {"names": ("gripper",), "q": (0.0,), "dq": (0.0,)}
+        bench.state(sender=Sender(b"gripper", 3), **gripper)
+        assert bench.period(sender=Sender(b"driver", number)).mode is Mode.RUNNING
+
+
+def test_a_second_publisher_whose_states_are_bad_is_named_as_such():
+    bench = Bench()
+    bench.period(sender=Sender(b"driver", 1))
+    bench.start()
+    for bad in ({"q": (0.1, math.nan, 0.3)}, {"stamp": EPOCH}):
+        bench.period(sender=Sender(b"other", 1), **bad)
+        assert bench.supervisor.last_fault.kind is FaultKind.PUBLISHER
 
 
 def test_a_state_is_stale_after_two_periods_and_not_before():

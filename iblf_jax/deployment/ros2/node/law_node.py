@@ -10,11 +10,12 @@ reports it ten times a second.
 from __future__ import annotations
 
 import gc
+import inspect
 import math
 import signal
 import sys
 from array import array
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from time import monotonic_ns
 from typing import Any
@@ -40,9 +41,12 @@ from iblf_jax.deployment.ros2.node.supervisor import (
     ARRIVAL_TIMEOUT,
     NANOSECONDS,
     STALE_PERIODS,
+    UNKNOWN,
     Command,
     Configuration,
+    FaultKind,
     Mode,
+    Sender,
     Supervisor,
 )
 
@@ -58,6 +62,8 @@ FINAL_TIMEOUT = Duration(seconds=0.5)
 """Longest wait for the arrival of the last command."""
 QUEUE_DEPTH = 10
 """Messages that a topic stores."""
+SIGNALS = (signal.SIGTERM, signal.SIGINT)
+"""They end the node."""
 DECIMAL_POINT = "Numbers have a decimal point in YAML: 50.0."
 
 
@@ -238,7 +244,7 @@ class LawNode(Node):  # type: ignore[misc]
         if self.trigger == "state":
             # A lost state would stop a simulator in lock-step: this one is reliable.
             self._states = self.create_subscription(
-                JointState, "joint_states", self._on_state, quality
+                JointState, "joint_states", _with_information(self._on_state), quality
             )
             period = self.supervisor.configuration.arrival_timeout / 2
             self.create_timer(period, self._on_watchdog, clock=steady)
@@ -246,13 +252,13 @@ class LawNode(Node):  # type: ignore[misc]
             # Drivers publish with either reliability; this one receives from both.
             quality.reliability = ReliabilityPolicy.BEST_EFFORT
             self._states = self.create_subscription(
-                JointState, "joint_states", self._receive, quality
+                JointState, "joint_states", _with_information(self._receive), quality
             )
             period = self.supervisor.configuration.period
             self._timer = self.create_timer(period, self._on_timer, clock=steady)
         self.create_timer(DIAGNOSTICS_PERIOD, self._publish_diagnostics, clock=steady)
 
-    def _receive(self, message: JointState) -> bool:
+    def _receive(self, message: JointState, information: Mapping[str, Any]) -> bool:
         """Takes a state; returns whether it is a new sample or not valid."""
         stamp = message.header.stamp
         return self.supervisor.receive(
@@ -261,11 +267,12 @@ class LawNode(Node):  # type: ignore[misc]
             message.velocity,
             stamp.sec * NANOSECONDS + stamp.nanosec,
             monotonic_ns(),
+            _sender(information),
         )
 
-    def _on_state(self, message: JointState) -> None:
+    def _on_state(self, message: JointState, information: Mapping[str, Any]) -> None:
         """One sample of the law for each state that is a new sample."""
-        if not self._receive(message):
+        if not self._receive(message, information):
             return
         command = self.supervisor.command(monotonic_ns())
         if command is None:
@@ -314,7 +321,7 @@ class LawNode(Node):  # type: ignore[misc]
                 taken = self._states.handle.take_message(JointState, False)
             if taken is None:
                 return
-            self._receive(taken[0])
+            self._receive(*taken)
 
     def _clock_of_stamps(self) -> int | None:
         """The clock with which stamps are compared [ns]; None for states that are the clock."""
@@ -342,18 +349,28 @@ class LawNode(Node):  # type: ignore[misc]
         self._logged_mode = mode
         fault = self.supervisor.last_fault
         if mode is Mode.FAULT and fault is not None:
+            text = _fault_text(fault)
+            if fault.kind is FaultKind.PUBLISHER:
+                text += f" (publishers of joint_states: {', '.join(self._nodes_of_states())})"
             policy = self.supervisor.configuration.on_fault
-            self.get_logger().error(f"{_fault_text(fault)}; torques by the policy {policy!r}.")
+            self.get_logger().error(f"{text}; torques by the policy {policy!r}.")
         else:
             self.get_logger().info(f"The mode is {mode.value}.")
+
+    def _nodes_of_states(self) -> list[str]:
+        """The nodes that publish joint_states; the ended ones too, for some seconds."""
+        found = self.get_publishers_info_by_topic(self._states.topic_name)
+        return [f"{x.node_namespace.rstrip('/')}/{x.node_name}" for x in found]
 
     def send_final_command(self) -> None:
         """Publishes the torques of the fault policy before the node ends."""
         command = self.supervisor.final_command()
         if command is not None:
             self._send(command)
-            # The process ends after this; without waiting, the message may be lost.
-            self._publisher.wait_for_all_acked(FINAL_TIMEOUT)
+
+    def wait_for_efforts(self) -> None:
+        """Waits for the arrival of the last command."""
+        self._publisher.wait_for_all_acked(FINAL_TIMEOUT)
 
     def _start(self) -> tuple[bool, str]:
         self._catch_up()
@@ -381,7 +398,7 @@ class LawNode(Node):  # type: ignore[misc]
         names = ["mode", "last_fault", "note", *FLAGS, "limited"]
         names += [f"margin.{joint} [rad]" for joint in joints]
         names += ["samples", "missed_periods", "missed_share", "periods_without_new_state"]
-        names += ["longest_latency [s]", "latency_99 [s]", "time_origin [s]"]
+        names += ["longest_latency [s]", "latency_99 [s]", "time_origin [s]", "publishers"]
         self._values = [KeyValue(key=name) for name in names]
         self._status = DiagnosticStatus(
             name=f"{self.get_name()}: law", hardware_id=self.get_name(), values=self._values
@@ -403,12 +420,17 @@ class LawNode(Node):  # type: ignore[misc]
         texts.append(str(supervisor.repeated))
         texts.append(f"{monitor.longest_latency * 1e-9:.6f}")
         texts += [f"{monitor.latency_quantile(0.99):.6f}", self._origin_text()]
+        publishers = self.count_publishers(self._states.topic_name)
+        texts.append(str(publishers))
         for value, text in zip(self._values, texts, strict=True):
             value.value = text
-        self._status.level = self._level()
         reason = supervisor.note
         if supervisor.mode is Mode.FAULT and fault is not None:
             reason = fault.reason
+        self._status.level = self._level()
+        if publishers > 1 and supervisor.sender == UNKNOWN:
+            self._status.level = max(self._status.level, DiagnosticStatus.WARN)
+            reason += f"; {publishers} publishers, which the middleware does not tell apart"
         self._status.message = f"{supervisor.mode.value}: {reason}".removesuffix(": ")
         self._diagnostics.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics_publisher.publish(self._diagnostics)
@@ -429,6 +451,29 @@ def _fault_text(fault: Any) -> str:
 
 def _boolean(flag: int) -> str:
     return str(bool(flag)).lower()
+
+
+def _with_information(receive: Callable[[JointState, Mapping[str, Any]], Any]) -> Any:
+    """The callback of a subscription that receives messages with their information.
+
+    rclpy knows such a callback by its signature.  Its executors in Python call it with two
+    arguments, and that in C++ with a tuple of the two.
+    """
+
+    def callback(*given: Any) -> None:
+        message, information = given[0] if len(given) == 1 else given
+        receive(message, information)
+
+    vars(callback)["__signature__"] = inspect.signature(receive)
+    return callback
+
+
+def _sender(information: Mapping[str, Any]) -> Sender:
+    """The publisher of a message; rclpy before ROS 2 Kilted does not report its identity, and not
+    every middleware counts its messages.
+    """
+    identity = information.get("publisher_gid")
+    return Sender(identity and identity["data"], information.get("publication_sequence_number"))
 
 
 def _service(action: Callable[[], tuple[bool, str]]) -> Callable[..., Any]:
@@ -498,8 +543,8 @@ def _spin(executor: Any) -> None:
     def end(*_: Any) -> None:
         ended[0] = True
 
-    signal.signal(signal.SIGTERM, end)
-    signal.signal(signal.SIGINT, end)
+    for number in SIGNALS:
+        signal.signal(number, end)
     while not ended[0]:
         executor.spin_once(timeout_sec=DIAGNOSTICS_PERIOD)
 
@@ -525,6 +570,11 @@ def main(args: Sequence[str] | None = None) -> int:
         _spin(executor)
     finally:
         node.send_final_command()
+        # Another signal ends the process at once from now on.
+        for number in SIGNALS:
+            signal.signal(number, signal.SIG_DFL)
+        # The process ends after this; without waiting, the command may be lost.
+        node.wait_for_efforts()
         rclpy.try_shutdown()
     return 0
 

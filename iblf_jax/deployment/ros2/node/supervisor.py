@@ -34,6 +34,8 @@ STALE_PERIODS = 2.0
 """Default of the parameter `state_timeout`, in periods."""
 ARRIVAL_TIMEOUT = 0.5
 """Default of the parameter `arrival_timeout` [s]."""
+PUBLISHER_TIMEOUT = 1.0
+"""Time for which a publisher has to be the only one until its states are used again [s]."""
 
 
 class Mode(enum.Enum):
@@ -53,6 +55,7 @@ class FaultKind(enum.Enum):
     NOT_FINITE = "state that is not finite"
     JOINTS = "joints that do not match"
     CLOCK = "clock that jumped"
+    PUBLISHER = "states of several publishers"
     TORQUE = "torque that is not finite"
 
 
@@ -61,6 +64,26 @@ class Fault(NamedTuple):
 
     kind: FaultKind
     reason: str
+
+
+class Sender(NamedTuple):
+    """What the middleware reports about the publisher of a message."""
+
+    identity: bytes | None = None
+    """The same for all messages of a publisher; None if it is unknown."""
+    number: int | None = None
+    """Counts the messages of a publisher; None if it is unknown."""
+
+    def may_follow(self, last: Sender) -> bool:
+        """Whether this message can be a later one of the publisher of another message."""
+        is_other = None not in (self.identity, last.identity) and self.identity != last.identity
+        if is_other or self.number is None or last.number is None:
+            return not is_other
+        return self.number > last.number
+
+
+UNKNOWN = Sender()
+"""A publisher about which the middleware reports nothing."""
 
 
 class JointSample(NamedTuple):
@@ -224,12 +247,16 @@ class Supervisor:
         """Whether a torque was clipped since `reset_extremes`."""
         self.repeated = 0
         """Periods without a new state, in which the law's last torques were published again."""
+        self.sender: Sender | None = None
+        """Of the last message with the joints."""
         self._reader = JointReader(configuration.joints, configuration.reads_velocity)
         self._state: JointSample | None = None
         """The last valid state."""
         self._previous: JointSample | None = None
         self._last_stamp: int | None = None
         self._due_stamp: int | None = None
+        self._alone_from: float = 0.0
+        """Time by the steady clock from which on a publisher counts as the only one [ns]."""
         self._why_invalid: str | None = None
         """Why the last message with the joints is not valid; None if it is."""
         self._law_stamp: int | None = None
@@ -253,11 +280,13 @@ class Supervisor:
         velocity: Sequence[float],
         stamp: int,
         received: int,
+        sender: Sender = UNKNOWN,
     ) -> bool:
         """Takes a joint state.
 
         Args:
           names, position, velocity, stamp, received: as `JointReader.read`.
+          sender: the publisher of the message.
 
         Returns:
           Whether a law that samples with the states has to answer: the stamp is that of a new
@@ -267,14 +296,29 @@ class Supervisor:
         if found is None:
             self.note = f"a state has none of the joints {', '.join(self.configuration.joints)}"
             return False
-        if isinstance(found, JointSample):
+        fault = self._publisher_fault(sender, received)
+        if isinstance(found, Fault):
+            fault = fault or found
+        elif fault is None:
             fault = self._clock_fault(stamp)
             if fault is None:
                 return self._accept(found)
-            found = fault
-        self._why_invalid = found.reason
-        self._report(found)
+        self._why_invalid = fault.reason
+        self._report(fault)
         return True
+
+    def _publisher_fault(self, sender: Sender, received: int) -> Fault | None:
+        """A fault for a state of another publisher than the last one, and for all states after it
+        until one publisher has been the only one for `PUBLISHER_TIMEOUT`.
+        """
+        last = self.sender
+        self.sender = sender
+        if last is not None and not sender.may_follow(last):
+            self._alone_from = received + PUBLISHER_TIMEOUT * NANOSECONDS
+        if received >= self._alone_from:
+            return None
+        reason = "a second publisher sends states of the joints, or the only one was restarted"
+        return Fault(FaultKind.PUBLISHER, reason)
 
     def _clock_fault(self, stamp: int) -> Fault | None:
         """A fault for a stamp before the last one; the later states are compared with this one."""
