@@ -38,8 +38,8 @@ class Status(enum.IntFlag):
     made, its metrics are NaN."""
     INACCURATE = 128
     """The estimated error of the positions is more than 0.5 % of the width of the tube
-    (`error_estimate.TOLERANCE`): take a smaller dt.  In a loop that rounds a reading or a torque the
-    error may be that of another code (`error_growth`), which a finer resolution reduces."""
+    (`error_estimate.TOLERANCE`): take a smaller dt.  In a loop that rounds a reading or a torque
+    it may be the error by another code (`error_growth`), which a finer resolution reduces."""
     GUARD_STAYED = 256
     """The guard was active after the first instant: there the loop ran with a softer barrier than
     the requested one."""

@@ -49,7 +49,7 @@ compared with runs at a sixteenth of the step.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -68,6 +68,7 @@ from iblf_jax.simulation.closed_loop import (
     run_sampled_law,
     with_integrated_part,
 )
+from iblf_jax.simulation.error_estimate import RELATIVE, Accuracy
 from iblf_jax.simulation.levels import sensor_state
 from iblf_jax.simulation.noise import normals
 from iblf_jax.simulation.sampling import Instant, step_torques
@@ -505,8 +506,8 @@ def bound(
 
 
 def with_growth(
-    accuracy: Any, bounds: jax.Array, width: jax.Array
-) -> tuple[Any, dict[str, jax.Array]]:
+    accuracy: Accuracy, bounds: jax.Array, width: jax.Array
+) -> tuple[Accuracy, dict[str, jax.Array]]:
     """The `error_estimate.Accuracy` of a run, as the head of this module states, and the results
     that it adds to the metrics.
 
@@ -526,6 +527,16 @@ def with_growth(
         relative=jnp.where(jumped, relative, jnp.minimum(before_relative, relative)),
     )
     return found, {BOUND: jnp.where(jumped, relative, 0.0)}
+
+
+def errors_by_step(metrics: Mapping[str, Any]) -> jax.Array:
+    """The stated error of runs relative to the tube; 0 where a smaller step does not reduce it,
+    because a code of a rounded signal may differ.
+    """
+    errors = jnp.asarray(metrics[RELATIVE])
+    if BOUND not in metrics:
+        return errors
+    return jnp.where(jnp.asarray(metrics[BOUND]) > 0.0, 0.0, errors)
 
 
 def _through_queue(

@@ -10,8 +10,11 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from typing import Any
 
+import numpy as np
+
 from iblf_jax.core import checks, notices
 from iblf_jax.core.progress import announced, bar
+from iblf_jax.simulation.error_growth import errors_by_step
 from iblf_jax.simulation.metrics import Fold
 from iblf_jax.simulation.noise import has_noise
 from iblf_jax.simulation.scenario import Scenario
@@ -21,7 +24,7 @@ from iblf_jax.studies.execution import run_all_cases
 from iblf_jax.studies.options import RunOptions, ThisProcess, check_deprecated, executor_of
 from iblf_jax.studies.study import Study
 from iblf_jax.studies.study_setup import prepare
-from iblf_jax.studies.time_step import errors_by_step, warn_of_step
+from iblf_jax.studies.time_step import warn_of_step
 
 
 @notices.each_warning_once
@@ -99,7 +102,7 @@ def monte_carlo(
     checks.fits_memory("runs", options.runs, case_bytes(prepared))
     with bar(progress, options.runs) as shown:
         results = run_all_cases(prepared, executor, shown.update)
-    errors = errors_by_step(results.metrics)
+    errors = np.asarray(errors_by_step(results.metrics))
     warn_of_step(results.status, results.fastest_mode, errors, options.dt, method)
     return Study.of(prepared, results)
 

@@ -21,6 +21,7 @@ import numpy as np
 from iblf_jax.core import checks, notices
 from iblf_jax.core.progress import announced, bar
 from iblf_jax.engine import cases_per_unit, whole_blocks
+from iblf_jax.simulation.error_growth import errors_by_step
 from iblf_jax.simulation.metrics import Fold, metric_units
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.simulation.signals import dimension_names
@@ -44,7 +45,7 @@ from iblf_jax.studies.options import (
 from iblf_jax.studies.store import Store, StoreError, Variable, load_store, open_store
 from iblf_jax.studies.study_setup import PreparedStudy, prepare
 from iblf_jax.studies.sweep_points import make_points
-from iblf_jax.studies.time_step import errors_by_step, warn_of_step
+from iblf_jax.studies.time_step import warn_of_step
 
 if TYPE_CHECKING:
     import xarray

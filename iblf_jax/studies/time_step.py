@@ -12,8 +12,8 @@ from iblf_jax.core import checks, notices
 from iblf_jax.core.progress import announced
 from iblf_jax.core.status import LOST, Status, has_flag
 from iblf_jax.engine import block_size, step_size
-from iblf_jax.simulation.error_estimate import RELATIVE, TOLERANCE
-from iblf_jax.simulation.error_growth import BOUND
+from iblf_jax.simulation.error_estimate import TOLERANCE
+from iblf_jax.simulation.error_growth import errors_by_step
 from iblf_jax.simulation.integrators import tableau
 from iblf_jax.simulation.scenario import Scenario, canonical
 from iblf_jax.studies.blocks import run_blocks
@@ -96,7 +96,7 @@ def _dt_for_all(
     lost_before = None
     for _ in range(MAX_TRIES):
         results = first_block(dt)
-        errors = errors_by_step(results.metrics)
+        errors = np.asarray(errors_by_step(results.metrics))
         needed = _dt_to_try(results.status, results.fastest_mode, errors, dt, method)
         if needed is None:
             return dt
@@ -151,16 +151,6 @@ def _dt_to_try(
     return min((step for step in (of_kept, of_lost) if step is not None), default=None)
 
 
-def errors_by_step(metrics: Mapping[str, Any]) -> np.ndarray:
-    """The estimated error of each run relative to the tube; 0 where a smaller step does not reduce
-    it, because a code of a rounded signal may differ (`error_growth`).
-    """
-    errors = np.asarray(metrics[RELATIVE])
-    if BOUND not in metrics:
-        return errors
-    return np.where(np.asarray(metrics[BOUND]) > 0.0, 0.0, errors)
-
-
 def needed_dt(
     status: np.ndarray, modes: np.ndarray, errors: np.ndarray, dt: float, method: str
 ) -> float | None:
@@ -168,7 +158,7 @@ def needed_dt(
 
     Args:
       status, modes, errors: flags, fastest mode [1/s] and estimated error relative to the tube of
-        each run, `errors_by_step`.
+        each run (`errors_by_step`).
       dt: their time step [s].
       method: the integrator.
     """

@@ -24,6 +24,7 @@ import numpy as np
 from iblf_jax.core import checks
 from iblf_jax.core.pytree import component
 from iblf_jax.core.status import Status, has_flag
+from iblf_jax.simulation.error_growth import errors_by_step
 from iblf_jax.simulation.noise import NOISE_NAME, noise_values
 from iblf_jax.studies import statistics
 from iblf_jax.studies.blocks import BlockResults
@@ -33,7 +34,7 @@ from iblf_jax.studies.execution import run_all_cases
 from iblf_jax.studies.options import ThisProcess
 from iblf_jax.studies.perturbation_cube import Cube
 from iblf_jax.studies.study_setup import PreparedStudy
-from iblf_jax.studies.time_step import errors_by_step, warn_of_step
+from iblf_jax.studies.time_step import warn_of_step
 
 MARGINS = {"positions": "margin", "velocities": "velocity_margin", "regions": "region_margin"}
 """What may fail -> the metric that is its margin."""
@@ -153,7 +154,7 @@ class NormalSpace:
         self.runs += len(z)
         self.status.append(results.status)
         self._modes.append(results.fastest_mode)
-        self._errors.append(errors_by_step(results.metrics))
+        self._errors.append(np.asarray(errors_by_step(results.metrics)))
         margins = statistics.worst_joint(results.metrics, self.metric).astype(float) - self.limit
         margins = np.nan_to_num(margins, nan=0.0, posinf=np.inf, neginf=-np.inf)
         diverged = has_flag(results.status, Status.NOT_FINITE)
