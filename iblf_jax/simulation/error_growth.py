@@ -49,7 +49,6 @@ compared with runs at a sixteenth of the step.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -105,11 +104,10 @@ def is_interrupted(scenario: Scenario) -> bool:
     """
     sampling, smooth = scenario.sampling, actuators.smooth(scenario.actuator)
     if sampling is None:
-        continuous = smooth is not scenario.actuator
-        return continuous and not rounds_continuously(scenario)
+        return smooth is not scenario.actuator and not rounds_continuously(scenario)
     if sampling.trigger is not None or smooth is not scenario.actuator:
         return True
-    return _rounds(scenario.sensor)
+    return _rounds_readings(scenario)
 
 
 def rounds_continuously(scenario: Scenario) -> bool:
@@ -121,14 +119,17 @@ def rounds_continuously(scenario: Scenario) -> bool:
         return False
     if actuators.input_delay(actuator) is not None:
         return True
-    return _rounds(actuator, actuators.actuator_member)
+    return _rounds_torque(scenario)
 
 
-def _rounds(part: Any, member: Callable = sensor_member) -> bool:
-    """Whether a sensor or an actuator rounds."""
-    if member is sensor_member:
-        return unrounded(part) is not part
-    return member(part, "resolution") is not None
+def _rounds_readings(scenario: Scenario) -> bool:
+    """Whether the sensor rounds."""
+    return unrounded(scenario.sensor) is not scenario.sensor
+
+
+def _rounds_torque(scenario: Scenario) -> bool:
+    """Whether the actuator rounds."""
+    return actuators.actuator_member(scenario.actuator, "resolution") is not None
 
 
 def _variables(scenario: Scenario, state: LoopState) -> Any:
@@ -138,7 +139,7 @@ def _variables(scenario: Scenario, state: LoopState) -> Any:
     """
     if scenario.sampling is None:
         return state
-    if _rounds(scenario.sensor):
+    if _rounds_readings(scenario):
         return (integrated_part(state),)
     sampled: Any = state.sampled
     memory = (state.controller, state.observer, sampled.sensor)
@@ -168,10 +169,10 @@ def begin(scenario: Scenario, state: LoopState, derivative: jax.Array) -> Any:
 
 def _rounds_twice(scenario: Scenario) -> bool:
     """Whether a loop with rounded readings has a rounded torque or an event trigger too."""
-    if scenario.sampling is None or not _rounds(scenario.sensor):
+    if scenario.sampling is None or not _rounds_readings(scenario):
         return False
     has_trigger = scenario.sampling.trigger is not None
-    return has_trigger or _rounds(scenario.actuator, actuators.actuator_member)
+    return has_trigger or _rounds_torque(scenario)
 
 
 def _reads_without_rounding(
@@ -214,7 +215,7 @@ def _moved(x: Any, by: Any, factor: Any) -> Any:
 def _scales(error: Any) -> tuple[jax.Array, jax.Array]:
     """The factors s / |e|, by which an error becomes a small difference, and |e| / s."""
     leaves = [x for x in jax.tree.leaves(error) if jnp.issubdtype(x.dtype, jnp.floating)]
-    size = sum(jnp.sum(jnp.abs(x)) for x in leaves)
+    size = jnp.sum(jnp.stack([jnp.sum(jnp.abs(x)) for x in leaves]))
     small = jnp.finfo(size.dtype).eps ** 0.5
     size = jnp.maximum(size, jnp.finfo(size.dtype).eps ** 2)
     return small / size, size / small
@@ -320,7 +321,7 @@ def _torques(
     """
     sampling: Any = scenario.sampling
     torque = step_torques(sampling, dt, now, state.sampled.commands).torque
-    is_cut = _rounds(scenario.sensor) or _rounds(scenario.actuator, actuators.actuator_member)
+    is_cut = _rounds_readings(scenario) or _rounds_torque(scenario)
     if is_cut:
         return torque, jnp.zeros_like(torque)
     errors = step_torques(sampling, dt, now, growth.error[2])
@@ -339,7 +340,7 @@ def _at_sample(
 ) -> ErrorGrowth:
     """The errors after the law has run, and whether a code may differ (A.3)."""
     normal = normals(noise, now.sample, scenario.sensor.draws, scenario.n).astype(state.q.dtype)
-    if _rounds(scenario.sensor):
+    if _rounds_readings(scenario):
         reaches = _reaches_code(growth.error[0].x, scenario, before, normal)
         return growth._replace(jumped=jnp.where(reaches, 1.0, growth.jumped))
     return _after_law(growth, scenario, t, normal, before, state)
@@ -405,8 +406,8 @@ def _after_law(
         fires = state.sampled.sent.number > held.sent.number
         command_error = jnp.where(fires, command_error, sent.input)
         sent = sent._replace(input=command_error, torque=command_error)
-    if _rounds(scenario.actuator, actuators.actuator_member):
-        actuator = as_at(scenario.actuator, t)
+    if _rounds_torque(scenario):
+        actuator: Any = as_at(scenario.actuator, t)
         distance = actuator.distance_to_jump(state.sampled.commands[0], state.dq, state.actuator)
         reaches = reaches | jnp.any(jnp.abs(command_error) + blur >= distance)
     jumped = jnp.where(reaches, 1.0, growth.jumped)
@@ -478,7 +479,7 @@ def bound(
 
     none = jnp.zeros((size - plant - n, n), Phi.dtype)
     inputs = [columns(by_torque, none) * _torque_width(scenario, growth)]
-    if _rounds(scenario.sensor):
+    if _rounds_readings(scenario):
         step = _resolution(scenario, state.x)
         for rows, width in zip(_rows_of_levels(state), step, strict=True):
             law = derivative[plant : plant + n, rows]
@@ -529,9 +530,9 @@ def with_growth(
     return found, {BOUND: jnp.where(jumped, relative, 0.0)}
 
 
-def errors_by_step(metrics: Mapping[str, Any]) -> jax.Array:
+def errors_by_step(metrics: Any) -> jax.Array:
     """The stated error of runs relative to the tube; 0 where a smaller step does not reduce it,
-    because a code of a rounded signal may differ.
+    because a code of a rounded signal may differ. `metrics` are by name.
     """
     errors = jnp.asarray(metrics[RELATIVE])
     if BOUND not in metrics:
